@@ -245,6 +245,19 @@ class Calibration:
     coverage: Array
 
 
+def widening(fitted: Fitted, simulate: Simulate, draws: Array, seed: int) -> Array:
+    """How many times wider (P,) the network's posteriors have to be to hold what is known as often as they say.
+
+    Simulates at `draws` (n, P) of the posterior: root mean square of what was simulated minus the mean that the network
+    gives, over its standard deviation.
+    """
+    statistics = simulate(draws, draw_seeds(draws.shape[0], np.random.default_rng(seed)))
+    mean, covariance = fitted.network.mixtures(statistics).moments()
+    factor = fitted.region.factor
+    std = np.sqrt(np.einsum("ij,njk,ik->ni", factor, covariance, factor))
+    return np.asarray(np.sqrt(np.mean(((draws - fitted.region.points(mean)) / std) ** 2, axis=0)))
+
+
 def calibrate(fitted: Fitted, simulate: Simulate, count: int, seed: int) -> Calibration:
     """Simulation-based calibration (Talts et al., 2018) and expected coverage, on `count` fresh simulations."""
     rng = np.random.default_rng(seed)
@@ -253,7 +266,7 @@ def calibrate(fitted: Fitted, simulate: Simulate, count: int, seed: int) -> Cali
     draws, _ = fitted.draw(statistics, _DRAWS, rng)
     # A rank between two draws is anywhere between them.
     ranks = ((draws < truth[:, None]).sum(axis=1) + rng.random(truth.shape)) / (_DRAWS + 1.0)
-    mixtures = fitted.network.mixtures(statistics)
+    mixtures = fitted.posteriors(statistics)
     size = truth.shape[1]
     unit = fitted.region.unit(draws.reshape(-1, size)).reshape(draws.shape)
     density = mixtures.log_density(unit)
@@ -268,7 +281,7 @@ def calibrate(fitted: Fitted, simulate: Simulate, count: int, seed: int) -> Cali
 
 def effective_simulations(fitted: Fitted, observed: Array) -> float:
     """How many simulations of the last region the posterior rests on: (sum w)^2 / sum w^2 with w its density there."""
-    mixtures = fitted.network.mixtures(observed[None])
+    mixtures = fitted.posteriors(observed[None])
     log_weight = mixtures.log_density(fitted.region.unit(fitted.theta)[None])[0]
     weight = np.exp(log_weight - log_weight.max())
     return float(weight.sum() ** 2 / (weight**2).sum())

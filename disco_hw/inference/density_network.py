@@ -82,6 +82,24 @@ class Mixtures:
         total: Array = top + np.log(np.exp(parts - top[..., None]).sum(axis=2)) - 0.5 * size * math.log(2.0 * math.pi)
         return total
 
+    def moments(self) -> tuple[Array, Array]:
+        """Means (n, P) and covariances (n, P, P)."""
+        share = np.exp(self.log_weight)
+        share = share / share.sum(axis=1, keepdims=True)
+        mean = np.einsum("nc,nci->ni", share, self.mean)
+        inverse, apart = np.linalg.inv(self.factor), self.mean - mean[:, None]
+        within = np.einsum("nc,ncik,ncjk->nij", share, inverse, inverse)
+        return mean, within + np.einsum("nc,nci,ncj->nij", share, apart, apart)
+
+    def spread(self, by: Array) -> Mixtures:
+        """Mixtures of the same means, in which deviations from these are `by` (P, P) times what they were."""
+        middle = self.moments()[0][:, None]
+        # A factor that is not triangular is so again after a rotation of the normal vector: QL, by way of QR.
+        upper = np.linalg.qr((self.factor @ np.linalg.inv(by))[..., ::-1, ::-1]).R
+        lower = upper[..., ::-1, ::-1]
+        sign = np.sign(np.diagonal(lower, axis1=-2, axis2=-1))
+        return Mixtures(self.log_weight, middle + (self.mean - middle) @ by.T, sign[..., None] * lower)
+
     def draw(self, count: int, rng: np.random.Generator) -> Array:
         """Draws (n, count, P)."""
         n, components, size = self.mean.shape
@@ -281,7 +299,8 @@ class RoundSettings:
 class Fitted:
     """The last round: region, network in the region's coordinates, and the simulations it was trained on.
 
-    `theta` (n, P), `statistics` (n, S); `simulations` counts those of all rounds.
+    `theta` (n, P), `statistics` (n, S); `simulations` counts those of all rounds. `widening` (P,): what the standard
+    deviations that the network gives are multiplied by, or None (`checks.widening`).
     """
 
     region: Region
@@ -289,12 +308,21 @@ class Fitted:
     theta: Array
     statistics: Array
     simulations: int
+    widening: Array | None = None
+
+    def posteriors(self, statistics: Array) -> Mixtures:
+        """The posteriors given statistics (n, S), in the region's coordinates and not cut to it."""
+        found = self.network.mixtures(statistics)
+        if self.widening is None:
+            return found
+        factor = self.region.factor
+        return found.spread(np.asarray(np.linalg.solve(factor, self.widening[:, None] * factor), dtype=np.float64))
 
     def draw(self, statistics: Array, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
         """Draws (n, count, P) of the posteriors given statistics (n, S), and the share (n,) that had to be drawn again
         because it fell outside the region.
         """
-        return truncated_draws(self.region, self.network.mixtures(statistics), count, rng)
+        return truncated_draws(self.region, self.posteriors(statistics), count, rng)
 
 
 def truncated_draws(region: Region, mixtures: Mixtures, count: int, rng: np.random.Generator) -> tuple[Array, Array]:

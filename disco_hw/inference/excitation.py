@@ -238,7 +238,7 @@ _SHAPE_LAGS_S = (0.15, 1.0)
 # A squared error counts up to so many variances in what tells the shape of the noise.
 _LARGEST_SQUARE = 9.0
 _FEWEST_WINDOWS = 12
-_LEAST_RATIO = 0.5
+_LEAST_RATIO = 0.25
 # Of a window, the part at either end over which positions are averaged.
 _ENDS = 0.25
 # Neighbours of a pose; a jump is so many times the median distance from their median (12: about 6 standard deviations).
@@ -312,15 +312,16 @@ def slip_intensity(drive: Excitation, speed_share: float) -> tuple[Array, Array]
 @dataclass(frozen=True, slots=True)
 class _Windows:
     """Errors over windows of one lag (W, 3): forward, left, yaw; time in motion and on the slip's clock (W,), s;
-    `growth` of a random walk from the mean of one end to that of the other, beside that from end to end; `sensor`: how
-    often the sensor's variance is in the error's; `independent`: how many windows count, as they overlap by half.
+    `growth` of a random walk from the mean of one end to that of the other, beside that from end to end; `sensor`
+    (W, 3): how often the sensor's variance is in the error's; `independent`: how many windows count, as they overlap by
+    half.
     """
 
     error: Array
     moving_s: Array
     intensity: Array
     growth: float
-    sensor: float
+    sensor: Array
     independent: float
 
 
@@ -331,13 +332,13 @@ def measured_noise(drive: Excitation, theta: Array) -> Noise:
     with the time in motion (structure function), slower at first the longer it keeps its direction. Errors beyond three
     standard deviations are held there, so that jumps of the sensor do not count.
     """
-    error = _errors(drive, theta)
+    error, turned = _in_body(drive, _errors(drive, theta))
     by_speed_s = slip_intensity(drive, 1.0)[1]
     rows: list[_Windows] = []
     shape: list[_Windows] = []
     period_s = float(np.median(np.diff(drive.t_s)[~drive.starts[1:]]))
     for lag in sorted({max(1, round(lag_s / period_s)) for lag_s in _LAGS_S}):
-        windows = _windows(drive, error, by_speed_s, lag)
+        windows = _windows(drive, error, turned, by_speed_s, lag)
         length_s = lag * period_s
         for moves, chosen in (
             (False, windows.moving_s < 0.05 * length_s),
@@ -351,15 +352,14 @@ def measured_noise(drive: Excitation, theta: Array) -> Noise:
     if len(rows) < 3:
         return USUAL
     times_s = np.array([float(np.mean(row.moving_s)) * row.growth for row in rows])
-    sensor, counts = np.array([(row.sensor, row.independent) for row in rows]).T
+    sensor, counts = np.array([row.sensor.mean(axis=0) for row in rows]), np.array([row.independent for row in rows])
     variances = np.array([_variance(row.error**2) for row in rows])
     sensors, slips, correlation_s = _two_terms(times_s, sensor, counts, variances)
-    lever_m = _lever(shape, slips[2], correlation_s)
+    lever_m = _lever(shape, sensors[2])
     # Short drives say little of the smaller one; wheels that slip one way on a floor slip the other way too.
-    least = _LEAST_RATIO**2 * max(slips[0], slips[1])
-    forward, left = max(slips[0], least), max(slips[1], least)
-    left = max(left - lever_m**2 * slips[2], _LEAST_RATIO**2 * least)
-    found = np.sqrt([0.5 * (sensors[0] + sensors[1]), sensors[2], forward, left, slips[2]])
+    forward, left = slips[0], _left(rows, _grown(times_s, correlation_s), sensors, lever_m)
+    least = _LEAST_RATIO**2 * max(forward, left)
+    found = np.sqrt([0.5 * (sensors[0] + sensors[1]), sensors[2], max(forward, least), max(left, least), slips[2]])
     share = _speed_share(shape, sensors, slips, correlation_s)
     white = Noise(*np.clip(found, _SMALLEST, _LARGEST).tolist())
     return replace(white, correlation_s=correlation_s, lever_m=lever_m, speed_share=share)
@@ -371,7 +371,7 @@ def _chosen(windows: _Windows, chosen: NDArray[np.bool_], independent: float) ->
         windows.moving_s[chosen],
         windows.intensity[chosen],
         windows.growth,
-        windows.sensor,
+        windows.sensor[chosen],
         independent * np.count_nonzero(chosen),
     )
 
@@ -390,7 +390,7 @@ def _grown(time_s: Array, correlation_s: float) -> Array:
 
 def _two_terms(time_s: Array, sensor: Array, counts: Array, variances: Array) -> tuple[Array, Array, float]:
     """Sensor variances R (axes,), slip variances q (axes,) per second, and the correlation time of slip in
-    `variance = sensor R + q grown(time)`; `variances` (rows, axes). R and q are not negative.
+    `variance = sensor R + q grown(time)`; `sensor`, `variances` (rows, axes). R and q are not negative.
 
     Slip that keeps its direction for a while grows slower at first; its rate later on is what parameters feel. Errors
     are relative to the variance and fall with the number of windows.
@@ -399,8 +399,13 @@ def _two_terms(time_s: Array, sensor: Array, counts: Array, variances: Array) ->
     axes = range(variances.shape[1])
     best_cost = np.inf
     for tau_s in _CORRELATIONS_S:
-        columns = np.column_stack([sensor, _grown(time_s, tau_s)])
-        fits = [_not_negative(columns * scales[:, [axis]], variances[:, axis] * scales[:, axis]) for axis in axes]
+        grown = _grown(time_s, tau_s)
+        fits = [
+            _not_negative(
+                np.column_stack([sensor[:, axis], grown]) * scales[:, [axis]], variances[:, axis] * scales[:, axis]
+            )
+            for axis in axes
+        ]
         cost = sum(fit[1] for fit in fits)
         if cost < best_cost:
             best_cost, best_tau_s, best = cost, tau_s, np.array([fit[0] for fit in fits])
@@ -419,18 +424,35 @@ def _not_negative(columns: Array, values: Array) -> tuple[Array, float]:
     return best, best_cost
 
 
-def _lever(windows: list[_Windows], slip_yaw: float, correlation_s: float) -> float:
-    """How far before the tracked point slip turns the body (m): errors to the left go with those of yaw."""
-    together = grown = 0.0
+def _lever(windows: list[_Windows], sensor_yaw: float) -> float:
+    """How far before the tracked point slip turns the body (m): the slope of errors to the left over those in yaw.
+
+    Of both in the same windows, without what the sensor adds to those in yaw.
+    """
+    together = square = 0.0
     for one in windows:
         left, yaw = one.error[:, 1], one.error[:, 2]
         spread = _variance(one.error[:, 1:] ** 2)
         usual = (left**2 < _LARGEST_SQUARE * spread[0]) & (yaw**2 < _LARGEST_SQUARE * spread[1])
-        weight = 1.0 / max(spread[0] * spread[1], 1e-24)
-        times_s = _grown(one.moving_s * one.growth, correlation_s)
-        together -= weight * float((left * yaw)[usual].sum()) / one.independent
-        grown += weight * slip_yaw * float(times_s[usual].sum()) / one.independent
-    return together / grown if grown > 0.0 else 0.0
+        weight = 1.0 / (one.independent * max(spread[0] * spread[1], 1e-24))
+        together -= weight * float((left * yaw)[usual].sum())
+        square += weight * float((yaw**2 - one.sensor[:, 2] * sensor_yaw)[usual].sum())
+    return together / square if square > 0.0 else 0.0
+
+
+def _left(rows: list[_Windows], grown_s: Array, sensors: Array, lever_m: float) -> float:
+    """Variance per second of the slip to the left at the end of the lever; `grown_s` (rows,) as `_grown` gives it.
+
+    The errors there themselves are taken: of two variances that are nearly the same a difference tells little.
+    """
+    part = whole = 0.0
+    for one, grown in zip(rows, grown_s.tolist(), strict=True):
+        variance = float(_variance((one.error[:, [1]] + lever_m * one.error[:, [2]]) ** 2)[0])
+        sensor, sensor_yaw = one.sensor[:, 1:].mean(axis=0) * sensors[1:]
+        weight = one.independent / max(variance, 1e-12) ** 2
+        part += weight * grown * (variance - float(sensor + lever_m**2 * sensor_yaw))
+        whole += weight * grown**2
+    return max(part / whole, 0.0) if whole > 0.0 else 0.0
 
 
 def _speed_share(windows: list[_Windows], sensors: Array, slips: Array, correlation_s: float) -> float:
@@ -496,13 +518,29 @@ def _without_jumps(error: Array) -> Array:
     return np.where(apart > _JUMP * np.maximum(np.median(apart, axis=0), 1e-9), middle, error)
 
 
-def _windows(drive: Excitation, error: Array, by_speed_s: Array, lag: int) -> _Windows:
-    """Errors over windows of `lag` poses; `by_speed_s` (P,) as `slip_intensity` gives it for slip that is all by speed.
+def _in_body(drive: Excitation, error: Array) -> tuple[Array, Array]:
+    """Errors (P, 3) summed up along the body's own axes from the world's, and the squared turn so far (P,), rad^2.
+
+    Over a second of turning, what slips forward would be counted to the left otherwise.
+    """
+    own, turned = np.zeros_like(error), np.zeros(error.shape[0])
+    for lo, hi in _bounds(drive):
+        yaw = drive.pose[lo:hi, 2]
+        turn = np.diff(yaw)
+        cosine, sine = np.cos(yaw[:-1] + 0.5 * turn), np.sin(yaw[:-1] + 0.5 * turn)
+        x, y, off = np.diff(error[lo:hi], axis=0).T
+        own[lo + 1 : hi] = np.cumsum(np.column_stack([x * cosine + y * sine, y * cosine - x * sine, off]), axis=0)
+        turned[lo + 1 : hi] = np.cumsum(turn**2)
+    return own, turned
+
+
+def _windows(drive: Excitation, error: Array, turned: Array, by_speed_s: Array, lag: int) -> _Windows:
+    """Windows of `lag` poses, from `_in_body`; `by_speed_s` (P,) as `slip_intensity` gives it for slip all by speed.
 
     From the mean of some poses to the mean of as many that are `lag` later, which quietens the sensor.
     """
     ends = max(1, round(_ENDS * lag))
-    errors, moving, by_speed = [np.empty((0, 3))], [np.empty(0)], [np.empty(0)]
+    errors, moving, by_speed, turns = [np.empty((0, 3))], [np.empty(0)], [np.empty(0)], [np.empty(0)]
     stride = max(1, lag // 2)
     moved_s, grown_s = np.cumsum(drive.moving_s), np.cumsum(by_speed_s)
     for lo, hi in _bounds(drive):
@@ -510,20 +548,20 @@ def _windows(drive: Excitation, error: Array, by_speed_s: Array, lag: int) -> _W
             continue
         start = np.arange(lo, hi - lag - ends + 1, stride)
         within = np.arange(ends)
-        step = (error[start[:, None] + lag + within] - error[start[:, None] + within]).mean(axis=1)
-        yaw = drive.pose[start + lag // 2, 2]
-        cosine, sine = np.cos(yaw), np.sin(yaw)
-        forward, left = step[:, 0] * cosine + step[:, 1] * sine, step[:, 1] * cosine - step[:, 0] * sine
-        errors.append(np.column_stack([forward, left, step[:, 2]]))
+        errors.append((error[start[:, None] + lag + within] - error[start[:, None] + within]).mean(axis=1))
         moving.append(moved_s[start + lag] - moved_s[start])
         by_speed.append(grown_s[start + lag] - grown_s[start])
+        turns.append(turned[start + lag] - turned[start])
     moving_s = np.concatenate(moving)
+    # A random walk from the mean of one end to that of the other grows by a third of an end less.
+    growth = 1.0 - (ends - 1) / (3.0 * lag)
+    # What the sensor adds to a position and takes off the next one does not cancel where the body has turned meanwhile.
+    position = 2.0 / ends + growth * np.concatenate(turns)
     return _Windows(
         np.concatenate(errors),
         moving_s,
         np.concatenate(by_speed) / np.maximum(moving_s, 1e-9),
-        # A random walk from the mean of one end to that of the other grows by a third of an end less.
-        1.0 - (ends - 1) / (3.0 * lag),
-        2.0 / ends,
+        growth,
+        np.column_stack([position, position, np.full(moving_s.size, 2.0 / ends)]),
         0.0,
     )

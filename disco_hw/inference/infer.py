@@ -23,6 +23,7 @@ from disco_hw.inference.checks import (
     effective_simulations,
     predictive,
     undetermined,
+    widening,
 )
 from disco_hw.inference.density_network import Fitted, Mixtures, NetworkSettings, Region, RoundSettings, run_rounds
 from disco_hw.inference.estimates import cross_correlation, estimates, paper_statistics
@@ -45,6 +46,7 @@ Array = NDArray[np.float64]
 
 POSTERIOR_DRAWS = 4000
 PREDICTIVE_SIMULATIONS = 120
+WIDENING_SIMULATIONS = 400
 CALIBRATION_SIMULATIONS = 300
 DEFAULT_SIMULATIONS = 3000
 PAPER_SIMULATIONS = 1000
@@ -139,7 +141,8 @@ def infer(
         summary = cross_correlation(drive) if options.cross_correlation else paper_statistics(drive)
     simulator = Simulator(nominal, drive, noise, known.factor)
     observed = summary(drive.pose[None])[0]
-    tally = Tally(simulations + PREDICTIVE_SIMULATIONS + CALIBRATION_SIMULATIONS, report_progress)
+    widened = 0 if options.paper else WIDENING_SIMULATIONS
+    tally = Tally(simulations + widened + PREDICTIVE_SIMULATIONS + CALIBRATION_SIMULATIONS, report_progress)
 
     def simulate(theta: Array, seeds: Seeds) -> Array:
         return simulator.summaries(theta, seeds, summary, workers, tally.add)
@@ -149,9 +152,12 @@ def infer(
         settings = replace(settings, network=replace(settings.network, fourier=FOURIER_FEATURES))
     fitted = run_rounds(simulate, observed, prior, simulations, settings, options.seed, tally.stage, workers)
     rng = np.random.default_rng([options.seed, 1])
+    if widened:
+        tally.stage("width of the posterior")
+        draws, _ = fitted.draw(observed[None], widened, rng)
+        fitted = replace(fitted, widening=widening(fitted, simulate, draws[0], options.seed + 5))
     draws, outside = fitted.draw(observed[None], POSTERIOR_DRAWS, rng)
-    mixtures = fitted.network.mixtures(observed[None])
-    belief = belief_of(mixtures, fitted.region, prior.low, prior.high, NAMES, rng)
+    belief = belief_of(fitted.posteriors(observed[None]), fitted.region, prior.low, prior.high, NAMES, rng)
     tally.stage("posterior predictive check")
     few = draws[0, :PREDICTIVE_SIMULATIONS]
     check = predictive(

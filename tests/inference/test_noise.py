@@ -60,9 +60,11 @@ def test_the_plants_noise_is_found_at_its_own_estimate():
 def test_slip_that_keeps_its_direction_for_a_while_is_rated_by_what_it_grows_to():
     tau_s, rate, sensor = 0.3, 1.5e-5, 2.5e-5
     time_s = np.array([0.04, 0.12, 0.2, 0.4, 0.8, 1.6, 3.0])
-    weight = np.full(time_s.size, 2.0)
+    weight = 2.0
     variance = weight * sensor + rate * (time_s - tau_s * (1.0 - np.exp(-time_s / tau_s)))
-    sensors, rates, found_s = _two_terms(time_s, weight, np.full(time_s.size, 50.0), np.outer(variance, [1.0, 4.0]))
+    sensors, rates, found_s = _two_terms(
+        time_s, np.full((time_s.size, 2), weight), np.full(time_s.size, 50.0), np.outer(variance, [1.0, 4.0])
+    )
     assert sensors == pytest.approx([sensor, 4.0 * sensor], rel=1e-3)
     assert rates == pytest.approx([rate, 4.0 * rate], rel=1e-3)
     assert found_s == tau_s
@@ -89,6 +91,18 @@ def test_how_long_slip_keeps_its_direction_is_found(true_s, low_s, high_s):
 def test_about_which_point_slip_turns_the_body_is_found(true_m):
     found = found_in_simulations(replace(TRUE, lever_m=true_m))
     assert np.mean([one.lever_m for one in found]) == pytest.approx(true_m, abs=0.04)
+
+
+def test_slip_about_the_centre_of_rotation_is_counted_neither_to_the_left_nor_forward():
+    # To the left of the tracked point it makes three times what slips forward.
+    true = replace(
+        TRUE, slip_forward_m_sqrt_s=0.005, slip_left_m_sqrt_s=0.0, slip_yaw_rad_sqrt_s=0.06, lever_m=0.25,
+        correlation_s=0.15,
+    )  # fmt: skip
+    forward, left = np.median([one.vector()[2:4] for one in found_in_simulations(true)], axis=0)
+    assert forward == pytest.approx(0.005, rel=0.2)
+    # No less than a quarter of the slip forward is ever counted.
+    assert left < 0.3 * forward
 
 
 @pytest.mark.parametrize("true_share", [0.0, 1.0])
