@@ -57,6 +57,14 @@ def test_exactly_the_hidden_effect_is_named_and_the_gap_closes(name, size, param
     assert report.offered == "amended"
 
 
+def test_a_steady_circle_shows_what_stands_beside_the_lag_of_real_motors():
+    log = simulated_drive({"wheel_gain": -0.044}, seed=11101, drive="circle", motors="real")
+    report = find_gap(log, MODEL, pictures=False)
+    assert {effect.name for effect in report.effects} == {"motor_lag", "wheel_gain"}
+    gains = report.effects[[effect.name for effect in report.effects].index("wheel_gain")].parameters
+    assert all(gain.low < -0.044 < gain.high for gain in gains.values())
+
+
 @pytest.mark.long
 def test_two_effects_of_different_channels_are_both_named():
     report = report_of(("yaw_rate_limit", 1.0), ("pose_latency", 0.1))

@@ -232,26 +232,39 @@ def masks_at_nodes(drive: GriddedDrive) -> Mapping[str, Mask]:
     size = np.abs(speed).max(axis=1)
     moving = size > settings.rest_rad_s
     steady = moving & (np.abs(growth) < settings.speeding_rad_s2)
-    middle = float(np.median(size[moving])) if moving.any() else 1.0
     turning = np.abs(half) > 0.3
-    usual_turn = float(np.median(np.abs(half[turning]))) if turning.any() else 1.0
+    slow, fast = _halves(size, moving, settings.halves_apart)
+    turning_slowly, turning_fast = _halves(np.abs(half), turning, settings.halves_apart)
     times = np.linspace(drive.t_s[0], drive.t_s[-1], 4)
     return {
         "standstill": ~moving,
         "speeding up": moving & (growth >= settings.speeding_rad_s2),
         "braking": moving & (growth <= -settings.speeding_rad_s2),
-        "slow": steady & (size <= middle),
-        "fast": steady & (size > middle),
+        "slow": steady & slow,
+        "fast": steady & fast,
         "straight": steady & ~turning,
         "turning left": turning & (half > 0),
         "turning right": turning & (half < 0),
-        "turning slowly": turning & (np.abs(half) <= usual_turn),
-        "turning fast": turning & (np.abs(half) > usual_turn),
+        "turning slowly": turning_slowly,
+        "turning fast": turning_fast,
         "driving ahead": moving & (mean > 0.3),
         "driving back": moving & (mean < -0.3),
         "early": drive.t_s <= times[1],
         "late": drive.t_s >= times[2],
     }
+
+
+def _halves(size: Array, of: Mask, apart: float) -> tuple[Mask, Mask]:
+    """Nodes (M,) of a part of the drive with a size up to its median there, and above it.
+
+    None at all where those above are not `apart` times as large in the mean: noise alone would then have told one from
+    the other, and every value that goes with the size would differ between them.
+    """
+    middle = float(np.median(size[of])) if of.any() else 0.0
+    below, above = of & (size <= middle), of & (size > middle)
+    if not above.any() or float(size[above].mean()) < apart * float(size[below].mean()):
+        return np.zeros_like(of), np.zeros_like(of)
+    return below, above
 
 
 def regimes(
