@@ -377,8 +377,8 @@ class ReportSettings:
     """By so many standard deviations. Chosen: of some twenty comparisons in a log one in a hundred logs by chance."""
     regime_known_share: float = 0.05
     """A regime that holds less of what is known of a value says nothing of it. Chosen."""
-    halves_apart: float = 1.2
-    """Slow and fast differ by so much in the mean, else the drive has neither. Chosen: wheels' speeds scatter by less.
+    halves_apart: float = 0.1
+    """Slow and fast are what differs by this share from the median. Chosen: wheels' speeds scatter by less.
     """
     regime_blocks: int = 3
     """Neighbouring blocks taken as one for the scatter of regimes. Chosen: 9 s."""

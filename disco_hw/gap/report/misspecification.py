@@ -255,16 +255,12 @@ def masks_at_nodes(drive: GriddedDrive) -> Mapping[str, Mask]:
 
 
 def _halves(size: Array, of: Mask, apart: float) -> tuple[Mask, Mask]:
-    """Nodes (M,) of a part of the drive with a size up to its median there, and above it.
+    """Nodes (M,) of a part of the drive with a size below its median there and above it, by the share `apart` or more.
 
-    None at all where those above are not `apart` times as large in the mean: noise alone would then have told one from
-    the other, and every value that goes with the size would differ between them.
+    Between nodes nearer to it noise alone decides, and every value that goes with the size would differ.
     """
     middle = float(np.median(size[of])) if of.any() else 0.0
-    below, above = of & (size <= middle), of & (size > middle)
-    if not above.any() or float(size[above].mean()) < apart * float(size[below].mean()):
-        return np.zeros_like(of), np.zeros_like(of)
-    return below, above
+    return of & (size <= (1.0 - apart) * middle), of & (size > (1.0 + apart) * middle)
 
 
 def regimes(

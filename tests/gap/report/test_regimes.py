@@ -27,15 +27,15 @@ def test_nodes_lie_in_the_regimes_that_the_wheels_tell():
     assert parts["late"][-1]
 
 
-@pytest.mark.parametrize(("other", "apart"), [(1.1, False), (1.5, True)])
-def test_a_drive_at_nearly_one_speed_has_neither_slow_nor_fast(other, apart):
-    """Noise would have told them apart, and every value that goes with the speed would differ between them."""
+@pytest.mark.parametrize(("other", "least", "most"), [(1.0, 0.0, 0.01), (1.6, 0.4, 0.6)])
+def test_what_is_driven_at_one_speed_is_neither_slow_nor_fast(other, least, most):
+    """Noise would tell them apart, and every value that goes with the speed would differ between them."""
     wheels = np.repeat([[2.0, 5.0], [2.0 * other, 5.0 * other]], 300, axis=0)
-    noisy = wheels * (1.0 + 0.03 * np.random.default_rng(1).standard_normal(wheels.shape))
+    noisy = wheels * (1.0 + 0.015 * np.random.default_rng(1).standard_normal(wheels.shape))
     parts = masks_at_nodes(line_of(noisy))
-    assert parts["turning left"].any()
-    for one, opposite in (("slow", "fast"), ("turning slowly", "turning fast")):
-        assert (parts[one].any(), parts[opposite].any()) == (apart, apart)
+    assert parts["turning left"].all()
+    for name in ("turning slowly", "turning fast"):
+        assert least <= parts[name].mean() <= most
 
 
 def test_a_fault_shows_in_its_regime_and_goes_with_its_effect():
