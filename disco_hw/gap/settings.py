@@ -378,8 +378,7 @@ class ReportSettings:
     regime_known_share: float = 0.05
     """A regime that holds less of what is known of a value says nothing of it. Chosen."""
     halves_apart: float = 0.1
-    """Slow and fast are what differs by this share from the median. Chosen: wheels' speeds scatter by less.
-    """
+    """Slow and fast differ by this share or more from the median. Chosen: wheels' speeds scatter by less."""
     regime_blocks: int = 3
     """Neighbouring blocks taken as one for the scatter of regimes. Chosen: 9 s."""
     compared_parts: tuple[int, ...] = (2, 4)

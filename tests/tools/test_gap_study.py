@@ -38,8 +38,9 @@ def test_a_part_of_the_study(job):
     found = gap_jobs.work(job)
     assert found.right, found
     if job.hidden:
-        # Of what the timed model leaves, motors with friction and limits keep a part that no effect holds.
-        assert 0.5 < found.closed < 1.0
+        # Of the gap of the fitted geometry; `closed` is of what a timed model leaves, less the motors' lag.
+        assert found.refitted_mm - found.amended_mm > 0.8 * (found.refitted_mm - found.floor_mm)
+        assert found.closed > 0.5
         assert max(found.errors) < 0.15
 
 
