@@ -56,7 +56,7 @@ NAMES = {
     "dead_band": ("deadband", "width_rad_s"),
     "unequal_wheels": ("wheel_radius_asymmetry", "ratio"),
     "pose_latency": ("pose_latency", "latency_s"),
-    "slope": ("slope", ""),
+    "slope": ("downhill_slide", ""),
     "payload": ("lateral_icr", "offset_m"),
 }
 """The model's effect that stands for what is hidden, and its parameter; the others have no name in the model."""
@@ -89,7 +89,7 @@ class Result:
         values = self.named.get(effect)
         if values is None:
             return None
-        return values[parameter] if parameter else math.atan2(values["drift_y_m_s"], values["drift_x_m_s"])
+        return values[parameter] if parameter else math.atan2(values["slide_y_m"], values["slide_x_m"])
 
     @property
     def right(self) -> bool:

@@ -91,8 +91,6 @@ class NoiseSettings:
     """Where poses fail to come for longer, a window ends. Chosen."""
     slip_onset_m_s: float = 0.05
     """From this rim speed on the body slips as much as it ever does. Chosen."""
-    drift_onset_m_s: float = 0.02
-    """From this speed on the drift of a slope is whole. Chosen."""
     trusted_wheel_blocks: float = 1.0
     """How far the wheels' noise model is believed before a log speaks, in blocks of time. Measured: the mean square of
     scores of what is not there is 3.4 over six dirty logs."""
@@ -106,6 +104,10 @@ class NoiseSettings:
     """At least so many samples either side then. Chosen."""
     huber: float = 3.0
     """Whitened residuals beyond grow linearly. Literature: Huber's loss (1964); the size is chosen."""
+    even_span_s: float = 0.3
+    """How large errors are that are alike at every speed is measured over this. Chosen: several readings."""
+    even_huber: float = 1.345
+    """Of them those beyond so many times their size grow linearly. Literature: 95 % efficient (Huber, 1964)."""
     prior_sd: float = 2.0
     """Standard deviation of the logarithm of every noise parameter about its start. Chosen: a factor of seven."""
     difference_step: float = 2e-2
@@ -208,6 +210,11 @@ class SelectionSettings:
     (Kass and Raftery, 1995)."""
     block_lengths: tuple[int, ...] = (1, 3, 9)
     """Neighbouring blocks taken as one for the sandwich variance. Chosen: 3, 9 and 27 s."""
+    even_rounds: int = 3
+    """How often a fit to errors that are alike at every speed weighs them anew. Chosen: it is settled by then."""
+    clearly_closer: float = 0.7
+    """Such a fit is told where its deviations, in the geometric mean, are so many times those of the other. Chosen:
+    less may be chance."""
     fewest_blocks: int = 5
     """Fewer blocks say nothing about their scatter. Chosen."""
     rest_rad_s: float = 0.05
@@ -370,6 +377,8 @@ class ReportSettings:
     times_unnamed: float = 3.0
     """So is one that is worth less than so many times what a term without a name beside it is. Chosen: half an order of
     magnitude."""
+    alike_share: float = 0.05
+    """Where a name can do less than this of what the term does, the term has to be worth more than it. Chosen."""
     form_share: float = 0.5
     """And one whose value differs from one regime to its opposite by this share of itself. Chosen: nobody who is told
     the value expects it."""

@@ -19,7 +19,7 @@ NAMES = {
     },
     Channel.WHEEL_TO_BODY: {
         "encoder_scale", "wheel_radius_asymmetry", "turn_slip", "acceleration_slip", "side_slip", "lateral_icr",
-        "slope", "surface_change",
+        "slope", "downhill_slide", "surface_change",
     },
     Channel.POSE_SENSOR: {"pose_latency", "pose_offset", "heading_bias"},
 }  # fmt: skip
@@ -90,6 +90,7 @@ def test_effects_describe_themselves(effect):
         ("side_slip", {"k_s": 0.15}, TURN),
         ("lateral_icr", {"offset_m": 0.05}, SPIN),
         ("slope", {"drift_x_m_s": 0.02, "drift_y_m_s": -0.01}, START_STOP),
+        ("downhill_slide", {"slide_x_m": 0.1, "slide_y_m": -0.05}, TURN),
         ("surface_change", {"track": 0.15, "time_s": 60.65, "radius": -0.03}, TURN),
     ],
 )
@@ -223,6 +224,16 @@ def test_a_slope_moves_only_a_robot_whose_wheels_turn():
     np.testing.assert_array_equal(free_run(values, np.zeros((10, 2)))[-1, :2], [0.0, 0.0])
     moved = free_run(values, STRAIGHT)[-1, :2] - free_run({}, STRAIGHT)[-1, :2]
     np.testing.assert_allclose(moved, [0.04, 0.02], atol=1e-12)
+
+
+def test_a_turning_robot_slides_downhill_as_fast_as_it_turns_and_a_straight_one_holds():
+    values = {"downhill_slide": {"slide_x_m": 0.1, "slide_y_m": 0.05}}
+    np.testing.assert_array_equal(free_run(values, STRAIGHT), free_run({}, STRAIGHT))
+    for direction in (1.0, -1.0):
+        turned, plainly = free_run(values, direction * SPIN), free_run({}, direction * SPIN)
+        np.testing.assert_allclose(turned[:, 2], plainly[:, 2])
+        slid = abs(turned[-1, 2])
+        np.testing.assert_allclose((turned - plainly)[-1, :2], [0.1 * slid, 0.05 * slid], rtol=1e-9)
 
 
 def test_a_surface_changes_at_its_time():

@@ -32,7 +32,7 @@ def test_a_value_is_right_within_a_tenth():
     assert not result(truth=0.25).right
     assert not result(named={"command_delay": {"delay_s": 0.21}}).right
     assert not result("worn_tyre", truth=None).right
-    downhill = result("slope", named={"slope": {"drift_x_m_s": -0.1, "drift_y_m_s": 0.1}}, truth=0.75 * math.pi)
+    downhill = result("slope", named={"downhill_slide": {"slide_x_m": -0.1, "slide_y_m": 0.1}}, truth=0.75 * math.pi)
     assert downhill.right
 
 

@@ -32,13 +32,12 @@ _STEPS: Mapping[str, float] = {
     "rad/s^2": 1e-2,
     "m": 1e-4,
     "m/s": 1e-4,
+    "m/rad": 1e-3,
     "rad": 1e-3,
     "1": 2e-4,
 }
 _OTHER_STEP = 1e-3
 _UNLIMITED = 1e6
-# Wheel speed (rad/s) at which whatever sets in with motion has set in.
-_FAST_RAD_S = 1e6
 
 
 @dataclass(frozen=True)
@@ -137,22 +136,20 @@ _ASKED = {effect.name: asks_for(effect.plain) for effect in (*_ENCODERS, *_POSE_
 _SENSED = np.array(
     [
         *range(BASE_COUNT),
-        *(BODY.place[column] for effect in (*_POSE_TIME, *_POSE, *_WORLD) for column in effect.columns),
+        *(BODY.place[column] for effect in (*_POSE_TIME, *_POSE) for column in effect.columns),
     ]
 )
 
 
 class PoseSensor(NamedTuple):
     """What a vector of the body channel says of the poses: how old they are (s), where the sensor sits ahead and to the
-    left of the tracked point (m), how far its yaw is off (rad), and the drift of a moving robot in the world (m/s).
+    left of the tracked point (m), and how far its yaw is off (rad).
     """
 
     late_s: float
     forward_m: float
     left_m: float
     bias_rad: float
-    drift_x_m_s: float
-    drift_y_m_s: float
 
 
 def pose_sensor(p: Array) -> PoseSensor:
@@ -168,11 +165,27 @@ def _sensor(values: tuple[float, ...]) -> PoseSensor:
     mount = 0.0, 0.0, 0.0
     for effect in _POSE:
         mount = _plain(BODY, p, effect, x=mount[0], y=mount[1], yaw=mount[2])
-    drift = 0.0, 0.0
+    return PoseSensor(late_s, *(float(each) for each in mount))
+
+
+def carried(p: Array, speed_rad_s: Array, t_s: Array) -> Array:
+    """How far the ground has carried a robot by each node (M, 2), m in the world, at a vector of the body channel.
+
+    `speed_rad_s` (M, 2) its measured wheel speeds, `t_s` (M,).
+    """
+    moved = np.zeros_like(speed_rad_s)
     for effect in _WORLD:
-        moving = {"wheel_sum": _FAST_RAD_S, "difference": 0.0, "time_s": 0.0}
-        drift = _plain(BODY, p, effect, x=drift[0], y=drift[1], **moving)
-    return PoseSensor(late_s, *(float(each) for each in (*mount, *drift)))
+        place = _SPANS[False][effect.name]
+        if (p[place] == BODY.neutral[place]).all():
+            continue
+        motion = {
+            "wheel_sum": speed_rad_s.sum(axis=1),
+            "difference": speed_rad_s[:, 1] - speed_rad_s[:, 0],
+            "time_s": t_s,
+        }
+        x, y = _plain(BODY, p, effect, x=moved[:, 0], y=moved[:, 1], **motion)
+        moved = np.column_stack([x, y])
+    return np.asarray(np.cumsum(moved, axis=0) * GRID_STEP_S)
 
 
 def counted(layout: Layout, p: Array) -> tuple[float, float]:
@@ -183,9 +196,13 @@ def counted(layout: Layout, p: Array) -> tuple[float, float]:
     return float(turns[0]), float(turns[1])
 
 
-def _plain(layout: Layout, p: Array, effect: Effect, **motion: float) -> Any:
+def _plain(layout: Layout, p: Array, effect: Effect, **motion: float | Array) -> Any:
     """What an effect makes of the motion in a second, at a vector."""
-    known = {"values": tuple(p[_SPANS[layout.of_wheels][effect.name]].tolist()), "step_s": 1.0, **motion}
+    known: dict[str, Any] = {
+        "values": tuple(p[_SPANS[layout.of_wheels][effect.name]].tolist()),
+        "step_s": 1.0,
+        **motion,
+    }
     known["geometry"] = tuple(p[:BASE_COUNT].tolist())
     return effect.plain(**{name: known[name] for name in _ASKED[effect.name]})
 

@@ -164,7 +164,7 @@ def read_angles(angle: Array, node: Index, fraction: Array, out: Array) -> None:
 
 @kernel_function
 def _lay(
-    late: float, bias: float, drift_x: float, drift_y: float, track: Array, moving_s: Array, node: Index,
+    late: float, bias: float, ground: Array, track: Array, node: Index,
     fraction: Array, window: Index, first_node: Index, last_node: Index, use: Mask, measured: Array, out: Array,
 ) -> None:  # fmt: skip
     count = node.shape[0]
@@ -189,9 +189,11 @@ def _lay(
         for k in range(begin, end):
             place = min(max(node[k] + fraction[k] - late, float(first_node[k])), last_node[k] - 1e-6)
             low = math.floor(place)
-            moved = moving_s[low] + (place - low) * (moving_s[low + 1] - moving_s[low])
-            x = cosine * out[k, 0] - sine * out[k, 1] + drift_x * moved
-            y = sine * out[k, 0] + cosine * out[k, 1] + drift_y * moved
+            part = place - low
+            moved_x = ground[low, 0] + part * (ground[low + 1, 0] - ground[low, 0])
+            moved_y = ground[low, 1] + part * (ground[low + 1, 1] - ground[low, 1])
+            x = cosine * out[k, 0] - sine * out[k, 1] + moved_x
+            y = sine * out[k, 0] + cosine * out[k, 1] + moved_y
             out[k, 0], out[k, 1] = measured[k, 0] - x, measured[k, 1] - y
             out[k, 2] = measured[k, 2] - out[k, 2] - turned
             if use[k]:
@@ -204,27 +206,25 @@ def _lay(
 
 
 def pose_residual(
-    p: Array, track: Array, moving_s: Array, node: Index, fraction: Array, window: Index, first_node: Index,
+    p: Array, track: Array, ground: Array, node: Index, fraction: Array, window: Index, first_node: Index,
     last_node: Index, use: Mask, measured: Array,
 ) -> Array:  # fmt: skip
     """Measured minus predicted pose (P, 3) in the world frame, each window laid on its measurements.
 
     `window` (P,) numbers ascending from 0; within one the predicted path is turned and shifted as a whole by the mean
-    difference over the samples in `use`. `moving_s` (M,) is the time in motion, for the drift; `first_node`,
+    difference over the samples in `use`. `ground` (M, 2) is how far the ground has carried the robot (m); `first_node`,
     `last_node` (P,) bound the run of each sample, for the latency.
     """
     out = np.empty_like(measured)
     sensor = pose_sensor(p)
-    late, bias, drift = sensor.late_s / GRID_STEP_S, sensor.bias_rad, (sensor.drift_x_m_s, sensor.drift_y_m_s)
-    _lay(
-        late, bias, *drift, track, moving_s, node, fraction, window, first_node, last_node, use, measured, out
-    )  # fmt: skip
+    late = sensor.late_s / GRID_STEP_S
+    _lay(late, sensor.bias_rad, ground, track, node, fraction, window, first_node, last_node, use, measured, out)
     return out
 
 
 @kernel_function
 def _displace(
-    p: Any, track: Any, moving_s: Any, start: Any, low: Any, high: Any, heading: Any, ahead: int, out: Any
+    p: Any, track: Any, ground: Any, start: Any, low: Any, high: Any, heading: Any, ahead: int, out: Any
 ) -> None:
     late = p[0] / GRID_STEP_S
     top = track.shape[0] - 2
@@ -241,28 +241,38 @@ def _displace(
         # The measured heading is the true one plus the bias: displacement is given in the measured frame.
         turned = yaw_start + p[1]
         cosine, sine = math.cos(turned), math.sin(turned)
-        moved = moving_s[min(start[k] + ahead, top)] - moving_s[start[k]]
+        end = min(start[k] + ahead, top)
+        moved_x, moved_y = ground[end, 0] - ground[start[k], 0], ground[end, 1] - ground[start[k], 1]
         c, s = math.cos(heading[k]), math.sin(heading[k])
-        out[k, 0] = cosine * x + sine * y + (c * p[2] + s * p[3]) * moved
-        out[k, 1] = -sine * x + cosine * y + (-s * p[2] + c * p[3]) * moved
+        out[k, 0] = cosine * x + sine * y + c * moved_x + s * moved_y
+        out[k, 1] = -sine * x + cosine * y - s * moved_x + c * moved_y
         out[k, 2] = yaw - yaw_start
 
 
 def displacement(
-    p: Array, first: NDArray[np.bool_], track: Array, moving_s: Array, start: Index, heading_rad: Array, ahead_s: float
+    p: Array, first: NDArray[np.bool_], track: Array, ground: Array, start: Index, heading_rad: Array, ahead_s: float
 ) -> Array:
     """Forward, left and yaw (K, 3) that a pose sensor would see from each start node to `ahead_s` later.
 
     `p` in the order of `BODY.columns`; `first` (M,) where runs begin, out of which no latency looks; `track` (M, 3) a
-    free run of the body; `heading_rad` (K,) measured there.
+    free run of the body, `ground` (M, 2) how far the ground has carried it; `heading_rad` (K,) measured there.
     """
     begins = np.flatnonzero(first)
     run = np.searchsorted(begins, start, side="right") - 1
     low, high = begins[run], np.append(begins[1:], first.size)[run] - 1
     out = np.empty((start.size, 3))
     sensor = pose_sensor(p)
-    world = np.array([sensor.late_s, sensor.bias_rad, sensor.drift_x_m_s, sensor.drift_y_m_s])
-    _displace(world, track, moving_s, start, low, high, heading_rad, round(ahead_s / GRID_STEP_S), out)
+    _displace(
+        np.array([sensor.late_s, sensor.bias_rad]),
+        track,
+        ground,
+        start,
+        low,
+        high,
+        heading_rad,
+        round(ahead_s / GRID_STEP_S),
+        out,
+    )
     return out
 
 

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap.data import BASE_COUNT, BODY, WHEEL, Layout
+from disco_hw.gap.data import BASE_COUNT, BODY, WHEEL, Layout, carried
 from disco_hw.gap.data.free_runs import pose_residual, read_angles, run_body, run_wheels
 from disco_hw.gap.data.gridded_drive import GriddedDrive, GridSamples
 from disco_hw.gap.noise.body_noise import BodyGains, BodyMotion, BodyNoise, body_gains, whiten_body
@@ -25,11 +25,14 @@ from disco_hw.gap.noise.wheel_noise import (
     wheel_gains,
     whiten_wheels,
 )
-from disco_hw.gap.settings import GRID_STEP_S, GapSettings
+from disco_hw.gap.settings import GapSettings
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+
+# A noise parameter that is as good as zero; the logarithm of it is taken.
+_HARDLY = 1e-5
 
 
 class ResidualChannel(Protocol):
@@ -130,6 +133,29 @@ class WheelChannel:
         """The same with other weights (E, 2)."""
         return replace(self, weight=weight)
 
+    def evenly(self, p: Array, extra: Array | None = None) -> WheelChannel:
+        """The same, as if wheels erred by as much at every speed; errors that are large beside what a vector leaves
+        count less (Huber, 1964).
+        """
+        settings, samples = self.settings.noise, self.drive.encoder
+        raw = self.raw_residual(p, extra)
+        apart = max(round(settings.even_span_s / max(float(np.median(np.diff(samples.t_s))), 1e-3)), 1)
+        moving = np.abs(self.drive.speed_rad_s[samples.node]).max(axis=1) > settings.rest_rad_s
+        counted = self.gains.use & moving
+        grown = (raw[apart:] - raw[:-apart])[counted[apart:] & counted[:-apart]]
+        off_rad = float(np.sqrt((grown**2).mean())) if grown.size else 0.0
+        # Readings and time stamps err as they do.
+        noise = replace(
+            self.noise,
+            relative=_HARDLY,
+            wander=_HARDLY,
+            drift_rad_sqrt_s=max(off_rad, _HARDLY) / settings.even_span_s**0.5,
+        )
+        even = self.with_noise(noise)
+        white = even.whitened(p, extra)
+        size = float(np.sqrt((white[counted] ** 2).mean())) if counted.any() else 1.0
+        return even.weighted(np.minimum(1.0, settings.even_huber * size / np.maximum(np.abs(white), 1e-9)) / size)
+
     @property
     def settings(self) -> GapSettings:
         """The settings of the analysis."""
@@ -211,7 +237,6 @@ class BodyChannel:
     window: Index
     first_node: Index
     last_node: Index
-    moving_s: Array
     use: Mask
     gains: BodyGains
     weight: Array
@@ -232,8 +257,6 @@ class BodyChannel:
         ends = np.append(starts[1:], drive.t_s.size) - 1
         run = np.searchsorted(starts, samples.node, side="right") - 1
         rim = np.abs(drive.speed_rad_s).max(axis=1) * geometry[0]
-        rolling = np.abs(drive.speed_rad_s).mean(axis=1) * geometry[0]
-        moving_s = np.cumsum(np.minimum(rolling / drive.settings.noise.drift_onset_m_s, 1.0)) * GRID_STEP_S
         channel = cls(
             drive,
             samples,
@@ -241,7 +264,6 @@ class BodyChannel:
             window,
             starts[run],
             ends[run],
-            moving_s,
             chosen,
             body_gains(noise, _no_motion(samples)),
             np.ones((samples.t_s.size, 3)),
@@ -332,12 +354,16 @@ class BodyChannel:
         perturbation = total_perturbation(drive, 3, drive.known_motion, extra)
         return run_body(p, drive.angle_rad, drive.speed_rad_s, perturbation, drive.first, drive.t_s)
 
+    def carried(self, p: Array) -> Array:
+        """How far the ground has carried the robot by each node, (M, 2), m in the world."""
+        return carried(p, self.drive.speed_rad_s, self.drive.t_s)
+
     def raw_residual(self, p: Array, extra: Array | None = None) -> Array:
         """Measured minus predicted poses (P, 3) in the world, each window laid on its measurements."""
         return pose_residual(
             p,
             self.track(p, extra),
-            self.moving_s,
+            self.carried(p),
             self.samples.node,
             self.samples.fraction,
             self.window,

@@ -317,9 +317,9 @@ def _moved(
     ]
     step += _rotated(own[1] - own[0], _earlier(measured[:, 2] - old.bias_rad + turned))
     # A drift of the world's has its directions, not the robot's.
-    rolled = np.interp(drive.pose.t_s, drive.t_s, channel.moving_s)
-    drift = np.array([new.drift_x_m_s - old.drift_x_m_s, new.drift_y_m_s - old.drift_y_m_s])
-    step += np.diff(rolled, prepend=rolled[:1])[:, None] * drift
+    ground = channel.carried(then[0]) - channel.carried(now[0])
+    seen = np.column_stack([np.interp(drive.pose.t_s, drive.t_s, ground[:, axis]) for axis in (0, 1)])
+    step += np.diff(seen, axis=0, prepend=seen[:1])
     step[~inside] = np.diff(measured[:, :2], axis=0, prepend=measured[:1, :2])[~inside]
     place = measured[0, :2] + np.cumsum(step, axis=0)
     return np.column_stack([place, measured[:, 2] + turned + new.bias_rad - old.bias_rad])

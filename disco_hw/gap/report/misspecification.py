@@ -151,17 +151,30 @@ def _takes_little(found: ChannelResult, name: str) -> str | None:
 
 
 def _beside_as_much(found: ChannelResult, name: str) -> str | None:
-    """That a term without a name, in the same channel, is worth about as much."""
+    """That a term without a name, in the same channel, is worth about as much, or more if its traces are of another
+    kind: such a term explains something else, beside which a name may be true that takes more.
+    """
     settings, taken = found.channel.settings.report, _gain(found, name)
-    for one in found.unnamed:
-        if taken < settings.times_unnamed * one.evidence.gain:
+    for place, one in enumerate(found.unnamed, start=-len(found.unnamed)):
+        times = settings.times_unnamed if _alike(found, name, place) > settings.alike_share else 1.0
+        if taken < times * one.evidence.gain:
             return f"{one.form} beside it explains {one.evidence.gain / max(taken, 1e-9):.2g} times as much"
     return None
 
 
+def _alike(found: ChannelResult, name: str, place: int) -> float:
+    """Share of what a term does to the residuals, to first order, that a name can do too; `place` among the terms."""
+    best, layout = found.fit, found.selector.channel.layout
+    term = best.jacobian[:, best.active.index(len(layout.columns) + place)]
+    columns = [best.active.index(layout.place[c]) for c in CANDIDATES[name].columns if layout.place[c] in best.active]
+    own = best.jacobian[:, columns]
+    pull = own.T @ term
+    return float(pull @ inverse(own.T @ own) @ pull) / max(float(term @ term), 1e-300)
+
+
 def _changes_with_regime(found: ChannelResult, name: str) -> str | None:
     """That a value is another where the robot drives differently, by more than its noise and by much of itself."""
-    best, channel, settings = found.fit, found.selector.channel, found.channel.settings.report
+    best, channel, settings = found.told, found.selector.channel, found.channel.settings.report
     layout, drive = channel.layout, found.channel.drive
     columns = [column for column in CANDIDATES[name].columns if layout.place[column] in best.active]
     sizes = [abs(best.vector[layout.place[column]] - layout.neutral[layout.place[column]]) for column in columns]

@@ -238,7 +238,7 @@ def _base(analysis: GapAnalysis) -> list[Fit]:
 def _whole(analysis: GapAnalysis, final: FinalFit) -> list[Fit]:
     """Fits of both channels, or of the body, with all that was found."""
     assert final.final_body is not None
-    return [final.final_body, *([] if analysis.wheels is None else [analysis.wheels.fit])]
+    return [final.final_body, *([] if analysis.wheels is None else [analysis.wheels.told])]
 
 
 def _by_fold(analysis: GapAnalysis, fits: Sequence[Fit]) -> dict[int, list[Array]]:

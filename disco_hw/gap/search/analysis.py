@@ -60,7 +60,7 @@ class ChannelEstimates:
 
 def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
     """Intervals of all parameters that a channel's accepted set frees."""
-    best, channel = found.fit, found.selector.channel
+    best, channel = found.told, found.selector.channel
     columns = channel.layout.columns
     factors = np.array([inflation(best, channel, (index,)) for index in best.active])
     covariance = best.covariance() * np.sqrt(np.outer(factors, factors))
@@ -135,7 +135,7 @@ def in_parts(found: ChannelResult, parts: NDArray[np.int64]) -> dict[str, InPart
 
     `parts` (B,): the part of each block of time of the channel, in order.
     """
-    best, channel, layout = found.fit, found.selector.channel, found.selector.channel.layout
+    best, channel, layout = found.told, found.selector.channel, found.selector.channel.layout
     labels = np.unique(parts)
     if not best.active or labels.size < 2:
         return {}
@@ -338,7 +338,7 @@ def _with_encoder(body: ChannelResult, wheels: ChannelResult) -> tuple[Fit, Chan
     vector = body.fit.vector.copy()
     vector[channel.layout.place[ASYMMETRY_COLUMN]] = 0.0
     for side in ("left", "right"):
-        gain = wheels.fit.vector[wheels.selector.channel.layout.place[f"{GAIN}.{side}"]]
+        gain = wheels.told.vector[wheels.selector.channel.layout.place[f"{GAIN}.{side}"]]
         vector[channel.layout.place[f"{ENCODER}.{side}"]] = gain
     refitted = fit(channel, vector, indices(channel, names))
     selector = replace(body.selector, fits={frozenset(names): refitted}, proofs={})

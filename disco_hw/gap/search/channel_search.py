@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import chain
 
 import numpy as np
@@ -30,7 +31,7 @@ from disco_hw.gap.search.richest_model import (
     smooth_of,
     with_pose_delay,
 )
-from disco_hw.gap.search.selection import EffectEvidence, Names, Selector, Split, Thresholds, compare
+from disco_hw.gap.search.selection import EffectEvidence, Names, Selector, Split, Thresholds, compare, inflation
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms, body_terms, places, places_near, wheel_terms
 from disco_hw.gap.settings import GRID_STEP_S, SelectionSettings
 
@@ -68,11 +69,43 @@ class ChannelResult:
         """The fit of the accepted effects and terms."""
         return self.selector.exact(self.names)
 
+    @cached_property
+    def told(self) -> Fit:
+        """The fit that values are told of and predictions made with: where the noise model does not hold, another."""
+        return _told(self)
+
     @property
     def base(self) -> Fit:
         """The fit without anything that is missing."""
         selector = self.plain or self.selector
         return selector.exact(selector.given)
+
+
+def _told(found: ChannelResult) -> Fit:
+    """The accepted set as it was fitted, or to errors that are alike at every speed, if blocks agree better on that.
+
+    The noise of wheels is taken to grow with their speed, and weighs slow ones most. What the accepted set cannot
+    describe does not: then values are as good as least squares of speeds make them, by the scatter between blocks
+    (sandwich variance; White, 1982).
+    """
+    best, channel = found.fit, found.channel
+    if not isinstance(channel, WheelChannel) or not best.active:
+        return best
+    settings, terms = channel.settings.selection, tuple(one.term for one in found.unnamed)
+    vector = best.vector
+    for _ in range(settings.even_rounds):
+        plainly = channel.evenly(*found.selector.channel.split(vector))
+        even: ResidualChannel = WithTerms.of(plainly, terms) if terms else plainly
+        other = fit(even, vector, best.active)
+        vector = other.vector
+    ratio = np.mean(np.log(_deviations(other, channel)) - np.log(_deviations(best, channel)))
+    return other if ratio < math.log(settings.clearly_closer) else best
+
+
+def _deviations(best: Fit, channel: WheelChannel) -> Array:
+    """Standard deviations of what was fitted, (A,), by how blocks of time scatter."""
+    factors = [inflation(best, channel, (index,)) for index in best.active]
+    return np.asarray(np.sqrt(np.maximum(np.diag(best.covariance()) * factors, 1e-300)))
 
 
 def wheel_moves(channel: WheelChannel, geometry: Array) -> Callable[[Split, Split], float]:
@@ -111,7 +144,7 @@ def body_moves(channel: BodyChannel) -> Callable[[Split, Split], float]:
         ends = []
         for p, extra in (small, big):
             ends.append(
-                displacement(p, drive.first, channel.track(p, extra), channel.moving_s, start, heading, ahead_s)
+                displacement(p, drive.first, channel.track(p, extra), channel.carried(p), start, heading, ahead_s)
             )
         apart = ends[1] - ends[0]
         lever = 0.5 * np.hypot(ends[1][:, 0], ends[1][:, 1])

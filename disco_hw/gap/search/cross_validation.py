@@ -243,7 +243,7 @@ def chain_track(
 
 def prediction_error(body: BodyChannel, starts: Starts, p: Array, track: Array, ahead_s: float) -> Array:
     """Measured minus predicted pose (K, 3) at the end, in the frame of the start: forward, left, yaw."""
-    moved = displacement(p, body.drive.first, track, body.moving_s, starts.node, starts.pose[:, 2], ahead_s)
+    moved = displacement(p, body.drive.first, track, body.carried(p), starts.node, starts.pose[:, 2], ahead_s)
     dx, dy = starts.end[:, 0] - starts.pose[:, 0], starts.end[:, 1] - starts.pose[:, 1]
     cosine, sine = np.cos(starts.pose[:, 2]), np.sin(starts.pose[:, 2])
     yaw = starts.end[:, 2] - starts.pose[:, 2] - moved[:, 2]
@@ -388,7 +388,7 @@ def _by_fold(found: ChannelResult) -> Angles:
     """Angles (M, 2) of a free run for each fold, fitted on the other one's data."""
     channel, selector = found.channel, found.selector
     assert isinstance(channel, WheelChannel)
-    vectors = fold_vectors(found.fit, channel.block, selector.channel.neutral, channel.settings)
+    vectors = fold_vectors(found.told, channel.block, selector.channel.neutral, channel.settings)
     return {held: channel.angles(*selector.channel.split(vector)) for held, vector in vectors.items()}
 
 

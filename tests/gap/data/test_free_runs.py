@@ -107,17 +107,17 @@ def test_poses_that_are_older_than_their_stamps_have_a_latency_above_zero(late_s
     node = np.arange(100, 2900, 4)
     p = BODY.neutral.copy()
     drift = (0.05, -0.03)
-    p[BODY.place["slope.drift_x_m_s"]], p[BODY.place["slope.drift_y_m_s"]] = drift
     then = t_s[node] - late_s
     # What the sensor reports at a stamp is where the robot was that long before.
     measured = np.column_stack([np.interp(then, t_s, track[:, axis]) for axis in range(3)])
+    ground = moving_s[:, None] * drift
     measured[:, :2] += np.interp(then, t_s, moving_s)[:, None] * drift
 
     def residual(latency_s):
         q = p.copy()
         q[BODY.place["pose_latency.latency_s"]] = latency_s
         return pose_residual(
-            q, track, moving_s, node, np.zeros(node.size), np.arange(node.size) // 100,
+            q, track, ground, node, np.zeros(node.size), np.arange(node.size) // 100,
             np.zeros(node.size, dtype=np.int64), np.full(node.size, 2999), np.ones(node.size, dtype=bool), measured,
         )  # fmt: skip
 

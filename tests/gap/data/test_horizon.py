@@ -5,19 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data import BODY
+from disco_hw.gap.data import BODY, carried
 from disco_hw.gap.data.free_runs import displacement, starts_as_far_as, starts_of
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 
 N = 1000
 ONE_RUN = np.arange(N) == 0
+STILL = np.zeros((N, 2))
 
 
 def test_a_circle_looks_the_same_from_everywhere():
     t = np.arange(N) * GRID_STEP_S
     track = np.column_stack([np.sin(0.5 * t), 1.0 - np.cos(0.5 * t), 0.5 * t])
     start = np.array([100, 300, 600])
-    moved = displacement(BODY.neutral, ONE_RUN, track, t, start, track[start, 2], 2.0)
+    moved = displacement(BODY.neutral, ONE_RUN, track, STILL, start, track[start, 2], 2.0)
     np.testing.assert_allclose(moved, np.tile([np.sin(1.0), 1.0 - np.cos(1.0), 1.0], (3, 1)), atol=1e-9)
 
 
@@ -27,15 +28,33 @@ def test_latency_shows_what_was_and_drift_adds_in_the_world():
     late = BODY.neutral.copy()
     late[BODY.place["pose_latency.latency_s"]] = 0.1
     start = np.array([300])
-    sooner, later = (displacement(p, ONE_RUN, track, t, start, np.zeros(1), 1.0)[0, 0] for p in (BODY.neutral, late))
+    sooner, later = (
+        displacement(p, ONE_RUN, track, STILL, start, np.zeros(1), 1.0)[0, 0] for p in (BODY.neutral, late)
+    )
     assert sooner - later == pytest.approx(0.1, abs=1e-6)
-    drift = BODY.neutral.copy()
-    drift[BODY.place["slope.drift_y_m_s"]] = 0.02
+    ground = np.column_stack([np.zeros(N), 0.02 * t])
     moved = (
-        displacement(drift, ONE_RUN, track, t, start, np.full(1, np.pi / 2), 1.0)[0]
-        - displacement(BODY.neutral, ONE_RUN, track, t, start, np.full(1, np.pi / 2), 1.0)[0]
+        displacement(BODY.neutral, ONE_RUN, track, ground, start, np.full(1, np.pi / 2), 1.0)[0]
+        - displacement(BODY.neutral, ONE_RUN, track, STILL, start, np.full(1, np.pi / 2), 1.0)[0]
     )
     np.testing.assert_allclose(moved, [0.02, 0.0, 0.0], atol=1e-9)
+
+
+def test_a_slope_carries_a_robot_while_its_wheels_turn_and_a_slide_as_far_as_it_turns():
+    speed = np.concatenate([np.zeros((500, 2)), np.full((200, 2), 5.0), np.tile([-5.0, 5.0], (300, 1))])
+    t_s = np.arange(N) * GRID_STEP_S
+    p = BODY.neutral.copy()
+    np.testing.assert_array_equal(carried(p, speed, t_s), STILL)
+    p[BODY.place["slope.drift_x_m_s"]], p[BODY.place["slope.drift_y_m_s"]] = 0.02, -0.01
+    p[BODY.place["downhill_slide.slide_y_m"]] = 0.1
+    p[BODY.place["wheel_radius_m"]], p[BODY.place["axial_distance_m"]] = 0.1, 0.5
+    ground = carried(p, speed, t_s)
+    np.testing.assert_array_equal(ground[499], [0.0, 0.0])
+    straight_s, turning_s = 200 * GRID_STEP_S, 300 * GRID_STEP_S
+    np.testing.assert_allclose(ground[699], [0.02 * straight_s, -0.01 * straight_s], rtol=1e-9)
+    # Turning at 0.1 / 0.5 * 10 rad/s.
+    moved = ground[-1] - ground[699]
+    np.testing.assert_allclose(moved, [0.02 * turning_s, (-0.01 + 0.1 * 2.0) * turning_s], rtol=1e-9)
 
 
 @pytest.mark.parametrize("latency_s", [-0.3, -0.04, 0.0, 0.3, 1.5])
@@ -48,7 +67,7 @@ def test_a_latency_does_not_look_into_another_run(latency_s):
     shifted[BODY.place["pose_latency.latency_s"]] = latency_s
     start = starts_of(first, np.ones(N, bool), 1.0, replace(DEFAULT_SETTINGS.grid, start_every_s=0.01))
     assert start.max() + 102 == N
-    moved = displacement(shifted, first, track, np.zeros(N), start, np.zeros(start.size), 1.0)[:, 0]
+    moved = displacement(shifted, first, track, STILL, start, np.zeros(start.size), 1.0)[:, 0]
     # Before a run begins nothing is known: a pose that is so late sees the robot stand.
     expected = 0.5 - 0.5 * np.maximum(latency_s - (start % 250) * GRID_STEP_S, 0.0)
     expected[start // 250 == 1] *= -1.0

@@ -5,8 +5,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from disco_hw.gap.data import BODY, WHEEL
+from disco_hw.gap.noise.channels import WheelChannel
+from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report.judge import across_logs, drifting_parameters
 from disco_hw.gap.search.analysis import (
     ChannelEstimates,
@@ -20,10 +23,10 @@ from disco_hw.gap.search.analysis import (
     in_thirds,
     wandered,
 )
-from disco_hw.gap.search.channel_search import ChannelResult, body_moves
+from disco_hw.gap.search.channel_search import ChannelResult, body_moves, wheel_moves
 from disco_hw.gap.search.selection import Selector
-from disco_hw.gap.settings import DEFAULT_SETTINGS
-from tests.gap.synthetic import body_channel
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
+from tests.gap.synthetic import GEOMETRY, body_channel, line_of
 
 
 def estimated(channel, names=("turn_slip",)):
@@ -164,3 +167,55 @@ def test_the_division_of_a_log_that_shows_most_says_how_far_a_parameter_wanders(
     channel = SimpleNamespace(block=np.repeat(np.arange(12), 5), settings=DEFAULT_SETTINGS)
     found = SimpleNamespace(channel=channel, selector=SimpleNamespace(channel=channel))
     assert wandered(found) == {"motor_lag.tau_s": 0.3}
+
+
+def wheels_that_lose(lost_on_the_spot):
+    """What is found of wheels that lose 0.5 rad/s on straights and arcs, and so much on each spot; 1.5 % of noise."""
+    rng = np.random.default_rng(12)
+    pairs = np.array(20 * [(4, 4), (-4, -4), (3, 5), (-1, 1), (5, 3), (1, -1)], dtype=float)
+    commands = rng.permutation(pairs)
+    on_the_spot = commands.sum(axis=1) == 0.0
+    width = np.full(len(commands), 0.5)
+    width[on_the_spot] = lost_on_the_spot(rng, np.count_nonzero(on_the_spot))
+    turned = np.repeat(np.sign(commands) * np.maximum(np.abs(commands) - width[:, None], 0.0), 50, axis=0)
+    keep = np.exp(-GRID_STEP_S / 0.15)
+    error = lfilter([(1.0 - keep**2) ** 0.5], [1.0, -keep], rng.standard_normal(turned.shape), axis=0)
+    speed = turned * (1.0 + 0.015 * error) + 0.02 * rng.standard_normal(turned.shape)
+    line = replace(line_of(speed), command_rad_s=np.repeat(commands, 50, axis=0))
+    noise = WheelNoise(relative=0.015, correlation_s=0.15, stamp_s=1e-6, wander=1e-3, drift_rad_sqrt_s=2e-3)
+    channel = WheelChannel.build(line, noise, np.array(GEOMETRY))
+    return ChannelResult(Selector(channel, wheel_moves(channel, np.array(GEOMETRY))), ("deadband",), channel)
+
+
+def test_where_the_noise_model_holds_its_fit_is_told():
+    found = wheels_that_lose(lambda rng, count: np.full(count, 0.5))
+    assert found.told is found.fit
+
+
+def test_where_slow_wheels_contradict_each_other_the_value_of_all_is_told():
+    """Errors that are taken to grow with the speed would leave the say to slow wheels, on the spot."""
+    found = wheels_that_lose(lambda rng, count: rng.uniform(0.0, 0.5, count))
+    place, column = WHEEL.place["deadband.width_rad_s"], "deadband.width_rad_s"
+    assert found.fit.vector[place] < 0.4
+    assert found.told.vector[place] == pytest.approx(0.5, abs=0.08)
+    estimated = estimate_parameters(found).by_name[column]
+    assert estimated.value == found.told.vector[place]
+    plain = replace(found)
+    plain.__dict__["told"] = plain.fit
+    assert estimated.deviation < 0.7 * estimate_parameters(plain).by_name[column].deviation
+
+
+def test_errors_that_are_alike_at_every_speed_are_of_the_size_that_is_left():
+    found = wheels_that_lose(lambda rng, count: np.full(count, 0.5))
+    even = found.channel.evenly(found.fit.vector)
+    used = even.gains.use
+    white = even.whitened(found.fit.vector)[used]
+    # Those of usual size count whole, in units of their root mean square; an outlier grows linearly.
+    assert (white**2).mean() ** 0.5 * even.weight[used].max() == pytest.approx(1.0, abs=1e-6)
+    counted = np.abs(white * even.weight[used])
+    assert counted.max() == pytest.approx(even.settings.noise.even_huber, rel=1e-6)
+    assert np.mean(counted < counted.max() - 1e-6) > 0.7
+    speed = np.abs(found.channel.motion.speed_rad_s[:, 0])
+    slow, fast = speed < 1.0, speed > 3.0
+    assert even.gains.scale[slow, 0].mean() == pytest.approx(even.gains.scale[fast, 0].mean(), rel=0.01)
+    assert found.channel.gains.scale[slow, 0].mean() > 1.1 * found.channel.gains.scale[fast, 0].mean()
