@@ -58,6 +58,7 @@ NAMES = {
     "pose_latency": ("pose_latency", "latency_s"),
     "slope": ("downhill_slide", ""),
     "payload": ("lateral_icr", "offset_m"),
+    "worn_tyre": ("turn_asymmetry", "share"),
 }
 """The model's effect that stands for what is hidden, and its parameter; the others have no name in the model."""
 
@@ -107,7 +108,8 @@ def truth_of(hidden: str, recording: Recording, beside: Sequence[str] = ()) -> f
 
     A delay and a lag are those that the true wheels show, the servo's own included. A payload's is what the true motion
     shows: the forward speed of the middle that turning makes, with the forms that the search has `beside` it, as a
-    share of a curve depends on what else has a share in it.
+    share of a curve depends on what else has a share in it. A worn tyre's is how much further the same difference of
+    the true wheels turns the robot to the left.
     """
     if hidden not in NAMES:
         return None
@@ -134,6 +136,13 @@ def truth_of(hidden: str, recording: Recording, beside: Sequence[str] = ()) -> f
             ]
             causes = np.column_stack([wheels, rate, *known])
             return float(np.linalg.lstsq(causes, way, rcond=None)[0][1])
+        case "worn_tyre":
+            every = slice(None, None, 48)
+            t_s, yaw, turned = recording.truth_s[every], recording.truth[every, 2], recording.turned[every]
+            left, right = (np.gradient(turned[:, side].mean(axis=1), t_s) for side in ([0, 2], [1, 3]))
+            causes = np.column_stack([right - left, np.abs(right - left), right + left])
+            both, one_way, _ = np.linalg.lstsq(causes, np.gradient(yaw, t_s), rcond=None)[0]
+            return float(one_way / both)
     return size
 
 

@@ -18,8 +18,8 @@ NAMES = {
         "turning_buildup",
     },
     Channel.WHEEL_TO_BODY: {
-        "encoder_scale", "wheel_radius_asymmetry", "turn_slip", "acceleration_slip", "side_slip", "lateral_icr",
-        "slope", "downhill_slide", "surface_change",
+        "encoder_scale", "wheel_radius_asymmetry", "turn_slip", "turn_asymmetry", "acceleration_slip", "side_slip",
+        "lateral_icr", "slope", "downhill_slide", "surface_change",
     },
     Channel.POSE_SENSOR: {"pose_latency", "pose_offset", "heading_bias"},
 }  # fmt: skip
@@ -86,6 +86,7 @@ def test_effects_describe_themselves(effect):
         ("turning_buildup", {"limit_rad_s2": 1.5, "at_once_rad_s": 0.4, "shared": 0.7}, THERE_AND_BACK),
         ("wheel_radius_asymmetry", {"ratio": 0.03}, STRAIGHT),
         ("turn_slip", {"k_s": 0.2}, SPIN),
+        ("turn_asymmetry", {"share": 0.1}, THERE_AND_BACK),
         ("acceleration_slip", {"k_s2_m": 0.2}, START_STOP),
         ("side_slip", {"k_s": 0.15}, TURN),
         ("lateral_icr", {"offset_m": 0.05}, SPIN),
@@ -224,6 +225,14 @@ def test_a_slope_moves_only_a_robot_whose_wheels_turn():
     np.testing.assert_array_equal(free_run(values, np.zeros((10, 2)))[-1, :2], [0.0, 0.0])
     moved = free_run(values, STRAIGHT)[-1, :2] - free_run({}, STRAIGHT)[-1, :2]
     np.testing.assert_allclose(moved, [0.04, 0.02], atol=1e-12)
+
+
+def test_an_uneven_grip_turns_further_one_way_and_leaves_straights_alone():
+    values = {"turn_asymmetry": {"share": 0.1}}
+    np.testing.assert_array_equal(free_run(values, STRAIGHT), free_run({}, STRAIGHT))
+    plainly = free_run({}, SPIN)[-1, 2]
+    assert free_run(values, SPIN)[-1, 2] == pytest.approx(1.1 * plainly)
+    assert free_run(values, -SPIN)[-1, 2] == pytest.approx(-0.9 * plainly)
 
 
 def test_a_turning_robot_slides_downhill_as_fast_as_it_turns_and_a_straight_one_holds():

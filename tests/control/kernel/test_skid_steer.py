@@ -60,6 +60,7 @@ FULL = {
     },
     "wheel_radius_asymmetry": {"ratio": st.floats(-0.05, 0.05)},
     "turn_slip": {"k_s": st.floats(-0.1, 0.3)},
+    "turn_asymmetry": {"share": st.floats(-0.2, 0.2)},
     "acceleration_slip": {"k_s2_m": st.floats(-0.1, 0.3)},
     "side_slip": {"k_s": st.floats(-0.1, 0.3)},
     "lateral_icr": {"offset_m": st.floats(-0.1, 0.1)},

@@ -1,0 +1,49 @@
+"""Turn asymmetry: the robot turns further one way than the other, as where the tyres do not all hold alike."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from disco_hw.effects import Array, Channel, Effect, Parameter, Stage, Symptom, Value, Values
+from disco_hw.jit import cast_like, scalar_function
+
+
+def plain(turn: Value, values: Values) -> Value:
+    """omega -> omega + share |omega|.
+
+    The tyres that hold least are dragged most: with a worn one in front on the left the robot turns about another point
+    to the left than to the right, and each side drags the other less or more.
+    """
+    (share,) = values
+    return turn + share * np.abs(turn)
+
+
+def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
+    """The share, (L,)."""
+    return (values[:, 0],)
+
+
+@scalar_function
+def term(turn: float, coefficients: tuple[float] | None) -> float:
+    """Half the yaw rate of half a yaw rate (rad/s)."""
+    if coefficients is None:
+        return turn
+    (share,) = coefficients
+    return turn + cast_like(share, turn) * abs(turn)
+
+
+EFFECT = Effect(
+    name="turn_asymmetry",
+    channel=Channel.WHEEL_TO_BODY,
+    stage=Stage.TURN,
+    order=125,
+    parameters=(Parameter("share", "1", -0.5, 0.5, 0.0, realistic=0.05),),
+    plain=plain,
+    coefficients=coefficients,
+    term=term,
+    may_turn_more=True,
+    symptoms=(Symptom.LEFT_UNLIKE_RIGHT,),
+    excitation="turns both ways at the same rates",
+    script="spins",
+    sentence="the same wheel speeds turn the robot by {share:+.1%} of the turn further to the left",
+)
