@@ -57,10 +57,11 @@ def mutants(source: str) -> Iterator[Mutant]:
         else:
             replacements = _REPLACED_BY.get(token, ()) if found.lastgroup != "skip" else ()
         for new in replacements:
-            yield _mutant(source, found.start(), token, new)
+            yield marked(source, found.start(), token, new)
 
 
-def _mutant(source: str, offset: int, old: str, new: str) -> Mutant:
+def marked(source: str, offset: int, old: str, new: str) -> Mutant:
+    """The mutant with `old` at `offset` replaced, which must lie in one line."""
     start = source.rfind("\n", 0, offset) + 1
     end = source.find("\n", offset)
     end = len(source) if end < 0 else end

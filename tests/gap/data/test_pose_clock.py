@@ -1,0 +1,284 @@
+"""The pieces of the poses' alignment with the wheels, each against what is computed by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from disco_hw.gap.data import timing
+from disco_hw.gap.data.timing import PoseClock, pose_clock, pose_delay_s
+from disco_hw.gap.settings import GridSettings
+from disco_hw.log.drive import Poses, Wheels
+
+SETTINGS = GridSettings()
+
+
+def poses_at(t_s, segment=0):
+    """Poses that tell themselves by their place."""
+    t_s = np.asarray(t_s, dtype=float)
+    place = np.arange(t_s.size, dtype=float)
+    return Poses(t_s, place, 10.0 + place, 0.01 * place, np.full(t_s.size, segment))
+
+
+def test_a_clock_that_drifts_is_off_by_its_drift_over_the_span_and_by_nothing_in_the_middle():
+    clock = PoseClock(0.3, middle_s=50.0, span_s=80.0, drift_s=0.16)
+    np.testing.assert_allclose(clock.off_s(np.array([10.0, 50.0, 70.0, 90.0])), [-0.08, 0.0, 0.04, 0.08])
+    poses = poses_at([10.0, 50.0, 90.0])
+    np.testing.assert_allclose(clock.corrected(poses).t_s, [10.08, 50.0, 89.92])
+    assert clock.notes == (
+        "the poses' clock drifts against the wheels' by +2.00 ms every second, +160 ms over the log: "
+        "their stamps are corrected; synchronise the clocks",
+    )
+
+
+def test_a_clock_that_jumps_is_off_by_half_of_it_on_either_side_and_poses_that_come_before_others_are_left_out():
+    clock = PoseClock(0.3, jump_s=0.25, jump_at_s=20.0)
+    np.testing.assert_allclose(clock.off_s(np.array([0.0, 19.9, 20.0, 40.0])), [-0.125, -0.125, 0.125, 0.125])
+    even = clock.corrected(poses_at([19.7, 19.9, 20.0, 20.1, 20.2, 20.3]))
+    # 19.825 and 20.025, then 19.875, 19.975, 20.075 and 20.175.
+    np.testing.assert_allclose(even.t_s, [19.825, 20.025, 20.075, 20.175])
+    assert even.x_m.tolist() == [0.0, 1.0, 4.0, 5.0]
+    assert even.y_m.tolist() == [10.0, 11.0, 14.0, 15.0]
+    np.testing.assert_allclose(even.yaw_rad, [0.0, 0.01, 0.04, 0.05])
+    assert even.segment.tolist() == [0] * 4
+    assert clock.notes == (
+        "the poses' clock jumps against the wheels' by +250 ms at 20 s: their stamps are corrected; synchronise the "
+        "clocks",
+    )
+
+
+def test_an_even_clock_changes_nothing():
+    clock = PoseClock(0.3)
+    poses = poses_at([1.0, 2.0])
+    assert (clock.off_s(poses.t_s) == 0.0).all()
+    assert (clock.corrected(poses).t_s == poses.t_s).all()
+    assert clock.notes == ()
+    # Two that are stamped alike are one.
+    assert clock.corrected(poses_at([1.0, 1.0, 2.0])).x_m.tolist() == [0.0, 2.0]
+
+
+@pytest.fixture
+def seen(monkeypatch):
+    """What `pose_clock` makes of these delays of stretches, where the whole log fits better by `gained` nats."""
+
+    def made(delays, gained=1.0, span_s=120.0, middles=None):
+        delays = np.array(delays)
+        poses = poses_at(np.linspace(100.0, 100.0 + span_s, 50))
+        middles = 100.0 + span_s * (np.arange(delays.size) + 0.5) / delays.size if middles is None else middles
+        monkeypatch.setattr(timing, "_by_stretch", lambda *_: (middles, delays))
+        monkeypatch.setattr(timing, "pose_delay_s", lambda wheels, of, settings: 0.2 if of is poses else 0.21)
+        misfits = {True: 5.0, False: 5.0 - gained}
+        monkeypatch.setattr(timing, "_misfit_at", lambda wheels, of, delay_s, settings: misfits[of is poses])
+        monkeypatch.setattr(timing, "_instant", lambda wheels, of, settings, delays, place, about_s: about_s)
+        return pose_clock(None, poses, SETTINGS)
+
+    return made
+
+
+def test_delays_on_a_line_are_a_drift_over_the_whole_log(seen):
+    assert seen([0.1, 0.2, 0.3, 0.4]) == PoseClock(0.21, 160.0, 120.0, drift_s=pytest.approx(0.4))
+    assert seen([0.4, 0.3, 0.2, 0.1]).drift_s == pytest.approx(-0.4)
+
+
+def test_delays_of_two_sizes_are_a_jump_between_two_stretches(seen):
+    clock = seen([0.1, 0.1, 0.1, 0.35, 0.3, 0.35])
+    assert (clock.delay_s, clock.jump_s, clock.jump_at_s) == (0.21, pytest.approx(0.25), pytest.approx(160.0))
+    assert clock.drift_s == 0.0
+    assert seen([0.3, 0.3, 0.3, 0.1, 0.1, 0.1]).jump_s == pytest.approx(-0.2)
+    # Of the early ones there are two at least, and of the late ones.
+    assert seen([0.3, 0.3, 0.1, 0.1, 0.1, 0.1]).jump_at_s == pytest.approx(140.0)
+    assert seen([0.3, 0.3, 0.3, 0.3, 0.1, 0.1]).jump_at_s == pytest.approx(180.0)
+
+
+def test_a_clock_is_believed_from_four_stretches_on_that_agree_and_where_it_matters(seen):
+    plain = PoseClock(0.2)
+    assert seen([0.1, 0.2, 0.3]) == plain
+    assert seen([0.1, 0.2, 0.3, 0.4], gained=0.019) == plain
+    assert seen([0.1, 0.2, 0.3, 0.4], gained=0.021) != plain
+    # Over the log it drifts by 4/3 of what lies between the first and the last middle: 29 and 31 ms.
+    assert seen(0.1 + 0.02175 * np.arange(4) / 3.0) == plain
+    assert seen(0.1 + 0.02325 * np.arange(4) / 3.0) != plain
+    assert seen([0.1, 0.1, 0.1, 0.129, 0.129, 0.129]) == plain
+    assert seen([0.1, 0.1, 0.1, 0.131, 0.131, 0.131]) != plain
+
+
+@pytest.mark.parametrize(("scatter", "believed"), [(0.9, False), (1.1, True)])
+def test_it_explains_as_much_again_of_the_scatter_as_it_leaves(seen, scatter, believed):
+    centred = np.arange(12) - 5.5
+    # Neither a line nor a step, and of as large squares as the line where it counts 1.
+    other = np.tile([1.0, -1.0], 6)
+    other -= centred * (centred @ other) / (centred @ centred)
+    line = 0.05 * centred
+    other *= np.linalg.norm(line) / np.linalg.norm(other) / scatter
+    clock = seen(0.3 + line + other)
+    assert (clock.drift_s != 0.0) is believed
+
+
+def test_of_no_poses_nothing_is_said():
+    wheels = Wheels(*(np.arange(100.0),) * 5, np.zeros(100, dtype=int), True, True)
+    assert pose_clock(wheels, poses_at([]), SETTINGS) == PoseClock(0.0)
+
+
+def test_stretches_of_even_length_are_looked_at_one_by_one(monkeypatch):
+    poses = poses_at(np.arange(0.0, 50.0, 0.5))
+    parts = []
+
+    def delay(wheels, part, settings):
+        parts.append(part)
+        return 0.0 if len(parts) == 2 else 0.1 * len(parts)
+
+    monkeypatch.setattr(timing, "pose_delay_s", delay)
+    middles, delays = timing._by_stretch(None, poses, SETTINGS)
+    # 49.5 s are four stretches of 12 s and a bit; every pose is in one of them.
+    assert [part.t_s.size for part in parts] == [25, 25, 25, 25]
+    assert [x for part in parts for x in part.x_m] == poses.x_m.tolist()
+    # What shows no delay says nothing.
+    assert middles == pytest.approx(49.5 * np.array([0.125, 0.625, 0.875]))
+    assert delays == pytest.approx([0.1, 0.3, 0.4])
+    parts.clear()
+    timing._by_stretch(None, poses_at([0.0, 5.0]), SETTINGS)
+    assert [part.t_s.size for part in parts] == [2]
+
+
+def test_a_jump_is_where_both_sides_fit_best(monkeypatch):
+    poses = poses_at(np.arange(0.0, 60.0, 0.25))
+
+    def misfit(wheels, part, delay_s, settings):
+        # Per pose: the share that has another delay than it should, before and after 33 s.
+        return float(np.mean(np.where(part.t_s < 33.0, 0.1, 0.4) != delay_s)) if part.t_s.size else 0.0
+
+    monkeypatch.setattr(timing, "_misfit_at", misfit)
+    delays = np.array([0.1, 0.1, 0.7, 0.4, 0.4, 0.4])
+    assert timing._instant(None, poses, SETTINGS, delays, 3, 30.0) == pytest.approx(33.0, abs=0.26)
+    assert timing._instant(None, poses, SETTINGS, delays, 3, 44.9) == pytest.approx(33.0, abs=0.26)
+    # No further than a stretch away.
+    assert timing._instant(None, poses, SETTINGS, delays, 3, 47.0) == 35.0
+    assert timing._instant(None, poses, SETTINGS, delays, 3, 19.0) == 30.0
+
+
+def test_the_least_of_a_parabola_lies_between_places():
+    values = (np.arange(7.0) - 3.3) ** 2
+    assert timing._vertex(values, 3) == pytest.approx(0.3)
+    assert timing._vertex(values[::-1], 3) == pytest.approx(-0.3)
+    assert timing._vertex((np.arange(7.0) - 1.2) ** 2, 1) == pytest.approx(0.2)
+    assert timing._vertex((np.arange(7.0) - 4.8) ** 2, 5) == pytest.approx(-0.2)
+    for at_the_end in (0, 6):
+        assert timing._vertex(values, at_the_end) == 0.0
+    assert timing._vertex(np.ones(7), 3) == 0.0
+    for place in (2, 3, 4):
+        assert timing._vertex(np.where(np.arange(7) == place, np.inf, values), 3) == 0.0
+
+
+@pytest.mark.parametrize(("depth", "found_s"), [(0.051, 0.1234), (0.049, 0.0)])
+def test_a_delay_is_told_where_it_stands_out_and_between_those_that_are_tried(monkeypatch, depth, found_s):
+    tried = []
+
+    def misfits(wheels, poses, delays, settings):
+        tried.append(delays)
+        off = (delays - 0.1234) / 0.02
+        # The least value that is tried is at 0.12.
+        least = 0.17**2
+        out = np.minimum(off**2 - least, 4.0) * 0.25 * depth
+        out[-3:] = np.inf
+        return out
+
+    monkeypatch.setattr(timing, "_misfits", misfits)
+    assert pose_delay_s(None, None, SETTINGS) == pytest.approx(found_s, abs=1e-9)
+    assert tried[0] == pytest.approx(np.arange(-50, 51) * 0.02)
+    monkeypatch.setattr(timing, "_misfits", lambda wheels, poses, delays, settings: np.full(delays.size, np.inf))
+    assert pose_delay_s(None, None, SETTINGS) == 0.0
+    assert timing._misfit_at(None, None, 0.1, SETTINGS) == 0.0
+
+
+def test_wheels_are_known_from_their_first_to_their_last_sample_of_a_segment():
+    t_s = np.array([0.0, 1.0, 2.0, 5.0, 6.0, 9.0])
+    wheels = Wheels(t_s, *(np.zeros(6),) * 4, np.array([0, 0, 0, 2, 2, 2]), True, True)
+    begin, end = timing._bounds(wheels, np.array([2, 0, 1, 2]))
+    assert begin.tolist() == [5.0, 0.0, np.inf, 5.0]
+    assert end.tolist() == [9.0, 2.0, -np.inf, 9.0]
+
+
+def by_hand(wheels, poses, delay_s):
+    """Minus the log likelihood per pose of turns and ways, each fitted robustly by those of both wheels."""
+    rows, turns, ways = [], [], []
+    for k in range(poses.t_s.size):
+        later = [j for j in range(k, poses.t_s.size) if poses.t_s[j] > poses.t_s[k] + 0.4 - 1e-6]
+        if not later or poses.segment[later[0]] != poses.segment[k] or poses.t_s[later[0]] - poses.t_s[k] > 0.64:
+            continue
+        own = wheels.t_s[wheels.segment == poses.segment[k]]
+        begin_s, end_s = poses.t_s[k] - delay_s, poses.t_s[later[0]] - delay_s
+        if not own.size or begin_s < own[0] or end_s > own[-1]:
+            continue
+        turned = [
+            np.interp(end_s, wheels.t_s, angle) - np.interp(begin_s, wheels.t_s, angle)
+            for angle in (wheels.left_angle_rad, wheels.right_angle_rad)
+        ]
+        turn = np.angle(np.exp(1j * (poses.yaw_rad[later[0]] - poses.yaw_rad[k])))
+        towards = poses.yaw_rad[k] + 0.5 * turn
+        ahead = (poses.x_m[later[0]] - poses.x_m[k], poses.y_m[later[0]] - poses.y_m[k])
+        rows.append((turned[1] - turned[0], turned[1] + turned[0]))
+        turns.append(turn)
+        ways.append(ahead[0] * np.cos(towards) + ahead[1] * np.sin(towards))
+    return len(rows), sum(of_regression(np.array(rows), np.array(measured)) for measured in (turns, ways))
+
+
+def of_regression(columns, measured):
+    weight = np.ones(measured.size)
+    for _ in range(4):
+        fitted = np.linalg.lstsq(columns * weight[:, None], measured * weight, rcond=None)[0]
+        left = np.abs(measured - columns @ fitted)
+        limit = 2.0 * 1.4826 * np.median(left) + 1e-9
+        weight = np.sqrt(np.minimum(1.0, limit / np.maximum(left, 1e-12)))
+    return 0.5 * np.log(np.where(left < limit, left**2, limit * (2.0 * left - limit)).mean() + 1e-10)
+
+
+def winding(seed=3):
+    """A drive in three segments of wheels at 20 Hz and poses at 10 Hz, seen with noise, a silence in between."""
+    rng = np.random.default_rng(seed)
+    t_s = np.arange(0.0, 40.0, 0.05)
+    angle = np.cumsum(rng.normal(4.0, 3.0, (t_s.size, 2)), axis=0) * 0.05
+    cut = np.searchsorted([13.0, 27.0], t_s, side="right")
+    wheels = Wheels(t_s, angle[:, 0], angle[:, 1], *(np.zeros(t_s.size),) * 2, cut, True, True)
+    seen = np.arange(0, t_s.size, 2)
+    seen = seen[(t_s[seen] < 20.0) | (t_s[seen] > 21.1)]
+    yaw = 0.3 * (angle[seen, 1] - angle[seen, 0]) + rng.normal(0.0, 0.02, seen.size)
+    way = np.cumsum(rng.normal(0.02, 0.01, (seen.size, 2)), axis=0)
+    poses = Poses(t_s[seen], way[:, 0], way[:, 1], np.remainder(yaw + np.pi, 2.0 * np.pi) - np.pi, cut[seen])
+    return wheels, poses
+
+
+@pytest.mark.parametrize("delay_s", [-0.33, 0.0, 0.12])
+def test_turns_and_ways_of_poses_are_fitted_by_those_of_the_wheels_at_a_delay(delay_s):
+    wheels, poses = winding()
+    count, misfit = by_hand(wheels, poses, delay_s)
+    assert count > 250
+    assert timing._misfit_at(wheels, poses, delay_s, SETTINGS) == pytest.approx(misfit, rel=1e-9)
+    many = timing._misfits(wheels, poses, np.array([5.0, delay_s, 90.0]), SETTINGS)
+    assert many[1] == pytest.approx(misfit, rel=1e-9)
+    assert many[2] == np.inf
+
+
+@pytest.mark.parametrize(("fewest", "known"), [(0, True), (1, False)])
+def test_too_few_pairs_are_not_fitted(fewest, known):
+    wheels, poses = winding()
+    count, _ = by_hand(wheels, poses, 0.12)
+    settings = replace(SETTINGS, fewest_poses=count + fewest)
+    assert np.isfinite(timing._misfits(wheels, poses, np.array([0.12]), settings))[0] == known
+    pairs = timing._pairs(poses, 0.4)[0].size
+    for more, wanted in ((0, True), (1, False)):
+        settings = replace(SETTINGS, fewest_poses=pairs + more)
+        unlimited = replace(wheels, t_s=wheels.t_s.copy(), segment=wheels.segment)
+        assert np.isfinite(timing._misfits(unlimited, poses, np.array([0.0]), settings))[0] == wanted
+    single = replace(wheels, **{name: getattr(wheels, name)[:1] for name in wheels.__slots__[:6]})
+    assert timing._misfits(single, poses, np.array([0.0]), SETTINGS)[0] == np.inf
+
+
+def test_two_columns_are_solved_as_normal_equations_and_like_columns_as_one():
+    rng = np.random.default_rng(4)
+    a, b, y = rng.standard_normal((3, 50))
+    a *= 2.0
+    expected = np.linalg.lstsq(np.column_stack([a, b]), y, rcond=None)[0]
+    assert timing._projected(a @ a, a @ b, b @ b, a @ y, b @ y) == pytest.approx(tuple(expected))
+    b = 0.5 * a
+    assert timing._projected(a @ a, a @ b, b @ b, a @ y, b @ y) == pytest.approx((a @ y / (a @ a), 0.0))
+    assert timing._projected(0.0, 0.0, 0.0, 0.0, 0.0) == (0.0, 0.0)

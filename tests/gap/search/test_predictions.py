@@ -1,0 +1,289 @@
+"""The pieces of held-out predictions, each against what is computed by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from disco_hw.gap.data import BODY, WHEEL
+from disco_hw.gap.noise import SensorNoise
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
+from disco_hw.gap.noise.wheel_noise import WheelNoise
+from disco_hw.gap.search.cross_validation import (
+    Chain,
+    Starts,
+    chain_track,
+    chain_wheels,
+    errors_of,
+    find_starts,
+    floor_errors,
+    fold_vectors,
+    prediction_error,
+    smoothed_poses,
+    summarise,
+)
+from disco_hw.gap.search.least_squares import Fit
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
+from tests.gap.synthetic import GEOMETRY, NOISE, line_of
+
+RADIUS_M, AXLE_M, X_ICR_M = GEOMETRY
+
+
+def vector_of(layout=BODY, **values):
+    out = layout.neutral.copy()
+    if layout is BODY:
+        out[:3] = GEOMETRY
+    for name, value in values.items():
+        out[layout.place[name.replace("__", ".")]] = value
+    return out
+
+
+def steady(left_rad_s, right_rad_s, seconds=8.0, pose=(0.0, 0.0, 0.0)):
+    """A drive at steady wheel speeds and its body channel, with exact poses of a path that begins at this one."""
+    line = line_of(np.repeat([[left_rad_s, right_rad_s]], round(seconds / GRID_STEP_S), axis=0))
+    plain = BodyChannel.build(line, NOISE, vector_of())
+    return with_poses(line, placed(plain.track(vector_of())[line.pose.node], pose))
+
+
+def placed(track, pose):
+    """A path (K, 3) from 0 as it is from another pose."""
+    cosine, sine = np.cos(pose[2]), np.sin(pose[2])
+    x = pose[0] + cosine * track[:, 0] - sine * track[:, 1]
+    return np.column_stack([x, pose[1] + sine * track[:, 0] + cosine * track[:, 1], pose[2] + track[:, 2]])
+
+
+def with_poses(line, poses, samples=None, use=None):
+    line = replace(line, pose_values=poses, pose=line.pose if samples is None else samples)
+    return BodyChannel.build(line, NOISE, vector_of(), use)
+
+
+def test_exact_poses_are_carried_exactly_along_the_path():
+    channel = steady(2.0, 4.0, pose=(3.0, -2.0, 2.5))
+    truth = placed(channel.track(vector_of()), (3.0, -2.0, 2.5))
+    for poses in smoothed_poses(channel, vector_of()):
+        known = np.isfinite(poses[:, 0])
+        assert known.mean() > 0.95
+        np.testing.assert_allclose(poses[known], truth[known], atol=1e-9)
+
+
+def test_poses_at_rest_are_averaged_within_their_reach_and_their_run_and_taken_alone_from_the_nearest():
+    line = line_of(np.zeros((800, 2)))
+    line = replace(line, first=np.isin(np.arange(800), (0, 402)))
+    rng = np.random.default_rng(1)
+    values = rng.normal(0.0, 0.01, (line.pose.t_s.size, 3)) + np.where(line.pose.node < 402, 1.0, 2.0)[:, None]
+    values[7] = 50.0
+    use = np.arange(values.shape[0]) != 7
+    channel = with_poses(line, values, use=use)
+    smooth, alone = smoothed_poses(channel, vector_of())
+    t_s = line.pose.t_s
+    for node in (36, 40, 60, 200, 333, 395, 396, 404, 417, 500, 760):
+        now = node * GRID_STEP_S
+        same = use & ((t_s < 4.02) == (now < 4.02))
+        near = same & (np.abs(t_s - now) < 0.3 + 1e-9)
+        if node in line.pose.node:
+            np.testing.assert_allclose(smooth[node], values[near].mean(axis=0), atol=1e-9)
+        nearest = np.argmin(np.where(use, np.abs(t_s - now), np.inf))
+        np.testing.assert_allclose(alone[node], values[nearest], atol=1e-9)
+
+
+def test_where_no_pose_is_near_there_is_none():
+    line = line_of(np.zeros((800, 2)))
+    away = (line.pose.t_s > 2.0) & (line.pose.t_s < 3.5)
+    channel = with_poses(line, np.ones((np.count_nonzero(~away), 3)), line.pose.pick(~away))
+    times = channel.samples.t_s
+    apart_s = np.abs(line.t_s[:, None] - times).min(axis=1)
+    for poses in smoothed_poses(channel, vector_of()):
+        assert np.isnan(poses[apart_s > 0.1 + 1e-9]).all()
+        np.testing.assert_allclose(poses[apart_s < 0.1 - 1e-9], 1.0)
+    assert (apart_s > 0.11).sum() > 100
+
+
+def starts_at(node, pose, end, block=None):
+    count = len(node)
+    block = np.zeros(count, dtype=np.int64) if block is None else np.array(block)
+    return Starts(np.array(node), np.array(pose, dtype=float), np.array(end, dtype=float), block, ("curves",) * count)
+
+
+def test_an_error_is_what_was_measured_less_what_was_predicted_seen_from_the_start():
+    channel = steady(3.0, 3.0)
+    # It looks along y and drives 0.18 m in 1 s; measured are 0.2 m ahead and 0.1 m to the left, a turn and a bit more.
+    starts = starts_at([200], [[1.0, 2.0, 0.5 * np.pi]], [[0.9, 2.2, 2.5 * np.pi + 0.1]])
+    error = prediction_error(channel, starts, vector_of(), channel.track(vector_of()), 1.0)
+    assert error == pytest.approx(np.array([[0.02, 0.1, 0.1]]))
+    turned = starts_at([200], [[1.0, 2.0, 0.5 * np.pi]], [[0.9, 2.2, 0.5 * np.pi - 0.1]])
+    assert prediction_error(channel, turned, vector_of(), channel.track(vector_of()), 1.0)[0, 2] == pytest.approx(-0.1)
+
+
+def wheels_on(line):
+    return WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
+
+
+def test_wheels_of_the_chain_are_as_they_turn_and_not_as_they_are_counted():
+    channel = steady(-3.0, 3.0)
+    t_s = channel.drive.t_s
+    assert chain_wheels(channel, None, Chain(vector_of(), None))[0] is channel.drive.angle_rad
+    assert chain_wheels(channel, wheels_on(channel.drive), Chain(vector_of(), None))[1] is channel.drive.speed_rad_s
+    # They turn on the spot at 0.9 rad/s, of which a limit leaves a half; wheels of half the radius stay below it.
+    q = vector_of(WHEEL, encoder_scale__left=0.1, encoder_scale__right=-0.2, yaw_rate_limit__limit_rad_s=0.45)
+    angle, speed = chain_wheels(channel, wheels_on(channel.drive), Chain(vector_of(), q))
+    np.testing.assert_allclose(angle, np.outer(t_s, (-1.5, 1.5)), atol=1e-9)
+    np.testing.assert_allclose(speed[1:], np.broadcast_to((-1.5, 1.5), (t_s.size - 1, 2)), atol=1e-9)
+    assert (speed[0] == 0.0).all()
+    small = chain_wheels(channel, wheels_on(channel.drive), Chain(vector_of(wheel_radius_m=0.5 * RADIUS_M), q))[0]
+    np.testing.assert_allclose(small, np.outer(t_s, (-3.0, 3.0)), atol=1e-9)
+
+
+def test_terms_of_the_wheels_and_of_the_body_drive_the_chain():
+    channel = steady(3.0, 3.0)
+    t_s, count = channel.drive.t_s, channel.drive.t_s.size
+    extra = np.column_stack([np.full(count, 0.02), np.zeros(count), np.zeros(count)])
+    chain = Chain(vector_of(), WHEEL.neutral, extra, np.full((count, 2), 1.0))
+    track, speed = chain_track(channel, wheels_on(channel.drive), chain)
+    np.testing.assert_allclose(track[:, 0], (0.24 + 0.02) * t_s, atol=1e-9)
+    np.testing.assert_allclose(speed[1:], 4.0, atol=1e-9)
+    known = replace(channel, drive=replace(channel.drive, known_motion=2.0 * extra))
+    np.testing.assert_allclose(chain_track(known, None, chain)[0][:, 0], (0.18 + 0.06) * t_s, atol=1e-9)
+
+
+def test_encoders_that_count_wrong_matter_to_the_body_only_where_they_are_read():
+    channel = steady(3.0, 3.0)
+    body = vector_of(encoder_scale__left=0.25, encoder_scale__right=0.25)
+    read = chain_track(channel, None, Chain(body, None))[0]
+    np.testing.assert_allclose(read[:, 0], 0.18 / 1.25 * channel.drive.t_s, atol=1e-9)
+    commanded = chain_track(channel, wheels_on(channel.drive), Chain(body, WHEEL.neutral))[0]
+    np.testing.assert_allclose(commanded[:, 0], 0.18 * channel.drive.t_s, atol=1e-9)
+    turned = np.outer(channel.drive.t_s, (1.0, 1.0)), np.ones((channel.drive.t_s.size, 2))
+    given = chain_track(channel, None, Chain(vector_of(), None), turned)
+    np.testing.assert_allclose(given[0][:, 0], 0.06 * channel.drive.t_s, atol=1e-9)
+    assert given[1] is turned[1]
+
+
+def test_predictions_start_where_poses_are_known_at_both_ends_and_commands_all_the_way():
+    channel = steady(3.0, 3.0, seconds=60.0)
+    smooth, alone = smoothed_poses(channel, vector_of())
+    smooth, alone = smooth.copy(), alone.copy()
+    smooth[1000:1100], alone[2000:2100] = np.nan, np.nan
+    drive = replace(channel.drive, command_rad_s=channel.drive.command_rad_s.copy())
+    drive.command_rad_s[3000:3050] = np.nan
+    starts = find_starts(replace(channel, drive=drive), (smooth, alone), 2.0)
+    nodes = np.arange(100, 6000 - 201, 20)
+    kept = [k for k in nodes if not (1000 <= k < 1100 or 1800 <= k < 1900 or 2800 <= k < 3050)]
+    assert set(kept) - set(starts.node) <= {2799, *nodes[-3:]}
+    assert set(starts.node) <= set(kept)
+    np.testing.assert_array_equal(starts.pose, smooth[starts.node])
+    np.testing.assert_array_equal(starts.end, alone[starts.node + 200])
+    np.testing.assert_array_equal(starts.block, starts.node // 2100)
+    assert set(starts.regime) == {"straight ahead"}
+    # Without any commands the wheels' own turns are enough.
+    silent = replace(drive, command_rad_s=np.full_like(drive.command_rad_s, np.nan))
+    uncommanded = find_starts(replace(channel, drive=silent), (smooth, alone), 2.0).node
+    assert set(starts.node) < set(uncommanded)
+
+
+def test_each_start_is_predicted_by_the_chain_of_its_own_stretch():
+    channel = steady(3.0, 5.0, seconds=45.0)
+    poses = smoothed_poses(channel, vector_of())
+    wheels = wheels_on(replace(channel.drive, command_rad_s=channel.drive.command_rad_s + 1.0))
+    # In one kind of stretches the wheels turn too fast.
+    right, wrong = Chain(vector_of(), None), Chain(vector_of(), WHEEL.neutral)
+    both = errors_of(channel, None, {0: right, 1: right}, 2.0, poses)
+    assert both.position_m < 1e-9
+    assert both.wheel_rad_s == 0.0
+    first = errors_of(channel, wheels, {0: wrong, 1: right}, 2.0, poses)
+    second = errors_of(channel, wheels, {0: right, 1: wrong}, 2.0, poses)
+    np.testing.assert_array_equal(first.squares[:, 0] > 1e-6, (True, False, True))
+    np.testing.assert_array_equal(second.squares[:, 0] > 1e-6, (False, True, False))
+
+
+def test_errors_are_root_mean_squares_by_regime_and_by_stretch():
+    error = np.array([[3.0, 4.0, 0.1], [0.0, 1.0, -0.2], [2.0, 0.0, 0.2], [0.0, 0.0, 0.0]])
+    starts = replace(starts_at([0, 1, 2, 3], error, error, [0, 0, 2, 2]), regime=("curves", "rest", "curves", "rest"))
+    told = summarise(error, np.array([1.0, -3.0, 1.0, 1.0]), starts, DEFAULT_SETTINGS.prediction)
+    assert told.position_m == pytest.approx(np.sqrt((25.0 + 1.0 + 4.0) / 4.0))
+    assert told.yaw_rad == pytest.approx(0.15)
+    assert told.wheel_rad_s == pytest.approx(np.sqrt(3.0))
+    assert told.by_regime_m == {"curves": pytest.approx(np.sqrt(14.5)), "rest": pytest.approx(np.sqrt(0.5))}
+    np.testing.assert_allclose(told.squares, [[26.0, 0.05], [4.0, 0.04]])
+    # Of two stretches either may be drawn twice.
+    assert told.position_ci == pytest.approx((np.sqrt(2.0), np.sqrt(13.0)))
+    assert told.yaw_ci == pytest.approx((np.sqrt(0.02), np.sqrt(0.025)))
+
+
+def test_of_no_predictions_nothing_is_told():
+    nothing = np.empty((0, 3))
+    told = summarise(nothing, np.empty(0), starts_at([], nothing, nothing), DEFAULT_SETTINGS.prediction)
+    assert np.isnan([told.position_m, *told.position_ci, told.yaw_rad, *told.yaw_ci, told.wheel_rad_s]).all()
+    assert told.by_regime_m == {}
+    assert told.squares is None
+
+
+def test_an_interval_holds_what_stretches_scatter():
+    rng = np.random.default_rng(2)
+    of_stretch = rng.uniform(0.5, 1.5, 300)
+    counts = rng.integers(1, 6, 300)
+    block = np.repeat(np.arange(300), counts)
+    squares = of_stretch[block]
+    error = np.column_stack([np.sqrt(squares), np.zeros(block.size), np.sqrt(squares)])
+    starts = starts_at(np.arange(block.size), error, error, block)
+    told = summarise(error, np.zeros(block.size), starts, DEFAULT_SETTINGS.prediction)
+    # A ratio of two sums over stretches: its deviation to first order.
+    mean = squares.mean()
+    deviation = np.sqrt((counts**2 * (of_stretch - mean) ** 2).sum()) / counts.sum()
+    assert told.position_ci == pytest.approx(np.sqrt((mean - 1.96 * deviation, mean + 1.96 * deviation)), rel=0.005)
+    assert told.yaw_ci == told.position_ci
+
+
+@pytest.mark.parametrize("every", [1, 4, 25])
+def test_the_floor_is_the_noise_of_a_pose_and_of_a_mean_and_a_heading_that_is_off_at_the_start(every):
+    channel = steady(3.0, 5.0, seconds=40.0, pose=(0.0, 0.0, 0.7))
+    if every > 1:
+        line = channel.drive
+        chosen = np.arange(0, line.pose.t_s.size, every)
+        channel = with_poses(line, line.pose_values[chosen], line.pose.pick(chosen))
+    smooth, alone = smoothed_poses(channel, vector_of())
+    noise = SensorNoise(0.004, 0.01, 0.05)
+    floor = floor_errors(channel, noise, 2.0, (smooth, alone))
+    # Poses within 0.3 s either side are averaged, one every 0.04 s.
+    many = max(0.6 / (0.04 * every), 1.0)
+    v, omega = 0.24, RADIUS_M / AXLE_M * 2.0
+    turned = omega * 2.0
+    way_m = np.hypot(v / omega, X_ICR_M) * 2.0 * np.sin(0.5 * turned)
+    assert floor.yaw_rad == pytest.approx(0.01 * np.sqrt(1.0 + 1.0 / many), rel=0.04)
+    position = 2.0 * 0.004**2 * (1.0 + 1.0 / many) + (way_m * 0.01) ** 2 / many
+    assert floor.position_m == pytest.approx(np.sqrt(position), rel=0.04)
+    assert floor.wheel_rad_s == pytest.approx(0.05)
+
+
+def test_a_fold_is_predicted_by_a_fit_of_the_other_one():
+    rng = np.random.default_rng(6)
+    block = np.arange(1000) // 10
+    slope = rng.standard_normal((1000, 3))
+    y = slope @ (0.5, -2.0, 1.0) + rng.standard_normal(1000)
+    whole = np.linalg.lstsq(slope, y, rcond=None)[0]
+    vector = np.array([9.0, *whole])
+    residual = slope @ whole - y
+    found = Fit(vector, (1, 2, 3), 0.5 * float(residual @ residual), residual, slope)
+    folds = fold_vectors(found, block, np.zeros(4), DEFAULT_SETTINGS)
+    # Seven blocks of 3 s are a stretch.
+    for held in (0, 1):
+        other = (block // 7) % 2 != held
+        expected = np.linalg.lstsq(slope[other], y[other], rcond=None)[0]
+        assert folds[held] == pytest.approx([9.0, *expected], rel=1e-9)
+    none = fold_vectors(Fit(vector, (), 0.0, residual, np.empty((1000, 0))), block, np.zeros(4), DEFAULT_SETTINGS)
+    assert none[0] is none[1] is vector
+    single = fold_vectors(found, np.zeros(1000, dtype=int), np.zeros(4), DEFAULT_SETTINGS)
+    assert single[0] is single[1] is vector
+
+
+@pytest.mark.parametrize(("value", "used"), [(1.2, True), (0.8, False)])
+def test_what_the_other_fold_says_little_of_is_used_if_it_fixes_the_value_itself(value, used):
+    block = np.arange(1400) // 10
+    slope = np.zeros((1400, 1))
+    # Nearly all is known from the even stretches: of the odd ones 25 in squares, five sigmas of a value of one.
+    odd = (block // 7) % 2 == 1
+    slope[odd, 0], slope[~odd, 0] = (25.0 / odd.sum()) ** 0.5, 20.0
+    residual = np.zeros(1400)
+    found = Fit(np.array([value]), (0,), 0.0, residual, slope)
+    folds = fold_vectors(found, block, np.array([0.25]), DEFAULT_SETTINGS)
+    assert folds[0][0] == (value if used else 0.25)
+    assert folds[1][0] == value

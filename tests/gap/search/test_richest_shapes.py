@@ -1,0 +1,208 @@
+"""What the richest model of a channel is made of, and how much of it is taken."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from disco_hw.gap.data import BODY, WHEEL
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
+from disco_hw.gap.noise.wheel_noise import WheelNoise
+from disco_hw.gap.search import richest_model
+from disco_hw.gap.search.richest_model import (
+    CANDIDATES,
+    candidates_of,
+    driven,
+    indices,
+    learn_saturated_body,
+    learn_saturated_wheels,
+    parameters_of,
+    smooth_of,
+    with_pose_delay,
+)
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, FitSettings
+from tests.gap.synthetic import GEOMETRY, NOISE, body_channel, line_of
+
+
+def test_a_ridge_takes_most_away_and_holds_columns_that_look_alike_small():
+    rng = np.random.default_rng(0)
+    slope = rng.standard_normal((200, 4)) * (1.0, 10.0, 0.1, 1.0)
+    slope[:, 3] = slope[:, 0] + 1e-9 * rng.standard_normal(200)
+    residual = rng.standard_normal(200) - slope @ (2.0, -0.3, 5.0, 0.0)
+    # As so many further equations, on columns of unit length.
+    lengths = np.linalg.norm(slope, axis=0)
+    stacked = np.vstack([slope, np.diag(0.01**0.5 * lengths)])
+    expected = np.linalg.lstsq(stacked, np.append(-residual, np.zeros(4)), rcond=None)[0]
+    found = richest_model._ridge(slope, residual, FitSettings())
+    assert found == pytest.approx(expected, rel=1e-6)
+    assert found[0] == pytest.approx(found[3], rel=1e-3)
+
+
+def test_speeds_add_up_to_angles_in_each_run_from_nothing():
+    speed = np.array([[1.0, 2.0], [3.0, 0.0], [-1.0, 1.0], [5.0, 5.0], [7.0, 0.0]])
+    first = np.array([True, False, False, True, False])
+    angle = richest_model._integrated(speed, first)
+    expected = -0.01 * np.array([[0.0, 0.0], [3.0, 0.0], [2.0, 1.0], [0.0, 0.0], [7.0, 0.0]])
+    np.testing.assert_allclose(angle, expected, atol=1e-15)
+
+
+def test_a_lag_takes_its_time_and_a_limit_its_steps():
+    step = np.ones((200, 1))
+    step[0] = 0.0
+    t_s = GRID_STEP_S * np.arange(200)[:, None]
+    np.testing.assert_allclose(richest_model._slow(step, 0.3), 1.0 - np.exp(-t_s / 0.3), atol=1e-12)
+    asked = np.array([[0.0, 1.0], [5.0, 1.0], [5.0, -9.0], [5.0, 1.0], [-5.0, 0.95]])
+    expected = [[0.0, 1.0], [0.2, 1.0], [0.4, 0.8], [0.6, 1.0], [0.4, 0.95]]
+    np.testing.assert_allclose(richest_model._slewed(asked, 20.0), expected, atol=1e-12)
+
+
+def shapes_of(command_rad_s, **effects):
+    line = replace(line_of(np.repeat([[3.0, 5.0]], command_rad_s.shape[0], axis=0)), command_rad_s=command_rad_s)
+    channel = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
+    vector = WHEEL.neutral.copy()
+    for name, value in effects.items():
+        vector[WHEEL.place[name.replace("__", ".")]] = value
+    return line, [*richest_model._wheel_shapes(channel, vector)]
+
+
+def lagged(u, response_s):
+    keep = np.exp(-GRID_STEP_S / response_s)
+    out = np.zeros_like(u)
+    for k in range(u.shape[0]):
+        out[k] = (out[k - 1] if k else 0.0) * keep + (1.0 - keep) * u[k]
+    return out
+
+
+def test_wheels_may_bend_a_command_and_answer_it_quickly_slowly_and_no_faster_than_they_can():
+    commands = np.repeat(np.random.default_rng(1).uniform(-6.0, 6.0, (10, 2)), 40, axis=0)
+    line, shapes = shapes_of(commands, command_delay__delay_s=0.1, motor_lag__tau_s=0.2)
+    asked = np.vstack([np.repeat(commands[:1], 10, axis=0), commands[:-10]])
+    u = lagged(asked, 0.2)
+    other, most = u[:, ::-1], np.abs(u).max()
+    expected = [
+        np.sign(u) * np.maximum(np.abs(u) - share * most, 0.0)
+        for share in (0.02, 0.05, 0.1, 0.2, 0.35, 0.55, 0.75, 0.9)
+    ]
+    expected += [np.tanh(u / 0.05), u, np.abs(u), u**2, other, np.abs(other) * np.tanh(u / 0.05), np.abs(other) * u]
+    expected += [u * np.sin(line.angle_rad), u * np.cos(line.angle_rad)]
+    for response_s in (0.02, 0.05, 0.12, 0.3):
+        behind = lagged(u, response_s) - u
+        expected += [behind, behind[:, ::-1], lagged(behind, response_s)]
+    for full_s in (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0):
+        now, followed = asked[0].copy(), []
+        for one in asked:
+            now = now + np.clip(one - now, -most / full_s * GRID_STEP_S, most / full_s * GRID_STEP_S)
+            followed.append(now)
+        expected.append(np.array(followed) - asked)
+    assert len(shapes) == len(expected)
+    for shape, right in zip(shapes, expected, strict=True):
+        np.testing.assert_allclose(shape, right, atol=1e-9)
+
+
+def test_wheels_without_a_lag_answer_at_once_and_without_a_command_not_at_all():
+    commands = np.repeat(np.random.default_rng(1).uniform(-6.0, 6.0, (5, 2)), 20, axis=0)
+    _, shapes = shapes_of(commands)
+    np.testing.assert_allclose(shapes[9], commands, rtol=1e-3)
+    line, none = shapes_of(np.zeros((400, 2)))
+    assert none == []
+    channel = WheelChannel.build(line, WheelNoise(reading_rad=1e-3), np.array(GEOMETRY))
+    learnt, left, many = learn_saturated_wheels(channel, WHEEL.neutral)
+    np.testing.assert_array_equal(left, channel.raw_residual(WHEEL.neutral))
+    assert many == WHEEL.neutral.size
+    assert learnt.noise != channel.noise
+
+
+def test_a_body_is_pushed_as_it_is_fitted_best_and_where_that_is_too_far_half_of_it():
+    channel, line = body_channel()
+    p = channel.neutral
+    push = np.zeros((line.t_s.size, 3))
+    push[2000:4000, 0] = 0.5
+    moved = channel.track(p, 0.1 * push) - channel.track(p)
+    pushed = BodyChannel.build(replace(line, pose_values=channel.measured + moved[channel.samples.node]), NOISE, p)
+    learnt, vector, extra, many = learn_saturated_body(pushed, (), p, iter((np.zeros_like(push), push)))
+    assert many == 4
+    np.testing.assert_allclose(extra, 0.1 * push, atol=0.01 * 0.5)
+    assert vector[:3] == pytest.approx(GEOMETRY, abs=2e-3)
+    assert learnt.noise.position_m == pytest.approx(NOISE.position_m, rel=0.1)
+    half = np.sum(pushed.residual(vector, extra) ** 2)
+    assert half < 1.1 * np.sum(channel.residual(p) ** 2)
+
+
+class Bent:
+    """A channel of one number whose derivative promises ten, where only what is below `least` fits better than none."""
+
+    layout, settings, free = BODY, DEFAULT_SETTINGS, (0,)
+    drive = SimpleNamespace(t_s=np.zeros(5))
+
+    def __init__(self, least):
+        self.least = least
+
+    def residual(self, vector, extra=None):
+        moved = vector[0] - GEOMETRY[0]
+        if abs(moved) < 1e-3:
+            return np.array([1.0 - moved / 10.0])
+        return np.array([0.5 if moved < self.least else 2.0])
+
+
+@pytest.mark.parametrize(("least", "share"), [(11.0, 1.0), (6.0, 0.5), (3.0, 0.25), (1.5, 0.125), (1.0, 0.0)])
+def test_a_step_of_the_richest_model_is_halved_until_it_fits_better(monkeypatch, least, share):
+    channel = Bent(least)
+    monkeypatch.setattr(richest_model, "learn_body_noise", lambda of, vector, extra: ("learnt", vector, extra))
+    wide = replace(BODY, high=np.full_like(BODY.high, 1e9))
+    monkeypatch.setattr(Bent, "layout", wide)
+    vector = BODY.neutral.copy()
+    vector[0] = GEOMETRY[0]
+    learnt, moved, extra, many = learn_saturated_body(channel, (), vector, ())
+    full = 10.0 / (1.0 + DEFAULT_SETTINGS.fit.ridge)
+    assert moved[0] - GEOMETRY[0] == pytest.approx(share * full, rel=1e-3, abs=1e-12)
+    assert (learnt is channel) is (share == 0.0)
+    assert extra.shape == (5, 3)
+    assert many == 1
+
+
+def test_the_richest_model_stays_in_its_ranges(monkeypatch):
+    channel = Bent(100.0)
+    monkeypatch.setattr(richest_model, "learn_body_noise", lambda of, vector, extra: of)
+    vector = BODY.neutral.copy()
+    vector[0] = GEOMETRY[0]
+    assert learn_saturated_body(channel, (), vector, ())[1][0] == BODY.high[0]
+
+
+def test_effects_see_the_commands_that_are_known_the_geometry_and_the_time_of_what_is_measured():
+    commands = np.tile([2.0, 3.0], (800, 1))
+    commands[100:300] = np.nan
+    line = replace(line_of(np.tile([2.0, 3.0], (800, 1))), command_rad_s=commands)
+    wheels = driven(WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY)))
+    body = driven(BodyChannel.build(line, NOISE, np.array([*GEOMETRY, *BODY.neutral[3:]])))
+    for seen in (wheels, body):
+        assert seen.commands.shape == (600, 2)
+        assert seen.geometry == GEOMETRY[:2]
+    assert (wheels.first_s, wheels.last_s) == (0.0, pytest.approx(7.99))
+    assert (body.first_s, body.last_s) == (pytest.approx(0.04), pytest.approx(7.96))
+
+
+def test_a_delay_at_first_sight_is_put_where_the_age_of_poses_is_within_its_range():
+    channel, line = body_channel()
+    place = BODY.place["pose_latency.latency_s"]
+    for seen_s, put_s in ((0.2, 0.2), (-0.1, -0.1), (99.0, BODY.high[place]), (-99.0, BODY.low[place])):
+        late = replace(channel, drive=replace(line, pose_delay_s=seen_s))
+        vector = with_pose_delay(late, channel.neutral)
+        assert vector[place] == put_s
+        assert (np.delete(vector, place) == np.delete(channel.neutral, place)).all()
+        assert CANDIDATES["pose_latency"].starts(late) == ((0.0,), (put_s,))
+
+
+def test_effects_compete_in_their_own_channel_with_all_their_parameters():
+    channel, _ = body_channel()
+    assert "motor_lag" in candidates_of(WHEEL)
+    assert "turn_slip" in candidates_of(BODY)
+    assert not set(candidates_of(WHEEL)) & set(candidates_of(BODY))
+    # A change of the floor has a time that is scanned, and two that are fitted.
+    assert parameters_of(("surface_change", "turn_slip")) == 4
+    fitted = [BODY.columns[place] for place in indices(channel, ("surface_change", "turn_slip"))]
+    assert fitted[:3] == ["wheel_radius_m", "axial_distance_m", "x_icr_m"]
+    assert set(fitted[3:]) == {"surface_change.track", "surface_change.radius", "turn_slip.k_s"}
+    assert {"turn_slip", "slope"} < set(smooth_of(BODY))
+    assert {"motor_lag", "wheel_gain"} < set(smooth_of(WHEEL))
+    assert "surface_change" not in smooth_of(BODY)

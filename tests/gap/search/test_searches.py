@@ -1,0 +1,284 @@
+"""Whole searches of a channel on a short drive whose truth is known, and how lag and delay are fitted first."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from disco_hw.gap.data import BODY, WHEEL
+from disco_hw.gap.data.free_runs import run_wheels
+from disco_hw.gap.search import channel_search
+from disco_hw.gap.search.channel_search import ChannelResult, responding, search_body, search_wheels
+from disco_hw.gap.search.least_squares import Fit
+from disco_hw.gap.search.richest_model import LATE, LATE_COLUMNS, LATE_STARTS_S, indices, smooth_of
+from disco_hw.gap.search.selection import Selector
+from disco_hw.gap.search.unnamed_terms import body_terms
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
+from tests.gap.synthetic import DRIVE, GEOMETRY, NOISE, body_channel, line_of
+
+READ_TO_RAD = 1e-3
+
+
+def wheels_of(extra=None, settings=DEFAULT_SETTINGS, drive=DRIVE * 3, **effects):
+    """Wheels read with some noise that answer their commands with these first parameters of effects."""
+    command = np.repeat(np.array(drive, dtype=float), 200, axis=0)
+    truth = WHEEL.neutral.copy()
+    for name, value in effects.items():
+        truth[next(place for column, place in WHEEL.place.items() if column.startswith(f"{name}."))] = value
+    line = replace(line_of(command), settings=settings)
+    still = np.zeros_like(command)
+    added = still if extra is None else extra(command)
+    angle = run_wheels(truth, np.array(GEOMETRY), command, added, line.first, line.t_s, still)
+    noise = READ_TO_RAD * np.random.default_rng(3).standard_normal((line.encoder.node.size, 2))
+    return replace(
+        line, angle_rad=angle, speed_rad_s=np.gradient(angle, GRID_STEP_S, axis=0),
+        encoder_angle_rad=angle[line.encoder.node] + noise,
+    )  # fmt: skip
+
+
+def test_what_slows_the_wheels_is_named_and_the_rest_is_what_they_are_read_with():
+    found = search_wheels(wheels_of(motor_lag=0.15), np.array(GEOMETRY), WHEEL.neutral)
+    assert found.names == ("motor_lag",)
+    assert not found.unnamed
+    assert found.fit.vector[WHEEL.place["motor_lag.tau_s"]] == pytest.approx(0.15, abs=0.002)
+    assert found.channel.noise.reading_rad == pytest.approx(READ_TO_RAD, rel=0.1)
+    # Half a square each.
+    assert found.fit.cost == pytest.approx(0.5 * found.channel.count, rel=0.1)
+    assert found.base.cost > 2.0 * found.fit.cost
+    assert found.richest.shape == found.fit.residual.shape
+    # Nothing else is there that a richer model could take.
+    assert found.richest @ found.richest == pytest.approx(2.0 * found.fit.cost, rel=0.02)
+    assert found.richest_parameters > WHEEL.neutral.size
+
+
+def test_what_a_model_knows_of_the_wheels_is_refitted_and_not_found():
+    start = WHEEL.neutral.copy()
+    start[WHEEL.place["motor_lag.tau_s"]] = 0.1
+    found = search_wheels(wheels_of(motor_lag=0.15), np.array(GEOMETRY), start, ("motor_lag",))
+    assert found.names == found.selector.given == ("motor_lag",)
+    assert found.base.vector[WHEEL.place["motor_lag.tau_s"]] == pytest.approx(0.15, abs=0.002)
+
+
+def test_wheels_with_a_term_that_has_no_name_have_it_found_with_its_number():
+    line = wheels_of(lambda u: -0.02 * u * np.abs(u), drive=DRIVE * 2)
+    found = search_wheels(line, np.array(GEOMETRY), WHEEL.neutral)
+    assert found.names == ()
+    (one,) = found.unnamed
+    assert one.form.endswith(" u |u|")
+    assert found.fit.vector[-1] == pytest.approx(-0.02, rel=0.05)
+    assert one.term.model_name == "command += k u |u|"
+
+
+def test_what_slips_is_named_and_the_rest_is_the_noise_of_the_poses():
+    channel, line = body_channel(turn_slip=0.08)
+    found = search_body(line, channel.neutral)
+    assert found.names == ("turn_slip",)
+    assert not found.unnamed
+    assert not found.either
+    assert found.channel.noise.position_m == pytest.approx(NOISE.position_m, rel=0.1)
+    assert found.channel.noise.yaw_rad == pytest.approx(NOISE.yaw_rad, rel=0.1)
+    assert found.base.cost > 1.3 * found.fit.cost
+    assert found.richest.shape == found.fit.residual.shape
+    assert found.richest @ found.richest == pytest.approx(2.0 * found.fit.cost, rel=0.03)
+    # The geometry, all that is smooth, every term of the motion and the disc of the floor that promises most.
+    terms = len([*body_terms(found.channel, found.channel.neutral)])
+    smooth = len(indices(found.channel, smooth_of(BODY)))
+    assert found.richest_parameters in (smooth + terms, smooth + terms + 1)
+
+
+def test_poses_that_are_late_at_first_sight_are_named_late_and_their_noise_is_not_that_of_slip():
+    channel, line = body_channel()
+    late = np.clip(line.pose.node - 30, 0, None)
+    poses = channel.track(channel.neutral)[late] + (line.pose_values - channel.track(channel.neutral)[line.pose.node])
+    line = replace(line, pose_values=poses, pose_delay_s=0.28)
+    found = search_body(line, channel.neutral)
+    assert found.names == ("pose_latency",)
+    assert found.fit.vector[BODY.place["pose_latency.latency_s"]] == pytest.approx(0.3, abs=0.005)
+    assert found.channel.noise.position_m == pytest.approx(NOISE.position_m, rel=0.15)
+
+
+@pytest.mark.parametrize(("late_s", "seen_s", "begun_s"), [(0.3, 0.28, 0.28), (0.0, 0.28, 0.0)])
+def test_the_first_noise_is_that_of_poses_as_late_as_fits_better(monkeypatch, late_s, seen_s, begun_s):
+    channel, line = body_channel()
+    track = channel.track(channel.neutral)
+    late = np.clip(line.pose.node - round(late_s / GRID_STEP_S), 0, None)
+    poses = track[late] + (line.pose_values - track[line.pose.node])
+
+    def begin(of, vector, **_):
+        raise RuntimeError(vector[BODY.place["pose_latency.latency_s"]])
+
+    monkeypatch.setattr(channel_search, "learn_body_noise", begin)
+    with pytest.raises(RuntimeError) as begun:
+        search_body(replace(line, pose_values=poses, pose_delay_s=seen_s), channel.neutral)
+    assert begun.value.args == (begun_s,)
+
+
+def test_what_a_model_knows_of_the_body_is_refitted_and_not_found():
+    channel, line = body_channel(turn_slip=0.08)
+    start = channel.neutral.copy()
+    start[BODY.place["turn_slip.k_s"]] = 0.05
+    found = search_body(line, start, ("turn_slip",))
+    assert found.names == found.selector.given == ("turn_slip",)
+    assert found.base.vector[BODY.place["turn_slip.k_s"]] == pytest.approx(0.08, abs=0.004)
+
+
+def test_a_body_with_a_term_that_has_no_name_has_it_found_with_its_number():
+    channel, line = body_channel()
+    speed, p = line.speed_rad_s, channel.neutral
+    v = 0.5 * p[0] * speed.sum(axis=1)
+    extra = np.zeros((v.size, 3))
+    extra[:, 0] = -0.8 * v**3
+    moved = channel.track(p, extra) - channel.track(p)
+    found = search_body(replace(line, pose_values=line.pose_values + moved[line.pose.node]), p)
+    (one,) = found.unnamed
+    assert one.term.model_name == "v_x += k v^3"
+    # Of the speed that wheels of another radius make.
+    expected = -0.8 * (GEOMETRY[0] / one.term.geometry[0]) ** 3
+    assert found.fit.vector[-1] == pytest.approx(expected, rel=0.1)
+
+
+@pytest.fixture
+def noted(monkeypatch):
+    """What a search makes: its selectors, the entries that its fits free, and of what it takes the noise's tails."""
+    selectors, freed, tails = [], [], []
+
+    def note(name, to, told):
+        made = getattr(channel_search, name)
+
+        def noting(*arguments, **named):
+            result = made(*arguments, **named)
+            to.append(told(result, arguments))
+            return result
+
+        monkeypatch.setattr(channel_search, name, noting)
+
+    note("Selector", selectors, lambda result, arguments: result)
+    note("fit", freed, lambda result, arguments: arguments[2])
+    note("_thresholds", tails, lambda result, arguments: (*arguments, result))
+    return SimpleNamespace(selectors=selectors, freed=freed, tails=tails)
+
+
+def test_the_noise_of_wheels_is_learnt_of_a_rough_selection_and_all_that_is_smooth(noted):
+    found = search_wheels(
+        wheels_of(motor_lag=0.15, drive=((0, 4), (3, 3), (0, 0)) * 6), np.array(GEOMETRY), WHEEL.neutral
+    )
+    rough, chosen = noted.selectors
+    settings = DEFAULT_SETTINGS.selection
+    # What moves no prediction would pass for noise too.
+    assert (rough.thresholds.score, rough.thresholds.moves_m, rough.closely) == (settings.rough_score, 0.0, True)
+    assert chosen is found.selector
+    assert (chosen.thresholds.moves_m, chosen.closely) == (settings.least_moved_m, False)
+    assert all(len(set(active)) == len(active) for active in noted.freed)
+    assert set(indices(found.channel, smooth_of(WHEEL))) in [set(active) for active in noted.freed]
+    # Heavy tails are those of wheels of which one turns at least.
+    ((white, use, of, limits),) = noted.tails
+    turning = np.abs(found.channel.drive.speed_rad_s[found.channel.drive.encoder.node]) > settings.rest_rad_s
+    np.testing.assert_array_equal(use, found.channel.gains.use & turning.any(axis=1))
+    assert turning.any(axis=1).mean() > turning.all(axis=1).mean() + 0.2
+    np.testing.assert_array_equal((white * found.channel.weight).ravel(), found.richest)
+    assert of is settings
+    assert limits is chosen.thresholds
+
+
+def test_where_nothing_that_is_known_comes_near_the_noise_is_what_that_leaves(noted):
+    drive = ((4, 4), (-3, 3), (0, 0), (2, 5)) * 5
+
+    def searched(far_off):
+        choice = replace(DEFAULT_SETTINGS.selection, far_off=far_off)
+        line = wheels_of(drive=drive, settings=replace(DEFAULT_SETTINGS, selection=choice), motor_lag=0.15)
+        noted.selectors.clear()
+        return search_wheels(line, np.array(GEOMETRY), WHEEL.neutral), len(noted.selectors)
+
+    near, selectors = searched(1e9)
+    assert selectors == 2
+    # Half a square each is expected of what the richest model leaves as noise.
+    times = near.fit.cost / (0.5 * near.channel.count)
+    again, selectors = searched(1.01 * times)
+    assert selectors == 2
+    assert again.channel.noise == near.channel.noise
+    plainer, selectors = searched(0.99 * times)
+    assert selectors == 3
+    assert plainer.channel.noise != near.channel.noise
+    assert plainer.richest_parameters == near.richest_parameters
+    assert plainer.names == ("motor_lag",)
+
+
+def test_the_noise_of_a_body_is_learnt_of_a_rough_selection_and_all_that_is_smooth(noted):
+    channel, line = body_channel(turn_slip=0.08)
+    found = search_body(line, channel.neutral)
+    rough, chosen = noted.selectors
+    settings = DEFAULT_SETTINGS.selection
+    assert (rough.thresholds.score, rough.thresholds.moves_m, rough.closely) == (settings.rough_score, 0.0, True)
+    assert chosen is found.selector
+    assert (chosen.thresholds.moves_m, chosen.closely) == (settings.least_moved_m, False)
+    assert all(len(set(active)) == len(active) for active in noted.freed)
+    assert set(indices(found.channel, smooth_of(BODY))) in [set(active) for active in noted.freed]
+    ((white, use, of, limits),) = noted.tails
+    assert use is found.channel.use
+    np.testing.assert_array_equal((white * found.channel.weight).ravel(), found.richest)
+    assert of is settings
+    assert limits is chosen.thresholds
+
+
+LATE_PLACES = [WHEEL.place[column] for column in LATE_COLUMNS]
+
+
+def begun(names, given=(), before=None, best=0):
+    """Vectors from which `responding` fits lateness with a stand-in for `fit`, of which one ends best, and its end."""
+    selector = Selector(SimpleNamespace(layout=WHEEL, free=()), lambda small, big: 0.0, given=given)
+    plain = WHEEL.neutral.copy()
+    plain[WHEEL.place["deadband.width_rad_s"]] = 0.4
+    others = tuple(name for name in names if name in given or name not in LATE)
+    selector.fits[frozenset(others)] = Fit(plain, (), 50.0, np.empty(0), np.empty((0, 0)))
+    if before is not None:
+        selector.fits[frozenset(names)] = before
+    starts = []
+
+    def fitted(channel, start, active):
+        assert active == indices(channel, names)
+        starts.append(start)
+        cost = 10.0 if len(starts) - 1 == best else 20.0
+        return Fit(start, active, cost, np.empty(0), np.empty((0, 0)))
+
+    return selector, starts, fitted
+
+
+def test_lateness_is_fitted_from_quick_and_slow_responses(monkeypatch):
+    selector, starts, fitted = begun((*LATE, "deadband"), best=2)
+    monkeypatch.setattr(channel_search, "fit", fitted)
+    responding(selector, (*LATE, "deadband"))
+    assert [tuple(start[LATE_PLACES]) for start in starts] == list(LATE_STARTS_S)
+    assert {start[WHEEL.place["deadband.width_rad_s"]] for start in starts} == {0.4}
+    assert selector.fits[frozenset((*LATE, "deadband"))].vector is starts[2]
+
+
+def test_lateness_on_top_of_what_was_accepted_is_fitted_from_none(monkeypatch):
+    names = (*LATE, "deadband")
+    for before_cost, kept in ((5.0, True), (15.0, False)):
+        before = Fit(WHEEL.neutral, (), before_cost, np.empty(0), np.empty((0, 0)))
+        selector, starts, fitted = begun(names, before=before)
+        monkeypatch.setattr(channel_search, "fit", fitted)
+        responding(selector, names)
+        assert [tuple(start[LATE_PLACES]) for start in starts] == [(0.0, 0.0)]
+        assert (selector.fits[frozenset(names)] is before) is kept
+
+
+def test_lateness_that_is_known_already_is_fitted_from_these_too(monkeypatch):
+    selector, starts, fitted = begun(LATE, given=("motor_lag",))
+    monkeypatch.setattr(channel_search, "fit", fitted)
+    responding(selector, LATE)
+    assert [tuple(start[LATE_PLACES]) for start in starts] == list(LATE_STARTS_S)
+
+
+def test_a_result_has_the_fits_with_and_without_what_is_missing_and_of_a_search_with_terms_those_before():
+    def selector(given):
+        return SimpleNamespace(given=given, exact=lambda names: (given, names))
+
+    found = ChannelResult(selector(("slope",)), ("slope", "turn_slip"), None)
+    assert found.fit == (("slope",), ("slope", "turn_slip"))
+    assert found.base == (("slope",), ("slope",))
+    extended = replace(found, plain=selector(()))
+    assert extended.fit == found.fit
+    assert extended.base == ((), ())
+    assert found.richest_parameters == 0

@@ -1,0 +1,234 @@
+"""What the last fits of the stages free, how surely it was known before, and which of them is told."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+
+from disco_hw.gap import search as stages
+from disco_hw.gap.data import BODY, WHEEL
+from disco_hw.gap.search import _chain, _Fitted, _information, _on_top, _roughly, _timed, joint_predictions
+from disco_hw.gap.search.analysis import final_fit
+from disco_hw.gap.search.cross_validation import Chain, PredictionErrors
+from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
+from disco_hw.gap.search.least_squares import Fit
+from disco_hw.gap.search.richest_model import LATE_STARTS_S
+from disco_hw.gap.settings import DEFAULT_SETTINGS
+from tests.gap.search.test_stages import LAG, SLIP, analysed
+
+DELAY = WHEEL.place["command_delay.delay_s"]
+
+
+def fit_of(slope, residual=None, active=None, precision=None, vector=None):
+    active = tuple(range(slope.shape[1])) if active is None else active
+    residual = np.zeros(slope.shape[0]) if residual is None else residual
+    return Fit(vector, active, 0.0, residual, slope, precision)
+
+
+def test_what_a_fold_says_is_what_its_own_stretches_say_and_what_was_expected():
+    rng = np.random.default_rng(0)
+    slope, block = rng.standard_normal((900, 3)), np.arange(900) // 10
+    channel = SimpleNamespace(settings=DEFAULT_SETTINGS, block=block)
+    for fold in (0, 1):
+        own = slope[(block // 7) % 2 == fold]
+        np.testing.assert_allclose(_information(fit_of(slope), channel, fold), own.T @ own)
+        expected = _information(fit_of(slope, precision=np.array([1.0, 2.0, 3.0])), channel, fold)
+        np.testing.assert_allclose(expected, own.T @ own + np.diag([1.0, 2.0, 3.0]))
+
+
+def test_the_geometry_is_about_what_the_body_has_it_to_be_and_of_the_rest_nothing_is_known():
+    vector = np.array([0.06, 0.4, 0.1, 7.0, 9.0])
+    body = SimpleNamespace(settings=DEFAULT_SETTINGS, free=(0, 1, 2))
+    known = _roughly(body, fit_of(np.zeros((1, 4)), active=(0, 1, 2, 4), vector=vector))
+    # A tenth of each, and of the axial distance for x_icr.
+    np.testing.assert_allclose(known, np.diag([0.006**-2.0, 0.04**-2.0, 0.04**-2.0, 0.0]))
+    wheels = SimpleNamespace(settings=DEFAULT_SETTINGS, free=())
+    assert (_roughly(wheels, fit_of(np.zeros((1, 2)), active=(3, 4), vector=vector)) == np.zeros((2, 2))).all()
+
+
+def known(size, seed):
+    root = np.random.default_rng(seed).standard_normal((size, size))
+    return root @ root.T + size * np.eye(size)
+
+
+def test_on_top_of_the_timed_stage_stands_what_else_was_found_as_surely_as_by_itself():
+    body, wheels = BODY.neutral.copy(), WHEEL.neutral.copy()
+    own_body, own_wheels = body.copy(), wheels.copy()
+    own_body[[0, 1, 2, SLIP]] = 0.07, 0.5, 0.2, 0.08
+    own_wheels[[LAG, 13]] = 0.3, 0.1
+    body[:3] = 0.06, 0.4, 0.1
+    wheels[[LAG, DELAY]] = 0.2, 0.05
+    raised = WHEEL.low.copy()
+    raised[[LAG, DELAY, 13]] = 0.01, 0.02, 0.03
+    amended = Freed(
+        (Part(BODY, own_body, (0, 1, 2, SLIP), known(4, 0)), Part(WHEEL, own_wheels, (LAG, 13), known(2, 1))),
+        lambda vectors: Chain(*vectors),
+    )
+    timed = Freed(
+        (
+            Part(BODY, body, (0, 1, 2), known(3, 2)),
+            Part(replace(WHEEL, low=raised), wheels, (LAG, DELAY), known(2, 3)),
+        ),
+        lambda vectors: Chain(*vectors),
+    )
+    both = _on_top(amended, timed)
+    assert both.chain is amended.chain
+    first, second = both.parts
+    assert first.active == (0, 1, 2, SLIP)
+    np.testing.assert_array_equal(first.vector[[0, 1, 2, SLIP]], [0.06, 0.4, 0.1, 0.08])
+    # What is known of an entry alone, whatever the others: the inverse of its variance.
+    alone = 1.0 / np.linalg.inv(known(4, 0))[3, 3]
+    np.testing.assert_allclose(first.information, block_diag(known(3, 2), [[alone]]))
+    assert second.active == (LAG, DELAY, 13)
+    np.testing.assert_array_equal(second.vector[[LAG, DELAY, 13]], [0.2, 0.05, 0.1])
+    np.testing.assert_allclose(second.information, block_diag(known(2, 3), [[1.0 / np.linalg.inv(known(2, 1))[1, 1]]]))
+    # A lag may not become less than the timed stage lets it.
+    np.testing.assert_array_equal(second.layout.low[[LAG, DELAY, 13]], [0.01, 0.02, WHEEL.low[13]])
+    same = _on_top(replace(amended, parts=(replace(amended.parts[0], active=(0, 1, 2), information=known(3, 5)),)),
+                   replace(timed, parts=timed.parts[:1]))  # fmt: skip
+    np.testing.assert_array_equal(same.parts[0].information, known(3, 2))
+
+
+class Noted:
+    """Stands for the fit of the whole chain: it moves each freed entry by `by`; `asked` for so far."""
+
+    def __init__(self, by=0.0, costs=()):
+        self.by, self.asked, self.costs, self.costed = by, [], list(costs), []
+
+    def fit(self, of, left_out=None):
+        self.asked.append((of, left_out))
+        moved = of.vectors(of.joined(lambda part: part.vector) + self.by * (1 if left_out is None else 2 + left_out))
+        return JointFit(tuple(moved), 0.0, of.names, np.eye(len(of.names)))
+
+    def usual_cost(self, chain):
+        self.costed.append(chain)
+        return self.costs[len(self.costed) - 1]
+
+
+def two_parts(active=()):
+    return Freed(
+        (Part(BODY, BODY.neutral, (0, 1, 2), known(3, 0)), Part(WHEEL, WHEEL.neutral, active, known(len(active), 1))),
+        lambda vectors: Chain(*vectors),
+    )
+
+
+@pytest.mark.parametrize("best", range(len(LATE_STARTS_S)))
+def test_lateness_is_freed_from_every_start_and_kept_from_the_best(best):
+    ahead = Noted(0.001, [0.0 if k == best else 1.0 + k for k in range(len(LATE_STARTS_S))])
+    found = _timed(ahead, two_parts((13,)))
+    for (of, left_out), start in zip(ahead.asked, LATE_STARTS_S, strict=True):
+        assert left_out is None
+        body, wheels = of.parts
+        assert body.active == (0, 1, 2)
+        assert wheels.active == (13, LAG, DELAY)
+        assert tuple(wheels.vector[[LAG, DELAY]]) == start
+        np.testing.assert_array_equal(wheels.information, block_diag(known(1, 1), np.zeros((2, 2))))
+        # Real wheels are never ahead of their command, though a wrong clock may let them seem so.
+        assert (wheels.layout.low[[LAG, DELAY]] == 0.0).all()
+        assert wheels.layout.low[13] == WHEEL.low[13]
+    assert tuple(found.parts[1].vector[[LAG, DELAY]]) == pytest.approx(tuple(x + 0.001 for x in LATE_STARTS_S[best]))
+    assert found.parts[1].vector is ahead.costed[best].wheels
+
+
+def test_lateness_that_is_free_already_is_freed_once_and_without_wheels_none():
+    ahead = Noted(costs=[1.0] * len(LATE_STARTS_S))
+    assert _timed(ahead, two_parts((LAG,))).parts[1].active == (LAG, DELAY)
+    alone = replace(two_parts(), parts=two_parts().parts[:1])
+    assert _timed(ahead, alone) is alone
+
+
+def test_folds_are_fitted_from_the_fit_of_all_or_from_where_each_begins():
+    ahead = Noted(0.001)
+    of = two_parts((LAG,))
+    fitted = _Fitted.to(ahead, of)
+    assert [left_out for _, left_out in ahead.asked] == [None, 0, 1]
+    assert ahead.asked[1][0].parts[1].vector[LAG] == pytest.approx(0.001)
+    # Around the fit of all data, and around those without a fold.
+    assert [fitted.at(held).parts[1].vector[LAG] for held in (None, 0, 1)] == pytest.approx([0.001, 0.003, 0.004])
+    assert [fitted.chains[held].wheels[LAG] for held in (0, 1)] == pytest.approx([0.003, 0.004])
+    own = {held: of.at([BODY.neutral, WHEEL.neutral + 10.0 * (1 + held)]) for held in (0, 1)}
+    begun = _Fitted.to(ahead, of, own)
+    assert [begun.folds[held].vectors[1][LAG] for held in (0, 1)] == pytest.approx([10.002, 20.003])
+    assert begun.joint.vectors[1][LAG] == pytest.approx(0.001)
+
+
+@pytest.fixture
+def unfitted(monkeypatch):
+    """Has every fit of the whole chain stay where it begins; what was asked for."""
+    asked = []
+
+    def fit(self, of, left_out=None):
+        asked.append((of, left_out))
+        return Noted().fit(of, left_out)
+
+    monkeypatch.setattr(Ahead, "fit", fit)
+    return asked
+
+
+def errors_in_turn(monkeypatch, *sizes):
+    """Has the amended options err by these positions and headings, in their order."""
+    left = list(sizes)
+
+    def errors(body, wheels, chains, ahead_s, poses):
+        position_m, yaw_rad = left.pop(0)
+        return PredictionErrors(position_m, (0.0, 1.0), yaw_rad, (0.0, 1.0), 0.0, {})
+
+    monkeypatch.setattr(stages, "errors_of", errors)
+
+
+@pytest.mark.parametrize(
+    ("apart", "on_top", "told_on_top"),
+    [((0.1, 0.4), (0.3, 0.1), True), ((0.1, 0.2), (0.3, 0.1), False), ((0.2, 0.2), (0.2, 0.19), True)],
+)
+def test_of_the_amended_stage_the_way_is_told_that_predicts_better(unfitted, monkeypatch, apart, on_top, told_on_top):
+    errors_in_turn(monkeypatch, apart, on_top)
+    analysis = analysed()
+    predictions = joint_predictions(analysis, final_fit(analysis))
+    assert ("command_delay.delay_s" in predictions.joint["amended"][1].names) is told_on_top
+
+
+def test_what_channels_say_is_trusted_to_three_of_their_deviations_and_folds_by_what_the_other_says(
+    unfitted, monkeypatch
+):
+    errors_in_turn(monkeypatch, (0.1, 0.1), (0.2, 0.2))
+    analysis = analysed()
+    joint_predictions(analysis, final_fit(analysis))
+    body, wheels = analysis.body.told, analysis.wheels.told
+    refitted = [of for of, left_out in unfitted if of.names == ("wheel_radius_m", "axial_distance_m", "x_icr_m")]
+    np.testing.assert_allclose(
+        refitted[0].parts[0].information, _roughly(analysis.body.channel, analysis.body.base), rtol=1e-9
+    )
+    names = ("wheel_radius_m", "axial_distance_m", "x_icr_m", "turn_slip.k_s", "motor_lag.tau_s")
+    whole, *folds = ((of, left_out) for of, left_out in unfitted if of.names == names)
+    assert whole[1] is None
+    for part, fitted in zip(whole[0].parts, (body, wheels), strict=True):
+        np.testing.assert_allclose(part.information, fitted.information() / 9.0)
+        np.testing.assert_array_equal(part.vector, fitted.vector)
+    assert [left_out for _, left_out in folds] == [0, 1]
+    for of, held in folds:
+        for part, fitted, found in zip(of.parts, (body, wheels), (analysis.body, analysis.wheels), strict=True):
+            expected = _information(fitted, found.channel, 1 - held) / 9.0
+            np.testing.assert_allclose(part.information, expected)
+            assert (part.vector != fitted.vector).any()
+
+
+def test_without_anything_found_nothing_is_put_on_top(unfitted):
+    analysis = analysed((), ())
+    predictions = joint_predictions(analysis, final_fit(analysis))
+    assert predictions.joint["amended"][1].names == ("wheel_radius_m", "axial_distance_m", "x_icr_m")
+
+
+def test_where_encoders_count_wrong_the_wheels_of_the_chain_have_no_gain():
+    analysis = analysed()
+    gains = [WHEEL.place[f"wheel_gain.{side}"] for side in ("left", "right")]
+    wheels = WHEEL.neutral.copy()
+    wheels[gains] = 0.1, 0.2
+    vectors = [BODY.neutral, wheels]
+    for cause, expected in ((False, (0.1, 0.2)), (True, (0.0, 0.0))):
+        chain = _chain(analysis, SimpleNamespace(encoder_is_cause=cause), vectors)
+        assert tuple(chain.wheels[gains]) == expected
+        assert chain.body is vectors[0]
+        assert chain.body_perturbation is chain.wheels_perturbation is None
+    assert tuple(wheels[gains]) == (0.1, 0.2)

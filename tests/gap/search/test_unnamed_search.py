@@ -1,0 +1,314 @@
+"""Terms without a name: which is tried, what it takes to be accepted, and whether a patch or a change is told."""
+
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from disco_hw.gap.noise.channels import BodyChannel
+from disco_hw.gap.search import channel_search
+from disco_hw.gap.search.channel_search import (
+    ChannelResult,
+    UnnamedTerm,
+    _priced,
+    _thresholds,
+    _time_or_place,
+    best_term,
+    body_moves,
+    with_unnamed,
+)
+from disco_hw.gap.search.least_squares import Fit
+from disco_hw.gap.search.selection import EffectEvidence, Selector, Thresholds
+from disco_hw.gap.search.unnamed_terms import Term
+from disco_hw.gap.settings import DEFAULT_SETTINGS, SelectionSettings
+from tests.gap.synthetic import NOISE, body_channel
+
+
+class Linear:
+    """A channel of 300 residuals, each of which feels one entry of what is added (150, 2); `asked` for so far."""
+
+    settings = DEFAULT_SETTINGS
+
+    def __init__(self, left, held=None):
+        self.left, self.held, self.asked = left, held, []
+        self.inner = self
+
+    def split(self, vector):
+        return vector, self.held
+
+    def residual(self, core, extra):
+        self.asked.append(np.zeros((150, 2)) if extra is None else extra)
+        return self.left + self.asked[-1].ravel()
+
+    def fitted(self, slope):
+        left = self.residual(None, self.held)
+        return Fit(np.zeros(slope.shape[1]), tuple(range(slope.shape[1])), 0.5 * float(left @ left), left, slope)
+
+
+def along(*shares):
+    """A term along some of the residuals."""
+    perturbation = np.zeros(300)
+    perturbation[: len(shares)] = shares
+    return Term(str(shares), perturbation.reshape(150, 2))
+
+
+NOTHING = Term("nothing", np.zeros((150, 2)))
+
+
+def test_the_term_is_tried_that_takes_most_off_the_squares_and_only_if_that_may_be_worth_it():
+    left = np.zeros(300)
+    # Half their squares: 18.6, 32 and 17.4 nats.
+    left[:3] = 6.1, -8.0, 5.9
+    channel = Linear(left)
+    small = channel.fitted(np.empty((300, 0)))
+    first, second, third = along(3.0), along(0.0, 0.2), along(0.0, 0.0, -1.0)
+    assert best_term(small, channel, iter((NOTHING, first, second, third))) == (second, 4)
+    assert best_term(small, channel, iter((second, first, NOTHING))) == (second, 3)
+    assert best_term(small, channel, iter((first,))) == (first, 2)
+    assert best_term(small, channel, iter((third, NOTHING, third))) == (None, 3)
+    # Together 18.6 + 17.4 nats, in the right proportion.
+    assert best_term(small, channel, iter((second, along(6.1, 0.0, 5.9))))[0].form.startswith("(6.1")
+
+
+def test_what_is_fitted_already_is_no_gain_of_a_term():
+    rng = np.random.default_rng(0)
+    slope, left = rng.standard_normal((300, 2)), 2.0 * rng.standard_normal(300)
+    slope[:, 1] += 0.8 * slope[:, 0]
+    # A fit that has not come to its end: what is left pulls along its own entries too.
+    left += slope @ (0.3, -0.5)
+    channel = Linear(left)
+    small = channel.fitted(slope)
+
+    def squares(columns):
+        return float(np.linalg.lstsq(columns, left, rcond=None)[1][0])
+
+    options = [
+        Term(str(k), rng.standard_normal((150, 2)) + left.reshape(150, 2) * rng.uniform(0.1, 0.4)) for k in range(9)
+    ]
+    gains = [squares(slope) - squares(np.column_stack([slope, one.perturbation.ravel()])) for one in options]
+    assert max(gains) > 36.0
+    assert best_term(small, channel, iter(options))[0] is options[int(np.argmax(gains))]
+
+
+@pytest.mark.parametrize(("own", "tried"), [(0.09, False), (0.11, True)])
+def test_a_term_of_which_what_is_fitted_does_the_most_is_not_tried(own, tried):
+    left = np.zeros(300)
+    left[1] = 100.0
+    slope = np.zeros((300, 1))
+    slope[0] = 2.0
+    channel = Linear(left)
+    term = along((1.0 - own) ** 0.5, own**0.5)
+    assert best_term(channel.fitted(slope), channel, iter((term,)))[0] is (term if tried else None)
+
+
+@pytest.mark.parametrize("held", [None, np.full((150, 2), 0.7)])
+def test_a_term_is_tried_in_a_size_that_hardly_matters_on_top_of_terms_that_are_there(held):
+    channel = Linear(np.full(300, 9.0), held)
+    small = channel.fitted(np.empty((300, 0)))
+    channel.asked.clear()
+    best_term(small, channel, iter((along(50.0),)))
+    before, tried = channel.asked
+    assert (before == (0.0 if held is None else 0.7)).all()
+    assert np.sqrt(((tried - before) ** 2).mean()) == pytest.approx(1e-3)
+
+
+def turned_in(since, until, factor):
+    """A drive whose turns are so much larger between two fractions of it, its channel, and the term that says so."""
+    channel, line = body_channel()
+    p = channel.neutral
+    inside = (np.arange(line.t_s.size) >= since * line.t_s.size) & (np.arange(line.t_s.size) < until * line.t_s.size)
+    perturbation = np.zeros((line.t_s.size, 3))
+    perturbation[:, 2] = np.where(inside, p[0] / p[1] * (line.speed_rad_s[:, 1] - line.speed_rad_s[:, 0]), 0.0)
+    moved = channel.track(p, factor * perturbation) - channel.track(p)
+    poses = channel.measured + moved[channel.samples.node]
+    return BodyChannel.build(replace(line, pose_values=poses), NOISE, p), Term("omega += {:.2f} then", perturbation)
+
+
+def searched(channel, names=(), moves=None):
+    return ChannelResult(
+        Selector(channel, moves or body_moves(channel), Thresholds(unnamed_score=20.0)), names, channel
+    )
+
+
+def test_a_term_is_accepted_with_its_number_and_its_evidence_and_what_stood_in_for_it_goes():
+    channel, term = turned_in(0.3, 0.5, -0.15)
+    other = replace(term, form="other", perturbation=np.roll(term.perturbation, 400, axis=0))
+    found = with_unnamed(searched(channel, ("turn_slip",)), lambda found: iter((other, term)))
+    assert found.names == ()
+    (one,) = found.unnamed
+    assert one.form == "omega += -0.15 then"
+    assert one.term is term
+    small, big = searched(channel).selector.exact(("turn_slip",)), one.evidence
+    assert big.gain > 100.0
+    # Its own parameter costs ln n, and the choice of one in two twice ln 2.
+    price = np.log(channel.count) + 2.0 * np.log(2.0)
+    assert big.score == pytest.approx(2.0 * big.gain / big.inflation - price)
+    assert found.fit.cost < small.cost - 100.0
+    assert found.fit.vector[-1] == pytest.approx(-0.15, abs=0.01)
+    assert found.base.cost == pytest.approx(searched(channel).selector.exact(()).cost)
+    assert found.base.vector.size == channel.neutral.size
+    assert found.plain.channel is channel
+
+
+def test_no_more_terms_are_added_than_two(monkeypatch):
+    channel, term = turned_in(0.1, 0.9, -0.2)
+    size = channel.drive.t_s.size
+    inside = [(np.arange(size) // (size // 5) == k)[:, None] for k in (1, 2, 3)]
+    parts = [replace(term, perturbation=np.where(of, term.perturbation, 0.0)) for of in inside]
+    monkeypatch.setattr(channel_search, "compare", lambda *_: EffectEvidence(30.0, 10.0, 1.0, 1.0, 40.0))
+    found = with_unnamed(searched(channel), lambda found: iter(parts))
+    assert len(found.unnamed) == 2
+    assert found.unnamed[0].term is not found.unnamed[1].term
+    # Both coefficients are told as they are when both are in.
+    assert [one.form for one in found.unnamed] == [f"omega += {k:.2f} then" for k in found.fit.vector[-2:]]
+    assert found.fit.vector.size == channel.neutral.size + 2
+
+
+@pytest.mark.parametrize(
+    ("score", "repeated", "moved_m", "accepted"),
+    [
+        (20.0, 1.0, 0.001, True),
+        (19.9, 1.0, 0.1, False),
+        (40.0, 0.01, 0.001, True),
+        (40.0, 0.0, 0.1, False),
+        (40.0, -1.0, 0.1, False),
+        (40.0, 1.0, 0.0009, False),
+    ],
+)
+def test_a_term_takes_its_score_and_repeats_and_moves_predictions(monkeypatch, score, repeated, moved_m, accepted):
+    channel, term = turned_in(0.3, 0.5, -0.15)
+    proof = EffectEvidence(30.0, 10.0, repeated, 1.0, score)
+    monkeypatch.setattr(channel_search, "compare", lambda *_: proof)
+    found = with_unnamed(searched(channel, moves=lambda small, big: moved_m), lambda found: iter((term,)))
+    assert [one.evidence for one in found.unnamed] == ([proof] if accepted else [])
+
+
+def test_a_patch_is_looked_for_closer_around_the_best(monkeypatch):
+    channel, term = turned_in(0.3, 0.5, -0.15)
+    rough = replace(
+        term, form="rough {:.1f}", perturbation=np.roll(term.perturbation, 100, axis=0), disc=(1.0, 2.0, 0.5)
+    )
+    near = replace(term, disc=(1.1, 2.0, 0.5))
+    asked = []
+
+    def closer(inner, p, disc):
+        asked.append((inner, disc))
+        return iter((near, replace(near, perturbation=0.0 * term.perturbation)))
+
+    monkeypatch.setattr(channel_search, "places_near", closer)
+    found = with_unnamed(searched(channel), lambda found: iter((rough, rough, rough)))
+    assert asked[0] == (channel, rough.disc)
+    (one,) = found.unnamed
+    assert one.term is near
+    # Three were tried, and the best of them with two around it.
+    price = np.log(channel.count) + 2.0 * np.log(6.0)
+    assert one.evidence.score == pytest.approx(2.0 * one.evidence.gain / one.evidence.inflation - price)
+
+
+@dataclass(frozen=True)
+class Searched:
+    """What is looked at of a channel's search."""
+
+    names: tuple = ("turn_slip", "surface_change")
+    unnamed: tuple = ()
+    price: float = 100.0
+    given: tuple = ()
+    either: tuple = ()
+
+    @property
+    def channel(self):
+        return SimpleNamespace(settings=DEFAULT_SETTINGS)
+
+    @property
+    def selector(self):
+        return SimpleNamespace(given=self.given)
+
+
+PATCH = UnnamedTerm("patch", None, replace(NOTHING, disc=(0.0, 0.0, 1.0)))
+PLAIN = UnnamedTerm("plain", None, NOTHING)
+
+
+def told(monkeypatch, found, placed_price=90.0, placed_terms=(PATCH,), placed_names=("turn_slip",)):
+    searches = []
+
+    def named(one, options):
+        searches.append(one.names)
+        if "surface_change" in one.names:
+            return one
+        return replace(one, unnamed=placed_terms, price=placed_price, names=placed_names)
+
+    monkeypatch.setattr(channel_search, "with_unnamed", named)
+    monkeypatch.setattr(channel_search, "_priced", lambda one: one.price)
+    return _time_or_place(found), searches
+
+
+def test_a_patch_is_told_in_place_of_a_change_that_is_not_clearly_better(monkeypatch):
+    change = Searched()
+    clearly = DEFAULT_SETTINGS.selection.place_nats
+    both, searches = told(monkeypatch, change, 100.0 + 0.9 * clearly)
+    assert searches == [("turn_slip", "surface_change"), ("turn_slip",)]
+    assert (both.names, both.unnamed, both.either) == (("turn_slip",), (PATCH,), ("surface_change",))
+    assert told(monkeypatch, change, 100.0 - 0.9 * clearly)[0].either == ("surface_change",)
+    assert told(monkeypatch, change, 100.0 + clearly)[0] is change
+    placed = told(monkeypatch, change, 100.0 - clearly)[0]
+    assert (placed.names, placed.either) == (("turn_slip",), ())
+
+
+def test_a_change_stays_where_no_patch_was_found_or_the_change_beside_it(monkeypatch):
+    change = Searched()
+    assert told(monkeypatch, change, placed_terms=(PLAIN,))[0] is change
+    assert told(monkeypatch, change, placed_terms=())[0] is change
+    assert told(monkeypatch, change, placed_terms=(PLAIN, PATCH))[0].unnamed == (PLAIN, PATCH)
+    assert told(monkeypatch, change, placed_names=("turn_slip", "surface_change"))[0] is change
+
+
+def test_without_a_change_of_the_floor_or_with_a_known_one_no_patch_competes(monkeypatch):
+    plain = Searched(("turn_slip",))
+    assert told(monkeypatch, plain)[1] == [("turn_slip",)]
+    known = replace(plain, names=("surface_change",), given=("surface_change",))
+    assert told(monkeypatch, known)[1] == [("surface_change",)]
+
+
+def test_the_price_of_a_patch_is_that_of_four_numbers_and_of_a_term_one_and_the_choice_among_all():
+    def priced(names, unnamed, count=1000):
+        channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=count)
+        return _priced(SimpleNamespace(names=names, unnamed=unnamed, channel=channel, fit=SimpleNamespace(cost=50.0)))
+
+    each = 0.5 * np.log(1000)
+    assert priced((), ()) == 50.0
+    assert priced(("slope",), ()) == pytest.approx(50.0 + 2.0 * each)
+    assert priced(("slope",), (PATCH,)) == pytest.approx(50.0 + 6.0 * each)
+    assert priced(("slope",), (PLAIN, PATCH)) == pytest.approx(50.0 + 7.0 * each + np.log(110))
+    assert priced(("slope",), (), 1) == pytest.approx(50.0 + np.log(2.0))
+
+
+def heavy(white, use=None):
+    white = np.asarray(white, dtype=float)
+    settings = SelectionSettings(named_score=4.0, unnamed_score=20.0, least_moved_m=0.002)
+    return _thresholds(white, np.ones(white.shape[0], dtype=bool) if use is None else np.asarray(use), settings)
+
+
+def test_the_heavier_the_tails_of_the_noise_the_more_evidence_it_takes():
+    # A fourth of the samples twice and the rest nothing like as large: a kurtosis of 3.6 and of 12.8 over 3.
+    some = np.array([[3.0, 3.0]] * 9 + [[0.5, 0.5]] * 32)
+    kurtosis = (some**4).mean() / (some**2).mean() ** 2
+    assert 1.0 < kurtosis / 3.0 < 1.5
+    assert heavy(some) == Thresholds(pytest.approx(4.0 * kurtosis / 3.0), 0.002, pytest.approx(20.0 * kurtosis / 3.0))
+    few = np.array([[5.0, 5.0]] + [[0.1, 0.1]] * 60)
+    assert heavy(few) == Thresholds(6.0, 0.002, 30.0)
+    # Light ones do not make it easier.
+    assert heavy(np.ones((40, 2))) == Thresholds(4.0, 0.002, 20.0)
+
+
+def test_only_samples_that_are_used_and_say_something_tell_of_tails():
+    some = np.array([[3.0, 3.0]] * 9 + [[0.5, 0.5]] * 32)
+    plain = heavy(some)
+    silent = np.zeros((500, 2))
+    silent[:, 1] = 0.0009
+    assert heavy(np.vstack([some, silent])) == plain
+    # One of the two is enough.
+    assert heavy(np.vstack([some, [[0.0, 0.5]] * 10])) != plain
+    unused = np.vstack([some, [[9.0, 9.0]]])
+    assert heavy(unused, [True] * 41 + [False]) == plain
+    assert heavy(silent) == heavy(some, [False] * 41) == Thresholds(4.0, 0.002)
