@@ -209,8 +209,9 @@ class Effect:
     Traits: `uses_geometry`, whether its coefficients depend on the geometry; `may_turn_more`, whether it can make the
     robot turn faster than its wheels say; `late_by`, the parameter that is a time by which wheels are behind commands,
     fitted from `late_starts`; `dead_by`, the parameter that is what a drive takes off a command;
-    `like_a_patch`, what decides between it and a patch of the floor if that leaves the same traces; `mimics`, an effect
-    that competes in its place.
+    `also_seen_as`, an effect of the other channel, by its module, and its parameter that is the same quantity as the
+    first one here; `like_a_patch`, what decides between it and a patch of the floor if that leaves the same traces;
+    `mimics`, an effect that competes in its place.
 
     How it is searched for: all parameters from neutral; or from the best of `starts` for a drive; or one by a `scan`.
     `limited(commands, geometry)` is, for a limit, what it limits, (N,); `trials` are sizes to try in turn where it is
@@ -236,6 +237,7 @@ class Effect:
     late_by: str | None = None
     dead_by: str | None = None
     late_starts: tuple[float, ...] = ()
+    also_seen_as: tuple[Any, str] | None = None
     like_a_patch: str | None = None
     mimics: Mimicked | None = None
     starts: Callable[[CommandedDrive], tuple[tuple[float, ...], ...]] | None = None
@@ -282,6 +284,11 @@ class Effect:
     def columns(self) -> tuple[str, ...]:
         """Full names of its parameters, as models and logs have them."""
         return tuple(f"{self.name}.{parameter.name}" for parameter in self.parameters)
+
+    @property
+    def witness(self) -> str | None:
+        """Full name of the other channel's parameter that is the same quantity as the first one, if there is one."""
+        return None if self.also_seen_as is None else f"{self.also_seen_as[0].EFFECT.name}.{self.also_seen_as[1]}"
 
     @property
     def is_limit(self) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from disco_hw.effects import Array, Channel, Effect, Parameter, Stage, Symptom, Value, Values
+from disco_hw.effects import Array, Channel, Effect, Parameter, Stage, Symptom, Value, Values, turning_load
 from disco_hw.jit import scalar_function
 
 
@@ -37,6 +37,7 @@ EFFECT = Effect(
     coefficients=coefficients,
     term=term,
     may_turn_more=True,
+    also_seen_as=(turning_load, "unequal"),
     symptoms=(Symptom.TURNS_ON_STRAIGHTS, Symptom.LEFT_UNLIKE_RIGHT),
     excitation="long straights, forward and back",
     script="straights",

@@ -233,7 +233,21 @@ class Measured:
         disputed: dict[str, str] = {}
         for found in (analysis.body, analysis.wheels):
             disputed |= {} if found is None else disputed_names(found)
-        return cls(analysis.drive, (float(vector[0]), float(vector[1])), disputed)
+        estimated: dict[str, ParameterEstimate] = {}
+        for channel in (final.body_estimates, final.wheel_estimates):
+            estimated |= {} if channel is None else channel.by_name
+        doubted = {name: why for name, why in disputed.items() if not _confirmed(REGISTRY[name], estimated)}
+        return cls(analysis.drive, (float(vector[0]), float(vector[1])), doubted)
+
+
+def _confirmed(effect: Effect, estimated: Mapping[str, ParameterEstimate]) -> bool:
+    """Whether the other channel, from other measurements, says the same of an effect, and clearly not nothing."""
+    own, other = estimated.get(effect.columns[0]), estimated.get(effect.witness or "")
+    if own is None or other is None:
+        return False
+    nothing = effect.parameters[0].neutral
+    overlap = own.low <= other.high and other.low <= own.high
+    return overlap and not (own.low <= nothing <= own.high or other.low <= nothing <= other.high)
 
 
 def sort_out(

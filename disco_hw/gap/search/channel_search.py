@@ -320,9 +320,10 @@ def with_unnamed(found: ChannelResult, options: Callable[[ChannelResult], Iterat
             tried += closer
         channel = WithTerms.of(found.channel, (*terms, best))
         small = found.fit
-        start = np.append(small.vector, 0.0)
-        selector = Selector(channel, found.selector.moves, given=found.selector.given, start=_extended(plain, channel))
-        selector.fits[frozenset(found.names)] = big = fit(channel, start, indices(channel, found.names))
+        begin = np.append(small.vector, 0.0)
+        moves, given, start = found.selector.moves, found.selector.given, _extended(plain, channel)
+        selector = Selector(channel, moves, plain.thresholds, given=given, start=start)
+        selector.fits[frozenset(found.names)] = big = fit(channel, begin, indices(channel, found.names))
         parameters = 1.0 + 2.0 * math.log(tried) / math.log(channel.count)
         proof = compare(small, big, channel, parameters)
         moved = selector.moves(found.selector.channel.split(small.vector), channel.split(big.vector))

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report import EffectFinding
-from disco_hw.gap.report.judge import Measured, doubt_of, sort_out
+from disco_hw.gap.report.judge import Measured, _confirmed, doubt_of, sort_out
 from disco_hw.gap.search.analysis import ParameterEstimate
 from tests.gap.synthetic import line_of
 
@@ -54,3 +55,26 @@ def test_effects_are_parted_and_keep_their_order():
     sure, doubtful = sort_out(effects, drive())
     assert [one.name for one in sure] == ["motor_lag"]
     assert [(one.name, "exceeded" in one.why) for one in doubtful] == [("speed_limit", True)]
+
+
+@pytest.mark.parametrize(
+    ("of_body", "of_wheels", "confirmed"),
+    [
+        ((0.02, 0.015, 0.025), (0.021, 0.020, 0.022), True),
+        ((0.02, 0.015, 0.025), (0.026, 0.025, 0.027), True),
+        ((0.02, 0.015, 0.025), (0.027, 0.026, 0.028), False),
+        ((0.02, 0.015, 0.025), (0.013, 0.012, 0.014), False),
+        # Nothing is no witness, and needs none.
+        ((0.02, 0.015, 0.025), (0.010, -0.010, 0.030), False),
+        ((0.02, -0.001, 0.041), (0.021, 0.020, 0.022), False),
+        ((-0.02, -0.025, -0.015), (-0.021, -0.022, -0.020), True),
+    ],
+)
+def test_what_both_channels_say_alike_is_not_disputed(of_body, of_wheels, confirmed):
+    """Unequal wheels lead the robot aside, and share the load of a turn unequally."""
+    said = {"wheel_radius_asymmetry.ratio": of_body, "turning_load.unequal": of_wheels}
+    estimated = {name: ParameterEstimate(*values) for name, values in said.items()}
+    assert _confirmed(REGISTRY["wheel_radius_asymmetry"], estimated) == confirmed
+    assert not _confirmed(REGISTRY["turn_slip"], {**estimated, "turn_slip.k_s": ParameterEstimate(0.1, 0.09, 0.11)})
+    del estimated["turning_load.unequal"]
+    assert not _confirmed(REGISTRY["wheel_radius_asymmetry"], estimated)
