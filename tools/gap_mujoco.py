@@ -38,12 +38,12 @@ from tools.gap_study import revision
 from tools.mujoco_robot import (
     DOWNHILL_RAD,
     EFFECTS,
+    ROBOTS,
     STEPS_PER_COMMAND,
     STEPS_PER_S,
-    TRACK_M,
-    WHEEL_RADIUS_M,
     Hidden,
     Recording,
+    Robot,
     record,
 )
 
@@ -113,7 +113,7 @@ def truth_of(hidden: str, recording: Recording, beside: Sequence[str] = ()) -> f
     """
     if hidden not in NAMES:
         return None
-    size = EFFECTS[hidden][0]
+    size = recording.hidden.get(hidden, 0.0)
     match hidden:
         case "command_delay" | "motor_lag":
             return response_of(recording)[hidden]
@@ -127,7 +127,7 @@ def truth_of(hidden: str, recording: Recording, beside: Sequence[str] = ()) -> f
             way = np.gradient(x, t_s) * np.cos(yaw) + np.gradient(y, t_s) * np.sin(yaw)
             wheels = np.gradient(recording.turned[every].mean(axis=1), t_s)
             rate = np.gradient(yaw, t_s)
-            speed = WHEEL_RADIUS_M * wheels
+            speed = recording.robot.wheel_radius_m * wheels
             forms = [re.sub(r"abs\((\w+)\)", r"|\1|", form.split(" ", 3)[3]) for form in beside if form[:4] == "v_x "]
             known = [
                 BODY_FEATURES[form](speed, rate, np.gradient(speed, t_s), t_s)
@@ -188,11 +188,11 @@ def injected_floor(recording: Recording) -> tuple[float, float]:
     return 1e3 * float(np.sqrt((off[:, :2] ** 2).sum(axis=1).mean())), 1e3 * float(np.sqrt((off[:, 2] ** 2).mean()))
 
 
-def work(hidden: str, seed: int) -> Result:
+def work(hidden: str, seed: int, robot: Robot = ROBOTS["middle"]) -> Result:
     """Make a drive and one that is kept back, search the first as `disco-hw gap` does, predict the other."""
-    sizes: Hidden = {hidden: EFFECTS[hidden][0]} if hidden in EFFECTS else {}
-    seen, kept_back = record(sizes, seed), record(sizes, seed + UNSEEN)
-    nominal = Model(WHEEL_RADIUS_M, TRACK_M, 0.0)
+    sizes: Hidden = {hidden: robot.size(hidden)} if hidden in EFFECTS else {}
+    seen, kept_back = record(sizes, seed, robot=robot), record(sizes, seed + UNSEEN, robot=robot)
+    nominal = Model(robot.wheel_radius_m, robot.track_m, 0.0)
     began = time.process_time()
     analysis, _ = search_log(seen.as_drive(), nominal)
     final = final_fit(analysis)
@@ -260,30 +260,32 @@ def table(results: Sequence[Result]) -> list[str]:
     ]
 
 
-def study(hidden: Iterable[str], seeds: Iterable[int], out: Path) -> list[Result]:
+def study(hidden: Iterable[str], seeds: Iterable[int], out: Path, robot: str = "middle") -> list[Result]:
     """All results, from before with this code or new, each kept as soon as it is there."""
     folder = out / "results" / f"mujoco-{revision()}"
     folder.mkdir(parents=True, exist_ok=True)
     names, results = list(hidden), []
     for seed in seeds:
         for name in names:
-            path = folder / f"{name}-{seed}.json"
+            path = folder / f"{robot}-{name}-{seed}.json"
             if path.exists():
                 result = msgspec.json.decode(path.read_bytes(), type=Result)
             else:
-                result = work(name, seed)
+                result = work(name, seed, ROBOTS[robot])
                 unfinished = path.with_suffix(".part")
                 unfinished.write_bytes(msgspec.json.encode(result))
                 unfinished.replace(path)
             results.append(result)
             print(row(result), file=sys.stderr, flush=True)
-    (out / "gap_mujoco.md").write_text("\n".join(table(results)) + "\n", encoding="utf-8")
+    name = "gap_mujoco.md" if robot == "middle" else f"gap_mujoco_{robot}.md"
+    (out / name).write_text("\n".join(table(results)) + "\n", encoding="utf-8")
     return results
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tools.gap_mujoco", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("hidden", nargs="*", metavar="EFFECT", help=f"of nothing, {', '.join(EFFECTS)} (all)")
+    parser.add_argument("--robot", choices=tuple(ROBOTS), default="middle", help="which robot (middle)")
     parser.add_argument("--seeds", type=int, default=3, help="drives of each hidden effect (3)")
     parser.add_argument("--first", type=int, default=1, help="first seed (1)")
     parser.add_argument("-o", "--out", type=Path, default=Path("out/gap_study"), help="directory to write to")
@@ -292,7 +294,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if unknown:
         parser.error(f"no such effect: {', '.join(sorted(unknown))}; write some of nothing, {', '.join(EFFECTS)}")
     seeds = range(options.first, options.first + options.seeds)
-    print("\n".join(table(study(options.hidden or ["nothing", *EFFECTS], seeds, options.out))))
+    print("\n".join(table(study(options.hidden or ["nothing", *EFFECTS], seeds, options.out, options.robot))))
     return 0
 
 

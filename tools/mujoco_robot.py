@@ -5,8 +5,8 @@ person with a joystick. It shares no constant and no equation with the virtual r
 for missing effects fits (`tests/tools/test_mujoco_robot.py` holds it to that): turning, slip and droop are what contact
 and servos make of them.
 
-Poses are of the base's middle and carry white noise of POSITION_STD_M on each axis and YAW_STD_RAD; encoders are those
-of the motors, the mean of a side's two, in steps of 2 pi / COUNTS_PER_TURN. Stamps are exact.
+Poses are of the base's middle and carry white noise on each axis and on the yaw; encoders are those of the motors, the
+mean of a side's two, in steps of a turn over their counts. Stamps are exact. There are robots of three sizes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import argparse
 import math
 import sys
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -57,6 +57,105 @@ EFFECTS = {
 """What can be hidden: a usual size, and what the size means."""
 Hidden = dict[str, float]
 
+
+@dataclass(frozen=True, slots=True)
+class Robot:
+    """One robot: its sizes in m and kg, its servos, encoders and poses; `sizes`: of what is hidden, where not as usual.
+
+    `half_m`: half the base's length, width and height; `above_m`: of its middle above the wheels'; `rotor_kg_m2`: of a
+    motor, seen from its wheel; `payload_m`: half the edge of the box that is put on, and where.
+    """
+
+    wheel_radius_m: float = WHEEL_RADIUS_M
+    track_m: float = TRACK_M
+    wheelbase_m: float = WHEELBASE_M
+    top_rad_s: float = TOP_RAD_S
+    counts_per_turn: int = COUNTS_PER_TURN
+    position_std_m: float = POSITION_STD_M
+    yaw_std_rad: float = YAW_STD_RAD
+    servo_nm_s: float = SERVO_NM_S
+    servo_lag_s: float = SERVO_LAG_S
+    torque_nm: float = TORQUE_NM
+    friction: float = 0.57
+    base_kg: float = 33.0
+    half_m: tuple[float, float, float] = (0.29, 0.165, 0.055)
+    above_m: float = 0.033
+    wheel_kg: float = 1.9
+    wheel_half_m: float = 0.042
+    rotor_kg_m2: float = 0.105
+    bearing_nm_s: float = 0.023
+    payload_m: Mapping[str, float] = field(default_factory=lambda: {"half": 0.07, "aside": 0.165, "high": 0.165})
+    sizes: Mapping[str, float] = field(default_factory=dict)
+
+    def size(self, effect: str) -> float:
+        """Usual size of what can be hidden."""
+        return self.sizes.get(effect, EFFECTS[effect][0])
+
+
+ROBOTS = {
+    "middle": Robot(),
+    "heavy": Robot(
+        wheel_radius_m=0.163,
+        track_m=0.63,
+        wheelbase_m=0.39,
+        top_rad_s=6.1,
+        counts_per_turn=3900,
+        position_std_m=0.0032,
+        yaw_std_rad=0.0041,
+        servo_nm_s=24.7,
+        servo_lag_s=0.059,
+        torque_nm=61.0,
+        friction=0.79,
+        base_kg=47.0,
+        sizes={
+            "command_delay": 0.097,
+            "motor_lag": 0.155,
+            "dead_band": 0.36,
+            "unequal_wheels": 0.021,
+            "pose_latency": 0.125,
+            "slope": 4.1,
+            "payload": 18.5,
+            "torque_limit": 14.3,
+            "worn_tyre": 0.51,
+            "backlash": 0.053,
+        },
+    ),
+    "light": Robot(
+        wheel_radius_m=0.0615,
+        track_m=0.266,
+        wheelbase_m=0.205,
+        top_rad_s=9.1,
+        counts_per_turn=2060,
+        position_std_m=0.0021,
+        yaw_std_rad=0.0053,
+        servo_nm_s=0.91,
+        servo_lag_s=0.031,
+        torque_nm=4.1,
+        friction=0.69,
+        base_kg=5.2,
+        half_m=(0.135, 0.081, 0.029),
+        above_m=0.0155,
+        wheel_kg=0.255,
+        wheel_half_m=0.0195,
+        rotor_kg_m2=0.0061,
+        bearing_nm_s=0.0021,
+        payload_m={"half": 0.031, "aside": 0.081, "high": 0.0815},
+        sizes={
+            "command_delay": 0.205,
+            "motor_lag": 0.31,
+            "dead_band": 0.81,
+            "unequal_wheels": 0.031,
+            "pose_latency": 0.155,
+            "slope": 7.2,
+            "payload": 2.1,
+            "torque_limit": 0.81,
+            "worn_tyre": 0.41,
+            "backlash": 0.155,
+        },
+    ),
+}
+"""Robots of three sizes; where none is named, the first."""
+
 _WHEELS = (("fl", 1, 1), ("fr", 1, -1), ("rl", -1, 1), ("rr", -1, -1))
 _MODEL = """
 <mujoco>
@@ -64,8 +163,8 @@ _MODEL = """
   <option timestep="{step_s}" integrator="implicitfast" cone="elliptic" impratio="9" gravity="{gravity}"/>
   <worldbody>
     <geom name="floor" type="plane" size="99 99 1" solref="0.0042 1"/>
-    <body name="base" pos="0 0 0.155"><freejoint/>
-      <geom type="box" size="0.29 0.165 0.055" mass="33" pos="0 0 0.033"/>{payload}{wheels}
+    <body name="base" pos="0 0 {high}"><freejoint/>
+      <geom type="box" size="{half}" mass="{base_kg}" pos="0 0 {above}"/>{payload}{wheels}
     </body>
   </worldbody>
   <actuator>{servos}
@@ -73,10 +172,10 @@ _MODEL = """
 </mujoco>"""
 _WHEEL = """
       <body pos="{x} {y} -0.021">
-        <joint name="{name}" type="hinge" axis="0 1 0" damping="0.023" armature="0.105" frictionloss="{dry_nm}"/>
+        <joint name="{name}" type="hinge" axis="0 1 0" damping="{damping}" armature="{rotor}" frictionloss="{dry_nm}"/>
         <geom type="sphere" size="0.011" mass="0.13" contype="0" conaffinity="0"/>
         <body>{play}
-          <geom type="cylinder" size="{radius} 0.042" zaxis="0 1 0" mass="1.9" priority="1" condim="4"
+          <geom type="cylinder" size="{radius} {width}" zaxis="0 1 0" mass="{wheel_kg}" priority="1" condim="4"
                 friction="{friction} 0.0044 0.0011" solref="0.0042 1"/>
         </body>
       </body>"""
@@ -86,7 +185,7 @@ _PLAY = """
 _SERVO = """
     <general joint="{name}" dyntype="filterexact" dynprm="{lag_s}" gainprm="{gain}" biastype="affine"
              biasprm="0 0 -{gain}" forcerange="-{most} {most}"/>"""
-_PAYLOAD = '<geom type="box" size="0.07 0.07 0.07" mass="{}" pos="0 0.165 0.165"/>'
+_PAYLOAD = '<geom type="box" size="{half} {half} {half}" mass="{kg}" pos="0 {aside} {high}"/>'
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +208,7 @@ class Recording:
     turned: Array
     noise: Array
     hidden: Hidden = field(default_factory=dict)
+    robot: Robot = ROBOTS["middle"]
 
     def as_drive(self) -> DriveLog:
         """The log that a host would have: nothing of the truth."""
@@ -125,18 +225,22 @@ class Recording:
         )
 
 
-def mjcf(hidden: Hidden) -> str:
-    """The robot as MuJoCo's model text."""
+def mjcf(hidden: Hidden, robot: Robot = ROBOTS["middle"]) -> str:
+    """A robot as MuJoCo's model text."""
     tilt = math.radians(hidden.get("slope", 0.0))
     pull = [9.81 * math.sin(tilt) * part for part in (math.cos(DOWNHILL_RAD), math.sin(DOWNHILL_RAD))]
     wheels = "".join(
         _WHEEL.format(
             name=name,
-            x=front * WHEELBASE_M / 2,
-            y=left * TRACK_M / 2,
-            radius=WHEEL_RADIUS_M * (1.0 + (hidden.get("unequal_wheels", 0.0) if left < 0 else 0.0)),
-            friction=0.57 * (hidden.get("worn_tyre", 1.0) if name == "fl" else 1.0),
-            dry_nm=hidden.get("dead_band", 0.0) * SERVO_NM_S,
+            x=front * robot.wheelbase_m / 2,
+            y=left * robot.track_m / 2,
+            radius=robot.wheel_radius_m * (1.0 + (hidden.get("unequal_wheels", 0.0) if left < 0 else 0.0)),
+            width=robot.wheel_half_m,
+            wheel_kg=robot.wheel_kg,
+            damping=robot.bearing_nm_s,
+            rotor=robot.rotor_kg_m2,
+            friction=robot.friction * (hidden.get("worn_tyre", 1.0) if name == "fl" else 1.0),
+            dry_nm=hidden.get("dead_band", 0.0) * robot.servo_nm_s,
             play=_PLAY.format(half=hidden["backlash"] / 2) if "backlash" in hidden else "",
         )
         for name, front, left in _WHEELS
@@ -144,22 +248,26 @@ def mjcf(hidden: Hidden) -> str:
     servos = "".join(
         _SERVO.format(
             name=name,
-            lag_s=hidden.get("motor_lag", SERVO_LAG_S),
-            gain=SERVO_NM_S,
-            most=hidden.get("torque_limit", TORQUE_NM),
+            lag_s=hidden.get("motor_lag", robot.servo_lag_s),
+            gain=robot.servo_nm_s,
+            most=hidden.get("torque_limit", robot.torque_nm),
         )
         for name, *_ in _WHEELS
     )
     return _MODEL.format(
         step_s=1.0 / STEPS_PER_S,
         gravity=f"{pull[0]} {pull[1]} {-9.81 * math.cos(tilt)}",
-        payload=_PAYLOAD.format(hidden["payload"]) if "payload" in hidden else "",
+        high=robot.wheel_radius_m + 0.022,
+        half=" ".join(map(str, robot.half_m)),
+        base_kg=robot.base_kg,
+        above=robot.above_m,
+        payload=_PAYLOAD.format(kg=hidden["payload"], **robot.payload_m) if "payload" in hidden else "",
         wheels=wheels,
         servos=servos,
     )
 
 
-def joystick(seed: int, duration_s: float = DURATION_S) -> Array:
+def joystick(seed: int, duration_s: float = DURATION_S, top_rad_s: float = TOP_RAD_S) -> Array:
     """Wheel-speed commands (N, 2) of a person who tries a robot out: straights, turns, arcs, weaving, pauses, stops.
 
     A wish is held for some seconds and reached as fast as a thumb moves; the stick is never quite still.
@@ -180,7 +288,7 @@ def joystick(seed: int, duration_s: float = DURATION_S) -> Array:
         now = now + np.clip(wish - now, -thumb, thumb)
         stick[k] = now
     sides = np.column_stack([stick[:, 0] - stick[:, 1], stick[:, 0] + stick[:, 1]])
-    return TOP_RAD_S * np.clip(sides, -1.0, 1.0)
+    return top_rad_s * np.clip(sides, -1.0, 1.0)
 
 
 def _round(rng: np.random.Generator) -> list[tuple[float, float, float]]:
@@ -211,8 +319,8 @@ def _slow(rng: np.random.Generator, shape: tuple[int, ...], samples: float) -> A
     return white
 
 
-def record(hidden: Hidden, seed: int, command: Array | None = None) -> Recording:
-    """Drive the robot with these effects hidden in it; `command`: (N, 2), in place of the joystick's.
+def record(hidden: Hidden, seed: int, command: Array | None = None, robot: Robot = ROBOTS["middle"]) -> Recording:
+    """Drive a robot with these effects hidden in it; `command`: (N, 2), in place of the joystick's.
 
     Raises ValueError for an effect that does not exist, ImportError without mujoco.
     """
@@ -221,8 +329,8 @@ def record(hidden: Hidden, seed: int, command: Array | None = None) -> Recording
     unknown = set(hidden) - set(EFFECTS)
     if unknown:
         raise ValueError(f"no such effect: {', '.join(sorted(unknown))}; give some of {', '.join(EFFECTS)}")
-    command = joystick(seed) if command is None else command
-    model = mujoco.MjModel.from_xml_string(mjcf(hidden))
+    command = joystick(seed, top_rad_s=robot.top_rad_s) if command is None else command
+    model = mujoco.MjModel.from_xml_string(mjcf(hidden, robot))
     data = mujoco.MjData(model)
     motors = [model.joint(name).qposadr[0] for name, *_ in _WHEELS]
     waiting = deque([np.zeros(4)] * round(hidden.get("command_delay", 0.0) * STEPS_PER_S))
@@ -242,10 +350,10 @@ def record(hidden: Hidden, seed: int, command: Array | None = None) -> Recording
     where[:, 2] = np.unwrap(where[:, 2])
     now_s = np.arange(steps) / STEPS_PER_S
     sides = np.column_stack([turned[:, [0, 2]].mean(axis=1), turned[:, [1, 3]].mean(axis=1)])
-    count = 2 * math.pi / COUNTS_PER_TURN
+    count = 2 * math.pi / robot.counts_per_turn
     read, seen = np.arange(0, steps, STEPS_PER_READING), np.arange(0, steps, STEPS_PER_POSE)
     noise = np.random.default_rng([seed, 1234]).standard_normal((seen.size, 3))
-    noise *= [POSITION_STD_M, POSITION_STD_M, YAW_STD_RAD]
+    noise *= [robot.position_std_m, robot.position_std_m, robot.yaw_std_rad]
     pose = where[seen] + noise
     pose[:, 2] = np.arctan2(np.sin(pose[:, 2]), np.cos(pose[:, 2]))
     latency_s = hidden.get("pose_latency", 0.0)
@@ -262,6 +370,7 @@ def record(hidden: Hidden, seed: int, command: Array | None = None) -> Recording
         turned=turned,
         noise=noise[inside],
         hidden=dict(hidden),
+        robot=robot,
     )
 
 
@@ -269,20 +378,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tools.mujoco_robot", description=(__doc__ or "").split(":")[0])
     about = "; ".join(f"{name}={usual} {meaning}" for name, (usual, meaning) in EFFECTS.items())
     parser.add_argument("--hide", action="append", default=[], metavar="EFFECT[=SIZE]", help=about)
+    parser.add_argument("--robot", choices=tuple(ROBOTS), default="middle", help="which robot (middle)")
     parser.add_argument("--seed", type=int, default=1, help="of drive and noise (1)")
     parser.add_argument("--seconds", type=float, default=DURATION_S, help=f"length of the drive ({DURATION_S:g})")
     parser.add_argument("-o", "--out", type=Path, required=True, help="log to write")
     options = parser.parse_args(arguments)
-    hidden = {}
+    hidden, robot = {}, ROBOTS[options.robot]
     for text in options.hide:
         name, _, size = text.partition("=")
         if name not in EFFECTS:
             parser.error(f"--hide {text}: no such effect; give some of {', '.join(EFFECTS)}")
         try:
-            hidden[name] = float(size) if size else EFFECTS[name][0]
+            hidden[name] = float(size) if size else robot.size(name)
         except ValueError:
             parser.error(f"--hide {text}: {size} is no number")
-    driven = record(hidden, options.seed, joystick(options.seed, options.seconds))
+    command = joystick(options.seed, options.seconds, robot.top_rad_s)
+    driven = record(hidden, options.seed, command, robot)
     records = write_log(driven.as_drive(), options.out, "mujoco")
     print(f"{options.out}: {records} records")
     return 0

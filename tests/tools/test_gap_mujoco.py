@@ -9,7 +9,7 @@ import pytest
 
 from tools import gap_mujoco
 from tools.gap_mujoco import Result, injected_floor, response_of, table, truth_of
-from tools.mujoco_robot import Recording, joystick
+from tools.mujoco_robot import Recording, Robot, joystick
 
 LATENCY = {"pose_latency": {"latency_s": 0.2}}
 
@@ -103,10 +103,21 @@ def test_what_a_payload_does_is_told_beside_the_forms_that_have_a_share_in_it():
     assert truth_of("payload", recording, ["omega += 0.3 abs(omega)"]) == pytest.approx(-0.125, abs=0.003)
 
 
+def test_a_worn_tyre_is_told_by_how_much_further_a_turn_to_the_left_goes():
+    t_s = np.arange(48 * 2000) / 480.0
+    left, right = 3.0 - np.sin(0.7 * t_s), 3.0 + np.sin(0.7 * t_s) + 0.5 * np.sin(0.31 * t_s)
+    rate = 0.2 * ((right - left) + 0.15 * np.abs(right - left)) + 0.001 * (right + left)
+    truth = np.column_stack([0.0 * t_s, 0.0 * t_s, np.cumsum(rate) / 480.0])
+    turned = (np.cumsum(np.column_stack([left, right]), axis=0) / 480.0)[:, [0, 1, 0, 1]]
+    nothing = np.zeros((0, 3))
+    recording = Recording(t_s[:0], nothing, t_s[:0], nothing, t_s[:0], nothing, t_s, truth, turned, nothing)
+    assert truth_of("worn_tyre", recording) == pytest.approx(0.15, rel=0.01)
+
+
 def test_a_study_goes_on_where_it_was_broken_off(tmp_path, monkeypatch):
     done = []
 
-    def work(hidden: str, seed: int) -> Result:
+    def work(hidden: str, seed: int, robot: Robot) -> Result:
         if len(done) == 3:
             raise KeyboardInterrupt
         done.append((hidden, seed))
@@ -116,7 +127,7 @@ def test_a_study_goes_on_where_it_was_broken_off(tmp_path, monkeypatch):
     monkeypatch.setattr(gap_mujoco, "revision", lambda: "this")
     with pytest.raises(KeyboardInterrupt):
         gap_mujoco.study(["nothing", "pose_latency"], (1, 2), tmp_path)
-    monkeypatch.setattr(gap_mujoco, "work", lambda hidden, seed: done.append((hidden, seed)) or result(hidden, seed))
+    monkeypatch.setattr(gap_mujoco, "work", lambda hidden, seed, _: done.append((hidden, seed)) or result(hidden, seed))
     found = gap_mujoco.study(["nothing", "pose_latency"], (1, 2), tmp_path)
     assert found == [result(hidden, seed) for seed in (1, 2) for hidden in ("nothing", "pose_latency")]
     assert len(done) == len(set(done)) == 4
@@ -124,6 +135,9 @@ def test_a_study_goes_on_where_it_was_broken_off(tmp_path, monkeypatch):
     monkeypatch.setattr(gap_mujoco, "revision", lambda: "other")
     gap_mujoco.study(["nothing"], (1,), tmp_path)
     assert len(done) == 5
+    gap_mujoco.study(["nothing"], (1,), tmp_path, "heavy")
+    assert len(done) == 6
+    assert (tmp_path / "gap_mujoco_heavy.md").read_text().count("\n| nothing |") == 1
 
 
 @pytest.mark.long

@@ -11,7 +11,7 @@ import pytest
 
 from disco_hw.log.load import load_drive
 from tools import mujoco_robot
-from tools.mujoco_robot import EFFECTS, STEPS_PER_S, TRACK_M, WHEEL_RADIUS_M, joystick, record
+from tools.mujoco_robot import EFFECTS, ROBOTS, STEPS_PER_S, TRACK_M, WHEEL_RADIUS_M, joystick, record
 
 pytest.importorskip("mujoco", reason="pip install 'disco-hw[mujoco]'")
 
@@ -70,8 +70,20 @@ def test_it_turns_as_skid_steer_robots_do(wheels):
     assert 0.34 < short / 2.0 < 0.44
 
 
-def test_it_stands_where_it_stands():
-    recording = record({}, 1, held(0.0, 0.0))
+@pytest.mark.parametrize("name", ["heavy", "light"])
+def test_robots_of_other_sizes_turn_so_too(name):
+    robot = ROBOTS[name]
+    for wheels in [(-4.0, 4.0), (1.0, 3.0)]:
+        speeds, yaw_rate = steady(record({}, 1, held(*wheels), robot))
+        rolled = robot.wheel_radius_m * (speeds[[1, 3]].mean() - speeds[[0, 2]].mean())
+        assert 1.3 < rolled / yaw_rate / robot.track_m < 2.6
+    speeds, _ = steady(record({"unequal_wheels": robot.size("unequal_wheels")}, 1, held(3.0, 3.0), robot))
+    assert speeds[0] / speeds[1] == pytest.approx(1.0 + robot.size("unequal_wheels"), rel=0.005)
+
+
+@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
+def test_it_stands_where_it_stands(robot):
+    recording = record({}, 1, held(0.0, 0.0), robot)
     assert np.abs(recording.truth - recording.truth[0]).max() < 1e-4
     assert np.abs(recording.turned).max() < 1e-3
 
