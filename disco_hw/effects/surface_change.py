@@ -49,12 +49,11 @@ def term(
 
 
 def times(driven: CommandedDrive) -> tuple[float, ...]:
-    """Times to try (s), none near the ends or in a drive too short: chance makes two drives of a few turns."""
+    """Times to try (s); none in a drive too short to have been two."""
     first, last = driven.first_s, driven.last_s
     if last - first < 30.0:
         return ()
-    apart = max(10.0, 0.12 * (last - first))
-    return tuple(np.arange(first + apart, last - apart, max(4.0, (last - first) / 40.0)).tolist())
+    return tuple(np.arange(first + 10.0, last - 10.0, max(4.0, (last - first) / 40.0)).tolist())
 
 
 EFFECT = Effect(

@@ -304,13 +304,17 @@ def _body_options(found: ChannelResult) -> Iterator[Term]:
 def with_unnamed(found: ChannelResult, options: Callable[[ChannelResult], Iterator[Term]]) -> ChannelResult:
     """Add unnamed terms as long as the best one is worth its price and that of the choice among all.
 
-    After each, the named effects are selected anew: one that only stood in for the term is not needed any more.
+    After each, the named effects are selected anew: one that only stood in for the term is not needed any more. A patch
+    of the floor has to be worth it without the block of time that says most: around whatever happened once, a patch can
+    be drawn.
     """
     terms: tuple[Term, ...] = ()
+    patches = True
     proofs: tuple[EffectEvidence, ...] = ()
     plain = found.selector
     while len(terms) < found.channel.settings.terms.most_terms:
-        best, tried = best_term(found.fit, found.selector.channel, options(found))
+        offered = (term for term in options(found) if patches or term.disc is None)
+        best, tried = best_term(found.fit, found.selector.channel, offered)
         if best is None:
             break
         if best.disc is not None and isinstance(found.channel, BodyChannel):
@@ -328,6 +332,9 @@ def with_unnamed(found: ChannelResult, options: Callable[[ChannelResult], Iterat
         proof = compare(small, big, channel, parameters)
         moved = selector.moves(found.selector.channel.split(small.vector), channel.split(big.vector))
         limits = plain.thresholds
+        if best.disc is not None and proof.again(parameters, channel.count) < limits.unnamed_score:
+            patches = False
+            continue
         if proof.score < limits.unnamed_score or proof.repeated <= 0.0 or moved < limits.moves_m:
             break
         terms = (*terms, best)

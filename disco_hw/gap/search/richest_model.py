@@ -176,12 +176,14 @@ class Candidate:
     """An effect in the competition.
 
     `columns` are fitted from each of the `starts`, none of which means from neutral, where the effect is smooth.
+    `once`: it begins at some time of the drive.
     """
 
     name: str
     columns: tuple[str, ...]
     starts: Callable[[ResidualChannel], Starts] | None = None
     profile: Profile | None = None
+    once: bool = False
 
     @property
     def parameters(self) -> int:
@@ -231,6 +233,7 @@ def _candidate(effect: Effect) -> Candidate:
         None
         if scan is None
         else Profile(f"{effect.name}.{scan.parameter}", lambda channel: scan.values(driven(channel)), scan.refine),
+        effect.like_a_patch is not None,
     )
 
 

@@ -36,6 +36,10 @@ class EffectEvidence:
     inflation: float
     score: float
 
+    def again(self, parameters: float, count: int) -> float:
+        """The score of what is repeated, for so many parameters and residuals."""
+        return 2.0 * self.repeated / self.inflation - parameters * math.log(max(count, 2))
+
 
 def held_out_by_block(found: Fit, channel: ResidualChannel) -> Array:
     """Half squares on each block (B,) with parameters fitted without it, to second order."""
@@ -263,8 +267,12 @@ class Selector:
         if 2.0 * gain < limits.score:
             return False
         proof = self.evidence(smaller, larger)
+        # What begins at some time can be begun before whatever happened once.
+        once = any(CANDIDATES[name].once for name in set(larger) - set(smaller))
+        price = parameters_of(larger) - parameters_of(smaller)
         return (
-            (proof.score > limits.score or self._dominant(smaller, gain))
+            (not once or proof.again(price, self.channel.count) > 0.0)
+            and (proof.score > limits.score or self._dominant(smaller, gain))
             and proof.repeated > 0.0
             and self.moves(self.split(smaller), self.split(larger)) > limits.moves_m
         )

@@ -53,8 +53,8 @@ def test_a_patch_that_is_left_for_good_is_told_with_the_change_it_looks_like():
     assert term.indistinguishable_from == ("surface_change",)
     assert term.experiment == "drive again, later, where it was different"
     assert "confounded with surface_change" in as_text(report)
-    # Half of the log says nothing about it: its prediction is that of the plain model, not worse.
-    assert report.why_not_amended is None
+    # It is told by few stretches of the log, and what has it is not handed out for that.
+    assert "1.9 stretches" in report.why_not_amended
 
 
 def test_what_holds_the_wheels_is_not_fitted_with_a_slow_response():
@@ -67,5 +67,5 @@ def test_what_holds_the_wheels_is_not_fitted_with_a_slow_response():
     slow = selector.fit((*both, "stiction")).cost
     responding(selector, (*both, "stiction"))
     alone = selector.fit(("stiction",)).cost
-    assert slow > 1.5 * alone
+    assert slow > alone + 50.0
     assert selector.fit((*both, "stiction")).cost <= alone + 1e-6

@@ -11,6 +11,7 @@ from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
+from disco_hw.gap.search import selection
 from disco_hw.gap.search.channel_search import body_moves, wheel_moves
 from disco_hw.gap.search.least_squares import Fit, fit
 from disco_hw.gap.search.richest_model import CANDIDATES, LATE, Profile, candidates_of, indices
@@ -97,6 +98,19 @@ def test_what_moves_no_prediction_is_not_accepted():
     assert strict.select() == ()
     assert not strict.acceptable((), ("turn_slip",))
     assert selector(turn_slip=0.08).acceptable((), ("turn_slip",))
+
+
+@pytest.mark.parametrize(("share", "accepted"), [(0.99, False), (1.01, True)])
+def test_what_begins_at_some_time_is_worth_it_without_the_block_that_says_most(monkeypatch, share, accepted):
+    found = selector(turn_slip=0.08)
+    # Three parameters, each for half a ln n, in noise that is 1.2 times what was thought.
+    nats = 0.5 * 1.2 * 3.0 * np.log(found.channel.count)
+    proof = EffectEvidence(90.0, 80.0, share * nats, 1.2, 99.0)
+    monkeypatch.setattr(selection, "compare", lambda *_: proof)
+    assert found.acceptable((), ("surface_change",)) == accepted
+    # Others have to repeat, however little.
+    monkeypatch.setattr(selection, "compare", lambda *_: EffectEvidence(90.0, 80.0, 0.01, 1.2, 99.0))
+    assert found.acceptable((), ("turn_slip",))
 
 
 def test_a_change_is_found_when_it_happens():

@@ -206,6 +206,22 @@ def test_a_patch_is_looked_for_closer_around_the_best(monkeypatch):
     assert one.evidence.score == pytest.approx(2.0 * one.evidence.gain / one.evidence.inflation - price)
 
 
+def test_a_patch_is_worth_it_without_the_block_that_says_most_and_where_none_is_the_next_best_is_tried(monkeypatch):
+    channel, term = turned_in(0.3, 0.5, -0.15)
+    patch = replace(term, disc=(0.0, 0.0, 0.5))
+    other = replace(term, form="other {:.2f}", perturbation=np.roll(term.perturbation, 300, axis=0))
+    monkeypatch.setattr(channel_search, "places_near", lambda *_: iter(()))
+    # Of three that are tried, or of one: what a term costs, one parameter and the choice, and 20 more.
+    price = np.log(channel.count) + 2.0 * np.log(4.0)
+    nats = 0.5 * 1.3 * (20.0 + price)
+    for repeated, told in ((1.001 * nats, "omega += -0.15 then"), (0.999 * nats, "other")):
+        monkeypatch.setattr(channel_search, "compare", lambda *_, r=repeated: EffectEvidence(90.0, 80.0, r, 1.3, 99.0))
+        found = with_unnamed(searched(channel), lambda found: iter((patch, other)))
+        assert found.unnamed[0].form.startswith(told)
+    again = EffectEvidence(90.0, 80.0, 30.0, 1.5, 99.0).again(2.0, 1000)
+    assert again == pytest.approx(2.0 * 30.0 / 1.5 - 2.0 * np.log(1000.0))
+
+
 @dataclass(frozen=True)
 class Searched:
     """What is looked at of a channel's search."""
