@@ -191,7 +191,7 @@ class SelectionSettings:
     """Whitened residuals beyond do not raise it further. Chosen."""
     silent: float = 1e-3
     """Whitened residuals below come of samples that say nothing. Chosen."""
-    most_effects: int = 6
+    most_effects: int = 8
     """More effects are not named. Chosen."""
     worth_fitting_nats: float = 8.0
     """Gain to first order from which on an effect is fitted. Chosen: well below what acceptance takes."""

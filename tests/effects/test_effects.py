@@ -19,7 +19,7 @@ NAMES = {
     },
     Channel.WHEEL_TO_BODY: {
         "encoder_scale", "wheel_radius_asymmetry", "turn_slip", "turn_asymmetry", "acceleration_slip", "side_slip",
-        "lateral_icr", "slope", "downhill_slide", "surface_change",
+        "lateral_icr", "turning_point", "load_transfer", "slope", "downhill_slide", "surface_change",
     },
     Channel.POSE_SENSOR: {"pose_latency", "pose_offset", "heading_bias"},
 }  # fmt: skip
@@ -49,6 +49,7 @@ STRAIGHT = np.full((20, 2), 4.0)
 SPIN = np.tile([-4.0, 4.0], (20, 1))
 TURN = np.tile([2.0, 5.0], (20, 1))
 THERE_AND_BACK = np.repeat([[-3.0, 5.0], [5.0, -3.0]], 10, axis=0)
+SPEEDING_UP_IN_AN_ARC = np.column_stack([np.linspace(0.0, 6.0, 20), np.linspace(3.0, 9.0, 20)])
 START_STOP = np.repeat([[0.0, 0.0], [5.0, 5.0], [0.0, 0.0], [-3.0, -4.0]], 5, axis=0)
 
 
@@ -90,6 +91,8 @@ def test_effects_describe_themselves(effect):
         ("acceleration_slip", {"k_s2_m": 0.2}, START_STOP),
         ("side_slip", {"k_s": 0.15}, TURN),
         ("lateral_icr", {"offset_m": 0.05}, SPIN),
+        ("turning_point", {"ahead_m": 0.05}, SPIN),
+        ("load_transfer", {"k_s2": 0.3}, SPEEDING_UP_IN_AN_ARC),
         ("slope", {"drift_x_m_s": 0.02, "drift_y_m_s": -0.01}, START_STOP),
         ("downhill_slide", {"slide_x_m": 0.1, "slide_y_m": -0.05}, TURN),
         ("surface_change", {"track": 0.15, "time_s": 60.65, "radius": -0.03}, TURN),
@@ -225,6 +228,24 @@ def test_a_slope_moves_only_a_robot_whose_wheels_turn():
     np.testing.assert_array_equal(free_run(values, np.zeros((10, 2)))[-1, :2], [0.0, 0.0])
     moved = free_run(values, STRAIGHT)[-1, :2] - free_run({}, STRAIGHT)[-1, :2]
     np.testing.assert_allclose(moved, [0.04, 0.02], atol=1e-12)
+
+
+def test_a_robot_turns_about_another_point_to_the_left_than_to_the_right():
+    """Of a small turn from heading 0, the axle moves to the left whichever way it goes."""
+    values = {"turning_point": {"ahead_m": 0.05}}
+    for spin in (SPIN[:1], -SPIN[:1]):
+        turned, plainly = free_run(values, spin)[-1], free_run({}, spin)[-1]
+        assert turned[1] - plainly[1] == pytest.approx(0.05 * abs(turned[2]), rel=0.01)
+        assert turned[2] == plainly[2]
+    np.testing.assert_array_equal(free_run(values, STRAIGHT), free_run({}, STRAIGHT))
+
+
+def test_a_robot_that_speeds_up_in_a_turn_is_carried_aside_and_one_at_a_steady_speed_is_not():
+    values = {"load_transfer": {"k_s2": 0.3}}
+    np.testing.assert_allclose(
+        free_run(values, TURN)[2:], free_run({}, TURN)[2:] + (free_run(values, TURN) - free_run({}, TURN))[1]
+    )
+    np.testing.assert_array_equal(free_run(values, STRAIGHT), free_run({}, STRAIGHT))
 
 
 def test_an_uneven_grip_turns_further_one_way_and_leaves_straights_alone():

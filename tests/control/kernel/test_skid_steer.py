@@ -64,6 +64,8 @@ FULL = {
     "acceleration_slip": {"k_s2_m": st.floats(-0.1, 0.3)},
     "side_slip": {"k_s": st.floats(-0.1, 0.3)},
     "lateral_icr": {"offset_m": st.floats(-0.1, 0.1)},
+    "turning_point": {"ahead_m": st.floats(-0.1, 0.1)},
+    "load_transfer": {"k_s2": st.floats(-0.2, 0.2)},
     "slope": {"drift_x_m_s": st.floats(-0.05, 0.05), "drift_y_m_s": st.floats(-0.05, 0.05)},
     "downhill_slide": {"slide_x_m": st.floats(-0.2, 0.2), "slide_y_m": st.floats(-0.2, 0.2)},
     "surface_change": {"track": st.floats(-0.2, 0.3), "time_s": st.floats(0.0, 8.0), "radius": st.floats(-0.05, 0.05)},
