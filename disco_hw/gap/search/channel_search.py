@@ -340,13 +340,11 @@ def with_unnamed(found: ChannelResult, options: Callable[[ChannelResult], Iterat
         terms = (*terms, best)
         names = selector.select()
         proofs = (*proofs, proof)
-        coefficients = selector.exact(names).vector[-len(terms) :].tolist()
-        accepted = tuple(
-            UnnamedTerm(term.form.format(coefficient), evidence, term)
-            for term, coefficient, evidence in zip(terms, coefficients, proofs, strict=True)
-        )
+        accepted = tuple(UnnamedTerm(term.form, evidence, term) for term, evidence in zip(terms, proofs, strict=True))
         found = replace(found, selector=selector, names=names, unnamed=accepted, plain=plain)
-    return found
+    coefficients = found.told.vector[found.told.vector.size - len(terms) :].tolist()
+    written = zip(found.unnamed, coefficients, strict=True)
+    return replace(found, unnamed=tuple(replace(one, form=one.form.format(value)) for one, value in written))
 
 
 def _extended(plain: Selector, channel: WithTerms) -> Array:
