@@ -1,6 +1,6 @@
 """Shows which changes of a Python file its fast tests notice: one operator, number or truth value at a time.
 
-    python -m tools.python_mutants FILE.py ... [--tests PATH ...] [--leave-out TEXT ...] [--every N] [--report FILE]
+    python -m tools.python_mutants FILE.py ... [--tests PATH ...] [--leave-out TEXT ...] [--every N [--first N]]
 
 Each mutant is run, in a process forked for it, with those tests that ran the statement that it changes, the quickest
 first, until one fails. Those that nothing can tell from the original are in python_equivalents.toml, each with its
@@ -267,6 +267,7 @@ class Watched:
     def __init__(self, files: Sequence[Path], leave_out: Sequence[str]) -> None:
         self.files, self.leave_out = {str(file) for file in files}, leave_out
         self.lines: set[tuple[str, int]] = set()
+        self.failed = "not one is run"
         self.tests: dict[str, tuple[float, list[tuple[str, int]]]] = {}
 
     def pytest_collection_modifyitems(self, items: list[Any]) -> None:
@@ -283,6 +284,10 @@ class Watched:
         self.lines = set()
         self.began = time.process_time()
         sys.settrace(self.traced)
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        if report.failed:
+            self.failed = f"{report.nodeid}: {report.longrepr}"
 
     def pytest_runtest_logfinish(self, nodeid: str) -> None:
         sys.settrace(None)
@@ -346,7 +351,7 @@ def sweep(files: Sequence[Path], given: argparse.Namespace, folder: Path) -> Cou
     known = tomllib.loads(EQUIVALENTS.read_text("utf-8")) if EQUIVALENTS.exists() else {}
     watched = Watched(files, given.leave_out)
     if run_tests(given.tests, [watched]) != 0:
-        raise RuntimeError("the tests fail")
+        raise RuntimeError(f"the unchanged files fail their tests: {watched.failed}")
     tests = sorted(watched.tests.items(), key=lambda one: one[1][0])
     counts: Counter[tuple[str, str]] = Counter()
     for file in files:

@@ -62,7 +62,7 @@ def beats_throughout(before: PredictionErrors, after: PredictionErrors, settings
     """Whether errors after beat those before whichever one block of time is left out: not by a single stretch."""
     if not beats(before, after, settings):
         return False
-    if before.squares is None or after.squares is None or len(before.squares) < 2:
+    if before.squares is None or after.squares is None:
         return True
     without = [np.maximum(of.sum(axis=0) - of, 1e-30) for of in (before.squares, after.squares)]
     return all(_no_larger((float(a), float(b)), settings) for a, b in np.sqrt(without[1] / without[0]))

@@ -22,6 +22,7 @@ from disco_hw.gap.search.cross_validation import (
     smoothed_poses,
     stretches_telling,
     surely_beats,
+    worse_by,
 )
 from disco_hw.gap.search.end_to_end import Ahead
 from disco_hw.gap.search.least_squares import fit
@@ -162,6 +163,31 @@ def test_what_beats_by_one_stretch_alone_does_not_beat():
     # Heading may not pay for position.
     assert not beats(before, in_stretches([0.25] * 6, [1.2] * 6), settings)
     assert beats(before, in_stretches([0.25] * 6, [1.1] * 6), settings)
+
+
+def test_the_larger_growth_of_position_and_heading_counts():
+    before = in_stretches([1.0] * 6, [4.0] * 6)
+    assert worse_by(before, in_stretches([4.0] * 6, [9.0] * 6)) == pytest.approx(2.0)
+    assert worse_by(before, in_stretches([1.0] * 6, [9.0] * 6)) == pytest.approx(1.5)
+
+
+def test_at_its_bounds_a_model_still_beats():
+    before = in_stretches([1.0] * 6, [1.0] * 6)
+    settings = replace(DEFAULT_SETTINGS.prediction, worse=2.0, level=1.0, far_better=0.5, fewest_stretches=7.0)
+    assert beats(before, in_stretches([4.0] * 6, [0.25] * 6), settings)
+    assert not beats(before, in_stretches([4.4] * 6, [0.2] * 6), settings)
+    assert surely_beats(before, in_stretches([0.25] * 6, [0.25] * 6), settings)
+    assert not surely_beats(before, in_stretches([0.26] * 6, [0.25] * 6), settings)
+
+
+def test_of_two_stretches_each_has_to_be_better():
+    settings = replace(DEFAULT_SETTINGS.prediction, fewest_stretches=0.0)
+    before = in_stretches([1.0, 1.0], [1.0, 1.0])
+    by_one = in_stretches([0.1, 1.1], [0.1, 1.1])
+    assert not surely_beats(before, by_one, settings)
+    # Where one is not known by stretch, the whole has to do.
+    assert surely_beats(replace(before, squares=None), by_one, settings)
+    assert surely_beats(before, replace(by_one, squares=None), settings)
 
 
 def test_without_errors_by_stretch_the_whole_decides():
