@@ -61,7 +61,7 @@ def test_an_even_clock_changes_nothing():
 def seen(monkeypatch):
     """What `pose_clock` makes of these delays of stretches, where the whole log fits better by `gained` nats."""
 
-    def made(delays, gained=1.0, span_s=120.0, middles=None):
+    def made(delays, gained=1.0, span_s=120.0, middles=None, **settings):
         delays = np.array(delays)
         poses = poses_at(np.linspace(100.0, 100.0 + span_s, 50))
         middles = 100.0 + span_s * (np.arange(delays.size) + 0.5) / delays.size if middles is None else middles
@@ -70,7 +70,7 @@ def seen(monkeypatch):
         misfits = {True: 5.0, False: 5.0 - gained}
         monkeypatch.setattr(timing, "_misfit_at", lambda wheels, of, delay_s, settings: misfits[of is poses])
         monkeypatch.setattr(timing, "_instant", lambda wheels, of, settings, delays, place, about_s: about_s)
-        return pose_clock(None, poses, SETTINGS)
+        return pose_clock(None, poses, replace(SETTINGS, **settings))
 
     return made
 
@@ -88,6 +88,19 @@ def test_delays_of_two_sizes_are_a_jump_between_two_stretches(seen):
     # Of the early ones there are two at least, and of the late ones.
     assert seen([0.3, 0.3, 0.1, 0.1, 0.1, 0.1]).jump_at_s == pytest.approx(140.0)
     assert seen([0.3, 0.3, 0.3, 0.3, 0.1, 0.1]).jump_at_s == pytest.approx(180.0)
+
+
+@pytest.mark.parametrize(
+    ("delays", "after"),
+    [([0.26, 0.26, 0.26, 0.36, 0.42, 0.4, 0.42], 3), ([0.26, 0.34, 0.32, 0.26, 0.42, 0.4, 0.36], 4)],
+)
+def test_a_jump_is_where_it_leaves_the_least_squares_on_both_sides(seen, delays, after):
+    assert seen(delays).jump_at_s == pytest.approx(100.0 + 120.0 * after / 7.0)
+    assert seen(delays[::-1]).jump_at_s == pytest.approx(100.0 + 120.0 * (7 - after) / 7.0)
+
+
+def test_one_stretch_alone_is_no_side_of_a_jump(seen):
+    assert seen([0.6, 0.1, 0.1, 0.1, 0.1, 0.1]) == seen([0.3, 0.3, 0.3, 0.3, 0.3, 0.1]) == PoseClock(0.2)
 
 
 def test_a_clock_is_believed_from_four_stretches_on_that_agree_and_where_it_matters(seen):
@@ -114,6 +127,15 @@ def test_it_explains_as_much_again_of_the_scatter_as_it_leaves(seen, scatter, be
     assert (clock.drift_s != 0.0) is believed
 
 
+def test_at_its_bounds_a_clock_is_believed_by_its_size_and_its_agreement_and_not_by_its_nats(seen):
+    jump = [0.25, 0.25, 0.5, 0.5]
+    assert seen(jump, least_clock_error_s=0.25).jump_s == 0.25
+    assert seen(jump, gained=0.5, least_clock_nats=0.5) == PoseClock(0.2)
+    # Squares of 8 about their mean, and of 4 about those of both sides.
+    assert seen([2.0, 0.0, 4.0, 2.0], clock_times_better=2.0).jump_s == 2.0
+    assert seen([2.0, 0.0, 4.0, 2.0], clock_times_better=2.1) == PoseClock(0.2)
+
+
 def test_of_no_poses_nothing_is_said():
     wheels = Wheels(*(np.arange(100.0),) * 5, np.zeros(100, dtype=int), True, True)
     assert pose_clock(wheels, poses_at([]), SETTINGS) == PoseClock(0.0)
@@ -135,6 +157,9 @@ def test_stretches_of_even_length_are_looked_at_one_by_one(monkeypatch):
     # What shows no delay says nothing.
     assert middles == pytest.approx(49.5 * np.array([0.125, 0.625, 0.875]))
     assert delays == pytest.approx([0.1, 0.3, 0.4])
+    parts.clear()
+    timing._by_stretch(None, poses_at(np.arange(0.0, 48.25, 0.5)), SETTINGS)
+    assert [part.t_s.size for part in parts] == [25, 24, 24, 24]
     parts.clear()
     timing._by_stretch(None, poses_at([0.0, 5.0]), SETTINGS)
     assert [part.t_s.size for part in parts] == [2]
@@ -188,6 +213,14 @@ def test_a_delay_is_told_where_it_stands_out_and_between_those_that_are_tried(mo
     monkeypatch.setattr(timing, "_misfits", lambda wheels, poses, delays, settings: np.full(delays.size, np.inf))
     assert pose_delay_s(None, None, SETTINGS) == 0.0
     assert timing._misfit_at(None, None, 0.1, SETTINGS) == 0.0
+
+
+def test_a_delay_that_stands_out_by_just_enough_is_told(monkeypatch):
+    settings = replace(SETTINGS, least_delay_nats=0.5)
+    monkeypatch.setattr(
+        timing, "_misfits", lambda wheels, poses, delays, settings: -0.5 * (np.arange(delays.size) == 60)
+    )
+    assert pose_delay_s(None, None, settings) == pytest.approx(0.2)
 
 
 def test_wheels_are_known_from_their_first_to_their_last_sample_of_a_segment():
