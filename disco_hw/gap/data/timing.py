@@ -166,8 +166,6 @@ def _misfits(wheels: Wheels, poses: Poses, delays: Array, settings: GridSettings
     """Minus the log likelihood per pose at each of some delays (D,); infinite where the poses are too few."""
     misfit = np.full(delays.size, np.inf)
     before, after = _pairs(poses, settings.delay_span_s)
-    if wheels.t_s.size < 2 or before.size < settings.fewest_poses:
-        return misfit
     turn = np.remainder(poses.yaw_rad[after] - poses.yaw_rad[before] + np.pi, 2.0 * np.pi) - np.pi
     heading = poses.yaw_rad[before] + 0.5 * turn
     way = (poses.x_m[after] - poses.x_m[before]) * np.cos(heading)

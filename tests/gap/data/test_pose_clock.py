@@ -269,7 +269,7 @@ def winding(seed=3):
     """A drive in three segments of wheels at 20 Hz and poses at 10 Hz, seen with noise, a silence in between."""
     rng = np.random.default_rng(seed)
     t_s = np.arange(0.0, 40.0, 0.05)
-    angle = np.cumsum(rng.normal(4.0, 3.0, (t_s.size, 2)), axis=0) * 0.05
+    angle = np.cumsum(rng.normal((3.5, 4.5), 3.0, (t_s.size, 2)), axis=0) * 0.05
     cut = np.searchsorted([13.0, 27.0], t_s, side="right")
     wheels = Wheels(t_s, angle[:, 0], angle[:, 1], *(np.zeros(t_s.size),) * 2, cut, True, True)
     seen = np.arange(0, t_s.size, 2)
@@ -285,6 +285,8 @@ def test_turns_and_ways_of_poses_are_fitted_by_those_of_the_wheels_at_a_delay(de
     wheels, poses = winding()
     count, misfit = by_hand(wheels, poses, delay_s)
     assert count > 250
+    # Headings go past half a turn.
+    assert np.abs(np.diff(poses.yaw_rad)).max() > 6.0
     assert timing._misfit_at(wheels, poses, delay_s, SETTINGS) == pytest.approx(misfit, rel=1e-9)
     many = timing._misfits(wheels, poses, np.array([5.0, delay_s, 90.0]), SETTINGS)
     assert many[1] == pytest.approx(misfit, rel=1e-9)
@@ -302,8 +304,10 @@ def test_too_few_pairs_are_not_fitted(fewest, known):
         settings = replace(SETTINGS, fewest_poses=pairs + more)
         unlimited = replace(wheels, t_s=wheels.t_s.copy(), segment=wheels.segment)
         assert np.isfinite(timing._misfits(unlimited, poses, np.array([0.0]), settings))[0] == wanted
-    single = replace(wheels, **{name: getattr(wheels, name)[:1] for name in wheels.__slots__[:6]})
-    assert timing._misfits(single, poses, np.array([0.0]), SETTINGS)[0] == np.inf
+    for few in (0, 1):
+        hardly = replace(wheels, **{name: getattr(wheels, name)[:few] for name in wheels.__slots__[:6]})
+        assert timing._misfits(hardly, poses, np.array([0.0]), SETTINGS)[0] == np.inf
+        assert timing._misfits(hardly, poses_at([]), np.array([0.0]), SETTINGS)[0] == np.inf
 
 
 def test_two_columns_are_solved_as_normal_equations_and_like_columns_as_one():
@@ -315,3 +319,4 @@ def test_two_columns_are_solved_as_normal_equations_and_like_columns_as_one():
     b = 0.5 * a
     assert timing._projected(a @ a, a @ b, b @ b, a @ y, b @ y) == pytest.approx((a @ y / (a @ a), 0.0))
     assert timing._projected(0.0, 0.0, 0.0, 0.0, 0.0) == (0.0, 0.0)
+    assert timing._projected(0.5, 0.0, 0.25, 1.0, 0.5) == (2.0, 2.0)
