@@ -180,6 +180,26 @@ def test_at_its_bounds_a_model_still_beats():
     assert not surely_beats(before, in_stretches([0.26] * 6, [0.25] * 6), settings)
 
 
+def test_two_models_are_level_within_a_hundredth_of_their_mean_errors():
+    before, settings = in_stretches([1.0] * 6, [1.0] * 6), DEFAULT_SETTINGS.prediction
+    for times, level in ((1.0095, True), (1.0115, False)):
+        after = in_stretches([times**2] * 6, [times**2] * 6)
+        assert beats(before, after, settings) == level
+
+
+def test_at_its_bounds_nothing_is_clearly_worse_and_without_stretches_the_size_alone_decides():
+    before, twice = in_stretches([1.0] * 6, [1.0] * 6), in_stretches([4.0] * 6, [1.0] * 6)
+    settings = replace(DEFAULT_SETTINGS.prediction, worse=2.0, far_worse=2.0)
+    assert not clearly_worse(before, twice, settings)
+    assert clearly_worse(before, twice, replace(settings, far_worse=1.9))
+    settings = replace(settings, worse=1.9)
+    assert clearly_worse(before, twice, settings)
+    uneven = in_stretches([19.0, 1.0, 1.0, 1.0, 1.0, 1.0], [1.0] * 6)
+    assert not clearly_worse(before, uneven, settings)
+    assert clearly_worse(replace(before, squares=None), uneven, settings)
+    assert clearly_worse(before, replace(uneven, squares=None), settings)
+
+
 def test_of_two_stretches_each_has_to_be_better():
     settings = replace(DEFAULT_SETTINGS.prediction, fewest_stretches=0.0)
     before = in_stretches([1.0, 1.0], [1.0, 1.0])
