@@ -3,7 +3,8 @@
 `DISCO_HW_DATA=FOLDER python -m tools.gap_halves [--days] [NAME...]`: logs whose path holds a NAME, all without one. For
 either half: the stage that is offered, the errors 2 s ahead on the half that was not seen, of every stage, and how many
 of its 95 % intervals hold what the other half says of the same parameters, where that knows half as much of them.
-With `--days` the same of whole logs: each learnt from, and every other one of the same robot predicted.
+With `--days` the same of whole logs: each learnt from, and every other one of the same robot predicted; where that is
+of windows of 2 s, 1 s ahead.
 """
 
 from __future__ import annotations
@@ -29,7 +30,13 @@ from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search import joint_predictions
 from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, estimate_parameters, final_fit
-from disco_hw.gap.search.cross_validation import Chain, PredictionErrors, errors_of, smoothed_poses
+from disco_hw.gap.search.cross_validation import (
+    Chain,
+    PredictionErrors,
+    errors_of,
+    judged_horizon_s,
+    smoothed_poses,
+)
 from disco_hw.gap.search.unnamed_terms import with_known_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.log.drive import DriveLog
@@ -93,7 +100,10 @@ def unseen_errors(drive: GriddedDrive, models: dict[str, Model], ahead_s: float 
         wheels = WheelChannel.build(known, WheelNoise(), body_vector[:3]) if drive.has_commands else None
         poses = smoothed_poses(body, body_vector) if poses is None else poses
         chain = Chain(body_vector, None if wheels is None else wheel_vector)
-        errors[stage] = errors_of(body, wheels, {0: chain, 1: chain}, ahead_s, poses)
+        # Of windows of 2 s nothing is known so far ahead.
+        errors[stage] = errors_of(
+            body, wheels, {0: chain, 1: chain}, min(ahead_s, judged_horizon_s(body, poses)), poses
+        )
     return errors
 
 
@@ -158,8 +168,10 @@ def taught(part: Part, others: Sequence[Part], nominal: Model) -> Iterator[Half]
 
 
 def halves(path: Path) -> Iterator[Half]:
-    """Both halves of a log, each learnt from and the other one predicted."""
+    """Both halves of a log, each learnt from and the other one predicted; none of a log without poses."""
     log, nominal = read(path)
+    if not log.poses.t_s.size:
+        return
     middle_s = 0.5 * (float(log.wheels.t_s[0]) + float(log.wheels.t_s[-1]))
     parts = [
         Part.search(f"{path.stem} {number}", cut, nominal)

@@ -38,6 +38,7 @@ from disco_hw.gap.report.judge import (
     channel_findings,
     drifting_parameters,
     effect_findings,
+    left_out_notes,
     residue_sentences,
     sort_out,
     unnamed_findings,
@@ -48,9 +49,9 @@ from disco_hw.gap.search.analysis import ChannelEstimates, FinalFit, GapAnalysis
 from disco_hw.gap.search.channel_search import search_body, search_wheels
 from disco_hw.gap.search.cross_validation import (
     PredictionErrors,
-    beats,
     clearly_worse,
     only_timed,
+    outdoes,
     surely_beats,
     wheel_table,
     worse_by,
@@ -105,6 +106,8 @@ def find_gap(
     if prove:
         spots = proved(spots, finder(analysis, say), settings.report.proved_claims)
     amended, remarks = model_of(offered, model, analysis, final, predictions)
+    if predictions is not None and predictions.kept is not None:
+        remarks = (*left_out_notes(analysis, predictions.kept[0]), *remarks)
     return GapReport(
         sources=log.sources,
         channels=channel_findings(analysis, named, unnamed),
@@ -131,16 +134,17 @@ def _of_wheels(wheels: Mapping[str, Mapping[float, PredictionErrors]]) -> dict[s
 
 
 def offered_stage(gap: Mapping[str, Mapping[float, PredictionErrors]], found: bool, settings: GapSettings) -> str:
-    """The stage whose model is handed out: the amended one unless a plainer one predicts held-out data better.
+    """The stage whose model is handed out: the amended one where it predicts held-out data clearly better than `timed`.
 
-    Better too where the amended one is so by a single stretch only, or by little where few stretches tell: another
-    drive need not have their like. Where predictions cannot be compared it is the amended one too.
+    Not where it is so by a single stretch only, or by little where few stretches tell: another drive need not have
+    their like. Where nothing was found it is the amended one unless that is clearly worse; where predictions cannot be
+    compared too.
     """
     horizon_s, prediction = reached_horizon_s(gap, settings.prediction), settings.prediction
     if not gap or not math.isfinite(gap["amended"][horizon_s].position_m):
         return "amended"
     refitted, timed, amended = (gap[stage][horizon_s] for stage in STAGES[1:4])
-    plainer, plain = ("refitted", refitted) if beats(timed, refitted, prediction) else ("timed", timed)
+    plainer, plain = ("refitted", refitted) if outdoes(timed, refitted, prediction) else ("timed", timed)
     if surely_beats(plain, amended, prediction) or (not found and not clearly_worse(plain, amended, prediction)):
         return "amended"
     return plainer
@@ -159,6 +163,7 @@ def model_of(
         return model_of("amended", model, timed, final_fit(timed), None)
     if predictions is not None:
         of, joint = predictions.joint["amended"]
+        analysis, final = predictions.kept or (analysis, final)
 
         def moved(part: ChannelEstimates | None, channel: int) -> ChannelEstimates | None:
             return None if part is None else at_joint_fit(part, of.parts[channel], of, joint)

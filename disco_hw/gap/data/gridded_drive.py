@@ -48,7 +48,8 @@ class GriddedDrive:
     (E, 2) laid on even times, its stamps scatter by `stamp_scatter_s`; `pose`: pose samples with `pose` (P, 3) x, y,
     yaw not wrapped within a run. `known_command` (M, 2) rad/s and `known_motion` (M, 3) m/s, m/s, rad/s: what the
     terms without a name that a given model has add; None without. `settings` travel with the drive: what judges it
-    reads them there. `pose_delay_s`: how much older than their stamps poses are at first sight, s.
+    reads them there. `pose_delay_s`: how much older than their stamps poses are at first sight, s; `pose_clock_even`:
+    whether their clock neither drifts nor jumps.
     """
 
     t_s: Array
@@ -69,6 +70,7 @@ class GriddedDrive:
     known_motion: Array | None = None
     settings: GapSettings = DEFAULT_SETTINGS
     pose_delay_s: float = 0.0
+    pose_clock_even: bool = True
 
     @property
     def has_commands(self) -> bool:
@@ -166,6 +168,7 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
         notes=tuple(notes),
         settings=settings,
         pose_delay_s=clock.delay_s,
+        pose_clock_even=not (clock.drift_s or clock.jump_s),
     )
 
 

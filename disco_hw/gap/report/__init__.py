@@ -14,7 +14,13 @@ from typing import Any
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report.blind_spots import BlindSpot
 from disco_hw.gap.search.analysis import ParameterEstimate
-from disco_hw.gap.search.cross_validation import PredictionErrors, beats, beats_throughout, stretches_telling
+from disco_hw.gap.search.cross_validation import (
+    PredictionErrors,
+    beats,
+    beats_throughout,
+    outdoes,
+    stretches_telling,
+)
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings, PredictionSettings
 from disco_hw.model import Model
 
@@ -235,6 +241,11 @@ class GapReport:
         amended = of["amended"][self.horizon_s]
         if not beats(plainer, amended, settings):
             return "The amended model does not beat it."
+        if not outdoes(plainer, amended, settings):
+            return (
+                f"The amended model errs by less than {100.0 * (1.0 - settings.worth):.0f} % less: too little to be "
+                "believed of another drive."
+            )
         if not beats_throughout(plainer, amended, settings):
             return f"Without one stretch of {settings.fold_s:g} s the amended model does not beat it."
         return (

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.effects import Channel, Effect, Parameter
+from disco_hw.effects import Channel, Effect, Parameter, Stage
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.report import (
@@ -153,6 +153,22 @@ def residue_sentences(analysis: GapAnalysis) -> tuple[str, ...]:
     for found in (analysis.wheels, analysis.body):
         if found is not None:
             out += [*remaining_disagreements(found), *misspecified_effects(found)]
+    return tuple(out)
+
+
+def left_out_notes(analysis: GapAnalysis, kept: GapAnalysis) -> tuple[str, ...]:
+    """Sentences on what was found and the amended model does not have."""
+    gone = kept.pruned[len(analysis.pruned) :]
+    of_the_clock = [name for name in gone if name in REGISTRY and REGISTRY[name].stage is Stage.POSE_TIME]
+    others = [name for name in gone if name not in of_the_clock]
+    out = []
+    if of_the_clock:
+        out.append(
+            f"the amended model leaves out {', '.join(of_the_clock)}: a clock that runs unevenly does not say how late "
+            "poses are in another drive"
+        )
+    if others:
+        out.append(f"the amended model leaves out {', '.join(others)}: held-out data are predicted as well without")
     return tuple(out)
 
 

@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from disco_hw.effects import Stage
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.noise import sensor_noise
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.search.analysis import GAIN, FinalFit, GapAnalysis, final_fit
@@ -31,11 +33,12 @@ from disco_hw.gap.search.cross_validation import (
     fold_vectors,
     judged_horizon_s,
     smoothed_poses,
+    within_one_standard_error,
     worse_by,
 )
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
 from disco_hw.gap.search.least_squares import Fit, inverse
-from disco_hw.gap.search.richest_model import LATE_COLUMNS, LATE_STARTS_S, with_pose_delay
+from disco_hw.gap.search.richest_model import LATE, LATE_COLUMNS, LATE_STARTS_S, with_pose_delay
 
 Array = NDArray[np.float64]
 
@@ -45,7 +48,7 @@ class StagePredictions:
     """For each stage the chains of the two folds, each fitted on the other one's data.
 
     `poses` (M, 3) twice: smoothed, and of the nearest sample alone; `joint`: of stages that were fitted end to end,
-    what was freed and the fit on all data.
+    what was freed and the fit on all data; `kept`: what `amended` has of all that was found.
     """
 
     body: BodyChannel
@@ -53,6 +56,7 @@ class StagePredictions:
     chains: Mapping[str, dict[int, Chain]]
     poses: tuple[Array, Array]
     joint: Mapping[str, tuple[Freed, JointFit]] = field(default_factory=dict)
+    kept: tuple[GapAnalysis, FinalFit] | None = None
 
     @property
     def judged_horizon_s(self) -> float:
@@ -123,19 +127,14 @@ def joint_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePrediction
     """Predictions of every stage, each of which ends with a fit of the whole chain, from commands to poses.
 
     `nominal`: the model as given; `refitted`: its geometry, and the effects that it had; `timed`: also what makes
-    wheels late; `amended`: all that was found, from where the channels apart have it or, if held-out data are predicted
-    better so, on top of `timed`.
+    wheels late; `amended`: what predictions need of all that was found, from where the channels apart have it or, if
+    held-out data are predicted better so, on top of `timed`.
     """
     apart = stage_predictions(analysis, final)
     ahead = Ahead.of(apart.body, apart.wheels, apart.poses)
-    trust = apart.body.settings.prediction.joint_trust**-2.0
-    base, whole = _base(analysis), _whole(analysis, final)
+    base = _base(analysis)
     nominal = [analysis.nominal_body, analysis.nominal_wheels][: len(base)]
     chains = {"nominal": _chains(analysis, final, {0: nominal, 1: nominal})}
-
-    def chain(vectors: Sequence[Array]) -> Chain:
-        return _chain(analysis, final, vectors)
-
     parts = tuple(
         Part(channel.layout, one.vector, one.active, _roughly(channel, one))
         for channel, one in zip((apart.body, apart.wheels), base, strict=False)
@@ -145,33 +144,103 @@ def joint_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePrediction
         ahead, Freed(parts, lambda vectors: Chain(vectors[0], vectors[1] if len(vectors) > 1 else None))
     )
     timed = _Fitted.to(ahead, _timed(ahead, refitted.at()))
-    of_all = tuple(
-        Part(one.selector.channel.layout, fitted.vector, fitted.active, trust * fitted.information())
-        for one, fitted in zip((analysis.body, analysis.wheels), whole, strict=False)
-        if one is not None
-    )
-    by_fold = {}
-    for held, vectors in _by_fold(analysis, whole).items():
-        inside = zip(of_all, vectors, whole, (apart.body, apart.wheels), strict=False)
-        folded = tuple(
-            replace(part, vector=vector, information=trust * _information(one, channel, 1 - held))
-            for part, vector, one, channel in inside
-            if channel is not None
-        )
-        by_fold[held] = Freed(folded, chain)
-    options = [_Fitted.to(ahead, Freed(of_all, chain), by_fold)]
-    if analysis.found_any:
-        on_top = {held: _on_top(of, timed.at(held)) for held, of in by_fold.items()}
-        options.append(_Fitted.to(ahead, _on_top(options[0].of, timed.at()), on_top))
-
-    def size(option: _Fitted) -> float:
-        errors = errors_of(apart.body, apart.wheels, option.chains, apart.judged_horizon_s, apart.poses)
-        return errors.position_m * errors.yaw_rad
-
-    stages = {"refitted": refitted, "timed": timed, "amended": min(options, key=size)}
+    needed = _needed(analysis, timed, ahead, apart)
+    stages = {"refitted": refitted, "timed": timed, "amended": _Fitted.to(ahead, needed.of, needed.by_fold)}
     chains |= {name: stage.chains for name, stage in stages.items()}
     joint = {name: (stage.of, stage.joint) for name, stage in stages.items()}
-    return StagePredictions(apart.body, apart.wheels, chains, apart.poses, joint)
+    return StagePredictions(apart.body, apart.wheels, chains, apart.poses, joint, (needed.analysis, needed.final))
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A model that may be handed out: what was found of it, what a fit of all data frees, and one of either fold."""
+
+    analysis: GapAnalysis
+    final: FinalFit
+    of: Freed
+    by_fold: Mapping[int, Freed]
+
+    @classmethod
+    def of_channels(cls, analysis: GapAnalysis, apart: StagePredictions) -> _Candidate:
+        """All that was found, from where the channels apart have it."""
+        trust, final = apart.body.settings.prediction.joint_trust**-2.0, final_fit(analysis)
+        whole = _whole(analysis, final)
+
+        def chain(vectors: Sequence[Array]) -> Chain:
+            return _chain(analysis, final, vectors)
+
+        of_all = tuple(
+            Part(one.selector.channel.layout, fitted.vector, fitted.active, trust * fitted.information())
+            for one, fitted in zip((analysis.body, analysis.wheels), whole, strict=False)
+            if one is not None
+        )
+        by_fold = {}
+        for held, vectors in _by_fold(analysis, whole).items():
+            inside = zip(of_all, vectors, whole, (apart.body, apart.wheels), strict=False)
+            folded = tuple(
+                replace(part, vector=vector, information=trust * _information(one, channel, 1 - held))
+                for part, vector, one, channel in inside
+                if channel is not None
+            )
+            by_fold[held] = Freed(folded, chain)
+        return cls(analysis, final, Freed(of_all, chain), by_fold)
+
+    def on_top(self, timed: _Fitted) -> _Candidate:
+        """The same on top of `timed`."""
+        by_fold = {held: _on_top(of, timed.at(held)) for held, of in self.by_fold.items()}
+        return replace(self, of=_on_top(self.of, timed.at()), by_fold=by_fold)
+
+    def errors(self, ahead: Ahead, apart: StagePredictions) -> PredictionErrors:
+        """Errors on held-out data."""
+        chains = {held: of.chain(ahead.fit(of, held).vectors) for held, of in self.by_fold.items()}
+        return errors_of(apart.body, apart.wheels, chains, apart.judged_horizon_s, apart.poses)
+
+
+def _size(errors: PredictionErrors) -> float:
+    return errors.position_m * errors.yaw_rad
+
+
+def _needed(analysis: GapAnalysis, timed: _Fitted, ahead: Ahead, apart: StagePredictions) -> _Candidate:
+    """The candidate that has what predictions need of what was found.
+
+    Poses of a clock that runs unevenly are late by what holds in this log only. Of the rest goes, the least evident
+    first, what held-out data are predicted without as well as by the best, within one standard error (Breiman et al.,
+    Classification and Regression Trees, 1984, ch. 3): what a log does not need is as likely of this log alone.
+    """
+    if not analysis.drive.pose_clock_even:
+        for which, name in _least_evident_first(analysis):
+            if name in REGISTRY and REGISTRY[name].stage is Stage.POSE_TIME:
+                analysis = _lacking(analysis, which, name)
+    kept = _Candidate.of_channels(analysis, apart)
+    if not analysis.found_any:
+        return kept
+    options = [(option, option.errors(ahead, apart)) for option in (kept, kept.on_top(timed))]
+    kept, best = min(options, key=lambda option: _size(option[1]))
+    for which, name in _least_evident_first(analysis):
+        fewer = _lacking(kept.analysis, which, name)
+        if not fewer.found_any:
+            break
+        option = _Candidate.of_channels(fewer, apart).on_top(timed)
+        now = option.errors(ahead, apart)
+        if within_one_standard_error(best, now):
+            kept = option
+        best = min(best, now, key=_size)
+    return kept
+
+
+def _least_evident_first(analysis: GapAnalysis) -> list[tuple[str, str | None]]:
+    """What was found and `timed` does not have, as its channel and its name, or None for the terms of a channel."""
+    out: list[tuple[float, str, str | None]] = []
+    for which in ("wheels", "body"):
+        found: ChannelResult | None = getattr(analysis, which)
+        if found is None:
+            continue
+        for name, rest in _each(found):
+            if name not in LATE:
+                out.append((found.selector.evidence(rest, found.names).score, which, name))
+        if found.unnamed:
+            out.append((max(term.evidence.score for term in found.unnamed), which, None))
+    return [(which, name) for _, which, name in sorted(out, key=lambda one: one[0])]
 
 
 def _on_top(amended: Freed, timed: Freed) -> Freed:
@@ -315,14 +384,24 @@ def _best(
 
 def _lacking_one(analysis: GapAnalysis) -> Iterator[GapAnalysis]:
     """Analyses that lack one of the names, or the terms of a channel."""
-    for found in (analysis.wheels, analysis.body):
+    for which in ("wheels", "body"):
+        found: ChannelResult | None = getattr(analysis, which)
         if found is None:
             continue
-        for name, rest in _each(found):
-            yield _changed(analysis, found, replace(found, names=rest), (name,))
+        for name, _ in _each(found):
+            yield _lacking(analysis, which, name)
         if found.unnamed and found.plain is not None:
-            bare = replace(found, selector=found.plain, unnamed=(), plain=None)
-            yield _changed(analysis, found, bare, tuple(term.form for term in found.unnamed))
+            yield _lacking(analysis, which, None)
+
+
+def _lacking(analysis: GapAnalysis, which: str, name: str | None) -> GapAnalysis:
+    """An analysis without a name in one of its channels, or without the terms there."""
+    found: ChannelResult = getattr(analysis, which)
+    if name is not None:
+        rest = tuple(other for other in found.names if other != name)
+        return _changed(analysis, found, replace(found, names=rest), (name,))
+    bare = replace(found, selector=found.plain or found.selector, unnamed=(), plain=None)
+    return _changed(analysis, found, bare, tuple(term.form for term in found.unnamed))
 
 
 def _swapped_one(analysis: GapAnalysis) -> Iterator[GapAnalysis]:

@@ -75,9 +75,14 @@ def stretches_telling(errors: PredictionErrors) -> float:
     return float((errors.squares.sum(axis=0) ** 2 / np.maximum((errors.squares**2).sum(axis=0), 1e-300)).min())
 
 
+def outdoes(before: PredictionErrors, after: PredictionErrors, settings: PredictionSettings) -> bool:
+    """Whether errors after beat those before by enough to be worth another model."""
+    return beats(before, after, settings) and math.prod(_ratios(before, after)) ** 0.5 <= settings.worth
+
+
 def surely_beats(before: PredictionErrors, after: PredictionErrors, settings: PredictionSettings) -> bool:
-    """Whether errors after beat those before throughout and, where few stretches tell, by far."""
-    if not beats_throughout(before, after, settings):
+    """Whether errors after outdo those before, beat them throughout and, where few stretches tell, by far."""
+    if not (outdoes(before, after, settings) and beats_throughout(before, after, settings)):
         return False
     few = stretches_telling(before) < settings.fewest_stretches
     return not few or math.prod(_ratios(before, after)) ** 0.5 <= settings.far_better
@@ -103,6 +108,18 @@ def _sigmas(before: PredictionErrors, after: PredictionErrors, quantity: int) ->
     growth = after.squares[:, quantity] - before.squares[:, quantity]
     scatter = math.sqrt(growth.size) * float(growth.std(ddof=1)) if growth.size > 1 else math.inf
     return float(growth.sum()) / max(scatter, 1e-30)
+
+
+def within_one_standard_error(best: PredictionErrors, other: PredictionErrors) -> bool:
+    """Whether other errors exceed the best ones by no more than the standard error that stretches of time give it.
+
+    Squares of position and of heading count alike, each as shares of the best ones'.
+    """
+    if best.squares is None or other.squares is None:
+        return other.position_m * other.yaw_rad <= best.position_m * best.yaw_rad
+    growth = ((other.squares - best.squares) / np.maximum(best.squares.sum(axis=0), 1e-300)).sum(axis=1)
+    error = math.sqrt(growth.size) * float(growth.std(ddof=1)) if growth.size > 1 else 0.0
+    return float(growth.sum()) <= error
 
 
 @dataclass(frozen=True)
