@@ -153,7 +153,8 @@ def taught(part: Part, others: Sequence[Part], nominal: Model) -> Iterator[Half]
     began = time.process_time()
     final = final_fit(part.analysis)
     predictions = joint_predictions(part.analysis, final)
-    offered = offered_stage(predictions.table(), part.analysis.found_any, DEFAULT_SETTINGS)
+    kept = part.analysis if predictions.kept is None else predictions.kept[0]
+    offered = offered_stage(predictions.table(), part.analysis.found_any, kept.adds_to_timed, DEFAULT_SETTINGS)
     cpu_s = part.cpu_s + time.process_time() - began
     models = {stage: model_of(stage, nominal, part.analysis, final, predictions)[0] for stage in STAGES}
     names = tuple(

@@ -49,6 +49,7 @@ from disco_hw.gap.search.analysis import ChannelEstimates, FinalFit, GapAnalysis
 from disco_hw.gap.search.channel_search import search_body, search_wheels
 from disco_hw.gap.search.cross_validation import (
     PredictionErrors,
+    beats,
     clearly_worse,
     only_timed,
     outdoes,
@@ -101,13 +102,13 @@ def find_gap(
     gap = {} if predictions is None else predictions.table()
     wheels = wheel_table(analysis)
     # Without poses the wheels decide, where geometry says nothing: as given, timed or amended.
-    offered = offered_stage(gap or _of_wheels(wheels), bool(named or unnamed), settings)
+    kept = analysis if predictions is None or predictions.kept is None else predictions.kept[0]
+    offered = offered_stage(gap or _of_wheels(wheels), bool(named or unnamed), kept.adds_to_timed, settings)
     spots = blind_spot_findings(analysis, named, top_rad_s)
     if prove:
         spots = proved(spots, finder(analysis, say), settings.report.proved_claims)
     amended, remarks = model_of(offered, model, analysis, final, predictions)
-    if predictions is not None and predictions.kept is not None:
-        remarks = (*left_out_notes(analysis, predictions.kept[0]), *remarks)
+    remarks = (*left_out_notes(analysis, kept), *remarks)
     return GapReport(
         sources=log.sources,
         channels=channel_findings(analysis, named, unnamed),
@@ -133,19 +134,22 @@ def _of_wheels(wheels: Mapping[str, Mapping[float, PredictionErrors]]) -> dict[s
     return {**wheels, "refitted": wheels["nominal"]} if wheels else {}
 
 
-def offered_stage(gap: Mapping[str, Mapping[float, PredictionErrors]], found: bool, settings: GapSettings) -> str:
+def offered_stage(
+    gap: Mapping[str, Mapping[float, PredictionErrors]], found: bool, adds: bool, settings: GapSettings
+) -> str:
     """The stage whose model is handed out: the amended one where it predicts held-out data clearly better than `timed`.
 
     Not where it is so by a single stretch only, or by little where few stretches tell: another drive need not have
-    their like. Where nothing was found it is the amended one unless that is clearly worse; where predictions cannot be
-    compared too.
+    their like. One that `adds` nothing to a delay and a lag has to be level. Where nothing was `found` it is the
+    amended one unless that is clearly worse; where predictions cannot be compared too.
     """
     horizon_s, prediction = reached_horizon_s(gap, settings.prediction), settings.prediction
     if not gap or not math.isfinite(gap["amended"][horizon_s].position_m):
         return "amended"
     refitted, timed, amended = (gap[stage][horizon_s] for stage in STAGES[1:4])
     plainer, plain = ("refitted", refitted) if outdoes(timed, refitted, prediction) else ("timed", timed)
-    if surely_beats(plain, amended, prediction) or (not found and not clearly_worse(plain, amended, prediction)):
+    sure = surely_beats(plain, amended, prediction) or (not adds and beats(plain, amended, prediction))
+    if sure or (not found and not clearly_worse(plain, amended, prediction)):
         return "amended"
     return plainer
 
@@ -199,7 +203,8 @@ def missing_effects(log: DriveLog, model: Model) -> tuple[str, ...]:
     """
     analysis, _ = search_log(log, model)
     final = final_fit(analysis)
-    names = tuple(effect.name for effect in effect_findings(analysis, final))
+    sure, _ = sort_out(effect_findings(analysis, final), Measured.of(analysis, final))
+    names = tuple(effect.name for effect in sure)
     if analysis.body is None or not names:
         return names
     stages = stage_predictions(analysis, final)

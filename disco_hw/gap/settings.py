@@ -365,10 +365,11 @@ class ReportSettings:
     """Ratios of strength beyond are not distinguished. Chosen."""
     end_share: float = 0.01
     """A value this close to where its fit had to end, in its range, is not believed. Chosen."""
-    wide_share: float = 0.8
-    """A half interval over so much of a value's distance from none says too little of it. Chosen: 2.5 deviations."""
-    limit_share: float = 0.5
-    """Of a limit, the same of half of it. Chosen."""
+    wide_share: float = 0.5
+    """A half interval over so much of a value's distance from none says too little of it. Chosen: no interval is wider
+    than its value."""
+    limit_share: float = 0.8
+    """Of a limit, the same of this share of it. Chosen."""
     beyond_limit: float = 1.05
     """Wheels that are faster than a limit by this are beyond it. Chosen: above what a reading errs by."""
     beyond_s: float = 0.5

@@ -23,7 +23,12 @@ def searched():
     log = simulated_drive({"motor_lag": 0.15}, 1, "circle")
     analysis, notes = gap.search_log(log, MODEL)
     predictions = joint_predictions(analysis, final_fit(analysis))
-    return log, analysis, notes, SimpleNamespace(table=predictions.table().copy, joint=predictions.joint)
+    return (
+        log,
+        analysis,
+        notes,
+        SimpleNamespace(table=predictions.table().copy, joint=predictions.joint, kept=predictions.kept),
+    )
 
 
 def robot_toml(generator):

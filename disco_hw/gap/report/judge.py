@@ -289,7 +289,7 @@ def doubt_of(effect: EffectFinding, measured: Measured) -> str | None:
             return f"{_written(parameter, estimate)} lies at the end of its range"
     if all(_unknown(parameter, estimate, settings) for parameter, estimate in pairs):
         said = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
-        return f"{said} is not known well enough to be distinguished from none"
+        return f"{said} is hardly known: its interval is wider than the value"
     return _exceeded(described, pairs[0][1], measured) or measured.disputed.get(effect.name)
 
 
@@ -301,7 +301,9 @@ def _at_end(parameter: Parameter, value: float, settings: ReportSettings) -> boo
 
 
 def _unknown(parameter: Parameter, estimate: ParameterEstimate, settings: ReportSettings) -> bool:
-    """Whether an interval is so wide that the value says little: nearly to neutral, or of a limit to half of it."""
+    """Whether an interval is so wide that the value says little: wider than how far it is from neutral, nearly so of a
+    limit.
+    """
     half = 0.5 * (estimate.high - estimate.low)
     limits = math.isinf(parameter.neutral)
     size = settings.limit_share * estimate.value if limits else abs(estimate.value - parameter.neutral)

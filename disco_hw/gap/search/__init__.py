@@ -209,7 +209,7 @@ def _needed(analysis: GapAnalysis, timed: _Fitted, ahead: Ahead, apart: StagePre
     """
     if not analysis.drive.pose_clock_even:
         for which, name in _least_evident_first(analysis):
-            if name in REGISTRY and REGISTRY[name].stage is Stage.POSE_TIME:
+            if name is not None and REGISTRY[name].stage is Stage.POSE_TIME:
                 analysis = _lacking(analysis, which, name)
     kept = _Candidate.of_channels(analysis, apart)
     if not analysis.found_any:

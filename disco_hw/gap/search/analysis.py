@@ -18,7 +18,7 @@ from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.least_squares import Fit, by_block, fit, inverse
-from disco_hw.gap.search.richest_model import CANDIDATES, indices
+from disco_hw.gap.search.richest_model import CANDIDATES, LATE, indices
 from disco_hw.gap.search.selection import inflation
 from disco_hw.gap.settings import SelectionSettings
 
@@ -277,6 +277,12 @@ class GapAnalysis:
         """Whether anything is missing in the model, by name or without."""
         channels = [found for found in (self.body, self.wheels) if found is not None]
         return any(found.unnamed or set(found.names) - set(found.selector.given) for found in channels)
+
+    @property
+    def adds_to_timed(self) -> bool:
+        """Whether anything is missing beyond a delay and a lag."""
+        channels = [found for found in (self.body, self.wheels) if found is not None]
+        return any(found.unnamed or set(found.names) - {*found.selector.given, *LATE} for found in channels)
 
 
 @dataclass(frozen=True)

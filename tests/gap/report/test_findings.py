@@ -74,7 +74,7 @@ def test_the_answer_says_why_a_model_that_errs_less_is_not_offered(timed, amende
     by_stage = {"refitted": in_stretches([9.0] * len(timed)), "timed": in_stretches(timed)}
     by_stage["amended"] = in_stretches(amended)
     of = replace(report(0.014), gap={**dict.fromkeys(("nominal", "floor"), by_stage["refitted"]), **by_stage})
-    of = replace(of, offered=offered_stage(of.gap, True, DEFAULT_SETTINGS))
+    of = replace(of, offered=offered_stage(of.gap, True, True, DEFAULT_SETTINGS))
     if why is None:
         assert of.offered == "amended"
         assert of.why_not_amended is None
@@ -134,9 +134,9 @@ def test_a_log_of_short_runs_is_answered_as_far_ahead_as_it_reaches():
     assert short.horizon_s == 1.0
     assert answer(short)[1].startswith("1 s ahead on held-out data the amended model errs by 14 mm")
     assert short.as_dict()["gap"]["horizon_s"] == 1.0
-    assert offered_stage(short.gap, True, DEFAULT_SETTINGS) == "amended"
+    assert offered_stage(short.gap, True, True, DEFAULT_SETTINGS) == "amended"
     worse = {**short.gap, "amended": short.gap["nominal"]}
-    assert offered_stage(worse, True, DEFAULT_SETTINGS) == "timed"
+    assert offered_stage(worse, True, True, DEFAULT_SETTINGS) == "timed"
 
 
 FIVE = ("turn_slip", "side_slip", "deadband", "stiction", "motor_lag")

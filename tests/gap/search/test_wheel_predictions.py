@@ -48,7 +48,9 @@ def analysed(names, **effects):
 
 def table_of(analysis):
     table = wheel_table(analysis)
-    return table, offered_stage({**table, "refitted": table["nominal"]}, analysis.found_any, DEFAULT_SETTINGS)
+    return table, offered_stage(
+        {**table, "refitted": table["nominal"]}, analysis.found_any, analysis.adds_to_timed, DEFAULT_SETTINGS
+    )
 
 
 def report_of(analysis):
