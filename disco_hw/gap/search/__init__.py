@@ -10,7 +10,7 @@ one that harms them goes or another that would do as well takes its place.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 
@@ -38,7 +38,8 @@ from disco_hw.gap.search.cross_validation import (
 )
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
 from disco_hw.gap.search.least_squares import Fit, inverse
-from disco_hw.gap.search.richest_model import LATE, LATE_COLUMNS, LATE_STARTS_S, with_pose_delay
+from disco_hw.gap.search.reduced import lacking, lacking_one, least_evident_first, swapped_one
+from disco_hw.gap.search.richest_model import LATE_COLUMNS, LATE_STARTS_S, with_pose_delay
 
 Array = NDArray[np.float64]
 
@@ -145,10 +146,12 @@ def joint_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePrediction
     )
     timed = _Fitted.to(ahead, _timed(ahead, refitted.at()))
     needed = _needed(analysis, timed, ahead, apart)
-    stages = {"refitted": refitted, "timed": timed, "amended": _Fitted.to(ahead, needed.of, needed.by_fold)}
+    amended = _Fitted(needed.candidate.of, ahead.fit(needed.candidate.of), needed.folds)
+    stages = {"refitted": refitted, "timed": timed, "amended": amended}
     chains |= {name: stage.chains for name, stage in stages.items()}
     joint = {name: (stage.of, stage.joint) for name, stage in stages.items()}
-    return StagePredictions(apart.body, apart.wheels, chains, apart.poses, joint, (needed.analysis, needed.final))
+    kept = needed.candidate.analysis, needed.candidate.final
+    return StagePredictions(apart.body, apart.wheels, chains, apart.poses, joint, kept)
 
 
 @dataclass(frozen=True)
@@ -190,57 +193,53 @@ class _Candidate:
         by_fold = {held: _on_top(of, timed.at(held)) for held, of in self.by_fold.items()}
         return replace(self, of=_on_top(self.of, timed.at()), by_fold=by_fold)
 
-    def errors(self, ahead: Ahead, apart: StagePredictions) -> PredictionErrors:
-        """Errors on held-out data."""
-        chains = {held: of.chain(ahead.fit(of, held).vectors) for held, of in self.by_fold.items()}
-        return errors_of(apart.body, apart.wheels, chains, apart.judged_horizon_s, apart.poses)
+    def judged(self, ahead: Ahead, apart: StagePredictions) -> _Judged:
+        """What it errs by on held-out data."""
+        folds = {held: ahead.fit(of, held) for held, of in self.by_fold.items()}
+        chains = {held: of.chain(folds[held].vectors) for held, of in self.by_fold.items()}
+        errors = errors_of(apart.body, apart.wheels, chains, apart.judged_horizon_s, apart.poses)
+        return _Judged(self, folds, errors)
 
 
-def _size(errors: PredictionErrors) -> float:
-    return errors.position_m * errors.yaw_rad
+@dataclass(frozen=True)
+class _Judged:
+    """A candidate, its fits without either fold, and their errors on that."""
+
+    candidate: _Candidate
+    folds: Mapping[int, JointFit]
+    errors: PredictionErrors
+
+    @property
+    def size(self) -> float:
+        """Errors of position and heading together."""
+        return self.errors.position_m * self.errors.yaw_rad
 
 
-def _needed(analysis: GapAnalysis, timed: _Fitted, ahead: Ahead, apart: StagePredictions) -> _Candidate:
-    """The candidate that has what predictions need of what was found.
+def _needed(analysis: GapAnalysis, timed: _Fitted, ahead: Ahead, apart: StagePredictions) -> _Judged:
+    """The candidate that has what predictions need of all that was found.
 
     Poses of a clock that runs unevenly are late by what holds in this log only. Of the rest goes, the least evident
-    first, what held-out data are predicted without as well as by the best, within one standard error (Breiman et al.,
+    first, what held-out data are predicted as well without as by the best, within one standard error (Breiman et al.,
     Classification and Regression Trees, 1984, ch. 3): what a log does not need is as likely of this log alone.
     """
     if not analysis.drive.pose_clock_even:
-        for which, name in _least_evident_first(analysis):
+        for which, name in least_evident_first(analysis):
             if name is not None and REGISTRY[name].stage is Stage.POSE_TIME:
-                analysis = _lacking(analysis, which, name)
-    kept = _Candidate.of_channels(analysis, apart)
+                analysis = lacking(analysis, which, name)
+    whole = _Candidate.of_channels(analysis, apart)
+    kept = whole.judged(ahead, apart)
     if not analysis.found_any:
         return kept
-    options = [(option, option.errors(ahead, apart)) for option in (kept, kept.on_top(timed))]
-    kept, best = min(options, key=lambda option: _size(option[1]))
-    for which, name in _least_evident_first(analysis):
-        fewer = _lacking(kept.analysis, which, name)
+    kept = best = min(kept, whole.on_top(timed).judged(ahead, apart), key=lambda one: one.size)
+    for which, name in least_evident_first(analysis):
+        fewer = lacking(kept.candidate.analysis, which, name)
         if not fewer.found_any:
             break
-        option = _Candidate.of_channels(fewer, apart).on_top(timed)
-        now = option.errors(ahead, apart)
-        if within_one_standard_error(best, now):
+        option = _Candidate.of_channels(fewer, apart).on_top(timed).judged(ahead, apart)
+        if within_one_standard_error(best.errors, option.errors):
             kept = option
-        best = min(best, now, key=_size)
+        best = min(best, option, key=lambda one: one.size)
     return kept
-
-
-def _least_evident_first(analysis: GapAnalysis) -> list[tuple[str, str | None]]:
-    """What was found and `timed` does not have, as its channel and its name, or None for the terms of a channel."""
-    out: list[tuple[float, str, str | None]] = []
-    for which in ("wheels", "body"):
-        found: ChannelResult | None = getattr(analysis, which)
-        if found is None:
-            continue
-        for name, rest in _each(found):
-            if name not in LATE:
-                out.append((found.selector.evidence(rest, found.names).score, which, name))
-        if found.unnamed:
-            out.append((max(term.evidence.score for term in found.unnamed), which, None))
-    return [(which, name) for _, which, name in sorted(out, key=lambda one: one[0])]
 
 
 def _on_top(amended: Freed, timed: Freed) -> Freed:
@@ -357,10 +356,10 @@ def prune(analysis: GapAnalysis) -> GapAnalysis:
     now = predictions.errors("amended")
     for _ in range(settings.most_changes):
         if clearly_worse(refitted, now, settings):
-            options = chain(_lacking_one(analysis), _swapped_one(analysis))
+            options = chain(lacking_one(analysis), swapped_one(analysis))
             better = _best(refitted, worse_by(refitted, now), options)
         else:
-            better = _best(now, 1.0 / settings.worse, _lacking_one(analysis))
+            better = _best(now, 1.0 / settings.worse, lacking_one(analysis))
             if better is not None and not clearly_worse(better[1], now, settings):
                 better = None
         if better is None:
@@ -380,49 +379,3 @@ def _best(
         if ratio < least:
             best, least = (option, errors), ratio
     return best
-
-
-def _lacking_one(analysis: GapAnalysis) -> Iterator[GapAnalysis]:
-    """Analyses that lack one of the names, or the terms of a channel."""
-    for which in ("wheels", "body"):
-        found: ChannelResult | None = getattr(analysis, which)
-        if found is None:
-            continue
-        for name, _ in _each(found):
-            yield _lacking(analysis, which, name)
-        if found.unnamed and found.plain is not None:
-            yield _lacking(analysis, which, None)
-
-
-def _lacking(analysis: GapAnalysis, which: str, name: str | None) -> GapAnalysis:
-    """An analysis without a name in one of its channels, or without the terms there."""
-    found: ChannelResult = getattr(analysis, which)
-    if name is not None:
-        rest = tuple(other for other in found.names if other != name)
-        return _changed(analysis, found, replace(found, names=rest), (name,))
-    bare = replace(found, selector=found.plain or found.selector, unnamed=(), plain=None)
-    return _changed(analysis, found, bare, tuple(term.form for term in found.unnamed))
-
-
-def _swapped_one(analysis: GapAnalysis) -> Iterator[GapAnalysis]:
-    """Analyses that have, in place of one of the names, another that would do as well."""
-    for found in (analysis.wheels, analysis.body):
-        if found is None:
-            continue
-        for name, rest in _each(found):
-            for rival in found.selector.rivals(found.names, name):
-                yield _changed(analysis, found, replace(found, names=(*rest, rival)), (name,))
-
-
-def _each(found: ChannelResult) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Every name that was found, and the others."""
-    for name in found.names:
-        if name not in found.selector.given:
-            yield name, tuple(other for other in found.names if other != name)
-
-
-def _changed(analysis: GapAnalysis, old: ChannelResult, new: ChannelResult, pruned: tuple[str, ...]) -> GapAnalysis:
-    pruned = (*analysis.pruned, *pruned)
-    if old is analysis.wheels:
-        return replace(analysis, wheels=new, pruned=pruned)
-    return replace(analysis, body=new, pruned=pruned)
