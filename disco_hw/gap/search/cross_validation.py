@@ -160,7 +160,7 @@ def smoothed_poses(channel: BodyChannel, p: Array) -> tuple[Array, Array]:
     run_of = np.cumsum(drive.first)
     run_sample = run_of[samples.node[good]]
     turned = measured[:, 2] - at[:, 2]
-    centre = np.clip(np.searchsorted(t, drive.t_s), 0, t.size - 1)
+    centre = np.minimum(np.searchsorted(t, drive.t_s), t.size - 1)
     reach = max(int(reach_s / max(float(np.median(np.diff(t))), 1e-3)), 1)
     near = np.arange(-reach, reach + 1)
     members = np.clip(centre[:, None] + near[None, :], 0, t.size - 1)

@@ -200,6 +200,19 @@ def test_at_its_bounds_nothing_is_clearly_worse_and_without_stretches_the_size_a
     assert clearly_worse(before, replace(uneven, squares=None), settings)
 
 
+@pytest.mark.parametrize(("sigmas", "worse"), [(2.1, True), (1.95, False)])
+def test_growth_is_clear_by_how_stretches_scatter_about_their_own_mean(sigmas, worse):
+    # Squares that grow by 1.3 of 10 on the mean, three stretches by more and three by less.
+    scatter = 1.3 * np.sqrt(6.0) / sigmas
+    growth = 1.3 + scatter * np.sqrt(5.0 / 6.0) * np.array([1, -1, 1, -1, 1, -1])
+    before = in_stretches([10.0] * 6, [1.0] * 6)
+    assert clearly_worse(before, in_stretches(10.0 + growth, [1.0] * 6), DEFAULT_SETTINGS.prediction) is worse
+    # Two stretches that grow alike are sure too, one is not.
+    for count in (1, 2):
+        before, after = in_stretches([10.0] * count, [1.0] * count), in_stretches([11.3, 11.4][:count], [1.0] * count)
+        assert clearly_worse(before, after, DEFAULT_SETTINGS.prediction) is (count == 2)
+
+
 def test_of_two_stretches_each_has_to_be_better():
     settings = replace(DEFAULT_SETTINGS.prediction, fewest_stretches=0.0)
     before = in_stretches([1.0, 1.0], [1.0, 1.0])

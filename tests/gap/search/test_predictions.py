@@ -19,6 +19,7 @@ from disco_hw.gap.search.cross_validation import (
     floor_errors,
     fold_vectors,
     prediction_error,
+    regimes_driven,
     smoothed_poses,
     summarise,
 )
@@ -287,3 +288,33 @@ def test_what_the_other_fold_says_little_of_is_used_if_it_fixes_the_value_itself
     folds = fold_vectors(found, block, np.array([0.25]), DEFAULT_SETTINGS)
     assert folds[0][0] == (value if used else 0.25)
     assert folds[1][0] == value
+
+
+@pytest.mark.parametrize(
+    ("v_m_s", "omega_rad_s", "told"),
+    [
+        (0.019, 0.049, "standstill"),
+        (-0.019, -0.049, "standstill"),
+        (0.021, 0.0, "straight ahead"),
+        (0.0, 0.051, "straight ahead"),
+        (0.059, -0.101, "turning on the spot"),
+        (0.061, 0.101, "straight ahead"),
+        (0.059, 0.099, "straight ahead"),
+        (0.2, 0.31, "curves"),
+        (-0.2, -0.31, "curves"),
+        (0.2, 0.29, "straight ahead"),
+        (-0.2, 0.29, "straight back"),
+    ],
+)
+def test_a_regime_is_told_by_mean_speed_and_mean_yaw_rate(v_m_s, omega_rad_s, told):
+    both, apart = v_m_s / (0.5 * RADIUS_M), omega_rad_s * AXLE_M / RADIUS_M
+    channel = steady(0.5 * (both - apart), 0.5 * (both + apart))
+    assert regimes_driven(channel, np.array([100, 300]), 200) == [told] * 2
+
+
+@pytest.mark.parametrize(("faster_m_s", "told"), [(0.245, "straight ahead"), (0.255, "speeding up and braking")])
+def test_a_robot_speeds_up_by_what_its_speed_spans_on_the_way(faster_m_s, told):
+    line = line_of(np.repeat(np.linspace(5.0, 5.0 + 2.0 * faster_m_s / RADIUS_M, 401)[:, None], 2, axis=1))
+    channel = BodyChannel.build(line, NOISE, vector_of())
+    # Half of all of it in half the time.
+    assert regimes_driven(channel, np.array([100]), 201) == [told]
