@@ -2,8 +2,8 @@
 
 `DISCO_HW_DATA=FOLDER python -m tools.gap_shifts [NAME...]`: logs whose path holds a NAME, all without one. Poses are
 moved by -0.32 to 0.32 s and the channel from wheel to body is searched, commands by 0.1 to 0.4 s and that from command
-to wheel. Found: within 20 ms of what the log itself shows and the move; a name that the log itself has not is one too
-many.
+to wheel. Found: within 20 ms of the move and of what the log itself shows with the same delays in the fit, named there
+or not; a name that the log itself has not is one too many. "said": not found, and the log is told not to show it.
 """
 
 from __future__ import annotations
@@ -33,13 +33,17 @@ POSE_TIME = tuple(column.partition(".")[0] for column in OLD_POSE_COLUMNS)
 
 @dataclass(frozen=True)
 class Shift:
-    """What one search said of a log moved by `moved_s`: how far it is found moved, and names that it has besides."""
+    """What one search said of a log moved by `moved_s`: how far it is found moved, and names that it has besides.
+
+    `said`: that the time of this part of the log is told not to be known.
+    """
 
     log: str
     part: str
     moved_s: float
     found_s: float
     besides: tuple[str, ...]
+    said: bool
 
     @property
     def found(self) -> bool:
@@ -61,7 +65,14 @@ def form_of(text: str) -> str:
 def late_s(found: ChannelResult, columns: Sequence[str]) -> float:
     """Sum of what was found of some delays, s; what has no name is none."""
     place = found.selector.channel.layout.place
-    return sum(float(found.fit.vector[place[each]]) for each in columns if each.partition(".")[0] in found.names)
+    return sum(float(found.told.vector[place[each]]) for each in columns if each.partition(".")[0] in found.names)
+
+
+def shown_s(found: ChannelResult, columns: Sequence[str], names: Sequence[str]) -> float:
+    """The same of a log that was not moved, with delays of these names in the fit: its own may be too short for one."""
+    timed = {each.partition(".")[0] for each in columns}
+    missing = (name for name in names if name in timed and name not in found.names)
+    return late_s(replace(found, names=(*found.names, *missing)), columns)
 
 
 def moved(log: DriveLog, part: str, by_s: float) -> DriveLog:
@@ -79,8 +90,9 @@ def compare(
     plain, sign = searched[0.0], -1.0 if part == "commands" else 1.0
     for by_s, one in searched.items():
         if by_s:
-            found_s = sign * (late_s(one, columns) - late_s(plain, columns))
-            yield Shift(log, part, by_s, found_s, tuple(sorted(told(one) - told(plain) - set(names))))
+            found_s = sign * (late_s(one, columns) - shown_s(plain, columns, one.names))
+            said = part == "commands" and not one.channel.drive.commands_timed
+            yield Shift(log, part, by_s, found_s, tuple(sorted(told(one) - told(plain) - set(names))), said)
 
 
 def shifts(path: Path) -> Iterator[Shift]:
@@ -103,7 +115,8 @@ def shifts(path: Path) -> Iterator[Shift]:
 
 def row(of: Shift) -> str:
     """One line of the table."""
-    cells = (of.log, of.part, f"{of.moved_s:+.2f}", f"{of.found_s:+.3f}", "" if of.found else "no")
+    missed = "said" if of.said else "no"
+    cells = (of.log, of.part, f"{of.moved_s:+.2f}", f"{of.found_s:+.3f}", "" if of.found else missed)
     return f"| {' | '.join([*cells, ', '.join(of.besides).replace('|', chr(92) + '|')])} |"
 
 
@@ -119,7 +132,8 @@ def main(names: Sequence[str]) -> int:
     for part in ("poses", "commands"):
         own = [shift for shift in found if shift.part == part]
         alone = sum(not shift.besides for shift in own)
-        print(f"\n{part}: found within 20 ms {sum(shift.found for shift in own)} of {len(own)}, alone {alone}")
+        found_here, said = sum(shift.found for shift in own), sum(shift.said and not shift.found for shift in own)
+        print(f"\n{part}: found within 20 ms {found_here} of {len(own)}, said not to be known {said}, alone {alone}")
     print(f"CPU {time.process_time() - began:.0f} s")
     return 0
 

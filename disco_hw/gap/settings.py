@@ -63,12 +63,20 @@ class GridSettings:
     """Poses are stamped at most so much too early or too late. Chosen: a pose that is later than that is of no use."""
     delay_step_s: float = 0.02
     """The delay of poses is scanned in steps of this. Chosen: between them a parabola is exact enough to begin with."""
+    lags_s: tuple[float, ...] = (0.02, 0.04, 0.06, 0.09, 0.13, 0.18, 0.25, 0.35, 0.5, 0.7, 1.0)
+    """Lags behind which the delay of commands is scanned. Chosen: as close as the delay can tell them apart."""
+    lag_reach_s: float = 0.15
+    """So far about the delay that is as long in all. Chosen: a lag is not quite as late as a delay of its length."""
+    most_command_pairs: int = 3000
+    """About so many pairs of samples are compared in it at most. Chosen: more say no more, and take longer."""
     delay_span_s: float = 0.4
     """Turns and ways between poses so far apart are compared with the wheels'. Chosen: several poses of a lidar."""
     clock_stretch_s: float = 12.0
     """A drift or jump of the poses' clock is looked for in stretches of this. Chosen: each with starts and turns."""
     fewest_clock_stretches: int = 4
     """In fewer of them it is not looked for. Chosen."""
+    least_clock_share: float = 0.5
+    """Nor where those that show a delay lie in less of the log. Chosen: a line through them says little of the rest."""
     clock_times_better: float = 2.0
     """It explains so many times more of how the stretches' delays scatter than it leaves. Chosen."""
     least_clock_error_s: float = 0.03

@@ -118,14 +118,17 @@ def _run_body(
         track[i, 0], track[i, 1], track[i, 2] = x, y, yaw
 
 
-def run_wheels(p: Array, geometry: Array, command: Array, extra: Array, first: Mask, t_s: Array, start: Array) -> Array:
+def run_wheels(
+    p: Array, geometry: Array, command: Array, extra: Array, first: Mask, t_s: Array, start: Array, moved_s: float = 0.0
+) -> Array:
     """Measured wheel angles (M, 2) that the commands alone make.
 
     `p` in the order of `WHEEL.columns`; `command` (M, 2) rad/s per cell, NaN begins anew; `extra` (M, 2) is added to
-    the command; `start` (M, 2) measured speeds, read where a run begins; `geometry` (3,).
+    the command; `start` (M, 2) measured speeds, read where a run begins; `geometry` (3,). The commands lie `moved_s`
+    later than they are stamped.
     """
     angle = np.empty_like(command)
-    late = WHEEL.at(p, DELAYED_BY) / GRID_STEP_S
+    late = (WHEEL.at(p, DELAYED_BY) - moved_s) / GRID_STEP_S
     _run_wheels(wheel_effects(p, geometry), late, command, extra, first, t_s, start, angle)
     turns = counted(WHEEL, p)
     if turns != (1.0, 1.0):
@@ -207,17 +210,18 @@ def _lay(
 
 def pose_residual(
     p: Array, track: Array, ground: Array, node: Index, fraction: Array, window: Index, first_node: Index,
-    last_node: Index, use: Mask, measured: Array,
+    last_node: Index, use: Mask, measured: Array, moved_s: float = 0.0,
 ) -> Array:  # fmt: skip
     """Measured minus predicted pose (P, 3) in the world frame, each window laid on its measurements.
 
     `window` (P,) numbers ascending from 0; within one the predicted path is turned and shifted as a whole by the mean
     difference over the samples in `use`. `ground` (M, 2) is how far the ground has carried the robot (m); `first_node`,
-    `last_node` (P,) bound the run of each sample, for the latency.
+    `last_node` (P,) bound the run of each sample, for the latency. The poses lie `moved_s` earlier than they
+    are stamped.
     """
     out = np.empty_like(measured)
     sensor = pose_sensor(p)
-    late = sensor.late_s / GRID_STEP_S
+    late = (sensor.late_s - moved_s) / GRID_STEP_S
     _lay(late, sensor.bias_rad, ground, track, node, fraction, window, first_node, last_node, use, measured, out)
     return out
 
@@ -250,29 +254,22 @@ def _displace(
 
 
 def displacement(
-    p: Array, first: NDArray[np.bool_], track: Array, ground: Array, start: Index, heading_rad: Array, ahead_s: float
-) -> Array:
+    p: Array, first: NDArray[np.bool_], track: Array, ground: Array, start: Index, heading_rad: Array, ahead_s: float,
+    moved_s: float = 0.0,
+) -> Array:  # fmt: skip
     """Forward, left and yaw (K, 3) that a pose sensor would see from each start node to `ahead_s` later.
 
     `p` in the order of `BODY.columns`; `first` (M,) where runs begin, out of which no latency looks; `track` (M, 3) a
-    free run of the body, `ground` (M, 2) how far the ground has carried it; `heading_rad` (K,) measured there.
+    free run of the body, `ground` (M, 2) how far the ground has carried it; `heading_rad` (K,) measured there. The
+    poses lie `moved_s` earlier than they are stamped.
     """
     begins = np.flatnonzero(first)
     run = np.searchsorted(begins, start, side="right") - 1
     low, high = begins[run], np.append(begins[1:], first.size)[run] - 1
     out = np.empty((start.size, 3))
     sensor = pose_sensor(p)
-    _displace(
-        np.array([sensor.late_s, sensor.bias_rad]),
-        track,
-        ground,
-        start,
-        low,
-        high,
-        heading_rad,
-        round(ahead_s / GRID_STEP_S),
-        out,
-    )
+    world = np.array([sensor.late_s - moved_s, sensor.bias_rad])
+    _displace(world, track, ground, start, low, high, heading_rad, round(ahead_s / GRID_STEP_S), out)
     return out
 
 

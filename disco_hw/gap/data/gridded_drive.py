@@ -11,14 +11,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from disco_hw.gap.data.timing import pose_clock
+from disco_hw.gap.data.timing import PoseClock, command_delay_s, pose_clock
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, GapSettings, GridSettings
-from disco_hw.log.drive import Commands, DriveLog, Wheels
+from disco_hw.log.drive import Commands, DriveLog, Poses, Wheels
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -49,7 +50,9 @@ class GriddedDrive:
     yaw not wrapped within a run. `known_command` (M, 2) rad/s and `known_motion` (M, 3) m/s, m/s, rad/s: what the
     terms without a name that a given model has add; None without. `settings` travel with the drive: what judges it
     reads them there. `pose_delay_s`: how much older than their stamps poses are at first sight, s; `pose_clock_even`:
-    whether their clock neither drifts nor jumps.
+    whether their clock neither drifts nor jumps. Commands and poses are laid where they belong at first sight:
+    `commands_moved_s` later and `poses_moved_s` earlier than their stamps, whole cells. `commands_timed`: whether it is
+    known where commands belong.
     """
 
     t_s: Array
@@ -71,6 +74,9 @@ class GriddedDrive:
     settings: GapSettings = DEFAULT_SETTINGS
     pose_delay_s: float = 0.0
     pose_clock_even: bool = True
+    commands_moved_s: float = 0.0
+    commands_timed: bool = True
+    poses_moved_s: float = 0.0
 
     @property
     def has_commands(self) -> bool:
@@ -94,23 +100,23 @@ class GriddedDrive:
         Zero where none is known, before the first and after the last as these.
         """
         raw = np.nan_to_num(self.command_rad_s)
-        return raw[np.clip(np.arange(raw.shape[0]) - round(late_s / GRID_STEP_S), 0, raw.shape[0] - 1)]
+        cells = round((late_s - self.commands_moved_s) / GRID_STEP_S)
+        return raw[np.clip(np.arange(raw.shape[0]) - cells, 0, raw.shape[0] - 1)]
 
 
 def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> GriddedDrive:
     """Lay a drive on the grid; a log without wheel samples has an empty one."""
     grid_settings = settings.grid
     wheels = undo_sample_hold(log.wheels, grid_settings)
-    clock = pose_clock(wheels, log.poses, grid_settings)
-    poses = clock.corrected(log.poses)
-    notes: list[str] = [*clock.notes]
+    timed = _timed(log, wheels, grid_settings)
+    asked, poses, notes = timed.commands, timed.poses, [*timed.notes]
     nodes_t, nodes_first, commands, changes, angles, speeds = [], [], [], [], [], []
     encoder_at, encoder_angle, pose_at, pose_values = [], [], [], []
     offset, foreign_s = 0, 0.0
     runs = _runs(wheels.t_s, wheels.segment, grid_settings)
     driven_s = sum(float(wheels.t_s[hi - 1] - wheels.t_s[lo]) for lo, hi in runs)
     if driven_s > grid_settings.longest_s:
-        runs = _spread(wheels.t_s, runs, driven_s, _commanded(log.commands, wheels), grid_settings)
+        runs = _spread(wheels.t_s, runs, driven_s, _commanded(asked, wheels), grid_settings)
         notes.append(
             f"{driven_s:.0f} s of driving: {grid_settings.longest_s:.0f} s of it, evenly spread and those with "
             "commands first, are judged"
@@ -122,7 +128,7 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
         segment = int(wheels.segment[lo])
         grid = t[0] + GRID_STEP_S * np.arange(int((t[-1] - t[0]) / GRID_STEP_S) + 1)
         at = np.column_stack([np.interp(grid, t, angle[:, side]) for side in (0, 1)])
-        command, change = _command_cells(log.commands, segment, grid)
+        command, change = _command_cells(asked, segment, grid)
         span_s = max(grid_settings.speed_span_s, float(np.median(np.diff(t))))
         speed = _speeds(grid, t, angle, span_s)
         foreign = _foreign(command, speed, span_s, grid_settings)
@@ -167,9 +173,50 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
         pose_values=np.concatenate(pose_values),
         notes=tuple(notes),
         settings=settings,
-        pose_delay_s=clock.delay_s,
-        pose_clock_even=not (clock.drift_s or clock.jump_s),
+        pose_delay_s=timed.clock.delay_s,
+        pose_clock_even=not (timed.clock.drift_s or timed.clock.jump_s),
+        commands_moved_s=timed.commands_moved_s,
+        commands_timed=timed.commands_timed,
+        poses_moved_s=timed.poses_moved_s,
     )
+
+
+class _Timed(NamedTuple):
+    """Commands and poses where they belong beside the wheels at first sight, and by how much they were moved."""
+
+    commands: Commands
+    poses: Poses
+    commands_moved_s: float
+    commands_timed: bool
+    poses_moved_s: float
+    clock: PoseClock
+    notes: tuple[str, ...]
+
+
+def _timed(log: DriveLog, wheels: Wheels, settings: GridSettings) -> _Timed:
+    clock, delay_s = pose_clock(wheels, log.poses, settings), command_delay_s(wheels, log.commands, settings)
+    later_s, earlier_s = (round(each / GRID_STEP_S) * GRID_STEP_S for each in (delay_s or 0.0, clock.delay_s))
+    poses, notes = clock.corrected(log.poses), clock.notes
+    if delay_s is None:
+        said = (
+            f"wheels answer commands more slowly than behind a lag of {max(settings.lags_s):g} s, or more than "
+            f"{settings.most_pose_delay_s:g} s late or early: how late commands are stamped is not known from this log"
+        )
+        notes = (*notes, said)
+    return _Timed(
+        replace(log.commands, t_s=_moved(log.commands.t_s, later_s)),
+        replace(poses, t_s=_moved(poses.t_s, -earlier_s)),
+        later_s,
+        delay_s is not None,
+        earlier_s,
+        clock,
+        notes,
+    )
+
+
+def _moved(t_s: Array, by_s: float) -> Array:
+    """Times, moved, to the nanosecond: the last digits would decide on which side of a cell's border a sample lies."""
+    return np.round(t_s + by_s, 9) if by_s else t_s
 
 
 def even_times(t_s: Array, neighbours: int) -> Array:

@@ -1,4 +1,4 @@
-"""How much earlier or later than the wheels the poses are stamped, found from the log alone before anything is fitted.
+"""How much earlier or later than the wheels poses and commands are stamped, found before anything is fitted.
 
 A search that begins without a delay of 0.3 s does not find it: it takes what the delay makes for slip and noise.
 """
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from disco_hw.gap.settings import GridSettings
 from disco_hw.jit import kernel_function, scalar_function
-from disco_hw.log.drive import Poses, Wheels
+from disco_hw.log.drive import Commands, Poses, Wheels
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -72,15 +72,17 @@ def pose_clock(wheels: Wheels, poses: Poses, settings: GridSettings) -> PoseCloc
     """Delay of the poses against the wheels, and whether it drifts or jumps, from stretches looked at one by one.
 
     A drift or a jump is believed where the stretches agree on it far beyond their scatter, and where the whole log fits
-    clearly better with it.
+    clearly better with it; of both the one with which it fits better. One stretch that is off looks like a jump to the
+    others.
     """
     plain = PoseClock(pose_delay_s(wheels, poses, settings))
     if not poses.t_s.size:
         return plain
     middles, delays = _by_stretch(wheels, poses, settings)
-    if delays.size < settings.fewest_clock_stretches:
-        return plain
     first, last = float(poses.t_s[0]), float(poses.t_s[-1])
+    few = delays.size < settings.fewest_clock_stretches
+    if few or middles[-1] - middles[0] < settings.least_clock_share * (last - first):
+        return plain
     centred = (middles - 0.5 * (first + last)) / (last - first)
     slope, level = np.polyfit(centred, delays, 1)
     # The step that the stretches show best lies between two of them.
@@ -89,26 +91,26 @@ def pose_clock(wheels: Wheels, poses: Poses, settings: GridSettings) -> PoseCloc
     ]
     squares, place = min(steps)
     of_drift = float(((delays - level - slope * centred) ** 2).sum())
-    constant = float(((delays - delays.mean()) ** 2).sum())
-    least = min(of_drift, squares)
-    if constant < settings.clock_times_better * least:
+    most = float(((delays - delays.mean()) ** 2).sum()) / settings.clock_times_better
+    drifting = PoseClock(plain.delay_s, 0.5 * (first + last), last - first, drift_s=float(slope))
+    jump_s = float(np.median(delays[place:]) - np.median(delays[:place]))
+    jumping = PoseClock(plain.delay_s, jump_s=jump_s, jump_at_s=float(0.5 * (middles[place - 1] + middles[place])))
+    likely = sorted(((of_drift, drifting), (squares, jumping)), key=lambda one: one[0])
+    sizes = [max(abs(clock.drift_s), abs(clock.jump_s)) for _, clock in likely]
+    if likely[0][0] > most or sizes[0] < settings.least_clock_error_s:
         return plain
-    if of_drift <= squares:
-        clock = PoseClock(plain.delay_s, 0.5 * (first + last), last - first, drift_s=float(slope))
-        size_s = abs(slope)
-    else:
-        jump_s = float(np.median(delays[place:]) - np.median(delays[:place]))
-        at_s = float(0.5 * (middles[place - 1] + middles[place]))
-        clock = PoseClock(
-            plain.delay_s, jump_s=jump_s, jump_at_s=_instant(wheels, poses, settings, delays, place, at_s)
-        )
-        size_s = abs(jump_s)
-    if size_s < settings.least_clock_error_s:
-        return plain
-    even = clock.corrected(poses)
-    delay_s = pose_delay_s(wheels, even, settings)
-    gained = _misfit_at(wheels, poses, plain.delay_s, settings) - _misfit_at(wheels, even, delay_s, settings)
-    return replace(clock, delay_s=delay_s) if gained > settings.least_clock_nats else plain
+    best, least = plain, _misfit_at(wheels, poses, plain.delay_s, settings) - settings.least_clock_nats
+    for (left, clock), size_s in zip(likely, sizes, strict=True):
+        if left > most or size_s < settings.least_clock_error_s:
+            continue
+        at_s = _instant(wheels, poses, settings, delays, place, clock.jump_at_s) if clock.jump_s else clock.jump_at_s
+        tried = replace(clock, jump_at_s=at_s)
+        even = tried.corrected(poses)
+        delay_s = pose_delay_s(wheels, even, settings)
+        misfit = _misfit_at(wheels, even, delay_s, settings)
+        if misfit < least:
+            best, least = replace(tried, delay_s=delay_s), misfit
+    return best
 
 
 def _by_stretch(wheels: Wheels, poses: Poses, settings: GridSettings) -> tuple[Array, Array]:
@@ -156,6 +158,88 @@ def pose_delay_s(wheels: Wheels, poses: Poses, settings: GridSettings) -> float:
     return float(delays[best] + settings.delay_step_s * _vertex(misfit, best))
 
 
+def command_delay_s(wheels: Wheels, commands: Commands, settings: GridSettings) -> float | None:
+    """How much later than its stamp a command is acted on at first sight, s: negative where it is stamped too late.
+
+    Scanned as the poses' delay: what a wheel turns between samples `delay_span_s` apart is fitted by what both commands
+    ask for, first without a lag, then with each of `lags_s`, as long in all. 0 where commands are too few or where no
+    delay stands out; None where the longest delay or lag fits best, so that no other is known to be the one.
+    """
+    if min(wheels.t_s.size, commands.t_s.size) < 2:
+        return 0.0
+    # Held speeds may come less often.
+    span_s = max(settings.delay_span_s, float(np.median(np.diff(wheels.t_s))))
+    first, second = _apart(wheels.t_s, wheels.segment, span_s)
+    if first.size < settings.fewest_poses:
+        return 0.0
+    every = max(first.size // settings.most_command_pairs, 1)
+    first, second = first[::every], second[::every]
+    pairs = wheels.t_s[first], wheels.t_s[second], wheels.segment[first]
+    turned = [angle[second] - angle[first] for angle in (wheels.left_angle_rad, wheels.right_angle_rad)]
+    steps = round(settings.most_pose_delay_s / settings.delay_step_s)
+    delays: Array = settings.delay_step_s * np.arange(-steps, steps + 1, dtype=np.float64)
+    misfit = _command_misfits(commands, pairs, turned, delays, 0.0, settings)
+    ordinary = misfit[np.isfinite(misfit)]
+    if not ordinary.size:
+        return 0.0
+    best, usual = int(np.argmin(misfit)), float(np.median(ordinary))
+    found, least = float(delays[best] + settings.delay_step_s * _vertex(misfit, best)), float(misfit[best])
+    within = 0 < best < delays.size - 1
+    for lag_s in settings.lags_s:
+        shorter = delays[np.abs(delays - (delays[best] - lag_s)) < settings.lag_reach_s]
+        misfit = _command_misfits(commands, pairs, turned, shorter, lag_s, settings)
+        if misfit.size and misfit.min() < least:
+            place = int(np.argmin(misfit))
+            found, least = float(shorter[place] + settings.delay_step_s * _vertex(misfit, place)), float(misfit[place])
+            within = within and lag_s < max(settings.lags_s)
+    if usual - least < settings.least_delay_nats:
+        return 0.0
+    return found if within else None
+
+
+def _command_misfits(
+    commands: Commands, pairs: tuple[Array, Array, Index], turned: list[Array], delays: Array, lag_s: float,
+    settings: GridSettings,
+) -> Array:  # fmt: skip
+    """Minus the log likelihood per pair and wheel at each of some delays (D,) behind a lag; infinite for too few."""
+    begin, end, segment = pairs
+    asked = np.column_stack([commands.left_rad_s, commands.right_rad_s])
+    unknown = np.isnan(asked[:, 0])
+    state, angle = np.empty(asked.shape), np.empty(asked.shape)
+    _answer(commands.t_s, np.nan_to_num(asked), lag_s, state, angle)
+    lost = np.concatenate([[0.0], np.cumsum(np.diff(commands.t_s) * unknown[:-1])])
+    misfit = np.full(delays.size, np.inf)
+    for place, delay in enumerate(delays):
+        ends, known = [], np.ones(begin.size, dtype=bool)
+        for at in (begin - delay, end - delay):
+            k = np.clip(np.searchsorted(commands.t_s, at, side="right") - 1, 0, commands.t_s.size - 1)
+            since = (at - commands.t_s[k])[:, None]
+            slow = lag_s * (1.0 - np.exp(-since / lag_s)) if lag_s > 0.0 else 0.0
+            now = np.nan_to_num(asked[k])
+            ends.append((angle[k] + now * since + (state[k] - now) * slow, lost[k] + since[:, 0] * unknown[k]))
+            known &= (commands.segment[k] == segment) & (at >= commands.t_s[0]) & (at <= commands.t_s[-1])
+        known &= ends[1][1] - ends[0][1] < 1e-9
+        if np.count_nonzero(known) < settings.fewest_poses:
+            continue
+        moved = (ends[1][0] - ends[0][0])[known]
+        difference, total = moved[:, 1] - moved[:, 0], moved[:, 1] + moved[:, 0]
+        misfit[place] = sum(_misfit(difference, total, measured[known]) for measured in turned)
+    return misfit
+
+
+@kernel_function
+def _answer(t_s: Array, asked: Array, lag_s: float, state: Array, angle: Array) -> None:
+    """Speeds (N, 2) of wheels that follow commands with a lag at the instants of these, and the way turned by then."""
+    for side in range(asked.shape[1]):
+        state[0, side], angle[0, side] = asked[0, side], 0.0
+        for k in range(1, t_s.shape[0]):
+            step_s, before = t_s[k] - t_s[k - 1], asked[k - 1, side]
+            left = math.exp(-step_s / lag_s) if lag_s > 0.0 else 0.0
+            behind = state[k - 1, side] - before
+            angle[k, side] = angle[k - 1, side] + before * step_s + behind * lag_s * (1.0 - left)
+            state[k, side] = before + behind * left
+
+
 def _misfit_at(wheels: Wheels, poses: Poses, delay_s: float, settings: GridSettings) -> float:
     """Minus the log likelihood per pose at a delay; 0 where the poses are too few."""
     misfit = float(_misfits(wheels, poses, np.full(1, delay_s), settings)[0])
@@ -188,10 +272,15 @@ def _misfits(wheels: Wheels, poses: Poses, delays: Array, settings: GridSettings
 
 def _pairs(poses: Poses, span_s: float) -> tuple[Index, Index]:
     """Pairs of poses of one segment that lie `span_s` apart, or little more."""
-    later = np.searchsorted(poses.t_s, poses.t_s + span_s - 1e-9)
-    first = np.flatnonzero(later < poses.t_s.size)
+    return _apart(poses.t_s, poses.segment, span_s)
+
+
+def _apart(t_s: Array, segment: Index, span_s: float) -> tuple[Index, Index]:
+    """Pairs of samples of one segment that lie `span_s` apart, or little more."""
+    later = np.searchsorted(t_s, t_s + span_s - 1e-9)
+    first = np.flatnonzero(later < t_s.size)
     second = later[first]
-    near = (poses.segment[first] == poses.segment[second]) & (poses.t_s[second] - poses.t_s[first] < 1.6 * span_s)
+    near = (segment[first] == segment[second]) & (t_s[second] - t_s[first] < 1.6 * span_s)
     return first[near], second[near]
 
 

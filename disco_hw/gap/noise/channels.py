@@ -205,8 +205,9 @@ class WheelChannel:
         drive = self.drive
         perturbation = total_perturbation(drive, 2, drive.known_command, extra)
         return run_wheels(
-            p, self.geometry, drive.command_rad_s, perturbation, drive.first, drive.t_s, drive.speed_rad_s
-        )
+            p, self.geometry, drive.command_rad_s, perturbation, drive.first, drive.t_s, drive.speed_rad_s,
+            drive.commands_moved_s,
+        )  # fmt: skip
 
     def raw_residual(self, p: Array, extra: Array | None = None) -> Array:
         """Measured minus predicted wheel angles at the samples, (E, 2)."""
@@ -371,6 +372,7 @@ class BodyChannel:
             self.last_node,
             self.use,
             self.measured,
+            self.drive.poses_moved_s,
         )
 
     def whitened(self, p: Array, extra: Array | None = None) -> Array:

@@ -298,7 +298,8 @@ def with_effect(drive: GriddedDrive, found: ChannelResult, vector: Array) -> Gri
     wheels = Wheels(drive.t_s, left, right, left_speed, right_speed, run, True, False)
     x, y, yaw = moved.pose_values.T
     poses = Poses(drive.pose.t_s, x, y, yaw, run[drive.pose.node])
-    return replace(moved, pose_delay_s=pose_delay_s(wheels, poses, drive.settings.grid))
+    seen_s = drive.poses_moved_s + pose_delay_s(wheels, poses, drive.settings.grid)
+    return replace(moved, pose_delay_s=seen_s)
 
 
 def _moved(
@@ -330,7 +331,7 @@ def _path(drive: GriddedDrive, channel: BodyChannel, vector: Array, extra: Array
     begins = np.flatnonzero(drive.first)
     run = np.searchsorted(begins, drive.pose.node, side="right") - 1
     low, high = begins[run], np.append(begins[1:], drive.first.size)[run] - 1
-    late = pose_sensor(vector).late_s / GRID_STEP_S
+    late = (pose_sensor(vector).late_s - drive.poses_moved_s) / GRID_STEP_S
     place = np.clip(drive.pose.node + drive.pose.fraction - late, low, high - 1e-6)
     node = np.floor(place).astype(np.int64)
     out = np.empty((place.size, 3))

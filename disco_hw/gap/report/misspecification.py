@@ -26,7 +26,7 @@ from disco_hw.gap.noise import largest_command_jitter_s
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.least_squares import Fit, fit, inverse
-from disco_hw.gap.search.richest_model import CANDIDATES, indices
+from disco_hw.gap.search.richest_model import CANDIDATES, LATE, indices
 from disco_hw.gap.search.selection import Split, inflation
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms
 from disco_hw.gap.settings import GRID_STEP_S, ReportSettings
@@ -125,7 +125,12 @@ def disputed_names(found: ChannelResult) -> dict[str, str]:
     for name in found.names:
         if name in found.selector.given:
             continue
-        why = _takes_little(found, name) or _beside_as_much(found, name) or _changes_with_regime(found, name)
+        why = (
+            _answers_otherwise(found, name)
+            or _takes_little(found, name)
+            or _beside_as_much(found, name)
+            or _changes_with_regime(found, name)
+        )
         if why is not None:
             out[name] = f"something acts like it and has another form: {why}"
     return out
@@ -135,6 +140,13 @@ def _gain(found: ChannelResult, name: str) -> float:
     """What a name is worth in nats, the others kept."""
     rest = tuple(other for other in found.names if other != name)
     return found.selector.exact(rest).cost - found.fit.cost
+
+
+def _answers_otherwise(found: ChannelResult, name: str) -> str | None:
+    """That wheels do not answer as they do behind a delay and a lag, of what makes them late."""
+    if name in LATE and not found.channel.drive.commands_timed:
+        return "wheels answer more slowly, or later, than behind any delay and lag that were tried before"
+    return None
 
 
 def _takes_little(found: ChannelResult, name: str) -> str | None:

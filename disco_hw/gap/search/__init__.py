@@ -39,7 +39,7 @@ from disco_hw.gap.search.cross_validation import (
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
 from disco_hw.gap.search.least_squares import Fit, inverse
 from disco_hw.gap.search.reduced import lacking, lacking_one, least_evident_first, swapped_one
-from disco_hw.gap.search.richest_model import LATE_COLUMNS, LATE_STARTS_S, with_pose_delay
+from disco_hw.gap.search.richest_model import LATE_COLUMNS, LATE_STARTS_S, with_delay
 
 Array = NDArray[np.float64]
 
@@ -73,7 +73,7 @@ class StagePredictions:
         """Errors by stage and horizon, with the floor, for which the wheels' path is that of the geometry alone."""
         horizons = self.body.settings.prediction.horizons_s
         table = {stage: {ahead_s: self.errors(stage, ahead_s) for ahead_s in horizons} for stage in self.chains}
-        noise = sensor_noise(self.body, with_pose_delay(self.body, self.chains["refitted"][0].body))
+        noise = sensor_noise(self.body, with_delay(self.body, self.chains["refitted"][0].body))
         table["floor"] = {ahead_s: floor_errors(self.body, noise, ahead_s, self.poses) for ahead_s in horizons}
         return table
 

@@ -24,12 +24,13 @@ from disco_hw.gap.search.richest_model import (
     LATE,
     LATE_COLUMNS,
     LATE_STARTS_S,
+    delays_of,
     indices,
     learn_saturated_body,
     learn_saturated_wheels,
     parameters_of,
     smooth_of,
-    with_pose_delay,
+    with_delay,
 )
 from disco_hw.gap.search.selection import EffectEvidence, Names, Selector, Split, Thresholds, compare, inflation
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms, body_terms, places, places_near, wheel_terms
@@ -144,8 +145,11 @@ def body_moves(channel: BodyChannel) -> Callable[[Split, Split], float]:
         ends = []
         for p, extra in (small, big):
             ends.append(
-                displacement(p, drive.first, channel.track(p, extra), channel.carried(p), start, heading, ahead_s)
-            )
+                displacement(
+                    p, drive.first, channel.track(p, extra), channel.carried(p), start, heading, ahead_s,
+                    drive.poses_moved_s,
+                )
+            )  # fmt: skip
         apart = ends[1] - ends[0]
         lever = 0.5 * np.hypot(ends[1][:, 0], ends[1][:, 1])
         return _where_most(apart[:, 0] ** 2 + apart[:, 1] ** 2 + (lever * apart[:, 2]) ** 2, settings.most_moved_share)
@@ -169,7 +173,8 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
     moves = wheel_moves(channel, geometry)
     settings = drive.settings.selection
     # What is left of a rough fit becomes the noise of all that follow.
-    rough = Selector(channel, moves, Thresholds(settings.rough_score, 0.0), given=given, start=start, closely=True)
+    seen = with_delay(channel, start)
+    rough = Selector(channel, moves, Thresholds(settings.rough_score, 0.0), given=given, start=seen, closely=True)
     begin = tuple(dict.fromkeys((*given, *LATE)))
     responding(rough, begin)
     names = rough.greedy(begin, responding)
@@ -183,16 +188,43 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
         white = whiten_wheels(left, channel.gains)
         rolling = np.abs(drive.speed_rad_s[drive.encoder.node]).max(axis=1) > settings.rest_rad_s
         limits = _thresholds(white, channel.gains.use & rolling, settings)
-        selector = Selector(channel, moves, limits, given=given, start=rough.fit(given).vector)
+        selector = timed(Selector(channel, moves, limits, given=given, start=rough.fit(given).vector))
         selector.fits[frozenset(names)] = fit(channel, rough.fit(names).vector, indices(channel, names))
         richest = (white * channel.weight).ravel()
         found = ChannelResult(selector, selector.select(names), channel, richest=richest, richest_parameters=many)
-        return with_unnamed(found, _wheel_options)
+        return judged(with_unnamed(found, _wheel_options), given, start)
 
     found = searched(sound)
     # Where nothing known comes near, the noise is too little to compare what is all wrong: the family shows in the
     # noise that the best of it leaves, and what is left against the richest model.
     return searched(plain) if found.fit.cost > settings.far_off * 0.5 * sound.count else found
+
+
+def timed(selector: Selector) -> Selector:
+    """One without fits whose sets all have the delay of commands or poses, fitted from what is seen at first sight.
+
+    Where a delay is missing other effects stand in for it, and what is chosen depends on how long it is.
+    """
+    channel, start = selector.channel, selector.channel.neutral if selector.start is None else selector.start
+    given = tuple(dict.fromkeys((*selector.given, *delays_of(channel.layout))))
+    return replace(selector, given=given, start=with_delay(channel, start), fits={}, proofs={})
+
+
+def judged(found: ChannelResult, given: Names, start: Array) -> ChannelResult:
+    """The same when a delay must be worth its name as all else: against none, in a vector that has `given` alone."""
+
+    def against_none(selector: Selector, start: Array) -> Selector:
+        delays = frozenset(delays_of(selector.channel.layout))
+        fits = {names: one for names, one in selector.fits.items() if delays <= names}
+        return replace(selector, given=given, start=start, fits=fits, proofs={})
+
+    plain = None if found.plain is None else against_none(found.plain, start)
+    if plain is not None:
+        assert isinstance(found.selector.channel, WithTerms)
+        start = _extended(plain, found.selector.channel)
+    selector = against_none(found.selector, start)
+    names = selector.needed(selector.swapped(selector.needed(found.names)))
+    return _written(replace(found, selector=selector, plain=plain, names=names))
 
 
 def responding(selector: Selector, names: Names) -> None:
@@ -210,6 +242,7 @@ def responding(selector: Selector, names: Names) -> None:
     for response_s in LATE_STARTS_S if before is None else ():
         vector = plain.copy()
         vector[places] = response_s
+        vector += with_delay(channel, channel.layout.neutral) - channel.layout.neutral
         options.append(fit(channel, vector, active))
     selector.fits[frozenset(names)] = min(options, key=lambda option: option.cost)
 
@@ -219,22 +252,22 @@ def search_body(drive: GriddedDrive, start: Array, given: Names = ()) -> Channel
     channel = BodyChannel.build(drive, BodyNoise(), start)
     nominal = fit(channel, start, indices(channel, given))
     # Noise that is learnt from poses that are laid beside the wrong wheels hides that they are.
-    delayed = fit(channel, with_pose_delay(channel, nominal.vector), indices(channel, given))
+    delayed = fit(channel, with_delay(channel, start), indices(channel, given))
     channel = learn_body_noise(channel, min(nominal, delayed, key=lambda one: one.cost).vector, iterations=4)
     settings = drive.settings.selection
     limits = Thresholds(settings.rough_score, 0.0)
-    rough = Selector(channel, body_moves(channel), limits, given=given, start=nominal.vector, closely=True)
-    names = rough.greedy()
+    rough = Selector(channel, body_moves(channel), limits, given=given, start=delayed.vector, closely=True)
+    names = rough.greedy(tuple(dict.fromkeys((*given, *delays_of(BODY)))))
     rich = (*names, *(name for name in smooth_of(BODY) if name not in names))
     vector = fit(channel, rough.fit(names).vector, indices(channel, rich)).vector
     channel = learn_body_noise(channel, vector)
     perturbations = _body_perturbations(channel, rich, vector)
     channel, fullest, extra, many = learn_saturated_body(channel, rich, vector, perturbations)
     limits = _thresholds(channel.whitened(fullest, extra), channel.use, settings)
-    selector = Selector(channel, body_moves(channel), limits, given=given, start=rough.fit(given).vector)
+    selector = timed(Selector(channel, body_moves(channel), limits, given=given, start=rough.fit(given).vector))
     richest = channel.residual(fullest, extra)
     found = ChannelResult(selector, selector.select(), channel, richest=richest, richest_parameters=many)
-    return _time_or_place(found)
+    return judged(_time_or_place(found), given, nominal.vector)
 
 
 def _time_or_place(found: ChannelResult) -> ChannelResult:
@@ -342,9 +375,14 @@ def with_unnamed(found: ChannelResult, options: Callable[[ChannelResult], Iterat
         proofs = (*proofs, proof)
         accepted = tuple(UnnamedTerm(term.form, evidence, term) for term, evidence in zip(terms, proofs, strict=True))
         found = replace(found, selector=selector, names=names, unnamed=accepted, plain=plain)
-    coefficients = found.told.vector[found.told.vector.size - len(terms) :].tolist()
+    return _written(found)
+
+
+def _written(found: ChannelResult) -> ChannelResult:
+    """The same, its terms with the coefficients that are told."""
+    coefficients = found.told.vector[found.told.vector.size - len(found.unnamed) :].tolist()
     written = zip(found.unnamed, coefficients, strict=True)
-    return replace(found, unnamed=tuple(replace(one, form=one.form.format(value)) for one, value in written))
+    return replace(found, unnamed=tuple(replace(one, form=one.term.form.format(value)) for one, value in written))
 
 
 def _extended(plain: Selector, channel: WithTerms) -> Array:

@@ -260,7 +260,10 @@ def chain_track(
 
 def prediction_error(body: BodyChannel, starts: Starts, p: Array, track: Array, ahead_s: float) -> Array:
     """Measured minus predicted pose (K, 3) at the end, in the frame of the start: forward, left, yaw."""
-    moved = displacement(p, body.drive.first, track, body.carried(p), starts.node, starts.pose[:, 2], ahead_s)
+    drive = body.drive
+    moved = displacement(
+        p, drive.first, track, body.carried(p), starts.node, starts.pose[:, 2], ahead_s, drive.poses_moved_s
+    )
     dx, dy = starts.end[:, 0] - starts.pose[:, 0], starts.end[:, 1] - starts.pose[:, 1]
     cosine, sine = np.cos(starts.pose[:, 2]), np.sin(starts.pose[:, 2])
     yaw = starts.end[:, 2] - starts.pose[:, 2] - moved[:, 2]

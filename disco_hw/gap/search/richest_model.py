@@ -204,21 +204,34 @@ def driven(channel: ResidualChannel) -> CommandedDrive:
 OLD_POSE_COLUMNS = tuple(f"{effect.name}.{effect.parameters[0].name}" for effect in in_stages(Stage.POSE_TIME))
 
 
-def with_pose_delay(channel: BodyChannel, vector: Array) -> Array:
-    """A parameter vector with the poses' delay as it is at first sight."""
-    delayed = vector.copy()
-    places = [channel.layout.place[column] for column in OLD_POSE_COLUMNS]
-    delayed[places] = np.clip(channel.drive.pose_delay_s, channel.layout.low[places], channel.layout.high[places])
+def delay_columns(layout: Layout) -> tuple[str, ...]:
+    """What moves one side of a channel in time against the other."""
+    return (DELAYED_BY,) if layout.of_wheels else OLD_POSE_COLUMNS
+
+
+def delays_of(layout: Layout) -> tuple[str, ...]:
+    """The effects that do."""
+    return tuple(column.partition(".")[0] for column in delay_columns(layout))
+
+
+def with_delay(channel: ResidualChannel, vector: Array) -> Array:
+    """A parameter vector with the delay of commands or poses as it is at first sight."""
+    delayed, layout, drive = vector.copy(), channel.layout, channel.inner.drive
+    places = [layout.place[column] for column in delay_columns(layout)]
+    seen_s = drive.commands_moved_s if layout.of_wheels else drive.pose_delay_s
+    delayed[places] = np.clip(seen_s, layout.low[places], layout.high[places])
     return delayed
 
 
 def _pose_starts(channel: ResidualChannel) -> Starts:
-    """Where the fit of a pose's age begins: without any, and at first sight."""
-    inner = channel.inner
-    assert isinstance(inner, BodyChannel)
-    neutral = inner.layout.neutral
-    seen = with_pose_delay(inner, neutral)
-    return tuple((float(vector[inner.layout.place[OLD_POSE_COLUMNS[0]]]),) for vector in (neutral, seen))
+    """Where the fit of a pose's age begins: at first sight."""
+    seen = with_delay(channel, channel.neutral)
+    return ((float(seen[channel.layout.place[OLD_POSE_COLUMNS[0]]]),),)
+
+
+def _delay_starts(channel: ResidualChannel, starts: Starts) -> Starts:
+    """Where the fit of a dead time begins: its starts, from what is seen at first sight on."""
+    return tuple((start + channel.inner.drive.commands_moved_s, *rest) for start, *rest in starts)
 
 
 def _candidate(effect: Effect) -> Candidate:
@@ -226,6 +239,12 @@ def _candidate(effect: Effect) -> Candidate:
     fitted = [p.name for p in effect.parameters if scan is None or p.name != scan.parameter]
     if effect.stage is Stage.POSE_TIME:
         return Candidate(effect.name, tuple(f"{effect.name}.{key}" for key in fitted), _pose_starts)
+    if effect.stage is Stage.DELAY and begin is not None:
+        return Candidate(
+            effect.name,
+            tuple(f"{effect.name}.{key}" for key in fitted),
+            lambda channel: _delay_starts(channel, begin(driven(channel))),
+        )
     return Candidate(
         effect.name,
         tuple(f"{effect.name}.{key}" for key in fitted),

@@ -98,8 +98,10 @@ def compare(small: Fit, big: Fit, channel: ResidualChannel, parameters: float) -
     gain = small.cost - big.cost
     blocks = held_out_by_block(small, channel) - held_out_by_block(big, channel)
     held_out = float(blocks.sum())
+    # One that a fit without it explains by nothing at all is so large that in a difference the others would be lost.
+    others = np.delete(blocks, int(np.argmax(blocks))) if blocks.max(initial=0.0) > 0.0 else blocks
     score = 2.0 * gain / factor - parameters * math.log(max(channel.count, 2))
-    return EffectEvidence(gain, held_out, held_out - float(blocks.max(initial=0.0)), factor, score)
+    return EffectEvidence(gain, held_out, float(others.sum()), factor, score)
 
 
 Names = tuple[str, ...]
@@ -321,14 +323,14 @@ class Selector:
 
         Swaps and drops may come back to a set that was there before: then it is the best of those on the way.
         """
-        accepted = self._backward(begin) if begin else self.given
+        accepted = self.needed(begin) if begin else self.given
         visited = {frozenset(accepted): accepted}
         while len(accepted) < self.settings.most_effects:
             ranked = self.ranked(accepted)
             new = next((name for name in ranked if self.acceptable(accepted, (*accepted, name))), None)
             if new is None:
                 break
-            larger = self._backward(self._swapped((*accepted, new)))
+            larger = self.needed(self.swapped((*accepted, new)))
             if frozenset(larger) in visited:
                 return min(visited.values(), key=self._priced)
             visited[frozenset(larger)] = accepted = larger
@@ -338,7 +340,7 @@ class Selector:
         """Misfit of a set in nats with half the price of its parameters."""
         return float(self.fit(names).cost + 0.5 * parameters_of(names) * np.log(self.channel.count))
 
-    def _swapped(self, accepted: Names) -> Names:
+    def swapped(self, accepted: Names) -> Names:
         """Replace single effects as long as that fits better by more than the parameters' price."""
         for _ in range(len(accepted)):
             best, score = accepted, self.settings.swap_nats
@@ -370,7 +372,7 @@ class Selector:
         price = 0.5 * CANDIDATES[name].parameters * np.log(self.channel.count)
         return float(self.fit(rest).cost - self.fit(accepted).cost - price)
 
-    def _backward(self, accepted: Names) -> Names:
+    def needed(self, accepted: Names) -> Names:
         """Drop effects that the others have made unnecessary, of several first the one that is missed least."""
         idle = []
         for name in accepted:
@@ -380,7 +382,7 @@ class Selector:
             self._refit_without(accepted, name, rest)
             if not self.acceptable(rest, accepted):
                 idle.append((self._worth(rest, accepted, name), rest))
-        return self._backward(min(idle)[1]) if idle else accepted
+        return self.needed(min(idle)[1]) if idle else accepted
 
     def _refit_without(self, accepted: Names, name: str, rest: Names) -> None:
         """Fit `rest` from the fit of the larger set too: what has thresholds may have found better ones there."""

@@ -113,17 +113,21 @@ def test_poses_that_are_older_than_their_stamps_have_a_latency_above_zero(late_s
     ground = moving_s[:, None] * drift
     measured[:, :2] += np.interp(then, t_s, moving_s)[:, None] * drift
 
-    def residual(latency_s):
+    def residual(latency_s, laid=node, moved_s=0.0):
         q = p.copy()
         q[BODY.place["pose_latency.latency_s"]] = latency_s
         return pose_residual(
-            q, track, ground, node, np.zeros(node.size), np.arange(node.size) // 100,
+            q, track, ground, laid, np.zeros(node.size), np.arange(node.size) // 100,
             np.zeros(node.size, dtype=np.int64), np.full(node.size, 2999), np.ones(node.size, dtype=bool), measured,
+            moved_s,
         )  # fmt: skip
 
     np.testing.assert_allclose(residual(late_s), 0.0, atol=1e-9)
     assert np.abs(residual(0.0)).max() > 0.1 * abs(late_s)
     assert np.linalg.norm(residual(-late_s)) > 1.5 * np.linalg.norm(residual(0.0))
+    # The same where they are laid 0.15 s earlier than they are stamped.
+    np.testing.assert_allclose(residual(late_s, node - 15, 0.15), 0.0, atol=1e-9)
+    assert np.abs(residual(late_s, node - 15)).max() > 0.02
 
 
 def test_a_limit_that_nothing_comes_near_runs_as_one_that_is_not_there():
@@ -142,3 +146,18 @@ def test_a_limit_that_nothing_comes_near_runs_as_one_that_is_not_there():
     absent = turned(WHEEL.neutral[WHEEL.place[columns[0]]])
     np.testing.assert_allclose(turned(1e5), absent, atol=1e-7)
     assert np.abs(turned(1.0) - absent).max() > 0.1
+
+
+@pytest.mark.parametrize("moved_s", [-0.3, 0.12])
+def test_commands_that_lie_later_than_they_are_stamped_are_as_much_less_late(moved_s):
+    t_s = np.arange(N) * GRID_STEP_S
+    commands = np.column_stack([4 * np.sin(0.8 * t_s), 6 * np.sign(np.sin(0.5 * t_s)) + 1])
+    cells = round(moved_s / GRID_STEP_S)
+    p, less = WHEEL.neutral.copy(), WHEEL.neutral.copy()
+    p[WHEEL.place["command_delay.delay_s"]], less[WHEEL.place["command_delay.delay_s"]] = 0.2, 0.2 - moved_s
+    still, laid = np.zeros((N, 2)), np.roll(commands, cells, axis=0)
+    stamped = run_wheels(p, np.array(BASE), commands, still, t_s == 0.0, t_s, still)
+    moved = run_wheels(p, np.array(BASE), laid, still, t_s == 0.0, t_s, still, moved_s)
+    inside = slice(100, -100)
+    np.testing.assert_allclose(np.diff(moved, axis=0)[inside], np.diff(stamped, axis=0)[inside], atol=1e-9)
+    np.testing.assert_array_equal(moved, run_wheels(less, np.array(BASE), laid, still, t_s == 0.0, t_s, still))

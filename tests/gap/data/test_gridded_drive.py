@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from disco_hw.gap.data.gridded_drive import even_times, grid_drive
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
@@ -40,12 +41,40 @@ def test_a_command_that_changes_within_a_cell_counts_by_its_share():
 def test_commands_in_force_are_earlier_ones_or_later_ones_where_their_stamps_are_late(cells):
     t = np.arange(0.0, 10.0, 0.02)
     line = grid_drive(drive(t, np.sin(t), t, np.sin(t)))
-    own, in_force = np.nan_to_num(line.command_rad_s), line.late_commands(cells * GRID_STEP_S)
+    own, in_force = np.nan_to_num(line.command_rad_s), line.late_commands(line.commands_moved_s + cells * GRID_STEP_S)
     assert in_force.shape == own.shape
     node = np.arange(20, own.shape[0] - 20)
     np.testing.assert_array_equal(in_force[node], own[node - cells])
     edge = own[0] if cells > 0 else own[-1]
     np.testing.assert_array_equal(in_force[0 if cells > 0 else -1], edge)
+
+
+@pytest.mark.parametrize("by_s", [-0.3, 0.1, 0.4])
+def test_a_log_whose_stamps_are_moved_lies_on_the_grid_as_if_they_were_not(by_s):
+    rng = np.random.default_rng(7)
+    t = np.arange(0.0, 40.0, 0.02)
+    speed = rng.uniform(-2.0, 4.0, 40)[(t % 40.0).astype(int)]
+    log = drive(t, speed, t, speed)
+    yaw = np.interp(log.poses.t_s, t, np.sin(np.cumsum(speed) * 0.02))
+    log = replace(
+        log, poses=replace(log.poses, x_m=0.1 * np.interp(log.poses.t_s, t, np.cumsum(speed) * 0.02), yaw_rad=0.0 * yaw)
+    )
+    plain = grid_drive(log)
+    commands = grid_drive(replace(log, commands=replace(log.commands, t_s=log.commands.t_s + by_s)))
+    assert commands.commands_moved_s == pytest.approx(plain.commands_moved_s - by_s)
+    inside = slice(round(abs(by_s) / GRID_STEP_S) + 1, -round(abs(by_s) / GRID_STEP_S) - 1)
+    np.testing.assert_allclose(commands.command_rad_s[inside], plain.command_rad_s[inside], atol=1e-9)
+    np.testing.assert_allclose(commands.command_change[inside], plain.command_change[inside], atol=1e-9)
+    # And what is in force after a delay is counted from the stamps.
+    late_s = commands.commands_moved_s + 0.05
+    np.testing.assert_allclose(
+        commands.late_commands(late_s)[inside][5:], plain.late_commands(plain.commands_moved_s + 0.05)[inside][5:]
+    )
+    poses = grid_drive(replace(log, poses=replace(log.poses, t_s=log.poses.t_s + by_s)))
+    assert poses.poses_moved_s == pytest.approx(plain.poses_moved_s + by_s)
+    assert poses.pose_delay_s == pytest.approx(plain.pose_delay_s + by_s, abs=1e-3)
+    here, there = (each.pose.t_s[(each.pose.t_s > 1.0) & (each.pose.t_s < 38.0)] for each in (poses, plain))
+    np.testing.assert_allclose(here, there, atol=1e-9)
 
 
 def test_silence_and_segments_cut_runs():
@@ -112,3 +141,16 @@ def test_of_a_long_drive_the_stretches_with_commands_are_judged_first(commanded_
     # From the first to the last; neighbours are one run.
     assert line.t_s[-1] - line.t_s[0] > 180.0
     assert line.first.sum() == (3 if end_s < 200.0 else 6)
+
+
+@pytest.mark.parametrize("lag_s", [0.2, 4.0])
+def test_wheels_that_answer_slower_than_any_lag_do_not_say_how_late_commands_are(lag_s):
+    rng = np.random.default_rng(4)
+    t = np.arange(0.0, 90.0, 0.02)
+    command = np.repeat(rng.uniform(-2.0, 4.0, 18), 250)
+    speed = lfilter([1.0 - math.exp(-0.02 / lag_s)], [1.0, -math.exp(-0.02 / lag_s)], command)
+    line = grid_drive(drive(t, command, t, speed))
+    said = [note for note in line.notes if "not known from this log" in note]
+    assert line.commands_timed == (lag_s < 1.0)
+    assert len(said) == (0 if line.commands_timed else 1)
+    assert abs(line.commands_moved_s) < 0.05

@@ -32,6 +32,8 @@ def test_latency_shows_what_was_and_drift_adds_in_the_world():
         displacement(p, ONE_RUN, track, STILL, start, np.zeros(1), 1.0)[0, 0] for p in (BODY.neutral, late)
     )
     assert sooner - later == pytest.approx(0.1, abs=1e-6)
+    laid = displacement(late, ONE_RUN, track, STILL, start, np.zeros(1), 1.0, 0.1)[0, 0]
+    assert laid == pytest.approx(sooner, abs=1e-9)
     ground = np.column_stack([np.zeros(N), 0.02 * t])
     moved = (
         displacement(BODY.neutral, ONE_RUN, track, ground, start, np.full(1, np.pi / 2), 1.0)[0]

@@ -115,6 +115,33 @@ def test_a_clock_is_believed_from_four_stretches_on_that_agree_and_where_it_matt
     assert seen([0.1, 0.1, 0.1, 0.131, 0.131, 0.131]) != plain
 
 
+@pytest.mark.parametrize(("with_drift", "with_jump"), [(4.0, 4.5), (4.5, 4.0)])
+def test_of_a_drift_and_a_jump_the_one_with_which_the_whole_log_fits_better_is_believed(
+    seen, monkeypatch, with_drift, with_jump
+):
+    # One stretch that is off makes the others look as if they jumped.
+    delays = 1e-3 * np.array([-85.0, -77.0, -59.0, -53.0, -46.0, -38.0, -26.0, -115.0, -24.0, 0.0, 12.0, 23.0, 31.0])
+    assert seen(delays).jump_s == pytest.approx(0.0705)
+
+    poses = poses_at(np.linspace(100.0, 220.0, 50))
+
+    def misfit(wheels, of, delay_s, settings):
+        if of is poses:
+            return 5.0
+        return with_drift if np.ptp(np.diff(of.t_s)) < 1e-6 else with_jump
+
+    monkeypatch.setattr(timing, "_misfit_at", misfit)
+    clock = pose_clock(None, poses, SETTINGS)
+    assert (clock.drift_s != 0.0) is (with_drift < with_jump)
+    assert (clock.jump_s != 0.0) is (with_jump < with_drift)
+
+
+def test_stretches_that_lie_in_a_part_of_the_log_alone_say_nothing_of_all_of_it(seen):
+    delays = [0.1, 0.2, 0.3, 0.4]
+    assert seen(delays, middles=np.array([105.0, 120.0, 135.0, 164.0])) == PoseClock(0.2)
+    assert seen(delays, middles=np.array([105.0, 120.0, 135.0, 166.0])) != PoseClock(0.2)
+
+
 @pytest.mark.parametrize(("scatter", "believed"), [(0.9, False), (1.1, True)])
 def test_it_explains_as_much_again_of_the_scatter_as_it_leaves(seen, scatter, believed):
     centred = np.arange(12) - 5.5

@@ -3,6 +3,7 @@ A name that only acts like what is missing is disputed, with the reason.
 """
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,13 @@ import pytest
 from disco_hw.gap.data import BODY
 from disco_hw.gap.data.free_runs import read_angles
 from disco_hw.gap.noise.channels import BodyChannel
-from disco_hw.gap.report.misspecification import _apart, _perturbation_of, disputed_names, misspecified_effects
+from disco_hw.gap.report.misspecification import (
+    _answers_otherwise,
+    _apart,
+    _perturbation_of,
+    disputed_names,
+    misspecified_effects,
+)
 from disco_hw.gap.search.channel_search import ChannelResult, UnnamedTerm, body_moves
 from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.selection import EffectEvidence, Selector
@@ -181,3 +188,13 @@ def test_values_that_scatter_as_noise_does_are_not_called_different(monkeypatch)
     times = -1.05
     assert disputed_names(found) != {}
     assert asked
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_of_wheels_that_answer_like_no_lag_a_delay_is_disputed(timed):
+    found = SimpleNamespace(channel=SimpleNamespace(drive=SimpleNamespace(commands_timed=timed)))
+    assert [_answers_otherwise(found, name) is None for name in ("motor_lag", "command_delay", "stiction")] == [
+        timed,
+        timed,
+        True,
+    ]

@@ -3,6 +3,7 @@
 And what holds the wheels is not taken for a slow response.
 """
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -14,7 +15,7 @@ from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report.page import as_text
-from disco_hw.gap.search.channel_search import responding, search_body, wheel_moves
+from disco_hw.gap.search.channel_search import responding, search_body, search_wheels, wheel_moves
 from disco_hw.gap.search.selection import Selector
 from disco_hw.model import Model
 from tools.gap_logs import simulated_drive
@@ -69,3 +70,28 @@ def test_what_holds_the_wheels_is_not_fitted_with_a_slow_response():
     alone = selector.fit(("stiction",)).cost
     assert slow > alone + 50.0
     assert selector.fit((*both, "stiction")).cost <= alone + 1e-6
+
+
+@pytest.mark.parametrize("by_s", [-0.3, 0.4])
+def test_a_log_whose_stamps_are_moved_is_told_as_the_log_itself_and_moved_by_as_much(by_s):
+    log = simulated_drive({"stiction": 0.85, "side_slip": 0.08}, seed=3005)
+    start = BODY.neutral.copy()
+    start[:3] = 0.061, 0.415, 0.238
+
+    def told(log):
+        body = search_body(grid_drive(log), start)
+        wheels = search_wheels(grid_drive(log), start[:3], WHEEL.neutral.copy())
+        return body, wheels
+
+    body, wheels = told(log)
+    commands, poses = (replace(part, t_s=part.t_s + by_s) for part in (log.commands, log.poses))
+    moved_body, moved_wheels = told(replace(log, commands=commands, poses=poses))
+    assert set(moved_body.names) == {*body.names, "pose_latency"}
+    assert set(moved_wheels.names) == {*wheels.names, "command_delay"}
+    assert moved_body.fit.vector[BODY.place["pose_latency.latency_s"]] == pytest.approx(by_s, abs=0.01)
+    assert moved_wheels.fit.vector[WHEEL.place["command_delay.delay_s"]] == pytest.approx(-by_s, abs=0.01)
+    for found, same, layout, column in (
+        (moved_body, body, BODY, "side_slip.k_s"),
+        (moved_wheels, wheels, WHEEL, "stiction.threshold_rad_s"),
+    ):
+        assert found.fit.vector[layout.place[column]] == pytest.approx(same.fit.vector[layout.place[column]], rel=0.05)

@@ -19,7 +19,7 @@ from disco_hw.gap.search.richest_model import (
     learn_saturated_wheels,
     parameters_of,
     smooth_of,
-    with_pose_delay,
+    with_delay,
 )
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, FitSettings
 from tests.gap.synthetic import GEOMETRY, NOISE, body_channel, line_of
@@ -187,10 +187,23 @@ def test_a_delay_at_first_sight_is_put_where_the_age_of_poses_is_within_its_rang
     place = BODY.place["pose_latency.latency_s"]
     for seen_s, put_s in ((0.2, 0.2), (-0.1, -0.1), (99.0, BODY.high[place]), (-99.0, BODY.low[place])):
         late = replace(channel, drive=replace(line, pose_delay_s=seen_s))
-        vector = with_pose_delay(late, channel.neutral)
+        vector = with_delay(late, channel.neutral)
         assert vector[place] == put_s
         assert (np.delete(vector, place) == np.delete(channel.neutral, place)).all()
-        assert CANDIDATES["pose_latency"].starts(late) == ((0.0,), (put_s,))
+        assert CANDIDATES["pose_latency"].starts(late) == ((put_s,),)
+
+
+@pytest.mark.parametrize("seen_s", [0.0, -0.25, 0.1])
+def test_a_delay_of_commands_begins_from_what_is_seen_at_first_sight(seen_s):
+    line = replace(line_of(np.tile([2.0, 3.0], (800, 1))), commands_moved_s=seen_s)
+    channel = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
+    place = WHEEL.place["command_delay.delay_s"]
+    vector = with_delay(channel, WHEEL.neutral)
+    assert vector[place] == seen_s
+    assert (np.delete(vector, place) == np.delete(WHEEL.neutral, place)).all()
+    begin = CANDIDATES["command_delay"].starts
+    unmoved = replace(channel, drive=replace(line, commands_moved_s=0.0))
+    assert begin(channel) == tuple((start + seen_s,) for (start,) in begin(unmoved))
 
 
 def test_effects_compete_in_their_own_channel_with_all_their_parameters():

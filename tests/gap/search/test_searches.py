@@ -167,7 +167,8 @@ def test_the_noise_of_wheels_is_learnt_of_a_rough_selection_and_all_that_is_smoo
     settings = DEFAULT_SETTINGS.selection
     # What moves no prediction would pass for noise too.
     assert (rough.thresholds.score, rough.thresholds.moves_m, rough.closely) == (settings.rough_score, 0.0, True)
-    assert chosen is found.selector
+    assert chosen.channel is found.selector.channel is found.channel
+    assert chosen.thresholds is found.selector.thresholds
     assert (chosen.thresholds.moves_m, chosen.closely) == (settings.least_moved_m, False)
     assert all(len(set(active)) == len(active) for active in noted.freed)
     assert set(indices(found.channel, smooth_of(WHEEL))) in [set(active) for active in noted.freed]
@@ -210,7 +211,8 @@ def test_the_noise_of_a_body_is_learnt_of_a_rough_selection_and_all_that_is_smoo
     rough, chosen = noted.selectors
     settings = DEFAULT_SETTINGS.selection
     assert (rough.thresholds.score, rough.thresholds.moves_m, rough.closely) == (settings.rough_score, 0.0, True)
-    assert chosen is found.selector
+    assert chosen.channel is found.selector.channel is found.channel
+    assert chosen.thresholds is found.selector.thresholds
     assert (chosen.thresholds.moves_m, chosen.closely) == (settings.least_moved_m, False)
     assert all(len(set(active)) == len(active) for active in noted.freed)
     assert set(indices(found.channel, smooth_of(BODY))) in [set(active) for active in noted.freed]
@@ -224,9 +226,11 @@ def test_the_noise_of_a_body_is_learnt_of_a_rough_selection_and_all_that_is_smoo
 LATE_PLACES = [WHEEL.place[column] for column in LATE_COLUMNS]
 
 
-def begun(names, given=(), before=None, best=0):
+def begun(names, given=(), before=None, best=0, seen_s=0.0):
     """Vectors from which `responding` fits lateness with a stand-in for `fit`, of which one ends best, and its end."""
-    selector = Selector(SimpleNamespace(layout=WHEEL, free=()), lambda small, big: 0.0, given=given)
+    drive = SimpleNamespace(commands_moved_s=seen_s)
+    channel = SimpleNamespace(layout=WHEEL, free=(), inner=SimpleNamespace(drive=drive))
+    selector = Selector(channel, lambda small, big: 0.0, given=given)
     plain = WHEEL.neutral.copy()
     plain[WHEEL.place["deadband.width_rad_s"]] = 0.4
     others = tuple(name for name in names if name in given or name not in LATE)
@@ -244,11 +248,13 @@ def begun(names, given=(), before=None, best=0):
     return selector, starts, fitted
 
 
-def test_lateness_is_fitted_from_quick_and_slow_responses(monkeypatch):
-    selector, starts, fitted = begun((*LATE, "deadband"), best=2)
+@pytest.mark.parametrize("seen_s", [0.0, -0.4])
+def test_lateness_is_fitted_from_quick_and_slow_responses_after_what_is_seen_at_first_sight(monkeypatch, seen_s):
+    selector, starts, fitted = begun((*LATE, "deadband"), best=2, seen_s=seen_s)
     monkeypatch.setattr(channel_search, "fit", fitted)
     responding(selector, (*LATE, "deadband"))
-    assert [tuple(start[LATE_PLACES]) for start in starts] == list(LATE_STARTS_S)
+    later = [seen_s * (name == "command_delay") for name in LATE]
+    assert [tuple(start[LATE_PLACES]) for start in starts] == [tuple(np.add(each, later)) for each in LATE_STARTS_S]
     assert {start[WHEEL.place["deadband.width_rad_s"]] for start in starts} == {0.4}
     assert selector.fits[frozenset((*LATE, "deadband"))].vector is starts[2]
 

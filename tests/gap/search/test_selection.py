@@ -45,7 +45,7 @@ def test_what_is_not_needed_goes_again():
 
 def test_a_stand_in_is_swapped_for_what_it_stood_in_for():
     found = selector(turn_slip=0.08)
-    assert found._swapped(("surface_change",)) == ("turn_slip",)
+    assert found.swapped(("surface_change",)) == ("turn_slip",)
 
 
 def wheels_slow(tau_s):
@@ -63,7 +63,7 @@ def test_a_short_lag_with_a_delay_beside_it_is_not_taken_for_the_delay():
     found = wheels_slow(0.03)
     both = ("motor_lag", "command_delay")
     assert not any(found.acceptable((name,), both) for name in both)
-    assert found._backward(both) == ("motor_lag",)
+    assert found.needed(both) == ("motor_lag",)
 
 
 @pytest.mark.parametrize("hidden", ["turning_load", "deadband"])
@@ -266,10 +266,10 @@ class Circling(Selector):
     def acceptable(self, smaller, larger):
         return True
 
-    def _swapped(self, accepted):
+    def swapped(self, accepted):
         return accepted
 
-    def _backward(self, accepted):
+    def needed(self, accepted):
         return {
             ("turn_slip", "side_slip"): ("side_slip", "turn_slip"),
             ("side_slip", "turn_slip", "slope"): ("turn_slip",),
