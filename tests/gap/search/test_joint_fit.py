@@ -1,0 +1,113 @@
+"""The last fit of the chain on errors that are linear in what is freed: against a plain minimiser of the same cost."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from disco_hw.gap.data import BODY
+from disco_hw.gap.search import end_to_end
+from disco_hw.gap.search.cross_validation import Chain
+from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part, _usual
+from disco_hw.gap.settings import DEFAULT_SETTINGS
+from tests.gap.synthetic import GEOMETRY
+
+MANY = 80
+HORIZONS_S = (1.0, 2.0)
+
+
+def start():
+    vector = BODY.neutral.copy()
+    vector[:3] = GEOMETRY
+    return vector
+
+
+@pytest.fixture
+def linear(monkeypatch):
+    """Predictions whose errors are linear in the geometry, with some that are far off; slopes and errors at 0."""
+    rng = np.random.default_rng(4)
+    slopes = [rng.standard_normal((MANY, 3, 3)) * (1.0, 0.3, 0.5) for _ in HORIZONS_S]
+    truth = np.add(GEOMETRY, (0.01, -0.04, 0.03))
+    noise = [rng.standard_normal((MANY, 3)) * (0.004, 0.004, 0.02) for _ in HORIZONS_S]
+    for of in noise:
+        of[::9] *= 12.0
+
+    def errors(self, chain, turned=None):
+        return [a @ (chain.body[:3] - truth) + e for a, e in zip(slopes, noise, strict=True)]
+
+    monkeypatch.setattr(Ahead, "errors", errors)
+    monkeypatch.setattr(end_to_end, "chain_wheels", lambda *_: None)
+    body = SimpleNamespace(settings=DEFAULT_SETTINGS)
+    starts = tuple((ahead_s, SimpleNamespace(block=np.arange(MANY) // 10)) for ahead_s in HORIZONS_S)
+    return Ahead(body, None, starts), lambda values: [
+        a @ (values - truth) + e for a, e in zip(slopes, noise, strict=True)
+    ]
+
+
+def minimised(errors, chosen, information, begin):
+    """The same by its definition: two rounds, each in units of what is usual where it begins."""
+    values = begin.copy()
+    shares = [np.sqrt(0.2 / ahead_s) for ahead_s in HORIZONS_S]
+    huber = 3.0 * max(shares)
+    for _ in range(2):
+        units = []
+        for error, share in zip(errors(values), shares, strict=True):
+            position = 1.4826 * np.median(np.abs(error[chosen][:, :2]))
+            heading = 1.4826 * np.median(np.abs(error[chosen][:, 2]))
+            units.append(np.array([position, position, heading]) / share)
+
+        def cost(at, units=units):
+            parts = [(e[chosen] / unit).ravel() for e, unit in zip(errors(at), units, strict=True)]
+            z = np.abs(np.concatenate([*parts, np.linalg.cholesky(information).T @ (at - begin)]))
+            return float(np.where(z <= huber, 0.5 * z**2, huber * (z - 0.5 * huber)).sum())
+
+        values = minimize(cost, values, method="BFGS", options={"gtol": 1e-9}).x
+    return values, cost(values)
+
+
+@pytest.mark.parametrize("left_out", [None, 0, 1])
+@pytest.mark.parametrize("known", [1e-3, 3e3])
+def test_what_predicts_best_is_found_by_errors_in_their_usual_size_and_what_was_known_before(linear, left_out, known):
+    ahead, errors = linear
+    information = known * np.diag([1.0, 2.0, 0.5])
+    of = Freed((Part(BODY, start(), (0, 1, 2), information),), lambda vectors: Chain(vectors[0], None))
+    found = ahead.fit(of, left_out)
+    chosen = (np.arange(MANY) // 10) % 2 != left_out
+    values, cost = minimised(errors, chosen, information, np.array(GEOMETRY))
+    assert found.vectors[0][:3] == pytest.approx(values, abs=2e-5)
+    assert np.abs(values - GEOMETRY).max() > 0.002
+    assert found.cost == pytest.approx(cost, rel=1e-3)
+    assert (found.vectors[0][3:] == BODY.neutral[3:]).all()
+
+
+def test_without_predictions_everything_stays_as_surely_as_it_was_known():
+    ahead = Ahead(SimpleNamespace(settings=DEFAULT_SETTINGS), None, ())
+    information = np.array([[4.0, 1.0, 0.0], [1.0, 3.0, 0.5], [0.0, 0.5, 2.0]]) * 1e4
+    of = Freed((Part(BODY, start(), (0, 1, 2), information),), lambda vectors: Chain(vectors[0], None))
+    found = ahead.fit(of)
+    assert found.vectors[0] == pytest.approx(start())
+    assert found.cost == np.inf
+    assert found.covariance == pytest.approx(np.linalg.inv(information), rel=1e-3)
+
+
+def test_what_is_usual_is_the_median_of_positions_and_of_headings():
+    error = np.array([[1.0, -3.0, 0.1], [2.0, 5.0, -0.4], [-4.0, 90.0, 0.2]])
+    assert _usual(error) == pytest.approx(1.4826 * np.array([3.5, 3.5, 0.2]))
+    assert _usual(np.zeros((3, 3))) == pytest.approx(np.full(3, 1e-5))
+
+
+def test_chains_are_compared_by_the_logarithms_of_both_usual_errors(linear):
+    ahead, errors = linear
+    expected = sum(np.log(_usual(error)[1]) + np.log(_usual(error)[2]) for error in errors(np.array(GEOMETRY)))
+    assert ahead.usual_cost(Chain(start(), None)) == pytest.approx(expected)
+
+
+def test_an_entry_is_told_of_its_own_part_or_of_the_first_that_has_it():
+    parts = tuple(Part(BODY, start(), (0,), np.eye(1)) for _ in range(2))
+    of = Freed(parts, lambda vectors: Chain(vectors[0], None))
+    vectors = (start(), 2.0 * start())
+    joint = JointFit(vectors, 0.0, (), np.zeros((0, 0)))
+    assert joint.value("axial_distance_m", of) == GEOMETRY[1]
+    assert joint.value("axial_distance_m", of, parts[1]) == 2.0 * GEOMETRY[1]
+    assert joint.value("nothing", of) is None
