@@ -187,7 +187,8 @@ def days(paths: Sequence[Path]) -> Iterator[Half]:
     """Each log with poses learnt from and every other one of the same robot predicted."""
     for robot in ROBOTS:
         own = [(path, *read(path)) for path in paths if path.parent.name == robot]
-        parts = [Part.search(path.stem, log, nominal) for path, log, nominal in own if log.poses.t_s.size]
+        own = [(path, log, nominal) for path, log, nominal in own if log.poses.t_s.size]
+        parts = [Part.search(path.stem, log, nominal) for path, log, nominal in own] if len(own) > 1 else []
         for part in parts:
             others = [other for other in parts if other is not part]
             if part.analysis.body is not None and others:

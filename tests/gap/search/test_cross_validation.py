@@ -146,7 +146,8 @@ def test_what_few_stretches_tell_has_to_be_better_by_far():
 
     assert stretches_telling(many) == pytest.approx(6.0)
     assert stretches_telling(few) == pytest.approx(6.4**2 / 18.04)
-    assert surely_beats(many, times(many, 0.9), settings)
+    assert surely_beats(many, times(many, 0.89), settings)
+    assert not surely_beats(many, times(many, 0.91), settings)
     assert not surely_beats(few, times(few, 0.9), settings)
     assert not surely_beats(few, times(few, 0.71), settings)
     assert surely_beats(few, times(few, 0.69), settings)
@@ -227,7 +228,7 @@ def test_without_errors_by_stretch_the_whole_decides():
     whole = PredictionErrors(1.0, (0.0, 1.0), 1.0, (0.0, 1.0), 0.0, {})
     one = in_stretches([1.0], [1.0])
     settings = DEFAULT_SETTINGS.prediction
-    assert surely_beats(whole, replace(whole, position_m=0.9), settings)
+    assert surely_beats(whole, replace(whole, position_m=0.8), settings)
     assert not surely_beats(whole, replace(whole, position_m=1.1), settings)
     # A single stretch has to be better by far.
     assert surely_beats(one, in_stretches([0.25], [0.25]), settings)
