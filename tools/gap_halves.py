@@ -22,7 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from disco_hw.gap import model_of, offered_stage, search_log
+from disco_hw.gap import model_of, offered_stage, search_log, written_of
 from disco_hw.gap.data import BODY, DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.data.gridded_drive import GriddedDrive, grid_drive
 from disco_hw.gap.noise.body_noise import BodyNoise
@@ -152,11 +152,12 @@ def taught(part: Part, others: Sequence[Part], nominal: Model) -> Iterator[Half]
     """What a part taught of each of some others."""
     began = time.process_time()
     final = final_fit(part.analysis)
-    predictions = joint_predictions(part.analysis, final)
-    kept = part.analysis if predictions.kept is None else predictions.kept[0]
-    offered = offered_stage(predictions.table(), part.analysis.found_any, kept.adds_to_timed, DEFAULT_SETTINGS)
+    written = written_of(part.analysis, final, joint_predictions(part.analysis, final))
+    assert written[2] is not None
+    kept = written[0] if written[2].kept is None else written[2].kept[0]
+    offered = offered_stage(written[2].table(), part.analysis.found_any, kept.adds_to_timed, DEFAULT_SETTINGS)
     cpu_s = part.cpu_s + time.process_time() - began
-    models = {stage: model_of(stage, nominal, part.analysis, final, predictions)[0] for stage in STAGES}
+    models = {stage: model_of(stage, nominal, *written)[0] for stage in STAGES}
     names = tuple(
         name for found in (part.analysis.wheels, part.analysis.body) if found is not None
         for name in (*found.names, *(term.form for term in found.unnamed))

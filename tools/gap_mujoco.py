@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
-from disco_hw.gap import model_of, offered_stage, search_log
+from disco_hw.gap import model_of, offered_stage, search_log, written_of
 from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.report.judge import Measured, effect_findings, sort_out, unnamed_findings
 from disco_hw.gap.search import joint_predictions
@@ -198,12 +198,13 @@ def work(hidden: str, seed: int, robot: Robot = ROBOTS["middle"]) -> Result:
     final = final_fit(analysis)
     fits, unnamed = effect_findings(analysis, final), unnamed_findings(analysis)
     named, doubtful = sort_out(fits, Measured.of(analysis, final))
-    predictions = joint_predictions(analysis, final)
-    kept = analysis if predictions.kept is None else predictions.kept[0]
-    table = predictions.table()
+    written = written_of(analysis, final, joint_predictions(analysis, final))
+    assert written[2] is not None
+    kept = written[0] if written[2].kept is None else written[2].kept[0]
+    table = written[2].table()
     offered = offered_stage(table, bool(fits or unnamed), kept.adds_to_timed, DEFAULT_SETTINGS)
     cpu_s = time.process_time() - began
-    models = {stage: model_of(stage, nominal, analysis, final, predictions)[0] for stage in STAGES}
+    models = {stage: model_of(stage, nominal, *written)[0] for stage in STAGES}
     unseen = unseen_errors(grid_drive(kept_back.as_drive()), models, AHEAD_S)
     floor = table["floor"][AHEAD_S]
     return Result(

@@ -46,7 +46,7 @@ from disco_hw.gap.report.judge import (
 from disco_hw.gap.report.page import as_text, page
 from disco_hw.gap.search import StagePredictions, joint_predictions, prune, stage_predictions
 from disco_hw.gap.search.analysis import ChannelEstimates, FinalFit, GapAnalysis, final_fit
-from disco_hw.gap.search.channel_search import search_body, search_wheels
+from disco_hw.gap.search.channel_search import search_body, search_wheels, that_models_hold
 from disco_hw.gap.search.cross_validation import (
     PredictionErrors,
     beats,
@@ -101,14 +101,20 @@ def find_gap(
     predictions = joint_predictions(analysis, final) if analysis.body is not None else None
     gap = {} if predictions is None else predictions.table()
     wheels = wheel_table(analysis)
+    written = written_of(analysis, final, predictions)
+    if written[0] is not analysis:
+        if gap and written[2] is not None:
+            gap["written"] = written[2].table()["amended"]
+        if wheels:
+            wheels = {**wheels, "written": wheel_table(written[0])["amended"]}
     # Without poses the wheels decide, where geometry says nothing: as given, timed or amended.
-    kept = analysis if predictions is None or predictions.kept is None else predictions.kept[0]
+    kept = written[0] if written[2] is None or written[2].kept is None else written[2].kept[0]
     offered = offered_stage(gap or _of_wheels(wheels), bool(named or unnamed), kept.adds_to_timed, settings)
     spots = blind_spot_findings(analysis, named, top_rad_s)
     if prove:
         spots = proved(spots, finder(analysis, say), settings.report.proved_claims)
-    amended, remarks = model_of(offered, model, analysis, final, predictions)
-    remarks = (*left_out_notes(analysis, kept), *remarks)
+    amended, remarks = model_of(offered, model, *written)
+    remarks = (*left_out_notes(written[0], kept), *remarks)
     return GapReport(
         sources=log.sources,
         channels=channel_findings(analysis, named, unnamed),
@@ -130,6 +136,22 @@ def find_gap(
     )
 
 
+def written_of(
+    analysis: GapAnalysis, final: FinalFit, predictions: StagePredictions | None
+) -> tuple[GapAnalysis, FinalFit, StagePredictions | None]:
+    """What the model is written from: with other terms in place of those that no model can carry, and other values."""
+    held = analysis
+    if analysis.body is not None and (body := that_models_hold(analysis.body)) is not analysis.body:
+        held = replace(held, body=body)
+    if analysis.wheels is not None and (own := that_models_hold(analysis.wheels)) is not analysis.wheels:
+        held = replace(held, wheels=own)
+    if held is analysis:
+        return analysis, final, predictions
+    held = prune(held)
+    final = final_fit(held)
+    return held, final, joint_predictions(held, final) if held.body is not None else None
+
+
 def _of_wheels(wheels: Mapping[str, Mapping[float, PredictionErrors]]) -> dict[str, Mapping[float, PredictionErrors]]:
     return {**wheels, "refitted": wheels["nominal"]} if wheels else {}
 
@@ -139,14 +161,16 @@ def offered_stage(
 ) -> str:
     """The stage whose model is handed out: the amended one where it predicts held-out data clearly better than `timed`.
 
-    Not where it is so by a single stretch only, or by little where few stretches tell: another drive need not have
-    their like. One that `adds` nothing to a delay and a lag has to be level. Where nothing was `found` it is the
-    amended one unless that is clearly worse; where predictions cannot be compared too.
+    The amended one as it is `written`, where it lacks what no model can carry. Not where it is so by a single stretch
+    only, or by little where few stretches tell: another drive need not have their like. One that `adds` nothing to a
+    delay and a lag has to be level. Where nothing was `found` it is the amended one unless that is clearly worse; where
+    predictions cannot be compared too.
     """
     horizon_s, prediction = reached_horizon_s(gap, settings.prediction), settings.prediction
     if not gap or not math.isfinite(gap["amended"][horizon_s].position_m):
         return "amended"
     refitted, timed, amended = (gap[stage][horizon_s] for stage in STAGES[1:4])
+    amended = gap["written"][horizon_s] if "written" in gap else amended
     plainer, plain = ("refitted", refitted) if outdoes(timed, refitted, prediction) else ("timed", timed)
     sure = surely_beats(plain, amended, prediction) or (not adds and beats(plain, amended, prediction))
     if sure or (not found and not clearly_worse(plain, amended, prediction)):

@@ -242,14 +242,21 @@ class SelectionSettings:
 class TermSettings:
     """Unnamed terms, and patches of the floor."""
 
-    most_terms: int = 2
+    most_terms: int = 3
     """More terms are not added. Chosen."""
     least_own_share: float = 0.1
     """A term of which what is fitted already does the rest is left out: it would only pull against it. Chosen."""
     worth_trying_nats: float = 18.0
     """Gain to first order from which on a term is fitted. Chosen: below what acceptance takes."""
+    most_tried: int = 4
+    """So many of the most promising terms are fitted until one is accepted. Chosen: what promises most to first order
+    may gain nothing, and the next all of it."""
     about_many: int = 110
     """Number of terms that the price of a choice among all assumes. Chosen: about as many as a usual log offers."""
+    waves: int = 8
+    """How many cosines of the time ground may vary by, the slowest. Chosen: of 150 s, down to a period of 37 s."""
+    usual_wave: float = 0.1
+    """Standard deviation that is expected of each, as a share of the speed. Chosen."""
     smooth_nodes: int = 8
     """Accelerations are taken of speeds averaged over so many nodes either side. Chosen: a tenth of a second."""
     disc_radii_m: tuple[float, ...] = (0.5, 0.75, 1.0, 1.3)

@@ -118,7 +118,8 @@ class GapReport:
     """What `find_gap` returns; `model` is the one of the stage `offered`: the amended one, if it predicts best.
 
     `gap` holds errors of poses by stage and horizon, `wheels` those of the wheels alone; either is empty where it could
-    not be judged. `across`: what several logs say of each parameter.
+    not be judged. `written` in them: the amended model as it is written, where that lacks a term which no model can
+    carry. `across`: what several logs say of each parameter.
     """
 
     sources: tuple[str, ...]
@@ -221,9 +222,10 @@ class GapReport:
     def _gap_dict(self) -> dict[str, Any]:
         if not self.gap:
             return {"horizon_s": self.horizon_s, "held_out": True}
-        stages = {stage: _errors_dict(self.at_horizon(stage)) for stage in STAGES}
+        known = [stage for stage in (*STAGES, "written") if stage in self.gap]
+        stages = {stage: _errors_dict(self.at_horizon(stage)) for stage in known}
         horizons = [
-            {"horizon_s": horizon, **{stage: _errors_dict(self.gap[stage][horizon]) for stage in STAGES}}
+            {"horizon_s": horizon, **{stage: _errors_dict(self.gap[stage][horizon]) for stage in known}}
             for horizon in self.gap["nominal"]
         ]
         return {
@@ -238,7 +240,7 @@ class GapReport:
         if self.offered == "amended":
             return None
         plainer = of[self.offered if self.offered in of else "nominal"][self.horizon_s]
-        amended = of["amended"][self.horizon_s]
+        amended = of.get("written", of["amended"])[self.horizon_s]
         if not beats(plainer, amended, settings):
             return "The amended model does not beat it."
         if not outdoes(plainer, amended, settings):

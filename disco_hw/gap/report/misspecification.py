@@ -12,7 +12,7 @@ explains as much, or its value is another wherever the robot drives differently 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
 
@@ -167,17 +167,23 @@ def _beside_as_much(found: ChannelResult, name: str) -> str | None:
     kind: such a term explains something else, beside which a name may be true that takes more.
     """
     settings, taken = found.channel.settings.report, _gain(found, name)
-    for place, one in enumerate(found.unnamed, start=-len(found.unnamed)):
-        times = settings.times_unnamed if _alike(found, name, place) > settings.alike_share else 1.0
+    end = 0
+    for one in found.unnamed:
+        begin, end = end, end + len(one.term.features)
+        times = settings.times_unnamed if _alike(found, name, range(begin, end)) > settings.alike_share else 1.0
         if taken < times * one.evidence.gain:
             return f"{one.form} beside it explains {one.evidence.gain / max(taken, 1e-9):.2g} times as much"
     return None
 
 
-def _alike(found: ChannelResult, name: str, place: int) -> float:
-    """Share of what a term does to the residuals, to first order, that a name can do too; `place` among the terms."""
+def _alike(found: ChannelResult, name: str, places: Iterable[int]) -> float:
+    """Share of what a term does to the residuals, to first order, that a name can do too; `places`: its coefficients
+    among those of all terms.
+    """
     best, layout = found.fit, found.selector.channel.layout
-    term = best.jacobian[:, best.active.index(len(layout.columns) + place)]
+    first = len(found.channel.layout.columns)
+    indices = [first + place for place in places]
+    term = best.jacobian[:, [best.active.index(index) for index in indices]] @ best.vector[indices]
     columns = [best.active.index(layout.place[c]) for c in CANDIDATES[name].columns if layout.place[c] in best.active]
     own = best.jacobian[:, columns]
     pull = own.T @ term

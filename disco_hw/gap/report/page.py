@@ -62,6 +62,10 @@ def _gap_line(report: GapReport) -> str:
         f"{off['amended']}, {'one with geometry, delay and' if report.gap else 'with a delay and a'} "
         f"lag alone (timed) by {off['timed']}; {last}."
     )
+    if "written" in off:
+        said += (
+            f" Without the terms that no model can carry, as it is written, the amended one errs by {off['written']}."
+        )
     if report.why_not_amended is None:
         return said
     offered = report.offered if report.gap or report.offered == "timed" else "given"

@@ -294,7 +294,7 @@ def _priced(found: ChannelResult) -> float:
     many = float(parameters_of(found.names))
     chosen = 0.0
     for one in found.unnamed:
-        many += 4.0 if one.term.disc else 1.0
+        many += 4.0 if one.term.disc else len(one.term.features)
         chosen += 0.0 if one.term.disc else math.log(found.channel.settings.terms.about_many)
     return found.fit.cost + 0.5 * many * math.log(max(found.channel.count, 2)) + chosen
 
@@ -302,10 +302,9 @@ def _priced(found: ChannelResult) -> float:
 def _body_perturbations(channel: BodyChannel, names: Names, vector: Array) -> Iterator[Array]:
     """Pushes of all terms of the body, and of the disc of the floor that promises most."""
     rich = fit(channel, vector, indices(channel, names), 1)
-    disc, _ = best_term(rich, channel, places(channel, vector))
-    yield from (term.perturbation for term in body_terms(channel, vector))
-    if disc is not None:
-        yield disc.perturbation
+    discs, _ = best_terms(rich, channel, places(channel, vector))
+    yield from (feature for term in body_terms(channel, vector) for feature in term.features)
+    yield from (disc.perturbation for disc in discs)
 
 
 def _thresholds(white: Array, use: NDArray[np.bool_], settings: SelectionSettings) -> Thresholds:
@@ -335,54 +334,86 @@ def _body_options(found: ChannelResult) -> Iterator[Term]:
 
 
 def with_unnamed(found: ChannelResult, options: Callable[[ChannelResult], Iterator[Term]]) -> ChannelResult:
-    """Add unnamed terms as long as the best one is worth its price and that of the choice among all.
+    """Add unnamed terms as long as one of the best is worth its price and that of the choice among all.
 
     After each, the named effects are selected anew: one that only stood in for the term is not needed any more. A patch
     of the floor has to be worth it without the block of time that says most: around whatever happened once, a patch can
     be drawn.
     """
-    terms: tuple[Term, ...] = ()
     patches = True
-    proofs: tuple[EffectEvidence, ...] = ()
-    plain = found.selector
-    while len(terms) < found.channel.settings.terms.most_terms:
-        offered = (term for term in options(found) if patches or term.disc is None)
-        best, tried = best_term(found.fit, found.selector.channel, offered)
-        if best is None:
+    while len(found.unnamed) < found.channel.settings.terms.most_terms:
+        larger, patches = _with_one_more(found, options, patches)
+        if larger is None:
             break
-        if best.disc is not None and isinstance(found.channel, BodyChannel):
-            near = places_near(found.channel, found.fit.vector, best.disc)
-            best, closer = best_term(found.fit, found.selector.channel, chain((best,), near))
-            assert best is not None
-            tried += closer
-        channel = WithTerms.of(found.channel, (*terms, best))
-        small = found.fit
-        begin = np.append(small.vector, 0.0)
-        moves, given, start = found.selector.moves, found.selector.given, _extended(plain, channel)
-        selector = Selector(channel, moves, plain.thresholds, given=given, start=start)
-        selector.fits[frozenset(found.names)] = big = fit(channel, begin, indices(channel, found.names))
-        parameters = 1.0 + 2.0 * math.log(tried) / math.log(channel.count)
-        proof = compare(small, big, channel, parameters)
-        moved = selector.moves(found.selector.channel.split(small.vector), channel.split(big.vector))
-        limits = plain.thresholds
-        if best.disc is not None and proof.again(parameters, channel.count) < limits.unnamed_score:
-            patches = False
-            continue
-        if proof.score < limits.unnamed_score or proof.repeated <= 0.0 or moved < limits.moves_m:
-            break
-        terms = (*terms, best)
-        names = selector.select()
-        proofs = (*proofs, proof)
-        accepted = tuple(UnnamedTerm(term.form, evidence, term) for term, evidence in zip(terms, proofs, strict=True))
-        found = replace(found, selector=selector, names=names, unnamed=accepted, plain=plain)
+        found = larger
     return _written(found)
 
 
 def _written(found: ChannelResult) -> ChannelResult:
     """The same, its terms with the coefficients that are told."""
-    coefficients = found.told.vector[found.told.vector.size - len(found.unnamed) :].tolist()
+    if not found.unnamed:
+        return found
+    told, ends = found.told.vector, np.cumsum([len(one.term.features) for one in found.unnamed])
+    coefficients = np.split(told[told.size - ends[-1] :], ends[:-1])
     written = zip(found.unnamed, coefficients, strict=True)
-    return replace(found, unnamed=tuple(replace(one, form=one.term.form.format(value)) for one, value in written))
+    return replace(found, unnamed=tuple(replace(one, form=one.term.written(values)) for one, values in written))
+
+
+def that_models_hold(found: ChannelResult) -> ChannelResult:
+    """With other terms in place of those that no model can carry, and the names that are needed then."""
+    if found.plain is None or all(one.term.model_name is not None for one in found.unnamed):
+        return found
+    options = _wheel_options if isinstance(found.channel, WheelChannel) else _body_options
+    bare = replace(found, selector=found.plain, names=found.plain.select(found.names), unnamed=(), plain=None)
+    return with_unnamed(bare, lambda of: (term for term in options(of) if term.model_name is not None))
+
+
+def _with_one_more(
+    found: ChannelResult, options: Callable[[ChannelResult], Iterator[Term]], patches: bool
+) -> tuple[ChannelResult | None, bool]:
+    """With the first of the most promising terms that is accepted, None if none is; and whether a patch may be one."""
+    offered = (term for term in options(found) if patches or term.disc is None)
+    promising, tried = best_terms(found.fit, found.selector.channel, offered)
+    for promised in promising:
+        term, among = promised, tried
+        if term.disc is not None and isinstance(found.channel, BodyChannel):
+            near = places_near(found.channel, found.fit.vector, term.disc)
+            (term, *_), closer = best_terms(found.fit, found.selector.channel, chain((term,), near))
+            among += closer
+        larger, happened_again = _with_term(found, term, among)
+        if larger is not None:
+            return larger, patches
+        if not happened_again:
+            return _with_one_more(found, options, False)
+    return None, patches
+
+
+def _with_term(found: ChannelResult, term: Term, tried: int) -> tuple[ChannelResult | None, bool]:
+    """With one more term, which was chosen among `tried`, None if it is not worth that; and whether, if it is a patch,
+    it is worth that without the block that says most.
+    """
+    plain, small = found.plain or found.selector, found.fit
+    terms = (*(one.term for one in found.unnamed), term)
+    channel = WithTerms.of(found.channel, terms)
+    begin = np.append(small.vector, np.zeros(len(term.features)))
+    moves, given, start = found.selector.moves, found.selector.given, _extended(plain, channel)
+    selector = Selector(channel, moves, plain.thresholds, given=given, start=start)
+    selector.fits[frozenset(found.names)] = big = fit(channel, begin, indices(channel, found.names))
+    parameters = len(term.features) + 2.0 * math.log(tried) / math.log(channel.count)
+    proof = compare(small, big, channel, parameters)
+    moved = selector.moves(found.selector.channel.split(small.vector), channel.split(big.vector))
+    limits = plain.thresholds
+    if term.disc is not None and proof.again(parameters, channel.count) < limits.unnamed_score:
+        return None, False
+    if proof.score < limits.unnamed_score or proof.repeated <= 0.0 or moved < limits.moves_m:
+        return None, True
+    names = selector.select()
+    if selector.priced(names) > selector.priced(found.names):
+        # What only works together is not found one at a time.
+        names = selector.select(found.names)
+    proofs = (*(one.evidence for one in found.unnamed), proof)
+    accepted = tuple(UnnamedTerm(each.form, evidence, each) for each, evidence in zip(terms, proofs, strict=True))
+    return replace(found, selector=selector, names=names, unnamed=accepted, plain=plain), True
 
 
 def _extended(plain: Selector, channel: WithTerms) -> Array:
@@ -391,26 +422,41 @@ def _extended(plain: Selector, channel: WithTerms) -> Array:
     return np.append(start, np.zeros(channel.neutral.size - start.size))
 
 
-def best_term(small: Fit, channel: ResidualChannel, options: Iterator[Term]) -> tuple[Term | None, int]:
-    """The term that promises most to first order on top of a fit, if it may be worth it, and how many were tried."""
+def best_terms(small: Fit, channel: ResidualChannel, options: Iterator[Term]) -> tuple[list[Term], int]:
+    """The terms that promise most to first order on top of a fit, if they may be worth it, and how many were tried.
+
+    Of the discs of the floor, which are variations of one another, only the best.
+    """
     settings = channel.settings.terms
-    best, most, tried = None, settings.worth_trying_nats, 0
+    promising: list[tuple[float, Term]] = []
+    tried = 0
     core, held = channel.split(small.vector)
     inner = channel.inner
     base = inner.residual(core, held)
     solved, gradient = inverse(small.information()), small.gradient
     for term in options:
         tried += 1
-        size = float(np.sqrt((term.perturbation**2).mean()))
-        if size < 1e-9:
+        columns = []
+        for feature in term.features:
+            size = float(np.sqrt((feature**2).mean()))
+            if size < 1e-9:
+                continue
+            epsilon = 1e-3 / size
+            perturbation = epsilon * feature if held is None else held + epsilon * feature
+            columns.append((inner.residual(core, perturbation) - base) / epsilon)
+        if not columns:
             continue
-        epsilon = 1e-3 / size
-        perturbation = epsilon * term.perturbation if held is None else held + epsilon * term.perturbation
-        column = (inner.residual(core, perturbation) - base) / epsilon
-        across = small.jacobian.T @ column
-        own = float(column @ column - across @ solved @ across)
-        pull = float(column @ small.residual - across @ solved @ gradient)
-        gain = 0.5 * pull * pull / own if own > settings.least_own_share * float(column @ column) else 0.0
-        if gain > most:
-            best, most = term, gain
-    return best, max(tried, 2)
+        slope = np.column_stack(columns)
+        across = small.jacobian.T @ slope
+        own = slope.T @ slope - across.T @ solved @ across
+        pull = slope.T @ small.residual - across.T @ solved @ gradient
+        if np.trace(own) < settings.least_own_share * float((slope**2).sum()):
+            continue
+        gain = 0.5 * float(pull @ inverse(own) @ pull) - 0.5 * (len(columns) - 1) * math.log(channel.count)
+        if gain > settings.worth_trying_nats:
+            promising.append((gain, term))
+    best: list[Term] = []
+    for _, term in sorted(promising, key=lambda one: -one[0]):
+        if term.disc is None or all(other.disc is None for other in best):
+            best.append(term)
+    return best[: settings.most_tried], max(tried, 2)

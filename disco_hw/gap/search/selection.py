@@ -332,11 +332,11 @@ class Selector:
                 break
             larger = self.needed(self.swapped((*accepted, new)))
             if frozenset(larger) in visited:
-                return min(visited.values(), key=self._priced)
+                return min(visited.values(), key=self.priced)
             visited[frozenset(larger)] = accepted = larger
         return accepted
 
-    def _priced(self, names: Names) -> float:
+    def priced(self, names: Names) -> float:
         """Misfit of a set in nats with half the price of its parameters."""
         return float(self.fit(names).cost + 0.5 * parameters_of(names) * np.log(self.channel.count))
 

@@ -18,6 +18,7 @@ from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.settings import GRID_STEP_S, GapSettings, TermSettings
 from disco_hw.model import EffectSetting
+from disco_hw.model.memory import BODY_MEMORIES, COMMAND_MEMORIES
 from disco_hw.model.terms import BODY_FEATURES, BODY_TARGETS, COMMAND, COMMAND_FEATURES, TERMS, term_name
 
 Array = NDArray[np.float64]
@@ -31,6 +32,8 @@ class Term:
     `form` has a place for the coefficient. `model_name`: the term of `disco_hw.model.terms` that it is; None if a model
     cannot carry it, because it depends on what a model's state does not hold. `geometry`: wheel radius and axial
     distance (m) that the speeds in it are made with. `disc`: x, y and radius (m) of the floor that it is about.
+    `beside`: further waves of which it is the first, each with a coefficient of its own, and `usual` the standard
+    deviation that is expected of these.
     """
 
     form: str
@@ -38,6 +41,18 @@ class Term:
     model_name: str | None = None
     geometry: tuple[float, float] = (1.0, 1.0)
     disc: tuple[float, float, float] | None = None
+    beside: tuple[Array, ...] = ()
+    usual: float = math.inf
+
+    @property
+    def features(self) -> tuple[Array, ...]:
+        """What its coefficients stand before."""
+        return (self.perturbation, *self.beside)
+
+    def written(self, coefficients: Array) -> str:
+        """The form with its number, from one coefficient a feature: of waves the root of their mean square."""
+        size = float(coefficients[0]) if not self.beside else float(np.sqrt(0.5 * (coefficients**2).sum()))
+        return self.form.format(size)
 
 
 def wheel_terms(channel: WheelChannel, late_s: float) -> Iterator[Term]:
@@ -48,6 +63,8 @@ def wheel_terms(channel: WheelChannel, late_s: float) -> Iterator[Term]:
     for form, feature in COMMAND_FEATURES.items():
         name = term_name(COMMAND, form)
         yield Term(_with_place(name), feature(u, other, t), name)
+    for form, memory in COMMAND_MEMORIES.items():
+        yield Term(_with_place(term_name(COMMAND, form)), memory.at_nodes(GRID_STEP_S, u, other))
     growth = np.gradient(u, GRID_STEP_S, axis=0)
     sign = COMMAND_FEATURES["sign(u)"](u, other, t)
     angle = drive.angle_rad
@@ -80,14 +97,26 @@ def body_terms(channel: BodyChannel, p: Array) -> Iterator[Term]:
         for form, feature in BODY_FEATURES.items():
             name = term_name(target, form)
             yield Term(_with_place(name), _on(axis, feature(v, w, a, drive.t_s)), name, (float(p[0]), float(p[1])))
+        for form, memory in BODY_MEMORIES[target].items():
+            yield Term(_with_place(term_name(target, form)), _on(axis, memory.at_nodes(GRID_STEP_S, v, w)))
         for form, perturbation in beyond.items():
             yield Term(_with_place(term_name(target, form)), _on(axis, perturbation))
     left, right = drive.speed_rad_s[:, 0] * p[0] / 2.0, drive.speed_rad_s[:, 1] * p[0] / 2.0
+    yield from _waves(drive, v, w)
     angle = drive.angle_rad
     for wave, turn in (("sin", np.sin), ("cos", np.cos)):
         rim = (left * turn(angle[:, 0]), right * turn(angle[:, 1]))
         perturbation = np.column_stack([rim[0] + rim[1], np.zeros_like(v), 2.0 * (rim[1] - rim[0]) / p[1]])
         yield Term(f"rim speed += {{:.4g}} {wave}(wheel angle) of itself", perturbation)
+
+
+def _waves(drive: GriddedDrive, v: Array, w: Array) -> Iterator[Term]:
+    """Ground that carries more and less in turn: the slowest cosines of the time over the whole log."""
+    since_s, settings = drive.t_s - drive.t_s[0], drive.settings.terms
+    waves = [np.cos(math.pi * number * since_s / float(since_s[-1])) for number in range(1, settings.waves + 1)]
+    for axis, speed, name in ((0, v, "v_x += {:.2g} v"), (2, w, "omega += {:.2g} omega")):
+        first, *others = (_on(axis, wave * speed) for wave in waves)
+        yield Term(f"{name} times what varies slowly with time", first, beside=tuple(others), usual=settings.usual_wave)
 
 
 def with_known_terms(drive: GriddedDrive, effects: Iterable[EffectSetting], p: Array, late_s: float) -> GriddedDrive:
@@ -190,9 +219,16 @@ class WithTerms:
     @classmethod
     def of(cls, inner: WheelChannel | BodyChannel, terms: tuple[Term, ...]) -> WithTerms:
         """Extend a channel."""
-        plain, count = inner.layout, len(terms)
-        names = tuple(f"term{k}" for k in range(count))
-        sizes = [max(float(np.sqrt((term.perturbation**2).mean())), 1e-12) for term in terms]
+        plain = inner.layout
+        names = tuple(
+            f"term{k}" if part == 0 else f"term{k}.{part}"
+            for k, term in enumerate(terms)
+            for part in range(len(term.features))
+        )
+        features = [feature for term in terms for feature in term.features]
+        sizes = [max(float(np.sqrt((feature**2).mean())), 1e-12) for feature in features]
+        usual = np.array([term.usual for term in terms for _ in term.features])
+        count = len(features)
         layout = replace(
             plain,
             columns=plain.columns + names,
@@ -200,7 +236,7 @@ class WithTerms:
             step=np.append(plain.step, [1e-3 / size for size in sizes]),
             low=np.append(plain.low, np.full(count, -math.inf)),
             high=np.append(plain.high, np.full(count, math.inf)),
-            precision=np.append(plain.precision, np.zeros(count)),
+            precision=np.append(plain.precision, usual**-2.0),
             place={**plain.place, **{name: len(plain.columns) + k for k, name in enumerate(names)}},
         )
         return cls(inner, terms, layout)
@@ -213,13 +249,18 @@ class WithTerms:
     @property
     def neutral(self) -> Array:
         """The vector without any effect or term."""
-        return np.append(self.inner.neutral, np.zeros(len(self.terms)))
+        return np.append(self.inner.neutral, np.zeros(self.many))
+
+    @property
+    def many(self) -> int:
+        """Number of coefficients."""
+        return sum(len(term.features) for term in self.terms)
 
     @property
     def free(self) -> tuple[int, ...]:
         """Entries that are always fitted: the base and the coefficients."""
         first = len(self.inner.layout.columns)
-        return (*self.inner.free, *range(first, first + len(self.terms)))
+        return (*self.inner.free, *range(first, first + self.many))
 
     @property
     def block(self) -> Index:
@@ -243,8 +284,9 @@ class WithTerms:
         key = coefficients.tobytes()
         if key not in self.kept:
             perturbation = np.zeros_like(self.terms[0].perturbation)
-            for coefficient, term in zip(coefficients, self.terms, strict=True):
-                perturbation += coefficient * term.perturbation
+            features = (feature for term in self.terms for feature in term.features)
+            for coefficient, feature in zip(coefficients, features, strict=True):
+                perturbation += coefficient * feature
             self.kept.clear()
             self.kept[key] = perturbation
         return p[:width], self.kept[key]

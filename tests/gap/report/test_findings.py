@@ -53,6 +53,26 @@ def test_a_model_that_predicts_worse_is_not_recommended():
     assert report(0.048).as_dict()["gap"]["why_not_amended"] is None
 
 
+def without_its_terms(written_m, offered="amended"):
+    """A report of which the amended model, as it is written, errs by so much."""
+    of = report(0.014, offered=offered)
+    return replace(of, gap={**of.gap, "written": {ahead_s: errors(written_m) for ahead_s in of.gap["amended"]}})
+
+
+@pytest.mark.parametrize(("written_m", "offered"), [(0.02, "amended"), (0.052, "timed")])
+def test_a_model_that_lacks_what_no_model_can_carry_is_judged_without_it(written_m, offered):
+    of = without_its_terms(written_m, offered)
+    assert offered_stage(of.gap, True, True, DEFAULT_SETTINGS) == offered
+    assert of.why_not_amended == (None if offered == "amended" else "The amended model does not beat it.")
+    said = (
+        f"Without the terms that no model can carry, as it is written, the amended one errs by {1e3 * written_m:g} mm"
+    )
+    assert said in answer(of)[1]
+    assert of.as_dict()["gap"]["written"]["position_rmse_m"] == written_m
+    assert "written" not in report(0.014).as_dict()["gap"]
+    assert said in page(of)
+
+
 def in_stretches(squares):
     """Errors by stage that are the same however far ahead; squares of position and heading by stretch."""
     off = errors(float(np.sqrt(np.mean(squares))), float(np.sqrt(np.mean(squares))))

@@ -293,8 +293,8 @@ def test_the_price_of_an_effect_is_that_of_all_its_parameters():
     # Left and right: half of 2 ln(1000).
     assert fitted.promise((), "wheel_gain") == pytest.approx(50.0 - np.log(1000))
     assert fitted._worth((), ("wheel_gain",), "wheel_gain") == pytest.approx(50.0 - np.log(1000))
-    assert fitted._priced(("wheel_gain",)) == pytest.approx(650.0 + np.log(1000))
-    assert fitted._priced(()) == 700.0
+    assert fitted.priced(("wheel_gain",)) == pytest.approx(650.0 + np.log(1000))
+    assert fitted.priced(()) == 700.0
 
 
 def test_what_promises_nothing_to_first_order_is_not_fitted():

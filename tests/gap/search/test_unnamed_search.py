@@ -14,7 +14,7 @@ from disco_hw.gap.search.channel_search import (
     _priced,
     _thresholds,
     _time_or_place,
-    best_term,
+    best_terms,
     body_moves,
     with_unnamed,
 )
@@ -29,6 +29,7 @@ class Linear:
     """A channel of 300 residuals, each of which feels one entry of what is added (150, 2); `asked` for so far."""
 
     settings = DEFAULT_SETTINGS
+    count = 300
 
     def __init__(self, left, held=None):
         self.left, self.held, self.asked = left, held, []
@@ -63,12 +64,17 @@ def test_the_term_is_tried_that_takes_most_off_the_squares_and_only_if_that_may_
     channel = Linear(left)
     small = channel.fitted(np.empty((300, 0)))
     first, second, third = along(3.0), along(0.0, 0.2), along(0.0, 0.0, -1.0)
-    assert best_term(small, channel, iter((NOTHING, first, second, third))) == (second, 4)
-    assert best_term(small, channel, iter((second, first, NOTHING))) == (second, 3)
-    assert best_term(small, channel, iter((first,))) == (first, 2)
-    assert best_term(small, channel, iter((third, NOTHING, third))) == (None, 3)
+    assert best_terms(small, channel, iter((NOTHING, first, second, third))) == ([second, first], 4)
+    assert best_terms(small, channel, iter((second, first, NOTHING))) == ([second, first], 3)
+    assert best_terms(small, channel, iter((first,))) == ([first], 2)
+    assert best_terms(small, channel, iter((third, NOTHING, third))) == ([], 3)
     # Together 18.6 + 17.4 nats, in the right proportion.
-    assert best_term(small, channel, iter((second, along(6.1, 0.0, 5.9))))[0].form.startswith("(6.1")
+    assert best_terms(small, channel, iter((second, along(6.1, 0.0, 5.9))))[0][0].form.startswith("(6.1")
+    # No more than the four that promise most, and of patches, which are variations of one another, the best alone.
+    many = [along(*np.eye(1, 3, 1)[0], *(0.1 * np.eye(1, 6, k)[0])) for k in range(6)]
+    assert len(best_terms(small, channel, iter(many))[0]) == 4
+    patches = [replace(one, disc=(0.0, 0.0, 1.0)) for one in (second, along(0.1, 1.0))]
+    assert best_terms(small, channel, iter((first, *patches)))[0] == [patches[0], first]
 
 
 def test_what_is_fitted_already_is_no_gain_of_a_term():
@@ -88,7 +94,8 @@ def test_what_is_fitted_already_is_no_gain_of_a_term():
     ]
     gains = [squares(slope) - squares(np.column_stack([slope, one.perturbation.ravel()])) for one in options]
     assert max(gains) > 36.0
-    assert best_term(small, channel, iter(options))[0] is options[int(np.argmax(gains))]
+    order = [options[k] for k in np.argsort(gains)[::-1] if gains[k] > 36.0][:4]
+    assert best_terms(small, channel, iter(options))[0] == order
 
 
 @pytest.mark.parametrize(("own", "tried"), [(0.09, False), (0.11, True)])
@@ -99,7 +106,7 @@ def test_a_term_of_which_what_is_fitted_does_the_most_is_not_tried(own, tried):
     slope[0] = 2.0
     channel = Linear(left)
     term = along((1.0 - own) ** 0.5, own**0.5)
-    assert best_term(channel.fitted(slope), channel, iter((term,)))[0] is (term if tried else None)
+    assert best_terms(channel.fitted(slope), channel, iter((term,)))[0] == ([term] if tried else [])
 
 
 @pytest.mark.parametrize("held", [None, np.full((150, 2), 0.7)])
@@ -107,7 +114,7 @@ def test_a_term_is_tried_in_a_size_that_hardly_matters_on_top_of_terms_that_are_
     channel = Linear(np.full(300, 9.0), held)
     small = channel.fitted(np.empty((300, 0)))
     channel.asked.clear()
-    best_term(small, channel, iter((along(50.0),)))
+    best_terms(small, channel, iter((along(50.0),)))
     before, tried = channel.asked
     assert (before == (0.0 if held is None else 0.7)).all()
     assert np.sqrt(((tried - before) ** 2).mean()) == pytest.approx(1e-3)
@@ -151,18 +158,17 @@ def test_a_term_is_accepted_with_its_number_and_its_evidence_and_what_stood_in_f
     assert found.plain.channel is channel
 
 
-def test_no_more_terms_are_added_than_two(monkeypatch):
+def test_no_more_terms_are_added_than_three(monkeypatch):
     channel, term = turned_in(0.1, 0.9, -0.2)
     size = channel.drive.t_s.size
-    inside = [(np.arange(size) // (size // 5) == k)[:, None] for k in (1, 2, 3)]
+    inside = [(np.arange(size) // (size // 6) == k)[:, None] for k in (1, 2, 3, 4)]
     parts = [replace(term, perturbation=np.where(of, term.perturbation, 0.0)) for of in inside]
     monkeypatch.setattr(channel_search, "compare", lambda *_: EffectEvidence(30.0, 10.0, 1.0, 1.0, 40.0))
     found = with_unnamed(searched(channel), lambda found: iter(parts))
-    assert len(found.unnamed) == 2
-    assert found.unnamed[0].term is not found.unnamed[1].term
-    # Both coefficients are told as they are when both are in.
-    assert [one.form for one in found.unnamed] == [f"omega += {k:.2f} then" for k in found.fit.vector[-2:]]
-    assert found.fit.vector.size == channel.neutral.size + 2
+    assert len({id(one.term) for one in found.unnamed}) == len(found.unnamed) == 3
+    # All coefficients are told as they are when all are in.
+    assert [one.form for one in found.unnamed] == [f"omega += {k:.2f} then" for k in found.fit.vector[-3:]]
+    assert found.fit.vector.size == channel.neutral.size + 3
 
 
 @pytest.mark.parametrize(

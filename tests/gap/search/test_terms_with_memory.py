@@ -1,0 +1,130 @@
+"""Terms that remember or vary with time: found, told, and left out of the model that is written."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from disco_hw.gap import find_gap
+from disco_hw.gap.search import channel_search
+from disco_hw.gap.search.channel_search import (
+    ChannelResult,
+    UnnamedTerm,
+    best_terms,
+    body_moves,
+    that_models_hold,
+    with_unnamed,
+)
+from disco_hw.gap.search.selection import EffectEvidence, Selector
+from disco_hw.gap.search.unnamed_terms import Term, WithTerms, body_terms, motion
+from disco_hw.model import Model
+from tests.gap.synthetic import body_channel
+from tools import strange_robot
+
+PROOF = EffectEvidence(100.0, 90.0, 80.0, 1.0, 190.0)
+
+
+@cache
+def turning_less():
+    """A channel whose robot turns less the faster it turns, its plain fit, and the yaw rate at the nodes."""
+    channel, line = body_channel(turn_slip=0.1)
+    selector = Selector(channel, body_moves(channel))
+    return ChannelResult(selector, (), channel), motion(line, channel.neutral)[1]
+
+
+def on_turning(form, feature, **kinds):
+    return Term(form, np.column_stack([np.zeros((feature.size, 2)), feature]), **kinds)
+
+
+def test_of_the_terms_that_promise_most_the_first_that_is_worth_it_is_taken(monkeypatch):
+    found, rate = turning_less()
+    good, poor, bad = (
+        on_turning(form, feature)
+        for form, feature in (
+            ("good {:.3g}", rate * np.abs(rate)),
+            ("poor {:.3g}", rate**3),
+            ("bad {:.3g}", 0.1 * np.sin(0.6 * np.arange(rate.size))),
+        )
+    )
+    options = [bad, poor, good]
+    promising, tried = best_terms(found.fit, found.channel, iter(options))
+    assert tried == 3
+    assert [term.form for term in promising] == [good.form, poor.form]
+    (taken,) = with_unnamed(found, lambda of: iter(options)).unnamed
+    assert taken.term is good
+    accept = channel_search._with_term
+    monkeypatch.setattr(
+        channel_search, "_with_term", lambda of, term, tried: (None, True) if term is good else accept(of, term, tried)
+    )
+    assert with_unnamed(found, lambda of: iter(options)).unnamed[0].term is poor
+
+
+def test_features_that_belong_together_have_a_coefficient_each_and_pay_for_each():
+    found, rate = turning_less()
+    half = np.where(np.arange(rate.size) < rate.size // 2, 1.0, 0.0)
+    both = on_turning("{:.3g}", rate * half)
+    both = replace(both, beside=(on_turning("", rate * (1.0 - half)).perturbation,), usual=0.1)
+    channel = WithTerms.of(found.channel, (both, on_turning("{}", rate**3)))
+    width = len(found.channel.layout.columns)
+    assert channel.layout.columns[width:] == ("term0", "term0.1", "term1")
+    assert channel.many == 3
+    assert channel.layout.precision[width:] == pytest.approx([100.0, 100.0, 0.0])
+    _, added = channel.split(np.concatenate([found.channel.neutral, [0.2, -0.1, 0.0]]))
+    np.testing.assert_allclose(added[:, 2], rate * (0.2 * half - 0.1 * (1.0 - half)))
+    assert both.written(np.array([0.3, -0.4])) == f"{0.5 / 2**0.5:.3g}"
+
+
+def test_ground_that_varies_slowly_is_one_form_with_a_cosine_for_each_wave():
+    channel, _ = body_channel()
+    (turning,) = (
+        term for term in body_terms(channel, channel.neutral) if term.form.startswith("omega += {:.2g} omega")
+    )
+    assert turning.model_name is None
+    assert len(turning.features) == channel.settings.terms.waves
+    rate = motion(channel.drive, channel.neutral)[1]
+    once = turning.features[1][:, 2]
+    # The second wave goes once round in the log.
+    np.testing.assert_allclose(once, rate * np.cos(2.0 * np.pi * channel.drive.t_s / channel.drive.t_s[-1]), atol=1e-9)
+    assert not turning.features[1][:, :2].any()
+
+
+def carrying(name):
+    """What is found with a term that fits, and that a model carries under this name, or cannot carry."""
+    found, rate = turning_less()
+    term = on_turning("omega += {:.3g} omega |omega|", rate * np.abs(rate), model_name=name)
+    channel = WithTerms.of(found.channel, (term,))
+    selector = Selector(channel, found.selector.moves)
+    return replace(found, selector=selector, unnamed=(UnnamedTerm("", PROOF, term),), plain=found.selector)
+
+
+def test_what_every_model_can_carry_is_written_as_it_was_found():
+    found = carrying("omega += k omega |omega|")
+    assert that_models_hold(found) is found
+    bare, _ = turning_less()
+    assert that_models_hold(bare) is bare
+
+
+def test_in_place_of_what_no_model_can_carry_names_and_other_terms_are_fitted():
+    written = that_models_hold(carrying(None))
+    assert written.names == ("turn_slip",)
+    assert all(one.term.model_name is not None for one in written.unnamed)
+    assert written.plain is None or written.unnamed
+
+
+@pytest.mark.long
+def test_a_supply_that_both_wheels_drain_is_told_by_its_load_and_is_not_in_the_model():
+    report = find_gap(strange_robot.record("cross_coupled_supply", 502).log, Model(*strange_robot.NOMINAL))
+    assert {effect.name for effect in report.effects} <= {"motor_lag", "command_delay"}
+    assert any("mean_1s(|u| + |u_other|)" in term.form and not term.in_model for term in report.unnamed)
+    at = {stage: errors[2.0].position_m for stage, errors in report.gap.items()}
+    assert at["timed"] - at["amended"] > 0.5 * (at["timed"] - at["floor"])
+    assert at["written"] > at["amended"]
+    assert not any("mean" in setting.name for setting in report.model.effects)
+
+
+@pytest.mark.long
+def test_ground_that_carries_more_and_less_in_turn_is_neither_a_change_nor_a_patch():
+    report = find_gap(strange_robot.record("time_varying_friction", 503).log, Model(*strange_robot.NOMINAL))
+    assert {effect.name for effect in report.effects} <= {"motor_lag", "command_delay"}
+    assert "varies slowly with time" in report.unnamed[0].form

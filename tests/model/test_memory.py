@@ -1,0 +1,51 @@
+"""Features that remember: means that fade, as a first-order lag makes them."""
+
+import math
+
+import numpy as np
+import pytest
+
+from disco_hw.model.memory import BODY_MEMORIES, COMMAND_MEMORIES
+
+STEP_S = 0.01
+STEADY = np.full((2000, 2), (3.0, -2.0))
+
+
+def of_command(form, u):
+    return COMMAND_MEMORIES[form].at_nodes(STEP_S, u, u[:, ::-1])
+
+
+def test_a_mean_has_followed_a_step_by_63_percent_after_its_time():
+    from_mean = of_command("(u - mean_1s(u))", STEADY)
+    assert from_mean[99] == pytest.approx(STEADY[0] * math.exp(-1.0))
+    assert from_mean[-1] == pytest.approx([0.0, 0.0], abs=1e-6)
+    slower = of_command("(u - mean_3s(u))", STEADY)
+    assert slower[299] == pytest.approx(STEADY[0] * math.exp(-1.0))
+
+
+def test_what_both_wheels_take_lowers_each_in_proportion():
+    load = of_command("u mean_1s(|u| + |u_other|)", STEADY)
+    assert load[-1] == pytest.approx([15.0, -10.0], rel=1e-6)
+    assert load[99] == pytest.approx(np.array([15.0, -10.0]) * (1.0 - math.exp(-1.0)))
+
+
+def test_a_motor_warms_with_the_square_of_its_command():
+    heat = of_command("u mean_30s(u^2)", STEADY)
+    assert heat[-1] == pytest.approx(np.array([27.0, -8.0]) * (1.0 - math.exp(-20.0 / 30.0)), rel=1e-3)
+
+
+def test_a_direction_is_that_of_the_last_change_and_fades():
+    up_then_down = np.repeat([[1.0, 1.0], [3.0, 3.0], [2.0, 2.0]], 400, axis=0)
+    direction = of_command("sign(u - mean_0.3s(u))", up_then_down)
+    assert direction[405] == pytest.approx([1.0, 1.0], abs=0.01)
+    assert direction[805] == pytest.approx([-1.0, -1.0], abs=0.02)
+    assert direction[-1] == pytest.approx([0.0, 0.0], abs=1e-3)
+
+
+def test_the_body_is_asked_in_its_own_speeds():
+    v, w = np.full(500, 0.4), np.full(500, -0.9)
+    turning = BODY_MEMORIES["omega"]["(omega - mean_1s(omega))"].at_nodes(STEP_S, v, w)
+    assert turning[99] == pytest.approx(-0.9 * math.exp(-1.0))
+    forward = BODY_MEMORIES["v_x"]["(v - mean_1s(v))"].at_nodes(STEP_S, v, w)
+    assert forward[99] == pytest.approx(0.4 * math.exp(-1.0))
+    assert BODY_MEMORIES["v_y"] == {}
