@@ -283,12 +283,15 @@ def fold_vectors(found: Fit, block: Index, neutral: Array, settings: GapSettings
     normal, gradient = by_block(found, fold)
     out = {}
     active = np.array(found.active)
+    # What was expected before any log was looked at is expected of either fold.
+    precision = np.zeros(active.size) if found.precision is None else found.precision
+    pull = precision * (found.vector[active] - neutral[active])
     for held in (0, 1):
         vector = found.vector.copy()
         determined = known(normal[1 - held], normal.sum(axis=0), settings.fit)
         determined |= np.diag(normal[1 - held]) * vector[active] ** 2 > settings.prediction.fixed_sigmas**2
-        here = normal[1 - held] if found.precision is None else normal[1 - held] + np.diag(found.precision)
-        vector[active[determined]] -= inverse(here[np.ix_(determined, determined)]) @ gradient[1 - held][determined]
+        here = (normal[1 - held] + np.diag(precision))[np.ix_(determined, determined)]
+        vector[active[determined]] -= inverse(here) @ (gradient[1 - held] + pull)[determined]
         vector[active[~determined]] = neutral[active[~determined]]
         out[held] = vector
     return out

@@ -276,6 +276,26 @@ def test_a_fold_is_predicted_by_a_fit_of_the_other_one():
     assert single[0] is single[1] is vector
 
 
+def test_what_is_expected_of_a_parameter_is_expected_of_each_fold():
+    rng = np.random.default_rng(7)
+    block, precision, neutral = np.arange(1000) // 10, np.array([0.0, 400.0]), np.array([0.0, 0.2])
+    slope = rng.standard_normal((1000, 2))
+    y = slope @ (0.5, 1.0) + rng.standard_normal(1000)
+
+    def fitted(rows):
+        # An expected value is one more row, of its weight.
+        wide = np.vstack([slope[rows], np.diag(precision**0.5)])
+        return np.linalg.lstsq(wide, np.append(y[rows], precision**0.5 * neutral), rcond=None)[0]
+
+    whole = fitted(np.ones(1000, dtype=bool))
+    residual = slope @ whole - y
+    found = Fit(whole, (0, 1), 0.0, residual, slope, precision)
+    folds = fold_vectors(found, block, neutral, DEFAULT_SETTINGS)
+    for held in (0, 1):
+        assert folds[held] == pytest.approx(fitted((block // 7) % 2 != held), rel=1e-9)
+    assert abs(folds[0][1] - folds[1][1]) < 0.1
+
+
 @pytest.mark.parametrize(("value", "used"), [(1.2, True), (0.8, False)])
 def test_what_the_other_fold_says_little_of_is_used_if_it_fixes_the_value_itself(value, used):
     block = np.arange(1400) // 10
