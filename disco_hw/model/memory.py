@@ -59,10 +59,6 @@ COMMAND_MEMORIES: Mapping[str, Remembered] = MappingProxyType(
         )
         for time_s in (0.3, 1.0, 3.0)
     }
-    | {
-        f"(u - mean_{time_s:g}s(u))": Remembered(lambda u, other: u, time_s, lambda u, other, mean: u - mean)
-        for time_s in (0.3, 1.0, 3.0)
-    }
 )
 # Of forward speed v (m/s) and yaw rate w (rad/s).
 BODY_MEMORIES: Mapping[str, Mapping[str, Remembered]] = MappingProxyType(

@@ -16,11 +16,12 @@ def of_command(form, u):
 
 
 def test_a_mean_has_followed_a_step_by_63_percent_after_its_time():
-    from_mean = of_command("(u - mean_1s(u))", STEADY)
-    assert from_mean[99] == pytest.approx(STEADY[0] * math.exp(-1.0))
-    assert from_mean[-1] == pytest.approx([0.0, 0.0], abs=1e-6)
-    slower = of_command("(u - mean_3s(u))", STEADY)
-    assert slower[299] == pytest.approx(STEADY[0] * math.exp(-1.0))
+    speed, rate = np.full(2000, 3.0), np.full(2000, -2.0)
+    from_mean = BODY_MEMORIES["omega"]["(omega - mean_1s(omega))"].at_nodes(STEP_S, speed, rate)
+    assert from_mean[99] == pytest.approx(-2.0 * math.exp(-1.0))
+    assert from_mean[-1] == pytest.approx(0.0, abs=1e-6)
+    slower = BODY_MEMORIES["v_x"]["(v - mean_3s(v))"].at_nodes(STEP_S, speed, rate)
+    assert slower[299] == pytest.approx(3.0 * math.exp(-1.0))
 
 
 def test_what_both_wheels_take_lowers_each_in_proportion():
