@@ -142,10 +142,12 @@ def in_parts(found: ChannelResult, parts: NDArray[np.int64]) -> dict[str, InPart
     settings = channel.settings
     each = settings.selection.block_lengths[1]
     normal, gradient = by_block(best, channel.block)
-    whole = np.diag(normal.sum(axis=0))
     inside = [parts == label for label in labels]
     least = settings.fit.part_known_share / labels.size
-    enough = np.all([np.diag(normal[of].sum(axis=0)) > least * whole for of in inside], axis=0)
+    # What a part cannot tell from others it does not know, however much depends on it: a circle has one axial distance
+    # for every pair of wheels.
+    whole = 1.0 / np.diag(inverse(normal.sum(axis=0)))
+    enough = np.all([1.0 / np.diag(inverse(normal[of].sum(axis=0))) > least * whole for of in inside], axis=0)
     places = np.array(best.active)[enough]
     if not places.size:
         return {}

@@ -8,7 +8,8 @@ import pytest
 from scipy.signal import lfilter
 
 from disco_hw.gap.data import BODY, WHEEL
-from disco_hw.gap.noise.channels import WheelChannel
+from disco_hw.gap.data.free_runs import read_angles
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report.judge import across_logs, drifting_parameters
 from disco_hw.gap.search.analysis import (
@@ -26,7 +27,7 @@ from disco_hw.gap.search.analysis import (
 from disco_hw.gap.search.channel_search import ChannelResult, body_moves, wheel_moves
 from disco_hw.gap.search.selection import Selector
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
-from tests.gap.synthetic import GEOMETRY, body_channel, line_of
+from tests.gap.synthetic import DRIVE, GEOMETRY, NOISE, body_channel, line_of
 
 
 def estimated(channel, names=("turn_slip",)):
@@ -121,6 +122,25 @@ def test_what_wanders_is_told_from_what_parts_know_badly():
     assert narrow.apart(1, 0) == -narrow.apart(0, 1)
     # A part that knows little weighs little.
     assert InParts(np.array([1.0, 1.0, 9.0]), np.array([0.1, 0.1, 8.0])).variance_between == 0.0
+
+
+def test_a_part_that_cannot_tell_two_parameters_apart_says_nothing_of_either():
+    """On a circle a longer axle is as good as slip."""
+    rich = 2 * DRIVE
+    line = line_of(np.repeat(np.array([(3, 5)] * len(rich) + list(rich), dtype=float), 200, axis=0))
+    truth = BODY.neutral.copy()
+    truth[:3] = GEOMETRY
+    plain = BodyChannel.build(line, NOISE, truth)
+    truth[BODY.place["turn_slip.k_s"]] = 0.08
+    poses = np.empty((line.pose.t_s.size, 3))
+    noise = np.random.default_rng(4).standard_normal(poses.shape) * (0.004, 0.004, 0.006)
+    read_angles(plain.track(truth), line.pose.node, line.pose.fraction, poses)
+    channel = BodyChannel.build(replace(line, pose_values=poses + noise), NOISE, plain.neutral)
+    result = ChannelResult(Selector(channel, body_moves(channel)), ("turn_slip",), channel)
+    found = in_logs(result, (0.0, 0.5 * channel.drive.duration_s))
+    assert "turn_slip.k_s" not in found
+    assert "axial_distance_m" not in found
+    assert found["x_icr_m"].values == pytest.approx((GEOMETRY[2], GEOMETRY[2]), abs=0.005)
 
 
 def test_each_of_several_logs_speaks_for_itself():
