@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from disco_hw.effects import Array, Channel, Effect, Parameter, Stage, Symptom, Value, Values
+from disco_hw.effects import Array, Channel, Effect, Parameter, Stage, Value, Values
 from disco_hw.jit import scalar_function
 
 
@@ -41,7 +41,6 @@ EFFECT = Effect(
     coefficients=coefficients,
     term=term,
     uses_geometry=True,
-    symptoms=(Symptom.SIDEWAYS_IN_FAST_TURNS,),
     excitation="speeding up and braking in arcs",
     script="curves",
     sentence="the point that the robot turns about moves back by {k_s2:.3f} m for every m/s^2 of speeding up",

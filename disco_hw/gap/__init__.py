@@ -220,14 +220,16 @@ def _drawn(analysis: GapAnalysis, gap: dict[str, dict[float, PredictionErrors]])
 
 
 def missing_effects(log: DriveLog, model: Model) -> tuple[str, ...]:
-    """Only the names of what a log shows and a model lacks, doubtful or not, the surest first; raises as `find_gap`.
+    """Only the names of what a log shows and a model lacks, the surest first; raises as `find_gap`.
 
-    None where poses are predicted as well without them, from commands and with the geometry refitted: a log of two
-    minutes shows a delay of 2 ms, which nobody has to know to drive.
+    Doubtful ones only where all are: something is missing then too. None where poses are predicted as well without
+    them, from commands and with the geometry refitted: a log of two minutes shows a delay of 2 ms, which nobody has to
+    know to drive.
     """
     analysis, _ = search_log(log, model)
     final = final_fit(analysis)
-    names = tuple(effect.name for effect in effect_findings(analysis, final))
+    sure, doubtful = sort_out(effect_findings(analysis, final), Measured.of(analysis, final))
+    names = tuple(effect.name for effect in sure or doubtful)
     if analysis.body is None or not names:
         return names
     stages = stage_predictions(analysis, final)
