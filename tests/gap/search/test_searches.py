@@ -13,7 +13,7 @@ from disco_hw.gap.search.channel_search import ChannelResult, responding, search
 from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.richest_model import LATE, LATE_COLUMNS, LATE_STARTS_S, indices, smooth_of
 from disco_hw.gap.search.selection import Selector
-from disco_hw.gap.search.unnamed_terms import body_terms
+from disco_hw.gap.search.unnamed_terms import WithTerms, body_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from tests.gap.synthetic import DRIVE, GEOMETRY, NOISE, body_channel, line_of
 
@@ -159,12 +159,9 @@ def noted(monkeypatch):
     return SimpleNamespace(selectors=selectors, freed=freed, tails=tails)
 
 
-def test_the_noise_of_wheels_is_learnt_of_a_rough_selection_and_all_that_is_smooth(noted):
-    found = search_wheels(
-        wheels_of(motor_lag=0.15, drive=((0, 4), (3, 3), (0, 0)) * 6), np.array(GEOMETRY), WHEEL.neutral
-    )
-    # What comes after tries a term, which is not worth it.
-    rough, chosen, *_ = noted.selectors
+def of_rough_and_smooth(found, noted, layout):
+    """The selector that chose, after a rough one, whose noise is learnt with all that is smooth."""
+    rough, chosen, *trials = noted.selectors
     settings = DEFAULT_SETTINGS.selection
     # What moves no prediction would pass for noise too.
     assert (rough.thresholds.score, rough.thresholds.moves_m, rough.closely) == (settings.rough_score, 0.0, True)
@@ -172,7 +169,20 @@ def test_the_noise_of_wheels_is_learnt_of_a_rough_selection_and_all_that_is_smoo
     assert chosen.thresholds is found.selector.thresholds
     assert (chosen.thresholds.moves_m, chosen.closely) == (settings.least_moved_m, False)
     assert all(len(set(active)) == len(active) for active in noted.freed)
-    assert set(indices(found.channel, smooth_of(WHEEL))) in [set(active) for active in noted.freed]
+    assert set(indices(found.channel, smooth_of(layout))) in [set(active) for active in noted.freed]
+    # What comes after tries terms one by one, of which none is worth it.
+    assert len(trials) <= DEFAULT_SETTINGS.terms.most_tried
+    assert all(isinstance(trial.channel, WithTerms) and len(trial.channel.terms) == 1 for trial in trials)
+    assert not found.unnamed
+    return chosen
+
+
+def test_the_noise_of_wheels_is_learnt_of_a_rough_selection_and_all_that_is_smooth(noted):
+    found = search_wheels(
+        wheels_of(motor_lag=0.15, drive=((0, 4), (3, 3), (0, 0)) * 6), np.array(GEOMETRY), WHEEL.neutral
+    )
+    chosen = of_rough_and_smooth(found, noted, WHEEL)
+    settings = DEFAULT_SETTINGS.selection
     # Heavy tails are those of wheels of which one turns at least.
     ((white, use, of, limits),) = noted.tails
     turning = np.abs(found.channel.drive.speed_rad_s[found.channel.drive.encoder.node]) > settings.rest_rad_s
@@ -209,15 +219,8 @@ def test_where_nothing_that_is_known_comes_near_the_noise_is_what_that_leaves(no
 def test_the_noise_of_a_body_is_learnt_of_a_rough_selection_and_all_that_is_smooth(noted):
     channel, line = body_channel(turn_slip=0.08)
     found = search_body(line, channel.neutral)
-    # What comes after tries a term, which is not worth it.
-    rough, chosen, *_ = noted.selectors
+    chosen = of_rough_and_smooth(found, noted, BODY)
     settings = DEFAULT_SETTINGS.selection
-    assert (rough.thresholds.score, rough.thresholds.moves_m, rough.closely) == (settings.rough_score, 0.0, True)
-    assert chosen.channel is found.selector.channel is found.channel
-    assert chosen.thresholds is found.selector.thresholds
-    assert (chosen.thresholds.moves_m, chosen.closely) == (settings.least_moved_m, False)
-    assert all(len(set(active)) == len(active) for active in noted.freed)
-    assert set(indices(found.channel, smooth_of(BODY))) in [set(active) for active in noted.freed]
     ((white, use, of, limits),) = noted.tails
     assert use is found.channel.use
     np.testing.assert_array_equal((white * found.channel.weight).ravel(), found.richest)
