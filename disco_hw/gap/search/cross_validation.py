@@ -163,8 +163,11 @@ def smoothed_poses(channel: BodyChannel, p: Array) -> tuple[Array, Array]:
     centre = np.minimum(np.searchsorted(t, drive.t_s), t.size - 1)
     reach = max(int(reach_s / max(float(np.median(np.diff(t))), 1e-3)), 1)
     near = np.arange(-reach, reach + 1)
-    members = np.clip(centre[:, None] + near[None, :], 0, t.size - 1)
+    places = centre[:, None] + near[None, :]
+    members = np.clip(places, 0, t.size - 1)
     valid = (np.abs(t[members] - drive.t_s[:, None]) <= reach_s) & (run_sample[members] == run_of[:, None])
+    # Beyond either end the outermost sample stands in, and counts once.
+    valid &= members == places
     weight = valid / np.maximum(valid.sum(axis=1, keepdims=True), 1)
     angle = (turned[members] * weight).sum(axis=1)
     cosine, sine = np.cos(angle), np.sin(angle)

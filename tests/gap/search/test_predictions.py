@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.data import BODY, WHEEL
+from disco_hw.gap.data.gridded_drive import GridSamples
 from disco_hw.gap.noise import SensorNoise
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
@@ -24,7 +25,7 @@ from disco_hw.gap.search.cross_validation import (
     summarise,
 )
 from disco_hw.gap.search.least_squares import Fit
-from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, PredictionSettings
 from tests.gap.synthetic import GEOMETRY, NOISE, line_of
 
 RADIUS_M, AXLE_M, X_ICR_M = GEOMETRY
@@ -77,7 +78,7 @@ def test_poses_at_rest_are_averaged_within_their_reach_and_their_run_and_taken_a
     channel = with_poses(line, values, use=use)
     smooth, alone = smoothed_poses(channel, vector_of())
     t_s = line.pose.t_s
-    for node in (36, 40, 60, 200, 333, 395, 396, 404, 417, 500, 760):
+    for node in (4, 5, 8, 36, 40, 60, 200, 333, 395, 396, 404, 417, 500, 760, 784, 793, 796, 798):
         now = node * GRID_STEP_S
         same = use & ((t_s < 4.02) == (now < 4.02))
         near = same & (np.abs(t_s - now) < 0.3 + 1e-9)
@@ -85,6 +86,18 @@ def test_poses_at_rest_are_averaged_within_their_reach_and_their_run_and_taken_a
             np.testing.assert_allclose(smooth[node], values[near].mean(axis=0), atol=1e-9)
         nearest = np.argmin(np.where(use, np.abs(t_s - now), np.inf))
         np.testing.assert_allclose(alone[node], values[nearest], atol=1e-9)
+
+
+def test_poses_at_the_end_of_their_reach_count_and_thin_ones_of_either_side():
+    line = line_of(np.zeros((800, 2)))
+    line = replace(line, settings=replace(line.settings, prediction=PredictionSettings(pose_reach_s=0.25)))
+    poses = np.array([0, 25, 50, 80, 200, 260])
+    samples = GridSamples(poses, np.zeros(6), line.t_s[poses], np.zeros(6, dtype=int))
+    smooth, alone = smoothed_poses(
+        with_poses(line, np.repeat([1.0, 3.0, 7.0, 9.0, 5.0, 4.0], 3).reshape(6, 3), samples), vector_of()
+    )
+    assert smooth[[0, 25, 195, 205, 255]][:, 0] == pytest.approx([2.0, 11.0 / 3.0, 5.0, 5.0, 4.0])
+    assert alone[[0, 10, 25, 195, 205, 255]][:, 0] == pytest.approx([1.0, 1.0, 3.0, 5.0, 5.0, 4.0])
 
 
 def test_where_no_pose_is_near_there_is_none():
@@ -113,6 +126,13 @@ def test_an_error_is_what_was_measured_less_what_was_predicted_seen_from_the_sta
     assert error == pytest.approx(np.array([[0.02, 0.1, 0.1]]))
     turned = starts_at([200], [[1.0, 2.0, 0.5 * np.pi]], [[0.9, 2.2, 0.5 * np.pi - 0.1]])
     assert prediction_error(channel, turned, vector_of(), channel.track(vector_of()), 1.0)[0, 2] == pytest.approx(-0.1)
+
+
+def test_ground_that_slopes_is_predicted_where_the_robot_looks():
+    channel, downhill = steady(3.0, 3.0), vector_of(slope__drift_y_m_s=0.01)
+    starts = starts_at([200], [[1.0, 2.0, 0.5 * np.pi]], [[1.0, 2.2, 0.5 * np.pi]])
+    error = prediction_error(channel, starts, downhill, channel.track(downhill), 1.0)
+    assert error == pytest.approx(np.array([[0.01, 0.0, 0.0]]), abs=1e-9)
 
 
 def wheels_on(line):
@@ -149,8 +169,9 @@ def test_terms_of_the_wheels_and_of_the_body_drive_the_chain():
 def test_encoders_that_count_wrong_matter_to_the_body_only_where_they_are_read():
     channel = steady(3.0, 3.0)
     body = vector_of(encoder_scale__left=0.25, encoder_scale__right=0.25)
-    read = chain_track(channel, None, Chain(body, None))[0]
-    np.testing.assert_allclose(read[:, 0], 0.18 / 1.25 * channel.drive.t_s, atol=1e-9)
+    for wheels, commanded in ((None, None), (None, WHEEL.neutral), (wheels_on(channel.drive), None)):
+        read = chain_track(channel, wheels, Chain(body, commanded))[0]
+        np.testing.assert_allclose(read[:, 0], 0.18 / 1.25 * channel.drive.t_s, atol=1e-9)
     commanded = chain_track(channel, wheels_on(channel.drive), Chain(body, WHEEL.neutral))[0]
     np.testing.assert_allclose(commanded[:, 0], 0.18 * channel.drive.t_s, atol=1e-9)
     turned = np.outer(channel.drive.t_s, (1.0, 1.0)), np.ones((channel.drive.t_s.size, 2))
@@ -329,7 +350,27 @@ def test_what_the_other_fold_says_little_of_is_used_if_it_fixes_the_value_itself
 def test_a_regime_is_told_by_mean_speed_and_mean_yaw_rate(v_m_s, omega_rad_s, told):
     both, apart = v_m_s / (0.5 * RADIUS_M), omega_rad_s * AXLE_M / RADIUS_M
     channel = steady(0.5 * (both - apart), 0.5 * (both + apart))
-    assert regimes_driven(channel, np.array([100, 300]), 200) == [told] * 2
+    assert regimes_driven(channel, np.array([0, 100, 300]), 200) == [told] * 3
+    assert regimes_driven(channel, np.array([0, 100]), 20) == [told] * 2
+
+
+@pytest.mark.parametrize(
+    ("bound", "v_m_s", "omega_rad_s"),
+    [
+        ("standing_m_s", 0.0, 0.0),
+        ("standing_rad_s", 0.0, 0.0),
+        ("standing_m_s", 0.0, 0.2),
+        ("spinning_rad_s", 0.03, 0.0),
+        ("speeding_m_s2", 0.3, 0.0),
+        ("turning_rad_s", 0.3, 0.0),
+    ],
+)
+def test_at_a_bound_of_a_regime_the_robot_is_not_in_it(bound, v_m_s, omega_rad_s):
+    both, apart = v_m_s / (0.5 * RADIUS_M), omega_rad_s * AXLE_M / RADIUS_M
+    channel = steady(0.5 * (both - apart), 0.5 * (both + apart))
+    settings = replace(DEFAULT_SETTINGS, prediction=replace(DEFAULT_SETTINGS.prediction, **{bound: 0.0}))
+    channel = replace(channel, drive=replace(channel.drive, settings=settings))
+    assert regimes_driven(channel, np.array([100]), 200) == ["straight ahead"]
 
 
 @pytest.mark.parametrize(("faster_m_s", "told"), [(0.245, "straight ahead"), (0.255, "speeding up and braking")])
