@@ -33,7 +33,7 @@ def lacking_one(analysis: GapAnalysis) -> Iterator[GapAnalysis]:
             continue
         for name, _ in each_name(found):
             yield lacking(analysis, which, name)
-        if found.unnamed and found.plain is not None:
+        if found.unnamed:
             yield lacking(analysis, which, None)
 
 

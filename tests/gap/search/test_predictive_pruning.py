@@ -39,7 +39,8 @@ class Whole:
     def errors(self, stage, ahead_s=None):
         names = frozenset((*self.wheels.names, *self.body.names))
         size = 0.1 if stage == "refitted" else self.amended_m.get(names, 0.1)
-        return PredictionErrors(size, (size, size), size, (size, size), size, {})
+        position_m, yaw_rad = size if isinstance(size, tuple) else (size, size)
+        return PredictionErrors(position_m, (0.0, 1.0), yaw_rad, (0.0, 1.0), 0.0, {})
 
 
 @pytest.fixture(autouse=True)
@@ -72,6 +73,12 @@ def test_a_name_without_which_predictions_are_clearly_better_goes():
     # Another that would do as well needs more reason than that.
     swapped = {"motor_lag": 0.03, "command_delay": 0.01}
     assert told(swapped, ("motor_lag",), motor_lag=("command_delay",)) == (("motor_lag",), ())
+
+
+@pytest.mark.parametrize(("yaw_rad", "goes"), [(0.030, False), (0.0287, False), (0.0284, True)])
+def test_a_name_goes_only_where_position_and_heading_are_both_better_without(yaw_rad, goes):
+    sizes = {"motor_lag wheel_gain": 0.03, "motor_lag": (0.015, yaw_rad), "wheel_gain": 0.08}
+    assert told(sizes, ("motor_lag", "wheel_gain"))[1] == (("wheel_gain",) if goes else ())
 
 
 def test_another_that_would_do_in_its_place_takes_it_if_it_predicts_better_than_none():
