@@ -358,11 +358,13 @@ def sweep(files: Sequence[Path], given: argparse.Namespace, folder: Path) -> Cou
         source, here, name = file.read_text("utf-8"), str(file.relative_to(ROOT)), module_name(file)
         trial = Trial(name, file, touched_by(name), folder)
         ran = {test: {line for of, line in lines if of == str(file)} for test, (_, lines) in tests}
-        if trial.killed(source, [test for test, lines in ran.items() if lines]):
+        every = [test for test, lines in ran.items() if lines]
+        if trial.killed(source, every):
             raise RuntimeError(f"{here}: fails its tests unchanged: every mutant would pass for noticed")
         for placed in mutants(source)[given.first :: given.every]:
             mutant = placed.mutant
-            chosen = [test for test, lines in ran.items() if lines & placed.lines or (placed.on_import and lines)]
+            # What no test runs may run when the module is imported, in a function that is called there.
+            chosen = every if placed.on_import else [test for test in every if ran[test] & placed.lines] or every
             began = time.monotonic()
             if mutant.key in known.get(here, {}):
                 outcome = "equivalent"
