@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from disco_hw.gap.data import timing
 from disco_hw.gap.data.timing import command_delay_s, pose_clock, pose_delay_s
@@ -145,6 +146,10 @@ def test_wheels_that_do_not_turn_leave_all_that_is_measured():
     assert timing._misfit(nothing, nothing, measured) == pytest.approx(by_decomposition(nothing, nothing, measured))
 
 
+# As many pairs as tell a delay to 20 ms.
+FEW_PAIRS = GridSettings(most_command_pairs=700)
+
+
 def commanded(late_s, lag_s=0.0, seed=0, unlike=0.0):
     """Commands that change at random and wheels that answer `late_s` after their stamps, through a lag."""
     rng = np.random.default_rng(seed)
@@ -153,12 +158,8 @@ def commanded(late_s, lag_s=0.0, seed=0, unlike=0.0):
     steps = np.unique(rng.uniform(2.0, 58.0, 40).round(2))
     level = np.concatenate([np.zeros((1, 2)), rng.uniform(-4.0, 6.0, (steps.size, 2))])
     asked = level[np.searchsorted(steps, t_s, side="right")]
-    turning = np.empty_like(asked)
     keep = np.exp(-step_s / lag_s) if lag_s else 0.0
-    now = asked[0]
-    for k, each in enumerate(asked):
-        now = keep * now + (1.0 - keep) * each
-        turning[k] = now
+    turning = lfilter([1.0 - keep], [1.0, -keep], asked, axis=0)
     turning = turning * [1.0, 1.0 + unlike] + rng.normal(0.0, 0.2, asked.shape)
     angle = np.cumsum(turning, axis=0) * step_s
     every, one = slice(0, None, 20), np.zeros(t_s[::20].size, np.int64)
@@ -166,47 +167,25 @@ def commanded(late_s, lag_s=0.0, seed=0, unlike=0.0):
     return wheels, Commands(t_s[every] - late_s, *asked[every].T, one)
 
 
-@pytest.mark.parametrize(
-    ("late_s", "lag_s"), [(-0.7, 0.0), (-0.2, 0.12), (0.0, 0.0), (0.0, 0.25), (0.15, 0.06), (0.6, 0.2)]
-)
+@pytest.mark.parametrize(("late_s", "lag_s"), [(-0.7, 0.0), (-0.2, 0.12), (0.0, 0.25), (0.15, 0.06)])
 def test_a_delay_of_commands_of_either_sign_is_parted_from_a_lag(late_s, lag_s):
-    assert command_delay_s(*commanded(late_s, lag_s), GridSettings()) == pytest.approx(late_s, abs=0.02)
+    assert command_delay_s(*commanded(late_s, lag_s), FEW_PAIRS) == pytest.approx(late_s, abs=0.02)
 
 
 def test_unequal_wheels_and_commands_that_are_not_known_do_not_move_it():
     wheels, commands = commanded(0.3, 0.1, unlike=0.1)
     unknown = (commands.t_s > 20.0) & (commands.t_s < 24.0)
     left, right = (np.where(unknown, np.nan, each) for each in (commands.left_rad_s, commands.right_rad_s))
-    assert command_delay_s(wheels, replace(commands, left_rad_s=left, right_rad_s=right), GridSettings()) == (
+    assert command_delay_s(wheels, replace(commands, left_rad_s=left, right_rad_s=right), FEW_PAIRS) == (
         pytest.approx(0.3, abs=0.02)
     )
-
-
-def test_commands_of_another_segment_are_none():
-    wheels, commands = commanded(0.3)
-    assert command_delay_s(wheels, replace(commands, segment=commands.segment + 1), GridSettings()) == 0.0
-
-
-@pytest.mark.parametrize("kept", [0, 1, 40])
-def test_too_few_commands_or_samples_have_no_delay(kept):
-    wheels, commands = commanded(0.3)
-    few = Commands(
-        *(each[:kept] for each in (commands.t_s, commands.left_rad_s, commands.right_rad_s)), commands.segment[:kept]
-    )
-    assert command_delay_s(wheels, few, GridSettings()) == 0.0
-    part = slice(0, kept)
-    fewer = Wheels(
-        wheels.t_s[part], wheels.left_angle_rad[part], wheels.right_angle_rad[part], wheels.left_speed_rad_s[part],
-        wheels.right_speed_rad_s[part], wheels.segment[part], True, True,
-    )  # fmt: skip
-    assert command_delay_s(fewer, commands, GridSettings()) == 0.0
 
 
 def test_a_steady_command_has_no_delay_that_stands_out():
     t_s = np.arange(0.0, 60.0, 0.02)
     steady, one = np.full(t_s.size, 3.0), np.zeros(t_s.size, np.int64)
     wheels = Wheels(t_s, 3.0 * t_s, 3.0 * t_s, steady, steady, one, True, True)
-    assert command_delay_s(wheels, Commands(t_s, steady, steady, one), GridSettings()) == 0.0
+    assert command_delay_s(wheels, Commands(t_s, steady, steady, one), FEW_PAIRS) == 0.0
 
 
 def test_speeds_that_come_less_often_than_they_are_compared_show_it_too():
@@ -216,4 +195,4 @@ def test_speeds_that_come_less_often_than_they_are_compared_show_it_too():
         wheels.t_s[thin], wheels.left_angle_rad[thin], wheels.right_angle_rad[thin], wheels.left_speed_rad_s[thin],
         wheels.right_speed_rad_s[thin], wheels.segment[thin], False, True,
     )  # fmt: skip
-    assert command_delay_s(held, commands, GridSettings()) == pytest.approx(0.3, abs=0.04)
+    assert command_delay_s(held, commands, FEW_PAIRS) == pytest.approx(0.3, abs=0.04)

@@ -12,16 +12,20 @@ from disco_hw.gap.search.channel_search import indices
 from disco_hw.gap.search.cross_validation import (
     Chain,
     PredictionErrors,
+    _sigmas,
     beats,
+    beats_throughout,
     clearly_worse,
     errors_of,
     floor_errors,
     fold_vectors,
     judged_horizon_s,
+    outdoes,
     regimes_driven,
     smoothed_poses,
     stretches_telling,
     surely_beats,
+    within_one_standard_error,
     worse_by,
 )
 from disco_hw.gap.search.end_to_end import Ahead
@@ -181,6 +185,21 @@ def test_at_its_bounds_a_model_still_beats():
     assert not surely_beats(before, in_stretches([0.26] * 6, [0.25] * 6), settings)
 
 
+def test_what_beats_throughout_beats_in_all_too():
+    before, settings = in_stretches([1.0] * 6, [1.0] * 6), DEFAULT_SETTINGS.prediction
+    better, worse = in_stretches([0.9] * 6, [0.9] * 6), in_stretches([1.2] * 6, [1.2] * 6)
+    for of in (before, replace(before, squares=None)):
+        assert beats_throughout(of, better, settings)
+        assert not beats_throughout(of, worse, settings)
+
+
+def test_a_model_that_is_worth_another_errs_by_no_more_than_its_share():
+    before, settings = in_stretches([1.0] * 6, [1.0] * 6), replace(DEFAULT_SETTINGS.prediction, worth=0.5)
+    assert outdoes(before, in_stretches([0.25] * 6, [0.25] * 6), settings)
+    assert outdoes(before, in_stretches([0.0625] * 6, [1.0] * 6), settings)
+    assert not outdoes(before, in_stretches([0.25] * 6, [0.26] * 6), settings)
+
+
 def test_two_models_are_level_within_a_hundredth_of_their_mean_errors():
     before, settings = in_stretches([1.0] * 6, [1.0] * 6), DEFAULT_SETTINGS.prediction
     for times, level in ((1.0095, True), (1.0115, False)):
@@ -212,6 +231,43 @@ def test_growth_is_clear_by_how_stretches_scatter_about_their_own_mean(sigmas, w
     for count in (1, 2):
         before, after = in_stretches([10.0] * count, [1.0] * count), in_stretches([11.3, 11.4][:count], [1.0] * count)
         assert clearly_worse(before, after, DEFAULT_SETTINGS.prediction) is (count == 2)
+
+
+def test_growth_that_is_just_as_sure_as_it_must_be_is_not_clear_and_of_one_stretch_nothing_is_sure():
+    before, after = in_stretches([10.0] * 4, [1.0] * 4), in_stretches([11.5, 11.0, 11.5, 11.0], [1.0] * 4)
+    sure = _sigmas(before, after, 0)
+    assert sure == pytest.approx(5.0 / (2.0 * np.sqrt(0.25 / 3.0)))
+    assert not clearly_worse(before, after, replace(DEFAULT_SETTINGS.prediction, worse_sigmas=sure))
+    assert clearly_worse(before, after, replace(DEFAULT_SETTINGS.prediction, worse_sigmas=0.99 * sure))
+    assert _sigmas(in_stretches([10.0], [1.0]), in_stretches([11.0], [1.0]), 0) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("position", "yaw", "within"),
+    [
+        # Shares by which squares grow, of which the standard error of two is their difference.
+        ((0.05, -0.0025), (0.0, 0.0), True),
+        ((0.05, 0.0025), (0.0, 0.0), False),
+        ((0.05, 0.0), (0.0, -0.04), True),
+        ((0.0, 0.05), (-0.04, 0.0), True),
+        # Squares of position are far larger, and count no more.
+        ((0.001, -0.0009), (0.0, 0.04), False),
+    ],
+)
+def test_as_good_as_the_best_is_what_exceeds_it_by_no_more_than_its_growth_scatters(position, yaw, within):
+    best = in_stretches([50.0, 50.0], [0.005, 0.005])
+    other = in_stretches(50.0 + 100.0 * np.array(position), 0.005 + 0.01 * np.array(yaw))
+    assert within_one_standard_error(best, other) == within
+
+
+@pytest.mark.parametrize(
+    ("position_m", "yaw_rad", "within"), [(2.0, 1.0, True), (2.0, 1.01, False), (1.0, 2.1, False), (0.5, 3.9, True)]
+)
+def test_without_errors_by_stretch_the_best_is_what_errs_least_in_position_times_heading(position_m, yaw_rad, within):
+    best, other = in_stretches([1.0] * 4, [4.0] * 4), in_stretches([position_m**2] * 4, [yaw_rad**2] * 4)
+    bare = [replace(one, squares=None) for one in (best, other)]
+    for pair in ((bare[0], bare[1]), (best, bare[1]), (bare[0], other)):
+        assert within_one_standard_error(*pair) == within
 
 
 def test_of_two_stretches_each_has_to_be_better():

@@ -1,12 +1,13 @@
 """The last fit of the chain on errors that are linear in what is freed: against a plain minimiser of the same cost."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from disco_hw.gap.data import BODY
+from disco_hw.gap.data import BASE_COUNT, BODY, WHEEL
 from disco_hw.gap.search import end_to_end
 from disco_hw.gap.search.cross_validation import Chain
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part, _usual
@@ -45,10 +46,10 @@ def linear(monkeypatch):
     ]
 
 
-def minimised(errors, chosen, information, begin):
+def minimised(errors, chosen, information, begin, horizons_s=HORIZONS_S):
     """The same by its definition: two rounds, each in units of what is usual where it begins."""
     values = begin.copy()
-    shares = [np.sqrt(0.2 / ahead_s) for ahead_s in HORIZONS_S]
+    shares = [min(np.sqrt(0.2 / ahead_s), 1.0) for ahead_s in horizons_s]
     huber = 3.0 * max(shares)
     for _ in range(2):
         units = []
@@ -79,6 +80,57 @@ def test_what_predicts_best_is_found_by_errors_in_their_usual_size_and_what_was_
     assert np.abs(values - GEOMETRY).max() > 0.002
     assert found.cost == pytest.approx(cost, rel=1e-3)
     assert (found.vectors[0][3:] == BODY.neutral[3:]).all()
+
+
+def test_predictions_that_do_not_overlap_count_whole(linear):
+    ahead, errors = linear
+    horizons_s = (0.1, 1.0)
+    ahead = replace(ahead, starts=tuple(zip(horizons_s, (starts for _, starts in ahead.starts), strict=True)))
+    information = np.eye(3)
+    of = Freed((Part(BODY, start(), (0, 1, 2), information),), lambda vectors: Chain(vectors[0], None))
+    values, cost = minimised(errors, np.full(MANY, True), information, np.array(GEOMETRY), horizons_s)
+    found = ahead.fit(of)
+    assert found.vectors[0][:3] == pytest.approx(values, abs=2e-5)
+    assert found.cost == pytest.approx(cost, rel=1e-3)
+
+
+def test_wheels_are_run_anew_for_what_moves_them_and_not_for_effects_of_the_body(monkeypatch):
+    asked, turned_once = [], object()
+
+    def errors(self, chain, turned=None):
+        values = np.array([chain.body[2], chain.body[BASE_COUNT], chain.wheels[5]])
+        asked.append((values, turned))
+        return [np.full((4, 3), 0.1) + values.sum()]
+
+    monkeypatch.setattr(Ahead, "errors", errors)
+    monkeypatch.setattr(end_to_end, "chain_wheels", lambda *_: turned_once)
+    prediction = replace(DEFAULT_SETTINGS.prediction, fit_rounds=1, fit_steps=1)
+    body = SimpleNamespace(settings=replace(DEFAULT_SETTINGS, prediction=prediction))
+    parts = (
+        Part(BODY, start(), (2, BASE_COUNT), np.eye(2)),
+        Part(WHEEL, WHEEL.neutral, (5,), np.eye(1)),
+    )
+    Ahead(body, None, ((1.0, SimpleNamespace(block=np.zeros(4, dtype=int))),)).fit(
+        Freed(parts, lambda vectors: Chain(*vectors))
+    )
+    # Derivatives: at the start with the wheels as they turn there, then by one entry after the other.
+    base = next(place for place, (_, turned) in enumerate(asked) if turned is turned_once)
+    moved = asked[base + 1 : base + 4]
+    np.testing.assert_array_equal(np.array([values for values, _ in moved]) != asked[base][0], np.eye(3, dtype=bool))
+    assert [turned for _, turned in moved] == [None, turned_once, None]
+
+
+def test_what_nothing_is_known_of_hardly_stays_and_a_fit_begins_inside_its_bounds():
+    ahead = Ahead(SimpleNamespace(settings=DEFAULT_SETTINGS), None, ())
+    vector, step = start(), BODY.step[:3]
+    vector[0], vector[1] = BODY.low[0], BODY.high[1]
+    of = Freed((Part(BODY, vector, (0, 1, 2), np.zeros((3, 3))),), lambda vectors: Chain(vectors[0], None))
+    found = ahead.fit(of)
+    # To ten thousand of the steps by which derivatives are taken.
+    assert np.sqrt(np.diag(found.covariance)) == pytest.approx(1e4 * step, rel=1e-6)
+    inside = np.array([found.vectors[0][0] - BODY.low[0], BODY.high[1] - found.vectors[0][1]])
+    assert (inside > 0.0).all()
+    assert (inside < 1e-3 * step[:2]).all()
 
 
 def test_without_predictions_everything_stays_as_surely_as_it_was_known():

@@ -113,6 +113,69 @@ def test_wheels_without_a_lag_answer_at_once_and_without_a_command_not_at_all():
     assert learnt.noise != channel.noise
 
 
+class Read:
+    """Wheels that were read with errors, under a noise whose gains are `gains` times what is left."""
+
+    drive = SimpleNamespace(
+        first=np.arange(40) % 20 == 0,
+        encoder=SimpleNamespace(node=np.arange(1, 40, 2), fraction=np.zeros(20)),
+    )
+    settings = DEFAULT_SETTINGS
+    weight = np.linspace(0.5, 2.0, 40).reshape(20, 2)
+
+    def __init__(self, name, gains, raw=None):
+        self.name, self.gains, self.raw = name, gains, raw
+        self.noise = SimpleNamespace(reading_rad=0.25, vector=lambda: name)
+
+    def raw_residual(self, vector):
+        return self.raw
+
+    def with_noise(self, noise):
+        assert noise == WheelNoise(reading_rad=0.25)
+        return Read("usual", self.gains**2)
+
+
+@pytest.mark.parametrize(
+    ("misfits", "best"), [((4.0, 3.0, 5.0, 6.0), 1), ((4.0, 5.0, 3.0, 3.5), 2), ((4.0, 5.0, 3.0, 3.0), 3)]
+)
+def test_wheels_are_fitted_anew_with_each_noise_that_is_learnt_and_the_likeliest_is_kept(monkeypatch, misfits, best):
+    rng = np.random.default_rng(5)
+    shapes, raw = rng.standard_normal((3, 40, 2)), rng.standard_normal((20, 2))
+    gains = rng.uniform(0.5, 2.0, (6, 20, 2))
+    columns = np.array(
+        [
+            -GRID_STEP_S * np.concatenate([np.cumsum(s[:20], axis=0) - s[0], np.cumsum(s[20:], axis=0) - s[20]])
+            for s in shapes
+        ]
+    )[:, 1::2]
+    asked, taken = [], iter(misfits)
+
+    def learn(channel, left):
+        asked.append((channel.name, left))
+        return Read(len(asked), gains[len(asked)])
+
+    channel = Read("own", gains[0], raw)
+    monkeypatch.setattr(richest_model, "_wheel_shapes", lambda *_: iter(shapes))
+    monkeypatch.setattr(richest_model, "learn_wheel_noise", learn)
+    monkeypatch.setattr(richest_model, "whiten_wheels", lambda residual, of: of * residual)
+    monkeypatch.setattr(
+        richest_model, "wheel_misfit", lambda of, left: lambda noise: next(taken) if of is channel else None
+    )
+    learnt, left, many = learn_saturated_wheels(channel, None)
+    # From its own noise twice, then from the usual one.
+    assert [name for name, _ in asked] == ["own", 1, "usual", 3]
+    for (_, found), of in zip(asked, (gains[0], gains[1], gains[0] ** 2, gains[3]), strict=True):
+        slope = (columns * (of * Read.weight)).reshape(3, -1).T
+        size = np.linalg.norm(slope, axis=0)
+        target = np.append(-(raw * of * Read.weight).ravel(), np.zeros(3))
+        stacked = np.vstack([slope, np.diag(DEFAULT_SETTINGS.fit.ridge**0.5 * size)])
+        expected = raw + np.tensordot(np.linalg.lstsq(stacked, target, rcond=None)[0], columns, axes=1)
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert learnt.name == best + 1
+    assert left is asked[best][1]
+    assert many == 3 + WHEEL.neutral.size
+
+
 def test_a_body_is_pushed_as_it_is_fitted_best_and_where_that_is_too_far_half_of_it():
     channel, line = body_channel()
     p = channel.neutral

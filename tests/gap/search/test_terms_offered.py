@@ -10,6 +10,7 @@ from disco_hw.gap.data import BODY
 from disco_hw.gap.search.unnamed_terms import (
     Term,
     WithTerms,
+    _discs,
     body_terms,
     motion,
     places,
@@ -46,16 +47,18 @@ def test_terms_of_a_command_are_made_of_what_is_in_force_and_of_where_the_wheels
     np.testing.assert_allclose(terms["command += 1 t/100 u"].perturbation, 0.01 * T_S[:, None] * u, atol=1e-12)
     assert terms["command += 1 u |u|"].model_name == "command += k u |u|"
     later = slice(60, -5)
+    # A sign fades in with the command.
+    sign = u * np.abs(u) / (u * u + 0.05**2)
     expected = {
-        "du/dt": (1.0, -2.0), "|du/dt| sign(u)": (1.0, -2.0), "u |du/dt|": u * (1.0, 2.0),
+        "du/dt": (1.0, -2.0), "|du/dt| sign(u)": sign * (1.0, 2.0), "u |du/dt|": u * (1.0, 2.0),
         "u sin(wheel angle)": u * np.sin(line.angle_rad), "u cos(wheel angle)": u * np.cos(line.angle_rad),
     }  # fmt: skip
     for form, value in expected.items():
         term = terms[f"command += 1 {form}"]
-        # A sign fades in with the command.
-        tolerance = 0.3 if "sign" in form else 1e-9
-        np.testing.assert_allclose(term.perturbation[later], np.broadcast_to(value, u.shape)[later], rtol=tolerance)
+        np.testing.assert_allclose(term.perturbation[later], np.broadcast_to(value, u.shape)[later], rtol=1e-9)
         assert term.model_name is None
+    # No command is made with a geometry.
+    assert {term.geometry for term in terms.values()} == {(1.0, 1.0)}
 
 
 def swaying(seconds=6.0):
@@ -111,6 +114,21 @@ def test_a_robot_moves_where_a_wheel_turns():
     assert moving.model_name is None
 
 
+def test_ground_that_varies_slowly_is_one_form_with_a_cosine_for_each_wave():
+    line, t_s = swaying()
+    line, p = replace(line, t_s=t_s + 7.0), np.array(GEOMETRY)
+    v, w, _ = motion(line, p)
+    terms = {term.form: term for term in body_terms(SimpleNamespace(drive=line), p)}
+    for axis, form, speed in ((0, "v_x += {:.2g} v", v), (2, "omega += {:.2g} omega", w)):
+        term = terms[f"{form} times what varies slowly with time"]
+        # From half a period over the whole log on.
+        waves = [speed * np.cos(np.pi * k * t_s / t_s[-1]) for k in range(1, 9)]
+        np.testing.assert_allclose([feature[:, axis] for feature in term.features], waves, atol=1e-9)
+        assert not any(np.delete(feature, axis, axis=1).any() for feature in term.features)
+        assert term.model_name is None
+        assert term.usual == 0.1
+
+
 @pytest.mark.parametrize(("wave", "turn"), [("sin", np.sin), ("cos", np.cos)])
 def test_a_wheel_that_is_not_round_moves_its_rim_and_turns_the_robot_over_the_axle(wave, turn):
     line, _ = swaying()
@@ -143,14 +161,19 @@ def test_terms_of_a_given_model_are_added_up_by_channel():
     assert with_known_terms(line, settings[2:3], p, 0.5).known_command is None
 
 
-def lawn(seconds=100.0, width_m=4.0, height_m=2.0):
+def lawn(seconds=100.0, width_m=4.0, height_m=2.0, corner_m=(0.0, 0.0), **settings):
     """A body channel's drive all over a floor, along rows, turning evenly."""
     count = round(seconds / GRID_STEP_S)
     line = line_of(np.repeat([[1.0, 3.0]], count, axis=0))
     share = line.t_s / seconds
-    x, y = width_m * np.abs(np.mod(10.0 * share, 2.0) - 1.0), height_m * share
+    x, y = corner_m[0] + width_m * np.abs(np.mod(10.0 * share, 2.0) - 1.0), corner_m[1] + height_m * share
     measured = np.column_stack([x, y, np.zeros(count)])[line.pose.node]
-    return SimpleNamespace(drive=line, settings=DEFAULT_SETTINGS, samples=line.pose, measured=measured), x, y
+    chosen = replace(DEFAULT_SETTINGS, terms=TermSettings(**settings))
+    return SimpleNamespace(drive=line, settings=chosen, samples=line.pose, measured=measured), x, y
+
+
+def sought_on(channel):
+    return next(places(channel, np.array(GEOMETRY)), None) is not None
 
 
 def test_patches_cover_the_floor_where_a_good_part_of_the_turning_was_done_inside_and_outside():
@@ -178,9 +201,47 @@ def test_patches_cover_the_floor_where_a_good_part_of_the_turning_was_done_insid
     [(100.0, 10.0, 6.0, True), (100.0, 10.0, 6.9, False), (390.0, 4.0, 2.0, True), (410.0, 4.0, 2.0, False)],
 )
 def test_on_large_floors_and_in_long_logs_no_patch_is_sought(seconds, width_m, height_m, sought):
-    # 96 % of 10 m and of 6.5 m are 60 square metres.
-    channel, _, _ = lawn(seconds, width_m, height_m)
-    assert (next(places(channel, np.array(GEOMETRY)), None) is not None) is sought
+    # 96 % of 10 m and of 6.5 m are 60 square metres, wherever they lie.
+    for corner_m in ((0.0, 0.0), (50.0, -30.0)):
+        channel, _, _ = lawn(seconds, width_m, height_m, corner_m)
+        assert sought_on(channel) is sought
+
+
+def test_a_floor_or_a_log_as_large_as_may_be_is_still_looked_at():
+    assert sought_on(lawn(longest_s=100.0)[0])
+    channel, _, _ = lawn()
+    x, y = (np.interp(channel.drive.t_s, channel.samples.t_s, channel.measured[:, axis]) for axis in (0, 1))
+    area_m2 = np.prod([np.diff(np.quantile(of, (0.02, 0.98)))[0] for of in (x, y)])
+    assert sought_on(lawn(largest_floor_m2=area_m2)[0])
+
+
+@pytest.mark.parametrize(
+    ("least", "most", "told"), [(0.2, 0.8, [0.0, 3.0]), (0.25, 0.8, [0.0]), (0.2, 0.75, [3.0]), (0.1, 0.2, [])]
+)
+def test_a_patch_holds_more_than_the_least_and_less_than_the_most_of_all_turning(least, most, told):
+    # Three quarters of it in one spot and the rest in another, at 1 rad/s.
+    line = line_of(np.repeat([[1.0, 3.0]], 400, axis=0))
+    x = np.repeat([0.0, 0.0, 0.0, 3.0], 100)
+    settings = replace(DEFAULT_SETTINGS, terms=TermSettings(least_inside=least, most_inside=most))
+    measured = np.column_stack([x, 0.0 * x, 0.0 * x])
+    channel = SimpleNamespace(drive=line, samples=SimpleNamespace(t_s=line.t_s), measured=measured, settings=settings)
+    discs = _discs(channel, np.array([0.5, 1.0]), ((spot_m, 0.0, 1.0) for spot_m in (0.0, 3.0)))
+    assert [term.disc[0] for term in discs] == told
+
+
+def test_a_patch_ends_at_its_radius():
+    line = line_of(np.repeat([[1.0, 3.0]], 400, axis=0))
+    x, y = np.repeat([0.0, 3.0, 3.1, 9.0], 100), np.repeat([0.0, -4.0, -4.0, 0.0], 100)
+    channel = SimpleNamespace(
+        drive=line,
+        samples=SimpleNamespace(t_s=line.t_s),
+        measured=np.column_stack([x, y, y]),
+        settings=DEFAULT_SETTINGS,
+    )
+    for radius_m, inside in ((5.0, 100), (5.01, 200), (5.1, 300)):
+        (term,) = _discs(channel, np.array(GEOMETRY), [(0.0, 0.0, radius_m)])
+        assert np.count_nonzero(term.perturbation[:, 2]) == inside
+        np.testing.assert_allclose(term.perturbation[:inside, 2], 0.15 * 2.0)
 
 
 def test_turning_counts_and_neither_time_nor_too_little_nor_nearly_all_of_it():

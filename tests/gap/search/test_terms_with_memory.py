@@ -17,7 +17,7 @@ from disco_hw.gap.search.channel_search import (
     with_unnamed,
 )
 from disco_hw.gap.search.selection import EffectEvidence, Selector
-from disco_hw.gap.search.unnamed_terms import Term, WithTerms, body_terms, motion
+from disco_hw.gap.search.unnamed_terms import Term, WithTerms, motion
 from disco_hw.model import Model
 from tests.gap.synthetic import body_channel
 from tools import strange_robot
@@ -73,20 +73,6 @@ def test_features_that_belong_together_have_a_coefficient_each_and_pay_for_each(
     _, added = channel.split(np.concatenate([found.channel.neutral, [0.2, -0.1, 0.0]]))
     np.testing.assert_allclose(added[:, 2], rate * (0.2 * half - 0.1 * (1.0 - half)))
     assert both.written(np.array([0.3, -0.4])) == f"{0.5 / 2**0.5:.3g}"
-
-
-def test_ground_that_varies_slowly_is_one_form_with_a_cosine_for_each_wave():
-    channel, _ = body_channel()
-    (turning,) = (
-        term for term in body_terms(channel, channel.neutral) if term.form.startswith("omega += {:.2g} omega")
-    )
-    assert turning.model_name is None
-    assert len(turning.features) == channel.settings.terms.waves
-    rate = motion(channel.drive, channel.neutral)[1]
-    once = turning.features[1][:, 2]
-    # The second wave goes once round in the log.
-    np.testing.assert_allclose(once, rate * np.cos(2.0 * np.pi * channel.drive.t_s / channel.drive.t_s[-1]), atol=1e-9)
-    assert not turning.features[1][:, :2].any()
 
 
 def carrying(name):
