@@ -4,7 +4,6 @@ import json
 import re
 from functools import cache
 
-import numpy as np
 import pytest
 
 from disco_hw import gap
@@ -40,7 +39,8 @@ def test_nothing_is_missing_in_a_log_with_nothing_hidden():
     ("name", "size", "parameter"),
     [
         ("motor_lag", 0.12, "tau_s"),
-        ("turn_slip", 0.09, "k_s"),
+        # Quick tests have slip found in `search/test_searches.py`, and predicted in `search/test_stages.py`.
+        pytest.param("turn_slip", 0.09, "k_s", marks=pytest.mark.long),
         pytest.param("yaw_acceleration_limit", 2.0, "limit_rad_s2", marks=pytest.mark.long),
     ],
 )
@@ -145,15 +145,6 @@ def test_a_log_with_nothing_to_judge_is_refused():
     poses = type(whole.poses)(*(getattr(whole.poses, name)[few] for name in whole.poses.__slots__))
     with pytest.raises(LogError, match="too little"):
         find_gap(DriveLog(whole.sources, whole.commands, cut, poses, whole.gyro), MODEL)
-
-
-def test_the_amended_belief_is_a_joint_gaussian():
-    model = report_of(("turn_slip", 0.09)).model
-    covariance = model.belief.covariance()
-    assert np.linalg.eigvalsh(covariance).min() > 0.0
-    names = model.belief.names
-    axial, slip = names.index("axial_distance_m"), names.index("turn_slip.k_s")
-    assert abs(covariance[axial, slip]) > 0.0
 
 
 @pytest.fixture

@@ -106,8 +106,10 @@ def test_wheels_are_run_anew_for_what_moves_them_and_not_for_effects_of_the_body
     monkeypatch.setattr(end_to_end, "chain_wheels", lambda *_: turned_once)
     prediction = replace(DEFAULT_SETTINGS.prediction, fit_rounds=1, fit_steps=1)
     body = SimpleNamespace(settings=replace(DEFAULT_SETTINGS, prediction=prediction))
+    vector = start()
+    vector[2] = BODY.high[2]
     parts = (
-        Part(BODY, start(), (2, BASE_COUNT), np.eye(2)),
+        Part(BODY, vector, (2, BASE_COUNT), np.eye(2)),
         Part(WHEEL, WHEEL.neutral, (5,), np.eye(1)),
     )
     Ahead(body, None, ((1.0, SimpleNamespace(block=np.zeros(4, dtype=int))),)).fit(
@@ -118,13 +120,19 @@ def test_wheels_are_run_anew_for_what_moves_them_and_not_for_effects_of_the_body
     moved = asked[base + 1 : base + 4]
     np.testing.assert_array_equal(np.array([values for values, _ in moved]) != asked[base][0], np.eye(3, dtype=bool))
     assert [turned for _, turned in moved] == [None, turned_once, None]
+    # By a step up, or down where there is no room.
+    steps = [BODY.step[2], BODY.step[BASE_COUNT], WHEEL.step[5]]
+    changes = [values[k] - asked[base][0][k] for k, (values, _) in enumerate(moved)]
+    assert changes == pytest.approx(np.array([-1.0, 1.0, 1.0]) * steps, rel=1e-6)
 
 
 def test_what_nothing_is_known_of_hardly_stays_and_a_fit_begins_inside_its_bounds():
     ahead = Ahead(SimpleNamespace(settings=DEFAULT_SETTINGS), None, ())
-    vector, step = start(), BODY.step[:3]
+    vector, active = start(), (0, 1, int(np.argmax(BODY.step)))
+    step = BODY.step[list(active)]
+    assert step[2] > 5.0 * step[0]
     vector[0], vector[1] = BODY.low[0], BODY.high[1]
-    of = Freed((Part(BODY, vector, (0, 1, 2), np.zeros((3, 3))),), lambda vectors: Chain(vectors[0], None))
+    of = Freed((Part(BODY, vector, active, np.zeros((3, 3))),), lambda vectors: Chain(vectors[0], None))
     found = ahead.fit(of)
     # To ten thousand of the steps by which derivatives are taken.
     assert np.sqrt(np.diag(found.covariance)) == pytest.approx(1e4 * step, rel=1e-6)

@@ -1,11 +1,13 @@
 """The model that is handed out has of what was found only what predictions need, and nothing of this log's clock."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from disco_hw.gap import model_of
+from disco_hw.gap import search as stages
 from disco_hw.gap.data import WHEEL
 from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.report.judge import left_out_notes
@@ -15,22 +17,13 @@ from disco_hw.gap.search.channel_search import ChannelResult, body_moves
 from disco_hw.gap.search.cross_validation import PredictionErrors, within_one_standard_error
 from disco_hw.gap.search.selection import Selector
 from disco_hw.model import Model
+from tests.gap.search.test_reduced import analysis_of, found, told
 from tests.gap.synthetic import GEOMETRY, NOISE, body_channel
 
-LATE_NODES = 6
 
-
-def kept_of(names, late_nodes=0, even=True):
-    """What is kept of names that were found in a body that slips turning, and the model and the notes of that."""
+def kept_of(names):
+    """What is kept of names that were found in a body that slips turning, the model and the notes of that."""
     _, line = body_channel(turn_slip=0.08)
-    inside = line.pose.node < line.pose.node[-1] - late_nodes
-    pose = type(line.pose)(
-        line.pose.node[inside] + late_nodes,
-        line.pose.fraction[inside],
-        line.pose.t_s[inside] + 0.01 * late_nodes,
-        line.pose.block[inside],
-    )
-    line = replace(line, pose=pose, pose_values=line.pose_values[inside], pose_clock_even=even)
     # Without commands it starts from the wheels as measured.
     line = replace(line, command_rad_s=np.full_like(line.command_rad_s, np.nan))
     start = body_channel()[0].neutral.copy()
@@ -42,20 +35,110 @@ def kept_of(names, late_nodes=0, even=True):
     model, _ = model_of("amended", Model(*GEOMETRY), analysis, final, predictions)
     kept = predictions.kept[0]
     assert {effect.name for effect in model.effects} == set(kept.body.names)
-    return kept.body.names, left_out_notes(analysis, kept)
+    return kept.body.names, model, left_out_notes(analysis, kept)
 
 
-def test_a_name_that_predictions_do_not_need_is_left_out_and_said():
-    names, notes = kept_of(("turn_slip", "acceleration_slip"))
+def test_a_name_that_predictions_do_not_need_is_left_out_and_said_and_the_rest_is_believed_jointly():
+    names, model, notes = kept_of(("turn_slip", "acceleration_slip"))
     assert names == ("turn_slip",)
+    covariance, entries = model.belief.covariance(), model.belief.names
+    assert np.linalg.eigvalsh(covariance).min() > 0.0
+    axial, slip = entries.index("axial_distance_m"), entries.index("turn_slip.k_s")
+    assert abs(covariance[axial, slip]) > 0.1 * (covariance[axial, axial] * covariance[slip, slip]) ** 0.5
     assert notes == ("the amended model leaves out acceleration_slip: held-out data are predicted as well without",)
 
 
+class Candidate:
+    """Stands for a model that may be handed out: it errs by what is said of all that it has, apart or on top."""
+
+    squares: dict
+    judged_so_far: list
+
+    def __init__(self, analysis, on_top=False):
+        self.analysis, self.is_on_top = analysis, on_top
+
+    @classmethod
+    def of_channels(cls, analysis, apart):
+        assert apart == "apart"
+        return cls(analysis)
+
+    def on_top(self, of):
+        assert of == "timed"
+        return type(self)(self.analysis, True)
+
+    def judged(self, ahead, apart):
+        assert (ahead, apart) == ("ahead", "apart")
+        wheels, body, _ = told(self.analysis)
+        has = frozenset((*(wheels or ()), *(body or ())))
+        self.judged_so_far.append((has, self.is_on_top))
+        square = self.squares.get((has, self.is_on_top), 9.0)
+        return stages._Judged(self, {}, errors(*[square] * 4))
+
+
+def needed(monkeypatch, squares, wheels=None, body=None, even=True):
+    """What is needed of what was found, whether on top of the timed model, and all that was judged."""
+    by_set = {(frozenset(names.split()), on_top): square for (names, on_top), square in squares.items()}
+    monkeypatch.setattr(Candidate, "squares", by_set, raising=False)
+    monkeypatch.setattr(Candidate, "judged_so_far", [], raising=False)
+    monkeypatch.setattr(stages, "_Candidate", Candidate)
+    analysis = replace(analysis_of(wheels, body), drive=SimpleNamespace(pose_clock_even=even))
+    kept = stages._needed(analysis, "timed", "ahead", "apart").candidate
+    wheels, body, pruned = told(kept.analysis)
+    return " ".join((*(wheels or ()), *(body or ()))), kept.is_on_top, pruned, Candidate.judged_so_far
+
+
+def test_the_least_evident_goes_first_where_nothing_is_worse_without_and_the_rest_stays(monkeypatch):
+    squares = {
+        ("turn_slip slope side_slip", False): 1.1, ("turn_slip slope side_slip", True): 1.0,
+        ("turn_slip slope", True): 1.0, ("turn_slip", True): 1.01, ("slope", True): 1.0,
+    }  # fmt: skip
+    body = found(("turn_slip", "slope", "side_slip"))
+    names, on_top, pruned, _ = needed(monkeypatch, squares, body=body)
+    assert (names, on_top, pruned) == ("slope", True, ("side_slip", "turn_slip"))
+    # Where it does better without, all else is held against that.
+    better = {**squares, ("turn_slip slope", True): 0.8, ("slope", True): 0.9}
+    assert needed(monkeypatch, better, body=body)[0] == "turn_slip slope"
+    # Also where it is not the last that was as good.
+    best = {
+        **squares,
+        ("turn_slip slope side_slip", True): 0.5,
+        ("turn_slip slope", True): 0.8,
+        ("slope side_slip", True): 0.8,
+    }
+    assert needed(monkeypatch, best, body=body)[:2] == ("turn_slip slope side_slip", True)
+
+
+def test_channels_apart_are_kept_where_they_err_less_until_something_goes(monkeypatch):
+    squares = {("turn_slip slope", False): 0.9, ("turn_slip slope", True): 1.0, ("turn_slip", True): 0.95}
+    body = found(("turn_slip", "slope"))
+    assert needed(monkeypatch, squares, body=body)[:2] == ("turn_slip slope", False)
+    squares["turn_slip", True] = 0.9
+    assert needed(monkeypatch, squares, body=body)[:3] == ("turn_slip", True, ("slope",))
+
+
+def test_something_of_what_was_found_stays(monkeypatch):
+    squares = {("slope", False): 1.0, ("slope", True): 2.0, ("", True): 0.1}
+    names, _, _, judged = needed(monkeypatch, squares, body=found(("slope",)))
+    assert names == "slope"
+    assert judged == [({"slope"}, False), ({"slope"}, True)]
+    # A lag is no candidate to go.
+    squares = {("motor_lag slope", True): 1.0, ("motor_lag", True): 1.0}
+    assert needed(monkeypatch, squares, found(("motor_lag",)), found(("slope",)))[0] == "motor_lag"
+
+
+def test_where_nothing_was_found_the_channels_are_as_they_are(monkeypatch):
+    judged = needed(monkeypatch, {}, found(("motor_lag",), given=("motor_lag",)), found(()))[3]
+    assert judged == [({"motor_lag"}, False)]
+
+
 @pytest.mark.parametrize("even", [True, False])
-def test_how_late_poses_are_is_kept_only_where_their_clock_runs_evenly(even):
-    names, notes = kept_of(("turn_slip", "pose_latency"), LATE_NODES, even)
-    assert names == (("turn_slip", "pose_latency") if even else ("turn_slip",))
-    assert [note.partition(":")[0] for note in notes] == ([] if even else ["the amended model leaves out pose_latency"])
+def test_a_clock_that_runs_unevenly_says_nothing_of_how_late_poses_are(monkeypatch, even):
+    body = found(("turn_slip", "pose_latency"), [("drag", 45.0)])
+    squares = {("turn_slip pose_latency drag", True): 1.0, ("turn_slip drag", True): 2.0 if even else 1.0}
+    names, _, pruned, judged = needed(monkeypatch, squares, body=body, even=even)
+    assert ("pose_latency" in names.split()) is even
+    assert pruned == (() if even else ("pose_latency",))
+    assert any("pose_latency" in has for has, _ in judged) is even
 
 
 def errors(*squares):

@@ -13,6 +13,7 @@ from disco_hw.gap.search import richest_model
 from disco_hw.gap.search.richest_model import (
     CANDIDATES,
     candidates_of,
+    delays_of,
     driven,
     indices,
     learn_saturated_body,
@@ -104,6 +105,8 @@ def test_wheels_without_a_lag_answer_at_once_and_without_a_command_not_at_all():
     commands = np.repeat(np.random.default_rng(1).uniform(-6.0, 6.0, (5, 2)), 20, axis=0)
     _, shapes = shapes_of(commands)
     np.testing.assert_allclose(shapes[9], commands, rtol=1e-3)
+    # However small it is.
+    np.testing.assert_allclose(shapes_of(0.01 * commands)[1][9], 0.01 * commands, rtol=1e-3)
     line, none = shapes_of(np.zeros((400, 2)))
     assert none == []
     channel = WheelChannel.build(line, WheelNoise(reading_rad=1e-3), np.array(GEOMETRY))
@@ -192,20 +195,41 @@ def test_a_body_is_pushed_as_it_is_fitted_best_and_where_that_is_too_far_half_of
     assert half < 1.1 * np.sum(channel.residual(p) ** 2)
 
 
+def test_a_push_is_tried_in_a_size_that_hardly_matters(monkeypatch):
+    push = 7.0 * np.random.default_rng(3).standard_normal((50, 3))
+    asked = []
+
+    def residual(vector, extra=None):
+        asked.append(extra)
+        return np.ones(4) if extra is None else np.ones(4) + (push * extra).mean()
+
+    channel = SimpleNamespace(
+        layout=BODY, settings=DEFAULT_SETTINGS, free=(), drive=SimpleNamespace(t_s=np.zeros(50)), residual=residual
+    )
+    monkeypatch.setattr(richest_model, "learn_body_noise", lambda of, vector, extra: of)
+    extra = learn_saturated_body(channel, (), BODY.neutral, (push,))[2]
+    tried = asked[1]
+    assert np.sqrt((tried**2).mean()) == pytest.approx(1e-3)
+    np.testing.assert_allclose(tried / push, tried[0, 0] / push[0, 0])
+    # As much of it as takes what is left away, but for the ridge.
+    share = -1.0 / (1.0 + DEFAULT_SETTINGS.fit.ridge) / (push**2).mean()
+    np.testing.assert_allclose(extra, share * push, rtol=1e-6)
+
+
 class Bent:
     """A channel of one number whose derivative promises ten, where only what is below `least` fits better than none."""
 
     layout, settings, free = BODY, DEFAULT_SETTINGS, (0,)
     drive = SimpleNamespace(t_s=np.zeros(5))
 
-    def __init__(self, least):
-        self.least = least
+    def __init__(self, least, beyond=-2.0):
+        self.least, self.beyond = least, beyond
 
     def residual(self, vector, extra=None):
         moved = vector[0] - GEOMETRY[0]
         if abs(moved) < 1e-3:
-            return np.array([1.0 - moved / 10.0])
-        return np.array([0.5 if moved < self.least else 2.0])
+            return np.array([moved / 10.0 - 1.0])
+        return np.array([0.5 if moved < self.least else self.beyond])
 
 
 @pytest.mark.parametrize(("least", "share"), [(11.0, 1.0), (6.0, 0.5), (3.0, 0.25), (1.5, 0.125), (1.0, 0.0)])
@@ -222,6 +246,15 @@ def test_a_step_of_the_richest_model_is_halved_until_it_fits_better(monkeypatch,
     assert (learnt is channel) is (share == 0.0)
     assert extra.shape == (5, 3)
     assert many == 1
+
+
+def test_a_step_that_fits_as_well_as_none_is_none(monkeypatch):
+    monkeypatch.setattr(Bent, "layout", replace(BODY, high=np.full_like(BODY.high, 1e9)))
+    vector, channel = BODY.neutral.copy(), Bent(0.0, 1.0)
+    vector[0] = GEOMETRY[0]
+    learnt, moved, _, _ = learn_saturated_body(channel, (), vector, ())
+    assert learnt is channel
+    assert moved is vector
 
 
 def test_the_richest_model_stays_in_its_ranges(monkeypatch):
@@ -282,3 +315,6 @@ def test_effects_compete_in_their_own_channel_with_all_their_parameters():
     assert {"turn_slip", "slope"} < set(smooth_of(BODY))
     assert {"motor_lag", "wheel_gain"} < set(smooth_of(WHEEL))
     assert "surface_change" not in smooth_of(BODY)
+    assert (delays_of(WHEEL), delays_of(BODY)) == (("command_delay",), ("pose_latency",))
+    # What begins at some time of the drive.
+    assert [name for name, candidate in CANDIDATES.items() if candidate.once] == ["surface_change"]

@@ -264,8 +264,20 @@ def test_closer_around_a_patch_are_its_neighbours_and_other_sizes():
         (round(2.0 + dx, 2), round(1.0 + dy, 2), round(0.75 + dr, 2))
         for dx in steps for dy in steps for dr in (-0.15, -0.05, 0.0, 0.05, 0.15)
     }  # fmt: skip
-    small = {term.disc[2] for term in places_near(channel, np.array(GEOMETRY), (2.0, 1.0, 0.15))}
-    assert all(size > 0.0 for size in small)
+    small = {round(term.disc[2], 2) for term in places_near(channel, np.array(GEOMETRY), (2.0, 1.0, 0.5))}
+    assert small == {0.35, 0.45, 0.5, 0.55, 0.65}
+    # From the centre to the right and away, and larger.
+    channel, _, _ = lawn(disc_steps_m=(0.0, 0.2), disc_size_steps_m=(-1.0, 0.1))
+    beside = {tuple(np.round(term.disc, 2)) for term in places_near(channel, np.array(GEOMETRY), (2.0, 1.0, 0.75))}
+    assert beside == {(2.0, 1.0, 0.85), (2.2, 1.0, 0.85), (2.0, 1.2, 0.85), (2.2, 1.2, 0.85)}
+
+
+def test_patches_are_sought_up_to_both_ends_of_the_floor():
+    channel, _, _ = lawn(disc_spacing_m=0.5, disc_radii_m=(0.4,))
+    x = np.where(np.arange(channel.samples.t_s.size) % 4 < 2, 1.0, 3.0)
+    channel.measured = np.column_stack([x, np.full(x.size, 2.0), x])
+    discs = {term.disc for term in places(channel, np.array(GEOMETRY))}
+    assert discs == {(x, 2.0, 0.4) for x in (1.0, 1.5, 2.0, 2.5, 3.0)}
 
 
 def extended():

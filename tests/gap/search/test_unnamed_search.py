@@ -14,6 +14,7 @@ from disco_hw.gap.search.channel_search import (
     _priced,
     _thresholds,
     _time_or_place,
+    _written,
     best_terms,
     body_moves,
     with_unnamed,
@@ -158,19 +159,6 @@ def test_a_term_is_accepted_with_its_number_and_its_evidence_and_what_stood_in_f
     assert found.plain.channel is channel
 
 
-def test_no_more_terms_are_added_than_three(monkeypatch):
-    channel, term = turned_in(0.1, 0.9, -0.2)
-    size = channel.drive.t_s.size
-    inside = [(np.arange(size) // (size // 6) == k)[:, None] for k in (1, 2, 3, 4)]
-    parts = [replace(term, perturbation=np.where(of, term.perturbation, 0.0)) for of in inside]
-    monkeypatch.setattr(channel_search, "compare", lambda *_: EffectEvidence(30.0, 10.0, 1.0, 1.0, 40.0))
-    found = with_unnamed(searched(channel), lambda found: iter(parts))
-    assert len({id(one.term) for one in found.unnamed}) == len(found.unnamed) == 3
-    # All coefficients are told as they are when all are in.
-    assert [one.form for one in found.unnamed] == [f"omega += {k:.2f} then" for k in found.fit.vector[-3:]]
-    assert found.fit.vector.size == channel.neutral.size + 3
-
-
 @pytest.mark.parametrize(
     ("score", "repeated", "moved_m", "accepted"),
     [
@@ -237,6 +225,11 @@ class Searched:
     price: float = 100.0
     given: tuple = ()
     either: tuple = ()
+    vector: tuple = ()
+
+    @property
+    def told(self):
+        return SimpleNamespace(vector=np.array(self.vector))
 
     @property
     def channel(self):
@@ -249,6 +242,39 @@ class Searched:
 
 PATCH = UnnamedTerm("patch", None, replace(NOTHING, disc=(0.0, 0.0, 1.0)))
 PLAIN = UnnamedTerm("plain", None, NOTHING)
+
+
+def added(monkeypatch, *outcomes):
+    """How many terms are added where these are found in turn, and whether each time patches were looked for."""
+    asked, left = [], list(outcomes)
+
+    def one_more(of, options, patches):
+        assert options == "options"
+        asked.append(patches)
+        one, still = left.pop(0)
+        return None if one is None else replace(of, unnamed=(*of.unnamed, one)), still
+
+    monkeypatch.setattr(channel_search, "_with_one_more", one_more)
+    monkeypatch.setattr(channel_search, "_written", lambda of: ("written", of.unnamed))
+    told, terms = with_unnamed(Searched(), "options")
+    assert told == "written"
+    return terms, asked
+
+
+def test_terms_are_added_until_none_is_accepted_and_no_more_than_three(monkeypatch):
+    assert added(monkeypatch, (None, True)) == ((), [True])
+    assert added(monkeypatch, (PLAIN, False), (None, False)) == ((PLAIN,), [True, False])
+    assert added(monkeypatch, *[(PATCH, True), (PLAIN, False)] * 2) == ((PATCH, PLAIN, PATCH), [True, True, False])
+
+
+def test_all_coefficients_are_told_as_they_are_when_all_terms_are_in():
+    waves = UnnamedTerm("", None, replace(NOTHING, form="waves {:.2f}", beside=(NOTHING.perturbation,)))
+    single = UnnamedTerm("", None, replace(NOTHING, form="single {:.2f}"))
+    last = UnnamedTerm("", None, replace(NOTHING, form="last {:.2f}"))
+    found = Searched(unnamed=(single, waves, last), vector=(9.0, 9.0, 0.25, 0.6, -0.8, 0.5))
+    assert [one.form for one in _written(found).unnamed] == ["single 0.25", f"waves {0.5**0.5:.2f}", "last 0.50"]
+    none = Searched(vector=(9.0,))
+    assert _written(none) is none
 
 
 def told(monkeypatch, found, placed_price=90.0, placed_terms=(PATCH,), placed_names=("turn_slip",)):

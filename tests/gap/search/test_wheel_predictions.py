@@ -1,5 +1,7 @@
 """Wheels that are judged without poses: the way and the heading that they make, on stretches that were not fitted."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -12,7 +14,7 @@ from disco_hw.gap.report import GapReport
 from disco_hw.gap.report.page import answer, as_text, page
 from disco_hw.gap.search.analysis import GapAnalysis, final_fit
 from disco_hw.gap.search.channel_search import ChannelResult, wheel_moves
-from disco_hw.gap.search.cross_validation import only_timed, wheel_table
+from disco_hw.gap.search.cross_validation import _errors, only_timed, wheel_table
 from disco_hw.gap.search.selection import Selector
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from disco_hw.model import Model
@@ -64,6 +66,8 @@ def test_wheels_with_a_dead_band_are_predicted_with_it_and_not_with_a_lag_alone(
     errors = {stage: of[2.0] for stage, of in table.items()}
     # Each wheel loses 1 rad/s: 0.12 m in 2 s where both turn the same way, nothing where they turn against each other.
     assert 0.05 < errors["nominal"].position_m < 0.12
+    # In every stretch.
+    assert (errors["nominal"].squares[:, 0] > 0.0).all()
     assert errors["amended"].position_m < 0.02 * errors["nominal"].position_m
     assert errors["amended"].yaw_rad < 0.02 * errors["timed"].yaw_rad
     assert errors["amended"].wheel_rad_s < 0.1 * errors["nominal"].wheel_rad_s
@@ -103,6 +107,29 @@ def test_a_log_without_poses_is_answered_with_the_way_that_its_wheels_make():
     told = report.as_dict()
     assert [row["horizon_s"] for row in told["wheels"]] == list(DEFAULT_SETTINGS.prediction.horizons_s)
     assert told["offered"] == "timed"
+
+
+def test_each_stretch_is_predicted_by_the_angles_of_its_own_fold():
+    line = line_of(np.repeat([[3.0, 6.0]], 6000, axis=0))
+    line.command_rad_s[2500:2600] = np.nan
+    channel = SimpleNamespace(drive=line, geometry=np.array(GEOMETRY), settings=DEFAULT_SETTINGS)
+    right = line.angle_rad
+    wrong = right + np.outer(line.t_s, (0.1, -0.2))
+    for of, off in (({0: wrong, 1: right}, (True, False, True)), ({0: right, 1: wrong}, (False, True, False))):
+        told = _errors(channel, of, 2.0)
+        # In 2 s the left wheel turns 0.2 rad less and the right one 0.4 rad more than was predicted.
+        way_m, heading_rad = 0.5 * 0.06 * 0.2, 0.06 / 0.4 * 0.6
+        (squares_m2, squares_rad2), many = told.squares.T, np.where(off, told.squares[:, 0] / way_m**2, 0.0)
+        np.testing.assert_allclose(squares_m2, many * way_m**2, atol=1e-12)
+        np.testing.assert_allclose(squares_rad2, many * heading_rad**2, atol=1e-12)
+        assert many[np.array(off)] == pytest.approx(np.round(many[np.array(off)]))
+        assert (many[np.array(off)] > 60).all()
+        share = told.position_m**2 / way_m**2
+        assert told.wheel_rad_s == pytest.approx(0.05 * share**0.5)
+        assert told.by_regime_m == {"curves": told.position_m}
+    # Stretches of 21 s, where commands are known all the way.
+    starts = _errors(channel, {0: wrong, 1: wrong}, 2.0).squares[:, 0] / way_m**2
+    assert starts == pytest.approx([100, 90, 80], abs=6)
 
 
 def test_without_commands_there_is_no_such_table():
