@@ -93,6 +93,7 @@ class Result:
     alike: list[str] = field(default_factory=list)
     too_small: list[str] = field(default_factory=list)
     timed_mm: float | None = None
+    written_mm: float | None = None
 
     @property
     def told(self) -> bool:
@@ -123,10 +124,18 @@ class Result:
         It is the gap of the timed model, as the motors have a lag besides, but where nothing else was hidden than what
         that model holds.
         """
+        return self._closed_at(self.amended_mm)
+
+    @property
+    def closed_as_written(self) -> float | None:
+        """The same of the amended model as it stands in its file, which lacks the terms that no model can carry."""
+        return self._closed_at(self.amended_mm if self.written_mm is None else self.written_mm)
+
+    def _closed_at(self, after_mm: float) -> float | None:
         timed = self.timed_mm is not None and not set(self.hidden) <= TIMES
         before_mm = self.timed_mm if timed else self.refitted_mm
         removable = before_mm - self.floor_mm
-        return (before_mm - self.amended_mm) / removable if removable > 1.0 else None
+        return (before_mm - after_mm) / removable if removable > 1.0 else None
 
 
 def jobs(kind: str, seeds: Iterable[int]) -> Iterator[Job]:
@@ -168,7 +177,7 @@ def work(job: Job) -> Result:
             spot.name for spot in report.blind_spots
             if spot.name in job.hidden and too_small(spot, job.hidden[spot.name])
         ],
-        mm["timed"],
+        mm["timed"], mm.get("written"),
     )  # fmt: skip
 
 

@@ -44,6 +44,8 @@ def summary(results: Sequence[Result]) -> dict[str, float]:
         if closed and kind not in ("none", "dirty"):
             figures[f"gap.{kind}.closed_median"] = float(np.median(closed))
             figures[f"gap.{kind}.closed_by_half"] = float(np.mean(np.array(closed) >= 0.5))
+            written = [result.closed_as_written or 0.0 for result in of if result.closed is not None]
+            figures[f"gap.{kind}.written_by_half"] = float(np.mean(np.array(written) >= 0.5))
             figures[f"gap.{kind}.closed_of"] = len(closed)
         errors = [error for result in of for error in result.errors]
         covered = [inside for result in of for inside in result.covered]

@@ -91,6 +91,11 @@ def test_the_gap_to_close_is_that_of_the_timed_model_where_more_than_times_is_hi
     assert result(hidden=("motor_lag", "deadband"), timed_mm=24.0).closed == pytest.approx(0.9)
     figures = gap_tables.summary([strange, result("strange", ("backlash",), (), timed_mm=24.0, amended_mm=20.0)])
     assert (figures["gap.strange.closed_by_half"], figures["gap.strange.closed_of"]) == (0.5, 2)
+    assert figures["gap.strange.written_by_half"] == 0.5
+    # What no model can carry is not in the one that is written.
+    lacking = dataclasses.replace(strange, written_mm=24.0)
+    assert (lacking.closed, lacking.closed_as_written) == (pytest.approx(0.5), 0.0)
+    assert gap_tables.summary([strange, lacking])["gap.strange.written_by_half"] == 0.5
     assert any(line.startswith("| `backlash` |") for line in gap_tables.per_effect([strange]))
     assert [next(iter(job.hidden)) for job in jobs("strange", [7])] == list(FORMS)
 
