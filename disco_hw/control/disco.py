@@ -20,6 +20,7 @@ from disco_hw.control.parameter_points import (
     shared_pairs,
     unscented_points,
 )
+from disco_hw.control.past_motion import PastMotion
 from disco_hw.control.plan import (
     Array,
     CommandLimits,
@@ -105,6 +106,9 @@ class Disco:
             0.0,
             np.zeros((self._history, CHANNELS)),
         )
+        # What is remembered where the plan begins, in the mean of what is believed, (n,), and under each point, (L, n).
+        self._mean_means: Array | None = None
+        self._means: Array | None = None
 
     def _shared_points(self, model: Model) -> tuple[Array, Array]:
         """Parameter points (L, P) and weights (L,) of the first step; those of `ut` and `point` stay."""
@@ -141,6 +145,7 @@ class Disco:
             np.ascontiguousarray(found[:, 2 * pair : 2 * pair + 2]) if pair < self._pairs else None for pair in (0, 1)
         )
         self._wheels_differ = self._do_wheels_differ(theta)
+        self._past = PastMotion.of(model, theta, self._mean_theta)
 
     def set_belief(self, belief: Belief) -> None:
         """Plan under this belief from the next `plan` on; the last plan and the random numbers go on.
@@ -246,6 +251,8 @@ class Disco:
         self._begun_ns = begun_ns
         elapsed_s = (t0_ns - begun_ns) * 1e-9 if state.elapsed_s is None else state.elapsed_s + settings.latency_s
         start = self._predicted(state, t0_ns, elapsed_s)
+        if self._past is not None and self._mean_means is not None:
+            self._means = self._past.of_points(state, t0_ns, self._acting, self._mean_means)
         system = self._system(state, start, t0_ns, (t0_ns - begun_ns) * 1e-9, elapsed_s)
         shift_steps = 0.0 if self._t0_ns is None else (t0_ns - self._t0_ns) * 1e-9 / settings.step_s
         self._t0_ns = t0_ns
@@ -257,11 +264,11 @@ class Disco:
             self._failing_since_ns = None
         self._planned_from, self._elapsed_s = start, elapsed_s
         nominal = self._optimiser.nominal()
-        trajectory = self._trajectory(self._mean, nominal, 0)
+        trajectory = self._mean_trajectory(nominal)
         if guided and self._is_to_be_guided(now_ns, system, trajectory):
             self._optimiser.take_guide()
             nominal = self._optimiser.nominal()
-            trajectory = self._trajectory(self._mean, nominal, 0)
+            trajectory = self._mean_trajectory(nominal)
         return WheelPlan(
             t0_ns=t0_ns,
             step_s=settings.step_s,
@@ -368,13 +375,16 @@ class Disco:
         """State (5,) at `t0_ns`: x, y, yaw, wheel speeds, under the mean parameters and the commands already sent."""
         wheels = state.left_speed_rad_s, state.right_speed_rad_s
         start = np.array([state.x_m, state.y_m, state.yaw_rad, *self._turning(*wheels)])
+        if self._past is not None:
+            self._mean_means = self._past.of_mean(state, state.t_ns, self._acting, self._turning(*wheels))
         gap_s = (t0_ns - state.t_ns) * 1e-9
         if gap_s < SHORTEST_GAP_S:
             return start
         count = math.ceil(gap_s / self._settings.step_s)
         run = FreeRun(self._model, self._mean_theta, gap_s / count)
         past = self._acting(command_history(state.sent, t0_ns, gap_s / count, run.past_rows + count, wheels))
-        return np.asarray(run.states(start, past, run.past_rows, elapsed_s - gap_s, 0, self._slide)[-1])
+        ahead_s = elapsed_s - gap_s
+        return np.asarray(run.states(start, past, run.past_rows, ahead_s, 0, self._slide, self._mean_means)[-1])
 
     def _follow_disturbance(self, now_ns: int, state: PlannerState) -> None:
         """Plan with this disturbance, and with what the wheels have lost of their commands since the last plan."""
@@ -392,7 +402,9 @@ class Disco:
             run = self._wheel_runs[gap_ms] = FreeRun(self._model, self._mean_theta, gap_ms * 1e-3)
         sent = command_history(state.sent, state.t_ns, gap_ms * 1e-3, run.past_rows + 1, wheels)
         start = np.array([0.0, 0.0, 0.0, *wheels])
-        left, right = run.states(start, self._loss.acting(sent), run.past_rows)[-1, 3:].tolist()
+        begin_ns = state.t_ns - gap_ms * 1_000_000
+        means = None if self._past is None else self._past.of_mean(state, begin_ns, self._loss.acting, wheels)
+        left, right = run.states(start, self._loss.acting(sent), run.past_rows, means=means)[-1, 3:].tolist()
         return left, right
 
     def _turning(self, left_rad_s: float, right_rad_s: float) -> tuple[float, float]:
@@ -435,8 +447,9 @@ class Disco:
             self._draw_points()
         base, effects = self._tables
         each = True if self._own_draws else None
+        means = None if self._means is None else self._means.astype(np.float32)
         return SkidSteer(
-            self._start, self._slides, base, effects, each, self._ahead, self._scaled, self._skip_mean_cost,
+            self._start, self._slides, means, base, effects, each, self._ahead, self._scaled, self._skip_mean_cost,
             self._series, self._wide, self._euler, task, self._history, self._wheels, self._wheels_differ,
         )  # fmt: skip
 
@@ -460,7 +473,7 @@ class Disco:
         commands, weights = self._optimiser.sampled_commands(count)
         trajectories = np.empty((len(commands), self._settings.sampler.horizon + 1, 3))
         for row, one in enumerate(commands):
-            trajectories[row] = self._trajectory(self._mean, one, 0)
+            trajectories[row] = self._mean_trajectory(one)
         return Rollouts(np.array([self._asked(one) for one in commands]), trajectories, weights)
 
     def point_trajectories(self) -> Array:
@@ -470,8 +483,13 @@ class Disco:
         """
         wheel_speeds = self._optimiser.nominal()
         count = self._weights.size
-        return np.array([self._trajectory(self._points, wheel_speeds, point) for point in range(count)])
+        return np.array([self._trajectory(self._points, wheel_speeds, self._means, point) for point in range(count)])
 
-    def _trajectory(self, run: FreeRun, wheel_speeds: Array, point: int) -> Array:
-        commands = self._with_past(wheel_speeds)
-        return run.states(self._planned_from, commands, self._history, self._elapsed_s, point, self._slide)[:, :3]
+    def _mean_trajectory(self, wheel_speeds: Array) -> Array:
+        means = None if self._mean_means is None else self._mean_means[None]
+        return self._trajectory(self._mean, wheel_speeds, means, 0)
+
+    def _trajectory(self, run: FreeRun, wheel_speeds: Array, means: Array | None, point: int) -> Array:
+        commands, start = self._with_past(wheel_speeds), self._planned_from
+        own = None if means is None else means[point].copy()
+        return run.states(start, commands, self._history, self._elapsed_s, point, self._slide, own)[:, :3]

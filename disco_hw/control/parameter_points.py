@@ -23,7 +23,7 @@ SAME_RATIO = 1e-9
 def moving_names(belief: Belief) -> tuple[str, ...]:
     """Those parameters of a belief that change motion: of effects, then wheel radius and axial distance, then x_icr."""
     base = {parameter.name for parameter in BASE_PARAMETERS}
-    moving = [name for name in belief.names if name in base or effect_of(name.split(".")[0]).moves]
+    moving = [name for name in belief.names if name in base or effect_of(name.rpartition(".")[0]).moves]
     return tuple(sorted(moving, key=lambda name: (name in base) + (name == X_ICR.name)))
 
 

@@ -217,7 +217,9 @@ class SentCommand(msgspec.Struct, frozen=True, gc=False):
 class PlannerState(msgspec.Struct, frozen=True, gc=False):
     """Pose in the world frame and measured wheel speeds at `t_ns`, and the commands sent up to now, oldest first.
 
-    `disturbance`: how the robot moves beside its model.
+    `disturbance`: how the robot moves beside its model. `command_means`, `body_means`: what the model's terms remember,
+    of commands (a pair each) up to the first one of `sent`, of the wheels (a number each) up to `t_ns`; empty if
+    nothing was before.
     `elapsed_s`: time since the drive began, for effects that depend on it; None counts from the planner's start.
     """
 
@@ -230,6 +232,8 @@ class PlannerState(msgspec.Struct, frozen=True, gc=False):
     sent: tuple[SentCommand, ...] = ()
     elapsed_s: float | None = None
     disturbance: Disturbance = NO_DISTURBANCE
+    command_means: tuple[tuple[float, float], ...] = ()
+    body_means: tuple[float, ...] = ()
 
 
 class PlanOutcome(enum.Enum):

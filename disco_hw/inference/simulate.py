@@ -20,7 +20,9 @@ from numpy.typing import NDArray
 from disco_hw.errors import InputError, WorkError
 from disco_hw.inference.excitation import Excitation, Noise, slip_intensity
 from disco_hw.jit import parallel_kernel
+from disco_hw.model.added_terms import count_means, means_of, new_means
 from disco_hw.model.coefficients import base_point, effect_point
+from disco_hw.model.memory import forget
 from disco_hw.model.model import BASE_PARAMETERS, Model, coefficient_tables
 from disco_hw.model.step import axle_of, integration_from, integration_series, step, tracked_of
 
@@ -47,6 +49,7 @@ def simulate_kernel(
     starts: Any,
     run_node: Any,
     run_pose: Any,
+    means: Any,
     out: Any,
 ) -> None:
     """Measured poses (n, P, 3) of n simulations, one for each row of `base` and `effects` and each of `seeds`.
@@ -54,7 +57,8 @@ def simulate_kernel(
     Every run starts at its pose of `starts` (runs, 3). Slip is added after every step of a moving robot: forward, to
     the left, and in yaw about the lever's end; its variance is that of the noise times `intensity` (M,), and it keeps
     its direction for the correlation time. Every simulation has a noise of its own: `noise_scale` (7,) as
-    `Noise.scales`, times exp(`noise_spread` (7, 7) z); the lever, last, plus that in its place.
+    `Noise.scales`, times exp(`noise_spread` (7, 7) z); the lever, last, plus that in its place. `means`: scratch of
+    `new_means`.
     """
     integration = integration_from(series, True, None)
     root = math.sqrt(integration.step_s)
@@ -70,6 +74,10 @@ def simulate_kernel(
         keep = math.exp(-integration.step_s / max(noise[5], 1e-4))
         fresh, long_run = math.sqrt(1.0 - keep * keep), math.sqrt((1.0 - keep) / (1.0 + keep))
         here, effects_here = base_point(base, i), effect_point(effects, i)
+        forget(means)
+        of_commands = count_means(effects_here.command_terms)
+        command_means = means_of(effects_here.command_terms, means, np.uintp(0), np.uintp(1))
+        body_means = means_of(effects_here.body_terms, means, np.uintp(of_commands), np.uintp(1))
         for run in range(run_node.shape[0] - 1):
             x, y, yaw = starts[run, 0], starts[run, 1], starts[run, 2]
             cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
@@ -82,7 +90,7 @@ def simulate_kernel(
                 before_x, before_y, before_yaw = x, y, yaw
                 axle_x, axle_y, cos_yaw, sin_yaw, wheel_left, wheel_right, _, turn = step(
                     axle_x, axle_y, cos_yaw, sin_yaw, wheel_left, wheel_right, wheel[k, 0], wheel[k, 1],
-                    k * integration.step_s, here, effects_here, integration,
+                    k * integration.step_s, here, effects_here, integration, command_means, body_means,
                 )  # fmt: skip
                 yaw = yaw + (turn + turn) * integration.step_s
                 x, y = tracked_of(axle_x, axle_y, cos_yaw, sin_yaw, here)
@@ -141,6 +149,7 @@ class Simulator:
             drive.pose[drive.run_pose[:-1]],
             drive.run_node,
             drive.run_pose,
+            new_means(effects),
             out,
         )
         return out

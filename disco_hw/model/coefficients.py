@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import namedtuple
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import msgspec
@@ -28,7 +28,10 @@ class Base(NamedTuple):
 
 
 class TermCoefficients(Protocol):
-    """Coefficients of a term without a name: k and steps a second, of one parameter point or arrays (L,) of many."""
+    """Coefficients of a term without a name, of one parameter point or arrays (L,) of many.
+
+    k and, of a term that remembers, how its mean follows in a step, else the steps a second.
+    """
 
     @property
     def k(self) -> Any:
@@ -37,6 +40,17 @@ class TermCoefficients(Protocol):
     @property
     def per_s(self) -> Any:
         """Steps a second."""
+
+    @property
+    def by_end(self) -> Any:
+        """How much of its way the mean goes by the end of a step."""
+
+    @property
+    def over_step(self) -> Any:
+        """How much of its way the mean has gone in the mean over a step."""
+
+    def __iter__(self) -> Iterator[Any]:
+        """Those that it has, in the order of its type."""
 
 
 Terms = tuple[TermCoefficients, ...]
@@ -108,7 +122,7 @@ def terms_point(terms: Terms | None, i: int) -> Terms | None:
     if terms is None:
         return None
     kinds: list[Any] = [type(term) for term in terms]
-    return tuple(kind(term.k[i], term.per_s[i]) for kind, term in zip(kinds, terms, strict=True))
+    return tuple(kind(*(column[i] for column in term)) for kind, term in zip(kinds, terms, strict=True))
 
 
 @specialise(terms_point)
@@ -117,8 +131,10 @@ def _terms_point(terms: Any, i: types.Type) -> Callable[..., Any]:
         return lambda terms, i: None
     # A tuple of mixed types cannot be looped over in compiled code, so the call is written out for every term.
     scope = {kind.instance_class.__name__: kind.instance_class for kind in terms.types}
-    names = [kind.instance_class.__name__ for kind in terms.types]
-    picks = "".join(f"{name}(terms[{place}].k[i], terms[{place}].per_s[i]), " for place, name in enumerate(names))
+    picks = ""
+    for place, kind in enumerate(terms.types):
+        columns = ", ".join(f"terms[{place}].{field}[i]" for field in kind.instance_class._fields)
+        picks += f"{kind.instance_class.__name__}({columns}), "
     pick: Callable[..., Any] = eval(f"lambda terms, i: ({picks})", scope)
     return pick
 

@@ -17,8 +17,9 @@ from disco_hw import config
 from disco_hw.effects import Effect, Parameter
 from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
 from disco_hw.files import nearest
+from disco_hw.model.added_terms import table_entry
 from disco_hw.model.coefficients import Base, Coefficients, Effects, TermCoefficients
-from disco_hw.model.terms import COMMAND, TERMS, effect_of, table_entry
+from disco_hw.model.terms import COMMAND, TERMS, effect_of
 
 Array = NDArray[np.float64]
 

@@ -7,8 +7,9 @@ effect does is `plain` in its own file; here is what all robots have in common, 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,17 +18,20 @@ from disco_hw.effects import Array, Effect, Stage, Value, Values, asks_for
 from disco_hw.effects.registry import DELAY, in_stages
 
 Theta = Mapping[str, Value]
+Means = Mapping[str, tuple[Value, ...]]
+"""By name the mean that a term remembers: of both wheels for one of commands, one of the body's."""
 
 
 @dataclass(frozen=True)
 class RobotState:
-    """Pose of the tracked point (m, rad) and wheel speeds (rad/s)."""
+    """Pose of the tracked point (m, rad), wheel speeds (rad/s) and what terms remember, 0 where that is not named."""
 
     x: Value
     y: Value
     yaw: Value
     wheel_left: Value
     wheel_right: Value
+    means: Means = field(default_factory=dict)
 
 
 def theta_of(names: tuple[str, ...], values: Array) -> dict[str, Value]:
@@ -97,10 +101,80 @@ BODY_FEATURES: Mapping[str, Callable[[Value, Value, Value, float], Value]] = {
 }
 
 
+@dataclass(frozen=True)
+class _Memory:
+    """A lag (s), what goes into it, and the feature of the motion and what comes out, in the mean over a step."""
+
+    time_s: float
+    goes_in: Callable[..., Value]
+    feature: Callable[..., Value]
+
+    def over(self, before: Value, value: Value, step_s: float) -> Value:
+        """Mean of what comes out over a step, at whose start it was `before`, while `value` goes in."""
+        lag = self.time_s / step_s
+        return value + (before - value) * lag * (1.0 - math.exp(-1.0 / lag))
+
+    def after(self, before: Value, value: Value, step_s: float) -> Value:
+        """What comes out at the end of that step."""
+        return value + (before - value) * math.exp(-step_s / self.time_s)
+
+
+_SHORT_TO_LONG = {"0.3": 0.3, "1": 1.0, "3": 3.0}
+COMMAND_MEMORIES: Mapping[str, _Memory] = {
+    **{
+        f"u mean_{name}s(|u| + |u_other|)": _Memory(
+            time_s, lambda u, other: np.abs(u) + np.abs(other), lambda u, other, mean: mean * u
+        )
+        for name, time_s in _SHORT_TO_LONG.items()
+    },
+    "u mean_30s(u^2)": _Memory(30.0, lambda u, other: u**2, lambda u, other, mean: mean * u),
+    **{
+        f"sign(u - mean_{name}s(u))": _Memory(time_s, lambda u, other: u, lambda u, other, mean: _sign(u - mean, 0.1))
+        for name, time_s in _SHORT_TO_LONG.items()
+    },
+}
+BODY_MEMORIES: Mapping[str, _Memory] = {
+    **{
+        f"(v - mean_{name}s(v))": _Memory(time_s, lambda v, w: v, lambda v, w, mean: v - mean)
+        for name, time_s in _SHORT_TO_LONG.items()
+    },
+    **{
+        f"(omega - mean_{name}s(omega))": _Memory(time_s, lambda v, w: w, lambda v, w, mean: w - mean)
+        for name, time_s in _SHORT_TO_LONG.items()
+    },
+}
+
+
 def _terms(theta: Theta, target: str) -> list[tuple[str, Value]]:
     """Features and coefficients of the terms that act on `target`; they are named `target += k feature`."""
     parted = [(name.removesuffix(".k").partition(" += k "), value) for name, value in theta.items()]
     return [(feature, value) for (acted_on, _, feature), value in parted if feature and acted_on == target]
+
+
+def _commands_remembered(theta: Theta, left: Value, right: Value) -> dict[str, tuple[_Memory, tuple[Value, ...]]]:
+    """By feature the memories of commands that act, and what goes into each of their means."""
+    acting = [(name, COMMAND_MEMORIES[name]) for name, _ in _terms(theta, "command") if name in COMMAND_MEMORIES]
+    return {name: (memory, (memory.goes_in(left, right), memory.goes_in(right, left))) for name, memory in acting}
+
+
+def _body_remembered(theta: Theta, v: Value, w: Value) -> dict[str, tuple[_Memory, tuple[Value, ...]]]:
+    """The same of the body's, which go by forward speed and yaw rate."""
+    features = [name for target in ("v_x", "omega") for name, _ in _terms(theta, target)]
+    acting = [(name, BODY_MEMORIES[name]) for name in features if name in BODY_MEMORIES]
+    return {name: (memory, (memory.goes_in(v, w),)) for name, memory in acting}
+
+
+def _ideal(theta: Theta, left: Value, right: Value) -> tuple[Value, Value]:
+    """Forward speed (m/s) and yaw rate (rad/s) that these wheel speeds make without slip."""
+    radius = theta["wheel_radius_m"]
+    return radius * (right + left) / 2.0, radius * (right - left) / theta["axial_distance_m"]
+
+
+def settled_means(theta: Theta, left: Value, right: Value, wheel_left: Value, wheel_right: Value) -> Means:
+    """What is remembered of a robot whose commands and wheel speeds (rad/s) have been these for ever."""
+    body = _body_remembered(theta, *_ideal(theta, wheel_left, wheel_right))
+    remembered = _commands_remembered(theta, left, right) | body
+    return {name: values for name, (_, values) in remembered.items()}
 
 
 def _acts(effect: Effect, theta: Theta) -> bool:
@@ -124,7 +198,15 @@ def wheel_targets(
 ) -> tuple[Value, Value]:
     """Wheel speeds that the drive aims for (rad/s), from commands and the wheel speeds of the state."""
     u_left, u_right = left, right
+    remembered = _commands_remembered(theta, left, right)
     for feature, k in _terms(theta, "command"):
+        if feature in remembered:
+            memory, values = remembered[feature]
+            before = state.means.get(feature, (0.0, 0.0))
+            of_left, of_right = (memory.over(*pair, step_s) for pair in zip(before, values, strict=True))
+            left = left + k * memory.feature(u_left, u_right, of_left)
+            right = right + k * memory.feature(u_right, u_left, of_right)
+            continue
         left = left + k * COMMAND_FEATURES[feature](u_left, u_right, time_s)
         right = right + k * COMMAND_FEATURES[feature](u_right, u_left, time_s)
     for effect in _acting(theta, Stage.COMMAND):
@@ -158,14 +240,14 @@ def responded(theta: Theta, state: RobotState, left: Value, right: Value, time_s
 
 
 def body_velocity(
-    theta: Theta, left: Value, right: Value, change: Value, step_s: float, time_s: float
+    theta: Theta, left: Value, right: Value, change: Value, step_s: float, time_s: float, means: Means
 ) -> tuple[Value, Value, Value]:
     """Forward and lateral speed (m/s) of the tracked point and yaw rate (rad/s).
 
-    From the mean wheel speeds over a step and the change of their sum over it (rad/s).
+    From the mean wheel speeds over a step, the change of their sum over it (rad/s), and what was remembered before.
     """
     radius, axial = theta["wheel_radius_m"], theta["axial_distance_m"]
-    ideal = (radius * (right + left) / 2.0, radius * (right - left) / axial, radius * change / 2.0 / step_s, time_s)
+    ideal = (*_ideal(theta, left, right), radius * change / 2.0 / step_s, time_s)
     motion: dict[str, Value] = {
         "wheel_sum": left + right, "difference": right - left, "change": change, "time_s": time_s
     }  # fmt: skip
@@ -185,11 +267,21 @@ def body_velocity(
                 motion["turn"] = found
             case _:
                 across = across + found
-    v, omega = motion["forward"], 2.0 * motion["turn"]
-    v = v + sum(k * BODY_FEATURES[feature](*ideal) for feature, k in _terms(theta, "v_x"))
-    across = across + sum(k * BODY_FEATURES[feature](*ideal) for feature, k in _terms(theta, "v_y"))
-    omega = omega + sum(k * BODY_FEATURES[feature](*ideal) for feature, k in _terms(theta, "omega"))
-    return v, across - omega * theta["x_icr_m"], omega
+    remembered = _body_remembered(theta, *ideal[:2])
+
+    def added(target: str) -> Value:
+        total: Value = 0.0
+        for feature, k in _terms(theta, target):
+            if feature in remembered:
+                memory, (value,) = remembered[feature]
+                (before,) = means.get(feature, (0.0,))
+                total = total + k * memory.feature(*ideal[:2], memory.over(before, value, step_s))
+            else:
+                total = total + k * BODY_FEATURES[feature](*ideal)
+        return total
+
+    v, omega = motion["forward"] + added("v_x"), 2.0 * motion["turn"] + added("omega")
+    return v, across + added("v_y") - omega * theta["x_icr_m"], omega
 
 
 def step(
@@ -201,10 +293,19 @@ def step(
     at half the turn and is shorter than the arc by sin(z) / z, z = omega step / 2. With `euler` it moves straight,
     along the heading that the step begins with. What acts in the world comes on top.
     """
+    remembered = _commands_remembered(theta, left, right)
     left, right = wheel_targets(theta, state, left, right, time_s, step_s)
     end_left, end_right, mean_left, mean_right = responded(theta, state, left, right, time_s, step_s)
     change = (end_left + end_right) - (state.wheel_left + state.wheel_right)
-    v, v_lateral, omega = body_velocity(theta, mean_left, mean_right, change, step_s, time_s)
+    v, v_lateral, omega = body_velocity(theta, mean_left, mean_right, change, step_s, time_s, state.means)
+    remembered |= _body_remembered(theta, *_ideal(theta, mean_left, mean_right))
+    means = {
+        name: tuple(
+            memory.after(before, value, step_s)
+            for before, value in zip(state.means.get(name, (0.0,) * len(values)), values, strict=True)
+        )
+        for name, (memory, values) in remembered.items()
+    }
 
     middle = state.yaw + omega * step_s / 2.0
     chord = step_s * np.sinc(omega * step_s / 2.0 / np.pi)
@@ -215,4 +316,4 @@ def step(
     for effect in _acting(theta, Stage.WORLD):
         rolling = {"wheel_sum": mean_left + mean_right, "difference": mean_right - mean_left, "time_s": time_s}
         x, y = _called(effect, theta, {"x": x, "y": y, **rolling}, step_s)
-    return RobotState(x, y, state.yaw + omega * step_s, end_left, end_right), v, omega
+    return RobotState(x, y, state.yaw + omega * step_s, end_left, end_right, means), v, omega

@@ -21,9 +21,17 @@ from numpy.typing import NDArray
 from disco_hw.effects import Effect, Stage, asks_for
 from disco_hw.effects.registry import DELAY, REGISTRY, in_stages
 from disco_hw.jit import cast_like, compiled_for, kernel_function, scalar_function
+from disco_hw.model.added_terms import (
+    add_to_commands,
+    add_to_velocity,
+    count_means,
+    means_of,
+    new_means,
+    terms_need_change,
+)
 from disco_hw.model.coefficients import MOVES_RAD_S, NO_SLIDE, Base, Coefficients, Integration, base_point, effect_point
+from disco_hw.model.memory import Means
 from disco_hw.model.model import Model, coefficient_tables
-from disco_hw.model.terms import add_to_commands, add_to_velocity, terms_need_change
 
 Pose: TypeAlias = tuple[float, float, float, float]
 """x, y (m), cosine and sine of yaw."""
@@ -47,29 +55,32 @@ def integration_from(series: NDArray[np.floating], wide: object, euler: object) 
 
 @scalar_function
 def wheel_step(
-    left: float, right: float, wheel_left: float, wheel_right: float, time_s: float, effects: Coefficients
-) -> tuple[float, float, float, float]:
+    left: float, right: float, wheel_left: float, wheel_right: float, time_s: float, effects: Coefficients,
+    means: Means | None,
+) -> tuple[float, float, float, float]:  # fmt: skip
     """Wheel speeds at the end of a step and their means over it, left and right (rad/s).
 
-    From the commands (after the command delay), the wheel speeds at the start of the step and its time.
+    From the commands (after the command delay), the wheel speeds at the start of the step and its time. `means` of
+    commands that terms remember go on by the step.
     """
-    left, right = add_to_commands(left, right, time_s, effects.command_terms)
+    left, right = add_to_commands(left, right, time_s, effects.command_terms, means)
     turned: tuple[float, float, float, float] = wheel_terms(left, right, wheel_left, wheel_right, time_s, effects)
     return turned
 
 
 @scalar_function
 def body_velocity(
-    wheel_sum: float, difference: float, change: float, time_s: float, base: Base, effects: Coefficients
-) -> tuple[float, float | None, float]:
+    wheel_sum: float, difference: float, change: float, time_s: float, base: Base, effects: Coefficients,
+    means: Means | None,
+) -> tuple[float, float | None, float]:  # fmt: skip
     """Forward speed (m/s), lateral speed of the axle (m/s) or None, and half the yaw rate (rad/s).
 
     From the mean wheel speeds over a step, left plus right and right minus left, the change of their sum over it
-    (rad/s), and the time at its start (s).
+    (rad/s), and the time at its start (s). `means` of wheel speeds that terms remember go on by the step.
     """
     forward, lateral, turn = body_terms(wheel_sum, difference, change, time_s, base, effects)
     return add_to_velocity(
-        forward, lateral, turn, wheel_sum, difference, change, time_s, base, effects.body_terms
+        forward, lateral, turn, wheel_sum, difference, change, time_s, base, effects.body_terms, means
     )  # fmt: skip
 
 
@@ -167,12 +178,12 @@ def straight(
 @scalar_function
 def body_step(
     axle_x: float, axle_y: float, cos_yaw: float, sin_yaw: float, wheel_sum: float, difference: float, change: float,
-    time_s: float, base: Base, effects: Coefficients, integration: Integration,
+    time_s: float, base: Base, effects: Coefficients, integration: Integration, means: Means | None,
 ) -> tuple[float, float, float, float, float, float]:  # fmt: skip
     """The body's half of a step: the axle's point (m), cosine and sine of yaw after it; forward speed (m/s) and half
     the yaw rate (rad/s) over it. Wheel speeds as for `body_velocity`.
     """
-    forward, lateral, turn = body_velocity(wheel_sum, difference, change, time_s, base, effects)
+    forward, lateral, turn = body_velocity(wheel_sum, difference, change, time_s, base, effects, means)
     arc = move(axle_x, axle_y, cos_yaw, sin_yaw, forward, lateral, turn, integration)
     axle_x, axle_y, cos_yaw, sin_yaw = straight(
         integration.euler, arc, axle_x, axle_y, cos_yaw, sin_yaw, forward, lateral, turn, base, integration.step_s
@@ -185,18 +196,22 @@ def body_step(
 def step(
     axle_x: float, axle_y: float, cos_yaw: float, sin_yaw: float, wheel_left: float, wheel_right: float, left: float,
     right: float, time_s: float, base: Base, effects: Coefficients, integration: Integration,
+    command_means: Means | None, body_means: Means | None,
 ) -> tuple[float, float, float, float, float, float, float, float]:  # fmt: skip
     """One step of f_theta.
 
     State: the axle's point (m), cosine and sine of yaw, wheel speeds (rad/s); controls: the commands in force over the
     step (rad/s), after the command delay; the time at its start (s). Returns the state after it, the forward speed over
-    it (m/s) and half the yaw rate over it (rad/s).
+    it (m/s) and half the yaw rate over it (rad/s). The means that terms of commands and of the body remember, None
+    without such, are set to those at its end.
     """
-    end_left, end_right, mean_left, mean_right = wheel_step(left, right, wheel_left, wheel_right, time_s, effects)
+    end_left, end_right, mean_left, mean_right = wheel_step(
+        left, right, wheel_left, wheel_right, time_s, effects, command_means
+    )
     change = (end_left + end_right) - (wheel_left + wheel_right)
     axle_x, axle_y, cos_yaw, sin_yaw, forward, turn = body_step(
         axle_x, axle_y, cos_yaw, sin_yaw, mean_left + mean_right, mean_right - mean_left, change, time_s,
-        base, effects, integration,
+        base, effects, integration, body_means,
     )  # fmt: skip
     return axle_x, axle_y, cos_yaw, sin_yaw, end_left, end_right, forward, turn
 
@@ -353,21 +368,26 @@ class FreeRun:
         delay = getattr(self._effects, DELAY.name)
         self._run: Callable[..., None] | None = None
         self.past_rows = 0 if delay is None else int(delay[0].max()) + 1
+        self._remembers = new_means(self._effects) is not None
 
     def states(
-        self, start: Array, commands: Array, history: int, time_s: float = 0.0, point: int = 0, slide: Array = NO_SLIDE
-    ) -> Array:
+        self, start: Array, commands: Array, history: int, time_s: float = 0.0, point: int = 0,
+        slide: Array = NO_SLIDE, means: Array | None = None,
+    ) -> Array:  # fmt: skip
         """States (N + 1, 5) from `start` (5,): x, y (m), yaw (rad, not wrapped), wheel speeds (rad/s).
 
         `commands` (history + N, 2) rad/s, each held for a step; the first `history` rows were sent before and must be
         at least `past_rows`. `time_s`: the time at the start, for effects that depend on it. `point`: which of theta.
-        `slide` (3,): how the robot slides beside its model, `Disturbance.slides`.
+        `slide` (3,): how the robot slides beside its model, `Disturbance.slides`. `means` (n,): what the model's terms
+        remember of what acted up to the start, as `PastMotion` gives it, set to what they remember at the end; without
+        them nothing was before.
         """
         states = np.empty((commands.shape[0] - history + 1, 5))
         states[0] = start
         # A fresh copy, as a read-only array or a strided one is another type and would be compiled anew, in mid-loop.
         own = np.array(commands, dtype=np.float64, order="C")
-        arguments = states, own, history, float(time_s), point, slide, self._base, self._effects, self._series
+        kept = None if not self._remembers else new_means(self._effects) if means is None else means
+        arguments = states, own, history, float(time_s), point, slide, kept, self._base, self._effects, self._series
         if self._run is None:
             self._run = compiled_for(run_states, *arguments)
         self._run(*arguments)
@@ -396,12 +416,14 @@ def simulate(model: Model, commands: Array, step_s: float = 0.02, start: Array |
 
 @kernel_function
 def run_states(
-    states: Array, commands: Array, history: int, time_s: float, point: int, slide: Array, base: Base,
-    effects: Coefficients, series: NDArray[np.floating],
+    states: Array, commands: Array, history: int, time_s: float, point: int, slide: Array, means: Array | None,
+    base: Base, effects: Coefficients, series: NDArray[np.floating],
 ) -> None:  # fmt: skip
     """Fill `states[1:]` from `states[0]`; as `FreeRun.states`."""
     integration = integration_from(series, True, None)
     here, acting = base_point(base, point), effect_point(effects, point)
+    command_means = means_of(acting.command_terms, means, np.uintp(0), np.uintp(1))
+    body_means = means_of(acting.body_terms, means, np.uintp(count_means(acting.command_terms)), np.uintp(1))
     x, y, yaw = states[0, 0], states[0, 1], states[0, 2]
     wheel_left, wheel_right = states[0, 3], states[0, 4]
     cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
@@ -415,7 +437,7 @@ def run_states(
         right = in_force(commands[recent, 1], commands[older, 1], acting)
         axle_x, axle_y, cos_yaw, sin_yaw, wheel_left, wheel_right, _, turn = step(
             axle_x, axle_y, cos_yaw, sin_yaw, wheel_left, wheel_right, left, right,
-            time_s + t * integration.step_s, here, acting, integration,
+            time_s + t * integration.step_s, here, acting, integration, command_means, body_means,
         )  # fmt: skip
         yaw = yaw + (turn + turn) * integration.step_s
         x, y = tracked_of(axle_x, axle_y, cos_yaw, sin_yaw, here)

@@ -1,26 +1,26 @@
 """Terms without a name: a feature of the motion, times a number, added to a command or to a velocity of the body.
 
 What a log shows to be missing and no named effect explains becomes such a term, written as its equation, for example
-`v_x += k v^3`. Terms stand in a model's list of effects; a model that has none compiles to nothing of this file.
+`v_x += k v^3`. Terms stand in a model's list of effects; some remember (`disco_hw.model.memory`). What the compiled
+step makes of them is in `disco_hw.model.added_terms`.
 """
 
 from __future__ import annotations
 
 import re
-from collections import namedtuple
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numba import types
 from numpy.typing import NDArray
 
 from disco_hw.effects import Channel, Effect, Parameter, Stage
 from disco_hw.effects.registry import REGISTRY
-from disco_hw.jit import cast_like, scalar_function, specialise
-from disco_hw.model.coefficients import Base, TermCoefficients, Terms
+from disco_hw.jit import cast_like, specialise
+from disco_hw.model.memory import BODY_MEMORIES, COMMAND_MEMORIES, Remembered
 
 Array = NDArray[np.float64]
 Feature = Callable[..., Any]
@@ -115,6 +115,11 @@ def _coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...
     return values[:, 0], np.full(values.shape[0], 1.0 / step_s)
 
 
+def _following(memory: Remembered, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
+    """k, and how the mean follows: by the end of a step and in the mean over it; each (L,)."""
+    return values[:, 0], *(np.full(values.shape[0], part) for part in memory.follows(step_s))
+
+
 @dataclass(frozen=True, slots=True)
 class GenericTerm:
     """A term: `target` of `COMMAND` and `BODY_TARGETS` gains k times the feature."""
@@ -128,6 +133,21 @@ class GenericTerm:
         return term_name(self.target, self.feature)
 
     @property
+    def memory(self) -> Remembered | None:
+        """What it remembers; None for a term of what is alone."""
+        return (COMMAND_MEMORIES if self.target == COMMAND else BODY_MEMORIES[self.target]).get(self.feature)
+
+    @property
+    def means(self) -> int:
+        """Number of means that are kept for it: one for each wheel's command, or one of the body."""
+        return 0 if self.memory is None else 2 if self.target == COMMAND else 1
+
+    @property
+    def needs_acceleration(self) -> bool:
+        """Whether its feature is of the acceleration."""
+        return re.search(r"\ba\b", self.feature) is not None
+
+    @property
     def effect(self) -> Effect:
         """The term as an effect of a model; k is in SI units."""
         return Effect(
@@ -136,7 +156,7 @@ class GenericTerm:
             stage=Stage.TERMS,
             parameters=(Parameter("k", "SI", -np.inf, np.inf, 0.0),),
             plain=_nothing_plain,
-            coefficients=_coefficients,
+            coefficients=_coefficients if self.memory is None else partial(_following, self.memory),
             may_turn_more=self.target == "omega",
             excitation="the drive in which it was found",
             script="excite",
@@ -150,6 +170,8 @@ class GenericTerm:
         """
         if self.target == COMMAND:
             return 1.0
+        if self.memory is not None:
+            return float(radius_ratio**-1.0 * axial_ratio ** self.feature.startswith("(omega"))
         forward = (
             len(re.findall(r"\bv\b|\ba\b", self.feature)) + 1 * ("v^2" in self.feature) + 2 * ("v^3" in self.feature)
         )
@@ -162,7 +184,10 @@ class GenericTerm:
 TERMS: Mapping[str, GenericTerm] = MappingProxyType(
     {
         term.name: term
-        for target, features in ((COMMAND, COMMAND_FEATURES), *((axis, BODY_FEATURES) for axis in BODY_TARGETS))
+        for target, features in (
+            (COMMAND, (*COMMAND_FEATURES, *COMMAND_MEMORIES)),
+            *((axis, (*BODY_FEATURES, *BODY_MEMORIES[axis])) for axis in BODY_TARGETS),
+        )
         for term in (GenericTerm(target, feature) for feature in features)
     }
 )
@@ -176,138 +201,11 @@ def effect_of(name: str) -> Effect:
     return REGISTRY[name] if name in REGISTRY else _TERM_EFFECTS[name]
 
 
-def _entry_type(name: str) -> Any:
-    kind: Any = namedtuple
-    made = kind("Term" + "".join(f"_{ord(c):x}" if not c.isalnum() else c for c in name), ("k", "per_s"))
-    made.__module__ = __name__
-    return made
-
-
-# A type for every term: the compiler sees in the types alone which terms a model has.
-_ENTRIES: Mapping[str, Any] = MappingProxyType({name: _entry_type(name) for name in TERMS})
-_NAME_OF: Mapping[Any, str] = MappingProxyType({kind: name for name, kind in _ENTRIES.items()})
-# Compiled code that is kept on disk finds its types by their names in this module.
-globals().update({kind.__name__: kind for kind in _ENTRIES.values()})
-_COMPILED: Mapping[str, Any] = MappingProxyType(
-    {
-        name: scalar_function((COMMAND_FEATURES if term.target == COMMAND else BODY_FEATURES)[term.feature])
-        for name, term in TERMS.items()
-    }
-)
-
-
-def table_entry(name: str, columns: tuple[NDArray[np.floating], ...]) -> TermCoefficients:
-    """A term's coefficients, arrays (L,), in the form that the step takes."""
-    made: TermCoefficients = _ENTRIES[name](*columns)
-    return made
-
-
-def add_to_commands(left: float, right: float, time_s: float, terms: Terms | None) -> tuple[float, float]:
-    """Both commands (rad/s) with the terms that act on them."""
-    if terms is None:
-        return left, right
-    new_left, new_right = left, right
-    for term in terms:
-        feature = COMMAND_FEATURES[TERMS[_NAME_OF[type(term)]].feature]
-        new_left = new_left + term.k * feature(left, right, time_s)
-        new_right = new_right + term.k * feature(right, left, time_s)
-    return new_left, new_right
-
-
-# What is overloaded is chosen by numba's types; those of tuples have fields that its annotations do not know.
-@specialise(add_to_commands)
-def _add_to_commands(left: types.Type, right: types.Type, time_s: types.Type, terms: Any) -> Callable[..., Any]:
-    if isinstance(terms, types.NoneType):
-        return lambda left, right, time_s, terms: (left, right)
-    scope, lines = {}, ["new_left, new_right = left, right"]
-    for n, kind in enumerate(terms.types):
-        scope[f"feature{n}"] = _COMPILED[_NAME_OF[kind.instance_class]]
-        lines += [
-            f"new_left = new_left + terms[{n}].k * feature{n}(left, right, time_s)",
-            f"new_right = new_right + terms[{n}].k * feature{n}(right, left, time_s)",
-        ]
-    return _made("add_to_commands", "left, right, time_s, terms", [*lines, "return new_left, new_right"], scope)
-
-
-@scalar_function
-def _plus(lateral: float | None, more: float) -> float:
-    if lateral is None:
-        return more
-    return lateral + more
-
-
-def add_to_velocity(
-    forward: float, lateral: float | None, turn: float, wheel_sum: float, difference: float, change: float,
-    time_s: float, base: Base, terms: Terms | None,
-) -> tuple[float, float | None, float]:  # fmt: skip
-    """Forward and lateral speed (m/s) and half the yaw rate (rad/s) with the terms; wheels as for `body_velocity`."""
-    if terms is None:
-        return forward, lateral, turn
-    v, w = base.half_radius_m * wheel_sum, 2.0 * base.half_turn_ratio * difference
-    for term in terms:
-        made = TERMS[_NAME_OF[type(term)]]
-        more = term.k * BODY_FEATURES[made.feature](v, w, base.half_radius_m * change * term.per_s, time_s)
-        match made.target:
-            case "v_x":
-                forward = forward + more
-            case "v_y":
-                lateral = more if lateral is None else lateral + more
-            case _:
-                turn = turn + 0.5 * more
-    return forward, lateral, turn
-
-
-@specialise(add_to_velocity)
-def _add_to_velocity(
-    forward: types.Type, lateral: types.Type, turn: types.Type, wheel_sum: types.Type, difference: types.Type,
-    change: types.Type, time_s: types.Type, base: types.Type, terms: Any,
-) -> Callable[..., Any]:  # fmt: skip
-    arguments = "forward, lateral, turn, wheel_sum, difference, change, time_s, base, terms"
-    if isinstance(terms, types.NoneType):
-        return _made("add_to_velocity", arguments, ["return forward, lateral, turn"], {})
-    scope: dict[str, Any] = {"plus": _plus, "cast_like": cast_like}
-    lines = [
-        "v = base.half_radius_m * wheel_sum",
-        "w = (base.half_turn_ratio + base.half_turn_ratio) * difference",
-        "new_forward, new_turn, lateral0 = forward, turn, lateral",
-    ]
-    across = 0
-    for n, kind in enumerate(terms.types):
-        term = TERMS[_NAME_OF[kind.instance_class]]
-        scope[f"feature{n}"] = _COMPILED[term.name]
-        acceleration = f"base.half_radius_m * change * terms[{n}].per_s" if _reads_change(term) else "v"
-        more = f"terms[{n}].k * feature{n}(v, w, {acceleration}, time_s)"
-        match term.target:
-            case "v_x":
-                lines.append(f"new_forward = new_forward + {more}")
-            case "v_y":
-                lines.append(f"lateral{across + 1} = plus(lateral{across}, {more})")
-                across += 1
-            case _:
-                lines.append(f"new_turn = new_turn + cast_like(0.5, turn) * ({more})")
-    return _made("add_to_velocity", arguments, [*lines, f"return new_forward, lateral{across}, new_turn"], scope)
-
-
-def _reads_change(term: GenericTerm) -> bool:
-    return re.search(r"\ba\b", term.feature) is not None
-
-
-def terms_need_change(terms: Terms | None) -> bool:
-    """Whether any of the body's terms depends on the acceleration; a constant to the compiler."""
-    return terms is not None and any(_reads_change(TERMS[_NAME_OF[type(term)]]) for term in terms)
-
-
-@specialise(terms_need_change)
-def _terms_need_change(terms: Any) -> Callable[..., Any]:
-    present = [] if isinstance(terms, types.NoneType) else [_NAME_OF[kind.instance_class] for kind in terms.types]
-    if any(_reads_change(TERMS[name]) for name in present):
-        return lambda terms: True
-    return lambda terms: False
-
-
-def _made(name: str, arguments: str, lines: list[str], scope: dict[str, Any]) -> Callable[..., Any]:
-    """A function of these lines; a tuple of mixed types cannot be looped over in compiled code."""
-    body = "\n".join(f"    {line}" for line in lines)
-    exec(f"def {name}({arguments}):\n{body}", scope)
-    made: Callable[..., Any] = scope[name]
-    return made
+def memories_of(names: Iterable[str]) -> tuple[tuple[Remembered, ...], tuple[Remembered, ...]]:
+    """What the terms among a model's effects remember, of commands and of the body, in the order of their means."""
+    remembering = [term for term in (TERMS.get(name) for name in names) if term is not None and term.memory is not None]
+    of_commands, of_body = (
+        tuple(term.memory for term in remembering if term.memory is not None and (term.target == COMMAND) is wanted)
+        for wanted in (True, False)
+    )
+    return of_commands, of_body

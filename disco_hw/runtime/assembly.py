@@ -26,6 +26,7 @@ from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.log.recorder import Recorder
 from disco_hw.model import Model
 from disco_hw.runtime.core import DaemonCore
+from disco_hw.runtime.drive_means import DriveMeans
 from disco_hw.runtime.pipeline import Governor, Pipeline, Planner, WheelLimits
 from disco_hw.runtime.preflight import check_firmware_limits, check_task, failures
 from disco_hw.runtime.robot_setup import Setup, geometry
@@ -70,6 +71,7 @@ def make_pipeline(config: RobotConfig, model: Model, planner: Planner) -> Pipeli
         governor=Governor(limits, 1.0 / config.control.rate_hz),
         plan_tail_s=config.control.plan_tail_s,
         disturbance=DisturbanceEstimator() if config.control.disturbance else None,
+        means=DriveMeans.of(model),
     )
 
 

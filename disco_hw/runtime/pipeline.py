@@ -24,6 +24,7 @@ from disco_hw.estimation.correction import DisturbanceEstimator, PoseUpdate
 from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.model import Belief
 from disco_hw.model.coefficients import NO_DISTURBANCE, Disturbance
+from disco_hw.runtime.drive_means import DriveMeans
 from disco_hw.tasks import PlannedTask
 from drivers.types import PoseSample, Readings
 
@@ -261,9 +262,10 @@ class Pipeline:
 
     def __init__(
         self, fusion: PoseFusion, planner: Planner, governor: Governor, plan_tail_s: float,
-        disturbance: DisturbanceEstimator | None = None,
+        disturbance: DisturbanceEstimator | None = None, means: DriveMeans | None = None,
     ) -> None:  # fmt: skip
         self._fusion = fusion
+        self._means = means
         self._disturbance = disturbance
         self._planner = planner
         self._governor = governor
@@ -317,6 +319,9 @@ class Pipeline:
         updates = tuple(self._take_pose(pose, now_ns) for pose in readings.poses)
         self._fusion.sources.step(now_ns)
         estimate = self._fusion.estimate(now_ns)
+        if self._means is not None and self._last_ns is not None:
+            between_s = (now_ns - self._last_ns) * 1e-9
+            self._means.add_wheels(estimate.left_speed_rad_s, estimate.right_speed_rad_s, between_s)
         mark("estimate")
         plan, failure = None, None
         if isinstance(motion, FollowTask):
@@ -359,6 +364,8 @@ class Pipeline:
             right_speed_rad_s=estimate.right_speed_rad_s,
             sent=tuple(self._sent),
             disturbance=self.disturbance,
+            command_means=() if self._means is None else self._means.commands,
+            body_means=() if self._means is None else self._means.body,
         )
         try:
             plan = self._planner.plan(now_ns, state)
@@ -392,5 +399,7 @@ class Pipeline:
         command = self._governor.step(requested[0], requested[1], dt_s)
         self._sent.append(SentCommand(now_ns, command.left_rad_s, command.right_rad_s))
         while now_ns - self._sent[0].t_ns > HISTORY_NS:
-            self._sent.popleft()
+            gone = self._sent.popleft()
+            if self._means is not None:
+                self._means.add_command(gone.left_rad_s, gone.right_rad_s, (self._sent[0].t_ns - gone.t_ns) * 1e-9)
         return command

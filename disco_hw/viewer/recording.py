@@ -19,7 +19,7 @@ from disco_hw.log import records
 from disco_hw.log.reader import Log
 from disco_hw.log.records import TOPICS, BeliefChange, FrameIn, FrameOut, Plan, Task
 from disco_hw.model import Model
-from disco_hw.model.plain import RobotState, delayed, step, theta_of
+from disco_hw.model.plain import RobotState, delayed, settled_means, step, theta_of
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.robot_setup import Setup, geometry, load_setup, setup_of_log, task_of
 from disco_hw.tasks import RobotTask
@@ -152,7 +152,8 @@ class ParameterPoints:
     def trajectories(self, plan: Plan, wheel_speeds: tuple[float, float]) -> Array:
         """Positions (L, T + 1, 2) m of L sigma points from the plan's start, under its commands; (0, 0, 2) without.
 
-        `wheel_speeds` (left, right) rad/s at the start. Commands sent before the plan are taken as its first.
+        `wheel_speeds` (left, right) rad/s at the start. Commands sent before the plan are taken as its first, and what
+        terms remember as that and these speeds for ever.
         """
         if not plan.path_x_m or not plan.left_rad_s:
             return np.empty((0, 0, 2))
@@ -178,6 +179,7 @@ class ParameterPoints:
             plan.path_yaw_rad[0] * ones,
             wheel_speeds[0] * ones,
             wheel_speeds[1] * ones,
+            settled_means(theta, commands[0, 0], commands[0, 1], *wheel_speeds),
         )
         path = np.empty((len(points), len(commands) + 1, 2))
         path[:, 0] = np.stack((state.x, state.y), axis=-1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,8 @@ from disco_hw.config import Estimation
 from disco_hw.control import Diagnostics, NoValidControl
 from disco_hw.estimation import PoseFusion
 from disco_hw.estimation.odometry import OdometryParameters
+from disco_hw.model import EffectSetting, Model
+from disco_hw.runtime.drive_means import DriveMeans
 from disco_hw.runtime.pipeline import FollowTask, Governor, Limited, Manual, Off, Pipeline, Source, Stand, WheelLimits
 from drivers.types import PoseSample, Readings, WheelSample
 
@@ -45,9 +49,9 @@ class Scripted:
         self.resets += 1
 
 
-def make(planner, plan_tail_s: float = 0.06) -> Pipeline:
+def make(planner, plan_tail_s: float = 0.06, means: DriveMeans | None = None) -> Pipeline:
     fusion = PoseFusion(Estimation(), OdometryParameters(0.06, 0.4, 0.0), 0.05)
-    return Pipeline(fusion, planner, Governor(WheelLimits(8.0, 20.0, 20.0), 0.02), plan_tail_s)
+    return Pipeline(fusion, planner, Governor(WheelLimits(8.0, 20.0, 20.0), 0.02), plan_tail_s, means=means)
 
 
 def run(pipeline: Pipeline, motions, start: int = 0):
@@ -140,3 +144,42 @@ def test_stages_are_marked_in_order():
     marked = []
     make(Scripted()).step(0, Readings(), Off(), marked.append)
     assert marked == ["estimate", "plan"]
+
+
+def test_what_terms_remember_is_kept_up_while_something_else_drives():
+    model = Model(
+        0.06, 0.4,
+        effects=tuple(
+            EffectSetting(name, {"k": 0.1}) for name in ("command += k u mean_30s(u^2)", "v_x += k (v - mean_3s(v))")
+        ),
+    )  # fmt: skip
+    planner = Scripted(1.0)
+    pipeline = make(planner, means=DriveMeans.of(model))
+    ticks, turned = [], 0.0
+    for k in range(200):
+        speed = ticks[-1].command.left_rad_s if ticks else 0.0
+        turned += 0.02 * speed
+        wheels = WheelSample(PERIOD_NS * k, PERIOD_NS * k, turned, 0.0, speed, 0.0)
+        motion = FollowTask() if k == 199 else Manual(3.0, 0.03 * k - 2.0)
+        ticks.append(pipeline.step(PERIOD_NS * k, Readings(wheels=(wheels,)), motion))
+    (state,) = planner.states
+    # The commands since the state's first one are in `sent`; up to it they are averaged.
+    gone = [tick.command for tick in ticks if tick.t_ns < state.sent[0].t_ns]
+    expected, keep = [0.0, 0.0], math.exp(-0.02 / 30.0)
+    for command in gone:
+        speeds = command.left_rad_s, command.right_rad_s
+        expected = [u * u + (mean - u * u) * keep for u, mean in zip(speeds, expected, strict=True)]
+    assert len(gone) == 98
+    assert state.command_means == (pytest.approx(tuple(expected)),)
+    total = 0.0
+    for tick in ticks[1:]:
+        both = tick.estimate.left_speed_rad_s + tick.estimate.right_speed_rad_s
+        total = both + (total - both) * math.exp(-0.02 / 3.0)
+    assert state.body_means == pytest.approx((total,))
+    assert total > 1.0
+
+
+def test_a_model_without_memory_gives_the_planner_none():
+    planner = Scripted(1.0)
+    run(make(planner), [Off(), FollowTask()])
+    assert (planner.states[0].command_means, planner.states[0].body_means) == ((), ())

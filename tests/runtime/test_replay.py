@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,8 @@ from disco_hw.errors import InputError
 from disco_hw.log import MODEL_TOML, ROBOT_TOML, Attachment
 from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
 from disco_hw.log.records import UnexplainedMotion
+from disco_hw.model import EffectSetting, load_model, save_model
+from disco_hw.runtime.drive_means import DriveMeans
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.supervisor import UserRequest
@@ -78,6 +81,28 @@ def test_what_no_parameter_explains_is_recorded_and_replays_bit_for_bit(tmp_path
     report = replay(write_log(tmp_path / "wrong.mcap", wrong, text))
     assert report.difference is not None
     assert report.difference.field == "UnexplainedMotion.left"
+
+
+def test_a_drive_whose_model_remembers_replays_bit_for_bit(tmp_path, monkeypatch):
+    model = load_model(ROBOTS / "wombot_model.toml")
+    terms = {"command += k sign(u - mean_1s(u))": -0.2, "omega += k (omega - mean_1s(omega))": -0.3}
+    model = replace(model, effects=tuple(EffectSetting(name, {"k": k}) for name, k in terms.items()))
+    save_model(model, tmp_path / "model.toml")
+    text = (ROBOTS / "wombot.toml").read_text().replace("wombot_model.toml", "model.toml")
+    (tmp_path / "robot.toml").write_text(text)
+    stack = simulated_stack(robot_file=tmp_path / "robot.toml")
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ARM)
+    # Longer than commands are kept one by one.
+    stack.run(3.0, UserRequest.START)
+    ticks = stack.recorder.ticks
+    log = write_log(tmp_path / "run.mcap", ticks, text, (tmp_path / "model.toml").read_text())
+    report = replay(log)
+    assert report.ok, report.as_text()
+    for forgotten in ("add_command", "add_wheels"):
+        with monkeypatch.context() as patch:
+            patch.setattr(DriveMeans, forgotten, lambda *_: None)
+            assert not replay(log).ok
 
 
 def test_a_follower_takes_over_from_a_planner_that_finds_nothing_and_replays_bit_for_bit(tmp_path, monkeypatch):

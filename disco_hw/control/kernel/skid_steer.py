@@ -8,7 +8,7 @@ them is costed. What is absent is None, in arguments of their own, as the compil
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from disco_hw.control.kernel import (
     AXLE_X,
     AXLE_Y,
     BLOCK,
+    BODY_REMEMBERED,
     CHANNELS,
     COLUMNS,
     COS,
@@ -29,6 +30,7 @@ from disco_hw.control.kernel import (
     LEFT,
     MEMORY,
     OWN,
+    REMEMBERED,
     RIGHT,
     ROW,
     SCALED0,
@@ -50,6 +52,7 @@ from disco_hw.control.kernel import (
     terminal_cost,
 )
 from disco_hw.jit import bits_of_float, block_function, cast_like, float_from_bits, scalar_function, tune_loops
+from disco_hw.model.added_terms import count_means, means_of
 from disco_hw.model.coefficients import (
     MOVES_RAD_S,
     Base,
@@ -93,6 +96,7 @@ class SkidSteer(NamedTuple):
     (s), the task's memory; how far the ground carries the robot in a step along x and y (m), in proportion to the size
     of equivalent points, and how far it slides to the left for each metre forward (`model/coefficients.py`). `slides`:
     None, or anything else if the last three count.
+    `means` (L, n): what the terms of each point remember at the start, of commands first, or None where none remembers.
     `base`, `effects`: coefficient tables of L points; `each` is None, or anything else if the
     tables hold points for every sample, (L, K'). `ahead`, `scaled` (L, 2) int or None: pairs of points that
     share a point's rollout, as `parameter_points.equivalent_points` finds them. `skip_mean`: None, or anything else if
@@ -104,6 +108,7 @@ class SkidSteer(NamedTuple):
 
     start: Floats
     slides: Absent
+    means: Floats | None
     base: Base
     effects: Coefficients
     each: Absent
@@ -127,6 +132,8 @@ def _turn_wheels(
     commands: Floats,
     state: Floats,
     start: Floats,
+    means: Floats | None,
+    point: int,
     effects: Coefficients,
     late: int,
     step_s: float,
@@ -136,6 +143,7 @@ def _turn_wheels(
     for b in range(BLOCK):
         state[LEFT + b] = start[4]
         state[RIGHT + b] = start[5]
+    _begin_means(means, state, REMEMBERED, point, U(0), effects.command_terms)
     for t in range(horizon):
         time_s = start[6] + cast_like(t, step_s) * step_s
         recent = U((t + late) * CHANNELS) * BLOCK
@@ -146,13 +154,26 @@ def _turn_wheels(
             left = in_force(commands[recent + b], commands[older + b], acting)
             right = in_force(commands[recent + BLOCK + b], commands[older + BLOCK + b], acting)
             was_left, was_right = state[LEFT + b], state[RIGHT + b]
-            end_left, end_right, mean_left, mean_right = wheel_step(left, right, was_left, was_right, time_s, acting)
+            end_left, end_right, mean_left, mean_right = wheel_step(
+                left, right, was_left, was_right, time_s, acting,
+                means_of(acting.command_terms, state, REMEMBERED + b, BLOCK),
+            )  # fmt: skip
             state[LEFT + b] = end_left
             state[RIGHT + b] = end_right
             wheels[row + SUM + b] = mean_left + mean_right
             wheels[row + DIFFERENCE + b] = mean_right - mean_left
             if needs_change(acting):
                 wheels[change_row + b] = (end_left + end_right) - (was_left + was_right)
+
+
+@scalar_function
+def _begin_means(means: Floats | None, state: Floats, row: int, point: int, first: int, terms: Any) -> None:
+    """Set the rows from `row` on to the means of a point's terms, from number `first` on; nothing if none remembers."""
+    if means is None:
+        return
+    for n in range(U(count_means(terms))):
+        for b in range(BLOCK):
+            state[row + n * BLOCK + b] = means[point, first + n]
 
 
 @scalar_function
@@ -189,6 +210,7 @@ def _move(
     axle_x, axle_y, cos_yaw, sin_yaw, forward, _ = body_step(
         state[AXLE_X + b], state[AXLE_Y + b], state[COS + b], state[SIN + b],
         wheel_sum, difference, change, time_s, base, effects, integration,
+        means_of(effects.body_terms, state, BODY_REMEMBERED + b, BLOCK),
     )  # fmt: skip
     step_x, step_y = axle_x - state[AXLE_X + b], axle_y - state[AXLE_Y + b]
     axle_x, axle_y = _slid(slides, axle_x, axle_y, step_x, step_y, wheel_sum, difference, start)
@@ -394,8 +416,8 @@ def _end(
 @block_function
 def _roll(
     costs: Floats, at: int, ahead_at: CostPlaces, scaled_at: CostPlaces, horizon: int, commands: Floats, late: int,
-    wheels: Floats, state: Floats, slides: Absent, start: Floats, base: Base, skip_mean: Absent, ahead: BasePair,
-    scaled: BasePair, effects: Coefficients, integration: Integration, task: Terms,
+    wheels: Floats, state: Floats, slides: Absent, start: Floats, means: Floats | None, point: int, base: Base,
+    skip_mean: Absent, ahead: BasePair, scaled: BasePair, effects: Coefficients, integration: Integration, task: Terms,
 ) -> None:  # fmt: skip
     """Roll the block out from `start` with its wheels turning as in `wheels`; writes `costs[at:at + BLOCK]`.
 
@@ -416,6 +438,7 @@ def _roll(
         _begin(state, AHEAD1, b, start, task)
         _begin(state, SCALED0, b, start, task)
         _begin(state, SCALED1, b, start, task)
+    _begin_means(means, state, BODY_REMEMBERED, point, U(count_means(effects.command_terms)), effects.body_terms)
     _look_ups(looks_up(task), state, skip_mean, ahead, scaled, task)
     for t in range(horizon):
         time_s = start[6] + cast_like(t, x) * integration.step_s
@@ -468,7 +491,8 @@ def _roll_points(
     padded: int, block: int, horizon: int, commands: Floats, state: Floats,
 ) -> None:  # fmt: skip
     integration = integration_from(system.series, system.wide, system.euler)
-    slides, start, wheels, task = system.slides, system.start, system.wheels, system.task
+    slides, start, means = system.slides, system.start, system.means
+    wheels, task = system.wheels, system.task
     lane = U(block) * BLOCK
     for i in range(points):
         at = U(i * padded) + lane
@@ -476,14 +500,16 @@ def _roll_points(
         late = system.history - delay_steps(acting)
         if each is not None:
             if needs_change(acting) or not wheels_follow(acting):
-                _turn_wheels(wheels, at, horizon, commands, state, start, system.effects, late, integration.step_s)
+                _turn_wheels(
+                    wheels, at, horizon, commands, state, start, means, i, system.effects, late, integration.step_s
+                )
             _roll(
-                costs, at, None, None, horizon, commands, late, wheels, state, slides, start, system.base, None, None,
-                None, system.effects, integration, task,
+                costs, at, None, None, horizon, commands, late, wheels, state, slides, start, means, i, system.base,
+                None, None, None, system.effects, integration, task,
             )  # fmt: skip
         else:
             if (i == 0 or system.wheels_differ) and (needs_change(acting) or not wheels_follow(acting)):
-                _turn_wheels(wheels, at, horizon, commands, state, start, acting, late, integration.step_s)
+                _turn_wheels(wheels, at, horizon, commands, state, start, means, i, acting, late, integration.step_s)
             alone = i > 0 or skip_mean is None
             if ahead is not None:
                 # Whatever leads equivalent points beside the first point is costed in a rollout of its own.
@@ -492,19 +518,19 @@ def _roll_points(
                     if scaled is None:
                         _roll(
                             costs, at, _places(ahead[i], padded, lane), None, horizon, commands, late, wheels, state,
-                            slides, start, here, skip_mean, _bases(system.base, ahead[i]), None, acting, integration,
-                            task,
+                            slides, start, means, i, here, skip_mean, _bases(system.base, ahead[i]), None, acting,
+                            integration, task,
                         )  # fmt: skip
                     else:
                         _roll(
                             costs, at, _places(ahead[i], padded, lane), _places(scaled[i], padded, lane), horizon,
-                            commands, late, wheels, state, slides, start, here, skip_mean,
+                            commands, late, wheels, state, slides, start, means, i, here, skip_mean,
                             _bases(system.base, ahead[i]), _bases(system.base, scaled[i]), acting, integration, task,
                         )  # fmt: skip
             if alone:
                 _roll(
-                    costs, at, None, None, horizon, commands, late, wheels, state, slides, start, here, None, None,
-                    None, acting, integration, task,
+                    costs, at, None, None, horizon, commands, late, wheels, state, slides, start, means, i, here, None,
+                    None, None, acting, integration, task,
                 )  # fmt: skip
 
 

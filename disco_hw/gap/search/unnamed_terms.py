@@ -19,7 +19,15 @@ from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.settings import GRID_STEP_S, GapSettings, TermSettings
 from disco_hw.model import EffectSetting
 from disco_hw.model.memory import BODY_MEMORIES, COMMAND_MEMORIES
-from disco_hw.model.terms import BODY_FEATURES, BODY_TARGETS, COMMAND, COMMAND_FEATURES, TERMS, term_name
+from disco_hw.model.terms import (
+    BODY_FEATURES,
+    BODY_TARGETS,
+    COMMAND,
+    COMMAND_FEATURES,
+    TERMS,
+    GenericTerm,
+    term_name,
+)
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -64,7 +72,8 @@ def wheel_terms(channel: WheelChannel, late_s: float) -> Iterator[Term]:
         name = term_name(COMMAND, form)
         yield Term(_with_place(name), feature(u, other, t), name)
     for form, memory in COMMAND_MEMORIES.items():
-        yield Term(_with_place(term_name(COMMAND, form)), memory.at_nodes(GRID_STEP_S, u, other))
+        name = term_name(COMMAND, form)
+        yield Term(_with_place(name), memory.at_nodes(GRID_STEP_S, u, other), name)
     growth = np.gradient(u, GRID_STEP_S, axis=0)
     sign = COMMAND_FEATURES["sign(u)"](u, other, t)
     angle = drive.angle_rad
@@ -93,12 +102,14 @@ def body_terms(channel: BodyChannel, p: Array) -> Iterator[Term]:
     dw = np.gradient(smoothed(w, drive.settings.terms), GRID_STEP_S)
     moving = np.minimum(np.abs(drive.speed_rad_s).max(axis=1) * p[0] / 0.05, 1.0)
     beyond = {"moving": moving, "domega/dt": dw, "v domega/dt": v * dw}
+    geometry = float(p[0]), float(p[1])
     for axis, target in enumerate(BODY_TARGETS):
         for form, feature in BODY_FEATURES.items():
             name = term_name(target, form)
-            yield Term(_with_place(name), _on(axis, feature(v, w, a, drive.t_s)), name, (float(p[0]), float(p[1])))
+            yield Term(_with_place(name), _on(axis, feature(v, w, a, drive.t_s)), name, geometry)
         for form, memory in BODY_MEMORIES[target].items():
-            yield Term(_with_place(term_name(target, form)), _on(axis, memory.at_nodes(GRID_STEP_S, v, w)))
+            name = term_name(target, form)
+            yield Term(_with_place(name), _on(axis, memory.at_nodes(GRID_STEP_S, v, w)), name, geometry)
         for form, perturbation in beyond.items():
             yield Term(_with_place(term_name(target, form)), _on(axis, perturbation))
     left, right = drive.speed_rad_s[:, 0] * p[0] / 2.0, drive.speed_rad_s[:, 1] * p[0] / 2.0
@@ -128,13 +139,27 @@ def with_known_terms(drive: GriddedDrive, effects: Iterable[EffectSetting], p: A
         if term is None:
             continue
         if term.target == COMMAND:
-            perturbation = setting.values["k"] * COMMAND_FEATURES[term.feature](u, u[:, ::-1], drive.t_s[:, None])
+            perturbation = setting.values["k"] * _of_commands(term, u, drive.t_s)
             command = perturbation if command is None else command + perturbation
         else:
-            perturbation = setting.values["k"] * BODY_FEATURES[term.feature](v, w, a, drive.t_s)
+            perturbation = setting.values["k"] * _of_body(term, v, w, a, drive.t_s)
             perturbation = _on(BODY_TARGETS.index(term.target), perturbation)
             motion_perturbation = perturbation if motion_perturbation is None else motion_perturbation + perturbation
     return replace(drive, known_command=command, known_motion=motion_perturbation)
+
+
+def _of_commands(term: GenericTerm, u: Array, t_s: Array) -> Array:
+    """The feature of a term of commands (M, 2) at the nodes."""
+    if term.memory is not None:
+        return term.memory.at_nodes(GRID_STEP_S, u, u[:, ::-1])
+    return np.asarray(COMMAND_FEATURES[term.feature](u, u[:, ::-1], t_s[:, None]))
+
+
+def _of_body(term: GenericTerm, v: Array, w: Array, a: Array, t_s: Array) -> Array:
+    """The feature of a term of the body (M,) at the nodes."""
+    if term.memory is not None:
+        return term.memory.at_nodes(GRID_STEP_S, v, w)
+    return np.asarray(BODY_FEATURES[term.feature](v, w, a, t_s))
 
 
 def _with_place(name: str) -> str:

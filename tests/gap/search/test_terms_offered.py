@@ -46,6 +46,10 @@ def test_terms_of_a_command_are_made_of_what_is_in_force_and_of_where_the_wheels
     np.testing.assert_allclose(terms["command += 1 u_other"].perturbation, u[:, ::-1], atol=1e-12)
     np.testing.assert_allclose(terms["command += 1 t/100 u"].perturbation, 0.01 * T_S[:, None] * u, atol=1e-12)
     assert terms["command += 1 u |u|"].model_name == "command += k u |u|"
+    load = terms["command += 1 u mean_1s(|u| + |u_other|)"]
+    assert load.model_name == "command += k u mean_1s(|u| + |u_other|)"
+    # What grows by 3 rad/s in a second is followed a second later.
+    np.testing.assert_allclose(load.perturbation[-1], u[-1] * 3.0 * (5.49 - (1.0 - np.exp(-5.49))), rtol=2e-3)
     later = slice(60, -5)
     # A sign fades in with the command.
     sign = u * np.abs(u) / (u * u + 0.05**2)
@@ -98,6 +102,8 @@ def test_terms_of_a_body_are_made_of_its_motion():
         np.testing.assert_allclose(cubic.perturbation[:, axis], v**3, atol=1e-12)
         assert cubic.model_name == f"{target} += k v^3"
         assert cubic.geometry == (RADIUS_M, AXLE_M)
+        for memory in (term for form, term in terms.items() if form.startswith(f"{target} += 1 (")):
+            assert (memory.model_name, memory.geometry) == (memory.form.replace("{:.4g}", "k"), (RADIUS_M, AXLE_M))
         expected = {"|v| a": v * a, "t/100 omega": 0.01 * t_s * w, "domega/dt": faster, "v domega/dt": v * faster}
         for form, value in expected.items():
             term = terms[f"{target} += 1 {form}"]
@@ -159,6 +165,14 @@ def test_terms_of_a_given_model_are_added_up_by_channel():
     np.testing.assert_allclose(timed.known_command, 0.01 * T_S[:, None] * u, atol=1e-12)
     assert timed.known_motion is None
     assert with_known_terms(line, settings[2:3], p, 0.5).known_command is None
+    before = [
+        EffectSetting("command += k u mean_30s(u^2)", {"k": -0.1}),
+        EffectSetting("omega += k (omega - mean_1s(omega))", {"k": -0.5}),
+    ]
+    remembered = with_known_terms(line, before, p, 0.5)
+    offered = by_form(wheel_terms(SimpleNamespace(drive=line), 0.5))["command += 1 u mean_30s(u^2)"]
+    np.testing.assert_allclose(remembered.known_command, -0.1 * offered.perturbation, atol=1e-12)
+    np.testing.assert_allclose(remembered.known_motion[:, 2], -0.5 * w * np.exp(-T_S - 0.005), rtol=1e-4)
 
 
 def lawn(seconds=100.0, width_m=4.0, height_m=2.0, corner_m=(0.0, 0.0), **settings):

@@ -1,0 +1,76 @@
+"""What a model's terms remember where a rollout begins, from what was sent and how the wheels turned before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.control.plan import PlannerState
+from disco_hw.effects.registry import DELAY
+from disco_hw.model import Model
+from disco_hw.model.memory import of_wheels
+from disco_hw.model.terms import memories_of
+
+Array = NDArray[np.float64]
+Acting = Callable[[Array], Array]
+DELAYED_BY = DELAY.columns[0]
+
+
+class PastMotion:
+    """The means that a model keeps, n of them, at a time of the recent past, under each of its parameter points.
+
+    Commands act later under a longer delay. `acting(commands)` (N, 2) in all methods: what of commands moves the model,
+    and `turning` (2,) how the model's wheels turn (rad/s) where the measured ones turn as they do. What was before a
+    state's first command, and before its wheel speeds, is known by its means alone: it is taken to have moved the model
+    as these do.
+    """
+
+    def __init__(self, model: Model, delays_s: Array, mean_delay_s: float) -> None:
+        self._commands, self._body = memories_of(setting.name for setting in model.effects)
+        self._delays_s, self._mean_delay_s = delays_s, mean_delay_s
+
+    @classmethod
+    def of(cls, model: Model, theta: Array, mean_theta: Array) -> PastMotion | None:
+        """That of the points (L, P) and the mean (1, P) of a model; None if it remembers nothing."""
+        if not any(memories_of(setting.name for setting in model.effects)):
+            return None
+        if DELAYED_BY not in model.parameter_names:
+            return cls(model, np.zeros(len(theta)), 0.0)
+        column = model.parameter_names.index(DELAYED_BY)
+        return cls(model, theta[:, column], float(mean_theta[0, column]))
+
+    def of_mean(self, state: PlannerState, t_ns: int, acting: Acting, turning: tuple[float, float]) -> Array:
+        """Means (n,) at `t_ns` in the mean of what is believed, in the order of the compiled step."""
+        of_commands, of_body = self._of_commands(state, t_ns, self._mean_delay_s, acting), np.zeros(len(self._body))
+        if state.body_means:
+            measured = state.left_speed_rad_s, state.right_speed_rad_s
+            for n, memory in enumerate(self._body):
+                of_body[n] = state.body_means[n] + of_wheels(memory, *turning) - of_wheels(memory, *measured)
+        return np.concatenate([of_commands, of_body])
+
+    def of_points(self, state: PlannerState, t_ns: int, acting: Acting, of_mean: Array) -> Array:
+        """Means (L, n) at `t_ns` under the points, from those of the mean (n,) at that time."""
+        means = np.tile(of_mean, (len(self._delays_s), 1))
+        for delay_s in np.unique(self._delays_s):
+            of_commands = self._of_commands(state, t_ns, float(delay_s), acting)
+            means[self._delays_s == delay_s, : of_commands.size] = of_commands
+        return means
+
+    def _of_commands(self, state: PlannerState, t_ns: int, delay_s: float, acting: Acting) -> Array:
+        if not self._commands or not state.sent:
+            return np.zeros(2 * len(self._commands))
+        asked = np.array([(one.left_rad_s, one.right_rad_s) for one in state.sent])
+        moved = acting(asked)
+        begins_s = np.array([(one.t_ns - t_ns) * 1e-9 + delay_s for one in state.sent])
+        begins_s = np.minimum(begins_s, 0.0)
+        ends_s = np.append(begins_s[1:], 0.0)
+        found = np.empty((len(self._commands), 2))
+        before = state.command_means or np.zeros_like(found)
+        for n, memory in enumerate(self._commands):
+            first = memory.of(moved[0], moved[0, ::-1]) - memory.of(asked[0], asked[0, ::-1])
+            share = np.exp(ends_s / memory.time_s) - np.exp(begins_s / memory.time_s)
+            left = np.exp(begins_s[0] / memory.time_s)
+            found[n] = left * (np.array(before[n]) + first) + share @ memory.of(moved, moved[:, ::-1])
+        return found.ravel()

@@ -1,0 +1,249 @@
+"""What the compiled step adds for a model's terms without a name, and what it remembers for them.
+
+A term that a model lacks leaves nothing in the machine code. Of a command's term that remembers the means of both
+wheels are kept, of the body's that of the sum or the difference of the wheels' speeds, which no parameter changes.
+"""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+
+from disco_hw.jit import cast_like, scalar_function, specialise
+from disco_hw.model.coefficients import Base, Coefficients, TermCoefficients, Terms
+from disco_hw.model.memory import Means, recall, remember
+from disco_hw.model.terms import BODY_FEATURES, COMMAND, COMMAND_FEATURES, TERMS, Feature, GenericTerm
+
+
+def _entry_type(name: str, term: GenericTerm) -> Any:
+    kind: Any = namedtuple
+    fields = ("k", "per_s") if term.memory is None else ("k", "by_end", "over_step")
+    made = kind("Term" + "".join(f"_{ord(c):x}" if not c.isalnum() else c for c in name), fields)
+    made.__module__ = __name__
+    return made
+
+
+# A type for every term: the compiler sees in the types alone which terms a model has.
+_ENTRIES: Mapping[str, Any] = MappingProxyType({name: _entry_type(name, term) for name, term in TERMS.items()})
+_NAME_OF: Mapping[Any, str] = MappingProxyType({kind: name for name, kind in _ENTRIES.items()})
+# Compiled code that is kept on disk finds its types by their names in this module.
+globals().update({kind.__name__: kind for kind in _ENTRIES.values()})
+
+
+def _feature(term: GenericTerm) -> Feature:
+    if term.memory is not None:
+        return term.memory.feature
+    return (COMMAND_FEATURES if term.target == COMMAND else BODY_FEATURES)[term.feature]
+
+
+_COMPILED: Mapping[str, Any] = MappingProxyType({name: scalar_function(_feature(term)) for name, term in TERMS.items()})
+_AVERAGED: Mapping[str, Any] = MappingProxyType(
+    {name: scalar_function(term.memory.of) for name, term in TERMS.items() if term.memory is not None}
+)
+
+
+def table_entry(name: str, columns: tuple[NDArray[np.floating], ...]) -> TermCoefficients:
+    """A term's coefficients, arrays (L,), in the form that the step takes."""
+    made: TermCoefficients = _ENTRIES[name](*columns)
+    return made
+
+
+def _terms_of(kinds: Iterable[Any]) -> list[GenericTerm]:
+    return [TERMS[_NAME_OF[kind]] for kind in kinds]
+
+
+def _compiled_terms(terms: Any) -> list[GenericTerm]:
+    """Those of a tuple whose numba type this is."""
+    return [] if isinstance(terms, types.NoneType) else _terms_of(kind.instance_class for kind in terms.types)
+
+
+def count_means(terms: Terms | None) -> int:
+    """Number of means that are kept for terms; a constant to the compiler."""
+    return sum(term.means for term in _terms_of(map(type, terms or ())))
+
+
+@specialise(count_means)
+def _count_means(terms: Any) -> Callable[..., Any]:
+    count = sum(term.means for term in _compiled_terms(terms))
+    return lambda terms: count
+
+
+def new_means(effects: Coefficients) -> NDArray[np.float64] | None:
+    """The means (n,) of a model, of commands first, before anything was; None if it remembers nothing."""
+    count = count_means(effects.command_terms) + count_means(effects.body_terms)
+    return np.zeros(count) if count else None
+
+
+def means_of(terms: Terms | None, values: Any, at: Any, apart: Any) -> Means | None:
+    """Where the means of terms lie in a buffer, from `at` on and so far apart; None if none of them remembers."""
+    return Means(values, at, apart) if count_means(terms) else None
+
+
+@specialise(means_of)
+def _means_of(terms: Any, values: Any, at: types.Type, apart: types.Type) -> Callable[..., Any]:
+    if any(term.memory is not None for term in _compiled_terms(terms)):
+        return lambda terms, values, at, apart: Means(values, at, apart)
+    return lambda terms, values, at, apart: None
+
+
+def add_to_commands(
+    left: float, right: float, time_s: float, terms: Terms | None, means: Means | None
+) -> tuple[float, float]:
+    """Both commands (rad/s) with the terms that act on them; `means` of those that remember go on by a step."""
+    if terms is None:
+        return left, right
+    new_left, new_right, place = left, right, 0
+    for entry, term in zip(terms, _terms_of(map(type, terms)), strict=True):
+        if term.memory is None:
+            feature = COMMAND_FEATURES[term.feature]
+            new_left = new_left + entry.k * feature(left, right, time_s)
+            new_right = new_right + entry.k * feature(right, left, time_s)
+            continue
+        assert means is not None
+        mean_left = _averaged(term.memory.of(left, right), entry, means, place)
+        mean_right = _averaged(term.memory.of(right, left), entry, means, place + 1)
+        new_left = new_left + entry.k * term.memory.feature(left, right, mean_left)
+        new_right = new_right + entry.k * term.memory.feature(right, left, mean_right)
+        place += term.means
+    return new_left, new_right
+
+
+@scalar_function
+def _averaged(signal: float, entry: TermCoefficients, means: Means, place: int) -> float:
+    """A mean over a step in which its signal stays as it is; the mean goes on to its end."""
+    before = recall(means, place)
+    remember(means, place, before + entry.by_end * (signal - before))
+    over_step: float = before + entry.over_step * (signal - before)
+    return over_step
+
+
+# What is overloaded is chosen by numba's types; those of tuples have fields that its annotations do not know.
+@specialise(add_to_commands)
+def _add_to_commands(
+    left: types.Type, right: types.Type, time_s: types.Type, terms: Any, means: Any
+) -> Callable[..., Any]:
+    arguments = "left, right, time_s, terms, means"
+    if isinstance(terms, types.NoneType):
+        return _made("add_to_commands", arguments, ["return left, right"], {})
+    scope: dict[str, Any] = {"averaged": _averaged, "place": np.uintp}
+    lines, place = ["new_left, new_right = left, right"], 0
+    for n, term in enumerate(_compiled_terms(terms)):
+        scope[f"feature{n}"] = _COMPILED[term.name]
+        if term.memory is None:
+            lines += [
+                f"new_left = new_left + terms[{n}].k * feature{n}(left, right, time_s)",
+                f"new_right = new_right + terms[{n}].k * feature{n}(right, left, time_s)",
+            ]
+            continue
+        scope[f"of{n}"] = _AVERAGED[term.name]
+        lines += [
+            f"mean_left = averaged(of{n}(left, right), terms[{n}], means, place({place}))",
+            f"mean_right = averaged(of{n}(right, left), terms[{n}], means, place({place + 1}))",
+            f"new_left = new_left + terms[{n}].k * feature{n}(left, right, mean_left)",
+            f"new_right = new_right + terms[{n}].k * feature{n}(right, left, mean_right)",
+        ]
+        place += term.means
+    return _made("add_to_commands", arguments, [*lines, "return new_left, new_right"], scope)
+
+
+@scalar_function
+def _plus(lateral: float | None, more: float) -> float:
+    if lateral is None:
+        return more
+    return lateral + more
+
+
+def add_to_velocity(
+    forward: float, lateral: float | None, turn: float, wheel_sum: float, difference: float, change: float,
+    time_s: float, base: Base, terms: Terms | None, means: Means | None,
+) -> tuple[float, float | None, float]:  # fmt: skip
+    """Forward and lateral speed (m/s) and half the yaw rate (rad/s) with the terms; wheels as for `body_velocity`.
+
+    `means` of terms that remember go on by a step.
+    """
+    if terms is None:
+        return forward, lateral, turn
+    ratio = 2.0 * base.half_turn_ratio
+    v, w, place = base.half_radius_m * wheel_sum, ratio * difference, 0
+    for entry, term in zip(terms, _terms_of(map(type, terms)), strict=True):
+        if term.memory is None:
+            more = entry.k * BODY_FEATURES[term.feature](v, w, base.half_radius_m * change * entry.per_s, time_s)
+        else:
+            assert means is not None
+            unit = term.memory.of(base.half_radius_m, ratio)
+            mean = unit * _averaged(term.memory.of(wheel_sum, difference), entry, means, place)
+            more = entry.k * term.memory.feature(v, w, mean)
+            place += term.means
+        match term.target:
+            case "v_x":
+                forward = forward + more
+            case "v_y":
+                lateral = more if lateral is None else lateral + more
+            case _:
+                turn = turn + 0.5 * more
+    return forward, lateral, turn
+
+
+@specialise(add_to_velocity)
+def _add_to_velocity(
+    forward: types.Type, lateral: types.Type, turn: types.Type, wheel_sum: types.Type, difference: types.Type,
+    change: types.Type, time_s: types.Type, base: types.Type, terms: Any, means: Any,
+) -> Callable[..., Any]:  # fmt: skip
+    arguments = "forward, lateral, turn, wheel_sum, difference, change, time_s, base, terms, means"
+    if isinstance(terms, types.NoneType):
+        return _made("add_to_velocity", arguments, ["return forward, lateral, turn"], {})
+    scope: dict[str, Any] = {"plus": _plus, "cast_like": cast_like, "averaged": _averaged, "place": np.uintp}
+    lines = [
+        "v = base.half_radius_m * wheel_sum",
+        "w = (base.half_turn_ratio + base.half_turn_ratio) * difference",
+        "new_forward, new_turn, lateral0 = forward, turn, lateral",
+    ]
+    across = place = 0
+    for n, term in enumerate(_compiled_terms(terms)):
+        scope[f"feature{n}"] = _COMPILED[term.name]
+        if term.memory is None:
+            acceleration = f"base.half_radius_m * change * terms[{n}].per_s" if term.needs_acceleration else "v"
+            more = f"terms[{n}].k * feature{n}(v, w, {acceleration}, time_s)"
+        else:
+            scope[f"of{n}"] = _AVERAGED[term.name]
+            lines += [
+                f"unit = of{n}(base.half_radius_m, base.half_turn_ratio + base.half_turn_ratio)",
+                f"mean = unit * averaged(of{n}(wheel_sum, difference), terms[{n}], means, place({place}))",
+            ]
+            more = f"terms[{n}].k * feature{n}(v, w, mean)"
+            place += term.means
+        match term.target:
+            case "v_x":
+                lines.append(f"new_forward = new_forward + {more}")
+            case "v_y":
+                lines.append(f"lateral{across + 1} = plus(lateral{across}, {more})")
+                across += 1
+            case _:
+                lines.append(f"new_turn = new_turn + cast_like(0.5, turn) * ({more})")
+    return _made("add_to_velocity", arguments, [*lines, f"return new_forward, lateral{across}, new_turn"], scope)
+
+
+def terms_need_change(terms: Terms | None) -> bool:
+    """Whether any of the body's terms depends on the acceleration; a constant to the compiler."""
+    return terms is not None and any(TERMS[_NAME_OF[type(term)]].needs_acceleration for term in terms)
+
+
+@specialise(terms_need_change)
+def _terms_need_change(terms: Any) -> Callable[..., Any]:
+    if any(term.needs_acceleration for term in _compiled_terms(terms)):
+        return lambda terms: True
+    return lambda terms: False
+
+
+def _made(name: str, arguments: str, lines: list[str], scope: dict[str, Any]) -> Callable[..., Any]:
+    """A function of these lines; a tuple of mixed types cannot be looped over in compiled code."""
+    body = "\n".join(f"    {line}" for line in lines)
+    exec(f"def {name}({arguments}):\n{body}", scope)
+    made: Callable[..., Any] = scope[name]
+    return made
