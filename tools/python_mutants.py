@@ -262,13 +262,21 @@ def run_tests(arguments: Sequence[str], plugins: Sequence[Any] = ()) -> int:
 
 
 class Watched:
-    """Which lines of some files each test runs, and how long it takes; a plugin of pytest."""
+    """Which lines of some files each test runs, and how long it takes, and which run on import; a plugin of pytest."""
 
     def __init__(self, files: Sequence[Path], leave_out: Sequence[str]) -> None:
         self.files, self.leave_out = {str(file) for file in files}, leave_out
         self.lines: set[tuple[str, int]] = set()
+        self.on_import: set[tuple[str, int]] = set()
         self.failed = "not one is run"
         self.tests: dict[str, tuple[float, list[tuple[str, int]]]] = {}
+
+    def pytest_collection(self) -> None:
+        sys.settrace(self.traced)
+
+    def pytest_collection_finish(self) -> None:
+        sys.settrace(None)
+        self.on_import = self.lines
 
     def pytest_collection_modifyitems(self, items: list[Any]) -> None:
         items[:] = [item for item in items if not any(text in item.nodeid for text in self.leave_out)]
@@ -356,6 +364,7 @@ def sweep(files: Sequence[Path], given: argparse.Namespace, folder: Path) -> Cou
     counts: Counter[tuple[str, str]] = Counter()
     for file in files:
         source, here, name = file.read_text("utf-8"), str(file.relative_to(ROOT)), module_name(file)
+        on_import = {line for of, line in watched.on_import if of == str(file)}
         trial = Trial(name, file, touched_by(name), folder)
         ran = {test: {line for of, line in lines if of == str(file)} for test, (_, lines) in tests}
         every = [test for test, lines in ran.items() if lines]
@@ -363,8 +372,9 @@ def sweep(files: Sequence[Path], given: argparse.Namespace, folder: Path) -> Cou
             raise RuntimeError(f"{here}: fails its tests unchanged: every mutant would pass for noticed")
         for placed in mutants(source)[given.first :: given.every]:
             mutant = placed.mutant
-            # What no test runs may run when the module is imported, in a function that is called there.
-            chosen = every if placed.on_import else [test for test in every if ran[test] & placed.lines] or every
+            # A function may be called when its module is imported.
+            imported = placed.on_import or placed.lines & on_import
+            chosen = every if imported else [test for test in every if ran[test] & placed.lines]
             began = time.monotonic()
             if mutant.key in known.get(here, {}):
                 outcome = "equivalent"

@@ -102,7 +102,7 @@ def pose_clock(wheels: Wheels, poses: Poses, settings: GridSettings) -> PoseCloc
     best, least = plain, _misfit_at(wheels, poses, plain.delay_s, settings) - settings.least_clock_nats
     for (left, clock), size_s in zip(likely, sizes, strict=True):
         if left > most or size_s < settings.least_clock_error_s:
-            continue
+            break
         at_s = _instant(wheels, poses, settings, delays, place, clock.jump_at_s) if clock.jump_s else clock.jump_at_s
         tried = replace(clock, jump_at_s=at_s)
         even = tried.corrected(poses)
@@ -212,7 +212,7 @@ def _command_misfits(
     for place, delay in enumerate(delays):
         ends, known = [], np.ones(begin.size, dtype=bool)
         for at in (begin - delay, end - delay):
-            k = np.clip(np.searchsorted(commands.t_s, at, side="right") - 1, 0, commands.t_s.size - 1)
+            k = np.maximum(np.searchsorted(commands.t_s, at, side="right") - 1, 0)
             since = (at - commands.t_s[k])[:, None]
             slow = lag_s * (1.0 - np.exp(-since / lag_s)) if lag_s > 0.0 else 0.0
             now = np.nan_to_num(asked[k])

@@ -111,6 +111,15 @@ def test_a_pair_is_known_from_the_first_command_to_the_last_and_up_to_one_that_i
         assert np.isfinite(misfit[0]) == known
 
 
+def test_what_was_not_known_right_after_the_first_command_is_not_known():
+    commands = commands_at([1.0, 2.0, 2.25, 3.0], [(1, 2), (np.nan, np.nan), (2, 2), (4, 4)])
+    settings = replace(SETTINGS, fewest_poses=1)
+    for begin_s, end_s, known in ((1.5, 2.0, True), (1.5, 2.125, False), (1.5, 2.5, False), (2.25, 2.5, True)):
+        pairs = np.array([begin_s]), np.array([end_s]), np.array([0])
+        misfit = timing._command_misfits(commands, pairs, [np.ones(1)] * 2, np.zeros(1), 0.0, settings)
+        assert np.isfinite(misfit[0]) == known
+
+
 def sampled(count=400, period_s=0.05, segment=0):
     """Wheels at even samples that turn at 2 and 3 rad/s."""
     t_s = period_s * np.arange(count)

@@ -136,10 +136,28 @@ def test_of_a_drift_and_a_jump_the_one_with_which_the_whole_log_fits_better_is_b
     assert (clock.jump_s != 0.0) is (with_jump < with_drift)
 
 
+@pytest.mark.parametrize("bound", [{"clock_times_better": 5.0}, {"least_clock_error_s": 0.5}])
+def test_a_jump_that_explains_too_little_or_is_too_small_is_none_however_well_the_log_fits_with_it(
+    seen, monkeypatch, bound
+):
+    # On a line a step leaves a quarter of the squares, and is half as large.
+    delays = 0.05 * np.arange(13)
+    seen(delays)
+    poses = poses_at(np.linspace(100.0, 220.0, 50))
+    misfits = {True: 4.5, False: 4.0}
+    monkeypatch.setattr(
+        timing,
+        "_misfit_at",
+        lambda wheels, of, *_: 5.0 if of is poses else misfits[bool(np.ptp(np.diff(of.t_s)) < 1e-6)],
+    )
+    assert pose_clock(None, poses, SETTINGS).jump_s > 0.3
+    assert pose_clock(None, poses, replace(SETTINGS, **bound)).drift_s == pytest.approx(0.65)
+
+
 def test_stretches_that_lie_in_a_part_of_the_log_alone_say_nothing_of_all_of_it(seen):
     delays = [0.1, 0.2, 0.3, 0.4]
     assert seen(delays, middles=np.array([105.0, 120.0, 135.0, 164.0])) == PoseClock(0.2)
-    assert seen(delays, middles=np.array([105.0, 120.0, 135.0, 166.0])) != PoseClock(0.2)
+    assert seen(delays, middles=np.array([105.0, 120.0, 135.0, 165.0])) != PoseClock(0.2)
 
 
 @pytest.mark.parametrize(("scatter", "believed"), [(0.9, False), (1.1, True)])
@@ -217,8 +235,8 @@ def test_the_least_of_a_parabola_lies_between_places():
     for at_the_end in (0, 6):
         assert timing._vertex(values, at_the_end) == 0.0
     assert timing._vertex(np.ones(7), 3) == 0.0
-    for place in (2, 3, 4):
-        assert timing._vertex(np.where(np.arange(7) == place, np.inf, values), 3) == 0.0
+    for place, told in ((1, 0.3), (2, 0.0), (3, 0.0), (4, 0.0), (5, 0.3)):
+        assert timing._vertex(np.where(np.arange(7) == place, np.inf, values), 3) == pytest.approx(told)
 
 
 @pytest.mark.parametrize(("depth", "found_s"), [(0.051, 0.1234), (0.049, 0.0)])
@@ -315,9 +333,8 @@ def test_turns_and_ways_of_poses_are_fitted_by_those_of_the_wheels_at_a_delay(de
     # Headings go past half a turn.
     assert np.abs(np.diff(poses.yaw_rad)).max() > 6.0
     assert timing._misfit_at(wheels, poses, delay_s, SETTINGS) == pytest.approx(misfit, rel=1e-9)
-    many = timing._misfits(wheels, poses, np.array([5.0, delay_s, 90.0]), SETTINGS)
-    assert many[1] == pytest.approx(misfit, rel=1e-9)
-    assert many[2] == np.inf
+    many = timing._misfits(wheels, poses, np.array([-90.0, delay_s, 90.0]), SETTINGS)
+    assert many == pytest.approx([np.inf, misfit, np.inf], rel=1e-9)
 
 
 @pytest.mark.parametrize(("fewest", "known"), [(0, True), (1, False)])

@@ -217,6 +217,17 @@ def test_each_start_is_predicted_by_the_chain_of_its_own_stretch():
     np.testing.assert_array_equal(second.squares[:, 0] > 1e-6, (False, True, False))
 
 
+def test_speeds_of_wheels_are_compared_where_a_prediction_ends():
+    channel = steady(3.0, 5.0, seconds=45.0)
+    poses = smoothed_poses(channel, vector_of())
+    # For 20 s they are commanded faster by 1 rad/s than they are measured to turn.
+    faster = channel.drive.t_s < 20.0
+    wheels = wheels_on(replace(channel.drive, command_rad_s=channel.drive.command_rad_s + faster[:, None]))
+    told = errors_of(channel, wheels, {fold: Chain(vector_of(), WHEEL.neutral) for fold in (0, 1)}, 2.0, poses)
+    ends = find_starts(channel, poses, 2.0).node + 200
+    assert told.wheel_rad_s == pytest.approx(np.sqrt(faster[ends].mean()), rel=0.01)
+
+
 def test_errors_are_root_mean_squares_by_regime_and_by_stretch():
     error = np.array([[3.0, 4.0, 0.1], [0.0, 1.0, -0.2], [2.0, 0.0, 0.2], [0.0, 0.0, 0.0]])
     starts = replace(starts_at([0, 1, 2, 3], error, error, [0, 0, 2, 2]), regime=("curves", "rest", "curves", "rest"))

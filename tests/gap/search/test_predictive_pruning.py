@@ -65,6 +65,11 @@ def test_the_name_that_does_the_harm_goes_and_the_others_stay():
     assert told(amended_m, ("motor_lag", "battery_sag"), ("slope",)) == (("battery_sag", "slope"), ("motor_lag",))
 
 
+def test_of_two_that_do_as_much_harm_the_first_goes():
+    amended_m = {"motor_lag battery_sag": 0.5, "motor_lag": 0.03, "battery_sag": 0.03}
+    assert told(amended_m, ("motor_lag", "battery_sag")) == (("battery_sag",), ("motor_lag",))
+
+
 def test_a_name_without_which_predictions_are_clearly_better_goes():
     amended_m = {"motor_lag wheel_gain": 0.03, "motor_lag": 0.02, "wheel_gain": 0.08}
     assert told(amended_m, ("motor_lag", "wheel_gain")) == (("motor_lag",), ("wheel_gain",))

@@ -300,6 +300,10 @@ def test_a_delay_of_commands_begins_from_what_is_seen_at_first_sight(seen_s):
     begin = CANDIDATES["command_delay"].starts
     unmoved = replace(channel, drive=replace(line, commands_moved_s=0.0))
     assert begin(channel) == tuple((start + seen_s,) for (start,) in begin(unmoved))
+    others = [CANDIDATES[name] for name in candidates_of(WHEEL) if name != "command_delay"]
+    begun = [(other.starts(channel), other.starts(unmoved)) for other in others if other.starts is not None]
+    assert begun
+    assert all(one == other for one, other in begun)
 
 
 def test_effects_compete_in_their_own_channel_with_all_their_parameters():

@@ -1,6 +1,6 @@
 """Whole searches of a channel on a short drive whose truth is known, and how lag and delay are fitted first."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,8 +8,10 @@ import pytest
 
 from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.data.free_runs import run_wheels
+from disco_hw.gap.noise.channels import WheelChannel
+from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search import channel_search
-from disco_hw.gap.search.channel_search import ChannelResult, responding, search_body, search_wheels
+from disco_hw.gap.search.channel_search import ChannelResult, judged, responding, search_body, search_wheels, timed
 from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.richest_model import LATE, LATE_COLUMNS, LATE_STARTS_S, indices, smooth_of
 from disco_hw.gap.search.selection import Selector
@@ -293,3 +295,46 @@ def test_a_result_has_the_fits_with_and_without_what_is_missing_and_of_a_search_
     assert extended.fit == found.fit
     assert extended.base == ((), ())
     assert found.richest_parameters == 0
+
+
+def test_every_set_has_the_delay_that_is_seen_at_first_sight_until_it_is_judged_itself():
+    line = replace(line_of(np.tile([2.0, 3.0], (800, 1))), commands_moved_s=0.2)
+    channel = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
+    start = WHEEL.neutral.copy()
+    start[WHEEL.place["wheel_gain.left"]] = 0.1
+    moved = np.zeros(start.size)
+    moved[WHEEL.place["command_delay.delay_s"]] = 0.2
+    for given, begin, expected in ((("wheel_gain",), start, start + moved), ((), None, WHEEL.neutral + moved)):
+        selector = Selector(channel, None, given=given, start=begin, fits={frozenset(): 1}, proofs={(): 2})
+        late = timed(selector)
+        assert late.given == (*given, "command_delay")
+        np.testing.assert_array_equal(late.start, expected)
+        assert (late.fits, late.proofs) == ({}, {})
+
+
+@dataclass(frozen=True)
+class Held:
+    """Stands for a selector: what it takes for needed and swaps is seen in the names."""
+
+    channel: object
+    given: tuple
+    start: object
+    fits: dict
+    proofs: dict
+
+    def needed(self, names):
+        return (*names, "needed")
+
+    def swapped(self, names):
+        return (*names, "swapped")
+
+
+def test_a_delay_is_judged_against_none_and_fits_that_have_it_stay():
+    sets = [frozenset(names) for names in ((), ("command_delay",), ("command_delay", "deadband"), ("deadband",))]
+    selector = Held(SimpleNamespace(layout=WHEEL), ("command_delay",), None, dict.fromkeys(sets, "fit"), {1: 2})
+    start = WHEEL.neutral
+    found = judged(ChannelResult(selector, ("deadband",), None), (), start)
+    assert found.names == ("deadband", "needed", "swapped", "needed")
+    assert set(found.selector.fits) == {sets[1], sets[2]}
+    assert (found.selector.given, found.selector.start, found.selector.proofs) == ((), start, {})
+    assert found.plain is None

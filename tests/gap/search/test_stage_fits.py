@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 
 from disco_hw.gap import search as stages
 from disco_hw.gap.data import BODY, WHEEL
-from disco_hw.gap.search import _chain, _Fitted, _information, _on_top, _roughly, _timed, joint_predictions
+from disco_hw.gap.search import _chain, _Fitted, _information, _on_top, _roughly, _split, _timed, joint_predictions
 from disco_hw.gap.search.analysis import final_fit
 from disco_hw.gap.search.cross_validation import Chain, PredictionErrors
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
@@ -219,6 +219,20 @@ def test_without_anything_found_nothing_is_put_on_top(unfitted):
     analysis = analysed((), ())
     predictions = joint_predictions(analysis, final_fit(analysis))
     assert predictions.joint["amended"][1].names == ("wheel_radius_m", "axial_distance_m", "x_icr_m")
+
+
+def test_a_vector_without_terms_is_whole_and_of_one_with_terms_what_they_add_is_told():
+    channel = SimpleNamespace(split=lambda vector: (vector[:3], vector[3:] * 10.0))
+    found = SimpleNamespace(
+        channel=SimpleNamespace(layout=SimpleNamespace(columns=("a", "b", "c"))),
+        selector=SimpleNamespace(channel=channel),
+    )
+    plain = np.array([1.0, 2.0, 3.0])
+    core, added = _split(found, plain)
+    assert core is plain
+    assert added is None
+    core, added = _split(found, np.array([1.0, 2.0, 3.0, 4.0, 5.0]))
+    assert (core.tolist(), added.tolist()) == ([1.0, 2.0, 3.0], [40.0, 50.0])
 
 
 def test_where_encoders_count_wrong_the_wheels_of_the_chain_have_no_gain():

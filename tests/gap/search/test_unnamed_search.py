@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from disco_hw.gap.noise.channels import BodyChannel
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.search import channel_search
 from disco_hw.gap.search.channel_search import (
     ChannelResult,
@@ -14,9 +14,12 @@ from disco_hw.gap.search.channel_search import (
     _priced,
     _thresholds,
     _time_or_place,
+    _with_one_more,
+    _with_term,
     _written,
     best_terms,
     body_moves,
+    that_models_hold,
     with_unnamed,
 )
 from disco_hw.gap.search.least_squares import Fit
@@ -110,6 +113,36 @@ def test_a_term_of_which_what_is_fitted_does_the_most_is_not_tried(own, tried):
     assert best_terms(channel.fitted(slope), channel, iter((term,)))[0] == ([term] if tried else [])
 
 
+def two(first, second):
+    """A term of two features along some of the residuals."""
+    return replace(along(*first), beside=(along(*second).perturbation,))
+
+
+def test_features_that_belong_together_pay_for_each_but_one():
+    for gain_nats, tried in ((20.65, False), (21.05, True)):
+        # Worth 18 nats, and half of ln 300 for the second.
+        left = np.zeros(300)
+        left[:2] = gain_nats**0.5
+        channel = Linear(left)
+        term = two((3.0,), (0.0, 0.2))
+        assert best_terms(channel.fitted(np.empty((300, 0))), channel, iter((term,)))[0] == ([term] if tried else [])
+    # One that is nothing is none of them.
+    left[:2] = 0.0, 6.1
+    channel = Linear(left)
+    silent = two((), (0.0, 1.0))
+    assert best_terms(channel.fitted(np.empty((300, 0))), channel, iter((silent,)))[0] == [silent]
+
+
+def test_what_is_fitted_already_leaves_all_features_together_too_little_and_others_are_tried():
+    left, slope = np.zeros(300), np.zeros((300, 1))
+    left[1], slope[0] = 100.0, 2.0
+    channel = Linear(left)
+    small = channel.fitted(slope)
+    # The second feature has a twentieth of the squares, and nothing else is new.
+    term, other = two((0.95**0.5,), (0.0, 0.05**0.5)), along(0.0, 1.0)
+    assert best_terms(small, channel, iter((term, other)))[0] == [other]
+
+
 @pytest.mark.parametrize("held", [None, np.full((150, 2), 0.7)])
 def test_a_term_is_tried_in_a_size_that_hardly_matters_on_top_of_terms_that_are_there(held):
     channel = Linear(np.full(300, 9.0), held)
@@ -200,18 +233,20 @@ def test_a_patch_is_looked_for_closer_around_the_best(monkeypatch):
     assert one.evidence.score == pytest.approx(2.0 * one.evidence.gain / one.evidence.inflation - price)
 
 
-def test_a_patch_is_worth_it_without_the_block_that_says_most_and_where_none_is_the_next_best_is_tried(monkeypatch):
+def test_a_patch_is_worth_it_without_the_block_that_says_most(monkeypatch):
     channel, term = turned_in(0.3, 0.5, -0.15)
     patch = replace(term, disc=(0.0, 0.0, 0.5))
-    other = replace(term, form="other {:.2f}", perturbation=np.roll(term.perturbation, 300, axis=0))
-    monkeypatch.setattr(channel_search, "places_near", lambda *_: iter(()))
-    # Of three that are tried, or of one: what a term costs, one parameter and the choice, and 20 more.
+    # Of four that were tried: what a term costs, one parameter and the choice, and 20 more.
     price = np.log(channel.count) + 2.0 * np.log(4.0)
     nats = 0.5 * 1.3 * (20.0 + price)
-    for repeated, told in ((1.001 * nats, "omega += -0.15 then"), (0.999 * nats, "other")):
+    for repeated, worth_it in ((1.001 * nats, True), (0.999 * nats, False)):
         monkeypatch.setattr(channel_search, "compare", lambda *_, r=repeated: EffectEvidence(90.0, 80.0, r, 1.3, 99.0))
-        found = with_unnamed(searched(channel), lambda found: iter((patch, other)))
-        assert found.unnamed[0].form.startswith(told)
+        larger, happened_again = _with_term(searched(channel), patch, 4)
+        assert happened_again is (larger is not None) is worth_it
+    # Another term need not happen again, but what is not worth it is none.
+    assert _with_term(searched(channel), term, 4)[0] is not None
+    monkeypatch.setattr(channel_search, "compare", lambda *_: EffectEvidence(90.0, 80.0, 80.0, 1.3, 19.0))
+    assert _with_term(searched(channel), patch, 4) == (None, True)
     again = EffectEvidence(90.0, 80.0, 30.0, 1.5, 99.0).again(2.0, 1000)
     assert again == pytest.approx(2.0 * 30.0 / 1.5 - 2.0 * np.log(1000.0))
 
@@ -275,6 +310,118 @@ def test_all_coefficients_are_told_as_they_are_when_all_terms_are_in():
     assert [one.form for one in _written(found).unnamed] == ["single 0.25", f"waves {0.5**0.5:.2f}", "last 0.50"]
     none = Searched(vector=(9.0,))
     assert _written(none) is none
+
+
+@pytest.fixture
+def one_more(monkeypatch):
+    """Adds the first of some terms that is accepted; which were offered and tried, with how many, in turn."""
+    offers, tries = [], []
+
+    def made(options, accepted=(), once=(), closer=(), patches=True, channel=None):
+        def best(fit, channel, offered):
+            offers.append(terms := [*offered])
+            return terms, len(terms)
+
+        def tried(found, term, among):
+            tries.append((term, among))
+            return (("with", term), True) if term in accepted else (None, term not in once)
+
+        offers.clear()
+        tries.clear()
+        monkeypatch.setattr(channel_search, "best_terms", best)
+        monkeypatch.setattr(channel_search, "_with_term", tried)
+        monkeypatch.setattr(channel_search, "places_near", lambda inner, p, disc: iter(closer))
+        found = SimpleNamespace(
+            fit=SimpleNamespace(vector=None), selector=SimpleNamespace(channel=None), channel=channel
+        )
+        return *_with_one_more(found, lambda of: iter(options) if of is found else None, patches), offers, tries
+
+    return made
+
+
+FIRST, SECOND, DISC, NEAR = (
+    replace(NOTHING, form=form, disc=disc)
+    for form, disc in (("first", None), ("second", None), ("disc", (1.0, 2.0, 0.5)), ("near", (1.1, 2.0, 0.5)))
+)
+
+
+def test_the_first_term_that_is_accepted_is_added(one_more):
+    larger, patches, offers, tries = one_more([FIRST, SECOND, DISC], accepted=[SECOND, DISC])
+    assert (larger, patches) == (("with", SECOND), True)
+    assert offers == [[FIRST, SECOND, DISC]]
+    assert tries == [(FIRST, 3), (SECOND, 3)]
+    assert one_more([FIRST, SECOND])[:2] == (None, True)
+    # Without patches.
+    larger, patches, offers, _ = one_more([DISC, FIRST], accepted=[DISC], patches=False)
+    assert (larger, patches, offers) == (None, False, [[FIRST]])
+
+
+def test_where_a_patch_did_not_happen_again_none_is_looked_for_any_more(one_more):
+    larger, patches, offers, tries = one_more([DISC, NEAR, FIRST], accepted=[NEAR, FIRST], once=[DISC])
+    assert (larger, patches) == (("with", FIRST), False)
+    assert offers == [[DISC, NEAR, FIRST], [FIRST]]
+    assert tries == [(DISC, 3), (FIRST, 1)]
+
+
+def test_a_patch_of_a_body_is_tried_where_it_lies_best_among_all_that_were_looked_at(one_more):
+    body = object.__new__(BodyChannel)
+    _, _, offers, tries = one_more([DISC, FIRST], accepted=[DISC], closer=[NEAR], channel=body)
+    assert offers[1] == [DISC, NEAR]
+    assert tries == [(DISC, 4)]
+    assert one_more([FIRST, DISC], accepted=[DISC], closer=[NEAR], channel=body)[3] == [(FIRST, 2), (DISC, 4)]
+
+
+@pytest.mark.parametrize(
+    ("new_price", "names"), [(10.0, ("selected", "again")), (9.0, ("selected",)), (8.0, ("selected",))]
+)
+def test_names_are_selected_anew_and_from_those_that_were_found_where_that_costs_less(monkeypatch, new_price, names):
+    prices = {("selected",): new_price, ("slope",): 9.0}
+
+    class Stub:
+        def __init__(self, channel, moves, thresholds, given, start):
+            assert (given, start.tolist()) == (("given",), [1.0, 2.0, 0.0])
+            self.fits, self.moves = {}, moves
+
+        def select(self, begin=()):
+            return ("selected", "again") if begin == ("slope",) else ("selected",)
+
+        def priced(self, names):
+            return prices[names]
+
+    channel = SimpleNamespace(count=1000, neutral=np.zeros(3), split=lambda vector: vector)
+    monkeypatch.setattr(channel_search.WithTerms, "of", lambda inner, terms: channel)
+    monkeypatch.setattr(channel_search, "Selector", Stub)
+    monkeypatch.setattr(channel_search, "indices", lambda *_: ())
+    monkeypatch.setattr(channel_search, "fit", lambda channel, begin, active: SimpleNamespace(vector=begin))
+    monkeypatch.setattr(channel_search, "compare", lambda *_: EffectEvidence(90.0, 80.0, 1.0, 1.0, 99.0))
+    selector = SimpleNamespace(
+        exact=lambda names: SimpleNamespace(vector=np.array([3.0, 4.0])),
+        fit=lambda given: SimpleNamespace(vector=np.array([1.0, 2.0])),
+        moves=lambda small, big: 1.0,
+        given=("given",),
+        thresholds=Thresholds(),
+        channel=channel,
+    )
+    larger, _ = _with_term(ChannelResult(selector, ("slope",), None), FIRST, 2)
+    assert larger.names == names
+    assert larger.plain is selector
+
+
+@pytest.mark.parametrize("of", [WheelChannel, BodyChannel])
+def test_terms_that_no_model_can_carry_make_room_for_others_and_for_names(monkeypatch, of):
+    carried = replace(NOTHING, model_name="v_x += k v^3")
+    options = {WheelChannel: (FIRST, carried), BodyChannel: (carried, SECOND, carried)}
+    monkeypatch.setattr(channel_search, "_wheel_options", lambda found: iter(options[WheelChannel]))
+    monkeypatch.setattr(channel_search, "_body_options", lambda found: iter(options[BodyChannel]))
+    monkeypatch.setattr(channel_search, "with_unnamed", lambda bare, offered: (bare, [*offered(bare)]))
+    plain = SimpleNamespace(select=lambda names: (*names, "selected"))
+    terms = tuple(UnnamedTerm("", None, one) for one in (carried, FIRST))
+    found = ChannelResult(None, ("slope",), object.__new__(of), terms, plain)
+    bare, offered = that_models_hold(found)
+    assert (bare.selector, bare.names, bare.unnamed, bare.plain) == (plain, ("slope", "selected"), (), None)
+    assert offered == [one for one in options[of] if one is carried]
+    for same in (replace(found, unnamed=terms[:1]), replace(found, unnamed=(), plain=None)):
+        assert that_models_hold(same) is same
 
 
 def told(monkeypatch, found, placed_price=90.0, placed_terms=(PATCH,), placed_names=("turn_slip",)):
