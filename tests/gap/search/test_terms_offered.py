@@ -165,6 +165,9 @@ def test_terms_of_a_given_model_are_added_up_by_channel():
     np.testing.assert_allclose(timed.known_command, 0.01 * T_S[:, None] * u, atol=1e-12)
     assert timed.known_motion is None
     assert with_known_terms(line, settings[2:3], p, 0.5).known_command is None
+    load = with_known_terms(line, [EffectSetting("command += k u mean_1s(|u| + |u_other|)", {"k": 0.2})], p, 0.5)
+    offered = by_form(wheel_terms(SimpleNamespace(drive=line), 0.5))["command += 1 u mean_1s(|u| + |u_other|)"]
+    np.testing.assert_allclose(load.known_command, 0.2 * offered.perturbation, atol=1e-12)
     before = [
         EffectSetting("command += k u mean_30s(u^2)", {"k": -0.1}),
         EffectSetting("omega += k (omega - mean_1s(omega))", {"k": -0.5}),
