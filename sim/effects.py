@@ -103,6 +103,16 @@ _SPECS = (
         (EffectValue("limit_rad_s2", "rad/s^2", (0.9, 3.2), _POSITIVE, neutral=math.inf),),
     ),
     EffectSpec(
+        "acceleration_limit",
+        _WHEEL,
+        "the wheel's acceleration is cut at +- this, at (1 + more) times as much where no speed is asked for",
+        (
+            EffectValue("limit_rad_s2", "rad/s^2", (3.1, 21.5), _POSITIVE, neutral=math.inf),
+            EffectValue("more", "1", (0.0, 0.0), _NOT_NEGATIVE, default=0.0),
+        ),
+        lone=(0,),
+    ),
+    EffectSpec(
         "battery_sag",
         _WHEEL,
         "u -> u (1 - loss t / duration): wheel speed falls linearly with the time since start",
@@ -210,12 +220,6 @@ _SPECS = (
             EffectValue("natural_frequency_rad_s", "rad/s", (10.0, 25.0), _NOT_NEGATIVE),
             EffectValue("damping", "1", (0.5, 1.0), _POSITIVE, neutral=0.7, default=0.7),
         ),
-    ),
-    EffectSpec(
-        "x_slew_limited_motor",
-        _WHEEL,
-        "the wheel's acceleration is cut at +- this",
-        (EffectValue("limit_rad_s2", "rad/s^2", (5.0, 12.0), _POSITIVE, neutral=math.inf),),
     ),
     EffectSpec(
         "x_smooth_deadband",

@@ -32,6 +32,7 @@ _PARAMETERS = np.dtype(
         ("second_order_frequency", "f8"),
         ("second_order_damping", "f8"),
         ("acceleration_limit", "f8"),
+        ("stop_limit", "f8"),
         ("inertia", "f8"),
         ("viscous", "f8"),
         ("dry", "f8"),
@@ -141,7 +142,7 @@ def _parameter_record(p: PlantParameters, effects: HiddenEffects) -> npt.NDArray
     record = np.zeros(1, dtype=_PARAMETERS)
     (lag_s,) = effects.values("motor_lag")
     frequency, damping = effects.values("x_second_order_motor")
-    (slew_limit,) = effects.values("x_slew_limited_motor")
+    slew_limit, more_to_stop = effects.values("acceleration_limit")
     sag, sag_duration_s = effects.values("battery_sag")
     left_gain, right_gain = effects.values("wheel_gain")
     values = {
@@ -150,6 +151,7 @@ def _parameter_record(p: PlantParameters, effects: HiddenEffects) -> npt.NDArray
         "second_order_frequency": frequency,
         "second_order_damping": damping,
         "acceleration_limit": min(p.max_motor_acceleration_rad_s2, slew_limit),
+        "stop_limit": min(p.max_motor_acceleration_rad_s2, slew_limit * (1.0 + more_to_stop)),
         "inertia": p.wheel_inertia_kg_m2,
         "viscous": p.viscous_friction_nm_s,
         "dry": p.dry_friction_nm,
@@ -227,7 +229,7 @@ def _setpoints(p: Any, wheels: Any, left: float, right: float, now_s: float, dt:
 def _profile(p: Any, wheel: Any, reference: float, dt: float) -> float:
     """Move the speed profile on by one piece; return the profile speed at the piece's start for the angle's mean."""
     before: float = wheel["profile"]
-    most = p["acceleration_limit"] * dt
+    most = (p["acceleration_limit"] if reference != 0.0 else p["stop_limit"]) * dt
     frequency = p["second_order_frequency"]
     if frequency > 0.0:
         damping = 2.0 * p["second_order_damping"] * frequency

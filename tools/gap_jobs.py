@@ -30,7 +30,6 @@ OUTSIDE = ("x_wheel_ripple", "x_motor_droop", "x_shared_supply", "x_speed_square
 # Another form of a named family, and the names that count as the family's.
 FORMS = {
     "x_second_order_motor": {"motor_lag", "command_delay"},
-    "x_slew_limited_motor": {"motor_lag", "command_delay"},
     "x_saturating_turn_slip": {"turn_slip"},
     "x_smooth_deadband": {"deadband"},
 }

@@ -17,6 +17,9 @@ from tools.simulated_log import LogOptions, dirty_log_options, dirty_parameters,
 # What a robot.toml sets if it says nothing else.
 LARGEST_RAD_S, LARGEST_RAD_S2 = 8.0, 20.0
 NAMED = tuple(name for name in EFFECTS if not name.startswith("x_"))
+# Sizes are drawn by an effect's place: new effects come last, so that the logs of before stay as they are.
+_LATER = ("acceleration_limit",)
+_PLACES = (*sorted(EFFECTS.keys() - _LATER), *_LATER)
 
 
 def simulated_drive(
@@ -90,7 +93,7 @@ def as_drive(t_s: np.ndarray, cells: np.ndarray, ticks_per_rev: int) -> DriveLog
 
 def realistic(name: str, seed: int, share: float = 1.0) -> dict[str, float | tuple[float, ...]]:
     """An effect of realistic size, either sign where it has one; `share` makes it smaller."""
-    generator = np.random.default_rng([seed, sorted(EFFECTS).index(name)])
+    generator = np.random.default_rng([seed, _PLACES.index(name)])
     spec = EFFECTS[name]
     drawn = {value.name: float(generator.uniform(*value.realistic)) for value in spec.values}
     sign = float(generator.choice([-1.0, 1.0]))
@@ -110,10 +113,8 @@ def realistic(name: str, seed: int, share: float = 1.0) -> dict[str, float | tup
     if name in {"speed_limit", "yaw_rate_limit"}:
         top = 7.6 if name == "speed_limit" else 1.5
         return {name: top - share * (top - drawn["limit_rad_s"])}
-    if name == "yaw_acceleration_limit":
+    if name in {"yaw_acceleration_limit", "acceleration_limit"}:
         return {name: drawn["limit_rad_s2"] / share}
-    if name == "x_slew_limited_motor":
-        return {name: drawn["limit_rad_s2"]}
     if name == "x_second_order_motor":
         return {name: (drawn["natural_frequency_rad_s"], drawn["damping"])}
     if name == "x_saturating_turn_slip":

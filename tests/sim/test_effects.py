@@ -18,7 +18,7 @@ from sim.effects import (
 
 NAMES = {
     "command_to_wheel": "motor_lag command_delay deadband stiction speed_limit yaw_rate_limit "
-    "yaw_acceleration_limit battery_sag wheel_gain",
+    "yaw_acceleration_limit acceleration_limit battery_sag wheel_gain",
     "wheel_to_body": "encoder_scale wheel_radius_asymmetry turn_slip acceleration_slip side_slip lateral_icr slope "
     "surface_change",
     "pose_sensor": "pose_latency pose_offset heading_bias",

@@ -212,10 +212,17 @@ def test_the_second_order_motor_overshoots_as_its_damping_says():
     assert speeds[-1] == pytest.approx(2.0, abs=1e-3)
 
 
-def test_the_slew_limited_motor_ramps():
-    speeds = Bench(IDEAL, x_slew_limited_motor=10.0).run(0.5, 3.0, -3.0)
+def test_a_motor_of_limited_acceleration_ramps():
+    speeds = Bench(IDEAL, acceleration_limit=10.0).run(0.5, 3.0, -3.0)
     assert speeds[99] == pytest.approx((1.0, -1.0), abs=1e-9)
     assert speeds[-1] == pytest.approx((3.0, -3.0), abs=1e-12)
+
+
+def test_a_motor_may_stop_faster_than_it_ramps():
+    bench = Bench(IDEAL, acceleration_limit=(10.0, 4.0))
+    bench.run(0.3, 3.0, -3.0)
+    assert bench.run(0.01, 0.0, 0.0)[-1] == pytest.approx((2.5, -2.5), abs=1e-9)
+    assert bench.run(0.01, 1.0, -1.0)[-1] == pytest.approx((2.4, -2.4), abs=1e-9)
 
 
 def test_disturbance_multiplies_the_true_speed_of_its_side():

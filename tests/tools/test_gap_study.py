@@ -56,8 +56,8 @@ def test_what_counts_as_right_depends_on_the_kind():
     assert result(hidden=("pose_offset",), named=("lateral_icr",)).right
     assert not result("outside", ("x_motor_droop",), ("wheel_gain",), unnamed=["u |u|"]).right
     assert result("outside", ("x_motor_droop",), (), unnamed=["u |u|"]).right
-    assert not result("forms", ("x_slew_limited_motor",), ("motor_lag",)).right
-    assert result("forms", ("x_slew_limited_motor",), ("motor_lag",), residue=1).right
+    assert not result("forms", ("x_second_order_motor",), ("motor_lag",)).right
+    assert result("forms", ("x_second_order_motor",), ("motor_lag",), residue=1).right
     assert result("strange", ("hysteresis",), ("motor_lag", "command_delay"), unnamed=["u |u|"]).right
     assert not result("strange", ("hysteresis",), ("motor_lag", "deadband")).right
     assert result("strange", ("stribeck_friction",), ("deadband",)).right

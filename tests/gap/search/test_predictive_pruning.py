@@ -110,5 +110,5 @@ def test_what_was_left_out_is_said():
 @pytest.mark.long
 def test_a_motor_with_a_slew_limit_is_not_given_a_gain_that_misleads(monkeypatch):
     monkeypatch.undo()
-    report = find_gap(simulated_drive({"x_slew_limited_motor": 10.0}, seed=7002), Model(0.061, 0.415, 0.238))
+    report = find_gap(simulated_drive({"acceleration_limit": 10.0}, seed=7002), Model(0.061, 0.415, 0.238))
     assert report.why_not_amended is None

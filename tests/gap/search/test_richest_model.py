@@ -34,7 +34,7 @@ def test_the_noise_of_a_sound_robot_is_what_the_simulator_makes():
 
 
 def test_what_has_no_name_does_not_pass_for_noise():
-    plain, channel = learnt(("x_slew_limited_motor", 8.0))
+    plain, channel = learnt(("acceleration_limit", 8.0))
     assert plain.noise.relative > 0.03
     assert channel.noise.relative < 0.022
     assert channel.noise.command_stamp_s <= 1.001 * largest_command_jitter_s(channel.drive)
