@@ -107,7 +107,7 @@ _SPECS = (
         _WHEEL,
         "the wheel's acceleration is cut at +- this, at (1 + more) times as much where no speed is asked for",
         (
-            EffectValue("limit_rad_s2", "rad/s^2", (3.1, 21.5), _POSITIVE, neutral=math.inf),
+            EffectValue("limit_rad_s2", "rad/s^2", (3.1, 12.5), _POSITIVE, neutral=math.inf),
             EffectValue("more", "1", (0.0, 0.0), _NOT_NEGATIVE, default=0.0),
         ),
         lone=(0,),

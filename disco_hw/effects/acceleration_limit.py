@@ -11,6 +11,8 @@ from disco_hw.jit import cast_like, scalar_function
 
 # Below such an aim a wheel is to stop (rad/s).
 _STOP_RAD_S = 0.02
+# A stop that takes no more than this share of the time is at once.
+_LEAST_SHARE = 1e-3
 # How long the fastest speed that was commanded takes to reach, where a fit begins (s).
 RISES_S = (0.3, 1.0, 4.0)
 
@@ -19,11 +21,11 @@ def plain(
     left: Value, right: Value, end_left: Value, end_right: Value, mean_left: Value, mean_right: Value,
     wheel_left: Value, wheel_right: Value, values: Values, step_s: float,
 ) -> tuple[Value, Value, Value, Value]:  # fmt: skip
-    """The change of each wheel's speed over a step is cut, of one that is to stop at 1 + `stops_faster` times it."""
-    limit, stops_faster = values
+    """The change of each wheel's speed over a step is cut; one that is to stop takes `stop_share` of the time."""
+    limit, stop_share = values
 
     def within(aim: Value, speed: Value, before: Value, within_s: float) -> Value:
-        change = np.where(np.abs(aim) < 0.02, limit * (1.0 + stops_faster), limit) * within_s
+        change = np.where(np.abs(aim) < 0.02, limit / np.maximum(stop_share, 1e-3), limit) * within_s
         return np.clip(speed, before - change, before + change)
 
     return (
@@ -37,7 +39,7 @@ def plain(
 def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
     """Largest change of a wheel's speed over a step, and of one that is to stop (rad/s), (L,) each."""
     most = values[:, 0] * step_s
-    return most, most * (1.0 + values[:, 1])
+    return most, most / np.maximum(values[:, 1], _LEAST_SHARE)
 
 
 @scalar_function
@@ -67,7 +69,7 @@ def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
     if largest < 0.1:
         return ()
     ramps = [largest / rise_s for rise_s in RISES_S]
-    return tuple((ramp, stops_faster) for ramp in ramps for stops_faster in (0.0, 20.0))
+    return tuple((ramp, stop_share) for ramp in ramps for stop_share in (1.0, 0.05))
 
 
 EFFECT = Effect(
@@ -76,8 +78,8 @@ EFFECT = Effect(
     stage=Stage.RESPONSE,
     order=75,
     parameters=(
-        Parameter("limit_rad_s2", "rad/s^2", 0.05, 200.0, 5.0, neutral=math.inf, realistic=20.0),
-        Parameter("stops_faster", "1", -0.9, 1000.0, 0.0, expected=30.0),
+        Parameter("limit_rad_s2", "rad/s^2", 0.05, 200.0, 5.0, neutral=math.inf, realistic=10.0),
+        Parameter("stop_share", "1", 0.0, 5.0, 1.0, neutral=1.0, expected=1.0, least_fitted=-0.2),
     ),
     plain=plain,
     coefficients=coefficients,
@@ -87,5 +89,5 @@ EFFECT = Effect(
     excitation="steps of the wheel command, from rest and back to it",
     script="starts",
     sentence="each wheel's speed changes by no more than {limit_rad_s2:.2f} rad/s^2, "
-    "to a stop by {stops_faster:.1f} times more",
+    "and takes {stop_share:.2f} of that time to a stop",
 )

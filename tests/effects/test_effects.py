@@ -84,7 +84,7 @@ def test_effects_describe_themselves(effect):
         ("battery_sag", {"loss": 0.5}, START_STOP),
         ("wheel_gain", {"left": -0.1, "right": 0.05}, TURN),
         ("turning_load", {"load_rad_s": 0.4, "unequal": 0.02}, TURN),
-        ("acceleration_limit", {"limit_rad_s2": 1.5, "stops_faster": 0.7}, START_STOP),
+        ("acceleration_limit", {"limit_rad_s2": 1.5, "stop_share": 0.7}, START_STOP),
         ("turning_buildup", {"limit_rad_s2": 1.5, "at_once_rad_s": 0.4, "shared": 0.7}, THERE_AND_BACK),
         ("wheel_radius_asymmetry", {"ratio": 0.03}, STRAIGHT),
         ("turn_slip", {"k_s": 0.2}, SPIN),
@@ -126,7 +126,7 @@ def test_yaw_rate_limit_keeps_the_mean_and_cuts_the_turn():
 
 
 def test_wheels_ramp_between_speeds_and_stop_faster():
-    values = {"acceleration_limit": {"limit_rad_s2": 4.0, "stops_faster": 2.0}}
+    values = {"acceleration_limit": {"limit_rad_s2": 4.0, "stop_share": 1 / 3}}
     wheels = free_run(values, np.array([[3.0, -1.0]] * 5 + [[1.5, 0.0]] + [[0.0, 0.3]] * 2))[1:, 3:]
     assert wheels[:, 0] == pytest.approx([0.4, 0.8, 1.2, 1.6, 2.0, 1.6, 0.4, 0.0])
     assert wheels[:, 1] == pytest.approx([-0.4, -0.8, -1.0, -1.0, -1.0, 0.0, 0.3, 0.3])
