@@ -42,6 +42,7 @@ def test_nothing_is_missing_in_a_log_with_nothing_hidden():
         # Quick tests have slip found in `search/test_searches.py`, and predicted in `search/test_stages.py`.
         pytest.param("turn_slip", 0.09, "k_s", marks=pytest.mark.long),
         pytest.param("yaw_acceleration_limit", 2.0, "limit_rad_s2", marks=pytest.mark.long),
+        pytest.param("acceleration_limit", 7.3, "limit_rad_s2", marks=pytest.mark.long),
     ],
 )
 def test_exactly_the_hidden_effect_is_named_and_the_gap_closes(name, size, parameter):

@@ -141,3 +141,27 @@ def test_the_camera_clock_of_a_small_robot_drifts(name):
 
 def test_the_lidar_clock_of_a_husky_does_not():
     assert not any("clock" in note for note in grid_drive(load_drive(Path(DATA) / HUSKY[0], 2048.0, HUSKY[1])).notes)
+
+
+def ramp_of(name):
+    report = report_of(f"optiodom/{name}.csv", 0.042, 0.2, 2796.8)
+    return {effect.name: effect.parameters for effect in report.effects}["acceleration_limit"], report
+
+
+def test_three_drives_of_a_small_robot_show_one_ramp_of_its_drive():
+    ramps = [ramp_of(f"square_20201223_0029_{run}")[0] for run in ("run01", "run02", "run04")]
+    limits = [ramp["limit_rad_s2"].value for ramp in ramps]
+    assert max(limits) < 1.1 * min(limits)
+    # Nor does it stop at once, as another firmware of it did half a year before.
+    assert all(ramp["stop_share"].value > 0.15 for ramp in ramps)
+
+
+def test_a_drive_that_ramps_for_seconds_and_stops_at_once_is_predicted_several_times_as_well():
+    ramp, report = ramp_of("square_20200623_2042_run01")
+    # Straight on its wheels reach 1.35 rad/s within four seconds, and stand within a tenth of a second.
+    assert ramp["limit_rad_s2"].value == pytest.approx(1.35 / 4.0, rel=0.2)
+    assert ramp["stop_share"].value * 4.0 < 0.1
+    assert report.offered == "amended"
+    timed, amended = (report.gap[stage][2.0] for stage in ("timed", "amended"))
+    assert amended.position_m < timed.position_m / 3.0
+    assert amended.yaw_rad < timed.yaw_rad / 6.0

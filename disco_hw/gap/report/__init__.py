@@ -253,7 +253,8 @@ class GapReport:
         return (
             f"That the amended model beats it is told by {stretches_telling(plainer):.1f} stretches of "
             f"{settings.fold_s:g} s: with fewer than {settings.fewest_stretches:g} it has to err by "
-            f"{100.0 * (1.0 - settings.far_better):.0f} % less to be believed of another drive."
+            f"{100.0 * (1.0 - settings.far_better):.0f} % less, or less in each of them, to be believed of another "
+            "drive."
         )
 
     @property

@@ -76,16 +76,33 @@ def stretches_telling(errors: PredictionErrors) -> float:
 
 
 def outdoes(before: PredictionErrors, after: PredictionErrors, settings: PredictionSettings) -> bool:
-    """Whether errors after beat those before by enough to be worth another model."""
-    return beats(before, after, settings) and math.prod(_ratios(before, after)) ** 0.5 <= settings.worth
+    """Whether errors after beat those before, and one of them by enough to be worth another model."""
+    return beats(before, after, settings) and min(_ratios(before, after)) <= settings.worth
 
 
 def surely_beats(before: PredictionErrors, after: PredictionErrors, settings: PredictionSettings) -> bool:
-    """Whether errors after outdo those before, beat them throughout and, where few stretches tell, by far."""
+    """Whether errors after outdo those before and beat them throughout.
+
+    Where few stretches tell, both have to be worth it together, in each stretch that tells, or all of them by far.
+    """
     if not (outdoes(before, after, settings) and beats_throughout(before, after, settings)):
         return False
-    few = stretches_telling(before) < settings.fewest_stretches
-    return not few or math.prod(_ratios(before, after)) ** 0.5 <= settings.far_better
+    together = math.prod(_ratios(before, after)) ** 0.5
+    if stretches_telling(before) >= settings.fewest_stretches or together <= settings.far_better:
+        return True
+    return together <= settings.worth and beats_in_each(before, after, settings)
+
+
+def beats_in_each(before: PredictionErrors, after: PredictionErrors, settings: PredictionSettings) -> bool:
+    """Whether errors after are smaller, position and heading together, in each stretch that holds a share of those
+    before, and there are three of these.
+    """
+    if before.squares is None or after.squares is None:
+        return False
+    shares = before.squares / np.maximum(before.squares.sum(axis=0), 1e-300)
+    tells = shares.max(axis=1) >= settings.telling_share
+    smaller = after.squares[tells].prod(axis=1) < before.squares[tells].prod(axis=1)
+    return bool(np.count_nonzero(tells) > 2 and smaller.all())
 
 
 def _no_larger(ratios: tuple[float, float], settings: PredictionSettings) -> bool:

@@ -52,6 +52,7 @@ FULL = {
     "speed_limit": {"limit_rad_s": st.floats(2.0, 9.0)},
     "yaw_rate_limit": {"limit_rad_s": st.floats(0.3, 5.0)},
     "yaw_acceleration_limit": {"limit_rad_s2": st.floats(0.5, 50.0)},
+    "acceleration_limit": {"limit_rad_s2": st.floats(0.3, 60.0), "stop_share": st.floats(0.0, 3.0)},
     "battery_sag": {"loss": st.floats(0.0, 0.5)},
     "wheel_gain": {"left": st.floats(-0.1, 0.1), "right": st.floats(-0.1, 0.1)},
     "turning_load": {"load_rad_s": st.floats(0.0, 1.5), "unequal": st.floats(-0.05, 0.05)},
@@ -368,6 +369,7 @@ OF_LONG_WAY = {
     "speed_limit": {"limit_rad_s": 7.97758228652401},
     "wheel_gain": {"left": 0.030486864105775724, "right": 0.0},
     "yaw_rate_limit": {"limit_rad_s": 1.5},
+    "acceleration_limit": {"limit_rad_s2": 60.0, "stop_share": 1.0},
     "turning_buildup": {"limit_rad_s2": 100.0, "at_once_rad_s": 0.0, "shared": 0.0},
 }
 

@@ -14,6 +14,7 @@ from disco_hw.gap.search.cross_validation import (
     PredictionErrors,
     _sigmas,
     beats,
+    beats_in_each,
     beats_throughout,
     clearly_worse,
     errors_of,
@@ -152,9 +153,44 @@ def test_what_few_stretches_tell_has_to_be_better_by_far():
     assert stretches_telling(few) == pytest.approx(6.4**2 / 18.04)
     assert surely_beats(many, times(many, 0.89), settings)
     assert not surely_beats(many, times(many, 0.91), settings)
-    assert not surely_beats(few, times(few, 0.9), settings)
-    assert not surely_beats(few, times(few, 0.71), settings)
-    assert surely_beats(few, times(few, 0.69), settings)
+    # Nine tenths in all, but more in one of those that tell.
+    uneven = few.squares * np.array([[0.4], [1.005], [0.7], [0.7], [0.7], [0.7]])
+    assert 0.7 < worse_by(few, in_stretches(*uneven.T)) < 0.9
+    assert not surely_beats(few, in_stretches(*uneven.T), settings)
+    assert surely_beats(few, times(few, 0.89), settings)
+    assert not surely_beats(few, times(few, 0.91), settings)
+    assert surely_beats(few, in_stretches(*(0.45 * few.squares.T)), settings)
+
+
+@pytest.mark.parametrize(
+    ("position", "yaw", "each"),
+    [
+        ([0.8, 0.8, 0.8, 1.0, 1.0], [0.8, 0.8, 0.8, 1.0, 1.0], True),
+        # One pays for the other, in the same stretch alone.
+        ([0.5, 0.5, 0.5, 1.0, 1.0], [1.9, 1.9, 1.9, 1.0, 1.0], True),
+        ([0.5, 0.5, 0.5, 1.0, 1.0], [1.9, 1.9, 2.1, 1.0, 1.0], False),
+        ([0.8, 0.8, 1.0, 1.0, 1.0], [0.8, 0.8, 1.0, 1.0, 1.0], False),
+        # What hardly errs tells nothing.
+        ([0.8, 0.8, 0.8, 3.0, 3.0], [0.8, 0.8, 0.8, 3.0, 3.0], True),
+    ],
+)
+def test_in_each_stretch_that_tells_errors_have_to_be_smaller(position, yaw, each):
+    settings, size = DEFAULT_SETTINGS.prediction, np.array([1.0, 1.0, 1.0, 0.05, 0.05])
+    before = in_stretches(size, size)
+    assert beats_in_each(before, in_stretches(size * position, size * yaw), settings) == each
+    assert not beats_in_each(before, replace(before, squares=None), settings)
+    assert not beats_in_each(replace(before, squares=None), before, settings)
+
+
+def test_two_stretches_that_tell_are_not_each_of_several():
+    settings, size = DEFAULT_SETTINGS.prediction, np.array([1.0, 1.0, 0.05, 0.04])
+    assert not beats_in_each(in_stretches(size, size), in_stretches(0.5 * size, 0.5 * size), settings)
+    # A share of the heading's errors tells as much as one of the position's.
+    assert beats_in_each(in_stretches(size, size[::-1]), in_stretches(0.5 * size, 0.5 * size[::-1]), settings)
+    # At the share itself it tells.
+    even = np.ones(10)
+    assert beats_in_each(in_stretches(even, even), in_stretches(0.9 * even, even), settings)
+    assert not beats_in_each(in_stretches(even, even), in_stretches([*(0.9 * even[1:]), 1.1], even), settings)
 
 
 def test_what_beats_by_one_stretch_alone_does_not_beat():
@@ -179,6 +215,7 @@ def test_the_larger_growth_of_position_and_heading_counts():
 def test_at_its_bounds_a_model_still_beats():
     before = in_stretches([1.0] * 6, [1.0] * 6)
     settings = replace(DEFAULT_SETTINGS.prediction, worse=2.0, level=1.0, far_better=0.5, fewest_stretches=7.0)
+    settings = replace(settings, telling_share=1.0)
     assert beats(before, in_stretches([4.0] * 6, [0.25] * 6), settings)
     assert not beats(before, in_stretches([4.4] * 6, [0.2] * 6), settings)
     assert surely_beats(before, in_stretches([0.25] * 6, [0.25] * 6), settings)
@@ -196,8 +233,9 @@ def test_what_beats_throughout_beats_in_all_too():
 def test_a_model_that_is_worth_another_errs_by_no_more_than_its_share():
     before, settings = in_stretches([1.0] * 6, [1.0] * 6), replace(DEFAULT_SETTINGS.prediction, worth=0.5)
     assert outdoes(before, in_stretches([0.25] * 6, [0.25] * 6), settings)
-    assert outdoes(before, in_stretches([0.0625] * 6, [1.0] * 6), settings)
-    assert not outdoes(before, in_stretches([0.25] * 6, [0.26] * 6), settings)
+    assert outdoes(before, in_stretches([0.25] * 6, [1.0] * 6), settings)
+    assert outdoes(before, in_stretches([1.0] * 6, [0.25] * 6), settings)
+    assert not outdoes(before, in_stretches([0.26] * 6, [0.26] * 6), settings)
 
 
 def test_two_models_are_level_within_a_hundredth_of_their_mean_errors():
