@@ -213,7 +213,8 @@ def _command_misfits(
         ends, known = [], np.ones(begin.size, dtype=bool)
         for at in (begin - delay, end - delay):
             k = np.maximum(np.searchsorted(commands.t_s, at, side="right") - 1, 0)
-            since = (at - commands.t_s[k])[:, None]
+            # Before the first command nothing is known, and is not counted below.
+            since = np.maximum(at - commands.t_s[k], 0.0)[:, None]
             slow = lag_s * (1.0 - np.exp(-since / lag_s)) if lag_s > 0.0 else 0.0
             now = np.nan_to_num(asked[k])
             ends.append((angle[k] + now * since + (state[k] - now) * slow, lost[k] + since[:, 0] * unknown[k]))

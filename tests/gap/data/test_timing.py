@@ -181,6 +181,16 @@ def test_unequal_wheels_and_commands_that_are_not_known_do_not_move_it():
     )
 
 
+@pytest.mark.filterwarnings("error")
+def test_commands_that_begin_long_after_the_wheels_are_followed_from_there():
+    wheels, commands = commanded(0.3, 0.02)
+    late = commands.t_s > 30.0
+    begun = Commands(
+        *(each[late] for each in (commands.t_s, commands.left_rad_s, commands.right_rad_s, commands.segment))
+    )
+    assert command_delay_s(wheels, begun, FEW_PAIRS) == pytest.approx(0.3, abs=0.02)
+
+
 def test_a_steady_command_has_no_delay_that_stands_out():
     t_s = np.arange(0.0, 60.0, 0.02)
     steady, one = np.full(t_s.size, 3.0), np.zeros(t_s.size, np.int64)
