@@ -29,7 +29,7 @@ from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search import joint_predictions
-from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, estimate_parameters, final_fit
+from disco_hw.gap.search.analysis import Z95, FinalFit, GapAnalysis, estimate_parameters, final_fit
 from disco_hw.gap.search.cross_validation import (
     Chain,
     PredictionErrors,
@@ -54,19 +54,27 @@ STAGES = ("refitted", "timed", "amended")
 
 @dataclass(frozen=True)
 class Half:
-    """What a half of a log, or a log, taught: the stage offered, and by stage the errors 2 s ahead on another one."""
+    """What a half of a log, or a log, taught: the stage offered, and by stage the errors 2 s ahead on another one.
+
+    `away`: by parameter how far that one's value lies from its own, in standard deviations of its interval.
+    """
 
     learnt_from: str
     offered: str
     names: tuple[str, ...]
     unseen: dict[str, PredictionErrors]
-    held: dict[str, bool]
+    away: dict[str, float]
     cpu_s: float
 
     def ratios(self, stage: str) -> tuple[float, float]:
         """Errors of a stage over those of `timed`, of position and of heading."""
         one, timed = self.unseen[stage], self.unseen["timed"]
         return one.position_m / timed.position_m, one.yaw_rad / timed.yaw_rad
+
+    @property
+    def missed(self) -> dict[str, float]:
+        """Of the parameters whose interval does not hold the other one's value, how far that is away."""
+        return {name: away for name, away in self.away.items() if abs(away) > Z95}
 
 
 def between(log: DriveLog, low_s: float, high_s: float) -> DriveLog:
@@ -107,9 +115,12 @@ def unseen_errors(drive: GriddedDrive, models: dict[str, Model], ahead_s: float 
     return errors
 
 
-def intervals_held(analysis: GapAnalysis, final: FinalFit, other: GapAnalysis) -> dict[str, bool]:
-    """Of each parameter that another half knows half as well or better: whether its interval holds that one's value."""
-    held = {}
+def values_away(analysis: GapAnalysis, final: FinalFit, other: GapAnalysis) -> dict[str, float]:
+    """How far another half's value of a parameter lies from its own, in standard deviations of its interval.
+
+    Of the parameters that the other half knows at least half as well.
+    """
+    away = {}
     for found, own, there in (
         (analysis.body, final.body_estimates, other.body),
         (analysis.wheels, final.wheel_estimates, other.wheels),
@@ -121,8 +132,10 @@ def intervals_held(analysis: GapAnalysis, final: FinalFit, other: GapAnalysis) -
         for name, estimate in own.by_name.items():
             value = same.by_name.get(name)
             if value is not None and value.deviation <= 2.0 * estimate.deviation:
-                held[name] = estimate.low <= value.value <= estimate.high
-    return held
+                apart = value.value - estimate.value
+                reach = estimate.high - estimate.value if apart > 0.0 else estimate.value - estimate.low
+                away[name] = Z95 * apart / max(reach, 1e-12)
+    return away
 
 
 @dataclass(frozen=True)
@@ -163,9 +176,9 @@ def taught(part: Part, others: Sequence[Part], nominal: Model) -> Iterator[Half]
         for name in (*found.names, *(term.form for term in found.unnamed))
     )  # fmt: skip
     for other in others:
-        held = intervals_held(part.analysis, final, other.analysis)
+        away = values_away(part.analysis, final, other.analysis)
         name = part.name if len(others) == 1 else f"{part.name} -> {other.name}"
-        yield Half(name, offered, names, unseen_errors(grid_drive(other.log), models), held, cpu_s)
+        yield Half(name, offered, names, unseen_errors(grid_drive(other.log), models), away, cpu_s)
         cpu_s = 0.0
 
 
@@ -200,7 +213,7 @@ def row(of: Half) -> str:
     """One line of the table: mm and mrad by stage, and the offered one against `timed`."""
     cells = [f"{1e3 * of.unseen[stage].position_m:.1f} / {1e3 * of.unseen[stage].yaw_rad:.0f}" for stage in STAGES]
     position, yaw = of.ratios(of.offered)
-    held = f"{sum(of.held.values())} of {len(of.held)}"
+    held = f"{len(of.away) - len(of.missed)} of {len(of.away)}"
     return f"| {of.learnt_from} | {' | '.join(cells)} | {of.offered} | {position:.2f} / {yaw:.2f} | {held} |"
 
 
@@ -228,10 +241,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     worse = [half for half in found if half.offered != "timed" and max(half.ratios(half.offered)) > 1.05]
     better = [half for half in found if min(half.ratios(half.offered)) < 0.8 and max(half.ratios(half.offered)) <= 1.05]
     print(f"\noffered worse than timed by over 5 %: {len(worse)} of {len(found)}; better by 20 %: {len(better)}")
-    held = [inside for half in found for inside in half.held.values()]
-    print(f"95 % intervals that hold the other one's value: {sum(held)} of {len(held)}")
-    missed = sorted(f"{half.learnt_from} {name}" for half in found for name, inside in half.held.items() if not inside)
-    print(f"not: {', '.join(missed)}; CPU {sum(half.cpu_s for half in found):.0f} s")
+    asked, missed = sum(len(half.away) for half in found), sum(len(half.missed) for half in found)
+    print(f"95 % intervals that hold the other one's value: {asked - missed} of {asked}")
+    names = sorted(
+        f"{half.learnt_from} {name} ({away:+.1f} sd)" for half in found for name, away in half.missed.items()
+    )
+    print(f"not: {', '.join(names)}; CPU {sum(half.cpu_s for half in found):.0f} s")
     return 0
 
 

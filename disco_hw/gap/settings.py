@@ -413,11 +413,11 @@ class ReportSettings:
     """Slow and fast differ by this share or more from the median. Chosen: wheels' speeds scatter by less."""
     regime_blocks: int = 3
     """Neighbouring blocks taken as one for the scatter of regimes. Chosen: 9 s."""
-    compared_parts: tuple[int, ...] = (2, 4)
-    """Into so many parts a log is divided to see how parameters wander. Chosen: halves, and what moves faster."""
+    short_parts: int = 4
+    """Beside halves a log is divided into so many parts to see how parameters change along it. Chosen."""
     drift_sigmas: float = 3.0
     """A parameter drifts whose first and last third of a log lie so many standard deviations apart, the second between
-    them; logs of one robot differ by as much. Chosen: one in 370."""
+    them; logs of one robot differ by as much, and halves of which the next drive goes on. Chosen: one in 370."""
     drift_share: float = 0.1
     """And by so much of itself. Chosen: less than that nobody drives differently for."""
     differ_share: float = 0.03

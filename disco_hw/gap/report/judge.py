@@ -40,12 +40,13 @@ from disco_hw.gap.search.analysis import (
     GapAnalysis,
     ParameterEstimate,
     confounded_with,
-    in_logs,
-    in_thirds,
 )
 from disco_hw.gap.search.channel_search import ChannelResult
+from disco_hw.gap.search.parts import in_equal_parts, in_logs
 from disco_hw.gap.search.richest_model import candidates_of, parameters_of
 from disco_hw.gap.settings import GRID_STEP_S, ReportSettings
+
+_PLACES = {2: ("first half of the log", "second"), 3: ("first third of the log", "second", "last")}
 
 
 def effect_findings(analysis: GapAnalysis, final: FinalFit, given: bool = False) -> tuple[EffectFinding, ...]:
@@ -173,20 +174,24 @@ def left_out_notes(analysis: GapAnalysis, kept: GapAnalysis) -> tuple[str, ...]:
 
 
 def drifting_parameters(analysis: GapAnalysis, final: FinalFit) -> tuple[str, ...]:
-    """Sentences on parameters of effects that go one way along a log: something warms up or wears."""
+    """Sentences on parameters of effects that go one way along a log: something warms up or wears.
+
+    Over its thirds, or over its halves where a third of it says too little.
+    """
     settings, out = analysis.drive.settings.report, []
     for found, estimated in ((analysis.body, final.body_estimates), (analysis.wheels, final.wheel_estimates)):
         if found is None or estimated is None:
             continue
-        for name, thirds in in_thirds(found).items():
-            early, middle, late = (float(value) for value in thirds.values)
-            far = abs(late - early) > settings.drift_share * max(abs(early), abs(late))
-            sure = abs(thirds.apart(0, 2)) > settings.drift_sigmas
-            if "." in name and far and sure and min(early, late) <= middle <= max(early, late):
-                out.append(
-                    f"{name} drifts: {early:.3g} in the first third of the log, {middle:.3g} in the second, "
-                    f"{late:.3g} in the last"
-                )
+        for name, parts in (in_equal_parts(found, 2) | in_equal_parts(found, 3)).items():
+            values = [float(value) for value in parts.values]
+            size = max(abs(values[0]), abs(values[-1]))
+            far = abs(values[-1] - values[0]) > settings.drift_share * size
+            sure = abs(parts.apart(0, len(values) - 1)) > settings.drift_sigmas
+            if "." in name and far and sure and sorted(values) in (values, values[::-1]):
+                said = [
+                    f"{value:.3g} in the {place}" for value, place in zip(values, _PLACES[len(values)], strict=True)
+                ]
+                out.append(f"{name} drifts: {', '.join(said)}")
     return tuple(out)
 
 
@@ -287,7 +292,8 @@ def doubt_of(effect: EffectFinding, measured: Measured) -> str | None:
     for parameter, estimate in pairs:
         if _at_end(parameter, estimate.value, settings):
             return f"{_written(parameter, estimate)} lies at the end of its range"
-    if all(_unknown(parameter, estimate, settings) for parameter, estimate in pairs):
+    clock_s = measured.drive.pose_clock_range_s if described.stage is Stage.POSE_TIME else 0.0
+    if all(_unknown(parameter, estimate, clock_s, settings) for parameter, estimate in pairs):
         said = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
         return f"{said} is hardly known: its interval is wider than the value"
     return _exceeded(described, pairs[0][1], measured) or measured.disputed.get(effect.name)
@@ -300,14 +306,16 @@ def _at_end(parameter: Parameter, value: float, settings: ReportSettings) -> boo
     return any(abs(value - end) <= settings.end_share * abs(end) for end in ends)
 
 
-def _unknown(parameter: Parameter, estimate: ParameterEstimate, settings: ReportSettings) -> bool:
+def _unknown(parameter: Parameter, estimate: ParameterEstimate, clock_s: float, settings: ReportSettings) -> bool:
     """Whether an interval is so wide that the value says little: wider than how far it is from neutral, nearly so of a
     limit.
+
+    What a clock that runs unevenly makes of it, of deviation `clock_s`, does not count: that is another drive's.
     """
-    half = 0.5 * (estimate.high - estimate.low)
+    half = Z95 * max(estimate.deviation**2 - clock_s**2, 0.0) ** 0.5
     limits = math.isinf(parameter.neutral)
     size = settings.limit_share * estimate.value if limits else abs(estimate.value - parameter.neutral)
-    return half > settings.wide_share * size
+    return bool(half > settings.wide_share * size)
 
 
 def _written(parameter: Parameter, estimate: ParameterEstimate) -> str:

@@ -6,18 +6,19 @@ also what is confounded by algebra: effects with the same equations, and one cau
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.effects import Channel
+from disco_hw.effects import Channel, Stage
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data.gridded_drive import GriddedDrive
-from disco_hw.gap.search.channel_search import ChannelResult
-from disco_hw.gap.search.least_squares import Fit, by_block, fit, inverse
+from disco_hw.gap.search.channel_search import ChannelResult, deviations_of
+from disco_hw.gap.search.least_squares import Fit, fit
+from disco_hw.gap.search.parts import wandered
 from disco_hw.gap.search.richest_model import CANDIDATES, LATE, indices
 from disco_hw.gap.search.selection import inflation
 from disco_hw.gap.settings import SelectionSettings
@@ -59,16 +60,19 @@ class ChannelEstimates:
 
 
 def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
-    """Intervals of all parameters that a channel's accepted set frees."""
+    """Intervals of all parameters that a channel's accepted set frees: where the next drive's values are expected."""
     best, channel = found.told, found.selector.channel
     columns = channel.layout.columns
     factors = np.array([inflation(best, channel, (index,)) for index in best.active])
     covariance = best.covariance() * np.sqrt(np.outer(factors, factors))
-    # A parameter that wanders along a log, or from log to log, is no better known than by how much: another drive
-    # finds it elsewhere.
-    wandering = wandered(found)
     own = np.maximum(np.diag(covariance), 1e-300)
-    more = np.array([(wandering.get(columns[index], 0.0) / own[place]) for place, index in enumerate(best.active)])
+    wandering, apart = wandered(found), _weightings_apart(found)
+    more = np.array(
+        [
+            (wandering.get(columns[index], 0.0) + _of_the_clock(found, columns[index]) + apart[place]) / own[place]
+            for place, index in enumerate(best.active)
+        ]
+    )
     covariance = covariance * np.sqrt(np.outer(1.0 + more, 1.0 + more))
     deviations = np.sqrt(np.diag(covariance))
     by_name = {
@@ -84,92 +88,28 @@ def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
     return ChannelEstimates(by_name, tuple(columns[index] for index in best.active), covariance)
 
 
-@dataclass(frozen=True, slots=True)
-class InParts:
-    """A parameter in the parts of a log, in order, with the standard deviation of each, (K,)."""
+def _of_the_clock(found: ChannelResult, column: str) -> float:
+    """Variance of how late poses are from one drive to the next, where their clock drifts or jumps; else none.
 
-    values: Array
-    deviations: Array
-
-    @property
-    def variance_between(self) -> float:
-        """Variance of the parameter from part to part beyond that of its estimates (DerSimonian and Laird, 1986)."""
-        weight = self.deviations**-2.0
-        total = float(weight.sum())
-        mean = float(weight @ self.values) / total
-        excess = float(weight @ (self.values - mean) ** 2) - (self.values.size - 1)
-        return max(excess, 0.0) / (total - float((weight**2).sum()) / total)
-
-    def apart(self, one: int, other: int) -> float:
-        """How far two parts lie apart, in standard deviations of the difference."""
-        return float((self.values[other] - self.values[one]) / np.hypot(self.deviations[one], self.deviations[other]))
-
-
-def wandered(found: ChannelResult) -> dict[str, float]:
-    """Variance of each parameter along a log, by full name: the largest of what several divisions of it show."""
-    blocks = np.unique(found.selector.channel.block)
-    largest: dict[str, float] = {}
-    for count in found.channel.settings.report.compared_parts:
-        edges = np.linspace(0, blocks.size, count + 1)[1:-1]
-        parts = np.searchsorted(edges, np.arange(blocks.size), side="right")
-        for name, one in in_parts(found, parts).items():
-            largest[name] = max(one.variance_between, largest.get(name, 0.0))
-    return largest
-
-
-def in_thirds(found: ChannelResult) -> dict[str, InParts]:
-    """What each third of a log says of the parameters."""
-    count = np.unique(found.selector.channel.block).size
-    return in_parts(found, 3 * np.arange(count) // max(count, 1))
-
-
-def in_logs(found: ChannelResult, begins_s: Sequence[float]) -> dict[str, InParts]:
-    """What each of several logs that were searched together says, each `begins_s` on the time of the blocks."""
-    channel = found.selector.channel
-    ends_s = (np.unique(channel.block) + 1) * channel.settings.grid.block_s
-    return in_parts(found, np.searchsorted(begins_s, ends_s))
-
-
-def in_parts(found: ChannelResult, parts: NDArray[np.int64]) -> dict[str, InParts]:
-    """What each part of a log says of the parameters, to second order; without those of which one says little.
-
-    `parts` (B,): the part of each block of time of the channel, in order.
+    Of two logs of a clock that drifts the later one begins where the other ended.
     """
-    best, channel, layout = found.told, found.selector.channel, found.selector.channel.layout
-    labels = np.unique(parts)
-    if not best.active or labels.size < 2:
-        return {}
-    settings = channel.settings
-    each = settings.selection.block_lengths[1]
-    normal, gradient = by_block(best, channel.block)
-    inside = [parts == label for label in labels]
-    least = settings.fit.part_known_share / labels.size
-    # What a part cannot tell from others it does not know, however much depends on it: a circle has one axial distance
-    # for every pair of wheels.
-    whole = 1.0 / np.diag(inverse(normal.sum(axis=0)))
-    enough = np.all([1.0 / np.diag(inverse(normal[of].sum(axis=0))) > least * whole for of in inside], axis=0)
-    places = np.array(best.active)[enough]
-    if not places.size:
-        return {}
-    values, deviations = [], []
-    for of in inside:
-        # Neighbouring blocks err together: a few are taken as one.
-        group = np.arange(np.count_nonzero(of)) // each
-        blocks = normal[of][:, enough][:, :, enough]
-        pulls = gradient[of][:, enough]
-        covariance = inverse(blocks.sum(axis=0))
-        step = -covariance @ pulls.sum(axis=0)
-        # How much more than the noise model says the blocks of a part scatter about what it says itself.
-        left = np.zeros((group[-1] + 1, places.size))
-        np.add.at(left, group, (pulls + blocks @ step) @ covariance)
-        variance = np.maximum(np.diag(covariance), (left**2).sum(axis=0))
-        deviations.append(np.sqrt(variance))
-        values.append(np.clip(best.vector[places] + step, layout.low[places], layout.high[places]))
-    columns = layout.columns
-    return {
-        columns[index]: InParts(np.array([of[k] for of in values]), np.array([of[k] for of in deviations]))
-        for k, index in enumerate(places)
-    }
+    effect = REGISTRY.get(column.split(".", maxsplit=1)[0])
+    of_clock = effect is not None and effect.stage is Stage.POSE_TIME
+    return found.selector.channel.inner.drive.pose_clock_range_s**2 if of_clock else 0.0
+
+
+def _weightings_apart(found: ChannelResult) -> Array:
+    """Squares, (A,), of how far the two weightings of the wheels' errors lie apart, beyond what chance does.
+
+    Were the model right, both would find the same, and the difference vary by the difference of their variances
+    (Hausman, 1978); as it is not, either finds what its own mixture of slow and fast wheels makes of it.
+    """
+    best, evenly = found.told, found.evenly
+    if evenly is None:
+        return np.zeros(len(best.active))
+    chosen = list(best.active)
+    by_chance = np.abs(deviations_of(evenly, found.channel) ** 2 - deviations_of(found.fit, found.channel) ** 2)
+    return np.asarray(np.maximum((evenly.vector - found.fit.vector)[chosen] ** 2 - by_chance, 0.0))
 
 
 def in_motion(wheels: ChannelEstimates, body: ChannelEstimates) -> ChannelEstimates:
@@ -196,22 +136,30 @@ def _around(value: float, deviation: float) -> tuple[float, float]:
 
 
 def _profiled(found: ChannelResult, column: str, step: float) -> ParameterEstimate:
-    """Interval in which the profile of the cost rises by no more than 1.92 nats."""
+    """Interval in which the profile of the cost rises by no more than 1.92 nats, or that of how blocks scatter."""
     selector, best = found.selector, found.fit
     channel = selector.channel
     place = channel.layout.place[column]
     active = indices(channel, found.names)
-    edges = []
+    ends = []
     for sign in (-1.0, 1.0):
         reach = step
         while True:
             vector = best.vector.copy()
             vector[place] += sign * reach
-            if fit(channel, vector, active, 1).cost > best.cost + _RISE or reach > 64.0 * step:
+            there = fit(channel, vector, active, 1)
+            if there.cost > best.cost + _RISE or reach > 64.0 * step:
                 break
             reach *= 2.0
-        edges.append(float(best.vector[place] + sign * reach))
-    return ParameterEstimate(float(best.vector[place]), edges[0], edges[1])
+        ends.append(there)
+    value, low, high = (float(each.vector[place]) for each in (best, *ends))
+    # Between the ends of the interval it is a parameter as any other, where steps smaller than those may do nothing.
+    slope = np.column_stack([best.jacobian, (ends[1].residual - ends[0].residual) / (high - low)])
+    precision = None if best.precision is None else np.append(best.precision, 0.0)
+    free = replace(best, active=(*best.active, place), slope=slope, precision=precision)
+    deviation = float(free.covariance()[-1, -1] * inflation(free, channel, (place,))) ** 0.5
+    least, most = _around(value, deviation)
+    return ParameterEstimate(value, min(low, least), max(high, most))
 
 
 _MIMICS = {name: effect.mimics for name, effect in REGISTRY.items() if effect.mimics is not None}

@@ -71,6 +71,11 @@ class ChannelResult:
         return self.selector.exact(self.names)
 
     @cached_property
+    def evenly(self) -> Fit | None:
+        """The accepted set as it fits errors that are alike at every speed; None where there are no other weights."""
+        return _evenly(self)
+
+    @cached_property
     def told(self) -> Fit:
         """The fit that values are told of and predictions made with: where the noise model does not hold, another."""
         return _told(self)
@@ -82,6 +87,20 @@ class ChannelResult:
         return selector.exact(selector.given)
 
 
+def _evenly(found: ChannelResult) -> Fit | None:
+    """The accepted set, fitted to errors that are alike at every speed; None but of wheels."""
+    best, channel = found.fit, found.channel
+    if not isinstance(channel, WheelChannel) or not best.active:
+        return None
+    terms, vector = tuple(one.term for one in found.unnamed), best.vector
+    for _ in range(channel.settings.selection.even_rounds):
+        plainly = channel.evenly(*found.selector.channel.split(vector))
+        even: ResidualChannel = WithTerms.of(plainly, terms) if terms else plainly
+        other = fit(even, vector, best.active)
+        vector = other.vector
+    return other
+
+
 def _told(found: ChannelResult) -> Fit:
     """The accepted set as it was fitted, or to errors that are alike at every speed, if blocks agree better on that.
 
@@ -89,21 +108,15 @@ def _told(found: ChannelResult) -> Fit:
     describe does not: then values are as good as least squares of speeds make them, by the scatter between blocks
     (sandwich variance; White, 1982).
     """
-    best, channel = found.fit, found.channel
-    if not isinstance(channel, WheelChannel) or not best.active:
+    best, other = found.fit, found.evenly
+    if other is None:
         return best
-    settings, terms = channel.settings.selection, tuple(one.term for one in found.unnamed)
-    vector = best.vector
-    for _ in range(settings.even_rounds):
-        plainly = channel.evenly(*found.selector.channel.split(vector))
-        even: ResidualChannel = WithTerms.of(plainly, terms) if terms else plainly
-        other = fit(even, vector, best.active)
-        vector = other.vector
-    ratio = np.mean(np.log(_deviations(other, channel)) - np.log(_deviations(best, channel)))
+    settings = found.channel.settings.selection
+    ratio = np.mean(np.log(deviations_of(other, found.channel)) - np.log(deviations_of(best, found.channel)))
     return other if ratio < math.log(settings.clearly_closer) else best
 
 
-def _deviations(best: Fit, channel: WheelChannel) -> Array:
+def deviations_of(best: Fit, channel: ResidualChannel) -> Array:
     """Standard deviations of what was fitted, (A,), by how blocks of time scatter."""
     factors = [inflation(best, channel, (index,)) for index in best.active]
     return np.asarray(np.sqrt(np.maximum(np.diag(best.covariance()) * factors, 1e-300)))

@@ -8,6 +8,7 @@ import pytest
 from scipy.signal import lfilter
 
 from disco_hw.gap.data.gridded_drive import even_times, grid_drive
+from disco_hw.gap.data.timing import PoseClock
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels
 
@@ -75,6 +76,22 @@ def test_a_log_whose_stamps_are_moved_lies_on_the_grid_as_if_they_were_not(by_s)
     assert poses.pose_delay_s == pytest.approx(plain.pose_delay_s + by_s, abs=1e-3)
     here, there = (each.pose.t_s[(each.pose.t_s > 1.0) & (each.pose.t_s < 38.0)] for each in (poses, plain))
     np.testing.assert_allclose(here, there, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("clock", "range_s"),
+    [
+        (PoseClock(0.1), 0.0),
+        (PoseClock(0.1, 5.0, 10.0, -0.06), 0.06),
+        (PoseClock(0.1, jump_s=-0.2, jump_at_s=4.0), 0.2),
+    ],
+)
+def test_a_drive_knows_by_how_much_its_poses_clock_runs_unevenly(monkeypatch, clock, range_s):
+    monkeypatch.setitem(grid_drive.__globals__, "pose_clock", lambda *of: clock)
+    t = np.arange(0.0, 10.0, 0.02)
+    line = grid_drive(drive(t, np.sin(t), t, np.sin(t)))
+    assert line.pose_clock_range_s == range_s
+    assert line.pose_clock_even == (range_s == 0.0)
 
 
 def test_silence_and_segments_cut_runs():

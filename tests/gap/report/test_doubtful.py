@@ -1,5 +1,7 @@
 """What is not known, or contradicted by its own log, is listed with the reason and not told as found."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -45,6 +47,15 @@ def test_only_what_is_known_and_not_contradicted_is_told(name, values, why):
     found = doubt_of(effect(name, **values), drive())
     assert (found is None) == (why is None)
     assert why is None or why in found
+
+
+@pytest.mark.parametrize(("clock_s", "told"), [(0.0, False), (0.02, False), (0.1, True)])
+def test_poses_of_an_uneven_clock_are_late_for_all_that_it_runs_otherwise_in_another_drive(clock_s, told):
+    measured = Measured(replace(drive().drive, pose_clock_range_s=clock_s), GEOMETRY)
+    late = effect("pose_latency", latency_s=(0.1, -0.1, 0.3))
+    assert (doubt_of(late, measured) is None) == told
+    # Of nothing else.
+    assert doubt_of(effect("motor_lag", tau_s=(0.1, -0.1, 0.3)), measured) is not None
 
 
 def test_a_moment_beyond_a_limit_contradicts_nothing():

@@ -15,16 +15,13 @@ from disco_hw.gap.report.judge import across_logs, drifting_parameters
 from disco_hw.gap.search.analysis import (
     ChannelEstimates,
     GapAnalysis,
-    InParts,
     ParameterEstimate,
     estimate_parameters,
     final_fit,
-    in_logs,
     in_motion,
-    in_thirds,
-    wandered,
 )
-from disco_hw.gap.search.channel_search import ChannelResult, body_moves, wheel_moves
+from disco_hw.gap.search.channel_search import ChannelResult, body_moves, deviations_of, wheel_moves
+from disco_hw.gap.search.parts import InParts, in_equal_parts, in_logs, wandered
 from disco_hw.gap.search.selection import Selector
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from tests.gap.synthetic import DRIVE, GEOMETRY, NOISE, body_channel, line_of
@@ -71,6 +68,17 @@ def test_the_time_of_a_change_has_an_interval_around_it():
     assert time.low < time.value < time.high
     assert time.value == pytest.approx(35.0, abs=1.0)
     assert time.high - time.low < 10.0
+
+
+def test_how_late_poses_of_an_uneven_clock_are_is_known_no_better_than_it_runs():
+    even = body_channel(turn_slip=0.08)[0]
+    uneven = type(even).build(replace(even.drive, pose_clock_range_s=0.06), even.noise, even.neutral)
+    found = [estimated(one, ("pose_latency", "turn_slip")).by_name for one in (even, uneven)]
+    known = found[0]["pose_latency.latency_s"]
+    assert known.deviation < 0.01
+    assert found[1]["pose_latency.latency_s"].value == known.value
+    assert found[1]["pose_latency.latency_s"].deviation == pytest.approx(np.hypot(known.deviation, 0.06))
+    assert all(found[1][name] == found[0][name] for name in found[0] if name != "pose_latency.latency_s")
 
 
 def test_a_limit_of_turning_is_no_better_known_than_the_geometry_that_it_is_told_in():
@@ -124,6 +132,15 @@ def test_what_wanders_is_told_from_what_parts_know_badly():
     assert InParts(np.array([1.0, 1.0, 9.0]), np.array([0.1, 0.1, 8.0])).variance_between == 0.0
 
 
+@pytest.mark.parametrize("parts", [2, 4, 8])
+def test_what_wanders_at_random_is_expected_as_far_off_in_the_next_log_as_it_is(parts):
+    steps = np.random.default_rng(parts).standard_normal((4000, 2 * 400))
+    this, following = np.split(np.cumsum(steps, axis=1), 2, axis=1)
+    means = this.reshape(4000, parts, -1).mean(axis=2)
+    expected = np.mean([InParts(each, np.full(parts, 1e-3)).variance_to_next for each in means])
+    assert expected == pytest.approx(np.mean((following.mean(axis=1) - this.mean(axis=1)) ** 2), rel=0.08)
+
+
 def test_a_part_that_cannot_tell_two_parameters_apart_says_nothing_of_either():
     """On a circle a longer axle is as good as slip."""
     rich = 2 * DRIVE
@@ -151,7 +168,7 @@ def test_each_of_several_logs_speaks_for_itself():
     assert found["turn_slip.k_s"].apart(0, 1) > 3.0
     assert abs(found["wheel_radius_m"].apart(0, 1)) < 3.0
     assert in_logs(result, (0.0,)) == {}
-    assert in_thirds(result)["turn_slip.k_s"].values.size == 3
+    assert in_equal_parts(result, 3)["turn_slip.k_s"].values.size == 3
 
 
 def test_a_parameter_that_changes_along_a_log_is_said_to_drift_and_another_is_not():
@@ -161,6 +178,29 @@ def test_a_parameter_that_changes_along_a_log_is_said_to_drift_and_another_is_no
         said = drifting_parameters(analysis, final_fit(analysis))
         assert bool(said) == drifts
         assert not drifts or said[0].startswith("turn_slip.k_s drifts: 0.0")
+
+
+@pytest.mark.parametrize(
+    ("thirds", "halves", "said"),
+    [
+        ([1.0, 1.1, 1.2], [1.0, 1.2], "1 in the first third of the log, 1.1 in the second, 1.2 in the last"),
+        ([1.2, 1.1, 1.0], None, "1.2 in the first third of the log, 1.1 in the second, 1 in the last"),
+        (None, [1.0, 1.2], "1 in the first half of the log, 1.2 in the second"),
+        (None, [1.0, 1.09], None),
+        (None, [1.0, 0.885], None),
+        ([1.0, 1.3, 1.2], [1.0, 1.2], None),
+        (None, None, None),
+    ],
+)
+def test_a_drift_shows_in_thirds_or_where_these_say_too_little_in_halves(monkeypatch, thirds, halves, said):
+    def in_equal_parts(found, count):
+        values = {2: halves, 3: thirds}[count]
+        return {} if values is None else {"lag.s": InParts(np.array(values), np.full(count, 0.03))}
+
+    monkeypatch.setitem(drifting_parameters.__globals__, "in_equal_parts", in_equal_parts)
+    analysis = SimpleNamespace(drive=SimpleNamespace(settings=DEFAULT_SETTINGS), body="body", wheels=None)
+    found = drifting_parameters(analysis, SimpleNamespace(body_estimates="found", wheel_estimates=None))
+    assert found == (() if said is None else (f"lag.s drifts: {said}",))
 
 
 def test_logs_of_one_robot_differ_in_what_changed_between_them_alone():
@@ -176,17 +216,24 @@ def test_logs_of_one_robot_differ_in_what_changed_between_them_alone():
             assert all(low < value < high for value, low, high in each.values)
 
 
-@pytest.mark.parametrize(("of_halves", "of_quarters"), [(0.3, 0.1), (0.1, 0.3)])
-def test_the_division_of_a_log_that_shows_most_says_how_far_a_parameter_wanders(monkeypatch, of_halves, of_quarters):
-    spread = {2: of_halves, 4: of_quarters}
+@pytest.mark.parametrize(
+    ("halves", "quarters", "noise", "expected"),
+    [(0.3, 0.5, 1e-6, 1.2), (0.1, 0.5, 1e-6, 0.5), (0.3, 0.1, 0.2, 0.26), (0.3, 0.1, 0.15, 4.0 * 0.2775)],
+)
+def test_what_halves_surely_differ_by_goes_on_and_what_quarters_differ_by_comes_and_goes(
+    monkeypatch, halves, quarters, noise, expected
+):
+    spread = {2: halves, 4: quarters}
 
     def in_parts(found, parts):
-        return {"motor_lag.tau_s": SimpleNamespace(variance_between=spread[np.unique(parts).size])}
+        count = np.unique(parts).size
+        assert np.bincount(parts).tolist() == [12 // count] * count
+        return {"motor_lag.tau_s": InParts(np.array([0.0, (2.0 * spread[count]) ** 0.5]), np.full(2, noise))}
 
     monkeypatch.setitem(wandered.__globals__, "in_parts", in_parts)
     channel = SimpleNamespace(block=np.repeat(np.arange(12), 5), settings=DEFAULT_SETTINGS)
     found = SimpleNamespace(channel=channel, selector=SimpleNamespace(channel=channel))
-    assert wandered(found) == {"motor_lag.tau_s": 0.3}
+    assert wandered(found) == {"motor_lag.tau_s": pytest.approx(expected)}
 
 
 def wheels_that_lose(lost_on_the_spot):
@@ -207,9 +254,38 @@ def wheels_that_lose(lost_on_the_spot):
     return ChannelResult(Selector(channel, wheel_moves(channel, np.array(GEOMETRY))), ("deadband",), channel)
 
 
+def wheels_that_stick(thresholds):
+    """What is found of wheels that follow forty ramps from rest, each beyond a threshold."""
+    rng = np.random.default_rng(12)
+    ramp = np.concatenate([np.linspace(0.0, 1.5, 150), np.zeros(50)])
+    command = np.tile(ramp, thresholds.size)[:, None] * (1.0, 1.0)
+    turned = np.where(command > np.repeat(thresholds, ramp.size)[:, None], command, 0.0)
+    line = replace(line_of(turned + 0.02 * rng.standard_normal(turned.shape)), command_rad_s=command)
+    noise = WheelNoise(relative=0.015, correlation_s=0.15, stamp_s=1e-6, wander=1e-3, drift_rad_sqrt_s=2e-3)
+    channel = WheelChannel.build(line, noise, np.array(GEOMETRY))
+    return ChannelResult(Selector(channel, wheel_moves(channel, np.array(GEOMETRY))), ("stiction",), channel)
+
+
+@pytest.mark.parametrize("scatters", [False, True])
+def test_a_threshold_is_known_no_better_than_blocks_agree_on_it(monkeypatch, scatters):
+    thresholds = np.random.default_rng(1).uniform(0.6, 0.8, 40) if scatters else np.full(40, 0.7)
+    found = wheels_that_stick(thresholds)
+    wide = estimate_parameters(found).by_name["stiction.threshold_rad_s"]
+    assert wide.low < wide.value < wide.high
+    assert wide.value == pytest.approx(0.7, abs=0.03)
+    monkeypatch.setitem(estimate_parameters.__globals__, "inflation", lambda *of: 1.0)
+    plain = estimate_parameters(found).by_name["stiction.threshold_rad_s"]
+    assert plain.low < plain.value == wide.value < plain.high
+    assert (wide.deviation > 1.2 * plain.deviation) == scatters
+
+
 def test_where_the_noise_model_holds_its_fit_is_told():
     found = wheels_that_lose(lambda rng, count: np.full(count, 0.5))
     assert found.told is found.fit
+    # Either weighting finds the same.
+    estimated = estimate_parameters(found).by_name["deadband.width_rad_s"]
+    assert estimated.low < 0.5 < estimated.high
+    assert estimated.high - estimated.low < 0.02
 
 
 def test_where_slow_wheels_contradict_each_other_the_value_of_all_is_told():
@@ -220,9 +296,10 @@ def test_where_slow_wheels_contradict_each_other_the_value_of_all_is_told():
     assert found.told.vector[place] == pytest.approx(0.5, abs=0.08)
     estimated = estimate_parameters(found).by_name[column]
     assert estimated.value == found.told.vector[place]
-    plain = replace(found)
-    plain.__dict__["told"] = plain.fit
-    assert estimated.deviation < 0.7 * estimate_parameters(plain).by_name[column].deviation
+    assert deviations_of(found.told, found.channel)[0] < 0.7 * deviations_of(found.fit, found.channel)[0]
+    # That slow wheels say otherwise is part of what is not known.
+    assert found.told.vector[place] - found.fit.vector[place] > 2.0 * deviations_of(found.fit, found.channel)[0]
+    assert estimated.low < found.fit.vector[place]
 
 
 def test_errors_that_are_alike_at_every_speed_are_of_the_size_that_is_left():
