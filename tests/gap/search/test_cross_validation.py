@@ -220,6 +220,8 @@ def test_at_its_bounds_a_model_still_beats():
     assert not beats(before, in_stretches([4.4] * 6, [0.2] * 6), settings)
     assert surely_beats(before, in_stretches([0.25] * 6, [0.25] * 6), settings)
     assert not surely_beats(before, in_stretches([0.26] * 6, [0.25] * 6), settings)
+    settings = replace(settings, worth=0.5, far_better=0.4, telling_share=0.1)
+    assert surely_beats(before, in_stretches([0.25] * 6, [0.25] * 6), settings)
 
 
 def test_what_beats_throughout_beats_in_all_too():

@@ -1,0 +1,125 @@
+"""Intervals, profiles and what the parts of a log say of a value, each against what is computed by hand."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from disco_hw.gap.search import analysis, parts
+from disco_hw.gap.search.analysis import estimate_parameters
+from disco_hw.gap.search.least_squares import Fit
+from disco_hw.gap.search.parts import InParts, in_equal_parts, in_logs, in_parts, wandered
+from disco_hw.gap.settings import DEFAULT_SETTINGS, FitSettings, GapSettings
+
+
+def test_an_interval_is_widened_by_how_blocks_scatter_and_by_how_a_value_wanders(monkeypatch):
+    covariance = np.array([[4.0, 1.0], [1.0, 9.0]])
+    told = SimpleNamespace(vector=np.array([7.0, 5.0, 3.0]), active=(2, 0), covariance=lambda: covariance)
+    channel = SimpleNamespace(layout=SimpleNamespace(columns=("a", "b", "c")))
+    found = SimpleNamespace(told=told, selector=SimpleNamespace(channel=channel), names=())
+    monkeypatch.setattr(analysis, "inflation", lambda best, of, active: {2: 4.0, 0: 1.44}[active[0]])
+    monkeypatch.setattr(analysis, "wandered", lambda of: {"c": 4.0})
+    monkeypatch.setattr(analysis, "_of_the_clock", lambda of, column: 2.0 if column == "c" else 0.0)
+    monkeypatch.setattr(analysis, "_weightings_apart", lambda of: np.array([3.0, 0.0]))
+    estimates = estimate_parameters(found)
+    # Of `c` 4 x 4 and 9 beside, of `a` 9 x 1.44.
+    deviations = np.sqrt([16.0 + 9.0, 12.96])
+    together = 1.0 * 2.0 * 1.2 * np.sqrt(25.0 / 16.0)
+    np.testing.assert_allclose(estimates.covariance, [[25.0, together], [together, 12.96]])
+    assert estimates.fitted == ("c", "a")
+    for name, value, deviation in (("c", 3.0, deviations[0]), ("a", 7.0, deviations[1])):
+        one = estimates.by_name[name]
+        assert (one.value, one.low, one.high) == pytest.approx(
+            (value, value - 1.96 * deviation, value + 1.96 * deviation)
+        )
+
+
+@pytest.mark.parametrize("step", [0.5, 2.0])
+@pytest.mark.parametrize(("slope", "ends"), [(1e3, (-4.0, 128.0)), (0.392, (-10.0, 128.0)), (0.01, (-392.0, 392.0))])
+@pytest.mark.parametrize("precision", [None, np.array([3.0])])
+def test_a_profile_reaches_to_where_the_cost_has_risen_or_blocks_scatter(monkeypatch, step, slope, ends, precision):
+    # Below, the cost rises by 1.91 nats within two steps and by 1.93 within four; above it never does.
+    def at(steps):
+        cost = 5.0 + {-1.0: 0.5, -2.0: 1.91, -4.0: 1.93}.get(steps, 0.0)
+        residual = np.array([0.0, slope * steps])
+        return Fit(np.array([3.0, 10.0 + step * steps]), (0,), cost, residual, np.array([[1.0], [0.0]]), precision)
+
+    def fit(channel, vector, active, iterations):
+        assert (active, iterations, vector[0]) == (("freed",), 1, 3.0)
+        return at((vector[1] - 10.0) / step)
+
+    monkeypatch.setattr(analysis, "fit", fit)
+    monkeypatch.setattr(analysis, "indices", lambda channel, names: ("freed",))
+    monkeypatch.setattr(analysis, "inflation", lambda free, channel, of: {((0, 1), (1,)): 4.0}[free.active, of])
+    channel = SimpleNamespace(layout=SimpleNamespace(place={"x.at": 1}))
+    found = SimpleNamespace(selector=SimpleNamespace(channel=channel), fit=at(0.0), names=())
+    one = analysis._profiled(found, "x.at", step)
+    # Twice as far each time, beyond 64 steps no more; or 1.96 deviations, which are twice those of the noise model.
+    assert (one.low, one.value, one.high) == pytest.approx((10.0 + ends[0] * step, 10.0, 10.0 + ends[1] * step))
+
+
+def of_blocks(block, told=None, settings=DEFAULT_SETTINGS):
+    layout = SimpleNamespace(columns=("x",), low=np.array([-np.inf]), high=np.array([np.inf]))
+    channel = SimpleNamespace(block=np.asarray(block), settings=settings, layout=layout)
+    return SimpleNamespace(told=told, channel=channel, selector=SimpleNamespace(channel=channel))
+
+
+def test_a_value_wanders_by_what_halves_surely_differ_or_by_the_most_that_shorter_parts_do(monkeypatch):
+    # Halves that lie 3.1 and 2.9 of their deviations apart.
+    sure, unsure = (InParts(np.array([0.0, of * 2.0**0.5]), np.ones(2)) for of in (-3.1, 2.9))
+    quarters = InParts(np.array([0.0, 4.0, 0.0, 4.0]), np.ones(4))
+    shown = {2: {"sure": sure, "unsure": unsure, "both": sure}, 4: {"both": quarters, "short": quarters}}
+    monkeypatch.setattr(parts, "in_equal_parts", lambda found, count: shown[count])
+    # Squares of half their distance, twice, less one expected.
+    of_sure, of_unsure = 3.1**2 - 1.0, 2.9**2 - 1.0
+    told = wandered(of_blocks(np.arange(12)))
+    assert told == {
+        "sure": pytest.approx(4.0 * of_sure), "unsure": pytest.approx(of_unsure), "both": pytest.approx(4.0 * of_sure),
+        "short": pytest.approx((16.0 - 3.0) / 3.0),
+    }  # fmt: skip
+    # What goes on from drive to drive is seen in halves alone.
+    shown[2] = {"short": unsure}
+    assert wandered(of_blocks(np.arange(12)))["short"] == pytest.approx(of_unsure)
+
+
+def test_parts_of_a_log_are_as_long_as_each_other(monkeypatch):
+    monkeypatch.setattr(parts, "in_parts", lambda found, of: of.tolist())
+    # Eight blocks with something in them.
+    assert in_equal_parts(of_blocks([0, 0, 1, 3, 4, 4, 5, 6, 8, 9]), 2) == [0, 0, 0, 0, 1, 1, 1, 1]
+    assert in_equal_parts(of_blocks(np.arange(8)), 3) == [0, 0, 0, 1, 1, 1, 2, 2]
+
+
+def test_a_block_belongs_to_the_log_in_which_it_ends(monkeypatch):
+    monkeypatch.setattr(parts, "in_parts", lambda found, of: of.tolist())
+    # Blocks of 3 s.
+    assert in_logs(of_blocks(np.arange(12)), [0.0, 30.0]) == [1] * 10 + [2] * 2
+    assert in_logs(of_blocks(np.arange(4)), [0.0, 8.9]) == [1, 1, 2, 2]
+
+
+def scattered(share, seed=0):
+    """Twelve blocks of one residual each, of whose information the first half holds this share."""
+    rng = np.random.default_rng(seed)
+    squares = np.repeat([share / 6.0, (1.0 - share) / 6.0], 6)
+    slope, residual = np.sqrt(squares)[:, None], 3.0 * rng.standard_normal(12)
+    return slope, residual, Fit(np.array([2.0]), (0,), 0.0, residual, slope)
+
+
+@pytest.mark.parametrize(("share", "known"), [(0.11, True), (0.09, False)])
+def test_a_part_that_says_less_than_its_share_of_a_value_says_nothing(share, known):
+    settings = GapSettings(fit=FitSettings(part_known_share=0.2))
+    found = of_blocks(np.arange(12), scattered(share)[2], settings)
+    assert bool(in_parts(found, np.repeat([0, 1], 6))) is known
+
+
+def test_a_part_says_a_value_as_surely_as_the_noise_model_or_its_own_blocks_three_by_three_have_it():
+    slope, residual, told = scattered(0.4)
+    one = in_parts(of_blocks(np.arange(12), told), np.repeat([0, 1], 6))["x"]
+    for part, rows in enumerate((slice(0, 6), slice(6, 12))):
+        a, r = slope[rows, 0], residual[rows]
+        variance = 1.0 / (a @ a)
+        step = -variance * (a @ r)
+        by_threes = (variance * a * (r + a * step)).reshape(2, 3).sum(axis=1)
+        assert one.values[part] == pytest.approx(2.0 + step)
+        assert one.deviations[part] ** 2 == pytest.approx(max(variance, (by_threes**2).sum()))
+    # The residuals are three times what is expected: blocks say less than the noise model in one half at least.
+    assert max(one.deviations**2 * [0.4, 0.6]) > 1.5
