@@ -3,7 +3,8 @@ import pytest
 
 from disco_hw.inference.excitation import Noise, excitation
 from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds, physical_range
-from disco_hw.model import Model
+from disco_hw.model import EffectSetting, Model
+from disco_hw.model.step import FreeRun
 from tests.inference.drives import TRUTH, logged
 
 SILENT = Noise(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -20,6 +21,26 @@ def test_without_noise_the_true_parameters_repeat_a_noiseless_log():
     error = poses - sim.drive.pose
     assert np.abs(error[:, :2]).max() < 3e-3
     assert np.abs(error[:, 2]).max() < 5e-3
+
+
+def test_each_simulation_remembers_its_own_drive_from_the_beginning():
+    rubber = EffectSetting("omega += k (omega - mean_3s(omega))", {"k": -0.5})
+    plain = simulator()
+    drive = plain.drive
+    found = Simulator(Model(0.06, 0.4, effects=(rubber,)), drive, SILENT)
+    first, second = found.poses(np.repeat(THETA, 2, axis=0), np.zeros(2, dtype=np.uint32))
+    np.testing.assert_array_equal(first, second)
+    without = plain.poses(THETA, np.zeros(1, dtype=np.uint32))[0]
+    assert np.abs(first - without)[:, 2].max() > 0.02
+    # As a run of the model from its first pose, whose wheels do as they are told.
+    start = np.array([*drive.pose[0], *drive.wheel_rad_s[0]])
+    model = Model(*(TRUTH[name] for name in ("wheel_radius_m", "axial_distance_m", "x_icr_m")), effects=(rubber,))
+    end = drive.run_node[1]
+    states = FreeRun(model, model.point()[None], drive.step_s).states(start, drive.wheel_rad_s[:end], 0)
+    of_first_run = slice(0, drive.run_pose[1])
+    node, part = drive.node[of_first_run], drive.fraction[of_first_run]
+    expected = states[node, 2] + part * (states[node + 1, 2] - states[node, 2])
+    np.testing.assert_allclose(first[of_first_run, 2], expected, atol=1e-6)
 
 
 def test_wrong_parameters_do_not():

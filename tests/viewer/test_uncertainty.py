@@ -3,7 +3,7 @@ import pytest
 
 from disco_hw.control.parameter_points import unscented_points
 from disco_hw.log import records
-from disco_hw.model import Gaussian, Model, load_model
+from disco_hw.model import EffectSetting, Gaussian, Model, load_model
 from disco_hw.model.step import FreeRun
 from disco_hw.viewer.recording import ParameterPoints
 from tools.viewer_run import MODEL_FILE, plan_at
@@ -22,6 +22,20 @@ def test_paths_are_those_of_the_compiled_model():
     for index, path in enumerate(paths):
         expected = runs.states(start, commands, 0, 0.0, index)[:, :2]
         assert np.abs(path - expected).max() < 1e-9
+
+
+def test_a_robot_that_remembers_is_taken_to_have_done_the_same_before():
+    terms = {"command += k u mean_1s(|u| + |u_other|)": -0.02, "omega += k (omega - mean_1s(omega))": -0.5}
+    effects = tuple(EffectSetting(name, {"k": k}) for name, k in terms.items())
+    model, plan = Model(0.06, 0.3, 0.1, effects), plan_at(0)
+    (path,) = ParameterPoints(model).trajectories(plan, (1.0, 2.0))
+    commands = np.column_stack((plan.left_rad_s, plan.right_rad_s))
+    start = np.array([plan.path_x_m[0], plan.path_y_m[0], plan.path_yaw_rad[0], 1.0, 2.0])
+    load = np.abs(commands[0]).sum()
+    run = FreeRun(model, model.point()[None], plan.step_s)
+    expected = run.states(start, commands, 0, means=np.array([load, load, 2.0 - 1.0]))[:, :2]
+    assert np.abs(path - expected).max() < 1e-9
+    assert np.abs(path - run.states(start, commands, 0)[:, :2]).max() > 1e-3
 
 
 def test_a_point_estimate_gives_one_path():

@@ -1,14 +1,11 @@
 """Terms that remember or vary with time: found, told, and written into the model where one can carry them."""
 
-import math
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
-from disco_hw.control import PlannerState, SentCommand
-from disco_hw.control.past_motion import PastMotion
 from disco_hw.gap import find_gap
 from disco_hw.gap.search import channel_search
 from disco_hw.gap.search.channel_search import (
@@ -22,11 +19,9 @@ from disco_hw.gap.search.channel_search import (
 from disco_hw.gap.search.selection import EffectEvidence, Selector
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms, motion
 from disco_hw.model import Model, load_model, save_model
-from disco_hw.model.step import FreeRun
-from disco_hw.runtime.drive_means import DriveMeans
 from tests.gap.synthetic import body_channel
 from tools import strange_robot
-from tools.mujoco_robot import joystick
+from tools.gap_another_drive import another_drive, errors_ahead, without_terms
 
 PROOF = EffectEvidence(100.0, 90.0, 80.0, 1.0, 190.0)
 
@@ -104,39 +99,6 @@ def test_in_place_of_what_no_model_can_carry_names_and_other_terms_are_fitted():
     assert written.plain is None or written.unnamed
 
 
-def errors_ahead(model, log, ahead_s=2.0, step_s=0.02):
-    """Root mean square errors (m, rad) of free runs of a model from the commands alone, with what was before."""
-    point = model.point()[None]
-    run, past, means = FreeRun(model, point, step_s), PastMotion.of(model, point, point), DriveMeans.of(model)
-    asked, wheels, poses = log.commands, log.wheels, log.poses
-    rows = zip((1e9 * asked.t_s).tolist(), asked.left_rad_s.tolist(), asked.right_rad_s.tolist(), strict=True)
-    sent = tuple(SentCommand(round(t_ns), left, right) for t_ns, left, right in rows)
-    speeds = np.column_stack([wheels.left_speed_rad_s, wheels.right_speed_rad_s])
-    taken, squares = 0, []
-    for near_s in np.arange(3.0, poses.t_s[-1] - ahead_s - 1.0, 1.0):
-        begin, end = (int(np.argmin(np.abs(poses.t_s - t_s))) for t_s in (near_s, near_s + ahead_s))
-        begin_s = poses.t_s[begin]
-        grid_s = begin_s + step_s * np.arange(-50, round(ahead_s / step_s) + 2)
-        index = np.clip(np.searchsorted(asked.t_s, grid_s + 1e-3, side="right") - 1, 0, None)
-        commands = np.column_stack([asked.left_rad_s[index], asked.right_rad_s[index]])
-        now = int(np.argmin(np.abs(wheels.t_s - begin_s)))
-        remembered = None
-        if past is not None:
-            for k in range(taken, now):
-                means.add_wheels(*speeds[k].tolist(), float(wheels.t_s[k + 1] - wheels.t_s[k]))
-            taken, now_ns = now, round(1e9 * begin_s)
-            before = tuple(one for one in sent if one.t_ns <= now_ns)
-            state = PlannerState(now_ns, 0.0, 0.0, 0.0, *speeds[now].tolist(), before, body_means=means.body)
-            remembered = past.of_mean(state, now_ns, lambda commands: commands, tuple(speeds[now]))
-        start = np.array([poses.x_m[begin], poses.y_m[begin], poses.yaw_rad[begin], *speeds[now]])
-        states = run.states(start, commands, 50, float(begin_s), means=remembered)
-        steps = (poses.t_s[end] - begin_s) / step_s
-        x, y, yaw = (np.interp(steps, np.arange(len(states)), states[:, axis]) for axis in range(3))
-        off_rad = math.remainder(yaw - poses.yaw_rad[end], 2.0 * math.pi)
-        squares.append(((x - poses.x_m[end]) ** 2 + (y - poses.y_m[end]) ** 2, off_rad**2))
-    return np.sqrt(np.mean(squares, axis=0))
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("form", "seed", "term"),
@@ -154,10 +116,13 @@ def test_what_a_robot_remembers_is_in_its_model_and_predicts_another_drive(form,
     save_model(report.model, tmp_path / "model.toml")
     model = load_model(tmp_path / "model.toml")
     assert term in [setting.name for setting in model.effects]
-    bare = replace(model, belief=None, effects=tuple(one for one in model.effects if "mean" not in one.name))
-    other = strange_robot.record(form, seed, joystick(seed + 5000, strange_robot.DURATION_S)).log
-    with_it, without = errors_ahead(model, other), errors_ahead(bare, other)
+    other = another_drive(form, seed)
+    with_it, without, forgetting = (
+        np.array(errors_ahead(one, other, remembers))
+        for one, remembers in ((model, True), (without_terms(model), True), (model, False))
+    )
     assert (with_it < 0.7 * without).all(), (with_it, without)
+    assert (with_it < 0.7 * forgetting).all(), (with_it, forgetting)
 
 
 @pytest.mark.long

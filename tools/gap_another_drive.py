@@ -1,0 +1,130 @@
+"""`python -m tools.gap_another_drive FORM:SEED...`: what a model that was written predicts of another drive.
+
+A robot with a hidden form of `tools/strange_robot.py` is searched, and its model.toml written and read again. Errors of
+free runs of the model's own step, 2 s ahead from single poses and readings of the wheels, with what the runtime keeps
+of the past: on the log itself, and on another drive of the same robot, where also with nothing remembered, and without
+the model's terms. The table of `docs/gap.md`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.control import PlannerState, SentCommand
+from disco_hw.control.past_motion import PastMotion
+from disco_hw.gap import find_gap
+from disco_hw.log.drive import DriveLog
+from disco_hw.model import Model, load_model, save_model
+from disco_hw.model.step import FreeRun
+from disco_hw.model.terms import TERMS
+from disco_hw.runtime.drive_means import DriveMeans
+from tools import strange_robot
+from tools.mujoco_robot import joystick
+
+Array = NDArray[np.float64]
+AHEAD_S, STEP_S, BEFORE_STEPS = 2.0, 0.02, 50
+FIRST_S = 3.0
+OTHER_SEED = 5000
+
+
+class Past:
+    """What is remembered along a log, from one time to a later one."""
+
+    def __init__(self, model: Model, log: DriveLog) -> None:
+        point, asked = model.point()[None], log.commands
+        self._motion, self._means = PastMotion.of(model, point, point), DriveMeans.of(model)
+        rows = zip(asked.t_s.tolist(), asked.left_rad_s.tolist(), asked.right_rad_s.tolist(), strict=True)
+        self._sent = [SentCommand(round(1e9 * t_s), left, right) for t_s, left, right in rows]
+        self._wheels, self._taken = log.wheels, 0
+
+    def means(self, t_s: float, reading: int) -> Array | None:
+        """The means at a time, at which this was the last reading of the wheels; None for a model without memory."""
+        if self._motion is None or self._means is None:
+            return None
+        wheels = self._wheels
+        for k in range(self._taken, reading):
+            held_s = float(wheels.t_s[k + 1] - wheels.t_s[k])
+            self._means.add_wheels(float(wheels.left_speed_rad_s[k]), float(wheels.right_speed_rad_s[k]), held_s)
+        self._taken, now_ns = reading, round(1e9 * t_s)
+        speeds = float(wheels.left_speed_rad_s[reading]), float(wheels.right_speed_rad_s[reading])
+        sent = tuple(one for one in self._sent if one.t_ns <= now_ns)
+        state = PlannerState(now_ns, 0.0, 0.0, 0.0, *speeds, sent=sent, body_means=self._means.body)
+        return self._motion.of_mean(state, now_ns, lambda commands: commands, speeds)
+
+
+def errors_ahead(model: Model, log: DriveLog, remembers: bool = True) -> tuple[float, float]:
+    """Root mean square errors of position (m) and heading (rad) of free runs of a model from the commands alone."""
+    run, past = FreeRun(model, model.point()[None], STEP_S), Past(model, log)
+    asked, wheels, poses, squares = log.commands, log.wheels, log.poses, []
+    for near_s in np.arange(FIRST_S, poses.t_s[-1] - AHEAD_S - 1.0, 1.0):
+        begin, end = (int(np.argmin(np.abs(poses.t_s - t_s))) for t_s in (near_s, near_s + AHEAD_S))
+        begin_s = float(poses.t_s[begin])
+        grid_s = begin_s + STEP_S * np.arange(-BEFORE_STEPS, round(AHEAD_S / STEP_S) + 2)
+        index = np.clip(np.searchsorted(asked.t_s, grid_s + 1e-3, side="right") - 1, 0, None)
+        commands = np.column_stack([asked.left_rad_s[index], asked.right_rad_s[index]])
+        now = int(np.argmin(np.abs(wheels.t_s - begin_s)))
+        speeds = wheels.left_speed_rad_s[now], wheels.right_speed_rad_s[now]
+        start = np.array([poses.x_m[begin], poses.y_m[begin], poses.yaw_rad[begin], *speeds])
+        means = past.means(begin_s, now) if remembers else None
+        states = run.states(start, commands, BEFORE_STEPS, begin_s, means=means)
+        steps = (poses.t_s[end] - begin_s) / STEP_S
+        x, y, yaw = (float(np.interp(steps, np.arange(len(states)), states[:, axis])) for axis in range(3))
+        off_rad = math.remainder(yaw - poses.yaw_rad[end], 2.0 * math.pi)
+        squares.append(((x - poses.x_m[end]) ** 2 + (y - poses.y_m[end]) ** 2, off_rad**2))
+    position_m, yaw_rad = np.sqrt(np.mean(squares, axis=0)).tolist()
+    return position_m, yaw_rad
+
+
+def written_model(form: str, seed: int) -> Model:
+    """What a search of a robot with this form writes, as it is read again."""
+    report = find_gap(strange_robot.record(form, seed).log, Model(*strange_robot.NOMINAL))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.toml"
+        save_model(report.model, path)
+        return load_model(path)
+
+
+def another_drive(form: str, seed: int) -> DriveLog:
+    """The same robot, driven by another joystick."""
+    return strange_robot.record(form, seed, joystick(seed + OTHER_SEED, strange_robot.DURATION_S)).log
+
+
+def without_terms(model: Model) -> Model:
+    """A model without its terms, the other values as they are."""
+    return replace(model, belief=None, effects=tuple(one for one in model.effects if one.name not in TERMS))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        prog="python -m tools.gap_another_drive", description=(__doc__ or "").split("\n")[0]
+    )
+    parser.add_argument("forms", nargs="+", metavar="FORM:SEED", help=f"of {', '.join(strange_robot.FORMS)}")
+    print("| hidden, seed | its own log, mm / mrad | another drive | nothing remembered | without its terms |")
+    print("|---|---|---|---|---|")
+    for given in parser.parse_args(arguments).forms:
+        form, _, number = given.partition(":")
+        seed, model = int(number), written_model(form, int(number))
+        own, other = strange_robot.record(form, seed).log, another_drive(form, seed)
+        errors = [
+            errors_ahead(model, own), errors_ahead(model, other), errors_ahead(model, other, remembers=False),
+            errors_ahead(without_terms(model), other),
+        ]  # fmt: skip
+        cells = [f"{1e3 * position_m:.1f} / {1e3 * yaw_rad:.0f}" for position_m, yaw_rad in errors]
+        print(f"| {form}, {seed} | {' | '.join(cells)} |", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
