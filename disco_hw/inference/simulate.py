@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from disco_hw.errors import InputError, WorkError
 from disco_hw.inference.excitation import Excitation, Noise, slip_intensity
 from disco_hw.jit import parallel_kernel
-from disco_hw.model.added_terms import count_means, means_of, new_means
+from disco_hw.model.added_terms import new_means
 from disco_hw.model.coefficients import base_point, effect_point
 from disco_hw.model.memory import forget
 from disco_hw.model.model import BASE_PARAMETERS, Model, coefficient_tables
@@ -75,9 +75,6 @@ def simulate_kernel(
         fresh, long_run = math.sqrt(1.0 - keep * keep), math.sqrt((1.0 - keep) / (1.0 + keep))
         here, effects_here = base_point(base, i), effect_point(effects, i)
         forget(means)
-        of_commands = count_means(effects_here.command_terms)
-        command_means = means_of(effects_here.command_terms, means, np.uintp(0), np.uintp(1))
-        body_means = means_of(effects_here.body_terms, means, np.uintp(of_commands), np.uintp(1))
         for run in range(run_node.shape[0] - 1):
             x, y, yaw = starts[run, 0], starts[run, 1], starts[run, 2]
             cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
@@ -90,7 +87,7 @@ def simulate_kernel(
                 before_x, before_y, before_yaw = x, y, yaw
                 axle_x, axle_y, cos_yaw, sin_yaw, wheel_left, wheel_right, _, turn = step(
                     axle_x, axle_y, cos_yaw, sin_yaw, wheel_left, wheel_right, wheel[k, 0], wheel[k, 1],
-                    k * integration.step_s, here, effects_here, integration, command_means, body_means,
+                    k * integration.step_s, here, effects_here, integration, means,
                 )  # fmt: skip
                 yaw = yaw + (turn + turn) * integration.step_s
                 x, y = tracked_of(axle_x, axle_y, cos_yaw, sin_yaw, here)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import namedtuple
 from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numba import types
@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 
 from disco_hw.jit import cast_like, scalar_function, specialise
 from disco_hw.model.coefficients import Base, Coefficients, TermCoefficients, Terms
-from disco_hw.model.memory import Means, recall, remember
 from disco_hw.model.terms import BODY_FEATURES, COMMAND, COMMAND_FEATURES, TERMS, Feature, GenericTerm
+
+Means: TypeAlias = Any
+"""A flat array that holds means, or None where terms remember nothing."""
 
 
 def _entry_type(name: str, term: GenericTerm) -> Any:
@@ -80,22 +82,13 @@ def new_means(effects: Coefficients) -> NDArray[np.float64] | None:
     return np.zeros(count) if count else None
 
 
-def means_of(terms: Terms | None, values: Any, at: Any, apart: Any) -> Means | None:
-    """Where the means of terms lie in a buffer, from `at` on and so far apart; None if none of them remembers."""
-    return Means(values, at, apart) if count_means(terms) else None
-
-
-@specialise(means_of)
-def _means_of(terms: Any, values: Any, at: types.Type, apart: types.Type) -> Callable[..., Any]:
-    if any(term.memory is not None for term in _compiled_terms(terms)):
-        return lambda terms, values, at, apart: Means(values, at, apart)
-    return lambda terms, values, at, apart: None
-
-
 def add_to_commands(
-    left: float, right: float, time_s: float, terms: Terms | None, means: Means | None
+    left: float, right: float, time_s: float, terms: Terms | None, means: Means, at: Any, apart: Any
 ) -> tuple[float, float]:
-    """Both commands (rad/s) with the terms that act on them; `means` of those that remember go on by a step."""
+    """Both commands (rad/s) with the terms that act on them.
+
+    Number n of the means that terms remember is `means[at + n * apart]`, and goes on by a step.
+    """
     if terms is None:
         return left, right
     new_left, new_right, place = left, right, 0
@@ -105,9 +98,8 @@ def add_to_commands(
             new_left = new_left + entry.k * feature(left, right, time_s)
             new_right = new_right + entry.k * feature(right, left, time_s)
             continue
-        assert means is not None
-        mean_left = _averaged(term.memory.of(left, right), entry, means, place)
-        mean_right = _averaged(term.memory.of(right, left), entry, means, place + 1)
+        mean_left = _averaged(term.memory.of(left, right), entry, means, at + place * apart)
+        mean_right = _averaged(term.memory.of(right, left), entry, means, at + (place + 1) * apart)
         new_left = new_left + entry.k * term.memory.feature(left, right, mean_left)
         new_right = new_right + entry.k * term.memory.feature(right, left, mean_right)
         place += term.means
@@ -115,10 +107,10 @@ def add_to_commands(
 
 
 @scalar_function
-def _averaged(signal: float, entry: TermCoefficients, means: Means, place: int) -> float:
+def _averaged(signal: float, entry: TermCoefficients, means: Means, at: Any) -> float:
     """A mean over a step in which its signal stays as it is; the mean goes on to its end."""
-    before = recall(means, place)
-    remember(means, place, before + entry.by_end * (signal - before))
+    before = means[at]
+    means[at] = before + entry.by_end * (signal - before)
     over_step: float = before + entry.over_step * (signal - before)
     return over_step
 
@@ -126,9 +118,9 @@ def _averaged(signal: float, entry: TermCoefficients, means: Means, place: int) 
 # What is overloaded is chosen by numba's types; those of tuples have fields that its annotations do not know.
 @specialise(add_to_commands)
 def _add_to_commands(
-    left: types.Type, right: types.Type, time_s: types.Type, terms: Any, means: Any
+    left: types.Type, right: types.Type, time_s: types.Type, terms: Any, means: Any, at: types.Type, apart: types.Type
 ) -> Callable[..., Any]:
-    arguments = "left, right, time_s, terms, means"
+    arguments = "left, right, time_s, terms, means, at, apart"
     if isinstance(terms, types.NoneType):
         return _made("add_to_commands", arguments, ["return left, right"], {})
     scope: dict[str, Any] = {"averaged": _averaged, "place": np.uintp}
@@ -143,8 +135,8 @@ def _add_to_commands(
             continue
         scope[f"of{n}"] = _AVERAGED[term.name]
         lines += [
-            f"mean_left = averaged(of{n}(left, right), terms[{n}], means, place({place}))",
-            f"mean_right = averaged(of{n}(right, left), terms[{n}], means, place({place + 1}))",
+            f"mean_left = averaged(of{n}(left, right), terms[{n}], means, at + place({place}) * apart)",
+            f"mean_right = averaged(of{n}(right, left), terms[{n}], means, at + place({place + 1}) * apart)",
             f"new_left = new_left + terms[{n}].k * feature{n}(left, right, mean_left)",
             f"new_right = new_right + terms[{n}].k * feature{n}(right, left, mean_right)",
         ]
@@ -161,11 +153,10 @@ def _plus(lateral: float | None, more: float) -> float:
 
 def add_to_velocity(
     forward: float, lateral: float | None, turn: float, wheel_sum: float, difference: float, change: float,
-    time_s: float, base: Base, terms: Terms | None, means: Means | None,
+    time_s: float, base: Base, terms: Terms | None, means: Means, at: Any, apart: Any,
 ) -> tuple[float, float | None, float]:  # fmt: skip
-    """Forward and lateral speed (m/s) and half the yaw rate (rad/s) with the terms; wheels as for `body_velocity`.
-
-    `means` of terms that remember go on by a step.
+    """Forward and lateral speed (m/s) and half the yaw rate (rad/s) with the terms; wheels as for `body_velocity`,
+    means as for `add_to_commands`.
     """
     if terms is None:
         return forward, lateral, turn
@@ -175,9 +166,8 @@ def add_to_velocity(
         if term.memory is None:
             more = entry.k * BODY_FEATURES[term.feature](v, w, base.half_radius_m * change * entry.per_s, time_s)
         else:
-            assert means is not None
             unit = term.memory.of(base.half_radius_m, ratio)
-            mean = unit * _averaged(term.memory.of(wheel_sum, difference), entry, means, place)
+            mean = unit * _averaged(term.memory.of(wheel_sum, difference), entry, means, at + place * apart)
             more = entry.k * term.memory.feature(v, w, mean)
             place += term.means
         match term.target:
@@ -193,9 +183,9 @@ def add_to_velocity(
 @specialise(add_to_velocity)
 def _add_to_velocity(
     forward: types.Type, lateral: types.Type, turn: types.Type, wheel_sum: types.Type, difference: types.Type,
-    change: types.Type, time_s: types.Type, base: types.Type, terms: Any, means: Any,
+    change: types.Type, time_s: types.Type, base: types.Type, terms: Any, means: Any, at: types.Type, apart: types.Type,
 ) -> Callable[..., Any]:  # fmt: skip
-    arguments = "forward, lateral, turn, wheel_sum, difference, change, time_s, base, terms, means"
+    arguments = "forward, lateral, turn, wheel_sum, difference, change, time_s, base, terms, means, at, apart"
     if isinstance(terms, types.NoneType):
         return _made("add_to_velocity", arguments, ["return forward, lateral, turn"], {})
     scope: dict[str, Any] = {"plus": _plus, "cast_like": cast_like, "averaged": _averaged, "place": np.uintp}
@@ -214,7 +204,7 @@ def _add_to_velocity(
             scope[f"of{n}"] = _AVERAGED[term.name]
             lines += [
                 f"unit = of{n}(base.half_radius_m, base.half_turn_ratio + base.half_turn_ratio)",
-                f"mean = unit * averaged(of{n}(wheel_sum, difference), terms[{n}], means, place({place}))",
+                f"mean = unit * averaged(of{n}(wheel_sum, difference), terms[{n}], means, at + place({place}) * apart)",
             ]
             more = f"terms[{n}].k * feature{n}(v, w, mean)"
             place += term.means

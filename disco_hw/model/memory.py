@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,27 +22,6 @@ Array = NDArray[np.float64]
 Feature = Callable[..., Any]
 # Below such a difference of a command from its mean its direction fades out.
 _STEADY_RAD_S = 0.1
-
-
-class Means(NamedTuple):
-    """Where the means of a robot's terms lie in a buffer: number n at `values[at + n * apart]`."""
-
-    values: Any
-    at: Any
-    apart: Any
-
-
-@scalar_function
-def recall(means: Means, n: int) -> float:
-    """Mean number n at the start of a step."""
-    kept: float = means.values[means.at + n * means.apart]
-    return kept
-
-
-@scalar_function
-def remember(means: Means, n: int, value: float) -> None:
-    """Set mean number n to what it is at the end of a step."""
-    means.values[means.at + n * means.apart] = value
 
 
 @scalar_function

@@ -22,15 +22,14 @@ from disco_hw.effects import Effect, Stage, asks_for
 from disco_hw.effects.registry import DELAY, REGISTRY, in_stages
 from disco_hw.jit import cast_like, compiled_for, kernel_function, scalar_function
 from disco_hw.model.added_terms import (
+    Means,
     add_to_commands,
     add_to_velocity,
     count_means,
-    means_of,
     new_means,
     terms_need_change,
 )
 from disco_hw.model.coefficients import MOVES_RAD_S, NO_SLIDE, Base, Coefficients, Integration, base_point, effect_point
-from disco_hw.model.memory import Means
 from disco_hw.model.model import Model, coefficient_tables
 
 Pose: TypeAlias = tuple[float, float, float, float]
@@ -56,14 +55,14 @@ def integration_from(series: NDArray[np.floating], wide: object, euler: object) 
 @scalar_function
 def wheel_step(
     left: float, right: float, wheel_left: float, wheel_right: float, time_s: float, effects: Coefficients,
-    means: Means | None,
+    means: Means, at: Any, apart: Any,
 ) -> tuple[float, float, float, float]:  # fmt: skip
     """Wheel speeds at the end of a step and their means over it, left and right (rad/s).
 
-    From the commands (after the command delay), the wheel speeds at the start of the step and its time. `means` of
-    commands that terms remember go on by the step.
+    From the commands (after the command delay), the wheel speeds at the start of the step and its time. What terms
+    remember of commands, number n at `means[at + n * apart]`, goes on by the step.
     """
-    left, right = add_to_commands(left, right, time_s, effects.command_terms, means)
+    left, right = add_to_commands(left, right, time_s, effects.command_terms, means, at, apart)
     turned: tuple[float, float, float, float] = wheel_terms(left, right, wheel_left, wheel_right, time_s, effects)
     return turned
 
@@ -71,16 +70,17 @@ def wheel_step(
 @scalar_function
 def body_velocity(
     wheel_sum: float, difference: float, change: float, time_s: float, base: Base, effects: Coefficients,
-    means: Means | None,
+    means: Means, at: Any, apart: Any,
 ) -> tuple[float, float | None, float]:  # fmt: skip
     """Forward speed (m/s), lateral speed of the axle (m/s) or None, and half the yaw rate (rad/s).
 
     From the mean wheel speeds over a step, left plus right and right minus left, the change of their sum over it
-    (rad/s), and the time at its start (s). `means` of wheel speeds that terms remember go on by the step.
+    (rad/s), and the time at its start (s). What terms remember of wheel speeds goes on as in `wheel_step`.
     """
     forward, lateral, turn = body_terms(wheel_sum, difference, change, time_s, base, effects)
     return add_to_velocity(
-        forward, lateral, turn, wheel_sum, difference, change, time_s, base, effects.body_terms, means
+        forward, lateral, turn, wheel_sum, difference, change, time_s, base, effects.body_terms, means, at,
+        apart,
     )  # fmt: skip
 
 
@@ -178,12 +178,13 @@ def straight(
 @scalar_function
 def body_step(
     axle_x: float, axle_y: float, cos_yaw: float, sin_yaw: float, wheel_sum: float, difference: float, change: float,
-    time_s: float, base: Base, effects: Coefficients, integration: Integration, means: Means | None,
+    time_s: float, base: Base, effects: Coefficients, integration: Integration,
+    means: Means, at: Any, apart: Any,
 ) -> tuple[float, float, float, float, float, float]:  # fmt: skip
     """The body's half of a step: the axle's point (m), cosine and sine of yaw after it; forward speed (m/s) and half
-    the yaw rate (rad/s) over it. Wheel speeds as for `body_velocity`.
+    the yaw rate (rad/s) over it. Wheel speeds and means as for `body_velocity`.
     """
-    forward, lateral, turn = body_velocity(wheel_sum, difference, change, time_s, base, effects, means)
+    forward, lateral, turn = body_velocity(wheel_sum, difference, change, time_s, base, effects, means, at, apart)
     arc = move(axle_x, axle_y, cos_yaw, sin_yaw, forward, lateral, turn, integration)
     axle_x, axle_y, cos_yaw, sin_yaw = straight(
         integration.euler, arc, axle_x, axle_y, cos_yaw, sin_yaw, forward, lateral, turn, base, integration.step_s
@@ -195,23 +196,23 @@ def body_step(
 @scalar_function
 def step(
     axle_x: float, axle_y: float, cos_yaw: float, sin_yaw: float, wheel_left: float, wheel_right: float, left: float,
-    right: float, time_s: float, base: Base, effects: Coefficients, integration: Integration,
-    command_means: Means | None, body_means: Means | None,
+    right: float, time_s: float, base: Base, effects: Coefficients, integration: Integration, means: Means,
 ) -> tuple[float, float, float, float, float, float, float, float]:  # fmt: skip
     """One step of f_theta.
 
     State: the axle's point (m), cosine and sine of yaw, wheel speeds (rad/s); controls: the commands in force over the
     step (rad/s), after the command delay; the time at its start (s). Returns the state after it, the forward speed over
-    it (m/s) and half the yaw rate over it (rad/s). The means that terms of commands and of the body remember, None
-    without such, are set to those at its end.
+    it (m/s) and half the yaw rate over it (rad/s). `means`: what terms remember, of commands first, set to what they
+    remember at its end; None without such.
     """
+    first, next_one = np.uintp(0), np.uintp(1)
     end_left, end_right, mean_left, mean_right = wheel_step(
-        left, right, wheel_left, wheel_right, time_s, effects, command_means
+        left, right, wheel_left, wheel_right, time_s, effects, means, first, next_one
     )
     change = (end_left + end_right) - (wheel_left + wheel_right)
     axle_x, axle_y, cos_yaw, sin_yaw, forward, turn = body_step(
         axle_x, axle_y, cos_yaw, sin_yaw, mean_left + mean_right, mean_right - mean_left, change, time_s,
-        base, effects, integration, body_means,
+        base, effects, integration, means, np.uintp(count_means(effects.command_terms)), next_one,
     )  # fmt: skip
     return axle_x, axle_y, cos_yaw, sin_yaw, end_left, end_right, forward, turn
 
@@ -422,8 +423,6 @@ def run_states(
     """Fill `states[1:]` from `states[0]`; as `FreeRun.states`."""
     integration = integration_from(series, True, None)
     here, acting = base_point(base, point), effect_point(effects, point)
-    command_means = means_of(acting.command_terms, means, np.uintp(0), np.uintp(1))
-    body_means = means_of(acting.body_terms, means, np.uintp(count_means(acting.command_terms)), np.uintp(1))
     x, y, yaw = states[0, 0], states[0, 1], states[0, 2]
     wheel_left, wheel_right = states[0, 3], states[0, 4]
     cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
@@ -437,7 +436,7 @@ def run_states(
         right = in_force(commands[recent, 1], commands[older, 1], acting)
         axle_x, axle_y, cos_yaw, sin_yaw, wheel_left, wheel_right, _, turn = step(
             axle_x, axle_y, cos_yaw, sin_yaw, wheel_left, wheel_right, left, right,
-            time_s + t * integration.step_s, here, acting, integration, command_means, body_means,
+            time_s + t * integration.step_s, here, acting, integration, means,
         )  # fmt: skip
         yaw = yaw + (turn + turn) * integration.step_s
         x, y = tracked_of(axle_x, axle_y, cos_yaw, sin_yaw, here)

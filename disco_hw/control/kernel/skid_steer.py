@@ -52,7 +52,7 @@ from disco_hw.control.kernel import (
     terminal_cost,
 )
 from disco_hw.jit import bits_of_float, block_function, cast_like, float_from_bits, scalar_function, tune_loops
-from disco_hw.model.added_terms import count_means, means_of
+from disco_hw.model.added_terms import count_means
 from disco_hw.model.coefficients import (
     MOVES_RAD_S,
     Base,
@@ -156,7 +156,7 @@ def _turn_wheels(
             was_left, was_right = state[LEFT + b], state[RIGHT + b]
             end_left, end_right, mean_left, mean_right = wheel_step(
                 left, right, was_left, was_right, time_s, acting,
-                means_of(acting.command_terms, state, REMEMBERED + b, BLOCK),
+                state, REMEMBERED + b, BLOCK,
             )  # fmt: skip
             state[LEFT + b] = end_left
             state[RIGHT + b] = end_right
@@ -210,7 +210,7 @@ def _move(
     axle_x, axle_y, cos_yaw, sin_yaw, forward, _ = body_step(
         state[AXLE_X + b], state[AXLE_Y + b], state[COS + b], state[SIN + b],
         wheel_sum, difference, change, time_s, base, effects, integration,
-        means_of(effects.body_terms, state, BODY_REMEMBERED + b, BLOCK),
+        state, BODY_REMEMBERED + b, BLOCK,
     )  # fmt: skip
     step_x, step_y = axle_x - state[AXLE_X + b], axle_y - state[AXLE_Y + b]
     axle_x, axle_y = _slid(slides, axle_x, axle_y, step_x, step_y, wheel_sum, difference, start)

@@ -64,7 +64,7 @@ def _run_wheels(
             angle[i, 0], angle[i, 1] = angle[i - 1, 0], angle[i - 1, 1]
             continue
         left_speed, right_speed, mean_left, mean_right = wheel_step(
-            left + extra[cell, 0], right + extra[cell, 1], left_speed, right_speed, t_s[cell], effects, None
+            left + extra[cell, 0], right + extra[cell, 1], left_speed, right_speed, t_s[cell], effects, None, 0, 0
         )
         angle[i, 0] = angle[i - 1, 0] + GRID_STEP_S * mean_left
         angle[i, 1] = angle[i - 1, 1] + GRID_STEP_S * mean_right
@@ -102,7 +102,7 @@ def _run_body(
             right = (angle[i, 1] - angle[i - 1, 1]) * scale[1] / GRID_STEP_S
             change = scale[0] * (speed[i, 0] - speed[i - 1, 0]) + scale[1] * (speed[i, 1] - speed[i - 1, 1])
             forward, lateral, half_rate = body_velocity(
-                left + right, right - left, change, t_s[i - 1], base, effects, None
+                left + right, right - left, change, t_s[i - 1], base, effects, None, 0, 0
             )
             turn = (2.0 * half_rate + extra[i - 1, 2]) * GRID_STEP_S
             along = (forward + extra[i - 1, 0]) * GRID_STEP_S
