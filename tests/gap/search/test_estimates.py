@@ -34,6 +34,17 @@ def test_an_interval_is_widened_by_how_blocks_scatter_and_by_how_a_value_wanders
         )
 
 
+def test_two_weightings_lie_apart_by_what_is_beyond_the_difference_of_their_variances(monkeypatch):
+    told = SimpleNamespace(active=(2, 0, 1), vector=np.array([1.0, 2.0, 3.0]))
+    evenly = SimpleNamespace(active=(2, 0, 1), vector=np.array([2.0, 0.0, 7.0]))
+    deviations = {id(evenly): np.array([3.0, 1.0, 1.0]), id(told): np.array([2.0, 2.0, 1.0])}
+    monkeypatch.setattr(analysis, "deviations_of", lambda best, channel: deviations[id(best)])
+    found = SimpleNamespace(told=told, fit=told, evenly=evenly, channel=None)
+    # 16 beyond 9 - 4, 1 within 4 - 1, and 4 beyond none.
+    assert analysis._weightings_apart(found).tolist() == [11.0, 0.0, 4.0]
+    assert analysis._weightings_apart(SimpleNamespace(told=told, evenly=None)).tolist() == [0.0] * 3
+
+
 @pytest.mark.parametrize("step", [0.5, 2.0])
 @pytest.mark.parametrize(("slope", "ends"), [(1e3, (-4.0, 128.0)), (0.392, (-10.0, 128.0)), (0.01, (-392.0, 392.0))])
 @pytest.mark.parametrize("precision", [None, np.array([3.0])])
