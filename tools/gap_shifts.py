@@ -4,6 +4,7 @@
 moved by -0.32 to 0.32 s and the channel from wheel to body is searched, commands by 0.1 to 0.4 s and that from command
 to wheel. Found: within 20 ms of the move and of what the log itself shows with the same delays in the fit, named there
 or not; a name that the log itself has not is one too many. "said": not found, and the log is told not to show it.
+Then commands are moved from the middle on, and whether the log is told to jump, by how much and when.
 """
 
 from __future__ import annotations
@@ -18,15 +19,22 @@ from pathlib import Path
 # Each process works alone on one log: a second thread for its small matrices would only be in another one's way.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import numpy as np
+
 from disco_hw.gap.data import BODY, WHEEL
-from disco_hw.gap.data.gridded_drive import grid_drive
+from disco_hw.gap.data.command_timing import command_clock
+from disco_hw.gap.data.gridded_drive import grid_drive, undo_sample_hold
+from disco_hw.gap.data.stamp_clock import StampClock
 from disco_hw.gap.search.channel_search import ChannelResult, search_body, search_wheels
 from disco_hw.gap.search.richest_model import LATE, LATE_COLUMNS, OLD_POSE_COLUMNS
+from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.log.drive import DriveLog
 from tools.gap_halves import measured_logs, read, vector
 
-POSES_BY_S = (-0.32, -0.2, -0.1, 0.1, 0.2, 0.32)
-COMMANDS_BY_S = (0.1, 0.2, 0.4)
+# Some are no whole cells of the grid and no steps of a scan.
+POSES_BY_S = (-0.32, -0.317, -0.203, -0.2, -0.1, 0.1, 0.107, 0.2, 0.213, 0.32)
+COMMANDS_BY_S = (0.1, 0.107, 0.2, 0.213, 0.4)
+JUMPS_BY_S = (-0.2, 0.1, 0.2, 0.4)
 WITHIN_S = 0.02
 POSE_TIME = tuple(column.partition(".")[0] for column in OLD_POSE_COLUMNS)
 
@@ -113,6 +121,15 @@ def shifts(path: Path) -> Iterator[Shift]:
         yield from compare(path.stem, "commands", searched, LATE_COLUMNS, LATE)
 
 
+def jumped(log: DriveLog, by_s: float) -> StampClock:
+    """The clock that is seen of commands whose stamps are moved from the middle on."""
+    commands, settings = log.commands, DEFAULT_SETTINGS.grid
+    known_s = commands.t_s[np.isfinite(commands.left_rad_s)]
+    later = commands.t_s >= 0.5 * (known_s[0] + known_s[-1])
+    moved = StampClock(0.0, jump_s=-by_s, jump_at_s=float(commands.t_s[later][0])).corrected(commands)
+    return command_clock(undo_sample_hold(log.wheels, settings), moved, settings)[0]
+
+
 def row(of: Shift) -> str:
     """One line of the table."""
     missed = "said" if of.said else "no"
@@ -125,7 +142,8 @@ def main(names: Sequence[str]) -> int:
     print("|---|---|---|---|---|---|")
     found: list[Shift] = []
     began = time.process_time()
-    for path in measured_logs(names):
+    paths = measured_logs(names)
+    for path in paths:
         for shift in shifts(path):
             found.append(shift)
             print(row(shift), flush=True)
@@ -134,6 +152,19 @@ def main(names: Sequence[str]) -> int:
         alone = sum(not shift.besides for shift in own)
         found_here, said = sum(shift.found for shift in own), sum(shift.said and not shift.found for shift in own)
         print(f"\n{part}: found within 20 ms {found_here} of {len(own)}, said not to be known {said}, alone {alone}")
+    print("\n| log | commands move from the middle on by, s | told to jump by, s | drift, s |")
+    print("|---|---|---|---|")
+    told_to, many = 0, 0
+    for path in paths:
+        log, _ = read(path)
+        if not grid_drive(log).has_commands:
+            continue
+        for by_s in (0.0, *JUMPS_BY_S):
+            clock = jumped(log, by_s)
+            many += by_s != 0.0
+            told_to += by_s != 0.0 and not clock.even
+            print(f"| {path.stem} | {by_s:+.2f} | {clock.jump_s:+.3f} | {clock.drift_s:+.3f} |", flush=True)
+    print(f"\nan uneven clock is told of in {told_to} of {many}")
     print(f"CPU {time.process_time() - began:.0f} s")
     return 0
 

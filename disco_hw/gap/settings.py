@@ -77,12 +77,18 @@ class GridSettings:
     """In fewer of them it is not looked for. Chosen."""
     least_clock_share: float = 0.5
     """Nor where those that show a delay lie in less of the log. Chosen: a line through them says little of the rest."""
+    clock_outlier_s: float = 0.1
+    """A stretch further off than this counts as so far. Chosen: wheels that begin a circle slowly look late by more."""
     clock_times_better: float = 2.0
     """It explains so many times more of how the stretches' delays scatter than it leaves. Chosen."""
     least_clock_error_s: float = 0.03
     """A smaller one is none. Chosen: a pose of a robot that turns at 1 rad/s is then off by its usual noise."""
     least_clock_nats: float = 0.02
     """And the whole log fits by so much per pose better with it. Measured: drifting clocks 0.04 to 0.8."""
+    least_link_error_s: float = 0.06
+    """Of commands a smaller one is none. Measured: lags that differ from turn to turn make 0.05 of an even link."""
+    least_link_nats: float = 0.05
+    """And the whole log fits by so much per pair better with it. Measured: even links 0.046 at most."""
     least_delay_nats: float = 0.05
     """A delay stands out by so much per pose. Measured: steady circles 0.4, a robot that turns about 3."""
 

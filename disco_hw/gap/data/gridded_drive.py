@@ -17,7 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from disco_hw.gap.data.timing import PoseClock, command_delay_s, pose_clock
+from disco_hw.gap.data.command_timing import command_clock
+from disco_hw.gap.data.stamp_clock import StampClock
+from disco_hw.gap.data.timing import pose_clock
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, GapSettings, GridSettings
 from disco_hw.log.drive import Commands, DriveLog, Poses, Wheels
 
@@ -51,8 +53,8 @@ class GriddedDrive:
     terms without a name that a given model has add; None without. `settings` travel with the drive: what judges it
     reads them there. `pose_delay_s`: how much older than their stamps poses are at first sight, s;
     `pose_clock_range_s`: by how much that changes over the drive, where their clock drifts or jumps. Commands and poses
-    are laid where they belong at first sight: `commands_moved_s` later and `poses_moved_s` earlier than their stamps,
-    whole cells. `commands_timed`: whether it is known where commands belong.
+    are laid where they belong at first sight: `commands_moved_s` later than their stamps, so that they change at the
+    borders of cells, and `poses_moved_s` earlier. `commands_timed`: whether it is known where commands belong.
     """
 
     t_s: Array
@@ -194,34 +196,52 @@ class _Timed(NamedTuple):
     commands_moved_s: float
     commands_timed: bool
     poses_moved_s: float
-    clock: PoseClock
+    clock: StampClock
     notes: tuple[str, ...]
 
 
 def _timed(log: DriveLog, wheels: Wheels, settings: GridSettings) -> _Timed:
-    clock, delay_s = pose_clock(wheels, log.poses, settings), command_delay_s(wheels, log.commands, settings)
-    later_s, earlier_s = (round(each / GRID_STEP_S) * GRID_STEP_S for each in (delay_s or 0.0, clock.delay_s))
-    poses, notes = clock.corrected(log.poses), clock.notes
-    if delay_s is None:
+    clock = pose_clock(wheels, log.poses, settings)
+    link, known = command_clock(wheels, log.commands, settings)
+    poses, commands = clock.corrected(log.poses), link.corrected(log.commands)
+    notes = (*clock.notes("poses'"), *link.notes("commands'"))
+    if not known:
         said = (
             f"wheels answer commands more slowly than behind a lag of {max(settings.lags_s):g} s, or more than "
-            f"{settings.most_pose_delay_s:g} s late or early: how late commands are stamped is not known from this log"
+            f"{settings.most_pose_delay_s:g} s late or early, or commands hardly change: how late commands are stamped "
+            "is not known from this log"
         )
         notes = (*notes, said)
+    later_s = _to_borders(commands, float(wheels.t_s[0]), -link.delay_s) if wheels.t_s.size else 0.0
     return _Timed(
-        replace(log.commands, t_s=_moved(log.commands.t_s, later_s)),
-        replace(poses, t_s=_moved(poses.t_s, -earlier_s)),
+        replace(commands, t_s=_moved(commands.t_s, later_s)),
+        replace(poses, t_s=_moved(poses.t_s, -clock.delay_s)),
         later_s,
-        delay_s is not None,
-        earlier_s,
+        known,
+        clock.delay_s,
         clock,
         notes,
     )
 
 
+def _to_borders(commands: Commands, begin_s: float, later_s: float) -> float:
+    """The move nearest to `later_s` that lets commands change at the borders of cells, in the mean over their changes.
+
+    A delay of a part of a cell is made by a mean of neighbouring cells: a change within a cell would be smeared twice.
+    Where they are less than a quarter of a cell off, as stamps scatter, whole cells.
+    """
+    asked = np.nan_to_num(np.column_stack([commands.left_rad_s, commands.right_rad_s]))
+    changes = (np.diff(asked, axis=0) ** 2).sum(axis=1)
+    turn = 2.0j * np.pi / GRID_STEP_S
+    mean = complex(np.sum(changes * np.exp(turn * (commands.t_s[1:] - begin_s))))
+    within_s = float(np.angle(mean)) / abs(turn)
+    within_s = within_s if abs(within_s) > 0.25 * GRID_STEP_S else 0.0
+    return round((later_s + within_s) / GRID_STEP_S) * GRID_STEP_S - within_s
+
+
 def _moved(t_s: Array, by_s: float) -> Array:
     """Times, moved, to the nanosecond: the last digits would decide on which side of a cell's border a sample lies."""
-    return np.round(t_s + by_s, 9) if by_s else t_s
+    return np.asarray(np.round(t_s + by_s, 9))
 
 
 def even_times(t_s: Array, neighbours: int) -> Array:

@@ -182,7 +182,9 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
     `geometry` (3,) is how far they move the robot; `start` is the vector without what is missing, in which effects
     `given` are known already.
     """
-    channel = WheelChannel.build(drive, WheelNoise(reading_rad=max(drive.quantum_rad, 2e-4)), geometry)
+    # As if commands were stamped where they lie: so the search is the same wherever their stamps are, to the last bit.
+    here = replace(drive, commands_moved_s=0.0)
+    channel = WheelChannel.build(here, WheelNoise(reading_rad=max(drive.quantum_rad, 2e-4)), geometry)
     moves = wheel_moves(channel, geometry)
     settings = drive.settings.selection
     # What is left of a rough fit becomes the noise of all that follow.
@@ -205,12 +207,35 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
         selector.fits[frozenset(names)] = fit(channel, rough.fit(names).vector, indices(channel, names))
         richest = (white * channel.weight).ravel()
         found = ChannelResult(selector, selector.select(names), channel, richest=richest, richest_parameters=many)
-        return judged(with_unnamed(found, _wheel_options), given, start)
+        return judged(stamped(with_unnamed(found, _wheel_options), drive), given, start)
 
     found = searched(sound)
     # Where nothing known comes near, the noise is too little to compare what is all wrong: the family shows in the
     # noise that the best of it leaves, and what is left against the richest model.
     return searched(plain) if found.fit.cost > settings.far_off * 0.5 * sound.count else found
+
+
+def stamped(found: ChannelResult, drive: GriddedDrive) -> ChannelResult:
+    """What was found in wheels whose commands seemed stamped where they lie, with delays counted from their stamps."""
+    place, later_s = WHEEL.place[DELAYED_BY], drive.commands_moved_s
+    assert isinstance(found.channel, WheelChannel)
+    channel = replace(found.channel, drive=drive)
+    moves = wheel_moves(channel, channel.geometry)
+
+    def from_stamps(vector: Array) -> Array:
+        moved = vector.copy()
+        moved[place] += later_s
+        return moved
+
+    def of(selector: Selector) -> Selector:
+        terms = selector.channel.terms if isinstance(selector.channel, WithTerms) else ()
+        inner = WithTerms.of(channel, terms) if terms else channel
+        fits = {names: replace(one, vector=from_stamps(one.vector)) for names, one in selector.fits.items()}
+        start = None if selector.start is None else from_stamps(selector.start)
+        return replace(selector, channel=inner, moves=moves, start=start, fits=fits, proofs={})
+
+    plain = None if found.plain is None else of(found.plain)
+    return replace(found, selector=of(found.selector), channel=channel, plain=plain)
 
 
 def timed(selector: Selector) -> Selector:

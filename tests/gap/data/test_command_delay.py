@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data import timing
-from disco_hw.gap.data.timing import command_delay_s
+from disco_hw.gap.data.command_timing import Answer, CommandAlignment, Response, Turned, command_clock, response
+from disco_hw.gap.data.stamp_clock import StampClock, picked
 from disco_hw.gap.settings import GridSettings
 from disco_hw.log.drive import Commands, Wheels
 
@@ -34,8 +34,8 @@ def commands_at(t_s, asked, segment=0):
 def test_wheels_answer_each_change_of_a_command_by_itself(lag_s):
     commands = commands_at([2.0, 2.3, 2.5, 3.1, 4.0], [(1.0, -2.0), (4.0, 0.0), (-3.0, 0.5), (2.0, 2.0), (0.0, 1.0)])
     asked = np.column_stack([commands.left_rad_s, commands.right_rad_s])
-    state, angle = np.empty((5, 2)), np.empty((5, 2))
-    timing._answer(commands.t_s, asked, lag_s, state, angle)
+    answer = Answer.of(commands, lag_s)
+    state, angle = answer.speed, answer.angle
     speed, way = answered(commands, lag_s, commands.t_s)
     if lag_s:
         np.testing.assert_allclose(state, speed, atol=1e-12)
@@ -43,6 +43,15 @@ def test_wheels_answer_each_change_of_a_command_by_itself(lag_s):
         # Just before a change they are as fast as was asked until then.
         np.testing.assert_allclose(state[1:], asked[:-1], atol=1e-12)
     np.testing.assert_allclose(angle, way, atol=1e-12)
+
+
+def test_a_segment_begins_with_wheels_that_follow_its_first_command():
+    asked = [(1.0, -2.0), (4.0, 0.0), (-3.0, 0.5), (2.0, 2.0)]
+    both = replace(commands_at([2.0, 2.3, 2.5, 3.1], asked), segment=np.array([0, 0, 1, 1]))
+    late = Answer.of(both, 0.3)
+    own = Answer.of(commands_at([2.5, 3.1], asked[2:]), 0.3)
+    np.testing.assert_allclose(late.speed[2:], own.speed, atol=1e-12)
+    np.testing.assert_allclose(late.angle[3] - late.angle[2], own.angle[1], atol=1e-12)
 
 
 def of_regression(columns, measured):
@@ -66,13 +75,12 @@ def driven(seed=2):
     begin = np.sort(rng.uniform(-1.0, 25.5, 150))
     end = begin + rng.uniform(0.3, 0.5, 150)
     segment = np.where(begin < 15.0, 3, 4)
-    turned = [rng.normal(0.5, 1.0, 150), rng.normal(0.4, 1.0, 150)]
-    return commands, (begin, end, segment), turned
+    return commands, Turned(begin, end, segment, rng.normal(0.5, 1.0, 150), rng.normal(0.4, 1.0, 150))
 
 
-def by_hand(commands, pairs, turned, delay_s, lag_s):
+def by_hand(commands, turned, delay_s, lag_s):
     """How many pairs are known, and their misfit."""
-    begin, end, segment = pairs
+    begin, end, segment = turned.begin_s, turned.end_s, turned.segment
     known = np.ones(begin.size, dtype=bool)
     for at in (begin - delay_s, end - delay_s):
         known &= (at >= commands.t_s[0]) & (at <= commands.t_s[-1])
@@ -81,43 +89,42 @@ def by_hand(commands, pairs, turned, delay_s, lag_s):
         known &= commands.segment[place] == segment
     # From 10 to 11 s nothing is known.
     known &= (end - delay_s <= 10.0) | (begin - delay_s >= 11.0)
-    ways = [answered(commands, lag_s, at - delay_s)[1] for at in (begin, end)]
-    moved = (ways[1] - ways[0])[known]
+    moved = np.zeros((begin.size, 2))
+    for number in (3, 4):
+        own = picked(commands, commands.segment == number)
+        ways = [answered(own, lag_s, at - delay_s)[1] for at in (begin, end)]
+        moved = np.where((segment == number)[:, None], ways[1] - ways[0], moved)
+    moved = moved[known]
     columns = np.column_stack([moved[:, 1] - moved[:, 0], moved[:, 1] + moved[:, 0]])
-    return int(known.sum()), sum(of_regression(columns, of[known]) for of in turned)
+    return int(known.sum()), sum(of_regression(columns, of[known]) for of in (turned.left_rad, turned.right_rad))
 
 
 @pytest.mark.parametrize(("delay_s", "lag_s"), [(0.0, 0.0), (0.33, 0.0), (-0.4, 0.2), (0.12, 0.5)])
 def test_what_wheels_turn_is_fitted_by_what_both_commands_make_them_turn(delay_s, lag_s):
-    commands, pairs, turned = driven()
-    count, misfit = by_hand(commands, pairs, turned, delay_s, lag_s)
+    commands, turned = driven()
+    count, misfit = by_hand(commands, turned, delay_s, lag_s)
     assert 100 < count < 140
-    delays = np.array([90.0, delay_s, -90.0])
-    found = timing._command_misfits(commands, pairs, turned, delays, lag_s, replace(SETTINGS, fewest_poses=count))
-    assert found == pytest.approx([np.inf, misfit, np.inf], rel=1e-9)
-    few = timing._command_misfits(commands, pairs, turned, delays, lag_s, replace(SETTINGS, fewest_poses=count + 1))
-    assert (few == np.inf).all()
+    delays, answer = np.array([90.0, delay_s, -90.0]), Answer.of(commands, lag_s)
+    assert answer.misfits(turned, delays, count) == pytest.approx([np.inf, misfit, np.inf], rel=1e-9)
+    assert (answer.misfits(turned, delays, count + 1) == np.inf).all()
+    assert np.count_nonzero(answer.known(turned, delay_s)) == count
 
 
 def test_a_pair_is_known_from_the_first_command_to_the_last_and_up_to_one_that_is_not_known():
     commands = commands_at([1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [(1, 2), (3, 1), (2, 2), (np.nan, np.nan), (4, 4), (1, 0)])
-    settings = replace(SETTINGS, fewest_poses=1)
     for begin_s, end_s, known in (
         (1.0, 2.0, True), (0.99, 2.0, False), (2.5, 4.0, True), (2.5, 4.01, False), (4.99, 5.5, False),
         (5.0, 6.0, True), (5.5, 6.01, False),
     ):  # fmt: skip
-        pairs = np.array([begin_s]), np.array([end_s]), np.array([0])
-        misfit = timing._command_misfits(commands, pairs, [np.ones(1)] * 2, np.zeros(1), 0.0, settings)
-        assert np.isfinite(misfit[0]) == known
+        pair = Turned(*(np.array([each]) for each in (begin_s, end_s, 0, 1.0, 1.0)))
+        assert Answer.of(commands, 0.0).known(pair, 0.0).tolist() == [known]
 
 
 def test_what_was_not_known_right_after_the_first_command_is_not_known():
     commands = commands_at([1.0, 2.0, 2.25, 3.0], [(1, 2), (np.nan, np.nan), (2, 2), (4, 4)])
-    settings = replace(SETTINGS, fewest_poses=1)
     for begin_s, end_s, known in ((1.5, 2.0, True), (1.5, 2.125, False), (1.5, 2.5, False), (2.25, 2.5, True)):
-        pairs = np.array([begin_s]), np.array([end_s]), np.array([0])
-        misfit = timing._command_misfits(commands, pairs, [np.ones(1)] * 2, np.zeros(1), 0.0, settings)
-        assert np.isfinite(misfit[0]) == known
+        pair = Turned(*(np.array([each]) for each in (begin_s, end_s, 0, 1.0, 1.0)))
+        assert Answer.of(commands, 0.0).known(pair, 0.0).tolist() == [known]
 
 
 def sampled(count=400, period_s=0.05, segment=0):
@@ -126,88 +133,144 @@ def sampled(count=400, period_s=0.05, segment=0):
     return Wheels(t_s, 2.0 * t_s, 3.0 * t_s, 0.0 * t_s, 0.0 * t_s, np.full(count, segment), True, True)
 
 
-ONE = commands_at([0.0, 1.0], [(1.0, 1.0), (2.0, 2.0)])
+ONE = commands_at([0.0, 30.0], [(1.0, 1.0), (2.0, 2.0)])
 
 
 @pytest.fixture
 def scanned(monkeypatch):
-    """What is told where the misfit is a parabola about a delay for each lag; what was asked for."""
+    """What is told where the misfit is a parabola about a delay for each lag, and commands known up to some delay."""
     asked = []
 
-    def told(lowest, wheels=None, commands=ONE, known=True, **settings):
+    def told(lowest, wheels=None, commands=ONE, known_s=9.0, shared=True, **settings):
         asked.clear()
 
-        def misfits(commands, pairs, turned, delays, lag_s, settings):
-            asked.append((pairs, turned, delays, lag_s))
-            if not known:
-                return np.full(delays.size, np.inf)
-            at_s, depth = lowest.get(lag_s, (0.0, 0.0))
-            return -np.maximum(depth - 100.0 * (delays - at_s) ** 2, 0.0)
+        def misfits(answer, turned, delays, fewest):
+            asked.append((turned, delays, answer.lag_s))
+            at_s, depth = lowest.get(answer.lag_s, (0.0, 0.0))
+            there = -np.maximum(depth - 100.0 * (delays - at_s) ** 2, 0.0)
+            counts = np.array([np.count_nonzero(answer.known(turned, each)) for each in delays])
+            return np.where(counts >= fewest, there, np.inf)
 
-        monkeypatch.setattr(timing, "_command_misfits", misfits)
-        chosen = replace(SETTINGS, lags_s=(0.1, 0.3), lag_reach_s=0.11, **settings)
-        return command_delay_s(sampled() if wheels is None else wheels, commands, chosen)
+        def known(answer, turned, delay_s):
+            # One pair in three is lost where commands are not known.
+            return (np.arange(turned.begin_s.size) % 3 > 0) | (abs(delay_s) <= known_s)
+
+        monkeypatch.setattr(Answer, "misfits", misfits)
+        monkeypatch.setattr(Answer, "known", known)
+        monkeypatch.setattr(Answer, "stands_out", lambda *_: shared)
+        chosen = replace(SETTINGS, lags_s=(0.1, 0.3), lag_reach_s=0.12, **settings)
+        return response(Turned.of(sampled() if wheels is None else wheels, chosen), commands, chosen)
 
     told.asked = asked
     return told
 
 
 def test_a_delay_is_found_between_those_that_are_tried_without_a_lag_and_with_each_as_long_in_all(scanned):
-    assert scanned({0.0: (0.247, 1.0)}) == pytest.approx(0.247)
-    delays, *shorter = [delays for _, _, delays, _ in scanned.asked]
-    assert delays == pytest.approx(0.02 * np.arange(-50, 51))
-    # Nearest to the best is 0.24.
-    assert shorter[0] == pytest.approx(0.24 - 0.1 + 0.02 * np.arange(-5, 6))
-    assert shorter[1] == pytest.approx(0.24 - 0.3 + 0.02 * np.arange(-5, 6))
-    assert [lag_s for *_, lag_s in scanned.asked] == [0.0, 0.1, 0.3]
-    assert scanned({0.0: (0.247, 1.0), 0.1: (0.151, 1.1)}) == pytest.approx(0.151)
-    assert scanned({0.0: (0.247, 1.0), 0.1: (0.151, 0.9)}) == pytest.approx(0.247)
-    # The best of all counts, and not the last that is better than the first.
-    assert scanned({0.0: (0.247, 1.0), 0.1: (0.151, 1.3), 0.3: (-0.049, 1.2)}) == pytest.approx(0.151)
+    assert scanned({0.0: (0.247, 1.0)}).delay_s == pytest.approx(0.247, abs=1e-3)
+    scans = [(delays, lag_s) for _, delays, lag_s in scanned.asked if delays.size > 1]
+    # Some lags over all delays, and then each about the best.
+    for delays, _ in scans[:2]:
+        assert delays == pytest.approx(0.04 * np.arange(-25, 26))
+    assert [lag_s for _, lag_s in scans] == [0.0, 0.3, 0.0, 0.1, 0.3]
+    for delays, lag_s in scans[2:]:
+        assert delays == pytest.approx(0.247 - lag_s + 0.02 * np.arange(-6, 7), abs=1e-3)
+    for first, shorter, found in (
+        ((0.247, 1.0), {0.1: (0.151, 1.1)}, (0.151, 0.1)),
+        ((0.247, 1.0), {0.1: (0.151, 0.9)}, (0.247, 0.0)),
+        # The best of all counts, and not the last that is better than the first.
+        ((0.247, 1.0), {0.1: (0.151, 1.3), 0.3: (-0.049, 1.2)}, (0.151, 0.1)),
+    ):
+        told = scanned({0.0: first, **shorter})
+        assert (told.delay_s, told.lag_s) == (pytest.approx(found[0], abs=1e-3), found[1])
+        assert told.known
+
+
+def test_lags_are_told_apart_where_they_fit_best_and_not_at_the_steps_of_the_scan(scanned):
+    # At the steps of the scan about 0.247 a lag of 0.1 s fits no better.
+    told = scanned({0.0: (0.247, 1.0), 0.1: (0.157, 1.005)})
+    assert (told.delay_s, told.lag_s) == (pytest.approx(0.157, abs=1e-3), 0.1)
+    assert told.misfit == pytest.approx(-1.005, abs=1e-3)
 
 
 def test_where_the_longest_delay_or_lag_fits_best_no_delay_is_known(scanned):
-    assert scanned({0.0: (0.5, 1.0), 0.3: (0.2, 1.1)}) is None
-    for at_s, known in ((1.0, False), (0.98, True), (-1.0, False), (-0.98, True)):
+    # Behind the longest lag a delay is where the log is laid, though it need not be the one.
+    told = scanned({0.0: (0.5, 1.0), 0.3: (0.2, 1.1)})
+    assert (told.delay_s, told.known) == (pytest.approx(0.2, abs=1e-3), False)
+    for at_s, known in ((1.0, False), (0.96, True), (-1.0, False), (-0.96, True)):
         told = scanned({0.0: (at_s, 1.0)})
-        assert (told is not None) == known
-        assert not known or told == pytest.approx(at_s)
+        assert told.known == known
+        assert told.delay_s == (pytest.approx(at_s, abs=1e-3) if known else 0.0)
 
 
-def test_a_delay_of_commands_is_told_where_it_stands_out(scanned):
+def test_delays_at_which_a_quarter_of_the_pairs_is_lost_are_none(scanned):
+    assert scanned({0.0: (0.4, 1.0)}).known
+    assert scanned({0.0: (0.4, 1.0)}, known_s=0.5).delay_s == pytest.approx(0.4, abs=1e-3)
+    # The next one that would be longer has lost them.
+    told = scanned({0.0: (0.48, 1.0)}, known_s=0.5)
+    assert (told.delay_s, told.known) == (0.0, False)
+
+
+def test_a_delay_of_commands_is_told_where_it_stands_out_among_others_and_for_the_same_pairs(scanned):
     for depth, told in ((0.051, 0.24), (0.049, 0.0)):
-        assert scanned({0.0: (0.24, depth)}) == pytest.approx(told)
+        found = scanned({0.0: (0.24, depth)})
+        assert (found.delay_s, found.known) == (pytest.approx(told, abs=1e-3), told > 0.0)
     # With a lag it may do so though not without.
-    assert scanned({0.0: (0.24, 0.04), 0.1: (0.14, 0.06)}) == pytest.approx(0.14)
-    assert scanned({0.0: (0.24, 0.5)}, least_delay_nats=0.5) == pytest.approx(0.24)
-    # It is not known, but it does not stand out either.
-    assert scanned({0.0: (1.0, 0.04)}) == 0.0
-    assert scanned({}, known=False) == 0.0
-    assert len(scanned.asked) == 1
+    assert scanned({0.0: (0.24, 0.04), 0.1: (0.14, 0.06)}).delay_s == pytest.approx(0.14, abs=1e-3)
+    assert scanned({0.0: (0.24, 0.5)}, least_delay_nats=0.49).delay_s == pytest.approx(0.24, abs=1e-3)
+    assert scanned({0.0: (0.24, 1.0)}, shared=False) == Response(known=False)
 
 
-def test_pairs_lie_as_far_apart_as_poses_or_as_samples_come_and_are_thinned(scanned):
+@pytest.mark.parametrize(("by_s", "told"), [(0.0, True), (0.1, True), (0.3, False)])
+def test_the_same_pairs_fit_worse_at_a_shorter_and_at_a_longer_delay(by_s, told):
+    t_s = np.arange(0.0, 60.0, 0.1)
+    rng = np.random.default_rng(3)
+    commands = commands_at(t_s[::10], rng.normal(0.0, 3.0, (60, 2)))
+    begin = np.arange(2.0, 55.0, 0.2)
+    way = [answered(commands, 0.0, at)[1] for at in (begin - 0.2, begin + 0.2)]
+    turned = Turned(begin, begin + 0.4, np.zeros(begin.size, np.int64), *(way[1] - way[0]).T)
+    answer = Answer.of(commands, 0.0)
+    assert answer.stands_out(turned, 0.2 + by_s, 0.15) == told
+    steady = Answer.of(commands_at(t_s, np.ones((600, 2))), 0.0)
+    assert not steady.stands_out(turned, 0.2, 0.15)
+    assert not answer.stands_out(turned, 90.0, 0.15)
+
+
+def test_pairs_lie_as_far_apart_as_poses_or_as_samples_come_and_are_thinned():
     wheels = sampled(segment=7)
-    scanned({0.0: (0.24, 1.0)}, wheels)
-    (begin, end, segment), turned, *_ = scanned.asked[0]
-    assert begin == pytest.approx(wheels.t_s[:392])
-    assert end - begin == pytest.approx(0.4)
-    assert (segment == 7).all()
-    assert turned == [pytest.approx(0.8), pytest.approx(1.2)]
-    scanned({0.0: (0.24, 1.0)}, sampled(period_s=0.7))
-    assert scanned.asked[0][0][1] - scanned.asked[0][0][0] == pytest.approx(0.7)
+    turned = Turned.of(wheels, SETTINGS)
+    assert turned.begin_s == pytest.approx(wheels.t_s[:392])
+    assert turned.end_s - turned.begin_s == pytest.approx(0.4)
+    assert (turned.segment == 7).all()
+    assert (turned.left_rad, turned.right_rad) == (pytest.approx(0.8), pytest.approx(1.2))
+    rare = Turned.of(sampled(period_s=0.7), SETTINGS)
+    assert rare.end_s - rare.begin_s == pytest.approx(0.7)
     for most, every in ((392, 1), (197, 1), (196, 2), (100, 3)):
-        scanned({0.0: (0.24, 1.0)}, wheels, most_command_pairs=most)
-        assert scanned.asked[0][0][0] == pytest.approx(wheels.t_s[:392:every])
-        assert scanned.asked[0][0][1] == pytest.approx(wheels.t_s[:392:every] + 0.4)
+        turned = Turned.of(wheels, replace(SETTINGS, most_command_pairs=most))
+        assert turned.begin_s == pytest.approx(wheels.t_s[:392:every])
+        assert turned.end_s == pytest.approx(wheels.t_s[:392:every] + 0.4)
+    part = Turned.of(wheels, SETTINGS).between(1.0, 2.0)
+    assert part.begin_s == pytest.approx(np.arange(1.0, 2.0, 0.05))
+    assert part.left_rad.size == part.end_s.size == part.segment.size == 20
 
 
-def test_too_few_samples_or_commands_have_no_delay(scanned):
+def test_too_few_samples_or_commands_have_no_delay_and_nothing_is_asked_of_it(scanned):
     found = {0.0: (0.24, 1.0)}
-    none = Commands(*(of[:1] for of in (ONE.t_s, ONE.left_rad_s, ONE.right_rad_s, ONE.segment)))
-    assert scanned(found, commands=none) == 0.0
+    none = picked(ONE, np.array([True, False]))
+    assert scanned(found, commands=none) == Response()
     # Two samples make one pair.
-    assert scanned(found, sampled(2, 0.4), fewest_poses=1) == pytest.approx(0.24)
-    assert scanned(found, sampled(1, 0.4), fewest_poses=0) == 0.0
-    for fewest, told in ((392, 0.24), (393, 0.0)):
-        assert scanned(found, fewest_poses=fewest) == pytest.approx(told)
+    assert scanned(found, sampled(2, 0.4), fewest_poses=1).delay_s == pytest.approx(0.24, abs=1e-3)
+    assert scanned(found, sampled(1, 0.4), fewest_poses=1) == Response()
+    for fewest, told in ((392, True), (393, False)):
+        assert (scanned(found, fewest_poses=fewest).delay_s > 0.2) == told
+    assert command_clock(sampled(), none, SETTINGS) == (StampClock(0.0), True)
+
+
+def test_stretches_of_commands_are_longer_where_speeds_come_less_often():
+    answer = Answer.of(ONE, 0.1)
+    for period_s, stretch_s in ((0.05, 12.0), (0.5, 45.0)):
+        turned = Turned.of(sampled(period_s=period_s), SETTINGS)
+        align = CommandAlignment(turned, Response(), answer, SETTINGS)
+        assert align.stretch_s == pytest.approx(stretch_s)
+        assert align.span_s == (0.0, 30.0)
+    unknown = replace(ONE, left_rad_s=np.array([1.0, np.nan]))
+    assert CommandAlignment(turned, Response(), Answer.of(unknown, 0.0), SETTINGS).span_s == (0.0, 0.0)

@@ -62,6 +62,26 @@ def test_what_a_model_knows_of_the_wheels_is_refitted_and_not_found():
     assert found.base.vector[WHEEL.place["motor_lag.tau_s"]] == pytest.approx(0.15, abs=0.002)
 
 
+@pytest.mark.parametrize("curved", [0.0, -0.02])
+def test_commands_are_searched_alike_to_the_last_bit_wherever_they_are_stamped(curved):
+    """A delay that is counted from other stamps is rounded otherwise, and what it leads to may be another set."""
+    line = wheels_of(lambda u: curved * u * np.abs(u), motor_lag=0.15)
+    plain, moved = (
+        search_wheels(replace(line, commands_moved_s=seen_s), np.array(GEOMETRY), WHEEL.neutral)
+        for seen_s in (0.0, -0.3)
+    )
+    assert set(moved.names) == {*plain.names, "command_delay"}
+    assert [one.term.model_name for one in moved.unnamed] == [one.term.model_name for one in plain.unnamed]
+    assert len(plain.unnamed) == (curved != 0.0)
+    both = moved.names
+    ends = [found.selector.fits[frozenset(both)] for found in (plain, moved)]
+    assert ends[0].cost == ends[1].cost
+    np.testing.assert_array_equal(ends[0].residual, ends[1].residual)
+    late = WHEEL.place["command_delay.delay_s"]
+    assert ends[1].vector[late] == pytest.approx(ends[0].vector[late] - 0.3, abs=1e-15)
+    np.testing.assert_array_equal(np.delete(ends[0].vector, late), np.delete(ends[1].vector, late))
+
+
 def test_wheels_with_a_term_that_has_no_name_have_it_found_with_its_number():
     line = wheels_of(lambda u: -0.02 * u * np.abs(u), drive=DRIVE * 2)
     found = search_wheels(line, np.array(GEOMETRY), WHEEL.neutral)
@@ -167,7 +187,10 @@ def of_rough_and_smooth(found, noted, layout):
     settings = DEFAULT_SETTINGS.selection
     # What moves no prediction would pass for noise too.
     assert (rough.thresholds.score, rough.thresholds.moves_m, rough.closely) == (settings.rough_score, 0.0, True)
-    assert chosen.channel is found.selector.channel is found.channel
+    assert found.selector.channel is found.channel
+    # Of the wheels the same, but for where commands are stamped.
+    assert chosen.channel.gains is found.channel.gains
+    assert chosen.channel.weight is found.channel.weight
     assert chosen.thresholds is found.selector.thresholds
     assert (chosen.thresholds.moves_m, chosen.closely) == (settings.least_moved_m, False)
     assert all(len(set(active)) == len(active) for active in noted.freed)

@@ -1,0 +1,181 @@
+"""How the clock that stamped some samples runs against that of the wheels: evenly, adrift, or with a jump."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from itertools import pairwise
+from typing import Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.gap.settings import GridSettings
+from disco_hw.log.drive import Commands, Poses
+
+Array = NDArray[np.float64]
+Samples = TypeVar("Samples", Commands, Poses)
+
+
+class Alignment(Protocol):
+    """Samples beside the wheels: how old they are, all of them and in parts of the log (s), and how well that fits."""
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """Stamps of the first and of the last sample."""
+
+    @property
+    def stretch_s(self) -> float:
+        """Length of the stretches that are looked at one by one."""
+
+    def fitted(self, clock: StampClock) -> tuple[float, float]:
+        """Age of all samples, their stamps corrected by a clock, and the misfit of a sample in nats."""
+
+    def part_delay_s(self, low_s: float, high_s: float) -> float | None:
+        """Age of the samples of a stretch; None where it does not show."""
+
+    def part_misfit(self, low_s: float, high_s: float, delay_s: float) -> float:
+        """Misfit of all samples of a stretch at an age, nats."""
+
+
+@dataclass(frozen=True, slots=True)
+class StampClock:
+    """`delay_s` is how much older than its stamp a sample is mid-log, negative where it is acted on later.
+
+    Over the log the delay grows by `drift_s` on the whole, or by `jump_s` at once at `jump_at_s`; both 0 as a rule.
+    """
+
+    delay_s: float
+    middle_s: float = 0.0
+    span_s: float = 1.0
+    drift_s: float = 0.0
+    jump_s: float = 0.0
+    jump_at_s: float = 0.0
+
+    @property
+    def even(self) -> bool:
+        """Whether it neither drifts nor jumps."""
+        return not (self.drift_s or self.jump_s)
+
+    def off_s(self, t_s: Array) -> Array:
+        """How much more than by `delay_s` samples stamped so are older."""
+        drift = self.drift_s * (t_s - self.middle_s) / self.span_s
+        return np.asarray(drift + self.jump_s * ((t_s >= self.jump_at_s) - 0.5))
+
+    def corrected(self, samples: Samples) -> Samples:
+        """Samples with stamps of an even clock; those that a jump makes come before an earlier one are left out."""
+        t_s = samples.t_s - self.off_s(samples.t_s)
+        keep = t_s > np.concatenate([[-np.inf], np.maximum.accumulate(t_s)[:-1]])
+        return replace(picked(samples, keep), t_s=t_s[keep])
+
+    def notes(self, whose: str) -> tuple[str, ...]:
+        """What a person has to know of it; `whose`: "poses'" or "commands'"."""
+        if self.drift_s:
+            per_s = 1e3 * self.drift_s / self.span_s
+            return (
+                f"the {whose} clock drifts against the wheels' by {per_s:+.2f} ms every second, "
+                f"{1e3 * self.drift_s:+.0f} ms over the log: their stamps are corrected; synchronise the clocks",
+            )
+        if self.jump_s:
+            return (
+                f"the {whose} clock jumps against the wheels' by {1e3 * self.jump_s:+.0f} ms at "
+                f"{self.jump_at_s:.0f} s: their stamps are corrected; synchronise the clocks",
+            )
+        return ()
+
+
+def picked(samples: Samples, chosen: NDArray[np.bool_]) -> Samples:
+    """Some samples (n,) of all."""
+    columns = {each.name: getattr(samples, each.name)[chosen] for each in fields(samples)}
+    return replace(samples, **columns)
+
+
+def clock_of(align: Alignment, settings: GridSettings, least_error_s: float, least_nats: float) -> StampClock:
+    """How old samples are, and whether that drifts or jumps, from stretches looked at one by one.
+
+    A drift or a jump is believed where the stretches agree on it far beyond their scatter, where it is no less than
+    `least_error_s`, and where the whole log fits better with it by `least_nats` per sample; of both the one with which
+    it fits better. One stretch that is off looks like a jump to the others.
+    """
+    delay_s, least = align.fitted(StampClock(0.0))
+    plain = StampClock(delay_s)
+    first, last = align.span_s
+    if last <= first:
+        return plain
+    middles, delays = by_stretch(align)
+    few = delays.size < settings.fewest_clock_stretches
+    if few or middles[-1] - middles[0] < settings.least_clock_share * (last - first):
+        return plain
+    centred = (middles - 0.5 * (first + last)) / (last - first)
+    far_s = settings.clock_outlier_s
+    most = _level(delays, far_s)[0] / settings.clock_times_better
+    of_drift, drift_s = _line(centred, delays, far_s)
+    # The step that the stretches show best lies between two of them.
+    steps = []
+    for k in range(2, delays.size - 1):
+        (before, early_s), (after, late_s) = _level(delays[:k], far_s), _level(delays[k:], far_s)
+        steps.append((before + after, k, early_s, late_s))
+    squares, place, *sides = min(steps)
+    drifting = StampClock(delay_s, 0.5 * (first + last), last - first, drift_s=drift_s)
+    at_s = float(0.5 * (middles[place - 1] + middles[place]))
+    jumping = StampClock(delay_s, jump_s=sides[1] - sides[0], jump_at_s=at_s)
+    likely = sorted(((of_drift, drifting), (squares, jumping)), key=lambda one: one[0])
+    sizes = [max(abs(clock.drift_s), abs(clock.jump_s)) for _, clock in likely]
+    if sizes[0] < least_error_s:
+        return plain
+    best, least = plain, least - least_nats
+    for (left, clock), size_s in zip(likely, sizes, strict=True):
+        if left > most or size_s < least_error_s:
+            break
+        at_s = jump_instant(align, (sides[0], sides[1]), clock.jump_at_s) if clock.jump_s else clock.jump_at_s
+        tried = replace(clock, jump_at_s=at_s)
+        delay_s, misfit = align.fitted(tried)
+        if misfit < least:
+            best, least = replace(tried, delay_s=delay_s), misfit
+    return best
+
+
+def _level(delays: Array, far_s: float) -> tuple[float, float]:
+    """Sum of squares of delays (n,) about the level that most agree on, those further off than `far_s` counting as
+    that; and the median of those that agree.
+    """
+    off = delays - delays[:, None]
+    level = float(delays[int(np.argmin(np.minimum(off**2, far_s**2).sum(axis=1)))])
+    agree = np.abs(delays - level) < far_s
+    return _squares(delays - delays[agree].mean(), far_s), float(np.median(delays[agree]))
+
+
+def _line(x: Array, delays: Array, far_s: float) -> tuple[float, float]:
+    """The same about the line over `x` (n,) that most agree on, and its slope."""
+    first, second = np.triu_indices(x.size, 1)
+    slopes = (delays[second] - delays[first]) / (x[second] - x[first])
+    off = delays - delays[first, None] - slopes[:, None] * (x - x[first, None])
+    agree = np.abs(off[int(np.argmin(np.minimum(off**2, far_s**2).sum(axis=1)))]) < far_s
+    slope, level = np.polyfit(x[agree], delays[agree], 1)
+    return _squares(delays - level - slope * x, far_s), float(slope)
+
+
+def _squares(off_s: Array, far_s: float) -> float:
+    return float(np.minimum(off_s**2, far_s**2).sum())
+
+
+def by_stretch(align: Alignment) -> tuple[Array, Array]:
+    """Middles of stretches of even length, and the age of the samples of each that shows one."""
+    first, last = align.span_s
+    count = max(int((last - first) / align.stretch_s), 1)
+    middles, delays = [], []
+    for low, high in pairwise(np.linspace(first, last + 1e-6, count + 1).tolist()):
+        delay_s = align.part_delay_s(low, high)
+        if delay_s is not None:
+            middles.append(0.5 * (low + high))
+            delays.append(delay_s)
+    return np.array(middles), np.array(delays)
+
+
+def jump_instant(align: Alignment, sides: tuple[float, float], about_s: float) -> float:
+    """When samples jumped from one age to another, to a second: where both sides together fit best."""
+    reach = np.arange(about_s - align.stretch_s, about_s + align.stretch_s, 1.0)
+    costs = [
+        align.part_misfit(-np.inf, at_s, sides[0]) + align.part_misfit(at_s, np.inf, sides[1])
+        for at_s in reach.tolist()
+    ]
+    return float(reach[int(np.argmin(costs))])
