@@ -22,6 +22,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
+from disco_hw.effects import Stage
+from disco_hw.effects.registry import in_stages
 from disco_hw.gap import model_of, offered_stage, search_log, written_of
 from disco_hw.gap.data import BODY, DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.data.gridded_drive import GriddedDrive, grid_drive
@@ -118,9 +120,12 @@ def unseen_errors(drive: GriddedDrive, models: dict[str, Model], ahead_s: float 
 def values_away(analysis: GapAnalysis, final: FinalFit, other: GapAnalysis) -> dict[str, float]:
     """How far another half's value of a parameter lies from its own, in standard deviations of its interval.
 
-    Of the parameters that the other half knows at least half as well.
+    Of the parameters that the other half knows at least half as well; not of how late poses of a clock are that is said
+    to run unevenly, which is each log's own.
     """
     away = {}
+    uneven = not (analysis.drive.pose_clock_even and other.drive.pose_clock_even)
+    of_this_log = {column for effect in in_stages(Stage.POSE_TIME) if uneven for column in effect.columns}
     for found, own, there in (
         (analysis.body, final.body_estimates, other.body),
         (analysis.wheels, final.wheel_estimates, other.wheels),
@@ -131,7 +136,7 @@ def values_away(analysis: GapAnalysis, final: FinalFit, other: GapAnalysis) -> d
         same = estimate_parameters(replace(there, selector=selector, names=found.names, plain=None, unnamed=()))
         for name, estimate in own.by_name.items():
             value = same.by_name.get(name)
-            if value is not None and value.deviation <= 2.0 * estimate.deviation:
+            if name not in of_this_log and value is not None and value.deviation <= 2.0 * estimate.deviation:
                 apart = value.value - estimate.value
                 reach = estimate.high - estimate.value if apart > 0.0 else estimate.value - estimate.low
                 away[name] = Z95 * apart / max(reach, 1e-12)

@@ -292,8 +292,7 @@ def doubt_of(effect: EffectFinding, measured: Measured) -> str | None:
     for parameter, estimate in pairs:
         if _at_end(parameter, estimate.value, settings):
             return f"{_written(parameter, estimate)} lies at the end of its range"
-    clock_s = measured.drive.pose_clock_range_s if described.stage is Stage.POSE_TIME else 0.0
-    if all(_unknown(parameter, estimate, clock_s, settings) for parameter, estimate in pairs):
+    if all(_unknown(parameter, estimate, settings) for parameter, estimate in pairs):
         said = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
         return f"{said} is hardly known: its interval is wider than the value"
     return _exceeded(described, pairs[0][1], measured) or measured.disputed.get(effect.name)
@@ -306,16 +305,14 @@ def _at_end(parameter: Parameter, value: float, settings: ReportSettings) -> boo
     return any(abs(value - end) <= settings.end_share * abs(end) for end in ends)
 
 
-def _unknown(parameter: Parameter, estimate: ParameterEstimate, clock_s: float, settings: ReportSettings) -> bool:
+def _unknown(parameter: Parameter, estimate: ParameterEstimate, settings: ReportSettings) -> bool:
     """Whether an interval is so wide that the value says little: wider than how far it is from neutral, nearly so of a
     limit.
-
-    What a clock that runs unevenly makes of it, of deviation `clock_s`, does not count: that is another drive's.
     """
-    half = Z95 * max(estimate.deviation**2 - clock_s**2, 0.0) ** 0.5
+    half = 0.5 * (estimate.high - estimate.low)
     limits = math.isinf(parameter.neutral)
     size = settings.limit_share * estimate.value if limits else abs(estimate.value - parameter.neutral)
-    return bool(half > settings.wide_share * size)
+    return half > settings.wide_share * size
 
 
 def _written(parameter: Parameter, estimate: ParameterEstimate) -> str:
@@ -329,7 +326,7 @@ def _exceeded(effect: Effect, limit: ParameterEstimate, measured: Measured) -> s
         return None
     drive, settings = measured.drive, measured.drive.settings.report
     reached = effect.limited(_calm(drive), measured.geometry)
-    beyond = reached > max(limit.high, limit.value * settings.beyond_limit)
+    beyond = reached > limit.value * settings.beyond_limit
     seconds = float(beyond.sum()) * GRID_STEP_S
     if seconds < max(settings.beyond_s, settings.beyond_share * drive.duration_s):
         return None

@@ -13,7 +13,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.effects import Channel, Stage
+from disco_hw.effects import Channel
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.search.channel_search import ChannelResult, deviations_of
@@ -68,10 +68,7 @@ def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
     own = np.maximum(np.diag(covariance), 1e-300)
     wandering, apart = wandered(found), _weightings_apart(found)
     more = np.array(
-        [
-            (wandering.get(columns[index], 0.0) + _of_the_clock(found, columns[index]) + apart[place]) / own[place]
-            for place, index in enumerate(best.active)
-        ]
+        [(wandering.get(columns[index], 0.0) + apart[place]) / own[place] for place, index in enumerate(best.active)]
     )
     covariance = covariance * np.sqrt(np.outer(1.0 + more, 1.0 + more))
     deviations = np.sqrt(np.diag(covariance))
@@ -86,16 +83,6 @@ def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
         if profile is not None:
             by_name[profile.column] = _profiled(found, profile.column, profile.refine)
     return ChannelEstimates(by_name, tuple(columns[index] for index in best.active), covariance)
-
-
-def _of_the_clock(found: ChannelResult, column: str) -> float:
-    """Variance of how late poses are from one drive to the next, where their clock drifts or jumps; else none.
-
-    Of two logs of a clock that drifts the later one begins where the other ended.
-    """
-    effect = REGISTRY.get(column.split(".", maxsplit=1)[0])
-    of_clock = effect is not None and effect.stage is Stage.POSE_TIME
-    return found.selector.channel.inner.drive.pose_clock_range_s**2 if of_clock else 0.0
 
 
 def _weightings_apart(found: ChannelResult) -> Array:

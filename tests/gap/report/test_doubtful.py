@@ -1,7 +1,5 @@
 """What is not known, or contradicted by its own log, is listed with the reason and not told as found."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -37,6 +35,8 @@ def effect(name, **values):
         ("speed_limit", {"limit_rad_s": (4.2, 4.1, 4.3)}, None),
         ("speed_limit", {"limit_rad_s": (4.2, 2.4, 6.0)}, "wider than the value"),
         ("speed_limit", {"limit_rad_s": (3.5, 3.4, 3.6)}, "s of this log, up to 4 rad/s"),
+        # However wide its interval.
+        ("speed_limit", {"limit_rad_s": (3.5, 2.9, 4.1)}, "s of this log, up to 4 rad/s"),
         ("yaw_rate_limit", {"limit_rad_s": (0.15, 0.14, 0.16)}, "is exceeded"),
         ("yaw_rate_limit", {"limit_rad_s": (1.2, 1.15, 1.25)}, None),
         ("wheel_gain", {"left": (0.0, -0.1, 0.1), "right": (0.05, 0.04, 0.06)}, None),
@@ -47,15 +47,6 @@ def test_only_what_is_known_and_not_contradicted_is_told(name, values, why):
     found = doubt_of(effect(name, **values), drive())
     assert (found is None) == (why is None)
     assert why is None or why in found
-
-
-@pytest.mark.parametrize(("clock_s", "told"), [(0.0, False), (0.02, False), (0.1, True)])
-def test_poses_of_an_uneven_clock_are_late_for_all_that_it_runs_otherwise_in_another_drive(clock_s, told):
-    measured = Measured(replace(drive().drive, pose_clock_range_s=clock_s), GEOMETRY)
-    late = effect("pose_latency", latency_s=(0.1, -0.1, 0.3))
-    assert (doubt_of(late, measured) is None) == told
-    # Of nothing else.
-    assert doubt_of(effect("motor_lag", tau_s=(0.1, -0.1, 0.3)), measured) is not None
 
 
 def test_a_moment_beyond_a_limit_contradicts_nothing():

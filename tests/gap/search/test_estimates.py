@@ -18,8 +18,7 @@ def test_an_interval_is_widened_by_how_blocks_scatter_and_by_how_a_value_wanders
     channel = SimpleNamespace(layout=SimpleNamespace(columns=("a", "b", "c")))
     found = SimpleNamespace(told=told, selector=SimpleNamespace(channel=channel), names=())
     monkeypatch.setattr(analysis, "inflation", lambda best, of, active: {2: 4.0, 0: 1.44}[active[0]])
-    monkeypatch.setattr(analysis, "wandered", lambda of: {"c": 4.0})
-    monkeypatch.setattr(analysis, "_of_the_clock", lambda of, column: 2.0 if column == "c" else 0.0)
+    monkeypatch.setattr(analysis, "wandered", lambda of: {"c": 6.0})
     monkeypatch.setattr(analysis, "_weightings_apart", lambda of: np.array([3.0, 0.0]))
     estimates = estimate_parameters(found)
     # Of `c` 4 x 4 and 9 beside, of `a` 9 x 1.44.

@@ -70,17 +70,6 @@ def test_the_time_of_a_change_has_an_interval_around_it():
     assert time.high - time.low < 10.0
 
 
-def test_how_late_poses_of_an_uneven_clock_are_is_known_no_better_than_it_runs():
-    even = body_channel(turn_slip=0.08)[0]
-    uneven = type(even).build(replace(even.drive, pose_clock_range_s=0.06), even.noise, even.neutral)
-    found = [estimated(one, ("pose_latency", "turn_slip")).by_name for one in (even, uneven)]
-    known = found[0]["pose_latency.latency_s"]
-    assert known.deviation < 0.01
-    assert found[1]["pose_latency.latency_s"].value == known.value
-    assert found[1]["pose_latency.latency_s"].deviation == pytest.approx(np.hypot(known.deviation, 0.06))
-    assert all(found[1][name] == found[0][name] for name in found[0] if name != "pose_latency.latency_s")
-
-
 def test_a_limit_of_turning_is_no_better_known_than_the_geometry_that_it_is_told_in():
     def estimates_of(covariance, **values):
         ends = [1.96 * spread for spread in np.sqrt(np.diag(covariance))]
