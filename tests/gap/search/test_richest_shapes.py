@@ -121,7 +121,8 @@ class Read:
 
     drive = SimpleNamespace(
         first=np.arange(40) % 20 == 0,
-        encoder=SimpleNamespace(node=np.arange(1, 40, 2), fraction=np.zeros(20)),
+        # At every second node, the last from the one before: a reading lies between two nodes.
+        encoder=SimpleNamespace(node=np.append(np.arange(1, 39, 2), 38), fraction=np.append(np.zeros(19), 1.0)),
     )
     settings = DEFAULT_SETTINGS
     weight = np.linspace(0.5, 2.0, 40).reshape(20, 2)
