@@ -307,6 +307,9 @@ class PredictionSettings:
     joint_trust: float = 3.0
     """Before the whole chain is fitted, channels are trusted to so many of their standard deviations. Measured: halves
     of real logs predict each other best with 3 to 10."""
+    late_far_s: float = 0.2
+    """Where `timed` has a delay or a lag so far from that of the wheels' channel, the last fit begins from either.
+    Chosen: a ramp of seconds makes a lag of a second, and a fit that begins there ends there."""
     worse: float = 1.05
     """A larger ratio of errors is worse. Measured: equally good models scatter by some percent."""
     level: float = 1.01

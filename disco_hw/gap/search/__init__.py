@@ -188,10 +188,29 @@ class _Candidate:
             by_fold[held] = Freed(folded, chain)
         return cls(analysis, final, Freed(of_all, chain), by_fold)
 
-    def on_top(self, timed: _Fitted) -> _Candidate:
-        """The same on top of `timed`."""
-        by_fold = {held: _on_top(of, timed.at(held)) for held, of in self.by_fold.items()}
-        return replace(self, of=_on_top(self.of, timed.at()), by_fold=by_fold)
+    def on_top(self, timed: _Fitted) -> tuple[_Candidate, ...]:
+        """The same on top of `timed`; beside it from where the channels have it, if that is far from there.
+
+        A lag that stands for something else is where a fit with that in it should not begin.
+        """
+        starts = (True, False) if self._begins_far(timed.at()) else (True,)
+        return tuple(
+            replace(
+                self,
+                of=_on_top(self.of, timed.at(), there),
+                by_fold={held: _on_top(of, timed.at(held), there) for held, of in self.by_fold.items()},
+            )
+            for there in starts
+        )
+
+    def _begins_far(self, timed: Freed) -> bool:
+        """Whether `timed` makes wheels late by much more or less than their channel."""
+        if len(timed.parts) == 1:
+            return False
+        own, plain = self.of.parts[1], timed.parts[1].vector
+        late = [own.layout.place[name] for name in LATE_COLUMNS]
+        far_s: float = self.analysis.drive.settings.prediction.late_far_s
+        return bool(np.abs(own.vector[late] - plain[late]).max() > far_s)
 
     def judged(self, ahead: Ahead, apart: StagePredictions) -> _Judged:
         """What it errs by on held-out data."""
@@ -230,20 +249,26 @@ def _needed(analysis: GapAnalysis, timed: _Fitted, ahead: Ahead, apart: StagePre
     kept = whole.judged(ahead, apart)
     if not analysis.found_any:
         return kept
-    kept = best = min(kept, whole.on_top(timed).judged(ahead, apart), key=lambda one: one.size)
+
+    def topped(candidate: _Candidate) -> _Judged:
+        return min((one.judged(ahead, apart) for one in candidate.on_top(timed)), key=lambda one: one.size)
+
+    kept = best = min(kept, topped(whole), key=lambda one: one.size)
     for which, name in least_evident_first(analysis):
         fewer = lacking(kept.candidate.analysis, which, name)
         if not fewer.found_any:
             break
-        option = _Candidate.of_channels(fewer, apart).on_top(timed).judged(ahead, apart)
+        option = topped(_Candidate.of_channels(fewer, apart))
         if within_one_standard_error(best.errors, option.errors):
             kept = option
         best = min(best, option, key=lambda one: one.size)
     return kept
 
 
-def _on_top(amended: Freed, timed: Freed) -> Freed:
+def _on_top(amended: Freed, timed: Freed, there: bool) -> Freed:
     """What was found freed on top of `timed`: its geometry and its lateness as free as there, the rest as trusted.
+
+    They begin `there`, or else as near to it as where the channels have them.
 
     Where a channel's form is none of the known ones, its best fit may be far from what predicts best, and surer of it
     than it should be.
@@ -254,7 +279,8 @@ def _on_top(amended: Freed, timed: Freed) -> Freed:
         others = [k for k, place in enumerate(own.active) if place not in plain.active]
         trusted = inverse(inverse(own.information)[np.ix_(others, others)])
         vector, low, both = own.vector.copy(), own.layout.low.copy(), list(plain.active)
-        vector[both], low[both] = plain.vector[both], plain.layout.low[both]
+        low[both] = plain.layout.low[both]
+        vector[both] = plain.vector[both] if there else np.maximum(vector[both], low[both])
         information = block_diag(plain.information, trusted) if others else plain.information
         parts.append(Part(replace(own.layout, low=low), vector, active, information))
     return replace(amended, parts=tuple(parts))

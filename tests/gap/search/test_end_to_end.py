@@ -69,7 +69,7 @@ def test_on_top_of_the_timed_model_a_channel_that_is_wrong_and_sure_does_not_hol
     of = Freed((Part(BODY, wrong, (0, 1, 2, slip), 1e12 * np.eye(4)),), lambda vectors: Chain(vectors[0], None))
     held = ahead.fit(of).vectors[0]
     timed = geometry_of(channel.neutral)
-    free = ahead.fit(_on_top(of, timed.at(ahead.fit(timed).vectors))).vectors[0]
+    free = ahead.fit(_on_top(of, timed.at(ahead.fit(timed).vectors), True)).vectors[0]
     assert held[:3] == pytest.approx(wrong[:3], rel=1e-3)
     assert free[:3] == pytest.approx(GEOMETRY, abs=2e-3)
     assert free[slip] == pytest.approx(0.08, rel=1e-3)

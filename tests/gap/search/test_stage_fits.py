@@ -73,7 +73,7 @@ def test_on_top_of_the_timed_stage_stands_what_else_was_found_as_surely_as_by_it
         ),
         lambda vectors: Chain(*vectors),
     )
-    both = _on_top(amended, timed)
+    both = _on_top(amended, timed, True)
     assert both.chain is amended.chain
     first, second = both.parts
     assert first.active == (0, 1, 2, SLIP)
@@ -87,8 +87,40 @@ def test_on_top_of_the_timed_stage_stands_what_else_was_found_as_surely_as_by_it
     # A lag may not become less than the timed stage lets it.
     np.testing.assert_array_equal(second.layout.low[[LAG, DELAY, 13]], [0.01, 0.02, WHEEL.low[13]])
     same = _on_top(replace(amended, parts=(replace(amended.parts[0], active=(0, 1, 2), information=known(3, 5)),)),
-                   replace(timed, parts=timed.parts[:1]))  # fmt: skip
+                   replace(timed, parts=timed.parts[:1]), True)  # fmt: skip
     np.testing.assert_array_equal(same.parts[0].information, known(3, 2))
+    # From where the channels have it all else is alike; a delay of none is less than the timed stage lets it be.
+    own = _on_top(amended, timed, False)
+    for part, begun, vector in zip(both.parts, own.parts, (own_body, own_wheels), strict=True):
+        assert begun.active == part.active
+        np.testing.assert_array_equal(begun.information, part.information)
+        np.testing.assert_array_equal(begun.layout.low, part.layout.low)
+        expected = vector.copy()
+        if part is both.parts[1]:
+            expected[DELAY] = 0.02
+        np.testing.assert_array_equal(begun.vector, expected)
+
+
+@pytest.mark.parametrize(
+    ("lag_s", "delay_s", "begins"), [(0.49, 0.19, 1), (0.51, 0.0, 2), (0.09, 0.0, 2), (0.3, 0.21, 2), (0.3, 0.2, 1)]
+)
+def test_a_fit_begins_also_where_the_channel_has_it_if_the_timed_stage_is_far_off(lag_s, delay_s, begins):
+    def of(lag_s, delay_s):
+        wheels = WHEEL.neutral.copy()
+        wheels[[LAG, DELAY]] = lag_s, delay_s
+        parts = Part(BODY, BODY.neutral, (0, 1, 2), np.eye(3)), Part(WHEEL, wheels, (LAG, DELAY), np.eye(2))
+        return Freed(parts, lambda vectors: Chain(*vectors))
+
+    analysis = SimpleNamespace(drive=SimpleNamespace(settings=DEFAULT_SETTINGS))
+    own = of(0.3, 0.0)
+    timed = SimpleNamespace(at=lambda held=None: of(lag_s, delay_s))
+    found = stages._Candidate(analysis, None, own, {0: own, 1: own}).on_top(timed)
+    assert [one.of.parts[1].vector[LAG] for one in found] == [lag_s, 0.3][:begins]
+    assert [one.by_fold[1].parts[1].vector[LAG] for one in found] == [lag_s, 0.3][:begins]
+    # Without commands wheels are late by nothing.
+    alone = SimpleNamespace(at=lambda held=None: replace(of(lag_s, delay_s), parts=of(0.0, 0.0).parts[:1]))
+    bare = replace(own, parts=own.parts[:1])
+    assert len(stages._Candidate(analysis, None, bare, {0: bare, 1: bare}).on_top(alone)) == 1
 
 
 class Noted:
