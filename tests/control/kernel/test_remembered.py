@@ -101,6 +101,7 @@ ALL = {"wheel_radius_m": 0.002, "axial_distance_m": 0.02, "x_icr_m": 0.02, "comm
 ALL |= {f"{name}.k": deviation for name, (_, deviation) in TERMS.items()}
 
 
+@pytest.mark.long
 def test_costs_under_points_that_differ_in_when_and_how_much_was_remembered():
     model = model_of(ALL)
     disco, theta = check(model)
