@@ -85,8 +85,9 @@ class GridSettings:
     """A smaller one is none. Chosen: a pose of a robot that turns at 1 rad/s is then off by its usual noise."""
     least_clock_nats: float = 0.02
     """And the whole log fits by so much per pose better with it. Measured: drifting clocks 0.04 to 0.8."""
-    least_link_error_s: float = 0.06
-    """Of commands a smaller one is none. Measured: lags that differ from turn to turn make 0.05 of an even link."""
+    least_link_error_s: float = 0.15
+    """Of commands a smaller one is none. Measured: lags that differ from turn to turn make 0.05 of an even link, and a
+    drive that ramps by 9 rad/s^2 makes 0.105."""
     least_link_nats: float = 0.05
     """And the whole log fits by so much per pair better with it. Measured: even links 0.046 at most."""
     least_delay_nats: float = 0.05
