@@ -51,3 +51,14 @@ def body_channel(seed=0, **effects):
     noise = np.random.default_rng(seed).standard_normal(clean.shape) * (0.004, 0.004, 0.006)
     line = replace(line, pose_values=clean + noise)
     return BodyChannel.build(line, NOISE, plain), line
+
+
+def of_regression(columns, measured):
+    """Minus the log likelihood of a sample, of a regression by Huber's weights whose steps are decompositions."""
+    weight = np.ones(measured.size)
+    for _ in range(4):
+        fitted = np.linalg.lstsq(columns * weight[:, None], measured * weight, rcond=None)[0]
+        left = np.abs(measured - columns @ fitted)
+        limit = 2.0 * 1.4826 * np.median(left) + 1e-9
+        weight = np.sqrt(np.minimum(1.0, limit / np.maximum(left, 1e-12)))
+    return 0.5 * np.log(np.where(left < limit, left**2, limit * (2.0 * left - limit)).mean() + 1e-10)

@@ -52,9 +52,9 @@ class GriddedDrive:
     yaw not wrapped within a run. `known_command` (M, 2) rad/s and `known_motion` (M, 3) m/s, m/s, rad/s: what the
     terms without a name that a given model has add; None without. `settings` travel with the drive: what judges it
     reads them there. `pose_delay_s`: how much older than their stamps poses are at first sight, s;
-    `pose_clock_range_s`: by how much that changes over the drive, where their clock drifts or jumps. Commands and poses
-    are laid where they belong at first sight: `commands_moved_s` later than their stamps, so that they change at the
-    borders of cells, and `poses_moved_s` earlier. `commands_timed`: whether it is known where commands belong.
+    `pose_clock_even`: whether their clock neither drifts nor jumps. Commands and poses are laid where they belong at
+    first sight: `commands_moved_s` later than their stamps, so that they change at the borders of cells, and
+    `poses_moved_s` earlier. `commands_timed`: whether it is known where commands belong.
     """
 
     t_s: Array
@@ -75,15 +75,10 @@ class GriddedDrive:
     known_motion: Array | None = None
     settings: GapSettings = DEFAULT_SETTINGS
     pose_delay_s: float = 0.0
-    pose_clock_range_s: float = 0.0
+    pose_clock_even: bool = True
     commands_moved_s: float = 0.0
     commands_timed: bool = True
     poses_moved_s: float = 0.0
-
-    @property
-    def pose_clock_even(self) -> bool:
-        """Whether the poses' clock neither drifts nor jumps."""
-        return self.pose_clock_range_s == 0.0
 
     @property
     def has_commands(self) -> bool:
@@ -181,7 +176,7 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
         notes=tuple(notes),
         settings=settings,
         pose_delay_s=timed.clock.delay_s,
-        pose_clock_range_s=abs(timed.clock.drift_s) + abs(timed.clock.jump_s),
+        pose_clock_even=timed.clock.even,
         commands_moved_s=timed.commands_moved_s,
         commands_timed=timed.commands_timed,
         poses_moved_s=timed.poses_moved_s,

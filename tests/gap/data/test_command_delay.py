@@ -9,6 +9,7 @@ from disco_hw.gap.data.command_timing import Answer, CommandAlignment, Response,
 from disco_hw.gap.data.stamp_clock import StampClock, picked
 from disco_hw.gap.settings import GridSettings
 from disco_hw.log.drive import Commands, Wheels
+from tests.gap.synthetic import of_regression
 
 SETTINGS = GridSettings()
 
@@ -52,17 +53,6 @@ def test_a_segment_begins_with_wheels_that_follow_its_first_command():
     own = Answer.of(commands_at([2.5, 3.1], asked[2:]), 0.3)
     np.testing.assert_allclose(late.speed[2:], own.speed, atol=1e-12)
     np.testing.assert_allclose(late.angle[3] - late.angle[2], own.angle[1], atol=1e-12)
-
-
-def of_regression(columns, measured):
-    """Minus the log likelihood of a sample, of a regression by Huber's weights whose steps are decompositions."""
-    weight = np.ones(measured.size)
-    for _ in range(4):
-        fitted = np.linalg.lstsq(columns * weight[:, None], measured * weight, rcond=None)[0]
-        left = np.abs(measured - columns @ fitted)
-        limit = 2.0 * 1.4826 * np.median(left) + 1e-9
-        weight = np.sqrt(np.minimum(1.0, limit / np.maximum(left, 1e-12)))
-    return 0.5 * np.log(np.where(left < limit, left**2, limit * (2.0 * left - limit)).mean() + 1e-10)
 
 
 def driven(seed=2):

@@ -11,6 +11,7 @@ from disco_hw.gap.data.stamp_clock import StampClock, by_stretch, clock_of, jump
 from disco_hw.gap.data.timing import PoseAlignment, pose_clock, pose_delay_s
 from disco_hw.gap.settings import GridSettings
 from disco_hw.log.drive import Commands, Poses, Wheels
+from tests.gap.synthetic import of_regression
 
 SETTINGS = GridSettings()
 
@@ -325,16 +326,6 @@ def by_hand(wheels, poses, delay_s):
         turns.append(turn)
         ways.append(ahead[0] * np.cos(towards) + ahead[1] * np.sin(towards))
     return len(rows), sum(of_regression(np.array(rows), np.array(measured)) for measured in (turns, ways))
-
-
-def of_regression(columns, measured):
-    weight = np.ones(measured.size)
-    for _ in range(4):
-        fitted = np.linalg.lstsq(columns * weight[:, None], measured * weight, rcond=None)[0]
-        left = np.abs(measured - columns @ fitted)
-        limit = 2.0 * 1.4826 * np.median(left) + 1e-9
-        weight = np.sqrt(np.minimum(1.0, limit / np.maximum(left, 1e-12)))
-    return 0.5 * np.log(np.where(left < limit, left**2, limit * (2.0 * left - limit)).mean() + 1e-10)
 
 
 def winding(seed=3):

@@ -8,9 +8,11 @@ from scipy.signal import lfilter
 
 from disco_hw.gap.data import alignment
 from disco_hw.gap.data.command_timing import Turned, command_clock, response
+from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.data.timing import pose_clock, pose_delay_s
 from disco_hw.gap.settings import GridSettings
 from disco_hw.log.drive import Commands, Poses, Wheels
+from tools.gap_logs import realistic, simulated_drive
 
 RADIUS_M, TRACK_M = 0.11, 0.6
 
@@ -219,6 +221,11 @@ def test_a_link_that_drifts_is_made_even_and_said_to_drift():
     assert clock.drift_s == pytest.approx(0.2, abs=0.04)
     assert clock.delay_s == pytest.approx(-0.1, abs=0.02)
     assert "commands' clock drifts" in clock.notes("commands'")[0]
+
+
+def test_a_drive_that_ramps_answers_late_by_what_it_is_asked_and_no_clock_jumps():
+    drive = simulated_drive(realistic("acceleration_limit", 1), seed=1)
+    assert not [note for note in grid_drive(drive).notes if "commands' clock" in note]
 
 
 @pytest.mark.parametrize("seed", range(3))
