@@ -249,7 +249,10 @@ def timed(selector: Selector) -> Selector:
 
 
 def judged(found: ChannelResult, given: Names, start: Array) -> ChannelResult:
-    """The same when a delay must be worth its name as all else: against none, in a vector that has `given` alone."""
+    """The same when a delay must be worth its name as all else: against none, in a vector that has `given` alone.
+
+    The others stay as they were found beside it: one that is too short for a name would change them too.
+    """
 
     def against_none(selector: Selector, start: Array) -> Selector:
         delays = frozenset(delays_of(selector.channel.layout))
@@ -261,7 +264,8 @@ def judged(found: ChannelResult, given: Names, start: Array) -> ChannelResult:
         assert isinstance(found.selector.channel, WithTerms)
         start = _extended(plain, found.selector.channel)
     selector = against_none(found.selector, start)
-    names = selector.needed(selector.swapped(selector.needed(found.names)))
+    delays = delays_of(selector.channel.layout)
+    names = selector.needed(selector.swapped(selector.needed(found.names, delays), delays), delays)
     return _written(replace(found, selector=selector, plain=plain, names=names))
 
 

@@ -340,12 +340,14 @@ class Selector:
         """Misfit of a set in nats with half the price of its parameters."""
         return float(self.fit(names).cost + 0.5 * parameters_of(names) * np.log(self.channel.count))
 
-    def swapped(self, accepted: Names) -> Names:
-        """Replace single effects as long as that fits better by more than the parameters' price."""
+    def swapped(self, accepted: Names, among: Names | None = None) -> Names:
+        """Replace single effects, or only those `among` some, as long as that fits better by more than the parameters'
+        price.
+        """
         for _ in range(len(accepted)):
             best, score = accepted, self.settings.swap_nats
             for place, old in enumerate(accepted):
-                if old in self.given:
+                if old in self.given or (among is not None and old not in among):
                     continue
                 rest = (*accepted[:place], *accepted[place + 1 :])
                 worth = self._worth(rest, accepted, old)
@@ -372,17 +374,19 @@ class Selector:
         price = 0.5 * CANDIDATES[name].parameters * np.log(self.channel.count)
         return float(self.fit(rest).cost - self.fit(accepted).cost - price)
 
-    def needed(self, accepted: Names) -> Names:
-        """Drop effects that the others have made unnecessary, of several first the one that is missed least."""
+    def needed(self, accepted: Names, among: Names | None = None) -> Names:
+        """Drop effects, or only those `among` some, that the others have made unnecessary, of several first the one
+        that is missed least.
+        """
         idle = []
         for name in accepted:
-            if name in self.given:
+            if name in self.given or (among is not None and name not in among):
                 continue
             rest = tuple(other for other in accepted if other != name)
             self._refit_without(accepted, name, rest)
             if not self.acceptable(rest, accepted):
                 idle.append((self._worth(rest, accepted, name), rest))
-        return self.needed(min(idle)[1]) if idle else accepted
+        return self.needed(min(idle)[1], among) if idle else accepted
 
     def _refit_without(self, accepted: Names, name: str, rest: Names) -> None:
         """Fit `rest` from the fit of the larger set too: what has thresholds may have found better ones there."""

@@ -337,7 +337,7 @@ def test_every_set_has_the_delay_that_is_seen_at_first_sight_until_it_is_judged_
 
 @dataclass(frozen=True)
 class Held:
-    """Stands for a selector: what it takes for needed and swaps is seen in the names."""
+    """Stands for a selector: what it takes for needed and swaps, and among what, is seen in the names."""
 
     channel: object
     given: tuple
@@ -345,19 +345,20 @@ class Held:
     fits: dict
     proofs: dict
 
-    def needed(self, names):
-        return (*names, "needed")
+    def needed(self, names, among):
+        return (*names, f"needed of {among}")
 
-    def swapped(self, names):
-        return (*names, "swapped")
+    def swapped(self, names, among):
+        return (*names, f"swapped of {among}")
 
 
-def test_a_delay_is_judged_against_none_and_fits_that_have_it_stay():
+def test_a_delay_alone_is_judged_against_none_and_fits_that_have_it_stay():
     sets = [frozenset(names) for names in ((), ("command_delay",), ("command_delay", "deadband"), ("deadband",))]
     selector = Held(SimpleNamespace(layout=WHEEL), ("command_delay",), None, dict.fromkeys(sets, "fit"), {1: 2})
     start = WHEEL.neutral
     found = judged(ChannelResult(selector, ("deadband",), None), (), start)
-    assert found.names == ("deadband", "needed", "swapped", "needed")
+    of = "of ('command_delay',)"
+    assert found.names == ("deadband", f"needed {of}", f"swapped {of}", f"needed {of}")
     assert set(found.selector.fits) == {sets[1], sets[2]}
     assert (found.selector.given, found.selector.start, found.selector.proofs) == ((), start, {})
     assert found.plain is None

@@ -48,6 +48,13 @@ def test_a_stand_in_is_swapped_for_what_it_stood_in_for():
     assert found.swapped(("surface_change",)) == ("turn_slip",)
 
 
+def test_among_some_only_those_are_dropped_or_swapped():
+    found = selector(turn_slip=0.08)
+    assert found.needed(("side_slip", "turn_slip", "slope"), ("slope", "turn_slip")) == ("side_slip", "turn_slip")
+    assert found.swapped(("surface_change",), ("slope",)) == ("surface_change",)
+    assert found.swapped(("surface_change",), ("surface_change",)) == ("turn_slip",)
+
+
 def wheels_slow(tau_s):
     """A search of wheels that follow steps of their commands as a lag."""
     commands = np.repeat(np.random.default_rng(7).choice([-4.0, -2.0, 0.0, 3.0, 5.0], 60), 100)
