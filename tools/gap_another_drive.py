@@ -23,13 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.control import PlannerState, SentCommand
-from disco_hw.control.past_motion import PastMotion
+from disco_hw.control.past_motion import DriveMeans, PastMotion
 from disco_hw.gap import find_gap
 from disco_hw.log.drive import DriveLog
 from disco_hw.model import Model, load_model, save_model
 from disco_hw.model.step import FreeRun
 from disco_hw.model.terms import TERMS
-from disco_hw.runtime.drive_means import DriveMeans
 from tools import strange_robot
 from tools.mujoco_robot import joystick
 

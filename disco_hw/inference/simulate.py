@@ -22,9 +22,9 @@ from disco_hw.inference.excitation import Excitation, Noise, slip_intensity
 from disco_hw.jit import parallel_kernel
 from disco_hw.model.added_terms import new_means
 from disco_hw.model.coefficients import base_point, effect_point
-from disco_hw.model.memory import forget
 from disco_hw.model.model import BASE_PARAMETERS, Model, coefficient_tables
 from disco_hw.model.step import axle_of, integration_from, integration_series, step, tracked_of
+from disco_hw.model.terms import forget
 
 Array = NDArray[np.float64]
 Seeds = NDArray[np.uint32]

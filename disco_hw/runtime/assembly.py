@@ -19,6 +19,7 @@ from disco_hw.adaptation.guard import (
 )
 from disco_hw.config import RobotConfig
 from disco_hw.control.baselines import LAWS, WithFallback
+from disco_hw.control.past_motion import DriveMeans
 from disco_hw.errors import InputError
 from disco_hw.estimation import PoseFusion
 from disco_hw.estimation.correction import DisturbanceEstimator
@@ -26,7 +27,6 @@ from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.log.recorder import Recorder
 from disco_hw.model import Model
 from disco_hw.runtime.core import DaemonCore
-from disco_hw.runtime.drive_means import DriveMeans
 from disco_hw.runtime.pipeline import Governor, Pipeline, Planner, WheelLimits
 from disco_hw.runtime.preflight import check_firmware_limits, check_task, failures
 from disco_hw.runtime.robot_setup import Setup, geometry

@@ -19,12 +19,12 @@ from typing import Protocol
 import msgspec
 
 from disco_hw.control import NoValidControl, PlannerState, PlanOutcome, Rollouts, SentCommand, WheelPlan
+from disco_hw.control.past_motion import DriveMeans
 from disco_hw.estimation import PoseEstimate, PoseFusion
 from disco_hw.estimation.correction import DisturbanceEstimator, PoseUpdate
 from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.model import Belief
 from disco_hw.model.coefficients import NO_DISTURBANCE, Disturbance
-from disco_hw.runtime.drive_means import DriveMeans
 from disco_hw.tasks import PlannedTask
 from drivers.types import PoseSample, Readings
 

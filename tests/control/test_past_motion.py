@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from disco_hw.control import PlannerState, SentCommand
-from disco_hw.control.past_motion import PastMotion
+from disco_hw.control.past_motion import DriveMeans, PastMotion
 from disco_hw.model import EffectSetting, Model
 from disco_hw.model.step import FreeRun
-from disco_hw.runtime.drive_means import DriveMeans
 
 DIRECTION, LOAD = "command += k sign(u - mean_0.3s(u))", "command += k u mean_1s(|u| + |u_other|)"
 RUBBER = "omega += k (omega - mean_1s(omega))"

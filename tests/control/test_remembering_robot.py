@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand
+from disco_hw.control.past_motion import DriveMeans
 from disco_hw.model import EffectSetting, Model, load_model, plain, save_model
-from disco_hw.runtime.drive_means import DriveMeans
 from disco_hw.tasks.circle import CircleCost
 
 TICK_S, TICK_NS = 0.02, 20_000_000

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from disco_hw.model.memory import BODY_MEMORIES, COMMAND_MEMORIES
+from disco_hw.model.terms import BODY_MEMORIES, COMMAND_MEMORIES
 
 STEP_S = 0.01
 STEADY = np.full((2000, 2), (3.0, -2.0))

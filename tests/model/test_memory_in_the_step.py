@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from disco_hw.model import EffectSetting, Gaussian, Model, load_model, plain, save_model
-from disco_hw.model.memory import BODY_MEMORIES, COMMAND_MEMORIES
 from disco_hw.model.model import coefficient_tables
 from disco_hw.model.step import FreeRun, simulate
-from disco_hw.model.terms import BODY_TARGETS, TERMS, memories_of
+from disco_hw.model.terms import BODY_MEMORIES, BODY_TARGETS, COMMAND_MEMORIES, TERMS, memories_of
 
 BASE = (0.06, 0.4, 0.1)
 STEP_S = 0.05

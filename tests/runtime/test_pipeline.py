@@ -9,10 +9,10 @@ import pytest
 
 from disco_hw.config import Estimation
 from disco_hw.control import Diagnostics, NoValidControl
+from disco_hw.control.past_motion import DriveMeans
 from disco_hw.estimation import PoseFusion
 from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.model import EffectSetting, Model
-from disco_hw.runtime.drive_means import DriveMeans
 from disco_hw.runtime.pipeline import FollowTask, Governor, Limited, Manual, Off, Pipeline, Source, Stand, WheelLimits
 from drivers.types import PoseSample, Readings, WheelSample
 

@@ -10,12 +10,12 @@ from msgspec import structs
 
 import disco_hw
 from disco_hw.control.optimiser import Optimiser
+from disco_hw.control.past_motion import DriveMeans
 from disco_hw.errors import InputError
 from disco_hw.log import MODEL_TOML, ROBOT_TOML, Attachment
 from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
 from disco_hw.log.records import UnexplainedMotion
 from disco_hw.model import EffectSetting, load_model, save_model
-from disco_hw.runtime.drive_means import DriveMeans
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.supervisor import UserRequest

@@ -22,7 +22,16 @@ from disco_hw.effects import Stage
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.noise import sensor_noise
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
-from disco_hw.gap.search.analysis import GAIN, FinalFit, GapAnalysis, final_fit
+from disco_hw.gap.search.analysis import (
+    GAIN,
+    FinalFit,
+    GapAnalysis,
+    final_fit,
+    lacking,
+    lacking_one,
+    least_evident_first,
+    swapped_one,
+)
 from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.cross_validation import (
     Chain,
@@ -38,7 +47,6 @@ from disco_hw.gap.search.cross_validation import (
 )
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
 from disco_hw.gap.search.least_squares import Fit, inverse
-from disco_hw.gap.search.reduced import lacking, lacking_one, least_evident_first, swapped_one
 from disco_hw.gap.search.richest_model import LATE_COLUMNS, LATE_STARTS_S, with_delay
 
 Array = NDArray[np.float64]

@@ -18,12 +18,13 @@ from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.settings import GRID_STEP_S, GapSettings, TermSettings
 from disco_hw.model import EffectSetting
-from disco_hw.model.memory import BODY_MEMORIES, COMMAND_MEMORIES
 from disco_hw.model.terms import (
     BODY_FEATURES,
+    BODY_MEMORIES,
     BODY_TARGETS,
     COMMAND,
     COMMAND_FEATURES,
+    COMMAND_MEMORIES,
     TERMS,
     GenericTerm,
     term_name,

@@ -11,7 +11,7 @@ from disco_hw.control.kernel import BLOCK
 from disco_hw.control.parameter_points import drawn_points, unscented_points
 from disco_hw.control.plan import command_history
 from disco_hw.model import EffectSetting, Gaussian, Model, plain
-from disco_hw.model.memory import BODY_MEMORIES, COMMAND_MEMORIES
+from disco_hw.model.terms import BODY_MEMORIES, COMMAND_MEMORIES
 from disco_hw.tasks.circle import CircleCost
 from tests.control import oracle
 from tests.tasks.costs import circle_cost

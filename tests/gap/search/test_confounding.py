@@ -19,7 +19,7 @@ from disco_hw.gap.search.analysis import (
     one_encoder,
 )
 from disco_hw.gap.settings import DEFAULT_SETTINGS
-from tests.gap.search.test_reduced import analysis_of, found
+from tests.gap.search.test_lacking import analysis_of, found
 
 SETTINGS = DEFAULT_SETTINGS.selection
 

@@ -17,7 +17,7 @@ from disco_hw.gap.search.channel_search import ChannelResult, body_moves
 from disco_hw.gap.search.cross_validation import PredictionErrors, within_one_standard_error
 from disco_hw.gap.search.selection import Selector
 from disco_hw.model import Model
-from tests.gap.search.test_reduced import analysis_of, found, told
+from tests.gap.search.test_lacking import analysis_of, found, told
 from tests.gap.synthetic import GEOMETRY, NOISE, body_channel
 
 
