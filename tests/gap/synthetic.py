@@ -9,9 +9,11 @@ from disco_hw.gap.data.free_runs import read_angles
 from disco_hw.gap.data.gridded_drive import GriddedDrive, GridSamples
 from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel
+from disco_hw.gap.search.selection import Thresholds
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 
 GEOMETRY = (0.06, 0.4, 0.1)
+LIMITS = Thresholds(score=20.0, moves_m=0.001, unnamed_score=20.0)
 NOISE = BodyNoise(0.004, 0.006, 1e-4, 1e-4, 1e-4, 1e-4, 0.3, 1e-4, 1e-3)
 DRIVE = ((4, 4), (0, 0), (-3, 3), (4, -4), (6, 6), (2, 5), (5, 2), (-4, -4), (-1.5, 1.5), (1.5, -1.5), (3, 6), (0, 0))
 

@@ -13,7 +13,7 @@ from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.search.channel_search import body_moves
 from disco_hw.gap.search.selection import Selector
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
-from tests.gap.synthetic import body_channel
+from tests.gap.synthetic import LIMITS, body_channel
 from tools.gap_logs import simulated_drive
 
 GROUPS = [type(getattr(DEFAULT_SETTINGS, field.name)) for field in fields(GapSettings)]
@@ -52,8 +52,8 @@ def test_a_setting_of_the_selection_is_felt_by_who_selects():
     channel, drive = body_channel(turn_slip=0.08)
     none = replace(DEFAULT_SETTINGS, selection=replace(DEFAULT_SETTINGS.selection, most_effects=0))
     strict = type(channel).build(replace(drive, settings=none), channel.noise, channel.neutral)
-    assert Selector(channel, body_moves(channel)).select() == ("turn_slip",)
-    assert Selector(strict, body_moves(strict)).select() == ()
+    assert Selector(channel, body_moves(channel), LIMITS).select() == ("turn_slip",)
+    assert Selector(strict, body_moves(strict), LIMITS).select() == ()
 
 
 def test_a_setting_of_the_noise_is_felt_by_the_channel():

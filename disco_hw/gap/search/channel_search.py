@@ -189,7 +189,8 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
     settings = drive.settings.selection
     # What is left of a rough fit becomes the noise of all that follow.
     seen = with_delay(channel, start)
-    rough = Selector(channel, moves, Thresholds(settings.rough_score, 0.0), given=given, start=seen, closely=True)
+    limits = Thresholds(settings.rough_score, 0.0, settings.rough_score)
+    rough = Selector(channel, moves, limits, given=given, start=seen, closely=True)
     begin = tuple(dict.fromkeys((*given, *LATE)))
     responding(rough, begin)
     names = rough.greedy(begin, responding)
@@ -297,7 +298,7 @@ def search_body(drive: GriddedDrive, start: Array, given: Names = ()) -> Channel
     delayed = fit(channel, with_delay(channel, start), indices(channel, given))
     channel = learn_body_noise(channel, min(nominal, delayed, key=lambda one: one.cost).vector, iterations=4)
     settings = drive.settings.selection
-    limits = Thresholds(settings.rough_score, 0.0)
+    limits = Thresholds(settings.rough_score, 0.0, settings.rough_score)
     rough = Selector(channel, body_moves(channel), limits, given=given, start=delayed.vector, closely=True)
     names = rough.greedy(tuple(dict.fromkeys((*given, *delays_of(BODY)))))
     rich = (*names, *(name for name in smooth_of(BODY) if name not in names))
@@ -357,7 +358,7 @@ def _thresholds(white: Array, use: NDArray[np.bool_], settings: SelectionSetting
     sound = white[use]
     sound = sound[np.abs(sound).max(axis=1) > settings.silent]
     if not sound.size:
-        return Thresholds(settings.named_score, settings.least_moved_m)
+        return Thresholds(settings.named_score, settings.least_moved_m, settings.unnamed_score)
     sound = np.clip(sound / np.sqrt((sound**2).mean()), -settings.clipped_at, settings.clipped_at)
     heavy = float((sound**4).mean()) / settings.gaussian_kurtosis
     times = min(max(heavy, 1.0), settings.heaviest)

@@ -79,7 +79,7 @@ def inflation(found: Fit, channel: ResidualChannel, added: tuple[int, ...]) -> f
         scatter = float(np.einsum("bi,ij,bj->", gradient @ moved, weight, gradient @ moved))
         information = np.einsum("bij,ip,pq,jq->b", normal, moved, weight, moved)
         if information.max() <= 0.0:
-            continue
+            return 1.0
         information = information / information.max()
         # Where few blocks hold most information, as few scatter: fitting takes one of them, and the rest says little of
         # the noise.
@@ -112,9 +112,9 @@ Split = tuple[Array, Array | None]
 class Thresholds:
     """When an effect is accepted: evidence score, of one without a name too, and shift of the 2 s predictions."""
 
-    score: float = 20.0
-    moves_m: float = 0.001
-    unnamed_score: float = 20.0
+    score: float
+    moves_m: float
+    unnamed_score: float
 
 
 @dataclass
@@ -127,7 +127,7 @@ class Selector:
 
     channel: ResidualChannel
     moves: Callable[[Split, Split], float]
-    thresholds: Thresholds = Thresholds()
+    thresholds: Thresholds
     given: Names = ()
     start: Array | None = None
     closely: bool = False
@@ -235,7 +235,8 @@ class Selector:
         """Gain in nats that the candidate promises to first order, from the parent's fit."""
         channel, layout = self.channel, self.channel.layout
         vector, residual = parent.vector, parent.residual
-        if value is not None and new.profile is not None:
+        if value is not None:
+            assert new.profile is not None
             vector = vector.copy()
             vector[layout.place[new.profile.column]] = value
             if not self._neutral(parent, new):
@@ -358,7 +359,7 @@ class Selector:
                             self.promise(rest, name) - worth,
                         )
             if best == accepted:
-                break
+                return accepted
             accepted = best
         return accepted
 

@@ -12,14 +12,14 @@ from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report.blind_spots import BlindSpot, blind_spots, proved, with_effect, with_size
 from disco_hw.gap.search.channel_search import ChannelResult, body_moves, wheel_moves
 from disco_hw.gap.search.richest_model import candidates_of
-from disco_hw.gap.search.selection import Selector, Thresholds
-from tests.gap.synthetic import GEOMETRY, body_channel, line_of
+from disco_hw.gap.search.selection import Selector
+from tests.gap.synthetic import GEOMETRY, LIMITS, body_channel, line_of
 
 
 @pytest.mark.parametrize("name", candidates_of(BODY))
 def test_poses_of_a_log_into_which_an_effect_is_put_are_those_of_a_robot_that_has_it(name):
     channel, drive = body_channel()
-    found = ChannelResult(Selector(channel, body_moves(channel)), (), channel)
+    found = ChannelResult(Selector(channel, body_moves(channel), LIMITS), (), channel)
     size = REGISTRY[name].parameters[0].realistic or REGISTRY[name].parameters[0].start
     vector = with_size(found, name, size)
     changed = with_effect(drive, found, vector)
@@ -41,7 +41,7 @@ def test_wheels_of_a_log_into_which_an_effect_is_put_are_those_of_a_robot_that_h
     _, drive = body_channel()
     geometry = np.array(GEOMETRY)
     channel = WheelChannel.build(drive, WheelNoise(), geometry)
-    found = ChannelResult(Selector(channel, wheel_moves(channel, geometry)), (), channel)
+    found = ChannelResult(Selector(channel, wheel_moves(channel, geometry), LIMITS), (), channel)
     for name, size in {"motor_lag": 0.1, "command_delay": 0.1, "speed_limit": 4.0, "deadband": 0.5}.items():
         vector = with_size(found, name, size)
         again = WheelChannel.build(with_effect(drive, found, vector), WheelNoise(), geometry)
@@ -85,7 +85,7 @@ def test_the_boldest_claims_are_proved_first():
 
 
 def spots_of(channel, names=(), limits=None):
-    selector = Selector(channel, body_moves(channel), limits or Thresholds())
+    selector = Selector(channel, body_moves(channel), limits or LIMITS)
     return {spot.name: spot for spot in blind_spots(ChannelResult(selector, names, channel))}
 
 
@@ -104,11 +104,11 @@ def test_twice_the_smallest_visible_size_is_found_and_a_third_of_it_is_not(name)
     size = spots_of(body_channel()[0])[name].smallest_visible
     for share, found in ((2.0, True), (1.0 / 3.0, False)):
         channel, _ = body_channel(1, **{name: share * size})
-        assert (name in Selector(channel, body_moves(channel)).select()) is found, (name, share, size)
+        assert (name in Selector(channel, body_moves(channel), LIMITS).select()) is found, (name, share, size)
 
 
 def test_what_moves_the_prediction_too_little_to_be_reported_is_called_too_small():
-    limits = Thresholds(moves_m=0.008)
+    limits = replace(LIMITS, moves_m=0.008)
     size = spots_of(body_channel()[0], limits=limits)["lateral_icr"].smallest_visible
     assert size > 1.5 * spots_of(body_channel()[0])["lateral_icr"].smallest_visible
     for share, found in ((1.2, True), (0.8, False)):
@@ -130,7 +130,7 @@ def test_how_fast_turning_speeds_up_shows_only_where_the_robot_is_asked_to_turn(
 
     def spot_at(*commands):
         channel = WheelChannel.build(line_of(np.repeat(commands, 200, axis=0)), WheelNoise(), geometry)
-        found = ChannelResult(Selector(channel, wheel_moves(channel, geometry)), (), channel)
+        found = ChannelResult(Selector(channel, wheel_moves(channel, geometry), LIMITS), (), channel)
         return {spot.name: spot for spot in blind_spots(found, 8.0)}["yaw_acceleration_limit"]
 
     straight = spot_at(*[(0.0, 0.0), (5.0, 5.0), (-5.0, -5.0)] * 4)
@@ -148,7 +148,7 @@ def test_no_limit_shows_above_what_was_asked_of_the_robot():
 
     def spots_at(left, right, top_rad_s):
         channel = WheelChannel.build(line_of(np.full((4000, 2), (left, right))), WheelNoise(), geometry)
-        found = ChannelResult(Selector(channel, wheel_moves(channel, geometry)), (), channel)
+        found = ChannelResult(Selector(channel, wheel_moves(channel, geometry), LIMITS), (), channel)
         return {spot.name: spot for spot in blind_spots(found, top_rad_s)}
 
     # A steady circle at half speed: 0.3 rad/s of turning.
@@ -170,7 +170,7 @@ def test_whether_a_drive_is_blind_is_a_plain_truth_value_however_slowly_the_robo
     geometry = np.array(GEOMETRY)
     for speeds in ((0.0, 0.0), (4.0, 4.0), (-1.5, 1.5), (-40.0, 40.0)):
         channel = WheelChannel.build(line_of(np.full((4000, 2), speeds)), WheelNoise(), geometry)
-        found = ChannelResult(Selector(channel, wheel_moves(channel, geometry)), (), channel)
+        found = ChannelResult(Selector(channel, wheel_moves(channel, geometry), LIMITS), (), channel)
         for spot in blind_spots(found, top_rad_s):
             assert type(spot.blind) is bool, spot.name
             assert spot.smallest_visible is None or type(spot.smallest_visible) is float, spot.name

@@ -23,7 +23,7 @@ from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.selection import EffectEvidence, Selector
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms, motion
 from disco_hw.gap.settings import DEFAULT_SETTINGS
-from tests.gap.synthetic import GEOMETRY, NOISE, body_channel, line_of
+from tests.gap.synthetic import GEOMETRY, LIMITS, NOISE, body_channel, line_of
 
 # Turns at four rates: at two of them a wrong axial distance makes up for any form.
 DRIVE = ((4, 4), (0, 0), (-1, 1), (1, -1), (-2, 2), (2, -2), (-3.5, 3.5), (3.5, -3.5), (-6, 6), (6, -6), (3, 6), (6, 3))
@@ -56,7 +56,7 @@ def found_of(name, truth, perturbation):
     read_angles(channel.track(truth, perturbation), line.pose.node, line.pose.fraction, clean)
     noise = np.random.default_rng(5).standard_normal(clean.shape) * (0.004, 0.004, 0.006)
     channel = BodyChannel.build(replace(line, pose_values=clean + noise), NOISE, plain)
-    selector = Selector(channel, body_moves(channel))
+    selector = Selector(channel, body_moves(channel), LIMITS)
     return ChannelResult(selector, (name,), channel)
 
 
@@ -116,7 +116,7 @@ def beside(form, times):
     column = {"omega += k omega |omega|": (0, 0, 1), "v_x += k v^3": (1, 0, 0)}[form]
     term = Term(form, np.where(column[2], turning, forward)[:, None] * np.array(column, dtype=float))
     channel = WithTerms.of(found.channel, (term,))
-    selector = Selector(channel, found.selector.moves)
+    selector = Selector(channel, found.selector.moves, LIMITS)
     gain = selector.exact(()).cost - selector.exact(found.names).cost
     evidence = EffectEvidence(times * gain, 1.0, 1.0, 1.0, 1.0)
     return replace(found, selector=selector, unnamed=(UnnamedTerm(form, evidence, term),))
@@ -142,7 +142,7 @@ def test_a_name_beside_a_form_without_one_that_is_worth_a_third_of_it_is_dispute
 @pytest.mark.parametrize(("offset_m", "disputed"), [(0.0, False), (0.1, True)])
 def test_a_name_that_takes_little_of_what_its_channel_lacks_is_disputed(offset_m, disputed):
     channel, _ = body_channel(turn_slip=0.02, lateral_icr=offset_m)
-    selector = Selector(channel, body_moves(channel))
+    selector = Selector(channel, body_moves(channel), LIMITS)
     richest = selector.fit(("turn_slip", "lateral_icr")).residual
     found = ChannelResult(selector, ("turn_slip",), channel, richest=richest, richest_parameters=6)
     why = disputed_names(found).get("turn_slip", "")

@@ -1,5 +1,6 @@
 """Evidence is honest about noise that is not what the model says."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -47,10 +48,11 @@ def test_noise_that_comes_in_blocks_inflates_the_variance():
     assert shaken > 20.0
 
 
-def test_what_is_told_of_next_to_nothing_is_judged_without_a_fault():
+@pytest.mark.parametrize("size", [1e-90, 0.0])
+def test_what_is_told_of_next_to_nothing_is_judged_without_a_fault(size):
     white = np.random.default_rng(5).standard_normal(N)
     with np.errstate(all="raise"):
-        assert inflation(linear_fit(np.full((N, 1), 1e-90), white), channel(), (0,)) >= 1.0
+        assert inflation(linear_fit(np.full((N, 1), size), white), channel(), (0,)) == 1.0
 
 
 def test_a_block_is_judged_by_the_others():
@@ -145,6 +147,25 @@ def test_without_blocks_enough_the_model_of_the_noise_is_believed():
     assert inflation(linear_fit(np.ones((N, 1)), wander + 1.0), few, (0,)) == 1.0
 
 
+def longest(lengths, fewest=5, trusted=0.0, blocks=N // EACH):
+    """The inflation by blocks of these lengths, of noise that wanders, of what the first so many blocks show."""
+    x = np.where(np.arange(N) < blocks * EACH, 1.0, 0.0)[:, None]
+    wander = np.repeat(np.random.default_rng(17).standard_normal(N // EACH), EACH)
+    chosen = replace(DEFAULT_SETTINGS.selection, block_lengths=lengths, fewest_blocks=fewest)
+    settings = SimpleNamespace(selection=chosen)
+    of = SimpleNamespace(settings=settings, block=channel().block, count=N, trusted_blocks=trusted)
+    return inflation(linear_fit(x, wander), of, (0,))
+
+
+def test_blocks_are_judged_where_there_are_enough_of_them_and_more_than_one_speaks_whatever_other_lengths_show():
+    assert longest((1,), fewest=60) > 5.0
+    assert longest((1,), fewest=61) == 1.0
+    # Nine are taken as one in seven.
+    assert longest((9, 1), fewest=8) == longest((1,), fewest=8)
+    assert longest((1,), blocks=1) == 1.0
+    assert longest((3, 1), blocks=2) == longest((1,), blocks=2) > 5.0
+
+
 def test_what_repeats_is_what_is_left_without_the_block_that_says_most_however_little_that_is():
     x = np.random.default_rng(11).standard_normal((N, 1))
     y = 0.01 * (0.5 * x[:, 0] + np.random.default_rng(12).standard_normal(N))
@@ -156,6 +177,15 @@ def test_what_repeats_is_what_is_left_without_the_block_that_says_most_however_l
     # A log of a single residual pays for a parameter as one of two.
     single = SimpleNamespace(**{**vars(channel()), "count": 1})
     assert compare(small, big, single, 1.0).score == pytest.approx(2.0 * proof.gain / proof.inflation - np.log(2.0))
+    assert proof.again(1.0, 1) == pytest.approx(2.0 * proof.repeated / proof.inflation - np.log(2.0))
+
+
+def test_where_every_block_is_fitted_worse_none_is_left_out_of_what_repeats():
+    y = np.random.default_rng(16).standard_normal(N)
+    small, big = (Fit(np.zeros(0), (), 0.0, times * y, np.empty((N, 0))) for times in (1.0, 1.001))
+    proof = compare(small, big, channel(), 1.0)
+    assert proof.repeated < 0.0
+    assert proof.repeated == proof.held_out
 
 
 def test_blocks_that_say_nothing_of_a_parameter_hide_no_scatter_of_the_others():

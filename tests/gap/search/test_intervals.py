@@ -24,11 +24,11 @@ from disco_hw.gap.search.channel_search import ChannelResult, body_moves, deviat
 from disco_hw.gap.search.parts import InParts, in_equal_parts, in_logs, wandered
 from disco_hw.gap.search.selection import Selector
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
-from tests.gap.synthetic import DRIVE, GEOMETRY, NOISE, body_channel, line_of
+from tests.gap.synthetic import DRIVE, GEOMETRY, LIMITS, NOISE, body_channel, line_of
 
 
 def estimated(channel, names=("turn_slip",)):
-    return estimate_parameters(ChannelResult(Selector(channel, body_moves(channel)), names, channel))
+    return estimate_parameters(ChannelResult(Selector(channel, body_moves(channel), LIMITS), names, channel))
 
 
 def test_intervals_hold_the_truth_nine_times_of_ten():
@@ -103,7 +103,7 @@ def test_halves_that_disagree_widen_the_interval_to_hold_both():
     names = ("turn_slip",)
     same, drifting = changing(0.08), changing(0.16)
     found = [estimated(one, names).by_name["turn_slip.k_s"] for one in (same, drifting)]
-    result = ChannelResult(Selector(drifting, body_moves(drifting)), names, drifting)
+    result = ChannelResult(Selector(drifting, body_moves(drifting), LIMITS), names, drifting)
     early, late = in_logs(result, (0.0, 0.5 * drifting.drive.duration_s))["turn_slip.k_s"].values
     assert (early, late) == pytest.approx((0.08, 0.16), abs=0.03)
     assert found[1].low < early < late < found[1].high
@@ -142,7 +142,7 @@ def test_a_part_that_cannot_tell_two_parameters_apart_says_nothing_of_either():
     noise = np.random.default_rng(4).standard_normal(poses.shape) * (0.004, 0.004, 0.006)
     read_angles(plain.track(truth), line.pose.node, line.pose.fraction, poses)
     channel = BodyChannel.build(replace(line, pose_values=poses + noise), NOISE, plain.neutral)
-    result = ChannelResult(Selector(channel, body_moves(channel)), ("turn_slip",), channel)
+    result = ChannelResult(Selector(channel, body_moves(channel), LIMITS), ("turn_slip",), channel)
     found = in_logs(result, (0.0, 0.5 * channel.drive.duration_s))
     assert "turn_slip.k_s" not in found
     assert "axial_distance_m" not in found
@@ -151,7 +151,7 @@ def test_a_part_that_cannot_tell_two_parameters_apart_says_nothing_of_either():
 
 def test_each_of_several_logs_speaks_for_itself():
     channel = changing(0.16)
-    result = ChannelResult(Selector(channel, body_moves(channel)), ("turn_slip",), channel)
+    result = ChannelResult(Selector(channel, body_moves(channel), LIMITS), ("turn_slip",), channel)
     found = in_logs(result, (0.0, 0.5 * channel.drive.duration_s))
     assert found["turn_slip.k_s"].values == pytest.approx((0.08, 0.16), abs=0.03)
     assert found["turn_slip.k_s"].apart(0, 1) > 3.0
@@ -162,7 +162,7 @@ def test_each_of_several_logs_speaks_for_itself():
 
 def test_a_parameter_that_changes_along_a_log_is_said_to_drift_and_another_is_not():
     for channel, drifts in ((changing(0.08), False), (changing(0.16), True)):
-        result = ChannelResult(Selector(channel, body_moves(channel)), ("turn_slip",), channel)
+        result = ChannelResult(Selector(channel, body_moves(channel), LIMITS), ("turn_slip",), channel)
         analysis = GapAnalysis(channel.drive, channel.neutral, WHEEL.neutral, result, None)
         said = drifting_parameters(analysis, final_fit(analysis))
         assert bool(said) == drifts
@@ -195,7 +195,7 @@ def test_a_drift_shows_in_thirds_or_where_these_say_too_little_in_halves(monkeyp
 def test_logs_of_one_robot_differ_in_what_changed_between_them_alone():
     for late_k_s, differs in ((0.08, set()), (0.16, {"turn_slip.k_s"})):
         channel = changing(late_k_s)
-        result = ChannelResult(Selector(channel, body_moves(channel)), ("turn_slip",), channel)
+        result = ChannelResult(Selector(channel, body_moves(channel), LIMITS), ("turn_slip",), channel)
         analysis = GapAnalysis(channel.drive, channel.neutral, WHEEL.neutral, result, None)
         found = across_logs(analysis, (0.0, 0.5 * channel.drive.duration_s))
         assert {each.name for each in found} >= {"turn_slip.k_s", "wheel_radius_m", "x_icr_m"}
@@ -240,7 +240,7 @@ def wheels_that_lose(lost_on_the_spot):
     line = replace(line_of(speed), command_rad_s=np.repeat(commands, 50, axis=0))
     noise = WheelNoise(relative=0.015, correlation_s=0.15, stamp_s=1e-6, wander=1e-3, drift_rad_sqrt_s=2e-3)
     channel = WheelChannel.build(line, noise, np.array(GEOMETRY))
-    return ChannelResult(Selector(channel, wheel_moves(channel, np.array(GEOMETRY))), ("deadband",), channel)
+    return ChannelResult(Selector(channel, wheel_moves(channel, np.array(GEOMETRY)), LIMITS), ("deadband",), channel)
 
 
 def wheels_that_stick(thresholds):
@@ -252,7 +252,7 @@ def wheels_that_stick(thresholds):
     line = replace(line_of(turned + 0.02 * rng.standard_normal(turned.shape)), command_rad_s=command)
     noise = WheelNoise(relative=0.015, correlation_s=0.15, stamp_s=1e-6, wander=1e-3, drift_rad_sqrt_s=2e-3)
     channel = WheelChannel.build(line, noise, np.array(GEOMETRY))
-    return ChannelResult(Selector(channel, wheel_moves(channel, np.array(GEOMETRY))), ("stiction",), channel)
+    return ChannelResult(Selector(channel, wheel_moves(channel, np.array(GEOMETRY)), LIMITS), ("stiction",), channel)
 
 
 @pytest.mark.parametrize("scatters", [False, True])

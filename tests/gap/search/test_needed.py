@@ -18,7 +18,7 @@ from disco_hw.gap.search.cross_validation import PredictionErrors, within_one_st
 from disco_hw.gap.search.selection import Selector
 from disco_hw.model import Model
 from tests.gap.search.test_lacking import analysis_of, found, told
-from tests.gap.synthetic import GEOMETRY, NOISE, body_channel
+from tests.gap.synthetic import GEOMETRY, LIMITS, NOISE, body_channel
 
 
 def kept_of(names):
@@ -28,7 +28,7 @@ def kept_of(names):
     line = replace(line, command_rad_s=np.full_like(line.command_rad_s, np.nan))
     start = body_channel()[0].neutral.copy()
     channel = BodyChannel.build(line, NOISE, start)
-    selector = Selector(channel, body_moves(channel))
+    selector = Selector(channel, body_moves(channel), LIMITS)
     analysis = GapAnalysis(line, start, WHEEL.neutral, ChannelResult(selector, names, channel), None)
     final = final_fit(analysis)
     predictions = joint_predictions(analysis, final)

@@ -17,7 +17,7 @@ from disco_hw.gap.search.richest_model import LATE, LATE_COLUMNS, LATE_STARTS_S,
 from disco_hw.gap.search.selection import Selector
 from disco_hw.gap.search.unnamed_terms import WithTerms, body_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
-from tests.gap.synthetic import DRIVE, GEOMETRY, NOISE, body_channel, line_of
+from tests.gap.synthetic import DRIVE, GEOMETRY, LIMITS, NOISE, body_channel, line_of
 
 READ_TO_RAD = 1e-3
 
@@ -260,7 +260,7 @@ def begun(names, given=(), before=None, best=0, seen_s=0.0):
     """Vectors from which `responding` fits lateness with a stand-in for `fit`, of which one ends best, and its end."""
     drive = SimpleNamespace(commands_moved_s=seen_s)
     channel = SimpleNamespace(layout=WHEEL, free=(), inner=SimpleNamespace(drive=drive))
-    selector = Selector(channel, lambda small, big: 0.0, given=given)
+    selector = Selector(channel, lambda small, big: 0.0, LIMITS, given=given)
     plain = WHEEL.neutral.copy()
     plain[WHEEL.place["deadband.width_rad_s"]] = 0.4
     others = tuple(name for name in names if name in given or name not in LATE)
@@ -328,7 +328,7 @@ def test_every_set_has_the_delay_that_is_seen_at_first_sight_until_it_is_judged_
     moved = np.zeros(start.size)
     moved[WHEEL.place["command_delay.delay_s"]] = 0.2
     for given, begin, expected in ((("wheel_gain",), start, start + moved), ((), None, WHEEL.neutral + moved)):
-        selector = Selector(channel, None, given=given, start=begin, fits={frozenset(): 1}, proofs={(): 2})
+        selector = Selector(channel, None, LIMITS, given=given, start=begin, fits={frozenset(): 1}, proofs={(): 2})
         late = timed(selector)
         assert late.given == (*given, "command_delay")
         np.testing.assert_array_equal(late.start, expected)

@@ -14,15 +14,15 @@ from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search import selection
 from disco_hw.gap.search.channel_search import body_moves, wheel_moves
 from disco_hw.gap.search.least_squares import Fit, fit
-from disco_hw.gap.search.richest_model import CANDIDATES, LATE, Profile, candidates_of, indices
-from disco_hw.gap.search.selection import EffectEvidence, Selector, Thresholds
+from disco_hw.gap.search.richest_model import CANDIDATES, LATE, candidates_of, indices
+from disco_hw.gap.search.selection import EffectEvidence, Selector
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
-from tests.gap.synthetic import GEOMETRY, body_channel, line_of
+from tests.gap.synthetic import GEOMETRY, LIMITS, body_channel, line_of
 
 
 def selector(given=(), start=None, moves_m=0.001, **effects):
     channel, _ = body_channel(**effects)
-    return Selector(channel, body_moves(channel), Thresholds(moves_m=moves_m), given=given, start=start)
+    return Selector(channel, body_moves(channel), replace(LIMITS, moves_m=moves_m), given=given, start=start)
 
 
 def test_nothing_is_selected_where_nothing_is_missing():
@@ -63,7 +63,7 @@ def wheels_slow(tau_s):
     line = line_of(np.repeat(followed[:, None], 2, axis=1))
     line = replace(line, command_rad_s=np.repeat(commands[:, None], 2, axis=1))
     channel = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
-    return Selector(channel, wheel_moves(channel, np.array(GEOMETRY)), Thresholds(moves_m=0.005))
+    return Selector(channel, wheel_moves(channel, np.array(GEOMETRY)), replace(LIMITS, moves_m=0.005))
 
 
 def test_a_short_lag_with_a_delay_beside_it_is_not_taken_for_the_delay():
@@ -86,7 +86,7 @@ def test_what_only_turning_loses_is_told_from_what_every_wheel_loses(hidden):
     followed = turned if hidden == "turning_load" else less(commands)
     line = replace(line_of(followed + 0.05 * rng.standard_normal(commands.shape)), command_rad_s=commands)
     channel = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
-    found = Selector(channel, wheel_moves(channel, np.array(GEOMETRY)), Thresholds())
+    found = Selector(channel, wheel_moves(channel, np.array(GEOMETRY)), LIMITS)
     # Starts and stops within a cell of the grid look like a short delay.
     assert [name for name in found.select() if name not in LATE] == [hidden]
     column = REGISTRY[hidden].columns[0]
@@ -133,7 +133,7 @@ def test_a_change_is_found_when_it_happens():
         - channel.track(truth)[channel.samples.node]
     )
     changed = type(channel).build(replace(line, pose_values=moved), channel.noise, truth)
-    found = Selector(changed, body_moves(changed))
+    found = Selector(changed, body_moves(changed), LIMITS)
     names = found.select()
     assert names == ("surface_change",)
     assert found.fit(names).vector[BODY.place["surface_change.time_s"]] == pytest.approx(40.0, abs=2.0)
@@ -146,7 +146,7 @@ def wheels_late(commands_rad_s, late_cells=20):
     geometry = np.array(GEOMETRY)
     line = replace(line_of(followed), command_rad_s=commands)
     channel = WheelChannel.build(line, WheelNoise(), geometry)
-    return Selector(channel, wheel_moves(channel, geometry))
+    return Selector(channel, wheel_moves(channel, geometry), LIMITS)
 
 
 def test_a_slow_drive_cannot_tell_lag_from_delay_and_says_so():
@@ -162,7 +162,7 @@ def judged(gain=30.0, score=30.0, repeated=10.0, moved_m=0.01, misfit=0.0, count
     """Whether one effect is accepted on top of none: its gain, proof, what it moves, and what the fit without lacks."""
     channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=count, split=lambda vector: (vector, None))
     base = 0.5 * count * (1.0 + misfit)
-    limits = Thresholds(score=20.0, moves_m=0.001)
+    limits = LIMITS
     chosen = Selector(channel, lambda small, big: moved_m, limits)
     for names, cost in ((frozenset(), base), (frozenset({"turn_slip"}), base - gain)):
         chosen.fits[names] = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
@@ -208,7 +208,7 @@ def test_noise_that_wanders_is_named_by_gain_alone_and_not_by_the_rule():
     wandering = type(channel).build(
         replace(line, pose_values=channel.measured + moved[channel.samples.node]), channel.noise, plain
     )
-    found = Selector(wandering, body_moves(wandering), Thresholds(score=20.0))
+    found = Selector(wandering, body_moves(wandering), LIMITS)
     gains = {name: found.fit(()).cost - found.fit((name,)).cost for name in ("turn_slip", "surface_change")}
     assert max(gains.values()) > 20.0
     assert found.select() == ()
@@ -285,16 +285,16 @@ class Circling(Selector):
 
 def test_a_search_that_comes_back_to_where_it_was_ends_with_the_best_set_on_its_way():
     channel, _ = body_channel(turn_slip=0.08, side_slip=0.1)
-    circling = Circling(channel, body_moves(channel), Thresholds())
+    circling = Circling(channel, body_moves(channel), LIMITS)
     assert circling.select(("turn_slip",)) == ("side_slip", "turn_slip")
     # One that is next to nothing worth is not the best, as its price is paid.
     channel, _ = body_channel(turn_slip=0.08)
-    assert Circling(channel, body_moves(channel), Thresholds()).select(("turn_slip",)) == ("turn_slip",)
+    assert Circling(channel, body_moves(channel), LIMITS).select(("turn_slip",)) == ("turn_slip",)
 
 
 def test_the_price_of_an_effect_is_that_of_all_its_parameters():
     channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=1000)
-    fitted = Selector(channel, lambda small, big: 1.0)
+    fitted = Selector(channel, lambda small, big: 1.0, LIMITS)
     for names, cost in ((frozenset(), 700.0), (frozenset({"wheel_gain"}), 650.0)):
         fitted.fits[names] = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
     # Left and right: half of 2 ln(1000).
@@ -316,32 +316,8 @@ def test_what_promises_nothing_to_first_order_is_not_fitted():
     assert frozenset({"turn_slip"}) in slipping.fits
 
 
-class Scanned(Selector):
-    """A search of one entry whose gain to first order is largest at 34.3 and whose fit is best at 35.4."""
-
-    def _linear_gain(self, parent, new, value=None):
-        return 100.0 - (value - 34.3) ** 2
-
-    def _at(self, start, active, new, value, iterations=None):
-        return Fit(np.array([value]), (), (value - 35.4) ** 2, np.empty(0), np.empty((0, 0)))
-
-
-def test_a_profiled_entry_is_searched_closer_to_first_order_and_then_by_fits():
-    scanned = Scanned(SimpleNamespace(settings=DEFAULT_SETTINGS), lambda small, big: 1.0)
-    new = SimpleNamespace(profile=Profile("entry", lambda channel: tuple(10.0 * k for k in range(7)), 0.5))
-    worth = DEFAULT_SETTINGS.selection.worth_fitting_nats
-
-    def found(cost):
-        parent = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
-        return float(scanned._profiled(parent, (), new).vector[0])
-
-    assert found(100.0) == pytest.approx(35.4, abs=0.3)
-    # Where nothing is gained the first fit is enough.
-    assert found(worth) == pytest.approx(34.3, abs=0.3)
-
-
 def test_a_set_is_settled_after_every_step_and_the_steps_end_where_nothing_is_accepted():
-    found = Selector(SimpleNamespace(settings=DEFAULT_SETTINGS), lambda small, big: 1.0)
+    found = Selector(SimpleNamespace(settings=DEFAULT_SETTINGS), lambda small, big: 1.0, LIMITS)
     found.ranked = lambda accepted: [name for name in ("side_slip", "turn_slip", "slope") if name not in accepted]
     found.acceptable = lambda smaller, larger: larger[-1] != "slope"
     settled = []

@@ -15,7 +15,7 @@ from disco_hw.gap.search.analysis import GapAnalysis, final_fit
 from disco_hw.gap.search.channel_search import ChannelResult, body_moves, wheel_moves
 from disco_hw.gap.search.selection import Selector
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
-from tests.gap.synthetic import DRIVE, GEOMETRY, NOISE, line_of
+from tests.gap.synthetic import DRIVE, GEOMETRY, LIMITS, NOISE, line_of
 
 LAG_S, SLIP_S = 0.2, 0.08
 LAG, SLIP = WHEEL.place["motor_lag.tau_s"], BODY.place["turn_slip.k_s"]
@@ -43,11 +43,13 @@ def analysed(body_names=("turn_slip",), wheel_names=("motor_lag",), commands=Tru
     nominal = BODY.neutral.copy()
     nominal[:3] = 0.062, 0.38, 0.12
     body = BodyChannel.build(line, NOISE, nominal)
-    found = ChannelResult(Selector(body, body_moves(body)), body_names, body)
+    found = ChannelResult(Selector(body, body_moves(body), LIMITS), body_names, body)
     wheels = None
     if commands:
         channel = WheelChannel.build(line, WheelNoise(reading_rad=1e-3), np.array(GEOMETRY))
-        wheels = ChannelResult(Selector(channel, wheel_moves(channel, np.array(GEOMETRY))), wheel_names, channel)
+        wheels = ChannelResult(
+            Selector(channel, wheel_moves(channel, np.array(GEOMETRY)), LIMITS), wheel_names, channel
+        )
     return GapAnalysis(line, nominal, WHEEL.neutral, found, wheels)
 
 

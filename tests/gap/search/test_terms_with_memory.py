@@ -19,7 +19,7 @@ from disco_hw.gap.search.channel_search import (
 from disco_hw.gap.search.selection import EffectEvidence, Selector
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms, motion
 from disco_hw.model import Model, load_model, save_model
-from tests.gap.synthetic import body_channel
+from tests.gap.synthetic import LIMITS, body_channel
 from tools import strange_robot
 from tools.gap_another_drive import another_drive, errors_ahead, without_terms
 
@@ -30,7 +30,7 @@ PROOF = EffectEvidence(100.0, 90.0, 80.0, 1.0, 190.0)
 def turning_less():
     """A channel whose robot turns less the faster it turns, its plain fit, and the yaw rate at the nodes."""
     channel, line = body_channel(turn_slip=0.1)
-    selector = Selector(channel, body_moves(channel))
+    selector = Selector(channel, body_moves(channel), LIMITS)
     return ChannelResult(selector, (), channel), motion(line, channel.neutral)[1]
 
 
@@ -81,7 +81,7 @@ def carrying(name):
     found, rate = turning_less()
     term = on_turning("omega += {:.3g} omega |omega|", rate * np.abs(rate), model_name=name)
     channel = WithTerms.of(found.channel, (term,))
-    selector = Selector(channel, found.selector.moves)
+    selector = Selector(channel, found.selector.moves, LIMITS)
     return replace(found, selector=selector, unnamed=(UnnamedTerm("", PROOF, term),), plain=found.selector)
 
 

@@ -26,7 +26,7 @@ from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.selection import EffectEvidence, Selector, Thresholds
 from disco_hw.gap.search.unnamed_terms import Term
 from disco_hw.gap.settings import DEFAULT_SETTINGS, SelectionSettings
-from tests.gap.synthetic import NOISE, body_channel
+from tests.gap.synthetic import LIMITS, NOISE, body_channel
 
 
 class Linear:
@@ -167,9 +167,7 @@ def turned_in(since, until, factor):
 
 
 def searched(channel, names=(), moves=None):
-    return ChannelResult(
-        Selector(channel, moves or body_moves(channel), Thresholds(unnamed_score=20.0)), names, channel
-    )
+    return ChannelResult(Selector(channel, moves or body_moves(channel), LIMITS), names, channel)
 
 
 def test_a_term_is_accepted_with_its_number_and_its_evidence_and_what_stood_in_for_it_goes():
@@ -399,7 +397,7 @@ def test_names_are_selected_anew_and_from_those_that_were_found_where_that_costs
         fit=lambda given: SimpleNamespace(vector=np.array([1.0, 2.0])),
         moves=lambda small, big: 1.0,
         given=("given",),
-        thresholds=Thresholds(),
+        thresholds=LIMITS,
         channel=channel,
     )
     larger, _ = _with_term(ChannelResult(selector, ("slope",), None), FIRST, 2)
@@ -506,4 +504,4 @@ def test_only_samples_that_are_used_and_say_something_tell_of_tails():
     assert heavy(np.vstack([some, [[0.0, 0.5]] * 10])) != plain
     unused = np.vstack([some, [[9.0, 9.0]]])
     assert heavy(unused, [True] * 41 + [False]) == plain
-    assert heavy(silent) == heavy(some, [False] * 41) == Thresholds(4.0, 0.002)
+    assert heavy(silent) == heavy(some, [False] * 41) == Thresholds(4.0, 0.002, 20.0)

@@ -18,7 +18,7 @@ from disco_hw.gap.search.cross_validation import _errors, only_timed, wheel_tabl
 from disco_hw.gap.search.selection import Selector
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from disco_hw.model import Model
-from tests.gap.synthetic import DRIVE, GEOMETRY, line_of
+from tests.gap.synthetic import DRIVE, GEOMETRY, LIMITS, line_of
 
 MODEL = Model(*GEOMETRY)
 
@@ -42,7 +42,7 @@ def analysed(names, **effects):
         }
     )
     channel = WheelChannel.build(line, WheelNoise(reading_rad=1e-3), np.array(GEOMETRY))
-    selector = Selector(channel, wheel_moves(channel, np.array(GEOMETRY)))
+    selector = Selector(channel, wheel_moves(channel, np.array(GEOMETRY)), LIMITS)
     body = BODY.neutral.copy()
     body[:3] = GEOMETRY
     return GapAnalysis(line, body, WHEEL.neutral, None, ChannelResult(selector, names, channel))
