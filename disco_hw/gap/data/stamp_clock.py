@@ -99,8 +99,6 @@ def clock_of(align: Alignment, settings: GridSettings, least_error_s: float, lea
     delay_s, least = align.fitted(StampClock(0.0))
     plain = StampClock(delay_s)
     first, last = align.span_s
-    if last <= first:
-        return plain
     middles, delays = by_stretch(align)
     few = delays.size < settings.fewest_clock_stretches
     if few or middles[-1] - middles[0] < settings.least_clock_share * (last - first):

@@ -155,21 +155,20 @@ def fit(
         if held:
             normal, gradient = normal + np.diag(precision), gradient + precision * (vector[chosen] - expected)
         scale = np.maximum(np.diag(normal), 1e-12 * max(float(np.max(np.diag(normal))), 1e-30))
-        better, gained = False, 0.0
-        before, was = vector, now
+        gained, before, was = 0.0, vector, now
         for _ in range(6):
-            step = -np.linalg.solve(normal + np.diag(damping * scale + 1e-300), gradient)
+            step = -np.linalg.solve(normal + np.diag(damping * scale), gradient)
             trial = vector.copy()
             trial[chosen] = np.clip(vector[chosen] + step, low, high)
             there = residual(trial)
             cost_there = total(there, trial)
             if cost_there < cost:
-                gained, better = cost - cost_there, True
+                gained = cost - cost_there
                 vector, now, cost = trial, there, cost_there
                 damping = max(damping * 0.1, 1e-9)
                 break
             damping *= 10.0
-        if better:
+        if gained > 0.0:
             moved = (vector - before)[chosen]
             carried = loose and _as_promised(gained, gradient, normal, moved, settings)
         elif carried:
@@ -179,7 +178,7 @@ def fit(
             break
         taken = partial(jacobian, residual, vector, active, layout, now)
         slope = _carried(slope, moved, now - was, scale) if carried else taken
-        if better and gained < enough_nats:
+        if 0.0 < gained < enough_nats:
             break
     if carried:
         slope = partial(jacobian, residual, vector, active, layout, now)
@@ -201,12 +200,10 @@ def _carried(slope: Array, step: Array, change: Array, scale: Array) -> Array:
 def by_block(found: Fit, block: Index, blocks_each: int = 1) -> tuple[Array, Array]:
     """Normal matrices (B, A, A) and gradients (B, A) by block of time, `blocks_each` neighbouring blocks as one."""
     label = np.unique(block // blocks_each, return_inverse=True)[1]
-    count, width = int(label.max()) + 1, len(found.active)
-    normal, gradient = np.zeros((count, width, width)), np.zeros((count, width))
-    order = np.argsort(label, kind="stable")
-    edges = np.searchsorted(label[order], np.arange(count + 1))
-    for b in range(count):
-        rows = order[edges[b] : edges[b + 1]]
+    sizes, width = np.bincount(label), len(found.active)
+    normal, gradient = np.zeros((sizes.size, width, width)), np.zeros((sizes.size, width))
+    inside = np.split(np.argsort(label, kind="stable"), np.cumsum(sizes)[:-1])
+    for b, rows in enumerate(inside):
         part = found.jacobian[rows]
         normal[b] = part.T @ part
         gradient[b] = part.T @ found.residual[rows]

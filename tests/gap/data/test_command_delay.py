@@ -1,11 +1,11 @@
 """The pieces of the commands' alignment with the wheels, each against what is computed by hand."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.command_timing import Answer, CommandAlignment, Response, Turned, command_clock, response
+from disco_hw.gap.data.command_timing import Answer, Response, Turned, command_clock, response
 from disco_hw.gap.data.stamp_clock import StampClock, picked
 from disco_hw.gap.settings import GridSettings
 from disco_hw.log.drive import Commands, Wheels
@@ -148,7 +148,7 @@ def scanned(monkeypatch):
         monkeypatch.setattr(Answer, "misfits", misfits)
         monkeypatch.setattr(Answer, "known", known)
         monkeypatch.setattr(Answer, "stands_out", lambda *_: shared)
-        chosen = replace(SETTINGS, lags_s=(0.1, 0.3), lag_reach_s=0.12, **settings)
+        chosen = replace(SETTINGS, **({"lags_s": (0.1, 0.3), "lag_reach_s": 0.12} | settings))
         return response(Turned.of(sampled() if wheels is None else wheels, chosen), commands, chosen)
 
     told.asked = asked
@@ -175,6 +175,23 @@ def test_a_delay_is_found_between_those_that_are_tried_without_a_lag_and_with_ea
         assert told.known
 
 
+def test_every_third_lag_is_scanned_and_the_rest_about_the_delay_that_these_show(scanned):
+    lags_s = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3)
+    told = scanned({0.25: (-0.5, 0.2), 0.15: (-0.4, 0.9)}, lags_s=lags_s)
+    assert (told.delay_s, told.lag_s) == (pytest.approx(-0.4, abs=1e-3), 0.15)
+    scans = [lag_s for _, delays, lag_s in scanned.asked if delays.size == 51]
+    assert scans == [0.0, 0.1, 0.25]
+
+
+def test_only_lags_that_may_fit_best_are_looked_at_between_the_steps_of_the_scan(scanned):
+    told = scanned({0.0: (0.247, 1.0), 0.1: (0.147, 0.97), 0.3: (-0.053, 0.9)}, least_delay_nats=0.05)
+    assert told.lag_s == 0.0
+    # The best of the scan first, and then those that are close to it.
+    closely = [lag_s for _, delays, lag_s in scanned.asked if delays.size == 1]
+    assert list(dict.fromkeys(closely)) == [0.0, 0.1]
+    assert scanned({0.0: (0.24, 1.0)}, least_delay_nats=0.0).delay_s == pytest.approx(0.24, abs=1e-3)
+
+
 def test_lags_are_told_apart_where_they_fit_best_and_not_at_the_steps_of_the_scan(scanned):
     # At the steps of the scan about 0.247 a lag of 0.1 s fits no better.
     told = scanned({0.0: (0.247, 1.0), 0.1: (0.157, 1.005)})
@@ -198,6 +215,9 @@ def test_delays_at_which_a_quarter_of_the_pairs_is_lost_are_none(scanned):
     # The next one that would be longer has lost them.
     told = scanned({0.0: (0.48, 1.0)}, known_s=0.5)
     assert (told.delay_s, told.known) == (0.0, False)
+    # Of the next but one nothing is asked.
+    for at_s, known in ((0.44, True), (-0.44, True), (-0.48, False)):
+        assert scanned({0.0: (at_s, 1.0)}, known_s=0.5).known == known
 
 
 def test_a_delay_of_commands_is_told_where_it_stands_out_among_others_and_for_the_same_pairs(scanned):
@@ -225,6 +245,25 @@ def test_the_same_pairs_fit_worse_at_a_shorter_and_at_a_longer_delay(by_s, told)
     assert not answer.stands_out(turned, 90.0, 0.15)
 
 
+@pytest.mark.parametrize(
+    ("shorter", "longer", "told"), [(0.2, 0.2, True), (0.2, 0.0, False), (0.0, 0.2, False), (0.2, 1e-4, False)]
+)
+def test_both_fit_worse_for_the_pairs_that_are_known_at_all_three(monkeypatch, shorter, longer, told):
+    known = {0.1: [1, 1, 0, 1], 0.3: [1, 0, 1, 1], 0.5: [1, 1, 1, 0]}
+    misfits = {0.1: shorter, 0.3: 0.0, 0.5: longer}
+    seen = []
+
+    def misfit(answer, turned, delay_s):
+        seen.append(turned.begin_s.tolist())
+        return misfits[round(delay_s, 9)]
+
+    monkeypatch.setattr(Answer, "known", lambda answer, turned, delay_s: np.array(known[round(delay_s, 9)]) > 0)
+    monkeypatch.setattr(Answer, "_misfit", misfit)
+    pairs = Turned(np.arange(4.0), *(np.arange(4.0),) * 4)
+    assert Answer.of(ONE, 0.0).stands_out(pairs, 0.3, 0.2) is told
+    assert seen == [[0.0]] * 3
+
+
 def test_pairs_lie_as_far_apart_as_poses_or_as_samples_come_and_are_thinned():
     wheels = sampled(segment=7)
     turned = Turned.of(wheels, SETTINGS)
@@ -243,6 +282,12 @@ def test_pairs_lie_as_far_apart_as_poses_or_as_samples_come_and_are_thinned():
     assert part.left_rad.size == part.end_s.size == part.segment.size == 20
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_single_sample_makes_no_pair():
+    none = Turned.of(sampled(1), SETTINGS)
+    assert [getattr(none, each.name).size for each in fields(none)] == [0] * 5
+
+
 def test_too_few_samples_or_commands_have_no_delay_and_nothing_is_asked_of_it(scanned):
     found = {0.0: (0.24, 1.0)}
     none = picked(ONE, np.array([True, False]))
@@ -253,14 +298,3 @@ def test_too_few_samples_or_commands_have_no_delay_and_nothing_is_asked_of_it(sc
     for fewest, told in ((392, True), (393, False)):
         assert (scanned(found, fewest_poses=fewest).delay_s > 0.2) == told
     assert command_clock(sampled(), none, SETTINGS) == (StampClock(0.0), True)
-
-
-def test_stretches_of_commands_are_longer_where_speeds_come_less_often():
-    answer = Answer.of(ONE, 0.1)
-    for period_s, stretch_s in ((0.05, 12.0), (0.5, 45.0)):
-        turned = Turned.of(sampled(period_s=period_s), SETTINGS)
-        align = CommandAlignment(turned, Response(), answer, SETTINGS)
-        assert align.stretch_s == pytest.approx(stretch_s)
-        assert align.span_s == (0.0, 30.0)
-    unknown = replace(ONE, left_rad_s=np.array([1.0, np.nan]))
-    assert CommandAlignment(turned, Response(), Answer.of(unknown, 0.0), SETTINGS).span_s == (0.0, 0.0)

@@ -1,0 +1,53 @@
+"""The level and the line that most stretches agree on, whatever the others show."""
+
+import numpy as np
+import pytest
+
+from disco_hw.gap.data.stamp_clock import _level, _line
+
+
+@pytest.mark.parametrize(
+    ("delays", "squares", "level"),
+    [
+        # Three that are alike, and two that are further off than counts.
+        ([0.5, 0.55, 0.6, 0.0, 0.0], 0.025, 0.55),
+        # Two that are alike against some of which each is far off from the next.
+        ([0.0, 0.0, 0.15, 0.3, 0.45], 0.03, 0.0),
+        # What is just so far off does not agree.
+        ([0.0, 0.0, 0.1], 0.01, 0.0),
+        # The squares are about the mean of those that agree, the level is the one in the middle.
+        ([0.0, 0.01, 0.05, 9.0], 0.01 + 0.0014, 0.01),
+    ],
+)
+def test_a_level_is_that_of_most(delays, squares, level):
+    for turned in (1.0, -1.0):
+        assert _level(turned * np.array(delays), 0.1) == pytest.approx((squares, turned * level), abs=1e-12)
+
+
+def test_without_a_bound_the_level_is_the_median_and_squares_are_about_the_mean():
+    assert _level(np.array([1.0, 2.0, 6.0]), np.inf) == pytest.approx((14.0, 2.0))
+
+
+@pytest.mark.parametrize("slope", [2.0, -0.5])
+def test_a_line_is_that_of_most(slope):
+    x = np.array([-0.5, -0.4, -0.1, 0.2, 0.5])
+    off = np.array([0.0, 0.0, 0.3, 0.0, -0.2])
+    assert _line(x, 0.7 + slope * x + off, 0.1) == pytest.approx((0.02, slope))
+    # Two at the end of three that lie on none: the line through the first and its neighbour.
+    assert _line(np.array([0.0, 1.0, 5.0]), np.array([0.0, slope, 9.0]), 0.1)[1] == pytest.approx(slope)
+
+
+def test_a_line_is_fitted_to_those_that_are_not_just_as_far_off_as_counts():
+    delays = np.zeros(9)
+    delays[4] = 0.25
+    assert _line(np.arange(9.0), delays, 0.25) == pytest.approx((0.25**2, 0.0), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("off", "squares", "slope"),
+    [([0.0, 0.0, 0.0, 0.0, 0.0, 0.3], 0.01, 0.1),
+     ([0.0, 0.06, 0.0, 0.0, -0.06, 0.0], 0.0072 - 0.18**2 / 17.5, 0.1 - 0.18 / 17.5)],
+)  # fmt: skip
+def test_one_that_is_far_off_does_not_turn_a_line_and_two_that_are_little_do(off, squares, slope):
+    x = np.arange(6.0)
+    assert _line(x, 0.1 * x + np.array(off), 0.1) == pytest.approx((squares, slope))
