@@ -51,3 +51,8 @@ def test_a_line_is_fitted_to_those_that_are_not_just_as_far_off_as_counts():
 def test_one_that_is_far_off_does_not_turn_a_line_and_two_that_are_little_do(off, squares, slope):
     x = np.arange(6.0)
     assert _line(x, 0.1 * x + np.array(off), 0.1) == pytest.approx((squares, slope))
+
+
+def test_four_that_are_nearly_on_a_line_are_more_than_three_that_are():
+    delays = np.array([0.0, -1.0, -2.0, 5.0, 5.05, 5.05, 5.0])
+    assert _line(np.arange(7.0), delays, 0.1) == pytest.approx((0.0325, 0.0), abs=1e-9)

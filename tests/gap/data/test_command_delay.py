@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.command_timing import Answer, Response, Turned, command_clock, response
+from disco_hw.gap.data.command_timing import Answer, Response, Turned, _answer, command_clock, response
 from disco_hw.gap.data.stamp_clock import StampClock, picked
 from disco_hw.gap.settings import GridSettings
 from disco_hw.log.drive import Commands, Wheels
@@ -44,6 +44,16 @@ def test_wheels_answer_each_change_of_a_command_by_itself(lag_s):
         # Just before a change they are as fast as was asked until then.
         np.testing.assert_allclose(state[1:], asked[:-1], atol=1e-12)
     np.testing.assert_allclose(angle, way, atol=1e-12)
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.3])
+def test_two_commands_at_one_instant_count_as_the_later_one(lag_s):
+    t_s, asked = np.array([2.0, 2.5, 2.5, 3.0]), np.array([(1.0, -2.0), (4.0, 0.0), (-3.0, 0.5), (2.0, 2.0)])
+    speed, angle = np.full((2, 4, 2), np.nan)
+    _answer(t_s, asked, np.zeros(4, np.int64), lag_s, speed, angle)
+    alone = Answer.of(commands_at(t_s[[0, 2, 3]], asked[[0, 2, 3]]), lag_s)
+    np.testing.assert_allclose(speed[[0, 1, 3]], alone.speed, atol=1e-12)
+    np.testing.assert_allclose(angle[[0, 1, 3]], alone.angle, atol=1e-12)
 
 
 def test_a_segment_begins_with_wheels_that_follow_its_first_command():
@@ -246,7 +256,8 @@ def test_the_same_pairs_fit_worse_at_a_shorter_and_at_a_longer_delay(by_s, told)
 
 
 @pytest.mark.parametrize(
-    ("shorter", "longer", "told"), [(0.2, 0.2, True), (0.2, 0.0, False), (0.0, 0.2, False), (0.2, 1e-4, False)]
+    ("shorter", "longer", "told"),
+    [(0.2, 0.2, True), (0.2, 0.0, False), (0.0, 0.2, False), (0.2, 1e-4, False), (1.1e-4, 0.2, True)],
 )
 def test_both_fit_worse_for_the_pairs_that_are_known_at_all_three(monkeypatch, shorter, longer, told):
     known = {0.1: [1, 1, 0, 1], 0.3: [1, 0, 1, 1], 0.5: [1, 1, 1, 0]}
@@ -291,7 +302,7 @@ def test_a_single_sample_makes_no_pair():
 def test_too_few_samples_or_commands_have_no_delay_and_nothing_is_asked_of_it(scanned):
     found = {0.0: (0.24, 1.0)}
     none = picked(ONE, np.array([True, False]))
-    assert scanned(found, commands=none) == Response()
+    assert scanned(found, commands=none) == Response(delay_s=0.0, lag_s=0.0, misfit=0.0, known=True)
     # Two samples make one pair.
     assert scanned(found, sampled(2, 0.4), fewest_poses=1).delay_s == pytest.approx(0.24, abs=1e-3)
     assert scanned(found, sampled(1, 0.4), fewest_poses=1) == Response()

@@ -92,9 +92,9 @@ def test_the_age_of_commands_in_a_stretch_is_minus_the_delay_that_stands_out_in_
 
 
 def test_the_misfit_of_a_stretch_at_an_age_is_that_of_all_its_pairs(shown):
-    align = shown(0.2, 2.0)
-    # At minus 0.1 s of 0.2 s a nat less for each of four.
-    assert align.part_misfit(5.0, 9.0, -0.1) == pytest.approx(-4.0)
+    align = shown(0.2, 3.0)
+    # At 0.1 s of 0.2 s a nat less for each of four.
+    assert align.part_misfit(5.0, 9.0, -0.1) == pytest.approx(-8.0)
     assert [(begin_s, delays.tolist()) for begin_s, delays in shown.asked] == [([5.0, 6.0, 7.0, 8.0], [0.1])]
     assert align.part_misfit(5.0, 9.0, -0.95) == 0.0
 

@@ -143,6 +143,14 @@ def test_wheels_that_do_not_turn_leave_all_that_is_measured():
     )
 
 
+def test_wheels_that_only_turn_alike_or_against_each_other_tell_all_that_they_do():
+    nothing, turned, noise = np.random.default_rng(8).normal(0.0, 0.1, (3, 100)) * [[0.0], [1.0], [0.1]]
+    measured = 2.0 * turned + noise
+    expected = by_decomposition(nothing, turned, measured)
+    assert alignment.misfit_of(nothing, turned, measured) == pytest.approx(expected)
+    assert alignment.misfit_of(turned, nothing, measured) == pytest.approx(expected)
+
+
 # As many pairs as tell a delay to 20 ms.
 FEW_PAIRS = GridSettings(most_command_pairs=700)
 
