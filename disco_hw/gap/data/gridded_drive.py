@@ -20,7 +20,7 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from disco_hw.gap.data.command_timing import command_clock
 from disco_hw.gap.data.stamp_clock import StampClock
 from disco_hw.gap.data.timing import pose_clock
-from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, GapSettings, GridSettings
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, Folds, GapSettings, GridSettings
 from disco_hw.log.drive import Commands, DriveLog, Poses, Wheels
 
 Array = NDArray[np.float64]
@@ -95,6 +95,12 @@ class GriddedDrive:
     def duration_s(self) -> float:
         """Time covered by the grid."""
         return float(self.t_s.size * GRID_STEP_S)
+
+    @property
+    def folds(self) -> Folds:
+        """How it is divided to be predicted by what the rest of it says."""
+        prediction = self.settings.prediction
+        return prediction.folds if self.duration_s >= prediction.short_s else prediction.short_folds
 
     def late_commands(self, late_s: float) -> Array:
         """Commands at the nodes (M, 2) that are in force after a dead time, negative of commands that are stamped late.

@@ -249,12 +249,11 @@ class GapReport:
                 "believed of another drive."
             )
         if not beats_throughout(plainer, amended, settings):
-            return f"Without one stretch of {settings.fold_s:g} s the amended model does not beat it."
+            return "Without one stretch of time the amended model does not beat it."
         return (
-            f"That the amended model beats it is told by {stretches_telling(plainer):.1f} stretches of "
-            f"{settings.fold_s:g} s: with fewer than {settings.fewest_stretches:g} it has to err by "
-            f"{100.0 * (1.0 - settings.far_better):.0f} % less, or less in each of them, to be believed of another "
-            "drive."
+            f"That the amended model beats it is told by {stretches_telling(plainer):.1f} stretches of time: with "
+            f"fewer than {settings.fewest_stretches:g} it has to err by {100.0 * (1.0 - settings.far_better):.0f} % "
+            "less, or less in each of them, to be believed of another drive."
         )
 
     @property

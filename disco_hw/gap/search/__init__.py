@@ -39,6 +39,7 @@ from disco_hw.gap.search.cross_validation import (
     clearly_worse,
     errors_of,
     floor_errors,
+    fold_of,
     fold_vectors,
     judged_horizon_s,
     smoothed_poses,
@@ -54,7 +55,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class StagePredictions:
-    """For each stage the chains of the two folds, each fitted on the other one's data.
+    """For each stage the chains of the folds, each fitted on the data of the others.
 
     `poses` (M, 3) twice: smoothed, and of the nearest sample alone; `joint`: of stages that were fitted end to end,
     what was freed and the fit on all data; `kept`: what `amended` has of all that was found.
@@ -119,8 +120,8 @@ class _Fitted:
     def to(cls, ahead: Ahead, of: Freed, folds: Mapping[int, Freed] | None = None) -> _Fitted:
         """Fit all data, and each of the `folds` from where it begins; without them, from the fit of all data."""
         joint = ahead.fit(of)
-        begin = dict.fromkeys((0, 1), of.at(joint.vectors)) if folds is None else folds
-        return cls(of, joint, {held: ahead.fit(begin[held], held) for held in (0, 1)})
+        begin = dict.fromkeys(range(ahead.folds), of.at(joint.vectors)) if folds is None else folds
+        return cls(of, joint, {held: ahead.fit(start, held) for held, start in begin.items()})
 
     def at(self, held: int | None = None) -> Freed:
         """What was freed, around the fit of all data or around that without one fold."""
@@ -128,7 +129,7 @@ class _Fitted:
 
     @property
     def chains(self) -> dict[int, Chain]:
-        """The chains of the two folds."""
+        """The chains of the folds."""
         return {held: self.of.chain(fitted.vectors) for held, fitted in self.folds.items()}
 
 
@@ -143,7 +144,8 @@ def joint_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePrediction
     ahead = Ahead.of(apart.body, apart.wheels, apart.poses)
     base = _base(analysis)
     nominal = [analysis.nominal_body, analysis.nominal_wheels][: len(base)]
-    chains = {"nominal": _chains(analysis, final, {0: nominal, 1: nominal})}
+    every = dict.fromkeys(range(analysis.drive.folds.count), nominal)
+    chains = {"nominal": _chains(analysis, final, every)}
     parts = tuple(
         Part(channel.layout, one.vector, one.active, _roughly(channel, one))
         for channel, one in zip((apart.body, apart.wheels), base, strict=False)
@@ -164,7 +166,7 @@ def joint_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePrediction
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A model that may be handed out: what was found of it, what a fit of all data frees, and one of either fold."""
+    """A model that may be handed out: what was found of it, what a fit of all data frees, and one of each fold."""
 
     analysis: GapAnalysis
     final: FinalFit
@@ -189,7 +191,7 @@ class _Candidate:
         for held, vectors in _by_fold(analysis, whole).items():
             inside = zip(of_all, vectors, whole, (apart.body, apart.wheels), strict=False)
             folded = tuple(
-                replace(part, vector=vector, information=trust * _information(one, channel, 1 - held))
+                replace(part, vector=vector, information=trust * _information(one, channel, held))
                 for part, vector, one, channel in inside
                 if channel is not None
             )
@@ -230,7 +232,7 @@ class _Candidate:
 
 @dataclass(frozen=True)
 class _Judged:
-    """A candidate, its fits without either fold, and their errors on that."""
+    """A candidate, its fits without each fold, and their errors on that."""
 
     candidate: _Candidate
     folds: Mapping[int, JointFit]
@@ -294,10 +296,9 @@ def _on_top(amended: Freed, timed: Freed, there: bool) -> Freed:
     return replace(amended, parts=tuple(parts))
 
 
-def _information(found: Fit, channel: BodyChannel | WheelChannel, fold: int) -> Array:
-    """What the data of one fold say of the active entries of a fit, with what was expected of them, (A, A)."""
-    prediction, grid = channel.settings.prediction, channel.settings.grid
-    inside = (channel.block // round(prediction.fold_s / grid.block_s)) % 2 == fold
+def _information(found: Fit, channel: BodyChannel | WheelChannel, left_out: int) -> Array:
+    """What the data without one fold say of the active entries of a fit, with what was expected of them, (A, A)."""
+    inside = fold_of(channel) != left_out
     slope = found.jacobian[inside]
     return np.asarray(slope.T @ slope) + (0.0 if found.precision is None else np.diag(found.precision))
 
@@ -344,14 +345,14 @@ def _whole(analysis: GapAnalysis, final: FinalFit) -> list[Fit]:
 
 
 def _by_fold(analysis: GapAnalysis, fits: Sequence[Fit]) -> dict[int, list[Array]]:
-    """For each fold the vectors of the channels, fitted on the other one's data."""
+    """For each fold the vectors of the channels, fitted on the data of the others."""
     channels = [found for found in (analysis.body, analysis.wheels) if found is not None]
-    settings = analysis.drive.settings
+    count, settings = analysis.drive.folds.count, analysis.drive.settings
     by_channel = [
-        fold_vectors(one, found.channel.block, found.selector.channel.neutral, settings)
+        fold_vectors(one, fold_of(found.channel), count, found.selector.channel.neutral, settings)
         for found, one in zip(channels, fits, strict=True)
     ]
-    return {held: [vectors[held] for vectors in by_channel] for held in (0, 1)}
+    return {held: [vectors[held] for vectors in by_channel] for held in range(count)}
 
 
 def _chains(analysis: GapAnalysis, final: FinalFit, by_fold: Mapping[int, Sequence[Array]]) -> dict[int, Chain]:

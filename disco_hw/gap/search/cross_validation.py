@@ -214,7 +214,7 @@ def find_starts(channel: BodyChannel, poses: tuple[Array, Array], ahead_s: float
     node = starts_of(drive.first, known, ahead_s, drive.settings.grid)
     ahead = round(ahead_s / GRID_STEP_S)
     node = node[np.isfinite(smooth[node, 0]) & np.isfinite(alone[node + ahead, 0])]
-    block = np.floor(drive.t_s[node] / drive.settings.prediction.fold_s).astype(np.int64)
+    block = np.floor(drive.t_s[node] / drive.folds.stretch_s).astype(np.int64)
     return Starts(node, smooth[node], alone[node + ahead], block, tuple(regimes_driven(channel, node, ahead)))
 
 
@@ -291,27 +291,35 @@ def prediction_error(body: BodyChannel, starts: Starts, p: Array, track: Array, 
     return np.column_stack([cosine * dx + sine * dy - moved[:, 0], -sine * dx + cosine * dy - moved[:, 1], yaw])
 
 
-def fold_vectors(found: Fit, block: Index, neutral: Array, settings: GapSettings) -> dict[int, Array]:
-    """For each of two interleaved folds the vector fitted on the other one's data, to second order.
+def fold_of(channel: BodyChannel | WheelChannel) -> Index:
+    """The fold (n,) of each residual of a channel."""
+    folds = channel.drive.folds
+    fold: Index = channel.block // round(folds.stretch_s / channel.settings.grid.block_s) % folds.count
+    return fold
 
-    What the other one's data say next to nothing about is as in `neutral`: a limit that was reached, or a patch of the
+
+def fold_vectors(found: Fit, fold: Index, count: int, neutral: Array, settings: GapSettings) -> dict[int, Array]:
+    """For each of `count` folds (n,) of a fit's residuals the vector fitted on the data of the others, to second order.
+
+    What the others' data say next to nothing about is as in `neutral`: a limit that was reached, or a patch of the
     floor that was crossed, in one fold only is not known in the other, unless its few data fix the value by themselves.
     """
-    fold = (block // round(settings.prediction.fold_s / settings.grid.block_s)) % 2
-    if not found.active or np.unique(fold).size < 2:
-        return {0: found.vector, 1: found.vector}
+    present = np.unique(fold)
+    if not found.active or present.size < 2:
+        return dict.fromkeys(range(count), found.vector)
     normal, gradient = by_block(found, fold)
-    out = {}
+    out = dict.fromkeys(range(count), found.vector)
     active = np.array(found.active)
-    # What was expected before any log was looked at is expected of either fold.
+    # What was expected before any log was looked at is expected of each fold.
     precision = np.zeros(active.size) if found.precision is None else found.precision
     pull = precision * (found.vector[active] - neutral[active])
-    for held in (0, 1):
-        vector = found.vector.copy()
-        determined = known(normal[1 - held], normal.sum(axis=0), settings.fit)
-        determined |= np.diag(normal[1 - held]) * vector[active] ** 2 > settings.prediction.fixed_sigmas**2
-        here = (normal[1 - held] + np.diag(precision))[np.ix_(determined, determined)]
-        vector[active[determined]] -= inverse(here) @ (gradient[1 - held] + pull)[determined]
+    for place, held in enumerate(present.tolist()):
+        vector, others = found.vector.copy(), np.delete(normal, place, axis=0).sum(axis=0)
+        pulled = np.delete(gradient, place, axis=0).sum(axis=0) + pull
+        determined = known(others, normal.sum(axis=0), settings.fit)
+        determined |= np.diag(others) * vector[active] ** 2 > settings.prediction.fixed_sigmas**2
+        here = (others + np.diag(precision))[np.ix_(determined, determined)]
+        vector[active[determined]] -= inverse(here) @ pulled[determined]
         vector[active[~determined]] = neutral[active[~determined]]
         out[held] = vector
     return out
@@ -330,7 +338,7 @@ def errors_of(
     speed_error = np.zeros(starts.node.size)
     ahead = round(ahead_s / GRID_STEP_S)
     for held, chain in chains.items():
-        inside = starts.block % 2 == held
+        inside = starts.block % len(chains) == held
         track, speed = chain_track(body, wheels, chain)
         error[inside] = prediction_error(body, starts, chain.body, track, ahead_s)[inside]
         there = starts.node[inside] + ahead
@@ -419,7 +427,7 @@ def wheel_table(analysis: GapAnalysis) -> dict[str, dict[float, PredictionErrors
     assert isinstance(channel, WheelChannel)
     nominal = channel.angles(analysis.nominal_wheels)
     tracks: dict[str, Angles] = {
-        "nominal": {0: nominal, 1: nominal},
+        "nominal": dict.fromkeys(range(channel.drive.folds.count), nominal),
         "timed": _by_fold(only_timed(found)),
         "amended": _by_fold(found),
     }
@@ -428,10 +436,11 @@ def wheel_table(analysis: GapAnalysis) -> dict[str, dict[float, PredictionErrors
 
 
 def _by_fold(found: ChannelResult) -> Angles:
-    """Angles (M, 2) of a free run for each fold, fitted on the other one's data."""
+    """Angles (M, 2) of a free run for each fold, fitted on the data of the others."""
     channel, selector = found.channel, found.selector
     assert isinstance(channel, WheelChannel)
-    vectors = fold_vectors(found.told, channel.block, selector.channel.neutral, channel.settings)
+    folds = channel.drive.folds.count
+    vectors = fold_vectors(found.told, fold_of(channel), folds, selector.channel.neutral, channel.settings)
     return {held: channel.angles(*selector.channel.split(vector)) for held, vector in vectors.items()}
 
 
@@ -439,10 +448,10 @@ def _errors(channel: WheelChannel, of: Angles, ahead_s: float) -> PredictionErro
     drive, settings = channel.drive, channel.settings
     node = starts_of(drive.first, np.isfinite(drive.command_rad_s[:, 0]), ahead_s, settings.grid)
     ahead = round(ahead_s / GRID_STEP_S)
-    block = np.floor(drive.t_s[node] / settings.prediction.fold_s).astype(np.int64)
+    block = np.floor(drive.t_s[node] / drive.folds.stretch_s).astype(np.int64)
     turned, speed = np.zeros((node.size, 2)), np.zeros(node.size)
     for held, angle in of.items():
-        inside = block % 2 == held
+        inside = block % len(of) == held
         off = drive.angle_rad - angle
         turned[inside] = (off[node + ahead] - off[node])[inside]
         faster = drive.speed_rad_s[node + ahead] - np.gradient(angle, GRID_STEP_S, axis=0)[node + ahead]

@@ -118,6 +118,11 @@ class Ahead:
         every = [(ahead_s, find_starts(body, poses, ahead_s)) for ahead_s in horizons]
         return cls(body, wheels, tuple((ahead_s, starts) for ahead_s, starts in every if starts.node.size))
 
+    @property
+    def folds(self) -> int:
+        """In how many folds the drive is divided."""
+        return self.body.drive.folds.count
+
     def errors(self, chain: Chain, turned: tuple[Array, Array] | None = None) -> list[Array]:
         """Measured minus predicted poses (K, 3) by horizon; `turned`: what the wheels do, if that is known."""
         track, _ = chain_track(self.body, self.wheels, chain, turned)
@@ -128,13 +133,13 @@ class Ahead:
         return sum(float(np.log(_usual(error)[1:]).sum()) for error in self.errors(chain))
 
     def fit(self, of: Freed, left_out: int | None = None) -> JointFit:
-        """The freed values that predict best, one of the two folds `left_out` or none.
+        """The freed values that predict best, one of the folds `left_out` or none.
 
         Errors of position and of heading are each measured in what they usually are at the start of a round; large ones
         count linearly (Huber, 1964). Neighbouring predictions overlap, so that each counts for the time it adds.
         """
         settings = self.body.settings.prediction
-        chosen = [starts.block % 2 != left_out for _, starts in self.starts]
+        chosen = [starts.block % self.folds != left_out for _, starts in self.starts]
         every_s = self.body.settings.grid.start_every_s
         shares = [min(every_s / ahead_s, 1.0) ** 0.5 for ahead_s, _ in self.starts]
         start, step = of.joined(lambda part: part.vector), of.joined(lambda part: part.layout.step)

@@ -83,8 +83,8 @@ def in_stretches(squares):
     ("timed", "amended", "why"),
     [
         # As a real robot that drives on asphalt under commands for 35 s: better by a sixth, in one of two stretches.
-        ([5.8, 5.0, 0.04], [5.9, 1.7, 0.01], "That the amended model beats it is told by 2.0 stretches of 21 s:"),
-        ([1.0] * 4, [0.01, 1.05, 1.05, 1.05], "Without one stretch of 21 s the amended model does not beat it."),
+        ([5.8, 5.0, 0.04], [5.9, 1.7, 0.01], "That the amended model beats it is told by 2.0 stretches of time:"),
+        ([1.0] * 4, [0.01, 1.05, 1.05, 1.05], "Without one stretch of time the amended model does not beat it."),
         ([1.0] * 4, [1.2] * 4, "The amended model does not beat it."),
         ([1.0] * 4, [0.96] * 4, "The amended model errs by less than 10 % less:"),
         ([1.0] * 4, [0.8] * 4, None),

@@ -19,6 +19,7 @@ from disco_hw.gap.search.cross_validation import (
     clearly_worse,
     errors_of,
     floor_errors,
+    fold_of,
     fold_vectors,
     judged_horizon_s,
     outdoes,
@@ -31,7 +32,7 @@ from disco_hw.gap.search.cross_validation import (
 )
 from disco_hw.gap.search.end_to_end import Ahead
 from disco_hw.gap.search.least_squares import fit
-from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, Folds
 from tests.gap.synthetic import NOISE, body_channel
 
 AHEAD_S = 2.0
@@ -89,19 +90,26 @@ def test_smoothed_poses_are_closer_to_the_truth_than_measured_ones():
     assert error[1] == pytest.approx(NOISE.position_m, rel=0.3)
 
 
-def test_each_fold_is_predicted_by_what_was_fitted_on_the_other():
+def test_a_log_of_two_minutes_is_divided_into_long_stretches_and_a_shorter_one_finer():
+    _, line = body_channel()
+    for duration_s, folds in ((126.0, Folds(21.0, 2)), (125.9, Folds(9.0, 4))):
+        assert replace(line, t_s=np.zeros(round(duration_s / GRID_STEP_S))).folds == folds
+
+
+def test_each_fold_is_predicted_by_what_was_fitted_on_the_others():
     channel, line = body_channel()
     spoilt = line.pose_values.copy()
-    # In the first stretch of 21 s every turn is measured a tenth too large.
-    first = line.pose.t_s < 21.0
+    # In the first stretch of time every turn is measured a tenth too large.
+    first = line.pose.t_s < line.folds.stretch_s
     spoilt[first, 2] *= 1.1
     shifted = BodyChannel.build(type(line)(**{**_fields(line), "pose_values": spoilt}), NOISE, channel.neutral)
     found = fit(shifted, channel.neutral, indices(shifted, ()))
-    vectors = fold_vectors(found, shifted.block, shifted.neutral, DEFAULT_SETTINGS)
-    axle = {fold: vector[1] for fold, vector in vectors.items()}
+    folds = line.folds.count
+    vectors = fold_vectors(found, fold_of(shifted), folds, shifted.neutral, DEFAULT_SETTINGS)
+    axle = [vectors[fold][1] for fold in range(folds)]
     # Fold 0 holds that stretch: who predicts it has not seen it.
     assert axle[0] == pytest.approx(0.4, rel=0.01)
-    assert abs(axle[1] - 0.4) > 3.0 * abs(axle[0] - 0.4)
+    assert min(abs(each - 0.4) for each in axle[1:]) > 3.0 * abs(axle[0] - 0.4)
 
 
 def test_what_a_fold_knows_nothing_about_is_not_in_its_prediction():
@@ -109,11 +117,11 @@ def test_what_a_fold_knows_nothing_about_is_not_in_its_prediction():
     place = BODY.place["turn_slip.k_s"]
     found = fit(channel, with_slip(channel), indices(channel, ("turn_slip",)))
     # As if all turning had been done in fold 0: nothing elsewhere depends on the slip.
-    column = found.active.index(place)
-    elsewhere = (channel.block // round(DEFAULT_SETTINGS.prediction.fold_s / DEFAULT_SETTINGS.grid.block_s)) % 2 == 1
+    column, folds = found.active.index(place), channel.drive.folds.count
+    elsewhere = fold_of(channel) != 0
     slope = found.jacobian.copy()
     slope[elsewhere, column] *= 1e-6
-    vectors = fold_vectors(replace(found, slope=slope), channel.block, channel.neutral, DEFAULT_SETTINGS)
+    vectors = fold_vectors(replace(found, slope=slope), fold_of(channel), folds, channel.neutral, DEFAULT_SETTINGS)
     assert vectors[0][place] == 0.0
     assert vectors[1][place] == pytest.approx(0.1, rel=0.2)
 

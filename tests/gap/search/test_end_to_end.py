@@ -52,8 +52,8 @@ def test_what_is_known_well_before_stays():
 def test_the_fold_that_is_left_out_is_not_looked_at():
     channel, line = body_channel()
     spoilt = line.pose_values.copy()
-    # In the first stretch of 21 s every turn is measured a tenth too large.
-    spoilt[line.pose.t_s < 21.0, 2] *= 1.1
+    # In the first stretch of time every turn is measured a tenth too large.
+    spoilt[line.pose.t_s < line.folds.stretch_s, 2] *= 1.1
     ahead = predictions(BodyChannel.build(replace(line, pose_values=spoilt), NOISE, channel.neutral))
     axle = {held: ahead.fit(geometry_of(channel.neutral), held).vectors[0][1] for held in (0, 1)}
     assert axle[0] == pytest.approx(0.4, rel=0.01)
@@ -122,9 +122,9 @@ def test_a_model_that_is_better_by_one_stretch_only_is_not_offered(of_last, offe
         total = float(np.mean(squares)) ** 0.5
         return {2.0: replace(errors(total, total)[2.0], squares=np.column_stack([squares, squares]))}
 
-    gap = {"nominal": by_block(9.0, 9.0, 9.0), "refitted": by_block(4.0, 4.0, 4.0), "timed": by_block(1.0, 1.0, 1.0)}
+    gap = {stage: by_block(*[size] * 5) for stage, size in (("nominal", 9.0), ("refitted", 4.0), ("timed", 1.0))}
     # In sum it is better either way.
-    gap["amended"] = by_block(0.1, 1.0, of_last)
+    gap["amended"] = by_block(0.1, 1.0, 1.0, 1.0, of_last)
     assert offered_stage(gap, True, True, DEFAULT_SETTINGS) == offered
 
 

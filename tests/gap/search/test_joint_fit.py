@@ -11,11 +11,12 @@ from disco_hw.gap.data import BASE_COUNT, BODY, WHEEL
 from disco_hw.gap.search import end_to_end
 from disco_hw.gap.search.cross_validation import Chain
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part, _usual
-from disco_hw.gap.settings import DEFAULT_SETTINGS
+from disco_hw.gap.settings import DEFAULT_SETTINGS, Folds
 from tests.gap.synthetic import GEOMETRY
 
 MANY = 80
 HORIZONS_S = (1.0, 2.0)
+IN_TWO = SimpleNamespace(folds=Folds(21.0, 2))
 
 
 def start():
@@ -39,7 +40,7 @@ def linear(monkeypatch):
 
     monkeypatch.setattr(Ahead, "errors", errors)
     monkeypatch.setattr(end_to_end, "chain_wheels", lambda *_: None)
-    body = SimpleNamespace(settings=DEFAULT_SETTINGS)
+    body = SimpleNamespace(settings=DEFAULT_SETTINGS, drive=IN_TWO)
     starts = tuple((ahead_s, SimpleNamespace(block=np.arange(MANY) // 10)) for ahead_s in HORIZONS_S)
     return Ahead(body, None, starts), lambda values: [
         a @ (values - truth) + e for a, e in zip(slopes, noise, strict=True)
@@ -105,7 +106,7 @@ def test_wheels_are_run_anew_for_what_moves_them_and_not_for_effects_of_the_body
     monkeypatch.setattr(Ahead, "errors", errors)
     monkeypatch.setattr(end_to_end, "chain_wheels", lambda *_: turned_once)
     prediction = replace(DEFAULT_SETTINGS.prediction, fit_rounds=1, fit_steps=1)
-    body = SimpleNamespace(settings=replace(DEFAULT_SETTINGS, prediction=prediction))
+    body = SimpleNamespace(settings=replace(DEFAULT_SETTINGS, prediction=prediction), drive=IN_TWO)
     vector = start()
     vector[2] = BODY.high[2]
     parts = (
@@ -127,7 +128,7 @@ def test_wheels_are_run_anew_for_what_moves_them_and_not_for_effects_of_the_body
 
 
 def test_what_nothing_is_known_of_hardly_stays_and_a_fit_begins_inside_its_bounds():
-    ahead = Ahead(SimpleNamespace(settings=DEFAULT_SETTINGS), None, ())
+    ahead = Ahead(SimpleNamespace(settings=DEFAULT_SETTINGS, drive=IN_TWO), None, ())
     vector, active = start(), (0, 1, int(np.argmax(BODY.step)))
     step = BODY.step[list(active)]
     assert step[2] > 5.0 * step[0]
@@ -142,7 +143,7 @@ def test_what_nothing_is_known_of_hardly_stays_and_a_fit_begins_inside_its_bound
 
 
 def test_without_predictions_everything_stays_as_surely_as_it_was_known():
-    ahead = Ahead(SimpleNamespace(settings=DEFAULT_SETTINGS), None, ())
+    ahead = Ahead(SimpleNamespace(settings=DEFAULT_SETTINGS, drive=IN_TWO), None, ())
     information = np.array([[4.0, 1.0, 0.0], [1.0, 3.0, 0.5], [0.0, 0.5, 2.0]]) * 1e4
     of = Freed((Part(BODY, start(), (0, 1, 2), information),), lambda vectors: Chain(vectors[0], None))
     found = ahead.fit(of)

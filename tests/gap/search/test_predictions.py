@@ -194,7 +194,7 @@ def test_predictions_start_where_poses_are_known_at_both_ends_and_commands_all_t
     assert set(starts.node) <= set(kept)
     np.testing.assert_array_equal(starts.pose, smooth[starts.node])
     np.testing.assert_array_equal(starts.end, alone[starts.node + 200])
-    np.testing.assert_array_equal(starts.block, starts.node // 2100)
+    np.testing.assert_array_equal(starts.block, starts.node // 900)
     assert set(starts.regime) == {"straight ahead"}
     # Without any commands the wheels' own turns are enough.
     silent = replace(drive, command_rad_s=np.full_like(drive.command_rad_s, np.nan))
@@ -213,8 +213,8 @@ def test_each_start_is_predicted_by_the_chain_of_its_own_stretch():
     assert both.wheel_rad_s == 0.0
     first = errors_of(channel, wheels, {0: wrong, 1: right}, 2.0, poses)
     second = errors_of(channel, wheels, {0: right, 1: wrong}, 2.0, poses)
-    np.testing.assert_array_equal(first.squares[:, 0] > 1e-6, (True, False, True))
-    np.testing.assert_array_equal(second.squares[:, 0] > 1e-6, (False, True, False))
+    np.testing.assert_array_equal(first.squares[:, 0] > 1e-6, (True, False, True, False, True))
+    np.testing.assert_array_equal(second.squares[:, 0] > 1e-6, (False, True, False, True, False))
 
 
 def test_speeds_of_wheels_are_compared_where_a_prediction_ends():
@@ -315,30 +315,33 @@ def test_a_heading_that_is_off_at_the_start_moves_the_end_aside_by_the_way(wheel
     assert floor.position_m == pytest.approx(way_m * 0.01 / np.sqrt(0.6 / 0.16), rel=0.04)
 
 
-def test_a_fold_is_predicted_by_a_fit_of_the_other_one():
+def test_a_fold_is_predicted_by_a_fit_of_the_others():
     rng = np.random.default_rng(6)
-    block = np.arange(1000) // 10
+    fold = np.arange(1000) // 70 % 3
     slope = rng.standard_normal((1000, 3))
     y = slope @ (0.5, -2.0, 1.0) + rng.standard_normal(1000)
     whole = np.linalg.lstsq(slope, y, rcond=None)[0]
     vector = np.array([9.0, *whole])
     residual = slope @ whole - y
     found = Fit(vector, (1, 2, 3), 0.5 * float(residual @ residual), residual, slope)
-    folds = fold_vectors(found, block, np.zeros(4), DEFAULT_SETTINGS)
-    # Seven blocks of 3 s are a stretch.
-    for held in (0, 1):
-        other = (block // 7) % 2 != held
-        expected = np.linalg.lstsq(slope[other], y[other], rcond=None)[0]
+    folds = fold_vectors(found, fold, 3, np.zeros(4), DEFAULT_SETTINGS)
+    for held in range(3):
+        others = fold != held
+        expected = np.linalg.lstsq(slope[others], y[others], rcond=None)[0]
         assert folds[held] == pytest.approx([9.0, *expected], rel=1e-9)
-    none = fold_vectors(Fit(vector, (), 0.0, residual, np.empty((1000, 0))), block, np.zeros(4), DEFAULT_SETTINGS)
-    assert none[0] is none[1] is vector
-    single = fold_vectors(found, np.zeros(1000, dtype=int), np.zeros(4), DEFAULT_SETTINGS)
+    # A fold of which nothing was measured is predicted by all there is.
+    fewer = fold_vectors(found, np.where(fold == 1, 3, fold), 4, np.zeros(4), DEFAULT_SETTINGS)
+    assert fewer[1] is vector
+    assert fewer[3] == pytest.approx(folds[1], rel=1e-9)
+    none = fold_vectors(Fit(vector, (), 0.0, residual, np.empty((1000, 0))), fold, 3, np.zeros(4), DEFAULT_SETTINGS)
+    assert none[0] is none[1] is none[2] is vector
+    single = fold_vectors(found, np.zeros(1000, dtype=int), 2, np.zeros(4), DEFAULT_SETTINGS)
     assert single[0] is single[1] is vector
 
 
 def test_what_is_expected_of_a_parameter_is_expected_of_each_fold():
     rng = np.random.default_rng(7)
-    block, precision, neutral = np.arange(1000) // 10, np.array([0.0, 400.0]), np.array([0.0, 0.2])
+    fold, precision, neutral = np.arange(1000) // 70 % 2, np.array([0.0, 400.0]), np.array([0.0, 0.2])
     slope = rng.standard_normal((1000, 2))
     y = slope @ (0.5, 1.0) + rng.standard_normal(1000)
 
@@ -350,22 +353,22 @@ def test_what_is_expected_of_a_parameter_is_expected_of_each_fold():
     whole = fitted(np.ones(1000, dtype=bool))
     residual = slope @ whole - y
     found = Fit(whole, (0, 1), 0.0, residual, slope, precision)
-    folds = fold_vectors(found, block, neutral, DEFAULT_SETTINGS)
+    folds = fold_vectors(found, fold, 2, neutral, DEFAULT_SETTINGS)
     for held in (0, 1):
-        assert folds[held] == pytest.approx(fitted((block // 7) % 2 != held), rel=1e-9)
+        assert folds[held] == pytest.approx(fitted(fold != held), rel=1e-9)
     assert abs(folds[0][1] - folds[1][1]) < 0.1
 
 
 @pytest.mark.parametrize(("value", "used"), [(1.2, True), (-1.2, True), (1.0, False), (0.8, False)])
 def test_what_the_other_fold_says_little_of_is_used_if_it_fixes_the_value_itself(value, used):
-    block = np.arange(1400) // 10
+    fold = np.arange(1400) // 70 % 2
     slope = np.zeros((1400, 1))
     # Nearly all is known from the even stretches: of the odd ones 25 in squares, five sigmas of a value of one.
-    odd = (block // 7) % 2 == 1
+    odd = fold == 1
     slope[np.flatnonzero(odd)[:25], 0], slope[~odd, 0] = 1.0, 20.0
     residual = np.zeros(1400)
     found = Fit(np.array([value]), (0,), 0.0, residual, slope)
-    folds = fold_vectors(found, block, np.array([0.25]), DEFAULT_SETTINGS)
+    folds = fold_vectors(found, fold, 2, np.array([0.25]), DEFAULT_SETTINGS)
     assert folds[0][0] == (value if used else 0.25)
     assert folds[1][0] == value
 

@@ -15,7 +15,7 @@ from disco_hw.gap.search.cross_validation import Chain, PredictionErrors
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
 from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.richest_model import LATE_STARTS_S
-from disco_hw.gap.settings import DEFAULT_SETTINGS
+from disco_hw.gap.settings import DEFAULT_SETTINGS, Folds
 from tests.gap.search.test_stages import LAG, SLIP, analysed
 
 DELAY = WHEEL.place["command_delay.delay_s"]
@@ -27,15 +27,16 @@ def fit_of(slope, residual=None, active=None, precision=None, vector=None):
     return Fit(vector, active, 0.0, residual, slope, precision)
 
 
-def test_what_a_fold_says_is_what_its_own_stretches_say_and_what_was_expected():
+def test_without_a_fold_is_known_what_the_stretches_of_the_others_say_and_what_was_expected():
     rng = np.random.default_rng(0)
     slope, block = rng.standard_normal((900, 3)), np.arange(900) // 10
-    channel = SimpleNamespace(settings=DEFAULT_SETTINGS, block=block)
-    for fold in (0, 1):
-        own = slope[(block // 7) % 2 == fold]
-        np.testing.assert_allclose(_information(fit_of(slope), channel, fold), own.T @ own)
+    # Four blocks of 3 s are a stretch of 12 s, and every third one is of one fold.
+    channel = SimpleNamespace(settings=DEFAULT_SETTINGS, block=block, drive=SimpleNamespace(folds=Folds(12.0, 3)))
+    for fold in range(3):
+        others = slope[(block // 4) % 3 != fold]
+        np.testing.assert_allclose(_information(fit_of(slope), channel, fold), others.T @ others)
         expected = _information(fit_of(slope, precision=np.array([1.0, 2.0, 3.0])), channel, fold)
-        np.testing.assert_allclose(expected, own.T @ own + np.diag([1.0, 2.0, 3.0]))
+        np.testing.assert_allclose(expected, others.T @ others + np.diag([1.0, 2.0, 3.0]))
 
 
 def test_the_geometry_is_about_what_the_body_has_it_to_be_and_of_the_rest_nothing_is_known():
@@ -125,6 +126,8 @@ def test_a_fit_begins_also_where_the_channel_has_it_if_the_timed_stage_is_far_of
 
 class Noted:
     """Stands for the fit of the whole chain: it moves each freed entry by `by`; `asked` for so far."""
+
+    folds = 2
 
     def __init__(self, by=0.0, costs=()):
         self.by, self.asked, self.costs, self.costed = by, [], list(costs), []
@@ -221,7 +224,7 @@ def test_of_the_amended_stage_the_way_is_told_that_predicts_better(unfitted, mon
     assert ("command_delay.delay_s" in predictions.joint["amended"][1].names) is told_on_top
 
 
-def test_what_channels_say_is_trusted_to_three_of_their_deviations_and_folds_by_what_the_other_says(
+def test_what_channels_say_is_trusted_to_three_of_their_deviations_and_folds_by_what_the_others_say(
     unfitted, monkeypatch
 ):
     errors_in_turn(monkeypatch, (0.1, 0.1), (0.2, 0.2))
@@ -239,10 +242,10 @@ def test_what_channels_say_is_trusted_to_three_of_their_deviations_and_folds_by_
     for part, fitted in zip(whole.parts, (body, wheels), strict=True):
         np.testing.assert_allclose(part.information, fitted.information() / 9.0)
         np.testing.assert_array_equal(part.vector, fitted.vector)
-    assert [left_out for _, left_out in folds] == [0, 1]
+    assert [left_out for _, left_out in folds] == list(range(analysis.drive.folds.count))
     for of, held in folds:
         for part, fitted, found in zip(of.parts, (body, wheels), (analysis.body, analysis.wheels), strict=True):
-            expected = _information(fitted, found.channel, 1 - held) / 9.0
+            expected = _information(fitted, found.channel, held) / 9.0
             np.testing.assert_allclose(part.information, expected)
             assert (part.vector != fitted.vector).any()
 

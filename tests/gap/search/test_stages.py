@@ -62,8 +62,9 @@ def predicted():
 def test_each_stage_has_what_it_may_have_and_no_more():
     analysis, stages = predicted()
     assert set(stages.chains) == {"nominal", "refitted", "timed", "amended"}
-    assert all(set(folds) == {0, 1} for folds in stages.chains.values())
-    for fold in (0, 1):
+    every = range(analysis.drive.folds.count)
+    assert all(set(folds) == set(every) for folds in stages.chains.values())
+    for fold in every:
         chain = {stage: folds[fold] for stage, folds in stages.chains.items()}
         assert (chain["nominal"].body == analysis.nominal_body).all()
         assert (chain["nominal"].wheels == analysis.nominal_wheels).all()
