@@ -170,6 +170,13 @@ def test_what_few_stretches_tell_has_to_be_better_by_far():
     assert surely_beats(few, in_stretches(*(0.45 * few.squares.T)), settings)
 
 
+def test_stretches_that_are_just_enough_need_not_each_be_better():
+    settings, alike = DEFAULT_SETTINGS.prediction, in_stretches([1.0] * 6, [1.0] * 6)
+    worse_in_one = in_stretches(*[[0.6, 0.6, 0.6, 0.6, 0.6, 1.05]] * 2)
+    for fewest, better in ((6.0, True), (6.1, False)):
+        assert surely_beats(alike, worse_in_one, replace(settings, fewest_stretches=fewest)) is better
+
+
 @pytest.mark.parametrize(
     ("position", "yaw", "each"),
     [
