@@ -11,7 +11,15 @@ from disco_hw.gap.data.free_runs import run_wheels
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search import channel_search
-from disco_hw.gap.search.channel_search import ChannelResult, judged, responding, search_body, search_wheels, timed
+from disco_hw.gap.search.channel_search import (
+    ChannelResult,
+    judged,
+    responding,
+    search_body,
+    search_wheels,
+    stamped,
+    timed,
+)
 from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.richest_model import LATE, LATE_COLUMNS, LATE_STARTS_S, indices, smooth_of
 from disco_hw.gap.search.selection import Selector
@@ -333,6 +341,30 @@ def test_every_set_has_the_delay_that_is_seen_at_first_sight_until_it_is_judged_
         assert late.given == (*given, "command_delay")
         np.testing.assert_array_equal(late.start, expected)
         assert (late.fits, late.proofs) == ({}, {})
+
+
+def test_wheels_are_searched_as_if_commands_were_stamped_where_they_lie(monkeypatch):
+    drives = []
+
+    def build(drive, noise, geometry):
+        drives.append(drive)
+        raise InterruptedError
+
+    monkeypatch.setattr(channel_search, "WheelChannel", SimpleNamespace(build=build))
+    line = replace(line_of(np.tile([2.0, 3.0], (80, 1))), commands_moved_s=0.2)
+    with pytest.raises(InterruptedError):
+        search_wheels(line, np.array(GEOMETRY), WHEEL.neutral)
+    assert [drive.commands_moved_s for drive in drives] == [0.0]
+
+
+def test_delays_are_told_from_the_stamps_of_commands_with_where_fits_begin():
+    line = line_of(np.tile([2.0, 3.0], (80, 1)))
+    channel = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
+    moved = np.where([column == "command_delay.delay_s" for column in WHEEL.columns], 0.2, 0.0)
+    for start, expected in ((WHEEL.neutral, WHEEL.neutral + moved), (None, None)):
+        found = ChannelResult(Selector(channel, None, LIMITS, start=start), (), channel)
+        later = stamped(found, replace(line, commands_moved_s=0.2)).selector.start
+        assert later is expected is None or (later == expected).all()
 
 
 @dataclass(frozen=True)

@@ -254,6 +254,9 @@ def test_without_anything_found_nothing_is_put_on_top(unfitted):
     analysis = analysed((), ())
     predictions = joint_predictions(analysis, final_fit(analysis))
     assert predictions.joint["amended"][1].names == ("wheel_radius_m", "axial_distance_m", "x_icr_m")
+    refitted = predictions.joint["refitted"][0].chain
+    assert refitted(["body", "wheels"]) == Chain("body", "wheels")
+    assert refitted(["body"]) == Chain("body", None)
 
 
 def test_a_vector_without_terms_is_whole_and_of_one_with_terms_what_they_add_is_told():
