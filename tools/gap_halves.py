@@ -31,7 +31,7 @@ from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search import joint_predictions
-from disco_hw.gap.search.analysis import Z95, FinalFit, GapAnalysis, estimate_parameters, final_fit
+from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, estimate_parameters, final_fit
 from disco_hw.gap.search.cross_validation import (
     Chain,
     PredictionErrors,
@@ -39,6 +39,7 @@ from disco_hw.gap.search.cross_validation import (
     judged_horizon_s,
     smoothed_poses,
 )
+from disco_hw.gap.search.selection import Z95
 from disco_hw.gap.search.unnamed_terms import with_known_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.log.drive import DriveLog

@@ -34,7 +34,6 @@ from disco_hw.gap.search.analysis import (
     ENCODER,
     GAIN,
     OUTSIDE_TESTS,
-    Z95,
     ChannelEstimates,
     FinalFit,
     GapAnalysis,
@@ -44,6 +43,7 @@ from disco_hw.gap.search.analysis import (
 from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.parts import in_equal_parts, in_logs
 from disco_hw.gap.search.richest_model import candidates_of, parameters_of
+from disco_hw.gap.search.selection import Z95
 from disco_hw.gap.settings import GRID_STEP_S, ReportSettings
 
 _PLACES = {2: ("first half of the log", "second"), 3: ("first third of the log", "second", "last")}

@@ -21,7 +21,7 @@ from disco_hw.gap.search.channel_search import ChannelResult, deviations_of
 from disco_hw.gap.search.least_squares import Fit, fit
 from disco_hw.gap.search.parts import wandered
 from disco_hw.gap.search.richest_model import CANDIDATES, LATE, indices
-from disco_hw.gap.search.selection import inflation
+from disco_hw.gap.search.selection import Z95, inflation, interval_inflation
 from disco_hw.gap.settings import SelectionSettings
 
 Array = NDArray[np.float64]
@@ -33,7 +33,6 @@ _OF_TURNING = tuple(
     if effect.uses_geometry and effect.channel is Channel.COMMAND_TO_WHEEL
     for column in effect.columns
 )
-Z95 = 1.96
 _RISE = 0.5 * Z95**2
 
 
@@ -64,7 +63,7 @@ def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
     """Intervals of all parameters that a channel's accepted set frees: where the next drive's values are expected."""
     best, channel = found.told, found.selector.channel
     columns = channel.layout.columns
-    factors = np.array([inflation(best, channel, (index,)) for index in best.active])
+    factors = np.array([interval_inflation(best, channel, (index,)) for index in best.active])
     covariance = best.covariance() * np.sqrt(np.outer(factors, factors))
     own = np.maximum(np.diag(covariance), 1e-300)
     wandering, apart = wandered(found), _weightings_apart(found)
@@ -145,7 +144,7 @@ def _profiled(found: ChannelResult, column: str, step: float) -> ParameterEstima
     slope = np.column_stack([best.jacobian, (ends[1].residual - ends[0].residual) / (high - low)])
     precision = None if best.precision is None else np.append(best.precision, 0.0)
     free = replace(best, active=(*best.active, place), slope=slope, precision=precision)
-    deviation = float(free.covariance()[-1, -1] * inflation(free, channel, (place,))) ** 0.5
+    deviation = float(free.covariance()[-1, -1] * interval_inflation(free, channel, (place,))) ** 0.5
     least, most = _around(value, deviation)
     return ParameterEstimate(value, min(low, least), max(high, most))
 

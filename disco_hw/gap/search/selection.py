@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from disco_hw.gap.noise.channels import ResidualChannel
 from disco_hw.gap.search.least_squares import Fit, by_block, fit, inverse, known, sensitivity
@@ -20,6 +21,8 @@ from disco_hw.gap.search.richest_model import CANDIDATES, Candidate, candidates_
 from disco_hw.gap.settings import SelectionSettings
 
 Array = NDArray[np.float64]
+Z95 = 1.96
+"""So many standard deviations of a normal distribution either side hold 95 %."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,13 +68,28 @@ def inflation(found: Fit, channel: ResidualChannel, added: tuple[int, ...]) -> f
     The information in blocks is weighed against what is known of the channel: `trusted_blocks` of them in which the
     model holds.
     """
+    return _scatter(found, channel, added)[0]
+
+
+def interval_inflation(found: Fit, channel: ResidualChannel, added: tuple[int, ...]) -> float:
+    """The same of the variance of which 1.96 standard deviations hold 95 %.
+
+    How blocks scatter is known as well as there are blocks: the interval is that of Student's t (Bell and McCaffrey,
+    2002), wide where a parameter shows at two or three moments of a log.
+    """
+    factor, freedom = _scatter(found, channel, added)
+    return factor * (float(stdtrit(max(freedom, 1.0), 0.975)) / Z95) ** 2
+
+
+def _scatter(found: Fit, channel: ResidualChannel, added: tuple[int, ...]) -> tuple[float, float]:
+    """Inflation and the degrees of freedom that it is known by; of none that blocks tell, as many as one likes."""
     places = [found.active.index(index) for index in added if index in found.active]
     if not places:
-        return 1.0
+        return 1.0, math.inf
     covariance = found.covariance()
     moved = covariance[:, places]
     weight = np.linalg.inv(covariance[np.ix_(places, places)])
-    largest = 1.0
+    largest, freedom = 1.0, math.inf
     for length in channel.settings.selection.block_lengths:
         normal, gradient = by_block(found, channel.block, length)
         if gradient.shape[0] < channel.settings.selection.fewest_blocks:
@@ -79,7 +97,7 @@ def inflation(found: Fit, channel: ResidualChannel, added: tuple[int, ...]) -> f
         scatter = float(np.einsum("bi,ij,bj->", gradient @ moved, weight, gradient @ moved))
         information = np.einsum("bij,ip,pq,jq->b", normal, moved, weight, moved)
         if information.max() <= 0.0:
-            return 1.0
+            return 1.0, math.inf
         information = information / information.max()
         # Where few blocks hold most information, as few scatter: fitting takes one of them, and the rest says little of
         # the noise.
@@ -87,8 +105,10 @@ def inflation(found: Fit, channel: ResidualChannel, added: tuple[int, ...]) -> f
         known = channel.trusted_blocks / len(places)
         if known + blocks <= 1.0:
             continue
-        largest = max(largest, (known + blocks * scatter / len(places)) / (known + blocks - 1.0))
-    return largest
+        factor = (known + blocks * scatter / len(places)) / (known + blocks - 1.0)
+        if factor > largest or freedom == math.inf:
+            largest, freedom = max(factor, largest), known + blocks - 1.0
+    return largest, freedom
 
 
 def compare(small: Fit, big: Fit, channel: ResidualChannel, parameters: float) -> EffectEvidence:

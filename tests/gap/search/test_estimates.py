@@ -17,7 +17,7 @@ def test_an_interval_is_widened_by_how_blocks_scatter_and_by_how_a_value_wanders
     told = SimpleNamespace(vector=np.array([7.0, 5.0, 3.0]), active=(2, 0), covariance=lambda: covariance)
     channel = SimpleNamespace(layout=SimpleNamespace(columns=("a", "b", "c")))
     found = SimpleNamespace(told=told, selector=SimpleNamespace(channel=channel), names=())
-    monkeypatch.setattr(analysis, "inflation", lambda best, of, active: {2: 4.0, 0: 1.44}[active[0]])
+    monkeypatch.setattr(analysis, "interval_inflation", lambda best, of, active: {2: 4.0, 0: 1.44}[active[0]])
     monkeypatch.setattr(analysis, "wandered", lambda of: {"c": 6.0})
     monkeypatch.setattr(analysis, "_weightings_apart", lambda of: np.array([3.0, 0.0]))
     estimates = estimate_parameters(found)
@@ -60,7 +60,9 @@ def test_a_profile_reaches_to_where_the_cost_has_risen_or_blocks_scatter(monkeyp
 
     monkeypatch.setattr(analysis, "fit", fit)
     monkeypatch.setattr(analysis, "indices", lambda channel, names: ("freed",))
-    monkeypatch.setattr(analysis, "inflation", lambda free, channel, of: {((0, 1), (1,)): 4.0}[free.active, of])
+    monkeypatch.setattr(
+        analysis, "interval_inflation", lambda free, channel, of: {((0, 1), (1,)): 4.0}[free.active, of]
+    )
     channel = SimpleNamespace(layout=SimpleNamespace(place={"x.at": 1}))
     found = SimpleNamespace(selector=SimpleNamespace(channel=channel), fit=at(0.0), names=())
     one = analysis._profiled(found, "x.at", step)

@@ -5,9 +5,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from disco_hw.gap.search.least_squares import Fit
-from disco_hw.gap.search.selection import compare, held_out_by_block, inflation
+from disco_hw.gap.search.selection import compare, held_out_by_block, inflation, interval_inflation
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 
 N, EACH = 3000, 50
@@ -139,6 +140,38 @@ def test_the_inflation_is_the_scatter_of_blocks_over_what_noise_alone_would_scat
     assert len(expected) > 2
     assert inflation(found, of, added) == pytest.approx(max(expected), rel=1e-6)
     assert max(expected) > 1.5
+
+
+def shown_in(blocks, trusted, wander):
+    """A parameter that so many blocks of time show, of 60, under noise that wanders from block to block."""
+    x = np.where(np.arange(N) < blocks * EACH, 1.0, 0.0)[:, None]
+    chosen = replace(DEFAULT_SETTINGS.selection, block_lengths=(1,))
+    of = SimpleNamespace(
+        settings=SimpleNamespace(selection=chosen), block=channel().block, count=N, trusted_blocks=trusted
+    )
+    white = wander.standard_normal(N)
+    return linear_fit(x, white + 2.0 * np.repeat(wander.standard_normal(N // EACH), EACH)), of
+
+
+@pytest.mark.parametrize(("blocks", "trusted"), [(2, 1.0), (3, 1.0), (3, 6.0), (60, 1.0)])
+def test_an_interval_is_students_by_as_many_blocks_as_tell_how_they_scatter(blocks, trusted):
+    found, of = shown_in(blocks, trusted, np.random.default_rng(21))
+    times = np.sqrt(interval_inflation(found, of, (0,)) / inflation(found, of, (0,)))
+    assert times == pytest.approx(stats.t.ppf(0.975, blocks + trusted - 1.0) / 1.96, rel=1e-6)
+    # Of what no block tells apart from the others nothing is known of how they scatter.
+    none = SimpleNamespace(**{**vars(of), "block": np.zeros(N, dtype=int)})
+    assert interval_inflation(found, none, (0,)) == pytest.approx(1.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("blocks", [3, 6, 20])
+def test_of_few_blocks_too_intervals_hold_nearly_as_often_as_they_say(blocks):
+    rng, held = np.random.default_rng(22), []
+    for _ in range(300):
+        found, of = shown_in(blocks, 1.0, rng)
+        deviation = np.sqrt(found.covariance()[0, 0] * interval_inflation(found, of, (0,)))
+        held.append(abs(found.vector[0]) < 1.96 * deviation)
+    # Of 1.96 deviations without that 73, 83 and 92 %.
+    assert 0.86 < np.mean(held) < 0.99
 
 
 def test_without_blocks_enough_the_model_of_the_noise_is_believed():

@@ -262,7 +262,7 @@ def test_a_threshold_is_known_no_better_than_blocks_agree_on_it(monkeypatch, sca
     wide = estimate_parameters(found).by_name["stiction.threshold_rad_s"]
     assert wide.low < wide.value < wide.high
     assert wide.value == pytest.approx(0.7, abs=0.03)
-    monkeypatch.setitem(estimate_parameters.__globals__, "inflation", lambda *of: 1.0)
+    monkeypatch.setitem(estimate_parameters.__globals__, "interval_inflation", lambda *of: 1.0)
     plain = estimate_parameters(found).by_name["stiction.threshold_rad_s"]
     assert plain.low < plain.value == wide.value < plain.high
     assert (wide.deviation > 1.2 * plain.deviation) == scatters
