@@ -206,6 +206,7 @@ def test_at_its_bounds_a_clock_is_believed_by_its_size_and_its_agreement_and_not
 def test_of_no_poses_nothing_is_said():
     wheels = Wheels(*(np.arange(100.0),) * 5, np.zeros(100, dtype=int), True, True)
     assert pose_clock(wheels, poses_at([]), SETTINGS) == StampClock(0.0)
+    assert PoseAlignment(wheels, poses_at([]), SETTINGS).span_s == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("off_s", [-0.4, 0.0, 3.0])

@@ -1,6 +1,7 @@
 """Errors on held-out stretches: the right model errs by the noise of a pose, a wrong one by what it lacks."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -110,6 +111,12 @@ def test_each_fold_is_predicted_by_what_was_fitted_on_the_others():
     # Fold 0 holds that stretch: who predicts it has not seen it.
     assert axle[0] == pytest.approx(0.4, rel=0.01)
     assert min(abs(each - 0.4) for each in axle[1:]) > 3.0 * abs(axle[0] - 0.4)
+
+
+def test_every_third_stretch_is_of_one_fold_of_three():
+    drive = SimpleNamespace(folds=Folds(2.0 * DEFAULT_SETTINGS.grid.block_s, 3))
+    channel = SimpleNamespace(drive=drive, settings=DEFAULT_SETTINGS, block=np.arange(14))
+    assert fold_of(channel).tolist() == [0, 0, 1, 1, 2, 2] * 2 + [0, 0]
 
 
 def test_what_a_fold_knows_nothing_about_is_not_in_its_prediction():
