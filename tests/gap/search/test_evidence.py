@@ -163,6 +163,21 @@ def test_an_interval_is_students_by_as_many_blocks_as_tell_how_they_scatter(bloc
     assert interval_inflation(found, none, (0,)) == pytest.approx(1.0, rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("told", "scatter", "freedom"),
+    # Blocks that scatter by turns: nine as one hardly. Less than the noise model says: as many as the shortest ones.
+    [(1.0, 3.0, 59.0), (1.0, 0.1, 59.0), (0.0447, 3.0, 1.0)],
+)
+def test_an_interval_is_known_by_the_blocks_that_scatter_most_and_no_worse_than_by_two(told, scatter, freedom):
+    block = np.arange(N) // EACH
+    x = np.where(block == 0, 1.0, told)[:, None]
+    found = linear_fit(x, scatter * np.where(block % 2 == 0, 1.0, -1.0))
+    lengths = replace(DEFAULT_SETTINGS.selection, block_lengths=(1, 9) if told == 1.0 else (1,))
+    of = SimpleNamespace(settings=SimpleNamespace(selection=lengths), block=block, count=N, trusted_blocks=0.0)
+    times = np.sqrt(interval_inflation(found, of, (0,)) / inflation(found, of, (0,)))
+    assert times == pytest.approx(stats.t.ppf(0.975, freedom) / 1.96, rel=1e-6)
+
+
 @pytest.mark.parametrize("blocks", [3, 6, 20])
 def test_of_few_blocks_too_intervals_hold_nearly_as_often_as_they_say(blocks):
     rng, held = np.random.default_rng(22), []
