@@ -95,20 +95,18 @@ def seen(monkeypatch):
     """The clock that these delays of stretches show, where the whole log fits better by `gained` nats."""
 
     def instant(align, sides, about_s):
-        made.sides.append(sides)
+        made.asked.append((sides, about_s))
         return about_s
 
     def made(delays, gained=1.0, span_s=120.0, middles=None, misfit_with=None, least_s=0.03, least_nats=0.02, **grid):
         delays = np.array(delays)
         middles = 100.0 + span_s * (np.arange(delays.size) + 0.5) / delays.size if middles is None else middles
         monkeypatch.setattr(stamp_clock, "by_stretch", lambda align: (middles, delays))
-        monkeypatch.setattr(
-            stamp_clock, "jump_instant", lambda align, sides, about_s: made.sides.append(sides) or about_s
-        )
+        monkeypatch.setattr(stamp_clock, "jump_instant", instant)
         settings = replace(SETTINGS, **({"clock_outlier_s": np.inf} | grid))
         return clock_of(Stamped((), gained, span_s, misfit_with=misfit_with), settings, least_s, least_nats)
 
-    made.sides = []
+    made.asked = []
     return made
 
 
@@ -120,7 +118,7 @@ def test_delays_on_a_line_are_a_drift_over_the_whole_log(seen):
 def test_delays_of_two_sizes_are_a_jump_between_two_stretches(seen):
     clock = seen([0.1, 0.1, 0.1, 0.35, 0.3, 0.35])
     assert (clock.delay_s, clock.jump_s, clock.jump_at_s) == (0.21, pytest.approx(0.25), pytest.approx(160.0))
-    assert seen.sides == [pytest.approx((0.1, 0.35))]
+    assert seen.asked == [(pytest.approx((0.1, 0.35)), pytest.approx(160.0))]
     assert clock.drift_s == 0.0
     assert seen([0.3, 0.3, 0.3, 0.1, 0.1, 0.1]).jump_s == pytest.approx(-0.2)
     # Of the early ones there are two at least, and of the late ones.
@@ -258,6 +256,9 @@ def test_a_jump_is_where_both_sides_fit_best():
     # No further than a stretch away.
     assert jump_instant(stamped, (0.1, 0.4), 47.0) == 35.0
     assert jump_instant(stamped, (0.1, 0.4), 19.0) == 30.0
+    # Of all before it, from the first on.
+    before = Stamped((), wrong=lambda low_s, high_s, delay_s: abs(high_s - 33.0) if low_s == -np.inf else 0.0)
+    assert jump_instant(before, (0.1, 0.4), 30.0) == 33.0
 
 
 @pytest.mark.parametrize("about_s", [0.11, 0.1234, 0.14])
