@@ -1,10 +1,10 @@
 """What models learnt from one half of a measured log predict of the other, end to end: the table of `docs/gap.md`.
 
-`DISCO_HW_DATA=FOLDER python -m tools.gap_halves [--days] [NAME...]`: logs whose path holds a NAME, all without one. For
-either half: the stage that is offered, the errors 2 s ahead on the half that was not seen, of every stage, and how many
-of its 95 % intervals hold what the other half says of the same parameters, where that knows half as much of them.
-With `--days` the same of whole logs: each learnt from, and every other one of the same robot predicted; where that is
-of windows of 2 s, 1 s ahead.
+`DISCO_HW_DATA=FOLDER python -m tools.gap_halves [--parts N | --days] [NAME...]`: logs whose path holds a NAME, all
+without one. For either half: the stage that is offered, the errors 2 s ahead on the half that was not seen, of every
+stage, and how many of its 95 % intervals hold what the other half says of the same parameters, where that knows half as
+much of them. With `--parts` the same of N parts of each log, and of every other one of it; with `--days` of whole logs,
+each learnt from, and every other one of the same robot predicted. Where those are of windows of 2 s, 1 s ahead.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from pathlib import Path
 
 # Each process works alone on one log: a second thread for its small matrices would only be in another one's way.
@@ -188,19 +189,19 @@ def taught(part: Part, others: Sequence[Part], nominal: Model) -> Iterator[Half]
         cpu_s = 0.0
 
 
-def halves(path: Path) -> Iterator[Half]:
-    """Both halves of a log, each learnt from and the other one predicted; none of a log without poses."""
+def halves(path: Path, count: int) -> Iterator[Half]:
+    """Each of some parts of a log, equally long, learnt from and the others predicted; none of a log without poses."""
     log, nominal = read(path)
     if not log.poses.t_s.size:
         return
-    middle_s = 0.5 * (float(log.wheels.t_s[0]) + float(log.wheels.t_s[-1]))
-    parts = [
-        Part.search(f"{path.stem} {number}", cut, nominal)
-        for number, cut in enumerate((between(log, -np.inf, middle_s), between(log, middle_s, np.inf)), 1)
-    ]
-    for part, other in (parts, parts[::-1]):
-        if part.analysis.body is not None:
-            yield from taught(part, (other,), nominal)
+    ends_s = np.linspace(float(log.wheels.t_s[0]), float(log.wheels.t_s[-1]), count + 1)
+    ends_s[[0, -1]] = -np.inf, np.inf
+    cuts = (between(log, *ends) for ends in pairwise(ends_s))
+    parts = [Part.search(f"{path.stem} {number}", cut, nominal) for number, cut in enumerate(cuts, 1)]
+    judged = [part for part in parts if part.analysis.body is not None]
+    for part in judged:
+        others = [other for other in judged if other is not part]
+        yield from taught(part, others, nominal)
 
 
 def days(paths: Sequence[Path]) -> Iterator[Half]:
@@ -234,6 +235,7 @@ def measured_logs(names: Sequence[str]) -> list[Path]:
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tools.gap_halves", description=(__doc__ or "").split(":")[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help="logs whose path holds it (all)")
+    parser.add_argument("--parts", type=int, default=2, metavar="N", help="of each log (2)")
     parser.add_argument("--days", action="store_true", help="whole logs of one robot predict each other")
     options = parser.parse_args(arguments)
     paths = measured_logs(options.names)
@@ -241,7 +243,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(f"| learnt from | {head} |")
     print("|---|---|---|---|---|---|---|")
     found = []
-    for half in days(paths) if options.days else (half for path in paths for half in halves(path)):
+    for half in days(paths) if options.days else (half for path in paths for half in halves(path, options.parts)):
         found.append(half)
         print(row(half), flush=True)
     worse = [half for half in found if half.offered != "timed" and max(half.ratios(half.offered)) > 1.05]
