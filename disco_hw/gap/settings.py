@@ -100,6 +100,9 @@ class NoiseSettings:
 
     window_s: float = 3.0
     """Poses are compared in windows of this length, the start of which is unknown. Chosen."""
+    by_stamps_share: float = 0.5
+    """Poses as they are stamped begin the search in place of those as late as at first sight, where they leave so small
+    a share of the misfit. Chosen: what is late by little fits alike, and first sight that errs by 0.3 s far worse."""
     shortest_window: int = 12
     """Windows with fewer poses are left out, unless most are so thin. Chosen."""
     longest_pose_gap_s: float = 2.0

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.effects.registry import REGISTRY
-from disco_hw.gap.data import BODY, DELAYED_BY, WHEEL
+from disco_hw.gap.data import BODY, DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.data.free_runs import displacement, starts_as_far_as
 from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.noise import learn_body_noise, learn_wheel_noise
@@ -24,6 +24,7 @@ from disco_hw.gap.search.richest_model import (
     LATE,
     LATE_COLUMNS,
     LATE_STARTS_S,
+    delay_columns,
     delays_of,
     indices,
     learn_saturated_body,
@@ -182,9 +183,7 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
     `geometry` (3,) is how far they move the robot; `start` is the vector without what is missing, in which effects
     `given` are known already.
     """
-    # As if commands were stamped where they lie: so the search is the same wherever their stamps are, to the last bit.
-    here = replace(drive, commands_moved_s=0.0)
-    channel = WheelChannel.build(here, WheelNoise(reading_rad=max(drive.quantum_rad, 2e-4)), geometry)
+    channel = WheelChannel.build(_as_laid(drive), WheelNoise(reading_rad=max(drive.quantum_rad, 2e-4)), geometry)
     moves = wheel_moves(channel, geometry)
     settings = drive.settings.selection
     # What is left of a rough fit becomes the noise of all that follow.
@@ -216,17 +215,22 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
     return searched(plain) if found.fit.cost > settings.far_off * 0.5 * sound.count else found
 
 
+def _as_laid(drive: GriddedDrive) -> GriddedDrive:
+    """A drive as if commands and poses were stamped where they lie.
+
+    So a search is the same wherever their stamps are, to the last bit.
+    """
+    late_s = drive.pose_delay_s - drive.poses_moved_s
+    return replace(drive, commands_moved_s=0.0, poses_moved_s=0.0, pose_delay_s=late_s)
+
+
 def stamped(found: ChannelResult, drive: GriddedDrive) -> ChannelResult:
-    """What was found in wheels whose commands seemed stamped where they lie, with delays counted from their stamps."""
-    place, later_s = WHEEL.place[DELAYED_BY], drive.commands_moved_s
-    assert isinstance(found.channel, WheelChannel)
-    channel = replace(found.channel, drive=drive)
-    moves = wheel_moves(channel, channel.geometry)
+    """What was found in a drive as it is laid, with delays counted from the stamps of commands or poses."""
+    channel: WheelChannel | BodyChannel = replace(found.channel, drive=drive)
+    moves = wheel_moves(channel, channel.geometry) if isinstance(channel, WheelChannel) else body_moves(channel)
 
     def from_stamps(vector: Array) -> Array:
-        moved = vector.copy()
-        moved[place] += later_s
-        return moved
+        return _later(vector, drive, channel.layout, 1.0)
 
     def of(selector: Selector) -> Selector:
         terms = selector.channel.terms if isinstance(selector.channel, WithTerms) else ()
@@ -237,6 +241,13 @@ def stamped(found: ChannelResult, drive: GriddedDrive) -> ChannelResult:
 
     plain = None if found.plain is None else of(found.plain)
     return replace(found, selector=of(found.selector), channel=channel, plain=plain)
+
+
+def _later(vector: Array, drive: GriddedDrive, layout: Layout, times: float) -> Array:
+    """A vector with a delay longer by so many times what commands or poses were moved by."""
+    moved, by_s = vector.copy(), drive.commands_moved_s if layout.of_wheels else drive.poses_moved_s
+    moved[layout.place[delay_columns(layout)[0]]] += times * by_s
+    return moved
 
 
 def timed(selector: Selector) -> Selector:
@@ -265,8 +276,9 @@ def judged(found: ChannelResult, given: Names, start: Array) -> ChannelResult:
         assert isinstance(found.selector.channel, WithTerms)
         start = _extended(plain, found.selector.channel)
     selector = against_none(found.selector, start)
-    delays = delays_of(selector.channel.layout)
-    names = selector.needed(selector.swapped(selector.needed(found.names, delays), delays), delays)
+    layout = selector.channel.layout
+    delays, late = delays_of(layout), LATE if layout.of_wheels else ()
+    names = selector.needed(selector.swapped(selector.needed(found.names, delays), late), delays)
     return _written(replace(found, selector=selector, plain=plain, names=names))
 
 
@@ -292,11 +304,14 @@ def responding(selector: Selector, names: Names) -> None:
 
 def search_body(drive: GriddedDrive, start: Array, given: Names = ()) -> ChannelResult:
     """Effects between measured wheel angles and measured poses; `start` and `given` as for the wheels."""
-    channel = BodyChannel.build(drive, BodyNoise(), start)
-    nominal = fit(channel, start, indices(channel, given))
+    here, begin = _as_laid(drive), start.copy()
+    begin[BODY.place[delay_columns(BODY)[0]]] = here.pose_delay_s
+    channel = BodyChannel.build(here, BodyNoise(), begin)
+    nominal = fit(channel, _later(start, drive, BODY, -1.0), indices(channel, given))
     # Noise that is learnt from poses that are laid beside the wrong wheels hides that they are.
     delayed = fit(channel, with_delay(channel, start), indices(channel, given))
-    channel = learn_body_noise(channel, min(nominal, delayed, key=lambda one: one.cost).vector, iterations=4)
+    errs = nominal.cost < drive.settings.noise.by_stamps_share * delayed.cost
+    channel = learn_body_noise(channel, (nominal if errs else delayed).vector, iterations=4)
     settings = drive.settings.selection
     limits = Thresholds(settings.rough_score, 0.0, settings.rough_score)
     rough = Selector(channel, body_moves(channel), limits, given=given, start=delayed.vector, closely=True)
@@ -310,7 +325,7 @@ def search_body(drive: GriddedDrive, start: Array, given: Names = ()) -> Channel
     selector = timed(Selector(channel, body_moves(channel), limits, given=given, start=rough.fit(given).vector))
     richest = channel.residual(fullest, extra)
     found = ChannelResult(selector, selector.select(), channel, richest=richest, richest_parameters=many)
-    return judged(_time_or_place(found), given, nominal.vector)
+    return judged(stamped(_time_or_place(found), drive), given, _later(nominal.vector, drive, BODY, 1.0))
 
 
 def _time_or_place(found: ChannelResult) -> ChannelResult:

@@ -362,8 +362,8 @@ class Selector:
         return float(self.fit(names).cost + 0.5 * parameters_of(names) * np.log(self.channel.count))
 
     def swapped(self, accepted: Names, among: Names | None = None) -> Names:
-        """Replace single effects, or only those `among` some, as long as that fits better by more than the parameters'
-        price.
+        """Replace single effects, or only those `among` some by others of these, as long as that fits better by more
+        than the parameters' price.
         """
         for _ in range(len(accepted)):
             best, score = accepted, self.settings.swap_nats
@@ -372,7 +372,7 @@ class Selector:
                     continue
                 rest = (*accepted[:place], *accepted[place + 1 :])
                 worth = self._worth(rest, accepted, old)
-                for name in candidates_of(self.channel.layout):
+                for name in candidates_of(self.channel.layout) if among is None else among:
                     if name not in accepted and self.promise(rest, name) - worth > score:
                         best, score = (
                             (*accepted[:place], name, *accepted[place + 1 :]),

@@ -90,6 +90,24 @@ def test_commands_are_searched_alike_to_the_last_bit_wherever_they_are_stamped(c
     np.testing.assert_array_equal(np.delete(ends[0].vector, late), np.delete(ends[1].vector, late))
 
 
+@pytest.mark.parametrize("late_s", [0.0, 0.3])
+def test_poses_are_searched_alike_to_the_last_bit_wherever_they_are_stamped(late_s):
+    channel, line = body_channel(turn_slip=0.08)
+    plain, moved = (
+        search_body(replace(line, pose_delay_s=late_s + by_s, poses_moved_s=late_s + by_s), channel.neutral)
+        for by_s in (0.0, -0.25)
+    )
+    both = ("pose_latency", "turn_slip")
+    assert {"turn_slip"} <= set(plain.names) <= set(both)
+    assert {"turn_slip"} <= set(moved.names) <= set(both)
+    ends = [found.selector.fits[frozenset(both)] for found in (plain, moved)]
+    assert ends[0].cost == ends[1].cost
+    np.testing.assert_array_equal(ends[0].residual, ends[1].residual)
+    late = BODY.place["pose_latency.latency_s"]
+    assert ends[1].vector[late] == pytest.approx(ends[0].vector[late] - 0.25, abs=1e-15)
+    np.testing.assert_array_equal(np.delete(ends[0].vector, late), np.delete(ends[1].vector, late))
+
+
 def test_wheels_with_a_term_that_has_no_name_have_it_found_with_its_number():
     line = wheels_of(lambda u: -0.02 * u * np.abs(u), drive=DRIVE * 2)
     found = search_wheels(line, np.array(GEOMETRY), WHEEL.neutral)
@@ -128,8 +146,8 @@ def test_poses_that_are_late_at_first_sight_are_named_late_and_their_noise_is_no
     assert found.channel.noise.position_m == pytest.approx(NOISE.position_m, rel=0.15)
 
 
-@pytest.mark.parametrize(("late_s", "seen_s", "begun_s"), [(0.3, 0.28, 0.28), (0.0, 0.28, 0.0)])
-def test_the_first_noise_is_that_of_poses_as_late_as_fits_better(monkeypatch, late_s, seen_s, begun_s):
+@pytest.mark.parametrize(("late_s", "seen_s", "begun_s"), [(0.3, 0.28, 0.28), (0.0, 0.28, 0.0), (0.0, 0.003, 0.003)])
+def test_the_first_noise_is_of_poses_as_late_as_at_first_sight_unless_that_errs(monkeypatch, late_s, seen_s, begun_s):
     channel, line = body_channel()
     track = channel.track(channel.neutral)
     late = np.clip(line.pose.node - round(late_s / GRID_STEP_S), 0, None)
@@ -389,8 +407,8 @@ def test_a_delay_alone_is_judged_against_none_and_fits_that_have_it_stay():
     selector = Held(SimpleNamespace(layout=WHEEL), ("command_delay",), None, dict.fromkeys(sets, "fit"), {1: 2})
     start = WHEEL.neutral
     found = judged(ChannelResult(selector, ("deadband",), None), (), start)
-    of = "of ('command_delay',)"
-    assert found.names == ("deadband", f"needed {of}", f"swapped {of}", f"needed {of}")
+    of, late = "of ('command_delay',)", "of ('motor_lag', 'command_delay')"
+    assert found.names == ("deadband", f"needed {of}", f"swapped {late}", f"needed {of}")
     assert set(found.selector.fits) == {sets[1], sets[2]}
     assert (found.selector.given, found.selector.start, found.selector.proofs) == ((), start, {})
     assert found.plain is None

@@ -51,8 +51,9 @@ def test_a_stand_in_is_swapped_for_what_it_stood_in_for():
 def test_among_some_only_those_are_dropped_or_swapped():
     found = selector(turn_slip=0.08)
     assert found.needed(("side_slip", "turn_slip", "slope"), ("slope", "turn_slip")) == ("side_slip", "turn_slip")
-    assert found.swapped(("surface_change",), ("slope",)) == ("surface_change",)
-    assert found.swapped(("surface_change",), ("surface_change",)) == ("turn_slip",)
+    assert found.swapped(("surface_change",), ("slope", "turn_slip")) == ("surface_change",)
+    assert found.swapped(("surface_change",), ("surface_change", "slope")) == ("surface_change",)
+    assert found.swapped(("surface_change",), ("surface_change", "slope", "turn_slip")) == ("turn_slip",)
 
 
 def wheels_slow(tau_s):
