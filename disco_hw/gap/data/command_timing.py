@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap.data.alignment import apart, lowest, misfit_of
 from disco_hw.gap.data.stamp_clock import StampClock, clock_of
+from disco_hw.gap.data.timing import apart, lowest, misfit_of
 from disco_hw.gap.settings import GridSettings
 from disco_hw.jit import kernel_function
 from disco_hw.log.drive import Commands, Wheels

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data import alignment, stamp_clock, timing
+from disco_hw.gap.data import stamp_clock, timing
 from disco_hw.gap.data.stamp_clock import StampClock, by_stretch, clock_of, jump_instant
 from disco_hw.gap.data.timing import PoseAlignment, pose_clock, pose_delay_s
 from disco_hw.gap.settings import GridSettings
@@ -266,7 +266,7 @@ def test_the_least_of_a_misfit_is_found_wherever_the_steps_of_a_scan_lie(about_s
     def misfits(delays):
         return np.where(delays > 0.15, np.inf, np.abs(delays - 0.1234) + 10.0 * (delays - 0.1234) ** 2 - 3.0)
 
-    delay_s, misfit = alignment.lowest(misfits, about_s, 0.02)
+    delay_s, misfit = timing.lowest(misfits, about_s, 0.02)
     assert delay_s == pytest.approx(0.1234, abs=2e-4)
     assert misfit == pytest.approx(-3.0, abs=1e-3)
 
@@ -387,8 +387,8 @@ def test_two_columns_are_solved_as_normal_equations_and_like_columns_as_one():
     a, b, y = rng.standard_normal((3, 50))
     a *= 2.0
     expected = np.linalg.lstsq(np.column_stack([a, b]), y, rcond=None)[0]
-    assert alignment.projected(a @ a, a @ b, b @ b, a @ y, b @ y) == pytest.approx(tuple(expected))
+    assert timing.projected(a @ a, a @ b, b @ b, a @ y, b @ y) == pytest.approx(tuple(expected))
     b = 0.5 * a
-    assert alignment.projected(a @ a, a @ b, b @ b, a @ y, b @ y) == pytest.approx((a @ y / (a @ a), 0.0))
-    assert alignment.projected(0.0, 0.0, 0.0, 0.0, 0.0) == (0.0, 0.0)
-    assert alignment.projected(0.5, 0.0, 0.25, 1.0, 0.5) == (2.0, 2.0)
+    assert timing.projected(a @ a, a @ b, b @ b, a @ y, b @ y) == pytest.approx((a @ y / (a @ a), 0.0))
+    assert timing.projected(0.0, 0.0, 0.0, 0.0, 0.0) == (0.0, 0.0)
+    assert timing.projected(0.5, 0.0, 0.25, 1.0, 0.5) == (2.0, 2.0)

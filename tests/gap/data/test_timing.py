@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from disco_hw.gap.data import alignment
+from disco_hw.gap.data import timing
 from disco_hw.gap.data.command_timing import Turned, command_clock, response
 from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.data.timing import pose_clock, pose_delay_s
@@ -108,7 +108,7 @@ def test_poses_are_compared_over_no_silence_and_no_segment():
     nothing = np.zeros(t_s.size)
     poses = Poses(t_s, nothing, nothing, nothing, np.array([0, 0, 0, 0, 0, 0, 1, 1]))
     # The first that is 0.3 s later, where that is hardly more than 0.3 s.
-    pairs = [each.tolist() for each in alignment.apart(poses.t_s, poses.segment, 0.3)]
+    pairs = [each.tolist() for each in timing.apart(poses.t_s, poses.segment, 0.3)]
     assert pairs == [[0, 1], [2, 3]]
 
 
@@ -131,24 +131,22 @@ def test_a_regression_by_normal_equations_fits_as_one_by_decomposition(alike, sc
     difference = scale * (0.4 * total + alike * rng.normal(0.0, 1.0, 300))
     measured = 0.11 * total + 0.05 / scale * difference + 0.01 * rng.normal(0.0, 1.0, 300)
     measured[::17] += 0.8
-    found = alignment.misfit_of(difference, total, measured)
+    found = timing.misfit_of(difference, total, measured)
     assert found == pytest.approx(by_decomposition(difference, total, measured), abs=1e-8)
-    assert alignment.misfit_of(difference, total, measured + 0.1 * total**2) > found + 0.1
+    assert timing.misfit_of(difference, total, measured + 0.1 * total**2) > found + 0.1
 
 
 def test_wheels_that_do_not_turn_leave_all_that_is_measured():
     nothing, measured = np.zeros(100), np.random.default_rng(6).normal(0.0, 0.1, 100)
-    assert alignment.misfit_of(nothing, nothing, measured) == pytest.approx(
-        by_decomposition(nothing, nothing, measured)
-    )
+    assert timing.misfit_of(nothing, nothing, measured) == pytest.approx(by_decomposition(nothing, nothing, measured))
 
 
 def test_wheels_that_only_turn_alike_or_against_each_other_tell_all_that_they_do():
     nothing, turned, noise = np.random.default_rng(8).normal(0.0, 0.1, (3, 100)) * [[0.0], [1.0], [0.1]]
     measured = 2.0 * turned + noise
     expected = by_decomposition(nothing, turned, measured)
-    assert alignment.misfit_of(nothing, turned, measured) == pytest.approx(expected)
-    assert alignment.misfit_of(turned, nothing, measured) == pytest.approx(expected)
+    assert timing.misfit_of(nothing, turned, measured) == pytest.approx(expected)
+    assert timing.misfit_of(turned, nothing, measured) == pytest.approx(expected)
 
 
 # As many pairs as tell a delay to 20 ms.
