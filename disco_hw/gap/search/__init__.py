@@ -156,7 +156,7 @@ def joint_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePrediction
     )
     timed = _Fitted.to(ahead, _timed(ahead, refitted.at()))
     needed = _needed(analysis, timed, ahead, apart)
-    amended = _Fitted(needed.candidate.of, ahead.fit(needed.candidate.of), needed.folds)
+    amended = _Fitted(needed.candidate.of, needed.fit(ahead), needed.folds)
     stages = {"refitted": refitted, "timed": timed, "amended": amended}
     chains |= {name: stage.chains for name, stage in stages.items()}
     joint = {name: (stage.of, stage.joint) for name, stage in stages.items()}
@@ -242,6 +242,15 @@ class _Judged:
     def size(self) -> float:
         """Errors of position and heading together."""
         return self.errors.position_m * self.errors.yaw_rad
+
+    def fit(self, ahead: Ahead) -> JointFit:
+        """The fit of all data that predicts them best, of those from where the candidate begins and from each fold's.
+
+        From a start far off the whole log may end where no fold does.
+        """
+        of = self.candidate.of
+        fits = [ahead.fit(of), *(ahead.fit(of, begin=fold.vectors) for fold in self.folds.values())]
+        return min(fits, key=lambda one: ahead.usual_cost(of.chain(one.vectors)))
 
 
 def _needed(analysis: GapAnalysis, timed: _Fitted, ahead: Ahead, apart: StagePredictions) -> _Judged:

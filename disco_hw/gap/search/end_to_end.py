@@ -132,8 +132,9 @@ class Ahead:
         """How far off predictions usually are, on a scale that compares chains: log of the sizes of both errors."""
         return sum(float(np.log(_usual(error)[1:]).sum()) for error in self.errors(chain))
 
-    def fit(self, of: Freed, left_out: int | None = None) -> JointFit:
-        """The freed values that predict best, one of the folds `left_out` or none.
+    def fit(self, of: Freed, left_out: int | None = None, begin: Sequence[Array] | None = None) -> JointFit:
+        """The freed values that predict best, one of the folds `left_out` or none; they `begin` at other vectors or at
+        those that they are trusted about.
 
         Errors of position and of heading are each measured in what they usually are at the start of a round; large ones
         count linearly (Huber, 1964). Neighbouring predictions overlap, so that each counts for the time it adds.
@@ -149,7 +150,8 @@ class Ahead:
         first = np.array(of.parts[0].active)
         of_body = np.concatenate([first >= BASE_COUNT, np.zeros(step.size - first.size, dtype=bool)])
         root = np.linalg.cholesky(precision + np.diag((_HARDLY / step) ** 2)).T
-        values, cost, normal = np.clip(start, low + _INSIDE * step, high - _INSIDE * step), math.inf, root.T @ root
+        first_at = start if begin is None else of.at(begin).joined(lambda part: part.vector)
+        values, cost, normal = np.clip(first_at, low + _INSIDE * step, high - _INSIDE * step), math.inf, root.T @ root
         for _ in range(settings.fit_rounds if any(mask.any() for mask in chosen) else 0):
             units = [
                 _usual(error[mask]) / share

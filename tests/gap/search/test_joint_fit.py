@@ -83,6 +83,18 @@ def test_what_predicts_best_is_found_by_errors_in_their_usual_size_and_what_was_
     assert (found.vectors[0][3:] == BODY.neutral[3:]).all()
 
 
+def test_a_fit_begins_where_it_is_told_and_trusts_what_it_is_about(linear):
+    ahead, _ = linear
+    steps = replace(DEFAULT_SETTINGS, prediction=replace(DEFAULT_SETTINGS.prediction, fit_rounds=0))
+    still = replace(ahead, body=SimpleNamespace(settings=steps, drive=IN_TWO))
+    information, off = 3e6 * np.eye(3), start() + np.where(np.arange(start().size) < 3, 0.01, 0.0)
+    of = Freed((Part(BODY, start(), (0, 1, 2), information),), lambda vectors: Chain(vectors[0], None))
+    assert still.fit(of, begin=[off]).vectors[0][:3] == pytest.approx(off[:3], abs=1e-6)
+    assert still.fit(of).vectors[0][:3] == pytest.approx(GEOMETRY, abs=1e-6)
+    # From there it finds what it finds from its own start.
+    assert ahead.fit(of, begin=[off]).vectors[0] == pytest.approx(ahead.fit(of).vectors[0], abs=1e-4)
+
+
 def test_predictions_that_do_not_overlap_count_whole(linear):
     ahead, errors = linear
     horizons_s = (0.1, 1.0)

@@ -132,9 +132,10 @@ class Noted:
     def __init__(self, by=0.0, costs=()):
         self.by, self.asked, self.costs, self.costed = by, [], list(costs), []
 
-    def fit(self, of, left_out=None):
+    def fit(self, of, left_out=None, begin=None):
         self.asked.append((of, left_out))
-        moved = of.vectors(of.joined(lambda part: part.vector) + self.by * (1 if left_out is None else 2 + left_out))
+        at = of if begin is None else of.at(begin)
+        moved = of.vectors(at.joined(lambda part: part.vector) + self.by * (1 if left_out is None else 2 + left_out))
         return JointFit(tuple(moved), 0.0, of.names, np.eye(len(of.names)))
 
     def usual_cost(self, chain):
@@ -189,14 +190,26 @@ def test_folds_are_fitted_from_the_fit_of_all_or_from_where_each_begins():
     assert begun.joint.vectors[1][LAG] == pytest.approx(0.001)
 
 
+@pytest.mark.parametrize("best", range(3))
+def test_the_fit_of_all_data_begins_from_those_of_the_folds_too_and_the_best_is_kept(best):
+    of = two_parts((LAG,))
+    lags = [0.001, 0.201, 0.401]
+    folds = {held: JointFit((BODY.neutral, WHEEL.neutral + 0.2 * (1 + held)), 0.0, (), np.eye(0)) for held in (0, 1)}
+    ahead = Noted(0.001, [0.0 if k == best else 1.0 + k for k in range(3)])
+    found = stages._Judged(SimpleNamespace(of=of), folds, None).fit(ahead)
+    assert [chain.wheels[LAG] for chain in ahead.costed] == pytest.approx(lags)
+    assert [left_out for _, left_out in ahead.asked] == [None] * 3
+    assert found.vectors[1][LAG] == pytest.approx(lags[best])
+
+
 @pytest.fixture
 def unfitted(monkeypatch):
     """Has every fit of the whole chain stay where it begins; what was asked for."""
     asked = []
 
-    def fit(self, of, left_out=None):
+    def fit(self, of, left_out=None, begin=None):
         asked.append((of, left_out))
-        return Noted().fit(of, left_out)
+        return Noted().fit(of, left_out, begin)
 
     monkeypatch.setattr(Ahead, "fit", fit)
     return asked
@@ -237,7 +250,9 @@ def test_what_channels_say_is_trusted_to_three_of_their_deviations_and_folds_by_
     )
     names = ("wheel_radius_m", "axial_distance_m", "x_icr_m", "turn_slip.k_s", "motor_lag.tau_s")
     asked = [(of, left_out) for of, left_out in unfitted if of.names == names]
-    (whole,) = (of for of, left_out in asked if left_out is None)
+    whole, *again = (of for of, left_out in asked if left_out is None)
+    # Once from where it begins, and from where each fold ended, about the same.
+    assert [of is whole for of in again] == [True] * analysis.drive.folds.count
     folds = [(of, left_out) for of, left_out in asked if left_out is not None]
     for part, fitted in zip(whole.parts, (body, wheels), strict=True):
         np.testing.assert_allclose(part.information, fitted.information() / 9.0)
