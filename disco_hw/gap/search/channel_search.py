@@ -246,7 +246,7 @@ def stamped(found: ChannelResult, drive: GriddedDrive) -> ChannelResult:
 def _later(vector: Array, drive: GriddedDrive, layout: Layout, times: float) -> Array:
     """A vector with a delay longer by so many times what commands or poses were moved by."""
     moved, by_s = vector.copy(), drive.commands_moved_s if layout.of_wheels else drive.poses_moved_s
-    moved[layout.place[delay_columns(layout)[0]]] += times * by_s
+    moved[[layout.place[column] for column in delay_columns(layout)]] += times * by_s
     return moved
 
 
@@ -305,7 +305,7 @@ def responding(selector: Selector, names: Names) -> None:
 def search_body(drive: GriddedDrive, start: Array, given: Names = ()) -> ChannelResult:
     """Effects between measured wheel angles and measured poses; `start` and `given` as for the wheels."""
     here, begin = _as_laid(drive), start.copy()
-    begin[BODY.place[delay_columns(BODY)[0]]] = here.pose_delay_s
+    begin[[BODY.place[column] for column in delay_columns(BODY)]] = here.pose_delay_s
     channel = BodyChannel.build(here, BodyNoise(), begin)
     nominal = fit(channel, _later(start, drive, BODY, -1.0), indices(channel, given))
     # Noise that is learnt from poses that are laid beside the wrong wheels hides that they are.

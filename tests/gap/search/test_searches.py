@@ -105,6 +105,8 @@ def test_poses_are_searched_alike_to_the_last_bit_wherever_they_are_stamped(late
     np.testing.assert_array_equal(ends[0].residual, ends[1].residual)
     late = BODY.place["pose_latency.latency_s"]
     assert ends[1].vector[late] == pytest.approx(ends[0].vector[late] - 0.25, abs=1e-15)
+    # Without a name they are as late as they are stamped.
+    assert [found.selector.start[late] for found in (plain, moved)] == pytest.approx([0.0, 0.0], abs=1e-15)
     np.testing.assert_array_equal(np.delete(ends[0].vector, late), np.delete(ends[1].vector, late))
 
 
@@ -146,11 +148,22 @@ def test_poses_that_are_late_at_first_sight_are_named_late_and_their_noise_is_no
     assert found.channel.noise.position_m == pytest.approx(NOISE.position_m, rel=0.15)
 
 
-@pytest.mark.parametrize(("late_s", "seen_s", "begun_s"), [(0.3, 0.28, 0.28), (0.0, 0.28, 0.0), (0.0, 0.003, 0.003)])
-def test_the_first_noise_is_of_poses_as_late_as_at_first_sight_unless_that_errs(monkeypatch, late_s, seen_s, begun_s):
+@pytest.mark.parametrize(
+    ("late_s", "seen_s", "moved_s", "begun_s"),
+    [
+        (0.3, 0.28, 0.0, 0.28),
+        (0.0, 0.28, 0.0, 0.0),
+        (0.0, 0.003, 0.0, 0.003),
+        # Laid too early by what first sight errs by, they are true later than they lie.
+        (-0.28, 0.28, 0.28, -0.28),
+    ],
+)
+def test_the_first_noise_is_of_poses_as_late_as_at_first_sight_unless_that_errs(
+    monkeypatch, late_s, seen_s, moved_s, begun_s
+):
     channel, line = body_channel()
     track = channel.track(channel.neutral)
-    late = np.clip(line.pose.node - round(late_s / GRID_STEP_S), 0, None)
+    late = np.clip(line.pose.node - round(late_s / GRID_STEP_S), 0, len(track) - 1)
     poses = track[late] + (line.pose_values - track[line.pose.node])
 
     def begin(of, vector, **_):
@@ -158,7 +171,7 @@ def test_the_first_noise_is_of_poses_as_late_as_at_first_sight_unless_that_errs(
 
     monkeypatch.setattr(channel_search, "learn_body_noise", begin)
     with pytest.raises(RuntimeError) as begun:
-        search_body(replace(line, pose_values=poses, pose_delay_s=seen_s), channel.neutral)
+        search_body(replace(line, pose_values=poses, pose_delay_s=seen_s, poses_moved_s=moved_s), channel.neutral)
     assert begun.value.args == (begun_s,)
 
 
