@@ -10,8 +10,7 @@ import pytest
 
 from disco_hw import gap
 from disco_hw.gap.data.gridded_drive import grid_drive
-from disco_hw.gap.search.channel_search import body_moves
-from disco_hw.gap.search.selection import Selector
+from disco_hw.gap.search.selection import Selector, body_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
 from tests.gap.synthetic import LIMITS, body_channel
 from tools.gap_logs import simulated_drive

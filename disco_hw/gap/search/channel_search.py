@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data import BODY, DELAYED_BY, WHEEL, Layout
-from disco_hw.gap.data.free_runs import displacement, starts_as_far_as
 from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.noise import learn_body_noise, learn_wheel_noise
 from disco_hw.gap.noise.body_noise import BodyNoise
@@ -33,9 +32,18 @@ from disco_hw.gap.search.richest_model import (
     smooth_of,
     with_delay,
 )
-from disco_hw.gap.search.selection import EffectEvidence, Names, Selector, Split, Thresholds, compare, inflation
+from disco_hw.gap.search.selection import (
+    EffectEvidence,
+    Names,
+    Selector,
+    Thresholds,
+    body_moves,
+    compare,
+    inflation,
+    wheel_moves,
+)
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms, body_terms, places, places_near, wheel_terms
-from disco_hw.gap.settings import GRID_STEP_S, SelectionSettings
+from disco_hw.gap.settings import SelectionSettings
 
 Array = NDArray[np.float64]
 
@@ -121,60 +129,6 @@ def deviations_of(best: Fit, channel: ResidualChannel) -> Array:
     """Standard deviations of what was fitted, (A,), by how blocks of time scatter."""
     factors = [inflation(best, channel, (index,)) for index in best.active]
     return np.asarray(np.sqrt(np.maximum(np.diag(best.covariance()) * factors, 1e-300)))
-
-
-def wheel_moves(channel: WheelChannel, geometry: Array) -> Callable[[Split, Split], float]:
-    """How far two fits of the wheels lie apart `ahead_s` ahead, m (lever arm of half the way)."""
-    drive = channel.drive
-    settings = channel.settings.selection
-    usable = np.isfinite(drive.command_rad_s[:, 0])
-    start, ahead_s = starts_as_far_as(drive.first, usable, settings.ahead_s, channel.settings.grid)
-    ahead = round(ahead_s / GRID_STEP_S)
-
-    def moves(small: Split, big: Split) -> float:
-        if not start.size:
-            return 0.0
-        difference = channel.angles(*big) - channel.angles(*small)
-        step = difference[start + ahead] - difference[start]
-        way = drive.angle_rad[start + ahead] - drive.angle_rad[start]
-        forward = 0.5 * geometry[0] * step.sum(axis=1)
-        yaw = geometry[0] / geometry[1] * (step[:, 1] - step[:, 0])
-        lever = np.abs(0.25 * geometry[0] * way.sum(axis=1)) + abs(geometry[2])
-        return _where_most(forward**2 + (lever * yaw) ** 2, settings.most_moved_share)
-
-    return moves
-
-
-def body_moves(channel: BodyChannel) -> Callable[[Split, Split], float]:
-    """How far two fits of the body lie apart `ahead_s` ahead, m."""
-    drive = channel.drive
-    settings = channel.settings.selection
-    everywhere = np.ones(drive.t_s.size, dtype=bool)
-    start, ahead_s = starts_as_far_as(drive.first, everywhere, settings.ahead_s, channel.settings.grid)
-    heading = np.interp(drive.t_s[start], channel.samples.t_s, channel.measured[:, 2])
-
-    def moves(small: Split, big: Split) -> float:
-        if not start.size:
-            return 0.0
-        ends = []
-        for p, extra in (small, big):
-            ends.append(
-                displacement(
-                    p, drive.first, channel.track(p, extra), channel.carried(p), start, heading, ahead_s,
-                    drive.poses_moved_s,
-                )
-            )  # fmt: skip
-        apart = ends[1] - ends[0]
-        lever = 0.5 * np.hypot(ends[1][:, 0], ends[1][:, 1])
-        return _where_most(apart[:, 0] ** 2 + apart[:, 1] ** 2 + (lever * apart[:, 2]) ** 2, settings.most_moved_share)
-
-    return moves
-
-
-def _where_most(squares: Array, share: float) -> float:
-    """Root of the mean of the largest `share` of some squares (n,)."""
-    few = max(round(share * squares.size), 1)
-    return float(np.sqrt(np.partition(squares, squares.size - few)[-few:].mean()))
 
 
 def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Names = ()) -> ChannelResult:

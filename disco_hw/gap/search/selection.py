@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from disco_hw.gap.noise.channels import ResidualChannel
+from disco_hw.gap.data.free_runs import displacement, starts_as_far_as
+from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
 from disco_hw.gap.search.least_squares import Fit, by_block, fit, inverse, known, sensitivity
 from disco_hw.gap.search.richest_model import CANDIDATES, Candidate, candidates_of, indices, parameters_of
-from disco_hw.gap.settings import SelectionSettings
+from disco_hw.gap.settings import GRID_STEP_S, SelectionSettings
 
 Array = NDArray[np.float64]
 Z95 = 1.96
@@ -82,7 +83,7 @@ def interval_inflation(found: Fit, channel: ResidualChannel, added: tuple[int, .
 
 
 def _scatter(found: Fit, channel: ResidualChannel, added: tuple[int, ...]) -> tuple[float, float]:
-    """Inflation and the degrees of freedom that it is known by; of none that blocks tell, as many as one likes."""
+    """Inflation, and the degrees of freedom by which blocks tell it; infinite where they tell nothing."""
     places = [found.active.index(index) for index in added if index in found.active]
     if not places:
         return 1.0, math.inf
@@ -126,6 +127,60 @@ def compare(small: Fit, big: Fit, channel: ResidualChannel, parameters: float) -
 
 Names = tuple[str, ...]
 Split = tuple[Array, Array | None]
+
+
+def wheel_moves(channel: WheelChannel, geometry: Array) -> Callable[[Split, Split], float]:
+    """How far two fits of the wheels lie apart `ahead_s` ahead, m (lever arm of half the way)."""
+    drive = channel.drive
+    settings = channel.settings.selection
+    usable = np.isfinite(drive.command_rad_s[:, 0])
+    start, ahead_s = starts_as_far_as(drive.first, usable, settings.ahead_s, channel.settings.grid)
+    ahead = round(ahead_s / GRID_STEP_S)
+
+    def moves(small: Split, big: Split) -> float:
+        if not start.size:
+            return 0.0
+        difference = channel.angles(*big) - channel.angles(*small)
+        step = difference[start + ahead] - difference[start]
+        way = drive.angle_rad[start + ahead] - drive.angle_rad[start]
+        forward = 0.5 * geometry[0] * step.sum(axis=1)
+        yaw = geometry[0] / geometry[1] * (step[:, 1] - step[:, 0])
+        lever = np.abs(0.25 * geometry[0] * way.sum(axis=1)) + abs(geometry[2])
+        return _where_most(forward**2 + (lever * yaw) ** 2, settings.most_moved_share)
+
+    return moves
+
+
+def body_moves(channel: BodyChannel) -> Callable[[Split, Split], float]:
+    """How far two fits of the body lie apart `ahead_s` ahead, m."""
+    drive = channel.drive
+    settings = channel.settings.selection
+    everywhere = np.ones(drive.t_s.size, dtype=bool)
+    start, ahead_s = starts_as_far_as(drive.first, everywhere, settings.ahead_s, channel.settings.grid)
+    heading = np.interp(drive.t_s[start], channel.samples.t_s, channel.measured[:, 2])
+
+    def moves(small: Split, big: Split) -> float:
+        if not start.size:
+            return 0.0
+        ends = []
+        for p, extra in (small, big):
+            ends.append(
+                displacement(
+                    p, drive.first, channel.track(p, extra), channel.carried(p), start, heading, ahead_s,
+                    drive.poses_moved_s,
+                )
+            )  # fmt: skip
+        apart = ends[1] - ends[0]
+        lever = 0.5 * np.hypot(ends[1][:, 0], ends[1][:, 1])
+        return _where_most(apart[:, 0] ** 2 + apart[:, 1] ** 2 + (lever * apart[:, 2]) ** 2, settings.most_moved_share)
+
+    return moves
+
+
+def _where_most(squares: Array, share: float) -> float:
+    """Root of the mean of the largest `share` of some squares (n,)."""
+    few = max(round(share * squares.size), 1)
+    return float(np.sqrt(np.partition(squares, squares.size - few)[-few:].mean()))
 
 
 @dataclass(frozen=True, slots=True)

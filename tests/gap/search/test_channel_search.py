@@ -15,8 +15,8 @@ from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report.page import as_text
-from disco_hw.gap.search.channel_search import responding, search_body, search_wheels, wheel_moves
-from disco_hw.gap.search.selection import Selector
+from disco_hw.gap.search.channel_search import responding, search_body, search_wheels
+from disco_hw.gap.search.selection import Selector, wheel_moves
 from disco_hw.model import Model
 from tests.gap.synthetic import LIMITS
 from tools.gap_logs import simulated_drive

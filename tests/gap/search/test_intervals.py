@@ -20,9 +20,9 @@ from disco_hw.gap.search.analysis import (
     final_fit,
     in_motion,
 )
-from disco_hw.gap.search.channel_search import ChannelResult, body_moves, deviations_of, wheel_moves
+from disco_hw.gap.search.channel_search import ChannelResult, deviations_of
 from disco_hw.gap.search.parts import InParts, in_equal_parts, in_logs, wandered
-from disco_hw.gap.search.selection import Selector
+from disco_hw.gap.search.selection import Selector, body_moves, wheel_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from tests.gap.synthetic import DRIVE, GEOMETRY, LIMITS, NOISE, body_channel, line_of
 

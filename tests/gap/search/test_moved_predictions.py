@@ -8,7 +8,7 @@ import pytest
 
 from disco_hw.gap.data import BODY
 from disco_hw.gap.noise.channels import BodyChannel
-from disco_hw.gap.search.channel_search import _where_most, body_moves, wheel_moves
+from disco_hw.gap.search.selection import _where_most, body_moves, wheel_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from tests.gap.synthetic import NOISE, line_of
 
