@@ -135,7 +135,10 @@ class TransportCounters:
 
 
 class TransmitBusyError(Exception):
-    """The medium has no room for a frame now; the frame was not sent and may be tried again."""
+    """The medium did not take a frame in time; the frame may be tried again.
+
+    On a host that pauses in the middle of a write it may then be sent twice: pyserial looks at its clock last.
+    """
 
 
 class LinkLostError(Exception):

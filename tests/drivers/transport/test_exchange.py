@@ -86,7 +86,9 @@ def exchange():
 
 
 @pytest.fixture
-def transport(line, exchange):
+def transport(line, exchange, monkeypatch):
+    # A write that this host cuts short by a pause counts as not taken, and its frame is sent once more.
+    monkeypatch.setattr("drivers.transport.serial.WRITE_TIMEOUT_S", 10.0)
     medium = SerialMedium(str(line.path), 115_200, exchange=exchange)
     transport = ReconnectingTransport(medium, backoff=FAST, carries_packets=True)
     transport.open()
