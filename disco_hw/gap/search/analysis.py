@@ -163,13 +163,13 @@ OUTSIDE_TESTS: Mapping[frozenset[str], str] = MappingProxyType(
 
 
 def one_encoder(
-    wheels: ChannelEstimates, asymmetry: tuple[float, float], accepted: bool, settings: SelectionSettings
+    wheels: ChannelEstimates, asymmetry: tuple[float, float], settings: SelectionSettings
 ) -> tuple[bool, bool]:
     """Whether an encoder that counts wrong explains the wheels' gains, and whether it is the only explanation.
 
     An encoder's scale shows as a gain of its wheel and, with the opposite sign, as an asymmetry of half the difference;
-    `asymmetry` is what the body alone gives for it, with its standard deviation, `accepted` if that is an effect of its
-    own. Too small for that it still decides where it is clearly what the encoder would make it and clearly not none.
+    `asymmetry` is what the body alone gives for it, with its standard deviation. That decides, however small, where it
+    is clearly what the gains make it and clearly not none: gains that are hardly known agree with every asymmetry.
     """
     gains = [wheels.by_name.get(f"{GAIN}.{side}") for side in ("left", "right")]
     if gains[0] is None or gains[1] is None:
@@ -182,7 +182,7 @@ def one_encoder(
     variance = deviation**2 + spread**2
     possible = abs(value - expected) < settings.encoder_sigmas * variance**0.5
     nats = 0.5 * (value**2 - (value - expected) ** 2) / variance
-    return possible, possible and (accepted or nats > settings.encoder_nats)
+    return possible, possible and nats > settings.encoder_nats
 
 
 def confounded_with(names: tuple[str, ...], encoder_possible: bool) -> dict[str, tuple[str, ...]]:
@@ -262,7 +262,7 @@ def _encoder(
         return False, False
     seen = body.by_name.get(ASYMMETRY_COLUMN)
     asymmetry = _free_asymmetry(analysis.body) if seen is None else (seen.value, seen.deviation)
-    return one_encoder(wheels, asymmetry, seen is not None, analysis.drive.settings.selection)
+    return one_encoder(wheels, asymmetry, analysis.drive.settings.selection)
 
 
 def _free_asymmetry(found: ChannelResult) -> tuple[float, float]:
