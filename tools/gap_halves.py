@@ -32,7 +32,8 @@ from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search import joint_predictions
-from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, estimate_parameters, final_fit
+from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, final_fit
+from disco_hw.gap.search.channel_result import estimate_parameters
 from disco_hw.gap.search.cross_validation import (
     Chain,
     PredictionErrors,

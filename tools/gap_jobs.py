@@ -17,7 +17,7 @@ from disco_hw.drive.scripts import separating
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap import find_gap
 from disco_hw.gap.report.blind_spots import BlindSpot
-from disco_hw.gap.search.analysis import ParameterEstimate
+from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.log.drive import DriveLog
 from disco_hw.model import Model
 from tools import strange_robot

@@ -25,7 +25,8 @@ from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.data.command_timing import command_clock
 from disco_hw.gap.data.gridded_drive import grid_drive, undo_sample_hold
 from disco_hw.gap.data.stamp_clock import StampClock
-from disco_hw.gap.search.channel_search import ChannelResult, search_body, search_wheels
+from disco_hw.gap.search.channel_result import ChannelResult
+from disco_hw.gap.search.channel_search import search_body, search_wheels
 from disco_hw.gap.search.richest_model import LATE, LATE_COLUMNS, OLD_POSE_COLUMNS
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.log.drive import DriveLog

@@ -45,7 +45,8 @@ from disco_hw.gap.report.judge import (
 )
 from disco_hw.gap.report.page import as_text, page
 from disco_hw.gap.search import StagePredictions, joint_predictions, prune, stage_predictions
-from disco_hw.gap.search.analysis import ChannelEstimates, FinalFit, GapAnalysis, final_fit
+from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, final_fit
+from disco_hw.gap.search.channel_result import ChannelEstimates
 from disco_hw.gap.search.channel_search import search_body, search_wheels, that_models_hold
 from disco_hw.gap.search.cross_validation import (
     PredictionErrors,

@@ -15,7 +15,7 @@ from disco_hw.config import load_robot_config
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.errors import InputError, LogError
 from disco_hw.gap.report import STAGES, Doubt, EffectFinding, FleetRow, GapReport, UnnamedFinding
-from disco_hw.gap.search.analysis import ParameterEstimate
+from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.log.importing import write_log
 from disco_hw.model import Model

@@ -29,7 +29,7 @@ from disco_hw.gap.report import (
     UnnamedFinding,
 )
 from disco_hw.gap.report.blind_spots import BlindSpot
-from disco_hw.gap.search.analysis import ParameterEstimate
+from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.inference.checks import CHECKS, Predictive
 from disco_hw.inference.infer_command import GapCheck, InferResult

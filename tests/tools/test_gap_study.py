@@ -9,7 +9,7 @@ from dask.distributed import LocalCluster
 from rich.console import Console
 
 from disco_hw.gap.report.blind_spots import BlindSpot
-from disco_hw.gap.search.analysis import ParameterEstimate
+from disco_hw.gap.search.channel_result import ParameterEstimate
 from tools import gap_jobs, gap_study, gap_tables
 from tools.gap_jobs import Job, Result, jobs
 from tools.gap_logs import NAMED

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from disco_hw.gap.search.analysis import ChannelEstimates, FinalFit, GapAnalysis, ParameterEstimate
-from disco_hw.gap.search.channel_search import UnnamedTerm
+from disco_hw.gap.search.analysis import FinalFit, GapAnalysis
+from disco_hw.gap.search.channel_result import ChannelEstimates, ParameterEstimate, UnnamedTerm
 from disco_hw.gap.search.end_to_end import Freed, JointFit, Part
 from disco_hw.gap.search.selection import Z95
 from disco_hw.model import EffectSetting, Gaussian, Model

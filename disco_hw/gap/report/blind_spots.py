@@ -20,7 +20,8 @@ from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.data.timing import pose_delay_s
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.search.analysis import GapAnalysis
-from disco_hw.gap.search.channel_search import ChannelResult, search_body, search_wheels
+from disco_hw.gap.search.channel_result import ChannelResult
+from disco_hw.gap.search.channel_search import search_body, search_wheels
 from disco_hw.gap.search.least_squares import inverse, sensitivity, solve
 from disco_hw.gap.search.richest_model import CANDIDATES, LATE_COLUMNS, candidates_of
 from disco_hw.gap.settings import GRID_STEP_S

@@ -14,7 +14,7 @@ from disco_hw.gap.report import STAGES, reached_horizon_s
 from disco_hw.gap.report.judge import regimes_of
 from disco_hw.gap.report.misspecification import Regime
 from disco_hw.gap.search.analysis import GapAnalysis
-from disco_hw.gap.search.channel_search import ChannelResult
+from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.settings import GRID_STEP_S
 from disco_hw.reports import BASELINE, FLOOR, MAIN, REFERENCE, png

@@ -29,19 +29,14 @@ from disco_hw.gap.report.misspecification import (
     regimes,
     remaining_disagreements,
 )
-from disco_hw.gap.search.analysis import (
-    ASYMMETRY,
-    ENCODER,
-    GAIN,
-    OUTSIDE_TESTS,
+from disco_hw.gap.search.analysis import ASYMMETRY, ENCODER, GAIN, OUTSIDE_TESTS, FinalFit, GapAnalysis, confounded_with
+from disco_hw.gap.search.channel_result import (
     ChannelEstimates,
-    FinalFit,
-    GapAnalysis,
+    ChannelResult,
     ParameterEstimate,
-    confounded_with,
+    in_equal_parts,
+    in_logs,
 )
-from disco_hw.gap.search.channel_search import ChannelResult
-from disco_hw.gap.search.parts import in_equal_parts, in_logs
 from disco_hw.gap.search.richest_model import candidates_of, parameters_of
 from disco_hw.gap.search.selection import Z95
 from disco_hw.gap.settings import GRID_STEP_S, ReportSettings

@@ -24,7 +24,7 @@ from disco_hw.gap.data import BODY
 from disco_hw.gap.data.gridded_drive import GriddedDrive, GridSamples
 from disco_hw.gap.noise import largest_command_jitter_s
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
-from disco_hw.gap.search.channel_search import ChannelResult
+from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.least_squares import Fit, fit, inverse
 from disco_hw.gap.search.richest_model import CANDIDATES, LATE, indices
 from disco_hw.gap.search.selection import Split, inflation

@@ -32,7 +32,7 @@ from disco_hw.gap.search.analysis import (
     least_evident_first,
     swapped_one,
 )
-from disco_hw.gap.search.channel_search import ChannelResult
+from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.cross_validation import (
     Chain,
     PredictionErrors,

@@ -1,8 +1,7 @@
-"""What the searches of the channels ended with, the one fit of it that every finding rests on, and its intervals.
+"""What the searches of both channels ended with, and the one fit of it that every finding rests on.
 
-95 % intervals and the joint covariance of what was fitted are widened where the noise model is too narrow. Here is
-also what is confounded by algebra: effects with the same equations, and one cause seen in two channels; and an analysis
-that has less than another, or another name in the place of one.
+Here is also what is confounded by algebra: effects with the same equations, and one cause seen in two channels; and an
+analysis that has less than another, or another name in the place of one.
 """
 
 from __future__ import annotations
@@ -17,11 +16,10 @@ from numpy.typing import NDArray
 from disco_hw.effects import Channel
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data.gridded_drive import GriddedDrive
-from disco_hw.gap.search.channel_search import ChannelResult, deviations_of
+from disco_hw.gap.search.channel_result import ChannelEstimates, ChannelResult, ParameterEstimate, estimate_parameters
 from disco_hw.gap.search.least_squares import Fit, fit
-from disco_hw.gap.search.parts import wandered
-from disco_hw.gap.search.richest_model import CANDIDATES, LATE, indices
-from disco_hw.gap.search.selection import Z95, inflation, interval_inflation
+from disco_hw.gap.search.richest_model import LATE, indices
+from disco_hw.gap.search.selection import inflation
 from disco_hw.gap.settings import SelectionSettings
 
 Array = NDArray[np.float64]
@@ -33,70 +31,6 @@ _OF_TURNING = tuple(
     if effect.uses_geometry and effect.channel is Channel.COMMAND_TO_WHEEL
     for column in effect.columns
 )
-_RISE = 0.5 * Z95**2
-
-
-@dataclass(frozen=True, slots=True)
-class ParameterEstimate:
-    """A parameter with its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
-
-    @property
-    def deviation(self) -> float:
-        """Standard deviation that the interval stands for."""
-        return max((self.high - self.low) / (2.0 * Z95), 1e-9)
-
-
-@dataclass(frozen=True)
-class ChannelEstimates:
-    """Parameters of a channel by full name, and the covariance (A, A) of the fitted ones in order of `fitted`."""
-
-    by_name: dict[str, ParameterEstimate]
-    fitted: tuple[str, ...]
-    covariance: Array
-
-
-def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
-    """Intervals of all parameters that a channel's accepted set frees: where the next drive's values are expected."""
-    best, channel = found.told, found.selector.channel
-    columns = channel.layout.columns
-    factors = np.array([interval_inflation(best, channel, (index,)) for index in best.active])
-    covariance = best.covariance() * np.sqrt(np.outer(factors, factors))
-    own = np.maximum(np.diag(covariance), 1e-300)
-    wandering, apart = wandered(found), _weightings_apart(found)
-    more = np.array(
-        [(wandering.get(columns[index], 0.0) + apart[place]) / own[place] for place, index in enumerate(best.active)]
-    )
-    covariance = covariance * np.sqrt(np.outer(1.0 + more, 1.0 + more))
-    deviations = np.sqrt(np.diag(covariance))
-    by_name = {
-        columns[index]: ParameterEstimate(
-            float(best.vector[index]), *_around(float(best.vector[index]), float(deviation))
-        )
-        for index, deviation in zip(best.active, deviations, strict=True)
-    }
-    for name in found.names:
-        profile = CANDIDATES[name].profile
-        if profile is not None:
-            by_name[profile.column] = _profiled(found, profile.column, profile.refine)
-    return ChannelEstimates(by_name, tuple(columns[index] for index in best.active), covariance)
-
-
-def _weightings_apart(found: ChannelResult) -> Array:
-    """Squares, (A,), of how far the two weightings of the wheels' errors lie apart, beyond what chance does.
-
-    Were the model right, both would find the same, and the difference vary by the difference of their variances
-    (Hausman, 1978); as it is not, either finds what its own mixture of slow and fast wheels makes of it.
-    """
-    best, evenly = found.told, found.evenly
-    if evenly is None:
-        return np.zeros(len(best.active))
-    chosen = list(best.active)
-    by_chance = np.abs(deviations_of(evenly, found.channel) ** 2 - deviations_of(found.fit, found.channel) ** 2)
-    return np.asarray(np.maximum((evenly.vector - found.fit.vector)[chosen] ** 2 - by_chance, 0.0))
 
 
 def in_motion(wheels: ChannelEstimates, body: ChannelEstimates) -> ChannelEstimates:
@@ -109,44 +43,11 @@ def in_motion(wheels: ChannelEstimates, body: ChannelEstimates) -> ChannelEstima
     moved = {name: wheels.by_name[name] for name in _OF_TURNING if name in wheels.by_name}
     added = np.array([moved[name].value if name in moved else 0.0 for name in wheels.fitted])
     by_name = {
-        name: ParameterEstimate(
-            each.value, *_around(each.value, float(np.hypot(each.deviation, each.value * of_ratio**0.5)))
-        )
+        name: ParameterEstimate.around(each.value, float(np.hypot(each.deviation, each.value * of_ratio**0.5)))
         for name, each in moved.items()
     }
     covariance = wheels.covariance + of_ratio * np.outer(added, added)
     return ChannelEstimates({**wheels.by_name, **by_name}, wheels.fitted, covariance)
-
-
-def _around(value: float, deviation: float) -> tuple[float, float]:
-    return value - Z95 * deviation, value + Z95 * deviation
-
-
-def _profiled(found: ChannelResult, column: str, step: float) -> ParameterEstimate:
-    """Interval in which the profile of the cost rises by no more than 1.92 nats, or that of how blocks scatter."""
-    selector, best = found.selector, found.fit
-    channel = selector.channel
-    place = channel.layout.place[column]
-    active = indices(channel, found.names)
-    ends = []
-    for sign in (-1.0, 1.0):
-        reach = step
-        while True:
-            vector = best.vector.copy()
-            vector[place] += sign * reach
-            there = fit(channel, vector, active, 1)
-            if there.cost > best.cost + _RISE or reach > 64.0 * step:
-                break
-            reach *= 2.0
-        ends.append(there)
-    value, low, high = (float(each.vector[place]) for each in (best, *ends))
-    # Between the ends of the interval it is a parameter as any other, where steps smaller than those may do nothing.
-    slope = np.column_stack([best.jacobian, (ends[1].residual - ends[0].residual) / (high - low)])
-    precision = None if best.precision is None else np.append(best.precision, 0.0)
-    free = replace(best, active=(*best.active, place), slope=slope, precision=precision)
-    deviation = float(free.covariance()[-1, -1] * interval_inflation(free, channel, (place,))) ** 0.5
-    least, most = _around(value, deviation)
-    return ParameterEstimate(value, min(low, least), max(high, most))
 
 
 _MIMICS = {name: effect.mimics for name, effect in REGISTRY.items() if effect.mimics is not None}

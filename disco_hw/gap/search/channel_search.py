@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from itertools import chain
 
 import numpy as np
@@ -18,6 +17,7 @@ from disco_hw.gap.noise import learn_body_noise, learn_wheel_noise
 from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise, whiten_wheels
+from disco_hw.gap.search.channel_result import ChannelResult, UnnamedTerm, terms_are_known
 from disco_hw.gap.search.least_squares import Fit, fit, inverse
 from disco_hw.gap.search.richest_model import (
     LATE,
@@ -33,102 +33,17 @@ from disco_hw.gap.search.richest_model import (
     with_delay,
 )
 from disco_hw.gap.search.selection import (
-    EffectEvidence,
     Names,
     Selector,
     Thresholds,
     body_moves,
     compare,
-    inflation,
     wheel_moves,
 )
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms, body_terms, places, places_near, wheel_terms
 from disco_hw.gap.settings import SelectionSettings
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class UnnamedTerm:
-    """An accepted unnamed term: how it is written, with its coefficient, its evidence, and the term itself."""
-
-    form: str
-    evidence: EffectEvidence
-    term: Term
-
-
-@dataclass(frozen=True)
-class ChannelResult:
-    """What a channel's search ended with: its selector (noise held, all fits kept), accepted effects and terms.
-
-    `richest` (n,): whitened residuals of the channel's richest model, which had `richest_parameters`. `either`:
-    effects that explain what a patch of the floor does as well.
-    """
-
-    selector: Selector
-    names: Names
-    channel: WheelChannel | BodyChannel
-    unnamed: tuple[UnnamedTerm, ...] = ()
-    plain: Selector | None = None
-    richest: Array | None = None
-    richest_parameters: int = 0
-    either: tuple[str, ...] = ()
-
-    @property
-    def fit(self) -> Fit:
-        """The fit of the accepted effects and terms."""
-        return self.selector.exact(self.names)
-
-    @cached_property
-    def evenly(self) -> Fit | None:
-        """The accepted set as it fits errors that are alike at every speed; None where there are no other weights."""
-        return _evenly(self)
-
-    @cached_property
-    def told(self) -> Fit:
-        """The fit that values are told of and predictions made with: where the noise model does not hold, another."""
-        return _told(self)
-
-    @property
-    def base(self) -> Fit:
-        """The fit without anything that is missing."""
-        selector = self.plain or self.selector
-        return selector.exact(selector.given)
-
-
-def _evenly(found: ChannelResult) -> Fit | None:
-    """The accepted set, fitted to errors that are alike at every speed; None but of wheels."""
-    best, channel = found.fit, found.channel
-    if not isinstance(channel, WheelChannel) or not best.active:
-        return None
-    terms, vector = tuple(one.term for one in found.unnamed), best.vector
-    for _ in range(channel.settings.selection.even_rounds):
-        plainly = channel.evenly(*found.selector.channel.split(vector))
-        even: ResidualChannel = WithTerms.of(plainly, terms) if terms else plainly
-        other = fit(even, vector, best.active)
-        vector = other.vector
-    return other
-
-
-def _told(found: ChannelResult) -> Fit:
-    """The accepted set as it was fitted, or to errors that are alike at every speed, if blocks agree better on that.
-
-    The noise of wheels is taken to grow with their speed, and weighs slow ones most. What the accepted set cannot
-    describe does not: then values are as good as least squares of speeds make them, by the scatter between blocks
-    (sandwich variance; White, 1982).
-    """
-    best, other = found.fit, found.evenly
-    if other is None:
-        return best
-    settings = found.channel.settings.selection
-    ratio = np.mean(np.log(deviations_of(other, found.channel)) - np.log(deviations_of(best, found.channel)))
-    return other if ratio < math.log(settings.clearly_closer) else best
-
-
-def deviations_of(best: Fit, channel: ResidualChannel) -> Array:
-    """Standard deviations of what was fitted, (A,), by how blocks of time scatter."""
-    factors = [inflation(best, channel, (index,)) for index in best.active]
-    return np.asarray(np.sqrt(np.maximum(np.diag(best.covariance()) * factors, 1e-300)))
 
 
 def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Names = ()) -> ChannelResult:
@@ -401,8 +316,8 @@ def _with_one_more(
 
 
 def _with_term(found: ChannelResult, term: Term, tried: int) -> tuple[ChannelResult | None, bool]:
-    """With one more term, which was chosen among `tried`, None if it is not worth that; and whether, if it is a patch,
-    it is worth that without the block that says most.
+    """With one more term, which was chosen among `tried`, None if it is not worth that or a term is not known then; and
+    whether, if it is a patch, it is worth that without the block that says most.
     """
     plain, small = found.plain or found.selector, found.fit
     terms = (*(one.term for one in found.unnamed), term)
@@ -425,7 +340,8 @@ def _with_term(found: ChannelResult, term: Term, tried: int) -> tuple[ChannelRes
         names = selector.select(found.names)
     proofs = (*(one.evidence for one in found.unnamed), proof)
     accepted = tuple(UnnamedTerm(each.form, evidence, each) for each, evidence in zip(terms, proofs, strict=True))
-    return replace(found, selector=selector, names=names, unnamed=accepted, plain=plain), True
+    larger = replace(found, selector=selector, names=names, unnamed=accepted, plain=plain)
+    return larger if terms_are_known(larger) else None, True
 
 
 def _extended(plain: Selector, channel: WithTerms) -> Array:

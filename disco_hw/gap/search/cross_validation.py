@@ -18,7 +18,8 @@ from disco_hw.gap.data.free_runs import displacement, read_angles, run_body, sta
 from disco_hw.gap.noise import SensorNoise
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel, total_perturbation
 from disco_hw.gap.search.analysis import GapAnalysis
-from disco_hw.gap.search.channel_search import ChannelResult, responding
+from disco_hw.gap.search.channel_result import ChannelResult
+from disco_hw.gap.search.channel_search import responding
 from disco_hw.gap.search.least_squares import Fit, by_block, inverse, known
 from disco_hw.gap.search.richest_model import LATE
 from disco_hw.gap.settings import GRID_STEP_S, GapSettings, PredictionSettings

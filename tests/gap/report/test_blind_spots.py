@@ -10,7 +10,7 @@ from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report.blind_spots import BlindSpot, blind_spots, proved, with_effect, with_size
-from disco_hw.gap.search.channel_search import ChannelResult
+from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.richest_model import candidates_of
 from disco_hw.gap.search.selection import Selector, body_moves, wheel_moves
 from tests.gap.synthetic import GEOMETRY, LIMITS, body_channel, line_of

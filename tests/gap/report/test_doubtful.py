@@ -6,7 +6,7 @@ import pytest
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report import EffectFinding
 from disco_hw.gap.report.judge import Measured, _confirmed, doubt_of, sort_out
-from disco_hw.gap.search.analysis import ParameterEstimate
+from disco_hw.gap.search.channel_result import ParameterEstimate
 from tests.gap.synthetic import line_of
 
 GEOMETRY = (0.06, 0.4)

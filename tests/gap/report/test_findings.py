@@ -11,7 +11,7 @@ from disco_hw.gap import offered_stage
 from disco_hw.gap.report import STAGES, AcrossLogs, EffectFinding, GapReport, Provenance, UnnamedFinding
 from disco_hw.gap.report.blind_spots import BlindSpot
 from disco_hw.gap.report.page import answer, as_text, page, sentence
-from disco_hw.gap.search.analysis import ParameterEstimate
+from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.model import Model

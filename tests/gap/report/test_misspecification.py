@@ -18,7 +18,7 @@ from disco_hw.gap.report.misspecification import (
     disputed_names,
     misspecified_effects,
 )
-from disco_hw.gap.search.channel_search import ChannelResult, UnnamedTerm
+from disco_hw.gap.search.channel_result import ChannelResult, UnnamedTerm
 from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.selection import EffectEvidence, Selector, body_moves
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms, motion

@@ -10,7 +10,6 @@ from disco_hw.gap.search import analysis as analysed
 from disco_hw.gap.search.analysis import (
     FinalFit,
     GapAnalysis,
-    ParameterEstimate,
     _encoder,
     _free_asymmetry,
     _with_encoder,
@@ -18,6 +17,7 @@ from disco_hw.gap.search.analysis import (
     final_fit,
     one_encoder,
 )
+from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from tests.gap.search.test_lacking import analysis_of, found
 

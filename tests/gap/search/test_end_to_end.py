@@ -11,7 +11,7 @@ from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report.amend import at_joint_fit
 from disco_hw.gap.search import _on_top
-from disco_hw.gap.search.analysis import ChannelEstimates, ParameterEstimate
+from disco_hw.gap.search.channel_result import ChannelEstimates, ParameterEstimate
 from disco_hw.gap.search.cross_validation import Chain, PredictionErrors, chain_wheels, smoothed_poses
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
 from disco_hw.gap.settings import DEFAULT_SETTINGS

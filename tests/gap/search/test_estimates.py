@@ -5,10 +5,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from disco_hw.gap.search import analysis, parts
-from disco_hw.gap.search.analysis import estimate_parameters
+from disco_hw.gap.search import channel_result
+from disco_hw.gap.search.channel_result import (
+    InParts,
+    ParameterEstimate,
+    estimate_parameters,
+    in_equal_parts,
+    in_logs,
+    in_parts,
+    terms_are_known,
+    wandered,
+)
 from disco_hw.gap.search.least_squares import Fit
-from disco_hw.gap.search.parts import InParts, in_equal_parts, in_logs, in_parts, wandered
 from disco_hw.gap.settings import DEFAULT_SETTINGS, FitSettings, GapSettings
 
 
@@ -17,9 +25,9 @@ def test_an_interval_is_widened_by_how_blocks_scatter_and_by_how_a_value_wanders
     told = SimpleNamespace(vector=np.array([7.0, 5.0, 3.0]), active=(2, 0), covariance=lambda: covariance)
     channel = SimpleNamespace(layout=SimpleNamespace(columns=("a", "b", "c")))
     found = SimpleNamespace(told=told, selector=SimpleNamespace(channel=channel), names=())
-    monkeypatch.setattr(analysis, "interval_inflation", lambda best, of, active: {2: 4.0, 0: 1.44}[active[0]])
-    monkeypatch.setattr(analysis, "wandered", lambda of: {"c": 6.0})
-    monkeypatch.setattr(analysis, "_weightings_apart", lambda of: np.array([3.0, 0.0]))
+    monkeypatch.setattr(channel_result, "interval_inflation", lambda best, of, active: {2: 4.0, 0: 1.44}[active[0]])
+    monkeypatch.setattr(channel_result, "wandered", lambda of: {"c": 6.0})
+    monkeypatch.setattr(channel_result, "_weightings_apart", lambda of: np.array([3.0, 0.0]))
     estimates = estimate_parameters(found)
     # Of `c` 4 x 4 and 9 beside, of `a` 9 x 1.44.
     deviations = np.sqrt([16.0 + 9.0, 12.96])
@@ -33,15 +41,37 @@ def test_an_interval_is_widened_by_how_blocks_scatter_and_by_how_a_value_wanders
         )
 
 
+@pytest.mark.parametrize(
+    ("intervals", "known"),
+    [
+        ({"term0": (0.1, 0.2), "term1": (-0.2, -0.1), "term1.1": (-0.1, 0.1)}, True),
+        ({"term0": (0.1, 0.2), "term1": (-0.1, 0.1), "term1.1": (0.1, 0.2)}, True),
+        ({"term0": (0.1, 0.2), "term1": (-0.1, 0.1), "term1.1": (0.0, 0.2)}, False),
+        ({"term0": (-0.2, 0.0), "term1": (0.1, 0.2), "term1.1": (0.1, 0.2)}, False),
+    ],
+)
+def test_a_term_is_known_if_one_of_its_coefficients_surely_is_not_none(monkeypatch, intervals, known):
+    by_name = {"a": ParameterEstimate(0.0, -1.0, 1.0)}
+    by_name |= {name: ParameterEstimate(0.5 * (low + high), low, high) for name, (low, high) in intervals.items()}
+    monkeypatch.setattr(channel_result, "estimate_parameters", lambda of: SimpleNamespace(by_name=by_name))
+    features = [np.zeros((3, 2))]
+    terms = [SimpleNamespace(term=SimpleNamespace(features=features * count)) for count in (1, 2)]
+    inner = SimpleNamespace(layout=SimpleNamespace(columns=("a", "b")))
+    channel = SimpleNamespace(layout=SimpleNamespace(columns=("a", "b", "term0", "term1", "term1.1")))
+    found = SimpleNamespace(channel=inner, selector=SimpleNamespace(channel=channel), unnamed=terms)
+    assert terms_are_known(found) is known
+    assert terms_are_known(SimpleNamespace(channel=inner, selector=found.selector, unnamed=()))
+
+
 def test_two_weightings_lie_apart_by_what_is_beyond_the_difference_of_their_variances(monkeypatch):
     told = SimpleNamespace(active=(2, 0, 1), vector=np.array([1.0, 2.0, 3.0]))
     evenly = SimpleNamespace(active=(2, 0, 1), vector=np.array([2.0, 0.0, 7.0]))
     deviations = {id(evenly): np.array([3.0, 1.0, 1.0]), id(told): np.array([2.0, 2.0, 1.0])}
-    monkeypatch.setattr(analysis, "deviations_of", lambda best, channel: deviations[id(best)])
+    monkeypatch.setattr(channel_result, "deviations_of", lambda best, channel: deviations[id(best)])
     found = SimpleNamespace(told=told, fit=told, evenly=evenly, channel=None)
     # 16 beyond 9 - 4, 1 within 4 - 1, and 4 beyond none.
-    assert analysis._weightings_apart(found).tolist() == [11.0, 0.0, 4.0]
-    assert analysis._weightings_apart(SimpleNamespace(told=told, evenly=None)).tolist() == [0.0] * 3
+    assert channel_result._weightings_apart(found).tolist() == [11.0, 0.0, 4.0]
+    assert channel_result._weightings_apart(SimpleNamespace(told=told, evenly=None)).tolist() == [0.0] * 3
 
 
 @pytest.mark.parametrize("step", [0.5, 2.0])
@@ -58,14 +88,14 @@ def test_a_profile_reaches_to_where_the_cost_has_risen_or_blocks_scatter(monkeyp
         assert (active, iterations, vector[0]) == (("freed",), 1, 3.0)
         return at((vector[1] - 10.0) / step)
 
-    monkeypatch.setattr(analysis, "fit", fit)
-    monkeypatch.setattr(analysis, "indices", lambda channel, names: ("freed",))
+    monkeypatch.setattr(channel_result, "fit", fit)
+    monkeypatch.setattr(channel_result, "indices", lambda channel, names: ("freed",))
     monkeypatch.setattr(
-        analysis, "interval_inflation", lambda free, channel, of: {((0, 1), (1,)): 4.0}[free.active, of]
+        channel_result, "interval_inflation", lambda free, channel, of: {((0, 1), (1,)): 4.0}[free.active, of]
     )
     channel = SimpleNamespace(layout=SimpleNamespace(place={"x.at": 1}))
     found = SimpleNamespace(selector=SimpleNamespace(channel=channel), fit=at(0.0), names=())
-    one = analysis._profiled(found, "x.at", step)
+    one = channel_result._profiled(found, "x.at", step)
     # Twice as far each time, beyond 64 steps no more; or 1.96 deviations, which are twice those of the noise model.
     assert (one.low, one.value, one.high) == pytest.approx((10.0 + ends[0] * step, 10.0, 10.0 + ends[1] * step))
 
@@ -81,7 +111,7 @@ def test_a_value_wanders_by_what_halves_surely_differ_or_by_the_most_that_shorte
     sure, unsure = (InParts(np.array([0.0, of * 2.0**0.5]), np.ones(2)) for of in (-3.1, 2.9))
     quarters = InParts(np.array([0.0, 4.0, 0.0, 4.0]), np.ones(4))
     shown = {2: {"sure": sure, "unsure": unsure, "both": sure}, 4: {"both": quarters, "short": quarters}}
-    monkeypatch.setattr(parts, "in_equal_parts", lambda found, count: shown[count])
+    monkeypatch.setattr(channel_result, "in_equal_parts", lambda found, count: shown[count])
     # Squares of half their distance, twice, less one expected.
     of_sure, of_unsure = 3.1**2 - 1.0, 2.9**2 - 1.0
     told = wandered(of_blocks(np.arange(12)))
@@ -95,14 +125,14 @@ def test_a_value_wanders_by_what_halves_surely_differ_or_by_the_most_that_shorte
 
 
 def test_parts_of_a_log_are_as_long_as_each_other(monkeypatch):
-    monkeypatch.setattr(parts, "in_parts", lambda found, of: of.tolist())
+    monkeypatch.setattr(channel_result, "in_parts", lambda found, of: of.tolist())
     # Eight blocks with something in them.
     assert in_equal_parts(of_blocks([0, 0, 1, 3, 4, 4, 5, 6, 8, 9]), 2) == [0, 0, 0, 0, 1, 1, 1, 1]
     assert in_equal_parts(of_blocks(np.arange(8)), 3) == [0, 0, 0, 1, 1, 1, 2, 2]
 
 
 def test_a_block_belongs_to_the_log_in_which_it_ends(monkeypatch):
-    monkeypatch.setattr(parts, "in_parts", lambda found, of: of.tolist())
+    monkeypatch.setattr(channel_result, "in_parts", lambda found, of: of.tolist())
     # Blocks of 3 s.
     assert in_logs(of_blocks(np.arange(12)), [0.0, 30.0]) == [1] * 10 + [2] * 2
     assert in_logs(of_blocks(np.arange(4)), [0.0, 8.9]) == [1, 1, 2, 2]

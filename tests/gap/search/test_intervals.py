@@ -12,16 +12,18 @@ from disco_hw.gap.data.free_runs import read_angles
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report.judge import across_logs, drifting_parameters
-from disco_hw.gap.search.analysis import (
+from disco_hw.gap.search.analysis import GapAnalysis, final_fit, in_motion
+from disco_hw.gap.search.channel_result import (
     ChannelEstimates,
-    GapAnalysis,
+    ChannelResult,
+    InParts,
     ParameterEstimate,
+    deviations_of,
     estimate_parameters,
-    final_fit,
-    in_motion,
+    in_equal_parts,
+    in_logs,
+    wandered,
 )
-from disco_hw.gap.search.channel_search import ChannelResult, deviations_of
-from disco_hw.gap.search.parts import InParts, in_equal_parts, in_logs, wandered
 from disco_hw.gap.search.selection import Selector, body_moves, wheel_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from tests.gap.synthetic import DRIVE, GEOMETRY, LIMITS, NOISE, body_channel, line_of

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from disco_hw.gap.search.analysis import GapAnalysis, lacking, lacking_one, least_evident_first, swapped_one
-from disco_hw.gap.search.channel_search import ChannelResult, UnnamedTerm
+from disco_hw.gap.search.channel_result import ChannelResult, UnnamedTerm
 
 SCORES = {
     "motor_lag": 90.0, "deadband": 40.0, "stiction": 60.0, "turn_slip": 50.0, "slope": 30.0, "side_slip": 5.0,

@@ -13,7 +13,7 @@ from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.report.judge import left_out_notes
 from disco_hw.gap.search import joint_predictions
 from disco_hw.gap.search.analysis import GapAnalysis, final_fit
-from disco_hw.gap.search.channel_search import ChannelResult
+from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.cross_validation import PredictionErrors, within_one_standard_error
 from disco_hw.gap.search.selection import Selector, body_moves
 from disco_hw.model import Model

@@ -11,15 +11,8 @@ from disco_hw.gap.data.free_runs import run_wheels
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search import channel_search
-from disco_hw.gap.search.channel_search import (
-    ChannelResult,
-    judged,
-    responding,
-    search_body,
-    search_wheels,
-    stamped,
-    timed,
-)
+from disco_hw.gap.search.channel_result import ChannelResult
+from disco_hw.gap.search.channel_search import judged, responding, search_body, search_wheels, stamped, timed
 from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.richest_model import LATE, LATE_COLUMNS, LATE_STARTS_S, indices, smooth_of
 from disco_hw.gap.search.selection import Selector

@@ -12,7 +12,7 @@ from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search import joint_predictions, stage_predictions
 from disco_hw.gap.search.analysis import GapAnalysis, final_fit
-from disco_hw.gap.search.channel_search import ChannelResult
+from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.selection import Selector, body_moves, wheel_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from tests.gap.synthetic import DRIVE, GEOMETRY, LIMITS, NOISE, line_of

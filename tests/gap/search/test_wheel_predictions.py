@@ -13,7 +13,7 @@ from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report import GapReport
 from disco_hw.gap.report.page import answer, as_text, page
 from disco_hw.gap.search.analysis import GapAnalysis, final_fit
-from disco_hw.gap.search.channel_search import ChannelResult
+from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.cross_validation import _errors, only_timed, wheel_table
 from disco_hw.gap.search.selection import Selector, wheel_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S

@@ -1,0 +1,318 @@
+"""What the search of a channel ended with: its fits, parameters with their intervals, and what parts of a log say.
+
+95 % intervals and the joint covariance of what was fitted are widened where the noise model is too narrow, and by how
+far another drive's values may lie from those of this one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
+from disco_hw.gap.search.least_squares import Fit, by_block, fit, inverse
+from disco_hw.gap.search.richest_model import CANDIDATES, indices
+from disco_hw.gap.search.selection import Z95, EffectEvidence, Names, Selector, inflation, interval_inflation
+from disco_hw.gap.search.unnamed_terms import Term, WithTerms
+
+Array = NDArray[np.float64]
+
+_RISE = 0.5 * Z95**2
+
+
+@dataclass(frozen=True)
+class UnnamedTerm:
+    """An accepted unnamed term: how it is written, with its coefficient, its evidence, and the term itself."""
+
+    form: str
+    evidence: EffectEvidence
+    term: Term
+
+
+@dataclass(frozen=True)
+class ChannelResult:
+    """What a channel's search ended with: its selector (noise held, all fits kept), accepted effects and terms.
+
+    `richest` (n,): whitened residuals of the channel's richest model, which had `richest_parameters`. `either`:
+    effects that explain what a patch of the floor does as well.
+    """
+
+    selector: Selector
+    names: Names
+    channel: WheelChannel | BodyChannel
+    unnamed: tuple[UnnamedTerm, ...] = ()
+    plain: Selector | None = None
+    richest: Array | None = None
+    richest_parameters: int = 0
+    either: tuple[str, ...] = ()
+
+    @property
+    def fit(self) -> Fit:
+        """The fit of the accepted effects and terms."""
+        return self.selector.exact(self.names)
+
+    @cached_property
+    def evenly(self) -> Fit | None:
+        """The accepted set as it fits errors that are alike at every speed; None where there are no other weights."""
+        return _evenly(self)
+
+    @cached_property
+    def told(self) -> Fit:
+        """The fit that values are told of and predictions made with: where the noise model does not hold, another."""
+        return _told(self)
+
+    @property
+    def base(self) -> Fit:
+        """The fit without anything that is missing."""
+        selector = self.plain or self.selector
+        return selector.exact(selector.given)
+
+
+def _evenly(found: ChannelResult) -> Fit | None:
+    """The accepted set, fitted to errors that are alike at every speed; None but of wheels."""
+    best, channel = found.fit, found.channel
+    if not isinstance(channel, WheelChannel) or not best.active:
+        return None
+    terms, vector = tuple(one.term for one in found.unnamed), best.vector
+    for _ in range(channel.settings.selection.even_rounds):
+        plainly = channel.evenly(*found.selector.channel.split(vector))
+        even: ResidualChannel = WithTerms.of(plainly, terms) if terms else plainly
+        other = fit(even, vector, best.active)
+        vector = other.vector
+    return other
+
+
+def _told(found: ChannelResult) -> Fit:
+    """The accepted set as it was fitted, or to errors that are alike at every speed, if blocks agree better on that.
+
+    The noise of wheels is taken to grow with their speed, and weighs slow ones most. What the accepted set cannot
+    describe does not: then values are as good as least squares of speeds make them, by the scatter between blocks
+    (sandwich variance; White, 1982).
+    """
+    best, other = found.fit, found.evenly
+    if other is None:
+        return best
+    settings = found.channel.settings.selection
+    ratio = np.mean(np.log(deviations_of(other, found.channel)) - np.log(deviations_of(best, found.channel)))
+    return other if ratio < math.log(settings.clearly_closer) else best
+
+
+def deviations_of(best: Fit, channel: ResidualChannel) -> Array:
+    """Standard deviations of what was fitted, (A,), by how blocks of time scatter."""
+    factors = [inflation(best, channel, (index,)) for index in best.active]
+    return np.asarray(np.sqrt(np.maximum(np.diag(best.covariance()) * factors, 1e-300)))
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterEstimate:
+    """A parameter with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+    @classmethod
+    def around(cls, value: float, deviation: float) -> ParameterEstimate:
+        """One of a normal distribution."""
+        return cls(value, value - Z95 * deviation, value + Z95 * deviation)
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation that the interval stands for."""
+        return max((self.high - self.low) / (2.0 * Z95), 1e-9)
+
+
+@dataclass(frozen=True)
+class ChannelEstimates:
+    """Parameters of a channel by full name, and the covariance (A, A) of the fitted ones in order of `fitted`."""
+
+    by_name: dict[str, ParameterEstimate]
+    fitted: tuple[str, ...]
+    covariance: Array
+
+
+def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
+    """Intervals of all parameters that a channel's accepted set frees: where the next drive's values are expected."""
+    best, channel = found.told, found.selector.channel
+    columns = channel.layout.columns
+    factors = np.array([interval_inflation(best, channel, (index,)) for index in best.active])
+    covariance = best.covariance() * np.sqrt(np.outer(factors, factors))
+    own = np.maximum(np.diag(covariance), 1e-300)
+    wandering, apart = wandered(found), _weightings_apart(found)
+    more = np.array(
+        [(wandering.get(columns[index], 0.0) + apart[place]) / own[place] for place, index in enumerate(best.active)]
+    )
+    covariance = covariance * np.sqrt(np.outer(1.0 + more, 1.0 + more))
+    deviations = np.sqrt(np.diag(covariance))
+    by_name = {
+        columns[index]: ParameterEstimate.around(float(best.vector[index]), float(deviation))
+        for index, deviation in zip(best.active, deviations, strict=True)
+    }
+    for name in found.names:
+        profile = CANDIDATES[name].profile
+        if profile is not None:
+            by_name[profile.column] = _profiled(found, profile.column, profile.refine)
+    return ChannelEstimates(by_name, tuple(columns[index] for index in best.active), covariance)
+
+
+def terms_are_known(found: ChannelResult) -> bool:
+    """Whether of every unnamed term the interval of a coefficient leaves out 0.
+
+    A term that may be none tells nothing, and beside it what has a name is known no better.
+    """
+    by_name = estimate_parameters(found).by_name
+    place = len(found.channel.layout.columns)
+    for one in found.unnamed:
+        own = found.selector.channel.layout.columns[place : place + len(one.term.features)]
+        if all(by_name[column].low <= 0.0 <= by_name[column].high for column in own):
+            return False
+        place += len(own)
+    return True
+
+
+def _weightings_apart(found: ChannelResult) -> Array:
+    """Squares, (A,), of how far the two weightings of the wheels' errors lie apart, beyond what chance does.
+
+    Were the model right, both would find the same, and the difference vary by the difference of their variances
+    (Hausman, 1978); as it is not, either finds what its own mixture of slow and fast wheels makes of it.
+    """
+    best, evenly = found.told, found.evenly
+    if evenly is None:
+        return np.zeros(len(best.active))
+    chosen = list(best.active)
+    by_chance = np.abs(deviations_of(evenly, found.channel) ** 2 - deviations_of(found.fit, found.channel) ** 2)
+    return np.asarray(np.maximum((evenly.vector - found.fit.vector)[chosen] ** 2 - by_chance, 0.0))
+
+
+def _profiled(found: ChannelResult, column: str, step: float) -> ParameterEstimate:
+    """Interval in which the profile of the cost rises by no more than 1.92 nats, or that of how blocks scatter."""
+    selector, best = found.selector, found.fit
+    channel = selector.channel
+    place = channel.layout.place[column]
+    active = indices(channel, found.names)
+    ends = []
+    for sign in (-1.0, 1.0):
+        reach = step
+        while True:
+            vector = best.vector.copy()
+            vector[place] += sign * reach
+            there = fit(channel, vector, active, 1)
+            if there.cost > best.cost + _RISE or reach > 64.0 * step:
+                break
+            reach *= 2.0
+        ends.append(there)
+    value, low, high = (float(each.vector[place]) for each in (best, *ends))
+    # Between the ends of the interval it is a parameter as any other, where steps smaller than those may do nothing.
+    slope = np.column_stack([best.jacobian, (ends[1].residual - ends[0].residual) / (high - low)])
+    precision = None if best.precision is None else np.append(best.precision, 0.0)
+    free = replace(best, active=(*best.active, place), slope=slope, precision=precision)
+    deviation = float(free.covariance()[-1, -1] * interval_inflation(free, channel, (place,))) ** 0.5
+    normal = ParameterEstimate.around(value, deviation)
+    return ParameterEstimate(value, min(low, normal.low), max(high, normal.high))
+
+
+@dataclass(frozen=True, slots=True)
+class InParts:
+    """A parameter in the parts of a log, in order, with the standard deviation of each, (K,)."""
+
+    values: Array
+    deviations: Array
+
+    @property
+    def variance_between(self) -> float:
+        """Variance of the parameter from part to part beyond that of its estimates (DerSimonian and Laird, 1986)."""
+        weight = self.deviations**-2.0
+        total = float(weight.sum())
+        mean = float(weight @ self.values) / total
+        excess = float(weight @ (self.values - mean) ** 2) - (self.values.size - 1)
+        return max(excess, 0.0) / (total - float((weight**2).sum()) / total)
+
+    @property
+    def variance_to_next(self) -> float:
+        """Variance of how far the next log of the same length lies from this one, of what wanders at random.
+
+        The parts of one log are nearer to one another in time than two drives: where q is the variance by which a
+        random walk moves over a log, means over its parts vary by q / 6, into however many it is divided, and the means
+        of two such logs in a row differ by 2 q / 3.
+        """
+        return 4.0 * self.variance_between
+
+    def apart(self, one: int, other: int) -> float:
+        """How far two parts lie apart, in standard deviations of the difference."""
+        return float((self.values[other] - self.values[one]) / np.hypot(self.deviations[one], self.deviations[other]))
+
+
+def wandered(found: ChannelResult) -> dict[str, float]:
+    """Variance of each parameter from this log to the next, by full name.
+
+    What halves surely differ by goes on from drive to drive, as a random walk does. Of what changes more quickly a
+    drive shows the mean: what shorter parts differ by counts once, as what may be chance does.
+    """
+    settings = found.channel.settings.report
+    variance: dict[str, float] = {}
+    for count in (2, settings.short_parts):
+        for name, one in in_equal_parts(found, count).items():
+            goes_on = count == 2 and abs(one.apart(0, 1)) > settings.drift_sigmas
+            apart = one.variance_to_next if goes_on else one.variance_between
+            variance[name] = max(apart, variance.get(name, 0.0))
+    return variance
+
+
+def in_equal_parts(found: ChannelResult, count: int) -> dict[str, InParts]:
+    """What each of so many parts of a log, of equal length, says of the parameters."""
+    blocks = np.unique(found.selector.channel.block).size
+    return in_parts(found, count * np.arange(blocks) // max(blocks, 1))
+
+
+def in_logs(found: ChannelResult, begins_s: Sequence[float]) -> dict[str, InParts]:
+    """What each of several logs that were searched together says, each `begins_s` on the time of the blocks."""
+    channel = found.selector.channel
+    ends_s = (np.unique(channel.block) + 1) * channel.settings.grid.block_s
+    return in_parts(found, np.searchsorted(begins_s, ends_s))
+
+
+def in_parts(found: ChannelResult, parts: NDArray[np.int64]) -> dict[str, InParts]:
+    """What each part of a log says of the parameters, to second order; without those of which one says little.
+
+    `parts` (B,): the part of each block of time of the channel, in order.
+    """
+    best, channel, layout = found.told, found.selector.channel, found.selector.channel.layout
+    labels = np.unique(parts)
+    if not best.active or labels.size < 2:
+        return {}
+    settings = channel.settings
+    each = settings.selection.block_lengths[1]
+    normal, gradient = by_block(best, channel.block)
+    inside = [parts == label for label in labels]
+    least = settings.fit.part_known_share / labels.size
+    # What a part cannot tell from others it does not know, however much depends on it: a circle has one axial distance
+    # for every pair of wheels.
+    whole = 1.0 / np.diag(inverse(normal.sum(axis=0)))
+    enough = np.all([1.0 / np.diag(inverse(normal[of].sum(axis=0))) > least * whole for of in inside], axis=0)
+    places = np.array(best.active)[enough]
+    if not places.size:
+        return {}
+    values, deviations = [], []
+    for of in inside:
+        # Neighbouring blocks err together: a few are taken as one.
+        group = np.arange(np.count_nonzero(of)) // each
+        blocks = normal[of][:, enough][:, :, enough]
+        pulls = gradient[of][:, enough]
+        covariance = inverse(blocks.sum(axis=0))
+        step = -covariance @ pulls.sum(axis=0)
+        # How much more than the noise model says the blocks of a part scatter about what it says itself.
+        left = np.zeros((group[-1] + 1, places.size))
+        np.add.at(left, group, (pulls + blocks @ step) @ covariance)
+        variance = np.maximum(np.diag(covariance), (left**2).sum(axis=0))
+        deviations.append(np.sqrt(variance))
+        values.append(np.clip(best.vector[places] + step, layout.low[places], layout.high[places]))
+    columns = layout.columns
+    return {
+        columns[index]: InParts(np.array([of[k] for of in values]), np.array([of[k] for of in deviations]))
+        for k, index in enumerate(places)
+    }
