@@ -332,7 +332,9 @@ def _with_term(found: ChannelResult, term: Term, tried: int) -> tuple[ChannelRes
     limits = plain.thresholds
     if term.disc is not None and proof.again(parameters, channel.count) < limits.unnamed_score:
         return None, False
-    if proof.score < limits.unnamed_score or proof.repeated <= 0.0 or moved < limits.moves_m:
+    # A patch that is driven over twice has been tried again.
+    repeats = term.disc is not None or proof.repays(parameters, channel.count)
+    if proof.score < limits.unnamed_score or not repeats or moved < limits.moves_m:
         return None, True
     names = selector.select()
     if selector.priced(names) > selector.priced(found.names):

@@ -31,18 +31,26 @@ class EffectEvidence:
     """For one set of effects against a smaller one.
 
     `gain` in nats of the fit; `held_out` in nats on blocks left out, `repeated` the same without the block that says
-    most; `inflation` of the variance; `score` = 2 gain / inflation - parameters ln(n), the difference of BIC.
+    most, `thrice` without the two that do; `inflation` of the variance; `score` = 2 gain / inflation -
+    parameters ln(n), the difference of BIC.
     """
 
     gain: float
     held_out: float
     repeated: float
+    thrice: float
     inflation: float
     score: float
 
     def again(self, parameters: float, count: int) -> float:
         """The score of what is repeated, for so many parameters and residuals."""
         return 2.0 * self.repeated / self.inflation - parameters * math.log(max(count, 2))
+
+    def repays(self, parameters: float, count: int) -> bool:
+        """Whether so many parameters are worth it without the two blocks that say most: what shows twice may be chance,
+        and says little of another drive.
+        """
+        return self.thrice > 0.5 * parameters * math.log(max(count, 2))
 
 
 def held_out_by_block(found: Fit, channel: ResidualChannel) -> Array:
@@ -120,9 +128,15 @@ def compare(small: Fit, big: Fit, channel: ResidualChannel, parameters: float) -
     blocks = held_out_by_block(small, channel) - held_out_by_block(big, channel)
     held_out = float(blocks.sum())
     # One that a fit without it explains by nothing at all is so large that in a difference the others would be lost.
-    others = np.delete(blocks, int(np.argmax(blocks))) if blocks.max(initial=0.0) > 0.0 else blocks
+    repeated, thrice = (float(_without_most(blocks, many).sum()) for many in (1, 2))
     score = 2.0 * gain / factor - parameters * math.log(max(channel.count, 2))
-    return EffectEvidence(gain, held_out, float(others.sum()), factor, score)
+    return EffectEvidence(gain, held_out, repeated, thrice, factor, score)
+
+
+def _without_most(blocks: Array, many: int) -> Array:
+    """Nats of blocks (B,) without those of so many that say most for something; of no others than such."""
+    ordered = np.sort(blocks)
+    return ordered[: ordered.size - min(many, int(np.count_nonzero(ordered > 0.0)))]
 
 
 Names = tuple[str, ...]
@@ -351,7 +365,7 @@ class Selector:
         return (
             (not once or proof.again(price, self.channel.count) > 0.0)
             and (proof.score > limits.score or self._dominant(smaller, gain))
-            and proof.repeated > 0.0
+            and proof.repays(price, self.channel.count)
             and self.moves(self.split(smaller), self.split(larger)) > limits.moves_m
         )
 

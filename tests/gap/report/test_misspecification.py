@@ -118,7 +118,7 @@ def beside(form, times):
     channel = WithTerms.of(found.channel, (term,))
     selector = Selector(channel, found.selector.moves, LIMITS)
     gain = selector.exact(()).cost - selector.exact(found.names).cost
-    evidence = EffectEvidence(times * gain, 1.0, 1.0, 1.0, 1.0)
+    evidence = EffectEvidence(times * gain, 1.0, 1.0, 1.0, 1.0, 1.0)
     return replace(found, selector=selector, unnamed=(UnnamedTerm(form, evidence, term),))
 
 

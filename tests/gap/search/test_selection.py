@@ -112,12 +112,23 @@ def test_what_begins_at_some_time_is_worth_it_without_the_block_that_says_most(m
     found = selector(turn_slip=0.08)
     # Three parameters, each for half a ln n, in noise that is 1.2 times what was thought.
     nats = 0.5 * 1.2 * 3.0 * np.log(found.channel.count)
-    proof = EffectEvidence(90.0, 80.0, share * nats, 1.2, 99.0)
+    proof = EffectEvidence(90.0, 80.0, share * nats, 70.0, 1.2, 99.0)
     monkeypatch.setattr(selection, "compare", lambda *_: proof)
     assert found.acceptable((), ("surface_change",)) == accepted
-    # Others have to repeat, however little.
-    monkeypatch.setattr(selection, "compare", lambda *_: EffectEvidence(90.0, 80.0, 0.01, 1.2, 99.0))
+    # Others need not.
+    monkeypatch.setattr(selection, "compare", lambda *_: EffectEvidence(90.0, 80.0, 0.01, 70.0, 1.2, 99.0))
     assert found.acceptable((), ("turn_slip",))
+
+
+@pytest.mark.parametrize(("name", "parameters"), [("turn_slip", 1.0), ("surface_change", 3.0)])
+@pytest.mark.parametrize(("share", "accepted"), [(0.99, False), (1.01, True)])
+def test_every_effect_pays_for_its_parameters_without_the_two_blocks_that_say_most(
+    monkeypatch, name, parameters, share, accepted
+):
+    found = selector(turn_slip=0.08)
+    thrice = share * 0.5 * parameters * np.log(found.channel.count)
+    monkeypatch.setattr(selection, "compare", lambda *_: EffectEvidence(90.0, 80.0, 70.0, thrice, 1.2, 99.0))
+    assert found.acceptable((), (name,)) == accepted
 
 
 def test_a_change_is_found_when_it_happens():
@@ -158,7 +169,7 @@ def test_a_slow_drive_cannot_tell_lag_from_delay_and_says_so():
     assert steps.rivals(("command_delay",), "command_delay") == ()
 
 
-def judged(gain=30.0, score=30.0, repeated=10.0, moved_m=0.01, misfit=0.0, count=1000):
+def judged(gain=30.0, score=30.0, thrice=10.0, moved_m=0.01, misfit=0.0, count=1000):
     """Whether one effect is accepted on top of none: its gain, proof, what it moves, and what the fit without lacks."""
     channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=count, split=lambda vector: (vector, None))
     base = 0.5 * count * (1.0 + misfit)
@@ -166,7 +177,7 @@ def judged(gain=30.0, score=30.0, repeated=10.0, moved_m=0.01, misfit=0.0, count
     chosen = Selector(channel, lambda small, big: moved_m, limits)
     for names, cost in ((frozenset(), base), (frozenset({"turn_slip"}), base - gain)):
         chosen.fits[names] = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
-    chosen.proofs[frozenset(), frozenset({"turn_slip"})] = EffectEvidence(gain, repeated, repeated, 1.0, score)
+    chosen.proofs[frozenset(), frozenset({"turn_slip"})] = EffectEvidence(gain, 50.0, 50.0, thrice, 1.0, score)
     return chosen.acceptable((), ("turn_slip",))
 
 
@@ -176,11 +187,12 @@ def test_an_effect_is_accepted_only_if_every_condition_holds():
     # At the thresholds: twice the gain may be as large as the score asked for, the score has to be larger.
     assert judged(gain=10.0) is True
     assert judged(score=20.0) is False
-    assert judged(repeated=0.1) is True
+    # One parameter of 1000 residuals is 3.45 nats.
+    assert judged(thrice=3.46) is True
     assert judged(gain=9.9) is False
     assert judged(score=19.9) is False
-    assert judged(repeated=0.0) is False
-    assert judged(repeated=-1.0) is False
+    assert judged(thrice=3.45) is False
+    assert judged(thrice=-1.0) is False
     assert judged(moved_m=0.001) is False
 
 
@@ -192,7 +204,7 @@ def test_what_fits_badly_is_helped_by_a_large_part_of_what_it_lacks_whatever_its
     assert judged(score=-5.0, gain=200.0, misfit=0.45) is False
     assert judged(score=-5.0, gain=200.0, misfit=0.5) is False
     assert judged(score=-5.0, gain=200.0, misfit=0.6) is True
-    assert judged(score=-5.0, gain=260.0, misfit=2.0, repeated=-1.0) is False
+    assert judged(score=-5.0, gain=260.0, misfit=2.0, thrice=-1.0) is False
     assert judged(score=-5.0, gain=260.0, misfit=2.0, moved_m=0.0) is False
 
 

@@ -97,7 +97,7 @@ def judged(smaller, larger, proof, count=1000):
 def test_what_repeats_of_what_happens_once_pays_for_all_that_is_new(smaller, larger, parameters):
     price = 0.5 * (parameters * np.log(1000))
     for repeated, accepted in ((price, False), (1.001 * price, True)):
-        assert judged(smaller, larger, EffectEvidence(50.0, 40.0, repeated, 1.0, 99.0)) == accepted
+        assert judged(smaller, larger, EffectEvidence(50.0, 40.0, repeated, repeated, 1.0, 99.0)) == accepted
 
 
 def test_evidence_pays_for_the_parameters_that_are_new(monkeypatch):

@@ -17,7 +17,7 @@ from tests.gap.synthetic import LIMITS, body_channel
 from tools import strange_robot
 from tools.gap_another_drive import another_drive, errors_ahead, without_terms
 
-PROOF = EffectEvidence(100.0, 90.0, 80.0, 1.0, 190.0)
+PROOF = EffectEvidence(100.0, 90.0, 80.0, 80.0, 1.0, 190.0)
 
 
 @cache

@@ -189,19 +189,21 @@ def test_a_term_is_accepted_with_its_number_and_its_evidence_and_what_stood_in_f
 
 
 @pytest.mark.parametrize(
-    ("score", "repeated", "moved_m", "accepted"),
+    ("score", "prices", "moved_m", "accepted"),
     [
-        (20.0, 1.0, 0.001, True),
-        (19.9, 1.0, 0.1, False),
-        (40.0, 0.01, 0.001, True),
-        (40.0, 0.0, 0.1, False),
+        (20.0, 1.5, 0.001, True),
+        (19.9, 1.5, 0.1, False),
+        (40.0, 1.01, 0.001, True),
+        (40.0, 0.99, 0.1, False),
         (40.0, -1.0, 0.1, False),
-        (40.0, 1.0, 0.0009, False),
+        (40.0, 1.5, 0.0009, False),
     ],
 )
-def test_a_term_takes_its_score_and_repeats_and_moves_predictions(monkeypatch, score, repeated, moved_m, accepted):
+def test_a_term_takes_its_score_and_shows_thrice_and_moves_predictions(monkeypatch, score, prices, moved_m, accepted):
     channel, term = turned_in(0.3, 0.5, -0.15)
-    proof = EffectEvidence(30.0, 10.0, repeated, 1.0, score)
+    # Without the two blocks that say most; the only one counts as one of two that were tried.
+    thrice = prices * (0.5 * np.log(channel.count) + np.log(2.0))
+    proof = EffectEvidence(30.0, 10.0, 9.0, thrice, 1.0, score)
     monkeypatch.setattr(channel_search, "compare", lambda *_: proof)
     found = with_unnamed(searched(channel, moves=lambda small, big: moved_m), lambda found: iter((term,)))
     assert [one.evidence for one in found.unnamed] == ([proof] if accepted else [])
@@ -236,14 +238,20 @@ def test_a_patch_is_worth_it_without_the_block_that_says_most(monkeypatch):
     price = np.log(channel.count) + 2.0 * np.log(4.0)
     nats = 0.5 * 1.3 * (20.0 + price)
     for repeated, worth_it in ((1.001 * nats, True), (0.999 * nats, False)):
-        monkeypatch.setattr(channel_search, "compare", lambda *_, r=repeated: EffectEvidence(90.0, 80.0, r, 1.3, 99.0))
+        proof = EffectEvidence(90.0, 80.0, repeated, 0.0, 1.3, 99.0)
+        monkeypatch.setattr(channel_search, "compare", lambda *_, proof=proof: proof)
         larger, happened_again = _with_term(searched(channel), patch, 4)
         assert happened_again is (larger is not None) is worth_it
-    # Another term need not happen again, but what is not worth it is none.
+    # Another term has to show thrice, whatever is left without one block, and what is not worth it is none.
+    assert _with_term(searched(channel), term, 4) == (None, True)
+    shown = EffectEvidence(90.0, 80.0, 0.0, 0.51 * price, 1.3, 99.0)
+    monkeypatch.setattr(channel_search, "compare", lambda *_: shown)
     assert _with_term(searched(channel), term, 4)[0] is not None
-    monkeypatch.setattr(channel_search, "compare", lambda *_: EffectEvidence(90.0, 80.0, 80.0, 1.3, 19.0))
+    monkeypatch.setattr(channel_search, "compare", lambda *_: replace(shown, thrice=0.49 * price))
+    assert _with_term(searched(channel), term, 4) == (None, True)
+    monkeypatch.setattr(channel_search, "compare", lambda *_: EffectEvidence(90.0, 80.0, 80.0, 80.0, 1.3, 19.0))
     assert _with_term(searched(channel), patch, 4) == (None, True)
-    again = EffectEvidence(90.0, 80.0, 30.0, 1.5, 99.0).again(2.0, 1000)
+    again = EffectEvidence(90.0, 80.0, 30.0, 30.0, 1.5, 99.0).again(2.0, 1000)
     assert again == pytest.approx(2.0 * 30.0 / 1.5 - 2.0 * np.log(1000.0))
 
 
@@ -392,7 +400,7 @@ def test_names_are_selected_anew_and_from_those_that_were_found_where_that_costs
     monkeypatch.setattr(channel_search, "Selector", Stub)
     monkeypatch.setattr(channel_search, "indices", lambda *_: ())
     monkeypatch.setattr(channel_search, "fit", lambda channel, begin, active: SimpleNamespace(vector=begin))
-    monkeypatch.setattr(channel_search, "compare", lambda *_: EffectEvidence(90.0, 80.0, 1.0, 1.0, 99.0))
+    monkeypatch.setattr(channel_search, "compare", lambda *_: EffectEvidence(90.0, 80.0, 70.0, 60.0, 1.0, 99.0))
     selector = SimpleNamespace(
         exact=lambda names: SimpleNamespace(vector=np.array([3.0, 4.0])),
         fit=lambda given: SimpleNamespace(vector=np.array([1.0, 2.0])),
