@@ -31,8 +31,8 @@ class EffectEvidence:
     """For one set of effects against a smaller one.
 
     `gain` in nats of the fit; `held_out` in nats on blocks left out, `repeated` the same without the block that says
-    most, `thrice` without the two that do; `inflation` of the variance; `score` = 2 gain / inflation -
-    parameters ln(n), the difference of BIC.
+    most, `thrice` what the others say beside the two that say most, all together or the best of them alone;
+    `inflation` of the variance; `score` = 2 gain / inflation - parameters ln(n), the difference of BIC.
     """
 
     gain: float
@@ -46,11 +46,11 @@ class EffectEvidence:
         """The score of what is repeated, for so many parameters and residuals."""
         return 2.0 * self.repeated / self.inflation - parameters * math.log(max(count, 2))
 
-    def repays(self, parameters: float, count: int) -> bool:
-        """Whether so many parameters are worth it without the two blocks that say most: what shows twice may be chance,
-        and says little of another drive.
+    def shows_thrice(self, count: int) -> bool:
+        """Whether a third place of a log with so many residuals says more than a parameter costs: what shows twice may
+        be chance, and says little of another drive.
         """
-        return self.thrice > 0.5 * parameters * math.log(max(count, 2))
+        return self.thrice > 0.5 * math.log(max(count, 2))
 
 
 def held_out_by_block(found: Fit, channel: ResidualChannel) -> Array:
@@ -128,7 +128,8 @@ def compare(small: Fit, big: Fit, channel: ResidualChannel, parameters: float) -
     blocks = held_out_by_block(small, channel) - held_out_by_block(big, channel)
     held_out = float(blocks.sum())
     # One that a fit without it explains by nothing at all is so large that in a difference the others would be lost.
-    repeated, thrice = (float(_without_most(blocks, many).sum()) for many in (1, 2))
+    repeated, others = float(_without_most(blocks, 1).sum()), _without_most(blocks, 2)
+    thrice = max(float(others.sum()), float(others.max(initial=0.0)))
     score = 2.0 * gain / factor - parameters * math.log(max(channel.count, 2))
     return EffectEvidence(gain, held_out, repeated, thrice, factor, score)
 
@@ -365,7 +366,7 @@ class Selector:
         return (
             (not once or proof.again(price, self.channel.count) > 0.0)
             and (proof.score > limits.score or self._dominant(smaller, gain))
-            and proof.repays(price, self.channel.count)
+            and proof.shows_thrice(self.channel.count)
             and self.moves(self.split(smaller), self.split(larger)) > limits.moves_m
         )
 

@@ -222,7 +222,9 @@ def test_what_repeats_is_what_is_left_without_the_block_that_says_most_however_l
     assert 0.0 < blocks.max() < 0.1
     proof = compare(small, big, channel(), 1.0)
     assert proof.repeated == pytest.approx(blocks.sum() - blocks.max(), rel=1e-9)
-    assert proof.thrice == pytest.approx(np.sort(blocks)[:-2].sum(), rel=1e-9)
+    others = np.sort(blocks)[:-2]
+    assert proof.thrice == pytest.approx(others.sum(), rel=1e-9)
+    assert others.sum() > others.max()
     # A log of a single residual pays for a parameter as one of two.
     single = SimpleNamespace(**{**vars(channel()), "count": 1})
     assert compare(small, big, single, 1.0).score == pytest.approx(2.0 * proof.gain / proof.inflation - np.log(2.0))
@@ -234,25 +236,35 @@ def test_where_every_block_is_fitted_worse_none_is_left_out_of_what_repeats():
     small, big = (Fit(np.zeros(0), (), 0.0, times * y, np.empty((N, 0))) for times in (1.0, 1.001))
     proof = compare(small, big, channel(), 1.0)
     assert proof.repeated < 0.0
-    assert proof.repeated == proof.thrice == proof.held_out
+    assert proof.repeated == proof.held_out
+    assert proof.thrice == 0.0
 
 
-def test_of_blocks_of_which_one_alone_is_fitted_better_that_is_left_out_and_no_other():
+def test_what_shows_in_three_blocks_does_so_however_much_worse_others_are_fitted():
     y = np.random.default_rng(16).standard_normal(N)
-    times = np.where(channel().block == 3, 0.5, 1.001)
-    small, big = (Fit(np.zeros(0), (), 0.0, each * y, np.empty((N, 0))) for each in (1.0, times))
-    proof = compare(small, big, channel(), 1.0)
-    assert proof.held_out > 0.0
-    assert proof.repeated == proof.thrice < 0.0
+
+    def proof(better):
+        times = np.where(np.isin(channel().block, better), 0.5, 1.1)
+        small, big = (Fit(np.zeros(0), (), 0.0, each * y, np.empty((N, 0))) for each in (1.0, times))
+        return compare(small, big, channel(), 1.0)
+
+    gains = np.sort(0.5 * (1.0 - 0.25) * np.bincount(channel().block, weights=y**2)[[3, 5, 9]])
+    three = proof([3, 5, 9])
+    assert three.repeated < 0.0
+    assert three.thrice == pytest.approx(gains[0])
+    # Of one alone that is left out, and no other.
+    one, two = proof([3]), proof([3, 5])
+    assert one.thrice == two.thrice == 0.0
+    assert one.repeated == pytest.approx(one.held_out - 0.375 * (y[channel().block == 3] ** 2).sum())
 
 
-def test_what_shows_thrice_pays_for_parameters():
-    price = 1.5 * np.log(1000.0)
-    for thrice, pays in ((1.001 * price, True), (price, False), (-1.0, False)):
-        assert EffectEvidence(90.0, 80.0, 70.0, thrice, 9.0, 99.0).repays(3.0, 1000) == pays
-    # A log of a single residual pays as one of two.
-    assert not EffectEvidence(90.0, 80.0, 70.0, 0.34, 9.0, 99.0).repays(1.0, 1)
-    assert EffectEvidence(90.0, 80.0, 70.0, 0.35, 9.0, 99.0).repays(1.0, 1)
+def test_a_third_place_says_more_than_a_parameter_costs():
+    price = 0.5 * np.log(1000.0)
+    for thrice, shows in ((1.001 * price, True), (price, False), (-1.0, False)):
+        assert EffectEvidence(90.0, 80.0, 70.0, thrice, 9.0, 99.0).shows_thrice(1000) == shows
+    # A log of a single residual counts as one of two.
+    assert not EffectEvidence(90.0, 80.0, 70.0, 0.34, 9.0, 99.0).shows_thrice(1)
+    assert EffectEvidence(90.0, 80.0, 70.0, 0.35, 9.0, 99.0).shows_thrice(1)
 
 
 def test_blocks_that_say_nothing_of_a_parameter_hide_no_scatter_of_the_others():

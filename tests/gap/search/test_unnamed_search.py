@@ -201,8 +201,7 @@ def test_a_term_is_accepted_with_its_number_and_its_evidence_and_what_stood_in_f
 )
 def test_a_term_takes_its_score_and_shows_thrice_and_moves_predictions(monkeypatch, score, prices, moved_m, accepted):
     channel, term = turned_in(0.3, 0.5, -0.15)
-    # Without the two blocks that say most; the only one counts as one of two that were tried.
-    thrice = prices * (0.5 * np.log(channel.count) + np.log(2.0))
+    thrice = prices * 0.5 * np.log(channel.count)
     proof = EffectEvidence(30.0, 10.0, 9.0, thrice, 1.0, score)
     monkeypatch.setattr(channel_search, "compare", lambda *_: proof)
     found = with_unnamed(searched(channel, moves=lambda small, big: moved_m), lambda found: iter((term,)))
@@ -244,10 +243,10 @@ def test_a_patch_is_worth_it_without_the_block_that_says_most(monkeypatch):
         assert happened_again is (larger is not None) is worth_it
     # Another term has to show thrice, whatever is left without one block, and what is not worth it is none.
     assert _with_term(searched(channel), term, 4) == (None, True)
-    shown = EffectEvidence(90.0, 80.0, 0.0, 0.51 * price, 1.3, 99.0)
+    shown = EffectEvidence(90.0, 80.0, 0.0, 0.51 * np.log(channel.count), 1.3, 99.0)
     monkeypatch.setattr(channel_search, "compare", lambda *_: shown)
     assert _with_term(searched(channel), term, 4)[0] is not None
-    monkeypatch.setattr(channel_search, "compare", lambda *_: replace(shown, thrice=0.49 * price))
+    monkeypatch.setattr(channel_search, "compare", lambda *_: replace(shown, thrice=0.49 * np.log(channel.count)))
     assert _with_term(searched(channel), term, 4) == (None, True)
     monkeypatch.setattr(channel_search, "compare", lambda *_: EffectEvidence(90.0, 80.0, 80.0, 80.0, 1.3, 19.0))
     assert _with_term(searched(channel), patch, 4) == (None, True)
