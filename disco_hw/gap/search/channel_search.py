@@ -333,7 +333,7 @@ def _with_term(found: ChannelResult, term: Term, tried: int) -> tuple[ChannelRes
     if term.disc is not None and proof.again(parameters, channel.count) < limits.unnamed_score:
         return None, False
     # A patch that is driven over twice has been tried again.
-    repeats = term.disc is not None or proof.shows_thrice(channel.count)
+    repeats = term.disc is not None or proof.repeats(channel.count)
     if proof.score < limits.unnamed_score or not repeats or moved < limits.moves_m:
         return None, True
     names = selector.select()

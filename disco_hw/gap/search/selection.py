@@ -46,11 +46,11 @@ class EffectEvidence:
         """The score of what is repeated, for so many parameters and residuals."""
         return 2.0 * self.repeated / self.inflation - parameters * math.log(max(count, 2))
 
-    def shows_thrice(self, count: int) -> bool:
-        """Whether a third place of a log with so many residuals says more than a parameter costs: what shows twice may
-        be chance, and says little of another drive.
+    def repeats(self, count: int) -> bool:
+        """Whether it is there without the block that says most, and a third place of a log with so many residuals says
+        more than a parameter costs: what shows twice may be chance, and says little of another drive.
         """
-        return self.thrice > 0.5 * math.log(max(count, 2))
+        return self.repeated > 0.0 and self.thrice > 0.5 * math.log(max(count, 2))
 
 
 def held_out_by_block(found: Fit, channel: ResidualChannel) -> Array:
@@ -366,7 +366,7 @@ class Selector:
         return (
             (not once or proof.again(price, self.channel.count) > 0.0)
             and (proof.score > limits.score or self._dominant(smaller, gain))
-            and proof.shows_thrice(self.channel.count)
+            and proof.repeats(self.channel.count)
             and self.moves(self.split(smaller), self.split(larger)) > limits.moves_m
         )
 

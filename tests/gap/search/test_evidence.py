@@ -258,13 +258,15 @@ def test_what_shows_in_three_blocks_does_so_however_much_worse_others_are_fitted
     assert one.repeated == pytest.approx(one.held_out - 0.375 * (y[channel().block == 3] ** 2).sum())
 
 
-def test_a_third_place_says_more_than_a_parameter_costs():
+def test_what_repeats_is_there_without_a_block_and_in_a_third_place_says_more_than_a_parameter_costs():
     price = 0.5 * np.log(1000.0)
-    for thrice, shows in ((1.001 * price, True), (price, False), (-1.0, False)):
-        assert EffectEvidence(90.0, 80.0, 70.0, thrice, 9.0, 99.0).shows_thrice(1000) == shows
+    for repeated, thrice, shows in (
+        (0.1, 1.001 * price, True), (0.1, price, False), (70.0, -1.0, False), (0.0, 9.0, False), (-1.0, 9.0, False),
+    ):  # fmt: skip
+        assert EffectEvidence(90.0, 80.0, repeated, thrice, 9.0, 99.0).repeats(1000) == shows
     # A log of a single residual counts as one of two.
-    assert not EffectEvidence(90.0, 80.0, 70.0, 0.34, 9.0, 99.0).shows_thrice(1)
-    assert EffectEvidence(90.0, 80.0, 70.0, 0.35, 9.0, 99.0).shows_thrice(1)
+    assert not EffectEvidence(90.0, 80.0, 70.0, 0.34, 9.0, 99.0).repeats(1)
+    assert EffectEvidence(90.0, 80.0, 70.0, 0.35, 9.0, 99.0).repeats(1)
 
 
 def test_blocks_that_say_nothing_of_a_parameter_hide_no_scatter_of_the_others():

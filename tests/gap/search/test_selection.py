@@ -115,9 +115,12 @@ def test_what_begins_at_some_time_is_worth_it_without_the_block_that_says_most(m
     proof = EffectEvidence(90.0, 80.0, share * nats, 70.0, 1.2, 99.0)
     monkeypatch.setattr(selection, "compare", lambda *_: proof)
     assert found.acceptable((), ("surface_change",)) == accepted
-    # Others need not.
-    monkeypatch.setattr(selection, "compare", lambda *_: EffectEvidence(90.0, 80.0, 0.01, 70.0, 1.2, 99.0))
-    assert found.acceptable((), ("turn_slip",))
+    # Others have to repeat, however little.
+    for repeated, there in ((0.01, True), (0.0, False)):
+        shown = EffectEvidence(90.0, 80.0, repeated, 70.0, 1.2, 99.0)
+        monkeypatch.setattr(selection, "compare", lambda *_, shown=shown: shown)
+        found.proofs.clear()
+        assert found.acceptable((), ("turn_slip",)) == there
 
 
 @pytest.mark.parametrize("name", ["turn_slip", "surface_change"])

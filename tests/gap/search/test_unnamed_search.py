@@ -241,13 +241,14 @@ def test_a_patch_is_worth_it_without_the_block_that_says_most(monkeypatch):
         monkeypatch.setattr(channel_search, "compare", lambda *_, proof=proof: proof)
         larger, happened_again = _with_term(searched(channel), patch, 4)
         assert happened_again is (larger is not None) is worth_it
-    # Another term has to show thrice, whatever is left without one block, and what is not worth it is none.
+    # Another term has to repeat, however little, and in a third place; what is not worth it is none.
     assert _with_term(searched(channel), term, 4) == (None, True)
-    shown = EffectEvidence(90.0, 80.0, 0.0, 0.51 * np.log(channel.count), 1.3, 99.0)
+    shown = EffectEvidence(90.0, 80.0, 0.1, 0.51 * np.log(channel.count), 1.3, 99.0)
     monkeypatch.setattr(channel_search, "compare", lambda *_: shown)
     assert _with_term(searched(channel), term, 4)[0] is not None
-    monkeypatch.setattr(channel_search, "compare", lambda *_: replace(shown, thrice=0.49 * np.log(channel.count)))
-    assert _with_term(searched(channel), term, 4) == (None, True)
+    for less in (replace(shown, repeated=0.0), replace(shown, thrice=0.49 * np.log(channel.count))):
+        monkeypatch.setattr(channel_search, "compare", lambda *_, less=less: less)
+        assert _with_term(searched(channel), term, 4) == (None, True)
     monkeypatch.setattr(channel_search, "compare", lambda *_: EffectEvidence(90.0, 80.0, 80.0, 80.0, 1.3, 19.0))
     assert _with_term(searched(channel), patch, 4) == (None, True)
     again = EffectEvidence(90.0, 80.0, 30.0, 30.0, 1.5, 99.0).again(2.0, 1000)
