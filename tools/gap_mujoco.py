@@ -103,6 +103,66 @@ class Result:
         return one[0] / timed[0], one[1] / timed[1]
 
 
+def robot_of(name: str) -> Robot:
+    """The robot of a name, or the one that a number draws. Raises ValueError for what is neither."""
+    return ROBOTS[name] if name in ROBOTS else drawn(int(name))
+
+
+def drawn(number: int) -> Robot:
+    """A robot whose size, weight, servos, sensors and floor, and the sizes of what may be hidden in it, a number draws.
+
+    Wheels of 55 to 190 mm, and the mass that goes with them (3 to 130 kg); turning takes 0.35 to 1 rad/s from a side.
+    """
+    draw = np.random.default_rng([number, 99]).uniform
+
+    def times(low: float, high: float) -> float:
+        return math.exp(draw(math.log(low), math.log(high)))
+
+    radius_m = times(0.055, 0.19)
+    scale = radius_m / Robot().wheel_radius_m
+    track_m = radius_m * draw(3.3, 4.6)
+    wheelbase_m = track_m * draw(0.62, 1.05)
+    base_kg = Robot().base_kg * scale**2.7 * draw(0.75, 1.35)
+    wheel_kg = Robot().wheel_kg * scale**2.7 * draw(0.8, 1.2)
+    mass_kg = base_kg + 4.0 * (wheel_kg + 0.13)
+    friction = draw(0.42, 0.9)
+    # What dragging a wheel sideways asks of its motor.
+    scrub_nm = friction * mass_kg * 9.81 / 4.0 * radius_m
+    servo_nm_s = scrub_nm / draw(0.35, 1.0)
+    torque_nm = scrub_nm * draw(3.0, 5.5)
+    top_rad_s = draw(0.55, 1.25) / radius_m
+    length, width, height = Robot().half_m
+    half_m = (length * scale * draw(0.9, 1.1), width * scale * draw(0.9, 1.1), height * scale)
+    sizes = {
+        "command_delay": draw(0.06, 0.25), "motor_lag": draw(0.1, 0.33), "dead_band": draw(0.06, 0.12) * top_rad_s,
+        "unequal_wheels": draw(0.018, 0.05), "pose_latency": draw(0.08, 0.25), "slope": draw(3.5, 8.0),
+        "payload": mass_kg * draw(0.25, 0.4), "torque_limit": scrub_nm * draw(0.8, 1.15),
+        "worn_tyre": draw(0.3, 0.55), "backlash": draw(0.05, 0.16),
+    }  # fmt: skip
+    return Robot(
+        wheel_radius_m=radius_m,
+        track_m=track_m,
+        wheelbase_m=wheelbase_m,
+        top_rad_s=top_rad_s,
+        counts_per_turn=int(times(700, 5000)),
+        position_std_m=times(0.0012, 0.008),
+        yaw_std_rad=times(0.003, 0.01),
+        servo_nm_s=servo_nm_s,
+        servo_lag_s=draw(0.02, 0.075),
+        torque_nm=torque_nm,
+        friction=friction,
+        base_kg=base_kg,
+        half_m=half_m,
+        above_m=Robot().above_m * scale,
+        wheel_kg=wheel_kg,
+        wheel_half_m=Robot().wheel_half_m * scale,
+        rotor_kg_m2=mass_kg * radius_m**2 * draw(0.06, 0.2),
+        bearing_nm_s=0.0017 * servo_nm_s,
+        payload_m={name: of * scale for name, of in Robot().payload_m.items()},
+        sizes=sizes,
+    )
+
+
 def truth_of(hidden: str, recording: Recording, beside: Sequence[str] = ()) -> float | None:
     """What is true of the parameter that stands for what was hidden.
 
@@ -273,7 +333,7 @@ def study(hidden: Iterable[str], seeds: Iterable[int], out: Path, robot: str = "
             if path.exists():
                 result = msgspec.json.decode(path.read_bytes(), type=Result)
             else:
-                result = work(name, seed, ROBOTS[robot])
+                result = work(name, seed, robot_of(robot))
                 unfinished = path.with_suffix(".part")
                 unfinished.write_bytes(msgspec.json.encode(result))
                 unfinished.replace(path)
@@ -287,7 +347,8 @@ def study(hidden: Iterable[str], seeds: Iterable[int], out: Path, robot: str = "
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tools.gap_mujoco", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("hidden", nargs="*", metavar="EFFECT", help=f"of nothing, {', '.join(EFFECTS)} (all)")
-    parser.add_argument("--robot", choices=tuple(ROBOTS), default="middle", help="which robot (middle)")
+    which = f"{', '.join(ROBOTS)}, or a number, which draws one (middle)"
+    parser.add_argument("--robot", default="middle", help=which)
     parser.add_argument("--seeds", type=int, default=3, help="drives of each hidden effect (3)")
     parser.add_argument("--first", type=int, default=1, help="first seed (1)")
     parser.add_argument("-o", "--out", type=Path, default=Path("out/gap_study"), help="directory to write to")
@@ -295,6 +356,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     unknown = set(options.hidden) - {"nothing", *EFFECTS}
     if unknown:
         parser.error(f"no such effect: {', '.join(sorted(unknown))}; write some of nothing, {', '.join(EFFECTS)}")
+    if options.robot not in ROBOTS and not options.robot.isdecimal():
+        parser.error(f"--robot {options.robot}: no such robot; write {which}")
     seeds = range(options.first, options.first + options.seeds)
     print("\n".join(table(study(options.hidden or ["nothing", *EFFECTS], seeds, options.out, options.robot))))
     return 0

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tools import gap_mujoco
-from tools.gap_mujoco import Result, injected_floor, response_of, table, truth_of
-from tools.mujoco_robot import Recording, Robot, joystick
+from tools.gap_mujoco import Result, drawn, injected_floor, response_of, robot_of, table, truth_of
+from tools.mujoco_robot import EFFECTS, ROBOTS, Recording, Robot, joystick, record
 
 LATENCY = {"pose_latency": {"latency_s": 0.2}}
 
@@ -138,6 +138,36 @@ def test_a_study_goes_on_where_it_was_broken_off(tmp_path, monkeypatch):
     gap_mujoco.study(["nothing"], (1,), tmp_path, "heavy")
     assert len(done) == 6
     assert (tmp_path / "gap_mujoco_heavy.md").read_text().count("\n| nothing |") == 1
+
+
+def test_a_robot_is_one_with_a_name_or_the_one_that_a_number_draws(capsys):
+    assert robot_of("heavy") is ROBOTS["heavy"]
+    assert robot_of("11") == drawn(11) != drawn(12)
+    assert set(drawn(11).sizes) == set(EFFECTS)
+    radii_m = np.array([drawn(number).wheel_radius_m for number in range(40)])
+    assert 0.055 < radii_m.min() < 0.07
+    assert 0.16 < radii_m.max() < 0.19
+    for name in ("huge", "-3"):
+        with pytest.raises(SystemExit):
+            gap_mujoco.main([f"--robot={name}"])
+        assert f"--robot {name}: no such robot; write middle, heavy, light, or a number" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", [11, 14])
+def test_a_robot_that_is_drawn_drives_and_turns_as_skid_steer_robots_do(number):
+    pytest.importorskip("mujoco", reason="pip install 'disco-hw[mujoco]'")
+    robot = drawn(number)
+    straight, turning = 0.5 * robot.top_rad_s, 0.6 * robot.top_rad_s
+    commands = np.tile([straight, straight], (80, 1)), np.tile([-turning, turning], (80, 1))
+    driven = [record({}, 1, command, robot) for command in commands]
+    late = driven[0].truth_s > 1.0
+    slopes = [np.polyfit(one.truth_s[late], np.c_[one.turned, one.truth[:, 2]][late], 1)[0] for one in driven]
+    assert slopes[0][:4] == pytest.approx([straight] * 4, rel=0.01)
+    assert abs(slopes[0][4]) < 0.01
+    rolled = robot.wheel_radius_m * (slopes[1][1] - slopes[1][0])
+    assert 1.3 < rolled / slopes[1][4] / robot.track_m < 4.0
+    # Scrub takes up to 1 rad/s from a side.
+    assert 0.1 < turning - slopes[1][1] < 1.2
 
 
 @pytest.mark.long
