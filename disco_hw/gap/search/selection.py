@@ -18,7 +18,15 @@ from scipy.special import stdtrit
 from disco_hw.gap.data.free_runs import displacement, starts_as_far_as
 from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
 from disco_hw.gap.search.least_squares import Fit, by_block, fit, inverse, known, sensitivity
-from disco_hw.gap.search.richest_model import CANDIDATES, Candidate, candidates_of, indices, parameters_of
+from disco_hw.gap.search.richest_model import (
+    CANDIDATES,
+    LATE,
+    Candidate,
+    candidates_of,
+    delays_of,
+    indices,
+    parameters_of,
+)
 from disco_hw.gap.settings import GRID_STEP_S, SelectionSettings
 
 Array = NDArray[np.float64]
@@ -363,11 +371,17 @@ class Selector:
         # What begins at some time can be begun before whatever happened once.
         once = any(CANDIDATES[name].once for name in set(larger) - set(smaller))
         price = parameters_of(larger) - parameters_of(smaller)
+        # A delay is wrong by as much as a lag beside it is missing, however little that moves.
+        delays = set(delays_of(self.channel.layout))
+        lags_too = set(larger) - set(smaller) <= set(LATE) - delays and not delays.isdisjoint(smaller)
         return (
             (not once or proof.again(price, self.channel.count) > 0.0)
             and (proof.score > limits.score or self._dominant(smaller, gain))
             and proof.repeats(self.channel.count)
-            and self.moves(self.split(smaller), self.split(larger)) > limits.moves_m
+            and (
+                self.moves(self.split(smaller), self.split(larger)) > limits.moves_m
+                or (lags_too and proof.score > limits.unnamed_score)
+            )
         )
 
     def _dominant(self, smaller: Names, gain: float) -> bool:

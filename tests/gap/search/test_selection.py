@@ -14,7 +14,7 @@ from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search import selection
 from disco_hw.gap.search.least_squares import Fit, fit
 from disco_hw.gap.search.richest_model import CANDIDATES, LATE, candidates_of, indices
-from disco_hw.gap.search.selection import EffectEvidence, Selector, body_moves, wheel_moves
+from disco_hw.gap.search.selection import EffectEvidence, Selector, Thresholds, body_moves, wheel_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from tests.gap.synthetic import GEOMETRY, LIMITS, body_channel, line_of
 
@@ -69,7 +69,9 @@ def wheels_slow(tau_s):
 def test_a_short_lag_with_a_delay_beside_it_is_not_taken_for_the_delay():
     found = wheels_slow(0.03)
     both = ("motor_lag", "command_delay")
-    assert not any(found.acceptable((name,), both) for name in both)
+    # The lag surely is there, however little it moves beside a delay; a delay is not.
+    assert found.acceptable(("command_delay",), both)
+    assert not found.acceptable(("motor_lag",), both)
     assert found.needed(both) == ("motor_lag",)
 
 
@@ -172,7 +174,7 @@ def test_a_slow_drive_cannot_tell_lag_from_delay_and_says_so():
 
 def judged(gain=30.0, score=30.0, thrice=10.0, moved_m=0.01, misfit=0.0, count=1000):
     """Whether one effect is accepted on top of none: its gain, proof, what it moves, and what the fit without lacks."""
-    channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=count, split=lambda vector: (vector, None))
+    channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=count, split=lambda vector: (vector, None), layout=BODY)
     base = 0.5 * count * (1.0 + misfit)
     limits = LIMITS
     chosen = Selector(channel, lambda small, big: moved_m, limits)
@@ -195,6 +197,31 @@ def test_an_effect_is_accepted_only_if_every_condition_holds():
     assert judged(thrice=3.45) is False
     assert judged(thrice=-1.0) is False
     assert judged(moved_m=0.001) is False
+
+
+@pytest.mark.parametrize(
+    ("smaller", "new", "score", "accepted"),
+    [
+        (("command_delay",), ("motor_lag",), 20.1, True),
+        (("deadband", "command_delay"), ("motor_lag",), 20.1, True),
+        (("motor_lag",), ("command_delay",), 99.0, False),
+        (("command_delay",), ("motor_lag",), 20.0, False),
+        ((), ("motor_lag",), 99.0, False),
+        ((), ("motor_lag", "command_delay"), 99.0, False),
+        (("command_delay",), ("deadband",), 99.0, False),
+        (("command_delay",), ("motor_lag", "deadband"), 99.0, False),
+    ],
+)
+def test_a_lag_beside_a_delay_is_told_where_it_surely_is_however_little_it_moves(smaller, new, score, accepted):
+    channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=1000, split=lambda vector: (vector, None), layout=WHEEL)
+    limits = Thresholds(10.0, 0.001, 20.0)
+    chosen = Selector(channel, lambda small, big: 0.0009, limits)
+    larger = (*smaller, *new)
+    for names, cost in ((smaller, 500.0), (larger, 450.0)):
+        chosen.fits[frozenset(names)] = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
+    proof = EffectEvidence(50.0, 40.0, 30.0, 20.0, 1.0, score)
+    chosen.proofs[frozenset(smaller), frozenset(larger)] = proof
+    assert chosen.acceptable(smaller, larger) == accepted
 
 
 def test_what_fits_badly_is_helped_by_a_large_part_of_what_it_lacks_whatever_its_score():

@@ -82,7 +82,7 @@ def test_rivals_are_those_that_are_worse_by_less_than_it_takes_to_tell():
 
 def judged(smaller, larger, proof, count=1000):
     """Whether what one set has more than another is accepted, as its proof is, by 50 nats."""
-    channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=count, split=lambda vector: (vector, None))
+    channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=count, split=lambda vector: (vector, None), layout=BODY)
     chosen = Selector(channel, lambda small, big: 1.0, LIMITS)
     for names, cost in ((smaller, 500.0), (larger, 450.0)):
         chosen.fits[frozenset(names)] = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
