@@ -160,21 +160,6 @@ def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
     return ChannelEstimates(by_name, tuple(columns[index] for index in best.active), covariance)
 
 
-def terms_are_known(found: ChannelResult) -> bool:
-    """Whether of every unnamed term the interval of a coefficient leaves out 0.
-
-    A term that may be none tells nothing, and beside it what has a name is known no better.
-    """
-    by_name = estimate_parameters(found).by_name
-    place = len(found.channel.layout.columns)
-    for one in found.unnamed:
-        own = found.selector.channel.layout.columns[place : place + len(one.term.features)]
-        if all(by_name[column].low <= 0.0 <= by_name[column].high for column in own):
-            return False
-        place += len(own)
-    return True
-
-
 def _weightings_apart(found: ChannelResult) -> Array:
     """Squares, (A,), of how far the two weightings of the wheels' errors lie apart, beyond what chance does.
 

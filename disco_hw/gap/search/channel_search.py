@@ -17,7 +17,7 @@ from disco_hw.gap.noise import learn_body_noise, learn_wheel_noise
 from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise, whiten_wheels
-from disco_hw.gap.search.channel_result import ChannelResult, UnnamedTerm, terms_are_known
+from disco_hw.gap.search.channel_result import ChannelResult, UnnamedTerm
 from disco_hw.gap.search.least_squares import Fit, fit, inverse
 from disco_hw.gap.search.richest_model import (
     LATE,
@@ -316,8 +316,8 @@ def _with_one_more(
 
 
 def _with_term(found: ChannelResult, term: Term, tried: int) -> tuple[ChannelResult | None, bool]:
-    """With one more term, which was chosen among `tried`, None if it is not worth that or a term is not known then; and
-    whether, if it is a patch, it is worth that without the block that says most.
+    """With one more term, which was chosen among `tried`, None if it is not worth that; and whether, if it is a patch,
+    it is worth that without the block that says most.
     """
     plain, small = found.plain or found.selector, found.fit
     terms = (*(one.term for one in found.unnamed), term)
@@ -342,8 +342,7 @@ def _with_term(found: ChannelResult, term: Term, tried: int) -> tuple[ChannelRes
         names = selector.select(found.names)
     proofs = (*(one.evidence for one in found.unnamed), proof)
     accepted = tuple(UnnamedTerm(each.form, evidence, each) for each, evidence in zip(terms, proofs, strict=True))
-    larger = replace(found, selector=selector, names=names, unnamed=accepted, plain=plain)
-    return larger if terms_are_known(larger) else None, True
+    return replace(found, selector=selector, names=names, unnamed=accepted, plain=plain), True
 
 
 def _extended(plain: Selector, channel: WithTerms) -> Array:

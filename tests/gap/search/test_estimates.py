@@ -8,12 +8,10 @@ import pytest
 from disco_hw.gap.search import channel_result
 from disco_hw.gap.search.channel_result import (
     InParts,
-    ParameterEstimate,
     estimate_parameters,
     in_equal_parts,
     in_logs,
     in_parts,
-    terms_are_known,
     wandered,
 )
 from disco_hw.gap.search.least_squares import Fit
@@ -39,28 +37,6 @@ def test_an_interval_is_widened_by_how_blocks_scatter_and_by_how_a_value_wanders
         assert (one.value, one.low, one.high) == pytest.approx(
             (value, value - 1.96 * deviation, value + 1.96 * deviation)
         )
-
-
-@pytest.mark.parametrize(
-    ("intervals", "known"),
-    [
-        ({"term0": (0.1, 0.2), "term1": (-0.2, -0.1), "term1.1": (-0.1, 0.1)}, True),
-        ({"term0": (0.1, 0.2), "term1": (-0.1, 0.1), "term1.1": (0.1, 0.2)}, True),
-        ({"term0": (0.1, 0.2), "term1": (-0.1, 0.1), "term1.1": (0.0, 0.2)}, False),
-        ({"term0": (-0.2, 0.0), "term1": (0.1, 0.2), "term1.1": (0.1, 0.2)}, False),
-    ],
-)
-def test_a_term_is_known_if_one_of_its_coefficients_surely_is_not_none(monkeypatch, intervals, known):
-    by_name = {"a": ParameterEstimate(0.0, -1.0, 1.0)}
-    by_name |= {name: ParameterEstimate(0.5 * (low + high), low, high) for name, (low, high) in intervals.items()}
-    monkeypatch.setattr(channel_result, "estimate_parameters", lambda of: SimpleNamespace(by_name=by_name))
-    features = [np.zeros((3, 2))]
-    terms = [SimpleNamespace(term=SimpleNamespace(features=features * count)) for count in (1, 2)]
-    inner = SimpleNamespace(layout=SimpleNamespace(columns=("a", "b")))
-    channel = SimpleNamespace(layout=SimpleNamespace(columns=("a", "b", "term0", "term1", "term1.1")))
-    found = SimpleNamespace(channel=inner, selector=SimpleNamespace(channel=channel), unnamed=terms)
-    assert terms_are_known(found) is known
-    assert terms_are_known(SimpleNamespace(channel=inner, selector=found.selector, unnamed=()))
 
 
 def test_two_weightings_lie_apart_by_what_is_beyond_the_difference_of_their_variances(monkeypatch):

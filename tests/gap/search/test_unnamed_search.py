@@ -375,13 +375,10 @@ def test_a_patch_of_a_body_is_tried_where_it_lies_best_among_all_that_were_looke
     assert one_more([FIRST, DISC], accepted=[DISC], closer=[NEAR], channel=body)[3] == [(FIRST, 2), (DISC, 4)]
 
 
-@pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize(
     ("new_price", "names"), [(10.0, ("selected", "again")), (9.0, ("selected",)), (8.0, ("selected",))]
 )
-def test_names_are_selected_anew_and_from_those_that_were_found_where_that_costs_less(
-    monkeypatch, new_price, names, known
-):
+def test_names_are_selected_anew_and_from_those_that_were_found_where_that_costs_less(monkeypatch, new_price, names):
     prices = {("selected",): new_price, ("slope",): 9.0}
 
     class Stub:
@@ -409,14 +406,10 @@ def test_names_are_selected_anew_and_from_those_that_were_found_where_that_costs
         thresholds=LIMITS,
         channel=channel,
     )
-    asked = []
-    monkeypatch.setattr(channel_search, "terms_are_known", lambda of: asked.append(of) or known)
     larger, happened_again = _with_term(ChannelResult(selector, ("slope",), None), FIRST, 2)
-    assert asked[0].names == names
-    assert asked[0].plain is selector
-    assert [one.term for one in asked[0].unnamed] == [FIRST]
-    # One that may be none is left out, for what it is and not for having happened once.
-    assert larger is (asked[0] if known else None)
+    assert larger.names == names
+    assert larger.plain is selector
+    assert [one.term for one in larger.unnamed] == [FIRST]
     assert happened_again
 
 
