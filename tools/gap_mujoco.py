@@ -111,27 +111,29 @@ def robot_of(name: str) -> Robot:
 def drawn(number: int) -> Robot:
     """A robot whose size, weight, servos, sensors and floor, and the sizes of what may be hidden in it, a number draws.
 
-    Wheels of 55 to 190 mm, and the mass that goes with them (3 to 130 kg); turning takes 0.35 to 1 rad/s from a side.
+    Wheels of 55 to 190 mm, and the mass that goes with them (3 to 140 kg); all friction of a wheel takes 0.35 to 1
+    rad/s from its motor.
     """
+    usual = Robot()
     draw = np.random.default_rng([number, 99]).uniform
 
     def times(low: float, high: float) -> float:
         return math.exp(draw(math.log(low), math.log(high)))
 
     radius_m = times(0.055, 0.19)
-    scale = radius_m / Robot().wheel_radius_m
+    scale = radius_m / usual.wheel_radius_m
     track_m = radius_m * draw(3.3, 4.6)
     wheelbase_m = track_m * draw(0.62, 1.05)
-    base_kg = Robot().base_kg * scale**2.7 * draw(0.75, 1.35)
-    wheel_kg = Robot().wheel_kg * scale**2.7 * draw(0.8, 1.2)
+    base_kg = usual.base_kg * scale**2.7 * draw(0.75, 1.35)
+    wheel_kg = usual.wheel_kg * scale**2.7 * draw(0.8, 1.2)
     mass_kg = base_kg + 4.0 * (wheel_kg + 0.13)
     friction = draw(0.42, 0.9)
-    # What dragging a wheel sideways asks of its motor.
+    # What all the friction of a wheel asks of its motor.
     scrub_nm = friction * mass_kg * 9.81 / 4.0 * radius_m
     servo_nm_s = scrub_nm / draw(0.35, 1.0)
     torque_nm = scrub_nm * draw(3.0, 5.5)
     top_rad_s = draw(0.55, 1.25) / radius_m
-    length, width, height = Robot().half_m
+    length, width, height = usual.half_m
     half_m = (length * scale * draw(0.9, 1.1), width * scale * draw(0.9, 1.1), height * scale)
     sizes = {
         "command_delay": draw(0.06, 0.25), "motor_lag": draw(0.1, 0.33), "dead_band": draw(0.06, 0.12) * top_rad_s,
@@ -153,12 +155,12 @@ def drawn(number: int) -> Robot:
         friction=friction,
         base_kg=base_kg,
         half_m=half_m,
-        above_m=Robot().above_m * scale,
+        above_m=usual.above_m * scale,
         wheel_kg=wheel_kg,
-        wheel_half_m=Robot().wheel_half_m * scale,
+        wheel_half_m=usual.wheel_half_m * scale,
         rotor_kg_m2=mass_kg * radius_m**2 * draw(0.06, 0.2),
         bearing_nm_s=0.0017 * servo_nm_s,
-        payload_m={name: of * scale for name, of in Robot().payload_m.items()},
+        payload_m={name: of * scale for name, of in usual.payload_m.items()},
         sizes=sizes,
     )
 

@@ -147,6 +147,9 @@ def test_a_robot_is_one_with_a_name_or_the_one_that_a_number_draws(capsys):
     radii_m = np.array([drawn(number).wheel_radius_m for number in range(40)])
     assert 0.055 < radii_m.min() < 0.07
     assert 0.16 < radii_m.max() < 0.19
+    masses_kg = [robot.base_kg + 4.0 * (robot.wheel_kg + 0.13) for robot in map(drawn, range(2000))]
+    assert 3.0 < min(masses_kg) < 4.0
+    assert 120.0 < max(masses_kg) < 140.0
     for name in ("huge", "-3"):
         with pytest.raises(SystemExit):
             gap_mujoco.main([f"--robot={name}"])
@@ -166,7 +169,7 @@ def test_a_robot_that_is_drawn_drives_and_turns_as_skid_steer_robots_do(number):
     assert abs(slopes[0][4]) < 0.01
     rolled = robot.wheel_radius_m * (slopes[1][1] - slopes[1][0])
     assert 1.3 < rolled / slopes[1][4] / robot.track_m < 4.0
-    # Scrub takes up to 1 rad/s from a side.
+    # All friction of a wheel would take up to 1 rad/s.
     assert 0.1 < turning - slopes[1][1] < 1.2
 
 
