@@ -58,6 +58,7 @@ _CONTROLLER_STATES = (
 )
 _RECEIVE_OVERFLOW = 0x01
 ECHO_NS = 1_000_000_000
+# Of a bus whose library or system is not here; where a library was not loaded, some of python-can use it all the same.
 _NOT_HERE = (can.CanInterfaceNotImplementedError, ImportError, NameError)
 _OVER_A_TTY = ("slcan", "serial", "seeedstudio", "robotell")
 KIND = "can"
