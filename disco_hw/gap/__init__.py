@@ -211,7 +211,7 @@ def model_of(
             name, _, key = column.partition(".")
             if name not in named and column in values:
                 named[name] = {key: values[column]}
-    return amended_model(model, named, carried_terms(analysis), channel_estimates(analysis, final))
+    return amended_model(model, named, carried_terms(analysis, final), channel_estimates(analysis, final))
 
 
 def _drawn(analysis: GapAnalysis, gap: dict[str, dict[float, PredictionErrors]]) -> dict[str, bytes]:

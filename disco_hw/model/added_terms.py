@@ -25,7 +25,7 @@ Means: TypeAlias = Any
 
 def _entry_type(name: str, term: GenericTerm) -> Any:
     kind: Any = namedtuple
-    fields = ("k", "per_s") if term.memory is None else ("k", "by_end", "over_step")
+    fields = ("k", "reach", "per_s") if term.memory is None else ("k", "reach", "by_end", "over_step")
     made = kind("Term" + "".join(f"_{ord(c):x}" if not c.isalnum() else c for c in name), fields)
     made.__module__ = __name__
     return made
@@ -95,15 +95,21 @@ def add_to_commands(
     for entry, term in zip(terms, _terms_of(map(type, terms)), strict=True):
         if term.memory is None:
             feature = COMMAND_FEATURES[term.feature]
-            new_left = new_left + entry.k * feature(left, right, time_s)
-            new_right = new_right + entry.k * feature(right, left, time_s)
+            new_left = new_left + entry.k * _within(feature(left, right, time_s), entry.reach)
+            new_right = new_right + entry.k * _within(feature(right, left, time_s), entry.reach)
             continue
         mean_left = _averaged(term.memory.of(left, right), entry, means, at + place * apart)
         mean_right = _averaged(term.memory.of(right, left), entry, means, at + (place + 1) * apart)
-        new_left = new_left + entry.k * term.memory.feature(left, right, mean_left)
-        new_right = new_right + entry.k * term.memory.feature(right, left, mean_right)
+        new_left = new_left + entry.k * _within(term.memory.feature(left, right, mean_left), entry.reach)
+        new_right = new_right + entry.k * _within(term.memory.feature(right, left, mean_right), entry.reach)
         place += term.means
     return new_left, new_right
+
+
+@scalar_function
+def _within(feature: float, reach: float) -> float:
+    """A feature no larger than the log had it in which its term was found."""
+    return min(max(feature, -reach), reach)
 
 
 @scalar_function
@@ -123,22 +129,22 @@ def _add_to_commands(
     arguments = "left, right, time_s, terms, means, at, apart"
     if isinstance(terms, types.NoneType):
         return _made("add_to_commands", arguments, ["return left, right"], {})
-    scope: dict[str, Any] = {"averaged": _averaged, "place": np.uintp}
+    scope: dict[str, Any] = {"averaged": _averaged, "within": _within, "place": np.uintp}
     lines, place = ["new_left, new_right = left, right"], 0
     for n, term in enumerate(_compiled_terms(terms)):
         scope[f"feature{n}"] = _COMPILED[term.name]
         if term.memory is None:
             lines += [
-                f"new_left = new_left + terms[{n}].k * feature{n}(left, right, time_s)",
-                f"new_right = new_right + terms[{n}].k * feature{n}(right, left, time_s)",
+                f"new_left = new_left + terms[{n}].k * within(feature{n}(left, right, time_s), terms[{n}].reach)",
+                f"new_right = new_right + terms[{n}].k * within(feature{n}(right, left, time_s), terms[{n}].reach)",
             ]
             continue
         scope[f"of{n}"] = _AVERAGED[term.name]
         lines += [
             f"mean_left = averaged(of{n}(left, right), terms[{n}], means, at + place({place}) * apart)",
             f"mean_right = averaged(of{n}(right, left), terms[{n}], means, at + place({place + 1}) * apart)",
-            f"new_left = new_left + terms[{n}].k * feature{n}(left, right, mean_left)",
-            f"new_right = new_right + terms[{n}].k * feature{n}(right, left, mean_right)",
+            f"new_left = new_left + terms[{n}].k * within(feature{n}(left, right, mean_left), terms[{n}].reach)",
+            f"new_right = new_right + terms[{n}].k * within(feature{n}(right, left, mean_right), terms[{n}].reach)",
         ]
         place += term.means
     return _made("add_to_commands", arguments, [*lines, "return new_left, new_right"], scope)
@@ -164,12 +170,13 @@ def add_to_velocity(
     v, w, place = base.half_radius_m * wheel_sum, ratio * difference, 0
     for entry, term in zip(terms, _terms_of(map(type, terms)), strict=True):
         if term.memory is None:
-            more = entry.k * BODY_FEATURES[term.feature](v, w, base.half_radius_m * change * entry.per_s, time_s)
+            feature = BODY_FEATURES[term.feature](v, w, base.half_radius_m * change * entry.per_s, time_s)
         else:
             unit = term.memory.of(base.half_radius_m, ratio)
             mean = unit * _averaged(term.memory.of(wheel_sum, difference), entry, means, at + place * apart)
-            more = entry.k * term.memory.feature(v, w, mean)
+            feature = term.memory.feature(v, w, mean)
             place += term.means
+        more = entry.k * _within(feature, entry.reach)
         match term.target:
             case "v_x":
                 forward = forward + more
@@ -188,7 +195,9 @@ def _add_to_velocity(
     arguments = "forward, lateral, turn, wheel_sum, difference, change, time_s, base, terms, means, at, apart"
     if isinstance(terms, types.NoneType):
         return _made("add_to_velocity", arguments, ["return forward, lateral, turn"], {})
-    scope: dict[str, Any] = {"plus": _plus, "cast_like": cast_like, "averaged": _averaged, "place": np.uintp}
+    scope: dict[str, Any] = {
+        "plus": _plus, "cast_like": cast_like, "averaged": _averaged, "within": _within, "place": np.uintp
+    }  # fmt: skip
     lines = [
         "v = base.half_radius_m * wheel_sum",
         "w = (base.half_turn_ratio + base.half_turn_ratio) * difference",
@@ -199,15 +208,16 @@ def _add_to_velocity(
         scope[f"feature{n}"] = _COMPILED[term.name]
         if term.memory is None:
             acceleration = f"base.half_radius_m * change * terms[{n}].per_s" if term.needs_acceleration else "v"
-            more = f"terms[{n}].k * feature{n}(v, w, {acceleration}, time_s)"
+            feature = f"feature{n}(v, w, {acceleration}, time_s)"
         else:
             scope[f"of{n}"] = _AVERAGED[term.name]
             lines += [
                 f"unit = of{n}(base.half_radius_m, base.half_turn_ratio + base.half_turn_ratio)",
                 f"mean = unit * averaged(of{n}(wheel_sum, difference), terms[{n}], means, at + place({place}) * apart)",
             ]
-            more = f"terms[{n}].k * feature{n}(v, w, mean)"
+            feature = f"feature{n}(v, w, mean)"
             place += term.means
+        more = f"terms[{n}].k * within({feature}, terms[{n}].reach)"
         match term.target:
             case "v_x":
                 lines.append(f"new_forward = new_forward + {more}")

@@ -30,12 +30,16 @@ class Base(NamedTuple):
 class TermCoefficients(Protocol):
     """Coefficients of a term without a name, of one parameter point or arrays (L,) of many.
 
-    k and, of a term that remembers, how its mean follows in a step, else the steps a second.
+    k, reach and, of a term that remembers, how its mean follows in a step, else the steps a second.
     """
 
     @property
     def k(self) -> Any:
         """The term's number."""
+
+    @property
+    def reach(self) -> Any:
+        """The size at which its feature stays."""
 
     @property
     def per_s(self) -> Any:

@@ -19,7 +19,7 @@ from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
 from disco_hw.files import nearest
 from disco_hw.model.added_terms import table_entry
 from disco_hw.model.coefficients import Base, Coefficients, Effects, TermCoefficients
-from disco_hw.model.terms import COMMAND, TERMS, effect_of
+from disco_hw.model.terms import COMMAND, REACH, TERMS, effect_of
 
 Array = NDArray[np.float64]
 
@@ -190,7 +190,7 @@ BASE_PARAMETERS = (WHEEL_RADIUS, AXIAL_DISTANCE, X_ICR)
 
 @dataclass(frozen=True)
 class EffectSetting:
-    """An effect that a model has, with the values of its parameters.
+    """An effect that a model has, with the values of its parameters; of a term without a name `reach` may be left out.
 
     Raises ValueError for an unknown effect, missing or unknown parameters, or values outside their physical range.
     """
@@ -206,14 +206,15 @@ class EffectSetting:
                 f"{', '.join(REGISTRY)}, and terms such as 'v_x += k v^3'"
             )
         expected = [parameter.name for parameter in self.effect.parameters]
-        for given in self.values:
+        values = {REACH.name: REACH.neutral, **self.values} if self.name in TERMS else self.values
+        for given in values:
             if given not in expected:
                 raise ValueError(f"{self.name}.{given}: no such parameter; {self.name} has {', '.join(expected)}")
         for parameter in self.effect.parameters:
-            if parameter.name not in self.values:
+            if parameter.name not in values:
                 raise ValueError(f"{self.name}.{parameter.name}: missing; add its value in {parameter.unit}")
-            _check_range(f"{self.name}.{parameter.name}", parameter, self.values[parameter.name])
-        ordered = {name: float(self.values[name]) for name in expected}
+            _check_range(f"{self.name}.{parameter.name}", parameter, values[parameter.name])
+        ordered = {name: float(values[name]) for name in expected}
         object.__setattr__(self, "values", MappingProxyType(ordered))
 
     @property

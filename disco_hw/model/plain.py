@@ -145,21 +145,21 @@ BODY_MEMORIES: Mapping[str, _Memory] = {
 }
 
 
-def _terms(theta: Theta, target: str) -> list[tuple[str, Value]]:
-    """Features and coefficients of the terms that act on `target`; they are named `target += k feature`."""
-    parted = [(name.removesuffix(".k").partition(" += k "), value) for name, value in theta.items()]
-    return [(feature, value) for (acted_on, _, feature), value in parted if feature and acted_on == target]
+def _terms(theta: Theta, target: str) -> list[tuple[str, Value, Value]]:
+    """Features, coefficients and reach of the terms that act on `target`; they are named `target += k feature`."""
+    names = [name.removesuffix(".k") for name in theta if name.startswith(f"{target} += k ") and name.endswith(".k")]
+    return [(name.partition(" += k ")[2], theta[f"{name}.k"], theta[f"{name}.reach"]) for name in names]
 
 
 def _commands_remembered(theta: Theta, left: Value, right: Value) -> dict[str, tuple[_Memory, tuple[Value, ...]]]:
     """By feature the memories of commands that act, and what goes into each of their means."""
-    acting = [(name, COMMAND_MEMORIES[name]) for name, _ in _terms(theta, "command") if name in COMMAND_MEMORIES]
+    acting = [(name, COMMAND_MEMORIES[name]) for name, *_ in _terms(theta, "command") if name in COMMAND_MEMORIES]
     return {name: (memory, (memory.goes_in(left, right), memory.goes_in(right, left))) for name, memory in acting}
 
 
 def _body_remembered(theta: Theta, v: Value, w: Value) -> dict[str, tuple[_Memory, tuple[Value, ...]]]:
     """The same of the body's, which go by forward speed and yaw rate."""
-    features = [name for target in ("v_x", "omega") for name, _ in _terms(theta, target)]
+    features = [name for target in ("v_x", "omega") for name, *_ in _terms(theta, target)]
     acting = [(name, BODY_MEMORIES[name]) for name in features if name in BODY_MEMORIES]
     return {name: (memory, (memory.goes_in(v, w),)) for name, memory in acting}
 
@@ -199,16 +199,16 @@ def wheel_targets(
     """Wheel speeds that the drive aims for (rad/s), from commands and the wheel speeds of the state."""
     u_left, u_right = left, right
     remembered = _commands_remembered(theta, left, right)
-    for feature, k in _terms(theta, "command"):
+    for feature, k, reach in _terms(theta, "command"):
         if feature in remembered:
             memory, values = remembered[feature]
             before = state.means.get(feature, (0.0, 0.0))
             of_left, of_right = (memory.over(*pair, step_s) for pair in zip(before, values, strict=True))
-            left = left + k * memory.feature(u_left, u_right, of_left)
-            right = right + k * memory.feature(u_right, u_left, of_right)
+            left = left + k * np.clip(memory.feature(u_left, u_right, of_left), -reach, reach)
+            right = right + k * np.clip(memory.feature(u_right, u_left, of_right), -reach, reach)
             continue
-        left = left + k * COMMAND_FEATURES[feature](u_left, u_right, time_s)
-        right = right + k * COMMAND_FEATURES[feature](u_right, u_left, time_s)
+        left = left + k * np.clip(COMMAND_FEATURES[feature](u_left, u_right, time_s), -reach, reach)
+        right = right + k * np.clip(COMMAND_FEATURES[feature](u_right, u_left, time_s), -reach, reach)
     for effect in _acting(theta, Stage.COMMAND):
         at_start = {"wheel_left": state.wheel_left, "wheel_right": state.wheel_right, "time_s": time_s}
         if "command" in asks_for(effect.plain):
@@ -271,13 +271,14 @@ def body_velocity(
 
     def added(target: str) -> Value:
         total: Value = 0.0
-        for feature, k in _terms(theta, target):
+        for feature, k, reach in _terms(theta, target):
             if feature in remembered:
                 memory, (value,) = remembered[feature]
                 (before,) = means.get(feature, (0.0,))
-                total = total + k * memory.feature(*ideal[:2], memory.over(before, value, step_s))
+                gained = memory.feature(*ideal[:2], memory.over(before, value, step_s))
             else:
-                total = total + k * BODY_FEATURES[feature](*ideal)
+                gained = BODY_FEATURES[feature](*ideal)
+            total = total + k * np.clip(gained, -reach, reach)
         return total
 
     v, omega = motion["forward"] + added("v_x"), 2.0 * motion["turn"] + added("omega")

@@ -4,6 +4,9 @@ What a log shows to be missing and no named effect explains becomes such a term,
 `v_x += k v^3`. Terms stand in a model's list of effects. What the compiled step makes of them is in
 `disco_hw.model.added_terms`.
 
+Nothing says what such a form becomes beyond the motion that showed it: a cubic that was found below 0.3 rad/s is six
+times as much at 0.6. So a term has a `reach`, the largest size that its feature had in the log, and stays there.
+
 Some remember: `mean_1s(x)` is x through a first-order lag of 1 s, the mean over the past, of which what is older counts
 less. A load that drains a supply, motors that warm, a servo whose answer depends on where it comes from and rubber that
 gives way all depend on what was before. A model with such a feature has its means in its state; before a drive began
@@ -190,18 +193,22 @@ def _nothing_plain() -> None:
 
 
 def _coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """k and steps a second, each (L,)."""
-    return values[:, 0], np.full(values.shape[0], 1.0 / step_s)
+    """k, reach and steps a second, each (L,)."""
+    return values[:, 0], values[:, 1], np.full(values.shape[0], 1.0 / step_s)
 
 
 def _following(memory: Remembered, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """k, and how the mean follows: by the end of a step and in the mean over it; each (L,)."""
-    return values[:, 0], *(np.full(values.shape[0], part) for part in memory.follows(step_s))
+    """k, reach, and how the mean follows: by the end of a step and in the mean over it; each (L,)."""
+    return values[:, 0], values[:, 1], *(np.full(values.shape[0], part) for part in memory.follows(step_s))
+
+
+REACH = Parameter("reach", "SI", 0.0, 1e9, 1e9, neutral=1e9)
+"""The size at which a term's feature stays, however fast the robot moves; neutral where no robot gets to."""
 
 
 @dataclass(frozen=True, slots=True)
 class GenericTerm:
-    """A term: `target` of `COMMAND` and `BODY_TARGETS` gains k times the feature."""
+    """A term: `target` of `COMMAND` and `BODY_TARGETS` gains k times the feature, which stays within its reach."""
 
     target: str
     feature: str
@@ -228,12 +235,12 @@ class GenericTerm:
 
     @property
     def effect(self) -> Effect:
-        """The term as an effect of a model; k is in SI units."""
+        """The term as an effect of a model; k and reach are in SI units."""
         return Effect(
             name=self.name,
             channel=Channel.COMMAND_TO_WHEEL if self.target == COMMAND else Channel.WHEEL_TO_BODY,
             stage=Stage.TERMS,
-            parameters=(Parameter("k", "SI", -np.inf, np.inf, 0.0),),
+            parameters=(Parameter("k", "SI", -np.inf, np.inf, 0.0), REACH),
             plain=_nothing_plain,
             coefficients=_coefficients if self.memory is None else partial(_following, self.memory),
             may_turn_more=self.target == "omega",

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from disco_hw.errors import InputError
 from disco_hw.model import EffectSetting, Gaussian, Model, load_model, plain, save_model
 from disco_hw.model.step import FreeRun
 from disco_hw.model.terms import BODY_FEATURES, COMMAND_FEATURES, TERMS
@@ -30,6 +31,28 @@ def every_term(target, features):
     return tuple(
         EffectSetting(f"{target} += k {feature}", {"k": 0.003 * (1 + n)}) for n, feature in enumerate(features)
     )
+
+
+def within(reach):
+    """A term of each kind, of what is now and of what was before, of which each is somewhere beyond its reach."""
+    terms = {
+        "command += k u |u|": (0.01, 9.0), "command += k sign(u - mean_1s(u))": (0.3, 0.6),
+        "v_x += k v^3": (-9.0, 3e-3), "v_y += k omega^3": (0.2, 0.05),
+        "omega += k (omega - mean_1s(omega))": (-0.3, 0.1),
+    }  # fmt: skip
+    return tuple(EffectSetting(name, {"k": k, **({"reach": far} if reach else {})}) for name, (k, far) in terms.items())
+
+
+def test_no_term_goes_on_beyond_its_reach():
+    kept = compiled(within(reach=True))
+    np.testing.assert_allclose(kept, by_reference(within(reach=True)), atol=1e-9)
+    # Each of the states feels it: x, y and yaw by the terms of the body, wheels by those of commands.
+    assert (np.abs(kept - compiled(within(reach=False))).max(axis=0) > 1e-3).all()
+    drag, v = EffectSetting("v_x += k v^3", {"k": -4.0, "reach": 0.005}), 0.06 * 4.0
+    assert compiled((drag,))[6, 0] == pytest.approx((v - 4.0 * 0.005) * 0.3)
+    back = compiled((drag,))[12] - compiled((drag,))[6]
+    turned = compiled(())[12] - compiled(())[6]
+    assert back[2] == pytest.approx(turned[2])
 
 
 @pytest.mark.long
@@ -73,10 +96,17 @@ def test_terms_stand_in_a_model_file_and_its_belief(tmp_path):
     name = "v_x += k v^3"
     names = ("wheel_radius_m", "axial_distance_m", f"{name}.k")
     belief = Gaussian(names, np.array([0.06, 0.4, -0.4]), np.diag([1e-6, 1e-4, 1e-3]))
-    model = Model(*BASE, effects=(EffectSetting(name, {"k": -0.4}),), belief=belief)
+    model = Model(*BASE, effects=(EffectSetting(name, {"k": -0.4, "reach": 0.3}),), belief=belief)
     save_model(model, tmp_path / "model.toml")
     again = load_model(tmp_path / "model.toml")
     assert again.parameter_names == model.parameter_names
+    assert again.effects[0].values == {"k": -0.4, "reach": 0.3}
+    written = (tmp_path / "model.toml").read_text()
+    (tmp_path / "old.toml").write_text(written.replace("reach = 0.3\n", ""))
+    assert load_model(tmp_path / "old.toml").effects[0].values["reach"] > 1e8
+    (tmp_path / "wrong.toml").write_text(written.replace("reach = 0.3\n", "reach = -0.3\n"))
+    with pytest.raises(InputError, match=r"wrong.toml: v_x \+= k v\^3.reach: -0.3 is outside \[0.0, "):
+        load_model(tmp_path / "wrong.toml")
     np.testing.assert_array_equal(again.belief.covariance(), model.belief.covariance())
     with pytest.raises(ValueError, match=r"unknown effect 'v_x \+= k v\^4'"):
         EffectSetting("v_x += k v^4", {"k": 1.0})

@@ -13,20 +13,19 @@ from disco_hw.gap.search.analysis import FinalFit, GapAnalysis
 from disco_hw.gap.search.channel_result import ChannelEstimates, ParameterEstimate, UnnamedTerm
 from disco_hw.gap.search.end_to_end import Freed, JointFit, Part
 from disco_hw.gap.search.selection import Z95
+from disco_hw.gap.search.unnamed_terms import Term
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model.model import BASE_PARAMETERS
-from disco_hw.model.terms import TERMS, effect_of
+from disco_hw.model.terms import REACH, TERMS, effect_of
 
 Array = NDArray[np.float64]
 
 
 def channel_estimates(analysis: GapAnalysis, final: FinalFit) -> tuple[ChannelEstimates, ...]:
     """Estimates of the channels, body first, with the unnamed terms under their names in a model."""
-    body = final.final_body
-    geometry = (1.0, 1.0) if body is None else (float(body.vector[0]), float(body.vector[1]))
     both = ((analysis.body, final.final_body_estimates), (analysis.wheels, final.wheel_estimates))
     return tuple(
-        with_terms_named(part, found.unnamed, geometry)
+        with_terms_named(part, found.unnamed, _geometry(final))
         for found, part in both
         if found is not None and part is not None
     )
@@ -73,7 +72,7 @@ def simple_model(model: Model, of: Freed, joint: JointFit) -> tuple[Model, tuple
             for key in (p.name for p in effect_of(name).parameters)
             if (estimate := by_name.get(f"{name}.{key}", _given(model, name, key))) is not None
         }
-    return amended_model(model, effects, (), (ChannelEstimates(by_name, joint.names, joint.covariance),))
+    return amended_model(model, effects, {}, (ChannelEstimates(by_name, joint.names, joint.covariance),))
 
 
 def _given(model: Model, name: str, key: str) -> ParameterEstimate | None:
@@ -82,10 +81,28 @@ def _given(model: Model, name: str, key: str) -> ParameterEstimate | None:
     return ParameterEstimate(values[0], values[0], values[0]) if values else None
 
 
-def carried_terms(analysis: GapAnalysis) -> tuple[str, ...]:
-    """Names of the accepted unnamed terms that a model can carry."""
+def _geometry(final: FinalFit) -> tuple[float, float]:
+    """Wheel radius and axial distance (m) as they were fitted; 1 where no poses tell."""
+    body = final.final_body
+    return (1.0, 1.0) if body is None else (float(body.vector[0]), float(body.vector[1]))
+
+
+def carried_terms(analysis: GapAnalysis, final: FinalFit) -> dict[str, float]:
+    """By name the accepted unnamed terms that a model can carry, and the largest size that their features had."""
     found = [found for found in (analysis.body, analysis.wheels) if found is not None]
-    return tuple(one.term.model_name for each in found for one in each.unnamed if one.term.model_name is not None)
+    terms = [one.term for each in found for one in each.unnamed]
+    return {
+        term.model_name: float(np.abs(term.perturbation).max()) / _rescaled(term, _geometry(final))
+        for term in terms
+        if term.model_name is not None
+    }
+
+
+def _rescaled(term: Term, geometry: tuple[float, float]) -> float:
+    """Factor of a term's number with speeds that wheels of `geometry` make."""
+    assert term.model_name is not None
+    old_radius, old_axial = term.geometry
+    return TERMS[term.model_name].rescaled(geometry[0] / old_radius, geometry[1] / old_axial)
 
 
 def with_terms_named(
@@ -102,8 +119,7 @@ def with_terms_named(
         if name is None or column not in names:
             continue
         place = names.index(column)
-        old_radius, old_axial = found.term.geometry
-        factor = TERMS[name].rescaled(geometry[0] / old_radius, geometry[1] / old_axial)
+        factor = _rescaled(found.term, geometry)
         names[place], factors[place] = f"{name}.k", factor
         old = by_name.pop(column)
         by_name[f"{name}.k"] = ParameterEstimate(old.value * factor, old.low * factor, old.high * factor)
@@ -113,28 +129,29 @@ def with_terms_named(
 def amended_model(
     model: Model,
     effects: Mapping[str, Mapping[str, ParameterEstimate]],
-    terms: Sequence[str],
+    terms: Mapping[str, float],
     parts: tuple[ChannelEstimates, ...],
 ) -> tuple[Model, tuple[str, ...]]:
     """The model with base parameters of `parts`, `effects` and `terms` added, and their joint Gaussian; and notes.
 
-    Terms that the model has already stay, with what was believed of them. Values outside an effect's physical range are
-    put at its end, with a note.
+    `terms` has by name how far each reaches. Terms that the model has already stay, with what was believed of them, and
+    reach no less far. Values outside an effect's physical range are put at its end, with a note.
     """
     notes: list[str] = []
     estimates = {name: estimate for part in parts for name, estimate in part.by_name.items()}
     base = {p.name: estimates[p.name].value for p in BASE_PARAMETERS if p.name in estimates}
-    known = _known_terms(model, base)
-    for name in terms:
+    known, reach = _known_terms(model, base)
+    for name, largest in terms.items():
         found, before = estimates[f"{name}.k"], known[name].value if name in known else 0.0
         known[name] = ParameterEstimate(before + found.value, before + found.low, before + found.high)
+        reach[name] = max(largest, reach.get(name, 0.0))
     wanted = {**effects, **{name: {"k": estimate} for name, estimate in known.items()}}
     settings = []
     for name, values in wanted.items():
         inside = {}
         for parameter in effect_of(name).parameters:
             key = parameter.name
-            value = values[key].value if key in values else parameter.neutral
+            value = values[key].value if key in values else reach.get(name, parameter.neutral)
             inside[key] = min(max(value, parameter.low), parameter.high)
             if inside[key] != value:
                 notes.append(f"{name}.{key}: {value:.4g} is outside what the model takes; {inside[key]:.4g} is written")
@@ -152,12 +169,12 @@ def amended_model(
     return replace(bare, belief=belief), tuple(notes)
 
 
-def _known_terms(model: Model, base: Mapping[str, float]) -> dict[str, ParameterEstimate]:
-    """The terms that a model has, with their intervals, in units of the refitted `base`."""
+def _known_terms(model: Model, base: Mapping[str, float]) -> tuple[dict[str, ParameterEstimate], dict[str, float]]:
+    """The terms that a model has, with their intervals, and how far they reach, in units of the refitted `base`."""
     ratios = [
         base.get(name, getattr(model, name)) / getattr(model, name) for name in ("wheel_radius_m", "axial_distance_m")
     ]
-    found = {}
+    found, reach = {}, {}
     for setting in model.effects:
         if setting.name not in TERMS:
             continue
@@ -168,7 +185,8 @@ def _known_terms(model: Model, base: Mapping[str, float]) -> dict[str, Parameter
             deviation = abs(factor) * float(model.belief.covariance()[place, place]) ** 0.5
         value = setting.values["k"] * factor
         found[setting.name] = ParameterEstimate(value, value - Z95 * deviation, value + Z95 * deviation)
-    return found
+        reach[setting.name] = min(setting.values[REACH.name] / factor, REACH.neutral)
+    return found, reach
 
 
 def _joint(

@@ -161,17 +161,18 @@ def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
 
 
 def _weightings_apart(found: ChannelResult) -> Array:
-    """Squares, (A,), of how far the two weightings of the wheels' errors lie apart, beyond what chance does.
+    """Variances, (A,), of what the two weightings of the wheels' errors find, beyond what chance does.
 
     Were the model right, both would find the same, and the difference vary by the difference of their variances
-    (Hausman, 1978); as it is not, either finds what its own mixture of slow and fast wheels makes of it.
+    (Hausman, 1978); as it is not, either finds what its own mixture of slow and fast wheels makes of it. Two values
+    that differ by d vary by d^2 / 2.
     """
     best, evenly = found.told, found.evenly
     if evenly is None:
         return np.zeros(len(best.active))
     chosen = list(best.active)
     by_chance = np.abs(deviations_of(evenly, found.channel) ** 2 - deviations_of(found.fit, found.channel) ** 2)
-    return np.asarray(np.maximum((evenly.vector - found.fit.vector)[chosen] ** 2 - by_chance, 0.0))
+    return np.asarray(0.5 * np.maximum((evenly.vector - found.fit.vector)[chosen] ** 2 - by_chance, 0.0))
 
 
 def _profiled(found: ChannelResult, column: str, step: float) -> ParameterEstimate:

@@ -25,6 +25,7 @@ from disco_hw.model.terms import (
     COMMAND,
     COMMAND_FEATURES,
     COMMAND_MEMORIES,
+    REACH,
     TERMS,
     GenericTerm,
     term_name,
@@ -140,13 +141,19 @@ def with_known_terms(drive: GriddedDrive, effects: Iterable[EffectSetting], p: A
         if term is None:
             continue
         if term.target == COMMAND:
-            perturbation = setting.values["k"] * _of_commands(term, u, drive.t_s)
+            perturbation = _times(setting, _of_commands(term, u, drive.t_s))
             command = perturbation if command is None else command + perturbation
         else:
-            perturbation = setting.values["k"] * _of_body(term, v, w, a, drive.t_s)
+            perturbation = _times(setting, _of_body(term, v, w, a, drive.t_s))
             perturbation = _on(BODY_TARGETS.index(term.target), perturbation)
             motion_perturbation = perturbation if motion_perturbation is None else motion_perturbation + perturbation
     return replace(drive, known_command=command, known_motion=motion_perturbation)
+
+
+def _times(setting: EffectSetting, feature: Array) -> Array:
+    """What a model's term adds for a feature at the nodes."""
+    reach = setting.values[REACH.name]
+    return np.asarray(setting.values["k"] * np.clip(feature, -reach, reach))
 
 
 def _of_commands(term: GenericTerm, u: Array, t_s: Array) -> Array:

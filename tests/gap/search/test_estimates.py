@@ -45,8 +45,8 @@ def test_two_weightings_lie_apart_by_what_is_beyond_the_difference_of_their_vari
     deviations = {id(evenly): np.array([3.0, 1.0, 1.0]), id(told): np.array([2.0, 2.0, 1.0])}
     monkeypatch.setattr(channel_result, "deviations_of", lambda best, channel: deviations[id(best)])
     found = SimpleNamespace(told=told, fit=told, evenly=evenly, channel=None)
-    # 16 beyond 9 - 4, 1 within 4 - 1, and 4 beyond none.
-    assert channel_result._weightings_apart(found).tolist() == [11.0, 0.0, 4.0]
+    # Half of 16 beyond 9 - 4, of 1 within 4 - 1, and of 4 beyond none.
+    assert channel_result._weightings_apart(found).tolist() == [5.5, 0.0, 2.0]
     assert channel_result._weightings_apart(SimpleNamespace(told=told, evenly=None)).tolist() == [0.0] * 3
 
 

@@ -165,6 +165,15 @@ def test_terms_of_a_given_model_are_added_up_by_channel():
     np.testing.assert_allclose(timed.known_command, 0.01 * T_S[:, None] * u, atol=1e-12)
     assert timed.known_motion is None
     assert with_known_terms(line, settings[2:3], p, 0.5).known_command is None
+    short = [
+        EffectSetting("command += k u |u|", {"k": 0.1, "reach": 2.0}),
+        EffectSetting("v_y += k v omega", {"k": 0.4, "reach": 0.01}),
+    ]
+    near = with_known_terms(line, short, p, 0.5)
+    assert np.abs(u * np.abs(u)).max() > 2.0
+    np.testing.assert_allclose(near.known_command, 0.1 * np.clip(u * np.abs(u), -2.0, 2.0), atol=1e-12)
+    assert abs(v * w) > 0.01
+    np.testing.assert_allclose(near.known_motion[:, 1], 0.4 * 0.01, atol=1e-12)
     load = with_known_terms(line, [EffectSetting("command += k u mean_1s(|u| + |u_other|)", {"k": 0.2})], p, 0.5)
     offered = by_form(wheel_terms(SimpleNamespace(drive=line), 0.5))["command += 1 u mean_1s(|u| + |u_other|)"]
     np.testing.assert_allclose(load.known_command, 0.2 * offered.perturbation, atol=1e-12)

@@ -52,6 +52,15 @@ def rms_error_m(model, log):
 def test_the_form_that_was_found_closes_the_gap_on_another_drive(name, size, term, tmp_path):
     report = report_of(name, size)
     assert [setting.name for setting in report.model.effects] == [term]
+    log, reach = simulated_drive({name: size}, seed=902), report.model.effects[0].values["reach"]
+    if term.startswith("command"):
+        # Of commands in force over a step, which is their mean.
+        fastest = np.abs([log.commands.left_rad_s, log.commands.right_rad_s]).max()
+        assert reach == pytest.approx(fastest**2, rel=1e-3)
+    else:
+        # Single readings scatter by a few percent, their cubes by three times that.
+        fastest = np.abs(log.wheels.left_speed_rad_s + log.wheels.right_speed_rad_s).max()
+        assert reach == pytest.approx((0.5 * report.model.wheel_radius_m * fastest) ** 3, rel=0.15)
     save_model(report.model, tmp_path / "model.toml")
     amended = load_model(tmp_path / "model.toml")
     other = simulated_drive({name: size}, seed=903, robot=902)

@@ -1,0 +1,62 @@
+"""What an amended model holds of terms without a name: their numbers, and how far each of them reaches."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from disco_hw.gap.report.amend import amended_model, carried_terms
+from disco_hw.gap.search.channel_result import ChannelEstimates, ParameterEstimate, UnnamedTerm
+from disco_hw.gap.search.unnamed_terms import Term
+from disco_hw.model import EffectSetting, Model
+
+DRAG, SHARED = "v_x += k v^3", "command += k u_other"
+
+
+def estimates(**values):
+    """Of parameters that are known to a tenth of a unit."""
+    by_name = {name: ParameterEstimate.around(value, 0.1) for name, value in values.items()}
+    return (ChannelEstimates(by_name, tuple(by_name), 0.01 * np.eye(len(by_name))),)
+
+
+def terms_of(model, terms, values):
+    found, notes = amended_model(model, {}, terms, estimates(**values))
+    assert not notes
+    return {setting.name: dict(setting.values) for setting in found.effects}, found
+
+
+def test_a_term_reaches_as_far_as_its_log_did():
+    terms, found = terms_of(Model(0.06, 0.4), {DRAG: 0.2, SHARED: 7.0}, {f"{DRAG}.k": -0.5, f"{SHARED}.k": 0.1})
+    assert terms == {DRAG: {"k": -0.5, "reach": 0.2}, SHARED: {"k": 0.1, "reach": 7.0}}
+    # Nothing is believed of a reach: it is no property of the robot.
+    assert found.belief.names == (f"{DRAG}.k", f"{SHARED}.k")
+
+
+@pytest.mark.parametrize(("larger", "smaller"), [(0.3, 0.2), (0.2, 0.3)])
+def test_a_term_that_a_model_has_reaches_no_less_far_after_another_log(larger, smaller):
+    model = Model(0.06, 0.4, effects=(EffectSetting(DRAG, {"k": -0.5, "reach": larger}),))
+    terms, _ = terms_of(model, {DRAG: smaller}, {f"{DRAG}.k": -0.1})
+    assert terms[DRAG] == {"k": pytest.approx(-0.6), "reach": 0.3}
+
+
+def test_the_reach_of_a_known_term_is_that_of_the_same_turns_on_other_wheels():
+    model = Model(
+        0.06, 0.4, effects=(EffectSetting(DRAG, {"k": -0.5, "reach": 0.2}), EffectSetting(SHARED, {"k": 0.1}))
+    )
+    terms, found = terms_of(model, {}, {"wheel_radius_m": 0.066})
+    assert terms[DRAG] == {"k": pytest.approx(-0.5 / 1.1**3), "reach": pytest.approx(0.2 * 1.1**3)}
+    assert terms[SHARED] == {"k": pytest.approx(0.1), "reach": 1e9}
+    assert amended_model(found, {}, {}, estimates(wheel_radius_m=0.01))[0].effects[1].values["reach"] == 1e9
+
+
+def test_how_far_a_term_reaches_is_its_largest_feature_in_speeds_of_the_last_fit():
+    feature = np.array([[0.1, 0.0, 0.0], [-0.3, 0.0, 0.0], [0.2, 0.0, 0.0]])
+    drag = Term("v_x += {:.4g} v^3", feature, DRAG, geometry=(0.06, 0.4))
+    shared = Term("command += {:.4g} u_other", np.array([[4.0, -5.0]]), SHARED)
+    written = [UnnamedTerm(term.form, None, term) for term in (drag, replace(drag, model_name=None), shared)]
+    analysis = SimpleNamespace(body=SimpleNamespace(unnamed=written[:2]), wheels=SimpleNamespace(unnamed=written[2:]))
+    final = SimpleNamespace(final_body=SimpleNamespace(vector=np.array([0.066, 0.5, 0.0])))
+    assert carried_terms(analysis, final) == {DRAG: pytest.approx(0.3 * 1.1**3), SHARED: 5.0}
+    alone = carried_terms(SimpleNamespace(body=None, wheels=analysis.wheels), SimpleNamespace(final_body=None))
+    assert alone == {SHARED: 5.0}
