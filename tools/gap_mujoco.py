@@ -22,7 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize_scalar
 from scipy.signal import lfilter
 
 from disco_hw.gap import model_of, offered_stage, search_log, written_of
@@ -168,10 +168,11 @@ def drawn(number: int) -> Robot:
 def truth_of(hidden: str, recording: Recording, beside: Sequence[str] = ()) -> float | None:
     """What is true of the parameter that stands for what was hidden.
 
-    A delay and a lag are those that the true wheels show, the servo's own included. A payload's is what the true motion
-    shows: the forward speed of the middle that turning makes, with the forms that the search has `beside` it, as a
-    share of a curve depends on what else has a share in it. A worn tyre's is how much further the same difference of
-    the true wheels turns the robot to the left.
+    A delay and a lag are those that the true wheels show, the servo's own included. How late poses are is how far they
+    lie behind the true wheels: the body's own lag, as tyres slip before they push, comes on top. A payload's is what
+    the true motion shows: the forward speed of the middle that turning makes, with the forms that the search has
+    `beside` it, as a share of a curve depends on what else has a share in it. A worn tyre's is how much further the
+    same difference of the true wheels turns the robot to the left.
     """
     if hidden not in NAMES:
         return None
@@ -179,6 +180,8 @@ def truth_of(hidden: str, recording: Recording, beside: Sequence[str] = ()) -> f
     match hidden:
         case "command_delay" | "motor_lag":
             return response_of(recording)[hidden]
+        case "pose_latency":
+            return size + body_lag_s(recording)
         case "unequal_wheels":
             return size / (2.0 + size)
         case "slope":
@@ -227,6 +230,28 @@ def response_of(recording: Recording) -> dict[str, float]:
 
     delay_s, lag_s, _ = least_squares(off, [0.05, 0.08, 1.0], x_scale=[0.01, 0.01, 0.01], diff_step=1e-3).x
     return {"command_delay": float(delay_s), "motor_lag": float(lag_s)}
+
+
+def body_lag_s(recording: Recording) -> float:
+    """How far the true body follows behind the true wheels (s): the shift that fits the speeds of its two sides best.
+
+    Forward and turning speeds are as large as the wheels make them, by a factor of each, without any noise.
+    """
+    every = slice(None, None, 8)
+    t_s, (x, y, yaw), turned = recording.truth_s[every], recording.truth[every].T, recording.turned[every]
+    forward = np.gradient(x, t_s) * np.cos(yaw) + np.gradient(y, t_s) * np.sin(yaw)
+    turning = np.gradient(yaw, t_s) * recording.robot.track_m / 2
+    left, right = (np.gradient(turned[:, side].mean(axis=1), t_s) for side in ([0, 2], [1, 3]))
+
+    def off(lag_s: float) -> float:
+        squares = 0.0
+        for wheels, body in ((right + left, forward), (right - left, turning)):
+            earlier = np.interp(t_s - lag_s, t_s, wheels)
+            scale = max(float(earlier @ earlier), 1e-12)
+            squares += float(((body - (earlier @ body) / scale * earlier) ** 2).sum())
+        return squares
+
+    return float(minimize_scalar(off, bounds=(-0.1, 0.2), method="bounded", options={"xatol": 1e-4}).x)
 
 
 def injected_floor(recording: Recording) -> tuple[float, float]:

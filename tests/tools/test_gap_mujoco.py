@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tools import gap_mujoco
-from tools.gap_mujoco import Result, drawn, injected_floor, response_of, robot_of, table, truth_of
+from tools.gap_mujoco import Result, body_lag_s, drawn, injected_floor, response_of, robot_of, table, truth_of
 from tools.mujoco_robot import EFFECTS, ROBOTS, Recording, Robot, joystick, record
 
 LATENCY = {"pose_latency": {"latency_s": 0.2}}
@@ -68,6 +69,22 @@ def test_the_noise_that_was_put_in_makes_what_it_must():
     position = math.sqrt(2.0 * size**2 * (1.0 + 1.0 / averaged) + (way * yaw_size) ** 2 / averaged)
     yaw = yaw_size * math.sqrt(1.0 + 1.0 / averaged)
     assert injected_floor(recording) == pytest.approx((1e3 * position, 1e3 * yaw), rel=0.02)
+
+
+def test_how_late_poses_are_is_counted_from_the_true_wheels():
+    """A body that follows its wheels 25 ms later, whatever share of their turning it loses."""
+    t_s = np.arange(14_400) / 480.0
+    command = np.repeat(joystick(5, 30.0), 12, axis=0)
+    turned = np.cumsum(command, axis=0)[:, [0, 1, 0, 1]] / 480.0
+    late = np.vstack([np.zeros((12, 2)), command[:-12]])
+    yaw = np.cumsum(0.4 * 0.13 / 0.49 * (late[:, 1] - late[:, 0])) / 480.0
+    forward = 0.13 / 2 * late.sum(axis=1)
+    truth = np.column_stack([np.cumsum(forward * np.cos(yaw)) / 480.0, np.cumsum(forward * np.sin(yaw)) / 480.0, yaw])
+    nothing, none = np.zeros((0, 3)), np.zeros((0, 2))
+    recording = Recording(t_s[:0], none, t_s[:0], none, t_s[:0], nothing, t_s, truth, turned, nothing)
+    assert body_lag_s(recording) == pytest.approx(0.025, abs=0.001)
+    recording = replace(recording, hidden={"pose_latency": 0.2})
+    assert truth_of("pose_latency", recording) == pytest.approx(0.225, abs=0.001)
 
 
 def test_the_response_of_true_wheels_is_told_whatever_turning_loses():
