@@ -30,7 +30,7 @@ from disco_hw.model import Model, load_model, save_model
 from disco_hw.model.step import FreeRun
 from disco_hw.model.terms import TERMS
 from tools import strange_robot
-from tools.mujoco_robot import joystick
+from tools.joystick import joystick
 
 Array = NDArray[np.float64]
 AHEAD_S, STEP_S, BEFORE_STEPS = 2.0, 0.02, 50

@@ -37,10 +37,12 @@ from tools.gap_halves import STAGES, unseen_errors
 from tools.gap_study import revision
 from tools.mujoco_robot import (
     DOWNHILL_RAD,
+    DURATION_S,
     EFFECTS,
     ROBOTS,
     STEPS_PER_COMMAND,
     STEPS_PER_S,
+    Habits,
     Hidden,
     Recording,
     Robot,
@@ -48,6 +50,8 @@ from tools.mujoco_robot import (
 )
 
 AHEAD_S = 2.0
+OTHER_HABITS = 100
+"""From this number on a robot is drawn with how it is driven and logged."""
 UNSEEN = 1000
 """The drive that nobody saw has a seed that is so much larger."""
 NAMES = {
@@ -112,7 +116,7 @@ def drawn(number: int) -> Robot:
     """A robot whose size, weight, servos, sensors and floor, and the sizes of what may be hidden in it, a number draws.
 
     Wheels of 55 to 190 mm, and the mass that goes with them (3 to 140 kg); all friction of a wheel takes 0.35 to 1
-    rad/s from its motor.
+    rad/s from its motor. From 100 on the number draws too how the robot is driven and logged.
     """
     usual = Robot()
     draw = np.random.default_rng([number, 99]).uniform
@@ -162,6 +166,27 @@ def drawn(number: int) -> Robot:
         bearing_nm_s=0.0017 * servo_nm_s,
         payload_m={name: of * scale for name, of in usual.payload_m.items()},
         sizes=sizes,
+        habits=_habits(number) if number >= OTHER_HABITS else Habits(),
+    )
+
+
+def _habits(number: int) -> Habits:
+    """Keys or a joystick, slowly or not for long; 10 to 40 commands, 15 to 60 readings and 10 to 30 poses a second."""
+    rng = np.random.default_rng([number, 777])
+    pose_every, reading_every, command_every = (
+        int(rng.choice(options)) for options in ([1, 2, 3], [1, 2, 4], [1, 2, 4])
+    )
+    jitter_s, lost = float(rng.choice([0.0, 0.002, 0.006])), float(rng.choice([0.0, 0.02, 0.1]))
+    style = rng.choice(["joystick", "keyboard", "short", "slow"])
+    return Habits(
+        seconds={"short": 70.0, "slow": 200.0}.get(style, DURATION_S),
+        pace=0.5 if style == "slow" else 1.0,
+        keyboard=bool(style == "keyboard"),
+        command_every=command_every,
+        reading_every=reading_every,
+        pose_every=pose_every,
+        jitter_s=jitter_s,
+        lost=lost,
     )
 
 
@@ -217,7 +242,7 @@ def response_of(recording: Recording) -> dict[str, float]:
     Least squares on how far they turn from one twentieth of a second to the next, without any noise.
     """
     t_s, asked = recording.truth_s, recording.command.mean(axis=1)
-    asked = np.repeat(asked, STEPS_PER_COMMAND)[: t_s.size]
+    asked = np.repeat(asked, STEPS_PER_COMMAND * recording.robot.habits.command_every)[: t_s.size]
     every = slice(None, None, STEPS_PER_S // 20)
     turned = np.diff(recording.turned.mean(axis=1)[every])
 

@@ -38,7 +38,8 @@ from disco_hw.log.load import load_drive
 from disco_hw.model import Model
 from sim.plant_parameters import PlantParameters
 from tools.foreign_plant import ForeignPlant, ForeignRobot
-from tools.mujoco_robot import COUNTS_PER_TURN, TOP_RAD_S, TRACK_M, WHEEL_RADIUS_M, record
+from tools.joystick import TOP_RAD_S
+from tools.mujoco_robot import COUNTS_PER_TURN, TRACK_M, WHEEL_RADIUS_M, record
 from tools.simulated_drives import make_drive
 from tools.simulated_log import simulated_log, write_csv
 

@@ -6,7 +6,8 @@ for missing effects fits (`tests/tools/test_mujoco_robot.py` holds it to that): 
 and servos make of them.
 
 Poses are of the base's middle and carry white noise on each axis and on the yaw; encoders are those of the motors, the
-mean of a side's two, in steps of a turn over their counts. Stamps are exact. There are robots of three sizes.
+mean of a side's two, in steps of a turn over their counts. Stamps are exact, unless its `Habits` are others. There are
+robots of three sizes.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ from numpy.typing import NDArray
 
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, differentiate_angle
 from disco_hw.log.importing import write_log
+from tools.joystick import COMMANDS_PER_S, TOP_RAD_S, joystick, keyboard
 
 Array = NDArray[np.float64]
 
 STEPS_PER_S = 480
-STEPS_PER_COMMAND, STEPS_PER_READING = 12, 8
+STEPS_PER_COMMAND, STEPS_PER_READING = STEPS_PER_S // COMMANDS_PER_S, 8
 STEPS_PER_POSE = 2 * STEPS_PER_READING
 WHEEL_RADIUS_M, TRACK_M, WHEELBASE_M = 0.133, 0.49, 0.43
-TOP_RAD_S = 5.3
 COUNTS_PER_TURN = 1470
 POSITION_STD_M, YAW_STD_RAD = 0.0062, 0.0073
 DURATION_S = 153.0
@@ -56,6 +57,24 @@ EFFECTS = {
 }
 """What can be hidden: a usual size, and what the size means."""
 Hidden = dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Habits:
+    """How a robot is driven, and how its host logs that: one of so many commands, readings and poses that there are.
+
+    A joystick or the keys of a keyboard ask for `pace` of what the robot can. Stamps are late at random, by half a
+    normal distribution of `jitter_s`; a share of readings and of poses is lost.
+    """
+
+    seconds: float = DURATION_S
+    pace: float = 1.0
+    keyboard: bool = False
+    command_every: int = 1
+    reading_every: int = 1
+    pose_every: int = 1
+    jitter_s: float = 0.0
+    lost: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +105,7 @@ class Robot:
     bearing_nm_s: float = 0.023
     payload_m: Mapping[str, float] = field(default_factory=lambda: {"half": 0.07, "aside": 0.165, "high": 0.165})
     sizes: Mapping[str, float] = field(default_factory=dict)
+    habits: Habits = Habits()
 
     def size(self, effect: str) -> float:
         """Usual size of what can be hidden."""
@@ -192,9 +212,9 @@ _PAYLOAD = '<geom type="box" size="{half} {half} {half}" mass="{kg}" pos="0 {asi
 class Recording:
     """What was measured, and the truth beside it.
 
-    Times in s from the start; commands and counted angles (N, 2), left and right, in rad/s and rad; poses (P, 3) in m
-    and rad. `truth`: where the robot was at `truth_s`, (T, 3), its yaw not wrapped; `turned`: its wheels' angles there,
-    (T, 4), as in `_WHEELS`; `noise`: what was added to the poses, (P, 3).
+    Times in s from the start, as stamped; commands and counted angles (N, 2), left and right, in rad/s and rad; poses
+    (P, 3) in m and rad. `truth`: where the robot was at `truth_s`, (T, 3), its yaw not wrapped; `turned`: its wheels'
+    angles there, (T, 4), as in `_WHEELS`; `noise`: what was added to the poses, (P, 3).
     """
 
     command_s: Array
@@ -267,60 +287,16 @@ def mjcf(hidden: Hidden, robot: Robot = ROBOTS["middle"]) -> str:
     )
 
 
-def joystick(seed: int, duration_s: float = DURATION_S, top_rad_s: float = TOP_RAD_S) -> Array:
-    """Wheel-speed commands (N, 2) of a person who tries a robot out: straights, turns, arcs, weaving, pauses, stops.
-
-    A wish is held for some seconds and reached as fast as a thumb moves; the stick is never quite still.
-    """
-    rng = np.random.default_rng([seed, 4711])
-    rate = STEPS_PER_S // STEPS_PER_COMMAND
-    wishes: list[tuple[float, float, float]] = []
-    rows = np.zeros((0, 2))
-    while rows.shape[0] < duration_s * rate:
-        if not wishes:
-            wishes = _round(rng)
-        seconds, forward, turn = wishes.pop()
-        rows = np.concatenate([rows, np.tile([forward, turn], (round(seconds * rate), 1))])
-    rows = rows[: round(duration_s * rate)]
-    shaken = rows * (1.0 + 0.021 * _slow(rng, rows.shape, rate / 3))
-    stick, thumb, now = np.empty_like(shaken), rng.uniform(2.1, 4.3) / rate, np.zeros(2)
-    for k, wish in enumerate(shaken):
-        now = now + np.clip(wish - now, -thumb, thumb)
-        stick[k] = now
-    sides = np.column_stack([stick[:, 0] - stick[:, 1], stick[:, 0] + stick[:, 1]])
-    return top_rad_s * np.clip(sides, -1.0, 1.0)
-
-
-def _round(rng: np.random.Generator) -> list[tuple[float, float, float]]:
-    """Half a minute or so of wishes in some order: seconds, and stick forward and to the left as shares."""
-    either = rng.choice([-1.0, 1.0], size=9)
-    wishes = [
-        (rng.uniform(2, 4), rng.uniform(0.37, 0.93), 0.0),
-        (rng.uniform(2, 3), -rng.uniform(0.27, 0.67), 0.0),
-        (rng.uniform(2, 4), 0.0, either[0] * rng.uniform(0.32, 0.57)),
-        (rng.uniform(1, 3), 0.0, -either[0] * rng.uniform(0.19, 0.44)),
-        *((rng.uniform(2, 5), rng.uniform(0.29, 0.66), side * rng.uniform(0.07, 0.29)) for side in either[1:5]),
-        (rng.uniform(2, 4), -rng.uniform(0.22, 0.43), either[5] * rng.uniform(0.07, 0.19)),
-        (rng.uniform(1, 2), rng.uniform(0.11, 0.27), either[6] * rng.uniform(0.09, 0.23)),
-    ]
-    wishes = [wishes[place] for place in rng.permutation(len(wishes))]
-    # A thumb lets go now and then, for a moment or longer.
-    rests = rng.random(len(wishes)) < 0.47
-    pauses = [[(rng.uniform(0.61, 1.9), 0.0, 0.0)] if rest else [] for rest in rests]
-    return [each for wish, pause in zip(wishes, pauses, strict=True) for each in (wish, *pause)]
-
-
-def _slow(rng: np.random.Generator, shape: tuple[int, ...], samples: float) -> Array:
-    """Noise of unit variance that stays the same for about so many samples."""
-    white = rng.standard_normal(shape)
-    keep = 1.0 - 1.0 / samples
-    for k in range(1, shape[0]):
-        white[k] = keep * white[k - 1] + math.sqrt(1.0 - keep * keep) * white[k]
-    return white
+def driven(robot: Robot, seed: int) -> Array:
+    """Commands (N, 2) of whoever drives a robot, as they are sent: each stays until the next."""
+    habits = robot.habits
+    by = keyboard if habits.keyboard else joystick
+    command, every = by(seed, habits.seconds, habits.pace * robot.top_rad_s), habits.command_every
+    return np.repeat(command[::every], every, axis=0)[: command.shape[0]]
 
 
 def record(hidden: Hidden, seed: int, command: Array | None = None, robot: Robot = ROBOTS["middle"]) -> Recording:
-    """Drive a robot with these effects hidden in it; `command`: (N, 2), in place of the joystick's.
+    """Drive a robot with these effects hidden in it; `command`: (N, 2), in place of what its driver would do.
 
     Raises ValueError for an effect that does not exist, ImportError without mujoco.
     """
@@ -329,7 +305,7 @@ def record(hidden: Hidden, seed: int, command: Array | None = None, robot: Robot
     unknown = set(hidden) - set(EFFECTS)
     if unknown:
         raise ValueError(f"no such effect: {', '.join(sorted(unknown))}; give some of {', '.join(EFFECTS)}")
-    command = joystick(seed, top_rad_s=robot.top_rad_s) if command is None else command
+    command, habits = driven(robot, seed) if command is None else command, robot.habits
     model = mujoco.MjModel.from_xml_string(mjcf(hidden, robot))
     data = mujoco.MjData(model)
     motors = [model.joint(name).qposadr[0] for name, *_ in _WHEELS]
@@ -351,19 +327,31 @@ def record(hidden: Hidden, seed: int, command: Array | None = None, robot: Robot
     now_s = np.arange(steps) / STEPS_PER_S
     sides = np.column_stack([turned[:, [0, 2]].mean(axis=1), turned[:, [1, 3]].mean(axis=1)])
     count = 2 * math.pi / robot.counts_per_turn
-    read, seen = np.arange(0, steps, STEPS_PER_READING), np.arange(0, steps, STEPS_PER_POSE)
+    rng = np.random.default_rng([seed, 3131])
+
+    def stamped(times_s: Array) -> Array:
+        """Times as a host has them, in order: none overtakes another on a bus."""
+        return np.sort(times_s + np.abs(rng.normal(0.0, habits.jitter_s, times_s.size)))
+
+    def kept(every: int) -> NDArray[np.int64]:
+        """Steps of which something is read and not lost."""
+        at = np.arange(0, steps, every)
+        return at[rng.random(at.size) >= habits.lost]
+
+    read, seen = kept(STEPS_PER_READING * habits.reading_every), kept(STEPS_PER_POSE * habits.pose_every)
     noise = np.random.default_rng([seed, 1234]).standard_normal((seen.size, 3))
     noise *= [robot.position_std_m, robot.position_std_m, robot.yaw_std_rad]
     pose = where[seen] + noise
     pose[:, 2] = np.arctan2(np.sin(pose[:, 2]), np.cos(pose[:, 2]))
     latency_s = hidden.get("pose_latency", 0.0)
     inside = seen / STEPS_PER_S + latency_s <= now_s[-1]
+    sent = np.arange(0, command.shape[0], habits.command_every)
     return Recording(
-        command_s=np.arange(command.shape[0]) * STEPS_PER_COMMAND / STEPS_PER_S,
-        command=command,
-        wheel_s=now_s[read],
+        command_s=stamped(sent * STEPS_PER_COMMAND / STEPS_PER_S),
+        command=command[sent],
+        wheel_s=stamped(now_s[read]),
         angle=np.round(sides[read] / count) * count,
-        pose_s=seen[inside] / STEPS_PER_S + latency_s,
+        pose_s=stamped(seen[inside] / STEPS_PER_S + latency_s),
         pose=pose[inside],
         truth_s=now_s,
         truth=where,
@@ -393,8 +381,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except ValueError:
             parser.error(f"--hide {text}: {size} is no number")
     command = joystick(options.seed, options.seconds, robot.top_rad_s)
-    driven = record(hidden, options.seed, command, robot)
-    records = write_log(driven.as_drive(), options.out, "mujoco")
+    recording = record(hidden, options.seed, command, robot)
+    records = write_log(recording.as_drive(), options.out, "mujoco")
     print(f"{options.out}: {records} records")
     return 0
 

@@ -10,7 +10,8 @@ import pytest
 
 from tools import gap_mujoco
 from tools.gap_mujoco import Result, body_lag_s, drawn, injected_floor, response_of, robot_of, table, truth_of
-from tools.mujoco_robot import EFFECTS, ROBOTS, Recording, Robot, joystick, record
+from tools.joystick import joystick
+from tools.mujoco_robot import EFFECTS, ROBOTS, Habits, Recording, Robot, record
 
 LATENCY = {"pose_latency": {"latency_s": 0.2}}
 
@@ -103,6 +104,10 @@ def test_the_response_of_true_wheels_is_told_whatever_turning_loses():
     found = response_of(recording)
     assert found["command_delay"] == pytest.approx(0.1, abs=0.003)
     assert found["motor_lag"] == pytest.approx(0.17, abs=0.003)
+    every_other = replace(
+        recording, command=command[::2], robot=replace(ROBOTS["middle"], habits=Habits(command_every=2))
+    )
+    assert response_of(every_other)["command_delay"] == pytest.approx(0.0875, abs=0.004)
 
 
 def test_what_a_payload_does_is_told_beside_the_forms_that_have_a_share_in_it():
@@ -167,6 +172,15 @@ def test_a_robot_is_one_with_a_name_or_the_one_that_a_number_draws(capsys):
     masses_kg = [robot.base_kg + 4.0 * (robot.wheel_kg + 0.13) for robot in map(drawn, range(2000))]
     assert 3.0 < min(masses_kg) < 4.0
     assert 120.0 < max(masses_kg) < 140.0
+    habits = [drawn(number).habits for number in range(100, 200)]
+    assert {drawn(number).habits for number in range(100)} == {Habits()}
+    assert {each.pose_every for each in habits} == {1, 2, 3}
+    assert {each.reading_every for each in habits} == {each.command_every for each in habits} == {1, 2, 4}
+    assert {each.jitter_s for each in habits} == {0.0, 0.002, 0.006}
+    assert {each.lost for each in habits} == {0.0, 0.02, 0.1}
+    assert {(each.seconds, each.pace, each.keyboard) for each in habits} == {
+        (153.0, 1.0, False), (153.0, 1.0, True), (70.0, 1.0, False), (200.0, 0.5, False)
+    }  # fmt: skip
     for name in ("huge", "-3"):
         with pytest.raises(SystemExit):
             gap_mujoco.main([f"--robot={name}"])

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import ast
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from disco_hw.log.load import load_drive
+from tools import joystick as people
 from tools import mujoco_robot
-from tools.mujoco_robot import EFFECTS, ROBOTS, STEPS_PER_S, TRACK_M, WHEEL_RADIUS_M, joystick, record
+from tools.joystick import COMMANDS_PER_S, joystick, keyboard
+from tools.mujoco_robot import EFFECTS, ROBOTS, STEPS_PER_S, TRACK_M, WHEEL_RADIUS_M, Habits, driven, record
 
 pytest.importorskip("mujoco", reason="pip install 'disco-hw[mujoco]'")
 
 ROOT = Path(__file__).parents[2]
-SOURCE = Path(mujoco_robot.__file__)
-PER_S = STEPS_PER_S // mujoco_robot.STEPS_PER_COMMAND
+SOURCES = [Path(module.__file__) for module in (mujoco_robot, people)]
+PER_S = COMMANDS_PER_S
 # Counts, halves and powers of ten say nothing of where they come from.
 NEUTRAL = {0.5, *map(float, range(13))} | {10.0**power for power in range(-9, 10)}
 
@@ -45,14 +48,15 @@ def steady(recording: mujoco_robot.Recording) -> tuple[np.ndarray, float]:
 
 
 def test_it_shares_no_constant_and_no_code_with_our_simulator_and_model():
-    source = SOURCE.read_text()
+    source = "\n".join(file.read_text().replace("from __future__ import annotations", "") for file in SOURCES)
     ours = [file for room in ("sim", "disco_hw/model", "disco_hw/effects") for file in (ROOT / room).rglob("*.py")]
     assert len(ours) > 40
     own = numbers(source)
     both = {file.name: own & numbers(file.read_text()) for file in ours}
     assert not {name: shared for name, shared in both.items() if shared}
     imported = re.findall(r"^ *(?:from|import) ([\w.]+)", source, re.MULTILINE)
-    assert not [name for name in imported if name.startswith(("sim", "disco_hw.model", "disco_hw.effects", "tools"))]
+    strange = ("sim", "disco_hw.model", "disco_hw.effects", "tools")
+    assert [name for name in imported if name.startswith(strange)] == ["tools.joystick"]
 
 
 def test_constants_that_are_shared_would_be_seen():
@@ -103,6 +107,40 @@ def test_what_is_measured_is_the_truth_and_the_noise_that_is_stated():
     stated = [mujoco_robot.POSITION_STD_M, mujoco_robot.POSITION_STD_M, mujoco_robot.YAW_STD_RAD]
     assert off.std(axis=0) == pytest.approx(stated, rel=0.15)
     assert np.ptp(recording.truth[:, :2]) > 1.0
+
+
+def test_a_robot_is_driven_and_logged_as_its_habits_say():
+    robot = replace(ROBOTS["middle"], habits=Habits(9.0, 0.6, True, 2, 3, 2, 0.004, 0.1))
+    command = driven(robot, 7)
+    assert command.shape == (9 * PER_S, 2)
+    assert (command[::2] == command[1::2]).all()
+    assert np.abs(command).max() <= 0.6 * robot.top_rad_s
+    rare, all_there = record({}, 7, robot=robot), record({}, 7, command)
+    assert rare.turned == pytest.approx(all_there.turned)
+    assert (rare.command == command[::2]).all()
+    # Stamps are late, never early, by half a normal distribution, and in order.
+    late_s = rare.command_s - np.arange(rare.command_s.size) * 2 / PER_S
+    assert (late_s >= 0.0).all()
+    assert np.sqrt((late_s**2).mean()) == pytest.approx(0.004, rel=0.15)
+    for times_s, period_s in ((rare.wheel_s, 24 / STEPS_PER_S), (rare.pose_s, 32 / STEPS_PER_S)):
+        assert (np.diff(times_s) >= 0.0).all()
+        assert 0.84 < times_s.size * period_s / 9.0 < 0.96
+    # What is logged is of the truth a moment before its stamp.
+    then = np.column_stack([np.interp(rare.pose_s, rare.truth_s, each) for each in rare.truth.T[:2]])
+    fastest_m_s = np.abs(command).max() * WHEEL_RADIUS_M
+    assert np.abs(rare.pose[:, :2] - rare.noise[:, :2] - then).max() < 0.02 * fastest_m_s
+
+
+def test_keys_are_held_and_a_stick_never_stays():
+    keys, stick = keyboard(3, 20.0, 5.0), joystick(3, 20.0, 5.0)
+    assert keys.shape == stick.shape == (20 * PER_S, 2)
+    changes = [int(np.count_nonzero(np.abs(np.diff(each, axis=0)).max(axis=1) > 1e-9)) for each in (keys, stick)]
+    assert 4 < changes[0] < 29
+    assert changes[1] > 300
+    assert np.abs(keys - keyboard(4, 20.0, 5.0)).max() > 0.1
+    # Forward, back and both ways round, each at times.
+    ways = set(map(tuple, np.sign(keyboard(3, 200.0, 5.0)).tolist()))
+    assert {(-1.0, -1.0), (1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (0.0, 0.0)} <= ways
 
 
 def test_a_delay_and_a_latency_are_there_to_the_step():

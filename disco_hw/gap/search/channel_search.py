@@ -336,10 +336,10 @@ def _with_term(found: ChannelResult, term: Term, tried: int) -> tuple[ChannelRes
     repeats = term.disc is not None or proof.repeats(channel.count)
     if proof.score < limits.unnamed_score or not repeats or moved < limits.moves_m:
         return None, True
-    names = selector.select()
-    if selector.priced(names) > selector.priced(found.names):
-        # What only works together is not found one at a time.
-        names = selector.select(found.names)
+    names = selector.select(found.names)
+    if set(names) != set(found.names):
+        # What stood in for the term may have kept out what it is really about.
+        names = min(names, selector.select(), key=selector.priced)
     proofs = (*(one.evidence for one in found.unnamed), proof)
     accepted = tuple(UnnamedTerm(each.form, evidence, each) for each, evidence in zip(terms, proofs, strict=True))
     return replace(found, selector=selector, names=names, unnamed=accepted, plain=plain), True

@@ -376,10 +376,19 @@ def test_a_patch_of_a_body_is_tried_where_it_lies_best_among_all_that_were_looke
 
 
 @pytest.mark.parametrize(
-    ("new_price", "names"), [(10.0, ("selected", "again")), (9.0, ("selected",)), (8.0, ("selected",))]
+    ("kept", "new_price", "names"),
+    [
+        (("slope",), 5.0, ("slope",)),
+        (("slope", "again"), 9.5, ("slope", "again")),
+        (("slope", "again"), 8.5, ("selected",)),
+        ((), 9.5, ()),
+        ((), 8.5, ("selected",)),
+    ],
 )
-def test_names_are_selected_anew_and_from_those_that_were_found_where_that_costs_less(monkeypatch, new_price, names):
-    prices = {("selected",): new_price, ("slope",): 9.0}
+def test_names_that_a_term_changes_are_selected_anew_and_those_that_cost_less_are_kept(
+    monkeypatch, kept, new_price, names
+):
+    prices, begun = {("selected",): new_price, kept: 9.0}, []
 
     class Stub:
         def __init__(self, channel, moves, thresholds, given, start):
@@ -387,7 +396,8 @@ def test_names_are_selected_anew_and_from_those_that_were_found_where_that_costs
             self.fits, self.moves = {}, moves
 
         def select(self, begin=()):
-            return ("selected", "again") if begin == ("slope",) else ("selected",)
+            begun.append(begin)
+            return kept if begin == ("slope",) else ("selected",)
 
         def priced(self, names):
             return prices[names]
@@ -408,6 +418,8 @@ def test_names_are_selected_anew_and_from_those_that_were_found_where_that_costs
     )
     larger, happened_again = _with_term(ChannelResult(selector, ("slope",), None), FIRST, 2)
     assert larger.names == names
+    # All names anew is what takes the time: only where it is asked for.
+    assert begun == [("slope",)] + [()] * (kept != ("slope",))
     assert larger.plain is selector
     assert [one.term for one in larger.unnamed] == [FIRST]
     assert happened_again
