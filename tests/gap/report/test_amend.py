@@ -6,12 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from disco_hw.gap.report.amend import amended_model, carried_terms
+from disco_hw.gap.report.amend import amended_model, carried_terms, with_terms_named
 from disco_hw.gap.search.channel_result import ChannelEstimates, ParameterEstimate, UnnamedTerm
 from disco_hw.gap.search.unnamed_terms import Term
-from disco_hw.model import EffectSetting, Model
+from disco_hw.model import EffectSetting, Gaussian, Model
 
-DRAG, SHARED = "v_x += k v^3", "command += k u_other"
+DRAG, TURN, SHARED = "v_x += k v^3", "omega += k v^2 omega", "command += k u_other"
 
 
 def estimates(**values):
@@ -58,5 +58,45 @@ def test_how_far_a_term_reaches_is_its_largest_feature_in_speeds_of_the_last_fit
     analysis = SimpleNamespace(body=SimpleNamespace(unnamed=written[:2]), wheels=SimpleNamespace(unnamed=written[2:]))
     final = SimpleNamespace(final_body=SimpleNamespace(vector=np.array([0.066, 0.5, 0.0])))
     assert carried_terms(analysis, final) == {DRAG: pytest.approx(0.3 * 1.1**3), SHARED: 5.0}
+    turning = UnnamedTerm("", None, replace(drag, model_name=TURN))
+    analysis = SimpleNamespace(body=SimpleNamespace(unnamed=[turning]), wheels=analysis.wheels)
+    # The larger wheels and the longer axle turn more slowly.
+    assert carried_terms(analysis, final)[TURN] == pytest.approx(0.3 * 1.1**3 / (0.5 / 0.4))
+    unfitted = carried_terms(analysis, SimpleNamespace(final_body=None))
+    assert unfitted[TURN] == pytest.approx(0.3 / 0.06**3 * 0.4)
     alone = carried_terms(SimpleNamespace(body=None, wheels=analysis.wheels), SimpleNamespace(final_body=None))
     assert alone == {SHARED: 5.0}
+
+
+def test_numbers_of_terms_are_those_of_speeds_of_the_last_fit_with_what_they_share_with_others():
+    drag = UnnamedTerm("", None, Term("", np.ones((1, 3)), DRAG, geometry=(0.06, 0.4)))
+    place = UnnamedTerm("", None, Term("", np.ones((1, 3))))
+    covariance = np.array([[4.0, 1.0, 0.5], [1.0, 9.0, 0.25], [0.5, 0.25, 16.0]])
+    by_name = {
+        name: ParameterEstimate(value, value - 0.2, value + 0.3) for name, value in (("term0", 8.0), ("term1", 3.0))
+    }
+    part = ChannelEstimates(
+        by_name | {"x_icr_m": ParameterEstimate.around(0.1, 0.1)}, ("term0", "x_icr_m", "term1"), covariance
+    )
+    named = with_terms_named(part, (place, drag), (0.12, 0.4))
+    assert named.fitted == ("term0", "x_icr_m", f"{DRAG}.k")
+    assert named.by_name["term0"] == by_name["term0"]
+    value = named.by_name[f"{DRAG}.k"]
+    assert (value.value, value.low, value.high) == pytest.approx((3.0 / 8.0, 2.8 / 8.0, 3.3 / 8.0))
+    assert named.covariance == pytest.approx(covariance * np.outer([1.0, 1.0, 0.125], [1.0, 1.0, 0.125]))
+    assert with_terms_named(part, (), (0.12, 0.4)).fitted == part.fitted
+
+
+def test_what_is_believed_of_a_known_term_is_believed_after_a_log_that_says_nothing_of_it():
+    believed = Gaussian(("x_icr_m", f"{DRAG}.k"), np.array([0.0, -0.5]), np.diag([0.01, 0.04]))
+    effects = (EffectSetting(DRAG, {"k": -0.5}), EffectSetting(SHARED, {"k": 0.1}))
+    model = Model(0.06, 0.4, effects=effects, belief=believed)
+    found, _ = amended_model(model, {}, {}, estimates(wheel_radius_m=0.12))
+    spread = dict(zip(found.belief.names, np.sqrt(np.diag(found.belief.covariance())), strict=True))
+    # Twice as large wheels make an eighth of the number, and of how far it may be off.
+    assert spread[f"{DRAG}.k"] == pytest.approx(0.2 / 8.0)
+    assert spread[f"{SHARED}.k"] == pytest.approx(0.0, abs=1e-6)
+    more, _ = amended_model(model, {}, {DRAG: 1.0}, estimates(**{f"{DRAG}.k": 0.3}))
+    assert more.effects[0].values["k"] == pytest.approx(-0.2)
+    spread = dict(zip(more.belief.names, np.sqrt(np.diag(more.belief.covariance())), strict=True))
+    assert spread[f"{DRAG}.k"] == pytest.approx(0.1)
