@@ -29,7 +29,7 @@ from disco_hw.gap.report import (
     reached_horizon_s,
 )
 from disco_hw.gap.report.amend import amended_model, at_joint_fit, carried_terms, channel_estimates, simple_model
-from disco_hw.gap.report.blind_spots import finder, proved
+from disco_hw.gap.report.blind_spots import boldest_claims, finder, proved
 from disco_hw.gap.report.judge import (
     Measured,
     across_logs,
@@ -113,7 +113,10 @@ def find_gap(
     offered = offered_stage(gap or _of_wheels(wheels), bool(named or unnamed), kept.adds_to_timed, settings)
     spots = blind_spot_findings(analysis, named, top_rad_s)
     if prove:
-        spots = proved(spots, finder(analysis, say), settings.report.proved_claims)
+        claims = boldest_claims(spots, settings.report.proved_claims)
+        if claims:
+            say(f"proof of what this log shows: {', '.join(claim.name for claim in claims)} put in and searched for")
+        spots = proved(spots, claims, finder(analysis))
     amended, remarks = model_of(offered, model, *written)
     remarks = (*left_out_notes(written[0], kept), *remarks)
     return GapReport(

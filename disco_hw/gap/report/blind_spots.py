@@ -5,9 +5,14 @@ The boldest claims are proved: the effect is put into that very log, and the sea
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable, Iterable
+import multiprocessing
+import os
+import threading
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
 
 import numpy as np
 from numpy.typing import NDArray
@@ -197,21 +202,27 @@ def _by_trial(found: ChannelResult, column: str, trials: tuple[float, ...], thre
 # Whether a search names an effect that was put into the log at a size.
 Finds = Callable[[BlindSpot, float], bool]
 
-# A claim whose size is missed by chance is made for twice that size, if it is found then.
-_TRIED = (1.0, 2.0)
+# So many times below what real robots show is the boldest claim: nobody has to know of less.
+_BOLDEST = 10.0
 
 
-def proved(spots: Iterable[BlindSpot], finds: Finds, most: int) -> tuple[BlindSpot, ...]:
-    """Blind spots of which the `most` boldest claims, against what real robots show, are proved.
-
-    What is missed at its size and at twice that (of a limit, half) is not claimed: the log is blind to it.
-    """
-    spots = tuple(spots)
+def boldest_claims(spots: Iterable[BlindSpot], most: int) -> tuple[BlindSpot, ...]:
+    """The claims that are furthest below what real robots show, and are no other effect's by algebra."""
     claims = [spot for spot in spots if spot.smallest_visible is not None and not spot.blind and _boldness(spot)]
     claims = [spot for spot in claims if REGISTRY[spot.name].mimics is None]
-    judged: dict[str, BlindSpot] = {}
-    for spot in sorted(claims, key=_boldness, reverse=True)[:most]:
-        judged[spot.name] = _judged(spot, finds)
+    return tuple(sorted(claims, key=_boldness, reverse=True)[:most])
+
+
+def proved(spots: Iterable[BlindSpot], claims: Sequence[BlindSpot], finds: Finds) -> tuple[BlindSpot, ...]:
+    """Blind spots of which some claims are proved.
+
+    An effect is put in at the size that is claimed, or at a tenth of what real robots show if that is more (of a limit,
+    at ten times that if it is less). Where that is missed, the claim is made for what real robots show, if it is found
+    then; else the log is blind to it.
+    """
+    spots = tuple(spots)
+    done = side_by_side(lambda spot: _judged(spot, finds), claims)
+    judged = {spot.name: spot for spot in done}
     # What is another effect by algebra shows as that one does.
     for spot in spots:
         mimics = REGISTRY[spot.name].mimics
@@ -220,16 +231,57 @@ def proved(spots: Iterable[BlindSpot], finds: Finds, most: int) -> tuple[BlindSp
             judged[spot.name] = replace(
                 spot, smallest_visible=other.smallest_visible, blind=other.blind, proved=other.proved
             )
-    done = (judged.get(spot.name, spot) for spot in spots)
-    return tuple(sorted(done, key=lambda spot: not spot.blind))
+    return tuple(sorted((judged.get(spot.name, spot) for spot in spots), key=lambda spot: not spot.blind))
+
+
+def side_by_side(judge: Callable[[BlindSpot], BlindSpot], claims: Sequence[BlindSpot]) -> list[BlindSpot]:
+    """Each claim judged, on as many processors as there are; one after the other where processes cannot be copied.
+
+    A copy of a process with several threads may wait for ever for what another thread held.
+    """
+    many = min(len(claims), len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1)
+    if many < 2 or threading.active_count() > 1 or multiprocessing.current_process().daemon:
+        return [judge(claim) for claim in claims]
+    fork, shares = multiprocessing.get_context("fork"), [claims[first::many] for first in range(many)]
+    ends = [fork.Pipe(duplex=False) for _ in shares[1:]]
+    copies = [
+        fork.Process(target=_judge_share, args=(judge, share, sender), daemon=True)
+        for share, (_, sender) in zip(shares[1:], ends, strict=True)
+    ]
+    try:
+        for copy, (_, sender) in zip(copies, ends, strict=True):
+            copy.start()
+            sender.close()
+        judged = {claim.name: judge(claim) for claim in shares[0]}
+        for share, (receiver, _) in zip(shares[1:], ends, strict=True):
+            try:
+                done = receiver.recv()
+            except EOFError:
+                # What failed there fails here too, and says why.
+                done = [judge(claim) for claim in share]
+            judged |= {claim.name: one for claim, one in zip(share, done, strict=True)}
+    finally:
+        for copy in copies:
+            copy.terminate()
+            copy.join()
+    return [judged[claim.name] for claim in claims]
+
+
+def _judge_share(judge: Callable[[BlindSpot], BlindSpot], share: Sequence[BlindSpot], sender: Connection) -> None:
+    """In a copy of the process: judge claims and hand them over; where that fails nothing comes."""
+    with contextlib.suppress(Exception):
+        sender.send([judge(claim) for claim in share])
 
 
 def _judged(spot: BlindSpot, finds: Finds) -> BlindSpot:
-    assert spot.smallest_visible is not None
-    for times in _TRIED:
-        size = spot.smallest_visible / times if REGISTRY[spot.name].is_limit else spot.smallest_visible * times
-        if finds(spot, size):
-            return replace(spot, smallest_visible=size, blind=is_blind(spot.name, size), proved=True)
+    size, realistic = spot.smallest_visible, REGISTRY[spot.name].parameters[0].realistic
+    assert size is not None
+    assert realistic is not None
+    limit = REGISTRY[spot.name].is_limit
+    sober = min(size, _BOLDEST * realistic) if limit else max(size, realistic / _BOLDEST)
+    for tried in dict.fromkeys((sober, realistic)):
+        if finds(spot, tried):
+            return replace(spot, smallest_visible=tried, blind=False, proved=True)
     return replace(spot, smallest_visible=None, blind=True, proved=False)
 
 
@@ -241,11 +293,10 @@ def _boldness(spot: BlindSpot) -> float:
     return size / realistic if REGISTRY[spot.name].is_limit else realistic / size
 
 
-def finder(analysis: GapAnalysis, say: Callable[[str], None]) -> Finds:
+def finder(analysis: GapAnalysis) -> Finds:
     """The search of the channel in which an effect acts, on the log with the effect put in."""
 
     def finds(spot: BlindSpot, size: float) -> bool:
-        say(f"proof of what this log shows: {spot.name} of {size:.3g} {spot.unit} is put in and searched for")
         of_body = f"{spot.name}.{spot.parameter}" in BODY.place
         found = analysis.body if of_body else analysis.wheels
         assert found is not None

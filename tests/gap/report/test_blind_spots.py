@@ -1,6 +1,10 @@
 """What a drive could not have shown: its size is the one at which the effect is found, put into that very drive too."""
 
+import multiprocessing
+import os
+import threading
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +13,15 @@ from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
-from disco_hw.gap.report.blind_spots import BlindSpot, blind_spots, proved, with_effect, with_size
+from disco_hw.gap.report.blind_spots import (
+    BlindSpot,
+    blind_spots,
+    boldest_claims,
+    proved,
+    side_by_side,
+    with_effect,
+    with_size,
+)
 from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.richest_model import candidates_of
 from disco_hw.gap.search.selection import Selector, body_moves, wheel_moves
@@ -54,34 +66,109 @@ def spot(name, size, blind=False):
     return BlindSpot(name, REGISTRY[name].parameters[0].name, "", size, blind, "")
 
 
-def test_a_claim_that_is_found_only_at_twice_its_size_is_made_for_that_and_one_that_is_not_is_not_made():
-    spots = spot("turn_slip", 0.001), spot("side_slip", 0.001), spot("pose_latency", 0.001), spot("slope", None, True)
-    least = {"turn_slip": 0.0, "side_slip": 0.0015, "pose_latency": 1.0}
+def realistic(name):
+    return REGISTRY[name].parameters[0].realistic
+
+
+def judged(spots, finds, most=9):
+    return {one.name: one for one in proved(spots, boldest_claims(spots, most), finds)}
+
+
+@pytest.fixture
+def alone(monkeypatch):
+    """One processor: everything happens in this process."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
+
+
+@pytest.mark.usefixtures("alone")
+def test_a_claim_that_is_missed_is_made_for_what_robots_show_and_one_that_is_missed_there_too_is_not_made():
+    usual = {name: realistic(name) for name in ("turn_slip", "side_slip", "pose_latency")}
+    spots = *(spot(name, 0.3 * size) for name, size in usual.items()), spot("slope", None, True)
+    least = {"turn_slip": 0.0, "side_slip": 0.5 * usual["side_slip"], "pose_latency": 1.0}
     tried = []
 
     def finds(claim, size):
-        tried.append((claim.name, size))
+        tried.append((claim.name, size / usual[claim.name]))
         return size > least[claim.name]
 
-    judged = {one.name: one for one in proved(spots, finds, 3)}
-    assert judged["turn_slip"] == replace(spots[0], proved=True)
-    assert judged["side_slip"] == replace(spots[1], smallest_visible=0.002, proved=True)
-    assert judged["pose_latency"] == replace(spots[2], smallest_visible=None, blind=True, proved=False)
-    assert judged["slope"] == spots[3]
-    assert len(tried) == 5
+    found = judged(spots, finds)
+    assert found["turn_slip"] == replace(spots[0], proved=True)
+    assert found["side_slip"] == replace(spots[1], smallest_visible=usual["side_slip"], proved=True)
+    assert found["pose_latency"] == replace(spots[2], smallest_visible=None, blind=True, proved=False)
+    assert found["slope"] == spots[3]
+    assert sorted(tried) == [
+        (name, pytest.approx(share))
+        for name, share in (
+            ("pose_latency", 0.3), ("pose_latency", 1.0), ("side_slip", 0.3), ("side_slip", 1.0), ("turn_slip", 0.3)
+        )
+    ]  # fmt: skip
 
 
-def test_of_a_limit_half_of_it_is_tried_and_what_is_the_same_by_algebra_follows():
-    spots = spot("yaw_rate_limit", 100.0), spot("lateral_icr", 0.001), spot("pose_offset", 0.001)
-    judged = {one.name: one for one in proved(spots, lambda claim, size: size != 0.001 and size < 60.0, 9)}
-    assert judged["yaw_rate_limit"].smallest_visible == 50.0
-    assert judged["pose_offset"].smallest_visible == judged["lateral_icr"].smallest_visible == 0.002
-    assert judged["pose_offset"].proved
+@pytest.mark.usefixtures("alone")
+def test_no_claim_is_bolder_than_a_tenth_of_what_robots_show_of_a_limit_than_ten_times_that():
+    slip, limit = realistic("turn_slip"), realistic("yaw_rate_limit")
+    found = judged((spot("turn_slip", 0.01 * slip), spot("yaw_rate_limit", 40.0 * limit)), lambda *_: True)
+    assert found["turn_slip"].smallest_visible == pytest.approx(0.1 * slip)
+    assert found["yaw_rate_limit"].smallest_visible == pytest.approx(10.0 * limit)
+    found = judged((spot("yaw_rate_limit", 3.0 * limit),), lambda claim, size: size < 2.0 * limit)
+    assert found["yaw_rate_limit"] == replace(spot("yaw_rate_limit", limit), proved=True)
+    tried = []
+    judged((spot("turn_slip", slip),), lambda claim, size: tried.append(size))
+    assert tried == [slip]
+
+
+@pytest.mark.usefixtures("alone")
+def test_what_is_the_same_by_algebra_follows():
+    least = realistic("lateral_icr") / 20.0
+    spots = spot("lateral_icr", least), spot("pose_offset", least)
+    assert [claim.name for claim in boldest_claims(spots, 9)] == ["lateral_icr"]
+    found = judged(spots, lambda *_: True)
+    assert found["pose_offset"].smallest_visible == found["lateral_icr"].smallest_visible == pytest.approx(2.0 * least)
+    assert found["pose_offset"].proved
 
 
 def test_the_boldest_claims_are_proved_first():
-    spots = spot("turn_slip", 0.02), spot("side_slip", 0.0001)
-    assert [one.proved for one in proved(spots, lambda *_: True, 1)] == [None, True]
+    spots = spot("turn_slip", 0.02), spot("side_slip", 0.0001), spot("slope", 1e9, True), spot("deadband", None)
+    assert [one.name for one in boldest_claims(spots, 1)] == ["side_slip"]
+    assert [one.name for one in boldest_claims(spots, 9)] == ["side_slip", "turn_slip"]
+    assert [one.proved for one in proved(spots, spots[1:2], lambda *_: True)] == [None, None, True, None]
+
+
+def in_processes(claims, judge, monkeypatch, processors=2, threads=1):
+    monkeypatch.setattr(threading, "active_count", lambda: threads)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(processors)))
+    return side_by_side(judge, claims)
+
+
+def test_claims_are_judged_on_all_processors_and_come_back_in_order(monkeypatch):
+    claims = [spot(name, 0.1) for name in ("turn_slip", "side_slip", "slope", "deadband", "motor_lag")]
+    done = in_processes(claims, lambda claim: replace(claim, unit=str(os.getpid())), monkeypatch)
+    assert [replace(one, unit="") for one in done] == claims
+    pids = [int(one.unit) for one in done]
+    assert pids[0] == pids[2] == pids[4] == os.getpid() != pids[1] == pids[3]
+    each = in_processes(claims, lambda claim: replace(claim, unit=str(os.getpid())), monkeypatch, processors=9)
+    assert len({one.unit for one in each}) == 5
+    assert in_processes([], lambda claim: claim, monkeypatch) == []
+    assert not multiprocessing.active_children()
+
+
+def test_what_fails_in_another_process_fails_here(monkeypatch):
+    claims = [spot(name, 0.1) for name in ("turn_slip", "side_slip")]
+    with pytest.raises(ZeroDivisionError):
+        in_processes(
+            claims, lambda claim: replace(claim, smallest_visible=1 / (claim.name != "side_slip")), monkeypatch
+        )
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize("of", ["threads", "a helper"])
+def test_no_process_is_copied_that_has_other_threads_or_may_have_no_copies(monkeypatch, of):
+    if of == "a helper":
+        monkeypatch.setattr(multiprocessing, "current_process", lambda: SimpleNamespace(daemon=True))
+    claims = [spot(name, 0.1) for name in ("turn_slip", "side_slip")]
+    threads = 2 if of == "threads" else 1
+    done = in_processes(claims, lambda claim: replace(claim, unit=str(os.getpid())), monkeypatch, threads=threads)
+    assert [one.unit for one in done] == [str(os.getpid())] * 2
 
 
 def spots_of(channel, names=(), limits=None):
