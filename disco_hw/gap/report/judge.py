@@ -155,13 +155,12 @@ def residue_sentences(analysis: GapAnalysis) -> tuple[str, ...]:
 def left_out_notes(analysis: GapAnalysis, kept: GapAnalysis) -> tuple[str, ...]:
     """Sentences on what was found and the amended model does not have."""
     gone = kept.pruned[len(analysis.pruned) :]
-    of_the_clock = [name for name in gone if name in REGISTRY and REGISTRY[name].stage is Stage.POSE_TIME]
-    others = [name for name in gone if name not in of_the_clock]
+    of_poses = [name for name in gone if name in REGISTRY and REGISTRY[name].stage in (Stage.POSE, Stage.POSE_TIME)]
+    others = [name for name in gone if name not in of_poses]
     out = []
-    if of_the_clock:
+    if of_poses:
         out.append(
-            f"the amended model leaves out {', '.join(of_the_clock)}: a clock that runs unevenly does not say how late "
-            "poses are in another drive"
+            f"the amended model leaves out {', '.join(of_poses)}: this log does not say how poses are in another drive"
         )
     if others:
         out.append(f"the amended model leaves out {', '.join(others)}: held-out data are predicted as well without")

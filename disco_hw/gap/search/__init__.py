@@ -155,7 +155,7 @@ def joint_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePrediction
         ahead, Freed(parts, lambda vectors: Chain(vectors[0], vectors[1] if len(vectors) > 1 else None))
     )
     timed = _Fitted.to(ahead, _timed(ahead, refitted.at()))
-    needed = _needed(analysis, timed, ahead, apart)
+    needed = _needed(_of_every_log(analysis, final), timed, ahead, apart)
     amended = _Fitted(needed.candidate.of, needed.fit(ahead), needed.folds)
     stages = {"refitted": refitted, "timed": timed, "amended": amended}
     chains |= {name: stage.chains for name, stage in stages.items()}
@@ -253,17 +253,31 @@ class _Judged:
         return min(fits, key=lambda one: ahead.usual_cost(of.chain(one.vectors)))
 
 
+def _of_every_log(analysis: GapAnalysis, final: FinalFit) -> GapAnalysis:
+    """The analysis without what the pose source does in this log only.
+
+    Poses of a clock that runs unevenly are late by what the next log need not show, and so is any effect of the sensor
+    that is as well none there: the interval of each parameter holds it.
+    """
+    estimated = {} if final.body_estimates is None else final.body_estimates.by_name
+    for which, name in least_evident_first(analysis):
+        effect = None if name is None else REGISTRY[name]
+        if effect is None or effect.stage not in (Stage.POSE, Stage.POSE_TIME):
+            continue
+        known = [estimated[column] for column in effect.columns]
+        none = all(e.low <= p.neutral <= e.high for e, p in zip(known, effect.parameters, strict=True))
+        if none or (effect.stage is Stage.POSE_TIME and not analysis.drive.pose_clock_even):
+            analysis = lacking(analysis, which, name)
+    return analysis
+
+
 def _needed(analysis: GapAnalysis, timed: _Fitted, ahead: Ahead, apart: StagePredictions) -> _Judged:
     """The candidate that has what predictions need of all that was found.
 
-    Poses of a clock that runs unevenly are late by what holds in this log only. Of the rest goes, the least evident
-    first, what held-out data are predicted as well without as by the best, within one standard error (Breiman et al.,
-    Classification and Regression Trees, 1984, ch. 3): what a log does not need is as likely of this log alone.
+    What goes, the least evident first, is what held-out data are predicted as well without as by the best, within one
+    standard error (Breiman et al., Classification and Regression Trees, 1984, ch. 3): what a log does not need is as
+    likely of this log alone.
     """
-    if not analysis.drive.pose_clock_even:
-        for which, name in least_evident_first(analysis):
-            if name is not None and REGISTRY[name].stage is Stage.POSE_TIME:
-                analysis = lacking(analysis, which, name)
     whole = _Candidate.of_channels(analysis, apart)
     kept = whole.judged(ahead, apart)
     if not analysis.found_any:

@@ -108,7 +108,9 @@ def body_terms(channel: BodyChannel, p: Array) -> Iterator[Term]:
     for axis, target in enumerate(BODY_TARGETS):
         for form, feature in BODY_FEATURES.items():
             name = term_name(target, form)
-            yield Term(_with_place(name), _on(axis, feature(v, w, a, drive.t_s)), name, geometry)
+            # Nothing makes a robot slide aside ever more: a gyro's yaw drifts, and another drive begins anew.
+            carried = None if target == "v_y" and form.startswith("t/100") else name
+            yield Term(_with_place(name), _on(axis, feature(v, w, a, drive.t_s)), carried, geometry)
         for form, memory in BODY_MEMORIES[target].items():
             name = term_name(target, form)
             yield Term(_with_place(name), _on(axis, memory.at_nodes(GRID_STEP_S, v, w)), name, geometry)
