@@ -51,6 +51,7 @@ _LONGEST_SILENCE_NS = 500_000_000
 _LONGEST_COMMAND_NS = 500_000_000
 _LONGEST_PAUSE_NS = 2_000_000_000
 _LARGEST_STEP_RAD = 20.0 * math.pi
+_NO_WHEEL_RAD_S, _NO_WHEELS_STEP_RAD = 150.0, 1.0
 _MOST_MESSAGES = 20_000_000
 
 
@@ -299,9 +300,13 @@ def _pauses(wheel_ns: Index, others: Sequence[Index]) -> Index:
 
 
 def _steps(wheel_ns: Index, wheel: Array) -> Index:
-    """Where an encoder was set: a step of more than ten turns."""
+    """Where an encoder was set: a step of more than ten turns, or one that no wheel turns in that time."""
     steps = np.abs(np.diff(wheel[:, :2], axis=0)).max(axis=1, initial=0.0)
-    return np.asarray(wheel_ns[1:][steps > _LARGEST_STEP_RAD])
+    rate_rad_s = steps / np.maximum(np.diff(wheel_ns) * 1e-9, 1e-3)
+    usual_rad_s = float(np.quantile(rate_rad_s, 0.99)) if rate_rad_s.size else 0.0
+    # Messages that come in bursts seem fast as well, but take small steps.
+    set_anew = (steps > _NO_WHEELS_STEP_RAD) & (rate_rad_s > max(_NO_WHEEL_RAD_S, 5.0 * usual_rad_s))
+    return np.asarray(wheel_ns[1:][(steps > _LARGEST_STEP_RAD) | set_anew])
 
 
 def _wheels(t_s: Array, segment: Index, wheel: Array, measured: tuple[bool, bool]) -> Wheels:

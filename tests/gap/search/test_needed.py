@@ -1,4 +1,4 @@
-"""The model that is handed out has of what was found only what predictions need, and nothing of this log's clock."""
+"""The model that is handed out has of what was found only what predictions need, and nothing of this log's poses."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap import model_of
 from disco_hw.gap import search as stages
 from disco_hw.gap.data import WHEEL
@@ -13,7 +14,7 @@ from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.report.judge import left_out_notes
 from disco_hw.gap.search import joint_predictions
 from disco_hw.gap.search.analysis import GapAnalysis, final_fit
-from disco_hw.gap.search.channel_result import ChannelResult
+from disco_hw.gap.search.channel_result import ChannelResult, ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors, within_one_standard_error
 from disco_hw.gap.search.selection import Selector, body_moves
 from disco_hw.model import Model
@@ -77,13 +78,13 @@ class Candidate:
         return stages._Judged(self, {}, errors(*[square] * 4))
 
 
-def needed(monkeypatch, squares, wheels=None, body=None, even=True):
+def needed(monkeypatch, squares, wheels=None, body=None):
     """What is needed of what was found, whether on top of the timed model, and all that was judged."""
     by_set = {(frozenset(names.split()), on_top): square for (names, on_top), square in squares.items()}
     monkeypatch.setattr(Candidate, "squares", by_set, raising=False)
     monkeypatch.setattr(Candidate, "judged_so_far", [], raising=False)
     monkeypatch.setattr(stages, "_Candidate", Candidate)
-    analysis = replace(analysis_of(wheels, body), drive=SimpleNamespace(pose_clock_even=even))
+    analysis = analysis_of(wheels, body)
     kept = stages._needed(analysis, "timed", "ahead", "apart").candidate
     wheels, body, pruned = told(kept.analysis)
     return " ".join((*(wheels or ()), *(body or ()))), kept.is_on_top, pruned, Candidate.judged_so_far
@@ -133,14 +134,52 @@ def test_where_nothing_was_found_the_channels_are_as_they_are(monkeypatch):
     assert judged == [({"motor_lag"}, False)]
 
 
+def of_every_log(names, even=True, **estimates):
+    """What stays of a body's names, and what goes, by intervals of its parameters; others are clearly there."""
+    by_name = {
+        column: ParameterEstimate(0.1, 0.05, 0.15)
+        for name in names
+        for column in REGISTRY[name].columns
+    }  # fmt: skip
+    by_name |= {column: ParameterEstimate(0.1, *ends) for column, ends in estimates.items()}
+    analysis = replace(analysis_of(None, found(names, [("drag", 45.0)])), drive=SimpleNamespace(pose_clock_even=even))
+    final = SimpleNamespace(body_estimates=SimpleNamespace(by_name=by_name))
+    _, body, pruned = told(stages._of_every_log(analysis, final))
+    return body, pruned
+
+
 @pytest.mark.parametrize("even", [True, False])
-def test_a_clock_that_runs_unevenly_says_nothing_of_how_late_poses_are(monkeypatch, even):
-    body = found(("turn_slip", "pose_latency"), [("drag", 45.0)])
-    squares = {("turn_slip pose_latency drag", True): 1.0, ("turn_slip drag", True): 2.0 if even else 1.0}
-    names, _, pruned, judged = needed(monkeypatch, squares, body=body, even=even)
-    assert ("pose_latency" in names.split()) is even
-    assert pruned == (() if even else ("pose_latency",))
-    assert any("pose_latency" in has for has, _ in judged) is even
+def test_a_clock_that_runs_unevenly_says_nothing_of_how_late_poses_are(even):
+    kept, gone = of_every_log(("turn_slip", "pose_latency"), even)
+    assert ("pose_latency" in kept) is even
+    assert gone == (() if even else ("pose_latency",))
+    # Of how poses are turned it says as much as ever.
+    assert of_every_log(("heading_bias",), even)[1] == ()
+
+
+@pytest.mark.parametrize(
+    ("ends", "goes"), [((-0.1, 0.3), True), ((0.0, 0.2), True), ((0.1, 0.3), False), ((-0.3, -0.1), False)]
+)
+def test_what_poses_may_as_well_not_have_in_another_log_is_of_this_log(ends, goes):
+    for name in ("heading_bias", "pose_latency"):
+        column = REGISTRY[name].columns[0]
+        kept, gone = of_every_log(("turn_slip", name), **{column: ends})
+        assert gone == ((name,) if goes else ())
+        assert ("turn_slip" in kept, name in kept) == (True, not goes)
+    # Of the robot itself what is hardly known is the best that is known.
+    assert of_every_log(("turn_slip",), **{REGISTRY["turn_slip"].columns[0]: ends})[1] == ()
+
+
+def test_without_poses_nothing_is_of_the_pose_source():
+    analysis = analysis_of(found(("motor_lag", "deadband")), None)
+    assert stages._of_every_log(analysis, SimpleNamespace(body_estimates=None)) == analysis
+
+
+def test_what_is_of_this_log_is_gone_before_anything_is_judged_and_that_is_said():
+    names, model, notes = kept_of(("turn_slip", "heading_bias"))
+    assert names == ("turn_slip",)
+    assert "heading_bias.bias_rad" not in model.parameter_names
+    assert notes == ("the amended model leaves out heading_bias: this log does not say how poses are in another drive",)
 
 
 def errors(*squares):

@@ -104,6 +104,9 @@ def test_terms_of_a_body_are_made_of_its_motion():
         assert cubic.geometry == (RADIUS_M, AXLE_M)
         for memory in (term for form, term in terms.items() if form.startswith(f"{target} += 1 (")):
             assert (memory.model_name, memory.geometry) == (memory.form.replace("{:.4g}", "k"), (RADIUS_M, AXLE_M))
+        # What grows with time along a robot is its own; aside it is a yaw that drifts.
+        assert (terms[f"{target} += 1 t/100 v"].model_name is None) is (target == "v_y")
+        assert (terms[f"{target} += 1 t/100 omega"].model_name is None) is (target == "v_y")
         expected = {"|v| a": v * a, "t/100 omega": 0.01 * t_s * w, "domega/dt": faster, "v domega/dt": v * faster}
         for form, value in expected.items():
             term = terms[f"{target} += 1 {form}"]

@@ -197,6 +197,25 @@ def test_what_is_not_finite_is_left_out_and_counted(tmp_path):
     assert said(drive, "wheels: 1 messages lack a position or velocity")
 
 
+@pytest.mark.parametrize(
+    ("lost_rad", "burst", "segments"), [(80.0, False, 2), (4.0, False, 2), (0.0, False, 1), (0.0, True, 1)]
+)
+def test_where_a_driver_counts_anew_nothing_is_predicted_across(tmp_path, lost_rad, burst, segments):
+    with bag(place(tmp_path)) as maker:
+        for k in range(300):
+            t_ns = BEGAN_NS + k * 20_000_000
+            if burst and k == 200:
+                # This one comes right after the one before.
+                t_ns -= 19_900_000
+            angle = 0.4 * k - (lost_rad if k >= 200 else 0.0)
+            maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [angle] * 4, []), t_ns)
+    drive = read_rosbag(place(tmp_path), robot_config())
+    assert drive.segments == segments
+    assert said(drive, "1 times the wheels paused, or a clock or encoder was set") is (segments == 2)
+    fast = np.abs(drive.wheels.left_speed_rad_s) > 30.0
+    assert fast.any() == burst
+
+
 def test_positions_within_one_turn_are_made_continuous(tmp_path):
     with bag(place(tmp_path)) as maker:
         for k in range(200):
