@@ -9,7 +9,7 @@ from disco_hw.gap.search.channel_result import ChannelResult, UnnamedTerm
 
 SCORES = {
     "motor_lag": 90.0, "deadband": 40.0, "stiction": 60.0, "turn_slip": 50.0, "slope": 30.0, "side_slip": 5.0,
-    "pose_latency": 10.0, "heading_bias": 15.0,
+    "pose_latency": 10.0, "heading_bias": 15.0, "pose_offset": 12.0,
 }  # fmt: skip
 
 

@@ -158,16 +158,24 @@ def test_a_clock_that_runs_unevenly_says_nothing_of_how_late_poses_are(even):
 
 
 @pytest.mark.parametrize(
-    ("ends", "goes"), [((-0.1, 0.3), True), ((0.0, 0.2), True), ((0.1, 0.3), False), ((-0.3, -0.1), False)]
+    ("ends", "goes"),
+    [((-0.1, 0.3), True), ((0.0, 0.2), True), ((-0.2, 0.0), True), ((0.1, 0.3), False), ((-0.3, -0.1), False)],
 )
 def test_what_poses_may_as_well_not_have_in_another_log_is_of_this_log(ends, goes):
+    # One that is of the robot is less evident, one is more so.
     for name in ("heading_bias", "pose_latency"):
         column = REGISTRY[name].columns[0]
-        kept, gone = of_every_log(("turn_slip", name), **{column: ends})
+        kept, gone = of_every_log(("turn_slip", name, "side_slip"), **{column: ends})
         assert gone == ((name,) if goes else ())
-        assert ("turn_slip" in kept, name in kept) == (True, not goes)
+        assert ("turn_slip" in kept, name in kept, "side_slip" in kept) == (True, not goes, True)
     # Of the robot itself what is hardly known is the best that is known.
     assert of_every_log(("turn_slip",), **{REGISTRY["turn_slip"].columns[0]: ends})[1] == ()
+
+
+def test_an_offset_is_there_that_is_so_in_one_direction():
+    ahead, aside = REGISTRY["pose_offset"].columns
+    assert of_every_log(("pose_offset",), **{ahead: (-0.1, 0.1)})[1] == ()
+    assert of_every_log(("pose_offset",), **{ahead: (-0.1, 0.1), aside: (-0.1, 0.1)})[1] == ("pose_offset",)
 
 
 def test_without_poses_nothing_is_of_the_pose_source():
