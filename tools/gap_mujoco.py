@@ -35,13 +35,12 @@ from disco_hw.model import Model
 from disco_hw.model.terms import BODY_FEATURES
 from tools.gap_halves import STAGES, unseen_errors
 from tools.gap_study import revision
+from tools.joystick import STEPS_PER_COMMAND, STEPS_PER_S
 from tools.mujoco_robot import (
     DOWNHILL_RAD,
     DURATION_S,
     EFFECTS,
     ROBOTS,
-    STEPS_PER_COMMAND,
-    STEPS_PER_S,
     Habits,
     Hidden,
     Recording,

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-COMMANDS_PER_S = 480 // 12
+# Commands come every so many steps of the physics that they drive.
+STEPS_PER_S, STEPS_PER_COMMAND = 480, 12
+COMMANDS_PER_S = STEPS_PER_S // STEPS_PER_COMMAND
 TOP_RAD_S = 5.3
 
 

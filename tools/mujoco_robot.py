@@ -25,12 +25,11 @@ from numpy.typing import NDArray
 
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, differentiate_angle
 from disco_hw.log.importing import write_log
-from tools.joystick import COMMANDS_PER_S, TOP_RAD_S, joystick, keyboard
+from tools.joystick import STEPS_PER_COMMAND, STEPS_PER_S, TOP_RAD_S, joystick, keyboard
 
 Array = NDArray[np.float64]
 
-STEPS_PER_S = 480
-STEPS_PER_COMMAND, STEPS_PER_READING = STEPS_PER_S // COMMANDS_PER_S, 8
+STEPS_PER_READING = 8
 STEPS_PER_POSE = 2 * STEPS_PER_READING
 WHEEL_RADIUS_M, TRACK_M, WHEELBASE_M = 0.133, 0.49, 0.43
 COUNTS_PER_TURN = 1470

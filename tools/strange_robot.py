@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, differentiate_angle
-from tools.joystick import joystick
-from tools.mujoco_robot import STEPS_PER_COMMAND, STEPS_PER_S
+from tools.joystick import STEPS_PER_COMMAND, STEPS_PER_S, joystick
 
 Array = NDArray[np.float64]
 

@@ -118,7 +118,7 @@ def find_gap(
             say(f"proof of what this log shows: {', '.join(claim.name for claim in claims)} put in and searched for")
         spots = proved(spots, claims, finder(analysis))
     amended, remarks = model_of(offered, model, *written)
-    remarks = (*left_out_notes(written[0], kept), *remarks)
+    remarks = (*left_out_notes(written[0], written[1], kept), *remarks)
     return GapReport(
         sources=log.sources,
         channels=channel_findings(analysis, named, unnamed),

@@ -13,8 +13,8 @@ import pytest
 from disco_hw.log.load import load_drive
 from tools import joystick as people
 from tools import mujoco_robot
-from tools.joystick import COMMANDS_PER_S, joystick, keyboard
-from tools.mujoco_robot import EFFECTS, ROBOTS, STEPS_PER_S, TRACK_M, WHEEL_RADIUS_M, Habits, driven, record
+from tools.joystick import COMMANDS_PER_S, STEPS_PER_S, joystick, keyboard
+from tools.mujoco_robot import EFFECTS, ROBOTS, TRACK_M, WHEEL_RADIUS_M, Habits, driven, record
 
 pytest.importorskip("mujoco", reason="pip install 'disco-hw[mujoco]'")
 

@@ -243,33 +243,33 @@ def side_by_side(judge: Callable[[BlindSpot], BlindSpot], claims: Sequence[Blind
     if many < 2 or threading.active_count() > 1 or multiprocessing.current_process().daemon:
         return [judge(claim) for claim in claims]
     fork, shares = multiprocessing.get_context("fork"), [claims[first::many] for first in range(many)]
-    ends = [fork.Pipe(duplex=False) for _ in shares[1:]]
-    copies = [
-        fork.Process(target=_judge_share, args=(judge, share, sender), daemon=True)
-        for share, (_, sender) in zip(shares[1:], ends, strict=True)
-    ]
+    others = []
     try:
-        for copy, (_, sender) in zip(copies, ends, strict=True):
+        for share in shares[1:]:
+            receiver, sender = fork.Pipe(duplex=False)
+            copy = fork.Process(target=_judge_share, args=(judge, share, sender), daemon=True)
             copy.start()
             sender.close()
+            others.append((share, receiver, copy))
         judged = {claim.name: judge(claim) for claim in shares[0]}
-        for share, (receiver, _) in zip(shares[1:], ends, strict=True):
-            try:
-                done = receiver.recv()
-            except EOFError:
-                # What failed there fails here too, and says why.
-                done = [judge(claim) for claim in share]
+        for share, receiver, _ in others:
+            with receiver:
+                try:
+                    done = receiver.recv()
+                except EOFError:
+                    # What failed there fails here too, and says why.
+                    done = [judge(claim) for claim in share]
             judged |= {claim.name: one for claim, one in zip(share, done, strict=True)}
     finally:
-        for copy in copies:
+        for *_, copy in others:
             copy.terminate()
             copy.join()
     return [judged[claim.name] for claim in claims]
 
 
 def _judge_share(judge: Callable[[BlindSpot], BlindSpot], share: Sequence[BlindSpot], sender: Connection) -> None:
-    """In a copy of the process: judge claims and hand them over; where that fails nothing comes."""
-    with contextlib.suppress(Exception):
+    """In a copy of the process: judge claims and hand them over; where that fails, or is interrupted, nothing comes."""
+    with contextlib.suppress(Exception, KeyboardInterrupt):
         sender.send([judge(claim) for claim in share])
 
 

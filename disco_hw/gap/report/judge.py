@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.effects import Channel, Effect, Parameter, Stage
+from disco_hw.effects import Channel, Effect, Parameter
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.report import (
@@ -29,6 +29,7 @@ from disco_hw.gap.report.misspecification import (
     regimes,
     remaining_disagreements,
 )
+from disco_hw.gap.search import of_every_log
 from disco_hw.gap.search.analysis import ASYMMETRY, ENCODER, GAIN, OUTSIDE_TESTS, FinalFit, GapAnalysis, confounded_with
 from disco_hw.gap.search.channel_result import (
     ChannelEstimates,
@@ -152,10 +153,11 @@ def residue_sentences(analysis: GapAnalysis) -> tuple[str, ...]:
     return tuple(out)
 
 
-def left_out_notes(analysis: GapAnalysis, kept: GapAnalysis) -> tuple[str, ...]:
-    """Sentences on what was found and the amended model does not have."""
+def left_out_notes(analysis: GapAnalysis, final: FinalFit, kept: GapAnalysis) -> tuple[str, ...]:
+    """Sentences on what was found, with its `final` fit, and the amended model does not have."""
     gone = kept.pruned[len(analysis.pruned) :]
-    of_poses = [name for name in gone if name in REGISTRY and REGISTRY[name].stage in (Stage.POSE, Stage.POSE_TIME)]
+    of_this_log = of_every_log(analysis, final).pruned[len(analysis.pruned) :]
+    of_poses = [name for name in gone if name in of_this_log]
     others = [name for name in gone if name not in of_poses]
     out = []
     if of_poses:

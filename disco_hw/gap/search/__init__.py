@@ -155,7 +155,7 @@ def joint_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePrediction
         ahead, Freed(parts, lambda vectors: Chain(vectors[0], vectors[1] if len(vectors) > 1 else None))
     )
     timed = _Fitted.to(ahead, _timed(ahead, refitted.at()))
-    needed = _needed(_of_every_log(analysis, final), timed, ahead, apart)
+    needed = _needed(of_every_log(analysis, final), timed, ahead, apart)
     amended = _Fitted(needed.candidate.of, needed.fit(ahead), needed.folds)
     stages = {"refitted": refitted, "timed": timed, "amended": amended}
     chains |= {name: stage.chains for name, stage in stages.items()}
@@ -253,7 +253,7 @@ class _Judged:
         return min(fits, key=lambda one: ahead.usual_cost(of.chain(one.vectors)))
 
 
-def _of_every_log(analysis: GapAnalysis, final: FinalFit) -> GapAnalysis:
+def of_every_log(analysis: GapAnalysis, final: FinalFit) -> GapAnalysis:
     """The analysis without what the pose source does in this log only.
 
     Poses of a clock that runs unevenly are late by what the next log need not show, and so is any effect of the sensor

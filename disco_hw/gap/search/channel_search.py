@@ -263,7 +263,7 @@ def _body_options(found: ChannelResult) -> Iterator[Term]:
 def with_unnamed(found: ChannelResult, options: Callable[[ChannelResult], Iterator[Term]]) -> ChannelResult:
     """Add unnamed terms as long as one of the best is worth its price and that of the choice among all.
 
-    After each, the named effects are selected anew: one that only stood in for the term is not needed any more. A patch
+    After each, it is seen which names are still needed: one that only stood in for the term is not. A patch
     of the floor has to be worth it without the block of time that says most: around whatever happened once, a patch can
     be drawn.
     """

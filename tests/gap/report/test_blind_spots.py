@@ -161,6 +161,19 @@ def test_what_fails_in_another_process_fails_here(monkeypatch):
     assert not multiprocessing.active_children()
 
 
+def test_another_process_that_is_interrupted_says_nothing_and_its_share_is_judged_here(monkeypatch, capfd):
+    here = os.getpid()
+
+    def judge(claim):
+        if os.getpid() != here:
+            raise KeyboardInterrupt
+        return replace(claim, proved=True)
+
+    claims = [spot(name, 0.1) for name in ("turn_slip", "side_slip", "slope")]
+    assert [one.proved for one in in_processes(claims, judge, monkeypatch)] == [True] * 3
+    assert capfd.readouterr().err == ""
+
+
 @pytest.mark.parametrize("of", ["threads", "a helper"])
 def test_no_process_is_copied_that_has_other_threads_or_may_have_no_copies(monkeypatch, of):
     if of == "a helper":

@@ -36,7 +36,7 @@ def kept_of(names):
     model, _ = model_of("amended", Model(*GEOMETRY), analysis, final, predictions)
     kept = predictions.kept[0]
     assert {effect.name for effect in model.effects} == set(kept.body.names)
-    return kept.body.names, model, left_out_notes(analysis, kept)
+    return kept.body.names, model, left_out_notes(analysis, final, kept)
 
 
 def test_a_name_that_predictions_do_not_need_is_left_out_and_said_and_the_rest_is_believed_jointly():
@@ -144,7 +144,7 @@ def of_every_log(names, even=True, **estimates):
     by_name |= {column: ParameterEstimate(0.1, *ends) for column, ends in estimates.items()}
     analysis = replace(analysis_of(None, found(names, [("drag", 45.0)])), drive=SimpleNamespace(pose_clock_even=even))
     final = SimpleNamespace(body_estimates=SimpleNamespace(by_name=by_name))
-    _, body, pruned = told(stages._of_every_log(analysis, final))
+    _, body, pruned = told(stages.of_every_log(analysis, final))
     return body, pruned
 
 
@@ -180,7 +180,7 @@ def test_an_offset_is_there_that_is_so_in_one_direction():
 
 def test_without_poses_nothing_is_of_the_pose_source():
     analysis = analysis_of(found(("motor_lag", "deadband")), None)
-    assert stages._of_every_log(analysis, SimpleNamespace(body_estimates=None)) == analysis
+    assert stages.of_every_log(analysis, SimpleNamespace(body_estimates=None)) == analysis
 
 
 def test_what_is_of_this_log_is_gone_before_anything_is_judged_and_that_is_said():
@@ -188,6 +188,21 @@ def test_what_is_of_this_log_is_gone_before_anything_is_judged_and_that_is_said(
     assert names == ("turn_slip",)
     assert "heading_bias.bias_rad" not in model.parameter_names
     assert notes == ("the amended model leaves out heading_bias: this log does not say how poses are in another drive",)
+
+
+@pytest.mark.parametrize(
+    ("ends", "why"),
+    [((-0.1, 0.3), "this log does not say how poses are in another drive"), ((0.1, 0.3), "predicted as well without")],
+)
+def test_what_predictions_do_not_need_of_poses_is_not_said_to_be_of_this_log(ends, why):
+    column = REGISTRY["heading_bias"].columns[0]
+    final = SimpleNamespace(body_estimates=SimpleNamespace(by_name={column: ParameterEstimate(0.1, *ends)}))
+    analysis = replace(
+        analysis_of(None, found(("heading_bias", "turn_slip"))), drive=SimpleNamespace(pose_clock_even=True)
+    )
+    (note,) = left_out_notes(analysis, final, stages.lacking(analysis, "body", "heading_bias"))
+    assert note.startswith("the amended model leaves out heading_bias: ")
+    assert note.endswith(why)
 
 
 def errors(*squares):
