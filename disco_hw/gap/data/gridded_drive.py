@@ -229,14 +229,12 @@ def _to_borders(commands: Commands, begin_s: float, later_s: float) -> float:
     """The move nearest to `later_s` that lets commands change at the borders of cells, in the mean over their changes.
 
     A delay of a part of a cell is made by a mean of neighbouring cells: a change within a cell would be smeared twice.
-    Where they are less than a quarter of a cell off, as stamps scatter, whole cells.
     """
     asked = np.nan_to_num(np.column_stack([commands.left_rad_s, commands.right_rad_s]))
     changes = (np.diff(asked, axis=0) ** 2).sum(axis=1)
     turn = 2.0j * np.pi / GRID_STEP_S
     mean = complex(np.sum(changes * np.exp(turn * (commands.t_s[1:] - begin_s))))
     within_s = float(np.angle(mean)) / abs(turn)
-    within_s = within_s if abs(within_s) > 0.25 * GRID_STEP_S else 0.0
     return round((later_s + within_s) / GRID_STEP_S) * GRID_STEP_S - within_s
 
 

@@ -372,12 +372,15 @@ class Selector:
         once = any(CANDIDATES[name].once for name in set(larger) - set(smaller))
         price = parameters_of(larger) - parameters_of(smaller)
         # A delay is wrong by as much as a lag beside it is missing, however little that moves.
-        delays = set(delays_of(self.channel.layout))
-        lags_too = set(larger) - set(smaller) <= set(LATE) - delays and not delays.isdisjoint(smaller)
+        layout, new = self.channel.layout, set(larger) - set(smaller)
+        delays = set(delays_of(layout))
+        lags_too = new <= set(LATE) - delays and not delays.isdisjoint(smaller)
+        # All commands are late alike: that few of them change says nothing against it.
+        repeats = (layout.of_wheels and new <= delays) or proof.repeats(self.channel.count)
         return (
             (not once or proof.again(price, self.channel.count) > 0.0)
             and (proof.score > limits.score or self._dominant(smaller, gain))
-            and proof.repeats(self.channel.count)
+            and repeats
             and (
                 self.moves(self.split(smaller), self.split(larger)) > limits.moves_m
                 or (lags_too and proof.score > limits.unnamed_score)

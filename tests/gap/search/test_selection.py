@@ -224,6 +224,29 @@ def test_a_lag_beside_a_delay_is_told_where_it_surely_is_however_little_it_moves
     assert chosen.acceptable(smaller, larger) == accepted
 
 
+@pytest.mark.parametrize(
+    ("layout", "smaller", "new", "accepted"),
+    [
+        (WHEEL, (), ("command_delay",), True),
+        (WHEEL, ("motor_lag", "deadband"), ("command_delay",), True),
+        (WHEEL, ("command_delay",), ("motor_lag",), False),
+        (WHEEL, (), ("command_delay", "motor_lag"), False),
+        (BODY, (), ("pose_latency",), False),
+    ],
+)
+@pytest.mark.parametrize("score", [10.1, 10.0])
+def test_a_delay_of_the_commands_needs_its_score_but_not_to_show_in_a_third_place(
+    layout, smaller, new, accepted, score
+):
+    channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=1000, split=lambda vector: (vector, None), layout=layout)
+    chosen = Selector(channel, lambda small, big: 0.01, Thresholds(10.0, 0.001, 20.0))
+    larger = (*smaller, *new)
+    for names, cost in ((smaller, 500.0), (larger, 480.0)):
+        chosen.fits[frozenset(names)] = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
+    chosen.proofs[frozenset(smaller), frozenset(larger)] = EffectEvidence(20.0, -1.0, -7.0, 0.0, 1.0, score)
+    assert chosen.acceptable(smaller, larger) == (accepted and score > 10.0)
+
+
 def test_what_fits_badly_is_helped_by_a_large_part_of_what_it_lacks_whatever_its_score():
     # 500 of 1000 residuals' half squares are expected: with a misfit of 2, 1000 are lacking.
     assert judged(score=-5.0, gain=260.0, misfit=2.0) is True
