@@ -57,6 +57,7 @@ NAMES = {
     "command_delay": ("command_delay", "delay_s"),
     "motor_lag": ("motor_lag", "tau_s"),
     "dead_band": ("deadband", "width_rad_s"),
+    "dry_friction": ("deadband", "width_rad_s"),
     "unequal_wheels": ("wheel_radius_asymmetry", "ratio"),
     "pose_latency": ("pose_latency", "latency_s"),
     "slope": ("downhill_slide", ""),
@@ -139,11 +140,12 @@ def drawn(number: int) -> Robot:
     length, width, height = usual.half_m
     half_m = (length * scale * draw(0.9, 1.1), width * scale * draw(0.9, 1.1), height * scale)
     sizes = {
-        "command_delay": draw(0.06, 0.25), "motor_lag": draw(0.1, 0.33), "dead_band": draw(0.06, 0.12) * top_rad_s,
+        "command_delay": draw(0.06, 0.25), "motor_lag": draw(0.1, 0.33), "dry_friction": draw(0.06, 0.12) * top_rad_s,
         "unequal_wheels": draw(0.018, 0.05), "pose_latency": draw(0.08, 0.25), "slope": draw(3.5, 8.0),
         "payload": mass_kg * draw(0.25, 0.4), "torque_limit": scrub_nm * draw(0.8, 1.15),
         "worn_tyre": draw(0.3, 0.55), "backlash": draw(0.05, 0.16),
     }  # fmt: skip
+    sizes["dead_band"] = sizes["dry_friction"]
     return Robot(
         wheel_radius_m=radius_m,
         track_m=track_m,

@@ -2,8 +2,8 @@
 
 Four wheels in contact with a floor, each on a velocity servo with a lag and a limited torque, driven by a script like a
 person with a joystick. It shares no constant and no equation with the virtual robot or with the model that the search
-for missing effects fits (`tests/tools/test_mujoco_robot.py` holds it to that): turning, slip and droop are what contact
-and servos make of them.
+for missing effects fits (`tests/tools/test_mujoco_robot.py` holds it to that), but for what delay and dead band are:
+turning, slip and droop are what contact and servos make of them.
 
 Poses are of the base's middle and carry white noise on each axis and on the yaw; encoders are those of the motors, the
 mean of a side's two, in steps of a turn over their counts. Stamps are exact, unless its `Habits` are others. There are
@@ -45,7 +45,8 @@ DOWNHILL_RAD = 0.57
 EFFECTS = {
     "command_delay": (0.145, "s from a command to the servos"),
     "motor_lag": (0.23, "s, time constant of the servos in place of theirs"),
-    "dead_band": (0.57, "rad/s that dry friction of a motor takes from a wheel"),
+    "dead_band": (0.57, "rad/s of each command that the servos ignore"),
+    "dry_friction": (0.57, "rad/s that dry friction of a motor takes from a wheel"),
     "unequal_wheels": (0.042, "by so much the right wheels are larger"),
     "pose_latency": (0.21, "s by which poses are stamped late"),
     "slope": (5.7, "degrees that the floor falls"),
@@ -130,6 +131,7 @@ ROBOTS = {
             "command_delay": 0.097,
             "motor_lag": 0.155,
             "dead_band": 0.36,
+            "dry_friction": 0.36,
             "unequal_wheels": 0.021,
             "pose_latency": 0.125,
             "slope": 4.1,
@@ -163,6 +165,7 @@ ROBOTS = {
             "command_delay": 0.205,
             "motor_lag": 0.31,
             "dead_band": 0.81,
+            "dry_friction": 0.81,
             "unequal_wheels": 0.031,
             "pose_latency": 0.155,
             "slope": 7.2,
@@ -259,7 +262,7 @@ def mjcf(hidden: Hidden, robot: Robot = ROBOTS["middle"]) -> str:
             damping=robot.bearing_nm_s,
             rotor=robot.rotor_kg_m2,
             friction=robot.friction * (hidden.get("worn_tyre", 1.0) if name == "fl" else 1.0),
-            dry_nm=hidden.get("dead_band", 0.0) * robot.servo_nm_s,
+            dry_nm=hidden.get("dry_friction", 0.0) * robot.servo_nm_s,
             play=_PLAY.format(half=hidden["backlash"] / 2) if "backlash" in hidden else "",
         )
         for name, front, left in _WHEELS
@@ -305,6 +308,7 @@ def record(hidden: Hidden, seed: int, command: Array | None = None, robot: Robot
     if unknown:
         raise ValueError(f"no such effect: {', '.join(sorted(unknown))}; give some of {', '.join(EFFECTS)}")
     command, habits = driven(robot, seed) if command is None else command, robot.habits
+    heard = np.sign(command) * np.maximum(np.abs(command) - hidden.get("dead_band", 0.0), 0.0)
     model = mujoco.MjModel.from_xml_string(mjcf(hidden, robot))
     data = mujoco.MjData(model)
     motors = [model.joint(name).qposadr[0] for name, *_ in _WHEELS]
@@ -318,7 +322,7 @@ def record(hidden: Hidden, seed: int, command: Array | None = None, robot: Robot
         w, x, y, z = data.qpos[3:7]
         where[k] = data.qpos[0], data.qpos[1], math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         turned[k] = data.qpos[motors] - turned_before
-        left, right = command[k // STEPS_PER_COMMAND]
+        left, right = heard[k // STEPS_PER_COMMAND]
         waiting.append(np.array([left, right, left, right]))
         data.ctrl[:] = waiting.popleft()
         mujoco.mj_step(model, data)

@@ -158,8 +158,14 @@ def test_a_delay_and_a_latency_are_there_to_the_step():
 def test_each_other_effect_does_what_it_says():
     straight, spin = held(3.0, 3.0, 3.0), held(-4.0, 4.0, 3.0)
     plain, turning = record({}, 1, straight), record({}, 1, spin)
-    speeds, _ = steady(record({"dead_band": 0.57}, 1, straight))
-    assert speeds == pytest.approx([3.0 - 0.57] * 4, rel=0.005)
+    for name in ("dead_band", "dry_friction"):
+        speeds, _ = steady(record({name: 0.57}, 1, straight))
+        assert speeds == pytest.approx([3.0 - 0.57] * 4, rel=0.005)
+        assert np.abs(record({name: 0.57}, 1, held(0.3, -0.5)).turned).max() < 0.2
+    # Friction goes on while a command ends, what a drive ignores is a matter of commands alone.
+    ends = np.concatenate([held(3.0, 3.0, 2.0), held(0.0, 0.0, 1.0)])
+    ignoring, rubbing = (record({name: 0.57}, 1, ends).turned[-1, 0] for name in ("dead_band", "dry_friction"))
+    assert rubbing < ignoring - 0.01
     lagging = record({"motor_lag": 0.23}, 1, straight)
     # What a lag costs of the way is the speed times its growth.
     assert plain.turned[-1] - lagging.turned[-1] == pytest.approx(3.0 * (0.23 - 0.037), rel=0.03)
