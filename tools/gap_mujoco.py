@@ -32,7 +32,7 @@ from disco_hw.gap.search import joint_predictions
 from disco_hw.gap.search.analysis import final_fit
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.model import Model
-from disco_hw.model.terms import BODY_FEATURES
+from disco_hw.model.terms import BODY_FEATURES, BODY_MEMORIES
 from tools.gap_halves import STAGES, unseen_errors
 from tools.gap_study import revision
 from tools.joystick import STEPS_PER_COMMAND, STEPS_PER_S
@@ -49,6 +49,8 @@ from tools.mujoco_robot import (
 )
 
 AHEAD_S = 2.0
+SIDES = ([0, 2], [1, 3])
+"""The left wheels and the right ones."""
 OTHER_HABITS = 100
 """From this number on a robot is drawn with how it is driven and logged."""
 UNSEEN = 1000
@@ -195,10 +197,10 @@ def truth_of(hidden: str, recording: Recording, beside: Sequence[str] = ()) -> f
     """What is true of the parameter that stands for what was hidden.
 
     A delay and a lag are those that the true wheels show, the servo's own included. How late poses are is how far they
-    lie behind the true wheels: the body's own lag, as tyres slip before they push, comes on top. A payload's is what
-    the true motion shows: the forward speed of the middle that turning makes, with the forms that the search has
-    `beside` it, as a share of a curve depends on what else has a share in it. A worn tyre's is how much further the
-    same difference of the true wheels turns the robot to the left.
+    lie behind the true wheels: the body's own lag, as tyres slip before they push, comes on top, less what the forms
+    `beside` it hold of that. A payload's is what the true motion shows: the forward speed of the middle that turning
+    makes, with those forms, as a share of a curve depends on what else has a share in it. A worn tyre's is how much
+    further the same difference of the true wheels turns the robot to the left.
     """
     if hidden not in NAMES:
         return None
@@ -207,7 +209,7 @@ def truth_of(hidden: str, recording: Recording, beside: Sequence[str] = ()) -> f
         case "command_delay" | "motor_lag":
             return response_of(recording)[hidden]
         case "pose_latency":
-            return size + body_lag_s(recording)
+            return size + body_lag_s(recording, beside)
         case "unequal_wheels":
             return size / (2.0 + size)
         case "slope":
@@ -230,7 +232,7 @@ def truth_of(hidden: str, recording: Recording, beside: Sequence[str] = ()) -> f
         case "worn_tyre":
             every = slice(None, None, 48)
             t_s, yaw, turned = recording.truth_s[every], recording.truth[every, 2], recording.turned[every]
-            left, right = (np.gradient(turned[:, side].mean(axis=1), t_s) for side in ([0, 2], [1, 3]))
+            left, right = (np.gradient(turned[:, side].mean(axis=1), t_s) for side in SIDES)
             causes = np.column_stack([right - left, np.abs(right - left), right + left])
             both, one_way, _ = np.linalg.lstsq(causes, np.gradient(yaw, t_s), rcond=None)[0]
             return float(one_way / both)
@@ -258,20 +260,28 @@ def response_of(recording: Recording) -> dict[str, float]:
     return {"command_delay": float(delay_s), "motor_lag": float(lag_s)}
 
 
-def body_lag_s(recording: Recording) -> float:
+def body_lag_s(recording: Recording, beside: Sequence[str] = ()) -> float:
     """How far the true body follows behind the true wheels (s): the shift that fits the speeds of its two sides best.
 
-    Forward and turning speeds are as large as the wheels make them, by a factor of each, without any noise.
+    Forward and turning speeds are as large as the wheels make them, by a factor of each, without any noise; forward
+    ones with what tyres that slip make of them in the forms `beside` it.
     """
     every = slice(None, None, 8)
     t_s, (x, y, yaw), turned = recording.truth_s[every], recording.truth[every].T, recording.turned[every]
     forward = np.gradient(x, t_s) * np.cos(yaw) + np.gradient(y, t_s) * np.sin(yaw)
     turning = np.gradient(yaw, t_s) * recording.robot.track_m / 2
-    left, right = (np.gradient(turned[:, side].mean(axis=1), t_s) for side in ([0, 2], [1, 3]))
+    left, right = (recording.robot.wheel_radius_m * np.gradient(turned[:, side].mean(axis=1), t_s) for side in SIDES)
+    driven = (left + right) / 2
+    for form in beside:
+        _, _, k, feature = form.split(" ", 3)
+        if "slewed" in feature:
+            rolling = np.gradient(recording.robot.wheel_radius_m * recording.turned.mean(axis=1), recording.truth_s)
+            slipping = BODY_MEMORIES["v_x"][feature].at_nodes(1.0 / STEPS_PER_S, rolling, 0.0 * rolling)
+            driven = driven + float(k) * slipping[every]
 
     def off(lag_s: float) -> float:
         squares = 0.0
-        for wheels, body in ((right + left, forward), (right - left, turning)):
+        for wheels, body in ((driven, forward), ((right - left) / 2, turning)):
             earlier = np.interp(t_s - lag_s, t_s, wheels)
             scale = max(float(earlier @ earlier), 1e-12)
             squares += float(((body - (earlier @ body) / scale * earlier) ** 2).sum())

@@ -19,10 +19,15 @@ DELAYED_BY = DELAY.columns[0]
 
 
 class DriveMeans:
-    """The means of a drive that begins with nothing before it, of commands and of wheel speeds; pure."""
+    """The means of a drive that begins with nothing before it, of commands and of wheel speeds; pure.
 
-    def __init__(self, of_commands: tuple[Remembered, ...], of_body: tuple[Remembered, ...]) -> None:
-        self._memories, self._body = of_commands, of_body
+    `half_radius_m`: of the wheels, forward speed for each rad/s of their sum.
+    """
+
+    def __init__(
+        self, of_commands: tuple[Remembered, ...], of_body: tuple[Remembered, ...], half_radius_m: float = 1.0
+    ) -> None:
+        self._memories, self._body, self._half_radius_m = of_commands, of_body, half_radius_m
         self._commands = tuple((0.0, 0.0) for _ in of_commands)
         self._wheels = tuple(0.0 for _ in of_body)
 
@@ -30,7 +35,7 @@ class DriveMeans:
     def of(cls, model: Model) -> DriveMeans | None:
         """Those of a model; None if it remembers nothing."""
         memories = memories_of(setting.name for setting in model.effects)
-        return cls(*memories) if any(memories) else None
+        return cls(*memories, 0.5 * model.wheel_radius_m) if any(memories) else None
 
     @property
     def commands(self) -> tuple[tuple[float, float], ...]:
@@ -46,8 +51,8 @@ class DriveMeans:
         """Take in a command that was held for so long."""
         self._commands = tuple(
             (
-                _followed(left, memory.of(left_rad_s, right_rad_s), held_s, memory.time_s),
-                _followed(right, memory.of(right_rad_s, left_rad_s), held_s, memory.time_s),
+                memory.after(left, memory.of(left_rad_s, right_rad_s), held_s, 1.0),
+                memory.after(right, memory.of(right_rad_s, left_rad_s), held_s, 1.0),
             )
             for memory, (left, right) in zip(self._memories, self._commands, strict=True)
         )
@@ -56,13 +61,9 @@ class DriveMeans:
         """Take in wheel speeds of so long; what is not finite counts as standing."""
         left, right = (speed if math.isfinite(speed) else 0.0 for speed in (left_rad_s, right_rad_s))
         self._wheels = tuple(
-            _followed(mean, of_wheels(memory, left, right), for_s, memory.time_s)
+            memory.after(mean, of_wheels(memory, left, right), for_s, self._half_radius_m)
             for memory, mean in zip(self._body, self._wheels, strict=True)
         )
-
-
-def _followed(mean: float, signal: float, for_s: float, time_s: float) -> float:
-    return signal + (mean - signal) * math.exp(-max(for_s, 0.0) / time_s)
 
 
 class PastMotion:

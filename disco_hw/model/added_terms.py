@@ -25,7 +25,8 @@ Means: TypeAlias = Any
 
 def _entry_type(name: str, term: GenericTerm) -> Any:
     kind: Any = namedtuple
-    fields = ("k", "reach", "per_s") if term.memory is None else ("k", "reach", "by_end", "over_step")
+    memory = ("by_end", "over_step") if term.memory is not None and not term.memory.slews else ("most",)
+    fields = ("k", "reach", *(("per_s",) if term.memory is None else memory))
     made = kind("Term" + "".join(f"_{ord(c):x}" if not c.isalnum() else c for c in name), fields)
     made.__module__ = __name__
     return made
@@ -45,7 +46,7 @@ def _feature(term: GenericTerm) -> Feature:
 
 
 _COMPILED: Mapping[str, Any] = MappingProxyType({name: scalar_function(_feature(term)) for name, term in TERMS.items()})
-_AVERAGED: Mapping[str, Any] = MappingProxyType(
+_FOLLOWED: Mapping[str, Any] = MappingProxyType(
     {name: scalar_function(term.memory.of) for name, term in TERMS.items() if term.memory is not None}
 )
 
@@ -121,6 +122,16 @@ def _averaged(signal: float, entry: TermCoefficients, means: Means, at: Any) -> 
     return over_step
 
 
+@scalar_function
+def _slewed(signal: float, most: float, means: Means, at: Any) -> float:
+    """What follows a signal by at most so much a step, in the mean over one; it goes on to its end."""
+    before = means[at]
+    moved = min(max(signal - before, -most), most)
+    means[at] = before + moved
+    over_step: float = before + moved * (cast_like(1.0, moved) - cast_like(0.5, moved) * abs(moved) / most)
+    return over_step
+
+
 # What is overloaded is chosen by numba's types; those of tuples have fields that its annotations do not know.
 @specialise(add_to_commands)
 def _add_to_commands(
@@ -139,7 +150,7 @@ def _add_to_commands(
                 f"new_right = new_right + terms[{n}].k * within(feature{n}(right, left, time_s), terms[{n}].reach)",
             ]
             continue
-        scope[f"of{n}"] = _AVERAGED[term.name]
+        scope[f"of{n}"] = _FOLLOWED[term.name]
         lines += [
             f"mean_left = averaged(of{n}(left, right), terms[{n}], means, at + place({place}) * apart)",
             f"mean_right = averaged(of{n}(right, left), terms[{n}], means, at + place({place + 1}) * apart)",
@@ -173,8 +184,12 @@ def add_to_velocity(
             feature = BODY_FEATURES[term.feature](v, w, base.half_radius_m * change * entry.per_s, time_s)
         else:
             unit = term.memory.of(base.half_radius_m, ratio)
-            mean = unit * _averaged(term.memory.of(wheel_sum, difference), entry, means, at + place * apart)
-            feature = term.memory.feature(v, w, mean)
+            signal, here = term.memory.of(wheel_sum, difference), at + place * apart
+            if term.memory.slews:
+                followed = unit * _slewed(signal, entry.most / unit, means, here)
+            else:
+                followed = unit * _averaged(signal, entry, means, here)
+            feature = term.memory.feature(v, w, followed)
             place += term.means
         more = entry.k * _within(feature, entry.reach)
         match term.target:
@@ -196,7 +211,8 @@ def _add_to_velocity(
     if isinstance(terms, types.NoneType):
         return _made("add_to_velocity", arguments, ["return forward, lateral, turn"], {})
     scope: dict[str, Any] = {
-        "plus": _plus, "cast_like": cast_like, "averaged": _averaged, "within": _within, "place": np.uintp
+        "plus": _plus, "cast_like": cast_like, "averaged": _averaged, "slewed": _slewed, "within": _within,
+        "place": np.uintp,
     }  # fmt: skip
     lines = [
         "v = base.half_radius_m * wheel_sum",
@@ -210,12 +226,14 @@ def _add_to_velocity(
             acceleration = f"base.half_radius_m * change * terms[{n}].per_s" if term.needs_acceleration else "v"
             feature = f"feature{n}(v, w, {acceleration}, time_s)"
         else:
-            scope[f"of{n}"] = _AVERAGED[term.name]
+            scope[f"of{n}"] = _FOLLOWED[term.name]
+            slews = term.memory.slews
+            follow, how = ("slewed", f"terms[{n}].most / unit") if slews else ("averaged", f"terms[{n}]")
             lines += [
                 f"unit = of{n}(base.half_radius_m, base.half_turn_ratio + base.half_turn_ratio)",
-                f"mean = unit * averaged(of{n}(wheel_sum, difference), terms[{n}], means, at + place({place}) * apart)",
+                f"followed = unit * {follow}(of{n}(wheel_sum, difference), {how}, means, at + place({place}) * apart)",
             ]
-            feature = f"feature{n}(v, w, mean)"
+            feature = f"feature{n}(v, w, followed)"
             place += term.means
         more = f"terms[{n}].k * within({feature}, terms[{n}].reach)"
         match term.target:

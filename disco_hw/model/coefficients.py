@@ -30,7 +30,7 @@ class Base(NamedTuple):
 class TermCoefficients(Protocol):
     """Coefficients of a term without a name, of one parameter point or arrays (L,) of many.
 
-    k, reach and, of a term that remembers, how its mean follows in a step, else the steps a second.
+    k, reach and, of a term that remembers, how its memory follows in a step, else the steps a second.
     """
 
     @property
@@ -52,6 +52,10 @@ class TermCoefficients(Protocol):
     @property
     def over_step(self) -> Any:
         """How much of its way the mean has gone in the mean over a step."""
+
+    @property
+    def most(self) -> Any:
+        """By how much what follows at a limited rate goes on in a step (m/s)."""
 
     def __iter__(self) -> Iterator[Any]:
         """Those that it has, in the order of its type."""

@@ -119,8 +119,30 @@ class _Memory:
         return value + (before - value) * math.exp(-step_s / self.time_s)
 
 
+@dataclass(frozen=True)
+class _Slewed:
+    """The same of what comes out of a limit of so much a second (m/s^2)."""
+
+    most: float
+    goes_in: Callable[..., Value]
+    feature: Callable[..., Value]
+
+    def over(self, before: Value, value: Value, step_s: float) -> Value:
+        """Mean of what comes out over a step, at whose start it was `before`: on its way, and there for the rest."""
+        way = value - before
+        arrives = np.minimum(np.abs(way) / (self.most * step_s), 1.0)
+        end = self.after(before, value, step_s)
+        return 0.5 * (before + end) * arrives + end * (1.0 - arrives)
+
+    def after(self, before: Value, value: Value, step_s: float) -> Value:
+        """What comes out at the end of that step."""
+        return np.clip(value, before - self.most * step_s, before + self.most * step_s)
+
+
+_Remembering = _Memory | _Slewed
+
 _SHORT_TO_LONG = {"0.3": 0.3, "1": 1.0, "3": 3.0}
-COMMAND_MEMORIES: Mapping[str, _Memory] = {
+COMMAND_MEMORIES: Mapping[str, _Remembering] = {
     **{
         f"u mean_{name}s(|u| + |u_other|)": _Memory(
             time_s, lambda u, other: np.abs(u) + np.abs(other), lambda u, other, mean: mean * u
@@ -133,7 +155,7 @@ COMMAND_MEMORIES: Mapping[str, _Memory] = {
         for name, time_s in _SHORT_TO_LONG.items()
     },
 }
-BODY_MEMORIES: Mapping[str, _Memory] = {
+BODY_MEMORIES: Mapping[str, _Remembering] = {
     **{
         f"(v - mean_{name}s(v))": _Memory(time_s, lambda v, w: v, lambda v, w, mean: v - mean)
         for name, time_s in _SHORT_TO_LONG.items()
@@ -141,6 +163,10 @@ BODY_MEMORIES: Mapping[str, _Memory] = {
     **{
         f"(omega - mean_{name}s(omega))": _Memory(time_s, lambda v, w: w, lambda v, w, mean: w - mean)
         for name, time_s in _SHORT_TO_LONG.items()
+    },
+    **{
+        f"(v - slewed_{most}(v))": _Slewed(float(most), lambda v, w: v, lambda v, w, slewed: v - slewed)
+        for most in ("1", "1.25", "1.6", "2", "2.5", "3.2", "4", "5", "6.3", "8")
     },
 }
 
@@ -151,13 +177,13 @@ def _terms(theta: Theta, target: str) -> list[tuple[str, Value, Value]]:
     return [(name.partition(" += k ")[2], theta[f"{name}.k"], theta[f"{name}.reach"]) for name in names]
 
 
-def _commands_remembered(theta: Theta, left: Value, right: Value) -> dict[str, tuple[_Memory, tuple[Value, ...]]]:
+def _commands_remembered(theta: Theta, left: Value, right: Value) -> dict[str, tuple[_Remembering, tuple[Value, ...]]]:
     """By feature the memories of commands that act, and what goes into each of their means."""
     acting = [(name, COMMAND_MEMORIES[name]) for name, *_ in _terms(theta, "command") if name in COMMAND_MEMORIES]
     return {name: (memory, (memory.goes_in(left, right), memory.goes_in(right, left))) for name, memory in acting}
 
 
-def _body_remembered(theta: Theta, v: Value, w: Value) -> dict[str, tuple[_Memory, tuple[Value, ...]]]:
+def _body_remembered(theta: Theta, v: Value, w: Value) -> dict[str, tuple[_Remembering, tuple[Value, ...]]]:
     """The same of the body's, which go by forward speed and yaw rate."""
     features = [name for target in ("v_x", "omega") for name, *_ in _terms(theta, target)]
     acting = [(name, BODY_MEMORIES[name]) for name in features if name in BODY_MEMORIES]

@@ -8,9 +8,9 @@ Nothing says what such a form becomes beyond the motion that showed it: a cubic 
 times as much at 0.6. So a term has a `reach`, the largest size that its feature had in the log, and stays there.
 
 Some remember: `mean_1s(x)` is x through a first-order lag of 1 s, the mean over the past, of which what is older counts
-less. A load that drains a supply, motors that warm, a servo whose answer depends on where it comes from and rubber that
-gives way all depend on what was before. A model with such a feature has its means in its state; before a drive began
-nothing was.
+less; `slewed_5(v)` follows v by at most 5 m/s^2. A load that drains a supply, motors that warm, a servo whose answer
+depends on where it comes from, rubber that gives way and tyres that slip all depend on what was before. A model with
+such a feature has what it remembers in its state; before a drive began nothing was.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from disco_hw.effects import Channel, Effect, Parameter, Stage
 from disco_hw.effects.registry import REGISTRY
-from disco_hw.jit import cast_like, scalar_function, specialise
+from disco_hw.jit import cast_like, kernel_function, scalar_function, specialise
 
 Array = NDArray[np.float64]
 Feature = Callable[..., Any]
@@ -54,28 +54,58 @@ def forget(values: Any) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Remembered:
-    """A feature with a memory: `of` the motion is averaged, older than `time_s` (s) counts little, and `feature` gets
-    the motion and that mean over a step, in which the motion stays as it is.
+    """A feature with a memory: `of` the motion is followed, and `feature` gets the motion and that over a step, in
+    which the motion stays as it is.
+
+    What is older than `time_s` (s) counts little: a mean. Or, with a `most` (m/s^2), it is followed by that much a
+    second and no faster.
     """
 
     of: Feature
     time_s: float
     feature: Feature
+    most: float = math.inf
+
+    @property
+    def slews(self) -> bool:
+        """Whether it follows at a limited rate and is no mean."""
+        return self.most < math.inf
 
     def follows(self, step_s: float) -> tuple[float, float]:
         """How much of its way to `of` the mean goes in a step: by its end, and in the mean over it."""
         gone = -math.expm1(-step_s / self.time_s)
         return gone, 1.0 - gone * self.time_s / step_s
 
+    def after(self, before: float, signal: float, for_s: float, unit: float) -> float:
+        """What is remembered after a signal of so long, in signals of which one is `unit` (m/s)."""
+        if self.slews:
+            most = self.most * max(for_s, 0.0) / unit
+            return before + min(max(signal - before, -most), most)
+        return signal + (before - signal) * math.exp(-max(for_s, 0.0) / self.time_s)
+
     def at_nodes(self, step_s: float, *motion: Array) -> Array:
         """The feature of a motion that is known all along, each (M, ...), in steps of `step_s`; nothing was before."""
         from scipy.signal import lfilter  # noqa: PLC0415  (slow to import, and no robot that drives needs it)
 
-        by_end, over_step = self.follows(step_s)
         signal = np.asarray(self.of(*motion))
+        if self.slews:
+            over = np.empty_like(signal)
+            _slew(signal, self.most * step_s, over)
+            return np.asarray(self.feature(*motion, over))
+        by_end, over_step = self.follows(step_s)
         after = lfilter([by_end], [1.0, by_end - 1.0], signal, axis=0)
         before = np.concatenate([np.zeros_like(after[:1]), after[:-1]])
         return np.asarray(self.feature(*motion, before + over_step * (signal - before)))
+
+
+@kernel_function
+def _slew(signal: Array, most: float, over: Array) -> None:
+    """What follows a signal (M,) by at most so much a step, in the mean over each."""
+    now = 0.0
+    for k in range(signal.shape[0]):
+        moved = min(max(signal[k] - now, -most), most)
+        over[k] = now + moved * (1.0 - 0.5 * abs(moved) / most)
+        now += moved
 
 
 def _sign(x: float, rest: float) -> float:
@@ -162,12 +192,17 @@ COMMAND_MEMORIES: Mapping[str, Remembered] = MappingProxyType(
         for time_s in (0.3, 1.0, 3.0)
     }
 )
-# Of forward speed v (m/s) and yaw rate w (rad/s); the mean is of one of them.
+# Of forward speed v (m/s) and yaw rate w (rad/s); the mean is of one of them. Tyres push a robot with no more than they
+# grip: its speed follows the wheels' by so much a second (m/s^2).
 BODY_MEMORIES: Mapping[str, Mapping[str, Remembered]] = MappingProxyType(
     {
         "v_x": {
             f"(v - mean_{time_s:g}s(v))": Remembered(lambda v, w: v, time_s, lambda v, w, mean: v - mean)
             for time_s in (0.3, 1.0, 3.0)
+        }
+        | {
+            f"(v - slewed_{most:g}(v))": Remembered(lambda v, w: v, 0.0, lambda v, w, slewed: v - slewed, most)
+            for most in (1.0, 1.25, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0, 6.3, 8.0)
         },
         "v_y": {},
         "omega": {
@@ -198,7 +233,11 @@ def _coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...
 
 
 def _following(memory: Remembered, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """k, reach, and how the mean follows: by the end of a step and in the mean over it; each (L,)."""
+    """k, reach, and how the mean follows: by the end of a step and in the mean over it, or by how much at most in a
+    step (m/s); each (L,).
+    """
+    if memory.slews:
+        return values[:, 0], values[:, 1], np.full(values.shape[0], memory.most * step_s)
     return values[:, 0], values[:, 1], *(np.full(values.shape[0], part) for part in memory.follows(step_s))
 
 

@@ -127,3 +127,16 @@ def test_nothing_was_before_a_drive_and_speeds_that_are_none_count_as_standing()
     means = DriveMeans.of(MODEL)
     means.add_wheels(math.nan, 3.0, 10.0)
     assert means.body == pytest.approx((3.0,), rel=1e-3)
+
+
+def test_of_tyres_that_slip_it_is_kept_how_fast_the_robot_really_is():
+    slipping = Model(0.06, 0.4, effects=(EffectSetting("v_x += k (v - slewed_2(v))", {"k": -1.0}),))
+    means = DriveMeans.of(slipping)
+    # 0.1 m/s in 0.05 s: of wheels of 60 mm 10/3 rad/s in the sum of both.
+    for gained in (10.0 / 3.0, 20.0 / 3.0, 8.0):
+        means.add_wheels(4.0, 4.0, 0.05)
+        assert means.body == pytest.approx((gained,))
+    means.add_wheels(0.0, 0.0, 0.05)
+    assert means.body == pytest.approx((8.0 - 10.0 / 3.0,))
+    means.add_wheels(0.0, 0.0, -1.0)
+    assert means.body == pytest.approx((8.0 - 10.0 / 3.0,))

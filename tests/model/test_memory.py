@@ -53,3 +53,18 @@ def test_the_body_is_asked_in_its_own_speeds():
     forward = BODY_MEMORIES["v_x"]["(v - mean_1s(v))"].at_nodes(STEP_S, v, w)
     assert forward[99] == pytest.approx(0.4 * LEFT)
     assert BODY_MEMORIES["v_y"] == {}
+
+
+def test_a_robot_whose_tyres_slip_follows_its_wheels_by_so_much_a_second():
+    v = np.concatenate([np.full(40, 1.0), np.full(60, -0.2)])
+    behind = BODY_MEMORIES["v_x"]["(v - slewed_5(v))"].at_nodes(STEP_S, v, 0.0 * v)
+    # 0.05 m/s a step, half of it in the mean over the step in which it goes on.
+    assert behind[:3] == pytest.approx([0.975, 0.925, 0.875])
+    assert behind[20:40] == pytest.approx(np.zeros(20), abs=1e-12)
+    assert behind[40:42] == pytest.approx([-1.175, -1.125])
+    assert behind[64:] == pytest.approx(np.zeros(36), abs=1e-12)
+    slower = BODY_MEMORIES["v_x"]["(v - slewed_1.25(v))"].at_nodes(STEP_S, v, 0.0 * v)
+    assert slower[:2] == pytest.approx([1.0 - 0.00625, 1.0 - 0.01875])
+    # What is nearer than a step's way is there for the rest of it.
+    near = BODY_MEMORIES["v_x"]["(v - slewed_5(v))"].at_nodes(STEP_S, np.full(2, 0.03), np.zeros(2))
+    assert near == pytest.approx([0.03 * 0.03 / 0.05 / 2.0, 0.0])

@@ -12,7 +12,7 @@ BASE = (0.06, 0.4, 0.1)
 STEP_S = 0.05
 DRIVE = np.repeat([[4.0, 4.0], [-3.0, 2.0], [6.0, 1.0], [0.0, 0.5], [-5.0, -4.0]], 6, axis=0)
 DIRECTION, LOAD = "command += k sign(u - mean_0.3s(u))", "command += k u mean_1s(|u| + |u_other|)"
-RUBBER = "omega += k (omega - mean_1s(omega))"
+RUBBER, SLIPPING = "omega += k (omega - mean_1s(omega))", "v_x += k (v - slewed_2(v))"
 EVERY = [f"command += k {form}" for form in COMMAND_MEMORIES]
 EVERY += [f"{target} += k {form}" for target in BODY_TARGETS for form in BODY_MEMORIES[target]]
 
@@ -70,6 +70,24 @@ def test_a_body_turns_by_the_feature_of_how_its_wheels_turned():
     np.testing.assert_allclose(turned[1:], wheels[1:, 2] - 0.5 * STEP_S * np.cumsum(more), atol=1e-12)
 
 
+def test_a_robot_whose_tyres_slip_goes_by_what_they_grip():
+    """Wheels of 60 mm that spin up to 0.24 m/s at once, and 2 m/s^2: in steps of 0.1 m/s."""
+    model = model_of(EffectSetting(SLIPPING, {"k": -1.0}))
+    np.testing.assert_allclose(run(model, DRIVE), by_reference(model, DRIVE), atol=1e-12)
+    means = np.zeros(1)
+    ahead = run(model, np.full((4, 2), 4.0), means=means)[:, 0]
+    assert np.diff(ahead) == pytest.approx([0.05 * 0.05, 0.05 * 0.15, 0.05 * (0.24 - 0.04 * 0.4 / 2.0), 0.05 * 0.24])
+    # Kept in rad/s of both wheels, as they are measured.
+    assert means == pytest.approx([8.0])
+    wheels = 0.03 * DRIVE.sum(axis=1)
+    behind = BODY_MEMORIES["v_x"]["(v - slewed_2(v))"].at_nodes(STEP_S, wheels, 0.0 * wheels)
+    turns, found = np.diff(run(model_of(), DRIVE), axis=0), np.diff(run(model, DRIVE), axis=0)
+    way = np.hypot(*found[:, :2].T)
+    sideways = 0.1 * np.abs(turns[:, 2])
+    chord = np.sinc(0.5 * turns[:, 2] / np.pi)
+    assert way == pytest.approx(np.hypot(STEP_S * (wheels - behind), sideways) * chord, abs=1e-9)
+
+
 def test_longer_steps_lead_to_the_same_place():
     straight = np.repeat([[4.0, 4.0], [2.0, 2.0]], 30, axis=0)
     finer = np.repeat(straight, 10, axis=0)
@@ -123,6 +141,9 @@ def test_a_table_says_how_a_mean_follows_in_a_step():
     assert entry.by_end == pytest.approx(1.0 - np.exp(-0.1))
     assert entry.over_step == pytest.approx(1.0 - (1.0 - np.exp(-0.1)) / 0.1)
     assert effects.command_terms is None
+    model = model_of(EffectSetting(SLIPPING, {"k": -1.0}))
+    (entry,) = coefficient_tables(model, model.point()[None], 0.1)[1].body_terms
+    assert entry.most == pytest.approx(0.2)
 
 
 def test_means_are_in_the_order_of_a_model_s_effects():

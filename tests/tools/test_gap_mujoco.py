@@ -10,7 +10,7 @@ import pytest
 
 from tools import gap_mujoco
 from tools.gap_mujoco import Result, body_lag_s, drawn, injected_floor, response_of, robot_of, table, truth_of
-from tools.joystick import joystick
+from tools.joystick import joystick, keyboard
 from tools.mujoco_robot import EFFECTS, ROBOTS, Habits, Recording, Robot, record
 
 LATENCY = {"pose_latency": {"latency_s": 0.2}}
@@ -86,6 +86,22 @@ def test_how_late_poses_are_is_counted_from_the_true_wheels():
     assert body_lag_s(recording) == pytest.approx(0.025, abs=0.001)
     recording = replace(recording, hidden={"pose_latency": 0.2})
     assert truth_of("pose_latency", recording) == pytest.approx(0.225, abs=0.001)
+
+
+def test_what_tyres_slip_is_no_lateness_where_it_is_told():
+    """A body that follows its wheels by at most 2 m/s^2, and 15 ms later."""
+    t_s = np.arange(9_600) / 480.0
+    command = np.repeat(keyboard(5, 20.0, 8.0), 12, axis=0).mean(axis=1)
+    turned, speed, rolling = np.cumsum(command) / 480.0, 0.0, np.zeros(t_s.size)
+    for k, wish in enumerate(0.133 * command):
+        speed = min(max(wish, speed - 2.0 / 480.0), speed + 2.0 / 480.0)
+        rolling[k] = speed
+    x = np.concatenate([np.zeros(7), np.cumsum(rolling)[:-7]]) / 480.0
+    nothing, none = np.zeros((0, 3)), np.zeros((0, 2))
+    truth, wheels = np.column_stack([x, 0.0 * x, 0.0 * x]), np.repeat(turned[:, None], 4, axis=1)
+    recording = Recording(t_s[:0], none, t_s[:0], none, t_s[:0], nothing, t_s, truth, wheels, nothing)
+    assert body_lag_s(recording) > 0.05
+    assert body_lag_s(recording, ["v_x += -1 (v - slewed_2(v))", "omega += 3 v"]) == pytest.approx(0.015, abs=0.002)
 
 
 def test_the_response_of_true_wheels_is_told_whatever_turning_loses():
