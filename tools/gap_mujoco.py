@@ -271,13 +271,14 @@ def body_lag_s(recording: Recording, beside: Sequence[str] = ()) -> float:
     forward = np.gradient(x, t_s) * np.cos(yaw) + np.gradient(y, t_s) * np.sin(yaw)
     turning = np.gradient(yaw, t_s) * recording.robot.track_m / 2
     left, right = (recording.robot.wheel_radius_m * np.gradient(turned[:, side].mean(axis=1), t_s) for side in SIDES)
-    driven = (left + right) / 2
+    way = recording.robot.wheel_radius_m * recording.turned.mean(axis=1)
+    rolling = np.gradient(way, recording.truth_s)
     for form in beside:
         _, _, k, feature = form.split(" ", 3)
         if "slewed" in feature:
-            rolling = np.gradient(recording.robot.wheel_radius_m * recording.turned.mean(axis=1), recording.truth_s)
             slipping = BODY_MEMORIES["v_x"][feature].at_nodes(1.0 / STEPS_PER_S, rolling, 0.0 * rolling)
-            driven = driven + float(k) * slipping[every]
+            way = way + float(k) * np.cumsum(slipping) / STEPS_PER_S
+    driven = np.gradient(way[every], t_s)
 
     def off(lag_s: float) -> float:
         squares = 0.0
