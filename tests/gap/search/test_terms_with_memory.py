@@ -93,6 +93,23 @@ def test_in_place_of_what_no_model_can_carry_names_and_other_terms_are_fitted():
     assert written.plain is None or written.unnamed
 
 
+def test_tyres_that_slip_are_told_by_what_they_grip():
+    """A robot whose speed follows its wheels by at most 0.02 m/s in a hundredth of a second, where they jump."""
+    channel, line = body_channel()
+    rolling = 0.5 * channel.neutral[0] * line.speed_rad_s.sum(axis=1)
+    speed, lost = 0.0, np.zeros((rolling.size, 3))
+    for k, wheels in enumerate(rolling):
+        before, speed = speed, min(max(wheels, speed - 0.02), speed + 0.02)
+        lost[k, 0] = 0.5 * (before + speed) - wheels
+    moved = channel.track(channel.neutral, lost) - channel.track(channel.neutral)
+    slipping = replace(line, pose_values=channel.measured + moved[channel.samples.node])
+    channel = type(channel).build(slipping, channel.noise, channel.neutral)
+    bare = ChannelResult(Selector(channel, body_moves(channel), LIMITS), (), channel)
+    (term, *_) = with_unnamed(bare, channel_search._body_options).unnamed
+    assert term.term.model_name == "v_x += k (v - slewed_2(v))"
+    assert float(term.form.split()[2]) == pytest.approx(-1.0, abs=0.1)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("form", "seed", "term"),
