@@ -262,6 +262,12 @@ class GenericTerm:
         """What it remembers; None for a term of what is alone."""
         return (COMMAND_MEMORIES if self.target == COMMAND else BODY_MEMORIES[self.target]).get(self.feature)
 
+    def meaning(self, k: float) -> str | None:
+        """What a robot does of which this is found with such a number; None where the equation is all that is known."""
+        if self.memory is None or not self.memory.slews or k > -0.5:
+            return None
+        return f"tyres slip: the robot follows its wheels by about {self.memory.most:g} m/s^2 at most"
+
     @property
     def means(self) -> int:
         """Number of means that are kept for it: one for each wheel's command, or one of the body."""

@@ -58,7 +58,10 @@ class EffectFinding:
 
 @dataclass(frozen=True)
 class UnnamedFinding:
-    """Something missing that is none of the named effects, as a term of the model, and what is confounded with it."""
+    """Something missing that is none of the named effects, as a term of the model, and what is confounded with it.
+
+    `meaning`: what a robot does of which such a term is found; None where the equation is all that is known.
+    """
 
     channel: str
     form: str
@@ -66,6 +69,7 @@ class UnnamedFinding:
     in_model: bool = True
     indistinguishable_from: tuple[str, ...] = ()
     experiment: str | None = None
+    meaning: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,6 +190,7 @@ class GapReport:
                     "in_model": term.in_model,
                     "indistinguishable_from": list(term.indistinguishable_from),
                     "experiment": term.experiment,
+                    "meaning": term.meaning,
                 }
                 for term in self.unnamed
             ],

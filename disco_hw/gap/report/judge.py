@@ -41,6 +41,7 @@ from disco_hw.gap.search.channel_result import (
 from disco_hw.gap.search.richest_model import candidates_of, parameters_of
 from disco_hw.gap.search.selection import Z95
 from disco_hw.gap.settings import GRID_STEP_S, ReportSettings
+from disco_hw.model.terms import TERMS
 
 _PLACES = {2: ("first half of the log", "second"), 3: ("first third of the log", "second", "last")}
 
@@ -92,8 +93,9 @@ def unnamed_findings(analysis: GapAnalysis) -> tuple[UnnamedFinding, ...]:
         for one in found.unnamed:
             same = found.either if one.term.disc is not None else ()
             test = REGISTRY[same[0]].like_a_patch if same else None
-            in_model = one.term.model_name is not None
-            out.append(UnnamedFinding(place.value, one.form, one.evidence.score, in_model, same, test))
+            name = one.term.model_name
+            meaning = None if name is None else TERMS[name].meaning(float(one.form.split()[2]))
+            out.append(UnnamedFinding(place.value, one.form, one.evidence.score, name is not None, same, test, meaning))
     return tuple(out)
 
 

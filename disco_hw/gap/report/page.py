@@ -30,7 +30,7 @@ def answer(report: GapReport) -> list[str]:
         first = "; ".join(sentence(effect) for effect in report.effects[:_MOST_NAMES])
         first += f"; and {more} more, listed below." if more > 0 else "."
     elif report.unnamed:
-        first = f"Something is missing that has no name: {report.unnamed[0].form}."
+        first = f"Something is missing that has no name: {_in_words(report.unnamed[0])}."
     elif report.residue or report.doubtful:
         first = "Something is missing that none of the known effects explains."
     else:
@@ -78,7 +78,7 @@ def as_text(report: GapReport) -> str:
     for effect in report.effects:
         values = ", ".join(f"{n} {e.value:.4g} [{e.low:.4g}, {e.high:.4g}]" for n, e in effect.parameters.items())
         lines.append(f"{effect.channel}: {effect.name}: {values}{_confounded(effect)}")
-    lines += [f"{term.channel}: unnamed: {term.form}{_confounded(term)}" for term in report.unnamed]
+    lines += [f"{term.channel}: unnamed: {_in_words(term)}{_confounded(term)}" for term in report.unnamed]
     lines += [f"doubtful: {doubt.name}: {doubt.why}" for doubt in report.doubtful]
     lines += [*report.residue, *_logs_in_words(report), *report.notes]
     of = report.gap or report.wheels
@@ -108,6 +108,11 @@ def _in_cell(errors: PredictionErrors) -> str:
     if not math.isfinite(errors.position_m):
         return "-"
     return f"{1e3 * errors.position_m:9.1f} mm {errors.yaw_rad:6.3f} rad"
+
+
+def _in_words(term: UnnamedFinding) -> str:
+    """The equation of a term, and what it means where that is known."""
+    return term.form if term.meaning is None else f"{term.form} ({term.meaning})"
 
 
 def _confounded(finding: EffectFinding | UnnamedFinding) -> str:
@@ -222,7 +227,7 @@ def _effects(report: GapReport) -> str:
             "in the amended model" if term.in_model else "not in the model: it depends on what no model's state holds"
         )
         also, test = ", ".join(term.indistinguishable_from), f"; {term.experiment}" if term.experiment else ""
-        rows.append(("unnamed", term.channel, term.form, f"{term.evidence:.0f}", also, place + test))
+        rows.append(("unnamed", term.channel, _in_words(term), f"{term.evidence:.0f}", also, place + test))
     if not rows:
         return "<p>Nothing that this log shows.</p>"
     head = (

@@ -15,6 +15,7 @@ from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.model import Model
+from disco_hw.model.terms import TERMS
 from disco_hw.reports import as_json
 
 
@@ -41,6 +42,21 @@ def test_the_answer_has_the_gap_before_and_after_and_the_noise():
         "2 s ahead on held-out data the amended model errs by 14 mm and 0.02 rad, one with geometry, delay and lag "
         "alone (timed) by 47 mm and 0.02 rad; the sensors' noise makes 14 mm and 0.02 rad."
     )
+
+
+def test_a_term_is_told_in_words_where_it_is_known_what_it_means():
+    plain = report(0.014)
+    assert answer(plain)[0] == "Something is missing that has no name: v_x += -0.4 v^3."
+    meaning = TERMS["v_x += k (v - slewed_6.3(v))"].meaning(-0.97)
+    slipping = UnnamedFinding("wheel_to_body", "v_x += -0.97 (v - slewed_6.3(v))", 99.0, meaning=meaning)
+    told = "v_x += -0.97 (v - slewed_6.3(v)) (tyres slip: the robot follows its wheels by about 6.3 m/s^2 at most)"
+    assert answer(replace(plain, unnamed=(slipping,)))[0] == f"Something is missing that has no name: {told}."
+    assert f"unnamed: {told}" in as_text(replace(plain, unnamed=(slipping,)))
+    assert replace(plain, unnamed=(slipping,)).as_dict()["unnamed"][0]["meaning"] == meaning
+    # Half of it is something else, and so is any other form.
+    assert TERMS["v_x += k (v - slewed_6.3(v))"].meaning(-0.4) is None
+    assert TERMS["v_x += k (v - mean_1s(v))"].meaning(-1.0) is None
+    assert TERMS["v_x += k v^3"].meaning(-1.0) is None
 
 
 def test_a_model_that_predicts_worse_is_not_recommended():
