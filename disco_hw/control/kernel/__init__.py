@@ -46,7 +46,7 @@ STATE_ROWS = 55
 # While the wheels are turned, the state's first rows hold their speeds, and those behind them the means of commands.
 LEFT, RIGHT, REMEMBERED = U(0) * BLOCK, BLOCK, U(2) * BLOCK
 # Means of the body: where its terms act, no point shares another's rollout at another scale, and these rows are free.
-BODY_REMEMBERED = SCALED1
+BODY_REMEMBERED = SCALED0
 # The wheels' motion: for every step a row of their sum and one of right minus left; then a row of the sum's change.
 SUM, DIFFERENCE = U(0) * BLOCK, BLOCK
 WHEEL_STRIDE = U(2) * BLOCK
