@@ -381,8 +381,9 @@ def best_terms(small: Fit, channel: ResidualChannel, options: Iterator[Term]) ->
         pull = slope.T @ small.residual - across.T @ solved @ gradient
         if np.trace(own) < settings.least_own_share * float((slope**2).sum()):
             continue
-        gain = 0.5 * float(pull @ inverse(own) @ pull) - 0.5 * (len(columns) - 1) * math.log(channel.count)
-        if gain > settings.worth_trying_nats:
+        coefficients = -inverse(own) @ pull
+        gain = -0.5 * float(pull @ coefficients) - 0.5 * (len(columns) - 1) * math.log(channel.count)
+        if gain > settings.worth_trying_nats and coefficients.max() <= term.highest:
             promising.append((gain, term))
     best: list[Term] = []
     for _, term in sorted(promising, key=lambda one: -one[0]):

@@ -43,7 +43,7 @@ class Term:
     cannot carry it, because it depends on what a model's state does not hold. `geometry`: wheel radius and axial
     distance (m) that the speeds in it are made with. `disc`: x, y and radius (m) of the floor that it is about.
     `beside`: further waves of which it is the first, each with a coefficient of its own, and `usual` the standard
-    deviation that is expected of these.
+    deviation that is expected of these. `highest`: a coefficient can be no larger.
     """
 
     form: str
@@ -53,6 +53,7 @@ class Term:
     disc: tuple[float, float, float] | None = None
     beside: tuple[Array, ...] = ()
     usual: float = math.inf
+    highest: float = math.inf
 
     @property
     def features(self) -> tuple[Array, ...]:
@@ -113,7 +114,10 @@ def body_terms(channel: BodyChannel, p: Array) -> Iterator[Term]:
             yield Term(_with_place(name), _on(axis, feature(v, w, a, drive.t_s)), carried, geometry)
         for form, memory in BODY_MEMORIES[target].items():
             name = term_name(target, form)
-            yield Term(_with_place(name), _on(axis, memory.at_nodes(GRID_STEP_S, v, w)), name, geometry)
+            # No robot runs ahead of wheels that spin up.
+            highest = 0.0 if memory.slews else math.inf
+            perturbation = _on(axis, memory.at_nodes(GRID_STEP_S, v, w))
+            yield Term(_with_place(name), perturbation, name, geometry, highest=highest)
         for form, perturbation in beyond.items():
             yield Term(_with_place(term_name(target, form)), _on(axis, perturbation))
     left, right = drive.speed_rad_s[:, 0] * p[0] / 2.0, drive.speed_rad_s[:, 1] * p[0] / 2.0
@@ -270,7 +274,7 @@ class WithTerms:
             neutral=np.append(plain.neutral, np.zeros(count)),
             step=np.append(plain.step, [1e-3 / size for size in sizes]),
             low=np.append(plain.low, np.full(count, -math.inf)),
-            high=np.append(plain.high, np.full(count, math.inf)),
+            high=np.append(plain.high, [term.highest for term in terms for _ in term.features]),
             precision=np.append(plain.precision, usual**-2.0),
             place={**plain.place, **{name: len(plain.columns) + k for k, name in enumerate(names)}},
         )

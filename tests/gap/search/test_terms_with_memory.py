@@ -110,6 +110,20 @@ def test_tyres_that_slip_are_told_by_what_they_grip():
     assert float(term.form.split()[2]) == pytest.approx(-1.0, abs=0.1)
 
 
+def test_a_term_whose_number_cannot_be_so_large_is_not_offered_and_not_fitted_beyond():
+    found, rate = turning_less()
+    # It turns less the faster it turns: the number is below zero.
+    for sign, highest, offered in ((1.0, 0.0, True), (-1.0, 0.0, False), (-1.0, np.inf, True)):
+        term = on_turning("{:.3g}", sign * rate * np.abs(rate), highest=highest)
+        promising, _ = best_terms(found.fit, found.channel, iter([term]))
+        assert bool(promising) == offered
+        channel = WithTerms.of(found.channel, (term,))
+        assert channel.layout.high[-1] == highest
+    options = channel_search._body_options(found)
+    most = {term.highest for term in options if term.model_name is not None and "slewed" in term.model_name}
+    assert most == {0.0}
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("form", "seed", "term"),
