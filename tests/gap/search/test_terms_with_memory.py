@@ -10,6 +10,7 @@ from disco_hw.gap import find_gap
 from disco_hw.gap.search import channel_search
 from disco_hw.gap.search.channel_result import ChannelResult, UnnamedTerm
 from disco_hw.gap.search.channel_search import best_terms, that_models_hold, with_unnamed
+from disco_hw.gap.search.least_squares import fit
 from disco_hw.gap.search.selection import EffectEvidence, Selector, body_moves
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms, motion
 from disco_hw.model import Model, load_model, save_model
@@ -116,6 +117,11 @@ def test_a_term_whose_number_cannot_be_so_large_is_not_offered_and_not_fitted_be
     for sign, highest, offered in ((1.0, 0.0, True), (-1.0, 0.0, False), (-1.0, np.inf, True)):
         term = on_turning("{:.3g}", sign * rate * np.abs(rate), highest=highest)
         promising, _ = best_terms(found.fit, found.channel, iter([term]))
+        assert bool(promising) == offered
+        # Nor beside another one.
+        beside = WithTerms.of(found.channel, (on_turning("{:.3g}", np.cos(0.01 * np.arange(rate.size))),))
+        with_other = fit(beside, np.append(found.fit.vector, 0.0), beside.free)
+        promising, _ = best_terms(with_other, beside, iter([term]))
         assert bool(promising) == offered
         channel = WithTerms.of(found.channel, (term,))
         assert channel.layout.high[-1] == highest
