@@ -119,7 +119,7 @@ def test_a_term_whose_number_cannot_be_so_large_is_not_offered_and_not_fitted_be
         promising, _ = best_terms(found.fit, found.channel, iter([term]))
         assert bool(promising) == offered
         # Nor beside another one.
-        beside = WithTerms.of(found.channel, (on_turning("{:.3g}", np.cos(0.01 * np.arange(rate.size))),))
+        beside = WithTerms.of(found.channel, (on_turning("{:.3g}", 0.1 * np.sin(0.6 * np.arange(rate.size))),))
         with_other = fit(beside, np.append(found.fit.vector, 0.0), beside.free)
         promising, _ = best_terms(with_other, beside, iter([term]))
         assert bool(promising) == offered
