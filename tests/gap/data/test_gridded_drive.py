@@ -82,11 +82,12 @@ def test_a_log_whose_stamps_are_moved_lies_on_the_grid_as_if_they_were_not(by_s)
 
 
 @pytest.mark.parametrize("off_s", [0.0, 0.0004, 0.002, 0.003, 0.0062, -0.2026])
-def test_commands_are_laid_so_that_they_change_at_the_borders_of_cells(off_s):
+@pytest.mark.parametrize("begin_s", [0.0, 3.304])
+def test_commands_are_laid_so_that_they_change_at_the_borders_of_cells(off_s, begin_s):
     rng = np.random.default_rng(9)
     t = np.arange(0.0, 40.0, 0.02)
     speed = rng.uniform(-2.0, 4.0, 40)[(t % 40.0).astype(int)]
-    line = grid_drive(drive(t + off_s, speed, t, speed))
+    line = grid_drive(drive(begin_s + t + off_s, speed, begin_s + t, speed))
     changed = np.abs(np.diff(line.command_rad_s[:, 0])) > 1e-6
     # From one level to the next without a cell between.
     assert not (changed[1:] & changed[:-1])[150:-150].any()
