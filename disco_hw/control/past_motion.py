@@ -25,7 +25,7 @@ class DriveMeans:
     """
 
     def __init__(
-        self, of_commands: tuple[Remembered, ...], of_body: tuple[Remembered, ...], half_radius_m: float = 1.0
+        self, of_commands: tuple[Remembered, ...], of_body: tuple[Remembered, ...], half_radius_m: float
     ) -> None:
         self._memories, self._body, self._half_radius_m = of_commands, of_body, half_radius_m
         self._commands = tuple((0.0, 0.0) for _ in of_commands)

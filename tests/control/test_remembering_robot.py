@@ -22,7 +22,7 @@ MODEL = Model(
             EffectSetting(name, {"k": 0.0})
             for name in (
                 "command += k u mean_1s(|u| + |u_other|)", "omega += k (omega - mean_1s(omega))",
-                "v_x += k (v - mean_0.3s(v))", "v_x += k v^3",
+                "v_x += k (v - slewed_1.25(v))", "v_x += k v^3",
             )
         ),
     ),

@@ -22,7 +22,7 @@ SETTINGS = DiscoSettings(sampler=Sampler(samples=SAMPLES, horizon=HORIZON), iter
 LIMITS = CommandLimits(8.0, 20.0)
 CIRCLE = CircleCost(0.3, -0.2)
 DIRECTION, LOAD = "sign(u - mean_0.3s(u))", "u mean_1s(|u| + |u_other|)"
-RUBBER, PITCH = "(omega - mean_1s(omega))", "(v - mean_0.3s(v))"
+RUBBER, PITCH = "(omega - mean_1s(omega))", "(v - slewed_1.25(v))"
 TERMS = {
     f"command += k {DIRECTION}": (-0.3, 0.05), f"command += k {LOAD}": (-0.01, 0.002),
     f"omega += k {RUBBER}": (-0.6, 0.1), f"v_x += k {PITCH}": (-0.2, 0.05), "v_x += k v^3": (-0.3, 0.01),
