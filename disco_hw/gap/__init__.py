@@ -29,7 +29,7 @@ from disco_hw.gap.report import (
     reached_horizon_s,
 )
 from disco_hw.gap.report.amend import amended_model, at_joint_fit, carried_terms, channel_estimates, simple_model
-from disco_hw.gap.report.blind_spots import boldest_claims, finder, proved
+from disco_hw.gap.report.blind_spots import being_proved, boldest_claims, finder
 from disco_hw.gap.report.judge import (
     Measured,
     across_logs,
@@ -99,24 +99,25 @@ def find_gap(
     final = final_fit(analysis)
     named, unnamed = effect_findings(analysis, final), unnamed_findings(analysis)
     effects, doubtful = sort_out(named, Measured.of(analysis, final))
-    predictions = joint_predictions(analysis, final) if analysis.body is not None else None
-    gap = {} if predictions is None else predictions.table()
-    wheels = wheel_table(analysis)
-    written = written_of(analysis, final, predictions)
-    if written[0] is not analysis:
-        if gap and written[2] is not None:
-            gap["written"] = written[2].table()["amended"]
-        if wheels:
-            wheels = {**wheels, "written": wheel_table(written[0])["amended"]}
+    spots = blind_spot_findings(analysis, named, top_rad_s)
+    claims = boldest_claims(spots, settings.report.proved_claims) if prove else ()
+    if claims:
+        say(f"proof of what this log shows: {', '.join(claim.name for claim in claims)} put in and searched for")
+    with being_proved(spots, claims, finder(analysis)) as proved:
+        predictions = joint_predictions(analysis, final) if analysis.body is not None else None
+        gap = {} if predictions is None else predictions.table()
+        wheels = wheel_table(analysis)
+        written = written_of(analysis, final, predictions)
+        if written[0] is not analysis:
+            if gap and written[2] is not None:
+                gap["written"] = written[2].table()["amended"]
+            if wheels:
+                wheels = {**wheels, "written": wheel_table(written[0])["amended"]}
+        drawn = _drawn(analysis, gap) if pictures else {}
+        spots = proved()
     # Without poses the wheels decide, where geometry says nothing: as given, timed or amended.
     kept = written[0] if written[2] is None or written[2].kept is None else written[2].kept[0]
     offered = offered_stage(gap or _of_wheels(wheels), bool(named or unnamed), kept.adds_to_timed, settings)
-    spots = blind_spot_findings(analysis, named, top_rad_s)
-    if prove:
-        claims = boldest_claims(spots, settings.report.proved_claims)
-        if claims:
-            say(f"proof of what this log shows: {', '.join(claim.name for claim in claims)} put in and searched for")
-        spots = proved(spots, claims, finder(analysis))
     amended, remarks = model_of(offered, model, *written)
     remarks = (*left_out_notes(written[0], written[1], kept), *remarks)
     return GapReport(
@@ -132,7 +133,7 @@ def find_gap(
         doubtful=doubtful,
         notes=(*log.notes, *analysis.drive.notes, *notes, *remarks),
         candidates=candidate_evidence(analysis),
-        pictures=_drawn(analysis, gap) if pictures else {},
+        pictures=drawn,
         seconds=time.perf_counter() - began,
         settings=settings,
         wheels=wheels,

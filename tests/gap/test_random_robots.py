@@ -1,6 +1,7 @@
 """Whatever the robot, the last stage of `gap` judges what its log could not show and writes every file."""
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -59,7 +60,7 @@ def written(searched, monkeypatch, folder, seeds):
     monkeypatch.setattr(gap, "load_drive", lambda *_: log)
     # None depends on the robot's limits, and each takes long.
     monkeypatch.setattr(gap, "joint_predictions", lambda *_: predictions)
-    monkeypatch.setattr(gap, "proved", lambda spots, *_: spots)
+    monkeypatch.setattr(gap, "being_proved", lambda spots, *_: nullcontext(lambda: spots))
     monkeypatch.setattr(gap, "_drawn", lambda *_: {"picture": b"PNG"})
     for seed in seeds:
         (radius_m, axial_m, fastest_rad_s), text = robot_toml(np.random.default_rng([23, seed]))

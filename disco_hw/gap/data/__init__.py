@@ -174,10 +174,12 @@ def carried(p: Array, speed_rad_s: Array, t_s: Array) -> Array:
     `speed_rad_s` (M, 2) its measured wheel speeds, `t_s` (M,).
     """
     moved = np.zeros_like(speed_rad_s)
-    for effect in _WORLD:
-        place = _SPANS[False][effect.name]
-        if (p[place] == BODY.neutral[place]).all():
-            continue
+    absent = BODY.neutral == p
+    acting = [effect for effect in _WORLD if not absent[_SPANS[False][effect.name]].all()]
+    # Most robots stand on level ground, and it is asked in every run.
+    if not acting:
+        return moved
+    for effect in acting:
         motion = {
             "wheel_sum": speed_rad_s.sum(axis=1),
             "difference": speed_rad_s[:, 1] - speed_rad_s[:, 0],

@@ -10,9 +10,10 @@ import math
 import multiprocessing
 import os
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 
 import numpy as np
 from numpy.typing import NDArray
@@ -213,64 +214,87 @@ def boldest_claims(spots: Iterable[BlindSpot], most: int) -> tuple[BlindSpot, ..
     return tuple(sorted(claims, key=_boldness, reverse=True)[:most])
 
 
-def proved(spots: Iterable[BlindSpot], claims: Sequence[BlindSpot], finds: Finds) -> tuple[BlindSpot, ...]:
-    """Blind spots of which some claims are proved.
+@contextlib.contextmanager
+def being_proved(
+    spots: Iterable[BlindSpot], claims: Sequence[BlindSpot], finds: Finds
+) -> Iterator[Callable[[], tuple[BlindSpot, ...]]]:
+    """Blind spots of which some claims are proved, in other processes as far as there are; what is given ends it.
 
     An effect is put in at the size that is claimed, or at a tenth of what real robots show if that is more (of a limit,
     at ten times that if it is less). Where that is missed, the claim is made for what real robots show, if it is found
     then; else the log is blind to it.
     """
     spots = tuple(spots)
-    done = side_by_side(lambda spot: _judged(spot, finds), claims)
-    judged = {spot.name: spot for spot in done}
-    # What is another effect by algebra shows as that one does.
-    for spot in spots:
-        mimics = REGISTRY[spot.name].mimics
-        other = None if mimics is None else judged.get(mimics.effect.name)
-        if other is not None and spot.smallest_visible is not None:
-            judged[spot.name] = replace(
-                spot, smallest_visible=other.smallest_visible, blind=other.blind, proved=other.proved
-            )
-    return tuple(sorted((judged.get(spot.name, spot) for spot in spots), key=lambda spot: not spot.blind))
+    with side_by_side(lambda spot: _judged(spot, finds), claims) as all_judged:
+
+        def finished() -> tuple[BlindSpot, ...]:
+            judged = {spot.name: spot for spot in all_judged()}
+            # What is another effect by algebra shows as that one does.
+            for spot in spots:
+                mimics = REGISTRY[spot.name].mimics
+                other = None if mimics is None else judged.get(mimics.effect.name)
+                if other is not None and spot.smallest_visible is not None:
+                    judged[spot.name] = replace(
+                        spot, smallest_visible=other.smallest_visible, blind=other.blind, proved=other.proved
+                    )
+            return tuple(sorted((judged.get(spot.name, spot) for spot in spots), key=lambda spot: not spot.blind))
+
+        yield finished
 
 
-def side_by_side(judge: Callable[[BlindSpot], BlindSpot], claims: Sequence[BlindSpot]) -> list[BlindSpot]:
-    """Each claim judged, on as many processors as there are; one after the other where processes cannot be copied.
+Judge = Callable[[BlindSpot], BlindSpot]
 
-    A copy of a process with several threads may wait for ever for what another thread held.
+
+@contextlib.contextmanager
+def side_by_side(judge: Judge, claims: Sequence[BlindSpot]) -> Iterator[Callable[[], list[BlindSpot]]]:
+    """Claims judged in a process for every other processor; what is given judges the rest here, and gives them all.
+
+    Each process takes the next claim that nobody has. Where processes cannot be copied all are judged here. A copy of a
+    process with several threads may wait for ever for what another thread held.
     """
-    many = min(len(claims), len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1)
-    if many < 2 or threading.active_count() > 1 or multiprocessing.current_process().daemon:
-        return [judge(claim) for claim in claims]
-    fork, shares = multiprocessing.get_context("fork"), [claims[first::many] for first in range(many)]
-    others = []
+    spare = len(os.sched_getaffinity(0)) - 1 if hasattr(os, "sched_getaffinity") else 0
+    if not spare or threading.active_count() > 1 or multiprocessing.current_process().daemon:
+        yield lambda: [judge(claim) for claim in claims]
+        return
+    fork = multiprocessing.get_context("fork")
+    taken = fork.Value("i", 0)
+    others: list[tuple[Connection, BaseProcess]] = []
+
+    def judge_next() -> Iterator[tuple[int, BlindSpot]]:
+        while True:
+            with taken.get_lock():
+                number = taken.value
+                taken.value += 1
+            if number >= len(claims):
+                return
+            yield number, judge(claims[number])
+
+    def finished() -> list[BlindSpot]:
+        judged = dict(judge_next())
+        for receiver, _ in others:
+            with receiver, contextlib.suppress(EOFError):
+                judged |= receiver.recv()
+        # What failed there fails here too, and says why.
+        return [judged[number] if number in judged else judge(claim) for number, claim in enumerate(claims)]
+
     try:
-        for share in shares[1:]:
+        for _ in range(min(spare, len(claims))):
             receiver, sender = fork.Pipe(duplex=False)
-            copy = fork.Process(target=_judge_share, args=(judge, share, sender), daemon=True)
+            copy: BaseProcess = fork.Process(target=_send, args=(judge_next, sender), daemon=True)
             copy.start()
             sender.close()
-            others.append((share, receiver, copy))
-        judged = {claim.name: judge(claim) for claim in shares[0]}
-        for share, receiver, _ in others:
-            with receiver:
-                try:
-                    done = receiver.recv()
-                except EOFError:
-                    # What failed there fails here too, and says why.
-                    done = [judge(claim) for claim in share]
-            judged |= {claim.name: one for claim, one in zip(share, done, strict=True)}
+            others.append((receiver, copy))
+        yield finished
     finally:
-        for *_, copy in others:
+        for _, copy in others:
             copy.terminate()
             copy.join()
-    return [judged[claim.name] for claim in claims]
 
 
-def _judge_share(judge: Callable[[BlindSpot], BlindSpot], share: Sequence[BlindSpot], sender: Connection) -> None:
+def _send(judge_next: Callable[[], Iterator[tuple[int, BlindSpot]]], sender: Connection) -> None:
     """In a copy of the process: judge claims and hand them over; where that fails, or is interrupted, nothing comes."""
     with contextlib.suppress(Exception, KeyboardInterrupt):
-        sender.send([judge(claim) for claim in share])
+        sender.send(dict(judge_next()))
 
 
 def _judged(spot: BlindSpot, finds: Finds) -> BlindSpot:

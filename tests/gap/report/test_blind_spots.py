@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import threading
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -15,9 +16,9 @@ from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report.blind_spots import (
     BlindSpot,
+    being_proved,
     blind_spots,
     boldest_claims,
-    proved,
     side_by_side,
     with_effect,
     with_size,
@@ -71,7 +72,8 @@ def realistic(name):
 
 
 def judged(spots, finds, most=9):
-    return {one.name: one for one in proved(spots, boldest_claims(spots, most), finds)}
+    with being_proved(spots, boldest_claims(spots, most), finds) as proved:
+        return {one.name: one for one in proved()}
 
 
 @pytest.fixture
@@ -131,33 +133,91 @@ def test_the_boldest_claims_are_proved_first():
     spots = spot("turn_slip", 0.02), spot("side_slip", 0.0001), spot("slope", 1e9, True), spot("deadband", None)
     assert [one.name for one in boldest_claims(spots, 1)] == ["side_slip"]
     assert [one.name for one in boldest_claims(spots, 9)] == ["side_slip", "turn_slip"]
-    assert [one.proved for one in proved(spots, spots[1:2], lambda *_: True)] == [None, None, True, None]
+    with being_proved(spots, spots[1:2], lambda *_: True) as proved:
+        assert [one.proved for one in proved()] == [None, None, True, None]
 
 
-def in_processes(claims, judge, monkeypatch, processors=2, threads=1):
+def in_processes(claims, judge, monkeypatch, processors=2, threads=1, meanwhile=lambda: None):
     monkeypatch.setattr(threading, "active_count", lambda: threads)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(processors)))
-    return side_by_side(judge, claims)
-
-
-def test_claims_are_judged_on_all_processors_and_come_back_in_order(monkeypatch):
-    claims = [spot(name, 0.1) for name in ("turn_slip", "side_slip", "slope", "deadband", "motor_lag")]
-    done = in_processes(claims, lambda claim: replace(claim, unit=str(os.getpid())), monkeypatch)
-    assert [replace(one, unit="") for one in done] == claims
-    pids = [int(one.unit) for one in done]
-    assert pids[0] == pids[2] == pids[4] == os.getpid() != pids[1] == pids[3]
-    each = in_processes(claims, lambda claim: replace(claim, unit=str(os.getpid())), monkeypatch, processors=9)
-    assert len({one.unit for one in each}) == 5
-    assert in_processes([], lambda claim: claim, monkeypatch) == []
+    with side_by_side(judge, claims) as all_judged:
+        meanwhile()
+        done = all_judged()
     assert not multiprocessing.active_children()
+    return done
+
+
+def others_end():
+    for copy in multiprocessing.active_children():
+        copy.join(60.0)
+
+
+def by_whom(claim):
+    return replace(claim, unit=str(os.getpid()))
+
+
+CLAIMS = [spot(name, 0.1) for name in ("turn_slip", "side_slip", "slope", "deadband", "motor_lag")]
+
+
+def test_claims_are_judged_while_this_process_does_something_else_and_come_back_in_order(monkeypatch):
+    done = in_processes(CLAIMS, by_whom, monkeypatch, meanwhile=others_end)
+    assert [replace(one, unit="") for one in done] == CLAIMS
+    assert len({one.unit for one in done}) == 1
+    assert done[0].unit != str(os.getpid())
+    assert in_processes([], by_whom, monkeypatch) == []
+
+
+def test_there_is_a_process_for_every_other_processor_and_none_without_a_claim(monkeypatch):
+    together = multiprocessing.get_context("fork").Barrier(5)
+
+    def judge(claim):
+        together.wait(60.0)
+        return by_whom(claim)
+
+    done = in_processes(CLAIMS, judge, monkeypatch, processors=9, meanwhile=others_end)
+    assert len({one.unit for one in done} - {str(os.getpid())}) == 5
+
+
+def test_what_no_other_process_has_taken_is_judged_here(monkeypatch):
+    fork, here = multiprocessing.get_context("fork"), os.getpid()
+    taken, done_here = fork.Event(), fork.Event()
+
+    def judge(claim):
+        if os.getpid() != here:
+            taken.set()
+            done_here.wait(60.0)
+            return by_whom(claim)
+        taken.wait(60.0)
+        if claim == CLAIMS[-1]:
+            done_here.set()
+        return by_whom(claim)
+
+    # The other process waits with the one that it has until the last one is judged here.
+    done = in_processes(CLAIMS, judge, monkeypatch)
+    assert [replace(one, unit="") for one in done] == CLAIMS
+    assert sum(one.unit == str(here) for one in done) == 4
 
 
 def test_what_fails_in_another_process_fails_here(monkeypatch):
-    claims = [spot(name, 0.1) for name in ("turn_slip", "side_slip")]
+    def judge(claim):
+        return replace(claim, smallest_visible=1 / (claim.name != "side_slip"))
+
     with pytest.raises(ZeroDivisionError):
-        in_processes(
-            claims, lambda claim: replace(claim, smallest_visible=1 / (claim.name != "side_slip")), monkeypatch
-        )
+        in_processes(CLAIMS[:2], judge, monkeypatch, meanwhile=others_end)
+    assert not multiprocessing.active_children()
+
+
+def test_other_processes_end_with_what_is_done_meanwhile(monkeypatch):
+    def judge(claim):
+        time.sleep(60.0)
+        return claim
+
+    def interrupted():
+        assert len(multiprocessing.active_children()) == 1
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        in_processes(CLAIMS, judge, monkeypatch, meanwhile=interrupted)
     assert not multiprocessing.active_children()
 
 
@@ -169,8 +229,8 @@ def test_another_process_that_is_interrupted_says_nothing_and_its_share_is_judge
             raise KeyboardInterrupt
         return replace(claim, proved=True)
 
-    claims = [spot(name, 0.1) for name in ("turn_slip", "side_slip", "slope")]
-    assert [one.proved for one in in_processes(claims, judge, monkeypatch)] == [True] * 3
+    done = in_processes(CLAIMS, judge, monkeypatch, meanwhile=others_end)
+    assert [one.proved for one in done] == [True] * 5
     assert capfd.readouterr().err == ""
 
 
@@ -178,10 +238,9 @@ def test_another_process_that_is_interrupted_says_nothing_and_its_share_is_judge
 def test_no_process_is_copied_that_has_other_threads_or_may_have_no_copies(monkeypatch, of):
     if of == "a helper":
         monkeypatch.setattr(multiprocessing, "current_process", lambda: SimpleNamespace(daemon=True))
-    claims = [spot(name, 0.1) for name in ("turn_slip", "side_slip")]
     threads = 2 if of == "threads" else 1
-    done = in_processes(claims, lambda claim: replace(claim, unit=str(os.getpid())), monkeypatch, threads=threads)
-    assert [one.unit for one in done] == [str(os.getpid())] * 2
+    done = in_processes(CLAIMS, by_whom, monkeypatch, threads=threads, meanwhile=others_end)
+    assert [one.unit for one in done] == [str(os.getpid())] * 5
 
 
 def spots_of(channel, names=(), limits=None):
