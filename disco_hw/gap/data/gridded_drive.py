@@ -19,7 +19,7 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from disco_hw.gap.data.command_timing import command_clock
 from disco_hw.gap.data.stamp_clock import StampClock
-from disco_hw.gap.data.timing import pose_clock
+from disco_hw.gap.data.timing import pose_clock, tick_s
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, Folds, GapSettings, GridSettings
 from disco_hw.log.drive import Commands, DriveLog, Poses, Wheels
 
@@ -54,7 +54,8 @@ class GriddedDrive:
     reads them there. `pose_delay_s`: how much older than their stamps poses are at first sight, s;
     `pose_clock_even`: whether their clock neither drifts nor jumps. Commands and poses are laid where they belong at
     first sight: `commands_moved_s` later than their stamps, so that they change at the borders of cells, and
-    `poses_moved_s` earlier. `commands_timed`: whether it is known where commands belong.
+    `poses_moved_s` earlier. `commands_timed`: whether it is known where commands belong. `command_tick_s`,
+    `pose_tick_s`: time between the rows of a log that stamps both the wheels and them by its rows; else 0.
     """
 
     t_s: Array
@@ -79,6 +80,8 @@ class GriddedDrive:
     commands_moved_s: float = 0.0
     commands_timed: bool = True
     poses_moved_s: float = 0.0
+    command_tick_s: float = 0.0
+    pose_tick_s: float = 0.0
 
     @property
     def has_commands(self) -> bool:
@@ -186,6 +189,8 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
         commands_moved_s=timed.commands_moved_s,
         commands_timed=timed.commands_timed,
         poses_moved_s=timed.poses_moved_s,
+        command_tick_s=tick_s(log.commands.t_s, log.wheels.t_s),
+        pose_tick_s=tick_s(log.poses.t_s, log.wheels.t_s),
     )
 
 

@@ -27,6 +27,8 @@ _ROUNDS = 4
 _LEAST_SQUARE = 1e-10
 # A column of which the other one leaves less than this share of its square says nothing of its own.
 _LEAST_OWN = 1e-12
+# Stamps are alike to the microsecond.
+_STAMP_DIGITS = 6
 # So closely the least of a misfit is searched: a hundredth of what a cell of the grid holds.
 _CLOSE_S = 1e-4
 
@@ -90,6 +92,17 @@ def pose_delay_s(wheels: Wheels, poses: Poses, settings: GridSettings) -> float:
     if not ordinary.size or float(np.median(ordinary)) - misfit[best] < settings.least_delay_nats:
         return 0.0
     return lowest(lambda some: _misfits(wheels, poses, some, settings), float(delays[best]), settings.delay_step_s)[0]
+
+
+def tick_s(t_s: Array, rows_s: Array) -> float:
+    """Time between the rows of a log, s, where samples (n,) are stamped as these (R,); 0 where they have own stamps.
+
+    What a row holds was so at some time since the row before: when is not known.
+    """
+    if not t_s.size or rows_s.size < 2:
+        return 0.0
+    shared = np.isin(np.round(t_s, _STAMP_DIGITS), np.round(rows_s, _STAMP_DIGITS))
+    return float(np.median(np.diff(rows_s))) if shared.all() else 0.0
 
 
 def _misfit_at(wheels: Wheels, poses: Poses, delay_s: float, settings: GridSettings) -> float:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
 from disco_hw.gap.search.least_squares import Fit, by_block, fit, inverse
-from disco_hw.gap.search.richest_model import CANDIDATES, indices
+from disco_hw.gap.search.richest_model import CANDIDATES, delay_columns, indices
 from disco_hw.gap.search.selection import Z95, EffectEvidence, Names, Selector, inflation, interval_inflation
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms
 
@@ -143,9 +143,12 @@ def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
     factors = np.array([interval_inflation(best, channel, (index,)) for index in best.active])
     covariance = best.covariance() * np.sqrt(np.outer(factors, factors))
     own = np.maximum(np.diag(covariance), 1e-300)
-    wandering, apart = wandered(found), _weightings_apart(found)
+    wandering, apart, stamped = wandered(found), _weightings_apart(found), _stamped(found)
     more = np.array(
-        [(wandering.get(columns[index], 0.0) + apart[place]) / own[place] for place, index in enumerate(best.active)]
+        [
+            (wandering.get(columns[index], 0.0) + apart[place] + stamped.get(columns[index], 0.0)) / own[place]
+            for place, index in enumerate(best.active)
+        ]
     )
     covariance = covariance * np.sqrt(np.outer(1.0 + more, 1.0 + more))
     deviations = np.sqrt(np.diag(covariance))
@@ -173,6 +176,17 @@ def _weightings_apart(found: ChannelResult) -> Array:
     chosen = list(best.active)
     by_chance = np.abs(deviations_of(evenly, found.channel) ** 2 - deviations_of(found.fit, found.channel) ** 2)
     return np.asarray(0.5 * np.maximum((evenly.vector - found.fit.vector)[chosen] ** 2 - by_chance, 0.0))
+
+
+def _stamped(found: ChannelResult) -> dict[str, float]:
+    """Variance, s^2, of a delay of what is stamped by rows of a log, as the wheels are: of any time between two rows.
+
+    Loops that run side by side meet in the same way all along a log, and in another one in the next.
+    """
+    channel = found.selector.channel
+    drive = channel.inner.drive
+    apart_s = drive.command_tick_s if channel.layout.of_wheels else drive.pose_tick_s
+    return dict.fromkeys(delay_columns(channel.layout), apart_s**2 / 12.0)
 
 
 def _profiled(found: ChannelResult, column: str, step: float) -> ParameterEstimate:

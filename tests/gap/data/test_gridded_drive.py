@@ -42,6 +42,26 @@ def test_a_command_that_changes_within_a_cell_counts_by_its_share():
     assert line.command_rad_s[round((8.0 + moved_s) / GRID_STEP_S) - 1, 0] == pytest.approx(0.8, abs=1e-6)
 
 
+def test_what_rows_of_a_log_stamp_is_known_as_closely_as_they_follow_one_another():
+    t = np.arange(0.0, 10.0, 0.05)
+    turned = np.sin(t)
+
+    def ticks(commands_s, poses_s):
+        line = grid_drive(drive(commands_s, np.zeros(commands_s.size), t, turned, pose_s=poses_s))
+        return line.command_tick_s, line.pose_tick_s
+
+    # Every third row has a pose, and all but a few a command.
+    assert ticks(t[3:], t[::3]) == pytest.approx((0.05, 0.05))
+    # To the microsecond: a table has no more digits.
+    assert ticks(t + 2e-7, t[::3] - 2e-7) == pytest.approx((0.05, 0.05))
+    # Stamps of their own, however few of them.
+    assert ticks(t + 0.004, t[::3]) == (0.0, pytest.approx(0.05))
+    own = t[::3].copy()
+    own[5] += 0.004
+    assert ticks(t, own) == (pytest.approx(0.05), 0.0)
+    assert ticks(t[:0], t[:0]) == (0.0, 0.0)
+
+
 @pytest.mark.parametrize("cells", [-7, 0, 7])
 def test_commands_in_force_are_earlier_ones_or_later_ones_where_their_stamps_are_late(cells):
     t = np.arange(0.0, 10.0, 0.02)

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.search import channel_result
 from disco_hw.gap.search.channel_result import (
     InParts,
@@ -26,11 +27,12 @@ def test_an_interval_is_widened_by_how_blocks_scatter_and_by_how_a_value_wanders
     monkeypatch.setattr(channel_result, "interval_inflation", lambda best, of, active: {2: 4.0, 0: 1.44}[active[0]])
     monkeypatch.setattr(channel_result, "wandered", lambda of: {"c": 6.0})
     monkeypatch.setattr(channel_result, "_weightings_apart", lambda of: np.array([3.0, 0.0]))
+    monkeypatch.setattr(channel_result, "_stamped", lambda of: {"a": 2.0})
     estimates = estimate_parameters(found)
-    # Of `c` 4 x 4 and 9 beside, of `a` 9 x 1.44.
-    deviations = np.sqrt([16.0 + 9.0, 12.96])
-    together = 1.0 * 2.0 * 1.2 * np.sqrt(25.0 / 16.0)
-    np.testing.assert_allclose(estimates.covariance, [[25.0, together], [together, 12.96]])
+    # Of `c` 4 x 4 and 9 beside, of `a` 9 x 1.44 and 2 beside.
+    deviations = np.sqrt([16.0 + 9.0, 12.96 + 2.0])
+    together = 1.0 * 2.0 * 1.2 * np.sqrt(25.0 / 16.0 * 14.96 / 12.96)
+    np.testing.assert_allclose(estimates.covariance, [[25.0, together], [together, 14.96]])
     assert estimates.fitted == ("c", "a")
     for name, value, deviation in (("c", 3.0, deviations[0]), ("a", 7.0, deviations[1])):
         one = estimates.by_name[name]
@@ -48,6 +50,17 @@ def test_two_weightings_lie_apart_by_what_is_beyond_the_difference_of_their_vari
     # Half of 16 beyond 9 - 4, of 1 within 4 - 1, and of 4 beyond none.
     assert channel_result._weightings_apart(found).tolist() == [5.5, 0.0, 2.0]
     assert channel_result._weightings_apart(SimpleNamespace(told=told, evenly=None)).tolist() == [0.0] * 3
+
+
+def test_a_delay_of_what_rows_of_a_log_stamp_is_any_between_two_rows():
+    drive = SimpleNamespace(command_tick_s=0.06, pose_tick_s=0.12)
+    for layout, column, variance in ((WHEEL, "command_delay.delay_s", 3e-4), (BODY, "pose_latency.latency_s", 12e-4)):
+        channel = SimpleNamespace(layout=layout, inner=SimpleNamespace(drive=drive))
+        of_delays = channel_result._stamped(SimpleNamespace(selector=SimpleNamespace(channel=channel)))
+        assert of_delays == {column: pytest.approx(variance)}
+        # As even spreads are.
+        even = np.random.default_rng(0).uniform(0.0, 0.06 if layout is WHEEL else 0.12, 100_000)
+        assert np.var(even) == pytest.approx(variance, rel=0.02)
 
 
 @pytest.mark.parametrize("step", [0.5, 2.0])
