@@ -1,10 +1,11 @@
 """What models learnt from one half of a measured log predict of the other, end to end: tables of `docs/gap-figures.md`.
 
-`DISCO_HW_DATA=FOLDER python -m tools.gap_halves [--parts N | --days] [NAME...]`: logs whose path holds a NAME, all
-without one. For either half: the stage that is offered, the errors 2 s ahead on the half that was not seen, of every
-stage, and how many of its 95 % intervals hold what the other half says of the same parameters, where that knows half as
-much of them. With `--parts` the same of N parts of each log, and of every other one of it; with `--days` of whole logs,
-each learnt from, and every other one of the same robot predicted. Where those are of windows of 2 s, 1 s ahead.
+`DISCO_HW_DATA=FOLDER python -m tools.gap_halves [--parts N | --days | --others] [NAME...]`: logs whose path holds a
+NAME, all without one. For either half: the stage that is offered, the errors 2 s ahead on the half that was not seen,
+of every stage, and how many of its 95 % intervals hold what the other half says of the same parameters, where that
+knows half as much of them. With `--parts` the same of N parts of each log, and of every other one of it; with `--days`
+of whole logs, each learnt from, and every other one of the same robot predicted; with `--others` each log predicted by
+all others of the robot, searched together. Where those are of windows of 2 s, 1 s ahead.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ from disco_hw.gap.search.cross_validation import (
 from disco_hw.gap.search.selection import Z95
 from disco_hw.gap.search.unnamed_terms import with_known_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS
-from disco_hw.log.drive import DriveLog
+from disco_hw.log.drive import DriveLog, concatenate
 from disco_hw.log.load import load_drive
 from disco_hw.model import Model
 
@@ -205,15 +206,18 @@ def halves(path: Path, count: int) -> Iterator[Half]:
         yield from taught(part, others, nominal)
 
 
-def days(paths: Sequence[Path]) -> Iterator[Half]:
-    """Each log with poses learnt from and every other one of the same robot predicted."""
+def days(paths: Sequence[Path], together: bool) -> Iterator[Half]:
+    """Each log with poses learnt from and every other one of the same robot predicted, or the other way `together`."""
     for robot in ROBOTS:
         own = [(path, *read(path)) for path in paths if path.parent.name == robot]
         own = [(path, log, nominal) for path, log, nominal in own if log.poses.t_s.size]
         parts = [Part.search(path.stem, log, nominal) for path, log, nominal in own] if len(own) > 1 else []
         for part in parts:
             others = [other for other in parts if other is not part]
-            if part.analysis.body is not None and others:
+            if together:
+                joined = concatenate([other.log for other in others])
+                yield from taught(Part.search(f"all but {part.name}", joined, own[0][2]), [part], own[0][2])
+            elif part.analysis.body is not None and others:
                 yield from taught(part, others, own[0][2])
 
 
@@ -238,13 +242,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("names", nargs="*", metavar="NAME", help="logs whose path holds it (all)")
     parser.add_argument("--parts", type=int, default=2, metavar="N", help="of each log (2)")
     parser.add_argument("--days", action="store_true", help="whole logs of one robot predict each other")
+    parser.add_argument("--others", action="store_true", help="all others of one robot together predict each log")
     options = parser.parse_args(arguments)
     paths = measured_logs(options.names)
     head = "refitted, mm / mrad | timed | amended | offered | offered over timed | intervals hold"
     print(f"| learnt from | {head} |")
     print("|---|---|---|---|---|---|---|")
     found = []
-    for half in days(paths) if options.days else (half for path in paths for half in halves(path, options.parts)):
+    whole = options.days or options.others
+    every = (half for path in paths for half in halves(path, options.parts))
+    for half in days(paths, options.others) if whole else every:
         found.append(half)
         print(row(half), flush=True)
     worse = [half for half in found if half.offered != "timed" and max(half.ratios(half.offered)) > 1.05]

@@ -137,7 +137,7 @@ def find_gap(
         seconds=time.perf_counter() - began,
         settings=settings,
         wheels=wheels,
-        across=across_logs(analysis, log.begins_s),
+        across=across_logs(analysis),
     )
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from disco_hw.gap.data.command_timing import command_clock
+from disco_hw.gap.data.log_clocks import Aligned, aligned
 from disco_hw.gap.data.stamp_clock import StampClock
 from disco_hw.gap.data.timing import pose_clock, tick_s
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, Folds, GapSettings, GridSettings
@@ -54,8 +55,9 @@ class GriddedDrive:
     reads them there. `pose_delay_s`: how much older than their stamps poses are at first sight, s;
     `pose_clock_even`: whether their clock neither drifts nor jumps. Commands and poses are laid where they belong at
     first sight: `commands_moved_s` later than their stamps, so that they change at the borders of cells, and
-    `poses_moved_s` earlier. `commands_timed`: whether it is known where commands belong. `command_tick_s`,
-    `pose_tick_s`: time between the rows of a log that stamps both the wheels and them by its rows; else 0.
+    `poses_moved_s` earlier. `commands_timed`: whether it is known where commands belong. `command_stamps_s`,
+    `pose_stamps_s`: standard deviation of how much older they may be in another log, where this one stamps them by its
+    rows or several are searched together; `log_begins_s`: when each of these begins.
     """
 
     t_s: Array
@@ -80,8 +82,9 @@ class GriddedDrive:
     commands_moved_s: float = 0.0
     commands_timed: bool = True
     poses_moved_s: float = 0.0
-    command_tick_s: float = 0.0
-    pose_tick_s: float = 0.0
+    command_stamps_s: float = 0.0
+    pose_stamps_s: float = 0.0
+    log_begins_s: tuple[float, ...] = (0.0,)
 
     @property
     def has_commands(self) -> bool:
@@ -120,7 +123,7 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
     grid_settings = settings.grid
     wheels = undo_sample_hold(log.wheels, grid_settings)
     timed = _timed(log, wheels, grid_settings)
-    asked, poses, notes = timed.commands, timed.poses, [*timed.notes]
+    asked, poses, notes = timed.commands.samples, timed.poses.samples, [*timed.notes]
     nodes_t, nodes_first, commands, changes, angles, speeds = [], [], [], [], [], []
     encoder_at, encoder_angle, pose_at, pose_values = [], [], [], []
     offset, foreign_s = 0, 0.0
@@ -184,50 +187,48 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
         pose_values=np.concatenate(pose_values),
         notes=tuple(notes),
         settings=settings,
-        pose_delay_s=timed.clock.delay_s,
-        pose_clock_even=timed.clock.even,
+        pose_delay_s=timed.poses.delay_s,
+        pose_clock_even=timed.poses.even,
         commands_moved_s=timed.commands_moved_s,
-        commands_timed=timed.commands_timed,
-        poses_moved_s=timed.poses_moved_s,
-        command_tick_s=tick_s(log.commands.t_s, log.wheels.t_s),
-        pose_tick_s=tick_s(log.poses.t_s, log.wheels.t_s),
+        commands_timed=timed.commands.known,
+        poses_moved_s=timed.poses.delay_s,
+        command_stamps_s=math.hypot(tick_s(log.commands.t_s, log.wheels.t_s) / 12.0**0.5, timed.commands.apart_s),
+        pose_stamps_s=math.hypot(tick_s(log.poses.t_s, log.wheels.t_s) / 12.0**0.5, timed.poses.apart_s),
+        log_begins_s=log.begins_s,
     )
 
 
 class _Timed(NamedTuple):
     """Commands and poses where they belong beside the wheels at first sight, and by how much they were moved."""
 
-    commands: Commands
-    poses: Poses
+    commands: Aligned[Commands]
+    poses: Aligned[Poses]
     commands_moved_s: float
-    commands_timed: bool
-    poses_moved_s: float
-    clock: StampClock
     notes: tuple[str, ...]
 
 
 def _timed(log: DriveLog, wheels: Wheels, settings: GridSettings) -> _Timed:
-    clock = pose_clock(wheels, log.poses, settings)
-    link, known = command_clock(wheels, log.commands, settings)
-    poses, commands = clock.corrected(log.poses), link.corrected(log.commands)
-    notes = (*clock.notes("poses'"), *link.notes("commands'"))
-    if not known:
+    def of_poses(wheels: Wheels, poses: Poses) -> tuple[StampClock, bool]:
+        clock = pose_clock(wheels, poses, settings)
+        return clock, clock.delay_s != 0.0
+
+    def of_commands(wheels: Wheels, commands: Commands) -> tuple[StampClock, bool]:
+        return command_clock(wheels, commands, settings)
+
+    poses = aligned(wheels, log.poses, log.begins_s, of_poses, settings.least_clock_error_s, "poses'")
+    asked = aligned(wheels, log.commands, log.begins_s, of_commands, settings.least_link_error_s, "commands'")
+    notes = (*poses.notes, *asked.notes)
+    if not asked.known:
         said = (
             f"wheels answer commands more slowly than behind a lag of {max(settings.lags_s):g} s, or more than "
             f"{settings.most_pose_delay_s:g} s late or early, or commands hardly change: how late commands are stamped "
             "is not known from this log"
         )
         notes = (*notes, said)
-    later_s = _to_borders(commands, float(wheels.t_s[0]), -link.delay_s) if wheels.t_s.size else 0.0
-    return _Timed(
-        replace(commands, t_s=_moved(commands.t_s, later_s)),
-        replace(poses, t_s=_moved(poses.t_s, -clock.delay_s)),
-        later_s,
-        known,
-        clock.delay_s,
-        clock,
-        notes,
-    )
+    later_s = _to_borders(asked.samples, float(wheels.t_s[0]), -asked.delay_s) if wheels.t_s.size else 0.0
+    commands = replace(asked.samples, t_s=_moved(asked.samples.t_s, later_s))
+    seen = replace(poses.samples, t_s=_moved(poses.samples.t_s, -poses.delay_s))
+    return _Timed(replace(asked, samples=commands), replace(poses, samples=seen), later_s, notes)
 
 
 def _to_borders(commands: Commands, begin_s: float, later_s: float) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -193,14 +193,14 @@ def drifting_parameters(analysis: GapAnalysis, final: FinalFit) -> tuple[str, ..
     return tuple(out)
 
 
-def across_logs(analysis: GapAnalysis, begins_s: Sequence[float]) -> tuple[AcrossLogs, ...]:
+def across_logs(analysis: GapAnalysis) -> tuple[AcrossLogs, ...]:
     """Every parameter that each of several logs determines, and whether they differ in it by more than their noise."""
     settings, out = analysis.drive.settings.report, []
     for found in (analysis.body, analysis.wheels):
-        if found is None or len(begins_s) < 2:
+        if found is None:
             continue
-        for name, logs in in_logs(found, begins_s).items():
-            if logs.values.size != len(begins_s):
+        for name, logs in in_logs(found).items():
+            if logs.values.size != len(analysis.drive.log_begins_s):
                 continue
             low, high = int(np.argmin(logs.values)), int(np.argmax(logs.values))
             # A point of turning near the axle is compared with the robot's size.

@@ -7,7 +7,6 @@ far another drive's values may lie from those of this one.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -179,14 +178,15 @@ def _weightings_apart(found: ChannelResult) -> Array:
 
 
 def _stamped(found: ChannelResult) -> dict[str, float]:
-    """Variance, s^2, of a delay of what is stamped by rows of a log, as the wheels are: of any time between two rows.
+    """Variance, s^2, of the delay of a channel from log to log, by what is known of the stamps.
 
-    Loops that run side by side meet in the same way all along a log, and in another one in the next.
+    Of what is stamped by rows of a log, as the wheels are, it is any between two rows: loops that run side by side meet
+    in the same way all along a log, and in another one in the next.
     """
     channel = found.selector.channel
     drive = channel.inner.drive
-    apart_s = drive.command_tick_s if channel.layout.of_wheels else drive.pose_tick_s
-    return dict.fromkeys(delay_columns(channel.layout), apart_s**2 / 12.0)
+    stamps_s = drive.command_stamps_s if channel.layout.of_wheels else drive.pose_stamps_s
+    return dict.fromkeys(delay_columns(channel.layout), stamps_s**2)
 
 
 def _profiled(found: ChannelResult, column: str, step: float) -> ParameterEstimate:
@@ -251,7 +251,8 @@ def wandered(found: ChannelResult) -> dict[str, float]:
     """Variance of each parameter from this log to the next, by full name.
 
     What halves surely differ by goes on from drive to drive, as a random walk does. Of what changes more quickly a
-    drive shows the mean: what shorter parts differ by counts once, as what may be chance does.
+    drive shows the mean: what shorter parts differ by counts once, as what may be chance does. What logs that are
+    searched together differ by is what the next one may differ by.
     """
     settings = found.channel.settings.report
     variance: dict[str, float] = {}
@@ -260,6 +261,8 @@ def wandered(found: ChannelResult) -> dict[str, float]:
             goes_on = count == 2 and abs(one.apart(0, 1)) > settings.drift_sigmas
             apart = one.variance_to_next if goes_on else one.variance_between
             variance[name] = max(apart, variance.get(name, 0.0))
+    for name, one in in_logs(found).items():
+        variance[name] = max(one.variance_between, variance.get(name, 0.0))
     return variance
 
 
@@ -269,17 +272,18 @@ def in_equal_parts(found: ChannelResult, count: int) -> dict[str, InParts]:
     return in_parts(found, count * np.arange(blocks) // max(blocks, 1))
 
 
-def in_logs(found: ChannelResult, begins_s: Sequence[float]) -> dict[str, InParts]:
-    """What each of several logs that were searched together says, each `begins_s` on the time of the blocks."""
+def in_logs(found: ChannelResult) -> dict[str, InParts]:
+    """What each of several logs that were searched together says, without those that say little of a parameter."""
     channel = found.selector.channel
     ends_s = (np.unique(channel.block) + 1) * channel.settings.grid.block_s
-    return in_parts(found, np.searchsorted(begins_s, ends_s))
+    return in_parts(found, np.searchsorted(channel.inner.drive.log_begins_s, ends_s), some=True)
 
 
-def in_parts(found: ChannelResult, parts: NDArray[np.int64]) -> dict[str, InParts]:
-    """What each part of a log says of the parameters, to second order; without those of which one says little.
+def in_parts(found: ChannelResult, parts: NDArray[np.int64], some: bool = False) -> dict[str, InParts]:
+    """What each part of a log says of the parameters, to second order; of which one says little, none does.
 
-    `parts` (B,): the part of each block of time of the channel, in order.
+    `parts` (B,): the part of each block of time of the channel, in order; `some`: those that say enough of a parameter,
+    where there are two.
     """
     best, channel, layout = found.told, found.selector.channel, found.selector.channel.layout
     labels = np.unique(parts)
@@ -293,26 +297,25 @@ def in_parts(found: ChannelResult, parts: NDArray[np.int64]) -> dict[str, InPart
     # What a part cannot tell from others it does not know, however much depends on it: a circle has one axial distance
     # for every pair of wheels.
     whole = 1.0 / np.diag(inverse(normal.sum(axis=0)))
-    enough = np.all([1.0 / np.diag(inverse(normal[of].sum(axis=0))) > least * whole for of in inside], axis=0)
-    places = np.array(best.active)[enough]
-    if not places.size:
-        return {}
-    values, deviations = [], []
-    for of in inside:
+    enough = np.array([1.0 / np.diag(inverse(normal[of].sum(axis=0))) > least * whole for of in inside])
+    if not some:
+        enough[:] = enough.all(axis=0)
+    said: dict[int, list[tuple[float, float]]] = {index: [] for index in best.active}
+    for of, knows in zip(inside, enough, strict=True):
+        places = np.array(best.active)[knows]
+        if not places.size:
+            continue
         # Neighbouring blocks err together: a few are taken as one.
         group = np.arange(np.count_nonzero(of)) // each
-        blocks = normal[of][:, enough][:, :, enough]
-        pulls = gradient[of][:, enough]
+        blocks = normal[of][:, knows][:, :, knows]
+        pulls = gradient[of][:, knows]
         covariance = inverse(blocks.sum(axis=0))
         step = -covariance @ pulls.sum(axis=0)
         # How much more than the noise model says the blocks of a part scatter about what it says itself.
         left = np.zeros((group[-1] + 1, places.size))
         np.add.at(left, group, (pulls + blocks @ step) @ covariance)
         variance = np.maximum(np.diag(covariance), (left**2).sum(axis=0))
-        deviations.append(np.sqrt(variance))
-        values.append(np.clip(best.vector[places] + step, layout.low[places], layout.high[places]))
-    columns = layout.columns
-    return {
-        columns[index]: InParts(np.array([of[k] for of in values]), np.array([of[k] for of in deviations]))
-        for k, index in enumerate(places)
-    }
+        values = np.clip(best.vector[places] + step, layout.low[places], layout.high[places])
+        for index, value, deviation in zip(places.tolist(), values.tolist(), np.sqrt(variance).tolist(), strict=True):
+            said[index].append((value, deviation))
+    return {layout.columns[index]: InParts(*np.array(of).T) for index, of in said.items() if len(of) > 1}

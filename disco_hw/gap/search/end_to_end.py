@@ -182,7 +182,9 @@ class Ahead:
 
 
 def _usual(error: Array) -> Array:
-    """Usual size of errors (K, 3): of position, twice, and of heading; (3,)."""
+    """Usual size of errors (K, 3): of position, twice, and of heading; (3,), 1 of no errors."""
+    if not error.size:
+        return np.ones(3)
     position = _OF_MEDIAN * float(np.median(np.abs(error[:, :2])))
     heading = _OF_MEDIAN * float(np.median(np.abs(error[:, 2])))
     return np.asarray(np.maximum(np.array([position, position, heading]), _LEAST_SCALE))

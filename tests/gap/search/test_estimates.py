@@ -52,15 +52,12 @@ def test_two_weightings_lie_apart_by_what_is_beyond_the_difference_of_their_vari
     assert channel_result._weightings_apart(SimpleNamespace(told=told, evenly=None)).tolist() == [0.0] * 3
 
 
-def test_a_delay_of_what_rows_of_a_log_stamp_is_any_between_two_rows():
-    drive = SimpleNamespace(command_tick_s=0.06, pose_tick_s=0.12)
-    for layout, column, variance in ((WHEEL, "command_delay.delay_s", 3e-4), (BODY, "pose_latency.latency_s", 12e-4)):
+def test_a_delay_is_known_as_well_as_the_stamps_are():
+    drive = SimpleNamespace(command_stamps_s=0.02, pose_stamps_s=0.03)
+    for layout, column, variance in ((WHEEL, "command_delay.delay_s", 4e-4), (BODY, "pose_latency.latency_s", 9e-4)):
         channel = SimpleNamespace(layout=layout, inner=SimpleNamespace(drive=drive))
         of_delays = channel_result._stamped(SimpleNamespace(selector=SimpleNamespace(channel=channel)))
         assert of_delays == {column: pytest.approx(variance)}
-        # As even spreads are.
-        even = np.random.default_rng(0).uniform(0.0, 0.06 if layout is WHEEL else 0.12, 100_000)
-        assert np.var(even) == pytest.approx(variance, rel=0.02)
 
 
 @pytest.mark.parametrize("step", [0.5, 2.0])
@@ -101,6 +98,8 @@ def test_a_value_wanders_by_what_halves_surely_differ_or_by_the_most_that_shorte
     quarters = InParts(np.array([0.0, 4.0, 0.0, 4.0]), np.ones(4))
     shown = {2: {"sure": sure, "unsure": unsure, "both": sure}, 4: {"both": quarters, "short": quarters}}
     monkeypatch.setattr(channel_result, "in_equal_parts", lambda found, count: shown[count])
+    logs: dict[str, InParts] = {}
+    monkeypatch.setattr(channel_result, "in_logs", lambda found: logs)
     # Squares of half their distance, twice, less one expected.
     of_sure, of_unsure = 3.1**2 - 1.0, 2.9**2 - 1.0
     told = wandered(of_blocks(np.arange(12)))
@@ -111,6 +110,13 @@ def test_a_value_wanders_by_what_halves_surely_differ_or_by_the_most_that_shorte
     # What goes on from drive to drive is seen in halves alone.
     shown[2] = {"short": unsure}
     assert wandered(of_blocks(np.arange(12)))["short"] == pytest.approx(of_unsure)
+    # And by what logs differ, where that is more.
+    logs |= {"short": quarters, "new": quarters}
+    most = {"short": of_unsure, "new": 13.0 / 3.0}
+    told = wandered(of_blocks(np.arange(12)))
+    assert {name: told[name] for name in most} == pytest.approx(most)
+    logs["short"] = InParts(np.array([0.0, 5.0]), np.ones(2))
+    assert wandered(of_blocks(np.arange(12)))["short"] == pytest.approx(12.5 - 1.0)
 
 
 def test_parts_of_a_log_are_as_long_as_each_other(monkeypatch):
@@ -121,10 +127,16 @@ def test_parts_of_a_log_are_as_long_as_each_other(monkeypatch):
 
 
 def test_a_block_belongs_to_the_log_in_which_it_ends(monkeypatch):
-    monkeypatch.setattr(channel_result, "in_parts", lambda found, of: of.tolist())
+    monkeypatch.setattr(channel_result, "in_parts", lambda found, of, some: (some, of.tolist()))
+
+    def labels(blocks, *begins_s):
+        found = of_blocks(blocks)
+        found.channel.inner = SimpleNamespace(drive=SimpleNamespace(log_begins_s=begins_s))
+        return in_logs(found)
+
     # Blocks of 3 s.
-    assert in_logs(of_blocks(np.arange(12)), [0.0, 30.0]) == [1] * 10 + [2] * 2
-    assert in_logs(of_blocks(np.arange(4)), [0.0, 8.9]) == [1, 1, 2, 2]
+    assert labels(np.arange(12), 0.0, 30.0) == (True, [1] * 10 + [2] * 2)
+    assert labels(np.arange(4), 0.0, 8.9) == (True, [1, 1, 2, 2])
 
 
 def scattered(share, seed=0):

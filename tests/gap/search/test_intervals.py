@@ -101,12 +101,17 @@ def changing(late_k_s):
     return type(channel).build(replace(line, pose_values=poses), channel.noise, channel.neutral)
 
 
+def of_two_logs(channel):
+    """The same, as if its halves were logs that are searched together."""
+    return replace(channel, drive=replace(channel.drive, log_begins_s=(0.0, 0.5 * channel.drive.duration_s)))
+
+
 def test_halves_that_disagree_widen_the_interval_to_hold_both():
     names = ("turn_slip",)
     same, drifting = changing(0.08), changing(0.16)
     found = [estimated(one, names).by_name["turn_slip.k_s"] for one in (same, drifting)]
     result = ChannelResult(Selector(drifting, body_moves(drifting), LIMITS), names, drifting)
-    early, late = in_logs(result, (0.0, 0.5 * drifting.drive.duration_s))["turn_slip.k_s"].values
+    early, late = in_equal_parts(result, 2)["turn_slip.k_s"].values
     assert (early, late) == pytest.approx((0.08, 0.16), abs=0.03)
     assert found[1].low < early < late < found[1].high
     assert found[0].deviation < 0.3 * found[1].deviation
@@ -145,20 +150,27 @@ def test_a_part_that_cannot_tell_two_parameters_apart_says_nothing_of_either():
     read_angles(plain.track(truth), line.pose.node, line.pose.fraction, poses)
     channel = BodyChannel.build(replace(line, pose_values=poses + noise), NOISE, plain.neutral)
     result = ChannelResult(Selector(channel, body_moves(channel), LIMITS), ("turn_slip",), channel)
-    found = in_logs(result, (0.0, 0.5 * channel.drive.duration_s))
+    found = in_equal_parts(result, 2)
     assert "turn_slip.k_s" not in found
     assert "axial_distance_m" not in found
     assert found["x_icr_m"].values == pytest.approx((GEOMETRY[2], GEOMETRY[2]), abs=0.005)
+    # Of three logs, of which the first is such a circle, the two others speak.
+    quarter_s = 0.25 * channel.drive.duration_s
+    three = replace(channel, drive=replace(channel.drive, log_begins_s=(0.0, 2.0 * quarter_s, 3.0 * quarter_s)))
+    found = in_logs(ChannelResult(Selector(three, body_moves(three), LIMITS), ("turn_slip",), three))
+    assert found["turn_slip.k_s"].values == pytest.approx((0.08, 0.08), abs=0.03)
+    assert found["x_icr_m"].values.size == 3
 
 
 def test_each_of_several_logs_speaks_for_itself():
-    channel = changing(0.16)
+    channel = of_two_logs(changing(0.16))
     result = ChannelResult(Selector(channel, body_moves(channel), LIMITS), ("turn_slip",), channel)
-    found = in_logs(result, (0.0, 0.5 * channel.drive.duration_s))
+    found = in_logs(result)
     assert found["turn_slip.k_s"].values == pytest.approx((0.08, 0.16), abs=0.03)
     assert found["turn_slip.k_s"].apart(0, 1) > 3.0
     assert abs(found["wheel_radius_m"].apart(0, 1)) < 3.0
-    assert in_logs(result, (0.0,)) == {}
+    one = changing(0.16)
+    assert in_logs(ChannelResult(Selector(one, body_moves(one), LIMITS), ("turn_slip",), one)) == {}
     assert in_equal_parts(result, 3)["turn_slip.k_s"].values.size == 3
 
 
@@ -196,13 +208,12 @@ def test_a_drift_shows_in_thirds_or_where_these_say_too_little_in_halves(monkeyp
 
 def test_logs_of_one_robot_differ_in_what_changed_between_them_alone():
     for late_k_s, differs in ((0.08, set()), (0.16, {"turn_slip.k_s"})):
-        channel = changing(late_k_s)
+        channel = of_two_logs(changing(late_k_s))
         result = ChannelResult(Selector(channel, body_moves(channel), LIMITS), ("turn_slip",), channel)
         analysis = GapAnalysis(channel.drive, channel.neutral, WHEEL.neutral, result, None)
-        found = across_logs(analysis, (0.0, 0.5 * channel.drive.duration_s))
+        found = across_logs(analysis)
         assert {each.name for each in found} >= {"turn_slip.k_s", "wheel_radius_m", "x_icr_m"}
         assert {each.name for each in found if each.differs} - {"axial_distance_m"} == differs
-        assert across_logs(analysis, (0.0,)) == ()
         for each in found:
             assert all(low < value < high for value, low, high in each.values)
 
@@ -222,6 +233,7 @@ def test_what_halves_surely_differ_by_goes_on_and_what_quarters_differ_by_comes_
         return {"motor_lag.tau_s": InParts(np.array([0.0, (2.0 * spread[count]) ** 0.5]), np.full(2, noise))}
 
     monkeypatch.setitem(wandered.__globals__, "in_parts", in_parts)
+    monkeypatch.setitem(wandered.__globals__, "in_logs", lambda found: {})
     channel = SimpleNamespace(block=np.repeat(np.arange(12), 5), settings=DEFAULT_SETTINGS)
     found = SimpleNamespace(channel=channel, selector=SimpleNamespace(channel=channel))
     assert wandered(found) == {"motor_lag.tau_s": pytest.approx(expected)}

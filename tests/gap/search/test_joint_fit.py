@@ -168,6 +168,8 @@ def test_what_is_usual_is_the_median_of_positions_and_of_headings():
     error = np.array([[1.0, -3.0, 0.1], [2.0, 5.0, -0.4], [-4.0, 90.0, 0.2]])
     assert _usual(error) == pytest.approx(1.4826 * np.array([3.5, 3.5, 0.2]))
     assert _usual(np.zeros((3, 3))) == pytest.approx(np.full(3, 1e-5))
+    # A fold may hold all that is predicted so far ahead: then nothing is known, and nothing asked.
+    assert _usual(np.zeros((0, 3))).tolist() == [1.0] * 3
 
 
 def test_chains_are_compared_by_the_logarithms_of_both_usual_errors(linear):
