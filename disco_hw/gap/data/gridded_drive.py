@@ -123,7 +123,15 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
     grid_settings = settings.grid
     wheels = undo_sample_hold(log.wheels, grid_settings)
     timed = _timed(log, wheels, grid_settings)
+    ticks_s = {"commands": tick_s(log.commands.t_s, log.wheels.t_s), "poses": tick_s(log.poses.t_s, log.wheels.t_s)}
+    scatter_s = {whose: each_s / 12.0**0.5 for whose, each_s in ticks_s.items()}
     asked, poses, notes = timed.commands.samples, timed.poses.samples, [*timed.notes]
+    notes += [
+        f"{whose} are stamped by the rows of the log, {1e3 * ticks_s[whose]:.0f} ms apart: how late they are is known "
+        f"to {2e3 * each_s:.0f} ms at best"
+        for whose, each_s in scatter_s.items()
+        if ticks_s[whose] > grid_settings.least_clock_error_s
+    ]
     nodes_t, nodes_first, commands, changes, angles, speeds = [], [], [], [], [], []
     encoder_at, encoder_angle, pose_at, pose_values = [], [], [], []
     offset, foreign_s = 0, 0.0
@@ -192,8 +200,8 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
         commands_moved_s=timed.commands_moved_s,
         commands_timed=timed.commands.known,
         poses_moved_s=timed.poses.delay_s,
-        command_stamps_s=math.hypot(tick_s(log.commands.t_s, log.wheels.t_s) / 12.0**0.5, timed.commands.apart_s),
-        pose_stamps_s=math.hypot(tick_s(log.poses.t_s, log.wheels.t_s) / 12.0**0.5, timed.poses.apart_s),
+        command_stamps_s=math.hypot(scatter_s["commands"], timed.commands.apart_s),
+        pose_stamps_s=math.hypot(scatter_s["poses"], timed.poses.apart_s),
         log_begins_s=log.begins_s,
     )
 

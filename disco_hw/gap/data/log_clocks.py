@@ -54,11 +54,19 @@ def aligned(
     middle_s = float(np.median(delays))
     apart = max(abs(delay_s - middle_s) for delay_s in delays) >= least_s
     parts: list[Samples] = []
+    uneven: list[str] = []
     notes: list[str] = []
     for number, ((_, own), (clock, known)) in enumerate(zip(logs, clocks, strict=True), 1):
         even = clock.corrected(own)
         parts.append(replace(even, t_s=even.t_s - (clock.delay_s - middle_s)) if apart and known else even)
-        notes += clock.notes(f"{whose[:-1]} of log {number}'s")
+        if not clock.even:
+            how = f"{1e3 * clock.drift_s:+.0f} ms over" if clock.drift_s else f"{1e3 * clock.jump_s:+.0f} ms at once in"
+            uneven.append(f"{how} log {number}")
+    if uneven:
+        notes.append(
+            f"the {whose} clock runs unevenly against the wheels' ({', '.join(uneven)}): their stamps are corrected; "
+            "synchronise the clocks"
+        )
     if apart:
         said = ", ".join(f"{clock.delay_s:.3g} s" if known else "not known" for clock, known in clocks)
         notes.append(
@@ -70,7 +78,7 @@ def aligned(
         replace(samples, **joined),
         middle_s,
         True,
-        all(clock.even for clock, _ in clocks),
+        not uneven,
         float(np.std(delays, ddof=1)) if apart else 0.0,
         tuple(notes),
     )

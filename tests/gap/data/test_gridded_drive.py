@@ -62,6 +62,15 @@ def test_what_rows_of_a_log_stamp_is_known_as_closely_as_they_follow_one_another
     own[5] += 0.004
     assert scatter(t, own) == (pytest.approx(even, rel=0.01), 0.0)
     assert scatter(t[:0], t[:0]) == (0.0, 0.0)
+    notes = grid_drive(drive(t, np.zeros(t.size), t, turned, pose_s=own)).notes
+    said = "commands are stamped by the rows of the log, 50 ms apart: how late they are is known to 29 ms at best"
+    assert said in notes
+    assert not any(note.startswith("poses") for note in notes)
+    # Rows that follow closely are no news.
+    t = np.arange(0.0, 10.0, 0.02)
+    line = grid_drive(drive(t, np.zeros(t.size), t, np.sin(t)))
+    assert line.command_stamps_s == pytest.approx(0.4 * even, rel=0.01)
+    assert not any(note.startswith("commands are") for note in line.notes)
 
 
 @pytest.mark.parametrize("cells", [-7, 0, 7])

@@ -68,13 +68,15 @@ def test_a_log_that_shows_no_delay_stays_and_speaks_for_none():
 
 
 def test_a_clock_that_drifts_in_one_log_is_mended_there_and_said():
-    drifting = StampClock(0.3, 30.0, 20.0, drift_s=0.2)
-    found, _ = laid([(StampClock(0.3), True), (drifting, True), (StampClock(0.3), True)])
+    drifting, jumping = StampClock(0.3, 30.0, 20.0, drift_s=0.2), StampClock(0.3, jump_s=-0.5, jump_at_s=50.0)
+    found, _ = laid([(StampClock(0.3), True), (drifting, True), (jumping, True)])
     t_s = samples()[1].t_s
     expected = t_s - np.where((t_s >= 20.0) & (t_s < 40.0), 0.2 * (t_s - 30.0) / 20.0, 0.0)
+    expected -= np.where(t_s < 40.0, 0.0, np.where(t_s < 50.0, 0.25, -0.25))
     np.testing.assert_allclose(found.samples.t_s, expected)
     assert not found.even
-    assert found.notes[0].startswith("the poses of log 2's clock drifts")
+    assert len(found.notes) == 1
+    assert "(+200 ms over log 2, -500 ms at once in log 3)" in found.notes[0]
 
 
 def log_of(seed, late_s, heard_s):
