@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from disco_hw.gap.data.command_timing import command_clock
-from disco_hw.gap.data.log_clocks import Aligned, aligned
-from disco_hw.gap.data.stamp_clock import StampClock
+from disco_hw.gap.data.stamp_clock import Aligned, StampClock, aligned
 from disco_hw.gap.data.timing import pose_clock, tick_s
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, Folds, GapSettings, GridSettings
 from disco_hw.log.drive import Commands, DriveLog, Poses, Wheels

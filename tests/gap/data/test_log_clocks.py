@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.data.gridded_drive import grid_drive
-from disco_hw.gap.data.log_clocks import aligned
-from disco_hw.gap.data.stamp_clock import StampClock
+from disco_hw.gap.data.stamp_clock import StampClock, aligned
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, concatenate
 
 BEGINS_S = (0.0, 22.0, 42.0)
