@@ -257,17 +257,15 @@ def side_by_side(judge: Judge, claims: Sequence[BlindSpot]) -> Iterator[Callable
         yield lambda: [judge(claim) for claim in claims]
         return
     fork = multiprocessing.get_context("fork")
-    taken = fork.Value("i", 0)
     others: list[tuple[Connection, BaseProcess]] = []
+    # Numbers of the claims that nobody has: whoever reads one takes it.
+    left, writer = os.pipe()
+    os.write(writer, bytes(range(len(claims))))
+    os.close(writer)
 
     def judge_next() -> Iterator[tuple[int, BlindSpot]]:
-        while True:
-            with taken.get_lock():
-                number = taken.value
-                taken.value += 1
-            if number >= len(claims):
-                return
-            yield number, judge(claims[number])
+        while number := os.read(left, 1):
+            yield number[0], judge(claims[number[0]])
 
     def finished() -> list[BlindSpot]:
         judged = dict(judge_next())
@@ -289,6 +287,7 @@ def side_by_side(judge: Judge, claims: Sequence[BlindSpot]) -> Iterator[Callable
         for _, copy in others:
             copy.terminate()
             copy.join()
+        os.close(left)
 
 
 def _send(judge_next: Callable[[], Iterator[tuple[int, BlindSpot]]], sender: Connection) -> None:
