@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
-from disco_hw.gap.search.least_squares import Fit, by_block, fit, inverse
+from disco_hw.gap.search.least_squares import Fit, by_block, fit, inverse, within
 from disco_hw.gap.search.richest_model import CANDIDATES, delay_columns, indices
 from disco_hw.gap.search.selection import Z95, EffectEvidence, Names, Selector, inflation, interval_inflation
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms
@@ -149,7 +149,8 @@ def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
             for place, index in enumerate(best.active)
         ]
     )
-    covariance = covariance * np.sqrt(np.outer(1.0 + more, 1.0 + more))
+    chosen, layout = list(best.active), channel.layout
+    covariance = within(covariance * np.sqrt(np.outer(1.0 + more, 1.0 + more)), layout.low[chosen], layout.high[chosen])
     deviations = np.sqrt(np.diag(covariance))
     by_name = {
         columns[index]: ParameterEstimate.around(float(best.vector[index]), float(deviation))
@@ -287,8 +288,6 @@ def in_parts(found: ChannelResult, parts: NDArray[np.int64], some: bool = False)
     """
     best, channel, layout = found.told, found.selector.channel, found.selector.channel.layout
     labels = np.unique(parts)
-    if not best.active or labels.size < 2:
-        return {}
     settings = channel.settings
     each = settings.selection.block_lengths[1]
     normal, gradient = by_block(best, channel.block)

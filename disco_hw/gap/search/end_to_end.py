@@ -26,7 +26,7 @@ from disco_hw.gap.search.cross_validation import (
     judged_horizon_s,
     prediction_error,
 )
-from disco_hw.gap.search.least_squares import inverse
+from disco_hw.gap.search.least_squares import inverse, within
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -178,7 +178,7 @@ class Ahead:
                 f_scale=settings.fit_huber * max(shares), max_nfev=settings.fit_steps, ftol=1e-5, xtol=1e-8,
             )  # fmt: skip
             values, cost, normal = found.x, float(found.cost), np.asarray(found.jac.T @ found.jac)
-        return JointFit(tuple(of.vectors(values)), cost, of.names, inverse(normal))
+        return JointFit(tuple(of.vectors(values)), cost, of.names, within(inverse(normal), low, high))
 
 
 def _usual(error: Array) -> Array:

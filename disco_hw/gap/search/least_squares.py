@@ -70,6 +70,15 @@ def inverse(matrix: Array) -> Array:
     return np.asarray((vectors / np.maximum(values, 1e-10)) @ vectors.T / np.outer(scale, scale))
 
 
+def within(covariance: Array, low: Array, high: Array) -> Array:
+    """A covariance (A, A) of entries of which no more is unknown than where in their ranges, `low` to `high` (A,), they
+    lie: the standard deviation is that of an even distribution there at most.
+    """
+    deviations = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    share = np.minimum(1.0, (high - low) / 12.0**0.5 / deviations)
+    return np.asarray(covariance * np.outer(share, share))
+
+
 def known(part: Array, whole: Array, settings: FitSettings) -> NDArray[np.bool_]:
     """Which parameters (A,) a part of a log determines, from its normal matrix and the whole log's, (A, A) each.
 

@@ -9,6 +9,7 @@ from scipy.signal import lfilter
 
 from disco_hw.gap.data.gridded_drive import even_times, grid_drive
 from disco_hw.gap.data.stamp_clock import StampClock
+from disco_hw.gap.data.timing import tick_s
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels
 
@@ -40,6 +41,13 @@ def test_a_command_that_changes_within_a_cell_counts_by_its_share():
     assert line.command_rad_s[cell, 0] == pytest.approx(0.8, abs=1e-6)
     assert line.command_rad_s[cell - 1, 0] == pytest.approx(0.0, abs=1e-9)
     assert line.command_rad_s[round((8.0 + moved_s) / GRID_STEP_S) - 1, 0] == pytest.approx(0.8, abs=1e-6)
+
+
+@pytest.mark.parametrize(("rows", "tick"), [(1, 0.0), (2, 0.05), (3, 0.05)])
+def test_one_row_alone_says_nothing_of_how_close_rows_are(rows, tick):
+    t = 0.05 * np.arange(rows)
+    assert tick_s(t[:1], t) == pytest.approx(tick)
+    assert tick_s(t, t[:0]) == 0.0
 
 
 def test_what_rows_of_a_log_stamp_is_known_as_closely_as_they_follow_one_another():

@@ -38,8 +38,21 @@ def test_logs_that_agree_are_taken_as_one():
     assert found.samples.t_s.tolist() == samples()[1].t_s.tolist()
     # One log is looked at once.
     one, spans = laid([], (0.0,))
-    assert one.delay_s == 7.0
+    assert (one.delay_s, one.apart_s, one.even, one.notes) == (7.0, 0.0, True, ())
     assert spans == [(0.0, 59.0)]
+    # So far apart as the least they are not one.
+    assert laid([(StampClock(0.25 * k), True) for k in (1, 2, 3)], least_s=0.25)[0].apart_s == 0.25
+
+
+def test_two_logs_are_two_and_one_says_itself_what_its_clock_does():
+    found, spans = laid([(StampClock(0.5), True), (StampClock(0.25), True)], (0.0, 22.0))
+    assert spans == [(0.0, 19.0), (20.0, 59.0)]
+    assert found.delay_s == 0.375
+    drifting = StampClock(0.3, 30.0, 60.0, drift_s=0.2)
+    alone = aligned(*samples(), (0.0,), lambda *of: (drifting, True), 0.03, "poses'")
+    assert alone.notes == drifting.notes("poses'")
+    assert not alone.even
+    assert alone.samples.t_s.tolist() == drifting.corrected(samples()[1]).t_s.tolist()
 
 
 def test_logs_that_do_not_agree_are_each_laid_by_their_own_delay():

@@ -1,5 +1,6 @@
 """Intervals, profiles and what the parts of a log say of a value, each against what is computed by hand."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,7 +23,9 @@ from disco_hw.gap.settings import DEFAULT_SETTINGS, FitSettings, GapSettings
 def test_an_interval_is_widened_by_how_blocks_scatter_and_by_how_a_value_wanders(monkeypatch):
     covariance = np.array([[4.0, 1.0], [1.0, 9.0]])
     told = SimpleNamespace(vector=np.array([7.0, 5.0, 3.0]), active=(2, 0), covariance=lambda: covariance)
-    channel = SimpleNamespace(layout=SimpleNamespace(columns=("a", "b", "c")))
+    low, high = np.array([-60.0, 0.0, -np.inf]), np.array([60.0, 1.0, np.inf])
+    layout = SimpleNamespace(columns=("a", "b", "c"), low=low, high=high)
+    channel = SimpleNamespace(layout=layout)
     found = SimpleNamespace(told=told, selector=SimpleNamespace(channel=channel), names=())
     monkeypatch.setattr(channel_result, "interval_inflation", lambda best, of, active: {2: 4.0, 0: 1.44}[active[0]])
     monkeypatch.setattr(channel_result, "wandered", lambda of: {"c": 6.0})
@@ -39,6 +42,17 @@ def test_an_interval_is_widened_by_how_blocks_scatter_and_by_how_a_value_wanders
         assert (one.value, one.low, one.high) == pytest.approx(
             (value, value - 1.96 * deviation, value + 1.96 * deviation)
         )
+    # Of what a log says nothing the range is known.
+    layout.low, layout.high = np.array([-1.0, 0.0, -0.5]), np.array([2.0, 1.0, 1.0])
+    spread = [float(np.std(np.random.default_rng(0).uniform(0.0, width, 100_000))) for width in (1.5, 3.0)]
+    narrow = estimate_parameters(found)
+    assert [narrow.by_name[name].deviation for name in ("c", "a")] == pytest.approx(spread, rel=0.01)
+    np.testing.assert_allclose(np.sqrt(np.diag(narrow.covariance)), spread, rtol=0.01)
+    np.testing.assert_allclose(correlation(narrow.covariance), correlation(estimates.covariance))
+
+
+def correlation(covariance):
+    return covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1])
 
 
 def test_two_weightings_lie_apart_by_what_is_beyond_the_difference_of_their_variances(monkeypatch):
@@ -111,8 +125,8 @@ def test_a_value_wanders_by_what_halves_surely_differ_or_by_the_most_that_shorte
     shown[2] = {"short": unsure}
     assert wandered(of_blocks(np.arange(12)))["short"] == pytest.approx(of_unsure)
     # And by what logs differ, where that is more.
-    logs |= {"short": quarters, "new": quarters}
-    most = {"short": of_unsure, "new": 13.0 / 3.0}
+    logs |= {"short": quarters, "new": quarters, "little": InParts(np.array([0.0, 0.5]), np.full(2, 0.1))}
+    most = {"short": of_unsure, "new": 13.0 / 3.0, "little": 0.125 - 0.01}
     told = wandered(of_blocks(np.arange(12)))
     assert {name: told[name] for name in most} == pytest.approx(most)
     logs["short"] = InParts(np.array([0.0, 5.0]), np.ones(2))
@@ -152,6 +166,28 @@ def test_a_part_that_says_less_than_its_share_of_a_value_says_nothing(share, kno
     settings = GapSettings(fit=FitSettings(part_known_share=0.2))
     found = of_blocks(np.arange(12), scattered(share)[2], settings)
     assert bool(in_parts(found, np.repeat([0, 1], 6))) is known
+
+
+def test_of_several_logs_those_that_say_enough_speak_where_there_are_two():
+    found = of_blocks(np.arange(12), scattered(0.02)[2])
+    assert in_parts(found, np.repeat([0, 1], 6), some=True) == {}
+    # The first third says next to nothing, and the others are as they are beside one that is known.
+    thirds = np.repeat([0, 1, 2], (6, 3, 3))
+    assert in_parts(found, thirds) == {}
+    two = in_parts(found, thirds, some=True)["x"]
+    alone = in_parts(of_blocks(np.arange(6), later(found.told)), np.repeat([0, 1], 3))["x"]
+    np.testing.assert_allclose((two.values, two.deviations), (alone.values, alone.deviations))
+
+
+def later(told):
+    """The second half of a fit."""
+    return replace(told, residual=told.residual[6:], slope=told.slope[6:])
+
+
+def test_of_one_part_nothing_is_said_apart():
+    assert in_parts(of_blocks(np.arange(12), scattered(0.5)[2]), np.zeros(12, dtype=np.int64)) == {}
+    nothing = Fit(np.array([2.0]), (), 0.0, np.ones(12), np.empty((12, 0)))
+    assert in_parts(of_blocks(np.arange(12), nothing), np.repeat([0, 1], 6)) == {}
 
 
 def test_a_part_says_a_value_as_surely_as_the_noise_model_or_its_own_blocks_three_by_three_have_it():
