@@ -216,8 +216,7 @@ class _Timed(NamedTuple):
 
 def _timed(log: DriveLog, wheels: Wheels, settings: GridSettings) -> _Timed:
     def of_poses(wheels: Wheels, poses: Poses) -> tuple[StampClock, bool]:
-        clock = pose_clock(wheels, poses, settings)
-        return clock, clock.delay_s != 0.0
+        return pose_clock(wheels, poses, settings), True
 
     def of_commands(wheels: Wheels, commands: Commands) -> tuple[StampClock, bool]:
         return command_clock(wheels, commands, settings)

@@ -187,7 +187,7 @@ def jump_instant(align: Alignment, sides: tuple[float, float], about_s: float) -
 _EARLY_S = 2.0
 
 ClockOf = Callable[[Wheels, Samples], tuple[StampClock, bool]]
-"""The clock of samples against that of the wheels, and whether the log shows it."""
+"""The clock of samples against that of the wheels, without a delay where none is seen, and whether it is known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,7 +217,8 @@ def aligned(
     """
     edges_s = [-np.inf, *(begin_s - _EARLY_S for begin_s in begins_s[1:]), np.inf]
     logs = [(_between(wheels, *span), _between(samples, *span)) for span in pairwise(edges_s)]
-    clocks = [clock_of(*log) for log in logs] if len(logs) > 1 else []
+    seen = [clock_of(*log) for log in logs] if len(logs) > 1 else []
+    clocks = [(clock, known and clock.delay_s != 0.0) for clock, known in seen]
     delays = [clock.delay_s for clock, known in clocks if known]
     if not delays:
         clock, known = clock_of(wheels, samples)

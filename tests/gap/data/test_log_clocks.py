@@ -132,6 +132,20 @@ def test_logs_whose_clocks_differ_lie_on_the_grid_beside_their_own_wheels():
         np.testing.assert_allclose(together.pose.t_s[run == number] - begins_s, alone.pose.t_s, atol=1e-6)
 
 
+def test_a_log_without_commands_or_poses_speaks_for_no_delay():
+    empty, none = np.empty(0), np.empty(0, np.int64)
+    whole = log_of(1, 0.1, 0.06)
+    bare = replace(log_of(2, 0.4, 0.2), commands=Commands(empty, empty, empty, none))
+    still = replace(log_of(3, 0.4, 0.06), poses=Poses(empty, empty, empty, empty, none))
+    alone = grid_drive(whole)
+    for logs in ([whole, bare, bare], [bare, whole]):
+        assert grid_drive(concatenate(logs)).commands_moved_s == pytest.approx(alone.commands_moved_s, abs=0.001)
+    together = grid_drive(concatenate([whole, still, still]))
+    assert together.pose_delay_s == pytest.approx(alone.pose_delay_s, abs=1e-6)
+    assert together.pose_stamps_s == 0.0
+    assert grid_drive(concatenate([bare, bare])).commands_timed
+
+
 def test_logs_with_one_clock_are_one():
     logs = [log_of(1, 0.1, 0.06), log_of(2, 0.11, 0.06)]
     together = grid_drive(concatenate(logs))
