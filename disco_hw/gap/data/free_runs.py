@@ -26,15 +26,12 @@ Mask = NDArray[np.bool_]
 
 
 @scalar_function
-def _at(command: Any, node: int, begin: int, end: int, late_cells: float, side: int) -> Any:
-    """Command of the cell at `node`, `late_cells` earlier; before the run's first and after its last it is that one."""
-    place = node - late_cells
-    below = math.floor(place)
-    part = place - below
-    low = min(max(below, begin), end)
+def _at(command: Any, place: int, part: float, begin: int, end: int, side: int) -> Any:
+    """Command at a cell and a part of the next; before the run's first and after its last it is that one."""
+    low = min(max(place, begin), end)
     if part == 0.0:
         return command[low, side]
-    high = min(max(below + 1, begin), end)
+    high = min(max(place + 1, begin), end)
     return command[low, side] + part * (command[high, side] - command[low, side])
 
 
@@ -42,6 +39,8 @@ def _at(command: Any, node: int, begin: int, end: int, late_cells: float, side: 
 def _run_wheels(
     effects: Any, late: float, command: Array, extra: Array, first: Mask, t_s: Array, start: Array, angle: Array
 ) -> None:
+    earlier = math.floor(-late)
+    part = -late - earlier
     begin = end = 0
     left_speed, right_speed = 0.0, 0.0
     known = False
@@ -58,7 +57,8 @@ def _run_wheels(
             known = not math.isnan(command[i, 0])
             continue
         cell = i - 1
-        left, right = _at(command, cell, begin, end, late, 0), _at(command, cell, begin, end, late, 1)
+        place = cell + earlier
+        left, right = _at(command, place, part, begin, end, 0), _at(command, place, part, begin, end, 1)
         if math.isnan(command[cell, 0]) or math.isnan(left) or math.isnan(right):
             known = False
             angle[i, 0], angle[i, 1] = angle[i - 1, 0], angle[i - 1, 1]
