@@ -243,6 +243,13 @@ def test_no_process_is_copied_that_has_other_threads_or_may_have_no_copies(monke
     assert [one.unit for one in done] == [str(os.getpid())] * 5
 
 
+def test_where_nobody_says_how_many_processors_there_are_no_process_is_copied(monkeypatch):
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    with side_by_side(by_whom, CLAIMS) as all_judged:
+        assert not multiprocessing.active_children()
+        assert [one.unit for one in all_judged()] == [str(os.getpid())] * 5
+
+
 def spots_of(channel, names=(), limits=None):
     selector = Selector(channel, body_moves(channel), limits or LIMITS)
     return {spot.name: spot for spot in blind_spots(ChannelResult(selector, names, channel))}
