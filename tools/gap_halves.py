@@ -240,9 +240,10 @@ def measured_logs(names: Sequence[str]) -> list[Path]:
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tools.gap_halves", description=(__doc__ or "").split(":")[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help="logs whose path holds it (all)")
-    parser.add_argument("--parts", type=int, default=2, metavar="N", help="of each log (2)")
-    parser.add_argument("--days", action="store_true", help="whole logs of one robot predict each other")
-    parser.add_argument("--others", action="store_true", help="all others of one robot together predict each log")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--parts", type=int, default=2, metavar="N", help="of each log (2)")
+    what.add_argument("--days", action="store_true", help="whole logs of one robot predict each other")
+    what.add_argument("--others", action="store_true", help="all others of one robot together predict each log")
     options = parser.parse_args(arguments)
     paths = measured_logs(options.names)
     head = "refitted, mm / mrad | timed | amended | offered | offered over timed | intervals hold"

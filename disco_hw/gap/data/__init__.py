@@ -174,8 +174,8 @@ def carried(p: Array, speed_rad_s: Array, t_s: Array) -> Array:
     `speed_rad_s` (M, 2) its measured wheel speeds, `t_s` (M,).
     """
     moved = np.zeros_like(speed_rad_s)
-    absent = BODY.neutral == p
-    acting = [effect for effect in _WORLD if not absent[_SPANS[False][effect.name]].all()]
+    places = [(effect, _SPANS[False][effect.name]) for effect in _WORLD]
+    acting = [effect for effect, place in places if (p[place] != BODY.neutral[place]).any()]
     # Most robots stand on level ground, and it is asked in every run.
     if not acting:
         return moved

@@ -5,8 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from disco_hw.gap.data import BODY
 from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.data.stamp_clock import StampClock, aligned
+from disco_hw.gap.search.channel_result import estimate_parameters
+from disco_hw.gap.search.channel_search import search_body
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, concatenate
 
 BEGINS_S = (0.0, 22.0, 42.0)
@@ -101,7 +104,9 @@ def log_of(seed, late_s, heard_s):
     angle = 0.02 * np.cumsum(turned, axis=0)
     rate, v = 0.3 * (turned[:, 1] - turned[:, 0]), 0.1 * turned.sum(axis=1)
     yaw = 0.02 * np.cumsum(rate)
-    x, y = 0.02 * np.cumsum(v * np.cos(yaw)), 0.02 * np.cumsum(v * np.sin(yaw))
+    # Along the heading in the middle of each step: at its end, it would be a side slip of 10 ms.
+    middle = yaw - 0.01 * rate
+    x, y = 0.02 * np.cumsum(v * np.cos(middle)), 0.02 * np.cumsum(v * np.sin(middle))
     own = t_s[::2] + 0.0037
     seen = [np.interp(own - late_s, t_s, each) + 1e-3 * rng.standard_normal(own.size) for each in (x, y, yaw)]
     seen[2] = np.mod(seen[2] + np.pi, 2.0 * np.pi) - np.pi
@@ -130,6 +135,21 @@ def test_logs_whose_clocks_differ_lie_on_the_grid_beside_their_own_wheels():
     run = np.cumsum(together.first)[together.pose.node]
     for number, (alone, begins_s) in enumerate(zip(each, together.log_begins_s, strict=True), 1):
         np.testing.assert_allclose(together.pose.t_s[run == number] - begins_s, alone.pose.t_s, atol=1e-6)
+
+
+def test_a_search_of_logs_whose_clocks_differ_finds_the_robot_and_holds_how_late_the_poses_of_each_are():
+    start = BODY.neutral.copy()
+    start[:3] = 0.2, 0.6, 0.0
+    found = search_body(grid_drive(concatenate([log_of(1, 0.1, 0.06), log_of(2, 0.42, 0.06)])), start)
+    assert found.names == ("pose_latency",)
+    said = estimate_parameters(found).by_name
+    late = said["pose_latency.latency_s"]
+    assert late.value == pytest.approx(0.26, abs=0.02)
+    assert late.low < 0.1 < late.high
+    assert late.low < 0.42 < late.high
+    # The wheels' radius over two is 0.1 m, over the axial distance 0.3.
+    assert said["wheel_radius_m"].value == pytest.approx(0.2, rel=0.01)
+    assert said["axial_distance_m"].value == pytest.approx(0.2 / 0.3, rel=0.01)
 
 
 def test_a_log_without_commands_or_poses_speaks_for_no_delay():
