@@ -45,9 +45,7 @@ def _drive(directory: Path, link: str, seconds: float) -> None:
         disco_hw_process("daemon", daemon, directory / "daemon.txt") as host,
     ):
         operator = Operator(directory / "control.sock", (robot, host))
-        operator.wait_for("READY", READY_TIMEOUT_S)
-        operator.request("arm")
-        operator.wait_for("ARMED", 5.0)
+        operator.arm()
         operator.request("start")
         time.sleep(SETTLED_S + seconds)
 

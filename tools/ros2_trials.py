@@ -164,8 +164,7 @@ def one(operator: Operator, parts: Parts, fault: str, wait_s: float) -> tuple[fl
     if status["running"]:
         return 0.0, "it began to drive by itself"
     if status["state"] == "READY":
-        operator.request("arm")
-        operator.wait_for("ARMED", 5.0)
+        operator.arm()
     operator.request("start")
     operator.wait_until("moving", lambda now: not stands(now), 10.0)
     time.sleep(wait_s)

@@ -30,6 +30,8 @@ from drivers.pose.udp import SOURCE as UDP_POSES
 DEVICES = MappingProxyType({driver.name: driver.example for driver in motor_drivers().values() if driver.example})
 """By name of a driver whose controller can be simulated: its lines in [link]."""
 _VENDORS_BAUD = 115_200
+READY_TIMEOUT_S = 180.0
+"""A first start compiles the planner: more than a minute on a busy machine. A daemon that ends is noticed at once."""
 _POLL_S = 0.05
 _END_TIMEOUT_S = 10.0
 _STILL_RAD_S = 0.05
@@ -97,6 +99,23 @@ class Operator:
         if not reply.get("ok"):
             raise WorkError(f"the daemon refused to {what}: {reply.get('error')}")
 
+    def arm(self, timeout_s: float = 5.0) -> None:
+        """Once ready, arm; raises WorkError with what kept the robot from it.
+
+        A busy machine may hold up the robot or its daemon while it arms, who then drop the request, as they must.
+        Nothing arms again by itself: it is asked for again here, twice at most, but not in a fault.
+        """
+        for left in reversed(range(_STARTS)):
+            self.wait_for("READY", READY_TIMEOUT_S)
+            try:
+                self.request("arm")
+                self.wait_for("ARMED", timeout_s)
+            except WorkError:
+                if not left or self.status()["state"] == "FAULT":
+                    raise
+            else:
+                return
+
     def wait_until(
         self, what: str, condition: Callable[[Mapping[str, Any]], bool], timeout_s: float
     ) -> Mapping[str, Any]:
@@ -123,7 +142,8 @@ class Operator:
                     return status
                 words = f"{status.get('state')}: {status.get('detail')}"
             time.sleep(_POLL_S)
-        raise WorkError(f"not {what} within {timeout_s:g} s ({words})")
+        said = "".join(f"; the {child.name} last said: {child.last_words()}" for child in self._children)
+        raise WorkError(f"not {what} within {timeout_s:g} s ({words}{said})")
 
     def wait_for(self, state: str, timeout_s: float) -> Mapping[str, Any]:
         """Wait for a state of the daemon."""
@@ -146,8 +166,6 @@ def stands(status: Mapping[str, Any]) -> bool:
     return wheels is not None and max(abs(wheels[0]), abs(wheels[1])) < _STILL_RAD_S
 
 
-READY_TIMEOUT_S = 180.0
-"""A first start compiles the planner: more than a minute on a busy machine. A daemon that ends is noticed at once."""
 FAST_TASK = 'kind = "circle"\nradius_m = 3.0\nspeed_m_s = 0.45\n'
 FAST_START = (3.0, 0.0, 1.5707963)
 
@@ -216,9 +234,7 @@ class Stack:
 
     def start(self) -> None:
         """Arm and start the task."""
-        self.operator.wait_for("READY", READY_TIMEOUT_S)
-        self.operator.request("arm")
-        self.operator.wait_for("ARMED", 5.0)
+        self.operator.arm()
         self.operator.request("start")
 
     def inject(self, command: str) -> str:

@@ -30,7 +30,6 @@ from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments import (
     DEVICES,
-    READY_TIMEOUT_S,
     Operator,
     disco_hw_process,
     link_of_device,
@@ -50,7 +49,6 @@ from disco_hw.runtime.robot_setup import Setup, geometry, load_setup
 from disco_hw.tasks.circle import CircleTask, circle_task, inwards_sine
 from disco_hw.viewer import DEFAULT_PORT, LOOPBACK, TOKEN_VARIABLE, page_address, page_token
 
-_START_TIMEOUT_S = READY_TIMEOUT_S
 _POLL_S = 0.1
 _STOP_TIMEOUT_S = 10.0
 _STALL_MS = 100
@@ -236,9 +234,7 @@ def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
         operator = Operator(files.socket, (robot, daemon))
         link = options.link if options.device is None else link_of_device(options.device)
         console.print(f"virtual robot pid {robot.process.pid}, daemon pid {daemon.process.pid}, link {link}")
-        operator.wait_for("READY", _START_TIMEOUT_S)
-        operator.request("arm")
-        operator.wait_for("ARMED", 5.0)
+        operator.arm()
         operator.request("start")
         _watch_laps(operator, options, 3.0 * lap_s * options.laps + 10.0, console)
         operator.request("stop")

@@ -39,6 +39,46 @@ def test_the_robot_keeps_to_its_circle_from_the_start():
     assert max(off_m) < 0.03
 
 
+def simulated_time(monkeypatch):
+    clock = SimulatedClock()
+    passing = SimpleNamespace(monotonic=lambda: clock.now_ns() * 1e-9, sleep=lambda s: clock.advance_ns(round(s * 1e9)))
+    monkeypatch.setattr(experiments, "time", passing)
+    return clock
+
+
+class Scripted:
+    """A daemon's control socket; each request to arm ends in the next of `ends` after a second."""
+
+    def __init__(self, monkeypatch, tmp_path, *ends):
+        monkeypatch.setattr(experiments, "send_request", self.answer)
+        self.clock, self.ends, self.asked_s = simulated_time(monkeypatch), ends, []
+        self.path = tmp_path / "control.sock"
+        self.path.touch()
+
+    def answer(self, path, request, timeout_s):
+        assert path == self.path
+        now_s = self.clock.now_ns() * 1e-9
+        if request["do"] == "arm":
+            self.asked_s.append(now_s)
+            return {"ok": True}
+        over = self.asked_s and now_s > self.asked_s[-1] + 1.0
+        return {"ok": True, "state": self.ends[len(self.asked_s) - 1] if over else "READY", "detail": "so"}
+
+
+def test_an_arming_that_a_busy_machine_ended_is_asked_for_again(monkeypatch, tmp_path):
+    daemon = Scripted(monkeypatch, tmp_path, "READY", "READY", "ARMED")
+    Operator(daemon.path).arm()
+    assert len(daemon.asked_s) == 3
+
+
+@pytest.mark.parametrize(("ends", "asked"), [(["READY"] * 3, 3), (["READY", "FAULT"], 2)])
+def test_an_arming_is_not_asked_for_without_end_and_not_in_a_fault(monkeypatch, tmp_path, ends, asked):
+    daemon = Scripted(monkeypatch, tmp_path, *ends)
+    with pytest.raises(WorkError, match=rf"not ARMED within 5 s \({ends[-1]}: so\)"):
+        Operator(daemon.path).arm()
+    assert len(daemon.asked_s) == asked
+
+
 class Compiling:
     """A daemon that compiles for so many looks at it, and then says nothing."""
 
@@ -51,11 +91,9 @@ class Compiling:
 
 
 def test_the_time_in_which_a_first_start_compiles_does_not_count(tmp_path, monkeypatch):
-    clock = SimulatedClock()
-    passing = SimpleNamespace(monotonic=lambda: clock.now_ns() * 1e-9, sleep=lambda s: clock.advance_ns(round(s * 1e9)))
-    monkeypatch.setattr(experiments, "time", passing)
+    simulated_time(monkeypatch)
     daemon = Compiling(looks=20)
-    with pytest.raises(WorkError, match=r"not READY within 0.2 s \(compiling: 7 functions, 3 s\)"):
+    with pytest.raises(WorkError, match=r"not READY within 0.2 s \(compiling: 7 functions, 3 s; .* waiting\)"):
         Operator(tmp_path / "none", (daemon,)).wait_for("READY", 0.2)
     assert daemon.looks <= 0
 

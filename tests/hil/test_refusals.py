@@ -130,8 +130,7 @@ def test_forgeries_on_the_bus_never_turn_a_wheel(tmp_path, armed):
     with running_stack(tmp_path) as stack:
         stack.operator.wait_for("READY", READY_TIMEOUT_S)
         if armed:
-            stack.operator.request("arm")
-            stack.operator.wait_for("ARMED", 5.0)
+            stack.operator.arm()
         session = int(stack.inject("state").split(",")[13])
         with can.Bus(interface="unixcan", channel=str(tmp_path / "bus")) as bus:
             for n in range(1500):

@@ -66,8 +66,7 @@ class Base:
         operator = self.operator
         operator.wait_for("READY", READY_TIMEOUT_S)
         operator.wait_until("a pose", lambda status: status["pose_ok"], 30.0)
-        operator.request("arm")
-        operator.wait_for("ARMED", 10.0)
+        operator.arm(10.0)
         operator.request("start")
         operator.wait_until("at speed", lambda status: status["wheels"] and max(status["wheels"]) > 6.0, 20.0)
 

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from disco_hw.errors import WorkError
-from disco_hw.experiments import READY_TIMEOUT_S, Operator, disco_hw_process, write_robot_file
+from disco_hw.experiments import Operator, disco_hw_process, write_robot_file
 from disco_hw.log.reader import open_log
 from disco_hw.processes import can_use_fifo
 from tools.emulated_board import build_board, missing, running_board
@@ -110,7 +109,8 @@ def run(directory, robot_file, others):
     log = directory / "run.mcap"
     with disco_hw_process("daemon", ["run", str(robot_file), "--log", str(log)], directory / "daemon.txt") as daemon:
         operator = Operator(directory / "control.sock", (daemon, *others))
-        arm(operator)
+        # An emulator that is held up while it starts has a clock that leaps: the daemon then meets it anew.
+        operator.arm()
         operator.request("start")
         far = lambda status: status["state"] != "ARMED" or status["task"]["laps"] >= LAPS  # noqa: E731
         status = operator.wait_until(f"{LAPS} laps", far, 4 * LAPS * LAP_S)
@@ -128,23 +128,6 @@ def joined(parts):
     """Columns of several logs, one after the other; a stage that one of them has not is 0 there."""
     names = {name for part in parts for name in part}
     return {name: np.concatenate([part.get(name, np.zeros(len(part["tick"]))) for part in parts]) for name in names}
-
-
-def arm(operator):
-    """Arm, a second time if need be: an emulator that is held up while it starts has a clock that leaps.
-
-    The daemon then meets the robot anew and drops the request, as it must.
-    """
-    for attempt in range(2):
-        operator.wait_for("READY", READY_TIMEOUT_S)
-        operator.request("arm")
-        try:
-            operator.wait_for("ARMED", 5.0)
-        except WorkError:
-            if attempt:
-                raise
-        else:
-            return
 
 
 def mean_square_m2(poses):
