@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from hypothesis.internal.conjecture import providers
 from xdist.scheduler import LoadScopeScheduling
 
 # The machine's load is not a property of the code: no example fails for being slow. A change is judged on the same
@@ -14,6 +15,14 @@ settings.load_profile("project")
 
 ROBOT_TESTS = Path(__file__).parent / "robot"
 REAL_TIME = ("tests/hil/", "tests/firmware_protocol/emulated/")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_configure(config):
+    if settings().derandomize:
+        # Examples take constants from what a process has imported so far, which is chance on three workers.
+        assert callable(providers._get_local_constants)
+        providers._get_local_constants = lambda: providers._local_constants
 
 
 class FilesToWorkers(LoadScopeScheduling):
