@@ -25,9 +25,12 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize_scalar
 from scipy.signal import lfilter
 
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap import model_of, offered_stage, search_log, written_of
 from disco_hw.gap.data.gridded_drive import grid_drive
+from disco_hw.gap.report import EffectFinding
 from disco_hw.gap.report.judge import Measured, effect_findings, sort_out, unnamed_findings
+from disco_hw.gap.report.page import known_besides
 from disco_hw.gap.search import joint_predictions
 from disco_hw.gap.search.analysis import final_fit
 from disco_hw.gap.settings import DEFAULT_SETTINGS
@@ -95,7 +98,8 @@ class Result:
         effect, parameter = NAMES.get(self.hidden, ("", ""))
         values = self.named.get(effect)
         if values is None:
-            return None
+            seen_too = REGISTRY[effect].witness if effect else None
+            return next(iter(self.named.get(seen_too or "", {}).values()), None)
         return values[parameter] if parameter else math.atan2(values["slide_y_m"], values["slide_x_m"])
 
     @property
@@ -334,7 +338,7 @@ def work(hidden: str, seed: int, robot: Robot = ROBOTS["middle"]) -> Result:
     return Result(
         hidden=hidden,
         seed=seed,
-        named={each.name: {key: part.value for key, part in each.parameters.items()} for each in named},
+        named=_values(named),
         unnamed=[term.form for term in unnamed],
         doubtful=[doubt.name for doubt in doubtful],
         truth=truth_of(hidden, seen, [term.form for term in unnamed]),
@@ -344,6 +348,13 @@ def work(hidden: str, seed: int, robot: Robot = ROBOTS["middle"]) -> Result:
         injected=injected_floor(seen),
         cpu_s=cpu_s,
     )
+
+
+def _values(named: Iterable[EffectFinding]) -> dict[str, dict[str, float]]:
+    """Values of what is named, by name; of what a parameter says by itself by its own name, too."""
+    values = {each.name: {key: part.value for key, part in each.parameters.items()} for each in named}
+    besides = {f"{each.name}.{key}": {key: each.parameters[key].value} for each in named for key in known_besides(each)}
+    return values | besides
 
 
 def row(of: Result) -> str:

@@ -203,8 +203,9 @@ class Effect:
     (L, P) in the order of `parameters`, `base` (L, 3) the geometry; arrays of shape (L,). `order` is the place among
     the effects of a stage, ascending.
 
-    How it is reported: `sentence` for a report, with `{parameter}` fields; `excitation`, the manoeuvre that shows it,
-    and `script`, the one of `disco-hw drive --script` that drives it; `symptoms`.
+    How it is reported: `sentence` for a report, with `{parameter}` fields; `besides`, pairs of a parameter and what
+    follows the sentence where that one is known, too; `excitation`, the manoeuvre that shows it, and `script`, the one
+    of `disco-hw drive --script` that drives it; `symptoms`.
 
     Traits: `uses_geometry`, whether its coefficients depend on the geometry; `may_turn_more`, whether it can make the
     robot turn faster than its wheels say; `late_by`, the parameter that is a time by which wheels are behind commands,
@@ -231,6 +232,7 @@ class Effect:
     term: Callable[..., Any] | None = None
     coefficients: Callable[[Array, Array, float], tuple[Array, ...]] = no_coefficients
     order: int = 0
+    besides: tuple[tuple[str, str], ...] = ()
     symptoms: tuple[Symptom, ...] = ()
     uses_geometry: bool = False
     may_turn_more: bool = False
@@ -247,11 +249,13 @@ class Effect:
 
     def __post_init__(self) -> None:
         keys = [parameter.name for parameter in self.parameters]
-        for key in (self.late_by, self.dead_by, None if self.scan is None else self.scan.parameter):
+        scanned = None if self.scan is None else self.scan.parameter
+        for key in (self.late_by, self.dead_by, scanned, *dict(self.besides)):
             if key is not None and key not in keys:
                 raise ValueError(f"{self.name}: has no parameter {key!r}, only {', '.join(keys)}")
         try:
-            self.sentence.format(**{parameter.name: parameter.start for parameter in self.parameters})
+            for text in (self.sentence, *dict(self.besides).values()):
+                text.format(**{parameter.name: parameter.start for parameter in self.parameters})
         except (KeyError, IndexError) as error:
             raise ValueError(f"{self.name}: its sentence names {error}, which is no parameter") from None
         if self.stage is Stage.TERMS:

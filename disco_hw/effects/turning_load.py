@@ -62,4 +62,11 @@ EFFECT = Effect(
     excitation="turning on the spot at two rates, both ways",
     script="spins",
     sentence="turning takes {load_rad_s:.2f} rad/s from each side's wheels, however fast the robot turns",
+    besides=(
+        (
+            "unequal",
+            "as it acts on the two sides, the right wheels are {unequal:+.2%} larger than the mean and the left "
+            "ones as much smaller",
+        ),
+    ),
 )

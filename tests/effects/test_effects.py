@@ -1,6 +1,7 @@
 """Every effect: registered, described, does what it says in kernel and reference, and nothing when neutral."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -65,10 +66,17 @@ def test_effects_describe_themselves(effect):
     for parameter in effect.parameters:
         assert parameter.low < parameter.high
         assert parameter.low <= parameter.start <= parameter.high
-    sentence = effect.sentence.format(**{p.name: p.start for p in effect.parameters})
-    assert sentence[0].islower()
-    assert "{" not in sentence
+    for text in (effect.sentence, *dict(effect.besides).values()):
+        sentence = text.format(**{p.name: p.start for p in effect.parameters})
+        assert sentence[0].islower()
+        assert "{" not in sentence
     assert effect.excitation
+
+
+@pytest.mark.parametrize("besides", [(("no", "no"),), (("unequal", "wheels are {no}"),)])
+def test_what_follows_a_sentence_is_of_a_parameter_and_names_parameters(besides):
+    with pytest.raises(ValueError, match=r"turning_load: .*'no'"):
+        replace(REGISTRY["turning_load"], besides=besides)
 
 
 @pytest.mark.parametrize(

@@ -34,6 +34,10 @@ def test_a_value_is_right_within_a_tenth():
     assert not result(truth=0.25).right
     assert not result(named={"command_delay": {"delay_s": 0.21}}).right
     assert not result("worn_tyre", truth=None).right
+    load = {"turning_load": {"load_rad_s": 0.5, "unequal": 0.0095}}
+    assert not result("unequal_wheels", named=load, truth=0.0097).right
+    assert result("unequal_wheels", named=load | {"turning_load.unequal": {"unequal": 0.0095}}, truth=0.0097).right
+    assert not result("unequal_wheels", named=load | {"turning_load.unequal": {"unequal": 0.0085}}, truth=0.0097).right
     downhill = result("slope", named={"downhill_slide": {"slide_x_m": -0.1, "slide_y_m": 0.1}}, truth=0.75 * math.pi)
     assert downhill.right
 

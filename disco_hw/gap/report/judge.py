@@ -290,7 +290,7 @@ def doubt_of(effect: EffectFinding, measured: Measured) -> str | None:
     for parameter, estimate in pairs:
         if _at_end(parameter, estimate.value, settings):
             return f"{_written(parameter, estimate)} lies at the end of its range"
-    if all(_unknown(parameter, estimate, settings) for parameter, estimate in pairs):
+    if all(hardly_known(parameter, estimate, settings) for parameter, estimate in pairs):
         said = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
         return f"{said} is hardly known: its interval is wider than the value"
     return _exceeded(described, pairs[0][1], measured) or measured.disputed.get(effect.name)
@@ -303,7 +303,7 @@ def _at_end(parameter: Parameter, value: float, settings: ReportSettings) -> boo
     return any(abs(value - end) <= settings.end_share * abs(end) for end in ends)
 
 
-def _unknown(parameter: Parameter, estimate: ParameterEstimate, settings: ReportSettings) -> bool:
+def hardly_known(parameter: Parameter, estimate: ParameterEstimate, settings: ReportSettings) -> bool:
     """Whether an interval is so wide that the value says little: wider than how far it is from neutral, nearly so of a
     limit.
     """

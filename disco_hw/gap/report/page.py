@@ -9,13 +9,24 @@ from html import escape
 from disco_hw import reports
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report import STAGES, EffectFinding, GapReport, UnnamedFinding
+from disco_hw.gap.report.judge import hardly_known
 from disco_hw.gap.search.cross_validation import PredictionErrors
+from disco_hw.gap.settings import DEFAULT_SETTINGS, ReportSettings
 
 
-def sentence(effect: EffectFinding) -> str:
+def known_besides(effect: EffectFinding, settings: ReportSettings = DEFAULT_SETTINGS.report) -> tuple[str, ...]:
+    """The parameters of a missing effect that say something by themselves, and are known."""
+    described = {parameter.name: parameter for parameter in REGISTRY[effect.name].parameters}
+    by_themselves = dict(REGISTRY[effect.name].besides)
+    return tuple(name for name in by_themselves if not hardly_known(described[name], effect.parameters[name], settings))
+
+
+def sentence(effect: EffectFinding, settings: ReportSettings = DEFAULT_SETTINGS.report) -> str:
     """What a missing effect does, with its values."""
     described = REGISTRY[effect.name]
-    said: str = described.sentence.format(**{name: e.value for name, e in effect.parameters.items()})
+    besides = dict(described.besides)
+    texts = (described.sentence, *(besides[name] for name in known_besides(effect, settings)))
+    said = "; ".join(text.format(**{name: e.value for name, e in effect.parameters.items()}) for text in texts)
     early = any(effect.parameters[p.name].value < p.low for p in described.parameters if p.least_fitted is not None)
     return f"{said} (before they come: a clock stamps too late)" if early else said
 
@@ -27,7 +38,7 @@ def answer(report: GapReport) -> list[str]:
     """The answer in at most four lines: what is missing, how far predictions are off, what to drive next, going on."""
     if report.effects:
         more = len(report.effects) - _MOST_NAMES
-        first = "; ".join(sentence(effect) for effect in report.effects[:_MOST_NAMES])
+        first = "; ".join(sentence(effect, report.settings.report) for effect in report.effects[:_MOST_NAMES])
         first += f"; and {more} more, listed below." if more > 0 else "."
     elif report.unnamed:
         first = f"Something is missing that has no name: {_in_words(report.unnamed[0])}."

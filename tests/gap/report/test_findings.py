@@ -155,6 +155,22 @@ def test_the_page_names_the_score_that_a_name_takes():
     assert accepts in page(report(0.014))
 
 
+@pytest.mark.parametrize(("wide", "said"), [(0.004, True), (0.006, False)])
+def test_that_wheels_are_unequal_is_said_where_only_their_load_shows_it_and_it_is_known(wide, said):
+    load = EffectFinding(
+        "turning_load",
+        "command_to_wheel",
+        {
+            "load_rad_s": ParameterEstimate(0.53, 0.5, 0.56),
+            "unequal": ParameterEstimate(-0.0095, -0.0095 - wide, -0.0095 + wide),
+        },
+        9.0,
+    )
+    found = replace(report(0.014), effects=(load,))
+    assert answer(found)[0].startswith("Turning takes 0.53 rad/s from each side's wheels, however fast the robot turns")
+    assert ("the right wheels are -0.95% larger than the mean" in answer(found)[0]) is said
+
+
 @pytest.mark.parametrize(("delay_s", "wrong"), [(0.12, False), (-0.17, True)])
 def test_a_response_before_its_command_is_said_to_be_a_wrong_clock(delay_s, wrong):
     late = EffectFinding(
