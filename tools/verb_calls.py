@@ -183,7 +183,10 @@ def without_work() -> Iterator[None]:
     patches += [patch(name, _after(name)) for name in _ENDS_AFTER]
     patches += [patch(name, instead) for name, instead in _WITHOUT.items()]
     # Of a call's time the command's own making is nine tenths, and the same each time.
-    patches += [patch("typer.main.get_command", cache(typer.main.get_command))]
+    patches += [
+        patch.object(cli, "app", cache(cli.app)),
+        patch("typer.main.get_command", cache(typer.main.get_command)),
+    ]
     with patch.object(sys, "argv", ["disco-hw"]):
         for one in patches:
             one.start()

@@ -240,6 +240,10 @@ def _display(socket: Path, shown: bool) -> Iterator[Any]:
         else:
             with closing(AsyncPrinter(STANDARD_OUTPUT, in_text)) as printer:
                 yield printer
+    except InputError:
+        # Nothing was driven, so there is nothing to wait for.
+        process.kill()
+        raise
     finally:
         try:
             process.wait(_DISPLAY_TIMEOUT_S)
