@@ -37,6 +37,7 @@ _END_TIMEOUT_S = 10.0
 _STILL_RAD_S = 0.05
 _STARTS = 3
 _CAUSES_OF_THIS_HOST = ("COMMAND_TIMEOUT", "COMMAND_EXPIRED", "HOST_SILENT")
+_ROBOT_SILENT = b"-> stopping: telemetry lost"
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,10 +193,6 @@ class TruthRow:
         return max(abs(self.setpoints[0]), abs(self.setpoints[1]))
 
 
-def _stopped_for_this_host(status: Mapping[str, Any]) -> bool:
-    return status["state"] != "ARMED" and status["stop_cause"] in _CAUSES_OF_THIS_HOST
-
-
 def _faster_than(speed_rad_s: float, status: Mapping[str, Any]) -> bool:
     return status["wheels"] is not None and max(map(abs, status["wheels"])) > speed_rad_s
 
@@ -220,17 +217,25 @@ class Stack:
     ) -> Mapping[str, Any]:
         """Arm, start, and wait until `reached` holds, called `what` in words; the status then.
 
-        A robot that stops because this busy machine sent it nothing in time is started again, twice at most.
+        A robot that stops because this busy machine held up the daemon or the robot is started again, twice at most.
         """
         for _ in range(_STARTS - 1):
+            said = len(self.daemon.output.read_bytes())
             self.start()
-            status = self.operator.wait_until(
-                what, lambda status: reached(status) or _stopped_for_this_host(status), timeout_s
-            )
+            over = partial(self._over, reached, said)
+            status = self.operator.wait_until(what, over, timeout_s)
             if reached(status):
                 return status
         self.start()
         return self.operator.wait_until(what, reached, timeout_s)
+
+    def _over(self, reached: Callable[[Mapping[str, Any]], bool], said: int, status: Mapping[str, Any]) -> bool:
+        """Whether that is reached, or the robot stopped as it, or the daemon, heard nothing of the other.
+
+        `said`: so many bytes the daemon had said before.
+        """
+        silent = status["stop_cause"] in _CAUSES_OF_THIS_HOST or _ROBOT_SILENT in self.daemon.output.read_bytes()[said:]
+        return reached(status) or bool(status["state"] != "ARMED" and silent)
 
     def start(self) -> None:
         """Arm and start the task."""

@@ -13,7 +13,7 @@ import pytest
 
 from disco_hw import experiments
 from disco_hw.errors import WorkError
-from disco_hw.experiments import Operator
+from disco_hw.experiments import Operator, Stack
 from disco_hw.experiments.demo import start_pose
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
@@ -77,6 +77,51 @@ def test_an_arming_is_not_asked_for_without_end_and_not_in_a_fault(monkeypatch, 
     with pytest.raises(WorkError, match=rf"not ARMED within 5 s \({ends[-1]}: so\)"):
         Operator(daemon.path).arm()
     assert len(daemon.asked_s) == asked
+
+
+class Driven:
+    """An operator whose first `lost` drives end for this reason, and all others at speed."""
+
+    def __init__(self, daemon, lost, cause, said):
+        self.output, self.lost, self.cause, self.said, self.started = daemon, lost, cause, said, 0
+
+    def arm(self):
+        pass
+
+    def request(self, what):
+        self.started += 1
+        if self.started <= self.lost:
+            self.output.write_bytes(self.output.read_bytes() + self.said)
+
+    def wait_until(self, what, accept, timeout_s):
+        fails = self.started <= self.lost
+        status = {"state": "READY", "stop_cause": self.cause} if fails else {"state": "ARMED", "stop_cause": "NONE"}
+        if not accept(status):
+            raise WorkError(f"not {what}")
+        return status
+
+
+@pytest.mark.parametrize(
+    ("lost", "cause", "said", "drives"),
+    [
+        (2, "COMMAND_TIMEOUT", b"", 3),
+        (2, "REQUESTED", b"event: armed -> stopping: telemetry lost\n", 3),
+        (1, "REQUESTED", b"event: armed -> stopping: an e-stop\n", None),
+        (3, "COMMAND_TIMEOUT", b"", None),
+    ],
+)
+def test_a_drive_that_a_busy_machine_held_up_is_begun_anew(tmp_path, lost, cause, said, drives):
+    output = tmp_path / "daemon.txt"
+    output.write_bytes(b"event: armed -> stopping: telemetry lost\n")
+    operator = Driven(output, lost, cause, said)
+    stack = Stack(tmp_path, tmp_path, None, SimpleNamespace(output=output), operator, None)
+    at_speed = lambda status: status["state"] == "ARMED"  # noqa: E731
+    if drives is None:
+        with pytest.raises(WorkError, match="not at speed"):
+            stack.drive_until("at speed", at_speed, 10.0)
+    else:
+        assert stack.drive_until("at speed", at_speed, 10.0)["state"] == "ARMED"
+        assert operator.started == drives
 
 
 class Compiling:
