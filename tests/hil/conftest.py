@@ -1,56 +1,74 @@
-"""A test in real time that fails while the host of this virtual machine holds it up is tried once more.
+"""A test in real time that fails while the host of this virtual machine, or its kernel, holds it up is tried once more.
 
-What the host takes of the processors stops robot, daemon and test alike, and the robot's watchdog then ends the drive,
-as it must: that says nothing of the code. Nothing else is tried again.
+Then robot, daemon and test are stopped alike, and the robot's watchdog ends the drive, as it must: that says nothing of
+the code. Nothing else is tried again.
 """
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 import threading
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from functools import cache
+from pathlib import Path
 
 import pytest
 from _pytest.runner import runtestprotocol
 
 from disco_hw import processes
+from tests.watched_processors import build_watcher, watched_processors
 
 STALL_MS = 100
 """Of all processors together, within half a second; a robot hears nothing for no longer than 100 ms."""
 PERIOD_S, LOOKS = 0.05, 10
+WATCH_US, LEAST_US = 5_000, 50_000
+FOLDER = tempfile.TemporaryDirectory(prefix="watched-")
+
+
+@cache
+def watcher() -> Path | None:
+    """What tells of pauses; None where it cannot be compiled or be above everything else."""
+    return build_watcher(Path(FOLDER.name)) if shutil.which("cc") and processes.can_use_fifo() else None
 
 
 @contextmanager
-def most_taken() -> Iterator[list[int]]:
-    """The most that the host took within LOOKS periods, in ms: one entry, there after the block."""
+def held_up_ms() -> Iterator[list[int]]:
+    """How long this machine held up what ran, one entry that is there after the block: the longest time for which a
+    processor ran nobody, or the most that the host took within LOOKS periods.
+    """
     most: list[int] = []
     ended = threading.Event()
+    worst = 0
 
     def watch() -> None:
+        nonlocal worst
         said = deque([processes.stolen_ms()], LOOKS + 1)
-        worst = 0
         while not ended.wait(PERIOD_S):
             said.append(processes.stolen_ms())
             worst = max(worst, said[-1] - said[0])
-        most.append(max(worst, processes.stolen_ms() - said[0]))
 
-    thread = threading.Thread(target=watch)
-    thread.start()
-    try:
-        yield most
-    finally:
-        ended.set()
-        thread.join()
+    program, thread = watcher(), threading.Thread(target=watch)
+    watching = nullcontext(list) if program is None else watched_processors(program, program.parent, WATCH_US, LEAST_US)
+    with watching as paused:
+        thread.start()
+        try:
+            yield most
+        finally:
+            ended.set()
+            thread.join()
+            most.append(max(worst, *((to - since) // 1_000_000 for since, to in paused()), 0))
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool:
     item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
-    with most_taken() as most:
+    with held_up_ms() as most:
         reports = runtestprotocol(item, log=False, nextitem=nextitem)
     if most[0] >= STALL_MS and any(report.failed and report.when == "call" for report in reports):
-        item.warn(pytest.PytestWarning(f"tried once more: the host took {most[0]} ms of the processors at once"))
+        item.warn(pytest.PytestWarning(f"tried once more: this machine ran nothing for {most[0]} ms"))
         reports = runtestprotocol(item, log=False, nextitem=nextitem)
     for report in reports:
         item.ihook.pytest_runtest_logreport(report=report)

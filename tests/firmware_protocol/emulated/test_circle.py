@@ -1,13 +1,9 @@
 """The paper's circle, driven by the real daemon through an emulated board, as closely as through the virtual robot."""
 
-import contextlib
 import csv
 import math
-import os
 import statistics
-import subprocess
 from collections import defaultdict
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +11,7 @@ import pytest
 from disco_hw.experiments import Operator, disco_hw_process, write_robot_file
 from disco_hw.log.reader import open_log
 from disco_hw.processes import can_use_fifo
+from tests.watched_processors import build_watcher, watched_processors
 from tools.emulated_board import build_board, missing, running_board
 
 pytestmark = [
@@ -28,33 +25,7 @@ LAPS = 3.25
 LAP_S = 2 * math.pi * RADIUS_M / 0.2
 START = ("0.75", "0.0", "1.5707963")
 PERIOD_NS = 20_000_000
-BARE_LOOP = Path(__file__).parents[3] / "tools" / "bare_loop.c"
 LEAST_PAUSE_US = 500
-
-
-@contextlib.contextmanager
-def watched_processors(folder):
-    """A program on each processor that sleeps for a millisecond at a time, above everything else.
-
-    Yields a function that tells when they were not run: from when to when, ns, on any of them. The computer's own host
-    has done that, or its kernel; no program of ours can.
-    """
-    program = folder / "watch"
-    subprocess.run(["cc", "-std=c99", "-O2", "-o", str(program), str(BARE_LOOP)], check=True)
-    with contextlib.ExitStack() as stack:
-        said = []
-        for processor in sorted(os.sched_getaffinity(0)):
-            said.append(folder / f"paused-{processor}")
-            sink = stack.enter_context(said[-1].open("wb"))
-            command = [str(program), "1000", "99" if can_use_fifo() else "0", str(processor), str(LEAST_PAUSE_US)]
-            watch = stack.enter_context(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=sink))
-            stack.callback(watch.kill)
-
-        def paused():
-            pauses = [tuple(map(int, line.split())) for path in said for line in path.read_text().splitlines()]
-            return sorted(pauses)
-
-        yield paused
 
 
 def own_overruns(deadlines_ns, ends_ns, pauses):
@@ -88,7 +59,7 @@ def drive(directory, robot_file, others=()):
 
     Returns how many overruns were the daemon's own, or the emulator's; and what its log says of its loop, in words.
     """
-    with watched_processors(directory) as paused:
+    with watched_processors(build_watcher(directory), directory, 1000, LEAST_PAUSE_US) as paused:
         parts = run(directory, robot_file, others)
         pauses = paused()
     loop = joined([part.columns("/loop") for part in parts])
