@@ -37,7 +37,7 @@ _END_TIMEOUT_S = 10.0
 _STILL_RAD_S = 0.05
 _STARTS = 3
 _CAUSES_OF_THIS_HOST = ("COMMAND_TIMEOUT", "COMMAND_EXPIRED", "HOST_SILENT")
-_ROBOT_SILENT = b"-> stopping: telemetry lost"
+_ROBOT_SILENT = "-> stopping: telemetry lost"
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,9 +48,13 @@ class Child:
     process: subprocess.Popen[bytes]
     output: Path
 
+    def said(self) -> str:
+        """All that it wrote so far."""
+        return self.output.read_text(encoding="utf-8", errors="replace")
+
     def last_words(self) -> str:
         """The last line it wrote."""
-        lines = self.output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        lines = self.said().strip().splitlines()
         return lines[-1] if lines else ""
 
 
@@ -220,7 +224,7 @@ class Stack:
         A robot that stops because this busy machine held up the daemon or the robot is started again, twice at most.
         """
         for _ in range(_STARTS - 1):
-            said = len(self.daemon.output.read_bytes())
+            said = len(self.daemon.said())
             self.start()
             over = partial(self._over, reached, said)
             status = self.operator.wait_until(what, over, timeout_s)
@@ -232,9 +236,9 @@ class Stack:
     def _over(self, reached: Callable[[Mapping[str, Any]], bool], said: int, status: Mapping[str, Any]) -> bool:
         """Whether that is reached, or the robot stopped as it, or the daemon, heard nothing of the other.
 
-        `said`: so many bytes the daemon had said before.
+        `said`: so many characters the daemon had said before.
         """
-        silent = status["stop_cause"] in _CAUSES_OF_THIS_HOST or _ROBOT_SILENT in self.daemon.output.read_bytes()[said:]
+        silent = status["stop_cause"] in _CAUSES_OF_THIS_HOST or _ROBOT_SILENT in self.daemon.said()[said:]
         return reached(status) or bool(status["state"] != "ARMED" and silent)
 
     def start(self) -> None:

@@ -114,7 +114,7 @@ def test_a_drive_that_a_busy_machine_held_up_is_begun_anew(tmp_path, lost, cause
     output = tmp_path / "daemon.txt"
     output.write_bytes(b"event: armed -> stopping: telemetry lost\n")
     operator = Driven(output, lost, cause, said)
-    stack = Stack(tmp_path, tmp_path, None, SimpleNamespace(output=output), operator, None)
+    stack = Stack(tmp_path, tmp_path, None, SimpleNamespace(said=output.read_text), operator, None)
     at_speed = lambda status: status["state"] == "ARMED"  # noqa: E731
     if drives is None:
         with pytest.raises(WorkError, match="not at speed"):

@@ -61,12 +61,13 @@ NO_FILES = {
 def test_what_is_no_plain_file_of_its_size_is_refused(tmp_path, make, words, read):
     path = tmp_path / "robot.toml"
     make(path)
-    before = len(os.listdir("/proc/self/fd"))
+    before = set(os.listdir("/proc/self/fd"))
     with pytest.raises(InputError, match=words) as refused:
         read(path, ROBOT_TOML)
     assert "\n" not in str(refused.value)
     assert str(refused.value).startswith(f"{path}: ")
-    assert len(os.listdir("/proc/self/fd")) == before
+    # What others have left behind may be closed meanwhile, as garbage.
+    assert set(os.listdir("/proc/self/fd")) <= before
 
 
 def test_a_file_whose_size_says_nothing_is_read_no_further_than_its_kind_goes():
