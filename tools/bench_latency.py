@@ -18,7 +18,6 @@ from disco_hw.log.reader import open_log
 
 WHEEL_COMMAND, WHEEL_TICKS = 0x100, 0x111
 SETTLED_S = 2.0
-READY_TIMEOUT_S = 400.0
 
 
 def run(seconds: float = 20.0) -> dict[str, float]:

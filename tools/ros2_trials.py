@@ -27,8 +27,15 @@ from typing import Any
 
 from disco_hw.config import load_robot_config
 from disco_hw.errors import WorkError
-from disco_hw.experiments import FAST_START, FAST_TASK, Operator, disco_hw_process, stands, write_robot_file
-from tools.bench_latency import READY_TIMEOUT_S
+from disco_hw.experiments import (
+    FAST_START,
+    FAST_TASK,
+    READY_TIMEOUT_S,
+    Operator,
+    disco_hw_process,
+    stands,
+    write_robot_file,
+)
 
 DOMAIN = 91
 STOPPING_S = 1.0

@@ -85,14 +85,13 @@ class Axis:
         self.fed += 1
         self.watchdog_left = int(f32(f32(self.watchdog_timeout_s) * 1000.0 * CHECKS_PER_MS))
 
-    def check_watchdog(self, error: int, checks: int = 1) -> None:
-        """So many of the 8 checks in a millisecond."""
+    def check_watchdog(self, error: int) -> None:
+        """One of the 8 checks in a millisecond."""
         if not self.watchdog_enabled:
             return
-        if self.watchdog_left >= checks:
-            self.watchdog_left -= checks
+        if self.watchdog_left > 0:
+            self.watchdog_left -= 1
         else:
-            self.watchdog_left = 0
             self.fail(error)
 
     def fail(self, error: int) -> None:
@@ -227,8 +226,9 @@ class OdriveBoard:
 
     def step(self, now_ms: int) -> list[CanFrame]:
         """Go through one millisecond: watchdogs, states, cyclic messages; return the frames to send."""
+        for _ in range(CHECKS_PER_MS):
+            self.check_watchdogs()
         for axis in self.axes:
-            axis.check_watchdog(WATCHDOG_ERROR[self.generation], CHECKS_PER_MS)
             axis.run_state_machine()
         return self.cyclic(now_ms)
 

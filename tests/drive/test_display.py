@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import io
 import threading
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
 from disco_hw.daemon.control_socket import ControlServer
+from disco_hw.drive import drive_command
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.terminal import line, show, table
+from disco_hw.errors import InputError, WorkError
 
 COVERAGE = Coverage(8.0)
 for _tick in range(251):
@@ -74,3 +77,13 @@ def test_it_shows_the_daemon_and_ends_with_it(tmp_path, terminal):
         shown.join(10.0)
     assert not shown.is_alive()
     assert "5 s driven" in console.file.getvalue()
+
+
+@pytest.mark.parametrize(("error", "killed"), [(InputError("a key"), True), (WorkError("the link"), False)])
+def test_what_shows_a_drive_is_not_waited_for_where_nothing_was_driven(monkeypatch, tmp_path, error, killed):
+    done = []
+    shows = SimpleNamespace(kill=lambda: done.append("killed"), wait=lambda timeout_s: done.append("waited"))
+    monkeypatch.setattr(drive_command.subprocess, "Popen", lambda *_args, **_options: shows)
+    with pytest.raises(type(error)), drive_command._display(tmp_path / "control.sock", shown=True):
+        raise error
+    assert done == ["killed"] * killed + ["waited"]

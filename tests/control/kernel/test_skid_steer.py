@@ -215,12 +215,14 @@ def check_against_reference(model, state, task, plan_settings, seed):
     assert not got[~weighed].any()
     got = got[weighed]
     apart = ~np.isclose(got, expected, atol=1e-4, rtol=RELATIVE).all(axis=0)
+    if apart.mean() >= FEW:
+        # By the reference alone: a robot just so far off a path that its steps end on an edge says nothing of the rest.
+        assume(beyond_single_precision(commands).mean() < FEW)
+    assert apart.mean() < FEW
     excused = apart.copy()
     if apart.any():
         excused[apart] = beyond_single_precision(commands[apart])
     np.testing.assert_allclose(got[:, ~excused], expected[:, ~excused], atol=1e-4, rtol=RELATIVE)
-    # A robot that is just so far off a path that all of its steps end on an edge says nothing of the rest.
-    assume(excused.mean() < FEW)
 
     mean = oracle.mean_risk(np.where(excused, got, expected), point_weights[weighed])
     np.testing.assert_allclose(work.costs[: sampler.samples], mean, atol=1e-4, rtol=RELATIVE)
