@@ -57,23 +57,32 @@ NO_FILES = {
 }
 
 
+def leaves_as_open(refused):
+    """Whether as many files are open after a refusal: in a fork: no thread or garbage of other tests closes any."""
+    child = os.fork()
+    if child == 0:
+        gc.disable()
+        before, after = len(os.listdir("/proc/self/fd")), None
+        try:
+            refused()
+        except InputError:
+            after = len(os.listdir("/proc/self/fd"))
+        finally:
+            os._exit(0 if after == before else 1)
+    _, status = os.waitpid(child, 0)
+    return os.waitstatus_to_exitcode(status) == 0
+
+
 @pytest.mark.parametrize("read", [open_file, read_bytes, lambda path, kind: list(read_lines(path, kind)), read_toml])
 @pytest.mark.parametrize(("make", "words"), NO_FILES.values(), ids=NO_FILES)
 def test_what_is_no_plain_file_of_its_size_is_refused(tmp_path, make, words, read):
     path = tmp_path / "robot.toml"
     make(path)
-    # What other tests have left behind is not closed as garbage meanwhile.
-    gc.disable()
-    before = len(os.listdir("/proc/self/fd"))
-    try:
-        with pytest.raises(InputError, match=words) as refused:
-            read(path, ROBOT_TOML)
-        after = len(os.listdir("/proc/self/fd"))
-    finally:
-        gc.enable()
+    with pytest.raises(InputError, match=words) as refused:
+        read(path, ROBOT_TOML)
     assert "\n" not in str(refused.value)
     assert str(refused.value).startswith(f"{path}: ")
-    assert after == before
+    assert leaves_as_open(lambda: read(path, ROBOT_TOML))
 
 
 def test_a_file_whose_size_says_nothing_is_read_no_further_than_its_kind_goes():
@@ -275,3 +284,16 @@ def test_what_would_be_found(source, call):
 )
 def test_what_is_let_be(source):
     assert not reads(source)
+
+
+def test_a_file_that_stays_open_or_is_closed_for_others_is_noticed():
+    def leaks():
+        os.open("/dev/null", os.O_RDONLY)
+        raise InputError("left open")
+
+    def closes():
+        os.close(0)
+        raise InputError("not its own")
+
+    assert not leaves_as_open(leaks)
+    assert not leaves_as_open(closes)
