@@ -27,7 +27,7 @@ SETTLED_S, JUDGED_S = 10.0, 25.0
 COST = 0.022
 """Mean tracking cost on the truth: 0.013 learning, 0.033 not learning."""
 RELEARNT_COST = 0.0145
-"""Mean tracking cost after a change of 15 % was learnt: 0.0127 measured. Before it, at another part of the lap, 0.0110."""
+"""Mean tracking cost after a change of 15 % was learnt: 0.0127; 0.0110 before it, at another part of the lap."""
 
 
 def driven_otherwise(directory, adaptation):
