@@ -36,7 +36,7 @@ from disco_hw.daemon.daemon import Daemon, Say
 from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path, tick_feed_path
 from disco_hw.daemon.process import STANDARD_OUTPUT, AsyncPrinter, StopPath, StopSignals
-from disco_hw.errors import InputError
+from disco_hw.errors import InputError, LogError
 from disco_hw.log import DBC, Attachment, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, RecordingSettings
 from disco_hw.processes import end_with_parent
@@ -155,12 +155,14 @@ def serve(
     stop = StopPath()
     with StopSignals() as signals:
         try:
-            return _start(setup, key, transport, pipeline, log_file, signals, stop, say, pilot, adapt, ask).run()
+            code = _start(setup, key, transport, pipeline, log_file, signals, stop, say, pilot, adapt, ask).run()
         finally:
             # Whatever is interrupted here, the wheels come first: they were added last.
-            for outcome in stop.run():
+            outcomes = stop.run()
+            for outcome in outcomes:
                 if not outcome.ok:
                     say("stop", f"{outcome.name}: {outcome.error}")
+        return code or int(any(outcome.name == _RECORDER and not outcome.ok for outcome in outcomes))
 
 
 def _start(
@@ -189,7 +191,7 @@ def _start(
     recorder = WatchedRecorder(_make_recorder(setup, log), feed, ticks)
     if ask is not None and log is not None:
         stop.add("log", lambda: say("log", f"look at it: disco-hw view {log}, or disco-hw log info {log}"))
-    stop.add("recorder", lambda: _close_recorder(recorder, say))
+    stop.add(_RECORDER, lambda: _close_recorder(recorder, say))
     adaptation: GeometryAdaptation | None = None
     match adapt:
         case "network":
@@ -247,12 +249,18 @@ def _make_recorder(setup: Setup, log: Path | None) -> Recorder:
 
 
 def _close_recorder(recorder: Recorder, say: Say) -> None:
+    """End the log and report where its ticks are; raises LogError if some are in no file."""
     stats = recorder.close()
     for sentence in recorder.news():
         say("recording", sentence)
     if stats.path:
         # No fault: of those `drive` makes a drive that is not whole.
         say("log", recording_in_words(asdict(stats)))
+    if stats.waiting_ticks or stats.dropped_ticks:
+        raise LogError("the log is not whole; free space on its disk before the next drive")
+
+
+_RECORDER = "recorder"
 
 
 def in_text(topic: str, text: str) -> str:
