@@ -22,6 +22,7 @@ from typing import Any
 
 from disco_hw.config import RobotConfig, load_daemon_address
 from disco_hw.errors import InputError, WorkError
+from disco_hw.files import file_name_of
 from disco_hw.runtime import advice, by_command, status_headline
 from drivers.private_files import placed_by, user_name, why_not_private
 from drivers.types import SAID_BY_WORDS, SaidBy
@@ -41,7 +42,7 @@ def default_socket_path(name: str) -> Path:
     given the socket in another user's XDG_RUNTIME_DIR if there is one.
     """
     uid = os.geteuid()
-    file_name = re.sub(r"[^A-Za-z0-9_-]", "_", name) + ".sock"
+    file_name = f"{file_name_of(name)}.sock"
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     if runtime:
         directory = Path(runtime) / "disco-hw"

@@ -37,6 +37,7 @@ from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path, tick_feed_path
 from disco_hw.daemon.process import STANDARD_OUTPUT, AsyncPrinter, StopPath, StopSignals
 from disco_hw.errors import InputError, LogError
+from disco_hw.files import file_name_of
 from disco_hw.log import DBC, Attachment, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, RecordingSettings
 from disco_hw.processes import end_with_parent
@@ -236,7 +237,7 @@ def _log_path(config: RobotConfig, log_file: Path | None) -> Path | None:
     if log_file is not None or not config.log.enabled:
         return log_file
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-    return Path(config.log.directory) / f"{config.robot.name}-{stamp}.mcap"
+    return Path(config.log.directory) / f"{file_name_of(config.robot.name)}-{stamp}.mcap"
 
 
 def _make_recorder(setup: Setup, log: Path | None) -> Recorder:

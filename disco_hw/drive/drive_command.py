@@ -25,6 +25,7 @@ from disco_hw.drive.script import Script, ScriptSource, Unattended, in_table, ro
 from disco_hw.drive.scripts import make_script
 from disco_hw.drive.terminal import HELP, Keyboard, KeyHold
 from disco_hw.errors import InputError, LogError
+from disco_hw.files import file_name_of
 from disco_hw.log.reader import open_log
 from disco_hw.runtime.robot_setup import load_setup
 from drivers.gamepad import Gamepad, GamepadError, GamepadMapping, open_gamepad
@@ -212,7 +213,7 @@ def _gamepad(config: RobotConfig, top_rad_s: float) -> GamepadSource:
 
 def _new_log(config: RobotConfig) -> Path:
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-    return Path(config.log.directory) / f"{config.robot.name}-drive-{stamp}.mcap"
+    return Path(config.log.directory) / f"{file_name_of(config.robot.name)}-drive-{stamp}.mcap"
 
 
 @contextmanager
