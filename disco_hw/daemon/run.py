@@ -102,10 +102,12 @@ def run_daemon(
     options: DaemonOptions,
     make_pilot: Callable[[RobotConfig], Pilot] = lambda _config: TaskPilot(),
     law: Law | None = None,
+    page_news: Callable[[], tuple[str, ...]] = lambda: (),
 ) -> int:
     """Run until SIGTERM, SIGINT or a quit request; returns the exit code, after a stop was sent to the robot.
 
-    `make_pilot`: of who drives; the task alone, unless it is said. `law`: plans in DISCO's place.
+    `make_pilot`: of who drives; the task alone, unless it is said. `law`: plans in DISCO's place. `page_news`: what
+    happened to the page, to be recorded.
     Raises InputError, before anything is opened, if a file or an option is wrong. An exception in the loop is reported,
     the robot stopped, and the exception passed on.
     """
@@ -126,6 +128,7 @@ def run_daemon(
             lambda: make_planner(setup.config, setup.model) if law is None else _controller(law, setup),
             adapt,
             by_command(options.robot),
+            page_news,
         )
 
 
@@ -141,6 +144,7 @@ def serve(
     new_planner: Callable[[], Planner] = NoPlanner,
     adapt: Adapt = "off",
     ask: Ask | None = None,
+    page_news: Callable[[], tuple[str, ...]] = lambda: (),
 ) -> int:
     """Run until SIGTERM, SIGINT, a quit request or the pilot's end, as `run_daemon`; returns the exit code.
 
@@ -156,7 +160,9 @@ def serve(
     stop = StopPath()
     with StopSignals() as signals:
         try:
-            code = _start(setup, key, transport, pipeline, log_file, signals, stop, say, pilot, adapt, ask).run()
+            code = _start(
+                setup, key, transport, pipeline, log_file, signals, stop, say, pilot, adapt, ask, page_news
+            ).run()
         finally:
             # Whatever is interrupted here, the wheels come first: they were added last.
             outcomes = stop.run()
@@ -178,6 +184,7 @@ def _start(
     pilot: Pilot,
     adapt: Adapt,
     ask: Ask | None,
+    page_news: Callable[[], tuple[str, ...]],
 ) -> Daemon:
     """Make everything, in the order that real time needs, and add to the stop path what must be undone."""
     config = setup.config
@@ -215,7 +222,7 @@ def _start(
     stop.add("pose source", core.pose_source.close)
     if isinstance(pilot, FindsWiring):
         core.directions = None
-    daemon = Daemon(core, server, recorder, MonotonicClock(), signals, say, pilot, ask)
+    daemon = Daemon(core, server, recorder, MonotonicClock(), signals, say, pilot, ask, page_news)
     stop.add("wheels", daemon.stop_wheels)
     if config.daemon.realtime_priority:
         say("real time", str(processes.raise_loop_thread(config.daemon.realtime_priority)))

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -88,8 +88,8 @@ class DriveResult:
         return f"{self.ended}\n{self.coverage_words}\nlog {self.log}{lost}"
 
 
-def run_drive(options: DriveOptions) -> DriveResult:
-    """Drive by keyboard, gamepad or script until that ends, and record it.
+def run_drive(options: DriveOptions, page_news: Callable[[], tuple[str, ...]] = lambda: ()) -> DriveResult:
+    """Drive by keyboard, gamepad or script until that ends, and record it; `page_news` as for `run_daemon`.
 
     Runs the daemon's loop with its governor, supervisor and recorder; there is no planner, and no pose is needed.
     Raises InputError for wrong options, files and devices.
@@ -114,7 +114,7 @@ def run_drive(options: DriveOptions) -> DriveResult:
                     said.append(text)
                 say(topic, text)
 
-            serve(setup, log_file, report, HandPilot(source, coverage, page))
+            serve(setup, log_file, report, HandPilot(source, coverage, page), page_news=page_news)
     finally:
         source.close()
     # A writer that was slow for a second and then wrote all that had waited has lost nothing.

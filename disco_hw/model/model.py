@@ -284,11 +284,11 @@ class Model:
             for believed, mean, variance in zip(self.belief.names, self.belief.mean().tolist(), variances, strict=True):
                 parameter = self.parameters[believed]
                 _check_range(f"belief: mean of {believed}", parameter, mean)
-                if not variance <= (parameter.high - parameter.low) ** 2:
+                std, width, unit = math.sqrt(variance), parameter.high - parameter.low, parameter.unit
+                if not std <= width:
                     raise ValueError(
-                        f"belief: standard deviation of {believed} is {math.sqrt(variance):.3g} {parameter.unit}, wider "
-                        f"than its whole range of {parameter.high - parameter.low:.4g} {parameter.unit}; "
-                        "write the model again with `disco-hw infer`"
+                        f"belief: standard deviation of {believed} is {std:.3g} {unit}, wider than its whole range of "
+                        f"{width:.4g} {unit}; write the model again with `disco-hw infer`"
                     )
 
     @classmethod

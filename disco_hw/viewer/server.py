@@ -172,7 +172,8 @@ def _guarded(guard: Guard, desk: Desk | None, listener: socket.socket) -> Iterat
         return serve(
             handle,
             process_request=process,
-            create_connection=counted_connections(admission),
+            # A factory serves as well as a class, says the documentation of websockets.
+            create_connection=counted_connections(admission),  # type: ignore[arg-type]
             open_timeout=REQUEST_TIMEOUT_S,
             backlog=admission.per_turn,
             sock=listener,
