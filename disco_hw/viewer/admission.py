@@ -7,6 +7,9 @@ descriptor of the process and every turn of its event loop.
 from __future__ import annotations
 
 import logging
+import math
+import socket
+import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -19,8 +22,11 @@ REQUEST_TIMEOUT_S = 3.0
 _MOST_UNPROVEN = 64
 _LEAST_UNPROVEN = 8
 _FREE_PER_UNPROVEN = 4
-_UNPROVEN_PER_TURN = 4
 _REPEAT_S = 1.0
+_FLOOD_S = 1.0
+_FLOOD_PAUSE_S = 0.001
+ACCEPTED_PER_TURN = 8
+"""How many connections the event loop accepts before it looks at what else has come, as an e-stop."""
 
 
 class Abortable(Protocol):
@@ -39,9 +45,7 @@ class Admission:
     def __init__(self, most: int | None = None) -> None:
         room = free_descriptors() // _FREE_PER_UNPROVEN
         self.most = min(_MOST_UNPROVEN, max(_LEAST_UNPROVEN, room)) if most is None else most
-        # Accepted in one turn of the event loop, before any of them is read.
-        self.per_turn = max(1, self.most // _UNPROVEN_PER_TURN)
-        self.closed = 0
+        self._closed_s = -math.inf
         self._unproven: dict[Abortable, None] = {}
 
     def arrive(self, transport: Abortable) -> None:
@@ -50,8 +54,13 @@ class Admission:
         if len(self._unproven) > self.most:
             oldest = next(iter(self._unproven))
             del self._unproven[oldest]
-            self.closed += 1
+            self._closed_s = time.monotonic()
             oldest.abort()
+
+    @property
+    def is_flooded(self) -> bool:
+        """Whether a connection had to make room for a newer one within the last second."""
+        return time.monotonic() - self._closed_s < _FLOOD_S
 
     def prove(self, transport: Abortable) -> None:
         """Note that a connection has shown the token: it stays."""
@@ -59,6 +68,23 @@ class Admission:
 
     # One that has ended needs no place any more.
     leave = prove
+
+
+class PacedListener(socket.socket):
+    """A listening socket that accepts at most a thousand connections a second while the page is flooded.
+
+    Each pause leaves the processor and the interpreter to the threads that stop the robot. Takes over `listener`.
+    """
+
+    def __init__(self, listener: socket.socket, admission: Admission) -> None:
+        super().__init__(fileno=listener.detach())
+        self._admission = admission
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """Accept a connection as `socket.accept` does, after a pause if there are too many."""
+        if self._admission.is_flooded:
+            time.sleep(_FLOOD_PAUSE_S)
+        return super().accept()
 
 
 class _CountedConnection(ServerConnection):

@@ -30,7 +30,14 @@ from websockets.http11 import Request, Response
 
 from disco_hw.errors import InputError
 from disco_hw.viewer import DEFAULT_PORT, LOOPBACK, page_address, page_token
-from disco_hw.viewer.admission import REQUEST_TIMEOUT_S, Admission, OncePerSecond, counted_connections
+from disco_hw.viewer.admission import (
+    ACCEPTED_PER_TURN,
+    REQUEST_TIMEOUT_S,
+    Admission,
+    OncePerSecond,
+    PacedListener,
+    counted_connections,
+)
 from disco_hw.viewer.operator_controls import Desk
 
 _LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost"})
@@ -108,8 +115,9 @@ def serving(label: str, host: str = LOOPBACK, port: int = DEFAULT_PORT, desk: De
         guard = Guard(page_token(), local=host == LOOPBACK)
     except ValueError as error:
         raise InputError(str(error)) from None
-    listener = _listen(host, port)
-    with _guarded(guard, desk, listener), redirect_stdout(io.StringIO()):
+    admission = Admission()
+    listener = PacedListener(_listen(host, port), admission)
+    with _guarded(guard, desk, listener, admission), redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     # What waits to be accepted may be many, though the event loop takes few at a turn.
     listener.listen(_WAITING_CONNECTIONS)
@@ -130,14 +138,13 @@ def serving(label: str, host: str = LOOPBACK, port: int = DEFAULT_PORT, desk: De
 
 
 @contextmanager
-def _guarded(guard: Guard, desk: Desk | None, listener: socket.socket) -> Iterator[None]:
+def _guarded(guard: Guard, desk: Desk | None, listener: socket.socket, admission: Admission) -> Iterator[None]:
     """Put the guard before every request of the server made inside the block, and the desk beside its page.
 
     The server accepts on `listener`, in place of a port of its own, and no more connections than the admission allows.
     """
     serve = websockets.asyncio.server.serve
     instance = secrets.token_hex(8)
-    admission = Admission()
     logger = logging.getLogger("websockets.server")
     limit = OncePerSecond()
     for repeating in (logger, logging.getLogger("asyncio")):
@@ -175,7 +182,7 @@ def _guarded(guard: Guard, desk: Desk | None, listener: socket.socket) -> Iterat
             # A factory serves as well as a class, says the documentation of websockets.
             create_connection=counted_connections(admission),  # type: ignore[arg-type]
             open_timeout=REQUEST_TIMEOUT_S,
-            backlog=admission.per_turn,
+            backlog=ACCEPTED_PER_TURN,
             sock=listener,
             **options,
         )
