@@ -78,8 +78,10 @@ class KeptConnection:
         """Whether there is a connection on which the daemon has neither hung up nor left anything unread."""
         if self._connection is None:
             return False
+        # With a timeout set Python itself waits, whatever the flags say.
+        self._connection.settimeout(0.0)
         try:
-            self._connection.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+            self._connection.recv(1, socket.MSG_PEEK)
         except BlockingIOError:
             return True
         except OSError:

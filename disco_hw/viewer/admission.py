@@ -24,8 +24,8 @@ _LEAST_UNPROVEN = 8
 _FREE_PER_UNPROVEN = 4
 _REPEAT_S = 1.0
 _FLOOD_S = 1.0
-_FLOOD_PAUSE_S = 0.001
-ACCEPTED_PER_TURN = 8
+_FLOOD_PAUSE_S = 0.002
+ACCEPTED_PER_TURN = 4
 """How many connections the event loop accepts before it looks at what else has come, as an e-stop."""
 
 
@@ -71,7 +71,7 @@ class Admission:
 
 
 class PacedListener(socket.socket):
-    """A listening socket that accepts at most a thousand connections a second while the page is flooded.
+    """A listening socket that accepts at most 500 connections a second while the page is flooded.
 
     Each pause leaves the processor and the interpreter to the threads that stop the robot. Takes over `listener`.
     """

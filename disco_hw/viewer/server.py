@@ -44,7 +44,7 @@ _LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost"})
 _COOKIE = "disco-hw-token"
 _DESK_PATH = "/desk"
 _INSTANCE_PATH = "/instance"
-_WAITING_CONNECTIONS = 4096
+_WAITING_CONNECTIONS = 256
 Answer = Callable[[Any, Request], Response | None]
 Handler = Callable[[Any], Awaitable[None]]
 
