@@ -99,7 +99,7 @@ def test_a_writer_that_was_slow_has_lost_nothing_where_the_log_proves_it(tmp_pat
     log = tmp_path / "drive.mcap"
     pauses = "the log writer has not answered for 0.8 s; what comes is kept and waits"
 
-    def served(_setup, path, say, _pilot):
+    def served(_setup, path, say, _pilot, **_options):
         write_log(path, ticks=60)
         os.truncate(path, path.stat().st_size - cut_off)
         say("recording", pauses)
