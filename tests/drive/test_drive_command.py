@@ -86,7 +86,7 @@ def test_the_result_is_for_people_and_machines():
 
 @pytest.mark.parametrize("said", [("event", "armed"), ("recording", "the log writer died (signal 9)")])
 def test_a_drive_whose_log_is_not_whole_is_not_completed(tmp_path, monkeypatch, said):
-    monkeypatch.setattr("disco_hw.drive.drive_command.serve", lambda _setup, _log, say, _pilot: say(*said))
+    monkeypatch.setattr("disco_hw.drive.drive_command.serve", lambda _setup, _log, say, _pilot, **_: say(*said))
     result = run_drive(DriveOptions(write_robot_file(tmp_path), page=True, as_json=True))
     whole = said[0] != "recording"
     assert result.completed is whole
