@@ -22,24 +22,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import msgspec
-
 from drivers.pose import PoseSourceError
-from drivers.pose.udp import LONGEST_DATAGRAM, MOST_A_TICK, pose_of
+from drivers.pose.udp import LONGEST_DATAGRAM, MOST_A_TICK, pose_of, words_of
 from drivers.types import PoseSample
 
 SOURCE = "nmea"
 _READER = "drivers.pose.nmea"
 _END_TIMEOUT_S = 1.0
-
-
-class Words(msgspec.Struct, frozen=True):
-    """A sentence of the reader for a person."""
-
-    said: str
-
-
-_WORDS = msgspec.json.Decoder(Words)
 
 
 def make_pose_source(
@@ -89,8 +78,8 @@ class NmeaPoses:
                 pose = pose_of(message, now_ns)
                 if pose is not None:
                     poses.append(pose)
-                else:
-                    self._keep_words(message)
+                elif (words := words_of(message)) is not None:
+                    self._said.append(words)
         return poses
 
     def news(self) -> Sequence[str]:
@@ -119,10 +108,6 @@ class NmeaPoses:
             self._ended = True
             self._said.append("the process that reads the GPS receiver has ended; restart the daemon")
         return message
-
-    def _keep_words(self, message: bytes) -> None:
-        with contextlib.suppress(msgspec.MsgspecError):
-            self._said.append(_WORDS.decode(message).said)
 
 
 DAY_S = 86_400.0
