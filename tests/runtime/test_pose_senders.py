@@ -4,13 +4,20 @@ import json
 import math
 import socket
 
+import msgspec
 import pytest
 
 from disco_hw.daemon.control_socket import status
+from disco_hw.drive.coverage import Coverage
+from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
+from disco_hw.runtime.pipeline import NoPlanner
+from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
+from drivers.types import PoseSample
+from tests.drive.test_hand_pilot import Hand
 from tests.drivers.waiting import free_port
 from tests.runtime.simulated import ROBOT_FILE, simulated_stack
 from tools.fault_run import CirclingPlanner
@@ -97,7 +104,7 @@ def containing(said, words):
 
 
 @pytest.mark.parametrize("off_m", [1.0, -0.3])
-def test_a_robot_that_is_carried_stops_its_task_and_says_so_and_its_operator_starts_it_again(bench, tmp_path, off_m):
+def test_a_robot_that_is_carried_stops_its_task_and_says_so_and_its_operator_starts_it_again(bench, off_m):
     made = bench()
     carried = []
     made.send(25.0, lambda _t_s: off_m if carried else 0.0)
@@ -121,8 +128,6 @@ def test_a_robot_that_is_carried_stops_its_task_and_says_so_and_its_operator_sta
     (reply,) = [reply for tick in made.stack.run(0.1, UserRequest.START) for reply in tick.replies]
     assert reply.accepted
     assert made.stack.run(1.0)[-1].output.running
-    log = tmp_path / "run.mcap"
-    made.stack.write_log(log)
 
 
 def test_a_jump_while_nothing_runs_is_said_and_keeps_nobody_from_starting_later(bench):
@@ -219,7 +224,7 @@ def test_a_heading_that_never_moves_is_found_out_by_the_first_turn_and_the_estim
     assert status(made.stack.core, {}, RecorderStats())["poses"][0]["heading"] == "stands still"
 
 
-def test_a_heading_sensor_that_dies_is_left_out_and_the_drive_goes_on_by_positions(bench, tmp_path):
+def test_a_heading_sensor_that_dies_is_left_out_and_the_drive_goes_on_by_positions(bench):
     made = bench("offset = [0.1, 0.0]\n")
     dead = []
 
@@ -240,5 +245,44 @@ def test_a_heading_sensor_that_dies_is_left_out_and_the_drive_goes_on_by_positio
     assert containing(made.said(), "udp: its headings are used again")
     assert last.output.running
     assert made.error_m() < 0.03
+
+
+def test_a_drive_whose_heading_is_left_out_on_the_way_is_replayed_bit_for_bit(tmp_path):
+    """By hand, as the harness' planner is not the one that a replay makes."""
+    stack = simulated_stack(NoPlanner())
+    received = stack.core.pose_source.receive
+    stack.core.pose_source.receive = lambda now_ns, poses: [
+        msgspec.structs.replace(pose, yaw_rad=1.5) for pose in received(now_ns, poses)
+    ]
+    hand = Hand()
+    stack.pilot = HandPilot(hand, Coverage(8.0))
+    stack.run(1.5)
+    hand.held = True
+    found, truth = stack.run(4.0)[-1].pipeline.estimate, stack.robot.truth
+    # It was forgotten, and found again by positions and motion.
+    assert (found.reinitialisations, found.heading_known) == (1, True)
+    assert abs(math.remainder(found.yaw_rad - truth.yaw_rad, math.tau)) < 0.2
     log = tmp_path / "run.mcap"
-    made.stack.write_log(log)
+    stack.write_log(log)
+    report = replay(log)
+    assert report.ok, report.as_text()
+    recorded = [one for _, tick in stack.recorder.ticks for one in tick if isinstance(one, PoseSample)]
+    assert {pose.yaw_rad for pose in recorded} == {1.5}
+
+
+def test_a_first_pose_that_is_not_where_the_wheels_led_to_from_the_origin_stops_the_task(tmp_path):
+    file = tmp_path / "robot.toml"
+    text = ROBOT_FILE.read_text(encoding="utf-8").replace(
+        'file = "wombot_model.toml"', f'file = "{ROBOT_FILE.parent / "wombot_model.toml"}"'
+    )
+    file.write_text(f"{text}\n[estimation]\npose_required = false\n", encoding="utf-8")
+    stack = simulated_stack(CirclingPlanner(load_setup(file).config, (0.061, 0.415, 0.238)), robot_file=file)
+    received, heard = stack.core.pose_source.receive, []
+    stack.core.pose_source.receive = lambda now_ns, poses: received(now_ns, poses) if heard else []
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ARM)
+    assert stack.run(2.0, UserRequest.START)[-1].output.running
+    heard.append(True)
+    seen = stack.run(0.5)
+    assert not seen[-1].output.running
+    assert containing([event for tick in seen for event in tick.events], "task stopped: the pose jumped by")
