@@ -111,7 +111,7 @@ class Bridge:
         pose = self._pose or config.pose
         silence_s = TAKE_OVER_TIMEOUTS * config.estimation.pose_timeout_s
         self._poses = ros2_inlets.PoseInlet(pose, silence_s)
-        self._transforms = ros2_inlets.TransformInlet(pose, config.ros2.base_frame or out.BASE_FRAME)
+        self._transforms = ros2_inlets.TransformInlet(pose, config.ros2.base_frame or out.BASE_FRAME, silence_s)
         self._speeds = ros2_commands.SpeedInlet(config.robot, config.drive, parameters)
         self._pad = ros2_commands.DaemonPad(socket_path(config))
         self._to_daemon = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -219,17 +219,17 @@ class Bridge:
                 yield sample, sample.sample_info.source_timestamp
 
     def _take_transforms(self, message: msg.TFMessage, sent_ns: int, *, static: bool = False) -> None:
-        for pose in self._transforms.poses(message, sent_ns, time.time_ns(), static=static):
+        publisher = _publisher_of(message)
+        for pose in self._transforms.poses(message, sent_ns, time.time_ns(), static=static, publisher=publisher):
             self._take_pose(pose, sent_ns)
 
     def _take_static_transforms(self, message: msg.TFMessage, sent_ns: int) -> None:
         self._take_transforms(message, sent_ns, static=True)
 
     def _take_pose(self, message: ros2_inlets.PoseMessage, sent_ns: int) -> None:
-        info = getattr(message, "sample_info", None)
-        publisher = None if info is None else f"publisher {info.publication_handle:x}"
+        publisher = _publisher_of(message)
         datagram = self._poses.datagram(message, sent_ns, time.monotonic_ns(), time.time_ns(), publisher)
-        for words in self._poses.news():
+        for words in (*self._poses.news(), *self._transforms.news()):
             self._send_to_daemon(json.dumps({"said": words}).encode())
         if datagram is not None:
             self._send_to_daemon(datagram)
@@ -302,6 +302,12 @@ class Bridge:
                 self._writers[topic].write(message)
         except DDSException:
             self._unwritten += 1
+
+
+def _publisher_of(message: Any) -> str | None:
+    """The writer of a message that came over DDS; None for one of our own."""
+    info = getattr(message, "sample_info", None)
+    return None if info is None else f"publisher {info.publication_handle:x}"
 
 
 def _domain(config: RobotConfig) -> int:

@@ -135,8 +135,10 @@ class TransformInlet:
     has nothing new: twice a second, with three times the standard deviation.
     """
 
-    def __init__(self, settings: PoseInput, base_frame: str) -> None:
+    def __init__(self, settings: PoseInput, base_frame: str, silence_s: float = SILENCE_S) -> None:
         self.refused: Counter[str] = Counter()
+        self._silence_s = silence_s
+        self._publishers: dict[str, SenderGate] = {}
         self._settings = settings
         self._map, self._base = _frame(settings.frame), _frame(base_frame)
         self._edges: dict[str, _Followed] = {}
@@ -144,9 +146,12 @@ class TransformInlet:
         self._spoken_ns = 0
 
     def poses(
-        self, message: msg.TFMessage, sent_ns: int, wall_ns: int, *, static: bool
+        self, message: msg.TFMessage, sent_ns: int, wall_ns: int, *, static: bool, publisher: Hashable = None
     ) -> Iterator[msg.PoseWithCovarianceStamped]:
-        """The poses that the transforms of a message bring; `sent_ns` is the time of those without a stamp."""
+        """The poses that the transforms of a message bring; `sent_ns` is the time of those without a stamp.
+
+        `publisher`: who sent it; of several that move one edge the first counts, until it has been silent.
+        """
         for each in message.transforms:
             parent, child = _frame(each.header.frame_id), _frame(each.child_frame_id)
             place, turned = each.transform.translation, each.transform.rotation
@@ -157,10 +162,21 @@ class TransformInlet:
                 self.refused["transforms that are not finite, or no rotation"] += 1
             elif before is None and len(self._edges) >= _MOST_EDGES:
                 self.refused["transforms of too many frames"] += 1
+            elif not static and not self._publishers_of(child).may_send(publisher, wall_ns):
+                self.refused["transforms of a second publisher of the same edge"] += 1
             elif self._keep(parent, child, t_ns, values, static=static):
+                self._publishers_of(child).note_pose(publisher, wall_ns)
                 pose = self._pose_by(child, wall_ns)
                 if pose is not None:
                     yield pose
+
+    def news(self) -> list[str]:
+        """What a person should know since the last call."""
+        return [words for one in self._publishers.values() for words in one.news()]
+
+    def _publishers_of(self, child: str) -> SenderGate:
+        """Who moves the edge to this frame; there are no more than edges are kept."""
+        return self._publishers.setdefault(child, SenderGate(self._silence_s))
 
     def _keep(self, parent: str, child: str, t_ns: int, values: tuple[float, ...], *, static: bool) -> bool:
         """Whether this is a new transform of the edge."""

@@ -359,6 +359,21 @@ class TestTransforms:
             self.heard(inlet, 0, "map", f"frame{number}", (0.0, 0.0, 0.0))
         assert inlet.refused["transforms of too many frames"] > 400
 
+    def test_of_two_publishers_of_one_edge_the_first_counts_and_the_other_is_named(self, inlet):
+        def heard(at_ms, x, publisher):
+            header = msg.Header(msg.stamp_of(WALL_NS + at_ms * MS), "map")
+            place = msg.Transform(msg.Vector3(x, 0.0, 0.0), msg.Quaternion(0.0, 0.0, 0.0, 1.0))
+            message = msg.TFMessage([msg.TransformStamped(header, "odom", place)])
+            return list(inlet.poses(message, 0, WALL_NS + at_ms * MS, static=False, publisher=publisher))
+
+        for at_ms in range(0, 500, 50):
+            self.heard(inlet, at_ms, "odom", "base_link", (1.0, 0.0, 0.0))
+            heard(at_ms, 3.0, "slam")
+            assert not heard(at_ms + 10, 9.0, "amcl")
+        assert inlet.refused["transforms of a second publisher of the same edge"] == 10
+        (said,) = inlet.news()
+        assert said.startswith("amcl sends poses beside slam: not used")
+
     def test_a_clock_that_was_set_back_begins_anew(self, inlet):
         self.heard(inlet, 60_000, "odom", "base_footprint", (1.0, 0.0, 0.0))
         self.heard(inlet, 60_000, "map", "odom", (1.0, 0.0, 0.0))
