@@ -3,8 +3,11 @@
 import hashlib
 import hmac
 import json
+import re
 import socket
+import textwrap
 import time
+from pathlib import Path
 
 import pytest
 
@@ -120,6 +123,20 @@ def test_over_a_real_socket_only_the_holder_of_the_key_is_heard():
     assert source.refused == 2
     (said,) = source.news()
     assert "sends poses without the proof of pose.key_file: not used" in said
+    source.close()
+
+
+def test_the_pages_sender_with_a_key(tmp_path, monkeypatch):
+    page = (Path(__file__).parents[3] / "docs/poses.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"\n(    import hashlib.*?5005\)\)\n)", page, flags=re.DOTALL)
+    port = free_port(socket.SOCK_DGRAM)
+    (tmp_path / "pose.key").write_text(KEY.hex() + "\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    source, names = make_pose_source("udp", port=port, key=KEY), {}
+    exec(textwrap.dedent(code).replace("5005", str(port)), names)
+    names["send"](POSE)
+    assert [pose.x_m for pose in source.receive(NOW_NS, ())] == [1.0]
+    names["sender"].close()
     source.close()
 
 
