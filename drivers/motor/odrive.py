@@ -388,7 +388,10 @@ class OdriveDriver:
 
     @property
     def _all_in_estop(self) -> bool:
-        return all(axis.error & ESTOP_ERROR[self._generation] for axis in self._all)
+        # The error is latched by the frame; the motor is released a control cycle later.
+        return all(
+            axis.error & ESTOP_ERROR[self._generation] and axis.state != AxisState.CLOSED_LOOP for axis in self._all
+        )
 
     def _idle(self, permit: MotionPermit) -> None:
         """Idle is due at once for all that are still energised."""

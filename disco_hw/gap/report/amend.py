@@ -15,7 +15,7 @@ from disco_hw.gap.search.end_to_end import Freed, JointFit, Part
 from disco_hw.gap.search.selection import Z95
 from disco_hw.gap.search.unnamed_terms import Term
 from disco_hw.model import EffectSetting, Gaussian, Model
-from disco_hw.model.model import BASE_PARAMETERS
+from disco_hw.model.model import BASE_PARAMETERS, within_ranges
 from disco_hw.model.terms import REACH, TERMS, effect_of
 
 Array = NDArray[np.float64]
@@ -165,6 +165,7 @@ def amended_model(
     if not names:
         return bare, tuple(notes)
     point = dict(zip(bare.parameter_names, bare.point(), strict=True))
+    covariance = within_ranges(covariance, [bare.parameters[name] for name in names])
     belief = Gaussian(names, np.array([point[name] for name in names]), covariance)
     return replace(bare, belief=belief), tuple(notes)
 
