@@ -136,9 +136,11 @@ def set_anew(t_s: Array, angles_rad: Array) -> Mask:
 
     That is a step of more than ten turns, or of one radian that no wheel turns in that time.
     """
+    if t_s.size < 2:
+        return np.zeros(t_s.size, dtype=bool)
     steps = np.abs(np.diff(angles_rad, axis=0)).max(axis=1, initial=0.0)
     rate_rad_s = steps / np.maximum(np.diff(t_s), 1e-3)
-    usual_rad_s = float(np.quantile(rate_rad_s, 0.99)) if rate_rad_s.size else 0.0
+    usual_rad_s = float(np.quantile(rate_rad_s, 0.99))
     # Samples that come in bursts seem fast as well, but take small steps.
     sudden = (steps > _NO_WHEELS_STEP_RAD) & (rate_rad_s > max(_NO_WHEEL_RAD_S, 5.0 * usual_rad_s))
     return np.concatenate([[False], (steps > _LARGEST_STEP_RAD) | sudden])

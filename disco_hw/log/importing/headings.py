@@ -65,5 +65,7 @@ def with_headings_only(drive: DriveLog) -> DriveLog:
         "what needs poses needs a source that measures the heading"
     )
     poses = drive.poses
-    kept = Poses(*(column[measured] for column in (poses.t_s, poses.x_m, poses.y_m, poses.yaw_rad, poses.segment)))
+    kept = Poses(
+        poses.t_s[measured], poses.x_m[measured], poses.y_m[measured], poses.yaw_rad[measured], poses.segment[measured]
+    )
     return replace(drive, poses=kept, notes=(note, *drive.notes))

@@ -180,7 +180,7 @@ def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: R
             [
                 times.breaks_ns,
                 _pauses(wheel_ns, (command_ns, pose_ns)),
-                wheel_ns[set_anew(wheel_ns * 1e-9, wheel[:, :2])],
+                wheel_ns[set_anew((wheel_ns - began_ns).astype(np.float64) * 1e-9, wheel[:, :2])],
             ]
         )
     )

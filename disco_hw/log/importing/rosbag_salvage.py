@@ -1,16 +1,19 @@
 """What is whole of a damaged bag -> a new file that `rosbags` can read.
 
 A recording that ended in a power cut has no index, and a last chunk that is not whole. Its records are read one after
-the other until the damage, and from an MCAP also after a chunk that does not match its checksum.
+the other until the damage, and also after a chunk that does not match its checksum or cannot be unpacked.
 """
 
 from __future__ import annotations
 
+import bz2
 import contextlib
 import sqlite3
+import struct
 from collections.abc import Callable, Iterator
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
@@ -28,7 +31,7 @@ def salvage(path: Path, folder: Path) -> tuple[Path, str] | None:
 
     Returns the new file and a sentence on what is missing, or None where nothing could be read or nobody knows how.
     """
-    copy: Callable[[Path, Path], str] | None = {".mcap": _copy_mcap, ".db3": _copy_sqlite}.get(path.suffix)
+    copy = _COPIES.get(path.suffix)
     if copy is None:
         return None
     target = folder / path.name
@@ -67,13 +70,15 @@ def _copy_mcap(path: Path, target: Path) -> str:
                             channels[record.channel_id], record.log_time, record.data, record.publish_time
                         )
         read = source.tell()
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]  # The library does not annotate it.
+    return _extent(messages, read, size, damaged)
+
+
+def _extent(messages: int, read: int, size: int, damaged: int) -> str:
+    """Say how much of a file (`read` of `size` bytes) was read; empty if there is no message."""
     chunks = f", {damaged} damaged chunks were left out" if damaged else ""
-    return (
-        f"{messages} messages were read from {100.0 * read / max(size, 1):.0f} % of the file{chunks}"
-        if messages
-        else ""
-    )
+    share = 100.0 * read / max(size, 1)
+    return f"{messages} messages were read from {share:.0f} % of the file{chunks}" if messages else ""
 
 
 def _records(source: Any) -> Iterator[Any]:  # Any: a binary file; the library's records, None for a damaged chunk.
@@ -115,3 +120,87 @@ def _rows(source: sqlite3.Connection, table: str) -> Iterator[tuple[Any, ...]]: 
     found = source.execute(f'SELECT * FROM "{table}" NOT INDEXED')
     while rows := found.fetchmany(_QUERY_BATCH):
         yield from rows
+
+
+_MESSAGE, _CHUNK, _CONNECTION = b"\x02", b"\x05", b"\x07"
+"""Kinds (op) of the records of a bag of ROS 1."""
+Record = tuple[dict[str, bytes], bytes]
+
+
+def _copy_ros1(path: Path, target: Path) -> str:
+    """Copy the messages of a bag of ROS 1; returns how far it could be read, empty if there is no message."""
+    from rosbags.rosbag1 import Writer as BagWriter  # noqa: PLC0415
+
+    connections: dict[bytes, Any] = {}
+    messages = damaged = 0
+    with path.open("rb") as source, BagWriter(target) as writer:
+        source.readline()
+        with contextlib.suppress(Exception):
+            for record in _ros1_records(source):
+                if record is None:
+                    damaged += 1
+                    continue
+                header, data = record
+                if header["op"] == _CONNECTION and header["conn"] not in connections:
+                    said = _ros1_fields(data)
+                    connections[header["conn"]] = writer.add_connection(
+                        header["topic"].decode(),
+                        said["type"].decode().replace("/", "/msg/"),
+                        msgdef=said["message_definition"].decode(),
+                        md5sum=said["md5sum"].decode(),
+                        # Two publishers of one topic are two connections.
+                        callerid=str(len(connections)),
+                    )
+                elif header["op"] == _MESSAGE and header["conn"] in connections:
+                    messages += 1
+                    if len(data) <= _LARGEST_MESSAGE_BYTES:
+                        s, ns = struct.unpack("<II", header["time"])
+                        writer.write(connections[header["conn"]], s * 1_000_000_000 + ns, data)
+        read = source.tell()
+    return _extent(messages, read, path.stat().st_size, damaged)
+
+
+def _ros1_records(source: BinaryIO) -> Iterator[Record | None]:
+    """Yield header and data of each whole record, those in chunks as well; None for a chunk that cannot be unpacked."""
+    while size := source.read(4):
+        header = _ros1_fields(source.read(*struct.unpack("<I", size)))
+        (length,) = struct.unpack("<I", source.read(4))
+        if length > _LARGEST_RECORD_BYTES:
+            raise ValueError("record too large")
+        data = source.read(length)
+        is_chunk = header["op"] == _CHUNK
+        # What is whole of a chunk that was cut can be read if it is not compressed.
+        if len(data) < length and not (is_chunk and header["compression"] == b"none"):
+            return
+        if not is_chunk:
+            yield header, data
+            continue
+        try:
+            yield from _ros1_records(BytesIO(_unpacked(header["compression"], data)))
+        except Exception:  # Whatever the decompressors raise of damaged bytes: counted, and said.
+            yield None
+
+
+def _ros1_fields(block: bytes) -> dict[str, bytes]:
+    """The fields of a header, by name: each a length (4 bytes) and name=value."""
+    fields, at = {}, 0
+    while at < len(block):
+        (length,) = struct.unpack_from("<I", block, at)
+        name, _, value = block[at + 4 : at + 4 + length].partition(b"=")
+        fields[name.decode()] = value
+        at += 4 + length
+    return fields
+
+
+def _unpacked(compression: bytes, data: bytes) -> bytes:
+    if compression == b"none":
+        return data
+    if compression == b"bz2":
+        return bz2.BZ2Decompressor().decompress(data, _LARGEST_UNPACKED_BYTES)
+    from lz4.frame import LZ4FrameDecompressor  # noqa: PLC0415
+
+    return bytes(LZ4FrameDecompressor().decompress(data, _LARGEST_UNPACKED_BYTES))
+
+
+_COPIES: dict[str, Callable[[Path, Path], str]] = {".mcap": _copy_mcap, ".db3": _copy_sqlite, ".bag": _copy_ros1}
+"""How a file is copied as far as it is whole, by how its name ends."""
