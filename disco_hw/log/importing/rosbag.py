@@ -29,7 +29,7 @@ from disco_hw.log.drive import (
     rotations,
 )
 from disco_hw.log.importing import LogFormat
-from disco_hw.log.importing.counter_wrap import set_anew, unwrap_counter
+from disco_hw.log.importing.counter_wrap import WIDTHS_BITS, Mask, set_anew, unwrap_wheels
 from disco_hw.log.importing.csv_drive import length_fault
 from disco_hw.log.importing.losses import WARNING, loss_note
 from disco_hw.log.importing.rosbag_file import Bag, BagMessage, DamagedBagError, is_bag, open_bag
@@ -174,13 +174,16 @@ def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: R
     command_ns, command = _expired(*arrays.get(COMMANDS, (nothing[0], np.empty((0, 2)))))
     wheel_ns, wheel = arrays.get(WHEELS, nothing)
     wheel_ns, wheel, measured = _measured_columns(path, wheel_ns, wheel, notes)
+    uncertain = np.zeros(wheel_ns.size, dtype=bool)
+    if measured[0]:
+        wheel, uncertain = _unwrapped(path, wheel_ns, wheel, robot, (command_ns, command), notes)
     began_ns = min(int(t_ns[0]) for t_ns in (command_ns, wheel_ns, pose_ns) if t_ns.size)
     breaks_ns = np.unique(
         np.concatenate(
             [
                 times.breaks_ns,
                 _pauses(wheel_ns, (command_ns, pose_ns)),
-                wheel_ns[set_anew((wheel_ns - began_ns).astype(np.float64) * 1e-9, wheel[:, :2])],
+                wheel_ns[set_anew((wheel_ns - began_ns).astype(np.float64) * 1e-9, wheel[:, :2]) | uncertain],
             ]
         )
     )
@@ -310,24 +313,32 @@ def _measured_columns(
     if has_angle and has_speed and (wheel[:, 2:] == 0.0).all() and np.ptp(wheel[:, 0]) > 1.0:
         notes.append("wheels: the velocities are all zero while the wheels turn; they were taken from the positions")
         has_speed = False
-    return t_ns[kept], _unwrapped(path, t_ns[kept], wheel, has_angle, notes), (has_angle, has_speed)
+    return t_ns[kept], wheel, (has_angle, has_speed)
 
 
-def _unwrapped(path: Path, t_ns: Index, wheel: Array, has_angle: bool, notes: list[str]) -> Array:
-    """Angles that wrap, at a turn or where the counter behind them overflows, made continuous; each wheel by itself."""
-    if not has_angle or not wheel.size:
-        return wheel
-    columns = []
-    for side, column in zip(("left", "right"), wheel[:, :2].T, strict=True):
-        found = unwrap_counter((t_ns - t_ns[0]) * 1e-9, column, (2.0 * math.pi,), unit="rad")
-        if found.fault:
-            raise LogError(f"{path}: {side} wheel: {found.fault}")
-        if found.wraps:
+def _unwrapped(
+    path: Path, t_ns: Index, wheel: Array, robot: Robot, commands: tuple[Index, Array], notes: list[str]
+) -> tuple[Array, Mask]:
+    """Wheels whose angles are continuous; and where the number of wraps is not known, (N,).
+
+    Angles wrap at a turn or where the counter behind them overflows; each wheel is judged by itself.
+    """
+    # Before the first command nothing is known.
+    commanded = np.vstack([[np.nan, np.nan], commands[1]])[np.searchsorted(commands[0], t_ns, side="right")]
+    known = np.where(np.isfinite(wheel[:, 2:]), wheel[:, 2:], commanded)
+    tick_rad = 2.0 * math.pi / robot.ticks_per_rev
+    spans = (2.0 * math.pi, *(2.0**bits * tick_rad for bits in WIDTHS_BITS))
+    begins = np.concatenate([[True], np.diff(t_ns) > _LONGEST_SILENCE_NS])
+    found = unwrap_wheels((t_ns - t_ns[0]) * 1e-9, wheel[:, :2], spans, begins, known, "rad")
+    for side, one in zip(("left", "right"), found, strict=True):
+        if one.fault:
+            raise LogError(f"{path}: {side} wheel: {one.fault}")
+        if one.wraps:
             notes.append(
-                f"{side} wheel: the position wraps at {found.span:.10g} rad: made continuous at {found.wraps} places"
+                f"{side} wheel: the position wraps at {one.span:.10g} rad: made continuous at {one.wraps} places"
             )
-        columns.append(found.values)
-    return np.column_stack([*columns, wheel[:, 2:]])
+    angles = np.column_stack([one.values for one in found])
+    return np.column_stack([angles, wheel[:, 2:]]), found[0].uncertain | found[1].uncertain
 
 
 def _pauses(wheel_ns: Index, others: Sequence[Index]) -> Index:
