@@ -93,11 +93,11 @@ def test_a_truncated_bag_is_read_as_far_as_it_is_whole(tmp_path, whole_bags, sto
     assert 0.3 * share * samples < drive.wheels.t_s.size <= samples
     assert (np.diff(drive.wheels.t_s) < 0.5).all()
     warned = [note for note in drive.notes if note.startswith("warning: ")]
-    assert re.search(r"damaged, or its recording did not end regularly: \d+ messages were read", warned[0])
+    assert re.search(r"damaged, or its recording did not end regularly: \d+ messages could be read", warned[0])
 
 
 @pytest.mark.parametrize("storage", ENDINGS)
-@pytest.mark.parametrize("size", [20, 100, 3000])
+@pytest.mark.parametrize("size", [20, 100])
 def test_a_bag_that_was_cut_before_its_first_message_is_one_line(tmp_path, whole_bags, storage, size):
     path = tmp_path / f"b.{ENDINGS[storage]}"
     path.write_bytes(whole_bags[0][storage][:size])
