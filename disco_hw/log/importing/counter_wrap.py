@@ -23,14 +23,17 @@ _NEIGHBOURS = 5
 """Steps whose median is the motion that is expected of the next one."""
 _AMBIGUOUS_SHARE = 0.25
 """Steps longer than this share of the span could be one way or the other."""
-_FIT_SHARE = 0.2
-"""A wrap leaves a step within this share of the span of what is expected."""
+_FIT_SHARE, _SLACK_SHARE, _CHANGE = 0.2, 0.02, 3.0
+"""A wrap leaves a step within the first share of the span of what is expected, and within the second of it but for a
+change by three usual steps: an outlier leaves something else."""
 _FULL_SHARE = 0.8
 """Counts of a counter that wraps all the time fill this share of its span."""
 _OFTEN = 3
 """Without a usual width, so many jumps of one size are a span."""
 _SAME_SHARE = 0.05
 """Jumps that differ by less than this share of themselves are of one size."""
+_TOLERANCE_SHARE, _TOLERANCE_COUNTS = 0.005, 2.0
+"""A usual span this near to the size of the jumps is theirs: 4096 is not 4000."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,14 +61,13 @@ def unwrap_counter(t_s: Array, values: Array, spans: Sequence[float] = (), *, un
         return Unwrapped(values)
     dt_s = np.maximum(np.diff(t_s), 1e-9)
     usual = sorted({float(2**bits) for bits in WIDTHS_BITS} | {float(span) for span in spans})
-    whole = unit == "counts"
-    for span in [span for span in usual if reach < span <= 2.0 * reach]:
-        found = _taken_out(dt_s, steps, values, span)
-        if found is not None:
-            return found
-    measured = _span_of_jumps(dt_s, steps, reach, whole)
+    possible = [span for span in usual if reach < span <= 2.0 * reach]
+    measured = _span_of_jumps(dt_s, steps, reach, unit == "counts")
     if measured is not None:
-        found = _taken_out(dt_s, steps, values, measured)
+        size, tolerance = measured
+        possible = [span for span in possible if abs(span - size) <= tolerance] + [size]
+    for span in possible:
+        found = _taken_out(dt_s, steps, values, span)
         if found is not None:
             return found
     return Unwrapped(values, fault=_too_fast(steps, reach, usual, unit))
@@ -80,7 +82,8 @@ def _taken_out(dt_s: Array, steps: Array, values: Array, span: float) -> Unwrapp
     wraps = turns != 0.0
     if not wraps.any():
         return None
-    fits = np.abs(left - expected) <= _FIT_SHARE * span
+    motion = np.maximum(np.abs(expected), np.quantile(np.abs(shortest), 0.9))
+    fits = np.abs(left - expected) <= np.minimum(_FIT_SHARE * span, _SLACK_SHARE * span + _CHANGE * motion)
     # Jumps that leave something else are those of a counter that was set anew: they stay as they are.
     if np.count_nonzero(wraps & ~fits) > 0.2 * np.count_nonzero(wraps):
         return None
@@ -105,8 +108,8 @@ def _expected(dt_s: Array, steps: Array, usable: Mask) -> Array:
     return np.asarray(np.median(rates[known[columns]], axis=1) * dt_s)
 
 
-def _span_of_jumps(dt_s: Array, steps: Array, reach: float, whole: bool) -> float | None:
-    """The span that jumps of one size show, again and again; None if there are too few or they differ."""
+def _span_of_jumps(dt_s: Array, steps: Array, reach: float, whole: bool) -> tuple[float, float] | None:
+    """The span that jumps of one size show, again and again, and its tolerance; None if they are few or differ."""
     jumps = np.abs(steps) > 0.5 * reach
     if np.count_nonzero(jumps) < _OFTEN:
         return None
@@ -115,7 +118,9 @@ def _span_of_jumps(dt_s: Array, steps: Array, reach: float, whole: bool) -> floa
     alike = np.abs(sizes - span) <= _SAME_SHARE * span
     if np.count_nonzero(alike) < max(_OFTEN, 0.8 * sizes.size):
         return None
-    return max(float(round(span)) if whole else span, reach * (1.0 + 1e-9))
+    spread = 3.0 * float(np.median(np.abs(sizes - span)))
+    tolerance = max(_TOLERANCE_SHARE * span, spread, _TOLERANCE_COUNTS if whole else 0.0)
+    return max(float(round(span)) if whole else span, reach * (1.0 + 1e-9)), tolerance
 
 
 def _too_fast(steps: Array, reach: float, spans: Sequence[float], unit: str) -> str:
