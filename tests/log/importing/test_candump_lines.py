@@ -108,6 +108,7 @@ OTHERS = {
     "extended": ["(1700000001.0) can0 00000110#0102030405060708"],
     "error on the screen": [" (1700000001.0)  can0  20000004   [8]  00 01 00 00 00 00 00 00   ERRORFRAME"],
     "remote on the screen": [" (1700000001.0)  can0  110   [0]  remote request"],
+    "text beside the bytes": [" (1700000001.0)  can0  7A1   [2]  41 42   'AB'"],
     "blank": ["", "   "],
 }
 
@@ -172,14 +173,14 @@ def test_of_two_robots_one_must_be_named(tmp_path, frames, whole):
 def test_the_channel_comes_from_the_command_line_or_robot_toml(tmp_path, frames):
     path, robot = tmp_path / "dump.log", tmp_path / "robot.toml"
     path.write_text("\n".join(two_robots(frames)) + "\n")
-    robot.write_text(ROBOT_TOML.replace("2048", "2048") + '[link]\nbackend = "socketcan"\nchannel = "vcan0"\n')
+    robot.write_text(ROBOT_TOML + '[link]\nchannel = "vcan0"\n')
     with pytest.raises(LogError, match="--channel"):
         import_log(path, robot, tmp_path / "a.mcap")
     assert import_log(path, robot, tmp_path / "a.mcap", channel="can0").duration_s > 9.0
-    robot.write_text(ROBOT_TOML + '[link]\nbackend = "socketcan"\nchannel = "can1"\n')
+    robot.write_text(ROBOT_TOML + '[link]\nchannel = "can1"\n')
     assert import_log(path, robot, tmp_path / "b.mcap").duration_s < 6.0
     (tmp_path / "a.csv").write_text("t_s\n")
-    with pytest.raises(InputError, match="--channel: .* is a csv, which has no channels"):
+    with pytest.raises(InputError, match=r"--channel: .* is a csv, which has no channels"):
         import_log(tmp_path / "a.csv", robot, tmp_path / "c.mcap", channel="can0")
 
 
