@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from disco_hw.config import Robot, RobotConfig
 from disco_hw.errors import LogError
@@ -80,7 +81,9 @@ class _Column:
 
     def stamps(self) -> Stamps:
         """The times of its rows."""
-        return Stamps(np.array(self.log_ns, dtype=np.int64), np.array(self.stamp_ns, dtype=np.int64))
+        table = self.table()
+        is_repeat = np.concatenate([[False], _alike(table[1:], table[:-1])]) if len(table) else np.empty(0, dtype=bool)
+        return Stamps(np.array(self.log_ns, dtype=np.int64), np.array(self.stamp_ns, dtype=np.int64), is_repeat)
 
     def table(self) -> Array:
         """Its rows, (N, width)."""
@@ -233,12 +236,18 @@ def _of_the_choice(choice: Choice) -> list[str]:
 
 
 def _ordered(path: Path, name: str, t_ns: Index, table: Array, notes: list[str]) -> tuple[Index, Array]:
-    """Sort messages by time, and keep the first of several with one time."""
-    unique, first = np.unique(t_ns, return_index=True)
-    if unique.size < t_ns.size:
-        lost, what = t_ns.size - unique.size, "messages have the time of another and were left out"
+    """Sort messages by time, and keep the first of several with one time; one that is sent again is no loss."""
+    unique, first, place = np.unique(t_ns, return_index=True, return_inverse=True)
+    lost = int(np.count_nonzero(~_alike(table, table[first][place])))
+    if lost:
+        what = "messages have the time of another and were left out"
         notes.append(loss_note(str(path), name, lost, t_ns.size, what, "record it again, or name another topic"))
     return unique, table[first]
+
+
+def _alike(one: Array, other: Array) -> NDArray[np.bool_]:
+    """Whether the rows of two tables (N, k) hold the same values."""
+    return np.asarray(((one == other) | (np.isnan(one) & np.isnan(other))).all(axis=1))
 
 
 def _pose_table(

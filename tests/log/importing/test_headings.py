@@ -8,7 +8,6 @@ import sys
 import numpy as np
 import pytest
 
-from disco_hw.errors import LogError
 from disco_hw.log.drive import DriveLog
 from disco_hw.log.importing.csv_drive import read_csv
 from disco_hw.log.importing.headings import without_standing_headings
