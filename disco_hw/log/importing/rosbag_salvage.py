@@ -222,7 +222,7 @@ def _unpacked(compression: bytes, data: bytes) -> bytes:
         from zstandard import ZstdDecompressor  # noqa: PLC0415
 
         return bytes(ZstdDecompressor().stream_reader(data).read(_LARGEST_UNPACKED_BYTES))
-    from lz4.frame import LZ4FrameDecompressor  # noqa: PLC0415
+    from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]  # noqa: PLC0415
 
     return bytes(LZ4FrameDecompressor().decompress(data, _LARGEST_UNPACKED_BYTES))
 

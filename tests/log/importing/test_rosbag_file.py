@@ -180,7 +180,7 @@ def test_a_mutated_bag_is_a_drive_or_one_line(tmp_path, storage):
 
 
 @pytest.mark.parametrize("size", [2**31, 2**40, 2**62, 2**64 - 1])
-def test_a_record_that_claims_any_size_is_one_line(tmp_path, size):
+def test_a_chunk_that_claims_any_size_is_read_as_one_that_was_cut(tmp_path, size):
     path = file_of(small(tmp_path / "b"))
     spoilt = bytearray(path.read_bytes())
     # The first record after the header: its opcode, then its length.
@@ -188,6 +188,17 @@ def test_a_record_that_claims_any_size_is_one_line(tmp_path, size):
     struct.pack_into("<Q", spoilt, 17 + header + 1, size)
     # Without the index at the end the file is read through.
     struct.pack_into("<Q", spoilt, len(spoilt) - 28, 0)
+    path.write_bytes(spoilt)
+    drive = read_rosbag(path, robot_config())
+    assert drive.wheels.t_s.size == 50
+    assert drive.notes[0].startswith("warning: ")
+
+
+@pytest.mark.parametrize("size", [2**31, 2**40, 2**62, 2**64 - 1])
+def test_a_first_record_that_claims_any_size_is_one_line(tmp_path, size):
+    path = file_of(small(tmp_path / "b"))
+    spoilt = bytearray(path.read_bytes())
+    struct.pack_into("<Q", spoilt, 9, size)
     path.write_bytes(spoilt)
     with pytest.raises(LogError) as error:
         read_rosbag(path, robot_config())
