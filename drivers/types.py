@@ -360,6 +360,12 @@ class Driver(Protocol):
     def request(self, request: Request) -> None:
         """Set what the host wants; held until changed. ARM is consumed: it never re-arms by itself after a stop."""
 
+    def release(self, why: str) -> None:
+        """Take the torque off every motor from now on, without a ramp, which would need the encoders.
+
+        `why`, in words, is a fault until a reset.
+        """
+
     def transmit(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
         """Frames due now: the command (only while armed; zeros while arming) and house-keeping."""
 

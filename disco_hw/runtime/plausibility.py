@@ -1,8 +1,9 @@
-"""Does the robot do what it should: wheels follow commands, supply holds, poses change, and the task gets on.
+"""Does the robot do what it should: supply holds, poses change, the task gets on, and wheels are wired as declared.
 
 `Plausibility` and `Headway` stop nothing: they count and report what the rest of the stack tolerates, faults too short
-or too small for the firmware's own limits, before they grow. `Directions` looks at the first motion after arming: are
-the wheels wired as robot.toml says? If not, the robot is stopped. Their counts are compared with what was commanded,
+or too small for the firmware's own limits, before they grow. `Directions` looks at the first motion: are
+the wheels wired as robot.toml says? If not, the robot is stopped. Once that is known, no later fault is a matter of
+wiring, and `wheel_faults` says what it is. Their counts are compared with what was commanded,
 and the measured poses with what the counts predict: a wheel whose encoder and motor both turn the wrong way looks right
 to the first and not to the second.
 """
@@ -19,11 +20,6 @@ from dataclasses import asdict, dataclass
 from drivers.motor import Wiring
 from drivers.types import PoseSample, PowerSample, WheelCommand, WheelSample
 
-COMMANDS_OF_LATE_NS = 600_000_000
-"""Delay and lag of the wheels together: what was commanded so long ago may still be on its way."""
-SLACK_RAD_S = 0.5
-SLACK_PART = 0.2
-SAMPLES_OUTSIDE = 3
 SUPPLY_MEAN_S = 10.0
 DIP_PART = 0.94
 DIP_OVER_PART = 0.97
@@ -34,8 +30,8 @@ _SIDES = ("left", "right")
 
 @dataclass(frozen=True, slots=True)
 class PlausibilityStats:
-    """Times that a wheel was elsewhere than its commands could have taken it, that the supply dipped, and that the pose
-    stayed the same to the last digit while the wheels turned; each counts once, at its beginning.
+    """Times that a wheel began not to follow its commands (`wheel_faults.WheelFaults` counts them), that the supply
+    dipped, and that the pose stayed the same to the last digit while the wheels turned.
     """
 
     wheels_not_following: int = 0
@@ -46,15 +42,12 @@ class PlausibilityStats:
 class Plausibility:
     """Compares what the robot reports with what it was commanded; pure, one step a tick.
 
-    A wheel follows if its speed lies within what it was commanded over the last 0.6 s, give or take 0.5 rad/s and a
-    fifth; it does not after three samples in a row outside. The supply dips by 6 % below its mean over 10 s, and has
+    The supply dips by 6 % below its mean over 10 s, and has
     recovered above 3 %. A pose that is repeated twice to the last digit is frozen.
     """
 
     def __init__(self) -> None:
         self._counts = asdict(PlausibilityStats())
-        self._sent: deque[tuple[int, float, float]] = deque()
-        self._outside = [0, 0]
         self._supply_v: float | None = None
         self._supply_ns = 0
         self._dipped = False
@@ -71,40 +64,9 @@ class Plausibility:
         wheels: Sequence[WheelSample],
         poses: Sequence[PoseSample],
         power: Sequence[PowerSample],
-        command: WheelCommand | None,
     ) -> tuple[str, ...]:
-        """Take in a tick's samples and the command that it sends (None for none); returns what began, in words."""
-        events = [*self._watch_wheels(wheels), *self._watch_supply(power), *self._watch_poses(poses, wheels)]
-        if command is None:
-            self._sent.clear()
-            self._outside = [0, 0]
-        else:
-            self._sent.append((now_ns, command.left_rad_s, command.right_rad_s))
-            while now_ns - self._sent[0][0] > COMMANDS_OF_LATE_NS:
-                self._sent.popleft()
-        return tuple(events)
-
-    def _watch_wheels(self, wheels: Sequence[WheelSample]) -> list[str]:
-        sent = self._sent
-        if not wheels or not sent or sent[-1][0] - sent[0][0] < COMMANDS_OF_LATE_NS // 2:
-            return []
-        _, lefts, rights = zip(*sent, strict=True)
-        events = [
-            *self._watch_wheel(0, min(lefts), max(lefts), [sample.left_speed_rad_s for sample in wheels]),
-            *self._watch_wheel(1, min(rights), max(rights), [sample.right_speed_rad_s for sample in wheels]),
-        ]
-        self._counts["wheels_not_following"] += len(events)
-        return events
-
-    def _watch_wheel(self, side: int, low: float, high: float, speeds: Sequence[float]) -> Iterator[str]:
-        least = low - SLACK_RAD_S - SLACK_PART * abs(low)
-        most = high + SLACK_RAD_S + SLACK_PART * abs(high)
-        for speed in speeds:
-            self._outside[side] = 0 if least <= speed <= most else self._outside[side] + 1
-            if self._outside[side] == SAMPLES_OUTSIDE:
-                yield (
-                    f"the {_SIDES[side]} wheel does not follow: {speed:.1f} rad/s, commanded {low:.1f} to {high:.1f}"
-                )
+        """Take in a tick's samples; returns what began, in words."""
+        return (*self._watch_supply(power), *self._watch_poses(poses, wheels))
 
     def _watch_supply(self, power: Sequence[PowerSample]) -> list[str]:
         events = []
@@ -141,7 +103,7 @@ class Plausibility:
 WINDOW_NS = 5_000_000_000
 LEAST_M = 0.05
 """Who gets no further than this within the window makes no progress; less for a task that is slower than that."""
-LEAST_PART = 0.25
+LEAST_WAY_PART = 0.25
 """Of what the task's speed makes in the window."""
 ASKED_RAD_S = 0.05
 """A command below this asks for no motion."""
@@ -165,7 +127,7 @@ class Headway:
     """Watches a running task of this speed; one of NaN, whose places have times and may rest, is not watched."""
 
     def __init__(self, speed_m_s: float) -> None:
-        self._least_m = min(LEAST_M, LEAST_PART * speed_m_s * WINDOW_NS * 1e-9) if speed_m_s > 0.0 else math.nan
+        self._least_m = min(LEAST_M, LEAST_WAY_PART * speed_m_s * WINDOW_NS * 1e-9) if speed_m_s > 0.0 else math.nan
         self._window: _Window | None = None
 
     def step(
@@ -211,6 +173,8 @@ MOVES_RAD_S = 0.3
 STANDS_RAD_S = 0.15
 LEAST_RAD = 0.15
 LEAST_SUM_RAD = 0.4
+LEAST_PART = 0.1
+"""Of the other wheel's turning: one that turned by less stood, and shows nothing of which side it is on."""
 SAMPLES = 3
 _OPPOSITE_PART = 0.25
 _CROSSED_COSINE, _STRAIGHT_COSINE = 0.97, 0.93
@@ -226,7 +190,10 @@ Pair = tuple[float, float]
 
 
 class Directions:
-    """Pure, one step a tick; `radius_m` and `track_m` are the nominal ones, `wiring` what robot.toml says of it."""
+    """Pure, one step a tick; `radius_m` and `track_m` are the nominal ones, `wiring` what robot.toml says of it.
+
+    The wiring is judged once: after five seconds of motion without a finding it is known to be right.
+    """
 
     def __init__(self, radius_m: float, track_m: float, wiring: Wiring) -> None:
         self._radius_m, self._track_m, self._wiring = radius_m, track_m, wiring
@@ -237,7 +204,7 @@ class Directions:
         self._asked: Pair = (0.0, 0.0)
         self._before: Pair = (0.0, 0.0)
         self._signs: tuple[float, ...] = (0.0, 0.0)
-        self._reversed = self._found = False
+        self._reversed = self._found = self.is_judged = False
         self._in_a_row = ("", 0)
         self._evidence: dict[tuple[bool, tuple[int, ...]], float] = {}
         self._reset()
@@ -248,12 +215,19 @@ class Directions:
         wheels: Sequence[WheelSample],
         poses: Sequence[PoseSample],
         command: WheelCommand | None,
+        has_followed: tuple[bool, bool] = (False, False),
+        is_suspect: bool = False,
     ) -> str | None:
-        """Take in a tick's samples and the command that it sends; returns once what is wrong and what to change."""
+        """Take in a tick's samples and the command that it sends; returns once what is wrong and what to change.
+
+        `has_followed`: wheels that have counted as commanded before, which cannot be wired the other way round.
+        `is_suspect`: a wheel does not follow now, so that poses do not show how it is wired.
+        """
         if command is None:
             self._reset()
             return None
-        if self._found or (self._begun_ns is not None and now_ns - self._begun_ns > JUDGED_NS):
+        self.is_judged = self.is_judged or (self._begun_ns is not None and now_ns - self._begun_ns > JUDGED_NS)
+        if self._found or self.is_judged:
             return None
         for sample in wheels:
             self._turned.append((sample.t_ns, sample.left_angle_rad, sample.right_angle_rad))
@@ -267,7 +241,7 @@ class Directions:
             step_s = (now_ns - self._last_ns) * 1e-9
             self._asked = (self._asked[0] + step_s * self._before[0], self._asked[1] + step_s * self._before[1])
             self._before, self._last_ns = asked, now_ns
-            found = self._by_commands(wheels) or self._by_poses(poses)
+            found = self._by_commands(wheels, has_followed) or (None if is_suspect else self._by_poses(poses))
             self._found = found is not None
             return found
         return None
@@ -306,7 +280,7 @@ class Directions:
         _, left, right = self._turned[at]
         return left - self._turned[0][1], right - self._turned[0][2]
 
-    def _by_commands(self, wheels: Sequence[WheelSample]) -> str | None:
+    def _by_commands(self, wheels: Sequence[WheelSample], has_followed: tuple[bool, bool]) -> str | None:
         """Sides that turn against what was commanded, or as the other was."""
         if not wheels or self._reversed:
             return None
@@ -314,10 +288,12 @@ class Directions:
         wrong = [
             side
             for side in (0, 1)
-            if turned[side] * math.copysign(1.0, asked[side]) < -max(LEAST_RAD, _OPPOSITE_PART * abs(asked[side]))
+            if not has_followed[side] and turned[side] * math.copysign(1.0, asked[side]) < -max(LEAST_RAD, _OPPOSITE_PART * abs(asked[side]))
         ]
         crossed = (asked[1], asked[0])
-        enough = abs(turned[0]) + abs(turned[1]) > LEAST_SUM_RAD
+        enough = abs(turned[0]) + abs(turned[1]) > LEAST_SUM_RAD and min(map(abs, turned)) > LEAST_PART * max(
+            map(abs, turned)
+        )
         if enough and _cosine(turned, crossed) > _CROSSED_COSINE and _cosine(turned, asked) < _STRAIGHT_COSINE:
             return self._again(self._words_of_crossed())
         return self._again(self._words_of_opposite(wrong) if wrong else "")

@@ -1,0 +1,386 @@
+"""Finds a wheel that does not obey: by its commands, its counts and the measured poses, as three witnesses.
+
+Two cumulative sums (Page 1954, one-sided CUSUM) watch each wheel, both in radians. `missing` grows while a wheel turns by
+less than half of what it is expected to: the least command of the time in which delay and lag may still hold it back,
+less what the wheel has shown to lose of its commands (dead band, sag, load). `beyond` grows while it turns faster than
+any command explains. The poses are the third witness: straight lines through the newest of them say how fast each wheel
+truly turned. They tell an encoder from a motor, and they find an encoder that does not count where commands are too slow
+to expect anything.
+
+A robot with slip, dead band, stiction, lag, lifted wheels or rough ground stays below: its wheels lose a part of what
+is expected, and what they lose for long is learnt.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from disco_hw.estimation.odometry import OdometryParameters
+from drivers.types import PoseSample, WheelCommand, WheelSample
+
+LATE_NS = 600_000_000
+"""Delay and lag of a wheel together: what was commanded so long ago may still be on its way."""
+EXPECTED_PART = 0.5
+"""A wheel that turns by this part of what it is expected to follows; drift of the CUSUM between sound and standing."""
+MISSING_RAD = 0.1
+SHORTEST_NS = 350_000_000
+"""A wheel may stand for less against a stone."""
+LONGEST_NS = 700_000_000
+"""So long after the first sign at most is waited for poses that tell the cause."""
+UNKNOWN_LOSS_RAD_S = 1.5
+"""Dead band and stiction of a wheel that has not turned since it stood."""
+FASTER_PART, FASTER_RAD_S, BEYOND_RAD = 1.5, 1.0, 0.15
+FOLLOWED_RAD = 0.3
+RESTS_RAD_S = 0.1
+_FILTER_S, _LOSES_LESS_S, _LOSES_MORE_S = 0.3, 0.5, 2.0
+_SIDES = ("left", "right")
+WHEELS = "wheels"
+
+
+class Cause(enum.Enum):
+    """What is wrong with a wheel, for a person; {side} is filled in."""
+
+    ENCODER_SILENT = (
+        "the {side} wheel turns, as the poses show, and its encoder does not count: frozen or disconnected; check the "
+        "encoder's plug and cable"
+    )
+    ENCODER_REVERSED = (
+        "the {side} wheel's encoder suddenly counts backwards, and the poses show that the wheel turns as commanded: "
+        "check the encoder's cable and channels"
+    )
+    STANDS = (
+        "the {side} wheel stands although it is commanded to turn: blocked, its motor without power, or its encoder "
+        "lost where the controller turns the motor by it; free the wheel, check the cables of motor and encoder"
+    )
+    RUNS_AWAY = (
+        "the {side} wheel runs away: it turns much faster than commanded; check the motor controller, and the cables "
+        "of motor and encoder"
+    )
+    TURNS_BACKWARD = (
+        "the {side} wheel turns backward, as counts and poses show, although it is commanded forward or the other way "
+        "round; check the motor controller and the motor's cable"
+    )
+    SILENT = (
+        "the {side} wheel does not count although it is commanded to turn, and the poses do not show whether it turns: "
+        "its encoder is frozen or disconnected, or the wheel is blocked; check both"
+    )
+    OPPOSED = (
+        "the {side} wheel suddenly counts against its commands, and the poses do not show which way it turns: its "
+        "encoder is reversed, or its motor runs the wrong way; check the cables of both"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class WheelFault:
+    """What was found, at which wheel or both."""
+
+    cause: Cause
+    side: str
+
+    @property
+    def words(self) -> str:
+        """For a person, with what to look at."""
+        return self.cause.value.format(side=self.side)
+
+
+@dataclass(slots=True)
+class _Wheel:
+    """One wheel; angles in rad, all in the direction of its command but for `angle_rad`."""
+
+    angle_rad: float = math.nan
+    speed_rad_s: float = 0.0
+    loss_rad_s: float = UNKNOWN_LOSS_RAD_S
+    missing_rad: float = 0.0
+    beyond_rad: float = 0.0
+    since_ns: int = 0
+    expected_rad: float = 0.0
+    counted_rad: float = 0.0
+    followed_rad: float = 0.0
+    direction: float = 1.0
+    is_told: bool = False
+
+    def rest(self) -> None:
+        """Nothing is commanded: nothing is expected."""
+        self.missing_rad = self.beyond_rad = self.expected_rad = self.counted_rad = 0.0
+        self.loss_rad_s, self.is_told = UNKNOWN_LOSS_RAD_S, False
+
+    def step(self, t_ns: int, dt_s: float, turned_rad: float, commands: Sequence[float]) -> None:
+        """Take in by how much it was counted, and the commands that may be in force meanwhile."""
+        low, high = min(commands), max(commands)
+        if low > 0.0 or high < 0.0:
+            self.direction = math.copysign(1.0, low)
+        least = max(low, -high, 0.0)
+        most = max(abs(low), abs(high))
+        progress = self.direction * turned_rad
+        self._learn(dt_s, progress, 0.5 * (least + most), abs(commands[-1]))
+        expected = max(least - self.loss_rad_s, 0.0) * dt_s
+        self.beyond_rad = max(self.beyond_rad + abs(turned_rad) - (FASTER_PART * most + FASTER_RAD_S) * dt_s, 0.0)
+        # Without a command that must be in force by now a wheel may turn either way.
+        self.missing_rad += EXPECTED_PART * expected - progress if least > 0.0 else 0.0
+        if self.missing_rad <= 0.0 or least == 0.0:
+            self.missing_rad, self.since_ns = 0.0, t_ns
+            self.expected_rad = self.counted_rad = 0.0
+            self.is_told = False
+            self.followed_rad += max(progress, 0.0) if least > 0.0 else 0.0
+        else:
+            self.expected_rad += expected
+            self.counted_rad += progress
+
+    def _learn(self, dt_s: float, progress_rad: float, commanded_rad_s: float, newest_rad_s: float) -> None:
+        """Learn what it loses of its commands while it turns by them; a wheel that came to rest may stick again."""
+        if dt_s > 0.0:
+            self.speed_rad_s += (progress_rad / dt_s - self.speed_rad_s) * -math.expm1(-dt_s / _FILTER_S)
+        if newest_rad_s < RESTS_RAD_S and abs(self.speed_rad_s) < RESTS_RAD_S:
+            self.loss_rad_s = UNKNOWN_LOSS_RAD_S
+        elif self.speed_rad_s > EXPECTED_PART * max(commanded_rad_s - self.loss_rad_s, 0.1 * commanded_rad_s):
+            loses = max(commanded_rad_s - self.speed_rad_s, 0.0)
+            time_s = _LOSES_LESS_S if loses < self.loss_rad_s else _LOSES_MORE_S
+            self.loss_rad_s += (loses - self.loss_rad_s) * -math.expm1(-dt_s / time_s)
+
+    @property
+    def has_followed(self) -> bool:
+        """Whether it has ever counted as commanded, for long enough to know how it is wired."""
+        return self.followed_rad > FOLLOWED_RAD
+
+    @property
+    def is_suspect(self) -> bool:
+        """Whether less of the evidence than stops the robot speaks against it."""
+        return self.missing_rad > 0.5 * MISSING_RAD or self.beyond_rad > 0.5 * BEYOND_RAD
+
+    def is_missing(self, now_ns: int) -> bool:
+        """Whether it does not follow."""
+        return self.missing_rad > MISSING_RAD and now_ns - self.since_ns >= SHORTEST_NS
+
+    @property
+    def is_backward(self) -> bool:
+        """Whether it counted the other way, of what does not follow."""
+        return self.counted_rad < -0.25 * max(self.expected_rad, 0.5 * self.missing_rad)
+
+
+POSES_NS = 1_000_000_000
+LEAST_POSES = 5
+SLIP_PART = 0.1
+"""By so much of its speed a wheel may slip."""
+DECIDED = 2.0
+"""Standard deviations from the middle between two explanations."""
+LARGEST_OFF = 5.0
+"""Standard deviations of a pose from the line through its neighbours."""
+SEEN = 4.0
+"""Standard deviations of a motion that the counts deny."""
+_SETTLED_NS = 60_000_000
+
+
+@dataclass(slots=True)
+class _PoseTravel:
+    """The newest poses of the first source, as wheel speeds."""
+
+    poses: deque[PoseSample] = field(default_factory=deque)
+
+    def add(self, pose: PoseSample) -> bool:
+        """Take in one; returns whether it is used."""
+        if pose.source != 0 or not pose.has_heading or (self.poses and pose.t_ns <= self.poses[-1].t_ns):
+            return False
+        self.poses.append(pose)
+        while pose.t_ns - self.poses[0].t_ns > POSES_NS:
+            self.poses.popleft()
+        return True
+
+    def wheel_speeds(self, since_ns: int, geometry: OdometryParameters) -> tuple[float, float, float] | None:
+        """Left and right speed since then (rad/s), and their standard deviation; None from too few poses."""
+        used = [pose for pose in self.poses if pose.t_ns >= since_ns]
+        if len(used) < LEAST_POSES:
+            return None
+        first = used[0]
+        times = [(pose.t_ns - first.t_ns) * 1e-9 for pose in used]
+        mean_s = sum(times) / len(times)
+        weights = [time - mean_s for time in times]
+        spread = sum(weight * weight for weight in weights)
+        yaws = [math.remainder(pose.yaw_rad - first.yaw_rad, 2.0 * math.pi) for pose in used]
+        along = first.yaw_rad + sum(yaws) / len(yaws)
+        cosine, sine = math.cos(along), math.sin(along)
+        ahead = sum(
+            weight * ((pose.x_m - first.x_m) * cosine + (pose.y_m - first.y_m) * sine)
+            for weight, pose in zip(weights, used, strict=True)
+        )
+        turn = sum(weight * yaw for weight, yaw in zip(weights, yaws, strict=True))
+        if not self._is_straight(used, yaws, weights, along, turn / spread):
+            return None
+        half_m = 0.5 * geometry.axial_distance_m
+        position_std_m = max(pose.position_std_m for pose in used)
+        yaw_std_rad = max(pose.yaw_std_rad for pose in used)
+        radius = geometry.wheel_radius_m
+        left, right = ((ahead + side * half_m * turn) / spread / radius for side in (-1.0, 1.0))
+        std = math.hypot(position_std_m, half_m * yaw_std_rad) / math.sqrt(spread) / radius
+        return left, right, math.hypot(std, SLIP_PART * max(abs(left), abs(right)))
+
+    def _is_straight(
+        self, used: Sequence[PoseSample], yaws: Sequence[float], weights: Sequence[float], along: float, turn: float
+    ) -> bool:
+        """Whether the poses lie on a line as well as their noise lets them: no jump and no outlier among them."""
+        first = used[0]
+        mean_yaw = sum(yaws) / len(yaws)
+        off = [
+            (yaw - mean_yaw - turn * weight) / max(pose.yaw_std_rad, 1e-6)
+            for yaw, weight, pose in zip(yaws, weights, used, strict=True)
+        ]
+        for axis in (0.0, 0.5 * math.pi):
+            cosine, sine = math.cos(along + axis), math.sin(along + axis)
+            places = [(pose.x_m - first.x_m) * cosine + (pose.y_m - first.y_m) * sine for pose in used]
+            mean = sum(places) / len(places)
+            spread = sum(weight * weight for weight in weights)
+            slope = sum(weight * place for weight, place in zip(weights, places, strict=True)) / spread
+            off += [
+                (place - mean - slope * weight) / max(pose.position_std_m, 1e-6)
+                for place, weight, pose in zip(places, weights, used, strict=True)
+            ]
+        return max(map(abs, off)) < LARGEST_OFF
+
+
+class WheelFaults:
+    """Pure, one step a tick and, after it, the command that the tick sent.
+
+    `events` of a step say when a wheel begins not to follow; `not_following` counts them.
+    """
+
+    def __init__(self) -> None:
+        self._wheels = (_Wheel(), _Wheel())
+        self._travel = _PoseTravel()
+        self._commands: deque[tuple[int, float, float]] = deque()
+        self._last_ns: int | None = None
+        self.not_following = 0
+        self.events: tuple[str, ...] = ()
+
+    @property
+    def has_followed(self) -> tuple[bool, bool]:
+        """Whether left and right have ever counted as commanded: from then on the wiring is known to be right."""
+        left, right = self._wheels
+        return left.has_followed, right.has_followed
+
+    @property
+    def is_suspect(self) -> bool:
+        """Whether a wheel does not follow now, so that poses cannot say how it is wired."""
+        return any(wheel.is_suspect for wheel in self._wheels)
+
+    def commanded(self, now_ns: int, command: WheelCommand | None) -> None:
+        """Take in what a tick sent; None for nothing."""
+        if command is None:
+            self._commands.clear()
+            for wheel in self._wheels:
+                wheel.rest()
+            return
+        self._commands.append((now_ns, command.left_rad_s, command.right_rad_s))
+
+    def step(
+        self, now_ns: int, wheels: Sequence[WheelSample], poses: Sequence[PoseSample], geometry: OdometryParameters,
+        is_wiring_known: bool = True,
+    ) -> WheelFault | None:  # fmt: skip
+        """Take in a tick's samples; returns what is wrong, for as long as it is.
+
+        Without `is_wiring_known` a wheel that never counted as commanded and counts backward is left to others.
+        """
+        has_new_pose = any([self._travel.add(pose) for pose in poses])
+        events: list[str] = []
+        for sample in wheels:
+            self._take(sample)
+            events += self._begun()
+        self.events = tuple(events)
+        if not self._commands or now_ns - self._commands[0][0] < LATE_NS // 2:
+            return None
+        return (
+            self._runaway(geometry)
+            or self._missing(now_ns, geometry, is_wiring_known)
+            or (self._unseen(geometry) if has_new_pose else None)
+        )
+
+    def _take(self, sample: WheelSample) -> None:
+        dt_s = 0.0 if self._last_ns is None else max(sample.t_ns - self._last_ns, 0) * 1e-9
+        self._last_ns = sample.t_ns
+        sent = self._commands
+        while len(sent) > 1 and sample.t_ns - sent[1][0] > LATE_NS:
+            sent.popleft()
+        for side, angle in enumerate((sample.left_angle_rad, sample.right_angle_rad)):
+            wheel = self._wheels[side]
+            turned, wheel.angle_rad = angle - wheel.angle_rad, angle
+            if sent and math.isfinite(turned):
+                wheel.step(sample.t_ns, dt_s, turned, [entry[1 + side] for entry in sent])
+
+    def _begun(self) -> list[str]:
+        """Words for each wheel that begins not to follow."""
+        said = []
+        for wheel, name in zip(self._wheels, _SIDES, strict=True):
+            if wheel.is_suspect and not wheel.is_told:
+                wheel.is_told = True
+                self.not_following += 1
+                asked = self._commands[-1][1 + _SIDES.index(name)]
+                said.append(
+                    f"the {name} wheel does not follow: {wheel.direction * wheel.speed_rad_s:.1f} rad/s, commanded "
+                    f"{asked:.1f} rad/s"
+                )
+        return said
+
+    def _runaway(self, geometry: OdometryParameters) -> WheelFault | None:
+        found = [side for side in (0, 1) if self._wheels[side].beyond_rad > BEYOND_RAD]
+        if not found:
+            return None
+        wheel = self._wheels[found[0]]
+        if wheel.is_backward and wheel.missing_rad > MISSING_RAD:
+            # Its loop runs away with an encoder that is reversed, or it runs away backward.
+            turns = self._turns(found[0], geometry)
+            if turns is not None and turns > 0:
+                return WheelFault(Cause.ENCODER_REVERSED, _names(found))
+        return WheelFault(Cause.RUNS_AWAY, _names(found))
+
+    def _missing(self, now_ns: int, geometry: OdometryParameters, is_wiring_known: bool) -> WheelFault | None:
+        found = [side for side in (0, 1) if self._wheels[side].is_missing(now_ns)]
+        known = [is_wiring_known or self._wheels[side].has_followed for side in (0, 1)]
+        found = [side for side in found if known[side] or not self._wheels[side].is_backward]
+        if not found:
+            return None
+        wheel = self._wheels[found[0]]
+        turns = self._turns(found[0], geometry)
+        if turns is None and self._travel.poses and now_ns - wheel.since_ns < LONGEST_NS:
+            return None
+        if wheel.is_backward:
+            causes = {1: Cause.ENCODER_REVERSED, -1: Cause.TURNS_BACKWARD, 0: Cause.OPPOSED, None: Cause.OPPOSED}
+        else:
+            causes = {1: Cause.ENCODER_SILENT, -1: Cause.ENCODER_SILENT, 0: Cause.STANDS, None: Cause.SILENT}
+        return WheelFault(causes[turns], _names(found))
+
+    def _turns(self, side: int, geometry: OdometryParameters) -> int | None:
+        """How a wheel that does not follow truly turns: 1 as commanded, 0 not at all, -1 backward; None if unclear."""
+        wheel = self._wheels[side]
+        seen = self._travel.wheel_speeds(wheel.since_ns + _SETTLED_NS, geometry)
+        lasted_s = (self._travel.poses[-1].t_ns - wheel.since_ns) * 1e-9 if self._travel.poses else 0.0
+        if seen is None or lasted_s <= 0.0:
+            return None
+        speed, std = wheel.direction * seen[side], seen[2]
+        middle = 0.5 * max(wheel.expected_rad, abs(wheel.counted_rad)) / lasted_s
+        if speed - middle > DECIDED * std:
+            return 1
+        if speed + middle < -DECIDED * std:
+            return -1
+        return 0 if middle - abs(speed) > DECIDED * std else None
+
+    def _unseen(self, geometry: OdometryParameters) -> WheelFault | None:
+        """A wheel of which nothing is expected, that does not count, and that the poses show to turn."""
+        if not self._commands:
+            return None
+        seen = self._travel.wheel_speeds(self._commands[0][0], geometry)
+        if seen is None:
+            return None
+        for side in (0, 1):
+            wheel, other, asked = self._wheels[side], self._wheels[1 - side], self._commands[-1][1 + side]
+            speed, std = math.copysign(1.0, asked) * seen[side], seen[2]
+            counts = abs(wheel.speed_rad_s) > 0.2 * speed
+            agrees = abs(seen[1 - side] - other.direction * other.speed_rad_s) < DECIDED * std + 0.2 * abs(speed)
+            if wheel.loss_rad_s >= abs(asked) and not counts and agrees and speed > max(SEEN * std, 0.5 * abs(asked)):
+                return WheelFault(Cause.ENCODER_SILENT, _SIDES[side])
+        return None
+
+
+def _names(sides: Sequence[int]) -> str:
+    return " and the ".join(_SIDES[side] for side in sides)
