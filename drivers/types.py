@@ -492,7 +492,8 @@ class MotorDriver:
     clock, so that `check` can ask. `exchange` makes what a serial line is spoken with; None: the reference protocol's
     frames. `serial_field`: of the settings, one that belongs to a serial link, where it must be given, and to no other.
     `example`: its fields in [link] for a robot as the demonstration drives it; none where its controller is not
-    simulated. `recognise`: of frames that came, the fields in [link] that they show, None if they are not its
+    simulated. `takes_body_speeds`: whether it is given speed and turn rate of the body, and makes wheel speeds of them by
+    a track of its own. `recognise`: of frames that came, the fields in [link] that they show, None if they are not its
     controller's; where it says nothing by itself, of the replies to `questions` on a serial line. `latches_stop`:
     whether the controller itself keeps an e-stop until it is reset.
     """
@@ -512,5 +513,6 @@ class MotorDriver:
     recognise: Callable[[Sequence[Frame]], dict[str, Any] | None] = lambda _frames: None
     questions: LineQuestions | None = None
     latches_stop: bool = True
+    takes_body_speeds: bool = False
     authenticates: bool = False
     tells_reception: bool = False

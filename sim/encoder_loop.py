@@ -1,9 +1,9 @@
 """What a vendor's motor loop makes of an encoder that does not report what its motor does.
 
-With a sound encoder the plant's own speed loop stands for the controller's, and nothing here acts. The loop's error is
-the wanted speed less the reported one; what a wrong report adds to it, the true speed less the reported one, drives a
-proportional-integral term that ends at full speed, as a RoboClaw's does when the encoder's cable comes off. A motor that
-is commutated by the encoder cannot run away so: its field stands where the encoder says, and the rotor locks to it.
+With a sound encoder the plant's own speed loop stands for the controller's, and nothing here acts. With a wrong one the
+wanted speed less the reported one drives a proportional-integral term that ends at full speed, as a RoboClaw's does when
+the encoder's cable comes off. A motor that is commutated by the encoder cannot run away so: its field stands where the
+encoder says, and the rotor locks to it.
 """
 
 from __future__ import annotations
@@ -34,18 +34,25 @@ class EncoderLoop:
 
     use: EncoderUse
     full_rad_s: float
-    _missed_rad_s: list[float] = field(default_factory=lambda: [0.0, 0.0])
-    _missed_rad: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    _error_rad_s: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    _error_rad: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    _denied_rad: list[float] = field(default_factory=lambda: [0.0, 0.0])
 
-    def see(self, true: FirmwareInputs, reported: FirmwareInputs, dt_s: float, regulates: bool) -> None:
-        """Take in what the encoders saw and what the controller was told of it."""
+    def see(
+        self, wanted_rad_s: Sequence[float], true: FirmwareInputs, reported: FirmwareInputs, dt_s: float,
+        regulates: bool,
+    ) -> None:  # fmt: skip
+        """Take in what was wanted, what the encoders saw, and what the controller was told of it."""
         seen = (true.left_speed_rad_s, true.right_speed_rad_s)
         told = (reported.left_speed_rad_s, reported.right_speed_rad_s)
         for side in (0, 1):
-            missed = seen[side] - told[side]
-            self._missed_rad_s[side] = missed
-            # A loop that is let go, or that sees its motor again, forgets.
-            self._missed_rad[side] = self._missed_rad[side] + missed * dt_s if regulates and missed != 0.0 else 0.0
+            if not regulates or seen[side] == told[side]:
+                # A loop that is let go, or that sees its motor again, forgets.
+                self._error_rad_s[side] = self._error_rad[side] = self._denied_rad[side] = 0.0
+                continue
+            self._error_rad_s[side] = wanted_rad_s[side] - told[side]
+            self._error_rad[side] += self._error_rad_s[side] * dt_s
+            self._denied_rad[side] += (seen[side] - told[side]) * dt_s
 
     def drive(self, wanted_rad_s: Sequence[float]) -> tuple[float, float]:
         """Return the speeds that the motors are driven at while the loop holds the wanted ones."""
@@ -53,10 +60,7 @@ class EncoderLoop:
         return left, right
 
     def _drive(self, side: int, wanted: float) -> float:
-        missed = self._missed_rad[side]
-        if missed == 0.0:
-            return wanted
         if self.use is EncoderUse.COMMUTATION:
-            return 0.0 if abs(missed) > LOCKED_RAD else wanted
-        driven = wanted + PROPORTIONAL * self._missed_rad_s[side] + INTEGRAL_PER_S * missed
-        return math.copysign(min(abs(driven), self.full_rad_s), driven)
+            return 0.0 if abs(self._denied_rad[side]) > LOCKED_RAD else wanted
+        driven = wanted + PROPORTIONAL * self._error_rad_s[side] + INTEGRAL_PER_S * self._error_rad[side]
+        return math.copysign(min(abs(driven), max(self.full_rad_s, abs(wanted))), driven)

@@ -197,7 +197,7 @@ class VendorRobot:
         inputs = sensor_inputs(plant, self.estop_button, error_counters, ResetCause.POWER_ON)
         if faults is not None:
             true, inputs = inputs, faults.inputs(inputs, asked, enabled)
-            self._loop.see(true, inputs, dt_s, regulates)
+            self._loop.see(asked, true, inputs, dt_s, regulates)
         frames, self._replies = [*self._replies, *self.controller.step(now_us, inputs)], []
         return [Frame(frame.can_id, frame.data, frame.extended) for frame in frames]
 

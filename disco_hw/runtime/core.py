@@ -24,6 +24,7 @@ from disco_hw.runtime.robot_setup import record_of
 from disco_hw.runtime.supervisor import Inputs, Output, Reply, Supervisor, UserRequest
 from disco_hw.runtime.wheel_faults import WheelFaults
 from disco_hw.tasks import RobotTask
+from drivers.motor import find_driver
 from drivers.pose.robot import RobotPoses
 from drivers.types import (
     Driver,
@@ -93,7 +94,7 @@ class DaemonCore:
         self.recorder = recorder
         self.adaptation = adaptation or NoAdaptation()
         self._plausibility = Plausibility()
-        self._wheel_faults = WheelFaults()
+        self._wheel_faults = WheelFaults(find_driver(config.link.driver).takes_body_speeds)
         robot = config.robot
         self.directions: Directions | None = Directions(robot.wheel_radius_m, robot.axial_distance_m, config.wheels)
         """None where somebody finds out how the wheels are wired, and looks at them: no fault of one stops it then."""

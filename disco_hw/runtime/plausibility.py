@@ -13,9 +13,9 @@ from __future__ import annotations
 import itertools
 import math
 from bisect import bisect_right
-from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from typing import NamedTuple
 
 from drivers.motor import Wiring
 from drivers.types import PoseSample, PowerSample, WheelCommand, WheelSample
@@ -184,9 +184,37 @@ _UNKNOWN_PART = 0.2
 _ENOUGH, _MOST_OF_ONE = 10.0, 4.0
 """Of log-likelihood against what robot.toml says, in all and by one pose."""
 _LARGEST_TURN_RAD = 1.5
+_MOVED_STD, _START_STD, _MOST_STARTS = 6.0, 2.0, 50
+"""Standard deviations of a pose at rest that are no motion, and of their mean; how many count."""
 _TURNED_PARTS = (0.4, 0.6, 0.8, 1.0)
 """Of the turn of an ideal robot: a skid-steer turns less, by how much is what the model knows."""
 Pair = tuple[float, float]
+
+
+class _Start(NamedTuple):
+    """The mean of poses at rest, of one source."""
+
+    source: int
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    count: int
+
+    @staticmethod
+    def of(pose: PoseSample) -> _Start:
+        """The first one."""
+        return _Start(pose.source, pose.x_m, pose.y_m, pose.yaw_rad, 1)
+
+    def take(self, pose: PoseSample) -> _Start:
+        """Take in one more; another source, or a place that noise does not explain, begins anew."""
+        yaw = math.remainder(pose.yaw_rad - self.yaw_rad, 2.0 * math.pi)
+        away_m = math.hypot(pose.x_m - self.x_m, pose.y_m - self.y_m)
+        moved = away_m > _MOVED_STD * pose.position_std_m or abs(yaw) > _MOVED_STD * pose.yaw_std_rad
+        if pose.source != self.source or moved:
+            return _Start.of(pose)
+        part = 1.0 / (self.count + 1)
+        x_m, y_m = self.x_m + part * (pose.x_m - self.x_m), self.y_m + part * (pose.y_m - self.y_m)
+        return _Start(self.source, x_m, y_m, self.yaw_rad + part * yaw, min(self.count + 1, _MOST_STARTS))
 
 
 class Directions:
@@ -198,7 +226,7 @@ class Directions:
     def __init__(self, radius_m: float, track_m: float, wiring: Wiring) -> None:
         self._radius_m, self._track_m, self._wiring = radius_m, track_m, wiring
         self._turned: list[tuple[int, float, float]] = []
-        self._pose: PoseSample | None = None
+        self._start: _Start | None = None
         self._begun_ns: int | None = None
         self._last_ns = 0
         self._asked: Pair = (0.0, 0.0)
@@ -248,7 +276,7 @@ class Directions:
 
     def _reset(self) -> None:
         self._turned = []
-        self._pose = None
+        self._start = None
         self._begun_ns = None
         self._last_ns = 0
         self._asked = (0.0, 0.0)
@@ -263,8 +291,9 @@ class Directions:
         self, now_ns: int, wheels: Sequence[WheelSample], poses: Sequence[PoseSample], asked: Pair
     ) -> None:
         """What turns and moves from here on belongs to a motion that began at rest."""
-        with_heading = [pose for pose in poses if pose.has_heading]
-        self._pose = with_heading[-1] if with_heading else self._pose
+        for pose in poses:
+            if pose.has_heading:
+                self._start = _Start.of(pose) if self._start is None else self._start.take(pose)
         stands = all(
             max(abs(wheel.left_speed_rad_s), abs(wheel.right_speed_rad_s)) < STANDS_RAD_S for wheel in wheels[-1:]
         )
@@ -288,7 +317,8 @@ class Directions:
         wrong = [
             side
             for side in (0, 1)
-            if not has_followed[side] and turned[side] * math.copysign(1.0, asked[side]) < -max(LEAST_RAD, _OPPOSITE_PART * abs(asked[side]))
+            if not has_followed[side]
+            and turned[side] * math.copysign(1.0, asked[side]) < -max(LEAST_RAD, _OPPOSITE_PART * abs(asked[side]))
         ]
         crossed = (asked[1], asked[0])
         enough = abs(turned[0]) + abs(turned[1]) > LEAST_SUM_RAD and min(map(abs, turned)) > LEAST_PART * max(
@@ -300,7 +330,7 @@ class Directions:
 
     def _by_poses(self, poses: Sequence[PoseSample]) -> str | None:
         """What else than robot.toml says explains how the robot has moved since it stood."""
-        start, declared = self._pose, (False, (1, 1))
+        start, declared = self._start, (False, (1, 1))
         for pose in poses:
             if start is None or not pose.has_heading or pose.source != start.source:
                 continue
@@ -313,7 +343,9 @@ class Directions:
             far_m = 0.5 * self._radius_m * (abs(turned[0]) + abs(turned[1]))
             arc_std_m = 0.5 * self._track_m * pose.yaw_std_rad
             variance = 2.0 * (pose.position_std_m**2 + arc_std_m**2) + (_SLIP_PART * far_m) ** 2
-            off_declared = max(0.0, self._off_m(ahead_m, yaw, turned, *declared) - _UNKNOWN_PART * far_m)
+            # All poses share the start's error, which may be no evidence.
+            start_m = _START_STD * math.hypot(pose.position_std_m, arc_std_m) / math.sqrt(start.count)
+            off_declared = max(0.0, self._off_m(ahead_m, yaw, turned, *declared) - _UNKNOWN_PART * far_m - start_m)
             for wired in self._evidence:
                 off = self._off_m(ahead_m, yaw, turned, *wired)
                 gain = 0.5 * (off_declared**2 - off**2) / max(variance, 1e-9)

@@ -17,9 +17,11 @@ import enum
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import NamedTuple
 
 from disco_hw.estimation.odometry import OdometryParameters
+from disco_hw.runtime.pose_travel import PoseTravel
 from drivers.types import PoseSample, WheelCommand, WheelSample
 
 LATE_NS = 600_000_000
@@ -29,16 +31,17 @@ EXPECTED_PART = 0.5
 MISSING_RAD = 0.1
 SHORTEST_NS = 350_000_000
 """A wheel may stand for less against a stone."""
-LONGEST_NS = 700_000_000
+LONGEST_NS = 500_000_000
 """So long after the first sign at most is waited for poses that tell the cause."""
 UNKNOWN_LOSS_RAD_S = 1.5
 """Dead band and stiction of a wheel that has not turned since it stood."""
-FASTER_PART, FASTER_RAD_S, BEYOND_RAD = 1.5, 1.0, 0.15
+FASTER_PART, FASTER_RAD_S, BEYOND_RAD = 1.25, 0.75, 0.15
+BODY_TURN_PART = 1.5
+"""A base that is given speeds of the body may turn by wheels that differ by so much more than those asked for."""
 FOLLOWED_RAD = 0.3
 RESTS_RAD_S = 0.1
 _FILTER_S, _LOSES_LESS_S, _LOSES_MORE_S = 0.3, 0.5, 2.0
 _SIDES = ("left", "right")
-WHEELS = "wheels"
 
 
 class Cause(enum.Enum):
@@ -87,6 +90,22 @@ class WheelFault:
         return self.cause.value.format(side=self.side)
 
 
+class _Asked(NamedTuple):
+    """A command of one wheel (rad/s): as it stands, the slowest it may mean with its sign, and the fastest."""
+
+    speed: float
+    slowest: float
+    fastest: float
+
+
+def _asked(speed: float, other: float, turn_part: float) -> _Asked:
+    """What one wheel is asked for beside the other, where wheels may differ by up to `turn_part` of what is asked."""
+    mean = 0.5 * (speed + other)
+    turned = mean + turn_part * (speed - mean)
+    slowest = min((speed, turned), key=abs) if turned * speed > 0.0 else 0.0
+    return _Asked(speed, slowest, max(abs(speed), abs(turned)))
+
+
 @dataclass(slots=True)
 class _Wheel:
     """One wheel; angles in rad, all in the direction of its command but for `angle_rad`."""
@@ -108,20 +127,20 @@ class _Wheel:
         self.missing_rad = self.beyond_rad = self.expected_rad = self.counted_rad = 0.0
         self.loss_rad_s, self.is_told = UNKNOWN_LOSS_RAD_S, False
 
-    def step(self, t_ns: int, dt_s: float, turned_rad: float, commands: Sequence[float]) -> None:
+    def step(self, t_ns: int, dt_s: float, turned_rad: float, commands: Sequence[_Asked]) -> None:
         """Take in by how much it was counted, and the commands that may be in force meanwhile."""
-        low, high = min(commands), max(commands)
+        low, high = min(each.slowest for each in commands), max(each.slowest for each in commands)
         if low > 0.0 or high < 0.0:
             self.direction = math.copysign(1.0, low)
         least = max(low, -high, 0.0)
-        most = max(abs(low), abs(high))
+        most = max(each.fastest for each in commands)
         progress = self.direction * turned_rad
-        self._learn(dt_s, progress, 0.5 * (least + most), abs(commands[-1]))
+        self._learn(dt_s, progress, 0.5 * (least + max(abs(low), abs(high))), abs(commands[-1].speed))
         expected = max(least - self.loss_rad_s, 0.0) * dt_s
         self.beyond_rad = max(self.beyond_rad + abs(turned_rad) - (FASTER_PART * most + FASTER_RAD_S) * dt_s, 0.0)
         # Without a command that must be in force by now a wheel may turn either way.
-        self.missing_rad += EXPECTED_PART * expected - progress if least > 0.0 else 0.0
-        if self.missing_rad <= 0.0 or least == 0.0:
+        self.missing_rad = self.missing_rad + EXPECTED_PART * expected - progress if least > 0.0 else 0.0
+        if self.missing_rad <= 0.0:
             self.missing_rad, self.since_ns = 0.0, t_ns
             self.expected_rad = self.counted_rad = 0.0
             self.is_told = False
@@ -152,7 +171,7 @@ class _Wheel:
         return self.missing_rad > 0.5 * MISSING_RAD or self.beyond_rad > 0.5 * BEYOND_RAD
 
     def is_missing(self, now_ns: int) -> bool:
-        """Whether it does not follow."""
+        """Whether it does not follow, as far as counts can tell."""
         return self.missing_rad > MISSING_RAD and now_ns - self.since_ns >= SHORTEST_NS
 
     @property
@@ -161,95 +180,25 @@ class _Wheel:
         return self.counted_rad < -0.25 * max(self.expected_rad, 0.5 * self.missing_rad)
 
 
-POSES_NS = 1_000_000_000
-LEAST_POSES = 5
-SLIP_PART = 0.1
-"""By so much of its speed a wheel may slip."""
 DECIDED = 2.0
 """Standard deviations from the middle between two explanations."""
-LARGEST_OFF = 5.0
-"""Standard deviations of a pose from the line through its neighbours."""
 SEEN = 4.0
 """Standard deviations of a motion that the counts deny."""
 _SETTLED_NS = 60_000_000
 
 
-@dataclass(slots=True)
-class _PoseTravel:
-    """The newest poses of the first source, as wheel speeds."""
-
-    poses: deque[PoseSample] = field(default_factory=deque)
-
-    def add(self, pose: PoseSample) -> bool:
-        """Take in one; returns whether it is used."""
-        if pose.source != 0 or not pose.has_heading or (self.poses and pose.t_ns <= self.poses[-1].t_ns):
-            return False
-        self.poses.append(pose)
-        while pose.t_ns - self.poses[0].t_ns > POSES_NS:
-            self.poses.popleft()
-        return True
-
-    def wheel_speeds(self, since_ns: int, geometry: OdometryParameters) -> tuple[float, float, float] | None:
-        """Left and right speed since then (rad/s), and their standard deviation; None from too few poses."""
-        used = [pose for pose in self.poses if pose.t_ns >= since_ns]
-        if len(used) < LEAST_POSES:
-            return None
-        first = used[0]
-        times = [(pose.t_ns - first.t_ns) * 1e-9 for pose in used]
-        mean_s = sum(times) / len(times)
-        weights = [time - mean_s for time in times]
-        spread = sum(weight * weight for weight in weights)
-        yaws = [math.remainder(pose.yaw_rad - first.yaw_rad, 2.0 * math.pi) for pose in used]
-        along = first.yaw_rad + sum(yaws) / len(yaws)
-        cosine, sine = math.cos(along), math.sin(along)
-        ahead = sum(
-            weight * ((pose.x_m - first.x_m) * cosine + (pose.y_m - first.y_m) * sine)
-            for weight, pose in zip(weights, used, strict=True)
-        )
-        turn = sum(weight * yaw for weight, yaw in zip(weights, yaws, strict=True))
-        if not self._is_straight(used, yaws, weights, along, turn / spread):
-            return None
-        half_m = 0.5 * geometry.axial_distance_m
-        position_std_m = max(pose.position_std_m for pose in used)
-        yaw_std_rad = max(pose.yaw_std_rad for pose in used)
-        radius = geometry.wheel_radius_m
-        left, right = ((ahead + side * half_m * turn) / spread / radius for side in (-1.0, 1.0))
-        std = math.hypot(position_std_m, half_m * yaw_std_rad) / math.sqrt(spread) / radius
-        return left, right, math.hypot(std, SLIP_PART * max(abs(left), abs(right)))
-
-    def _is_straight(
-        self, used: Sequence[PoseSample], yaws: Sequence[float], weights: Sequence[float], along: float, turn: float
-    ) -> bool:
-        """Whether the poses lie on a line as well as their noise lets them: no jump and no outlier among them."""
-        first = used[0]
-        mean_yaw = sum(yaws) / len(yaws)
-        off = [
-            (yaw - mean_yaw - turn * weight) / max(pose.yaw_std_rad, 1e-6)
-            for yaw, weight, pose in zip(yaws, weights, used, strict=True)
-        ]
-        for axis in (0.0, 0.5 * math.pi):
-            cosine, sine = math.cos(along + axis), math.sin(along + axis)
-            places = [(pose.x_m - first.x_m) * cosine + (pose.y_m - first.y_m) * sine for pose in used]
-            mean = sum(places) / len(places)
-            spread = sum(weight * weight for weight in weights)
-            slope = sum(weight * place for weight, place in zip(weights, places, strict=True)) / spread
-            off += [
-                (place - mean - slope * weight) / max(pose.position_std_m, 1e-6)
-                for place, weight, pose in zip(places, weights, used, strict=True)
-            ]
-        return max(map(abs, off)) < LARGEST_OFF
-
-
 class WheelFaults:
     """Pure, one step a tick and, after it, the command that the tick sent.
 
-    `events` of a step say when a wheel begins not to follow; `not_following` counts them.
+    `events` of a step say when a wheel begins not to follow; `not_following` counts them. `takes_body_speeds`: the base
+    makes wheel speeds of its own.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, takes_body_speeds: bool = False) -> None:
+        self._turn_part = BODY_TURN_PART if takes_body_speeds else 1.0
         self._wheels = (_Wheel(), _Wheel())
-        self._travel = _PoseTravel()
-        self._commands: deque[tuple[int, float, float]] = deque()
+        self._travel = PoseTravel()
+        self._commands: deque[tuple[int, _Asked, _Asked]] = deque()
         self._last_ns: int | None = None
         self.not_following = 0
         self.events: tuple[str, ...] = ()
@@ -272,7 +221,8 @@ class WheelFaults:
             for wheel in self._wheels:
                 wheel.rest()
             return
-        self._commands.append((now_ns, command.left_rad_s, command.right_rad_s))
+        left, right = command.left_rad_s, command.right_rad_s
+        self._commands.append((now_ns, _asked(left, right, self._turn_part), _asked(right, left, self._turn_part)))
 
     def step(
         self, now_ns: int, wheels: Sequence[WheelSample], poses: Sequence[PoseSample], geometry: OdometryParameters,
@@ -282,7 +232,7 @@ class WheelFaults:
 
         Without `is_wiring_known` a wheel that never counted as commanded and counts backward is left to others.
         """
-        has_new_pose = any([self._travel.add(pose) for pose in poses])
+        has_new_pose = sum(self._travel.add(pose) for pose in poses) > 0
         events: list[str] = []
         for sample in wheels:
             self._take(sample)
@@ -315,7 +265,7 @@ class WheelFaults:
             if wheel.is_suspect and not wheel.is_told:
                 wheel.is_told = True
                 self.not_following += 1
-                asked = self._commands[-1][1 + _SIDES.index(name)]
+                asked = self._commands[-1][1 + _SIDES.index(name)].speed
                 said.append(
                     f"the {name} wheel does not follow: {wheel.direction * wheel.speed_rad_s:.1f} rad/s, commanded "
                     f"{asked:.1f} rad/s"
@@ -335,14 +285,18 @@ class WheelFaults:
         return WheelFault(Cause.RUNS_AWAY, _names(found))
 
     def _missing(self, now_ns: int, geometry: OdometryParameters, is_wiring_known: bool) -> WheelFault | None:
-        found = [side for side in (0, 1) if self._wheels[side].is_missing(now_ns)]
         known = [is_wiring_known or self._wheels[side].has_followed for side in (0, 1)]
-        found = [side for side in found if known[side] or not self._wheels[side].is_backward]
+        suspect = [side for side in (0, 1) if self._wheels[side].missing_rad > 0.5 * MISSING_RAD]
+        suspect = [side for side in suspect if known[side] or not self._wheels[side].is_backward]
+        found = [side for side in suspect if self._wheels[side].is_missing(now_ns)]
+        if not found:
+            # Where the poses deny the counts, nothing may be waited for: the loop may be running away.
+            found = [side for side in suspect if self._turns(side, geometry, SEEN) == 1]
         if not found:
             return None
         wheel = self._wheels[found[0]]
         turns = self._turns(found[0], geometry)
-        if turns is None and self._travel.poses and now_ns - wheel.since_ns < LONGEST_NS:
+        if turns is None and self._travel.newest_ns is not None and now_ns - wheel.since_ns < LONGEST_NS:
             return None
         if wheel.is_backward:
             causes = {1: Cause.ENCODER_REVERSED, -1: Cause.TURNS_BACKWARD, 0: Cause.OPPOSED, None: Cause.OPPOSED}
@@ -350,20 +304,21 @@ class WheelFaults:
             causes = {1: Cause.ENCODER_SILENT, -1: Cause.ENCODER_SILENT, 0: Cause.STANDS, None: Cause.SILENT}
         return WheelFault(causes[turns], _names(found))
 
-    def _turns(self, side: int, geometry: OdometryParameters) -> int | None:
+    def _turns(self, side: int, geometry: OdometryParameters, sure: float = DECIDED) -> int | None:
         """How a wheel that does not follow truly turns: 1 as commanded, 0 not at all, -1 backward; None if unclear."""
         wheel = self._wheels[side]
         seen = self._travel.wheel_speeds(wheel.since_ns + _SETTLED_NS, geometry)
-        lasted_s = (self._travel.poses[-1].t_ns - wheel.since_ns) * 1e-9 if self._travel.poses else 0.0
-        if seen is None or lasted_s <= 0.0:
+        newest_ns = self._travel.newest_ns
+        if seen is None or newest_ns is None:
             return None
-        speed, std = wheel.direction * seen[side], seen[2]
+        lasted_s = (newest_ns - wheel.since_ns) * 1e-9
+        speed, std = wheel.direction * seen[side], seen.std_rad_s
         middle = 0.5 * max(wheel.expected_rad, abs(wheel.counted_rad)) / lasted_s
-        if speed - middle > DECIDED * std:
+        if speed - middle > sure * std:
             return 1
-        if speed + middle < -DECIDED * std:
+        if speed + middle < -sure * std:
             return -1
-        return 0 if middle - abs(speed) > DECIDED * std else None
+        return 0 if middle - abs(speed) > sure * std else None
 
     def _unseen(self, geometry: OdometryParameters) -> WheelFault | None:
         """A wheel of which nothing is expected, that does not count, and that the poses show to turn."""
@@ -373,8 +328,8 @@ class WheelFaults:
         if seen is None:
             return None
         for side in (0, 1):
-            wheel, other, asked = self._wheels[side], self._wheels[1 - side], self._commands[-1][1 + side]
-            speed, std = math.copysign(1.0, asked) * seen[side], seen[2]
+            wheel, other, asked = self._wheels[side], self._wheels[1 - side], self._commands[-1][1 + side].speed
+            speed, std = math.copysign(1.0, asked) * seen[side], seen.std_rad_s
             counts = abs(wheel.speed_rad_s) > 0.2 * speed
             agrees = abs(seen[1 - side] - other.direction * other.speed_rad_s) < DECIDED * std + 0.2 * abs(speed)
             if wheel.loss_rad_s >= abs(asked) and not counts and agrees and speed > max(SEEN * std, 0.5 * abs(asked)):

@@ -325,6 +325,7 @@ DRIVER = MotorDriver(
     "agilex",
     lambda settings, _key: AgilexDriver(settings),
     settings=AgilexSettings,
+    takes_body_speeds=True,
     example=EXAMPLE,
     recognise=recognise,
     latches_stop=False,

@@ -336,6 +336,7 @@ DRIVER = MotorDriver(
     "ros2_base",
     lambda settings, _key: Ros2BaseDriver(settings),
     settings=wire.Ros2BaseSettings,
+    takes_body_speeds=True,
     example=wire.EXAMPLE,
     stop_frames=wire.stop_frames,
     stop_confirmation=wire.stop_confirmation,
