@@ -440,7 +440,8 @@ class SafetyCard:
     """Who stops the robot when, in words for a person.
 
     `reaction_s`: how long the wheels may still be driven after the host has fallen silent. `brakes`: whether they are
-    braked then, or coast. `unverified`: what this computer could not find out. `setup`: what the controller must be
+    braked then, or coast. `wheel_fault`: how this computer stops wheels of which one does not obey, without a ramp that
+    would need its encoder. `unverified`: what this computer could not find out. `setup`: what the controller must be
     set to.
     """
 
@@ -449,6 +450,7 @@ class SafetyCard:
     reaction_s: float
     brakes: bool
     estop: str
+    wheel_fault: str = "by the ramp of every stop"
     unverified: tuple[str, ...] = ()
     setup: tuple[str, ...] = ()
 

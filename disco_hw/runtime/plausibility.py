@@ -198,7 +198,7 @@ class _Start(NamedTuple):
     x_m: float
     y_m: float
     yaw_rad: float
-    count: int
+    poses: int
 
     @staticmethod
     def of(pose: PoseSample) -> _Start:
@@ -212,9 +212,9 @@ class _Start(NamedTuple):
         moved = away_m > _MOVED_STD * pose.position_std_m or abs(yaw) > _MOVED_STD * pose.yaw_std_rad
         if pose.source != self.source or moved:
             return _Start.of(pose)
-        part = 1.0 / (self.count + 1)
+        part = 1.0 / (self.poses + 1)
         x_m, y_m = self.x_m + part * (pose.x_m - self.x_m), self.y_m + part * (pose.y_m - self.y_m)
-        return _Start(self.source, x_m, y_m, self.yaw_rad + part * yaw, min(self.count + 1, _MOST_STARTS))
+        return _Start(self.source, x_m, y_m, self.yaw_rad + part * yaw, min(self.poses + 1, _MOST_STARTS))
 
 
 class Directions:
@@ -344,7 +344,7 @@ class Directions:
             arc_std_m = 0.5 * self._track_m * pose.yaw_std_rad
             variance = 2.0 * (pose.position_std_m**2 + arc_std_m**2) + (_SLIP_PART * far_m) ** 2
             # All poses share the start's error, which may be no evidence.
-            start_m = _START_STD * math.hypot(pose.position_std_m, arc_std_m) / math.sqrt(start.count)
+            start_m = _START_STD * math.hypot(pose.position_std_m, arc_std_m) / math.sqrt(start.poses)
             off_declared = max(0.0, self._off_m(ahead_m, yaw, turned, *declared) - _UNKNOWN_PART * far_m - start_m)
             for wired in self._evidence:
                 off = self._off_m(ahead_m, yaw, turned, *wired)

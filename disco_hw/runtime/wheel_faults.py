@@ -28,14 +28,14 @@ LATE_NS = 600_000_000
 """Delay and lag of a wheel together: what was commanded so long ago may still be on its way."""
 EXPECTED_PART = 0.5
 """A wheel that turns by this part of what it is expected to follows; drift of the CUSUM between sound and standing."""
-MISSING_RAD = 0.1
-SHORTEST_NS = 350_000_000
+MISSING_RAD = 0.08
+SHORTEST_NS = 300_000_000
 """A wheel may stand for less against a stone."""
-LONGEST_NS = 500_000_000
+LONGEST_NS = 400_000_000
 """So long after the first sign at most is waited for poses that tell the cause."""
 UNKNOWN_LOSS_RAD_S = 1.5
 """Dead band and stiction of a wheel that has not turned since it stood."""
-FASTER_PART, FASTER_RAD_S, BEYOND_RAD = 1.25, 0.75, 0.15
+FASTER_PART, FASTER_RAD_S, BEYOND_RAD = 1.25, 0.5, 0.1
 BODY_TURN_PART = 1.5
 """A base that is given speeds of the body may turn by wheels that differ by so much more than those asked for."""
 FOLLOWED_RAD = 0.3
@@ -198,7 +198,7 @@ class WheelFaults:
         self._turn_part = BODY_TURN_PART if takes_body_speeds else 1.0
         self._wheels = (_Wheel(), _Wheel())
         self._travel = PoseTravel()
-        self._commands: deque[tuple[int, _Asked, _Asked]] = deque()
+        self._commands: deque[tuple[int, tuple[_Asked, _Asked]]] = deque()
         self._last_ns: int | None = None
         self.not_following = 0
         self.events: tuple[str, ...] = ()
@@ -222,7 +222,7 @@ class WheelFaults:
                 wheel.rest()
             return
         left, right = command.left_rad_s, command.right_rad_s
-        self._commands.append((now_ns, _asked(left, right, self._turn_part), _asked(right, left, self._turn_part)))
+        self._commands.append((now_ns, (_asked(left, right, self._turn_part), _asked(right, left, self._turn_part))))
 
     def step(
         self, now_ns: int, wheels: Sequence[WheelSample], poses: Sequence[PoseSample], geometry: OdometryParameters,
@@ -256,7 +256,7 @@ class WheelFaults:
             wheel = self._wheels[side]
             turned, wheel.angle_rad = angle - wheel.angle_rad, angle
             if sent and math.isfinite(turned):
-                wheel.step(sample.t_ns, dt_s, turned, [entry[1 + side] for entry in sent])
+                wheel.step(sample.t_ns, dt_s, turned, [asked[side] for _, asked in sent])
 
     def _begun(self) -> list[str]:
         """Words for each wheel that begins not to follow."""
@@ -265,7 +265,7 @@ class WheelFaults:
             if wheel.is_suspect and not wheel.is_told:
                 wheel.is_told = True
                 self.not_following += 1
-                asked = self._commands[-1][1 + _SIDES.index(name)].speed
+                asked = self._commands[-1][1][_SIDES.index(name)].speed
                 said.append(
                     f"the {name} wheel does not follow: {wheel.direction * wheel.speed_rad_s:.1f} rad/s, commanded "
                     f"{asked:.1f} rad/s"
@@ -322,17 +322,17 @@ class WheelFaults:
 
     def _unseen(self, geometry: OdometryParameters) -> WheelFault | None:
         """A wheel of which nothing is expected, that does not count, and that the poses show to turn."""
-        if not self._commands:
-            return None
-        seen = self._travel.wheel_speeds(self._commands[0][0], geometry)
+        newest = self._commands[-1][1]
+        unexpected = [side for side in (0, 1) if self._wheels[side].loss_rad_s >= abs(newest[side].speed) > 0.0]
+        seen = self._travel.wheel_speeds(self._commands[0][0], geometry) if unexpected else None
         if seen is None:
             return None
-        for side in (0, 1):
-            wheel, other, asked = self._wheels[side], self._wheels[1 - side], self._commands[-1][1 + side].speed
+        for side in unexpected:
+            wheel, other, asked = self._wheels[side], self._wheels[1 - side], newest[side].speed
             speed, std = math.copysign(1.0, asked) * seen[side], seen.std_rad_s
             counts = abs(wheel.speed_rad_s) > 0.2 * speed
             agrees = abs(seen[1 - side] - other.direction * other.speed_rad_s) < DECIDED * std + 0.2 * abs(speed)
-            if wheel.loss_rad_s >= abs(asked) and not counts and agrees and speed > max(SEEN * std, 0.5 * abs(asked)):
+            if not counts and agrees and speed > max(SEEN * std, 0.5 * abs(asked)):
                 return WheelFault(Cause.ENCODER_SILENT, _SIDES[side])
         return None
 
