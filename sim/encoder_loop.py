@@ -46,13 +46,15 @@ class EncoderLoop:
         seen = (true.left_speed_rad_s, true.right_speed_rad_s)
         told = (reported.left_speed_rad_s, reported.right_speed_rad_s)
         for side in (0, 1):
-            if not regulates or seen[side] == told[side]:
+            denied = seen[side] - told[side]
+            # A field whose angle was lost finds it again only when it is aligned anew.
+            self._denied_rad[side] = self._denied_rad[side] + denied * dt_s if regulates else 0.0
+            if not regulates or denied == 0.0:
                 # A loop that is let go, or that sees its motor again, forgets.
-                self._error_rad_s[side] = self._error_rad[side] = self._denied_rad[side] = 0.0
+                self._error_rad_s[side] = self._error_rad[side] = 0.0
                 continue
             self._error_rad_s[side] = wanted_rad_s[side] - told[side]
             self._error_rad[side] += self._error_rad_s[side] * dt_s
-            self._denied_rad[side] += (seen[side] - told[side]) * dt_s
 
     def drive(self, wanted_rad_s: Sequence[float]) -> tuple[float, float]:
         """Return the speeds that the motors are driven at while the loop holds the wanted ones."""

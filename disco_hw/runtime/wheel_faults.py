@@ -40,6 +40,7 @@ BODY_TURN_PART = 1.5
 """A base that is given speeds of the body may turn by wheels that differ by so much more than those asked for."""
 FOLLOWED_RAD = 0.3
 RESTS_RAD_S = 0.1
+_SMOOTH_S = 0.15
 _FILTER_S, _LOSES_LESS_S, _LOSES_MORE_S = 0.3, 0.5, 2.0
 _SIDES = ("left", "right")
 
@@ -91,24 +92,28 @@ class WheelFault:
 
 
 class _Asked(NamedTuple):
-    """A command of one wheel (rad/s): as it stands, the slowest it may mean with its sign, and the fastest."""
+    """A command of one wheel (rad/s): the slowest it may mean, as it stands and smoothed, and the fastest.
 
-    speed: float
-    slowest: float
-    fastest: float
+    Smoothed, as a wheel's angle is the integral of its commands: what a planner adds and takes away again is no loss.
+    """
+
+    slowest: float = 0.0
+    smoothed: float = 0.0
+    fastest: float = 0.0
 
 
-def _asked(speed: float, other: float, turn_part: float) -> _Asked:
+def _asked(speed: float, other: float, turn_part: float, before: _Asked, elapsed_s: float) -> _Asked:
     """What one wheel is asked for beside the other, where wheels may differ by up to `turn_part` of what is asked."""
     mean = 0.5 * (speed + other)
     turned = mean + turn_part * (speed - mean)
     slowest = min((speed, turned), key=abs) if turned * speed > 0.0 else 0.0
-    return _Asked(speed, slowest, max(abs(speed), abs(turned)))
+    smoothed = before.smoothed + (slowest - before.smoothed) * -math.expm1(-elapsed_s / _SMOOTH_S)
+    return _Asked(slowest, smoothed, max(abs(speed), abs(turned)))
 
 
 @dataclass(slots=True)
 class _Wheel:
-    """One wheel; angles in rad, all in the direction of its command but for `angle_rad`."""
+    """One wheel; angles and speeds in the direction of its command, but for `angle_rad` and `speed_rad_s` as counted."""
 
     angle_rad: float = math.nan
     speed_rad_s: float = 0.0
@@ -129,17 +134,21 @@ class _Wheel:
 
     def step(self, t_ns: int, dt_s: float, turned_rad: float, commands: Sequence[_Asked]) -> None:
         """Take in by how much it was counted, and the commands that may be in force meanwhile."""
-        low, high = min(each.slowest for each in commands), max(each.slowest for each in commands)
+        newest = commands[-1].slowest
+        low = min(newest, min(each.smoothed for each in commands))
+        high = max(newest, max(each.smoothed for each in commands))
         if low > 0.0 or high < 0.0:
             self.direction = math.copysign(1.0, low)
         least = max(low, -high, 0.0)
         most = max(each.fastest for each in commands)
         progress = self.direction * turned_rad
-        self._learn(dt_s, progress, 0.5 * (least + max(abs(low), abs(high))), abs(commands[-1].speed))
+        self._learn(dt_s, turned_rad, 0.5 * (least + max(abs(low), abs(high))), abs(newest))
         expected = max(least - self.loss_rad_s, 0.0) * dt_s
         self.beyond_rad = max(self.beyond_rad + abs(turned_rad) - (FASTER_PART * most + FASTER_RAD_S) * dt_s, 0.0)
         # Without a command that must be in force by now a wheel may turn either way.
         self.missing_rad = self.missing_rad + EXPECTED_PART * expected - progress if least > 0.0 else 0.0
+        # Bounded, so that a wheel that follows again is soon clear of what was.
+        self.missing_rad = min(self.missing_rad, 2.0 * MISSING_RAD)
         if self.missing_rad <= 0.0:
             self.missing_rad, self.since_ns = 0.0, t_ns
             self.expected_rad = self.counted_rad = 0.0
@@ -149,14 +158,15 @@ class _Wheel:
             self.expected_rad += expected
             self.counted_rad += progress
 
-    def _learn(self, dt_s: float, progress_rad: float, commanded_rad_s: float, newest_rad_s: float) -> None:
+    def _learn(self, dt_s: float, turned_rad: float, commanded_rad_s: float, newest_rad_s: float) -> None:
         """Learn what it loses of its commands while it turns by them; a wheel that came to rest may stick again."""
         if dt_s > 0.0:
-            self.speed_rad_s += (progress_rad / dt_s - self.speed_rad_s) * -math.expm1(-dt_s / _FILTER_S)
-        if newest_rad_s < RESTS_RAD_S and abs(self.speed_rad_s) < RESTS_RAD_S:
+            self.speed_rad_s += (turned_rad / dt_s - self.speed_rad_s) * -math.expm1(-dt_s / _FILTER_S)
+        speed = self.direction * self.speed_rad_s
+        if newest_rad_s < RESTS_RAD_S and abs(speed) < RESTS_RAD_S:
             self.loss_rad_s = UNKNOWN_LOSS_RAD_S
-        elif self.speed_rad_s > EXPECTED_PART * max(commanded_rad_s - self.loss_rad_s, 0.1 * commanded_rad_s):
-            loses = max(commanded_rad_s - self.speed_rad_s, 0.0)
+        elif speed > EXPECTED_PART * max(commanded_rad_s - self.loss_rad_s, 0.1 * commanded_rad_s):
+            loses = max(commanded_rad_s - speed, 0.0)
             time_s = _LOSES_LESS_S if loses < self.loss_rad_s else _LOSES_MORE_S
             self.loss_rad_s += (loses - self.loss_rad_s) * -math.expm1(-dt_s / time_s)
 
@@ -182,6 +192,8 @@ class _Wheel:
 
 DECIDED = 2.0
 """Standard deviations from the middle between two explanations."""
+COUNTED_PART = 0.2
+"""A wheel counts if it counts this part of what the poses show."""
 SEEN = 4.0
 """Standard deviations of a motion that the counts deny."""
 _SETTLED_NS = 60_000_000
@@ -222,7 +234,13 @@ class WheelFaults:
                 wheel.rest()
             return
         left, right = command.left_rad_s, command.right_rad_s
-        self._commands.append((now_ns, (_asked(left, right, self._turn_part), _asked(right, left, self._turn_part))))
+        before_ns, before = self._commands[-1] if self._commands else (now_ns, (_Asked(), _Asked()))
+        elapsed_s = max(now_ns - before_ns, 0) * 1e-9
+        asked = (
+            _asked(left, right, self._turn_part, before[0], elapsed_s),
+            _asked(right, left, self._turn_part, before[1], elapsed_s),
+        )
+        self._commands.append((now_ns, asked))
 
     def step(
         self, now_ns: int, wheels: Sequence[WheelSample], poses: Sequence[PoseSample], geometry: OdometryParameters,
@@ -265,10 +283,9 @@ class WheelFaults:
             if wheel.is_suspect and not wheel.is_told:
                 wheel.is_told = True
                 self.not_following += 1
-                asked = self._commands[-1][1][_SIDES.index(name)].speed
+                asked = self._commands[-1][1][_SIDES.index(name)].slowest
                 said.append(
-                    f"the {name} wheel does not follow: {wheel.direction * wheel.speed_rad_s:.1f} rad/s, commanded "
-                    f"{asked:.1f} rad/s"
+                    f"the {name} wheel does not follow: {wheel.speed_rad_s:.1f} rad/s, commanded {asked:.1f} rad/s"
                 )
         return said
 
@@ -323,15 +340,15 @@ class WheelFaults:
     def _unseen(self, geometry: OdometryParameters) -> WheelFault | None:
         """A wheel of which nothing is expected, that does not count, and that the poses show to turn."""
         newest = self._commands[-1][1]
-        unexpected = [side for side in (0, 1) if self._wheels[side].loss_rad_s >= abs(newest[side].speed) > 0.0]
+        unexpected = [side for side in (0, 1) if self._wheels[side].loss_rad_s >= abs(newest[side].slowest) > 0.0]
         seen = self._travel.wheel_speeds(self._commands[0][0], geometry) if unexpected else None
         if seen is None:
             return None
         for side in unexpected:
-            wheel, other, asked = self._wheels[side], self._wheels[1 - side], newest[side].speed
+            wheel, other, asked = self._wheels[side], self._wheels[1 - side], newest[side].slowest
             speed, std = math.copysign(1.0, asked) * seen[side], seen.std_rad_s
-            counts = abs(wheel.speed_rad_s) > 0.2 * speed
-            agrees = abs(seen[1 - side] - other.direction * other.speed_rad_s) < DECIDED * std + 0.2 * abs(speed)
+            counts = abs(wheel.speed_rad_s) > COUNTED_PART * speed
+            agrees = abs(seen[1 - side] - other.speed_rad_s) < DECIDED * std + 0.2 * abs(speed)
             if not counts and agrees and speed > max(SEEN * std, 0.5 * abs(asked)):
                 return WheelFault(Cause.ENCODER_SILENT, _SIDES[side])
         return None

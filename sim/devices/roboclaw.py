@@ -201,8 +201,6 @@ class RoboclawController:
     boards without supply.
     """
 
-    brakes = False
-
     def __init__(self, settings: RoboclawSettings, ticks_per_rev: int) -> None:
         self._settings = settings
         self._counts_per_tick = settings.counts_per_rev / ticks_per_rev
@@ -222,6 +220,11 @@ class RoboclawController:
             mean = direction * sum(known) / len(side) / self._settings.counts_per_rad
             held.append(mean if len(known) == len(side) else None)
         return held[0], held[1]
+
+    @property
+    def brakes(self) -> bool:
+        """Whether zero duty shorts every motor."""
+        return all(board.command == ("duty", 0, 0) for board in self.boards.values())
 
     @property
     def regulates(self) -> bool:
