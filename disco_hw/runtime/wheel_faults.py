@@ -190,7 +190,7 @@ class _Wheel:
         return self.counted_rad < -0.25 * max(self.expected_rad, 0.5 * self.missing_rad)
 
 
-DECIDED = 2.0
+DECIDED = 2.5
 """Standard deviations from the middle between two explanations."""
 COUNTED_PART = 0.2
 """A wheel counts if it counts this part of what the poses show."""
