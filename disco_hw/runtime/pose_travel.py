@@ -12,8 +12,6 @@ from drivers.types import PoseSample
 
 KEPT_NS = 1_000_000_000
 LEAST_POSES = 5
-SLIP_PART = 0.1
-"""By so much of its speed a wheel may slip."""
 LARGEST_OFF, CURVED_PART = 5.0, 0.2
 """A pose lies so many standard deviations from the line at most, and the part of the way by which a robot that speeds up
 from rest leaves it; a jump is more.
@@ -21,7 +19,7 @@ from rest leaves it; a jump is more.
 
 
 class PosedSpeeds(NamedTuple):
-    """Left and right wheel speed (rad/s) and the standard deviation of both."""
+    """Left and right wheel speed (rad/s) and the standard deviation of both, by the noise of the poses alone."""
 
     left_rad_s: float
     right_rad_s: float
@@ -73,8 +71,7 @@ class PoseTravel:
             return None
         half_m, radius_m = 0.5 * geometry.axial_distance_m, geometry.wheel_radius_m
         left, right = ((ahead[0] + side * half_m * turn[0]) / radius_m for side in (-1.0, 1.0))
-        std = math.hypot(ahead[1], half_m * turn[1]) / radius_m
-        return PosedSpeeds(left, right, math.hypot(std, SLIP_PART * max(abs(left), abs(right))))
+        return PosedSpeeds(left, right, math.hypot(ahead[1], half_m * turn[1]) / radius_m)
 
 
 def _line(weights: Sequence[float], values: Sequence[float], std: float) -> tuple[float, float] | None:

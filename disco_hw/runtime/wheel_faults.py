@@ -194,6 +194,8 @@ DECIDED = 2.5
 """Standard deviations from the middle between two explanations."""
 COUNTED_PART = 0.2
 """A wheel counts if it counts this part of what the poses show."""
+SLIP_PART = 0.1
+"""By so much of its speed a wheel may slip."""
 SEEN = 4.0
 """Standard deviations of a motion that the counts deny."""
 _SETTLED_NS = 60_000_000
@@ -329,8 +331,9 @@ class WheelFaults:
         if seen is None or newest_ns is None:
             return None
         lasted_s = (newest_ns - wheel.since_ns) * 1e-9
-        speed, std = wheel.direction * seen[side], seen.std_rad_s
+        speed = wheel.direction * seen[side]
         middle = 0.5 * max(wheel.expected_rad, abs(wheel.counted_rad)) / lasted_s
+        std = math.hypot(seen.std_rad_s, SLIP_PART * 2.0 * middle)
         if speed - middle > sure * std:
             return 1
         if speed + middle < -sure * std:
@@ -346,7 +349,8 @@ class WheelFaults:
             return None
         for side in unexpected:
             wheel, other, asked = self._wheels[side], self._wheels[1 - side], newest[side].slowest
-            speed, std = math.copysign(1.0, asked) * seen[side], seen.std_rad_s
+            speed = math.copysign(1.0, asked) * seen[side]
+            std = math.hypot(seen.std_rad_s, SLIP_PART * max(map(abs, seen[:2])))
             counts = abs(wheel.speed_rad_s) > COUNTED_PART * speed
             agrees = abs(seen[1 - side] - other.speed_rad_s) < DECIDED * std + 0.2 * abs(speed)
             if not counts and agrees and speed > max(SEEN * std, 0.5 * abs(asked)):
