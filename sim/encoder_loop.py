@@ -1,9 +1,9 @@
 """What a vendor's motor loop makes of an encoder that does not report what its motor does.
 
-With a sound encoder the plant's own speed loop stands for the controller's, and nothing here acts. With a wrong one the
-wanted speed less the reported one drives a proportional-integral term that ends at full speed, as a RoboClaw's does when
-the encoder's cable comes off. A motor that is commutated by the encoder cannot run away so: its field stands where the
-encoder says, and the rotor locks to it.
+With a sound encoder the plant's own speed loop stands for the controller's, and nothing here acts. With a wrong one
+the wanted speed less the reported one drives a proportional-integral term that ends at full speed, as a RoboClaw's
+does when the encoder's cable comes off. A motor that is commutated by the encoder cannot run away so: its field
+stands where the encoder says, and the rotor locks to it.
 """
 
 from __future__ import annotations

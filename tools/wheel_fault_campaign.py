@@ -1,8 +1,8 @@
 """`python -m tools.wheel_fault_campaign`: wheels that cease to obey, with every driver's simulated controller.
 
-Every fault at every speed with every driver on a circle and straight on, the sides in turn; then healthy drives on rough
-ground. Prints the table of docs/results.md, and exits with 1 if a fault was missed, a cause was wrong, or a healthy robot
-was stopped.
+Every fault at every speed with every driver on a circle and straight on, the sides in turn; then healthy drives on
+rough ground. Prints the table of docs/results.md, and exits with 1 if a fault was missed, a cause was wrong, or a
+healthy robot was stopped.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """A robot of which a wheel ceases to obey, in simulated time: any driver with its simulated controller, and the tick.
 
-The daemon's own tick drives a circle or a straight line by a simple law. The plant's wheels say what truly happened: the
-fault shows from when the count of its wheel, or the wheel itself, leaves what was commanded, and the robot is stopped
-when all wheels stand and no motor is driven.
+The daemon's own tick drives a circle or a straight line by a simple law. The plant says what truly happened: a fault
+shows from when it is there while a wheel is commanded, and the robot is stopped when all wheels stand.
 """
 
 from __future__ import annotations

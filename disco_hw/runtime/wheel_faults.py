@@ -1,11 +1,11 @@
 """Finds a wheel that does not obey: by its commands, its counts and the measured poses, as three witnesses.
 
-Two cumulative sums (Page 1954, one-sided CUSUM) watch each wheel, both in radians. `missing` grows while a wheel turns by
-less than half of what it is expected to: the least command of the time in which delay and lag may still hold it back,
-less what the wheel has shown to lose of its commands (dead band, sag, load). `beyond` grows while it turns faster than
-any command explains. The poses are the third witness: straight lines through the newest of them say how fast each wheel
-truly turned. They tell an encoder from a motor, and they find an encoder that does not count where commands are too slow
-to expect anything.
+Two cumulative sums (one-sided CUSUM, Page 1954) watch each wheel, both in radians. `missing` grows while a wheel
+turns by less than half of what it is expected to: the least command of the time in which delay and lag may still hold
+it back, less what the wheel has shown to lose of its commands (dead band, sag, load). `beyond` grows while it turns
+faster than any command explains. The poses are the third witness: straight lines through the newest of them say how
+fast each wheel truly turned. They tell an encoder from a motor, and they find an encoder that does not count where
+commands are too slow to expect anything.
 
 A robot with slip, dead band, stiction, lag, lifted wheels or rough ground stays below: its wheels lose a part of what
 is expected, and what they lose for long is learnt.
@@ -113,7 +113,7 @@ def _asked(speed: float, other: float, turn_part: float, before: _Asked, elapsed
 
 @dataclass(slots=True)
 class _Wheel:
-    """One wheel; angles and speeds in the direction of its command, but for `angle_rad` and `speed_rad_s` as counted."""
+    """One wheel; angles and speeds are in the direction of its command, `angle_rad` and `speed_rad_s` as counted."""
 
     angle_rad: float = math.nan
     speed_rad_s: float = 0.0
@@ -135,8 +135,8 @@ class _Wheel:
     def step(self, t_ns: int, dt_s: float, turned_rad: float, commands: Sequence[_Asked]) -> None:
         """Take in by how much it was counted, and the commands that may be in force meanwhile."""
         newest = commands[-1].slowest
-        low = min(newest, min(each.smoothed for each in commands))
-        high = max(newest, max(each.smoothed for each in commands))
+        smoothed = [each.smoothed for each in commands]
+        low, high = min(newest, *smoothed), max(newest, *smoothed)
         if low > 0.0 or high < 0.0:
             self.direction = math.copysign(1.0, low)
         least = max(low, -high, 0.0)

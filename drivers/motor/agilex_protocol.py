@@ -193,7 +193,7 @@ def safety_card(settings: AgilexSettings) -> SafetyCard:
         brakes=True,
         estop="no frame for it: zero speed and standby are sent, and nothing latches them but this driver; use the "
         "buttons on the base. Whoever holds the remote control comes first",
-        wheel_fault="zero and standby at once; no frame takes the torque off its motors, so that what a lost encoder does "
+        wheel_fault="zero and standby at once; no frame takes the torque off its motors, and what a lost encoder does "
         "to them is the base's own matter: use the buttons on the base",
         unverified=(
             "how it slows down, and its time-out, are the manual's words",

@@ -517,7 +517,7 @@ def _safety_card(_settings: NoSettings) -> SafetyCard:
         reaction_s=0.1,
         brakes=True,
         estop="a frame of any length, also from `disco-hw estop`: it decelerates, latched and confirmed",
-        wheel_fault="the motors are switched off (COAST) while the wheels roll out, 1 s, then disarmed and braked; no ramp",
+        wheel_fault="the motors are off (COAST) while the wheels roll out, 1 s, then disarmed and braked; no ramp",
     )
 
 

@@ -22,7 +22,7 @@ SLOW, FAST = 0.45, 3.2
 
 @dataclass
 class Robot:
-    """Wheels that lag behind their commands, and poses of where they take it; `fault` changes the left one from then."""
+    """Wheels that lag behind their commands, and poses of where they take the robot."""
 
     lag_s: float = 0.1
     dead_rad_s: float = 0.0
