@@ -179,6 +179,7 @@ SAMPLES = 3
 _OPPOSITE_PART = 0.25
 _CROSSED_COSINE, _STRAIGHT_COSINE = 0.97, 0.93
 _SLIP_PART = 0.15
+_COUNTED_PART = 0.25
 _UNKNOWN_PART = 0.2
 """Of the way: a radius that is written down wrongly and slip that lasts, which every pose shows equally."""
 _ENOUGH, _MOST_OF_ONE = 10.0, 4.0
@@ -331,6 +332,10 @@ class Directions:
     def _by_poses(self, poses: Sequence[PoseSample]) -> str | None:
         """What else than robot.toml says explains how the robot has moved since it stood."""
         start, declared = self._start, (False, (1, 1))
+        counted = self._moved(self._turned[-1][0])
+        if any(abs(turn) < _COUNTED_PART * abs(asked) for turn, asked in zip(counted, self._asked, strict=True)):
+            # A wheel that does not count says nothing of how it is wired.
+            return None
         for pose in poses:
             if start is None or not pose.has_heading or pose.source != start.source:
                 continue

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from disco_hw.estimation.odometry import OdometryParameters
-from disco_hw.runtime.pose_travel import PoseTravel
+from disco_hw.runtime.pose_travel import KEPT_NS, PoseTravel
 from drivers.types import PoseSample, WheelCommand, WheelSample
 
 LATE_NS = 600_000_000
@@ -38,7 +38,7 @@ UNKNOWN_LOSS_RAD_S = 1.5
 FASTER_PART, FASTER_RAD_S, BEYOND_RAD = 1.25, 0.5, 0.1
 BODY_TURN_PART = 1.5
 """A base that is given speeds of the body may turn by wheels that differ by so much more than those asked for."""
-FOLLOWED_RAD = 0.3
+FOLLOWED_RAD = 0.15
 RESTS_RAD_S = 0.1
 _SMOOTH_S = 0.15
 _FILTER_S, _LOSES_LESS_S, _LOSES_MORE_S = 0.3, 0.5, 2.0
@@ -137,8 +137,9 @@ class _Wheel:
         newest = commands[-1].slowest
         smoothed = [each.smoothed for each in commands]
         low, high = min(newest, *smoothed), max(newest, *smoothed)
-        if low > 0.0 or high < 0.0:
-            self.direction = math.copysign(1.0, low)
+        is_one_way = low >= 0.0 < high or low < 0.0 >= high
+        if is_one_way:
+            self.direction = 1.0 if high > 0.0 else -1.0
         least = max(low, -high, 0.0)
         most = max(each.fastest for each in commands)
         progress = self.direction * turned_rad
@@ -153,7 +154,7 @@ class _Wheel:
             self.missing_rad, self.since_ns = 0.0, t_ns
             self.expected_rad = self.counted_rad = 0.0
             self.is_told = False
-            self.followed_rad += max(progress, 0.0) if least > 0.0 else 0.0
+            self.followed_rad += max(progress, 0.0) if is_one_way else 0.0
         else:
             self.expected_rad += expected
             self.counted_rad += progress
@@ -213,7 +214,7 @@ class WheelFaults:
         self._wheels = (_Wheel(), _Wheel())
         self._travel = PoseTravel()
         self._commands: deque[tuple[int, tuple[_Asked, _Asked]]] = deque()
-        self._last_ns: int | None = None
+        self._counted: deque[tuple[int, float, float]] = deque()
         self.not_following = 0
         self.events: tuple[str, ...] = ()
 
@@ -267,8 +268,11 @@ class WheelFaults:
         )
 
     def _take(self, sample: WheelSample) -> None:
-        dt_s = 0.0 if self._last_ns is None else max(sample.t_ns - self._last_ns, 0) * 1e-9
-        self._last_ns = sample.t_ns
+        counted = self._counted
+        dt_s = max(sample.t_ns - counted[-1][0], 0) * 1e-9 if counted else 0.0
+        counted.append((sample.t_ns, sample.left_angle_rad, sample.right_angle_rad))
+        while sample.t_ns - counted[0][0] > KEPT_NS:
+            counted.popleft()
         sent = self._commands
         while len(sent) > 1 and sample.t_ns - sent[1][0] > LATE_NS:
             sent.popleft()
@@ -341,21 +345,32 @@ class WheelFaults:
         return 0 if middle - abs(speed) > sure * std else None
 
     def _unseen(self, geometry: OdometryParameters) -> WheelFault | None:
-        """A wheel of which nothing is expected, that does not count, and that the poses show to turn."""
-        newest = self._commands[-1][1]
-        unexpected = [side for side in (0, 1) if self._wheels[side].loss_rad_s >= abs(newest[side].slowest) > 0.0]
-        seen = self._travel.wheel_speeds(self._commands[0][0], geometry) if unexpected else None
-        if seen is None:
+        """A wheel that the poses show to turn as it is asked to, and that does not count; the other one does."""
+        since_ns, newest = self._commands[0][0], self._commands[-1][1]
+        quiet = [
+            side for side in (0, 1) if abs(self._wheels[side].speed_rad_s) < COUNTED_PART * abs(newest[side].slowest)
+        ]
+        seen = self._travel.wheel_speeds(since_ns, geometry) if len(quiet) == 1 else None
+        counted = None if seen is None else self._counted_speeds(since_ns)
+        if seen is None or counted is None:
             return None
-        for side in unexpected:
-            wheel, other, asked = self._wheels[side], self._wheels[1 - side], newest[side].slowest
-            speed = math.copysign(1.0, asked) * seen[side]
-            std = math.hypot(seen.std_rad_s, SLIP_PART * max(map(abs, seen[:2])))
-            counts = abs(wheel.speed_rad_s) > COUNTED_PART * speed
-            agrees = abs(seen[1 - side] - other.speed_rad_s) < DECIDED * std + 0.2 * abs(speed)
-            if not counts and agrees and speed > max(SEEN * std, 0.5 * abs(asked)):
-                return WheelFault(Cause.ENCODER_SILENT, _SIDES[side])
-        return None
+        (side,) = quiet
+        asked = newest[side].slowest
+        speed = math.copysign(1.0, asked) * seen[side]
+        std = math.hypot(seen.std_rad_s, SLIP_PART * max(map(abs, seen[:2])))
+        counts = abs(counted[side]) > COUNTED_PART * speed
+        agrees = abs(seen[1 - side] - counted[1 - side]) < DECIDED * std + 0.2 * abs(speed)
+        if counts or not agrees or speed < max(SEEN * std, 0.5 * abs(asked)):
+            return None
+        return WheelFault(Cause.ENCODER_SILENT, _SIDES[side])
+
+    def _counted_speeds(self, since_ns: int) -> tuple[float, float] | None:
+        """Mean speeds that were counted since then."""
+        used = [entry for entry in self._counted if entry[0] >= since_ns]
+        lasted_s = (used[-1][0] - used[0][0]) * 1e-9 if used else 0.0
+        if lasted_s <= 0.0:
+            return None
+        return (used[-1][1] - used[0][1]) / lasted_s, (used[-1][2] - used[0][2]) / lasted_s
 
 
 def _names(sides: Sequence[int]) -> str:
