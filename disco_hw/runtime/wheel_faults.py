@@ -347,8 +347,12 @@ class WheelFaults:
     def _unseen(self, geometry: OdometryParameters) -> WheelFault | None:
         """A wheel that the poses show to turn as it is asked to, and that does not count; the other one does."""
         since_ns, newest = self._commands[0][0], self._commands[-1][1]
+        # One that has turned since it stood is known by what it is expected to do.
         quiet = [
-            side for side in (0, 1) if abs(self._wheels[side].speed_rad_s) < COUNTED_PART * abs(newest[side].slowest)
+            side
+            for side, wheel in enumerate(self._wheels)
+            if wheel.loss_rad_s > 0.5 * UNKNOWN_LOSS_RAD_S
+            and abs(wheel.speed_rad_s) < COUNTED_PART * abs(newest[side].slowest)
         ]
         seen = self._travel.wheel_speeds(since_ns, geometry) if len(quiet) == 1 else None
         counted = None if seen is None else self._counted_speeds(since_ns)

@@ -1,4 +1,4 @@
-"""A wheel that ceases to obey, with each driver's simulated controller in the whole tick; the whole campaign is long."""
+"""A wheel that ceases to obey, with each driver's simulated controller in the tick; the whole campaign is long."""
 
 import sys
 
