@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
+from typing import Any
 
 from disco_hw.experiments import TruthRow
 
@@ -15,11 +17,24 @@ MOTOR_SETTLING_S = 0.3
 
 
 def disco(*arguments: str, timeout_s: float = 60.0) -> tuple[int, str]:
-    """Run the command `disco-hw` to its end; returns the exit code and all that it said."""
-    result = subprocess.run(
-        [sys.executable, "-m", "disco_hw", *arguments], capture_output=True, text=True, timeout=timeout_s, check=False
-    )
+    """Run the command `disco-hw` to its end; returns the exit code and all that it printed."""
+    result = _run(arguments, timeout_s)
     return result.returncode, result.stdout + result.stderr
+
+
+def disco_json(*arguments: str, timeout_s: float = 60.0) -> tuple[int, dict[str, Any]]:
+    """Run the command `disco-hw` with `--json`; returns the exit code and the parsed standard output.
+
+    Standard error is not parsed: it has lines for people, such as "compiling ...".
+    """
+    result = _run((*arguments, "--json"), timeout_s)
+    assert result.stdout, result.stderr
+    return result.returncode, json.loads(result.stdout)
+
+
+def _run(arguments: tuple[str, ...], timeout_s: float) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "disco_hw", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
 
 
 def assert_stopped_in_time(rows: list[TruthRow], cut_s: float) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import re
 
 import pytest
 
 from disco_hw.experiments import READY_TIMEOUT_S, disco_hw_process, running_stack, write_robot_file
-from tests.hil.stack import disco
+from tests.hil.stack import disco, disco_json
 
 pytestmark = pytest.mark.hil
 
@@ -18,12 +17,11 @@ def test_check_passes_with_a_robot_and_says_what_it_measured(tmp_path, link):
     robot_file = write_robot_file(tmp_path, link=link)
     with disco_hw_process("virtual robot", ["sim", str(robot_file)], tmp_path / "sim.txt"):
         wait_for_line(tmp_path / "sim.txt", "ready")
-        code, output = disco("check", str(robot_file), "--json")
-    report = json.loads(output)
+        code, report = disco_json("check", str(robot_file))
     levels = {check["name"]: check["level"] for check in report["checks"]}
     failed = {name for name, level in levels.items() if level == "fail"}
     # How soon a busy machine answers is not for a test to judge.
-    assert failed <= {"round trip"}, output
+    assert failed <= {"round trip"}, report
     assert code == bool(failed)
     assert levels["link"] == "ok"
     assert levels["firmware"] == "ok"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import time
@@ -10,7 +9,7 @@ import time
 import pytest
 
 from disco_hw.experiments import DEVICES, running_stack
-from tests.hil.stack import STILL_RAD_S, disco
+from tests.hil.stack import STILL_RAD_S, disco_json
 
 pytestmark = pytest.mark.hil
 
@@ -59,12 +58,11 @@ def test_an_estop_from_beside_stops_it_and_is_confirmed(tmp_path, device, daemon
         stack.drive()
         if daemon == "frozen":
             os.kill(stack.daemon.process.pid, signal.SIGSTOP)
-        code, said = disco("estop", str(stack.robot_file), "--json")
+        code, outcome = disco_json("estop", str(stack.robot_file))
         told_s = time.monotonic()
         if daemon == "frozen":
             os.kill(stack.daemon.process.pid, signal.SIGCONT)
-        assert code == 0, said
-        outcome = json.loads(said)
+        assert code == 0, outcome
         assert outcome["sent"]
         time.sleep(ROLLS_S)
         status = stack.operator.status()
