@@ -18,6 +18,7 @@ from disco_hw.daemon import check, run
 from disco_hw.daemon.run import compile_beforehand, compile_progress
 from disco_hw.inference import infer_command
 from disco_hw.model import EffectSetting, load_model, save_model
+from tests.tables import thinned
 
 KERNEL = """
 from drivers.kernel_cache import compiled
@@ -104,7 +105,7 @@ def test_what_cannot_be_kept_is_compiled_by_the_process_itself(start):
     assert (compiled_by, result) == ({own}, "3.0")
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@thinned("number", [signal.SIGTERM, signal.SIGKILL], quick=1)
 def test_who_compiles_ends_with_the_process_that_it_compiles_for(start, number):
     for_ever = "(double(1.5), time.sleep(3600))"
     start("import time\n" + START.replace("double(1.5)", for_ever), ended_by=number)

@@ -75,6 +75,7 @@ print(json.dumps({
 """
 
 
+@pytest.mark.thorough
 def test_model_files_fan_competition_classes_and_checks_have_effects_of_other_packages(tmp_path):
     package = OutsidePackage(tmp_path, turn_droop=TURN_DROOP, mast_lean=MAST_LEAN, speed_drag=effect_of_the_page())
     found = json.loads(package.printed(EVERYWHERE, str(tmp_path / "model.toml")))

@@ -34,6 +34,7 @@ def test_check_passes_with_a_robot_and_says_what_it_measured(tmp_path, link):
     assert 20 <= poses <= 26
 
 
+@pytest.mark.thorough
 def test_check_fails_without_a_robot_and_says_what_to_do(tmp_path):
     code, output = disco("check", str(write_robot_file(tmp_path)))
     assert code == 1

@@ -21,7 +21,12 @@ pytestmark = pytest.mark.hil
 
 # What is judged begins after a quarter lap.
 @pytest.mark.parametrize(
-    ("link", "plant_seed", "laps"), [("can", 3, 0.6), pytest.param("serial", 4, 1.0, marks=pytest.mark.long)]
+    ("link", "plant_seed", "laps"),
+    [
+        ("can", 3, 0.4),
+        pytest.param("can", 3, 0.6, marks=pytest.mark.thorough),
+        pytest.param("serial", 4, 1.0, marks=pytest.mark.long),
+    ],
 )
 def test_demo_follows_the_circle(tmp_path, link, plant_seed, laps):
     result = subprocess.run(

@@ -37,10 +37,10 @@ pytestmark = pytest.mark.hil
 @pytest.mark.parametrize(
     ("verb", "old", "new", "field"),
     [
-        ("run", "ticks_per_rev = 2048\n", "", "ticks_per_rev"),
+        pytest.param("run", "ticks_per_rev = 2048\n", "", "ticks_per_rev", marks=pytest.mark.thorough),
         ("check", "wheel_radius_m", "weel_radius_m", "weel_radius_m"),
-        ("sim", "rate_hz = 50.0", "rate_hz = 5000.0", "control.rate_hz"),
-        ("ctl", 'kind = "can"', "kind = 3", "link.kind"),
+        pytest.param("sim", "rate_hz = 50.0", "rate_hz = 5000.0", "control.rate_hz", marks=pytest.mark.thorough),
+        pytest.param("ctl", 'kind = "can"', "kind = 3", "link.kind", marks=pytest.mark.thorough),
     ],
 )
 def test_a_wrong_robot_file_gets_one_line_and_exit_code_2(tmp_path, verb, old, new, field):
@@ -222,7 +222,9 @@ def from_the_host(bus_log):
 
 
 @pytest.mark.parametrize(
-    "seeded", [False, pytest.param(True, marks=pytest.mark.long)], ids=["entropy", "a seed asked for by name"]
+    "seeded",
+    [pytest.param(False, marks=pytest.mark.thorough), pytest.param(True, marks=pytest.mark.long)],
+    ids=["entropy", "a seed asked for by name"],
 )
 def test_a_session_recorded_before_a_restart_does_not_arm_after_it(tmp_path, seeded):
     """Without a key. The robot with a seed, whose entropy repeats, shows that the recording is a good one."""
@@ -283,13 +285,23 @@ def test_garbage_on_a_serial_line_leaves_the_daemon_waiting(tmp_path):
 
 @pytest.mark.parametrize(
     ("verb", "csv", "words"),
+    # tests/tasks has each mistake in a path; here is that each verb says it.
     [
         ("run", "x_m,y_m\n0,0\n1,one\n", "line 3: y_m: 'one' is not a finite number; write one"),
-        ("sim", "x_m,y_m\n0,0\n", "1 way-points; write at least two"),
-        ("check", "x,y\n0,0\n1,1\n", "line 1: column x_m: missing; name x_m and y_m there"),
-        ("view", "x_m,y_m\n0,0\n0,0\n", "line 3: the same way-point again; remove it"),
-        ("check", "x_m,y_m\n0,0\n1,0\n1,0.2\n0,0.2\n", "lines 3 to 4: the way turns twice within 0.28 m, too near"),
-        ("run", None, "cannot be read"),
+        pytest.param("sim", "x_m,y_m\n0,0\n", "1 way-points; write at least two", marks=pytest.mark.thorough),
+        *(
+            pytest.param(*case, marks=pytest.mark.thorough)
+            for case in (
+                ("check", "x,y\n0,0\n1,1\n", "line 1: column x_m: missing; name x_m and y_m there"),
+                ("view", "x_m,y_m\n0,0\n0,0\n", "line 3: the same way-point again; remove it"),
+                (
+                    "check",
+                    "x_m,y_m\n0,0\n1,0\n1,0.2\n0,0.2\n",
+                    "lines 3 to 4: the way turns twice within 0.28 m, too near",
+                ),
+                ("run", None, "cannot be read"),
+            )
+        ),
     ],
 )
 def test_a_bad_path_gets_one_line_and_exit_code_2(tmp_path, verb, csv, words):

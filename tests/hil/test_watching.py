@@ -32,6 +32,7 @@ def test_python_cans_logger_writes_what_the_bus_carries(tmp_path):
     assert sum(1 for line in lines if re.search(r" 110#[0-9A-F]{16}", line)) > 50
 
 
+@pytest.mark.thorough
 def test_python_cans_viewer_shows_the_frames_in_a_terminal(tmp_path):
     robot_file = write_robot_file(tmp_path)
     with disco_hw_process("virtual robot", ["sim", str(robot_file)], tmp_path / "sim.txt"):
