@@ -99,6 +99,7 @@ def test_a_first_start_compiles_in_another_process_and_the_next_one_not_at_all(s
     assert start(START)[1:] == (set(), "3.0")
 
 
+@pytest.mark.thorough
 def test_what_cannot_be_kept_is_compiled_by_the_process_itself(start):
     # A function that is in no file has no place beside it for its kernel.
     own, compiled_by, result = start(START.replace("from kernel import double", KERNEL))

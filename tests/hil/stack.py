@@ -5,8 +5,12 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
 from typing import Any
+from unittest import mock
 
+from disco_hw.cli import main
 from disco_hw.experiments import TruthRow
 
 STILL_RAD_S = 0.05
@@ -30,6 +34,17 @@ def disco_json(*arguments: str, timeout_s: float = 60.0) -> tuple[int, dict[str,
     result = _run((*arguments, "--json"), timeout_s)
     assert result.stdout, result.stderr
     return result.returncode, json.loads(result.stdout)
+
+
+def disco_here(*arguments: str) -> tuple[int, str]:
+    """Run the command `disco-hw` in this process, which has imported it; returns the exit code and all it printed."""
+    printed = StringIO()
+    with mock.patch.object(sys, "argv", ["disco-hw", *arguments]), redirect_stdout(printed), redirect_stderr(printed):
+        try:
+            main()
+        except SystemExit as end:
+            return int(end.code or 0), printed.getvalue()
+    return 0, printed.getvalue()
 
 
 def _run(arguments: tuple[str, ...], timeout_s: float) -> subprocess.CompletedProcess[str]:

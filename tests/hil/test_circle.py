@@ -23,8 +23,7 @@ pytestmark = pytest.mark.hil
 @pytest.mark.parametrize(
     ("link", "plant_seed", "laps"),
     [
-        ("can", 3, 0.4),
-        pytest.param("can", 3, 0.6, marks=pytest.mark.thorough),
+        ("can", 3, 0.5),
         pytest.param("serial", 4, 1.0, marks=pytest.mark.long),
     ],
 )

@@ -174,6 +174,7 @@ def test_a_key_held_drives_and_a_frozen_typist_stops_the_robot(tmp_path):
     assert np.abs(wheels[-1]).max() < STILL_RAD_S
 
 
+@pytest.mark.thorough
 def test_a_terminal_that_closes_stops_the_robot_and_ends(tmp_path):
     master, slave = os.openpty()
     with bench(tmp_path) as made:

@@ -28,7 +28,7 @@ from disco_hw.experiments import (
 )
 from firmware_protocol.codec import Codec
 from tests.drivers.waiting import wait_until
-from tests.hil.stack import STILL_RAD_S, disco
+from tests.hil.stack import STILL_RAD_S, disco, disco_here
 from tests.runtime.path_robot import path_robot
 
 pytestmark = pytest.mark.hil
@@ -37,16 +37,16 @@ pytestmark = pytest.mark.hil
 @pytest.mark.parametrize(
     ("verb", "old", "new", "field"),
     [
-        pytest.param("run", "ticks_per_rev = 2048\n", "", "ticks_per_rev", marks=pytest.mark.thorough),
+        ("run", "ticks_per_rev = 2048\n", "", "ticks_per_rev"),
         ("check", "wheel_radius_m", "weel_radius_m", "weel_radius_m"),
-        pytest.param("sim", "rate_hz = 50.0", "rate_hz = 5000.0", "control.rate_hz", marks=pytest.mark.thorough),
-        pytest.param("ctl", 'kind = "can"', "kind = 3", "link.kind", marks=pytest.mark.thorough),
+        ("sim", "rate_hz = 50.0", "rate_hz = 5000.0", "control.rate_hz"),
+        ("ctl", 'kind = "can"', "kind = 3", "link.kind"),
     ],
 )
 def test_a_wrong_robot_file_gets_one_line_and_exit_code_2(tmp_path, verb, old, new, field):
     path = write_robot_file(tmp_path)
     path.write_text(path.read_text().replace(old, new, 1))
-    code, output = disco(verb, str(path), *(["status"] if verb == "ctl" else []))
+    code, output = disco_here(verb, str(path), *(["status"] if verb == "ctl" else []))
     assert code == 2, output
     assert len(output.strip().splitlines()) == 1
     assert str(path) in output
@@ -88,7 +88,7 @@ def test_a_firmware_that_does_not_fit_is_refused_in_words(tmp_path, change, word
                     assert word in status["detail"]
                 with pytest.raises(WorkError, match="refused to arm"):
                     operator.request("arm")
-            code, output = disco("check", str(robot_file))
+            code, output = disco_here("check", str(robot_file))
             assert code == 1
             for word in words:
                 assert word in output
@@ -285,30 +285,20 @@ def test_garbage_on_a_serial_line_leaves_the_daemon_waiting(tmp_path):
 
 @pytest.mark.parametrize(
     ("verb", "csv", "words"),
-    # tests/tasks has each mistake in a path; here is that each verb says it.
     [
         ("run", "x_m,y_m\n0,0\n1,one\n", "line 3: y_m: 'one' is not a finite number; write one"),
-        pytest.param("sim", "x_m,y_m\n0,0\n", "1 way-points; write at least two", marks=pytest.mark.thorough),
-        *(
-            pytest.param(*case, marks=pytest.mark.thorough)
-            for case in (
-                ("check", "x,y\n0,0\n1,1\n", "line 1: column x_m: missing; name x_m and y_m there"),
-                ("view", "x_m,y_m\n0,0\n0,0\n", "line 3: the same way-point again; remove it"),
-                (
-                    "check",
-                    "x_m,y_m\n0,0\n1,0\n1,0.2\n0,0.2\n",
-                    "lines 3 to 4: the way turns twice within 0.28 m, too near",
-                ),
-                ("run", None, "cannot be read"),
-            )
-        ),
+        ("sim", "x_m,y_m\n0,0\n", "1 way-points; write at least two"),
+        ("check", "x,y\n0,0\n1,1\n", "line 1: column x_m: missing; name x_m and y_m there"),
+        ("view", "x_m,y_m\n0,0\n0,0\n", "line 3: the same way-point again; remove it"),
+        ("check", "x_m,y_m\n0,0\n1,0\n1,0.2\n0,0.2\n", "lines 3 to 4: the way turns twice within 0.28 m, too near"),
+        ("run", None, "cannot be read"),
     ],
 )
 def test_a_bad_path_gets_one_line_and_exit_code_2(tmp_path, verb, csv, words):
     path = path_robot(tmp_path, csv or "")
     if csv is None:
         (tmp_path / "path.csv").unlink()
-    code, output = disco(verb, *(["--live", "--robot"] if verb == "view" else []), str(path))
+    code, output = disco_here(verb, *(["--live", "--robot"] if verb == "view" else []), str(path))
     assert code == 2, output
     assert len(output.strip().splitlines()) == 1
     assert str(tmp_path / "path.csv") in output
@@ -318,6 +308,6 @@ def test_a_bad_path_gets_one_line_and_exit_code_2(tmp_path, verb, csv, words):
 def test_a_daemon_can_be_asked_to_stop_when_the_path_is_gone(tmp_path):
     path = path_robot(tmp_path)
     (tmp_path / "path.csv").unlink()
-    code, output = disco("ctl", str(path), "disarm")
+    code, output = disco_here("ctl", str(path), "disarm")
     assert code == 1, output
     assert "path.csv" not in output

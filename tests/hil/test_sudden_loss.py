@@ -43,7 +43,7 @@ def mend(stack, fault: str) -> None:
         ("can", ["SIGSTOP", "unplug", "bus_off", "babble_flood", "SIGKILL"]),
         pytest.param("can", ["babble_commands"], marks=pytest.mark.long),
         pytest.param("serial", ["SIGKILL"], marks=pytest.mark.long),
-        ("serial", ["unplug"]),
+        pytest.param("serial", ["unplug"], marks=pytest.mark.thorough),
     ],
     ids=lambda value: value if isinstance(value, str) else " ".join(value),
 )

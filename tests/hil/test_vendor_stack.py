@@ -17,16 +17,18 @@ ROLLS_S = 6.0
 """Until a robot that coasts stands: the simulated floor takes so long from 6 rad/s."""
 
 
-def each_device(short, faults):
-    """Every device with every fault, all but `short` of them in the long run: what they share, one of them shows."""
+def each_device(marks, faults):
+    """Every device with every fault, `long` unless `marks` has other ones: what they share, one of them shows."""
     return [
-        pytest.param(device, fault, marks=() if (device, fault) in short else pytest.mark.long)
+        pytest.param(device, fault, marks=marks.get((device, fault), pytest.mark.long))
         for device in DEVICES
         for fault in faults
     ]
 
 
-@pytest.mark.parametrize(("device", "fault"), each_device({("odrive", "SIGKILL")}, ("SIGKILL", "SIGSTOP", "unplug")))
+@pytest.mark.parametrize(
+    ("device", "fault"), each_device({("odrive", "SIGKILL"): ()}, ("SIGKILL", "SIGSTOP", "unplug"))
+)
 def test_the_robot_stops_and_nothing_arms_again(tmp_path, device, fault):
     with running_stack(tmp_path, device=device) as stack:
         stack.drive()
@@ -52,7 +54,9 @@ def test_the_robot_stops_and_nothing_arms_again(tmp_path, device, fault):
     assert max(row.fastest for row in stopped) < STILL_RAD_S
 
 
-@pytest.mark.parametrize(("device", "daemon"), each_device({("vesc", "frozen")}, ("healthy", "frozen")))
+@pytest.mark.parametrize(
+    ("device", "daemon"), each_device({("vesc", "frozen"): pytest.mark.thorough}, ("healthy", "frozen"))
+)
 def test_an_estop_from_beside_stops_it_and_is_confirmed(tmp_path, device, daemon):
     with running_stack(tmp_path, device=device) as stack:
         stack.drive()

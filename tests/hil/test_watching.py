@@ -19,6 +19,7 @@ from tests.hil.test_check import wait_for_line
 pytestmark = pytest.mark.hil
 
 
+@pytest.mark.thorough
 def test_python_cans_logger_writes_what_the_bus_carries(tmp_path):
     robot_file = write_robot_file(tmp_path)
     with disco_hw_process("virtual robot", ["sim", str(robot_file)], tmp_path / "sim.txt"):

@@ -19,7 +19,13 @@ STILL = (DriverState.STANDBY, DriverState.READY)
 COASTING_S = 2.5
 
 
-@pytest.fixture(params=VENDORS, ids=str)
+# Of several boards with one driver all are tried by `make test-all`; of the quick ones, each driver has its first.
+FURTHER = ("odrive-0.5", "vesc-four-braking", "roboclaw-a-board-a-side")
+
+
+@pytest.fixture(
+    params=[pytest.param(one, marks=pytest.mark.thorough) if str(one) in FURTHER else one for one in VENDORS], ids=str
+)
 def vendor(request):
     return request.param
 

@@ -216,7 +216,7 @@ def test_of_a_long_drive_the_stretches_with_commands_are_judged_first(commanded_
     assert line.first.sum() == (3 if end_s < 200.0 else 6)
 
 
-@pytest.mark.parametrize("lag_s", [0.2, 4.0])
+@thinned("lag_s", [0.2, 4.0], quick=1)
 def test_wheels_that_answer_slower_than_any_lag_do_not_say_how_late_commands_are(lag_s):
     rng = np.random.default_rng(4)
     t = np.arange(0.0, 90.0, 0.02)

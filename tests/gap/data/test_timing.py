@@ -208,7 +208,7 @@ def test_commands_that_stay_as_they_are_in_each_short_segment_do_not_show_when_t
         assert (found.delay_s, found.known) == (0.0, False)
 
 
-@pytest.mark.parametrize("jump_s", [-0.2, 0.17])
+@thinned("jump_s", [-0.2, 0.17], quick=1)
 def test_a_link_that_jumps_is_made_even_and_said_to_jump(jump_s):
     wheels, commands = commanded(0.1, 0.05)
     later = replace(commands, t_s=commands.t_s + jump_s * (commands.t_s > 33.0))
