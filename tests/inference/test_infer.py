@@ -41,6 +41,7 @@ def test_the_belief_has_the_moments_of_the_draws_and_goes_into_a_model(circle):
     assert model.name == "test"
 
 
+@pytest.mark.thorough
 def test_the_same_seed_gives_the_same_posterior(circle):
     again = infer(logged("circle"), robot_config(), FEW)
     assert np.array_equal(again.draws, circle.draws)
@@ -55,6 +56,7 @@ def test_a_log_without_encoders_is_driven_by_its_commands():
     assert found.draws.mean(axis=0) == pytest.approx(THETA, rel=0.05)
 
 
+@pytest.mark.thorough
 def test_the_papers_way_leaves_the_wheel_radius_as_wide_as_the_prior():
     found = infer(logged("circle"), robot_config(), InferOptions(paper=True, seed=3))
     assert found.drive.source == "commands"

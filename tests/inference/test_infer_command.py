@@ -171,6 +171,7 @@ def test_a_log_that_the_search_cannot_judge_gives_a_model_with_a_warning(known, 
     assert "next: disco-hw gap" not in result.as_text()
 
 
+@pytest.mark.thorough
 def test_several_logs_count_together(robot, tmp_path, inferred):
     _, result, _ = inferred
     logs = [write_log(tmp_path / f"{seed}.csv", "poor", seed) for seed in (1, 2)]

@@ -175,6 +175,7 @@ def test_drive_it_over_can_and_let_go(start, host):
     vanish_and_see_it_stop(robot, port)
 
 
+@pytest.mark.thorough
 def test_drive_it_over_a_serial_line_and_let_go(start, host, tmp_path):
     robot = start("--kind", "serial", "--port", str(tmp_path / "0" / "tty"), patient=True)
     assert robot.ready.startswith(f"ready serial {robot.port} at 921600 Bd")
