@@ -122,7 +122,7 @@ class GapReport:
     """What `find_gap` returns; `model` is the one of the stage `offered`: the amended one, if it predicts best.
 
     `gap` holds errors of poses by stage and horizon, `wheels` those of the wheels alone; either is empty where it could
-    not be judged. `written` in them: the amended model as it is written, where that lacks a term which no model can
+    not be judged. `warnings`: what contradicts itself in the logs, though they are still of use. `written` in them: the amended model as it is written, where that lacks a term which no model can
     carry. `across`: what several logs say of each parameter.
     """
 
@@ -144,6 +144,7 @@ class GapReport:
     wheels: dict[str, dict[float, PredictionErrors]] = field(default_factory=dict)
     across: tuple[AcrossLogs, ...] = ()
     provenance: Provenance | None = None
+    warnings: tuple[str, ...] = ()
 
     @property
     def horizon_s(self) -> float:
@@ -165,6 +166,7 @@ class GapReport:
         """The content of report.json."""
         return {
             "verdict": self.verdict,
+            "warnings": list(self.warnings),
             "channels": [
                 {"name": channel.name, "significant": channel.significant, "where": channel.where}
                 for channel in self.channels
