@@ -396,7 +396,7 @@ _SMALLEST_DEVIATION = 1e-5
 
 
 class EmptyRegionError(ValueError):
-    """No parameters are left to draw: a posterior lies outside of the prior, or far outside of all that was simulated."""
+    """No parameters are left to draw: the posterior lies outside the prior, or far from all that was simulated."""
 
 
 @dataclass(frozen=True, slots=True)

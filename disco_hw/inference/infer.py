@@ -133,8 +133,8 @@ def infer(
         return _infer(log, robot, options or InferOptions(), report_progress, workers)
     except (EmptyRegionError, np.linalg.LinAlgError):
         raise InputError(
-            f"{', '.join(log.sources)}: no parameters within the prior of robot.toml explain this log: poses, wheels and "
-            "commands are not of one drive, or their units or robot.toml are wrong; check them, or widen the prior"
+            f"{', '.join(log.sources)}: no parameters within the prior of robot.toml explain this log: poses, wheels "
+            "and commands are not of one drive, or their units or robot.toml are wrong; check them, or widen the prior"
         ) from None
 
 

@@ -122,8 +122,9 @@ class GapReport:
     """What `find_gap` returns; `model` is the one of the stage `offered`: the amended one, if it predicts best.
 
     `gap` holds errors of poses by stage and horizon, `wheels` those of the wheels alone; either is empty where it could
-    not be judged. `warnings`: what contradicts itself in the logs, though they are still of use. `written` in them: the amended model as it is written, where that lacks a term which no model can
-    carry. `across`: what several logs say of each parameter.
+    not be judged. `written` in them: the amended model as it is written, where that lacks a term which no model can
+    carry. `across`: what several logs say of each parameter. `warnings`: what contradicts itself in logs that are
+    still of use.
     """
 
     sources: tuple[str, ...]
