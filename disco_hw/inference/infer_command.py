@@ -229,10 +229,10 @@ def infer_command(
     config = load_robot_config(robot)
     drive = load_drive(list(logs), config.robot.ticks_per_rev, config.robot.wheel_radius_m)
     nominal = Model.nominal(config.robot)
-    excitation(drive)
     found_wrong = find_contradictions(drive, nominal.wheel_radius_m, nominal.axial_distance_m)
     by_commands = options is not None and options.paper
     refuse_contradictions(found_wrong, ("body", "response") if by_commands else ("body",))
+    excitation(drive)
     with search(drive, nominal) as searched, _workers(dask) as workers:
         inference = infer(drive, config, options, report_progress, workers)
         report_progress("search for missing effects", 1.0)
