@@ -45,10 +45,10 @@ def test_a_sound_log_is_sound_also_in_another_frame_and_without_commands(drive):
     assert found(log) == found(rotated(1.1)(log)) == found(without_commands(log)) == ()
 
 
+@pytest.mark.parametrize("drive", ["poor", pytest.param("free", marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", EFFECTS)
-def test_what_a_robot_may_do_is_no_contradiction(name):
-    for drive in ("free", "poor"):
-        assert found(simulated_drive(realistic(name, 5), seed=5, drive=drive, dirty=True, motors="real")) == ()
+def test_what_a_robot_may_do_is_no_contradiction(name, drive):
+    assert found(simulated_drive(realistic(name, 5), seed=5, drive=drive, dirty=True, motors="real")) == ()
 
 
 def test_a_sound_log_does_not_hide_what_is_wrong_with_another():
