@@ -25,6 +25,7 @@ from disco_hw.estimation.correction import DisturbanceEstimator, PoseUpdate
 from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.model import Belief
 from disco_hw.model.coefficients import NO_DISTURBANCE, Disturbance
+from disco_hw.runtime.fence_guard import HOLDS_STILL, IDLE, FenceGuard, FenceState
 from disco_hw.tasks import PlannedTask
 from drivers.types import PoseSample, Readings
 
@@ -40,6 +41,7 @@ class Limited(enum.Flag):
     ACCELERATION = enum.auto()
     PERIOD = enum.auto()
     NOT_FINITE = enum.auto()
+    FENCE = enum.auto()
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,7 +236,7 @@ class Tick(msgspec.Struct, frozen=True, gc=False):
 
     `plan` is this tick's new plan or None, `plan_age_ns` the age of the one in force, `planner_failure` why there is no
     new one; `requested` is what `source` wanted, `command` what the governor lets through (rad/s); `disturbance` what
-    was planned with, None where none is estimated.
+    was planned with, None where none is estimated; `fence` what the fence guard made of what was requested.
     """
 
     t_ns: int
@@ -247,6 +249,7 @@ class Tick(msgspec.Struct, frozen=True, gc=False):
     requested: tuple[float, float]
     command: Governed
     disturbance: Disturbance | None = None
+    fence: FenceState = IDLE
 
 
 def untimed(_stage: str) -> None:
@@ -263,7 +266,9 @@ class Pipeline:
     def __init__(
         self, fusion: PoseFusion, planner: Planner, governor: Governor, plan_tail_s: float,
         disturbance: DisturbanceEstimator | None = None, means: DriveMeans | None = None,
+        guard: FenceGuard | None = None,
     ) -> None:  # fmt: skip
+        self._guard = guard
         self._fusion = fusion
         self._means = means
         self._disturbance = disturbance
@@ -309,10 +314,18 @@ class Pipeline:
         """
         return None if self._plan is None else self._planner.sampled_rollouts(count)
 
-    def step(self, now_ns: int, readings: Readings, motion: Motion, mark: Callable[[str], None] = untimed) -> Tick:
+    def step(
+        self,
+        now_ns: int,
+        readings: Readings,
+        motion: Motion,
+        mark: Callable[[str], None] = untimed,
+        fence_overridden: bool = False,
+    ) -> Tick:
         """Advance by one tick; `mark(stage)` is called at the end of the stages "estimate" and "plan".
 
-        Never raises on what the robot sent; a planner without a valid control is reported in the tick.
+        `fence_overridden`: a person drives in spite of the fence. Never raises on what the robot sent; a planner
+        without a valid control is reported in the tick.
         """
         for wheels in readings.wheels:
             self._fusion.add_wheels(wheels)
@@ -329,7 +342,10 @@ class Pipeline:
         else:
             self._plan, self._following = None, False
         source, requested = self._wanted(now_ns, motion, plan)
-        command = self._govern(now_ns, source, requested)
+        fence, allowed = self._guarded(estimate, source, requested, fence_overridden)
+        command = self._govern(now_ns, source, allowed)
+        if allowed is not requested:
+            command = msgspec.structs.replace(command, limited=command.limited | Limited.FENCE)
         mark("plan")
         return Tick(
             t_ns=now_ns,
@@ -342,7 +358,27 @@ class Pipeline:
             requested=requested,
             command=command,
             disturbance=None if self._disturbance is None else self._disturbance.value,
+            fence=fence,
         )
+
+    def _guarded(
+        self, estimate: PoseEstimate, source: Source, requested: tuple[float, float], overridden: bool
+    ) -> tuple[FenceState, tuple[float, float]]:
+        """What the fence guard says of the requested wheel speeds, and the part of them that it lets through."""
+        if self._guard is None or not self._guard.is_active or source in {Source.OFF, Source.SILENT}:
+            return IDLE, requested
+        last = (self._sent[-1].left_rad_s, self._sent[-1].right_rad_s) if self._sent else (0.0, 0.0)
+        found = self._guard.step(estimate, self._fusion.parameters, last, requested, overridden)
+        if found.verdict in HOLDS_STILL:
+            return found, (0.0, 0.0) if requested != (0.0, 0.0) else requested
+        if found.scale == 1.0:
+            return found, requested
+        return found, (found.scale * requested[0], found.scale * requested[1])
+
+    @property
+    def guard(self) -> FenceGuard | None:
+        """What keeps every command within the fence; None where nothing does."""
+        return self._guard
 
     def _take_pose(self, pose: PoseSample, now_ns: int) -> PoseUpdate:
         update = self._fusion.add_pose(pose, now_ns)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from disco_hw.config import Robot, RobotConfig, link_fields, load_robot_config
+from disco_hw.config import Robot, RobotConfig, link_fields, load_robot_config, refuse_outside_task
 from disco_hw.errors import InputError
 from disco_hw.files import KEY, WAY_POINTS, read_bytes
 from disco_hw.files import MODEL_TOML as MODEL_KIND
@@ -57,6 +57,8 @@ def load_setup(robot: Path, model: Path | None = None, link: str | None = None, 
     else:
         judged, path_file = path_file is None, path_file or robot.parent / config.task.file
         config = msgspec.structs.replace(config, task=config.task.with_file(path_file, config.robot, judged))
+        if judged:
+            refuse_outside_task(robot, config)
     if link is not None:
         config = msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, **link_fields(link)))
     model_file = model
