@@ -269,7 +269,8 @@ class FenceGuard(msgspec.Struct, frozen=True, gc=False):
     """What the fence guard made of the command of one tick, while there is a fence or an obstacle.
 
     `scale`: of the requested command that was let through. `clearance_m`: least along the stopping path after it, less
-    the uncertainty of the pose. The last three: that path of the tracked point, in every fifth tick.
+    the uncertainty of the pose. The rest in every fifth tick: that path of the tracked point, and the obstacles as x, y
+    and radius of one after the other (m).
     """
 
     t_ns: int
@@ -281,6 +282,7 @@ class FenceGuard(msgspec.Struct, frozen=True, gc=False):
     path_x_m: tuple[float, ...] = ()
     path_y_m: tuple[float, ...] = ()
     path_yaw_rad: tuple[float, ...] = ()
+    obstacles: tuple[float, ...] = ()
 
 
 class Fence(msgspec.Struct, frozen=True, gc=False):

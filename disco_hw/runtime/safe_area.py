@@ -62,11 +62,22 @@ class SafeArea:
         written, self._pending = self._pending, []
         if verdict is not FenceVerdict.IDLE:
             self._ticks += 1
-            shown = found.path if changed or self._ticks % _PATH_EVERY == 0 else ()
-            x, y, yaw = zip(*shown, strict=True) if shown else ((), (), ())
+            is_shown = changed or self._ticks % _PATH_EVERY == 0
+            x, y, yaw = zip(*found.path, strict=True) if is_shown and found.path else ((), (), ())
+            circles = self.obstacles.circles(now_ns) if is_shown else ()
+            obstacles = tuple(value for one in circles for value in (one.x_m, one.y_m, one.radius_m))
             written.append(
                 records.FenceGuard(
-                    now_ns, verdict.value, found.scale, found.clearance_m, overridden, found.reason, x, y, yaw
+                    now_ns,
+                    verdict.value,
+                    found.scale,
+                    found.clearance_m,
+                    overridden,
+                    found.reason,
+                    x,
+                    y,
+                    yaw,
+                    obstacles,
                 )
             )
         return events, written

@@ -1,4 +1,4 @@
-"""Whatever is commanded, a robot that the guard watches can always stop within the fence; and the guard fails closed."""
+"""Whatever is commanded, a robot can always stop within the fence that the guard watches; and it fails closed."""
 
 from __future__ import annotations
 
@@ -144,10 +144,10 @@ def test_the_believed_spread_makes_the_path_longer_and_wider():
     aside = judge(fence, spinning, (-1, 1), geometry=centre)
     assert plain.clearance_m - aside.clearance_m == pytest.approx(3 * 0.01 * turned, rel=0.05)
     # What radius and axle have in common does not change how the robot turns.
-    both = OdometryParameters(
-        RADIUS, AXLE, X_ICR, ((0.01**2 * RADIUS**2, 0.01**2 * RADIUS * AXLE, 0), (0.01**2 * RADIUS * AXLE, 0.01**2 * AXLE**2, 0), (0, 0, 0))
-    )  # fmt: skip
-    alone = OdometryParameters(RADIUS, AXLE, X_ICR, ((0.01**2 * RADIUS**2, 0, 0), (0, 0.01**2 * AXLE**2, 0), (0, 0, 0)))
+    common = 0.01**2 * RADIUS * AXLE
+    own = (0.01**2 * RADIUS**2, 0.01**2 * AXLE**2)
+    both = OdometryParameters(RADIUS, AXLE, X_ICR, ((own[0], common, 0), (common, own[1], 0), (0, 0, 0)))
+    alone = OdometryParameters(RADIUS, AXLE, X_ICR, ((own[0], 0, 0), (0, own[1], 0), (0, 0, 0)))
     assert (
         judge(fence, spinning, (-1, 1), geometry=both).clearance_m
         > judge(fence, spinning, (-1, 1), geometry=alone).clearance_m + 1e-3
