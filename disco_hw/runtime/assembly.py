@@ -20,10 +20,12 @@ from disco_hw.adaptation.guard import (
 from disco_hw.config import RobotConfig
 from disco_hw.control.baselines import LAWS, WithFallback
 from disco_hw.control.past_motion import DriveMeans
+from disco_hw.control.surroundings import Surroundings
 from disco_hw.errors import InputError
 from disco_hw.estimation import PoseFusion
 from disco_hw.estimation.correction import DisturbanceEstimator
 from disco_hw.estimation.odometry import OdometryParameters
+from disco_hw.fence import Fence
 from disco_hw.fence.clearance import Boundaries
 from disco_hw.log.recorder import Recorder
 from disco_hw.model import Model
@@ -46,15 +48,33 @@ _LEAST_RESPONSE_S = 0.05
 def make_planner(config: RobotConfig, model: Model) -> control.Disco:
     """DISCO for this robot's task, compiled and warmed up: takes seconds."""
     task = config.task.planned(config.control.mode)
+    settings = control.DiscoSettings.from_config(config.control, config.task.speed_m_s)
     planner = control.Disco(
         model,
         task,
-        control.DiscoSettings.from_config(config.control, config.task.speed_m_s),
+        settings,
         control.CommandLimits.of_robot(config.robot),
         config.control.seed,
+        make_surroundings(config, settings),
     )
     planner.warm_up()
     return planner
+
+
+def make_surroundings(config: RobotConfig, settings: control.DiscoSettings) -> Surroundings | None:
+    """What DISCO keeps away from; None for a robot.toml without [fence], where the guard alone minds obstacles."""
+    if config.fence == Fence():
+        return None
+    around = Surroundings(
+        config.robot.footprint,
+        config.fence.margin_m,
+        config.fence.max_breach_probability,
+        settings.step_s,
+        settings.sampler.horizon,
+        config.task.speed_m_s,
+    )
+    around.look_around(Boundaries(config.robot.footprint, config.fence), 0.0)
+    return around
 
 
 def make_pipeline(config: RobotConfig, model: Model, planner: Planner) -> Pipeline:

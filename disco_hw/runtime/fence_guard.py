@@ -217,7 +217,7 @@ class FenceGuard:
         turned = np.cumsum(np.abs(driven[..., 1]), axis=1)
         moved = np.cumsum(np.abs(driven[..., 0]), axis=1)
         unknown = spread.turn * turned * (reach_m + 0.5 * moved) + spread.x_icr_m * turned
-        clearance -= (_pose_deviation_m(estimate, bounds) + unknown)[..., None]
+        clearance -= (SIGMAS * corner_deviation_m(estimate, bounds) + unknown)[..., None]
         step = np.abs(driven[..., 0]) + reach_m * np.abs(driven[..., 1])
         nearer = np.minimum(clearance[:count], clearance[count:])
         return poses[:count], nearer, np.maximum(step[:count], step[count:])
@@ -307,8 +307,8 @@ def _spread(geometry: OdometryParameters) -> _Spread:
     )
 
 
-def _pose_deviation_m(estimate: PoseEstimate, bounds: Boundaries) -> float:
-    """Three standard deviations of that corner of the footprint whose place is known least (m)."""
+def corner_deviation_m(estimate: PoseEstimate, bounds: Boundaries) -> float:
+    """Standard deviation of that corner of the footprint whose place is known least, in its worst direction (m)."""
     covariance = np.array(estimate.covariance)
     cos, sin = math.cos(estimate.yaw_rad), math.sin(estimate.yaw_rad)
     largest = 0.0
@@ -316,7 +316,7 @@ def _pose_deviation_m(estimate: PoseEstimate, bounds: Boundaries) -> float:
         jacobian = np.array([[1.0, 0.0, -sin * x - cos * y], [0.0, 1.0, cos * x - sin * y]])
         (xx, xy), (_, yy) = (jacobian @ covariance @ jacobian.T).tolist()
         largest = max(largest, 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy))
-    return SIGMAS * math.sqrt(largest)
+    return math.sqrt(largest)
 
 
 def _are_finite(estimate: PoseEstimate, geometry: OdometryParameters, last_sent: tuple[float, float]) -> bool:

@@ -14,7 +14,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import msgspec
 
@@ -23,9 +23,10 @@ from disco_hw.control.past_motion import DriveMeans
 from disco_hw.estimation import PoseEstimate, PoseFusion
 from disco_hw.estimation.correction import DisturbanceEstimator, PoseUpdate
 from disco_hw.estimation.odometry import OdometryParameters
+from disco_hw.fence.clearance import Boundaries
 from disco_hw.model import Belief
 from disco_hw.model.coefficients import NO_DISTURBANCE, Disturbance
-from disco_hw.runtime.fence_guard import HOLDS_STILL, IDLE, FenceGuard, FenceState
+from disco_hw.runtime.fence_guard import HOLDS_STILL, IDLE, FenceGuard, FenceState, corner_deviation_m
 from disco_hw.tasks import PlannedTask
 from drivers.types import PoseSample, Readings
 
@@ -166,6 +167,14 @@ class Planner(Protocol):
         """The weightiest sequences of the last plan; changes nothing."""
 
 
+@runtime_checkable
+class AvoidsBoundaries(Protocol):
+    """A planner that keeps away from fence and obstacles by itself."""
+
+    def look_around(self, bounds: Boundaries, deviation_m: float) -> None:
+        """Keep away from these boundaries from the next plan on; `deviation_m`: of the footprint's place."""
+
+
 class NoPlanner:
     """In the place of a planner where the robot is driven by hand: it never has a plan."""
 
@@ -269,6 +278,7 @@ class Pipeline:
         guard: FenceGuard | None = None,
     ) -> None:  # fmt: skip
         self._guard = guard
+        self._avoids = planner if isinstance(planner, AvoidsBoundaries) else None
         self._fusion = fusion
         self._means = means
         self._disturbance = disturbance
@@ -403,6 +413,8 @@ class Pipeline:
             command_means=() if self._means is None else self._means.commands,
             body_means=() if self._means is None else self._means.body,
         )
+        if self._avoids is not None and self._guard is not None and self._guard.boundaries is not None:
+            self._avoids.look_around(self._guard.boundaries, corner_deviation_m(estimate, self._guard.boundaries))
         try:
             plan = self._planner.plan(now_ns, state)
         except NoValidControl as error:

@@ -51,6 +51,7 @@ from disco_hw.control.kernel import (
     stage_cost,
     terminal_cost,
 )
+from disco_hw.control.kernel.avoid import LOOK_EVERY, Area, touch_cost
 from disco_hw.jit import bits_of_float, block_function, cast_like, float_from_bits, scalar_function, tune_loops
 from disco_hw.model.added_terms import count_means
 from disco_hw.model.coefficients import (
@@ -103,7 +104,7 @@ class SkidSteer(NamedTuple):
     the first point has no weight, so that it is rolled out for its equivalent points alone and its cost is left as it
     is. `series` (8,), `wide`, `euler`: how a step is integrated; under Euler steps no points share a rollout.
     `history`: rows of commands from before the plan. `wheels`: buffer of the wheels' motion, T * WHEEL_ROWS * BLOCK;
-    `wheels_differ`: whether the points differ in how the wheels turn.
+    `wheels_differ`: whether the points differ in how the wheels turn. `area`: what is kept away from, or None.
     """
 
     start: Floats
@@ -122,6 +123,7 @@ class SkidSteer(NamedTuple):
     history: int
     wheels: Floats
     wheels_differ: bool
+    area: Area | None = None
 
 
 @block_function
@@ -385,6 +387,36 @@ def _costs(
 
 
 @scalar_function
+def _avoid(
+    area: Area | None, state: Floats, at: int, t: int, base: Base, skip_mean: Absent, ahead: BasePair,
+    scaled: BasePair, start: Floats,
+) -> None:  # fmt: skip
+    """Add what step t, which the block has just made, costs for touching a shape; nothing without an area."""
+    if area is None:
+        return
+    time_s = cast_like(t + 1, start[0]) * area.body[4]
+    for k in range(area.count[0]):
+        if skip_mean is None:
+            for b in range(BLOCK):
+                place = _place(state, b, lane_base(base, at + b))
+                state[OWN + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
+        if ahead is not None:
+            for b in range(BLOCK):
+                place = _ahead_place(state, b, base, ahead[0], start)
+                state[AHEAD0 + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
+            for b in range(BLOCK):
+                place = _ahead_place(state, b, base, ahead[1], start)
+                state[AHEAD1 + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
+        if scaled is not None:
+            for b in range(BLOCK):
+                place = _scaled_place(state, b, base, scaled[0], start)
+                state[SCALED0 + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
+            for b in range(BLOCK):
+                place = _scaled_place(state, b, base, scaled[1], start)
+                state[SCALED1 + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
+
+
+@scalar_function
 def sliding_heading(
     slides: Absent, cos_yaw: float, sin_yaw: float, forward_m: float, start: Floats
 ) -> tuple[float, float]:
@@ -418,6 +450,7 @@ def _roll(
     costs: Floats, at: int, ahead_at: CostPlaces, scaled_at: CostPlaces, horizon: int, commands: Floats, late: int,
     wheels: Floats, state: Floats, slides: Absent, start: Floats, means: Floats | None, point: int, base: Base,
     skip_mean: Absent, ahead: BasePair, scaled: BasePair, effects: Coefficients, integration: Integration, task: Terms,
+    area: Area | None,
 ) -> None:  # fmt: skip
     """Roll the block out from `start` with its wheels turning as in `wheels`; writes `costs[at:at + BLOCK]`.
 
@@ -460,6 +493,8 @@ def _roll(
                 )  # fmt: skip
                 _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task)
         _look_ups(looks_up(task), state, skip_mean, ahead, scaled, task)
+        if t % LOOK_EVERY == LOOK_EVERY - 1:
+            _avoid(area, state, at, t, base, skip_mean, ahead, scaled, start)
     for b in range(BLOCK):
         _costs(state, b, horizon - 1, lane_base(base, at + b), skip_mean, ahead, scaled, start, task, True)
     # One after the other: a loop that wrote to all at once would not be vectorised.
@@ -505,7 +540,7 @@ def _roll_points(
                 )
             _roll(
                 costs, at, None, None, horizon, commands, late, wheels, state, slides, start, means, i, system.base,
-                None, None, None, system.effects, integration, task,
+                None, None, None, system.effects, integration, task, system.area,
             )  # fmt: skip
         else:
             if (i == 0 or system.wheels_differ) and (needs_change(acting) or not wheels_follow(acting)):
@@ -519,18 +554,20 @@ def _roll_points(
                         _roll(
                             costs, at, _places(ahead[i], padded, lane), None, horizon, commands, late, wheels, state,
                             slides, start, means, i, here, skip_mean, _bases(system.base, ahead[i]), None, acting,
-                            integration, task,
+                            integration, task, system.area,
                         )  # fmt: skip
                     else:
                         _roll(
                             costs, at, _places(ahead[i], padded, lane), _places(scaled[i], padded, lane), horizon,
                             commands, late, wheels, state, slides, start, means, i, here, skip_mean,
                             _bases(system.base, ahead[i]), _bases(system.base, scaled[i]), acting, integration, task,
+                            system.area,
                         )  # fmt: skip
             if alone:
                 _roll(
                     costs, at, None, None, horizon, commands, late, wheels, state, slides, start, means, i, here, None,
                     None, None, acting, integration, task,
+                            system.area,
                 )  # fmt: skip
 
 
