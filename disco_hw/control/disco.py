@@ -230,6 +230,11 @@ class Disco:
         if self._surroundings is not None:
             self._surroundings.look_around(bounds, deviation_m)
 
+    def set_line(self, line_m: Array) -> None:
+        """Drive around what stands on this line, points (N, 2); nothing without surroundings."""
+        if self._surroundings is not None:
+            self._surroundings.set_line(line_m)
+
     @property
     def optimiser(self) -> Optimiser:
         """The sampling optimiser, for its buffers and figures."""
@@ -345,7 +350,7 @@ class Disco:
 
         Turning in from there costs more than standing for as long as is planned, or is put off from plan to plan.
         """
-        if not self._optimiser.guide_is_valid:
+        if not self._optimiser.guide_is_valid or self._guide_touches():
             return False
         settings = self._settings
         horizon_s = settings.sampler.horizon * settings.step_s
@@ -361,6 +366,10 @@ class Disco:
         """Whether every sample of the last step touches the fence or an obstacle for most of the horizon."""
         around = self._surroundings
         return around is not None and self._optimiser.least_cost >= around.trapped_cost
+
+    def _guide_touches(self) -> bool:
+        around = self._surroundings
+        return around is not None and self._optimiser.guide_cost >= around.touching_cost
 
     def _leave_touching_plan(self) -> None:
         """Continue from the best sample where the plan touches something and that sample does not.

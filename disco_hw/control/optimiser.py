@@ -150,6 +150,11 @@ class Optimiser:
         return bool(self._work.costs[1] < below * self._work.costs[0])
 
     @property
+    def guide_cost(self) -> float:
+        """Cost of the guide in the last step."""
+        return float(self._work.costs[1])
+
+    @property
     def guide_is_valid(self) -> bool:
         """Whether the guide had a cost in the last step."""
         return bool(self._work.costs[1] < INVALID)

@@ -8,8 +8,18 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.control.detours import Detours
 from disco_hw.control.kernel import aligned_zeros
-from disco_hw.control.kernel.avoid import COLUMNS, LOOK_EVERY, MOST_SHAPES, TOUCH_COST, Area, place_shapes
+from disco_hw.control.kernel.avoid import (
+    COLUMNS,
+    DETOUR_COLUMNS,
+    DETOURS,
+    LOOK_EVERY,
+    MOST_SHAPES,
+    TOUCH_COST,
+    Area,
+    place_shapes,
+)
 from disco_hw.fence import Footprint
 from disco_hw.fence.clearance import Boundaries
 from disco_hw.fence.outlines import circle_outline
@@ -37,6 +47,7 @@ class Surroundings:
     ) -> None:
         self.speed_m_s = speed_m_s
         """The task's speed."""
+        self._detours = Detours(footprint)
         self._footprint = footprint
         self._margin_m = margin_m
         self._deviations = NormalDist().inv_cdf(1.0 - max_breach_probability)
@@ -49,6 +60,7 @@ class Surroundings:
             aligned_zeros(MOST_SHAPES * COLUMNS),
             np.zeros(1, np.int64),
             np.array([0.5 * footprint.length, 0.5 * footprint.width, footprint.ahead, 0.0, step_s], np.float32),
+            np.zeros(DETOURS * DETOUR_COLUMNS, np.float32),
             np.zeros(MOST_SHAPES),
         )
 
@@ -71,7 +83,13 @@ class Surroundings:
         moving = np.zeros((len(circles), COLUMNS))
         moving[:, [0, 1, 5, 6, 7]] = circles
         self._table = np.concatenate((self._edges, moving))
-        self.area.body[3] = self._margin_m + self._deviations * deviation_m
+        keep_m = self._margin_m + self._deviations * deviation_m
+        self.area.body[3] = keep_m
+        self._detours.look_around(bounds, keep_m)
+
+    def set_line(self, line_m: Array) -> None:
+        """Drive around what stands on this line, points (N, 2)."""
+        self._detours.set_line(line_m)
 
     def place(self, x_m: float, y_m: float, origin_m: tuple[float, float], speed_m_s: float) -> Area:
         """Put the shapes that a plan from here can reach into the kernel's buffers, relative to the origin.
@@ -84,6 +102,7 @@ class Surroundings:
         if self._place is None:
             self._place = compiled_for(place_shapes, *arguments)
         self._place(*arguments)
+        self._detours.place(self.area.detours, x_m, y_m, origin_m)
         return self.area
 
 

@@ -73,6 +73,7 @@ def make_surroundings(config: RobotConfig, settings: control.DiscoSettings) -> S
         settings.sampler.horizon,
         config.task.speed_m_s,
     )
+    around.set_line(config.task.course().outline_m())
     around.look_around(Boundaries(config.robot.footprint, config.fence), 0.0)
     return around
 

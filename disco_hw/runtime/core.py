@@ -151,7 +151,7 @@ class DaemonCore:
         """Follow another task of the same kind from the next tick on, in which it is recorded."""
         self.task, self.course, self.progress = task, task.course(), task.progress()
         self._headway = Headway(task.reference_speed_m_s)
-        self.pipeline.set_task(task.planned(self.config.control.mode))
+        self.pipeline.set_task(task.planned(self.config.control.mode), self.course.outline_m())
         self._task_changed = True
 
     def tick(

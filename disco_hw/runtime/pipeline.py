@@ -17,6 +17,8 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from disco_hw.control import NoValidControl, PlannerState, PlanOutcome, Rollouts, SentCommand, WheelPlan
 from disco_hw.control.past_motion import DriveMeans
@@ -174,6 +176,9 @@ class AvoidsBoundaries(Protocol):
     def look_around(self, bounds: Boundaries, deviation_m: float) -> None:
         """Keep away from these boundaries from the next plan on; `deviation_m`: of the footprint's place."""
 
+    def set_line(self, line_m: NDArray[np.float64]) -> None:
+        """Drive around what stands on this line, points (N, 2)."""
+
 
 class NoPlanner:
     """In the place of a planner where the robot is driven by hand: it never has a plan."""
@@ -301,9 +306,14 @@ class Pipeline:
         """How the robot moves beside its model, as far as is known."""
         return NO_DISTURBANCE if self._disturbance is None else self._disturbance.value
 
-    def set_task(self, task: PlannedTask) -> None:
-        """Follow another task of the same kind; what is planned for the present one is dropped."""
+    def set_task(self, task: PlannedTask, line_m: NDArray[np.float64] | None = None) -> None:
+        """Follow another task of the same kind; what is planned for the present one is dropped.
+
+        `line_m` (N, 2): its line, for a planner that drives around obstacles on it.
+        """
         self._planner.set_task(task)
+        if self._avoids is not None and line_m is not None:
+            self._avoids.set_line(line_m)
         self._plan, self._following = None, False
 
     def set_belief(self, belief: Belief, odometry: OdometryParameters) -> None:

@@ -129,7 +129,9 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
         for tick, entries in groupby(log.records(_TOPICS), key=lambda entry: entry.tick):
             recorded = list(entries)
             for task in (entry.record for entry in recorded if isinstance(entry.record, Task)):
-                pipeline.set_task(task_of(task, setup.config.task).planned(setup.config.control.mode))
+                changed = task_of(task, setup.config.task)
+                line_m = changed.course().outline_m()
+                pipeline.set_task(changed.planned(setup.config.control.mode), line_m)
             for change in (entry.record for entry in recorded if isinstance(entry.record, BeliefChange)):
                 put_in_force(pipeline, setup.model, geometry_of(change))
             area.take(recorded)

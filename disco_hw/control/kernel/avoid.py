@@ -27,17 +27,24 @@ LOOK_EVERY = 2
 """Steps from one look to the next."""
 
 
+DETOURS, DETOUR_COLUMNS = 2, 7
+"""How many obstacles on the line are driven around at once; of each middle x, y, the line's direction x, y, one over
+half the detour's length (1/m), how far to the left it leads (m), and how far aside of the line it counts (m)."""
+
+
 class Area(NamedTuple):
     """What rollouts keep away from.
 
     `shapes` (MOST_SHAPES * COLUMNS,); `count` (1,) of them are there. `body` (5,): half the footprint's length and
     width, how far its centre lies ahead of the tracked point, the distance to keep (m), and the length of a step (s).
+    `detours` (DETOURS * DETOUR_COLUMNS,): around obstacles on the task's line.
     `away` (MOST_SHAPES,): how far each shape is from where the plan begins (m).
     """
 
     shapes: Floats
     count: NDArray[np.int64]
     body: Floats
+    detours: Floats
     away: NDArray[np.float64]
 
 
@@ -76,6 +83,32 @@ def place_shapes(
             if area.away[k] > farthest:
                 farthest, farthest_at = area.away[k], k
     area.count[0] = count
+
+
+@scalar_function
+def detoured(
+    area: Area | None, place: tuple[float, float, float]
+) -> tuple[float, float, float]:  # fmt: skip
+    """Where the task is to see a robot: on the line while it drives around an obstacle as it should; compiled only."""
+    if area is None:
+        return place
+    x, y, forward = place
+    moved_x, moved_y = _shifted(area.detours, 0, x, y)
+    more_x, more_y = _shifted(area.detours, DETOUR_COLUMNS, x, y)
+    return x + moved_x + more_x, y + moved_y + more_y, forward
+
+
+@scalar_function
+def _shifted(detours: Floats, at: int, x: float, y: float) -> tuple[float, float]:
+    """How far one detour moves a position: most in its middle, smoothly to nothing at both ends."""
+    row = U(at)
+    off_x, off_y = x - detours[row], y - detours[row + U(1)]
+    along_x, along_y = detours[row + U(2)], detours[row + U(3)]
+    along = (off_x * along_x + off_y * along_y) * detours[row + U(4)]
+    aside = abs(off_y * along_x - off_x * along_y)
+    part = max(constant(1.0, x) - along * along, constant(0.0, x))
+    left = detours[row + U(5)] * part * part if aside < detours[row + U(6)] else constant(0.0, x)
+    return left * along_y, -left * along_x
 
 
 @scalar_function

@@ -51,7 +51,7 @@ from disco_hw.control.kernel import (
     stage_cost,
     terminal_cost,
 )
-from disco_hw.control.kernel.avoid import LOOK_EVERY, Area, touch_cost
+from disco_hw.control.kernel.avoid import LOOK_EVERY, Area, detoured, touch_cost
 from disco_hw.jit import bits_of_float, block_function, cast_like, float_from_bits, scalar_function, tune_loops
 from disco_hw.model.added_terms import count_means
 from disco_hw.model.coefficients import (
@@ -224,10 +224,11 @@ def _move(
 
 
 @scalar_function
-def _begin(state: Floats, own: int, b: int, start: Floats, task: Terms) -> None:
+def _begin(state: Floats, own: int, b: int, start: Floats, task: Terms, area: Area | None) -> None:
     """Set the rows from `own` on to the start."""
-    state[own + X + b] = start[0]
-    state[own + Y + b] = start[1]
+    x, y, _ = detoured(area, (start[0], start[1], start[0]))
+    state[own + X + b] = x
+    state[own + Y + b] = y
     state[own + MEMORY + b] = start[7]
     state[own + TOTAL + b] = cast_like(0.0, start[0])
     _remember(looks_up(task), state, own, b, start[7], task)
@@ -348,18 +349,19 @@ def _follows(
     scaled: BasePair,
     start: Floats,
     task: Terms,
+    area: Area | None,
 ) -> None:
     """Move the memories of a point and its equivalent points on; nothing without a table."""
     if looks is None:
         return
     if skip_mean is None:
-        _follow(looks, state, OWN, b, _place(state, b, base), task)
+        _follow(looks, state, OWN, b, detoured(area, _place(state, b, base)), task)
     if ahead is not None:
-        _follow(looks, state, AHEAD0, b, _ahead_place(state, b, base, ahead[0], start), task)
-        _follow(looks, state, AHEAD1, b, _ahead_place(state, b, base, ahead[1], start), task)
+        _follow(looks, state, AHEAD0, b, detoured(area, _ahead_place(state, b, base, ahead[0], start)), task)
+        _follow(looks, state, AHEAD1, b, detoured(area, _ahead_place(state, b, base, ahead[1], start)), task)
     if scaled is not None:
-        _follow(looks, state, SCALED0, b, _scaled_place(state, b, base, scaled[0], start), task)
-        _follow(looks, state, SCALED1, b, _scaled_place(state, b, base, scaled[1], start), task)
+        _follow(looks, state, SCALED0, b, detoured(area, _scaled_place(state, b, base, scaled[0], start)), task)
+        _follow(looks, state, SCALED1, b, detoured(area, _scaled_place(state, b, base, scaled[1], start)), task)
 
 
 @scalar_function
@@ -374,16 +376,17 @@ def _costs(
     start: Floats,
     task: Terms,
     last: Absent,
+    area: Area | None,
 ) -> None:
     """Costs of step t under a point and its equivalent points, pairs or None."""
     if skip_mean is None:
-        _cost(state, OWN, b, t, _place(state, b, base), task, last)
+        _cost(state, OWN, b, t, detoured(area, _place(state, b, base)), task, last)
     if ahead is not None:
-        _cost(state, AHEAD0, b, t, _ahead_place(state, b, base, ahead[0], start), task, last)
-        _cost(state, AHEAD1, b, t, _ahead_place(state, b, base, ahead[1], start), task, last)
+        _cost(state, AHEAD0, b, t, detoured(area, _ahead_place(state, b, base, ahead[0], start)), task, last)
+        _cost(state, AHEAD1, b, t, detoured(area, _ahead_place(state, b, base, ahead[1], start)), task, last)
     if scaled is not None:
-        _cost(state, SCALED0, b, t, _scaled_place(state, b, base, scaled[0], start), task, last)
-        _cost(state, SCALED1, b, t, _scaled_place(state, b, base, scaled[1], start), task, last)
+        _cost(state, SCALED0, b, t, detoured(area, _scaled_place(state, b, base, scaled[0], start)), task, last)
+        _cost(state, SCALED1, b, t, detoured(area, _scaled_place(state, b, base, scaled[1], start)), task, last)
 
 
 @scalar_function
@@ -466,11 +469,11 @@ def _roll(
         state[COS + b] = cos_yaw
         state[SIN + b] = sin_yaw
         if skip_mean is None:
-            _begin(state, OWN, b, start, task)
-        _begin(state, AHEAD0, b, start, task)
-        _begin(state, AHEAD1, b, start, task)
-        _begin(state, SCALED0, b, start, task)
-        _begin(state, SCALED1, b, start, task)
+            _begin(state, OWN, b, start, task, area)
+        _begin(state, AHEAD0, b, start, task, area)
+        _begin(state, AHEAD1, b, start, task, area)
+        _begin(state, SCALED0, b, start, task, area)
+        _begin(state, SCALED1, b, start, task, area)
     _begin_means(means, state, BODY_REMEMBERED, point, U(count_means(effects.command_terms)), effects.body_terms)
     _look_ups(looks_up(task), state, skip_mean, ahead, scaled, task)
     for t in range(horizon):
@@ -482,21 +485,21 @@ def _roll(
                     state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting,
                     integration, slides, start,
                 )  # fmt: skip
-                _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task)
+                _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task, area)
         else:
             for b in range(BLOCK):
                 here, acting = lane_base(base, at + b), lane_effects(effects, at + b)
-                _costs(state, b, t - 1, here, skip_mean, ahead, scaled, start, task, None)
+                _costs(state, b, t - 1, here, skip_mean, ahead, scaled, start, task, None, area)
                 _move(
                     state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting,
                     integration, slides, start,
                 )  # fmt: skip
-                _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task)
+                _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task, area)
         _look_ups(looks_up(task), state, skip_mean, ahead, scaled, task)
         if t % LOOK_EVERY == LOOK_EVERY - 1:
             _avoid(area, state, at, t, base, skip_mean, ahead, scaled, start)
     for b in range(BLOCK):
-        _costs(state, b, horizon - 1, lane_base(base, at + b), skip_mean, ahead, scaled, start, task, True)
+        _costs(state, b, horizon - 1, lane_base(base, at + b), skip_mean, ahead, scaled, start, task, True, area)
     # One after the other: a loop that wrote to all at once would not be vectorised.
     if skip_mean is None:
         _end(costs, at, state, OWN, slides, start, integration.step_s, task)
