@@ -59,7 +59,9 @@ class Surroundings:
         self.area = Area(
             aligned_zeros(MOST_SHAPES * COLUMNS),
             np.zeros(1, np.int64),
-            np.array([0.5 * footprint.length, 0.5 * footprint.width, footprint.ahead, 0.0, step_s], np.float32),
+            np.array(
+                [0.5 * footprint.length, 0.5 * footprint.width, footprint.ahead, 0.0, step_s, 0.0, 0.0], np.float32
+            ),
             np.zeros(DETOURS * DETOUR_COLUMNS, np.float32),
             np.zeros(MOST_SHAPES),
         )
@@ -97,7 +99,9 @@ class Surroundings:
         `speed_m_s`: the fastest that the plan may go.
         """
         time_s = self._horizon * float(self.area.body[4])
-        reach_m = speed_m_s * time_s + self._footprint.reach_m + float(self.area.body[3])
+        near_m = self._footprint.reach_m + float(self.area.body[3])
+        self.area.body[5:] = speed_m_s, near_m
+        reach_m = speed_m_s * time_s + near_m
         arguments = self.area, self._table, x_m, y_m, *origin_m, reach_m, time_s
         if self._place is None:
             self._place = compiled_for(place_shapes, *arguments)

@@ -9,13 +9,14 @@ comes nearer than half the way, which is kept in addition.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.control.kernel import Floats, U
-from disco_hw.jit import kernel_function, scalar_function
+from disco_hw.jit import kernel_function, scalar_function, specialise
 from disco_hw.tasks import constant, norm_and_inverse
 
 COLUMNS = 8
@@ -35,14 +36,15 @@ half the detour's length (1/m), how far to the left it leads (m), and how far as
 class Area(NamedTuple):
     """What rollouts keep away from.
 
-    `shapes` (MOST_SHAPES * COLUMNS,); `count` (1,) of them are there. `body` (5,): half the footprint's length and
-    width, how far its centre lies ahead of the tracked point, the distance to keep (m), and the length of a step (s).
+    `shapes` (MOST_SHAPES * COLUMNS,); `number` (1,) of them are there. `body` (7,): half the footprint's length and
+    width, how far its centre lies ahead of the tracked point, the distance to keep (m), the length of a step (s), the
+    fastest that a plan goes (m/s), and the reach of the footprint with the distance to keep (m).
     `detours` (DETOURS * DETOUR_COLUMNS,): around obstacles on the task's line.
     `away` (MOST_SHAPES,): how far each shape is from where the plan begins (m).
     """
 
     shapes: Floats
-    count: NDArray[np.int64]
+    number: NDArray[np.int64]
     body: Floats
     detours: Floats
     away: NDArray[np.float64]
@@ -82,32 +84,53 @@ def place_shapes(
         for k in range(count):
             if area.away[k] > farthest:
                 farthest, farthest_at = area.away[k], k
-    area.count[0] = count
+    area.number[0] = count
+
+
+Bend: TypeAlias = tuple[float, float, float, float, float, float, float]
+Bends: TypeAlias = tuple[Bend, Bend] | None
+"""The numbers of both detours, or None without an area: read once, as a loop over samples must not look for them."""
+
+
+def bends_of(area: Area | None) -> Bends:
+    """The detours of an area, None without one; compiled code only."""
+    raise TypeError(f"{type(area).__name__} is no area")
+
+
+def _read_bends(area: Area) -> Bends:
+    at = area.detours
+    return (
+        (at[U(0)], at[U(1)], at[U(2)], at[U(3)], at[U(4)], at[U(5)], at[U(6)]),
+        (at[U(7)], at[U(8)], at[U(9)], at[U(10)], at[U(11)], at[U(12)], at[U(13)]),
+    )
+
+
+@specialise(bends_of)
+def _bends_of(area: Any) -> Callable[[Any], Bends]:
+    return _read_bends if hasattr(area, "instance_class") else (lambda area: None)
 
 
 @scalar_function
-def detoured(
-    area: Area | None, place: tuple[float, float, float]
-) -> tuple[float, float, float]:  # fmt: skip
+def detoured(bends: Bends, place: tuple[float, float, float]) -> tuple[float, float, float]:
     """Where the task is to see a robot: on the line while it drives around an obstacle as it should; compiled only."""
-    if area is None:
+    if bends is None:
         return place
     x, y, forward = place
-    moved_x, moved_y = _shifted(area.detours, 0, x, y)
-    more_x, more_y = _shifted(area.detours, DETOUR_COLUMNS, x, y)
-    return x + moved_x + more_x, y + moved_y + more_y, forward
+    moved_x, moved_y = _shifted(bends[0], x, y)
+    more_x, more_y = _shifted(bends[1], x, y)
+    return x + (moved_x + more_x), y + (moved_y + more_y), forward
 
 
 @scalar_function
-def _shifted(detours: Floats, at: int, x: float, y: float) -> tuple[float, float]:
+def _shifted(bend: Bend, x: float, y: float) -> tuple[float, float]:
     """How far one detour moves a position: most in its middle, smoothly to nothing at both ends."""
-    row = U(at)
-    off_x, off_y = x - detours[row], y - detours[row + U(1)]
-    along_x, along_y = detours[row + U(2)], detours[row + U(3)]
-    along = (off_x * along_x + off_y * along_y) * detours[row + U(4)]
+    middle_x, middle_y, along_x, along_y, per_half, left_m, aside_m = bend
+    off_x, off_y = x - middle_x, y - middle_y
+    along = (off_x * along_x + off_y * along_y) * per_half
     aside = abs(off_y * along_x - off_x * along_y)
     part = max(constant(1.0, x) - along * along, constant(0.0, x))
-    left = detours[row + U(5)] * part * part if aside < detours[row + U(6)] else constant(0.0, x)
+    part = part if aside < aside_m else constant(0.0, x)
+    left = left_m * part * part
     return left * along_y, -left * along_x
 
 

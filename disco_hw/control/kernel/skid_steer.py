@@ -51,7 +51,7 @@ from disco_hw.control.kernel import (
     stage_cost,
     terminal_cost,
 )
-from disco_hw.control.kernel.avoid import LOOK_EVERY, Area, detoured, touch_cost
+from disco_hw.control.kernel.avoid import LOOK_EVERY, Area, Bends, bends_of, detoured, touch_cost
 from disco_hw.jit import bits_of_float, block_function, cast_like, float_from_bits, scalar_function, tune_loops
 from disco_hw.model.added_terms import count_means
 from disco_hw.model.coefficients import (
@@ -224,9 +224,9 @@ def _move(
 
 
 @scalar_function
-def _begin(state: Floats, own: int, b: int, start: Floats, task: Terms, area: Area | None) -> None:
+def _begin(state: Floats, own: int, b: int, start: Floats, task: Terms, bends: Bends) -> None:
     """Set the rows from `own` on to the start."""
-    x, y, _ = detoured(area, (start[0], start[1], start[0]))
+    x, y, _ = detoured(bends, (start[0], start[1], start[0]))
     state[own + X + b] = x
     state[own + Y + b] = y
     state[own + MEMORY + b] = start[7]
@@ -349,19 +349,19 @@ def _follows(
     scaled: BasePair,
     start: Floats,
     task: Terms,
-    area: Area | None,
+    bends: Bends,
 ) -> None:
     """Move the memories of a point and its equivalent points on; nothing without a table."""
     if looks is None:
         return
     if skip_mean is None:
-        _follow(looks, state, OWN, b, detoured(area, _place(state, b, base)), task)
+        _follow(looks, state, OWN, b, detoured(bends, _place(state, b, base)), task)
     if ahead is not None:
-        _follow(looks, state, AHEAD0, b, detoured(area, _ahead_place(state, b, base, ahead[0], start)), task)
-        _follow(looks, state, AHEAD1, b, detoured(area, _ahead_place(state, b, base, ahead[1], start)), task)
+        _follow(looks, state, AHEAD0, b, detoured(bends, _ahead_place(state, b, base, ahead[0], start)), task)
+        _follow(looks, state, AHEAD1, b, detoured(bends, _ahead_place(state, b, base, ahead[1], start)), task)
     if scaled is not None:
-        _follow(looks, state, SCALED0, b, detoured(area, _scaled_place(state, b, base, scaled[0], start)), task)
-        _follow(looks, state, SCALED1, b, detoured(area, _scaled_place(state, b, base, scaled[1], start)), task)
+        _follow(looks, state, SCALED0, b, detoured(bends, _scaled_place(state, b, base, scaled[0], start)), task)
+        _follow(looks, state, SCALED1, b, detoured(bends, _scaled_place(state, b, base, scaled[1], start)), task)
 
 
 @scalar_function
@@ -376,17 +376,17 @@ def _costs(
     start: Floats,
     task: Terms,
     last: Absent,
-    area: Area | None,
+    bends: Bends,
 ) -> None:
     """Costs of step t under a point and its equivalent points, pairs or None."""
     if skip_mean is None:
-        _cost(state, OWN, b, t, detoured(area, _place(state, b, base)), task, last)
+        _cost(state, OWN, b, t, detoured(bends, _place(state, b, base)), task, last)
     if ahead is not None:
-        _cost(state, AHEAD0, b, t, detoured(area, _ahead_place(state, b, base, ahead[0], start)), task, last)
-        _cost(state, AHEAD1, b, t, detoured(area, _ahead_place(state, b, base, ahead[1], start)), task, last)
+        _cost(state, AHEAD0, b, t, detoured(bends, _ahead_place(state, b, base, ahead[0], start)), task, last)
+        _cost(state, AHEAD1, b, t, detoured(bends, _ahead_place(state, b, base, ahead[1], start)), task, last)
     if scaled is not None:
-        _cost(state, SCALED0, b, t, detoured(area, _scaled_place(state, b, base, scaled[0], start)), task, last)
-        _cost(state, SCALED1, b, t, detoured(area, _scaled_place(state, b, base, scaled[1], start)), task, last)
+        _cost(state, SCALED0, b, t, detoured(bends, _scaled_place(state, b, base, scaled[0], start)), task, last)
+        _cost(state, SCALED1, b, t, detoured(bends, _scaled_place(state, b, base, scaled[1], start)), task, last)
 
 
 @scalar_function
@@ -398,7 +398,10 @@ def _avoid(
     if area is None:
         return
     time_s = cast_like(t + 1, start[0]) * area.body[4]
-    for k in range(area.count[0]):
+    reach_m = area.body[6] + area.body[5] * time_s
+    for k in range(area.number[0]):
+        if area.away[k] > reach_m:
+            continue
         if skip_mean is None:
             for b in range(BLOCK):
                 place = _place(state, b, lane_base(base, at + b))
@@ -463,17 +466,18 @@ def _roll(
     which saves a sixth of the time.
     """
     tune_loops()
+    bends = bends_of(area)
     x, y, cos_yaw, sin_yaw = start[0], start[1], start[2], start[3]
     for b in range(BLOCK):
         state[AXLE_X + b], state[AXLE_Y + b] = axle_of(x, y, cos_yaw, sin_yaw, lane_base(base, at + b))
         state[COS + b] = cos_yaw
         state[SIN + b] = sin_yaw
         if skip_mean is None:
-            _begin(state, OWN, b, start, task, area)
-        _begin(state, AHEAD0, b, start, task, area)
-        _begin(state, AHEAD1, b, start, task, area)
-        _begin(state, SCALED0, b, start, task, area)
-        _begin(state, SCALED1, b, start, task, area)
+            _begin(state, OWN, b, start, task, bends)
+        _begin(state, AHEAD0, b, start, task, bends)
+        _begin(state, AHEAD1, b, start, task, bends)
+        _begin(state, SCALED0, b, start, task, bends)
+        _begin(state, SCALED1, b, start, task, bends)
     _begin_means(means, state, BODY_REMEMBERED, point, U(count_means(effects.command_terms)), effects.body_terms)
     _look_ups(looks_up(task), state, skip_mean, ahead, scaled, task)
     for t in range(horizon):
@@ -485,21 +489,21 @@ def _roll(
                     state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting,
                     integration, slides, start,
                 )  # fmt: skip
-                _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task, area)
+                _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task, bends)
         else:
             for b in range(BLOCK):
                 here, acting = lane_base(base, at + b), lane_effects(effects, at + b)
-                _costs(state, b, t - 1, here, skip_mean, ahead, scaled, start, task, None, area)
+                _costs(state, b, t - 1, here, skip_mean, ahead, scaled, start, task, None, bends)
                 _move(
                     state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting,
                     integration, slides, start,
                 )  # fmt: skip
-                _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task, area)
+                _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task, bends)
         _look_ups(looks_up(task), state, skip_mean, ahead, scaled, task)
         if t % LOOK_EVERY == LOOK_EVERY - 1:
             _avoid(area, state, at, t, base, skip_mean, ahead, scaled, start)
     for b in range(BLOCK):
-        _costs(state, b, horizon - 1, lane_base(base, at + b), skip_mean, ahead, scaled, start, task, True, area)
+        _costs(state, b, horizon - 1, lane_base(base, at + b), skip_mean, ahead, scaled, start, task, True, bends)
     # One after the other: a loop that wrote to all at once would not be vectorised.
     if skip_mean is None:
         _end(costs, at, state, OWN, slides, start, integration.step_s, task)
