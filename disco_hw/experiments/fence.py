@@ -17,15 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 import disco_hw
+from disco_hw.config.robot import prior_around
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.fence import Circle, Fence, Footprint
-from disco_hw.fence.clearance import Boundaries
+from disco_hw.fence.clearance import Boundaries, MovingCircle
 from disco_hw.fence.outlines import fence_outlines
 from disco_hw.fence.task_line import task_breach
+from disco_hw.model import Model
 from disco_hw.reports import write_pictures
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.core import CoreTick, PilotTick
 from disco_hw.runtime.fence_guard import FenceVerdict
+from disco_hw.runtime.obstacles import ObstacleReport
 from disco_hw.runtime.pipeline import Manual, NoPlanner, Planner
 from disco_hw.runtime.robot_setup import Setup, load_setup
 from disco_hw.runtime.supervisor import UserRequest
@@ -207,18 +210,74 @@ def wall_drive(setup: Setup, plant: PlantParameters, rng: np.random.Generator) -
 
 
 def task_drive(
-    setup: Setup, plant: PlantParameters, planner: Planner, seconds: float, seed: int, guarded: bool = True
+    setup: Setup,
+    plant: PlantParameters,
+    planner: Planner,
+    seconds: float,
+    seed: int,
+    guarded: bool = True,
+    pillar: ObstacleReport | None = None,
 ) -> FencedDrive:
     """The task, from its start; without `guarded` the guard is off, and the planner alone keeps to the fence."""
     start = BodyPose(*setup.config.task.course().start)
     run = SimulatedRun(setup, virtual_robot(setup, plant, start, seed=seed), planner)
+    area, fence = run.core.area, setup.config.fence
+    assert area is not None
+    if pillar is not None:
+        area.report(0, pillar)
+        fence = msgspec.structs.replace(
+            fence, keep_out=(*fence.keep_out, Circle((pillar.x_m, pillar.y_m), pillar.radius_m))
+        )
     if not guarded:
-        assert run.core.area is not None
-        run.core.area.guard.set_boundaries(Boundaries(FOOTPRINT, Fence()), 0.0)
+        area.guard.ignore_all()
     _begin(run)
-    return _drive(
-        run, Boundaries(FOOTPRINT, setup.config.fence), setup.config.fence, run.ticks(seconds), lambda t_s, tick: None
-    )
+    return _drive(run, Boundaries(FOOTPRINT, fence), fence, run.ticks(seconds), lambda t_s, tick: None)
+
+
+def _pillar_on(task: CircleTask, fence: Fence, rng: np.random.Generator) -> ObstacleReport | None:
+    """A pillar on the circle's line, ahead of the start, that leaves room on one side; None if there is none."""
+    for _ in range(20):
+        angle, radius_m = float(rng.uniform(1.2, 5.0)), float(rng.uniform(0.05, 0.15))
+        x_m = task.center_x_m + task.radius_m * math.cos(angle)
+        y_m = task.center_y_m + task.radius_m * math.sin(angle)
+        around = Boundaries(FOOTPRINT, fence, [MovingCircle(x_m, y_m, radius_m)])
+        beside = radius_m + 0.5 * FOOTPRINT.width + 0.2
+        poses = [
+            (x_m + side * beside * math.cos(angle), y_m + side * beside * math.sin(angle), angle + 0.5 * math.pi)
+            for side in (-1.0, 1.0)
+        ]
+        if around.clearance_m(np.array(poses)).max() > 0.1:
+            return ObstacleReport(name="pillar", x_m=x_m, y_m=y_m, radius_m=radius_m, age_limit_s=1000.0)
+    return None
+
+
+CONTENDERS = {
+    "point model": ("point", "off", False),
+    "sigma points, prior": ("ut", "off", True),
+    "sigma points, model file": ("ut", "off", False),
+    "sigma points, adapted": ("ut", "fast", True),
+}
+"""Planners without the guard: uncertainty, adaptation, and whether the model is the prior around robot.toml's robot."""
+
+
+def unguarded_drive(name: str, rng: np.random.Generator, off: float, seconds: float) -> FencedDrive:
+    """A circle with a pillar on it, by one of the CONTENDERS alone; the same rooms and robots for all."""
+    while True:
+        fence, task = random_task_room(rng)
+        pillar = _pillar_on(task, fence, rng)
+        if pillar is not None:
+            break
+    uncertainty, adaptation, by_prior = CONTENDERS[name]
+    setup = fenced_setup(fence, task)
+    control = msgspec.structs.replace(setup.config.control, uncertainty=uncertainty, adaptation=adaptation)
+    setup = replace(setup, config=msgspec.structs.replace(setup.config, control=control))
+    if by_prior:
+        robot = msgspec.structs.replace(setup.config.robot, axial_distance_m=0.415, x_icr_m=0.238, wheel_radius_m=0.061)
+        config = msgspec.structs.replace(setup.config, robot=robot, prior=prior_around(robot))
+        setup = replace(setup, config=config, model=Model.nominal(robot, config.prior))
+    planner = make_planner(setup.config, setup.model)
+    plant = untold_plant(rng, off)
+    return task_drive(setup, plant, planner, seconds, int(rng.integers(1 << 30)), guarded=False, pillar=pillar)
 
 
 def _begin(run: SimulatedRun) -> None:
@@ -336,4 +395,11 @@ def run_fence(options: FenceOptions, progress: Progress) -> FenceResult:
         lambda rng: along_drive(rng, options.off, options.seconds),
     )
     gather("task in a random room", options.rooms, task)
+    for number, name in enumerate(CONTENDERS):
+        alone = [
+            unguarded_drive(name, np.random.default_rng([options.seed, 99, k]), options.off, 2.0 * options.seconds)
+            for k in range(max(1, options.rooms // 4))
+        ]
+        drives[f"guard off: {name}"] = alone
+        progress(f"guard off, {number + 1} of {len(CONTENDERS)}: {sum(one.least_m < 0.0 for one in alone)} breaches")
     return FenceResult(options, drives)
