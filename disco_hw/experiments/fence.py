@@ -31,6 +31,7 @@ from disco_hw.runtime.fence_guard import FenceVerdict
 from disco_hw.runtime.obstacles import ObstacleReport
 from disco_hw.runtime.pipeline import Manual, NoPlanner, Planner
 from disco_hw.runtime.robot_setup import Setup, load_setup
+from disco_hw.runtime.safe_area import SafeArea
 from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.tasks import RobotTask
 from disco_hw.tasks.circle import CircleTask
@@ -100,6 +101,15 @@ class _Hand:
     def status(self) -> dict[str, Any]:
         """Nothing is added."""
         return {}
+
+
+class _Overridden(SafeArea):
+    """Fence and obstacles of a robot whose planner knows them and whose guard is overridden throughout."""
+
+    def begin(self, now_ns: int, by_hand: bool) -> bool:
+        """As of the base class, and overridden."""
+        super().begin(now_ns, by_hand)
+        return True
 
 
 def fenced_setup(fence: Fence, task: RobotTask | None = None, base: Setup | None = None) -> Setup:
@@ -223,13 +233,13 @@ def task_drive(
     run = SimulatedRun(setup, virtual_robot(setup, plant, start, seed=seed), planner)
     area, fence = run.core.area, setup.config.fence
     assert area is not None
+    if not guarded:
+        area = run.core.area = _Overridden(area.guard, fence, FOOTPRINT)
     if pillar is not None:
         area.report(0, pillar)
         fence = msgspec.structs.replace(
             fence, keep_out=(*fence.keep_out, Circle((pillar.x_m, pillar.y_m), pillar.radius_m))
         )
-    if not guarded:
-        area.guard.ignore_all()
     _begin(run)
     return _drive(run, Boundaries(FOOTPRINT, fence), fence, run.ticks(seconds), lambda t_s, tick: None)
 

@@ -98,7 +98,6 @@ class FenceGuard:
         self._obstacles: tuple[MovingCircle, ...] = ()
         self._lost: tuple[str, ...] = ()
         self._is_stopped = False
-        self._is_off = False
 
     @property
     def boundaries(self) -> Boundaries | None:
@@ -120,10 +119,6 @@ class FenceGuard:
         """Keep within another fence from the next step on."""
         boundaries.set_obstacles(self._obstacles)
         self._boundaries, self._margin_m = boundaries, margin_m
-
-    def ignore_all(self) -> None:
-        """Let every command through for good, for experiments on what a planner does alone."""
-        self._is_off = True
 
     def set_deceleration(self, deceleration_rad_s2: float) -> None:
         """Take the wheels to slow down so (rad/s^2), where the controller says less than robot.toml."""
@@ -151,7 +146,7 @@ class FenceGuard:
         `overridden`: a person has asked to move in spite of the fence; nothing is scaled then.
         """
         bounds = self._boundaries
-        if bounds is None or self._is_off or not self.is_active:
+        if bounds is None or not self.is_active:
             return IDLE
         if overridden:
             return FenceState(FenceVerdict.OVERRIDDEN, 1.0, math.nan, reason="moved by hand in spite of the fence")
