@@ -28,6 +28,9 @@ def demo(
     uncertainty: Annotated[str, typer.Option(help="ut, mc, joint or point.")] = "ut",
     view: View = False,
     adapt: Annotated[bool, typer.Option("--adapt", help="Learn the geometry on the way (docs/adapt.md).")] = False,
+    obstacle: Annotated[
+        bool, typer.Option("--obstacle", help="Put a pillar on the circle, and drive around it (docs/fence.md).")
+    ] = False,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page.")] = DEFAULT_PORT,
     as_json: AsJson = False,
 ) -> None:
@@ -44,6 +47,7 @@ def demo(
             uncertainty=uncertainty,
             view=view,
             adapt=adapt,
+            obstacle=obstacle,
             port=port,
             show_progress=not as_json,
         )

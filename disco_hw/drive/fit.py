@@ -62,9 +62,10 @@ def fit_script(
         if not remaining:
             yield Script(script.name, tuple(chosen))
             return
+    slowest = f"at {SCALES[-1]:.0%} of its speed either"
     raise ScriptDoesNotFit(
-        f"script {script.name} does not fit into the fence from here, at {SCALES[-1]:.0%} of its speed either; as it is "
-        f"it needs {room.in_words()}. Make room, or put the robot in the middle"
+        f"script {script.name} does not fit into the fence from here, {slowest}; as it is it needs {room.in_words()}. "
+        "Make room, or put the robot in the middle"
     )
 
 

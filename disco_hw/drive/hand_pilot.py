@@ -127,9 +127,8 @@ class HandPilot:
     def step(self, now_ns: int, last: CoreTick | None) -> PilotTick:
         """Poll the source once and judge what it says."""
         state = State.DISCONNECTED if last is None else last.output.state
-        newest = self._source.poll(
-            now_ns, RobotView(state, self._driving, _measured(last), _pose(last), _is_held(last))
-        )
+        view = RobotView(state, self._driving, _measured(last), _pose(last), _is_held(last))
+        newest = self._source.poll(now_ns, view)
         verdict = self._deadman.step(now_ns, newest, state)
         if self._source.ended is not None:
             self._told.append(self._source.ended)
