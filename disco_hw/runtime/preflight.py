@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from disco_hw.config import Control, Link, Robot
+from disco_hw.fence import Fence
 from disco_hw.tasks import RobotTask
 from drivers.motor import find_driver
 from drivers.types import SAID_BY_WORDS, CyclicFrame, Limits, SafetyCard
@@ -118,6 +119,17 @@ def check_task(robot: Robot, task: RobotTask) -> Check:
     if refusal is not None:
         return Check("task", Level.FAIL, f"task.speed_m_s: {refusal}")
     return Check("task", Level.OK, f"{task.in_words()}; the wheels can do {task.fastest_m_s(robot):.2f} m/s on it")
+
+
+def check_fence(robot: Robot, fence: Fence) -> list[Check]:
+    """Say what the fence holds, and where the footprint is only guessed; nothing without a fence."""
+    if not fence.is_set:
+        return []
+    size = robot.footprint
+    found = f"footprint {size.length:.2f} m x {size.width:.2f} m, {size.ahead:+.2f} m ahead of the tracked point"
+    if robot.footprint_m is None:
+        return [Check("fence", Level.WARNING, f"{found}, guessed from the wheels; measure it: robot.footprint_m")]
+    return [Check("fence", Level.OK, found)]
 
 
 def check_command_timing(control: Control, limits: Limits) -> Check:
