@@ -1,7 +1,7 @@
 """`make test` in fresh clones of HEAD, one after the other, each with the conditions that it ran under.
 
-`python -m tools.clones 10 --busy 5` is ten, the last five beside four busy processes (`--processes`). It exits with 1 if
-one failed or took longer than `--most` seconds; those beside busy processes may take `--more` seconds longer.
+`python -m tools.clones 10 --busy 5` is ten, the last five beside four busy processes (`--processes`). It exits with 1
+if one failed or took longer than `--most` seconds; those beside busy processes may take `--more` seconds longer.
 `--dry` only clones, and prints what would be done.
 """
 
@@ -83,9 +83,7 @@ def main() -> int:
     parser.add_argument("--busy", type=int, default=0, metavar="N", help="run the last N beside busy processes")
     parser.add_argument("--processes", type=int, default=4, metavar="N", help="how many busy processes")
     parser.add_argument("--most", type=float, default=math.inf, metavar="S", help="seconds that one may take")
-    parser.add_argument(
-        "--more", type=float, default=0.0, metavar="S", help="seconds more that one may take beside busy processes"
-    )
+    parser.add_argument("--more", type=float, default=0.0, metavar="S", help="seconds more beside busy processes")
     parser.add_argument("--dry", action="store_true", help="clone, but only say what make would do")
     asked = parser.parse_args()
     command = ["make", "test", *(["-n"] if asked.dry else [])]
