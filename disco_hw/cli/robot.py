@@ -22,15 +22,21 @@ from disco_hw.cli.options import (
 )
 from disco_hw.config import check_named_files
 from disco_hw.errors import InputError
-from disco_hw.viewer import DEFAULT_PORT, LOOPBACK
+from disco_hw.viewer import DEFAULT_PORT, LOOPBACK, PageProcess
 
 PagePort = Annotated[int, typer.Option("--port", min=1, max=65535, help="Port of the page.")]
 
 
-def _page(view: bool, robot: Path, model: Path | None, port: int, link: str | None) -> AbstractContextManager[object]:
+def _page(
+    view: bool, robot: Path, model: Path | None, port: int, link: str | None
+) -> AbstractContextManager[PageProcess | None]:
     from disco_hw.viewer import page_beside
 
     return page_beside(robot, model, LOOPBACK, port, link) if view else nullcontext()
+
+
+def _no_news() -> tuple[str, ...]:
+    return ()
 
 
 def run(
@@ -56,9 +62,9 @@ def run(
     from disco_hw.daemon.run import DaemonOptions, run_daemon
     from disco_hw.drive.hand_pilot import task_pilot
 
-    with _page(view, robot, model, port, link):
+    with _page(view, robot, model, port, link) as page:
         options = DaemonOptions(robot, model, link, log_file, as_json, accept_missing_effects, adapt)
-        code = run_daemon(options, task_pilot)
+        code = run_daemon(options, task_pilot, page_news=_no_news if page is None else page.news)
     raise typer.Exit(code)
 
 
@@ -95,7 +101,7 @@ def drive(
     check_named_files(robot, model)
     from disco_hw.drive.drive_command import DriveOptions, run_drive
 
-    with _page(view or page, robot, model, port, link):
+    with _page(view or page, robot, model, port, link) as served:
         result = run_drive(
             DriveOptions(
                 robot=robot,
@@ -110,7 +116,8 @@ def drive(
                 seconds=seconds,
                 seed=seed,
                 as_json=as_json,
-            )
+            ),
+            _no_news if served is None else served.news,
         )
     print_result(result.as_dict(), as_json, result.as_text())
     if not result.completed:

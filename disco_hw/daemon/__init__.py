@@ -22,6 +22,7 @@ from typing import Any
 
 from disco_hw.config import RobotConfig, load_daemon_address
 from disco_hw.errors import InputError, WorkError
+from disco_hw.files import file_name_of
 from disco_hw.runtime import advice, by_command, status_headline
 from drivers.private_files import placed_by, user_name, why_not_private
 from drivers.types import SAID_BY_WORDS, SaidBy
@@ -41,7 +42,7 @@ def default_socket_path(name: str) -> Path:
     given the socket in another user's XDG_RUNTIME_DIR if there is one.
     """
     uid = os.geteuid()
-    file_name = re.sub(r"[^A-Za-z0-9_-]", "_", name) + ".sock"
+    file_name = f"{file_name_of(name)}.sock"
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     if runtime:
         directory = Path(runtime) / "disco-hw"
@@ -151,22 +152,24 @@ def send_request(path: Path, request: Mapping[str, Any], timeout_s: float = 2.0)
     not answer within `timeout_s`, or it hangs up.
     """
     deadline_s = time.monotonic() + timeout_s
-    try:
-        with connect(path, timeout_s) as connection:
-            connection.sendall(json.dumps(dict(request)).encode() + b"\n")
-            line = bytearray()
-            while not line.endswith(b"\n"):
-                connection.settimeout(max(1e-3, deadline_s - time.monotonic()))
-                data = connection.recv(65536)
-                if not data or len(line) > _MAX_REPLY_BYTES:
-                    raise WorkError(f"{path}: the daemon hung up without an answer; see its output")
-                line += data
-    except TimeoutError:
-        raise WorkError(f"{path}: no answer from the daemon within {timeout_s:g} s; see its output") from None
-    except (FileNotFoundError, ConnectionRefusedError):
-        raise WorkError(f"{path}: no daemon listens there; start it with `disco-hw run`") from None
-    except OSError as error:
-        raise WorkError(f"{path}: the daemon cannot be asked ({error.strerror or error}); be its user") from None
+    with errors_in_one_line(path, timeout_s), connect(path, timeout_s) as connection:
+        return exchange(connection, path, request, deadline_s)
+
+
+def exchange(connection: socket.socket, path: Path, request: Mapping[str, Any], deadline_s: float) -> dict[str, Any]:
+    """Send one request on an open connection to the daemon at `path` and return the reply.
+
+    Raises OSError (TimeoutError after `deadline_s`), HungUpError, or WorkError for a reply that is none.
+    """
+    connection.settimeout(max(1e-3, deadline_s - time.monotonic()))
+    connection.sendall(json.dumps(dict(request)).encode() + b"\n")
+    line = bytearray()
+    while not line.endswith(b"\n"):
+        connection.settimeout(max(1e-3, deadline_s - time.monotonic()))
+        data = connection.recv(65536)
+        if not data or len(line) > _MAX_REPLY_BYTES:
+            raise HungUpError(f"{path}: the daemon hung up without an answer; see its output")
+        line += data
     try:
         reply = json.loads(line)
     except ValueError:
@@ -174,6 +177,23 @@ def send_request(path: Path, request: Mapping[str, Any], timeout_s: float = 2.0)
     if not isinstance(reply, dict):
         raise WorkError(f"{path}: what listens there is not a disco-hw daemon")
     return reply
+
+
+class HungUpError(WorkError):
+    """The daemon closed the connection before it answered."""
+
+
+@contextlib.contextmanager
+def errors_in_one_line(path: Path, timeout_s: float) -> Iterator[None]:
+    """Turn the errors of a connection to the daemon at `path` into a WorkError with the remedy."""
+    try:
+        yield
+    except TimeoutError:
+        raise WorkError(f"{path}: no answer from the daemon within {timeout_s:g} s; see its output") from None
+    except (FileNotFoundError, ConnectionRefusedError):
+        raise WorkError(f"{path}: no daemon listens there; start it with `disco-hw run`") from None
+    except OSError as error:
+        raise WorkError(f"{path}: the daemon cannot be asked ({error.strerror or error}); be its user") from None
 
 
 ADAPT_ACTIONS = ("revert", "adapt")

@@ -328,7 +328,7 @@ def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> d
         "driver": asdict(core.driver.stats),
         "fusion": asdict(core.pipeline.fusion.stats),
         "poses": _poses(core),
-        "plausibility": asdict(core.plausibility.stats),
+        "plausibility": asdict(core.plausibility),
         "recorder": asdict(recorder),
         "adaptation": core.adaptation.status(),
     }
@@ -339,8 +339,8 @@ def _poses(core: DaemonCore) -> list[dict[str, Any]]:
     tick, sources = core.last, core.pipeline.fusion.sources
     found = sources.status(0 if tick is None else tick.pipeline.t_ns)
     return [
-        {**one, "origin": list(named.origin), "offset": list(named.offset)}
-        for one, named in zip(found, core.config.pose.every(), strict=True)
+        {**one, "heading": heading.value, "origin": list(named.origin), "offset": list(named.offset)}
+        for one, heading, named in zip(found, core.pipeline.headings.held, core.config.pose.every(), strict=True)
     ]
 
 
@@ -365,7 +365,7 @@ def counters(
         transport=asdict(core.transport.stats),
         driver=asdict(core.driver.stats),
         fusion=asdict(core.pipeline.fusion.stats),
-        plausibility=asdict(core.plausibility.stats),
+        plausibility=asdict(core.plausibility),
         recorder={name: value for name, value in asdict(recorder).items() if type(value) is int},
         loop={"ticks": loop.ticks, "overruns": loop.overruns, "skipped": loop.skipped_periods, "stolen_ms": stolen_ms},
         adaptation=core.adaptation.counts(),

@@ -43,8 +43,10 @@ class Daemon:
         say: Say,
         pilot: Pilot,
         ask: Ask | None = None,
+        page_news: Callable[[], tuple[str, ...]] = lambda: (),
     ) -> None:
         self._ask = ask
+        self._page_news = page_news
         self._waiting = Waiting()
         self._core = core
         self._server = server
@@ -182,7 +184,7 @@ class Daemon:
         return (records_of_tick.fan(now_ns, rollouts),)
 
     def _mind_recorder(self, now_ns: int) -> tuple[records.Record, ...]:
-        """Look after the recorder ten times a second; what happens to it goes to the terminal, the log and the page."""
+        """Look after the recorder ten times a second; what happens to it and to the page becomes events."""
         if now_ns < self._next_recorder_ns:
             return ()
         self._next_recorder_ns = now_ns + _RECORDER_NS
@@ -194,7 +196,9 @@ class Daemon:
         news = self._recorder.news()
         for sentence in news:
             self._say("recording", sentence)
-        return tuple(records.Event(now_ns, "warning", "recording", sentence) for sentence in news)
+        # What becomes of the page is on standard error already.
+        coded = [*(("recording", sentence) for sentence in news), *(("page", text) for text in self._page_news())]
+        return tuple(records.Event(now_ns, "warning", code, sentence) for code, sentence in coded)
 
     def _every_second(self, now_ns: int) -> tuple[records.Record, ...]:
         if now_ns < self._next_second_ns:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -94,13 +94,16 @@ class EstopOutcome:
         return "\n".join(lines)
 
 
-def stop_robot(robot: Path, link: str | None = None) -> EstopOutcome:
+def stop_robot(robot: Path, link: str | None = None, kept: Mapping[str, Any] | None = None) -> EstopOutcome:
     """Send the e-stop on the link and through the daemon, and wait half a second for the robot to confirm.
 
-    `link` is what the option --link says. Raises InputError only when neither it nor the file says where the link is,
+    `link` is what the option --link says; `kept`, what `read_robot_toml` read of the file before, is used where it
+    cannot be read now. Raises InputError only when neither it nor the file says where the link is,
     and no daemon takes the stop either.
     """
     raw, file_error = _read(robot)
+    if file_error is not None and kept:
+        raw, file_error = dict(kept), None
     socket_path = _socket_path(raw)
     refused = passed_over(socket_path) if socket_path is not None else ()
     try:
@@ -126,6 +129,11 @@ def stop_robot(robot: Path, link: str | None = None) -> EstopOutcome:
         confirmed, link_error = _attempt(partial(way, settings, frames, heard))
         daemon_confirmed, daemon_error = _ask_daemon(socket_path)
     return replace(outcome, link_error=link_error, daemon_error=daemon_error, confirmed=confirmed or daemon_confirmed)
+
+
+def read_robot_toml(robot: Path) -> Mapping[str, Any]:
+    """What robot.toml says now, to be kept for `stop_robot`; empty if it cannot be read."""
+    return _read(robot)[0]
 
 
 def _attempt(way: Callable[[], bool]) -> tuple[bool, str | None]:

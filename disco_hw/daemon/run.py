@@ -34,7 +34,8 @@ from disco_hw.daemon.daemon import Daemon, Say
 from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path, tick_feed_path
 from disco_hw.daemon.process import STANDARD_OUTPUT, AsyncPrinter, StopPath, StopSignals
-from disco_hw.errors import InputError
+from disco_hw.errors import InputError, LogError
+from disco_hw.files import file_name_of
 from disco_hw.log import DBC, Attachment, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, RecordingSettings
 from disco_hw.processes import end_with_parent
@@ -96,10 +97,12 @@ def run_daemon(
     options: DaemonOptions,
     make_pilot: Callable[[RobotConfig], Pilot] = lambda _config: TaskPilot(),
     law: Law | None = None,
+    page_news: Callable[[], tuple[str, ...]] = lambda: (),
 ) -> int:
     """Run until SIGTERM, SIGINT or a quit request; returns the exit code, after a stop was sent to the robot.
 
-    `make_pilot`: of who drives; the task alone, unless it is said. `law`: plans in DISCO's place.
+    `make_pilot`: of who drives; the task alone, unless it is said. `law`: plans in DISCO's place. `page_news`: what
+    happened to the page, to be recorded.
     Raises InputError, before anything is opened, if a file or an option is wrong. An exception in the loop is reported,
     the robot stopped, and the exception passed on.
     """
@@ -120,6 +123,7 @@ def run_daemon(
             lambda: make_planner(setup.config, setup.model) if law is None else _controller(law, setup),
             adapt,
             by_command(options.robot),
+            page_news,
         )
 
 
@@ -135,6 +139,7 @@ def serve(
     new_planner: Callable[[], Planner] = NoPlanner,
     adapt: Adapt = "off",
     ask: Ask | None = None,
+    page_news: Callable[[], tuple[str, ...]] = lambda: (),
 ) -> int:
     """Run until SIGTERM, SIGINT, a quit request or the pilot's end, as `run_daemon`; returns the exit code.
 
@@ -150,12 +155,16 @@ def serve(
     stop = StopPath()
     with StopSignals() as signals:
         try:
-            return _start(setup, key, transport, pipeline, log_file, signals, stop, say, pilot, adapt, ask).run()
+            code = _start(
+                setup, key, transport, pipeline, log_file, signals, stop, say, pilot, adapt, ask, page_news
+            ).run()
         finally:
             # Whatever is interrupted here, the wheels come first: they were added last.
-            for outcome in stop.run():
+            outcomes = stop.run()
+            for outcome in outcomes:
                 if not outcome.ok:
                     say("stop", f"{outcome.name}: {outcome.error}")
+        return code or int(any(outcome.name == _RECORDER and not outcome.ok for outcome in outcomes))
 
 
 def _start(
@@ -170,6 +179,7 @@ def _start(
     pilot: Pilot,
     adapt: Adapt,
     ask: Ask | None,
+    page_news: Callable[[], tuple[str, ...]],
 ) -> Daemon:
     """Make everything, in the order that real time needs, and add to the stop path what must be undone."""
     config = setup.config
@@ -184,7 +194,7 @@ def _start(
     recorder = WatchedRecorder(_make_recorder(setup, log), feed, ticks)
     if ask is not None and log is not None:
         stop.add("log", lambda: say("log", f"look at it: disco-hw view {log}, or disco-hw log info {log}"))
-    stop.add("recorder", lambda: _close_recorder(recorder, say))
+    stop.add(_RECORDER, lambda: _close_recorder(recorder, say))
     adaptation = make_fast_adaptation(setup, pipeline) if adapt == "fast" else None
     for step in processes.enter_real_time(config.daemon.realtime_priority):
         say("real time", str(step))
@@ -198,7 +208,7 @@ def _start(
     stop.add("pose source", core.pose_source.close)
     if isinstance(pilot, FindsWiring):
         core.directions = None
-    daemon = Daemon(core, server, recorder, MonotonicClock(), signals, say, pilot, ask)
+    daemon = Daemon(core, server, recorder, MonotonicClock(), signals, say, pilot, ask, page_news)
     stop.add("wheels", daemon.stop_wheels)
     if config.daemon.realtime_priority:
         say("real time", str(processes.raise_loop_thread(config.daemon.realtime_priority)))
@@ -220,7 +230,7 @@ def _log_path(config: RobotConfig, log_file: Path | None) -> Path | None:
     if log_file is not None or not config.log.enabled:
         return log_file
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-    return Path(config.log.directory) / f"{config.robot.name}-{stamp}.mcap"
+    return Path(config.log.directory) / f"{file_name_of(config.robot.name)}-{stamp}.mcap"
 
 
 def _make_recorder(setup: Setup, log: Path | None) -> Recorder:
@@ -233,12 +243,18 @@ def _make_recorder(setup: Setup, log: Path | None) -> Recorder:
 
 
 def _close_recorder(recorder: Recorder, say: Say) -> None:
+    """End the log and report where its ticks are; raises LogError if some are in no file."""
     stats = recorder.close()
     for sentence in recorder.news():
         say("recording", sentence)
     if stats.path:
         # No fault: of those `drive` makes a drive that is not whole.
         say("log", recording_in_words(asdict(stats)))
+    if stats.waiting_ticks or stats.dropped_ticks:
+        raise LogError("the log is not whole; free space on its disk before the next drive")
+
+
+_RECORDER = "recorder"
 
 
 def in_text(topic: str, text: str) -> str:

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -25,6 +25,7 @@ from disco_hw.drive.script import Script, ScriptSource, Unattended, in_table, ro
 from disco_hw.drive.scripts import make_script
 from disco_hw.drive.terminal import HELP, Keyboard, KeyHold
 from disco_hw.errors import InputError, LogError
+from disco_hw.files import file_name_of
 from disco_hw.log.reader import open_log
 from disco_hw.runtime.robot_setup import load_setup
 from drivers.gamepad import Gamepad, GamepadError, GamepadMapping, open_gamepad
@@ -87,8 +88,8 @@ class DriveResult:
         return f"{self.ended}\n{self.coverage_words}\nlog {self.log}{lost}"
 
 
-def run_drive(options: DriveOptions) -> DriveResult:
-    """Drive by keyboard, gamepad or script until that ends, and record it.
+def run_drive(options: DriveOptions, page_news: Callable[[], tuple[str, ...]] = lambda: ()) -> DriveResult:
+    """Drive by keyboard, gamepad or script until that ends, and record it; `page_news` as for `run_daemon`.
 
     Runs the daemon's loop with its governor, supervisor and recorder; there is no planner, and no pose is needed.
     Raises InputError for wrong options, files and devices.
@@ -113,7 +114,7 @@ def run_drive(options: DriveOptions) -> DriveResult:
                     said.append(text)
                 say(topic, text)
 
-            serve(setup, log_file, report, HandPilot(source, coverage, page))
+            serve(setup, log_file, report, HandPilot(source, coverage, page), page_news=page_news)
     finally:
         source.close()
     # A writer that was slow for a second and then wrote all that had waited has lost nothing.
@@ -212,7 +213,7 @@ def _gamepad(config: RobotConfig, top_rad_s: float) -> GamepadSource:
 
 def _new_log(config: RobotConfig) -> Path:
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-    return Path(config.log.directory) / f"{config.robot.name}-drive-{stamp}.mcap"
+    return Path(config.log.directory) / f"{file_name_of(config.robot.name)}-drive-{stamp}.mcap"
 
 
 @contextmanager

@@ -55,6 +55,11 @@ CANDUMP = FileKind("a candump", 512 * _MIB, "give the path of a candump")
 LOG = FileKind("a log", 16 * _KIB * _MIB, "give the path of a log")
 
 
+def file_name_of(name: str) -> str:
+    """A robot's name as part of a file name: letters, digits, - and _ stay, so that it cannot leave its directory."""
+    return re.sub(r"[^A-Za-z0-9_-]", "_", name)
+
+
 def open_file(path: Path, kind: FileKind) -> int:
     """A descriptor of a plain file that is not too large; raises InputError for anything else."""
     try:

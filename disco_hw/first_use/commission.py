@@ -19,7 +19,7 @@ from disco_hw.daemon.process import STANDARD_ERROR, AsyncPrinter
 from disco_hw.daemon.run import in_text, serve
 from disco_hw.drive.terminal import Keyboard, KeyHold
 from disco_hw.errors import InputError, WorkError
-from disco_hw.files import ROBOT_TOML, read_bytes
+from disco_hw.files import ROBOT_TOML, file_name_of, read_bytes
 from disco_hw.first_use import in_toml, with_fields
 from disco_hw.first_use.judgement import Findings, judge_floor, judge_sides, judge_turns
 from disco_hw.first_use.procedure import CommissionPilot, Procedure, Steps, floor, sides, turns
@@ -200,7 +200,8 @@ def write_fields(
 def _drive(stage: GuidedStage, setup: Setup, options: CommissionOptions) -> Any:
     """One drive through the daemon; what its procedure returned. Raises WorkError if the person gave up."""
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-    log = _log_directory(options, setup) / f"{setup.config.robot.name}-commission-{stage.name}-{stamp}.mcap"
+    name = file_name_of(setup.config.robot.name)
+    log = _log_directory(options, setup) / f"{name}-commission-{stage.name}-{stamp}.mcap"
     keyboard = Keyboard(_STANDARD_INPUT, KeyHold(0.0), MonotonicClock())
     procedure = Procedure(stage.steps(setup.config.robot, slowest_rad_s(setup)))
     pilot = CommissionPilot(procedure, keyboard, keyboard.typed, lambda: keyboard.in_vain)

@@ -284,6 +284,8 @@ class Log:
             ticks += 1
             missing += lost
         duration_s = (last - first) * 1e-9
+        # A part that continues another holds ticks from before it was begun.
+        start_ns = min(self._metadata.start_ns, first) if ticks else self._metadata.start_ns
         ending = self._ending
         if ending is not None:
             missing += max(0, ending.sequence - (self._last_tick or self._metadata.continues_sequence or 0))
@@ -297,7 +299,7 @@ class Log:
             robot=self._metadata.robot,
             version=self._metadata.version,
             part=self._metadata.part,
-            start=_iso(self._metadata.start_ns + self._metadata.wall_offset_ns),
+            start=_iso(start_ns + self._metadata.wall_offset_ns),
             duration_s=duration_s,
             ticks=ticks,
             missing_ticks=missing,

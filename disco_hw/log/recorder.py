@@ -42,6 +42,7 @@ _START_PATIENCE_S = 15.0
 _CAUSE_S = 0.3
 _RETRY_S = (0.0, 1.0, 2.0, 5.0)
 _CLOSING_STEP_S = 0.02
+_CLOSING_RETRY_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,6 +201,8 @@ class ProcessRecorder:
         self._keeper = KeeperLink(start)
         self._line: WriterLine | None = None
         self._status = WriterStatus("recording", str(recording.path), 1)
+        # Of the newest file that holds something: a writer that fails before its first tick leaves no file.
+        self._kept_status = self._status
         self._await_first_writer()
 
     @property
@@ -268,11 +271,14 @@ class ProcessRecorder:
         if self._final is None:
             deadline_s = time.monotonic() + timeout_s
             self._end = msgspec.msgpack.encode(End(time.monotonic_ns(), self._sequence, self._delivery.dropped_ticks))
+            # There may be room again.
+            self._retry_s = 0.0
             while self._unfinished() and time.monotonic() < deadline_s:
                 self._exchange(self._recording.queue_ticks)
                 self._keeper.read()
                 self._look_after(time.monotonic())
                 self._wait(min(_CLOSING_STEP_S, max(0.0, deadline_s - time.monotonic())))
+            self._report_losses()
             self._final = self._stats()
             if self._line is not None:
                 self._line.close()
@@ -338,6 +344,7 @@ class ProcessRecorder:
             delivery.acknowledge(status.sequence)
             if status.sequence:
                 self._retries, self._patience_s = 0, _PATIENCE_S
+                self._kept_status = status
             if status.state != "failed" and status.error and status.error != refusal:
                 self._tell(f"a record was refused by the log writer: {status.error}")
 
@@ -382,15 +389,19 @@ class ProcessRecorder:
         self._refused += status.refused
         if status.deleted:
             self._delivery.file_deleted()
-        if line.heard and not (status.state == "failed" and not status.sequence):
+        if status.state == "failed" and not status.sequence:
+            self._status = self._kept_status
+        elif line.heard:
             self._next_part = status.part + 1
             self._continues = status.path
         self._delivery.new_file()
         if self._end is not None and status.state == "finished":
+            self._recovered()
             return
         self._deaths += 1
         self._fault = f"nothing is being recorded: {cause}"
-        self._retry_s = now_s + _RETRY_S[min(self._retries, len(_RETRY_S) - 1)]
+        pause_s = _RETRY_S[min(self._retries, len(_RETRY_S) - 1)]
+        self._retry_s = now_s + (pause_s if self._end is None else min(pause_s, _CLOSING_RETRY_S))
         self._retries += 1
         self._tell(cause)
         self._look_after(now_s)
@@ -407,10 +418,20 @@ class ProcessRecorder:
             self._tell(self._fault)
 
     def _recovered(self) -> None:
-        """The writer writes: say so if it did not, or was another one."""
-        if self._fault:
+        """Report that ticks are in a file again, if they were not; a file without a tick may still come to nothing."""
+        if self._fault and self._status.sequence:
             self._fault, self._frozen = "", False
             self._news.append(f"recording goes on in {self._status.path}")
+
+    def _report_losses(self) -> None:
+        """Report at the end how many ticks are in no file, and why."""
+        delivery = self._delivery
+        missing = delivery.waiting_ticks + delivery.dropped_ticks
+        if missing:
+            given = delivery.ticks + delivery.dropped_ticks
+            busy = "too many waited for a slow disk" if not delivery.waiting_ticks else "the log writer is still busy"
+            self._fault = f"{missing} of {given} ticks are in no log: {self._last_error or busy}"
+            self._news.append(self._fault)
 
     def _tell(self, sentence: str) -> None:
         """Report a failure, but not again while it only repeats itself."""

@@ -5,7 +5,8 @@ A belief is a joint Gaussian, a mixture of them, or a uniform box.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Protocol
@@ -230,6 +231,15 @@ def _check_range(name: str, parameter: Parameter, value: float) -> None:
         )
 
 
+def within_ranges(covariance: Array, parameters: Sequence[Parameter]) -> Array:
+    """Narrow a covariance (P, P) so that no standard deviation exceeds its parameter's range; correlations stay."""
+    std = np.sqrt(np.diag(covariance))
+    widths = np.array([parameter.high - parameter.low for parameter in parameters])
+    # A hair less than the range, which rounding must not exceed.
+    factor = np.minimum(1.0, (1.0 - 1e-9) * widths / std)
+    return np.asarray(covariance * np.outer(factor, factor))
+
+
 @dataclass(frozen=True)
 class Model:
     """The transition function's parameters and what is believed of them.
@@ -237,8 +247,8 @@ class Model:
     `base` and `effects` hold the point values; `belief` is a joint distribution over any of `parameter_names`, and
     parameters it does not name are known exactly. `missing_effects` names effects of the robot that the model is known
     to lack, so that its parameters may have absorbed them. Raises ValueError for repeated effects, values outside their
-    physical range, a belief over parameters that the model does not have or with a mean outside theirs, or a missing
-    effect that is unknown or there.
+    physical range, a belief over parameters that the model does not have, with a mean outside their range or wider than
+    it, or a missing effect that is unknown or there.
     """
 
     wheel_radius_m: float
@@ -270,8 +280,16 @@ class Model:
                     )
                 if self.belief.names.count(believed) > 1:
                     raise ValueError(f"belief names {believed!r} twice; keep one")
-            for believed, mean in zip(self.belief.names, self.belief.mean().tolist(), strict=True):
-                _check_range(f"belief: mean of {believed}", self.parameters[believed], mean)
+            variances = np.diag(self.belief.covariance()).tolist()
+            for believed, mean, variance in zip(self.belief.names, self.belief.mean().tolist(), variances, strict=True):
+                parameter = self.parameters[believed]
+                _check_range(f"belief: mean of {believed}", parameter, mean)
+                std, width, unit = math.sqrt(variance), parameter.high - parameter.low, parameter.unit
+                if not std <= width:
+                    raise ValueError(
+                        f"belief: standard deviation of {believed} is {std:.3g} {unit}, wider than its whole range of "
+                        f"{width:.4g} {unit}; write the model again with `disco-hw infer`"
+                    )
 
     @classmethod
     def nominal(cls, robot: config.Robot, prior: config.Prior | None = None) -> Model:

@@ -107,7 +107,7 @@ def spawn_at_normal_priority(command: list[str], pass_fds: Sequence[int] = ()) -
     return process
 
 
-_SWITCH_INTERVAL_S = 0.0005
+SWITCH_INTERVAL_S = 0.0005
 _MCL_CURRENT = 1
 _MCL_FUTURE = 2
 _CAP_IPC_LOCK = 14
@@ -190,8 +190,8 @@ def can_lock_memory() -> bool:
 
 
 def _set_switch_interval() -> Step:
-    sys.setswitchinterval(_SWITCH_INTERVAL_S)
-    return Step("interpreter", True, f"a thread gives way within {_SWITCH_INTERVAL_S * 1e3:g} ms")
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    return Step("interpreter", True, f"a thread gives way within {SWITCH_INTERVAL_S * 1e3:g} ms")
 
 
 def _freeze_garbage() -> Step:

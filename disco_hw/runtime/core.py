@@ -6,6 +6,7 @@ a pilot says: the task's planner, or somebody in its place.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -18,10 +19,13 @@ from disco_hw.log import records
 from disco_hw.log.recorder import Recorder
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.pipeline import FollowTask, Motion, Off, Pipeline, Source, Stand, Tick, untimed
-from disco_hw.runtime.plausibility import Directions, Headway, Plausibility
+from disco_hw.runtime.plausibility import Directions, Headway, Plausibility, PlausibilityStats
+from disco_hw.runtime.pose_jumps import PoseJumps
 from disco_hw.runtime.robot_setup import record_of
 from disco_hw.runtime.supervisor import Inputs, Output, Reply, Supervisor, UserRequest
+from disco_hw.runtime.wheel_faults import WheelFaults
 from disco_hw.tasks import RobotTask
+from drivers.motor import find_driver
 from drivers.pose.robot import RobotPoses
 from drivers.types import (
     Driver,
@@ -90,10 +94,11 @@ class DaemonCore:
         self.pipeline = pipeline
         self.recorder = recorder
         self.adaptation = adaptation or NoAdaptation()
-        self.plausibility = Plausibility()
+        self._plausibility = Plausibility()
+        self._wheel_faults = WheelFaults(find_driver(config.link.driver).takes_body_speeds)
         robot = config.robot
         self.directions: Directions | None = Directions(robot.wheel_radius_m, robot.axial_distance_m, config.wheels)
-        """None where somebody finds out how the wheels are wired."""
+        """None where somebody finds out how the wheels are wired, and looks at them: no fault of one stops it then."""
         self.task, self.course = config.task, config.task.course()
         self.progress = config.task.progress()
         self._headway = Headway(config.task.reference_speed_m_s)
@@ -104,6 +109,8 @@ class DaemonCore:
         """Why nothing is recorded although it should be, kept up to date by whoever looks after the recorder."""
         self.announce: Callable[[int, Sequence[WheelSample]], None] = unannounced
         """Hears the wheels of a tick before it is planned, for whoever cannot wait for its record; must not block."""
+        self._jumps = PoseJumps()
+        self._jump = ""
         self._supervisor = supervisor
         self._preflight = preflight
         self._preflight_errors: tuple[str, ...] = ()
@@ -117,6 +124,12 @@ class DaemonCore:
         self._said: tuple[str, bool, bool] | None = None
         self.entered: dict[str, int] = {}
         self._task_changed = False
+
+    @property
+    def plausibility(self) -> PlausibilityStats:
+        """A snapshot of what was counted of wheels, supply and poses."""
+        counted = self._plausibility.stats
+        return dataclasses.replace(counted, wheels_not_following=self._wheel_faults.not_following)
 
     def set_task(self, task: RobotTask) -> None:
         """Follow another task of the same kind from the next tick on, in which it is recorded."""
@@ -146,23 +159,29 @@ class DaemonCore:
         poses = self.pose_source.receive(now_ns, readings.poses)
         readings = msgspec.structs.replace(readings, poses=tuple(poses))
         self._remember(now_ns, readings)
+        believed = self.pipeline.screen(readings)
         if readings.wheels:
             self.announce(now_ns, readings.wheels)
+        self._watch_wheels(now_ns, believed)
         output = self._supervisor.step(now_ns, self._inputs(now_ns, requests, by_hand))
         mark("receive")
         learnt = self.adaptation.step(now_ns)
-        result = self.pipeline.step(now_ns, readings, _motion(output, motion), mark)
+        result = self.pipeline.step(now_ns, believed, _motion(output, motion), mark)
+        self._jump = self._jumps.step(result.estimate, result.pose_updates)
         command = self._command(output, result)
         sent = self._send(now_ns, output, command, silent=result.source is Source.SILENT)
         mark("send")
-        doubts = self.plausibility.step(now_ns, readings.wheels, readings.poses, readings.power, command)
-        miswired = None if self.directions is None else self.directions.step(now_ns, readings.wheels, poses, command)
-        # Stopped in the next tick, and not armed again before the daemon has read what was mended.
-        self._miswired = self._miswired if miswired is None else (miswired,)
-        source = self.pose_source
-        news = [*(source.news() if isinstance(source, SaysWhy) else ()), *self.pipeline.fusion.sources.news()]
-        said = [f"poses: {words}" for words in news]
-        events = (*readings.events, *said, *output.events, *learnt.events, *self._planner_events(result), *doubts)
+        doubts = self._plausibility.step(now_ns, readings.wheels, readings.poses, readings.power)
+        doubts = (*self._wheel_faults.events, *doubts)
+        self._watch_wiring(now_ns, believed, command)
+        events = (
+            *readings.events,
+            *self._pose_events(),
+            *output.events,
+            *learnt.events,
+            *self._planner_events(result),
+            *doubts,
+        )
         events = (*events, *self._stays(now_ns, output, result))
         self._follow_progress(output, result)
         self.recorder.put(
@@ -180,10 +199,32 @@ class DaemonCore:
                 *extra_records,
             ],
         )
-        self.adaptation.feed(now_ns, self._to_learn_from(readings))
+        self.adaptation.feed(now_ns, self._to_learn_from(believed))
         mark("record")
         self.last = CoreTick(output, result, command, events, readings)
         return self.last
+
+    def _watch_wheels(self, now_ns: int, readings: Readings) -> None:
+        """Stop a robot of which a wheel does not obey: by its driver, without torque, as a ramp would need encoders."""
+        geometry = self.pipeline.fusion.parameters
+        directions = self.directions
+        is_wiring_known = directions is not None and directions.is_judged
+        fault = self._wheel_faults.step(now_ns, readings.wheels, readings.poses, geometry, is_wiring_known)
+        if fault is not None and directions is not None and self.driver.state is DriverState.ARMED:
+            self.driver.release(fault.words)
+
+    def _watch_wiring(self, now_ns: int, readings: Readings, command: WheelCommand | None) -> None:
+        """Stop a robot that is wired otherwise than declared, until the daemon has read what was mended."""
+        wheels = self._wheel_faults
+        wheels.commanded(now_ns, command)
+        if self.directions is None:
+            return
+        miswired = self.directions.step(
+            now_ns, readings.wheels, readings.poses, command, wheels.has_followed, wheels.is_suspect
+        )
+        if miswired is not None:
+            self._miswired = (miswired,)
+            self.driver.release(miswired)
 
     def _follow_link(self, now_ns: int) -> None:
         """Notify the driver when the link comes and goes; a link renewed between two ticks is both."""
@@ -236,6 +277,7 @@ class DaemonCore:
             heading_missing=estimate is not None and estimate.initialised and not estimate.heading_known,
             by_hand=by_hand,
             poses_contradict=self.pipeline.fusion.sources.contradiction,
+            pose_jump=self._jump,
         )
 
     def _to_learn_from(self, readings: Readings) -> Readings:
@@ -262,6 +304,13 @@ class DaemonCore:
         if output.send_estop:
             outgoing = (*self.driver.estop(now_ns), *outgoing)
         return [records_of_tick.frame_out(now_ns, frame, self.transport.send(frame, now_ns)) for frame in outgoing]
+
+    def _pose_events(self) -> list[str]:
+        """What pose sources, their headings and the estimate have to say, each as an event."""
+        source, pipeline = self.pose_source, self.pipeline
+        news = [*(source.news() if isinstance(source, SaysWhy) else ()), *pipeline.headings.news()]
+        news += [*pipeline.fusion.sources.news(), *self._jumps.news()]
+        return [f"poses: {words}" for words in news]
 
     def _planner_events(self, result: Tick) -> tuple[str, ...]:
         """Say when the planner begins and ceases to fail, or to plan from too few samples, not in every tick."""
@@ -308,7 +357,7 @@ class DaemonCore:
         return [record_of(now_ns, self.task)] if changed else []
 
     def _follow_progress(self, output: Output, result: Tick) -> None:
-        if output.running:
+        if output.running and not self._jump:
             self.progress.add(result.t_ns, result.estimate.x_m, result.estimate.y_m, result.estimate.yaw_rad)
         else:
             self.progress.pause()

@@ -158,6 +158,7 @@ def check_safety(robot: Robot, card: SafetyCard) -> list[Check]:
         Check("stops when the host is silent", Level.OK, card.host_silent),
         Check("stops by", Level.OK if card.brakes else Level.WARNING, f"{card.stops_by}; {far}"),
         Check("e-stop", Level.OK, card.estop),
+        Check("a wheel does not obey", Level.OK, card.wheel_fault),
     ]
     checks += [Check("not verified", Level.WARNING, text) for text in card.unverified]
     return checks + [Check("to be set in the controller", Level.OK, text) for text in card.setup]

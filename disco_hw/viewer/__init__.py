@@ -6,9 +6,11 @@ Here the live page as a process of its own beside a daemon, where it is found, a
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,12 +19,102 @@ DEFAULT_PORT = 8080
 TOKEN_VARIABLE = "DISCO_HW_PAGE_TOKEN"
 _SHORTEST = 16
 _END_TIMEOUT_S = 3.0
+_RESTART_PAUSE_S = 1.0
+
+
+class PageProcess:
+    """The page's process beside a daemon: started again when a signal has ended it, and reported either way.
+
+    A thread waits for it. Make it before the process takes a real-time priority: the thread keeps the normal one, and
+    so does a page that it starts again.
+    """
+
+    def __init__(self, command: Sequence[str]) -> None:
+        self._command = list(command)
+        # The same token again, so that an open page connects to the next process.
+        self._environment = {**os.environ, TOKEN_VARIABLE: _token_or_given()}
+        self._lock = threading.Lock()
+        self._news: list[str] = []
+        self._ending = threading.Event()
+        self._process = self._start()
+        self._thread = threading.Thread(target=self._watch, name="page watch", daemon=True)
+        self._thread.start()
+
+    @property
+    def pid(self) -> int:
+        """The process id of the page that runs now, or ran last."""
+        return self._process.pid
+
+    @property
+    def returncode(self) -> int | None:
+        """How the page ended, negative for a signal; None while it runs."""
+        return self._process.returncode
+
+    def wait(self, timeout_s: float) -> int:
+        """Wait until the page ends for good and return how; raises TimeoutError."""
+        self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            raise TimeoutError(f"the page still runs after {timeout_s:g} s")
+        return self._process.returncode
+
+    def news(self) -> tuple[str, ...]:
+        """What happened to the page since this was last asked, in sentences."""
+        with self._lock:
+            news, self._news = tuple(self._news), []
+        return news
+
+    def close(self) -> None:
+        """End the page; one that does not end in time is killed."""
+        with self._lock:
+            self._ending.set()
+            process = self._process
+        process.terminate()
+        self._thread.join(_END_TIMEOUT_S)
+        if self._thread.is_alive():
+            process.kill()
+            self._thread.join()
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        # A session of its own keeps the terminal's Ctrl-C from it.
+        return subprocess.Popen(self._command, stdin=subprocess.DEVNULL, start_new_session=True, env=self._environment)
+
+    def _watch(self) -> None:
+        while True:
+            code = self._process.wait()
+            if self._ending.is_set() or code >= 0:
+                # What it says itself on standard error is the reason.
+                self._report(f"the page ended with exit code {code}; start it again with `disco-hw view`")
+                return
+            self._report(f"the page was ended by {_signal_name(-code)}; it is started again")
+            if self._ending.wait(_RESTART_PAUSE_S):
+                return
+            with self._lock:
+                if self._ending.is_set():
+                    return
+                try:
+                    self._process = self._start()
+                except OSError as error:
+                    self._news.append(f"the page cannot be started again ({error.strerror}); use `disco-hw estop`")
+                    return
+
+    def _report(self, sentence: str) -> None:
+        if not self._ending.is_set():
+            with self._lock:
+                self._news.append(sentence)
+            print(f"page: {sentence}", file=sys.stderr, flush=True)
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
 
 
 @contextmanager
 def page_beside(
     robot: Path, model: Path | None, host: str, port: int, link: str | None = None
-) -> Iterator[subprocess.Popen[bytes]]:
+) -> Iterator[PageProcess]:
     """Run the live page of `robot` while the block does, and end it with the block or with this process.
 
     `link` overrides robot.toml's kind, as for the daemon. What the page says goes to standard error: standard output
@@ -34,17 +126,19 @@ def page_beside(
     # An empty argument is none.
     chosen = ["" if model is None else str(model), link or ""]
     command = [sys.executable, "-m", f"{__name__}.commands", str(os.getpid()), host, str(port), str(robot), *chosen]
-    # A session of its own keeps the terminal's Ctrl-C from it.
-    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
+    page = PageProcess(command)
     try:
-        yield process
+        yield page
     finally:
-        process.terminate()
-        try:
-            process.wait(_END_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        page.close()
+
+
+def _token_or_given() -> str:
+    """A token for the page; one that the environment gives wrongly stays as it is, and the page refuses it."""
+    try:
+        return page_token()
+    except ValueError:
+        return os.environ[TOKEN_VARIABLE]
 
 
 def page_token() -> str:

@@ -20,6 +20,7 @@ from disco_hw.config import link_fields, load_robot_config
 from disco_hw.daemon import socket_path
 from disco_hw.daemon.process import StopSignals
 from disco_hw.errors import InputError
+from disco_hw.processes import SWITCH_INTERVAL_S
 from disco_hw.viewer import DEFAULT_PORT, LOOPBACK
 from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.pages import LivePage, ReplayPage, run_live, run_replay
@@ -43,6 +44,8 @@ def view_live(
     InputError for a bad file or link, or a host or port that cannot be listened to.
     """
     link_fields(link)
+    # A busy event loop gives way to the threads of the e-stop as fast as the daemon's does.
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
     stage = stage_of_robot(robot, model)
     socket = socket_path(load_robot_config(robot))
     desk = Desk(socket, robot, link)

@@ -19,8 +19,10 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
 from disco_hw.daemon import connect, send_request
-from disco_hw.daemon.emergency import stop_robot
+from disco_hw.daemon.emergency import read_robot_toml, stop_robot
+from disco_hw.daemon.kept_connection import KeptConnection
 from disco_hw.errors import InputError, WorkError
+from disco_hw.files.descriptors import DescriptorReserve
 from disco_hw.runtime import advice, is_estop, next_step, status_headline
 
 REQUESTS = ("arm", "start", "stop", "disarm", "reset", "task")
@@ -29,6 +31,7 @@ _STATUS_TIMEOUT_S = 0.5
 _REQUEST_TIMEOUT_S = 1.0
 _ESTOP_TIMEOUT_S = 0.5
 _DRIVE_TIMEOUT_S = 0.5
+_RESERVED_DESCRIPTORS = 16
 _MOST_BYTES = 4096
 _MOST_M = 1e6
 
@@ -56,6 +59,11 @@ class Desk:
         self._socket = socket
         self._robot_file = robot_file
         self._link = link
+        # The e-stop opens nothing new: descriptors may have run out when it is pressed.
+        self._stop_line = KeptConnection(socket)
+        self._status_line = KeptConnection(socket)
+        self._reserve = DescriptorReserve(_RESERVED_DESCRIPTORS)
+        self._robot_toml = read_robot_toml(robot_file)
         self._asking = ThreadPoolExecutor(4, "desk")
         # Of its own, so that no other request can be before it in a queue.
         self._stopping = ThreadPoolExecutor(2, "desk e-stop")
@@ -123,6 +131,9 @@ class Desk:
         """End the threads; safe to call twice."""
         for pool in (self._asking, self._stopping, self._watching):
             pool.shutdown(wait=False, cancel_futures=True)
+        self._stop_line.close()
+        self._status_line.close()
+        self._reserve.close()
 
     async def _ask(self, request: dict[str, Any], send: Send) -> None:
         loop = asyncio.get_running_loop()
@@ -147,14 +158,15 @@ class Desk:
     def estop(self) -> dict[str, Any]:
         """Have the daemon stop; where it does not confirm that, stop the robot on its link as well. Never raises."""
         try:
-            reply = send_request(self._socket, {"do": "estop"}, _ESTOP_TIMEOUT_S)
+            reply = self._stop_line.request({"do": "estop"}, _ESTOP_TIMEOUT_S)
             if reply.get("ok"):
                 return reply
             refused = str(reply.get("error"))
         except WorkError as error:
             refused = str(error)
         try:
-            outcome = stop_robot(self._robot_file, self._link)
+            with self._reserve.released():
+                outcome = stop_robot(self._robot_file, self._link, self._robot_toml)
         except InputError as error:
             return {"do": "estop", "ok": False, "error": f"{refused}; NOT SENT: {error}"}
         words = "text" if outcome.confirmed else "error"
@@ -178,8 +190,9 @@ class Desk:
             await asyncio.sleep(STATUS_S)
 
     def _ask_status(self) -> tuple[dict[str, Any] | None, str]:
+        self._stop_line.ensure_connected()
         try:
-            return send_request(self._socket, {"do": "status"}, _STATUS_TIMEOUT_S), ""
+            return self._status_line.request({"do": "status"}, _STATUS_TIMEOUT_S), ""
         except WorkError as error:
             return None, str(error)
 

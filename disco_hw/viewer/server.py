@@ -12,6 +12,7 @@ import gzip
 import hmac
 import http
 import io
+import logging
 import secrets
 import socket
 from collections.abc import Awaitable, Callable, Iterator
@@ -29,12 +30,21 @@ from websockets.http11 import Request, Response
 
 from disco_hw.errors import InputError
 from disco_hw.viewer import DEFAULT_PORT, LOOPBACK, page_address, page_token
+from disco_hw.viewer.admission import (
+    ACCEPTED_PER_TURN,
+    REQUEST_TIMEOUT_S,
+    Admission,
+    OncePerSecond,
+    PacedListener,
+    counted_connections,
+)
 from disco_hw.viewer.operator_controls import Desk
 
 _LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost"})
 _COOKIE = "disco-hw-token"
 _DESK_PATH = "/desk"
 _INSTANCE_PATH = "/instance"
+_WAITING_CONNECTIONS = 256
 Answer = Callable[[Any, Request], Response | None]
 Handler = Callable[[Any], Awaitable[None]]
 
@@ -101,20 +111,21 @@ def serving(label: str, host: str = LOOPBACK, port: int = DEFAULT_PORT, desk: De
     The address carries the page's token. Raises InputError if the port is taken, the host is none of this machine's, or
     the token of the environment is none.
     """
-    _check_free(host, port)
     try:
         guard = Guard(page_token(), local=host == LOOPBACK)
     except ValueError as error:
         raise InputError(str(error)) from None
-    with _guarded(guard, desk), redirect_stdout(io.StringIO()):
+    admission = Admission()
+    listener = PacedListener(_listen(host, port), admission)
+    with _guarded(guard, desk, listener, admission), redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+    # What waits to be accepted may be many, though the event loop takes few at a turn.
+    listener.listen(_WAITING_CONNECTIONS)
     try:
         elsewhere = _held_on_ipv6(server.get_port()) if guard.local else None
         # Looked up when a client asks for it, so this is enough to keep the tunnel shut.
         server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
         taken = server.get_port()
-        if port not in {0, taken}:
-            raise InputError(f"--port {port}: another program took it just now; give another one")
         server.gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=False)
         guard.port = taken
         guard.alone = elsewhere is not None
@@ -127,16 +138,25 @@ def serving(label: str, host: str = LOOPBACK, port: int = DEFAULT_PORT, desk: De
 
 
 @contextmanager
-def _guarded(guard: Guard, desk: Desk | None) -> Iterator[None]:
-    """Put the guard before every request of the server made inside the block, and the desk beside its page."""
+def _guarded(guard: Guard, desk: Desk | None, listener: socket.socket, admission: Admission) -> Iterator[None]:
+    """Put the guard before every request of the server made inside the block, and the desk beside its page.
+
+    The server accepts on `listener`, in place of a port of its own, and no more connections than the admission allows.
+    """
     serve = websockets.asyncio.server.serve
     instance = secrets.token_hex(8)
+    logger = logging.getLogger("websockets.server")
+    limit = OncePerSecond()
+    for repeating in (logger, logging.getLogger("asyncio")):
+        repeating.addFilter(limit)
 
-    def guarded_serve(handler: Handler, *arguments: Any, process_request: Answer, **options: Any) -> Any:
+    def guarded_serve(handler: Handler, _host: str, _port: int, process_request: Answer, **options: Any) -> Any:
         @functools.wraps(process_request)
         def process(connection: Any, request: Request) -> Response | None:
             upgrade = request.headers.get("Upgrade", "").lower() == "websocket"
             response = guard.refusal(request.path, request.headers, upgrade)
+            if response is None and urlsplit(request.path).path != _INSTANCE_PATH:
+                admission.prove(connection.transport)
             if response is None and desk is not None and not upgrade:
                 response = _desk_answer(desk, instance, guard, request)
             if response is None:
@@ -156,7 +176,16 @@ def _guarded(guard: Guard, desk: Desk | None) -> Iterator[None]:
             else:
                 await handler(connection)
 
-        return serve(handle, *arguments, process_request=process, **options)
+        return serve(
+            handle,
+            process_request=process,
+            # A factory serves as well as a class, says the documentation of websockets.
+            create_connection=counted_connections(admission),  # type: ignore[arg-type]
+            open_timeout=REQUEST_TIMEOUT_S,
+            backlog=ACCEPTED_PER_TURN,
+            sock=listener,
+            **options,
+        )
 
     websockets.asyncio.server.serve = guarded_serve  # type: ignore[assignment,misc]
     try:
@@ -218,10 +247,9 @@ def _held_on_ipv6(port: int) -> socket.socket | None:
     return held
 
 
-def _check_free(host: str, port: int) -> None:
+def _listen(host: str, port: int) -> socket.socket:
     try:
-        with socket.create_server((host, port), reuse_port=False):
-            pass
+        return socket.create_server((host, port), reuse_port=False)
     except OSError as error:
         raise InputError(
             f"--host {host} --port {port}: cannot be listened to ({error.strerror}); give another"

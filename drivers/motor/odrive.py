@@ -204,6 +204,10 @@ class OdriveDriver:
         self._count("commands_sent")
         return parts.commanding(now_ns, command, *self._velocity())
 
+    def release(self, why: str) -> None:
+        """Every axis idles from now on: no torque."""
+        self._idle(self._permit.lost(why))
+
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Frames that stop every axis in any state; whatever was wanted is dropped, and nothing is commanded again."""
         self._permit = self._permit.stopped()
@@ -388,7 +392,10 @@ class OdriveDriver:
 
     @property
     def _all_in_estop(self) -> bool:
-        return all(axis.error & ESTOP_ERROR[self._generation] for axis in self._all)
+        # The error is latched by the frame; the motor is released a control cycle later.
+        return all(
+            axis.error & ESTOP_ERROR[self._generation] and axis.state != AxisState.CLOSED_LOOP for axis in self._all
+        )
 
     def _idle(self, permit: MotionPermit) -> None:
         """Idle is due at once for all that are still energised."""

@@ -291,13 +291,17 @@ def stop_frames(settings: OdriveSettings) -> tuple[Frame, ...]:
 
 
 def stop_confirmation(settings: OdriveSettings) -> Callable[[Frame], bool]:
-    """Return what says, frame by frame heard, whether every node has reported the e-stop."""
+    """Return what says, frame by frame heard, whether every node has reported the e-stop and a released motor."""
     waiting = set(all_of(settings.nodes))
 
     def heard(frame: Frame) -> bool:
         decoded = decode(settings.generation, frame)
         beat = decoded if decoded is not None and decoded.name == "Heartbeat" else None
-        if beat is not None and int(beat.values["axis_error"]) & ESTOP_ERROR[settings.generation]:
+        if beat is None:
+            return not waiting
+        # The error is latched by the frame; the motor is released a control cycle later.
+        is_released = int(beat.values["axis_state"]) != AxisState.CLOSED_LOOP
+        if is_released and int(beat.values["axis_error"]) & ESTOP_ERROR[settings.generation]:
             waiting.discard(beat.node)
         return not waiting
 
@@ -337,6 +341,7 @@ def safety_card(settings: OdriveSettings) -> SafetyCard:
         reaction_s=settings.watchdog_s,
         brakes=False,
         estop="a frame to each axis (0x02): it idles and coasts, latched, reported in its heartbeat",
+        wheel_fault="each axis idles at once, without torque: it coasts",
         unverified=(
             f"watchdog ({settings.watchdog_s:g} s), velocity limit and heartbeat period are declared in robot.toml "
             "and were not read back; any frame to an axis may feed its watchdog",

@@ -17,6 +17,7 @@ from drivers.motor.odrive_protocol import OdriveSettings
 from drivers.motor.vendor_parts import sides_of
 from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_protocol import CanFrame
+from sim.encoder_loop import EncoderLoop, EncoderUse
 
 CHECKS_PER_MS = 8
 IDLE, CLOSED_LOOP, POSITION_CONTROL, VELOCITY_CONTROL, PASSTHROUGH = 1, 8, 3, 2, 1
@@ -92,23 +93,30 @@ class Axis:
         if self.watchdog_left > 0:
             self.watchdog_left -= 1
         else:
-            self.fail(error)
+            self.axis_error |= error
 
-    def fail(self, error: int) -> None:
-        """Latch an error; a motor that runs is released."""
-        self.axis_error |= error
-        if self.axis_state != IDLE:
-            self.disarm_reason = error
+    def release_on_error(self) -> None:
+        """Release a motor that runs with an error latched: the control loop's part, 8 times in a millisecond.
+
+        A frame only latches or clears the error. What the control loop has released, clearing does not energise again.
+        """
+        if self.axis_error and self.axis_state != IDLE:
+            self.disarm_reason = self.axis_error
             self.axis_state = IDLE
 
     def run_state_machine(self) -> None:
-        """Take the state asked for, once; with an error latched the axis stays idle."""
+        """Take the requested state, once; with an error latched the axis stays idle.
+
+        A request clears an INVALID_STATE that an earlier one has left.
+        """
         wanted, self.requested_state = self.requested_state, 0
         if wanted == 0:
             return
+        self.axis_error &= ~INVALID_STATE
         self.obeyed_states.append(wanted)
         if wanted == CLOSED_LOOP and not self.calibrated:
-            self.fail(INVALID_STATE)
+            self.axis_error |= INVALID_STATE
+            self.axis_state = IDLE
         elif wanted == CLOSED_LOOP and self.axis_error == 0:
             self.feed()
             self.axis_state = CLOSED_LOOP
@@ -194,7 +202,7 @@ class OdriveBoard:
             return
         match command:
             case 0x02:
-                axis.fail(ESTOP_ERROR[self.generation])
+                axis.axis_error |= ESTOP_ERROR[self.generation]
             case 0x06 if self.generation == "0.5":
                 axis.node_id = struct.unpack_from("<I", data)[0]
             case 0x0C:
@@ -222,7 +230,13 @@ class OdriveBoard:
             axis.check_watchdog(WATCHDOG_ERROR[self.generation])
             if axis.axis_error != before:
                 failed.append((axis, axis.axis_error & ~before))
+        self.release_on_error()
         return failed
+
+    def release_on_error(self) -> None:
+        """Run the part of the control loop that releases the motors of axes with an error."""
+        for axis in self.axes:
+            axis.release_on_error()
 
     def step(self, now_ms: int) -> list[CanFrame]:
         """Go through one millisecond: watchdogs, states, cyclic messages; return the frames to send."""
@@ -318,6 +332,7 @@ class OdriveController:
     def __init__(self, settings: OdriveSettings, ticks_per_rev: int) -> None:
         self._settings = settings
         self._ticks_per_rev = ticks_per_rev
+        self._received_us = 0
         self.boards = self._make_boards()
         self.axes = self._axes_by_side()
 
@@ -330,6 +345,16 @@ class OdriveController:
             turns = sum(held) / len(held) if held else None
             wheels.append(None if turns is None else direction * turns * 2.0 * math.pi / self._settings.gear)
         return wheels[0], wheels[1]
+
+    @property
+    def regulates(self) -> bool:
+        """Whether an axis is in closed loop."""
+        return any(axis.axis_state == CLOSED_LOOP for side in self.axes for axis in side)
+
+    def make_loop(self) -> EncoderLoop:
+        """Its field-oriented control, whose angle is the encoder's."""
+        turns_s = self._settings.vel_limit_turns_s
+        return EncoderLoop(EncoderUse.COMMUTATION, 2.0 * math.pi * turns_s / self._settings.gear)
 
     @property
     def state(self) -> str:
@@ -346,6 +371,11 @@ class OdriveController:
 
     def receive(self, now_us: int, frame: CanFrame) -> Sequence[CanFrame]:
         """Take in one frame; return the replies."""
+        if now_us - self._received_us >= 1000 // CHECKS_PER_MS:
+            # The control loop ran between this frame and the one before: no clearing undoes what it has released.
+            for board in self.boards:
+                board.release_on_error()
+        self._received_us = now_us
         return [reply for board in self.boards for reply in board.receive(frame)]
 
     def step(self, now_us: int, inputs: FirmwareInputs) -> Sequence[CanFrame]:
@@ -356,7 +386,7 @@ class OdriveController:
         for side, direction, counted, speed in zip(self.axes, self._settings.direction, ticks, speeds, strict=True):
             for axis in side:
                 if inputs.estop_button:
-                    axis.fail(ESTOP_ERROR[self._settings.firmware])
+                    axis.axis_error |= ESTOP_ERROR[self._settings.firmware]
                 axis.pos_turns = f32(direction * gear * counted / self._ticks_per_rev)
                 axis.vel_turns_s = f32(direction * gear * speed / (2.0 * math.pi))
         return [frame for board in self.boards for frame in board.step(now_us // 1000)]

@@ -16,11 +16,14 @@ from drivers.motor.vendor_parts import sides_of
 from drivers.motor.vesc_settings import VescSettings
 from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_protocol import CanFrame
+from sim.encoder_loop import EncoderLoop, EncoderUse
 
 BUFFER = 520
 APPCONF_SIGNATURE = 3264926020
 _APPCONF_REST = 300
 """Bytes of the application's settings that follow, of no meaning here."""
+KILL_SWITCH_IGNORES_MS = 20
+"""For so long after a check that found the kill switch active, commands do not reach the motor."""
 CHECK_MS = 10
 _F32 = struct.Struct("<f")
 _CAN_SET = {
@@ -77,7 +80,6 @@ class VescValues:
     adc2_v: float = 0.0
     adc3_v: float = 0.0
     ppm: float = 0.0
-    kill_switch: bool = False
 
 
 def _steps(value: float, scale: float, code: str, number: Callable[[float], float] = f32) -> bytes:
@@ -88,7 +90,11 @@ def _steps(value: float, scale: float, code: str, number: Callable[[float], floa
 
 
 class Vesc:
-    """One controller. `calls` are the commands that reached its motor, by name and value, since `take_calls`."""
+    """One controller. `take_calls` returns the commands that reached its motor, by name and value.
+
+    `kill_switch_pin`: its kill switch input. Like `timed_out`, the `kill_switch_active` that it reports is the result
+    of the last check of the timeout thread (vedderb/bldc, timeout.c), not the state at the time of the request.
+    """
 
     def __init__(self, controller_id: int, timeout_ms: int = 1000, timeout_brake_current_a: float = 0.0) -> None:
         self.controller_id = controller_id
@@ -97,11 +103,14 @@ class Vesc:
         self.values = VescValues()
         self.status_ms: dict[int, int] = {}
         self.timed_out = False
+        self.kill_switch_pin = False
+        self.kill_switch_active = False
         self.fed = 0
         self.last_fed_ms = 0
         self.held: tuple[str, float] = ("set_current", 0.0)
         self.firmware = b"\x07\x01" + b"sim\0" + bytes(12) + b"\0\1" + bytes(12)
         self._now_ms = 0
+        self._ignores_until_ms = 0
         self._calls: list[tuple[str, float]] = []
         self._fragments = bytearray(BUFFER)
         self._serial = _PacketParser()
@@ -167,10 +176,18 @@ class Vesc:
         return b""
 
     def check_timeout(self, now_ms: int) -> float | None:
-        """The check that runs every 10 ms; returns the brake current (A) that it applies, None while all is well."""
+        """The check that runs every 10 ms; returns the brake current (A) that it applies, None while all is well.
+
+        While the kill switch is active the timeout is neither found nor ended, and commands are ignored.
+        """
         self._now_ms = now_ms
-        self.timed_out = 0 < self.timeout_ms < now_ms - self.last_fed_ms
-        if not self.timed_out:
+        expired = 0 < self.timeout_ms < now_ms - self.last_fed_ms
+        self.kill_switch_active = self.kill_switch_pin
+        if self.kill_switch_active:
+            self._ignores_until_ms = now_ms + KILL_SWITCH_IGNORES_MS
+        else:
+            self.timed_out = expired
+        if not (expired or self.kill_switch_active):
             return None
         self.held = ("set_brake_current", self.timeout_brake_current_a)
         return self.timeout_brake_current_a
@@ -202,7 +219,7 @@ class Vesc:
     def answer_values(self, mask: int) -> bytes:
         """The bytes of the values that the mask asks for."""
         v = self.values
-        status = int(self.timed_out) | v.kill_switch << 1
+        status = int(self.timed_out) | self.kill_switch_active << 1
         parts: tuple[Callable[[], bytes], ...] = (
             lambda: _steps(v.t_fet_c, 10, "h"),
             lambda: _steps(v.t_motor_c, 10, "h"),
@@ -246,7 +263,9 @@ class Vesc:
     def _set(self, name: str, raw: int, scale: float) -> None:
         value = f32(f32(raw) / f32(scale))
         self._calls.append((name, value))
-        self.held = (name, value)
+        # The layer below ignores it; the timeout is fed all the same.
+        if self._now_ms >= self._ignores_until_ms:
+            self.held = (name, value)
         self._feed()
 
     def _feed(self) -> None:
@@ -379,6 +398,15 @@ class VescController:
         return wheels[0], wheels[1]
 
     @property
+    def regulates(self) -> bool:
+        """Whether a motor has a speed to hold; currents need no loop of speed."""
+        return any(vesc.held[0] == "set_erpm" for side in self.sides for vesc in side)
+
+    def make_loop(self) -> EncoderLoop:
+        """Its field-oriented control, whose angle is the encoder's."""
+        return EncoderLoop(EncoderUse.COMMUTATION, self._settings.max_erpm / self._settings.erpm_per_rad_s)
+
+    @property
     def state(self) -> str:
         """In one word."""
         vescs = [vesc for side in self.sides for vesc in side]
@@ -416,7 +444,7 @@ class VescController:
                 counted = settings.direction[side] * (self._ticks[side] - self._zero_ticks[side])
                 vesc.values.tachometer = round(per_tick * counted)
                 vesc.values.erpm = settings.direction[side] * speeds[side] * settings.erpm_per_rad_s
-                vesc.values.kill_switch = inputs.estop_button
+                vesc.kill_switch_pin = inputs.estop_button
                 frames += vesc.step(self._now_ms)
         # A serial line has no status messages.
         return frames if settings.uart_node is None else ()
@@ -457,7 +485,7 @@ class VescController:
             return 0.0
         name, value = vesc.held
         limit = self._settings.max_erpm
-        stopped = vesc.values.fault or vesc.values.kill_switch
+        stopped = vesc.values.fault or vesc.kill_switch_active
         lets_go = stopped or name != "set_erpm" or abs(value) < self._settings.min_erpm
         return None if lets_go else min(max(value, -limit), limit)
 

@@ -86,7 +86,7 @@ def test_the_result_is_for_people_and_machines():
 
 @pytest.mark.parametrize("said", [("event", "armed"), ("recording", "the log writer died (signal 9)")])
 def test_a_drive_whose_log_is_not_whole_is_not_completed(tmp_path, monkeypatch, said):
-    monkeypatch.setattr("disco_hw.drive.drive_command.serve", lambda _setup, _log, say, _pilot: say(*said))
+    monkeypatch.setattr("disco_hw.drive.drive_command.serve", lambda _setup, _log, say, _pilot, **_: say(*said))
     result = run_drive(DriveOptions(write_robot_file(tmp_path), page=True, as_json=True))
     whole = said[0] != "recording"
     assert result.completed is whole
@@ -99,7 +99,7 @@ def test_a_writer_that_was_slow_has_lost_nothing_where_the_log_proves_it(tmp_pat
     log = tmp_path / "drive.mcap"
     pauses = "the log writer has not answered for 0.8 s; what comes is kept and waits"
 
-    def served(_setup, path, say, _pilot):
+    def served(_setup, path, say, _pilot, **_options):
         write_log(path, ticks=60)
         os.truncate(path, path.stat().st_size - cut_off)
         say("recording", pauses)

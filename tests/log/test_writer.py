@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -161,6 +162,44 @@ def test_a_full_disk_ends_the_log_and_with_room_again_another_begins(tmp_path):
         assert final.delivered_ticks == final.ticks
         assert recorder.path == disk / "run.part2.mcap"
         assert ticks_of(path) + ticks_of(recorder.path) == list(range(1, final.ticks + 1))
+
+
+def full_recorder(disk):
+    """A recorder whose writer has met a full disk, the file to delete for room, and how many ticks were given."""
+    filler = disk / "filler"
+    filler.write_bytes(bytes(4040 * 1024))
+    recorder = ProcessRecorder(recording(disk / "run.mcap"))
+    _, given = fill(recorder)
+    return recorder, filler, given
+
+
+def test_the_last_words_with_a_full_disk_count_the_ticks_that_are_lost_and_name_files_that_exist(tmp_path):
+    with SmallDisk(tmp_path, 4160) as disk:
+        recorder, _, given = full_recorder(disk)
+        recorder.news()
+        final = recorder.close(1.0)
+        assert final.waiting_ticks == given - final.delivered_ticks > 0
+        words = recorder.news()
+        assert f"{final.waiting_ticks} of {given} ticks are in no log: " in words[-1]
+        assert "No space left on device" in words[-1]
+        assert not [line for line in words if "goes on" in line]
+        assert final.fault == words[-1]
+        assert Path(final.path).exists()
+
+
+def test_a_disk_with_room_again_at_the_end_loses_nothing_and_the_part_begins_before_it_ends(tmp_path):
+    with SmallDisk(tmp_path, 4160) as disk:
+        recorder, filler, given = full_recorder(disk)
+        # The next attempt is seconds away.
+        wait_until(lambda: recorder.poll().writer_deaths > 3)
+        recorder.news()
+        filler.unlink()
+        final = recorder.close()
+        assert (final.delivered_ticks, final.waiting_ticks, final.fault) == (given, 0, "")
+        assert recorder.news() == (f"recording goes on in {final.path}",)
+        assert ticks_of(disk / "run.mcap") + ticks_of(Path(final.path)) == list(range(1, given + 1))
+        with open_log(Path(final.path)) as log:
+            assert log.summary().start < log.summary().end
 
 
 def test_a_file_that_may_not_grow_is_continued_by_another(path):

@@ -92,6 +92,13 @@ GOOD = model_text(
         ("tau_s = 0.1", "tau_s = " + "[" * 3000 + "]" * 3000, "not valid TOML .*16 deep"),
         ("[0.0001, 0.0]", "[0.0001, 0.1]", "belief: covariance is not symmetric"),
         ("[0.0, 0.0001]", "[0.0, -0.0001]", "belief: covariance is not positive definite"),
+        ("[0.0, 0.0001]", "[0.0, nan]", "belief: covariance holds a value that is not finite"),
+        (
+            "[0.0, 0.0001]",
+            "[0.0, 17.0]",
+            r"belief: standard deviation of x_icr_m is 4\.12 m, wider than its whole range",
+        ),
+        ("[0.0, 0.0001]", "[0.0, 1e300]", r"belief: standard deviation of x_icr_m is 1e\+150 m, wider than its whole"),
         ("[0.0, 0.0001]", "[0.0]", "belief: covariance has rows of different lengths"),
         ('kind = "gaussian"', 'kind = "cauchy"', "belief: invalid value 'cauchy'|belief.kind: invalid value 'cauchy'"),
     ],

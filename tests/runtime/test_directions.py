@@ -188,3 +188,32 @@ def test_a_robot_whose_geometry_is_written_down_wrongly_is_not_taken_for_miswire
     )
     run.start()
     assert all("wheels." not in tick.output.detail for tick in run.ticks(4.0))
+
+
+@pytest.mark.parametrize("runs_at", [3.0, 9.0])
+def test_a_wheel_that_does_not_count_gets_no_wiring_advice_however_it_turns(runs_at):
+    watch, floor, found = Directions(RADIUS_M, TRACK_M, AS_TOLD), Floor(), []
+    for tick in range(150):
+        now_ns, moves = tick * TICK_NS, tick > 12
+        floor.roll(0.02 * runs_at * moves, 0.06 * moves)
+        right = 0.06 * max(tick - 12, 0)
+        wheels = WheelSample(now_ns, now_ns, 0.0, right, 0.0, 3.0 * moves)
+        command = WheelCommand(*((3.0, 3.0) if tick > 10 else (0.0, 0.0)), 0.1)
+        found.append(watch.step(now_ns, (wheels,), (floor.pose(now_ns),), command))
+    assert not any(found)
+
+
+def test_a_wheel_that_counts_backward_after_it_has_followed_gets_no_wiring_advice():
+    asked = [(0.0, 0.0)] + [(2.0, 2.0)] * 60
+    turned = [(0.0, 0.0)] + [(0.04 * (tick if tick < 10 else 20 - tick), 0.04 * tick) for tick in range(60)]
+    last, found = (0.0, 0.0), {}
+    for followed in (False, True):
+        watch = Directions(RADIUS_M, TRACK_M, AS_TOLD)
+        for tick, (speeds, angles) in enumerate(zip(asked, turned, strict=True)):
+            now_ns = tick * TICK_NS
+            rates = [(now - was) / 0.02 for now, was in zip(angles, last, strict=True)]
+            sample, last = WheelSample(now_ns, now_ns, *angles, *rates), angles
+            said = watch.step(now_ns, (sample,), (), WheelCommand(*speeds, 0.1), (followed, followed))
+            found[followed] = found.get(followed) or said
+    assert "wheels.encoder_direction" in found[False]
+    assert found[True] is None

@@ -1,4 +1,5 @@
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -87,3 +88,31 @@ def test_a_page_that_hangs_is_ended_all_the_same():
 def test_what_the_block_raises_is_passed_on(error):
     with pytest.raises(error), page_beside(ROBOT_FILE, None, "127.0.0.1", free_port()):
         raise error
+
+
+def test_a_page_that_was_killed_is_reported_and_started_again_under_the_same_token(capfd):
+    port = free_port()
+    said = ""
+
+    def addresses():
+        nonlocal said
+        said += "".join(capfd.readouterr())
+        return re.findall(rf"http://127\.0\.0\.1:{port}/\?token=\S+", said)
+
+    with page_beside(ROBOT_FILE, None, "127.0.0.1", port) as page:
+        wait_until(lambda: len(addresses()) == 1, 60.0)
+        first = page.pid
+        os.kill(first, signal.SIGKILL)
+        wait_until(lambda: len(addresses()) == 2, 60.0)
+        assert len(set(addresses())) == 1
+        assert not Path(f"/proc/{first}").exists(), "a zombie is left"
+        assert page.news() == ("the page was ended by SIGKILL; it is started again",)
+        assert page.news() == ()
+    assert "page: the page was ended by SIGKILL; it is started again" in said
+    assert not listens(port)
+
+
+def test_a_page_that_ends_by_itself_is_reported_and_not_started_again(tmp_path, capfd):
+    with page_beside(tmp_path / "none.toml", None, "127.0.0.1", 0) as page:
+        assert page.wait(60) == 2
+        assert page.news() == ("the page ended with exit code 2; start it again with `disco-hw view`",)

@@ -199,7 +199,7 @@ def _check_serial_answer(found: Comparison, device: Vesc, case: Case) -> None:
             found.same("request", codec.packet(codec.ask_values(given["mask"])), request)
         device.firmware = payload[1:] if payload[:1] == b"\0" else device.firmware
         device.timed_out = bool(then.get("status_byte", 0) & codec.TIMED_OUT)
-        device.values.kill_switch = bool(then.get("status_byte", 0) & codec.KILL_SWITCH)
+        device.kill_switch_active = bool(then.get("status_byte", 0) & codec.KILL_SWITCH)
         answer, _ = device.receive_bytes(request)
     found.same("answer", answer.hex(), case["bytes"])
     found.same("packets", [each.hex() for each in codec.PacketDecoder().feed(answer)], [then["payload"]])
@@ -211,7 +211,10 @@ def _check_serial_answer(found: Comparison, device: Vesc, case: Case) -> None:
 
 
 class _Clocked:
-    """Runs a device through the milliseconds of a case, noting what its timeout does."""
+    """Runs a device through the milliseconds of a case, noting what its timeout does.
+
+    What arrives in a millisecond comes before that millisecond's check: the timeout thread sleeps until then.
+    """
 
     def __init__(self, device: Vesc, given: Mapping[str, Any]) -> None:
         device.timeout_ms = given["timeout_ms"]
@@ -224,7 +227,6 @@ class _Clocked:
 
     def check(self, ms: int) -> None:
         device = self.device
-        device.at(ms)
         if ms % CHECK_MS:
             return
         current = device.check_timeout(ms)
@@ -242,11 +244,12 @@ def _check_timeout(found: Comparison, device: Vesc, given: Mapping[str, Any], th
     clocked = _Clocked(device, given)
     obeyed = []
     for ms in range(given["until_ms"]):
-        clocked.check(ms)
+        device.at(ms)
         for at, can_id, data in given["sent_ms_id_data"]:
             if at == ms:
                 device.receive(CanFrame(can_id, bytes.fromhex(data), extended=True))
                 obeyed += [[ms, *call] for call in device.take_calls()]
+        clocked.check(ms)
     _check_clocked(found, clocked, then)
     found.same("obeyed", obeyed, then["obeyed_ms_call_value"])
 
@@ -255,12 +258,13 @@ def _check_serial_timeout(found: Comparison, device: Vesc, given: Mapping[str, A
     clocked = _Clocked(device, given)
     events: list[list[object]] = []
     for ms in range(given["until_ms"]):
-        clocked.check(ms)
+        device.at(ms)
         for at, sent in given["sent_ms_bytes"]:
             if at == ms:
                 answer, _ = device.receive_bytes(bytes.fromhex(sent))
                 events += [[ms, *call] for call in device.take_calls()]
                 events += [[ms, "reply", answer.hex()]] if answer else []
+        clocked.check(ms)
     _check_clocked(found, clocked, then)
     found.same("events", events, then["events_ms"])
 

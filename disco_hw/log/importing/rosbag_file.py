@@ -20,6 +20,7 @@ from disco_hw.errors import InputError, LogError
 from disco_hw.files import LOG, FileKind, open_file, read_bytes
 from disco_hw.log.container import MAGIC
 from disco_hw.log.drive import Index
+from disco_hw.log.importing.rosbag_types import Definitions
 
 METADATA = "metadata.yaml"
 ROS1_MAGIC = b"#ROSBAG V"
@@ -43,12 +44,11 @@ def is_bag(begin: bytes) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class BagTopic:
-    """A topic of a bag: ROS's name of its type, and whether messages of it can be read (`unreadable` says why not)."""
+    """A topic of a bag, with ROS's name of its type."""
 
     name: str
     type: str
     count: int
-    unreadable: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +70,13 @@ class Bag:
     end_ns: int
     _reader: Any
     _read: Callable[[bytes, str], Any]
+    _definitions: Definitions
+
+    def why_unreadable(self, topic: str) -> str:
+        """Why messages of a topic cannot be read; empty if they can. Parses the bag's definition of its type."""
+        kind = self.topics[topic].type
+        one = next(one for one in self._reader.connections if (one.topic, one.msgtype) == (topic, kind))
+        return self._definitions.fault(one)
 
     def messages(self, topics: Collection[str], start_ns: int | None = None) -> Iterator[BagMessage]:
         """Messages of these topics in the order of their recording; raises LogError for one that cannot be read."""
@@ -89,8 +96,7 @@ class Bag:
             yield BagMessage(connection.topic, log_ns, value)
 
     def _is_readable(self, connection: Any) -> bool:  # Any: a connection of the library.
-        topic = self.topics[connection.topic]
-        return not topic.unreadable and topic.type == connection.msgtype
+        return self.topics[connection.topic].type == connection.msgtype and not self._definitions.fault(connection)
 
 
 @contextmanager
@@ -111,9 +117,9 @@ def open_bag(path: Path) -> Iterator[Bag]:
             with _in_one_line(path):
                 # The messages that are used are the same from Humble to Kilted.
                 store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
-                topics = _topics(path, reader, store)
+                topics = _topics(path, reader)
                 start_ns, end_ns = reader.start_time, reader.end_time
-            yield Bag(path, topics, start_ns, end_ns, reader, _decoder(store, is_ros1))
+            yield Bag(path, topics, start_ns, end_ns, reader, _decoder(store, is_ros1), Definitions(store))
         finally:
             reader.close()
 
@@ -170,7 +176,7 @@ def _check_unpacked(path: Path) -> None:
                 raise LogError(f"{path}: unpacks to over {most // 2**20} MiB; unpack it with `zstd -d` and give that")
 
 
-def _topics(path: Path, reader: Any, store: Any) -> dict[str, BagTopic]:  # Any: the library's classes.
+def _topics(path: Path, reader: Any) -> dict[str, BagTopic]:  # Any: the library's class.
     if len(reader.connections) > _MOST_TOPICS:
         raise LogError(f"{path}: {len(reader.connections)} topics, over {_MOST_TOPICS}; record fewer")
     topics: dict[str, BagTopic] = {}
@@ -180,33 +186,8 @@ def _topics(path: Path, reader: Any, store: Any) -> dict[str, BagTopic]:  # Any:
             # Two publishers of different types: ROS itself lets nobody hear both.
             continue
         count = one.msgcount + (former.count if former is not None else 0)
-        topics[one.topic] = BagTopic(one.topic, one.msgtype, count, _define(store, one))
+        topics[one.topic] = BagTopic(one.topic, one.msgtype, count)
     return topics
-
-
-def _define(store: Any, connection: Any) -> str:  # Any: the library's classes.
-    """Make a type known that the bag defines itself; why its messages cannot be read, or empty."""
-    from rosbags.interfaces import MessageDefinitionFormat  # noqa: PLC0415
-    from rosbags.typesys import get_types_from_idl, get_types_from_msg  # noqa: PLC0415
-
-    encoding = getattr(connection.ext, "serialization_format", "cdr")
-    if encoding != "cdr":
-        return f"it is encoded as {encoding}, not as CDR"
-    if connection.msgtype in store.fielddefs:
-        return ""
-    definition = connection.msgdef
-    if definition.format == MessageDefinitionFormat.NONE:
-        return f"its type {connection.msgtype} is not of ROS and the bag does not define it"
-    try:
-        if definition.format == MessageDefinitionFormat.MSG:
-            found = get_types_from_msg(definition.data, connection.msgtype)
-        else:
-            found = get_types_from_idl(definition.data)
-        store.register({name: fields for name, fields in found.items() if name not in store.fielddefs})
-    except Exception as error:
-        # Foreign text in the hands of a grammar; a type that nobody needs must not spoil the bag.
-        return f"the bag's definition of {connection.msgtype} cannot be read ({_words(error)})"
-    return "" if connection.msgtype in store.fielddefs else f"the bag does not define its type {connection.msgtype}"
 
 
 @contextmanager

@@ -113,8 +113,8 @@ def _named(bag: Bag, role: str, name: str) -> TopicCandidate:
     if topic is None:
         near = ", ".join(list(bag.topics)[:8]) or "none"
         raise LogError(f"{bag.path}: {role}: no topic {name}; it has {near}")
-    if topic.unreadable:
-        raise LogError(f"{bag.path}: {role}: {name}: {topic.unreadable}; record as MCAP, or name another topic")
+    if why := bag.why_unreadable(name):
+        raise LogError(f"{bag.path}: {role}: {name}: {why}; record as MCAP, or name another topic")
     if not topic.count:
         raise LogError(f"{bag.path}: {role}: {name} has no message; name another topic")
     if not _serves(topic, role):
@@ -136,8 +136,8 @@ def _of_role(
     for topic in bag.topics.values():
         if not (topic.count and _serves(topic, role)):
             continue
-        if topic.unreadable:
-            yield TopicCandidate(role, topic.name, topic.type, topic.count, 200, topic.unreadable)
+        if why := bag.why_unreadable(topic.name):
+            yield TopicCandidate(role, topic.name, topic.type, topic.count, 200, why)
             continue
         judged = {COMMANDS: _as_command, WHEELS: _as_wheels, POSES: _as_pose}[role](bag, topic, left, right, settings)
         if judged is not None:
@@ -233,7 +233,7 @@ def _wheel_joints(bag: Bag, settings: Ros2) -> tuple[tuple[str, ...], tuple[str,
         return tuple(settings.left_joints), tuple(settings.right_joints)
     names: list[str] = []
     for topic in bag.topics.values():
-        if topic.type == JOINTS and topic.count and not topic.unreadable:
+        if topic.type == JOINTS and topic.count and not bag.why_unreadable(topic.name):
             names += [name for one in _first(bag, topic.name) for name in one.value.name]
     wheels = [name for name in dict.fromkeys(names) if _is_wheel(name)]
     left = tuple(name for name in wheels if _LEFT.search(name.lower()))

@@ -512,3 +512,21 @@ def test_an_emergency_stop_that_is_heard_is_taken_at_once_and_said_once(vendor, 
     assert [event for event in bench.events if "outside" in event or "another host is" in event] == [
         "stopped from outside on the link, by `disco-hw estop` or another host"
     ]
+
+
+def test_released_no_speed_but_zero_is_commanded_any_more_and_the_reason_is_a_fault_until_a_reset(vendor, bench):
+    drive(bench)
+    bench.driver.release("the left wheel does not count")
+    bench.run(0.02)
+    sent = len(bench.robot.received)
+    assert bench.driver.state is DriverState.FAULT
+    assert "the left wheel does not count" in bench.driver.detail
+    bench.run(COASTING_S, FORWARD)
+    assert not [frame for frame in bench.robot.received[sent:] if vendor.is_motion(frame)], "a ramp would be motion"
+    assert no_wheel_is_driven(bench)
+    bench.driver.request(Request.ARM)
+    bench.run(0.5)
+    assert bench.driver.state is DriverState.FAULT
+    bench.driver.request(Request.RESET)
+    bench.run(1.0)
+    bench.run_until(*STILL)

@@ -54,7 +54,9 @@ class Vendor:
 
 
 def fail_left_odrive(rig):
-    rig.controller.axes[0][0].fail(0x40 if rig.controller.boards[0].generation == "0.5" else 0x1000)
+    axis = rig.controller.axes[0][0]
+    axis.axis_error |= 0x40 if rig.controller.boards[0].generation == "0.5" else 0x1000
+    axis.release_on_error()
 
 
 def is_odrive_motion(frame):

@@ -1,0 +1,74 @@
+"""The e-stop of the page while another user of the machine holds 4000 connections to it, with few descriptors."""
+
+import os
+import resource
+import shutil
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.drivers.waiting import free_port, wait_until
+from tests.viewer.test_operator_controls import COOKIES, Daemon, ask, line_to
+from tests.viewer.test_server import get
+from tools.viewer_run import ROBOT_FILE
+
+TOKEN = "a-token-of-the-test"
+CONNECTIONS, PRESSES = 4000, 12
+
+
+@contextmanager
+def page_process(directory, descriptors):
+    """A page that may open so many files, beside a daemon; the daemon, the port and what the page says."""
+    daemon = Daemon(directory / "run")
+    shutil.copytree(ROBOT_FILE.parent, directory / "robots")
+    robot = directory / "robots" / ROBOT_FILE.name
+    text = ROBOT_FILE.read_text()
+    assert "[daemon]" not in text
+    robot.write_text(f'{text}\n[daemon]\ncontrol_socket = "{daemon.server.path}"\n')
+    port = free_port()
+    said = directory / "said.txt"
+    command = [sys.executable, "-m", "disco_hw.viewer.commands", str(os.getpid()), "127.0.0.1", str(port), str(robot)]
+    with said.open("wb") as output:
+        page = subprocess.Popen(
+            [*command, "", ""], stdout=output, stderr=output, env=os.environ | {"DISCO_HW_PAGE_TOKEN": TOKEN},
+        )  # fmt: skip
+    resource.prlimit(page.pid, resource.RLIMIT_NOFILE, (descriptors, descriptors))
+    try:
+        wait_until(lambda: b"?token=" in said.read_bytes(), 60.0)
+        COOKIES[port] = f"disco-hw-token-{port}={TOKEN}"
+        yield daemon, port, said
+    finally:
+        page.terminate()
+        page.wait()
+        daemon.close()
+
+
+@contextmanager
+def attack(port):
+    with subprocess.Popen(
+        [sys.executable, str(Path(__file__).with_name("attacker.py")), str(port), str(CONNECTIONS)],
+        stdout=subprocess.PIPE,
+    ) as attacker:
+        try:
+            assert attacker.stdout.readline() == b"open\n"
+            yield
+        finally:
+            attacker.kill()
+
+
+@pytest.mark.parametrize("descriptors", [pytest.param(1024, marks=pytest.mark.long), 256])
+def test_every_press_reaches_the_daemon_and_new_pages_get_in_during_an_attack(tmp_path, descriptors):
+    with page_process(tmp_path, descriptors) as (daemon, port, said), line_to(port) as line:
+        ask(line, do="stop")
+        with attack(port):
+            for press in range(PRESSES):
+                # A machine that is busy with other things may confirm late; it is sent all the same.
+                assert "NOT SENT" not in str(ask(line, do="estop"))
+                assert daemon.actions("status", "drive").count("estop") > press
+            assert get(port, "/", Cookie=COOKIES[port])[0].status == 200
+            with line_to(port) as another:
+                assert "NOT SENT" not in str(ask(another, do="estop"))
+        assert len(said.read_bytes()) < 20_000
