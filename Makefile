@@ -10,7 +10,7 @@ SOURCES := pyproject.toml setup.py constraints.txt firmware_protocol/build_firmw
 # the libraries anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: venv demo chromium test test-all test-rest test-long bench gap-study soak fault-campaign fuzz firmware-check firmware-mutants firmware-emulated cross-tools socketcan-test test-arm ros dist-check docs clean
+.PHONY: venv demo chromium test test-all test-rest test-long test-clones bench gap-study soak fault-campaign fuzz firmware-check firmware-mutants firmware-emulated cross-tools socketcan-test test-arm ros dist-check docs clean
 
 venv: $(STAMP)
 
@@ -90,6 +90,10 @@ test-all: test
 
 test-long:
 	$(MAKE) test-rest REST=long
+
+# Whether `make test` is ever red by chance: ten fresh clones, the last five beside four busy processes. An hour.
+test-clones: $(STAMP)
+	$(BIN)/python -m tools.clones 10 --busy 5 --most 240 --more 120
 
 # The peers that our figures stand beside, and nothing else needs: in an environment of their own, on top of ours.
 PEERS := .venv-bench

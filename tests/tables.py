@@ -15,7 +15,8 @@ def thinned(names: str | Sequence[str], cases: Sequence[Any], *, quick: int, **o
     thin both: then each quick value of one meets each quick value of the other.
     """
     cases = list(cases)
-    kept = {round(i * (len(cases) - 1) / max(quick - 1, 1)) for i in range(min(quick, len(cases)))}
+    quick = min(quick, len(cases))
+    kept = {round(i * (len(cases) - 1) / max(quick - 1, 1)) for i in range(quick)}
     single = isinstance(names, str) and "," not in names
     parameters = [case if at in kept else _thorough(case, single) for at, case in enumerate(cases)]
     return pytest.mark.parametrize(names, parameters, **options)

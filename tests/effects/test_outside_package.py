@@ -22,6 +22,7 @@ for effects in ({"motor_lag": {"tau_s": 0.1}}, {"motor_lag": {"tau_s": 0.1}, "tu
 """
 
 
+@pytest.mark.thorough
 def test_the_wheels_of_an_effect_that_uses_the_geometry_differ_between_its_points(tmp_path):
     assert OutsidePackage(tmp_path, turn_droop=TURN_DROOP).printed(POINTS_DIFFER).split() == ["False", "True"]
 

@@ -100,6 +100,7 @@ def test_a_sensor_mounted_aside_is_reported_as_a_class():
     assert report.effects[0].experiment
 
 
+@pytest.mark.thorough
 def test_a_steady_circle_is_blind_to_what_it_cannot_show():
     report = report_of(("turn_slip", 0.1), drive="circle")
     assert not report.effects
@@ -167,6 +168,7 @@ def searched(monkeypatch):
     return made
 
 
+@pytest.mark.thorough
 def test_the_names_alone_are_those_of_the_report(searched):
     log = searched({"pose_latency": 0.1, "motor_lag": 0.12}, seed=902, drive="poor")
     report = find_gap(log, MODEL)

@@ -47,6 +47,7 @@ def test_the_same_seed_gives_the_same_posterior(circle):
     assert np.array_equal(again.draws, circle.draws)
 
 
+@pytest.mark.thorough
 def test_a_log_without_encoders_is_driven_by_its_commands():
     log = logged("circle")
     nothing, none = np.empty(0), np.empty(0, dtype=np.int64)

@@ -14,6 +14,7 @@ from drivers.types import PoseSample, WheelCommand, WheelSample
 from sim.plant_parameters import PlantParameters
 from tests.drivers.motor.vendors import VENDORS
 from tests.runtime.simulated import simulated_stack
+from tests.tables import thinned
 
 RADIUS_M, TRACK_M = 0.06, 0.31
 TICK_NS = 20_000_000
@@ -94,7 +95,7 @@ def test_a_wrong_wiring_is_noticed_in_the_first_half_second_of_motion(vendor, wi
     assert all(part in found for part in said.split(".*"))
 
 
-@pytest.mark.parametrize("speeds", [(3.0, 2.0), (-2.0, 2.0), (6.0, 6.0), (-1.0, -3.0), (1.0, 3.0)])
+@thinned("speeds", [(3.0, 2.0), (-2.0, 2.0), (6.0, 6.0), (-1.0, -3.0), (1.0, 3.0)], quick=2)
 @pytest.mark.parametrize("vendor", ONE_OF_EACH, ids=str)
 def test_a_right_wiring_is_let_alone(vendor, speeds):
     assert first_doubt(vendor, AS_TOLD, AS_TOLD, speeds) is None

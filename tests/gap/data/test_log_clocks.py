@@ -168,6 +168,7 @@ def test_a_log_without_commands_or_poses_speaks_for_no_delay():
     assert grid_drive(concatenate([bare, bare])).commands_timed
 
 
+@pytest.mark.thorough
 def test_logs_with_one_clock_are_one():
     logs = [log_of(1, 0.1, 0.06), log_of(2, 0.11, 0.06)]
     together = grid_drive(concatenate(logs))

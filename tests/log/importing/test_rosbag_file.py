@@ -215,6 +215,7 @@ def test_a_pipe_in_a_bags_folder_holds_nobody_up(tmp_path):
         read_rosbag(folder, robot_config())
 
 
+@pytest.mark.thorough
 def test_a_command_on_what_is_no_bag_exits_with_two(tmp_path):
     robot = tmp_path / "robot.toml"
     robot.write_text(ROBOT)
