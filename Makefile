@@ -43,6 +43,7 @@ endif
 test: $(STAMP) chromium
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/vulture
 	nice $(BIN)/mypy & types=$$!; \
 		$(BIN)/python -m pytest -n 0 --collect-only > /dev/null 2>&1 & \
 		$(BIN)/python -m tools.compile_kernels && \

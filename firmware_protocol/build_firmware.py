@@ -23,7 +23,22 @@ HEADERS = (
     "serial_framing.h",
     "slcan.h",
     "parameter_record.h",
+    "core.h",
+    "pose.h",
     "firmware.h",
+)
+# What only the core's own modules include: its layers, from the bottom up, end with reception.c and firmware.c.
+PRIVATE_HEADERS = (
+    "protocol_constants.h",
+    "quantise.h",
+    "timebase.h",
+    "rejection.h",
+    "host.h",
+    "command.h",
+    "drive.h",
+    "supervisor.h",
+    "telemetry.h",
+    "parameters.h",
 )
 SOURCES = (
     "disco_robot.c",
@@ -37,14 +52,17 @@ SOURCES = (
     "transmit.c",
     "serial_framing.c",
     "slcan.c",
+    "quantise.c",
+    "pose.c",
     "timebase.c",
-    "reception.c",
+    "rejection.c",
     "host.c",
     "command.c",
-    "supervisor.c",
     "drive.c",
-    "parameters.c",
+    "supervisor.c",
     "telemetry.c",
+    "parameters.c",
+    "reception.c",
     "firmware.c",
 )
 _WRAPPER = re.compile(r"^(#.*|extern \"C\" \{|\})$", re.MULTILINE)
@@ -66,7 +84,7 @@ def make_ffi() -> FFI:
         "\n".join(f'#include "{header}"' for header in HEADERS),
         sources=[f"firmware_protocol/firmware/{source}" for source in SOURCES],
         include_dirs=["firmware_protocol/firmware"],
-        depends=[f"firmware_protocol/firmware/{header}" for header in (*HEADERS, "core.h", "protocol_constants.h")],
+        depends=[f"firmware_protocol/firmware/{header}" for header in (*HEADERS, *PRIVATE_HEADERS)],
         extra_compile_args=["-std=c99"],
         # One file name however it is built, so that no stale extension can shadow a fresh one.
         py_limited_api=True,

@@ -43,7 +43,6 @@ class TrueState(msgspec.Struct, frozen=True, gc=False):
     left_speed_rad_s: float
     right_speed_rad_s: float
     speed_m_s: float
-    lateral_speed_m_s: float
     yaw_rate_rad_s: float
 
 
@@ -113,8 +112,8 @@ class Plant:
         """The true state now."""
         pose = self._body.pose
         left, right = self._wheels.speeds_rad_s
-        speed, lateral, yaw_rate = self._body.velocity
-        return TrueState(self._now_us, pose.x_m, pose.y_m, wrapped(pose.yaw_rad), left, right, speed, lateral, yaw_rate)
+        speed, _, yaw_rate = self._body.velocity
+        return TrueState(self._now_us, pose.x_m, pose.y_m, wrapped(pose.yaw_rad), left, right, speed, yaw_rate)
 
     def step(
         self,

@@ -1,119 +1,207 @@
-"""What adaptation costs the loop, and what it wins; `python -m tools.bench_adapt steps`: how soon a step is known."""
+"""What adaptation costs the loop, and what it wins; `python -m tools.bench_adapt scenarios`: how well it estimates."""
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 import disco_hw
-from disco_hw.adaptation.adapter import Adapter
-from disco_hw.adaptation.adapter_link import InForce, PoseReading, ProcessLink, Samples, WheelAngles
-from disco_hw.adaptation.geometry_filter import GeometryFilter
-from disco_hw.adaptation.guard import Geometry, believed_geometry, possible_range
-from disco_hw.adaptation.network import Training, train_network, training_range
-from disco_hw.adaptation.recursive import evidence
+from disco_hw.adaptation.fast import FastAdaptation
+from disco_hw.adaptation.guard import Geometry, believed_geometry
 from disco_hw.daemon.run import warm_up
 from disco_hw.experiments import FAST_START, FAST_TASK, running_stack
 from disco_hw.experiments.adapt import AdaptOptions, drive_through_change, run_adapt
-from disco_hw.inference.excitation import USUAL
-from disco_hw.runtime.assembly import make_adaptation, make_pipeline, make_planner, put_in_force
+from disco_hw.runtime.assembly import make_fast_adaptation, make_pipeline, make_planner, put_in_force
 from disco_hw.runtime.robot_setup import Setup, load_setup
 from drivers.types import PoseSample, Readings, WheelSample
-from tools.adaptation_drives import TRUTH, excited, messages
-from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot
+from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots
+
+Array = NDArray[np.float64]
 
 LIVE_S = 30.0
 ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
+LENGTHS = ("radius_m", "axle_m", "x_icr_m")
+# The order of the adaptation's arrays is x_icr, wheel radius, axial distance.
+_TO_ADAPTATION, _FROM_ADAPTATION = [2, 0, 1], [1, 2, 0]
 
 
 def run() -> dict[str, float]:
-    """Microseconds of the daemon's calls, milliseconds of the adapter's, figures of the loop, and of the experiment."""
+    """Microseconds of the daemon's calls, figures of the loop in real time, and of the experiment."""
     setup = load_setup(ROBOT)
-    return _calls(setup) | _adapter(setup) | _live() | _changed_live() | _won_back(setup)
+    return _calls(setup) | _live() | _changed_live() | _won_back(setup)
 
 
-def steps(seeds: int = 12) -> dict[str, float]:
-    """Seconds until the geometry filter and the recursive estimate know 80 % of a step of 15 %, at most LONGEST_STEP_S.
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """A drive of a foreign robot: what it is, how it changes at `change_s`, and how good its poses are.
 
-    Foreign robots that turn at 0.29 rad/s, the same readings for both. Of the recursive estimate every proposal counts,
-    also one that the daemon's checks would have confirmed first.
+    `changed` gives the robot after `seconds` of driving. `narrow`: the belief at first is 1 % wide, else 15 %.
+    `poses`: every how many-th pose arrives, and the noise added to it (m, rad). Judged over the last `judged_s`.
+    `step` of the length number `index` by a factor: how soon 80 % of it is known.
     """
+
+    robot: Callable[[int], ForeignRobot] = lambda seed: ForeignRobot(*NOMINAL)
+    changed: Callable[[ForeignRobot, float], ForeignRobot] = lambda robot, seconds: robot
+    narrow: bool = False
+    poses: tuple[int, float, float] = (1, 0.0, 0.0)
+    duration_s: float = 45.0
+    judged_s: float = 15.0
+    step: tuple[int, float] | None = None
+
+
+CHANGE_S = 15.0
+
+
+def _step(index: int, factor: float, **more: object) -> Scenario:
+    name = LENGTHS[index]
+    changed: dict[str, float] = {name: NOMINAL[index] * factor}
+
+    def after(robot: ForeignRobot, seconds: float) -> ForeignRobot:
+        return replace(robot, **(changed if seconds >= CHANGE_S else {}), **(more if seconds >= CHANGE_S else {}))  # type: ignore[arg-type]
+
+    return Scenario(changed=after, step=(index, factor))
+
+
+def _unlike(seed: int) -> ForeignRobot:
+    return robots(8000 + seed, 1)[0]
+
+
+SCENARIOS: dict[str, Scenario] = {
+    **{
+        f"{name} {100 * (factor - 1):+.0f} %": _step(index, factor)
+        for index, name in enumerate(LENGTHS)
+        for factor in (1.15, 0.85)
+    },
+    "slippery surface": _step(1, 1.1, grip_std=0.08, push_n=160.0),
+    "robot unlike its model": Scenario(robot=_unlike),
+    "the same, belief of 1 %": Scenario(robot=lambda seed: robots(8000 + seed, 1, 0.10)[0], narrow=True),
+    "radius drifts 5 % in 60 s": Scenario(
+        changed=lambda robot, seconds: replace(robot, radius_m=NOMINAL[0] * (1.0 - 0.05 * min(seconds / 60.0, 1.0))),
+        duration_s=70.0,
+        judged_s=40.0,
+    ),
+    "no change, rough ground": Scenario(
+        robot=lambda seed: ForeignRobot(*NOMINAL, grip_std=0.08), duration_s=60.0, judged_s=40.0
+    ),
+    "no change, belief of 1 %": Scenario(narrow=True, duration_s=60.0, judged_s=50.0),
+    "poses 5 Hz, 10 mm": Scenario(robot=_unlike, poses=(5, 0.01, 0.015), duration_s=60.0),
+    "poses 2 Hz, 25 mm": Scenario(robot=_unlike, poses=(12, 0.025, 0.03), duration_s=90.0, judged_s=30.0),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Estimated:
+    """One drive: root mean square error (3,) by size, share of time (3,) in which the 90 % interval held the truth.
+
+    `known_s` after a step until 80 % of it was known (infinite: never); `changes` that the filter believed in.
+    """
+
+    error: Array
+    held: Array
+    known_s: float
+    changes: int
+
+
+def scenarios(seeds: int = 8) -> dict[str, float]:
+    """Errors and coverage of the filter's estimates on foreign robots, and how soon a change is known."""
     figures: dict[str, float] = {}
-    for index, field in enumerate(("radius_m", "axle_m", "x_icr_m")):
-        for factor in (1.15, 0.85):
-            taken = np.array([step_known_s(index, field, factor, seed) for seed in range(61, 61 + seeds)])
-            key = f"adapt.step.{field}_{factor:g}"
-            for name, column in zip(("filter", "recursive"), taken.T, strict=True):
-                figures |= {f"{key}.{name}_median_s": float(np.median(column)), f"{key}.{name}_worst_s": column.max()}
+    for name, scenario in SCENARIOS.items():
+        found = [estimate(scenario, seed) for seed in range(seeds)]
+        key = f"adapt.{name}"
+        errors, held = (np.array([getattr(one, field) for one in found]) for field in ("error", "held"))
+        for index, length in enumerate(LENGTHS):
+            figures[f"{key}.{length}_error_percent"] = float(100.0 * np.median(errors[:, index]))
+            figures[f"{key}.{length}_held_percent"] = float(100.0 * np.mean(held[:, index]))
+        if scenario.step is not None:
+            figures[f"{key}.known_median_s"] = float(np.median([one.known_s for one in found]))
+            figures[f"{key}.known_worst_s"] = max(one.known_s for one in found)
+        figures[f"{key}.changes"] = float(sum(one.changes for one in found))
     return figures
 
 
-CHANGED_AFTER_S, LONGEST_STEP_S = 10.0, 10.0
-# The filter's order is wheel radius, axial distance, x_icr; that of messages begins with x_icr.
-_TO_MESSAGE, _FROM_MESSAGE = [2, 0, 1], [1, 2, 0]
-
-
-def step_known_s(index: int, field: str, factor: float, seed: int) -> tuple[float, float]:
-    """Seconds until filter and recursive estimate know 80 % of a step of one length (`index`, `field`) by `factor`."""
-    mean = np.array(NOMINAL)
-    covariance = np.diag((0.15 / np.sqrt(3.0) * mean) ** 2)
-    filtered, recursive = GeometryFilter(mean, covariance, 0.5 * mean, 1.6 * mean), Adapter()
-    wide = covariance[np.ix_(_TO_MESSAGE, _TO_MESSAGE)].ravel().tolist()
-    recursive.take(InForce(0, tuple(mean[_TO_MESSAGE].tolist()), tuple(wide), adapted=False))
-    plant = ForeignPlant(ForeignRobot(*NOMINAL), (0.0, 0.0, 0.3), seed)
-    found = [LONGEST_STEP_S, LONGEST_STEP_S]
-    begin = round(CHANGED_AFTER_S / 0.02)
-    for tick in range(begin + round(LONGEST_STEP_S / 0.02)):
-        if tick == begin:
-            other = ForeignPlant(replace(plant.robot, **{field: factor * NOMINAL[index]}), plant.pose, 1)
+def estimate(scenario: Scenario, seed: int) -> Estimated:
+    """Drive one scenario in simulated time, and judge the belief in force."""
+    mean = np.array(NOMINAL)[_TO_ADAPTATION]
+    spread = 0.01 if scenario.narrow else 0.15 / math.sqrt(3.0)
+    model = Geometry(mean, np.diag((spread * mean) ** 2))
+    in_force = [model]
+    adaptation = FastAdaptation(model, 0.5 * mean, 1.6 * mean, lambda one: in_force.append(one or model))
+    first = scenario.robot(seed)
+    plant, noise = ForeignPlant(first, (0.0, 0.0, 0.3), seed), np.random.default_rng(seed + 1000)
+    errors, held, known_s = [], [], math.inf
+    for tick in range(round(scenario.duration_s / 0.02)):
+        seconds = 0.02 * tick
+        if tick % 25 == 0:
+            other = ForeignPlant(scenario.changed(first, seconds), plant.pose, 1)
             plant.robot, plant._numbers = other.robot, other._numbers
-        readings = plant.readings()
-        filtered.add(readings.wheels, readings.poses)
-        report = recursive.take(_message(plant.now_ns, readings))
-        plant.advance(2.6, 4.6, 20)
-        if tick < begin:
-            continue
-        believed = [filtered.mean]
-        if report is not None and report.proposals:
-            believed.append(np.array(report.proposals[-1].mean)[_FROM_MESSAGE])
-        for place, one in enumerate(believed):
-            if (one[index] / NOMINAL[index] - 1.0) / (factor - 1.0) > 0.8:
-                found[place] = min(found[place], 0.02 * (tick + 1 - begin))
-        if max(found) < LONGEST_STEP_S:
-            break
-    return found[0], found[1]
+        adaptation.feed(plant.now_ns, _as_good(plant.readings(), scenario.poses, noise))
+        adaptation.step(plant.now_ns)
+        plant.advance(*_commands(seconds), 20)
+        truth = np.array([getattr(plant.robot, length) for length in LENGTHS])
+        believed, deviation = (array[_FROM_ADAPTATION] for array in (in_force[-1].mean, in_force[-1].std))
+        if seconds > scenario.duration_s - scenario.judged_s:
+            errors.append(believed / truth - 1.0)
+            held.append(np.abs(believed - truth) < 1.645 * deviation)
+        if scenario.step is not None and seconds >= CHANGE_S and math.isinf(known_s):
+            index, factor = scenario.step
+            if (believed[index] / NOMINAL[index] - 1.0) / (factor - 1.0) > 0.8:
+                known_s = seconds - CHANGE_S
+    error = np.sqrt(np.mean(np.square(errors), axis=0))
+    return Estimated(error, np.mean(held, axis=0), known_s, adaptation.counts()["changes"])
 
 
-def _message(now_ns: int, readings: Readings) -> Samples:
-    """The readings as the daemon hands them to the adapter's process."""
-    return Samples(
-        now_ns,
-        tuple(WheelAngles(one.t_ns, one.left_angle_rad, one.right_angle_rad) for one in readings.wheels),
-        tuple(PoseReading(one.t_ns, one.x_m, one.y_m, one.yaw_rad) for one in readings.poses),
-    )
+def _commands(seconds: float) -> tuple[float, float]:
+    """Wheel speeds (rad/s) at a time: curves, a straight, a turn the other way, a turn on the spot; 12 s in all."""
+    phase = seconds % 12.0
+    if phase < 4.0:
+        return 3.0 + 0.8 * math.sin(1.7 * seconds), 4.2 - 0.6 * math.sin(1.3 * seconds)
+    if phase < 7.0:
+        return 4.0, 4.0
+    return (4.6, 2.4) if phase < 10.0 else (-1.5, 1.5)
+
+
+def _as_good(readings: Readings, poses: tuple[int, float, float], noise: np.random.Generator) -> Readings:
+    """The readings with poses made rarer and noisier."""
+    every, position_m, yaw_rad = poses
+    found = []
+    for pose in readings.poses:
+        if (pose.t_ns // 40_000_000) % every == 0:
+            x, y, yaw = noise.standard_normal(3) * (position_m, position_m, yaw_rad)
+            spread = math.hypot(pose.position_std_m, position_m), math.hypot(pose.yaw_std_rad, yaw_rad)
+            found.append(
+                msgspec.structs.replace(
+                    pose, x_m=pose.x_m + x, y_m=pose.y_m + y, yaw_rad=pose.yaw_rad + yaw,
+                    position_std_m=spread[0], yaw_std_rad=spread[1],
+                )
+            )  # fmt: skip
+    return Readings(wheels=readings.wheels, poses=tuple(found))
 
 
 def _calls(setup: Setup) -> dict[str, float]:
-    """The calls that the loop makes, the adapter's process at the other end."""
-    link = ProcessLink()
+    """Times of the calls that the loop makes."""
     planner = make_planner(setup.config, setup.model)
     pipeline = make_pipeline(setup.config, setup.model, planner)
     warm_up(pipeline)
-    adaptation = make_adaptation(setup, pipeline, link)
-    readings = Readings(
-        wheels=(WheelSample(1, 1, 0.0, 0.0, 0.0, 0.0),), poses=(PoseSample(1, 1, 0.0, 0.0, 0.0, 0.01, 0.01),)
-    )
-    try:
-        figures = _timed("adapt.step", 2000, lambda k: adaptation.step(k * 20_000_000))
-        figures |= _timed("adapt.feed", 2000, lambda k: adaptation.feed(k * 20_000_000, readings))
-    finally:
-        link.close()
+    adaptation = make_fast_adaptation(setup, pipeline)
+
+    def readings(k: int) -> Readings:
+        t_ns, angle_rad = k * 20_000_000, 0.08 * k
+        pose = PoseSample(t_ns, t_ns, 0.004 * k, 0.0, 0.0, 0.005, 0.01)
+        return Readings(
+            wheels=(WheelSample(t_ns, t_ns, angle_rad, angle_rad, 4.0, 4.0),), poses=(pose,) if k % 2 else ()
+        )
+
+    figures = _timed("adapt.feed", 2000, lambda k: adaptation.feed(k * 20_000_000, readings(k)))
+    figures |= _timed("adapt.step", 2000, lambda k: adaptation.step(k * 20_000_000))
     believed = believed_geometry(setup.model)
     beliefs = [Geometry(believed.mean * (1.0 + 1e-4 * k), believed.covariance) for k in range(300)]
     figures |= _timed("adapt.put_in_force", 300, lambda k: put_in_force(pipeline, setup.model, beliefs[k]))
@@ -128,35 +216,6 @@ def _timed(name: str, count: int, call: Callable[[int], object]) -> dict[str, fl
         taken[k] = 1e6 * (time.perf_counter() - begun)
     p50, p99, p999 = np.percentile(taken, (50.0, 99.0, 99.9))
     return {f"{name}_p50_us": float(p50), f"{name}_p99_us": float(p99), f"{name}_p999_us": float(p999)}
-
-
-def _adapter(setup: Setup) -> dict[str, float]:
-    """A report of the recursive estimate over a full window, training, and a conditioning; coverage of the network."""
-    adapter = Adapter()
-    adapter.take(InForce(0, TRUTH, tuple((np.diag([0.02, 0.006, 0.04]) ** 2).ravel().tolist()), adapted=False))
-    reports = []
-    for message in messages(60.0):
-        begun = time.perf_counter()
-        if adapter.take(message) is not None:
-            reports.append(1e3 * (time.perf_counter() - begun))
-    mean = np.array(TRUTH)
-    low, high = training_range(mean, *possible_range(setup.config.prior))
-    begun = time.perf_counter()
-    network = train_network(Training(low, high, setup.config.robot.max_wheel_speed_rad_s), USUAL, setup.model)
-    figures = {
-        "adapt.report_p50_ms": float(np.median(reports[30:])),
-        "adapt.train_s": time.perf_counter() - begun,
-    }
-    rng = np.random.default_rng(1)
-    inside, taken = [], []
-    for seed in range(100):
-        truth = tuple((mean * rng.uniform(0.85, 1.1, 3)).tolist())
-        window = evidence(excited(8.0, seed=seed, truth=truth), USUAL)
-        begun = time.perf_counter()
-        found = network.condition(window)
-        taken.append(1e3 * (time.perf_counter() - begun))
-        inside.append(np.abs(found.mean - truth) < 1.645 * np.sqrt(np.diag(found.covariance)))
-    return figures | {"adapt.condition_p50_ms": float(np.median(taken)), "adapt.coverage_of_90": float(np.mean(inside))}
 
 
 def _live() -> dict[str, float]:
@@ -201,5 +260,5 @@ def _won_back(setup: Setup) -> dict[str, float]:
 
 if __name__ == "__main__":
     asked = sys.argv[1:]
-    for key, value in (steps(*map(int, asked[1:])) if asked[:1] == ["steps"] else run()).items():
+    for key, value in (scenarios(*map(int, asked[1:])) if asked[:1] == ["scenarios"] else run()).items():
         print(f"{key:45} {value:12.4g}")

@@ -17,9 +17,8 @@ from pathlib import Path
 import msgspec
 
 import disco_hw
-from disco_hw.adaptation import Learnt, NoAdaptation
-from disco_hw.adaptation.adapter_link import NAMES
-from disco_hw.adaptation.guard import believed_geometry
+from disco_hw.adaptation import AdaptationUpdate, NoAdaptation
+from disco_hw.adaptation.guard import NAMES, believed_geometry
 from disco_hw.drive import ManualInput
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
@@ -47,9 +46,9 @@ class LearntOnce(NoAdaptation):
         self._stack, self._at_ns, self._model = stack, at_ns, setup().model
         self._done = False
 
-    def step(self, now_ns: int) -> Learnt:
+    def step(self, now_ns: int) -> AdaptationUpdate:
         if self._done or now_ns < self._at_ns:
-            return Learnt()
+            return AdaptationUpdate()
         self._done = True
         believed = believed_geometry(self._model)
         mean = believed.mean.copy()
@@ -57,7 +56,7 @@ class LearntOnce(NoAdaptation):
         learnt = replace(believed, mean=mean)
         put_in_force(self._stack.core.pipeline, self._model, learnt)
         change = BeliefChange(now_ns, "adapted", NAMES, tuple(mean.tolist()), tuple(learnt.covariance.ravel().tolist()))
-        return Learnt((change,))
+        return AdaptationUpdate((change,))
 
 
 class Hand:

@@ -155,7 +155,6 @@ class Daemon:
         if state is not State.ARMED and now_ns >= self._next_collect_ns:
             # The collector is off; what cycles there are go while nobody depends on the loop.
             gc.collect()
-            self._core.adaptation.tend()
             self._next_collect_ns = now_ns + _COLLECT_NS
 
     def _timing(self, now_ns: int) -> records.Record:

@@ -25,8 +25,6 @@ from typing import Any, Literal, TypeVar
 from numba.core import event
 
 from disco_hw import processes
-from disco_hw.adaptation import GeometryAdaptation
-from disco_hw.adaptation.adapter_link import ProcessLink
 from disco_hw.adaptation.guard import check_adaptable, choose_adaptation
 from disco_hw.config import RobotConfig
 from disco_hw.control.plan import Law, LawController
@@ -45,8 +43,6 @@ from disco_hw.runtime import Ask, by_command
 from disco_hw.runtime.assembly import (
     assemble_core,
     driver_of,
-    make_adaptation,
-    make_audited_adaptation,
     make_fast_adaptation,
     make_link,
     make_pipeline,
@@ -59,9 +55,8 @@ from drivers.kernel_cache import are_kernels_kept
 from drivers.types import PoseSample, Readings, Transport, WheelSample
 from firmware_protocol.codec import packaged_dbc
 
-Adapt = Literal["off", "fast", "audited", "network"]
-"""Who learns the geometry on the way: nobody, a filter in the tick, the same audited by a network in a process of its
-own, or that network alone."""
+Adapt = Literal["off", "fast"]
+"""What learns the geometry while driving: nothing, or the filter in the tick."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +109,7 @@ def run_daemon(
     setup = load_setup(options.robot, options.model, options.link)
     if not options.accept_missing_effects:
         refuse_missing_effects(setup)
-    adapt: Adapt = "network"
+    adapt: Adapt = "fast"
     if options.adapt:
         check_adaptable(setup.model, setup.config.control.uncertainty)
     else:
@@ -149,9 +144,9 @@ def serve(
     """Run until SIGTERM, SIGINT, a quit request or the pilot's end, as `run_daemon`; returns the exit code.
 
     `say` is called in the loop, and so must not wait. `pilot` decides what the robot does while motion is allowed;
-    `new_planner` is called twice, as one planner is used up in the warm-up. `adapt`: who learns the geometry on the
-    way; nobody where a person drives. `ask`: how a person asks for what comes next; with it the daemon says what it
-    waits for, what to do, and where the log is. Raises InputError.
+    `new_planner` is called twice, as one planner is used up in the warm-up. `adapt`: whether the geometry is learnt
+    while driving; not where an operator drives. `ask`: how a person asks for what comes next; with it the daemon says
+    what it waits for, what to do, and where the log is. Raises InputError.
     """
     key, transport = link_key(setup), make_link(setup)
     # Before the signals are caught: whoever has enough of a compilation may break it off, as nothing is open yet.
@@ -200,16 +195,7 @@ def _start(
     if ask is not None and log is not None:
         stop.add("log", lambda: say("log", f"look at it: disco-hw view {log}, or disco-hw log info {log}"))
     stop.add(_RECORDER, lambda: _close_recorder(recorder, say))
-    adaptation: GeometryAdaptation | None = None
-    match adapt:
-        case "network":
-            adaptation = make_adaptation(setup, pipeline, ProcessLink())
-        case "fast":
-            adaptation = make_fast_adaptation(setup, pipeline)
-        case "audited":
-            adaptation = make_audited_adaptation(setup, pipeline, ProcessLink())
-    if adaptation is not None:
-        stop.add("adapter", adaptation.close)
+    adaptation = make_fast_adaptation(setup, pipeline) if adapt == "fast" else None
     for step in processes.enter_real_time(config.daemon.realtime_priority):
         say("real time", str(step))
     for line in passed_over(server.path):

@@ -13,13 +13,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 import disco_hw
-from disco_hw.adaptation.adapter import Adapter, InlineLink
-from disco_hw.adaptation.adapter_link import NAMES
-from disco_hw.adaptation.guard import Geometry, believed_geometry, with_geometry
+from disco_hw.adaptation.guard import NAMES, Geometry, believed_geometry, with_geometry
 from disco_hw.effects import surface_change
 from disco_hw.experiments import running_stack
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
@@ -251,7 +250,9 @@ def drive(
     recorder: MemoryRecorder | None = None,
 ) -> AdaptRun:
     """One drive round the circle from standstill; times count from the start of driving."""
-    config = setup.config
+    control = msgspec.structs.replace(setup.config.control, adaptation="fast" if adapted else "off")
+    config = msgspec.structs.replace(setup.config, control=control)
+    setup = replace(setup, config=config)
     task = circle_task(config.task, "experiment adapt")
     mean = believed_geometry(setup.model).mean
     plant = replace(
@@ -265,7 +266,6 @@ def drive(
         setup,
         virtual_robot(setup, plant, start, effects=effects, seed=seed),
         make_planner(config, setup.model),
-        adapter=InlineLink(Adapter()) if adapted else None,
         recorder=recorder,
     )
     rows: list[tuple[float, float, float, float]] = []

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.adaptation import GeometryAdaptation
-from disco_hw.adaptation.adapter_link import AdapterLink
 from disco_hw.adaptation.guard import choose_adaptation
 from disco_hw.config import RobotConfig
 from disco_hw.control.plan import Law, LawController
@@ -29,8 +28,6 @@ from disco_hw.reports import refuse_file
 from disco_hw.runtime.assembly import (
     assemble_core,
     driver_of,
-    make_adaptation,
-    make_audited_adaptation,
     make_fast_adaptation,
     make_pipeline,
     make_planner,
@@ -73,7 +70,7 @@ def virtual_robot(
 class SimulatedRun:
     """A virtual robot, driven by the daemon's core with this planner and pilot.
 
-    Without `needs_pose` motion needs no pose, whatever robot.toml says. `adapter`: the geometry is learnt on the way.
+    Without `needs_pose` motion needs no pose, whatever robot.toml says.
     """
 
     def __init__(
@@ -84,7 +81,6 @@ class SimulatedRun:
         pilot: Pilot | None = None,
         *,
         needs_pose: bool | None = None,
-        adapter: AdapterLink | None = None,
         recorder: MemoryRecorder | None = None,
     ) -> None:
         self.robot = robot
@@ -100,18 +96,14 @@ class SimulatedRun:
             pipeline,
             self.recorder,
             self.pilot.needs_pose if needs_pose is None else needs_pose,
-            adaptation=self._adaptation(setup, pipeline, adapter),
+            adaptation=self._adaptation(setup, pipeline),
         )
         if isinstance(self.pilot, FindsWiring):
             self.core.directions = None
         self._period_us = round(1e6 / setup.config.control.rate_hz)
 
     @staticmethod
-    def _adaptation(setup: Setup, pipeline: Pipeline, adapter: AdapterLink | None) -> GeometryAdaptation | None:
-        wanted = setup.config.control.adaptation
-        if adapter is not None:
-            make = make_audited_adaptation if wanted == "audited" else make_adaptation
-            return make(setup, pipeline, adapter)
+    def _adaptation(setup: Setup, pipeline: Pipeline) -> GeometryAdaptation | None:
         chosen = choose_adaptation(setup.config.control, setup.config.pose, setup.model)
         return None if chosen.kind == "off" else make_fast_adaptation(setup, pipeline)
 

@@ -185,7 +185,6 @@ class DensityNetwork:
 
     scaling: Scaling
     stack: _Stack
-    validation_log_density: float
 
     def mixtures(self, statistics: Array) -> Mixtures:
         """Mixtures of all members together for statistics (n, S)."""
@@ -220,10 +219,10 @@ def train(
                 torch.as_tensor(skip, dtype=torch.float32),
                 torch.as_tensor(residual, dtype=torch.float32),
             )
-            validation = _fit(stack, x, y, settings)
+            _fit(stack, x, y, settings)
     finally:
         torch.set_num_threads(threads)
-    return DensityNetwork(scaling, stack, validation)
+    return DensityNetwork(scaling, stack)
 
 
 def _least_squares(features: Array, targets: Array) -> tuple[Array, Array]:
@@ -234,8 +233,8 @@ def _least_squares(features: Array, targets: Array) -> tuple[Array, Array]:
     return skip, np.maximum((targets - columns @ skip).std(axis=0), 1e-3)
 
 
-def _fit(stack: _Stack, x: torch.Tensor, y: torch.Tensor, settings: NetworkSettings) -> float:
-    """Train in place with early stopping; returns the mean validation log density of the members."""
+def _fit(stack: _Stack, x: torch.Tensor, y: torch.Tensor, settings: NetworkSettings) -> None:
+    """Train an ensemble in place, with early stopping by the log density of held-out pairs."""
     members, count = settings.members, x.shape[0]
     held = max(8, round(_VALIDATION_SHARE * count))
     order = torch.stack([torch.randperm(count) for _ in range(members)])
@@ -268,7 +267,6 @@ def _fit(stack: _Stack, x: torch.Tensor, y: torch.Tensor, settings: NetworkSetti
     with torch.no_grad():
         for copy, parameter in zip(kept, stack.parameters(), strict=True):
             parameter.copy_(copy)
-    return float(best.mean())
 
 
 Simulate = Callable[[Array, Seeds], Array]

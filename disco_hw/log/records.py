@@ -185,11 +185,11 @@ class BeliefChange(msgspec.Struct, frozen=True, gc=False):
 
 
 class Adaptation(msgspec.Struct, frozen=True, gc=False):
-    """The result of one report of the adapter: `outcome` for machines, `text` for a person.
+    """Result of one step of adaptation: `outcome` for machines, `text` for the operator.
 
-    published, confirming, agrees, refused: of a proposal, whose `mean` and `std` are given; idle: there was none;
-    reverted: back to the model file; lost: no adapter; audit: the network's estimate beside the filter's; taken_over:
-    the network drives from now on. `data_s` of driving that the proposal rests on.
+    refused: an estimate that failed a check; reverted: the model file's belief is in force again. Logs up to version
+    0.1 also hold published, confirming, agrees, idle, lost, audit and taken_over, of estimators that no longer exist;
+    `mean`, `std` (order of `names`) and `data_s` of driving belong to these.
     """
 
     t_ns: int

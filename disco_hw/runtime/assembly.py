@@ -5,12 +5,10 @@ from __future__ import annotations
 import msgspec
 
 from disco_hw import control
-from disco_hw.adaptation import CheckedAdaptation, GeometryAdaptation
-from disco_hw.adaptation.adapter_link import AdapterLink
-from disco_hw.adaptation.fast import AuditedAdaptation, FastAdaptation
+from disco_hw.adaptation import GeometryAdaptation
+from disco_hw.adaptation.fast import FastAdaptation
 from disco_hw.adaptation.guard import (
     ASKED_BY_FILE,
-    BeliefGuard,
     Geometry,
     believed_geometry,
     check_adaptable,
@@ -75,22 +73,6 @@ def make_pipeline(config: RobotConfig, model: Model, planner: Planner) -> Pipeli
     )
 
 
-def make_adaptation(setup: Setup, pipeline: Pipeline, link: AdapterLink) -> CheckedAdaptation:
-    """Adaptation of this robot's belief over its geometry; raises InputError where the model does not allow it.
-
-    `pipeline` has taken no step yet.
-    """
-    check_adaptable(setup.model, setup.config.control.uncertainty)
-    believed = _rehearsed(setup, pipeline)
-    return CheckedAdaptation(
-        link,
-        BeliefGuard(believed, *possible_range(setup.config.prior)),
-        believed,
-        lambda geometry: put_in_force(pipeline, setup.model, geometry),
-        setup.config.robot.max_wheel_speed_rad_s,
-    )
-
-
 def make_fast_adaptation(setup: Setup, pipeline: Pipeline) -> FastAdaptation:
     """The filter that learns the geometry in the tick itself; raises InputError where the model does not allow it.
 
@@ -102,18 +84,6 @@ def make_fast_adaptation(setup: Setup, pipeline: Pipeline) -> FastAdaptation:
         *possible_range(setup.config.prior),
         lambda geometry: put_in_force(pipeline, setup.model, geometry),
         setup.config.control.disturbance,
-    )
-
-
-def make_audited_adaptation(setup: Setup, pipeline: Pipeline, link: AdapterLink) -> AuditedAdaptation:
-    """The same filter with a density network at the end of `link` that audits it; raises InputError as above."""
-    check_adaptable(setup.model, setup.config.control.uncertainty, ASKED_BY_FILE)
-    return AuditedAdaptation(
-        _rehearsed(setup, pipeline),
-        *possible_range(setup.config.prior),
-        link,
-        lambda geometry: put_in_force(pipeline, setup.model, geometry),
-        setup.config.robot.max_wheel_speed_rad_s,
     )
 
 

@@ -1,5 +1,9 @@
-#include "core.h"
+#include "command.h"
+
 #include "disco_robot.h"
+#include "protocol_constants.h"
+#include "rejection.h"
+#include "timebase.h"
 
 #define LENGTH (8u)
 #define ZEROS_TO_ARM (5u)

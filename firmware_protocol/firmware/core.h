@@ -1,50 +1,113 @@
-/* What the parts of the core share; not for its users. */
+/* The state of the firmware core, which its modules share; users of the core include firmware.h. */
 #ifndef DISCO_CORE_H
 #define DISCO_CORE_H
 
-#include "firmware.h"
-#include "protocol_constants.h"
+#include <stdbool.h>
+#include <stdint.h>
 
-/* timebase.c: the core's own time, and its second clock, the count of its cycles */
-void disco_time_advance(disco_firmware_t *core, uint64_t clock_us);
-/* From one time to a later one, or the most that fits. */
-uint32_t disco_elapsed_us(uint64_t now_us, uint64_t since_us);
-void disco_time_step(disco_firmware_t *core, uint64_t clock_us);
+#include "robot_config.h"
+#include "authentication.h"
+#include "e2e.h"
+#include "faults.h"
+#include "wheel_limits.h"
+#include "transmit.h"
 
-/* reception.c */
-void disco_reject(disco_firmware_t *core, uint8_t reason);
-bool disco_e2e_usable(disco_firmware_t *core, disco_e2e_status_t status, bool qualified);
+enum { DISCO_REJECT_REASONS = 16, DISCO_PERIODIC = 7, DISCO_INTRODUCTION = 4 };
 
-/* host.c: handshake, requests, sessions */
-void disco_host_hello(disco_firmware_t *core, const uint8_t *data);
-void disco_host_state(disco_firmware_t *core, const uint8_t *data, bool crc_ok);
-void disco_host_expire(disco_firmware_t *core);
-void disco_session_open(disco_firmware_t *core);
-void disco_session_close(disco_firmware_t *core);
-void disco_session_new_challenge(disco_firmware_t *core);
+/* The other end, as far as it has proved itself. */
+typedef struct {
+    disco_e2e_receiver_t e2e;
+    uint64_t last_state_us;
+    uint64_t last_frame_us;
+    uint16_t fault;
+    uint8_t request;
+    uint8_t session;
+    bool accepted;
+    bool hash_mismatch;
+    bool major_mismatch;
+    bool hello_requested;
+    bool reset_pending;
+} disco_host_t;
 
-/* command.c: the wheel command and its watchdog */
-void disco_command_receive(disco_firmware_t *core, const uint8_t *data, bool crc_ok);
-void disco_command_arm(disco_firmware_t *core);
-void disco_command_expire(disco_firmware_t *core);
-bool disco_command_enough_zeros(const disco_firmware_t *core);
-bool disco_command_older_than(const disco_firmware_t *core, uint32_t age_us);
+typedef struct {
+    uint16_t challenge;
+    uint64_t entropy;
+    uint32_t entries; /* makes each challenge another one */
+    uint8_t current;  /* 0: none */
+    uint8_t last;
+    bool challenge_answered;
+} disco_session_t;
 
-/* supervisor.c: conditions and transitions */
-void disco_estop_latch(disco_firmware_t *core, uint8_t source);
-uint8_t disco_blockers(const disco_firmware_t *core);
-void disco_supervise(disco_firmware_t *core);
+typedef struct {
+    disco_e2e_receiver_t e2e;
+    uint64_t last_accepted_us;
+    uint64_t last_accepted_cycles_us; /* the same on the second clock */
+    uint64_t last_motion_us; /* when motion was last asked for, accepted or not */
+    uint32_t valid_for_us;
+    uint32_t accepted_count;
+    disco_wheels_t target;
+    uint8_t mode;
+    uint8_t counter;
+    uint8_t zero_count;
+} disco_command_t;
 
-/* drive.c: what the wheels do in each state */
-void disco_drive_step(disco_firmware_t *core);
-bool disco_wheels_still(const disco_firmware_t *core);
+typedef struct {
+    disco_wheels_t setpoint;
+    uint64_t stop_since_us;
+    bool enabled;
+    bool brake;
+    bool limited;
+} disco_drive_t;
 
-/* parameters.c */
-void disco_parameter_request(disco_firmware_t *core, const uint8_t *data);
+typedef struct {
+    uint64_t due_us[DISCO_PERIODIC];
+    uint64_t hello_us;
+    uint16_t shown_fault;
+    uint16_t shown_challenge;
+    uint8_t shown_state;
+    uint8_t shown_session;
+    bool shown_accepted;
+    uint8_t next_part; /* of the introduction */
+    bool limits_changed;
+    bool introduced;
+} disco_telemetry_t;
 
-/* telemetry.c */
-void disco_telemetry_step(disco_firmware_t *core);
-void disco_telemetry_time(disco_firmware_t *core, uint8_t sequence);
-void disco_telemetry_parameter(disco_firmware_t *core, uint8_t status, uint16_t key, float value);
+/* What is asked for most often comes first: a Cortex-M0+ reaches only the first bytes of a struct in one instruction. */
+typedef struct {
+    uint8_t state;
+    uint8_t estop_source;
+    uint8_t stop_cause;
+    uint8_t reject_reason;
+    bool config_valid;
+    bool self_test_passed;
+    bool bus_off;
+    bool inputs_known;
+    bool clock_mismatch;
+    bool entropy_valid;
+    disco_session_t session;
+    uint64_t now_us;         /* the core's own time, which only goes forwards */
+    uint64_t clock_us;       /* the caller's clock, when it last told */
+    uint64_t cycle_clock_us; /* the same, at the last cycle */
+    uint64_t cycles_us;      /* the second clock: cycles, each as long as it should be */
+    int32_t clock_ahead_us;  /* of the second clock, forgotten slowly */
+    uint32_t rejected_total;
+    uint32_t crc_errors;
+    uint32_t sequence_errors;
+    uint32_t watchdog_events;
+    disco_drive_t drive;
+    disco_host_t host;
+    disco_command_t command;
+    disco_config_t config;
+    disco_inputs_t inputs;
+    disco_telemetry_t telemetry;
+    uint32_t bus_off_events;
+    uint32_t clock_errors;
+    uint32_t unknown_frames;
+    uint32_t parameter_writes; /* by the host, accepted */
+    uint32_t rejected[DISCO_REJECT_REASONS];
+    disco_faults_t faults;
+    disco_transmit_t transmit;
+    disco_authentication_t authentication;
+} disco_firmware_t;
 
 #endif

@@ -1,6 +1,10 @@
+#include "drive.h"
+
 #include <math.h>
 
-#include "core.h"
+#include "command.h"
+#include "protocol_constants.h"
+#include "timebase.h"
 
 static const disco_wheels_t standstill = {0.0f, 0.0f};
 

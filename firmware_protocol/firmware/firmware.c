@@ -1,6 +1,12 @@
 #include "firmware.h"
 
-#include "core.h"
+#include "command.h"
+#include "drive.h"
+#include "host.h"
+#include "protocol_constants.h"
+#include "supervisor.h"
+#include "telemetry.h"
+#include "timebase.h"
 
 #define BUS_OFF_ABOVE (255u)
 
@@ -89,4 +95,9 @@ void disco_firmware_step(disco_firmware_t *core, uint64_t now_us, const disco_in
 bool disco_firmware_pop(disco_firmware_t *core, disco_frame_t *frame)
 {
     return disco_transmit_pop(&core->transmit, frame);
+}
+
+void disco_firmware_pose(disco_firmware_t *core, const disco_pose_t *pose, uint64_t sample_us)
+{
+    disco_telemetry_pose(core, pose, sample_us);
 }

@@ -1,5 +1,9 @@
-#include "core.h"
+#include "host.h"
+
 #include "disco_robot.h"
+#include "protocol_constants.h"
+#include "rejection.h"
+#include "timebase.h"
 
 #define LENGTH (8u)
 #define MIXING_STEP UINT64_C(0x9E3779B97F4A7C15)

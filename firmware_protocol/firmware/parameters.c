@@ -1,9 +1,12 @@
+#include "parameters.h"
+
 #include <math.h>
 #include <string.h>
 
-#include "core.h"
 #include "disco_robot.h"
 #include "parameter_record.h"
+#include "protocol_constants.h"
+#include "telemetry.h"
 
 #define LENGTH (8u)
 #define RECORD_FORMAT (1u)

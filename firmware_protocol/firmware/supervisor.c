@@ -1,5 +1,11 @@
-#include "core.h"
+#include "supervisor.h"
+
+#include "command.h"
+#include "drive.h"
+#include "host.h"
+#include "protocol_constants.h"
 #include "states.h"
+#include "timebase.h"
 
 void disco_estop_latch(disco_firmware_t *core, uint8_t source)
 {

@@ -1,8 +1,10 @@
-#include <math.h>
-#include <string.h>
+#include "telemetry.h"
 
-#include "core.h"
 #include "disco_robot.h"
+#include "protocol_constants.h"
+#include "quantise.h"
+#include "supervisor.h"
+#include "timebase.h"
 
 #define LENGTH (8u)
 #define US_PER_MS (1000u)
@@ -10,19 +12,10 @@
 #define TIME_MASK (UINT64_C(0xFFFFFFFFFF))
 /* However often a host asks, the answer to HELLO_REQUEST leaves room for everything else. */
 #define HELLO_SPACING_US (20000u)
-/* A float is (fraction + implicit bit) * 2^(exponent - INTEGER_EXPONENT); from that exponent on, all are out of range. */
-#define FRACTION_BITS (23u)
-#define FRACTION_MASK (0x007FFFFFu)
-#define IMPLICIT_BIT (0x00800000u)
-#define EXPONENT_MASK (0xFFu)
-#define INTEGER_EXPONENT (150u)
-/* 24 bits by 10000 are 38: further down, nothing is left of them. */
-#define SMALLEST_SHIFT (39u)
 #define HIGH_TIME_MASK (0xFFu)
 #define FIRST_LIMITS (2u)
 #define LARGEST_POSITION (0x7FFFFF)
 #define BEYOND_POSITION (0x800000)
-#define BEYOND_YAW (0x8000)
 
 /* One transmit counter each. */
 enum {
@@ -58,49 +51,6 @@ static void send_frame(disco_firmware_t *core, uint16_t can_id, const uint8_t *d
     disco_transmit_send(&core->transmit, can_id, data, DISCO_DATA_ID(can_id, major));
 }
 
-/* The raw value nearest to a physical one, within the signal's range; 0 for what is not a number. Exact, in integers: a
- * float has too few bits for it, and a double costs a controller hundreds of instructions. */
-static int32_t raw(float value, uint32_t per_unit, int32_t minimum, int32_t maximum)
-{
-    uint32_t bits;
-    (void)memcpy(&bits, &value, sizeof(bits));
-    const bool negative = (bits >> 31) != 0u;
-    const uint32_t exponent = (bits >> FRACTION_BITS) & EXPONENT_MASK;
-    const uint32_t shift = INTEGER_EXPONENT - exponent;
-    int32_t result;
-    if (isnan(value)) {
-        result = 0;
-    } else if (exponent >= INTEGER_EXPONENT) {
-        result = negative ? minimum : maximum;
-    } else if (shift > SMALLEST_SHIFT) {
-        result = 0;
-    } else {
-        /* Halves go up, so that those of negative values go towards zero. */
-        const uint64_t half = UINT64_C(1) << (shift - 1u);
-        const uint64_t magnitude = (uint64_t)((bits & FRACTION_MASK) | IMPLICIT_BIT) * per_unit;
-        const uint64_t rounded = ((magnitude + half) - (negative ? 1u : 0u)) >> shift;
-        const uint32_t bound = (uint32_t)(negative ? -minimum : maximum);
-        const int32_t limited = (int32_t)((rounded < bound) ? (uint32_t)rounded : bound);
-        result = negative ? -limited : limited;
-    }
-    return result;
-}
-
-static int16_t raw_i16(float value, uint32_t per_unit)
-{
-    return (int16_t)raw(value, per_unit, INT16_MIN, INT16_MAX);
-}
-
-static uint16_t raw_u16(float value, uint32_t per_unit)
-{
-    return (uint16_t)raw(value, per_unit, 0, UINT16_MAX);
-}
-
-static int8_t raw_i8(float value)
-{
-    return (int8_t)raw(value, 1u, INT8_MIN, INT8_MAX);
-}
-
 static uint16_t milliseconds(uint32_t us)
 {
     const uint32_t rounded = (us + (US_PER_MS / 2u)) / US_PER_MS;
@@ -130,8 +80,8 @@ static void send_wheels(disco_firmware_t *core)
         .right_valid = (uint8_t)(in->encoder_valid[1] && disco_finite(in->wheel_speed[1])),
         .driver_enabled = core->drive.enabled,
         .limited = core->drive.limited,
-        .left_speed = raw_i16(in->wheel_speed[0], DISCO_WHEEL_SPEED_LEFT_SPEED_PER_UNIT),
-        .right_speed = raw_i16(in->wheel_speed[1], DISCO_WHEEL_SPEED_RIGHT_SPEED_PER_UNIT),
+        .left_speed = disco_raw_i16(in->wheel_speed[0], DISCO_WHEEL_SPEED_LEFT_SPEED_PER_UNIT),
+        .right_speed = disco_raw_i16(in->wheel_speed[1], DISCO_WHEEL_SPEED_RIGHT_SPEED_PER_UNIT),
         .sample_time = time_in(core->now_us, DISCO_WHEEL_SPEED_SAMPLE_TIME_SCALE),
     };
     struct disco_robot_wheel_ticks_t ticks = {
@@ -146,10 +96,10 @@ static void send_motor(disco_firmware_t *core)
 {
     const disco_inputs_t *in = &core->inputs;
     struct disco_robot_motor_t motor = {
-        .left_current = raw_i16(in->current[0], DISCO_MOTOR_LEFT_CURRENT_PER_UNIT),
-        .right_current = raw_i16(in->current[1], DISCO_MOTOR_RIGHT_CURRENT_PER_UNIT),
-        .left_temperature = raw_i8(in->temperature[0]),
-        .right_temperature = raw_i8(in->temperature[1]),
+        .left_current = disco_raw_i16(in->current[0], DISCO_MOTOR_LEFT_CURRENT_PER_UNIT),
+        .right_current = disco_raw_i16(in->current[1], DISCO_MOTOR_RIGHT_CURRENT_PER_UNIT),
+        .left_temperature = disco_raw_i8(in->temperature[0]),
+        .right_temperature = disco_raw_i8(in->temperature[1]),
     };
     SEND(core, MOTOR, motor, motor);
 }
@@ -198,9 +148,9 @@ static void send_power(disco_firmware_t *core)
 {
     const disco_inputs_t *in = &core->inputs;
     struct disco_robot_power_t power = {
-        .voltage = raw_u16(in->voltage, DISCO_POWER_VOLTAGE_PER_UNIT),
-        .current = raw_i16(in->battery_current, DISCO_POWER_CURRENT_PER_UNIT),
-        .temperature = raw_i8(in->battery_temperature),
+        .voltage = disco_raw_u16(in->voltage, DISCO_POWER_VOLTAGE_PER_UNIT),
+        .current = disco_raw_i16(in->battery_current, DISCO_POWER_CURRENT_PER_UNIT),
+        .temperature = disco_raw_i8(in->battery_temperature),
     };
     SEND(core, POWER, power, power);
 }
@@ -223,8 +173,8 @@ static void send_first_limits(disco_firmware_t *core)
     const disco_config_t *config = &core->config;
     struct disco_robot_limits_t limits = {
         .page = 0u,
-        .max_wheel_speed = raw_u16(config->max_wheel_speed, DISCO_LIMITS_MAX_WHEEL_SPEED_PER_UNIT),
-        .max_wheel_acceleration = raw_u16(config->max_wheel_acceleration, DISCO_LIMITS_MAX_WHEEL_ACCELERATION_PER_UNIT),
+        .max_wheel_speed = disco_raw_u16(config->max_wheel_speed, DISCO_LIMITS_MAX_WHEEL_SPEED_PER_UNIT),
+        .max_wheel_acceleration = disco_raw_u16(config->max_wheel_acceleration, DISCO_LIMITS_MAX_WHEEL_ACCELERATION_PER_UNIT),
         .ticks_per_rev = config->ticks_per_rev,
     };
     SEND(core, LIMITS, limits, limits);
@@ -237,7 +187,7 @@ static void send_second_limits(disco_firmware_t *core)
         .page = 1u,
         .command_timeout = milliseconds(config->command_timeout_us),
         .drive_off_timeout = milliseconds(config->drive_off_timeout_us),
-        .stop_deceleration = raw_u16(config->stop_deceleration, DISCO_LIMITS_STOP_DECELERATION_PER_UNIT),
+        .stop_deceleration = disco_raw_u16(config->stop_deceleration, DISCO_LIMITS_STOP_DECELERATION_PER_UNIT),
     };
     SEND(core, LIMITS, limits, limits);
 }
@@ -274,26 +224,13 @@ void disco_telemetry_parameter(disco_firmware_t *core, uint8_t status, uint16_t 
     SEND(core, PARAM_RESPONSE, param_response, response);
 }
 
-disco_pose_t disco_pose(float x, float y, float yaw, float position_std, float yaw_std)
-{
-    const bool known = disco_finite(x) && disco_finite(y) && disco_finite(yaw) && (position_std >= 0.0f) && (yaw_std >= 0.0f);
-    return (disco_pose_t){
-        .valid = known,
-        .x = raw(x, DISCO_POSE_POSITION_X_PER_UNIT, -BEYOND_POSITION, BEYOND_POSITION),
-        .y = raw(y, DISCO_POSE_POSITION_Y_PER_UNIT, -BEYOND_POSITION, BEYOND_POSITION),
-        .yaw = raw(yaw, DISCO_POSE_HEADING_YAW_PER_UNIT, -BEYOND_YAW, BEYOND_YAW),
-        .position_std = raw_u16(position_std, DISCO_POSE_HEADING_POSITION_STD_PER_UNIT),
-        .yaw_std = raw_u16(yaw_std, DISCO_POSE_HEADING_YAW_STD_PER_UNIT),
-    };
-}
-
 static int32_t within(int32_t value, int32_t minimum, int32_t maximum)
 {
     const int32_t not_above = (value < maximum) ? value : maximum;
     return (not_above > minimum) ? not_above : minimum;
 }
 
-void disco_firmware_pose(disco_firmware_t *core, const disco_pose_t *pose, uint64_t sample_us)
+void disco_telemetry_pose(disco_firmware_t *core, const disco_pose_t *pose, uint64_t sample_us)
 {
     const uint64_t own_us = sample_us + (core->now_us - core->clock_us);
     const int32_t x = within(pose->x, -BEYOND_POSITION, LARGEST_POSITION);

@@ -1,4 +1,4 @@
-#include "core.h"
+#include "timebase.h"
 
 #define FRAME_AHEAD_US (10000u)
 /* How far the clock and the count of cycles may come apart, of which a tenth of a cycle is forgotten in each cycle. */

@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from disco_hw.adaptation.guard import (
     believed_geometry,
     check_adaptable,
     choose_adaptation,
+    geometry_fault,
     possible_range,
     with_geometry,
 )
@@ -67,8 +69,10 @@ def test_poses_that_are_not_good_enough_are_named(field, value):
 
 def test_what_the_file_asks_for_counts_whatever_the_poses():
     assert choose_adaptation(Control(adaptation="off"), GOOD, MODEL).kind == "off"
-    for asked in ("fast", "audited"):
-        assert choose_adaptation(Control(adaptation=asked), PoseInput(), MODEL).kind == asked
+    assert choose_adaptation(Control(adaptation="fast"), PoseInput(), MODEL).kind == "fast"
+    deprecated = choose_adaptation(Control(adaptation="audited"), PoseInput(), MODEL)
+    assert deprecated.kind == "fast"
+    assert 'write "fast"' in deprecated.why
     with pytest.raises(InputError, match=r"^control.adaptation: .*uncertainty"):
         choose_adaptation(Control(adaptation="fast", uncertainty="point"), GOOD, MODEL)
 
@@ -83,3 +87,30 @@ def test_the_range_is_the_prior_as_far_as_it_is_possible():
     low, high = possible_range(Prior(wheel_radius_m=(0.0, 0.2)))
     assert low.tolist() == [0.0, 0.005, 0.1]
     assert high.tolist() == [0.5, 0.2, 0.5]
+
+
+MEAN = np.array([0.238, 0.061, 0.415])
+LOW, HIGH = 0.5 * MEAN, 1.6 * MEAN
+GOOD_COVARIANCE = np.diag((0.02 * MEAN) ** 2)
+TOO_CORRELATED = GOOD_COVARIANCE + 1.01 * (0.02**2 * MEAN[0] * MEAN[1]) * np.array([[0, 1, 0], [1, 0, 0], [0, 0, 0]])
+
+
+@pytest.mark.parametrize(
+    ("mean", "covariance", "fault"),
+    [
+        (MEAN, GOOD_COVARIANCE, ""),
+        (LOW, GOOD_COVARIANCE, ""),
+        (HIGH, GOOD_COVARIANCE, ""),
+        (MEAN * np.nan, GOOD_COVARIANCE, "not finite"),
+        (MEAN, np.full((3, 3), np.inf), "not finite"),
+        (MEAN, GOOD_COVARIANCE * 0.0, "no covariance"),
+        (MEAN, -GOOD_COVARIANCE, "no covariance"),
+        (MEAN, GOOD_COVARIANCE * 1e300, "no covariance"),
+        (MEAN, TOO_CORRELATED, "no covariance"),
+        (MEAN * [1.0, 1.7, 1.0], GOOD_COVARIANCE, r"wheel_radius_m 0\.1037 is outside \[0\.0305, 0\.0976\]"),
+        (MEAN * [1.0, 1.0, 0.4], GOOD_COVARIANCE, "axial_distance_m .* is outside"),
+    ],
+)
+def test_an_estimate_with_a_fault_is_named(mean, covariance, fault):
+    found = geometry_fault(Geometry(np.asarray(mean), covariance), LOW, HIGH)
+    assert re.search(fault, found) if fault else found == ""

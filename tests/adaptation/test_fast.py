@@ -1,18 +1,21 @@
-"""Fast adaptation in the daemon's tick: learnt, recorded, replayed bit for bit, taken back when asked."""
+"""Adaptation in the daemon's tick: learnt, recorded, replayed bit for bit, refused, taken back when asked."""
 
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from disco_hw.adaptation.guard import believed_geometry
+from disco_hw.adaptation import NoAdaptation
+from disco_hw.adaptation.fast import FastAdaptation
+from disco_hw.adaptation.guard import Geometry, believed_geometry
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
-from disco_hw.log.records import BeliefChange
+from disco_hw.log.records import Adaptation, BeliefChange
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import load_setup
 from sim.body_dynamics import BodyPose
 from sim.plant_parameters import PlantParameters
+from tools.foreign_plant import NOMINAL, ForeignPlant, robots
 
 ROBOT = Path(__file__).parents[2] / "disco_hw" / "robots" / "wombot.toml"
 
@@ -64,3 +67,52 @@ def test_the_geometry_is_learnt_logged_and_taken_back_when_asked(tmp_path):
     report = replay(tmp_path / "drive.mcap")
     assert report.ok, report.as_text()
     assert report.ticks > 500
+
+
+MEAN = np.array(NOMINAL)[[2, 0, 1]]
+MODEL = Geometry(MEAN, np.diag((0.05 * MEAN) ** 2))
+
+
+def learning(put_in_force, spoil=lambda adaptation: None):
+    """Drive a robot unlike MODEL for 4 s; returns the adaptation and the records that it wrote."""
+    adaptation = FastAdaptation(MODEL, 0.5 * MEAN, 1.6 * MEAN, put_in_force)
+    plant, written = ForeignPlant(robots(8001, 1)[0], (0.0, 0.0, 0.3), 1), []
+    for _ in range(200):
+        adaptation.feed(plant.now_ns, plant.readings())
+        spoil(adaptation)
+        written += adaptation.step(plant.now_ns).records
+        plant.advance(2.6, 4.6, 20)
+    return adaptation, written
+
+
+def test_a_belief_that_the_planner_refuses_is_counted_and_not_in_force():
+    def refuse(geometry):
+        raise ValueError("too fast a turn")
+
+    adaptation, written = learning(refuse)
+    status = adaptation.status()
+    assert status["belief"] == "model"
+    assert list(status["mean"].values()) == MEAN.tolist()
+    assert adaptation.counts()["refused"] == len(written) > 0
+    assert {(type(one), one.outcome) for one in written} == {(Adaptation, "refused")}
+    assert "too fast a turn" in written[0].text
+
+
+def test_an_estimate_of_absurd_variance_never_reaches_the_planner():
+    put = []
+
+    def spoil(adaptation):
+        adaptation._filter._bank.covariance[0, 3:6, 3:6] = np.diag([1e300] * 3)
+
+    adaptation, written = learning(put.append, spoil)
+    assert put == []
+    assert adaptation.status()["belief"] == "model"
+    assert adaptation.counts()["refused"] == len(written) > 0
+    assert all("no covariance" in one.text for one in written)
+
+
+def test_without_adaptation_a_request_is_refused_with_what_starts_it():
+    accepted, text = NoAdaptation().ask("adapt")
+    assert not accepted
+    assert "--adapt" in text
+    assert NoAdaptation().status() is None

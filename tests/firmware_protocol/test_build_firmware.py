@@ -1,3 +1,5 @@
+import re
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 from firmware_protocol import build_firmware
@@ -14,8 +16,19 @@ def test_declarations_are_what_is_left_of_a_header():
 
 def test_every_source_and_header_is_built():
     assert {path.name for path in FIRMWARE.glob("*.c")} == set(build_firmware.SOURCES)
-    private = {"core.h", "protocol_constants.h"}
-    assert {path.name for path in FIRMWARE.glob("*.h")} == set(build_firmware.HEADERS) | private
+    headers = {*build_firmware.HEADERS, *build_firmware.PRIVATE_HEADERS}
+    assert {path.name for path in FIRMWARE.glob("*.h")} == headers
+
+
+def includes(name: str) -> set[str]:
+    """Modules whose headers a module's source and header include, by name without extension."""
+    text = "".join(path.read_text("utf-8") for path in FIRMWARE.glob(f"{name}.[ch]"))
+    return {Path(header).stem for header in re.findall(r'#include "(.*)"', text)} - {name}
+
+
+def test_no_circle_of_modules_includes_itself():
+    modules = {path.stem: includes(path.stem) for path in FIRMWARE.glob("*.[ch]")}
+    tuple(TopologicalSorter(modules).static_order())  # raises CycleError
 
 
 def test_paths_are_relative_as_setuptools_wants_them():

@@ -1,10 +1,7 @@
-"""Adaptation in the real daemon: learnt, recorded, replayed; and an adapter that freezes or dies harms nothing."""
+"""Adaptation in the real daemon: learnt, recorded, replayed, and taken back by the operator."""
 
 from __future__ import annotations
 
-import os
-import signal
-import time
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +9,7 @@ import pytest
 
 import disco_hw
 from disco_hw.adaptation.guard import Geometry, believed_geometry, with_geometry
-from disco_hw.experiments import FAST_START, FAST_TASK, running_stack
+from disco_hw.experiments import running_stack
 from disco_hw.experiments.adapt import GROWTH, drive_through_change, newest_truth_s
 from disco_hw.log.reader import open_log
 from disco_hw.model import load_model, model_text
@@ -20,8 +17,7 @@ from tests.hil.stack import disco
 
 pytestmark = [pytest.mark.hil, pytest.mark.long]
 
-LOADING_S = 90.0
-SILENT_S = 9.0
+LEARNT_S = 30.0
 
 
 CIRCLE, CIRCLE_START = 'kind = "circle"\nradius_m = 0.75\nspeed_m_s = 0.2\n', (0.75, 0.0, 1.5707963)
@@ -30,6 +26,8 @@ OTHER_ROBOT = np.array([1.0, 1.13, 0.87])
 SETTLED_S, JUDGED_S = 10.0, 25.0
 COST = 0.022
 """Mean tracking cost on the truth: 0.013 learning, 0.033 not learning."""
+RELEARNT_COST = 0.0145
+"""Mean tracking cost after a change of 15 % was learnt: 0.0127; 0.0110 before it, at another part of the lap."""
 
 
 def driven_otherwise(directory, adaptation):
@@ -73,76 +71,31 @@ def test_a_robot_unlike_its_model_file_drives_worse_where_nothing_is_learnt(tmp_
     assert cost > COST
 
 
-def test_the_network_audits_the_filter_from_a_process_of_its_own(tmp_path):
-    with running_stack(tmp_path, "can", CIRCLE, CIRCLE_START, control='adaptation = "audited"') as stack:
-        stack.start()
-        audited = stack.operator.wait_until("audited", lambda s: "agree" in s["adaptation"]["audit"], LOADING_S)
-        assert audited["adaptation"]["takeovers"] == 0
-        assert audited["adaptation"]["belief"] == "adapted"
-        stack.operator.request("quit")
-        assert stack.daemon.process.wait(10.0) == 0
-    with open_log(tmp_path / "run.mcap") as log:
-        assert "audit" in list(log.columns("/adapt")["outcome"])
-    code, output = disco("replay", "--json", str(tmp_path / "run.mcap"), timeout_s=120.0)
-    assert code == 0, output
-
-
-def adapter_pid(daemon_pid: int) -> int:
-    """The daemon's child that runs the adapter."""
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            parent = int(stat.read_text().rpartition(")")[2].split()[1])
-            command = (stat.parent / "cmdline").read_bytes()
-        except OSError:
-            continue
-        if parent == daemon_pid and b"disco_hw.adaptation.adapter" in command:
-            return int(stat.parent.name)
-    raise AssertionError("no adapter runs")
-
-
-def test_an_adapter_that_freezes_and_dies_leaves_belief_and_loop(tmp_path):
-    task, start = FAST_TASK.replace("0.45", "0.3"), FAST_START
-    with running_stack(tmp_path, task=task, start=start, run_arguments=("--adapt",)) as stack:
+def test_an_operator_takes_the_learnt_belief_back_while_driving(tmp_path):
+    with running_stack(tmp_path, "can", CIRCLE, CIRCLE_START, run_arguments=("--adapt",)) as stack:
         operator = stack.operator
         stack.start()
-        operator.wait_until("adapting", lambda s: s["adaptation"]["belief"] == "adapted", LOADING_S)
-        pid = adapter_pid(stack.daemon.process.pid)
-
-        os.kill(pid, signal.SIGSTOP)
-        frozen = operator.wait_until("report of the silence", lambda s: s["adaptation"]["silent"], SILENT_S)
-        assert frozen["adaptation"]["belief"] == "adapted"
-        os.kill(pid, signal.SIGCONT)
-        operator.wait_until("heard again", lambda s: not s["adaptation"]["silent"], SILENT_S)
-
-        os.kill(pid, signal.SIGKILL)
-        dead = operator.wait_until("report of the death", lambda s: s["adaptation"]["link"]["deaths"] == 1, SILENT_S)
-        assert (dead["adaptation"]["belief"], dead["state"], dead["running"]) == ("adapted", "ARMED", True)
-        time.sleep(1.0)
-        assert operator.status()["source"] == "plan"
-
+        operator.wait_until("adapting", lambda s: s["adaptation"]["belief"] == "adapted", LEARNT_S)
         operator.request("revert")
-        operator.wait_until("the model's belief", lambda s: s["adaptation"]["belief"] == "model", 2.0)
-        operator.request("disarm")
-        operator.wait_until("a new adapter", lambda s: s["adaptation"]["link"]["alive"], 15.0)
+        reverted = operator.wait_until("the model's belief", lambda s: s["adaptation"]["belief"] == "model", 2.0)
+        assert (reverted["state"], reverted["running"]) == ("ARMED", True)
         operator.request("quit")
         assert stack.daemon.process.wait(10.0) == 0
-
     with open_log(tmp_path / "run.mcap") as log:
         sources = list(log.columns("/belief")["source"])
-        assert sources[0] == "adapted"
-        assert sources[-1] == "model"
-        assert "lost" in list(log.columns("/adapt")["outcome"])
+        assert (sources[0], sources[-1]) == ("adapted", "model")
+        assert list(log.columns("/adapt")["outcome"]) == ["reverted"]
     code, output = disco("replay", "--json", str(tmp_path / "run.mcap"), timeout_s=120.0)
     assert code == 0, output
 
 
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize(("changes", "most"), [("wheel radius", 1.2), ("axial distance", 1.15)])
-def test_what_grows_on_the_way_is_learnt_and_the_circle_is_driven_again(tmp_path, changes, most):
+@pytest.mark.parametrize("changes", ["wheel radius", "axial distance"])
+def test_what_grows_on_the_way_is_learnt_and_the_circle_is_driven_again(tmp_path, changes):
     driven = drive_through_change(tmp_path, changes, adapt=True)
     assert driven.believed == pytest.approx(1.0 + GROWTH, rel=0.03)
     assert driven.published_s < 20.0
-    assert driven.cost_after < most * driven.cost_before
+    assert driven.cost_after < RELEARNT_COST
 
 
 @pytest.mark.timeout(300)

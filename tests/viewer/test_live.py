@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from disco_hw.adaptation.adapter_link import NAMES
+from disco_hw.adaptation.guard import NAMES
 from disco_hw.daemon.page_feed import ViewerFeed, feed_path
 from disco_hw.drive.coverage import Coverage
 from disco_hw.log import records

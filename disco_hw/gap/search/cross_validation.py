@@ -402,8 +402,6 @@ def floor_errors(body: BodyChannel, noise: SensorNoise, ahead_s: float, poses: t
 
 Angles = dict[int, Array]
 
-WHEEL_STAGES = ("nominal", "timed", "amended")
-
 
 def only_timed(found: ChannelResult) -> ChannelResult:
     """The wheels with a delay and a lag in place of what was found: what a careful engineer fits by hand."""
