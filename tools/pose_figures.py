@@ -29,6 +29,7 @@ from disco_hw.runtime.core import CoreTick, TaskPilot
 from disco_hw.runtime.pipeline import Planner
 from disco_hw.runtime.robot_setup import Setup, load_setup
 from disco_hw.runtime.supervisor import UserRequest
+from drivers.pose.senders import SenderGate
 from drivers.pose.udp import UdpPoses
 from drivers.types import PoseSample
 from sim.body_dynamics import BodyPose
@@ -86,7 +87,7 @@ class Datagrams:
         taken = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         taken.setblocking(False)
         taken.bind(("127.0.0.1", 0))
-        self._source = UdpPoses(taken)
+        self._source = UdpPoses(taken, SenderGate())
         self._sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._sender.connect(taken.getsockname())
         self._has_heading = has_heading

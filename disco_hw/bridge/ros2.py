@@ -30,6 +30,7 @@ from disco_hw.daemon import send_request, socket_path
 from disco_hw.daemon.page_feed import FeedSubscriber, tick_feed_path
 from disco_hw.daemon.process import StopSignals
 from disco_hw.errors import InputError, WorkError
+from disco_hw.estimation.filter import TAKE_OVER_TIMEOUTS
 from disco_hw.runtime.assembly import odometry_parameters
 from disco_hw.runtime.robot_setup import Setup, load_setup
 from drivers.motor.ros2_base_wire import Ros2BaseSettings
@@ -108,8 +109,9 @@ class Bridge:
         self._feed = FeedSubscriber(tick_feed_path(socket_path(config)))
         self._pose = config.pose.of(SOURCE)
         pose = self._pose or config.pose
-        self._poses = ros2_inlets.PoseInlet(pose)
-        self._transforms = ros2_inlets.TransformInlet(pose, config.ros2.base_frame or out.BASE_FRAME)
+        silence_s = TAKE_OVER_TIMEOUTS * config.estimation.pose_timeout_s
+        self._poses = ros2_inlets.PoseInlet(pose, silence_s)
+        self._transforms = ros2_inlets.TransformInlet(pose, config.ros2.base_frame or out.BASE_FRAME, silence_s)
         self._speeds = ros2_commands.SpeedInlet(config.robot, config.drive, parameters)
         self._pad = ros2_commands.DaemonPad(socket_path(config))
         self._to_daemon = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -217,15 +219,23 @@ class Bridge:
                 yield sample, sample.sample_info.source_timestamp
 
     def _take_transforms(self, message: msg.TFMessage, sent_ns: int, *, static: bool = False) -> None:
-        for pose in self._transforms.poses(message, sent_ns, time.time_ns(), static=static):
+        publisher = _publisher_of(message)
+        for pose in self._transforms.poses(message, sent_ns, time.time_ns(), static=static, publisher=publisher):
             self._take_pose(pose, sent_ns)
 
     def _take_static_transforms(self, message: msg.TFMessage, sent_ns: int) -> None:
         self._take_transforms(message, sent_ns, static=True)
 
     def _take_pose(self, message: ros2_inlets.PoseMessage, sent_ns: int) -> None:
-        datagram = self._poses.datagram(message, sent_ns, time.monotonic_ns(), time.time_ns())
-        if datagram is None or self._pose is None:
+        publisher = _publisher_of(message)
+        datagram = self._poses.datagram(message, sent_ns, time.monotonic_ns(), time.time_ns(), publisher)
+        for words in (*self._poses.news(), *self._transforms.news()):
+            self._send_to_daemon(json.dumps({"said": words}).encode())
+        if datagram is not None:
+            self._send_to_daemon(datagram)
+
+    def _send_to_daemon(self, datagram: bytes) -> None:
+        if self._pose is None:
             return
         try:
             self._to_daemon.sendto(datagram, bridge_address(self._pose.port))
@@ -275,6 +285,7 @@ class Bridge:
         figures |= {
             f"poses refused: {why}": count for why, count in (self._poses.refused + self._transforms.refused).items()
         }
+        figures |= {"poses without a heading": self._poses.without_heading}
         figures |= {"speeds passed on": self._speeds.passed}
         figures |= {f"speeds refused: {why}": count for why, count in self._speeds.refused.items()}
         figures |= {"requests refused, too many": self._asking.refused + self._stopping.refused}
@@ -291,6 +302,12 @@ class Bridge:
                 self._writers[topic].write(message)
         except DDSException:
             self._unwritten += 1
+
+
+def _publisher_of(message: Any) -> str | None:
+    """The writer of a message that came over DDS; None for one of our own."""
+    info = getattr(message, "sample_info", None)
+    return None if info is None else f"publisher {info.publication_handle:x}"
 
 
 def _domain(config: RobotConfig) -> int:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import msgspec
@@ -20,6 +20,8 @@ from disco_hw.config import PoseInput
 from disco_hw.log.drive import Edge, Motion, chain
 from disco_hw.log.drive import poses as along
 from drivers.motor.ros2_base_wire import REFUSALS, Ros2BaseSettings, Wheels
+from drivers.pose.headings import is_heading_measured
+from drivers.pose.senders import SILENCE_S, SenderGate
 
 TYPES = (msg.PoseStamped, msg.PoseWithCovarianceStamped, msg.Odometry)
 PoseMessage = msg.PoseStamped | msg.PoseWithCovarianceStamped | msg.Odometry
@@ -38,19 +40,28 @@ _REPEAT_NS, _REPEATED = 500_000_000, 3.0
 class PoseInlet:
     """Judges poses and counts what it refuses, by reason."""
 
-    def __init__(self, settings: PoseInput) -> None:
+    def __init__(self, settings: PoseInput, silence_s: float = SILENCE_S) -> None:
         self.refused: Counter[str] = Counter()
+        self.without_heading = 0
+        """Poses passed on as positions only, as their covariance says that the heading is unknown."""
         self.passed = 0
         self.why = ""
+        self._publishers = SenderGate(silence_s)
         self._settings = settings
         self._newest_ns = self._passed_ns = -_OLDEST_POSE_NS
 
-    def datagram(self, message: PoseMessage, sent_ns: int, mono_ns: int, wall_ns: int) -> bytes | None:
+    def datagram(
+        self, message: PoseMessage, sent_ns: int, mono_ns: int, wall_ns: int, publisher: Hashable = None
+    ) -> bytes | None:
         """The datagram to send for a message heard now; None for what is not to be passed on.
 
         `sent_ns`: when it was sent, by the sender's wall clock, which counts where the message has no stamp. Of a flood
-        one pose in 4 ms is passed on, as a daemon has no use for more.
+        one pose in 4 ms is passed on, as a daemon has no use for more. `publisher`: who sent it; of several on the
+        topic the first counts, until it has been silent.
         """
+        if not self._publishers.may_send(publisher, mono_ns):
+            self.refused["of a second publisher on the topic"] += 1
+            return None
         reason, pose = self._judge(message, sent_ns, mono_ns, wall_ns)
         if pose is None:
             self.refused[reason] += 1
@@ -58,7 +69,12 @@ class PoseInlet:
             return None
         self.passed += 1
         self.why = ""
+        self._publishers.note_pose(publisher, mono_ns)
         return msgspec.msgpack.encode(pose)
+
+    def news(self) -> list[str]:
+        """What a person should know since the last call."""
+        return self._publishers.news()
 
     def _judge(
         self, message: PoseMessage, sent_ns: int, mono_ns: int, wall_ns: int
@@ -81,31 +97,25 @@ class PoseInlet:
         norm = turned.x**2 + turned.y**2 + turned.z**2 + turned.w**2
         if not (math.isfinite(place.x + place.y + norm) and abs(norm - 1.0) < _UNIT_MARGIN):
             return "not finite, or without a heading", None
-        stds = _stds(spread)
-        if stds is None:
-            return "with a covariance that cannot be", None
-        yaw = math.atan2(
-            2.0 * (turned.w * turned.z + turned.x * turned.y), 1.0 - 2.0 * (turned.y * turned.y + turned.z * turned.z)
-        )
+        xx, yy, tt = (0.0, 0.0, 0.0) if spread is None else (spread[0], spread[7], spread[35])
+        if not (math.isfinite(xx + yy) and min(xx, yy) >= 0.0):
+            return "with a covariance of the position that is unknown or cannot be", None
         self._newest_ns, self._passed_ns = t_ns, mono_ns
-        return "", {
+        found = {
             "t_ns": t_ns,
             "x_m": place.x,
             "y_m": place.y,
-            "yaw_rad": yaw,
-            "position_std_m": stds[0] or wanted.position_std_m,
-            "yaw_std_rad": stds[1] or wanted.yaw_std_rad,
+            "position_std_m": math.sqrt(max(xx, yy)) or wanted.position_std_m,
         }
-
-
-def _stds(covariance: Sequence[float] | None) -> tuple[float, float] | None:
-    """Standard deviations of position (m) and yaw (rad), 0 where they are not given; None for what cannot be."""
-    if covariance is None:
-        return 0.0, 0.0
-    xx, yy, tt = covariance[0], covariance[7], covariance[35]
-    if not (math.isfinite(xx + yy + tt) and min(xx, yy, tt) >= 0.0):
-        return None
-    return math.sqrt(max(xx, yy)), math.sqrt(tt)
+        yaw = math.atan2(
+            2.0 * (turned.w * turned.z + turned.x * turned.y), 1.0 - 2.0 * (turned.y * turned.y + turned.z * turned.z)
+        )
+        # Where no covariance says that the heading is unknown, the daemon sees whether it stands still.
+        if spread is None or is_heading_measured(yaw, tt):
+            found |= {"yaw_rad": yaw, "yaw_std_rad": math.sqrt(tt) or wanted.yaw_std_rad}
+        else:
+            self.without_heading += 1
+        return "", found
 
 
 @dataclass(slots=True)
@@ -125,8 +135,10 @@ class TransformInlet:
     has nothing new: twice a second, with three times the standard deviation.
     """
 
-    def __init__(self, settings: PoseInput, base_frame: str) -> None:
+    def __init__(self, settings: PoseInput, base_frame: str, silence_s: float = SILENCE_S) -> None:
         self.refused: Counter[str] = Counter()
+        self._silence_s = silence_s
+        self._publishers: dict[str, SenderGate] = {}
         self._settings = settings
         self._map, self._base = _frame(settings.frame), _frame(base_frame)
         self._edges: dict[str, _Followed] = {}
@@ -134,9 +146,12 @@ class TransformInlet:
         self._spoken_ns = 0
 
     def poses(
-        self, message: msg.TFMessage, sent_ns: int, wall_ns: int, *, static: bool
+        self, message: msg.TFMessage, sent_ns: int, wall_ns: int, *, static: bool, publisher: Hashable = None
     ) -> Iterator[msg.PoseWithCovarianceStamped]:
-        """The poses that the transforms of a message bring; `sent_ns` is the time of those without a stamp."""
+        """The poses that the transforms of a message bring; `sent_ns` is the time of those without a stamp.
+
+        `publisher`: who sent it; of several that move one edge the first counts, until it has been silent.
+        """
         for each in message.transforms:
             parent, child = _frame(each.header.frame_id), _frame(each.child_frame_id)
             place, turned = each.transform.translation, each.transform.rotation
@@ -147,10 +162,21 @@ class TransformInlet:
                 self.refused["transforms that are not finite, or no rotation"] += 1
             elif before is None and len(self._edges) >= _MOST_EDGES:
                 self.refused["transforms of too many frames"] += 1
+            elif not static and not self._publishers_of(child).may_send(publisher, wall_ns):
+                self.refused["transforms of a second publisher of the same edge"] += 1
             elif self._keep(parent, child, t_ns, values, static=static):
+                self._publishers_of(child).note_pose(publisher, wall_ns)
                 pose = self._pose_by(child, wall_ns)
                 if pose is not None:
                     yield pose
+
+    def news(self) -> list[str]:
+        """What a person should know since the last call."""
+        return [words for one in self._publishers.values() for words in one.news()]
+
+    def _publishers_of(self, child: str) -> SenderGate:
+        """Who moves the edge to this frame; there are no more than edges are kept."""
+        return self._publishers.setdefault(child, SenderGate(self._silence_s))
 
     def _keep(self, parent: str, child: str, t_ns: int, values: tuple[float, ...], *, static: bool) -> bool:
         """Whether this is a new transform of the edge."""

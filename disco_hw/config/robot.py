@@ -15,6 +15,7 @@ from disco_hw.files import ROBOT_TOML, in_words, read_toml
 from drivers.motor import AS_TOLD, DriverFieldError, UnknownDriverError, Wiring, find_driver, own_fields
 from drivers.pose import DEFAULT, PoseConvention, PoseSourceError, find_pose_source, pose_sources
 from drivers.pose import own_fields as own_pose_fields
+from drivers.pose.senders import parse_allowed
 
 if TYPE_CHECKING:
     from disco_hw.tasks import RobotTask
@@ -96,12 +97,15 @@ class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     `datum`: latitude and longitude (degrees) of the world frame's origin. For `disco-hw bridge ros2`: the topic, the
     frame that its poses must be in, and the standard deviations of poses that come without. By these, `rate_hz` (how
     often poses come at least) and `latency_s` it is decided whether the geometry is learnt while driving. `also`:
-    further sources, whose poses are fused with these.
+    further sources, whose poses are fused with these. `allow`: addresses and networks that may send to the port;
+    `key_file`: the key that each datagram must be proven with.
     """
 
     source: str = DEFAULT
     address: str = "127.0.0.1"
     port: Annotated[int, Meta(ge=1, le=65535)] = 5005
+    allow: tuple[str, ...] | None = None
+    key_file: str | None = None
     device: str | None = None
     baud: Annotated[int, Meta(ge=1200, le=4_000_000)] | None = None
     datum: Datum | None = None
@@ -445,6 +449,12 @@ def _check(path: Path, config: RobotConfig) -> None:
             _check_values(path, name, getattr(config, name))
     for number, one in enumerate(config.pose.also):
         _check_values(path, f"pose.also[{number}]", one)
+    for number, one in enumerate(config.pose.every()):
+        try:
+            parse_allowed(("127.0.0.1",) if one.allow is None else one.allow)
+        except ValueError as error:
+            field = "pose.allow" if number == 0 else f"pose.also[{number - 1}].allow"
+            _refuse(path, field, str(error), 'write addresses as "192.168.1.20" or networks as "192.168.1.0/24"')
     for field in config.prior.__struct_fields__:
         low, high = getattr(config.prior, field)
         if not (math.isfinite(low) and math.isfinite(high) and low < high):

@@ -339,8 +339,8 @@ def _poses(core: DaemonCore) -> list[dict[str, Any]]:
     tick, sources = core.last, core.pipeline.fusion.sources
     found = sources.status(0 if tick is None else tick.pipeline.t_ns)
     return [
-        {**one, "origin": list(named.origin), "offset": list(named.offset)}
-        for one, named in zip(found, core.config.pose.every(), strict=True)
+        {**one, "heading": heading.value, "origin": list(named.origin), "offset": list(named.offset)}
+        for one, heading, named in zip(found, core.pipeline.headings.held, core.config.pose.every(), strict=True)
     ]
 
 

@@ -127,6 +127,7 @@ class PoseFusion:
         self._wheel_timeout_s = wheel_timeout_s
         self._buffer: RewindBuffer | None = None
         self._tracker = WheelTracker()
+        self._forgets_heading = False
         self._pose_came_ns: int | None = None
         self._pose_interval_ns = 0.0
         self._counts = {field.name: 0 for field in fields(FusionStats)}
@@ -156,6 +157,17 @@ class PoseFusion:
             return 0.0, 0.0
         wheels = self._buffer.newest_wheels
         return wheels.left_speed_rad_s, wheels.right_speed_rad_s
+
+    @property
+    def wheel_difference_rad(self) -> float:
+        """How much further the right wheel has turned than the left since the start; zero before the first sample."""
+        if self._buffer is None:
+            return 0.0
+        return self._buffer.newest_wheels.right_rad - self._buffer.newest_wheels.left_rad
+
+    def forget_heading(self) -> None:
+        """Take the heading for unknown from the next position without one on: what it rests on was no measurement."""
+        self._forgets_heading = True
 
     def set_disturbance(self, disturbance: Disturbance) -> None:
         """Take the robot to move so beside its geometry from now on."""
@@ -257,6 +269,9 @@ class PoseFusion:
             return PoseReason.FUTURE
         if self._buffer is None:
             return PoseReason.NO_ODOMETRY
+        if self._forgets_heading and measurement.yaw_variance is None:
+            measurement = msgspec.structs.replace(measurement, forgets_heading=True)
+            self._forgets_heading = False
         outcome = self._buffer.add_pose(measurement)
         self._counts["pose_std_floored"] += measurement.floored and isinstance(outcome, Judgement)
         return outcome

@@ -108,7 +108,8 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
     """A screened pose with the variances that it is fused with (m^2, rad^2).
 
     `yaw_variance` is None where no heading was measured; `pose.yaw_rad` is then 0. The position is that of the point
-    `lever_x_m` ahead and `lever_y_m` to the left of the tracked one.
+    `lever_x_m` ahead and `lever_y_m` to the left of the tracked one. `forgets_heading`: that of the belief before is no
+    measurement.
     """
 
     t_ns: int
@@ -119,6 +120,7 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
     lever_x_m: float = 0.0
     lever_y_m: float = 0.0
     source: int = 0
+    forgets_heading: bool = False
 
     def lever(self, yaw_rad: float) -> tuple[float, float, float, float]:
         """The lever arm in the world (x, y) of a robot with this heading, and its derivative by the heading."""

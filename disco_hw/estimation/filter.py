@@ -222,13 +222,19 @@ class PoseFilter:
         """Judge a pose at the state's instant, and correct the belief by it if it passes.
 
         The first pose sets the belief; where it has no heading, every heading is followed until motion shows which is
-        right. A pose outside the gate is compared with where the rejected poses before it would be now: if
-        `gate_lockout_count` in a row agree with one another, and every source that was believed of late is among them,
-        the robot is where they say.
+        right. If the wheels were followed from the origin until then and have not led there, it counts as a jump. A
+        pose outside the gate is compared with where the rejected poses before it would be now: if `gate_lockout_count`
+        in a row agree with one another, and every source that was believed of late is among them, the robot is where
+        they say.
         """
-        if state.belief is None or state.pose_t_ns is None:
+        if state.belief is None:
             return self._after(state, measurement, self._fresh(measurement), Judgement(PoseReason.INITIALISED))
-        if measurement.yaw_variance is None and isinstance(state.belief, PoseBelief) and not state.heading_known:
+        if state.pose_t_ns is None:
+            jumps = self._corrected(state.belief, measurement)[1].distance2 > self._limit(measurement)
+            first = self._after(state, measurement, self._fresh(measurement), Judgement(PoseReason.INITIALISED))
+            return msgspec.structs.replace(first, reinitialisations=state.reinitialisations + jumps)
+        is_lost = isinstance(state.belief, PoseBelief) and not state.heading_known
+        if measurement.yaw_variance is None and (is_lost or measurement.forgets_heading):
             return self._after(state, measurement, self._fresh(measurement), Judgement(PoseReason.REINITIALISED))
         belief, correction = self._corrected(state.belief, measurement)
         limit = self._limit(measurement)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import msgspec
 
 from disco_hw import control
@@ -15,13 +17,16 @@ from disco_hw.adaptation.guard import (
     possible_range,
     with_geometry,
 )
-from disco_hw.config import RobotConfig
+from disco_hw.config import PoseInput, RobotConfig
 from disco_hw.control.baselines import LAWS, WithFallback
 from disco_hw.control.past_motion import DriveMeans
 from disco_hw.errors import InputError
 from disco_hw.estimation import PoseFusion
 from disco_hw.estimation.correction import DisturbanceEstimator
+from disco_hw.estimation.filter import TAKE_OVER_TIMEOUTS
+from disco_hw.estimation.heading_watch import HeadingWatch
 from disco_hw.estimation.odometry import OdometryParameters
+from disco_hw.files import KEY, read_bytes
 from disco_hw.log.recorder import Recorder
 from disco_hw.model import Model
 from disco_hw.runtime.core import DaemonCore
@@ -31,6 +36,7 @@ from disco_hw.runtime.robot_setup import Setup, geometry
 from disco_hw.runtime.supervisor import Supervisor, SupervisorSettings
 from drivers.motor import make_driver, rewired
 from drivers.pose import PoseSourceError, SeveralPoses, converted, make_pose_source
+from drivers.private_files import KeyFileError, key_of_file
 from drivers.transport import ReconnectingTransport, TransportSettingsError, make_transport
 from drivers.types import Driver, PoseSource, Transport
 
@@ -70,6 +76,7 @@ def make_pipeline(config: RobotConfig, model: Model, planner: Planner) -> Pipeli
         plan_tail_s=config.control.plan_tail_s,
         disturbance=DisturbanceEstimator() if config.control.disturbance else None,
         means=DriveMeans.of(model),
+        headings=HeadingWatch(config.pose.labels(), [one.offset for one in config.pose.every()]),
     )
 
 
@@ -143,16 +150,29 @@ def assemble_core(
 def pose_source_of(config: RobotConfig) -> PoseSource:
     """Return the pose source that robot.toml names, or those. Raises InputError for one that cannot be had."""
     opened: list[PoseSource] = []
+    # By then the task has stopped for want of poses: another sender never takes over while it runs.
+    silence_s = TAKE_OVER_TIMEOUTS * config.estimation.pose_timeout_s
     for label, named in zip(config.pose.labels(), config.pose.every(), strict=True):
         try:
-            source = make_pose_source(**msgspec.structs.asdict(named))
-        except PoseSourceError as error:
+            source = make_pose_source(**msgspec.structs.asdict(named), key=_pose_key(named), sender_silence_s=silence_s)
+        except (KeyFileError, PoseSourceError) as error:
             for one in opened:
                 one.close()
             which = "" if named is config.pose else f" {label}"
             raise InputError(f"robot.toml: pose.source{which}: {error}") from None
         opened.append(converted(source, named.convention()))
     return opened[0] if len(opened) == 1 else SeveralPoses(opened, config.pose.labels())
+
+
+def _pose_key(named: PoseInput) -> bytes | None:
+    """The key that each datagram must be proven with; None where none is named."""
+    if named.key_file is None:
+        return None
+    path = Path(named.key_file)
+    try:
+        return key_of_file(path, *read_bytes(path, KEY))
+    except InputError as error:
+        raise KeyFileError(str(error)) from None
 
 
 def driver_of(config: RobotConfig, key: bytes | None = None) -> Driver:

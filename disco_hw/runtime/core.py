@@ -19,6 +19,7 @@ from disco_hw.log.recorder import Recorder
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.pipeline import FollowTask, Motion, Off, Pipeline, Source, Stand, Tick, untimed
 from disco_hw.runtime.plausibility import Directions, Headway, Plausibility
+from disco_hw.runtime.pose_jumps import PoseJumps
 from disco_hw.runtime.robot_setup import record_of
 from disco_hw.runtime.supervisor import Inputs, Output, Reply, Supervisor, UserRequest
 from disco_hw.tasks import RobotTask
@@ -104,6 +105,8 @@ class DaemonCore:
         """Why nothing is recorded although it should be, kept up to date by whoever looks after the recorder."""
         self.announce: Callable[[int, Sequence[WheelSample]], None] = unannounced
         """Hears the wheels of a tick before it is planned, for whoever cannot wait for its record; must not block."""
+        self._jumps = PoseJumps()
+        self._jump = ""
         self._supervisor = supervisor
         self._preflight = preflight
         self._preflight_errors: tuple[str, ...] = ()
@@ -146,23 +149,31 @@ class DaemonCore:
         poses = self.pose_source.receive(now_ns, readings.poses)
         readings = msgspec.structs.replace(readings, poses=tuple(poses))
         self._remember(now_ns, readings)
+        believed = self.pipeline.screen(readings)
         if readings.wheels:
             self.announce(now_ns, readings.wheels)
         output = self._supervisor.step(now_ns, self._inputs(now_ns, requests, by_hand))
         mark("receive")
         learnt = self.adaptation.step(now_ns)
-        result = self.pipeline.step(now_ns, readings, _motion(output, motion), mark)
+        result = self.pipeline.step(now_ns, believed, _motion(output, motion), mark)
+        self._jump = self._jumps.step(result.estimate, result.pose_updates)
         command = self._command(output, result)
         sent = self._send(now_ns, output, command, silent=result.source is Source.SILENT)
         mark("send")
         doubts = self.plausibility.step(now_ns, readings.wheels, readings.poses, readings.power, command)
-        miswired = None if self.directions is None else self.directions.step(now_ns, readings.wheels, poses, command)
+        miswired = (
+            None if self.directions is None else self.directions.step(now_ns, readings.wheels, believed.poses, command)
+        )
         # Stopped in the next tick, and not armed again before the daemon has read what was mended.
         self._miswired = self._miswired if miswired is None else (miswired,)
-        source = self.pose_source
-        news = [*(source.news() if isinstance(source, SaysWhy) else ()), *self.pipeline.fusion.sources.news()]
-        said = [f"poses: {words}" for words in news]
-        events = (*readings.events, *said, *output.events, *learnt.events, *self._planner_events(result), *doubts)
+        events = (
+            *readings.events,
+            *self._pose_events(),
+            *output.events,
+            *learnt.events,
+            *self._planner_events(result),
+            *doubts,
+        )
         events = (*events, *self._stays(now_ns, output, result))
         self._follow_progress(output, result)
         self.recorder.put(
@@ -180,7 +191,7 @@ class DaemonCore:
                 *extra_records,
             ],
         )
-        self.adaptation.feed(now_ns, self._to_learn_from(readings))
+        self.adaptation.feed(now_ns, self._to_learn_from(believed))
         mark("record")
         self.last = CoreTick(output, result, command, events, readings)
         return self.last
@@ -236,6 +247,7 @@ class DaemonCore:
             heading_missing=estimate is not None and estimate.initialised and not estimate.heading_known,
             by_hand=by_hand,
             poses_contradict=self.pipeline.fusion.sources.contradiction,
+            pose_jump=self._jump,
         )
 
     def _to_learn_from(self, readings: Readings) -> Readings:
@@ -262,6 +274,13 @@ class DaemonCore:
         if output.send_estop:
             outgoing = (*self.driver.estop(now_ns), *outgoing)
         return [records_of_tick.frame_out(now_ns, frame, self.transport.send(frame, now_ns)) for frame in outgoing]
+
+    def _pose_events(self) -> list[str]:
+        """What pose sources, their headings and the estimate have to say, each as an event."""
+        source, pipeline = self.pose_source, self.pipeline
+        news = [*(source.news() if isinstance(source, SaysWhy) else ()), *pipeline.headings.news()]
+        news += [*pipeline.fusion.sources.news(), *self._jumps.news()]
+        return [f"poses: {words}" for words in news]
 
     def _planner_events(self, result: Tick) -> tuple[str, ...]:
         """Say when the planner begins and ceases to fail, or to plan from too few samples, not in every tick."""
@@ -308,7 +327,7 @@ class DaemonCore:
         return [record_of(now_ns, self.task)] if changed else []
 
     def _follow_progress(self, output: Output, result: Tick) -> None:
-        if output.running:
+        if output.running and not self._jump:
             self.progress.add(result.t_ns, result.estimate.x_m, result.estimate.y_m, result.estimate.yaw_rad)
         else:
             self.progress.pause()

@@ -22,6 +22,7 @@ from disco_hw.control import NoValidControl, PlannerState, PlanOutcome, Rollouts
 from disco_hw.control.past_motion import DriveMeans
 from disco_hw.estimation import PoseEstimate, PoseFusion
 from disco_hw.estimation.correction import DisturbanceEstimator, PoseUpdate
+from disco_hw.estimation.heading_watch import HeadingWatch
 from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.model import Belief
 from disco_hw.model.coefficients import NO_DISTURBANCE, Disturbance
@@ -263,8 +264,10 @@ class Pipeline:
     def __init__(
         self, fusion: PoseFusion, planner: Planner, governor: Governor, plan_tail_s: float,
         disturbance: DisturbanceEstimator | None = None, means: DriveMeans | None = None,
+        headings: HeadingWatch | None = None,
     ) -> None:  # fmt: skip
         self._fusion = fusion
+        self.headings = headings or HeadingWatch([one.label for one in fusion.sources.all])
         self._means = means
         self._disturbance = disturbance
         self._planner = planner
@@ -308,6 +311,20 @@ class Pipeline:
         A look from outside: no later tick is changed by it.
         """
         return None if self._plan is None else self._planner.sampled_rollouts(count)
+
+    def screen(self, readings: Readings) -> Readings:
+        """Leave out the headings that are no measurement; to be called once for the readings of each step."""
+        if not readings.poses:
+            return readings
+        geometry, difference_rad = self._fusion.parameters, self._fusion.wheel_difference_rad
+        turn_per_rad = geometry.wheel_radius_m / geometry.axial_distance_m
+        poses = []
+        for sample in readings.poses:
+            pose, never_measured = self.headings.screen(sample, difference_rad, turn_per_rad)
+            poses.append(pose)
+            if never_measured:
+                self._fusion.forget_heading()
+        return msgspec.structs.replace(readings, poses=tuple(poses))
 
     def step(self, now_ns: int, readings: Readings, motion: Motion, mark: Callable[[str], None] = untimed) -> Tick:
         """Advance by one tick; `mark(stage)` is called at the end of the stages "estimate" and "plan".

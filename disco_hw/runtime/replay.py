@@ -129,7 +129,7 @@ def _replay_tick(pipeline: Pipeline, recorded: Sequence[Entry]) -> list[Record]:
     )
     command = next((record for record in found if isinstance(record, Command)), None)
     motion = Off() if command is None else _motion(command)
-    return list(records_of_tick.tick(pipeline.step(recorded[0].now_ns, readings, motion), None, 0.0))
+    return list(records_of_tick.tick(pipeline.step(recorded[0].now_ns, pipeline.screen(readings), motion), None, 0.0))
 
 
 def _motion(command: Command) -> Motion:

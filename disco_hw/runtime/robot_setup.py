@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from disco_hw.config import Robot, RobotConfig, link_fields, load_robot_config
+from disco_hw.config import PoseInput, Robot, RobotConfig, link_fields, load_robot_config
 from disco_hw.errors import InputError
 from disco_hw.files import KEY, WAY_POINTS, read_bytes
 from disco_hw.files import MODEL_TOML as MODEL_KIND
@@ -62,8 +62,16 @@ def load_setup(robot: Path, model: Path | None = None, link: str | None = None, 
     model_file = model
     if model_file is None and config.model.file is not None:
         model_file = robot.parent / config.model.file
+    config = msgspec.structs.replace(config, pose=_with_key_beside(robot, config.pose))
     loaded = Model.nominal(config.robot, config.prior) if model_file is None else load_model(model_file)
     return Setup(robot, model_file, path_file, config, loaded)
+
+
+def _with_key_beside(robot: Path, pose: PoseInput) -> PoseInput:
+    """The pose sources with the full paths of their key files, which are written relative to robot.toml."""
+    key_file = None if pose.key_file is None else str(robot.parent / pose.key_file)
+    also = tuple(_with_key_beside(robot, one) for one in pose.also)
+    return msgspec.structs.replace(pose, key_file=key_file, also=also)
 
 
 def refuse_missing_effects(setup: Setup) -> None:

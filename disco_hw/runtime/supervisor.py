@@ -13,6 +13,7 @@ from drivers.types import DriverState, LinkState, Request
 from firmware_protocol.status_codes import BY_ITSELF, THEN_RESET, THEN_RESTART
 
 FIND_HEADING = "the poses have none: drive a metre straight on, by hand on the page, and it is found"
+AFTER_A_JUMP = "see that the robot is where the page shows it, then start again"
 _IDLE = frozenset({DriverState.STANDBY, DriverState.READY})
 _MAY_MOVE = frozenset({DriverState.ARMING, DriverState.ARMED, DriverState.STOPPING})
 # Conditions as integers: flags cost a microsecond an operation in Python 3.11, and this runs in every tick.
@@ -73,7 +74,7 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     task is left to drive. `recording_fault`: why nothing is recorded although it should be, which keeps the robot from
     being armed unless that is asked for. `heading_missing`: positions come, and which way the robot faces is not known.
     `by_hand`: a person drives, who sees that; nobody follows the task. `poses_contradict`: which two pose sources do,
-    in words, else empty.
+    in words, else empty. `pose_jump`: how the estimate jumped in the tick before, in words, else empty.
     """
 
     link_state: LinkState
@@ -92,6 +93,7 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     heading_missing: bool = False
     by_hand: bool = False
     poses_contradict: str = ""
+    pose_jump: str = ""
 
 
 class Reply(msgspec.Struct, frozen=True, gc=False):
@@ -271,6 +273,8 @@ class Supervisor:
         """What of the pose keeps the task from being followed; nothing while nobody follows it."""
         if inputs.by_hand:
             return None
+        if inputs.pose_jump:
+            return f"{inputs.pose_jump}; {AFTER_A_JUMP}"
         if inputs.poses_contradict:
             return f"{inputs.poses_contradict}; find out which is wrong and take it out of [pose]"
         if self._settings.heading_required and inputs.heading_missing:

@@ -40,10 +40,14 @@ def find_pose_source(name: str) -> Callable[..., PoseSource]:
     return known[name]
 
 
+OF_THE_HOST = frozenset({"key", "sender_silence_s"})
+"""What a source is given beside the fields of [pose]: the key that `key_file` names, and how long a sender is kept."""
+
+
 def own_fields(name: str) -> frozenset[str]:
     """The fields of [pose] that the source of this name takes, and others may not. Raises PoseSourceError."""
     parameters = inspect.signature(find_pose_source(name)).parameters.values()
-    return frozenset(each.name for each in parameters if each.kind is inspect.Parameter.KEYWORD_ONLY)
+    return frozenset(each.name for each in parameters if each.kind is inspect.Parameter.KEYWORD_ONLY) - OF_THE_HOST
 
 
 def make_pose_source(source: str, **fields: Any) -> PoseSource:

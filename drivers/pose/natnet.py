@@ -16,6 +16,7 @@ from typing import Any
 import msgspec
 
 from drivers.pose import PoseSourceError
+from drivers.pose.senders import SILENCE_S, SenderGate, parse_allowed
 from drivers.types import PoseSample
 
 SOURCE = "natnet"
@@ -158,9 +159,15 @@ def make_pose_source(
     up_axis: str = "y",
     position_std_m: float = 0.02,
     yaw_std_rad: float = 0.02,
+    allow: Sequence[str] | None = None,
+    sender_silence_s: float = SILENCE_S,
     **_of_other_sources: Any,
 ) -> NatNetPoses:
     """By the fields of [pose]. Raises PoseSourceError for an address or group that cannot be had."""
+    try:
+        senders = SenderGate(sender_silence_s, None if allow is None else parse_allowed(allow))
+    except ValueError as error:
+        raise PoseSourceError(f"pose.allow: {error}") from None
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     opened.setblocking(False)
     try:
@@ -177,7 +184,7 @@ def make_pose_source(
             "pose.address, which is this computer's in Motive's network"
         ) from None
     wanted = (body, up_axis, position_std_m, yaw_std_rad)
-    return NatNetPoses(opened, server, VERSIONS[natnet_version], *wanted)
+    return NatNetPoses(opened, senders, server, VERSIONS[natnet_version], *wanted)
 
 
 class NatNetPoses:
@@ -190,6 +197,7 @@ class NatNetPoses:
     def __init__(
         self,
         opened: socket.socket,
+        senders: SenderGate,
         server: str,
         version: Version,
         body: int,
@@ -197,7 +205,7 @@ class NatNetPoses:
         position_std_m: float,
         yaw_std_rad: float,
     ) -> None:
-        self._socket, self._server = opened, server
+        self._socket, self._senders, self._server = opened, senders, server
         self._version, self._body, self._up_axis = version, body, up_axis
         self._stds = position_std_m, yaw_std_rad
         self._asked_ns: int | None = None
@@ -213,15 +221,17 @@ class NatNetPoses:
         with contextlib.suppress(OSError):
             self._ask(now_ns)
             for _ in range(_MOST_A_TICK):
-                pose = self._take(self._socket.recv(_LONGEST_DATAGRAM), now_ns)
+                datagram, sender = self._socket.recvfrom(_LONGEST_DATAGRAM)
+                pose = self._take(datagram, now_ns) if self._counts(datagram, sender, now_ns) else None
                 if pose is not None:
+                    self._senders.note_pose(sender, now_ns)
                     poses.append(pose)
         return sorted(poses, key=lambda pose: pose.t_ns)
 
     def news(self) -> Sequence[str]:
         """What a person should know since the last call."""
         said, self._said = self._said, []
-        return said
+        return [*said, *self._senders.news()]
 
     def close(self) -> None:
         """Close the socket; safe to call twice."""
@@ -234,6 +244,12 @@ class NatNetPoses:
         for message in (CONNECT, KEEP_ALIVE):
             text = b"Ping\0" if message == CONNECT else b"\0"
             self._socket.sendto(struct.pack("<HH", message, len(text)) + text, (self._server, COMMAND_PORT))
+
+    def _counts(self, datagram: bytes, sender: tuple[str, int], now_ns: int) -> bool:
+        """Whether a datagram is looked at: a server describes itself from another port than its frames come from."""
+        if datagram[:2] == struct.pack("<H", SERVER_INFO) and sender[0] in (self._server, self._senders.kept_address):
+            return True
+        return self._senders.may_send(sender, now_ns)
 
     def _take(self, datagram: bytes, now_ns: int) -> PoseSample | None:
         if datagram[:2] == struct.pack("<H", SERVER_INFO):

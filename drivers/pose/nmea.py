@@ -1,7 +1,7 @@
 """Positions of a GPS receiver that speaks NMEA 0183, on a serial port or over TCP.
 
 The receiver is read by a process of its own, which runs this file, as ports and networks block: NMEA sentences in,
-positions in a local tangent plane out. Taken are GGA (position and quality), GST (its standard deviation) and HDT
+positions in a local tangent plane out. Taken are GGA (position and quality), GST (its standard deviation), HDT and THS
 (heading of two antennas). RMC and VTG give a course over ground, which is no heading for a robot that drives backward
 and turns on the spot: the estimator finds that better from the positions.
 """
@@ -22,24 +22,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import msgspec
-
 from drivers.pose import PoseSourceError
-from drivers.pose.udp import LONGEST_DATAGRAM, MOST_A_TICK, pose_of
+from drivers.pose.udp import LONGEST_DATAGRAM, MOST_A_TICK, pose_of, words_of
 from drivers.types import PoseSample
 
 SOURCE = "nmea"
 _READER = "drivers.pose.nmea"
 _END_TIMEOUT_S = 1.0
-
-
-class Words(msgspec.Struct, frozen=True):
-    """A sentence of the reader for a person."""
-
-    said: str
-
-
-_WORDS = msgspec.json.Decoder(Words)
 
 
 def make_pose_source(
@@ -89,8 +78,8 @@ class NmeaPoses:
                 pose = pose_of(message, now_ns)
                 if pose is not None:
                     poses.append(pose)
-                else:
-                    self._keep_words(message)
+                elif (words := words_of(message)) is not None:
+                    self._said.append(words)
         return poses
 
     def news(self) -> Sequence[str]:
@@ -120,10 +109,6 @@ class NmeaPoses:
             self._said.append("the process that reads the GPS receiver has ended; restart the daemon")
         return message
 
-    def _keep_words(self, message: bytes) -> None:
-        with contextlib.suppress(msgspec.MsgspecError):
-            self._said.append(_WORDS.decode(message).said)
-
 
 DAY_S = 86_400.0
 QUALITY_STD_M = {1: 3.0, 2: 0.8, 3: 2.0, 4: 0.02, 5: 0.4}
@@ -131,7 +116,13 @@ QUALITY_STD_M = {1: 3.0, 2: 0.8, 3: 2.0, 4: 0.02, 5: 0.4}
 with whole wavelengths, 5 without. 0 is no fix; 6, 7 and 8 are reckoned, typed in and simulated: no measurement."""
 FARTHEST_M = 838.0
 """As far as the estimator and the frames of a pose go."""
+MEASURED_MODE = "A"
+"""Of THS; E, M, S and V are reckoned, typed in, simulated and not valid: no measurement."""
+WIDE_HEADING_STD_RAD = 0.4
+WIDE_HEADING_QUALITIES = frozenset({0, 5, 6, 7, 8})
+"""With a float fix, or none, the heading of two antennas is off by as much as 0.4 m over a metre between them."""
 _LEAST_STD_M = 0.005
+_HINT_NS = 10_000_000_000
 _GST_HOLDS_S = 2.5
 _PAIR_NS = 60_000_000
 _HEADING_HOLDS_NS = 2_000_000_000
@@ -141,6 +132,15 @@ _LONGEST_LINE = 256
 _SILENT_S = 3.0
 _READ_S = 0.05
 _RETRY_S = (0.5, 1.0, 2.0, 5.0)
+
+
+@dataclass(frozen=True)
+class _HeadingSentence:
+    """A heading, clockwise from north; `is_wide`: it came while the fix was a float, or there was none."""
+
+    arrival_ns: int
+    heading_deg: float
+    is_wide: bool
 
 
 @dataclass(frozen=True)
@@ -214,9 +214,13 @@ class Fixes:
     _plane: TangentPlane | None = None
     _quality: int | None = None
     _gst: tuple[float, float] | None = None
-    _heading: tuple[int, float] | None = None
+    _heading: _HeadingSentence | None = None
     _waiting: dict[str, Any] | None = None
     _waits_since_ns: int = 0
+    _height_m: float | None = None
+    _first_ns: int | None = None
+    _heading_mode: str = "A"
+    _told: set[str] = field(default_factory=set)
     _far: bool = False
     _clock: ReceiverClock = field(default_factory=ReceiverClock)
 
@@ -234,11 +238,13 @@ class Fixes:
         kind = "" if said is None else said.msgID
         if kind == "GST":
             self._take_deviation(said)
-        elif kind == "HDT" and isinstance(said.headingT, float) and 0.0 <= said.headingT <= 360.0:
-            self._heading = (arrival_ns, said.headingT)
-            if self._waiting is not None:
-                ready += self._with_heading(self._waiting, said.headingT)
-                self._waiting = None
+        elif kind == "HDT":
+            ready += self._take_heading(said.headingT, arrival_ns)
+        elif kind == "THS":
+            mode = str(said.mi)
+            ready += self._mode_words(mode)
+            if mode == MEASURED_MODE:
+                ready += self._take_heading(said.headt, arrival_ns)
         elif kind == "GGA":
             ready += self._take_position(said, arrival_ns)
         return ready
@@ -255,13 +261,22 @@ class Fixes:
         if time_s is not None and all(isinstance(one, float) and one > 0.0 for one in deviations):
             self._gst = (time_s, max(deviations))
 
+    def _take_heading(self, heading_deg: Any, arrival_ns: int) -> list[dict[str, Any]]:
+        if not isinstance(heading_deg, float) or not 0.0 <= heading_deg <= 360.0:
+            return []
+        self._heading = _HeadingSentence(arrival_ns, heading_deg, self._quality in WIDE_HEADING_QUALITIES)
+        waiting, self._waiting = self._waiting, None
+        return [] if waiting is None else [self._with_heading(waiting, self._heading)]
+
     def _take_position(self, said: Any, arrival_ns: int) -> list[dict[str, Any]]:
         quality, time_s = said.quality, _time_of_day_s(said.time)
         words = self._quality_words(quality)
-        place = (said.lat, said.lon, said.alt)
-        if quality not in QUALITY_STD_M or time_s is None or not all(isinstance(one, float) for one in place):
+        if quality not in QUALITY_STD_M:
             return words
-        height_m = said.alt + (said.sep if isinstance(said.sep, float) else 0.0)
+        if time_s is None or not (isinstance(said.lat, float) and isinstance(said.lon, float)):
+            return words + self._once("GGA sentences come without time, latitude or longitude: no positions of those")
+        height_m, told = self._height_of(said)
+        words += told + self._heading_hint(arrival_ns)
         if self._plane is None:
             latitude, longitude = self.datum or (said.lat, said.lon)
             self._plane = TangentPlane(latitude, longitude, height_m)
@@ -274,10 +289,10 @@ class Fixes:
             "y_m": north_m,
             "position_std_m": self._deviation_m(quality, time_s, said.HDOP),
         }
-        if self._heading is None or arrival_ns - self._heading[0] > _HEADING_HOLDS_NS:
+        if self._heading is None or arrival_ns - self._heading.arrival_ns > _HEADING_HOLDS_NS:
             return [*words, position]
-        if arrival_ns - self._heading[0] < _PAIR_NS:
-            return [*words, *self._with_heading(position, self._heading[1])]
+        if arrival_ns - self._heading.arrival_ns < _PAIR_NS:
+            return [*words, self._with_heading(position, self._heading)]
         self._waiting, self._waits_since_ns = position, arrival_ns
         return words
 
@@ -287,10 +302,43 @@ class Fixes:
         usual = QUALITY_STD_M[quality]
         return usual * max(hdop, 1.0) if isinstance(hdop, float) else usual
 
-    def _with_heading(self, position: dict[str, Any], heading_deg: float) -> list[dict[str, Any]]:
+    def _height_of(self, said: Any) -> tuple[float, list[dict[str, Any]]]:
+        """The height over the ellipsoid: the fix's, else the last known one, else 0; the plane's scale hangs on it."""
+        if isinstance(said.alt, float):
+            self._height_m = said.alt + (said.sep if isinstance(said.sep, float) else 0.0)
+            return self._height_m, []
+        taken_at = "0 m" if self._height_m is None else f"the last height, {self._height_m:.1f} m"
+        return self._height_m or 0.0, self._once(f"GGA sentences come without an altitude: taken at {taken_at}")
+
+    def _with_heading(self, position: dict[str, Any], heading: _HeadingSentence) -> dict[str, Any]:
         """Clockwise from north, as the receiver says it, to counter-clockwise from east."""
-        yaw_rad = math.remainder(math.radians(90.0 - heading_deg), math.tau)
-        return [{**position, "yaw_rad": yaw_rad, "yaw_std_rad": self.heading_std_rad}]
+        yaw_rad = math.remainder(math.radians(90.0 - heading.heading_deg), math.tau)
+        is_wide = heading.is_wide or self._quality in WIDE_HEADING_QUALITIES
+        std_rad = max(WIDE_HEADING_STD_RAD, self.heading_std_rad) if is_wide else self.heading_std_rad
+        return {**position, "yaw_rad": yaw_rad, "yaw_std_rad": std_rad}
+
+    def _heading_hint(self, arrival_ns: int) -> list[dict[str, Any]]:
+        """Which sentence brings a heading, once, where none has come for a while."""
+        first_ns = self._first_ns = arrival_ns if self._first_ns is None else self._first_ns
+        if self._heading is not None or arrival_ns - first_ns < _HINT_NS:
+            return []
+        return self._once(
+            "no heading comes: positions only; if the receiver has two antennas, switch on its sentence HDT or THS"
+        )
+
+    def _mode_words(self, mode: str) -> list[dict[str, Any]]:
+        before, self._heading_mode = self._heading_mode, mode
+        if mode == before:
+            return []
+        why = {"V": "not valid", "E": "reckoned", "M": "typed in", "S": "simulated"}.get(mode, "of an unknown mode")
+        used = mode == MEASURED_MODE
+        return [{"said": f"THS: the heading is {'measured again' if used else f'{why} ({mode}) and not used'}"}]
+
+    def _once(self, words: str) -> list[dict[str, Any]]:
+        if words in self._told:
+            return []
+        self._told.add(words)
+        return [{"said": words}]
 
     def _range_words(self, away_m: float) -> list[dict[str, Any]]:
         before, self._far = self._far, away_m > FARTHEST_M

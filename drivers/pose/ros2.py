@@ -1,6 +1,7 @@
 """Poses of ROS 2, from the process `disco-hw bridge ros2`, as nothing of ROS belongs into the control process.
 
-It sends datagrams as those of `udp` to a Unix socket, whose sender the kernel names: only this user and root count.
+It sends datagrams as those of `udp` to a Unix socket, whose sender the kernel names: only this user and root count, and
+of several bridges the first. What a person should know comes the same way.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from drivers.pose import PoseSourceError
-from drivers.pose.udp import LONGEST_DATAGRAM, MOST_A_TICK, pose_of
+from drivers.pose.senders import SILENCE_S, SenderGate
+from drivers.pose.udp import LONGEST_DATAGRAM, MOST_A_TICK, pose_of, words_of
 from drivers.types import PoseSample
 
 SOURCE = "ros2"
@@ -33,6 +35,7 @@ def make_pose_source(
     frame: str = "",
     position_std_m: float = 0.0,
     yaw_std_rad: float = 0.0,
+    sender_silence_s: float = SILENCE_S,
     **_of_other_sources: Any,
 ) -> BridgePoses:
     """By the port of [pose]; the other fields are the bridge's.
@@ -49,15 +52,17 @@ def make_pose_source(
         raise PoseSourceError(
             f"the bridge's port {port}: {error.strerror}; choose another pose.port for one of the robots"
         ) from None
-    return BridgePoses(opened)
+    return BridgePoses(opened, SenderGate(sender_silence_s))
 
 
 class BridgePoses:
-    """Satisfies `drivers.types.PoseSource`."""
+    """Satisfies `drivers.types.PoseSource` and `drivers.types.SaysWhy`."""
 
-    def __init__(self, opened: socket.socket) -> None:
+    def __init__(self, opened: socket.socket, senders: SenderGate) -> None:
         self._socket = opened
         self._users = {os.geteuid(), _ROOT}
+        self._senders = senders
+        self._said: list[str] = []
         self.malformed = 0
         self.foreign_users = 0
 
@@ -67,22 +72,39 @@ class BridgePoses:
         with contextlib.suppress(OSError):
             for _ in range(MOST_A_TICK):
                 datagram, ancillary, _, _ = self._socket.recvmsg(LONGEST_DATAGRAM, socket.CMSG_SPACE(_CREDENTIALS.size))
-                if _sender(ancillary) not in self._users:
+                process, user = _sender(ancillary)
+                if user not in self._users:
                     self.foreign_users += 1
-                elif (pose := pose_of(datagram, now_ns)) is None:
-                    self.malformed += 1
-                else:
+                elif (pose := self._take(datagram, f"bridge process {process}", now_ns)) is not None:
                     poses.append(pose)
         return sorted(poses, key=lambda pose: pose.t_ns)
+
+    def news(self) -> Sequence[str]:
+        """What a person should know since the last call."""
+        said, self._said = self._said, []
+        return [*said, *self._senders.news()]
 
     def close(self) -> None:
         """Close the socket; safe to call twice."""
         self._socket.close()
 
+    def _take(self, datagram: bytes, sender: str, now_ns: int) -> PoseSample | None:
+        if not self._senders.may_send(sender, now_ns):
+            return None
+        pose = pose_of(datagram, now_ns)
+        if pose is not None:
+            self._senders.note_pose(sender, now_ns)
+        elif (words := words_of(datagram)) is not None:
+            self._said.append(words)
+        else:
+            self.malformed += 1
+        return pose
 
-def _sender(ancillary: Sequence[tuple[int, int, bytes]]) -> int | None:
-    """The user who sent a datagram, as the kernel says."""
+
+def _sender(ancillary: Sequence[tuple[int, int, bytes]]) -> tuple[int | None, int | None]:
+    """The process and the user that sent a datagram, as the kernel says."""
     for level, kind, data in ancillary:
         if (level, kind) == (socket.SOL_SOCKET, socket.SCM_CREDENTIALS) and len(data) == _CREDENTIALS.size:
-            return int(_CREDENTIALS.unpack(data)[1])
-    return None
+            process, user, _ = _CREDENTIALS.unpack(data)
+            return int(process), int(user)
+    return None, None

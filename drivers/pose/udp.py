@@ -2,7 +2,8 @@
 
 A map with `x_m`, `y_m`, `yaw_rad`, `position_std_m`, `yaw_std_rad`, and when it was true: `age_s` before it was sent,
 or `t_ns` on this computer's monotonic clock. `yaw_rad` and `yaw_std_rad` are both left out, or null, where there
-is no heading.
+is no heading; a heading whose standard deviation says that it is not known is left out here. One sender is kept to at a
+time; with a key each datagram must be proven (`drivers.pose.senders`).
 """
 
 from __future__ import annotations
@@ -10,12 +11,15 @@ from __future__ import annotations
 import contextlib
 import math
 import socket
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
 
 from drivers.pose import PoseSourceError
+from drivers.pose.headings import is_heading_filled_in
+from drivers.pose.senders import SILENCE_S, PoseProof, SenderGate, parse_allowed
 from drivers.types import PoseSample
 
 SOURCE = "udp"
@@ -34,14 +38,39 @@ class _Datagram(msgspec.Struct, frozen=True):
     t_ns: int | None = None
 
 
+class _Words(msgspec.Struct, frozen=True):
+    """A sentence for a person, from a process of ours that sends poses."""
+
+    said: str
+
+
+_WORDS = msgspec.json.Decoder(_Words)
 _DECODERS: tuple[Callable[[bytes], _Datagram], ...] = (
     msgspec.json.Decoder(_Datagram).decode,
     msgspec.msgpack.Decoder(_Datagram).decode,
 )
 
 
-def make_pose_source(*, address: str = "127.0.0.1", port: int = 5005, **_of_other_sources: Any) -> UdpPoses:
-    """By the fields of [pose]. Raises PoseSourceError for an address that cannot be had."""
+def make_pose_source(
+    *,
+    address: str = "127.0.0.1",
+    port: int = 5005,
+    allow: Sequence[str] | None = None,
+    key_file: str = "",
+    key: bytes | None = None,
+    sender_silence_s: float = SILENCE_S,
+    **_of_other_sources: Any,
+) -> UdpPoses:
+    """By the fields of [pose], and the `key` that the host has read from `key_file`.
+
+    Raises PoseSourceError for an address that cannot be had, and for a key that is named and not given.
+    """
+    if key_file and key is None:
+        raise PoseSourceError(f"the key of {key_file} was not read; poses without it would be believed")
+    try:
+        allowed = None if allow is None else parse_allowed(allow)
+    except ValueError as error:
+        raise PoseSourceError(f"pose.allow: {error}") from None
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     opened.setblocking(False)
     try:
@@ -50,31 +79,59 @@ def make_pose_source(*, address: str = "127.0.0.1", port: int = 5005, **_of_othe
         opened.close()
         reason = error.strerror or str(error)
         raise PoseSourceError(f"{address}:{port}: {reason}; choose another pose.port, or pose.address") from None
-    return UdpPoses(opened)
+    proof = None if key is None else PoseProof(key, time.time_ns())
+    return UdpPoses(opened, SenderGate(sender_silence_s, allowed), proof)
 
 
 class UdpPoses:
-    """Satisfies `drivers.types.PoseSource`."""
+    """Satisfies `drivers.types.PoseSource` and `drivers.types.SaysWhy`."""
 
-    def __init__(self, opened: socket.socket) -> None:
+    def __init__(self, opened: socket.socket, senders: SenderGate, proof: PoseProof | None = None) -> None:
         self._socket = opened
+        self._senders = senders
+        self._proof = proof
         self.malformed = 0
+
+    @property
+    def refused(self) -> int:
+        """Number of datagrams refused for their sender or for want of a proof."""
+        return self._senders.refused
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
         """What came since the last call, oldest first; never waits and never raises."""
         poses = []
         with contextlib.suppress(OSError):
             for _ in range(MOST_A_TICK):
-                pose = pose_of(self._socket.recv(LONGEST_DATAGRAM), now_ns)
-                if pose is None:
-                    self.malformed += 1
-                else:
+                pose = self._take(*self._socket.recvfrom(LONGEST_DATAGRAM), now_ns)
+                if pose is not None:
                     poses.append(pose)
         return sorted(poses, key=lambda pose: pose.t_ns)
+
+    def news(self) -> Sequence[str]:
+        """What a person should know since the last call."""
+        return self._senders.news()
 
     def close(self) -> None:
         """Close the socket; safe to call twice."""
         self._socket.close()
+
+    def _take(self, datagram: bytes, sender: tuple[str, int], now_ns: int) -> PoseSample | None:
+        """The pose in a datagram, if its sender counts; the cheap checks first, as anybody can send many."""
+        if not self._senders.may_send(sender, now_ns):
+            return None
+        if self._proof is not None:
+            opened = self._proof.open(datagram, time.time_ns())
+            if isinstance(opened, str):
+                words = f"{sender[0]}:{sender[1]} sends poses {opened}"
+                self._senders.refuse(now_ns, words, "docs/poses.md says what a sender with a key does")
+                return None
+            datagram = opened
+        pose = pose_of(datagram, now_ns)
+        if pose is None:
+            self.malformed += 1
+            return None
+        self._senders.note_pose(sender, now_ns)
+        return pose
 
 
 def pose_of(datagram: bytes, now_ns: int) -> PoseSample | None:
@@ -95,10 +152,18 @@ def pose_of(datagram: bytes, now_ns: int) -> PoseSample | None:
         yaw_rad = yaw_std_rad = math.nan
     elif read.yaw_rad is None or read.yaw_std_rad is None:
         return None
-    else:
+    elif is_heading_filled_in(read.yaw_rad, read.yaw_std_rad):
         yaw_rad, yaw_std_rad = read.yaw_rad, read.yaw_std_rad
-        if not (math.isfinite(yaw_rad) and math.isfinite(yaw_std_rad)) or yaw_std_rad < 0.0:
-            return None
+    else:
+        yaw_rad = yaw_std_rad = math.nan
     if read.position_std_m < 0.0:
         return None
     return PoseSample(t_ns, now_ns, read.x_m, read.y_m, yaw_rad, read.position_std_m, yaw_std_rad)
+
+
+def words_of(datagram: bytes) -> str | None:
+    """Return the sentence for a person in a datagram of a process of ours; None where there is none."""
+    try:
+        return _WORDS.decode(datagram).said
+    except (msgspec.MsgspecError, UnicodeDecodeError):
+        return None

@@ -359,6 +359,21 @@ class TestTransforms:
             self.heard(inlet, 0, "map", f"frame{number}", (0.0, 0.0, 0.0))
         assert inlet.refused["transforms of too many frames"] > 400
 
+    def test_of_two_publishers_of_one_edge_the_first_counts_and_the_other_is_named(self, inlet):
+        def heard(at_ms, x, publisher):
+            header = msg.Header(msg.stamp_of(WALL_NS + at_ms * MS), "map")
+            place = msg.Transform(msg.Vector3(x, 0.0, 0.0), msg.Quaternion(0.0, 0.0, 0.0, 1.0))
+            message = msg.TFMessage([msg.TransformStamped(header, "odom", place)])
+            return list(inlet.poses(message, 0, WALL_NS + at_ms * MS, static=False, publisher=publisher))
+
+        for at_ms in range(0, 500, 50):
+            self.heard(inlet, at_ms, "odom", "base_link", (1.0, 0.0, 0.0))
+            heard(at_ms, 3.0, "slam")
+            assert not heard(at_ms + 10, 9.0, "amcl")
+        assert inlet.refused["transforms of a second publisher of the same edge"] == 10
+        (said,) = inlet.news()
+        assert said.startswith("amcl sends poses beside slam: not used")
+
     def test_a_clock_that_was_set_back_begins_anew(self, inlet):
         self.heard(inlet, 60_000, "odom", "base_footprint", (1.0, 0.0, 0.0))
         self.heard(inlet, 60_000, "map", "odom", (1.0, 0.0, 0.0))
@@ -391,3 +406,37 @@ def test_over_dds_the_bridges_own_odometry_and_a_localisation_make_poses_for_the
     bridge.close()
     daemon.close()
     assert heard[0].x_m == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize(
+    ("yaw", "variance", "has_heading"),
+    [(0.0, 0.0, False), (0.0, 99999.0, False), (2.5, 1e3, False), (2.5, -1.0, False), (2.5, math.nan, False),
+     (2.5, 0.0, True), (0.0, 0.01, True), (2.5, 3.0, True)],
+)  # fmt: skip
+@pytest.mark.parametrize("kind", [msg.PoseWithCovarianceStamped, msg.Odometry])
+def test_a_heading_whose_covariance_says_unknown_is_left_out_and_the_position_is_passed_on(
+    kind, yaw, variance, has_heading
+):
+    inlet = PoseInlet(PoseInput())
+    message = pose_message(yaw=yaw, kind=kind, covariance=covariance(0.01, 0.01, variance))
+    pose = pose_of(inlet.datagram(message, 0, MONO_NS, WALL_NS), MONO_NS)
+    assert (pose.x_m, pose.y_m, pose.has_heading) == (1.0, -2.0, has_heading)
+    assert inlet.without_heading == (not has_heading)
+
+
+def test_of_two_publishers_on_the_topic_the_first_counts_until_it_is_silent_and_the_other_is_named():
+    inlet = PoseInlet(PoseInput())
+
+    def passes(at_ms, publisher):
+        t = at_ms * MS
+        return inlet.datagram(pose_message(20 * MS - t), 0, MONO_NS + t, WALL_NS + t, publisher) is not None
+
+    assert [passes(40 * k, "publisher a") for k in range(3)] == [True] * 3
+    assert [passes(90 + k, "publisher b") for k in range(5)] == [False] * 5
+    assert inlet.refused["of a second publisher on the topic"] == 5
+    (said,) = inlet.news()
+    assert said.startswith("publisher b sends poses beside publisher a: not used")
+    assert "kept until it has been silent for 2 s" in said
+    assert passes(120, "publisher a")
+    assert passes(2200, "publisher b")
+    assert inlet.news() == ["poses come from publisher b now; publisher a has been silent for 2.1 s"]

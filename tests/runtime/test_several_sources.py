@@ -144,6 +144,10 @@ class LoopFigures:
         ('[[pose.also]]\nsource = "udp"\nbaud = 9600\n', r'also\[0\]\.baud: a field of the source "nmea", and'),
         ('[[pose.also]]\nsource = "udp"\nrate_hz = 50.0\n', r"also\[0\]\.rate_hz: .*; remove it"),
         ('[[pose.also]]\nsource = "udp"\noffset = [inf, 0.0]\n', r"also\[0\]\.offset: not a finite number"),
+        ('[pose]\nsource = "udp"\nallow = []\n', r"pose\.allow: empty, so that nobody could send poses; write addr"),
+        ('[pose]\nsource = "natnet"\nallow = ["host"]\n', r'pose\.allow: "host" is no IPv4 address; write addr'),
+        ('[[pose.also]]\nsource = "udp"\nallow = ["10.0.0.0/99"]\n', r'also\[0\]\.allow: "10\.0\.0\.0/99" is no IPv4'),
+        ('[pose]\nsource = "robot"\nkey_file = "k"\n', r'pose\.key_file: a field of the source "udp", and'),
         ('[[pose.also]]\nsource = "udp"\nprot = 7\n', r"pose\.also.*prot: no such field; did you mean port"),
         ('[[pose.also]]\nsource = "udp"\nposition_unit = "km"\n', r"pose\.also.*position_unit: .*write one of"),
         ('[[pose.also]]\nsource = "udp"\n[[pose.also.also]]\nsource = "robot"\n', r"also\[0\]\.also: sources are not"),
@@ -180,3 +184,23 @@ def test_check_shows_each_and_that_two_disagree(tmp_path):
     turned = [PoseSample(t, t, 1.0, 2.0, 0.9, 0.01, 0.02, source=1) for t in range(9)]
     (last,) = [each for each in pose_source_checks(reported, [*poses[:30], *turned]) if "apart" in each.text]
     assert last.text.startswith("0.40 rad apart,")
+
+
+@pytest.mark.parametrize("where", ["", "[[pose.also]]\n"])
+def test_a_key_beside_robot_toml_is_read_and_one_that_others_can_read_or_is_none_is_refused(tmp_path, port, where):
+    robot = "" if where else "[pose]\n"
+    file = robot_toml(tmp_path, f'{robot}{where}source = "udp"\nport = {port}\nkey_file = "pose.key"\n')
+    key = tmp_path / "pose.key"
+    with pytest.raises(InputError, match=r"pose\.source.*: .*pose\.key: .*make one with"):
+        pose_source_of(load_setup(file).config)
+    key.write_text("00" * 16, encoding="utf-8")
+    key.chmod(0o644)
+    with pytest.raises(InputError, match=r"pose\.key: others may read the key"):
+        pose_source_of(load_setup(file).config)
+    key.chmod(0o600)
+    source = pose_source_of(load_setup(file).config)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.sendto(b'{"x_m":1,"y_m":2,"position_std_m":0.1,"age_s":0}', ("127.0.0.1", port))
+        assert list(source.receive(10**12, ())) == []
+    assert any("without the proof of pose.key_file" in words for words in source.news())
+    source.close()

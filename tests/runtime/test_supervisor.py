@@ -540,3 +540,24 @@ def test_to_arm_unrecorded_needs_all_else_that_arming_needs(state):
     ready = Bench()
     ready.ready()
     assert not ready.tick(UserRequest.ARM_UNRECORDED, wheel_speed_rad_s=1.0).replies[0].accepted
+
+
+def test_a_pose_that_jumps_stops_the_task_and_refuses_a_start_while_it_does():
+    jump = "the pose jumped by 1.00 m and 0.10 rad, which the wheels do not explain"
+    words = f"{jump}; see that the robot is where the page shows it, then start again"
+    bench = Bench().running()
+    out = bench.tick(pose_jump=jump)
+    assert (out.state, out.motion_allowed, out.zero_only) == (State.ARMED, False, True)
+    assert out.events[-1] == f"task stopped: {words}"
+    # The jump is over, and nobody has asked for motion again.
+    assert not bench.tick(pose_jump="", count=10).motion_allowed
+    assert refusal(bench.tick(START, pose_jump=jump)) == words
+    assert bench.tick(START, pose_jump="").motion_allowed
+
+
+def test_who_drives_by_hand_sees_a_jump_and_drives_on():
+    bench = Bench()
+    bench.ready().tick(ARM)
+    bench.tick(count=3)
+    assert bench.tick(START, by_hand=True).motion_allowed
+    assert bench.tick(pose_jump="the pose jumped by 1.00 m").motion_allowed

@@ -204,3 +204,19 @@ def test_by_unicast_it_asks_and_takes_version_and_clock_from_the_answer(port, mo
 def test_an_address_that_is_not_this_computers_is_one_line():
     with pytest.raises(PoseSourceError, match=r"mend pose\.group, pose\.server, or pose\.address"):
         make_pose_source("natnet", address="203.0.113.7")
+
+
+def test_frames_of_a_second_server_are_refused_and_named(port):
+    version = (3, 0)
+    source = make_pose_source("natnet", data_port=port, server="127.0.0.1", body=3)
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as two,
+    ):
+        for sender, x_m in ((one, 1.0), (two, 5.0), (one, 1.1)):
+            sender.sendto(frame(version, [rigid_body(version, 3, (x_m, 0.1, -2.0), TURNED)]), ("127.0.0.1", port))
+        names = [f"127.0.0.1:{sender.getsockname()[1]}" for sender in (one, two)]
+        found, said = until(source, lambda found, _: len(found) == 2)
+    assert [pose.x_m for pose in found] == pytest.approx([1.0, 1.1])
+    assert any(f"{names[1]} sends poses beside {names[0]}: not used" in words for words in said)
+    source.close()

@@ -229,3 +229,98 @@ def test_a_reader_that_is_killed_is_said_and_one_whose_daemon_has_gone_ends(ende
 def test_without_a_device_it_says_what_to_write():
     with pytest.raises(PoseSourceError, match=r'no device; write pose\.device = "/dev/serial'):
         make_pose_source("nmea")
+
+
+def sentence(text):
+    """With its checksum."""
+    checksum = 0
+    for byte in text.encode():
+        checksum ^= byte
+    return f"${text}*{checksum:02X}\r\n".encode()
+
+
+def fix(quality, altitude="499.6", talker="GN", time="092725.00", place="4717.11399,N,00833.91590,E"):
+    return sentence(f"{talker}GGA,{time},{place},{quality},08,1.01,{altitude},M,48.0,M,,")
+
+
+def said_by(found):
+    return [each["said"] for each in found if "said" in each]
+
+
+def taken(*lines):
+    """What is made of sentences that come 10 ms apart."""
+    fixes = Fixes()
+    return [each for k, line in enumerate(lines) for each in fixes.take(line, NOW_NS + 10_000_000 * k)]
+
+
+@pytest.mark.parametrize("quality", QUALITY_STD_M)
+def test_a_fix_without_an_altitude_is_a_position_and_said_once(quality):
+    found = taken(fix(quality, ""), fix(quality, ""), fix(quality), fix(quality, ""), fix(quality, ""))
+    assert [(pose["x_m"], pose["y_m"]) for pose in poses(found)] == [pytest.approx((0.0, 0.0), abs=1e-6)] * 5
+    assert [words for words in said_by(found) if "altitude" in words] == [
+        "GGA sentences come without an altitude: taken at 0 m",
+        "GGA sentences come without an altitude: taken at the last height, 547.6 m",
+    ]
+
+
+@pytest.mark.parametrize("broken", [{"time": ""}, {"place": ",,,"}])
+def test_a_fix_without_time_or_place_is_no_position_and_said_once(broken):
+    found = taken(fix(4, **broken), fix(4, **broken))
+    assert poses(found) == []
+    assert said_by(found)[1:] == ["GGA sentences come without time, latitude or longitude: no positions of those"]
+
+
+@pytest.mark.parametrize("talker", ["GP", "GN", "GL", "GA", "GB", "BD", "GQ"])
+@pytest.mark.parametrize("heading", ["HDT,123.456,T", "THS,123.456,A"])
+def test_a_heading_of_any_talker_is_read(talker, heading):
+    (pose,) = poses(taken(sentence(talker + heading), fix(4, talker=talker)))
+    assert pose["yaw_rad"] == pytest.approx(math.radians(90.0 - 123.456))
+    assert pose["yaw_std_rad"] == 0.02
+
+
+@pytest.mark.parametrize(
+    ("ths", "why"),
+    [("THS,123.4,V", "not valid"), ("THS,123.4,E", "reckoned"), ("THS,123.4,M", "typed in"),
+     ("THS,123.4,S", "simulated"), ("THS,,V", "not valid"), ("THS,123.4,", "unknown mode")],
+)  # fmt: skip
+def test_a_heading_that_the_receiver_does_not_measure_is_refused_and_said_once(ths, why):
+    found = taken(sentence("GN" + ths), fix(4), sentence("GN" + ths), fix(4))
+    assert ["yaw_rad" in pose for pose in poses(found)] == [False, False]
+    (said,) = [words for words in said_by(found) if words.startswith("THS")]
+    assert why in said
+    assert "not used" in said
+    again = taken(sentence("GN" + ths), sentence("GNTHS,123.4,A"), fix(4))
+    assert "THS: the heading is measured again" in said_by(again)
+    assert "yaw_rad" in poses(again)[0]
+
+
+@pytest.mark.parametrize("ths", ["GNTHS,400.0,A", "GNTHS,-3.0,A", "GNTHS,,A", "GNHDT,,T", "GNHDT,361.0,T"])
+def test_what_is_no_heading_is_none(ths):
+    assert ["yaw_rad" in pose for pose in poses(taken(sentence(ths), fix(4)))] == [False]
+    assert poses(taken(sentence("GNTHS,123.4,A").replace(b"123", b"124"), fix(4)))[0].keys().isdisjoint({"yaw_rad"})
+
+
+@pytest.mark.parametrize("heading", [sentence("GPHDT,123.4,T"), sentence("GNTHS,123.4,A")], ids=["HDT", "THS"])
+@pytest.mark.parametrize(("quality", "std_rad"), [(1, 0.02), (2, 0.02), (4, 0.02), (5, 0.4)])
+def test_the_heading_of_a_float_fix_is_wide_before_or_after_its_position(heading, quality, std_rad):
+    (first,) = poses(taken(heading, fix(quality)))
+    # The first position without a heading is not kept waiting; from then on it is known that there are some.
+    after = poses(taken(heading, fix(4), *[sentence("GNZDA,,,,,,")] * 9, fix(quality), heading))[-1]
+    assert first["yaw_std_rad"] == after["yaw_std_rad"] == std_rad
+
+
+def test_the_heading_that_came_without_a_fix_is_wide():
+    (pose,) = poses(taken(fix(0), sentence("GPHDT,123.4,T"), fix(4)))
+    assert pose["yaw_std_rad"] == 0.4
+
+
+def test_where_no_heading_comes_the_sentences_that_bring_one_are_named_once():
+    def said_over(seconds, *first):
+        fixes = Fixes()
+        found = [each for line in first for each in fixes.take(line, NOW_NS)]
+        found += [each for k in range(5 * seconds) for each in fixes.take(fix(4), NOW_NS + 200_000_000 * (k + 1))]
+        return [words for words in said_by(found) if "HDT or THS" in words]
+
+    assert len(said_over(30)) == 1
+    assert said_over(9) == []
+    assert said_over(30, HDT) == []

@@ -49,6 +49,23 @@ def test_what_another_user_says_does_not_count(source):
     assert source.foreign_users == 1
 
 
+ANOTHER_BRIDGE = """
+import socket, sys
+socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM).sendto(sys.stdin.buffer.read(), bytes.fromhex(sys.argv[1]))
+"""
+
+
+def test_a_second_bridge_is_refused_and_named(source):
+    say(msgspec.msgpack.encode({**POSE, "t_ns": NOW_NS}), msgspec.json.encode({"said": "hello"}))
+    datagram = msgspec.msgpack.encode({**POSE, "x_m": 9.0, "t_ns": NOW_NS})
+    address = bridge_address(PORT).hex()
+    subprocess.run([sys.executable, "-c", ANOTHER_BRIDGE, address], input=datagram, check=True, timeout=60)
+    assert [pose.x_m for pose in source.receive(NOW_NS, ())] == [1.0]
+    words, refused = source.news()
+    assert words == "hello"
+    assert f"sends poses beside bridge process {os.getpid()}: not used" in refused
+
+
 def test_a_second_daemon_is_asked_to_take_another_port(source):
     with pytest.raises(PoseSourceError, match=rf"port {PORT}: .*; choose another pose\.port"):
         make_pose_source("ros2", port=PORT)

@@ -1,6 +1,7 @@
 """Poses in datagrams: both forms, real sockets, hostile ones."""
 
 import json
+import math
 import re
 import shutil
 import socket
@@ -42,7 +43,7 @@ def test_a_datagram_is_a_pose_at_its_own_time(encode):
         {"t_ns": NOW_NS + 1},
         {},
         {"age_s": 0.0, "x_m": "1"},
-        {"age_s": 0.0, "yaw_std_rad": -1.0},
+        {"age_s": 0.0, "position_std_m": -1.0},
         {"age_s": 0.0, "x_m": None},
         {"age_s": 0.0, "yaw_rad": None},
         {"age_s": 0.0, "yaw_std_rad": None},
@@ -57,6 +58,23 @@ def test_a_position_without_heading_is_one_and_says_so(encode):
     for absent in ({}, {"yaw_rad": None, "yaw_std_rad": None}):
         pose = pose_of(encode({"x_m": 1.0, "y_m": -2.0, "position_std_m": 0.01, "age_s": 0.0, **absent}), NOW_NS)
         assert (pose.x_m, pose.y_m, pose.position_std_m, pose.has_heading) == (1.0, -2.0, 0.01, False)
+
+
+@pytest.mark.parametrize(
+    ("change", "has_heading"),
+    [
+        ({}, True),
+        ({"yaw_std_rad": -1.0}, False),
+        ({"yaw_std_rad": math.nan}, False),
+        ({"yaw_rad": math.nan}, False),
+        ({"yaw_rad": 0.0, "yaw_std_rad": 0.0}, False),
+        ({"yaw_rad": 0.0}, True),
+        ({"yaw_std_rad": 0.0}, True),
+    ],
+)
+def test_a_heading_that_nobody_has_filled_in_is_left_out_and_the_position_is_kept(change, has_heading):
+    pose = pose_of(msgspec.msgpack.encode({**POSE, "age_s": 0.0, **change}), NOW_NS)
+    assert (pose.x_m, pose.y_m, pose.has_heading) == (1.0, -2.0, has_heading)
 
 
 @pytest.mark.parametrize("word", [b"NaN", b"1e999", b"-Infinity"])

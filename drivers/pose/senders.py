@@ -1,0 +1,133 @@
+"""Who may send poses to a port: allowed addresses, one sender at a time, and a proof under a key; pure.
+
+Any user of this computer can send to a UDP port of it. Two programs that do so by mistake, or one on purpose, would
+pull the estimate to and fro without a word.
+
+A proven datagram is the time at which it was sent (UNIX time in ns, 8 bytes, big-endian), then the pose, then the
+HMAC-SHA256 of both under the key.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+from collections.abc import Collection, Hashable, Sequence
+from ipaddress import AddressValueError, IPv4Address, IPv4Network, NetmaskValueError
+
+SILENCE_S = 2.0
+"""A sender is kept until it has been silent for so long, unless the host says otherwise."""
+REPORT_AGAIN_NS = 10_000_000_000
+CLOCKS_APART_NS = 1_000_000_000
+"""A proven datagram was sent at most so long ago, by the sender's clock, or so far ahead of this computer's."""
+TIME_BYTES, PROOF_BYTES = 8, 32
+Sender = tuple[str, int]
+
+
+def parse_allowed(addresses: Collection[str]) -> tuple[IPv4Network, ...]:
+    """Return the networks that `pose.allow` names; raises ValueError with what is wrong with one of them."""
+    if not addresses:
+        raise ValueError("empty, so that nobody could send poses")
+    networks = []
+    for text in addresses:
+        try:
+            networks.append(IPv4Network(text, strict=False))
+        except (AddressValueError, NetmaskValueError, ValueError):
+            raise ValueError(f'"{text[:60]}" is no IPv4 address') from None
+    return tuple(networks)
+
+
+class PoseProof:
+    """Opens proven datagrams: each must have been sent later than all before it, and since the port was opened."""
+
+    def __init__(self, key: bytes, wall_ns: int) -> None:
+        self._key = key
+        self._newest_ns = wall_ns
+
+    def open(self, datagram: bytes, wall_ns: int) -> bytes | str:
+        """Return the body of a datagram that arrives at this UNIX time (ns), or in words why it is refused."""
+        told, proof = datagram[:-PROOF_BYTES], datagram[-PROOF_BYTES:]
+        if len(told) < TIME_BYTES or not hmac.compare_digest(hmac.digest(self._key, told, hashlib.sha256), proof):
+            return "without the proof of pose.key_file"
+        sent_ns = int.from_bytes(told[:TIME_BYTES], "big")
+        if abs(wall_ns - sent_ns) > CLOCKS_APART_NS:
+            return f"{abs(wall_ns - sent_ns) * 1e-9:.0f} s old or ahead by their sender's clock; synchronise the clocks"
+        if sent_ns <= self._newest_ns:
+            return "sent again, or out of order"
+        self._newest_ns = sent_ns
+        return told[TIME_BYTES:]
+
+
+class SenderGate:
+    """Keeps to one sender: the first whose pose is good, until it has been silent; all others are counted and named.
+
+    `allowed`: networks that may send at all; None for every one. A `sender` is whatever names one, as (address, port).
+    """
+
+    def __init__(self, silence_s: float = SILENCE_S, allowed: Sequence[IPv4Network] | None = None) -> None:
+        self.refused = 0
+        self._silence_ns = round(silence_s * 1e9)
+        self._allowed = allowed
+        self._known: dict[str, bool] = {}
+        self._kept: Hashable | None = None
+        self._came_ns = 0
+        self._said: list[str] = []
+        self._next_report_ns = 0
+        self._unreported = 0
+
+    @property
+    def kept_address(self) -> str | None:
+        """The network address of the sender that is kept to; None where there is none."""
+        return str(self._kept[0]) if isinstance(self._kept, tuple) else None
+
+    def may_send(self, sender: Hashable, now_ns: int) -> bool:
+        """Return whether a datagram of this sender is worth reading; one that is not is counted and reported."""
+        if self._allowed is not None and not self._is_allowed(sender):
+            self.refuse(now_ns, f"{_name(sender)} sends poses and is not in pose.allow", "add it there, or stop it")
+            return False
+        if self._kept in (None, sender) or self._is_silent(now_ns):
+            return True
+        self.refuse(
+            now_ns,
+            f"{_name(sender)} sends poses beside {_name(self._kept)}",
+            f"stop one of them; {_name(self._kept)} is kept until it has been silent for {self._silence_ns * 1e-9:g} s",
+        )
+        return False
+
+    def note_pose(self, sender: Hashable, now_ns: int) -> None:
+        """Take in that a good pose came from this sender, which is kept to from now on."""
+        if self._kept not in (None, sender):
+            self._said.append(
+                f"poses come from {_name(sender)} now; {_name(self._kept)} has been silent for "
+                f"{(now_ns - self._came_ns) * 1e-9:.1f} s"
+            )
+        self._kept, self._came_ns = sender, now_ns
+
+    def refuse(self, now_ns: int, words: str, hint: str) -> None:
+        """Count a refused datagram, and report it unless another was reported in the last ten seconds."""
+        self.refused += 1
+        self._unreported += 1
+        if now_ns >= self._next_report_ns:
+            self._next_report_ns = now_ns + REPORT_AGAIN_NS
+            self._said.append(f"{words}: not used ({self._unreported} datagrams); {hint}")
+            self._unreported = 0
+
+    def news(self) -> list[str]:
+        """Return what a person should know since the last call."""
+        said, self._said = self._said, []
+        return said
+
+    def _is_silent(self, now_ns: int) -> bool:
+        return now_ns - self._came_ns >= self._silence_ns
+
+    def _is_allowed(self, sender: Hashable) -> bool:
+        address = sender[0] if isinstance(sender, tuple) else str(sender)
+        if address not in self._known:
+            if len(self._known) > 1000:
+                # A flood from made-up addresses must not fill the memory.
+                self._known.clear()
+            self._known[address] = any(IPv4Address(address) in network for network in self._allowed or ())
+        return self._known[address]
+
+
+def _name(sender: Hashable) -> str:
+    return f"{sender[0]}:{sender[1]}" if isinstance(sender, tuple) else str(sender)

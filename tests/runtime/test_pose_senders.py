@@ -1,0 +1,288 @@
+"""The stack with poses by datagrams: a robot that is carried, a second sender, and headings that are no measurement."""
+
+import json
+import math
+import socket
+
+import msgspec
+import pytest
+
+from disco_hw.daemon.control_socket import status
+from disco_hw.drive.coverage import Coverage
+from disco_hw.drive.hand_pilot import HandPilot
+from disco_hw.log import records
+from disco_hw.log.recorder import RecorderStats
+from disco_hw.runtime.pipeline import NoPlanner
+from disco_hw.runtime.replay import replay
+from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.runtime.supervisor import UserRequest
+from drivers.types import PoseSample
+from tests.drive.test_hand_pilot import Hand
+from tests.drivers.waiting import free_port
+from tests.runtime.simulated import ROBOT_FILE, simulated_stack
+from tools.fault_run import CirclingPlanner
+
+
+class Sender:
+    """Tells by datagrams where the robot truly is, off by `off(t_s)` (m, east), at a rate; `said` changes a pose."""
+
+    def __init__(self, port, rate_hz, off=lambda t_s: 0.0, said=lambda pose: pose):
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.connect(("127.0.0.1", port))
+        self.name = "{}:{}".format(*self._socket.getsockname())
+        self._period_us, self._off, self._said = round(1e6 / rate_hz), off, said
+        self.is_silent = False
+
+    def step(self, now_us, truth):
+        if now_us % self._period_us == 0 and not self.is_silent:
+            pose = {"x_m": truth.x_m + self._off(now_us * 1e-6), "y_m": truth.y_m, "yaw_rad": truth.yaw_rad}
+            pose |= {"position_std_m": 0.005, "yaw_std_rad": 0.01, "age_s": 0.0}
+            self._socket.send(json.dumps(self._said(pose)).encode())
+
+    def close(self):
+        self._socket.close()
+
+
+class Bench:
+    """The shipped robot on its circle of 0.75 m, without DISCO, which is not what is tried."""
+
+    def __init__(self, directory, lines=""):
+        self.port = free_port(socket.SOCK_DGRAM)
+        file = directory / "robot.toml"
+        text = ROBOT_FILE.read_text(encoding="utf-8").replace(
+            'file = "wombot_model.toml"', f'file = "{ROBOT_FILE.parent / "wombot_model.toml"}"'
+        )
+        file.write_text(f'{text}\n[pose]\nsource = "udp"\nport = {self.port}\n{lines}', encoding="utf-8")
+        self.stack = simulated_stack(
+            CirclingPlanner(load_setup(file).config, (0.061, 0.415, 0.238)), robot_file=file, needs_pose=True
+        )
+        self.senders = []
+        self._advance = self.stack.robot.advance
+        self.stack.robot.advance = self.advance
+
+    def advance(self, now_us):
+        self._advance(now_us)
+        for sender in self.senders:
+            sender.step(now_us, self.stack.robot.truth)
+
+    def send(self, *of, **more):
+        self.senders.append(Sender(self.port, *of, **more))
+        return self.senders[-1]
+
+    def start(self):
+        self.stack.run(1.5)
+        self.stack.run(0.5, UserRequest.ARM)
+        return self.stack.run(0.5, UserRequest.START)[-1].output.running
+
+    def said(self):
+        return [
+            record.text for _, tick in self.stack.recorder.ticks for record in tick if isinstance(record, records.Event)
+        ]
+
+    def error_m(self):
+        found, truth = self.stack.core.last.pipeline.estimate, self.stack.robot.truth
+        return math.hypot(found.x_m - truth.x_m, found.y_m - truth.y_m)
+
+
+@pytest.fixture
+def bench(tmp_path):
+    made = []
+
+    def make(lines=""):
+        made.append(Bench(tmp_path, lines))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.stack.core.pose_source.close()
+        for sender in one.senders:
+            sender.close()
+
+
+def containing(said, words):
+    return [text for text in said if words in text]
+
+
+@pytest.mark.parametrize("off_m", [1.0, -0.3])
+def test_a_robot_that_is_carried_stops_its_task_and_says_so_and_its_operator_starts_it_again(bench, off_m):
+    made = bench()
+    carried = []
+    made.send(25.0, lambda _t_s: off_m if carried else 0.0)
+    assert made.start()
+    assert made.stack.run(4.0)[-1].output.running
+    assert not containing(made.said(), "jump")
+    carried.append(True)
+    last = made.stack.run(2.0)[-1]
+    assert not last.output.running
+    assert last.command.left_rad_s == last.command.right_rad_s == 0.0
+    said = made.said()
+    (jump,) = containing(said, "poses: the pose jumped by")
+    assert f"by {abs(off_m):.2f} m" in jump
+    assert "which the wheels do not explain: the robot was carried or has slipped, or its poses are wrong" in jump
+    (stop,) = containing(said, "task stopped: the pose jumped by")
+    assert stop.endswith("see that the robot is where the page shows it, then start again")
+    (misfit,) = containing(said, "poses: 3 in a row do not fit the wheels")
+    assert f"{abs(off_m):.2f} m off: not used" in misfit
+    # It never goes on by itself.
+    assert not made.stack.run(3.0)[-1].output.running
+    (reply,) = [reply for tick in made.stack.run(0.1, UserRequest.START) for reply in tick.replies]
+    assert reply.accepted
+    assert made.stack.run(1.0)[-1].output.running
+
+
+def test_a_jump_while_nothing_runs_is_said_and_keeps_nobody_from_starting_later(bench):
+    made = bench()
+    carried = []
+    made.send(25.0, lambda _t_s: 1.0 if carried else 0.0)
+    made.stack.run(1.5)
+    carried.append(True)
+    made.stack.run(1.0)
+    assert containing(made.said(), "poses: the pose jumped by 1.00 m")
+    made.stack.run(0.5, UserRequest.ARM)
+    assert made.stack.run(0.5, UserRequest.START)[-1].output.running
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "stranger_hz", "off"),
+    [(2.0, 25.0, lambda t_s: 1.0), (25.0, 250.0, lambda t_s: 0.03 * t_s), (25.0, 25.0, lambda t_s: 0.05)],
+)
+def test_a_second_sender_is_refused_and_named_and_the_robot_stays_on_its_circle(bench, rate_hz, stranger_hz, off):
+    made = bench()
+    first = made.send(rate_hz)
+    assert made.start()
+    stranger = made.send(stranger_hz, off)
+    last = made.stack.run(12.0)[-1]
+    assert last.output.running
+    assert made.error_m() < 0.05
+    named = containing(made.said(), f"poses: {stranger.name} sends poses beside {first.name}: not used")
+    assert 1 <= len(named) <= 2
+    assert f"stop one of them; {first.name} is kept until it has been silent for 2 s" in named[0]
+    assert made.stack.core.pose_source.refused > 11.0 * stranger_hz
+    assert made.stack.core.pipeline.fusion.stats.poses_gated <= 2
+
+
+def test_another_sender_takes_over_only_after_the_task_has_stopped_for_want_of_poses(bench):
+    made = bench()
+    first = made.send(25.0)
+    assert made.start()
+    second = made.send(25.0)
+    made.stack.run(1.0)
+    first.is_silent = True
+    seen = made.stack.run(4.0)
+    assert not seen[-1].output.running
+    said = made.said()
+    stopped = said.index("task stopped: no pose; check the pose sensor, or set estimation.pose_required = false")
+    (taken,) = containing(said, f"poses: poses come from {second.name} now; {first.name} has been silent for 2.0 s")
+    assert stopped < said.index(taken)
+    assert seen[-1].pipeline.estimate.pose_ok
+
+
+def test_only_allowed_addresses_may_send(bench):
+    made = bench('allow = ["10.0.0.0/8"]\n')
+    sender = made.send(25.0)
+    assert not made.start()
+    (said,) = containing(made.said(), "is not in pose.allow")
+    assert said.startswith(f"poses: {sender.name} sends poses and is not in pose.allow: not used (1 datagrams)")
+
+
+def constant(yaw_rad):
+    return lambda pose: {**pose, "yaw_rad": yaw_rad}
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        lambda pose: {**pose, "yaw_rad": 0.0, "yaw_std_rad": 0.0},
+        lambda pose: {**pose, "yaw_rad": 0.3, "yaw_std_rad": -1.0},
+        lambda pose: {**pose, "yaw_rad": 0.3, "yaw_std_rad": 316.0},
+    ],
+    ids=["identity", "minus one", "large"],
+)
+def test_a_heading_that_is_said_to_be_unknown_is_not_used_and_the_operator_is_told(bench, said):
+    made = bench()
+    made.send(25.0, said=said)
+    assert not made.start()
+    last = made.stack.core.last
+    assert (last.pipeline.estimate.initialised, last.pipeline.estimate.heading_known) == (True, False)
+    assert last.output.detail == "armed, holding zero"
+    assert made.error_m() < 0.05
+    (told,) = containing(made.said(), "the estimator runs on positions")
+    assert told.startswith("poses: udp: its poses have no heading, or one whose covariance says that it is unknown")
+    assert status(made.stack.core, {}, RecorderStats())["poses"][0]["heading"] == "none"
+
+
+def test_a_heading_that_never_moves_is_found_out_by_the_first_turn_and_the_estimate_forgets_it(bench):
+    """At first it fits: the circle begins with it."""
+    made = bench()
+    made.send(25.0, said=constant(0.5 * math.pi))
+    assert made.start()
+    last = made.stack.run(3.0)[-1]
+    assert not last.output.running
+    assert not last.pipeline.estimate.heading_known
+    (told,) = containing(made.said(), "the heading stands still at 1.57 rad while the wheels turn the robot by")
+    assert told.endswith("it is not used, and the estimator runs on positions")
+    assert status(made.stack.core, {}, RecorderStats())["poses"][0]["heading"] == "stands still"
+
+
+def test_a_heading_sensor_that_dies_is_left_out_and_the_drive_goes_on_by_positions(bench):
+    made = bench("offset = [0.1, 0.0]\n")
+    dead = []
+
+    def said(pose):
+        if made.stack.now_us > 6_000_000 and not dead:
+            dead.append(pose["yaw_rad"])
+        yaw = pose["yaw_rad"]
+        x, y = pose["x_m"] + 0.1 * math.cos(yaw), pose["y_m"] + 0.1 * math.sin(yaw)
+        return {**pose, "x_m": x, "y_m": y, "yaw_rad": dead[0] if dead and made.stack.now_us < 14_000_000 else yaw}
+
+    made.send(25.0, said=said)
+    assert made.start()
+    last = made.stack.run(10.0)[-1]
+    assert containing(made.said(), "udp: the heading stands still at")
+    assert last.output.running, made.said()
+    assert made.error_m() < 0.05
+    last = made.stack.run(5.0)[-1]
+    assert containing(made.said(), "udp: its headings are used again")
+    assert last.output.running
+    assert made.error_m() < 0.03
+
+
+def test_a_drive_whose_heading_is_left_out_on_the_way_is_replayed_bit_for_bit(tmp_path):
+    """By hand, as the harness' planner is not the one that a replay makes."""
+    stack = simulated_stack(NoPlanner())
+    received = stack.core.pose_source.receive
+    stack.core.pose_source.receive = lambda now_ns, poses: [
+        msgspec.structs.replace(pose, yaw_rad=1.5) for pose in received(now_ns, poses)
+    ]
+    hand = Hand()
+    stack.pilot = HandPilot(hand, Coverage(8.0))
+    stack.run(1.5)
+    hand.held = True
+    found, truth = stack.run(4.0)[-1].pipeline.estimate, stack.robot.truth
+    # It was forgotten, and found again by positions and motion.
+    assert (found.reinitialisations, found.heading_known) == (1, True)
+    assert abs(math.remainder(found.yaw_rad - truth.yaw_rad, math.tau)) < 0.2
+    log = tmp_path / "run.mcap"
+    stack.write_log(log)
+    report = replay(log)
+    assert report.ok, report.as_text()
+    recorded = [one for _, tick in stack.recorder.ticks for one in tick if isinstance(one, PoseSample)]
+    assert {pose.yaw_rad for pose in recorded} == {1.5}
+
+
+def test_a_first_pose_that_is_not_where_the_wheels_led_to_from_the_origin_stops_the_task(tmp_path):
+    file = tmp_path / "robot.toml"
+    text = ROBOT_FILE.read_text(encoding="utf-8").replace(
+        'file = "wombot_model.toml"', f'file = "{ROBOT_FILE.parent / "wombot_model.toml"}"'
+    )
+    file.write_text(f"{text}\n[estimation]\npose_required = false\n", encoding="utf-8")
+    stack = simulated_stack(CirclingPlanner(load_setup(file).config, (0.061, 0.415, 0.238)), robot_file=file)
+    received, heard = stack.core.pose_source.receive, []
+    stack.core.pose_source.receive = lambda now_ns, poses: received(now_ns, poses) if heard else []
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ARM)
+    assert stack.run(2.0, UserRequest.START)[-1].output.running
+    heard.append(True)
+    seen = stack.run(0.5)
+    assert not seen[-1].output.running
+    assert containing([event for tick in seen for event in tick.events], "task stopped: the pose jumped by")
