@@ -108,3 +108,10 @@ def test_a_stall_is_known_though_the_wheels_stand_at_the_first_status(state, cau
 
     status = {"state": state, "detail": "", "stop_cause": cause}
     assert isinstance(demo._why_stopped(Stopped(), status, 120), demo._HostStallError) is anew
+
+
+@pytest.mark.long
+def test_a_pillar_on_the_circle_is_driven_around_in_real_time(tmp_path):
+    report = demo.run_demo(demo.DemoOptions(out=tmp_path, laps=0.6, obstacle=True))
+    assert report.success
+    assert report.left_at_pillar_m > 0.02

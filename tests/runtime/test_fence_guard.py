@@ -295,7 +295,7 @@ def test_an_obstacle_that_moves_is_met_where_it_will_be(at_s):
 
 def test_the_time_at_each_point_of_the_path_is_when_the_robot_is_there():
     # The obstacle's front passes the robot's nose just before, or just after, the robot has come there.
-    speed, gap_m = 5.0, 0.08
+    speed = 5.0
     times = {"held": 0.08, "tail": 0.13, "brake": speed / 20.0}
     end_s = sum(times.values())
     end_m = 0.3 + stopping_m(speed)
@@ -312,7 +312,6 @@ def test_the_time_at_each_point_of_the_path_is_when_the_robot_is_there():
         )[1][-1]
         assert full[-1].min() == pytest.approx(0.01 if late else -0.01, abs=1e-6)
         assert found.scale < 1.0
-    assert gap_m
 
 
 def test_another_fence_is_kept_with_the_obstacles_and_its_own_margin():
@@ -500,3 +499,139 @@ def test_no_motion_ever_leaves_the_fence_even_if_the_host_dies(room, pillar, com
     for k in range(1, math.ceil(slowest / 0.002) + 50):
         share = max(0.0, 1.0 - k * 0.002 / slowest) if slowest else 0.0
         assert plant.advance((sent[0] * share, sent[1] * share), 0.002, inside)
+
+
+def test_the_path_is_sampled_as_finely_as_its_phases_say():
+    assert SCALES.tolist() == [0.0, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875, 1.0]
+    assert len(judge(Fence(keep_in=ROOM), estimate(), (1, 1)).path) == 1 + 3 + 2 + 3 + 3
+
+
+@pytest.mark.parametrize(("speed", "asks"), [(1e-3, False), (1.01e-3, True), (9.9e-4, False)])
+def test_a_command_below_a_thousandth_of_a_radian_asks_for_nothing(speed, asks):
+    for requested in ((speed, 0.0), (0.0, -speed)):
+        path = judge(Fence(keep_in=ROOM), estimate(), requested).path
+        assert (path[-1] != path[0]) == asks
+    assert judge(Fence(keep_in=ROOM), estimate(wheels=(5, 5)), (0.0, 0.0)).path[-1] == pytest.approx(
+        judge(Fence(keep_in=ROOM), estimate(wheels=(5, 5)), (math.nan, 0.0)).path[-1]
+    )
+
+
+def largest(clearance, driven, margin_m=0.5) -> float:
+    """The scale that is chosen for clearances (S, K) to one shape and corner steps (S, K)."""
+    guard = guard_of(Fence(), margin_m=margin_m)
+    return float(SCALES[guard._largest_scale(np.array(clearance, float)[..., None], np.array(driven, float))])
+
+
+def paths(stop, *others):
+    """Rows for all scales: of the stop, of the next ones, and ones deep in the fence for the rest."""
+    return [stop, *others, *([[-9.0] * len(stop)] * (len(SCALES) - 1 - len(others)))]
+
+
+STILL = [[0.0] * 3] * len(SCALES)
+
+
+def test_between_two_points_the_clearance_is_less_by_half_the_way_that_is_not_seen():
+    far = [1.0, 1.0, 1.0]
+    for step, chosen in ((1.74, 0.25), (1.76, 0.0)):
+        # 1 - step / 2 against a quarter of the margin.
+        driven = [[0.0] * 3, [0.0, step, 0.0], *STILL[2:]]
+        assert largest(paths(far, [1.0, 1.0, 1.0]), driven) == chosen
+    driven = [[0.0] * 3, [0.0, 0.0, 1.76], *STILL[2:]]
+    assert largest(paths(far, [1.0, 1.0, 1.0]), driven) == 0.0
+    # The first point has nothing before it.
+    assert largest(paths(far, [1.0, 1.0, 1.0]), [[0.0] * 3, [1.76, 0.0, 0.0], *STILL[2:]]) == 0.25
+    assert largest(paths(far, [1.0, 0.5, 0.1]), STILL) == 0.0
+
+
+def test_a_path_may_come_exactly_as_near_as_it_may():
+    assert largest(paths([1.0] * 3, [1.0, 0.5, 0.125]), STILL) == 0.25
+    assert largest(paths([1.0] * 3, [1.0, 0.5, 0.124]), STILL) == 0.0
+    # As near as the stop itself, too.
+    assert largest(paths([1.0, 0.5, 0.03], [1.0, 0.5, 0.03]), STILL) == 0.25
+    assert largest(paths([1.0, 0.5, 0.0], [1.0, 0.5, 0.0]), STILL) == 0.25
+    assert largest(paths([1.0, 0.5, -0.01], [1.0, 0.5, -0.01]), STILL) == 0.0
+
+
+def test_leading_away_is_never_nearer_and_at_last_farther_than_at_first():
+    stop = [-1.0, -1.0, -1.0]
+    assert largest(paths(stop, [-1.0, -1.0, -0.9]), STILL) == 0.25
+    assert largest(paths(stop, [-1.0, -0.8, -1.0]), STILL) == 0.0
+    assert largest(paths(stop, [-1.0, -1.1, -0.9]), STILL) == 0.0
+    assert largest(paths(stop, [-1.0, -1.0, -1.0]), STILL) == 0.0
+    assert largest(paths(stop, [-1.0, -0.9, -0.95]), STILL) == 0.25
+
+
+def test_of_two_shapes_both_must_hold():
+    guard = guard_of(Fence(), margin_m=0.5)
+    far, near = np.array(paths([1.0] * 3, [1.0] * 3)), np.array(paths([1.0] * 3, [1.0, 0.5, 0.1]))
+    assert guard._largest_scale(np.stack([far, far], axis=2), np.array(STILL)) == 1
+    assert guard._largest_scale(np.stack([far, near], axis=2), np.array(STILL)) == 0
+
+
+@pytest.mark.parametrize(("sent", "measured"), [((5.0, 5.0), (0.0, 0.0)), ((0.0, 0.0), (5.0, 5.0))])
+def test_the_nearer_of_the_paths_by_command_and_by_measurement_counts(sent, measured):
+    fence = Fence(keep_in=CELL)
+    seen = estimate(0.5, 0.0, 0.0, measured)
+    both = judge(fence, seen, (2.0, 2.0), last=sent).clearance_m
+    alone = judge(fence, estimate(0.5, 0.0, 0.0, (5.0, 5.0)), (2.0, 2.0)).clearance_m
+    slow = judge(fence, estimate(0.5, 0.0, 0.0, (0.0, 0.0)), (2.0, 2.0)).clearance_m
+    assert both == pytest.approx(alone)
+    assert both < slow - 0.01
+    steps = guard_of(fence)._stopping_paths(Boundaries(FOOTPRINT, fence), seen, EXACT, sent, (2.0, 2.0))[2]
+    assert steps[-1, 1] == pytest.approx(RADIUS * 5.0 * 0.08 / 3)
+
+
+def test_a_corner_moves_by_the_way_and_by_the_turn():
+    fence = Fence(keep_in=CELL)
+    seen = estimate(wheels=(1.0, 3.0))
+    steps = guard_of(fence)._stopping_paths(Boundaries(FOOTPRINT, fence), seen, EXACT, (1.0, 3.0), (1.0, 3.0))[2]
+    turn = RADIUS * 2.0 / AXLE * 0.08 / 3
+    moved = math.hypot(RADIUS * 2.0 * 0.08 / 3, X_ICR * turn)
+    assert steps[-1, 1] == pytest.approx(moved + FOOTPRINT.reach_m * turn)
+
+
+def test_long_arcs_end_where_they_do():
+    slow = StoppingSettings(response_s=1.2, reaction_s=0.9, deceleration_rad_s2=2.0, period_s=0.02)
+    wide = Fence(keep_in=Circle((0.0, 0.0), 20.0))
+    for before, command in (((2.0, 7.0), (2.0, 7.0)), ((-3.0, 4.0), (-3.0, 4.0))):
+        found = judge(wide, estimate(0.0, 0.0, 0.4, before), command, stops=slow)
+        expected = integrated(estimate(0.0, 0.0, 0.4, before), EXACT, before, command, slow, 1.2, 1.0)
+        np.testing.assert_allclose(found.path[-1], expected[-1], atol=2e-4)
+
+
+def test_a_believed_spread_makes_turns_longer_too():
+    spread = OdometryParameters(RADIUS, AXLE, X_ICR, ((0.02**2 * RADIUS**2, 0, 0), (0, 0, 0), (0, 0, 0)))
+    seen = estimate(wheels=(-2.0, 2.0))
+    exact, longer = (judge(Fence(keep_in=ROOM), seen, (-2.0, 2.0), geometry=one) for one in (EXACT, spread))
+    assert longer.path[-1][2] == pytest.approx(1.06 * exact.path[-1][2])
+    unknown_age, no_age = (
+        judge(Fence(keep_in=ROOM), estimate(wheels=(-2.0, 2.0), age_s=age), (-2.0, 2.0), geometry=spread)
+        for age in (None, 0.0)
+    )
+    assert unknown_age.path == no_age.path
+
+
+def test_the_clearance_is_less_by_the_turn_that_is_not_known_along_the_path():
+    spread = OdometryParameters(RADIUS, AXLE, X_ICR, ((0, 0, 0), (0, (0.01 * AXLE) ** 2, 0), (0, 0, 0)))
+    fence, seen = Fence(keep_in=CELL), estimate(wheels=(1.0, 3.0))
+    bounds = Boundaries(FOOTPRINT, fence)
+    exact, wide = (
+        guard_of(fence)._stopping_paths(bounds, seen, one, (1.0, 3.0), (1.0, 3.0)) for one in (EXACT, spread)
+    )
+    path = exact[0][-1]
+    turned = np.abs(path[:, 2] - path[0, 2])
+    moved = np.concatenate([[0.0], np.cumsum(np.hypot(RADIUS / AXLE * 0.0 + np.diff(turned) * X_ICR,
+                                                      np.diff(turned) * AXLE))])  # fmt: skip
+    lost = (exact[1] - wide[1])[-1, :, 1]
+    np.testing.assert_allclose(lost, 3 * 0.01 * turned * (FOOTPRINT.reach_m + 0.5 * moved), rtol=1e-6, atol=1e-12)
+
+
+def test_an_obstacle_is_met_at_the_time_of_coming_to_a_slower_command():
+    # From 6 to 2 rad/s takes 0.2 s; then follow the tail and the braking.
+    before, command = (6.0, 6.0), (2.0, 2.0)
+    for end_s, crosswise in ((0.08 + 0.2 + 0.13 + 0.1, 0.0),):
+        guard = guard_of(Fence())
+        guard.set_obstacles([MovingCircle(3.0, 0.0, 0.1, -1.0, crosswise)])
+        found = guard._stopping_paths(guard.boundaries, estimate(wheels=before), EXACT, before, command)
+        end_m = found[0][-1, -1, 0] + 0.3
+        assert found[1][-1, -1, 1] == pytest.approx(3.0 - end_s - 0.1 - end_m)
