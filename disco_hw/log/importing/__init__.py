@@ -27,7 +27,7 @@ from disco_hw.log.container import MAGIC
 from disco_hw.log.drive import DriveLog
 from disco_hw.log.importing.headings import without_standing_headings
 from disco_hw.log.importing.losses import WARNING, warnings_first
-from disco_hw.log.importing.rosbag_file import METADATA, SUFFIXES
+from disco_hw.log.importing.rosbag_file import METADATA, SUFFIXES, is_bag
 from disco_hw.log.mcap_log import McapLog
 from disco_hw.log.records import Command, Record
 from disco_hw.log.writer import LogFile
@@ -217,7 +217,8 @@ def _telling(path: Path) -> Path:
     if not path.is_dir():
         return path
     inside = sorted(one for one in path.iterdir() if one.suffix in SUFFIXES.values())
-    return path / METADATA if (path / METADATA).exists() or not inside else inside[0]
+    possible = [path / METADATA, *inside] if (path / METADATA).exists() else inside
+    return next((one for one in possible if is_bag(begin_of(one, LOG, LONGEST_BEGIN_BYTES))), [*possible, path][0])
 
 
 def _with_topics(settings: Ros2, topics: Sequence[str]) -> Ros2:

@@ -25,8 +25,8 @@ from drivers.types import Frame, ReceivedFrame
 
 _LINE = re.compile(
     r"\s*\((?P<time>[^()]{1,40})\)\s+(?P<channel>\S{1,64})\s+(?:[RT]X\s+[-BE\s]*)?(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
-    r"(?:#(?P<packed>\S*)|\s+\[\s*(?P<length>\d{1,2})\]\s*(?P<spaced>[0-9A-Fa-f ]*?|remote request.*|ERRORFRAME.*))"
-    r"(?:\s+[RT])?\s*"
+    r"(?:#(?P<packed>\S*)|\s+\[\s*(?P<length>\d{1,2})\]\s*(?P<spaced>[0-9A-Fa-f ]*?|remote request.*)"
+    r"(?:\s+(?:ERRORFRAME.*|'.*'))?)(?:\s+[RT])?\s*"
 )
 _SCREEN = re.compile(r"\s*\S{1,64}\s+(?:[RT]X\s+[-BE\s]*)?[0-9A-Fa-f]{3,8}\s+\[\s*\d{1,2}\]")
 _HEX = re.compile(r"(?:[0-9A-Fa-f]{2}){0,8}")

@@ -30,8 +30,8 @@ _UNKNOWN_SHARE = 0.4
 """Where a step of this share of the span is expected, nobody can tell how often the counter wrapped."""
 _FITTING_SHARE = 0.8
 """So many of the jumps have to be wraps of the span, or it is none."""
-_FULL_SHARE = 0.8
-"""Counts of a counter that wraps all the time fill this share of its span."""
+_FULL_SHARE = 0.5
+"""Counts of a counter that wraps all the time fill at least this share of its span."""
 _TOO_FAST_SHARE = 0.05
 """A counter of which more steps than this may be over half its span cannot be read."""
 _JUMPS_ALL_THE_TIME_SHARE = 0.1
@@ -39,6 +39,8 @@ _OFTEN = 3
 """Without a usual width, so many jumps of one size are a span."""
 _SAME_SHARE = 0.05
 """Jumps that differ by less than this share of themselves are of one size."""
+_NEAR_SHARE = 0.005
+"""A usual span this near to the size of the jumps is theirs: 4096 is not 4000."""
 _RESOLUTION = 2.0
 """Counts by which steps differ that are the same motion; of a position in rad, this share of 1000 of the span."""
 
@@ -174,19 +176,18 @@ def _span_of(motion: _Steps, usual: Sequence[float], reach: float, unit: str) ->
         return float(np.median(_left_over(motion, span)[1][jumps]))
 
     best = max(usual, key=lambda span: (fits(span), -off(span)), default=None)
-    measured, spread = _span_of_jumps(motion, unit) or (None, 0.0)
+    measured, tolerance = _span_of_jumps(motion, unit) or (None, 0.0)
     enough = max(1.0, _FITTING_SHARE * np.count_nonzero(jumps))
     resolution = _RESOLUTION if unit == "counts" else 1e-3 * _RESOLUTION * reach
     if best is not None and fits(best) >= enough:
         if measured is None or fits(measured) < enough:
             return best
-        is_near = abs(best - measured) <= spread or off(best) <= resolution + 1.5 * off(measured)
-        return best if is_near else measured
+        return best if abs(best - measured) <= max(tolerance, resolution) else measured
     return measured if measured is not None and fits(measured) >= enough else None
 
 
 def _span_of_jumps(motion: _Steps, unit: str) -> tuple[float, float] | None:
-    """The span that jumps of one size show, again and again, with its error; None if they are few or differ."""
+    """The span that jumps of one size show, again and again, with its tolerance; None if they are few or differ."""
     jumps = motion.is_jump
     if np.count_nonzero(jumps) < _OFTEN:
         return None
@@ -195,7 +196,9 @@ def _span_of_jumps(motion: _Steps, unit: str) -> tuple[float, float] | None:
     alike = np.abs(sizes - span) <= _SAME_SHARE * span
     if np.count_nonzero(alike) < max(_OFTEN, _FITTING_SHARE * sizes.size):
         return None
-    return float(round(span)) if unit == "counts" else span, 0.5 * float(np.ptp(sizes[alike]))
+    return float(round(span)) if unit == "counts" else span, max(
+        3.0 * float(np.median(np.abs(sizes - span))), _NEAR_SHARE * span
+    )
 
 
 def _taken_out(motion: _Steps, values: Array, span: float) -> Unwrapped | None:

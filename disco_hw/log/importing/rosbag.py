@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from disco_hw.config import Robot, RobotConfig
 from disco_hw.errors import LogError
@@ -22,14 +23,11 @@ from disco_hw.log.drive import (
     Index,
     Motion,
     Poses,
-    Wheels,
-    differentiate_angle,
-    integrate_angle,
     poses,
     rotations,
 )
 from disco_hw.log.importing import LogFormat
-from disco_hw.log.importing.counter_wrap import WIDTHS_BITS, Mask, set_anew, unwrap_wheels
+from disco_hw.log.importing.counter_wrap import set_anew
 from disco_hw.log.importing.csv_drive import length_fault
 from disco_hw.log.importing.losses import WARNING, loss_note
 from disco_hw.log.importing.rosbag_file import Bag, BagMessage, DamagedBagError, is_bag, open_bag
@@ -49,9 +47,9 @@ from disco_hw.log.importing.rosbag_topics import (
     Choice,
     choose,
 )
+from disco_hw.log.importing.rosbag_wheels import LONGEST_SILENCE_NS, measured_columns, unwrapped, wheels_of
 from drivers.pose.headings import is_heading_measured
 
-_LONGEST_SILENCE_NS = 500_000_000
 _LONGEST_COMMAND_NS = 500_000_000
 _LONGEST_PAUSE_NS = 2_000_000_000
 _MOST_MESSAGES = 20_000_000
@@ -80,7 +78,9 @@ class _Column:
 
     def stamps(self) -> Stamps:
         """The times of its rows."""
-        return Stamps(np.array(self.log_ns, dtype=np.int64), np.array(self.stamp_ns, dtype=np.int64))
+        table = self.table()
+        is_repeat = np.concatenate([[False], _alike(table[1:], table[:-1])]) if len(table) else np.empty(0, dtype=bool)
+        return Stamps(np.array(self.log_ns, dtype=np.int64), np.array(self.stamp_ns, dtype=np.int64), is_repeat)
 
     def table(self) -> Array:
         """Its rows, (N, width)."""
@@ -173,10 +173,10 @@ def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: R
     nothing: tuple[Index, Array] = (np.empty(0, dtype=np.int64), np.empty((0, 4)))
     command_ns, command = _expired(*arrays.get(COMMANDS, (nothing[0], np.empty((0, 2)))))
     wheel_ns, wheel = arrays.get(WHEELS, nothing)
-    wheel_ns, wheel, measured = _measured_columns(path, wheel_ns, wheel, notes)
+    wheel_ns, wheel, measured = measured_columns(path, wheel_ns, wheel, notes)
     uncertain = np.zeros(wheel_ns.size, dtype=bool)
     if measured[0]:
-        wheel, uncertain = _unwrapped(path, wheel_ns, wheel, robot, (command_ns, command), notes)
+        wheel, uncertain = unwrapped(path, wheel_ns, wheel, robot, (command_ns, command), notes)
     began_ns = min(int(t_ns[0]) for t_ns in (command_ns, wheel_ns, pose_ns) if t_ns.size)
     breaks_ns = np.unique(
         np.concatenate(
@@ -199,7 +199,7 @@ def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: R
 
     (command_s, command_segment), (pose_s, pose_segment) = when(command_ns), when(pose_ns)
     commands = Commands(command_s, command[:, 0], command[:, 1], command_segment)
-    wheels = _wheels(*when(wheel_ns), wheel, measured)
+    wheels = wheels_of(*when(wheel_ns), wheel, measured)
     drive_poses = Poses(pose_s, pose[:, 0], pose[:, 1], pose[:, 2], pose_segment)
     fault = length_fault(drive_poses, wheels, commands, robot.wheel_radius_m)
     if fault is not None:
@@ -236,12 +236,18 @@ def _of_the_choice(choice: Choice) -> list[str]:
 
 
 def _ordered(path: Path, name: str, t_ns: Index, table: Array, notes: list[str]) -> tuple[Index, Array]:
-    """Sort messages by time, and keep the first of several with one time."""
-    unique, first = np.unique(t_ns, return_index=True)
-    if unique.size < t_ns.size:
-        lost, what = t_ns.size - unique.size, "messages have the time of another and were left out"
+    """Sort messages by time, and keep the first of several with one time; one that is sent again is no loss."""
+    unique, first, place = np.unique(t_ns, return_index=True, return_inverse=True)
+    lost = int(np.count_nonzero(~_alike(table, table[first][place])))
+    if lost:
+        what = "messages have the time of another and were left out"
         notes.append(loss_note(str(path), name, lost, t_ns.size, what, "record it again, or name another topic"))
     return unique, table[first]
+
+
+def _alike(one: Array, other: Array) -> NDArray[np.bool_]:
+    """Whether the rows of two tables (N, k) hold the same values."""
+    return np.asarray(((one == other) | (np.isnan(one) & np.isnan(other))).all(axis=1))
 
 
 def _pose_table(
@@ -291,72 +297,12 @@ def _expired(t_ns: Index, speeds: Array) -> tuple[Index, Array]:
     return times[order], rows[order]
 
 
-def _measured_columns(
-    path: Path, t_ns: Index, wheel: Array, notes: list[str]
-) -> tuple[Index, Array, tuple[bool, bool]]:
-    """Rows in which everything is there that the wheels measure at all, and whether that is angles, and speeds."""
-    angles, speeds = (np.isfinite(wheel[:, part]).all(axis=1) for part in (slice(0, 2), slice(2, 4)))
-    has_angle, has_speed = (
-        bool(2 * np.count_nonzero(angles) > t_ns.size),
-        bool(2 * np.count_nonzero(speeds) > t_ns.size),
-    )
-    kept = (angles | (not has_angle)) & (speeds | (not has_speed))
-    if t_ns.size and not (has_angle or has_speed):
-        raise LogError(
-            f"{path}: wheels: most messages have neither position nor velocity of all wheels; "
-            "set ros2.left_joints and ros2.right_joints"
-        )
-    if not kept.all():
-        lost, what = int(np.count_nonzero(~kept)), "messages lack a position or velocity and were left out"
-        notes.append(loss_note(str(path), WHEELS, lost, kept.size, what, "set ros2.left_joints and ros2.right_joints"))
-    wheel = wheel[kept]
-    if has_angle and has_speed and (wheel[:, 2:] == 0.0).all() and np.ptp(wheel[:, 0]) > 1.0:
-        notes.append("wheels: the velocities are all zero while the wheels turn; they were taken from the positions")
-        has_speed = False
-    return t_ns[kept], wheel, (has_angle, has_speed)
-
-
-def _unwrapped(
-    path: Path, t_ns: Index, wheel: Array, robot: Robot, commands: tuple[Index, Array], notes: list[str]
-) -> tuple[Array, Mask]:
-    """Wheels whose angles are continuous; and where the number of wraps is not known, (N,).
-
-    Angles wrap at a turn or where the counter behind them overflows; each wheel is judged by itself.
-    """
-    # Before the first command nothing is known.
-    commanded = np.vstack([[np.nan, np.nan], commands[1]])[np.searchsorted(commands[0], t_ns, side="right")]
-    known = np.where(np.isfinite(wheel[:, 2:]), wheel[:, 2:], commanded)
-    tick_rad = 2.0 * math.pi / robot.ticks_per_rev
-    spans = (2.0 * math.pi, *(2.0**bits * tick_rad for bits in WIDTHS_BITS))
-    begins = np.concatenate([[True], np.diff(t_ns) > _LONGEST_SILENCE_NS])
-    found = unwrap_wheels((t_ns - t_ns[0]) * 1e-9, wheel[:, :2], spans, begins, known, "rad")
-    for side, one in zip(("left", "right"), found, strict=True):
-        if one.fault:
-            raise LogError(f"{path}: {side} wheel: {one.fault}")
-        if one.wraps:
-            notes.append(
-                f"{side} wheel: the position wraps at {one.span:.10g} rad: made continuous at {one.wraps} places"
-            )
-    angles = np.column_stack([one.values for one in found])
-    return np.column_stack([angles, wheel[:, 2:]]), found[0].uncertain | found[1].uncertain
-
-
 def _pauses(wheel_ns: Index, others: Sequence[Index]) -> Index:
     """Where nothing is known of the wheels for half a second; without wheels, of anything for two."""
     if wheel_ns.size:
-        return wheel_ns[1:][np.diff(wheel_ns) > _LONGEST_SILENCE_NS]
+        return wheel_ns[1:][np.diff(wheel_ns) > LONGEST_SILENCE_NS]
     all_ns = np.sort(np.concatenate(others))
     return np.asarray(all_ns[1:][np.diff(all_ns) > _LONGEST_PAUSE_NS])
-
-
-def _wheels(t_s: Array, segment: Index, wheel: Array, measured: tuple[bool, bool]) -> Wheels:
-    has_angle, has_speed = measured
-    (left, right), (left_speed, right_speed) = wheel[:, :2].T, wheel[:, 2:].T
-    if not has_angle:
-        left, right = (integrate_angle(t_s, speed, segment) for speed in (left_speed, right_speed))
-    if not has_speed:
-        left_speed, right_speed = (differentiate_angle(t_s, angle, segment) for angle in (left, right))
-    return Wheels(t_s, left, right, left_speed, right_speed, segment, has_angle, has_speed)
 
 
 Row = tuple[float, ...]

@@ -43,11 +43,10 @@ def salvage(path: Path, folder: Path) -> tuple[Path, str] | None:
 
 
 def _copy_mcap(path: Path, target: Path) -> str:
-    """Copy the messages of an MCAP; returns how far it could be read, empty if there is no message."""
+    """Copy the messages of an MCAP; returns how much could be read, empty if there is no message."""
     schemas: dict[int, int] = {}
     channels: dict[int, int] = {}
     messages = damaged = 0
-    size = path.stat().st_size
     with path.open("rb") as source, target.open("wb") as sink:
         writer = Writer(sink, compression=CompressionType.NONE)
         writer.start(profile="ros2")
@@ -69,32 +68,52 @@ def _copy_mcap(path: Path, target: Path) -> str:
                         writer.add_message(
                             channels[record.channel_id], record.log_time, record.data, record.publish_time
                         )
-        read = source.tell()
         writer.finish()  # type: ignore[no-untyped-call]  # The library does not annotate it.
-    return _extent(messages, read, size, damaged)
+    return _extent(messages, damaged)
 
 
-def _extent(messages: int, read: int, size: int, damaged: int) -> str:
-    """Say how much of a file (`read` of `size` bytes) was read; empty if there is no message."""
+def _extent(messages: int, damaged: int = 0) -> str:
+    """Say how much of a file was read; empty if there is no message."""
     chunks = f", {damaged} damaged chunks were left out" if damaged else ""
-    share = 100.0 * read / max(size, 1)
-    return f"{messages} messages were read from {share:.0f} % of the file{chunks}" if messages else ""
+    return f"{messages} messages could be read{chunks}" if messages else ""
 
 
-def _records(source: Any) -> Iterator[Any]:  # Any: a binary file; the library's records, None for a damaged chunk.
+def _records(source: BinaryIO) -> Iterator[Any]:  # Any: the library's records, None for a damaged chunk.
     reader = StreamReader(source, emit_chunks=True, record_size_limit=_LARGEST_RECORD_BYTES)
-    for record in reader.records:
-        if not isinstance(record, Chunk):
-            yield record
-        elif record.uncompressed_size <= _LARGEST_UNPACKED_BYTES:
-            try:
-                inside = breakup_chunk(record, validate_crc=True)
-            except Exception:  # Whatever the decompressors raise of damaged bytes: counted, and said.
+    whole = 0
+    with contextlib.suppress(Exception):
+        for record in reader.records:
+            whole = source.tell()
+            if not isinstance(record, Chunk):
+                yield record
+            elif record.uncompressed_size <= _LARGEST_UNPACKED_BYTES:
+                try:
+                    inside = breakup_chunk(record, validate_crc=True)
+                except Exception:  # Whatever the decompressors raise of damaged bytes: counted, and said.
+                    yield None
+                    continue
+                yield from inside
+            else:
                 yield None
-                continue
-            yield from inside
-        else:
-            yield None
+    source.seek(whole)
+    rest = source.read(_LARGEST_RECORD_BYTES)
+    # What is whole of a last chunk that was cut: a short recording may have no other.
+    if rest[:1] == _MCAP_CHUNK:
+        yield from StreamReader(BytesIO(_cut_chunk(rest)), skip_magic=True).records
+
+
+_MCAP_CHUNK = b"\x06"
+_BEFORE_COMPRESSION = struct.calcsize("<BQQQQI")
+"""Bytes before a chunk's compression: kind and length of the record, first and last time, unpacked size, checksum."""
+
+
+def _cut_chunk(record: bytes) -> bytes:
+    """Unpack the beginning of an MCAP chunk as far as it is there."""
+    (length,) = struct.unpack_from("<I", record, _BEFORE_COMPRESSION)
+    begin = _BEFORE_COMPRESSION + 4 + length
+    compression = record[begin - length : begin]
+    data = record[begin + 8 :]
+    return _unpacked(compression or b"none", data)
 
 
 def _copy_sqlite(path: Path, target: Path) -> str:
@@ -104,6 +123,8 @@ def _copy_sqlite(path: Path, target: Path) -> str:
         contextlib.closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as source,
         contextlib.closing(sqlite3.connect(target)) as sink,
     ):
+        # Without this a file that is shorter than its first page says is refused as a whole.
+        source.execute("PRAGMA writable_schema = ON")
         tables = source.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'")
         for name, creation in tables.fetchall():
             sink.execute(creation)
@@ -112,7 +133,7 @@ def _copy_sqlite(path: Path, target: Path) -> str:
                     sink.execute(f'INSERT INTO "{name}" VALUES ({", ".join("?" * len(row))})', row)
                     messages += name == "messages"
         sink.commit()
-    return f"{messages} messages were read up to the damage" if messages else ""
+    return _extent(messages)
 
 
 def _rows(source: sqlite3.Connection, table: str) -> Iterator[tuple[Any, ...]]:  # Any: whatever sqlite holds.
@@ -128,7 +149,7 @@ Record = tuple[dict[str, bytes], bytes]
 
 
 def _copy_ros1(path: Path, target: Path) -> str:
-    """Copy the messages of a bag of ROS 1; returns how far it could be read, empty if there is no message."""
+    """Copy the messages of a bag of ROS 1; returns how much could be read, empty if there is no message."""
     from rosbags.rosbag1 import Writer as BagWriter  # noqa: PLC0415
 
     connections: dict[bytes, Any] = {}
@@ -156,8 +177,7 @@ def _copy_ros1(path: Path, target: Path) -> str:
                     if len(data) <= _LARGEST_MESSAGE_BYTES:
                         s, ns = struct.unpack("<II", header["time"])
                         writer.write(connections[header["conn"]], s * 1_000_000_000 + ns, data)
-        read = source.tell()
-    return _extent(messages, read, path.stat().st_size, damaged)
+    return _extent(messages, damaged)
 
 
 def _ros1_records(source: BinaryIO) -> Iterator[Record | None]:
@@ -193,11 +213,16 @@ def _ros1_fields(block: bytes) -> dict[str, bytes]:
 
 
 def _unpacked(compression: bytes, data: bytes) -> bytes:
+    """Unpack packed bytes of which the end may be missing."""
     if compression == b"none":
         return data
     if compression == b"bz2":
         return bz2.BZ2Decompressor().decompress(data, _LARGEST_UNPACKED_BYTES)
-    from lz4.frame import LZ4FrameDecompressor  # noqa: PLC0415
+    if compression == b"zstd":
+        from zstandard import ZstdDecompressor  # noqa: PLC0415
+
+        return bytes(ZstdDecompressor().stream_reader(data).read(_LARGEST_UNPACKED_BYTES))
+    from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]  # noqa: PLC0415
 
     return bytes(LZ4FrameDecompressor().decompress(data, _LARGEST_UNPACKED_BYTES))
 

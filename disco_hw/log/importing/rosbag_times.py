@@ -7,7 +7,7 @@ one time, that the robot's clock was set, concerns all of them.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,18 +24,23 @@ _LEAD_NS = 50_000_000
 _LARGEST_NS = 4 * 10**18
 _SAME_CLOCK_NS = 30_000_000_000
 """Stamps of one clock may come so much apart, as where messages wait; those of another clock are further off."""
-_STANDS_NS = 20_000_000
-"""Messages recorded further apart than this were not true at one time."""
+_STANDS_NS, _REPEATS_NS = 20_000_000, 300_000_000
+"""Messages recorded further apart than this were not true at one time: those that differ, and those that are alike, as
+where the last measurement is sent again."""
 _STANDING_SHARE = 0.02
 """A topic of which more of the stamps stand still is dated by the recording."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stamps:
-    """Times of one topic's messages in order of their recording, all (N,), ns; a stamp of 0 is a missing one."""
+    """Times of one topic's messages in order of their recording, all (N,), ns; a stamp of 0 is a missing one.
+
+    `is_repeat`: which messages hold the values of the one before.
+    """
 
     log_ns: Index
     stamp_ns: Index
+    is_repeat: Mask | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +60,7 @@ def timeline(stamps: Mapping[str, Stamps]) -> BagTimes:
     carried over to the clock of the stamps where the two are more than 1 s apart, as with a simulated clock.
     So are those of transforms that are dated ahead, to be valid for a while.
     """
-    stamps = {name: Stamps(one.log_ns, _plausible(one.stamp_ns)) for name, one in stamps.items()}
+    stamps = {name: replace(one, stamp_ns=_plausible(one.stamp_ns)) for name, one in stamps.items()}
     faults = {name: fault for name, one in stamps.items() if (fault := _standing(one))}
     stamps = _without_stamps(stamps, faults)
     foreign = _of_another_clock(stamps)
@@ -142,7 +147,10 @@ def _standing(one: Stamps) -> str:
     """That the stamps of a topic stand still while the recording goes on, with the share; empty if they do not."""
     if one.stamp_ns.size < 2:
         return ""
-    same = (np.diff(one.stamp_ns) == 0) & (one.stamp_ns[1:] != 0) & (np.diff(one.log_ns) > _STANDS_NS)
+    changes = np.concatenate([[True], (np.diff(one.stamp_ns) != 0) | (one.stamp_ns[1:] == 0)])
+    began_ns = one.log_ns[np.maximum.accumulate(np.where(changes, np.arange(changes.size), 0))]
+    is_repeat = np.zeros(changes.size, dtype=bool) if one.is_repeat is None else one.is_repeat
+    same = one.log_ns - began_ns > np.where(is_repeat, _REPEATS_NS, _STANDS_NS)
     share = np.count_nonzero(same) / one.stamp_ns.size
     return f"stand still while the recording goes on ({100.0 * share:.0f} %)" if share > _STANDING_SHARE else ""
 

@@ -27,6 +27,7 @@ from disco_hw.log.load import load_drive
 from tests.inference.drives import robot_config
 from tests.inference.test_infer_command import ROBOT
 from tests.log.importing.bags import BEGAN_NS, LEFT, RIGHT, Maker, bag, recorded
+from tests.tables import thinned
 
 
 def small(path, storage="mcap", count=50):
@@ -84,7 +85,7 @@ ENDINGS = {"mcap": "mcap", "sqlite3": "db3", "ros1": "bag"}
 
 
 @pytest.mark.parametrize("storage", ENDINGS)
-@pytest.mark.parametrize("share", [0.55, 0.7, 0.9, 0.99])
+@thinned("share", [0.55, 0.7, 0.9, 0.99], quick=2)
 def test_a_truncated_bag_is_read_as_far_as_it_is_whole(tmp_path, whole_bags, storage, share):
     contents, samples = whole_bags
     path = tmp_path / f"b.{ENDINGS[storage]}"
@@ -93,11 +94,11 @@ def test_a_truncated_bag_is_read_as_far_as_it_is_whole(tmp_path, whole_bags, sto
     assert 0.3 * share * samples < drive.wheels.t_s.size <= samples
     assert (np.diff(drive.wheels.t_s) < 0.5).all()
     warned = [note for note in drive.notes if note.startswith("warning: ")]
-    assert re.search(r"damaged, or its recording did not end regularly: \d+ messages were read", warned[0])
+    assert re.search(r"damaged, or its recording did not end regularly: \d+ messages could be read", warned[0])
 
 
 @pytest.mark.parametrize("storage", ENDINGS)
-@pytest.mark.parametrize("size", [20, 100, 3000])
+@pytest.mark.parametrize("size", [20, 100])
 def test_a_bag_that_was_cut_before_its_first_message_is_one_line(tmp_path, whole_bags, storage, size):
     path = tmp_path / f"b.{ENDINGS[storage]}"
     path.write_bytes(whole_bags[0][storage][:size])
@@ -154,13 +155,13 @@ def in_chunks(folder, make):
     path = folder / "chunks.bag"
     writer = Writer1(path)
     writer.set_compression(Writer1.CompressionFormat[make.upper()])
-    writer.chunk_threshold = 10_000
+    vars(writer).update(chunk_threshold=10_000)
     with writer:
         fill(Maker(writer, get_typestore(Stores.ROS1_NOETIC), True), 400)
     return path, [one.end() for one in re.finditer(b"size=....(?=....(BZh|\x04\x22M))", path.read_bytes(), re.DOTALL)]
 
 
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3", "ros1"])
+@thinned("storage", ["mcap", "sqlite3", "ros1"], quick=1)
 def test_a_mutated_bag_is_a_drive_or_one_line(tmp_path, storage):
     source = small(tmp_path / "b.bag", storage)
     source = source if storage == "ros1" else file_of(source)
@@ -180,7 +181,7 @@ def test_a_mutated_bag_is_a_drive_or_one_line(tmp_path, storage):
 
 
 @pytest.mark.parametrize("size", [2**31, 2**40, 2**62, 2**64 - 1])
-def test_a_record_that_claims_any_size_is_one_line(tmp_path, size):
+def test_a_chunk_that_claims_any_size_is_read_as_one_that_was_cut(tmp_path, size):
     path = file_of(small(tmp_path / "b"))
     spoilt = bytearray(path.read_bytes())
     # The first record after the header: its opcode, then its length.
@@ -188,6 +189,17 @@ def test_a_record_that_claims_any_size_is_one_line(tmp_path, size):
     struct.pack_into("<Q", spoilt, 17 + header + 1, size)
     # Without the index at the end the file is read through.
     struct.pack_into("<Q", spoilt, len(spoilt) - 28, 0)
+    path.write_bytes(spoilt)
+    drive = read_rosbag(path, robot_config())
+    assert drive.wheels.t_s.size == 50
+    assert drive.notes[0].startswith("warning: ")
+
+
+@pytest.mark.parametrize("size", [2**31, 2**40, 2**62, 2**64 - 1])
+def test_a_first_record_that_claims_any_size_is_one_line(tmp_path, size):
+    path = file_of(small(tmp_path / "b"))
+    spoilt = bytearray(path.read_bytes())
+    struct.pack_into("<Q", spoilt, 9, size)
     path.write_bytes(spoilt)
     with pytest.raises(LogError) as error:
         read_rosbag(path, robot_config())
@@ -206,6 +218,7 @@ def test_a_message_that_claims_a_list_of_any_size_is_one_line(tmp_path):
     assert one_line(error)
 
 
+@pytest.mark.thorough
 def test_a_chunk_that_unpacks_to_more_than_memory_is_one_line(tmp_path):
     """3 GiB of zeros in 100 kB: in a process of its own, as what it takes must not stay."""
     import zstandard
@@ -339,6 +352,7 @@ def test_a_pipe_in_a_bags_folder_holds_nobody_up(tmp_path):
         read_rosbag(folder, robot_config())
 
 
+@pytest.mark.thorough
 def test_a_command_on_what_is_no_bag_exits_with_two(tmp_path):
     robot = tmp_path / "robot.toml"
     robot.write_text(ROBOT)
