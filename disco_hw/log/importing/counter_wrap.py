@@ -261,17 +261,25 @@ def _faster_than_read(span: float, unit: str) -> str:
 def set_anew(t_s: Array, angles_rad: Array) -> Mask:
     """Return which samples (N,) begin anew because an encoder was set, from wheel angles (N, 2).
 
-    That is a step of more than ten turns, or of one radian that no wheel turns in that time.
+    That is a step of more than ten turns, or one of a radian that is several times as fast as the wheel turns else, or
+    faster than it turns else and to zero.
     """
     if t_s.size < 2:
         return np.zeros(t_s.size, dtype=bool)
-    steps = np.abs(np.diff(angles_rad, axis=0)).max(axis=1, initial=0.0)
-    rate_rad_s = steps / np.maximum(np.diff(t_s), 1e-3)
-    usual_rad_s = float(np.quantile(rate_rad_s, 0.99))
+    dt_s = np.maximum(np.diff(t_s), 1e-3)[:, np.newaxis]
+    steps = np.abs(np.diff(angles_rad, axis=0))
+    rate_rad_s = steps / dt_s
+    # Without the few fastest, which are those that are looked for.
+    rarest = min(max(_FEW, steps.shape[0] // 100), steps.shape[0] - 1)
+    usual_rad_s = np.sort(rate_rad_s, axis=0)[-1 - rarest]
     # Samples that come in bursts seem fast as well, but take small steps.
-    sudden = (steps > _NO_WHEELS_STEP_RAD) & (rate_rad_s > max(_NO_WHEEL_RAD_S, 5.0 * usual_rad_s))
-    return np.concatenate([[False], (steps > _LARGEST_STEP_RAD) | sudden])
+    is_long = steps > _NO_WHEELS_STEP_RAD
+    sudden = is_long & (rate_rad_s > np.maximum(_FAST_WHEEL_RAD_S, _TIMES_AS_FAST * usual_rad_s))
+    at_zero = np.abs(angles_rad[1:]) <= usual_rad_s * dt_s
+    to_zero = is_long & at_zero & (rate_rad_s > _FASTER_TO_ZERO * usual_rad_s)
+    return np.concatenate([[False], ((steps > _LARGEST_STEP_RAD) | sudden | to_zero).any(axis=1)])
 
 
 _LARGEST_STEP_RAD = 20.0 * math.pi
-_NO_WHEEL_RAD_S, _NO_WHEELS_STEP_RAD = 150.0, 1.0
+_NO_WHEELS_STEP_RAD, _FAST_WHEEL_RAD_S, _FEW = 1.0, 30.0, 3
+_TIMES_AS_FAST, _FASTER_TO_ZERO = 3.0, 2.0

@@ -30,7 +30,7 @@ from disco_hw.log.importing import LogFormat
 from disco_hw.log.importing.counter_wrap import set_anew
 from disco_hw.log.importing.csv_drive import length_fault
 from disco_hw.log.importing.losses import WARNING, loss_note
-from disco_hw.log.importing.rosbag_file import Bag, BagMessage, DamagedBagError, is_bag, open_bag
+from disco_hw.log.importing.rosbag_file import Bag, DamagedBagError, Undecoded, is_bag, open_bag, words_of
 from disco_hw.log.importing.rosbag_times import Stamps, timeline
 from disco_hw.log.importing.rosbag_topics import (
     ARRAY,
@@ -106,14 +106,26 @@ def read_rosbag(path: Path, config: RobotConfig) -> DriveLog:
 def _read(path: Path, config: RobotConfig, *, salvage: bool) -> DriveLog:
     with open_bag(path, salvage=salvage) as bag:
         choice = choose(bag, config.ros2)
-        columns = _columns(bag, choice, config)
-        notes = bag.notes
+        undecoded: dict[str, Undecoded] = {}
+        columns = _columns(bag, choice, config, undecoded)
+        notes = (*bag.notes, *_notes_on_undecoded(bag, undecoded))
     drive = _assembled(path, choice, columns, config.robot)
     return replace(drive, notes=(*notes, *drive.notes))
 
 
-def _columns(bag: Bag, choice: Choice, config: RobotConfig) -> dict[str, _Column]:
-    """One pass through the chosen topics."""
+def _notes_on_undecoded(bag: Bag, undecoded: dict[str, Undecoded]) -> list[str]:
+    """Sentences on the messages that cannot be decoded, by topic; raises LogError for a topic of which most cannot."""
+    return [
+        loss_note(
+            str(bag.path), topic, one.count, max(one.count, bag.topics[topic].count),
+            f"messages cannot be decoded and were left out, the first says: {one.first}", "name another topic",
+        )
+        for topic, one in sorted(undecoded.items())
+    ]  # fmt: skip
+
+
+def _columns(bag: Bag, choice: Choice, config: RobotConfig, undecoded: dict[str, Undecoded]) -> dict[str, _Column]:
+    """One pass through the chosen topics; messages that cannot be decoded are counted."""
     columns: dict[str, _Column] = {}
     takes: dict[str, list[tuple[str, Take]]] = {}
     for role in ROLES:
@@ -126,11 +138,15 @@ def _columns(bag: Bag, choice: Choice, config: RobotConfig) -> dict[str, _Column
     edges = {edge: _Column(7) for edge in choice.edges} if by_tf else {}
     static: set[Edge] = set()
     transforms = {one.name for one in bag.topics.values() if one.type in TRANSFORMS} if by_tf else set()
-    for number, message in enumerate(bag.messages({*takes, *transforms})):
+    for number, message in enumerate(bag.messages({*takes, *transforms}, undecoded=undecoded)):
         if number >= _MOST_MESSAGES:
             raise LogError(f"{bag.path}: over {_MOST_MESSAGES} messages of its topics; record its topics alone")
         for role, take in takes.get(message.topic, ()):
-            columns[role].add(message.log_ns, stamp_of(message.value), _finite(take, message, bag.path))
+            try:
+                columns[role].add(message.log_ns, stamp_of(message.value), finite(take(message.value)))
+            except (IndexError, ValueError, TypeError, AttributeError, OverflowError) as error:
+                fault = f"not as its type has it ({words_of(error)})"
+                undecoded.setdefault(message.topic, Undecoded()).add(fault)
         if message.topic in transforms:
             for one in message.value.transforms:
                 edge = (one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/"))
@@ -143,15 +159,6 @@ def _columns(bag: Bag, choice: Choice, config: RobotConfig) -> dict[str, _Column
 
 def _edge_name(edge: Edge, static: bool) -> str:
     return f"{'/tf_static' if static else '/tf'} {edge[0]} - {edge[1]}"
-
-
-def _finite(take: Take, message: BagMessage, path: Path) -> Row | None:
-    try:
-        return finite(take(message.value))
-    except (IndexError, ValueError, TypeError, AttributeError, OverflowError) as error:
-        raise LogError(
-            f"{path}: {message.topic}: a message is not as its type has it ({error}); name another topic"
-        ) from None
 
 
 def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: Robot) -> DriveLog:

@@ -61,6 +61,18 @@ class BagMessage:
     value: Any  # Any: a class that `rosbags` makes of the message's definition.
 
 
+@dataclass(slots=True)
+class Undecoded:
+    """How many messages of a topic cannot be decoded, and what is wrong with the first."""
+
+    count: int = 0
+    first: str = ""
+
+    def add(self, fault: str) -> None:
+        """Count one more."""
+        self.count, self.first = self.count + 1, self.first or fault
+
+
 @dataclass(frozen=True)
 class Bag:
     """An open bag; its messages can be read as often as wanted."""
@@ -75,20 +87,32 @@ class Bag:
     _definitions: Definitions
 
     def why_unreadable(self, topic: str) -> str:
-        """Why messages of a topic cannot be read; empty if they can. Parses the bag's definition of its type."""
+        """Why no message of a topic can be read; empty if one can. Parses the bag's definition of its type."""
         kind = self.topics[topic].type
         connections = (one for reader in self._readers for one in reader.connections)
         one = next(one for one in connections if (one.topic, one.msgtype) == (topic, kind))
-        return self._definitions.fault(one)
+        fault = self._definitions.fault(one)
+        undecoded: dict[str, Undecoded] = {}
+        if not fault and next(self.messages([topic], undecoded=undecoded), None) is None and topic in undecoded:
+            fault = f"none of its messages can be decoded ({undecoded[topic].first})"
+        return fault
 
-    def messages(self, topics: Collection[str], start_ns: int | None = None) -> Iterator[BagMessage]:
-        """Messages of these topics in the order of their recording; raises LogError for one that cannot be read."""
+    def messages(
+        self, topics: Collection[str], start_ns: int | None = None, undecoded: dict[str, Undecoded] | None = None
+    ) -> Iterator[BagMessage]:
+        """Messages of these topics in the order of their recording.
+
+        A message that cannot be decoded costs no other: it is left out, and counted in `undecoded` by its topic.
+        """
+        found: dict[str, Undecoded] = {} if undecoded is None else undecoded
         for reader in self._readers:
             wanted = [one for one in reader.connections if one.topic in topics and self._is_readable(one)]
             if wanted and (start_ns is None or reader.end_time > start_ns):
-                yield from self._of_a_reader(reader, wanted, start_ns)
+                yield from self._of_a_reader(reader, wanted, start_ns, found)
 
-    def _of_a_reader(self, reader: Any, wanted: Sequence[Any], start_ns: int | None) -> Iterator[BagMessage]:
+    def _of_a_reader(
+        self, reader: Any, wanted: Sequence[Any], start_ns: int | None, undecoded: dict[str, Undecoded]
+    ) -> Iterator[BagMessage]:
         with _in_one_line(self.path):
             found = reader.messages(connections=wanted, start=start_ns)
         while True:
@@ -97,8 +121,12 @@ class Bag:
             if one is None:
                 return
             connection, log_ns, data = one
-            with _in_one_line(self.path, f"a message of {connection.topic} ({connection.msgtype})"):
-                value = self._read(data, connection.msgtype)
+            try:
+                with _in_one_line(self.path, f"a message of {connection.topic} ({connection.msgtype})"):
+                    value = self._read(data, connection.msgtype)
+            except DamagedBagError as error:
+                undecoded.setdefault(connection.topic, Undecoded()).add(words_of(error.__cause__ or error))
+                continue
             yield BagMessage(connection.topic, log_ns, value)
 
     def _is_readable(self, connection: Any) -> bool:  # Any: a connection of the library.
@@ -266,10 +294,11 @@ def _in_one_line(path: Path, what: str = "the bag") -> Iterator[None]:
         most = f"{_MOST_MEMORY_BYTES / 2**30:.1f} GiB"
         raise LogError(f"{path}: {what} needs over {most} of memory, as sizes in it say; {_REMEDY}") from None
     except Exception as error:
-        raise DamagedBagError(f"{path}: {what} cannot be read ({_words(error)}); {_REMEDY}") from None
+        raise DamagedBagError(f"{path}: {what} cannot be read ({words_of(error)}); {_REMEDY}") from error
 
 
-def _words(error: Exception) -> str:
+def words_of(error: BaseException) -> str:
+    """What an exception of a library says, in one line that is not too long."""
     return " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
 
 

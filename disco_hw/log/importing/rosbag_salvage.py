@@ -23,7 +23,6 @@ _LARGEST_RECORD_BYTES = 256 * 1024 * 1024
 _LARGEST_MESSAGE_BYTES = 1024 * 1024
 """Images and clouds are left behind: nothing that is imported is as large."""
 _LARGEST_UNPACKED_BYTES = 512 * 1024 * 1024
-_QUERY_BATCH = 1000
 
 
 def salvage(path: Path, folder: Path) -> tuple[Path, str] | None:
@@ -138,9 +137,8 @@ def _copy_sqlite(path: Path, target: Path) -> str:
 
 def _rows(source: sqlite3.Connection, table: str) -> Iterator[tuple[Any, ...]]:  # Any: whatever sqlite holds.
     """Rows in the order in which they were written; an index, which needs the whole file, is not used."""
-    found = source.execute(f'SELECT * FROM "{table}" NOT INDEXED')
-    while rows := found.fetchmany(_QUERY_BATCH):
-        yield from rows
+    # Row by row: of a batch that meets the damage nothing would be left.
+    yield from source.execute(f'SELECT * FROM "{table}" NOT INDEXED')
 
 
 _MESSAGE, _CHUNK, _CONNECTION = b"\x02", b"\x05", b"\x07"

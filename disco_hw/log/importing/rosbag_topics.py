@@ -75,6 +75,9 @@ class Choice:
         return "\n".join(["topics; * is read, `--topic ROLE=NAME` takes another", *(line.rstrip() for line in lines)])
 
 
+_UNREADABLE_RANK = 200
+
+
 def choose(bag: Bag, settings: Ros2) -> Choice:
     """Choose for each role; `settings` override. Raises LogError for what they name and the bag has not."""
     edges = _edges(bag)
@@ -86,7 +89,10 @@ def choose(bag: Bag, settings: Ros2) -> Choice:
         found = [*_of_role(bag, role, left, right, settings), *(_by_tf(bag, route) if role == POSES else ())]
         candidates += _one_used(bag, role, found, wanted[role])
     if not any(one.used for one in candidates):
-        some = ", ".join(f"{one.name} ({one.type})" for one in list(bag.topics.values())[:8]) or "none"
+        why = {one.topic: f", {one.why}" for one in candidates if one.rank >= _UNREADABLE_RANK}
+        some = (
+            ", ".join(f"{one.name} ({one.type}{why.get(one.name, '')})" for one in [*bag.topics.values()][:8]) or "none"
+        )
         raise LogError(
             f"{bag.path}: no topic with commands, wheels or poses; it has {some}; name one with --topic ROLE=NAME"
         )
@@ -96,7 +102,7 @@ def choose(bag: Bag, settings: Ros2) -> Choice:
 def _one_used(bag: Bag, role: str, found: list[TopicCandidate], wanted: str) -> list[TopicCandidate]:
     found.sort(key=lambda one: (one.rank, -one.count, one.topic))
     if wanted:
-        named = next((one for one in found if one.topic == wanted and one.rank < 200), None) or _named(
+        named = next((one for one in found if one.topic == wanted and one.rank < _UNREADABLE_RANK), None) or _named(
             bag, role, wanted
         )
         others = [one for one in found if one.topic != wanted]
@@ -137,7 +143,7 @@ def _of_role(
         if not (topic.count and _serves(topic, role)):
             continue
         if why := bag.why_unreadable(topic.name):
-            yield TopicCandidate(role, topic.name, topic.type, topic.count, 200, why)
+            yield TopicCandidate(role, topic.name, topic.type, topic.count, _UNREADABLE_RANK, why)
             continue
         judged = {COMMANDS: _as_command, WHEELS: _as_wheels, POSES: _as_pose}[role](bag, topic, left, right, settings)
         if judged is not None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from disco_hw.errors import LogError
-from disco_hw.log.importing.counter_wrap import unwrap_counter, unwrap_wheels
+from disco_hw.log.importing.counter_wrap import set_anew, unwrap_counter, unwrap_wheels
 from disco_hw.log.importing.csv_drive import read_csv
 
 DT_S = 0.05
@@ -68,3 +68,20 @@ def test_a_step_from_one_segment_to_the_next_is_no_wrap():
     assert (found.span, found.wraps) == (4096.0, 1)
     steps = np.delete(np.diff(found.values), 299)
     np.testing.assert_array_equal(steps, 20.0)
+
+
+@pytest.mark.parametrize("period_s", [0.01, 0.1, 0.2])
+@pytest.mark.parametrize("turned_rad", [3.0, 30.0, 300.0])
+@pytest.mark.parametrize("speed_rad_s", [3.0, -3.0])
+def test_an_encoder_that_returns_to_zero_is_seen_at_any_rate(period_s, turned_rad, speed_rad_s):
+    angles = speed_rad_s * period_s * np.arange(1 + round(2.0 * turned_rad / abs(speed_rad_s) / period_s))
+    other, at = angles.copy(), angles.size // 2
+    angles[at:] -= angles[at]
+    anew = set_anew(period_s * np.arange(angles.size), np.column_stack([angles, other]))
+    assert np.flatnonzero(anew).tolist() == [at]
+
+
+def test_samples_that_were_held_and_come_in_bursts_are_no_reset():
+    t_s = 0.02 * np.arange(1000)
+    held = 6.0 * 0.1 * np.floor(t_s / 0.1 + 1e-9)
+    assert not set_anew(t_s, np.column_stack([held, held])).any()
