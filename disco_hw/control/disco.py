@@ -278,7 +278,7 @@ class Disco:
         self._t0_ns = t0_ns
         guided = self._draw_guide(system, before)
         outcome, retries = self._improve(max(shift_steps, 0.0), before, system, first, guided)
-        if outcome is not PlanOutcome.STOPPING and self._is_trapped():
+        if outcome is not PlanOutcome.STOPPING and self.is_trapped:
             outcome = PlanOutcome.STOPPING
         if outcome is PlanOutcome.STOPPING:
             self._stop(now_ns, before)
@@ -362,7 +362,8 @@ class Disco:
             self._guided_until_ns = now_ns + round(horizon_s * 1e9)
         return self._guided_until_ns is not None and now_ns < self._guided_until_ns
 
-    def _is_trapped(self) -> bool:
+    @property
+    def is_trapped(self) -> bool:
         """Whether every sample of the last step touches the fence or an obstacle for most of the horizon."""
         around = self._surroundings
         return around is not None and self._optimiser.least_cost >= around.trapped_cost
@@ -390,7 +391,7 @@ class Disco:
             self._failing_since_ns = now_ns
         if (now_ns - self._failing_since_ns) * 1e-9 >= self._settings.decay_s:
             self._optimiser.reset()
-            if self._is_trapped():
+            if self.is_trapped:
                 raise NoValidControl(
                     "no way past the fence or an obstacle was found, and the robot stops before it; clear the way, or "
                     "drive it away from there"
