@@ -33,6 +33,8 @@ from disco_hw.control.plan import (
     WheelPlan,
     command_history,
 )
+from disco_hw.control.refinement import STEP_S as REFINED_STEP_S
+from disco_hw.control.refinement import Refinement, Scene
 from disco_hw.control.wheel_loss import WheelLoss
 from disco_hw.effects import Channel
 from disco_hw.effects.registry import DELAY
@@ -50,6 +52,8 @@ NOWHERE = 0.25
 # Steps kept beyond the longest delay that is believed in at first, for later beliefs.
 SPARE_HISTORY = 2
 SHORTEST_GAP_S = 1e-6
+# Outcomes whose plan is refined.
+REFINED = (PlanOutcome.PLANNED, PlanOutcome.RETRIED)
 
 
 class Disco:
@@ -78,6 +82,7 @@ class Disco:
         self._euler = True if settings.euler else None
         # The axle's path under Euler steps depends on x_icr.
         self._pairs = 0 if settings.euler else shared_pairs(model, theta, step_s)
+        self._refinement = Refinement(limits) if settings.refine else None
         self._take_points(model, theta)
         self._start = np.zeros(11, np.float32)
         self._slides = True if settings.offset_free else None
@@ -146,6 +151,11 @@ class Disco:
         )
         self._wheels_differ = self._do_wheels_differ(theta)
         self._past = PastMotion.of(model, theta, self._mean_theta)
+        if self._refinement is not None:
+            shared = self._settings.uncertainty == "ut"
+            self._refinement.take_points(
+                model, theta if shared else self._mean_theta, self._weights if shared else np.ones(1), self._chassis
+            )
 
     def set_belief(self, belief: Belief) -> None:
         """Plan under this belief from the next `plan` on; the last plan and the random numbers go on.
@@ -225,12 +235,16 @@ class Disco:
         self._optimiser.reset()
         self._begun_ns = self._t0_ns = self._failing_since_ns = self._memory = self._guided_until_ns = None
         self._loss.pause()
+        if self._refinement is not None:
+            self._refinement.reset()
 
     def warm_up(self) -> None:
         """Compile everything that any method calls, or load it from disk; leaves the planner as after `reset`."""
         number = self._optimiser.step_number
         self.reset()
         self.plan(0, PlannerState(0, 0.0, 0.0, 0.0, 0.0, 0.0))
+        if self._refinement is not None:
+            self._refinement.warm_up()
         self.sampled_rollouts(1)
         self.point_trajectories()
         self._optimiser.step_number = number
@@ -269,6 +283,10 @@ class Disco:
             self._optimiser.take_guide()
             nominal = self._optimiser.nominal()
             trajectory = self._mean_trajectory(nominal)
+        elif self._refinement is not None and outcome in REFINED:
+            refined = self._refined(state, system, start, t0_ns, elapsed_s, before, nominal)
+            if refined is not None:
+                return WheelPlan(t0_ns, REFINED_STEP_S, *refined, self._diagnostics(retries, outcome))
         return WheelPlan(
             t0_ns=t0_ns,
             step_s=settings.step_s,
@@ -276,6 +294,27 @@ class Disco:
             trajectory=trajectory,
             diagnostics=self._diagnostics(retries, outcome),
         )
+
+    def _refined(
+        self, state: PlannerState, system: SkidSteer, start: Array, t0_ns: int, elapsed_s: float,
+        before: tuple[float, float], nominal: Array,
+    ) -> tuple[Array, Array] | None:  # fmt: skip
+        """Return the refined commands (N, 2), as the robot is to get them, and where they lead; None without such."""
+        refinement = self._refinement
+        assert refinement is not None
+        wheels = state.left_speed_rad_s, state.right_speed_rad_s
+        past = self._acting(command_history(state.sent, t0_ns, REFINED_STEP_S, refinement.history, wheels))
+        means = None
+        if self._mean_means is not None:
+            means = self._mean_means[None] if self._settings.uncertainty != "ut" else self._means
+        scene = Scene(system.task, system.start, start, elapsed_s, self._slide, means, past, before)
+        commands = refinement.improve(scene, t0_ns, nominal, self._settings.step_s)
+        if commands is None:
+            return None
+        own = None if self._mean_means is None else self._mean_means.copy()
+        past = np.concatenate([past, commands])
+        states = refinement.mean.states(start, past, refinement.history, elapsed_s, 0, self._slide, own)
+        return self._asked(commands), states[:, :3]
 
     def _diagnostics(self, retries: int, outcome: PlanOutcome) -> Diagnostics:
         ess, temperature, least, mean, nominal, valid = self._optimiser.work.report.tolist()
@@ -310,7 +349,7 @@ class Disco:
 
     def _draw_guide(self, system: SkidSteer, before: tuple[float, float]) -> bool:
         """Set the guide for the next step; returns whether the task has a line to be guided along."""
-        if self._settings.guide_below <= 0.0 or not hasattr(system.task, "line_at"):
+        if self._settings.guide_below <= 0.0 or not hasattr(system.task, "way_ahead_m"):
             self._optimiser.sample_guide(False)
             return False
         optimiser = self._optimiser
