@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 HORIZON, STEP_S = 15, 0.1
 DISTANCE_WEIGHT, CHANGE_WEIGHT = 400.0, 0.02
 ITERATIONS = 2
-# How far behind and ahead of the last place on the line the nearest one is looked for, so that crossings do not confuse.
+# The nearest place is looked for so far behind and ahead of the last one: a line may cross itself.
 BEHIND_M, AHEAD_M = 0.1, 0.3
 SPACING_M = 0.002
 
@@ -62,7 +62,9 @@ class TimedReference:
 class NonlinearMpc:
     """Plans wheel speeds by nonlinear MPC, under the mean of the belief that it is given."""
 
-    def __init__(self, robot: ForeignRobot, track: Track, speed_m_s: float, geometry: tuple[float, float, float]) -> None:
+    def __init__(
+        self, robot: ForeignRobot, track: Track, speed_m_s: float, geometry: tuple[float, float, float]
+    ) -> None:
         self._reference = TimedReference(track.points_m, speed_m_s)
         self._geometry, self._lag_s, self._dead_rad_s = np.array(geometry), robot.lag_s, robot.dead_rad_s
         self._solver = _solver(robot.lag_s)
@@ -125,7 +127,7 @@ class NonlinearMpc:
 
 
 def _solver(lag_s: float) -> Any:
-    """Build the SQP solver: commands beyond the dead band; state, last command, geometry and reference as parameters."""
+    """Build the SQP solver for commands beyond the dead band; the state and the reference are parameters."""
     import casadi as ca  # noqa: PLC0415  (of [bench])
 
     commands = ca.MX.sym("u", 2 * HORIZON)
@@ -156,7 +158,8 @@ def _solver(lag_s: float) -> Any:
     }  # fmt: skip
     quiet = {"print_iter": False, "print_header": False, "print_info": False, "error_on_fail": False}
     options = {
-        "max_iter": ITERATIONS, "qpsol": "qrqp", "qpsol_options": quiet, "print_header": False, "print_iteration": False,
+        "max_iter": ITERATIONS, "qpsol": "qrqp", "qpsol_options": quiet, "print_header": False,
+        "print_iteration": False,
         "print_status": False, "print_time": False, "error_on_fail": False,
     }  # fmt: skip
     return ca.nlpsol("nmpc", "sqpmethod", problem, options)

@@ -30,9 +30,12 @@ Array = NDArray[np.float64]
 STEPS, STEP_S = 15, 0.1
 ITERATIONS = 2
 # A change of a wheel's rim speed costs as much as the distance that it covers in this time.
-CHANGE_S = 0.116
-# Weight of the last squared distance, and of the last heading's error, as parts of x_icr.
-END_WEIGHT, TURN_WEIGHT = 5.0, 1.0
+CHANGE_S = 0.2
+# What lies beyond the horizon: who follows the line exactly with the tracked point behind the centre of rotation turns
+# away from the heading that stays on it, e-fold over each x_icr of the way. So the end, distance and x_icr times the
+# error of the heading, counts as much as over so many times x_icr more of the way.
+END_X_ICR = 5.0
+LEAST_END_WEIGHT = 10.0
 # The robot is beside the line within this part of the way that the horizon covers, and facing within this cosine.
 BESIDE_PART, FACING = 0.3, 0.5
 
@@ -110,7 +113,7 @@ class Refinement:
         if not (distance_m < max(BESIDE_PART * way_m, 0.02) and facing > FACING):
             self._last = None
             return None
-        problem = self._posed(scene)
+        problem = self._posed(scene, way_m)
         buffers = self._buffers
         assert buffers is not None
         buffers.commands[: self.history] = scene.past
@@ -139,18 +142,19 @@ class Refinement:
     def warm_up(self) -> None:
         """Compile what has not been called."""
 
-    def _posed(self, scene: Scene) -> Problem:
+    def _posed(self, scene: Scene, way_m: float) -> Problem:
         self._start[:] = scene.start
         # The reference is relative to the task's origin.
         self._start[:2] = scene.begin[:2]
         self._before[:] = scene.before
         means = None if scene.means is None else np.ascontiguousarray(scene.means[self._counted[: len(scene.means)]])
+        x_icr_m = abs(self._chassis.x_icr_m)
+        end_weight = max(END_X_ICR * x_icr_m * STEPS / max(way_m, 1e-3), LEAST_END_WEIGHT)
         change = min(self._limits.acceleration_rad_s2 * STEP_S, 4.0 * self._limits.speed_rad_s)
         return Problem(
             self._start, float(scene.elapsed_s), np.array(scene.slide, np.float64), means, self._base, self._effects,
             self._series, self._weights, self.history, self._reference, float(self._limits.speed_rad_s), float(change),
-            self._before, CHANGE_S * self._chassis.wheel_radius_m, self._found[3:], END_WEIGHT,
-            TURN_WEIGHT * abs(self._chassis.x_icr_m),
+            self._before, CHANGE_S * self._chassis.wheel_radius_m, self._found[3:], end_weight, x_icr_m,
         )  # fmt: skip
 
     def _call(self, name: str, kernel: Callable[..., object], *arguments: object) -> float:

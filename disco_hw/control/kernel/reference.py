@@ -27,8 +27,8 @@ def timed_reference(
     """Fill `reference` (T, 2) with points (m), relative to the task's origin.
 
     `start` (11,) is the state of `SkidSteer`. Sets `found` (5,): distance to the line (m), cosine of the angle between
-    the robot and the heading in which it would stay on the line, the part of the task's speed that the wheels can do, at
-    most 1, and that heading at the end (cosine, sine).
+    the robot and the heading in which it would stay on the line, the part of the task's speed that the wheels can do,
+    at most 1, and that heading at the end (cosine, sine).
     """
     x, y, cos_yaw, sin_yaw = start[0], start[1], start[2], start[3]
     place = place_of(terms, start[7], x, y)

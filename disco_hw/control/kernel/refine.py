@@ -1,7 +1,7 @@
 """Gauss-Newton refinement of a plan: the bottom of the valley that sampling has found.
 
 Minimises, over the commands of T steps, the mean over the parameter points of the squared distances to a timed
-reference, plus the squared changes of the commands. Derivatives are finite differences of rollouts: one for each
+reference and of the squared error of the last heading, plus the squared changes of the commands. Derivatives are finite differences of rollouts: one for each
 command and point, from the step on in which the command acts. Limits of commands and of their changes are kept by
 Hildreth's dual method (a quadratic program with few active constraints). Double precision, no allocation.
 """
@@ -68,8 +68,8 @@ class Buffers(NamedTuple):
     """Scratch of the refinement: T steps, N = 2 T commands, H rows of history.
 
     `commands` (H + T, 2): the past and the plan, which is improved in place; `tried` the same for what is tried.
-    `states`, `moved` (T + 1, 9); `remembered` (n,) or None; `residuals` (2 T + 1,), `slopes` (N, 2 T + 1); `normal`, `inverse`
-    (N, N); `gradient`, `step` (N,); `multipliers` (2, 2 N).
+    `states`, `moved` (T + 1, 9); `remembered` (n,) or None; `residuals` (2 T + 1,), `slopes` (N, 2 T + 1);
+    `normal`, `inverse` (N, N); `gradient`, `step` (N,); `multipliers` (2, 2 N).
     """
 
     commands: Array
