@@ -243,8 +243,6 @@ class Disco:
         number = self._optimiser.step_number
         self.reset()
         self.plan(0, PlannerState(0, 0.0, 0.0, 0.0, 0.0, 0.0))
-        if self._refinement is not None:
-            self._refinement.warm_up()
         self.sampled_rollouts(1)
         self.point_trajectories()
         self._optimiser.step_number = number

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from disco_hw.control.kernel import Terms
 from disco_hw.control.kernel.guide import SteeredChassis
 from disco_hw.control.kernel.reference import timed_reference
-from disco_hw.control.kernel.refine import CHANNELS, STATE_COLUMNS, Buffers, Problem, plan_cost, refine
+from disco_hw.control.kernel.refine import CHANNELS, STATE_COLUMNS, Buffers, Problem, refine
 from disco_hw.control.parameter_points import mean_point
 from disco_hw.control.plan import CommandLimits
 from disco_hw.jit import compiled_for
@@ -124,23 +124,20 @@ class Refinement:
         best, best_cost = None, math.inf
         for one in starts:
             plan[:] = one
-            cost = self._call("cost", plan_cost, problem, buffers)
+            cost = self._call("refine", refine, problem, buffers, 0)
             if cost < best_cost:
                 best, best_cost = plan.copy(), cost
         if best is None:
             self._last = None
             return None
         plan[:] = best
-        cost = self._call("refine", refine, problem, buffers, ITERATIONS, best_cost)
+        cost = self._call("refine", refine, problem, buffers, ITERATIONS)
         found = plan.copy()
         if not (math.isfinite(cost) and np.isfinite(found).all()):
             self._last = None
             return None
         self._last, self._last_ns = found, t0_ns
         return found
-
-    def warm_up(self) -> None:
-        """Compile what has not been called."""
 
     def _posed(self, scene: Scene, way_m: float) -> Problem:
         self._start[:] = scene.start

@@ -1,7 +1,7 @@
 """Gauss-Newton refinement of a plan: the bottom of the valley that sampling has found.
 
-Minimises, over the commands of T steps, the mean over the parameter points of the squared distances to a timed
-reference and of the squared error of the last heading, plus the squared changes of the commands. Derivatives are finite differences of rollouts: one for each
+Minimises the mean over the parameter points of the squared distances to a timed reference and of the squared error of
+the last heading, plus the squared changes of the commands. Derivatives are finite differences of rollouts: one for each
 command and point, from the step on in which the command acts. Limits of commands and of their changes are kept by
 Hildreth's dual method (a quadratic program with few active constraints). Double precision, no allocation.
 """
@@ -349,17 +349,12 @@ def _take(problem: Problem, buffers: Buffers, share: float) -> None:
 
 
 @kernel_function
-def plan_cost(problem: Problem, buffers: Buffers) -> float:
-    """Bring `buffers.commands` within the limits and return their cost."""
+def refine(problem: Problem, buffers: Buffers, iterations: int) -> float:
+    """Bring `buffers.commands` within the limits and improve them; returns the cost that is left."""
     buffers.step[:] = 0.0
     _take(problem, buffers, 0.0)
     buffers.commands[:, :] = buffers.tried
-    return _cost(problem, buffers, buffers.commands)
-
-
-@kernel_function
-def refine(problem: Problem, buffers: Buffers, iterations: int, cost: float) -> float:
-    """Improve `buffers.commands`, which cost so much and are within the limits; returns the cost that is left."""
+    cost = _cost(problem, buffers, buffers.commands)
     for _ in range(iterations):
         _linearise(problem, buffers)
         for a in range(buffers.step.shape[0]):
