@@ -154,7 +154,10 @@ class Disco:
         if self._refinement is not None:
             shared = self._settings.uncertainty == "ut"
             self._refinement.take_points(
-                model, theta if shared else self._mean_theta, self._weights if shared else np.ones(1), self._chassis
+                model,
+                theta if shared else self._mean_theta,
+                self._weights.astype(np.float64) if shared else np.ones(1),
+                self._chassis,
             )
 
     def set_belief(self, belief: Belief) -> None:
@@ -230,6 +233,11 @@ class Disco:
         """The sampling optimiser, for its buffers and figures."""
         return self._optimiser
 
+    @property
+    def refinement(self) -> Refinement | None:
+        """The refinement of plans beside the line; None where the settings have none."""
+        return self._refinement
+
     def reset(self) -> None:
         """Forget the last plan, as at a new start; the random numbers go on."""
         self._optimiser.reset()
@@ -277,14 +285,15 @@ class Disco:
         self._planned_from, self._elapsed_s = start, elapsed_s
         nominal = self._optimiser.nominal()
         trajectory = self._mean_trajectory(nominal)
+        refined = None
+        if self._refinement is not None and outcome in REFINED:
+            refined = self._refined(state, system, start, t0_ns, elapsed_s, before, nominal)
         if guided and self._is_to_be_guided(now_ns, system, trajectory):
             self._optimiser.take_guide()
             nominal = self._optimiser.nominal()
             trajectory = self._mean_trajectory(nominal)
-        elif self._refinement is not None and outcome in REFINED:
-            refined = self._refined(state, system, start, t0_ns, elapsed_s, before, nominal)
-            if refined is not None:
-                return WheelPlan(t0_ns, REFINED_STEP_S, *refined, self._diagnostics(retries, outcome))
+        elif refined is not None:
+            return WheelPlan(t0_ns, REFINED_STEP_S, *refined, self._diagnostics(retries, outcome))
         return WheelPlan(
             t0_ns=t0_ns,
             step_s=settings.step_s,

@@ -77,6 +77,11 @@ class Refinement:
         """The part of the task's speed that the wheels can do ahead, at the last refinement; 1 if all of it."""
         return float(self._found[2])
 
+    @property
+    def is_compiled(self) -> bool:
+        """Whether a refinement would compile nothing any more."""
+        return "refine" in self._compiled
+
     def reset(self) -> None:
         """Forget the last plan."""
         self._last = None
@@ -110,12 +115,14 @@ class Refinement:
         )  # fmt: skip
         distance_m, facing, *_ = self._found.tolist()
         way_m = float(np.hypot(*np.diff(self._reference, axis=0).T).sum())
+        problem, buffers = self._posed(scene, way_m), self._buffers
+        assert buffers is not None
+        if not self.is_compiled:
+            # Off the line too, so that no compilation waits for the robot to reach it.
+            self._call("refine", refine, problem, buffers, 0)
         if not (distance_m < max(BESIDE_PART * way_m, 0.02) and facing > FACING):
             self._last = None
             return None
-        problem = self._posed(scene, way_m)
-        buffers = self._buffers
-        assert buffers is not None
         buffers.commands[: self.history] = scene.past
         plan = buffers.commands[self.history :]
         starts = [_resampled(nominal, step_s, 0.0)]

@@ -29,7 +29,7 @@ def _on_the_circle(speed_m_s: float) -> PlannerState:
 
 @pytest.fixture(scope="module")
 def drive_on() -> dict[float, tuple[np.ndarray, np.ndarray]]:
-    """Plans, commands and distances from the circle (m), for circles at a speed that wheels can do and one they cannot."""
+    """Plans: commands and distances (m), at a speed that the wheels can do, and at one they cannot."""
     found = {}
     for speed in (0.2, 0.8):
         planner = Disco(MODEL, CircleCost(radius_m=RADIUS_M, speed_m_s=speed), SETTINGS, LIMITS)
@@ -51,6 +51,14 @@ def test_a_line_too_fast_for_the_wheels_is_followed_slower(
     assert np.abs(commands).max() <= LIMITS.speed_rad_s
     assert np.abs(np.diff(commands, axis=0)).max() <= LIMITS.acceleration_rad_s2 * 0.1 + 1e-9
     assert np.abs(off_m).max() < 5e-3
+
+
+def test_warming_up_compiles_the_refinement() -> None:
+    """The refinement is compiled before the robot reaches its line, though warming up plans far from it."""
+    planner = Disco(MODEL, CircleCost(radius_m=RADIUS_M), SETTINGS, LIMITS)
+    planner.warm_up()
+    assert planner.refinement is not None
+    assert planner.refinement.is_compiled
 
 
 def test_the_papers_mode_is_not_refined() -> None:
