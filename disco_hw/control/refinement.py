@@ -70,7 +70,6 @@ class Refinement:
         self._last_ns = 0
         self._buffers: Buffers | None = None
         self.history = 0
-        self._problem: Problem | None = None
 
     @property
     def speed_part(self) -> float:

@@ -33,6 +33,9 @@ def drive_on() -> dict[float, tuple[np.ndarray, np.ndarray]]:
     for speed in (0.2, 0.8):
         planner = Disco(MODEL, CircleCost(radius_m=RADIUS_M, speed_m_s=speed), SETTINGS, LIMITS)
         plan = planner.plan(0, _on_the_circle(min(speed, 0.3)))
+        assert planner.refinement is not None
+        # The outer wheel would need more than its limit at 0.8 m/s on this circle.
+        assert (planner.refinement.speed_part < 1.0) is (speed > 0.5)
         found[speed] = plan.wheel_speeds, np.hypot(*plan.trajectory[:, :2].T) - RADIUS_M
     return found
 
