@@ -108,13 +108,16 @@ def import_log(
         list[str] | None,
         typer.Option("--topic", metavar="ROLE=NAME", help="Read commands, wheels or poses of a bag from this topic."),
     ] = None,
+    channel: Annotated[
+        str, typer.Option("--channel", metavar="NAME", help="Read this channel of a candump of several.")
+    ] = "",
     as_json: AsJson = False,
 ) -> None:
     """Convert a foreign log to MCAP for `infer`, `gap` and Foxglove; `view` and `replay` need a log of `run`."""
     check_named_files(robot, logs=[] if log.is_dir() else [log])
     from disco_hw.log.importing import import_log as import_foreign
 
-    result = import_foreign(log, robot, out, topic or ())
+    result = import_foreign(log, robot, out, topic or (), channel)
     print_result(result.as_dict(), as_json, result.as_text())
 
 

@@ -14,6 +14,7 @@ from disco_hw.log import ROBOT_TOML
 from disco_hw.log.container import MAGIC
 from disco_hw.log.drive import Array, Commands, DriveLog, Gyro, Index, Poses, Wheels, concatenate
 from disco_hw.log.importing.csv_drive import read_csv
+from disco_hw.log.importing.headings import with_headings_only, without_standing_headings
 from disco_hw.log.importing.rosbag_file import is_bag
 from disco_hw.log.reader import Log, open_log
 
@@ -222,4 +223,5 @@ def _load(path: Path, ticks_per_rev: float | None, wheel_radius_m: float | None)
     if begin.startswith(MAGIC):
         with open_log(path) as log:
             return drive_from_log(log)
-    return read_csv(path, ticks_per_rev, wheel_radius_m)
+    drive = without_standing_headings(read_csv(path, ticks_per_rev, wheel_radius_m))
+    return with_headings_only(drive)

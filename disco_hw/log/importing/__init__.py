@@ -25,7 +25,9 @@ from disco_hw.files import ROBOT_TOML as ROBOT_FILE
 from disco_hw.log import ROBOT_TOML, Attachment, End, Start, attachment, batch_encoder, version
 from disco_hw.log.container import MAGIC
 from disco_hw.log.drive import DriveLog
-from disco_hw.log.importing.rosbag_file import METADATA
+from disco_hw.log.importing.headings import without_standing_headings
+from disco_hw.log.importing.losses import WARNING, warnings_first
+from disco_hw.log.importing.rosbag_file import METADATA, SUFFIXES, is_bag
 from disco_hw.log.mcap_log import McapLog
 from disco_hw.log.records import Command, Record
 from disco_hw.log.writer import LogFile
@@ -41,6 +43,7 @@ class LogFormat:
     `read` takes path and robot.toml and returns the arrays of the drive; it raises LogError with one line
     that names the file, the place and the remedy. Of two formats that recognise a file the one with the lower `order`
     reads it; one that takes whatever is left comes last. `has_topics`: [ros2] and `--topic` say what of it is read.
+    `read_channel` reads one of several channels, where a file can have these.
     """
 
     name: str
@@ -48,6 +51,7 @@ class LogFormat:
     read: Callable[[Path, RobotConfig], DriveLog]
     order: int = 100
     has_topics: bool = False
+    read_channel: Callable[[Path, RobotConfig, str], DriveLog] | None = None
 
 
 @cache
@@ -162,20 +166,26 @@ class Imported:
     notes: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines."""
-        return {**asdict(self), "out": str(self.out)}
+        """Return the result as a JSON-serialisable dict; the warnings are among the notes, and a list of their own."""
+        warnings = [note.removeprefix(WARNING) for note in self._warnings]
+        return {**asdict(self), "out": str(self.out), "warnings": warnings}
 
     def as_text(self) -> str:
-        """For a person."""
+        """Return the result as lines: warnings first, then what was written, then notes."""
         written = f"{self.out}: {self.records} records, {self.duration_s:.1f} s, {self.segments} segments"
-        return "\n".join([written, *(f"note: {note}" for note in self.notes)])
+        notes = (f"note: {note}" for note in self.notes if note not in self._warnings)
+        return "\n".join([*self._warnings, written, *notes])
+
+    @property
+    def _warnings(self) -> tuple[str, ...]:
+        return tuple(note for note in self.notes if note.startswith(WARNING))
 
 
-def import_log(path: Path, robot: Path, out: Path, topics: Sequence[str] = ()) -> Imported:
+def import_log(path: Path, robot: Path, out: Path, topics: Sequence[str] = (), channel: str = "") -> Imported:
     """Write a foreign log, of whichever format it is, as an MCAP log of ours.
 
-    robot.toml goes into the log. `topics`, of a bag: ROLE=NAME, ahead of robot.toml's [ros2]. Raises LogError for what
-    can be no such file, and InputError.
+    robot.toml goes into the log. `topics`, of a bag: ROLE=NAME, ahead of robot.toml's [ros2]. `channel`: of a candump.
+    Raises LogError for what can be no such file, and InputError.
     """
     config = load_robot_config(robot)
     begin = begin_of(_telling(path), LOG, LONGEST_BEGIN_BYTES)
@@ -187,17 +197,28 @@ def import_log(path: Path, robot: Path, out: Path, topics: Sequence[str] = ()) -
         raise LogError(f"{path}: none of the formats that can be imported ({names}); write a CSV")
     if topics and not log_format.has_topics:
         raise InputError(f"--topic: {path} is a {log_format.name}, which has no topics; leave it out")
-    drive = log_format.read(path, msgspec.structs.replace(config, ros2=_with_topics(config.ros2, topics)))
+    if channel and log_format.read_channel is None:
+        raise InputError(f"--channel: {path} is a {log_format.name}, which has no channels; leave it out")
+    config = msgspec.structs.replace(config, ros2=_with_topics(config.ros2, topics))
+    if channel and log_format.read_channel is not None:
+        drive = log_format.read_channel(path, config, channel)
+    else:
+        drive = log_format.read(path, config)
+    drive = without_standing_headings(drive)
     records = write_log(drive, out, config.robot.name, (attachment(robot, ROBOT_TOML, ROBOT_FILE),))
-    notes = drive.notes
+    notes = warnings_first(drive.notes)
     if drive.gyro.t_s.size:
         notes += (f"{path}: the gyro was left out; the logs of disco-hw have no place for it",)
     return Imported(out, records, drive.segments, drive.end_s, notes)
 
 
 def _telling(path: Path) -> Path:
-    """The file that shows the format; a log that is a folder has one that says what it is."""
-    return path / METADATA if path.is_dir() and (path / METADATA).exists() else path
+    """The file that shows the format: of a bag's folder its metadata.yaml, or else the first bag in it."""
+    if not path.is_dir():
+        return path
+    inside = sorted(one for one in path.iterdir() if one.suffix in SUFFIXES.values())
+    possible = [path / METADATA, *inside] if (path / METADATA).exists() else inside
+    return next((one for one in possible if is_bag(begin_of(one, LOG, LONGEST_BEGIN_BYTES))), [*possible, path][0])
 
 
 def _with_topics(settings: Ros2, topics: Sequence[str]) -> Ros2:

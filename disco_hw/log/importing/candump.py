@@ -1,25 +1,20 @@
-"""A candump of a robot that speaks our protocol -> the arrays of a drive.
-
-Lines as `candump -l` writes them: `(1700000000.123456) can0 110#0102...`.
-"""
+"""A candump of a robot that speaks our protocol -> the arrays of a drive."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TextIO, cast
 
-import can
 import numpy as np
 
 from disco_hw.config import Robot
 from disco_hw.errors import LogError
-from disco_hw.files import CANDUMP, read_lines
 from disco_hw.log.drive import Array, Commands, DriveLog, Gyro, Poses, Wheels
 from disco_hw.log.importing import LogFormat
+from disco_hw.log.importing.candump_lines import Dump, is_candump, read_dump
+from disco_hw.log.importing.losses import loss_note, warnings_first
 from drivers.device_clock import DeviceClock
 from drivers.motor.reference_frames import POSE_MESSAGES, WHEEL_MESSAGES, FrameReception, Telemetry
-from drivers.types import Frame, ReceivedFrame
 from firmware_protocol.codec import Codec, Decoded
 
 _COMMAND = "WHEEL_COMMAND"
@@ -27,27 +22,71 @@ _LONGEST_SILENCE_NS = 500_000_000
 Row = tuple[float, ...]
 
 
-def read_candump(path: Path, robot: Robot) -> DriveLog:
-    """Commands, wheels and poses of a dump, stamped with their reception; raises LogError.
+@dataclass(slots=True)
+class _Rows:
+    """What the frames of one channel hold; `refused` of the protocol's frames failed their check."""
 
-    A command counts until the next one or as long as it is valid; frames that fail their check are left out, with a
-    note. Ticks per revolution and the largest speed, which distinguish a jump from motion, are robot.toml's.
+    commands: list[Row] = field(default_factory=list)
+    wheels: list[Row] = field(default_factory=list)
+    poses: list[Row] = field(default_factory=list)
+    frames: int = 0
+    refused: int = 0
+
+    @property
+    def count(self) -> int:
+        """Number of commands, wheel samples and poses."""
+        return len(self.commands) + len(self.wheels) + len(self.poses)
+
+
+def read_candump(path: Path, robot: Robot, channel: str = "", usual_channel: str = "") -> DriveLog:
+    """Read commands, wheels and poses of a dump, stamped with their reception.
+
+    A command counts until the next one or as long as it is valid. Frames that fail their check are left out and
+    counted. Ticks per revolution and the largest speed, which distinguish a jump from motion, are robot.toml's. Of
+    several channels `channel` is read, or the only one that speaks the protocol, or else `usual_channel`. Raises
+    LogError, also for several robots of which none is named.
     """
+    dump = read_dump(path)
+    if channel and channel not in dump.channels:
+        raise LogError(f"{path}: no channel {channel}; it has {', '.join(dump.channels)}")
+    wanted = [channel] if channel else list(dump.channels)
+    found = {each: _decoded(dump, each, robot) for each in wanted}
+    robots = {each: rows for each, rows in found.items() if rows.count}
+    if not robots:
+        frames = sum(rows.frames for rows in found.values())
+        raise LogError(f"{path}: {frames} frames, none of them a command, wheel sample or pose of our protocol")
+    if len(robots) > 1 and usual_channel not in robots:
+        counts = ", ".join(f"{each} with {rows.count} records" for each, rows in robots.items())
+        raise LogError(f"{path}: several channels hold a robot ({counts}); name one with --channel")
+    taken = usual_channel if usual_channel in robots else next(iter(robots))
+    rows, notes = robots[taken], list(dump.notes)
+    if len(dump.channels) > 1:
+        others = ", ".join(each for each in dump.channels if each != taken)
+        notes.append(f"{path}: channel {taken} was read, and {others} left out; --channel takes another")
+    if rows.refused:
+        notes.append(
+            loss_note(
+                str(path), f"frames of {taken}", rows.refused, rows.frames,
+                "failed their check and were left out", "look for a second sender, or name another channel",
+            )
+        )  # fmt: skip
+    return _drive(path, _expired(rows.commands), rows.wheels, rows.poses, warnings_first(tuple(notes)))
+
+
+def _decoded(dump: Dump, channel: str, robot: Robot) -> _Rows:
+    """What the frames of one channel hold."""
     codec = Codec()
     reception, telemetry = FrameReception(codec), Telemetry(DeviceClock())
     telemetry.configure(round(robot.ticks_per_rev), robot.max_wheel_speed_rad_s)
-    commands: list[Row] = []
-    wheels: list[Row] = []
-    poses: list[Row] = []
-    frames = 0
-    for received in _frames(path):
-        frames += 1
+    rows = _Rows()
+    for received in dump.frames(channel):
+        rows.frames += 1
         decoded = codec.decode(received.frame.can_id, received.frame.data)
         if isinstance(decoded, Decoded) and decoded.name == _COMMAND:
             values = decoded.values
             given = codec.choice_name(_COMMAND, "mode", values["mode"]) == "SPEED"
             speeds = (values["left_speed"], values["right_speed"]) if given else (np.nan, np.nan)
-            commands.append((received.t_ns, *speeds, values["valid_for"]))
+            rows.commands.append((received.t_ns, *speeds, values["valid_for"]))
             continue
         believed = reception.accept(received)
         if believed is None:
@@ -56,38 +95,13 @@ def read_candump(path: Path, robot: Robot) -> DriveLog:
             wheel = telemetry.wheels(believed, received.t_ns)
             if wheel is not None:
                 angles = (wheel.left_angle_rad, wheel.right_angle_rad)
-                wheels.append((received.t_ns, *angles, wheel.left_speed_rad_s, wheel.right_speed_rad_s))
+                rows.wheels.append((received.t_ns, *angles, wheel.left_speed_rad_s, wheel.right_speed_rad_s))
         elif believed.name in POSE_MESSAGES:
             pose = telemetry.pose(believed, received.t_ns)
             if pose is not None:
-                poses.append((received.t_ns, pose.x_m, pose.y_m, pose.yaw_rad))
-    if not (commands or wheels or poses):
-        raise LogError(f"{path}: {frames} frames, none of them a command, wheel sample or pose of our protocol")
-    refused = reception.rejected_crc + reception.rejected_sequence + reception.rejected_length
-    notes = (f"{path}: {refused} of {frames} frames failed their check and were left out",) if refused else ()
-    return _drive(path, _expired(commands), wheels, poses, notes)
-
-
-def _frames(path: Path) -> Iterator[ReceivedFrame]:
-    first_ns = last_ns = whole = 0
-    try:
-        # It takes any iterator of lines that can be closed, not only files.
-        with can.CanutilsLogReader(cast(TextIO, read_lines(path, CANDUMP))) as reader:
-            for number, message in enumerate(reader, start=1):
-                t_ns = round(message.timestamp * 1e9)
-                # Since the first frame: nanoseconds since 1970 need more digits than a float has.
-                first_ns = first_ns or t_ns
-                if t_ns < last_ns:
-                    raise LogError(f"{path}: frame {number}: the clock goes backwards; sort the lines by time")
-                last_ns, whole = t_ns, number
-                if not (message.is_error_frame or message.is_remote_frame or message.is_extended_id):
-                    yield ReceivedFrame(t_ns - first_ns, Frame(message.arbitration_id, bytes(message.data)))
-    except (ValueError, IndexError, OverflowError) as error:
-        if whole:
-            raise LogError(
-                f"{path}: after {whole} frames comes a line that is no frame ({error}); take it out"
-            ) from None
-        raise LogError(f"{path}: not a candump ({error}); record with `candump -l`") from None
+                rows.poses.append((received.t_ns, pose.x_m, pose.y_m, pose.yaw_rad))
+    rows.refused = reception.rejected_crc + reception.rejected_sequence + reception.rejected_length
+    return rows
 
 
 def _expired(commands: list[Row]) -> list[Row]:
@@ -132,5 +146,9 @@ def _table(rows: list[Row], width: int) -> Array:
 
 
 FORMAT = LogFormat(
-    "candump", lambda begin: begin.startswith(b"("), lambda path, config: read_candump(path, config.robot), order=10
+    "candump",
+    is_candump,
+    lambda path, config: read_candump(path, config.robot, usual_channel=config.link.channel),
+    order=10,
+    read_channel=lambda path, config, channel: read_candump(path, config.robot, channel),
 )

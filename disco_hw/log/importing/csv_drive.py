@@ -2,24 +2,22 @@
 
 Header row, columns by name in any order: `t_s`, `cmd_left_rad_s`, `cmd_right_rad_s`, either `enc_*_rad_s` or
 cumulative `enc_*_ticks` or both, `pose_x_m`, `pose_y_m`, `pose_yaw_rad`, optional `imu_wz_rad_s`, optional `segment`.
-An empty cell is "no sample at that time". A log in degrees, millimetres or milliseconds is refused. What is written
-has every float in the shortest form that reads back to the same bits.
+An empty cell is "no sample at that time"; `pose_yaw_rad` may be left out. A log in degrees,
+millimetres or milliseconds is refused. What is written has every float in the shortest form that reads back to the same
+bits.
 """
 
 from __future__ import annotations
 
 import csv
 import math
-from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from disco_hw.errors import LogError
-from disco_hw.files import DRIVE_CSV, read_lines
 from disco_hw.log.drive import (
     Array,
     Commands,
@@ -32,6 +30,20 @@ from disco_hw.log.drive import (
     integrate_angle,
 )
 from disco_hw.log.importing import LogFormat
+from disco_hw.log.importing.counter_wrap import set_anew, unwrap_counter
+from disco_hw.log.importing.csv_sheet import (
+    COMMAND,
+    GYRO,
+    POSITION,
+    SEGMENT,
+    SPEED,
+    TICKS,
+    TIME,
+    YAW,
+    Sheet,
+    read_sheet,
+)
+from disco_hw.log.importing.losses import warnings_first
 
 _LONGEST_PERIOD_S = 2.0
 _SHORTEST_PERIOD_S = 1e-4
@@ -114,154 +126,49 @@ def _roll(wheels: Wheels, commands: Commands) -> tuple[Array, Array]:
     return t_s, np.column_stack([integrate_angle(t_s, left, segment), integrate_angle(t_s, right, segment)])
 
 
-COMMAND = ("cmd_left_rad_s", "cmd_right_rad_s")
-SPEED = ("enc_left_rad_s", "enc_right_rad_s")
-TICKS = ("enc_left_ticks", "enc_right_ticks")
-POSE = ("pose_x_m", "pose_y_m", "pose_yaw_rad")
-GYRO = ("imu_wz_rad_s",)
-TIME = "t_s"
-SEGMENT = "segment"
-
-Mask = NDArray[np.bool_]
-
-_GROUPS = (COMMAND, SPEED, TICKS, POSE, GYRO)
-_KNOWN = frozenset({TIME, SEGMENT, *(name for group in _GROUPS for name in group)})
 _LONGEST_HOLD_S = 0.5
-_LARGEST_STEP_REV = 10.0
-
-
-class _Sheet(NamedTuple):
-    """A file's columns: times (N,), segments (N,), and cells (N,) with NaN where they are empty."""
-
-    name: str
-    t_s: Array
-    segment: Index
-    cells: dict[str, Array]
-    ignored: tuple[str, ...]
+_MOST_SET_ANEW_SHARE = 0.05
 
 
 def read_csv(path: Path, ticks_per_rev: float | None = None, wheel_radius_m: float | None = None) -> DriveLog:
     """Read one CSV file; `ticks_per_rev` is needed for ticks, the nominal `wheel_radius_m` only sharpens the checks.
 
-    A command holds through empty cells for half a second at most, after that it counts as unknown. Raises LogError with
-    one line naming file, line, column and remedy: nothing in it, missing columns, cells that are no finite number, a
-    clock that goes backwards, or units that cannot be.
+    A command holds through empty cells for half a second at most, after that it counts as unknown. Ticks that wrap are
+    made continuous, and where an encoder was set anew a new segment begins. A position without heading has NaN for its
+    yaw. Raises LogError with one line naming file, line, column and remedy: nothing in it, missing columns, a signal of
+    which over half cannot be read, a clock that goes back, ticks that wrap faster than they are read, or units that
+    cannot be.
     """
-    sheet = _read(path)
-    notes = [f"{path}: ignored columns: {', '.join(sheet.ignored)}"] if sheet.ignored else []
-    t_s, segment = sheet.t_s, sheet.segment
+    sheet = read_sheet(path)
+    notes: list[str] = []
 
     def refuse(fault: str | None) -> None:
         if fault is not None:
             raise LogError(f"{path}: {fault}")
 
-    refuse(time_fault(t_s))
+    refuse(time_fault(sheet.t_s))
+    sheet, wheels = _wheels(sheet, ticks_per_rev, notes)
+    t_s, segment = sheet.t_s, sheet.segment
     commands = _commands(sheet)
-    wheels = _wheels(sheet, ticks_per_rev)
-    pose, there = _group(sheet, POSE)
-    x_m, y_m, yaw_rad = pose[there].T
-    refuse(yaw_fault(t_s[there], yaw_rad, segment[there], wheels, commands))
+    position, there = sheet.group(POSITION)
+    x_m, y_m = position[there].T
+    yaw_rad = sheet.group((YAW,))[0][there, 0]
+    measured = np.isfinite(yaw_rad)
+    refuse(yaw_fault(t_s[there][measured], yaw_rad[measured], segment[there][measured], wheels, commands))
     poses = Poses(t_s[there], x_m, y_m, _wrapped(yaw_rad), segment[there])
-    if not np.array_equal(poses.yaw_rad, yaw_rad):
-        notes.append(f"{path}: pose_yaw_rad was wrapped to (-pi, pi]")
+    if not np.array_equal(poses.yaw_rad, yaw_rad, equal_nan=True):
+        notes.append(f"{path}: {YAW} was wrapped to (-pi, pi]")
     refuse(length_fault(poses, wheels, commands, wheel_radius_m))
-    rate, turning = _group(sheet, GYRO)
+    rate, turning = sheet.group(GYRO)
     gyro = Gyro(t_s[turning], rate[turning, 0], segment[turning])
     if not (np.isfinite(commands.left_rad_s).any() or wheels.t_s.size or poses.t_s.size):
         raise LogError(f"{path}: no row has a command, an encoder sample or a pose; nothing was driven in it")
-    return DriveLog((str(path),), commands, wheels, poses, gyro, tuple(notes))
+    return DriveLog((str(path),), commands, wheels, poses, gyro, warnings_first((*sheet.notes, *notes)))
 
 
-def _read(path: Path) -> _Sheet:
-    reader = csv.reader(read_lines(path, DRIVE_CSV))
-    try:
-        header = [name.strip() for name in next(reader, [])]
-        if not header:
-            raise LogError(f"{path}: empty file; it needs a header row and samples")
-        _check_header(path, header)
-        lines, columns = _columns(path, header, reader)
-    except csv.Error as error:
-        raise LogError(f"{path}: not a CSV file ({error}); give an MCAP log or a CSV file") from None
-    if not lines:
-        raise LogError(f"{path}: a header and no rows; nothing was recorded in it")
-    t_s = columns.pop(TIME)
-    _check_clock(path, t_s, lines)
-    segment = columns.pop(SEGMENT, np.zeros(t_s.size)).astype(np.int64)
-    ignored = tuple(name for name in header if name not in _KNOWN)
-    return _Sheet(str(path), t_s - t_s[0], segment, columns, ignored)
-
-
-def _columns(path: Path, header: Sequence[str], rows: Iterator[list[str]]) -> tuple[Sequence[int], dict[str, Array]]:
-    """The lines of the rows, and their known columns: NaN where a cell is empty, segments numbered from 0."""
-    lines = array("q")
-    columns = {name: array("d") for name in header if name in _KNOWN}
-    places = [(header.index(name), name, column) for name, column in columns.items() if name != SEGMENT]
-    segments, label_at = columns.get(SEGMENT), header.index(SEGMENT) if SEGMENT in header else 0
-    label, number = "", 0
-    for line, row in enumerate(rows, start=2):
-        if not row:
-            continue
-        if len(row) != len(header):
-            raise LogError(f"{path}: line {line}: {len(row)} cells under {len(header)} columns; mend that line")
-        lines.append(line)
-        for place, name, column in places:
-            column.append(_number(path, line, name, row[place]))
-        if segments is not None:
-            # An empty cell continues the segment.
-            given = row[label_at].strip()
-            if given and given != label:
-                number += bool(label)
-                label = given
-            segments.append(number)
-    return lines, {name: np.array(column) for name, column in columns.items()}
-
-
-def _check_header(path: Path, header: Sequence[str]) -> None:
-    doubled = sorted({name for name in header if header.count(name) > 1})
-    if doubled:
-        raise LogError(f"{path}: column {doubled[0]} is there twice; keep one")
-    missing = [name for name in (TIME, *COMMAND) if name not in header]
-    for group in (SPEED, TICKS, POSE):
-        if any(name in header for name in group):
-            missing += [name for name in group if name not in header]
-    if missing:
-        raise LogError(
-            f"{path}: no column {', '.join(missing)}; the header must name t_s, {', '.join(COMMAND)} and pairs"
-        )
-    if not any(name in header for name in (*SPEED, *TICKS, *POSE)):
-        raise LogError(f"{path}: neither encoder nor pose columns; add {', '.join(SPEED)} or {', '.join(POSE)}")
-
-
-def _check_clock(path: Path, t_s: Array, lines: Sequence[int]) -> None:
-    if np.isnan(t_s).any():
-        raise LogError(f"{path}: line {lines[int(np.argmax(np.isnan(t_s)))]}: t_s is empty; every row needs its time")
-    backwards = np.flatnonzero(np.diff(t_s) <= 0.0)
-    if backwards.size:
-        at = int(backwards[0])
-        what = "stands still" if t_s[at + 1] == t_s[at] else "goes backwards"
-        raise LogError(
-            f"{path}: line {lines[at + 1]}: the clock {what} (t_s {t_s[at]:.9g}, then {t_s[at + 1]:.9g}); "
-            "sort the rows, one for each time"
-        )
-
-
-def _number(path: Path, line: int, name: str, text: str) -> float:
-    if not text.strip():
-        return math.nan
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise LogError(
-            f"{path}: line {line}: {name} is {text!r}, not a finite number; leave a cell without sample empty"
-        )
-    return value
-
-
-def _commands(sheet: _Sheet) -> Commands:
+def _commands(sheet: Sheet) -> Commands:
     t_s = sheet.t_s
-    values, given = _group(sheet, COMMAND)
+    values, given = sheet.group(COMMAND)
     kept = given.copy()
     rows = np.flatnonzero(given)
     before = np.concatenate([np.zeros(1, dtype=bool), given[:-1]])
@@ -273,44 +180,68 @@ def _commands(sheet: _Sheet) -> Commands:
     return Commands(t_s[kept], values[kept, 0], values[kept, 1], sheet.segment[kept])
 
 
-def _wheels(sheet: _Sheet, ticks_per_rev: float | None) -> Wheels:
-    speeds, has_speed = _group(sheet, SPEED)
-    ticks, has_ticks = _group(sheet, TICKS)
+def _wheels(sheet: Sheet, ticks_per_rev: float | None, notes: list[str]) -> tuple[Sheet, Wheels]:
+    """Wheel samples, and the sheet with new segments where an encoder was set anew."""
+    speeds, has_speed = sheet.group(SPEED)
+    ticks, has_ticks = sheet.group(TICKS)
     if not has_ticks.any():
         t_s, segment = sheet.t_s[has_speed], sheet.segment[has_speed]
         left, right = speeds[has_speed].T
         left_angle, right_angle = integrate_angle(t_s, left, segment), integrate_angle(t_s, right, segment)
-        return Wheels(t_s, left_angle, right_angle, left, right, segment, False, bool(t_s.size))
+        return sheet, Wheels(t_s, left_angle, right_angle, left, right, segment, False, bool(t_s.size))
     if ticks_per_rev is None:
         raise LogError(f"{sheet.name}: {TICKS[0]} needs the ticks of a revolution; give --robot ROBOT.toml")
-    both = bool(has_speed.any())
-    there = has_ticks & has_speed if both else has_ticks
-    t_s, segment = sheet.t_s[there], sheet.segment[there]
-    left_angle, right_angle = ticks[there].T * (2.0 * math.pi / ticks_per_rev)
-    _check_angle(sheet.name, t_s, left_angle, segment)
-    _check_angle(sheet.name, t_s, right_angle, segment)
-    if both:
-        left, right = speeds[there].T
-    else:
-        left, right = differentiate_angle(t_s, left_angle, segment), differentiate_angle(t_s, right_angle, segment)
-    return Wheels(t_s, left_angle, right_angle, left, right, segment, True, both)
+    t_s = sheet.t_s[has_ticks]
+    counts = _continuous(sheet, ticks[has_ticks], t_s, ticks_per_rev, notes)
+    angles = counts * (2.0 * math.pi / ticks_per_rev)
+    sheet = _with_new_segments(sheet, t_s, angles, sheet.segment[has_ticks], notes)
+    segment = sheet.segment[has_ticks]
+    derived = np.column_stack([differentiate_angle(t_s, column, segment) for column in angles.T])
+    there = has_speed[has_ticks]
+    # Where the speeds are rare they say less than the ticks do.
+    both = bool(2 * np.count_nonzero(there) > there.size)
+    left, right = np.where(there[:, np.newaxis] & both, speeds[has_ticks], derived).T
+    if has_speed.any() and not (both and there.all()):
+        count = int(np.count_nonzero(~there) if both else there.size)
+        notes.append(f"{sheet.name}: {SPEED[0]}: {count} of {there.size} speeds were taken from the ticks")
+    return sheet, Wheels(t_s, angles[:, 0], angles[:, 1], left, right, segment, True, both)
 
 
-def _check_angle(name: str, t_s: Array, angle_rad: Array, segment: Index) -> None:
-    jumps = (np.abs(np.diff(angle_rad)) > 2.0 * math.pi * _LARGEST_STEP_REV) & (np.diff(segment) == 0)
-    if jumps.any():
+def _continuous(sheet: Sheet, ticks: Array, t_s: Array, ticks_per_rev: float, notes: list[str]) -> Array:
+    """Ticks (N, 2) of which none wraps; each wheel is judged by itself, within each segment."""
+    columns, segment = [], sheet.segment[np.searchsorted(sheet.t_s, t_s)]
+    for name, column in zip(TICKS, ticks.T, strict=True):
+        values, wraps, spans = column.copy(), 0, set()
+        for part in np.unique(segment):
+            rows = np.flatnonzero(segment == part)
+            found = unwrap_counter(t_s[rows], column[rows], (ticks_per_rev,))
+            if found.fault:
+                raise LogError(f"{sheet.name}: {name}: {found.fault}")
+            values[rows], wraps = found.values, wraps + found.wraps
+            spans |= {found.span} if found.wraps else set()
+        if wraps:
+            said = " and ".join(f"{span:.10g}" for span in sorted(spans))
+            notes.append(f"{sheet.name}: {name} wraps at {said}: made continuous at {wraps} places")
+        columns.append(values)
+    return np.column_stack(columns)
+
+
+def _with_new_segments(sheet: Sheet, t_s: Array, angles: Array, segment: Index, notes: list[str]) -> Sheet:
+    """The sheet with a new segment wherever an encoder begins anew (angles (N, 2) at t_s (N,))."""
+    anew = set_anew(t_s, angles) & np.concatenate([[False], np.diff(segment) == 0])
+    count = int(np.count_nonzero(anew))
+    if not count:
+        return sheet
+    if count > _MOST_SET_ANEW_SHARE * t_s.size:
         raise LogError(
-            f"{name}: an encoder jumps by more than {_LARGEST_STEP_REV:.0f} revolutions at "
-            f"t_s {t_s[1:][jumps][0]:.9g}; ticks must be cumulative and must not wrap"
+            f"{sheet.name}: an encoder jumps {count} times, first at t_s {t_s[anew][0]:.9g}, further than a "
+            f"wheel turns; {TICKS[0]} and {TICKS[1]} must be cumulative, and ticks_per_rev the true one"
         )
-
-
-def _group(sheet: _Sheet, names: Sequence[str]) -> tuple[Array, Mask]:
-    """The columns of a group side by side, (N, k), and where all of them have a value, (N,)."""
-    empty = np.full(sheet.t_s.size, np.nan)
-    values = np.column_stack([sheet.cells.get(name, empty) for name in names])
-    there: Mask = np.isfinite(values).all(axis=1)
-    return values, there
+    notes.append(
+        f"{sheet.name}: an encoder was set anew {count} times, first at t_s {t_s[anew][0]:.9g}; "
+        "new segments begin there"
+    )
+    return replace(sheet, segment=sheet.segment + np.searchsorted(t_s[anew], sheet.t_s, side="right"))
 
 
 def _wrapped(yaw: Array) -> Array:
@@ -342,7 +273,7 @@ def write_csv(drive: DriveLog, path: Path, ticks_per_rev: int | None) -> int:
     groups: list[tuple[tuple[str, ...], Cells]] = [
         (COMMAND, _in_force(drive)),
         (SPEED, _at(wheels.t_s, (wheels.left_speed_rad_s, wheels.right_speed_rad_s), repr)),
-        (POSE, _at(poses.t_s, (poses.x_m, poses.y_m, poses.yaw_rad), repr)),
+        ((*POSITION, YAW), _at(poses.t_s, (poses.x_m, poses.y_m, poses.yaw_rad), repr)),
     ]
     if ticks_per_rev is not None and wheels.angle_measured:
         per_rad = ticks_per_rev / (2.0 * math.pi)

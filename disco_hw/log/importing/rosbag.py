@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from array import array
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from disco_hw.config import Robot, RobotConfig
 from disco_hw.errors import LogError
@@ -29,8 +30,11 @@ from disco_hw.log.drive import (
     rotations,
 )
 from disco_hw.log.importing import LogFormat
+from disco_hw.log.importing.counter_wrap import set_anew, unwrap_counter
 from disco_hw.log.importing.csv_drive import length_fault
-from disco_hw.log.importing.rosbag_file import Bag, BagMessage, Stamps, is_bag, open_bag, timeline
+from disco_hw.log.importing.losses import WARNING, loss_note
+from disco_hw.log.importing.rosbag_file import Bag, BagMessage, DamagedBagError, is_bag, open_bag
+from disco_hw.log.importing.rosbag_times import Stamps, timeline
 from disco_hw.log.importing.rosbag_topics import (
     ARRAY,
     COMMANDS,
@@ -46,13 +50,14 @@ from disco_hw.log.importing.rosbag_topics import (
     Choice,
     choose,
 )
+from drivers.pose.headings import is_heading_measured
 
 _LONGEST_SILENCE_NS = 500_000_000
 _LONGEST_COMMAND_NS = 500_000_000
 _LONGEST_PAUSE_NS = 2_000_000_000
-_LARGEST_STEP_RAD = 20.0 * math.pi
-_NO_WHEEL_RAD_S, _NO_WHEELS_STEP_RAD = 150.0, 1.0
 _MOST_MESSAGES = 20_000_000
+_YAW_VARIANCE = 35
+"""Place of the yaw's variance among the 36 of a pose's covariance."""
 
 
 @dataclass(slots=True)
@@ -76,7 +81,9 @@ class _Column:
 
     def stamps(self) -> Stamps:
         """The times of its rows."""
-        return Stamps(np.array(self.log_ns, dtype=np.int64), np.array(self.stamp_ns, dtype=np.int64))
+        table = self.table()
+        is_repeat = np.concatenate([[False], _alike(table[1:], table[:-1])]) if len(table) else np.empty(0, dtype=bool)
+        return Stamps(np.array(self.log_ns, dtype=np.int64), np.array(self.stamp_ns, dtype=np.int64), is_repeat)
 
     def table(self) -> Array:
         """Its rows, (N, width)."""
@@ -90,10 +97,22 @@ def read_rosbag(path: Path, config: RobotConfig) -> DriveLog:
     a second, where a clock was set, and where an encoder was. A command counts until the next one, half a second at
     most, as the controllers of ROS have it.
     """
-    with open_bag(path) as bag:
+    try:
+        return _read(path, config, salvage=False)
+    except DamagedBagError as error:
+        try:
+            return _read(path, config, salvage=True)
+        except DamagedBagError:
+            raise error from None
+
+
+def _read(path: Path, config: RobotConfig, *, salvage: bool) -> DriveLog:
+    with open_bag(path, salvage=salvage) as bag:
         choice = choose(bag, config.ros2)
         columns = _columns(bag, choice, config)
-    return _assembled(path, choice, columns, config.robot)
+        notes = bag.notes
+    drive = _assembled(path, choice, columns, config.robot)
+    return replace(drive, notes=(*notes, *drive.notes))
 
 
 def _columns(bag: Bag, choice: Choice, config: RobotConfig) -> dict[str, _Column]:
@@ -112,7 +131,7 @@ def _columns(bag: Bag, choice: Choice, config: RobotConfig) -> dict[str, _Column
     transforms = {one.name for one in bag.topics.values() if one.type in TRANSFORMS} if by_tf else set()
     for number, message in enumerate(bag.messages({*takes, *transforms})):
         if number >= _MOST_MESSAGES:
-            raise LogError(f"{bag.path}: over {_MOST_MESSAGES} messages of its topics; cut it with `ros2 bag convert`")
+            raise LogError(f"{bag.path}: over {_MOST_MESSAGES} messages of its topics; record its topics alone")
         for role, take in takes.get(message.topic, ()):
             columns[role].add(message.log_ns, stamp_of(message.value), _finite(take, message, bag.path))
         if message.topic in transforms:
@@ -142,23 +161,31 @@ def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: R
     notes = [choice.as_text()]
     for name, column in columns.items():
         used = choice.used(name)
-        if column.left_out:
-            label = f"{name}, {used.topic}" if used is not None else name
-            notes.append(f"{label}: {column.left_out} messages hold no finite value and were left out")
         if not column.log_ns and used is not None:
             raise LogError(f"{path}: {used.topic}: none of its messages holds {name}; name another with --topic")
+        if column.left_out:
+            label = f"{name}, {used.topic}" if used is not None else name
+            total = column.left_out + len(column.log_ns)
+            what = "messages hold no finite value and were left out"
+            notes.append(loss_note(str(path), label, column.left_out, total, what, "name another topic with --topic"))
     static = {name for name in columns if name.startswith("/tf_static")}
     times = timeline({name: one.stamps() for name, one in columns.items() if one.log_ns and name not in static})
     notes += times.notes
-    arrays = {name: _ordered(name, times.t_ns[name], columns[name].table(), notes) for name in times.t_ns}
-    pose_ns, pose = _pose_table(path, choice, columns, arrays, static)
+    arrays = {name: _ordered(path, name, times.t_ns[name], columns[name].table(), notes) for name in times.t_ns}
+    pose_ns, pose = _pose_table(path, choice, columns, arrays, static, notes)
     nothing: tuple[Index, Array] = (np.empty(0, dtype=np.int64), np.empty((0, 4)))
     command_ns, command = _expired(*arrays.get(COMMANDS, (nothing[0], np.empty((0, 2)))))
     wheel_ns, wheel = arrays.get(WHEELS, nothing)
     wheel_ns, wheel, measured = _measured_columns(path, wheel_ns, wheel, notes)
     began_ns = min(int(t_ns[0]) for t_ns in (command_ns, wheel_ns, pose_ns) if t_ns.size)
     breaks_ns = np.unique(
-        np.concatenate([times.breaks_ns, _pauses(wheel_ns, (command_ns, pose_ns)), _steps(wheel_ns, wheel)])
+        np.concatenate(
+            [
+                times.breaks_ns,
+                _pauses(wheel_ns, (command_ns, pose_ns)),
+                wheel_ns[set_anew((wheel_ns - began_ns).astype(np.float64) * 1e-9, wheel[:, :2])],
+            ]
+        )
     )
     if breaks_ns.size:
         notes.append(
@@ -208,12 +235,19 @@ def _of_the_choice(choice: Choice) -> list[str]:
     return notes
 
 
-def _ordered(name: str, t_ns: Index, table: Array, notes: list[str]) -> tuple[Index, Array]:
-    """In order of time, the first of several with one time."""
-    unique, first = np.unique(t_ns, return_index=True)
-    if unique.size < t_ns.size:
-        notes.append(f"{name}: {t_ns.size - unique.size} messages have the time of another and were left out")
+def _ordered(path: Path, name: str, t_ns: Index, table: Array, notes: list[str]) -> tuple[Index, Array]:
+    """Sort messages by time, and keep the first of several with one time; one that is sent again is no loss."""
+    unique, first, place = np.unique(t_ns, return_index=True, return_inverse=True)
+    lost = int(np.count_nonzero(~_alike(table, table[first][place])))
+    if lost:
+        what = "messages have the time of another and were left out"
+        notes.append(loss_note(str(path), name, lost, t_ns.size, what, "record it again, or name another topic"))
     return unique, table[first]
+
+
+def _alike(one: Array, other: Array) -> NDArray[np.bool_]:
+    """Whether the rows of two tables (N, k) hold the same values."""
+    return np.asarray(((one == other) | (np.isnan(one) & np.isnan(other))).all(axis=1))
 
 
 def _pose_table(
@@ -222,12 +256,20 @@ def _pose_table(
     columns: dict[str, _Column],
     arrays: dict[str, tuple[Index, Array]],
     static: set[str],
+    notes: list[str],
 ) -> tuple[Index, Array]:
+    """Times (N,), ns, and x, y, yaw (N, 3) of the poses; yaw is NaN where nobody measured it."""
     used = choice.used(POSES)
     if used is None:
         return np.empty(0, dtype=np.int64), np.empty((0, 3))
     if used.topic != TF:
         t_ns, values = arrays[POSES]
+        bare = int(np.count_nonzero(np.isnan(values[:, 6])))
+        if bare:
+            notes.append(
+                f"{WARNING}{used.topic}: the covariance of {bare} of {t_ns.size} poses says that nobody measured the "
+                f"heading ({100.0 * bare / t_ns.size:.0f} %); their positions are kept, their headings are not"
+            )
         rotation = rotations(values[:, 3:])
         return t_ns, np.column_stack([values[:, :2], np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])])
     motions = []
@@ -271,24 +313,30 @@ def _measured_columns(
             "set ros2.left_joints and ros2.right_joints"
         )
     if not kept.all():
-        notes.append(f"wheels: {np.count_nonzero(~kept)} messages lack a position or velocity and were left out")
+        lost, what = int(np.count_nonzero(~kept)), "messages lack a position or velocity and were left out"
+        notes.append(loss_note(str(path), WHEELS, lost, kept.size, what, "set ros2.left_joints and ros2.right_joints"))
     wheel = wheel[kept]
     if has_angle and has_speed and (wheel[:, 2:] == 0.0).all() and np.ptp(wheel[:, 0]) > 1.0:
         notes.append("wheels: the velocities are all zero while the wheels turn; they were taken from the positions")
         has_speed = False
-    return t_ns[kept], _unwrapped(wheel, has_angle, notes), (has_angle, has_speed)
+    return t_ns[kept], _unwrapped(path, t_ns[kept], wheel, has_angle, notes), (has_angle, has_speed)
 
 
-def _unwrapped(wheel: Array, has_angle: bool, notes: list[str]) -> Array:
-    """Angles that a driver gives within one turn, made continuous."""
-    angles = wheel[:, :2]
-    if not has_angle or not angles.size:
+def _unwrapped(path: Path, t_ns: Index, wheel: Array, has_angle: bool, notes: list[str]) -> Array:
+    """Angles that wrap, at a turn or where the counter behind them overflows, made continuous; each wheel by itself."""
+    if not has_angle or not wheel.size:
         return wheel
-    within = np.ptp(angles, axis=0).max() <= 2.0 * math.pi + 1e-6
-    if within and (np.abs(np.diff(angles, axis=0)) > math.pi).any():
-        notes.append("wheels: the positions stay within one turn; they were made continuous")
-        return np.column_stack([np.unwrap(angles, axis=0), wheel[:, 2:]])
-    return wheel
+    columns = []
+    for side, column in zip(("left", "right"), wheel[:, :2].T, strict=True):
+        found = unwrap_counter((t_ns - t_ns[0]) * 1e-9, column, (2.0 * math.pi,), unit="rad")
+        if found.fault:
+            raise LogError(f"{path}: {side} wheel: {found.fault}")
+        if found.wraps:
+            notes.append(
+                f"{side} wheel: the position wraps at {found.span:.10g} rad: made continuous at {found.wraps} places"
+            )
+        columns.append(found.values)
+    return np.column_stack([*columns, wheel[:, 2:]])
 
 
 def _pauses(wheel_ns: Index, others: Sequence[Index]) -> Index:
@@ -297,16 +345,6 @@ def _pauses(wheel_ns: Index, others: Sequence[Index]) -> Index:
         return wheel_ns[1:][np.diff(wheel_ns) > _LONGEST_SILENCE_NS]
     all_ns = np.sort(np.concatenate(others))
     return np.asarray(all_ns[1:][np.diff(all_ns) > _LONGEST_PAUSE_NS])
-
-
-def _steps(wheel_ns: Index, wheel: Array) -> Index:
-    """Where an encoder was set: a step of more than ten turns, or one that no wheel turns in that time."""
-    steps = np.abs(np.diff(wheel[:, :2], axis=0)).max(axis=1, initial=0.0)
-    rate_rad_s = steps / np.maximum(np.diff(wheel_ns) * 1e-9, 1e-3)
-    usual_rad_s = float(np.quantile(rate_rad_s, 0.99)) if rate_rad_s.size else 0.0
-    # Messages that come in bursts seem fast as well, but take small steps.
-    set_anew = (steps > _NO_WHEELS_STEP_RAD) & (rate_rad_s > max(_NO_WHEEL_RAD_S, 5.0 * usual_rad_s))
-    return np.asarray(wheel_ns[1:][(steps > _LARGEST_STEP_RAD) | set_anew])
 
 
 def _wheels(t_s: Array, segment: Index, wheel: Array, measured: tuple[bool, bool]) -> Wheels:
@@ -423,11 +461,22 @@ def _odometry_wheels(robot: Robot) -> Take:
 
 
 def _odometry_pose(message: Any) -> Row | None:
-    return _space(message.pose.pose)
+    return _with_measured_heading(message.pose.pose, message.pose.covariance)
 
 
 def _measured_pose(message: Any) -> Row | None:
-    return _space(getattr(message.pose, "pose", message.pose))
+    if hasattr(message.pose, "covariance"):
+        return _with_measured_heading(message.pose.pose, message.pose.covariance)
+    return _space(message.pose)
+
+
+def _with_measured_heading(pose: Any, covariance: Any) -> Row | None:
+    """Position and quaternion (7,); the quaternion is NaN where the message says that nobody measured the heading."""
+    row = _space(pose)
+    if row is None:
+        return None
+    yaw_rad = math.atan2(2.0 * (row[6] * row[5] + row[3] * row[4]), 1.0 - 2.0 * (row[4] ** 2 + row[5] ** 2))
+    return row if is_heading_measured(yaw_rad, float(covariance[_YAW_VARIANCE])) else (*row[:3], *[math.nan] * 4)
 
 
 def _space(pose: Any) -> Row | None:

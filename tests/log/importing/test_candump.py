@@ -80,17 +80,19 @@ def test_frames_that_fail_their_check_are_left_out_and_counted(tmp_path):
 
     drive = read_candump(dumped(tmp_path / "dump.log", spoil), ROBOT)
     assert drive.wheels.t_s.size < COUNT - 1
-    assert "frames failed their check" in drive.notes[0]
+    assert "frames of can0: 4 of 900 failed their check" in drive.notes[0]
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("(1.0) can0 7FF#00\n", "1 frames, none of them a command"),
-        ("(2.0) can0 7FF#00\n(1.0) can0 7FF#00\n", "frame 2: the clock goes backwards"),
         ("(x) can0 7FF#00\n", "not a candump"),
         ("(inf) can0 7FF#00\n", "not a candump"),
-        ("(1.0) can0 7FF#00\n(1.1) can0 7FF#00\n(1.", "after 2 frames comes a line that is no frame .*; take it out"),
+        ("(1.0) can0 7FF#00\n(1.1) can0 7FF#00\n(1.", "2 frames, none of them a command"),
+        ("(1.0) can0 7FF#00\nx\ny\n", r"lines: 2 of 3 are no frame .*the first is line 2 \(67 %\); mend them"),
+        ("can0  110   [8]  00 01 02 03 04 05 06 07\n", "screen format without time stamps; record with `candump -L`"),
+        ("\n\n", "no frame in it"),
     ],
 )
 def test_what_is_no_such_dump_is_refused(tmp_path, text, message):

@@ -2,35 +2,45 @@
 
 import os
 import random
+import re
 import struct
 import subprocess
 import sys
 
 import msgspec
+import numpy as np
 import pytest
 
 pytest.importorskip("rosbags", reason="pip install 'disco-hw[ros2]'")
 
+from mcap.reader import make_reader
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from disco_hw.config import Ros2
 from disco_hw.errors import InputError, LogError
-from disco_hw.log.importing import format_of
+from disco_hw.log.importing import format_of, import_log
 from disco_hw.log.importing.rosbag import read_rosbag
 from disco_hw.log.load import load_drive
 from tests.inference.drives import robot_config
 from tests.inference.test_infer_command import ROBOT
-from tests.log.importing.bags import BEGAN_NS, LEFT, RIGHT, bag, recorded
+from tests.log.importing.bags import BEGAN_NS, LEFT, RIGHT, Maker, bag, recorded
 from tests.tables import thinned
 
 
-def small(path, storage="mcap"):
+def small(path, storage="mcap", count=50):
     with bag(path, storage) as maker:
-        for k in range(50):
-            t_ns = BEGAN_NS + k * 20_000_000
-            maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [0.1 * k] * 4, [5.0] * 4), t_ns)
+        fill(maker, count)
     return path
+
+
+def fill(maker, count):
+    """Write wheel samples at 5 rad/s."""
+    for k in range(count):
+        t_ns = BEGAN_NS + k * 20_000_000
+        maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [0.1 * k] * 4, [5.0] * 4), t_ns)
 
 
 def file_of(folder):
@@ -60,16 +70,95 @@ def test_what_infer_is_given_as_a_bag_is_to_be_imported_first(tmp_path):
         load_drive(file_of(small(tmp_path / "b")))
 
 
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3", "ros1"])
-@thinned("share", [0.01, 0.3, 0.7, 0.99], quick=2)
-def test_a_truncated_bag_is_one_line(tmp_path, storage, share):
-    path = tmp_path / "b.bag"
-    recorded(path, storage)
-    path = path if storage == "ros1" else file_of(path)
-    os.truncate(path, int(share * path.stat().st_size))
-    with pytest.raises(LogError, match=r"b(\.\w+)+: .*cannot be read .*; mend it with") as error:
+@pytest.fixture(scope="module")
+def whole_bags(tmp_path_factory):
+    """The content of one drive's bag by storage, and its number of wheel samples."""
+    folder, contents = tmp_path_factory.mktemp("bags"), {}
+    for storage in ("mcap", "sqlite3", "ros1"):
+        path = folder / f"{storage}.bag"
+        truth = recorded(path, storage)
+        contents[storage] = (path if storage == "ros1" else file_of(path)).read_bytes()
+    return contents, truth.wheels.t_s.size
+
+
+ENDINGS = {"mcap": "mcap", "sqlite3": "db3", "ros1": "bag"}
+
+
+@pytest.mark.parametrize("storage", ENDINGS)
+@thinned("share", [0.55, 0.7, 0.9, 0.99], quick=2)
+def test_a_truncated_bag_is_read_as_far_as_it_is_whole(tmp_path, whole_bags, storage, share):
+    contents, samples = whole_bags
+    path = tmp_path / f"b.{ENDINGS[storage]}"
+    path.write_bytes(contents[storage][: int(share * len(contents[storage]))])
+    drive = read_rosbag(path, robot_config())
+    assert 0.3 * share * samples < drive.wheels.t_s.size <= samples
+    assert (np.diff(drive.wheels.t_s) < 0.5).all()
+    warned = [note for note in drive.notes if note.startswith("warning: ")]
+    assert re.search(r"damaged, or its recording did not end regularly: \d+ messages could be read", warned[0])
+
+
+@pytest.mark.parametrize("storage", ENDINGS)
+@pytest.mark.parametrize("size", [20, 100])
+def test_a_bag_that_was_cut_before_its_first_message_is_one_line(tmp_path, whole_bags, storage, size):
+    path = tmp_path / f"b.{ENDINGS[storage]}"
+    path.write_bytes(whole_bags[0][storage][:size])
+    with pytest.raises(LogError, match=r"b\.\w+: the bag cannot be read .*; record it again, or convert") as error:
         read_rosbag(path, robot_config())
     assert one_line(error)
+
+
+def test_wherever_an_mcap_is_cut_it_is_a_drive_with_a_warning_or_one_line(tmp_path, whole_bags):
+    content, rng, path = whole_bags[0]["mcap"], random.Random(7), tmp_path / "b.mcap"
+    for _ in range(10):
+        path.write_bytes(content[: rng.randrange(len(content))])
+        try:
+            said = read_rosbag(path, robot_config()).notes[0]
+            assert said.startswith("warning: ")
+        except LogError as error:
+            said = str(error)
+        assert "\n" not in said
+        assert str(path) in said
+
+
+@pytest.mark.parametrize("make", ["mcap", "bz2", "lz4"])
+def test_a_damaged_chunk_costs_its_messages_only(tmp_path, make):
+    path, chunks = in_chunks(tmp_path, make)
+    assert len(chunks) > 5
+    spoilt = bytearray(path.read_bytes())
+    for at in range(chunks[3] + 20, chunks[3] + 80):
+        spoilt[at] ^= 0x55
+    path.write_bytes(spoilt)
+    drive = read_rosbag(path, robot_config())
+    assert 200 < drive.wheels.t_s.size < 400
+    assert drive.wheels.left_angle_rad[-1] == pytest.approx(0.1 * 399)
+    assert "1 damaged chunks were left out" in drive.notes[0]
+
+
+def in_chunks(folder, make):
+    """A bag of 400 wheel samples in small packed chunks, and where the bytes of each chunk begin."""
+    if make == "mcap":
+        small(folder / "b", count=400)
+        path = folder / "chunks.mcap"
+        with file_of(folder / "b").open("rb") as source, path.open("wb") as sink:
+            writer = McapWriter(sink, chunk_size=10_000)
+            writer.start(profile="ros2")
+            topic = None
+            for schema, channel, message in make_reader(source).iter_messages():
+                if topic is None:
+                    number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    topic = writer.register_channel(channel.topic, channel.message_encoding, number)
+                writer.add_message(topic, message.log_time, message.data, message.publish_time)
+            writer.finish()
+        with path.open("rb") as source:
+            found = make_reader(source).get_summary().chunk_indexes
+        return path, [one.chunk_start_offset + one.chunk_length - one.compressed_size for one in found]
+    path = folder / "chunks.bag"
+    writer = Writer1(path)
+    writer.set_compression(Writer1.CompressionFormat[make.upper()])
+    vars(writer).update(chunk_threshold=10_000)
+    with writer:
+        fill(Maker(writer, get_typestore(Stores.ROS1_NOETIC), True), 400)
+    return path, [one.end() for one in re.finditer(b"size=....(?=....(BZh|\x04\x22M))", path.read_bytes(), re.DOTALL)]
 
 
 @thinned("storage", ["mcap", "sqlite3", "ros1"], quick=1)
@@ -92,7 +181,7 @@ def test_a_mutated_bag_is_a_drive_or_one_line(tmp_path, storage):
 
 
 @pytest.mark.parametrize("size", [2**31, 2**40, 2**62, 2**64 - 1])
-def test_a_record_that_claims_any_size_is_one_line(tmp_path, size):
+def test_a_chunk_that_claims_any_size_is_read_as_one_that_was_cut(tmp_path, size):
     path = file_of(small(tmp_path / "b"))
     spoilt = bytearray(path.read_bytes())
     # The first record after the header: its opcode, then its length.
@@ -100,6 +189,17 @@ def test_a_record_that_claims_any_size_is_one_line(tmp_path, size):
     struct.pack_into("<Q", spoilt, 17 + header + 1, size)
     # Without the index at the end the file is read through.
     struct.pack_into("<Q", spoilt, len(spoilt) - 28, 0)
+    path.write_bytes(spoilt)
+    drive = read_rosbag(path, robot_config())
+    assert drive.wheels.t_s.size == 50
+    assert drive.notes[0].startswith("warning: ")
+
+
+@pytest.mark.parametrize("size", [2**31, 2**40, 2**62, 2**64 - 1])
+def test_a_first_record_that_claims_any_size_is_one_line(tmp_path, size):
+    path = file_of(small(tmp_path / "b"))
+    spoilt = bytearray(path.read_bytes())
+    struct.pack_into("<Q", spoilt, 9, size)
     path.write_bytes(spoilt)
     with pytest.raises(LogError) as error:
         read_rosbag(path, robot_config())
@@ -175,8 +275,6 @@ def custom(path, storage, definition="float32[2] drivers"):
         connection = writer.add_connection("/cmd_drive", "my_msgs/msg/Drive", typestore=store)
         message = store.types["my_msgs/msg/Drive"]
         for k in range(20):
-            import numpy as np
-
             value = message(np.array([2.0, 5.0], dtype=np.float32))
             writer.write(connection, BEGAN_NS + k * 20_000_000, store.serialize_cdr(value, "my_msgs/msg/Drive"))
     return path
@@ -199,11 +297,50 @@ def test_a_type_that_nobody_knows_is_named(tmp_path):
         read_rosbag(folder, msgspec.structs.replace(robot_config(), ros2=Ros2(command_topic="/cmd_drive")))
 
 
-def test_a_folder_without_its_metadata_names_the_file_to_give(tmp_path):
+@pytest.mark.parametrize(
+    "metadata",
+    [None, "rosbag2_bagfile_information:\n  version: 5\n", "rosbag2_bagfile_information: [", "", "\0\0"],
+    ids=["none", "no files", "not YAML", "empty", "zeros"],
+)
+def test_a_folder_whose_metadata_is_missing_or_wrong_is_read_by_its_files(tmp_path, metadata):
     folder = small(tmp_path / "b")
     (folder / "metadata.yaml").unlink()
-    with pytest.raises(LogError, match=r"a folder without metadata.yaml.*; give .*b\.mcap"):
-        read_rosbag(folder, robot_config())
+    if metadata is not None:
+        (folder / "metadata.yaml").write_text(metadata)
+    drive = read_rosbag(folder, robot_config())
+    assert drive.wheels.t_s.size == 50
+    assert "b: read by its files (b.mcap), as " in drive.notes[0]
+    robot = tmp_path / "robot.toml"
+    robot.write_text(ROBOT)
+    assert import_log(folder, robot, tmp_path / "log.mcap").duration_s == pytest.approx(0.98, abs=0.01)
+
+
+def test_an_empty_storage_identifier_is_read_by_the_files(tmp_path):
+    folder = small(tmp_path / "b")
+    metadata = folder / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("storage_identifier: mcap", "storage_identifier: ''"))
+    drive = read_rosbag(folder, robot_config())
+    assert drive.wheels.t_s.size == 50
+    assert "read by its files" in drive.notes[0]
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_the_files_of_a_bag_that_was_split_are_read_in_order_of_time(tmp_path, storage):
+    folder = tmp_path / "log"
+    folder.mkdir()
+    for number in (8, 9, 10):
+        part = tmp_path / f"part{number}"
+        with bag(part, storage) as maker:
+            for k in range(50 * (number - 8), 50 * (number - 7)):
+                t_ns = BEGAN_NS + k * 20_000_000
+                maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [0.1 * k] * 4, [5.0] * 4), t_ns)
+        file_of(part).rename(folder / f"log_{number}.{ENDINGS[storage]}")
+    drive = read_rosbag(folder, robot_config())
+    names = ", ".join(f"log_{number}.{ENDINGS[storage]}" for number in (8, 9, 10))
+    assert f"read by its files ({names}), as it has no metadata.yaml" in drive.notes[0]
+    np.testing.assert_allclose(drive.wheels.left_angle_rad, 0.1 * np.arange(150))
+    np.testing.assert_allclose(np.diff(drive.wheels.t_s), 0.02, atol=1e-9)
+    assert drive.segments == 1
 
 
 def test_a_pipe_in_a_bags_folder_holds_nobody_up(tmp_path):

@@ -1,0 +1,262 @@
+"""CSV files with faults of the kinds that are met in the field: read as far as they are whole, each loss counted."""
+
+import math
+
+import numpy as np
+import pytest
+
+from disco_hw.errors import LogError
+from disco_hw.log.importing.csv_drive import read_csv
+
+COLUMNS = (
+    "t_s", "cmd_left_rad_s", "cmd_right_rad_s", "enc_left_rad_s", "enc_right_rad_s", "pose_x_m", "pose_y_m",
+    "pose_yaw_rad",
+)  # fmt: skip
+ROWS = 100
+
+
+def table(count=ROWS, columns=COLUMNS):
+    """Cells of a drive at 2 and 3 rad/s: one dict of texts for each 0.05 s."""
+    rows = []
+    for k in range(count):
+        t_s = 0.05 * k
+        yaw = 0.06 / 0.31 * t_s
+        values = (
+            t_s,
+            2.0,
+            3.0,
+            2.0,
+            3.0,
+            0.775 * math.sin(yaw),
+            0.775 * (1.0 - math.cos(yaw)),
+            math.remainder(yaw, math.tau),
+        )
+        rows.append(dict(zip(COLUMNS, (f"{value:.6f}" for value in values), strict=True)))
+    return [{name: row.get(name, "") for name in columns} for row in rows]
+
+
+def as_text(rows, end="\n"):
+    return end.join([",".join(rows[0]), *(",".join(row.values()) for row in rows)]) + end
+
+
+def read(tmp_path, content, **settings):
+    path = tmp_path / "log.csv"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return read_csv(path, **settings)
+
+
+def refusal(tmp_path, content, **settings):
+    with pytest.raises(LogError) as error:
+        read(tmp_path, content, **settings)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def only_note(drive):
+    (note,) = drive.notes
+    return note
+
+
+def sizes(drive):
+    return drive.commands.t_s.size, drive.wheels.t_s.size, drive.poses.t_s.size
+
+
+@pytest.mark.parametrize("word", ["nan", "NaN", "NAN", " nan ", "N/A", "null", "None", "-", ""])
+def test_a_word_for_no_sample_is_an_empty_cell(tmp_path, word):
+    rows = table()
+    for row in rows[::2]:
+        row["enc_left_rad_s"] = row["pose_yaw_rad"] = word
+    drive = read(tmp_path, as_text(rows))
+    assert sizes(drive) == (100, 50, 100)
+    assert np.isnan(drive.poses.yaw_rad[::2]).all()
+    assert drive.notes == ()
+
+
+@pytest.mark.parametrize("text", ["inf", "1e400", "x", "1;5", "0x10", "12:30"])
+@pytest.mark.parametrize(
+    ("column", "signal", "expected"),
+    [
+        ("enc_right_rad_s", "wheel speeds", (100, 97, 100)),
+        ("pose_x_m", "positions", (100, 100, 97)),
+        ("cmd_left_rad_s", "commands", (97, 100, 100)),
+    ],
+)
+def test_a_cell_that_is_no_number_costs_its_sample_and_no_other(tmp_path, text, column, signal, expected):
+    rows = table()
+    for k in (20, 40, 60):
+        rows[k][column] = text
+    drive = read(tmp_path, as_text(rows))
+    assert sizes(drive) == expected
+    assert f"{signal}: 3 of 100 have a cell that is no number" in only_note(drive)
+    assert f"the first in line 22: {column} is '{text}' (3.0 %)" in only_note(drive)
+    assert not only_note(drive).startswith("warning: ")
+
+
+def test_over_5_percent_of_a_signal_is_a_warning_and_over_half_an_error(tmp_path):
+    def spoilt(count):
+        rows = table()
+        for row in rows[:count]:
+            row["pose_y_m"] = "lost"
+        return as_text(rows)
+
+    assert not only_note(read(tmp_path, spoilt(5))).startswith("warning: ")
+    assert only_note(read(tmp_path, spoilt(6))).startswith("warning: ")
+    assert only_note(read(tmp_path, spoilt(50))).startswith("warning: ")
+    assert "positions: 51 of 100 have a cell that is no number" in refusal(tmp_path, spoilt(51))
+
+
+def test_rows_of_another_width_are_left_out(tmp_path):
+    lines = as_text(table()).splitlines()
+    lines[10] += ",7"
+    lines[20] = "1.0,2.0"
+    drive = read(tmp_path, "\n".join(lines) + "\n")
+    assert sizes(drive) == (98, 98, 98)
+    assert "2 of 100 have not the 8 cells of the header and were left out, the first in line 11" in only_note(drive)
+
+
+def test_a_row_without_a_time_is_left_out(tmp_path):
+    rows = table()
+    rows[30]["t_s"], rows[31]["t_s"] = "", "x"
+    drive = read(tmp_path, as_text(rows))
+    assert drive.wheels.t_s.size == 98
+    assert "rows: 2 of 100 have no t_s" in only_note(drive)
+
+
+@pytest.mark.parametrize("left", [1, 10, 30])
+def test_a_last_line_that_is_cut_is_left_out(tmp_path, left):
+    content = as_text(table())
+    begin = content.rstrip("\n").rfind("\n") + 1
+    drive = read(tmp_path, content[: begin + left])
+    assert sizes(drive) == (99, 99, 99)
+    assert "the last line is cut off and was left out" in only_note(drive)
+
+
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize("cut", [False, True])
+def test_line_ends_of_windows_and_a_byte_order_mark_make_no_difference(tmp_path, mark, end, cut):
+    content = mark + as_text(table(), end).encode()
+    drive = read(tmp_path, content[:-20] if cut else content)
+    assert sizes(drive) == ((99, 99, 99) if cut else (100, 100, 100))
+    assert len(drive.notes) == cut
+
+
+def test_rows_in_slight_disorder_are_sorted(tmp_path):
+    rows = table()
+    rows[40], rows[45] = rows[45], rows[40]
+    drive, straight = read(tmp_path, as_text(rows)), read(tmp_path, as_text(table()))
+    np.testing.assert_array_equal(drive.wheels.t_s, straight.wheels.t_s)
+    np.testing.assert_array_equal(drive.poses.x_m, straight.poses.x_m)
+    assert "rows came after a later one and were sorted by t_s" in only_note(drive)
+
+
+def test_a_clock_that_goes_back_by_seconds_is_refused(tmp_path):
+    rows = table()
+    for row in rows[60:]:
+        row["t_s"] = f"{float(row['t_s']) - 2.0:.6f}"
+    assert "line 62: the clock goes backwards (t_s 2.95, then 1)" in refusal(tmp_path, as_text(rows))
+
+
+def split(rows, *parts):
+    """Each row as several rows of one time, each with some of the columns."""
+    return [
+        {name: cell if name in ("t_s", *part) else "" for name, cell in row.items()} for row in rows for part in parts
+    ]
+
+
+MERGES = {
+    "wheels and poses": (COLUMNS[1:5], COLUMNS[5:]),
+    "each signal": (COLUMNS[1:3], COLUMNS[3:5], COLUMNS[5:]),
+    "each column": tuple((name,) for name in COLUMNS[1:]),
+    "the other order": (COLUMNS[5:], COLUMNS[1:5]),
+}
+
+
+@pytest.mark.parametrize("parts", MERGES.values(), ids=MERGES)
+def test_rows_of_one_time_with_other_columns_are_one_row(tmp_path, parts):
+    drive, whole = read(tmp_path, as_text(split(table(), *parts))), read(tmp_path, as_text(table()))
+    for part, name in (
+        ("commands", "left_rad_s"),
+        ("wheels", "left_angle_rad"),
+        ("poses", "yaw_rad"),
+        ("poses", "t_s"),
+    ):
+        np.testing.assert_array_equal(getattr(getattr(drive, part), name), getattr(getattr(whole, part), name))
+    assert f"{(len(parts) - 1) * ROWS} rows have the time of another and were joined with it" in only_note(drive)
+
+
+def test_a_row_that_is_there_twice_costs_nothing(tmp_path):
+    rows = table()
+    drive = read(tmp_path, as_text([row for row in rows for _ in range(2)]))
+    assert sizes(drive) == (100, 100, 100)
+    assert "100 rows have the time of another" in only_note(drive)
+
+
+def test_rows_of_one_time_that_contradict_each_other_are_counted_by_signal(tmp_path):
+    def contradicting(count):
+        rows = table()
+        return as_text([*rows[:50], *(row | {"t_s": rows[49]["t_s"]} for row in rows[50 : 50 + count]), *rows[90:]])
+
+    drive = read(tmp_path, contradicting(10))
+    assert sizes(drive) == (60, 60, 60)
+    # The speeds are the same in all rows: nothing of these is lost.
+    assert drive.notes[0].startswith("warning: ")
+    assert "positions: 10 of 70 samples have the time of another sample and were left out (14 %)" in drive.notes[0]
+    assert not any("wheel speeds" in note for note in drive.notes)
+    standing = [row | {"t_s": f"{0.05 * (k // 4):.2f}"} for k, row in enumerate(table())]
+    assert "the clock stands still" in refusal(tmp_path, as_text(standing))
+
+
+def test_positions_without_a_yaw_column_are_read(tmp_path):
+    drive = read(tmp_path, as_text(table(columns=COLUMNS[:-1])))
+    assert drive.poses.x_m.size == 100
+    assert np.isnan(drive.poses.yaw_rad).all()
+
+
+TICKS = (*COLUMNS[:3], "enc_left_ticks", "enc_right_ticks", *COLUMNS[5:])
+TICKS_PER_REV = 2048
+
+
+def with_ticks(left=lambda ticks: ticks, right=lambda ticks: ticks, count=400, columns=TICKS):
+    """The drive with counts of an encoder of 2048 ticks, as `left` and `right` change them."""
+    rows = table(count, columns)
+    for k, row in enumerate(rows):
+        row["enc_left_ticks"] = str(left(round(2.0 * 0.05 * k * TICKS_PER_REV / (2.0 * math.pi))))
+        row["enc_right_ticks"] = str(right(round(3.0 * 0.05 * k * TICKS_PER_REV / (2.0 * math.pi))))
+    return rows
+
+
+def read_ticks(tmp_path, rows):
+    return read(tmp_path, as_text(rows), ticks_per_rev=TICKS_PER_REV)
+
+
+@pytest.mark.parametrize("span", [256, 1024, 2048, 3000, 4096])
+@pytest.mark.parametrize("both", [True, False])
+def test_ticks_that_wrap_are_made_continuous_wheel_by_wheel(tmp_path, span, both):
+    whole = read_ticks(tmp_path, with_ticks())
+    wrapped = with_ticks(lambda ticks: ticks % span, (lambda ticks: ticks % span) if both else (lambda ticks: ticks))
+    drive = read_ticks(tmp_path, wrapped)
+    np.testing.assert_allclose(drive.wheels.left_angle_rad, whole.wheels.left_angle_rad, atol=1e-9)
+    np.testing.assert_allclose(drive.wheels.right_angle_rad, whole.wheels.right_angle_rad, atol=1e-9)
+    assert drive.segments == 1
+    assert len(drive.notes) == 1 + both
+    assert f"enc_left_ticks wraps at {span}: made continuous at" in drive.notes[0]
+
+
+def test_an_encoder_that_is_set_anew_begins_a_new_segment(tmp_path):
+    drive = read_ticks(tmp_path, with_ticks(lambda ticks: ticks if ticks < 5000 else ticks - 5000))
+    assert drive.segments == 2
+    assert "an encoder was set anew 1 times, first at t_s 7.7; new segments begin there" in only_note(drive)
+    assert np.abs(drive.wheels.left_speed_rad_s).max() < 2.1
+    assert drive.poses.segment[-1] == drive.commands.segment[-1] == 1
+
+
+def test_speeds_that_are_rare_beside_ticks_do_not_thin_them_out(tmp_path):
+    rows = with_ticks(columns=(*TICKS, "enc_left_rad_s", "enc_right_rad_s"))
+    for row in rows[1::2] + rows[::4]:
+        row["enc_left_rad_s"] = row["enc_right_rad_s"] = ""
+    drive = read_ticks(tmp_path, rows)
+    assert drive.wheels.t_s.size == 400
+    assert drive.wheels.angle_measured
+    assert not drive.wheels.speed_measured
+    assert "400 of 400 speeds were taken from the ticks" in only_note(drive)
