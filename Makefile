@@ -10,7 +10,7 @@ SOURCES := pyproject.toml setup.py constraints.txt firmware_protocol/build_firmw
 # the libraries anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: venv demo chromium test test-long bench gap-study soak fault-campaign fuzz firmware-check firmware-mutants firmware-emulated cross-tools socketcan-test test-arm ros dist-check docs clean
+.PHONY: venv demo chromium test test-all test-rest test-long test-clones bench gap-study soak fault-campaign fuzz firmware-check firmware-mutants firmware-emulated cross-tools socketcan-test test-arm ros dist-check docs clean
 
 venv: $(STAMP)
 
@@ -37,18 +37,27 @@ ifeq ($(CHROMIUM),install)
 		echo "Chromium could not be installed (Debian, root and its mirrors are needed); the page's tests are skipped"
 endif
 
-# One thread of linear algebra a process: pools of them on two cores only wait for one another. The types are checked
-# beside the compiler and the tests, in what these leave of the processors. The tests are collected once before, so that
-# their modules are rewritten and compiled by one process, not by each of the three.
+# `make test` tries every rule once. `make test-rest` has the other tests: more cases of these rules (`thorough`), and
+# closed loops, studies, clusters and browsers (`long`). Both together are `make test-all`.
+BEGAN := $(shell date +%s)
+REST ?= long or thorough
+TOOK = echo "make $@ took $$(($$(date +%s) - $(BEGAN))) s, set-up included."
+# One thread of linear algebra a process: pools of them on two cores only wait for one another.
+PYTEST := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest --dist loadscope --no-loadscope-reorder
+
+# The types are checked beside the compiler and the tests, in what these leave of the processors. The tests are collected
+# once before, so that their modules are rewritten and compiled by one process, not by each of the three.
 test: $(STAMP) chromium
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/vulture
 	nice $(BIN)/mypy & types=$$!; \
-		$(BIN)/python -m pytest -n 0 --collect-only > /dev/null 2>&1 & \
+		$(BIN)/python -m pytest -n 0 --collect-only -m "long or thorough" > $(VENV)/.rest 2>&1 & \
 		$(BIN)/python -m tools.compile_kernels && \
-		OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadscope --no-loadscope-reorder -m "not long$(if $(CHROMIUM), or browser)"; \
+		$(PYTEST) -n 3 -m "not long and not thorough$(if $(CHROMIUM), or browser)"; \
 		tests=$$?; wait $$types && exit $$tests
+	@$(TOOK) "make test-all also runs $$(tail -n 1 $(VENV)/.rest | grep -o '^[0-9]*') tests:" \
+		"more cases of the same rules, closed loops, studies, clusters and the page in a browser."
 
 # The cross-compiler and emulator of a Cortex-M: 113 MB to download, 923 MB on disk. Without them their tests are skipped.
 cross-tools:
@@ -71,9 +80,20 @@ ros: $(STAMP)
 		touch $(ROS)/.installed; } || \
 		{ rm -rf $(ROS); echo "rclpy could not be installed for this Python; the tests against real ROS 2 are skipped"; }
 
-# Closed loops, studies, clusters and browsers: as much again.
-test-long: $(STAMP) chromium cross-tools ros
-	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadscope --no-loadscope-reorder -m long
+# What `make test` leaves out; REST=thorough has only what takes no other tools and no minutes for one test.
+test-rest: $(STAMP) $(if $(findstring long,$(REST)),chromium cross-tools ros)
+	$(PYTEST) -n 2 -m "$(REST)"
+	@$(TOOK)
+
+test-all: test
+	$(MAKE) test-rest
+
+test-long:
+	$(MAKE) test-rest REST=long
+
+# Whether `make test` is ever red by chance: ten fresh clones, the last five beside four busy processes. An hour.
+test-clones: $(STAMP)
+	$(BIN)/python -m tools.clones 10 --busy 5 --most 240 --more 120
 
 # The peers that our figures stand beside, and nothing else needs: in an environment of their own, on top of ours.
 PEERS := .venv-bench

@@ -360,6 +360,12 @@ class Driver(Protocol):
     def request(self, request: Request) -> None:
         """Set what the host wants; held until changed. ARM is consumed: it never re-arms by itself after a stop."""
 
+    def release(self, why: str) -> None:
+        """Take the torque off every motor from now on, without a ramp, which would need the encoders.
+
+        `why`, in words, is a fault until a reset.
+        """
+
     def transmit(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
         """Frames due now: the command (only while armed; zeros while arming) and house-keeping."""
 
@@ -434,7 +440,8 @@ class SafetyCard:
     """Who stops the robot when, in words for a person.
 
     `reaction_s`: how long the wheels may still be driven after the host has fallen silent. `brakes`: whether they are
-    braked then, or coast. `unverified`: what this computer could not find out. `setup`: what the controller must be
+    braked then, or coast. `wheel_fault`: how this computer stops wheels of which one does not obey, without a ramp that
+    would need its encoder. `unverified`: what this computer could not find out. `setup`: what the controller must be
     set to.
     """
 
@@ -443,6 +450,7 @@ class SafetyCard:
     reaction_s: float
     brakes: bool
     estop: str
+    wheel_fault: str = "by the ramp of every stop"
     unverified: tuple[str, ...] = ()
     setup: tuple[str, ...] = ()
 
@@ -476,19 +484,20 @@ class LineQuestions:
 class MotorDriver:
     """A motor controller that robot.toml can name: each file of `drivers.motor` that speaks to one holds a `DRIVER`.
 
-    `settings`: a struct of its own fields in [link], with `fault()`; those of another driver are refused there. `make`
-    returns a fresh driver of these and of the key of authenticated mode (16 bytes) or None. `stop_frames`: the e-stop
-    for a connection beside the daemon's, which needs no answer; `stop_confirmation` makes what says, given each frame
-    that is heard then, whether the robot has confirmed it. `slowest_rad_s`: the slowest wheel speed that it holds.
-    `cyclic_frames` (of settings, command rate in Hz, whether authenticated): what the link carries. `authenticates`:
-    whether there is such a mode; without one `link.key_file` is refused. `kinds`: of links that it speaks over, the
-    usual one first. `tells_reception`: whether the controller counts the frames that it rejects and answers for its
-    clock, so that `check` can ask. `exchange` makes what a serial line is spoken with; None: the reference protocol's
-    frames. `serial_field`: of the settings, one that belongs to a serial link, where it must be given, and to no other.
-    `example`: its fields in [link] for a robot as the demonstration drives it; none where its controller is not
-    simulated. `recognise`: of frames that came, the fields in [link] that they show, None if they are not its
-    controller's; where it says nothing by itself, of the replies to `questions` on a serial line. `latches_stop`:
-    whether the controller itself keeps an e-stop until it is reset.
+    `settings`: a struct of its own fields in [link], with `fault()`; those of another driver are refused there.
+    `make` returns a fresh driver of these and of the key of authenticated mode (16 bytes) or None. `stop_frames`: the
+    e-stop for a connection beside the daemon's, which needs no answer; `stop_confirmation` makes what says, given
+    each frame that is heard then, whether the robot has confirmed it. `slowest_rad_s`: the slowest wheel speed that
+    it holds. `cyclic_frames` (of settings, command rate in Hz, whether authenticated): what the link carries.
+    `authenticates`: whether there is such a mode; without one `link.key_file` is refused. `kinds`: of links that it
+    speaks over, the usual one first. `tells_reception`: whether the controller counts the frames that it rejects and
+    answers for its clock, so that `check` can ask. `exchange` makes what a serial line is spoken with; None: the
+    reference protocol's frames. `serial_field`: of the settings, one that belongs to a serial link, where it must be
+    given, and to no other. `example`: its fields in [link] for a robot as the demonstration drives it; none where its
+    controller is not simulated. `takes_body_speeds`: whether it is given speed and turn rate of the body, and makes
+    wheel speeds of them by a track of its own. `recognise`: of frames that came, the fields in [link] that they show,
+    None if they are not its controller's; where it says nothing by itself, of the replies to `questions` on a serial
+    line. `latches_stop`: whether the controller itself keeps an e-stop until it is reset.
     """
 
     name: str
@@ -506,5 +515,6 @@ class MotorDriver:
     recognise: Callable[[Sequence[Frame]], dict[str, Any] | None] = lambda _frames: None
     questions: LineQuestions | None = None
     latches_stop: bool = True
+    takes_body_speeds: bool = False
     authenticates: bool = False
     tells_reception: bool = False

@@ -103,7 +103,7 @@ class BoardRobot:
         """Move on to robot time `now_us`; return what the board's sensors say then."""
         plant, faults, wanted = self.plant, self.faults, self.outputs
         asked = (wanted.left_setpoint_rad_s, wanted.right_setpoint_rad_s)
-        turned = asked if faults is None else faults.setpoints(*asked)
+        turned = asked if faults is None else faults.setpoints(*asked, is_driven=wanted.driver_enabled)
         poses: Sequence[PoseMeasurement] = plant.step(now_us, *turned, wanted.driver_enabled, wanted.brake)
         inputs = self._inputs()
         if faults is not None:

@@ -91,6 +91,7 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
             Kind("unplug", Site.LINK, "the line is pulled out and put back in"),
             Kind("unplug_mid_frame", Site.LINK, "the same, in the middle of a frame"),
             Kind("encoder_stuck", Site.SENSORS, "an encoder does not count", (_WHEEL,)),
+            Kind("encoder_disconnected", Site.SENSORS, "an encoder's lines hang in the air", (_WHEEL,)),
             Kind(
                 "encoder_jump", Site.SENSORS, "an encoder's count jumps",
                 (_WHEEL, _number("ticks", 5000, -(1 << 31), 1 << 31, whole=True)), lasts=False,
@@ -119,6 +120,10 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
                 (FaultParameter("cause", "power_on", choices=("power_on", "watchdog")),), lasts=False,
             ),
             Kind("motor_stall", Site.ROBOT, "a wheel is blocked and draws 18 A", (_WHEEL,)),
+            Kind(
+                "motor_runaway", Site.ROBOT, "a motor runs at a speed of its own while its controller drives it",
+                (_WHEEL, _number("speed_rad_s", 15.0, -100.0, 100.0)),
+            ),
             Kind("battery_sag", Site.ROBOT, "the battery's voltage falls", (_DROP,)),
             Kind("estop_button", Site.ROBOT, "the button on the robot is held down"),
             Kind("cpu_hog", Site.PROCESS, "busy processes on so many cores", (_CORES,)),
@@ -274,6 +279,7 @@ _DRAWN: Mapping[tuple[str, str], tuple[float, ...]] = MappingProxyType(
         ("reorder", "window_s"): (0.005, 0.1),
         ("babble", "rate_hz"): (50.0, 3000.0),
         ("encoder_jump", "ticks"): (-100_000, 100_000),
+        ("motor_runaway", "speed_rad_s"): (-15.0, 15.0),
         ("encoder_wrap", "bits"): (6, 14),
         ("pose_jump", "dx_m"): (-3.0, 3.0),
         ("pose_jump", "dy_m"): (-3.0, 3.0),

@@ -23,7 +23,11 @@ from sim.sensors import PoseMeasurement
 LONGEST_FRAME_BITS = 111
 STALL_CURRENT_A = 18.0
 _SIDES = ("left", "right")
-_OF_ONE_WHEEL = ("motor_stall", "encoder_stuck", "encoder_wrap", "encoder_reversed")
+_OF_ONE_WHEEL = (
+    "motor_stall", "motor_runaway", "encoder_stuck", "encoder_disconnected", "encoder_wrap", "encoder_reversed",
+)  # fmt: skip
+_FLOATING_TICKS = 3
+"""A line that hangs in the air makes the count tremble by so much at most."""
 
 
 class FrameFaults:
@@ -117,6 +121,7 @@ class RobotFaults:
     def __init__(self) -> None:
         self.active: tuple[ScheduledFault, ...] = ()
         self._encoders = (_Encoder(), _Encoder())
+        self._chance = random.Random(0)
         self._touched = False
         self._changed = False
         self._jumps: list[ScheduledFault] = []
@@ -132,10 +137,15 @@ class RobotFaults:
         self._touched = self._touched or any(f.kind.name.startswith("encoder") for f in (*self.active, *begun))
         self._sort_out()
 
-    def setpoints(self, left_rad_s: float, right_rad_s: float) -> tuple[float, float]:
-        """What the motors make of the setpoints (rad/s)."""
-        stalled = self._by_wheel["motor_stall"]
-        return (0.0 if "left" in stalled else left_rad_s), (0.0 if "right" in stalled else right_rad_s)
+    def setpoints(self, left_rad_s: float, right_rad_s: float, *, is_driven: bool) -> tuple[float, float]:
+        """Return what the motors make of the setpoints (rad/s); one runs away only while its controller drives it."""
+        stalled, runaway = self._by_wheel["motor_stall"], self._by_wheel["motor_runaway"]
+        made = {"left": left_rad_s, "right": right_rad_s}
+        for side in stalled:
+            made[side] = 0.0
+        for side, fault in runaway.items() if is_driven else ():
+            made[side] = fault["speed_rad_s"]
+        return made["left"], made["right"]
 
     def poses(self, now_us: int, measured: Sequence[PoseMeasurement]) -> Sequence[PoseMeasurement]:
         """What becomes of the poses measured by `now_us` of robot time."""
@@ -159,7 +169,9 @@ class RobotFaults:
         ticks = [inputs.left_ticks, inputs.right_ticks]
         speeds = [inputs.left_speed_rad_s, inputs.right_speed_rad_s]
         currents = [inputs.left_current_a, inputs.right_current_a]
-        stalled, stuck, wrapped, backwards = (self._by_wheel[kind] for kind in _OF_ONE_WHEEL)
+        stalled, stuck = self._by_wheel["motor_stall"], self._by_wheel["encoder_stuck"]
+        wrapped, backwards = self._by_wheel["encoder_wrap"], self._by_wheel["encoder_reversed"]
+        floating = self._by_wheel["encoder_disconnected"]
         for index, side in enumerate(_SIDES):
             encoder = self._encoders[index]
             if self._changed:
@@ -167,12 +179,14 @@ class RobotFaults:
                 encoder.set(
                     ticks[index],
                     reversed_=side in backwards,
-                    stuck=side in stuck,
+                    stuck=side in stuck or side in floating,
                     modulus=None if bits is None else 1 << bits["bits"],
                 )
                 encoder.offset += sum(jump["ticks"] for jump in self._jumps if jump["wheel"] == side)
             ticks[index] = encoder.count(ticks[index])
-            speeds[index] *= 0.0 if side in stuck else encoder.sign
+            speeds[index] *= 0.0 if side in stuck or side in floating else encoder.sign
+            if side in floating:
+                ticks[index] += self._chance.randint(-_FLOATING_TICKS, _FLOATING_TICKS)
             if side in stalled and driver_enabled and setpoints[index] != 0.0:
                 currents[index] = math.copysign(STALL_CURRENT_A, setpoints[index])
         self._changed = False

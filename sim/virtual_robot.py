@@ -25,6 +25,7 @@ from firmware_protocol.firmware_core import (
 from sim.body_dynamics import BodyPose
 from sim.can_protocol import CanFrame
 from sim.effects import hidden_effects
+from sim.encoder_loop import EncoderLoop
 from sim.injected_faults import RobotFaults
 from sim.plant import Plant, TrueState
 from sim.plant_parameters import PlantParameters
@@ -111,6 +112,13 @@ class Controller(Protocol):
         """Whether the motors brake by themselves."""
 
     @property
+    def regulates(self) -> bool:
+        """Whether its speed loops run; without them a motor has a fixed duty, is released or braked."""
+
+    def make_loop(self) -> EncoderLoop:
+        """Return the motor loops at rest, as they are with an encoder that reports wrongly."""
+
+    @property
     def state(self) -> str:
         """In one word, for the truth record."""
 
@@ -143,6 +151,7 @@ class VendorRobot:
         self.faults: RobotFaults | None = None
         self.pose_sink = pose_sink
         self._coasting = [0.0, 0.0]
+        self._loop = controller.make_loop()
         self._replies: list[CanFrame] = []
 
     @property
@@ -172,10 +181,13 @@ class VendorRobot:
     def step(self, now_us: int, error_counters: tuple[int, int] = (0, 0)) -> Sequence[Frame]:
         """Move on to robot time `now_us` and run one cycle; return the frames that the controller sends, in order."""
         plant, faults = self.plant, self.faults
-        wanted = self.controller.wheels_rad_s
+        wanted, regulates = self.controller.wheels_rad_s, self.controller.regulates
         asked = self._setpoints(wanted)
-        turned = asked if faults is None else faults.setpoints(*asked)
+        turned = self._loop.drive(asked) if regulates else asked
+        if faults is not None:
+            turned = faults.setpoints(*turned, is_driven=regulates)
         enabled = wanted != (None, None)
+        dt_s = 1e-6 * (now_us - plant.now_us)
         poses: Sequence[PoseMeasurement] = plant.step(now_us, *turned, enabled, self.controller.brakes)
         if faults is not None:
             poses = faults.poses(now_us, poses)
@@ -184,7 +196,8 @@ class VendorRobot:
                 self.pose_sink(pose, now_us)
         inputs = sensor_inputs(plant, self.estop_button, error_counters, ResetCause.POWER_ON)
         if faults is not None:
-            inputs = faults.inputs(inputs, asked, enabled)
+            true, inputs = inputs, faults.inputs(inputs, asked, enabled)
+            self._loop.see(asked, true, inputs, dt_s, regulates)
         frames, self._replies = [*self._replies, *self.controller.step(now_us, inputs)], []
         return [Frame(frame.can_id, frame.data, frame.extended) for frame in frames]
 
@@ -320,7 +333,7 @@ class VirtualRobot:
         outputs, faults = self._outputs, self.faults
         asked = turned = (outputs.left_setpoint_rad_s, outputs.right_setpoint_rad_s)
         if faults is not None:
-            turned = faults.setpoints(*asked)
+            turned = faults.setpoints(*asked, is_driven=outputs.driver_enabled)
         poses: Sequence[PoseMeasurement] = plant.step(now_us, *turned, outputs.driver_enabled, outputs.brake)
         if faults is not None:
             poses = faults.poses(now_us, poses)

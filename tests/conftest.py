@@ -15,6 +15,8 @@ settings.load_profile("project")
 
 ROBOT_TESTS = Path(__file__).parent / "robot"
 REAL_TIME = ("tests/hil/", "tests/firmware_protocol/emulated/")
+# What does not drive may run beside what does.
+STANDING = tuple(f"tests/hil/test_{name}.py" for name in ("check", "held_up", "path", "waiting"))
 
 
 @pytest.hookimpl(trylast=True)
@@ -32,7 +34,8 @@ class FilesToWorkers(LoadScopeScheduling):
     """
 
     def _split_scope(self, nodeid: str) -> str:
-        return REAL_TIME[0] if nodeid.startswith(REAL_TIME) else nodeid.split("::", 1)[0]
+        drives = nodeid.startswith(REAL_TIME) and not nodeid.startswith(STANDING)
+        return REAL_TIME[0] if drives else nodeid.split("::", 1)[0]
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 ROOMS = (
     "cli", "experiments", "viewer", "bridge", "first_use", "drive", "daemon", "runtime", "adaptation", "inference",
-    "gap", "control", "estimation", "log", "model", "effects", "jit", "reports", "config", "tasks", "files",
+    "gap", "control", "estimation", "log", "model", "effects", "jit", "reports", "config", "tasks", "fence", "files",
     "processes", "errors",
 )  # fmt: skip
 """From top to bottom; a room may import the rooms below it."""

@@ -1,12 +1,14 @@
 """`make test` in fresh clones of HEAD, one after the other, each with the conditions that it ran under.
 
-`python -m tools.clones 10 --busy` is ten, the last beside two busy processes; it exits with 1 if one of them failed.
+`python -m tools.clones 10 --busy 5` is ten, the last five beside four busy processes (`--processes`). It exits with 1
+if one failed or took longer than `--most` seconds; those beside busy processes may take `--more` seconds longer.
 `--dry` only clones, and prints what would be done.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import re
 import resource
@@ -78,19 +80,24 @@ def busy(count: int) -> Iterator[None]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("clones", type=int)
-    parser.add_argument("--busy", action="store_true", help="run the last one beside two busy processes")
+    parser.add_argument("--busy", type=int, default=0, metavar="N", help="run the last N beside busy processes")
+    parser.add_argument("--processes", type=int, default=4, metavar="N", help="how many busy processes")
+    parser.add_argument("--most", type=float, default=math.inf, metavar="S", help="seconds that one may take")
+    parser.add_argument("--more", type=float, default=0.0, metavar="S", help="seconds more beside busy processes")
     parser.add_argument("--dry", action="store_true", help="clone, but only say what make would do")
     asked = parser.parse_args()
     command = ["make", "test", *(["-n"] if asked.dry else [])]
     codes: list[int] = []
     for number in range(1, asked.clones + 1):
-        beside = 2 if asked.busy and number == asked.clones else 0
+        beside = asked.processes if number > asked.clones - asked.busy else 0
         with tempfile.TemporaryDirectory(prefix="clone") as folder, busy(beside):
             subprocess.run(["git", "clone", "-q", ".", folder], check=True)
             outcome = run(command, Path(folder))
-        codes.append(outcome.code)
+        late = outcome.wall_s > asked.most + bool(beside) * asked.more
+        codes.append(outcome.code or int(late))
         print(
-            f"{number} of {asked.clones}{', beside two busy processes' * bool(beside)}: {outcome.in_words()}",
+            f"{number} of {asked.clones}{f', beside {beside} busy processes' * bool(beside)}: "
+            f"{outcome.in_words()}{', too long' * late}",
             flush=True,
         )
     print(f"{codes.count(0)} of {asked.clones} passed")

@@ -28,7 +28,7 @@ from typing import Any
 
 import pytest
 
-from tools.mutation import Mutant, marked
+from tools.mutation import QUICK, Mutant, marked
 
 ROOT = Path(__file__).resolve().parent.parent
 EQUIVALENTS = Path(__file__).with_name("python_equivalents.toml")
@@ -255,8 +255,8 @@ def quiet() -> Iterator[None]:
 
 
 def run_tests(arguments: Sequence[str], plugins: Sequence[Any] = ()) -> int:
-    """Run the fast ones of some tests until one fails."""
-    options = ["-x", "-n", "0", "-m", "not long", "-p", "no:cacheprovider", "-p", "no:timeout", "-p", "no:playwright"]
+    """Run those of some tests that `make test` runs until one fails."""
+    options = ["-x", "-n", "0", "-m", QUICK, "-p", "no:cacheprovider", "-p", "no:timeout", "-p", "no:playwright"]
     with quiet():
         return int(pytest.main([*options, *arguments], plugins=list(plugins)))
 

@@ -198,10 +198,17 @@ def commission(
 def ctl(
     robot: RobotFile,
     do: Annotated[
-        str, typer.Argument(help="arm, start, stop, disarm, reset, estop, status, task, revert, adapt or quit.")
+        str,
+        typer.Argument(
+            help="arm, start, stop, disarm, reset, estop, status, task, obstacle, fence, revert, adapt or quit."
+        ),
     ],
     changes: Annotated[
-        list[str] | None, typer.Argument(help="Of the task, while disarmed: radius_m=0.8 speed_m_s=0.3, for example.")
+        list[str] | None,
+        typer.Argument(
+            help="Of task, while disarmed: radius_m=0.8. Of obstacle: add name=pillar x_m=0.7 y_m=0 radius_m=0.15, or "
+            "remove name=pillar. Of fence: override, or hold."
+        ),
     ] = None,
     unrecorded: Annotated[
         bool, typer.Option("--unrecorded", help="Arm although nothing is being recorded that should be.")

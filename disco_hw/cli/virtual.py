@@ -28,6 +28,9 @@ def demo(
     uncertainty: Annotated[str, typer.Option(help="ut, mc, joint or point.")] = "ut",
     view: View = False,
     adapt: Annotated[bool, typer.Option("--adapt", help="Learn the geometry on the way (docs/adapt.md).")] = False,
+    obstacle: Annotated[
+        bool, typer.Option("--obstacle", help="Put a pillar on the circle, and drive around it (docs/fence.md).")
+    ] = False,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page.")] = DEFAULT_PORT,
     as_json: AsJson = False,
 ) -> None:
@@ -44,6 +47,7 @@ def demo(
             uncertainty=uncertainty,
             view=view,
             adapt=adapt,
+            obstacle=obstacle,
             port=port,
             show_progress=not as_json,
         )
@@ -240,3 +244,25 @@ def gap(
     print_result(
         result.as_dict(), as_json, f"{result.as_text()}\n\nwritten: {out}/experiment.png, report.html, drive.mcap"
     )
+
+
+@experiment_app.command()
+def fence(
+    rooms: Annotated[int, typer.Option(min=1, help="Random rooms with a task.")] = 200,
+    manual: Annotated[int, typer.Option(min=1, help="Wild drives by hand.")] = 200,
+    off: Annotated[
+        float, typer.Option(min=0.0, max=0.3, help="By how much of its size a true parameter may be off.")
+    ] = 0.15,
+    seconds: Annotated[float, typer.Option(min=2.0, help="Length of a drive.")] = 12.0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of rooms, robots and commands.")] = 1,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Directory for the picture.")] = Path("out/fence"),
+    as_json: AsJson = False,
+) -> None:
+    """Drive in random rooms on robots that nobody told, and count how often one leaves its fence."""
+    from disco_hw.experiments.fence import FenceOptions, run_fence
+
+    refuse_directory(out)
+    result = run_fence(FenceOptions(rooms, manual, off, seconds, seed), progress_line)
+    out.mkdir(parents=True, exist_ok=True)
+    result.write_pictures(out / "fence.png")
+    print_result(result.as_dict(), as_json, f"{result.table()}\n\nwritten: {out}/fence.png")

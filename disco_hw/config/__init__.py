@@ -23,6 +23,7 @@ from disco_hw.config.robot import (
     link_of,
     load_daemon_address,
     load_robot_config,
+    refuse_outside_task,
 )
 from disco_hw.errors import InputError
 from disco_hw.files import LOG, MODEL_TOML, WAY_POINTS, open_file, read_toml
@@ -47,6 +48,7 @@ __all__ = [
     "load_daemon_address",
     "load_robot_config",
     "names_address",
+    "refuse_outside_task",
 ]
 
 

@@ -11,6 +11,7 @@ import msgspec
 from msgspec import Meta
 
 from disco_hw.errors import InputError
+from disco_hw.fence import Fence, Footprint, fence_fault, usual_footprint
 from disco_hw.files import ROBOT_TOML, control_character_in, in_words, read_toml
 from drivers.motor import AS_TOLD, DriverFieldError, UnknownDriverError, Wiring, find_driver, own_fields
 from drivers.pose import DEFAULT, PoseConvention, PoseSourceError, find_pose_source, pose_sources
@@ -33,7 +34,10 @@ Datum = tuple[Annotated[float, Meta(ge=-90.0, le=90.0)], Annotated[float, Meta(g
 
 
 class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Nominal geometry and encoder of the robot (metres, radians)."""
+    """Nominal geometry and encoder of the robot (metres, radians).
+
+    `footprint_m`: the rectangle that the robot covers; None takes one guessed from the wheels.
+    """
 
     name: Annotated[str, Meta(min_length=1, max_length=64)]
     wheel_radius_m: Annotated[float, Meta(gt=0.0, le=2.0)]
@@ -42,6 +46,12 @@ class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     ticks_per_rev: Annotated[float, Meta(ge=1.0, le=65535.0)]
     max_wheel_speed_rad_s: Annotated[float, Meta(gt=0.0, le=65.5)]
     max_wheel_acceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 20.0
+    footprint_m: Footprint | None = None
+
+    @property
+    def footprint(self) -> Footprint:
+        """The rectangle that the robot covers, as robot.toml says or guessed from the wheels."""
+        return usual_footprint(self) if self.footprint_m is None else self.footprint_m
 
 
 class Prior(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -270,6 +280,7 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     daemon: DaemonSettings = DaemonSettings()
     drive: Drive = Drive()
     ros2: Ros2 = Ros2()
+    fence: Fence = Fence()
 
 
 def load_robot_config(path: Path | str) -> RobotConfig:
@@ -282,16 +293,28 @@ def load_robot_config(path: Path | str) -> RobotConfig:
     config = _without_task(path, raw)
     config = msgspec.structs.replace(config, task=_task_of(path, raw.get("task", {})))
     _check_task(path, config)
+    if "task" in raw and config.task.file is None:
+        refuse_outside_task(path, config)
     return config
+
+
+def refuse_outside_task(path: Path, config: RobotConfig) -> None:
+    """Raise InputError, naming the place, for a task on whose line or start the footprint is not within the fence."""
+    from disco_hw.fence.task_line import task_breach  # noqa: PLC0415
+
+    fault = task_breach(config.fence, config.robot.footprint, config.task.course())
+    if fault is not None:
+        _refuse(path, "fence", fault, "move the task or the fence")
 
 
 def load_daemon_address(path: Path) -> tuple[str, str | None]:
     """The robot's name and the control socket that robot.toml sets: what a request to the running daemon needs.
 
-    [task] is not looked at: a daemon can be asked and stopped whatever has been written there since it was started.
-    Raises InputError with one line naming file, field and remedy for any other section that is wrong.
+    [task] and [fence] are not looked at: a daemon can be asked and stopped whatever has been written there since it
+    was started. Raises InputError with one line naming file, field and remedy for any other section that is wrong.
     """
-    config = _without_task(path, read_toml(path, ROBOT_TOML))
+    raw = read_toml(path, ROBOT_TOML)
+    config = _without_task(path, {name: raw[name] for name in raw if name != "fence"})
     return config.robot.name, config.daemon.control_socket
 
 
@@ -449,16 +472,14 @@ def _check(path: Path, config: RobotConfig) -> None:
             _check_values(path, name, getattr(config, name))
     for number, one in enumerate(config.pose.also):
         _check_values(path, f"pose.also[{number}]", one)
-    for number, one in enumerate(config.pose.every()):
-        try:
-            parse_allowed(("127.0.0.1",) if one.allow is None else one.allow)
-        except ValueError as error:
-            field = "pose.allow" if number == 0 else f"pose.also[{number - 1}].allow"
-            _refuse(path, field, str(error), 'write addresses as "192.168.1.20" or networks as "192.168.1.0/24"')
+    _check_allowed_senders(path, config.pose)
     for field in config.prior.__struct_fields__:
         low, high = getattr(config.prior, field)
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
             _refuse(path, f"prior.{field}", f"[{low}, {high}] is not a range", "write [low, high] with low < high")
+    fault = fence_fault(config.fence, config.robot.footprint)
+    if fault is not None:
+        _refuse(path, f"fence.{fault.field}", fault.fault, fault.remedy)
     control = config.control
     if control.command_valid_for_s < 1.5 / control.rate_hz:
         _refuse(
@@ -481,6 +502,16 @@ def _check(path: Path, config: RobotConfig) -> None:
         _refuse(path, f"link.{field}", "belongs to a serial line, and to no other link", remedy)
     if config.link.key_file is not None and not driver.authenticates:
         _refuse(path, "link.key_file", f"the driver {driver.name} has no authenticated mode", "remove it")
+
+
+def _check_allowed_senders(path: Path, pose: PoseInput) -> None:
+    """Refuse an `allow` that is no list of addresses and networks."""
+    for number, one in enumerate(pose.every()):
+        try:
+            parse_allowed(("127.0.0.1",) if one.allow is None else one.allow)
+        except ValueError as error:
+            field = "pose.allow" if number == 0 else f"pose.also[{number - 1}].allow"
+            _refuse(path, field, str(error), 'write addresses as "192.168.1.20" or networks as "192.168.1.0/24"')
 
 
 def _check_task(path: Path, config: RobotConfig) -> None:

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from disco_hw.control.kernel import BLOCK, CHANNELS, WHEEL_ROWS, aligned_zeros
+from disco_hw.control.kernel.avoid import Area
 from disco_hw.control.kernel.guide import SteeredChassis, guide
 from disco_hw.control.kernel.skid_steer import SkidSteer
 from disco_hw.control.optimiser import Optimiser
@@ -33,9 +34,11 @@ from disco_hw.control.plan import (
     WheelPlan,
     command_history,
 )
+from disco_hw.control.surroundings import Surroundings
 from disco_hw.control.wheel_loss import WheelLoss
 from disco_hw.effects import Channel
 from disco_hw.effects.registry import DELAY
+from disco_hw.fence.clearance import Boundaries
 from disco_hw.jit import compiled_for
 from disco_hw.model import Belief, Model
 from disco_hw.model.coefficients import NO_DISTURBANCE, NO_SLIDE
@@ -50,6 +53,8 @@ NOWHERE = 0.25
 # Steps kept beyond the longest delay that is believed in at first, for later beliefs.
 SPARE_HISTORY = 2
 SHORTEST_GAP_S = 1e-6
+# A plan goes by no more than this faster than the task asks, or than the robot goes.
+SPEED_TO_SPARE = 1.25
 
 
 class Disco:
@@ -60,8 +65,9 @@ class Disco:
     """
 
     def __init__(
-        self, model: Model, task: PlannedTask, settings: DiscoSettings, limits: CommandLimits, seed: int = 1
-    ) -> None:
+        self, model: Model, task: PlannedTask, settings: DiscoSettings, limits: CommandLimits, seed: int = 1,
+        surroundings: Surroundings | None = None,
+    ) -> None:  # fmt: skip
         sampler, step_s = settings.sampler, settings.step_s
         self._model, self._task, self._settings, self._limits, self._seed = model, task, settings, limits, seed
         self._own_draws = settings.uncertainty == "joint" or (
@@ -95,6 +101,7 @@ class Disco:
             limits.acceleration_rad_s2 * step_s,
             seed,
         )
+        self._surroundings = surroundings
         self._guide: Callable[..., None] | None = None
         self._guided_until_ns: int | None = None
         self._begun_ns: int | None = None
@@ -215,6 +222,19 @@ class Disco:
         self._task = task
         self.reset()
 
+    def look_around(self, bounds: Boundaries, deviation_m: float) -> None:
+        """Keep away from these boundaries from the next plan on; nothing without surroundings.
+
+        `deviation_m`: standard deviation of the place of the footprint's corner that is known least.
+        """
+        if self._surroundings is not None:
+            self._surroundings.look_around(bounds, deviation_m)
+
+    def set_line(self, line_m: Array) -> None:
+        """Drive around what stands on this line, points (N, 2); nothing without surroundings."""
+        if self._surroundings is not None:
+            self._surroundings.set_line(line_m)
+
     @property
     def optimiser(self) -> Optimiser:
         """The sampling optimiser, for its buffers and figures."""
@@ -258,10 +278,13 @@ class Disco:
         self._t0_ns = t0_ns
         guided = self._draw_guide(system, before)
         outcome, retries = self._improve(max(shift_steps, 0.0), before, system, first, guided)
+        if outcome is not PlanOutcome.STOPPING and self._is_trapped():
+            outcome = PlanOutcome.STOPPING
         if outcome is PlanOutcome.STOPPING:
             self._stop(now_ns, before)
         else:
             self._failing_since_ns = None
+            self._leave_touching_plan()
         self._planned_from, self._elapsed_s = start, elapsed_s
         nominal = self._optimiser.nominal()
         trajectory = self._mean_trajectory(nominal)
@@ -327,7 +350,7 @@ class Disco:
 
         Turning in from there costs more than standing for as long as is planned, or is put off from plan to plan.
         """
-        if not self._optimiser.guide_is_valid:
+        if not self._optimiser.guide_is_valid or self._guide_touches():
             return False
         settings = self._settings
         horizon_s = settings.sampler.horizon * settings.step_s
@@ -339,12 +362,39 @@ class Disco:
             self._guided_until_ns = now_ns + round(horizon_s * 1e9)
         return self._guided_until_ns is not None and now_ns < self._guided_until_ns
 
+    def _is_trapped(self) -> bool:
+        """Whether every sample of the last step touches the fence or an obstacle for most of the horizon."""
+        around = self._surroundings
+        return around is not None and self._optimiser.least_cost >= around.trapped_cost
+
+    def _guide_touches(self) -> bool:
+        around = self._surroundings
+        return around is not None and self._optimiser.guide_cost >= around.touching_cost
+
+    def _leave_touching_plan(self) -> None:
+        """Continue from the best sample where the plan touches something and that sample does not.
+
+        The mean of samples that pass an obstacle on both sides leads through it.
+        """
+        around, optimiser = self._surroundings, self._optimiser
+        if around is None or optimiser.least_cost >= around.touching_cost:
+            return
+        if optimiser.nominal_cost >= around.touching_cost:
+            commands, _ = optimiser.sampled_commands(1)
+            if len(commands):
+                optimiser.set_nominal(commands[0])
+
     def _stop(self, now_ns: int, before: tuple[float, float]) -> None:
         """Put a ramp to zero in the plan's place; raises NoValidControl when that has gone on for too long."""
         if self._failing_since_ns is None:
             self._failing_since_ns = now_ns
         if (now_ns - self._failing_since_ns) * 1e-9 >= self._settings.decay_s:
             self._optimiser.reset()
+            if self._is_trapped():
+                raise NoValidControl(
+                    "no way past the fence or an obstacle was found, and the robot stops before it; clear the way, or "
+                    "drive it away from there"
+                )
             raise NoValidControl(
                 f"no command sequence had a finite cost for {self._settings.decay_s} s, in spite of retries and a "
                 "restart; check the pose, the wheel speeds and the model"
@@ -451,7 +501,16 @@ class Disco:
         return SkidSteer(
             self._start, self._slides, means, base, effects, each, self._ahead, self._scaled, self._skip_mean_cost,
             self._series, self._wide, self._euler, task, self._history, self._wheels, self._wheels_differ,
+            self._area(x, y, (origin_x, origin_y)),
         )  # fmt: skip
+
+    def _area(self, x_m: float, y_m: float, origin_m: tuple[float, float]) -> Area | None:
+        around = self._surroundings
+        if around is None:
+            return None
+        turning = max(abs(float(self._start[4])), abs(float(self._start[5])))
+        fastest = SPEED_TO_SPARE * max(around.speed_m_s, turning * self._chassis.wheel_radius_m)
+        return around.place(x_m, y_m, origin_m, fastest)
 
     def _draw_points(self) -> None:
         """Fresh draws of the belief for this step."""

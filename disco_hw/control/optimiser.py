@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from disco_hw.control.kernel import BLOCK, STATE_ROWS, Floats, System, aligned_zeros, block_count
 from disco_hw.control.kernel.sequences import Basis, Limits
-from disco_hw.control.kernel.step import ESS, INVALID, SAMPLING, TEMPERATURE, Workspace, disco_step
+from disco_hw.control.kernel.step import ESS, INVALID, LEAST, SAMPLING, TEMPERATURE, Workspace, disco_step
 from disco_hw.control.plan import Sampler
 from disco_hw.jit import compiled_for
 from disco_hw.tasks import single
@@ -150,6 +150,11 @@ class Optimiser:
         return bool(self._work.costs[1] < below * self._work.costs[0])
 
     @property
+    def guide_cost(self) -> float:
+        """Cost of the guide in the last step."""
+        return float(self._work.costs[1])
+
+    @property
     def guide_is_valid(self) -> bool:
         """Whether the guide had a cost in the last step."""
         return bool(self._work.costs[1] < INVALID)
@@ -188,6 +193,16 @@ class Optimiser:
     def ess(self) -> float:
         """Effective sample size of the last step."""
         return float(self._work.report[ESS])
+
+    @property
+    def least_cost(self) -> float:
+        """Least cost of a sample in the last step; NaN where none was finite."""
+        return float(self._work.report[LEAST])
+
+    @property
+    def nominal_cost(self) -> float:
+        """Cost that the plan had before the last step improved it."""
+        return float(self._work.costs[0])
 
     def report(self) -> dict[str, float]:
         """Figures of the last step, in order: ess, temperature, cost_min, cost_mean, cost_nominal, valid_samples."""

@@ -203,9 +203,10 @@ TASK = "task"
 UNRECORDED = "unrecorded"
 """What `arm` must say where nothing is being recorded although it should be."""
 UNRECORDED_REMEDY = "mend that, or arm with --unrecorded"
-PAGE_ACTIONS = (TASK, "drive")
-"""What takes arguments: another circle, and a hand on the page's pad."""
-ASKED = (*ACTIONS, TASK)
+OBSTACLE, FENCE = "obstacle", "fence"
+PAGE_ACTIONS = (TASK, OBSTACLE, FENCE, "drive")
+"""What takes arguments: another circle, an obstacle, the fence, and a hand on the page's pad."""
+ASKED = (*ACTIONS, TASK, OBSTACLE, FENCE)
 """What a person may ask for here; a hand on a pad is no matter of single requests."""
 SERVED = (*ACTIONS, *PAGE_ACTIONS)
 
@@ -229,12 +230,14 @@ def ask(robot: Path, action: str, changes: Sequence[str] = (), unrecorded: bool 
     """
     if action not in ASKED:
         raise InputError(f"{action}: no such request; write one of {', '.join(ASKED)}")
-    if (action == TASK) != bool(changes):
-        said = "say what to change" if action == TASK else f"{action} takes nothing more; only {TASK} does"
-        raise InputError(f"{said}: ctl {robot} {TASK} radius_m=0.8 speed_m_s=0.3")
+    if (action in _EXAMPLES) != bool(changes):
+        taking = ", ".join(_EXAMPLES)
+        said = "say what to change" if action in _EXAMPLES else f"{action} takes nothing more; only {taking} do"
+        shown = action if action in _EXAMPLES else TASK
+        raise InputError(f"{said}: ctl {robot} {shown} {_EXAMPLES[shown]}")
     if unrecorded and action != "arm":
         raise InputError(f"--unrecorded: only arm takes it, and not {action}; leave it out")
-    request: dict[str, Any] = {"do": action} | dict(map(_change, changes)) | ({UNRECORDED: True} if unrecorded else {})
+    request: dict[str, Any] = {"do": action} | _arguments(action, changes) | ({UNRECORDED: True} if unrecorded else {})
     try:
         path = _path_of(*load_daemon_address(robot))
         for line in passed_over(path):
@@ -245,6 +248,29 @@ def ask(robot: Path, action: str, changes: Sequence[str] = (), unrecorded: bool 
             raise
         remedy = f"use `disco-hw estop {robot}` or the robot's own e-stop button, now"
         raise type(error)(f"NOT SENT: {remedy} ({error})") from None
+
+
+_EXAMPLES = {
+    TASK: "radius_m=0.8 speed_m_s=0.3",
+    OBSTACLE: "add name=pillar x_m=0.7 y_m=0 radius_m=0.15",
+    FENCE: "override",
+}
+"""The requests that take more, each with an example of it."""
+
+
+def _arguments(action: str, changes: Sequence[str]) -> dict[str, Any]:
+    """What the words after a request say; raises InputError."""
+    if action == OBSTACLE and changes[0] in {"add", "remove"}:
+        name = [text.partition("=")[2] for text in changes[1:] if text.startswith("name=")]
+        rest = [text for text in changes[1:] if not text.startswith("name=")]
+        return {"change": changes[0], **({"name": name[-1]} if name else {}), **dict(map(_change, rest))}
+    if action == FENCE and list(changes) in (["override"], ["hold"]):
+        return {"override": changes[0] == "override"}
+    if action != TASK:
+        words = {OBSTACLE: "add or remove, and then NAME=VALUE", FENCE: "override or hold"}[action]
+        example = f"{action} {_EXAMPLES[action]}"
+        raise InputError(f"{action} {' '.join(changes)}: not understood; write {words}, as {example}")
+    return dict(map(_change, changes))
 
 
 def _change(text: str) -> tuple[str, float]:
@@ -274,6 +300,7 @@ def in_words(reply: dict[str, Any], robot: Path) -> str:
         f"loop lateness p99 {loop['lateness_us']['p99']:.0f} us, max {loop['lateness_us']['max']:.0f} us, "
         f"overruns {loop['overruns']}, skipped {loop['skipped']}",
     ]
+    lines += _fence_in_words(reply.get("area"))
     adaptation = reply.get("adaptation")
     if adaptation is not None:
         paused = ", paused" if adaptation["paused"] else ""
@@ -293,6 +320,19 @@ def in_words(reply: dict[str, Any], robot: Path) -> str:
     if recorder["last_error"] and recorder["last_error"] not in recorder["fault"]:
         lines.append(f"recording, last error: {recorder['last_error']}")
     return "\n".join(lines)
+
+
+def _fence_in_words(area: Mapping[str, Any] | None) -> Iterator[str]:
+    """What a status says of fence and obstacles; nothing where there are none."""
+    if area is None or area["verdict"] == "idle":
+        return
+    held = f", {area['reason']}" if area["reason"] else ""
+    left = "" if area["clearance_m"] is None else f"; {area['clearance_m']:.2f} m left on the stopping path"
+    yield f"fence: {area['verdict']}{held}{left}"
+    for one in area["obstacles"]:
+        lost = ", LOST: report it again or remove it" if one["lost"] else ""
+        place = f"({one['x_m']:.2f}, {one['y_m']:.2f}), radius {one['radius_m']:.2f} m"
+        yield f"obstacle {one['name']}: {place}, reported {one['age_s']:.1f} of {one['age_limit_s']:g} s ago{lost}"
 
 
 def controller_in_words(controller: Mapping[str, Any] | None) -> tuple[str, ...]:

@@ -24,6 +24,7 @@ from disco_hw.runtime.preflight import (
     Check,
     Level,
     check_command_timing,
+    check_fence,
     check_firmware_limits,
     check_link_load,
     check_realtime,
@@ -92,6 +93,7 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
     refuse_beside_a_daemon(setup.config)
     checks = [_model_check(setup), _adaptation_check(setup), check_task(setup.config.robot, setup.config.task)]
     checks.append(check_link_load(setup.config.link, setup.config.control))
+    checks += check_fence(setup.config.robot, setup.config.fence)
     control = setup.config.control
     priority = setup.config.daemon.realtime_priority
     checks += check_realtime(priority, can_use_fifo(), can_lock_memory(), os.cpu_count() or 1)

@@ -328,9 +328,10 @@ def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> d
         "driver": asdict(core.driver.stats),
         "fusion": asdict(core.pipeline.fusion.stats),
         "poses": _poses(core),
-        "plausibility": asdict(core.plausibility.stats),
+        "plausibility": asdict(core.plausibility),
         "recorder": asdict(recorder),
         "adaptation": core.adaptation.status(),
+        "area": None if core.area is None else core.area.status(tick.pipeline.t_ns),
     }
 
 
@@ -365,7 +366,7 @@ def counters(
         transport=asdict(core.transport.stats),
         driver=asdict(core.driver.stats),
         fusion=asdict(core.pipeline.fusion.stats),
-        plausibility=asdict(core.plausibility.stats),
+        plausibility=asdict(core.plausibility),
         recorder={name: value for name, value in asdict(recorder).items() if type(value) is int},
         loop={"ticks": loop.ticks, "overruns": loop.overruns, "skipped": loop.skipped_periods, "stolen_ms": stolen_ms},
         adaptation=core.adaptation.counts(),

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from disco_hw import processes
-from disco_hw.daemon import ADAPT_ACTIONS, PAGE_ACTIONS, UNRECORDED_REMEDY
+from disco_hw.daemon import ADAPT_ACTIONS, FENCE, OBSTACLE, PAGE_ACTIONS, TASK, UNRECORDED_REMEDY
 from disco_hw.daemon.control_socket import ControlMessage, ControlServer, counters, loop_figures, status
 from disco_hw.daemon.loop import Clock, Loop
 from disco_hw.daemon.page_feed import WatchedRecorder
@@ -15,7 +15,9 @@ from disco_hw.daemon.process import Notifier, StopSignals, Waiting
 from disco_hw.log import records
 from disco_hw.runtime import Ask, State, advice, headline, records_of_tick
 from disco_hw.runtime.core import CoreTick, DaemonCore, Pilot
+from disco_hw.runtime.obstacles import ObstacleRefused
 from disco_hw.runtime.robot_setup import TaskRefused, changed_task
+from disco_hw.runtime.safe_area import FenceRefused
 from disco_hw.runtime.supervisor import Reply, UserRequest
 from drivers.types import Request
 
@@ -127,8 +129,10 @@ class Daemon:
         for message in messages:
             if message.action == "drive":
                 self._steer(now_ns, message)
-            elif message.action == "task":
+            elif message.action == TASK:
                 self._change_task(message)
+            elif message.action in {OBSTACLE, FENCE}:
+                self._change_area(now_ns, message)
         wanted = self._pilot.step(now_ns, self._core.last)
         events = tuple(records.Event(now_ns, "info", "drive", text) for text in wanted.events)
         mark("control")
@@ -235,6 +239,26 @@ class Daemon:
         refusal = self._pilot.steer(now_ns, message.client, message.arguments)
         body: dict[str, Any] = {"ok": refusal is None, "stamp": str(now_ns)}
         self._server.reply(message, body if refusal is None else {**body, "error": refusal})
+
+    def _change_area(self, now_ns: int, message: ControlMessage) -> None:
+        """Add or remove an obstacle, change the fence, or let a person drive in spite of it."""
+        area, last = self._core.area, self._core.last
+        if area is None:
+            self._server.reply(message, {"ok": False, "error": "this drive has no fence guard"})
+            return
+        state = State.DISCONNECTED if last is None else last.output.state
+        try:
+            if message.action == OBSTACLE:
+                text = area.ask(now_ns, message.arguments)
+            elif set(message.arguments) == {"override"}:
+                text = area.override(now_ns, message.arguments["override"] is True)
+            else:
+                text = area.change_fence(now_ns, message.arguments, state)
+        except (ObstacleRefused, FenceRefused) as refused:
+            self._server.reply(message, {"ok": False, "error": str(refused)})
+            return
+        self._say("fence", text)
+        self._server.reply(message, {"ok": True, "text": text})
 
     def _change_task(self, message: ControlMessage) -> None:
         """Change the task, if this state and the robot's limits allow it."""

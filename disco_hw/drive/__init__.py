@@ -33,12 +33,15 @@ class ManualInput:
 @dataclass(frozen=True, slots=True)
 class RobotView:
     """What a source may see of the robot: the daemon's state, whether the last tick drove the wheels by hand, and the
-    wheels' measured speeds (rad/s, left and right), None where they are not known.
+    wheels' measured speeds (rad/s, left and right), None where they are not known; the pose (m, rad), None where
+    there is no valid one; whether the fence guard holds the robot.
     """
 
     state: State
     driving: bool
     wheels: tuple[float, float] | None = None
+    pose: tuple[float, float, float] | None = None
+    fence_stopped: bool = False
 
 
 class ManualSource(Protocol):

@@ -20,14 +20,16 @@ from disco_hw.daemon.process import STANDARD_ERROR, STANDARD_OUTPUT, AsyncPrinte
 from disco_hw.daemon.run import in_text, serve
 from disco_hw.drive import PAD_WORDS, GamepadSource, ManualSource, PageSource
 from disco_hw.drive.coverage import Coverage
+from disco_hw.drive.fit import FittedScriptSource, ScriptGeometry
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.script import Script, ScriptSource, Unattended, in_table, room_needed
 from disco_hw.drive.scripts import make_script
 from disco_hw.drive.terminal import HELP, Keyboard, KeyHold
 from disco_hw.errors import InputError, LogError
+from disco_hw.fence.clearance import Boundaries
 from disco_hw.files import check_log_file, file_name_of
 from disco_hw.log.reader import open_log
-from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.runtime.robot_setup import Setup, geometry, load_setup
 from drivers.gamepad import Gamepad, GamepadError, GamepadMapping, open_gamepad
 
 _VIRTUAL_INTERFACES = ("unixcan", "virtual")
@@ -102,7 +104,7 @@ def run_drive(options: DriveOptions, page_news: Callable[[], tuple[str, ...]] = 
     top_rad_s = config.drive.speed_share * config.robot.max_wheel_speed_rad_s
     words = "cmd_vel: ask the bridge to arm, then it drives; Ctrl-C ends" if options.ros2 else PAD_WORDS
     page = PageSource(top_rad_s, config.drive.turn_share, words) if options.page or options.ros2 else None
-    source = _source(options, config, script, top_rad_s, page)
+    source = _source(options, setup, script, top_rad_s, page)
     try:
         if not options.as_json:
             print("\n".join(_announcement(options, config, script)), flush=True)
@@ -161,8 +163,9 @@ def _announcement(options: DriveOptions, config: RobotConfig, script: Script | N
 
 
 def _source(
-    options: DriveOptions, config: RobotConfig, script: Script | None, top_rad_s: float, page: PageSource | None
+    options: DriveOptions, setup: Setup, script: Script | None, top_rad_s: float, page: PageSource | None
 ) -> ManualSource:
+    config = setup.config
     deadmen = {
         "--unattended": options.unattended,
         "--gamepad": options.gamepad,
@@ -186,7 +189,13 @@ def _source(
         held = _gamepad(config, top_rad_s)
     else:
         held = Keyboard(_STANDARD_INPUT, KeyHold(top_rad_s), MonotonicClock())
-    return held if script is None else ScriptSource(script, held)
+    if script is None:
+        return held
+    if not config.fence.is_set:
+        return ScriptSource(script, held)
+    robot = ScriptGeometry(*geometry(setup.model)[0])
+    room = room_needed(script.at, script.duration_s, config.robot)
+    return FittedScriptSource(script, held, robot, Boundaries(config.robot.footprint, config.fence), room)
 
 
 def _words(link: Link) -> str:

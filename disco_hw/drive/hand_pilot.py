@@ -12,6 +12,7 @@ from disco_hw.drive import INPUT_LIMIT_NS, ManualInput, ManualSource, PageSource
 from disco_hw.drive.coverage import Coverage
 from disco_hw.runtime import State
 from disco_hw.runtime.core import CoreTick, Pilot, PilotTick, TaskPilot
+from disco_hw.runtime.fence_guard import HOLDS_STILL
 from disco_hw.runtime.pipeline import Manual, Source, Stand
 from disco_hw.runtime.supervisor import Reply, UserRequest
 
@@ -126,7 +127,8 @@ class HandPilot:
     def step(self, now_ns: int, last: CoreTick | None) -> PilotTick:
         """Poll the source once and judge what it says."""
         state = State.DISCONNECTED if last is None else last.output.state
-        newest = self._source.poll(now_ns, RobotView(state, self._driving, _measured(last)))
+        view = RobotView(state, self._driving, _measured(last), _pose(last), _is_held(last))
+        newest = self._source.poll(now_ns, view)
         verdict = self._deadman.step(now_ns, newest, state)
         if self._source.ended is not None:
             self._told.append(self._source.ended)
@@ -181,6 +183,17 @@ def _measured(last: CoreTick | None) -> tuple[float, float] | None:
     if last is None or not last.pipeline.estimate.wheels_ok:
         return None
     return last.pipeline.estimate.left_speed_rad_s, last.pipeline.estimate.right_speed_rad_s
+
+
+def _pose(last: CoreTick | None) -> tuple[float, float, float] | None:
+    if last is None or not last.pipeline.estimate.ok:
+        return None
+    estimate = last.pipeline.estimate
+    return estimate.x_m, estimate.y_m, estimate.yaw_rad
+
+
+def _is_held(last: CoreTick | None) -> bool:
+    return last is not None and last.pipeline.fence.verdict in HOLDS_STILL
 
 
 _IN_USE = frozenset({State.ARMED, State.STOPPING})

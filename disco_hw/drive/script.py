@@ -174,11 +174,14 @@ class ScriptSource:
         self._driven = False
         self._driving = False
         self._over = False
+        self._fenced = ""
         self._limits = ReachedLimits()
 
     @property
     def ended(self) -> str | None:
         """The end of the script or of the source of the deadman."""
+        if self._fenced:
+            return f"the fence stopped the script {self._script.name} in {self._fenced}; see the event before it"
         return f"script {self._script.name} completed" if self._over else self._deadman.ended
 
     @property
@@ -210,7 +213,7 @@ class ScriptSource:
         self._advance(now_ns, robot)
         if held is None:
             return None
-        if self._over:
+        if self._over or self._fenced:
             return ManualInput(now_ns, 0.0, 0.0, deadman=False)
         left, right = self._wheels()
         return ManualInput(held.t_ns, left, right, held.deadman)
@@ -240,6 +243,9 @@ class ScriptSource:
             self._limits.observe(manoeuvre.name, manoeuvre.wheels(t_s - began_s), measured)
 
     def _advance(self, now_ns: int, robot: RobotView) -> None:
+        manoeuvre = self._manoeuvre
+        if robot.driving and robot.fence_stopped and manoeuvre is not None:
+            self._fenced = manoeuvre.name
         if robot.driving and self._last_ns is not None:
             # A loop held up must not skip what was to be driven meanwhile.
             self._driven_ns += min(now_ns - self._last_ns, _LONGEST_TICK_NS)

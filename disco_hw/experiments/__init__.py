@@ -98,9 +98,9 @@ class Operator:
         self._check_alive()
         return send_request(self._socket, {"do": "status"}, timeout_s=2.0)
 
-    def request(self, what: str) -> None:
+    def request(self, what: str, **arguments: float | str) -> None:
         """Send one request such as "arm"; raises WorkError with the daemon's reason if it refuses."""
-        reply = send_request(self._socket, {"do": what}, timeout_s=2.0)
+        reply = send_request(self._socket, {"do": what, **arguments}, timeout_s=2.0)
         if not reply.get("ok"):
             raise WorkError(f"the daemon refused to {what}: {reply.get('error')}")
 

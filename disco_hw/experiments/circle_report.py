@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from disco_hw.errors import WorkError
+from disco_hw.fence import Circle, Fence, Footprint
+from disco_hw.fence.clearance import Boundaries
+from disco_hw.fence.outlines import circle_outline
 from disco_hw.log.reader import Log, open_log
 from disco_hw.log.records import Counters
 from disco_hw.reports import write_png
@@ -142,11 +145,26 @@ class CircleReport:
     stopped: bool
     truth: Path
     estimate: Path
+    pillar: Circle | None = None
+    footprint: Footprint | None = None
+
+    @property
+    def left_at_pillar_m(self) -> float | None:
+        """Least true distance between footprint and pillar; None without one."""
+        if self.pillar is None or self.footprint is None:
+            return None
+        poses = np.column_stack([self.truth.x_m, self.truth.y_m, self.truth.yaw_rad])
+        return float(Boundaries(self.footprint, Fence(keep_out=(self.pillar,))).clearance_m(poses).min())
 
     @property
     def success(self) -> bool:
-        """Whether the laps were completed and the robot stands, disarmed."""
-        return self.stopped and self.circle.laps >= self.laps_wanted - _COMPLETED_TOLERANCE_LAPS
+        """Whether the laps were completed, no pillar was touched, and the robot stands, disarmed."""
+        left = self.left_at_pillar_m
+        return (
+            (left is None or left > 0.0)
+            and self.stopped
+            and self.circle.laps >= self.laps_wanted - _COMPLETED_TOLERANCE_LAPS
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """The figures for machines."""
@@ -157,6 +175,7 @@ class CircleReport:
             "estimation": asdict(self.estimation),
             "loop": asdict(self.loop),
             "frames": self.frames,
+            **({} if self.pillar is None else {"left_at_pillar_m": self.left_at_pillar_m}),
         }
 
     def table(self) -> Table:
@@ -181,6 +200,11 @@ class CircleReport:
             *((f"frames {name}", str(count)) for name, count in self.frames.items()),
             ("robot stands, disarmed", "yes" if self.stopped else "NO"),
         ]
+        left = self.left_at_pillar_m
+        if left is not None:
+            rows.insert(
+                1, ("least distance to the pillar", f"{left * 1e3:.0f} mm" + ("" if left > 0.0 else ": TOUCHED"))
+            )
         for row in rows:
             table.add_row(*row)
         return table
@@ -195,6 +219,8 @@ class CircleReport:
             self.task.center_y_m + self.task.radius_m * np.sin(angle),
             color="0.6", linewidth=4.0, label=f"circle, {self.task.radius_m} m",
         )  # fmt: skip
+        if self.pillar is not None:
+            axes.fill(*circle_outline(*self.pillar.center, self.pillar.radius_m).T, color="tab:red", label="pillar")
         axes.plot(self.truth.x_m, self.truth.y_m, color="tab:blue", linewidth=1.4, label="driven")
         axes.plot(
             self.estimate.x_m, self.estimate.y_m, color="tab:orange", linewidth=0.8, linestyle="--", label="estimated"

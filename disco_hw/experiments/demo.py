@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -44,6 +44,7 @@ from disco_hw.experiments.circle_report import (
     load_circle_report,
     picture,
 )
+from disco_hw.fence import Circle, Footprint
 from disco_hw.processes import stolen_ms
 from disco_hw.runtime.robot_setup import Setup, geometry, load_setup
 from disco_hw.tasks.circle import CircleTask, circle_task, inwards_sine
@@ -54,6 +55,14 @@ _STOP_TIMEOUT_S = 10.0
 _STALL_MS = 100
 _PICTURE_ROWS = 14
 _STALL_LOOK_BACK_S = 0.5
+PILLAR = Circle((-0.53, 0.53), 0.12)
+"""What stands on the circle with `--obstacle`, and is driven around."""
+FOOTPRINT = Footprint(0.40, 0.36, 0.10)
+_FOOTPRINT_TOML = "{ length = 0.40, width = 0.36, ahead = 0.10 }"
+_FENCE_TOML = """
+[fence]
+keep_in = [[-1.8, -1.8], [1.8, -1.8], [1.8, 1.8], [-1.8, 1.8]]
+"""
 _WATCHDOG = frozenset({"COMMAND_TIMEOUT", "COMMAND_EXPIRED", "HOST_SILENT"})
 
 
@@ -69,6 +78,7 @@ class DemoOptions:
     uncertainty: str = "ut"
     view: bool = False
     adapt: bool = False
+    obstacle: bool = False
     port: int = DEFAULT_PORT
     show_progress: bool = True
 
@@ -103,6 +113,8 @@ def run_demo(options: DemoOptions) -> CircleReport:
         stopped = _drive_undisturbed(options, files, console)
     task = circle_task(load_robot_config(_shipped_robot()).task, "the demonstration")
     report = load_circle_report(files.log, files.truth, task, options.laps, stopped)
+    if options.obstacle:
+        report = replace(report, pillar=PILLAR, footprint=FOOTPRINT)
     drawn = options.out / "circle.png"
     report.draw(drawn)
     console.print(report.table())
@@ -162,6 +174,8 @@ def _write_robot_file(scratch: Path, options: DemoOptions) -> Path:
         text = text.replace(old, new)
     if options.device is not None:
         text = with_device(text, options.device)
+    if options.obstacle:
+        text = text.replace("[robot]\n", f"[robot]\nfootprint_m = {_FOOTPRINT_TOML}\n", 1) + _FENCE_TOML
     text += f'\n[daemon]\ncontrol_socket = "{scratch / "control.sock"}"\n'
     path = scratch / "robot.toml"
     path.write_text(text, encoding="utf-8")
@@ -235,6 +249,9 @@ def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
         link = options.link if options.device is None else link_of_device(options.device)
         console.print(f"virtual robot pid {robot.process.pid}, daemon pid {daemon.process.pid}, link {link}")
         operator.arm()
+        if options.obstacle:
+            (x_m, y_m), radius_m = PILLAR.center, PILLAR.radius_m
+            operator.request("obstacle", change="add", name="pillar", x_m=x_m, y_m=y_m, radius_m=radius_m)
         operator.request("start")
         _watch_laps(operator, options, 3.0 * lap_s * options.laps + 10.0, console)
         operator.request("stop")

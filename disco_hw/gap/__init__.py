@@ -62,6 +62,7 @@ from disco_hw.gap.search.richest_model import LATE_COLUMNS, candidates_of
 from disco_hw.gap.search.unnamed_terms import with_known_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
 from disco_hw.log import version
+from disco_hw.log.consistency import find_contradictions, refuse_contradictions
 from disco_hw.log.drive import DriveLog, concatenate
 from disco_hw.log.load import load_drive
 from disco_hw.model import Model, load_model, save_model
@@ -94,6 +95,7 @@ def find_gap(
     began = time.perf_counter()
     say = progress or (lambda text: None)
     log = logs if isinstance(logs, DriveLog) else concatenate(logs)
+    warnings = check_consistency(log, model)
     analysis, notes = search_log(log, model, say, settings)
     say("intervals, blind spots and the gap on held-out data")
     final = final_fit(analysis)
@@ -138,6 +140,14 @@ def find_gap(
         settings=settings,
         wheels=wheels,
         across=across_logs(analysis),
+        warnings=warnings,
+    )
+
+
+def check_consistency(log: DriveLog, model: Model) -> tuple[str, ...]:
+    """Warnings of what contradicts itself in a log; raises LogError where nothing can be concluded from it."""
+    return refuse_contradictions(
+        find_contradictions(log, model.wheel_radius_m, model.axial_distance_m), ("body", "response")
     )
 
 
@@ -231,6 +241,7 @@ def missing_effects(log: DriveLog, model: Model) -> tuple[str, ...]:
     them, from commands and with the geometry refitted: a log of two minutes shows a delay of 2 ms, which nobody has to
     know to drive.
     """
+    check_consistency(log, model)
     analysis, _ = search_log(log, model)
     final = final_fit(analysis)
     sure, doubtful = sort_out(effect_findings(analysis, final), Measured.of(analysis, final))

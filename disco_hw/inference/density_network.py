@@ -393,6 +393,10 @@ _LARGEST_TRIES = 400
 _SMALLEST_DEVIATION = 1e-5
 
 
+class EmptyRegionError(ValueError):
+    """No parameters are left to draw: the posterior lies outside the prior, or far from all that was simulated."""
+
+
 @dataclass(frozen=True, slots=True)
 class Region:
     """All points `centre + factor @ z` with every |z| <= 1 that lie in the box from `low` to `high` and in `within`.
@@ -425,7 +429,7 @@ class Region:
         return np.asarray(inside if self.within is None else inside & self.within.contains(theta))
 
     def draw(self, count: int, rng: np.random.Generator) -> Array:
-        """Uniform draws (count, P); raises RuntimeError if the region is all but empty."""
+        """Uniform draws (count, P); raises EmptyRegionError if the region is all but empty."""
         size = self.centre.size
         found: list[Array] = []
         missing = count
@@ -436,7 +440,7 @@ class Region:
             missing -= kept.shape[0]
             if missing == 0:
                 return np.concatenate(found)
-        raise RuntimeError("the region to draw parameters from is all but empty")
+        raise EmptyRegionError("the region to draw parameters from is all but empty")
 
     def shrunk(self, draws: Array, deviations: float) -> Region:
         """The part of this region within `deviations` standard deviations of draws (n, P), along their main axes."""

@@ -25,7 +25,15 @@ from disco_hw.inference.checks import (
     undetermined,
     widening,
 )
-from disco_hw.inference.density_network import Fitted, Mixtures, NetworkSettings, Region, RoundSettings, run_rounds
+from disco_hw.inference.density_network import (
+    EmptyRegionError,
+    Fitted,
+    Mixtures,
+    NetworkSettings,
+    Region,
+    RoundSettings,
+    run_rounds,
+)
 from disco_hw.inference.estimates import cross_correlation, estimates, paper_statistics
 from disco_hw.inference.excitation import USUAL, Excitation, Noise, excitation, measured_noise
 from disco_hw.inference.simulate import (
@@ -121,8 +129,19 @@ def infer(
     `workers` run simulations and fits, by default on all cores; the result is the same. `report_progress` gets stage
     and share done. Raises InputError for a drive or options from which nothing can be inferred.
     """
+    try:
+        return _infer(log, robot, options or InferOptions(), report_progress, workers)
+    except (EmptyRegionError, np.linalg.LinAlgError):
+        raise InputError(
+            f"{', '.join(log.sources)}: no parameters within the prior of robot.toml explain this log: poses, wheels "
+            "and commands are not of one drive, or their units or robot.toml are wrong; check them, or widen the prior"
+        ) from None
+
+
+def _infer(
+    log: DriveLog, robot: RobotConfig, options: InferOptions, report_progress: ReportProgress, workers: Workers | None
+) -> Inference:
     began = perf_counter()
-    options = options or InferOptions()
     simulations = options.simulations or (PAPER_SIMULATIONS if options.paper else DEFAULT_SIMULATIONS)
     if not options.paper and (options.random_features or options.cross_correlation):
         raise InputError("--random-features and --cross-correlation are the paper's: give --paper too")

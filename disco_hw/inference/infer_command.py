@@ -24,6 +24,8 @@ from disco_hw.inference.checks import CHECKS, LARGEST_UNEXPLAINED, LEVELS
 from disco_hw.inference.excitation import excitation
 from disco_hw.inference.infer import Inference, InferOptions, infer
 from disco_hw.inference.simulate import NAMES, LocalWorkers, ReportProgress, Workers, dask_workers
+from disco_hw.log.consistency import find_contradictions, refuse_contradictions
+from disco_hw.log.contradictions import Contradiction
 from disco_hw.log.drive import DriveLog
 from disco_hw.log.load import load_drive
 from disco_hw.model import Model, save_model
@@ -93,10 +95,12 @@ class InferResult:
     robot: Path
     model_path: Path | None
     seconds: float
+    contradictions: tuple[Contradiction, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """For `--json`."""
         return {
+            "contradictions": [{"cause": each.cause, "message": each.message} for each in self.contradictions],
             "posterior": posterior_figures(self.inference),
             "undetermined": list(self.inference.undetermined),
             "outside_simulated": self.inference.predictive.outside_simulated,
@@ -113,7 +117,7 @@ class InferResult:
 
     def as_text(self) -> str:
         """For a person."""
-        lines = []
+        lines = [f"warning: {each.message}" for each in self.contradictions]
         for name, figures in posterior_figures(self.inference).items():
             low, high = figures["ci90"]
             lines.append(f"{name:<18} {figures['mean']:.4f}   90 % between {low:.4f} and {high:.4f}")
@@ -124,6 +128,10 @@ class InferResult:
             marked = "; `disco-hw run` refuses it without --accept-missing-effects" if self.gap.missing else ""
             lines.append(f"{self.model_path}: written in {self.seconds:.1f} s{marked}")
         return "\n".join(lines)
+
+    def all_warnings(self) -> list[str]:
+        """What contradicts itself in the logs, and what `warnings` say."""
+        return [*(f"warning: {each.message}" for each in self.contradictions), *self.warnings()]
 
     def warnings(self) -> list[str]:
         """Sentences for whoever would trust the posterior too early, the next step last."""
@@ -221,19 +229,22 @@ def infer_command(
     config = load_robot_config(robot)
     drive = load_drive(list(logs), config.robot.ticks_per_rev, config.robot.wheel_radius_m)
     nominal = Model.nominal(config.robot)
+    found_wrong = find_contradictions(drive, nominal.wheel_radius_m, nominal.axial_distance_m)
+    by_commands = options is not None and options.paper
+    refuse_contradictions(found_wrong, ("body", "response") if by_commands else ("body",))
     excitation(drive)
     with search(drive, nominal) as searched, _workers(dask) as workers:
         inference = infer(drive, config, options, report_progress, workers)
         report_progress("search for missing effects", 1.0)
         found = searched()
-    result = InferResult(inference, found, tuple(logs), robot, out, perf_counter() - began)
+    result = InferResult(inference, found, tuple(logs), robot, out, perf_counter() - began, found_wrong)
     if out is not None:
         model = replace(inference.model(nominal), missing_effects=found.missing)
         _write(out, lambda: save_model(model, out))
     if report is not None:
         from disco_hw.inference.report import report_html  # noqa: PLC0415  (matplotlib, slow to import)
 
-        page = report_html(inference, posterior_figures(inference), result.warnings())
+        page = report_html(inference, posterior_figures(inference), result.all_warnings())
         _write(report, lambda: report.write_text(page, encoding="utf-8"))
     return result
 

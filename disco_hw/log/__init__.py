@@ -38,11 +38,12 @@ class Attachment(msgspec.Struct, frozen=True):
 
 
 class TaskScene(msgspec.Struct, frozen=True):
-    """What a viewer draws beside the records: the task's course in the world, and the size of the robot (m)."""
+    """What a viewer draws beside the records: task's course, fence, and the robot's size (m)."""
 
     outline_m: tuple[tuple[float, float], ...]
     axial_distance_m: float
     wheel_radius_m: float
+    fence_m: tuple[tuple[tuple[float, float], ...], ...] = ()
 
 
 class Start(msgspec.Struct, frozen=True):

@@ -6,7 +6,7 @@ Poses may come as chains of transforms: what /tf and /tf_static say between fram
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -169,6 +169,29 @@ def concatenate(drives: Sequence[DriveLog]) -> DriveLog:
         notes=tuple(note for drive in drives for note in drive.notes),
         begins_s=tuple(shift + begin for drive, shift in zip(drives, shifts, strict=True) for begin in drive.begins_s),
     )
+
+
+def separate(drive: DriveLog) -> list[tuple[str, DriveLog]]:
+    """The logs that were put one after the other, each with its source's name and its own times."""
+    if len(drive.begins_s) != len(drive.sources):
+        return [(", ".join(drive.sources), drive)]
+    ends_s = (*drive.begins_s[1:], np.inf)
+    return [
+        (source, _between(drive, source, begin_s, end_s))
+        for source, begin_s, end_s in zip(drive.sources, drive.begins_s, ends_s, strict=True)
+    ]
+
+
+def _between(drive: DriveLog, source: str, begin_s: float, end_s: float) -> DriveLog:
+    if len(drive.begins_s) == 1:
+        return drive
+    parts: dict[str, Any] = {}
+    for name in ("commands", "wheels", "poses", "gyro"):
+        part = getattr(drive, name)
+        inside = (part.t_s >= begin_s) & (part.t_s < end_s)
+        arrays = {field: getattr(part, field)[inside] for field in part.__slots__ if not field.endswith("measured")}
+        parts[name] = replace(part, **(arrays | {"t_s": arrays["t_s"] - begin_s}))
+    return replace(drive, sources=(source,), begins_s=(0.0,), **parts)
 
 
 def integrate_angle(t_s: Array, speed_rad_s: Array, segment: Index) -> Array:

@@ -18,6 +18,7 @@ from typing import IO, Any, Protocol, cast
 import msgspec
 from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.CubePrimitive_pb2 import CubePrimitive
+from foxglove_schemas_protobuf.CylinderPrimitive_pb2 import CylinderPrimitive
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.Log_pb2 import Log
@@ -36,7 +37,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from disco_hw.log import Batch, BatchDecoder, End, Start, TaskScene
 from disco_hw.log.encoding import encode_json, json_schema
-from disco_hw.log.records import TOPICS, Estimate, Event, Fan, Plan, Record
+from disco_hw.log.records import TOPICS, Estimate, Event, Fan, FenceGuard, Plan, Record
 from drivers.types import PoseSample
 
 VIEWS: tuple[tuple[str, Any], ...] = (
@@ -45,6 +46,7 @@ VIEWS: tuple[tuple[str, Any], ...] = (
     ("/view/measured_pose", PoseInFrame),
     ("/view/plan", PosesInFrame),
     ("/view/rollouts", SceneUpdate),
+    ("/view/fence", SceneUpdate),
     ("/view/log", Log),
 )
 """Topics and their protobuf classes."""
@@ -86,6 +88,8 @@ def views(record: Record, wall_ns: int) -> list[tuple[str, bytes]]:
             return [("/view/plan", plan.SerializeToString())]
         case Fan() if record.weights:
             return [("/view/rollouts", _rollouts(record, time).SerializeToString())]
+        case FenceGuard() if record.path_x_m or record.obstacles:
+            return [("/view/fence", _stopping(record, time).SerializeToString())]
         case Event():
             log = Log(
                 timestamp=time,
@@ -112,10 +116,46 @@ def scene_message(scene: TaskScene) -> bytes:
         size=Vector3(x=1.5 * width, y=0.75 * width, z=radius),
         color=Color(r=0.9, g=0.6, b=0.1, a=0.8),
     )
-    task = SceneEntity(id="task", frame_id=_WORLD, lines=[line])
+    fence = [
+        LinePrimitive(
+            type=LinePrimitive.LINE_STRIP,
+            pose=Pose(),
+            thickness=0.02,
+            color=Color(r=0.75, g=0.1, b=0.1, a=1.0),
+            points=[Point3(x=x, y=y, z=0.0) for x, y in outline],
+        )
+        for outline in scene.fence_m
+    ]
+    task = SceneEntity(id="task", frame_id=_WORLD, lines=[line, *fence])
     robot = SceneEntity(id="robot", frame_id=_ROBOT, frame_locked=True, cubes=[body])
     message: bytes = SceneUpdate(entities=[task, robot]).SerializeToString()
     return message
+
+
+def _stopping(record: FenceGuard, time: Timestamp) -> SceneUpdate:
+    """The fence guard's stopping path, red where it holds the robot, and the obstacles."""
+    free = record.verdict in {"free", "scaled"}
+    colour = Color(r=0.1, g=0.6, b=0.2, a=1.0) if free else Color(r=0.8, g=0.1, b=0.1, a=1.0)
+    path = LinePrimitive(
+        type=LinePrimitive.LINE_STRIP,
+        pose=_pose(0.0, 0.0, 0.0),
+        thickness=0.02,
+        color=colour,
+        points=[Point3(x=x, y=y, z=0.0) for x, y in zip(record.path_x_m, record.path_y_m, strict=False)],
+    )
+    numbers = record.obstacles
+    obstacles = [
+        CylinderPrimitive(
+            pose=_pose(x, y, 0.0),
+            size=Vector3(x=2.0 * radius, y=2.0 * radius, z=0.3),
+            bottom_scale=1.0,
+            top_scale=1.0,
+            color=Color(r=0.9, g=0.4, b=0.1, a=0.7),
+        )
+        for x, y, radius in zip(numbers[::3], numbers[1::3], numbers[2::3], strict=False)
+    ]
+    entity = SceneEntity(timestamp=time, id="stopping path", frame_id=_WORLD, lines=[path], cylinders=obstacles)
+    return SceneUpdate(entities=[entity])
 
 
 def _rollouts(fan: Fan, time: Timestamp) -> SceneUpdate:

@@ -265,6 +265,48 @@ class UnexplainedMotion(msgspec.Struct, frozen=True, gc=False):
     drift_y_m_s: float
 
 
+class FenceGuard(msgspec.Struct, frozen=True, gc=False):
+    """What the fence guard made of the command of one tick, while there is a fence or an obstacle.
+
+    `scale`: of the requested command that was let through. `clearance_m`: least along the stopping path after it, less
+    the uncertainty of the pose. The rest in every fifth tick: that path of the tracked point, and the obstacles as x, y
+    and radius of one after the other (m).
+    """
+
+    t_ns: int
+    verdict: str
+    scale: float
+    clearance_m: float
+    overridden: bool = False
+    reason: str = ""
+    path_x_m: tuple[float, ...] = ()
+    path_y_m: tuple[float, ...] = ()
+    path_yaw_rad: tuple[float, ...] = ()
+    obstacles: tuple[float, ...] = ()
+
+
+class Fence(msgspec.Struct, frozen=True, gc=False):
+    """The fence from `t_ns` on, where it is another than robot.toml's: [fence] as JSON."""
+
+    t_ns: int
+    fence: str
+
+
+class Obstacle(msgspec.Struct, frozen=True, gc=False):
+    """A report of an obstacle taken in at `t_ns`, or its removal; fields as in `runtime.obstacles.ObstacleReport`."""
+
+    t_ns: int
+    name: str
+    x_m: float = nan
+    y_m: float = nan
+    radius_m: float = nan
+    vx_m_s: float = 0.0
+    vy_m_s: float = 0.0
+    age_s: float = 0.0
+    age_limit_s: float = 0.0
+    removed: bool = False
+
+
 Record = (
     FrameIn
     | FrameOut
@@ -288,6 +330,9 @@ Record = (
     | Fan
     | Controller
     | UnexplainedMotion
+    | FenceGuard
+    | Fence
+    | Obstacle
 )
 
 
@@ -322,6 +367,9 @@ TOPICS: tuple[Topic, ...] = (
     Topic("/adapt", Adaptation),
     Topic("/controller", Controller),
     Topic("/disturbance", UnexplainedMotion),
+    Topic("/fence/guard", FenceGuard),
+    Topic("/fence", Fence),
+    Topic("/obstacle", Obstacle),
 )
 
 TOPIC_INDEX: Mapping[type, int] = MappingProxyType({topic.record: index for index, topic in enumerate(TOPICS)})

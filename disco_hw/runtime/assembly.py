@@ -20,41 +20,66 @@ from disco_hw.adaptation.guard import (
 from disco_hw.config import PoseInput, RobotConfig
 from disco_hw.control.baselines import LAWS, WithFallback
 from disco_hw.control.past_motion import DriveMeans
+from disco_hw.control.surroundings import Surroundings
 from disco_hw.errors import InputError
 from disco_hw.estimation import PoseFusion
 from disco_hw.estimation.correction import DisturbanceEstimator
 from disco_hw.estimation.filter import TAKE_OVER_TIMEOUTS
 from disco_hw.estimation.heading_watch import HeadingWatch
 from disco_hw.estimation.odometry import OdometryParameters
+from disco_hw.fence import Fence
+from disco_hw.fence.clearance import Boundaries
 from disco_hw.files import KEY, read_bytes
 from disco_hw.log.recorder import Recorder
 from disco_hw.model import Model
 from disco_hw.runtime.core import DaemonCore
+from disco_hw.runtime.fence_guard import FenceGuard, StoppingSettings
+from disco_hw.runtime.obstacle_source import obstacle_source_of
 from disco_hw.runtime.pipeline import Governor, Pipeline, Planner, WheelLimits
 from disco_hw.runtime.preflight import check_firmware_limits, check_task, failures
 from disco_hw.runtime.robot_setup import Setup, geometry
 from disco_hw.runtime.supervisor import Supervisor, SupervisorSettings
-from drivers.motor import make_driver, rewired
+from drivers.motor import find_driver, make_driver, rewired
 from drivers.pose import PoseSourceError, SeveralPoses, converted, make_pose_source
 from drivers.private_files import KeyFileError, key_of_file
 from drivers.transport import ReconnectingTransport, TransportSettingsError, make_transport
 from drivers.types import Driver, PoseSource, Transport
 
 _REHEARSALS = 5
+_LEAST_RESPONSE_S = 0.05
 
 
 def make_planner(config: RobotConfig, model: Model) -> control.Disco:
     """DISCO for this robot's task, compiled and warmed up: takes seconds."""
     task = config.task.planned(config.control.mode)
+    settings = control.DiscoSettings.from_config(config.control, config.task.speed_m_s)
     planner = control.Disco(
         model,
         task,
-        control.DiscoSettings.from_config(config.control, config.task.speed_m_s),
+        settings,
         control.CommandLimits.of_robot(config.robot),
         config.control.seed,
+        make_surroundings(config, settings),
     )
     planner.warm_up()
     return planner
+
+
+def make_surroundings(config: RobotConfig, settings: control.DiscoSettings) -> Surroundings | None:
+    """What DISCO keeps away from; None for a robot.toml without [fence], where the guard alone minds obstacles."""
+    if config.fence == Fence():
+        return None
+    around = Surroundings(
+        config.robot.footprint,
+        config.fence.margin_m,
+        config.fence.max_breach_probability,
+        settings.step_s,
+        settings.sampler.horizon,
+        config.task.speed_m_s,
+    )
+    around.set_line(config.task.course().outline_m())
+    around.look_around(Boundaries(config.robot.footprint, config.fence), 0.0)
+    return around
 
 
 def make_pipeline(config: RobotConfig, model: Model, planner: Planner) -> Pipeline:
@@ -77,7 +102,23 @@ def make_pipeline(config: RobotConfig, model: Model, planner: Planner) -> Pipeli
         disturbance=DisturbanceEstimator() if config.control.disturbance else None,
         means=DriveMeans.of(model),
         headings=HeadingWatch(config.pose.labels(), [one.offset for one in config.pose.every()]),
+        guard=make_guard(config, model),
     )
+
+
+def make_guard(config: RobotConfig, model: Model) -> FenceGuard:
+    """The guard of robot.toml's fence; it does nothing until there is a fence or an obstacle.
+
+    The wheels respond as late as the model says, and 50 ms at least.
+    """
+    card = find_driver(config.link.driver).safety_card(config.link.settings())
+    names, mean = model.parameter_names, model.point()
+    late = [f"{one.name}.{one.effect.late_by}" for one in model.effects if one.effect.late_by is not None]
+    response_s = max(_LEAST_RESPONSE_S, sum(float(mean[names.index(name)]) for name in late if name in names))
+    settings = StoppingSettings(
+        response_s, card.reaction_s, config.robot.max_wheel_acceleration_rad_s2, 1.0 / config.control.rate_hz
+    )
+    return FenceGuard(Boundaries(config.robot.footprint, config.fence), settings, config.fence.margin_m)
 
 
 def make_fast_adaptation(setup: Setup, pipeline: Pipeline) -> FastAdaptation:
@@ -144,7 +185,10 @@ def assemble_core(
         return preflight(config, robot, with_task=needs_pose)
 
     pose_source = pose_source_of(config)
-    return DaemonCore(config, transport, driver, supervisor, pipeline, recorder, check, adaptation, pose_source)
+    obstacles = obstacle_source_of(config)
+    return DaemonCore(
+        config, transport, driver, supervisor, pipeline, recorder, check, adaptation, pose_source, obstacles
+    )
 
 
 def pose_source_of(config: RobotConfig) -> PoseSource:

@@ -6,7 +6,9 @@ a pilot says: the task's planner, or somebody in its place.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -17,12 +19,16 @@ from disco_hw.config import RobotConfig
 from disco_hw.log import records
 from disco_hw.log.recorder import Recorder
 from disco_hw.runtime import records_of_tick
+from disco_hw.runtime.obstacles import ObstacleRefused, ObstacleReport
 from disco_hw.runtime.pipeline import FollowTask, Motion, Off, Pipeline, Source, Stand, Tick, untimed
-from disco_hw.runtime.plausibility import Directions, Headway, Plausibility
+from disco_hw.runtime.plausibility import Directions, Headway, Plausibility, PlausibilityStats
 from disco_hw.runtime.pose_jumps import PoseJumps
 from disco_hw.runtime.robot_setup import record_of
+from disco_hw.runtime.safe_area import SafeArea
 from disco_hw.runtime.supervisor import Inputs, Output, Reply, Supervisor, UserRequest
+from disco_hw.runtime.wheel_faults import WheelFaults
 from disco_hw.tasks import RobotTask
+from drivers.motor import find_driver
 from drivers.pose.robot import RobotPoses
 from drivers.types import (
     Driver,
@@ -42,6 +48,27 @@ from drivers.types import (
 STATUS_HOLDS_NS = 500_000_000
 """What the robot said of its state is not known any more after so long: five of its reports have failed to come."""
 _FOLLOW_TASK = FollowTask()
+
+
+class ObstacleSource(Protocol):
+    """Where reports of obstacles come from; those of `disco_hw.runtime.obstacles` in each tick."""
+
+    def receive(self, now_ns: int) -> Sequence[ObstacleReport]:
+        """What was reported since the last call, oldest first; never waits and never raises."""
+
+    def close(self) -> None:
+        """Close it; safe to call twice."""
+
+
+class NoObstacles:
+    """In the place of a source of obstacles where there is none."""
+
+    def receive(self, now_ns: int) -> Sequence[ObstacleReport]:
+        """Return nothing."""
+        return ()
+
+    def close(self) -> None:
+        """Do nothing: this implementation holds no resources."""
 
 
 def unannounced(_now_ns: int, _wheels: Sequence[WheelSample]) -> None:
@@ -83,18 +110,24 @@ class DaemonCore:
         preflight: Callable[[Driver], tuple[str, ...]],
         adaptation: GeometryAdaptation | None = None,
         pose_source: PoseSource | None = None,
+        obstacle_source: ObstacleSource | None = None,
     ) -> None:
         self.config = config
         self.transport = transport
         self.driver = driver
         self.pose_source = pose_source or RobotPoses()
+        self.obstacle_source = obstacle_source or NoObstacles()
         self.pipeline = pipeline
+        guard = pipeline.guard
+        self.area = None if guard is None else SafeArea(guard, config.fence, config.robot.footprint)
+        """Fence and obstacles; None for a pipeline without a guard."""
         self.recorder = recorder
         self.adaptation = adaptation or NoAdaptation()
-        self.plausibility = Plausibility()
+        self._plausibility = Plausibility()
+        self._wheel_faults = WheelFaults(find_driver(config.link.driver).takes_body_speeds)
         robot = config.robot
         self.directions: Directions | None = Directions(robot.wheel_radius_m, robot.axial_distance_m, config.wheels)
-        """None where somebody finds out how the wheels are wired."""
+        """None where somebody finds out how the wheels are wired, and looks at them: no fault of one stops it then."""
         self.task, self.course = config.task, config.task.course()
         self.progress = config.task.progress()
         self._headway = Headway(config.task.reference_speed_m_s)
@@ -121,11 +154,17 @@ class DaemonCore:
         self.entered: dict[str, int] = {}
         self._task_changed = False
 
+    @property
+    def plausibility(self) -> PlausibilityStats:
+        """A snapshot of what was counted of wheels, supply and poses."""
+        counted = self._plausibility.stats
+        return dataclasses.replace(counted, wheels_not_following=self._wheel_faults.not_following)
+
     def set_task(self, task: RobotTask) -> None:
         """Follow another task of the same kind from the next tick on, in which it is recorded."""
         self.task, self.course, self.progress = task, task.course(), task.progress()
         self._headway = Headway(task.reference_speed_m_s)
-        self.pipeline.set_task(task.planned(self.config.control.mode))
+        self.pipeline.set_task(task.planned(self.config.control.mode), self.course.outline_m())
         self._task_changed = True
 
     def tick(
@@ -152,20 +191,20 @@ class DaemonCore:
         believed = self.pipeline.screen(readings)
         if readings.wheels:
             self.announce(now_ns, readings.wheels)
+        self._watch_wheels(now_ns, believed)
         output = self._supervisor.step(now_ns, self._inputs(now_ns, requests, by_hand))
         mark("receive")
         learnt = self.adaptation.step(now_ns)
-        result = self.pipeline.step(now_ns, believed, _motion(output, motion), mark)
+        overridden = self._begin_fence(now_ns, by_hand)
+        result = self.pipeline.step(now_ns, believed, _motion(output, motion), mark, overridden)
         self._jump = self._jumps.step(result.estimate, result.pose_updates)
+        fence_events, fence_records = ((), []) if self.area is None else self.area.end(now_ns, result.fence, overridden)
         command = self._command(output, result)
         sent = self._send(now_ns, output, command, silent=result.source is Source.SILENT)
         mark("send")
-        doubts = self.plausibility.step(now_ns, readings.wheels, readings.poses, readings.power, command)
-        miswired = (
-            None if self.directions is None else self.directions.step(now_ns, readings.wheels, believed.poses, command)
-        )
-        # Stopped in the next tick, and not armed again before the daemon has read what was mended.
-        self._miswired = self._miswired if miswired is None else (miswired,)
+        doubts = self._plausibility.step(now_ns, readings.wheels, readings.poses, readings.power)
+        doubts = (*self._wheel_faults.events, *doubts)
+        self._watch_wiring(now_ns, believed, command)
         events = (
             *readings.events,
             *self._pose_events(),
@@ -174,7 +213,7 @@ class DaemonCore:
             *self._planner_events(result),
             *doubts,
         )
-        events = (*events, *self._stays(now_ns, output, result))
+        events = (*events, *fence_events, *self._stays(now_ns, output, result))
         self._follow_progress(output, result)
         self.recorder.put(
             now_ns,
@@ -187,6 +226,7 @@ class DaemonCore:
                 *self._state_change(now_ns, output),
                 *self._task_change(now_ns),
                 *learnt.records,
+                *fence_records,
                 *(records.Event(now_ns, "info", "daemon", text) for text in events),
                 *extra_records,
             ],
@@ -195,6 +235,40 @@ class DaemonCore:
         mark("record")
         self.last = CoreTick(output, result, command, events, readings)
         return self.last
+
+    def _watch_wheels(self, now_ns: int, readings: Readings) -> None:
+        """Stop a robot of which a wheel does not obey: by its driver, without torque, as a ramp would need encoders."""
+        geometry = self.pipeline.fusion.parameters
+        directions = self.directions
+        is_wiring_known = directions is not None and directions.is_judged
+        fault = self._wheel_faults.step(now_ns, readings.wheels, readings.poses, geometry, is_wiring_known)
+        if fault is not None and directions is not None and self.driver.state is DriverState.ARMED:
+            self.driver.release(fault.words)
+
+    def _watch_wiring(self, now_ns: int, readings: Readings, command: WheelCommand | None) -> None:
+        """Stop a robot that is wired otherwise than declared, until the daemon has read what was mended."""
+        wheels = self._wheel_faults
+        wheels.commanded(now_ns, command)
+        if self.directions is None:
+            return
+        miswired = self.directions.step(
+            now_ns, readings.wheels, readings.poses, command, wheels.has_followed, wheels.is_suspect
+        )
+        if miswired is not None:
+            self._miswired = (miswired,)
+            self.driver.release(miswired)
+
+    def _begin_fence(self, now_ns: int, by_hand: bool) -> bool:
+        """Take in what is reported of obstacles; returns whether a person drives in spite of the fence."""
+        if self.area is None:
+            return False
+        if self.area.guard.boundaries is not None and self.driver.limits is not None:
+            stops = self.driver.limits.stop_deceleration_rad_s2.value
+            self.area.guard.set_deceleration(min(stops, self.config.robot.max_wheel_acceleration_rad_s2))
+        for report in self.obstacle_source.receive(now_ns):
+            with suppress(ObstacleRefused):
+                self.area.report(now_ns, report)
+        return self.area.begin(now_ns, by_hand)
 
     def _follow_link(self, now_ns: int) -> None:
         """Notify the driver when the link comes and goes; a link renewed between two ticks is both."""
@@ -248,6 +322,7 @@ class DaemonCore:
             by_hand=by_hand,
             poses_contradict=self.pipeline.fusion.sources.contradiction,
             pose_jump=self._jump,
+            fence_fault="" if self.area is None else self.area.task_fault,
         )
 
     def _to_learn_from(self, readings: Readings) -> Readings:

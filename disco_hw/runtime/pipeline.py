@@ -14,9 +14,11 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from disco_hw.control import NoValidControl, PlannerState, PlanOutcome, Rollouts, SentCommand, WheelPlan
 from disco_hw.control.past_motion import DriveMeans
@@ -24,8 +26,10 @@ from disco_hw.estimation import PoseEstimate, PoseFusion
 from disco_hw.estimation.correction import DisturbanceEstimator, PoseUpdate
 from disco_hw.estimation.heading_watch import HeadingWatch
 from disco_hw.estimation.odometry import OdometryParameters
+from disco_hw.fence.clearance import Boundaries
 from disco_hw.model import Belief
 from disco_hw.model.coefficients import NO_DISTURBANCE, Disturbance
+from disco_hw.runtime.fence_guard import HOLDS_STILL, IDLE, FenceGuard, FenceState, corner_deviation_m
 from disco_hw.tasks import PlannedTask
 from drivers.types import PoseSample, Readings
 
@@ -41,6 +45,7 @@ class Limited(enum.Flag):
     ACCELERATION = enum.auto()
     PERIOD = enum.auto()
     NOT_FINITE = enum.auto()
+    FENCE = enum.auto()
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,6 +170,17 @@ class Planner(Protocol):
         """The weightiest sequences of the last plan; changes nothing."""
 
 
+@runtime_checkable
+class AvoidsBoundaries(Protocol):
+    """A planner that keeps away from fence and obstacles by itself."""
+
+    def look_around(self, bounds: Boundaries, deviation_m: float) -> None:
+        """Keep away from these boundaries from the next plan on; `deviation_m`: of the footprint's place."""
+
+    def set_line(self, line_m: NDArray[np.float64]) -> None:
+        """Drive around what stands on this line, points (N, 2)."""
+
+
 class NoPlanner:
     """In the place of a planner where the robot is driven by hand: it never has a plan."""
 
@@ -235,7 +251,7 @@ class Tick(msgspec.Struct, frozen=True, gc=False):
 
     `plan` is this tick's new plan or None, `plan_age_ns` the age of the one in force, `planner_failure` why there is no
     new one; `requested` is what `source` wanted, `command` what the governor lets through (rad/s); `disturbance` what
-    was planned with, None where none is estimated.
+    was planned with, None where none is estimated; `fence` what the fence guard made of what was requested.
     """
 
     t_ns: int
@@ -248,6 +264,7 @@ class Tick(msgspec.Struct, frozen=True, gc=False):
     requested: tuple[float, float]
     command: Governed
     disturbance: Disturbance | None = None
+    fence: FenceState = IDLE
 
 
 def untimed(_stage: str) -> None:
@@ -265,7 +282,10 @@ class Pipeline:
         self, fusion: PoseFusion, planner: Planner, governor: Governor, plan_tail_s: float,
         disturbance: DisturbanceEstimator | None = None, means: DriveMeans | None = None,
         headings: HeadingWatch | None = None,
+        guard: FenceGuard | None = None,
     ) -> None:  # fmt: skip
+        self._guard = guard
+        self._avoids = planner if isinstance(planner, AvoidsBoundaries) else None
         self._fusion = fusion
         self.headings = headings or HeadingWatch([one.label for one in fusion.sources.all])
         self._means = means
@@ -289,9 +309,14 @@ class Pipeline:
         """How the robot moves beside its model, as far as is known."""
         return NO_DISTURBANCE if self._disturbance is None else self._disturbance.value
 
-    def set_task(self, task: PlannedTask) -> None:
-        """Follow another task of the same kind; what is planned for the present one is dropped."""
+    def set_task(self, task: PlannedTask, line_m: NDArray[np.float64] | None = None) -> None:
+        """Follow another task of the same kind; what is planned for the present one is dropped.
+
+        `line_m` (N, 2): its line, for a planner that drives around obstacles on it.
+        """
         self._planner.set_task(task)
+        if self._avoids is not None and line_m is not None:
+            self._avoids.set_line(line_m)
         self._plan, self._following = None, False
 
     def set_belief(self, belief: Belief, odometry: OdometryParameters) -> None:
@@ -326,10 +351,18 @@ class Pipeline:
                 self._fusion.forget_heading()
         return msgspec.structs.replace(readings, poses=tuple(poses))
 
-    def step(self, now_ns: int, readings: Readings, motion: Motion, mark: Callable[[str], None] = untimed) -> Tick:
+    def step(
+        self,
+        now_ns: int,
+        readings: Readings,
+        motion: Motion,
+        mark: Callable[[str], None] = untimed,
+        fence_overridden: bool = False,
+    ) -> Tick:
         """Advance by one tick; `mark(stage)` is called at the end of the stages "estimate" and "plan".
 
-        Never raises on what the robot sent; a planner without a valid control is reported in the tick.
+        `fence_overridden`: a person drives in spite of the fence. Never raises on what the robot sent; a planner
+        without a valid control is reported in the tick.
         """
         for wheels in readings.wheels:
             self._fusion.add_wheels(wheels)
@@ -346,7 +379,10 @@ class Pipeline:
         else:
             self._plan, self._following = None, False
         source, requested = self._wanted(now_ns, motion, plan)
-        command = self._govern(now_ns, source, requested)
+        fence, allowed = self._guarded(estimate, source, requested, fence_overridden)
+        command = self._govern(now_ns, source, allowed)
+        if allowed is not requested:
+            command = msgspec.structs.replace(command, limited=command.limited | Limited.FENCE)
         mark("plan")
         return Tick(
             t_ns=now_ns,
@@ -359,7 +395,27 @@ class Pipeline:
             requested=requested,
             command=command,
             disturbance=None if self._disturbance is None else self._disturbance.value,
+            fence=fence,
         )
+
+    def _guarded(
+        self, estimate: PoseEstimate, source: Source, requested: tuple[float, float], overridden: bool
+    ) -> tuple[FenceState, tuple[float, float]]:
+        """What the fence guard says of the requested wheel speeds, and the part of them that it lets through."""
+        if self._guard is None or not self._guard.is_active or source in {Source.OFF, Source.SILENT}:
+            return IDLE, requested
+        last = (self._sent[-1].left_rad_s, self._sent[-1].right_rad_s) if self._sent else (0.0, 0.0)
+        found = self._guard.step(estimate, self._fusion.parameters, last, requested, overridden)
+        if found.verdict in HOLDS_STILL:
+            return found, (0.0, 0.0) if requested != (0.0, 0.0) else requested
+        if found.scale == 1.0:
+            return found, requested
+        return found, (found.scale * requested[0], found.scale * requested[1])
+
+    @property
+    def guard(self) -> FenceGuard | None:
+        """What keeps every command within the fence; None where nothing does."""
+        return self._guard
 
     def _take_pose(self, pose: PoseSample, now_ns: int) -> PoseUpdate:
         update = self._fusion.add_pose(pose, now_ns)
@@ -384,6 +440,8 @@ class Pipeline:
             command_means=() if self._means is None else self._means.commands,
             body_means=() if self._means is None else self._means.body,
         )
+        if self._avoids is not None and self._guard is not None and self._guard.boundaries is not None:
+            self._avoids.look_around(self._guard.boundaries, corner_deviation_m(estimate, self._guard.boundaries))
         try:
             plan = self._planner.plan(now_ns, state)
         except NoValidControl as error:

@@ -1,8 +1,9 @@
-"""Does the robot do what it should: wheels follow commands, supply holds, poses change, and the task gets on.
+"""Does the robot do what it should: supply holds, poses change, the task gets on, and wheels are wired as declared.
 
 `Plausibility` and `Headway` stop nothing: they count and report what the rest of the stack tolerates, faults too short
-or too small for the firmware's own limits, before they grow. `Directions` looks at the first motion after arming: are
-the wheels wired as robot.toml says? If not, the robot is stopped. Their counts are compared with what was commanded,
+or too small for the firmware's own limits, before they grow. `Directions` looks at the first motion: are
+the wheels wired as robot.toml says? If not, the robot is stopped. Once that is known, no later fault is a matter of
+wiring, and `wheel_faults` says what it is. Their counts are compared with what was commanded,
 and the measured poses with what the counts predict: a wheel whose encoder and motor both turn the wrong way looks right
 to the first and not to the second.
 """
@@ -12,18 +13,13 @@ from __future__ import annotations
 import itertools
 import math
 from bisect import bisect_right
-from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from typing import NamedTuple
 
 from drivers.motor import Wiring
 from drivers.types import PoseSample, PowerSample, WheelCommand, WheelSample
 
-COMMANDS_OF_LATE_NS = 600_000_000
-"""Delay and lag of the wheels together: what was commanded so long ago may still be on its way."""
-SLACK_RAD_S = 0.5
-SLACK_PART = 0.2
-SAMPLES_OUTSIDE = 3
 SUPPLY_MEAN_S = 10.0
 DIP_PART = 0.94
 DIP_OVER_PART = 0.97
@@ -34,8 +30,8 @@ _SIDES = ("left", "right")
 
 @dataclass(frozen=True, slots=True)
 class PlausibilityStats:
-    """Times that a wheel was elsewhere than its commands could have taken it, that the supply dipped, and that the pose
-    stayed the same to the last digit while the wheels turned; each counts once, at its beginning.
+    """Times that a wheel began not to follow its commands (`wheel_faults.WheelFaults` counts them), that the supply
+    dipped, and that the pose stayed the same to the last digit while the wheels turned.
     """
 
     wheels_not_following: int = 0
@@ -46,15 +42,12 @@ class PlausibilityStats:
 class Plausibility:
     """Compares what the robot reports with what it was commanded; pure, one step a tick.
 
-    A wheel follows if its speed lies within what it was commanded over the last 0.6 s, give or take 0.5 rad/s and a
-    fifth; it does not after three samples in a row outside. The supply dips by 6 % below its mean over 10 s, and has
+    The supply dips by 6 % below its mean over 10 s, and has
     recovered above 3 %. A pose that is repeated twice to the last digit is frozen.
     """
 
     def __init__(self) -> None:
         self._counts = asdict(PlausibilityStats())
-        self._sent: deque[tuple[int, float, float]] = deque()
-        self._outside = [0, 0]
         self._supply_v: float | None = None
         self._supply_ns = 0
         self._dipped = False
@@ -71,40 +64,9 @@ class Plausibility:
         wheels: Sequence[WheelSample],
         poses: Sequence[PoseSample],
         power: Sequence[PowerSample],
-        command: WheelCommand | None,
     ) -> tuple[str, ...]:
-        """Take in a tick's samples and the command that it sends (None for none); returns what began, in words."""
-        events = [*self._watch_wheels(wheels), *self._watch_supply(power), *self._watch_poses(poses, wheels)]
-        if command is None:
-            self._sent.clear()
-            self._outside = [0, 0]
-        else:
-            self._sent.append((now_ns, command.left_rad_s, command.right_rad_s))
-            while now_ns - self._sent[0][0] > COMMANDS_OF_LATE_NS:
-                self._sent.popleft()
-        return tuple(events)
-
-    def _watch_wheels(self, wheels: Sequence[WheelSample]) -> list[str]:
-        sent = self._sent
-        if not wheels or not sent or sent[-1][0] - sent[0][0] < COMMANDS_OF_LATE_NS // 2:
-            return []
-        _, lefts, rights = zip(*sent, strict=True)
-        events = [
-            *self._watch_wheel(0, min(lefts), max(lefts), [sample.left_speed_rad_s for sample in wheels]),
-            *self._watch_wheel(1, min(rights), max(rights), [sample.right_speed_rad_s for sample in wheels]),
-        ]
-        self._counts["wheels_not_following"] += len(events)
-        return events
-
-    def _watch_wheel(self, side: int, low: float, high: float, speeds: Sequence[float]) -> Iterator[str]:
-        least = low - SLACK_RAD_S - SLACK_PART * abs(low)
-        most = high + SLACK_RAD_S + SLACK_PART * abs(high)
-        for speed in speeds:
-            self._outside[side] = 0 if least <= speed <= most else self._outside[side] + 1
-            if self._outside[side] == SAMPLES_OUTSIDE:
-                yield (
-                    f"the {_SIDES[side]} wheel does not follow: {speed:.1f} rad/s, commanded {low:.1f} to {high:.1f}"
-                )
+        """Take in a tick's samples; returns what began, in words."""
+        return (*self._watch_supply(power), *self._watch_poses(poses, wheels))
 
     def _watch_supply(self, power: Sequence[PowerSample]) -> list[str]:
         events = []
@@ -141,7 +103,7 @@ class Plausibility:
 WINDOW_NS = 5_000_000_000
 LEAST_M = 0.05
 """Who gets no further than this within the window makes no progress; less for a task that is slower than that."""
-LEAST_PART = 0.25
+LEAST_WAY_PART = 0.25
 """Of what the task's speed makes in the window."""
 ASKED_RAD_S = 0.05
 """A command below this asks for no motion."""
@@ -165,7 +127,7 @@ class Headway:
     """Watches a running task of this speed; one of NaN, whose places have times and may rest, is not watched."""
 
     def __init__(self, speed_m_s: float) -> None:
-        self._least_m = min(LEAST_M, LEAST_PART * speed_m_s * WINDOW_NS * 1e-9) if speed_m_s > 0.0 else math.nan
+        self._least_m = min(LEAST_M, LEAST_WAY_PART * speed_m_s * WINDOW_NS * 1e-9) if speed_m_s > 0.0 else math.nan
         self._window: _Window | None = None
 
     def step(
@@ -211,33 +173,67 @@ MOVES_RAD_S = 0.3
 STANDS_RAD_S = 0.15
 LEAST_RAD = 0.15
 LEAST_SUM_RAD = 0.4
+LEAST_PART = 0.1
+"""Of the other wheel's turning: one that turned by less stood, and shows nothing of which side it is on."""
 SAMPLES = 3
 _OPPOSITE_PART = 0.25
 _CROSSED_COSINE, _STRAIGHT_COSINE = 0.97, 0.93
 _SLIP_PART = 0.15
+_COUNTED_PART = 0.25
 _UNKNOWN_PART = 0.2
 """Of the way: a radius that is written down wrongly and slip that lasts, which every pose shows equally."""
 _ENOUGH, _MOST_OF_ONE = 10.0, 4.0
 """Of log-likelihood against what robot.toml says, in all and by one pose."""
 _LARGEST_TURN_RAD = 1.5
+_MOVED_STD, _START_STD, _MOST_STARTS = 6.0, 2.0, 50
+"""Standard deviations of a pose at rest that are no motion, and of their mean; how many count."""
 _TURNED_PARTS = (0.4, 0.6, 0.8, 1.0)
 """Of the turn of an ideal robot: a skid-steer turns less, by how much is what the model knows."""
 Pair = tuple[float, float]
 
 
+class _Start(NamedTuple):
+    """The mean of poses at rest, of one source."""
+
+    source: int
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    poses: int
+
+    @staticmethod
+    def of(pose: PoseSample) -> _Start:
+        """The first one."""
+        return _Start(pose.source, pose.x_m, pose.y_m, pose.yaw_rad, 1)
+
+    def take(self, pose: PoseSample) -> _Start:
+        """Take in one more; another source, or a place that noise does not explain, begins anew."""
+        yaw = math.remainder(pose.yaw_rad - self.yaw_rad, 2.0 * math.pi)
+        away_m = math.hypot(pose.x_m - self.x_m, pose.y_m - self.y_m)
+        moved = away_m > _MOVED_STD * pose.position_std_m or abs(yaw) > _MOVED_STD * pose.yaw_std_rad
+        if pose.source != self.source or moved:
+            return _Start.of(pose)
+        part = 1.0 / (self.poses + 1)
+        x_m, y_m = self.x_m + part * (pose.x_m - self.x_m), self.y_m + part * (pose.y_m - self.y_m)
+        return _Start(self.source, x_m, y_m, self.yaw_rad + part * yaw, min(self.poses + 1, _MOST_STARTS))
+
+
 class Directions:
-    """Pure, one step a tick; `radius_m` and `track_m` are the nominal ones, `wiring` what robot.toml says of it."""
+    """Pure, one step a tick; `radius_m` and `track_m` are the nominal ones, `wiring` what robot.toml says of it.
+
+    The wiring is judged once: after five seconds of motion without a finding it is known to be right.
+    """
 
     def __init__(self, radius_m: float, track_m: float, wiring: Wiring) -> None:
         self._radius_m, self._track_m, self._wiring = radius_m, track_m, wiring
         self._turned: list[tuple[int, float, float]] = []
-        self._pose: PoseSample | None = None
+        self._start: _Start | None = None
         self._begun_ns: int | None = None
         self._last_ns = 0
         self._asked: Pair = (0.0, 0.0)
         self._before: Pair = (0.0, 0.0)
         self._signs: tuple[float, ...] = (0.0, 0.0)
-        self._reversed = self._found = False
+        self._reversed = self._found = self.is_judged = False
         self._in_a_row = ("", 0)
         self._evidence: dict[tuple[bool, tuple[int, ...]], float] = {}
         self._reset()
@@ -248,12 +244,19 @@ class Directions:
         wheels: Sequence[WheelSample],
         poses: Sequence[PoseSample],
         command: WheelCommand | None,
+        has_followed: tuple[bool, bool] = (False, False),
+        is_suspect: bool = False,
     ) -> str | None:
-        """Take in a tick's samples and the command that it sends; returns once what is wrong and what to change."""
+        """Take in a tick's samples and the command that it sends; returns once what is wrong and what to change.
+
+        `has_followed`: wheels that have counted as commanded before, which cannot be wired the other way round.
+        `is_suspect`: a wheel does not follow now, so that poses do not show how it is wired.
+        """
         if command is None:
             self._reset()
             return None
-        if self._found or (self._begun_ns is not None and now_ns - self._begun_ns > JUDGED_NS):
+        self.is_judged = self.is_judged or (self._begun_ns is not None and now_ns - self._begun_ns > JUDGED_NS)
+        if self._found or self.is_judged:
             return None
         for sample in wheels:
             self._turned.append((sample.t_ns, sample.left_angle_rad, sample.right_angle_rad))
@@ -267,14 +270,14 @@ class Directions:
             step_s = (now_ns - self._last_ns) * 1e-9
             self._asked = (self._asked[0] + step_s * self._before[0], self._asked[1] + step_s * self._before[1])
             self._before, self._last_ns = asked, now_ns
-            found = self._by_commands(wheels) or self._by_poses(poses)
+            found = self._by_commands(wheels, has_followed) or (None if is_suspect else self._by_poses(poses))
             self._found = found is not None
             return found
         return None
 
     def _reset(self) -> None:
         self._turned = []
-        self._pose = None
+        self._start = None
         self._begun_ns = None
         self._last_ns = 0
         self._asked = (0.0, 0.0)
@@ -289,8 +292,9 @@ class Directions:
         self, now_ns: int, wheels: Sequence[WheelSample], poses: Sequence[PoseSample], asked: Pair
     ) -> None:
         """What turns and moves from here on belongs to a motion that began at rest."""
-        with_heading = [pose for pose in poses if pose.has_heading]
-        self._pose = with_heading[-1] if with_heading else self._pose
+        for pose in poses:
+            if pose.has_heading:
+                self._start = _Start.of(pose) if self._start is None else self._start.take(pose)
         stands = all(
             max(abs(wheel.left_speed_rad_s), abs(wheel.right_speed_rad_s)) < STANDS_RAD_S for wheel in wheels[-1:]
         )
@@ -306,7 +310,7 @@ class Directions:
         _, left, right = self._turned[at]
         return left - self._turned[0][1], right - self._turned[0][2]
 
-    def _by_commands(self, wheels: Sequence[WheelSample]) -> str | None:
+    def _by_commands(self, wheels: Sequence[WheelSample], has_followed: tuple[bool, bool]) -> str | None:
         """Sides that turn against what was commanded, or as the other was."""
         if not wheels or self._reversed:
             return None
@@ -314,17 +318,24 @@ class Directions:
         wrong = [
             side
             for side in (0, 1)
-            if turned[side] * math.copysign(1.0, asked[side]) < -max(LEAST_RAD, _OPPOSITE_PART * abs(asked[side]))
+            if not has_followed[side]
+            and turned[side] * math.copysign(1.0, asked[side]) < -max(LEAST_RAD, _OPPOSITE_PART * abs(asked[side]))
         ]
         crossed = (asked[1], asked[0])
-        enough = abs(turned[0]) + abs(turned[1]) > LEAST_SUM_RAD
+        enough = abs(turned[0]) + abs(turned[1]) > LEAST_SUM_RAD and min(map(abs, turned)) > LEAST_PART * max(
+            map(abs, turned)
+        )
         if enough and _cosine(turned, crossed) > _CROSSED_COSINE and _cosine(turned, asked) < _STRAIGHT_COSINE:
             return self._again(self._words_of_crossed())
         return self._again(self._words_of_opposite(wrong) if wrong else "")
 
     def _by_poses(self, poses: Sequence[PoseSample]) -> str | None:
         """What else than robot.toml says explains how the robot has moved since it stood."""
-        start, declared = self._pose, (False, (1, 1))
+        start, declared = self._start, (False, (1, 1))
+        counted = self._moved(self._turned[-1][0])
+        if any(abs(turn) < _COUNTED_PART * abs(asked) for turn, asked in zip(counted, self._asked, strict=True)):
+            # A wheel that does not count says nothing of how it is wired.
+            return None
         for pose in poses:
             if start is None or not pose.has_heading or pose.source != start.source:
                 continue
@@ -337,7 +348,9 @@ class Directions:
             far_m = 0.5 * self._radius_m * (abs(turned[0]) + abs(turned[1]))
             arc_std_m = 0.5 * self._track_m * pose.yaw_std_rad
             variance = 2.0 * (pose.position_std_m**2 + arc_std_m**2) + (_SLIP_PART * far_m) ** 2
-            off_declared = max(0.0, self._off_m(ahead_m, yaw, turned, *declared) - _UNKNOWN_PART * far_m)
+            # All poses share the start's error, which may be no evidence.
+            start_m = _START_STD * math.hypot(pose.position_std_m, arc_std_m) / math.sqrt(start.poses)
+            off_declared = max(0.0, self._off_m(ahead_m, yaw, turned, *declared) - _UNKNOWN_PART * far_m - start_m)
             for wired in self._evidence:
                 off = self._off_m(ahead_m, yaw, turned, *wired)
                 gain = 0.5 * (off_declared**2 - off**2) / max(variance, 1e-9)

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from disco_hw.config import Control, Link, Robot
+from disco_hw.fence import Fence
 from disco_hw.tasks import RobotTask
 from drivers.motor import find_driver
 from drivers.types import SAID_BY_WORDS, CyclicFrame, Limits, SafetyCard
@@ -120,6 +121,17 @@ def check_task(robot: Robot, task: RobotTask) -> Check:
     return Check("task", Level.OK, f"{task.in_words()}; the wheels can do {task.fastest_m_s(robot):.2f} m/s on it")
 
 
+def check_fence(robot: Robot, fence: Fence) -> list[Check]:
+    """Say what the fence holds, and where the footprint is only guessed; nothing without a fence."""
+    if not fence.is_set:
+        return []
+    size = robot.footprint
+    found = f"footprint {size.length:.2f} m x {size.width:.2f} m, {size.ahead:+.2f} m ahead of the tracked point"
+    if robot.footprint_m is None:
+        return [Check("fence", Level.WARNING, f"{found}, guessed from the wheels; measure it: robot.footprint_m")]
+    return [Check("fence", Level.OK, found)]
+
+
 def check_command_timing(control: Control, limits: Limits) -> Check:
     """Count how many commands in a row may be lost before the firmware stops the robot."""
     timeout_s = min(control.command_valid_for_s, limits.command_timeout_s.value)
@@ -158,6 +170,7 @@ def check_safety(robot: Robot, card: SafetyCard) -> list[Check]:
         Check("stops when the host is silent", Level.OK, card.host_silent),
         Check("stops by", Level.OK if card.brakes else Level.WARNING, f"{card.stops_by}; {far}"),
         Check("e-stop", Level.OK, card.estop),
+        Check("a wheel does not obey", Level.OK, card.wheel_fault),
     ]
     checks += [Check("not verified", Level.WARNING, text) for text in card.unverified]
     return checks + [Check("to be set in the controller", Level.OK, text) for text in card.setup]

@@ -13,13 +13,30 @@ from typing import Any
 import msgspec
 
 from disco_hw.adaptation.guard import geometry_of
+from disco_hw.config import RobotConfig
 from disco_hw.errors import InputError
+from disco_hw.fence.clearance import Boundaries
 from disco_hw.log.reader import Entry, open_log
-from disco_hw.log.records import BeliefChange, Command, Estimate, Innovation, Plan, Record, Task, UnexplainedMotion
+from disco_hw.log.records import (
+    BeliefChange,
+    Command,
+    Controller,
+    Estimate,
+    Fence,
+    FenceGuard,
+    Innovation,
+    Obstacle,
+    Plan,
+    Record,
+    Task,
+    UnexplainedMotion,
+)
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.assembly import make_pipeline, make_planner, put_in_force
+from disco_hw.runtime.obstacles import Obstacles
 from disco_hw.runtime.pipeline import FollowTask, Manual, Motion, Off, Pipeline, Silent, Source, Stand
 from disco_hw.runtime.robot_setup import setup_of_log, task_of
+from disco_hw.runtime.safe_area import fence_of_record, report_of_record
 from drivers.types import PoseSample, Readings, WheelSample
 
 _TOPICS = (
@@ -32,6 +49,10 @@ _TOPICS = (
     "/task",
     "/belief",
     "/disturbance",
+    "/fence/guard",
+    "/fence",
+    "/obstacle",
+    "/controller",
 )
 _COMPARED = (Estimate, Innovation, UnexplainedMotion, Plan, Command)
 # Whether a command went out is the driver's part, which is not replayed.
@@ -102,15 +123,19 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
             )
         setup = setup_of_log(log, _REPLAYED)
         pipeline = make_pipeline(setup.config, setup.model, make_planner(setup.config, setup.model))
+        area = _ReplayedArea(pipeline, setup.config)
         ticks = values = 0
         difference: Difference | None = None
         for tick, entries in groupby(log.records(_TOPICS), key=lambda entry: entry.tick):
             recorded = list(entries)
             for task in (entry.record for entry in recorded if isinstance(entry.record, Task)):
-                pipeline.set_task(task_of(task, setup.config.task).planned(setup.config.control.mode))
+                changed = task_of(task, setup.config.task)
+                line_m = changed.course().outline_m()
+                pipeline.set_task(changed.planned(setup.config.control.mode), line_m)
             for change in (entry.record for entry in recorded if isinstance(entry.record, BeliefChange)):
                 put_in_force(pipeline, setup.model, geometry_of(change))
-            outcome = _replay_tick(pipeline, recorded)
+            area.take(recorded)
+            outcome = _replay_tick(pipeline, recorded, area.begin(recorded[0].now_ns))
             ticks += 1
             compared, difference = _compare(tick, recorded[0].now_ns, recorded, outcome, tolerance)
             values += compared
@@ -121,7 +146,44 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
         return ReplayReport(ticks, values, log.summary().missing_ticks, log.metadata.version, difference, tolerance)
 
 
-def _replay_tick(pipeline: Pipeline, recorded: Sequence[Entry]) -> list[Record]:
+class _ReplayedArea:
+    """Fence, obstacles and override as they were in each tick of a log."""
+
+    def __init__(self, pipeline: Pipeline, config: RobotConfig) -> None:
+        self._guard = pipeline.guard
+        self._footprint = config.robot.footprint
+        self._fastest_rad_s2 = config.robot.max_wheel_acceleration_rad_s2
+        self._obstacles = Obstacles()
+        self._overridden = False
+
+    def take(self, recorded: Sequence[Entry]) -> None:
+        """Take in what a tick's records say of them."""
+        self._overridden = False
+        for entry in recorded:
+            match entry.record:
+                case Fence() as changed if self._guard is not None:
+                    fence = fence_of_record(changed)
+                    self._guard.set_boundaries(Boundaries(self._footprint, fence), fence.margin_m)
+                case Obstacle(removed=True) as gone:
+                    self._obstacles.remove(gone.name)
+                case Obstacle() as reported:
+                    self._obstacles.report(reported.t_ns, report_of_record(reported))
+                case Controller() as answers if self._guard is not None:
+                    said = {**answers.told, **answers.fixed, **answers.declared}
+                    stops = said.get("stop_deceleration_rad_s2", self._fastest_rad_s2)
+                    self._guard.set_deceleration(min(stops, self._fastest_rad_s2))
+                case FenceGuard() as found:
+                    self._overridden = found.overridden
+
+    def begin(self, now_ns: int) -> bool:
+        """Bring the guard up to a tick; returns whether the fence is overridden in it."""
+        if self._guard is not None:
+            self._obstacles.step(now_ns)
+            self._guard.set_obstacles(self._obstacles.circles(now_ns), self._obstacles.lost)
+        return self._overridden
+
+
+def _replay_tick(pipeline: Pipeline, recorded: Sequence[Entry], fence_overridden: bool) -> list[Record]:
     found = [entry.record for entry in recorded]
     readings = Readings(
         wheels=tuple(record for record in found if isinstance(record, WheelSample)),
@@ -129,7 +191,9 @@ def _replay_tick(pipeline: Pipeline, recorded: Sequence[Entry]) -> list[Record]:
     )
     command = next((record for record in found if isinstance(record, Command)), None)
     motion = Off() if command is None else _motion(command)
-    return list(records_of_tick.tick(pipeline.step(recorded[0].now_ns, pipeline.screen(readings), motion), None, 0.0))
+    screened = pipeline.screen(readings)
+    tick = pipeline.step(recorded[0].now_ns, screened, motion, fence_overridden=fence_overridden)
+    return list(records_of_tick.tick(tick, None, 0.0))
 
 
 def _motion(command: Command) -> Motion:

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from disco_hw.config import PoseInput, Robot, RobotConfig, link_fields, load_robot_config
+from disco_hw.config import PoseInput, Robot, RobotConfig, link_fields, load_robot_config, refuse_outside_task
 from disco_hw.errors import InputError
+from disco_hw.fence.outlines import fence_outlines
 from disco_hw.files import KEY, WAY_POINTS, read_bytes
 from disco_hw.files import MODEL_TOML as MODEL_KIND
 from disco_hw.files import ROBOT_TOML as ROBOT_KIND
@@ -57,6 +58,8 @@ def load_setup(robot: Path, model: Path | None = None, link: str | None = None, 
     else:
         judged, path_file = path_file is None, path_file or robot.parent / config.task.file
         config = msgspec.structs.replace(config, task=config.task.with_file(path_file, config.robot, judged))
+        if judged:
+            refuse_outside_task(robot, config)
     if link is not None:
         config = msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, **link_fields(link)))
     model_file = model
@@ -116,7 +119,8 @@ def geometry(model: Model) -> tuple[tuple[float, float, float], Matrix3]:
 def scene_of(config: RobotConfig) -> TaskScene:
     """The task's course and the robot's size, for whoever draws a log or a running robot."""
     outline = tuple((x, y) for x, y in config.task.course().outline_m().tolist())
-    return TaskScene(outline, config.robot.axial_distance_m, config.robot.wheel_radius_m)
+    fence = tuple(tuple((x, y) for x, y in line.tolist()) for line in fence_outlines(config.fence))
+    return TaskScene(outline, config.robot.axial_distance_m, config.robot.wheel_radius_m, fence)
 
 
 def kept_files(setup: Setup) -> list[Attachment]:

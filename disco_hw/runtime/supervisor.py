@@ -74,7 +74,8 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     task is left to drive. `recording_fault`: why nothing is recorded although it should be, which keeps the robot from
     being armed unless that is asked for. `heading_missing`: positions come, and which way the robot faces is not known.
     `by_hand`: a person drives, who sees that; nobody follows the task. `poses_contradict`: which two pose sources do,
-    in words, else empty. `pose_jump`: how the estimate jumped in the tick before, in words, else empty.
+    in words, else empty. `pose_jump`: how the estimate jumped in the tick before, in words, else empty. `fence_fault`:
+    why the fence lets no task go on, else empty.
     """
 
     link_state: LinkState
@@ -94,6 +95,7 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     by_hand: bool = False
     poses_contradict: str = ""
     pose_jump: str = ""
+    fence_fault: str = ""
 
 
 class Reply(msgspec.Struct, frozen=True, gc=False):
@@ -281,7 +283,7 @@ class Supervisor:
             return f"heading not known; {FIND_HEADING}"
         if self._settings.pose_required and not inputs.pose_ok:
             return "no pose; check the pose sensor, or set estimation.pose_required = false"
-        return None
+        return inputs.fence_fault or None
 
     def _why_not_reset(self, inputs: Inputs, seen: int) -> str | None:
         if self._state is not State.FAULT:

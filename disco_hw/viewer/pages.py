@@ -12,12 +12,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import viser
 
 from disco_hw.daemon.page_feed import FeedSubscriber, feed_path
+from disco_hw.fence import Fence
 from disco_hw.log.records import BeliefChange, Record
 from disco_hw.runtime.robot_setup import record_of, task_in_status
+from disco_hw.runtime.safe_area import record_of_fence
+from disco_hw.viewer.area import FenceEditor, fence_in_force
 from disco_hw.viewer.curves import Plots
 from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.panel import coverage_text, events_text, live_details, live_summary, replay_details, replay_text
@@ -69,6 +73,7 @@ class LivePage:
         self.scene = Scene(server, stage)
         self._views = Views(server, stage.task)
         self.editor = TaskEditor(server, desk.drag)
+        self.fence_editor = FenceEditor(gui, desk.request, stage.fence, stage.footprint)
         add_layers(server, self.scene, self._shade)
 
     def step(self) -> None:
@@ -89,10 +94,12 @@ class LivePage:
         status = self._desk.status
         self._learn_task(status)
         self._learn_belief(status)
+        self._learn_fence(status)
         snapshot = self._snapshot()
         if snapshot is not None:
             self.scene.show(snapshot, everything)
             self._views.follow(snapshot.pose)
+            self.fence_editor.show(snapshot.pose if snapshot.pose_healthy else None)
         self.editor.show(self._stage.task_at(None if snapshot is None else snapshot.task), self._desk.draft)
         if everything:
             behind_ms = None if snapshot is None else (time.monotonic_ns() - snapshot.t_ns) * 1e-6
@@ -136,6 +143,19 @@ class LivePage:
             return
         if self._stage.task_at(record) != asked:
             self.timeline.add(newest, record_of(newest, asked))
+
+    def _learn_fence(self, status: dict[str, Any] | None) -> None:
+        """Take over the daemon's fence: it may have been changed before this page was opened."""
+        newest = self.timeline.last_ns
+        area = None if status is None or not status.get("ok") else status.get("area")
+        if newest is None or area is None:
+            return
+        record = self.timeline.fences.last(newest)
+        if record is not None and newest - record.t_ns < _STATUS_OLDER_NS:
+            return
+        fence = msgspec.convert(area["fence"], Fence)
+        if fence_in_force(self._stage.fence, record) != fence:
+            self.timeline.add(newest, record_of_fence(newest, fence))
 
     def _learn_belief(self, status: dict[str, Any] | None) -> None:
         """Take over the belief in force: it may be from before this page was opened, or of a daemon that has gone."""

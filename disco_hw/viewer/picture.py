@@ -16,7 +16,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from disco_hw.errors import InputError
+from disco_hw.fence.outlines import fence_outlines
 from disco_hw.viewer import curves, scene
+from disco_hw.viewer.area import fence_in_force, obstacle_outlines, stopping_outlines
 from disco_hw.viewer.curves import WINDOW_NS, Curves
 from disco_hw.viewer.recording import ParameterPoints, Recording, ShownRobot, Snapshot, model_in_force
 from disco_hw.viewer.scene import Scene
@@ -151,8 +153,14 @@ def _draw_scene(axes: Axes, snapshot: Snapshot, stage: ShownRobot) -> None:
         body, nose = _outline(snapshot.pose, stage.axial_distance_m)
         axes.fill(*body.T, color=_web(scene.BODY_COLOUR), alpha=0.8)
         axes.fill(*nose.T, color="gold")
+        for line in stopping_outlines(snapshot.guard, stage.footprint):
+            axes.plot(*line.T, color=_web(scene.STOP_COLOUR), linewidth=1.2)
         ellipse = scene.ellipse_points(*snapshot.pose[:2], snapshot.covariance[:2, :2])
         axes.plot(*ellipse.T, color=_web(scene.ELLIPSE_COLOUR), linewidth=1.2)
+    for line in fence_outlines(fence_in_force(stage.fence, snapshot.fence)):
+        axes.plot(*line.T, color=_web(scene.FENCE_COLOUR), linewidth=1.6)
+    for line in obstacle_outlines(snapshot.guard):
+        axes.fill(*line.T, color=_web(scene.OBSTACLE_COLOUR), alpha=0.6)
     (x_m, y_m), reach = course.middle_m, 1.5 * course.reach_m + 0.3
     axes.set(
         xlim=(x_m - reach, x_m + reach),

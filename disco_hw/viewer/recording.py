@@ -15,6 +15,7 @@ from disco_hw.adaptation.guard import geometry_of, with_geometry
 from disco_hw.control.parameter_points import unscented_points
 from disco_hw.effects.registry import DELAY
 from disco_hw.errors import InputError
+from disco_hw.fence import Fence, Footprint
 from disco_hw.log import records
 from disco_hw.log.reader import Log
 from disco_hw.log.records import TOPICS, BeliefChange, FrameIn, FrameOut, Plan, Task
@@ -43,7 +44,8 @@ class Snapshot:
     `pose` (x, y, yaw) m and rad, its `covariance` (3, 3); `speed_m_s`, `yaw_rate_rad_s`; `wheel_angles`,
     `wheel_speeds`, `command` (left, right) rad and rad/s; `plan` not older than half a second; `poses` (N, 3) measured
     in the last 3 s; `trail` (N, 2) of estimated positions; `fan` not older than 1.1 s; `task` where it is not the
-    robot.toml's (`ShownRobot.task_at` makes one of both), `belief` where it is another than the model file's.
+    robot.toml's (`ShownRobot.task_at` makes one of both), `belief` where it is another than the model file's;
+    `guard`: what the fence guard found not over half a second ago, `fence` where it is not the robot.toml's.
     """
 
     t_ns: int
@@ -76,6 +78,8 @@ class Snapshot:
     task: records.Task | None
     belief: records.BeliefChange | None
     adaptation: records.Adaptation | None
+    guard: records.FenceGuard | None = None
+    fence: records.Fence | None = None
 
 
 def snapshot_at(timeline: Timeline, t_ns: int, plan: records.Plan | None) -> Snapshot:
@@ -116,7 +120,14 @@ def snapshot_at(timeline: Timeline, t_ns: int, plan: records.Plan | None) -> Sna
         task=timeline.tasks.last(t_ns),
         belief=timeline.beliefs.last(t_ns),
         adaptation=timeline.adaptations.last(t_ns),
+        guard=_fresh_guard(timeline, t_ns),
+        fence=timeline.fences.last(t_ns),
     )
+
+
+def _fresh_guard(timeline: Timeline, t_ns: int) -> records.FenceGuard | None:
+    guard = timeline.guards.last(t_ns)
+    return guard if guard is not None and t_ns - guard.t_ns <= PLAN_AGE_NS else None
 
 
 def _fresh_fan(timeline: Timeline, t_ns: int) -> records.Fan | None:
@@ -193,7 +204,8 @@ class ParameterPoints:
 class ShownRobot:
     """The robot's name, its task, nominal size (m) and model.
 
-    `x_icr_m` is the model's, `drive_top_rad_s` the fastest that a wheel is driven by hand.
+    `x_icr_m` is the model's, `drive_top_rad_s` the fastest that a wheel is driven by hand; `fence` and `footprint` are
+    robot.toml's.
     """
 
     name: str
@@ -203,6 +215,8 @@ class ShownRobot:
     x_icr_m: float
     drive_top_rad_s: float
     model: Model
+    fence: Fence = Fence()  # noqa: RUF009 - it is frozen
+    footprint: Footprint = Footprint(0.5, 0.4)  # noqa: RUF009 - it is frozen
 
     def task_at(self, record: Task | None) -> RobotTask:
         """The task that is in force where this record of it is the newest; robot.toml's without one."""
@@ -237,6 +251,8 @@ def _stage(setup: Setup) -> ShownRobot:
         x_icr_m=geometry(setup.model)[0][2],
         drive_top_rad_s=setup.config.drive.speed_share * robot.max_wheel_speed_rad_s,
         model=setup.model,
+        fence=setup.config.fence,
+        footprint=robot.footprint,
     )
 
 

@@ -9,8 +9,10 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from disco_hw.fence.outlines import fence_outlines
 from disco_hw.log import records
 from disco_hw.tasks import RobotTask
+from disco_hw.viewer.area import fence_in_force, obstacle_outlines, stopping_outlines
 from disco_hw.viewer.recording import ParameterPoints, ShownRobot, Snapshot, model_in_force
 
 Array = NDArray[np.float64]
@@ -26,6 +28,9 @@ FAN_COLOUR = (0, 105, 125)
 POSES_COLOUR = (125, 125, 132)
 ELLIPSE_COLOUR = (120, 40, 200)
 CENTRE_COLOUR = (0, 0, 0)
+FENCE_COLOUR = (190, 30, 30)
+OBSTACLE_COLOUR = (225, 95, 20)
+STOP_COLOUR = (20, 140, 60)
 
 LAYER_COLOURS = {
     "task": TASK_COLOUR,
@@ -37,6 +42,9 @@ LAYER_COLOURS = {
     "ellipse": ELLIPSE_COLOUR,
     "poses": POSES_COLOUR,
     "centre": CENTRE_COLOUR,
+    "fence": FENCE_COLOUR,
+    "obstacles": OBSTACLE_COLOUR,
+    "stop": STOP_COLOUR,
 }
 TRAIL_FULL_M = 0.1
 """Distance to the task at which the trail is wholly yellow."""
@@ -51,8 +59,12 @@ LAYERS = {
     "ellipse": "95 % of the position",
     "poses": "Measured poses, 3 s",
     "centre": "Turning centre (ICR)",
+    "fence": "Fence",
+    "obstacles": "Obstacles",
+    "stop": "Stopping path and footprint",
 }
 # What lies on the floor, from below: a trail of many laps must hide neither the task nor the rollouts.
+_FENCE_M = 0.004
 _TRAIL_M, _POSES_M, _TASK_M, _FAN_M, _POINTS_M, _PLAN_M = 0.002, 0.003, 0.005, (0.0095, 0.007), 0.011, 0.013
 TRAIL_PALEST = 0.12
 _TRAIL_REACHES = 10.0
@@ -65,7 +77,7 @@ _WHEEL_PARTS = (("front", 0.5), ("rear", -0.5))
 # is drawn twice by a dear shader, and grid, shadows and environment map cost ten times as much as all else together.
 _WIDTH_PX = {
     "task": 3.5, "trail": 4.0, "plan": 3.5, "fan": 1.5, "points": 1.5, "ellipse": 2.0, "centre": 1.5, "poses": 2.5,
-    "grid": 1.5,
+    "grid": 1.5, "fence": 3.0, "obstacles": 3.0, "stop": 2.0,
 }  # fmt: skip
 _GRID_LIGHT, _GRID_DARK = ((236, 236, 236), (190, 190, 190)), ((40, 40, 46), (76, 76, 84))
 _CENTRE_IN_THE_DARK = (225, 225, 225)
@@ -101,7 +113,7 @@ class Scene:
         empty, shades = np.zeros((1, 2, 3)), np.zeros((1, 2, 3), np.uint8)
         self._lines = {
             name: add_lines(server, name, empty, LAYER_COLOURS[name], _WIDTH_PX[name])
-            for name in ("points", "plan", "ellipse", "centre", "poses")
+            for name in ("points", "plan", "ellipse", "centre", "poses", "fence", "obstacles", "stop")
         }
         self._trail = add_lines(server, "trail", empty, shades, _WIDTH_PX["trail"])
         self._fan = add_lines(server, "fan", empty, shades, _WIDTH_PX["fan"])
@@ -123,6 +135,8 @@ class Scene:
                 wheel.wxyz = about_y(angle_rad)
             self._draw("ellipse", self._ellipse(snapshot))
             self._draw("centre", self._centre(snapshot))
+            self._draw("obstacles", _outlines(obstacle_outlines(snapshot.guard)))
+            self._draw("stop", _outlines(stopping_outlines(snapshot.guard, self._stage.footprint)))
             if not everything:
                 return
             plan = snapshot.plan
@@ -130,6 +144,7 @@ class Scene:
             self._draw("plan", segments(path, _PLAN_M))
             self._draw("points", self._points_paths(snapshot))
             self._draw("poses", _pose_marks(snapshot.poses))
+            self._draw("fence", _outlines(fence_outlines(fence_in_force(self._stage.fence, snapshot.fence))))
             self._draw_fan(snapshot.fan)
             self._draw_trail(snapshot)
 
@@ -316,6 +331,10 @@ def sparse(trail: Array, reach_m: float) -> Array:
     kept = np.append(True, np.diff(mark) > 0.0)
     kept[-1] = True
     return np.asarray(trail[kept])
+
+
+def _outlines(lines: list[Array]) -> Array:
+    return np.concatenate([segments(line, _FENCE_M) for line in lines]) if lines else np.empty((0, 2, 3))
 
 
 def _line(task: RobotTask) -> Array:

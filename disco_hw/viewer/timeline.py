@@ -147,8 +147,10 @@ class Timeline:
         self.tasks: Items[records.Task] = Items()
         self.beliefs: Items[records.BeliefChange] = Items()
         self.adaptations: Items[records.Adaptation] = Items()
+        self.guards: Items[records.FenceGuard] = Items()
+        self.fences: Items[records.Fence] = Items()
 
-    def add(self, now_ns: int, record: records.Record | records.PlanFigures) -> None:  # noqa: PLR0912
+    def add(self, now_ns: int, record: records.Record | records.PlanFigures) -> None:  # noqa: PLR0912, PLR0915
         """Take in one record of the tick at `now_ns`; ticks come in order. Frames are not kept."""
         self.first_ns = now_ns if self.first_ns is None else self.first_ns
         self.last_ns = now_ns
@@ -196,6 +198,12 @@ class Timeline:
                 self.beliefs.append(now_ns, it)
             case records.Adaptation() as it:
                 self.adaptations.append(now_ns, it)
+            case records.FenceGuard() as it:
+                # Those between two that hold a path would hide it.
+                if it.path_x_m or it.obstacles or it.reason:
+                    self.guards.append(now_ns, it)
+            case records.Fence() as it:
+                self.fences.append(now_ns, it)
             case _:
                 pass
 
@@ -207,7 +215,7 @@ class Timeline:
             series.forget_before(oldest_ns)
         for items in (
             self.plans, self.status, self.link, self.state, self.source, self.events, self.counters, self.fans,
-            self.tasks, self.beliefs, self.adaptations,
+            self.tasks, self.beliefs, self.adaptations, self.guards, self.fences,
         ):  # fmt: skip
             items.forget_before(oldest_ns)
 

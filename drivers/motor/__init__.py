@@ -164,6 +164,10 @@ class RewiredDriver:
         """Pass on."""
         self._driver.request(request)
 
+    def release(self, why: str) -> None:
+        """Pass on."""
+        self._driver.release(why)
+
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Pass on: an e-stop knows no sides."""
         return self._driver.estop(now_ns)

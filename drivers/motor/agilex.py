@@ -185,6 +185,10 @@ class AgilexDriver:
         self._count("commands_sent")
         return parts.commanding(now_ns, command, self._motion())
 
+    def release(self, why: str) -> None:
+        """Zero and standby from now on: the base has no frame that takes its motors' torque off."""
+        self._end(self._permit.lost(why))
+
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Zero and standby in any state; whatever was wanted is dropped, and nothing is commanded again."""
         self._end(self._permit.stopped())
@@ -321,6 +325,7 @@ DRIVER = MotorDriver(
     "agilex",
     lambda settings, _key: AgilexDriver(settings),
     settings=AgilexSettings,
+    takes_body_speeds=True,
     example=EXAMPLE,
     recognise=recognise,
     latches_stop=False,

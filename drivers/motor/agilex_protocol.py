@@ -193,6 +193,8 @@ def safety_card(settings: AgilexSettings) -> SafetyCard:
         brakes=True,
         estop="no frame for it: zero speed and standby are sent, and nothing latches them but this driver; use the "
         "buttons on the base. Whoever holds the remote control comes first",
+        wheel_fault="zero and standby at once; no frame takes the torque off its motors, and what a lost encoder does "
+        "to them is the base's own matter: use the buttons on the base",
         unverified=(
             "how it slows down, and its time-out, are the manual's words",
             "not tried on hardware: the driver was tried against a simulator made from the manual and the vendor's SDK",

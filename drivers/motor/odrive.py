@@ -204,6 +204,10 @@ class OdriveDriver:
         self._count("commands_sent")
         return parts.commanding(now_ns, command, *self._velocity())
 
+    def release(self, why: str) -> None:
+        """Every axis idles from now on: no torque."""
+        self._idle(self._permit.lost(why))
+
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Frames that stop every axis in any state; whatever was wanted is dropped, and nothing is commanded again."""
         self._permit = self._permit.stopped()

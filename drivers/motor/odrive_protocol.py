@@ -341,6 +341,7 @@ def safety_card(settings: OdriveSettings) -> SafetyCard:
         reaction_s=settings.watchdog_s,
         brakes=False,
         estop="a frame to each axis (0x02): it idles and coasts, latched, reported in its heartbeat",
+        wheel_fault="each axis idles at once, without torque: it coasts",
         unverified=(
             f"watchdog ({settings.watchdog_s:g} s), velocity limit and heartbeat period are declared in robot.toml "
             "and were not read back; any frame to an axis may feed its watchdog",

@@ -46,6 +46,8 @@ FAST_TIME_COUNT = 10
 ZERO_VALID_FOR_S = 0.1
 ESTOP_REPEATS = 3
 SHORTEST_VALID_FOR_S = 0.002
+COASTING_NS = 1_000_000_000
+"""A robot whose motors are released rolls out in this time; the controller's own ramp after it begins at a stand."""
 _HOUSE_KEEPING_NS = 100_000_000
 _ESTOP_DEADLINE_NS = 1_000_000_000
 _PENDING_TIMES = 8
@@ -106,6 +108,8 @@ class ReferenceDriver:
         self._last_heard_ns = 0
         self._events: list[str] = []
         self._foreign_reported = False
+        self._released: str | None = None
+        self._released_ns = 0
         self._now_ns = 0
 
     @property
@@ -118,6 +122,8 @@ class ReferenceDriver:
         if self.identity is None or self._status is None:
             return DriverState.HANDSHAKE
         state = _STATES.get(self._status.state, DriverState.HANDSHAKE)
+        if self._released is not None and state is not DriverState.ESTOP:
+            return DriverState.FAULT
         if self._arming.armed:
             return DriverState.ARMED
         if state is DriverState.STANDBY and self._arming.wanted is Request.ARM:
@@ -128,6 +134,8 @@ class ReferenceDriver:
     def detail(self) -> str:
         """One sentence for a person: why the state is what it is and what to do about it."""
         state, status, note = self.state, self._status, self._arming.note
+        if self._released is not None and state is DriverState.FAULT:
+            return f"{self._released}; remove the cause, then reset"
         if state in _ON_THE_WAY:
             return _ON_THE_WAY[state]
         if state is DriverState.DISCONNECTED:
@@ -199,6 +207,11 @@ class ReferenceDriver:
 
     def request(self, request: Request) -> None:
         """Set what the host wants; held until changed. ARM and RESET are consumed, see `Arming`."""
+        if self._released is not None:
+            if self._is_coasting:
+                # What is asked for meanwhile would end in a ramp, which needs the encoders.
+                return
+            self._released = None if request is Request.RESET else self._released
         if request is Request.ARM and self.state not in _MAY_ARM:
             self._arming.note = f"not arming: {self.detail}"
         elif request is not Request.READY or self._handshake.refusal is None:
@@ -236,7 +249,9 @@ class ReferenceDriver:
         self._check_liveness(now_ns)
         self._arming.step(now_ns)
         frames = []
-        if self._arming.armed and command is not None:
+        if self._is_coasting:
+            frames.append(self._coast(now_ns))
+        elif self._arming.armed and command is not None:
             frames.append(self._wheel_command(now_ns, "SPEED", command))
         elif self._arming.needs_zeros:
             frames.append(self._wheel_command(now_ns, "HOLD_ZERO", WheelCommand(0.0, 0.0, ZERO_VALID_FOR_S)))
@@ -244,11 +259,29 @@ class ReferenceDriver:
             self._watch.rest()
         return self._transmission.proved((*frames, *self._house_keeping(now_ns)))
 
+    def release(self, why: str) -> None:
+        """Switch the motors off (COAST) while the wheels roll out, then disarm; without a session only disarm."""
+        self._released, self._released_ns = why, self._now_ns
+        self._events.append(f"disarmed: {why}")
+        if not self._arming.armed:
+            self._arming.give_up(f"disarmed: {why}")
+
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Frames that stop the robot in any state; whatever was wanted is dropped."""
         self._arming.request(Request.STANDBY)
         frame = self._transmission.frame("ESTOP", now_ns, _ESTOP_DEADLINE_NS, reason="UNSPECIFIED")
         return (frame,) * ESTOP_REPEATS
+
+    @property
+    def _is_coasting(self) -> bool:
+        """Whether the released motors of an armed robot roll out."""
+        return self._released is not None and self._arming.armed
+
+    def _coast(self, now_ns: int) -> OutgoingFrame:
+        """The command that switches the motors off; the last one ends the session, and with it the armed state."""
+        if now_ns - self._released_ns > COASTING_NS:
+            self._arming.give_up(f"disarmed: {self._released}")
+        return self._wheel_command(now_ns, "COAST", WheelCommand(0.0, 0.0, ZERO_VALID_FOR_S))
 
     def _wheel_command(self, now_ns: int, mode: str, command: WheelCommand) -> OutgoingFrame:
         frame = self._transmission.frame(
@@ -484,6 +517,7 @@ def _safety_card(_settings: NoSettings) -> SafetyCard:
         reaction_s=0.1,
         brakes=True,
         estop="a frame of any length, also from `disco-hw estop`: it decelerates, latched and confirmed",
+        wheel_fault="the motors are off (COAST) while the wheels roll out, 1 s, then disarmed and braked; no ramp",
     )
 
 

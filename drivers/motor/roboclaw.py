@@ -270,6 +270,10 @@ class RoboclawDriver:
         self._count("commands_sent")
         return (*parts.commanding(now_ns, command, *self._velocity(now_ns)), *self._questions(now_ns, self._all))
 
+    def release(self, why: str) -> None:
+        """Zero duty for every motor from now on, which needs no encoder."""
+        self._stop(self._permit.lost(why))
+
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Packets that stop every motor in any state; the driver goes on with that until they are taken."""
         self._stop(self._permit.stopped())

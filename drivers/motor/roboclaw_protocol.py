@@ -313,6 +313,8 @@ def safety_card(settings: RoboclawSettings) -> SafetyCard:
         brakes=False,
         estop="through the daemon first, as two must not speak at once; zero duty for every board, which nothing "
         "latches but this driver and nothing confirms but standing motors: wire a button to S3, S4 or S5",
+        wheel_fault="zero duty for every motor at once, which needs no encoder; its PID, which runs to full speed with "
+        "a lost one, gets no speed any more",
         unverified=(
             "whether a motor that is stopped brakes or coasts; which packets feed the timeout is the manual's word",
             "not tried on hardware: the driver was tried against a simulator made from the manual and the vendor's "

@@ -173,6 +173,10 @@ class Ros2BaseDriver:
         self._count("commands_sent")
         return parts.commanding(now_ns, command, self._motion())
 
+    def release(self, why: str) -> None:
+        """The bridge says zero and stands by from now on: no topic takes the motors' torque off."""
+        self._end(self._permit.lost(why))
+
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Stop in any state; whatever was wanted is dropped, and nothing is commanded again."""
         self._end(self._permit.stopped())
@@ -332,6 +336,7 @@ DRIVER = MotorDriver(
     "ros2_base",
     lambda settings, _key: Ros2BaseDriver(settings),
     settings=wire.Ros2BaseSettings,
+    takes_body_speeds=True,
     example=wire.EXAMPLE,
     stop_frames=wire.stop_frames,
     stop_confirmation=wire.stop_confirmation,

@@ -267,6 +267,8 @@ def safety_card(settings: Ros2BaseSettings) -> SafetyCard:
         brakes=True,
         estop="zero speed, which the bridge repeats and latches until it is reset, as long as it lives and the network "
         "carries it; whoever else may speak on the topic can move the base: use the button on it",
+        wheel_fault="the bridge says zero at once and stands by; no topic takes the torque off the motors: a base "
+        "whose speed loops are not reset by a speed of zero may run on with a lost encoder: use the button on it",
         unverified=(
             f"link.watchdog_s = {base_s:g} is declared: ROS 2 has no way to read it back. With the wheels up, kill the "
             f"bridge while they turn: they must stop",

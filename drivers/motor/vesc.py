@@ -207,6 +207,10 @@ class VescDriver:
         self._count("commands_sent")
         return (*parts.commanding(now_ns, command, *self._velocity()), *asked)
 
+    def release(self, why: str) -> None:
+        """Every motor is braked by a current from now on, then let go, which needs no speed loop."""
+        self._permit = self._permit.lost(why)
+
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Frames that brake every motor in any state; the driver goes on with that until they stand."""
         self._permit = self._permit.stopped()

@@ -213,6 +213,8 @@ def safety_card(settings: VescSettings) -> SafetyCard:
         brakes=brakes,
         estop=f"a frame to all: brakes with {settings.brake_current_a:g} A; nothing latches it but this driver, and "
         "nothing confirms it but standing motors",
+        wheel_fault=f"a brake current of {settings.brake_current_a:g} A while a motor says that it turns, then a "
+        "current of zero; neither needs the speed loop",
         unverified=(
             "the speeds are declared in robot.toml and were not read back; the timeout and its brake current are, "
             "where the firmware reports them",

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from drivers.motor.agilex_protocol import AgilexSettings
 from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_protocol import CanFrame
+from sim.encoder_loop import EncoderLoop, EncoderUse
 
 TIMEOUT_MS = 500
 STANDBY, CAN_MODE, UART_MODE, RC_MODE = range(4)
@@ -168,6 +169,15 @@ class AgilexController:
         linear, angular = self.base.commanded
         turn = 0.5 * self._settings.track_m * angular
         return (linear - turn) / self._settings.wheel_radius_m, (linear + turn) / self._settings.wheel_radius_m
+
+    @property
+    def regulates(self) -> bool:
+        """Whether its wheels' loops run: in the modes in which somebody drives it, standing too."""
+        return self.base.vehicle_state == 0 and self.base.control_mode in (CAN_MODE, RC_MODE)
+
+    def make_loop(self) -> EncoderLoop:
+        """Its wheels' speed loops, assumed to be as simple as can be: the vendor tells nothing of them."""
+        return EncoderLoop(EncoderUse.SPEED, self._settings.max_speed_m_s / self._settings.wheel_radius_m)
 
     @property
     def state(self) -> str:

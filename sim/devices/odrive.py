@@ -17,6 +17,7 @@ from drivers.motor.odrive_protocol import OdriveSettings
 from drivers.motor.vendor_parts import sides_of
 from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_protocol import CanFrame
+from sim.encoder_loop import EncoderLoop, EncoderUse
 
 CHECKS_PER_MS = 8
 IDLE, CLOSED_LOOP, POSITION_CONTROL, VELOCITY_CONTROL, PASSTHROUGH = 1, 8, 3, 2, 1
@@ -344,6 +345,16 @@ class OdriveController:
             turns = sum(held) / len(held) if held else None
             wheels.append(None if turns is None else direction * turns * 2.0 * math.pi / self._settings.gear)
         return wheels[0], wheels[1]
+
+    @property
+    def regulates(self) -> bool:
+        """Whether an axis is in closed loop."""
+        return any(axis.axis_state == CLOSED_LOOP for side in self.axes for axis in side)
+
+    def make_loop(self) -> EncoderLoop:
+        """Its field-oriented control, whose angle is the encoder's."""
+        turns_s = self._settings.vel_limit_turns_s
+        return EncoderLoop(EncoderUse.COMMUTATION, 2.0 * math.pi * turns_s / self._settings.gear)
 
     @property
     def state(self) -> str:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from drivers.motor.roboclaw_protocol import RoboclawSettings
 from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_protocol import CanFrame
+from sim.encoder_loop import EncoderLoop, EncoderUse
 
 QUIET_US = 10_000
 
@@ -200,8 +201,6 @@ class RoboclawController:
     boards without supply.
     """
 
-    brakes = False
-
     def __init__(self, settings: RoboclawSettings, ticks_per_rev: int) -> None:
         self._settings = settings
         self._counts_per_tick = settings.counts_per_rev / ticks_per_rev
@@ -221,6 +220,21 @@ class RoboclawController:
             mean = direction * sum(known) / len(side) / self._settings.counts_per_rad
             held.append(mean if len(known) == len(side) else None)
         return held[0], held[1]
+
+    @property
+    def brakes(self) -> bool:
+        """Whether zero duty shorts every motor."""
+        return all(board.command == ("duty", 0, 0) for board in self.boards.values())
+
+    @property
+    def regulates(self) -> bool:
+        """Whether a motor has a speed to hold; a fixed duty needs no encoder."""
+        return any(board.command is not None and board.command[0] == "speed" for board in self.boards.values())
+
+    def make_loop(self) -> EncoderLoop:
+        """Its velocity PID, which full duty (QPPS) ends."""
+        qpps = min(board.registers.pid_m1[3] for board in self.boards.values())
+        return EncoderLoop(EncoderUse.SPEED, qpps / self._settings.counts_per_rad)
 
     @property
     def state(self) -> str:

@@ -13,6 +13,7 @@ from drivers.motor import ros2_base_wire as wire
 from drivers.types import Frame
 from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_protocol import CanFrame
+from sim.encoder_loop import EncoderLoop, EncoderUse
 
 WHEELS_MS, STATE_MS, STEP_MS = 20, 50, 20
 
@@ -36,6 +37,15 @@ class Ros2BaseController:
         linear, angular = self._said if self._now_ms - self._said_ms <= 1e3 * self._settings.watchdog_s else (0.0, 0.0)
         turn = 0.5 * self._settings.track_m * angular
         return (linear - turn) / self._settings.wheel_radius_m, (linear + turn) / self._settings.wheel_radius_m
+
+    @property
+    def regulates(self) -> bool:
+        """Whether its wheels' loops run; they are reset by a speed of zero, as in the usual firmware of small bases."""
+        return self.wheels_rad_s != (0.0, 0.0)
+
+    def make_loop(self) -> EncoderLoop:
+        """Its wheels' speed loops."""
+        return EncoderLoop(EncoderUse.SPEED, self._settings.max_speed_m_s / self._settings.wheel_radius_m)
 
     @property
     def state(self) -> str:

@@ -16,6 +16,7 @@ from drivers.motor.vendor_parts import sides_of
 from drivers.motor.vesc_settings import VescSettings
 from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_protocol import CanFrame
+from sim.encoder_loop import EncoderLoop, EncoderUse
 
 BUFFER = 520
 APPCONF_SIGNATURE = 3264926020
@@ -395,6 +396,15 @@ class VescController:
             erpm = sum(held) / len(held) if held else None
             wheels.append(None if erpm is None else direction * erpm / self._settings.erpm_per_rad_s)
         return wheels[0], wheels[1]
+
+    @property
+    def regulates(self) -> bool:
+        """Whether a motor has a speed to hold; currents need no loop of speed."""
+        return any(vesc.held[0] == "set_erpm" for side in self.sides for vesc in side)
+
+    def make_loop(self) -> EncoderLoop:
+        """Its field-oriented control, whose angle is the encoder's."""
+        return EncoderLoop(EncoderUse.COMMUTATION, self._settings.max_erpm / self._settings.erpm_per_rad_s)
 
     @property
     def state(self) -> str:

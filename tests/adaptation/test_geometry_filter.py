@@ -9,6 +9,7 @@ import pytest
 
 from disco_hw.adaptation.geometry_filter import GeometryFilter
 from disco_hw.control.baselines import Kanayama
+from tests.tables import thinned
 from tools.bench_adapt import SCENARIOS, estimate
 from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots
 from tools.tracking import classical, tracks
@@ -65,7 +66,7 @@ def settled():
     return found
 
 
-@pytest.mark.parametrize("factor", [0.85, 1.15])
+@thinned("factor", [0.85, 1.15], quick=1)
 @pytest.mark.parametrize(("index", "field"), [(0, "radius_m"), (1, "axle_m"), (2, "x_icr_m")])
 def test_four_fifths_of_a_change_are_known_after_two_and_a_half_seconds(settled, index, field, factor):
     known_part = []

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from disco_hw.cli import app, plain_stop
 from disco_hw.daemon import emergency
+from tests.tables import thinned
 
 VERBS = [
     *("demo", "run", "sim", "drive", "ctl", "check", "replay", "estop"),
@@ -33,7 +34,7 @@ def test_help_lists_every_verb():
         assert f" {verb} " in result.stdout
 
 
-@pytest.mark.parametrize(
+@thinned(
     "arguments",
     [
         ("replay", "/nowhere.mcap"),
@@ -44,6 +45,7 @@ def test_help_lists_every_verb():
         ("estop", "/nowhere.toml"),
         ("view",),
     ],
+    quick=2,
 )
 def test_a_mistake_is_one_line_and_exit_code_2(arguments):
     result = disco(*arguments)

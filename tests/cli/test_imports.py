@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import disco_hw
+from tests.tables import thinned
 
 SHIPPED = Path(disco_hw.__file__).parent / "robots"
 HEAVY = ("scipy", "torch", "matplotlib", "numba", "cantools", "filterpy", "viser", "zmq", "mcap", "cryptography",
@@ -69,7 +70,7 @@ def test_a_daemon_is_asked_whatever_has_become_of_the_task_in_the_file_but_not_w
     assert (code, "rate_hz" in said) == (2, True)
 
 
-@pytest.mark.parametrize(
+@thinned(
     "verb",
     [
         ["ctl", "{none}", "status"], ["run", "{none}"], ["drive", "{none}"], ["check", "{none}"], ["sim", "{none}"],
@@ -79,7 +80,7 @@ def test_a_daemon_is_asked_whatever_has_become_of_the_task_in_the_file_but_not_w
         ["infer", "{none}", "--robot", "{robot}"], ["gap", "{none}", "--robot", "{robot}", "-o", "out"],
         ["log", "info", "{none}"], ["log", "recover", "{none}", "-o", "out"], ["log", "export", "{none}", "-o", "out"],
         ["import", "{none}", "--robot", "{robot}", "-o", "out"],
-    ],
+    ], quick=4,
     ids=" ".join,
 )  # fmt: skip
 def test_a_missing_file_is_refused_before_anything_heavy_is_loaded(robot, tmp_path, verb):
@@ -102,7 +103,7 @@ def test_a_model_that_is_no_toml_is_refused_before_anything_heavy_is_loaded(robo
     assert not loaded & set(HEAVY)
 
 
-@pytest.mark.parametrize("module", ["disco_hw.daemon.run", "disco_hw.daemon.check"])
+@thinned("module", ["disco_hw.daemon.run", "disco_hw.daemon.check"], quick=1)
 def test_what_drives_loads_nothing_that_it_does_not_use(module):
     command = [sys.executable, "-c", IMPORTED.format(module=module)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
@@ -114,6 +115,7 @@ def test_what_drives_loads_nothing_that_it_does_not_use(module):
     assert "filterpy.kalman" in loaded or module != "disco_hw.daemon.run"
 
 
+@pytest.mark.thorough
 def test_filterpys_statistics_are_there_for_who_asks_for_them():
     text = "import disco_hw.estimation, filterpy.stats\nprint(filterpy.stats.logpdf([1.0], [0.0], [[1.0]]))"
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=120, check=True)

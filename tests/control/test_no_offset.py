@@ -3,13 +3,13 @@
 import math
 
 import numpy as np
-import pytest
 
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, SentCommand
 from disco_hw.experiments.circle import KinematicPlant
 from disco_hw.model import Gaussian, Model
 from disco_hw.model.model import EffectSetting
 from disco_hw.tasks.circle import CircleCost
+from tests.tables import thinned
 
 THETA = {"wheel_radius_m": 0.061, "axial_distance_m": 0.415, "x_icr_m": 0.238}
 MEAN = np.array(list(THETA.values()))
@@ -38,8 +38,8 @@ def mean_distance_m(settings, rate_hz, speed_m_s, radius_m):
     return float(np.mean(distance[len(distance) * 2 // 5 :]))
 
 
-@pytest.mark.parametrize("rate_hz", [10.0, 25.0, 50.0])
-@pytest.mark.parametrize("speed_m_s", [0.1, 0.2, 0.4, 0.6])
+@thinned("rate_hz", [10.0, 25.0, 50.0], quick=2)
+@thinned("speed_m_s", [0.1, 0.2, 0.4, 0.6], quick=2)
 def test_the_circle_is_driven_without_an_offset(rate_hz, speed_m_s):
     settings = DiscoSettings.for_speed(speed_m_s, rate_hz)
     for radius_m in (0.3, 0.75, 3.0):

@@ -94,6 +94,7 @@ def test_the_body_s_mean_is_that_of_its_wheels():
     assert twice - mean == pytest.approx(np.diff(commands[-1])[0])
 
 
+@pytest.mark.thorough
 def test_a_run_of_the_model_remembers_the_same():
     commands = weaving(150)
     undelayed = Model(0.06, 0.4, effects=MODEL.effects[1:])

@@ -18,6 +18,7 @@ from disco_hw.daemon import check, run
 from disco_hw.daemon.run import compile_beforehand, compile_progress
 from disco_hw.inference import infer_command
 from disco_hw.model import EffectSetting, load_model, save_model
+from tests.tables import thinned
 
 KERNEL = """
 from drivers.kernel_cache import compiled
@@ -98,13 +99,14 @@ def test_a_first_start_compiles_in_another_process_and_the_next_one_not_at_all(s
     assert start(START)[1:] == (set(), "3.0")
 
 
+@pytest.mark.thorough
 def test_what_cannot_be_kept_is_compiled_by_the_process_itself(start):
     # A function that is in no file has no place beside it for its kernel.
     own, compiled_by, result = start(START.replace("from kernel import double", KERNEL))
     assert (compiled_by, result) == ({own}, "3.0")
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@thinned("number", [signal.SIGTERM, signal.SIGKILL], quick=1)
 def test_who_compiles_ends_with_the_process_that_it_compiles_for(start, number):
     for_ever = "(double(1.5), time.sleep(3600))"
     start("import time\n" + START.replace("double(1.5)", for_ever), ended_by=number)

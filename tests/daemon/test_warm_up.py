@@ -7,14 +7,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from disco_hw.config import Estimation
 from disco_hw.control import NoValidControl
 from disco_hw.daemon.run import warm_up
 from disco_hw.estimation import PoseFusion
 from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.runtime.pipeline import Governor, Pipeline, WheelLimits
+from tests.tables import thinned
 
 
 class Refusing:
@@ -42,7 +41,7 @@ def test_poses_are_accepted_gated_and_refused_and_the_planner_is_asked():
     assert fusion.stats.poses_not_finite == 1
 
 
-@pytest.mark.parametrize("uncertainty", ["ut", "mc"])
+@thinned("uncertainty", ["ut", "mc"], quick=1)
 def test_nothing_is_compiled_while_the_robot_is_driven(uncertainty):
     # In a process of its own: what another test has compiled would hide it.
     command = [sys.executable, "-m", "tests.runtime.driven_once", uncertainty]

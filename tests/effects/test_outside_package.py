@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.effects.outside import ROOT, OutsidePackage, effect_of_the_page, entry_points_of_the_page
+from tests.tables import thinned
 
 TURN_DROOP, MAST_LEAN = (
     Path(__file__).with_name(name).read_text(encoding="utf-8") for name in ("turn_droop.py", "mast_lean.py")
@@ -21,6 +22,7 @@ for effects in ({"motor_lag": {"tau_s": 0.1}}, {"motor_lag": {"tau_s": 0.1}, "tu
 """
 
 
+@pytest.mark.thorough
 def test_the_wheels_of_an_effect_that_uses_the_geometry_differ_between_its_points(tmp_path):
     assert OutsidePackage(tmp_path, turn_droop=TURN_DROOP).printed(POINTS_DIFFER).split() == ["False", "True"]
 
@@ -75,6 +77,7 @@ print(json.dumps({
 """
 
 
+@pytest.mark.thorough
 def test_model_files_fan_competition_classes_and_checks_have_effects_of_other_packages(tmp_path):
     package = OutsidePackage(tmp_path, turn_droop=TURN_DROOP, mast_lean=MAST_LEAN, speed_drag=effect_of_the_page())
     found = json.loads(package.printed(EVERYWHERE, str(tmp_path / "model.toml")))
@@ -98,6 +101,7 @@ def test_the_page_names_the_module_that_it_shows():
     assert 'name="speed_drag"' in effect_of_the_page()
 
 
+@pytest.mark.thorough
 def test_the_virtual_robot_refuses_to_hide_it_in_one_line(tmp_path):
     package = OutsidePackage(tmp_path, turn_droop=TURN_DROOP)
     robot = str(ROOT / "disco_hw/robots/wombot.toml")
@@ -125,7 +129,7 @@ REFUSALS = {
 }
 
 
-@pytest.mark.parametrize(("text", "line"), REFUSALS.values(), ids=REFUSALS)
+@thinned(("text", "line"), list(REFUSALS.values()), quick=2, ids=REFUSALS)
 def test_a_wrong_description_is_refused_in_one_line(tmp_path, text, line):
     package = OutsidePackage(tmp_path, turn_droop=text)
     done = package.python("-m", "disco_hw", "check", str(ROOT / "disco_hw/robots/wombot.toml"))

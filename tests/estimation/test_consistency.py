@@ -91,6 +91,7 @@ def test_late_lossy_unordered_poses_leave_the_filter_consistent(slipping, seeds)
     assert_consistent(np.array(nees))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seeds", SEEDS)
 def test_uncertain_geometry_stays_consistent_only_if_the_filter_is_told(seeds):
     rng = np.random.default_rng(7)
@@ -121,6 +122,7 @@ def rmse(drive, runs):
     return np.sqrt(np.mean(np.sum(errors[..., :2] ** 2, axis=-1))), np.sqrt(np.mean(errors[..., 2] ** 2))
 
 
+@pytest.mark.thorough
 def test_late_lossy_unordered_poses_cost_less_than_three_percent_of_accuracy():
     # Wheels that do not slip: slip of the last 200 ms cannot be known to anyone, and would be added to the error.
     drive = drives(15, 8.0, slip=Slip(0.0, 0.0, 0.0))

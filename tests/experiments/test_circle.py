@@ -110,6 +110,7 @@ def test_every_curve_is_driven_and_reported(short):
     assert cost["true parameters"] < cost["posterior"] < cost["point estimate"] < cost["prior"]
 
 
+@pytest.mark.thorough
 def test_table_csv_and_picture(short, tmp_path):
     result, _ = short
     table = result.table()

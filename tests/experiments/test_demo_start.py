@@ -143,6 +143,7 @@ def test_the_time_in_which_a_first_start_compiles_does_not_count(tmp_path, monke
     assert daemon.looks <= 0
 
 
+@pytest.mark.thorough
 @pytest.mark.hil
 @pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGKILL, marks=pytest.mark.long)])
 def test_a_demonstration_that_is_ended_from_outside_leaves_no_process_behind(tmp_path, number):

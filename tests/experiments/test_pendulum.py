@@ -42,6 +42,7 @@ def swings():
     return run_pendulum(PendulumOptions(seeds=3, steps=200), reported.append), reported
 
 
+@pytest.mark.thorough
 def test_the_papers_ordering(swings):
     result, reported = swings
     assert [line.rsplit(":", 1)[0] for line in reported] == list(CURVES)

@@ -58,6 +58,7 @@ def test_exactly_the_hidden_effect_is_named_and_the_gap_closes(name, size, param
     assert report.offered == "amended"
 
 
+@pytest.mark.thorough
 def test_a_steady_circle_shows_what_stands_beside_the_lag_of_real_motors():
     log = simulated_drive({"wheel_gain": -0.044}, seed=11101, drive="circle", motors="real")
     report = find_gap(log, MODEL, pictures=False)
@@ -99,6 +100,7 @@ def test_a_sensor_mounted_aside_is_reported_as_a_class():
     assert report.effects[0].experiment
 
 
+@pytest.mark.thorough
 def test_a_steady_circle_is_blind_to_what_it_cannot_show():
     report = report_of(("turn_slip", 0.1), drive="circle")
     assert not report.effects
@@ -106,6 +108,7 @@ def test_a_steady_circle_is_blind_to_what_it_cannot_show():
     assert {"turn_slip", "side_slip", "wheel_radius_asymmetry", "heading_bias"} <= blind
 
 
+@pytest.mark.thorough
 def test_what_would_do_as_well_is_reported_with_the_drive_that_decides(monkeypatch):
     monkeypatch.setattr(Selector, "rivals", lambda self, accepted, name: ("command_delay",))
     report = find_gap(simulated_drive({"motor_lag": 0.12}, seed=902, drive="circle"), MODEL)
@@ -165,12 +168,14 @@ def searched(monkeypatch):
     return made
 
 
+@pytest.mark.thorough
 def test_the_names_alone_are_those_of_the_report(searched):
     log = searched({"pose_latency": 0.1, "motor_lag": 0.12}, seed=902, drive="poor")
     report = find_gap(log, MODEL)
     assert missing_effects(log, MODEL) == tuple(effect.name for effect in report.effects) != ()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("delay_s", "missing"), [(0.003, ()), pytest.param(0.1, ("command_delay",), marks=pytest.mark.long)]
 )

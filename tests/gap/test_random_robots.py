@@ -83,6 +83,7 @@ def written(searched, monkeypatch, folder, seeds):
     return slow
 
 
+@pytest.mark.thorough
 def test_robots_of_every_size_get_their_report(searched, monkeypatch, tmp_path):
     slow = written(searched, monkeypatch, tmp_path, range(12))
     assert any(slow)

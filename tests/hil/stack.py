@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from typing import Any
+from unittest import mock
 
+from disco_hw.cli import main
 from disco_hw.experiments import TruthRow
 
 STILL_RAD_S = 0.05
@@ -15,11 +21,35 @@ MOTOR_SETTLING_S = 0.3
 
 
 def disco(*arguments: str, timeout_s: float = 60.0) -> tuple[int, str]:
-    """Run the command `disco-hw` to its end; returns the exit code and all that it said."""
-    result = subprocess.run(
-        [sys.executable, "-m", "disco_hw", *arguments], capture_output=True, text=True, timeout=timeout_s, check=False
-    )
+    """Run the command `disco-hw` to its end; returns the exit code and all that it printed."""
+    result = _run(arguments, timeout_s)
     return result.returncode, result.stdout + result.stderr
+
+
+def disco_json(*arguments: str, timeout_s: float = 60.0) -> tuple[int, dict[str, Any]]:
+    """Run the command `disco-hw` with `--json`; returns the exit code and the parsed standard output.
+
+    Standard error is not parsed: it has lines for people, such as "compiling ...".
+    """
+    result = _run((*arguments, "--json"), timeout_s)
+    assert result.stdout, result.stderr
+    return result.returncode, json.loads(result.stdout)
+
+
+def disco_here(*arguments: str) -> tuple[int, str]:
+    """Run the command `disco-hw` in this process, which has imported it; returns the exit code and all it printed."""
+    printed = StringIO()
+    with mock.patch.object(sys, "argv", ["disco-hw", *arguments]), redirect_stdout(printed), redirect_stderr(printed):
+        try:
+            main()
+        except SystemExit as end:
+            return int(end.code or 0), printed.getvalue()
+    return 0, printed.getvalue()
+
+
+def _run(arguments: tuple[str, ...], timeout_s: float) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "disco_hw", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
 
 
 def assert_stopped_in_time(rows: list[TruthRow], cut_s: float) -> None:

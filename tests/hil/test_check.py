@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import re
 
 import pytest
 
 from disco_hw.experiments import READY_TIMEOUT_S, disco_hw_process, running_stack, write_robot_file
-from tests.hil.stack import disco
+from tests.hil.stack import disco, disco_here, disco_json
 
 pytestmark = pytest.mark.hil
 
@@ -18,12 +17,11 @@ def test_check_passes_with_a_robot_and_says_what_it_measured(tmp_path, link):
     robot_file = write_robot_file(tmp_path, link=link)
     with disco_hw_process("virtual robot", ["sim", str(robot_file)], tmp_path / "sim.txt"):
         wait_for_line(tmp_path / "sim.txt", "ready")
-        code, output = disco("check", str(robot_file), "--json")
-    report = json.loads(output)
+        code, report = disco_json("check", str(robot_file))
     levels = {check["name"]: check["level"] for check in report["checks"]}
     failed = {name for name, level in levels.items() if level == "fail"}
     # How soon a busy machine answers is not for a test to judge.
-    assert failed <= {"round trip"}, output
+    assert failed <= {"round trip"}, report
     assert code == bool(failed)
     assert levels["link"] == "ok"
     assert levels["firmware"] == "ok"
@@ -36,6 +34,7 @@ def test_check_passes_with_a_robot_and_says_what_it_measured(tmp_path, link):
     assert 20 <= poses <= 26
 
 
+@pytest.mark.thorough
 def test_check_fails_without_a_robot_and_says_what_to_do(tmp_path):
     code, output = disco("check", str(write_robot_file(tmp_path)))
     assert code == 1
@@ -46,21 +45,21 @@ def test_check_fails_without_a_robot_and_says_what_to_do(tmp_path):
 def test_check_and_a_second_daemon_keep_out_of_a_running_daemons_way(tmp_path):
     with running_stack(tmp_path) as stack:
         stack.operator.wait_for("READY", READY_TIMEOUT_S)
-        code, output = disco("check", str(stack.robot_file))
+        code, output = disco_here("check", str(stack.robot_file))
         assert code == 1
         assert "a daemon drives this robot" in output
         code, output = disco("ctl", str(stack.robot_file), "status")
         assert code == 0
         assert output.startswith("READY")
-        code, output = disco("ctl", str(stack.robot_file), "start")
+        code, output = disco_here("ctl", str(stack.robot_file), "start")
         assert code == 1
         assert "arm first" in output
-        code, output = disco("ctl", str(stack.robot_file), "jump")
+        code, output = disco_here("ctl", str(stack.robot_file), "jump")
         assert code == 2
-        code, output = disco("ctl", str(stack.robot_file), "task", "radius_m=1.25", "speed_m_s=0.25")
+        code, output = disco_here("ctl", str(stack.robot_file), "task", "radius_m=1.25", "speed_m_s=0.25")
         assert (code, "circle of 1.25 m" in output, "0.25 m/s" in output) == (0, True, True), output
         assert stack.operator.status()["task"]["asked"]["radius_m"] == 1.25
-        code, output = disco("ctl", str(stack.robot_file), "task", "speed_m_s=90")
+        code, output = disco_here("ctl", str(stack.robot_file), "task", "speed_m_s=90")
         assert code == 1
         assert "refused: " in output
         assert stack.operator.status()["task"]["asked"]["speed_m_s"] == 0.25

@@ -21,7 +21,11 @@ pytestmark = pytest.mark.hil
 
 # What is judged begins after a quarter lap.
 @pytest.mark.parametrize(
-    ("link", "plant_seed", "laps"), [("can", 3, 0.6), pytest.param("serial", 4, 1.0, marks=pytest.mark.long)]
+    ("link", "plant_seed", "laps"),
+    [
+        ("can", 3, 0.5),
+        pytest.param("serial", 4, 1.0, marks=pytest.mark.long),
+    ],
 )
 def test_demo_follows_the_circle(tmp_path, link, plant_seed, laps):
     result = subprocess.run(

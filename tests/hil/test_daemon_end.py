@@ -36,6 +36,8 @@ def test_a_signal_stops_the_wheels_before_the_process_ends(tmp_path, number):
         assert log.summary().complete
 
 
+# tests/hil/test_recording.py quits while the robot drives, too.
+@pytest.mark.thorough
 def test_quit_stops_the_wheels_too(tmp_path):
     with running_stack(tmp_path) as stack:
         stack.drive()

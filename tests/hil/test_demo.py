@@ -65,6 +65,7 @@ class Stolen:
         self._act(pid, line)
 
 
+@pytest.mark.thorough
 def test_it_drives_anew_where_the_machines_host_held_the_daemon_up(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(demo, "stolen_ms", Stolen(120, hold_up))
     report = demo.run_demo(demo.DemoOptions(out=tmp_path, laps=0.2))
@@ -80,7 +81,7 @@ def test_it_drives_anew_where_the_machines_host_held_the_daemon_up(tmp_path, mon
     ("stolen", "act"),
     [
         pytest.param({"taken_ms": 120}, disarm, marks=pytest.mark.long),
-        ({"taken_ms": 0, "early_ms": 5000}, hold_up),
+        pytest.param({"taken_ms": 0, "early_ms": 5000}, hold_up, marks=pytest.mark.thorough),
         pytest.param({"taken_ms": 90}, hold_up, marks=pytest.mark.long),
     ],
 )
@@ -107,3 +108,10 @@ def test_a_stall_is_known_though_the_wheels_stand_at_the_first_status(state, cau
 
     status = {"state": state, "detail": "", "stop_cause": cause}
     assert isinstance(demo._why_stopped(Stopped(), status, 120), demo._HostStallError) is anew
+
+
+@pytest.mark.long
+def test_a_pillar_on_the_circle_is_driven_around_in_real_time(tmp_path):
+    report = demo.run_demo(demo.DemoOptions(out=tmp_path, laps=0.6, obstacle=True))
+    assert report.success
+    assert report.left_at_pillar_m > 0.02

@@ -113,6 +113,7 @@ def assert_stands_in_time(t_s, wheels, before_s, silent_s):
     assert late.max() < STILL_RAD_S, f"{late.max()} rad/s"
 
 
+@pytest.mark.thorough
 def test_a_script_is_driven_unattended_and_recorded_as_executed(tmp_path, monkeypatch):
     with bench(tmp_path) as made:
         arguments = ["--script", "steps", "--seed", "1", "--seconds", "14", "--unattended", "--json"]
@@ -173,6 +174,7 @@ def test_a_key_held_drives_and_a_frozen_typist_stops_the_robot(tmp_path):
     assert np.abs(wheels[-1]).max() < STILL_RAD_S
 
 
+@pytest.mark.thorough
 def test_a_terminal_that_closes_stops_the_robot_and_ends(tmp_path):
     master, slave = os.openpty()
     with bench(tmp_path) as made:

@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
-import subprocess
-import sys
 import time
 
 import pytest
 
 from disco_hw.errors import WorkError
 from disco_hw.experiments import running_stack
-from tests.hil.stack import STILL_RAD_S
+from tests.hil.stack import STILL_RAD_S, disco, disco_json
 
 pytestmark = pytest.mark.hil
-
-
-def estop(robot_file, *arguments: str) -> tuple[int, str]:
-    result = subprocess.run(
-        [sys.executable, "-m", "disco_hw", "estop", str(robot_file), *arguments],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    return result.returncode, result.stdout + result.stderr
 
 
 @pytest.mark.parametrize(
@@ -51,12 +37,11 @@ def test_estop_stops_and_latches(tmp_path, link, daemon):
             robot_file = tmp_path / "broken.toml"
             robot_file.write_text(text)
             assert "round" in text
-        code, output = estop(robot_file, "--json")
+        code, outcome = disco_json("estop", str(robot_file))
         told_s = time.monotonic()
         if daemon == "frozen":
             os.kill(stack.daemon.process.pid, signal.SIGCONT)
-        assert code == 0, output
-        outcome = json.loads(output)
+        assert code == 0, outcome
         assert outcome["link_error"] is None
         assert outcome["confirmed"]
         stack.operator.wait_for("FAULT", 3.0)
@@ -79,7 +64,7 @@ def test_estop_stops_and_latches(tmp_path, link, daemon):
 def test_estop_without_a_robot_says_so_and_fails(tmp_path):
     from disco_hw.experiments import write_robot_file
 
-    code, output = estop(write_robot_file(tmp_path))
+    code, output = disco("estop", str(write_robot_file(tmp_path)))
     assert code == 1
     assert "NOT SENT" in output
     assert "Traceback" not in output

@@ -21,7 +21,9 @@ def locked_bytes(pid):
 
 
 @pytest.mark.skipif(not can_lock_memory(), reason="this user may not lock memory")
-@pytest.mark.parametrize("compiles", [False, pytest.param(True, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "compiles", [pytest.param(False, marks=pytest.mark.thorough), pytest.param(True, marks=pytest.mark.long)]
+)
 def test_a_daemon_that_drives_has_locked_no_more_than_it_says(tmp_path, monkeypatch, compiles):
     if compiles:
         kept = tmp_path / "kept"

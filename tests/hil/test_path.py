@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
 
 from disco_hw.experiments import READY_TIMEOUT_S, running_stack, write_robot_file
-from tests.hil.stack import disco
+from tests.hil.stack import disco, disco_json
 from tests.runtime.path_robot import ROBOTS
 
 PATH = "x_m,y_m\n0,0\n0.5,0\n0.8,0.2\n"
@@ -46,7 +44,7 @@ def test_a_path_is_driven_to_its_end_and_the_log_needs_no_other_file(tmp_path):
 def test_check_judges_the_path_and_its_speed(tmp_path):
     (tmp_path / "path.csv").write_text((ROBOTS / "eight.csv").read_text())
     robot_file = write_robot_file(tmp_path, task=TASK)
-    _, output = disco("check", str(robot_file), "--json")
-    found = {check["name"]: check for check in json.loads(output)["checks"]}["task"]
+    _, report = disco_json("check", str(robot_file))
+    found = {check["name"]: check for check in report["checks"]}["task"]
     assert found["level"] == "ok"
     assert found["text"].startswith("path path.csv of 9.")

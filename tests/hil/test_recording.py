@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import signal
+import time
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from disco_hw.experiments import READY_TIMEOUT_S, Stack, running_stack
 from disco_hw.log.log_command import info
 from disco_hw.log.reader import open_log
 from tests.drivers.waiting import free_port, wait_until
-from tests.hil.stack import disco
+from tests.hil.stack import STILL_RAD_S, disco_here
 from tests.log.processes import SmallDisk
 
 pytestmark = pytest.mark.hil
@@ -69,7 +70,7 @@ def test_a_recorder_frozen_killed_and_deleted_on_the_way_is_reported_counted_and
         os.kill(writer_of(stack), signal.SIGSTOP)
         frozen = stack.operator.wait_until("report of the fault", lambda status: status["recorder"]["fault"], 10.0)
         assert "the log writer has not answered for" in frozen["recorder"]["fault"]
-        code, text = disco("ctl", str(stack.robot_file), "status")
+        code, text = disco_here("ctl", str(stack.robot_file), "status")
         assert (code, "recording " in text) == (0, True)
         wait_for_recording(stack, 1)
         os.kill(writer_of(stack), signal.SIGKILL)
@@ -85,7 +86,10 @@ def test_a_recorder_frozen_killed_and_deleted_on_the_way_is_reported_counted_and
         assert recorder["ticks"] == sum(recorder[f"{where}_ticks"] for where in ("delivered", "waiting", "lost"))
         stack.operator.request("quit")
         assert stack.daemon.process.wait(60.0) == 0
+        ended_s = time.monotonic()
+        rows = stack.truth()
         output = (tmp_path / "daemon.txt").read_text()
+    assert next(row for row in reversed(rows) if row.t_s < ended_s).fastest < STILL_RAD_S
     for words in ("has not answered for", "was ended", "signal 9", "deleted while it was written", "goes on in"):
         assert any(line.startswith("recording: ") and words in line for line in output.splitlines()), words
     assert not third.exists()
@@ -120,13 +124,13 @@ def test_where_nothing_can_be_recorded_arming_is_refused_unless_that_is_asked_fo
         stack.operator.wait_until("report of the fault", lambda status: status["recorder"]["fault"], 10.0)
         with pytest.raises(WorkError, match=r"nothing is being recorded: .*; mend that, or arm with --unrecorded"):
             stack.operator.request("arm")
-        code, text = disco("ctl", str(stack.robot_file), "arm")
+        code, text = disco_here("ctl", str(stack.robot_file), "arm")
         assert code == 1
         assert "refused: nothing is being recorded" in text
         assert stack.operator.status()["state"] == "READY"
-        code, text = disco("ctl", str(stack.robot_file), "status")
+        code, text = disco_here("ctl", str(stack.robot_file), "status")
         assert "RECORDING: nothing is being recorded" in text
-        code, text = disco("ctl", str(stack.robot_file), "arm", "--unrecorded")
+        code, text = disco_here("ctl", str(stack.robot_file), "arm", "--unrecorded")
         assert (code, text.strip()) == (0, "arming")
         stack.operator.wait_for("ARMED", 5.0)
         logs.unlink()
@@ -136,6 +140,7 @@ def test_where_nothing_can_be_recorded_arming_is_refused_unless_that_is_asked_fo
         stack.operator.request("arm")
 
 
+@pytest.mark.thorough
 def test_a_keeper_frozen_or_killed_is_made_again_while_disarmed(tmp_path):
     with running_stack(tmp_path) as stack:
         stack.operator.wait_for("READY", READY_TIMEOUT_S)

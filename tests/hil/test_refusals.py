@@ -28,7 +28,7 @@ from disco_hw.experiments import (
 )
 from firmware_protocol.codec import Codec
 from tests.drivers.waiting import wait_until
-from tests.hil.stack import STILL_RAD_S, disco
+from tests.hil.stack import STILL_RAD_S, disco, disco_here
 from tests.runtime.path_robot import path_robot
 
 pytestmark = pytest.mark.hil
@@ -46,7 +46,7 @@ pytestmark = pytest.mark.hil
 def test_a_wrong_robot_file_gets_one_line_and_exit_code_2(tmp_path, verb, old, new, field):
     path = write_robot_file(tmp_path)
     path.write_text(path.read_text().replace(old, new, 1))
-    code, output = disco(verb, str(path), *(["status"] if verb == "ctl" else []))
+    code, output = disco_here(verb, str(path), *(["status"] if verb == "ctl" else []))
     assert code == 2, output
     assert len(output.strip().splitlines()) == 1
     assert str(path) in output
@@ -88,7 +88,7 @@ def test_a_firmware_that_does_not_fit_is_refused_in_words(tmp_path, change, word
                     assert word in status["detail"]
                 with pytest.raises(WorkError, match="refused to arm"):
                     operator.request("arm")
-            code, output = disco("check", str(robot_file))
+            code, output = disco_here("check", str(robot_file))
             assert code == 1
             for word in words:
                 assert word in output
@@ -222,7 +222,9 @@ def from_the_host(bus_log):
 
 
 @pytest.mark.parametrize(
-    "seeded", [False, pytest.param(True, marks=pytest.mark.long)], ids=["entropy", "a seed asked for by name"]
+    "seeded",
+    [pytest.param(False, marks=pytest.mark.thorough), pytest.param(True, marks=pytest.mark.long)],
+    ids=["entropy", "a seed asked for by name"],
 )
 def test_a_session_recorded_before_a_restart_does_not_arm_after_it(tmp_path, seeded):
     """Without a key. The robot with a seed, whose entropy repeats, shows that the recording is a good one."""
@@ -296,7 +298,7 @@ def test_a_bad_path_gets_one_line_and_exit_code_2(tmp_path, verb, csv, words):
     path = path_robot(tmp_path, csv or "")
     if csv is None:
         (tmp_path / "path.csv").unlink()
-    code, output = disco(verb, *(["--live", "--robot"] if verb == "view" else []), str(path))
+    code, output = disco_here(verb, *(["--live", "--robot"] if verb == "view" else []), str(path))
     assert code == 2, output
     assert len(output.strip().splitlines()) == 1
     assert str(tmp_path / "path.csv") in output
@@ -306,6 +308,6 @@ def test_a_bad_path_gets_one_line_and_exit_code_2(tmp_path, verb, csv, words):
 def test_a_daemon_can_be_asked_to_stop_when_the_path_is_gone(tmp_path):
     path = path_robot(tmp_path)
     (tmp_path / "path.csv").unlink()
-    code, output = disco("ctl", str(path), "disarm")
+    code, output = disco_here("ctl", str(path), "disarm")
     assert code == 1, output
     assert "path.csv" not in output

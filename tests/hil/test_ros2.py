@@ -66,7 +66,7 @@ def heard(output):
 
 
 RCLPY = Path(__file__).parents[2] / ".venv-ros" / "bin" / "python"
-real_ros = pytest.mark.skipif(not RCLPY.exists(), reason="no rclpy here: make test-long installs it where it can")
+real_ros = pytest.mark.skipif(not RCLPY.exists(), reason="no rclpy here: make test-all installs it where it can")
 
 
 @contextmanager

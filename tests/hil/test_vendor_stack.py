@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import time
@@ -10,7 +9,7 @@ import time
 import pytest
 
 from disco_hw.experiments import DEVICES, running_stack
-from tests.hil.stack import STILL_RAD_S, disco
+from tests.hil.stack import STILL_RAD_S, disco_json
 
 pytestmark = pytest.mark.hil
 
@@ -18,16 +17,18 @@ ROLLS_S = 6.0
 """Until a robot that coasts stands: the simulated floor takes so long from 6 rad/s."""
 
 
-def each_device(short, faults):
-    """Every device with every fault, all but `short` of them in the long run: what they share, one of them shows."""
+def each_device(marks, faults):
+    """Every device with every fault, `long` unless `marks` has other ones: what they share, one of them shows."""
     return [
-        pytest.param(device, fault, marks=() if (device, fault) in short else pytest.mark.long)
+        pytest.param(device, fault, marks=marks.get((device, fault), pytest.mark.long))
         for device in DEVICES
         for fault in faults
     ]
 
 
-@pytest.mark.parametrize(("device", "fault"), each_device({("odrive", "SIGKILL")}, ("SIGKILL", "SIGSTOP", "unplug")))
+@pytest.mark.parametrize(
+    ("device", "fault"), each_device({("odrive", "SIGKILL"): ()}, ("SIGKILL", "SIGSTOP", "unplug"))
+)
 def test_the_robot_stops_and_nothing_arms_again(tmp_path, device, fault):
     with running_stack(tmp_path, device=device) as stack:
         stack.drive()
@@ -53,18 +54,19 @@ def test_the_robot_stops_and_nothing_arms_again(tmp_path, device, fault):
     assert max(row.fastest for row in stopped) < STILL_RAD_S
 
 
-@pytest.mark.parametrize(("device", "daemon"), each_device({("vesc", "frozen")}, ("healthy", "frozen")))
+@pytest.mark.parametrize(
+    ("device", "daemon"), each_device({("vesc", "frozen"): pytest.mark.thorough}, ("healthy", "frozen"))
+)
 def test_an_estop_from_beside_stops_it_and_is_confirmed(tmp_path, device, daemon):
     with running_stack(tmp_path, device=device) as stack:
         stack.drive()
         if daemon == "frozen":
             os.kill(stack.daemon.process.pid, signal.SIGSTOP)
-        code, said = disco("estop", str(stack.robot_file), "--json")
+        code, outcome = disco_json("estop", str(stack.robot_file))
         told_s = time.monotonic()
         if daemon == "frozen":
             os.kill(stack.daemon.process.pid, signal.SIGCONT)
-        assert code == 0, said
-        outcome = json.loads(said)
+        assert code == 0, outcome
         assert outcome["sent"]
         time.sleep(ROLLS_S)
         status = stack.operator.status()

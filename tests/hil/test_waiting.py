@@ -6,7 +6,7 @@ import time
 import pytest
 
 from disco_hw.experiments import disco_hw_process, write_robot_file
-from tests.hil.stack import disco
+from tests.hil.stack import disco_here
 
 pytestmark = pytest.mark.hil
 
@@ -31,13 +31,13 @@ def test_without_a_robot_it_says_what_it_waits_for_what_to_do_and_where_the_log_
         assert waits_for.endswith("Check the robot's power and the cable to it.")
         assert f"log: recording to {log}" in lines
         assert any(line.startswith("next: ") and f"`disco-hw ctl {robot} arm`" in line for line in lines)
-        _, status = disco("ctl", str(robot), "status")
+        _, status = disco_here("ctl", str(robot), "status")
         assert status.splitlines()[0] == waits_for.removeprefix("state: ").split(". Check")[0]
         assert status.splitlines()[1] == "next: Check the robot's power and the cable to it."
         daemon.process.send_signal(signal.SIGTERM)
         assert daemon.process.wait(60.0) == 0
         assert lines_of_end(daemon)[-1] == f"log: look at it: disco-hw view {log}, or disco-hw log info {log}"
-    _, report = disco("check", str(robot))
+    _, report = disco_here("check", str(robot))
     assert f"fail  link: {status.splitlines()[0].removeprefix('DISCONNECTED: ')}" in report
 
 

@@ -19,6 +19,7 @@ from tests.hil.test_check import wait_for_line
 pytestmark = pytest.mark.hil
 
 
+@pytest.mark.thorough
 def test_python_cans_logger_writes_what_the_bus_carries(tmp_path):
     robot_file = write_robot_file(tmp_path)
     with disco_hw_process("virtual robot", ["sim", str(robot_file)], tmp_path / "sim.txt"):
@@ -32,6 +33,7 @@ def test_python_cans_logger_writes_what_the_bus_carries(tmp_path):
     assert sum(1 for line in lines if re.search(r" 110#[0-9A-F]{16}", line)) > 50
 
 
+@pytest.mark.thorough
 def test_python_cans_viewer_shows_the_frames_in_a_terminal(tmp_path):
     robot_file = write_robot_file(tmp_path)
     with disco_hw_process("virtual robot", ["sim", str(robot_file)], tmp_path / "sim.txt"):

@@ -89,6 +89,7 @@ def test_columns_of_the_pose_may_not_be_missing(good, tmp_path):
         infer_command([log], robot, search=finds())
 
 
+@pytest.mark.thorough
 def test_the_command_ends_with_2_and_one_line(good, tmp_path):
     robot, rows = good
     log = tmp_path / "bad.csv"

@@ -32,6 +32,7 @@ class Narrower:
         return Mixtures(found.log_weight, found.mean, found.factor * self.factor)
 
 
+@pytest.mark.thorough
 def test_a_good_posterior_is_calibrated(fitted):
     found = calibrate(fitted, simulate, 300, 2)
     assert found.p_values.min() > 0.001

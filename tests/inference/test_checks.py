@@ -1,11 +1,11 @@
 import numpy as np
-import pytest
 
 from disco_hw.inference.checks import CHECKS, Scores
 from disco_hw.inference.estimates import estimates
 from disco_hw.inference.excitation import excitation
 from disco_hw.inference.infer import noise_of
 from tests.inference.drives import logged
+from tests.tables import thinned
 
 
 def scores(hidden=(), drive="rich"):
@@ -18,7 +18,7 @@ def test_nothing_hidden_leaves_no_pattern():
     assert np.abs(list(scores().values())).max() < 4.5
 
 
-@pytest.mark.parametrize(
+@thinned(
     ("effect", "value", "name"),
     [
         ("turn_slip", 0.08, "less turn at speed"),
@@ -27,6 +27,7 @@ def test_nothing_hidden_leaves_no_pattern():
         ("wheel_radius_asymmetry", 0.015, "turns on straights"),
         ("lateral_icr", 0.03, "forward with turning"),
     ],
+    quick=2,
 )
 def test_a_hidden_effect_stands_out_in_its_check(effect, value, name):
     found = scores(((effect, value),))
@@ -38,7 +39,7 @@ def test_a_drive_that_cannot_show_it_scores_no_false_alarm():
     assert np.isfinite(list(scores(drive="circle").values())).all()
 
 
-@pytest.mark.parametrize(("track", "radius", "name"), [(0.1, 0.0, "turning changes"), (0.0, 0.04, "distance changes")])
+@thinned(("track", "radius", "name"), [(0.1, 0.0, "turning changes"), (0.0, 0.04, "distance changes")], quick=1)
 def test_a_change_during_the_drive_stands_out_and_says_which_way_it_went(track, radius, name):
     for sign in (1.0, -1.0):
         middle_s = 0.5 * float(logged("rich", 5).wheels.t_s[-1])

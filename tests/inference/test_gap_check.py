@@ -36,6 +36,7 @@ def die(send, log, model):
     os._exit(3)
 
 
+@pytest.mark.thorough
 def test_a_search_that_breaks_off_is_an_error_of_the_work(monkeypatch):
     monkeypatch.setattr(infer_command, "_search", die)
     with gap_check_beside(logged("poor"), NOMINAL) as searched, pytest.raises(WorkError, match="broke off"):

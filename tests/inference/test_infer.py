@@ -41,11 +41,13 @@ def test_the_belief_has_the_moments_of_the_draws_and_goes_into_a_model(circle):
     assert model.name == "test"
 
 
+@pytest.mark.thorough
 def test_the_same_seed_gives_the_same_posterior(circle):
     again = infer(logged("circle"), robot_config(), FEW)
     assert np.array_equal(again.draws, circle.draws)
 
 
+@pytest.mark.thorough
 def test_a_log_without_encoders_is_driven_by_its_commands():
     log = logged("circle")
     nothing, none = np.empty(0), np.empty(0, dtype=np.int64)
@@ -55,6 +57,7 @@ def test_a_log_without_encoders_is_driven_by_its_commands():
     assert found.draws.mean(axis=0) == pytest.approx(THETA, rel=0.05)
 
 
+@pytest.mark.thorough
 def test_the_papers_way_leaves_the_wheel_radius_as_wide_as_the_prior():
     found = infer(logged("circle"), robot_config(), InferOptions(paper=True, seed=3))
     assert found.drive.source == "commands"

@@ -3,6 +3,7 @@ import html
 import json
 import re
 from contextlib import nullcontext
+from dataclasses import replace
 
 import pytest
 
@@ -10,6 +11,7 @@ from disco_hw.errors import InputError, WorkError
 from disco_hw.inference import infer_command as verb
 from disco_hw.inference.infer import InferOptions
 from disco_hw.inference.infer_command import GapCheck, infer_command
+from disco_hw.log.contradictions import Contradiction
 from disco_hw.log.importing import import_log
 from disco_hw.model import load_model
 from tests.inference.drives import TICKS_PER_REV, TRUTH, write_log
@@ -69,6 +71,17 @@ def test_the_json_has_the_promised_shape(inferred):
     assert found["gap_not_judged"] is None
     assert 600 <= found["diagnostics"]["simulations"] < 640
     assert set(found["diagnostics"]["sbc_p"]) == set(TRUTH)
+
+
+def test_what_contradicts_itself_stands_first_in_text_and_json(inferred):
+    _, result, _ = inferred
+    wrong = Contradiction("encoder_scale", "a.csv: the wheels count 2.00 times the expected ticks", ())
+    warned = replace(result, contradictions=(wrong,))
+    assert warned.as_text().splitlines()[0] == f"warning: {wrong.message}"
+    assert warned.all_warnings() == [f"warning: {wrong.message}", *result.warnings()]
+    first, told = next(iter(warned.as_dict().items()))
+    assert (first, told) == ("contradictions", [{"cause": wrong.cause, "message": wrong.message}])
+    assert result.as_dict()["contradictions"] == []
 
 
 def test_the_model_file_loads_and_holds_the_posterior(inferred):
@@ -171,6 +184,7 @@ def test_a_log_that_the_search_cannot_judge_gives_a_model_with_a_warning(known, 
     assert "next: disco-hw gap" not in result.as_text()
 
 
+@pytest.mark.thorough
 def test_several_logs_count_together(robot, tmp_path, inferred):
     _, result, _ = inferred
     logs = [write_log(tmp_path / f"{seed}.csv", "poor", seed) for seed in (1, 2)]

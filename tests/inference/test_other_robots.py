@@ -13,6 +13,7 @@ from disco_hw.inference.infer import InferOptions, infer
 from disco_hw.inference.simulate import NAMES
 from disco_hw.log.load import load_drive
 from tests.inference.drives import write_log
+from tests.tables import thinned
 
 REAL_LOGS = os.environ.get("DISCO_HW_DATA")
 FEW = InferOptions(simulations=600, seed=3)
@@ -33,12 +34,13 @@ def inferred(robot: Path, log: Path) -> dict[str, float]:
     return dict(zip(NAMES, infer(drive, config, FEW).draws.mean(axis=0).tolist(), strict=True))
 
 
-@pytest.mark.parametrize(
+@thinned(
     ("radius_m", "track_m", "truth"),
     [
         (0.165, 0.54, {"wheel_radius_m": 0.165, "axial_distance_m": 1.1, "x_icr_m": -0.15}),
         (0.04, 0.2, {"wheel_radius_m": 0.042, "axial_distance_m": 0.2, "x_icr_m": 0.0}),
     ],
+    quick=1,
     ids=["as large as a Husky", "a small differential drive"],
 )
 def test_the_prior_of_a_robot_that_says_nothing_of_it_holds_the_robot(tmp_path, radius_m, track_m, truth):

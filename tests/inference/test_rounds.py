@@ -50,6 +50,7 @@ def test_a_posterior_at_the_priors_edge_stays_inside():
     assert draws[0, :, 0].mean() == pytest.approx(1.0, abs=2.0 * SD)
 
 
+@pytest.mark.thorough
 def test_the_same_seed_gives_the_same_posterior():
     first, second = (
         run_rounds(simulate, observed(np.array([0.5, 0.5])), PRIOR, 400, SETTINGS, 7).theta for _ in range(2)

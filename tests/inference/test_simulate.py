@@ -23,6 +23,7 @@ def test_without_noise_the_true_parameters_repeat_a_noiseless_log():
     assert np.abs(error[:, 2]).max() < 5e-3
 
 
+@pytest.mark.thorough
 def test_each_simulation_remembers_its_own_drive_from_the_beginning():
     rubber = EffectSetting("omega += k (omega - mean_3s(omega))", {"k": -0.5})
     plain = simulator()

@@ -114,6 +114,7 @@ def test_libraries_not_loaded_yet_are_held_to_one_thread_by_the_environment():
         assert seen["environment"][name] == "1"
 
 
+@pytest.mark.thorough
 def test_libraries_loaded_already_are_held_to_one_thread_and_still_work():
     script = """
 import numba, torch

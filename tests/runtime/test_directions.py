@@ -14,6 +14,7 @@ from drivers.types import PoseSample, WheelCommand, WheelSample
 from sim.plant_parameters import PlantParameters
 from tests.drivers.motor.vendors import VENDORS
 from tests.runtime.simulated import simulated_stack
+from tests.tables import thinned
 
 RADIUS_M, TRACK_M = 0.06, 0.31
 TICK_NS = 20_000_000
@@ -94,7 +95,7 @@ def test_a_wrong_wiring_is_noticed_in_the_first_half_second_of_motion(vendor, wi
     assert all(part in found for part in said.split(".*"))
 
 
-@pytest.mark.parametrize("speeds", [(3.0, 2.0), (-2.0, 2.0), (6.0, 6.0), (-1.0, -3.0), (1.0, 3.0)])
+@thinned("speeds", [(3.0, 2.0), (-2.0, 2.0), (6.0, 6.0), (-1.0, -3.0), (1.0, 3.0)], quick=2)
 @pytest.mark.parametrize("vendor", ONE_OF_EACH, ids=str)
 def test_a_right_wiring_is_let_alone(vendor, speeds):
     assert first_doubt(vendor, AS_TOLD, AS_TOLD, speeds) is None
@@ -187,3 +188,32 @@ def test_a_robot_whose_geometry_is_written_down_wrongly_is_not_taken_for_miswire
     )
     run.start()
     assert all("wheels." not in tick.output.detail for tick in run.ticks(4.0))
+
+
+@pytest.mark.parametrize("runs_at", [3.0, 9.0])
+def test_a_wheel_that_does_not_count_gets_no_wiring_advice_however_it_turns(runs_at):
+    watch, floor, found = Directions(RADIUS_M, TRACK_M, AS_TOLD), Floor(), []
+    for tick in range(150):
+        now_ns, moves = tick * TICK_NS, tick > 12
+        floor.roll(0.02 * runs_at * moves, 0.06 * moves)
+        right = 0.06 * max(tick - 12, 0)
+        wheels = WheelSample(now_ns, now_ns, 0.0, right, 0.0, 3.0 * moves)
+        command = WheelCommand(*((3.0, 3.0) if tick > 10 else (0.0, 0.0)), 0.1)
+        found.append(watch.step(now_ns, (wheels,), (floor.pose(now_ns),), command))
+    assert not any(found)
+
+
+def test_a_wheel_that_counts_backward_after_it_has_followed_gets_no_wiring_advice():
+    asked = [(0.0, 0.0)] + [(2.0, 2.0)] * 60
+    turned = [(0.0, 0.0)] + [(0.04 * (tick if tick < 10 else 20 - tick), 0.04 * tick) for tick in range(60)]
+    last, found = (0.0, 0.0), {}
+    for followed in (False, True):
+        watch = Directions(RADIUS_M, TRACK_M, AS_TOLD)
+        for tick, (speeds, angles) in enumerate(zip(asked, turned, strict=True)):
+            now_ns = tick * TICK_NS
+            rates = [(now - was) / 0.02 for now, was in zip(angles, last, strict=True)]
+            sample, last = WheelSample(now_ns, now_ns, *angles, *rates), angles
+            said = watch.step(now_ns, (sample,), (), WheelCommand(*speeds, 0.1), (followed, followed))
+            found[followed] = found.get(followed) or said
+    assert "wheels.encoder_direction" in found[False]
+    assert found[True] is None

@@ -4,10 +4,13 @@ import math
 
 import pytest
 
+from disco_hw.control.plan import LawController
+from disco_hw.runtime import State
 from disco_hw.runtime.plausibility import Headway
+from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
 from drivers.types import WheelSample
-from tests.runtime.simulated import simulated_stack
+from tests.runtime.simulated import ROBOT_FILE, simulated_stack
 
 TICK_NS = 20_000_000
 COMMAND = (0.4, -0.5)
@@ -59,10 +62,22 @@ def test_it_is_reported_when_the_robot_gets_on_again():
     assert [text.split(":")[1] for text in found] == [" no progress for 5 s", " gets on again"]
 
 
-def test_the_daemon_says_that_a_robot_with_a_dead_band_unknown_to_its_model_stands():
-    stack = simulated_stack(hide={"deadband": 20.0})
+def started(**changes):
+    stack = simulated_stack(**changes)
     stack.run(1.5)
     stack.run(0.5, UserRequest.ARM)
     stack.run(0.02, UserRequest.START)
-    events = [event for tick in stack.run(7.0) for event in tick.events]
+    return stack
+
+
+def test_the_daemon_says_that_a_robot_stands_within_a_dead_band_that_its_model_does_not_know():
+    setup = load_setup(ROBOT_FILE)
+    law = LawController(lambda *_: (1.2, 1.2), setup.model, setup.config.task.planned(setup.config.control.mode))
+    events = [event for tick in started(planner=law, hide={"deadband": 1.3}).run(7.0) for event in tick.events]
     assert [event for event in events if event.startswith("task: no progress for 5 s: the wheels stand")]
+
+
+def test_wheels_that_stand_beyond_any_dead_band_stop_the_robot():
+    *_, tick = started(hide={"deadband": 20.0}).run(3.0)
+    assert tick.output.state is State.FAULT
+    assert "although it is commanded to turn" in tick.output.detail

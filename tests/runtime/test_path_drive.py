@@ -55,6 +55,7 @@ def drive(stack, done, limit_s=60.0):
     return rows[:, :2], rows[:, 2]
 
 
+@pytest.mark.thorough
 def test_the_shipped_eight_is_followed_once_round(tmp_path):
     setup, stack = started(path_robot(tmp_path))
     places, speeds = drive(stack, lambda: stack.core.progress.laps >= 1.0)

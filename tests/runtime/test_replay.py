@@ -58,6 +58,7 @@ def test_the_same_robot_gives_the_same_bits(tmp_path, ticks):
     assert report.values > 5000
 
 
+@pytest.mark.thorough
 def test_what_no_parameter_explains_is_recorded_and_replays_bit_for_bit(tmp_path):
     text = (ROBOTS / "wombot.toml").read_text().replace("rate_hz = 50.0", "rate_hz = 50.0\ndisturbance = true")
     text = text.replace("wombot_model.toml", str(ROBOTS / "wombot_model.toml"))
@@ -83,6 +84,7 @@ def test_what_no_parameter_explains_is_recorded_and_replays_bit_for_bit(tmp_path
     assert report.difference.field == "UnexplainedMotion.left"
 
 
+@pytest.mark.thorough
 def test_a_drive_whose_model_remembers_replays_bit_for_bit(tmp_path, monkeypatch):
     model = load_model(ROBOTS / "wombot_model.toml")
     terms = {"command += k sign(u - mean_1s(u))": -0.2, "omega += k (omega - mean_1s(omega))": -0.3}

@@ -24,6 +24,7 @@ from sim.unixcan import UnixCanBus
 from sim.virtual_robot import TRUTH_COLUMNS
 from tests.drivers.waiting import wait_until
 from tests.sim.minimal_host import MinimalHost
+from tests.tables import thinned
 
 COMMAND_TIMEOUT_S = 0.5
 # The firmware gives its host as long as it can be set to: a test that is held up for 0.1 s has not let go.
@@ -175,6 +176,7 @@ def test_drive_it_over_can_and_let_go(start, host):
     vanish_and_see_it_stop(robot, port)
 
 
+@pytest.mark.thorough
 def test_drive_it_over_a_serial_line_and_let_go(start, host, tmp_path):
     robot = start("--kind", "serial", "--port", str(tmp_path / "0" / "tty"), patient=True)
     assert robot.ready.startswith(f"ready serial {robot.port} at 921600 Bd")
@@ -206,7 +208,7 @@ def vanish_and_see_it_stop(robot, port):
     assert robot.state()["state"] != "ARMED"
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@thinned("number", [signal.SIGTERM, signal.SIGINT], quick=1)
 def test_a_signal_ends_it_cleanly(start, number):
     robot = start()
     for name in ("bus", "inject"):
@@ -230,6 +232,7 @@ def read_to_the_end(bus):
     return None
 
 
+@pytest.mark.thorough
 def test_the_record_has_no_gap_whatever_happens_to_the_process(start, tmp_path):
     before_ns = time.monotonic_ns()
     robot = start("--start", "1", "-2", "0.5", "--bus-log", str(tmp_path / "bus.log"))

@@ -16,6 +16,7 @@ from sim.can_protocol import ECHO_OWN_FRAMES, FRAME_BYTES, CanFrame, ErrorState,
 from sim.hub import READER_QUEUE, READER_STALL_NS, Hub, HubLink
 from sim.process import SocketPathError
 from sim.unixcan import UnixCanBus
+from tests.tables import thinned
 
 T0 = 10**12
 LONG_NS = 10**10
@@ -361,7 +362,7 @@ def test_close_removes_the_socket_and_may_be_repeated(hub):
     assert a.received() == ["closed"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@thinned("number", [signal.SIGTERM, signal.SIGINT], quick=1)
 def test_process_ends_cleanly_on_a_signal(tmp_path, number):
     path = tmp_path / "hub"
     with subprocess.Popen(

@@ -37,7 +37,7 @@ def test_without_faults_nothing_is_touched():
     assert faults.inputs(given, (3.0, 3.0), True) is given
     poses = [pose(0)]
     assert faults.poses(0, poses) is poses
-    assert faults.setpoints(1.0, 2.0) == (1.0, 2.0)
+    assert faults.setpoints(1.0, 2.0, is_driven=True) == (1.0, 2.0)
 
 
 def test_a_stuck_encoder_loses_what_it_did_not_count():
@@ -77,10 +77,26 @@ def test_a_short_counter_wraps():
 def test_a_stalled_motor_does_not_turn_and_draws_current_while_it_is_asked_to():
     faults = RobotFaults()
     faults.set_active([fault("motor_stall", wheel="left")])
-    assert faults.setpoints(3.0, 3.0) == (0.0, 3.0)
+    assert faults.setpoints(3.0, 3.0, is_driven=True) == (0.0, 3.0)
     assert seen(faults, 0, (-3.0, 3.0)).left_current_a == -18.0
     assert seen(faults, 0, (0.0, 3.0)).left_current_a == 1.0
     assert faults.inputs(inputs(0), (3.0, 3.0), False).left_current_a == 1.0
+
+
+def test_a_motor_that_runs_away_stops_when_its_controller_drives_it_no_longer():
+    faults = RobotFaults()
+    faults.set_active([fault("motor_runaway", wheel="right", speed_rad_s=12.0)])
+    assert faults.setpoints(3.0, 3.0, is_driven=True) == (3.0, 12.0)
+    assert faults.setpoints(0.0, 0.0, is_driven=False) == (0.0, 0.0)
+
+
+def test_a_disconnected_encoder_trembles_where_it_stood():
+    faults = RobotFaults()
+    faults.set_active([fault("encoder_disconnected", wheel="left")])
+    counts = [seen(faults, ticks).left_ticks for ticks in range(100, 200)]
+    assert max(counts) - min(counts) <= 6 < len(counts)
+    assert len(set(counts)) > 1
+    assert seen(faults, 200).left_speed_rad_s == 0.0
 
 
 def test_a_sagging_battery_stops_at_nothing():

@@ -20,7 +20,7 @@ def test_without_faults_it_drives_and_nothing_is_reported():
     assert outcome.moving_s > 3.5
     assert outcome.commands_accepted > 200
     assert run.core.last.output.running
-    assert run.core.plausibility.stats == PlausibilityStats()
+    assert run.core.plausibility == PlausibilityStats()
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from viser.infra import WebsockServer
 
+from disco_hw.fence import Circle, Fence
 from disco_hw.log import records
+from disco_hw.log.records import FenceGuard
 from disco_hw.runtime.robot_setup import record_of
 from disco_hw.tasks.circle import CircleTask
 from disco_hw.viewer import scene as scene_module
@@ -25,9 +27,15 @@ FAN = records.Fan(
 )  # fmt: skip
 
 
+FENCE = Fence(keep_in=((-2.0, -2.0), (2.0, -2.0), (0.0, 2.0)), keep_out=(Circle((0.5, 0.5), 0.2),))
+GUARD = FenceGuard(
+    0, "free", 1.0, 0.5, path_x_m=(0.0, 0.1), path_y_m=(0.0, 0.0), path_yaw_rad=(0.0, 0.1), obstacles=(1.0, 0.0, 0.3)
+)
+
+
 @pytest.fixture(scope="module")
 def stage():
-    return stage_of_robot(ROBOT_FILE)
+    return replace(stage_of_robot(ROBOT_FILE), fence=FENCE)
 
 
 @pytest.fixture
@@ -39,7 +47,7 @@ def scene(stage):
 @pytest.fixture
 def shot(timeline):
     cut = snapshot_at(timeline, START_NS + TICK * PERIOD_NS, plan_at(TICK))
-    return replace(cut, fan=FAN)
+    return replace(cut, fan=FAN, guard=GUARD)
 
 
 def node(scene, layer):
@@ -62,7 +70,7 @@ def test_every_layer_is_drawn_and_can_be_switched_off_and_on(scene, shot):
 
 def test_nothing_known_draws_the_task_alone(scene):
     scene.show(snapshot_at(Timeline(), 5, None))
-    assert [layer for layer in LAYERS if node(scene, layer).visible] == ["task"]
+    assert [layer for layer in LAYERS if node(scene, layer).visible] == ["task", "fence"]
 
 
 def test_the_robot_stands_at_its_pose_and_its_wheels_turn_as_measured(scene, shot):
@@ -154,7 +162,7 @@ def test_nothing_is_drawn_that_costs_a_browser_without_a_graphics_card_ten_times
         Scene(page.server, stage)
     lines = [message.props.thickness_units for message in sent if hasattr(message, "props")
              and hasattr(message.props, "thickness_units")]  # fmt: skip
-    assert len(lines) == 10
+    assert len(lines) == 13
     assert set(lines) == {"screen"}
     assert not any(type(message).__name__ == "GridMessage" for message in sent)
     said = {type(message).__name__: message for message in sent}

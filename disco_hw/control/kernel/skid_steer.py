@@ -51,6 +51,7 @@ from disco_hw.control.kernel import (
     stage_cost,
     terminal_cost,
 )
+from disco_hw.control.kernel.avoid import LOOK_EVERY, Area, Bends, bends_of, detoured, touch_cost
 from disco_hw.jit import bits_of_float, block_function, cast_like, float_from_bits, scalar_function, tune_loops
 from disco_hw.model.added_terms import count_means
 from disco_hw.model.coefficients import (
@@ -103,7 +104,7 @@ class SkidSteer(NamedTuple):
     the first point has no weight, so that it is rolled out for its equivalent points alone and its cost is left as it
     is. `series` (8,), `wide`, `euler`: how a step is integrated; under Euler steps no points share a rollout.
     `history`: rows of commands from before the plan. `wheels`: buffer of the wheels' motion, T * WHEEL_ROWS * BLOCK;
-    `wheels_differ`: whether the points differ in how the wheels turn.
+    `wheels_differ`: whether the points differ in how the wheels turn. `area`: what is kept away from, or None.
     """
 
     start: Floats
@@ -122,6 +123,7 @@ class SkidSteer(NamedTuple):
     history: int
     wheels: Floats
     wheels_differ: bool
+    area: Area | None = None
 
 
 @block_function
@@ -222,10 +224,11 @@ def _move(
 
 
 @scalar_function
-def _begin(state: Floats, own: int, b: int, start: Floats, task: Terms) -> None:
+def _begin(state: Floats, own: int, b: int, start: Floats, task: Terms, bends: Bends) -> None:
     """Set the rows from `own` on to the start."""
-    state[own + X + b] = start[0]
-    state[own + Y + b] = start[1]
+    x, y, _ = detoured(bends, (start[0], start[1], start[0]))
+    state[own + X + b] = x
+    state[own + Y + b] = y
     state[own + MEMORY + b] = start[7]
     state[own + TOTAL + b] = cast_like(0.0, start[0])
     _remember(looks_up(task), state, own, b, start[7], task)
@@ -346,18 +349,19 @@ def _follows(
     scaled: BasePair,
     start: Floats,
     task: Terms,
+    bends: Bends,
 ) -> None:
     """Move the memories of a point and its equivalent points on; nothing without a table."""
     if looks is None:
         return
     if skip_mean is None:
-        _follow(looks, state, OWN, b, _place(state, b, base), task)
+        _follow(looks, state, OWN, b, detoured(bends, _place(state, b, base)), task)
     if ahead is not None:
-        _follow(looks, state, AHEAD0, b, _ahead_place(state, b, base, ahead[0], start), task)
-        _follow(looks, state, AHEAD1, b, _ahead_place(state, b, base, ahead[1], start), task)
+        _follow(looks, state, AHEAD0, b, detoured(bends, _ahead_place(state, b, base, ahead[0], start)), task)
+        _follow(looks, state, AHEAD1, b, detoured(bends, _ahead_place(state, b, base, ahead[1], start)), task)
     if scaled is not None:
-        _follow(looks, state, SCALED0, b, _scaled_place(state, b, base, scaled[0], start), task)
-        _follow(looks, state, SCALED1, b, _scaled_place(state, b, base, scaled[1], start), task)
+        _follow(looks, state, SCALED0, b, detoured(bends, _scaled_place(state, b, base, scaled[0], start)), task)
+        _follow(looks, state, SCALED1, b, detoured(bends, _scaled_place(state, b, base, scaled[1], start)), task)
 
 
 @scalar_function
@@ -372,16 +376,50 @@ def _costs(
     start: Floats,
     task: Terms,
     last: Absent,
+    bends: Bends,
 ) -> None:
     """Costs of step t under a point and its equivalent points, pairs or None."""
     if skip_mean is None:
-        _cost(state, OWN, b, t, _place(state, b, base), task, last)
+        _cost(state, OWN, b, t, detoured(bends, _place(state, b, base)), task, last)
     if ahead is not None:
-        _cost(state, AHEAD0, b, t, _ahead_place(state, b, base, ahead[0], start), task, last)
-        _cost(state, AHEAD1, b, t, _ahead_place(state, b, base, ahead[1], start), task, last)
+        _cost(state, AHEAD0, b, t, detoured(bends, _ahead_place(state, b, base, ahead[0], start)), task, last)
+        _cost(state, AHEAD1, b, t, detoured(bends, _ahead_place(state, b, base, ahead[1], start)), task, last)
     if scaled is not None:
-        _cost(state, SCALED0, b, t, _scaled_place(state, b, base, scaled[0], start), task, last)
-        _cost(state, SCALED1, b, t, _scaled_place(state, b, base, scaled[1], start), task, last)
+        _cost(state, SCALED0, b, t, detoured(bends, _scaled_place(state, b, base, scaled[0], start)), task, last)
+        _cost(state, SCALED1, b, t, detoured(bends, _scaled_place(state, b, base, scaled[1], start)), task, last)
+
+
+@scalar_function
+def _avoid(
+    area: Area | None, state: Floats, at: int, t: int, base: Base, skip_mean: Absent, ahead: BasePair,
+    scaled: BasePair, start: Floats,
+) -> None:  # fmt: skip
+    """Add what step t, which the block has just made, costs for touching a shape; nothing without an area."""
+    if area is None:
+        return
+    time_s = cast_like(t + 1, start[0]) * area.body[4]
+    reach_m = area.body[6] + area.body[5] * time_s
+    for k in range(area.number[0]):
+        if area.away[k] > reach_m:
+            continue
+        if skip_mean is None:
+            for b in range(BLOCK):
+                place = _place(state, b, lane_base(base, at + b))
+                state[OWN + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
+        if ahead is not None:
+            for b in range(BLOCK):
+                place = _ahead_place(state, b, base, ahead[0], start)
+                state[AHEAD0 + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
+            for b in range(BLOCK):
+                place = _ahead_place(state, b, base, ahead[1], start)
+                state[AHEAD1 + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
+        if scaled is not None:
+            for b in range(BLOCK):
+                place = _scaled_place(state, b, base, scaled[0], start)
+                state[SCALED0 + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
+            for b in range(BLOCK):
+                place = _scaled_place(state, b, base, scaled[1], start)
+                state[SCALED1 + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
 
 
 @scalar_function
@@ -418,6 +456,7 @@ def _roll(
     costs: Floats, at: int, ahead_at: CostPlaces, scaled_at: CostPlaces, horizon: int, commands: Floats, late: int,
     wheels: Floats, state: Floats, slides: Absent, start: Floats, means: Floats | None, point: int, base: Base,
     skip_mean: Absent, ahead: BasePair, scaled: BasePair, effects: Coefficients, integration: Integration, task: Terms,
+    area: Area | None,
 ) -> None:  # fmt: skip
     """Roll the block out from `start` with its wheels turning as in `wheels`; writes `costs[at:at + BLOCK]`.
 
@@ -427,17 +466,18 @@ def _roll(
     which saves a sixth of the time.
     """
     tune_loops()
+    bends = bends_of(area)
     x, y, cos_yaw, sin_yaw = start[0], start[1], start[2], start[3]
     for b in range(BLOCK):
         state[AXLE_X + b], state[AXLE_Y + b] = axle_of(x, y, cos_yaw, sin_yaw, lane_base(base, at + b))
         state[COS + b] = cos_yaw
         state[SIN + b] = sin_yaw
         if skip_mean is None:
-            _begin(state, OWN, b, start, task)
-        _begin(state, AHEAD0, b, start, task)
-        _begin(state, AHEAD1, b, start, task)
-        _begin(state, SCALED0, b, start, task)
-        _begin(state, SCALED1, b, start, task)
+            _begin(state, OWN, b, start, task, bends)
+        _begin(state, AHEAD0, b, start, task, bends)
+        _begin(state, AHEAD1, b, start, task, bends)
+        _begin(state, SCALED0, b, start, task, bends)
+        _begin(state, SCALED1, b, start, task, bends)
     _begin_means(means, state, BODY_REMEMBERED, point, U(count_means(effects.command_terms)), effects.body_terms)
     _look_ups(looks_up(task), state, skip_mean, ahead, scaled, task)
     for t in range(horizon):
@@ -449,19 +489,21 @@ def _roll(
                     state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting,
                     integration, slides, start,
                 )  # fmt: skip
-                _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task)
+                _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task, bends)
         else:
             for b in range(BLOCK):
                 here, acting = lane_base(base, at + b), lane_effects(effects, at + b)
-                _costs(state, b, t - 1, here, skip_mean, ahead, scaled, start, task, None)
+                _costs(state, b, t - 1, here, skip_mean, ahead, scaled, start, task, None, bends)
                 _move(
                     state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting,
                     integration, slides, start,
                 )  # fmt: skip
-                _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task)
+                _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task, bends)
         _look_ups(looks_up(task), state, skip_mean, ahead, scaled, task)
+        if t % LOOK_EVERY == LOOK_EVERY - 1:
+            _avoid(area, state, at, t, base, skip_mean, ahead, scaled, start)
     for b in range(BLOCK):
-        _costs(state, b, horizon - 1, lane_base(base, at + b), skip_mean, ahead, scaled, start, task, True)
+        _costs(state, b, horizon - 1, lane_base(base, at + b), skip_mean, ahead, scaled, start, task, True, bends)
     # One after the other: a loop that wrote to all at once would not be vectorised.
     if skip_mean is None:
         _end(costs, at, state, OWN, slides, start, integration.step_s, task)
@@ -505,7 +547,7 @@ def _roll_points(
                 )
             _roll(
                 costs, at, None, None, horizon, commands, late, wheels, state, slides, start, means, i, system.base,
-                None, None, None, system.effects, integration, task,
+                None, None, None, system.effects, integration, task, system.area,
             )  # fmt: skip
         else:
             if (i == 0 or system.wheels_differ) and (needs_change(acting) or not wheels_follow(acting)):
@@ -519,18 +561,20 @@ def _roll_points(
                         _roll(
                             costs, at, _places(ahead[i], padded, lane), None, horizon, commands, late, wheels, state,
                             slides, start, means, i, here, skip_mean, _bases(system.base, ahead[i]), None, acting,
-                            integration, task,
+                            integration, task, system.area,
                         )  # fmt: skip
                     else:
                         _roll(
                             costs, at, _places(ahead[i], padded, lane), _places(scaled[i], padded, lane), horizon,
                             commands, late, wheels, state, slides, start, means, i, here, skip_mean,
                             _bases(system.base, ahead[i]), _bases(system.base, scaled[i]), acting, integration, task,
+                            system.area,
                         )  # fmt: skip
             if alone:
                 _roll(
                     costs, at, None, None, horizon, commands, late, wheels, state, slides, start, means, i, here, None,
                     None, None, acting, integration, task,
+                            system.area,
                 )  # fmt: skip
 
 

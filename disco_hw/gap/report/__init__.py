@@ -123,7 +123,8 @@ class GapReport:
 
     `gap` holds errors of poses by stage and horizon, `wheels` those of the wheels alone; either is empty where it could
     not be judged. `written` in them: the amended model as it is written, where that lacks a term which no model can
-    carry. `across`: what several logs say of each parameter.
+    carry. `across`: what several logs say of each parameter. `warnings`: what contradicts itself in logs that are
+    still of use.
     """
 
     sources: tuple[str, ...]
@@ -144,6 +145,7 @@ class GapReport:
     wheels: dict[str, dict[float, PredictionErrors]] = field(default_factory=dict)
     across: tuple[AcrossLogs, ...] = ()
     provenance: Provenance | None = None
+    warnings: tuple[str, ...] = ()
 
     @property
     def horizon_s(self) -> float:
@@ -165,6 +167,7 @@ class GapReport:
         """The content of report.json."""
         return {
             "verdict": self.verdict,
+            "warnings": list(self.warnings),
             "channels": [
                 {"name": channel.name, "significant": channel.significant, "where": channel.where}
                 for channel in self.channels

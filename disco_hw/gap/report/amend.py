@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from disco_hw.effects import Stage
 from disco_hw.gap.search.analysis import FinalFit, GapAnalysis
 from disco_hw.gap.search.channel_result import ChannelEstimates, ParameterEstimate, UnnamedTerm
 from disco_hw.gap.search.end_to_end import Freed, JointFit, Part
@@ -135,7 +136,8 @@ def amended_model(
     """The model with base parameters of `parts`, `effects` and `terms` added, and their joint Gaussian; and notes.
 
     `terms` has by name how far each reaches. Terms that the model has already stay, with what was believed of them, and
-    reach no less far. Values outside an effect's physical range are put at its end, with a note.
+    reach no less far. Values outside an effect's physical range are put at its end, with a note. A time below a
+    millisecond is none: such a delay or lag is left out.
     """
     notes: list[str] = []
     estimates = {name: estimate for part in parts for name, estimate in part.by_name.items()}
@@ -145,7 +147,8 @@ def amended_model(
         found, before = estimates[f"{name}.k"], known[name].value if name in known else 0.0
         known[name] = ParameterEstimate(before + found.value, before + found.low, before + found.high)
         reach[name] = max(largest, reach.get(name, 0.0))
-    wanted = {**effects, **{name: {"k": estimate} for name, estimate in known.items()}}
+    wanted = {name: values for name, values in effects.items() if not _takes_no_time(name, values)}
+    wanted |= {name: {"k": estimate} for name, estimate in known.items()}
     settings = []
     for name, values in wanted.items():
         inside = {}
@@ -168,6 +171,16 @@ def amended_model(
     covariance = within_ranges(covariance, [bare.parameters[name] for name in names])
     belief = Gaussian(names, np.array([point[name] for name in names]), covariance)
     return replace(bare, belief=belief), tuple(notes)
+
+
+_LEAST_TIME_S = 1e-3
+
+
+def _takes_no_time(name: str, values: Mapping[str, ParameterEstimate]) -> bool:
+    """Whether an effect that is a time alone is shorter than anything that a robot's loop resolves."""
+    effect = effect_of(name)
+    is_time = effect.late_by is not None or effect.stage is Stage.POSE_TIME
+    return is_time and all(abs(values[p.name].value) < _LEAST_TIME_S for p in effect.parameters if p.name in values)
 
 
 def _known_terms(model: Model, base: Mapping[str, float]) -> tuple[dict[str, ParameterEstimate], dict[str, float]]:

@@ -293,7 +293,18 @@ def doubt_of(effect: EffectFinding, measured: Measured) -> str | None:
     if all(hardly_known(parameter, estimate, settings) for parameter, estimate in pairs):
         said = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
         return f"{said} is hardly known: its interval is wider than the value"
+    if holds_no_effect(effect):
+        said = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
+        return f"{said}: its interval holds no effect"
     return _exceeded(described, pairs[0][1], measured) or measured.disputed.get(effect.name)
+
+
+def holds_no_effect(effect: EffectFinding) -> bool:
+    """Whether the intervals of all that make an effect's size hold the value at which it does nothing."""
+    sizes = [each for each in REGISTRY[effect.name].parameters if math.isfinite(each.neutral)]
+    intervals = [(effect.parameters[each.name], each.neutral) for each in sizes]
+    # A limit does nothing only where it is infinite, which no interval holds.
+    return not REGISTRY[effect.name].is_limit and all(each.low <= none <= each.high for each, none in intervals)
 
 
 def _at_end(parameter: Parameter, value: float, settings: ReportSettings) -> bool:

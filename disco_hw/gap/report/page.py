@@ -85,7 +85,7 @@ def _gap_line(report: GapReport) -> str:
 
 def as_text(report: GapReport) -> str:
     """The report for a terminal."""
-    lines = [*answer(report), ""]
+    lines = [*(f"warning: {warning}" for warning in report.warnings), *answer(report), ""]
     for effect in report.effects:
         values = ", ".join(f"{n} {e.value:.4g} [{e.low:.4g}, {e.high:.4g}]" for n, e in effect.parameters.items())
         lines.append(f"{effect.channel}: {effect.name}: {values}{_confounded(effect)}")
@@ -155,7 +155,8 @@ def page(report: GapReport) -> str:
     """The whole page: the answer, the definitions in the margin, pictures, findings; expert tables folded."""
     lines = "".join(f"<p>{_with_code(line)}</p>" for line in answer(report))
     words = "".join(f"<dt>{name}</dt><dd>{escape(text)}</dd>" for name, text in _DEFINITIONS.items())
-    parts = [f'<div class="answer">{lines}</div>', _whence(report), f"<aside><dl>{words}</dl></aside>"]
+    warned = "".join(f'<p class="warn">{escape(warning)}</p>' for warning in report.warnings)
+    parts = [warned, f'<div class="answer">{lines}</div>', _whence(report), f"<aside><dl>{words}</dl></aside>"]
     parts += [
         reports.picture(data, name, _CAPTIONS.get(name, name.replace("_", " ")))
         for name, data in report.pictures.items()

@@ -330,10 +330,10 @@ def _with_term(found: ChannelResult, term: Term, tried: int) -> tuple[ChannelRes
     proof = compare(small, big, channel, parameters)
     moved = selector.moves(found.selector.channel.split(small.vector), channel.split(big.vector))
     limits = plain.thresholds
-    if term.disc is not None and proof.again(parameters, channel.count) < limits.unnamed_score:
+    if term.disc is not None and proof.score_without_best(parameters, channel.count) < limits.unnamed_score:
         return None, False
     # A patch that is driven over twice has been tried again.
-    repeats = term.disc is not None or proof.repeats(channel.count)
+    repeats = term.disc is not None or proof.holds_without_two_best(channel.count)
     if proof.score < limits.unnamed_score or not repeats or moved < limits.moves_m:
         return None, True
     names = selector.select(found.names)

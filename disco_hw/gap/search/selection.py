@@ -36,29 +36,31 @@ Z95 = 1.96
 
 @dataclass(frozen=True, slots=True)
 class EffectEvidence:
-    """For one set of effects against a smaller one.
+    """Evidence for one set of effects against a smaller one.
 
-    `gain` in nats of the fit; `held_out` in nats on blocks left out, `repeated` the same without the block that says
-    most, `thrice` what the others say beside the two that say most, all together or the best of them alone;
-    `inflation` of the variance; `score` = 2 gain / inflation - parameters ln(n), the difference of BIC.
+    `gain` in nats of the fit; `held_out` in nats on blocks left out. `held_out_without_best` is that without the block
+    with the largest gain. `held_out_without_two_best` is what remains without the two largest: the sum of the other
+    blocks, or the largest of them if that is more. `inflation` of the variance; `score` = 2 gain / inflation -
+    parameters ln(n), the difference of BIC.
     """
 
     gain: float
     held_out: float
-    repeated: float
-    thrice: float
+    held_out_without_best: float
+    held_out_without_two_best: float
     inflation: float
     score: float
 
-    def again(self, parameters: float, count: int) -> float:
-        """The score of what is repeated, for so many parameters and residuals."""
-        return 2.0 * self.repeated / self.inflation - parameters * math.log(max(count, 2))
+    def score_without_best(self, parameters: float, count: int) -> float:
+        """Return the score of the held-out gain without its best block, for so many parameters and residuals."""
+        return 2.0 * self.held_out_without_best / self.inflation - parameters * math.log(max(count, 2))
 
-    def repeats(self, count: int) -> bool:
-        """Whether it is there without the block that says most, and a third place of a log with so many residuals says
-        more than a parameter costs: what shows twice may be chance, and says little of another drive.
+    def holds_without_two_best(self, count: int) -> bool:
+        """Whether a gain remains without the best block, and without two pays for a parameter of `count` residuals.
+
+        What only two blocks show may be chance, and says little of another drive.
         """
-        return self.repeated > 0.0 and self.thrice > 0.5 * math.log(max(count, 2))
+        return self.held_out_without_best > 0.0 and self.held_out_without_two_best > 0.5 * math.log(max(count, 2))
 
 
 def held_out_by_block(found: Fit, channel: ResidualChannel) -> Array:
@@ -136,10 +138,10 @@ def compare(small: Fit, big: Fit, channel: ResidualChannel, parameters: float) -
     blocks = held_out_by_block(small, channel) - held_out_by_block(big, channel)
     held_out = float(blocks.sum())
     # One that a fit without it explains by nothing at all is so large that in a difference the others would be lost.
-    repeated, others = float(_without_most(blocks, 1).sum()), _without_most(blocks, 2)
-    thrice = max(float(others.sum()), float(others.max(initial=0.0)))
+    without_best, others = float(_without_most(blocks, 1).sum()), _without_most(blocks, 2)
+    without_two_best = max(float(others.sum()), float(others.max(initial=0.0)))
     score = 2.0 * gain / factor - parameters * math.log(max(channel.count, 2))
-    return EffectEvidence(gain, held_out, repeated, thrice, factor, score)
+    return EffectEvidence(gain, held_out, without_best, without_two_best, factor, score)
 
 
 def _without_most(blocks: Array, many: int) -> Array:
@@ -376,9 +378,9 @@ class Selector:
         delays = set(delays_of(layout))
         lags_too = new <= set(LATE) - delays and not delays.isdisjoint(smaller)
         # All commands are late alike: that few of them change says nothing against it.
-        repeats = (layout.of_wheels and new <= delays) or proof.repeats(self.channel.count)
+        repeats = (layout.of_wheels and new <= delays) or proof.holds_without_two_best(self.channel.count)
         return (
-            (not once or proof.again(price, self.channel.count) > 0.0)
+            (not once or proof.score_without_best(price, self.channel.count) > 0.0)
             and (proof.score > limits.score or self._dominant(smaller, gain))
             and repeats
             and (

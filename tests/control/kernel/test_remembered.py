@@ -116,6 +116,7 @@ def test_costs_under_points_that_differ_in_when_and_how_much_was_remembered():
         np.testing.assert_allclose(path[-1], [state.x, state.y, state.yaw], atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_it_matters_to_costs_what_was_before():
     model = model_of({"wheel_radius_m": 0.002})
     _, commands, got = planned(model, replace(SETTINGS, uncertainty="point"))

@@ -271,3 +271,22 @@ class DriverConformance:
         with pytest.raises(ValueError, match="not a wheel command"):
             bench.driver.transmit(bench.now_ns, command)
         assert bench.driver.stats.commands_sent == sent
+
+    def test_released_the_wheels_roll_out_without_a_ramp_and_the_reason_is_a_fault_until_a_reset(self, bench):
+        bench.arm()
+        bench.run(0.6, FORWARD)
+        bench.driver.release("the left wheel does not count")
+        bench.run(0.02)
+        assert bench.driver.state is DriverState.FAULT
+        assert "the left wheel does not count" in bench.driver.detail
+        bench.run(2.0)
+        assert bench.robot.speed_rad_s == pytest.approx(0.0, abs=0.05)
+        assert not bench.robot.armed
+        bench.driver.request(Request.ARM)
+        bench.run(0.5)
+        assert bench.driver.state is DriverState.FAULT
+        bench.driver.request(Request.RESET)
+        bench.run(0.5)
+        bench.driver.request(Request.STANDBY)
+        bench.run_until(*STILL)
+        bench.arm()

@@ -429,3 +429,19 @@ def test_a_command_leaves_in_time_or_not_at_all():
     assert values["session"] == bench.robot.session
     with pytest.raises(ValueError, match="left_speed"):
         bench.driver.transmit(bench.now_ns, WheelCommand(70.0, 0.0, 0.1))
+
+
+def test_released_its_motors_are_off_while_the_wheels_roll_out_and_nothing_that_is_wanted_meanwhile_ramps():
+    bench = make_bench()
+    bench.arm()
+    bench.run(0.6, (3.0, 2.0))
+    bench.driver.release("the left wheel does not count")
+    bench.run(0.05)
+    bench.driver.request(Request.STANDBY)
+    for _ in range(18):
+        bench.run(0.05)
+        assert bench.robot.armed
+        assert not bench.robot.outputs.driver_enabled
+    bench.run(1.0)
+    assert not bench.robot.armed
+    assert "disarmed: the left wheel does not count" in bench.events

@@ -12,13 +12,20 @@ from drivers.motor import find_driver
 from drivers.types import DriverState, Frame, OutgoingFrame, Request, WheelCommand
 from tests.drivers.motor.bench import START_NS
 from tests.drivers.motor.vendors import VENDORS
+from tests.tables import thinned
 
 FORWARD = (3.0, 2.0)
 STILL = (DriverState.STANDBY, DriverState.READY)
 COASTING_S = 2.5
 
 
-@pytest.fixture(params=VENDORS, ids=str)
+# Of several boards with one driver all are tried by `make test-all`; of the quick ones, each driver has its first.
+FURTHER = ("odrive-0.5", "vesc-four-braking", "roboclaw-a-board-a-side")
+
+
+@pytest.fixture(
+    params=[pytest.param(one, marks=pytest.mark.thorough) if str(one) in FURTHER else one for one in VENDORS], ids=str
+)
 def vendor(request):
     return request.param
 
@@ -141,7 +148,7 @@ def test_a_host_that_was_frozen_blames_itself_and_not_a_controller_whose_replies
     assert bench.largest_speed < 0.05
 
 
-@pytest.mark.parametrize("pause_s", [0.04, 0.06, 0.07, 0.08, 0.09])
+@thinned("pause_s", [0.04, 0.06, 0.07, 0.08, 0.09], quick=2)
 def test_a_host_that_pauses_for_less_than_any_watchdog_drives_on(vendor, bench, pause_s):
     """Whatever came last before it; what the controllers sent meanwhile is read a tick after the loop is back."""
     if pause_s + 0.04 > vendor.watchdog_s:
@@ -251,7 +258,7 @@ def test_an_error_cleared_does_not_energise_again(vendor, bench):
     assert bench.robot.speed == pytest.approx(FORWARD, abs=0.02)
 
 
-@pytest.mark.parametrize("when", ["before", "standby", "arming", "armed", "stopping", "fault"])
+@thinned("when", ["before", "standby", "arming", "armed", "stopping", "fault"], quick=3)
 def test_the_emergency_stop_stops_in_every_state(vendor, bench, when):
     if when != "before":
         bench.run_until(*STILL)
@@ -370,7 +377,7 @@ def test_a_fault_is_latched_although_the_line_was_out_since(vendor, bench):
     bench.run_until(*STILL)
 
 
-@pytest.mark.parametrize("out_for_s", [0.03, 0.09, 0.15])
+@thinned("out_for_s", [0.03, 0.09, 0.15], quick=2)
 def test_a_short_interruption_disarms_too(vendor, bench, out_for_s):
     drive(bench)
     bench.host_end.plug(False)
@@ -505,3 +512,21 @@ def test_an_emergency_stop_that_is_heard_is_taken_at_once_and_said_once(vendor, 
     assert [event for event in bench.events if "outside" in event or "another host is" in event] == [
         "stopped from outside on the link, by `disco-hw estop` or another host"
     ]
+
+
+def test_released_no_speed_but_zero_is_commanded_any_more_and_the_reason_is_a_fault_until_a_reset(vendor, bench):
+    drive(bench)
+    bench.driver.release("the left wheel does not count")
+    bench.run(0.02)
+    sent = len(bench.robot.received)
+    assert bench.driver.state is DriverState.FAULT
+    assert "the left wheel does not count" in bench.driver.detail
+    bench.run(COASTING_S, FORWARD)
+    assert not [frame for frame in bench.robot.received[sent:] if vendor.is_motion(frame)], "a ramp would be motion"
+    assert no_wheel_is_driven(bench)
+    bench.driver.request(Request.ARM)
+    bench.run(0.5)
+    assert bench.driver.state is DriverState.FAULT
+    bench.driver.request(Request.RESET)
+    bench.run(1.0)
+    bench.run_until(*STILL)

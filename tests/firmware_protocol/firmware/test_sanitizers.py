@@ -4,6 +4,7 @@ import subprocess
 
 import pytest
 
+from tests.tables import thinned
 from tools.firmware_check import HARNESS_SANITIZERS, build_harness, run_harness
 
 CYCLES = 100_000
@@ -21,7 +22,7 @@ def harness(tmp_path_factory):
     return build_harness(folder)
 
 
-@pytest.mark.parametrize("authenticated", [False, True])
+@thinned("authenticated", [True, False], quick=1)
 def test_no_undefined_behaviour_and_no_stray_access(harness, authenticated):
     """100 simulated seconds each; in a flood 20 random frames a millisecond. `make firmware-check` sends 10 million."""
     ran = run_harness(harness, CYCLES, 20, authenticated)

@@ -8,6 +8,7 @@ import random
 import pytest
 
 from tests.firmware_protocol.bench import CONFIG, FAULTS, MS, Bench
+from tests.tables import thinned
 
 SPEED = 4.0
 RAMP_CYCLES = math.ceil(SPEED / CONFIG.stop_deceleration_rad_s2 * 1000)
@@ -107,7 +108,7 @@ def test_a_clock_that_begins_to_run_at_another_rate_stops_a_robot_whose_host_goe
 
 
 @pytest.mark.parametrize("rate", [*RATES, 0.9, 0.95, 0.99, 1.0, 1.01, 1.05, 1.1])
-@pytest.mark.parametrize("late_us", [0, 1, 300, 999])
+@thinned("late_us", [0, 1, 300, 999], quick=2)
 def test_with_a_silent_host_the_wheels_stand_in_the_watchdogs_time_by_either_clock(rate, late_us):
     bench = driving()
     bench.command = None
@@ -133,7 +134,7 @@ def test_a_robot_whose_clock_never_ran_right_is_never_armed(rate):
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-@pytest.mark.parametrize("leap_us", [21_100, 25_000, 60_000, 250_000, 10**6, 3600 * 10**6, 10**15])
+@thinned("leap_us", [21_100, 25_000, 60_000, 250_000, 10**6, 3600 * 10**6, 10**15], quick=3)
 def test_one_leap_of_the_clock_stops_the_robot_at_once(leap_us, sign):
     bench = driving()
     bench.run(40_000)
@@ -241,7 +242,7 @@ def test_with_a_silent_host_no_row_of_small_leaps_keeps_the_robot_armed(leap_us)
 
 
 @pytest.mark.parametrize("config", [CONFIG, dataclasses.replace(CONFIG, cycle_s=0.005)], ids=["1 kHz", "200 Hz"])
-@pytest.mark.parametrize("rate", [0.91, 0.999, 0.9999, 1.0, 1.00004, 1.001, 1.09])
+@thinned("rate", [0.91, 0.999, 0.9999, 1.0, 1.00004, 1.001, 1.09], quick=4)
 @pytest.mark.parametrize("jitter", [0.0, 0.5, 0.99])
 def test_no_sound_clock_stops_the_robot_whose_cycles_jitter(config, rate, jitter):
     """Cycles a tenth too long or too short, each up to a whole period late or early, and now and then one lost."""

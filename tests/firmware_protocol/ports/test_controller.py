@@ -12,6 +12,7 @@ import pytest
 from firmware_protocol.build_firmware import PACKAGE, SOURCES
 from firmware_protocol.codec import Codec
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
+from tests.tables import thinned
 
 FIRMWARE, PORTS = PACKAGE / "firmware", PACKAGE / "ports"
 PORT = Path(__file__).with_name("replay_port.c")
@@ -110,7 +111,7 @@ def garbage(draw, link, ids):
         yield bytes(piece)
 
 
-@pytest.mark.parametrize("link", LINKS)
+@thinned("link", LINKS, quick=2)
 def test_garbage_on_its_lines_does_no_harm_and_it_answers_afterwards(replay, link):
     draw = random.Random(24)
     noise = b"".join(itertools.islice(garbage(draw, link, HOST_IDS), 4000))

@@ -12,6 +12,7 @@ from disco_hw.gap.data.stamp_clock import StampClock
 from disco_hw.gap.data.timing import tick_s
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels
+from tests.tables import thinned
 
 
 def drive(t_command, command, t_wheel, speed, ticks=2048, segment=None, pose_s=None):
@@ -93,7 +94,7 @@ def test_commands_in_force_are_earlier_ones_or_later_ones_where_their_stamps_are
     np.testing.assert_array_equal(in_force[0 if cells > 0 else -1], edge)
 
 
-@pytest.mark.parametrize("by_s", [-0.3, -0.203, 0.107, 0.4])
+@thinned("by_s", [-0.3, -0.203, 0.107, 0.4], quick=2)
 def test_a_log_whose_stamps_are_moved_lies_on_the_grid_as_if_they_were_not(by_s):
     rng = np.random.default_rng(7)
     t = np.arange(0.0, 40.0, 0.02)
@@ -120,7 +121,7 @@ def test_a_log_whose_stamps_are_moved_lies_on_the_grid_as_if_they_were_not(by_s)
     np.testing.assert_allclose(here, there, atol=1e-3)
 
 
-@pytest.mark.parametrize("off_s", [0.0, 0.0004, 0.002, 0.003, 0.0062, -0.2026])
+@thinned("off_s", [0.0, 0.0004, 0.002, 0.003, 0.0062, -0.2026], quick=2)
 @pytest.mark.parametrize("begin_s", [0.0, 3.304])
 def test_commands_are_laid_so_that_they_change_at_the_borders_of_cells(off_s, begin_s):
     rng = np.random.default_rng(9)
@@ -199,7 +200,7 @@ def test_a_sudden_start_out_of_a_long_rest_is_no_other_master():
     assert not line.notes
 
 
-@pytest.mark.parametrize("commanded_s", [(101.0, 139.0), (0.0, 200.0)])
+@thinned("commanded_s", [(101.0, 139.0), (0.0, 200.0)], quick=1)
 def test_of_a_long_drive_the_stretches_with_commands_are_judged_first(commanded_s):
     t = np.arange(0.0, 200.0, 0.02)
     begin_s, end_s = commanded_s
@@ -215,7 +216,7 @@ def test_of_a_long_drive_the_stretches_with_commands_are_judged_first(commanded_
     assert line.first.sum() == (3 if end_s < 200.0 else 6)
 
 
-@pytest.mark.parametrize("lag_s", [0.2, 4.0])
+@thinned("lag_s", [0.2, 4.0], quick=1)
 def test_wheels_that_answer_slower_than_any_lag_do_not_say_how_late_commands_are(lag_s):
     rng = np.random.default_rng(4)
     t = np.arange(0.0, 90.0, 0.02)

@@ -137,6 +137,7 @@ def test_logs_whose_clocks_differ_lie_on_the_grid_beside_their_own_wheels():
         np.testing.assert_allclose(together.pose.t_s[run == number] - begins_s, alone.pose.t_s, atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_a_search_of_logs_whose_clocks_differ_finds_the_robot_and_holds_how_late_the_poses_of_each_are():
     start = BODY.neutral.copy()
     start[:3] = 0.2, 0.6, 0.0
@@ -152,6 +153,7 @@ def test_a_search_of_logs_whose_clocks_differ_finds_the_robot_and_holds_how_late
     assert said["axial_distance_m"].value == pytest.approx(0.2 / 0.3, rel=0.01)
 
 
+@pytest.mark.thorough
 def test_a_log_without_commands_or_poses_speaks_for_no_delay():
     empty, none = np.empty(0), np.empty(0, np.int64)
     whole = log_of(1, 0.1, 0.06)
@@ -166,6 +168,7 @@ def test_a_log_without_commands_or_poses_speaks_for_no_delay():
     assert grid_drive(concatenate([bare, bare])).commands_timed
 
 
+@pytest.mark.thorough
 def test_logs_with_one_clock_are_one():
     logs = [log_of(1, 0.1, 0.06), log_of(2, 0.11, 0.06)]
     together = grid_drive(concatenate(logs))

@@ -12,6 +12,7 @@ from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.data.timing import pose_clock, pose_delay_s
 from disco_hw.gap.settings import GridSettings
 from disco_hw.log.drive import Commands, Poses, Wheels
+from tests.tables import thinned
 from tools.gap_logs import realistic, simulated_drive
 
 RADIUS_M, TRACK_M = 0.11, 0.6
@@ -183,7 +184,7 @@ def test_a_delay_of_commands_of_either_sign_is_parted_from_a_lag(late_s, lag_s):
 
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.11])
-@pytest.mark.parametrize("by_s", [-0.317, -0.2, 0.107, 0.213])
+@thinned("by_s", [-0.317, -0.2, 0.107, 0.213], quick=2)
 def test_commands_whose_stamps_are_moved_by_no_steps_of_the_scan_are_seen_moved_by_as_much(by_s, lag_s):
     wheels, commands = commanded(0.1, lag_s)
     plain, moved = answered(wheels, commands), answered(wheels, replace(commands, t_s=commands.t_s + by_s))
@@ -207,7 +208,7 @@ def test_commands_that_stay_as_they_are_in_each_short_segment_do_not_show_when_t
         assert (found.delay_s, found.known) == (0.0, False)
 
 
-@pytest.mark.parametrize("jump_s", [-0.2, 0.17])
+@thinned("jump_s", [-0.2, 0.17], quick=1)
 def test_a_link_that_jumps_is_made_even_and_said_to_jump(jump_s):
     wheels, commands = commanded(0.1, 0.05)
     later = replace(commands, t_s=commands.t_s + jump_s * (commands.t_s > 33.0))

@@ -100,3 +100,14 @@ def test_what_is_believed_of_a_known_term_is_believed_after_a_log_that_says_noth
     assert more.effects[0].values["k"] == pytest.approx(-0.2)
     spread = dict(zip(more.belief.names, np.sqrt(np.diag(more.belief.covariance())), strict=True))
     assert spread[f"{DRAG}.k"] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("name", ["motor_lag.tau_s", "command_delay.delay_s", "pose_latency.latency_s"])
+@pytest.mark.parametrize(("time_s", "written"), [(7.5e-14, False), (0.0009, False), (0.0011, True)])
+def test_a_time_below_a_millisecond_is_none(name, time_s, written):
+    effect, _, key = name.partition(".")
+    parts = estimates(**{name: time_s, "wheel_radius_m": 0.061})
+    found, notes = amended_model(Model(0.06, 0.4), {effect: {key: parts[0].by_name[name]}}, {}, parts)
+    assert [setting.name for setting in found.effects] == [effect] * written
+    assert found.belief.names == (("wheel_radius_m", name) if written else ("wheel_radius_m",))
+    assert not notes

@@ -34,7 +34,7 @@ def test_white_noise_speaks_for_nothing_and_a_real_slope_for_itself():
     real = compare(linear_fit(empty, noise + 0.2 * x[:, 0]), linear_fit(x, noise + 0.2 * x[:, 0]), channel(), 1.0)
     assert nothing.score < 0.0
     assert real.score > 50.0
-    assert real.repeated > 0.0
+    assert real.held_out_without_best > 0.0
     assert real.held_out == pytest.approx(real.gain, rel=0.2)
 
 
@@ -65,7 +65,7 @@ def test_a_block_is_judged_by_the_others():
     proof = compare(linear_fit(np.empty((N, 0)), y), fitted, channel(), 1.0)
     # Only one block speaks for it: without that one nothing repeats.
     assert proof.gain > 100.0
-    assert proof.repeated <= 1e-6
+    assert proof.held_out_without_best <= 1e-6
     assert held_out_by_block(fitted, channel()).size == N // EACH
 
 
@@ -80,7 +80,7 @@ def test_what_only_one_block_knows_does_not_hide_what_all_show():
         linear_fit(limit, y), Fit(both.vector, (0, 1), both.cost, both.residual, both.jacobian), channel(), 1.0
     )
     assert proof.held_out == pytest.approx(proof.gain, rel=0.2)
-    assert proof.repeated > 50.0
+    assert proof.held_out_without_best > 50.0
 
 
 def test_few_blocks_that_happen_to_scatter_do_not_take_the_evidence_away():
@@ -221,23 +221,25 @@ def test_what_repeats_is_what_is_left_without_the_block_that_says_most_however_l
     blocks = held_out_by_block(small, channel()) - held_out_by_block(big, channel())
     assert 0.0 < blocks.max() < 0.1
     proof = compare(small, big, channel(), 1.0)
-    assert proof.repeated == pytest.approx(blocks.sum() - blocks.max(), rel=1e-9)
+    assert proof.held_out_without_best == pytest.approx(blocks.sum() - blocks.max(), rel=1e-9)
     others = np.sort(blocks)[:-2]
-    assert proof.thrice == pytest.approx(others.sum(), rel=1e-9)
+    assert proof.held_out_without_two_best == pytest.approx(others.sum(), rel=1e-9)
     assert others.sum() > others.max()
     # A log of a single residual pays for a parameter as one of two.
     single = SimpleNamespace(**{**vars(channel()), "count": 1})
     assert compare(small, big, single, 1.0).score == pytest.approx(2.0 * proof.gain / proof.inflation - np.log(2.0))
-    assert proof.again(1.0, 1) == pytest.approx(2.0 * proof.repeated / proof.inflation - np.log(2.0))
+    assert proof.score_without_best(1.0, 1) == pytest.approx(
+        2.0 * proof.held_out_without_best / proof.inflation - np.log(2.0)
+    )
 
 
 def test_where_every_block_is_fitted_worse_none_is_left_out_of_what_repeats():
     y = np.random.default_rng(16).standard_normal(N)
     small, big = (Fit(np.zeros(0), (), 0.0, times * y, np.empty((N, 0))) for times in (1.0, 1.001))
     proof = compare(small, big, channel(), 1.0)
-    assert proof.repeated < 0.0
-    assert proof.repeated == proof.held_out
-    assert proof.thrice == 0.0
+    assert proof.held_out_without_best < 0.0
+    assert proof.held_out_without_best == proof.held_out
+    assert proof.held_out_without_two_best == 0.0
 
 
 def test_what_shows_in_three_blocks_does_so_however_much_worse_others_are_fitted():
@@ -250,23 +252,23 @@ def test_what_shows_in_three_blocks_does_so_however_much_worse_others_are_fitted
 
     gains = np.sort(0.5 * (1.0 - 0.25) * np.bincount(channel().block, weights=y**2)[[3, 5, 9]])
     three = proof([3, 5, 9])
-    assert three.repeated < 0.0
-    assert three.thrice == pytest.approx(gains[0])
+    assert three.held_out_without_best < 0.0
+    assert three.held_out_without_two_best == pytest.approx(gains[0])
     # Of one alone that is left out, and no other.
     one, two = proof([3]), proof([3, 5])
-    assert one.thrice == two.thrice == 0.0
-    assert one.repeated == pytest.approx(one.held_out - 0.375 * (y[channel().block == 3] ** 2).sum())
+    assert one.held_out_without_two_best == two.held_out_without_two_best == 0.0
+    assert one.held_out_without_best == pytest.approx(one.held_out - 0.375 * (y[channel().block == 3] ** 2).sum())
 
 
 def test_what_repeats_is_there_without_a_block_and_in_a_third_place_says_more_than_a_parameter_costs():
     price = 0.5 * np.log(1000.0)
-    for repeated, thrice, shows in (
+    for best, two_best, shows in (
         (0.1, 1.001 * price, True), (0.1, price, False), (70.0, -1.0, False), (0.0, 9.0, False), (-1.0, 9.0, False),
     ):  # fmt: skip
-        assert EffectEvidence(90.0, 80.0, repeated, thrice, 9.0, 99.0).repeats(1000) == shows
+        assert EffectEvidence(90.0, 80.0, best, two_best, 9.0, 99.0).holds_without_two_best(1000) == shows
     # A log of a single residual counts as one of two.
-    assert not EffectEvidence(90.0, 80.0, 70.0, 0.34, 9.0, 99.0).repeats(1)
-    assert EffectEvidence(90.0, 80.0, 70.0, 0.35, 9.0, 99.0).repeats(1)
+    assert not EffectEvidence(90.0, 80.0, 70.0, 0.34, 9.0, 99.0).holds_without_two_best(1)
+    assert EffectEvidence(90.0, 80.0, 70.0, 0.35, 9.0, 99.0).holds_without_two_best(1)
 
 
 def test_blocks_that_say_nothing_of_a_parameter_hide_no_scatter_of_the_others():

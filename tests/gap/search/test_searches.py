@@ -19,6 +19,7 @@ from disco_hw.gap.search.selection import Selector
 from disco_hw.gap.search.unnamed_terms import WithTerms, body_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from tests.gap.synthetic import DRIVE, GEOMETRY, LIMITS, NOISE, body_channel, line_of
+from tests.tables import thinned
 
 READ_TO_RAD = 1e-3
 
@@ -63,7 +64,7 @@ def test_what_a_model_knows_of_the_wheels_is_refitted_and_not_found():
     assert found.base.vector[WHEEL.place["motor_lag.tau_s"]] == pytest.approx(0.15, abs=0.002)
 
 
-@pytest.mark.parametrize("curved", [0.0, -0.02])
+@thinned("curved", [0.0, -0.02], quick=1)
 def test_commands_are_searched_alike_to_the_last_bit_wherever_they_are_stamped(curved):
     """A delay that is counted from other stamps is rounded otherwise, and what it leads to may be another set."""
     line = wheels_of(lambda u: curved * u * np.abs(u), motor_lag=0.15)
@@ -83,7 +84,7 @@ def test_commands_are_searched_alike_to_the_last_bit_wherever_they_are_stamped(c
     np.testing.assert_array_equal(np.delete(ends[0].vector, late), np.delete(ends[1].vector, late))
 
 
-@pytest.mark.parametrize("late_s", [0.0, 0.3])
+@thinned("late_s", [0.0, 0.3], quick=1)
 def test_poses_are_searched_alike_to_the_last_bit_wherever_they_are_stamped(late_s):
     channel, line = body_channel(turn_slip=0.08)
     plain, moved = (

@@ -118,8 +118,8 @@ def test_what_begins_at_some_time_is_worth_it_without_the_block_that_says_most(m
     monkeypatch.setattr(selection, "compare", lambda *_: proof)
     assert found.acceptable((), ("surface_change",)) == accepted
     # Others have to repeat, however little.
-    for repeated, there in ((0.01, True), (0.0, False)):
-        shown = EffectEvidence(90.0, 80.0, repeated, 70.0, 1.2, 99.0)
+    for held_out_without_best, there in ((0.01, True), (0.0, False)):
+        shown = EffectEvidence(90.0, 80.0, held_out_without_best, 70.0, 1.2, 99.0)
         monkeypatch.setattr(selection, "compare", lambda *_, shown=shown: shown)
         found.proofs.clear()
         assert found.acceptable((), ("turn_slip",)) == there
@@ -129,8 +129,8 @@ def test_what_begins_at_some_time_is_worth_it_without_the_block_that_says_most(m
 @pytest.mark.parametrize(("share", "accepted"), [(0.99, False), (1.01, True)])
 def test_every_effect_shows_beside_the_two_blocks_that_say_most(monkeypatch, name, share, accepted):
     found = selector(turn_slip=0.08)
-    thrice = share * 0.5 * np.log(found.channel.count)
-    monkeypatch.setattr(selection, "compare", lambda *_: EffectEvidence(90.0, 80.0, 70.0, thrice, 1.2, 99.0))
+    without_two = share * 0.5 * np.log(found.channel.count)
+    monkeypatch.setattr(selection, "compare", lambda *_: EffectEvidence(90.0, 80.0, 70.0, without_two, 1.2, 99.0))
     assert found.acceptable((), (name,)) == accepted
 
 
@@ -172,7 +172,7 @@ def test_a_slow_drive_cannot_tell_lag_from_delay_and_says_so():
     assert steps.rivals(("command_delay",), "command_delay") == ()
 
 
-def judged(gain=30.0, score=30.0, thrice=10.0, moved_m=0.01, misfit=0.0, count=1000):
+def judged(gain=30.0, score=30.0, without_two=10.0, moved_m=0.01, misfit=0.0, count=1000):
     """Whether one effect is accepted on top of none: its gain, proof, what it moves, and what the fit without lacks."""
     channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=count, split=lambda vector: (vector, None), layout=BODY)
     base = 0.5 * count * (1.0 + misfit)
@@ -180,7 +180,7 @@ def judged(gain=30.0, score=30.0, thrice=10.0, moved_m=0.01, misfit=0.0, count=1
     chosen = Selector(channel, lambda small, big: moved_m, limits)
     for names, cost in ((frozenset(), base), (frozenset({"turn_slip"}), base - gain)):
         chosen.fits[names] = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
-    chosen.proofs[frozenset(), frozenset({"turn_slip"})] = EffectEvidence(gain, 50.0, 50.0, thrice, 1.0, score)
+    chosen.proofs[frozenset(), frozenset({"turn_slip"})] = EffectEvidence(gain, 50.0, 50.0, without_two, 1.0, score)
     return chosen.acceptable((), ("turn_slip",))
 
 
@@ -191,11 +191,11 @@ def test_an_effect_is_accepted_only_if_every_condition_holds():
     assert judged(gain=10.0) is True
     assert judged(score=20.0) is False
     # A parameter of 1000 residuals costs 3.45 nats.
-    assert judged(thrice=3.46) is True
+    assert judged(without_two=3.46) is True
     assert judged(gain=9.9) is False
     assert judged(score=19.9) is False
-    assert judged(thrice=3.45) is False
-    assert judged(thrice=-1.0) is False
+    assert judged(without_two=3.45) is False
+    assert judged(without_two=-1.0) is False
     assert judged(moved_m=0.001) is False
 
 
@@ -255,7 +255,7 @@ def test_what_fits_badly_is_helped_by_a_large_part_of_what_it_lacks_whatever_its
     assert judged(score=-5.0, gain=200.0, misfit=0.45) is False
     assert judged(score=-5.0, gain=200.0, misfit=0.5) is False
     assert judged(score=-5.0, gain=200.0, misfit=0.6) is True
-    assert judged(score=-5.0, gain=260.0, misfit=2.0, thrice=-1.0) is False
+    assert judged(score=-5.0, gain=260.0, misfit=2.0, without_two=-1.0) is False
     assert judged(score=-5.0, gain=260.0, misfit=2.0, moved_m=0.0) is False
 
 

@@ -199,10 +199,12 @@ def test_a_term_is_accepted_with_its_number_and_its_evidence_and_what_stood_in_f
         (40.0, 1.5, 0.0009, False),
     ],
 )
-def test_a_term_takes_its_score_and_shows_thrice_and_moves_predictions(monkeypatch, score, prices, moved_m, accepted):
+def test_a_term_takes_its_score_holds_without_two_best_blocks_and_moves_predictions(
+    monkeypatch, score, prices, moved_m, accepted
+):
     channel, term = turned_in(0.3, 0.5, -0.15)
-    thrice = prices * 0.5 * np.log(channel.count)
-    proof = EffectEvidence(30.0, 10.0, 9.0, thrice, 1.0, score)
+    without_two = prices * 0.5 * np.log(channel.count)
+    proof = EffectEvidence(30.0, 10.0, 9.0, without_two, 1.0, score)
     monkeypatch.setattr(channel_search, "compare", lambda *_: proof)
     found = with_unnamed(searched(channel, moves=lambda small, big: moved_m), lambda found: iter((term,)))
     assert [one.evidence for one in found.unnamed] == ([proof] if accepted else [])
@@ -236,8 +238,8 @@ def test_a_patch_is_worth_it_without_the_block_that_says_most(monkeypatch):
     # Of four that were tried: what a term costs, one parameter and the choice, and 20 more.
     price = np.log(channel.count) + 2.0 * np.log(4.0)
     nats = 0.5 * 1.3 * (20.0 + price)
-    for repeated, worth_it in ((1.001 * nats, True), (0.999 * nats, False)):
-        proof = EffectEvidence(90.0, 80.0, repeated, 0.0, 1.3, 99.0)
+    for held_out_without_best, worth_it in ((1.001 * nats, True), (0.999 * nats, False)):
+        proof = EffectEvidence(90.0, 80.0, held_out_without_best, 0.0, 1.3, 99.0)
         monkeypatch.setattr(channel_search, "compare", lambda *_, proof=proof: proof)
         larger, happened_again = _with_term(searched(channel), patch, 4)
         assert happened_again is (larger is not None) is worth_it
@@ -246,12 +248,15 @@ def test_a_patch_is_worth_it_without_the_block_that_says_most(monkeypatch):
     shown = EffectEvidence(90.0, 80.0, 0.1, 0.51 * np.log(channel.count), 1.3, 99.0)
     monkeypatch.setattr(channel_search, "compare", lambda *_: shown)
     assert _with_term(searched(channel), term, 4)[0] is not None
-    for less in (replace(shown, repeated=0.0), replace(shown, thrice=0.49 * np.log(channel.count))):
+    for less in (
+        replace(shown, held_out_without_best=0.0),
+        replace(shown, held_out_without_two_best=0.49 * np.log(channel.count)),
+    ):
         monkeypatch.setattr(channel_search, "compare", lambda *_, less=less: less)
         assert _with_term(searched(channel), term, 4) == (None, True)
     monkeypatch.setattr(channel_search, "compare", lambda *_: EffectEvidence(90.0, 80.0, 80.0, 80.0, 1.3, 19.0))
     assert _with_term(searched(channel), patch, 4) == (None, True)
-    again = EffectEvidence(90.0, 80.0, 30.0, 30.0, 1.5, 99.0).again(2.0, 1000)
+    again = EffectEvidence(90.0, 80.0, 30.0, 30.0, 1.5, 99.0).score_without_best(2.0, 1000)
     assert again == pytest.approx(2.0 * 30.0 / 1.5 - 2.0 * np.log(1000.0))
 
 

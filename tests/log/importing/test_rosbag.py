@@ -21,6 +21,7 @@ from disco_hw.log.load import load_drive
 from tests.inference.drives import robot_config
 from tests.inference.test_infer_command import ROBOT
 from tests.log.importing.bags import BEGAN_NS, LATENCY_NS, LEFT, RIGHT, bag, recorded
+from tests.tables import thinned
 
 
 @pytest.fixture
@@ -70,7 +71,7 @@ def test_four_wheels_commands_and_the_chain_of_frames_are_read(tmp_path, storage
     assert drive.segments == 1
 
 
-@pytest.mark.parametrize("distro", [Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY, Stores.ROS2_KILTED])
+@thinned("distro", [Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY, Stores.ROS2_KILTED], quick=1)
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_bags_of_all_releases_are_read(tmp_path, distro, storage):
     truth = recorded(place(tmp_path), storage, distro)

@@ -22,6 +22,7 @@ from disco_hw.log.load import load_drive
 from tests.inference.drives import robot_config
 from tests.inference.test_infer_command import ROBOT
 from tests.log.importing.bags import BEGAN_NS, LEFT, RIGHT, bag, recorded
+from tests.tables import thinned
 
 
 def small(path, storage="mcap"):
@@ -60,7 +61,7 @@ def test_what_infer_is_given_as_a_bag_is_to_be_imported_first(tmp_path):
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3", "ros1"])
-@pytest.mark.parametrize("share", [0.01, 0.3, 0.7, 0.99])
+@thinned("share", [0.01, 0.3, 0.7, 0.99], quick=2)
 def test_a_truncated_bag_is_one_line(tmp_path, storage, share):
     path = tmp_path / "b.bag"
     recorded(path, storage)
@@ -71,7 +72,7 @@ def test_a_truncated_bag_is_one_line(tmp_path, storage, share):
     assert one_line(error)
 
 
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3", "ros1"])
+@thinned("storage", ["mcap", "sqlite3", "ros1"], quick=1)
 def test_a_mutated_bag_is_a_drive_or_one_line(tmp_path, storage):
     source = small(tmp_path / "b.bag", storage)
     source = source if storage == "ros1" else file_of(source)
@@ -117,6 +118,7 @@ def test_a_message_that_claims_a_list_of_any_size_is_one_line(tmp_path):
     assert one_line(error)
 
 
+@pytest.mark.thorough
 def test_a_chunk_that_unpacks_to_more_than_memory_is_one_line(tmp_path):
     """3 GiB of zeros in 100 kB: in a process of its own, as what it takes must not stay."""
     import zstandard
@@ -213,6 +215,7 @@ def test_a_pipe_in_a_bags_folder_holds_nobody_up(tmp_path):
         read_rosbag(folder, robot_config())
 
 
+@pytest.mark.thorough
 def test_a_command_on_what_is_no_bag_exits_with_two(tmp_path):
     robot = tmp_path / "robot.toml"
     robot.write_text(ROBOT)

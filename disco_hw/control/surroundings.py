@@ -1,0 +1,124 @@
+"""The fence and the obstacles around a plan: which shapes it can come near, and how far to keep from them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from statistics import NormalDist
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.control.detours import Detours
+from disco_hw.control.kernel import aligned_zeros
+from disco_hw.control.kernel.avoid import (
+    COLUMNS,
+    DETOUR_COLUMNS,
+    DETOURS,
+    LOOK_EVERY,
+    MOST_SHAPES,
+    TOUCH_COST,
+    Area,
+    place_shapes,
+)
+from disco_hw.fence import Footprint
+from disco_hw.fence.clearance import Boundaries
+from disco_hw.fence.outlines import circle_outline
+from disco_hw.jit import compiled_for
+
+Array = NDArray[np.float64]
+TRAPPED_PART = 0.5
+"""A plan all of whose samples touch something for so long has no way out."""
+
+
+class Surroundings:
+    """What a planner keeps away from, in the buffers that its kernel reads.
+
+    `max_breach_probability`: of a plan over its horizon; with the pose's deviation it makes the distance to keep.
+    """
+
+    def __init__(
+        self,
+        footprint: Footprint,
+        margin_m: float,
+        max_breach_probability: float,
+        step_s: float,
+        horizon: int,
+        speed_m_s: float,
+    ) -> None:
+        self.speed_m_s = speed_m_s
+        """The task's speed."""
+        self._detours = Detours(footprint)
+        self._footprint = footprint
+        self._margin_m = margin_m
+        self._deviations = NormalDist().inv_cdf(1.0 - max_breach_probability)
+        self._horizon = horizon
+        self._table = np.empty((0, COLUMNS))
+        self._edges = np.empty((0, COLUMNS))
+        self._bounds: Boundaries | None = None
+        self._place: Callable[..., None] | None = None
+        self.area = Area(
+            aligned_zeros(MOST_SHAPES * COLUMNS),
+            np.zeros(1, np.int64),
+            np.array(
+                [0.5 * footprint.length, 0.5 * footprint.width, footprint.ahead, 0.0, step_s, 0.0, 0.0], np.float32
+            ),
+            np.zeros(DETOURS * DETOUR_COLUMNS, np.float32),
+            np.zeros(MOST_SHAPES),
+        )
+
+    @property
+    def trapped_cost(self) -> float:
+        """Cost from which on a sequence touches something for most of the horizon."""
+        return TOUCH_COST * TRAPPED_PART * self._horizon / LOOK_EVERY
+
+    @property
+    def touching_cost(self) -> float:
+        """Cost from which on a sequence touches something."""
+        return TOUCH_COST
+
+    def look_around(self, bounds: Boundaries, deviation_m: float) -> None:
+        """Keep away from these boundaries; `deviation_m`: of the corner whose place is known least."""
+        if bounds is not self._bounds:
+            self._bounds = bounds
+            self._edges = _edges(bounds)
+        circles = bounds.circles
+        moving = np.zeros((len(circles), COLUMNS))
+        moving[:, [0, 1, 5, 6, 7]] = circles
+        self._table = np.concatenate((self._edges, moving))
+        keep_m = self._margin_m + self._deviations * deviation_m
+        self.area.body[3] = keep_m
+        self._detours.look_around(bounds, keep_m)
+
+    def set_line(self, line_m: Array) -> None:
+        """Drive around what stands on this line, points (N, 2)."""
+        self._detours.set_line(line_m)
+
+    def place(self, x_m: float, y_m: float, origin_m: tuple[float, float], speed_m_s: float) -> Area:
+        """Put the shapes that a plan from here can reach into the kernel's buffers, relative to the origin.
+
+        `speed_m_s`: the fastest that the plan may go.
+        """
+        time_s = self._horizon * float(self.area.body[4])
+        near_m = self._footprint.reach_m + float(self.area.body[3])
+        self.area.body[5:] = speed_m_s, near_m
+        reach_m = speed_m_s * time_s + near_m
+        arguments = self.area, self._table, x_m, y_m, *origin_m, reach_m, time_s
+        if self._place is None:
+            self._place = compiled_for(place_shapes, *arguments)
+        self._place(*arguments)
+        self._detours.place(self.area.detours, x_m, y_m, origin_m)
+        return self.area
+
+
+def _edges(bounds: Boundaries) -> Array:
+    """The edges of all polygons, and of one within the circle to stay in, as capsules of no radius."""
+    outlines = [corners for corners, _ in bounds.polygons]
+    circle = bounds.keep_in_circle
+    if circle is not None:
+        outlines.append(circle_outline(*circle.center, circle.radius_m)[:-1])
+    rows = []
+    for corners in outlines:
+        way = np.roll(corners, -1, axis=0) - corners
+        length = np.hypot(*way.T)
+        rows.append(np.column_stack([corners, way / length[:, None], length, np.zeros((len(corners), 3))]))
+    return np.concatenate(rows) if rows else np.empty((0, COLUMNS))

@@ -1,0 +1,175 @@
+"""Fits a script into the fence: manoeuvres turned round, mirrored, in another order, and slower where they must be.
+
+Pure. It takes a little time, so it is done a manoeuvre at a time while the robot stands.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.drive import ManualInput, ManualSource, RobotView
+from disco_hw.drive.script import Manoeuvre, Room, Script, ScriptSource, Wheels
+from disco_hw.fence.clearance import Boundaries
+
+Array = NDArray[np.float64]
+Pose = tuple[float, float, float]
+SCALES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.3)
+"""Parts of a script's speeds that are tried, the largest first."""
+SPARE_M = 0.08
+"""Distance kept from the fence beyond its margin, for what the robot does otherwise than its model."""
+_LOOK_AHEAD = 8
+_STEP_S = 0.05
+# As it is, mirrored, backward, and both.
+_VARIANTS = (("", 1.0, False), ("mirrored", 1.0, True), ("backward", -1.0, False), ("mirrored, backward", -1.0, True))
+
+
+@dataclass(frozen=True, slots=True)
+class ScriptGeometry:
+    """The robot that a script is fitted for (m): that of its model."""
+
+    wheel_radius_m: float
+    axial_distance_m: float
+    x_icr_m: float
+
+
+class ScriptDoesNotFit(Exception):  # noqa: N818
+    """No order and no speed brings the script into the fence; the message says how much room it needs."""
+
+
+def fit_script(
+    script: Script, start: Pose, robot: ScriptGeometry, bounds: Boundaries, room: Room
+) -> Iterator[Script | None]:
+    """Yield None while it works, and at last a script that stays inside from this pose. Raises ScriptDoesNotFit.
+
+    `room`: what the script takes as it is, for the message.
+    """
+    keep_m = bounds.fence.margin_m + SPARE_M
+    for scale in SCALES:
+        remaining, chosen, pose = list(script.manoeuvres), list[Manoeuvre](), start
+        while remaining:
+            found = _next_that_fits(remaining, scale, pose, robot, bounds, keep_m)
+            if found is None:
+                break
+            index, manoeuvre, pose = found
+            chosen.append(manoeuvre)
+            del remaining[index]
+            yield None
+        if not remaining:
+            yield Script(script.name, tuple(chosen))
+            return
+    slowest = f"at {SCALES[-1]:.0%} of its speed either"
+    raise ScriptDoesNotFit(
+        f"script {script.name} does not fit into the fence from here, {slowest}; as it is it needs {room.in_words()}. "
+        "Make room, or put the robot in the middle"
+    )
+
+
+def _next_that_fits(
+    remaining: list[Manoeuvre], scale: float, pose: Pose, robot: ScriptGeometry, bounds: Boundaries, keep_m: float
+) -> tuple[int, Manoeuvre, Pose] | None:
+    """The first of the next manoeuvres that stays inside in some variant, and where it ends."""
+    finds_limits = any(one.finds_limits for one in remaining)
+    for index, manoeuvre in enumerate(remaining[:_LOOK_AHEAD]):
+        if manoeuvre.within_limits and finds_limits:
+            # The limits that it is scaled into are not found yet.
+            continue
+        for words, sign, mirrored in _VARIANTS:
+            changed = _changed(manoeuvre, scale, words, sign, mirrored)
+            path = driven_path(changed, pose, robot)
+            if bounds.clearance_m(path).min() >= keep_m:
+                x_m, y_m, yaw_rad = path[-1].tolist()
+                return index, changed, (x_m, y_m, yaw_rad)
+    return None
+
+
+def _changed(manoeuvre: Manoeuvre, scale: float, words: str, sign: float, mirrored: bool) -> Manoeuvre:
+    if scale == 1.0 and not words:
+        return manoeuvre
+    original = manoeuvre.wheels
+
+    def wheels(t_s: float) -> Wheels:
+        left, right = original(t_s)
+        left, right = (right, left) if mirrored else (left, right)
+        return sign * scale * left, sign * scale * right
+
+    slower = "" if scale == 1.0 else f"at {scale:.0%}"
+    note = ", ".join(part for part in (words, slower) if part)
+    return replace(manoeuvre, wheels=wheels, purpose=f"{manoeuvre.purpose} ({note})")
+
+
+def driven_path(manoeuvre: Manoeuvre, start: Pose, robot: ScriptGeometry) -> Array:
+    """Poses (N, 3) of the tracked point over a manoeuvre, of a robot that does what it is told."""
+    count = max(1, math.ceil(manoeuvre.duration_s / _STEP_S))
+    step_s = manoeuvre.duration_s / count
+    wheels = np.array([manoeuvre.wheels((k + 0.5) * step_s) for k in range(count)])
+    moved = 0.5 * robot.wheel_radius_m * wheels.sum(axis=1) * step_s
+    turned = robot.wheel_radius_m * (wheels[:, 1] - wheels[:, 0]) / robot.axial_distance_m * step_s
+    yaw = start[2] + np.concatenate(([0.0], np.cumsum(turned)))
+    middle = yaw[:-1] + 0.5 * turned
+    x = start[0] + robot.x_icr_m * math.cos(start[2]) + np.concatenate(([0.0], np.cumsum(moved * np.cos(middle))))
+    y = start[1] + robot.x_icr_m * math.sin(start[2]) + np.concatenate(([0.0], np.cumsum(moved * np.sin(middle))))
+    return np.stack([x - robot.x_icr_m * np.cos(yaw), y - robot.x_icr_m * np.sin(yaw), yaw], axis=1)
+
+
+class FittedScriptSource:
+    """Plays a script, fitted into the fence from where the robot stands, while another source's deadman is held."""
+
+    def __init__(
+        self, script: Script, deadman: ManualSource, robot: ScriptGeometry, bounds: Boundaries, room: Room
+    ) -> None:
+        self._script, self._deadman = script, deadman
+        self._robot, self._bounds, self._room = robot, bounds, room
+        self._fitting: Iterator[Script | None] | None = None
+        self._playing: ScriptSource | None = None
+        self._refused: str | None = None
+
+    @property
+    def ended(self) -> str | None:
+        """That it does not fit, or the end of the script or of the source of the deadman."""
+        return self._refused or (self._deadman.ended if self._playing is None else self._playing.ended)
+
+    @property
+    def completed(self) -> bool:
+        """Whether the script was played to its end."""
+        return self._playing is not None and self._playing.completed
+
+    @property
+    def words(self) -> str:
+        """How far it is; what to do where nothing moves."""
+        if self._playing is not None:
+            return self._playing.words
+        return "waiting for a pose, to fit the script into the fence" if self._fitting is None else "fitting the script"
+
+    @property
+    def task(self) -> str:
+        """The manoeuvre under way, or next."""
+        return "" if self._playing is None else self._playing.task
+
+    def poll(self, now_ns: int, robot: RobotView) -> ManualInput | None:
+        """Fit one manoeuvre, and hold still meanwhile; once all are, play."""
+        if self._playing is not None:
+            return self._playing.poll(now_ns, robot)
+        self._fit(robot)
+        return ManualInput(now_ns, 0.0, 0.0, deadman=False)
+
+    def close(self) -> None:
+        """Close the source of the deadman."""
+        self._deadman.close()
+
+    def _fit(self, robot: RobotView) -> None:
+        if self._refused is not None or robot.pose is None:
+            return
+        if self._fitting is None:
+            self._fitting = fit_script(self._script, robot.pose, self._robot, self._bounds, self._room)
+        try:
+            fitted = next(self._fitting)
+        except ScriptDoesNotFit as refusal:
+            self._refused = str(refusal)
+            return
+        if fitted is not None:
+            self._playing = ScriptSource(fitted, self._deadman)

@@ -1,0 +1,245 @@
+"""Whether commands, wheels and poses of a drive can be those of one robot, and if not, the most likely cause.
+
+Increments over a second are fitted with a free geometry: of a sound log, whatever effects the robot has, that explains
+all but a part. Where it does not, or where the geometry is none that a robot can have, each known cause (an encoder
+reversed, an axis mirrored, another clock, ...) is put right in turn, and the one that explains the log is named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from disco_hw.errors import LogError
+from disco_hw.log.contradictions import (
+    SIDES,
+    Contradiction,
+    Link,
+    of_axes,
+    of_clock,
+    of_counts,
+    of_scale,
+    of_units,
+    of_unrelated,
+)
+from disco_hw.log.drive import Array, DriveLog, separate
+from disco_hw.log.motion_fits import BodyFit, CommandFit, fit_body, fit_commands, fit_pose_clock
+from disco_hw.log.motion_windows import MotionWindows, motion_windows
+from disco_hw.log.standstill import dead_encoders, never_counting, no_common_time, standing
+
+# Of real logs the worst is 0.37 (a Warthog on sand), of unrelated motion the best 0.7.
+_UNEXPLAINED = 0.6
+_EXPLAINED = 0.4
+_WELL_EXPLAINED = 0.2
+_AS_GOOD = 0.5
+_LEAST_LATE_S = 0.75
+_USUAL_GAIN = (0.55, 1.5)
+_UNEQUAL = 1.4
+# In a second of a slow drive a wheel may lack so much of its command by its deadband alone.
+_MOST_DEADBAND_RAD = 1.5
+# Signs and shares with which the counts of the left and right encoder are put right in turn.
+_ENCODER_FAULTS = {
+    (-1.0, 1.0): ("encoder_reversed", "the left encoder counts backwards"),
+    (1.0, -1.0): ("encoder_reversed", "the right encoder counts backwards"),
+    (0.5, 1.0): ("encoder_scale", "the left wheel counts 2.00 times the expected ticks, the right one does not"),
+    (1.0, 0.5): ("encoder_scale", "the right wheel counts 2.00 times the expected ticks, the left one does not"),
+    (2.0, 1.0): ("encoder_scale", "the left wheel counts 0.50 times the expected ticks, the right one does not"),
+    (1.0, 2.0): ("encoder_scale", "the right wheel counts 0.50 times the expected ticks, the left one does not"),
+}
+
+
+def find_contradictions(log: DriveLog, wheel_radius_m: float, axial_distance_m: float) -> tuple[Contradiction, ...]:
+    """Find what contradicts itself in logs of a robot with this nominal geometry; empty for sound ones.
+
+    Several logs are judged one by one: a sound one must not hide what is wrong with another.
+    """
+    return tuple(
+        replace(each, message=f"{name}: {each.message}")
+        for name, part in separate(log)
+        for each in _of_one(part, wheel_radius_m, axial_distance_m)
+    )
+
+
+def refuse_contradictions(found: Sequence[Contradiction], needs: Sequence[Link]) -> tuple[str, ...]:
+    """Raise LogError for the first that spoils what is needed; return the messages of all others as warnings."""
+    for each in found:
+        if set(each.spoils) & set(needs):
+            raise LogError(each.message)
+    return tuple(each.message for each in found)
+
+
+def _of_one(log: DriveLog, radius_m: float, axial_m: float) -> tuple[Contradiction, ...]:
+    if not log.wheels.t_s.size:
+        return ()
+    windows = motion_windows(log)
+    commands = fit_commands(windows)
+    dead = dead_encoders(windows)
+    if dead:
+        return dead
+    poses = _Poses(log, windows, radius_m, axial_m)
+    beside_commands = _of_commands(windows, commands)
+    if beside_commands is None:
+        return poses.contradictions(has_commands=commands is not None)
+    of_wheels, of_commands, as_commanded = beside_commands
+    if poses.fits(as_commanded):
+        return (replace(of_wheels, message=f"{of_wheels.message} (the poses say so too)"),)
+    if poses.fits(windows):
+        return (of_commands,)
+    return (*poses.contradictions(has_commands=True), of_wheels)
+
+
+def _of_commands(
+    windows: MotionWindows, fit: CommandFit | None
+) -> tuple[Contradiction, Contradiction, MotionWindows] | None:
+    """What contradicts itself between commands and wheels; None if nothing does.
+
+    Returns it as a fault of the wheels, as one of the commands, and the windows with the wheels put right.
+    """
+    if fit is None:
+        return None
+    gains = np.array(fit.gains)
+    swapped = fit_commands(windows, swapped=True)
+    if swapped is not None and swapped.worst < _EXPLAINED:
+        far_better = swapped.worst < _AS_GOOD * min(fit.unexplained)
+        if far_better or (_are_usual(swapped.gains) and not _are_usual(fit.gains)):
+            said = "each wheel follows the command of the other side: the left and right"
+            return (
+                Contradiction("sides_swapped", f"{said} encoders are swapped", ("body", "response")),
+                Contradiction("sides_swapped", f"{said} commands are swapped", ("response",)),
+                _with_wheels(windows, np.sign(swapped.gains)[::-1], swap=True),
+            )
+    if fit.worst > _UNEXPLAINED:
+        return None
+    if (gains < 0.0).any():
+        side = "both" if (gains < 0.0).all() else f"the {SIDES[int(np.argmin(gains))]}"
+        encoder, command = ("encoders count", "commands have") if side == "both" else ("encoder counts", "command has")
+        return (
+            Contradiction(
+                "encoder_reversed",
+                f"{side} {encoder} against the commands: change the sign of its ticks (link.direction)",
+                ("body", "response"),
+            ),
+            Contradiction(
+                "command_reversed",
+                f"{side} {command} the other sign than wheels and poses: change it in the log",
+                ("response",),
+            ),
+            _with_wheels(windows, np.sign(gains)),
+        )
+    if fit.worst > _EXPLAINED:
+        return None
+    ratio = float(gains[0] / gains[1])
+    if not 1.0 / _UNEQUAL < ratio < _UNEQUAL and not _are_usual(fit.gains):
+        more, times = (0, ratio) if ratio > 1.0 else (1, 1.0 / ratio)
+        said = (
+            f"the {SIDES[more]} wheel counts {times:.2f} times what the {SIDES[1 - more]} one does for a command "
+            f"({gains[more]:.2f} and {gains[1 - more]:.2f} times the command)"
+        )
+        return (
+            Contradiction("encoder_scale", f"{said}: check ticks_per_rev and gear", ("body", "response")),
+            Contradiction("command_scale", f"{said}, and the poses bear the wheels out: check commands", ("response",)),
+            _with_wheels(windows, 1.0 / gains),
+        )
+    gain = float(np.sqrt(gains[0] * gains[1]))
+    if _are_usual((gain,)) or (gain < 1.0 and (1.0 - gain) * fit.commanded_rad < _MOST_DEADBAND_RAD):
+        return None
+    return (
+        of_counts(gain, " by the commands", ("response",)),
+        Contradiction(
+            "command_scale",
+            f"commands are {1.0 / gain:.3g} times what the wheels do, and the poses bear the wheels out: write "
+            "cmd_left_rad_s and cmd_right_rad_s in rad/s of the wheel (behind the gear)",
+            ("response",),
+        ),
+        _with_wheels(windows, np.full(2, 1.0 / gain)),
+    )
+
+
+def _are_usual(gains: Sequence[float]) -> bool:
+    low, high = _USUAL_GAIN
+    return all(low < abs(gain) < high for gain in gains)
+
+
+def _with_wheels(windows: MotionWindows, factors: Array, swap: bool = False) -> MotionWindows:
+    rolled = windows.rolled_rad[:, ::-1] if swap else windows.rolled_rad
+    return replace(windows, rolled_rad=rolled * factors)
+
+
+class _Poses:
+    """Judges the poses of a log beside its wheels, with the nominal geometry of the robot."""
+
+    def __init__(self, log: DriveLog, windows: MotionWindows, radius_m: float, axial_m: float) -> None:
+        self._log = log
+        self._windows = windows
+        self._radius_m, self._axial_m = radius_m, axial_m
+
+    def fits(self, windows: MotionWindows) -> bool:
+        """Whether these wheels explain the poses with a geometry that the robot can have."""
+        fit = self._fit(windows)
+        return fit is not None and fit.worst < _UNEXPLAINED and fit.is_usual
+
+    def contradictions(self, has_commands: bool) -> tuple[Contradiction, ...]:
+        """What contradicts itself between wheels and poses, the likeliest cause first."""
+        if self._log.poses.t_s.size < 2:
+            return ()
+        apart = no_common_time(self._log) or standing(self._windows, self._radius_m, self._axial_m)
+        if apart is not None:
+            return (apart,)
+        fit = self._fit(self._windows)
+        if fit is None or (fit.worst < _WELL_EXPLAINED and fit.is_usual):
+            return ()
+        dead = None if has_commands else never_counting(self._windows)
+        cause = dead or of_units(fit) or self._put_right(fit)
+        if cause is not None:
+            return (cause,)
+        if fit.worst > _UNEXPLAINED:
+            return (of_unrelated(fit),)
+        found = [of_axes(fit), of_scale(fit, self._radius_m)]
+        if fit.worst > _EXPLAINED and any(found):
+            return (of_unrelated(fit),)
+        return tuple(each for each in found if each is not None)
+
+    def _fit(
+        self, windows: MotionWindows, factors: tuple[float, float] = (1.0, 1.0), mirrored: bool = False
+    ) -> BodyFit | None:
+        return fit_body(windows, self._radius_m, self._axial_m, factors, mirrored)
+
+    def _put_right(self, fit: BodyFit) -> Contradiction | None:
+        """The one thing that, put right, lets the wheels explain the poses; None if there is none."""
+        good = min(_EXPLAINED, _AS_GOOD * fit.worst)
+        for factors, (cause, what) in _ENCODER_FAULTS.items():
+            other = self._fit(self._windows, factors)
+            reversed_count = min(factors) < 0.0
+            # On a steady circle a reversed encoder explains no better than a geometry that no robot has.
+            limit = _EXPLAINED if reversed_count and not fit.has_clear_axes else good
+            if other is not None and other.is_usual and other.worst < limit:
+                remedy = (
+                    "set the sign of its ticks (link.direction)"
+                    if reversed_count
+                    else "check ticks_per_rev and gear there"
+                )
+                return Contradiction(cause, f"{what}, by the poses: {remedy}", ("body", "response"))
+        mirrored = self._fit(self._windows, mirrored=True)
+        if mirrored is not None and mirrored.worst < good:
+            return _mirrored(mirrored)
+        clock = fit_pose_clock(self._log, self._radius_m, self._axial_m, only_offset=fit.worst < _UNEXPLAINED)
+        if clock is None or clock.fit.worst > good or not clock.fit.is_usual:
+            return None
+        return of_clock(clock) if clock.rate != 1.0 or abs(clock.later_s) > _LEAST_LATE_S else None
+
+
+def _mirrored(fit: BodyFit) -> Contradiction:
+    """Positions and heading that turn in opposite ways; `fit` is that with the positions mirrored."""
+    if fit.turn_unexplained is not None and fit.turn_ratio < 0.0:
+        return Contradiction(
+            "heading_mirrored",
+            "pose_yaw_rad turns the other way than the wheels, and x, y do not: it is counted clockwise, as by a "
+            "compass; write yaw counter-clockwise from x",
+        )
+    return Contradiction(
+        "axis_mirrored",
+        "the positions are mirrored: pose_yaw_rad turns with the wheels and x, y turn the other way; change the sign "
+        "of pose_y_m (or exchange x and y)",
+    )

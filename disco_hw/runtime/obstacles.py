@@ -1,0 +1,136 @@
+"""Obstacles that somebody reports: circles with a velocity, each kept until its age limit; pure.
+
+An obstacle that is reported no longer is kept where its last velocity takes it. At its age limit it becomes lost: the
+robot must then stand still until it is reported again or removed, because nobody knows where it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
+
+from disco_hw.fence import FARTHEST_M
+from disco_hw.fence.clearance import MovingCircle
+
+MOST_OBSTACLES = 32
+REPORTED_AGE_LIMIT_S = 1.0
+"""Age limit of a report over UDP or ROS 2 that says none."""
+ENTERED_AGE_LIMIT_S = 600.0
+"""Age limit of an obstacle that a person enters and says none."""
+_FASTEST_M_S = 20.0
+_Coordinate = Annotated[float, Meta(ge=-FARTHEST_M, le=FARTHEST_M)]
+_Speed = Annotated[float, Meta(ge=-_FASTEST_M_S, le=_FASTEST_M_S)]
+
+
+class ObstacleReport(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What is said of one obstacle: centre and radius (m) and velocity (m/s) in the pose frame, `age_s` ago.
+
+    `age_limit_s`: how long the report may be relied on.
+    """
+
+    name: Annotated[str, Meta(min_length=1, max_length=32, pattern=r"^[A-Za-z0-9_.-]+$")]
+    x_m: _Coordinate
+    y_m: _Coordinate
+    radius_m: Annotated[float, Meta(gt=0.0, le=FARTHEST_M)]
+    vx_m_s: _Speed = 0.0
+    vy_m_s: _Speed = 0.0
+    age_s: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
+    age_limit_s: Annotated[float, Meta(gt=0.0, le=86400.0)] = REPORTED_AGE_LIMIT_S
+
+
+class ObstacleRefused(Exception):  # noqa: N818
+    """The obstacle is not taken; the message says why and what to do."""
+
+
+def report_from(fields: Mapping[str, Any], age_limit_s: float = REPORTED_AGE_LIMIT_S) -> ObstacleReport:
+    """Return the report that these fields make; `age_limit_s` where they say none. Raises ObstacleRefused."""
+    try:
+        report = msgspec.convert({"age_limit_s": age_limit_s, **fields}, ObstacleReport)
+    except msgspec.ValidationError as error:
+        example = "name=pillar x_m=0.5 y_m=0 radius_m=0.15"
+        raise ObstacleRefused(f"obstacle: {str(error).replace('`', '')}; write it as {example}") from None
+    if not all(math.isfinite(value) for value in msgspec.structs.astuple(report) if isinstance(value, float)):
+        raise ObstacleRefused("obstacle: not a finite number; write finite values")
+    return report
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    report: ObstacleReport
+    true_ns: int
+
+    def age_s(self, now_ns: int) -> float:
+        return max(0, now_ns - self.true_ns) * 1e-9
+
+    def now(self, now_ns: int) -> MovingCircle:
+        one, age_s = self.report, self.age_s(now_ns)
+        return MovingCircle(
+            one.x_m + one.vx_m_s * age_s, one.y_m + one.vy_m_s * age_s, one.radius_m, one.vx_m_s, one.vy_m_s
+        )
+
+
+class Obstacles:
+    """The obstacles that are known, by name."""
+
+    def __init__(self) -> None:
+        self._kept: dict[str, _Kept] = {}
+        self._lost: frozenset[str] = frozenset()
+        self.refused = 0
+        """Number of reports that found no room."""
+
+    def report(self, now_ns: int, report: ObstacleReport) -> None:
+        """Take in a report, in place of an earlier one of the same name. Raises ObstacleRefused if there are 32."""
+        if report.name not in self._kept and len(self._kept) >= MOST_OBSTACLES:
+            self.refused += 1
+            raise ObstacleRefused(f"obstacle {report.name}: there are {MOST_OBSTACLES} already; remove one first")
+        self._kept[report.name] = _Kept(report, now_ns - round(report.age_s * 1e9))
+
+    def remove(self, name: str) -> None:
+        """Forget an obstacle. Raises ObstacleRefused if there is none of that name."""
+        if name not in self._kept:
+            known = ", ".join(sorted(self._kept)) or "none"
+            raise ObstacleRefused(f"obstacle {name}: not known; known are: {known}")
+        del self._kept[name]
+
+    def step(self, now_ns: int) -> tuple[str, ...]:
+        """Let time pass; returns a sentence for each obstacle whose reports have ceased, and for each that is back."""
+        lost = frozenset(name for name, one in self._kept.items() if one.age_s(now_ns) > one.report.age_limit_s)
+        gone, back = sorted(lost - self._lost), sorted((self._lost - lost) & self._kept.keys())
+        self._lost = lost
+        limits = {name: self._kept[name].report.age_limit_s for name in gone}
+        said = [f"fence: obstacle {name} not reported for {limits[name]:g} s; the robot must stand" for name in gone]
+        return (*said, *(f"fence: obstacle {name} is reported again" for name in back))
+
+    @property
+    def lost(self) -> tuple[str, ...]:
+        """Names of the obstacles whose reports had ceased at the last step."""
+        return tuple(sorted(self._lost & self._kept.keys()))
+
+    def circles(self, now_ns: int) -> tuple[MovingCircle, ...]:
+        """Where the obstacles are now."""
+        return tuple(one.now(now_ns) for one in self._kept.values())
+
+    def status(self, now_ns: int) -> list[dict[str, Any]]:
+        """Each obstacle for a person or a machine: where it is now, and the age of its report."""
+        found = []
+        for name, one in sorted(self._kept.items()):
+            now = one.now(now_ns)
+            found.append(
+                {
+                    "name": name,
+                    "x_m": now.x_m,
+                    "y_m": now.y_m,
+                    "radius_m": now.radius_m,
+                    "vx_m_s": now.vx_m_s,
+                    "vy_m_s": now.vy_m_s,
+                    "age_s": one.age_s(now_ns),
+                    "age_limit_s": one.report.age_limit_s,
+                    "lost": name in self._lost,
+                }
+            )
+        return found

@@ -1,0 +1,172 @@
+"""What the daemon's tick knows of fence and obstacles: who reported what, the override, and what to say of it; pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from disco_hw.fence import Fence, Footprint, fence_fault
+from disco_hw.fence.clearance import Boundaries
+from disco_hw.log import records
+from disco_hw.runtime import State
+from disco_hw.runtime.fence_guard import HOLDS_STILL, IDLE, FenceGuard, FenceState, FenceVerdict
+from disco_hw.runtime.obstacles import ENTERED_AGE_LIMIT_S, ObstacleRefused, ObstacleReport, Obstacles, report_from
+
+OVERRIDE_NS = 60_000_000_000
+"""How long a manual override of the fence holds."""
+_PATH_EVERY = 5
+_LOCKED = frozenset({State.ARMED, State.STOPPING})
+
+
+class FenceRefused(Exception):  # noqa: N818
+    """The fence is not changed; the message says why and what to do."""
+
+
+class SafeArea:
+    """Fence, obstacles and override of one daemon, around the guard that its pipeline asks."""
+
+    def __init__(self, guard: FenceGuard, fence: Fence, footprint: Footprint) -> None:
+        self.guard = guard
+        self.fence = fence
+        self.footprint = footprint
+        self.obstacles = Obstacles()
+        self._override_until_ns: int | None = None
+        self._pending: list[records.Record] = []
+        self._events: list[str] = []
+        self._said = FenceVerdict.IDLE
+        self._ticks = 0
+        self.last: FenceState = IDLE
+
+    def begin(self, now_ns: int, by_hand: bool) -> bool:
+        """Bring guard and obstacles up to this tick; returns whether the fence is overridden in it."""
+        self._events += self.obstacles.step(now_ns)
+        self.guard.set_obstacles(self.obstacles.circles(now_ns), self.obstacles.lost)
+        if self._override_until_ns is not None and now_ns >= self._override_until_ns:
+            self._override_until_ns = None
+            self._events.append("fence: the manual override has ended; the fence holds again")
+        return self._override_until_ns is not None and by_hand
+
+    def end(self, now_ns: int, found: FenceState, overridden: bool) -> tuple[tuple[str, ...], list[records.Record]]:
+        """Take in what the guard found; returns what to say and what to record of this tick."""
+        self.last = found
+        verdict = found.verdict
+        if verdict is not self._said:
+            if verdict in HOLDS_STILL:
+                self._events.append(f"fence: stopped: {found.reason}")
+            elif self._said in HOLDS_STILL and verdict is not FenceVerdict.IDLE:
+                self._events.append("fence: motion is allowed again")
+        changed, self._said = verdict is not self._said, verdict
+        events, self._events = tuple(self._events), []
+        written, self._pending = self._pending, []
+        if verdict is not FenceVerdict.IDLE:
+            self._ticks += 1
+            is_shown = changed or self._ticks % _PATH_EVERY == 0
+            x, y, yaw = zip(*found.path, strict=True) if is_shown and found.path else ((), (), ())
+            circles = self.obstacles.circles(now_ns) if is_shown else ()
+            obstacles = tuple(value for one in circles for value in (one.x_m, one.y_m, one.radius_m))
+            written.append(
+                records.FenceGuard(
+                    now_ns,
+                    verdict.value,
+                    found.scale,
+                    found.clearance_m,
+                    overridden,
+                    found.reason,
+                    x,
+                    y,
+                    yaw,
+                    obstacles,
+                )
+            )
+        return events, written
+
+    @property
+    def task_fault(self) -> str:
+        """Why no task may go on, in words; empty if nothing of the fence speaks against it."""
+        return f"fence: {self.last.reason}" if self.last.verdict in HOLDS_STILL else ""
+
+    def override(self, now_ns: int, on: bool) -> str:
+        """Let a person drive in spite of the fence for a minute, or end that; returns the answer in words."""
+        if not on:
+            self._override_until_ns = None
+            self._events.append("fence: the manual override was taken back; the fence holds again")
+            return "the fence holds again"
+        self._override_until_ns = now_ns + OVERRIDE_NS
+        words = f"manual driving in spite of the fence for {OVERRIDE_NS // 1_000_000_000} s"
+        self._events.append(f"fence: OVERRIDDEN by request: {words}")
+        return words
+
+    def report(self, now_ns: int, report: ObstacleReport) -> None:
+        """Take in one obstacle. Raises ObstacleRefused."""
+        self.obstacles.report(now_ns, report)
+        self._pending.append(records.Obstacle(now_ns, *msgspec.structs.astuple(report)))
+
+    def ask(self, now_ns: int, asked: Mapping[str, Any]) -> str:
+        """Add or remove the obstacle that a person names; returns the answer in words. Raises ObstacleRefused."""
+        fields = dict(asked)
+        match fields.pop("change", None):
+            case "add":
+                report = report_from(fields, ENTERED_AGE_LIMIT_S)
+                self.report(now_ns, report)
+                return f"obstacle {report.name}: kept for {report.age_limit_s:g} s, then the robot stops"
+            case "remove" if set(fields) == {"name"}:
+                name = str(fields["name"])
+                self.obstacles.remove(name)
+                self._pending.append(records.Obstacle(now_ns, name, removed=True))
+                return f"obstacle {name}: removed"
+        raise ObstacleRefused("obstacle: say add or remove; write obstacle remove name=pillar, for example")
+
+    def change_fence(self, now_ns: int, asked: Mapping[str, Any], state: State) -> str:
+        """Put another fence in force, with the fields of [fence] in `asked`; returns the answer in words.
+
+        Raises FenceRefused while the robot is armed or stopping, and for a fence that is none.
+        """
+        if state in _LOCKED:
+            raise FenceRefused(f"the fence can be changed while the robot is disarmed, and it is {state.name}")
+        try:
+            fence = msgspec.convert({**msgspec.to_builtins(self.fence), **asked}, Fence)
+        except msgspec.ValidationError as error:
+            raise FenceRefused(f"fence: {str(error).replace('`', '')}; correct the value") from None
+        fault = fence_fault(fence, self.footprint)
+        if fault is not None:
+            raise FenceRefused(f"fence.{fault.field}: {fault.fault}; {fault.remedy}")
+        self.fence = fence
+        self.guard.set_boundaries(Boundaries(self.footprint, fence), fence.margin_m)
+        self._pending.append(record_of_fence(now_ns, fence))
+        self._events.append("fence: changed; it holds until the daemon ends, robot.toml keeps its own")
+        return "the fence is changed until the daemon ends; write it into robot.toml to keep it"
+
+    def status(self, now_ns: int) -> dict[str, Any]:
+        """What the daemon's status says of fence and obstacles."""
+        return {
+            "fence": msgspec.to_builtins(self.fence),
+            "footprint_m": msgspec.to_builtins(self.footprint),
+            "verdict": self.last.verdict.value,
+            "reason": self.last.reason,
+            "scale": self.last.scale,
+            "clearance_m": self.last.clearance_m if self.last.verdict is not FenceVerdict.IDLE else None,
+            "stopping_path": [list(pose) for pose in self.last.path],
+            "overridden_s": self._left_s(now_ns),
+            "obstacles": self.obstacles.status(now_ns),
+        }
+
+    def _left_s(self, now_ns: int) -> float:
+        return 0.0 if self._override_until_ns is None else max(0, self._override_until_ns - now_ns) * 1e-9
+
+
+def record_of_fence(t_ns: int, fence: Fence) -> records.Fence:
+    """The record of a fence that is in force from `t_ns` on."""
+    return records.Fence(t_ns, msgspec.json.encode(fence).decode())
+
+
+def fence_of_record(record: records.Fence) -> Fence:
+    """The fence of a record."""
+    return msgspec.json.decode(record.fence, type=Fence)
+
+
+def report_of_record(record: records.Obstacle) -> ObstacleReport:
+    """The report that a record of an obstacle keeps."""
+    fields: dict[str, Any] = {name: getattr(record, name) for name in ObstacleReport.__struct_fields__}
+    return ObstacleReport(**fields)

@@ -1,0 +1,381 @@
+"""Finds a wheel that does not obey: by its commands, its counts and the measured poses, as three witnesses.
+
+Two cumulative sums (one-sided CUSUM, Page 1954) watch each wheel, both in radians. `missing` grows while a wheel
+turns by less than half of what it is expected to: the least command of the time in which delay and lag may still hold
+it back, less what the wheel has shown to lose of its commands (dead band, sag, load). `beyond` grows while it turns
+faster than any command explains. The poses are the third witness: straight lines through the newest of them say how
+fast each wheel truly turned. They tell an encoder from a motor, and they find an encoder that does not count where
+commands are too slow to expect anything.
+
+A robot with slip, dead band, stiction, lag, lifted wheels or rough ground stays below: its wheels lose a part of what
+is expected, and what they lose for long is learnt.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from disco_hw.estimation.odometry import OdometryParameters
+from disco_hw.runtime.pose_travel import KEPT_NS, PoseTravel
+from drivers.types import PoseSample, WheelCommand, WheelSample
+
+LATE_NS = 600_000_000
+"""Delay and lag of a wheel together: what was commanded so long ago may still be on its way."""
+EXPECTED_PART = 0.5
+"""A wheel that turns by this part of what it is expected to follows; drift of the CUSUM between sound and standing."""
+MISSING_RAD = 0.08
+SHORTEST_NS = 300_000_000
+"""A wheel may stand for less against a stone."""
+LONGEST_NS = 400_000_000
+"""So long after the first sign at most is waited for poses that tell the cause."""
+UNKNOWN_LOSS_RAD_S = 1.5
+"""Dead band and stiction of a wheel that has not turned since it stood."""
+FASTER_PART, FASTER_RAD_S, BEYOND_RAD = 1.25, 0.5, 0.1
+BODY_TURN_PART = 1.5
+"""A base that is given speeds of the body may turn by wheels that differ by so much more than those asked for."""
+FOLLOWED_RAD = 0.15
+RESTS_RAD_S = 0.1
+_SMOOTH_S = 0.15
+_FILTER_S, _LOSES_LESS_S, _LOSES_MORE_S = 0.3, 0.5, 2.0
+_SIDES = ("left", "right")
+
+
+class Cause(enum.Enum):
+    """What is wrong with a wheel, for a person; {side} is filled in."""
+
+    ENCODER_SILENT = (
+        "the {side} wheel turns, as the poses show, and its encoder does not count: frozen or disconnected; check the "
+        "encoder's plug and cable"
+    )
+    ENCODER_REVERSED = (
+        "the {side} wheel's encoder suddenly counts backwards, and the poses show that the wheel turns as commanded: "
+        "check the encoder's cable and channels"
+    )
+    STANDS = (
+        "the {side} wheel stands although it is commanded to turn: blocked, its motor without power, or its encoder "
+        "lost where the controller turns the motor by it; free the wheel, check the cables of motor and encoder"
+    )
+    RUNS_AWAY = (
+        "the {side} wheel runs away: it turns much faster than commanded; check the motor controller, and the cables "
+        "of motor and encoder"
+    )
+    TURNS_BACKWARD = (
+        "the {side} wheel turns backward, as counts and poses show, although it is commanded forward or the other way "
+        "round; check the motor controller and the motor's cable"
+    )
+    SILENT = (
+        "the {side} wheel does not count although it is commanded to turn, and the poses do not show whether it turns: "
+        "its encoder is frozen or disconnected, or the wheel is blocked; check both"
+    )
+    OPPOSED = (
+        "the {side} wheel suddenly counts against its commands, and the poses do not show which way it turns: its "
+        "encoder is reversed, or its motor runs the wrong way; check the cables of both"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class WheelFault:
+    """What was found, at which wheel or both."""
+
+    cause: Cause
+    side: str
+
+    @property
+    def words(self) -> str:
+        """For a person, with what to look at."""
+        return self.cause.value.format(side=self.side)
+
+
+class _Asked(NamedTuple):
+    """A command of one wheel (rad/s): the slowest it may mean, as it stands and smoothed, and the fastest.
+
+    Smoothed, as a wheel's angle is the integral of its commands: what a planner adds and takes away again is no loss.
+    """
+
+    slowest: float = 0.0
+    smoothed: float = 0.0
+    fastest: float = 0.0
+
+
+def _asked(speed: float, other: float, turn_part: float, before: _Asked, elapsed_s: float) -> _Asked:
+    """What one wheel is asked for beside the other, where wheels may differ by up to `turn_part` of what is asked."""
+    mean = 0.5 * (speed + other)
+    turned = mean + turn_part * (speed - mean)
+    slowest = min((speed, turned), key=abs) if turned * speed > 0.0 else 0.0
+    smoothed = before.smoothed + (slowest - before.smoothed) * -math.expm1(-elapsed_s / _SMOOTH_S)
+    return _Asked(slowest, smoothed, max(abs(speed), abs(turned)))
+
+
+@dataclass(slots=True)
+class _Wheel:
+    """One wheel; angles and speeds are in the direction of its command, `angle_rad` and `speed_rad_s` as counted."""
+
+    angle_rad: float = math.nan
+    speed_rad_s: float = 0.0
+    loss_rad_s: float = UNKNOWN_LOSS_RAD_S
+    missing_rad: float = 0.0
+    beyond_rad: float = 0.0
+    since_ns: int = 0
+    expected_rad: float = 0.0
+    counted_rad: float = 0.0
+    followed_rad: float = 0.0
+    direction: float = 1.0
+    is_told: bool = False
+
+    def rest(self) -> None:
+        """Nothing is commanded: nothing is expected."""
+        self.missing_rad = self.beyond_rad = self.expected_rad = self.counted_rad = 0.0
+        self.loss_rad_s, self.is_told = UNKNOWN_LOSS_RAD_S, False
+
+    def step(self, t_ns: int, dt_s: float, turned_rad: float, commands: Sequence[_Asked]) -> None:
+        """Take in by how much it was counted, and the commands that may be in force meanwhile."""
+        newest = commands[-1].slowest
+        smoothed = [each.smoothed for each in commands]
+        low, high = min(newest, *smoothed), max(newest, *smoothed)
+        is_one_way = low >= 0.0 < high or low < 0.0 >= high
+        if is_one_way:
+            self.direction = 1.0 if high > 0.0 else -1.0
+        least = max(low, -high, 0.0)
+        most = max(each.fastest for each in commands)
+        progress = self.direction * turned_rad
+        self._learn(dt_s, turned_rad, 0.5 * (least + max(abs(low), abs(high))), abs(newest))
+        expected = max(least - self.loss_rad_s, 0.0) * dt_s
+        self.beyond_rad = max(self.beyond_rad + abs(turned_rad) - (FASTER_PART * most + FASTER_RAD_S) * dt_s, 0.0)
+        # Without a command that must be in force by now a wheel may turn either way.
+        self.missing_rad = self.missing_rad + EXPECTED_PART * expected - progress if least > 0.0 else 0.0
+        # Bounded, so that a wheel that follows again is soon clear of what was.
+        self.missing_rad = min(self.missing_rad, 2.0 * MISSING_RAD)
+        if self.missing_rad <= 0.0:
+            self.missing_rad, self.since_ns = 0.0, t_ns
+            self.expected_rad = self.counted_rad = 0.0
+            self.is_told = False
+            self.followed_rad += max(progress, 0.0) if is_one_way else 0.0
+        else:
+            self.expected_rad += expected
+            self.counted_rad += progress
+
+    def _learn(self, dt_s: float, turned_rad: float, commanded_rad_s: float, newest_rad_s: float) -> None:
+        """Learn what it loses of its commands while it turns by them; a wheel that came to rest may stick again."""
+        if dt_s > 0.0:
+            self.speed_rad_s += (turned_rad / dt_s - self.speed_rad_s) * -math.expm1(-dt_s / _FILTER_S)
+        speed = self.direction * self.speed_rad_s
+        if newest_rad_s < RESTS_RAD_S and abs(speed) < RESTS_RAD_S:
+            self.loss_rad_s = UNKNOWN_LOSS_RAD_S
+        elif speed > EXPECTED_PART * max(commanded_rad_s - self.loss_rad_s, 0.1 * commanded_rad_s):
+            loses = max(commanded_rad_s - speed, 0.0)
+            time_s = _LOSES_LESS_S if loses < self.loss_rad_s else _LOSES_MORE_S
+            self.loss_rad_s += (loses - self.loss_rad_s) * -math.expm1(-dt_s / time_s)
+
+    @property
+    def has_followed(self) -> bool:
+        """Whether it has ever counted as commanded, for long enough to know how it is wired."""
+        return self.followed_rad > FOLLOWED_RAD
+
+    @property
+    def is_suspect(self) -> bool:
+        """Whether less of the evidence than stops the robot speaks against it."""
+        return self.missing_rad > 0.5 * MISSING_RAD or self.beyond_rad > 0.5 * BEYOND_RAD
+
+    def is_missing(self, now_ns: int) -> bool:
+        """Whether it does not follow, as far as counts can tell."""
+        return self.missing_rad > MISSING_RAD and now_ns - self.since_ns >= SHORTEST_NS
+
+    @property
+    def is_backward(self) -> bool:
+        """Whether it counted the other way, of what does not follow."""
+        return self.counted_rad < -0.25 * max(self.expected_rad, 0.5 * self.missing_rad)
+
+
+DECIDED = 2.5
+"""Standard deviations from the middle between two explanations."""
+COUNTED_PART = 0.2
+"""A wheel counts if it counts this part of what the poses show."""
+SLIP_PART = 0.1
+"""By so much of its speed a wheel may slip."""
+SEEN = 4.0
+"""Standard deviations of a motion that the counts deny."""
+_SETTLED_NS = 60_000_000
+
+
+class WheelFaults:
+    """Pure, one step a tick and, after it, the command that the tick sent.
+
+    `events` of a step say when a wheel begins not to follow; `not_following` counts them. `takes_body_speeds`: the base
+    makes wheel speeds of its own.
+    """
+
+    def __init__(self, takes_body_speeds: bool = False) -> None:
+        self._turn_part = BODY_TURN_PART if takes_body_speeds else 1.0
+        self._wheels = (_Wheel(), _Wheel())
+        self._travel = PoseTravel()
+        self._commands: deque[tuple[int, tuple[_Asked, _Asked]]] = deque()
+        self._counted: deque[tuple[int, float, float]] = deque()
+        self.not_following = 0
+        self.events: tuple[str, ...] = ()
+
+    @property
+    def has_followed(self) -> tuple[bool, bool]:
+        """Whether left and right have ever counted as commanded: from then on the wiring is known to be right."""
+        left, right = self._wheels
+        return left.has_followed, right.has_followed
+
+    @property
+    def is_suspect(self) -> bool:
+        """Whether a wheel does not follow now, so that poses cannot say how it is wired."""
+        return any(wheel.is_suspect for wheel in self._wheels)
+
+    def commanded(self, now_ns: int, command: WheelCommand | None) -> None:
+        """Take in what a tick sent; None for nothing."""
+        if command is None:
+            self._commands.clear()
+            for wheel in self._wheels:
+                wheel.rest()
+            return
+        left, right = command.left_rad_s, command.right_rad_s
+        before_ns, before = self._commands[-1] if self._commands else (now_ns, (_Asked(), _Asked()))
+        elapsed_s = max(now_ns - before_ns, 0) * 1e-9
+        asked = (
+            _asked(left, right, self._turn_part, before[0], elapsed_s),
+            _asked(right, left, self._turn_part, before[1], elapsed_s),
+        )
+        self._commands.append((now_ns, asked))
+
+    def step(
+        self, now_ns: int, wheels: Sequence[WheelSample], poses: Sequence[PoseSample], geometry: OdometryParameters,
+        is_wiring_known: bool = True,
+    ) -> WheelFault | None:  # fmt: skip
+        """Take in a tick's samples; returns what is wrong, for as long as it is.
+
+        Without `is_wiring_known` a wheel that never counted as commanded and counts backward is left to others.
+        """
+        has_new_pose = sum(self._travel.add(pose) for pose in poses) > 0
+        events: list[str] = []
+        for sample in wheels:
+            self._take(sample)
+            events += self._begun()
+        self.events = tuple(events)
+        if not self._commands or now_ns - self._commands[0][0] < LATE_NS // 2:
+            return None
+        return (
+            self._runaway(geometry)
+            or self._missing(now_ns, geometry, is_wiring_known)
+            or (self._unseen(geometry) if has_new_pose else None)
+        )
+
+    def _take(self, sample: WheelSample) -> None:
+        counted = self._counted
+        dt_s = max(sample.t_ns - counted[-1][0], 0) * 1e-9 if counted else 0.0
+        counted.append((sample.t_ns, sample.left_angle_rad, sample.right_angle_rad))
+        while sample.t_ns - counted[0][0] > KEPT_NS:
+            counted.popleft()
+        sent = self._commands
+        while len(sent) > 1 and sample.t_ns - sent[1][0] > LATE_NS:
+            sent.popleft()
+        for side, angle in enumerate((sample.left_angle_rad, sample.right_angle_rad)):
+            wheel = self._wheels[side]
+            turned, wheel.angle_rad = angle - wheel.angle_rad, angle
+            if sent and math.isfinite(turned):
+                wheel.step(sample.t_ns, dt_s, turned, [asked[side] for _, asked in sent])
+
+    def _begun(self) -> list[str]:
+        """Words for each wheel that begins not to follow."""
+        said = []
+        for wheel, name in zip(self._wheels, _SIDES, strict=True):
+            if wheel.is_suspect and not wheel.is_told:
+                wheel.is_told = True
+                self.not_following += 1
+                asked = self._commands[-1][1][_SIDES.index(name)].slowest
+                said.append(
+                    f"the {name} wheel does not follow: {wheel.speed_rad_s:.1f} rad/s, commanded {asked:.1f} rad/s"
+                )
+        return said
+
+    def _runaway(self, geometry: OdometryParameters) -> WheelFault | None:
+        found = [side for side in (0, 1) if self._wheels[side].beyond_rad > BEYOND_RAD]
+        if not found:
+            return None
+        wheel = self._wheels[found[0]]
+        if wheel.is_backward and wheel.missing_rad > MISSING_RAD:
+            # Its loop runs away with an encoder that is reversed, or it runs away backward.
+            turns = self._turns(found[0], geometry)
+            if turns is not None and turns > 0:
+                return WheelFault(Cause.ENCODER_REVERSED, _names(found))
+        return WheelFault(Cause.RUNS_AWAY, _names(found))
+
+    def _missing(self, now_ns: int, geometry: OdometryParameters, is_wiring_known: bool) -> WheelFault | None:
+        known = [is_wiring_known or self._wheels[side].has_followed for side in (0, 1)]
+        suspect = [side for side in (0, 1) if self._wheels[side].missing_rad > 0.5 * MISSING_RAD]
+        suspect = [side for side in suspect if known[side] or not self._wheels[side].is_backward]
+        found = [side for side in suspect if self._wheels[side].is_missing(now_ns)]
+        if not found:
+            # Where the poses deny the counts, nothing may be waited for: the loop may be running away.
+            found = [side for side in suspect if self._turns(side, geometry, SEEN) == 1]
+        if not found:
+            return None
+        wheel = self._wheels[found[0]]
+        turns = self._turns(found[0], geometry)
+        if turns is None and self._travel.newest_ns is not None and now_ns - wheel.since_ns < LONGEST_NS:
+            return None
+        if wheel.is_backward:
+            causes = {1: Cause.ENCODER_REVERSED, -1: Cause.TURNS_BACKWARD, 0: Cause.OPPOSED, None: Cause.OPPOSED}
+        else:
+            causes = {1: Cause.ENCODER_SILENT, -1: Cause.ENCODER_SILENT, 0: Cause.STANDS, None: Cause.SILENT}
+        return WheelFault(causes[turns], _names(found))
+
+    def _turns(self, side: int, geometry: OdometryParameters, sure: float = DECIDED) -> int | None:
+        """How a wheel that does not follow truly turns: 1 as commanded, 0 not at all, -1 backward; None if unclear."""
+        wheel = self._wheels[side]
+        seen = self._travel.wheel_speeds(wheel.since_ns + _SETTLED_NS, geometry)
+        newest_ns = self._travel.newest_ns
+        if seen is None or newest_ns is None:
+            return None
+        lasted_s = (newest_ns - wheel.since_ns) * 1e-9
+        speed = wheel.direction * seen[side]
+        middle = 0.5 * max(wheel.expected_rad, abs(wheel.counted_rad)) / lasted_s
+        std = math.hypot(seen.std_rad_s, SLIP_PART * 2.0 * middle)
+        if speed - middle > sure * std:
+            return 1
+        if speed + middle < -sure * std:
+            return -1
+        return 0 if middle - abs(speed) > sure * std else None
+
+    def _unseen(self, geometry: OdometryParameters) -> WheelFault | None:
+        """A wheel that the poses show to turn as it is asked to, and that does not count; the other one does."""
+        since_ns, newest = self._commands[0][0], self._commands[-1][1]
+        # One that has turned since it stood is known by what it is expected to do.
+        quiet = [
+            side
+            for side, wheel in enumerate(self._wheels)
+            if wheel.loss_rad_s > 0.5 * UNKNOWN_LOSS_RAD_S
+            and abs(wheel.speed_rad_s) < COUNTED_PART * abs(newest[side].slowest)
+        ]
+        seen = self._travel.wheel_speeds(since_ns, geometry) if len(quiet) == 1 else None
+        counted = None if seen is None else self._counted_speeds(since_ns)
+        if seen is None or counted is None:
+            return None
+        (side,) = quiet
+        asked = newest[side].slowest
+        speed = math.copysign(1.0, asked) * seen[side]
+        std = math.hypot(seen.std_rad_s, SLIP_PART * max(map(abs, seen[:2])))
+        counts = abs(counted[side]) > COUNTED_PART * speed
+        agrees = abs(seen[1 - side] - counted[1 - side]) < DECIDED * std + 0.2 * abs(speed)
+        if counts or not agrees or speed < max(SEEN * std, 0.5 * abs(asked)):
+            return None
+        return WheelFault(Cause.ENCODER_SILENT, _SIDES[side])
+
+    def _counted_speeds(self, since_ns: int) -> tuple[float, float] | None:
+        """Mean speeds that were counted since then."""
+        used = [entry for entry in self._counted if entry[0] >= since_ns]
+        lasted_s = (used[-1][0] - used[0][0]) * 1e-9 if used else 0.0
+        if lasted_s <= 0.0:
+            return None
+        return (used[-1][1] - used[0][1]) / lasted_s, (used[-1][2] - used[0][2]) / lasted_s
+
+
+def _names(sides: Sequence[int]) -> str:
+    return " and the ".join(_SIDES[side] for side in sides)

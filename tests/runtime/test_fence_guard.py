@@ -1,0 +1,637 @@
+"""Whatever is commanded, a robot can always stop within the fence that the guard watches; and it fails closed."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from disco_hw.estimation import PoseEstimate
+from disco_hw.estimation.odometry import OdometryParameters
+from disco_hw.fence import Circle, Fence, Footprint
+from disco_hw.fence.clearance import Boundaries, MovingCircle
+from disco_hw.runtime.fence_guard import (
+    HOLDS_STILL,
+    IDLE,
+    SCALES,
+    FenceGuard,
+    FenceVerdict,
+    StoppingSettings,
+)
+from disco_hw.runtime.pipeline import Governor, WheelLimits
+
+FOOTPRINT = Footprint(0.5, 0.4, 0.05)
+CELL = ((-1.0, -1.0), (1.4, -1.0), (1.4, 0.9), (-1.0, 0.9))
+ROOM = ((-2.0, -1.5), (2.0, -1.5), (2.0, 1.5), (-2.0, 1.5))
+STOPS = StoppingSettings(response_s=0.08, reaction_s=0.1, deceleration_rad_s2=20.0, period_s=0.02)
+RADIUS, AXLE, X_ICR = 0.06, 0.4, 0.1
+EXACT = OdometryParameters(RADIUS, AXLE, X_ICR)
+NO_SPREAD = ((0.0,) * 3,) * 3
+GOES = {FenceVerdict.FREE, FenceVerdict.SCALED}
+
+
+def covariance(position_m: float, yaw_rad: float):
+    return ((position_m**2, 0.0, 0.0), (0.0, position_m**2, 0.0), (0.0, 0.0, yaw_rad**2))
+
+
+def estimate(
+    x=0.0, y=0.0, yaw=0.0, wheels=(0.0, 0.0), spread=NO_SPREAD, age_s: float | None = 0.0, **changes
+) -> PoseEstimate:  # fmt: skip
+    fields = {
+        "t_ns": 0, "x_m": x, "y_m": y, "yaw_rad": yaw, "covariance": spread, "speed_m_s": 0.0, "yaw_rate_rad_s": 0.0,
+        "left_speed_rad_s": wheels[0], "right_speed_rad_s": wheels[1], "wheel_age_s": 0.01, "pose_age_s": age_s,
+        "initialised": True, "wheels_ok": True, "pose_ok": True, "reinitialisations": 0, "heading_known": True,
+    }  # fmt: skip
+    return PoseEstimate(**{**fields, **changes})
+
+
+def guard_of(fence: Fence, stops: StoppingSettings = STOPS, margin_m: float = 0.05) -> FenceGuard:
+    return FenceGuard(Boundaries(FOOTPRINT, fence), stops, margin_m)
+
+
+def judge(fence: Fence, seen: PoseEstimate, requested, last=None, geometry=EXACT, stops=STOPS, margin_m=0.05):
+    sent = (seen.left_speed_rad_s, seen.right_speed_rad_s) if last is None else last
+    return guard_of(fence, stops, margin_m).step(seen, geometry, sent, requested)
+
+
+def test_without_a_fence_and_obstacles_nothing_is_judged():
+    assert guard_of(Fence()).step(estimate(pose_ok=False), EXACT, (0, 0), (5, 5)) is IDLE
+    assert FenceGuard(None, STOPS, 0.05).step(estimate(), EXACT, (0, 0), (5, 5)) is IDLE
+    assert not FenceGuard(None, STOPS, 0.05).is_active
+    assert IDLE.scale == 1.0
+    assert IDLE.verdict not in HOLDS_STILL
+
+
+def integrated(
+    seen: PoseEstimate, geometry: OdometryParameters, before, command, stops: StoppingSettings, held_s, longer
+):
+    """The end of the stopping path by small steps of what the module's docstring says, and the poses on the way."""
+    x, y, yaw = seen.x_m, seen.y_m, seen.yaw_rad
+    before, command, dt = np.array(before), np.array(command), 1e-4
+    excess = np.where(before * command < 0, before, np.where(abs(before) > abs(command), before - command, 0))
+    poses = [(x, y, yaw)]
+
+    def drive(speeds, lasting_s, slowing):
+        nonlocal x, y, yaw
+        steps = round(lasting_s / dt)
+        for k in range(steps):
+            left, right = speeds * (1 - (k + 0.5) / steps if slowing else 1.0)
+            v = longer * geometry.wheel_radius_m * (left + right) / 2
+            w = longer * geometry.wheel_radius_m * (right - left) / geometry.axial_distance_m
+            x += dt * (v * math.cos(yaw) + w * geometry.x_icr_m * math.sin(yaw))
+            y += dt * (v * math.sin(yaw) - w * geometry.x_icr_m * math.cos(yaw))
+            yaw += dt * w
+            poses.append((x, y, yaw))
+
+    drive(before, held_s, slowing=False)
+    drive(excess, abs(excess).max() / stops.deceleration_rad_s2, slowing=True)
+    drive(command, 1.5 * stops.period_s + stops.reaction_s, slowing=False)
+    drive(command, abs(command).max() / stops.deceleration_rad_s2, slowing=True)
+    return np.array(poses)
+
+
+@pytest.mark.parametrize("before", [(0.0, 0.0), (5.0, 5.0), (5.0, 2.0), (-4.0, 3.0)])
+@pytest.mark.parametrize("command", [(5.0, 5.0), (2.0, 6.0), (-3.0, 5.0), (-6.0, -2.0)])
+def test_the_stopping_path_is_what_the_wheels_would_do(before, command):
+    seen = estimate(0.3, -0.2, 0.7, before)
+    found = judge(Fence(keep_in=CELL), seen, command)
+    assert (found.verdict, found.scale) == (FenceVerdict.FREE, 1.0)
+    path = np.array(found.path)
+    expected = integrated(seen, EXACT, before, command, STOPS, STOPS.response_s, 1.0)
+    np.testing.assert_allclose(path[0], expected[0])
+    # What exceeds the command is driven along its own arc, so the way there is not the same to the millimetre.
+    np.testing.assert_allclose(path[-1], expected[-1], atol=2e-4)
+    off = np.abs(path[:, None, :] - expected[None]).max(axis=2).min(axis=1)
+    assert off.max() < 4e-4
+    nearest = Boundaries(FOOTPRINT, Fence(keep_in=CELL)).clearance_m(expected[::20]).min()
+    assert found.clearance_m == pytest.approx(nearest, abs=1e-3)
+
+
+def test_the_believed_spread_makes_the_path_longer_and_wider():
+    deviation = 0.02
+    spread = OdometryParameters(RADIUS, AXLE, X_ICR, ((deviation**2 * RADIUS**2, 0, 0), (0, 0, 0), (0, 0, 0)))
+    fence, stops = Fence(keep_in=ROOM), STOPS
+    seen = estimate(0.5, 0, 0, (5, 5), age_s=0.5)
+    exact, longer = (judge(fence, seen, (5, 5), geometry=one) for one in (EXACT, spread))
+    held_s = stops.response_s + 3 * deviation * 0.5
+    expected = integrated(seen, spread, (5, 5), (5, 5), stops, held_s, 1 + 3 * deviation)
+    np.testing.assert_allclose(longer.path[-1], expected[-1], atol=2e-4)
+    assert exact.path[-1][0] < longer.path[-1][0]
+    # A pose of unknown age has none.
+    np.testing.assert_allclose(
+        judge(fence, estimate(0.5, 0, 0, (5, 5), age_s=None), (5, 5), geometry=EXACT).path, exact.path
+    )
+    # Straight ahead neither a turn's spread nor that of the turning centre matters; on the spot both do.
+    turn = OdometryParameters(RADIUS, AXLE, X_ICR, ((0, 0, 0), (0, (0.02 * AXLE) ** 2, 0), (0, 0, 0)))
+    centre = OdometryParameters(RADIUS, AXLE, X_ICR, ((0, 0, 0), (0, 0, 0), (0, 0, 0.01**2)))
+    for one in (turn, centre):
+        assert judge(fence, seen, (5, 5), geometry=one).clearance_m == pytest.approx(exact.clearance_m)
+    # By the wall, while the robot turns through `turned`, the corner that comes nearest is at the end of it.
+    spinning = estimate(0.0, -1.1, 0.0, (-1, 1))
+    plain = judge(fence, spinning, (-1, 1))
+    path = np.array(plain.path)
+    turned = path[-1, 2]
+    assert turned == pytest.approx(2 * RADIUS / AXLE * (0.08 + 0.13 + 0.5 / 20))
+    moved = np.hypot(0.0, X_ICR * np.abs(np.diff(path[:, 2]))).sum()
+    wide = judge(fence, spinning, (-1, 1), geometry=turn)
+    assert plain.clearance_m - wide.clearance_m == pytest.approx(
+        3 * 0.02 * turned * (FOOTPRINT.reach_m + 0.5 * moved), rel=0.05
+    )
+    aside = judge(fence, spinning, (-1, 1), geometry=centre)
+    assert plain.clearance_m - aside.clearance_m == pytest.approx(3 * 0.01 * turned, rel=0.05)
+    # What radius and axle have in common does not change how the robot turns.
+    common = 0.01**2 * RADIUS * AXLE
+    own = (0.01**2 * RADIUS**2, 0.01**2 * AXLE**2)
+    both = OdometryParameters(RADIUS, AXLE, X_ICR, ((own[0], common, 0), (common, own[1], 0), (0, 0, 0)))
+    alone = OdometryParameters(RADIUS, AXLE, X_ICR, ((own[0], 0, 0), (0, own[1], 0), (0, 0, 0)))
+    assert (
+        judge(fence, spinning, (-1, 1), geometry=both).clearance_m
+        > judge(fence, spinning, (-1, 1), geometry=alone).clearance_m + 1e-3
+    )
+
+
+@pytest.mark.parametrize(
+    ("spread", "deviation_m"),
+    [
+        (covariance(0.01, 0.0), 0.01),
+        (covariance(0.0, 0.02), 0.02 * FOOTPRINT.reach_m),
+        (((1e-4, 0, 0), (0, 0, 0), (0, 0, 0)), 0.01),
+        (((1e-4, 1e-4, 0), (1e-4, 1e-4, 0), (0, 0, 0)), 0.01 * math.sqrt(2.0)),
+        # An error of the yaw that always goes with one of y moves the front corners by both.
+        (((0, 0, 0), (0, 1e-4, 2e-4), (0, 2e-4, 4e-4)), math.hypot(0.01 + 0.3 * 0.02, 0.2 * 0.02)),
+    ],
+)  # fmt: skip
+def test_three_deviations_of_the_corner_known_least_are_kept(spread, deviation_m):
+    fence = Fence(keep_in=ROOM)
+    known, unknown = (judge(fence, estimate(spread=one), (0, 0)) for one in (NO_SPREAD, spread))
+    assert known.clearance_m - unknown.clearance_m == pytest.approx(3 * deviation_m)
+
+
+def test_the_deviation_is_that_of_the_corner_in_the_world():
+    spread = ((0, 0, 0), (0, 1e-4, 2e-4), (0, 2e-4, 4e-4))
+    fence = Fence(keep_in=Circle((0.0, 0.0), 2.0))
+    for yaw in (0.3, 1.3, -2.0):
+        known, unknown = (judge(fence, estimate(yaw=yaw, spread=one), (0, 0)) for one in (NO_SPREAD, spread))
+        offsets = []
+        for x, y in FOOTPRINT.corners_m():
+            ahead, aside = x * math.cos(yaw) - y * math.sin(yaw), x * math.sin(yaw) + y * math.cos(yaw)
+            offsets.append(math.hypot(0.02 * -aside, 0.01 + 0.02 * ahead))
+        assert known.clearance_m - unknown.clearance_m == pytest.approx(3 * max(offsets))
+
+
+def ahead_of_wall(gap_m: float, wheels=(0.0, 0.0)) -> PoseEstimate:
+    """The footprint's front so far from the wall at x = 2, facing it."""
+    return estimate(2.0 - 0.3 - gap_m, 0.0, 0.0, wheels)
+
+
+def stopping_m(speed: float) -> float:
+    """What a robot at this speed (rad/s) needs to stop: response, reaction, a tick and a half, and braking."""
+    return RADIUS * (speed * (0.08 + 0.03 + 0.1) + speed**2 / (2 * 20.0))
+
+
+@pytest.mark.parametrize("speed", [2.0, 5.0, 8.0])
+def test_a_command_is_free_scaled_and_stopped_as_the_wall_comes_nearer(speed):
+    fence = Fence(keep_in=ROOM)
+    wheels = (speed, speed)
+    needed_m = stopping_m(speed)
+    for gap_m, verdict in (
+        (needed_m + 0.051, FenceVerdict.FREE),
+        (needed_m + 0.049, FenceVerdict.SCALED),
+        (needed_m + 0.001, FenceVerdict.SCALED),
+    ):
+        found = judge(fence, ahead_of_wall(gap_m, wheels), wheels)
+        assert (found.verdict, found.reason) == (verdict, "")
+        assert (found.scale == 1.0) == (verdict is FenceVerdict.FREE)
+    assert found.scale in SCALES
+    assert found.clearance_m >= 0.05 * found.scale
+    # Already the stop itself would end outside.
+    at_once_m = RADIUS * (speed * 0.08 + speed**2 / 40.0)
+    found = judge(fence, ahead_of_wall(at_once_m - 0.001, wheels), wheels)
+    assert (found.verdict, found.scale) == (FenceVerdict.STOPPED, 0.0)
+    assert found.clearance_m == pytest.approx(-0.001)
+    end_m = 1.7 - at_once_m + 0.001 + needed_m
+    assert found.reason == f"the stopping path would leave the fence at ({end_m:.2f}, 0.00)"
+
+
+def test_the_margin_is_kept_in_part_by_scaled_commands():
+    fence = Fence(keep_in=ROOM)
+    for margin_m in (0.0, 0.05, 0.2):
+        for gap_m in np.linspace(0.01, 0.4, 40):
+            found = judge(fence, ahead_of_wall(gap_m), (5, 5), margin_m=margin_m)
+            wanted = [s for s in SCALES if gap_m - (stopping_m(5 * s) - RADIUS * 5 * s * 0.08) >= s * margin_m]
+            assert found.scale == pytest.approx(max(wanted))
+            assert found.verdict in (GOES if found.scale else {FenceVerdict.STOPPED})
+
+
+def test_scales_go_from_nothing_to_all():
+    assert SCALES[0] == 0.0
+    assert SCALES[-1] == 1.0
+    assert (np.diff(SCALES) > 0).all()
+
+
+@pytest.mark.parametrize("gap_m", [0.02, 0.0, -0.03, -0.5, -3.0])
+def test_what_leads_away_from_the_fence_is_free(gap_m):
+    fence = Fence(keep_in=ROOM)
+    seen = ahead_of_wall(gap_m)
+    away = judge(fence, seen, (-8, -8))
+    assert (away.verdict, away.scale) == (FenceVerdict.FREE, 1.0)
+    for towards in ((3, 3), (-2, 2), (2, 5)):
+        assert judge(fence, seen, towards).scale == 0.0 or (gap_m > 0 and judge(fence, seen, towards).scale <= 0.25)
+    # Still moving outwards, not even the way back is let through: it would begin with going farther out.
+    assert judge(fence, ahead_of_wall(-0.03, (3, 3)), (-8, -8)).scale == 0.0
+
+
+def test_going_back_into_the_fence_must_not_lead_into_an_obstacle():
+    pillar = Circle((0.9, 0.0), 0.15)
+    seen = ahead_of_wall(-0.35)
+    assert judge(Fence(keep_in=ROOM), seen, (-8, -8)).scale == 1.0
+    assert judge(Fence(keep_in=ROOM, keep_out=(Circle((1.6, 0.0), 0.15),)), seen, (-8, -8)).scale == 0.5
+    assert judge(Fence(keep_in=ROOM, keep_out=(pillar,)), seen, (-8, -8)).scale == 1.0
+
+
+def test_along_the_fence_outside_of_the_margin_is_free():
+    fence = Fence(keep_in=ROOM)
+    deviation = covariance(0.005, 0.005)
+    spread = OdometryParameters(RADIUS, AXLE, X_ICR, ((1e-6, 0, 0), (0, 1e-4, 0), (0, 0, 1e-4)))
+    # 0.3 m/s, the side of the footprint 0.15 m from the wall.
+    seen = estimate(0.0, 1.5 - 0.2 - 0.15, 0.0, (5, 5), spread=deviation)
+    assert judge(fence, seen, (5, 5), geometry=spread).verdict is FenceVerdict.FREE
+
+
+def test_a_stopped_command_does_not_flutter():
+    guard = guard_of(Fence(keep_in=ROOM))
+
+    def scale(gap_m: float, requested=(5, 5)) -> float:
+        return guard.step(ahead_of_wall(gap_m), EXACT, (0, 0), requested).scale
+
+    freely = {s: stopping_m(5 * s) - RADIUS * 5 * s * 0.08 + s * 0.05 + 1e-4 for s in SCALES[1:]}
+    assert scale(freely[0.25]) == 0.25
+    assert scale(0.005) == 0.0
+    assert scale(freely[0.375]) == 0.0
+    assert scale(freely[0.5]) == 0.5
+    assert scale(freely[0.375]) == 0.375
+    assert scale(0.005) == 0.0
+    # Who lets go of the command and gives it anew begins anew.
+    assert scale(0.005, (0, 0)) == 1.0
+    assert scale(freely[0.375]) == 0.375
+
+
+@pytest.mark.parametrize("at_s", ["now", "coming"])
+def test_an_obstacle_that_moves_is_met_where_it_will_be(at_s):
+    guard = guard_of(Fence())
+    seen = estimate(0, 0, 0, (5, 5))
+    beside = MovingCircle(0.45, 0.8, 0.1, 0.0, 0.0 if at_s == "now" else -3.0)
+    guard.set_obstacles([beside])
+    assert guard.is_active
+    found = guard.step(seen, EXACT, (5, 5), (5, 5))
+    assert (found.verdict is FenceVerdict.FREE) == (at_s == "now")
+    guard.set_obstacles([])
+    assert guard.step(seen, EXACT, (5, 5), (5, 5)) is IDLE
+
+
+def test_the_time_at_each_point_of_the_path_is_when_the_robot_is_there():
+    # The obstacle's front passes the robot's nose just before, or just after, the robot has come there.
+    speed = 5.0
+    times = {"held": 0.08, "tail": 0.13, "brake": speed / 20.0}
+    end_s = sum(times.values())
+    end_m = 0.3 + stopping_m(speed)
+    for late in (False, True):
+        guard = guard_of(Fence())
+        # It comes along the robot's line towards it, to be where the robot stops at the end of its way.
+        radius, velocity = 0.1, -1.0
+        touches_at_end_m = end_m + radius
+        start_m = touches_at_end_m - velocity * end_s + (0.01 if late else -0.01)
+        guard.set_obstacles([MovingCircle(start_m, 0.0, radius, velocity, 0.0)])
+        found = guard.step(estimate(0, 0, 0, (speed, speed)), EXACT, (speed, speed), (speed, speed))
+        full = guard._stopping_paths(
+            guard.boundaries, estimate(0, 0, 0, (speed, speed)), EXACT, (speed, speed), (speed, speed)
+        )[1][-1]
+        assert full[-1].min() == pytest.approx(0.01 if late else -0.01, abs=1e-6)
+        assert found.scale < 1.0
+
+
+def test_another_fence_is_kept_with_the_obstacles_and_its_own_margin():
+    guard = guard_of(Fence(keep_in=ROOM))
+    guard.set_obstacles([MovingCircle(0.6, 0.0, 0.2)])
+    guard.set_boundaries(Boundaries(FOOTPRINT, Fence(keep_in=Circle((0, 0), 5.0))), 0.1)
+    assert guard.step(estimate(), EXACT, (0, 0), (5, 5)).verdict is not FenceVerdict.FREE
+    guard.set_obstacles([])
+    assert guard.step(estimate(4.0), EXACT, (0, 0), (1, 1)).verdict is FenceVerdict.FREE
+    near = 5.0 - 0.3 - 0.1 - 0.005
+    assert guard.step(estimate(near), EXACT, (0, 0), (1, 1)).scale < 1.0
+
+
+def test_a_slower_controller_needs_a_longer_way():
+    guard = guard_of(Fence(keep_in=ROOM))
+    seen = ahead_of_wall(0.16, (5, 5))
+    before = guard.step(seen, EXACT, (5, 5), (5, 5))
+    guard.set_deceleration(10.0)
+    assert guard.settings == StoppingSettings(0.08, 0.1, 10.0, 0.02)
+    after = guard.step(seen, EXACT, (5, 5), (5, 5))
+    assert before.scale > after.scale
+
+
+@pytest.mark.parametrize(
+    "broken", [(math.nan, 0, 1, 0.02), (0, -0.1, 1, 0.02), (0, 0, 0, 0.02), (0, 0, math.inf, 0.02), (0, 0, -1, 0.02)]
+)
+def test_settings_that_cannot_be_are_refused(broken):
+    with pytest.raises(ValueError, match="deceleration positive"):
+        StoppingSettings(*broken)
+    assert StoppingSettings(0.0, 0.0, 1.0, 0.0).response_s == 0.0
+
+
+@pytest.mark.parametrize(
+    "seen",
+    [
+        estimate(pose_ok=False),
+        estimate(initialised=False),
+        estimate(wheels_ok=False),
+        estimate(x=math.nan),
+        estimate(y=math.inf),
+        estimate(yaw=math.nan),
+        estimate(wheels=(math.nan, 0)),
+        estimate(wheels=(0, math.inf)),
+        estimate(spread=((math.nan, 0, 0), (0, 0, 0), (0, 0, 0))),
+        estimate(spread=((0, 0, 0), (0, 0, 0), (0, 0, math.inf))),
+    ],
+)
+def test_without_a_pose_that_is_a_pose_nothing_moves(seen):
+    found = guard_of(Fence(keep_in=ROOM)).step(seen, EXACT, (0, 0), (5, 5))
+    assert (found.verdict, found.scale) == (FenceVerdict.NO_POSE, 0.0)
+    assert found.reason == "no valid pose, and a fence is set"
+    assert found.verdict in HOLDS_STILL
+
+
+def test_a_pose_so_large_that_the_path_has_no_numbers_moves_nothing():
+    found = judge(Fence(keep_in=ROOM), estimate(x=1e308), (1e308, 1e308), last=(1e308, 1e308))
+    assert found.scale == 0.0
+    assert found.verdict in HOLDS_STILL
+
+
+@pytest.mark.parametrize("requested", [(math.nan, 0.0), (math.inf, 1.0), (0.0, 0.0), (1e-4, -1e-4)])
+def test_what_asks_for_no_motion_is_judged_as_a_stop(requested):
+    found = judge(Fence(keep_in=ROOM), estimate(wheels=(5, 5)), requested)
+    assert (found.verdict, found.scale) == (FenceVerdict.FREE, 1.0)
+    assert found.path[-1][0] == pytest.approx(RADIUS * (5 * 0.08 + 25 / 40))
+    assert judge(Fence(keep_in=ROOM), estimate(last_nan := 0.0), (1, 1), last=(math.nan, last_nan)).scale == 0.0
+
+
+def test_an_obstacle_that_is_reported_no_longer_stops_the_robot():
+    guard = guard_of(Fence())
+    guard.set_obstacles([MovingCircle(50.0, 0.0, 0.1)], ["person", "cart"])
+    found = guard.step(estimate(), EXACT, (0, 0), (1, 1))
+    assert (found.verdict, found.scale) == (FenceVerdict.OBSTACLE_LOST, 0.0)
+    assert found.reason == "obstacle person, cart is reported no longer; report it again or remove it"
+    guard.set_obstacles([], ["person"])
+    assert guard.step(estimate(), EXACT, (0, 0), (1, 1)).scale == 0.0
+    guard.set_obstacles([MovingCircle(50.0, 0.0, 0.1)])
+    assert guard.step(estimate(), EXACT, (0, 0), (1, 1)).scale == 1.0
+
+
+def test_an_override_lets_all_through_where_there_is_a_fence():
+    guard = guard_of(Fence(keep_in=ROOM))
+    found = guard.step(estimate(pose_ok=False), EXACT, (0, 0), (5, 5), overridden=True)
+    assert (found.verdict, found.scale) == (FenceVerdict.OVERRIDDEN, 1.0)
+    assert "in spite of the fence" in found.reason
+    assert guard_of(Fence()).step(estimate(), EXACT, (0, 0), (5, 5), overridden=True) is IDLE
+
+
+def corners(pose) -> np.ndarray:
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    return np.array([(pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y) for x, y in FOOTPRINT.corners_m()])
+
+
+def is_inside(pose, polygon, pillar: Circle) -> bool:
+    """By half planes of a convex polygon, and by the pillar in the robot's frame: not the product's own geometry."""
+    places = corners(pose)
+    for begin, end in zip(polygon, [*polygon[1:], polygon[0]], strict=True):
+        way = np.subtract(end, begin)
+        if (way[0] * (places[:, 1] - begin[1]) - way[1] * (places[:, 0] - begin[0]) < 0).any():
+            return False
+    dx, dy = pillar.center[0] - pose[0], pillar.center[1] - pose[1]
+    ahead = math.cos(pose[2]) * dx + math.sin(pose[2]) * dy - FOOTPRINT.ahead
+    aside = math.cos(pose[2]) * dy - math.sin(pose[2]) * dx
+    off = math.hypot(max(abs(ahead) - 0.25, 0.0), max(abs(aside) - 0.2, 0.0))
+    return off >= pillar.radius_m
+
+
+class Plant:
+    """A robot that nobody told: its own geometry, its wheels late by any response, its pose known with an error."""
+
+    def __init__(self, radius, axle, x_icr, response_s, pose):
+        self.radius, self.axle, self.x_icr = radius, axle, x_icr
+        self.queue = deque([(0.0, 0.0)] * round(response_s / 0.002))
+        self.pose, self.wheels = list(pose), (0.0, 0.0)
+
+    def advance(self, command, seconds, inside) -> bool:
+        for _ in range(round(seconds / 0.002)):
+            self.queue.append(command)
+            self.wheels = left, right = self.queue.popleft()
+            v, w = self.radius * (left + right) / 2, self.radius * (right - left) / self.axle
+            x, y, yaw = self.pose
+            self.pose = [
+                x + 0.002 * (v * math.cos(yaw) + w * self.x_icr * math.sin(yaw)),
+                y + 0.002 * (v * math.sin(yaw) - w * self.x_icr * math.cos(yaw)),
+                yaw + 0.002 * w,
+            ]
+        return inside(self.pose)
+
+
+unit = st.floats(-1.0, 1.0)
+rounds = st.integers(4, 7).flatmap(
+    lambda n: st.tuples(st.just(n), st.floats(1.0, 1.8), st.floats(0.0, 6.3))
+)  # fmt: skip
+
+
+@settings(max_examples=120)
+@given(
+    room=rounds,
+    pillar=st.tuples(unit, unit, st.floats(0.05, 0.3)),
+    commands=st.lists(st.tuples(st.floats(-8, 8), st.floats(-8, 8), st.integers(5, 40)), min_size=1, max_size=5),
+    truth=st.tuples(unit, unit, unit, st.floats(0.0, 1.0)),
+    error=st.tuples(st.floats(0.0, 6.3), unit),
+    start_yaw=st.floats(-3.1, 3.1),
+)
+def test_no_motion_ever_leaves_the_fence_even_if_the_host_dies(room, pillar, commands, truth, error, start_yaw):
+    count, size, turned = room
+    polygon = tuple(
+        (size * math.cos(turned + 2 * math.pi * k / count), size * math.sin(turned + 2 * math.pi * k / count))
+        for k in range(count)
+    )
+    post = Circle((pillar[0], pillar[1]), pillar[2])
+    fence = Fence(keep_in=polygon, keep_out=(post,))
+    deviation, position_m = (0.04, 0.04, 0.02), 0.01
+    believed = OdometryParameters(
+        RADIUS, AXLE, X_ICR,
+        ((deviation[0] ** 2 * RADIUS**2, 0, 0), (0, deviation[1] ** 2 * AXLE**2, 0), (0, 0, deviation[2] ** 2)),
+    )  # fmt: skip
+    plant = Plant(
+        RADIUS * (1 + 3 * deviation[0] * truth[0]), AXLE * (1 + 3 * deviation[1] * truth[1]),
+        X_ICR + 3 * deviation[2] * truth[2], STOPS.response_s * truth[3], (0.0, 0.0, start_yaw),
+    )  # fmt: skip
+    off = 3 * position_m * abs(error[1])
+    guard, governor = guard_of(fence), Governor(WheelLimits(8.0, 20.0, 20.0), 0.02)
+    sent = (0.0, 0.0)
+
+    def inside(pose):
+        return is_inside(pose, polygon, post)
+
+    if Boundaries(FOOTPRINT, fence).clearance_m(np.array([plant.pose]))[0] < 0.1:
+        return
+    for left, right, ticks in commands:
+        for _ in range(ticks):
+            x, y, yaw = plant.pose
+            seen = estimate(
+                x + off * math.cos(error[0]), y + off * math.sin(error[0]), yaw, plant.wheels,
+                covariance(position_m, 0.0),
+            )  # fmt: skip
+            found = guard.step(seen, believed, sent, (left, right))
+            command = governor.step(found.scale * left, found.scale * right, 0.02)
+            sent = (command.left_rad_s, command.right_rad_s)
+            assert plant.advance(sent, 0.02, inside)
+    # The host is silent: the wheels go on for the reaction time, and then slow down.
+    assert plant.advance(sent, STOPS.reaction_s, inside)
+    slowest = max(abs(sent[0]), abs(sent[1])) / STOPS.deceleration_rad_s2
+    for k in range(1, math.ceil(slowest / 0.002) + 50):
+        share = max(0.0, 1.0 - k * 0.002 / slowest) if slowest else 0.0
+        assert plant.advance((sent[0] * share, sent[1] * share), 0.002, inside)
+
+
+def test_the_path_is_sampled_as_finely_as_its_phases_say():
+    assert SCALES.tolist() == [0.0, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875, 1.0]
+    assert len(judge(Fence(keep_in=ROOM), estimate(), (1, 1)).path) == 1 + 3 + 2 + 3 + 3
+
+
+@pytest.mark.parametrize(("speed", "asks"), [(1e-3, False), (1.01e-3, True), (9.9e-4, False)])
+def test_a_command_below_a_thousandth_of_a_radian_asks_for_nothing(speed, asks):
+    for requested in ((speed, 0.0), (0.0, -speed)):
+        path = judge(Fence(keep_in=ROOM), estimate(), requested).path
+        assert (path[-1] != path[0]) == asks
+    assert judge(Fence(keep_in=ROOM), estimate(wheels=(5, 5)), (0.0, 0.0)).path[-1] == pytest.approx(
+        judge(Fence(keep_in=ROOM), estimate(wheels=(5, 5)), (math.nan, 0.0)).path[-1]
+    )
+
+
+def largest(clearance, driven, margin_m=0.5) -> float:
+    """The scale that is chosen for clearances (S, K) to one shape and corner steps (S, K)."""
+    guard = guard_of(Fence(), margin_m=margin_m)
+    return float(SCALES[guard._largest_scale(np.array(clearance, float)[..., None], np.array(driven, float))])
+
+
+def paths(stop, *others):
+    """Rows for all scales: of the stop, of the next ones, and ones deep in the fence for the rest."""
+    return [stop, *others, *([[-9.0] * len(stop)] * (len(SCALES) - 1 - len(others)))]
+
+
+STILL = [[0.0] * 3] * len(SCALES)
+
+
+def test_between_two_points_the_clearance_is_less_by_half_the_way_that_is_not_seen():
+    far = [1.0, 1.0, 1.0]
+    for step, chosen in ((1.74, 0.25), (1.76, 0.0)):
+        # 1 - step / 2 against a quarter of the margin.
+        driven = [[0.0] * 3, [0.0, step, 0.0], *STILL[2:]]
+        assert largest(paths(far, [1.0, 1.0, 1.0]), driven) == chosen
+    driven = [[0.0] * 3, [0.0, 0.0, 1.76], *STILL[2:]]
+    assert largest(paths(far, [1.0, 1.0, 1.0]), driven) == 0.0
+    # The first point has nothing before it.
+    assert largest(paths(far, [1.0, 1.0, 1.0]), [[0.0] * 3, [1.76, 0.0, 0.0], *STILL[2:]]) == 0.25
+    assert largest(paths(far, [1.0, 0.5, 0.1]), STILL) == 0.0
+
+
+def test_a_path_may_come_exactly_as_near_as_it_may():
+    assert largest(paths([1.0] * 3, [1.0, 0.5, 0.125]), STILL) == 0.25
+    assert largest(paths([1.0] * 3, [1.0, 0.5, 0.124]), STILL) == 0.0
+    # As near as the stop itself, too.
+    assert largest(paths([1.0, 0.5, 0.03], [1.0, 0.5, 0.03]), STILL) == 0.25
+    assert largest(paths([1.0, 0.5, 0.0], [1.0, 0.5, 0.0]), STILL) == 0.25
+    assert largest(paths([1.0, 0.5, -0.01], [1.0, 0.5, -0.01]), STILL) == 0.0
+
+
+def test_leading_away_is_never_nearer_and_at_last_farther_than_at_first():
+    stop = [-1.0, -1.0, -1.0]
+    assert largest(paths(stop, [-1.0, -1.0, -0.9]), STILL) == 0.25
+    assert largest(paths(stop, [-1.0, -0.8, -1.0]), STILL) == 0.0
+    assert largest(paths(stop, [-1.0, -1.1, -0.9]), STILL) == 0.0
+    assert largest(paths(stop, [-1.0, -1.0, -1.0]), STILL) == 0.0
+    assert largest(paths(stop, [-1.0, -0.9, -0.95]), STILL) == 0.25
+
+
+def test_of_two_shapes_both_must_hold():
+    guard = guard_of(Fence(), margin_m=0.5)
+    far, near = np.array(paths([1.0] * 3, [1.0] * 3)), np.array(paths([1.0] * 3, [1.0, 0.5, 0.1]))
+    assert guard._largest_scale(np.stack([far, far], axis=2), np.array(STILL)) == 1
+    assert guard._largest_scale(np.stack([far, near], axis=2), np.array(STILL)) == 0
+
+
+@pytest.mark.parametrize(("sent", "measured"), [((5.0, 5.0), (0.0, 0.0)), ((0.0, 0.0), (5.0, 5.0))])
+def test_the_nearer_of_the_paths_by_command_and_by_measurement_counts(sent, measured):
+    fence = Fence(keep_in=CELL)
+    seen = estimate(0.5, 0.0, 0.0, measured)
+    both = judge(fence, seen, (2.0, 2.0), last=sent).clearance_m
+    alone = judge(fence, estimate(0.5, 0.0, 0.0, (5.0, 5.0)), (2.0, 2.0)).clearance_m
+    slow = judge(fence, estimate(0.5, 0.0, 0.0, (0.0, 0.0)), (2.0, 2.0)).clearance_m
+    assert both == pytest.approx(alone)
+    assert both < slow - 0.01
+    steps = guard_of(fence)._stopping_paths(Boundaries(FOOTPRINT, fence), seen, EXACT, sent, (2.0, 2.0))[2]
+    assert steps[-1, 1] == pytest.approx(RADIUS * 5.0 * 0.08 / 3)
+
+
+def test_a_corner_moves_by_the_way_and_by_the_turn():
+    fence = Fence(keep_in=CELL)
+    seen = estimate(wheels=(1.0, 3.0))
+    steps = guard_of(fence)._stopping_paths(Boundaries(FOOTPRINT, fence), seen, EXACT, (1.0, 3.0), (1.0, 3.0))[2]
+    turn = RADIUS * 2.0 / AXLE * 0.08 / 3
+    moved = math.hypot(RADIUS * 2.0 * 0.08 / 3, X_ICR * turn)
+    assert steps[-1, 1] == pytest.approx(moved + FOOTPRINT.reach_m * turn)
+
+
+def test_long_arcs_end_where_they_do():
+    slow = StoppingSettings(response_s=1.2, reaction_s=0.9, deceleration_rad_s2=2.0, period_s=0.02)
+    wide = Fence(keep_in=Circle((0.0, 0.0), 20.0))
+    for before, command in (((2.0, 7.0), (2.0, 7.0)), ((-3.0, 4.0), (-3.0, 4.0))):
+        found = judge(wide, estimate(0.0, 0.0, 0.4, before), command, stops=slow)
+        expected = integrated(estimate(0.0, 0.0, 0.4, before), EXACT, before, command, slow, 1.2, 1.0)
+        np.testing.assert_allclose(found.path[-1], expected[-1], atol=2e-4)
+
+
+def test_a_believed_spread_makes_turns_longer_too():
+    spread = OdometryParameters(RADIUS, AXLE, X_ICR, ((0.02**2 * RADIUS**2, 0, 0), (0, 0, 0), (0, 0, 0)))
+    seen = estimate(wheels=(-2.0, 2.0))
+    exact, longer = (judge(Fence(keep_in=ROOM), seen, (-2.0, 2.0), geometry=one) for one in (EXACT, spread))
+    assert longer.path[-1][2] == pytest.approx(1.06 * exact.path[-1][2])
+    unknown_age, no_age = (
+        judge(Fence(keep_in=ROOM), estimate(wheels=(-2.0, 2.0), age_s=age), (-2.0, 2.0), geometry=spread)
+        for age in (None, 0.0)
+    )
+    assert unknown_age.path == no_age.path
+
+
+def test_the_clearance_is_less_by_the_turn_that_is_not_known_along_the_path():
+    spread = OdometryParameters(RADIUS, AXLE, X_ICR, ((0, 0, 0), (0, (0.01 * AXLE) ** 2, 0), (0, 0, 0)))
+    fence, seen = Fence(keep_in=CELL), estimate(wheels=(1.0, 3.0))
+    bounds = Boundaries(FOOTPRINT, fence)
+    exact, wide = (
+        guard_of(fence)._stopping_paths(bounds, seen, one, (1.0, 3.0), (1.0, 3.0)) for one in (EXACT, spread)
+    )
+    path = exact[0][-1]
+    turned = np.abs(path[:, 2] - path[0, 2])
+    moved = np.concatenate([[0.0], np.cumsum(np.hypot(RADIUS / AXLE * 0.0 + np.diff(turned) * X_ICR,
+                                                      np.diff(turned) * AXLE))])  # fmt: skip
+    lost = (exact[1] - wide[1])[-1, :, 1]
+    np.testing.assert_allclose(lost, 3 * 0.01 * turned * (FOOTPRINT.reach_m + 0.5 * moved), rtol=1e-6, atol=1e-12)
+
+
+def test_an_obstacle_is_met_at_the_time_of_coming_to_a_slower_command():
+    # From 6 to 2 rad/s takes 0.2 s; then follow the tail and the braking.
+    before, command = (6.0, 6.0), (2.0, 2.0)
+    for end_s, crosswise in ((0.08 + 0.2 + 0.13 + 0.1, 0.0),):
+        guard = guard_of(Fence())
+        guard.set_obstacles([MovingCircle(3.0, 0.0, 0.1, -1.0, crosswise)])
+        found = guard._stopping_paths(guard.boundaries, estimate(wheels=before), EXACT, before, command)
+        end_m = found[0][-1, -1, 0] + 0.3
+        assert found[1][-1, -1, 1] == pytest.approx(3.0 - end_s - 0.1 - end_m)

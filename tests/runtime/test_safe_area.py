@@ -1,0 +1,295 @@
+"""Fence and obstacles in the daemon's tick: tasks and hands are stopped inside, it is said, recorded and replayed."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import socket
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+import disco_hw
+from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
+from disco_hw.fence import Circle, Fence, Footprint
+from disco_hw.fence.clearance import Boundaries
+from disco_hw.log import records
+from disco_hw.runtime import State
+from disco_hw.runtime.core import PilotTick
+from disco_hw.runtime.fence_guard import FenceGuard, FenceVerdict, StoppingSettings
+from disco_hw.runtime.obstacle_source import UdpObstacles, obstacle_source_of, reports_in
+from disco_hw.runtime.obstacles import MOST_OBSTACLES, ObstacleRefused, ObstacleReport, Obstacles, report_from
+from disco_hw.runtime.pipeline import Limited, Manual, NoPlanner
+from disco_hw.runtime.replay import replay
+from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.runtime.safe_area import OVERRIDE_NS, FenceRefused, SafeArea, fence_of_record, report_of_record
+from disco_hw.runtime.supervisor import UserRequest
+from sim.body_dynamics import BodyPose
+from sim.plant_parameters import PlantParameters
+
+ROBOTS = Path(disco_hw.__file__).parent / "robots"
+ROOM = ((-2.0, -1.5), (2.0, -1.5), (2.0, 1.5), (-2.0, 1.5))
+FENCE = "\n[fence]\nkeep_in = [[-2, -1.5], [2, -1.5], [2, 1.5], [-2, 1.5]]\n"
+SECOND_NS = 1_000_000_000
+MIDDLE = BodyPose(0.0, 0.0, 0.0)
+
+
+class Hand:
+    """A pilot by hand, at wheel speeds that a test sets."""
+
+    needs_pose = False
+    done = False
+
+    def __init__(self):
+        self.wheels = (0.0, 0.0)
+
+    def step(self, now_ns, last):
+        return PilotTick(motion=Manual(*self.wheels), by_hand=True)
+
+    def learn(self, now_ns, tick, replies):
+        pass
+
+
+@pytest.fixture(scope="module")
+def robot_file(tmp_path_factory) -> Path:
+    directory = tmp_path_factory.mktemp("fenced")
+    path = directory / "robot.toml"
+    path.write_text((ROBOTS / "wombot.toml").read_text() + FENCE)
+    shutil.copy(ROBOTS / "wombot_model.toml", directory)
+    return path
+
+
+def by_hand(robot_file: Path, start: BodyPose = MIDDLE, **plant) -> tuple[SimulatedRun, Hand]:
+    setup, hand = load_setup(robot_file), Hand()
+    robot = virtual_robot(setup, PlantParameters(**plant), start)
+    run = SimulatedRun(setup, robot, NoPlanner(), hand)
+    run.run(1.5)
+    run.run(0.5, UserRequest.ARM)
+    run.run(0.02, UserRequest.START)
+    return run, hand
+
+
+def left_m(run: SimulatedRun) -> float:
+    truth, config = run.robot.truth, run.core.config
+    bounds = Boundaries(config.robot.footprint, config.fence)
+    return float(bounds.clearance_m(np.array([[truth.x_m, truth.y_m, truth.yaw_rad]]))[0])
+
+
+def events_of(ticks) -> list[str]:
+    return [event for tick in ticks for event in tick.events if event.startswith("fence:")]
+
+
+def test_a_hand_is_stopped_before_the_wall_and_may_leave_it(robot_file, tmp_path):
+    run, hand = by_hand(robot_file, BodyPose(1.0, 0.0, 0.0))
+    hand.wheels = (5.0, 5.0)
+    ticks = run.run(4.0)
+    assert any(tick.pipeline.fence.verdict is FenceVerdict.SCALED for tick in ticks)
+    assert Limited.FENCE in ticks[-1].pipeline.command.limited
+    assert ticks[-1].command.left_rad_s == 0.0
+    assert 0.0 < left_m(run) < 0.10
+    (event,) = events_of(ticks)
+    assert event.startswith("fence: stopped: the stopping path would leave the fence at (1.")
+    assert run.core.area.status(run.now_us * 1000)["verdict"] == "stopped"
+    hand.wheels = (-5.0, -5.0)
+    ticks = run.run(1.0)
+    assert events_of(ticks) == ["fence: motion is allowed again"]
+    assert left_m(run) > 0.2
+    guards = [one for _, tick in run.recorder.ticks for one in tick if isinstance(one, records.FenceGuard)]
+    assert {"free", "scaled", "stopped"} <= {one.verdict for one in guards}
+    assert sum(bool(one.path_x_m) for one in guards) > len(guards) / 6
+    log = tmp_path / "run.mcap"
+    run.write_log(log)
+    report = replay(log)
+    assert report.ok, report.as_text()
+
+
+def test_a_task_is_left_where_its_stopping_path_would_leave_the_fence(robot_file):
+    setup = load_setup(robot_file)
+    run = SimulatedRun(
+        setup, virtual_robot(setup, PlantParameters(), BodyPose(0.75, 0.0, 1.57)), NoPlanner(), needs_pose=True
+    )
+    run.run(1.5)
+    run.run(0.5, UserRequest.ARM)
+    area = run.core.area
+    area.report(run.now_us * 1000, ObstacleReport(name="box", x_m=0.75, y_m=0.5, radius_m=0.3, age_limit_s=60.0))
+    assert run.run(0.1, UserRequest.START)[-1].output.running
+    # Nobody plans here: what a plan would ask for is put in the guard's place.
+    run.pilot.step = lambda now_ns, last: PilotTick(motion=Manual(5.0, 5.0))
+    ticks = run.run(1.0)
+    assert not ticks[-1].output.running
+    said = [event for tick in ticks for event in tick.events if event.startswith("task stopped")]
+    (event,) = said
+    assert event.startswith("task stopped: fence: the stopping path would leave the fence at (0.")
+    assert ticks[-1].output.state is State.ARMED
+
+
+def test_without_a_pose_only_an_override_moves_the_robot(robot_file, tmp_path):
+    run, hand = by_hand(robot_file, pose_dropout_probability=1.0)
+    hand.wheels = (3.0, 3.0)
+    ticks = run.run(1.0)
+    assert all(tick.command.left_rad_s == 0.0 for tick in ticks)
+    assert ticks[-1].pipeline.fence.reason == "no valid pose, and a fence is set"
+    assert run.core.area.task_fault == "fence: no valid pose, and a fence is set"
+    assert run.core.area.override(run.now_us * 1000, on=True) == "manual driving in spite of the fence for 60 s"
+    ticks = run.run(1.0)
+    assert ticks[-1].command.left_rad_s == pytest.approx(3.0)
+    assert events_of(ticks)[0].startswith("fence: OVERRIDDEN by request")
+    assert run.core.area.status(run.now_us * 1000)["overridden_s"] == pytest.approx(59.0, abs=0.1)
+    assert any(one.overridden for _, tick in run.recorder.ticks for one in tick if isinstance(one, records.FenceGuard))
+    # It is the hand's alone.
+    run.pilot.step = lambda now_ns, last: PilotTick(motion=Manual(3.0, 3.0))
+    assert run.run(1.0)[-1].command.left_rad_s == 0.0
+    run.pilot.step = lambda now_ns, last: PilotTick(motion=Manual(3.0, 3.0), by_hand=True)
+    assert run.core.area.override(run.now_us * 1000, on=False) == "the fence holds again"
+    assert run.run(1.0)[-1].command.left_rad_s == 0.0
+    log = tmp_path / "run.mcap"
+    run.write_log(log)
+    assert replay(log).ok
+
+
+def test_an_override_ends_by_itself():
+    area = area_of(Fence(keep_in=ROOM))
+    area.override(0, on=True)
+    assert area.begin(OVERRIDE_NS - 1, by_hand=True)
+    assert not area.begin(OVERRIDE_NS - 1, by_hand=False)
+    assert not area.begin(OVERRIDE_NS, by_hand=True)
+    events, _ = area.end(OVERRIDE_NS, area.last, overridden=False)
+    assert events[-1] == "fence: the manual override has ended; the fence holds again"
+
+
+def area_of(fence: Fence) -> SafeArea:
+    footprint = Footprint(0.5, 0.4, 0.05)
+    guard = FenceGuard(Boundaries(footprint, fence), StoppingSettings(0.05, 0.1, 20.0, 0.02), fence.margin_m)
+    return SafeArea(guard, fence, footprint)
+
+
+def test_an_obstacle_is_kept_to_its_age_limit_and_then_stops_the_robot(robot_file):
+    run, hand = by_hand(robot_file)
+    hand.wheels = (1.0, 1.0)
+    now_ns = run.now_us * 1000
+    run.core.area.report(now_ns, ObstacleReport(name="cart", x_m=-1.0, y_m=0.5, radius_m=0.2, age_limit_s=0.5))
+    ticks = run.run(0.5)
+    assert ticks[-1].command.left_rad_s > 0.5
+    ticks = run.run(0.5)
+    assert ticks[-1].command.left_rad_s == 0.0
+    assert events_of(ticks) == [
+        "fence: obstacle cart not reported for 0.5 s; the robot must stand",
+        "fence: stopped: obstacle cart is reported no longer; report it again or remove it",
+    ]
+    assert run.core.area.task_fault.startswith("fence: obstacle cart")
+    run.core.area.ask(run.now_us * 1000, {"change": "remove", "name": "cart"})
+    assert run.run(0.5)[-1].command.left_rad_s > 0.5
+
+
+def report(name: str = "person", **fields) -> ObstacleReport:
+    return ObstacleReport(**{"name": name, "x_m": 1.0, "y_m": 2.0, "radius_m": 0.3, **fields})
+
+
+def test_an_obstacle_goes_on_with_its_velocity():
+    obstacles = Obstacles()
+    obstacles.report(SECOND_NS, report(vx_m_s=0.5, vy_m_s=-1.0, age_s=0.5, age_limit_s=2.0))
+    (circle,) = obstacles.circles(SECOND_NS)
+    assert (circle.x_m, circle.y_m) == (1.25, 1.5)
+    (circle,) = obstacles.circles(2 * SECOND_NS)
+    assert (circle.x_m, circle.y_m, circle.vx_m_s, circle.vy_m_s, circle.radius_m) == (1.75, 0.5, 0.5, -1.0, 0.3)
+    assert obstacles.step(round(2.5 * SECOND_NS)) == ()
+    assert obstacles.step(round(2.5 * SECOND_NS) + 1) == (
+        "fence: obstacle person not reported for 2 s; the robot must stand",
+    )
+    assert obstacles.lost == ("person",)
+    assert obstacles.status(3 * SECOND_NS)[0]["lost"]
+    assert obstacles.step(3 * SECOND_NS) == ()
+    obstacles.report(3 * SECOND_NS, report())
+    assert obstacles.step(3 * SECOND_NS) == ("fence: obstacle person is reported again",)
+    assert obstacles.lost == ()
+
+
+def test_thirty_two_obstacles_are_kept_and_no_more():
+    obstacles = Obstacles()
+    for number in range(MOST_OBSTACLES):
+        obstacles.report(0, report(f"one{number}"))
+    with pytest.raises(ObstacleRefused, match="there are 32 already; remove one first"):
+        obstacles.report(0, report("another"))
+    obstacles.report(0, report("one3", x_m=7.0))
+    assert obstacles.refused == 1
+    obstacles.remove("one3")
+    obstacles.report(0, report("another"))
+    with pytest.raises(ObstacleRefused, match="obstacle one3: not known; known are: another, one0"):
+        obstacles.remove("one3")
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"x_m": math.nan}, {"x_m": 900.0}, {"radius_m": 0.0}, {"radius_m": -1.0}, {"name": ""}, {"name": "a b"},
+        {"vx_m_s": 50.0}, {"age_s": -1.0}, {"age_limit_s": 0.0}, {"age_limit_s": math.inf}, {"colour": 3.0},
+    ],
+)  # fmt: skip
+def test_what_is_no_obstacle_is_refused_in_one_line(fields):
+    whole = {"name": "box", "x_m": 0.0, "y_m": 0.0, "radius_m": 0.1}
+    assert report_from(whole).age_limit_s == 1.0
+    with pytest.raises(ObstacleRefused, match=r"obstacle: .*; write"):
+        report_from({**whole, **fields})
+    assert reports_in(msgspec.json.encode({**whole, **fields})) == []
+
+
+def test_datagrams_of_one_and_of_several_are_taken():
+    one = {"name": "box", "x_m": 0.0, "y_m": 1.0, "radius_m": 0.1}
+    assert [each.name for each in reports_in(msgspec.json.encode(one))] == ["box"]
+    many = [{**one, "name": f"box{k}"} for k in range(40)]
+    assert len(reports_in(msgspec.json.encode(many))) == MOST_OBSTACLES
+    assert [each.y_m for each in reports_in(msgspec.msgpack.encode([one]))] == [1.0]
+    for garbage in (b"", b"{", b"[1]", b"\xff\xff", b"{}" * 3):
+        assert reports_in(garbage) == []
+
+
+def test_reports_come_over_udp(robot_file):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    config = load_setup(robot_file).config
+    fence = msgspec.structs.replace(config.fence, obstacles_port=port)
+    source = obstacle_source_of(msgspec.structs.replace(config, fence=fence))
+    assert isinstance(source, UdpObstacles)
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.sendto(b'{"name": "box", "x_m": 0.5, "y_m": 0, "radius_m": 0.1}', ("127.0.0.1", port))
+            sender.sendto(b"nonsense", ("127.0.0.1", port))
+        assert [one.name for one in source.receive(0)] == ["box"]
+        assert source.malformed == 1
+        assert list(source.receive(0)) == []
+    finally:
+        source.close()
+    assert list(obstacle_source_of(config).receive(0)) == []
+
+
+def test_a_person_adds_and_removes_obstacles_and_all_is_recorded():
+    area = area_of(Fence(keep_in=ROOM))
+    added = area.ask(5, {"change": "add", "name": "pillar", "x_m": 0.5, "y_m": 0.0, "radius_m": 0.1})
+    assert added == "obstacle pillar: kept for 600 s, then the robot stops"
+    assert area.ask(6, {"change": "remove", "name": "pillar"}) == "obstacle pillar: removed"
+    _, written = area.end(7, area.last, overridden=False)
+    assert [one.removed for one in written] == [False, True]
+    assert report_of_record(written[0]).radius_m == 0.1
+    for wrong in ({}, {"change": "add"}, {"change": "remove"}, {"change": "remove", "name": "x", "x_m": 1.0}):
+        with pytest.raises(ObstacleRefused):
+            area.ask(8, wrong)
+
+
+def test_the_fence_is_changed_while_disarmed_only():
+    area = area_of(Fence(keep_in=ROOM))
+    for state in (State.ARMED, State.STOPPING):
+        with pytest.raises(FenceRefused, match=f"while the robot is disarmed, and it is {state.name}"):
+            area.change_fence(0, {"margin_m": 0.1}, state)
+    for wrong in ({"keep_in": [[0, 0], [1, 1]]}, {"keep_in": 3}, {"margin": 0.1}, {"margin_m": -1.0}):
+        with pytest.raises(FenceRefused, match="fence"):
+            area.change_fence(0, wrong, State.READY)
+    assert area.fence.keep_in == ROOM
+    area.change_fence(3, {"keep_in": {"center": [0, 0], "radius_m": 3.0}}, State.READY)
+    assert area.fence == Fence(keep_in=Circle((0.0, 0.0), 3.0))
+    assert area.guard.boundaries.fence == area.fence
+    events, (record,) = area.end(4, area.last, overridden=False)
+    assert fence_of_record(record) == area.fence
+    assert events == ("fence: changed; it holds until the daemon ends, robot.toml keeps its own",)

@@ -1,0 +1,214 @@
+"""Which wheels are found not to obey, by commands, counts and poses, and which are left alone."""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import dataclass, field
+
+import pytest
+
+from disco_hw.estimation.odometry import OdometryParameters
+from disco_hw.runtime.wheel_faults import Cause, WheelFaults
+from drivers.types import PoseSample, WheelCommand, WheelSample
+
+RADIUS_M, TRACK_M = 0.07, 0.44
+GEOMETRY = OdometryParameters(RADIUS_M, TRACK_M, 0.1, ((1e-6, 0.0, 0.0), (0.0, 1e-6, 0.0), (0.0, 0.0, 1e-6)))
+TICK_S, TICK_NS = 0.02, 20_000_000
+STD_M, STD_RAD = 0.004, 0.006
+CIRCLE = (0.72, 1.28)
+SLOW, FAST = 0.45, 3.2
+
+
+@dataclass
+class Robot:
+    """Wheels that lag behind their commands, and poses of where they take the robot."""
+
+    lag_s: float = 0.1
+    dead_rad_s: float = 0.0
+    stiction_rad_s: float = 0.0
+    has_poses: bool = True
+    std: float = 1.0
+    slip: float = 0.0
+    seed: int = 1
+    faults: WheelFaults = field(default_factory=WheelFaults)
+
+    def __post_init__(self):
+        self.chance = random.Random(self.seed)
+        self.speeds, self.angles, self.counts, self.reported = [0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]
+        self.x = self.y = self.yaw = 0.0
+        self.tick = 0
+        self.sticks = [True, True]
+
+    def drive(self, seconds, command, turns=None, counts=None):
+        """Seconds until a wheel is found not to obey and what, None for nothing.
+
+        `turns(wanted)`: what the left wheel truly does; `counts(true)`: what its encoder says.
+        """
+        for number in range(round(seconds / TICK_S)):
+            asked = command(number * TICK_S) if callable(command) else command
+            self._move(asked, turns, counts)
+            now_ns = self.tick * TICK_NS
+            wheels = WheelSample(now_ns, now_ns, *self.counts, *self.reported)
+            poses = [self._pose(now_ns)] if self.has_poses and self.tick % 2 == 0 else []
+            found = self.faults.step(now_ns, [wheels], poses, GEOMETRY)
+            if found is not None:
+                return (number + 1) * TICK_S, found
+            self.faults.commanded(now_ns, WheelCommand(*asked, 0.1))
+        return None
+
+    def _move(self, asked, turns, counts):
+        self.tick += 1
+        for side in (0, 1):
+            wanted = math.copysign(max(abs(asked[side]) - self.dead_rad_s, 0.0), asked[side])
+            self.sticks[side] = self.sticks[side] and abs(wanted) <= self.stiction_rad_s
+            wanted = 0.0 if self.sticks[side] else wanted
+            self.speeds[side] += (wanted - self.speeds[side]) * (1.0 - math.exp(-TICK_S / self.lag_s))
+            true = self.speeds[side] if side or turns is None else turns(self.speeds[side])
+            self.angles[side] += true * TICK_S
+            self.reported[side] = true if side or counts is None else counts(true)
+            self.counts[side] += self.reported[side] * TICK_S
+            self._roll(side, true * (1.0 - self.slip))
+
+    def _roll(self, side, speed):
+        self.yaw += (1 if side else -1) * RADIUS_M * speed * TICK_S / TRACK_M
+        self.x += 0.5 * RADIUS_M * speed * TICK_S * math.cos(self.yaw)
+        self.y += 0.5 * RADIUS_M * speed * TICK_S * math.sin(self.yaw)
+
+    def _pose(self, now_ns):
+        place = [self.chance.gauss(value, self.std * STD_M) for value in (self.x, self.y)]
+        return PoseSample(now_ns, now_ns, *place, self.chance.gauss(self.yaw, self.std * STD_RAD), STD_M, STD_RAD)
+
+
+def around(speed):
+    return CIRCLE[0] * speed, CIRCLE[1] * speed
+
+
+FAULTS = [
+    pytest.param(None, lambda true: 0.0, Cause.ENCODER_SILENT, id="frozen"),
+    pytest.param(None, lambda true: -true, Cause.ENCODER_REVERSED, id="reversed"),
+    pytest.param(lambda wanted: 0.0, None, Cause.STANDS, id="blocked"),
+    pytest.param(lambda wanted: -wanted, None, Cause.TURNS_BACKWARD, id="turns-backward"),
+    pytest.param(lambda wanted: 12.0, None, Cause.RUNS_AWAY, id="runs-away"),
+    pytest.param(lambda wanted: 12.0, lambda true: -true, Cause.RUNS_AWAY, id="runs-away-reversed"),
+]
+UNDECIDED = {
+    Cause.ENCODER_SILENT: Cause.SILENT, Cause.STANDS: Cause.SILENT, Cause.ENCODER_REVERSED: Cause.OPPOSED,
+    Cause.TURNS_BACKWARD: Cause.OPPOSED, Cause.RUNS_AWAY: Cause.RUNS_AWAY,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("turns", "counts", "cause"), FAULTS)
+@pytest.mark.parametrize("speed", [SLOW, 0.8, FAST])
+@pytest.mark.parametrize("way", [1.0, -1.0], ids=["forward", "backward"])
+def test_a_wheel_that_ceases_to_obey_is_found_within_seven_tenths_of_a_second(turns, counts, cause, speed, way):
+    robot = Robot()
+    command = tuple(way * each for each in around(speed))
+    assert robot.drive(6.0, command) is None
+    after_s, found = robot.drive(2.0, command, turns, counts)
+    assert after_s <= 0.7
+    assert found.cause in (cause, UNDECIDED[cause])
+    assert found.side == "left"
+    if speed == FAST and cause is not Cause.RUNS_AWAY:
+        assert found.cause is cause, "at this speed the poses decide"
+
+
+@pytest.mark.parametrize(("turns", "counts", "cause"), FAULTS[:5])
+def test_without_poses_it_is_found_and_both_explanations_are_named(turns, counts, cause):
+    robot = Robot(has_poses=False)
+    assert robot.drive(4.0, around(FAST)) is None
+    after_s, found = robot.drive(2.0, around(FAST), turns, counts)
+    assert after_s <= 0.7
+    assert found.cause is UNDECIDED[cause]
+
+
+@pytest.mark.parametrize("frozen", [lambda true: 0.0, lambda true: 0.1 * true])
+def test_an_encoder_that_never_counted_is_shown_by_the_poses_where_commands_are_too_slow_to_expect_anything(frozen):
+    after_s, found = Robot().drive(4.0, around(0.9), None, frozen)
+    assert found.cause is Cause.ENCODER_SILENT
+    assert after_s <= 1.5
+
+
+HEALTHY = [
+    pytest.param(Robot(lag_s=0.6), FAST, id="slow-motors"),
+    pytest.param(Robot(dead_rad_s=0.3), SLOW, id="dead-band"),
+    pytest.param(Robot(dead_rad_s=1.2), SLOW, id="within-the-dead-band"),
+    pytest.param(Robot(stiction_rad_s=1.0), 0.8, id="stiction-of-one-wheel"),
+    pytest.param(Robot(slip=0.25), FAST, id="slip"),
+    pytest.param(Robot(slip=1.0), FAST, id="lifted"),
+    pytest.param(Robot(std=4.0), SLOW, id="poses-worse-than-they-say"),
+    pytest.param(Robot(has_poses=False), SLOW, id="no-poses"),
+]
+
+
+@pytest.mark.parametrize(("robot", "speed"), HEALTHY)
+def test_a_robot_that_obeys_as_well_as_it_can_is_left_alone(robot, speed):
+    assert robot.drive(15.0, around(speed)) is None
+
+
+def swinging(time_s):
+    return 3.0 * math.sin(2.5 * time_s), 4.0 * math.sin(1.7 * time_s)
+
+
+@pytest.mark.parametrize("lag_s", [0.02, 0.1, 0.3])
+def test_wheels_that_lag_behind_swinging_commands_follow_them(lag_s):
+    robot = Robot(lag_s=lag_s)
+    assert robot.drive(12.0, swinging) is None
+    assert robot.faults.not_following == 0
+
+
+def test_a_wheel_that_stands_for_a_moment_is_counted_once_and_stops_nothing():
+    robot = Robot()
+    robot.drive(3.0, (3.0, 3.0))
+    assert robot.drive(0.16, (3.0, 3.0), lambda wanted: 0.0) is None
+    assert robot.drive(3.0, (3.0, 3.0)) is None
+    assert robot.faults.not_following == 1
+
+
+def test_a_wheel_that_stands_against_a_stone_for_a_quarter_second_is_no_fault():
+    robot = Robot()
+    robot.drive(3.0, (3.0, 3.0))
+    assert robot.drive(0.26, (3.0, 3.0), lambda wanted: 0.0) is None
+    assert robot.drive(3.0, (3.0, 3.0)) is None
+
+
+def test_a_jump_of_the_poses_is_no_fault_of_a_wheel():
+    robot = Robot(stiction_rad_s=1.0)
+    robot.drive(1.0, around(0.8))
+    for _ in range(5):
+        robot.x, robot.yaw = robot.x + 0.3, robot.yaw - 0.4
+        assert robot.drive(1.5, around(0.8)) is None
+
+
+def test_a_wheel_that_never_followed_and_counts_backward_is_left_to_whoever_knows_the_wiring():
+    robot = Robot()
+    robot.faults.commanded(0, WheelCommand(0.0, 0.0, 0.1))
+    step = robot.faults.step
+    robot.faults.step = lambda *given: step(*given, is_wiring_known=False)
+    assert robot.drive(3.0, around(FAST), None, lambda true: -true) is None
+    assert robot.faults.has_followed == (False, True)
+
+
+def test_disarmed_nothing_is_expected():
+    robot = Robot()
+    robot.drive(3.0, around(FAST))
+    robot.drive(0.2, around(FAST), lambda wanted: 0.0)
+    robot.faults.commanded(robot.tick * TICK_NS, None)
+    for _ in range(100):
+        robot.tick += 1
+        now_ns = robot.tick * TICK_NS
+        assert robot.faults.step(now_ns, [WheelSample(now_ns, now_ns, *robot.counts, 0.0, 0.0)], [], GEOMETRY) is None
+
+
+def test_a_base_that_makes_wheel_speeds_of_its_own_may_turn_by_more():
+    def turned(asked):
+        mean = sum(asked) / 2
+        return tuple(mean + 1.5 * (each - mean) for each in asked)
+
+    for takes_body_speeds, is_left_alone in ((True, True), (False, False)):
+        robot = Robot(faults=WheelFaults(takes_body_speeds))
+        robot.drive(4.0, (3.0, 3.0))
+        asked = (0.6, 3.5)
+        move = robot._move
+        robot._move = lambda _asked, turns, counts, move=move, asked=asked: move(turned(asked), turns, counts)
+        assert (robot.drive(2.0, asked) is None) is is_left_alone

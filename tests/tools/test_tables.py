@@ -1,0 +1,35 @@
+"""Which cases of a table `make test` runs."""
+
+import pytest
+
+from tests.tables import thinned
+
+
+def split(decorator):
+    """The values of the quick cases and of the thorough ones."""
+    cases = decorator.mark.args[1]
+    marked = [case for case in cases if hasattr(case, "marks") and any(mark.name == "thorough" for mark in case.marks)]
+    return [case for case in cases if case not in marked], [case.values for case in marked]
+
+
+@pytest.mark.parametrize(
+    ("keep", "quick"), [(1, [0]), (2, [0, 4]), (3, [0, 2, 4]), (5, [0, 1, 2, 3, 4]), (9, [0, 1, 2, 3, 4])]
+)
+def test_the_quick_cases_are_spread_from_the_first_to_the_last_and_none_is_lost(keep, quick):
+    kept, thorough = split(thinned("number", range(5), quick=keep))
+    assert kept == quick
+    assert [values for (values,) in thorough] == [number for number in range(5) if number not in quick]
+
+
+def test_a_tuple_is_one_value_of_one_argument_and_the_values_of_several():
+    cases = [(1, 2), (3, 4)]
+    assert split(thinned("span", cases, quick=1))[1] == [((3, 4),)]
+    assert split(thinned(("low", "high"), cases, quick=1))[1] == [(3, 4)]
+    assert split(thinned("low, high", cases, quick=1))[1] == [(3, 4)]
+
+
+def test_a_case_keeps_its_name_and_its_marks():
+    cases = [1, pytest.param(2, marks=pytest.mark.long, id="two")]
+    case = thinned("number", cases, quick=1).mark.args[1][1]
+    assert case.id == "two"
+    assert {mark.name for mark in case.marks} == {"long", "thorough"}
