@@ -10,7 +10,7 @@ from tests.viewer.test_attack import attack, limited_page
 from tests.viewer.test_operator_controls import ask, line_to
 
 pytestmark = pytest.mark.hil
-ATTACKED_S = 1.0
+ATTACKED_S = 5.0
 
 
 @pytest.mark.parametrize("descriptors", [256, pytest.param(1024, marks=pytest.mark.long)])
