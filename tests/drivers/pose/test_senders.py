@@ -103,7 +103,7 @@ def test_each_proven_datagram_counts_once_and_none_from_before_the_port_was_open
     assert isinstance(proof.unwrap(second, WALL_NS + 40), str)
     assert isinstance(proof.unwrap(first, WALL_NS + 40), str)
     again = PoseProof(KEY, WALL_NS + 50)
-    assert isinstance(again.open(second, WALL_NS + 60), str)
+    assert isinstance(again.unwrap(second, WALL_NS + 60), str)
 
 
 def test_over_a_real_socket_only_the_holder_of_the_key_is_heard():
