@@ -259,8 +259,8 @@ _EXAMPLES = {
 
 
 def _arguments(action: str, changes: Sequence[str]) -> dict[str, Any]:
-    """Return what the words after a request say; empty for a request that takes none. Raises InputError."""
-    if action not in _EXAMPLES:
+    """Return what the words after a request say; empty where there are none. Raises InputError."""
+    if not changes:
         return {}
     if action == OBSTACLE and changes[0] in {"add", "remove"}:
         name = [text.partition("=")[2] for text in changes[1:] if text.startswith("name=")]
