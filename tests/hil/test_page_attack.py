@@ -13,7 +13,9 @@ pytestmark = pytest.mark.hil
 ATTACKED_S = 5.0
 
 
-@pytest.mark.parametrize("descriptors", [256, pytest.param(1024, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "descriptors", [pytest.param(256, marks=pytest.mark.thorough), pytest.param(1024, marks=pytest.mark.long)]
+)
 def test_a_press_during_an_attack_latches_the_stop_and_the_wheels_stand(tmp_path, descriptors):
     page_said = tmp_path / "page.txt"
     with running_stack(tmp_path) as stack, limited_page(stack.robot_file, page_said, descriptors) as port:

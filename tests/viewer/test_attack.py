@@ -68,7 +68,8 @@ def attack(port):
             attacker.kill()
 
 
-@pytest.mark.parametrize("descriptors", [pytest.param(1024, marks=pytest.mark.long), 256])
+@pytest.mark.long
+@pytest.mark.parametrize("descriptors", [1024, 256])
 def test_every_press_reaches_the_daemon_and_new_pages_get_in_during_an_attack(tmp_path, descriptors):
     with page_process(tmp_path, descriptors) as (daemon, port, said), line_to(port) as line:
         ask(line, do="stop")
