@@ -109,7 +109,7 @@ class Refinement:
         if not hasattr(scene.terms, "line_at"):
             return None
         self._call(
-            "reference", timed_reference, self._reference, scene.terms, scene.begin, self._chassis,
+            "timed reference", timed_reference, self._reference, scene.terms, scene.begin, self._chassis,
             self._limits.speed_rad_s, STEP_S, self._found,
         )  # fmt: skip
         distance_m, facing, *_ = self._found.tolist()
