@@ -19,6 +19,7 @@ from disco_hw.control.kernel.reference import timed_reference
 from disco_hw.control.kernel.refine import CHANNELS, STATE_COLUMNS, Buffers, Problem, refine
 from disco_hw.control.parameter_points import mean_point
 from disco_hw.control.plan import CommandLimits
+from disco_hw.effects.registry import DELAY
 from disco_hw.jit import compiled_for
 from disco_hw.model import Model
 from disco_hw.model.added_terms import new_means
@@ -94,7 +95,7 @@ class Refinement:
         base, effects = coefficient_tables(model, theta[counted], STEP_S)
         self._counted, self._weights = counted, weights[counted].astype(np.float64)
         self._base, self._effects = base, effects
-        delay = getattr(effects, "command_delay", None)
+        delay = getattr(effects, DELAY.name, None)
         history = max(self.mean.past_rows, 0 if delay is None else int(delay[0].max()) + 1)
         self._series = integration_series(STEP_S, wide=True)
         if self._buffers is None or history > self.history:
