@@ -1,8 +1,8 @@
-"""Encoder counts that wrap round or are set anew: found from the counts alone, and made continuous.
+"""Encoder counts that wrap round or are set anew: found from the counts themselves, and made continuous.
 
 A counter of 8 or 16 bits jumps by its span when it overflows. The jump is recognised by what is left when the span is
 taken out: the motion of the samples around it. A counter that is set to zero leaves something else, and begins a new
-segment. Nothing here knows of units: counts, radians and degrees are treated alike.
+segment. Nothing here knows of units: counts and radians are treated alike.
 """
 
 from __future__ import annotations
@@ -19,121 +19,243 @@ Mask = NDArray[np.bool_]
 
 WIDTHS_BITS = (8, 10, 12, 14, 16, 20, 24, 32)
 """Widths of counters and of absolute encoders that are in use."""
+_WINDOW_S = 0.25
 _NEIGHBOURS = 5
-"""Steps whose median is the motion that is expected of the next one."""
+"""The motion expected of a step is that of the neighbours within this time, and of so many at least."""
+_JUMP_SHARE = 0.3
+"""Steps longer than this share of all values' reach are jumps."""
 _AMBIGUOUS_SHARE = 0.25
-"""Steps longer than this share of the span could be one way or the other."""
-_FIT_SHARE, _SLACK_SHARE, _CHANGE = 0.2, 0.02, 3.0
-"""A wrap leaves a step within the first share of the span of what is expected, and within the second of it but for a
-change by three usual steps: an outlier leaves something else."""
-_FULL_SHARE = 0.8
-"""Counts of a counter that wraps all the time fill this share of its span."""
+"""If many steps are longer than this share of the span, any of them may be one way or the other."""
+_UNKNOWN_SHARE = 0.4
+"""Where a step of this share of the span is expected, nobody can tell how often the counter wrapped."""
+_FITTING_SHARE = 0.8
+"""So many of the jumps have to be wraps of the span, or it is none."""
+_FULL_SHARE = 0.5
+"""Counts of a counter that wraps all the time fill at least this share of its span."""
+_TOO_FAST_SHARE = 0.05
+"""A counter of which more steps than this may be over half its span cannot be read."""
+_JUMPS_ALL_THE_TIME_SHARE = 0.1
 _OFTEN = 3
 """Without a usual width, so many jumps of one size are a span."""
 _SAME_SHARE = 0.05
 """Jumps that differ by less than this share of themselves are of one size."""
-_TOLERANCE_SHARE, _TOLERANCE_COUNTS = 0.005, 2.0
+_NEAR_SHARE = 0.005
 """A usual span this near to the size of the jumps is theirs: 4096 is not 4000."""
+_RESOLUTION = 2.0
+"""Counts by which steps differ that are the same motion; of a position in rad, this share of 1000 of the span."""
 
 
 @dataclass(frozen=True, slots=True)
 class Unwrapped:
     """Counts made continuous: `values` (N,); `span` that was taken out `wraps` times, 0 if the counts did not wrap.
 
-    `fault` says why the counts cannot be made continuous, and is empty if they can.
+    `uncertain` (N,) marks values before which so much time passed that the number of wraps is not known. `fault` says
+    why the counts cannot be made continuous, and is empty if they can.
     """
 
     values: Array
+    uncertain: Mask
     span: float = 0.0
     wraps: int = 0
     fault: str = ""
 
 
-def unwrap_counter(t_s: Array, values: Array, spans: Sequence[float] = (), *, unit: str = "counts") -> Unwrapped:
+@dataclass(frozen=True, slots=True)
+class _Steps:
+    """From value to value (N - 1,): duration, step, and the motion expected by the neighbours.
+
+    A step within `tolerance` of what is expected is motion, and so is one within `longest`, which the fastest of all
+    samples would make. `is_inside` is False across a change of segment; `is_jump` marks what is no motion.
+    """
+
+    dt_s: Array
+    steps: Array
+    expected: Array
+    tolerance: Array
+    longest: Array
+    is_inside: Mask
+    is_jump: Mask
+
+
+def unwrap_counter(
+    t_s: Array,
+    values: Array,
+    spans: Sequence[float] = (),
+    *,
+    begins: Mask | None = None,
+    speeds: Array | None = None,
+    unit: str = "counts",
+) -> Unwrapped:
     """Make a counter continuous that jumps by a constant span whenever it overflows.
 
     `t_s` (N,) increases. `spans` are tried beside those of the usual widths; any other span has to show in three jumps
-    of one size. Counts that fit no span are returned as they are.
+    of one size. `begins` (N,) marks where segments begin. `speeds` (N,), in units a second, are the commanded or
+    measured ones, NaN where not known: they show a counter that wraps faster than it is read. Counts that fit no span
+    are returned as they are.
     """
-    steps = np.diff(values)
-    reach = float(np.ptp(values)) if values.size else 0.0
-    if steps.size < _NEIGHBOURS or reach == 0.0 or np.abs(steps).max() <= 0.5 * reach:
-        return Unwrapped(values)
-    dt_s = np.maximum(np.diff(t_s), 1e-9)
+    unchanged = Unwrapped(values, np.zeros(values.size, dtype=bool))
+    if values.size <= _NEIGHBOURS:
+        return unchanged
+    reach = float(np.ptp(values))
+    motion = _steps(t_s, values, begins, reach, unit)
+    if not motion.is_jump.any():
+        return unchanged
     usual = sorted({float(2**bits) for bits in WIDTHS_BITS} | {float(span) for span in spans})
-    possible = [span for span in usual if reach < span <= 2.0 * reach]
-    measured = _span_of_jumps(dt_s, steps, reach, unit == "counts")
-    if measured is not None:
-        size, tolerance = measured
-        possible = [span for span in possible if abs(span - size) <= tolerance] + [size]
-    for span in possible:
-        found = _taken_out(dt_s, steps, values, span)
+    span = _span_of(motion, [each for each in usual if reach < each <= 2.0 * reach], reach, unit)
+    if span is not None:
+        if _is_too_fast(motion, speeds, span):
+            return Unwrapped(values, unchanged.uncertain, fault=_faster_than_read(span, unit))
+        found = _taken_out(motion, values, span)
         if found is not None:
             return found
-    return Unwrapped(values, fault=_too_fast(steps, reach, usual, unit))
+    return Unwrapped(values, unchanged.uncertain, fault=_too_fast(motion, speeds, reach, usual, unit))
 
 
-def _taken_out(dt_s: Array, steps: Array, values: Array, span: float) -> Unwrapped | None:
-    """Take a span out of the steps (N - 1,) of some values (N,); None if what is left is not the motion around it."""
-    shortest = steps - span * np.round(steps / span)
-    expected = _expected(dt_s, shortest, np.abs(steps) <= 0.5 * span)
-    turns = np.round((steps - expected) / span)
-    left = steps - span * turns
-    wraps = turns != 0.0
-    if not wraps.any():
-        return None
-    motion = np.maximum(np.abs(expected), np.quantile(np.abs(shortest), 0.9))
-    fits = np.abs(left - expected) <= np.minimum(_FIT_SHARE * span, _SLACK_SHARE * span + _CHANGE * motion)
-    # Jumps that leave something else are those of a counter that was set anew: they stay as they are.
-    if np.count_nonzero(wraps & ~fits) > 0.2 * np.count_nonzero(wraps):
-        return None
-    if np.quantile(np.abs(left), 0.9) > _AMBIGUOUS_SHARE * span:
-        return None
-    left = np.where(wraps & ~fits, steps, left)
-    return Unwrapped(
-        np.concatenate([values[:1], values[0] + np.cumsum(left)]), span, int(np.count_nonzero(wraps & fits))
-    )
+def unwrap_wheels(
+    t_s: Array, values: Array, spans: Sequence[float], begins: Mask, speeds: Array, unit: str = "counts"
+) -> tuple[Unwrapped, Unwrapped]:
+    """Make the counters of both wheels continuous, `values` and `speeds` (N, 2); each wheel is judged by itself.
+
+    The counters are of one kind: a span that one wheel shows is tried on the other, which may wrap too rarely.
+    """
+
+    def unwrap(side: int, spans: Sequence[float]) -> Unwrapped:
+        return unwrap_counter(t_s, values[:, side], spans, begins=begins, speeds=speeds[:, side], unit=unit)
+
+    first = unwrap(0, spans), unwrap(1, spans)
+    shown = [*spans, *(one.span for one in first if one.wraps)]
+    left, right = (one if one.wraps or one.fault else unwrap(side, shown) for side, one in enumerate(first))
+    return left, right
+
+
+def _steps(t_s: Array, values: Array, begins: Mask | None, reach: float, unit: str) -> _Steps:
+    dt_s, steps = np.maximum(np.diff(t_s), 1e-9), np.diff(values)
+    inside = np.ones(steps.size, dtype=bool) if begins is None else ~begins[1:]
+    jumps = inside & (np.abs(steps) > _JUMP_SHARE * reach) & (reach > 0.0)
+    usable = inside & ~jumps
+    expected = _expected(dt_s, steps, usable)
+    has_motion = bool(usable.any())
+    spread = float(np.quantile(np.abs(steps - expected)[usable], 0.95)) if has_motion else 0.0
+    fastest = float(np.quantile((np.abs(steps) / dt_s)[usable], 0.99)) if has_motion else 0.0
+    resolution = _RESOLUTION if unit == "counts" else 1e-3 * _RESOLUTION * reach
+    longer = np.maximum(1.0, dt_s / np.median(dt_s))
+    tolerance = np.maximum(4.0 * spread * longer, 0.5 * np.abs(expected)) + resolution
+    return _Steps(dt_s, steps, expected, tolerance, 1.2 * fastest * dt_s + resolution, inside, jumps)
 
 
 def _expected(dt_s: Array, steps: Array, usable: Mask) -> Array:
-    """Steps (N,) that the rates of the neighbours let expect, the median of five of them that are usable."""
-    rates = np.where(usable, steps / dt_s, np.nan)
+    """Steps (N,) at the mean rate of the neighbours that are usable."""
     known = np.flatnonzero(usable)
     if not known.size:
         return np.zeros_like(steps)
-    place = np.clip(
-        np.searchsorted(known, np.arange(steps.size)) - _NEIGHBOURS // 2, 0, max(known.size - _NEIGHBOURS, 0)
-    )
-    columns = np.minimum(place[:, np.newaxis] + np.arange(_NEIGHBOURS), known.size - 1)
-    return np.asarray(np.median(rates[known[columns]], axis=1) * dt_s)
+    count = min(max(_NEIGHBOURS, round(_WINDOW_S / float(np.median(dt_s)))), known.size)
+    first = np.clip(np.searchsorted(known, np.arange(steps.size)) - count // 2, 0, known.size - count)
+    moved = np.concatenate([[0.0], np.cumsum(steps[known])])
+    passed_s = np.concatenate([[0.0], np.cumsum(dt_s[known])])
+    rate = (moved[first + count] - moved[first]) / (passed_s[first + count] - passed_s[first])
+    return np.asarray(rate * dt_s)
 
 
-def _span_of_jumps(dt_s: Array, steps: Array, reach: float, whole: bool) -> tuple[float, float] | None:
-    """The span that jumps of one size show, again and again, and its tolerance; None if they are few or differ."""
-    jumps = np.abs(steps) > 0.5 * reach
+def _left_over(motion: _Steps, span: float) -> tuple[Array, Array, Mask]:
+    """Turns of the span in each step (N,), what they leave beside the expected motion, and whether that is motion."""
+    turns = np.where(motion.is_inside, np.round((motion.steps - motion.expected) / span), 0.0)
+    left = motion.steps - span * turns
+    beside = np.abs(left - motion.expected)
+    return turns, beside, (beside <= motion.tolerance) | (np.abs(left) <= motion.longest)
+
+
+def _span_of(motion: _Steps, usual: Sequence[float], reach: float, unit: str) -> float | None:
+    """The span that explains the jumps: one of the usual ones, or the one that they show; None if none does."""
+    jumps = motion.is_jump
+
+    def fits(span: float) -> int:
+        turns, _, is_motion = _left_over(motion, span)
+        return int(np.count_nonzero(jumps & (turns != 0.0) & is_motion))
+
+    def off(span: float) -> float:
+        return float(np.median(_left_over(motion, span)[1][jumps]))
+
+    best = max(usual, key=lambda span: (fits(span), -off(span)), default=None)
+    measured, tolerance = _span_of_jumps(motion, unit) or (None, 0.0)
+    enough = max(1.0, _FITTING_SHARE * np.count_nonzero(jumps))
+    resolution = _RESOLUTION if unit == "counts" else 1e-3 * _RESOLUTION * reach
+    if best is not None and fits(best) >= enough:
+        if measured is None or fits(measured) < enough:
+            return best
+        return best if abs(best - measured) <= max(tolerance, resolution) else measured
+    return measured if measured is not None and fits(measured) >= enough else None
+
+
+def _span_of_jumps(motion: _Steps, unit: str) -> tuple[float, float] | None:
+    """The span that jumps of one size show, again and again, with its tolerance; None if they are few or differ."""
+    jumps = motion.is_jump
     if np.count_nonzero(jumps) < _OFTEN:
         return None
-    sizes = np.abs(steps - _expected(dt_s, steps, ~jumps))[jumps]
+    sizes = np.abs(motion.steps - motion.expected)[jumps]
     span = float(np.median(sizes))
     alike = np.abs(sizes - span) <= _SAME_SHARE * span
-    if np.count_nonzero(alike) < max(_OFTEN, 0.8 * sizes.size):
+    if np.count_nonzero(alike) < max(_OFTEN, _FITTING_SHARE * sizes.size):
         return None
-    spread = 3.0 * float(np.median(np.abs(sizes - span)))
-    tolerance = max(_TOLERANCE_SHARE * span, spread, _TOLERANCE_COUNTS if whole else 0.0)
-    return max(float(round(span)) if whole else span, reach * (1.0 + 1e-9)), tolerance
+    return float(round(span)) if unit == "counts" else span, max(
+        3.0 * float(np.median(np.abs(sizes - span))), _NEAR_SHARE * span
+    )
 
 
-def _too_fast(steps: Array, reach: float, spans: Sequence[float], unit: str) -> str:
+def _taken_out(motion: _Steps, values: Array, span: float) -> Unwrapped | None:
+    """Take the span out of some values (N,); None if many steps are so long that they could be one way or the other.
+
+    Jumps that leave something else than motion are those of a counter that was set anew: they stay as they are.
+    """
+    turns, _, is_motion = _left_over(motion, span)
+    wraps = (turns != 0.0) & (~motion.is_jump | is_motion)
+    left = np.where(wraps, motion.steps - span * turns, motion.steps)
+    if float(np.quantile(np.abs(left[motion.is_inside]), 0.9)) > _AMBIGUOUS_SHARE * span:
+        return None
+    uncertain = motion.is_inside & (
+        (np.abs(motion.expected) > _UNKNOWN_SHARE * span) | (motion.longest > _UNKNOWN_SHARE * 1.5 * span)
+    )
+    if np.count_nonzero(uncertain) > _TOO_FAST_SHARE * uncertain.size:
+        return None
+    return Unwrapped(
+        np.concatenate([values[:1], values[0] + np.cumsum(left)]),
+        np.concatenate([[False], uncertain]),
+        span,
+        int(np.count_nonzero(wraps)),
+    )
+
+
+def _is_too_fast(motion: _Steps, speeds: Array | None, span: float) -> bool:
+    """Whether speeds (N,) carry a counter over half its span from one value to the next, more than now and then."""
+    if speeds is None:
+        return False
+    lengths = np.abs(speeds[:-1]) * motion.dt_s
+    known = motion.is_inside & np.isfinite(lengths)
+    too_long = int(np.count_nonzero(lengths[known] > 0.5 * span))
+    return too_long > _TOO_FAST_SHARE * int(np.count_nonzero(known))
+
+
+def _too_fast(motion: _Steps, speeds: Array | None, reach: float, spans: Sequence[float], unit: str) -> str:
     """That a counter turns round within few samples, so that nobody can tell which way; empty if none does."""
+    if np.mean(motion.is_jump) <= _JUMPS_ALL_THE_TIME_SHARE:
+        return ""
     for span in spans:
         if _FULL_SHARE * span <= reach < span:
-            shortest = np.abs(steps - span * np.round(steps / span))
-            if np.quantile(shortest, 0.75) > _AMBIGUOUS_SHARE * span and np.mean(np.abs(steps) > 0.5 * span) > 0.1:
-                return (
-                    f"{unit} stay within {span:.10g} and jump all the time: the counter wraps faster than it is read; "
-                    "record a wider counter, or read it more often"
-                )
+            shortest = np.abs(motion.steps - span * np.round(motion.steps / span))
+            if np.quantile(shortest, 0.75) > _AMBIGUOUS_SHARE * span or _is_driven_over(motion, speeds, 2.0 * span):
+                return _faster_than_read(span, unit)
     return ""
+
+
+def _is_driven_over(motion: _Steps, speeds: Array | None, length: float) -> bool:
+    """Whether speeds (N,) that are known carry a wheel over a length, to and fro."""
+    return speeds is not None and float(np.nansum(np.abs(speeds[:-1]) * motion.dt_s)) > length
+
+
+def _faster_than_read(span: float, unit: str) -> str:
+    return (
+        f"{unit} stay within {span:.10g} and jump all the time: the counter wraps faster than it is read; "
+        "record a wider counter, or read it more often"
+    )
 
 
 def set_anew(t_s: Array, angles_rad: Array) -> Mask:

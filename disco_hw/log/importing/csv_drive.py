@@ -30,7 +30,7 @@ from disco_hw.log.drive import (
     integrate_angle,
 )
 from disco_hw.log.importing import LogFormat
-from disco_hw.log.importing.counter_wrap import set_anew, unwrap_counter
+from disco_hw.log.importing.counter_wrap import Mask, set_anew, unwrap_wheels
 from disco_hw.log.importing.csv_sheet import (
     COMMAND,
     GYRO,
@@ -192,9 +192,10 @@ def _wheels(sheet: Sheet, ticks_per_rev: float | None, notes: list[str]) -> tupl
     if ticks_per_rev is None:
         raise LogError(f"{sheet.name}: {TICKS[0]} needs the ticks of a revolution; give --robot ROBOT.toml")
     t_s = sheet.t_s[has_ticks]
-    counts = _continuous(sheet, ticks[has_ticks], t_s, ticks_per_rev, notes)
-    angles = counts * (2.0 * math.pi / ticks_per_rev)
-    sheet = _with_new_segments(sheet, t_s, angles, sheet.segment[has_ticks], notes)
+    per_rad = ticks_per_rev / (2.0 * math.pi)
+    counts, uncertain = _continuous(sheet, ticks[has_ticks], has_ticks, per_rad, notes)
+    angles = counts / per_rad
+    sheet = _with_new_segments(sheet, t_s, angles, uncertain, sheet.segment[has_ticks], notes)
     segment = sheet.segment[has_ticks]
     derived = np.column_stack([differentiate_angle(t_s, column, segment) for column in angles.T])
     there = has_speed[has_ticks]
@@ -207,41 +208,49 @@ def _wheels(sheet: Sheet, ticks_per_rev: float | None, notes: list[str]) -> tupl
     return sheet, Wheels(t_s, angles[:, 0], angles[:, 1], left, right, segment, True, both)
 
 
-def _continuous(sheet: Sheet, ticks: Array, t_s: Array, ticks_per_rev: float, notes: list[str]) -> Array:
-    """Ticks (N, 2) of which none wraps; each wheel is judged by itself, within each segment."""
-    columns, segment = [], sheet.segment[np.searchsorted(sheet.t_s, t_s)]
-    for name, column in zip(TICKS, ticks.T, strict=True):
-        values, wraps, spans = column.copy(), 0, set()
-        for part in np.unique(segment):
-            rows = np.flatnonzero(segment == part)
-            found = unwrap_counter(t_s[rows], column[rows], (ticks_per_rev,))
-            if found.fault:
-                raise LogError(f"{sheet.name}: {name}: {found.fault}")
-            values[rows], wraps = found.values, wraps + found.wraps
-            spans |= {found.span} if found.wraps else set()
-        if wraps:
-            said = " and ".join(f"{span:.10g}" for span in sorted(spans))
-            notes.append(f"{sheet.name}: {name} wraps at {said}: made continuous at {wraps} places")
-        columns.append(values)
-    return np.column_stack(columns)
+def _continuous(sheet: Sheet, ticks: Array, has_ticks: Mask, per_rad: float, notes: list[str]) -> tuple[Array, Mask]:
+    """Ticks (N, 2) of which none wraps, each wheel judged by itself; and where the number of wraps is not known, (N,).
+
+    `has_ticks` are the sheet's rows of the N ticks, `per_rad` the ticks of a radian.
+    """
+    t_s, segment = sheet.t_s[has_ticks], sheet.segment[has_ticks]
+    begins = np.concatenate([[True], np.diff(segment) != 0])
+    measured, commanded = (sheet.group(names)[0][has_ticks] * per_rad for names in (SPEED, COMMAND))
+    speeds = np.where(np.isfinite(measured), measured, commanded)
+
+    found = unwrap_wheels(t_s, ticks, (2.0 * math.pi * per_rad,), begins, speeds)
+    for name, one in zip(TICKS, found, strict=True):
+        if one.fault:
+            raise LogError(f"{sheet.name}: {name}: {one.fault}")
+        if one.wraps:
+            notes.append(f"{sheet.name}: {name} wraps at {one.span:.10g}: made continuous at {one.wraps} places")
+    return np.column_stack([one.values for one in found]), found[0].uncertain | found[1].uncertain
 
 
-def _with_new_segments(sheet: Sheet, t_s: Array, angles: Array, segment: Index, notes: list[str]) -> Sheet:
-    """The sheet with a new segment wherever an encoder begins anew (angles (N, 2) at t_s (N,))."""
-    anew = set_anew(t_s, angles) & np.concatenate([[False], np.diff(segment) == 0])
-    count = int(np.count_nonzero(anew))
-    if not count:
-        return sheet
+def _with_new_segments(
+    sheet: Sheet, t_s: Array, angles: Array, uncertain: Mask, segment: Index, notes: list[str]
+) -> Sheet:
+    """The sheet with a new segment wherever an encoder begins anew (angles (N, 2) at t_s (N,)) or may have wrapped."""
+    inside = np.concatenate([[False], np.diff(segment) == 0])
+    anew, uncertain = set_anew(t_s, angles) & ~uncertain & inside, uncertain & inside
+    count, unknown = int(np.count_nonzero(anew)), int(np.count_nonzero(uncertain))
     if count > _MOST_SET_ANEW_SHARE * t_s.size:
         raise LogError(
             f"{sheet.name}: an encoder jumps {count} times, first at t_s {t_s[anew][0]:.9g}, further than a "
             f"wheel turns; {TICKS[0]} and {TICKS[1]} must be cumulative, and ticks_per_rev the true one"
         )
-    notes.append(
-        f"{sheet.name}: an encoder was set anew {count} times, first at t_s {t_s[anew][0]:.9g}; "
-        "new segments begin there"
-    )
-    return replace(sheet, segment=sheet.segment + np.searchsorted(t_s[anew], sheet.t_s, side="right"))
+    if count:
+        notes.append(
+            f"{sheet.name}: an encoder was set anew {count} times, first at t_s {t_s[anew][0]:.9g}; "
+            "new segments begin there"
+        )
+    if unknown:
+        notes.append(
+            f"{sheet.name}: ticks are missing for so long that they may have wrapped unseen, {unknown} times, first "
+            f"at t_s {t_s[uncertain][0]:.9g}; new segments begin there"
+        )
+    breaks_s = t_s[anew | uncertain]
+    return replace(sheet, segment=sheet.segment + np.searchsorted(breaks_s, sheet.t_s, side="right"))
 
 
 def _wrapped(yaw: Array) -> Array:

@@ -23,14 +23,11 @@ from disco_hw.log.drive import (
     Index,
     Motion,
     Poses,
-    Wheels,
-    differentiate_angle,
-    integrate_angle,
     poses,
     rotations,
 )
 from disco_hw.log.importing import LogFormat
-from disco_hw.log.importing.counter_wrap import set_anew, unwrap_counter
+from disco_hw.log.importing.counter_wrap import set_anew
 from disco_hw.log.importing.csv_drive import length_fault
 from disco_hw.log.importing.losses import WARNING, loss_note
 from disco_hw.log.importing.rosbag_file import Bag, BagMessage, DamagedBagError, is_bag, open_bag
@@ -50,9 +47,9 @@ from disco_hw.log.importing.rosbag_topics import (
     Choice,
     choose,
 )
+from disco_hw.log.importing.rosbag_wheels import LONGEST_SILENCE_NS, measured_columns, unwrapped, wheels_of
 from drivers.pose.headings import is_heading_measured
 
-_LONGEST_SILENCE_NS = 500_000_000
 _LONGEST_COMMAND_NS = 500_000_000
 _LONGEST_PAUSE_NS = 2_000_000_000
 _MOST_MESSAGES = 20_000_000
@@ -176,14 +173,17 @@ def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: R
     nothing: tuple[Index, Array] = (np.empty(0, dtype=np.int64), np.empty((0, 4)))
     command_ns, command = _expired(*arrays.get(COMMANDS, (nothing[0], np.empty((0, 2)))))
     wheel_ns, wheel = arrays.get(WHEELS, nothing)
-    wheel_ns, wheel, measured = _measured_columns(path, wheel_ns, wheel, notes)
+    wheel_ns, wheel, measured = measured_columns(path, wheel_ns, wheel, notes)
+    uncertain = np.zeros(wheel_ns.size, dtype=bool)
+    if measured[0]:
+        wheel, uncertain = unwrapped(path, wheel_ns, wheel, robot, (command_ns, command), notes)
     began_ns = min(int(t_ns[0]) for t_ns in (command_ns, wheel_ns, pose_ns) if t_ns.size)
     breaks_ns = np.unique(
         np.concatenate(
             [
                 times.breaks_ns,
                 _pauses(wheel_ns, (command_ns, pose_ns)),
-                wheel_ns[set_anew((wheel_ns - began_ns).astype(np.float64) * 1e-9, wheel[:, :2])],
+                wheel_ns[set_anew((wheel_ns - began_ns).astype(np.float64) * 1e-9, wheel[:, :2]) | uncertain],
             ]
         )
     )
@@ -199,7 +199,7 @@ def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: R
 
     (command_s, command_segment), (pose_s, pose_segment) = when(command_ns), when(pose_ns)
     commands = Commands(command_s, command[:, 0], command[:, 1], command_segment)
-    wheels = _wheels(*when(wheel_ns), wheel, measured)
+    wheels = wheels_of(*when(wheel_ns), wheel, measured)
     drive_poses = Poses(pose_s, pose[:, 0], pose[:, 1], pose[:, 2], pose_segment)
     fault = length_fault(drive_poses, wheels, commands, robot.wheel_radius_m)
     if fault is not None:
@@ -297,64 +297,12 @@ def _expired(t_ns: Index, speeds: Array) -> tuple[Index, Array]:
     return times[order], rows[order]
 
 
-def _measured_columns(
-    path: Path, t_ns: Index, wheel: Array, notes: list[str]
-) -> tuple[Index, Array, tuple[bool, bool]]:
-    """Rows in which everything is there that the wheels measure at all, and whether that is angles, and speeds."""
-    angles, speeds = (np.isfinite(wheel[:, part]).all(axis=1) for part in (slice(0, 2), slice(2, 4)))
-    has_angle, has_speed = (
-        bool(2 * np.count_nonzero(angles) > t_ns.size),
-        bool(2 * np.count_nonzero(speeds) > t_ns.size),
-    )
-    kept = (angles | (not has_angle)) & (speeds | (not has_speed))
-    if t_ns.size and not (has_angle or has_speed):
-        raise LogError(
-            f"{path}: wheels: most messages have neither position nor velocity of all wheels; "
-            "set ros2.left_joints and ros2.right_joints"
-        )
-    if not kept.all():
-        lost, what = int(np.count_nonzero(~kept)), "messages lack a position or velocity and were left out"
-        notes.append(loss_note(str(path), WHEELS, lost, kept.size, what, "set ros2.left_joints and ros2.right_joints"))
-    wheel = wheel[kept]
-    if has_angle and has_speed and (wheel[:, 2:] == 0.0).all() and np.ptp(wheel[:, 0]) > 1.0:
-        notes.append("wheels: the velocities are all zero while the wheels turn; they were taken from the positions")
-        has_speed = False
-    return t_ns[kept], _unwrapped(path, t_ns[kept], wheel, has_angle, notes), (has_angle, has_speed)
-
-
-def _unwrapped(path: Path, t_ns: Index, wheel: Array, has_angle: bool, notes: list[str]) -> Array:
-    """Angles that wrap, at a turn or where the counter behind them overflows, made continuous; each wheel by itself."""
-    if not has_angle or not wheel.size:
-        return wheel
-    columns = []
-    for side, column in zip(("left", "right"), wheel[:, :2].T, strict=True):
-        found = unwrap_counter((t_ns - t_ns[0]) * 1e-9, column, (2.0 * math.pi,), unit="rad")
-        if found.fault:
-            raise LogError(f"{path}: {side} wheel: {found.fault}")
-        if found.wraps:
-            notes.append(
-                f"{side} wheel: the position wraps at {found.span:.10g} rad: made continuous at {found.wraps} places"
-            )
-        columns.append(found.values)
-    return np.column_stack([*columns, wheel[:, 2:]])
-
-
 def _pauses(wheel_ns: Index, others: Sequence[Index]) -> Index:
     """Where nothing is known of the wheels for half a second; without wheels, of anything for two."""
     if wheel_ns.size:
-        return wheel_ns[1:][np.diff(wheel_ns) > _LONGEST_SILENCE_NS]
+        return wheel_ns[1:][np.diff(wheel_ns) > LONGEST_SILENCE_NS]
     all_ns = np.sort(np.concatenate(others))
     return np.asarray(all_ns[1:][np.diff(all_ns) > _LONGEST_PAUSE_NS])
-
-
-def _wheels(t_s: Array, segment: Index, wheel: Array, measured: tuple[bool, bool]) -> Wheels:
-    has_angle, has_speed = measured
-    (left, right), (left_speed, right_speed) = wheel[:, :2].T, wheel[:, 2:].T
-    if not has_angle:
-        left, right = (integrate_angle(t_s, speed, segment) for speed in (left_speed, right_speed))
-    if not has_speed:
-        left_speed, right_speed = (differentiate_angle(t_s, angle, segment) for angle in (left, right))
-    return Wheels(t_s, left, right, left_speed, right_speed, segment, has_angle, has_speed)
 
 
 Row = tuple[float, ...]
