@@ -6,16 +6,20 @@ were found on robots 0 to 4 (`python -m tools.tune_baselines`); these are robots
 Names that begin with `mujoco` drive the robot of `tools/mujoco_plant.py`.
 
 `python -m tools.bench_tracking disco_adapting circle,square 20` drives some of it; `... starts 20` begins anywhere.
-`... 20 --first 5000` drives robots that nothing was chosen on.
+`... --first 5000 --count 20` drives robots that nothing was chosen on; `--speeds 0.1,0.2,0.3` at these speeds (m/s),
+and `--json` prints the figures as JSON. `nmpc` is a textbook nonlinear MPC (`tools/nmpc.py`, of [bench]). `forward` is
+the part of the time in which a robot moves forward: nothing in the cost of that MPC asks for it.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -26,6 +30,7 @@ from disco_hw.runtime.pipeline import Planner
 from disco_hw.tasks.circle import CircleCost
 from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots
 from tools.mujoco_plant import MujocoPlant, mujoco_robots
+from tools.nmpc import NonlinearMpc
 from tools.tracking import LIMITS, Contender, Drive, Track, classical, disco, drive, model, tracks
 
 FIRST = 1000
@@ -33,30 +38,39 @@ SPEED_M_S, RATE_HZ = 0.2, 50.0
 MUJOCO = "mujoco_"
 
 
-def contenders() -> dict[str, Contender]:
-    """The rows of the table."""
-    settings = DiscoSettings.for_speed(SPEED_M_S, RATE_HZ)
-    integral = classical(PurePursuit(look_ahead_m=0.081, integral=3.04, preview_s=0.142))
+def contenders(speed_m_s: float = SPEED_M_S) -> dict[str, Contender]:
+    """Return the rows of the table, by name, for tracks of this speed."""
+    settings = DiscoSettings.for_speed(speed_m_s, RATE_HZ)
+    nmpc = Contender(partial(_nmpc, speed_m_s), learns=True)
+    integral = classical(PurePursuit(look_ahead_m=0.081, integral=3.04, preview_s=0.142), speed_m_s)
     adapting = disco(settings, learns=True)
     offset_free = disco(replace(settings, offset_free=True), learns=True)
     return {
-        "pure_pursuit": classical(PurePursuit()),
+        "pure_pursuit": classical(PurePursuit(), speed_m_s),
         "pure_pursuit_integral": integral,
-        "kanayama": classical(Kanayama()),
-        "lqr": classical(LinearQuadratic()),
+        "kanayama": classical(Kanayama(), speed_m_s),
+        "lqr": classical(LinearQuadratic(), speed_m_s),
         "pytorch_mppi": Contender(_peer),
+        "nmpc": nmpc,
         "disco_point": disco(replace(settings, uncertainty="point")),
         "disco_ut": disco(settings),
         "disco_ut_offset_free": disco(replace(settings, offset_free=True)),
         "disco_adapting": adapting,
+        "disco_refined": disco(replace(settings, refine=True), learns=True),
         "disco_offset_free": offset_free,
         "disco_truth": disco(settings, knows=True),
-        "kanayama_truth": classical(Kanayama(), knows=True),
+        "kanayama_truth": classical(Kanayama(), speed_m_s, knows=True),
         MUJOCO + "pure_pursuit_integral": integral,
-        MUJOCO + "kanayama": classical(Kanayama()),
+        MUJOCO + "kanayama": classical(Kanayama(), speed_m_s),
+        MUJOCO + "nmpc": nmpc,
         MUJOCO + "disco_adapting": adapting,
         MUJOCO + "disco_offset_free": offset_free,
     }
+
+
+def _nmpc(speed_m_s: float, robot: ForeignRobot, track: Track) -> Planner:
+    """Make the nonlinear MPC that begins with the geometry which is believed."""
+    return NonlinearMpc(robot, track, speed_m_s, robot.believed)
 
 
 def _peer(robot: ForeignRobot, track: Track) -> Planner:
@@ -81,7 +95,7 @@ def _peer(robot: ForeignRobot, track: Track) -> Planner:
 
 
 def rows(
-    count: int, names: tuple[str, ...], ways: tuple[str, ...], first: int = FIRST
+    count: int, names: tuple[str, ...], ways: tuple[str, ...], first: int = FIRST, speed_m_s: float = SPEED_M_S
 ) -> Iterator[tuple[str, list[Drive]]]:
     """The drives of these contenders on robots `first` to `first + count` - 1, and what they are called, by way."""
     for name in names:
@@ -94,7 +108,12 @@ def rows(
                 f"tracking.{name}.{way}",
                 [
                     drive(
-                        contenders()[name], robot, tracks(SPEED_M_S)[way], rate_hz=RATE_HZ, seed=seed, plant_of=plant_of
+                        contenders(speed_m_s)[name],
+                        robot,
+                        tracks(speed_m_s)[way],
+                        rate_hz=RATE_HZ,
+                        seed=seed,
+                        plant_of=plant_of,
                     ).after()
                     for seed, robot in enumerate(made(first, count))
                 ],
@@ -102,13 +121,14 @@ def rows(
 
 
 def figures_of(drives: list[Drive]) -> dict[str, float]:
-    """Median and worst RMS and median signed distance (mm), travel (rot/s^2), speed (m/s)."""
+    """Median and worst RMS and median signed distance (mm), travel (rot/s^2), speed (m/s), part of the time forward."""
     return {
         "rms_median_mm": float(np.median([one.rms_mm for one in drives])),
         "rms_worst_mm": max(one.rms_mm for one in drives),
         "signed_median_mm": float(np.median([one.signed_mm for one in drives])),
         "travel_rot_s2": float(np.median([one.travel_rot_s2 for one in drives])),
         "speed_m_s": float(np.median([one.speed_m_s for one in drives])),
+        "forward": float(np.median([np.mean(one.forward_m_s > 0.0) for one in drives])),
     }
 
 
@@ -184,18 +204,29 @@ def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
     parser.add_argument("names", nargs="?", default=",".join(contenders()), help="contenders, or `starts COUNT [WAYS]`")
     parser.add_argument("ways", nargs="?", default=",".join(tracks(SPEED_M_S)))
-    parser.add_argument("count", nargs="?", default="", help="robots of each row, 6 unless said")
+    parser.add_argument("robots", nargs="?", default="", help="robots of each row, 6 unless said")
+    parser.add_argument("--count", type=int, help="the same")
     parser.add_argument("--first", type=int, default=FIRST, help="the first robot's number")
+    parser.add_argument("--speeds", default=str(SPEED_M_S), help="speeds of the tracks (m/s), comma-separated")
+    parser.add_argument("--json", action="store_true", help="print one JSON object of all figures at the end")
     options = parser.parse_args(arguments)
     if options.names == "starts":
-        for way in options.count.split(",") if options.count else STARTED_WAYS:
+        for way in options.robots.split(",") if options.robots else STARTED_WAYS:
             for key, value in starts(int(options.ways), (way,)).items():
                 print(f"{key:60} {value:10.3g}", flush=True)
         return
     names, ways = options.names.split(","), options.ways.split(",")
-    for key, drives in rows(int(options.count or 6), tuple(names), tuple(ways), options.first):
-        found = figures_of(drives)
-        print(f"{key:45}", *(f"{field} {value:.3g} " for field, value in found.items()), flush=True)
+    count = options.count or int(options.robots or 6)
+    figures: dict[str, float] = {}
+    for speed in options.speeds.split(","):
+        for key, drives in rows(count, tuple(names), tuple(ways), options.first, float(speed)):
+            found = figures_of(drives)
+            named = f"{key}.{float(speed):g}"
+            figures |= {f"{named}.{field}": value for field, value in found.items()}
+            if not options.json:
+                print(f"{named:45}", *(f"{field} {value:.3g} " for field, value in found.items()), flush=True)
+    if options.json:
+        print(json.dumps(figures, indent=2))
 
 
 if __name__ == "__main__":

@@ -121,6 +121,19 @@ def import_log(
     print_result(result.as_dict(), as_json, result.as_text())
 
 
+@log_app.command("fence")
+def fence_of(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="A log of a drive once round along the edge.")],
+    as_json: AsJson = False,
+) -> None:
+    """Write the [fence] that a robot went round, by hand or pushed, for its robot.toml (docs/fence.md)."""
+    check_named_files(logs=[log])
+    from disco_hw.first_use.fence_drive import fence_of_log, fence_toml
+
+    keep_in = fence_of_log(log)
+    print_result({"keep_in": [list(corner) for corner in keep_in]}, as_json, fence_toml(keep_in))
+
+
 @log_app.command()
 def info(log: Annotated[Path, typer.Argument(metavar="LOG")], as_json: AsJson = False) -> None:
     """Say what a log holds and whether anything was lost."""

@@ -163,7 +163,9 @@ def init(
     given = tuple((field, value) for field, value in measures.items() if value is not None)
     options = InitOptions(out, link, driver, name, given, listen_s, pose_source, overwrite, ask)
     written = run_init(options, None if yes or not sys.stdin.isatty() else input, progress_line)
-    print(f"written: {written}\nnext: disco-hw check {written}")
+    from disco_hw.first_use.fence_drive import OFFER
+
+    print(f"written: {written}\nnext: disco-hw check {written}\n{OFFER.format(robot=written)}")
 
 
 def commission(
@@ -189,8 +191,11 @@ def commission(
     options = CommissionOptions(robot, link, write=write, log_directory=log_directory)
     if stage:
         options = replace(options, stages=tuple(stage))
+    from disco_hw.first_use.fence_drive import OFFER
+
     result = run_commission(options)
-    print_result(result.as_dict(), as_json, result.as_text())
+    offer = f"\n{OFFER.format(robot=robot)}" if result.ok else ""
+    print_result(result.as_dict(), as_json, result.as_text() + offer)
     if not result.ok:
         raise typer.Exit(1)
 

@@ -12,7 +12,7 @@ from msgspec import Meta
 
 from disco_hw.errors import InputError
 from disco_hw.fence import Fence, Footprint, fence_fault, usual_footprint
-from disco_hw.files import ROBOT_TOML, in_words, read_toml
+from disco_hw.files import ROBOT_TOML, control_character_in, in_words, read_toml
 from drivers.motor import AS_TOLD, DriverFieldError, UnknownDriverError, Wiring, find_driver, own_fields
 from drivers.pose import DEFAULT, PoseConvention, PoseSourceError, find_pose_source, pose_sources
 from drivers.pose import own_fields as own_pose_fields
@@ -461,8 +461,8 @@ def _check_values(path: Path, name: str, section: Any) -> None:  # Any: a sectio
         numbers = value if isinstance(value, tuple) else (value,)
         if any(isinstance(number, float) and not math.isfinite(number) for number in numbers):
             _refuse(path, f"{name}.{field}", "not a finite number", "write a finite value")
-        if isinstance(value, str) and "\0" in value:
-            _refuse(path, f"{name}.{field}", "holds a NUL character, which no name has", "take it out")
+        if isinstance(value, str) and (fault := control_character_in(value)):
+            _refuse(path, f"{name}.{field}", fault, "take it out")
 
 
 def _check(path: Path, config: RobotConfig) -> None:

@@ -31,6 +31,7 @@ from disco_hw.control.plan import (
     held_plan,
     no_rollouts,
 )
+from disco_hw.fence.clearance import Boundaries
 from disco_hw.model import Belief
 from disco_hw.tasks import PlannedTask
 from disco_hw.tasks.line.course import SMALLEST_X_ICR_M, stable_yaw
@@ -345,6 +346,16 @@ class BelievedPlanner(Protocol):
     def set_belief(self, belief: Belief) -> None:
         """Plan under this belief; raises ValueError."""
 
+    @property
+    def is_trapped(self) -> bool:
+        """Whether the last plan found no way past the fence or an obstacle."""
+
+    def look_around(self, bounds: Boundaries, deviation_m: float) -> None:
+        """Keep away from these boundaries from the next plan on."""
+
+    def set_line(self, line_m: Array) -> None:
+        """Drive around what stands on this line, points (N, 2)."""
+
     def sampled_rollouts(self, count: int) -> Rollouts:
         """The weightiest sequences of the last plan."""
 
@@ -379,9 +390,12 @@ class WithFallback:
         try:
             plan = self._planner.plan(now_ns, state)
         except NoValidControl:
-            if not finite:
+            # A law that knows the line alone would drive into what the planner stops for.
+            if not finite or self._planner.is_trapped:
                 raise
         else:
+            if self._planner.is_trapped:
+                return plan
             if plan.diagnostics.outcome is not PlanOutcome.STOPPING:
                 self._follower.watch(state)
                 return plan
@@ -405,6 +419,14 @@ class WithFallback:
         """Plan under this belief, and steer a robot of its mean; the line's headings stay. Raises ValueError."""
         self._planner.set_belief(belief)
         self._follower.set_chassis(replace(self._chassis(), x_icr_m=self._follower.x_icr_m))
+
+    def look_around(self, bounds: Boundaries, deviation_m: float) -> None:
+        """Let the planner keep away from these boundaries; the law knows nothing of them, and the guard stops it."""
+        self._planner.look_around(bounds, deviation_m)
+
+    def set_line(self, line_m: Array) -> None:
+        """Let the planner drive around what stands on this line, points (N, 2)."""
+        self._planner.set_line(line_m)
 
     def sampled_rollouts(self, count: int) -> Rollouts:
         """The planner's, of its last plan."""

@@ -76,6 +76,13 @@ class Detours:
             found for circle in circles.tolist() if (found := self._around(bounds, circle, keep_m, before)) is not None
         ]  # fmt: skip
 
+    def is_near(self, path: Array) -> bool:
+        """Whether a path (N, 3) of x, y, yaw comes to where a detour begins."""
+        return any(
+            bool((np.hypot(path[:, 0] - one.x_m, path[:, 1] - one.y_m) < one.half_m + OTHER_SIDE_M).any())
+            for one in self._found
+        )
+
     def place(self, detours: NDArray[np.float32], x_m: float, y_m: float, origin_m: tuple[float, float]) -> None:
         """Put the nearest detours into the kernel's buffer, relative to the origin."""
         if not self._found:

@@ -34,6 +34,8 @@ from disco_hw.control.plan import (
     WheelPlan,
     command_history,
 )
+from disco_hw.control.refinement import STEP_S as REFINED_STEP_S
+from disco_hw.control.refinement import Refinement, Scene
 from disco_hw.control.surroundings import Surroundings
 from disco_hw.control.wheel_loss import WheelLoss
 from disco_hw.effects import Channel
@@ -55,6 +57,8 @@ SPARE_HISTORY = 2
 SHORTEST_GAP_S = 1e-6
 # A plan goes by no more than this faster than the task asks, or than the robot goes.
 SPEED_TO_SPARE = 1.25
+# Outcomes whose plan is refined.
+REFINED = (PlanOutcome.PLANNED, PlanOutcome.RETRIED)
 
 
 class Disco:
@@ -84,6 +88,7 @@ class Disco:
         self._euler = True if settings.euler else None
         # The axle's path under Euler steps depends on x_icr.
         self._pairs = 0 if settings.euler else shared_pairs(model, theta, step_s)
+        self._refinement = Refinement(limits) if settings.refine else None
         self._take_points(model, theta)
         self._start = np.zeros(11, np.float32)
         self._slides = True if settings.offset_free else None
@@ -153,6 +158,14 @@ class Disco:
         )
         self._wheels_differ = self._do_wheels_differ(theta)
         self._past = PastMotion.of(model, theta, self._mean_theta)
+        if self._refinement is not None:
+            shared = self._settings.uncertainty == "ut"
+            self._refinement.take_points(
+                model,
+                theta if shared else self._mean_theta,
+                self._weights.astype(np.float64) if shared else np.ones(1),
+                self._chassis,
+            )
 
     def set_belief(self, belief: Belief) -> None:
         """Plan under this belief from the next `plan` on; the last plan and the random numbers go on.
@@ -240,11 +253,18 @@ class Disco:
         """The sampling optimiser, for its buffers and figures."""
         return self._optimiser
 
+    @property
+    def refinement(self) -> Refinement | None:
+        """The refinement of plans beside the line; None where the settings have none."""
+        return self._refinement
+
     def reset(self) -> None:
         """Forget the last plan, as at a new start; the random numbers go on."""
         self._optimiser.reset()
         self._begun_ns = self._t0_ns = self._failing_since_ns = self._memory = self._guided_until_ns = None
         self._loss.pause()
+        if self._refinement is not None:
+            self._refinement.reset()
 
     def warm_up(self) -> None:
         """Compile everything that any method calls, or load it from disk; leaves the planner as after `reset`."""
@@ -278,7 +298,7 @@ class Disco:
         self._t0_ns = t0_ns
         guided = self._draw_guide(system, before)
         outcome, retries = self._improve(max(shift_steps, 0.0), before, system, first, guided)
-        if outcome is not PlanOutcome.STOPPING and self._is_trapped():
+        if outcome is not PlanOutcome.STOPPING and self.is_trapped:
             outcome = PlanOutcome.STOPPING
         if outcome is PlanOutcome.STOPPING:
             self._stop(now_ns, before)
@@ -288,10 +308,15 @@ class Disco:
         self._planned_from, self._elapsed_s = start, elapsed_s
         nominal = self._optimiser.nominal()
         trajectory = self._mean_trajectory(nominal)
+        refined = None
+        if self._refinement is not None and outcome in REFINED:
+            refined = self._refined(state, system, start, t0_ns, elapsed_s, before, nominal)
         if guided and self._is_to_be_guided(now_ns, system, trajectory):
             self._optimiser.take_guide()
             nominal = self._optimiser.nominal()
             trajectory = self._mean_trajectory(nominal)
+        elif refined is not None:
+            return WheelPlan(t0_ns, REFINED_STEP_S, *refined, self._diagnostics(retries, outcome))
         return WheelPlan(
             t0_ns=t0_ns,
             step_s=settings.step_s,
@@ -299,6 +324,31 @@ class Disco:
             trajectory=trajectory,
             diagnostics=self._diagnostics(retries, outcome),
         )
+
+    def _refined(
+        self, state: PlannerState, system: SkidSteer, start: Array, t0_ns: int, elapsed_s: float,
+        before: tuple[float, float], nominal: Array,
+    ) -> tuple[Array, Array] | None:  # fmt: skip
+        """Return the refined commands (N, 2), as the robot is to get them, and where they lead; None without such."""
+        refinement = self._refinement
+        assert refinement is not None
+        wheels = state.left_speed_rad_s, state.right_speed_rad_s
+        past = self._acting(command_history(state.sent, t0_ns, REFINED_STEP_S, refinement.history, wheels))
+        means = None
+        if self._mean_means is not None:
+            means = self._mean_means[None] if self._settings.uncertainty != "ut" else self._means
+        scene = Scene(system.task, system.start, start, elapsed_s, self._slide, means, past, before)
+        commands = refinement.improve(scene, t0_ns, nominal, self._settings.step_s)
+        if commands is None:
+            return None
+        own = None if self._mean_means is None else self._mean_means.copy()
+        past = np.concatenate([past, commands])
+        states = refinement.mean.states(start, past, refinement.history, elapsed_s, 0, self._slide, own)
+        path = states[:, :3]
+        # The refinement knows the line and nothing else: near an obstacle or a fence the sampled plan stands.
+        if self._surroundings is not None and not self._surroundings.allows(path):
+            return None
+        return self._asked(commands), path
 
     def _diagnostics(self, retries: int, outcome: PlanOutcome) -> Diagnostics:
         ess, temperature, least, mean, nominal, valid = self._optimiser.work.report.tolist()
@@ -333,7 +383,7 @@ class Disco:
 
     def _draw_guide(self, system: SkidSteer, before: tuple[float, float]) -> bool:
         """Set the guide for the next step; returns whether the task has a line to be guided along."""
-        if self._settings.guide_below <= 0.0 or not hasattr(system.task, "line_at"):
+        if self._settings.guide_below <= 0.0 or not hasattr(system.task, "way_ahead_m"):
             self._optimiser.sample_guide(False)
             return False
         optimiser = self._optimiser
@@ -362,7 +412,8 @@ class Disco:
             self._guided_until_ns = now_ns + round(horizon_s * 1e9)
         return self._guided_until_ns is not None and now_ns < self._guided_until_ns
 
-    def _is_trapped(self) -> bool:
+    @property
+    def is_trapped(self) -> bool:
         """Whether every sample of the last step touches the fence or an obstacle for most of the horizon."""
         around = self._surroundings
         return around is not None and self._optimiser.least_cost >= around.trapped_cost
@@ -390,7 +441,7 @@ class Disco:
             self._failing_since_ns = now_ns
         if (now_ns - self._failing_since_ns) * 1e-9 >= self._settings.decay_s:
             self._optimiser.reset()
-            if self._is_trapped():
+            if self.is_trapped:
                 raise NoValidControl(
                     "no way past the fence or an obstacle was found, and the robot stops before it; clear the way, or "
                     "drive it away from there"

@@ -114,6 +114,7 @@ class DiscoSettings:
     offset_free: whether rollouts move beside the model as the robot was found to (model/coefficients.py), and lose of a
     command what its wheels were found to lose (wheel_loss.py).
     iterations_at_start: optimisation steps for the first plan after a reset.
+    refine: whether a Gauss-Newton refinement improves the plan beside the task's line (refinement.py); experimental.
     min_ess: effective sample size below which a step counts as collapsed: it is tried again, and reported.
     retries: further attempts after a step without a valid result; then the plan is dropped and planned anew.
     decay_s: how long the planner answers with a ramp to zero when nothing helps, before it raises NoValidControl.
@@ -130,6 +131,7 @@ class DiscoSettings:
     guide_below: float = 0.85
     euler: bool = False
     offset_free: bool = False
+    refine: bool = False
     iterations_at_start: int = 5
     min_ess: float = 3.0
     retries: int = 2
@@ -171,6 +173,7 @@ class DiscoSettings:
             gain_by_time=False,
             guide_below=0.0,
             euler=True,
+            refine=False,
             iterations_at_start=1,
             min_ess=0.0,
         )

@@ -93,6 +93,13 @@ class Surroundings:
         """Drive around what stands on this line, points (N, 2)."""
         self._detours.set_line(line_m)
 
+    def allows(self, path: Array) -> bool:
+        """Whether a path (N, 3) of x, y, yaw needs no detour and keeps the footprint far enough from everything."""
+        if self._bounds is None or self._detours.is_near(path):
+            return self._bounds is None
+        keep_m = float(self.area.body[3])
+        return bool((self._bounds.clearance_m(path, within_m=2.0 * keep_m + 0.1) >= keep_m).all())
+
     def place(self, x_m: float, y_m: float, origin_m: tuple[float, float], speed_m_s: float) -> Area:
         """Put the shapes that a plan from here can reach into the kernel's buffers, relative to the origin.
 

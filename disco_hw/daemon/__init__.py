@@ -259,7 +259,9 @@ _EXAMPLES = {
 
 
 def _arguments(action: str, changes: Sequence[str]) -> dict[str, Any]:
-    """What the words after a request say; raises InputError."""
+    """Return what the words after a request say; empty where there are none. Raises InputError."""
+    if not changes:
+        return {}
     if action == OBSTACLE and changes[0] in {"add", "remove"}:
         name = [text.partition("=")[2] for text in changes[1:] if text.startswith("name=")]
         rest = [text for text in changes[1:] if not text.startswith("name=")]

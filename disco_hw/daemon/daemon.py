@@ -12,6 +12,7 @@ from disco_hw.daemon.control_socket import ControlMessage, ControlServer, counte
 from disco_hw.daemon.loop import Clock, Loop
 from disco_hw.daemon.page_feed import WatchedRecorder
 from disco_hw.daemon.process import Notifier, StopSignals, Waiting
+from disco_hw.fence.task_line import task_breach
 from disco_hw.log import records
 from disco_hw.runtime import Ask, State, advice, headline, records_of_tick
 from disco_hw.runtime.core import CoreTick, DaemonCore, Pilot
@@ -266,6 +267,10 @@ class Daemon:
         state = State.DISCONNECTED if last is None else last.output.state
         try:
             task = changed_task(self._core.task, message.arguments, self._core.config.robot, state)
+            area = self._core.area
+            fault = None if area is None else task_breach(area.fence, area.footprint, task.course())
+            if fault is not None:
+                raise TaskRefused(f"fence: {fault}; keep the task inside")
         except TaskRefused as refused:
             self._server.reply(message, {"ok": False, "error": str(refused)})
             return

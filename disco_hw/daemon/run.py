@@ -35,7 +35,7 @@ from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path, tick_feed_path
 from disco_hw.daemon.process import STANDARD_OUTPUT, AsyncPrinter, StopPath, StopSignals
 from disco_hw.errors import InputError, LogError
-from disco_hw.files import file_name_of
+from disco_hw.files import check_log_file, file_name_of
 from disco_hw.log import DBC, Attachment, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, RecordingSettings
 from disco_hw.processes import end_with_parent
@@ -106,6 +106,7 @@ def run_daemon(
     Raises InputError, before anything is opened, if a file or an option is wrong. An exception in the loop is reported,
     the robot stopped, and the exception passed on.
     """
+    check_log_file(options.log_file)
     setup = load_setup(options.robot, options.model, options.link)
     if not options.accept_missing_effects:
         refuse_missing_effects(setup)

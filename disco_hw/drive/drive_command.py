@@ -27,7 +27,7 @@ from disco_hw.drive.scripts import make_script
 from disco_hw.drive.terminal import HELP, Keyboard, KeyHold
 from disco_hw.errors import InputError, LogError
 from disco_hw.fence.clearance import Boundaries
-from disco_hw.files import file_name_of
+from disco_hw.files import check_log_file, file_name_of
 from disco_hw.log.reader import open_log
 from disco_hw.runtime.robot_setup import Setup, geometry, load_setup
 from drivers.gamepad import Gamepad, GamepadError, GamepadMapping, open_gamepad
@@ -96,6 +96,7 @@ def run_drive(options: DriveOptions, page_news: Callable[[], tuple[str, ...]] = 
     Runs the daemon's loop with its governor, supervisor and recorder; there is no planner, and no pose is needed.
     Raises InputError for wrong options, files and devices.
     """
+    check_log_file(options.log_file)
     setup = load_setup(options.robot, options.model, options.link)
     config = setup.config
     script = _script(options, config)

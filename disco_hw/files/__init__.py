@@ -27,6 +27,7 @@ DEEPEST_NESTING, MOST_KEY_PARTS = 16, 8
 _KIB, _MIB = 1024, 1024 * 1024
 _FLAGS = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
 _NOT_PLAIN = {stat.S_IFDIR: "a directory", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
+_CONTROL_CHARACTER = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 # Strings and comments whole, so that what is in them is not counted; one without its end goes on to the end.
 _TOML_TOKEN = re.compile(
     r'''(?P<string>"""(?:[^\\"]|\\.|"(?!""))*+(?:"{3,5}|\\?\Z)|"(?:[^"\\\n]|\\.)*+"?'''
@@ -58,6 +59,21 @@ LOG = FileKind("a log", 16 * _KIB * _MIB, "give the path of a log")
 def file_name_of(name: str) -> str:
     """A robot's name as part of a file name: letters, digits, - and _ stay, so that it cannot leave its directory."""
     return re.sub(r"[^A-Za-z0-9_-]", "_", name)
+
+
+def control_character_in(text: str) -> str | None:
+    """Describe the first control character in a name, as NUL or a line feed; None if there is none."""
+    found = _CONTROL_CHARACTER.search(text)
+    if found is None:
+        return None
+    what = "a NUL character" if found[0] == "\0" else f"the control character {found[0]!a}"
+    return f"holds {what}, which no name may have"
+
+
+def check_log_file(log_file: Path | None) -> None:
+    """Raise InputError if the name given with --log cannot stand in one line of a message."""
+    if log_file is not None and (fault := control_character_in(str(log_file))):
+        raise InputError(f"--log {str(log_file)!a}: {fault}; give another name")
 
 
 def open_file(path: Path, kind: FileKind) -> int:

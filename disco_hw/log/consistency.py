@@ -43,10 +43,10 @@ _MOST_DEADBAND_RAD = 1.5
 _ENCODER_FAULTS = {
     (-1.0, 1.0): ("encoder_reversed", "the left encoder counts backwards"),
     (1.0, -1.0): ("encoder_reversed", "the right encoder counts backwards"),
-    (0.5, 1.0): ("encoder_scale", "the left wheel counts 2.00 times the expected ticks, the right one does not"),
-    (1.0, 0.5): ("encoder_scale", "the right wheel counts 2.00 times the expected ticks, the left one does not"),
-    (2.0, 1.0): ("encoder_scale", "the left wheel counts 0.50 times the expected ticks, the right one does not"),
-    (1.0, 2.0): ("encoder_scale", "the right wheel counts 0.50 times the expected ticks, the left one does not"),
+    (0.5, 1.0): ("encoder_count", "the left wheel counts 2.00 times the expected ticks, the right one does not"),
+    (1.0, 0.5): ("encoder_count", "the right wheel counts 2.00 times the expected ticks, the left one does not"),
+    (2.0, 1.0): ("encoder_count", "the left wheel counts 0.50 times the expected ticks, the right one does not"),
+    (1.0, 2.0): ("encoder_count", "the right wheel counts 0.50 times the expected ticks, the left one does not"),
 }
 
 
@@ -138,7 +138,7 @@ def _of_commands(
             f"({gains[more]:.2f} and {gains[1 - more]:.2f} times the command)"
         )
         return (
-            Contradiction("encoder_scale", f"{said}: check ticks_per_rev and gear", ("body", "response")),
+            Contradiction("encoder_count", f"{said}: check ticks_per_rev and gear", ("body", "response")),
             Contradiction("command_scale", f"{said}, and the poses bear the wheels out: check commands", ("response",)),
             _with_wheels(windows, 1.0 / gains),
         )

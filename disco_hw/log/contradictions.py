@@ -118,7 +118,7 @@ def of_counts(times: float, by: str, spoils: tuple[Link, ...], otherwise: str = 
     whole = max(times, 1.0 / times)
     count = f"{times:.2f}" if _is_near(whole, round(whole)) and whole < 20.0 else f"{times:.3g}"
     message = f"the wheels count {count} times the expected ticks{by}: check ticks_per_rev and gear{otherwise}"
-    return Contradiction("encoder_scale", message, spoils)
+    return Contradiction("encoder_count", message, spoils)
 
 
 def of_clock(clock: ClockFit) -> Contradiction:

@@ -287,6 +287,18 @@ class CircleTerms(NamedTuple):
     turned_cos: float
     turned_sin: float
 
+    def place_of(self, place: float, x: float, y: float) -> float:
+        """Angle of a position about the centre (rad)."""
+        return math.atan2(y, x)
+
+    def line_at(self, place: float, ahead_m: float) -> tuple[float, float, float, float, float, float]:
+        """The point so much further round, how a robot that stays on the circle is turned there, and how fast it is."""
+        angle = place + ahead_m / self.radius_m
+        cosine, sine = math.cos(angle), math.sin(angle)
+        head_x = -sine * self.turned_cos - cosine * self.turned_sin
+        head_y = cosine * self.turned_cos - sine * self.turned_sin
+        return self.radius_m * cosine, self.radius_m * sine, head_x, head_y, self.turned_cos, self.speed_m_s
+
     def stage(
         self, memory: float, step: int, x_old: float, y_old: float, x: float, y: float,
         cos_yaw: float, sin_yaw: float, forward: float, found: Found,

@@ -26,6 +26,10 @@ VERSIONS = {text: tuple(int(part) for part in text.split(".")) for text in ("2.6
 VERSIONS |= {text: tuple(int(part) for part in text.split(".")) for text in ("3.0", "3.1", "4.0", "4.1")}
 _MOST_A_TICK = 100
 _LONGEST_DATAGRAM = 65_535
+_MOST_BYTES_A_TICK = 65_536
+"""After so many bytes the next datagram waits for the next tick: whoever floods the port must not hold up the loop."""
+_MOST_ITEMS = 3000
+"""In a frame, all kinds together: NatNet's own SDK has room for 1000 of a kind, and more would take milliseconds."""
 _ASK_NS = 1_000_000_000
 _NAME_LENGTH = 256
 _CLOCK_LEAST_S = 0.5
@@ -57,6 +61,7 @@ class _Reader:
 
     def __init__(self, data: bytes, at: int) -> None:
         self._data, self._at = data, at
+        self._items_left = _MOST_ITEMS
 
     def take(self, layout: str) -> tuple[Any, ...]:
         form = struct.Struct("<" + layout)
@@ -79,6 +84,13 @@ class _Reader:
             raise struct.error("a count that cannot be")
         return int(value)
 
+    def expect_items(self, count: int) -> range:
+        """Return a range over so many items that are read one by one; struct.error for more than Motive can send."""
+        self._items_left -= count
+        if self._items_left < 0:
+            raise struct.error("more than Motive can send")
+        return range(count)
+
 
 def parse_frame(datagram: bytes, version: Version) -> MotiveFrame | None:
     """Return the frame in a datagram of this version of NatNet; None for what is none."""
@@ -98,7 +110,11 @@ def _parse(datagram: bytes, version: Version) -> MotiveFrame | None:
     _section(reader, version, lambda: reader.skip(12))
     bodies: list[Body] = []
     _section(reader, version, lambda: bodies.append(_body(reader, version)), always=True)
-    _section(reader, version, lambda: (reader.take("i"), [_body(reader, version) for _ in range(reader.count())]))
+    _section(
+        reader,
+        version,
+        lambda: (reader.take("i"), [_body(reader, version) for _ in reader.expect_items(reader.count())]),
+    )
     if version >= (4, 1):
         _section(reader, version, lambda: None)
     _section(reader, version, lambda: reader.skip(22 + 4 * (version >= (3, 0))))
@@ -121,7 +137,7 @@ def _section(reader: _Reader, version: Version, each: Callable[[], object], alwa
         if not always:
             reader.skip(size)
             return
-    for _ in range(count):
+    for _ in reader.expect_items(count):
         each()
 
 
@@ -136,7 +152,7 @@ def _body(reader: _Reader, version: Version) -> Body:
 
 def _channels(reader: _Reader) -> None:
     reader.take("i")
-    for _ in range(reader.count()):
+    for _ in reader.expect_items(reader.count()):
         reader.skip(4 * reader.count())
 
 
@@ -220,8 +236,12 @@ class NatNetPoses:
         poses = []
         with contextlib.suppress(OSError):
             self._ask(now_ns)
+            taken = 0
             for _ in range(_MOST_A_TICK):
+                if taken >= _MOST_BYTES_A_TICK:
+                    break
                 datagram, sender = self._socket.recvfrom(_LONGEST_DATAGRAM)
+                taken += len(datagram)
                 pose = self._take(datagram, now_ns) if self._counts(datagram, sender, now_ns) else None
                 if pose is not None:
                     self._senders.note_pose(sender, now_ns)

@@ -37,13 +37,13 @@ def parse_allowed(addresses: Collection[str]) -> tuple[IPv4Network, ...]:
 
 
 class PoseProof:
-    """Opens proven datagrams: each must have been sent later than all before it, and since the port was opened."""
+    """Unwraps proven datagrams: each must have been sent later than all before it, and since the port was opened."""
 
     def __init__(self, key: bytes, wall_ns: int) -> None:
         self._key = key
         self._newest_ns = wall_ns
 
-    def open(self, datagram: bytes, wall_ns: int) -> bytes | str:
+    def unwrap(self, datagram: bytes, wall_ns: int) -> bytes | str:
         """Return the body of a datagram that arrives at this UNIX time (ns), or in words why it is refused."""
         told, proof = datagram[:-PROOF_BYTES], datagram[-PROOF_BYTES:]
         if len(told) < TIME_BYTES or not hmac.compare_digest(hmac.digest(self._key, told, hashlib.sha256), proof):

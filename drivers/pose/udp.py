@@ -120,7 +120,7 @@ class UdpPoses:
         if not self._senders.may_send(sender, now_ns):
             return None
         if self._proof is not None:
-            opened = self._proof.open(datagram, time.time_ns())
+            opened = self._proof.unwrap(datagram, time.time_ns())
             if isinstance(opened, str):
                 words = f"{sender[0]}:{sender[1]} sends poses {opened}"
                 self._senders.refuse(now_ns, words, "docs/poses.md says what a sender with a key does")

@@ -20,14 +20,14 @@ WRITTEN = {
     *(("init", "out"), ("commission", "log_directory")),
     *(("view", "snapshot"), ("view", "video"), ("view", "export")),
     *(("sim", "truth"), ("sim", "inject"), ("sim", "bus_log")),
-    *((f"experiment {name}", "out") for name in ("pendulum", "circle", "adapt", "gap")),
+    *((f"experiment {name}", "out") for name in ("pendulum", "circle", "adapt", "gap", "fence")),
 }
 READ = {
     *((verb, "robot") for verb in ("run", "drive", "check", "ctl", "estop", "infer", "gap", "import", "view", "sim")),
     *((verb, "robot") for verb in ("experiment circle", "experiment adapt", "experiment gap", "bridge ros2")),
     ("bridge ros2-base", "robot"),
     *((verb, "model") for verb in ("run", "drive", "gap", "view", "sim", "bridge ros2")),
-    *((verb, "log") for verb in ("import", "log info", "log recover", "log export", "view", "replay")),
+    *((verb, "log") for verb in ("import", "log info", "log recover", "log export", "log fence", "view", "replay")),
     *(("infer", "logs"), ("gap", "logs"), ("sim", "faults"), ("commission", "robot")),
 }
 
@@ -98,6 +98,10 @@ def test_good_files_get_as_far_as_the_work(tmp_path, calling, one):
     said = calling(one.argv(tmp_path))
     if one.verb == "experiment gap":
         assert "needs a circle" in said.errors
+    elif one.verb == "log fence":
+        # A log of a drive that does not go round.
+        assert said.code == 2
+        assert "run.mcap" in said.errors
     elif one.verb == "replay":
         assert said.code == 1
     else:

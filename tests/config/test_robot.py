@@ -116,6 +116,21 @@ def test_ranges_and_relations_are_checked(tmp_path, extra, field):
         load(tmp_path, GOOD + extra)
 
 
+@pytest.mark.parametrize(
+    ("escape", "words"), [(r"\u0000", "a NUL"), (r"\n", r"control character '\n'"), (r"\u001b", "control")]
+)
+@pytest.mark.parametrize("place", ["log.directory", "daemon.control_socket", "robot.name"])
+def test_no_name_holds_a_control_character(tmp_path, place, escape, words):
+    section, field = place.split(".")
+    text = f'{field} = "/tmp/a{escape}b"'
+    text = GOOD.replace('name = "wombot"', text) if section == "robot" else f"{GOOD}[{section}]\n{text}\n"
+    with pytest.raises(InputError) as error:
+        load(tmp_path, text)
+    assert f"robot.toml: {place}: holds " in str(error.value)
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+
+
 def test_unreadable_file(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         load_robot_config(tmp_path / "none.toml")

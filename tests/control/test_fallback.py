@@ -27,6 +27,7 @@ class Planted:
 
     def __init__(self) -> None:
         self.chassis = SteeredChassis(*BASE, 0.0, 0.0)
+        self.is_trapped = False
         self.outcome: PlanOutcome | None = PlanOutcome.PLANNED
 
     def plan(self, now_ns, state):
@@ -125,3 +126,15 @@ def test_a_square_is_driven_on_from_where_the_planner_left_it():
 def test_way_points_by_time_have_no_line_to_follow():
     with pytest.raises(TypeError, match="TimedPathCost has no line"):
         WithFallback(Planted(), LAWS["lqr"], TimedPathCost.__new__(TimedPathCost), LIMITS)
+
+
+def test_no_law_drives_into_what_the_planner_stops_for():
+    planted = Planted()
+    both = WithFallback(planted, LAWS["lqr"], TASKS["circle"], LIMITS)
+    planted.is_trapped, planted.outcome = True, PlanOutcome.STOPPING
+    assert both.plan(0, state()).diagnostics.outcome is PlanOutcome.STOPPING
+    planted.outcome = None
+    with pytest.raises(NoValidControl, match="planted"):
+        both.plan(20_000_000, state())
+    planted.is_trapped = False
+    assert both.plan(40_000_000, state()).diagnostics.outcome is PlanOutcome.FALLBACK

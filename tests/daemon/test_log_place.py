@@ -6,8 +6,9 @@ import msgspec
 import pytest
 
 from disco_hw.daemon import default_socket_path
-from disco_hw.daemon.run import _log_path
-from disco_hw.drive.drive_command import _new_log
+from disco_hw.daemon.run import DaemonOptions, _log_path, run_daemon
+from disco_hw.drive.drive_command import DriveOptions, _new_log, run_drive
+from disco_hw.errors import InputError
 from tests.inference.drives import robot_config
 
 NAMES = ["../../x", "/etc/x", "a\0b", "..", "x" * 64, "a/b", "\n", "ü" * 64, "~root"]
@@ -28,3 +29,11 @@ def test_no_name_of_a_robot_leaves_the_directory(name, tmp_path):
         path.unlink()
     assert default_socket_path(name).name == Path(default_socket_path(name).name).name
     assert "\0" not in str(default_socket_path(name))
+
+
+@pytest.mark.parametrize(("run", "options"), [(run_daemon, DaemonOptions), (run_drive, DriveOptions)])
+@pytest.mark.parametrize("name", ["a\nb.mcap", "a\0b.mcap", "a\x1b[2J.mcap"])
+def test_a_log_file_whose_name_breaks_lines_is_refused_before_anything_is_opened(run, options, name, tmp_path):
+    with pytest.raises(InputError, match=r"^--log '.*': holds .* character.*; give another name$"):
+        run(options(robot=tmp_path / "robot.toml", log_file=tmp_path / name))
+    assert not list(tmp_path.iterdir())

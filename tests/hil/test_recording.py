@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import time
@@ -14,7 +15,9 @@ from disco_hw.errors import WorkError
 from disco_hw.experiments import READY_TIMEOUT_S, Stack, running_stack
 from disco_hw.log.log_command import info
 from disco_hw.log.reader import open_log
+from tests.drivers.waiting import free_port, wait_until
 from tests.hil.stack import STILL_RAD_S, disco_here
+from tests.log.processes import SmallDisk
 
 pytestmark = pytest.mark.hil
 
@@ -148,3 +151,47 @@ def test_a_keeper_frozen_or_killed_is_made_again_while_disarmed(tmp_path):
             wait_for_recording(stack, deaths)
             assert keeper_of(stack) != keeper
         stack.operator.request("arm")
+
+
+@pytest.mark.long
+def test_a_drive_that_ends_with_a_full_disk_says_which_ticks_are_lost_and_exits_with_1(tmp_path):
+    with SmallDisk(tmp_path, 4160) as disk:
+        (disk / "filler").write_bytes(bytes(4040 * 1024))
+        with running_stack(tmp_path, run_arguments=("--log", str(disk / "run.mcap"))) as stack:
+            stack.operator.wait_until("disk full", lambda status: status["recorder"]["fault"], READY_TIMEOUT_S)
+            stack.daemon.process.send_signal(signal.SIGTERM)
+            assert stack.daemon.process.wait(60.0) == 1
+            output = (tmp_path / "daemon.txt").read_text()
+        last = output[output.index("SIGTERM") :]
+        assert "Traceback" not in output
+        assert re.search(r"recording: [1-9]\d* of \d+ ticks are in no log: .*No space left on device", last)
+        assert "stop: recorder: " in last
+        assert "free space on its disk before the next drive" in last
+        # The attempts that failed name a file that could not be made; what is left to look at must be there.
+        named_files = re.findall(r"\S+\.mcap", "".join(line for line in last.splitlines() if line.startswith("log: ")))
+        assert named_files
+        assert all(Path(name).exists() for name in named_files), last
+        assert ticks_in(disk / "run.mcap")
+
+
+@pytest.mark.long
+def test_a_page_that_is_killed_is_started_again_and_its_end_is_in_the_log(tmp_path):
+    page = ("--view", "--port", str(free_port()))
+    with running_stack(tmp_path, run_arguments=page) as stack:
+
+        def pages() -> list[int]:
+            return [pid for pid in children(stack.daemon.process.pid) if named(pid, "disco_hw.viewer.commands")]
+
+        stack.operator.wait_for("READY", READY_TIMEOUT_S)
+        (first,) = pages()
+        os.kill(first, signal.SIGKILL)
+        # One look decides: between two of them the page may die, before the daemon has noticed.
+        wait_until(lambda: set(pages()) - {first}, 60.0)
+        stack.operator.request("quit")
+        assert stack.daemon.process.wait(60.0) == 0
+        assert "page: the page was ended by SIGKILL; it is started again" in stack.daemon.said()
+    with open_log(tmp_path / "run.mcap") as log:
+        events = [entry.record for entry in log.records(("/event",)) if entry.record.code == "page"]
+    assert [(event.level, event.text) for event in events] == [
+        ("warning", "the page was ended by SIGKILL; it is started again")
+    ]

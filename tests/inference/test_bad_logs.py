@@ -39,6 +39,10 @@ def at(place, **values):
     return lambda rows: [row | values if index == place else row for index, row in enumerate(rows)]
 
 
+def everywhere(**values):
+    return lambda rows: [row | values for row in rows]
+
+
 def held(prefixes, value):
     """Every sample of these columns has the same value."""
     return lambda rows: [row | {name: value for name in row if name.startswith(prefixes) and row[name]} for row in rows]
@@ -53,11 +57,14 @@ CASES = {
     "no rows": (lambda rows: [], r"no rows|empty|no samples|at least"),
     "no motion": (at_rest, r"wheels turn by 0 rad in all; record a drive"),
     "wheels in the air": (lifted, r"wheels are off the ground or the pose sensor is dead"),
-    "a pose that is NaN": (at(40, pose_x_m="nan"), r"line 42: pose_x_m is 'nan', not a finite number; leave"),
-    "an encoder that is infinite": (at(7, enc_left_ticks="inf"), r"line 9: enc_left_ticks is 'inf'"),
-    "a word": (at(7, pose_y_m="lost"), r"line 9: pose_y_m is 'lost'"),
-    "a clock that goes backwards": (at(30, t_s="0.01"), r"line 32: the clock goes backwards .* sort the rows"),
-    "a clock that stands still": (lambda rows: [rows[0], *rows], r"line 3: the clock stands still"),
+    "poses that are NaN": (everywhere(pose_x_m="nan"), r"0 poses, at least 50 are needed"),
+    "encoders that are infinite": (
+        everywhere(enc_left_ticks="inf"),
+        r"wheel ticks: .* line 2: enc_left_ticks is 'inf'",
+    ),
+    "words": (everywhere(pose_y_m="lost"), r"positions: .* line 2: pose_y_m is 'lost' .*; leave a cell .* empty"),
+    "a clock that goes backwards": (at(30, t_s="-9.0"), r"line 32: the clock goes backwards .* a file of its own"),
+    "a clock that stands still": (everywhere(t_s="1.0"), r"have the time of another sample .*the clock stands still"),
     "milliseconds": (scaled(("t_s",), 1e5), r"t_s: .* does not look like seconds; write seconds"),
     "millimetres": (scaled(("pose_x", "pose_y_"), 1e3), r"pose_x_m, pose_y_m against the wheels: .*write metres"),
     "degrees": (scaled(("pose_yaw",), 180.0 / math.pi), r"pose_yaw_rad: .*like degrees; write radians"),
@@ -85,7 +92,7 @@ def test_columns_of_the_pose_may_not_be_missing(good, tmp_path):
     log = tmp_path / "bad.csv"
     names = [name for name in rows[0] if name != "pose_yaw_rad"]
     write(log, names, [{name: row[name] for name in names} for row in rows])
-    with pytest.raises(InputError, match="no column pose_yaw_rad"):
+    with pytest.raises(InputError, match=r"0 poses, at least 50 are needed; .*pose_yaw_rad"):
         infer_command([log], robot, search=finds())
 
 

@@ -51,7 +51,7 @@ def test_wheels_that_count_double_are_warned_of_in_the_first_line(run):
     assert first.startswith("warning: simulated: the wheels count 2.00 times the expected ticks")
     assert "check ticks_per_rev and gear" in first
     told = json.loads(json.dumps(result.as_dict()))
-    assert [each["cause"] for each in told["contradictions"]] == ["encoder_scale"]
+    assert [each["cause"] for each in told["contradictions"]] == ["encoder_count"]
     assert told["posterior"]["wheel_radius_m"]["mean"] == pytest.approx(0.5 * RADIUS_M, rel=0.1)
 
 

@@ -200,7 +200,7 @@ def test_several_logs_count_together(robot, tmp_path, inferred):
         ("", "empty file"),
         ("t_s,cmd_left_rad_s,cmd_right_rad_s,enc_left_ticks,enc_right_ticks\n0,1,1,0,0\n1,1,1,5,5\n", "0 poses"),
         ("t_s,cmd_left_rad_s,cmd_right_rad_s,pose_x_m,pose_y_m,pose_yaw_rad\n0,1,1,0,0,0\n0,1,1,nan,0,0\n", "."),
-        ("t_s,cmd_left_rad_s,cmd_right_rad_s,pose_x_m,pose_y_m,pose_yaw_rad\n1,1,1,0,0,0\n0,1,1,0,0,0\n", "backwards"),
+        ("t_s,cmd_left_rad_s,cmd_right_rad_s,pose_x_m,pose_y_m,pose_yaw_rad\n5,1,1,0,0,0\n0,1,1,0,0,0\n", "backwards"),
     ],
 )
 def test_a_bad_log_gets_one_line_and_no_model(robot, tmp_path, text, message):

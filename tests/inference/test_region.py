@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from disco_hw.inference.density_network import Region
+from disco_hw.inference.density_network import EmptyRegionError, Region
 
 LOW, HIGH = np.array([0.0, 0.0, 0.1]), np.array([0.5, 0.5, 0.5])
 
@@ -38,5 +38,5 @@ def test_a_region_never_leaves_the_one_it_came_from():
 
 def test_a_region_outside_the_box_is_an_error_not_an_endless_search():
     away = np.random.default_rng(0).normal(5.0, 0.001, (500, 3))
-    with pytest.raises(RuntimeError, match="empty"):
+    with pytest.raises(EmptyRegionError, match="empty"):
         Region.box(LOW, HIGH).shrunk(away, 4.5).draw(5, np.random.default_rng(1))

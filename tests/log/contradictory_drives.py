@@ -122,14 +122,14 @@ FAULTS: dict[str, tuple[Change, str, str]] = {
     ),
     "a standing heading": (with_poses(yaw_rad=lambda p: np.zeros(p.t_s.size)), "heading_still", "no measured heading"),
     "a heading that stops for a third": (heading_stops, "heading_still", "no measured heading"),
-    "encoders doubled": (with_wheels(2.0, 2.0), "encoder_scale", "wheels count 2.00 times the expected ticks"),
-    "encoders halved": (with_wheels(0.5, 0.5), "encoder_scale", "wheels count 0.50 times the expected ticks"),
+    "encoders doubled": (with_wheels(2.0, 2.0), "encoder_count", "wheels count 2.00 times the expected ticks"),
+    "encoders halved": (with_wheels(0.5, 0.5), "encoder_count", "wheels count 0.50 times the expected ticks"),
     "encoders doubled, no commands": (
         then(with_wheels(2.0, 2.0), without_commands),
-        "encoder_scale",
+        "encoder_count",
         "check ticks_per_rev and gear",
     ),
-    "left encoder doubled": (with_wheels(2.0, 1.0), "encoder_scale", "left wheel counts"),
+    "left encoder doubled": (with_wheels(2.0, 1.0), "encoder_count", "left wheel counts"),
     "encoders swapped": (with_wheels(swap=True), "sides_swapped", "encoders are swapped (the poses say so too)"),
     "encoders swapped, no commands": (
         then(with_wheels(swap=True), without_commands),

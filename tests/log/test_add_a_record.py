@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-LAST_TOPIC = '    Topic("/disturbance", UnexplainedMotion),'
+LAST_TOPIC = '    Topic("/obstacle", Obstacle),'
 PROGRAM = """
 import sys
 from pathlib import Path
@@ -35,7 +35,7 @@ def test_the_record_of_the_page_is_written_and_read(tmp_path):
     text = records.read_text(encoding="utf-8")
     for before, after in {
         "\nRecord = (\n": f"\n{code}\n\nRecord = (\n",
-        "    | UnexplainedMotion\n)\n": "    | UnexplainedMotion\n    | Temperature\n)\n",
+        "    | Obstacle\n)\n": "    | Obstacle\n    | Temperature\n)\n",
         f"{LAST_TOPIC}\n)": f'{LAST_TOPIC}\n    Topic("/temperature", Temperature),\n)',
     }.items():
         assert text.count(before) == 1, before

@@ -24,7 +24,7 @@ def log(tmp_path):
 def cut(tmp_path):
     path = tmp_path / "cut.mcap"
     data = log_bytes(drive_ticks(100), flush_every=10)
-    path.write_bytes(data[: len(data) * 6 // 10])
+    path.write_bytes(data[: len(data) * 5 // 10])
     return path
 
 

@@ -293,3 +293,31 @@ def test_the_fence_is_changed_while_disarmed_only():
     events, (record,) = area.end(4, area.last, overridden=False)
     assert fence_of_record(record) == area.fence
     assert events == ("fence: changed; it holds until the daemon ends, robot.toml keeps its own",)
+
+
+def test_the_log_of_a_drive_round_the_edge_makes_its_fence(tmp_path):
+    from disco_hw.errors import InputError
+    from disco_hw.first_use.fence_drive import fence_of_log, fence_toml
+
+    setup = load_setup(ROBOTS / "wombot.toml")
+    hand = Hand()
+    run = SimulatedRun(setup, virtual_robot(setup, PlantParameters(), MIDDLE), NoPlanner(), hand)
+    run.run(1.5)
+    run.run(0.5, UserRequest.ARM)
+    run.run(0.02, UserRequest.START)
+    hand.wheels = (4.0, 6.5)
+    log = tmp_path / "edge.mcap"
+    turned, before = 0.0, run.robot.truth.yaw_rad
+    for _ in run.ticks(60.0):
+        yaw = run.robot.truth.yaw_rad
+        turned, before = turned + math.remainder(yaw - before, 2 * math.pi), yaw
+        if turned > 2 * math.pi:
+            break
+    run.write_log(log)
+    text = fence_toml(fence_of_log(log))
+    assert text.startswith("[fence]\nkeep_in = [[")
+    short = SimulatedRun(setup, virtual_robot(setup, PlantParameters(), MIDDLE), NoPlanner(), Hand())
+    short.run(0.1)
+    short.write_log(tmp_path / "short.mcap")
+    with pytest.raises(InputError, match=r"short\.mcap: there are no poses; drive once round"):
+        fence_of_log(tmp_path / "short.mcap")

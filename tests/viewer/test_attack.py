@@ -20,6 +20,25 @@ CONNECTIONS, PRESSES = 4000, 12
 
 
 @contextmanager
+def limited_page(robot, output, descriptors):
+    """The live page of `robot` in a process that may open so many files; its port. What it says goes to `output`."""
+    port = free_port()
+    command = [sys.executable, "-m", "disco_hw.viewer.commands", str(os.getpid()), "127.0.0.1", str(port), str(robot)]
+    with output.open("wb") as sink:
+        page = subprocess.Popen(
+            [*command, "", ""], stdout=sink, stderr=sink, env=os.environ | {"DISCO_HW_PAGE_TOKEN": TOKEN}
+        )
+    resource.prlimit(page.pid, resource.RLIMIT_NOFILE, (descriptors, descriptors))
+    try:
+        wait_until(lambda: b"?token=" in output.read_bytes(), 60.0)
+        COOKIES[port] = f"disco-hw-token-{port}={TOKEN}"
+        yield port
+    finally:
+        page.terminate()
+        page.wait()
+
+
+@contextmanager
 def page_process(directory, descriptors):
     """A page that may open so many files, beside a daemon; the daemon, the port and what the page says."""
     daemon = Daemon(directory / "run")
@@ -28,21 +47,11 @@ def page_process(directory, descriptors):
     text = ROBOT_FILE.read_text()
     assert "[daemon]" not in text
     robot.write_text(f'{text}\n[daemon]\ncontrol_socket = "{daemon.server.path}"\n')
-    port = free_port()
     said = directory / "said.txt"
-    command = [sys.executable, "-m", "disco_hw.viewer.commands", str(os.getpid()), "127.0.0.1", str(port), str(robot)]
-    with said.open("wb") as output:
-        page = subprocess.Popen(
-            [*command, "", ""], stdout=output, stderr=output, env=os.environ | {"DISCO_HW_PAGE_TOKEN": TOKEN},
-        )  # fmt: skip
-    resource.prlimit(page.pid, resource.RLIMIT_NOFILE, (descriptors, descriptors))
     try:
-        wait_until(lambda: b"?token=" in said.read_bytes(), 60.0)
-        COOKIES[port] = f"disco-hw-token-{port}={TOKEN}"
-        yield daemon, port, said
+        with limited_page(robot, said, descriptors) as port:
+            yield daemon, port, said
     finally:
-        page.terminate()
-        page.wait()
         daemon.close()
 
 
@@ -59,7 +68,8 @@ def attack(port):
             attacker.kill()
 
 
-@pytest.mark.parametrize("descriptors", [pytest.param(1024, marks=pytest.mark.long), 256])
+@pytest.mark.long
+@pytest.mark.parametrize("descriptors", [1024, 256])
 def test_every_press_reaches_the_daemon_and_new_pages_get_in_during_an_attack(tmp_path, descriptors):
     with page_process(tmp_path, descriptors) as (daemon, port, said), line_to(port) as line:
         ask(line, do="stop")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bz2
 import contextlib
+import os
 import sqlite3
 import struct
 from collections.abc import Callable, Iterator
@@ -18,6 +19,8 @@ from typing import Any, BinaryIO
 from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
+
+from disco_hw.files import LOG, open_file
 
 _LARGEST_RECORD_BYTES = 256 * 1024 * 1024
 _LARGEST_MESSAGE_BYTES = 1024 * 1024
@@ -46,7 +49,7 @@ def _copy_mcap(path: Path, target: Path) -> str:
     schemas: dict[int, int] = {}
     channels: dict[int, int] = {}
     messages = damaged = 0
-    with path.open("rb") as source, target.open("wb") as sink:
+    with os.fdopen(open_file(path, LOG), "rb") as source, target.open("wb") as sink:
         writer = Writer(sink, compression=CompressionType.NONE)
         writer.start(profile="ros2")
         # Where the damage begins nothing can be read any more.
@@ -152,7 +155,7 @@ def _copy_ros1(path: Path, target: Path) -> str:
 
     connections: dict[bytes, Any] = {}
     messages = damaged = 0
-    with path.open("rb") as source, BagWriter(target) as writer:
+    with os.fdopen(open_file(path, LOG), "rb") as source, BagWriter(target) as writer:
         source.readline()
         with contextlib.suppress(Exception):
             for record in _ros1_records(source):

@@ -220,3 +220,27 @@ def test_frames_of_a_second_server_are_refused_and_named(port):
     assert [pose.x_m for pose in found] == pytest.approx([1.0, 1.1])
     assert any(f"{names[1]} sends poses beside {names[0]}: not used" in words for words in said)
     source.close()
+
+
+def test_a_frame_with_more_than_motive_can_send_is_none():
+    version = (3, 0)
+    one = [rigid_body(version, 3, (1.5, 0.1, -2.0), TURNED)]
+    whole = frame(version, one, empty=True)
+    # After size, number of the frame and its head: so many marker sets, none of which has a name or a marker.
+    sets = b"\0" + struct.pack("<i", 0)
+    for many, is_read in ((1000, True), (12_000, False)):
+        body = whole[4:8] + struct.pack("<i", many) + many * sets + whole[12:]
+        found = parse_frame(struct.pack("<HH", 7, len(body)) + body, version)
+        assert (found is not None) == is_read
+
+
+def test_a_flood_of_long_datagrams_waits_for_the_next_tick(port):
+    source = make_pose_source("natnet", data_port=port, server="127.0.0.1", body=3)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for _ in range(3):
+            sender.sendto(bytes(40_000), ("127.0.0.1", port))
+    assert list(source.receive(1, ())) == []
+    assert source.malformed == 2
+    assert list(source.receive(2, ())) == []
+    assert source.malformed == 3
+    source.close()

@@ -92,18 +92,18 @@ def test_what_is_no_address_is_refused(addresses, words):
     ],
 )
 def test_what_is_not_proven_or_not_of_now_is_refused(datagram, words):
-    assert words in PoseProof(KEY, WALL_NS - 500_000_000).open(datagram, WALL_NS)
+    assert words in PoseProof(KEY, WALL_NS - 500_000_000).unwrap(datagram, WALL_NS)
 
 
 def test_each_proven_datagram_counts_once_and_none_from_before_the_port_was_opened():
     proof = PoseProof(KEY, WALL_NS)
     first, second = proven(b"one", WALL_NS + 10), proven(b"two", WALL_NS + 20)
-    assert proof.open(first, WALL_NS + 30) == b"one"
-    assert proof.open(second, WALL_NS + 30) == b"two"
-    assert isinstance(proof.open(second, WALL_NS + 40), str)
-    assert isinstance(proof.open(first, WALL_NS + 40), str)
+    assert proof.unwrap(first, WALL_NS + 30) == b"one"
+    assert proof.unwrap(second, WALL_NS + 30) == b"two"
+    assert isinstance(proof.unwrap(second, WALL_NS + 40), str)
+    assert isinstance(proof.unwrap(first, WALL_NS + 40), str)
     again = PoseProof(KEY, WALL_NS + 50)
-    assert isinstance(again.open(second, WALL_NS + 60), str)
+    assert isinstance(again.unwrap(second, WALL_NS + 60), str)
 
 
 def test_over_a_real_socket_only_the_holder_of_the_key_is_heard():

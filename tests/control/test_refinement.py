@@ -1,0 +1,70 @@
+"""The refinement of DISCO's plan: what it reaches beside the line, within the limits, and where it is not used."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState
+from disco_hw.model import Model
+from disco_hw.model.model import EffectSetting
+from disco_hw.tasks.circle import CircleCost
+
+RADIUS_M, X_ICR_M = 0.75, 0.2
+LIMITS = CommandLimits(8.0, 20.0)
+MODEL = Model(0.06, 0.4, X_ICR_M, (EffectSetting("motor_lag", {"tau_s": 0.15}),))
+SETTINGS = DiscoSettings(uncertainty="point", refine=True)
+
+
+def _on_the_circle(speed_m_s: float) -> PlannerState:
+    """Return a robot that goes round the circle at this speed, turned inwards as it has to be."""
+    turned = math.asin(X_ICR_M / RADIUS_M)
+    forward, turn = speed_m_s * math.cos(turned), speed_m_s / RADIUS_M
+    wheels = [(forward + side * 0.2 * turn) / 0.06 for side in (-1.0, 1.0)]
+    return PlannerState(0, RADIUS_M, 0.0, 0.5 * math.pi + turned, *wheels)
+
+
+@pytest.fixture(scope="module")
+def drive_on() -> dict[float, tuple[np.ndarray, np.ndarray]]:
+    """Plans: commands and distances (m), at a speed that the wheels can do, and at one they cannot."""
+    found = {}
+    for speed in (0.2, 0.8):
+        planner = Disco(MODEL, CircleCost(radius_m=RADIUS_M, speed_m_s=speed), SETTINGS, LIMITS)
+        plan = planner.plan(0, _on_the_circle(min(speed, 0.3)))
+        assert planner.refinement is not None
+        # The outer wheel would need more than its limit at 0.8 m/s on this circle.
+        assert (planner.refinement.speed_part < 1.0) is (speed > 0.5)
+        found[speed] = plan.wheel_speeds, np.hypot(*plan.trajectory[:, :2].T) - RADIUS_M
+    return found
+
+
+def test_a_refined_plan_stays_on_the_line(drive_on: dict[float, tuple[np.ndarray, np.ndarray]]) -> None:
+    """A robot on the circle is planned to stay within a millimetre of it; sampling alone is not as near."""
+    assert np.abs(drive_on[0.2][1]).max() < 1e-3
+
+
+def test_a_line_too_fast_for_the_wheels_is_followed_slower(
+    drive_on: dict[float, tuple[np.ndarray, np.ndarray]],
+) -> None:
+    """Where the outer wheel cannot reach the speed, the plan keeps the limits and the line."""
+    commands, off_m = drive_on[0.8]
+    assert np.abs(commands).max() <= LIMITS.speed_rad_s
+    assert np.abs(np.diff(commands, axis=0)).max() <= LIMITS.acceleration_rad_s2 * 0.1 + 1e-9
+    assert np.abs(off_m).max() < 5e-3
+
+
+def test_warming_up_compiles_the_refinement() -> None:
+    """The refinement is compiled before the robot reaches its line, though warming up plans far from it."""
+    planner = Disco(MODEL, CircleCost(radius_m=RADIUS_M), SETTINGS, LIMITS)
+    planner.warm_up()
+    assert planner.refinement is not None
+    assert planner.refinement.is_compiled
+
+
+def test_plans_are_refined_only_where_the_settings_say_so() -> None:
+    """Neither the paper's mode nor the default refines, so that their plans and logs stay as they were."""
+    for settings in (DiscoSettings.paper(), DiscoSettings(uncertainty="point")):
+        assert not settings.refine
+        assert Disco(MODEL, CircleCost(radius_m=RADIUS_M), settings, LIMITS).refinement is None
