@@ -194,7 +194,7 @@ def _wheels(sheet: Sheet, ticks_per_rev: float | None, notes: list[str]) -> tupl
     t_s = sheet.t_s[has_ticks]
     per_rad = ticks_per_rev / (2.0 * math.pi)
     counts, uncertain = _continuous(sheet, ticks[has_ticks], has_ticks, per_rad, notes)
-    angles = counts / per_rad
+    angles = counts * (2.0 * math.pi / ticks_per_rev)
     sheet = _with_new_segments(sheet, t_s, angles, uncertain, sheet.segment[has_ticks], notes)
     segment = sheet.segment[has_ticks]
     derived = np.column_stack([differentiate_angle(t_s, column, segment) for column in angles.T])
