@@ -41,10 +41,6 @@ class Outputs(Protocol):
         """How many commands it has accepted since it started."""
 
     @property
-    def brake(self) -> bool:
-        """Whether the wheels are braked while the driver is off."""
-
-    @property
     def driver_enabled(self) -> bool:
         """Whether the motor driver is on."""
 
@@ -67,8 +63,6 @@ class MonitoredLimits:
     drive_off_s: float = 0.5
     # From 8 rad/s the plant's wheels, with a lag of 0.06 s, need this long to stand once zero is asked for.
     settling_s: float = 0.6
-    # A released wheel rolls out; the robot has to stand 1 s after the fault that it was released for.
-    rolling_s: float = 1.0
     still_rad_s: float = 0.05
 
 
@@ -131,7 +125,7 @@ class WheelMonitor:
             self._ended_sessions.pop(outputs.session, None)
         self._check_limits(now_us, dt_s, setpoints, earlier, before, outputs)
         self._check_time(now_us, dt_s, setpoints, earlier, before, outputs)
-        self._check_wheels(now_us, setpoints, wheel_speeds, outputs)
+        self._check_wheels(now_us, setpoints, wheel_speeds)
         self._last, self._last_us = outputs, now_us
 
     def _check_accepted(
@@ -214,17 +208,14 @@ class WheelMonitor:
                 self._report(now_us, f"setpoint {fastest} rad/s in {outputs.state} where {bound:.2f} is due")
             self._falling_bound = bound
 
-    def _check_wheels(self, now_us: int, setpoints: Pair, wheel_speeds: Pair, outputs: Outputs) -> None:
+    def _check_wheels(self, now_us: int, setpoints: Pair, wheel_speeds: Pair) -> None:
         if any(setpoints):
             self._zero_since_us = None
         elif self._zero_since_us is None:
             self._zero_since_us = now_us
         zero_s = 0.0 if self._zero_since_us is None else (now_us - self._zero_since_us) * 1e-6
         fastest = max(map(abs, wheel_speeds))
-        # A wheel that does not obey is released, and rolls out: neither brake nor speed loop holds it.
-        is_released = not outputs.driver_enabled and not outputs.brake
-        longest_s = self.limits.rolling_s if is_released else self.limits.settling_s
-        if zero_s > longest_s and fastest > self.limits.still_rad_s:
+        if zero_s > self.limits.settling_s and fastest > self.limits.still_rad_s:
             self._report(now_us, f"the wheels turn at {fastest:.3f} rad/s {zero_s:.2f} s after zero was asked for")
 
     def _report(self, now_us: int, text: str) -> None:
