@@ -30,7 +30,7 @@ from drivers.motor.odrive_protocol import (
     stop_confirmation,
     stop_frames,
 )
-from drivers.motor.vendor_parts import Controllers, MotionPermit, Stage
+from drivers.motor.permit import Controllers, MotionPermit, Stage
 from drivers.types import (
     DriverState,
     DriverStats,

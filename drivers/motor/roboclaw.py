@@ -14,8 +14,8 @@ from msgspec.structs import replace
 
 from drivers.motor import roboclaw_protocol as protocol
 from drivers.motor import vendor_parts as parts
+from drivers.motor.permit import Controllers, MotionPermit, Stage
 from drivers.motor.roboclaw_protocol import RoboclawExchange, RoboclawSettings, question, setting, stands, stop_frames
-from drivers.motor.vendor_parts import Controllers, MotionPermit, Stage
 from drivers.types import (
     DriverState,
     DriverStats,

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from drivers.motor import ros2_base_wire as wire
 from drivers.motor import vendor_parts as parts
-from drivers.motor.vendor_parts import Controllers, MotionPermit, Stage
+from drivers.motor.permit import Controllers, MotionPermit, Stage
 from drivers.types import (
     DriverState,
     DriverStats,

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from drivers.motor import vendor_parts as parts
 from drivers.motor import vesc_codec as codec
 from drivers.motor import vesc_settings as declared
-from drivers.motor.vendor_parts import Controllers, MotionPermit, Stage
+from drivers.motor.permit import Controllers, MotionPermit, Stage
 from drivers.types import (
     DriverState,
     DriverStats,
