@@ -377,8 +377,7 @@ class Questions:
     First their version, which firmware 0.5 does not know, so that its silence is the answer; then, where robot.toml
     says at which endpoints, their watchdogs; then what keeps those from running out.
 
-    `known`: all has been answered as robot.toml declares. `refusal`: why they are not driven. `said`: that they are
-    there, once, for whoever takes it away.
+    `known`: all has been answered as robot.toml declares. `refusal`: why they are not driven.
     """
 
     def __init__(self, settings: OdriveSettings) -> None:
@@ -390,11 +389,16 @@ class Questions:
         """Nothing is known of them."""
         self.known, self.version = False, ""
         self.refusal: str | None = None
-        self.said: str | None = None
+        self._said: str | None = None
         self._is_met = False
         self._watchdogs = {node: _Watchdog() for node in self._nodes}
         self._version_tries = self._watchdog_tries = 0
         self._asked_ns = now_ns - _PERIOD_NS
+
+    def news(self) -> str | None:
+        """Return what is to be said, once."""
+        said, self._said = self._said, None
+        return said
 
     def due(self, now_ns: int, all_are_heard: bool) -> list[Frame]:
         """The questions that are due now; only of nodes that idle, as each feeds their watchdogs."""
@@ -469,4 +473,4 @@ class Questions:
         self.known = True
         nodes = ", ".join(map(str, self._nodes))
         version = self.version and f", firmware {self.version}"
-        self.said = f"nodes {nodes} are there: ODrive {self._settings.firmware}{version}{watchdog}"
+        self._said = f"nodes {nodes} are there: ODrive {self._settings.firmware}{version}{watchdog}"
