@@ -27,6 +27,7 @@ from drivers.types import (
     Frame,
     Identity,
     Limit,
+    Limits,
     MotorDriver,
     OutgoingFrame,
     ReceivedFrame,
@@ -76,10 +77,12 @@ class AgilexPort:
         return None if self._state_ns is None else Identity("AgileX base, CAN v2", "", "robot.toml")
 
     @property
-    def limits(self) -> tuple[Limit, Limit]:
+    def limits(self) -> Limits:
         """What robot.toml declares of the base, and the time-out of them all."""
         fastest_rad_s = self._settings.max_speed_m_s / self._settings.wheel_radius_m
-        return Limit(fastest_rad_s, "robot.toml"), Limit(TIMEOUT_S, "fixed")
+        return parts.limits(
+            Limit(fastest_rad_s, "robot.toml"), Limit(TIMEOUT_S, "fixed"), self.table.stop_deceleration_rad_s2
+        )
 
     @property
     def is_stopped(self) -> bool:

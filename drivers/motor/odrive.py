@@ -39,6 +39,7 @@ from drivers.types import (
     Frame,
     Identity,
     Limit,
+    Limits,
     MotorDriver,
     OutgoingFrame,
     ReceivedFrame,
@@ -107,11 +108,15 @@ class OdrivePort:
         return Identity("ODrive", self._settings.firmware, "robot.toml")
 
     @property
-    def limits(self) -> tuple[Limit, Limit]:
+    def limits(self) -> Limits:
         """What robot.toml declares, and the watchdog where it can be read back."""
         it = self._settings
         fastest = Limit(2.0 * math.pi * it.vel_limit_turns_s / it.gear, "robot.toml")
-        return fastest, Limit(it.watchdog_s, "robot.toml" if it.watchdog_endpoints is None else "device")
+        return parts.limits(
+            fastest,
+            Limit(it.watchdog_s, "robot.toml" if it.watchdog_endpoints is None else "device"),
+            self.table.stop_deceleration_rad_s2,
+        )
 
     @property
     def is_stopped(self) -> bool:

@@ -19,6 +19,7 @@ from drivers.types import (
     Frame,
     Identity,
     Limit,
+    Limits,
     MotorDriver,
     OutgoingFrame,
     ReceivedFrame,
@@ -162,9 +163,13 @@ class RoboclawPort:
         return Identity("RoboClaw", str(self._all[0].known["version"]["version"]).strip(), "device")
 
     @property
-    def limits(self) -> tuple[Limit, Limit]:
+    def limits(self) -> Limits:
         """The slowest board's fastest speed, and the serial time-out that is set before each arming and read back."""
-        return Limit(self._fastest_rad_s, "device"), Limit(self._settings.watchdog_s, "device")
+        return parts.limits(
+            Limit(self._fastest_rad_s, "device"),
+            Limit(self._settings.watchdog_s, "device"),
+            self.table.stop_deceleration_rad_s2,
+        )
 
     @property
     def is_stopped(self) -> bool:

@@ -26,6 +26,7 @@ from drivers.types import (
     Frame,
     Identity,
     Limit,
+    Limits,
     MotorDriver,
     OutgoingFrame,
     ReceivedFrame,
@@ -71,9 +72,13 @@ class Ros2BasePort:
         return Identity("ROS 2 base", "", "robot.toml") if is_met else None
 
     @property
-    def limits(self) -> tuple[Limit, Limit]:
+    def limits(self) -> Limits:
         """What robot.toml declares of the base; it reports nothing of that itself."""
-        return Limit(self._settings.fastest_rad_s, "robot.toml"), Limit(self._settings.watchdog_s, "robot.toml")
+        return parts.limits(
+            Limit(self._settings.fastest_rad_s, "robot.toml"),
+            Limit(self._settings.watchdog_s, "robot.toml"),
+            self.table.stop_deceleration_rad_s2,
+        )
 
     @property
     def is_stopped(self) -> bool:

@@ -20,7 +20,6 @@ from drivers.types import (
     DriverStats,
     Frame,
     Identity,
-    Limit,
     Limits,
     OutgoingFrame,
     Readings,
@@ -121,8 +120,8 @@ class Port(Protocol):
         """Which controller answers; None before all of it is known."""
 
     @property
-    def limits(self) -> tuple[Limit, Limit]:
-        """The largest wheel speed (rad/s) and the command time-out (s); asked only when `identity` is known."""
+    def limits(self) -> Limits:
+        """What the controllers keep to, and who says so; asked only when `identity` is known."""
 
     @property
     def is_stopped(self) -> bool:
@@ -198,11 +197,7 @@ class VendorDriver:
     @property
     def limits(self) -> Limits | None:
         """What the controllers keep to, and who says so; None before they are known."""
-        if self._port.identity is None:
-            return None
-        fastest, timeout = self._port.limits
-        slows = Limit(self._table.stop_deceleration_rad_s2, "robot.toml")
-        return Limits(max_wheel_speed_rad_s=fastest, command_timeout_s=timeout, stop_deceleration_rad_s2=slows)
+        return None if self._port.identity is None else self._port.limits
 
     def link_up(self, now_ns: int) -> None:
         """The medium has come up (again): whatever was agreed is void."""

@@ -14,6 +14,8 @@ from drivers.types import (
     DriverState,
     DriverStats,
     Frame,
+    Limit,
+    Limits,
     OutgoingFrame,
     RobotStatus,
     WheelCommand,
@@ -57,10 +59,12 @@ class Odometer:
         self.last, self.t_ns, self.looked_ns, self.is_new = count, t_ns, looked_ns, True
         return plausible
 
-    def take_wrapping(self, count: int, t_ns: int, looked_ns: int, fastest: float, slack: float) -> bool:
-        """As `take`, of a count of 32 bits."""
-        last = count if self.last is None else int(self.last)
-        moved = (count - last + 2**31) % 2**32 - 2**31
+    def take_wrapping(
+        self, count: int, t_ns: int, looked_ns: int, fastest: float, slack: float, *, bits: int = 32
+    ) -> bool:
+        """As `take`, of a count that wraps."""
+        last, half = count if self.last is None else int(self.last), 2 ** (bits - 1)
+        moved = (count - last + half) % (2 * half) - half
         self.last = None if self.last is None else count - moved
         return self.take(count, t_ns, looked_ns, fastest, slack)
 
@@ -111,6 +115,12 @@ def layouts(order: str, *rows: tuple[str, int, str, str]) -> Mapping[str, Layout
     return MappingProxyType(
         {name: Layout(command, order, body, tuple(names.split())) for name, command, body, names in rows}
     )
+
+
+def limits(fastest: Limit, timeout: Limit, stop_deceleration_rad_s2: float) -> Limits:
+    """Of controllers that are slowed down by this host, with what robot.toml declares."""
+    slows = Limit(stop_deceleration_rad_s2, "robot.toml")
+    return Limits(max_wheel_speed_rad_s=fastest, command_timeout_s=timeout, stop_deceleration_rad_s2=slows)
 
 
 def body_speeds(

@@ -20,6 +20,7 @@ from drivers.types import (
     Frame,
     Identity,
     Limit,
+    Limits,
     MotorDriver,
     OutgoingFrame,
     ReceivedFrame,
@@ -105,11 +106,15 @@ class VescPort:
         return Identity("VESC", "", "robot.toml") if seen.missing is seen.refused is None else None
 
     @property
-    def limits(self) -> tuple[Limit, Limit]:
+    def limits(self) -> Limits:
         """What robot.toml declares, and the time-out where all of them report it."""
         settings, reported = self._settings, all(motor.timeout is not None for motor in self._all)
         fastest = Limit(settings.max_erpm / settings.erpm_per_rad_s, "robot.toml")
-        return fastest, Limit(settings.watchdog_s, "device" if reported else "robot.toml")
+        return parts.limits(
+            fastest,
+            Limit(settings.watchdog_s, "device" if reported else "robot.toml"),
+            self.table.stop_deceleration_rad_s2,
+        )
 
     @property
     def is_stopped(self) -> bool:
