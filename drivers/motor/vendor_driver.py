@@ -226,8 +226,8 @@ class VendorDriver:
                 wheels.append(heard.wheels)
         if self._permit.link_is_up:
             self._permit = self._permit.looked(now_ns)
-            self._check_objection()
             self._check_silence(now_ns)
+            self._check_objection()
         events, self._permit = self._permit.events, replace(self._permit, events=())
         return Readings(wheels=tuple(wheels), status=() if status is None else (status,), events=events)
 
