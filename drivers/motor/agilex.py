@@ -22,6 +22,7 @@ from drivers.motor.vendor_driver import (
     Source,
     Table,
     VendorDriver,
+    stop_confirmation,
 )
 from drivers.types import (
     Frame,
@@ -87,6 +88,8 @@ class AgilexPort:
     @property
     def is_stopped(self) -> bool:
         """Whether the base stands in a mode that CAN cannot drive, or one of its buttons is pressed."""
+        if self._state_ns is None or self._motion_ns is None:
+            return False
         standing_by = self._stands and self._mode != protocol.CAN_MODE
         return standing_by or self._vehicle == protocol.EMERGENCY_STOP
 
@@ -220,7 +223,7 @@ DRIVER = MotorDriver(
     recognise=protocol.recognise,
     latches_stop=False,
     stop_frames=stop_frames,
-    stop_confirmation=protocol.stop_confirmation,
+    stop_confirmation=lambda settings: stop_confirmation(AgilexPort(settings)),
     cyclic_frames=protocol.cyclic_frames,
     safety_card=protocol.safety_card,
 )

@@ -34,6 +34,7 @@ from drivers.motor.vendor_driver import (
     Source,
     Table,
     VendorDriver,
+    stop_confirmation,
 )
 from drivers.types import (
     Frame,
@@ -337,7 +338,7 @@ DRIVER = MotorDriver(
     example=protocol.EXAMPLE,
     recognise=protocol.recognise,
     stop_frames=stop_frames,
-    stop_confirmation=protocol.stop_confirmation,
+    stop_confirmation=lambda settings: stop_confirmation(OdrivePort(settings)),
     cyclic_frames=protocol.cyclic_frames,
     safety_card=protocol.safety_card,
 )

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import enum
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
@@ -288,24 +288,6 @@ def error_words(generation: Generation, error: int) -> str:
 def stop_frames(settings: OdriveSettings) -> tuple[Frame, ...]:
     """The e-stop to every node: it idles with an error that stays until it is cleared."""
     return tuple(encode(settings.generation, node, "Estop") for node in all_of(settings.nodes))
-
-
-def stop_confirmation(settings: OdriveSettings) -> Callable[[Frame], bool]:
-    """Return what says, frame by frame heard, whether every node has reported the e-stop and a released motor."""
-    waiting = set(all_of(settings.nodes))
-
-    def heard(frame: Frame) -> bool:
-        decoded = decode(settings.generation, frame)
-        beat = decoded if decoded is not None and decoded.name == "Heartbeat" else None
-        if beat is None:
-            return not waiting
-        # The error is latched by the frame; the motor is released a control cycle later.
-        is_released = int(beat.values["axis_state"]) != AxisState.CLOSED_LOOP
-        if is_released and int(beat.values["axis_error"]) & ESTOP_ERROR[settings.generation]:
-            waiting.discard(beat.node)
-        return not waiting
-
-    return heard
 
 
 def cyclic_frames(settings: OdriveSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:

@@ -14,7 +14,17 @@ from drivers.motor import roboclaw_protocol as protocol
 from drivers.motor import vendor_parts as parts
 from drivers.motor.permit import Controllers, MotionPermit, Stage
 from drivers.motor.roboclaw_protocol import RoboclawExchange, RoboclawSettings, question, setting, stands, stop_frames
-from drivers.motor.vendor_driver import IMPLAUSIBLE, UNKNOWN, Heard, Objection, Pending, Source, Table, VendorDriver
+from drivers.motor.vendor_driver import (
+    IMPLAUSIBLE,
+    UNKNOWN,
+    Heard,
+    Objection,
+    Pending,
+    Source,
+    Table,
+    VendorDriver,
+    stop_confirmation,
+)
 from drivers.types import (
     Frame,
     Identity,
@@ -174,7 +184,7 @@ class RoboclawPort:
     @property
     def is_stopped(self) -> bool:
         """Whether every board has taken a stop, and its motors stand."""
-        return self._stands and all(board.stopped for board in self._all)
+        return all(board.stopped and "speeds" in board.known for board in self._all) and self._stands
 
     def begin_anew(self, now_ns: int) -> None:
         """Forget what the boards said."""
@@ -378,7 +388,7 @@ DRIVER = MotorDriver(
     questions=protocol.QUESTIONS,
     latches_stop=False,
     stop_frames=stop_frames,
-    stop_confirmation=protocol.stop_confirmation,
+    stop_confirmation=lambda settings: stop_confirmation(RoboclawPort(settings)),
     cyclic_frames=protocol.cyclic_frames,
     safety_card=protocol.safety_card,
 )

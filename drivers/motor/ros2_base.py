@@ -21,6 +21,7 @@ from drivers.motor.vendor_driver import (
     Source,
     Table,
     VendorDriver,
+    stop_confirmation,
 )
 from drivers.types import (
     Frame,
@@ -83,7 +84,8 @@ class Ros2BasePort:
     @property
     def is_stopped(self) -> bool:
         """Whether the bridge has latched a stop and the base stands, or a button of it is pressed."""
-        return bool((self._flags & wire.LATCHED and self._stands) or self._flags & wire.BUTTON)
+        is_latched = self._flags & wire.LATCHED and not self._flags & wire.DRIVING
+        return bool((is_latched and self._wheels_ns is not None and self._stands) or self._flags & wire.BUTTON)
 
     def begin_anew(self, now_ns: int) -> None:
         """Forget what the bridge said."""
@@ -243,7 +245,7 @@ DRIVER = MotorDriver(
     takes_body_speeds=True,
     example=wire.EXAMPLE,
     stop_frames=wire.stop_frames,
-    stop_confirmation=wire.stop_confirmation,
+    stop_confirmation=lambda settings: stop_confirmation(Ros2BasePort(settings)),
     cyclic_frames=wire.cyclic_frames,
     safety_card=wire.safety_card,
 )

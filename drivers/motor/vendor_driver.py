@@ -7,7 +7,7 @@ permit to move and hands it to the port as a value; the port never changes it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import msgspec
@@ -31,6 +31,7 @@ from drivers.types import (
 )
 
 ARMING_TIMEOUT_NS = 1_500_000_000
+_LONG_AFTER_NS = 3_600_000_000_000
 
 
 class Table(msgspec.Struct, frozen=True, kw_only=True):
@@ -125,7 +126,7 @@ class Port(Protocol):
 
     @property
     def is_stopped(self) -> bool:
-        """Whether the controllers confirm that an e-stop holds."""
+        """Whether the controllers have confirmed, since they were met, that an e-stop holds."""
 
     def begin_anew(self, now_ns: int) -> None:
         """Forget what was heard: the link or the controllers have restarted. What the wheels have turned stays."""
@@ -165,6 +166,21 @@ class Port(Protocol):
 
     def stop_frames(self) -> tuple[Frame, ...]:
         """The e-stop to all controllers."""
+
+
+def stop_confirmation(port: Port) -> Callable[[Frame], bool]:
+    """Return what says, frame by frame heard, whether the controllers have confirmed an e-stop that was sent to them.
+
+    `port`: a fresh one, for a connection beside the driver's.
+    """
+    permit = MotionPermit(link_is_up=True, stage=Stage.BRAKING)
+
+    def heard(frame: Frame) -> bool:
+        # Long after any command: none of this connection's can be under way.
+        port.take(ReceivedFrame(_LONG_AFTER_NS, frame), permit)
+        return port.is_stopped
+
+    return heard
 
 
 class VendorDriver:

@@ -15,7 +15,17 @@ from drivers.motor import vendor_parts as parts
 from drivers.motor import vesc_codec as codec
 from drivers.motor import vesc_settings as declared
 from drivers.motor.permit import Controllers, MotionPermit, Stage
-from drivers.motor.vendor_driver import IMPLAUSIBLE, UNKNOWN, Heard, Objection, Pending, Source, Table, VendorDriver
+from drivers.motor.vendor_driver import (
+    IMPLAUSIBLE,
+    UNKNOWN,
+    Heard,
+    Objection,
+    Pending,
+    Source,
+    Table,
+    VendorDriver,
+    stop_confirmation,
+)
 from drivers.types import (
     Frame,
     Identity,
@@ -119,7 +129,7 @@ class VescPort:
     @property
     def is_stopped(self) -> bool:
         """Whether every motor stands, as it said last: nothing else confirms a stop here."""
-        return all(motor.stands for motor in self._all)
+        return all(motor.erpm_ns is not None and motor.stands for motor in self._all)
 
     def begin_anew(self, now_ns: int) -> None:
         """Forget what the controllers said."""
@@ -193,10 +203,9 @@ class VescPort:
 
     def brake(self, now_ns: int, lasts_ns: int) -> tuple[Sequence[Frame], bool]:
         """Brake by a current until the motors stand, then let go."""
-        known = all(motor.erpm_ns is not None for motor in self._all)
         # One that still says that it turns may be on a slope; of one that has fallen silent nobody knows.
         says_it_turns = any(not m.stands and now_ns - (m.erpm_ns or 0) < SILENT_NS for m in self._all)
-        if (known and self.is_stopped) or (lasts_ns > BRAKING_NS and not says_it_turns):
+        if self.is_stopped or (lasts_ns > BRAKING_NS and not says_it_turns):
             return [codec.command(motor.node, "set_current", 0.0) for motor in self._all], True
         amperes = self._settings.brake_current_a
         return [codec.command(motor.node, "set_brake_current", amperes) for motor in self._all], False
@@ -300,7 +309,7 @@ DRIVER = MotorDriver(
     recognise=declared.recognise,
     latches_stop=False,
     stop_frames=declared.stop_frames,
-    stop_confirmation=declared.stop_confirmation,
+    stop_confirmation=lambda settings: stop_confirmation(VescPort(settings)),
     cyclic_frames=declared.cyclic_frames,
     safety_card=declared.safety_card,
     kinds=("can", "serial"),
