@@ -68,7 +68,7 @@ cross-tools:
 
 # The firmware on an emulated Cortex-M3 and M4F: what it costs there, and what holds of it over its serial line.
 firmware-emulated: $(STAMP) cross-tools
-	$(BIN)/python -m tools.firmware_figures --check
+	$(BIN)/python -m tools.generate.firmware_figures --check
 	$(BIN)/python -m pytest -n 0 -rs -m long tests/firmware_protocol/emulated
 
 # Real ROS 2, 230 MB, in an environment of its own. Its wheels are not made for each Python; without them its tests are
@@ -93,7 +93,7 @@ test-long:
 
 # Whether `make test` is ever red by chance: ten fresh clones, the last five beside four busy processes. An hour.
 test-clones: $(STAMP)
-	$(BIN)/python -m tools.clones 10 --busy 5 --most 240 --more 120
+	$(BIN)/python -m tools.check.clones 10 --busy 5 --most 240 --more 120
 
 # The peers that our figures stand beside, and nothing else needs: in an environment of their own, on top of ours.
 PEERS := .venv-bench
@@ -106,7 +106,7 @@ $(PEERS)/.installed: $(STAMP)
 		$$($(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["bench"])')
 	@touch $@
 
-# PARTS names some of tools/bench_*.py; without it all of them run.
+# PARTS names some of those in tools/bench/__main__.py; without it all of them run.
 PARTS ?=
 bench: $(PEERS)/.installed
 	$(PEERS)/bin/python -m tools.bench $(PARTS)
@@ -115,7 +115,7 @@ gap-study: $(STAMP)
 	$(BIN)/python -m $(if $(filter mujoco,$(KIND)),tools.gap_mujoco,tools.gap_study $(KIND))
 
 soak: $(STAMP)
-	$(BIN)/python -m tools.soak --minutes 30
+	$(BIN)/python -m tools.check.soak --minutes 30
 
 fault-campaign: $(STAMP)
 	$(BIN)/python -m tools.fault_campaign --seeds 100 --hours 1
@@ -123,23 +123,23 @@ fault-campaign: $(STAMP)
 # The tests of properties, too, with new examples.
 PROPERTY_TESTS = $$(grep -rl hypothesis tests --include=test_*.py)
 fuzz: $(STAMP)
-	$(BIN)/python -m tools.fuzz
-	$(BIN)/python -m tools.fuzz_wire
+	$(BIN)/python -m tools.check.fuzz
+	$(BIN)/python -m tools.check.fuzz_wire
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --hypothesis-profile=search $(PROPERTY_TESTS)
 
 firmware-check: $(STAMP)
-	$(BIN)/python -m tools.firmware_check
+	$(BIN)/python -m tools.check.firmware_check
 
 # More than an hour on two cores.
 firmware-mutants: $(STAMP)
 	$(BIN)/python -m tools.firmware_mutants
 
 socketcan-test: $(STAMP)
-	$(BIN)/python -m tools.socketcan_test
+	$(BIN)/python -m tools.check.socketcan_test
 
 # Firmware core, estimation and kernels on aarch64, emulated where this is none: 240 MB to download.
 test-arm: $(STAMP)
-	nice -n 19 $(BIN)/python -m tools.test_arm
+	nice -n 19 $(BIN)/python -m tools.check.test_arm
 
 clean:
 	rm -rf $(VENV) $(PEERS) $(ROS) build *.egg-info firmware_protocol/_firmware*

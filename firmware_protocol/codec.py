@@ -74,7 +74,7 @@ class Protocol:
 
 @dataclass(frozen=True, slots=True)
 class Tables:
-    """What tools/generate_protocol.py writes for Python: the tables, and the CRC-32 of the DBC that they are of."""
+    """What tools/generate/protocol.py writes for Python: the tables, and the CRC-32 of the DBC that they are of."""
 
     crc: int
     protocol: Protocol
@@ -103,7 +103,7 @@ def dbc_hash(text: str) -> int:
 
 @cache
 def packaged_protocol() -> Protocol:
-    """Return the tables of the packaged DBC, from what tools/generate_protocol.py wrote of them if that is current."""
+    """Return the tables of the packaged DBC, from what tools/generate/protocol.py wrote of them if that is current."""
     text = packaged_dbc()
     try:
         written = resources.files("firmware_protocol").joinpath(TABLES).read_bytes()

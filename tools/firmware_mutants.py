@@ -23,8 +23,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from firmware_protocol.build_firmware import PACKAGE, SOURCES, make_ffi
-from tools.firmware_check import build_harness, run_harness
-from tools.mutation import QUICK, Mutant, mutants
+from tools.check.firmware_check import build_harness, run_harness
+from tools.check.mutation import QUICK, Mutant, mutants
 
 ROOT = Path(__file__).resolve().parent.parent
 FIRMWARE = PACKAGE / "firmware"

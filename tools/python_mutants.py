@@ -28,7 +28,7 @@ from typing import Any
 
 import pytest
 
-from tools.mutation import QUICK, Mutant, marked
+from tools.check.mutation import QUICK, Mutant, marked
 
 ROOT = Path(__file__).resolve().parent.parent
 EQUIVALENTS = Path(__file__).with_name("python_equivalents.toml")

@@ -9,7 +9,7 @@ What robot.toml says of a base follows the frames, with e-stop, bus load and saf
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated, Any
@@ -145,21 +145,6 @@ class AgilexSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 def stop_frames(_settings: AgilexSettings) -> tuple[Frame, ...]:
     """Zero and standby: the base has no e-stop by frame."""
     return motion(0.0, 0.0), control_mode(STANDBY)
-
-
-def stop_confirmation(_settings: AgilexSettings) -> Callable[[Frame], bool]:
-    """Return what says, frame by frame heard, whether the base is in no mode that CAN can drive, and stands."""
-    said = {"stands": False, "left": False}
-
-    def heard(frame: Frame) -> bool:
-        decoded = decode(frame)
-        if decoded is not None and decoded.name == "system_state":
-            said["left"] = decoded.values["control_mode"] != CAN_MODE
-        elif decoded is not None and decoded.name == "motion_state":
-            said["stands"] = stands(decoded)
-        return all(said.values())
-
-    return heard
 
 
 def stands(motion: Decoded) -> bool:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import enum
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
@@ -290,24 +290,6 @@ def stop_frames(settings: OdriveSettings) -> tuple[Frame, ...]:
     return tuple(encode(settings.generation, node, "Estop") for node in all_of(settings.nodes))
 
 
-def stop_confirmation(settings: OdriveSettings) -> Callable[[Frame], bool]:
-    """Return what says, frame by frame heard, whether every node has reported the e-stop and a released motor."""
-    waiting = set(all_of(settings.nodes))
-
-    def heard(frame: Frame) -> bool:
-        decoded = decode(settings.generation, frame)
-        beat = decoded if decoded is not None and decoded.name == "Heartbeat" else None
-        if beat is None:
-            return not waiting
-        # The error is latched by the frame; the motor is released a control cycle later.
-        is_released = int(beat.values["axis_state"]) != AxisState.CLOSED_LOOP
-        if is_released and int(beat.values["axis_error"]) & ESTOP_ERROR[settings.generation]:
-            waiting.discard(beat.node)
-        return not waiting
-
-    return heard
-
-
 def cyclic_frames(settings: OdriveSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:
     """Velocities, heartbeats and encoder estimates (each 10 ms) of every node."""
     frames: list[CyclicFrame] = []
@@ -377,8 +359,7 @@ class Questions:
     First their version, which firmware 0.5 does not know, so that its silence is the answer; then, where robot.toml
     says at which endpoints, their watchdogs; then what keeps those from running out.
 
-    `known`: all has been answered as robot.toml declares. `refusal`: why they are not driven. `said`: that they are
-    there, once, for whoever takes it away.
+    `known`: all has been answered as robot.toml declares. `refusal`: why they are not driven.
     """
 
     def __init__(self, settings: OdriveSettings) -> None:
@@ -390,11 +371,16 @@ class Questions:
         """Nothing is known of them."""
         self.known, self.version = False, ""
         self.refusal: str | None = None
-        self.said: str | None = None
+        self._said: str | None = None
         self._is_met = False
         self._watchdogs = {node: _Watchdog() for node in self._nodes}
         self._version_tries = self._watchdog_tries = 0
         self._asked_ns = now_ns - _PERIOD_NS
+
+    def news(self) -> str | None:
+        """Return what is to be said, once."""
+        said, self._said = self._said, None
+        return said
 
     def due(self, now_ns: int, all_are_heard: bool) -> list[Frame]:
         """The questions that are due now; only of nodes that idle, as each feeds their watchdogs."""
@@ -469,4 +455,4 @@ class Questions:
         self.known = True
         nodes = ", ".join(map(str, self._nodes))
         version = self.version and f", firmware {self.version}"
-        self.said = f"nodes {nodes} are there: ODrive {self._settings.firmware}{version}{watchdog}"
+        self._said = f"nodes {nodes} are there: ODrive {self._settings.firmware}{version}{watchdog}"

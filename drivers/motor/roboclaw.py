@@ -10,26 +10,30 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from msgspec.structs import replace
-
 from drivers.motor import roboclaw_protocol as protocol
 from drivers.motor import vendor_parts as parts
+from drivers.motor.permit import Controllers, MotionPermit, Stage
 from drivers.motor.roboclaw_protocol import RoboclawExchange, RoboclawSettings, question, setting, stands, stop_frames
-from drivers.motor.vendor_parts import Controllers, MotionPermit, Stage
+from drivers.motor.vendor_driver import (
+    IMPLAUSIBLE,
+    UNKNOWN,
+    Heard,
+    Objection,
+    Pending,
+    Source,
+    Table,
+    VendorDriver,
+    stop_confirmation,
+)
 from drivers.types import (
-    DriverState,
-    DriverStats,
     Frame,
     Identity,
     Limit,
     Limits,
     MotorDriver,
     OutgoingFrame,
-    Readings,
     ReceivedFrame,
     Request,
-    RobotStatus,
-    WheelCommand,
     WheelSample,
 )
 
@@ -52,12 +56,25 @@ _WORDS = {
 TO_KNOW = ("version", "velocity_pid_m1", "velocity_pid_m2", "status", "serial_timeout", "speeds", "encoders")
 
 
+ZEROS_TO_ARM = 5
+SILENT_NS, GONE_NS = 100_000_000, 500_000_000
+BRAKING_NS = 3_000_000_000
+_PACE_NS = 18_000_000
+_REPEAT_NS = 100_000_000
+_QUESTION_LIFE_NS = 20_000_000
+_QUESTION_RANK = 2
+_LONGEST_LIFE_NS = 60_000_000
+_TIMEOUT_EVERY = 8
+"""Of the slow questions every so many is for the serial timeout, the others for the errors."""
+_SETTER_NAMES = {layout.command: name for name, layout in protocol.SETTERS.items()}
+
+
 @dataclass(slots=True)
 class Board:
     """What is known of one board, by question; `turned` of both motors.
 
-    `stopped`: it has taken a stop since the last command. `waits_ns`: since when it has not answered, `refuses_ns`
-    since when it has taken no command.
+    `stopped`: it has taken a stop since the last command. `timeout_ds`: its serial timeout in steps of 0.1 s, as read
+    since arming began. `waits_ns`: since when it has not answered, `refuses_ns` since when it has taken no command.
     """
 
     address: int
@@ -65,6 +82,7 @@ class Board:
     turned: tuple[parts.Odometer, parts.Odometer] = field(default_factory=lambda: (parts.Odometer(), parts.Odometer()))
     stopped: bool = False
     zeros: int = 0
+    timeout_ds: int | None = None
     waits_ns: int | None = None
     refuses_ns: int | None = None
 
@@ -72,11 +90,6 @@ class Board:
     def errors(self) -> int:
         """The bits of its status that are no warnings."""
         return int(self.known["status"]["status_u32"]) & _ERRORS if "status" in self.known else 0
-
-    @property
-    def timeout_ds(self) -> int | None:
-        """Its serial timeout as read last, in steps of 0.1 s."""
-        return int(self.known["serial_timeout"]["timeout_ds"]) if "serial_timeout" in self.known else None
 
     @property
     def fastest_counts_s(self) -> float:
@@ -118,56 +131,36 @@ class Board:
 
     def meet_anew(self) -> None:
         """Nothing is known of it but what its motors have turned."""
-        self.known, self.waits_ns = {}, None
+        self.known, self.waits_ns, self.timeout_ds = {}, None, None
         for motor in self.turned:
             motor.begin_anew()
 
 
-ZEROS_TO_ARM = 5
-SILENT_NS = 100_000_000
-GONE_NS = 500_000_000
-ARMING_TIMEOUT_NS = 1_500_000_000
-BRAKING_NS = 3_000_000_000
-_PACE_NS = 18_000_000
-_REPEAT_NS = 100_000_000
-_QUESTION_LIFE_NS = 20_000_000
-_QUESTION_RANK = 2
-_LONGEST_LIFE_NS = 60_000_000
-_TIMEOUT_EVERY = 8
-"""Of the slow questions every so many is for the serial timeout, the others for the errors."""
-_SETTER_NAMES = {layout.command: name for name, layout in protocol.SETTERS.items()}
-
-
-class RoboclawDriver:
-    """Satisfies `drivers.types.Driver`: pure, and no frame makes it raise."""
-
-    clock_offset_ns: int | None = None
+class RoboclawPort:
+    """Satisfies `drivers.motor.vendor_driver.Port`."""
 
     def __init__(self, settings: RoboclawSettings) -> None:
         self._settings = settings
+        # They have no armed state to fall out of, and whatever ends a drive must have taken a stop.
+        self.table = Table(
+            stop_deceleration_rad_s2=settings.stop_deceleration_rad_s2,
+            watchdog_s=settings.watchdog_s,
+            idle=Stage.BRAKING,
+            after_loss=Stage.BRAKING,
+            begins=Stage.BRAKING,
+        )
         self._boards = {address: Board(address) for address in settings.addresses}
-        self.stats = DriverStats()
-        self._permit = MotionPermit(idle=Stage.BRAKING, after_loss=Stage.BRAKING, stage=Stage.BRAKING)
         self._velocity_ns = self._asked_ns = self._repeat_ns = 0
         self._slow = 0
 
     @property
-    def state(self) -> DriverState:
-        """Where the driver is with its boards."""
-        return self._permit.state(self._seen)
-
-    @property
-    def detail(self) -> str:
-        """For a person: why the state is what it is, and what to do about it."""
-        return self._permit.detail(self._seen)
-
-    @property
-    def _seen(self) -> Controllers:
+    def seen(self) -> Controllers:
+        """How the boards are."""
         silent = ", ".join(str(board.address) for board in self._all if not board.is_known)
         missing = f"board {silent} does not answer; is it switched on, in packet serial, at this baud and address?"
         pressed = any(board.is_pressed for board in self._all)
         return Controllers(
-            missing=None if self._is_known else missing,
+            missing=missing if silent else None,
             stopped="its e-stop input is pressed" if pressed else None,
             faulty="; ".join(board.error_words for board in self._all if board.errors) or None,
         )
@@ -180,135 +173,154 @@ class RoboclawDriver:
         return Identity("RoboClaw", str(self._all[0].known["version"]["version"]).strip(), "device")
 
     @property
-    def limits(self) -> Limits | None:
-        """The slowest board's fastest speed, the serial time-out that was read back, and what robot.toml declares."""
-        if self.identity is None:
-            return None
-        settings = self._settings
-        return Limits(
-            max_wheel_speed_rad_s=Limit(self._fastest_rad_s, "device"),
-            command_timeout_s=Limit(settings.watchdog_s, "device"),
-            stop_deceleration_rad_s2=Limit(settings.stop_deceleration_rad_s2, "robot.toml"),
+    def limits(self) -> Limits:
+        """The slowest board's fastest speed, and the serial time-out that is set before each arming and read back."""
+        return parts.limits(
+            Limit(self._fastest_rad_s, "device"),
+            Limit(self._settings.watchdog_s, "device"),
+            self.table.stop_deceleration_rad_s2,
         )
 
-    def link_up(self, now_ns: int) -> None:
-        """The medium has come up (again): whatever was agreed is void."""
-        self._meet_anew(self._permit.linked(True))
+    @property
+    def is_stopped(self) -> bool:
+        """Whether every board has taken a stop, and its motors stand."""
+        return all(board.stopped and "speeds" in board.known for board in self._all) and self._stands
 
-    def link_down(self, now_ns: int) -> None:
-        """The medium is gone: whatever was agreed is void."""
-        self._meet_anew(self._permit.linked(False))
+    def begin_anew(self, now_ns: int) -> None:
+        """Forget what the boards said."""
+        for board in self._all:
+            board.meet_anew()
 
-    def request(self, request: Request) -> None:
-        """Set what the host wants; ARM only from standing by, and consumed when the motors are stopped."""
-        before, self._permit = self._permit, self._permit.requested(request, self._seen)
-        if self._permit.wanted is Request.ARM is not before.wanted:
-            self._count("sessions")
+    def end_drive(self) -> None:
+        """Each board is to take a stop from now on."""
+        self._asked_ns = 0
+        for board in self._all:
+            board.stopped, board.refuses_ns = False, None
+
+    def take(self, received: ReceivedFrame, permit: MotionPermit) -> Heard:
+        """Take in a reply."""
+        frame, t_ns = received.frame, received.t_ns
+        address, command = divmod(frame.can_id, 256)
+        board = self._boards.get(address)
+        if board is None or frame.extended:
+            return UNKNOWN
+        name = protocol.getter_name(command)
+        if name is None:
+            return self._take_acknowledgement(board, frame, t_ns, permit.stage)
+        read = protocol.reply(address, name, frame.data)
+        if read is None:
+            return Heard(counts=("rejected_crc",))
+        board.waits_ns = None
+        plausible = name != "encoders" or board.take_counts(read[0], t_ns, permit.looked_ns)
+        board.known[name] = read[0]
+        if name == "speeds":
+            board.turned[0].speed, board.turned[1].speed = board.speeds
+        elif name == "serial_timeout":
+            board.timeout_ds = int(read[0]["timeout_ds"])
+        is_status = name == "encoders" and self._is_known
+        is_new = is_status and all(each.is_new for one in self._all for each in one.turned)
+        wheels = self._sample(t_ns) if is_new else None
+        if plausible:
+            return Heard(is_status=is_status, wheels=wheels)
+        jumped = f"board {address} has restarted: its counts jumped"
+        return Heard(counts=IMPLAUSIBLE, is_status=is_status, wheels=wheels, lost=jumped)
+
+    def sources(self) -> Sequence[Source]:
+        """The replies of each board that is known."""
+        return [
+            Source(f"board {board.address}", board.waits_ns if board.known else None, SILENT_NS, GONE_NS)
+            for board in self._all
+        ]
+
+    def objection(self, permit: MotionPermit) -> Objection | None:
+        """Errors, commands not taken, and a timeout that is not the one set."""
+        for board in self._all:
+            refused_ns = 0 if board.refuses_ns is None else permit.silent_ns(board.refuses_ns)
+            if board.errors:
+                return Objection(board.error_words)
+            if refused_ns > SILENT_NS:
+                return Objection(f"board {board.address} does not take its commands")
+            if permit.stage is Stage.ARMED and board.timeout_ds != self._settings.timeout_ds:
+                why = "its serial timeout is not the one that was set"
+                return Objection(f"board {board.address} has restarted: {why}")
+        return None
+
+    def prepare(self, now_ns: int, permit: MotionPermit) -> Pending | None:
+        """The serial timeout, set and read back, and then zeros that each board takes."""
+        if permit.lasts_ns(now_ns) == 0:
             self._repeat_ns = 0
             for board in self._all:
-                board.zeros, board.stopped = 0, False
-                # A board that has restarted since has forgotten it.
-                del board.known["serial_timeout"]
+                # A board that has restarted since has forgotten its timeout.
+                board.zeros, board.stopped, board.timeout_ds = 0, False, None
+        if not self._stands:
+            return Pending(why="a motor turns; wait until it stands", is_final=True)
+        wanted = self._settings.timeout_ds
+        without = [board.address for board in self._all if board.timeout_ds != wanted]
+        if without:
+            why = f"board {without[0]} does not take its serial timeout"
+            if now_ns - self._repeat_ns < _REPEAT_NS:
+                return Pending(why=why)
+            self._repeat_ns = now_ns
+            sets = (setting(address, "set_serial_timeout", timeout_ds=wanted) for address in without)
+            asks = (question(address, "serial_timeout") for address in without)
+            return Pending(why=why, frames=tuple(frame for pair in zip(sets, asks, strict=True) for frame in pair))
+        if all(board.zeros >= ZEROS_TO_ARM for board in self._all):
+            return None
+        return Pending(why="a board does not take zeros", frames=tuple(self.speeds(now_ns, 0.0, 0.0)))
 
-    def receive(self, now_ns: int, frames: Sequence[ReceivedFrame]) -> Readings:
-        """Take in replies and return what they meant; those that come while the link is down are ignored."""
-        wheels: list[WheelSample] = []
-        status: list[RobotStatus] = []
-        for received in frames if self._permit.link_is_up else ():
-            address, command = divmod(received.frame.can_id, 256)
-            board = self._boards.get(address)
-            if board is None or received.frame.extended:
-                self._count("unknown_id")
-                continue
-            name = protocol.getter_name(command)
-            if name is None:
-                self._take_acknowledgement(board, received.frame, received.t_ns)
-                continue
-            read = protocol.reply(address, name, received.frame.data)
-            if read is None:
-                self._count("rejected_crc")
-                continue
-            self._heard(board)
-            if name == "encoders":
-                self._take_counts(board, read[0], received.t_ns)
-            board.known[name] = read[0]
-            if name == "speeds":
-                board.turned[0].speed, board.turned[1].speed = board.speeds
-            if name == "encoders" and self._is_known:
-                status.append(self._status(received.t_ns))
-                if all(each.is_new for board in self._all for each in board.turned):
-                    wheels.append(self._sample(received.t_ns))
-        if self._permit.link_is_up:
-            self._check(now_ns)
-        events, self._permit = self._permit.events, replace(self._permit, events=())
-        return Readings(wheels=tuple(wheels), status=tuple(status[-1:]), events=events)
+    def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
+        """The speeds of each board's motors."""
+        settings, self._velocity_ns = self._settings, now_ns
+        per_board = {address: [0.0, 0.0] for address in self._boards}
+        fastest, wanted = self._fastest_rad_s, (left_rad_s, right_rad_s)
+        for side, direction, speed in zip(settings.sides, settings.direction, wanted, strict=True):
+            for address, motor in side:
+                per_board[address][motor] = direction * min(max(speed, -fastest), fastest) * settings.counts_per_rad
+        accel = max(1, round(settings.acceleration_rad_s2 * settings.counts_per_rad))
+        frames = []
+        for board in self._all:
+            board.refuses_ns = now_ns if board.refuses_ns is None else board.refuses_ns
+            board.stopped = False
+            first, second = map(round, per_board[board.address])
+            speeds = {"speed_m1_counts_s": first, "speed_m2_counts_s": second}
+            frames.append(setting(board.address, "speed_accel_m1m2", accel_counts_s2=accel, **speeds))
+        return frames
 
-    def transmit(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
-        """Packets due now: the command, or what stops; and the questions, which feed the serial timeout.
-
-        Raises ValueError for a command that is not finite or valid for no time.
-        """
-        parts.check_command(command)
-        if not self._permit.link_is_up:
-            return ()
-        if self._permit.is_late(now_ns, self._settings.watchdog_s):
-            # They have no armed state to fall out of: the next speed would move them again.
-            self._stop(self._permit.lost("no command for longer than the boards' serial timeout"))
-            return self._brake(now_ns)
-        match self._permit.stage:
-            case Stage.REST:
-                return (*self._reset(now_ns), *self._paced_questions(now_ns))
-            case Stage.ARMING:
-                return self._arm(now_ns)
-            case Stage.STOPPING:
-                return self._ramp(now_ns)
-            case Stage.BRAKING:
-                return self._brake(now_ns)
-        if command is None:
-            return ()
-        self._permit = self._permit.commanded(now_ns, command)
-        self._count("commands_sent")
-        return (*parts.commanding(now_ns, command, *self._velocity(now_ns)), *self._questions(now_ns, self._all))
-
-    def release(self, why: str) -> None:
-        """Zero duty for every motor from now on, which needs no encoder."""
-        self._stop(self._permit.lost(why))
-
-    def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
-        """Packets that stop every motor in any state; the driver goes on with that until they are taken."""
-        self._stop(self._permit.stopped())
-        return parts.estop_frames(now_ns, self._stops(self._all))
-
-    @property
-    def _all(self) -> Sequence[Board]:
-        return tuple(self._boards.values())
-
-    @property
-    def _is_known(self) -> bool:
-        arming = self._permit.stage is Stage.ARMING
-        return all(board.is_known or (arming and "encoders" in board.known) for board in self._all)
-
-    @property
-    def _stands(self) -> bool:
-        return all(stands(self._settings, *board.speeds) for board in self._all)
-
-    @property
-    def _fastest_rad_s(self) -> float:
-        return min(board.fastest_counts_s for board in self._all) / self._settings.counts_per_rad
-
-    def _stops(self, boards: Sequence[Board]) -> tuple[Frame, ...]:
-        return tuple(setting(board.address, "duty_m1m2", duty_m1=0, duty_m2=0) for board in boards)
-
-    def _paced_questions(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
+    def brake(self, now_ns: int, lasts_ns: int) -> tuple[Sequence[Frame], bool]:
+        """Zero duty for each board until it takes it, and before that no question, which would feed its timeout."""
+        waiting = [board for board in self._all if not board.stopped]
+        is_over = not waiting and self._is_known and (self._stands or lasts_ns > BRAKING_NS)
         if now_ns - self._asked_ns < _PACE_NS:
+            return (), is_over
+        for board in waiting:
+            board.waits_ns = now_ns if board.waits_ns is None else board.waits_ns
+        return [_stop(board.address) for board in waiting], is_over
+
+    def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
+        """Reset an e-stop that a board has latched, when asked; it ends its other errors by itself."""
+        latched = [board.address for board in self._all if board.is_pressed]
+        if permit.wanted is not Request.RESET or not latched or now_ns - self._repeat_ns < _REPEAT_NS:
             return ()
-        return self._questions(now_ns, [board for board in self._all if board.stopped])
+        self._repeat_ns = now_ns
+        return [setting(address, "reset_estop") for address in latched]
 
-    def _questions(self, now_ns: int, boards: Sequence[Board]) -> tuple[OutgoingFrame, ...]:
-        """What is still unknown of a board, one question at a time; of a known one speeds and counts.
+    def may_reset(self, now_ns: int) -> bool:
+        """Whatever matters is seen."""
+        return True
 
-        And of one board in turn its errors or its serial timeout.
+    def questions(self, now_ns: int, permit: MotionPermit) -> tuple[OutgoingFrame, ...]:
+        """Of boards with a command in this tick; or, in their own pace, of those that have taken a stop.
+
+        What is still unknown of a board, one question at a time; of a known one speeds and counts, and of one board in
+        turn its errors or its serial timeout.
         """
+        boards = self._all
+        if permit.stage in (Stage.REST, Stage.BRAKING):
+            if now_ns - self._asked_ns < _PACE_NS:
+                return ()
+            boards = [board for board in self._all if board.stopped]
+        elif self._velocity_ns != now_ns:
+            return ()
         self._asked_ns = now_ns
         frames = []
         self._slow += 1
@@ -322,158 +334,52 @@ class RoboclawDriver:
             frames += [question(board.address, name) for name in names]
         return tuple(OutgoingFrame(frame, now_ns + _QUESTION_LIFE_NS, _QUESTION_RANK) for frame in frames)
 
-    def _arm(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
-        """The serial timeout, set and read back, and zeros for as long as the motors stand."""
-        self._permit = self._permit.begun(now_ns)
-        if not self._stands:
-            self._stop(self._permit.given_up("not armed: a motor turns; wait until it stands"))
-            return self._brake(now_ns)
-        wanted = self._settings.timeout_ds
-        without = [board for board in self._all if board.timeout_ds != wanted]
-        if without and self._permit.lasts_ns(now_ns) > ARMING_TIMEOUT_NS:
-            why = f"not armed: board {without[0].address} does not take its serial timeout"
-            self._stop(self._permit.given_up(why))
-            return self._brake(now_ns)
-        if without:
-            if now_ns - self._repeat_ns < _REPEAT_NS:
-                return ()
-            self._repeat_ns = now_ns
-            asked = [
-                frame
-                for board in without
-                for frame in (
-                    setting(board.address, "set_serial_timeout", timeout_ds=wanted),
-                    question(board.address, "serial_timeout"),
-                )
-            ]
-            return parts.outgoing(now_ns, *asked)
-        self._permit = self._permit.fed_zero(now_ns)
-        if all(board.zeros >= ZEROS_TO_ARM for board in self._all):
-            self._permit = self._permit.armed(now_ns)
-        sent = parts.outgoing(now_ns, *self._velocity(now_ns))
-        return (*sent, *self._questions(now_ns, self._all))
+    def stop_frames(self) -> tuple[Frame, ...]:
+        """Zero duty for every board."""
+        return tuple(_stop(board.address) for board in self._all)
 
-    def _ramp(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
-        """Slow down with the declared deceleration, then stop, then only ask."""
-        self._permit = self._permit.slowed(now_ns, self._settings.stop_deceleration_rad_s2)
-        if any(self._permit.speeds):
-            return (*parts.outgoing(now_ns, *self._velocity(now_ns)), *self._questions(now_ns, self._all))
-        self._stop(self._permit.ramped())
-        return self._brake(now_ns)
+    @property
+    def _all(self) -> Sequence[Board]:
+        return tuple(self._boards.values())
 
-    def _brake(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
-        """Zero duty for each board until it takes it, and before that no question, which would feed its timeout."""
-        self._permit = self._permit.begun(now_ns)
-        waiting = [board for board in self._all if not board.stopped]
-        stood = self._is_known and (self._stands or self._permit.lasts_ns(now_ns) > BRAKING_NS)
-        if not waiting and stood:
-            self._permit = self._permit.rested()
-        if now_ns - self._asked_ns < _PACE_NS:
-            return ()
-        for board in waiting:
-            board.waits_ns = now_ns if board.waits_ns is None else board.waits_ns
-        return (*parts.outgoing(now_ns, *self._stops(waiting)), *self._paced_questions(now_ns))
+    @property
+    def _is_known(self) -> bool:
+        return all(board.is_known for board in self._all)
 
-    def _reset(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
-        """Clear what is latched here and an e-stop that a board has latched; it ends its other errors by itself."""
-        self._permit = self._permit.reset(self._seen)
-        latched = [board.address for board in self._all if board.is_pressed]
-        if self._permit.wanted is not Request.RESET or not latched or now_ns - self._repeat_ns < _REPEAT_NS:
-            return ()
-        self._repeat_ns = now_ns
-        return parts.outgoing(now_ns, *(setting(address, "reset_estop") for address in latched))
+    @property
+    def _stands(self) -> bool:
+        return all(stands(self._settings, *board.speeds) for board in self._all)
 
-    def _velocity(self, now_ns: int) -> list[Frame]:
-        settings, self._velocity_ns = self._settings, now_ns
-        per_board = {address: [0.0, 0.0] for address in self._boards}
-        fastest = self._fastest_rad_s
-        for side, direction, speed in zip(settings.sides, settings.direction, self._permit.speeds, strict=True):
-            for address, motor in side:
-                per_board[address][motor] = direction * min(max(speed, -fastest), fastest) * settings.counts_per_rad
-        frames = []
-        for board in self._all:
-            board.refuses_ns = now_ns if board.refuses_ns is None else board.refuses_ns
-            board.stopped = False
-            first, second = map(round, per_board[board.address])
-            accel = max(1, round(settings.acceleration_rad_s2 * settings.counts_per_rad))
-            speeds = {"speed_m1_counts_s": first, "speed_m2_counts_s": second}
-            frames.append(setting(board.address, "speed_accel_m1m2", accel_counts_s2=accel, **speeds))
-        return frames
+    @property
+    def _fastest_rad_s(self) -> float:
+        return min(board.fastest_counts_s for board in self._all) / self._settings.counts_per_rad
 
-    def _heard(self, board: Board) -> None:
-        board.waits_ns = None
-        self._count("frames_accepted")
-
-    def _take_acknowledgement(self, board: Board, frame: Frame, t_ns: int) -> None:
+    def _take_acknowledgement(self, board: Board, frame: Frame, t_ns: int, stage: Stage) -> Heard:
         name = _SETTER_NAMES.get(frame.can_id & 0xFF)
         if name is None or frame.data != protocol.ACKNOWLEDGE:
-            self._count("unknown_id")
-            return
-        self._heard(board)
-        if name == "duty_m1m2" and self._permit.stage is Stage.BRAKING:
+            return UNKNOWN
+        board.waits_ns = None
+        if name == "duty_m1m2" and stage is Stage.BRAKING:
             # A speed that waited behind the stop is sent after it: what is taken before that is gone is no stop yet.
             board.stopped = t_ns - self._velocity_ns > _LONGEST_LIFE_NS
         elif name == "speed_accel_m1m2":
             board.refuses_ns = None
             board.zeros += 1
-
-    def _take_counts(self, board: Board, read: Mapping[str, protocol.Value], t_ns: int) -> None:
-        if not board.take_counts(read, t_ns, self._permit.looked_ns):
-            self._count("implausible_ticks")
-            if self._permit.is_driving:
-                self._stop(self._permit.lost(f"board {board.address} has restarted: its counts jumped"))
+        return Heard()
 
     def _sample(self, t_ns: int) -> WheelSample:
         settings = self._settings
         turned = [[self._boards[address].turned[motor] for address, motor in side] for side in settings.sides]
         return parts.wheel_sample(t_ns, turned, settings.direction, 1.0 / settings.counts_per_rad)
 
-    def _check(self, now_ns: int) -> None:
-        """Errors, silence, commands not taken and a timeout that is not the one set stop all."""
-        self._permit = self._permit.looked(now_ns)
-        for board in self._all:
-            silent_ns = 0 if board.waits_ns is None else self._permit.silent_ns(board.waits_ns)
-            why = self._why_lost(board, silent_ns) if self._permit.is_driving else None
-            if why is not None:
-                self._stop(self._permit.lost(why))
-            elif not self._permit.is_driving and silent_ns > GONE_NS and board.known:
-                why = f"board {board.address} fell silent"
-                self._meet_anew(self._permit.restarted(why, f"{why}: asking anew"))
 
-    def _why_lost(self, board: Board, silent_ns: int) -> str | None:
-        refused_ns = 0 if board.refuses_ns is None else self._permit.silent_ns(board.refuses_ns)
-        if board.errors:
-            return board.error_words
-        if silent_ns > SILENT_NS:
-            return f"board {board.address} fell silent"
-        if refused_ns > SILENT_NS:
-            return f"board {board.address} does not take its commands"
-        if self._permit.stage is Stage.ARMED and board.timeout_ds != self._settings.timeout_ds:
-            return f"board {board.address} has restarted: its serial timeout is not the one that was set"
-        return None
-
-    def _status(self, t_ns: int) -> RobotStatus:
-        at_rest = self._stands and all(board.stopped for board in self._all)
-        return parts.status(t_ns, self.state, at_rest)
-
-    def _stop(self, permit: MotionPermit) -> None:
-        """Each board is to take a stop from now on."""
-        self._permit, self._asked_ns = permit, 0
-        for board in self._all:
-            board.stopped, board.refuses_ns = False, None
-
-    def _meet_anew(self, permit: MotionPermit) -> None:
-        self._stop(permit)
-        for board in self._all:
-            board.meet_anew()
-
-    def _count(self, name: str) -> None:
-        self.stats = parts.counted(self.stats, name)
+def _stop(address: int) -> Frame:
+    return setting(address, "duty_m1m2", duty_m1=0, duty_m2=0)
 
 
 DRIVER = MotorDriver(
     "roboclaw",
-    lambda settings, _key: RoboclawDriver(settings),
+    lambda settings, _key: VendorDriver(RoboclawPort(settings)),
     settings=RoboclawSettings,
     example=protocol.EXAMPLE,
     kinds=("serial",),
@@ -482,7 +388,7 @@ DRIVER = MotorDriver(
     questions=protocol.QUESTIONS,
     latches_stop=False,
     stop_frames=stop_frames,
-    stop_confirmation=protocol.stop_confirmation,
+    stop_confirmation=lambda settings: stop_confirmation(RoboclawPort(settings)),
     cyclic_frames=protocol.cyclic_frames,
     safety_card=protocol.safety_card,
 )

@@ -13,7 +13,7 @@ import binascii
 import math
 import re
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated, Any
@@ -268,23 +268,6 @@ def stop_frames(settings: RoboclawSettings) -> tuple[Frame, ...]:
         *(setting(address, "duty_m1m2", duty_m1=0, duty_m2=0) for address in settings.addresses),
         *(question(address, "speeds") for address in settings.addresses),
     )
-
-
-def stop_confirmation(settings: RoboclawSettings) -> Callable[[Frame], bool]:
-    """Return what says, reply by reply, whether every board took the stop and its motors stand since."""
-    taken = dict.fromkeys(settings.addresses, False)
-    standing = dict.fromkeys(settings.addresses, False)
-
-    def heard(frame: Frame) -> bool:
-        address, command = divmod(frame.can_id, 256)
-        if address in taken and command == SETTERS["duty_m1m2"].command:
-            taken[address] = True
-        elif address in taken and command == GETTERS["speeds"].command:
-            found = reply(address, "speeds", frame.data)
-            standing[address] = found is not None and stands(settings, found[0]["speed_m1"], found[0]["speed_m2"])
-        return all(taken.values()) and all(standing.values())
-
-    return heard
 
 
 def stands(settings: RoboclawSettings, *speeds_counts_s: Value) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -219,23 +219,6 @@ class BaseEnd:
 def stop_frames(_settings: Ros2BaseSettings) -> tuple[Frame, ...]:
     """The e-stop, which the bridge latches."""
     return (Frame(STOP, b""),)
-
-
-def stop_confirmation(settings: Ros2BaseSettings) -> Callable[[Frame], bool]:
-    """Return what says, frame by frame heard, whether the bridge has latched the stop and the base stands."""
-    said = {"latched": False, "stands": False}
-
-    def heard(frame: Frame) -> bool:
-        if frame.extended or LENGTHS.get(frame.can_id) != len(frame.data):
-            return False
-        if frame.can_id == STATE:
-            flags, _, _ = unpack_state(frame.data)
-            said["latched"] = bool(flags & LATCHED and not flags & DRIVING)
-        elif frame.can_id == WHEELS:
-            said["stands"] = settings.stands(*unpack_wheels(frame.data)[0])
-        return all(said.values())
-
-    return heard
 
 
 def cyclic_frames(_settings: Ros2BaseSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import msgspec
@@ -157,22 +157,6 @@ def questions(settings: VescSettings) -> tuple[Frame, ...]:
     """On a serial line, for all that must be known of each motor; no status messages come there."""
     ask = codec.ask_values(codec.ALL_OF_A_MOTOR)
     return tuple(frame for node in all_of(settings.nodes) for frame in codec.fragments(node, HOST_ID, ask))
-
-
-def stop_confirmation(settings: VescSettings) -> Callable[[Frame], bool]:
-    """Return what says, frame by frame heard, whether every motor stands: nothing else confirms a stop here."""
-    standing = dict.fromkeys(all_of(settings.nodes), False)
-
-    def heard(frame: Frame) -> bool:
-        decoded = codec.decode(frame)
-        if frame.can_id == codec.PROCESS_SHORT << 8 | HOST_ID and frame.data[0] in standing:
-            read = codec.values(frame.data[2:]) or {}
-            standing[frame.data[0]] = abs(read.get("erpm", math.inf)) < STANDS_ERPM
-        if decoded is not None and decoded.name == "status" and decoded.controller in standing:
-            standing[decoded.controller] = abs(decoded.values["erpm"]) < STANDS_ERPM
-        return all(standing.values())
-
-    return heard
 
 
 def cyclic_frames(settings: VescSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:

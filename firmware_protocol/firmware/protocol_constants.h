@@ -1,4 +1,4 @@
-/* Written by tools/generate_protocol.py from disco_robot.dbc; do not edit. */
+/* Written by tools/generate/protocol.py from disco_robot.dbc; do not edit. */
 #ifndef DISCO_PROTOCOL_CONSTANTS_H
 #define DISCO_PROTOCOL_CONSTANTS_H
 

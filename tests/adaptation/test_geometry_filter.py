@@ -10,7 +10,7 @@ import pytest
 from disco_hw.adaptation.geometry_filter import GeometryFilter
 from disco_hw.control.baselines import Kanayama
 from tests.tables import thinned
-from tools.bench_adapt import SCENARIOS, estimate
+from tools.bench.adapt import SCENARIOS, estimate
 from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots
 from tools.tracking import classical, tracks
 from tools.tracking import drive as track

@@ -11,7 +11,7 @@ import pytest
 
 from disco_hw.cli import app
 from disco_hw.files import LOG
-from tools.verb_calls import CALLS, call, good_files, without_work, write_good
+from tools.check.verb_calls import CALLS, call, good_files, without_work, write_good
 
 STUCK_S = 60
 WRITTEN = {

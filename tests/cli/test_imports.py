@@ -1,6 +1,6 @@
 """What a command imports: a stop, a question and a wrong file load none of the large libraries.
 
-Seconds are for a benchmark (tools/bench_start.py); what makes them is counted here.
+Seconds are for a benchmark (tools/bench/start.py); what makes them is counted here.
 """
 
 import subprocess

@@ -1,6 +1,6 @@
 """Logs of an earlier build are still read, and give the estimates, plans and commands that they gave then.
 
-Where one does not on purpose, `python -m tools.reference_logs` writes them anew.
+Where one does not on purpose, `python -m tools.generate.reference_logs` writes them anew.
 """
 
 from __future__ import annotations

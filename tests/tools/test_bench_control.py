@@ -11,8 +11,8 @@ from disco_hw.model import plain as physics
 from disco_hw.tasks.circle import CircleCost
 from tests.control import oracle
 from tests.tasks import costs
-from tools.bench_control import ROBOTS, beside_peer, torch_times_ms
-from tools.step_times import summary, times_ms, undisturbed
+from tools.bench.control import ROBOTS, beside_peer, torch_times_ms
+from tools.bench.step_times import summary, times_ms, undisturbed
 
 MODEL = load_model(ROBOTS / "wombot_model.toml")
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from disco_hw.tasks.path import PathTask
-from tools.bench_control_path import followed, paths
+from tools.bench.control_path import followed, paths
 
 LINE = PathTask(path="line.csv", speed_m_s=0.25, points=((0.0, 0.0), (4.0, 0.0)))
 THERE_AND_BACK = PathTask(path="back.csv", speed_m_s=0.25, points=paths()["there_and_back"])

@@ -1,4 +1,4 @@
-from tools.bench_estimation import run
+from tools.bench.estimation import run
 
 
 def test_every_figure_is_there_and_a_rewind_costs_more_than_a_tick():

@@ -1,4 +1,4 @@
-from tools.bench_loop import run
+from tools.bench.loop import run
 
 
 def test_every_figure_is_there_for_both_ways_of_running():

@@ -1,6 +1,6 @@
 import pytest
 
-from tools.bench_start import CASES, run
+from tools.bench.start import CASES, run
 
 
 @pytest.mark.long

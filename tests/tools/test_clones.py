@@ -3,7 +3,7 @@
 import re
 import sys
 
-from tools.clones import run
+from tools.check.clones import run
 
 
 def test_a_failed_run_names_what_failed_and_under_what_conditions(tmp_path):

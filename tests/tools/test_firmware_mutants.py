@@ -2,8 +2,8 @@
 
 import tomllib
 
+from tools.check.mutation import mutants
 from tools.firmware_mutants import EQUIVALENTS, FIRMWARE, HAND_WRITTEN
-from tools.mutation import mutants
 
 
 def test_every_listed_equivalent_is_still_a_mutant_and_has_its_reason():

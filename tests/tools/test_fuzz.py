@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tools import fuzz
+from tools.check import fuzz
 
 ROOT = Path(__file__).parents[2]
 
@@ -39,7 +39,8 @@ def test_what_gets_through_is_reported_and_the_file_kept(tmp_path, monkeypatch, 
 @pytest.mark.long
 def test_every_verb_reads_or_refuses_hostile_files(tmp_path):
     # In a process of its own: what other tests have loaded would count as memory that a verb took.
-    program = "import sys, pathlib\nfrom tools import fuzz\nprint(fuzz.attack_verbs(150, 1, pathlib.Path(sys.argv[1])))"
+    call = "print(fuzz.attack_verbs(150, 1, pathlib.Path(sys.argv[1])))"
+    program = f"import sys, pathlib\nfrom tools.check import fuzz\n{call}"
     command = [sys.executable, "-c", program, str(tmp_path / "verbs")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=250, check=False)
     assert done.returncode == 0, done.stderr

@@ -2,8 +2,8 @@ import random
 
 import pytest
 
-from tools import fuzz_wire
-from tools.fuzz_wire import TARGETS, campaign
+from tools.check import fuzz_wire
+from tools.check.fuzz_wire import TARGETS, campaign
 
 
 @pytest.mark.parametrize("name", TARGETS)

@@ -4,13 +4,13 @@ import sys
 import pytest
 
 from firmware_protocol.codec import load_protocol, packaged_dbc
-from tools import generate_protocol
-from tools.generate_protocol import FIRMWARE, generated_files, main
+from tools.generate import protocol as generate_protocol
+from tools.generate.protocol import FIRMWARE, generated_files, main
 
 
 def test_committed_files_are_current():
     for name, text in generated_files(packaged_dbc()).items():
-        assert (FIRMWARE / name).read_text("utf-8") == text, f"{name}: run python -m tools.generate_protocol"
+        assert (FIRMWARE / name).read_text("utf-8") == text, f"{name}: run python -m tools.generate.protocol"
 
 
 def test_generated_files_do_not_depend_on_the_day_or_on_the_tools_version():

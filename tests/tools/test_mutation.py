@@ -1,4 +1,4 @@
-from tools.mutation import mutants
+from tools.check.mutation import mutants
 
 
 def changes(source):

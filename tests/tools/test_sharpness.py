@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from disco_hw.inference.density_network import Mixtures, Region
-from tools.sharpness import _least_squares, _log_inside, compared, paired, summary
+from tools.study.sharpness import _least_squares, _log_inside, compared, paired, summary
 
 BOX = Region.box(np.full(3, -1.0), np.ones(3))
 

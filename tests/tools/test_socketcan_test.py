@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tools import socketcan_test as of_socketcan
+from tools.check import socketcan_test as of_socketcan
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tools.step_instructions import instructions_of
+from tools.bench.step_instructions import instructions_of
 
 try:
     instructions_of(lambda: None)

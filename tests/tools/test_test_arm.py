@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from tools import test_arm as arm
+from tools.check import test_arm as arm
 
-PROJECT = Path(arm.__file__).parents[1]
+PROJECT = Path(arm.__file__).parents[2]
 
 
 def test_mirrors_are_those_of_the_machines_own_debian():

@@ -25,7 +25,7 @@ SUMS = {
     "vesc-uart": "5ccdae 20cbc8 ee78c3 45676a e55985 0207b0 4d268f 85df41 218ce9 9f845f",
     "agilex": "e3b0c4 2d8bed 25fe17 bf6f49 ddae68 2650d2 a1a661 1df61c 52fd3f e3b0c4",
     "roboclaw": "6e0c07 cfe96a 90c18e 36a953 49fbbb 3e1653 09f34c 18e5cc 54503c fce227",
-    "roboclaw-a-board-a-side": "a0866e 68a16a 241b5a 3728ce cb6c09 160366 877c7f aa6233 475c97 ba2d7a",
+    "roboclaw-a-board-a-side": "a0866e 68a16a 241b5a 3728ce 0bc9c3 160366 877c7f aa6233 475c97 ba2d7a",
     "ros2-base": "e3b0c4 1450c4 22d636 e0adb8 044fb4 a3d951 e3b0c4 c0479d 92ef1b fc4d1f",
 }
 """SHA-256 of each phase's frames, its first six digits."""

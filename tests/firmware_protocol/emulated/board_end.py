@@ -9,7 +9,7 @@ from pathlib import Path
 
 from drivers.transport import can, serial
 from tests.firmware_protocol.other_end import LinkEnd
-from tools.emulated_board import build_board, running_board
+from tools.check.emulated_board import build_board, running_board
 
 
 class BoardEnd(LinkEnd):

@@ -20,7 +20,7 @@ from tests.firmware_protocol.other_end import LinkEnd
 from tests.firmware_protocol.protocol_host import CODEC, ProtocolHost
 from tests.sim.test_board import SimProcess
 from tests.sim.test_python_can_link import HubProcess, drive_beside_another_node
-from tools.emulated_board import build_board, missing, run_fast, running_bare_board, running_board
+from tools.check.emulated_board import build_board, missing, run_fast, running_bare_board, running_board
 
 ROOT = Path(__file__).parents[3]
 ARMED = 3

@@ -4,7 +4,7 @@ import pytest
 
 from tests.firmware_protocol.conformance import FirmwareConformance
 from tests.firmware_protocol.emulated.board_end import BoardEnd
-from tools.emulated_board import missing
+from tools.check.emulated_board import missing
 
 pytestmark = [
     pytest.mark.long,

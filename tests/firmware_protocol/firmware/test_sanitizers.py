@@ -5,7 +5,7 @@ import subprocess
 import pytest
 
 from tests.tables import thinned
-from tools.firmware_check import HARNESS_SANITIZERS, build_harness, run_harness
+from tools.check.firmware_check import HARNESS_SANITIZERS, build_harness, run_harness
 
 CYCLES = 100_000
 pytestmark = pytest.mark.timeout(300)

@@ -2,9 +2,9 @@
 
 import pytest
 
-from tools import firmware_figures
-from tools.emulated_board import PROCESSORS, missing
-from tools.firmware_figures import DOCUMENT, ROWS, complaints, documented, measure, sizes, table
+from tools.check.emulated_board import PROCESSORS, missing
+from tools.generate import firmware_figures
+from tools.generate.firmware_figures import DOCUMENT, ROWS, complaints, documented, measure, sizes, table
 
 FIGURES = documented(DOCUMENT.read_text("utf-8"))
 

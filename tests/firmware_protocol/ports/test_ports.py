@@ -124,7 +124,7 @@ def test_the_threads_of_the_queue_do_not_race(tmp_path):
 
 
 def test_the_core_has_no_double():
-    """The cross-compiler says so, too: tools/emulated_board.py has it take -Wdouble-promotion for an error."""
+    """The cross-compiler says so, too: tools/check/emulated_board.py has it take -Wdouble-promotion for an error."""
     for name in SOURCES:
         if name == "disco_robot.c":
             continue  # its doubles are in functions that nothing calls

@@ -13,7 +13,7 @@ from cantools.database.can.c_source import generate
 
 from firmware_protocol.codec import MessageLayout, Protocol, Tables, load_protocol
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 DBC = ROOT / "firmware_protocol" / "disco_robot.dbc"
 FIRMWARE = ROOT / "firmware_protocol" / "firmware"
 PREFIX = "disco_robot"
@@ -44,7 +44,7 @@ def _without_date(text: str) -> str:
 
 def _constants(protocol: Protocol) -> str:
     lines = [
-        "/* Written by tools/generate_protocol.py from disco_robot.dbc; do not edit. */",
+        "/* Written by tools/generate/protocol.py from disco_robot.dbc; do not edit. */",
         "#ifndef DISCO_PROTOCOL_CONSTANTS_H",
         "#define DISCO_PROTOCOL_CONSTANTS_H",
         "",
@@ -110,7 +110,7 @@ def main() -> int:
             if not check:
                 path.write_text(text, "utf-8")
     if check and stale:
-        print(f"not current: {', '.join(stale)}; run python -m tools.generate_protocol", file=sys.stderr)
+        print(f"not current: {', '.join(stale)}; run python -m tools.generate.protocol", file=sys.stderr)
         return 1
     return 0
 

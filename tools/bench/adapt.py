@@ -1,4 +1,4 @@
-"""What adaptation costs the loop, and what it wins; `python -m tools.bench_adapt scenarios`: how well it estimates."""
+"""What adaptation costs the loop, and what it wins; `python -m tools.bench.adapt scenarios`: how well it estimates."""
 
 from __future__ import annotations
 

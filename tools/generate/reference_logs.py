@@ -1,6 +1,6 @@
 """Writes the reference logs that tests/runtime/test_reference_logs.py replays.
 
-    python -m tools.reference_logs [DIRECTORY]
+    python -m tools.generate.reference_logs [DIRECTORY]
 
 Only after a change that is meant to alter estimates, plans or commands: the test says at which tick and in which field
 a build first differs from the one that recorded them.
@@ -33,7 +33,7 @@ from disco_hw.runtime.supervisor import UserRequest
 from sim.body_dynamics import BodyPose
 from sim.plant_parameters import PlantParameters
 
-DIRECTORY = Path(__file__).parents[1] / "tests" / "runtime" / "reference_logs"
+DIRECTORY = Path(__file__).parents[2] / "tests" / "runtime" / "reference_logs"
 ROBOTS = Path(disco_hw.__file__).parent / "robots"
 SHORT_SIGHTED = ("rate_hz = 50.0", "rate_hz = 50.0\nhorizon = 10\nstep_s = 0.3")
 """Ten steps instead of fifty: plans are most of a log."""

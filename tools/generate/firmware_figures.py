@@ -1,6 +1,6 @@
 """Measures on emulated processors what the firmware core costs, and prints the table of docs/port.md.
 
-    python -m tools.firmware_figures [--check | --write]
+    python -m tools.generate.firmware_figures [--check | --write]
 
 Code and constants: the linked core at -Os, without the C library's helpers. RAM: one core. Stack: the deepest, without
 interrupts. A step is a cycle of 1 ms with the sending of what it queued; a reception is one frame.
@@ -17,9 +17,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from firmware_protocol.build_firmware import SOURCES
-from tools.emulated_board import COMPILER, EMULATOR, FIRMWARE, FLAGS, PORTS, PROCESSORS, compile_for, missing
+from tools.check.emulated_board import COMPILER, EMULATOR, FIRMWARE, FLAGS, PORTS, PROCESSORS, compile_for, missing
 
-DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "port.md"
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "port.md"
 PROGRAM = Path(__file__).with_suffix(".c")
 GROWTH = 1.1
 WORST_TO_MEAN = 3.0

@@ -20,7 +20,7 @@ from disco_hw.experiments.circle import KinematicPlant, plants
 from disco_hw.model import Model, load_model
 from disco_hw.tasks.line import load_waypoints
 from disco_hw.tasks.path import PathTask
-from tools.step_times import summary, times_ms, undisturbed
+from tools.bench.step_times import summary, times_ms, undisturbed
 
 ROBOTS = FilePath(disco_hw.__file__).parent / "robots"
 LIMITS = CommandLimits(8.0, 20.0)

@@ -1,7 +1,7 @@
 """`make test` in fresh clones of HEAD, one after the other, each with the conditions that it ran under.
 
-`python -m tools.clones 10 --busy 5` is ten, the last five beside four busy processes (`--processes`). It exits with 1
-if one failed or took longer than `--most` seconds; those beside busy processes may take `--more` seconds longer.
+`python -m tools.check.clones 10 --busy 5` is ten, the last five beside four busy processes (`--processes`). It exits
+with 1 if one failed or took longer than `--most` seconds; those beside busy processes may take `--more` seconds longer.
 `--dry` only clones, and prints what would be done.
 """
 

@@ -22,7 +22,7 @@ import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
-PROJECT = Path(__file__).resolve().parent.parent
+PROJECT = Path(__file__).resolve().parents[2]
 BUILD = PROJECT / "build" / "arm64"
 ROOT, WHEELS = BUILD / "root", BUILD / "wheels"
 # Where they lie in the root. The sources are a copy: what is compiled beside them is of the other architecture.

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from firmware_protocol.build_firmware import SOURCES
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 HAND_WRITTEN = tuple(name for name in SOURCES if name != "disco_robot.c")
 WARNINGS = (
     "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wsign-conversion", "-Wdouble-promotion", "-Wshadow",

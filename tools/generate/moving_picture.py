@@ -1,8 +1,11 @@
 """Animated SVGs from real drives, where no code may run.
 
-`python -m tools.moving_picture LOG -o FILE.svg`: the task's circle, the way that was estimated, drawn as it was driven,
-and the robot on it. `python -m tools.moving_picture --hide deadband=0.8 -o FILE.svg`: the experiment `gap` with this
-effect hidden: the robot on its circle with the model as given and with the one amended, and the gap of either below.
+    python -m tools.generate.moving_picture LOG -o FILE.svg
+    python -m tools.generate.moving_picture --hide deadband=0.8 -o FILE.svg
+
+The first draws the task's circle, the way that was estimated, drawn as it was driven, and the robot on it. The second
+is the experiment `gap` with this effect hidden: the robot on its circle with the model as given and the one amended,
+and the gap of either below.
 """
 
 from __future__ import annotations

@@ -118,7 +118,7 @@ def _start_again(operator: Operator, state: str) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m tools.soak", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tools.check.soak", description=__doc__)
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--no-fifo", action="store_true", help="without SCHED_FIFO, for comparison")
     parser.add_argument("--hog-nice", type=int, default=0, help="niceness of the busy processes")

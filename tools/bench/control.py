@@ -31,7 +31,7 @@ from disco_hw.model import Model, load_model
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.tasks.circle import CircleCost
-from tools.step_times import summary, times_ms, undisturbed
+from tools.bench.step_times import summary, times_ms, undisturbed
 
 ROBOTS = Path(disco_hw.__file__).parent / "robots"
 PERIOD_NS = 20_000_000

@@ -13,8 +13,8 @@ from disco_hw.inference.infer import Inference, infer, noise_of
 from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds
 from disco_hw.log.drive import DriveLog
 from disco_hw.model import Model
-from tools.infer_study import config, logged, plant
-from tools.sharpness import PEERS, paired, scores
+from tools.study.infer_study import config, logged, plant
+from tools.study.sharpness import PEERS, paired, scores
 
 SEED = 5
 SIMULATIONS = 300
@@ -46,8 +46,9 @@ def run() -> dict[str, float]:
 
 
 def log_scores(result: Inference) -> dict[str, float]:
-    """Mean log scores of the posteriors on fresh simulations (`tools.sharpness`): ours, and how far it is ahead of
-    sbi's with the standard error of that, also before the posteriors are cut to their region. Without sbi only ours.
+    """Mean log scores of the posteriors on fresh simulations (`tools.study.sharpness`): ours, and how far it is ahead.
+
+    Ahead of sbi's, with the standard error, also before the posteriors are cut to their region. Without sbi only ours.
     """
     peers = PEERS if find_spec("sbi") else ()
     given = scores(result, peers)

@@ -1,6 +1,6 @@
 """Random faults of the bridge to ROS 2 and of its node, on the running stack: each must stop the robot, a flood none.
 
-    python -m tools.ros2_trials --trials 500 --record trials.jsonl
+    python -m tools.study.ros2_trials --trials 500 --record trials.jsonl
 
 A trial drives the circle by the poses of a node, strikes at a random time, and measures how long the wheels go on. They
 may for `estimation.pose_timeout_s` and the time in which a robot at speed stops; a trial takes ten to twenty seconds.

@@ -1,8 +1,8 @@
 """Recovery study of `infer`: robots drawn from the prior's plausible part, errors and coverage; pictures on request.
 
-python -m tools.infer_study --plants 20 --drive rich --out out/infer
-python -m tools.infer_study --kind foreign --first 200 --plants 40
-python -m tools.infer_study --kind slipping --first 200 --plants 40 --closed-form
+python -m tools.study.infer_study --plants 20 --drive rich --out out/infer
+python -m tools.study.infer_study --kind foreign --first 200 --plants 40
+python -m tools.study.infer_study --kind slipping --first 200 --plants 40 --closed-form
 
 Kinds: `own`, the robots of sim/, whose slip lasts 0.3 s; `foreign`, those of tools/foreign_plant.py, whose slip is a
 part of either wheel's speed and lasts 0.05 to 0.5 s, and whose body follows its wheels late; `slipping`, the same

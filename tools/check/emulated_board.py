@@ -3,7 +3,7 @@
 Its serial line is a socket, whose bytes whoever writes them delivers himself; or a terminal, as a program or a library
 may want one, whose bytes are carried by a thread of the kernel that has no priority and is late beside other work.
 
-    python -m tools.emulated_board [--processor m4f] [--key FILE] [--slcan] [--plant-line]   until Ctrl-C, to play with
+    python -m tools.check.emulated_board [--processor m4f] [--key FILE] [--slcan] [--plant-line]   until Ctrl-C
 
 Needs arm-none-eabi-gcc with newlib and qemu-system-arm; `make firmware-emulated` installs them on Debian.
 """

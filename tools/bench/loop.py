@@ -23,7 +23,7 @@ def run(seconds: float = 10.0) -> dict[str, float]:
     figures: dict[str, float] = {}
     for mode in ("plain", "realtime"):
         # Scheduler and collector belong to the process, so each case has one of its own.
-        command = [sys.executable, "-m", "tools.bench_loop", mode, str(seconds)]
+        command = [sys.executable, "-m", "tools.bench.loop", mode, str(seconds)]
         result = subprocess.run(command, check=True, capture_output=True, text=True)
         figures |= {f"loop.{mode}.{key}": value for key, value in json.loads(result.stdout).items()}
     return figures

@@ -37,8 +37,8 @@ from disco_hw.log.log_command import recover_log
 from disco_hw.log.reader import open_log
 from disco_hw.model import load_model
 from sim.fault_schedule import FaultFileError, schedule_of
-from tools import verb_calls
-from tools.verb_calls import good_files
+from tools.check import verb_calls
+from tools.check.verb_calls import good_files
 
 GROWTH_LIMIT_MB = 30.0
 WARM_UP = 300
@@ -279,7 +279,7 @@ def _resident_mb() -> float:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m tools.fuzz", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tools.check.fuzz", description=__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--seed", type=int, default=time.monotonic_ns() % 1_000_000)
     parser.add_argument("--verbs", type=int, default=5000, help="how many files for the verbs")

@@ -1,6 +1,6 @@
 """Log scores of `infer`'s posterior and of sbi's NPE, trained on the same simulations, paired on the same fresh ones.
 
-.venv-bench/bin/python -m tools.sharpness --drive circle --robots 8        (make .venv-bench/.installed installs sbi)
+.venv-bench/bin/python -m tools.study.sharpness --drive circle --robots 8   (make .venv-bench/.installed installs sbi)
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from disco_hw.inference.density_network import Region
 from disco_hw.inference.infer import Inference, InferOptions, infer
 from disco_hw.inference.simulate import draw_seeds
-from tools.infer_study import config, logged, plant
+from tools.study.infer_study import config, logged, plant
 
 Array = NDArray[np.float64]
 

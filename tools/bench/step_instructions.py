@@ -1,4 +1,4 @@
-"""Counts what a compiled planner step executes and holds, beside its time: `python -m tools.step_instructions`.
+"""Counts what a compiled planner step executes and holds, beside its time: `python -m tools.bench.step_instructions`.
 
 A step is run one instruction at a time, by ptrace: load changes the times, not the count. Linux on x86-64 or aarch64,
 not under an emulator.
@@ -20,8 +20,8 @@ from disco_hw.control import Disco
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.tasks import task_from
-from tools.bench_control import ROBOTS, moving
-from tools.step_times import times_ms, undisturbed
+from tools.bench.control import ROBOTS, moving
+from tools.bench.step_times import times_ms, undisturbed
 
 TRACE_ME, CONTINUE, SINGLE_STEP = 0, 7, 9
 MARK = signal.SIGUSR1

@@ -6,7 +6,7 @@ import random
 import pytest
 from msgspec.structs import replace
 
-from drivers.motor.vendor_parts import STOPPED_FROM_OUTSIDE, Controllers, MotionPermit, Stage
+from drivers.motor.permit import STOPPED_FROM_OUTSIDE, Controllers, MotionPermit, Stage
 from drivers.types import DriverState, Request, WheelCommand
 
 NOW = 7_000_000_000

@@ -1,0 +1,383 @@
+"""The life cycle of every controller that knows no session: one state machine, and the interface of what differs.
+
+`VendorDriver` arms, ramps, brakes, latches, and notices silence and a second host, the same for all vendors. A vendor's
+file gives it a `Port`: what its frames mean, which frames do what, and a `Table` of its figures. The machine owns the
+permit to move and hands it to the port as a value; the port never changes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import msgspec
+from msgspec.structs import replace
+
+from drivers.motor import vendor_parts as parts
+from drivers.motor.permit import STANDS_BY, Controllers, Idle, MotionPermit, Stage
+from drivers.types import (
+    DriverState,
+    DriverStats,
+    Frame,
+    Identity,
+    Limits,
+    OutgoingFrame,
+    Readings,
+    ReceivedFrame,
+    Request,
+    RobotStatus,
+    WheelCommand,
+    WheelSample,
+)
+
+ARMING_TIMEOUT_NS = 1_500_000_000
+_LONG_AFTER_NS = 3_600_000_000_000
+
+
+class Table(msgspec.Struct, frozen=True, kw_only=True):
+    """The figures in which controllers differ.
+
+    `watchdog_s`: after what silence of the host they have stopped by themselves, where they keep no state that shows
+    it, so that a later command would move them again; None where they do. `zeros_to_arm`: zeros commanded before the
+    first speed. `slowest_rad_s`: the slowest speed that they hold, at which the ramp of a stop ends. `idle` and
+    `after_loss`: see `MotionPermit`; `begins`: the stage in which they are met.
+    """
+
+    stop_deceleration_rad_s2: float
+    watchdog_s: float | None = None
+    zeros_to_arm: int = 0
+    slowest_rad_s: float = 0.0
+    idle: Idle = Stage.REST
+    after_loss: Idle = Stage.REST
+    begins: Idle = Stage.REST
+
+
+class Source(msgspec.Struct, frozen=True):
+    """Something that must be heard again and again, by name: when it was heard last, and how long it may be silent.
+
+    After `silent_ns` a drive ends; after `gone_ns` at rest the controllers must be met anew (None: they need not).
+    """
+
+    name: str
+    heard_ns: int | None
+    silent_ns: float
+    gone_ns: float | None = None
+
+
+class Objection(msgspec.Struct, frozen=True):
+    """Why a drive must end, and whether that is a fault that stays until a reset."""
+
+    why: str
+    is_fault: bool = True
+
+
+class Heard(msgspec.Struct, frozen=True, kw_only=True):
+    """What one received frame meant.
+
+    `counts`: counters of `DriverStats` that it adds to. `is_status`: it says how the controllers are. `is_stop` and
+    `commanded`: another host's e-stop, and whom another host commands. `lost`: what ends a drive, and nothing else.
+    `restarted`: why the controllers must be met anew. `said`: for a person.
+    """
+
+    counts: tuple[str, ...] = ("frames_accepted",)
+    wheels: WheelSample | None = None
+    is_status: bool = False
+    is_stop: bool = False
+    commanded: str | None = None
+    lost: str | None = None
+    restarted: str | None = None
+    said: str | None = None
+
+
+UNKNOWN = Heard(counts=("unknown_id",))
+REJECTED_LENGTH = Heard(counts=("rejected_length",))
+IMPLAUSIBLE = ("frames_accepted", "implausible_ticks")
+
+
+class Pending(msgspec.Struct, frozen=True, kw_only=True):
+    """What still lacks before zeros may be commanded: the frames that bring it about, and why arming fails without it.
+
+    `is_final`: waiting does not help.
+    """
+
+    why: str
+    frames: tuple[Frame, ...] = ()
+    is_final: bool = False
+
+
+class Port(Protocol):
+    """One vendor's protocol, as `VendorDriver` needs it. Pure: no clock, thread or I/O, and no frame makes it raise."""
+
+    @property
+    def table(self) -> Table:
+        """The figures of these controllers."""
+
+    @property
+    def seen(self) -> Controllers:
+        """How the controllers are, as heard last."""
+
+    @property
+    def identity(self) -> Identity | None:
+        """Which controller answers; None before all of it is known."""
+
+    @property
+    def limits(self) -> Limits:
+        """What the controllers keep to, and who says so; asked only when `identity` is known."""
+
+    @property
+    def is_stopped(self) -> bool:
+        """Whether the controllers have confirmed, since they were met, that an e-stop holds."""
+
+    def begin_anew(self, now_ns: int) -> None:
+        """Forget what was heard: the link or the controllers have restarted. What the wheels have turned stays."""
+
+    def end_drive(self) -> None:
+        """The drive is over: what stops the controllers is due at once."""
+
+    def take(self, received: ReceivedFrame, permit: MotionPermit) -> Heard:
+        """Take in a frame and return what it meant."""
+
+    def sources(self) -> Sequence[Source]:
+        """What must be heard again and again."""
+
+    def objection(self, permit: MotionPermit) -> Objection | None:
+        """Why the controllers, as heard last, may not be driven on."""
+
+    def prepare(self, now_ns: int, permit: MotionPermit) -> Pending | None:
+        """Return what lacks before zeros may be commanded; None when all proof is there.
+
+        Called in each tick of an arming, in the first one with `permit.lasts_ns(now_ns)` 0: proof is given anew.
+        """
+
+    def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
+        """The frames that command these wheel speeds."""
+
+    def brake(self, now_ns: int, lasts_ns: int) -> tuple[Sequence[Frame], bool]:
+        """The frames that hold the wheels, and whether they stand; `lasts_ns` since braking began."""
+
+    def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
+        """The frames due at rest: what keeps the controllers there, resets them, and asks for what is not known."""
+
+    def may_reset(self, now_ns: int) -> bool:
+        """Whether what is latched here may be cleared, by what `seen` does not show."""
+
+    def questions(self, now_ns: int, permit: MotionPermit) -> tuple[OutgoingFrame, ...]:
+        """The questions due in this tick, after its other frames; none may feed a watchdog without a command."""
+
+    def stop_frames(self) -> tuple[Frame, ...]:
+        """The e-stop to all controllers."""
+
+
+def stop_confirmation(port: Port) -> Callable[[Frame], bool]:
+    """Return what says, frame by frame heard, whether the controllers have confirmed an e-stop that was sent to them.
+
+    `port`: a fresh one, for a connection beside the driver's.
+    """
+    permit = MotionPermit(link_is_up=True, stage=Stage.BRAKING)
+
+    def heard(frame: Frame) -> bool:
+        # Long after any command: none of this connection's can be under way.
+        port.take(ReceivedFrame(_LONG_AFTER_NS, frame), permit)
+        return port.is_stopped
+
+    return heard
+
+
+class VendorDriver:
+    """Satisfies `drivers.types.Driver` with a `Port`: pure, and no frame makes it raise."""
+
+    clock_offset_ns: int | None = None
+
+    def __init__(self, port: Port) -> None:
+        table = port.table
+        self._port = port
+        self._table = table
+        self._permit = MotionPermit(idle=table.idle, after_loss=table.after_loss, stage=table.begins)
+        self.stats = DriverStats()
+
+    @property
+    def state(self) -> DriverState:
+        """Where the driver is with its controllers."""
+        return self._permit.state(self._port.seen)
+
+    @property
+    def detail(self) -> str:
+        """For a person: why the state is what it is, and what to do about it."""
+        return self._permit.detail(self._port.seen)
+
+    @property
+    def identity(self) -> Identity | None:
+        """Which controller answers; None before all of it is known."""
+        return self._port.identity
+
+    @property
+    def limits(self) -> Limits | None:
+        """What the controllers keep to, and who says so; None before they are known."""
+        return None if self._port.identity is None else self._port.limits
+
+    def link_up(self, now_ns: int) -> None:
+        """The medium has come up (again): whatever was agreed is void."""
+        self._meet_anew(self._permit.linked(True), now_ns)
+
+    def link_down(self, now_ns: int) -> None:
+        """The medium is gone: whatever was agreed is void."""
+        self._meet_anew(self._permit.linked(False), now_ns)
+
+    def request(self, request: Request) -> None:
+        """Set what the host wants; ARM only from standing by, and consumed when the controllers stop."""
+        before, self._permit = self._permit, self._permit.requested(request, self._port.seen)
+        if self._permit.wanted is Request.ARM is not before.wanted:
+            self._count("sessions")
+
+    def receive(self, now_ns: int, frames: Sequence[ReceivedFrame]) -> Readings:
+        """Take in received frames and return what they meant; frames that come while the link is down are ignored."""
+        wheels: list[WheelSample] = []
+        status: RobotStatus | None = None
+        for received in frames if self._permit.link_is_up else ():
+            heard = self._port.take(received, self._permit)
+            self._react(heard)
+            if heard.is_status:
+                status = parts.status(received.t_ns, self.state, self._port.is_stopped)
+            if heard.wheels is not None:
+                wheels.append(heard.wheels)
+        if self._permit.link_is_up:
+            self._permit = self._permit.looked(now_ns)
+            self._check_silence(now_ns)
+            self._check_objection()
+        events, self._permit = self._permit.events, replace(self._permit, events=())
+        return Readings(wheels=tuple(wheels), status=() if status is None else (status,), events=events)
+
+    def transmit(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
+        """Frames due now: the command, or what stops; and the questions.
+
+        Raises ValueError for a command that is not finite or valid for no time.
+        """
+        parts.check_command(command)
+        if not self._permit.link_is_up:
+            return ()
+        if self._table.watchdog_s is not None and self._permit.is_late(now_ns, self._table.watchdog_s):
+            self._end(self._permit.lost("no command for longer than the controllers' time-out"))
+        sent = self._step(now_ns, command)
+        return (*sent, *self._port.questions(now_ns, self._permit))
+
+    def release(self, why: str) -> None:
+        """Stop without a ramp from now on, as the controllers can; `why` is a fault until a reset."""
+        self._end(self._permit.lost(why))
+
+    def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
+        """Frames that stop in any state; whatever was wanted is dropped, and nothing is commanded again."""
+        self._end(self._permit.stopped())
+        return parts.estop_frames(now_ns, self._port.stop_frames())
+
+    def _step(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
+        """The frames of the stage, which may end in this tick."""
+        match self._permit.stage:
+            case Stage.ARMED:
+                if command is None:
+                    return ()
+                self._permit = self._permit.commanded(now_ns, command)
+                self._count("commands_sent")
+                return parts.commanding(now_ns, command, *self._port.speeds(now_ns, *self._permit.speeds))
+            case Stage.ARMING:
+                frames = self._arm(now_ns)
+            case Stage.STOPPING:
+                frames = self._ramp(now_ns)
+            case Stage.BRAKING:
+                frames = self._brake(now_ns)
+            case Stage.REST:
+                frames = self._rest(now_ns)
+        return parts.outgoing(now_ns, *frames)
+
+    def _arm(self, now_ns: int) -> Sequence[Frame]:
+        """What lacks, then zeros until there were enough; give up where that takes too long."""
+        self._permit = self._permit.begun(now_ns)
+        pending = self._port.prepare(now_ns, self._permit)
+        if pending is None:
+            self._permit = self._permit.fed_zero(now_ns)
+            if self._permit.zeros > self._table.zeros_to_arm:
+                self._permit = self._permit.armed(now_ns)
+            return self._port.speeds(now_ns, 0.0, 0.0)
+        if pending.is_final or self._permit.lasts_ns(now_ns) > ARMING_TIMEOUT_NS:
+            self._end(self._permit.given_up(f"not armed: {pending.why}"))
+            return self._rest(now_ns) if self._permit.stage is Stage.REST else self._brake(now_ns)
+        return pending.frames
+
+    def _ramp(self, now_ns: int) -> Sequence[Frame]:
+        """Slow down with the declared deceleration, then brake until the wheels stand."""
+        self._permit = self._permit.slowed(now_ns, self._table.stop_deceleration_rad_s2)
+        if max(map(abs, self._permit.speeds)) > self._table.slowest_rad_s:
+            return self._port.speeds(now_ns, *self._permit.speeds)
+        self._end(self._permit.ramped())
+        return self._brake(now_ns)
+
+    def _brake(self, now_ns: int) -> Sequence[Frame]:
+        self._permit = self._permit.begun(now_ns)
+        frames, stands = self._port.brake(now_ns, self._permit.lasts_ns(now_ns))
+        if stands:
+            self._permit = self._permit.rested()
+        return frames
+
+    def _rest(self, now_ns: int) -> Sequence[Frame]:
+        if self._permit.wanted is Request.RESET and self._port.may_reset(now_ns):
+            self._permit = self._permit.reset(self._port.seen)
+            if self._permit.wanted is not Request.RESET:
+                return ()
+        return self._port.rest(now_ns, self._permit)
+
+    def _react(self, heard: Heard) -> None:
+        for name in heard.counts:
+            self._count(name)
+        if heard.restarted is not None:
+            self._end(self._permit.restarted(heard.restarted))
+        if heard.said is not None:
+            self._permit = replace(self._permit, note=STANDS_BY).saying(heard.said)
+        if heard.is_stop:
+            self._end(self._permit.stop_heard())
+        elif heard.commanded is not None:
+            before, self._permit = self._permit, self._permit.command_heard(heard.commanded)
+            if before.stage is not self._permit.stage:
+                self._port.end_drive()
+        if heard.lost is not None and self._permit.is_driving:
+            self._end(self._permit.lost(heard.lost))
+        self._check_objection()
+
+    def _check_objection(self) -> None:
+        if not self._may_lose:
+            return
+        objection = self._port.objection(self._permit)
+        if objection is not None and objection.is_fault:
+            self._end(self._permit.lost(objection.why))
+        elif objection is not None:
+            self._end(self._permit.given_up(objection.why).saying(objection.why))
+
+    def _check_silence(self, now_ns: int) -> None:
+        for source in self._port.sources():
+            silent_ns = 0 if source.heard_ns is None else self._permit.silent_ns(source.heard_ns)
+            why = f"{source.name} fell silent"
+            if self._may_lose:
+                if silent_ns > source.silent_ns:
+                    self._end(self._permit.lost(f"{why}: nothing came for {source.silent_ns * 1e-9:g} s"))
+                    return
+            elif self._is_idle and source.gone_ns is not None and silent_ns > source.gone_ns:
+                self._meet_anew(self._permit.restarted(why, f"{why}: waiting for it"), now_ns)
+                return
+
+    @property
+    def _may_lose(self) -> bool:
+        """Whether something that is wrong has a drive to end, and has not ended it already."""
+        return self._permit.stage not in (Stage.REST, self._table.after_loss)
+
+    @property
+    def _is_idle(self) -> bool:
+        return self._permit.stage in (Stage.REST, self._table.idle)
+
+    def _end(self, permit: MotionPermit) -> None:
+        self._permit = permit
+        self._port.end_drive()
+
+    def _meet_anew(self, permit: MotionPermit, now_ns: int) -> None:
+        self._end(permit)
+        self._port.begin_anew(now_ns)
+
+    def _count(self, name: str) -> None:
+        self.stats = parts.counted(self.stats, name)
