@@ -250,7 +250,7 @@ def gap(
 def fence(
     rooms: Annotated[int, typer.Option(min=1, help="Random rooms with a task.")] = 200,
     manual: Annotated[int, typer.Option(min=1, help="Wild drives by hand.")] = 200,
-    alone: Annotated[int, typer.Option(min=1, help="Corridors for each planner without the guard.")] = 40,
+    alone: Annotated[int, typer.Option(min=1, help="Tight rooms for each planner without the guard.")] = 40,
     off: Annotated[
         float, typer.Option(min=0.0, max=0.3, help="By how much of its size a true parameter may be off.")
     ] = 0.15,

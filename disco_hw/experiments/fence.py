@@ -1,4 +1,4 @@
-"""The fence, tried: random rooms with tasks, wild manual drives, and planners alone in narrow corridors.
+"""The fence, tried: random rooms with tasks, wild manual drives, and planners alone in tight rooms.
 
 Each drive is one line of `drives.jsonl`, so that a campaign that was broken off goes on where it was. The kinds of
 drives that `tools/fence_peers.py` adds (another controller, another simulation) stand in the same table.
@@ -21,12 +21,12 @@ from disco_hw.config.robot import prior_around
 from disco_hw.experiments.fence_drives import (
     FencedDrive,
     along_drive,
-    corridor,
     fenced_setup,
     manual_drive,
     random_room,
     room_drive,
     task_drive,
+    tight_room,
     untold_plant,
     wall_drive,
 )
@@ -46,8 +46,7 @@ ALONE_STREAM = 99
 ALONE = "guard off: "
 """Begins the names of kinds in which the planner alone keeps inside."""
 LEARNING_S = 12.0
-_NARROW_M = (0.04, 0.12)
-_NARROW_MARGIN_M = 0.01
+_BESIDE_M = (0.05, 0.15)
 _POSES_EVERY = 5
 
 
@@ -95,11 +94,11 @@ def alone_drive(
     contender: tuple[str, str, bool],
     planner_of: Callable[[Setup], Planner] | None = None,
 ) -> FencedDrive:
-    """A circle in a corridor, by one of the CONTENDERS alone; the same corridors and robots for all.
+    """A circle in a tight room, by one of the CONTENDERS alone; the same rooms and robots for all.
 
     Who adapts has `LEARNING_S` to do so first. `planner_of` makes another planner for a setup.
     """
-    setup = fenced_setup(*corridor(rng, float(rng.uniform(*_NARROW_M)), _NARROW_MARGIN_M))
+    setup = fenced_setup(*tight_room(rng, float(rng.uniform(*_BESIDE_M))))
     plant, noise = untold_plant(rng, off), int(rng.integers(1 << 30))
     uncertainty, adaptation, by_prior = contender
     control = msgspec.structs.replace(setup.config.control, uncertainty=uncertainty, adaptation=adaptation)

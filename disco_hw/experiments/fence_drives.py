@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import disco_hw
+from disco_hw.control import CommandLimits
+from disco_hw.control.baselines import LAWS, Follower, NominalRobot, Reference
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.fence import Circle, Fence, Footprint
 from disco_hw.fence.clearance import Boundaries
@@ -235,21 +237,34 @@ def _begin(run: SimulatedRun) -> None:
     run.run(0.02, UserRequest.START)
 
 
-def corridor(rng: np.random.Generator, beside_m: float, margin_m: float = 0.05) -> tuple[Fence, CircleTask]:
-    """A circle at 0.3 m/s, and a fence so far beside the footprint's way on both sides."""
-    radius_m = float(rng.uniform(0.6, 1.2))
-    outer = max(math.hypot(radius_m + y, x) for x, y in FOOTPRINT.corners_m())
-    inner = radius_m - 0.5 * FOOTPRINT.width
+def tight_room(rng: np.random.Generator, beside_m: float) -> tuple[Fence, CircleTask]:
+    """A circle at 0.3 m/s in a square room whose walls come so near to the footprint's way."""
+    radius_m, turned = float(rng.uniform(0.6, 1.0)), float(rng.uniform(0.0, 2.0 * np.pi))
+    reach_m = math.sqrt(2.0) * (_outer_m(radius_m) + beside_m)
+    corners = [
+        (reach_m * math.cos(turned + k * 0.5 * np.pi), reach_m * math.sin(turned + k * 0.5 * np.pi)) for k in range(4)
+    ]
     task = CircleTask(center_x_m=0.0, center_y_m=0.0, radius_m=radius_m, speed_m_s=_WALL_M_S)
-    around, within = Circle((0.0, 0.0), outer + beside_m), Circle((0.0, 0.0), inner - beside_m)
-    return Fence(keep_in=around, keep_out=(within,), margin_m=margin_m), task
+    return Fence(keep_in=tuple(corners), margin_m=0.01), task
+
+
+def _outer_m(radius_m: float) -> float:
+    """How far from a circle's centre the footprint reaches that drives on it."""
+    return max(math.hypot(radius_m + y, x) for x, y in FOOTPRINT.corners_m())
 
 
 def along_drive(rng: np.random.Generator, off: float, seconds: float) -> FencedDrive:
-    """A circle at 0.3 m/s whose fence is 0.15 m outside of the footprint's way, with the guard."""
-    setup = fenced_setup(*corridor(rng, _ALONG_M))
-    planner = make_planner(setup.config, setup.model)
-    return task_drive(setup, untold_plant(rng, off), planner, seconds, int(rng.integers(1 << 30)))
+    """A circle at 0.3 m/s between two fences 0.15 m beside the footprint's way, by a control law that sees neither."""
+    radius_m = float(rng.uniform(0.6, 1.2))
+    around = Circle((0.0, 0.0), _outer_m(radius_m) + _ALONG_M)
+    within = Circle((0.0, 0.0), radius_m - 0.5 * FOOTPRINT.width - _ALONG_M)
+    task = CircleTask(center_x_m=0.0, center_y_m=0.0, radius_m=radius_m, speed_m_s=_WALL_M_S)
+    setup = fenced_setup(Fence(keep_in=around, keep_out=(within,)), task)
+    plant, robot = untold_plant(rng, off), setup.config.robot
+    geometry = (robot.wheel_radius_m, robot.axial_distance_m, robot.x_icr_m)
+    chassis = NominalRobot(*geometry, plant.speed_loop_time_constant_s, 0.0, CommandLimits.of_robot(robot))
+    law = Follower(Reference(task.course().outline_m(), _WALL_M_S, robot.x_icr_m), LAWS["kanayama"](), chassis)
+    return task_drive(setup, plant, law, seconds, int(rng.integers(1 << 30)))
 
 
 def room_drive(rng: np.random.Generator, off: float, seconds: float) -> FencedDrive:
