@@ -22,7 +22,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-from disco_hw.bridge import ros2_commands, ros2_inlets
+from disco_hw.bridge import ros2_commands, ros2_inlets, ros2_obstacles
 from disco_hw.bridge import ros2_messages as msg
 from disco_hw.bridge import ros2_outgoing as out
 from disco_hw.config import RobotConfig
@@ -114,9 +114,12 @@ class Bridge:
         self._transforms = ros2_inlets.TransformInlet(pose, config.ros2.base_frame or out.BASE_FRAME, silence_s)
         self._speeds = ros2_commands.SpeedInlet(config.robot, config.drive, parameters)
         self._pad = ros2_commands.DaemonPad(socket_path(config))
+        self._obstacles = ros2_obstacles.ObstacleInlet((self._pose or config.pose).frame)
+        self._obstacle_link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._obstacle_link.setblocking(False)
         self._to_daemon = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._to_daemon.setblocking(False)
-        self._unsent = self._malformed = self._unwritten = self._unread = 0
+        self._unsent = self._obstacles_unsent = self._malformed = self._unwritten = self._unread = 0
         self._heard_ns = self._next_diagnosis_ns = 0
         self._failure: BaseException | None = None
         self._ended = threading.Event()
@@ -138,6 +141,8 @@ class Bridge:
         """Where it is to be found, in words."""
         ros2 = self._config.ros2
         heard = "" if self._pose is None else f"; poses from {self._pose.topic}"
+        if self._config.fence.obstacles_port is not None:
+            heard += f"; obstacles from {ros2_obstacles.TOPIC}"
         reach = "this computer only" if ros2.localhost_only else "the network"
         return f"ROS 2 domain {_domain(self._config)}, {reach}, namespace /{ros2.namespace.strip('/')}{heard}"
 
@@ -173,6 +178,7 @@ class Bridge:
         self._feed.close()
         self._pad.close()
         self._to_daemon.close()
+        self._obstacle_link.close()
 
     def _make_readers(self, namespace: str) -> Iterator[tuple[DataReader[Any], _Take]]:
         # One for each type that a topic may have: only the one that the sender has is ever matched.
@@ -184,6 +190,8 @@ class Bridge:
                 yield self._reader(self._pose.topic, pose, SENSOR, namespace), self._take_pose
         for speed in () if self._base_on_ros else ros2_commands.TYPES:
             yield self._reader(CMD_VEL, speed, SENSOR, namespace), self._take_speed
+        for obstacles in () if self._config.fence.obstacles_port is None else ros2_obstacles.TYPES:
+            yield self._reader(ros2_obstacles.TOPIC, obstacles, SENSOR, namespace), self._take_obstacles
         yield self._reader(CTL, msg.String, RELIABLE, namespace), self._take_request
         yield self._reader(ESTOP, msg.Bool, RELIABLE, namespace), self._take_estop
 
@@ -243,6 +251,15 @@ class Bridge:
             # No daemon, or one that does not keep up: the next pose is worth more than this one.
             self._unsent += 1
 
+    def _take_obstacles(self, message: msg.ObstacleArrayMsg | msg.String, sent_ns: int) -> None:
+        fence = self._config.fence
+        for datagram in self._obstacles.datagrams(message, sent_ns, time.time_ns()):
+            try:
+                self._obstacle_link.sendto(datagram, (fence.obstacles_address, fence.obstacles_port))
+            except OSError:
+                # As with poses: the next report is worth more.
+                self._obstacles_unsent += 1
+
     def _take_speed(self, message: msg.Twist | msg.TwistStamped, sent_ns: int) -> None:
         now_ns = time.monotonic_ns()
         request = self._speeds.request(message, sent_ns, now_ns, time.time_ns())
@@ -286,6 +303,8 @@ class Bridge:
             f"poses refused: {why}": count for why, count in (self._poses.refused + self._transforms.refused).items()
         }
         figures |= {"poses without a heading": self._poses.without_heading}
+        figures |= {"obstacles passed on": self._obstacles.passed, "obstacles not sent": self._obstacles_unsent}
+        figures |= {f"obstacles refused: {why}": count for why, count in self._obstacles.refused.items()}
         figures |= {"speeds passed on": self._speeds.passed}
         figures |= {f"speeds refused: {why}": count for why, count in self._speeds.refused.items()}
         figures |= {"requests refused, too many": self._asking.refused + self._stopping.refused}

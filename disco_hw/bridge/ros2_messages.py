@@ -8,7 +8,7 @@ A type `nav_msgs/msg/Odometry` is `nav_msgs::msg::dds_::Odometry_` on the wire, 
 from dataclasses import dataclass, field
 
 from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import array, float64, int32, sequence, uint8, uint32
+from cyclonedds.idl.types import array, float32, float64, int32, int64, sequence, uint8, uint32
 
 
 @dataclass
@@ -207,6 +207,42 @@ class DiagnosticArray(IdlStruct, typename="diagnostic_msgs::msg::dds_::Diagnosti
 
     header: Header = field(default_factory=Header)
     status: sequence[DiagnosticStatus] = field(default_factory=list)
+
+
+@dataclass
+class Point32(IdlStruct, typename="geometry_msgs::msg::dds_::Point32_"):
+    """In m."""
+
+    x: float32 = 0.0
+    y: float32 = 0.0
+    z: float32 = 0.0
+
+
+@dataclass
+class Polygon(IdlStruct, typename="geometry_msgs::msg::dds_::Polygon_"):
+    """Corners one after the other."""
+
+    points: sequence[Point32] = field(default_factory=list)
+
+
+@dataclass
+class ObstacleMsg(IdlStruct, typename="costmap_converter_msgs::msg::dds_::ObstacleMsg_"):
+    """An obstacle: a circle if `polygon` is one point, with its `radius` (m) around all points otherwise."""
+
+    header: Header = field(default_factory=Header)
+    polygon: Polygon = field(default_factory=Polygon)
+    radius: float64 = 0.0
+    id: int64 = 0
+    orientation: Quaternion = field(default_factory=Quaternion)
+    velocities: TwistWithCovariance = field(default_factory=TwistWithCovariance)
+
+
+@dataclass
+class ObstacleArrayMsg(IdlStruct, typename="costmap_converter_msgs::msg::dds_::ObstacleArrayMsg_"):
+    """Some obstacles."""
+
+    header: Header = field(default_factory=Header)
+    obstacles: sequence[ObstacleMsg] = field(default_factory=list)
 
 
 def stamp_of(time_ns: int) -> Time:

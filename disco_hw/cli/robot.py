@@ -162,10 +162,14 @@ def init(
     }
     given = tuple((field, value) for field, value in measures.items() if value is not None)
     options = InitOptions(out, link, driver, name, given, listen_s, pose_source, overwrite, ask)
-    written = run_init(options, None if yes or not sys.stdin.isatty() else input, progress_line)
-    from disco_hw.first_use.fence_drive import OFFER
+    is_asked = not yes and sys.stdin.isatty()
+    written = run_init(options, input if is_asked else None, progress_line)
+    from disco_hw.first_use.fence_drive import OFFER, record_fence
 
-    print(f"written: {written}\nnext: disco-hw check {written}\n{OFFER.format(robot=written)}")
+    print(f"written: {written}\nnext: disco-hw check {written}", flush=True)
+    # Its wiring is not known to be right yet.
+    if not is_asked or not record_fence(written, input, "push it, disarmed; drive it after `commission` only", link):
+        print(OFFER.format(robot=written))
 
 
 def commission(
@@ -191,11 +195,12 @@ def commission(
     options = CommissionOptions(robot, link, write=write, log_directory=log_directory)
     if stage:
         options = replace(options, stages=tuple(stage))
-    from disco_hw.first_use.fence_drive import OFFER
+    from disco_hw.first_use.fence_drive import OFFER, record_fence
 
     result = run_commission(options)
-    offer = f"\n{OFFER.format(robot=robot)}" if result.ok else ""
-    print_result(result.as_dict(), as_json, result.as_text() + offer)
+    print_result(result.as_dict(), as_json, result.as_text())
+    if result.ok and not as_json and not record_fence(robot, input, "push it, or drive it by hand", link):
+        print(OFFER.format(robot=robot))
     if not result.ok:
         raise typer.Exit(1)
 

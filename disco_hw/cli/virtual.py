@@ -250,19 +250,24 @@ def gap(
 def fence(
     rooms: Annotated[int, typer.Option(min=1, help="Random rooms with a task.")] = 200,
     manual: Annotated[int, typer.Option(min=1, help="Wild drives by hand.")] = 200,
+    alone: Annotated[int, typer.Option(min=1, help="Tight rooms for each planner without the guard.")] = 40,
     off: Annotated[
         float, typer.Option(min=0.0, max=0.3, help="By how much of its size a true parameter may be off.")
     ] = 0.15,
     seconds: Annotated[float, typer.Option(min=2.0, help="Length of a drive.")] = 12.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of rooms, robots and commands.")] = 1,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Directory for the picture.")] = Path("out/fence"),
+    out: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--out", help="Directory for drives and picture; what is there already is not driven again."
+        ),
+    ] = Path("out/fence"),
     as_json: AsJson = False,
 ) -> None:
     """Drive in random rooms on robots that nobody told, and count how often one leaves its fence."""
     from disco_hw.experiments.fence import FenceOptions, run_fence
 
     refuse_directory(out)
-    result = run_fence(FenceOptions(rooms, manual, off, seconds, seed), progress_line)
-    out.mkdir(parents=True, exist_ok=True)
+    result = run_fence(FenceOptions(rooms, manual, alone, off, seconds, seed), out, progress_line)
     result.write_pictures(out / "fence.png")
     print_result(result.as_dict(), as_json, f"{result.table()}\n\nwritten: {out}/fence.png")

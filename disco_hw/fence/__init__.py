@@ -54,7 +54,8 @@ class Fence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     """[fence] of robot.toml: where the whole footprint must stay, and where no part of it may be.
 
     Within `margin_m` of the fence commands that lead towards it are scaled. `max_breach_probability`: of a plan over
-    its horizon. `obstacles_port`: UDP port on which obstacles are reported; None takes no reports.
+    its horizon. `obstacles_port`: UDP port on which obstacles are reported, also by the
+    bridge to ROS 2; None takes no reports.
     """
 
     keep_in: Shape | None = None

@@ -1,15 +1,19 @@
-"""The fence of a drive along the edge, by hand or pushed, from its log: lines for robot.toml."""
+"""The fence of a drive along the edge, by hand or pushed: recorded and written into robot.toml, or made from a log."""
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
+from disco_hw.drive.drive_command import DriveOptions, DriveResult, run_drive
 from disco_hw.errors import InputError
 from disco_hw.fence import Polygon
 from disco_hw.fence.recording import NoFence, fence_along
 from disco_hw.first_use import in_toml
+from disco_hw.first_use.commission import CommissionOptions, write_fields
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Estimate
 from disco_hw.runtime.robot_setup import setup_of_log
@@ -18,7 +22,9 @@ OFFER = (
     "to fence it in: push or drive it once round along the edge with `disco-hw drive {robot}`, then "
     "`disco-hw log fence LOG` writes the [fence] (docs/fence.md)"
 )
-"""What `init` and `commission` offer at their end."""
+"""What `init` and `commission` print at their end where nobody can be asked, or who is asked says no."""
+_QUESTION = "record the fence now, by taking the robot once round along the edge? Poses must come. [y/n] "
+_AGAIN = "once more? [y/n] "
 _EVERY = 5
 
 
@@ -40,3 +46,33 @@ def fence_of_log(log: Path) -> Polygon:
 def fence_toml(keep_in: Polygon) -> str:
     """The section for robot.toml."""
     return f"[fence]\nkeep_in = {in_toml([list(corner) for corner in keep_in])}\n"
+
+
+def record_fence(
+    robot: Path,
+    ask: Callable[[str], str],
+    how: str,
+    link: str | None = None,
+    drive: Callable[[DriveOptions], DriveResult] = run_drive,
+) -> bool:
+    """Offer to record the fence of a robot.toml in a drive along the edge, and to write it; whether it was written.
+
+    `how`: what the operator does once the recording runs. `ask`: how the operator is asked. A way that makes no fence
+    can be driven again. Raises InputError and WorkError as the drive does.
+    """
+    question = _QUESTION
+    while _is_yes(ask(question)):
+        print(f"{how}; Ctrl-D ends the recording", file=sys.stderr, flush=True)
+        log = drive(DriveOptions(robot, link=link)).log
+        try:
+            keep_in = fence_of_log(log)
+        except InputError as error:
+            print(error, file=sys.stderr, flush=True)
+            question = _AGAIN
+            continue
+        return write_fields(CommissionOptions(robot), {("fence", "keep_in"): [list(one) for one in keep_in]}, ask)
+    return False
+
+
+def _is_yes(answer: str) -> bool:
+    return answer.strip().lower() in {"y", "yes"}

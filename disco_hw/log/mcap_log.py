@@ -37,7 +37,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from disco_hw.log import Batch, BatchDecoder, End, Start, TaskScene
 from disco_hw.log.encoding import encode_json, json_schema
-from disco_hw.log.records import TOPICS, Estimate, Event, Fan, FenceGuard, Plan, Record
+from disco_hw.log.records import TOPICS, Estimate, Event, Fan, GuardVerdict, Plan, Record
 from drivers.types import PoseSample
 
 VIEWS: tuple[tuple[str, Any], ...] = (
@@ -88,7 +88,7 @@ def views(record: Record, wall_ns: int) -> list[tuple[str, bytes]]:
             return [("/view/plan", plan.SerializeToString())]
         case Fan() if record.weights:
             return [("/view/rollouts", _rollouts(record, time).SerializeToString())]
-        case FenceGuard() if record.path_x_m or record.obstacles:
+        case GuardVerdict() if record.path_x_m or record.obstacles:
             return [("/view/fence", _stopping(record, time).SerializeToString())]
         case Event():
             log = Log(
@@ -132,7 +132,7 @@ def scene_message(scene: TaskScene) -> bytes:
     return message
 
 
-def _stopping(record: FenceGuard, time: Timestamp) -> SceneUpdate:
+def _stopping(record: GuardVerdict, time: Timestamp) -> SceneUpdate:
     """The fence guard's stopping path, red where it holds the robot, and the obstacles."""
     free = record.verdict in {"free", "scaled"}
     colour = Color(r=0.1, g=0.6, b=0.2, a=1.0) if free else Color(r=0.8, g=0.1, b=0.1, a=1.0)

@@ -265,7 +265,7 @@ class UnexplainedMotion(msgspec.Struct, frozen=True, gc=False):
     drift_y_m_s: float
 
 
-class FenceGuard(msgspec.Struct, frozen=True, gc=False):
+class GuardVerdict(msgspec.Struct, frozen=True, gc=False):
     """What the fence guard made of the command of one tick, while there is a fence or an obstacle.
 
     `scale`: of the requested command that was let through. `clearance_m`: least along the stopping path after it, less
@@ -285,7 +285,7 @@ class FenceGuard(msgspec.Struct, frozen=True, gc=False):
     obstacles: tuple[float, ...] = ()
 
 
-class Fence(msgspec.Struct, frozen=True, gc=False):
+class FenceChange(msgspec.Struct, frozen=True, gc=False):
     """The fence from `t_ns` on, where it is another than robot.toml's: [fence] as JSON."""
 
     t_ns: int
@@ -330,8 +330,8 @@ Record = (
     | Fan
     | Controller
     | UnexplainedMotion
-    | FenceGuard
-    | Fence
+    | GuardVerdict
+    | FenceChange
     | Obstacle
 )
 
@@ -367,8 +367,8 @@ TOPICS: tuple[Topic, ...] = (
     Topic("/adapt", Adaptation),
     Topic("/controller", Controller),
     Topic("/disturbance", UnexplainedMotion),
-    Topic("/fence/guard", FenceGuard),
-    Topic("/fence", Fence),
+    Topic("/fence/guard", GuardVerdict),
+    Topic("/fence", FenceChange),
     Topic("/obstacle", Obstacle),
 )
 

@@ -75,7 +75,8 @@ class FenceState(msgspec.Struct, frozen=True, gc=False):
     """What the guard found in one tick.
 
     `scale`: of the requested command that is let through. `clearance_m`: least on the stopping path after it, less the
-    uncertainty; negative outside. `path`: that path, x, y (m), yaw (rad) of the tracked point.
+    uncertainty; negative outside; at most the margin and twice the footprint's reach. `path`: that path, x, y (m),
+    yaw (rad) of the tracked point.
     """
 
     verdict: FenceVerdict
@@ -163,7 +164,7 @@ class FenceGuard:
         poses, clearance, driven = self._stopping_paths(bounds, estimate, geometry, last_sent, wanted)
         if not np.isfinite(clearance).all():
             return FenceState(FenceVerdict.NO_POSE, 0.0, math.nan, reason="the stopping path is not finite")
-        chosen = self._largest_scale(clearance, driven) if asks else 0
+        chosen = self._largest_scale(clearance, driven)
         if self._is_stopped and chosen < RELEASED_FROM:
             chosen = 0
         self._is_stopped = asks and chosen == 0
@@ -190,8 +191,7 @@ class FenceGuard:
         least = np.minimum(between.min(axis=1), clearance.min(axis=1))
         stopping = least[0]
         keeps_off = least >= np.minimum(SCALES[:, None] * self._margin_m, stopping)
-        begin = clearance[:, :1]
-        leads_away = (clearance >= begin).all(axis=1) & (clearance[:, -1] > begin[:, 0])
+        leads_away = (clearance >= clearance[:, :1]).all(axis=1) & (clearance[:, -1] > clearance[:, 0])
         allowed = (leads_away | (keeps_off & (stopping >= 0.0))).all(axis=1)
         return int(np.flatnonzero(allowed)[-1]) if allowed.any() else 0
 
@@ -212,7 +212,7 @@ class FenceGuard:
         found = [self._paths(estimate, geometry, one, requested, spread) for one in (last_sent, measured)]
         poses, driven, time_s = (np.concatenate(each) for each in zip(*found, strict=True))
         clearance = bounds.clearances_m(
-            poses.reshape(-1, 3), time_s.reshape(-1), within_m=self._margin_m + 2.0 * reach_m
+            poses.reshape(-1, 3), time_s.ravel(), within_m=self._margin_m + 2.0 * reach_m
         ).reshape(*poses.shape[:2], -1)
         turned = np.cumsum(np.abs(driven[..., 1]), axis=1)
         moved = np.cumsum(np.abs(driven[..., 0]), axis=1)
@@ -239,7 +239,8 @@ class FenceGuard:
         now, command = np.array(wheels), SCALES[:, None] * np.array(requested)
         held_s = settings.response_s + spread.distance * (estimate.pose_age_s or 0.0)
         tail_s = 1.5 * settings.period_s + settings.reaction_s
-        slowed = np.where(now * command < 0.0, now, np.where(np.abs(now) > np.abs(command), now - command, 0.0))
+        # What of the present speed exceeds the command; all of it where the command is the other way.
+        slowed = now - np.clip(command, np.minimum(now, 0.0), np.maximum(now, 0.0))
         turned = [
             np.zeros((count, 1, 2)),
             np.broadcast_to(now * (held_s / _HELD), (count, _HELD, 2)),
@@ -252,9 +253,9 @@ class FenceGuard:
         lasting_s = [
             np.zeros((count, 1)),
             np.full((count, _HELD), held_s / _HELD),
-            coast_s[:, None] * np.diff(_even_braking(_COASTED)),
+            coast_s[:, None] * _braking_parts(_COASTED),
             np.full((count, _HELD), tail_s / _HELD),
-            brake_s[:, None] * np.diff(_even_braking(_BRAKED)),
+            brake_s[:, None] * _braking_parts(_BRAKED),
         ]
         radius, axle, x_icr = geometry.wheel_radius_m, geometry.axial_distance_m, geometry.x_icr_m
         moved = (1.0 + spread.distance) * 0.5 * radius * wheel_rad.sum(axis=2)
@@ -280,9 +281,9 @@ class FenceGuard:
         return np.repeat(whole[:, None, :] / steps, steps, axis=1)
 
 
-def _even_braking(steps: int) -> Array:
-    """When (0 to 1) a body that brakes evenly has come each of so many equal parts of its way."""
-    return np.asarray(1.0 - np.sqrt(1.0 - np.arange(steps + 1) / steps))
+def _braking_parts(steps: int) -> Array:
+    """Which part of its braking time a body that brakes evenly takes for each of so many equal parts of its way."""
+    return np.asarray(-np.diff(np.sqrt(np.linspace(1.0, 0.0, steps + 1))))
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,8 +22,8 @@ from disco_hw.log.records import (
     Command,
     Controller,
     Estimate,
-    Fence,
-    FenceGuard,
+    FenceChange,
+    GuardVerdict,
     Innovation,
     Obstacle,
     Plan,
@@ -161,7 +161,7 @@ class _ReplayedArea:
         self._overridden = False
         for entry in recorded:
             match entry.record:
-                case Fence() as changed if self._guard is not None:
+                case FenceChange() as changed if self._guard is not None:
                     fence = fence_of_record(changed)
                     self._guard.set_boundaries(Boundaries(self._footprint, fence), fence.margin_m)
                 case Obstacle(removed=True) as gone:
@@ -172,7 +172,7 @@ class _ReplayedArea:
                     said = {**answers.told, **answers.fixed, **answers.declared}
                     stops = said.get("stop_deceleration_rad_s2", self._fastest_rad_s2)
                     self._guard.set_deceleration(min(stops, self._fastest_rad_s2))
-                case FenceGuard() as found:
+                case GuardVerdict() as found:
                     self._overridden = found.overridden
 
     def begin(self, now_ns: int) -> bool:

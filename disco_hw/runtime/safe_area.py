@@ -67,7 +67,7 @@ class SafeArea:
             circles = self.obstacles.circles(now_ns) if is_shown else ()
             obstacles = tuple(value for one in circles for value in (one.x_m, one.y_m, one.radius_m))
             written.append(
-                records.FenceGuard(
+                records.GuardVerdict(
                     now_ns,
                     verdict.value,
                     found.scale,
@@ -156,12 +156,12 @@ class SafeArea:
         return 0.0 if self._override_until_ns is None else max(0, self._override_until_ns - now_ns) * 1e-9
 
 
-def record_of_fence(t_ns: int, fence: Fence) -> records.Fence:
+def record_of_fence(t_ns: int, fence: Fence) -> records.FenceChange:
     """The record of a fence that is in force from `t_ns` on."""
-    return records.Fence(t_ns, msgspec.json.encode(fence).decode())
+    return records.FenceChange(t_ns, msgspec.json.encode(fence).decode())
 
 
-def fence_of_record(record: records.Fence) -> Fence:
+def fence_of_record(record: records.FenceChange) -> Fence:
     """The fence of a record."""
     return msgspec.json.decode(record.fence, type=Fence)
 

@@ -20,13 +20,13 @@ Array = NDArray[np.float64]
 _NUMBERS_OF_CIRCLE = 3
 
 
-def obstacle_outlines(guard: records.FenceGuard | None) -> list[Array]:
+def obstacle_outlines(guard: records.GuardVerdict | None) -> list[Array]:
     """The obstacles of a record of the guard as closed lines (N, 2)."""
     numbers = () if guard is None else guard.obstacles
     return [circle_outline(*numbers[k : k + _NUMBERS_OF_CIRCLE]) for k in range(0, len(numbers), _NUMBERS_OF_CIRCLE)]
 
 
-def stopping_outlines(guard: records.FenceGuard | None, footprint: Footprint) -> list[Array]:
+def stopping_outlines(guard: records.GuardVerdict | None, footprint: Footprint) -> list[Array]:
     """The stopping path of a record of the guard, and the footprint at its beginning and its end, as lines (N, 2)."""
     if guard is None or not guard.path_x_m:
         return []
@@ -106,6 +106,6 @@ def in_text(shapes: Any) -> str:
     return "" if shapes is None else json.dumps(msgspec.to_builtins(shapes))
 
 
-def fence_in_force(fence: Fence, record: records.Fence | None) -> Fence:
+def fence_in_force(fence: Fence, record: records.FenceChange | None) -> Fence:
     """The fence where this record of it is the newest; robot.toml's, `fence`, without one."""
     return fence if record is None else fence_of_record(record)

@@ -78,8 +78,8 @@ class Snapshot:
     task: records.Task | None
     belief: records.BeliefChange | None
     adaptation: records.Adaptation | None
-    guard: records.FenceGuard | None = None
-    fence: records.Fence | None = None
+    guard: records.GuardVerdict | None = None
+    fence: records.FenceChange | None = None
 
 
 def snapshot_at(timeline: Timeline, t_ns: int, plan: records.Plan | None) -> Snapshot:
@@ -125,7 +125,7 @@ def snapshot_at(timeline: Timeline, t_ns: int, plan: records.Plan | None) -> Sna
     )
 
 
-def _fresh_guard(timeline: Timeline, t_ns: int) -> records.FenceGuard | None:
+def _fresh_guard(timeline: Timeline, t_ns: int) -> records.GuardVerdict | None:
     guard = timeline.guards.last(t_ns)
     return guard if guard is not None and t_ns - guard.t_ns <= PLAN_AGE_NS else None
 

@@ -147,8 +147,8 @@ class Timeline:
         self.tasks: Items[records.Task] = Items()
         self.beliefs: Items[records.BeliefChange] = Items()
         self.adaptations: Items[records.Adaptation] = Items()
-        self.guards: Items[records.FenceGuard] = Items()
-        self.fences: Items[records.Fence] = Items()
+        self.guards: Items[records.GuardVerdict] = Items()
+        self.fences: Items[records.FenceChange] = Items()
 
     def add(self, now_ns: int, record: records.Record | records.PlanFigures) -> None:  # noqa: PLR0912, PLR0915
         """Take in one record of the tick at `now_ns`; ticks come in order. Frames are not kept."""
@@ -198,11 +198,11 @@ class Timeline:
                 self.beliefs.append(now_ns, it)
             case records.Adaptation() as it:
                 self.adaptations.append(now_ns, it)
-            case records.FenceGuard() as it:
+            case records.GuardVerdict() as it:
                 # Those between two that hold a path would hide it.
                 if it.path_x_m or it.obstacles or it.reason:
                     self.guards.append(now_ns, it)
-            case records.Fence() as it:
+            case records.FenceChange() as it:
                 self.fences.append(now_ns, it)
             case _:
                 pass

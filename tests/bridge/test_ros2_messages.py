@@ -9,11 +9,24 @@ import numpy as np
 import pytest
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from disco_hw.bridge import ros2_messages as msg
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
+# As costmap_converter_msgs defines them; they are no part of ROS 2 itself.
+OBSTACLE = """std_msgs/Header header
+geometry_msgs/Polygon polygon
+float64 radius
+int64 id
+geometry_msgs/Quaternion orientation
+geometry_msgs/TwistWithCovariance velocities
+"""
+OBSTACLES = """std_msgs/Header header
+costmap_converter_msgs/ObstacleMsg[] obstacles
+"""
+for name, text in (("ObstacleMsg", OBSTACLE), ("ObstacleArrayMsg", OBSTACLES)):
+    STORE.register(get_types_from_msg(text, f"costmap_converter_msgs/msg/{name}"))
 TYPES = [
     one for one in vars(msg).values() if dataclasses.is_dataclass(one) and one.__module__ == msg.__name__
 ]  # fmt: skip
@@ -54,6 +67,8 @@ ELEMENTS = {
     ("TFMessage", "transforms"): msg.TransformStamped,
     ("DiagnosticStatus", "values"): msg.KeyValue,
     ("DiagnosticArray", "status"): msg.DiagnosticStatus,
+    ("Polygon", "points"): msg.Point32,
+    ("ObstacleArrayMsg", "obstacles"): msg.ObstacleMsg,
 }
 
 

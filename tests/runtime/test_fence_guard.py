@@ -593,7 +593,7 @@ def test_a_corner_moves_by_the_way_and_by_the_turn():
 def test_long_arcs_end_where_they_do():
     slow = StoppingSettings(response_s=1.2, reaction_s=0.9, deceleration_rad_s2=2.0, period_s=0.02)
     wide = Fence(keep_in=Circle((0.0, 0.0), 20.0))
-    for before, command in (((2.0, 7.0), (2.0, 7.0)), ((-3.0, 4.0), (-3.0, 4.0))):
+    for before, command in (((2.0, 7.0), (2.0, 7.0)), ((-3.0, 4.0), (-3.0, 4.0)), ((0.5, 0.6), (0.6, 0.7))):
         found = judge(wide, estimate(0.0, 0.0, 0.4, before), command, stops=slow)
         expected = integrated(estimate(0.0, 0.0, 0.4, before), EXACT, before, command, slow, 1.2, 1.0)
         np.testing.assert_allclose(found.path[-1], expected[-1], atol=2e-4)
@@ -635,3 +635,65 @@ def test_an_obstacle_is_met_at_the_time_of_coming_to_a_slower_command():
         found = guard._stopping_paths(guard.boundaries, estimate(wheels=before), EXACT, before, command)
         end_m = found[0][-1, -1, 0] + 0.3
         assert found[1][-1, -1, 1] == pytest.approx(3.0 - end_s - 0.1 - end_m)
+
+
+@pytest.mark.parametrize(("before", "command"), [((6.0, 3.0), (3.0, 1.0)), ((2.0, 5.0), (1.0, 6.0))])
+def test_in_a_turn_the_faster_wheel_says_how_long_the_braking_lasts(before, command):
+    guard = guard_of(Fence())
+    velocity = -0.25
+    guard.set_obstacles([MovingCircle(1.5, 0.0, 0.1, velocity, 0.0)])
+    found = guard._stopping_paths(guard.boundaries, estimate(wheels=before), EXACT, before, command)
+    excess = max(max(now - then, 0.0) for now, then in zip(before, command, strict=True))
+    end_s = 0.08 + excess / 20.0 + 0.13 + max(command) / 20.0
+    there = Boundaries(FOOTPRINT, Fence(), [MovingCircle(1.5 + velocity * end_s, 0.0, 0.1)])
+    assert found[1][-1, -1, 1] == pytest.approx(there.clearance_m(found[0][-1, -1:])[0], abs=1e-9)
+
+
+def test_a_clearance_that_matters_to_nothing_is_given_as_the_largest_that_does():
+    found = judge(Fence(keep_in=Circle((0.0, 0.0), 20.0)), estimate(), (0, 0), margin_m=0.25)
+    assert found.clearance_m == pytest.approx(0.25 + 2.0 * FOOTPRINT.reach_m)
+    assert judge(Fence(keep_in=((-9, -9), (9, -9), (9, 9), (-9, 9))), estimate(), (0, 0)).clearance_m == pytest.approx(
+        0.05 + 2.0 * FOOTPRINT.reach_m
+    )
+
+
+def test_a_path_of_which_only_the_end_has_no_numbers_moves_nothing():
+    with np.errstate(all="ignore"):
+        found = judge(Fence(keep_in=ROOM), estimate(), (1e200, 1e200))
+    assert (found.verdict, found.scale) == (FenceVerdict.NO_POSE, 0.0)
+    assert found.reason == "the stopping path is not finite"
+
+
+def test_the_place_that_is_said_is_where_the_full_command_would_be_deepest():
+    # It would go over the pillar and stop far behind it; a part of the command would stop on it.
+    slow = StoppingSettings(response_s=0.08, reaction_s=0.1, deceleration_rad_s2=2.0, period_s=0.02)
+    fence = Fence(keep_out=(Circle((0.55, 0.0), 0.14),))
+    found = judge(fence, estimate(), (8, 8), stops=slow, margin_m=0.25)
+    bounds = Boundaries(FOOTPRINT, fence)
+    expected = integrated(estimate(), EXACT, (0, 0), (8, 8), slow, slow.response_s, 1.0)
+    deepest = expected[bounds.clearance_m(expected).argmin()]
+    assert bounds.clearance_m(expected[-1:])[0] > 0.0
+    assert found.verdict is FenceVerdict.STOPPED
+    where = float(found.reason.partition("(")[2].partition(",")[0])
+    assert where == pytest.approx(deepest[0], abs=0.12)
+
+
+def test_between_two_points_both_of_them_count():
+    far = [1.0, 1.0, 1.0, 1.0]
+    still = [[0.0] * 4] * len(SCALES)
+    driven = [[0.0] * 4, [0.0, 0.0, 0.0, 0.2], *still[2:]]
+    # Between the last two the clearance may be 0.2 - 0.1, and a quarter of the margin is 0.125.
+    assert largest(paths(far, [1.0, 0.2, 0.2, 0.2]), driven) == 0.0
+    assert largest(paths(far, [1.0, 0.2, 0.2, 0.2]), still) == 0.25
+
+
+def test_the_spread_of_a_turn_counts_what_radius_and_axle_have_in_common_twice():
+    share = 0.01**2
+    radius, axle = share * RADIUS**2, share * AXLE**2
+    half = 0.5 * share * RADIUS * AXLE
+    both = OdometryParameters(RADIUS, AXLE, X_ICR, ((radius, half, 0), (half, axle, 0), (0, 0, 0)))
+    alone = OdometryParameters(RADIUS, AXLE, X_ICR, ((radius, 0, 0), (0, 0, 0), (0, 0, 0)))
+    found = [
+        judge(Fence(keep_in=CELL), estimate(wheels=(1, 3)), (1, 3), geometry=one).clearance_m for one in (both, alone)
+    ]
+    assert found[0] == pytest.approx(found[1], abs=1e-12)

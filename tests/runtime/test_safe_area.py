@@ -96,7 +96,7 @@ def test_a_hand_is_stopped_before_the_wall_and_may_leave_it(robot_file, tmp_path
     ticks = run.run(1.0)
     assert events_of(ticks) == ["fence: motion is allowed again"]
     assert left_m(run) > 0.2
-    guards = [one for _, tick in run.recorder.ticks for one in tick if isinstance(one, records.FenceGuard)]
+    guards = [one for _, tick in run.recorder.ticks for one in tick if isinstance(one, records.GuardVerdict)]
     assert {"free", "scaled", "stopped"} <= {one.verdict for one in guards}
     assert sum(bool(one.path_x_m) for one in guards) > len(guards) / 6
     log = tmp_path / "run.mcap"
@@ -137,7 +137,9 @@ def test_without_a_pose_only_an_override_moves_the_robot(robot_file, tmp_path):
     assert ticks[-1].command.left_rad_s == pytest.approx(3.0)
     assert events_of(ticks)[0].startswith("fence: OVERRIDDEN by request")
     assert run.core.area.status(run.now_us * 1000)["overridden_s"] == pytest.approx(59.0, abs=0.1)
-    assert any(one.overridden for _, tick in run.recorder.ticks for one in tick if isinstance(one, records.FenceGuard))
+    assert any(
+        one.overridden for _, tick in run.recorder.ticks for one in tick if isinstance(one, records.GuardVerdict)
+    )
     # It is the hand's alone.
     run.pilot.step = lambda now_ns, last: PilotTick(motion=Manual(3.0, 3.0))
     assert run.run(1.0)[-1].command.left_rad_s == 0.0

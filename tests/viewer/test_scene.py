@@ -9,7 +9,7 @@ from viser.infra import WebsockServer
 
 from disco_hw.fence import Circle, Fence
 from disco_hw.log import records
-from disco_hw.log.records import FenceGuard
+from disco_hw.log.records import GuardVerdict
 from disco_hw.runtime.robot_setup import record_of
 from disco_hw.tasks.circle import CircleTask
 from disco_hw.viewer import scene as scene_module
@@ -28,7 +28,7 @@ FAN = records.Fan(
 
 
 FENCE = Fence(keep_in=((-2.0, -2.0), (2.0, -2.0), (0.0, 2.0)), keep_out=(Circle((0.5, 0.5), 0.2),))
-GUARD = FenceGuard(
+GUARD = GuardVerdict(
     0, "free", 1.0, 0.5, path_x_m=(0.0, 0.1), path_y_m=(0.0, 0.0), path_yaw_rad=(0.0, 0.1), obstacles=(1.0, 0.0, 0.3)
 )
 

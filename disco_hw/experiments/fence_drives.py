@@ -1,0 +1,274 @@
+"""Drives near a fence in simulated time: wild ones by hand, into a wall, and a task in a room, on untold robots.
+
+The daemon's own tick (`SimulatedRun`). Each virtual robot's geometry is up to 15 % off what the model says, its motors
+are slower or quicker, and its ground slips more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+import disco_hw
+from disco_hw.control import CommandLimits
+from disco_hw.control.baselines import LAWS, Follower, NominalRobot, Reference
+from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
+from disco_hw.fence import Circle, Fence, Footprint
+from disco_hw.fence.clearance import Boundaries
+from disco_hw.fence.task_line import task_breach
+from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.core import CoreTick, PilotTick
+from disco_hw.runtime.fence_guard import FenceVerdict
+from disco_hw.runtime.pipeline import Manual, NoPlanner, Planner
+from disco_hw.runtime.robot_setup import Setup, load_setup
+from disco_hw.runtime.safe_area import SafeArea
+from disco_hw.runtime.supervisor import UserRequest
+from disco_hw.tasks import RobotTask
+from disco_hw.tasks.circle import CircleTask
+from sim.body_dynamics import BodyPose
+from sim.plant_parameters import PlantParameters
+
+Array = NDArray[np.float64]
+FOOTPRINT = Footprint(0.50, 0.40, 0.05)
+_SHIPPED = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
+_ALONG_M = 0.15
+_WALL_M_S = 0.3
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FencedDrive:
+    """One drive: its fence, the true poses (N, 3), the least true clearance (m), and the guard's stops.
+
+    `left_m`: the true clearance at rest after each of the guard's stops; `stops`: how often it stopped. `way_m`: how
+    far the tracked point went.
+    """
+
+    fence: Fence
+    poses: Array
+    least_m: float
+    left_m: tuple[float, ...]
+    stops: int
+    way_m: float
+
+
+class _Hand:
+    """A pilot by hand whose wheel speeds somebody else sets."""
+
+    def __init__(self) -> None:
+        self.wheels = (0.0, 0.0)
+
+    @property
+    def needs_pose(self) -> bool:
+        """By hand no pose is needed; the fence asks for one."""
+        return False
+
+    @property
+    def done(self) -> bool:
+        """It drives until it is left off."""
+        return False
+
+    def step(self, now_ns: int, last: CoreTick | None) -> PilotTick:
+        """Drive at the wheel speeds that are set."""
+        return PilotTick(motion=Manual(*self.wheels), by_hand=True)
+
+    def learn(self, now_ns: int, tick: CoreTick, replies: Any) -> None:
+        """Nothing is learnt."""
+
+    def steer(self, now_ns: int, page: int, wanted: Any) -> str | None:
+        """No page drives."""
+        return "driven by an experiment"
+
+    def status(self) -> dict[str, Any]:
+        """Nothing is added."""
+        return {}
+
+
+class _Overridden(SafeArea):
+    """Fence and obstacles of a robot whose planner knows them and whose guard is overridden throughout."""
+
+    def begin(self, now_ns: int, by_hand: bool) -> bool:
+        """As of the base class, and overridden."""
+        super().begin(now_ns, by_hand)
+        return True
+
+
+def fenced_setup(fence: Fence, task: RobotTask | None = None, base: Setup | None = None) -> Setup:
+    """The shipped robot, or `base`, with this fence and task and a footprint."""
+    setup = base or load_setup(_SHIPPED)
+    robot = msgspec.structs.replace(setup.config.robot, footprint_m=FOOTPRINT)
+    changes = {"fence": fence, "robot": robot} | ({} if task is None else {"task": task})
+    return replace(setup, config=msgspec.structs.replace(setup.config, **changes))
+
+
+def untold_plant(rng: np.random.Generator, off: float) -> PlantParameters:
+    """A plant whose geometry is up to `off` away from the model's mean, with other motors and another ground."""
+    usual = PlantParameters()
+    geometry = {
+        name: getattr(usual, name) * (1.0 + off * rng.uniform(-1.0, 1.0))
+        for name in ("wheel_radius_m", "axial_distance_m", "x_icr_m")
+    }
+    return replace(
+        usual,
+        **geometry,
+        speed_loop_time_constant_s=rng.uniform(0.03, 0.09),
+        slip_std_x_m_s=0.01 * rng.uniform(),
+        slip_std_y_m_s=0.008 * rng.uniform(),
+        slip_std_yaw_rad_s=0.036 * rng.uniform(),
+    )
+
+
+def random_room(rng: np.random.Generator, pillars: int) -> Fence:
+    """A room of four to eight corners about the origin, with pillars that leave the middle free."""
+    count = int(rng.integers(4, 9))
+    angles = np.sort(rng.uniform(0.0, 2.0 * np.pi, count) * 0.2 + 2.0 * np.pi * np.arange(count) / count)
+    reach = rng.uniform(1.5, 2.4, count)
+    corners = tuple((float(r * math.cos(a)), float(r * math.sin(a))) for r, a in zip(reach, angles, strict=True))
+    posts = []
+    for _ in range(pillars):
+        off, angle = rng.uniform(0.7, 1.6), rng.uniform(0.0, 2.0 * np.pi)
+        posts.append(Circle((off * math.cos(angle), off * math.sin(angle)), float(rng.uniform(0.05, 0.2))))
+    return Fence(keep_in=corners, keep_out=tuple(posts))
+
+
+def random_task_room(rng: np.random.Generator) -> tuple[Fence, CircleTask]:
+    """A room, and a circle in it at which the nominal footprint stays inside."""
+    while True:
+        radius_m = float(rng.uniform(0.4, 1.0))
+        center = rng.uniform(-0.4, 0.4, 2)
+        task = CircleTask(
+            center_x_m=float(center[0]), center_y_m=float(center[1]), radius_m=radius_m,
+            speed_m_s=float(rng.uniform(0.15, 0.3)),
+        )  # fmt: skip
+        fence = random_room(rng, int(rng.integers(0, 3)))
+        if task_breach(fence, FOOTPRINT, task.course()) is None:
+            return fence, task
+
+
+def _drive(
+    run: SimulatedRun, seconds: float, fence: Fence, hand: Callable[[float, CoreTick], None] = lambda t_s, tick: None,
+    learning_s: float = 0.0,
+) -> FencedDrive:  # fmt: skip
+    """Follow a run: true poses and clearances, and the guard's stops with what was left when the robot stood.
+
+    What happens in the first `learning_s` does not count.
+    """
+    boundaries = Boundaries(FOOTPRINT, fence)
+    poses: list[tuple[float, float, float]] = []
+    left: list[float] = []
+    stops, waiting, before = 0, False, FenceVerdict.IDLE
+    begun_us = run.now_us
+    for tick in run.ticks(seconds):
+        truth = run.robot.truth
+        poses.append((truth.x_m, truth.y_m, truth.yaw_rad))
+        verdict = tick.pipeline.fence.verdict
+        if verdict is FenceVerdict.STOPPED and before is not FenceVerdict.STOPPED:
+            stops += 1
+            waiting = True
+        before = verdict
+        if waiting and abs(truth.speed_m_s) < 1e-3 and tick.pipeline.command.left_rad_s == 0.0:
+            left.append(float(boundaries.clearance_m(np.array(poses[-1:]))[0]))
+            waiting = False
+        hand((run.now_us - begun_us) * 1e-6, tick)
+    places = np.array(poses)
+    places = places[min(round(learning_s / seconds * len(places)), len(places) - 1) :]
+    way_m = float(np.hypot(*np.diff(places[:, :2], axis=0).T).sum())
+    return FencedDrive(fence, places, float(boundaries.clearance_m(places).min()), tuple(left), stops, way_m)
+
+
+def manual_drive(setup: Setup, plant: PlantParameters, rng: np.random.Generator, seconds: float) -> FencedDrive:
+    """Wild commands, another one every half second or so, from the middle of the room."""
+    hand = _Hand()
+    start = BodyPose(0.0, 0.0, float(rng.uniform(-np.pi, np.pi)))
+    run = SimulatedRun(setup, virtual_robot(setup, plant, start, seed=int(rng.integers(1 << 30))), NoPlanner(), hand)
+    _begin(run)
+    top = setup.config.robot.max_wheel_speed_rad_s
+    next_s = 0.0
+
+    def steer(t_s: float, tick: CoreTick) -> None:
+        nonlocal next_s
+        if t_s >= next_s:
+            hand.wheels = tuple(rng.uniform(-top, top, 2).tolist())
+            next_s = t_s + float(rng.uniform(0.2, 1.5))
+
+    return _drive(run, seconds, setup.config.fence, steer)
+
+
+def wall_drive(setup: Setup, plant: PlantParameters, rng: np.random.Generator) -> FencedDrive:
+    """Straight on at 0.3 m/s from the middle of the room until the guard stops it."""
+    hand = _Hand()
+    start = BodyPose(0.0, 0.0, float(rng.uniform(-np.pi, np.pi)))
+    run = SimulatedRun(setup, virtual_robot(setup, plant, start, seed=int(rng.integers(1 << 30))), NoPlanner(), hand)
+    _begin(run)
+    speed = _WALL_M_S / plant.wheel_radius_m
+    hand.wheels = (speed, speed)
+    return _drive(run, 14.0, setup.config.fence)
+
+
+def task_drive(
+    setup: Setup,
+    plant: PlantParameters,
+    planner: Planner,
+    seconds: float,
+    seed: int,
+    guarded: bool = True,
+    learning_s: float = 0.0,
+) -> FencedDrive:
+    """The task, from its start; without `guarded` the guard is off, and the planner alone keeps to the fence."""
+    start = BodyPose(*setup.config.task.course().start)
+    run = SimulatedRun(setup, virtual_robot(setup, plant, start, seed=seed), planner)
+    area, fence = run.core.area, setup.config.fence
+    assert area is not None
+    if not guarded:
+        area = run.core.area = _Overridden(area.guard, fence, FOOTPRINT)
+    _begin(run)
+    return _drive(run, seconds, fence, learning_s=learning_s)
+
+
+def _begin(run: SimulatedRun) -> None:
+    run.run(1.5)
+    run.run(0.5, UserRequest.ARM)
+    run.run(0.02, UserRequest.START)
+
+
+def tight_room(rng: np.random.Generator, beside_m: float) -> tuple[Fence, CircleTask]:
+    """A circle at 0.3 m/s in a square room whose walls come so near to the footprint's way."""
+    radius_m, turned = float(rng.uniform(0.6, 1.0)), float(rng.uniform(0.0, 2.0 * np.pi))
+    reach_m = math.sqrt(2.0) * (_outer_m(radius_m) + beside_m)
+    corners = [
+        (reach_m * math.cos(turned + k * 0.5 * np.pi), reach_m * math.sin(turned + k * 0.5 * np.pi)) for k in range(4)
+    ]
+    task = CircleTask(center_x_m=0.0, center_y_m=0.0, radius_m=radius_m, speed_m_s=_WALL_M_S)
+    return Fence(keep_in=tuple(corners), margin_m=0.01), task
+
+
+def _outer_m(radius_m: float) -> float:
+    """How far from a circle's centre the footprint reaches that drives on it."""
+    return max(math.hypot(radius_m + y, x) for x, y in FOOTPRINT.corners_m())
+
+
+def along_drive(rng: np.random.Generator, off: float, seconds: float) -> FencedDrive:
+    """A circle at 0.3 m/s between two fences 0.15 m beside the footprint's way, by a control law that sees neither."""
+    radius_m = float(rng.uniform(0.6, 1.2))
+    around = Circle((0.0, 0.0), _outer_m(radius_m) + _ALONG_M)
+    within = Circle((0.0, 0.0), radius_m - 0.5 * FOOTPRINT.width - _ALONG_M)
+    task = CircleTask(center_x_m=0.0, center_y_m=0.0, radius_m=radius_m, speed_m_s=_WALL_M_S)
+    setup = fenced_setup(Fence(keep_in=around, keep_out=(within,)), task)
+    plant, robot = untold_plant(rng, off), setup.config.robot
+    geometry = (robot.wheel_radius_m, robot.axial_distance_m, robot.x_icr_m)
+    chassis = NominalRobot(*geometry, plant.speed_loop_time_constant_s, 0.0, CommandLimits.of_robot(robot))
+    law = Follower(Reference(task.course().outline_m(), _WALL_M_S, robot.x_icr_m), LAWS["kanayama"](), chassis)
+    return task_drive(setup, plant, law, seconds, int(rng.integers(1 << 30)))
+
+
+def room_drive(rng: np.random.Generator, off: float, seconds: float) -> FencedDrive:
+    """A circle in a random room, with the guard."""
+    setup = fenced_setup(*random_task_room(rng))
+    planner = make_planner(setup.config, setup.model)
+    return task_drive(setup, untold_plant(rng, off), planner, seconds, int(rng.integers(1 << 30)))

@@ -1,0 +1,167 @@
+"""Obstacles from ROS 2: what reaches the daemon's source of obstacles, and what is refused for which reason."""
+
+import math
+import os
+import socket
+import threading
+import time
+
+import pytest
+
+pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
+
+from disco_hw.bridge import ros2_messages as msg
+from disco_hw.bridge.ros2 import Bridge
+from disco_hw.bridge.ros2_obstacles import TOPIC, ObstacleInlet
+from disco_hw.runtime.obstacle_source import obstacle_source_of, reports_in
+from disco_hw.runtime.obstacles import MOST_OBSTACLES
+from disco_hw.runtime.robot_setup import load_setup
+from tests.first_use.miswired import robot_file
+
+WALL_NS = 1_800_000_000_000_000_000
+MS = 1_000_000
+
+
+def obstacle(*points, number=7, radius=0.3, velocity=(0.0, 0.0), frame="", age_ns: int | None = None):
+    stamp = msg.Time() if age_ns is None else msg.stamp_of(WALL_NS - age_ns)
+    twist = msg.Twist(msg.Vector3(*velocity, 0.0), msg.Vector3())
+    return msg.ObstacleMsg(
+        msg.Header(stamp, frame), msg.Polygon([msg.Point32(x, y, 0.0) for x, y in points or ((1.25, -0.5),)]), radius,
+        number, msg.Quaternion(), msg.TwistWithCovariance(twist),
+    )  # fmt: skip
+
+
+def array(*obstacles, frame="map", age_ns=20 * MS):
+    return msg.ObstacleArrayMsg(msg.Header(msg.stamp_of(WALL_NS - age_ns), frame), list(obstacles))
+
+
+def received(message, inlet=None, sent_ns=WALL_NS):
+    datagrams = (inlet or ObstacleInlet("map")).datagrams(message, sent_ns, WALL_NS)
+    return [one for datagram in datagrams for one in reports_in(datagram)]
+
+
+def test_a_circle_with_a_velocity_reaches_the_daemon_with_its_age():
+    inlet = ObstacleInlet("/map")
+    (found,) = received(array(obstacle(velocity=(-0.5, 0.25))), inlet)
+    assert found.name == "ros2.7"
+    assert (found.x_m, found.y_m, found.radius_m, found.vx_m_s, found.vy_m_s) == (1.25, -0.5, 0.3, -0.5, 0.25)
+    assert found.age_s == pytest.approx(0.02)
+    assert found.age_limit_s == 1.0
+    assert inlet.passed == 1
+    assert not inlet.refused
+
+
+def test_of_two_stamps_and_frames_the_obstacles_own_counts_and_the_time_of_sending_where_there_is_none():
+    (found,) = received(array(obstacle(age_ns=70 * MS, frame="map"), frame="laser"))
+    assert found.age_s == pytest.approx(0.07)
+    bare = msg.ObstacleArrayMsg(msg.Header(msg.Time(), "map"), [obstacle()])
+    assert received(bare, sent_ns=WALL_NS - 300 * MS)[0].age_s == pytest.approx(0.3)
+    # Clocks of two computers differ a little.
+    assert received(array(obstacle(), age_ns=-40 * MS))[0].age_s == 0.0
+
+
+def test_a_polygon_becomes_a_circle_that_holds_all_of_it():
+    corners = ((0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.5, 1.0))
+    (found,) = received(array(obstacle(*corners, radius=0.125)))
+    assert (found.x_m, found.y_m) == (1.0, 0.5)
+    assert all(math.dist(corner, (found.x_m, found.y_m)) <= found.radius_m - 0.125 + 1e-12 for corner in corners)
+    assert found.radius_m == pytest.approx(0.125 + math.hypot(1.0, 0.5))
+    # A radius that cannot be makes no obstacle smaller.
+    assert received(array(obstacle(*corners, radius=-3.0)))[0].radius_m == pytest.approx(math.hypot(1.0, 0.5))
+    assert received(array(obstacle(radius=0.0)))[0].radius_m == 1e-3
+
+
+@pytest.mark.parametrize(
+    ("message", "word"),
+    [
+        (array(obstacle(), frame="odom"), 'in frame "odom", not "map"'),
+        (array(obstacle(), frame=""), "in frame"),
+        (array(obstacle(frame="odom")), "in frame"),
+        (array(obstacle(), age_ns=1001 * MS), "another clock"),
+        (array(obstacle(), age_ns=-51 * MS), "another clock"),
+        (array(obstacle(age_ns=WALL_NS - 5)), "another clock"),
+        (array(obstacle((math.nan, 0.0))), "not finite"),
+        (array(obstacle((1e9, 0.0))), "too large"),
+        (array(obstacle(velocity=(math.inf, 0.0))), "not finite"),
+        (array(obstacle(velocity=(25.0, 0.0))), "too fast"),
+        (array(obstacle(radius=math.nan)), "not finite"),
+        (msg.String("person at the door"), "JSON"),
+        (msg.String('{"name": "a b", "x_m": 0, "y_m": 0, "radius_m": 1}'), "JSON"),
+    ],
+)
+def test_what_is_no_obstacle_is_refused_by_its_reason_and_others_are_still_taken(message, word):
+    inlet = ObstacleInlet("map")
+    assert received(message, inlet) == []
+    assert [word in reason for reason in inlet.refused] == [True]
+    assert list(inlet.refused.values()) == [1]
+    assert len(received(array(obstacle()), inlet)) == 1
+
+
+def test_an_obstacle_without_points_is_none():
+    nowhere = array(msg.ObstacleMsg(radius=1.0), obstacle(number=8))
+    assert [one.name for one in received(nowhere)] == ["ros2.8"]
+
+
+def test_of_too_many_the_first_are_passed_on_and_the_others_counted():
+    inlet = ObstacleInlet("map")
+    found = received(array(*(obstacle(number=k) for k in range(MOST_OBSTACLES + 3))), inlet)
+    assert len(found) == MOST_OBSTACLES
+    assert dict(inlet.refused) == {f"more than {MOST_OBSTACLES} in a message": 3}
+
+
+def test_text_holds_what_udp_takes():
+    text = '[{"name": "cart", "x_m": 1.5, "y_m": 0, "radius_m": 0.4, "vx_m_s": 0.2, "age_limit_s": 3}]'
+    inlet = ObstacleInlet("map")
+    (found,) = received(msg.String(text), inlet)
+    assert (found.name, found.x_m, found.vx_m_s, found.age_limit_s) == ("cart", 1.5, 0.2, 3.0)
+    assert inlet.passed == 1
+    assert not inlet.refused
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
+
+
+def test_over_dds_both_types_come_to_the_daemons_source(tmp_path):
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.topic import Topic
+
+    from disco_hw.bridge.ros2 import RELIABLE, wire_name
+
+    file = robot_file(tmp_path)
+    text = file.read_text(encoding="utf-8") + f"[fence]\nobstacles_port = {free_port()}\n"
+    text += f'[ros2]\ndomain = {13 + os.getpid() % 20 * 3}\n[daemon]\ncontrol_socket = "{tmp_path / "control"}"\n'
+    file.write_text(text, encoding="utf-8")
+    setup, ended = load_setup(file), []
+    daemon, bridge = obstacle_source_of(setup.config), Bridge(setup)
+    assert bridge.where.endswith(f"; obstacles from {TOPIC}")
+    thread = threading.Thread(target=bridge.run, args=(lambda: bool(ended),))
+    thread.start()
+    writers = [
+        DataWriter(bridge._participant, Topic(bridge._participant, wire_name(TOPIC, ""), kind), RELIABLE)
+        for kind in (msg.ObstacleArrayMsg, msg.String)
+    ]
+    found, deadline = {}, time.monotonic() + 60.0
+    while len(found) < 2 and time.monotonic() < deadline:
+        header = msg.Header(msg.stamp_of(time.time_ns()), "map")
+        writers[0].write(msg.ObstacleArrayMsg(header, [obstacle(velocity=(0.5, 0.0))]))
+        writers[1].write(msg.String('{"name": "cart", "x_m": 1.5, "y_m": 0, "radius_m": 0.4}'))
+        found |= {one.name: one for one in daemon.receive(time.monotonic_ns())}
+        time.sleep(0.02)
+    ended.append(True)
+    thread.join()
+    bridge.close()
+    daemon.close()
+    assert (found["ros2.7"].x_m, found["ros2.7"].vx_m_s, found["cart"].x_m) == (1.25, 0.5, 1.5)
+    said = {one.key: one.value for one in bridge._diagnosis(0, 0)[1].status[1].values if "obstacles" in one.key}
+    assert int(said["obstacles passed on"]) >= 2
+    assert said["obstacles not sent"] == "0"
+
+
+def test_without_a_port_for_obstacles_none_are_read(tmp_path):
+    bridge = Bridge(load_setup(robot_file(tmp_path)))
+    assert "obstacles" not in bridge.where
+    assert not any(take == bridge._take_obstacles for _, take in bridge._readers)
+    bridge.close()
