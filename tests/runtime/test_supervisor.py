@@ -97,7 +97,7 @@ def test_a_fault_of_the_robot_is_followed_by_this_hosts_reset_without_another_re
     bench.running()
     out = bench.tick(driver_state=DriverState.FAULT, driver_detail=status_codes.fault(fault))
     assert out.detail.endswith(ending)
-    assert "mend it" not in out.detail
+    assert "correct it" not in out.detail
     assert refusal(bench.tick(ARM)).endswith(ending)
 
 
