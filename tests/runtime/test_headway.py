@@ -74,7 +74,7 @@ def test_the_daemon_says_that_a_robot_stands_within_a_dead_band_that_its_model_d
     setup = load_setup(ROBOT_FILE)
     law = LawController(lambda *_: (1.2, 1.2), setup.model, setup.config.task.planned(setup.config.control.mode))
     events = [event for tick in started(planner=law, hide={"deadband": 1.3}).run(7.0) for event in tick.events]
-    assert [event for event in events if event.startswith("task: no progress for 5 s: the wheels stand")]
+    assert [event for event in events if event.startswith("task: no progress for 5 s: the wheels do not turn")]
 
 
 def test_wheels_that_stand_beyond_any_dead_band_stop_the_robot():
