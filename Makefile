@@ -10,7 +10,7 @@ SOURCES := pyproject.toml setup.py constraints.txt firmware_protocol/build_firmw
 # the libraries anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: venv demo chromium test test-all test-rest test-long test-clones bench gap-study soak fault-campaign fuzz firmware-check firmware-mutants firmware-emulated cross-tools socketcan-test test-arm ros dist-check docs clean
+.PHONY: venv demo chromium test test-all test-rest test-long test-clones bench gap-study soak fault-campaign fuzz firmware-check firmware-mutants firmware-emulated cross-tools socketcan-test test-arm ros dist-check docs prose clean
 
 venv: $(STAMP)
 
@@ -86,6 +86,7 @@ test-rest: $(STAMP) $(if $(findstring long,$(REST)),chromium cross-tools ros)
 	@$(TOOK)
 
 test-all: test
+	$(MAKE) prose
 	$(MAKE) test-rest
 
 test-long:
@@ -142,7 +143,7 @@ test-arm: $(STAMP)
 	nice -n 19 $(BIN)/python -m tools.check.test_arm
 
 clean:
-	rm -rf $(VENV) $(PEERS) $(ROS) build *.egg-info firmware_protocol/_firmware*
+	rm -rf $(VENV) $(PEERS) $(ROS) .prose-venv build *.egg-info firmware_protocol/_firmware*
 
 # What is handed out: sdist and wheel, the wheel installed into an empty environment, and the demonstration from there,
 # with nothing of this checkout on the path.
@@ -153,6 +154,16 @@ dist-check: $(BIN)/python
 	$(DIST)/build/bin/python -m build --outdir $(DIST)/dist .
 	$(PYTHON) -m venv $(DIST)/venv && PIP_CONSTRAINT=constraints.txt env -u PYTHONPATH $(DIST)/venv/bin/python -m pip install --quiet $(DIST)/dist/*.whl
 	cd $(DIST)/elsewhere && unset PYTHONPATH && ../venv/bin/disco-hw --version && ../venv/bin/disco-hw demo --laps 0.5
+
+# Spelling everywhere, and the wording of the pages; in an environment of its own, and skipped where it cannot be made.
+PROSE := .prose-venv
+PAGES := README.md CONTRIBUTING.md CHANGELOG.md $(wildcard docs/*.md) firmware_protocol/README.md
+prose:
+	@[ -e $(PROSE)/.installed ] || { $(PYTHON) -m venv $(PROSE) && $(PROSE)/bin/python -m pip install --disable-pip-version-check \
+		--quiet 'codespell>=2.4' 'proselint>=0.16' && touch $(PROSE)/.installed; } || \
+		{ rm -rf $(PROSE); echo "codespell and proselint could not be installed; spelling and wording are not checked"; }
+	@[ ! -e $(PROSE)/.installed ] || { $(PROSE)/bin/codespell $(PAGES) disco_hw drivers sim tools tests firmware_protocol && \
+		$(PROSE)/bin/proselint --config .proselintrc.json check $(PAGES); }
 
 # The documentation as a site, in an environment of its own.
 docs:

@@ -67,7 +67,7 @@ class RobotLink(Protocol):
         """Counters in one line."""
 
     def close(self) -> None:
-        """Release the medium; safe to call twice."""
+        """Release the link's medium; may be called twice."""
 
 
 class RobotNode:

@@ -153,7 +153,7 @@ class _Process:
         return [*self.link.filenos(), *([] if self._commands is None else [self._commands.fileno()])]
 
     def timeout_s(self) -> float:
-        """How long nothing is due."""
+        """Return the time until the next event is due, in s."""
         due_ns = self._start_ns + (self._steps + 1) * STEP_NS
         link_ns = self.link.next_event_ns()
         if link_ns is not None:

@@ -71,7 +71,7 @@ class BoardRobot:
 
     @property
     def outputs(self) -> FirmwareOutputs:
-        """What the board wanted when it was last heard; nothing if that is too long ago."""
+        """Return the board's last outputs; zeros if they are too old."""
         flags, state, fault, accepted = self._state
         left, right = (0.0, 0.0) if self.silent else self._setpoints
         enabled, brake = bool(flags & 1) and not self.silent, bool(flags & 2) or self.silent
@@ -122,10 +122,10 @@ class BoardRobot:
         self.plant.kidnap(dx_m, dy_m, dyaw_rad)
 
     def jump_clock(self, step_us: int) -> None:
-        """Nothing: the clock is the board's own, and `sim.app` refuses such a fault."""
+        """Do nothing: the clock is the board's own, and `sim.app` refuses such a fault."""
 
     def reboot(self, cause: ResetCause = ResetCause.POWER_ON) -> None:
-        """Refused: only a hand, or the board itself, can."""
+        """Raise LinkFaultError: only an operator or the board itself can restart it."""
         raise LinkFaultError("reboot: not over this line; press the board's reset button")
 
     def _inputs(self) -> FirmwareInputs:
@@ -192,16 +192,16 @@ class PlantLine:
 
     @property
     def address(self) -> str:
-        """What it is, and where."""
+        """Return a description of the board's link and port."""
         return f"the board on plant's line {self._medium.port}"
 
     @property
     def error_counters(self) -> tuple[int, int]:
-        """None."""
+        """Return zeros: the board's link reports no error counters."""
         return 0, 0
 
     def filenos(self) -> list[int]:
-        """The port's descriptor."""
+        """Return the file descriptor of the serial port."""
         return [] if self._port is None else [self._port.fileno()]
 
     def next_event_ns(self) -> int | None:
@@ -229,7 +229,7 @@ class PlantLine:
         return [ReceivedFrame(now_ns, self._waiting.popleft()) for _ in range(count)]
 
     def send(self, frames: Sequence[Frame]) -> None:
-        """Send without waiting; while the line takes nothing, whole frames are counted and lost."""
+        """Send frames without waiting; while the line is full, whole frames are dropped and counted."""
         if self._unsent:
             self.send_failures += len(frames)
             frames = ()
@@ -257,11 +257,11 @@ class PlantLine:
         raise LinkFaultError(f"bus_off {who}: the board's own link is not the simulator's")
 
     def babble(self, frame: Frame) -> None:
-        """Refused."""
+        """Raise LinkFaultError: faults of frames are not possible on the board's own link."""
         raise LinkFaultError("babble: the board's own link is not the simulator's")
 
     def tamper(self, fault: BusFault) -> None:
-        """Nothing: faults of frames are those of the board's own link, and `sim.app` refuses them."""
+        """Do nothing: faults of frames are those of the board's own link, and `sim.app` refuses them."""
 
     def summary(self) -> str:
         """Counters in one line."""
@@ -271,7 +271,7 @@ class PlantLine:
         )
 
     def close(self) -> None:
-        """Leave the line; safe to call twice."""
+        """Close the serial line; may be called twice."""
         port, self._port = self._port, None
         self._unsent = b""
         self._waiting.clear()

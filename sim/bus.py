@@ -38,7 +38,7 @@ _LOG_CHANNEL = "can0"
 
 @dataclass(frozen=True, slots=True)
 class FrameFate:
-    """What a fault makes of one transmission; the default is that nothing happens to it.
+    """Effect of a fault on one transmission; the default is none.
 
     `wire_error_bit` inverts that bit of the stuffed frame: an error frame follows, and the sender tries again. All
     others happen behind the receivers' CRC check, so the sender never learns of them: `lost` for all or `lost_at` the
@@ -124,7 +124,7 @@ class CanBus:
 
     @property
     def now_ns(self) -> int:
-        """Simulated time reached."""
+        """Simulated time that the bus has reached, in ns."""
         return self._now_ns
 
     @property
@@ -305,7 +305,7 @@ class CanBus:
             self._deliver(DeliveredFrame(end_ns, senders[0], transmission.frame, tuple(receivers)), transmission.fate)
 
     def _listeners(self, senders: Sequence[BusNode]) -> list[BusNode]:
-        """Who hears what these send, the senders left out."""
+        """Return the nodes that receive what these nodes send, without the senders."""
         return [node for node in self._nodes if node.state is not _BUS_OFF and node not in senders]
 
     def _deliver(self, delivery: DeliveredFrame, fate: FrameFate) -> None:

@@ -287,7 +287,7 @@ class BusNode:
         return len(self.queue) + (self.on_wire is not None)
 
     def push(self, sequence: int, frame: CanFrame) -> bool:
-        """Queue a frame; False, and a counter, when the queue is full or the node is bus-off."""
+        """Queue a frame; return False and count it if the queue is full or the node is bus-off."""
         if self.state is _BUS_OFF:
             self.refused_bus_off += 1
             return False

@@ -14,7 +14,9 @@ import typer
 from disco_hw.cli import app
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
+PAGES = sorted(
+    [*(ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG")), *(ROOT / "docs").rglob("*.md")]
+)
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 COMMAND = re.compile(r"^(?:\s*|.*`)(?:sudo )?(?:\.venv/bin/)?disco-hw +([^`]*)")
 
@@ -111,3 +113,33 @@ def test_make_offers_what_the_pages_say():
     for page in PAGES:
         said = set(re.findall(r"(?:^|`)make ([a-z][\w\-]*)", page.read_text(encoding="utf-8"), re.MULTILINE))
         assert said <= targets, page
+
+
+def sentences(page: Path) -> list[str]:
+    """The sentences of a page's running text, without its code, tables and headings."""
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    lines = [line for line in text.splitlines() if not line.lstrip().startswith(("|", "#", "!", "<"))]
+    text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", " ".join(lines))
+    return [found for found in re.split(r"(?<=[.?!])\s+(?=[A-Z`*(])", text.strip()) if len(found.split()) > 2]
+
+
+def test_sentences_have_20_words_in_the_mean():
+    lengths = [len(sentence.split()) for page in PAGES for sentence in sentences(page)]
+    assert len(lengths) > 500
+    assert sum(lengths) / len(lengths) <= 20.0
+
+
+@pytest.mark.parametrize("page", PAGES, ids=names)
+def test_a_page_begins_with_a_sentence_that_says_what_it_is_for(page):
+    _, title, first = re.split(r"^# (.+)\n+", page.read_text(encoding="utf-8"), maxsplit=1, flags=re.MULTILINE)
+    assert title
+    assert re.match(r"[A-Z`a-z\[(*]", first)
+    assert len(first.split("\n\n")[0].split()) >= 5
+
+
+def test_a_long_sentence_would_be_seen(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(
+        "# A title\n\nIt is short. `code` begins another [linked](there.md) one.\n\n| a | table. |\n", "utf-8"
+    )
+    assert sentences(page) == ["It is short.", "`code` begins another linked one."]

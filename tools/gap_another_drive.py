@@ -3,7 +3,7 @@
 A robot with a hidden form of `tools/strange_robot.py` is searched, and its model.toml written and read again. Errors of
 free runs of the model's own step, 2 s ahead from single poses and readings of the wheels, with what the runtime keeps
 of the past: on the log itself, and on another drive of the same robot, where also with nothing remembered, and without
-the model's terms. The table of `docs/gap-figures.md`.
+the model's terms. The table of `docs/results.md`.
 """
 
 from __future__ import annotations

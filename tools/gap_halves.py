@@ -1,4 +1,4 @@
-"""What models learnt from one half of a measured log predict of the other, end to end: tables of `docs/gap-figures.md`.
+"""What models learnt from one half of a measured log predict of the other, end to end: tables of `docs/results.md`.
 
 `DISCO_HW_DATA=FOLDER python -m tools.gap_halves [--parts N | --days | --others] [NAME...]`: logs whose path holds a
 NAME, all without one. For either half: the stage that is offered, the errors 2 s ahead on the half that was not seen,

@@ -124,7 +124,7 @@ class FastAdaptation:
         """Sentences on what the filter noticed since the last time."""
         found = []
         if self._filter.changes > self._changes:
-            found.append("adapt: the robot drives otherwise than learnt; learning anew")
+            found.append("adapt: the robot moves differently from what was learnt; learning again")
         if self._filter.carried > self._carried:
             found.append("adapt: the robot was carried")
         self._changes, self._carried = self._filter.changes, self._filter.carried
@@ -139,8 +139,8 @@ class FastAdaptation:
             self._counts["reverted"] += 1
             self._put_in_force(None)
             found.append(change_record(now_ns, "model", None, "asked for"))
-        found.append(records.Adaptation(now_ns, "reverted", "the model file's belief is in force: asked for"))
-        return AdaptationUpdate(tuple(found), ("adapt: back to the model file's belief, as asked for",))
+        found.append(records.Adaptation(now_ns, "reverted", "the model file's belief is in force, as requested"))
+        return AdaptationUpdate(tuple(found), ("adapt: back to the model file's belief, as requested",))
 
 
 def change_record(now_ns: int, source: str, geometry: Geometry | None, why: str) -> records.Record:

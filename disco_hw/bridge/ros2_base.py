@@ -276,7 +276,7 @@ class BaseBridge:
         end = self.end
         topics = self._settings
         words = [
-            f"{topics.speed_topic} is {'heard' if end.is_heard else 'heard by nobody'}",
+            f"{topics.speed_topic} {'has a listener' if end.is_heard else 'has no listener'}",
             *([f"another node speaks on {topics.speed_topic}"] if end.others_speak else []),
             "odometry comes" if end.has_odometry else f"no odometry: {wire.REFUSALS[end.refusal]}",
             *(["e-stop"] if end.latched else []),

@@ -104,7 +104,7 @@ class Outgoing:
         """How daemon and bridge are. `heard`: the daemon, of late; `wrong`: what the bridge has to complain of."""
         state = self._state
         if not heard or state is None:
-            daemon = msg.DiagnosticStatus(_SILENT, "disco-hw: daemon", "not heard; start it with disco-hw run")
+            daemon = msg.DiagnosticStatus(_SILENT, "disco-hw: daemon", "no daemon found; start it with disco-hw run")
         else:
             level = _ERROR if state.estop else _LEVELS.get(state.state, _WELL)
             daemon = msg.DiagnosticStatus(level, "disco-hw: daemon", f"{state.state}: {state.reason}")

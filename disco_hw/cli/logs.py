@@ -97,7 +97,7 @@ def gap(
     compile_beforehand(robot, out / "model.toml", progress_line)
 
 
-log_app = typer.Typer(help="Look into a log, mend it, hand it on.", no_args_is_help=True)
+log_app = typer.Typer(help="Inspect a log, repair it, export it.", no_args_is_help=True)
 
 
 def import_log(
@@ -146,7 +146,7 @@ def info(log: Annotated[Path, typer.Argument(metavar="LOG")], as_json: AsJson = 
 @log_app.command()
 def recover(
     log: Annotated[Path, typer.Argument(metavar="LOG")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Where to write the mended log.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Where to write the repaired log.")],
     as_json: AsJson = False,
 ) -> None:
     """Copy everything whole from a damaged log into a new one."""

@@ -178,7 +178,7 @@ def commission(
         list[str] | None, typer.Option(help="Only this stage, or these: sides, turns, floor.", show_default=False)
     ] = None,
     write: Annotated[
-        bool | None, typer.Option("--write/--no-write", help="Mend robot.toml, or never; without it you are asked.")
+        bool | None, typer.Option("--write/--no-write", help="Correct robot.toml, or never; without it you are asked.")
     ] = None,
     link: LinkOption = None,
     log_directory: Annotated[Path | None, typer.Option(help="Directory for the logs.")] = None,
@@ -256,7 +256,7 @@ def estop(
     link: LinkOption = None,
     as_json: AsJson = False,
 ) -> None:
-    """Stop the robot now, whatever state anything else is in."""
+    """Stop the robot now, whatever state the daemon is in."""
     from disco_hw.daemon.emergency import stop_and_say
 
     raise typer.Exit(stop_and_say(robot, link, as_json))

@@ -67,7 +67,7 @@ def passed_over(path: Path) -> tuple[str, ...]:
     for directory in candidates:
         with contextlib.suppress(OSError):
             if (why := why_not_private(directory, {uid})) is not None:
-                lines.append(f"{directory}: {why}; passed over")
+                lines.append(f"{directory}: {why}; not used")
     return tuple(lines)
 
 
@@ -202,7 +202,7 @@ ACTIONS = ("arm", "start", "stop", "disarm", "estop", "reset", "status", "quit",
 TASK = "task"
 UNRECORDED = "unrecorded"
 """What `arm` must say where nothing is being recorded although it should be."""
-UNRECORDED_REMEDY = "mend that, or arm with --unrecorded"
+UNRECORDED_REMEDY = "correct that, or arm with --unrecorded"
 OBSTACLE, FENCE = "obstacle", "fence"
 PAGE_ACTIONS = (TASK, OBSTACLE, FENCE, "drive")
 """What takes arguments: another circle, an obstacle, the fence, and a hand on the page's pad."""
@@ -232,7 +232,7 @@ def ask(robot: Path, action: str, changes: Sequence[str] = (), unrecorded: bool 
         raise InputError(f"{action}: no such request; write one of {', '.join(ASKED)}")
     if (action in _EXAMPLES) != bool(changes):
         taking = ", ".join(_EXAMPLES)
-        said = "say what to change" if action in _EXAMPLES else f"{action} takes nothing more; only {taking} do"
+        said = "say what to change" if action in _EXAMPLES else f"{action} takes no further arguments; only {taking} do"
         shown = action if action in _EXAMPLES else TASK
         raise InputError(f"{said}: ctl {robot} {shown} {_EXAMPLES[shown]}")
     if unrecorded and action != "arm":
@@ -357,5 +357,5 @@ def recording_in_words(recorder: Mapping[str, Any]) -> str:
     if recorder["refused"]:
         words.append(f"{recorder['refused']} records refused")
     if recorder["writer_deaths"]:
-        words.append(f"begun anew {recorder['writer_deaths']} times")
+        words.append(f"restarted {recorder['writer_deaths']} times")
     return f"{recorder['path']}: {', '.join(words)}"

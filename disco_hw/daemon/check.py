@@ -147,7 +147,7 @@ def refuse_beside_a_daemon(config: RobotConfig) -> None:
             return
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be looked at ({error.strerror}); be the daemon's user, or mend daemon.control_socket"
+            f"{path}: cannot be read ({error.strerror}); run as the daemon's user, or correct daemon.control_socket"
         ) from None
     try:
         send_request(path, {"do": "status"}, timeout_s=1.0)
@@ -250,7 +250,7 @@ def pose_source_checks(source: PoseInput, poses: Sequence[PoseSample]) -> list[C
     for one, other in combinations(range(len(labels)), 2):
         apart = _apart(*([pose for pose in poses if pose.source == number] for number in (one, other)))
         if apart:
-            text = f"{apart} beyond their stated noise; mend origin, offset or the standard deviations of one"
+            text = f"{apart} beyond their stated noise; correct origin, offset or the standard deviations of one"
             checks.append(Check(f"poses {labels[one]} and {labels[other]}", Level.FAIL, text))
     return checks
 
@@ -314,7 +314,7 @@ def _hearing_check(found: _Found) -> Check:
     """Whether the robot takes what this host sends; a wrong key shows nowhere else."""
     name = "hearing"
     if not found.reported:
-        return Check(name, Level.FAIL, "the robot did not say what it hears; check the firmware")
+        return Check(name, Level.FAIL, "the robot did not report which frames it receives; check the firmware")
     first, last = found.reported[0], found.reported[-1]
     rejected = (last.rejected_count - first.rejected_count) % 256
     if not rejected:

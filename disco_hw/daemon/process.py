@@ -207,7 +207,9 @@ class AsyncPrinter:
     def close(self, timeout_s: float = 1.0) -> None:
         """Wait at most `timeout_s` until everything is written; safe to call twice."""
         if self.dropped:
-            self._put("output", f"{self.dropped} sentences are missing here, as nobody read those before them")
+            self._put(
+                "output", f"{self.dropped} messages are missing here, because the output was not read fast enough"
+            )
             self.dropped = 0
         if self._thread is not None:
             self._lines.put(None)

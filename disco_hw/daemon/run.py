@@ -287,7 +287,7 @@ class _Compilation(event.Listener):
 
     def on_start(self, event: Any) -> None:
         if self._thread is None:
-            self._say(f"compiling {self._what}: some seconds, this once; the result is kept")
+            self._say(f"compiling {self._what}: takes some seconds, only once; the result is kept")
             self._began_ns = time.monotonic_ns()
             self._thread = threading.Thread(target=self._tell, name="compile progress", daemon=True)
             self._thread.start()

@@ -34,7 +34,9 @@ def _of_plugin(name: str) -> Effect:
     try:
         effect = getattr(import_module(name), "EFFECT", None)
     except Exception as error:
-        raise InputError(f"{name}: an effect that cannot be loaded ({error}); mend or uninstall its package") from error
+        raise InputError(
+            f"{name}: an effect that cannot be loaded ({error}); repair or uninstall its package"
+        ) from error
     if not isinstance(effect, Effect):
         raise InputError(f"{name}: holds no EFFECT of the type Effect; docs/add-an-effect.md shows one")
     return effect

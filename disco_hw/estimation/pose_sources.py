@@ -140,7 +140,7 @@ class PoseSources:
             self._judge(source, now_ns)
         apart = self._apart()
         if apart and not self.contradiction:
-            self._said.append(f"{apart}; the task stops, as nobody can say which is right")
+            self._said.append(f"{apart}; the task stops, because it is unknown which is right")
         if self.contradiction and not apart:
             self._said.append("no source contradicts another any more")
         self.contradiction = apart

@@ -156,7 +156,7 @@ def parse_toml(content: bytes, name: str) -> dict[str, Any]:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         # Not all that tomllib raises is its own error.
-        raise InputError(f"{name}: not valid TOML ({' '.join(str(error).split())}); mend that line") from None
+        raise InputError(f"{name}: not valid TOML ({' '.join(str(error).split())}); correct that line") from None
 
 
 def _refuse_hostile(text: str, name: str) -> None:
@@ -164,7 +164,7 @@ def _refuse_hostile(text: str, name: str) -> None:
 
     def refuse(fault: str, at: int) -> InputError:
         line = text.count("\n", 0, at) + 1
-        return InputError(f"{name}: not valid TOML (line {line}: {fault}); mend that line")
+        return InputError(f"{name}: not valid TOML (line {line}: {fault}); correct that line")
 
     for token in _TOML_TOKEN.finditer(text):
         match token.lastgroup:

@@ -225,14 +225,14 @@ def _controller(
         frames = listen(link, options.listen_s)
         found = recognised(frames)
         said = ", ".join(f"{one.driver} {one.fields or ''}".strip() for one in found)
-        say(f"{len(frames)} frames heard: {said or 'no controller that is known by its own frames'}")
+        say(f"{len(frames)} frames received: {said or 'no controller that is known by its own frames'}")
         if not frames and "port" in link:
             found = _answering(options, str(link["port"]), ask, say)
     if options.driver is not None:
         return next((one for one in found if one.driver == options.driver), Heard(options.driver, {}))
     if len(found) == 1:
         return found[0]
-    why = "several controllers were heard" if found else "no controller was heard"
+    why = "several controllers answered" if found else "no controller was recognised"
     known = ", ".join(motor_drivers())
     raise InputError(
         f"init: {why}; name it: --driver with one of {known}"

@@ -91,7 +91,7 @@ class CommissionResult:
         for stage in self.stages:
             lines += [f"{stage['name']}: {figure}" for figure in stage["figures"]]
             lines += [f"{stage['name']}: {fault['name']}: {_how(fault)}" for fault in stage["faults"]]
-        return "\n".join([*lines, "commissioned" if self.ok else "not commissioned: mend what is named above"])
+        return "\n".join([*lines, "commissioned" if self.ok else "not commissioned: correct what is named above"])
 
 
 def _how(fault: dict[str, Any]) -> str:
@@ -161,7 +161,7 @@ def _through(
             return True
         if not mended:
             return False
-        ask("mended; once more to see that it is right: press Enter ")
+        ask("corrected; to test it again press Enter ")
     return False
 
 

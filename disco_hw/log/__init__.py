@@ -38,7 +38,7 @@ class Attachment(msgspec.Struct, frozen=True):
 
 
 class TaskScene(msgspec.Struct, frozen=True):
-    """What a viewer draws beside the records: task's course, fence, and the robot's size (m)."""
+    """Static content that a viewer draws beside the records: the task's line, the fence, and the robot's size (m)."""
 
     outline_m: tuple[tuple[float, float], ...]
     axial_distance_m: float
@@ -69,7 +69,7 @@ class Start(msgspec.Struct, frozen=True):
 
 
 class Launch(msgspec.Struct, frozen=True):
-    """To the keeper: start a writer on the socket that comes with this."""
+    """Request to the keeper process to start a writer on the attached socket."""
 
     part: int
     start_ns: int
@@ -78,14 +78,14 @@ class Launch(msgspec.Struct, frozen=True):
 
 
 class Started(msgspec.Struct, frozen=True, tag=True):
-    """From the keeper: the process of the newest writer; 0 if none could be made, `error` says why."""
+    """Report of the keeper process: process id of the newest writer, or 0 with the reason in `error`."""
 
     pid: int
     error: str = ""
 
 
 class Ended(msgspec.Struct, frozen=True, tag=True):
-    """From the keeper: how a writer's process ended, negative for a signal."""
+    """Report of the keeper process: exit code of a writer, negative for a signal."""
 
     pid: int
     code: int

@@ -93,7 +93,7 @@ def _of_one(log: DriveLog, radius_m: float, axial_m: float) -> tuple[Contradicti
 def _of_commands(
     windows: MotionWindows, fit: CommandFit | None
 ) -> tuple[Contradiction, Contradiction, MotionWindows] | None:
-    """What contradicts itself between commands and wheels; None if nothing does.
+    """Return the contradiction between commands and wheels, or None.
 
     Returns it as a fault of the wheels, as one of the commands, and the windows with the wheels put right.
     """
@@ -181,7 +181,7 @@ class _Poses:
         return fit is not None and fit.worst < _UNEXPLAINED and fit.is_usual
 
     def contradictions(self, has_commands: bool) -> tuple[Contradiction, ...]:
-        """What contradicts itself between wheels and poses, the likeliest cause first."""
+        """Return the contradictions between wheels and poses, the most likely cause first."""
         if self._log.poses.t_s.size < 2:
             return ()
         apart = no_common_time(self._log) or standing(self._windows, self._radius_m, self._axial_m)

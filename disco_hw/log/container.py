@@ -72,7 +72,7 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ChunkRef:
-    """Where a chunk's content lies, and the log times of its first and last message (wall ns)."""
+    """Position of a chunk's content in the file, and the log times of its first and last message (wall-clock ns)."""
 
     offset: int
     length: int
@@ -82,7 +82,7 @@ class ChunkRef:
 
 @dataclass(frozen=True, slots=True)
 class AttachmentRef:
-    """Where an attachment's record lies, and what it is."""
+    """Position of an attachment's record in the file, its name and type."""
 
     offset: int
     length: int

@@ -97,7 +97,7 @@ class DriveLog:
 
     @property
     def segments(self) -> int:
-        """Number of segments: one more than the highest in any array."""
+        """Return the number of segments: one more than the highest index in any array."""
         arrays = (self.commands.segment, self.wheels.segment, self.poses.segment, self.gyro.segment)
         return 1 + max((int(segment.max()) for segment in arrays if segment.size), default=-1)
 

@@ -81,7 +81,7 @@ class JsonDecoder:
         return _decoded(self._decoders[topic], data)
 
     def decode_brief(self, topic: str, data: bytes) -> Record | PlanFigures:
-        """The same, but of a plan the figures alone, which takes less than half of the time."""
+        """Decode a record like `decode`, but of a plan only its scalar figures, in less than half of the time."""
         if topic != _PLAN:
             return self.decode(topic, data)
         return _decoded(self._plan_figures, data)

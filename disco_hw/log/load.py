@@ -144,7 +144,7 @@ def _poses(log: Log, notes: list[str]) -> tuple[Index, Array]:
 
 
 def _ordered(t_ns: NDArray[np.generic], values: Array, keep: Mask, what: str, notes: list[str]) -> tuple[Index, Array]:
-    """In order of time, the first of several with one time; a sample may come in later than a newer one."""
+    """Sort samples by time and keep the first of several with one time. Samples may arrive out of order."""
     times = t_ns.astype(np.int64)[keep]
     unique, first = np.unique(times, return_index=True)
     if unique.size < times.size:

@@ -29,7 +29,7 @@ from drivers.types import SAID_BY_WORDS, Identity, SaidBy
 
 
 def info(path: Path, as_json: bool) -> str:
-    """What a log holds and what of it is lost; raises LogError."""
+    """Summarise a log: its contents and what of it is lost. Raises LogError."""
     with open_log(path) as log:
         summary = log.summary()
         if as_json:
@@ -88,7 +88,7 @@ def _controller(record: Controller) -> str:
 
 
 def _end_in_words(summary: LogSummary) -> str:
-    """What the file proves of its end."""
+    """Describe in words whether the log ended properly."""
     if summary.ended:
         return "ended properly" if summary.complete else "ended by its recorder, but the file is not whole"
     if summary.ended is None:
@@ -115,7 +115,7 @@ def _in_words(summary: LogSummary) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Recovered:
-    """What a recovery has brought over, and in words what was lost."""
+    """Result of a recovery: what was copied, and in words what was lost."""
 
     messages: int
     chunks: int

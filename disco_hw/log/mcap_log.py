@@ -209,7 +209,7 @@ _MAX_TIME_NS = 2**64 - 1
 
 
 class ByteSink(Protocol):
-    """What a log is written to: append-only bytes."""
+    """Protocol of the destination of a log: append-only bytes."""
 
     def write(self, data: bytes) -> int:
         """Append all of the bytes; raises OSError if that fails."""
@@ -223,7 +223,7 @@ class ByteSink(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Metadata:
-    """What the log says of itself: wall-clock time is monotonic time plus `wall_offset_ns`.
+    """Metadata of a log: wall-clock time is monotonic time plus `wall_offset_ns`.
 
     A later part `continues` the file of that path, which holds ticks up to number `continues_sequence`; None if that
     was not recorded.
@@ -341,7 +341,7 @@ class McapLog:
 
     @property
     def records(self) -> int:
-        """Records written."""
+        """Number of records written."""
         return self._records
 
     @property

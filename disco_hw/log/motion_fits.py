@@ -163,7 +163,7 @@ _SAME_TIME_S = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class ClockFit:
-    """How the poses' clock reads beside the wheels': `later_s` at the log's begin, `rate` times as fast."""
+    """Offset (`later_s`, at the log's start) and `rate` of the poses' clock against the wheels' clock."""
 
     later_s: float
     rate: float

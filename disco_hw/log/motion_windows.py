@@ -23,7 +23,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class MotionWindows:
-    """What moved within each window: `t_s` (W,) where it begins, and increments, NaN where they are not known.
+    """Motion within each window of a log: `t_s` (W,) where it begins, and increments, NaN where they are not known.
 
     `commanded_rad`, `rolled_rad` (W, 2) left and right wheel; `moved_m` (W,) displacement in the world as complex
     x + iy; `heading_rad` (W,) at the middle; `turned_rad` (W,) change of the heading.

@@ -82,7 +82,7 @@ def _objects(values: list[Any]) -> Column:
 _R = TypeVar("_R")
 _EARLIEST_NS, _LATEST_NS = -(2**63), 2**63 - 1
 _NO_TIME = "a time or count in it is beyond 64 bits; leave this log out"
-_RECOVER = "run `disco-hw log recover` and use the mended log"
+_RECOVER = "run `disco-hw log recover` and use the recovered log"
 
 
 class Entry(NamedTuple):
@@ -102,14 +102,14 @@ class Gap(NamedTuple):
 
 
 class TopicSummary(msgspec.Struct, frozen=True):
-    """How much of one topic there is."""
+    """Number of messages of one topic, and their mean rate."""
 
     count: int
     rate_hz: float
 
 
 class LogSummary(msgspec.Struct, frozen=True):
-    """What a log holds and what it proves of its end.
+    """Contents of a log, and what is known of its end.
 
     `missing_ticks` were given to the recorder and are not in the file: between its ticks, before the first as far as
     the former part says, and after the last where the log was ended. `ended`: the recorder ended it, at `end`; None for
@@ -176,7 +176,7 @@ class Log:
 
     @property
     def path(self) -> Path:
-        """The file."""
+        """Path of the log file."""
         return self._path
 
     @property
@@ -191,13 +191,13 @@ class Log:
 
     @property
     def damage(self) -> tuple[str, ...]:
-        """What is lost, in words; of a mended log, what was lost when it was mended."""
+        """Description of lost data; in a recovered log, of what the recovery could not copy."""
         recovered = [record.metadata.get("lost", "") for record in self._contents.metadata if record.name == RECOVERY]
         return (*self._contents.damage, *(line for text in recovered for line in text.splitlines()))
 
     @property
     def metadata(self) -> Metadata:
-        """What the log says of itself."""
+        """Metadata of the log."""
         return self._metadata
 
     @property
@@ -276,7 +276,7 @@ class Log:
         raise LogError(f"{self._path}: holds no {name}; it holds {', '.join(self.attachment_names()) or 'no files'}")
 
     def summary(self) -> LogSummary:
-        """What the log holds; reads the whole file once. Raises LogError for damage."""
+        """Summarise the log's contents; reads the whole file once. Raises LogError for damage."""
         ticks, missing, first, last = 0, 0, 0, 0
         for now_ns, lost in self._ticks():
             first = first if ticks else now_ns
@@ -312,7 +312,7 @@ class Log:
         )
 
     def gaps(self) -> tuple[Gap, ...]:
-        """Where ticks are missing; reads the whole file once. Raises LogError for damage."""
+        """Return the ranges of missing control cycles; reads the whole file once. Raises LogError for damage."""
         return tuple(Gap(now_ns, lost) for now_ns, lost in self._ticks() if lost)
 
     def _ticks(self) -> Iterator[tuple[int, int]]:
@@ -362,7 +362,7 @@ def _contents(fd: int, path: Path) -> Contents:
         return read_contents(fd, str(path))
     except OSError as error:
         raise LogError(
-            f"{path}: cannot be read ({error.strerror}); mend its permissions, or give another log"
+            f"{path}: cannot be read ({error.strerror}); correct its permissions, or give another log"
         ) from None
 
 

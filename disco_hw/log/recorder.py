@@ -82,7 +82,7 @@ class Recorder(Protocol):
         """Look after the writer and return the counters; call it ten times a second."""
 
     def news(self) -> tuple[str, ...]:
-        """What a person should know of the recording, in sentences, since this was last asked."""
+        """Return messages about the recording since the last call, for the operator."""
 
     def tend(self) -> None:
         """Mend what takes milliseconds; call it only while the robot is not armed."""
@@ -92,13 +92,13 @@ class Recorder(Protocol):
 
 
 class NullRecorder:
-    """Records nothing."""
+    """Recorder that discards every record, for drives without a log."""
 
     def put(self, now_ns: int, records: Sequence[Record]) -> None:
-        """Do nothing."""
+        """Discard the records."""
 
     def poll(self) -> RecorderStats:
-        """Counters of nothing."""
+        """Return counters that are all zero."""
         return RecorderStats()
 
     def news(self) -> tuple[str, ...]:
@@ -109,7 +109,7 @@ class NullRecorder:
         """Nothing of it can break."""
 
     def close(self, timeout_s: float = 5.0) -> RecorderStats:
-        """Counters of nothing."""
+        """Return counters that are all zero."""
         return RecorderStats()
 
 
@@ -120,7 +120,7 @@ class MemoryRecorder:
         self.ticks: list[tuple[int, tuple[Record, ...]]] = []
 
     def put(self, now_ns: int, records: Sequence[Record]) -> None:
-        """Keep the tick."""
+        """Queue the records of one control cycle for the writer."""
         self.ticks.append((now_ns, tuple(records)))
 
     def poll(self) -> RecorderStats:
@@ -148,7 +148,7 @@ def wall_offset_ns() -> int:
 
 @dataclass(frozen=True, slots=True)
 class RecordingSettings:
-    """What a log begins with, and how many ticks may wait for the writer (`queue_ticks`) before more are dropped."""
+    """Header of a log, and how many control cycles may wait for the writer (`queue_ticks`) before more are dropped."""
 
     path: Path
     robot: str
@@ -249,7 +249,7 @@ class ProcessRecorder:
         return self._stats()
 
     def news(self) -> tuple[str, ...]:
-        """What a person should know of the recording, in sentences, since this was last asked."""
+        """Return messages about the recording since the last call, for the operator."""
         news, self._news = tuple(self._news), []
         return news
 
@@ -484,7 +484,7 @@ def _cause(line: WriterLine, code: int | None) -> str:
 
 
 def _check_place(path: Path) -> None:
-    """Make the directory; refuse what the writer could not create."""
+    """Create the log's directory. Raises LogError if the writer could not create a file there."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -494,4 +494,4 @@ def _check_place(path: Path) -> None:
     if path.exists():
         raise LogError(f"{path}: already exists and a log is never overwritten; give another name")
     if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise LogError(f"{path.parent}: cannot be written to; give another directory or mend its permissions")
+        raise LogError(f"{path.parent}: cannot be written to; give another directory or correct its permissions")

@@ -55,7 +55,7 @@ class Estimate(msgspec.Struct, frozen=True, gc=False):
 
 
 class Innovation(msgspec.Struct, frozen=True, gc=False):
-    """What the filter made of one measured pose.
+    """Result of fusing one measured pose.
 
     `innovation` is measured minus predicted (x, y, yaw), `variance` the diagonal of its covariance S, `test_ratio` the
     squared Mahalanobis distance over the gate (accepted at or below 1), `reason` why the pose was not used.
@@ -255,7 +255,7 @@ class Controller(msgspec.Struct, frozen=True, gc=False):
 
 
 class UnexplainedMotion(msgspec.Struct, frozen=True, gc=False):
-    """How the robot moves beside its model, as found by this tick: the fields of `model.coefficients.Disturbance`."""
+    """Motion that the model does not explain, by cycle: the fields of `model.coefficients.Disturbance`."""
 
     t_ns: int
     forward: float

@@ -1,4 +1,4 @@
-"""What stands still in a log while the rest of it moves: a pose, a heading, an encoder, or a clock."""
+"""Detection of signals that stand still in a log while the rest moves: a pose, a heading, an encoder, or a clock."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ class WriterLine:
         return time.monotonic() - self._heard_s
 
     def fileno(self) -> int:
-        """For `select`."""
+        """Return the socket's file descriptor, for `select`."""
         return self._connection.fileno()
 
     def send(self, data: bytes) -> bool:
@@ -106,7 +106,7 @@ class WriterLine:
         return bool(lines)
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection to the writer."""
         self._connection.close()
 
 
@@ -142,7 +142,7 @@ class KeeperLink:
         return self._process.pid if self._process is not None and self.alive else None
 
     def needs_renewal(self, now_s: float) -> bool:
-        """Whether it is dead, or has not started a writer for long after it was asked to."""
+        """Whether the keeper process is dead, or has not started a requested writer in time."""
         return not self.alive or (self._asked_s is not None and now_s - self._asked_s > _ANSWER_S)
 
     def launch(self, launch: Launch) -> socket.socket | None:
@@ -285,7 +285,7 @@ class Delivery:
         return self._waiting[self._sent].frame if self._sent < len(self._waiting) else None
 
     def sent(self) -> None:
-        """That frame was sent whole."""
+        """Mark a frame as sent completely."""
         self._sent += 1
 
     def acknowledge(self, sequence: int) -> None:
@@ -303,7 +303,7 @@ class Delivery:
         self._in_file = 0
 
     def file_deleted(self) -> None:
-        """What was in the present file is gone."""
+        """Count the control cycles of the current file as lost, because the file was deleted."""
         self.lost_ticks += self._in_file
         self.delivered_ticks -= self._in_file
         self._in_file = 0

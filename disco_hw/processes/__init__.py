@@ -100,7 +100,7 @@ def spawn_at_normal_priority(command: list[str], pass_fds: Sequence[int] = ()) -
     thread.start()
     thread.join()
     if failed:
-        raise LogError(f"{command[0]}: cannot start the log writer ({failed[0].strerror}); mend the installation")
+        raise LogError(f"{command[0]}: cannot start the log writer ({failed[0].strerror}); repair the installation")
     process = made[0]
     assert process.stdout is not None
     os.set_blocking(process.stdout.fileno(), False)

@@ -369,10 +369,14 @@ class DaemonCore:
             fell_back = result.source is Source.FALLBACK
             if fell_back is not self._fell_back:
                 law = self.config.control.fallback
-                events.append(f"planner: nothing valid found; {law} drives" if fell_back else "planner: drives again")
+                events.append(
+                    f"planner: no valid plan; {law} follows the line instead"
+                    if fell_back
+                    else "planner: valid plan again; it drives"
+                )
             self._fell_back = fell_back
             if found.collapsed != self._planner_collapsed:
-                few = f"planner: plans hang on {found.ess:.1f} effective samples, too few to be trusted"
+                few = f"planner: plans rest on {found.ess:.1f} effective samples, too few to trust the plan"
                 events.append(few if found.collapsed else "planner: enough effective samples again")
             self._planner_collapsed = found.collapsed
         return tuple(events)

@@ -78,7 +78,7 @@ class Plausibility:
             if not self._dipped and volts < DIP_PART * mean:
                 self._dipped = True
                 self._counts["supply_dips"] += 1
-                events.append(f"the supply dipped from {mean:.1f} V to {volts:.1f} V")
+                events.append(f"the supply voltage dropped from {mean:.1f} V to {volts:.1f} V")
             elif self._dipped and volts > DIP_OVER_PART * mean:
                 self._dipped = False
             elapsed_s = max(sample.t_ns - self._supply_ns, 0) * 1e-9
@@ -96,7 +96,7 @@ class Plausibility:
             self._poses[sample.source] = pose, repeats
             if repeats == REPEATS:
                 self._counts["poses_frozen"] += 1
-                events.append("the measured pose stays the same to the last digit while the wheels turn")
+                events.append("the measured pose does not change while the wheels turn; check the pose sensor")
         return events
 
 
@@ -142,7 +142,7 @@ class Headway:
         window = self._window
         if window is None or math.hypot(place_m[0] - window.x_m, place_m[1] - window.y_m) > self._least_m:
             self._window = _Window(now_ns, *place_m, angles)
-            return ("task: gets on again",) if window is not None and window.said else ()
+            return ("task: makes progress again",) if window is not None and window.said else ()
         window.largest_rad_s = max(window.largest_rad_s, *map(abs, command_rad_s))
         if window.said or now_ns - window.begun_ns < WINDOW_NS:
             return ()
@@ -155,16 +155,19 @@ def _obstacle(window: _Window, angles_rad: tuple[float, float] | None, planner_f
     if planner_failure is not None:
         return f"the planner has no plan: {planner_failure}"
     if window.largest_rad_s < ASKED_RAD_S:
-        return "the planner asks for no motion; look at the task and at where the robot is"
+        return "the planner commands no motion; check the task and the position of the robot"
     if angles_rad is None or window.angles_rad is None:
-        return f"the wheels were asked for up to {window.largest_rad_s:.2f} rad/s, and say nothing of how they turn"
+        return f"commanded up to {window.largest_rad_s:.2f} rad/s, but no wheel data arrive; check the encoders"
     turned = max(abs(now - then) for now, then in zip(angles_rad, window.angles_rad, strict=True))
     if turned < ROLLED_RAD:
         return (
-            f"the wheels stand although asked for up to {window.largest_rad_s:.2f} rad/s: blocked, or a dead band that "
-            "the model does not know (disco-hw gap finds it)"
+            f"the wheels do not turn although commanded up to {window.largest_rad_s:.2f} rad/s: blocked, or a dead "
+            "band that the model does not know (disco-hw gap finds it)"
         )
-    return f"the wheels have turned by {turned:.1f} rad, and the pose has not moved: slip, an obstacle, a frozen pose"
+    return (
+        f"the wheels have turned by {turned:.1f} rad, and the pose has not moved: slip, an obstacle, "
+        "or a frozen pose sensor"
+    )
 
 
 JUDGED_NS = 5_000_000_000
@@ -412,7 +415,7 @@ class Directions:
         if encoders != list(self._wiring.encoder_direction):
             changes.append(f"wheels.encoder_direction = {encoders}")
         return (
-            f"the robot moved otherwise than its wheels turned: {', '.join(said)}; in robot.toml write "
+            f"the robot moved differently from its wheels: {', '.join(said)}; in robot.toml write "
             f"{' and '.join(changes)}, unless it is the poses' frame that is wrong ([pose])"
         )
 

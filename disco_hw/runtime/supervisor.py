@@ -220,7 +220,7 @@ class Supervisor:
             case UserRequest.ESTOP:
                 self._estop_asked, self._resetting = True, None
                 self._drop_pending("e-stop")
-                text = "e-stop" if seen & _LINK_UP else "e-stop held; it is sent when the link is up"
+                text = "e-stop" if seen & _LINK_UP else "e-stop requested; it is sent as soon as the link is up"
             case UserRequest.DISARM:
                 self._disarm_asked = True
                 self._drop_pending("disarm")
@@ -229,19 +229,19 @@ class Supervisor:
                 text = "stopping the task" if self._running else "no task is running"
                 self._running = self._start_pending = False
             case UserRequest.ARM | UserRequest.ARM_UNRECORDED:
-                refusal = "an e-stop was asked for at the same time" if estop_now else self._why_not_arm(inputs, seen)
+                refusal = "an e-stop was requested at the same time" if estop_now else self._why_not_arm(inputs, seen)
                 if refusal is None and request is UserRequest.ARM and self._state is not State.ARMED:
                     refusal = inputs.recording_fault or None
                 if refusal is None and self._state is State.READY and self._arming is None:
                     self._arming = _Pending(now_ns)
                 text = "already armed" if self._state is State.ARMED else "arming"
             case UserRequest.START:
-                refusal = "an e-stop was asked for at the same time" if estop_now else self._why_not_start(inputs, seen)
+                refusal = "an e-stop was requested at the same time" if estop_now else self._why_not_start(inputs, seen)
                 if refusal is None and not (self._running or self._start_pending):
                     self._start_pending, self._by_hand = True, inputs.by_hand
                 text = "starting" if self._state is State.ARMED else "starting once armed"
             case UserRequest.RESET:
-                refusal = "an e-stop was asked for at the same time" if estop_now else self._why_not_reset(inputs, seen)
+                refusal = "an e-stop was requested at the same time" if estop_now else self._why_not_reset(inputs, seen)
                 if refusal is None:
                     self._estop_asked, self._resetting = False, self._resetting or _Pending(now_ns)
                 text = "resetting"
@@ -260,7 +260,7 @@ class Supervisor:
             case State.STOPPING:
                 return "still stopping; ask again when ready"
             case State.FAULT:
-                return self._trouble_and_remedy("mend it and reset first")
+                return self._trouble_and_remedy("correct the fault, then reset")
             case State.DISCONNECTED | State.HANDSHAKE:
                 return f"not connected to the robot: {self._words(inputs)}"
 
@@ -291,7 +291,7 @@ class Supervisor:
         if inputs.daemon_error is not None:
             return f"the daemon failed ({inputs.daemon_error}); restart it"
         if inputs.preflight_errors:
-            return f"{inputs.preflight_errors[0]}; mend it and restart the daemon"
+            return f"{inputs.preflight_errors[0]}; correct it and restart the daemon"
         if self._estop_asked and not seen & _ROBOT_ESTOP:
             return "the robot has not confirmed the e-stop yet"
         return None
@@ -391,7 +391,7 @@ class Supervisor:
             case State.STOPPING:
                 return f"{self._stop_reason}; waiting until the robot is disarmed and its wheels are still"
             case State.FAULT:
-                return self._trouble_and_remedy("mend it, then reset")
+                return self._trouble_and_remedy("correct it, then reset")
             case State.DISCONNECTED | State.HANDSHAKE:
                 return self._words(inputs)
 

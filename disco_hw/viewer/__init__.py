@@ -47,7 +47,7 @@ class PageProcess:
 
     @property
     def returncode(self) -> int | None:
-        """How the page ended, negative for a signal; None while it runs."""
+        """Exit code of the page's process, negative for a signal; None while it runs."""
         return self._process.returncode
 
     def wait(self, timeout_s: float) -> int:
@@ -58,7 +58,7 @@ class PageProcess:
         return self._process.returncode
 
     def news(self) -> tuple[str, ...]:
-        """What happened to the page since this was last asked, in sentences."""
+        """Return messages about the page's process since the last call."""
         with self._lock:
             news, self._news = tuple(self._news), []
         return news
@@ -158,5 +158,5 @@ def page_token() -> str:
 
 
 def page_address(host: str, port: int, token: str) -> str:
-    """What to open in a browser."""
+    """Return the address of the page for a browser, with its token."""
     return f"http://{host}:{port}/?token={token}"

@@ -30,7 +30,7 @@ ACCEPTED_PER_TURN = 4
 
 
 class Abortable(Protocol):
-    """What is needed of a transport: to be closed at once."""
+    """Protocol of a transport that can be closed at once."""
 
     def abort(self) -> None:
         """Close without waiting for what is unsent."""

@@ -1,4 +1,4 @@
-"""What the page shows of fence and obstacles: their lines on the floor, and the fields that change the fence."""
+"""Fence and obstacles on the page: their lines on the floor, and the fields that change the fence."""
 
 from __future__ import annotations
 

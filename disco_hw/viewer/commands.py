@@ -79,7 +79,7 @@ def view_log(
 
 
 def in_figures(recording: Recording) -> dict[str, Any]:
-    """What a log shows, for machines: its length, its ticks, and every mark with its time and words."""
+    """Return a log's length, number of control cycles and marks (time and text) as a JSON-serialisable dict."""
     marks = marks_of(recording.timeline)
     return {
         "duration_s": recording.duration_s,

@@ -208,7 +208,7 @@ class Desk:
 
 
 def shown(status: Mapping[str, Any] | None, error: str) -> dict[str, Any]:
-    """What of a status the desk shows; `error` says why there is none."""
+    """Return the part of a status that the desk shows; `error` says why there is none."""
     if status is None or not status.get("ok"):
         why = error or str((status or {}).get("error") or "the daemon has not started its loop yet")
         return {"kind": "status", "ok": False, "state": "NO DAEMON", "detail": why}
@@ -230,7 +230,7 @@ def shown(status: Mapping[str, Any] | None, error: str) -> dict[str, Any]:
 
 
 def _recording(status: Mapping[str, Any]) -> tuple[str, ...]:
-    """What is wrong with the recording now, as a sentence."""
+    """Describe the present fault of the recording; empty if there is none."""
     fault = status["recorder"]["fault"]
     return (f"RECORDING: {fault}.",) if fault else ()
 

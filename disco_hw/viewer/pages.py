@@ -115,7 +115,7 @@ class LivePage:
         self._desk.dark = self.scene.background == DARK
 
     def close(self) -> None:
-        """Leave the feed."""
+        """Close the subscription to the daemon's feed."""
         self._subscriber.close()
 
     def _snapshot(self) -> Snapshot | None:
@@ -182,7 +182,7 @@ def _belief_in_force(now_ns: int, adaptation: Mapping[str, Any] | None) -> Belie
 
 
 def _geometry(change: BeliefChange | None) -> tuple[tuple[float, ...], ...]:
-    """What distinguishes two beliefs; the model file's is empty."""
+    """Return a key that distinguishes two beliefs; empty for the model file's."""
     return () if change is None or change.source == "model" else (change.mean, change.covariance)
 
 

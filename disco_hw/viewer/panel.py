@@ -1,4 +1,4 @@
-"""What the panel says of the robot's state, in words; pure text for a live page and for a replay."""
+"""Text of the panel that describes the robot's state, for a live page and for a replay."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def _status_rows(status: Mapping[str, Any]) -> Rows:
 
 
 def _source(one: Mapping[str, Any]) -> str:
-    """How one of several pose sources does."""
+    """Describe the standing of one of several pose sources."""
     age = "none yet" if one["age_s"] is None else f"the last {one['age_s']:.2f} s ago"
     return f"{one['source']}: {one['standing']}, {age}, {one['outliers']} outliers"
 
@@ -130,7 +130,7 @@ def _battery(snapshot: Snapshot) -> tuple[str, str]:
 
 
 def motion_rows(snapshot: Snapshot) -> Rows:
-    """What a snapshot says of the motion, as (what, how much)."""
+    """Return the panel's rows about the motion, as (label, value)."""
     rows: Rows = []
     if snapshot.pose is not None:
         x_m, y_m, yaw_rad = snapshot.pose
@@ -147,7 +147,7 @@ def motion_rows(snapshot: Snapshot) -> Rows:
 
 
 def health_rows(snapshot: Snapshot) -> Rows:
-    """What a snapshot says of link and belief."""
+    """Return the panel's rows about link and belief, as (label, value)."""
     rows: Rows = []
     if snapshot.link is not None:
         it = snapshot.link

@@ -39,7 +39,7 @@ _EVENTS = 8
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Snapshot:
-    """What was known at `t_ns`; a thing of which nothing was known is None, NaN or empty.
+    """State of the robot as known at `t_ns`; unknown fields are None, NaN or empty.
 
     `pose` (x, y, yaw) m and rad, its `covariance` (3, 3); `speed_m_s`, `yaw_rate_rad_s`; `wheel_angles`,
     `wheel_speeds`, `command` (left, right) rad and rad/s; `plan` not older than half a second; `poses` (N, 3) measured

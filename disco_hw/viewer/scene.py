@@ -86,7 +86,7 @@ _TRAIL_STEP, _OLD_TRAIL_STEP = 0.05, 0.2
 
 
 def first_camera(task: RobotTask) -> tuple[Point, Point]:
-    """Where the page's camera is at first, and what it looks at: all of the task, from the south and above."""
+    """Return the initial position and target of the page's camera: all of the task, from the south and above."""
     course = task.course()
     (x_m, y_m), away = course.middle_m, 0.8 + 1.1 * course.reach_m
     return (x_m - 0.35 * away, y_m - 0.9 * away, 1.25 * away), (x_m, y_m, 0.0)
@@ -120,7 +120,7 @@ class Scene:
         self._drawn_fan: tuple[records.Fan, tuple[float, ...]] | None = None
 
     def show(self, snapshot: Snapshot, everything: bool = True) -> None:
-        """Draw this instant."""
+        """Draw one snapshot of the run."""
         layers = self.layers
         with self._server.atomic():
             self._shade()
@@ -428,7 +428,7 @@ def weight_colours(
 def instant_centre(
     pose: tuple[float, float, float], speed_m_s: float, yaw_rate_rad_s: float, x_icr_m: float, farthest_m: float
 ) -> tuple[float, float] | None:
-    """Where the body turns about, in the world; None when it is not a number or farther away than `farthest_m`.
+    """Return the centre of rotation in the world; None if it is not finite or farther away than `farthest_m`.
 
     In the body's frame it lies at (x_icr, v / omega): there the lateral velocity -omega x_icr of the tracked point and
     the forward one v are both undone.

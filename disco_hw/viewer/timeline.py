@@ -90,7 +90,7 @@ class Items(Generic[Item]):
         return iter(zip(self._times, self._items, strict=True))
 
     def append(self, now_ns: int, item: Item) -> None:
-        """Add a record."""
+        """Append one record of the log or feed to the timeline."""
         self._times.append(now_ns)
         self._items.append(item)
 
@@ -324,6 +324,6 @@ class Excited:
                 self._items.append(coverage.as_dict()["items"])
 
     def items(self, t_ns: int) -> ExcitationRows:
-        """What counts and how much of it there is, as `Coverage.as_dict` says; empty before the first command."""
+        """Return the motions driven so far, in the form of `Coverage.as_dict`; empty before the first command."""
         index = bisect_right(self._times, t_ns) - 1
         return self._items[index] if index >= 0 else ()

@@ -24,7 +24,7 @@ _SOUTH_M = 0.01
 
 
 def top_camera(task: RobotTask) -> tuple[Point, Point]:
-    """Where the camera is for a map of the whole task, north up, and what it looks at."""
+    """Return position and target of a camera that looks at the whole task from above, north up."""
     course = task.course()
     x_m, y_m = course.middle_m
     return (x_m, y_m - _SOUTH_M, 1.0 + 2.2 * course.reach_m), (x_m, y_m, 0.0)
@@ -111,7 +111,7 @@ def add_layers(server: viser.ViserServer, scene: Scene, changed: Callable[[], No
 
 
 def legend() -> str:
-    """HTML: the colour of each layer beside its name; of the trail what its colours mean."""
+    """Return the legend as HTML: the colour of each layer beside its name, and the trail's colour scale."""
     rows = [
         f'<div><span aria-hidden="true" style="display:inline-block;width:1.6em;height:0.5em;margin-right:0.6em;'
         f"border:1px solid #8888;"
@@ -149,7 +149,7 @@ class TaskEditor:
             ball.on_drag(pulled)
 
     def pull(self, ball: str, place: tuple[float, float]) -> None:
-        """One of the balls was pulled to a place of the floor."""
+        """Move one handle of the edited circle to a point on the floor."""
         if self._drawn is None:
             return
         values = self._drawn[1]
@@ -183,7 +183,7 @@ class TaskEditor:
 
 
 def floor_under(eye: Point, seen: Point) -> tuple[float, float] | None:
-    """Where the floor is seen through a point from the camera; None where the look does not go down."""
+    """Return the floor's point on the line from the camera through `seen`; None if that does not point down."""
     down = eye[2] - seen[2]
     if down <= 1e-6:
         return None

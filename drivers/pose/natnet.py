@@ -196,8 +196,8 @@ def make_pose_source(
     except OSError as error:
         opened.close()
         raise PoseSourceError(
-            f"{server or group}:{data_port} at {address}: {error.strerror or error}; mend pose.group, pose.server, or "
-            "pose.address, which is this computer's in Motive's network"
+            f"{server or group}:{data_port} at {address}: {error.strerror or error}; correct pose.group, pose.server, "
+            "or pose.address, which is this computer's in Motive's network"
         ) from None
     wanted = (body, up_axis, position_std_m, yaw_std_rad)
     return NatNetPoses(opened, senders, server, VERSIONS[natnet_version], *wanted)
@@ -278,12 +278,12 @@ class NatNetPoses:
         frame = parse_frame(datagram, self._version)
         if frame is None:
             self.malformed += 1
-            self._say(f"datagrams that are no frames of NatNet {_text(self._version)}; mend pose.natnet_version")
+            self._say(f"datagrams that are no frames of NatNet {_text(self._version)}; correct pose.natnet_version")
             return None
         body = next((each for each in frame.bodies if each.number == self._body), None)
         if body is None:
             there = ", ".join(str(each.number) for each in frame.bodies) or "none"
-            self._say(f"no rigid body {self._body} in Motive's frames, but {there}; mend pose.body")
+            self._say(f"no rigid body {self._body} in Motive's frames, but {there}; correct pose.body")
             return None
         if not body.tracked or not all(map(math.isfinite, (*body.position, *body.rotation))):
             self.lost += 1

@@ -344,7 +344,7 @@ class Fixes:
         before, self._far = self._far, away_m > FARTHEST_M
         if self._far is before or not self._far:
             return []
-        return [{"said": f"{away_m:.0f} m from the datum, and {FARTHEST_M:.0f} m is the farthest; mend pose.datum"}]
+        return [{"said": f"{away_m:.0f} m from the datum, and {FARTHEST_M:.0f} m is the farthest; correct pose.datum"}]
 
     def _quality_words(self, quality: int) -> list[dict[str, Any]]:
         before, self._quality = self._quality, quality

@@ -26,7 +26,7 @@ Sender = tuple[str, int]
 def parse_allowed(addresses: Collection[str]) -> tuple[IPv4Network, ...]:
     """Return the networks that `pose.allow` names; raises ValueError with what is wrong with one of them."""
     if not addresses:
-        raise ValueError("empty, so that nobody could send poses")
+        raise ValueError("empty, which allows no sender at all")
     networks = []
     for text in addresses:
         try:

@@ -11,7 +11,7 @@ from sim.virtual_robot import Controller
 
 
 def find_controller(driver: str) -> Callable[[Any, int], Controller] | None:
-    """What makes the controllers that a driver speaks to, of its settings and the encoder's ticks a turn.
+    """Return the factory of a driver's simulated controllers, called with its settings and the ticks a turn.
 
     None for a driver that has no file here.
     """

@@ -144,10 +144,10 @@ def test_every_field_is_documented():
         assert f"[{section}]" in text
         for field in _fields_of(section):
             # `of_driver` is what the driver's own fields become, not a field to write.
-            assert field == "of_driver" or f"\n{field} = " in text, f"[{section}] {field}"
+            assert field == "of_driver" or f"\n| `{field}` | " in text, f"[{section}] {field}"
     for driver in motor_drivers().values():
         for field in driver.settings.__struct_fields__:
-            assert f"\n{field} = " in text, f"{driver.name}: {field}"
+            assert f"\n| `{field}` | " in text, f"{driver.name}: {field}"
 
 
 def test_the_page_on_controllers_has_a_link_for_each_that_loads(tmp_path):

@@ -57,11 +57,11 @@ def test_a_terminal_that_is_held_by_ctrl_s_holds_nobody_up():
     teller.close(10.0)
     said = b""
     # A terminal hands on what was written to it piece by piece.
-    while b"sentences are missing here" not in said and select.select([master], [], [], 10.0)[0]:
+    while b"messages are missing here" not in said and select.select([master], [], [], 10.0)[0]:
         said += os.read(master, 65536)
     lines = said.decode().splitlines()
     assert lines[0] == "event: 0"
-    assert "sentences are missing here" in lines[-1]
+    assert "messages are missing here" in lines[-1]
     os.close(master)
     os.close(slave)
 

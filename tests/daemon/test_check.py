@@ -139,5 +139,5 @@ def test_a_socket_that_cannot_be_looked_at_is_one_line():
     # As where the daemon runs as another user, in a directory that only that one may enter.
     setup = load_setup(ROBOT_FILE)
     daemon = msgspec.structs.replace(setup.config.daemon, control_socket=f"/tmp/{'x' * 300}")
-    with pytest.raises(InputError, match="cannot be looked at"):
+    with pytest.raises(InputError, match="cannot be read"):
         check.refuse_beside_a_daemon(msgspec.structs.replace(setup.config, daemon=daemon))

@@ -17,7 +17,7 @@ ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
         ("jump", (), "jump: no such request"),
         ("drive", ("forward=1",), "drive: no such request"),
         ("task", (), "say what to change"),
-        ("arm", ("radius_m=1",), "arm takes nothing more"),
+        ("arm", ("radius_m=1",), "arm takes no further arguments"),
         ("task", ("radius_m",), "radius_m: not a change"),
         ("task", ("radius_m=wide",), "radius_m=wide: not a change"),
         ("task", ("radius_m=nan",), "radius_m=nan: not a change"),

@@ -189,7 +189,7 @@ def test_what_another_user_made_first_is_passed_over_and_named(temporary, tmp_pa
             ending.set()
             thread.join()
             server.close()
-        assert capsys.readouterr().err == f"disco-hw: {taken}: belongs to nobody (65534); passed over\n"
+        assert capsys.readouterr().err == f"disco-hw: {taken}: belongs to nobody (65534); not used\n"
 
 
 @needs_root

@@ -173,7 +173,7 @@ def test_a_roboclaw_is_found_by_its_version_and_by_nothing_that_moves_or_writes(
 def test_a_silent_line_is_asked_only_with_somebodys_leave(tmp_path):
     with line_with(Roboclaw()) as (port, heard):
         for answers in (None, lambda _question: "n"):
-            with pytest.raises(InputError, match=r"no controller was heard; .* or give --ask"):
+            with pytest.raises(InputError, match=r"no controller was recognised; .* or give --ask"):
                 from_line(tmp_path, port, answers)
         assert not heard
         assert load_robot_config(from_line(tmp_path, port, lambda _question: "y" if "[y/n]" in _question else "")).link
@@ -190,7 +190,7 @@ def test_who_names_the_controller_has_given_leave(tmp_path):
 
 def test_a_line_on_which_something_speaks_is_not_asked(tmp_path):
     with line_with(Roboclaw(), says=b"$GPGGA,1*00\r\n") as (port, heard):
-        with pytest.raises(InputError, match="no controller was heard"):
+        with pytest.raises(InputError, match="no controller was recognised"):
             from_line(tmp_path, port, may_ask=True)
         assert not heard
 

@@ -122,7 +122,7 @@ def test_where_nothing_can_be_recorded_arming_is_refused_unless_that_is_asked_fo
         shutil.rmtree(logs)
         logs.write_text("in the way")
         stack.operator.wait_until("report of the fault", lambda status: status["recorder"]["fault"], 10.0)
-        with pytest.raises(WorkError, match=r"nothing is being recorded: .*; mend that, or arm with --unrecorded"):
+        with pytest.raises(WorkError, match=r"nothing is being recorded: .*; correct that, or arm with --unrecorded"):
             stack.operator.request("arm")
         code, text = disco_here("ctl", str(stack.robot_file), "arm")
         assert code == 1

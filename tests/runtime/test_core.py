@@ -279,7 +279,7 @@ def test_plans_that_hang_on_too_few_samples_are_reported_once():
     ticks = stack.run(2.0, UserRequest.START)
     reported = [text for tick in ticks for text in tick.events if text.startswith("planner")]
     assert reported == [
-        "planner: plans hang on 1.2 effective samples, too few to be trusted",
+        "planner: plans rest on 1.2 effective samples, too few to trust the plan",
         "planner: enough effective samples again",
     ]
 

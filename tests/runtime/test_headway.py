@@ -31,8 +31,8 @@ def said(seconds, speed_m_s=0.2, robot_m_s=0.0, wheels_rad_s=0.0, command=COMMAN
 @pytest.mark.parametrize(
     ("what", "words"),
     [
-        ({}, "the wheels stand although asked for up to 0.50 rad/s"),
-        ({"command": (0.0, 0.0)}, "the planner asks for no motion"),
+        ({}, "the wheels do not turn although commanded up to 0.50 rad/s"),
+        ({"command": (0.0, 0.0)}, "the planner commands no motion"),
         ({"failure": "nothing finite"}, "the planner has no plan: nothing finite"),
         ({"wheels_rad_s": 2.0}, "the wheels have turned by 10.0 rad, and the pose has not moved"),
     ],
@@ -59,7 +59,7 @@ def test_it_is_reported_when_the_robot_gets_on_again():
     for tick in range(500):
         x_m = 0.0 if tick < 300 else 0.004 * (tick - 300)
         found += headway.step(tick * TICK_NS, True, (x_m, 0.0), COMMAND, None, None)
-    assert [text.split(":")[1] for text in found] == [" no progress for 5 s", " gets on again"]
+    assert [text.split(":")[1] for text in found] == [" no progress for 5 s", " makes progress again"]
 
 
 def started(**changes):
@@ -74,7 +74,7 @@ def test_the_daemon_says_that_a_robot_stands_within_a_dead_band_that_its_model_d
     setup = load_setup(ROBOT_FILE)
     law = LawController(lambda *_: (1.2, 1.2), setup.model, setup.config.task.planned(setup.config.control.mode))
     events = [event for tick in started(planner=law, hide={"deadband": 1.3}).run(7.0) for event in tick.events]
-    assert [event for event in events if event.startswith("task: no progress for 5 s: the wheels stand")]
+    assert [event for event in events if event.startswith("task: no progress for 5 s: the wheels do not turn")]
 
 
 def test_wheels_that_stand_beyond_any_dead_band_stop_the_robot():

@@ -26,7 +26,7 @@ def test_a_dip_of_the_supply_is_counted_once_and_again_after_it_has_recovered():
     volts = [25.0] * 20 + [23.0] * 3 + [24.9] * 10 + [23.0] * 2
     reported = [text for i, v in enumerate(volts) for text in watch.step(i * TICK_NS, (), (), power(0.1 * i, v))]
     assert watch.stats == PlausibilityStats(supply_dips=2)
-    assert reported[0] == "the supply dipped from 25.0 V to 23.0 V"
+    assert reported[0] == "the supply voltage dropped from 25.0 V to 23.0 V"
 
 
 def test_a_battery_that_runs_down_under_load_is_no_dip():

@@ -144,7 +144,7 @@ class LoopFigures:
         ('[[pose.also]]\nsource = "udp"\nbaud = 9600\n', r'also\[0\]\.baud: a field of the source "nmea", and'),
         ('[[pose.also]]\nsource = "udp"\nrate_hz = 50.0\n', r"also\[0\]\.rate_hz: .*; remove it"),
         ('[[pose.also]]\nsource = "udp"\noffset = [inf, 0.0]\n', r"also\[0\]\.offset: not a finite number"),
-        ('[pose]\nsource = "udp"\nallow = []\n', r"pose\.allow: empty, so that nobody could send poses; write addr"),
+        ('[pose]\nsource = "udp"\nallow = []\n', r"pose\.allow: empty, which allows no sender at all; write addr"),
         ('[pose]\nsource = "natnet"\nallow = ["host"]\n', r'pose\.allow: "host" is no IPv4 address; write addr'),
         ('[[pose.also]]\nsource = "udp"\nallow = ["10.0.0.0/99"]\n', r'also\[0\]\.allow: "10\.0\.0\.0/99" is no IPv4'),
         ('[pose]\nsource = "robot"\nkey_file = "k"\n', r'pose\.key_file: a field of the source "udp", and'),

@@ -97,7 +97,7 @@ def test_a_fault_of_the_robot_is_followed_by_this_hosts_reset_without_another_re
     bench.running()
     out = bench.tick(driver_state=DriverState.FAULT, driver_detail=status_codes.fault(fault))
     assert out.detail.endswith(ending)
-    assert "mend it" not in out.detail
+    assert "correct it" not in out.detail
     assert refusal(bench.tick(ARM)).endswith(ending)
 
 
@@ -391,7 +391,7 @@ def test_estop_asked_while_disconnected_is_sent_when_the_link_is_up():
     bench.tick(link_state=LinkState.CONNECTING)
     out = bench.tick(ESTOP)
     assert not out.send_estop
-    assert "when the link is up" in out.replies[0].text
+    assert "as soon as the link is up" in out.replies[0].text
     assert bench.tick(link_state=LinkState.UP).send_estop
     assert bench.tick(count=5).state is State.FAULT
 

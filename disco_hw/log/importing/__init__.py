@@ -83,7 +83,7 @@ def write_log(drive: DriveLog, path: Path, robot: str, attachments: tuple[Attach
     written.
     """
     if drive.end_s > _LONGEST_S:
-        raise LogError(f"{', '.join(drive.sources)}: its times span {drive.end_s:.3g} s; mend the clock that jumps")
+        raise LogError(f"{', '.join(drive.sources)}: its times span {drive.end_s:.3g} s; correct the clock that jumps")
     encode = batch_encoder()
     try:
         file = LogFile(path)
@@ -157,7 +157,7 @@ def _ns(t_s: float) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Imported:
-    """What was written where, and what a person should know of it."""
+    """Result of an import: the path written, and notes for the operator."""
 
     out: Path
     records: int

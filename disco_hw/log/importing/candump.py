@@ -24,7 +24,7 @@ Row = tuple[float, ...]
 
 @dataclass(slots=True)
 class _Rows:
-    """What the frames of one channel hold; `refused` of the protocol's frames failed their check."""
+    """Decoded frames of one channel; `refused` counts frames of the protocol that failed their check."""
 
     commands: list[Row] = field(default_factory=list)
     wheels: list[Row] = field(default_factory=list)
@@ -74,7 +74,7 @@ def read_candump(path: Path, robot: Robot, channel: str = "", usual_channel: str
 
 
 def _decoded(dump: Dump, channel: str, robot: Robot) -> _Rows:
-    """What the frames of one channel hold."""
+    """Decode the frames of one channel."""
     codec = Codec()
     reception, telemetry = FrameReception(codec), Telemetry(DeviceClock())
     telemetry.configure(round(robot.ticks_per_rev), robot.max_wheel_speed_rad_s)

@@ -95,7 +95,7 @@ def read_dump(path: Path) -> Dump:
         bad, filled = bad - 1, filled - 1
     if bad:
         what = f"are no frame and were left out, the first is line {first_bad}"
-        remedy = "not a candump; record with `candump -L`" if bad == filled else f"mend them, first line {first_bad}"
+        remedy = "not a candump; record with `candump -L`" if bad == filled else f"correct them, first line {first_bad}"
         notes.append(loss_note(str(path), "lines", bad, filled, what, remedy))
     if not channels:
         raise LogError(f"{path}: no frame in it; record with `candump -L`")

@@ -235,7 +235,7 @@ def _is_too_fast(motion: _Steps, speeds: Array | None, span: float) -> bool:
 
 
 def _too_fast(motion: _Steps, speeds: Array | None, reach: float, spans: Sequence[float], unit: str) -> str:
-    """That a counter turns round within few samples, so that nobody can tell which way; empty if none does."""
+    """Describe a counter that wraps within so few samples that its direction is unknown; empty if none does."""
     if np.mean(motion.is_jump) <= _JUMPS_ALL_THE_TIME_SHARE:
         return ""
     for span in spans:

@@ -57,7 +57,7 @@ _LARGEST_YAW_RATE_RAD_S = 6.0
 
 
 def time_fault(t_s: Array) -> str | None:
-    """What is wrong with times that should be in seconds, or None."""
+    """Describe the error in times that should be in seconds; None if there is none."""
     if t_s.size < 3:
         return None
     period_s = float(np.median(np.diff(t_s)))

@@ -64,7 +64,7 @@ class Sheet:
 
 @dataclass(slots=True)
 class _Faults:
-    """What could not be read: the first place of each kind as the remedy needs it, and how often."""
+    """Errors found while reading: the first place of each kind, and how many there are."""
 
     lines: int = 0
     uneven: list[int] = field(default_factory=list)
@@ -190,7 +190,7 @@ def _notes_on_rows(path: Path, header: Sequence[str], faults: _Faults) -> Iterat
         if bad:
             yield loss_note(
                 str(path), "rows", len(bad), faults.lines, f"{what} and were left out, the first in line {bad[0]}",
-                f"mend them, beginning with line {bad[0]}",
+                f"correct them, beginning with line {bad[0]}",
             )  # fmt: skip
 
 

@@ -59,7 +59,7 @@ _YAW_VARIANCE = 35
 
 @dataclass(slots=True)
 class _Column:
-    """What one topic, or one edge of the transforms, has given."""
+    """Samples collected from one topic, or from one edge of the transforms."""
 
     width: int
     log_ns: array[int] = field(default_factory=lambda: array("q"))
@@ -218,7 +218,7 @@ def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: R
 
 
 def _of_the_choice(choice: Choice) -> list[str]:
-    """What the kind of the chosen topics means for whoever reads the results."""
+    """Return notes on what the types of the chosen topics mean for the results."""
     notes = []
     command, wheel = choice.used(COMMANDS), choice.used(WHEELS)
     if command is None:
@@ -328,7 +328,7 @@ def stamp_of(message: Any) -> int:
 
 
 def take_of(role: str, kind: str, choice: Choice, config: RobotConfig) -> tuple[int, Take]:
-    """How many numbers a message of this type gives in this role, and how."""
+    """Return how many numbers a message of this type gives in this role, and the function that reads them."""
     if role == POSES:
         return 7, _odometry_pose if kind == ODOMETRY else _measured_pose
     if role == WHEELS:

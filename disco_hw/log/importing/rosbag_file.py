@@ -63,13 +63,13 @@ class BagMessage:
 
 @dataclass(slots=True)
 class Undecoded:
-    """How many messages of a topic cannot be decoded, and what is wrong with the first."""
+    """Count of the messages of a topic that cannot be decoded, with the error of the first."""
 
     count: int = 0
     first: str = ""
 
     def add(self, fault: str) -> None:
-        """Count one more."""
+        """Count one more message that cannot be decoded."""
         self.count, self.first = self.count + 1, self.first or fault
 
 
@@ -298,7 +298,7 @@ def _in_one_line(path: Path, what: str = "the bag") -> Iterator[None]:
 
 
 def words_of(error: BaseException) -> str:
-    """What an exception of a library says, in one line that is not too long."""
+    """Format the message of a library's exception as one short line."""
     return " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
 
 

@@ -144,7 +144,7 @@ def _dated_about(stamps: Mapping[str, Stamps], log_ns: int) -> set[str]:
 
 
 def _standing(one: Stamps) -> str:
-    """That the stamps of a topic stand still while the recording goes on, with the share; empty if they do not."""
+    """Describe a topic's stamps that stand still while the recording goes on, with their share; else empty."""
     if one.stamp_ns.size < 2:
         return ""
     changes = np.concatenate([[True], (np.diff(one.stamp_ns) != 0) | (one.stamp_ns[1:] == 0)])

@@ -63,7 +63,7 @@ class Choice:
     right_joints: tuple[str, ...]
 
     def used(self, role: str) -> TopicCandidate | None:
-        """What serves in this role."""
+        """Return the topic that is used in this role."""
         return next((one for one in self.table if one.role == role and one.used), None)
 
     def as_text(self) -> str:

@@ -173,8 +173,8 @@ def test_by_multicast_with_the_exposures_age_and_a_lost_body(port):
     found, said = until(source, lambda _, said: len(said) == 3)
     assert found == []
     assert said[0] == "the cameras have lost rigid body 3"
-    assert said[1] == "datagrams that are no frames of NatNet 3.0; mend pose.natnet_version"
-    assert said[2] == "no rigid body 3 in Motive's frames, but none; mend pose.body"
+    assert said[1] == "datagrams that are no frames of NatNet 3.0; correct pose.natnet_version"
+    assert said[2] == "no rigid body 3 in Motive's frames, but none; correct pose.body"
     assert (source.lost, source.malformed) == (3, 1)
     source.close()
     source.close()
@@ -202,7 +202,7 @@ def test_by_unicast_it_asks_and_takes_version_and_clock_from_the_answer(port, mo
 
 
 def test_an_address_that_is_not_this_computers_is_one_line():
-    with pytest.raises(PoseSourceError, match=r"mend pose\.group, pose\.server, or pose\.address"):
+    with pytest.raises(PoseSourceError, match=r"correct pose\.group, pose\.server, or pose\.address"):
         make_pose_source("natnet", address="203.0.113.7")
 
 

@@ -92,7 +92,7 @@ def test_what_is_no_fix_gives_none_and_breaks_nothing(broken):
 def test_a_datum_of_another_town_is_said():
     fixes = Fixes(datum=(47.0, 8.5))
     said = [each["said"] for each in fixes.take(GGA_ALONE, NOW_NS) if "said" in each]
-    assert "32097 m from the datum, and 838 m is the farthest; mend pose.datum" in said
+    assert "32097 m from the datum, and 838 m is the farthest; correct pose.datum" in said
     assert len(fixes.take(GGA_ALONE, NOW_NS)) == 1
 
 

@@ -62,7 +62,7 @@ def test_times_that_do_not_fit_into_a_log_are_refused_and_leave_nothing_behind(t
     t_s = drive.commands.t_s.copy()
     t_s[-1] = 1e12
     far = replace(drive, commands=replace(drive.commands, t_s=t_s))
-    with pytest.raises(LogError, match=r"its times span 1e\+12 s; mend the clock that jumps"):
+    with pytest.raises(LogError, match=r"its times span 1e\+12 s; correct the clock that jumps"):
         write_log(far, tmp_path / "log.mcap", "test")
     assert not (tmp_path / "log.mcap").exists()
 
