@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import disco_hw
-from disco_hw.config.robot import prior_around
+from disco_hw.config.robot_file import prior_around
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.fence import Circle, Fence, Footprint
 from disco_hw.fence.clearance import Boundaries, MovingCircle
