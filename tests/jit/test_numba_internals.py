@@ -14,8 +14,9 @@ from disco_hw.jit import numba_internals
 LAST_TRIED = (0, 68)
 TO_DO = (
     "disco_hw/jit/numba_internals.py relies on it: run tests/jit, tests/control/kernel and "
-    "`make bench PARTS=bench_control` with this numba, adapt that file, and write what holds here; until then keep numba below it in pyproject.toml"
-)  # fmt: skip
+    "`make bench PARTS=bench_control` with this numba, adapt that file, and write what holds here; "
+    "until then keep numba below it in pyproject.toml"
+)
 MEMBERS = {
     codegen.CodeLibrary: ("_raise_if_finalized", "_ensure_finalized"),
     codegen.JITCodeLibrary: ("finalize", "enable_object_caching", "_get_module_for_linking"),
