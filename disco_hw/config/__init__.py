@@ -20,11 +20,8 @@ from disco_hw.config.robot import (
     Robot,
     RobotConfig,
     Ros2,
-    link_of,
-    load_daemon_address,
-    load_robot_config,
-    refuse_outside_task,
 )
+from disco_hw.config.robot_file import link_of, load_daemon_address, load_robot_config, refuse_outside_task
 from disco_hw.errors import InputError
 from disco_hw.files import LOG, MODEL_TOML, WAY_POINTS, open_file, read_toml
 

@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.config.robot import prior_around
+from disco_hw.config.robot_file import prior_around
 from disco_hw.experiments.fence_drives import (
     FencedDrive,
     along_drive,

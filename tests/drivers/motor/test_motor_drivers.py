@@ -108,7 +108,7 @@ def test_a_key_for_a_driver_that_does_not_authenticate_is_refused(tmp_path, monk
     file = robot_toml(tmp_path, f'driver = "{DEFAULT}"\nkey_file = "robot.key"')
     assert load_robot_config(file).link.key_file == "robot.key"
     mute = replace(find_driver(None), authenticates=False)
-    monkeypatch.setattr("disco_hw.config.robot.find_driver", lambda _name: mute)
+    monkeypatch.setattr("disco_hw.config.robot_file.find_driver", lambda _name: mute)
     with pytest.raises(InputError, match=r"link\.key_file: .*no authenticated mode; remove it"):
         load_robot_config(file)
 

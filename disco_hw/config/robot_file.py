@@ -1,0 +1,279 @@
+"""Reads and checks robot.toml; every error is one line that names the file, the field and the remedy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import msgspec
+
+from disco_hw.config.robot import Link, PoseInput, Prior, Robot, RobotConfig
+from disco_hw.errors import InputError
+from disco_hw.fence import fence_fault
+from disco_hw.files import ROBOT_TOML, control_character_in, in_words, read_toml
+from drivers.motor import DriverFieldError, UnknownDriverError, find_driver, own_fields
+from drivers.pose import DEFAULT, PoseSourceError, find_pose_source, pose_sources
+from drivers.pose import own_fields as own_pose_fields
+from drivers.pose.senders import parse_allowed
+
+if TYPE_CHECKING:
+    # Tasks bring numpy with them, which no command needs to say what its options are.
+    from disco_hw.tasks import RobotTask
+
+
+def load_robot_config(path: Path | str) -> RobotConfig:
+    """Read and validate robot.toml, and none of the files that it names.
+
+    Raises InputError with one line naming file, field and remedy.
+    """
+    path = Path(path)
+    raw = read_toml(path, ROBOT_TOML)
+    config = _without_task(path, raw)
+    config = msgspec.structs.replace(config, task=_task_of(path, raw.get("task", {})))
+    _check_task(path, config)
+    if "task" in raw and config.task.file is None:
+        refuse_outside_task(path, config)
+    return config
+
+
+def refuse_outside_task(path: Path, config: RobotConfig) -> None:
+    """Raise InputError, naming the place, for a task on whose line or start the footprint is not within the fence."""
+    from disco_hw.fence.task_line import task_breach  # noqa: PLC0415
+
+    fault = task_breach(config.fence, config.robot.footprint, config.task.course())
+    if fault is not None:
+        _refuse(path, "fence", fault, "move the task or the fence")
+
+
+def load_daemon_address(path: Path) -> tuple[str, str | None]:
+    """The robot's name and the control socket that robot.toml sets: what a request to the running daemon needs.
+
+    [task] and [fence] are not looked at: a daemon can be asked and stopped whatever has been written there since it
+    was started. Raises InputError with one line naming file, field and remedy for any other section that is wrong.
+    """
+    raw = read_toml(path, ROBOT_TOML)
+    config = _without_task(path, {name: raw[name] for name in raw if name != "fence"})
+    return config.robot.name, config.daemon.control_socket
+
+
+def _without_task(path: Path, raw: dict[str, Any]) -> RobotConfig:
+    """All that robot.toml says but [task], validated; `task` is None."""
+    _check_names(path, raw)
+    _check_pose_fields(path, raw.get("pose"))
+    common, of_driver = _split_link(path, raw.get("link", {}))
+    try:
+        config = msgspec.convert({**raw, "link": common, "task": None}, RobotConfig)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{path}: {in_words(error, [RobotConfig], 'docs/robot.md')}") from None
+    config = msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, of_driver=of_driver))
+    given = {name: getattr(config.prior, name) for name in raw.get("prior", {})}
+    config = msgspec.structs.replace(config, prior=msgspec.structs.replace(prior_around(config.robot), **given))
+    _check(path, config)
+    return config
+
+
+def _split_link(path: Path, section: Any) -> tuple[Any, Any]:
+    """The fields of [link] that every driver has, and the settings of the driver that it names."""
+    if not isinstance(section, dict):
+        return section, None
+    if "of_driver" in section:
+        raise InputError(f"{path}: link.of_driver: no such field; remove it")
+    name = section.get("driver")
+    try:
+        own = own_fields(name, section)
+    except DriverFieldError as error:
+        raise InputError(f"{path}: link.{error}; remove it, or name that driver") from None
+    kind = find_driver(name).settings
+    try:
+        settings = msgspec.convert(own, kind)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{path}: {in_words(error, [kind], 'docs/robot.md', 'link')}") from None
+    fault = settings.fault()
+    if fault is not None:
+        raise InputError(f"{path}: link.{fault.field}: {fault.fault}; {fault.remedy}")
+    return {field: value for field, value in section.items() if field not in own}, settings
+
+
+def link_of(path: Path, section: dict[str, Any]) -> Link:
+    """[link] alone, of a robot.toml whose other sections may be broken; fields that are not its driver's are left out.
+
+    Raises InputError.
+    """
+    _check_names(path, {"link": section})
+    own = find_driver(section.get("driver")).settings.__struct_fields__
+    _, of_driver = _split_link(path, {name: section[name] for name in section if name in (*own, "driver")})
+    common = {name: section[name] for name in section if name in Link.__struct_fields__ and name != "of_driver"}
+    try:
+        link = msgspec.convert(common, Link)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{path}: [link]: {error}") from None
+    return msgspec.structs.replace(link, of_driver=of_driver)
+
+
+def prior_around(robot: Robot) -> Prior:
+    """Ranges that hold the robots of this nominal geometry.
+
+    A skid-steer's wheels slip sideways in turns, so that it turns as an ideal robot with a track 1.5 to 2.5 times its
+    own would (Mandow et al., IROS 2007); a differential drive as one with its own track.
+    """
+    radius, axial = robot.wheel_radius_m, robot.axial_distance_m
+    return Prior(
+        x_icr_m=(robot.x_icr_m - axial, robot.x_icr_m + axial),
+        wheel_radius_m=(0.5 * radius, 1.5 * radius),
+        axial_distance_m=(0.5 * axial, 3.0 * axial),
+    )
+
+
+def _task_of(path: Path, section: object) -> RobotTask:
+    """The task that [task] says; its kind knows which fields that has."""
+    from disco_hw.tasks import ReadField, UnknownKind, kinds, task_class, task_from  # noqa: PLC0415
+
+    if not isinstance(section, dict):
+        raise InputError(f"{path}: task: not a section; write [task] above its fields")
+    try:
+        return task_from(section)
+    except UnknownKind as error:
+        raise InputError(f"{path}: task.kind: {error}") from None
+    except ReadField as error:
+        raise InputError(f"{path}: [task] {error}") from None
+    except msgspec.ValidationError as error:
+        words = in_words(error, [task_class(kind) for kind in kinds()], "docs/robot.md", "task")
+        raise InputError(f"{path}: {words}") from None
+
+
+def _check_names(path: Path, raw: dict[str, Any]) -> None:
+    """Refuse what is no name of a driver or pose source; the registries know the names, the fields' types do not."""
+    link = raw.get("link")
+    if isinstance(link, dict) and "driver" in link:
+        try:
+            find_driver(str(link["driver"]))
+        except UnknownDriverError as error:
+            raise InputError(f"{path}: link.driver: {error}") from None
+    for where, section in _pose_sections(raw.get("pose")):
+        try:
+            find_pose_source(str(section.get("source", DEFAULT)))
+        except PoseSourceError as error:
+            raise InputError(f"{path}: {where}.source: {error}") from None
+
+
+def _pose_sections(section: Any) -> Iterator[tuple[str, dict[str, Any]]]:
+    """[pose] and each of [[pose.also]], where they are what they should be, with their names."""
+    if isinstance(section, dict):
+        yield "pose", section
+        also = section.get("also")
+        for number, one in enumerate(also if isinstance(also, list) else ()):
+            if isinstance(one, dict):
+                yield f"pose.also[{number}]", one
+
+
+# Whatever the source is, they say how good its poses are.
+_OF_EVERY_SOURCE = {"position_std_m", "yaw_std_rad"}
+
+
+def _check_pose_fields(path: Path, section: Any) -> None:
+    """Refuse fields of another pose source, and what no further source has."""
+    for where, one in _pose_sections(section):
+        if one is not section and "source" not in one:
+            _refuse(path, where, "does not say which source", f"add source, one of {', '.join(pose_sources())}")
+        name = str(one.get("source", DEFAULT))
+        own = own_pose_fields(name)
+        for other in pose_sources():
+            for field in sorted(own_pose_fields(other) - own - _OF_EVERY_SOURCE):
+                if field in one:
+                    fault = f'a field of the source "{other}", and {where}.source is "{name}"'
+                    _refuse(path, f"{where}.{field}", fault, "remove it")
+        if one is not section and "also" in one:
+            _refuse(path, f"{where}.also", "sources are not nested", "write another [[pose.also]]")
+        if one is not section and "rate_hz" in one:
+            fault = "says whether the geometry is learnt, which it is from the poses of [pose] alone"
+            _refuse(path, f"{where}.rate_hz", fault, "remove it")
+
+
+def _refuse(path: Path, field: str, fault: str, remedy: str) -> NoReturn:
+    raise InputError(f"{path}: {field}: {fault}; {remedy}")
+
+
+def _check_values(path: Path, name: str, section: Any) -> None:  # Any: a section's struct, or a kind of task.
+    for field in section.__struct_fields__:
+        value = getattr(section, field)
+        numbers = value if isinstance(value, tuple) else (value,)
+        if any(isinstance(number, float) and not math.isfinite(number) for number in numbers):
+            _refuse(path, f"{name}.{field}", "not a finite number", "write a finite value")
+        if isinstance(value, str) and (fault := control_character_in(value)):
+            _refuse(path, f"{name}.{field}", fault, "take it out")
+
+
+def _check(path: Path, config: RobotConfig) -> None:
+    """Refuse what no single field of the sections but [task] shows."""
+    for name in config.__struct_fields__:
+        if name != "task":
+            _check_values(path, name, getattr(config, name))
+    for number, one in enumerate(config.pose.also):
+        _check_values(path, f"pose.also[{number}]", one)
+    _check_allowed_senders(path, config.pose)
+    for field in config.prior.__struct_fields__:
+        low, high = getattr(config.prior, field)
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            _refuse(path, f"prior.{field}", f"[{low}, {high}] is not a range", "write [low, high] with low < high")
+    fault = fence_fault(config.fence, config.robot.footprint)
+    if fault is not None:
+        _refuse(path, f"fence.{fault.field}", fault.fault, fault.remedy)
+    control = config.control
+    if control.command_valid_for_s < 1.5 / control.rate_hz:
+        _refuse(
+            path,
+            "control.command_valid_for_s",
+            f"{control.command_valid_for_s} s is shorter than 1.5 control periods",
+            f"write at least {1.5 / control.rate_hz:.3f} or raise rate_hz",
+        )
+    if control.telemetry_disarm_s <= control.telemetry_zero_s:
+        _refuse(path, "control.telemetry_disarm_s", "not above telemetry_zero_s", "write a larger value")
+    driver = find_driver(config.link.driver)
+    if config.link.kind not in driver.kinds:
+        known = " or ".join(f'"{kind}"' for kind in driver.kinds)
+        _refuse(
+            path, "link.kind", f'the driver {driver.name} does not speak over "{config.link.kind}"', f"write {known}"
+        )
+    field = driver.serial_field
+    if field and (getattr(config.link.settings(), field) is None) is (config.link.kind == "serial"):
+        remedy = "remove it" if config.link.kind != "serial" else "add it (docs/robot.md says what it is)"
+        _refuse(path, f"link.{field}", "belongs to a serial line, and to no other link", remedy)
+    if config.link.key_file is not None and not driver.authenticates:
+        _refuse(path, "link.key_file", f"the driver {driver.name} has no authenticated mode", "remove it")
+
+
+def _check_allowed_senders(path: Path, pose: PoseInput) -> None:
+    """Refuse an `allow` that is no list of addresses and networks."""
+    for number, one in enumerate(pose.every()):
+        try:
+            parse_allowed(("127.0.0.1",) if one.allow is None else one.allow)
+        except ValueError as error:
+            field = "pose.allow" if number == 0 else f"pose.also[{number - 1}].allow"
+            _refuse(path, field, str(error), 'write addresses as "192.168.1.20" or networks as "192.168.1.0/24"')
+
+
+def _check_task(path: Path, config: RobotConfig) -> None:
+    """Refuse what no single field of [task] shows."""
+    _check_values(path, "task", config.task)
+    slowest = find_driver(config.link.driver).slowest_rad_s(config.link.settings()) * config.robot.wheel_radius_m
+    if config.task.speed_m_s < slowest:
+        _refuse(
+            path,
+            "task.speed_m_s",
+            f"{config.task.speed_m_s} m/s is slower than the controller holds",
+            f"write at least {slowest:.2f}, or set the controller for less",
+        )
+    if config.control.fallback != "ramp" and math.isnan(config.task.reference_speed_m_s):
+        _refuse(path, "control.fallback", "way-points by time have no speed to follow them at", 'write "ramp"')
+    fault = config.task.fault()
+    if fault is not None:
+        _refuse(path, f"task.{fault.field}", fault.fault, fault.remedy)
+    if config.task.speed_m_s > config.robot.max_wheel_speed_rad_s * config.robot.wheel_radius_m:
+        _refuse(
+            path,
+            "task.speed_m_s",
+            f"{config.task.speed_m_s} m/s is above what the wheels can do",
+            "lower it, or raise robot.max_wheel_speed_rad_s within the firmware's limit",
+        )
