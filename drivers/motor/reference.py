@@ -46,8 +46,8 @@ FAST_TIME_COUNT = 10
 ZERO_VALID_FOR_S = 0.1
 ESTOP_REPEATS = 3
 SHORTEST_VALID_FOR_S = 0.002
-COASTING_NS = 1_000_000_000
-"""A robot whose motors are released rolls out in this time; the controller's own ramp after it begins at a stand."""
+COASTING_NS = 200_000_000
+"""Released wheels roll freely for this long and lose their speed gently; then the controller's brake holds them."""
 _HOUSE_KEEPING_NS = 100_000_000
 _ESTOP_DEADLINE_NS = 1_000_000_000
 _PENDING_TIMES = 8
@@ -260,7 +260,7 @@ class ReferenceDriver:
         return self._transmission.proved((*frames, *self._house_keeping(now_ns)))
 
     def release(self, why: str) -> None:
-        """Switch the motors off (COAST) while the wheels roll out, then disarm; without a session only disarm."""
+        """Switch the motors off (COAST), then disarm, which brakes; without a session only disarm."""
         self._released, self._released_ns = why, self._now_ns
         self._events.append(f"disarmed: {why}")
         if not self._arming.armed:
@@ -517,7 +517,7 @@ def _safety_card(_settings: NoSettings) -> SafetyCard:
         reaction_s=0.1,
         brakes=True,
         estop="a frame of any length, also from `disco-hw estop`: it decelerates, latched and confirmed",
-        wheel_fault="the motors are off (COAST) while the wheels roll out, 1 s, then disarmed and braked; no ramp",
+        wheel_fault="the motors are off (COAST) for 0.2 s, then the controller brakes without its speed loop; no ramp",
     )
 
 

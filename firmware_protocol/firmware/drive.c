@@ -76,14 +76,15 @@ static void obey_command(disco_firmware_t *core)
     drive->limited = drive->enabled && !disco_wheels_equal(drive->setpoint, core->command.target);
 }
 
-/* A controlled stop ends when it is done, or when it has taken too long, or when the loop cannot be trusted. The brake
- * is on whenever the robot was not driven before, so no stop can begin from rest. */
+/* A controlled stop ends when it is done, or when it has taken too long, or when the loop cannot be trusted. Only what
+ * is driven decelerates: wheels that were released (COAST) are braked at once, as the host may have released them
+ * because their encoders, which the speed loop needs, cannot be trusted. */
 static bool may_decelerate(const disco_firmware_t *core)
 {
     const bool in_stop = (core->state == DISCO_STATE_STOPPING) || (core->state == DISCO_STATE_ESTOP);
     const uint32_t since_stop_us = disco_elapsed_us(core->now_us, core->drive.stop_since_us);
     const bool done = disco_wheels_equal(core->drive.setpoint, standstill) && disco_wheels_still(core);
-    return in_stop && !core->drive.brake && !done && (core->faults.latched == 0u) &&
+    return in_stop && core->drive.enabled && !done && (core->faults.latched == 0u) &&
            (since_stop_us < core->config.stop_timeout_us) && !disco_command_older_than(core, core->config.drive_off_timeout_us);
 }
 

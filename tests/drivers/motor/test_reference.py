@@ -431,17 +431,20 @@ def test_a_command_leaves_in_time_or_not_at_all():
         bench.driver.transmit(bench.now_ns, WheelCommand(70.0, 0.0, 0.1))
 
 
-def test_released_its_motors_are_off_while_the_wheels_roll_out_and_nothing_that_is_wanted_meanwhile_ramps():
+def test_released_its_motors_are_off_for_a_moment_then_braked_and_nothing_that_is_wanted_meanwhile_ramps():
     bench = make_bench()
     bench.arm()
     bench.run(0.6, (3.0, 2.0))
     bench.driver.release("the left wheel does not count")
     bench.run(0.05)
     bench.driver.request(Request.STANDBY)
-    for _ in range(18):
+    braked = []
+    for _ in range(30):
         bench.run(0.05)
-        assert bench.robot.armed
         assert not bench.robot.outputs.driver_enabled
-    bench.run(1.0)
+        braked.append(bench.robot.outputs.brake)
+    assert braked == sorted(braked)
+    assert not braked[0]
+    assert all(braked[6:])
     assert not bench.robot.armed
     assert "disarmed: the left wheel does not count" in bench.events

@@ -126,11 +126,39 @@ def test_taking_over_a_wheel_that_runs_away_starts_within_the_limit():
     bench.command = {"mode": "COAST"}
     bench.run(40)
     bench.speeds = [12.0, 6.0]
-    bench.step()
-    bench.core.receive(bench.now_us, 0x080, b"")
-    bench.step()
-    assert bench.out.driver_enabled
+    bench.command = {"mode": "HOLD_ZERO"}
+    while not bench.step().driver_enabled:
+        pass
     assert setpoints(bench) == pytest.approx((7.98, 3.99))
+
+
+def ask_to_disarm(bench):
+    bench.request["request"] = "STANDBY"
+
+
+def fall_silent(bench):
+    bench.command = None
+
+
+@pytest.mark.parametrize(
+    "act",
+    [lambda bench: bench.core.receive(bench.now_us, 0x080, b""), ask_to_disarm, fall_silent],
+    ids=["estop", "disarmed", "silence"],
+)
+def test_released_wheels_are_braked_by_any_stop_without_a_ramp(act):
+    bench = Bench()
+    bench.to_driving()
+    bench.wheels_follow = False
+    bench.command = {"mode": "COAST"}
+    bench.run(40)
+    bench.speeds = [4.0, 4.0]
+    act(bench)
+    while not bench.step().brake:
+        assert not bench.out.driver_enabled
+    assert bench.out.state != "ARMED"
+    for _ in range(200):
+        bench.step()
+        assert (bench.out.driver_enabled, bench.out.brake, setpoints(bench)) == (False, True, (0.0, 0.0))
 
 
 def stop(bench, act):
