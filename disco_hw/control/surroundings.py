@@ -34,7 +34,6 @@ class Surroundings:
     """What a planner keeps away from, in the buffers that its kernel reads.
 
     `max_breach_probability`: of a plan over its horizon; with the pose's deviation it makes the distance to keep.
-    `nearer_m`: see `swing_m`.
     """
 
     def __init__(
@@ -45,7 +44,6 @@ class Surroundings:
         step_s: float,
         horizon: int,
         speed_m_s: float,
-        nearer_m: float = 0.0,
     ) -> None:
         self.speed_m_s = speed_m_s
         """The task's speed."""
@@ -62,8 +60,7 @@ class Surroundings:
             aligned_zeros(MOST_SHAPES * COLUMNS),
             np.zeros(1, np.int64),
             np.array(
-                [0.5 * footprint.length, 0.5 * footprint.width, footprint.ahead, 0.0, step_s, 0.0, 0.0, nearer_m],
-                np.float32,
+                [0.5 * footprint.length, 0.5 * footprint.width, footprint.ahead, 0.0, step_s, 0.0, 0.0], np.float32
             ),
             np.zeros(DETOURS * DETOUR_COLUMNS, np.float32),
             np.zeros(MOST_SHAPES),
@@ -109,8 +106,8 @@ class Surroundings:
         `speed_m_s`: the fastest that the plan may go.
         """
         time_s = self._horizon * float(self.area.body[4])
-        near_m = self._footprint.reach_m + float(self.area.body[3] + self.area.body[7])
-        self.area.body[5:7] = speed_m_s, near_m
+        near_m = self._footprint.reach_m + float(self.area.body[3])
+        self.area.body[5:] = speed_m_s, near_m
         reach_m = speed_m_s * time_s + near_m
         arguments = self.area, self._table, x_m, y_m, *origin_m, reach_m, time_s
         if self._place is None:
@@ -118,19 +115,6 @@ class Surroundings:
         self._place(*arguments)
         self._detours.place(self.area.detours, x_m, y_m, origin_m)
         return self.area
-
-
-def swing_m(footprint: Footprint, x_icr_m: float, step_s: float, speed_m_s: float, turn_rad_s: float) -> float:
-    """How much nearer a footprint may come to something between two looks than at both of them (m).
-
-    A rectangle that moves straight on by less than its length is nowhere that it is not before or after. In a turn its
-    corners bulge out of that by the height of their arcs over the chords.
-    """
-    between_s = LOOK_EVERY * step_s
-    turned = turn_rad_s * between_s
-    height_m = 0.125 * turned * (speed_m_s * between_s + (footprint.reach_m + abs(x_icr_m)) * turned)
-    unseen_m = max(0.0, speed_m_s * between_s - footprint.length)
-    return min(height_m, footprint.reach_m) + 0.5 * unseen_m
 
 
 def _edges(bounds: Boundaries) -> Array:

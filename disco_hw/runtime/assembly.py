@@ -20,7 +20,7 @@ from disco_hw.adaptation.guard import (
 from disco_hw.config import PoseInput, RobotConfig
 from disco_hw.control.baselines import LAWS, WithFallback
 from disco_hw.control.past_motion import DriveMeans
-from disco_hw.control.surroundings import Surroundings, swing_m
+from disco_hw.control.surroundings import Surroundings
 from disco_hw.errors import InputError
 from disco_hw.estimation import PoseFusion
 from disco_hw.estimation.correction import DisturbanceEstimator
@@ -69,24 +69,16 @@ def make_surroundings(config: RobotConfig, settings: control.DiscoSettings) -> S
     """What DISCO keeps away from; None for a robot.toml without [fence], where the guard alone minds obstacles."""
     if config.fence == Fence():
         return None
-    robot = config.robot
     around = Surroundings(
-        robot.footprint,
+        config.robot.footprint,
         config.fence.margin_m,
         config.fence.max_breach_probability,
         settings.step_s,
         settings.sampler.horizon,
         config.task.speed_m_s,
-        swing_m(
-            robot.footprint,
-            robot.x_icr_m,
-            settings.step_s,
-            config.task.speed_m_s,
-            2.0 * robot.max_wheel_speed_rad_s * robot.wheel_radius_m / robot.axial_distance_m,
-        ),
     )
     around.set_line(config.task.course().outline_m())
-    around.look_around(Boundaries(robot.footprint, config.fence), 0.0)
+    around.look_around(Boundaries(config.robot.footprint, config.fence), 0.0)
     return around
 
 

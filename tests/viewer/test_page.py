@@ -1,5 +1,6 @@
 """The pages in a real browser: what is drawn, what the buttons do, what the page asks of the network."""
 
+import json
 import math
 import threading
 import time
@@ -236,6 +237,44 @@ def test_the_circle_is_dragged_with_the_mouse_and_set(browser, tmp_path):
                 wait_for(tab, lambda: any(action == "task" for action, _ in daemon.asked))
                 asked = next(arguments for action, arguments in daemon.asked if action == "task")
                 assert asked["center_x_m"] == desk.draft["center_x_m"]
+        finally:
+            ending.set()
+            thread.join()
+            desk.close()
+            daemon.close()
+
+
+def test_the_fence_is_typed_and_cornered_by_the_robots_nose_and_put_in_force(browser, tmp_path):
+    daemon = Daemon(tmp_path / "run")
+    daemon.status = WHOLE_STATUS
+    desk, ending = Desk(daemon.server.path, ROBOT_FILE), threading.Event()
+    with serving("test", port=0, desk=desk) as page:
+        live = LivePage(page.server, stage_of_robot(ROBOT_FILE), daemon.server.path, desk)
+        live.take([(now_ns, record) for now_ns, got in map(tick_records, range(20)) for record in got])
+        thread = threading.Thread(target=run_live, args=(live, ending.is_set))
+        thread.start()
+        try:
+            with opened(browser, page.url, 1200, 900) as tab:
+                tab.set_default_timeout(40_000)
+                panel = tab.frame_locator("#scene")
+                panel.get_by_text("Fence", exact=True).locator("visible=true").click()
+                stay_in = panel.get_by_label("Stay in")
+                panel.get_by_role("button", name="Corner at the robot's nose").click()
+                x, y, yaw = live.fence_editor._pose
+                ahead = live.fence_editor._footprint.ahead + 0.5 * live.fence_editor._footprint.length
+                nose = [[round(x + ahead * math.cos(yaw), 3), round(y + ahead * math.sin(yaw), 3)]]
+                wait_for(tab, lambda: stay_in.input_value() == json.dumps(nose))
+                stay_in.fill("[[-2, -1.5], [2, -1.5], [2, 1.5], [-2, 1.5]]")
+                panel.get_by_label("Keep out of").fill('[{"center": [0.9, 0], "radius_m": 0.15}]')
+                wait_for(tab, lambda: "radius_m" in live.fence_editor._keep_out.value)
+                panel.get_by_role("button", name="Use this fence").click()
+                wait_for(tab, lambda: any(action == "fence" for action, _ in daemon.asked))
+                asked = next(arguments for action, arguments in daemon.asked if action == "fence")
+                assert asked["keep_in"] == [[-2, -1.5], [2, -1.5], [2, 1.5], [-2, 1.5]]
+                assert asked["keep_out"] == [{"center": [0.9, 0], "radius_m": 0.15}]
+                assert asked["margin_m"] == 0.05
+                panel.get_by_text("done it").wait_for()
+                keep(tab, "fence-editor")
         finally:
             ending.set()
             thread.join()

@@ -2,8 +2,8 @@
 
 A shape is a capsule: a segment with a radius, which may move. A circle is one of no length, an edge of a polygon one of
 no radius. The rectangle's reach towards the nearest point of the segment is subtracted from the distance, which is
-exact for walls and never too far for anything convex. Every other step is looked at: how much nearer the footprint may
-come between two looks (`surroundings.swing_m`) is kept in addition.
+exact for walls and never too far for anything convex. Every other step is looked at: between two of them no corner
+comes nearer than half the way, which is kept in addition.
 """
 
 from __future__ import annotations
@@ -37,10 +37,9 @@ half the detour's length (1/m), how far to the left it leads (m), and how far as
 class Area(NamedTuple):
     """What rollouts keep away from.
 
-    `shapes` (MOST_SHAPES * COLUMNS,); `number` (1,) of them are there. `body` (8,): half the footprint's length and
+    `shapes` (MOST_SHAPES * COLUMNS,); `number` (1,) of them are there. `body` (7,): half the footprint's length and
     width, how far its centre lies ahead of the tracked point, the distance to keep (m), the length of a step (s), the
-    fastest that a plan goes (m/s), the reach of the footprint with the distance to keep (m), and how much nearer it may
-    come between two looks (m).
+    fastest that a plan goes (m/s), and the reach of the footprint with the distance to keep (m).
     `detours` (DETOURS * DETOUR_COLUMNS,): around obstacles on the task's line.
     `away` (MOST_SHAPES,): how far each shape is from where the plan begins (m).
     """
@@ -149,7 +148,7 @@ def touch_cost(
 ) -> float:
     """Cost of one shape at one step, for a robot with its tracked point there; compiled code only."""
     row, shapes, body = U(shape * COLUMNS), area.shapes, area.body
-    x, y, _ = place
+    x, y, forward = place
     zero = constant(0.0, x)
     off_x = x + body[2] * cos_yaw - (shapes[row] + time_s * shapes[row + U(6)])
     off_y = y + body[2] * sin_yaw - (shapes[row + U(1)] + time_s * shapes[row + U(7)])
@@ -159,6 +158,8 @@ def touch_cost(
     off, inverse = norm_and_inverse(off_x, off_y)
     ahead = abs(off_x * cos_yaw + off_y * sin_yaw)
     aside = abs(off_y * cos_yaw - off_x * sin_yaw)
-    overlap = body[3] + body[7] + shapes[row + U(5)] + (body[0] * ahead + body[1] * aside) * inverse - off
+    overlap = (
+        body[3] + abs(forward) * body[4] + shapes[row + U(5)] + (body[0] * ahead + body[1] * aside) * inverse - off
+    )
     touches = constant(TOUCH_COST, x) if overlap > zero else zero
     return touches + constant(TOUCH_COST_PER_M, x) * max(overlap, zero)

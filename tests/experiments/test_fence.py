@@ -1,0 +1,81 @@
+"""The campaign of fence drives: what is written is not driven again, and the table counts what was driven."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from disco_hw.experiments.fence import ALONE, DRIVES, Campaign, FenceOptions
+from disco_hw.experiments.fence_drives import FOOTPRINT, FencedDrive, tight_room
+from disco_hw.fence import Circle, Fence
+from disco_hw.fence.clearance import Boundaries
+
+FENCE = Fence(keep_in=Circle((0.0, 0.0), 3.0))
+
+
+class Driver:
+    """In the place of a drive: each ends with a clearance from its generator, and is counted."""
+
+    def __init__(self, lowest_m: float = 0.1) -> None:
+        self.driven, self.lowest_m = 0, lowest_m
+
+    def __call__(self, rng: np.random.Generator) -> FencedDrive:
+        self.driven += 1
+        poses = np.zeros((20, 3))
+        return FencedDrive(FENCE, poses, self.lowest_m + float(rng.uniform()), (0.04, 0.06), 2, 1.5)
+
+
+def campaign(out, **changes) -> Campaign:
+    return Campaign(out, FenceOptions(**changes), lambda words: None)
+
+
+def test_a_campaign_that_was_broken_off_goes_on_and_ends_as_if_it_had_not_been(tmp_path):
+    whole, first, second = Driver(), Driver(), Driver()
+    at_once = campaign(tmp_path / "once")
+    at_once.gather("by hand", 5, whole, 0)
+    campaign(tmp_path / "twice").gather("by hand", 2, first, 0)
+    with (tmp_path / "twice" / DRIVES).open("ab") as file:
+        file.write(b'{"kind": "by hand", "numb')
+        file.write(b"\n")
+    going_on = campaign(tmp_path / "twice")
+    going_on.gather("by hand", 5, second, 0)
+    assert (whole.driven, first.driven, second.driven) == (5, 2, 3)
+    assert going_on.result.rows() == at_once.result.rows()
+
+
+@pytest.mark.parametrize("changes", [{"seed": 2}, {"off": 0.1}, {"seconds": 5.0}])
+def test_drives_with_other_options_are_driven_anew(tmp_path, changes):
+    campaign(tmp_path).gather("by hand", 2, Driver(), 0)
+    again = Driver()
+    other = campaign(tmp_path, **changes)
+    other.gather("by hand", 2, again, 0)
+    assert again.driven == 2
+    assert other.result.rows()[0]["count"] == 2
+
+
+def test_the_table_counts_breaches_stops_and_ways(tmp_path):
+    driven = campaign(tmp_path)
+    driven.gather("by hand", 3, Driver(), 0)
+    driven.gather(f"{ALONE}point model", 4, Driver(-2.0), 1)
+    by_hand, alone = driven.result.rows()
+    assert (by_hand["count"], by_hand["breaches"], by_hand["stops"]) == (3, 0, 6)
+    assert by_hand["left_at_stop_median_m"] == pytest.approx(0.05)
+    assert alone["breaches"] == 4
+    assert alone["way_median_m"] == 1.5
+    assert "guard off: point model" in driven.result.table()
+    driven.result.write_pictures(tmp_path / "fence.png")
+    assert (tmp_path / "fence.png").stat().st_size > 10_000
+
+
+def test_in_a_tight_room_the_robot_on_its_line_comes_as_near_as_is_said():
+    for seed in range(5):
+        fence, task = tight_room(np.random.default_rng(seed), 0.08)
+        angles = np.linspace(0.0, 2.0 * np.pi, 4001)
+        on_line = np.column_stack(
+            [task.radius_m * np.cos(angles), task.radius_m * np.sin(angles), angles + 0.5 * np.pi]
+        )
+        least = Boundaries(FOOTPRINT, fence).clearance_m(on_line).min()
+        assert least == pytest.approx(0.08, abs=1e-4)
+        assert math.isfinite(task.speed_m_s)
