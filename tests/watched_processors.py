@@ -10,7 +10,7 @@ from pathlib import Path
 
 from disco_hw.processes import can_use_fifo
 
-BARE_LOOP = Path(__file__).parents[1] / "tools" / "bare_loop.c"
+BARE_LOOP = Path(__file__).parents[1] / "tools" / "check" / "bare_loop.c"
 Pauses = list[tuple[int, int]]
 
 

@@ -32,6 +32,7 @@ from disco_hw.experiments.fence_drives import (
 )
 from disco_hw.fence import Fence
 from disco_hw.fence.outlines import fence_outlines
+from disco_hw.files import FileKind, read_bytes
 from disco_hw.model import Model
 from disco_hw.reports import write_pictures
 from disco_hw.runtime.assembly import make_planner
@@ -112,13 +113,16 @@ def alone_drive(
     return task_drive(setup, plant, planner, seconds + learning_s, noise, guarded=False, learning_s=learning_s)
 
 
+_DRIVES = FileKind("the drives of a campaign", 64 * 1024 * 1024, "name another folder with -o")
+
+
 class Campaign:
     """Drives of one folder: those that are written there already, and those that are still to be driven."""
 
     def __init__(self, out: Path, options: FenceOptions, progress: Progress) -> None:
         self._file, self._options, self._progress = out / DRIVES, options, progress
         out.mkdir(parents=True, exist_ok=True)
-        lines = self._file.read_bytes().splitlines() if self._file.exists() else []
+        lines = read_bytes(self._file, _DRIVES)[0].splitlines() if self._file.exists() else []
         self._done: dict[str, dict[int, DriveLine]] = {}
         for line in lines:
             # The last line of a campaign that was killed may be half a line.
