@@ -35,7 +35,7 @@ from disco_hw.control.plan import (
     command_history,
 )
 from disco_hw.control.refinement import STEP_S as REFINED_STEP_S
-from disco_hw.control.refinement import Refinement, Scene
+from disco_hw.control.refinement import Refinement, RefinementStart
 from disco_hw.control.surroundings import Surroundings
 from disco_hw.control.wheel_loss import WheelLoss
 from disco_hw.effects import Channel
@@ -337,8 +337,8 @@ class Disco:
         means = None
         if self._mean_means is not None:
             means = self._mean_means[None] if self._settings.uncertainty != "ut" else self._means
-        scene = Scene(system.task, system.start, start, elapsed_s, self._slide, means, past, before)
-        commands = refinement.improve(scene, t0_ns, nominal, self._settings.step_s)
+        initial = RefinementStart(system.task, system.start, start, elapsed_s, self._slide, means, past, before)
+        commands = refinement.improve(initial, t0_ns, nominal, self._settings.step_s)
         if commands is None:
             return None
         own = None if self._mean_means is None else self._mean_means.copy()

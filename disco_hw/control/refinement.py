@@ -41,7 +41,7 @@ LEAST_END_WEIGHT = 10.0
 BESIDE_PART, FACING = 0.3, 0.5
 
 
-class Scene(NamedTuple):
+class RefinementStart(NamedTuple):
     """Where a refinement begins.
 
     `terms` of the task and `begin` (11,) as of `SkidSteer`; `start` (5,) in the world; `elapsed_s` there; `slide` (3,)
@@ -102,20 +102,20 @@ class Refinement:
             self.history = history
             self._buffers = _buffers(history, new_means(effects))
 
-    def improve(self, scene: Scene, t0_ns: int, nominal: Array, step_s: float) -> Array | None:
+    def improve(self, initial: RefinementStart, t0_ns: int, nominal: Array, step_s: float) -> Array | None:
         """Return commands (STEPS, 2) that cost less than the plan `nominal` in steps of `step_s`; None off the line.
 
         What is returned is kept as the start of the next refinement.
         """
-        if not hasattr(scene.terms, "line_at"):
+        if not hasattr(initial.terms, "line_at"):
             return None
         self._call(
-            "timed reference", timed_reference, self._reference, scene.terms, scene.begin, self._chassis,
+            "timed reference", timed_reference, self._reference, initial.terms, initial.begin, self._chassis,
             self._limits.speed_rad_s, STEP_S, self._found,
         )  # fmt: skip
         distance_m, facing, *_ = self._found.tolist()
         way_m = float(np.hypot(*np.diff(self._reference, axis=0).T).sum())
-        problem, buffers = self._posed(scene, way_m), self._buffers
+        problem, buffers = self._posed(initial, way_m), self._buffers
         assert buffers is not None
         if not self.is_compiled:
             # Off the line too, so that no compilation waits for the robot to reach it.
@@ -123,7 +123,7 @@ class Refinement:
         if not (distance_m < max(BESIDE_PART * way_m, 0.02) and facing > FACING):
             self._last = None
             return None
-        buffers.commands[: self.history] = scene.past
+        buffers.commands[: self.history] = initial.past
         plan = buffers.commands[self.history :]
         starts = [_resampled(nominal, step_s, 0.0)]
         if self._last is not None:
@@ -146,19 +146,22 @@ class Refinement:
         self._last, self._last_ns = found, t0_ns
         return found
 
-    def _posed(self, scene: Scene, way_m: float) -> Problem:
-        self._start[:] = scene.start
+    def _posed(self, initial: RefinementStart, way_m: float) -> Problem:
+        self._start[:] = initial.start
         # The reference is relative to the task's origin.
-        self._start[:2] = scene.begin[:2]
-        self._before[:] = scene.before
-        means = None if scene.means is None else np.ascontiguousarray(scene.means[self._counted[: len(scene.means)]])
+        self._start[:2] = initial.begin[:2]
+        self._before[:] = initial.before
+        means = (
+            None if initial.means is None else np.ascontiguousarray(initial.means[self._counted[: len(initial.means)]])
+        )
         x_icr_m = abs(self._chassis.x_icr_m)
         end_weight = max(END_X_ICR * x_icr_m * STEPS / max(way_m, 1e-3), LEAST_END_WEIGHT)
         change = min(self._limits.acceleration_rad_s2 * STEP_S, 4.0 * self._limits.speed_rad_s)
         return Problem(
-            self._start, float(scene.elapsed_s), np.array(scene.slide, np.float64), means, self._base, self._effects,
-            self._series, self._weights, self.history, self._reference, float(self._limits.speed_rad_s), float(change),
-            self._before, CHANGE_S * self._chassis.wheel_radius_m, self._found[3:], end_weight, x_icr_m,
+            self._start, float(initial.elapsed_s), np.array(initial.slide, np.float64), means, self._base,
+            self._effects, self._series, self._weights, self.history, self._reference,
+            float(self._limits.speed_rad_s), float(change), self._before, CHANGE_S * self._chassis.wheel_radius_m,
+            self._found[3:], end_weight, x_icr_m,
         )  # fmt: skip
 
     def _call(self, name: str, kernel: Callable[..., object], *arguments: object) -> float:

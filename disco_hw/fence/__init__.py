@@ -71,7 +71,7 @@ class Fence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         return self.keep_in is not None or bool(self.keep_out)
 
 
-class Chassis(Protocol):
+class WheelGeometry(Protocol):
     """What the usual footprint is made from: [robot] of robot.toml has it."""
 
     @property
@@ -87,7 +87,7 @@ class Chassis(Protocol):
         """How far ahead of the tracked point the robot turns."""
 
 
-def usual_footprint(robot: Chassis) -> Footprint:
+def usual_footprint(robot: WheelGeometry) -> Footprint:
     """Return a footprint guessed from the wheels, for a robot.toml without `robot.footprint_m`.
 
     As wide as the wheels with half a radius on each side, as long as wide and a wheel's radius at both ends, around

@@ -11,7 +11,7 @@ from disco_hw.fence import Fence, Footprint
 from disco_hw.fence.clearance import Boundaries, along_line, first_breach
 
 
-class Course(Protocol):
+class TaskLine(Protocol):
     """The line of a task; those of `disco_hw.tasks` have it."""
 
     @property
@@ -22,7 +22,7 @@ class Course(Protocol):
         """The line as points (N, 2)."""
 
 
-def task_breach(fence: Fence, footprint: Footprint, course: Course) -> str | None:
+def task_breach(fence: Fence, footprint: Footprint, course: TaskLine) -> str | None:
     """Say where a robot on this task would leave the fence, and how far; None if it stays inside.
 
     The robot is taken to face along the line. Where it turns at corners the guard sees to the rest.
