@@ -279,6 +279,9 @@ class ProcessRecorder:
                 self._look_after(time.monotonic())
                 self._wait(min(_CLOSING_STEP_S, max(0.0, deadline_s - time.monotonic())))
             self._report_losses()
+            if not self._status.sequence:
+                # A file that is being tried holds nothing yet; its writer deletes it when it fails after this.
+                self._status = self._kept_status
             self._final = self._stats()
             if self._line is not None:
                 self._line.close()

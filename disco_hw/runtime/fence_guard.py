@@ -161,7 +161,9 @@ class FenceGuard:
             return FenceState(FenceVerdict.NO_POSE, 0.0, math.nan, reason="no valid pose, and a fence is set")
         asks = max(map(abs, requested)) > STOPPED_RAD_S if all(map(math.isfinite, requested)) else False
         wanted = requested if asks else (0.0, 0.0)
-        poses, clearance, driven = self._stopping_paths(bounds, estimate, geometry, last_sent, wanted)
+        # A path that overflows has no clearance, which stops the robot: a warning would say nothing more.
+        with np.errstate(over="ignore", invalid="ignore"):
+            poses, clearance, driven = self._stopping_paths(bounds, estimate, geometry, last_sent, wanted)
         if not np.isfinite(clearance).all():
             return FenceState(FenceVerdict.NO_POSE, 0.0, math.nan, reason="the stopping path is not finite")
         chosen = self._largest_scale(clearance, driven)

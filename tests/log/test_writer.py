@@ -187,6 +187,15 @@ def test_the_last_words_with_a_full_disk_count_the_ticks_that_are_lost_and_name_
         assert Path(final.path).exists()
 
 
+def test_the_last_words_during_an_attempt_name_a_file_that_stays(tmp_path):
+    with SmallDisk(tmp_path, 4160) as disk:
+        recorder, _, _ = full_recorder(disk)
+        wait_until(lambda: recorder.poll() and recorder.path.name == "run.part2.mcap")
+        final = recorder.close(0.0)
+        wait_until(lambda: not (disk / "run.part2.mcap").exists())
+        assert Path(final.path).exists()
+
+
 def test_a_disk_with_room_again_at_the_end_loses_nothing_and_the_part_begins_before_it_ends(tmp_path):
     with SmallDisk(tmp_path, 4160) as disk:
         recorder, filler, given = full_recorder(disk)
