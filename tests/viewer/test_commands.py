@@ -14,6 +14,7 @@ from disco_hw.cli.logs import view
 from disco_hw.errors import InputError
 from disco_hw.viewer import picture, scene
 from disco_hw.viewer.commands import export_log, in_figures, snapshot_log, video_log
+from tests.tables import thinned
 from tools.viewer_run import FAULT_TICK
 
 
@@ -31,7 +32,7 @@ def test_a_snapshot_shows_circle_and_robot(log_file, tmp_path):
     assert np.abs(np.asarray(end).astype(int) - np.asarray(start)).max() > 100, "nothing moved"
 
 
-@pytest.mark.parametrize(("ending", "kind"), [("gif", "GIF"), ("webp", "WEBP"), ("apng", "PNG")])
+@thinned(("ending", "kind"), [("gif", "GIF"), ("webp", "WEBP"), ("apng", "PNG")], quick=1)
 def test_a_clip_moves_with_nothing_installed(log_file, tmp_path, monkeypatch, ending, kind):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("DISPLAY", raising=False)

@@ -32,13 +32,17 @@ def gone(pid):
     return not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] == "Z"
 
 
-def test_the_page_lives_as_long_as_the_block():
+def test_the_page_lives_as_long_as_the_block_and_prints_on_standard_error_alone(capfd):
     port = free_port()
+    said = []
     with page_beside(ROBOT_FILE, None, "127.0.0.1", port) as page:
+        wait_until(lambda: said.append(capfd.readouterr()) or f":{port}/" in "".join(it.err for it in said), 60.0)
         wait_until(lambda: listens(port), 60.0)
         assert os.getsid(page.pid) == page.pid
     assert page.returncode == 0
     assert not listens(port)
+    said.append(capfd.readouterr())
+    assert not any(it.out for it in said)
 
 
 def test_the_page_ends_when_its_parent_is_killed():
@@ -53,35 +57,18 @@ def test_the_page_ends_when_its_parent_is_killed():
     wait_until(lambda: gone(pid), 60.0)
 
 
-def test_a_page_that_cannot_start_does_not_matter(tmp_path, capfd):
+def test_a_page_that_cannot_start_is_reported_and_not_started_again(tmp_path, capfd):
     with page_beside(tmp_path / "none.toml", None, "127.0.0.1", 0) as page:
         assert page.wait(60) == 2
+        assert page.news() == ("the page ended with exit code 2; start it again with `disco-hw view`",)
     assert "none.toml" in capfd.readouterr().err
 
 
+@pytest.mark.thorough
 def test_the_link_that_the_daemon_was_given_is_the_pages_too(capfd):
     with page_beside(ROBOT_FILE, None, "127.0.0.1", 0, "carrier pigeon") as page:
         assert page.wait(60) == 2
     assert "--link carrier pigeon" in capfd.readouterr().err
-
-
-def test_what_the_page_says_is_none_of_the_blocks_output(capfd):
-    port = free_port()
-    said = []
-    with page_beside(ROBOT_FILE, None, "127.0.0.1", port):
-        wait_until(
-            lambda: said.append(capfd.readouterr()) or f":{port}/" in "".join(it.out + it.err for it in said), 60.0
-        )
-    assert not any(it.out for it in said)
-
-
-def test_a_page_that_hangs_is_ended_all_the_same():
-    port = free_port()
-    with page_beside(ROBOT_FILE, None, "127.0.0.1", port) as page:
-        # From here on it would end in order.
-        wait_until(lambda: listens(port), 60.0)
-        os.kill(page.pid, signal.SIGSTOP)
-    assert page.returncode == -signal.SIGKILL
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
@@ -90,7 +77,7 @@ def test_what_the_block_raises_is_passed_on(error):
         raise error
 
 
-def test_a_page_that_was_killed_is_reported_and_started_again_under_the_same_token(capfd):
+def test_a_killed_page_is_started_again_under_the_same_token_and_one_that_hangs_is_ended(capfd):
     port = free_port()
     said = ""
 
@@ -108,11 +95,9 @@ def test_a_page_that_was_killed_is_reported_and_started_again_under_the_same_tok
         assert not Path(f"/proc/{first}").exists(), "a zombie is left"
         assert page.news() == ("the page was ended by SIGKILL; it is started again",)
         assert page.news() == ()
+        # From here on it would end in order.
+        wait_until(lambda: listens(port), 60.0)
+        os.kill(page.pid, signal.SIGSTOP)
+    assert page.returncode == -signal.SIGKILL
     assert "page: the page was ended by SIGKILL; it is started again" in said
     assert not listens(port)
-
-
-def test_a_page_that_ends_by_itself_is_reported_and_not_started_again(tmp_path, capfd):
-    with page_beside(tmp_path / "none.toml", None, "127.0.0.1", 0) as page:
-        assert page.wait(60) == 2
-        assert page.news() == ("the page ended with exit code 2; start it again with `disco-hw view`",)
