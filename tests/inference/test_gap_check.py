@@ -17,6 +17,13 @@ def test_an_effect_that_the_log_shows_is_named_by_a_process_beside():
         assert searched().missing == ("pose_latency",)
 
 
+@pytest.mark.thorough
+def test_a_robot_like_its_model_lacks_nothing():
+    with gap_check_beside(logged("circle"), NOMINAL) as searched:
+        found = searched()
+    assert (found.missing, found.not_judged) == ((), None)
+
+
 def test_a_log_that_cannot_be_searched_is_not_judged(monkeypatch):
     nothing = logged("poor")
     short = type(nothing)(

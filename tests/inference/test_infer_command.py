@@ -5,15 +5,17 @@ import re
 from contextlib import nullcontext
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from disco_hw.errors import InputError, WorkError
 from disco_hw.inference import infer_command as verb
 from disco_hw.inference.infer import InferOptions
 from disco_hw.inference.infer_command import GapCheck, infer_command
+from disco_hw.inference.simulate import NAMES
 from disco_hw.log.contradictions import Contradiction
 from disco_hw.log.importing import import_log
-from disco_hw.model import load_model
+from disco_hw.model import Model, load_model
 from tests.inference.drives import TICKS_PER_REV, TRUTH, write_log
 
 ROBOT = f"""
@@ -51,10 +53,34 @@ def inferred(robot):
         robot,
         folder / "model.toml",
         folder / "report.html",
-        InferOptions(simulations=600, seed=2),
+        InferOptions(simulations=600, seed=3),
+        search=finds(),
         report_progress=lambda stage, share: said.append((stage, share)),
     )
     return folder, result, said
+
+
+@pytest.fixture(scope="module")
+def circle(inferred):
+    return inferred[1].inference
+
+
+def test_the_truth_lies_in_the_posterior_of_a_circle(circle):
+    truth = np.array([TRUTH[name] for name in NAMES])
+    mean, sd = circle.draws.mean(axis=0), circle.draws.std(axis=0)
+    assert mean == pytest.approx(truth, rel=0.03)
+    assert np.all(np.abs(mean - truth) < 4.0 * sd)
+    assert np.all(sd < 0.02 * np.array([0.5, 0.5, 0.4]))
+    assert not circle.predictive.outside_simulated
+
+
+def test_the_belief_has_the_moments_of_the_draws_and_goes_into_a_model(circle):
+    assert circle.belief.mean() == pytest.approx(circle.draws.mean(axis=0), rel=0.01)
+    assert np.sqrt(np.diag(circle.belief.covariance())) == pytest.approx(circle.draws.std(axis=0), rel=0.15)
+    model = circle.model(Model(0.055, 0.4, name="test"))
+    assert model.wheel_radius_m == pytest.approx(circle.belief.mean()[NAMES.index("wheel_radius_m")])
+    assert model.belief is circle.belief
+    assert model.name == "test"
 
 
 def test_the_json_has_the_promised_shape(inferred):
@@ -107,7 +133,7 @@ def test_the_report_has_every_figure_of_the_diagnostics(inferred):
     folder, result, _ = inferred
     page, told = (folder / "report.html").read_text(), result.as_dict()
     numbers = told["diagnostics"]
-    assert f"rests on {numbers['effective_simulations']:.0f}; seed 2" in page
+    assert f"rests on {numbers['effective_simulations']:.0f}; seed 3" in page
     assert f"{numbers['simulations']} simulations" in page
     for name, p in numbers["sbc_p"].items():
         assert f"{name} p = {p:.2g}" in page
@@ -130,6 +156,7 @@ def test_the_report_of_the_papers_way_says_what_its_statistics_cannot_tell(robot
     assert "driven by commands" in page
 
 
+@pytest.mark.thorough
 def test_a_log_of_ours_gives_what_its_table_gives(robot, tmp_path, inferred):
     """To the microsecond that tables keep: the same poses, the same geometry."""
     log, ours = write_log(tmp_path / "poor.csv", "poor"), tmp_path / "poor.mcap"
