@@ -1,4 +1,4 @@
-"""`disco-hw check` and `ctl` against a real virtual robot."""
+"""`disco-hw check` with a virtual robot in real time and with none."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import re
 
 import pytest
 
-from disco_hw.experiments import READY_TIMEOUT_S, disco_hw_process, running_stack, write_robot_file
-from tests.hil.stack import disco, disco_here, disco_json
+from disco_hw.experiments import disco_hw_process, write_robot_file
+from tests.hil.stack import disco, disco_json
 
 pytestmark = pytest.mark.hil
 
@@ -40,32 +40,6 @@ def test_check_fails_without_a_robot_and_says_what_to_do(tmp_path):
     assert code == 1
     assert "fail  link" in output
     assert "adaptation: off, as pose.rate_hz is not given" in output
-
-
-def test_check_and_a_second_daemon_keep_out_of_a_running_daemons_way(tmp_path):
-    with running_stack(tmp_path) as stack:
-        stack.operator.wait_for("READY", READY_TIMEOUT_S)
-        code, output = disco_here("check", str(stack.robot_file))
-        assert code == 1
-        assert "a daemon drives this robot" in output
-        code, output = disco("ctl", str(stack.robot_file), "status")
-        assert code == 0
-        assert output.startswith("READY")
-        code, output = disco_here("ctl", str(stack.robot_file), "start")
-        assert code == 1
-        assert "arm first" in output
-        code, output = disco_here("ctl", str(stack.robot_file), "jump")
-        assert code == 2
-        code, output = disco_here("ctl", str(stack.robot_file), "task", "radius_m=1.25", "speed_m_s=0.25")
-        assert (code, "circle of 1.25 m" in output, "0.25 m/s" in output) == (0, True, True), output
-        assert stack.operator.status()["task"]["asked"]["radius_m"] == 1.25
-        code, output = disco_here("ctl", str(stack.robot_file), "task", "speed_m_s=90")
-        assert code == 1
-        assert "refused: " in output
-        assert stack.operator.status()["task"]["asked"]["speed_m_s"] == 0.25
-        code, output = disco("run", str(stack.robot_file))
-        assert code == 2
-        assert "a daemon serves this socket already" in output
 
 
 def wait_for_line(path, word: str, timeout_s: float = 30.0) -> None:

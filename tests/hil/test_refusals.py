@@ -123,13 +123,39 @@ def forge(codec: Codec, rng: random.Random, session: int, counter: int) -> tuple
     return right.can_id, bytes(data)
 
 
+def assert_others_keep_out(stack):
+    """`check`, requests that are refused and a second daemon leave the daemon that drives this robot as it is."""
+    code, output = disco_here("check", str(stack.robot_file))
+    assert code == 1
+    assert "a daemon drives this robot" in output
+    code, output = disco("ctl", str(stack.robot_file), "status")
+    assert code == 0
+    assert output.startswith("READY")
+    code, output = disco_here("ctl", str(stack.robot_file), "start")
+    assert code == 1
+    assert "arm first" in output
+    code, output = disco_here("ctl", str(stack.robot_file), "jump")
+    assert code == 2
+    code, output = disco_here("ctl", str(stack.robot_file), "task", "radius_m=1.25", "speed_m_s=0.25")
+    assert (code, "circle of 1.25 m" in output, "0.25 m/s" in output) == (0, True, True), output
+    assert stack.operator.status()["task"]["asked"]["radius_m"] == 1.25
+    code, output = disco_here("ctl", str(stack.robot_file), "task", "speed_m_s=90")
+    assert code == 1
+    assert "refused: " in output
+    assert stack.operator.status()["task"]["asked"]["speed_m_s"] == 0.25
+    code, output = disco("run", str(stack.robot_file))
+    assert code == 2
+    assert "a daemon serves this socket already" in output
+
+
 @pytest.mark.parametrize("armed", [pytest.param(False, marks=pytest.mark.long), True])
-def test_forgeries_on_the_bus_never_turn_a_wheel(tmp_path, armed):
+def test_neither_forgeries_on_the_bus_nor_a_second_daemon_ever_turn_a_wheel(tmp_path, armed):
     rng = random.Random(5)
     codec = Codec()
     with running_stack(tmp_path) as stack:
         stack.operator.wait_for("READY", READY_TIMEOUT_S)
         if armed:
+            assert_others_keep_out(stack)
             stack.operator.arm()
         session = int(stack.inject("state").split(",")[13])
         with can.Bus(interface="unixcan", channel=str(tmp_path / "bus")) as bus:
