@@ -18,6 +18,7 @@ from disco_hw.errors import InputError
 from disco_hw.experiments import with_device
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import BeliefChange
+from tests.tables import thinned
 
 ROOT = Path(disco_hw.__file__).parents[1]
 PAGE = ROOT / "docs" / "my-controller.md"
@@ -70,7 +71,7 @@ def test_the_pages_comparison_with_disco_is_as_it_says(tmp_path):
     agree(figures(printed(1)), figures(run(program(1), tmp_path)))
 
 
-@pytest.mark.parametrize("rate_hz", [20, 33, 60, 100])
+@thinned("rate_hz", [20, 33, 60, 100], quick=2)
 def test_the_robot_starts_at_every_control_rate(tmp_path, rate_hz):
     robot = tmp_path / "robot.toml"
     text = ROBOT.read_text("utf-8").replace("rate_hz = 50.0", f"rate_hz = {rate_hz}.0")
