@@ -4,6 +4,7 @@ from collections import deque
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand
 from disco_hw.control.past_motion import DriveMeans
@@ -67,6 +68,7 @@ def misses(disco, model):
     return np.sqrt(np.mean(off[:, :2] ** 2)), np.sqrt(np.mean(off[:, 2] ** 2))
 
 
+@pytest.mark.thorough
 def test_plans_of_a_model_that_remembers_are_what_the_robot_then_does(tmp_path):
     save_model(MODEL, tmp_path / "model.toml")
     found = {}

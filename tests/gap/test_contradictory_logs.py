@@ -12,6 +12,7 @@ from disco_hw.gap.report.page import as_text, page
 from disco_hw.log.consistency import find_contradictions
 from disco_hw.model import Model
 from tests.log.contradictory_drives import AXIAL_M, FAULTS, RADIUS_M, sound
+from tests.tables import thinned
 
 MODEL = Model(RADIUS_M, AXIAL_M)
 
@@ -28,7 +29,7 @@ def no_search(monkeypatch):
     monkeypatch.setattr(gap, "search_log", search)
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@thinned("fault", FAULTS, quick=5)
 def test_what_says_nothing_is_refused_before_the_search_and_the_rest_is_searched(fault):
     change, _, remedy = FAULTS[fault]
     log = change(sound())

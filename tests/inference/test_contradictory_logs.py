@@ -14,6 +14,7 @@ from disco_hw.inference.infer import InferOptions
 from tests.inference.drives import logged, robot_config
 from tests.inference.test_infer_command import FEW, ROBOT, finds
 from tests.log.contradictory_drives import FAULTS, RADIUS_M, sound, with_wheels
+from tests.tables import thinned
 
 # Wheels that count all alike wrong are fitted, and commands are not read; without commands all is the same.
 OF_USE = ("encoders doubled", "encoders halved", "a heading that stops for a third")
@@ -34,7 +35,7 @@ def run(tmp_path, monkeypatch):
     return infer
 
 
-@pytest.mark.parametrize("fault", SPOILED)
+@thinned("fault", SPOILED, quick=4)
 def test_a_log_that_says_nothing_of_the_robot_is_refused_with_the_cause(run, fault, tmp_path):
     change, _, remedy = FAULTS[fault]
     log = change(sound())
