@@ -219,9 +219,14 @@ def task_drive(
     seed: int,
     guarded: bool = True,
     learning_s: float = 0.0,
+    facing_rad: float = 0.0,
 ) -> FencedDrive:
-    """The task, from its start; without `guarded` the guard is off, and the planner alone keeps to the fence."""
-    start = BodyPose(*setup.config.task.course().start)
+    """Drive the task from its start, facing so far to the left of its line there.
+
+    Without `guarded` the guard is off, and the planner alone keeps to the fence.
+    """
+    x_m, y_m, yaw_rad = setup.config.task.course().start
+    start = BodyPose(x_m, y_m, yaw_rad + facing_rad)
     run = SimulatedRun(setup, virtual_robot(setup, plant, start, seed=seed), planner)
     area, fence = run.core.area, setup.config.fence
     assert area is not None
@@ -254,17 +259,34 @@ def _outer_m(radius_m: float) -> float:
 
 
 def along_drive(rng: np.random.Generator, off: float, seconds: float) -> FencedDrive:
-    """A circle at 0.3 m/s between two fences 0.15 m beside the footprint's way, by a control law that sees neither."""
+    """A circle at 0.3 m/s between two fences 0.15 m beside the footprint's way, by a control law that sees neither.
+
+    The robot slides, so that it faces inwards on a circle: the fences are laid beside that footprint, and it begins so.
+    """
     radius_m = float(rng.uniform(0.6, 1.2))
-    around = Circle((0.0, 0.0), _outer_m(radius_m) + _ALONG_M)
-    within = Circle((0.0, 0.0), radius_m - 0.5 * FOOTPRINT.width - _ALONG_M)
     task = CircleTask(center_x_m=0.0, center_y_m=0.0, radius_m=radius_m, speed_m_s=_WALL_M_S)
-    setup = fenced_setup(Fence(keep_in=around, keep_out=(within,)), task)
-    plant, robot = untold_plant(rng, off), setup.config.robot
-    geometry = (robot.wheel_radius_m, robot.axial_distance_m, robot.x_icr_m)
-    chassis = NominalRobot(*geometry, plant.speed_loop_time_constant_s, 0.0, CommandLimits.of_robot(robot))
-    law = Follower(Reference(task.course().outline_m(), _WALL_M_S, robot.x_icr_m), LAWS["kanayama"](), chassis)
-    return task_drive(setup, plant, law, seconds, int(rng.integers(1 << 30)))
+    plant, shipped = untold_plant(rng, off), load_setup(_SHIPPED)
+    model = shipped.model
+    facing = math.asin(model.x_icr_m / radius_m)
+    turned = [(x * math.cos(facing) - y * math.sin(facing), x * math.sin(facing) + y * math.cos(facing)) for x, y in
+              FOOTPRINT.corners_m()]  # fmt: skip
+    # On a circle driven counterclockwise, ahead is along the tangent and left is towards the centre.
+    outer_m = max(math.hypot(radius_m - y, x) for x, y in turned)
+    inner_m = min(_distance_m((0.0, radius_m), turned[k - 1], turned[k]) for k in range(4))
+    around, within = Circle((0.0, 0.0), outer_m + _ALONG_M), Circle((0.0, 0.0), inner_m - _ALONG_M)
+    setup = fenced_setup(Fence(keep_in=around, keep_out=(within,)), task, shipped)
+    geometry = (model.wheel_radius_m, model.axial_distance_m, model.x_icr_m)
+    limits = CommandLimits.of_robot(setup.config.robot)
+    chassis = NominalRobot(*geometry, plant.speed_loop_time_constant_s, 0.0, limits)
+    law = Follower(Reference(task.course().outline_m(), _WALL_M_S, model.x_icr_m), LAWS["kanayama"](), chassis)
+    return task_drive(setup, plant, law, seconds, int(rng.integers(1 << 30)), facing_rad=facing)
+
+
+def _distance_m(point: tuple[float, float], begin: tuple[float, float], end: tuple[float, float]) -> float:
+    """How far a point is from a segment."""
+    along = np.subtract(end, begin)
+    part = float(np.clip(np.dot(np.subtract(point, begin), along) / np.dot(along, along), 0.0, 1.0))
+    return float(np.hypot(*(np.add(begin, part * along) - point)))
 
 
 def room_drive(rng: np.random.Generator, off: float, seconds: float) -> FencedDrive:
