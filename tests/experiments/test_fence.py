@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from disco_hw.experiments.fence import ALONE, DRIVES, Campaign, FenceOptions
-from disco_hw.experiments.fence_drives import FOOTPRINT, FencedDrive, tight_room
+from disco_hw.experiments.fence_drives import FOOTPRINT, FencedDrive, along_drive, tight_room
 from disco_hw.fence import Circle, Fence
 from disco_hw.fence.clearance import Boundaries
 
@@ -79,3 +79,10 @@ def test_in_a_tight_room_the_robot_on_its_line_comes_as_near_as_is_said():
         least = Boundaries(FOOTPRINT, fence).clearance_m(on_line).min()
         assert least == pytest.approx(0.08, abs=1e-4)
         assert math.isfinite(task.speed_m_s)
+
+
+def test_a_robot_on_a_line_0_15_m_inside_the_fence_is_not_stopped():
+    drive = along_drive(np.random.default_rng([21, 2, 0]), 0.15, 5.0)
+    assert Boundaries(FOOTPRINT, drive.fence).clearance_m(drive.poses[:1])[0] == pytest.approx(0.15, abs=1e-3)
+    assert drive.stops == 0
+    assert drive.way_m > 0.8
