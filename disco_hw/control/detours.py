@@ -28,7 +28,7 @@ _MOVED_M = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Detour:
-    """Around one obstacle: the point and direction of the line beside it, how far to the left, and half its length."""
+    """Detour around one obstacle: point and direction of the line beside it, offset to the left, half its length."""
 
     x_m: float
     y_m: float

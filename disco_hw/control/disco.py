@@ -1,4 +1,4 @@
-"""DISCO: stochastic model predictive control that rolls out every command sequence under the belief over parameters."""
+"""Stochastic model predictive control (DISCO) with rollouts of every command sequence under the belief."""
 
 from __future__ import annotations
 
@@ -215,7 +215,7 @@ class Disco:
 
     @property
     def task(self) -> PlannedTask:
-        """What is planned for."""
+        """The task that is planned for."""
         return self._task
 
     @property
@@ -225,7 +225,7 @@ class Disco:
 
     @property
     def settings(self) -> DiscoSettings:
-        """How it is planned."""
+        """The settings that plans are made with."""
         return self._settings
 
     def set_task(self, task: PlannedTask) -> None:

@@ -110,7 +110,7 @@ class Optimiser:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the plan; the random numbers go on."""
+        """Clear the plan but continue the sequence of random numbers."""
         self._work.nominal[:] = 0.0
         self._valid = False
         self._work.report[TEMPERATURE] = FIRST_TEMPERATURE
@@ -171,7 +171,7 @@ class Optimiser:
     def step(
         self, shift_steps: float, gain: float, before: tuple[float, ...], system: System, point_weights: Floats
     ) -> bool:
-        """One step: the plan moves on by `shift_steps` and is improved; False if nothing valid came out.
+        """Shift the plan by `shift_steps` and improve it once; return False if no valid plan came out.
 
         `gain`: how far the plan moves towards the weighted mean of the samples, 0 to 1.
 

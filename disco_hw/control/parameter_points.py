@@ -21,7 +21,7 @@ SAME_RATIO = 1e-9
 
 
 def moving_names(belief: Belief) -> tuple[str, ...]:
-    """Those parameters of a belief that change motion: of effects, then wheel radius and axial distance, then x_icr."""
+    """Return the belief's parameters that change motion: of effects, wheel radius and axial distance, then x_icr."""
     base = {parameter.name for parameter in BASE_PARAMETERS}
     moving = [name for name in belief.names if name in base or effect_of(name.rpartition(".")[0]).moves]
     return tuple(sorted(moving, key=lambda name: (name in base) + (name == X_ICR.name)))
@@ -130,7 +130,7 @@ def shared_pairs(model: Model, points: Array, step_s: float) -> int:
 
 
 def _wheel_coefficients(model: Model, points: Array, step_s: float) -> Array | None:
-    """What the effects of points (L, P) work with, (L, N); None if one acts after the wheels."""
+    """Return the effects' coefficients (L, N) for points (L, P); None if an effect acts after the wheels."""
     columns = [np.empty((len(points), 0))]
     at = len(BASE_PARAMETERS)
     for setting in model.effects:

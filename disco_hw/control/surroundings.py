@@ -31,7 +31,7 @@ TRAPPED_PART = 0.5
 
 
 class Surroundings:
-    """What a planner keeps away from, in the buffers that its kernel reads.
+    """Fence and obstacles that a planner keeps away from, in the buffers that its kernel reads.
 
     `max_breach_probability`: of a plan over its horizon; with the pose's deviation it makes the distance to keep.
     """

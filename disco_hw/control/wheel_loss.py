@@ -1,4 +1,4 @@
-"""How much slower wheels turn than their commands and the model say: an observer with an integral of what is missing.
+"""Observer of the wheel speed that is lost against the commands and the model, with an integral of the difference.
 
 A dead band, a motor's gain or a battery that the model has wrong lose a part of either wheel's command. Wheels that
 scrub over the floor while the robot turns lose a part of the difference between them: the outer one turns slower, the
@@ -30,7 +30,7 @@ LONGEST_GAP_S = 0.2
 
 
 class WheelLoss:
-    """What either wheel, and half the difference of the two, lose of a command (rad/s); negative where they gain."""
+    """Estimated loss of a command (rad/s) at each wheel and in half their difference; negative where they gain."""
 
     def __init__(self) -> None:
         self._loss, self._turn = np.zeros(2), 0.0
@@ -39,13 +39,13 @@ class WheelLoss:
 
     @property
     def rad_s(self) -> Wheels:
-        """Of the left wheel's command and of the right one's."""
+        """Loss (rad/s) of the left wheel's command and of the right one's."""
         left, right = self._loss.tolist()
         return left, right
 
     @property
     def turn_rad_s(self) -> float:
-        """Of half the difference between the two."""
+        """Loss (rad/s) of half the difference between the two commands."""
         return self._turn
 
     @property
@@ -97,7 +97,7 @@ _OUTWARDS = np.array([1.0, -1.0])
 
 
 def _part(commands: Array) -> Array:
-    """How much of its loss commands have, and which way."""
+    """Return the signed part of its loss that each command has: proportional when slow, then -1 or 1."""
     return np.clip(commands / WHOLE_RAD_S, -1.0, 1.0)
 
 

@@ -128,7 +128,10 @@ def place_of(terms: object, place: float, x: float, y: float) -> float:
 
 
 def line_at(terms: object, place: float, ahead_m: float) -> tuple[float, float, float, float, float, float]:
-    """Where and how to be on the line: `line_at` of terms with a line; compiled code only."""
+    """Return the point and motion on the line of a task's terms.
+
+    The order is that of `line_at` of terms with a line; compiled code only.
+    """
     raise TypeError(f"{type(terms).__name__} has no line")
 
 

@@ -34,7 +34,7 @@ Array = NDArray[Any]
 
 
 class Problem(NamedTuple):
-    """What is minimised.
+    """Least-squares problem of a refinement: initial state, model coefficients, command bounds and reference.
 
     `start` (5,): x, y (m, relative to the task's origin), yaw (rad), wheel speeds (rad/s); `time_s` of it; `slide` (3,)
     as of `Disturbance.slides`; `means` (L, n) of what the model's terms remember at the start, or None; `base`,

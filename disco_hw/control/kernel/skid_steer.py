@@ -193,7 +193,7 @@ def _rolling(wheels: Floats, t: int, b: int, commands: Floats, late: int, horizo
 def _slid(
     slides: Absent, x: float, y: float, step_x: float, step_y: float, wheel_sum: float, difference: float, start: Floats
 ) -> tuple[float, float]:
-    """Where a robot is after this step that slides and is carried beside its model; x and y as they are without."""
+    """Return the position x, y after this step with the side slip and drift that the disturbance adds to the model."""
     if slides is None:
         return x, y
     # The larger of both is the sum of the wheels' sizes.
@@ -236,7 +236,7 @@ def _begin(state: Floats, own: int, b: int, start: Floats, task: Terms, bends: B
 
 @scalar_function
 def _found(looks: Absent, state: Floats, own: int, b: int) -> Found:
-    """What sample b has kept and found in the task's table, in the rows from `own` on; zeros without a table."""
+    """Return what sample b has kept and found in the task's table, in the rows from `own` on; zeros without one."""
     if looks is None:
         zero = cast_like(0.0, state[own])
         return zero, zero, zero, zero, zero
@@ -523,7 +523,7 @@ def _bases(base: Base, pair: NDArray[np.int64]) -> tuple[Base, Base]:
 
 @scalar_function
 def _places(pair: NDArray[np.int64], padded: int, lane: np.uintp) -> CostPlaces:
-    """Where the costs of a pair of points begin."""
+    """Return the indices at which the costs of a pair of points begin."""
     return U(pair[0] * padded) + lane, U(pair[1] * padded) + lane
 
 
