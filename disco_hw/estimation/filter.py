@@ -50,7 +50,7 @@ class HeadingSearch(msgspec.Struct, frozen=True, gc=False):
     weights: tuple[float, ...]
 
     def each(self, change: Callable[[PoseBelief], PoseBelief]) -> HeadingSearch:
-        """The same with each component changed."""
+        """Return the search with each component changed."""
         return HeadingSearch(tuple(change(belief) for belief in self.beliefs), self.weights)
 
     def merged(self) -> PoseBelief:
@@ -85,7 +85,7 @@ class HeadingSearch(msgspec.Struct, frozen=True, gc=False):
 
 
 def any_heading(measurement: Measurement, model: MotionModel) -> HeadingSearch:
-    """Where the sensor was, with every heading alike; a heading that was measured is not looked at."""
+    """Create a search at the sensor's place with all headings equally likely; a measured heading is ignored."""
     tt = _COMPONENT_STD_RAD**2
     beliefs = []
     for k in range(COMPONENTS):

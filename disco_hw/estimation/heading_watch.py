@@ -30,7 +30,7 @@ REPORTED_AFTER = 10
 
 
 class Heading(enum.Enum):
-    """What is held of the headings of a source."""
+    """States of the headings of one pose source."""
 
     WAITING = "waiting"
     MEASURED = "measured"
@@ -62,7 +62,7 @@ class HeadingWatch:
 
     @property
     def held(self) -> tuple[Heading, ...]:
-        """What is held of the headings of each source."""
+        """State of the headings of each source."""
         return tuple(one.held for one in self._sources)
 
     def screen(self, sample: PoseSample, difference_rad: float, turn_per_rad: float) -> tuple[PoseSample, bool]:

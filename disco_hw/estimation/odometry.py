@@ -1,4 +1,4 @@
-"""Wheel odometry: continuous readings from samples, the exact arc that they make, and the belief carried along it.
+"""Wheel odometry with continuous readings from samples, the exact arc that they make, and the belief along it.
 
 The belief over the pose is a Gaussian; here are its prediction by odometry, and its bounds.
 """
@@ -259,7 +259,7 @@ class PoseBelief(msgspec.Struct, frozen=True, gc=False):
 
     @property
     def pose(self) -> Pose:
-        """The mean."""
+        """Mean of the belief: x, y (m), yaw (rad)."""
         return Pose(self.x_m, self.y_m, self.yaw_rad)
 
     @property
@@ -278,9 +278,11 @@ class PoseBelief(msgspec.Struct, frozen=True, gc=False):
 
 
 class MotionModel(msgspec.Struct, frozen=True, gc=False):
-    """What prediction needs to know: geometry, slip as variance per metre rolled or radian turned (so that it does not
-    depend on the sampling rate), and a square root of the covariance of (wheel_radius_m, axial_distance_m, x_icr_m),
-    3x3 row by row, or None if they are known.
+    """Parameters of the prediction by odometry.
+
+    Geometry; slip as variance per metre rolled or radian turned (so that it does not depend on the sampling rate); and
+    a square root of the covariance of (wheel_radius_m, axial_distance_m, x_icr_m), 3x3 row by row, or None if they are
+    known.
     """
 
     parameters: OdometryParameters
@@ -315,7 +317,7 @@ def belief_at(pose: Pose, position_variance: float, yaw_variance: float, model: 
 
 
 def rebased(belief: PoseBelief, model: MotionModel) -> PoseBelief:
-    """The same belief under other parameters, whose error has nothing to do with what those before have caused."""
+    """Return the belief under other parameters, whose error is independent of what those before have caused."""
     (xx, xy, xt), (_, yy, yt), (_, _, tt) = belief.covariance
     sensitivity: Flat9 | None = None if model.parameter_root is None else (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     return PoseBelief(belief.x_m, belief.y_m, belief.yaw_rad, xx, xy, xt, yy, yt, tt, sensitivity)

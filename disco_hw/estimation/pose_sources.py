@@ -31,7 +31,7 @@ _NAN3 = (math.nan, math.nan, math.nan)
 
 
 class Standing(enum.Enum):
-    """What is held of a source."""
+    """States of one pose source."""
 
     WAITING = "waiting"
     GOOD = "good"
@@ -42,7 +42,7 @@ class Standing(enum.Enum):
 
 @dataclass(slots=True)
 class TrackedSource:
-    """What one source has done; `came_ns` is when its newest pose came, `good_ns` the stamp of the newest accepted."""
+    """Record of one pose source; `came_ns` is when its newest pose came, `good_ns` the stamp of the newest accepted."""
 
     label: str
     standing: Standing = Standing.WAITING
