@@ -1,4 +1,4 @@
-"""The model f_theta: one definition of the physics for control, inference, gap and replay.
+"""Model f_theta of the robot, one definition of the physics for control, inference, gap and replay.
 
 Here is the model file: TOML in, TOML out; every error is one line that names file, field and remedy.
 """

@@ -1,4 +1,4 @@
-"""What the compiled step adds for a model's terms without a name, and what it remembers for them.
+"""Compiled code for a model's terms without a name: what they add to a step, and the means that they remember.
 
 A term that a model lacks leaves nothing in the machine code. Of a command's term that remembers the means of both
 wheels are kept, of the body's that of the sum or the difference of the wheels' speeds, which no parameter changes.
@@ -62,7 +62,7 @@ def _terms_of(kinds: Iterable[Any]) -> list[GenericTerm]:
 
 
 def _compiled_terms(terms: Any) -> list[GenericTerm]:
-    """Those of a tuple whose numba type this is."""
+    """Return the terms of a tuple, given the tuple's numba type."""
     return [] if isinstance(terms, types.NoneType) else _terms_of(kind.instance_class for kind in terms.types)
 
 
@@ -86,7 +86,7 @@ def new_means(effects: Coefficients) -> NDArray[np.float64] | None:
 def add_to_commands(
     left: float, right: float, time_s: float, terms: Terms | None, means: Means, at: Any, apart: Any
 ) -> tuple[float, float]:
-    """Both commands (rad/s) with the terms that act on them.
+    """Return both commands (rad/s) with the terms that act on them.
 
     Number n of the means that terms remember is `means[at + n * apart]`, and goes on by a step.
     """
@@ -124,7 +124,7 @@ def _averaged(signal: float, entry: TermCoefficients, means: Means, at: Any) -> 
 
 @scalar_function
 def _slewed(signal: float, most: float, means: Means, at: Any) -> float:
-    """What follows a signal by at most so much a step, in the mean over one; it goes on to its end."""
+    """Return the mean over a step of a value that follows the signal by at most `most` a step, and move it on."""
     before = means[at]
     moved = min(max(signal - before, -most), most)
     means[at] = before + moved
@@ -172,8 +172,9 @@ def add_to_velocity(
     forward: float, lateral: float | None, turn: float, wheel_sum: float, difference: float, change: float,
     time_s: float, base: Base, terms: Terms | None, means: Means, at: Any, apart: Any,
 ) -> tuple[float, float | None, float]:  # fmt: skip
-    """Forward and lateral speed (m/s) and half the yaw rate (rad/s) with the terms; wheels as for `body_velocity`,
-    means as for `add_to_commands`.
+    """Return forward and lateral speed (m/s) and half the yaw rate (rad/s) with the terms that act on them.
+
+    Wheels as for `body_velocity`, means as for `add_to_commands`.
     """
     if terms is None:
         return forward, lateral, turn
