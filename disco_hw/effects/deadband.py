@@ -15,7 +15,7 @@ def plain(command: Value, values: Values) -> Value:
 
 
 def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """The width, (L,)."""
+    """Return the width of the dead band, (L,)."""
     return (values[:, 0],)
 
 
@@ -29,7 +29,7 @@ def term(command: float, coefficients: tuple[float] | None) -> float:
 
 
 def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
-    """Where a fit begins."""
+    """Return the value from which a fit begins."""
     return ((0.2,),)
 
 

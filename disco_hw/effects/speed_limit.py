@@ -17,7 +17,7 @@ def plain(command: Value, values: Values) -> Value:
 
 
 def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """The limit, (L,)."""
+    """Return the limit of the speed, (L,)."""
     return (values[:, 0],)
 
 

@@ -18,7 +18,7 @@ def plain(command: Value, speed: Value, values: Values) -> Value:
 
 
 def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """The threshold, (L,)."""
+    """Return the threshold of motion, (L,)."""
     return (values[:, 0],)
 
 

@@ -19,7 +19,7 @@ def plain(turn: Value, values: Values) -> Value:
 
 
 def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """The share, (L,)."""
+    """Return the share of the turn, (L,)."""
     return (values[:, 0],)
 
 

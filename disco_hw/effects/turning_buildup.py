@@ -40,7 +40,7 @@ def plain(
 
 
 def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """What half the difference grows by in a step at most, and reaches at once (rad/s), and the share; (L,) each."""
+    """Return half the difference's largest growth in a step, what it reaches at once (rad/s), the share; (L,) each."""
     return values[:, 0] * step_s, values[:, 1], values[:, 2]
 
 
