@@ -1,4 +1,4 @@
-"""What a task is to everything else: the section of robot.toml, its line on the ground, its progress, its cost.
+"""Interface of a task: the section of robot.toml, its line on the ground, its progress, its cost.
 
 Every module of this package with a `TASK` is a kind, and its name is the kind's (docs/add-a-task.md says what such a
 file holds). Only the module of the kind that is asked for is loaded, so that reading robot.toml stays quick.
@@ -58,7 +58,7 @@ Positive = Annotated[float, Meta(gt=0.0)]
 
 
 class Chassis(Protocol):
-    """What a task asks of the robot: [robot] of robot.toml has it."""
+    """Properties of the robot that a task needs; [robot] of robot.toml has them."""
 
     @property
     def wheel_radius_m(self) -> float:
@@ -82,7 +82,7 @@ class Editable(NamedTuple):
 
 
 class TaskFault(NamedTuple):
-    """What is wrong with a task that no single field shows: the field to change, the fault, the remedy."""
+    """Fault of a task that no single field shows: the field to change, the fault, the remedy."""
 
     field: str
     fault: str
@@ -94,7 +94,7 @@ class Course(Protocol):
 
     @property
     def noun(self) -> str:
-        """What it is called."""
+        """Name of the course for panels and pictures."""
 
     @property
     def middle_m(self) -> Point:
@@ -102,7 +102,7 @@ class Course(Protocol):
 
     @property
     def reach_m(self) -> float:
-        """How far it goes from the middle along x or y."""
+        """Farthest distance (m) of the course from its middle along x or y."""
 
     @property
     def length_m(self) -> float:
@@ -110,7 +110,7 @@ class Course(Protocol):
 
     @property
     def start(self) -> tuple[float, float, float]:
-        """Where to begin and which way to face: x, y (m), yaw (rad)."""
+        """Start of the course and the heading there: x, y (m), yaw (rad)."""
 
     def outline_m(self) -> Array:
         """The line as points (N, 2)."""
@@ -120,7 +120,7 @@ class Course(Protocol):
 
 
 class Progress(Protocol):
-    """How far the task has been driven; follows the robot while the task runs."""
+    """Protocol of a task's progress, which follows the robot while the task runs."""
 
     @property
     def laps(self) -> float:
@@ -131,7 +131,7 @@ class Progress(Protocol):
         """Whether there is nothing left to drive."""
 
     def in_words(self) -> tuple[str, str]:
-        """What is counted, and how much of it, for a person."""
+        """Return the name of what is counted, and how much of it there is, as text."""
 
     def add(self, now_ns: int, x_m: float, y_m: float, yaw_rad: float) -> None:
         """Take in the pose of one tick; the first one after a pause begins anew."""
@@ -141,7 +141,7 @@ class Progress(Protocol):
 
 
 class Prepared(NamedTuple):
-    """What a plan needs of its task.
+    """Inputs of one plan from its task.
 
     `terms`: the compiled cost with its numbers in float32 (see above). `origin_m`: world position that
     rollouts are relative to, so that single precision is fine anywhere; `begin`: the memory that they start with.
@@ -161,7 +161,7 @@ class PlannedTask(Protocol):
         self, time_s: float, x_m: float, y_m: float, yaw_rad: float, memory: float | None, step_s: float, horizon: int,
         x_icr_m: float,
     ) -> Prepared:  # fmt: skip
-        """What a plan from here needs.
+        """Return the task's inputs for a plan that starts here.
 
         `time_s` since the planner's start, the pose in the world, the memory that the last plan handed back (None at
         the first), the steps that will be planned, and how far ahead of the tracked point the robot turns.
@@ -199,7 +199,7 @@ class RobotTask(Protocol):
         """
 
     def fault(self) -> TaskFault | None:
-        """What is wrong with the fields of [task] taken together."""
+        """Return what is wrong with the fields of [task] taken together, or None."""
 
     def fastest_m_s(self, robot: Chassis) -> float:
         """Speed at which a wheel of the nominal robot is at its limit on this task."""
@@ -211,7 +211,7 @@ class RobotTask(Protocol):
         """The fields that a person may change; the largest speed is that on the present line."""
 
     def editing_note(self, robot: Chassis) -> str:
-        """What the page says below those fields, and why there are none where there are none."""
+        """Return the text that the page shows below the editable fields, which also says why there are none."""
 
     def in_words(self) -> str:
         """The task for a person."""

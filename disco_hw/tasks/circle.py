@@ -1,4 +1,4 @@
-"""The paper's task: follow a circle at a constant speed, counter-clockwise (section V-B)."""
+"""Task of the paper: follow a circle at a constant speed, counter-clockwise (section V-B)."""
 
 from __future__ import annotations
 
@@ -60,11 +60,11 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
     @property
     def file(self) -> str | None:
-        """None: the fields say all."""
+        """Always None, because a circle is described by its fields alone."""
         return None
 
     def with_file(self, _file: Path, _robot: Chassis, _judged: bool) -> Self:
-        """Itself."""
+        """Return the task unchanged, because it has no file."""
         return self
 
     def fault(self) -> TaskFault | None:
@@ -95,7 +95,7 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         )
 
     def editable(self, robot: Chassis) -> Mapping[str, Editable]:
-        """All fields; the speed's largest value is that on the present radius."""
+        """Return the ranges of all fields; the largest speed is that on the present radius."""
         return {
             "radius_m": Editable(*RADIUS_M, "Radius (m)"),
             "speed_m_s": Editable(SLOWEST_M_S, self.fastest_m_s(robot), "Speed (m/s)"),
@@ -114,7 +114,7 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         return f"circle of {self.radius_m:g} m about {centre} at {self.speed_m_s:g} m/s"
 
     def course(self) -> CircleCourse:
-        """The circle."""
+        """Return the circle as a course."""
         return CircleCourse(self.center_x_m, self.center_y_m, self.radius_m)
 
     def progress(self) -> LapCounter:
@@ -147,22 +147,22 @@ class CircleCourse:
 
     @property
     def noun(self) -> str:
-        """What it is called."""
+        """Name of the course, "circle"."""
         return "circle"
 
     @property
     def middle_m(self) -> Point:
-        """The centre."""
+        """Centre of the circle: x, y (m)."""
         return self.center_x_m, self.center_y_m
 
     @property
     def reach_m(self) -> float:
-        """The radius."""
+        """Radius of the circle, m."""
         return self.radius_m
 
     @property
     def length_m(self) -> float:
-        """The circumference."""
+        """Circumference of the circle, m."""
         return 2.0 * math.pi * self.radius_m
 
     @property
@@ -197,11 +197,11 @@ class LapCounter:
 
     @property
     def finished(self) -> bool:
-        """Never: a circle has no end."""
+        """Always False, because a circle has no end."""
         return False
 
     def in_words(self) -> tuple[str, str]:
-        """Laps."""
+        """Return the word "laps" and their number as text."""
         return "laps", f"{self.laps:.2f}"
 
     def add(self, _now_ns: int, x_m: float, y_m: float, _yaw_rad: float) -> None:
@@ -243,7 +243,7 @@ class CircleCost:
     against_m: float = 0.6
 
     def paper(self) -> CircleCost:
-        """The same circle with the paper's cost alone."""
+        """Return a cost of the same circle with the paper's terms alone."""
         return replace(self, progress_weight=0.0, terminal_m=0.0, against_m=0.0)
 
     def prepare(

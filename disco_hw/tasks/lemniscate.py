@@ -44,11 +44,11 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
     @property
     def file(self) -> str | None:
-        """None: the fields say all."""
+        """Always None, because a lemniscate is described by its fields alone."""
         return None
 
     def with_file(self, _file: Path, _robot: Chassis, _judged: bool) -> Self:
-        """Itself."""
+        """Return the task unchanged, because it has no file."""
         return self
 
     def fault(self) -> TaskFault | None:
@@ -79,7 +79,7 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         )
 
     def editable(self, robot: Chassis) -> Mapping[str, Editable]:
-        """All fields; the speed's largest value is that on the present size."""
+        """Return the ranges of all fields; the largest speed is that on the present size."""
         return {
             "size_m": Editable(*SIZE_M, "Size (m)"),
             "speed_m_s": Editable(SLOWEST_M_S, self.fastest_m_s(robot), "Speed (m/s)"),
@@ -88,7 +88,7 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         }
 
     def editing_note(self, robot: Chassis) -> str:
-        """The largest speed."""
+        """Return a sentence with the largest speed on the present size."""
         return f"At a size of {self.size_m:g} m at most {self.fastest_m_s(robot):.3f} m/s."
 
     def in_words(self) -> str:

@@ -45,7 +45,7 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def file(self) -> str | None:
-        """The CSV."""
+        """Path of the CSV file with the way-points."""
         return self.path
 
     def with_file(self, file: Path, _robot: Chassis, judged: bool) -> Self:
@@ -69,7 +69,7 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return msgspec.structs.replace(self, points=points_of(found))
 
     def fault(self) -> TaskFault | None:
-        """None: what can be wrong is in the file."""
+        """Return None: only the way-points' file can be wrong."""
         return None
 
     def fastest_m_s(self, robot: Chassis) -> float:
@@ -81,11 +81,11 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return straight_too_fast(self.speed_m_s, robot)
 
     def editable(self, robot: Chassis) -> Mapping[str, Editable]:
-        """The speed."""
+        """Return the range of the speed, the only field to edit."""
         return speed_range(robot)
 
     def editing_note(self, robot: Chassis) -> str:
-        """The largest speed."""
+        """Return a sentence with the largest speed on this path."""
         return f"At most {self.fastest_m_s(robot):.3f} m/s."
 
     def in_words(self) -> str:

@@ -53,12 +53,12 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     @property
     def reference_speed_m_s(self) -> float:
-        """NaN: way-points by time have no one speed."""
+        """Always NaN, because a timed path has no single reference speed."""
         return math.nan
 
     @property
     def file(self) -> str | None:
-        """The CSV."""
+        """Path of the CSV file with the timed way-points."""
         return self.path
 
     def with_file(self, file: Path, robot: Chassis, _judged: bool) -> Self:
@@ -93,7 +93,7 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         return msgspec.structs.replace(self, points=points_of(found), times_s=tuple(times.tolist()))
 
     def fault(self) -> TaskFault | None:
-        """None: what can be wrong is in the file."""
+        """Return None: only the way-points' file can be wrong."""
         return None
 
     def fastest_m_s(self, robot: Chassis) -> float:
@@ -105,7 +105,7 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         return straight_too_fast(self.speed_m_s, robot)
 
     def editable(self, _robot: Chassis) -> Mapping[str, Editable]:
-        """Nothing."""
+        """Return an empty mapping, because no field can be edited."""
         return {}
 
     def editing_note(self, _robot: Chassis) -> str:
@@ -209,7 +209,7 @@ class TimedPathCost:
 
 
 class TimedPathTerms(NamedTuple):
-    """Where to be at the end of each step: `x`, `y` (T,) m; and which way that goes, `along_x`, `along_y` (T,).
+    """Desired position at each step's end, `x`, `y` (T,) m, and the direction it moves in, `along_x`, `along_y` (T,).
 
     The latter are of length one, or zero while the place rests.
     """
@@ -228,5 +228,5 @@ class TimedPathTerms(NamedTuple):
         return norm(x - self.x[step], y - self.y[step]) + _AGAINST * against, memory
 
     def terminal(self, memory: float, x: float, y: float, cos_yaw: float, sin_yaw: float, found: Found) -> float:
-        """Nothing."""
+        """Return zero, because there is no terminal cost."""
         return _ZERO

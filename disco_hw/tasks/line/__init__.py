@@ -1,7 +1,6 @@
-"""What kinds of tasks share that follow a line of way-points: here their file and the line as a table, with where on it
-a robot is; course, progress and cost lie beside it.
+"""Shared parts of tasks that follow a line of way-points: their file, and the line as a table with places on it.
 
-The table is the way-points of a CSV in equal pieces of arc length.
+Course, progress and cost lie beside this file. The table is the way-points of a CSV in equal pieces of arc length.
 """
 
 from __future__ import annotations

@@ -149,7 +149,7 @@ class PathTerms(NamedTuple):
         return x, y, along_x * cosine - along_y * sine, along_y * cosine + along_x * sine, cosine, speed
 
     def way_ahead_m(self, time_s: float) -> float:
-        """How far a robot on the path goes in so long; Python only."""
+        """Return the distance (m) that a robot on the path covers in `time_s`, up to the path's end; Python only."""
         return float(min(self.speed_m_s * time_s, max(self.end, 0.0) / self.per_m))
 
     def row_of(self, memory: float) -> int:

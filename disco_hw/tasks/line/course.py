@@ -62,7 +62,7 @@ class LineCourse:
         return x, y, math.atan2(to_y, to_x)
 
     def outline_m(self) -> Array:
-        """The way-points."""
+        """Return the way-points (N, 2) as outline, m."""
         return self.points_m
 
     def off_m(self, places_m: Array) -> Array:
@@ -106,7 +106,7 @@ END_M = 0.05
 
 
 def part_in_words(part: float, length_m: float) -> tuple[str, str]:
-    """What is counted along a line and how much of it, for a person."""
+    """Return the word "progress" and the part behind of a line's length as text."""
     return "progress", f"{part * length_m:.2f} of {length_m:.2f} m ({part:.0%})"
 
 
