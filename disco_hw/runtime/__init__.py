@@ -19,7 +19,7 @@ from firmware_protocol import status_codes
 
 
 class State(enum.Enum):
-    """Where the daemon is; the wheels can be driven in ARMED only."""
+    """States of the daemon; the wheels can be driven in ARMED only."""
 
     DISCONNECTED = "disconnected"
     HANDSHAKE = "handshake"
@@ -30,7 +30,7 @@ class State(enum.Enum):
 
 
 class Condition(enum.Flag):
-    """What is true now; the table is written in these."""
+    """Conditions that hold in one tick, in which the table of transitions is written."""
 
     NONE = 0
     LINK_UP = enum.auto()
@@ -137,17 +137,17 @@ _NEXT = {
 
 
 def by_button(action: str) -> str:
-    """How a person asks on the page."""
+    """Return how an operator requests an action on the page."""
     return f"press {action.capitalize()}"
 
 
 def by_command(robot: Path) -> Ask:
-    """How a person asks in a terminal."""
+    """Return a function that says how an operator requests an action in a terminal."""
     return lambda action: f"run `disco-hw ctl {robot} {action}`"
 
 
 def connection(link: LinkState, link_error: str | None, driver: DriverState, driver_detail: str) -> str:
-    """What stands between this host and a robot that answers, and what to do about it.
+    """Return why the robot does not answer, and what to do about it.
 
     `link_error` is the link's newest, with its remedy, or None.
     """
@@ -164,7 +164,7 @@ def headline(state: str, detail: str, running: bool, estop: bool, by_hand: bool 
 
 
 def status_headline(status: Mapping[str, Any]) -> tuple[str, str]:
-    """The same for a status of the daemon that is `ok`."""
+    """Return the headline and its detail for a daemon's status that is `ok`."""
     by_hand = "drive" in status and bool(status["drive"]["driving"])
     return headline(status["state"], status["detail"], status["running"], is_estop(status), by_hand)
 

@@ -66,7 +66,7 @@ def make_planner(config: RobotConfig, model: Model) -> control.Disco:
 
 
 def make_surroundings(config: RobotConfig, settings: control.DiscoSettings) -> Surroundings | None:
-    """What DISCO keeps away from; None for a robot.toml without [fence], where the guard alone minds obstacles."""
+    """Create the surroundings that DISCO avoids; None without [fence], where the guard alone minds obstacles."""
     if config.fence == Fence():
         return None
     around = Surroundings(
@@ -225,7 +225,7 @@ def driver_of(config: RobotConfig, key: bytes | None = None) -> Driver:
 
 
 def preflight(config: RobotConfig, driver: Driver, with_task: bool = True) -> tuple[str, ...]:
-    """What robot.toml asks that the robot's firmware or its wheels do not allow, in words; empty if they agree."""
+    """Return, in words, what robot.toml requests beyond the limits of firmware or wheels; empty if they agree."""
     if driver.limits is None:
         return ()
     checks = check_firmware_limits(config.robot, driver.limits)

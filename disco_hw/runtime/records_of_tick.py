@@ -1,4 +1,4 @@
-"""What is recorded of one tick."""
+"""Records for the log that are made of one tick."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _FAN_DIGITS = 3
 
 
 def frames_in(frames: Sequence[ReceivedFrame]) -> Iterator[records.Record]:
-    """The frames received."""
+    """Yield one record for each received frame."""
     for received in frames:
         yield records.FrameIn(received.t_ns, socketcan_id(received.frame), received.frame.data)
 
@@ -49,7 +49,7 @@ def controller(now_ns: int, identity: Identity, limits: Limits) -> records.Recor
 
 
 def samples(readings: Readings) -> Iterator[records.Record]:
-    """What the received frames meant."""
+    """Yield the samples that the received frames contained."""
     yield from readings.wheels
     yield from readings.poses
     yield from readings.motors

@@ -75,7 +75,7 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class ReplayReport:
-    """How many ticks and values were compared, and where they first differ (None if nowhere)."""
+    """Result of a replay: how many ticks and values were compared, and where they first differ (None if nowhere)."""
 
     ticks: int
     values: int

@@ -1,4 +1,4 @@
-"""What one robot is and has to do: its files, read and checked together, and what a person changes of its task.
+"""Setup of one robot: its files, read and checked together, and what an operator changes of its task.
 
 The files lie where robot.toml says, or in a log that carries them. A changed task is in the status, in the log and in
 force; it is pure.
@@ -226,7 +226,7 @@ def task_in_status(asked: Mapping[str, Any], robots: RobotTask) -> RobotTask | N
 
 @lru_cache(maxsize=4)
 def digest_of(read: tuple[object, ...]) -> str:
-    """A few letters that are the same for the same contents of a task's file only."""
+    """Return a 16-digit hash of the contents of a task's file."""
     return hashlib.sha256(msgspec.json.encode(read)).hexdigest()[:16]
 
 

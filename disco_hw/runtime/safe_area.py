@@ -1,4 +1,4 @@
-"""What the daemon's tick knows of fence and obstacles: who reported what, the override, and what to say of it; pure."""
+"""Pure state of fence, obstacles and override in the daemon's tick, with what to report of them."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ class SafeArea:
         return "the fence is changed until the daemon ends; write it into robot.toml to keep it"
 
     def status(self, now_ns: int) -> dict[str, Any]:
-        """What the daemon's status says of fence and obstacles."""
+        """Return the entries for fence and obstacles of the daemon's status."""
         return {
             "fence": msgspec.to_builtins(self.fence),
             "footprint_m": msgspec.to_builtins(self.footprint),

@@ -41,7 +41,7 @@ _PROBLEM = PROBLEM.value
 
 
 class UserRequest(enum.Enum):
-    """What a person can ask of the daemon."""
+    """Requests that an operator can make of the daemon."""
 
     ARM = "arm"
     ARM_UNRECORDED = "arm_unrecorded"
@@ -107,7 +107,7 @@ class Reply(msgspec.Struct, frozen=True, gc=False):
 
 
 class Output(msgspec.Struct, frozen=True, gc=False):
-    """What holds for this tick.
+    """Decision of the supervisor for one tick.
 
     `driver_request`: to be handed to the driver; None leaves the last one. `motion_allowed`: the plan may drive the
     wheels. `zero_only`: the command ramps to zero and stays there. Neither: no wheel command is sent. `send_estop`:
@@ -272,7 +272,7 @@ class Supervisor:
         return self._pose_fault(inputs)
 
     def _pose_fault(self, inputs: Inputs) -> str | None:
-        """What of the pose keeps the task from being followed; nothing while nobody follows it."""
+        """Return why the pose does not allow the task to be followed; None if it does, or while driven by hand."""
         if inputs.by_hand:
             return None
         if inputs.pose_jump:
