@@ -1,4 +1,4 @@
-"""`disco-hw check`: is everything ready to drive? Looks and asks; nothing moves and nothing is armed."""
+"""Check for `disco-hw check` that everything is ready to drive, without moving or arming anything."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """What the robot answered; `pose_news` is the newest that the pose source said of itself, empty for nothing."""
+    """Replies of the robot during a check; `pose_news` is the pose source's newest message, empty if there is none."""
 
     state: DriverState
     detail: str
@@ -256,7 +256,10 @@ def pose_source_checks(source: PoseInput, poses: Sequence[PoseSample]) -> list[C
 
 
 def _apart(one: Sequence[PoseSample], other: Sequence[PoseSample]) -> str:
-    """How far two sources differ, by the medians of what they said of a robot that stands; empty where they agree."""
+    """Describe the offset between two pose sources; empty if they agree.
+
+    Medians taken while the robot stands still are compared.
+    """
     if not one or not other:
         return ""
     dx, dy = (median(getattr(pose, name) for pose in one) - median(getattr(pose, name) for pose in other)

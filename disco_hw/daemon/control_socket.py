@@ -72,7 +72,9 @@ class _Client:
 
 
 class ControlServer:
-    """The daemon's end. `poll()` for requests in each tick, e-stop first; `reply()` to each.
+    """Server of the control socket: `poll()` for requests in each tick, e-stop first; `reply()` to each.
+
+    `poll()` for requests in each tick, e-stop first; `reply()` to each.
 
     Raises InputError if another daemon serves this socket, or the path cannot be used. What a dead daemon left behind
     is replaced: a record lock shows whether one lives, which the kernel drops with the process, however it ends.
@@ -336,7 +338,7 @@ def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> d
 
 
 def _poses(core: DaemonCore) -> list[dict[str, Any]]:
-    """Each pose source: its frame and place on the robot, and how it does."""
+    """Return the status of each pose source: its frame and place on the robot, and how it does."""
     tick, sources = core.last, core.pipeline.fusion.sources
     found = sources.status(0 if tick is None else tick.pipeline.t_ns)
     return [

@@ -228,7 +228,7 @@ def _progress(text: str) -> None:
 
 
 def _log_path(config: RobotConfig, log_file: Path | None) -> Path | None:
-    """Where is recorded to; None if nothing is."""
+    """Return the path of the log; None if nothing is recorded."""
     if log_file is not None or not config.log.enabled:
         return log_file
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
@@ -389,7 +389,7 @@ def compile_beforehand(robot: Path, model: Path | None, say: Callable[[str], Non
 
 
 def planner_in_words(setup: Setup) -> str:
-    """What a planner is compiled for."""
+    """Describe the planner that is compiled for a setup, with the model's effects."""
     effects = ", ".join(effect.name for effect in setup.model.effects)
     return f"the planner for this task{f' and a model with {effects}' if effects else ''}"
 
