@@ -1,4 +1,4 @@
-"""What a drive has excited so far, and what is still missing for inference and the search for gaps; pure.
+"""Coverage of a drive: what has been excited so far, and what inference and the search for gaps still miss; pure.
 
 The list is what separates pairs of parameters and effects that look the same otherwise: both turning directions, two
 speeds, backwards, starts and stops, steering, slow ramps through zero, rests.
@@ -37,7 +37,7 @@ class Item:
         return self.found >= self.wanted
 
     def in_words(self) -> str:
-        """Name and amounts."""
+        """Return the name with the found and the wanted amount as text."""
         unit = "" if self.unit == "times" else f" {self.unit}"
         return f"{self.name} {min(self.found, self.wanted):.0f}/{self.wanted:.0f}{unit}"
 
@@ -104,7 +104,7 @@ class Coverage:
             self._count_crossings(t_ns, dt_s, wheel, speed)
 
     def pause(self) -> None:
-        """Driving stops here: nothing is counted across the pause."""
+        """Interrupt the counting, so that nothing is counted across a pause of the drive."""
         self._t_ns = self._still_ns = self._quick_ns = self._swing = None
         self._crossing = [None, None]
 
@@ -115,7 +115,7 @@ class Coverage:
         return (*seconds, *times)
 
     def missing(self) -> tuple[Item, ...]:
-        """What there is too little of."""
+        """Return the items of which too little has been driven."""
         return tuple(item for item in self.items() if not item.covered)
 
     def in_words(self) -> str:
@@ -128,7 +128,7 @@ class Coverage:
         return f"{done}; missing: {', '.join(item.in_words() for item in missing[:4])}{more}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything for machines; `missing` holds names."""
+        """Return the coverage as a JSON-serialisable dict; `missing` holds names."""
         return {
             "driven_s": round(self.driven_s, 3),
             "items": [

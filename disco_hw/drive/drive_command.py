@@ -67,7 +67,7 @@ class DriveOptions:
 
 @dataclass(frozen=True, slots=True)
 class DriveResult:
-    """How a drive went: its log, what was excited, why it ended, whether that was as wanted, what of the log was lost.
+    """Result of a drive: its log, what was excited, why it ended, whether it was completed, what of the log was lost.
 
     `recording_errors`: sentences, if the log does not prove by its end that every tick is in it; with any of them the
     drive is not `completed`, as it was made for its log.
@@ -152,7 +152,7 @@ def _script(options: DriveOptions, config: RobotConfig) -> Script | None:
 
 
 def _announcement(options: DriveOptions, config: RobotConfig, script: Script | None) -> list[str]:
-    """What is said before anything moves."""
+    """Return the lines that are printed before anything moves."""
     lines = []
     if script is not None:
         room = room_needed(script.at, script.duration_s, config.robot)

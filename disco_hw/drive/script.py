@@ -1,4 +1,4 @@
-"""A scripted drive: manoeuvres one after the other, each wheel speeds as a function of time; pure.
+"""Scripted drive of manoeuvres one after the other, each wheel speeds as a function of time; pure.
 
 Manoeuvres are shares of the largest wheel speed that the robot reaches, which is measured first: the fastest, both
 ways, straight and turning. The script's clock runs while the robot is driven; the deadman is somebody else's.
@@ -36,7 +36,7 @@ class Manoeuvre:
 
 @dataclass(frozen=True, slots=True)
 class Script:
-    """Manoeuvres in order; raises ValueError without any."""
+    """Sequence of named manoeuvres; raises ValueError without any."""
 
     name: str
     manoeuvres: tuple[Manoeuvre, ...]
@@ -78,7 +78,7 @@ class Script:
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """Where a drive leads from its start, x forward and y left (m)."""
+    """Extent of a drive from its start, x forward and y left (m)."""
 
     x_m: tuple[float, float]
     y_m: tuple[float, float]
@@ -122,7 +122,7 @@ REST_S = 0.6
 
 
 def rest(duration_s: float = REST_S, purpose: str = "separates what comes before from what comes after") -> Manoeuvre:
-    """Stand still."""
+    """Create a manoeuvre that stands still."""
     return Manoeuvre("rest", purpose, duration_s, lambda _t_s: (0.0, 0.0))
 
 
@@ -142,7 +142,7 @@ class Pieces:
         return Manoeuvre(name, purpose, duration_s, wheels)
 
     def hold(self, name: str, purpose: str, duration_s: float, forward: float, turn: float) -> Manoeuvre:
-        """Constant shares."""
+        """Create a manoeuvre of constant shares."""
         return self.play(name, purpose, duration_s, lambda _t_s: (forward, turn))
 
     def each(self, purpose: str, *held: tuple[str, float, float, float]) -> list[Manoeuvre]:
@@ -151,7 +151,7 @@ class Pieces:
 
     @staticmethod
     def rest(duration_s: float = REST_S) -> Manoeuvre:
-        """Stand still."""
+        """Create a manoeuvre that stands still."""
         return rest(duration_s)
 
 
@@ -191,7 +191,7 @@ class ScriptSource:
 
     @property
     def words(self) -> str:
-        """How far it is; what to do where nothing moves."""
+        """Text for the operator on the script's progress, and on what to do where nothing moves."""
         progress = f"{self._driven_ns * 1e-9:.0f} of {self._script.duration_s:.0f} s"
         manoeuvre = self._manoeuvre
         name = "" if manoeuvre is None else f", {manoeuvre.name}"
@@ -283,12 +283,12 @@ class Unattended:
 
     @property
     def completed(self) -> bool:
-        """It never ends by itself as it should."""
+        """Always False, because it never ends by itself as it should."""
         return False
 
     @property
     def words(self) -> str:
-        """What it waits for."""
+        """Text for the operator on what it waits for."""
         return "unattended: waiting for the robot" if self._pressed_ns is None else "unattended: deadman held"
 
     @property
@@ -297,7 +297,7 @@ class Unattended:
         return ""
 
     def poll(self, now_ns: int, robot: RobotView) -> ManualInput | None:
-        """The deadman; speeds are zero."""
+        """Return the deadman's state, with wheel speeds of zero."""
         if self._first_ns is None:
             self._first_ns = now_ns
         held = self._pressed_ns is not None and self._ended is None
@@ -344,7 +344,7 @@ class ReachedLimits:
                 self._asked[wheel, wanted > 0.0] = wanted
 
     def share(self, wheel: int, *, forward: bool) -> float:
-        """Of the speed asked for, in [0, 1], for wheel 0 (left) or 1 (right)."""
+        """Return the reached share, in [0, 1], of the requested speed of wheel 0 (left) or 1 (right)."""
         found = [median(shares) for shares in self._shares[wheel, forward].values()]
         least = min(found, default=_LARGEST)
         return _LARGEST if not least < KEPT else max(0.0, least)

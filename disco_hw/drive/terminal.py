@@ -126,7 +126,7 @@ class KeyHold:
         self._last_ns = event.t_ns
 
     def at(self, now_ns: int) -> ManualInput:
-        """What is held now."""
+        """Return the wheel speeds and the deadman at a time."""
         if self._last_ns is None:
             self._last_ns = now_ns
         if self._state is _Hold.HELD and now_ns - self._last_ns > self._limit_ns:
@@ -217,11 +217,11 @@ class Keyboard:
 
     @property
     def task(self) -> str:
-        """A person decides."""
+        """Always empty, because the operator decides."""
         return ""
 
     def poll(self, now_ns: int, _robot: RobotView) -> ManualInput | None:
-        """What is held, after all that has been typed."""
+        """Return the wheel speeds and the deadman after all keys typed so far; None once the terminal is gone."""
         self._take(now_ns)
         if self._gone:
             return None
@@ -337,7 +337,7 @@ def _wait_for(socket: Path) -> None:
 
 
 def _status(socket: Path) -> Mapping[str, Any] | None:
-    """The daemon's status; None without a daemon that is driven by hand."""
+    """Return the daemon's status; None without a daemon that is driven by hand."""
     try:
         status = send_request(socket, {"do": "status"})
     except WorkError:
