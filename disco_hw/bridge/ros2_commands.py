@@ -1,4 +1,4 @@
-"""What the bridge hears of commands: /cmd_vel as a hand on the pad of `drive --ros2`, and requests as those of `ctl`.
+"""Commands that the bridge receives: /cmd_vel as a hand on the pad of `drive --ros2`, and requests as those of `ctl`.
 
 A speed drives for 0.2 s from when it was sent, and only after arming was asked for while speeds were coming. A silence
 disarms; then arming has to be asked for again.
@@ -119,7 +119,7 @@ class DaemonPad:
             self.close()
 
     def close(self) -> None:
-        """Hang up; safe to call twice."""
+        """Close the connection to the daemon; safe to call twice."""
         if self._connection is not None:
             self._connection.close()
             self._connection, self._rest = None, b""
@@ -164,7 +164,7 @@ class Errands:
         self._pool.submit(work, words).add_done_callback(lambda _: self._room.release())
 
     def close(self) -> None:
-        """Begin nothing more; safe to call twice."""
+        """Start no more errands; safe to call twice."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
 

@@ -1,4 +1,4 @@
-"""What the bridges hear of poses and wheels: a message of ROS 2 as what goes to the daemon, or why it is none; pure.
+"""Poses and wheel data that the bridges receive: each ROS 2 message as data for the daemon, or why it is refused; pure.
 
 A message's stamp is wall-clock time, the daemon's time is monotonic: an age says the same in both. An Odometry has been
 through the base's own kinematics: its way and turn are taken back to wheels by the nominal geometry. Distances are
@@ -73,7 +73,7 @@ class PoseInlet:
         return msgspec.msgpack.encode(pose)
 
     def news(self) -> list[str]:
-        """What a person should know since the last call."""
+        """Return messages for the operator since the last call."""
         return self._publishers.news()
 
     def _judge(
@@ -171,11 +171,11 @@ class TransformInlet:
                     yield pose
 
     def news(self) -> list[str]:
-        """What a person should know since the last call."""
+        """Return messages for the operator since the last call, of all transforms."""
         return [words for one in self._publishers.values() for words in one.news()]
 
     def _publishers_of(self, child: str) -> SenderGate:
-        """Who moves the edge to this frame; there are no more than edges are kept."""
+        """Return the gate of the publishers that move the edge to this frame; there are no more than edges are kept."""
         return self._publishers.setdefault(child, SenderGate(self._silence_s))
 
     def _keep(self, parent: str, child: str, t_ns: int, values: tuple[float, ...], *, static: bool) -> bool:
@@ -307,7 +307,7 @@ class WheelInlet:
         return angles, ((angles[0] - before[0]) / elapsed_s, (angles[1] - before[1]) / elapsed_s)
 
     def _of_pose(self, message: msg.Odometry) -> tuple[Both, Both]:
-        """Where an ideal base with this geometry would have turned its wheels to."""
+        """Return the wheel angles and speeds of an ideal base with this geometry that drove this odometry."""
         pose = _planar(message)
         angles = (0.0, 0.0) if self._before is None else self._before.angles_rad
         if self._pose is not None:

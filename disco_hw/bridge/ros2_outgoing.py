@@ -1,4 +1,4 @@
-"""What the bridge says: the daemon's records as messages of ROS 2; pure.
+"""Conversion of the daemon's records into the ROS 2 messages that the bridge publishes; pure.
 
 `odom` is dead reckoning by the wheels alone, so that it never jumps (REP 105); what the estimator makes of wheels and
 poses together goes out as `disco_hw/pose` in the map's frame.
@@ -68,9 +68,10 @@ class Outgoing:
         self._counters: records.Counters | None = None
 
     def messages(self, received: Sequence[tuple[int, records.Record]], wall_offset_ns: int) -> Iterator[Message]:
-        """What to say of these records; of wheels, estimates and plans only the newest. Wall minus monotonic time.
+        """Yield the messages for these records; of wheels, estimates and plans only the newest.
 
-        Odometry comes first, and each is made when it is asked for: a plan takes longer than all others together.
+        `wall_offset_ns`: wall minus monotonic time. Odometry comes first, and each is made when it is asked for: a plan
+        takes longer than all others together.
         """
         states: list[Message] = []
         wheels: WheelSample | None = None
@@ -101,7 +102,10 @@ class Outgoing:
             yield PLAN, self._path(plan, plan.t_ns + wall_offset_ns)
 
     def diagnostics(self, now_wall_ns: int, heard: bool, bridge: Mapping[str, str], wrong: str) -> Message:
-        """How daemon and bridge are. `heard`: the daemon, of late; `wrong`: what the bridge has to complain of."""
+        """Return the diagnostics of daemon and bridge.
+
+        `heard`: whether the daemon was heard lately; `wrong`: what is wrong with the bridge, or empty.
+        """
         state = self._state
         if not heard or state is None:
             daemon = msg.DiagnosticStatus(_SILENT, "disco-hw: daemon", "no daemon found; start it with disco-hw run")
