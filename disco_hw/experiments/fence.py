@@ -1,4 +1,4 @@
-"""The fence, tried: random rooms with tasks, wild manual drives, and planners alone in tight rooms.
+"""Trials of the fence: random rooms with tasks, wild manual drives, and planners alone in tight rooms.
 
 Each drive is one line of `drives.jsonl`, so that a campaign that was broken off goes on where it was. The kinds of
 drives that `tools/fence_peers.py` adds (another controller, another simulation) stand in the same table.
@@ -53,7 +53,7 @@ _POSES_EVERY = 5
 
 @dataclass(frozen=True, slots=True)
 class FenceOptions:
-    """How many of each, how far the true parameters are off, and how long a drive is (s)."""
+    """Options of the trials: how many of each, how far the true parameters are off, and how long a drive is (s)."""
 
     rooms: int = 200
     manual: int = 200
@@ -161,7 +161,7 @@ class Campaign:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FenceResult:
-    """What was driven: with the guard, and by the planner alone under each kind of belief."""
+    """Results of all drives: with the guard, and by the planner alone under each kind of belief."""
 
     options: FenceOptions
     drives: dict[str, list[DriveLine]]

@@ -44,7 +44,7 @@ _WALL_M_S = 0.3
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FencedDrive:
-    """One drive: its fence, the true poses (N, 3), the least true clearance (m), and the guard's stops.
+    """Record of one drive: its fence, the true poses (N, 3), the least true clearance (m), and the guard's stops.
 
     `left_m`: the true clearance at rest after each of the guard's stops; `stops`: how often it stopped. `way_m`: how
     far the tracked point went.
@@ -71,7 +71,7 @@ class _Hand:
 
     @property
     def done(self) -> bool:
-        """It drives until it is left off."""
+        """Always False, because it drives until the run is over."""
         return False
 
     def step(self, now_ns: int, last: CoreTick | None) -> PilotTick:
@@ -79,14 +79,14 @@ class _Hand:
         return PilotTick(motion=Manual(*self.wheels), by_hand=True)
 
     def learn(self, now_ns: int, tick: CoreTick, replies: Any) -> None:
-        """Nothing is learnt."""
+        """Ignore the tick, because wheel speeds are set from outside."""
 
     def steer(self, now_ns: int, page: int, wanted: Any) -> str | None:
-        """No page drives."""
+        """Refuse a page's steering, because an experiment drives."""
         return "driven by an experiment"
 
     def status(self) -> dict[str, Any]:
-        """Nothing is added."""
+        """Return an empty dict: the status gets no more entries."""
         return {}
 
 
@@ -94,7 +94,7 @@ class _Overridden(SafeArea):
     """Fence and obstacles of a robot whose planner knows them and whose guard is overridden throughout."""
 
     def begin(self, now_ns: int, by_hand: bool) -> bool:
-        """As of the base class, and overridden."""
+        """Begin a tick as the base class does, and return that the guard is overridden."""
         super().begin(now_ns, by_hand)
         return True
 
@@ -155,7 +155,7 @@ def _drive(
     run: SimulatedRun, seconds: float, fence: Fence, hand: Callable[[float, CoreTick], None] = lambda t_s, tick: None,
     learning_s: float = 0.0,
 ) -> FencedDrive:  # fmt: skip
-    """Follow a run: true poses and clearances, and the guard's stops with what was left when the robot stood.
+    """Follow a run and record true poses and clearances, and the guard's stops with what was left when the robot stood.
 
     What happens in the first `learning_s` does not count.
     """
@@ -249,7 +249,7 @@ def tight_room(rng: np.random.Generator, beside_m: float) -> tuple[Fence, Circle
 
 
 def _outer_m(radius_m: float) -> float:
-    """How far from a circle's centre the footprint reaches that drives on it."""
+    """Return how far (m) from the circle's centre a footprint reaches that drives on the circle."""
     return max(math.hypot(radius_m + y, x) for x, y in FOOTPRINT.corners_m())
 
 

@@ -56,7 +56,7 @@ CURVES = PAPER_CURVES | ABLATION
 
 @dataclass(frozen=True, slots=True)
 class PendulumOptions:
-    """How often and how long: `seeds` seeds from `seed_offset` on, `steps` of 0.05 s, spread of the sigma points."""
+    """Options of the experiment: `seeds` seeds from `seed_offset` on, `steps` of 0.05 s, spread of the sigma points."""
 
     seeds: int = 50
     steps: int = 200

@@ -1,4 +1,4 @@
-"""`disco-hw sim`: the virtual robot of a robot.toml, its true parameters from the model and what the user hides."""
+"""Virtual robot of `disco-hw sim`, with true parameters from the model of robot.toml and from what the user hides."""
 
 from __future__ import annotations
 
