@@ -31,7 +31,7 @@ class ScoreTest:
 
     @property
     def meaning(self) -> str:
-        """What it would look like, in words."""
+        """Description of what the deviation would look like."""
         return self.symptom.value
 
     @property
@@ -154,7 +154,9 @@ _EDGE_WIDTH = 0.1
 
 @dataclass(frozen=True)
 class Predictive:
-    """`deviations` (13,): how far the log's value of each of `CHECKS` is from the simulated ones, in their standard
+    """Comparison of the log with simulations under the posterior.
+
+    `deviations` (13,): how far the log's value of each of `CHECKS` is from the simulated ones, in their standard
     deviations; `estimate_deviations` (3,) the same for the estimates of wheel radius, x_icr and kappa. `edge` names
     parameters whose posterior is pressed against the prior's edge. `unexplained` is the part of the motion that counts
     as noise, and that no comparison with simulations which have that noise could find.
@@ -246,7 +248,7 @@ class Calibration:
 
 
 def widening(fitted: Fitted, simulate: Simulate, draws: Array, seed: int) -> Array:
-    """How many times wider (P,) the network's posteriors have to be to hold what is known as often as they say.
+    """Return the factors (P,) that widen the network's posteriors to hold the truth as often as they state.
 
     Simulates at `draws` (n, P) of the posterior: root mean square of what was simulated minus the mean that the network
     gives, over its standard deviation.
@@ -280,7 +282,7 @@ def calibrate(fitted: Fitted, simulate: Simulate, count: int, seed: int) -> Cali
 
 
 def effective_simulations(fitted: Fitted, observed: Array) -> float:
-    """How many simulations of the last region the posterior rests on: (sum w)^2 / sum w^2 with w its density there."""
+    """Return how many simulations of the last region the posterior rests on: (sum w)^2 / sum w^2, w its density."""
     mixtures = fitted.posteriors(observed[None])
     log_weight = mixtures.log_density(fitted.region.unit(fitted.theta)[None])[0]
     weight = np.exp(log_weight - log_weight.max())
@@ -306,8 +308,10 @@ PAPER = (
 
 @dataclass(frozen=True, slots=True)
 class Driven:
-    """How far the wheels rolled (rad, mean of both) straight ahead, in reverse; their difference in left and right
-    turns (rad); and whether nearly all of the motion was at one speed and one turn.
+    """Summary of the motion in a log.
+
+    How far the wheels rolled (rad, mean of both) straight ahead, in reverse; their difference in left and right turns
+    (rad); and whether nearly all of the motion was at one speed and one turn.
     """
 
     straight_rad: float

@@ -29,7 +29,9 @@ class Whitening(NamedTuple):
 
 
 def whitening(drive: Excitation, sensor: float, slip: float, grown_s: Array) -> Whitening:
-    """Factor for increments with the sensor's standard deviation and the slip per square root of second of its clock,
+    """Return the factor that makes increments of poses independent.
+
+    It is for increments with the sensor's standard deviation and the slip per square root of second of its clock,
     `grown_s` (P,) from pose to pose.
     """
     variance = 2.0 * sensor**2 + slip**2 * grown_s

@@ -72,8 +72,10 @@ FOURIER_FEATURES = 200
 
 @dataclass(frozen=True, slots=True)
 class InferOptions:
-    """`paper`: the paper's statistics, commands as input, one round; `simulations`: over all rounds, None for 3000
-    (paper: 1000).
+    """Options of the inference.
+
+    `paper`: the paper's statistics, commands as input, one round; `simulations`: over all rounds, None for 3000 (paper:
+    1000).
 
     `random_features` and `cross_correlation` are BayesSim's other density and statistics, for `paper` alone: a mixture
     on random Fourier features (MDRFF) in place of the network, and steps of the state against actions.
@@ -88,7 +90,7 @@ class InferOptions:
 
 @dataclass(frozen=True)
 class Inference:
-    """What the log says: posterior `draws` (D, 3) in the order of `NAMES`, the same as a belief, and how it came about.
+    """Result of the inference: posterior `draws` (D, 3) in the order of `NAMES`, the same as a belief, and its origin.
 
     `observed` (S,) are the log's statistics; `outside_region` is the share of the network's posterior that fell outside
     the region it was trained on; `effective_simulations` is how many the posterior rests on.
@@ -252,9 +254,10 @@ _SMALLEST_SCALE = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class NoiseSpread:
-    """Noise without the bias of its measurement, and `factor` (7, 7), lower triangular, of the covariance of its
-    logarithms, and of its lever, in the order of `Noise.scales`; `fit_std` (3,) is the scatter of the plain estimates
-    of the parameters.
+    """Noise without the bias of its measurement, and its uncertainty.
+
+    `factor` (7, 7), lower triangular, is of the covariance of its logarithms, and of its lever, in the order of
+    `Noise.scales`; `fit_std` (3,) is the scatter of the plain estimates of the parameters.
     """
 
     noise: Noise
