@@ -1,4 +1,4 @@
-"""Logs: what is recorded, how it gets to the disk without disturbing the loop, and how it is read again.
+"""Recording and reading of logs: what is recorded, how it gets to the disk without disturbing the loop, how it is read.
 
 Here what every log begins with (`Start`), and what recorder, keeper and writer say to each other. The recorder hands
 records to the writer over a stream socket, one frame a tick, and the writer answers on the same socket with how far it
@@ -100,7 +100,7 @@ class End(msgspec.Struct, frozen=True):
 
 
 class WriterStatus(msgspec.Struct, frozen=True):
-    """How the writer is doing: what is in its file, and the error that ended it, if any.
+    """State of the log writer: what is in its file, and the error that ended it, if any.
 
     All ticks up to number `sequence` that were sent are in the file, apart from `refused` records. `deleted`: the file
     was removed, and all that was in it with it.

@@ -94,7 +94,7 @@ class AttachmentRef:
 
 @dataclass(slots=True)
 class Contents:
-    """What a file holds.
+    """Contents of an MCAP file: its index of schemas, channels, chunks, attachments and metadata.
 
     `complete` is False when the index at the end is missing or unusable; then every chunk listed has been checked.
     `damage` says in words what was passed over.
@@ -170,7 +170,7 @@ def _with_unlisted(contents: Contents, count: int) -> Contents:
 
 
 def _next_chunk(fd: int, start: int, size: int) -> int | None:
-    """Where the next chunk record seems to begin at or after `start`: its content has a name of compression in it."""
+    """Return where the next chunk record seems to begin at or after `start`, found by the name of its compression."""
     at = start + _CHUNK_MARK_AT
     while at < size:
         try:

@@ -29,7 +29,7 @@ from drivers.types import SAID_BY_WORDS, Identity, SaidBy
 
 
 def info(path: Path, as_json: bool) -> str:
-    """Summarise a log: its contents and what of it is lost. Raises LogError."""
+    """Summarise the contents of a log and what of it is lost. Raises LogError."""
     with open_log(path) as log:
         summary = log.summary()
         if as_json:

@@ -390,7 +390,7 @@ class McapLog:
         self._writer.add_metadata(ENDING, ending.as_text())
 
     def finish(self) -> None:
-        """Write the index; nothing can be written after it."""
+        """Finish the file with its index; nothing can be written after it."""
         self.flush()
         self._writer.finish()  # type: ignore[no-untyped-call]
 

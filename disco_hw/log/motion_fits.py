@@ -1,4 +1,4 @@
-"""Fits between increments: wheels to poses, commands to wheels, and how well each explains what was measured."""
+"""Robust fits between increments, wheels to poses and commands to wheels, and how well each explains the data."""
 
 from __future__ import annotations
 

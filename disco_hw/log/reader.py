@@ -136,7 +136,7 @@ class LogSummary(msgspec.Struct, frozen=True):
 
 
 class Log:
-    """An open log; use it in a `with` statement. Times are monotonic ns unless the name says wall.
+    """Open log, to be used in a `with` statement. Times are monotonic ns unless the name says wall.
 
     Reading raises LogError on a damaged chunk of a log that is complete otherwise; of a log without its index the
     damaged chunks have been left out already, and `damage` says so.
@@ -169,7 +169,7 @@ class Log:
         self.close()
 
     def close(self) -> None:
-        """Close the file; safe to call twice."""
+        """Close the log's file; safe to call twice."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1

@@ -95,7 +95,7 @@ class NullRecorder:
     """Recorder that discards every record, for drives without a log."""
 
     def put(self, now_ns: int, records: Sequence[Record]) -> None:
-        """Discard the records."""
+        """Discard the records of a tick."""
 
     def poll(self) -> RecorderStats:
         """Return counters that are all zero."""

@@ -1,4 +1,4 @@
-"""What a log holds: one frozen record type for each topic, the one source of its content and of its schema.
+"""Record types of a log: one frozen type for each topic, the one source of its content and of its schema.
 
 Every record carries `t_ns`, the monotonic host time at which it was true. Left before right, x forward, y left, yaw
 counter-clockwise; SI units. Fields are plain on purpose (numbers, text, flat tuples, string-keyed counts): viewers
@@ -203,7 +203,7 @@ class Adaptation(msgspec.Struct, frozen=True, gc=False):
 
 
 class Fan(msgspec.Struct, frozen=True, gc=False):
-    """Some of the sequences that the plan made at `t_ns` was weighed from, rolled out under the mean parameters.
+    """Sampled sequences that the plan made at `t_ns` was weighted from, rolled out under the mean parameters.
 
     One path for each of `weights`, which are shares of all samples' total, the largest first. `x_m` and `y_m` hold the
     paths one after the other, of equally many points each, to the millimetre.
@@ -266,7 +266,7 @@ class UnexplainedMotion(msgspec.Struct, frozen=True, gc=False):
 
 
 class GuardVerdict(msgspec.Struct, frozen=True, gc=False):
-    """What the fence guard made of the command of one tick, while there is a fence or an obstacle.
+    """Verdict of the fence guard on the command of one tick, while there is a fence or an obstacle.
 
     `scale`: of the requested command that was let through. `clearance_m`: least along the stopping path after it, less
     the uncertainty of the pose. The rest in every fifth tick: that path of the tracked point, and the obstacles as x, y

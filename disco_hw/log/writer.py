@@ -78,7 +78,7 @@ class LogFile:
         self._written = self._whole
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file of the log."""
         os.close(self._fd)
 
 

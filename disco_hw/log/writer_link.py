@@ -116,7 +116,9 @@ _BUFFER_BYTES = 1 << 20
 
 
 class KeeperLink:
-    """A keeper process: starts writers that begin their logs with `start`. Raises LogError if it cannot be started.
+    """Link to a keeper process, which starts writers that begin their logs with `start`.
+
+    Raises LogError if it cannot be started.
 
     `pid` is the newest writer's, 0 until it is known; `code` how that one ended, negative for a signal.
     """

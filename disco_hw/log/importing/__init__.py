@@ -1,4 +1,4 @@
-"""`disco-hw import`: a foreign log -> our MCAP log.
+"""Import of logs in foreign formats into our MCAP log, for `disco-hw import`.
 
 The formats are modules here, each with a `FORMAT`, recognised by their first bytes. A format gives the arrays of a
 drive; here they become records of the log; `drive_from_log` reads the same arrays from it again.
@@ -38,7 +38,7 @@ LONGEST_BEGIN_BYTES = 64
 
 @dataclass(frozen=True, slots=True)
 class LogFormat:
-    """One format: `recognises` says of the first bytes of a file (64 at most) whether it is this one.
+    """Format of a foreign log: `recognises` tells from the first bytes of a file (64 at most) whether it is this one.
 
     `read` takes path and robot.toml and returns the arrays of the drive; it raises LogError with one line
     that names the file, the place and the remedy. Of two formats that recognise a file the one with the lower `order`

@@ -47,7 +47,7 @@ _RESOLUTION = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Unwrapped:
-    """Counts made continuous: `values` (N,); `span` that was taken out `wraps` times, 0 if the counts did not wrap.
+    """Counts of an encoder made continuous: `values` (N,); `span` that was taken out `wraps` times, 0 without wraps.
 
     `uncertain` (N,) marks values before which so much time passed that the number of wraps is not known. `fault` says
     why the counts cannot be made continuous, and is empty if they can.

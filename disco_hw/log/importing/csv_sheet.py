@@ -46,7 +46,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """A file's columns: times (N,) from 0 on, segments (N,), and cells (N,) with NaN where there is no sample."""
+    """Columns of a CSV file: times (N,) from 0 on, segments (N,), and cells (N,) with NaN where there is no sample."""
 
     name: str
     t_s: Array

@@ -305,7 +305,7 @@ def _expired(t_ns: Index, speeds: Array) -> tuple[Index, Array]:
 
 
 def _pauses(wheel_ns: Index, others: Sequence[Index]) -> Index:
-    """Where nothing is known of the wheels for half a second; without wheels, of anything for two."""
+    """Return the times (ns) after gaps: half a second without wheel data; without any, two seconds without anything."""
     if wheel_ns.size:
         return wheel_ns[1:][np.diff(wheel_ns) > LONGEST_SILENCE_NS]
     all_ns = np.sort(np.concatenate(others))

@@ -75,7 +75,7 @@ class Undecoded:
 
 @dataclass(frozen=True)
 class Bag:
-    """An open bag; its messages can be read as often as wanted."""
+    """Open bag, whose messages can be read any number of times."""
 
     path: Path
     topics: dict[str, BagTopic]
@@ -139,7 +139,7 @@ class DamagedBagError(LogError):
 
 @contextmanager
 def open_bag(path: Path, *, salvage: bool = False) -> Iterator[Bag]:
-    """Open a bag: a folder, its metadata.yaml, or one .mcap, .db3 or .bag; raises LogError and InputError.
+    """Open a bag, which is a folder, its metadata.yaml, or one .mcap, .db3 or .bag; raises LogError and InputError.
 
     A folder whose metadata.yaml is missing or wrong is read by its files. Raises DamagedBagError where a file cannot be
     read; with `salvage` whatever is whole of each file is copied to a temporary place and read from there.

@@ -1,4 +1,4 @@
-"""What is whole of a damaged bag -> a new file that `rosbags` can read.
+"""Salvage of a damaged bag: all that can be read is copied to a new file that `rosbags` can read.
 
 A recording that ended in a power cut has no index, and a last chunk that is not whole. Its records are read one after
 the other until the damage, and also after a chunk that does not match its checksum or cannot be unpacked.

@@ -55,7 +55,10 @@ class TopicCandidate:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What is read; an empty topic is a role that nothing serves. `edges` lead from the map to the robot, if by tf."""
+    """Choice of the topics to read; an empty topic is a role that nothing serves.
+
+    `edges` lead from the map to the robot, if by tf. `edges` lead from the map to the robot, if by tf.
+    """
 
     table: tuple[TopicCandidate, ...]
     edges: tuple[Edge, ...]
