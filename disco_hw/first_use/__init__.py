@@ -120,7 +120,7 @@ class InitOptions:
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """What was recognised on a link: the driver, the fields in [link] that its frames show, a serial line's speed."""
+    """Result of listening on a link: the driver, the fields in [link] that its frames show, a serial line's speed."""
 
     driver: str
     fields: dict[str, Any]

@@ -1,4 +1,4 @@
-"""`disco-hw commission`: the guided first drive over the daemon's own path, what it found, and robot.toml mended."""
+"""Guided first drive of `disco-hw commission` over the daemon's own path, its findings, and robot.toml corrected."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class CommissionOptions:
 
 @dataclass(frozen=True, slots=True)
 class CommissionResult:
-    """What was found, by stage: figures, faults with whether they were mended, and the logs."""
+    """Result of commissioning by stage: figures, faults with whether they were corrected, and the logs."""
 
     stages: tuple[dict[str, Any], ...]
     ok: bool

@@ -1,4 +1,4 @@
-"""What the guided first drive says of the robot: faults with the lines of robot.toml that mend them, and figures; pure.
+"""Evaluation of the guided first drive: faults with the lines of robot.toml that mend them, and figures; pure.
 
 A fault is judged against what robot.toml says already: what was mended once and is right now is no fault.
 """
@@ -42,7 +42,7 @@ SETTLED_S = 0.5
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong, in words with the remedy; `edits`: fields of robot.toml, by section and name, that mend it."""
+    """Fault with its remedy in words; `edits`: fields of robot.toml, by section and name, that correct it."""
 
     name: str
     text: str
@@ -58,7 +58,7 @@ class Findings:
 
     @property
     def edits(self) -> dict[tuple[str, str], Any]:
-        """Those of all faults together."""
+        """Edits of all faults together, by section and name of the field."""
         return {place: value for fault in self.faults for place, value in fault.edits.items()}
 
 
@@ -261,7 +261,7 @@ def _faster(left: float, right: float) -> float:
 
 
 def _response(track: Track) -> list[tuple[str, str]]:
-    """How late the wheels follow a command: between the halves of the rises of command and speed."""
+    """Return the figure of the wheels' delay after a command, between the halves of both rises."""
     if not track.commands:
         return []
     top = max(_faster(left, right) for _, left, right in track.commands)
@@ -273,7 +273,7 @@ def _response(track: Track) -> list[tuple[str, str]]:
 
 
 def judge_floor(seen: FloorSeen, told: PoseConvention, robot: Robot) -> Findings:
-    """In what units and about which axes the poses are, where the sensor sits, and how late it is.
+    """Find the units and axes of the poses, the sensor's place, and its delay.
 
     The poses are as the source sent them; `told` is what robot.toml says of them.
     """
@@ -322,7 +322,7 @@ _CHOICES = tuple(
 
 @dataclass(frozen=True)
 class _Fit:
-    """How well a convention explains the drive; `mismatch_rad`: of the sensor's heading in the two straights."""
+    """Fit of one pose convention to the drive; `mismatch_rad`: of the sensor's heading in the two straights."""
 
     convention: PoseConvention
     mismatch_rad: float
@@ -426,7 +426,7 @@ def _clockwise(clockwise: bool) -> str:
 
 
 def _places(seen: FloorSeen, best: _Fit) -> list[str]:
-    """Where the sensor sits beside the centre of the turns, and how much later than the wheels it speaks."""
+    """Return lines on where the sensor sits beside the centre of the turns, and its delay against the wheels."""
     convention = best.convention
     arms = [_arm([convention.converted(pose) for pose in track.poses]) for track in (seen.left, seen.right)]
     forward, left = (_mean([arm[k] for arm in arms]) for k in (0, 1))
