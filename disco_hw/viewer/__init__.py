@@ -1,4 +1,4 @@
-"""The page: the robot, its task and why it does what it does, live from the daemon and from a recorded log.
+"""Page that shows the robot, its task and why it does what it does, live from the daemon and from a recorded log.
 
 Here the live page as a process of its own beside a daemon, where it is found, and the token that opens it.
 """
@@ -64,7 +64,7 @@ class PageProcess:
         return news
 
     def close(self) -> None:
-        """End the page; one that does not end in time is killed."""
+        """Stop the page's process; one that does not end in time is killed."""
         with self._lock:
             self._ending.set()
             process = self._process

@@ -1,4 +1,4 @@
-"""The two pages: live, the feed of the daemon drawn some times a second beside the desk with its buttons; and replay.
+"""Pages of the viewer: live, the daemon's feed drawn some times a second beside the desk with its buttons; and replay.
 
 The replay shows one instant of a log at a time: by slider, by tick, by mark, or running.
 """

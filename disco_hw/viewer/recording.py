@@ -1,4 +1,4 @@
-"""What the page shows: a robot (task, size, model), a log opened for looking at, and one instant of it.
+"""Data for the page: a robot (task, size, model), a log opened for looking at, and one instant of it.
 
 A log's timeline is in memory; its plans are read when one is needed.
 """
@@ -285,7 +285,7 @@ class Recording:
         self.close()
 
     def close(self) -> None:
-        """Close the file; safe to call twice."""
+        """Close the recording's file; safe to call twice."""
         self._log.close()
 
     @property

@@ -1,4 +1,7 @@
-"""The drawn scene: everything of a snapshot that has a place in the world. Live page, replay and export share it."""
+"""Scene of the viewer: everything of a snapshot that has a place in the world.
+
+Live page, replay and export share it. Live page, replay and export share it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page's server: viser, closed to everybody but the operator.
+"""Server of the page: viser, closed to everybody but the operator.
 
 By itself viser listens to the whole network, takes another port when its own is in use, lets any web page open in the
 operator's browser press its buttons, and opens a public tunnel for any client that asks for one.
@@ -220,7 +220,7 @@ def _desk_answer(desk: Desk, instance: str, guard: Guard, request: Request) -> R
 
 
 def _framers(request: Request) -> str:
-    """Who may show an answer in a frame: the desk its scene, under any name of this machine; nobody the desk itself."""
+    """Return who may frame a reply: the desk its scene, under any name of this machine; nobody the desk itself."""
     if urlsplit(request.path).path != "/index.html":
         return "'none'"
     port = urlsplit(f"//{request.headers.get('Host', '')}").port

@@ -1,4 +1,4 @@
-"""What is known of a run up to now, in columns that can be cut at any time; live page and replay fill the same one."""
+"""Timeline of a run up to now, in columns that can be cut at any time; live page and replay fill the same one."""
 
 from __future__ import annotations
 

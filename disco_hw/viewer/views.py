@@ -1,4 +1,4 @@
-"""How the scene is looked at: the legend with a box for each layer, the camera's views, and the bar of a replay."""
+"""Views of the scene: the legend with a box for each layer, the camera's views, and the bar of a replay."""
 
 from __future__ import annotations
 
