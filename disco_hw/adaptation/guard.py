@@ -35,7 +35,7 @@ class Geometry:
 
     @property
     def std(self) -> Array:
-        """Standard deviations (3,)."""
+        """Standard deviations (3,) of the geometry, in the order of `NAMES`."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 

@@ -35,7 +35,7 @@ class MovingCircle:
 
 @dataclass(frozen=True, eq=False)
 class _Outline:
-    """A polygon: where its edges begin (E, 2) and the way along each (E, 2)."""
+    """Polygon with its edges as arrays: where they begin (E, 2) and the way along each (E, 2)."""
 
     begin: Array
     way: Array

@@ -39,7 +39,7 @@ _TOML_TOKEN = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class FileKind:
-    """What a file should be, in words, the most bytes that it may have, and what to do where there is none."""
+    """Kind of a file: what it should be, in words, the most bytes that it may have, what to do where there is none."""
 
     what: str
     most_bytes: int
@@ -92,7 +92,7 @@ def open_file(path: Path, kind: FileKind) -> int:
 
 
 def read_bytes(path: Path, kind: FileKind) -> tuple[bytes, os.stat_result]:
-    """What is in a file, with the status of the very file that was read; raises InputError."""
+    """Return the contents of a file, with the status of the very file that was read; raises InputError."""
     with os.fdopen(open_file(path, kind), "rb") as file:
         status = os.fstat(file.fileno())
         try:
@@ -207,9 +207,10 @@ _STEP = re.compile(r"\.(\w+)|\[\.*\d*\.*\]")
 
 
 def in_words(error: msgspec.ValidationError, kinds: Sequence[type], docs: str, within: str = "") -> str:
-    """One line: the field, what is wrong, the values or the name that it could have; `docs` says what each means.
+    """Return one line for an invalid field: its name, what is wrong, and the values or the name that it could have.
 
-    `kinds` are the types that the table could have been converted to, `within` is its section.
+    `docs` says what each value means. `kinds` are the types that the table could have been converted to, `within` is
+    its section.
     """
     roots = [inspect.type_info(kind) for kind in kinds]
     text, _, where = str(error).partition(" - at `$")
@@ -238,7 +239,7 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
 
 
 def _types_at(roots: Sequence[inspect.Type], place: str) -> list[inspect.Type]:
-    """What may stand at a place as `.link.kind` or `.belief.mean[...]`."""
+    """Return the types that may stand at a place such as `.link.kind` or `.belief.mean[...]`."""
     types = _members(roots)
     for step in _STEP.finditer(place):
         following: list[inspect.Type] = []

@@ -1,4 +1,4 @@
-"""How functions are compiled: one set of options, constants of the caller's precision, a cache key of all sources.
+"""Compilation of functions: one set of options, constants of the caller's precision, a cache key of all sources.
 
 `numba_internals.py` says how what kernels call is put into them.
 """

@@ -1,4 +1,4 @@
-"""What every report shares: whether its files can be written, found out before the work; results as JSON; the look.
+"""Shared parts of all reports: whether files can be written, found out before the work; results as JSON; the look.
 
 One page with one style sheet and the pictures inside it, one resolution, one set of colours.
 """
@@ -54,7 +54,7 @@ def _refuse_place(path: Path) -> None:
 
 
 def as_json(result: Mapping[str, Any], indent: int | None = None) -> str:
-    """One JSON object; JSON knows no infinity and no NaN, so that what is no number is null.
+    """Return a result as one JSON object; infinity and NaN, which JSON does not know, become null.
 
     Scalars and arrays of numpy are written as the numbers they are. Raises TypeError for what JSON has no word for.
     """
