@@ -29,7 +29,7 @@ _I16 = (-32768, 32767)
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """A message: its name, the bytes by `struct`, and each field with what one step of it is worth."""
+    """Layout of a message: its name, the bytes by `struct`, and each field with what one step of it is worth."""
 
     name: str
     body: str
@@ -143,7 +143,7 @@ class AgilexSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 
 def stop_frames(_settings: AgilexSettings) -> tuple[Frame, ...]:
-    """Zero and standby: the base has no e-stop by frame."""
+    """Return the frames for zero and standby, because the base has no e-stop by frame."""
     return motion(0.0, 0.0), control_mode(STANDBY)
 
 
@@ -169,7 +169,7 @@ def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
 
 
 def safety_card(settings: AgilexSettings) -> SafetyCard:
-    """Who stops the robot when."""
+    """Return the safety card of AgileX bases."""
     return SafetyCard(
         host_silent=f"the base {TIMEOUT_S:g} s after the last motion command; this cannot be changed",
         stops_by=f"slowing down by itself; at {settings.max_speed_m_s:g} m/s it has gone "

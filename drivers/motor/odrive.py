@@ -62,7 +62,7 @@ _QUIET = frozenset({AxisState.UNDEFINED, AxisState.IDLE, AxisState.CLOSED_LOOP})
 
 @dataclass(slots=True)
 class _Axis:
-    """What is known of one node; turns are of the motor."""
+    """State of one ODrive node; turns are of the motor."""
 
     node: int
     heard_ns: int | None = None
@@ -73,7 +73,7 @@ class _Axis:
 
 
 class OdrivePort:
-    """Satisfies `drivers.motor.vendor_driver.Port`."""
+    """Port of `VendorDriver` for ODrive boards (a `drivers.motor.vendor_driver.Port`)."""
 
     def __init__(self, settings: OdriveSettings) -> None:
         self._settings = settings
@@ -86,7 +86,7 @@ class OdrivePort:
 
     @property
     def seen(self) -> Controllers:
-        """How the axes are."""
+        """State of the axes, as received last."""
         silent = ", ".join(str(axis.node) for axis in self._all if axis.heard_ns is None)
         unheard = f"no heartbeat of node {silent}; is it switched on, at this bit rate, at this id?"
         stopped = any(axis.error & ESTOP_ERROR[self._generation] for axis in self._all)
@@ -101,7 +101,7 @@ class OdrivePort:
 
     @property
     def identity(self) -> Identity | None:
-        """What answers as an ODrive; 0.5 does not report its version."""
+        """Identity of the ODrives; firmware 0.5 does not report its version. None before all is known or if refused."""
         if not self._questions.known or self._questions.refusal is not None:
             return None
         if self._questions.version:
@@ -110,7 +110,7 @@ class OdrivePort:
 
     @property
     def limits(self) -> Limits:
-        """What robot.toml declares, and the watchdog where it can be read back."""
+        """Limits that robot.toml declares, and the watchdog where it can be read back."""
         it = self._settings
         fastest = Limit(2.0 * math.pi * it.vel_limit_turns_s / it.gear, "robot.toml")
         return parts.limits(

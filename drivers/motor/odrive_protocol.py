@@ -28,7 +28,7 @@ Value = float | int
 
 
 class Generation(enum.Enum):
-    """Of the firmware; 0.6 and later speak the same."""
+    """Generations of the firmware; 0.6 and later use the same protocol."""
 
     V05 = "0.5"
     V06 = "0.6"
@@ -262,11 +262,11 @@ class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
     @property
     def generation(self) -> Generation:
-        """Of the firmware."""
+        """Generation of the firmware."""
         return Generation(self.firmware)
 
     def fault(self) -> SettingsFault | None:
-        """What no single field shows."""
+        """Return what is wrong with the fields taken together, or None."""
         nodes = all_of(self.nodes)
         if not all(sides_of(self.nodes)):
             return SettingsFault("nodes", "a side has no node", "write [left, right], such as [3, 5]")
@@ -280,7 +280,7 @@ class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 
 def error_words(generation: Generation, error: int) -> str:
-    """What the bits of an axis' error mean, for a person."""
+    """Return the meaning of the bits of an axis' error as text."""
     said = [text for bit, text in _ERRORS[generation].items() if error & bit]
     return "; ".join(said) or f"error {error:#x}"
 
@@ -316,7 +316,7 @@ def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
 
 
 def safety_card(settings: OdriveSettings) -> SafetyCard:
-    """Who stops the robot when."""
+    """Return the safety card of ODrives."""
     return SafetyCard(
         host_silent=f"each axis after {settings.watchdog_s:g} s without a frame, by its watchdog: it idles",
         stops_by="coasting: an ODrive in idle does not brake",
@@ -347,14 +347,14 @@ _SAME_TIMEOUT_S = 0.002
 
 @dataclass(slots=True)
 class _Watchdog:
-    """What a node has said of it."""
+    """Watchdog of a node, as far as the node has reported it."""
 
     is_on: bool | None = None
     timeout_s: float | None = None
 
 
 class Questions:
-    """What is asked of all nodes, and what they have answered since they were met; pure.
+    """Questions to all nodes and their replies since the last start; pure.
 
     First their version, which firmware 0.5 does not know, so that its silence is the answer; then, where robot.toml
     says at which endpoints, their watchdogs; then what keeps those from running out.

@@ -26,7 +26,7 @@ STOPPED_FROM_OUTSIDE = "stopped from outside on the link, by `disco-hw estop` or
 
 
 class Stage(enum.Enum):
-    """Where a driver is between standing by and driving.
+    """Stages of a driver between standing by and driving.
 
     STOPPING is the ramp down, BRAKING what follows it, or replaces it, until the wheels stand.
     """
@@ -43,7 +43,7 @@ _DRIVING = (Stage.ARMING, Stage.ARMED, Stage.STOPPING)
 
 
 class Controllers(msgspec.Struct, frozen=True, kw_only=True):
-    """What a driver has heard of its controllers, in its vendor's meaning of the words; None for what is well.
+    """State of the controllers as received, in their vendor's meaning; None for what is well.
 
     For a person: what is `missing` that must be known of them, why they are `refused`, which e-stop of their own holds
     (`stopped`), what is `faulty`, and why they are `unfit` to be driven now although they are well. `energised`: they
@@ -60,7 +60,7 @@ class Controllers(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
-    """The value; each transition returns the next one.
+    """Immutable state of the permission to move; each transition returns the next one.
 
     `idle`: where a restart or an arming that fails leaves it, `after_loss` where a fault or an e-stop does: BRAKING for
     controllers that must be sent something until they stand. `since_ns`: the first tick of the stage, None before it.
@@ -91,7 +91,7 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return self.stage in _DRIVING
 
     def state(self, seen: Controllers) -> DriverState:
-        """Where the driver is with its controllers; what is latched comes before what is not known."""
+        """Return the driver's state with its controllers; what is latched comes before what is not known."""
         if not self.link_is_up:
             return DriverState.DISCONNECTED
         if self.estopped or seen.stopped is not None:
@@ -113,7 +113,7 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return DriverState.READY if self.wanted is Request.READY else DriverState.STANDBY
 
     def detail(self, seen: Controllers) -> str:
-        """For a person: why the state is what it is, and what to do about it."""
+        """Return why the state is what it is, and what to do about it."""
         match self.state(seen):
             case DriverState.DISCONNECTED:
                 return seen.offline
@@ -142,7 +142,7 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return holds and now_ns - self.fed_ns > timeout_s * 1e9
 
     def silent_ns(self, heard_ns: int) -> int:
-        """How long nothing has come since `heard_ns`, of the time in which the host looked without a pause.
+        """Return how long nothing has come since `heard_ns`, of the time in which the host looked without a pause.
 
         What was not heard in a pause is no silence of the controllers: the host was not there, or has not read yet.
         """
@@ -164,7 +164,10 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return met_anew if event is None else met_anew.saying(event)
 
     def requested(self, request: Request, seen: Controllers) -> MotionPermit:
-        """What the host wants; ARM only of controllers that stand by and are fit, and each time asked for anew."""
+        """Return the permit after a request of the host.
+
+        ARM is accepted only of controllers that stand by and are fit, and each time it is requested again.
+        """
         if request is self.wanted:
             return self
         if request is Request.ARM:

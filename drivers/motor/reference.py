@@ -72,7 +72,7 @@ _MAY_ARM = frozenset(DriverState) - {
 
 
 class ReferenceDriver:
-    """Satisfies `drivers.types.Driver`; pure: no clock, thread or I/O, and no frame makes it raise.
+    """Driver of the reference firmware's protocol (a `drivers.types.Driver`); pure, and no frame makes it raise.
 
     `request(ARM)` leads from STANDBY or READY through a new session to ARMED; it is ignored, with the reason in
     `detail`, before the handshake is complete. `transmit` raises ValueError for a command that is not finite or out of
@@ -114,7 +114,7 @@ class ReferenceDriver:
 
     @property
     def state(self) -> DriverState:
-        """Where the driver is with its robot."""
+        """State of the driver with its robot."""
         if not self._link_is_up:
             return DriverState.DISCONNECTED
         if self._handshake.refusal is not None:
@@ -155,12 +155,12 @@ class ReferenceDriver:
 
     @property
     def identity(self) -> Identity | None:
-        """What the robot said of itself in the handshake; None before it is complete."""
+        """Identity that the robot reported in the handshake; None before it is complete."""
         return self._handshake.identity
 
     @property
     def limits(self) -> Limits | None:
-        """What the robot said of its limits in the handshake; None before it is complete."""
+        """Limits that the robot reported in the handshake; None before it is complete."""
         return self._handshake.limits
 
     @property
@@ -237,7 +237,7 @@ class ReferenceDriver:
         return Readings(**{kind: tuple(samples) for kind, samples in collected.items()}, events=events)
 
     def transmit(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
-        """Frames due now: the command (only while armed; zeros while arming) and house-keeping.
+        """Return the frames due now: the command (only while armed; zeros while arming) and house-keeping.
 
         Raises ValueError for a command that is not finite, out of the wire's range, or valid for no time.
         """
@@ -349,7 +349,7 @@ class ReferenceDriver:
             collected.setdefault(kind, []).append(sample)
 
     def _make_handlers(self) -> dict[str, tuple[str, Callable[[Decoded, int], Any]]]:
-        """By message name: the field of `Readings`, and what turns a frame and its reception (ns) into a sample."""
+        """Return, by message name, the field of `Readings` and the function that makes a sample of a frame."""
         return {
             **dict.fromkeys(telemetry.WHEEL_MESSAGES, ("wheels", self._telemetry.wheels)),
             **dict.fromkeys(telemetry.POSE_MESSAGES, ("poses", self._telemetry.pose)),

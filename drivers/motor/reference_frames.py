@@ -400,7 +400,7 @@ class WheelTicks:
 
     @property
     def angles(self) -> tuple[float, float]:
-        """Both angles after the last accepted reading."""
+        """Angles (rad) of the left and right wheel after the last accepted reading."""
         left, right = self._start
         return left + self._left * self._angle_per_tick, right + self._right * self._angle_per_tick
 

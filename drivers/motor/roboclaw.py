@@ -71,7 +71,7 @@ _SETTER_NAMES = {layout.command: name for name, layout in protocol.SETTERS.items
 
 @dataclass(slots=True)
 class Board:
-    """What is known of one board, by question; `turned` of both motors.
+    """State of one board, by question; `turned` of both motors.
 
     `stopped`: it has taken a stop since the last command. `timeout_ds`: its serial timeout in steps of 0.1 s, as read
     since arming began. `waits_ns`: since when it has not answered, `refuses_ns` since when it has taken no command.
@@ -93,18 +93,18 @@ class Board:
 
     @property
     def fastest_counts_s(self) -> float:
-        """What both motors can do at full duty."""
+        """Speed (counts/s) that both motors reach at full duty."""
         return float(min(int(self.known[f"velocity_pid_m{motor}"]["qpps"]) for motor in (1, 2)))
 
     @property
     def speeds(self) -> tuple[float, float]:
-        """As measured, in counts/s."""
+        """Measured speeds of both motors, in counts/s."""
         read = self.known["speeds"]
         return float(read["speed_m1"]), float(read["speed_m2"])
 
     @property
     def is_known(self) -> bool:
-        """Whether it has answered all that must be known of it."""
+        """Whether every reply needed before arming has been read from the board."""
         return all(name in self.known for name in TO_KNOW)
 
     @property
@@ -137,7 +137,7 @@ class Board:
 
 
 class RoboclawPort:
-    """Satisfies `drivers.motor.vendor_driver.Port`."""
+    """Port of `VendorDriver` for RoboClaw boards (a `drivers.motor.vendor_driver.Port`)."""
 
     def __init__(self, settings: RoboclawSettings) -> None:
         self._settings = settings
@@ -155,7 +155,7 @@ class RoboclawPort:
 
     @property
     def seen(self) -> Controllers:
-        """How the boards are."""
+        """State of the boards, as received last."""
         silent = ", ".join(str(board.address) for board in self._all if not board.is_known)
         missing = f"board {silent} does not answer; is it switched on, in packet serial, at this baud and address?"
         pressed = any(board.is_pressed for board in self._all)
@@ -167,7 +167,7 @@ class RoboclawPort:
 
     @property
     def identity(self) -> Identity | None:
-        """What the first board says of itself."""
+        """Identity that the first board reports; None before all boards are known."""
         if not self._is_known:
             return None
         return Identity("RoboClaw", str(self._all[0].known["version"]["version"]).strip(), "device")
@@ -309,7 +309,7 @@ class RoboclawPort:
         return True
 
     def questions(self, now_ns: int, permit: MotionPermit) -> tuple[OutgoingFrame, ...]:
-        """Of boards with a command in this tick; or, in their own pace, of those that have taken a stop.
+        """Return the questions to boards with a command in this tick, or, more slowly, to boards that are stopped.
 
         What is still unknown of a board, one question at a time; of a known one speeds and counts, and of one board in
         turn its errors or its serial timeout.

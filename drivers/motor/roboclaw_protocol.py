@@ -1,4 +1,4 @@
-"""RoboClaw packet serial: the bytes of a command and of its reply. Big-endian.
+"""Packet serial of RoboClaw boards: the bytes of a command and of its reply. Big-endian. Big-endian.
 
 A command that sets something: address, command, arguments, CRC-16/XMODEM of all before; the reply is one byte, 0xFF,
 or nothing. A command that asks: address and command alone; the reply is data and the CRC of address, command and data.
@@ -176,7 +176,7 @@ class RoboclawSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
     @property
     def addresses(self) -> tuple[int, ...]:
-        """Of the boards, each once."""
+        """Addresses of the boards, each once."""
         return tuple(dict.fromkeys(address for side in self.sides for address, _ in side))
 
     @property
@@ -190,7 +190,7 @@ class RoboclawSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         return round(10.0 * self.watchdog_s)
 
     def fault(self) -> SettingsFault | None:
-        """What no single field shows."""
+        """Return what is wrong with the fields taken together, or None."""
         named = [name for side in self.motors for name in ((side,) if isinstance(side, str) else side)]
         wrong = [name for name in named if not _is_place(name)]
         if wrong or not named or () in self.motors:
@@ -208,7 +208,7 @@ class RoboclawSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
 @dataclass(frozen=True, slots=True)
 class RoboclawExchange:
-    """Satisfies `drivers.types.Exchange`; a frame's identifier is address and command, its data the packet."""
+    """Exchange with RoboClaw boards (a `drivers.types.Exchange`); `can_id` is address and command, data the packet."""
 
     timeout_s: float = 0.02
     quiet_s: float = 0.012
@@ -287,7 +287,7 @@ def cyclic_frames(settings: RoboclawSettings, command_rate_hz: float, _authentic
 
 
 def safety_card(settings: RoboclawSettings) -> SafetyCard:
-    """Who stops the robot when."""
+    """Return the safety card of RoboClaw boards."""
     return SafetyCard(
         host_silent=f"each board {settings.watchdog_s:g} s after the last packet of any kind, by its serial timeout, "
         "which is set and read back before each arming",

@@ -41,7 +41,7 @@ _REPEAT_NS = 100_000_000
 
 
 class Ros2BasePort:
-    """Satisfies `drivers.motor.vendor_driver.Port`."""
+    """Port of `VendorDriver` for bases on ROS 2 (a `drivers.motor.vendor_driver.Port`)."""
 
     def __init__(self, settings: wire.Ros2BaseSettings) -> None:
         self._settings = settings
@@ -55,7 +55,7 @@ class Ros2BasePort:
 
     @property
     def seen(self) -> Controllers:
-        """How the bridge and its base are."""
+        """State of the bridge and its base, as received last."""
         stopped = f"a button on the base is pressed{self._or_unheard}" if self._flags & wire.BUTTON else None
         latched = "emergency stop; remove its cause, then reset" if self._flags & wire.LATCHED else None
         return Controllers(
@@ -68,13 +68,13 @@ class Ros2BasePort:
 
     @property
     def identity(self) -> Identity | None:
-        """What answers behind the bridge; a base reports nothing of itself on its topics."""
+        """Identity of the base behind the bridge; a base reports nothing of itself on its topics."""
         is_met = self._state_ns is not None and not self._is_foreign_bridge
         return Identity("ROS 2 base", "", "robot.toml") if is_met else None
 
     @property
     def limits(self) -> Limits:
-        """What robot.toml declares of the base; it reports nothing of that itself."""
+        """Limits that robot.toml declares of the base, which reports none itself."""
         return parts.limits(
             Limit(self._settings.fastest_rad_s, "robot.toml"),
             Limit(self._settings.watchdog_s, "robot.toml"),
@@ -181,7 +181,7 @@ class Ros2BasePort:
         return True
 
     def questions(self, now_ns: int, permit: MotionPermit) -> tuple[OutgoingFrame, ...]:
-        """None: the bridge says all by itself."""
+        """Return no frames: the bridge sends everything by itself."""
         return ()
 
     def stop_frames(self) -> tuple[Frame, ...]:

@@ -72,7 +72,7 @@ class Objection(msgspec.Struct, frozen=True):
 
 
 class Heard(msgspec.Struct, frozen=True, kw_only=True):
-    """What one received frame meant.
+    """Meaning of one received frame.
 
     `counts`: counters of `DriverStats` that it adds to. `is_status`: it says how the controllers are. `is_stop` and
     `commanded`: another host's e-stop, and whom another host commands. `lost`: what ends a drive, and nothing else.
@@ -95,7 +95,7 @@ IMPLAUSIBLE = ("frames_accepted", "implausible_ticks")
 
 
 class Pending(msgspec.Struct, frozen=True, kw_only=True):
-    """What still lacks before zeros may be commanded: the frames that bring it about, and why arming fails without it.
+    """Precondition of arming that is not met yet: the frames that bring it about, and why arming fails without it.
 
     `is_final`: waiting does not help.
     """
@@ -114,15 +114,15 @@ class Port(Protocol):
 
     @property
     def seen(self) -> Controllers:
-        """How the controllers are, as heard last."""
+        """State of the controllers, as received last."""
 
     @property
     def identity(self) -> Identity | None:
-        """Which controller answers; None before all of it is known."""
+        """Identity of the controller; None before all of it is known."""
 
     @property
     def limits(self) -> Limits:
-        """What the controllers keep to, and who says so; asked only when `identity` is known."""
+        """Limits of the controllers, and who states them; requested only when `identity` is known."""
 
     @property
     def is_stopped(self) -> bool:
@@ -138,7 +138,7 @@ class Port(Protocol):
         """Take in a frame and return what it meant."""
 
     def sources(self) -> Sequence[Source]:
-        """What must be heard again and again."""
+        """Return the sources that must report again and again."""
 
     def objection(self, permit: MotionPermit) -> Objection | None:
         """Why the controllers, as heard last, may not be driven on."""
@@ -197,22 +197,22 @@ class VendorDriver:
 
     @property
     def state(self) -> DriverState:
-        """Where the driver is with its controllers."""
+        """State of the driver with its controllers."""
         return self._permit.state(self._port.seen)
 
     @property
     def detail(self) -> str:
-        """For a person: why the state is what it is, and what to do about it."""
+        """Text on why the state is what it is, and what to do about it."""
         return self._permit.detail(self._port.seen)
 
     @property
     def identity(self) -> Identity | None:
-        """Which controller answers; None before all of it is known."""
+        """Identity of the controller; None before all of it is known."""
         return self._port.identity
 
     @property
     def limits(self) -> Limits | None:
-        """What the controllers keep to, and who says so; None before they are known."""
+        """Limits of the controllers, and who states them; None before they are known."""
         return None if self._port.identity is None else self._port.limits
 
     def link_up(self, now_ns: int) -> None:
@@ -248,7 +248,7 @@ class VendorDriver:
         return Readings(wheels=tuple(wheels), status=() if status is None else (status,), events=events)
 
     def transmit(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
-        """Frames due now: the command, or what stops; and the questions.
+        """Return the frames due now: the command or a stop, and the questions.
 
         Raises ValueError for a command that is not finite or valid for no time.
         """
@@ -289,7 +289,7 @@ class VendorDriver:
         return parts.outgoing(now_ns, *frames)
 
     def _arm(self, now_ns: int) -> Sequence[Frame]:
-        """What lacks, then zeros until there were enough; give up where that takes too long."""
+        """Return the frames that arm: what lacks, then zeros until there were enough; give up after too long."""
         self._permit = self._permit.begun(now_ns)
         pending = self._port.prepare(now_ns, self._permit)
         if pending is None:

@@ -1,4 +1,4 @@
-"""What the drivers of vendors' controllers share: odometers, layouts of messages, frames as sent, ids as written."""
+"""Parts that the drivers of vendors' controllers share: odometers, layouts of messages, frames as sent, ids."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Sign = Literal[-1, 1]
 
 @dataclass(slots=True)
 class Odometer:
-    """What one motor has turned since the driver began, in the controller's counts.
+    """Distance that one motor has turned since the driver began, in the controller's counts.
 
     `total` goes on over a restart of the controller; `speed` in counts/s carries it on from `t_ns`, when the last count
     was received; it is not older than `looked_ns`, when the host had looked before.
@@ -89,7 +89,7 @@ def wheel_sample(
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """A message: its number, its bytes by `struct` without the byte order, and the names of the fields."""
+    """Layout of a message: its number, its bytes by `struct` without the byte order, and the names of the fields."""
 
     command: int
     order: str
@@ -98,7 +98,7 @@ class Layout:
 
     @property
     def length(self) -> int:
-        """Of the fields in bytes."""
+        """Length of the fields in bytes."""
         return struct.calcsize(self.order + self.body)
 
     def pack(self, *values: float) -> bytes:
@@ -111,14 +111,14 @@ class Layout:
 
 
 def layouts(order: str, *rows: tuple[str, int, str, str]) -> Mapping[str, Layout]:
-    """By name: each row has name, number, body and the fields' names."""
+    """Return layouts by name, from rows of name, number, body and the fields' names."""
     return MappingProxyType(
         {name: Layout(command, order, body, tuple(names.split())) for name, command, body, names in rows}
     )
 
 
 def limits(fastest: Limit, timeout: Limit, stop_deceleration_rad_s2: float) -> Limits:
-    """Of controllers that are slowed down by this host, with what robot.toml declares."""
+    """Return the limits of controllers that this host slows down, with what robot.toml declares."""
     slows = Limit(stop_deceleration_rad_s2, "robot.toml")
     return Limits(max_wheel_speed_rad_s=fastest, command_timeout_s=timeout, stop_deceleration_rad_s2=slows)
 
@@ -193,7 +193,7 @@ def all_of(nodes: tuple[Nodes, Nodes]) -> tuple[int, ...]:
 
 
 def in_sides(nodes: Sequence[int | str]) -> list[Any]:
-    """What was heard of motors as left and right, the lower half first: two numbers, or two lists."""
+    """Split the motors that were received into left and right, the lower half first: two numbers, or two lists."""
     half = len(nodes) // 2
     left, right = list(nodes[:half]), list(nodes[half:])
     return [left[0], right[0]] if len(left) == len(right) == 1 else [left, right]

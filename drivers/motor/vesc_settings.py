@@ -1,4 +1,4 @@
-"""What robot.toml says of VESC controllers, and what follows from that alone: e-stop, bus load, safety card."""
+"""Settings of VESC controllers in robot.toml, and what follows from them alone: e-stop, bus load, safety card."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class VescSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         return 60.0 / (2.0 * math.pi) * self.pole_pairs * self.gear
 
     def fault(self) -> SettingsFault | None:
-        """What no single field shows."""
+        """Return what is wrong with the fields taken together, or None."""
         nodes = all_of(self.nodes)
         if not all(sides_of(self.nodes)):
             return SettingsFault("nodes", "a side has no controller", "write [left, right], such as [23, 51]")
@@ -86,7 +86,7 @@ def slowest_rad_s(settings: VescSettings) -> float:
 
 
 def timeout_fault(settings: VescSettings, node: int, timeout_s: float, brake_current_a: float) -> str | None:
-    """How the timeout that a controller reports differs from what robot.toml declares."""
+    """Return how the timeout that a controller reports differs from what robot.toml declares, or None."""
     named = f"controller {node}: its timeout"
     if timeout_s <= 0.0:
         return f"{named} is off; set {1e3 * settings.watchdog_s:g} ms (VESC Tool, App Settings, General)"
@@ -98,7 +98,7 @@ def timeout_fault(settings: VescSettings, node: int, timeout_s: float, brake_cur
 
 
 class VescExchange:
-    """Satisfies `drivers.types.Exchange`: what goes over CAN elsewhere, in packets through the controller on the line.
+    """Exchange with VESCs on a serial line (a `drivers.types.Exchange`): CAN frames in packets through one controller.
 
     A command has no reply. A ping is asked as values, and a packet's answer comes as one fragment that holds it whole.
     """
@@ -187,7 +187,7 @@ def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
 
 
 def safety_card(settings: VescSettings) -> SafetyCard:
-    """Who stops the robot when."""
+    """Return the safety card of VESCs."""
     brakes = settings.timeout_brake_current_a > 0.0
     held = f"braking with {settings.timeout_brake_current_a:g} A"
     return SafetyCard(

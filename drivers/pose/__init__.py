@@ -24,7 +24,7 @@ DEFAULT = robot.SOURCE
 
 @cache
 def pose_sources() -> Mapping[str, Callable[..., PoseSource]]:
-    """By name: the `make_pose_source` of each module in this folder that has a `SOURCE`.
+    """Return the pose sources by name: the `make_pose_source` of each module in this folder that has a `SOURCE`.
 
     It makes a source of the fields of [pose], of which it takes its own and leaves the others.
     """
@@ -60,7 +60,7 @@ _RADIANS = {"rad": 1.0, "deg": math.pi / 180.0}
 
 
 class PoseConvention(msgspec.Struct, frozen=True):
-    """What a source sends: units; `clockwise` yaw; `mirrored`: its y is to the right of its x.
+    """Convention of a pose source: units; `clockwise` yaw; `mirrored`: its y is to the right of its x.
 
     `yaw_offset_rad` (counter-clockwise) is added to its yaw: where the sensor looks aside of the robot's forward.
     `origin` is the pose of the sensor's frame in the world (x, y, yaw), `offset` the place of the sensor on the robot,
@@ -129,11 +129,11 @@ class ConvertedPoses:
         return [self._convention.converted(sample) for sample in self._source.receive(now_ns, from_robot)]
 
     def news(self) -> Sequence[str]:
-        """What the source says."""
+        """Return the messages of the converted source."""
         return self._source.news() if isinstance(self._source, SaysWhy) else ()
 
     def close(self) -> None:
-        """Close the source."""
+        """Close the converted source; safe to call twice."""
         self._source.close()
 
 
@@ -158,7 +158,7 @@ class SeveralPoses:
         return sorted(found, key=lambda sample: (sample.t_ns, sample.source))
 
     def news(self) -> Sequence[str]:
-        """What they say, each under its name."""
+        """Return the messages of all sources, each under its source's name."""
         return [
             f"{label}: {words}"
             for label, source in self._sources

@@ -68,7 +68,7 @@ class NmeaPoses:
         self._said: list[str] = []
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
-        """What came since the last call, oldest first; never waits and never raises."""
+        """Return the poses received since the last call, oldest first; never waits and never raises."""
         poses = []
         with contextlib.suppress(BlockingIOError):
             for _ in range(MOST_A_TICK):
@@ -83,12 +83,12 @@ class NmeaPoses:
         return poses
 
     def news(self) -> Sequence[str]:
-        """What a person should know since the last call."""
+        """Return messages for the operator since the last call."""
         said, self._said = self._said, []
         return said
 
     def close(self) -> None:
-        """End the reader; safe to call twice."""
+        """Stop the reader process; safe to call twice."""
         self._socket.close()
         self._process.terminate()
         try:
@@ -152,7 +152,7 @@ class TangentPlane:
     height_m: float
 
     def east_north(self, latitude_deg: float, longitude_deg: float, height_m: float) -> tuple[float, float]:
-        """Where a place is, by geocentric coordinates."""
+        """Return the position of a place, east and north (m) of the datum, by geocentric coordinates."""
         here, datum = _geocentric(latitude_deg, longitude_deg, height_m), _geocentric(*self._datum)
         dx, dy, dz = (a - b for a, b in zip(here, datum, strict=True))
         latitude, longitude = math.radians(self.latitude_deg), math.radians(self.longitude_deg)
@@ -202,7 +202,7 @@ class ReceiverClock:
 
 @dataclass
 class Fixes:
-    """What sentences mean: `take` them with their arrival, and `flush` now and then; pure, and raises nothing.
+    """Conversion of NMEA sentences into poses: `take` them with their arrival, `flush` now and then; pure.
 
     What they give is a datagram's map (`drivers.pose.udp`), or {"said": sentence} where something changed for the worse
     or the better. A heading belongs to the position that came within 60 ms of it.

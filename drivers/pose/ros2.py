@@ -24,7 +24,7 @@ _ROOT = 0
 
 
 def bridge_address(port: int) -> bytes:
-    """Where the daemon of this user hears the bridge: an abstract name, which vanishes with the daemon."""
+    """Return the address at which this user's daemon receives the bridge: an abstract name, gone with the daemon."""
     return f"\0disco-hw/{os.geteuid()}/pose/{port}".encode()
 
 
@@ -67,7 +67,7 @@ class BridgePoses:
         self.foreign_users = 0
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
-        """What came since the last call, oldest first; never waits and never raises."""
+        """Return the poses received since the last call, oldest first; never waits and never raises."""
         poses = []
         with contextlib.suppress(OSError):
             for _ in range(MOST_A_TICK):
@@ -80,12 +80,12 @@ class BridgePoses:
         return sorted(poses, key=lambda pose: pose.t_ns)
 
     def news(self) -> Sequence[str]:
-        """What a person should know since the last call."""
+        """Return messages for the operator since the last call."""
         said, self._said = self._said, []
         return [*said, *self._senders.news()]
 
     def close(self) -> None:
-        """Close the socket; safe to call twice."""
+        """Close the bridge's socket; safe to call twice."""
         self._socket.close()
 
     def _take(self, datagram: bytes, sender: str, now_ns: int) -> PoseSample | None:

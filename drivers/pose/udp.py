@@ -98,7 +98,7 @@ class UdpPoses:
         return self._senders.refused
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
-        """What came since the last call, oldest first; never waits and never raises."""
+        """Return the poses received since the last call, oldest first; never waits and never raises."""
         poses = []
         with contextlib.suppress(OSError):
             for _ in range(MOST_A_TICK):
@@ -108,11 +108,11 @@ class UdpPoses:
         return sorted(poses, key=lambda pose: pose.t_ns)
 
     def news(self) -> Sequence[str]:
-        """What a person should know since the last call."""
+        """Return messages for the operator since the last call."""
         return self._senders.news()
 
     def close(self) -> None:
-        """Close the socket; safe to call twice."""
+        """Close the UDP socket; safe to call twice."""
         self._socket.close()
 
     def _take(self, datagram: bytes, sender: tuple[str, int], now_ns: int) -> PoseSample | None:

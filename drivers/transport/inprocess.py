@@ -31,7 +31,7 @@ class InProcessTransport:
 
     @property
     def name(self) -> str:
-        """The name given."""
+        """Name given to this end."""
         return self._name
 
     @property
@@ -60,7 +60,7 @@ class InProcessTransport:
         self._settle_both()
 
     def close(self) -> None:
-        """Disconnect; safe to call twice."""
+        """Disconnect this end; safe to call twice."""
         self._open = False
         self._settle_both()
 
