@@ -1,4 +1,4 @@
-"""What replaces the robot: plant, mock CAN bus, virtual robot.
+"""Simulated replacement of the robot: plant, mock CAN bus, virtual robot.
 
 Here the seam between them: the link of the virtual robot, be it a CAN bus or a serial line, and the robot's controller
 as a node on a bus.

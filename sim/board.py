@@ -122,10 +122,10 @@ class BoardRobot:
         self.plant.kidnap(dx_m, dy_m, dyaw_rad)
 
     def jump_clock(self, step_us: int) -> None:
-        """Do nothing: the clock is the board's own, and `sim.app` refuses such a fault."""
+        """Do nothing, because the clock is the board's own, and `sim.app` refuses such a fault."""
 
     def reboot(self, cause: ResetCause = ResetCause.POWER_ON) -> None:
-        """Raise LinkFaultError: only an operator or the board itself can restart it."""
+        """Raise LinkFaultError, because only an operator or the board itself can restart it."""
         raise LinkFaultError("reboot: not over this line; press the board's reset button")
 
     def _inputs(self) -> FirmwareInputs:
@@ -197,7 +197,7 @@ class PlantLine:
 
     @property
     def error_counters(self) -> tuple[int, int]:
-        """Return zeros: the board's link reports no error counters."""
+        """Counters of transmit and receive errors, always zero: the board's link reports none."""
         return 0, 0
 
     def filenos(self) -> list[int]:
@@ -257,11 +257,11 @@ class PlantLine:
         raise LinkFaultError(f"bus_off {who}: the board's own link is not the simulator's")
 
     def babble(self, frame: Frame) -> None:
-        """Raise LinkFaultError: faults of frames are not possible on the board's own link."""
+        """Raise LinkFaultError, because faults of frames are not possible on the board's own link."""
         raise LinkFaultError("babble: the board's own link is not the simulator's")
 
     def tamper(self, fault: BusFault) -> None:
-        """Do nothing: faults of frames are those of the board's own link, and `sim.app` refuses them."""
+        """Do nothing, because faults of frames are those of the board's own link, and `sim.app` refuses them."""
 
     def summary(self) -> str:
         """Counters in one line."""

@@ -96,7 +96,7 @@ class Body:
 
     @property
     def pose(self) -> BodyPose:
-        """Present pose: x, y (m), yaw (rad), in the world."""
+        """Pose of the body now: x, y (m), yaw (rad), in the world."""
         return BodyPose(*self._pose.tolist())
 
     @property

@@ -1,4 +1,4 @@
-"""Classic CAN: a frame as a value, SocketCAN bytes, a candump line and bits on the wire; and one controller of a bus.
+"""Frames of classic CAN as a value, SocketCAN bytes, a candump line and bits on the wire; and one controller of a bus.
 
 The bits give a frame's exact length with stuff bits and what decides arbitration. A controller has its transmit queue
 and its error confinement; it reports errors in the frames that Linux can-dev gives to a socket. Source: Bosch CAN
@@ -97,12 +97,12 @@ def controller_error_frame(tec: int, rec: int, state: int) -> CanFrame:
 
 
 def bus_off_frame() -> CanFrame:
-    """Error frame CAN_ERR_BUSOFF: this node has left the bus."""
+    """Return the error frame CAN_ERR_BUSOFF: this node has left the bus."""
     return CanFrame(0x040, bytes(8), error=True)
 
 
 def restarted_frame() -> CanFrame:
-    """Error frame CAN_ERR_RESTARTED: this node has come back from bus-off."""
+    """Return the error frame CAN_ERR_RESTARTED: this node has come back from bus-off."""
     return CanFrame(0x100, bytes(8), error=True)
 
 
@@ -164,7 +164,7 @@ def _head(can_id: int, extended: bool, remote: bool, length: int) -> tuple[int, 
 
 @lru_cache(maxsize=4096)
 def _after_head(can_id: int, extended: bool, remote: bool, length: int) -> tuple[int, int, int]:
-    """Where CRC and stuffing are after the head, which few frames do not share: bits, CRC, state << 8 | stuff bits."""
+    """Return CRC and stuffing after the head, which few frames do not share: bits, CRC, state << 8 | stuff bits."""
     head, bits = _head(can_id, extended, remote, length)
     padding = -bits % 8
     crc = 0
@@ -287,7 +287,7 @@ class BusNode:
         return len(self.queue) + (self.on_wire is not None)
 
     def push(self, sequence: int, frame: CanFrame) -> bool:
-        """Queue a frame; return False and count it if the queue is full or the node is bus-off."""
+        """Add a frame to the transmit queue; return False and count it if the queue is full or the node is bus-off."""
         if self.state is _BUS_OFF:
             self.refused_bus_off += 1
             return False

@@ -115,7 +115,7 @@ class Hub:
         return self.advance(now_ns)
 
     def collect(self, now_ns: int) -> int:
-        """Serve the sockets; return how many frames of clients now wait to be let onto the bus."""
+        """Read and write all sockets; return how many frames of clients now wait to be let onto the bus."""
         self._now_ns = now_ns
         if self._plug_in_ns is not None and now_ns >= self._plug_in_ns:
             self._plug_in_ns = None
@@ -306,7 +306,7 @@ class HubLink:
 
     @property
     def address(self) -> str:
-        """The hub's socket."""
+        """Address of the hub's socket."""
         return f"unixcan {self.hub.path}"
 
     @property
@@ -324,7 +324,7 @@ class HubLink:
         return min(times) if times else None
 
     def collect(self, now_ns: int) -> int:
-        """Serve the sockets."""
+        """Read and write all sockets of the hub; return how many frames wait to be let onto the bus."""
         return self.hub.collect(now_ns)
 
     def advance(self, now_ns: int, admit: int | None = None) -> list[ReceivedFrame]:

@@ -1,4 +1,4 @@
-"""What processes of `sim` need of the operating system: stop signals, records that may fail, sockets, text commands.
+"""Services of the operating system for processes of `sim`: stop signals, records that may fail, sockets, text commands.
 
 `python -m sim.process SOCKET COMMAND...` sends one command: to a virtual robot run with `--inject SOCKET`.
 """
@@ -114,7 +114,7 @@ def _remove_stale(path: Path, kind: socket.SocketKind) -> None:
 
 
 class PoseSender:
-    """To one address; what cannot be sent is lost, as on a network."""
+    """Sender of poses to one address; what cannot be sent is lost, as on a network."""
 
     def __init__(self, address: tuple[str, int]) -> None:
         self._address = address
@@ -137,7 +137,7 @@ class PoseSender:
             self._socket.sendto(text.encode(), self._address)
 
     def close(self) -> None:
-        """Close the socket."""
+        """Close the sender's socket."""
         self._socket.close()
 
 
@@ -172,7 +172,7 @@ class CommandSocket:
                 self.lost_replies += 1
 
     def close(self) -> None:
-        """Remove the socket; safe to call twice."""
+        """Close and remove the socket; safe to call twice."""
         self._socket.close()
         self._path.unlink(missing_ok=True)
 

@@ -45,7 +45,7 @@ class PythonCanLink:
 
     @property
     def address(self) -> str:
-        """Interface and channel."""
+        """Address as interface and channel."""
         return f"{self._interface} {self._channel}"
 
     @property
@@ -88,7 +88,7 @@ class PythonCanLink:
         return [ReceivedFrame(now_ns, self._waiting.popleft()) for _ in range(count)]
 
     def send(self, frames: Sequence[Frame]) -> None:
-        """Send without waiting; what the bus does not take is counted and lost."""
+        """Send frames without waiting; what the bus does not take is counted and lost."""
         for frame in frames:
             if self._bus is None:
                 self.send_failures += 1
@@ -129,7 +129,7 @@ class PythonCanLink:
         )
 
     def close(self) -> None:
-        """Leave the bus."""
+        """Leave the CAN bus."""
         self._shut_down()
 
     def _open(self) -> can.BusABC:
@@ -169,7 +169,7 @@ class PythonCanLink:
 
 
 class JoinError(Exception):
-    """What cannot be joined; the message is one line for the user."""
+    """Exception for a bus that cannot be joined; the message is one line for the user."""
 
 
 def joined(words: Sequence[str], now_ns: int, bitrate: int) -> PythonCanLink:

@@ -292,7 +292,7 @@ class SerialLine:
 
 
 def _damaged(encoded: bytes, fate: FrameFate) -> bytes:
-    """What of an encoded frame reaches the other end: all, one bit turned, or its beginning."""
+    """Return the bytes of an encoded frame that reach the other end: all, one bit turned, or its beginning."""
     if fate.wire_error_bit is None:
         return encoded
     place = fate.wire_error_bit % (8 * len(encoded))

@@ -25,7 +25,10 @@ _PERIODS_MS = {0x211: 100, 0x221: 20, 0x311: 20, 0x251: 20, 0x261: 100, 0x241: 2
 
 @dataclass(slots=True)
 class AgilexBase:
-    """One base. `commanded` is what it follows now: speed (m/s) and turn rate (rad/s)."""
+    """State of one base, of which `commanded` is what it follows now: speed (m/s) and turn rate (rad/s).
+
+    `commanded` is what it follows now: speed (m/s) and turn rate (rad/s).
+    """
 
     vehicle_state: int = 0
     control_mode: int = STANDBY
@@ -153,7 +156,10 @@ class AgilexBase:
 
 
 class AgilexController:
-    """One base: satisfies `virtual_robot.Controller`. It makes wheel speeds of its own, by the track that it has."""
+    """Controller of one AgileX base (a `virtual_robot.Controller`), which makes wheel speeds by its own track width.
+
+    It makes wheel speeds of its own, by the track that it has.
+    """
 
     brakes = False
 
@@ -181,14 +187,14 @@ class AgilexController:
 
     @property
     def state(self) -> str:
-        """In one word."""
+        """State of the base in one word."""
         if self.base.vehicle_state or self.base.error_code:
             return "FAULT"
         return "ARMED" if self.base.control_mode == CAN_MODE else "STANDBY"
 
     @property
     def obeyed(self) -> int:
-        """How many commands it has taken."""
+        """Number of commands accepted since power-on."""
         return len(self.base.obeyed)
 
     def receive(self, now_us: int, frame: CanFrame) -> Sequence[CanFrame]:

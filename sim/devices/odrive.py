@@ -87,7 +87,7 @@ class Axis:
         self.watchdog_left = int(f32(f32(self.watchdog_timeout_s) * 1000.0 * CHECKS_PER_MS))
 
     def check_watchdog(self, error: int) -> None:
-        """One of the 8 checks in a millisecond."""
+        """Run one of the 8 watchdog checks in a millisecond."""
         if not self.watchdog_enabled:
             return
         if self.watchdog_left > 0:
@@ -125,7 +125,7 @@ class Axis:
 
     @property
     def velocity_turns_s(self) -> float | None:
-        """What the motor is to turn at; None where it is released and coasts."""
+        """Commanded speed (turns/s) within the limit; None where the motor is released and coasts."""
         if self.axis_state != CLOSED_LOOP or self.control_mode != VELOCITY_CONTROL:
             return None
         return min(max(self.input_vel_turns_s, -self.vel_limit_turns_s), self.vel_limit_turns_s)
@@ -163,8 +163,10 @@ class OdriveBoard:
     """The axes of one board at their nodes, on a bus that they share."""
 
     def __init__(self, generation: str, nodes: Sequence[int], periods_ms: dict[str, int] | None = None) -> None:
-        """`generation`: "0.5" or "0.6". `periods_ms`: by the names of `PERIODS`, 0 for never; what is left out is as
-        the firmware has it.
+        """Create a board of firmware `generation` "0.5" or "0.6".
+
+        `periods_ms`: by the names of `PERIODS`, 0 for never; default: the firmware's. `periods_ms`: by the names of
+        `PERIODS`, 0 for never; what is left out is as the firmware has it.
         """
         self.generation = generation
         self.axes = [Axis(node) for node in nodes]
@@ -217,7 +219,7 @@ class OdriveBoard:
                 axis.pos_turns = struct.unpack_from("<f", data)[0]
 
     def clear_errors(self) -> None:
-        """Of every axis of the board, with all their parts; none is energised again by that."""
+        """Clear the errors of every axis of the board; none is energised again by that."""
         for axis in self.axes:
             axis.axis_error = axis.motor_error = axis.encoder_error = 0
             axis.controller_error = axis.sensorless_error = 0
@@ -358,7 +360,7 @@ class OdriveController:
 
     @property
     def state(self) -> str:
-        """In one word."""
+        """State of all axes in one word."""
         axes = [axis for side in self.axes for axis in side]
         if any(axis.axis_error for axis in axes):
             return "FAULT"
@@ -366,7 +368,7 @@ class OdriveController:
 
     @property
     def obeyed(self) -> int:
-        """How many frames its axes have taken."""
+        """Number of frames that the axes have accepted."""
         return sum(axis.fed for side in self.axes for axis in side)
 
     def receive(self, now_us: int, frame: CanFrame) -> Sequence[CanFrame]:

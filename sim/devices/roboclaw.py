@@ -23,7 +23,7 @@ QUIET_US = 10_000
 
 @dataclass(slots=True)
 class RoboclawRegisters:
-    """What a host can set and read; motor 1 and 2. Counts wrap at 2^32."""
+    """Registers that a host can set and read; motor 1 and 2. Counts wrap at 2^32. Counts wrap at 2^32."""
 
     timeout_ds: int = 0
     encoder_m1: int = 0
@@ -238,14 +238,14 @@ class RoboclawController:
 
     @property
     def state(self) -> str:
-        """In one word."""
+        """State of all boards in one word."""
         if any(board.registers.status & 0xFFFF for board in self.boards.values()):
             return "FAULT"
         return "STANDBY" if all(board.command is None for board in self.boards.values()) else "ARMED"
 
     @property
     def obeyed(self) -> int:
-        """How many speed commands they have taken."""
+        """Number of speed commands that the boards have accepted."""
         return sum(command in _MOVING for board in self.boards.values() for command, _ in board.obeyed)
 
     def receive(self, now_us: int, frame: CanFrame) -> Sequence[CanFrame]:

@@ -19,7 +19,10 @@ WHEELS_MS, STATE_MS, STEP_MS = 20, 50, 20
 
 
 class Ros2BaseController:
-    """Satisfies `sim.virtual_robot.Controller`. `joints`: whether the base says how all of its wheels turn."""
+    """Controller of a base on ROS 2 (a `sim.virtual_robot.Controller`).
+
+    `joints`: whether the base reports each wheel. `joints`: whether the base says how all of its wheels turn.
+    """
 
     brakes = False
 
@@ -49,7 +52,7 @@ class Ros2BaseController:
 
     @property
     def state(self) -> str:
-        """In one word."""
+        """State of the base in one word."""
         return "ESTOP" if self.end.latched else "ARMED" if self.end.driving else "STANDBY"
 
     def receive(self, now_us: int, frame: CanFrame) -> Sequence[CanFrame]:

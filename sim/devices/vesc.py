@@ -54,7 +54,7 @@ def f32(value: float) -> float:
 
 @dataclass(slots=True)
 class VescValues:
-    """What the controller measures."""
+    """Values that the controller measures."""
 
     t_fet_c: float = 30.0
     t_motor_c: float = 30.0
@@ -83,14 +83,17 @@ class VescValues:
 
 
 def _steps(value: float, scale: float, code: str, number: Callable[[float], float] = f32) -> bytes:
-    """In the vendor's way: multiplied, as a 32-bit float or as `number` says, and cut off toward zero."""
+    """Encode a value as the vendor does: multiplied, as a 32-bit float or as `number` says, and cut off toward zero."""
     bits = 8 * struct.calcsize(">" + code)
     low, high = -(1 << bits - 1), (1 << bits - 1) - 1
     return struct.pack(">" + code, min(max(int(number(f32(value) * scale)), low), high))
 
 
 class Vesc:
-    """One controller. `take_calls` returns the commands that reached its motor, by name and value.
+    """Model of one VESC controller.
+
+    `take_calls` returns the commands that reached its motor, by name and value. `take_calls` returns the commands that
+    reached its motor, by name and value.
 
     `kill_switch_pin`: its kill switch input. Like `timed_out`, the `kill_switch_active` that it reports is the result
     of the last check of the timeout thread (vedderb/bldc, timeout.c), not the state at the time of the request.
@@ -160,7 +163,7 @@ class Vesc:
         return bytes(self._serial_out), frames
 
     def take_packet_answer(self, frame: CanFrame) -> bytes:
-        """What goes out on the serial line for a fragment of another controller's answer to a forwarded packet."""
+        """Return the bytes for the serial line after a fragment of another controller's reply to a forwarded packet."""
         command, to = frame.can_id >> 8, frame.can_id & 0xFF
         if not frame.extended or to != self.controller_id:
             return b""
@@ -332,7 +335,7 @@ def serial_packet(payload: bytes) -> bytes:
 
 
 def wrapped(count: int) -> int:
-    """As a signed 32-bit number that wraps."""
+    """Return a count as a signed 32-bit number that wraps."""
     return (count + 2**31) % 2**32 - 2**31
 
 
@@ -408,7 +411,7 @@ class VescController:
 
     @property
     def state(self) -> str:
-        """In one word."""
+        """State of all VESCs in one word."""
         vescs = [vesc for side in self.sides for vesc in side]
         if any(vesc.values.fault for vesc in vescs):
             return "FAULT"
@@ -416,7 +419,7 @@ class VescController:
 
     @property
     def obeyed(self) -> int:
-        """How many set commands they have taken."""
+        """Number of set commands that the VESCs have accepted."""
         return sum(vesc.fed for side in self.sides for vesc in side)
 
     def receive(self, now_us: int, frame: CanFrame) -> Sequence[CanFrame]:
