@@ -89,7 +89,7 @@ def run_ros2_bridge(robot: Path, model: Path | None = None, link: str | None = N
 
 
 def wire_name(topic: str, namespace: str) -> str:
-    """The name on the wire of a topic, which is in the namespace unless it begins with a slash."""
+    """Return the name on the wire of a topic, which is in the namespace unless it begins with a slash."""
     return (
         "rt" + topic
         if topic.startswith("/")
@@ -327,7 +327,7 @@ class Bridge:
 
 
 def _publisher_of(message: Any) -> str | None:
-    """The writer of a message that came over DDS; None for one of our own."""
+    """Return the writer of a message that came over DDS; None for one of our own."""
     info = getattr(message, "sample_info", None)
     return None if info is None else f"publisher {info.publication_handle:x}"
 

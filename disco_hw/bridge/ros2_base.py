@@ -224,7 +224,7 @@ class BaseBridge:
             self._take_button(self._button)
 
     def _take_button(self, reader: DataReader[Any]) -> None:
-        """A button that nobody speaks for, or whose word cannot be read, keeps the base where it is."""
+        """Read the base's button; an unreadable message, or no publisher, keeps the base where it is."""
         unreadable = self._unreadable
         for message, _ in self._taken(reader):
             self.end.button, self.end.hears_button = message.data, True
@@ -272,7 +272,7 @@ class BaseBridge:
                 yield sample, sample.sample_info.source_timestamp
 
     def _tell(self) -> None:
-        """A line for a person at each change."""
+        """Print a line for the operator at each change."""
         end = self.end
         topics = self._settings
         words = [

@@ -62,7 +62,10 @@ class SpeedInlet:
     def request(
         self, message: msg.Twist | msg.TwistStamped, sent_ns: int, mono_ns: int, wall_ns: int
     ) -> dict[str, Any] | None:
-        """The request to the daemon for a speed heard now; None for what is none. `sent_ns` is wall-clock time."""
+        """Return the request to the daemon for a speed heard now; None for what is none.
+
+        `sent_ns` is wall-clock time.
+        """
         twist = message if isinstance(message, msg.Twist) else message.twist
         stamp_ns = 0 if isinstance(message, msg.Twist) else msg.time_of(message.header.stamp)
         age_ns = wall_ns - (stamp_ns or sent_ns)

@@ -53,7 +53,7 @@ class PoseInlet:
     def datagram(
         self, message: PoseMessage, sent_ns: int, mono_ns: int, wall_ns: int, publisher: Hashable = None
     ) -> bytes | None:
-        """The datagram to send for a message heard now; None for what is not to be passed on.
+        """Return the datagram to send for a message heard now; None for what is not to be passed on.
 
         `sent_ns`: when it was sent, by the sender's wall clock, which counts where the message has no stamp. Of a flood
         one pose in 4 ms is passed on, as a daemon has no use for more. `publisher`: who sent it; of several on the
@@ -148,7 +148,7 @@ class TransformInlet:
     def poses(
         self, message: msg.TFMessage, sent_ns: int, wall_ns: int, *, static: bool, publisher: Hashable = None
     ) -> Iterator[msg.PoseWithCovarianceStamped]:
-        """The poses that the transforms of a message bring; `sent_ns` is the time of those without a stamp.
+        """Yield the poses that the transforms of a message bring; `sent_ns` is the time of those without a stamp.
 
         `publisher`: who sent it; of several that move one edge the first counts, until it has been silent.
         """
@@ -196,7 +196,7 @@ class TransformInlet:
         return True
 
     def _pose_by(self, child: str, wall_ns: int) -> msg.PoseWithCovarianceStamped | None:
-        """The chain's end now that `child` has moved; None unless that is the first edge that moves."""
+        """Return the chain's end now that `child` has moved; None unless that is the first edge that moves."""
         if self._chain is None:
             self.refused[f'transforms without a chain from "{self._map[:40]}" to "{self._base[:40]}"'] += 1
             return None
@@ -225,7 +225,7 @@ class TransformInlet:
         return msg.PoseWithCovarianceStamped(msg.Header(msg.stamp_of(t_ns), self._settings.frame), pose)
 
     def _motion(self, child: str, only_ns: int | None) -> Motion:
-        """The transforms of an edge for the chain; of the first, the newest alone, at the time of the pose."""
+        """Return the transforms of an edge for the chain; of the first, the newest alone, at the time of the pose."""
         edge = self._edges[child]
         rows = list(edge.rows) if only_ns is None else [(only_ns, edge.rows[-1][1])]
         return Motion(np.array([t for t, _ in rows]), np.array([values for _, values in rows]), edge.static)
@@ -255,7 +255,7 @@ class WheelInlet:
         self._why, self._why_ns = _NOTHING, -_SECOND_NS
 
     def wheels(self, message: msg.JointState | msg.Odometry, sent_ns: int, mono_ns: int, wall_ns: int) -> Wheels | None:
-        """The wheels by a message heard now; None for what is refused, or says nothing of them.
+        """Return the wheels by a message heard now; None for what is refused, or says nothing of them.
 
         `sent_ns`: when it was sent, by the sender's wall clock, which counts where the message has no stamp.
         """
@@ -293,7 +293,7 @@ class WheelInlet:
         self._why, self._why_ns = why, mono_ns
 
     def _of_joints(self, message: msg.JointState, elapsed_s: float) -> tuple[Both, Both] | None:
-        """The mean of each side; speeds from the angles where there are none. None where a joint is missing."""
+        """Return the mean of each side; speeds from the angles where there are none. None where a joint is missing."""
         at = {name: place for place, name in enumerate(message.name)}
         sides = (self._settings.left_joints, self._settings.right_joints)
         if not at.keys() >= self._joints or len(message.position) < len(message.name):

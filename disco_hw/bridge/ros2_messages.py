@@ -246,10 +246,10 @@ class ObstacleArrayMsg(IdlStruct, typename="costmap_converter_msgs::msg::dds_::O
 
 
 def stamp_of(time_ns: int) -> Time:
-    """A wall-clock time in ns as a message has it."""
+    """Return a wall-clock time in ns as a message has it."""
     return Time(time_ns // 1_000_000_000, time_ns % 1_000_000_000)
 
 
 def time_of(stamp: Time) -> int:
-    """The wall-clock time of a stamp in ns; 0 is none."""
+    """Return the wall-clock time of a stamp in ns; 0 is none."""
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)

@@ -193,7 +193,7 @@ def _pose(x_m: float, y_m: float, yaw_rad: float) -> msg.RosPose:
 
 
 def _six(covariance: Matrix3) -> list[float]:
-    """The 6 x 6 matrix of x, y, z and the rotations about them."""
+    """Return the 6 x 6 matrix of x, y, z and the rotations about them."""
     full = [0.0] * 36
     for one, row in zip((0, 1, 5), covariance, strict=True):
         for other, value in zip((0, 1, 5), row, strict=True):
@@ -204,7 +204,7 @@ def _six(covariance: Matrix3) -> list[float]:
 
 
 def _figures(counters: records.Counters | None) -> Iterable[tuple[str, int]]:
-    """The counters that a person at a robot asks for first."""
+    """Yield the counters that a person at a robot asks for first."""
     if counters is not None:
         yield "loop overruns", counters.loop.get("overruns", 0)
         yield "ticks skipped", counters.loop.get("skipped", 0)

@@ -46,7 +46,10 @@ def main() -> None:
 
 
 def plain_stop(words: Sequence[str]) -> tuple[Path, str | None, bool] | None:
-    """The robot file, --link and --json of `estop`; None for another verb, and for whatever needs help or an error."""
+    """Return the robot file, --link and --json of `estop`.
+
+    None for another verb, and for whatever needs help or an error.
+    """
     if not words or words[0] != "estop":
         return None
     files: list[str] = []

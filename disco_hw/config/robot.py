@@ -88,7 +88,7 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
         return fields if exchange is None else {**fields, "exchange": exchange(self.settings())}
 
     def settings(self) -> Any:
-        """The driver's own settings. Raises msgspec.ValidationError where it needs some that are not there."""
+        """Return the driver's own settings. Raises msgspec.ValidationError where it needs some that are not there."""
         if self.of_driver is not None:
             return self.of_driver
         return msgspec.convert({}, find_driver(self.driver).settings)
@@ -135,7 +135,7 @@ class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     also: Annotated[tuple[PoseInput, ...], Meta(max_length=3)] = ()
 
     def every(self) -> tuple[PoseInput, ...]:
-        """This source and the further ones, in the order of their numbers."""
+        """Return this source and the further ones, in the order of their numbers."""
         return (self, *self.also)
 
     def labels(self) -> tuple[str, ...]:
@@ -147,7 +147,7 @@ class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         )
 
     def of(self, source: str) -> PoseInput | None:
-        """The first source of this kind; None where there is none."""
+        """Return the first source of this kind; None where there is none."""
         return next((one for one in self.every() if one.source == source), None)
 
     def convention(self) -> PoseConvention:

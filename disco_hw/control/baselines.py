@@ -160,7 +160,7 @@ class Follower:
         return Errors(place, left, math.remainder(state.yaw_rad - yaw, 2.0 * math.pi), off, self._sum_m_s)
 
     def set_task(self, _task: object) -> None:
-        """A line is for good."""
+        """Raise TypeError, because a follower keeps its line."""
         raise TypeError("a follower keeps its line")
 
     def set_belief(self, _belief: object) -> None:
@@ -229,7 +229,7 @@ class Reference:
         return int(near[int(square.argmin())])
 
     def beyond(self, place: int, entries: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Indices so many entries further on: round and round, or up to the ends."""
+        """Return indices so many entries further on: round and round, or up to the ends."""
         count = len(self.places_m)
         return np.asarray((place + entries) % count if self.closed else np.clip(place + entries, 0, count - 1))
 
@@ -258,7 +258,7 @@ class PurePursuit:
     largest_sum_m_s: float = 0.3
 
     def turn(self, reference: Reference, errors: Errors, x_m: float, y_m: float, yaw_rad: float) -> tuple[float, float]:
-        """The arc through the goal, less the reference's."""
+        """Return the arc through the goal, less the reference's."""
         goal_x, goal_y = reference.axle_m(reference.ahead(errors.place, self.look_ahead_m))
         axle_x, axle_y = x_m + reference.x_icr_m * math.cos(yaw_rad), y_m + reference.x_icr_m * math.sin(yaw_rad)
         to_x, to_y = goal_x - axle_x, goal_y - axle_y
@@ -363,7 +363,7 @@ class BelievedPlanner(Protocol):
         """Drive around what stands on this line, points (N, 2)."""
 
     def sampled_rollouts(self, count: int) -> Rollouts:
-        """The weightiest sequences of the last plan."""
+        """Return the weightiest sequences of the last plan."""
 
 
 class WithFallback:
@@ -390,7 +390,7 @@ class WithFallback:
         return NominalRobot(*self._planner.chassis, self._limits)
 
     def plan(self, now_ns: int, state: PlannerState) -> WheelPlan:
-        """The planner's plan, or the follower's; raises NoValidControl where neither can be."""
+        """Return the planner's plan, or the follower's; raises NoValidControl where neither can be."""
         numbers = state.x_m, state.y_m, state.yaw_rad, state.left_speed_rad_s, state.right_speed_rad_s
         finite = all(map(math.isfinite, numbers))
         try:
@@ -435,5 +435,5 @@ class WithFallback:
         self._planner.set_line(line_m)
 
     def sampled_rollouts(self, count: int) -> Rollouts:
-        """The planner's, of its last plan."""
+        """Return the planner's, of its last plan."""
         return self._planner.sampled_rollouts(count)

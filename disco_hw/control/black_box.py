@@ -98,7 +98,7 @@ class BlackBoxDisco:
 
     @torch.no_grad()
     def plan(self, state: NDArray[np.float64], shift_steps: int = 1) -> NDArray[np.float64]:
-        """Controls (T, m) from a state (n,) on, the last plan moved on by whole steps.
+        """Plan controls (T, m) from a state (n,) on, the last plan moved on by whole steps.
 
         Raises NoValidControl, and keeps the last plan, if no sample has a finite cost.
         """

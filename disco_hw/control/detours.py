@@ -97,7 +97,7 @@ class Detours:
             )  # fmt: skip
 
     def _around(self, bounds: Boundaries, circle: list[float], keep_m: float, before: list[Detour]) -> Detour | None:
-        """The detour around a circle (x, y, radius, velocity); None where it does not stand in the way."""
+        """Return the detour around a circle (x, y, radius, velocity); None where it does not stand in the way."""
         x, y, radius = circle[:3]
         off = np.array([x, y]) - self._line
         at = int(np.hypot(*off.T).argmin())

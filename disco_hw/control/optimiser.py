@@ -126,7 +126,7 @@ class Optimiser:
         return int(self._work.costs.size)
 
     def nominal(self) -> Array:
-        """A read-only copy of the plan, (T, C)."""
+        """Return a read-only copy of the plan, (T, C)."""
         copy: Array = self._work.nominal.astype(np.float64)
         copy.setflags(write=False)
         return copy

@@ -56,7 +56,7 @@ def moments(belief: Belief) -> tuple[Array, Array]:
 
 
 def point_estimate(model: Model) -> tuple[Array, Array]:
-    """The model's point values as the only point: (1, P), weight (1,)."""
+    """Return the model's point values as the only point: (1, P), weight (1,)."""
     return model.point()[None], np.ones(1)
 
 
@@ -87,7 +87,7 @@ def drawn_points(model: Model, count: int, seed: int, step: int) -> Array:
 
 
 def mean_point(model: Model) -> Array:
-    """The mean of the belief over all parameters of the model, (1, P), within their physical ranges."""
+    """Return the mean of the belief over all parameters of the model, (1, P), within their physical ranges."""
     if model.belief is None:
         return model.point()[None]
     return model.complete(model.belief.mean()[None], model.belief.names)

@@ -60,7 +60,7 @@ class PendulumTerms(NamedTuple):
 
 
 def instant_cost(angle_rad: float, speed_rad_s: float) -> float:
-    """The stage cost of a state."""
+    """Return the stage cost of a state."""
     return UPRIGHT_WEIGHT * (math.cos(angle_rad) - 1.0) ** 2 + speed_rad_s**2
 
 

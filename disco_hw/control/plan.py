@@ -46,14 +46,13 @@ class CommandLimits:
 
     @classmethod
     def of_robot(cls, robot: config.Robot) -> CommandLimits:
-        """The limits of robot.toml."""
+        """Return the limits of robot.toml."""
         return cls(robot.max_wheel_speed_rad_s, robot.max_wheel_acceleration_rad_s2)
 
 
 @dataclass(frozen=True, slots=True)
 class Sampler:
-    """Settings of sampling: how command sequences are sampled, weighted and carried on, in the system's units of a
-    command.
+    """Settings that say how command sequences are sampled, weighted and carried on, in the system's units.
 
     samples: sequences tried in a step (K). horizon: steps a plan covers (T).
     noise_std: standard deviation of the noise on one knot; of a fifth of the samples it is `wide` times as large, to
@@ -149,7 +148,7 @@ class DiscoSettings:
 
     @classmethod
     def paper(cls, uncertainty: Uncertainty = "ut") -> DiscoSettings:
-        """The paper's skid-steer experiment (appendix): white noise, control cost, UT with alpha = 0.5, Algorithm 1.
+        """Return the paper's skid-steer settings (appendix): white noise, control cost, UT with alpha = 0.5.
 
         K = 400, T = 50, temperature 0.1, control authority 0.25 (rotations per second)^2. Rollouts take Euler steps, as
         those of the skid-steer robot in the code of the same author do (github.com/lubaroli/dust).
@@ -196,7 +195,7 @@ class DiscoSettings:
 
     @classmethod
     def from_config(cls, control: config.Control, speed_m_s: float) -> DiscoSettings:
-        """The settings that robot.toml asks for, for its task's speed."""
+        """Return the settings that robot.toml asks for, for its task's speed."""
         settings = cls.paper() if control.mode == "paper" else cls.for_speed(speed_m_s, control.rate_hz)
         horizon = settings.sampler.horizon if control.horizon is None else control.horizon
         step_s = settings.step_s if control.step_s is None else control.step_s

@@ -118,7 +118,7 @@ class Surroundings:
 
 
 def _edges(bounds: Boundaries) -> Array:
-    """The edges of all polygons, and of one within the circle to stay in, as capsules of no radius."""
+    """Return the edges of all polygons, and of one within the circle to stay in, as capsules of no radius."""
     outlines = [corners for corners, _ in bounds.polygons]
     circle = bounds.keep_in_circle
     if circle is not None:

@@ -89,7 +89,7 @@ class WheelLoss:
         return _lessened(_turned(commands, self._turn, _lessened), self._loss)
 
     def asked(self, commands: Array) -> Array:
-        """The inverse of `acting`."""
+        """Return the inverse of `acting`."""
         return _turned(_greater(commands, self._loss), self._turn, _greater)
 
 
@@ -106,7 +106,7 @@ def _lessened(commands: Array, loss: Array | float) -> Array:
 
 
 def _greater(commands: Array, loss: Array | float) -> Array:
-    """The inverse of `_lessened`."""
+    """Return the inverse of `_lessened`."""
     small = commands / (1.0 - loss / WHOLE_RAD_S)
     large = commands + np.sign(commands) * loss
     return np.where(np.abs(small) < WHOLE_RAD_S, small, large)

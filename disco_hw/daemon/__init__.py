@@ -55,7 +55,7 @@ def default_socket_path(name: str) -> Path:
 
 
 def passed_over(path: Path) -> tuple[str, ...]:
-    """The directories that `default_socket_path` did not believe before it came to `path`: a line each, with owners."""
+    """Return a line for each directory, with owners, that `default_socket_path` did not accept before `path`."""
     uid = os.geteuid()
     if path.parent.parent != _TEMPORARY or not _numbered(uid).fullmatch(path.parent.name):
         return ()
@@ -109,7 +109,7 @@ def connect(path: Path, timeout_s: float) -> socket.socket:
 
 
 def peer_uid(connection: socket.socket) -> int:
-    """The user whose process has the other end of a Unix socket."""
+    """Return the user whose process has the other end of a Unix socket."""
     credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
     return int(struct.unpack("3i", credentials)[1])
 
@@ -287,7 +287,7 @@ def _change(text: str) -> tuple[str, float]:
 
 
 def in_words(reply: dict[str, Any], robot: Path) -> str:
-    """A reply of the daemon of `robot` for a person."""
+    """Return a reply of the daemon of `robot` for a person."""
     if not reply.get("ok"):
         return f"refused: {reply.get('error')}"
     if reply.get("do") != "status":

@@ -72,14 +72,14 @@ class CheckReport:
         return all(check.level is not Level.FAIL for check in self.checks)
 
     def as_dict(self) -> dict[str, Any]:
-        """The report for machines."""
+        """Return the report as a JSON-serialisable dict."""
         return {
             "ok": self.ok,
             "checks": [{"name": check.name, "level": check.level.value, "text": check.text} for check in self.checks],
         }
 
     def as_text(self) -> str:
-        """The report for a person, one line a check."""
+        """Return the report for a person, one line a check."""
         return "\n".join(f"{check.level.value:4}  {check.name}: {check.text}" for check in self.checks)
 
 

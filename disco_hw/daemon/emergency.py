@@ -62,7 +62,7 @@ class EstopOutcome:
         return self.link_error is None or self.daemon_error is None
 
     def as_dict(self) -> dict[str, Any]:
-        """The outcome for machines."""
+        """Return the outcome as a JSON-serialisable dict."""
         return {
             "sent": self.sent,
             "confirmed": self.confirmed,
@@ -74,7 +74,7 @@ class EstopOutcome:
         }
 
     def as_text(self) -> str:
-        """The outcome for a person."""
+        """Return the outcome as text."""
         lines = [
             *([] if self.file_error is None else [f"{self.file_error}: used --link alone"]),
             f"{self.link}: {self.link_error or 'e-stop sent'}",

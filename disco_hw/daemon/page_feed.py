@@ -105,7 +105,7 @@ class ViewerFeed:
             del self._pending[:-_MOST_RECORDS]
 
     def _notice_watchers(self) -> None:
-        """A first page subscribes, the last one leaves: the socket reports both."""
+        """Update whether a page watches: the socket reports when a first one subscribes and the last one leaves."""
         with contextlib.suppress(zmq.Again):
             while True:
                 self._watched = self._socket.recv(zmq.NOBLOCK)[:1] == b"\x01"

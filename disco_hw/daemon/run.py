@@ -260,12 +260,12 @@ _RECORDER = "recorder"
 
 
 def in_text(topic: str, text: str) -> str:
-    """A sentence of the daemon for a person."""
+    """Return a sentence of the daemon for a person."""
     return f"{topic}: {text}"
 
 
 def in_json(topic: str, text: str) -> str:
-    """A sentence of the daemon for machines."""
+    """Return a sentence of the daemon for machines."""
     return json.dumps({"topic": topic, "text": text})
 
 
@@ -395,7 +395,7 @@ def planner_in_words(setup: Setup) -> str:
 
 
 def warm_planner(setup: Setup, new_planner: Callable[[], Planner]) -> Planner:
-    """A new planner, after all that it will need was run once, by another one."""
+    """Return a new planner, after all that it will need was run once, by another one."""
     planner = new_planner()
     warm_up(make_pipeline(setup.config, setup.model, new_planner()))
     return planner

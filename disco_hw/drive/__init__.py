@@ -66,7 +66,7 @@ class ManualSource(Protocol):
         """Name of what is being carried out and what for; empty where the operator decides."""
 
     def poll(self, now_ns: int, robot: RobotView) -> ManualInput | None:
-        """The newest input, however old; None when the device is gone."""
+        """Return the newest input, however old; None when the device is gone."""
 
     def close(self) -> None:
         """Give the device back; safe to call twice."""
@@ -222,7 +222,7 @@ class PageSource:
         return None
 
     def poll(self, now_ns: int, _robot: RobotView) -> ManualInput | None:
-        """The newest input of the page that holds; open while no page does."""
+        """Return the newest input of the page that holds; open while no page does."""
         newest = self._newest
         if newest is not None and now_ns - newest.t_ns <= self._limit_ns:
             return newest

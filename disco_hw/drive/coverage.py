@@ -165,7 +165,7 @@ class Coverage:
             self._swing = (side, t_ns)
 
     def _count_crossings(self, t_ns: int, dt_s: float, wheel: int, speed: float) -> None:
-        """A crossing begins where a wheel was last beyond the band on one side and ends beyond it on the other."""
+        """Count slow crossings of zero: from beyond the band on one side to beyond it on the other."""
         if abs(speed) < _MOVING:
             self._rested_ns[wheel] += round(dt_s * 1e9) if abs(speed) <= _STILL else 0
             return
@@ -180,7 +180,7 @@ class Coverage:
 
 
 def _regime(forward: float, turn: float, size: float) -> str | None:
-    """The kind of motion; None for creeping, which counts for nothing."""
+    """Return the kind of motion; None for creeping, which counts for nothing."""
     if size <= _STILL:
         return "rest"
     if size < _MOVING:

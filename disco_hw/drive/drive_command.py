@@ -39,7 +39,7 @@ _STANDARD_INPUT = 0
 
 
 def leads_to_virtual_robot(link: Link) -> bool:
-    """True for the simulator's own bus, Linux's vcan and pseudo-terminals that exist; False when in doubt."""
+    """Return True for the simulator's own bus, Linux's vcan and existing pseudo-terminals; False when in doubt."""
     if link.kind == "serial":
         return os.path.realpath(link.port).startswith(_PSEUDO_TERMINALS)
     if link.interface == "socketcan":
@@ -81,11 +81,11 @@ class DriveResult:
     recording_errors: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
-        """The result for machines."""
+        """Return the result as a JSON-serialisable dict."""
         return {**asdict(self), "log": str(self.log)}
 
     def as_text(self) -> str:
-        """The result for a person."""
+        """Return the result as text."""
         lost = "".join(f"\nNOT WHOLE: {error}" for error in self.recording_errors)
         return f"{self.ended}\n{self.coverage_words}\nlog {self.log}{lost}"
 

@@ -72,7 +72,7 @@ def fit_script(
 def _next_that_fits(
     remaining: list[Manoeuvre], scale: float, pose: Pose, robot: ScriptGeometry, bounds: Boundaries, keep_m: float
 ) -> tuple[int, Manoeuvre, Pose] | None:
-    """The first of the next manoeuvres that stays inside in some variant, and where it ends."""
+    """Return the first of the next manoeuvres that stays inside in some variant, and where it ends."""
     finds_limits = any(one.finds_limits for one in remaining)
     for index, manoeuvre in enumerate(remaining[:_LOOK_AHEAD]):
         if manoeuvre.within_limits and finds_limits:

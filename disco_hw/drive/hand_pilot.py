@@ -243,7 +243,7 @@ class UntilHeading:
 
 
 def task_pilot(config: RobotConfig) -> UntilHeading:
-    """The pilot for this robot's task."""
+    """Return the pilot for this robot's task."""
     top_rad_s = config.drive.speed_share * config.robot.max_wheel_speed_rad_s
     page = PageSource(top_rad_s, config.drive.turn_share)
     return UntilHeading(TaskPilot(), HandPilot(page, Coverage(top_rad_s), page))

@@ -56,7 +56,7 @@ class Script:
         return (0.0, 0.0) if place is None else place[0].wheels(t_s - place[1])
 
     def place(self, t_s: float) -> tuple[Manoeuvre, float] | None:
-        """The manoeuvre under way at a time and when it began (s); None before the start and from the end on."""
+        """Return the manoeuvre under way at a time and when it began (s); None before the start and from the end on."""
         start_s = 0.0
         for manoeuvre in self.manoeuvres if t_s >= 0.0 else ():
             if t_s < start_s + manoeuvre.duration_s:
@@ -65,7 +65,7 @@ class Script:
         return None
 
     def cut(self, seconds: float) -> Script:
-        """The script broken off after so long."""
+        """Return the script broken off after so long."""
         kept: list[Manoeuvre] = []
         left_s = seconds
         for manoeuvre in self.manoeuvres:
@@ -84,7 +84,7 @@ class Room:
     y_m: tuple[float, float]
 
     def in_words(self) -> str:
-        """The room for a person."""
+        """Return the room as text."""
         return (
             f"about {self.x_m[1]:.1f} m ahead, {abs(self.x_m[0]):.1f} m behind, {self.y_m[1]:.1f} m to the left and "
             f"{abs(self.y_m[0]):.1f} m to the right of the tracked point"
@@ -92,7 +92,7 @@ class Room:
 
 
 def room_needed(wheels: Callable[[float], Wheels], duration_s: float, robot: Robot, step_s: float = 0.02) -> Room:
-    """The room that a drive takes on a robot with exactly the nominal geometry; a real one needs more."""
+    """Return the room that a drive takes on a robot with exactly the nominal geometry; a real one needs more."""
     x_m = y_m = yaw_rad = 0.0
     xs, ys = [0.0], [0.0]
     for k in range(math.ceil(duration_s / step_s)):
@@ -208,7 +208,7 @@ class ScriptSource:
         return f"{manoeuvre.name}{limits}: {manoeuvre.purpose}"
 
     def poll(self, now_ns: int, robot: RobotView) -> ManualInput | None:
-        """The script's wheel speeds with the other source's deadman and time."""
+        """Return the script's wheel speeds with the other source's deadman and time."""
         held = self._deadman.poll(now_ns, robot)
         self._advance(now_ns, robot)
         if held is None:
@@ -355,7 +355,7 @@ class ReachedLimits:
         return left, right
 
     def in_words(self) -> str:
-        """The limits for a person."""
+        """Return the limits as text."""
         if len(self._asked) < 4:
             return "limits not found: no wheel speeds were measured"
         reached = {key: asked * self.share(key[0], forward=key[1]) for key, asked in self._asked.items()}

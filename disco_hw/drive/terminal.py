@@ -140,7 +140,7 @@ class KeyHold:
         return ManualInput(self._last_ns, left, right, deadman=True)
 
     def _after(self, t_ns: int) -> _Hold:
-        """The state after a driving key at `t_ns`."""
+        """Return the state after a driving key at `t_ns`."""
         gap_ns = _FIRST_REPEAT_NS if self._last_ns is None else t_ns - self._last_ns
         match self._state:
             case _Hold.PRESSED if gap_ns < _SHORTEST_REPEAT_NS:
@@ -229,7 +229,7 @@ class Keyboard:
         return held if self._ended is None else ManualInput(now_ns, 0.0, 0.0, deadman=False)
 
     def typed(self) -> str:
-        """The printable keys that drive nothing, typed since it was asked last and seen by a poll."""
+        """Return the printable keys that drive nothing, typed since it was asked last and seen by a poll."""
         typed, self._typed = self._typed, ""
         return typed
 
@@ -283,13 +283,13 @@ _START_TIMEOUT_S = 60.0
 
 
 def line(status: Mapping[str, Any]) -> str:
-    """The state of the drive in one line."""
+    """Return the state of the drive in one line."""
     drive = status["drive"]
     return f"{status['state']}: {drive['words']} | {drive['coverage_words']}"
 
 
 def table(status: Mapping[str, Any]) -> Group:
-    """The state of the drive as a picture for the terminal."""
+    """Return the state of the drive as a picture for the terminal."""
     from rich.console import Group  # noqa: PLC0415
     from rich.table import Table  # noqa: PLC0415
     from rich.text import Text  # noqa: PLC0415

@@ -9,7 +9,7 @@ from disco_hw.jit import scalar_function
 
 
 def plain(command: Value, values: Values) -> Value:
-    """u -> sign(u) max(|u| - width, 0) on each wheel's command."""
+    """Map u to sign(u) max(|u| - width, 0) on each wheel's command."""
     (width,) = values
     return np.sign(command) * np.maximum(np.abs(command) - width, 0.0)
 

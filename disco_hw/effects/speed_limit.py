@@ -36,7 +36,7 @@ def limited(commands: Array, geometry: tuple[float, float]) -> Array:
 
 
 def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
-    """A fit begins where a part of what was commanded is cut."""
+    """Return where a fit begins: a part of what was commanded is cut."""
     largest = driven.largest_speed_rad_s
     return tuple((share * largest,) for share in (0.92, 0.75, 0.5)) if largest > 0.1 else ()
 

@@ -11,7 +11,7 @@ REST_RAD_S = 0.02
 
 
 def plain(command: Value, speed: Value, values: Values) -> Value:
-    """A wheel at rest, or passing through it, rests until |u| exceeds the threshold; a turning one feels nothing."""
+    """Return the command that acts: a wheel at rest needs |u| above the threshold; a turning one feels nothing."""
     (threshold,) = values
     resting = (np.abs(speed) < 0.02) | (np.asarray(speed * command) < 0.0)
     return np.where(resting & (np.abs(command) <= threshold), 0.0, command)

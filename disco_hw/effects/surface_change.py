@@ -49,7 +49,7 @@ def term(
 
 
 def times(driven: CommandedDrive) -> tuple[float, ...]:
-    """Times to try (s); none in a drive too short to have been two."""
+    """Return times to try (s); none in a drive too short to have been two."""
     first, last = driven.first_s, driven.last_s
     if last - first < 30.0:
         return ()

@@ -365,7 +365,7 @@ class RewindBuffer:
         return judgement
 
     def head(self) -> FilterState:
-        """The state after the last event."""
+        """Return the state after the last event."""
         return self._run(len(self._events) - 1)
 
     def _index_after(self, t_ns: int, include_equal: bool) -> int:

@@ -123,7 +123,7 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
     forgets_heading: bool = False
 
     def lever(self, yaw_rad: float) -> tuple[float, float, float, float]:
-        """The lever arm in the world (x, y) of a robot with this heading, and its derivative by the heading."""
+        """Return the lever arm in the world (x, y) of a robot with this heading, and its derivative by the heading."""
         cosine, sine = math.cos(yaw_rad), math.sin(yaw_rad)
         x = cosine * self.lever_x_m - sine * self.lever_y_m
         y = sine * self.lever_x_m + cosine * self.lever_y_m

@@ -137,7 +137,7 @@ class HeadingWatch:
 
 
 def _without_heading(sample: PoseSample, offset: tuple[float, float]) -> PoseSample:
-    """The position of the sensor itself, as where the tracked point is from there is not known without a heading."""
+    """Return the sensor's own position, because the tracked point is unknown without a heading."""
     cosine = sine = 0.0
     if math.isfinite(sample.yaw_rad):
         cosine, sine = math.cos(sample.yaw_rad), math.sin(sample.yaw_rad)

@@ -189,7 +189,7 @@ class WheelTracker:
         self._right_offset_rad = 0.0
 
     def take(self, sample: WheelSample) -> WheelReading | WheelReason:
-        """The reading of a sample, or why there is none.
+        """Return the reading of a sample, or why there is none.
 
         Angles that jump further than any wheel turns are taken as a restarted counter: no motion, new zero.
         """
@@ -310,7 +310,7 @@ def motion_model(settings: Estimation, parameters: OdometryParameters) -> Motion
 
 
 def belief_at(pose: Pose, position_variance: float, yaw_variance: float, model: MotionModel) -> PoseBelief:
-    """A belief with independent x, y (the same variance, m^2) and yaw (rad^2), independent of the parameters."""
+    """Return a belief with independent x, y (the same variance, m^2) and yaw (rad^2), independent of the parameters."""
     sensitivity: Flat9 | None = None if model.parameter_root is None else (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     x, y, yaw = pose.x_m, pose.y_m, wrap(pose.yaw_rad)
     return PoseBelief(x, y, yaw, position_variance, 0.0, 0.0, position_variance, 0.0, yaw_variance, sensitivity)

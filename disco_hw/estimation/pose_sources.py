@@ -63,7 +63,7 @@ class TrackedSource:
     _last: Triple = _NAN3
 
     def forget_course(self) -> None:
-        """The estimate is elsewhere now: what poses were off before says nothing."""
+        """Clear what poses were off by, because the estimate has jumped elsewhere."""
         self.in_a_row, self.left_by_jump, self.means_of = 0, False, 0
         self.innovation, self.variance, self._last = list(_NAN3), list(_NAN3), _NAN3
 
@@ -155,7 +155,7 @@ class PoseSources:
         return len(self.all) < 2 or self.all[number].standing is Standing.GOOD
 
     def counts(self) -> dict[str, int]:
-        """Accepted poses, outliers and refused ones of each source by name, where there are several."""
+        """Return accepted poses, outliers and refused ones of each source by name, where there are several."""
         if len(self.all) < 2:
             return {}
         return {

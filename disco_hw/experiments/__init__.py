@@ -53,14 +53,14 @@ class Child:
         return self.output.read_text(encoding="utf-8", errors="replace")
 
     def last_words(self) -> str:
-        """The last line it wrote."""
+        """Return the last line it wrote."""
         lines = self.said().strip().splitlines()
         return lines[-1] if lines else ""
 
 
 @contextmanager
 def disco_hw_process(name: str, arguments: Sequence[str], output: Path) -> Iterator[Child]:
-    """A `disco-hw` process in a session of its own; SIGTERM at the end, SIGKILL if that is ignored.
+    """Run a `disco-hw` process in a session of its own; SIGTERM at the end, SIGKILL if that is ignored.
 
     SIGTERM too if the thread that entered is gone, whatever ended it.
     """
@@ -277,12 +277,12 @@ def read_truth(path: Path) -> list[TruthRow]:
 
 
 def link_of_device(device: str) -> str:
-    """The kind of link that a motor controller of `DEVICES` is usually on."""
+    """Return the kind of link that a motor controller of `DEVICES` is usually on."""
     return find_driver(device).kinds[0]
 
 
 def with_device(text: str, device: str) -> str:
-    """A robot.toml's text with another motor controller of `DEVICES`, whose poses come by datagrams."""
+    """Return a robot.toml's text with another motor controller of `DEVICES`, whose poses come by datagrams."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
         opened.bind(("127.0.0.1", 0))
         port = opened.getsockname()[1]
@@ -300,7 +300,7 @@ def write_robot_file(
     device: str | None = None,
     control: str = "",
 ) -> Path:
-    """The shipped robot with addresses of its own.
+    """Return the shipped robot with addresses of its own.
 
     `device`: another motor controller, of `DEVICES`. `control`: a line for that section.
     """

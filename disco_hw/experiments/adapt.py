@@ -115,7 +115,7 @@ class AdaptResult:
         return found
 
     def table(self) -> str:
-        """The rows and the options as text."""
+        """Return the rows and the options as text."""
         lines = [
             f"{'what changes':16s} {'before':>8s} {'(adapting)':>10s} {'after':>8s} {'adapting':>9s} {'won back':>9s} "
             f"{'published':>10s} {'half back':>10s}"
@@ -292,7 +292,7 @@ def drive(
 
 
 def _beliefs(recorder: MemoryRecorder, model: Geometry) -> tuple[tuple[tuple[float, Array, Array], ...], int]:
-    """The beliefs in force over time, and how often that of the model came back."""
+    """Return the beliefs in force over time, and how often that of the model came back."""
     found = [(0.0, model.mean, model.std)]
     reverted = 0
     for _, tick in recorder.ticks:

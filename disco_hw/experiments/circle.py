@@ -147,7 +147,7 @@ class CircleResult:
         return found
 
     def table(self) -> str:
-        """The rows and the options as text."""
+        """Return the rows and the options as text."""
         lines = [
             f"{'controller':18s} {'mean cost':>10s} {'std':>8s} {'steady cost':>12s} {'rms (mm)':>9s} {'worst':>6s} "
             f"{'du (rot/s)':>11s}"
@@ -238,7 +238,7 @@ def plants(model: Model, count: int, first: int = 0) -> list[dict[str, float]]:
 
 
 def _knowing(name: str, model: Model, theta: dict[str, float]) -> Model:
-    """The controller's model for a curve."""
+    """Return the controller's model for a curve."""
     bare = replace(model, belief=None)
     match name:
         case "prior":

@@ -167,7 +167,7 @@ class CircleReport:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """The figures for machines."""
+        """Return the figures as a JSON-serialisable dict."""
         return {
             "success": self.success,
             "stopped": self.stopped,
@@ -179,7 +179,7 @@ class CircleReport:
         }
 
     def table(self) -> Table:
-        """The figures for a person."""
+        """Return the figures as text."""
         table = Table(title=f"Circle of {self.task.radius_m} m at {self.task.speed_m_s} m/s", title_justify="left")
         table.add_column("figure")
         table.add_column("value", justify="right")

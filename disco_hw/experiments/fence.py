@@ -95,7 +95,7 @@ def alone_drive(
     contender: tuple[str, str, bool],
     planner_of: Callable[[Setup], Planner] | None = None,
 ) -> FencedDrive:
-    """A circle in a tight room, by one of the CONTENDERS alone; the same rooms and robots for all.
+    """Drive a circle in a tight room, by one of the CONTENDERS alone; the same rooms and robots for all.
 
     Who adapts has `LEARNING_S` to do so first. `planner_of` makes another planner for a setup.
     """
@@ -193,7 +193,7 @@ class FenceResult:
         return {"options": asdict(self.options), "drives": rows}
 
     def table(self) -> str:
-        """The result for a person."""
+        """Return the result as text."""
         lines = [f"{'':<42}{'drives':>8}{'breaches':>10}{'least, m':>10}{'stops':>8}{'left, m':>9}{'way, m':>8}"]
         for row in self.rows():
             left = row["left_at_stop_median_m"]

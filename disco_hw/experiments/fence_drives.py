@@ -100,7 +100,7 @@ class _Overridden(SafeArea):
 
 
 def fenced_setup(fence: Fence, task: RobotTask | None = None, base: Setup | None = None) -> Setup:
-    """The shipped robot, or `base`, with this fence and task and a footprint."""
+    """Return the shipped robot, or `base`, with this fence and task and a footprint."""
     setup = base or load_setup(_SHIPPED)
     robot = msgspec.structs.replace(setup.config.robot, footprint_m=FOOTPRINT)
     changes = {"fence": fence, "robot": robot} | ({} if task is None else {"task": task})
@@ -108,7 +108,7 @@ def fenced_setup(fence: Fence, task: RobotTask | None = None, base: Setup | None
 
 
 def untold_plant(rng: np.random.Generator, off: float) -> PlantParameters:
-    """A plant whose geometry is up to `off` away from the model's mean, with other motors and another ground."""
+    """Return a plant whose geometry is up to `off` away from the model's mean, with other motors and another ground."""
     usual = PlantParameters()
     geometry = {
         name: getattr(usual, name) * (1.0 + off * rng.uniform(-1.0, 1.0))
@@ -125,7 +125,7 @@ def untold_plant(rng: np.random.Generator, off: float) -> PlantParameters:
 
 
 def random_room(rng: np.random.Generator, pillars: int) -> Fence:
-    """A room of four to eight corners about the origin, with pillars that leave the middle free."""
+    """Return a room of four to eight corners about the origin, with pillars that leave the middle free."""
     count = int(rng.integers(4, 9))
     angles = np.sort(rng.uniform(0.0, 2.0 * np.pi, count) * 0.2 + 2.0 * np.pi * np.arange(count) / count)
     reach = rng.uniform(1.5, 2.4, count)
@@ -138,7 +138,7 @@ def random_room(rng: np.random.Generator, pillars: int) -> Fence:
 
 
 def random_task_room(rng: np.random.Generator) -> tuple[Fence, CircleTask]:
-    """A room, and a circle in it at which the nominal footprint stays inside."""
+    """Return a room, and a circle in it at which the nominal footprint stays inside."""
     while True:
         radius_m = float(rng.uniform(0.4, 1.0))
         center = rng.uniform(-0.4, 0.4, 2)
@@ -220,7 +220,7 @@ def task_drive(
     guarded: bool = True,
     learning_s: float = 0.0,
 ) -> FencedDrive:
-    """The task, from its start; without `guarded` the guard is off, and the planner alone keeps to the fence."""
+    """Drive the task, from its start; without `guarded` the guard is off, and the planner alone keeps to the fence."""
     start = BodyPose(*setup.config.task.course().start)
     run = SimulatedRun(setup, virtual_robot(setup, plant, start, seed=seed), planner)
     area, fence = run.core.area, setup.config.fence
@@ -238,7 +238,7 @@ def _begin(run: SimulatedRun) -> None:
 
 
 def tight_room(rng: np.random.Generator, beside_m: float) -> tuple[Fence, CircleTask]:
-    """A circle at 0.3 m/s in a square room whose walls come so near to the footprint's way."""
+    """Return a circle at 0.3 m/s in a square room whose walls come so near to the footprint's way."""
     radius_m, turned = float(rng.uniform(0.6, 1.0)), float(rng.uniform(0.0, 2.0 * np.pi))
     reach_m = math.sqrt(2.0) * (_outer_m(radius_m) + beside_m)
     corners = [
@@ -254,7 +254,7 @@ def _outer_m(radius_m: float) -> float:
 
 
 def along_drive(rng: np.random.Generator, off: float, seconds: float) -> FencedDrive:
-    """A circle at 0.3 m/s between two fences 0.15 m beside the footprint's way, by a control law that sees neither."""
+    """Drive a circle at 0.3 m/s between two fences 0.15 m beside the footprint's way, by a law that sees neither."""
     radius_m = float(rng.uniform(0.6, 1.2))
     around = Circle((0.0, 0.0), _outer_m(radius_m) + _ALONG_M)
     within = Circle((0.0, 0.0), radius_m - 0.5 * FOOTPRINT.width - _ALONG_M)
@@ -268,7 +268,7 @@ def along_drive(rng: np.random.Generator, off: float, seconds: float) -> FencedD
 
 
 def room_drive(rng: np.random.Generator, off: float, seconds: float) -> FencedDrive:
-    """A circle in a random room, with the guard."""
+    """Drive a circle in a random room, with the guard."""
     setup = fenced_setup(*random_task_room(rng))
     planner = make_planner(setup.config, setup.model)
     return task_drive(setup, untold_plant(rng, off), planner, seconds, int(rng.integers(1 << 30)))

@@ -175,7 +175,7 @@ def run_gap_experiment(options: GapExperimentOptions, progress: Progress = lambd
 
 
 def without_effects(amended: Model, given: Model) -> Model:
-    """The amended model with the effects of the given one only, and what is believed of the rest."""
+    """Return the amended model with the effects of the given one only, and what is believed of the rest."""
     known = {setting.name for setting in given.effects}
     effects = tuple(setting for setting in amended.effects if setting.name in known)
     kept: list[EffectSetting] = list(effects)
@@ -213,7 +213,7 @@ def _record(
 def _circle(
     setup: Setup, options: GapExperimentOptions, hidden: Mapping[str, tuple[float, ...]], model: Model
 ) -> Track:
-    """The true path of DISCO round the circle with a model."""
+    """Return the true path of DISCO round the circle with a model."""
     task = circle_task(setup.config.task, "experiment gap")
     with_model = replace(setup, model=model)
     run = SimulatedRun(with_model, _robot(setup, options, hidden), make_planner(setup.config, model))

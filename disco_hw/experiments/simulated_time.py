@@ -54,7 +54,7 @@ def virtual_robot(
     effects: Mapping[str, float | Sequence[float]] | None = None,
     seed: int = 1,
 ) -> RobotInProcess:
-    """A robot with this plant whose controller has the limits of robot.toml.
+    """Return a robot with this plant whose controller has the limits of robot.toml.
 
     `effects`: hidden ones, as in `sim.effects`. Raises HiddenEffectError.
     """

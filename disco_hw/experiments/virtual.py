@@ -113,7 +113,7 @@ def run_sim(options: SimOptions) -> int:
 
 
 def true_parameters(setup: Setup, plant_seed: int | None) -> PlantParameters:
-    """The plant at the model's mean, or drawn from the model's belief with this seed."""
+    """Return the plant at the model's mean, or drawn from the model's belief with this seed."""
     mean, covariance = geometry(setup.model)
     radius, axial, x_icr = mean
     base = PlantParameters(ticks_per_rev=_whole_ticks(setup))

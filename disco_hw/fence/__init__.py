@@ -45,7 +45,7 @@ class Footprint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return math.hypot(abs(self.ahead) + 0.5 * self.length, 0.5 * self.width)
 
     def corners_m(self) -> tuple[Point, Point, Point, Point]:
-        """The corners relative to the tracked point, ahead and to the left, in counter-clockwise order."""
+        """Return the corners relative to the tracked point, ahead and to the left, in counter-clockwise order."""
         back, front, side = self.ahead - 0.5 * self.length, self.ahead + 0.5 * self.length, 0.5 * self.width
         return (back, -side), (front, -side), (front, side), (back, side)
 
@@ -178,7 +178,7 @@ def _leads_back(begin: Point, corner: Point, end: Point) -> bool:
 
 
 def _meeting(a: Point, b: Point, c: Point, d: Point) -> Point | None:
-    """A point that the segments a-b and c-d have in common; None if there is none."""
+    """Return a point that the segments a-b and c-d have in common; None if there is none."""
     c_side, d_side = _cross(a, b, c), _cross(a, b, d)
     a_side, b_side = _cross(c, d, a), _cross(c, d, b)
     if c_side * d_side < 0.0 and a_side * b_side < 0.0:

@@ -19,7 +19,7 @@ class TaskLine(Protocol):
         """Start of the line and the heading there: x, y (m), yaw (rad)."""
 
     def outline_m(self) -> NDArray[np.float64]:
-        """The line as points (N, 2)."""
+        """Return the line as points (N, 2)."""
 
 
 def task_breach(fence: Fence, footprint: Footprint, course: TaskLine) -> str | None:

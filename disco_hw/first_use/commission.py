@@ -82,11 +82,11 @@ class CommissionResult:
     ok: bool
 
     def as_dict(self) -> dict[str, Any]:
-        """The result for machines."""
+        """Return the result as a JSON-serialisable dict."""
         return {"ok": self.ok, "stages": list(self.stages)}
 
     def as_text(self) -> str:
-        """The result for a person."""
+        """Return the result as text."""
         lines = []
         for stage in self.stages:
             lines += [f"{stage['name']}: {figure}" for figure in stage["figures"]]
@@ -99,13 +99,13 @@ def _how(fault: dict[str, Any]) -> str:
 
 
 def slowest_rad_s(setup: Setup) -> float:
-    """The slowest true speed of a wheel that the controller holds."""
+    """Return the slowest true speed of a wheel that the controller holds."""
     link = setup.config.link
     return find_driver(link.driver).slowest_rad_s(link.settings()) * setup.config.wheels.turn_ratio
 
 
 def as_sent(setup: Setup) -> Setup:
-    """The robot with its poses as the first source sends them, and without those of others."""
+    """Return the robot with its poses as the first source sends them, and without those of others."""
     plain = msgspec.structs.replace(
         setup.config.pose,
         position_unit="m",

@@ -171,7 +171,7 @@ def _with(fault: Fault, place: tuple[str, str], value: Any) -> Fault:
 
 
 def _dead_band(side: int, track: Track) -> str:
-    """The command at which a wheel began to turn."""
+    """Return the command at which a wheel began to turn."""
     begun = next(
         (s.t_ns for s in track.wheels if max(abs(s.left_speed_rad_s), abs(s.right_speed_rad_s)) > STILL_RAD_S), None
     )
@@ -230,7 +230,7 @@ def _standing(still_s: float | None) -> str:
 
 
 def _simple(ratio: float) -> float:
-    """A ratio of small numbers where one is as near as a person can tell, else two digits."""
+    """Return a ratio of small numbers where one is as near as a person can tell, else two digits."""
     near = [a / b for b in range(1, 9) for a in range(1, 9) if abs(a / b / ratio - 1.0) < 0.3 * TURN_TOLERANCE]
     whole = [float(n) for n in range(2, 65) if min(abs(n / ratio - 1.0), abs(n * ratio - 1.0)) < 0.3 * TURN_TOLERANCE]
     if whole:
@@ -341,7 +341,7 @@ def _same_units(found: PoseConvention, told: PoseConvention) -> bool:
 
 
 def _fit(seen: FloorSeen, choice: PoseConvention, robot: Robot) -> _Fit | None:
-    """The drive in this convention; None where distance or turn cannot be so."""
+    """Return the drive in this convention; None where distance or turn cannot be so."""
     wheels_m = _travel(seen.straight, robot)
     dx, dy, heading = _displacement(seen.straight.poses, choice)
     poses_m = math.hypot(dx, dy)

@@ -128,7 +128,7 @@ class Track:
         return last.left_angle_rad - first.left_angle_rad, last.right_angle_rad - first.right_angle_rad
 
     def fastest(self) -> float:
-        """The faster wheel of the newest sample, without its sign (rad/s)."""
+        """Return the faster wheel of the newest sample, without its sign (rad/s)."""
         if not self.wheels:
             return 0.0
         return max(abs(self.wheels[-1].left_speed_rad_s), abs(self.wheels[-1].right_speed_rad_s))
@@ -147,7 +147,7 @@ SAW = {"1": "lf", "2": "lb", "3": "rf", "4": "rb", "0": ""}
 
 
 def speed_of(robot: Robot, slowest_rad_s: float) -> float:
-    """A tenth of the robot's largest wheel speed, or a little above the slowest that its controller holds (rad/s)."""
+    """Return a tenth of the largest wheel speed, or a little above the slowest that the controller holds (rad/s)."""
     return max(SPEED_SHARE * robot.max_wheel_speed_rad_s, _ABOVE_SLOWEST * slowest_rad_s)
 
 

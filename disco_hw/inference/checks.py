@@ -131,7 +131,7 @@ def _whitened(columns: Array, factor: Whitening) -> Array:
 
 
 def _scores(whitened: tuple[Array, int]) -> Array:
-    """t values of the tested columns, (tested,); the first column is the error, then come the nominal ones."""
+    """Return t values of the tested columns, (tested,); the first column is the error, then come the nominal ones."""
     columns, nominal = whitened
     base, _ = np.linalg.qr(columns[:, 1 : 1 + nominal])
     tested = columns[:, 1 + nominal :]
@@ -368,7 +368,7 @@ def undetermined(draws: Array, low: Array, high: Array, drive: Excitation, paper
 
 
 def _wide_directions(draws: Array, low: Array, high: Array, drive: Excitation) -> list[str]:
-    """Main axes of the posterior, in units of the prior's standard deviation, that are still wide."""
+    """Return the posterior's main axes, in units of the prior's standard deviation, that are still wide."""
     prior_sd = (high - low) / np.sqrt(12.0)
     variances, axes = np.linalg.eigh(np.cov((draws / prior_sd).T))
     sentences = []

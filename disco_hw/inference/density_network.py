@@ -309,7 +309,7 @@ class Fitted:
     widening: Array | None = None
 
     def posteriors(self, statistics: Array) -> Mixtures:
-        """The posteriors given statistics (n, S), in the region's coordinates and not cut to it."""
+        """Return the posteriors given statistics (n, S), in the region's coordinates and not cut to it."""
         found = self.network.mixtures(statistics)
         if self.widening is None:
             return found
@@ -444,7 +444,7 @@ class Region:
         raise EmptyRegionError("the region to draw parameters from is all but empty")
 
     def shrunk(self, draws: Array, deviations: float) -> Region:
-        """The part of this region within `deviations` standard deviations of draws (n, P), along their main axes."""
+        """Return the region's part within `deviations` standard deviations of draws (n, P), along their main axes."""
         scale = self.high - self.low
         covariance = np.cov((draws / scale).T) + _SMALLEST_DEVIATION**2 * np.eye(scale.size)
         variances, axes = np.linalg.eigh(covariance)

@@ -124,7 +124,7 @@ def excitation(log: DriveLog, source: Source | None = None) -> Excitation:
 
 
 def _left_out(log: DriveLog, source: Source) -> list[str]:
-    """A note where poses count for nothing, as the wheels beside them were not measured and those of others were."""
+    """Return a note where poses are ignored: the wheels beside them were not measured, those of others were."""
     if source == "commands":
         return []
     lacking = ~np.isin(log.poses.segment, log.wheels.segment)
@@ -274,7 +274,7 @@ class Noise:
     speed_share: float = 0.0
 
     def vector(self) -> Array:
-        """The five standard deviations in order, (5,)."""
+        """Return the five standard deviations in order, (5,)."""
         return np.array(
             [
                 self.position_m,
@@ -286,7 +286,7 @@ class Noise:
         )
 
     def scales(self) -> Array:
-        """The five standard deviations, the correlation time and the lever, (7,)."""
+        """Return the five standard deviations, the correlation time and the lever, (7,)."""
         return np.append(self.vector(), [self.correlation_s, self.lever_m])
 
     def about_the_point(self) -> Noise:
@@ -330,7 +330,7 @@ class _Windows:
 
 
 def measured_noise(drive: Excitation, theta: Array) -> Noise:
-    """The noise in what a geometry leaves unexplained; `theta` (3,) is x_icr, wheel radius, axial distance (m).
+    """Return the noise in what a geometry leaves unexplained; `theta` (3,) is x_icr, wheel radius, axial distance (m).
 
     Errors of predicted displacement over several lags: sensor noise adds the same variance to each, slip one that grows
     with the time in motion (structure function), slower at first the longer it keeps its direction. Errors beyond three
@@ -459,7 +459,7 @@ def _left(rows: list[_Windows], grown_s: Array, sensors: Array, lever_m: float) 
 
 
 def _speed_share(windows: list[_Windows], sensors: Array, slips: Array, correlation_s: float) -> float:
-    """The part of the slip's variance that grows with the square of speed, by likelihood."""
+    """Return the part of the slip's variance that grows with the square of speed, by likelihood."""
     costs = []
     for share in _SPEED_SHARES:
         cost = 0.0

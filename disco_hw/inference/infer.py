@@ -114,7 +114,7 @@ class Inference:
     seconds: float
 
     def model(self, nominal: Model) -> Model:
-        """The nominal model with the posterior's mean and the posterior as belief."""
+        """Return the nominal model with the posterior's mean and the posterior as belief."""
         mean = dict(zip(NAMES, self.belief.mean().tolist(), strict=True))
         return replace(nominal.with_point(mean), belief=self.belief)
 
@@ -207,7 +207,7 @@ def _infer(
 
 
 def prior_region(robot: RobotConfig) -> Region:
-    """The prior of robot.toml as far as it is physically possible; raises InputError if nothing of it is."""
+    """Return the prior of robot.toml as far as it is physically possible; raises InputError if nothing of it is."""
     possible = np.column_stack(physical_range())
     ranges = np.array([getattr(robot.prior, name) for name in NAMES])
     low, high = np.maximum(possible[:, 0], ranges[:, 0]), np.minimum(possible[:, 1], ranges[:, 1])
@@ -237,7 +237,7 @@ def _check_inside(prior: Region, estimate: Array, std: Array) -> None:
 
 
 def noise_of(drive: Excitation) -> Noise:
-    """The noise of a log: estimate the geometry, take what it leaves unexplained, and again with that."""
+    """Return the noise of a log: estimate the geometry, take what it leaves unexplained, and again with that."""
     noise = USUAL
     for _ in range(_NOISE_PASSES):
         theta = estimates(drive, noise).theta(drive.pose[None])[0]

@@ -87,7 +87,7 @@ def pairs_figure(draws: Array) -> Figure:
 
 
 def predictive_figure(deviations: Array) -> Figure:
-    """A bar for each of `CHECKS`."""
+    """Draw a figure with a bar for each of `CHECKS`."""
     figure = Figure(figsize=(7.5, 4.0), layout="constrained")
     axis = figure.subplots()
     colours = [ALARM if abs(value) > LARGEST_DEVIATION else MAIN for value in deviations]

@@ -198,7 +198,7 @@ class Workers(Protocol):
         """Results of `work(shared, item)` in the order of the items, as they come."""
 
     def call(self, work: Callable[..., R], *arguments: Any) -> R:
-        """The result of one piece of work."""
+        """Return the result of one piece of work."""
 
 
 class LocalWorkers:
@@ -227,7 +227,7 @@ class Tally:
         self._stage = ""
 
     def stage(self, text: str) -> None:
-        """A new stage begins."""
+        """Begin a new stage."""
         self._stage = text
         self.add(0)
 

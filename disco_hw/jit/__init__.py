@@ -122,7 +122,7 @@ def kernel_function(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def compiled_for(kernel: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
-    """The machine code of a kernel for arguments of these types, compiled or loaded if need be.
+    """Return the machine code of a kernel for arguments of these types, compiled or loaded if need be.
 
     Calling it spares working their types out in every call, which takes 10 us for nested tuples; it must only be called
     with arguments of the same types. Arrays of another kind are refused with a TypeError.

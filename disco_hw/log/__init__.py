@@ -157,7 +157,7 @@ class Frames:
 
 
 def batch_encoder() -> Callable[[int, int, Sequence[Record]], bytes]:
-    """A function (sequence, now_ns, records) -> message; it raises one of ENCODE_ERRORS."""
+    """Return a function (sequence, now_ns, records) -> message; it raises one of ENCODE_ERRORS."""
     encode = msgspec.msgpack.Encoder(enc_hook=_from_numpy).encode
     index = TOPIC_INDEX
 
@@ -184,7 +184,7 @@ class BatchDecoder:
         self._records = tuple(msgspec.msgpack.Decoder(topic.record) for topic in TOPICS)
 
     def batch(self, message: bytes) -> Batch:
-        """The batch of one message, its records still encoded."""
+        """Return the batch of one message, its records still encoded."""
         return self._batch.decode(message)
 
     def record(self, topic_index: int, data: msgspec.Raw) -> Record:
@@ -203,7 +203,7 @@ _MEDIA_TYPES = {".toml": "application/toml", ".json": "application/json", ".csv"
 
 
 def version() -> str:
-    """The package's version, with the commit when it runs from a checkout: "0.1.0+g1a2b3c4" or "...-dirty"."""
+    """Return the package's version, with the commit when it runs from a checkout: "0.1.0+g1a2b3c4" or "...-dirty"."""
     try:
         package = metadata.version("disco-hw")
     except metadata.PackageNotFoundError:
@@ -220,5 +220,5 @@ def version() -> str:
 
 
 def attachment(path: Path, name: str, kind: FileKind) -> Attachment:
-    """A copy of a file for the log, under a name of the log's; raises InputError if it cannot be read."""
+    """Return a copy of a file for the log, under a name of the log's; raises InputError if it cannot be read."""
     return Attachment(name, _MEDIA_TYPES.get(path.suffix, "text/plain"), read_bytes(path, kind)[0])

@@ -209,7 +209,7 @@ class Log:
     def records(
         self, topics: Collection[str] | None = None, start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Entry]:
-        """Records of these topics (all if None) from ticks at start_ns <= now_ns < end_ns, in recorded order.
+        """Yield records of these topics (all if None) from ticks at start_ns <= now_ns < end_ns, in recorded order.
 
         Raises LogError for a topic that no log has, and for damage.
         """
@@ -266,7 +266,7 @@ class Log:
         return tuple(ref.name for ref in self._contents.attachments)
 
     def attachment(self, name: str) -> bytes:
-        """The content of a file kept in the log; raises LogError if it is not there or damaged."""
+        """Return the content of a file kept in the log; raises LogError if it is not there or damaged."""
         for ref in self._contents.attachments:
             if ref.name == name:
                 try:

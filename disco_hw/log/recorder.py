@@ -303,7 +303,7 @@ class ProcessRecorder:
             self._wait(_CLOSING_STEP_S)
 
     def _encodable(self, now_ns: int, records: Sequence[Record]) -> list[Record]:
-        """The records that can be encoded; the others are counted."""
+        """Return the records that can be encoded; the others are counted."""
         kept = []
         for record in records:
             try:

@@ -230,7 +230,7 @@ class Task(msgspec.Struct, frozen=True, gc=False):
     speed_m_s: float = nan
 
     def values(self) -> dict[str, float]:
-        """The settings, of old and new logs."""
+        """Return the settings, of old and new logs."""
         old = (self.center_x_m, self.center_y_m, self.radius_m, self.speed_m_s)
         names = ("center_x_m", "center_y_m", "radius_m", "speed_m_s")
         kept = {name: value for name, value in zip(names, old, strict=True) if isfinite(value)}
@@ -377,5 +377,5 @@ TOPIC_BY_NAME: Mapping[str, Topic] = MappingProxyType({topic.name: topic for top
 
 
 def topic_of(record_type: type[Record]) -> str:
-    """The topic under which records of this type are found; KeyError if the type is none of ours."""
+    """Return the topic under which records of this type are found; KeyError if the type is none of ours."""
     return TOPICS[TOPIC_INDEX[record_type]].name

@@ -56,7 +56,7 @@ class LogFile:
         return len(data)
 
     def tell(self) -> int:
-        """The number of bytes written."""
+        """Return the number of bytes written."""
         return self._written
 
     def flush(self) -> None:

@@ -283,7 +283,7 @@ class Delivery:
         self.dropped_records += records
 
     def next_frame(self) -> bytes | None:
-        """The first frame that the present writer has not been sent."""
+        """Return the first frame that the present writer has not been sent."""
         return self._waiting[self._sent].frame if self._sent < len(self._waiting) else None
 
     def sent(self) -> None:

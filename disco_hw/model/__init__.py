@@ -157,7 +157,7 @@ def save_model(model: Model, path: Path | str) -> None:
 
 
 def model_text(model: Model) -> str:
-    """The model as TOML."""
+    """Return the model as TOML text."""
     lines = [
         f"format = {FORMAT}",
         f"name = {msgspec.json.encode(model.name).decode()}",

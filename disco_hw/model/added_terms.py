@@ -52,7 +52,7 @@ _FOLLOWED: Mapping[str, Any] = MappingProxyType(
 
 
 def table_entry(name: str, columns: tuple[NDArray[np.floating], ...]) -> TermCoefficients:
-    """A term's coefficients, arrays (L,), in the form that the step takes."""
+    """Return a term's coefficients, arrays (L,), in the form that the step takes."""
     made: TermCoefficients = _ENTRIES[name](*columns)
     return made
 
@@ -67,7 +67,7 @@ def _compiled_terms(terms: Any) -> list[GenericTerm]:
 
 
 def count_means(terms: Terms | None) -> int:
-    """Number of means that are kept for terms; a constant to the compiler."""
+    """Return the number of means that are kept for terms; a constant to the compiler."""
     return sum(term.means for term in _terms_of(map(type, terms or ())))
 
 
@@ -78,7 +78,7 @@ def _count_means(terms: Any) -> Callable[..., Any]:
 
 
 def new_means(effects: Coefficients) -> NDArray[np.float64] | None:
-    """The means (n,) of a model, of commands first, before anything was; None if it remembers nothing."""
+    """Return the means (n,) of a model, of commands first, before anything was; None if it remembers nothing."""
     count = count_means(effects.command_terms) + count_means(effects.body_terms)
     return np.zeros(count) if count else None
 
@@ -109,13 +109,13 @@ def add_to_commands(
 
 @scalar_function
 def _within(feature: float, reach: float) -> float:
-    """A feature no larger than the log had it in which its term was found."""
+    """Return a feature no larger than the log had it in which its term was found."""
     return min(max(feature, -reach), reach)
 
 
 @scalar_function
 def _averaged(signal: float, entry: TermCoefficients, means: Means, at: Any) -> float:
-    """A mean over a step in which its signal stays as it is; the mean goes on to its end."""
+    """Return a mean over a step in which its signal stays as it is; the mean goes on to its end."""
     before = means[at]
     means[at] = before + entry.by_end * (signal - before)
     over_step: float = before + entry.over_step * (signal - before)
@@ -261,7 +261,7 @@ def _terms_need_change(terms: Any) -> Callable[..., Any]:
 
 
 def _made(name: str, arguments: str, lines: list[str], scope: dict[str, Any]) -> Callable[..., Any]:
-    """A function of these lines; a tuple of mixed types cannot be looped over in compiled code."""
+    """Return a function of these lines; a tuple of mixed types cannot be looped over in compiled code."""
     body = "\n".join(f"    {line}" for line in lines)
     exec(f"def {name}({arguments}):\n{body}", scope)
     made: Callable[..., Any] = scope[name]

@@ -107,7 +107,7 @@ class Integration(NamedTuple):
 
 @scalar_function
 def base_point(base: Base, i: int) -> Base:
-    """Base coefficients of point i."""
+    """Return base coefficients of point i."""
     return Base(base.half_radius_m[i], base.half_turn_ratio[i], base.x_icr_m[i])
 
 
@@ -168,7 +168,7 @@ def _effect_point(effects: types.Type, i: types.Type) -> Callable[..., Any]:
 
 
 def lane_base(base: Base, i: int) -> Base:
-    """Base coefficients of a sample: the point itself, or entry i of a table with a point for every sample."""
+    """Return base coefficients of a sample: the point itself, or entry i of a table with a point for every sample."""
     point: Base = base_point(base, i)
     return point
 
@@ -185,7 +185,7 @@ def _lane_base(base: Any, i: types.Type) -> Callable[..., Any]:
 
 
 def _first_number(kind: types.Type) -> types.Type:
-    """The type of the first number, or array of numbers, in tuples within tuples."""
+    """Return the type of the first number, or array of numbers, in tuples within tuples."""
     while hasattr(kind, "types"):
         kind = kind.types[0]
     return kind
@@ -241,7 +241,7 @@ class Disturbance(msgspec.Struct, frozen=True, gc=False):
         return scale * left - more, scale * right + more
 
     def asked(self, left: Number, right: Number, axial_distance_m: float) -> tuple[Number, Number]:
-        """The inverse of `turning`."""
+        """Return the inverse of `turning`."""
         scale = 1.0 + self.forward
         more = 0.25 * self.curvature_per_m * axial_distance_m * (left + right) / scale
         return (left + more) / scale, (right - more) / scale

@@ -293,7 +293,7 @@ class Model:
 
     @classmethod
     def nominal(cls, robot: config.Robot, prior: config.Prior | None = None) -> Model:
-        """The geometry of robot.toml without effects; with a prior, that uniform prior is the belief."""
+        """Return the geometry of robot.toml without effects; with a prior, that uniform prior is the belief."""
         belief = None
         if prior is not None:
             ranges = {parameter.name: getattr(prior, parameter.name) for parameter in BASE_PARAMETERS}
@@ -318,7 +318,7 @@ class Model:
         return tuple(self.parameters)
 
     def point(self) -> Array:
-        """The point values, shape (P,) in the order of `parameter_names`."""
+        """Return the point values, shape (P,) in the order of `parameter_names`."""
         values = [getattr(self, parameter.name) for parameter in BASE_PARAMETERS]
         for setting in self.effects:
             values += setting.values.values()

@@ -52,7 +52,7 @@ def delayed(commands: Array, history: int, theta: Theta, step_s: float) -> Array
 
 
 def _sign(x: Value, rest: float) -> Value:
-    """The sign of x, faded out below `rest`."""
+    """Return the sign of x, faded out below `rest`."""
     return np.sign(x) * x**2 / (x**2 + rest**2)
 
 

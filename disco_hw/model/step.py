@@ -150,7 +150,7 @@ def axle_of(x: float, y: float, cos_yaw: float, sin_yaw: float, base: Base) -> t
 
 @scalar_function
 def tracked_of(axle_x: float, axle_y: float, cos_yaw: float, sin_yaw: float, base: Base) -> tuple[float, float]:
-    """The tracked point, from the axle's point."""
+    """Return the tracked point, from the axle's point."""
     return axle_x - base.x_icr_m * cos_yaw, axle_y - base.x_icr_m * sin_yaw
 
 

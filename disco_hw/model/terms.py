@@ -82,7 +82,10 @@ class Remembered:
         return signal + (before - signal) * math.exp(-max(for_s, 0.0) / self.time_s)
 
     def at_nodes(self, step_s: float, *motion: Array) -> Array:
-        """The feature of a motion that is known all along, each (M, ...), in steps of `step_s`; nothing was before."""
+        """Return the feature of a motion that is known all along, each (M, ...), in steps of `step_s`.
+
+        Nothing was before.
+        """
         from scipy.signal import lfilter  # noqa: PLC0415  (slow to import, and no robot that drives needs it)
 
         signal = np.asarray(self.of(*motion))
@@ -327,7 +330,7 @@ _TERM_EFFECTS: Mapping[str, Effect] = MappingProxyType({name: term.effect for na
 
 
 def effect_of(name: str) -> Effect:
-    """A named effect or a term; raises KeyError for what is neither."""
+    """Return a named effect or a term; raises KeyError for what is neither."""
     return REGISTRY[name] if name in REGISTRY else _TERM_EFFECTS[name]
 
 

@@ -158,7 +158,7 @@ def connection(link: LinkState, link_error: str | None, driver: DriverState, dri
 
 
 def headline(state: str, detail: str, running: bool, estop: bool, by_hand: bool = False) -> tuple[str, str]:
-    """The state in a word or two, and the sentence after it."""
+    """Return the state in a word or two, and the sentence after it."""
     head = "E-STOP" if estop else f"{state} · running" if running else state
     return head, "driven by hand" if by_hand else detail
 
@@ -200,7 +200,7 @@ def fault_sentence(name: str) -> str:
 
 
 def next_step(status: Mapping[str, Any]) -> str:
-    """The action that leads on from here; empty where there is none."""
+    """Return the action that leads on from here; empty where there is none."""
     state = str(status["state"])
     if "drive" in status and state in {"READY", "ARMED"}:
         return ""
@@ -210,7 +210,7 @@ def next_step(status: Mapping[str, Any]) -> str:
 
 
 def in_words(code: str) -> str:
-    """A code of the protocol as a person reads it: STALL_LEFT becomes Stall left."""
+    """Return a code of the protocol as a person reads it: STALL_LEFT becomes Stall left."""
     return code.replace("_", " ").capitalize()
 
 

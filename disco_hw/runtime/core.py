@@ -334,7 +334,7 @@ class DaemonCore:
         return msgspec.structs.replace(readings, poses=first)
 
     def _command(self, output: Output, result: Tick) -> WheelCommand | None:
-        """The command to send; while the robot is arming the driver sends the zeros that this takes."""
+        """Return the command to send; while the robot is arming the driver sends the zeros that this takes."""
         may_command = output.motion_allowed or output.zero_only
         if not may_command or result.source is Source.SILENT or self.driver.state is not DriverState.ARMED:
             return None
@@ -391,7 +391,7 @@ class DaemonCore:
         )  # fmt: skip
 
     def _state_change(self, now_ns: int, output: Output) -> list[records.Record]:
-        """The record of a change of state or of what is said of it, in the tick in which it happens."""
+        """Return the record of a change of state or of what is said of it, in the tick in which it happens."""
         before, self._state = self._state, output.state
         said, self._said = self._said, (output.detail, output.running, output.estop)
         if output.state is before and self._said == said:
@@ -401,7 +401,7 @@ class DaemonCore:
         return [records.DaemonState(now_ns, output.state.name, before.name, *self._said)]
 
     def _task_change(self, now_ns: int) -> list[records.Record]:
-        """The record of another task, in the first tick that it holds for."""
+        """Return the record of another task, in the first tick that it holds for."""
         changed, self._task_changed = self._task_changed, False
         return [record_of(now_ns, self.task)] if changed else []
 
@@ -485,7 +485,7 @@ class TaskPilot:
         """Do nothing: the task needs no result of a tick."""
 
     def steer(self, now_ns: int, page: int, wanted: Mapping[str, Any]) -> str | None:
-        """A task is followed."""
+        """Refuse a page's steering, because a task is followed."""
         return "this daemon follows its task; stop it and start `disco-hw drive ROBOT.toml --page`"
 
     def status(self) -> dict[str, Any]:

@@ -232,10 +232,9 @@ class FenceGuard:
         requested: tuple[float, float],
         spread: _Spread,
     ) -> tuple[Array, Array, Array]:
-        """Stopping paths (S, K, 3) for all scales; what is driven to each point (S, K, 2), m and rad; times (S, K), s.
+        """Return the stopping paths (S, K, 3) for all scales.
 
-        The wheels go on for the response time, come to the command, keep it for the reaction time, and slow down.
-        Distances are longer than believed by their spread.
+        With them what is driven to each point (S, K, 2), m and rad; times (S, K), s.
         """
         settings, count = self._settings, len(SCALES)
         now, command = np.array(wheels), SCALES[:, None] * np.array(requested)
@@ -311,7 +310,7 @@ def _spread(geometry: OdometryParameters) -> _Spread:
 
 
 def corner_deviation_m(estimate: PoseEstimate, bounds: Boundaries) -> float:
-    """Standard deviation of that corner of the footprint whose place is known least, in its worst direction (m)."""
+    """Return the standard deviation (m) of the least known corner of the footprint, in its worst direction."""
     covariance = np.array(estimate.covariance)
     cos, sin = math.cos(estimate.yaw_rad), math.sin(estimate.yaw_rad)
     largest = 0.0

@@ -167,7 +167,7 @@ class Planner(Protocol):
         """Plan under this belief from the next plan on; raises ValueError, and keeps the old one, if it cannot."""
 
     def sampled_rollouts(self, count: int) -> Rollouts:
-        """The weightiest sequences of the last plan; changes nothing."""
+        """Return the weightiest sequences of the last plan; changes nothing."""
 
 
 @runtime_checkable

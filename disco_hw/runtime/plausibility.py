@@ -373,7 +373,7 @@ class Directions:
         return min(math.hypot(ahead_m - ahead, turned_m - part * arc) for part in _TURNED_PARTS)
 
     def _again(self, words: str) -> str | None:
-        """The words, once the same was found so a few times in a row; none are nothing found."""
+        """Return the words once the same was found a few times in a row; no words mean that nothing was found."""
         before, times = self._in_a_row
         self._in_a_row = (words, times + 1 if words == before else 1)
         return words if words and self._in_a_row[1] == SAMPLES else None

@@ -111,7 +111,7 @@ def tick(result: Tick, command: WheelCommand | None, valid_for_s: float) -> Iter
 
 
 def fan(t_ns: int, rollouts: Rollouts) -> records.Fan:
-    """The rollouts of the plan made at `t_ns`, each thinned to 11 points from its first to its last."""
+    """Return the rollouts of the plan made at `t_ns`, each thinned to 11 points from its first to its last."""
     steps = rollouts.trajectories.shape[1]
     kept = np.unique(np.linspace(0, steps - 1, min(_FAN_POINTS, steps)).astype(int))
     places = np.round(rollouts.trajectories[:, kept, :2], _FAN_DIGITS)

@@ -90,11 +90,11 @@ class ReplayReport:
         return self.difference is None
 
     def as_dict(self) -> dict[str, Any]:
-        """The report for machines."""
+        """Return the report as a JSON-serialisable dict."""
         return {"ok": self.ok, **asdict(self)}
 
     def as_text(self) -> str:
-        """The report for a person."""
+        """Return the report as text."""
         lines = [f"{self.ticks} ticks, {self.values} values compared; recorded by disco-hw {self.recorded_by}"]
         if self.missing_ticks:
             lines.append(f"{self.missing_ticks} ticks are missing from the log: from there on nothing can be equal")

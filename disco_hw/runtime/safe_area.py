@@ -157,16 +157,16 @@ class SafeArea:
 
 
 def record_of_fence(t_ns: int, fence: Fence) -> records.FenceChange:
-    """The record of a fence that is in force from `t_ns` on."""
+    """Return the record of a fence that is in force from `t_ns` on."""
     return records.FenceChange(t_ns, msgspec.json.encode(fence).decode())
 
 
 def fence_of_record(record: records.FenceChange) -> Fence:
-    """The fence of a record."""
+    """Return the fence of a record."""
     return msgspec.json.decode(record.fence, type=Fence)
 
 
 def report_of_record(record: records.Obstacle) -> ObstacleReport:
-    """The report that a record of an obstacle keeps."""
+    """Return the report that a record of an obstacle keeps."""
     fields: dict[str, Any] = {name: getattr(record, name) for name in ObstacleReport.__struct_fields__}
     return ObstacleReport(**fields)

@@ -351,7 +351,10 @@ class Supervisor:
             self._events.append("task stopped: the path's end is reached")
 
     def _trouble_and_remedy(self, remedy: str) -> str:
-        """The trouble with its own remedy if it names one, else with this one; this host's reset always comes last."""
+        """Return the trouble with its own remedy if it names one, else with this one.
+
+        This host's reset always comes last.
+        """
         if self._trouble.endswith(THEN_RESET):
             return self._trouble
         if self._trouble.endswith((BY_ITSELF, THEN_RESTART)):
@@ -444,7 +447,7 @@ def _union(flags: Iterable[tuple[int, bool]]) -> int:
 
 
 def _said_by(robot: DriverState) -> int:
-    """The conditions that the driver's state alone decides."""
+    """Return the conditions that the driver's state alone decides."""
     return _union(
         (
             (_ROBOT_TALKS, robot in _IDLE | _MAY_MOVE),

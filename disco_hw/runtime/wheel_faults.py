@@ -348,7 +348,7 @@ class WheelFaults:
         return 0 if middle - abs(speed) > sure * std else None
 
     def _unseen(self, geometry: OdometryParameters) -> WheelFault | None:
-        """A wheel that the poses show to turn as it is asked to, and that does not count; the other one does."""
+        """Return a wheel that the poses show to turn as it is asked to, and that does not count; the other one does."""
         since_ns, newest = self._commands[0][0], self._commands[-1][1]
         # One that has turned since it stood is known by what it is expected to do.
         quiet = [

@@ -113,7 +113,7 @@ class Course(Protocol):
         """Start of the course and the heading there: x, y (m), yaw (rad)."""
 
     def outline_m(self) -> Array:
-        """The line as points (N, 2)."""
+        """Return the line as points (N, 2)."""
 
     def off_m(self, places_m: Array) -> Array:
         """Distance (N,) of positions (N, 2), positive to the right of the way: outside of a circle."""
@@ -137,7 +137,7 @@ class Progress(Protocol):
         """Take in the pose of one tick; the first one after a pause begins anew."""
 
     def pause(self) -> None:
-        """The task does not run in this tick."""
+        """Note that the task does not run in this tick."""
 
 
 class Prepared(NamedTuple):
@@ -193,7 +193,7 @@ class RobotTask(Protocol):
         """The file that [task] names, relative to robot.toml."""
 
     def with_file(self, file: Path, robot: Chassis, judged: bool) -> Self:
-        """The task with what its file holds, judged for what the robot cannot get past unless it was driven before.
+        """Return the task with its file's contents; unless it was driven before, impossible ones are refused.
 
         Raises InputError naming file, line and remedy.
         """
@@ -208,22 +208,22 @@ class RobotTask(Protocol):
         """Why the wheels of the nominal robot cannot do the task, and the remedy; None if they can."""
 
     def editable(self, robot: Chassis) -> Mapping[str, Editable]:
-        """The fields that a person may change; the largest speed is that on the present line."""
+        """Return the fields that a person may change; the largest speed is that on the present line."""
 
     def editing_note(self, robot: Chassis) -> str:
         """Return the text that the page shows below the editable fields, which also says why there are none."""
 
     def in_words(self) -> str:
-        """The task for a person."""
+        """Return the task as text."""
 
     def course(self) -> Course:
         """Its line on the ground, the same one for every speed."""
 
     def progress(self) -> Progress:
-        """The progress of the task as it begins."""
+        """Return the progress of the task as it begins."""
 
     def planned(self, mode: str) -> PlannedTask:
-        """The task with the cost of the control mode, "default" or "paper"."""
+        """Return the task with the cost of the control mode, "default" or "paper"."""
 
 
 Found = tuple[float, float, float, float, float]
@@ -246,12 +246,12 @@ def norm_of_three(x: float, y: float, z: float) -> float:
 
 
 def single(value: float) -> float:
-    """A number in single precision, for the terms of a cost and its constants."""
+    """Return a number in single precision, for the terms of a cost and its constants."""
     return cast(float, np.float32(value))
 
 
 def constant(value: float, like: float) -> float:
-    """A number in the precision of another one."""
+    """Return a number in the precision of another one."""
     return value
 
 
@@ -289,7 +289,7 @@ def kinds() -> tuple[str, ...]:
 
 
 def task_class(kind: str) -> type[RobotTask]:
-    """The struct that holds [task] of this kind; raises UnknownKind."""
+    """Return the struct that holds [task] of this kind; raises UnknownKind."""
     found = _task_in(kind) if kind in _modules() else None
     if found is None:
         raise UnknownKind(f"{kind!r} is no kind of task; write one of {', '.join(kinds())}")
@@ -297,17 +297,17 @@ def task_class(kind: str) -> type[RobotTask]:
 
 
 def kind_of(task: RobotTask) -> str:
-    """The kind of a task, as robot.toml names it."""
+    """Return the kind of a task, as robot.toml names it."""
     return type(task).__module__.rpartition(".")[2]
 
 
 def default_task() -> RobotTask:
-    """The task of a robot.toml without [task]."""
+    """Return the task of a robot.toml without [task]."""
     return task_from({})
 
 
 def task_from(section: Mapping[str, Any]) -> RobotTask:
-    """The task that [task] of robot.toml says, validated; the files that it names are not read.
+    """Return the task that [task] of robot.toml says, validated; the files that it names are not read.
 
     Without `kind` it is of the kind that claims one of the section's fields, else of the kind that claims none in
     particular. Raises UnknownKind, ReadField, and msgspec.ValidationError for fields that the kind does not have or

@@ -52,7 +52,7 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         return self
 
     def fault(self) -> TaskFault | None:
-        """A figure that goes where no pose is known."""
+        """Return a fault for a figure that goes where no pose is known, else None."""
         for field in ("center_x_m", "center_y_m"):
             farthest_m = abs(getattr(self, field)) + self.size_m
             if farthest_m > FARTHEST_M:
@@ -97,11 +97,11 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         return f"lemniscate of {self.size_m:g} m about {centre} at {self.speed_m_s:g} m/s"
 
     def points(self) -> tuple[Point, ...]:
-        """The figure as way-points: from the crossing along the lobe to the right, the last on the first."""
+        """Return the figure as way-points: from the crossing along the lobe to the right, the last on the first."""
         return _points(self.center_x_m, self.center_y_m, self.size_m)
 
     def course(self) -> LineCourse:
-        """The line through the figure's points."""
+        """Return the line through the figure's points."""
         return line_course(self.points(), "lemniscate")
 
     def progress(self) -> PathProgress:
@@ -109,7 +109,7 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         return PathProgress(PathTable(np.array(self.points())))
 
     def planned(self, _mode: str) -> PathCost:
-        """The figure with the cost of a path, the same in every mode."""
+        """Return the figure with the cost of a path, the same in every mode."""
         return PathCost(PathTable(np.array(self.points())), self.speed_m_s)
 
 

@@ -49,7 +49,7 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return self.path
 
     def with_file(self, file: Path, _robot: Chassis, judged: bool) -> Self:
-        """The task with the way-points of a CSV.
+        """Return the task with the way-points of a CSV.
 
         Raises InputError as `load_waypoints`, and for times, for too many way-points, for a path that is too short or
         too long, for a way-point further from the origin than poses go, and, if it is `judged`, for hairpins.
@@ -93,7 +93,7 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return f"path {self.path} of {self.course().length_m:.2f} m at {self.speed_m_s:g} m/s"
 
     def course(self) -> LineCourse:
-        """The line through the way-points."""
+        """Return the line through the way-points."""
         return line_course(self.points, "path")
 
     def progress(self) -> PathProgress:
@@ -101,7 +101,7 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return PathProgress(PathTable(np.array(self.points)))
 
     def planned(self, _mode: str) -> PathCost:
-        """The path with its cost, the same in every mode."""
+        """Return the path with its cost, the same in every mode."""
         return PathCost(PathTable(np.array(self.points)), self.speed_m_s)
 
 

@@ -62,7 +62,7 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         return self.path
 
     def with_file(self, file: Path, robot: Chassis, _judged: bool) -> Self:
-        """The task with the way-points and times of a CSV.
+        """Return the task with the way-points and times of a CSV.
 
         Raises InputError as `load_waypoints`, and for missing times, for a first time before the start, for too many
         way-points, for a path that is too short or too long, for a way-point further from the origin than poses go, and
@@ -118,15 +118,15 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         return f"path {self.path} of {length_m:.2f} m in {self.times_s[-1]:g} s, at most {self.speed_m_s:.3g} m/s"
 
     def course(self) -> LineCourse:
-        """The line through the way-points."""
+        """Return the line through the way-points."""
         return line_course(self.points, "timed path")
 
     def progress(self) -> TimedProgress:
-        """The part of the way that is due."""
+        """Create the progress, which is the part of the way that is due."""
         return TimedProgress(self.points, self.times_s)
 
     def planned(self, _mode: str) -> TimedPathCost:
-        """The way-points with their cost, the same in every mode."""
+        """Return the way-points with their cost, the same in every mode."""
         return TimedPathCost(Waypoints(np.array(self.points), np.array(self.times_s)))
 
 
@@ -165,7 +165,7 @@ class TimedProgress:
         self._off_m = math.dist((x_m, y_m), self._end_m)
 
     def pause(self) -> None:
-        """The task does not run in this tick."""
+        """Note that the task does not run in this tick."""
         self._begun_ns = None
 
 

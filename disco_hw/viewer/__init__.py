@@ -134,7 +134,7 @@ def page_beside(
 
 
 def _token_or_given() -> str:
-    """A token for the page; one that the environment gives wrongly stays as it is, and the page refuses it."""
+    """Return a token for the page; one that the environment gives wrongly stays as it is, and the page refuses it."""
     try:
         return page_token()
     except ValueError:
@@ -142,7 +142,7 @@ def _token_or_given() -> str:
 
 
 def page_token() -> str:
-    """The token of the page about to start: what $DISCO_HW_PAGE_TOKEN says, else one that nobody can guess.
+    """Return the token of the page about to start: what $DISCO_HW_PAGE_TOKEN says, else one that nobody can guess.
 
     In a variable, and not in an argument, as other users can read the arguments of a process. Raises ValueError for
     one of less than 16 characters or with others than letters, digits, - and _.

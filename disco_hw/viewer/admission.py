@@ -104,7 +104,7 @@ class _CountedConnection(ServerConnection):
 
 
 def counted_connections(admission: Admission) -> Callable[..., ServerConnection]:
-    """What `websockets.asyncio.server.serve` takes as `create_connection`."""
+    """Return a factory for `create_connection` of `websockets.asyncio.server.serve` that counts connections."""
 
     def create(*arguments: Any, **options: Any) -> ServerConnection:
         return _CountedConnection(admission, *arguments, **options)

@@ -72,7 +72,7 @@ class Desk:
         self._watch: asyncio.Task[None] | None = None
 
     def page(self, instance: str, token: str = "") -> bytes:
-        """The desk as HTML; `instance` is what this server says of itself under any of its names.
+        """Return the desk as HTML; `instance` is what this server says of itself under any of its names.
 
         `token` lets the scene in under this machine's other name; without it the scene stays under the desk's.
         """
@@ -295,7 +295,7 @@ def _numbers(values: object) -> dict[str, float] | None:
 
 
 def _request(message: str | bytes) -> dict[str, Any] | None:
-    """A browser's message as a request, or None if it is none."""
+    """Return a browser's message as a request, or None if it is none."""
     if len(message) > _MOST_BYTES:
         return None
     try:

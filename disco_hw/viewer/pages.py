@@ -174,7 +174,7 @@ class LivePage:
 
 
 def _belief_in_force(now_ns: int, adaptation: Mapping[str, Any] | None) -> BeliefChange:
-    """The belief of a status."""
+    """Return the belief of a status."""
     if adaptation is None or adaptation["belief"] != "adapted":
         return BeliefChange(now_ns, "model")
     mean = adaptation["mean"]

@@ -219,12 +219,12 @@ class ShownRobot:
     footprint: Footprint = Footprint(0.5, 0.4)  # noqa: RUF009 - it is frozen
 
     def task_at(self, record: Task | None) -> RobotTask:
-        """The task that is in force where this record of it is the newest; robot.toml's without one."""
+        """Return the task that is in force where this record of it is the newest; robot.toml's without one."""
         return self.task if record is None else task_of(record, self.task)
 
 
 def model_in_force(model: Model, change: BeliefChange | None) -> Model:
-    """The model with the belief that was put in force while driving; itself without one."""
+    """Return the model with the belief that was put in force while driving; itself without one."""
     learnt = None if change is None else geometry_of(change)
     return model if learnt is None else with_geometry(model, learnt)
 
@@ -305,12 +305,12 @@ class Recording:
         return (next(driven, self.first_ns) - self.first_ns) * 1e-9
 
     def at(self, t_s: float) -> Snapshot:
-        """The instant of the last tick at or before `t_s` seconds from the first; the ends beyond them."""
+        """Return the instant of the last tick at or before `t_s` seconds from the first; the ends beyond them."""
         t_ns = int(self.ticks[self.tick_at(t_s)])
         return snapshot_at(self.timeline, t_ns, self._plan_at(t_ns))
 
     def tick_at(self, t_s: float) -> int:
-        """Number of the last tick at or before `t_s`, from 0 on."""
+        """Return the number of the last tick at or before `t_s`, from 0 on."""
         t_ns = self.first_ns + round(t_s * 1e9)
         return min(max(int(np.searchsorted(self.ticks, t_ns, "right")) - 1, 0), len(self.ticks) - 1)
 

@@ -67,7 +67,7 @@ class Guard:
     alone: bool = False
 
     def refusal(self, path: str, headers: Headers, upgrade: bool) -> Response | None:
-        """The answer to a request that must not go on, or None."""
+        """Return the answer to a request that must not go on, or None."""
         if not self.open:
             return _plain(http.HTTPStatus.SERVICE_UNAVAILABLE, "the page is being made; load it again")
         host = headers.get("Host", "")
@@ -196,14 +196,14 @@ def _guarded(guard: Guard, desk: Desk | None, listener: socket.socket, admission
 
 @functools.lru_cache(maxsize=2)
 def _completed(page: bytes, zipped: bool) -> bytes:
-    """viser's page with ours added to its head."""
+    """Return viser's page with ours added to its head."""
     addition = files("disco_hw.viewer").joinpath("scene_page.html").read_bytes()
     plain = (gzip.decompress(page) if zipped else page).replace(b"</head>", addition + b"</head>", 1)
     return gzip.compress(plain) if zipped else plain
 
 
 def _desk_answer(desk: Desk, instance: str, guard: Guard, request: Request) -> Response | None:
-    """The desk's own pages; None for what belongs to the scene in it."""
+    """Return the desk's own pages; None for what belongs to the scene in it."""
     path = urlsplit(request.path).path
     if path == "/":
         return _answer(

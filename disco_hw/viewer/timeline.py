@@ -54,14 +54,14 @@ class Series:
         self._count, self._new_times, self._new_rows = count, [], []
 
     def rows(self, first_ns: int, last_ns: int) -> tuple[Times, Array]:
-        """Times (N,) and rows (N, columns) with first_ns <= time <= last_ns; views, not copies."""
+        """Return times (N,) and rows (N, columns) with first_ns <= time <= last_ns; views, not copies."""
         self._take_in()
         times = self._times[: self._count]
         first, last = np.searchsorted(times, first_ns, "left"), np.searchsorted(times, last_ns, "right")
         return times[first:last], self._rows[first:last]
 
     def last(self, at_ns: int) -> tuple[int, Array] | None:
-        """The newest row known at `at_ns` and its time; None before the first."""
+        """Return the newest row known at `at_ns` and its time; None before the first."""
         self._take_in()
         index = int(np.searchsorted(self._times[: self._count], at_ns, "right")) - 1
         return None if index < 0 else (int(self._times[index]), self._rows[index])
@@ -95,12 +95,12 @@ class Items(Generic[Item]):
         self._items.append(item)
 
     def last(self, at_ns: int) -> Item | None:
-        """The newest one known at `at_ns`; None before the first."""
+        """Return the newest one known at `at_ns`; None before the first."""
         index = bisect_right(self._times, at_ns) - 1
         return None if index < 0 else self._items[index]
 
     def latest(self, at_ns: int, count: int) -> list[tuple[int, Item]]:
-        """The last `count` known at `at_ns`, oldest first."""
+        """Return the last `count` known at `at_ns`, oldest first."""
         end = bisect_right(self._times, at_ns)
         first = max(0, end - count)
         return list(zip(self._times[first:end], self._items[first:end], strict=True))

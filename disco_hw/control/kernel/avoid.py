@@ -94,7 +94,7 @@ Bends: TypeAlias = tuple[Bend, Bend] | None
 
 
 def bends_of(area: Area | None, straight: bool | None) -> Bends:
-    """The detours of an area, None without one or with `straight`; compiled code only."""
+    """Return the detours of an area, None without one or with `straight`; compiled code only."""
     raise TypeError(f"{type(area).__name__} is no area")
 
 

@@ -517,7 +517,7 @@ def _roll(
 
 @scalar_function
 def _bases(base: Base, pair: NDArray[np.int64]) -> tuple[Base, Base]:
-    """Base coefficients of a pair of points."""
+    """Return base coefficients of a pair of points."""
     return base_point(base, pair[0]), base_point(base, pair[1])
 
 

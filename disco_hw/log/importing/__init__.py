@@ -64,7 +64,7 @@ def log_formats() -> tuple[LogFormat, ...]:
 
 
 def format_of(begin: bytes) -> LogFormat | None:
-    """The format of a file that begins with these bytes, None if it is none of them."""
+    """Return the format of a file that begins with these bytes, None if it is none of them."""
     return next((each for each in log_formats() if each.recognises(begin)), None)
 
 
@@ -114,7 +114,7 @@ def write_log(drive: DriveLog, path: Path, robot: str, attachments: tuple[Attach
 
 
 def _samples(drive: DriveLog) -> Iterator[_Timed]:
-    """Records with their time (ns) and segment, in order of time."""
+    """Return records with their time (ns) and segment, in order of time."""
     return iter(sorted([*_commands(drive), *_wheels(drive), *_poses(drive)], key=lambda sample: sample[0]))
 
 
@@ -213,7 +213,7 @@ def import_log(path: Path, robot: Path, out: Path, topics: Sequence[str] = (), c
 
 
 def _telling(path: Path) -> Path:
-    """The file that shows the format: of a bag's folder its metadata.yaml, or else the first bag in it."""
+    """Return the file that shows the format: of a bag's folder its metadata.yaml, or else the first bag in it."""
     if not path.is_dir():
         return path
     inside = sorted(one for one in path.iterdir() if one.suffix in SUFFIXES.values())

@@ -144,7 +144,7 @@ def _steps(t_s: Array, values: Array, begins: Mask | None, reach: float, unit: s
 
 
 def _expected(dt_s: Array, steps: Array, usable: Mask) -> Array:
-    """Steps (N,) at the mean rate of the neighbours that are usable."""
+    """Return the steps (N,) at the mean rate of the neighbours that are usable."""
     known = np.flatnonzero(usable)
     if not known.size:
         return np.zeros_like(steps)
@@ -157,7 +157,7 @@ def _expected(dt_s: Array, steps: Array, usable: Mask) -> Array:
 
 
 def _left_over(motion: _Steps, span: float) -> tuple[Array, Array, Mask]:
-    """Turns of the span in each step (N,), what they leave beside the expected motion, and whether that is motion."""
+    """Return turns of the span in each step (N,), what they leave beside the expected motion, and if that is motion."""
     turns = np.where(motion.is_inside, np.round((motion.steps - motion.expected) / span), 0.0)
     left = motion.steps - span * turns
     beside = np.abs(left - motion.expected)
@@ -165,7 +165,7 @@ def _left_over(motion: _Steps, span: float) -> tuple[Array, Array, Mask]:
 
 
 def _span_of(motion: _Steps, usual: Sequence[float], reach: float, unit: str) -> float | None:
-    """The span that explains the jumps: one of the usual ones, or the one that they show; None if none does."""
+    """Return the span that explains the jumps: one of the usual ones, or the one that they show; None if none does."""
     jumps = motion.is_jump
 
     def fits(span: float) -> int:
@@ -187,7 +187,10 @@ def _span_of(motion: _Steps, usual: Sequence[float], reach: float, unit: str) ->
 
 
 def _span_of_jumps(motion: _Steps, unit: str) -> tuple[float, float] | None:
-    """The span that jumps of one size show, again and again, with its tolerance; None if they are few or differ."""
+    """Return the span that jumps of one size show, again and again, with its tolerance.
+
+    None if they are few or differ.
+    """
     jumps = motion.is_jump
     if np.count_nonzero(jumps) < _OFTEN:
         return None

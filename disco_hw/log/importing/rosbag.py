@@ -77,7 +77,7 @@ class _Column:
         self.values.extend(row)
 
     def stamps(self) -> Stamps:
-        """The times of its rows."""
+        """Return the times of its rows."""
         table = self.table()
         is_repeat = np.concatenate([[False], _alike(table[1:], table[:-1])]) if len(table) else np.empty(0, dtype=bool)
         return Stamps(np.array(self.log_ns, dtype=np.int64), np.array(self.stamp_ns, dtype=np.int64), is_repeat)
@@ -265,7 +265,7 @@ def _pose_table(
     static: set[str],
     notes: list[str],
 ) -> tuple[Index, Array]:
-    """Times (N,), ns, and x, y, yaw (N, 3) of the poses; yaw is NaN where nobody measured it."""
+    """Return times (N,), ns, and x, y, yaw (N, 3) of the poses; yaw is NaN where nobody measured it."""
     used = choice.used(POSES)
     if used is None:
         return np.empty(0, dtype=np.int64), np.empty((0, 3))
@@ -317,12 +317,12 @@ Take = Callable[[Any], Row | None]
 
 
 def finite(row: Row | None) -> Row | None:
-    """A row without infinities, else None. NaN stands for what is not known, and stays."""
+    """Return a row without infinities, else None. NaN stands for what is not known, and stays."""
     return None if row is None or any(map(math.isinf, row)) else row
 
 
 def stamp_of(message: Any) -> int:
-    """The header's stamp, ns; 0 without a header."""
+    """Return the header's stamp, ns; 0 without a header."""
     header = getattr(message, "header", None)
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec) if header is not None else 0
 

@@ -193,12 +193,12 @@ def _readers(path: Path, stack: ExitStack, notes: list[str], salvage: bool) -> t
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """A key by which log_10 comes after log_9."""
+    """Return a key by which log_10 comes after log_9."""
     return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", name)]
 
 
 def _opened(path: Path, is_ros1: bool, stack: ExitStack, notes: list[str], salvage: bool) -> Any:  # Any: the library's.
-    """An open reader of a bag or file; raises DamagedBagError."""
+    """Return an open reader of a bag or file; raises DamagedBagError."""
     from rosbags import rosbag1, rosbag2  # noqa: PLC0415
 
     if salvage:
@@ -256,7 +256,7 @@ def _check_folder(path: Path) -> None:
 
 
 def _check_unpacked(path: Path) -> None:
-    """The library unpacks a file that was compressed as a whole onto the disk."""
+    """Raise LogError for a compressed file that unpacks to too much, as the library unpacks it onto the disk."""
     import zstandard  # noqa: PLC0415
 
     most = min(LOG.most_bytes, _MOST_UNPACKED_RATIO * max(path.stat().st_size, 4096))

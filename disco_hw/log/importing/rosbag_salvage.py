@@ -203,7 +203,7 @@ def _ros1_records(source: BinaryIO) -> Iterator[Record | None]:
 
 
 def _ros1_fields(block: bytes) -> dict[str, bytes]:
-    """The fields of a header, by name: each a length (4 bytes) and name=value."""
+    """Return the fields of a header, by name: each a length (4 bytes) and name=value."""
     fields, at = {}, 0
     while at < len(block):
         (length,) = struct.unpack_from("<I", block, at)

@@ -70,7 +70,7 @@ class Choice:
         return next((one for one in self.table if one.role == role and one.used), None)
 
     def as_text(self) -> str:
-        """The table, for a person."""
+        """Return the table of topics as text."""
         head = ("", "role", "topic", "type", "messages", "why")
         rows = [("*" if one.used else "", one.role, one.topic, one.type, str(one.count), one.why) for one in self.table]
         widths = [max(len(row[at]) for row in (head, *rows)) for at in range(len(head))]

@@ -89,7 +89,7 @@ class LineCourse:
 
 @lru_cache(maxsize=8)
 def line_course(points: tuple[Point, ...], noun: str) -> LineCourse:
-    """The line through way-points, the same one for the same way-points; `noun` is what it is called."""
+    """Return the line through way-points, the same one for the same way-points; `noun` is what it is called."""
     # Loaded for paths alone: half of the daemon's commands need no course at all.
     from scipy.spatial import KDTree  # noqa: PLC0415
 
@@ -151,7 +151,7 @@ class PathProgress:
         self._moved += step
 
     def pause(self) -> None:
-        """The task does not run in this tick."""
+        """Note that the task does not run in this tick."""
         self._paused = True
 
 
@@ -172,7 +172,7 @@ def straight_too_fast(speed_m_s: float, robot: Chassis) -> str | None:
 
 
 def speed_range(robot: Chassis) -> Mapping[str, Editable]:
-    """The speed as the field that a person may change."""
+    """Return the speed as the field that a person may change."""
     return {"speed_m_s": Editable(SLOWEST_M_S, straight_fastest_m_s(robot), "Speed (m/s)")}
 
 
@@ -203,7 +203,10 @@ def refuse_hairpins(file: Path, waypoints: Waypoints) -> None:
 
 
 def hairpin(path: PathTable) -> tuple[float, float, float] | None:
-    """The first turns that are too near to one another, and what they need between them, m along the path; or None."""
+    """Return the first turns that are too near to one another, and what they need between them, m along the path.
+
+    Or None.
+    """
     heading = _headings(path)
     length_m = path.spacing_m * (len(path.table) - 1)
     found = [
