@@ -147,7 +147,7 @@ class Gamepad:
         self._deadman = self._button in self._device.active_keys()
 
     def _share(self, code: int, value: int) -> float:
-        """An axis' value as a share of half its range, from the middle."""
+        """Return an axis' value as a share of half its range, from the middle."""
         low, high = self._range[code]
         return 0.0 if high <= low else min(1.0, max(-1.0, (value - low) / (0.5 * (high - low)) - 1.0))
 

@@ -29,7 +29,7 @@ _EXTENDED_FLAG = 0x8000_0000
 
 
 def socketcan_id(frame: Frame) -> int:
-    """The identifier with the flag of Linux's `can_id` for 29 bits: what a log keeps of a frame besides its data."""
+    """Return the identifier with Linux's `can_id` flag for 29 bits, as a log keeps it beside a frame's data."""
     return frame.can_id | _EXTENDED_FLAG if frame.extended else frame.can_id
 
 
@@ -258,7 +258,7 @@ class Limits:
     drive_off_timeout_s: Limit | None = None
 
     def known(self) -> dict[str, Limit]:
-        """The figures that somebody says, by name."""
+        """Return the figures that somebody says, by name."""
         each = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: limit for name, limit in each.items() if limit is not None}
 
@@ -349,10 +349,10 @@ class Driver(Protocol):
         """Host time minus device time, as estimated now; None before the first estimate."""
 
     def link_up(self, now_ns: int) -> None:
-        """The medium has come up (again): start the handshake; any session is void."""
+        """Start the handshake, because the medium has come up (again); any session is void."""
 
     def link_down(self, now_ns: int) -> None:
-        """The medium is gone: any session is void."""
+        """Drop any session, because the medium is gone."""
 
     def receive(self, now_ns: int, frames: Sequence[ReceivedFrame]) -> Readings:
         """Take in received frames and return what they meant."""
@@ -402,13 +402,16 @@ class Exchange(Protocol):
         """Silence after which a device that is in the middle of a packet begins anew."""
 
     def request(self, frame: Frame) -> bytes:
-        """The bytes of a packet on the line."""
+        """Return the bytes of a packet on the line."""
 
     def is_answered(self, frame: Frame) -> bool:
         """Whether the device replies to it."""
 
     def reply(self, frame: Frame, received: bytes) -> Frame | None:
-        """The reply to `frame` that the bytes received since then begin with; None if it is none, or not whole yet."""
+        """Return the reply to `frame` that the bytes received since then begin with.
+
+        None if it is none, or not whole yet.
+        """
 
 
 @runtime_checkable

@@ -43,7 +43,7 @@ class MessageNames(Protocol):
     """Part of a codec that proving frames needs."""
 
     def can_id(self, name: str) -> int:
-        """The identifier of a message's frames."""
+        """Return the identifier of a message's frames."""
 
 
 def _crc_table() -> bytes:

@@ -133,7 +133,10 @@ def advice(name: str) -> str:
 
 
 def fault(name: str) -> str:
-    """A fault of SYSTEM_STATE.fault and what to do about it; the name alone for one that this version does not know."""
+    """Return a fault of SYSTEM_STATE.fault and what to do about it.
+
+    The name alone for one that this version does not know.
+    """
     todo = advice(name)
     return f"{name}: {todo}" if todo else name
 

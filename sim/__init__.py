@@ -85,7 +85,10 @@ class RobotNode:
         return self.node.tec, self.node.rec
 
     def take(self, now_ns: int, deliveries: Sequence[DeliveredFrame]) -> list[ReceivedFrame]:
-        """The data frames among the bus's deliveries that the robot has received; minds the restart after bus-off."""
+        """Return the data frames among the bus's deliveries that the robot has received.
+
+        Minds the restart after bus-off.
+        """
         node = self.node
         if node.state is _BUS_OFF and node.recessive_sequences is None:
             if self.restart_ns is None:

@@ -297,7 +297,7 @@ def _rehearse(options: VirtualRobotOptions) -> None:
 
 
 def _given(config: FirmwareConfig) -> str:
-    """The fields of a configuration that someone has chosen."""
+    """Return the fields of a configuration that someone has chosen."""
     chosen = [
         f"{field.name}={getattr(config, field.name)}"
         for field in fields(config)

@@ -172,7 +172,7 @@ def _pose(pose: PoseMeasurement, now_us: int) -> list[Frame]:
 
 
 class PlantLine:
-    """This computer's end of the plant's line: a serial port, opened again when it breaks.
+    """Link of this computer to the plant's line: a serial port, opened again when it breaks.
 
     Raises OSError or `serial.SerialException` if it cannot be opened at first.
     """
@@ -253,7 +253,7 @@ class PlantLine:
         self._retry_ns = until_ns
 
     def force_bus_off(self, who: str) -> None:
-        """A serial line has none."""
+        """Raise LinkFaultError, because a serial line has no bus-off."""
         raise LinkFaultError(f"bus_off {who}: the board's own link is not the simulator's")
 
     def babble(self, frame: Frame) -> None:

@@ -162,7 +162,7 @@ class FaultSchedule:
 
 
 def parse_schedule(text: str, name: str = "schedule") -> FaultSchedule:
-    """The schedule of a TOML text, see `schedule_of`."""
+    """Return the schedule of a TOML text, see `schedule_of`."""
     try:
         return schedule_of(tomllib.loads(text), name)
     except (ValueError, RecursionError) as error:
@@ -188,7 +188,7 @@ def schedule_of(table: Mapping[str, Any], name: str) -> FaultSchedule:
 
 
 def in_order(faults: Sequence[ScheduledFault]) -> tuple[ScheduledFault, ...]:
-    """The faults by their beginnings, numbered from 1 in that order."""
+    """Return the faults by their beginnings, numbered from 1 in that order."""
     ordered = sorted(faults, key=lambda fault: (fault.begin_ns, fault.end_ns, fault.kind.name))
     return tuple(ScheduledFault(i, f.kind, f.begin_ns, f.end_ns, f.values) for i, f in enumerate(ordered, 1))
 

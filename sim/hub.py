@@ -256,7 +256,7 @@ class Hub:
             self.stats.frames_out += 1
 
     def _held_up_by(self) -> list[_Client]:
-        """The readers for whom senders wait."""
+        """Return the readers for whom senders wait."""
         if self._pacing:
             return []
         return [
@@ -315,7 +315,7 @@ class HubLink:
         return self._robot.error_counters
 
     def filenos(self) -> list[int]:
-        """The hub's epoll descriptor."""
+        """Return the hub's epoll descriptor."""
         return [self.hub.fileno()]
 
     def next_event_ns(self) -> int | None:

@@ -79,7 +79,7 @@ class SocketPathError(Exception):
 
 
 def bind_private(path: Path, kind: socket.SocketKind) -> socket.socket:
-    """A non-blocking Unix socket of `kind` bound to `path` with file mode 0600; a stale socket file is replaced.
+    """Return a non-blocking Unix socket of `kind` bound to `path` with file mode 0600; a stale socket file is replaced.
 
     A connection-oriented socket listens. Raises SocketPathError with one line that names the path and the remedy.
     """

@@ -54,7 +54,7 @@ class PythonCanLink:
         return 0, 0
 
     def filenos(self) -> list[int]:
-        """The bus's descriptor where it has one; without it the bus is looked at in every step."""
+        """Return the bus's descriptor where it has one; without it the bus is looked at in every step."""
         with contextlib.suppress(NotImplementedError, can.CanError, OSError):
             if self._bus is not None:
                 descriptor = self._bus.fileno()
@@ -110,7 +110,7 @@ class PythonCanLink:
         self._retry_ns = until_ns
 
     def force_bus_off(self, who: str) -> None:
-        """A controller cannot be made to fail through python-can."""
+        """Raise LinkFaultError, because a controller cannot be made to fail through python-can."""
         raise LinkFaultError(f"bus_off {who}: only on the simulator's own bus (interface unixcan)")
 
     def babble(self, frame: Frame) -> None:
@@ -118,7 +118,7 @@ class PythonCanLink:
         self.send((frame,))
 
     def tamper(self, fault: BusFault) -> None:
-        """The frames of somebody else's bus cannot be changed."""
+        """Raise LinkFaultError, because the frames of a foreign bus cannot be changed."""
         raise LinkFaultError("faults: only on the simulator's own bus (interface unixcan) or a serial line")
 
     def summary(self) -> str:

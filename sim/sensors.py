@@ -226,7 +226,7 @@ class Electrics:
         )
 
     def _warmed(self, now_c: float, heat_w: float, cooled: float) -> float:
-        """A motor's temperature on its way to where this heat keeps it."""
+        """Return a motor's temperature on its way to where this heat keeps it."""
         p = self._parameters
         rise_k = p.motor_thermal_resistance_k_per_w * heat_w
         return p.ambient_temperature_c + rise_k + (now_c - p.ambient_temperature_c - rise_k) * cooled

@@ -108,7 +108,7 @@ class SerialLine:
         return 0, 0
 
     def filenos(self) -> list[int]:
-        """The terminal while a host has it open: a closed one stays readable for ever."""
+        """Return the terminal while a host has it open: a closed one stays readable for ever."""
         return [self._master] if self._connected else []
 
     def next_event_ns(self) -> int | None:
@@ -183,7 +183,7 @@ class SerialLine:
         self._plug_in_ns = until_ns
 
     def force_bus_off(self, who: str) -> None:
-        """A serial line knows no bus-off."""
+        """Raise LinkFaultError, because a serial line has no bus-off."""
         raise LinkFaultError(f"bus_off {who}: a serial line has no bus-off")
 
     def babble(self, frame: Frame) -> None:

@@ -380,7 +380,7 @@ class VirtualRobot:
 
 
 def truth_row(robot: Robot, t_ns: int) -> str:
-    """The values of `TRUTH_COLUMNS` at the last step, which was at the monotonic time `t_ns`, separated by commas."""
+    """Return the values of `TRUTH_COLUMNS` at the last step, at the monotonic time `t_ns`, separated by commas."""
     truth, outputs = robot.truth, robot.outputs
     return (
         f"{t_ns},{truth.x_m:.6f},{truth.y_m:.6f},{truth.yaw_rad:.6f},"

@@ -69,7 +69,7 @@ def find_driver(name: str | None) -> MotorDriver:
 
 
 def _module_names() -> list[str]:
-    """The modules of this folder; a driver's has its name."""
+    """Return the modules of this folder; a driver's has its name."""
     return [each.name for each in pkgutil.iter_modules(__path__)]
 
 
@@ -227,5 +227,5 @@ class RewiredDriver:
 
 
 def rewired(driver: Driver, wiring: Wiring) -> Driver:
-    """The driver for wheels that are wired so; itself where nothing is to be changed."""
+    """Return the driver for wheels that are wired so; the driver itself where nothing is to be changed."""
     return driver if wiring == AS_TOLD else RewiredDriver(driver, wiring)

@@ -138,7 +138,7 @@ class AgilexPort:
         )
 
     def objection(self, permit: MotionPermit) -> Objection | None:
-        """A button, an error, or another mode; a person who takes the remote control is no fault."""
+        """Return what keeps the base from being driven: a button, an error, or another mode, but no remote control."""
         seen = self.seen
         if seen.stopped is not None:
             return Objection("a button on the base was pressed")
@@ -160,7 +160,7 @@ class AgilexPort:
         return None
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """The motion of the body, by the nominal geometry."""
+        """Return the frames that command the body's motion, by the nominal geometry."""
         it = self._settings
         body = parts.body_speeds(left_rad_s, right_rad_s, it.wheel_radius_m, it.track_m, it.max_speed_m_s)
         return (protocol.motion(*body),)

@@ -154,7 +154,7 @@ def stands(motion: Decoded) -> bool:
 
 
 def cyclic_frames(_settings: AgilexSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:
-    """The command, and what the base sends as its manual says."""
+    """Return the frames of each period: the command, and what the base sends as its manual says."""
     sent = {"state": 10.0, "motion": 50.0, "odometry": 50.0, "motors": 200.0, "drivers": 40.0, "remote control": 50.0}
     return (
         CyclicFrame("motion command", "HOST", 8, command_rate_hz),

@@ -161,13 +161,13 @@ class OdrivePort:
         return Heard()
 
     def sources(self) -> Sequence[Source]:
-        """The heartbeats of every axis."""
+        """Return the sources that must report again and again: the heartbeats of every axis."""
         silent_ns = max(SILENT_BEATS * self._settings.heartbeat_s * 1e9, SILENT_AT_LEAST_NS)
         gone_ns = max(2.0 * silent_ns, 5e8)
         return [Source(f"node {axis.node}", axis.heard_ns, silent_ns, gone_ns) for axis in self._all]
 
     def objection(self, permit: MotionPermit) -> Objection | None:
-        """An error, or an axis that has left closed loop by itself."""
+        """Return what ends a drive: an error, or an axis that has left closed loop by itself."""
         for axis in self._all:
             if permit.stage is Stage.ARMED and (axis.error or axis.state != AxisState.CLOSED_LOOP):
                 idles = f"it left closed loop by itself, for state {axis.state}"
@@ -204,7 +204,7 @@ class OdrivePort:
         return Pending(why=why, frames=tuple(frames))
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """The velocity of each axis."""
+        """Return the frames that command the velocity of each axis."""
         limit = self._settings.vel_limit_turns_s
         frames = []
         for side, direction, speed in zip(
@@ -249,7 +249,7 @@ class OdrivePort:
         return ()
 
     def stop_frames(self) -> tuple[Frame, ...]:
-        """The e-stop to every axis."""
+        """Return the e-stop frames to every axis."""
         return stop_frames(self._settings)
 
     @property

@@ -286,7 +286,7 @@ def error_words(generation: Generation, error: int) -> str:
 
 
 def stop_frames(settings: OdriveSettings) -> tuple[Frame, ...]:
-    """The e-stop to every node: it idles with an error that stays until it is cleared."""
+    """Return the e-stop to every node: it idles with an error that stays until it is cleared."""
     return tuple(encode(settings.generation, node, "Estop") for node in all_of(settings.nodes))
 
 
@@ -303,7 +303,7 @@ def cyclic_frames(settings: OdriveSettings, command_rate_hz: float, _authenticat
 
 
 def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
-    """The nodes whose heartbeats and estimates were heard, split into left and right as they are numbered.
+    """Return the nodes whose heartbeats and estimates were heard, split into left and right as they are numbered.
 
     None if there are none: heartbeats alone could be another vendor's frames.
     """
@@ -383,7 +383,7 @@ class Questions:
         return said
 
     def due(self, now_ns: int, all_are_heard: bool) -> list[Frame]:
-        """The questions that are due now; only of nodes that idle, as each feeds their watchdogs."""
+        """Return the questions that are due now; only of nodes that idle, as each feeds their watchdogs."""
         waits = self.known or self.refusal is not None
         if now_ns - self._asked_ns < (_ALIVE_PERIOD_NS if waits else _PERIOD_NS):
             return []
@@ -396,7 +396,7 @@ class Questions:
         return self._for_watchdogs() if self._is_met else self._for_version()
 
     def take_version(self, values: Mapping[str, float]) -> None:
-        """An answer for the version."""
+        """Handle a reply with the version."""
         if self._settings.generation is Generation.V05:
             self.refusal = 'the nodes answer for their version, which 0.5 does not; write link.firmware = "0.6"'
         elif not self._is_met:

@@ -149,16 +149,16 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return self.looked_ns - max(heard_ns, self.attentive_ns)
 
     def looked(self, now_ns: int) -> MotionPermit:
-        """The host looks at its controllers, once in each tick."""
+        """Return the permit after the host has looked at its controllers, once in each tick."""
         paused = now_ns - self.looked_ns > _PAUSE_NS
         return replace(self, looked_ns=now_ns, attentive_ns=now_ns if paused else self.attentive_ns)
 
     def linked(self, is_up: bool) -> MotionPermit:
-        """The medium has come up or is gone: all is void but what is latched."""
+        """Return the permit after the medium has come up or is gone: all is void but what is latched."""
         return replace(self.restarted("the link was lost"), link_is_up=is_up)
 
     def restarted(self, why: str, event: str | None = None) -> MotionPermit:
-        """The controllers must be met anew; what is latched stays."""
+        """Return the permit for controllers that must be synchronised again; what is latched stays."""
         note = f"disarmed: {why}" if self.wanted is Request.ARM else self.note
         met_anew = replace(self._idled(note), shared=False)
         return met_anew if event is None else met_anew.saying(event)
@@ -181,7 +181,7 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return replace(self, wanted=request)
 
     def begun(self, now_ns: int) -> MotionPermit:
-        """The stage's time runs from its first tick."""
+        """Return the permit with the stage's time running from its first tick."""
         return replace(self, since_ns=now_ns) if self.since_ns is None else self
 
     def lasts_ns(self, now_ns: int) -> int:
@@ -199,13 +199,13 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return replace(self, stage=Stage.ARMED, note="armed", fed_ns=now_ns, speeds=(0.0, 0.0))
 
     def commanded(self, now_ns: int, command: WheelCommand) -> MotionPermit:
-        """A command is passed on."""
+        """Return the permit after a command is passed on."""
         if self.stage is not Stage.ARMED:
             return self
         return replace(self, fed_ns=now_ns, speeds=(command.left_rad_s, command.right_rad_s))
 
     def slowed(self, now_ns: int, deceleration_rad_s2: float) -> MotionPermit:
-        """A step of the ramp: speeds nearer to zero; a pause counts for 0.1 s at most."""
+        """Return the permit after a step of the ramp: speeds nearer to zero; a pause counts for 0.1 s at most."""
         if self.stage is not Stage.STOPPING:
             return self
         step = deceleration_rad_s2 * min(max(now_ns - self.fed_ns, 0) * 1e-9, _LONGEST_STEP_S)
@@ -213,11 +213,11 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return replace(self.begun(now_ns), fed_ns=now_ns, speeds=(left, right))
 
     def ramped(self) -> MotionPermit:
-        """The ramp is through: brake until the wheels stand."""
+        """Return the permit after the ramp: brake until the wheels stand."""
         return replace(self, stage=Stage.BRAKING, since_ns=None) if self.stage is Stage.STOPPING else self
 
     def rested(self) -> MotionPermit:
-        """The stop is through."""
+        """Return the permit after the stop."""
         stopping = self.stage in (Stage.STOPPING, Stage.BRAKING)
         return replace(self, stage=Stage.REST, since_ns=None) if stopping else self
 
@@ -231,11 +231,11 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return stopped.saying(f"disarmed: {why}")
 
     def stopped(self) -> MotionPermit:
-        """An emergency stop was sent from here."""
+        """Return the permit after an emergency stop was sent from here."""
         return replace(self._idled("emergency stop sent"), stage=self.after_loss, estopped=True)
 
     def stop_heard(self) -> MotionPermit:
-        """An emergency stop was heard that somebody else sent; said once."""
+        """Return the permit after an emergency stop was received that somebody else sent; reported once."""
         stopped = replace(self._idled(self.note), stage=self.after_loss, estopped=True)
         return stopped if self.estopped else stopped.saying(STOPPED_FROM_OUTSIDE)
 

@@ -194,13 +194,13 @@ class ReferenceDriver:
         return self._clock.synced(self._now_ns)
 
     def link_up(self, now_ns: int) -> None:
-        """The medium has come up (again): start the handshake; any session is void."""
+        """Start the handshake, because the medium has come up (again); any session is void."""
         self._now_ns = now_ns
         self._restart("the link was lost")
         self._link_is_up = True
 
     def link_down(self, now_ns: int) -> None:
-        """The medium is gone: any session is void."""
+        """Drop any session, because the medium is gone."""
         self._now_ns = now_ns
         self._restart("the link was lost")
         self._link_is_up = False
@@ -278,7 +278,10 @@ class ReferenceDriver:
         return self._released is not None and self._arming.armed
 
     def _coast(self, now_ns: int) -> OutgoingFrame:
-        """The command that switches the motors off; the last one ends the session, and with it the armed state."""
+        """Return the command that switches the motors off.
+
+        The last one ends the session, and with it the armed state.
+        """
         if now_ns - self._released_ns > COASTING_NS:
             self._arming.give_up(f"disarmed: {self._released}")
         return self._wheel_command(now_ns, "COAST", WheelCommand(0.0, 0.0, ZERO_VALID_FOR_S))

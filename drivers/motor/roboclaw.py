@@ -226,7 +226,7 @@ class RoboclawPort:
         return Heard(counts=IMPLAUSIBLE, is_status=is_status, wheels=wheels, lost=jumped)
 
     def sources(self) -> Sequence[Source]:
-        """The replies of each board that is known."""
+        """Return the sources that must report again and again: each board that is known."""
         return [
             Source(f"board {board.address}", board.waits_ns if board.known else None, SILENT_NS, GONE_NS)
             for board in self._all
@@ -246,7 +246,7 @@ class RoboclawPort:
         return None
 
     def prepare(self, now_ns: int, permit: MotionPermit) -> Pending | None:
-        """The serial timeout, set and read back, and then zeros that each board takes."""
+        """Return what arming still needs: the serial timeout, set and read back, then zeros that each board takes."""
         if permit.lasts_ns(now_ns) == 0:
             self._repeat_ns = 0
             for board in self._all:
@@ -269,7 +269,7 @@ class RoboclawPort:
         return Pending(why="a board does not take zeros", frames=tuple(self.speeds(now_ns, 0.0, 0.0)))
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """The speeds of each board's motors."""
+        """Return the frames that command the speeds of each board's motors."""
         settings, self._velocity_ns = self._settings, now_ns
         per_board = {address: [0.0, 0.0] for address in self._boards}
         fastest, wanted = self._fastest_rad_s, (left_rad_s, right_rad_s)

@@ -214,7 +214,7 @@ class RoboclawExchange:
     quiet_s: float = 0.012
 
     def request(self, frame: Frame) -> bytes:
-        """The packet as it stands."""
+        """Return the packet as it stands."""
         return frame.data
 
     def is_answered(self, _frame: Frame) -> bool:
@@ -222,7 +222,7 @@ class RoboclawExchange:
         return True
 
     def reply(self, frame: Frame, received: bytes) -> Frame | None:
-        """The reply whole, with the CRC that fits this request alone; of a packet that sets something 0xFF."""
+        """Return the reply whole, with the CRC that fits this request alone; of a packet that sets something 0xFF."""
         address, command = divmod(frame.can_id, 256)
         name = getter_name(command)
         if name is None:
@@ -232,12 +232,12 @@ class RoboclawExchange:
 
 
 def setting(address: int, name: str, **values: int) -> Frame:
-    """The packet that sets something."""
+    """Return the packet that sets something."""
     return Frame(address << 8 | SETTERS[name].command, set_bytes(address, name, **values))
 
 
 def question(address: int, name: str) -> Frame:
-    """The packet that asks for something."""
+    """Return the packet that asks for something."""
     return Frame(address << 8 | GETTERS[name].command, ask_bytes(address, name))
 
 
@@ -248,7 +248,10 @@ QUESTIONS = LineQuestions(
 
 
 def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
-    """The motors of the boards that said their version: one board has both sides, of several the first half is left."""
+    """Return the motors of the boards that reported their version.
+
+    One board has both sides, of several the first half is left.
+    """
     version = GETTERS["version"].command
     asked = [(frame.can_id >> 8, frame) for frame in frames if frame.can_id & 0xFF == version and not frame.extended]
     boards = sorted(
@@ -276,7 +279,7 @@ def stands(settings: RoboclawSettings, *speeds_counts_s: Value) -> bool:
 
 
 def cyclic_frames(settings: RoboclawSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:
-    """A command, speeds and counts of each board in each tick, and one question more; request and reply in turn."""
+    """Return the frames of each period: a command, speeds and counts of each board, and one question more."""
     each = {"speed command": 16 + 1, "speeds": 2 + 10, "encoders": 2 + 10}
     frames = [
         CyclicFrame(f"{name} of {address}", "LINE", length, command_rate_hz, length, _TURNAROUND_S)

@@ -122,14 +122,14 @@ class Ros2BasePort:
         return Heard()
 
     def sources(self) -> Sequence[Source]:
-        """The bridge, and the base behind it."""
+        """Return the sources that must report again and again: the bridge, and the base behind it."""
         return (
             Source("the bridge", self._state_ns, SILENT_NS, GONE_NS),
             Source("the base's odometry", self._wheels_ns, SILENT_NS),
         )
 
     def objection(self, permit: MotionPermit) -> Objection | None:
-        """A button, a stop, other nodes, no odometry, or a bridge that drives no longer."""
+        """Return what ends a drive: a button, a stop, other nodes, no odometry, or a bridge that drives no longer."""
         if self._flags & wire.BUTTON:
             return Objection(f"a button on the base was pressed{self._or_unheard}")
         if self._flags & wire.LATCHED:
@@ -152,7 +152,7 @@ class Ros2BasePort:
         return None
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """The motion of the body, by the nominal geometry."""
+        """Return the frames that command the body's motion, by the nominal geometry."""
         it = self._settings
         body = parts.body_speeds(left_rad_s, right_rad_s, it.wheel_radius_m, it.track_m, it.max_speed_m_s)
         return (wire.speeds(*body),)
@@ -185,7 +185,7 @@ class Ros2BasePort:
         return ()
 
     def stop_frames(self) -> tuple[Frame, ...]:
-        """The stop that the bridge latches."""
+        """Return the stop that the bridge latches."""
         return wire.stop_frames(self._settings)
 
     @property
@@ -222,7 +222,7 @@ class Ros2BasePort:
         return self._settings.stands(*self._wheel_speeds)
 
     def _take_wheels(self, angles: tuple[int, int], data: bytes, t_ns: int, looked_ns: int) -> Heard:
-        """A sample of ANGLES and WHEELS; what the wheels could not have turned is left out."""
+        """Return a sample of ANGLES and WHEELS; what the wheels could not have turned is left out."""
         self._wheel_speeds, age_s = wire.unpack_wheels(data)
         fastest = 1.5 * self._settings.fastest_rad_s / wire.ANGLE_RAD
         plausible = [

@@ -109,7 +109,7 @@ class Wheels:
 
 
 def speeds(linear_m_s: float, angular_rad_s: float) -> Frame:
-    """The command to the base."""
+    """Return the command to the base."""
     return Frame(SPEEDS, struct.pack(">ff", linear_m_s, angular_rad_s))
 
 
@@ -139,7 +139,7 @@ def unpack_wheels(data: bytes) -> tuple[tuple[float, float], float]:
 
 
 def unpack_state(data: bytes) -> tuple[int, int, int]:
-    """Flags, why odometry was refused (an index of REFUSALS), and the check sum of the settings."""
+    """Return flags, why odometry was refused (an index of REFUSALS), and the check sum of the settings."""
     flags, refusal, check_sum = struct.unpack(">BBxxI", data)
     return flags, min(refusal, len(REFUSALS) - 1), check_sum
 
@@ -223,12 +223,12 @@ class BaseEnd:
 
 
 def stop_frames(_settings: Ros2BaseSettings) -> tuple[Frame, ...]:
-    """The e-stop, which the bridge latches."""
+    """Return the e-stop, which the bridge latches."""
     return (Frame(STOP, b""),)
 
 
 def cyclic_frames(_settings: Ros2BaseSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:
-    """The command, and what the bridge says of a base with 50 messages a second."""
+    """Return the frames of each period: the command, and the bridge's reports of a base with 50 messages a second."""
     return (
         CyclicFrame("speeds", "HOST", 8, command_rate_hz),
         *(CyclicFrame(name, "ROBOT", 8, rate) for name, rate in (("state", 20.0), ("angles", 50.0), ("wheels", 50.0))),

@@ -132,7 +132,7 @@ class Port(Protocol):
         """Forget what was heard: the link or the controllers have restarted. What the wheels have turned stays."""
 
     def end_drive(self) -> None:
-        """The drive is over: what stops the controllers is due at once."""
+        """Prepare the end of the drive: what stops the controllers is due at once."""
 
     def take(self, received: ReceivedFrame, permit: MotionPermit) -> Heard:
         """Take in a frame and return what it meant."""
@@ -150,22 +150,22 @@ class Port(Protocol):
         """
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """The frames that command these wheel speeds."""
+        """Return the frames that command these wheel speeds."""
 
     def brake(self, now_ns: int, lasts_ns: int) -> tuple[Sequence[Frame], bool]:
-        """The frames that hold the wheels, and whether they stand; `lasts_ns` since braking began."""
+        """Return the frames that hold the wheels, and whether they stand; `lasts_ns` since braking began."""
 
     def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
-        """The frames due at rest: what keeps the controllers there, resets them, and asks for what is not known."""
+        """Return the frames due at rest: what keeps the controllers there, resets them, asks for what is not known."""
 
     def may_reset(self, now_ns: int) -> bool:
         """Whether what is latched here may be cleared, by what `seen` does not show."""
 
     def questions(self, now_ns: int, permit: MotionPermit) -> tuple[OutgoingFrame, ...]:
-        """The questions due in this tick, after its other frames; none may feed a watchdog without a command."""
+        """Return the questions due in this tick, after its other frames; none may feed a watchdog without a command."""
 
     def stop_frames(self) -> tuple[Frame, ...]:
-        """The e-stop to all controllers."""
+        """Return the e-stop to all controllers."""
 
 
 def stop_confirmation(port: Port) -> Callable[[Frame], bool]:
@@ -216,11 +216,11 @@ class VendorDriver:
         return None if self._port.identity is None else self._port.limits
 
     def link_up(self, now_ns: int) -> None:
-        """The medium has come up (again): whatever was agreed is void."""
+        """Start again after the medium has come up: whatever was agreed is void."""
         self._meet_anew(self._permit.linked(True), now_ns)
 
     def link_down(self, now_ns: int) -> None:
-        """The medium is gone: whatever was agreed is void."""
+        """Drop whatever was agreed, because the medium is gone."""
         self._meet_anew(self._permit.linked(False), now_ns)
 
     def request(self, request: Request) -> None:
@@ -270,7 +270,7 @@ class VendorDriver:
         return parts.estop_frames(now_ns, self._port.stop_frames())
 
     def _step(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
-        """The frames of the stage, which may end in this tick."""
+        """Return the frames of the stage, which may end in this tick."""
         match self._permit.stage:
             case Stage.ARMED:
                 if command is None:

@@ -69,14 +69,17 @@ class Odometer:
         return self.take(count, t_ns, looked_ns, fastest, slack)
 
     def begin_anew(self) -> None:
-        """The controller may have restarted: the next count is compared with none before."""
+        """Compare the next count with none before, because the controller may have restarted."""
         self.last, self.is_new = None, False
 
 
 def wheel_sample(
     t_ns: int, sides: Sequence[Sequence[Odometer]], direction: tuple[int, int], rad_per_count: float
 ) -> WheelSample:
-    """The wheels of both sides, each the mean of its motors; what was counted earlier is carried on to `t_ns`."""
+    """Return the wheels of both sides, each the mean of its motors.
+
+    What was counted earlier is carried on to `t_ns`.
+    """
     angles, speeds = [], []
     for side, sign in zip(sides, direction, strict=True):
         turned = [each.total + each.speed * (t_ns - each.t_ns) * 1e-9 for each in side]
@@ -102,11 +105,11 @@ class Layout:
         return struct.calcsize(self.order + self.body)
 
     def pack(self, *values: float) -> bytes:
-        """The bytes of the fields."""
+        """Return the bytes of the fields."""
         return struct.pack(self.order + self.body, *values)
 
     def unpack(self, data: bytes) -> dict[str, Any]:
-        """The fields by name, of bytes that begin with them."""
+        """Return the fields by name, of bytes that begin with them."""
         return dict(zip(self.fields, struct.unpack_from(self.order + self.body, data), strict=True))
 
 
@@ -146,17 +149,17 @@ def outgoing(now_ns: int, *frames: Frame, life_ns: int = _FRAME_LIFE_NS) -> tupl
 
 
 def commanding(now_ns: int, command: WheelCommand, *frames: Frame) -> tuple[OutgoingFrame, ...]:
-    """The frames of a command: half of its validity may pass on the way."""
+    """Return the frames of a command: half of its validity may pass on the way."""
     return outgoing(now_ns, *frames, life_ns=round(0.5e9 * command.valid_for_s))
 
 
 def estop_frames(now_ns: int, frames: tuple[Frame, ...]) -> tuple[OutgoingFrame, ...]:
-    """The frames of an e-stop, three times over, before all others."""
+    """Return the frames of an e-stop, three times over, before all others."""
     return tuple(OutgoingFrame(frame, now_ns + _ESTOP_LIFE_NS, _ESTOP_RANK) for frame in _ESTOP_REPEATS * frames)
 
 
 def status(t_ns: int, state: DriverState, stop_confirmed: bool) -> RobotStatus:
-    """A status of nothing but the state: these controllers know no sessions and count no refused frames.
+    """Return a status of nothing but the state: these controllers know no sessions and count no refused frames.
 
     An e-stop that is not confirmed yet is a stop under way.
     """
@@ -176,12 +179,12 @@ def status(t_ns: int, state: DriverState, stop_confirmed: bool) -> RobotStatus:
 
 
 def counted(stats: DriverStats, name: str) -> DriverStats:
-    """The counters, with one more of `name`."""
+    """Return the counters, with one more of `name`."""
     return dataclasses.replace(stats, **{name: getattr(stats, name) + 1})
 
 
 def sides_of(nodes: tuple[Nodes, Nodes]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """The ids on the left and on the right."""
+    """Return the ids on the left and on the right."""
     left, right = ((side,) if isinstance(side, int) else side for side in nodes)
     return left, right
 

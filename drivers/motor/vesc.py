@@ -168,11 +168,11 @@ class VescPort:
         return Heard()
 
     def sources(self) -> Sequence[Source]:
-        """The speed of every motor."""
+        """Return the speed of every motor."""
         return [Source(f"controller {motor.node}", motor.erpm_ns, SILENT_NS, GONE_NS) for motor in self._all]
 
     def objection(self, permit: MotionPermit) -> Objection | None:
-        """A fault, a kill switch, or a timeout that ran out."""
+        """Return what ends a drive: a fault, a kill switch, or a timeout that ran out."""
         # An answer of before the first command is not meant.
         is_armed_long = permit.lasts_ns(permit.looked_ns) > 2 * len(self._all) * _FAULT_PERIOD_NS + SILENT_NS
         for motor in self._all:
@@ -193,7 +193,7 @@ class VescPort:
         return None
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """The electrical speed of each motor."""
+        """Return the electrical speed of each motor."""
         limit, wanted = self._settings.max_erpm, (left_rad_s, right_rad_s)
         frames = []
         for side, direction, speed in zip(self._sides, self._settings.direction, wanted, strict=True):

@@ -81,7 +81,7 @@ class VescSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 def slowest_rad_s(settings: VescSettings) -> float:
-    """The slowest speed of a wheel that the speed loop holds."""
+    """Return the slowest speed of a wheel that the speed loop holds."""
     return settings.min_erpm / settings.erpm_per_rad_s
 
 
@@ -110,7 +110,7 @@ class VescExchange:
         self._on_the_line = settings.uart_node
 
     def request(self, frame: Frame) -> bytes:
-        """The packet, forwarded where it is for another controller; for everybody both."""
+        """Return the packet, forwarded where it is for another controller; for everybody both."""
         to, payload = frame.can_id & 0xFF, self._payload(frame)
         sent = b"" if to not in (self._on_the_line, codec.EVERYBODY) else codec.packet(payload)
         return sent if to == self._on_the_line else sent + codec.packet(codec.forward(to, payload))
@@ -120,7 +120,7 @@ class VescExchange:
         return frame.can_id >> 8 in (codec.PING, codec.PROCESS_SHORT)
 
     def reply(self, frame: Frame, received: bytes) -> Frame | None:
-        """The first packet that answers this question, of this controller."""
+        """Return the first packet that answers this question, of this controller."""
         to, asked = frame.can_id & 0xFF, self._payload(frame)
         for payload in codec.PacketDecoder().feed(received):
             if payload[0] == asked[0] == codec.GET_APPCONF and codec.timeout(payload, to) is None:
@@ -148,7 +148,10 @@ class VescExchange:
 
 
 def stop_frames(settings: VescSettings) -> tuple[Frame, ...]:
-    """Brake with the declared current, all at once; nothing latches it. On a serial line also: do the motors stand?"""
+    """Return the frames that brake with the declared current, all at once; nothing latches it.
+
+    On a serial line they also ask whether the motors stand.
+    """
     brake = codec.command(codec.EVERYBODY, "set_brake_current", settings.brake_current_a)
     return (brake,) if settings.uart_node is None else (brake, *questions(settings))
 
@@ -180,7 +183,7 @@ def cyclic_frames(settings: VescSettings, command_rate_hz: float, _authenticated
 
 
 def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
-    """The controllers whose status was heard, split into left and right as they are numbered; None for none."""
+    """Return the controllers whose status was heard, split into left and right as they are numbered; None for none."""
     decoded = [codec.decode(frame) for frame in frames]
     nodes = sorted({one.controller for one in decoded if one is not None and one.name == "status"})
     return {"nodes": in_sides(nodes)} if len(nodes) > 1 else None

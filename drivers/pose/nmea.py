@@ -303,7 +303,10 @@ class Fixes:
         return usual * max(hdop, 1.0) if isinstance(hdop, float) else usual
 
     def _height_of(self, said: Any) -> tuple[float, list[dict[str, Any]]]:
-        """The height over the ellipsoid: the fix's, else the last known one, else 0; the plane's scale hangs on it."""
+        """Return the height over the ellipsoid: the fix's, else the last known one, else 0.
+
+        The plane's scale hangs on it.
+        """
         if isinstance(said.alt, float):
             self._height_m = said.alt + (said.sep if isinstance(said.sep, float) else 0.0)
             return self._height_m, []

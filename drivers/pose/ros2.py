@@ -102,7 +102,7 @@ class BridgePoses:
 
 
 def _sender(ancillary: Sequence[tuple[int, int, bytes]]) -> tuple[int | None, int | None]:
-    """The process and the user that sent a datagram, as the kernel says."""
+    """Return the process and the user that sent a datagram, as the kernel says."""
     for level, kind, data in ancillary:
         if (level, kind) == (socket.SOL_SOCKET, socket.SCM_CREDENTIALS) and len(data) == _CREDENTIALS.size:
             process, user, _ = _CREDENTIALS.unpack(data)

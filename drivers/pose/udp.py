@@ -116,7 +116,7 @@ class UdpPoses:
         self._socket.close()
 
     def _take(self, datagram: bytes, sender: tuple[str, int], now_ns: int) -> PoseSample | None:
-        """The pose in a datagram, if its sender counts; the cheap checks first, as anybody can send many."""
+        """Return the pose in a datagram, if its sender counts; the cheap checks first, as anybody can send many."""
         if not self._senders.may_send(sender, now_ns):
             return None
         if self._proof is not None:

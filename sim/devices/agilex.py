@@ -105,7 +105,7 @@ class AgilexBase:
         return []
 
     def take_remote_control(self, speed_m_s: float, turn_rad_s: float) -> None:
-        """A person switches the remote control on and drives."""
+        """Let an operator switch the remote control on and drive."""
         self.control_mode, self.rc_commanded = RC_MODE, (speed_m_s, turn_rad_s)
 
     def at(self, now_ms: int) -> None:
@@ -123,7 +123,7 @@ class AgilexBase:
         return frames
 
     def message(self, can_id: int) -> CanFrame:
-        """A message of the base by its identifier."""
+        """Return a message of the base by its identifier."""
         return CanFrame(can_id, self._body(can_id))
 
     def _body(self, can_id: int) -> bytes:
@@ -225,5 +225,5 @@ class AgilexController:
 
 
 def make_controller(settings: AgilexSettings, ticks_per_rev: int) -> AgilexController:
-    """The base of a robot whose robot.toml has these settings, with the encoder on the wheel."""
+    """Return the base of a robot whose robot.toml has these settings, with the encoder on the wheel."""
     return AgilexController(settings, ticks_per_rev)

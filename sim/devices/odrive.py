@@ -249,7 +249,7 @@ class OdriveBoard:
         return self.cyclic(now_ms)
 
     def cyclic(self, now_ms: int) -> list[CanFrame]:
-        """The frames due now, axis by axis."""
+        """Return the frames due now, axis by axis."""
         frames = []
         for axis in self.axes:
             for name, command in _CYCLIC.items():
@@ -260,11 +260,11 @@ class OdriveBoard:
         return frames
 
     def message(self, axis: Axis, command: int) -> CanFrame:
-        """A telemetry message of an axis by its command number."""
+        """Return a telemetry message of an axis by its command number."""
         return CanFrame(axis.node_id << 5 | command, self._telemetry_body(axis, command) or b"")
 
     def _telemetry_body(self, axis: Axis, command: int) -> bytes | None:
-        """The data of a message; None for a command that asks for none in this generation."""
+        """Return the data of a message; None for a command that asks for none in this generation."""
         if command == 0x09:
             return struct.pack("<ff", axis.pos_turns, axis.vel_turns_s)
         if command == 0x14:
@@ -420,5 +420,5 @@ class OdriveController:
 
 
 def make_controller(settings: OdriveSettings, ticks_per_rev: int) -> OdriveController:
-    """The controllers of a robot whose robot.toml has these settings, with the encoder on the wheel."""
+    """Return the controllers of a robot whose robot.toml has these settings, with the encoder on the wheel."""
     return OdriveController(settings, ticks_per_rev)

@@ -303,5 +303,5 @@ _MOVING = frozenset({34, 35, 36, 37, 40})
 
 
 def make_controller(settings: RoboclawSettings, ticks_per_rev: int) -> RoboclawController:
-    """The boards of a robot whose robot.toml has these settings."""
+    """Return the boards of a robot whose robot.toml has these settings."""
     return RoboclawController(settings, ticks_per_rev)

@@ -95,5 +95,5 @@ class Ros2BaseController:
 
 
 def make_controller(settings: wire.Ros2BaseSettings, ticks_per_rev: int) -> Ros2BaseController:
-    """The base of a robot whose robot.toml has these settings, with the encoder on the wheel."""
+    """Return the base of a robot whose robot.toml has these settings, with the encoder on the wheel."""
     return Ros2BaseController(settings, ticks_per_rev)

@@ -120,7 +120,7 @@ class Vesc:
         self._serial_out = bytearray()
 
     def take_calls(self) -> list[tuple[str, float]]:
-        """The commands that reached the motor since the last call."""
+        """Return the commands that reached the motor since the last call."""
         calls, self._calls = self._calls, []
         return calls
 
@@ -179,7 +179,7 @@ class Vesc:
         return b""
 
     def check_timeout(self, now_ms: int) -> float | None:
-        """The check that runs every 10 ms; returns the brake current (A) that it applies, None while all is well.
+        """Run the check of every 10 ms; return the brake current (A) that it applies, None while all is well.
 
         While the kill switch is active the timeout is neither found nor ended, and commands are ignored.
         """
@@ -203,7 +203,7 @@ class Vesc:
         return [self.status(number) for number, period in self.status_ms.items() if period and now_ms % period == 0]
 
     def status(self, number: int) -> CanFrame:
-        """A status message by its command number."""
+        """Return a status message by its command number."""
         v = self.values
         parts: dict[int, tuple[tuple[float, float, str], ...]] = {
             9: ((v.erpm, 1, "i"), (v.current_motor_a, 10, "h"), (v.duty, 1000, "h")),
@@ -220,7 +220,7 @@ class Vesc:
         return CanFrame(number << 8 | self.controller_id, data, extended=True)
 
     def answer_values(self, mask: int) -> bytes:
-        """The bytes of the values that the mask asks for."""
+        """Return the bytes of the values that the mask asks for."""
         v = self.values
         status = int(self.timed_out) | self.kill_switch_active << 1
         parts: tuple[Callable[[], bytes], ...] = (
@@ -312,7 +312,7 @@ class Vesc:
 
 
 def can_packet(to: int, sender: int, payload: bytes, send_mode: int) -> list[CanFrame]:
-    """A packet in fragments."""
+    """Return a packet in fragments."""
     if len(payload) <= 6:
         return [CanFrame(8 << 8 | to, bytes((sender, send_mode)) + payload, extended=True)]
     frames = [
@@ -329,7 +329,7 @@ def can_packet(to: int, sender: int, payload: bytes, send_mode: int) -> list[Can
 
 
 def serial_packet(payload: bytes) -> bytes:
-    """The bytes of a packet on the serial line."""
+    """Return the bytes of a packet on the serial line."""
     size = bytes((2, len(payload))) if len(payload) < 256 else b"\3" + len(payload).to_bytes(2)
     return size + payload + binascii.crc_hqx(payload, 0).to_bytes(2) + b"\3"
 
@@ -499,5 +499,5 @@ def _brakes(vesc: Vesc) -> bool:
 
 
 def make_controller(settings: VescSettings, ticks_per_rev: int) -> VescController:
-    """The controllers of a robot whose robot.toml has these settings, with the encoder on the wheel."""
+    """Return the controllers of a robot whose robot.toml has these settings, with the encoder on the wheel."""
     return VescController(settings, ticks_per_rev)
