@@ -1,5 +1,4 @@
-"""Holds the hand-written firmware C to account: no compiler warning, no undefined behaviour, every line and branch run,
-ten million random frames survived.
+"""Checks of the hand-written firmware C: warnings, undefined behaviour, coverage, ten million random frames.
 
 Builds the extension in a copy of the tree, once with the undefined-behaviour sanitizer and once with gcov (each adds
 branches of its own, which the other must not see), and runs the firmware's tests on both. Exits 1 if anything is

@@ -79,7 +79,7 @@ def run(*command: str, **options: object) -> str:
 
 
 def mirrors(targets: str) -> list[str]:
-    """apt's lines of the Debian among `ADDRESS|RELEASE|COMPONENT|ORIGIN` lines, each once."""
+    """Lines of apt for the Debian among `ADDRESS|RELEASE|COMPONENT|ORIGIN` lines, each once."""
     rows = [line.split("|") for line in targets.splitlines()]
     return list(dict.fromkeys(f"deb {row[0]} {row[1]} {row[2]}" for row in rows if row[3] == "Debian"))
 

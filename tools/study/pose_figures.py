@@ -68,8 +68,10 @@ UDP = PoseKind(
 
 @dataclass(frozen=True, slots=True)
 class PoseFigures:
-    """`rms_m` of the true distance to the circle after a quarter of a lap, `nees` the mean normalised error squared of
-    the estimate (3 where its covariance is right), `looks` that it is the mean of, `straight_m` driven by hand before.
+    """Figures of one drive with a pose source.
+
+    `rms_m` of the true distance to the circle after a quarter of a lap, `nees` the mean normalised error squared of the
+    estimate (3 where its covariance is right), `looks` that it is the mean of, `straight_m` driven by hand before.
     """
 
     kind: str
