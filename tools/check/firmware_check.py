@@ -33,7 +33,7 @@ FLOOD_FRAMES = 50
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """What of one file was executed."""
+    """Coverage of one file by the tests."""
 
     name: str
     lines: int
@@ -106,7 +106,10 @@ def build_harness(folder: Path, replaced: dict[str, Path] | None = None) -> Path
 def run_harness(
     harness: Path, cycles: int, frames: int, authenticated: bool, timeout_s: float | None = None
 ) -> subprocess.CompletedProcess[str]:
-    """Run it: so many cycles of a host and mad measurements, then random frames; its status is 0 if all was sound."""
+    """Run the harness; its status is 0 if all was sound.
+
+    So many cycles of a host and mad measurements, then random frames.
+    """
     return subprocess.run(
         [str(harness), str(cycles), str(frames), "1" if authenticated else "0"],
         capture_output=True, text=True, check=False, timeout=timeout_s,
