@@ -40,7 +40,7 @@ def _check(path: Path, status: os.stat_result) -> None:
 
 
 def user_name(uid: int) -> str:
-    """Return a user for a person: name and number."""
+    """Return a user as text: name and number."""
     try:
         return f"{pwd.getpwuid(uid).pw_name} ({uid})"
     except KeyError:

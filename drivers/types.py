@@ -84,7 +84,7 @@ class Transport(Protocol):
 
     @property
     def name(self) -> str:
-        """Medium and address, for messages to a person."""
+        """Medium and address, for messages to the operator."""
 
     @property
     def state(self) -> LinkState:
@@ -330,7 +330,7 @@ class Driver(Protocol):
 
     @property
     def detail(self) -> str:
-        """One sentence for a person: why the state is what it is and what to do about it."""
+        """One sentence for the operator: why the state is what it is and what to do about it."""
 
     @property
     def identity(self) -> Identity | None:
@@ -399,7 +399,7 @@ class Exchange(Protocol):
 
     @property
     def quiet_s(self) -> float:
-        """Silence after which a device that is in the middle of a packet begins anew."""
+        """Silence after which a device that is in the middle of a packet begins again."""
 
     def request(self, frame: Frame) -> bytes:
         """Return the bytes of a packet on the line."""
@@ -419,7 +419,7 @@ class SaysWhy(Protocol):
     """A pose source that knows why its poses come or fail to come."""
 
     def news(self) -> Sequence[str]:
-        """Sentences for a person since the last call."""
+        """Sentences for the operator since the last call."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -197,7 +197,7 @@ class Prover:
         return self._nonce is not None
 
     def challenge(self, nonce: int) -> None:
-        """Take in MAC_CHALLENGE's nonce; with a new one the counters begin anew, with one told before they go on.
+        """Take in MAC_CHALLENGE's nonce; with a new one the counters begin again, with one told before they go on.
 
         Anybody can send a wrong nonce: were the right one's counters lost with it, the robot would hear nothing more
         until they had caught up with its own.

@@ -150,7 +150,7 @@ class Bridge:
         return f"ROS 2 domain {_domain(self._config)}, {reach}, namespace /{ros2.namespace.strip('/')}{heard}"
 
     def run(self, should_stop: Callable[[], bool]) -> None:
-        """Carry both ways until asked to stop; what fails on the way in is raised here."""
+        """Carry both ways until requested to stop; what fails on the way in is raised here."""
         # Neither thread waits long for the other's Python, and what was imported is not looked through for garbage.
         sys.setswitchinterval(_SWITCH_S)
         gc.freeze()

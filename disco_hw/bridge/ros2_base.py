@@ -176,7 +176,7 @@ class BaseBridge:
         self._said = ""
 
     def run(self, should_stop: Callable[[], bool]) -> None:
-        """Carry both ways until asked to stop, and leave the base with zeros."""
+        """Carry both ways until requested to stop, and leave the base with zeros."""
         last_ns = time.monotonic_ns()
         try:
             while not should_stop():

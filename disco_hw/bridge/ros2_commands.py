@@ -62,7 +62,7 @@ class SpeedInlet:
     def request(
         self, message: msg.Twist | msg.TwistStamped, sent_ns: int, mono_ns: int, wall_ns: int
     ) -> dict[str, Any] | None:
-        """Return the request to the daemon for a speed heard now; None for what is none.
+        """Return the request to the daemon for a speed received now; None for what is none.
 
         `sent_ns` is wall-clock time.
         """

@@ -53,7 +53,7 @@ class PoseInlet:
     def datagram(
         self, message: PoseMessage, sent_ns: int, mono_ns: int, wall_ns: int, publisher: Hashable = None
     ) -> bytes | None:
-        """Return the datagram to send for a message heard now; None for what is not to be passed on.
+        """Return the datagram to send for a message received now; None for what is not to be passed on.
 
         `sent_ns`: when it was sent, by the sender's wall clock, which counts where the message has no stamp. Of a flood
         one pose in 4 ms is passed on, as a daemon has no use for more. `publisher`: who sent it; of several on the
@@ -255,7 +255,7 @@ class WheelInlet:
         self._why, self._why_ns = _NOTHING, -_SECOND_NS
 
     def wheels(self, message: msg.JointState | msg.Odometry, sent_ns: int, mono_ns: int, wall_ns: int) -> Wheels | None:
-        """Return the wheels by a message heard now; None for what is refused, or says nothing of them.
+        """Return the wheels by a message received now; None for what is refused, or says nothing of them.
 
         `sent_ns`: when it was sent, by the sender's wall clock, which counts where the message has no stamp.
         """
@@ -285,7 +285,7 @@ class WheelInlet:
         return self._before
 
     def why(self, now_ns: int) -> int:
-        """Why nothing usable was heard, of REFUSALS."""
+        """Why nothing usable was received, of REFUSALS."""
         return self._why if now_ns - self._why_ns < _SECOND_NS else _NOTHING
 
     def _refuse(self, why: int, mono_ns: int) -> None:

@@ -287,7 +287,7 @@ def _change(text: str) -> tuple[str, float]:
 
 
 def in_words(reply: dict[str, Any], robot: Path) -> str:
-    """Return a reply of the daemon of `robot` for a person."""
+    """Return a reply of the daemon of `robot` for the operator."""
     if not reply.get("ok"):
         return f"refused: {reply.get('error')}"
     if reply.get("do") != "status":

@@ -79,7 +79,7 @@ class CheckReport:
         }
 
     def as_text(self) -> str:
-        """Return the report for a person, one line a check."""
+        """Return the report for the operator, one line a check."""
         return "\n".join(f"{check.level.value:4}  {check.name}: {check.text}" for check in self.checks)
 
 

@@ -73,7 +73,7 @@ class Daemon:
         self._told_ready = False
 
     def run(self) -> int:
-        """Run the loop until asked to stop; returns the exit code. An exception is reported and ends it."""
+        """Run the loop until requested to stop; returns the exit code. An exception is reported and ends it."""
         try:
             self._loop.run(self._tick, lambda: self._quit or self._signals.received is not None or self._pilot.done)
         except Exception as error:

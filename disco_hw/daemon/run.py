@@ -61,7 +61,7 @@ Adapt = Literal["off", "fast"]
 
 @dataclass(frozen=True, slots=True)
 class DaemonOptions:
-    """What `disco-hw run` was asked; None leaves what robot.toml says."""
+    """Options of `disco-hw run`; None leaves what robot.toml says."""
 
     robot: Path
     model: Path | None = None
@@ -260,7 +260,7 @@ _RECORDER = "recorder"
 
 
 def in_text(topic: str, text: str) -> str:
-    """Return a sentence of the daemon for a person."""
+    """Return a sentence of the daemon for the operator."""
     return f"{topic}: {text}"
 
 
@@ -314,7 +314,7 @@ class _Compilation(event.Listener):
 def compile_progress(what: str, say: Callable[[str], None], every_s: float = _EVERY_S) -> Iterator[None]:
     """Within the block, say through `say` what numba compiles and how far it is; nothing where its cache has it all.
 
-    `what`: for a person, as "the planner for a circle". `say` is called from a thread, which ends with the block.
+    `what`: for the operator, as "the planner for a circle". `say` is called from a thread, which ends with the block.
     """
     compilation = _Compilation(what, say, every_s)
     try:

@@ -161,7 +161,7 @@ class Steering:
 
 
 def steering_from(arguments: Mapping[str, Any]) -> Steering:
-    """Read a request's arguments; raises ValueError in words for a person."""
+    """Read a request's arguments; raises ValueError in words for the operator."""
     if set(arguments) != {"forward", "left", "held", "stamp"}:
         raise ValueError("drive takes forward, left, held and stamp")
     forward, left, held = arguments["forward"], arguments["left"], arguments["held"]

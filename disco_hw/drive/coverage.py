@@ -119,7 +119,7 @@ class Coverage:
         return tuple(item for item in self.items() if not item.covered)
 
     def in_words(self) -> str:
-        """One line for a person: how much is done, and the first things that are missing."""
+        """One line for the operator: how much is done, and the first things that are missing."""
         items, missing = self.items(), self.missing()
         done = f"{self.driven_s:.0f} s driven, {len(items) - len(missing)} of {len(items)} excited"
         if not missing:

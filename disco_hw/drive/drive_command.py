@@ -49,7 +49,7 @@ def leads_to_virtual_robot(link: Link) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class DriveOptions:
-    """What `disco-hw drive` was asked; None leaves what robot.toml says, `seconds` breaks a script off."""
+    """Options of `disco-hw drive`; None leaves what robot.toml says, `seconds` breaks a script off."""
 
     robot: Path
     model: Path | None = None

@@ -162,7 +162,7 @@ _SETTLED_S = 0.8
 class ScriptSource:
     """Plays a script while the deadman of another source is held.
 
-    A manoeuvre that was broken off by disarming begins anew when driving goes on, so that each is recorded whole once.
+    A manoeuvre that was broken off by disarming begins again when driving goes on, so that each is recorded whole once.
     The wheels' limits are what they reach at the end of the manoeuvres that are to find them.
     """
 

@@ -146,7 +146,7 @@ class PoseSources:
         self.contradiction = apart
 
     def news(self) -> list[str]:
-        """Sentences for a person since the last call."""
+        """Sentences for the operator since the last call."""
         said, self._said = self._said, []
         return said
 
@@ -165,7 +165,7 @@ class PoseSources:
         }
 
     def status(self, now_ns: int) -> list[dict[str, Any]]:
-        """Each source for a person or page; what is not known is None."""
+        """Each source for the operator or page; what is not known is None."""
         return [
             {
                 "source": one.label,

@@ -28,7 +28,7 @@ _MOST_ACCELERATION_RAD_S2 = 655.0
 
 @dataclass(frozen=True, slots=True)
 class SimOptions:
-    """What `disco-hw sim` was asked; `start` is x, y (m) and yaw (rad), the task's start if None."""
+    """Options of `disco-hw sim`; `start` is x, y (m) and yaw (rad), the task's start if None."""
 
     robot: Path
     model: Path | None = None

@@ -102,7 +102,7 @@ QUESTIONS = (
 
 @dataclass(frozen=True, slots=True)
 class InitOptions:
-    """What `disco-hw init` was asked; None of a field is asked for, or the usual where nobody is to be asked.
+    """Options of `disco-hw init`; None of a field is asked for, or the usual where nobody is to be asked.
 
     `may_ask`: whether a serial line may be asked for controllers that only answer; None asks the person.
     """

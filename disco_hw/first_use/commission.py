@@ -65,7 +65,7 @@ STAGES = (
 
 @dataclass(frozen=True, slots=True)
 class CommissionOptions:
-    """What `disco-hw commission` was asked; `write`: mend robot.toml, None asks; `stages`: names of `STAGES`."""
+    """Options of `disco-hw commission`; `write`: mend robot.toml, None asks; `stages`: names of `STAGES`."""
 
     robot: Path
     link: str | None = None

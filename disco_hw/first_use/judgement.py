@@ -51,7 +51,7 @@ class Fault:
 
 @dataclass(frozen=True)
 class Findings:
-    """Faults, and figures for a person: what was measured, in words."""
+    """Faults, and figures for the operator: what was measured, in words."""
 
     faults: tuple[Fault, ...] = ()
     figures: tuple[str, ...] = ()

@@ -1,9 +1,9 @@
-"""The guided first drive as steps that wait for a person: what is asked of the wheels, tick by tick, and its pilot.
+"""The guided first drive as steps that wait for the operator: what is asked of the wheels, tick by tick, and its pilot.
 
 The pilot runs a procedure under a deadman held by a person, and takes the keys they answer with. All of it is pure.
 
 A step is a generator: it yields what it wants of the tick and gets what was seen in it, or a person's answer. A step
-that needs the deadman held begins anew when it was let go too early.
+that needs the deadman held begins again when it was let go too early.
 """
 
 from __future__ import annotations

@@ -476,7 +476,7 @@ class ProcessRecorder:
 
 
 def _cause(line: WriterLine, code: int | None) -> str:
-    """Why a writer has ended, for a person."""
+    """Why a writer has ended, for the operator."""
     status = line.status
     if status.state == "failed":
         return status.error

@@ -1,6 +1,6 @@
 """One tick of the robot, without a clock, a thread or a file; here the states that all of it is about.
 
-One table has every way between the states, and what each means for a person is in words. Rows are tried from top to
+One table has every way between the states, and what each means for the operator is in words. Rows are tried from top to
 bottom, one transition per step: what takes motion away stands above what gives it. `disco_hw.runtime.supervisor`
 computes the conditions and acts on the state. E-stop is shown in FAULT: the robot's firmware holds the latch, the
 supervisor repeats the request until the firmware shows it.

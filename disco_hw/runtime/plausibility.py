@@ -212,7 +212,7 @@ class _Start(NamedTuple):
         return _Start(pose.source, pose.x_m, pose.y_m, pose.yaw_rad, 1)
 
     def take(self, pose: PoseSample) -> _Start:
-        """Take in one more; another source, or a place that noise does not explain, begins anew."""
+        """Take in one more; another source, or a place that noise does not explain, begins again."""
         yaw = math.remainder(pose.yaw_rad - self.yaw_rad, 2.0 * math.pi)
         away_m = math.hypot(pose.x_m - self.x_m, pose.y_m - self.y_m)
         moved = away_m > _MOVED_STD * pose.position_std_m or abs(yaw) > _MOVED_STD * pose.yaw_std_rad

@@ -134,7 +134,7 @@ class Progress(Protocol):
         """Return the name of what is counted, and how much of it there is, as text."""
 
     def add(self, now_ns: int, x_m: float, y_m: float, yaw_rad: float) -> None:
-        """Take in the pose of one tick; the first one after a pause begins anew."""
+        """Take in the pose of one tick; the first one after a pause begins again."""
 
     def pause(self) -> None:
         """Note that the task does not run in this tick."""

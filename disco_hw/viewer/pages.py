@@ -187,7 +187,7 @@ def _geometry(change: BeliefChange | None) -> tuple[tuple[float, ...], ...]:
 
 
 def run_live(page: LivePage, should_stop: Callable[[], bool]) -> None:
-    """Draw until told to stop."""
+    """Draw until requested to stop."""
     try:
         while not should_stop():
             page.step()
@@ -359,7 +359,7 @@ def _spread(marks: tuple[Mark, ...], count: int) -> list[Mark]:
 
 
 def run_replay(page: ReplayPage, should_stop: Callable[[], bool]) -> None:
-    """Draw until told to stop."""
+    """Draw until requested to stop."""
     before_s = time.monotonic()
     while not should_stop():
         now_s = time.monotonic()

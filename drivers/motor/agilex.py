@@ -173,7 +173,7 @@ class AgilexPort:
         return (protocol.motion(0.0, 0.0),), False
 
     def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
-        """Bring a base that listens to CAN to standby, standing; clear errors when asked."""
+        """Bring a base that listens to CAN to standby, standing; clear errors when requested."""
         if now_ns - self._repeat_ns < _REPEAT_NS:
             return ()
         seen = self.seen

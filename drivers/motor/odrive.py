@@ -126,7 +126,7 @@ class OdrivePort:
         return all(axis.error & estop and axis.state != AxisState.CLOSED_LOOP for axis in self._all)
 
     def begin_anew(self, now_ns: int) -> None:
-        """Forget what the axes said."""
+        """Clear what the axes reported."""
         self._questions.begin_anew(now_ns)
         for axis in self._all:
             axis.heard_ns = None

@@ -303,7 +303,7 @@ def cyclic_frames(settings: OdriveSettings, command_rate_hz: float, _authenticat
 
 
 def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
-    """Return the nodes whose heartbeats and estimates were heard, split into left and right as they are numbered.
+    """Return the nodes whose heartbeats and estimates were received, split into left and right as they are numbered.
 
     None if there are none: heartbeats alone could be another vendor's frames.
     """

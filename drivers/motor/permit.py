@@ -246,7 +246,7 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return said if self.stage is Stage.REST else said.lost(f"another host commands {whom}; disconnect it")
 
     def reset(self, seen: Controllers) -> MotionPermit:
-        """Clear what is latched, when that is wanted of controllers at rest that were heard and are well.
+        """Clear what is latched, when that is wanted of controllers at rest that have reported and are well.
 
         Those that are refused may be reset: nothing arms them.
         """

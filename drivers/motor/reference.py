@@ -132,7 +132,7 @@ class ReferenceDriver:
 
     @property
     def detail(self) -> str:
-        """One sentence for a person: why the state is what it is and what to do about it."""
+        """One sentence for the operator: why the state is what it is and what to do about it."""
         state, status, note = self.state, self._status, self._arming.note
         if self._released is not None and state is DriverState.FAULT:
             return f"{self._released}; remove the cause, then reset"

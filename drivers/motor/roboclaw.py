@@ -114,7 +114,7 @@ class Board:
 
     @property
     def error_words(self) -> str:
-        """Its first error, for a person."""
+        """Its first error, for the operator."""
         if self.is_pressed:
             return f"board {self.address}: its e-stop input is pressed"
         bit = self.errors & -self.errors
@@ -187,7 +187,7 @@ class RoboclawPort:
         return all(board.stopped and "speeds" in board.known for board in self._all) and self._stands
 
     def begin_anew(self, now_ns: int) -> None:
-        """Forget what the boards said."""
+        """Clear what the boards reported."""
         for board in self._all:
             board.meet_anew()
 
@@ -297,7 +297,7 @@ class RoboclawPort:
         return [_stop(board.address) for board in waiting], is_over
 
     def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
-        """Reset an e-stop that a board has latched, when asked; it ends its other errors by itself."""
+        """Reset an e-stop that a board has latched, when requested; it ends its other errors by itself."""
         latched = [board.address for board in self._all if board.is_pressed]
         if permit.wanted is not Request.RESET or not latched or now_ns - self._repeat_ns < _REPEAT_NS:
             return ()

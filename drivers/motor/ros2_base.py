@@ -88,7 +88,7 @@ class Ros2BasePort:
         return bool((is_latched and self._wheels_ns is not None and self._stands) or self._flags & wire.BUTTON)
 
     def begin_anew(self, now_ns: int) -> None:
-        """Forget what the bridge said."""
+        """Clear what the bridge reported."""
         self._state_ns: int | None = None
         self._wheels_ns: int | None = None
         self._newest: tuple[int, int] | None = None
@@ -165,7 +165,7 @@ class Ros2BasePort:
         return (wire.speeds(0.0, 0.0),), False
 
     def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
-        """Bring the bridge to standing by, or to a stop that it does not hold yet; reset it when asked."""
+        """Bring the bridge to standing by, or to a stop that it does not hold yet; reset it when requested."""
         is_latched, frames = self._flags & wire.LATCHED, self.stop_frames()
         if permit.wanted is Request.RESET and is_latched:
             frames = (Frame(wire.RESET, b""),)

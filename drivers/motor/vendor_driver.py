@@ -53,7 +53,7 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Source(msgspec.Struct, frozen=True):
-    """Something that must be heard again and again, by name: when it was heard last, and how long it may be silent.
+    """Something that must be heard again and again, by name: when it was received last, and how long it may be silent.
 
     After `silent_ns` a drive ends; after `gone_ns` at rest the controllers must be met anew (None: they need not).
     """
@@ -76,7 +76,7 @@ class Heard(msgspec.Struct, frozen=True, kw_only=True):
 
     `counts`: counters of `DriverStats` that it adds to. `is_status`: it says how the controllers are. `is_stop` and
     `commanded`: another host's e-stop, and whom another host commands. `lost`: what ends a drive, and nothing else.
-    `restarted`: why the controllers must be met anew. `said`: for a person.
+    `restarted`: why the controllers must be met anew. `said`: for the operator.
     """
 
     counts: tuple[str, ...] = ("frames_accepted",)
@@ -129,7 +129,7 @@ class Port(Protocol):
         """Whether the controllers have confirmed, since they were met, that an e-stop holds."""
 
     def begin_anew(self, now_ns: int) -> None:
-        """Forget what was heard: the link or the controllers have restarted. What the wheels have turned stays."""
+        """Forget what was received: the link or the controllers have restarted. What the wheels have turned stays."""
 
     def end_drive(self) -> None:
         """Prepare the end of the drive: what stops the controllers is due at once."""
@@ -141,7 +141,7 @@ class Port(Protocol):
         """Return the sources that must report again and again."""
 
     def objection(self, permit: MotionPermit) -> Objection | None:
-        """Why the controllers, as heard last, may not be driven on."""
+        """Why the controllers, as received last, may not be driven on."""
 
     def prepare(self, now_ns: int, permit: MotionPermit) -> Pending | None:
         """Return what lacks before zeros may be commanded; None when all proof is there.

@@ -132,7 +132,7 @@ class VescPort:
         return all(motor.erpm_ns is not None and motor.stands for motor in self._all)
 
     def begin_anew(self, now_ns: int) -> None:
-        """Forget what the controllers said."""
+        """Clear what the controllers reported."""
         self._pinged_ns = now_ns - _PING_PERIOD_NS
         for motor in self._all:
             motor.answered = motor.timed_out = motor.killed = False

@@ -39,7 +39,7 @@ class _Datagram(msgspec.Struct, frozen=True):
 
 
 class _Words(msgspec.Struct, frozen=True):
-    """A sentence for a person, from a process of ours that sends poses."""
+    """A sentence for the operator, from a process of ours that sends poses."""
 
     said: str
 
@@ -162,7 +162,7 @@ def pose_of(datagram: bytes, now_ns: int) -> PoseSample | None:
 
 
 def words_of(datagram: bytes) -> str | None:
-    """Return the sentence for a person in a datagram of a process of ours; None where there is none."""
+    """Return the sentence for the operator in a datagram of a process of ours; None where there is none."""
     try:
         return _WORDS.decode(datagram).said
     except (msgspec.MsgspecError, UnicodeDecodeError):

@@ -142,7 +142,7 @@ class TransmitBusyError(Exception):
 
 
 class LinkLostError(Exception):
-    """The medium said that it is gone; the message is for a person."""
+    """The medium said that it is gone; the message is for the operator."""
 
 
 class LinkMuteError(LinkLostError):
@@ -171,7 +171,7 @@ class Medium(Protocol):
 
     @property
     def name(self) -> str:
-        """Medium and address, for messages to a person."""
+        """Medium and address, for messages to the operator."""
 
     def connect(self, counters: TransportCounters) -> Connection:
         """Connect in bounded time, counting malformed input and bus errors in `counters`; raises if it cannot."""
@@ -229,7 +229,7 @@ class ReconnectingTransport:
 
     @property
     def name(self) -> str:
-        """Medium and address, for messages to a person."""
+        """Medium and address, for messages to the operator."""
         return self._medium.name
 
     @property

@@ -262,7 +262,7 @@ def _faster_than_read(span: float, unit: str) -> str:
 
 
 def set_anew(t_s: Array, angles_rad: Array) -> Mask:
-    """Return which samples (N,) begin anew because an encoder was set, from wheel angles (N, 2).
+    """Return which samples (N,) begin again because an encoder was set, from wheel angles (N, 2).
 
     That is a step of more than ten turns, or one of a radian that is several times as fast as the wheel turns else, or
     faster than it turns else and to zero.
