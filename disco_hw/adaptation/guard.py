@@ -86,7 +86,7 @@ LEAST_RATE_HZ, MOST_POSITION_STD_M, MOST_YAW_STD_RAD, MOST_LATENCY_S = 10.0, 0.0
 
 @dataclass(frozen=True, slots=True)
 class AdaptationChoice:
-    """Which adaptation runs, and why."""
+    """Choice of the adaptation that runs, with the reason."""
 
     kind: Literal["off", "fast"]
     why: str

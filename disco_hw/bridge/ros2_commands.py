@@ -172,7 +172,7 @@ class Errands:
 
 
 def refusal(words: str, may_move: bool) -> str | None:
-    """Why a request is not taken from ROS 2, where nobody knows who sends; stopping is always."""
+    """Return why a request is not accepted from ROS 2, where senders are unknown; None for stops, which always are."""
     if may_move or words.split(" ", 1)[0] in _ALWAYS:
         return None
     return (

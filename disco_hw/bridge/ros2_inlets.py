@@ -285,7 +285,7 @@ class WheelInlet:
         return self._before
 
     def why(self, now_ns: int) -> int:
-        """Why nothing usable was received, of REFUSALS."""
+        """Return why nothing usable was received, as one of REFUSALS."""
         return self._why if now_ns - self._why_ns < _SECOND_NS else _NOTHING
 
     def _refuse(self, why: int, mono_ns: int) -> None:

@@ -21,7 +21,7 @@ class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
 
 @dataclass
 class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
-    """When, and in which frame."""
+    """Header of a message: when, and in which frame."""
 
     stamp: Time = field(default_factory=Time)
     frame_id: str = ""

@@ -72,7 +72,7 @@ def plain_stop(words: Sequence[str]) -> tuple[Path, str | None, bool] | None:
 
 
 def app() -> typer.Typer:
-    """Every verb, with its options and its help."""
+    """Return the application with every verb, its options and its help."""
     import typer
 
     from disco_hw.cli import logs, options, robot, virtual

@@ -59,7 +59,7 @@ def load_daemon_address(path: Path) -> tuple[str, str | None]:
 
 
 def _without_task(path: Path, raw: dict[str, Any]) -> RobotConfig:
-    """All that robot.toml says but [task], validated; `task` is None."""
+    """Return all of robot.toml but [task], validated; `task` is None."""
     _check_names(path, raw)
     _check_pose_fields(path, raw.get("pose"))
     common, of_driver = _split_link(path, raw.get("link", {}))

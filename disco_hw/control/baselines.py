@@ -330,7 +330,7 @@ class Line(Protocol):
         """Speed along the line, m/s."""
 
     def line_m(self) -> Array:
-        """Its points (N, 2) in the order of the drive; the last is the first where it is closed."""
+        """Return the line's points (N, 2) in the order of the drive; the last is the first where it is closed."""
 
 
 class BelievedPlanner(Protocol):

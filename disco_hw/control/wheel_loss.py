@@ -54,7 +54,7 @@ class WheelLoss:
         return self._turn == 0.0 and not self._loss.any()
 
     def pause(self) -> None:
-        """Something else moves the robot for a while; what is known of its wheels stays."""
+        """Interrupt the observer while something else moves the robot; what is known of its wheels stays."""
         self._speeds = None
 
     def step(

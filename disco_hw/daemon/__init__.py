@@ -338,7 +338,7 @@ def _fence_in_words(area: Mapping[str, Any] | None) -> Iterator[str]:
 
 
 def controller_in_words(controller: Mapping[str, Any] | None) -> tuple[str, ...]:
-    """Which controller a status speaks of, and its limits by who says them; nothing before it is known."""
+    """Return which controller a status describes, and its limits by who states them; nothing before it is known."""
     if controller is None:
         return ()
     by_source: dict[SaidBy, list[str]] = {}

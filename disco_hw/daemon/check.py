@@ -230,7 +230,7 @@ def _ask_robot(transport: Transport, driver: Driver, pose_source: PoseSource) ->
 
 
 def pose_source_checks(source: PoseInput, poses: Sequence[PoseSample]) -> list[Check]:
-    """Each of several pose sources, heard for the time of listening on a robot that stands, and whether they agree."""
+    """Check each of several pose sources on a robot that stands, and whether they agree."""
     labels, every = source.labels(), source.every()
     if len(labels) == 1:
         return []

@@ -279,7 +279,7 @@ def loop_figures(loop: LoopStats) -> dict[str, Any]:
 
 
 def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> dict[str, Any]:
-    """Everything that a person or a page wants to know now; what does not exist is None.
+    """Return everything that an operator or a page needs to know now; what does not exist is None.
 
     `robot_state_ns`: when the newest frame with the robot's state arrived, on the monotonic clock of this host.
 
@@ -362,7 +362,7 @@ def _microseconds(summary: dict[str, float]) -> dict[str, float]:
 def counters(
     core: DaemonCore, loop: LoopStats, recorder: RecorderStats, now_ns: int, stolen_ms: int = 0
 ) -> records.Counters:
-    """Every counter of the stack as one record for the log; `stolen_ms`: of `processes.stolen_ms`, since the start."""
+    """Return every counter of the stack as one record; `stolen_ms`: of `processes.stolen_ms`, since the start."""
     return records.Counters(
         t_ns=now_ns,
         transport=asdict(core.transport.stats),

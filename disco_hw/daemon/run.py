@@ -325,7 +325,7 @@ def compile_progress(what: str, say: Callable[[str], None], every_s: float = _EV
 
 
 class _NothingKeptError(Exception):
-    """Something would have been compiled."""
+    """Error for a function that would have been compiled."""
 
 
 class _Refusal(event.Listener):

@@ -51,7 +51,7 @@ class ManualSource(Protocol):
 
     @property
     def ended(self) -> str | None:
-        """Why there will be no further input, in words; None while there may be."""
+        """Reason why there will be no further input, in words; None while there may be."""
 
     @property
     def completed(self) -> bool:
@@ -234,7 +234,7 @@ class PageSource:
         return ManualInput(now_ns, 0.0, 0.0, deadman=False)
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing, because the source holds no resources."""
 
     def _hear_open(self, now_ns: int, page: int) -> None:
         self._open_ns = {one: at for one, at in self._open_ns.items() if now_ns - at <= self._limit_ns}

@@ -109,7 +109,7 @@ class Coverage:
         self._crossing = [None, None]
 
     def items(self) -> tuple[Item, ...]:
-        """Everything that counts, covered or not."""
+        """Return everything that counts, covered or not."""
         seconds = (Item(name, purpose, "s", wanted, self._found[name]) for name, purpose, wanted in _SECONDS)
         times = (Item(name, purpose, "times", wanted, self._found[name]) for name, purpose, wanted in _TIMES)
         return (*seconds, *times)

@@ -278,7 +278,7 @@ class Unattended:
 
     @property
     def ended(self) -> str | None:
-        """Why it was released."""
+        """Reason why the deadman was released; None while it was not."""
         return self._ended
 
     @property
@@ -317,7 +317,7 @@ class Unattended:
         return ManualInput(now_ns, 0.0, 0.0, deadman=held)
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing, because the source holds no resources."""
 
 
 KEPT = 0.95

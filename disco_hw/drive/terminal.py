@@ -197,7 +197,7 @@ class Keyboard:
 
     @property
     def ended(self) -> str | None:
-        """Why there will be no further input; Ctrl-D, or the terminal has closed."""
+        """Reason why there will be no further input: Ctrl-D, or the terminal has closed."""
         return self._ended
 
     @property

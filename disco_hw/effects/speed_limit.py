@@ -11,7 +11,7 @@ from disco_hw.jit import scalar_function
 
 
 def plain(command: Value, values: Values) -> Value:
-    """Each wheel's command is cut at +- the limit."""
+    """Cut each wheel's command at +- the limit."""
     (limit,) = values
     return np.clip(command, -limit, limit)
 

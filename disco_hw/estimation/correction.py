@@ -61,7 +61,7 @@ class _DeferredModule(ModuleType):
 
 
 class _DeferredThing:
-    """Something of a module; using it imports the module."""
+    """Placeholder for something of a module, whose use imports the module."""
 
     def __init__(self, module: str, name: str) -> None:
         self._source = module, name

@@ -134,7 +134,7 @@ class Judgement(msgspec.Struct, frozen=True, gc=False):
 
 
 class FilterState(msgspec.Struct, frozen=True, gc=False):
-    """Everything that the future depends on, at one instant.
+    """State of the filter at one instant: everything that the future depends on.
 
     `belief` is None before there is any, and a search while the heading is not known. `candidate` is the pose that the
     last rejected measurements agree on, `candidate_count` how many in a row do, and `candidate_of` of which sources.

@@ -172,7 +172,7 @@ class WheelReading(msgspec.Struct, frozen=True, gc=False):
 
 
 class WheelReason(enum.Enum):
-    """Why a wheel sample was refused."""
+    """Reasons why a wheel sample was refused."""
 
     NOT_FINITE = "not_finite"
     OUT_OF_RANGE = "out_of_range"

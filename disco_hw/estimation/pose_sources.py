@@ -165,7 +165,7 @@ class PoseSources:
         }
 
     def status(self, now_ns: int) -> list[dict[str, Any]]:
-        """Each source for the operator or page; what is not known is None."""
+        """Return each source's status for the operator or page; what is not known is None."""
         return [
             {
                 "source": one.label,
@@ -204,7 +204,7 @@ class PoseSources:
             self._said.append(f"{source.label}: its poses are used")
 
     def _apart(self) -> str:
-        """Which sources do not agree, and nobody knows who is right."""
+        """Return which sources do not agree where it is unknown which one is right."""
         live = [one for one in self.all if one.standing in (Standing.GOOD, Standing.DEVIATES)]
         for one in live:
             others = [other for other in live if other is not one and other.standing is Standing.GOOD]
@@ -218,7 +218,7 @@ class PoseSources:
 
 
 def _difference(one: TrackedSource, other: TrackedSource) -> str:
-    """By how much two sources differ, where that is more than their noise; else empty."""
+    """Return by how much two sources differ, where that is more than their noise; else empty."""
     (x, y, yaw), (xx, yy, tt) = _minus(one.innovation, other.innovation), _plus(one.variance, other.variance)
     if x * x / xx + y * y / yy > APART_STDS**2:
         return f"{math.hypot(x, y):.2f} m apart,"

@@ -49,7 +49,7 @@ class Child:
     output: Path
 
     def said(self) -> str:
-        """All that it wrote so far."""
+        """Return all that the process wrote so far."""
         return self.output.read_text(encoding="utf-8", errors="replace")
 
     def last_words(self) -> str:

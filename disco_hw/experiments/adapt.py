@@ -375,14 +375,14 @@ def drive_through_change(directory: Path, changes: str, *, adapt: bool) -> LiveD
 
 
 def first_truth_s(path: Path) -> float:
-    """When the truth begins, s of the monotonic clock."""
+    """Return when the truth begins, s of the monotonic clock."""
     with path.open(encoding="utf-8") as file:
         file.readline()
         return int(file.readline().partition(",")[0]) * 1e-9
 
 
 def newest_truth_s(path: Path) -> float:
-    """When the newest row on disk was true."""
+    """Return when the newest row on disk was true."""
     with path.open("rb") as file:
         file.seek(0, 2)
         file.seek(max(0, file.tell() - 1000))

@@ -155,7 +155,7 @@ class Campaign:
 
     @property
     def result(self) -> FenceResult:
-        """All that was driven with these options."""
+        """Result of all drives with these options."""
         return FenceResult(self._options, {kind: list(lines.values()) for kind, lines in self._done.items() if lines})
 
 

@@ -66,7 +66,7 @@ class _Hand:
 
     @property
     def needs_pose(self) -> bool:
-        """By hand no pose is needed; the fence asks for one."""
+        """Whether a pose is needed: not by hand; the fence asks for one."""
         return False
 
     @property

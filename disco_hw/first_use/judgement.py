@@ -63,7 +63,7 @@ class Findings:
 
 
 def judge_sides(seen: Sequence[SideSeen], wiring: Wiring, robot: Robot) -> Findings:
-    """Which motor and encoder is on which side, and which way round; `wiring`: what robot.toml says of that."""
+    """Find which motor and encoder is on which side, and which way round; `wiring`: that of robot.toml."""
     faults: list[Fault] = []
     figures = [_dead_band(side, one.track) for side, one in enumerate(seen)]
     for side, one in enumerate(seen):
@@ -162,7 +162,7 @@ def _wiring_faults(seen: Sequence[SideSeen], old: Wiring) -> list[Fault]:
 
 
 def _side_of(seen: Sequence[SideSeen], side: int) -> str:
-    """Which asked side turned this one, as a letter."""
+    """Return which commanded side turned this one, as a letter."""
     return "lr"[next(asked for asked, one in enumerate(seen) if "lr".index(one.seen[0]) == side)]
 
 
@@ -239,7 +239,7 @@ def _simple(ratio: float) -> float:
 
 
 def _stop_after_silence(track: Track) -> tuple[float, float | None] | None:
-    """When the wheels began to slow down and when they stood, since the last command (s); None if they went on."""
+    """Return when the wheels began to slow down and when they stood, since the last command (s), or None."""
     silent_ns = track.silent_ns or 0
     # What the robot said to be its own stop may show late; what began after the person had let go was not its own.
     let_go_s = (track.ended_ns - silent_ns) * 1e-9 if track.let_go and track.ended_ns is not None else math.inf
@@ -376,7 +376,7 @@ def _travel(track: Track, robot: Robot) -> float:
 
 
 def _displacement(poses: Sequence[PoseSample], choice: PoseConvention) -> tuple[float, float, float]:
-    """From the mean of the first poses, at rest, to that of the last; with the mean heading (m, m, rad)."""
+    """Return the way from the first poses' mean, at rest, to the last ones', with the mean heading (m, m, rad)."""
     rest = max(1, min(10, len(poses) // 4))
     found = [choice.converted(pose) for pose in poses]
     first, last = found[:rest], found[-rest:]
@@ -391,7 +391,7 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _turn(poses: Sequence[PoseSample], choice: PoseConvention) -> float:
-    """By how much the yaw has changed (rad), over the steps from pose to pose."""
+    """Return by how much the yaw has changed (rad), over the steps from pose to pose."""
     factor = (-1.0 if choice.clockwise else 1.0) * (math.pi / 180.0 if choice.yaw_unit == "deg" else 1.0)
     yaws = [factor * pose.yaw_rad for pose in poses]
     return math.fsum(math.remainder(b - a, 2.0 * math.pi) for a, b in pairwise(yaws))
@@ -457,7 +457,7 @@ def _arm(poses: Sequence[PoseSample]) -> tuple[float, float]:
 
 
 def _delay_s(track: Track, convention: PoseConvention) -> float:
-    """By how much the yaw of the poses lags behind the wheels' (s): the shift that fits best, to 5 ms."""
+    """Return by how much the poses' yaw lags behind the wheels' (s): the shift that fits best, to 5 ms."""
     wheel_t = np.array([s.t_ns for s in track.wheels]) * 1e-9
     turn = np.array([s.right_angle_rad - s.left_angle_rad for s in track.wheels])
     poses = [convention.converted(pose) for pose in track.poses]

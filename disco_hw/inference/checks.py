@@ -236,7 +236,7 @@ _DRAWS = 200
 
 @dataclass(frozen=True)
 class Calibration:
-    """From fresh simulations at parameters drawn from the last region.
+    """Calibration from fresh simulations at parameters drawn from the last region.
 
     `ranks` (n, 3) in [0, 1] of the true parameters among posterior draws, uniform if calibrated, and `p_values` (3,) of
     the Kolmogorov-Smirnov test for that; `coverage` (levels,) of the joint highest-density regions of `LEVELS`.

@@ -425,7 +425,7 @@ class Region:
         return np.asarray(self.centre + unit @ self.factor.T)
 
     def contains(self, theta: Array) -> Mask:
-        """Which points (n, P) are in it."""
+        """Return which points (n, P) are in the region."""
         inside = ((theta >= self.low) & (theta <= self.high) & (np.abs(self.unit(theta)) <= 1.0)).all(axis=1)
         return np.asarray(inside if self.within is None else inside & self.within.contains(theta))
 

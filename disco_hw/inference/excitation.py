@@ -68,7 +68,7 @@ class Excitation:
 
     @property
     def starts(self) -> NDArray[np.bool_]:
-        """Which poses begin a run, (P,)."""
+        """Mask (P,) of the poses that begin a run."""
         first = np.zeros(self.t_s.size, dtype=bool)
         first[self.run_pose[:-1]] = True
         return first

@@ -210,7 +210,7 @@ class LocalWorkers:
             yield from pool.map(lambda item: work(shared, item), items)
 
     def call(self, work: Callable[..., R], *arguments: Any) -> R:
-        """As `Workers.call`, in the caller's thread."""
+        """Return the result of one piece of work, computed in the caller's thread."""
         return work(*arguments)
 
 

@@ -36,7 +36,7 @@ def plugin_modules() -> tuple[str, ...]:
 
 
 def plugin_sources() -> tuple[Path, ...]:
-    """Their files, for whoever keeps compiled code; raises ModuleNotFoundError for a module that is not there."""
+    """Return the plug-in modules' files; raises ModuleNotFoundError for a module that is not there."""
     found = []
     for module in plugin_modules():
         spec = find_spec(module)

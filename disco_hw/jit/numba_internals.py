@@ -34,7 +34,7 @@ class _CalleeLibrary(JITCodeLibrary):
 
     @cached_property
     def own_module(self) -> Any:
-        """Its module without what it calls, to be linked any number of times."""
+        """Module of the function without what it calls, to be linked any number of times."""
         self._ensure_finalized()  # type: ignore[no-untyped-call]
         for function in self._final_module.functions:
             if not function.is_declaration and function.linkage.name == "external":

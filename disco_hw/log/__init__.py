@@ -47,7 +47,7 @@ class TaskScene(msgspec.Struct, frozen=True):
 
 
 class Start(msgspec.Struct, frozen=True):
-    """Everything a writer must know; wall-clock time is monotonic time plus `wall_offset_ns` throughout the log.
+    """Start of a log, all that a writer must know; wall-clock time is monotonic time plus `wall_offset_ns`.
 
     `path` is the first part's. A later part names the file that it continues, of which it is known that ticks up to
     `continues_sequence` are in it.

@@ -102,7 +102,7 @@ class DriveLog:
         return 1 + max((int(segment.max()) for segment in arrays if segment.size), default=-1)
 
     def to_pandas(self) -> Any:
-        """All of it as one `pandas.DataFrame`, a row a sample in order of time, with the columns of our CSV.
+        """Return the drive as one `pandas.DataFrame`, a row a sample in order of time, with our CSV's columns.
 
         `t_s`, `segment`, `cmd_left_rad_s`, ..., `imu_wz_rad_s`; what a row does not hold is NaN. Raises ImportError
         without pandas, which nothing else needs.

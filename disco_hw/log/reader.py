@@ -249,7 +249,7 @@ class Log:
     def columns(
         self, topic: str, start_ns: int | None = None, end_ns: int | None = None
     ) -> dict[str, NDArray[np.generic]]:
-        """All records of a topic as one array a field, shape (N, ...), and the tick's time as `now_ns`.
+        """Return all records of a topic as one array a field, shape (N, ...), and the tick's time as `now_ns`.
 
         Tuples of one length become (N, k) arrays, of different lengths arrays of objects; a mapping gives one array
         `field.key` for each key.

@@ -142,7 +142,7 @@ class DaemonState(msgspec.Struct, frozen=True, gc=False):
 
 
 class Event(msgspec.Struct, frozen=True, gc=False):
-    """Something a person should know; `code` is stable for machines, `text` is one sentence."""
+    """Event that the operator should know; `code` is stable for machines, `text` is one sentence."""
 
     t_ns: int
     level: Level
@@ -151,7 +151,7 @@ class Event(msgspec.Struct, frozen=True, gc=False):
 
 
 class Counters(msgspec.Struct, frozen=True, gc=False):
-    """Every counter of the stack, about once a second: totals since the start by name, grouped by who counts.
+    """Counters of the whole stack, about once a second: totals since the start by name, grouped by who counts.
 
     `entered`: how often the daemon has come into each of its states. `plausibility`: what the robot did against its
     commands, and the rest of the stack tolerated. `poses`: of each source, where there are several.
@@ -238,7 +238,7 @@ class Task(msgspec.Struct, frozen=True, gc=False):
 
 
 class Controller(msgspec.Struct, frozen=True, gc=False):
-    """Which motor controller answers from `t_ns` on, and what it keeps to.
+    """Motor controller that answers from `t_ns` on, and its limits.
 
     `said_by`: who says kind and firmware, "device" or "robot.toml". Limits by name, with their units: what the
     controller reports of itself, what cannot be set otherwise, and what robot.toml declares.

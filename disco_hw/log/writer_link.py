@@ -184,7 +184,7 @@ class KeeperLink:
                 self.code = word.code
 
     def renew(self) -> None:
-        """Another keeper in place of this one; takes milliseconds. The writer lives on."""
+        """Start another keeper in place of this one; takes milliseconds. The writer lives on."""
         self._end_process()
         self._make()
 
@@ -291,7 +291,7 @@ class Delivery:
         self._sent += 1
 
     def acknowledge(self, sequence: int) -> None:
-        """All ticks up to this number that were sent are in the present file."""
+        """Note that all ticks up to this number that were sent are in the present file."""
         while self._sent and self._waiting[0].sequence <= sequence:
             self._waiting.popleft()
             self._sent -= 1
@@ -300,7 +300,7 @@ class Delivery:
         self.last_delivered = max(self.last_delivered, sequence)
 
     def new_file(self) -> None:
-        """Another writer begins another file: it gets what is in none."""
+        """Note that another writer begins another file: it gets what is in none."""
         self._sent = 0
         self._in_file = 0
 

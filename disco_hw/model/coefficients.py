@@ -55,7 +55,7 @@ class TermCoefficients(Protocol):
 
     @property
     def most(self) -> Any:
-        """By how much what follows at a limited rate goes on in a step (m/s)."""
+        """Largest step (m/s) of what follows at a limited rate."""
 
     def __iter__(self) -> Iterator[Any]:
         """Iterate over the coefficients that the term has, in the order of its type."""

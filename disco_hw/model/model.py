@@ -306,7 +306,7 @@ class Model:
 
     @property
     def parameters(self) -> dict[str, Parameter]:
-        """Every parameter by its full name: the base ones, then `effect.parameter`."""
+        """Parameters by their full names: the base ones, then `effect.parameter`."""
         found = {parameter.name: parameter for parameter in BASE_PARAMETERS}
         for setting in self.effects:
             found |= {f"{setting.name}.{parameter.name}": parameter for parameter in setting.effect.parameters}

@@ -178,7 +178,7 @@ def _terms(theta: Theta, target: str) -> list[tuple[str, Value, Value]]:
 
 
 def _commands_remembered(theta: Theta, left: Value, right: Value) -> dict[str, tuple[_Remembering, tuple[Value, ...]]]:
-    """By feature the memories of commands that act, and what goes into each of their means."""
+    """Return, by feature, the memories of commands that act, and what goes into each of their means."""
     acting = [(name, COMMAND_MEMORIES[name]) for name, *_ in _terms(theta, "command") if name in COMMAND_MEMORIES]
     return {name: (memory, (memory.goes_in(left, right), memory.goes_in(right, left))) for name, memory in acting}
 

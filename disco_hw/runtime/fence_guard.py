@@ -283,7 +283,7 @@ class FenceGuard:
 
 
 def _braking_parts(steps: int) -> Array:
-    """Which part of its braking time a body that brakes evenly takes for each of so many equal parts of its way."""
+    """Return which part of its braking time an evenly braked body takes for each of so many equal parts of its way."""
     return np.asarray(-np.diff(np.sqrt(np.linspace(1.0, 0.0, steps + 1))))
 
 

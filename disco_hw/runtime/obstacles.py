@@ -116,7 +116,7 @@ class Obstacles:
         return tuple(one.now(now_ns) for one in self._kept.values())
 
     def status(self, now_ns: int) -> list[dict[str, Any]]:
-        """Each obstacle for the operator or a machine: where it is now, and the age of its report."""
+        """Return each obstacle's status: where it is now, and the age of its report."""
         found = []
         for name, one in sorted(self._kept.items()):
             now = one.now(now_ns)

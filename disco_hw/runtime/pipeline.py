@@ -38,7 +38,7 @@ _LARGEST_STEP_PERIODS = 1.5
 
 
 class Limited(enum.Flag):
-    """Why a command differs from what was desired; empty if it does not."""
+    """Reasons why a command differs from what was desired; empty if it does not."""
 
     NONE = 0
     SPEED = enum.auto()
@@ -204,7 +204,7 @@ class NoPlanner:
 
 @dataclass(frozen=True, slots=True)
 class Off:
-    """Nothing is sent to the wheels."""
+    """Motion request under which nothing is sent to the wheels."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,7 +32,7 @@ def frame_out(now_ns: int, outgoing: OutgoingFrame, sent: bool) -> records.Recor
 
 
 def controller(now_ns: int, identity: Identity, limits: Limits) -> records.Record:
-    """Which controller answers, and what it keeps to."""
+    """Return the record of the controller that answers, and of its limits."""
     by_origin: dict[SaidBy, dict[str, float]] = {"device": {}, "fixed": {}, "robot.toml": {}}
     for name, limit in limits.known().items():
         by_origin[limit.said_by][name] = limit.value

@@ -244,7 +244,7 @@ def _near(old: Any, new: Any, tolerance: float) -> bool:
 
 
 def _bits(value: Any) -> Any:
-    """Something that is equal exactly if the values are: -0.0 differs from 0.0, NaN equals NaN."""
+    """Return a key that is equal exactly if the values are: -0.0 differs from 0.0, NaN equals NaN."""
     if isinstance(value, float):
         return "nan" if math.isnan(value) else _FLOAT.pack(value)
     if isinstance(value, tuple):

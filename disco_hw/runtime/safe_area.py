@@ -84,7 +84,7 @@ class SafeArea:
 
     @property
     def task_fault(self) -> str:
-        """Why no task may go on, in words; empty if nothing of the fence speaks against it."""
+        """Reason why no task may go on, in words; empty if nothing of the fence speaks against it."""
         return f"fence: {self.last.reason}" if self.last.verdict in HOLDS_STILL else ""
 
     def override(self, now_ns: int, on: bool) -> str:

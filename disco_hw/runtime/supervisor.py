@@ -66,7 +66,7 @@ class SupervisorSettings:
 
 
 class Inputs(msgspec.Struct, frozen=True, gc=False):
-    """Everything the supervisor looks at in one tick.
+    """Inputs of the supervisor in one tick.
 
     `telemetry_age_s` is the age of the newest wheel sample, None before the first; `wheel_speed_rad_s` the larger
     magnitude of its two speeds. `link_error` is the link's newest error, with its remedy. `preflight_errors` and

@@ -205,7 +205,7 @@ class RobotTask(Protocol):
         """Speed at which a wheel of the nominal robot is at its limit on this task."""
 
     def too_fast(self, robot: Chassis) -> str | None:
-        """Why the wheels of the nominal robot cannot do the task, and the remedy; None if they can."""
+        """Return why the wheels of the nominal robot cannot do the task, and the remedy; None if they can."""
 
     def editable(self, robot: Chassis) -> Mapping[str, Editable]:
         """Return the fields that a person may change; the largest speed is that on the present line."""
@@ -217,7 +217,7 @@ class RobotTask(Protocol):
         """Return the task as text."""
 
     def course(self) -> Course:
-        """Its line on the ground, the same one for every speed."""
+        """Return the task's line on the ground, the same one for every speed."""
 
     def progress(self) -> Progress:
         """Return the progress of the task as it begins."""
@@ -284,7 +284,7 @@ def _task_in(module: str) -> type[RobotTask] | None:
 
 
 def kinds() -> tuple[str, ...]:
-    """All kinds of tasks, in alphabetical order."""
+    """Return all kinds of tasks, in alphabetical order."""
     return tuple(sorted(name for name in _modules() if _task_in(name) is not None))
 
 

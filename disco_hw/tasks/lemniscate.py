@@ -69,7 +69,7 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         return robot.max_wheel_speed_rad_s * robot.wheel_radius_m / outer
 
     def too_fast(self, robot: Chassis) -> str | None:
-        """Why the outer wheel cannot do it, and the remedy; None if it can."""
+        """Return why the outer wheel cannot do the task, and the remedy; None if it can."""
         fastest = self.fastest_m_s(robot)
         if self.speed_m_s <= fastest:
             return None

@@ -77,7 +77,7 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return straight_fastest_m_s(robot)
 
     def too_fast(self, robot: Chassis) -> str | None:
-        """Why the wheels cannot do it, and the remedy; None if they can."""
+        """Return why the wheels cannot do the task, and the remedy; None if they can."""
         return straight_too_fast(self.speed_m_s, robot)
 
     def editable(self, robot: Chassis) -> Mapping[str, Editable]:

@@ -101,7 +101,7 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         return straight_fastest_m_s(robot)
 
     def too_fast(self, robot: Chassis) -> str | None:
-        """Why the wheels cannot do it, and the remedy; None if they can."""
+        """Return why the wheels cannot do the task, and the remedy; None if they can."""
         return straight_too_fast(self.speed_m_s, robot)
 
     def editable(self, _robot: Chassis) -> Mapping[str, Editable]:
@@ -109,7 +109,7 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         return {}
 
     def editing_note(self, _robot: Chassis) -> str:
-        """Why nothing can be changed."""
+        """Return a sentence on why nothing can be changed."""
         return "Its way-points have times, which say all; change t_s in their CSV and start anew."
 
     def in_words(self) -> str:

@@ -38,7 +38,7 @@ _STATUS_OLDER_NS = 2_000_000_000
 
 @dataclass(slots=True)
 class _Due:
-    """Something to do every `period_s`."""
+    """Timer of something to do every `period_s`."""
 
     period_s: float
     next_s: float = 0.0

@@ -230,12 +230,12 @@ def model_in_force(model: Model, change: BeliefChange | None) -> Model:
 
 
 def stage_of_robot(robot_file: Path, model_file: Path | None = None) -> ShownRobot:
-    """From robot.toml and the model it names; raises InputError."""
+    """Create the stage from robot.toml and the model it names; raises InputError."""
     return _stage(load_setup(robot_file, model_file))
 
 
 def stage_of_log(log: Log, robot_file: Path | None = None) -> ShownRobot:
-    """From the files kept in the log, or from `robot_file` instead; raises InputError if there is neither."""
+    """Create the stage from the files kept in the log, or from `robot_file`; raises InputError without either."""
     if robot_file is not None:
         return stage_of_robot(robot_file)
     return _stage(setup_of_log(log, "name the robot with --robot"))
@@ -295,7 +295,7 @@ class Recording:
 
     @property
     def duration_s(self) -> float:
-        """From the first tick to the last."""
+        """Duration from the first tick to the last, s."""
         return float(self.ticks[-1] - self.ticks[0]) * 1e-9
 
     @property

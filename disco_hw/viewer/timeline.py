@@ -123,7 +123,7 @@ POWER = ("voltage_v", "current_a", "temperature_c")
 
 
 class Timeline:
-    """Every series of a run, and whole plans where it is given them; a replay reads these from its log when needed."""
+    """Timeline with every series of a run, and whole plans where it is given them; a replay reads these itself."""
 
     def __init__(self) -> None:
         self.first_ns: int | None = None
@@ -229,7 +229,7 @@ _APART_NS = 500_000_000
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """Something that happened at `t_ns`: its kind, and what it was in words."""
+    """Mark of something that happened at `t_ns`: its kind, and what it was in words."""
 
     t_ns: int
     kind: str
@@ -237,7 +237,7 @@ class Mark:
 
 
 def marks_of(timeline: Timeline) -> tuple[Mark, ...]:
-    """All marks in order of time; of one kind that comes again within half a second only the first."""
+    """Return all marks in order of time; of one kind that comes again within half a second only the first."""
     marks = [
         *_faults(timeline),
         *(Mark(t_ns, EVENT, event.text) for t_ns, event in timeline.events),

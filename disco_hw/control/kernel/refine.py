@@ -281,7 +281,7 @@ def _solve(factor: Array, vector: Array) -> None:
 
 @block_function
 def _violation(problem: Problem, buffers: Buffers) -> float:
-    """By how much the commands with the step exceed a limit at most (rad/s)."""
+    """Return by how much the commands with the step exceed a limit at most (rad/s)."""
     commands, history, worst = buffers.commands, problem.history, 0.0
     for t in range(problem.reference.shape[0]):
         for c in range(CHANNELS):

@@ -295,7 +295,7 @@ def pull_on_knots(pull: Floats, nominal: Floats, basis: Basis) -> None:
 
 @block_function
 def add_drawn_control_cost(costs: Floats, first: int, noise: Floats, at: int, pull: Floats, scale: float) -> None:
-    """As `add_control_cost`, but of the noise as drawn, which begins at index `at` of `noise`, by `pull_on_knots`."""
+    """Add the control cost as `add_control_cost` does, but of the noise as drawn, by `pull_on_knots`."""
     tune_loops()
     for r in range(U(pull.size)):
         slope = scale * pull[r]

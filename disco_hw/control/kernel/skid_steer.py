@@ -321,7 +321,7 @@ def _place(state: Floats, b: int, base: Base) -> Place:
 
 @scalar_function
 def _ahead_place(state: Floats, b: int, base: Base, other: Base, start: Floats) -> Place:
-    """As `_place`, for a point equivalent to `base` that differs in x_icr: it turns about the same axle."""
+    """Return the place for a point equivalent to `base` that differs in x_icr: it turns about the same axle."""
     x, y, forward = _place(state, b, base)
     farther = other.x_icr_m - base.x_icr_m
     return x - farther * (state[COS + b] - start[2]), y - farther * (state[SIN + b] - start[3]), forward
@@ -329,7 +329,7 @@ def _ahead_place(state: Floats, b: int, base: Base, other: Base, start: Floats) 
 
 @scalar_function
 def _scaled_place(state: Floats, b: int, base: Base, other: Base, start: Floats) -> Place:
-    """As `_place`, for a point equivalent to `base` whose path is the same at another scale."""
+    """Return the place for a point equivalent to `base` whose path is the same at another scale."""
     scale = other.half_radius_m / base.half_radius_m
     ahead, stays = other.x_icr_m - scale * base.x_icr_m, cast_like(1.0, scale) - scale
     axle_x = scale * state[AXLE_X + b] + (stays * start[0] + ahead * start[2])

@@ -56,7 +56,7 @@ class LogFormat:
 
 @cache
 def log_formats() -> tuple[LogFormat, ...]:
-    """All formats, in the order in which they are asked."""
+    """Return all formats, in the order in which they are tried."""
     names = [module.name for module in pkgutil.iter_modules(__path__)]
     modules = [importlib.import_module(f"{__name__}.{name}") for name in names]
     found = [module.FORMAT for module in modules if hasattr(module, "FORMAT")]

@@ -62,7 +62,7 @@ class Unwrapped:
 
 @dataclass(frozen=True, slots=True)
 class _Steps:
-    """From value to value (N - 1,): duration, step, and the motion expected by the neighbours.
+    """Steps from value to value (N - 1,): duration, step, and the motion expected by the neighbours.
 
     A step within `tolerance` of what is expected is motion, and so is one within `longest`, which the fastest of all
     samples would make. `is_inside` is False across a change of segment; `is_jump` marks what is no motion.

@@ -305,7 +305,7 @@ def write_csv(drive: DriveLog, path: Path, ticks_per_rev: int | None) -> int:
 
 
 def _rows(drive: DriveLog) -> tuple[Array, Index]:
-    """All times in order, and their segments."""
+    """Return all times in order, and their segments."""
     parts = (drive.commands, drive.wheels, drive.poses)
     times, first = np.unique(np.concatenate([part.t_s for part in parts]), return_index=True)
     return times, np.concatenate([part.segment for part in parts])[first]

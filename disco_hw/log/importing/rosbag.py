@@ -83,7 +83,7 @@ class _Column:
         return Stamps(np.array(self.log_ns, dtype=np.int64), np.array(self.stamp_ns, dtype=np.int64), is_repeat)
 
     def table(self) -> Array:
-        """Its rows, (N, width)."""
+        """Return the column's rows, (N, width)."""
         return np.array(self.values, dtype=np.float64).reshape(-1, self.width)
 
 

@@ -87,7 +87,7 @@ class Bag:
     _definitions: Definitions
 
     def why_unreadable(self, topic: str) -> str:
-        """Why no message of a topic can be read; empty if one can. Parses the bag's definition of its type."""
+        """Return why no message of a topic can be read; empty if one can. Parses the bag's definition of its type."""
         kind = self.topics[topic].type
         connections = (one for reader in self._readers for one in reader.connections)
         one = next(one for one in connections if (one.topic, one.msgtype) == (topic, kind))

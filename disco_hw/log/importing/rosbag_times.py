@@ -45,7 +45,7 @@ class Stamps:
 
 @dataclass(frozen=True, slots=True)
 class BagTimes:
-    """Each topic's times (N,), ns, the times at which something broke off, and what a person should know."""
+    """Times of each topic (N,), ns, the times at which something broke off, and messages for the operator."""
 
     t_ns: dict[str, Index]
     breaks_ns: Index
@@ -111,7 +111,7 @@ _Jump = tuple[int, int, str]
 
 
 def _jumps(stamps: Mapping[str, Stamps]) -> tuple[list[tuple[int, int]], set[str]]:
-    """When (ns of the recording) the clock was set, and by how much (ns); and topics that jump by themselves.
+    """Return when (ns of the recording) the clock was set, and by how much (ns); and topics that jump by themselves.
 
     A clock that is set shows in most of the topics that have stamps before and after.
     """

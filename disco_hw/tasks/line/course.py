@@ -161,7 +161,7 @@ def straight_fastest_m_s(robot: Chassis) -> float:
 
 
 def straight_too_fast(speed_m_s: float, robot: Chassis) -> str | None:
-    """Why the wheels cannot do a speed straight ahead, and the remedy; None if they can."""
+    """Return why the wheels cannot do a speed straight ahead, and the remedy; None if they can."""
     fastest = straight_fastest_m_s(robot)
     if speed_m_s <= fastest:
         return None
