@@ -54,7 +54,7 @@ class EventDevice(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class GamepadMapping:
-    """Which axes and button are used, by evdev's names; an axis with a minus before it is reversed.
+    """Mapping of the axes and button used, by evdev's names; an axis with a minus before it is reversed.
 
     Within `dead_zone` of its middle, as a share of half its range, an axis counts as 0.
     """

@@ -109,7 +109,7 @@ class Transport(Protocol):
         """Send a frame without blocking; False (and a counter) if it expired, did not fit or the link is down."""
 
     def receive(self) -> Sequence[ReceivedFrame]:
-        """All frames received since the last call, oldest first, without blocking."""
+        """Return all frames received since the last call, oldest first, without blocking."""
 
     def close(self) -> None:
         """Stop the thread and release the medium; safe to call twice."""
@@ -264,7 +264,7 @@ class Limits:
 
 
 class Readings(msgspec.Struct, frozen=True, gc=False):
-    """Everything that one batch of received frames meant, oldest first."""
+    """Readings from one batch of received frames, oldest first."""
 
     wheels: tuple[WheelSample, ...] = ()
     poses: tuple[PoseSample, ...] = ()
@@ -471,7 +471,7 @@ class NoSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Settings of a driver that has no fields of its own in [link]."""
 
     def fault(self) -> SettingsFault | None:
-        """Nothing can be wrong."""
+        """Return None, because nothing can be wrong."""
         return None
 
 

@@ -64,7 +64,7 @@ class MessageLayout:
 
 @dataclass(frozen=True, slots=True)
 class Protocol:
-    """Everything that the DBC says; `dbc_hash` is equal for two files that mean the same on the wire."""
+    """Protocol as the DBC defines it; `dbc_hash` is equal for two files that mean the same on the wire."""
 
     major: int
     minor: int
@@ -190,7 +190,7 @@ class Decoded(msgspec.Struct, frozen=True, gc=False):
 
 
 class FaultReason(enum.Enum):
-    """Why a frame could not be decoded."""
+    """Reasons why a frame could not be decoded."""
 
     UNKNOWN_ID = "unknown_id"
     LENGTH = "length"

@@ -35,7 +35,7 @@ def _default_s(name: str) -> float:
 
 
 class ResetCause(enum.IntEnum):
-    """Why the controller started."""
+    """Causes of the controller's start."""
 
     POWER_ON = 0
     WATCHDOG = 1

@@ -142,12 +142,12 @@ def fault(name: str) -> str:
 
 
 def stop_cause(name: str) -> str:
-    """Why the robot stopped by itself, by the name in SYSTEM_STATE.stop_cause."""
+    """Return why the robot stopped by itself, by the name in SYSTEM_STATE.stop_cause."""
     return _STOP_CAUSES.get(name, name)
 
 
 def reject_reason(name: str) -> str | None:
-    """Why the robot last rejected a frame, by the name in SYSTEM_STATE.reject_reason; None if it never did."""
+    """Return why the robot last rejected a frame, by the name in SYSTEM_STATE.reject_reason; None if it never did."""
     return None if name == "NONE" else _REJECT_REASONS.get(name, name)
 
 

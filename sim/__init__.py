@@ -40,7 +40,7 @@ class RobotLink(Protocol):
         """Descriptors that become readable when a host has done something."""
 
     def next_event_ns(self) -> int | None:
-        """When `collect` and `advance` are due even if no host does anything; None if never."""
+        """Return when `collect` and `advance` are due even if no host does anything; None if never."""
 
     def collect(self, now_ns: int) -> int:
         """Take in what hosts wrote; return how many of their frames now wait to be let onto the line."""

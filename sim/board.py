@@ -205,7 +205,7 @@ class PlantLine:
         return [] if self._port is None else [self._port.fileno()]
 
     def next_event_ns(self) -> int | None:
-        """When the port is opened again."""
+        """Return when the port is opened again."""
         return self._retry_ns
 
     def collect(self, now_ns: int) -> int:

@@ -1,4 +1,4 @@
-"""From wheel angles to the pose of the body: rolling, skid-steer turning, slip and the floor.
+"""Dynamics of the body, from wheel angles to its pose: rolling, skid-steer turning, slip and the floor.
 
 Over one integration piece the body moves along the screw of its mean velocity, which is integrated exactly. With
 wheels rolling at rim speeds u_L, u_R: v = (u_L + u_R) / 2, omega = (u_R - u_L) / a, and the body's own velocity is

@@ -178,7 +178,7 @@ class CanBus:
             self._recovering.append(node)
 
     def next_event_ns(self) -> int | None:
-        """When the bus next has something to do if nobody sends anything more; None if never."""
+        """Return when the bus next has something to do if no node sends anything more; None if never."""
         times = [self._delayed[0][0]] if self._delayed else []
         if self._out:
             times.append(self._now_ns)
@@ -334,7 +334,7 @@ class CanBus:
         self._out.append(DeliveredFrame(self._now_ns, node, error_frame, (node,)))
 
     def _next_recovery_ns(self) -> int:
-        """When on an idle bus the first recovering node will have seen enough recessive bits."""
+        """Return when the first recovering node on an idle bus will have seen enough recessive bits."""
         seen = max(node.recessive_sequences or 0 for node in self._recovering)
         left_ns = self._bits_ns(RECESSIVE_SEQUENCE_BITS * (RECOVERY_SEQUENCES - seen))
         return max(self._idle_counted_ns + left_ns, self._now_ns)

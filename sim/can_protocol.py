@@ -237,7 +237,7 @@ QueuedFrame = tuple[int, int, int, CanFrame]
 
 
 class TransmitOrder(enum.Enum):
-    """Which of its waiting frames a node sends first: the lowest identifier (mailboxes) or the oldest (a queue)."""
+    """Order in which a node sends its waiting frames: the lowest identifier (mailboxes) or the oldest (a queue)."""
 
     PRIORITY = "priority"
     FIFO = "fifo"

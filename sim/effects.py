@@ -283,7 +283,7 @@ class HiddenEffects:
     items: tuple[tuple[str, tuple[float, ...]], ...] = ()
 
     def values(self, name: str) -> tuple[float, ...]:
-        """All numbers of an effect in the order of its spec; the neutral ones if it is not hidden."""
+        """Return all numbers of an effect in the order of its spec; the neutral ones if it is not hidden."""
         for item_name, values in self.items:
             if item_name == name:
                 return values
@@ -328,7 +328,7 @@ def parse_hidden_effects(texts: Iterable[str]) -> HiddenEffects:
 
 
 def effects_table() -> str:
-    """Every effect with meaning, units and realistic sizes, as text for `--help`."""
+    """Return every effect with meaning, units and realistic sizes, as text for `--help`."""
     lines = []
     for channel in (_WHEEL, _BODY, _POSE):
         lines.append(f"{channel}:")

@@ -101,7 +101,7 @@ class Hub:
         return self._epoll.fileno()
 
     def next_event_ns(self) -> int | None:
-        """When `pump` is due even if no client does anything; None if never."""
+        """Return when `pump` is due even if no client does anything; None if never."""
         times = [t for t in (self.bus.next_event_ns(), self._plug_in_ns) if t is not None]
         times.extend(client.last_read_ns + READER_STALL_NS for client in self._held_up_by())
         return min(times) if times else None
@@ -319,7 +319,7 @@ class HubLink:
         return [self.hub.fileno()]
 
     def next_event_ns(self) -> int | None:
-        """When a frame ends, a restart is due, or clients may come back."""
+        """Return when a frame ends, a restart is due, or clients may come back."""
         times = [t for t in (self.hub.next_event_ns(), self._robot.restart_ns) if t is not None]
         return min(times) if times else None
 

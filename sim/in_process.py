@@ -45,11 +45,11 @@ class SimulatedCan:
         return []
 
     def next_event_ns(self) -> int | None:
-        """When the bus has something to do."""
+        """Return when the bus has something to do."""
         return self.bus.next_event_ns()
 
     def collect(self, now_ns: int) -> int:
-        """Nothing comes from outside."""
+        """Return 0, because no frames come from outside."""
         return 0
 
     def advance(self, now_ns: int, admit: int | None = None) -> list[ReceivedFrame]:
@@ -156,7 +156,7 @@ class HostTransport:
         return True
 
     def receive(self) -> Sequence[ReceivedFrame]:
-        """All frames received since the last call, oldest first."""
+        """Return all frames received since the last call, oldest first."""
         received = tuple(self._incoming)
         self._incoming.clear()
         return received

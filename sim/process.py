@@ -22,7 +22,7 @@ from sim.sensors import PoseMeasurement
 
 
 class StopSignal:
-    """From its making on, SIGTERM and SIGINT set `requested` and make `fileno()` readable; main thread only."""
+    """Stop request by SIGTERM or SIGINT: sets `requested` and makes `fileno()` readable; main thread only."""
 
     def __init__(self) -> None:
         self.requested = False

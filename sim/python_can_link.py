@@ -62,7 +62,7 @@ class PythonCanLink:
         return []
 
     def next_event_ns(self) -> int | None:
-        """When the bus is opened again."""
+        """Return when the bus is opened again."""
         return self._retry_ns
 
     def collect(self, now_ns: int) -> int:

@@ -112,7 +112,7 @@ class SerialLine:
         return [self._master] if self._connected else []
 
     def next_event_ns(self) -> int | None:
-        """When the next frame has passed or the line is plugged in again."""
+        """Return when the next frame has passed or the line is plugged in again."""
         times = [self._plug_in_ns] if self._plug_in_ns is not None else []
         if self._to_robot:
             times.append(self._to_robot[0].t_ns)

@@ -1,4 +1,4 @@
-"""From wheel-speed setpoints to wheel angles: command handling, speed profile, PI loop, friction, brake.
+"""Dynamics of the wheels, from speed setpoints to angles: command handling, speed profile, PI loop, friction, brake.
 
 Each motor follows a speed profile w* (first-order lag of the command with limited acceleration, or what a hidden
 effect makes of it). The tracking error e = w - w* obeys J e' = (torque limited - torque asked) - k e + z - load - b e,

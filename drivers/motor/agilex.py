@@ -131,7 +131,7 @@ class AgilexPort:
         return Heard()
 
     def sources(self) -> Sequence[Source]:
-        """Its state and its motion."""
+        """Return the sources that must report again and again: the base's state and its motion."""
         return (
             Source("the base", self._state_ns, STATE_SILENT_NS, GONE_NS),
             Source("the base's motion", self._motion_ns, MOTION_SILENT_NS),

@@ -126,7 +126,7 @@ max_speed_m_s = 1.5
 
 
 class AgilexSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Its fields in [link]: the base takes speeds of the body, which these turn wheel speeds into and back.
+    """Settings of AgileX bases in [link], which turn wheel speeds into speeds of the body and back.
 
     `wheel_radius_m` and `track_m` are the nominal ones: write those of [robot], and leave them when the model learns
     others. `max_speed_m_s` is what the base can do.
@@ -138,7 +138,7 @@ class AgilexSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
 
     def fault(self) -> SettingsFault | None:
-        """Nothing that a single field does not show."""
+        """Return None, because each field shows its own faults."""
         return None
 
 
@@ -163,7 +163,7 @@ def cyclic_frames(_settings: AgilexSettings, command_rate_hz: float, _authentica
 
 
 def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
-    """Nothing but that it is one: a base says who it is by its state and its motion, and nothing of its measures."""
+    """Return an empty dict if an AgileX base answers, else None: it shows its kind, but none of its measures."""
     heard = [frame.can_id for frame in frames if decode(frame) is not None]
     return {} if min(heard.count(SYSTEM_STATE), heard.count(MOTION_STATE)) >= _HEARD else None
 

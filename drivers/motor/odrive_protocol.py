@@ -243,7 +243,7 @@ _Endpoint = Annotated[int, Meta(ge=0, le=65535)]
 
 
 class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Its fields in [link]: left before right; `gear` is motor turns per wheel turn.
+    """Settings of ODrives in [link]: left before right; `gear` is motor turns per wheel turn.
 
     `watchdog_s`, `vel_limit_turns_s` (of the motor), `heartbeat_s` and `firmware` are what the controller is set to.
     `watchdog_endpoints`: of `axis0.config.enable_watchdog` and `axis0.config.watchdog_timeout` in the
@@ -368,7 +368,7 @@ class Questions:
         self.begin_anew(0)
 
     def begin_anew(self, now_ns: int) -> None:
-        """Nothing is known of them."""
+        """Clear everything that is known of the nodes."""
         self.known, self.version = False, ""
         self.refusal: str | None = None
         self._said: str | None = None
@@ -437,7 +437,7 @@ class Questions:
         return []
 
     def _for_watchdogs(self) -> list[Frame]:
-        """Until every node has said whether its watchdog is on and how long it waits."""
+        """Return the questions until every node has reported whether its watchdog is on and how long it waits."""
         self._watchdog_tries += 1
         endpoints = self._settings.watchdog_endpoints or ()
         waiting = [node for node, one in self._watchdogs.items() if one.is_on is None or one.timeout_s is None]

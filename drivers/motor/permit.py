@@ -193,7 +193,7 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return replace(self, fed_ns=now_ns, zeros=self.zeros + 1) if self.stage is Stage.ARMING else self
 
     def armed(self, now_ns: int) -> MotionPermit:
-        """All proof is there: commands may move it from now on."""
+        """Return the permit once all proof is there: commands may move it from now on."""
         if self.stage is not Stage.ARMING:
             return self
         return replace(self, stage=Stage.ARMED, note="armed", fed_ns=now_ns, speeds=(0.0, 0.0))
@@ -240,7 +240,7 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return stopped if self.estopped else stopped.saying(STOPPED_FROM_OUTSIDE)
 
     def command_heard(self, whom: str) -> MotionPermit:
-        """Another host commands `whom`; said once, and a fault unless the controllers are at rest."""
+        """Return the permit after another host has commanded `whom`; a fault unless the controllers are at rest."""
         said = self if self.shared else self.saying(f"another host is on the link: it commands {whom}; disconnect it")
         said = replace(said, shared=True)
         return said if self.stage is Stage.REST else said.lost(f"another host commands {whom}; disconnect it")
@@ -257,7 +257,7 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return replace(self, fault=None, estopped=False, wanted=Request.STANDBY, note=STANDS_BY)
 
     def saying(self, event: str) -> MotionPermit:
-        """Something that a person should know."""
+        """Return the permit with one more event for the operator."""
         return replace(self, events=(*self.events, event))
 
     def _idled(self, note: str) -> MotionPermit:

@@ -525,7 +525,7 @@ def _safety_card(_settings: NoSettings) -> SafetyCard:
 
 
 def _recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
-    """Nothing but that it is one: its frames carry a checksum that no other controller's has."""
+    """Return an empty dict if the frames have the checksum that is the reference controller's alone, else None."""
     reception = FrameReception(Codec())
     believed = [reception.accept(ReceivedFrame(0, frame)) for frame in frames]
     return {} if sum(one is not None for one in believed) >= _FRAMES_OF_OURS else None

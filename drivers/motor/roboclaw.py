@@ -114,7 +114,7 @@ class Board:
 
     @property
     def error_words(self) -> str:
-        """Its first error, for the operator."""
+        """Text of the board's first error, for the operator."""
         if self.is_pressed:
             return f"board {self.address}: its e-stop input is pressed"
         bit = self.errors & -self.errors
@@ -130,7 +130,7 @@ class Board:
         return second.take_wrapping(int(read["encoder_m2"]), t_ns, looked_ns, fastest, 100.0) and is_first_plausible
 
     def meet_anew(self) -> None:
-        """Nothing is known of it but what its motors have turned."""
+        """Clear all that is known of the board but what its motors have turned."""
         self.known, self.waits_ns, self.timeout_ds = {}, None, None
         for motor in self.turned:
             motor.begin_anew()
@@ -192,7 +192,7 @@ class RoboclawPort:
             board.meet_anew()
 
     def end_drive(self) -> None:
-        """Each board is to take a stop from now on."""
+        """Make each board take a stop from now on."""
         self._asked_ns = 0
         for board in self._all:
             board.stopped, board.refuses_ns = False, None

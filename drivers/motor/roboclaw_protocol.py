@@ -154,7 +154,7 @@ _Motors = str | tuple[str, ...]
 
 
 class RoboclawSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Its fields in [link]: left before right.
+    """Settings of RoboClaw boards in [link]: left before right.
 
     `motors`: "ADDRESS/MOTOR", address 128 to 135, motor 1 or 2, one or more a side. `counts_per_rev`: of the encoder a
     wheel turn, gear included. `watchdog_s`: the serial timeout, which the driver sets before each arming, in steps of
@@ -218,7 +218,7 @@ class RoboclawExchange:
         return frame.data
 
     def is_answered(self, _frame: Frame) -> bool:
-        """Every packet is, by one byte or by what it asks for."""
+        """Return True, because every packet is answered, by one byte or by what it asks for."""
         return True
 
     def reply(self, frame: Frame, received: bytes) -> Frame | None:

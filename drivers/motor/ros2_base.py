@@ -201,7 +201,7 @@ class Ros2BasePort:
 
     @property
     def _unfit(self) -> str | None:
-        """Why the base may not be driven, whatever is asked."""
+        """Reason why the base may not be driven, whatever is requested; None if it may."""
         topic = self._settings.speed_topic
         if self._flags & wire.OTHERS:
             return f"another node speaks on {topic}; end it, or give it a topic of its own"

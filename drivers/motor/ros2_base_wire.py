@@ -51,7 +51,7 @@ watchdog_s = 0.5
 
 
 class Ros2BaseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Its fields in [link]: the base takes speeds of the body, which these turn wheel speeds into and back.
+    """Settings of bases on ROS 2 in [link]: the base takes speeds of the body, converted from wheel speeds by these.
 
     `watchdog_s`: after what silence on its topic the base stops by itself, which nobody can read back. `wheels_topic`:
     JointState where the joints are named, else Odometry. `stop_topic`: a Bool that is true while a button of the base

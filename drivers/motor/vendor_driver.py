@@ -53,7 +53,7 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Source(msgspec.Struct, frozen=True):
-    """Something that must be heard again and again, by name: when it was received last, and how long it may be silent.
+    """Source that must report again and again, by name: when it was received last, and how long it may be silent.
 
     After `silent_ns` a drive ends; after `gone_ns` at rest the controllers must be met anew (None: they need not).
     """
@@ -65,7 +65,7 @@ class Source(msgspec.Struct, frozen=True):
 
 
 class Objection(msgspec.Struct, frozen=True):
-    """Why a drive must end, and whether that is a fault that stays until a reset."""
+    """Reason why a drive must end, and whether that is a fault that stays until a reset."""
 
     why: str
     is_fault: bool = True
@@ -141,7 +141,7 @@ class Port(Protocol):
         """Return the sources that must report again and again."""
 
     def objection(self, permit: MotionPermit) -> Objection | None:
-        """Why the controllers, as received last, may not be driven on."""
+        """Return why the controllers, as received last, may not be driven on; None if they may."""
 
     def prepare(self, now_ns: int, permit: MotionPermit) -> Pending | None:
         """Return what lacks before zeros may be commanded; None when all proof is there.

@@ -190,7 +190,7 @@ def sides_of(nodes: tuple[Nodes, Nodes]) -> tuple[tuple[int, ...], tuple[int, ..
 
 
 def all_of(nodes: tuple[Nodes, Nodes]) -> tuple[int, ...]:
-    """Every id, left before right."""
+    """Return every id, left before right."""
     left, right = sides_of(nodes)
     return (*left, *right)
 

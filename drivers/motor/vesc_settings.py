@@ -40,8 +40,9 @@ FAULTS = {
 
 
 class VescSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Its fields in [link]: left before right; `gear` is motor turns per wheel turn, `pole_pairs` half the poles.
+    """Settings of VESCs in [link]: left before right; `gear` is motor turns per wheel turn.
 
+    `pole_pairs` is half the motor's poles.
     `watchdog_s` (App Settings, Timeout), `timeout_brake_current_a`, `max_erpm` and `min_erpm` (below which the speed
     loop lets go) are what the controllers are set to. `uart_node`: on a serial link, the controller at its end, through
     which the others are reached on its CAN.

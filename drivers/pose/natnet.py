@@ -179,7 +179,10 @@ def make_pose_source(
     sender_silence_s: float = SILENCE_S,
     **_of_other_sources: Any,
 ) -> NatNetPoses:
-    """By the fields of [pose]. Raises PoseSourceError for an address or group that cannot be had."""
+    """Create the NatNet source from the fields of [pose].
+
+    Raises PoseSourceError for an address or group that cannot be had.
+    """
     try:
         senders = SenderGate(sender_silence_s, None if allow is None else parse_allowed(allow))
     except ValueError as error:

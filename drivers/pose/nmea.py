@@ -39,7 +39,10 @@ def make_pose_source(
     heading_std_rad: float = 0.02,
     **_of_other_sources: Any,
 ) -> NmeaPoses:
-    """By the fields of [pose]. Raises PoseSourceError for a device that is not named, or the library not there."""
+    """Create the NMEA source from the fields of [pose].
+
+    Raises PoseSourceError for a device that is not named, or the library not there.
+    """
     if not device:
         raise PoseSourceError('no device; write pose.device = "/dev/serial/by-id/..." or "socket://HOST:PORT"')
     if importlib.util.find_spec("pynmeagps") is None:
@@ -186,7 +189,7 @@ class ReceiverClock:
         self._days, self._last_s = 0.0, 0.0
 
     def host_ns(self, time_of_day_s: float, arrival_ns: int) -> int:
-        """When a fix of this time was true, at the latest."""
+        """Return when a fix of this time was true, at the latest."""
         if time_of_day_s < self._last_s - 0.5 * DAY_S:
             self._days += DAY_S
         elif abs(time_of_day_s - self._last_s) > 0.5:
@@ -321,7 +324,7 @@ class Fixes:
         return {**position, "yaw_rad": yaw_rad, "yaw_std_rad": std_rad}
 
     def _heading_hint(self, arrival_ns: int) -> list[dict[str, Any]]:
-        """Which sentence brings a heading, once, where none has come for a while."""
+        """Return which sentence brings a heading, once, where none has come for a while."""
         first_ns = self._first_ns = arrival_ns if self._first_ns is None else self._first_ns
         if self._heading is not None or arrival_ns - first_ns < _HINT_NS:
             return []

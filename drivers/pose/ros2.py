@@ -38,7 +38,7 @@ def make_pose_source(
     sender_silence_s: float = SILENCE_S,
     **_of_other_sources: Any,
 ) -> BridgePoses:
-    """By the port of [pose]; the other fields are the bridge's.
+    """Create the bridge's source by the port of [pose]; the other fields are the bridge's.
 
     Raises PoseSourceError where another daemon hears the bridge already.
     """

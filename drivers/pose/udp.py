@@ -61,7 +61,7 @@ def make_pose_source(
     sender_silence_s: float = SILENCE_S,
     **_of_other_sources: Any,
 ) -> UdpPoses:
-    """By the fields of [pose], and the `key` that the host has read from `key_file`.
+    """Create the UDP source from the fields of [pose], and the `key` that the host has read from `key_file`.
 
     Raises PoseSourceError for an address that cannot be had, and for a key that is named and not given.
     """

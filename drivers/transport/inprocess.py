@@ -84,7 +84,7 @@ class InProcessTransport:
         return True
 
     def receive(self) -> Sequence[ReceivedFrame]:
-        """All frames received since the last call, oldest first."""
+        """Return all frames received since the last call, oldest first."""
         received = tuple(self._incoming)
         self._incoming.clear()
         return received

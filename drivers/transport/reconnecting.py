@@ -292,7 +292,7 @@ class ReconnectingTransport:
         return dropped is not outgoing
 
     def receive(self) -> Sequence[ReceivedFrame]:
-        """All frames received since the last call, oldest first, without blocking."""
+        """Return all frames received since the last call, oldest first, without blocking."""
         with self._changed:
             received = tuple(self._incoming)
             self._incoming.clear()

@@ -182,7 +182,7 @@ class AgilexController:
         return self.base.vehicle_state == 0 and self.base.control_mode in (CAN_MODE, RC_MODE)
 
     def make_loop(self) -> EncoderLoop:
-        """Its wheels' speed loops, assumed to be as simple as can be: the vendor tells nothing of them."""
+        """Create the wheels' speed loops, assumed to be as simple as can be: the vendor documents nothing of them."""
         return EncoderLoop(EncoderUse.SPEED, self._settings.max_speed_m_s / self._settings.wheel_radius_m)
 
     @property

@@ -327,7 +327,10 @@ class OdriveBoard:
 
 
 class OdriveController:
-    """All axes of one robot: satisfies `sim.virtual_robot.Controller`. Firmware 0.6 has a board for each axis."""
+    """Controller of all axes of one robot (a `sim.virtual_robot.Controller`).
+
+    Firmware 0.6 has a board for each axis.
+    """
 
     brakes = False
 
@@ -354,7 +357,7 @@ class OdriveController:
         return any(axis.axis_state == CLOSED_LOOP for side in self.axes for axis in side)
 
     def make_loop(self) -> EncoderLoop:
-        """Its field-oriented control, whose angle is the encoder's."""
+        """Create the field-oriented control, whose angle is the encoder's."""
         turns_s = self._settings.vel_limit_turns_s
         return EncoderLoop(EncoderUse.COMMUTATION, 2.0 * math.pi * turns_s / self._settings.gear)
 

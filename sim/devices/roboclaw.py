@@ -232,7 +232,7 @@ class RoboclawController:
         return any(board.command is not None and board.command[0] == "speed" for board in self.boards.values())
 
     def make_loop(self) -> EncoderLoop:
-        """Its velocity PID, which full duty (QPPS) ends."""
+        """Create the velocity PID, which full duty (QPPS) ends."""
         qpps = min(board.registers.pid_m1[3] for board in self.boards.values())
         return EncoderLoop(EncoderUse.SPEED, qpps / self._settings.counts_per_rad)
 

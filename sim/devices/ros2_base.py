@@ -47,7 +47,7 @@ class Ros2BaseController:
         return self.wheels_rad_s != (0.0, 0.0)
 
     def make_loop(self) -> EncoderLoop:
-        """Its wheels' speed loops."""
+        """Create the wheels' speed loops."""
         return EncoderLoop(EncoderUse.SPEED, self._settings.max_speed_m_s / self._settings.wheel_radius_m)
 
     @property

@@ -375,7 +375,10 @@ class _PacketParser:
 
 
 class VescController:
-    """All VESCs of one robot: satisfies `sim.virtual_robot.Controller`. Below its least speed a motor is let go."""
+    """Controller of all VESCs of one robot (a `sim.virtual_robot.Controller`).
+
+    Below its least speed a motor is let go.
+    """
 
     def __init__(self, settings: VescSettings, ticks_per_rev: int) -> None:
         self._settings = settings
@@ -406,7 +409,7 @@ class VescController:
         return any(vesc.held[0] == "set_erpm" for side in self.sides for vesc in side)
 
     def make_loop(self) -> EncoderLoop:
-        """Its field-oriented control, whose angle is the encoder's."""
+        """Create the field-oriented control, whose angle is the encoder's."""
         return EncoderLoop(EncoderUse.COMMUTATION, self._settings.max_erpm / self._settings.erpm_per_rad_s)
 
     @property
