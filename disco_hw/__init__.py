@@ -1,4 +1,4 @@
-"""DISCO on hardware: estimation, control, daemon, logging and tools for a skid-steer robot.
+"""Control stack for skid-steer robots on hardware: estimation, control, daemon, logging and tools (DISCO).
 
 The names below are the public interface for programs (docs/python.md); each is loaded when it is first used, so that
 `import disco_hw` itself loads nothing.

@@ -1,8 +1,8 @@
-"""What a user did wrong, as opposed to what failed."""
+"""Exceptions for what a user did wrong, and for work that failed."""
 
 
 class InputError(Exception):
-    """Bad input: the message is one line that names the file, the field and the remedy; commands exit with 2."""
+    """Error for wrong input; the message is one line: file, field and remedy; commands exit with 2."""
 
 
 class WorkError(Exception):

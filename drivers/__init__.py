@@ -1,1 +1,1 @@
-"""What talks to hardware: transports and one driver for each motor controller."""
+"""Drivers that talk to hardware: transports, pose sources, and one driver for each motor controller."""

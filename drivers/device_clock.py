@@ -104,7 +104,10 @@ class DeviceClock:
         return self._base_host_ns - self._base_us * 1000 + round(self._shown(now_ns))
 
     def device_us(self, now_ns: int) -> float | None:
-        """The device's clock at host time `now_ns`, in microseconds modulo 2^40; None before the first exchange."""
+        """Return the device's clock at host time `now_ns`, in microseconds modulo 2^40.
+
+        None before the first exchange.
+        """
         offset_ns = self.offset_ns(now_ns)
         return None if offset_ns is None else ((now_ns - offset_ns) / 1000) % DEVICE_CLOCK_MODULUS_US
 
@@ -141,7 +144,7 @@ class _OffsetFilter:
         self._p11 = _SKEW_STD**2
 
     def at(self, now_ns: int) -> float:
-        """The offset at `now_ns`."""
+        """Return the offset at `now_ns`."""
         return self._offset_ns + self.skew * (now_ns - self._host_ns)
 
     def update(self, exchange: _Exchange) -> None:

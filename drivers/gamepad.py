@@ -15,7 +15,7 @@ _SYN_REPORT, _SYN_DROPPED = 0, 3
 
 
 class GamepadError(Exception):
-    """No usable gamepad; the message is one line that says what to do."""
+    """Exception for no usable gamepad; the message is one line that says what to do."""
 
 
 class InputEvent(Protocol):
@@ -35,7 +35,7 @@ class AxisInfo(Protocol):
 
 
 class EventDevice(Protocol):
-    """What is used of evdev.InputDevice."""
+    """Part of evdev.InputDevice that is used."""
 
     name: str
 
@@ -43,18 +43,18 @@ class EventDevice(Protocol):
         """Events since the last call; raises BlockingIOError for none, another OSError when the device is gone."""
 
     def absinfo(self, axis_num: int) -> AxisInfo:
-        """The axis now."""
+        """Return the present state of an axis."""
 
     def active_keys(self) -> list[int]:
         """Codes of the buttons held now."""
 
     def close(self) -> None:
-        """Close the device."""
+        """Close the input device."""
 
 
 @dataclass(frozen=True, slots=True)
 class GamepadMapping:
-    """Which axes and button are used, by evdev's names; an axis with a minus before it is reversed.
+    """Mapping of the axes and button used, by evdev's names; an axis with a minus before it is reversed.
 
     Within `dead_zone` of its middle, as a share of half its range, an axis counts as 0.
     """
@@ -67,7 +67,7 @@ class GamepadMapping:
 
 @dataclass(frozen=True, slots=True)
 class GamepadState:
-    """What is held: forward and left in [-1, 1], the deadman, and when the newest event came (host time)."""
+    """State of the gamepad: forward and left in [-1, 1], the deadman, and when the newest event came (host time)."""
 
     event_ns: int
     forward: float
@@ -100,7 +100,7 @@ class Gamepad:
 
     @property
     def name(self) -> str:
-        """What the device calls itself."""
+        """Name that the device reports."""
         return self._device.name
 
     def poll(self, now_ns: int) -> GamepadState | None:
@@ -122,7 +122,7 @@ class Gamepad:
         return GamepadState(self._event_ns, self._value(self._forward), self._value(self._left), self._deadman)
 
     def close(self) -> None:
-        """Close the device."""
+        """Close the gamepad's device."""
         self._device.close()
 
     def _take(self, event: InputEvent) -> None:
@@ -147,7 +147,7 @@ class Gamepad:
         self._deadman = self._button in self._device.active_keys()
 
     def _share(self, code: int, value: int) -> float:
-        """An axis' value as a share of half its range, from the middle."""
+        """Return an axis' value as a share of half its range, from the middle."""
         low, high = self._range[code]
         return 0.0 if high <= low else min(1.0, max(-1.0, (value - low) / (0.5 * (high - low)) - 1.0))
 

@@ -89,7 +89,7 @@ class _KernelCache(FunctionCache):
 
 
 def _why_not_believed(cache_path: str) -> str | None:
-    """Why the kernels in a directory could be another user's, with the path in front; None if they cannot."""
+    """Return why the kernels in a directory could be another user's, with the path in front; None if they cannot."""
     directory = Path(os.path.realpath(cache_path))
     named: str = vars(config)["CACHE_DIR"]
     given = Path(os.path.realpath(named)) if named else directory

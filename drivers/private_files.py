@@ -40,7 +40,7 @@ def _check(path: Path, status: os.stat_result) -> None:
 
 
 def user_name(uid: int) -> str:
-    """A user for a person: name and number."""
+    """Return a user as text: name and number."""
     try:
         return f"{pwd.getpwuid(uid).pw_name} ({uid})"
     except KeyError:
@@ -48,7 +48,7 @@ def user_name(uid: int) -> str:
 
 
 def why_not_private(directory: Path, owners: Collection[int]) -> str | None:
-    """Why users other than `owners` could put something into `directory`, in words without its name; None if not.
+    """Return why users other than `owners` could put something into `directory`, without its name; None if not.
 
     A link is refused, as whoever made it may turn it elsewhere. Raises OSError if the directory cannot be looked at.
     """

@@ -1,4 +1,4 @@
-"""What every driver speaks: frames on the link, samples from the robot, commands to it.
+"""Types that every driver uses: frames on the link, samples from the robot, commands to it.
 
 SI units; left before right; positive wheel speed drives forward; x forward, y left, yaw counter-clockwise.
 Time stamps are nanoseconds of the host's monotonic clock unless the name says otherwise.
@@ -29,7 +29,7 @@ _EXTENDED_FLAG = 0x8000_0000
 
 
 def socketcan_id(frame: Frame) -> int:
-    """The identifier with the flag of Linux's `can_id` for 29 bits: what a log keeps of a frame besides its data."""
+    """Return the identifier with Linux's `can_id` flag for 29 bits, as a log keeps it beside a frame's data."""
     return frame.can_id | _EXTENDED_FLAG if frame.extended else frame.can_id
 
 
@@ -84,7 +84,7 @@ class Transport(Protocol):
 
     @property
     def name(self) -> str:
-        """Medium and address, for messages to a person."""
+        """Medium and address, for messages to the operator."""
 
     @property
     def state(self) -> LinkState:
@@ -106,10 +106,10 @@ class Transport(Protocol):
         """Start the receive thread and the first connection attempt; return at once."""
 
     def send(self, outgoing: OutgoingFrame, now_ns: int) -> bool:
-        """Send without blocking; False (and a counter) if it expired, did not fit or the link is down."""
+        """Send a frame without blocking; False (and a counter) if it expired, did not fit or the link is down."""
 
     def receive(self) -> Sequence[ReceivedFrame]:
-        """All frames received since the last call, oldest first, without blocking."""
+        """Return all frames received since the last call, oldest first, without blocking."""
 
     def close(self) -> None:
         """Stop the thread and release the medium; safe to call twice."""
@@ -179,7 +179,7 @@ class PowerSample(msgspec.Struct, frozen=True, gc=False):
 
 
 class RobotStatus(msgspec.Struct, frozen=True, gc=False):
-    """What the robot's controller says of itself; names are those of the DBC's value tables."""
+    """Status that the robot's controller reports; names are those of the DBC's value tables."""
 
     t_ns: int
     state: str
@@ -217,7 +217,7 @@ SAID_BY_WORDS: Mapping[SaidBy, str] = MappingProxyType(
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Which controller answers: its kind, its firmware's version where it is known, and what else it reports of itself.
+    """Identity of a controller: its kind, its firmware's version where it is known, and what else it reports of itself.
 
     `said_by` is of kind and version: where the controller reports neither, they are what robot.toml says.
     """
@@ -228,7 +228,7 @@ class Identity:
     details: str = ""
 
     def in_words(self) -> str:
-        """For a person: all of it, and who says it."""
+        """Return the whole identity as text, with who states it."""
         version = self.firmware and f"firmware {self.firmware}"
         known = ", ".join(text for text in (self.controller, version, self.details) if text)
         return f"{known} ({SAID_BY_WORDS.get(self.said_by, self.said_by)})"
@@ -244,7 +244,7 @@ class Limit:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a controller keeps to; a figure that nobody says is None.
+    """Limits that a controller enforces; a figure that nobody states is None.
 
     `command_timeout_s`: how long it waits for a command before it stops the motors. `drive_off_timeout_s`: how long
     until it takes the current off them then.
@@ -258,13 +258,13 @@ class Limits:
     drive_off_timeout_s: Limit | None = None
 
     def known(self) -> dict[str, Limit]:
-        """The figures that somebody says, by name."""
+        """Return the figures that somebody says, by name."""
         each = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: limit for name, limit in each.items() if limit is not None}
 
 
 class Readings(msgspec.Struct, frozen=True, gc=False):
-    """Everything that one batch of received frames meant, oldest first."""
+    """Readings from one batch of received frames, oldest first."""
 
     wheels: tuple[WheelSample, ...] = ()
     poses: tuple[PoseSample, ...] = ()
@@ -276,7 +276,7 @@ class Readings(msgspec.Struct, frozen=True, gc=False):
 
 
 class DriverState(enum.Enum):
-    """Where a driver is with its robot."""
+    """States of a driver with its robot."""
 
     DISCONNECTED = "disconnected"
     HANDSHAKE = "handshake"
@@ -291,7 +291,7 @@ class DriverState(enum.Enum):
 
 
 class Request(enum.Enum):
-    """What the host asks of a driver: stay still, open a session, allow motion, clear a latched fault or e-stop."""
+    """Requests of the host to a driver: stay still, open a session, allow motion, clear a latched fault or e-stop."""
 
     STANDBY = "standby"
     READY = "ready"
@@ -326,19 +326,19 @@ class Driver(Protocol):
 
     @property
     def state(self) -> DriverState:
-        """Where the driver is with its robot."""
+        """State of the driver with its robot."""
 
     @property
     def detail(self) -> str:
-        """One sentence for a person: why the state is what it is and what to do about it."""
+        """One sentence for the operator: why the state is what it is and what to do about it."""
 
     @property
     def identity(self) -> Identity | None:
-        """Which controller answers; None before the handshake is complete."""
+        """Identity of the controller; None before the handshake is complete."""
 
     @property
     def limits(self) -> Limits | None:
-        """What the controller keeps to, and who says so; None before the handshake is complete."""
+        """Limits of the controller, and who states them; None before the handshake is complete."""
 
     @property
     def stats(self) -> DriverStats:
@@ -349,10 +349,10 @@ class Driver(Protocol):
         """Host time minus device time, as estimated now; None before the first estimate."""
 
     def link_up(self, now_ns: int) -> None:
-        """The medium has come up (again): start the handshake; any session is void."""
+        """Start the handshake, because the medium has come up (again); any session is void."""
 
     def link_down(self, now_ns: int) -> None:
-        """The medium is gone: any session is void."""
+        """Drop any session, because the medium is gone."""
 
     def receive(self, now_ns: int, frames: Sequence[ReceivedFrame]) -> Readings:
         """Take in received frames and return what they meant."""
@@ -367,14 +367,14 @@ class Driver(Protocol):
         """
 
     def transmit(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
-        """Frames due now: the command (only while armed; zeros while arming) and house-keeping."""
+        """Return the frames due now: the command (only while armed; zeros while arming) and house-keeping."""
 
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Frames that stop the robot in any state."""
 
 
 class PoseSource(Protocol):
-    """Where measured poses come from; called in each tick of the control loop, so that it must not wait."""
+    """Source of measured poses; called in each tick of the control loop, so that it must not wait."""
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
         """Poses that came since the last call, oldest first; `from_robot` are those of the motor driver.
@@ -387,7 +387,7 @@ class PoseSource(Protocol):
 
 
 class Exchange(Protocol):
-    """How a serial line is spoken on which one request is under way at a time, and a reply belongs to the last one.
+    """Protocol of a serial line on which one request is under way at a time, and a reply belongs to the last one.
 
     A frame is a packet here: `can_id` says to whom it goes and what it is. `timeout_s`: how long the device may take to
     begin; `quiet_s`: how long the line is left alone after a reply that did not come.
@@ -395,20 +395,23 @@ class Exchange(Protocol):
 
     @property
     def timeout_s(self) -> float:
-        """How long the device may take from the last byte of a request to the last of its reply, at infinite speed."""
+        """Longest time from the last byte of a request to the last of its reply, at infinite line speed."""
 
     @property
     def quiet_s(self) -> float:
-        """Silence after which a device that is in the middle of a packet begins anew."""
+        """Silence after which a device that is in the middle of a packet begins again."""
 
     def request(self, frame: Frame) -> bytes:
-        """The bytes of a packet on the line."""
+        """Return the bytes of a packet on the line."""
 
     def is_answered(self, frame: Frame) -> bool:
         """Whether the device replies to it."""
 
     def reply(self, frame: Frame, received: bytes) -> Frame | None:
-        """The reply to `frame` that the bytes received since then begin with; None if it is none, or not whole yet."""
+        """Return the reply to `frame` that the bytes received since then begin with.
+
+        None if it is none, or not whole yet.
+        """
 
 
 @runtime_checkable
@@ -416,7 +419,7 @@ class SaysWhy(Protocol):
     """A pose source that knows why its poses come or fail to come."""
 
     def news(self) -> Sequence[str]:
-        """Sentences for a person since the last call."""
+        """Sentences for the operator since the last call."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -437,7 +440,7 @@ class CyclicFrame:
 
 @dataclass(frozen=True, slots=True)
 class SafetyCard:
-    """Who stops the robot when, in words for a person.
+    """Summary, for the operator, of what stops the robot when.
 
     `reaction_s`: how long the wheels may still be driven after the host has fallen silent. `brakes`: whether they are
     braked then, or coast. `wheel_fault`: how this computer stops wheels of which one does not obey, without a ramp that
@@ -457,7 +460,7 @@ class SafetyCard:
 
 @dataclass(frozen=True, slots=True)
 class SettingsFault:
-    """What no single field of a driver's settings shows: the field's name, what is wrong, what to write."""
+    """Fault of a driver's settings that no single field shows: the field's name, what is wrong, what to write."""
 
     field: str
     fault: str
@@ -465,16 +468,16 @@ class SettingsFault:
 
 
 class NoSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Of a driver that has no fields of its own in [link]."""
+    """Settings of a driver that has no fields of its own in [link]."""
 
     def fault(self) -> SettingsFault | None:
-        """Nothing can be wrong."""
+        """Return None, because nothing can be wrong."""
         return None
 
 
 @dataclass(frozen=True, slots=True)
 class LineQuestions:
-    """What finds a controller that only answers: frames that move and write nothing, and the speeds (bit/s) to try."""
+    """Questions that find a controller which only replies: harmless frames, and the speeds (bit/s) to try."""
 
     frames: tuple[Frame, ...]
     bauds: tuple[int, ...]

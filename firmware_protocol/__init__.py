@@ -1,1 +1,1 @@
-"""What goes over the wire: the DBC, its codec, end-to-end protection, serial framing and the reference firmware."""
+"""Protocol on the wire: the DBC, its codec, end-to-end protection, serial framing and the reference firmware."""

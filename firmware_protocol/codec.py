@@ -30,7 +30,7 @@ _TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|[^\s":;,|@()\[\]]+|[:;,|@()\[\]]')
 
 @dataclass(frozen=True, slots=True)
 class SignalLayout:
-    """One little-endian signal: where it lies in the frame and what its raw value means (physical = scale * raw)."""
+    """Layout of one little-endian signal: its place in the frame and its raw value (physical = scale * raw)."""
 
     name: str
     shift: int
@@ -47,7 +47,7 @@ class SignalLayout:
 
 @dataclass(frozen=True, slots=True)
 class MessageLayout:
-    """One message; `data_id` is None where it carries no E2E header, `page_signal` names the multiplexer if any.
+    """Layout of one message; `data_id` is None without an E2E header, `page_signal` names the multiplexer if any.
 
     `period_s` is None for what is sent only when there is something to say.
     """
@@ -64,7 +64,7 @@ class MessageLayout:
 
 @dataclass(frozen=True, slots=True)
 class Protocol:
-    """Everything that the DBC says; `dbc_hash` is equal for two files that mean the same on the wire."""
+    """Protocol as the DBC defines it; `dbc_hash` is equal for two files that mean the same on the wire."""
 
     major: int
     minor: int
@@ -74,7 +74,7 @@ class Protocol:
 
 @dataclass(frozen=True, slots=True)
 class Tables:
-    """What tools/generate/protocol.py writes for Python: the tables, and the CRC-32 of the DBC that they are of."""
+    """Tables that tools/generate/protocol.py writes for Python, with the CRC-32 of the DBC that they are of."""
 
     crc: int
     protocol: Protocol
@@ -190,7 +190,7 @@ class Decoded(msgspec.Struct, frozen=True, gc=False):
 
 
 class FaultReason(enum.Enum):
-    """Why a frame could not be decoded."""
+    """Reasons why a frame could not be decoded."""
 
     UNKNOWN_ID = "unknown_id"
     LENGTH = "length"
@@ -207,7 +207,7 @@ class DecodeFault(msgspec.Struct, frozen=True, gc=False):
 
 
 class _Plan(msgspec.Struct, frozen=True):
-    """What decoding one message needs, worked out beforehand: per page, (name, shift, mask, sign bit, scale) rows."""
+    """Precomputed decoding of one message: per page, (name, shift, mask, sign bit, scale) rows."""
 
     layout: MessageLayout
     crc_suffix: bytes
@@ -218,7 +218,7 @@ class _Plan(msgspec.Struct, frozen=True):
 
 
 class _Slot(msgspec.Struct, frozen=True):
-    """What encoding one signal needs, worked out beforehand; raw values lie between `least` and `most`."""
+    """Precomputed encoding of one signal; raw values lie between `least` and `most`."""
 
     signal: SignalLayout
     name: str

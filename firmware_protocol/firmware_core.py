@@ -35,7 +35,7 @@ def _default_s(name: str) -> float:
 
 
 class ResetCause(enum.IntEnum):
-    """Why the controller started."""
+    """Causes of the controller's start."""
 
     POWER_ON = 0
     WATCHDOG = 1
@@ -44,7 +44,7 @@ class ResetCause(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class FirmwareConfig:
-    """What differs between robots, with the defaults of `disco_config_default`.
+    """Configuration that differs between robots, with the defaults of `disco_config_default`.
 
     A value out of the bounds of `robot_config.c` makes the core refuse to leave FAULT.
 
@@ -86,7 +86,7 @@ class FirmwareConfig:
 
 
 class FirmwareInputs(msgspec.Struct, frozen=True, gc=False, kw_only=True):
-    """What the board measures in one cycle; ticks are cumulative, a transmit error count over 255 means bus-off."""
+    """Measurements of the board in one cycle; ticks are cumulative, a transmit error count over 255 means bus-off."""
 
     left_ticks: int
     right_ticks: int
@@ -110,7 +110,7 @@ class FirmwareInputs(msgspec.Struct, frozen=True, gc=False, kw_only=True):
 
 
 class FirmwareOutputs(msgspec.Struct, frozen=True, gc=False):
-    """What the core wants of the motor driver, and what it shows; setpoints are after all limits, 0 with driver off.
+    """Commands of the core to the motor driver, and its state; setpoints are after all limits, 0 with driver off.
 
     `accepted_commands` counts the wheel commands ever accepted, `blockers` is the sum of the bits in the DBC's table of
     what keeps the controller from the next step towards motion.
@@ -188,7 +188,7 @@ def _fill_config(target: Any, config: FirmwareConfig) -> None:
 
 
 class FirmwareCore:
-    """One controller: frames and measurements in, setpoints and frames out; time is passed in, in microseconds."""
+    """Core of one controller: frames and measurements in, setpoints and frames out; time is passed in, microseconds."""
 
     __slots__ = (
         "_core",
@@ -230,7 +230,7 @@ class FirmwareCore:
         _lib.disco_firmware_receive(self._core, now_us, can_id & 0xFFFF_FFFF, data, min(len(data), 0xFF))
 
     def step(self, now_us: int, inputs: FirmwareInputs) -> FirmwareOutputs:
-        """Run one cycle; call it once in `cycle_s`."""
+        """Run one cycle; to be called once in `cycle_s`."""
         c = self._inputs
         c.ticks = (inputs.left_ticks & _TICKS_MASK, inputs.right_ticks & _TICKS_MASK)
         c.wheel_speed = (inputs.left_speed_rad_s, inputs.right_speed_rad_s)
@@ -299,17 +299,17 @@ class FirmwareCore:
 
     @property
     def rejections(self) -> dict[str, int]:
-        """How many frames were rejected for each reason of the DBC's table."""
+        """Number of frames rejected for each reason of the DBC's table."""
         return {name: self._core.rejected[reason] for reason, name in self._reasons.items() if reason}
 
     @property
     def overflowed_frames(self) -> int:
-        """How many frames did not fit into the transmit queue."""
+        """Number of frames that did not fit into the transmit queue."""
         return int(self._core.transmit.overflow_count)
 
     @property
     def unknown_frames(self) -> int:
-        """How many frames had an identifier that is not for this controller."""
+        """Number of frames whose identifier is not for this controller."""
         return int(self._core.unknown_frames)
 
 

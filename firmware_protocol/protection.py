@@ -1,4 +1,4 @@
-"""What shows that a frame is whole, in order, and from whom it should be: end-to-end protection, and a host's proof.
+"""Protection and authentication of frames: that they are intact and in order, and a host's proof that it sent them.
 
 Protection is against accident, and every frame has it: CRC-8 with a data id, a 4-bit counter, and the receiver's
 judgement of both. The CRC is AUTOSAR's CRC-8H2F (polynomial 0x2F, initial value and final xor 0xFF): over an 8-byte
@@ -40,10 +40,10 @@ class EncodedFrame(NamedTuple):
 
 
 class MessageNames(Protocol):
-    """What proving frames needs of a codec."""
+    """Part of a codec that proving frames needs."""
 
     def can_id(self, name: str) -> int:
-        """The identifier of a message's frames."""
+        """Return the identifier of a message's frames."""
 
 
 def _crc_table() -> bytes:
@@ -87,7 +87,7 @@ def challenge_answer(challenge: int, session: int, dbc_hash: int) -> int:
 
 
 class E2EStatus(enum.Enum):
-    """What the receiver thinks of one frame; only OK and OK_SOME_LOST may be used, and only while qualified."""
+    """Verdict of the receiver on one frame; only OK and OK_SOME_LOST may be used, and only while qualified."""
 
     INITIAL = 0
     OK = 1
@@ -183,7 +183,7 @@ class Prover:
     """Proves frames to one robot; pure. Without a nonce from the robot nothing can be proved."""
 
     def __init__(self, key: bytes, codec: MessageNames) -> None:
-        """`key`: 16 bytes."""
+        """Create a prover with a `key` of 16 bytes."""
         # The library is loaded here, and not with the first command in the loop.
         aes_cmac(key, b"")
         self._key = key
@@ -197,7 +197,7 @@ class Prover:
         return self._nonce is not None
 
     def challenge(self, nonce: int) -> None:
-        """Take in MAC_CHALLENGE's nonce; with a new one the counters begin anew, with one told before they go on.
+        """Take in MAC_CHALLENGE's nonce; with a new one the counters begin again, with one told before they go on.
 
         Anybody can send a wrong nonce: were the right one's counters lost with it, the robot would hear nothing more
         until they had caught up with its own.
@@ -209,7 +209,7 @@ class Prover:
         self._nonce = value
 
     def forget(self) -> None:
-        """Forget the nonce: the robot may be another one."""
+        """Clear the nonce, because the robot may be another one."""
         self._nonce = None
 
     def needs_proof(self, can_id: int) -> bool:

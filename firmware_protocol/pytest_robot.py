@@ -10,7 +10,7 @@ from typing import Any
 
 
 def pytest_addoption(parser: Any) -> None:
-    """Add the options."""
+    """Add the options for tests against a robot."""
     group = parser.getgroup("disco-hw")
     group.addoption("--robot", metavar="ROBOT.toml", help="test only that whatever answers on this link conforms")
     group.addoption("--allow-motion", action="store_true", help="with --robot: turn the wheels; lift them first")

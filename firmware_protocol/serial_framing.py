@@ -1,4 +1,4 @@
-"""Serial framing: the same frames as on CAN, between zero bytes, with COBS and a CRC-16 against line noise.
+"""Framing on serial lines: the same frames as on CAN, between zero bytes, with COBS and a CRC-16 against line noise.
 
 One serial frame is COBS([kind u8][can_id u16][data 0..8 bytes][CRC-16/CCITT-FALSE u16]) 0x00, little-endian.
 COBS: Cheshire and Baker, "Consistent Overhead Byte Stuffing", IEEE/ACM Transactions on Networking 7(2), 1999.
@@ -38,7 +38,7 @@ def encode_frame(can_id: int, data: bytes) -> bytes:
 
 @dataclass(slots=True)
 class FrameDecoderStats:
-    """What a decoder has seen since it was made; every discarded byte is under one of these."""
+    """Counters of a decoder since it was created; every discarded byte is under one of these."""
 
     frames: int = 0
     bytes: int = 0

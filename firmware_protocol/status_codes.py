@@ -1,4 +1,4 @@
-"""What the codes in a robot's status mean and what to do about each: faults, causes of a stop, refusals, e-stops.
+"""Meaning of the codes in a robot's status, and what to do about each: faults, causes of a stop, refusals, e-stops.
 
 Codes and names are the DBC's value tables, and how a fault ends is a bit of its code; the remedies stand here alone.
 The page, `ctl`, `check`, the log's events and the table in README.md take their words from this file.
@@ -95,7 +95,7 @@ class Fault:
 
     @property
     def latches(self) -> bool:
-        """Whether it stays when its cause is gone."""
+        """Whether the fault stays when its cause is gone."""
         return bool(self.code & _LATCHING)
 
     @property
@@ -105,14 +105,14 @@ class Fault:
 
     @property
     def ending(self) -> str:
-        """What ends it once its cause is gone."""
+        """Text on what ends the fault once its cause is gone."""
         if self.permanent:
             return THEN_RESTART
         return THEN_RESET if self.latches else BY_ITSELF
 
     @property
     def advice(self) -> str:
-        """What to do, to the end."""
+        """Text on what to do, from the cause to the end of the fault."""
         return f"{self.remedy}; {self.ending}"
 
 
@@ -133,26 +133,29 @@ def advice(name: str) -> str:
 
 
 def fault(name: str) -> str:
-    """A fault of SYSTEM_STATE.fault and what to do about it; the name alone for one that this version does not know."""
+    """Return a fault of SYSTEM_STATE.fault and what to do about it.
+
+    The name alone for one that this version does not know.
+    """
     todo = advice(name)
     return f"{name}: {todo}" if todo else name
 
 
 def stop_cause(name: str) -> str:
-    """Why the robot stopped by itself, by the name in SYSTEM_STATE.stop_cause."""
+    """Return why the robot stopped by itself, by the name in SYSTEM_STATE.stop_cause."""
     return _STOP_CAUSES.get(name, name)
 
 
 def reject_reason(name: str) -> str | None:
-    """Why the robot last rejected a frame, by the name in SYSTEM_STATE.reject_reason; None if it never did."""
+    """Return why the robot last rejected a frame, by the name in SYSTEM_STATE.reject_reason; None if it never did."""
     return None if name == "NONE" else _REJECT_REASONS.get(name, name)
 
 
 def blocker(name: str) -> str:
-    """What keeps the robot from the next step towards motion, by a name in SESSION_STATE.blockers."""
+    """Return what keeps the robot from the next step towards motion, by a name in SESSION_STATE.blockers."""
     return _BLOCKERS.get(name, name)
 
 
 def estop(source: str) -> str:
-    """Who stopped the robot, by the name in SYSTEM_STATE.estop_source, and what to do about it."""
+    """Return who stopped the robot, by the name in SYSTEM_STATE.estop_source, and what to do about it."""
     return _ESTOP_SOURCES.get(source, "emergency stop; reset when it is safe")

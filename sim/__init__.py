@@ -1,4 +1,4 @@
-"""What replaces the robot: plant, mock CAN bus, virtual robot.
+"""Simulated replacement of the robot: plant, mock CAN bus, virtual robot.
 
 Here the seam between them: the link of the virtual robot, be it a CAN bus or a serial line, and the robot's controller
 as a node on a bus.
@@ -40,7 +40,7 @@ class RobotLink(Protocol):
         """Descriptors that become readable when a host has done something."""
 
     def next_event_ns(self) -> int | None:
-        """When `collect` and `advance` are due even if no host does anything; None if never."""
+        """Return when `collect` and `advance` are due even if no host does anything; None if never."""
 
     def collect(self, now_ns: int) -> int:
         """Take in what hosts wrote; return how many of their frames now wait to be let onto the line."""
@@ -85,7 +85,10 @@ class RobotNode:
         return self.node.tec, self.node.rec
 
     def take(self, now_ns: int, deliveries: Sequence[DeliveredFrame]) -> list[ReceivedFrame]:
-        """The data frames among the bus's deliveries that the robot has received; minds the restart after bus-off."""
+        """Return the data frames among the bus's deliveries that the robot has received.
+
+        Minds the restart after bus-off.
+        """
         node = self.node
         if node.state is _BUS_OFF and node.recessive_sequences is None:
             if self.restart_ns is None:

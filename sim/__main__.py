@@ -1,4 +1,4 @@
-"""`python -m sim`: the virtual robot alone."""
+"""Command `python -m sim`, which runs the virtual robot alone."""
 
 from __future__ import annotations
 

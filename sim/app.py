@@ -47,7 +47,7 @@ class OptionError(Exception):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VirtualRobotOptions:
-    """How to run the virtual robot.
+    """Options of the virtual robot.
 
     With kind "can" and interface "unixcan" the process serves a bus of its own at the socket `channel`, with frames
     taking their time on the wire if `pacing`; any other `interface` is joined through python-can. With kind "serial" it
@@ -297,7 +297,7 @@ def _rehearse(options: VirtualRobotOptions) -> None:
 
 
 def _given(config: FirmwareConfig) -> str:
-    """The fields of a configuration that someone has chosen."""
+    """Return the fields of a configuration that someone has chosen."""
     chosen = [
         f"{field.name}={getattr(config, field.name)}"
         for field in fields(config)
@@ -331,7 +331,10 @@ def _open_link(options: VirtualRobotOptions, log: Callable[[str], object] | None
 
 
 def _schedule(priority: int) -> str:
-    """Ask for SCHED_FIFO; say what was granted. Late steps would look to a host like a robot that misses commands."""
+    """Request SCHED_FIFO and return what was granted.
+
+    Late steps would look to a host like a robot that misses commands.
+    """
     if priority <= 0:
         return "no real-time priority asked for"
     try:

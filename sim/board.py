@@ -122,10 +122,10 @@ class BoardRobot:
         self.plant.kidnap(dx_m, dy_m, dyaw_rad)
 
     def jump_clock(self, step_us: int) -> None:
-        """Do nothing: the clock is the board's own, and `sim.app` refuses such a fault."""
+        """Do nothing, because the clock is the board's own, and `sim.app` refuses such a fault."""
 
     def reboot(self, cause: ResetCause = ResetCause.POWER_ON) -> None:
-        """Raise LinkFaultError: only an operator or the board itself can restart it."""
+        """Raise LinkFaultError, because only an operator or the board itself can restart it."""
         raise LinkFaultError("reboot: not over this line; press the board's reset button")
 
     def _inputs(self) -> FirmwareInputs:
@@ -172,7 +172,7 @@ def _pose(pose: PoseMeasurement, now_us: int) -> list[Frame]:
 
 
 class PlantLine:
-    """This computer's end of the plant's line: a serial port, opened again when it breaks.
+    """Link of this computer to the plant's line: a serial port, opened again when it breaks.
 
     Raises OSError or `serial.SerialException` if it cannot be opened at first.
     """
@@ -197,7 +197,7 @@ class PlantLine:
 
     @property
     def error_counters(self) -> tuple[int, int]:
-        """Return zeros: the board's link reports no error counters."""
+        """Counters of transmit and receive errors, always zero: the board's link reports none."""
         return 0, 0
 
     def filenos(self) -> list[int]:
@@ -205,7 +205,7 @@ class PlantLine:
         return [] if self._port is None else [self._port.fileno()]
 
     def next_event_ns(self) -> int | None:
-        """When the port is opened again."""
+        """Return when the port is opened again."""
         return self._retry_ns
 
     def collect(self, now_ns: int) -> int:
@@ -253,15 +253,15 @@ class PlantLine:
         self._retry_ns = until_ns
 
     def force_bus_off(self, who: str) -> None:
-        """A serial line has none."""
+        """Raise LinkFaultError, because a serial line has no bus-off."""
         raise LinkFaultError(f"bus_off {who}: the board's own link is not the simulator's")
 
     def babble(self, frame: Frame) -> None:
-        """Raise LinkFaultError: faults of frames are not possible on the board's own link."""
+        """Raise LinkFaultError, because faults of frames are not possible on the board's own link."""
         raise LinkFaultError("babble: the board's own link is not the simulator's")
 
     def tamper(self, fault: BusFault) -> None:
-        """Do nothing: faults of frames are those of the board's own link, and `sim.app` refuses them."""
+        """Do nothing, because faults of frames are those of the board's own link, and `sim.app` refuses them."""
 
     def summary(self) -> str:
         """Counters in one line."""

@@ -1,4 +1,4 @@
-"""From wheel angles to the pose of the body: rolling, skid-steer turning, slip and the floor.
+"""Dynamics of the body, from wheel angles to its pose: rolling, skid-steer turning, slip and the floor.
 
 Over one integration piece the body moves along the screw of its mean velocity, which is integrated exactly. With
 wheels rolling at rim speeds u_L, u_R: v = (u_L + u_R) / 2, omega = (u_R - u_L) / a, and the body's own velocity is
@@ -96,7 +96,7 @@ class Body:
 
     @property
     def pose(self) -> BodyPose:
-        """Present pose: x, y (m), yaw (rad), in the world."""
+        """Pose of the body now: x, y (m), yaw (rad), in the world."""
         return BodyPose(*self._pose.tolist())
 
     @property
@@ -106,7 +106,7 @@ class Body:
         return speed, lateral, yaw_rate
 
     def pose_at(self, t_us: int) -> BodyPose:
-        """The pose within the newest integration piece, at t_us: between its end points on a straight line."""
+        """Return the pose within the newest integration piece, at t_us: between its end points on a straight line."""
         x, y, yaw, last_x, last_y, last_yaw = self._poses.tolist()
         last_us, now_us = self._times_us.tolist()
         span = now_us - last_us
@@ -190,7 +190,7 @@ def _parameter_record(p: PlantParameters, effects: HiddenEffects) -> npt.NDArray
 
 @compiled
 def _kept(lost: float) -> float:
-    """The share of a yaw rate that slip leaves."""
+    """Return the share of a yaw rate that slip leaves."""
     return min(max(1.0 - lost, LEAST_TURN_LEFT), 1.0 / LEAST_TURN_LEFT)
 
 

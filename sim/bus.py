@@ -63,7 +63,7 @@ class BusFault(Protocol):
     """Decides the fate of each transmission, retransmissions included."""
 
     def fate(self, now_ns: int, sender: str, frame: CanFrame) -> FrameFate:
-        """Called once when `frame` starts on the wire."""
+        """Return what happens to `frame`; called once when it starts on the wire."""
 
 
 class DeliveredFrame(msgspec.Struct, frozen=True, gc=False):
@@ -140,7 +140,7 @@ class CanBus:
         order: TransmitOrder = TransmitOrder.PRIORITY,
         echo: bool = False,
     ) -> BusNode:
-        """A new node with room for `capacity` waiting frames; with `echo` it receives its own frames as well."""
+        """Return a new node with room for `capacity` waiting frames; with `echo` it receives its own frames as well."""
         if capacity < 1:
             raise ValueError("a node needs room for one frame at least")
         node = BusNode(name, capacity, order, echo)
@@ -178,7 +178,7 @@ class CanBus:
             self._recovering.append(node)
 
     def next_event_ns(self) -> int | None:
-        """When the bus next has something to do if nobody sends anything more; None if never."""
+        """Return when the bus next has something to do if no node sends anything more; None if never."""
         times = [self._delayed[0][0]] if self._delayed else []
         if self._out:
             times.append(self._now_ns)
@@ -278,7 +278,7 @@ class CanBus:
         self.busy_ns += self._bits_ns(bits)
 
     def _end(self, transmission: _Transmission) -> None:
-        """The last bit of a frame or of an error delimiter has passed: count, deliver or requeue."""
+        """Count, deliver or requeue after the last bit of a frame or of an error delimiter."""
         end_ns, senders, intact = transmission.end_ns, transmission.senders, transmission.intact
         self._on_wire = None
         self._free_ns = end_ns + self._interframe_ns
@@ -334,7 +334,7 @@ class CanBus:
         self._out.append(DeliveredFrame(self._now_ns, node, error_frame, (node,)))
 
     def _next_recovery_ns(self) -> int:
-        """When on an idle bus the first recovering node will have seen enough recessive bits."""
+        """Return when the first recovering node on an idle bus will have seen enough recessive bits."""
         seen = max(node.recessive_sequences or 0 for node in self._recovering)
         left_ns = self._bits_ns(RECESSIVE_SEQUENCE_BITS * (RECOVERY_SEQUENCES - seen))
         return max(self._idle_counted_ns + left_ns, self._now_ns)
@@ -363,7 +363,10 @@ def _delivery_time(delivery: DeliveredFrame) -> int:
 
 
 def _first_difference(frames: list[CanFrame]) -> int | None:
-    """The first bit in which frames sent at the same time under the same identifier differ; None if they are equal."""
+    """Return the first bit in which frames sent at the same time under the same identifier differ.
+
+    None if they are equal.
+    """
     if all(frame == frames[0] for frame in frames):
         return None
     sent = [stuffed_bits(frame) for frame in frames]

@@ -1,4 +1,4 @@
-"""Classic CAN: a frame as a value, SocketCAN bytes, a candump line and bits on the wire; and one controller of a bus.
+"""Frames of classic CAN as a value, SocketCAN bytes, a candump line and bits on the wire; and one controller of a bus.
 
 The bits give a frame's exact length with stuff bits and what decides arbitration. A controller has its transmit queue
 and its error confinement; it reports errors in the frames that Linux can-dev gives to a socket. Source: Bosch CAN
@@ -49,7 +49,7 @@ class CanFrame(msgspec.Struct, frozen=True, gc=False):
 
 
 def pack_frame(frame: CanFrame) -> bytes:
-    """The 16 bytes of Linux `struct can_frame` (include/uapi/linux/can.h), host byte order.
+    """Return the 16 bytes of Linux `struct can_frame` (include/uapi/linux/can.h), host byte order.
 
     Raises ValueError if the identifier or the data do not fit a classic frame.
     """
@@ -68,7 +68,7 @@ def pack_frame(frame: CanFrame) -> bytes:
 
 
 def unpack_frame(packet: bytes) -> CanFrame | None:
-    """The frame in a `struct can_frame`, or None if these bytes are none."""
+    """Return the frame in a `struct can_frame`, or None if these bytes are none."""
     if len(packet) != FRAME_BYTES:
         return None
     can_id, length, data = _FRAME.unpack(packet)
@@ -83,7 +83,10 @@ def unpack_frame(packet: bytes) -> CanFrame | None:
 
 
 def candump_line(t_ns: int, channel: str, frame: CanFrame) -> str:
-    """The frame as `candump -L` writes it, for example `(0.000270) can0 110#8D300000`; `t_ns` is printed in seconds."""
+    """Return the frame as `candump -L` writes it, for example `(0.000270) can0 110#8D300000`.
+
+    `t_ns` is printed in seconds.
+    """
     width = 8 if frame.extended or frame.error else 3
     can_id = frame.can_id | _ERROR_FLAG if frame.error else frame.can_id
     body = f"R{frame.remote_length}" if frame.remote else frame.data.hex().upper()
@@ -97,12 +100,12 @@ def controller_error_frame(tec: int, rec: int, state: int) -> CanFrame:
 
 
 def bus_off_frame() -> CanFrame:
-    """Error frame CAN_ERR_BUSOFF: this node has left the bus."""
+    """Return the error frame CAN_ERR_BUSOFF: this node has left the bus."""
     return CanFrame(0x040, bytes(8), error=True)
 
 
 def restarted_frame() -> CanFrame:
-    """Error frame CAN_ERR_RESTARTED: this node has come back from bus-off."""
+    """Return the error frame CAN_ERR_RESTARTED: this node has come back from bus-off."""
     return CanFrame(0x100, bytes(8), error=True)
 
 
@@ -127,9 +130,10 @@ def _make_crc_table() -> tuple[int, ...]:
 
 
 def _make_stuffing_table(bits: int) -> tuple[int, ...]:
-    """What `bits` more bits do, for [state << bits | value]: next state << 8 | stuff bits inserted.
+    """Build the table of bit stuffing for `bits` more bits.
 
-    A state is the last bit << 2 | the length of its run - 1.
+    Entry [state << bits | value] is next state << 8 | stuff bits inserted. A state is the last bit << 2 | the length of
+    its run - 1.
     """
     table = []
     for state in range(8):
@@ -155,7 +159,7 @@ _STUFFING_7 = _make_stuffing_table(7)
 
 
 def _head(can_id: int, extended: bool, remote: bool, length: int) -> tuple[int, int]:
-    """The bits from start of frame to the length code as an integer (the first bits are 0), and how many they are."""
+    """Return the bits from start of frame to the length code as an integer (leading zeros), and their number."""
     if extended:
         # SOF, 11 high bits, SRR and IDE recessive, 18 low bits, RTR, r1 and r0 dominant, DLC.
         return (can_id >> 18) << 27 | 3 << 25 | (can_id & 0x3FFFF) << 7 | remote << 6 | length, 39
@@ -164,7 +168,7 @@ def _head(can_id: int, extended: bool, remote: bool, length: int) -> tuple[int, 
 
 @lru_cache(maxsize=4096)
 def _after_head(can_id: int, extended: bool, remote: bool, length: int) -> tuple[int, int, int]:
-    """Where CRC and stuffing are after the head, which few frames do not share: bits, CRC, state << 8 | stuff bits."""
+    """Return CRC and stuffing after the head, which few frames do not share: bits, CRC, state << 8 | stuff bits."""
     head, bits = _head(can_id, extended, remote, length)
     padding = -bits % 8
     crc = 0
@@ -200,7 +204,7 @@ def frame_bits(frame: CanFrame) -> int:
 
 
 def stuffed_bits(frame: CanFrame) -> str:
-    """The bits on the wire from start of frame to the end of the CRC, stuff bits included, as '0' and '1'."""
+    """Return the bits on the wire from start of frame to the end of the CRC, stuff bits included, as '0' and '1'."""
     data = b"" if frame.remote else frame.data
     length = frame.remote_length if frame.remote else len(data)
     value, bits = _head(frame.can_id, frame.extended, frame.remote, length)
@@ -217,7 +221,7 @@ def stuffed_bits(frame: CanFrame) -> str:
 
 
 def arbitration_key(frame: CanFrame) -> int:
-    """The arbitration field as a number: of frames that start together the lowest wins (a dominant bit is 0)."""
+    """Return the arbitration field as a number: of frames that start together the lowest wins (a dominant bit is 0)."""
     can_id = frame.can_id
     if frame.extended:
         return (can_id >> 18) << 21 | 3 << 19 | (can_id & 0x3FFFF) << 1 | frame.remote
@@ -233,7 +237,7 @@ QueuedFrame = tuple[int, int, int, CanFrame]
 
 
 class TransmitOrder(enum.Enum):
-    """Which of its waiting frames a node sends first: the lowest identifier (mailboxes) or the oldest (a queue)."""
+    """Order in which a node sends its waiting frames: the lowest identifier (mailboxes) or the oldest (a queue)."""
 
     PRIORITY = "priority"
     FIFO = "fifo"
@@ -287,7 +291,7 @@ class BusNode:
         return len(self.queue) + (self.on_wire is not None)
 
     def push(self, sequence: int, frame: CanFrame) -> bool:
-        """Queue a frame; return False and count it if the queue is full or the node is bus-off."""
+        """Add a frame to the transmit queue; return False and count it if the queue is full or the node is bus-off."""
         if self.state is _BUS_OFF:
             self.refused_bus_off += 1
             return False
@@ -304,7 +308,7 @@ class BusNode:
         return self.on_wire[3]
 
     def count_sent(self) -> CanFrame | None:
-        """The frame on the wire went through."""
+        """Count the frame on the wire as sent; return an error frame where the error state changes."""
         self.sent += 1
         self.on_wire = None
         if not self.tec or self.state is _BUS_OFF:
@@ -313,7 +317,7 @@ class BusNode:
         return self._confine()
 
     def count_transmit_error(self, acknowledged: bool) -> CanFrame | None:
-        """The frame on the wire was destroyed, or nobody acknowledged it; it goes back to the queue."""
+        """Count the frame on the wire as destroyed or not acknowledged, and put it back into the queue."""
         self.transmit_errors += 1
         item, self.on_wire = self.on_wire, None
         if self.state is ErrorState.BUS_OFF or item is None:
@@ -326,14 +330,14 @@ class BusNode:
         return self._confine()
 
     def count_received(self) -> CanFrame | None:
-        """A frame of another node was received."""
+        """Lower the receive error count after a frame of another node; return an error frame if the state changes."""
         if not self.rec:
             return None
         self.rec = self.rec - 1 if self.rec < PASSIVE_LIMIT else 120
         return self._confine()
 
     def count_receive_error(self) -> CanFrame | None:
-        """A frame of another node was destroyed."""
+        """Raise the receive error count after a destroyed frame of another node."""
         self.rec = min(self.rec + 1, 255)
         return self._confine()
 

@@ -41,7 +41,7 @@ class EffectValue:
 
 @dataclass(frozen=True, slots=True)
 class EffectSpec:
-    """One effect: where it acts, its equation in words, its numbers; `lone` are the numbers a single value sets."""
+    """Specification of one effect: place, equation in words, numbers; `lone` are the numbers a single value sets."""
 
     name: str
     channel: str
@@ -283,7 +283,7 @@ class HiddenEffects:
     items: tuple[tuple[str, tuple[float, ...]], ...] = ()
 
     def values(self, name: str) -> tuple[float, ...]:
-        """All numbers of an effect in the order of its spec; the neutral ones if it is not hidden."""
+        """Return all numbers of an effect in the order of its spec; the neutral ones if it is not hidden."""
         for item_name, values in self.items:
             if item_name == name:
                 return values
@@ -328,7 +328,7 @@ def parse_hidden_effects(texts: Iterable[str]) -> HiddenEffects:
 
 
 def effects_table() -> str:
-    """Every effect with meaning, units and realistic sizes, as text for `--help`."""
+    """Return every effect with meaning, units and realistic sizes, as text for `--help`."""
     lines = []
     for channel in (_WHEEL, _BODY, _POSE):
         lines.append(f"{channel}:")
@@ -371,7 +371,7 @@ def _complete(spec: EffectSpec, numbers: tuple[float, ...]) -> tuple[float, ...]
 
 
 def _signature(spec: EffectSpec) -> str:
-    """How an effect is written, with what may be left out in brackets."""
+    """Return how an effect is written, with what may be left out in brackets."""
     if (len(spec.lone) == 1 and spec.lone[0] > 0) or len(spec.lone) > 1:
         names = ",".join(value.name for value in spec.values)
         return f"{spec.name}={'/'.join(spec.values[place].name for place in spec.lone)} or {spec.name}={names}"

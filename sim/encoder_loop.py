@@ -1,4 +1,4 @@
-"""What a vendor's motor loop makes of an encoder that does not report what its motor does.
+"""Motor loops of vendors' controllers with an encoder that does not report what its motor does.
 
 With a sound encoder the plant's own speed loop stands for the controller's, and nothing here acts. With a wrong one
 the wanted speed less the reported one drives a proportional-integral term that ends at full speed, as a RoboClaw's
@@ -22,7 +22,7 @@ LOCKED_RAD = 0.05
 
 
 class EncoderUse(enum.Enum):
-    """What a controller needs the encoder for that it reports."""
+    """Uses that a controller makes of the encoder that it reports."""
 
     SPEED = "it regulates the speed of a brushed motor by it"
     COMMUTATION = "it turns the field of a brushless motor by it"

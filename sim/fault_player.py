@@ -33,7 +33,7 @@ _BUSY = "import os; os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))\
 
 
 class FaultStep(NamedTuple):
-    """What changes at one instant."""
+    """Faults that begin and end at one instant."""
 
     begun: tuple[ScheduledFault, ...]
     ended: tuple[ScheduledFault, ...]
@@ -43,7 +43,7 @@ _NOTHING = FaultStep((), ())
 
 
 class FaultTimeline:
-    """Walks a schedule; `active` holds the faults in force, `done` says that nothing more will happen."""
+    """Iterator over a schedule; `active` holds the faults in force, `done` says that nothing more will happen."""
 
     def __init__(self, schedule: FaultSchedule) -> None:
         self.active: tuple[ScheduledFault, ...] = ()
@@ -190,7 +190,7 @@ class Injection:
         }
 
     def execute(self, text: str, now_ns: int) -> str:
-        """Obey one command; return "ok", what was asked for, or "error: " and why."""
+        """Execute one command; return "ok", what was requested, or "error: " and why."""
         name, *arguments = text.split() or [""]
         try:
             handler = self._handlers.get(name)
@@ -269,13 +269,13 @@ class CommandError(Exception):
 
 
 class ProcessFaults(Protocol):
-    """Whoever can do something to processes; a harness has all of them in its hands, the simulator few."""
+    """Protocol of faults of processes; a harness can fault all of them, the simulator few."""
 
     def begin(self, fault: ScheduledFault) -> None:
         """Let the fault begin."""
 
     def end(self, fault: ScheduledFault) -> None:
-        """Take it back."""
+        """Undo the effect of a fault."""
 
 
 class CpuHogs:
@@ -300,7 +300,7 @@ class CpuHogs:
             self._busy[fault.number] = [subprocess.Popen(command) for _ in range(fault["cores"])]
 
     def end(self, fault: ScheduledFault) -> None:
-        """End them."""
+        """Stop the fault's busy processes."""
         self._stop(fault.number)
 
     def _stop(self, number: int) -> None:

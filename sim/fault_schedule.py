@@ -1,4 +1,4 @@
-"""What goes wrong and when, as data: the kinds of faults, a schedule in TOML, and schedules drawn from a seed."""
+"""Schedules of faults as data: the kinds of faults, a schedule in TOML, and schedules sampled from a seed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class FaultFileError(Exception):
 
 
 class Site(enum.Enum):
-    """Where a fault strikes."""
+    """Sites at which a fault strikes."""
 
     FRAMES = "frames"
     LINK = "link"
@@ -162,7 +162,7 @@ class FaultSchedule:
 
 
 def parse_schedule(text: str, name: str = "schedule") -> FaultSchedule:
-    """The schedule of a TOML text, see `schedule_of`."""
+    """Return the schedule of a TOML text, see `schedule_of`."""
     try:
         return schedule_of(tomllib.loads(text), name)
     except (ValueError, RecursionError) as error:
@@ -170,10 +170,10 @@ def parse_schedule(text: str, name: str = "schedule") -> FaultSchedule:
 
 
 def schedule_of(table: Mapping[str, Any], name: str) -> FaultSchedule:
-    """The schedule of a TOML table: `seed` (0 if absent) and a table `[[fault]]` for each fault with `kind`, `at_s`,
-    `for_s` (only kinds that last) and the kind's parameters.
+    """Return the schedule of a TOML table.
 
-    `name` stands for the file in messages. Raises FaultFileError for a table that is none.
+    It has `seed` (0 if absent) and a table `[[fault]]` for each fault with `kind`, `at_s`, `for_s` (only kinds that
+    last) and the kind's parameters.
     """
     unknown = set(table) - {"seed", "fault"}
     if unknown:
@@ -188,7 +188,7 @@ def schedule_of(table: Mapping[str, Any], name: str) -> FaultSchedule:
 
 
 def in_order(faults: Sequence[ScheduledFault]) -> tuple[ScheduledFault, ...]:
-    """The faults by their beginnings, numbered from 1 in that order."""
+    """Return the faults by their beginnings, numbered from 1 in that order."""
     ordered = sorted(faults, key=lambda fault: (fault.begin_ns, fault.end_ns, fault.kind.name))
     return tuple(ScheduledFault(i, f.kind, f.begin_ns, f.end_ns, f.values) for i, f in enumerate(ordered, 1))
 

@@ -101,7 +101,7 @@ class Hub:
         return self._epoll.fileno()
 
     def next_event_ns(self) -> int | None:
-        """When `pump` is due even if no client does anything; None if never."""
+        """Return when `pump` is due even if no client does anything; None if never."""
         times = [t for t in (self.bus.next_event_ns(), self._plug_in_ns) if t is not None]
         times.extend(client.last_read_ns + READER_STALL_NS for client in self._held_up_by())
         return min(times) if times else None
@@ -115,7 +115,7 @@ class Hub:
         return self.advance(now_ns)
 
     def collect(self, now_ns: int) -> int:
-        """Serve the sockets; return how many frames of clients now wait to be let onto the bus."""
+        """Read and write all sockets; return how many frames of clients now wait to be let onto the bus."""
         self._now_ns = now_ns
         if self._plug_in_ns is not None and now_ns >= self._plug_in_ns:
             self._plug_in_ns = None
@@ -256,7 +256,7 @@ class Hub:
             self.stats.frames_out += 1
 
     def _held_up_by(self) -> list[_Client]:
-        """The readers for whom senders wait."""
+        """Return the readers for whom senders wait."""
         if self._pacing:
             return []
         return [
@@ -306,7 +306,7 @@ class HubLink:
 
     @property
     def address(self) -> str:
-        """The hub's socket."""
+        """Address of the hub's socket."""
         return f"unixcan {self.hub.path}"
 
     @property
@@ -315,16 +315,16 @@ class HubLink:
         return self._robot.error_counters
 
     def filenos(self) -> list[int]:
-        """The hub's epoll descriptor."""
+        """Return the hub's epoll descriptor."""
         return [self.hub.fileno()]
 
     def next_event_ns(self) -> int | None:
-        """When a frame ends, a restart is due, or clients may come back."""
+        """Return when a frame ends, a restart is due, or clients may come back."""
         times = [t for t in (self.hub.next_event_ns(), self._robot.restart_ns) if t is not None]
         return min(times) if times else None
 
     def collect(self, now_ns: int) -> int:
-        """Serve the sockets."""
+        """Read and write all sockets of the hub; return how many frames wait to be let onto the bus."""
         return self.hub.collect(now_ns)
 
     def advance(self, now_ns: int, admit: int | None = None) -> list[ReceivedFrame]:

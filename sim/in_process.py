@@ -32,7 +32,7 @@ class SimulatedCan:
 
     @property
     def address(self) -> str:
-        """There is none."""
+        """Description of the bus, which has no address."""
         return "simulated CAN bus"
 
     @property
@@ -41,15 +41,15 @@ class SimulatedCan:
         return self.robot.error_counters
 
     def filenos(self) -> list[int]:
-        """None: nothing comes from outside."""
+        """Return no descriptors: nothing comes from outside."""
         return []
 
     def next_event_ns(self) -> int | None:
-        """When the bus has something to do."""
+        """Return when the bus has something to do."""
         return self.bus.next_event_ns()
 
     def collect(self, now_ns: int) -> int:
-        """Nothing comes from outside."""
+        """Return 0, because no frames come from outside."""
         return 0
 
     def advance(self, now_ns: int, admit: int | None = None) -> list[ReceivedFrame]:
@@ -87,7 +87,7 @@ class SimulatedCan:
         return f"error_frames={self.bus.error_frames} host: {self.host.stats}"
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing, because the bus holds no resources."""
 
 
 class HostTransport:
@@ -105,7 +105,7 @@ class HostTransport:
 
     @property
     def name(self) -> str:
-        """Medium and address."""
+        """Name of the medium, which has no address."""
         return "simulated CAN"
 
     @property
@@ -131,12 +131,12 @@ class HostTransport:
         return self._last_error
 
     def open(self) -> None:
-        """Connect."""
+        """Connect the host to the bus."""
         self._open = True
         self._connect()
 
     def close(self) -> None:
-        """Disconnect; safe to call twice."""
+        """Disconnect the host from the bus; safe to call twice."""
         self._leave()
         self._open, self._reopen_ns = False, None
 
@@ -156,7 +156,7 @@ class HostTransport:
         return True
 
     def receive(self) -> Sequence[ReceivedFrame]:
-        """All frames received since the last call, oldest first."""
+        """Return all frames received since the last call, oldest first."""
         received = tuple(self._incoming)
         self._incoming.clear()
         return received

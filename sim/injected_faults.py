@@ -50,7 +50,7 @@ class FrameFaults:
         self._active = tuple(f for f in active if f.kind.site is Site.FRAMES or f.kind.name == "one_way")
 
     def fate(self, now_ns: int, sender: str, frame: CanFrame) -> FrameFate:
-        """What becomes of one frame on its way; frames of the node "robot" go to the host, all others to the robot."""
+        """Return what happens to one frame; frames of the node "robot" go to the host, all others to the robot."""
         if self.break_next:
             self.break_next, self.broken = False, True
             return FrameFate(wire_error_bit=LONGEST_FRAME_BITS // 2, cut=True)
@@ -148,7 +148,7 @@ class RobotFaults:
         return made["left"], made["right"]
 
     def poses(self, now_us: int, measured: Sequence[PoseMeasurement]) -> Sequence[PoseMeasurement]:
-        """What becomes of the poses measured by `now_us` of robot time."""
+        """Return the poses that the faults let through by `now_us` of robot time, changed or delayed."""
         if not self.active and not self._late:
             if measured:
                 self._last_pose = measured[-1]
@@ -163,7 +163,7 @@ class RobotFaults:
         return due
 
     def inputs(self, inputs: FirmwareInputs, setpoints: tuple[float, float], driver_enabled: bool) -> FirmwareInputs:
-        """What the controller measures; `setpoints` are what it asked for (rad/s)."""
+        """Return the measurements of the controller under the faults; `setpoints` are what it requested (rad/s)."""
         if not self._touched and not self.active:
             return inputs
         ticks = [inputs.left_ticks, inputs.right_ticks]
@@ -220,7 +220,7 @@ class RobotFaults:
         return pose
 
     def _sort_out(self) -> None:
-        """What each cycle asks of the active faults, found once."""
+        """Look up, once for all cycles, what each cycle needs of the active faults."""
         self._by_wheel = {
             kind: {fault["wheel"]: fault for fault in self.active if fault.kind.name == kind} for kind in _OF_ONE_WHEEL
         }

@@ -1,4 +1,4 @@
-"""The physical robot: wheel-speed setpoints in, encoder ticks, poses and motor readings out; the truth for scoring.
+"""Simulation of the physical robot: wheel setpoints in, encoder ticks, poses and motor readings out; and the truth.
 
 Command -> wheels -> encoders and body -> pose sensor, integrated on an absolute time grid of `integration_step_us`.
 Everything random comes from the seed; disturbances belong to cells of that grid, so that the trajectory does not depend
@@ -30,7 +30,7 @@ _available_us = attrgetter("available_us")
 
 
 class TrueState(msgspec.Struct, frozen=True, gc=False):
-    """What is so at plant time `t_us`, known to nobody on board.
+    """True state of the robot at plant time `t_us`, which nothing on board knows.
 
     Pose of the tracked point in the world frame (m, rad; yaw in (-pi, pi]); wheel speeds (rad/s); velocity of the
     tracked point in the body frame: forward, left (m/s), yaw rate (rad/s).
@@ -79,7 +79,7 @@ class Plant:
 
     @property
     def now_us(self) -> int:
-        """Plant time, us."""
+        """Plant time in us, from the start."""
         return self._now_us
 
     @property

@@ -1,4 +1,4 @@
-"""What a plant is made of: geometry, motors, sensors, battery, disturbances; and plants drawn from a posterior."""
+"""Parameters of a plant: geometry, motors, sensors, battery, disturbances; and plants sampled from a posterior."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class DrawError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class PlantParameters:
-    """The true robot; the geometry's defaults are the posterior mean of the paper's appendix (skid-steer table).
+    """Parameters of the true robot; geometry defaults are the posterior mean of the paper's appendix.
 
     Geometry: the tracked point is the origin of the body frame, x forward, y left; it lies `x_icr_m` behind the line
     on which the instantaneous centre of rotation moves. Standard deviations are of stationary processes; a probability
@@ -123,7 +123,7 @@ class PlantParameters:
             self._check(field.name, getattr(self, field.name))
 
     def noiseless(self) -> PlantParameters:
-        """The same robot in a world without disturbances, sensor noise, jitter and losses (ticks stay whole)."""
+        """Return the parameters without disturbances, sensor noise, jitter and losses (ticks stay whole)."""
         return replace(
             self,
             wheel_disturbance_std=0.0,
@@ -141,7 +141,7 @@ class PlantParameters:
         )
 
     def with_ideal_motors(self) -> PlantParameters:
-        """The same robot with wheels that turn exactly as commanded: only a hidden effect lags or limits them."""
+        """Return the parameters with wheels that turn as commanded: only a hidden effect lags or limits them."""
         return replace(
             self,
             speed_loop_time_constant_s=0.0,

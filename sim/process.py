@@ -1,4 +1,4 @@
-"""What processes of `sim` need of the operating system: stop signals, records that may fail, sockets, text commands.
+"""Services of the operating system for processes of `sim`: stop signals, records that may fail, sockets, text commands.
 
 `python -m sim.process SOCKET COMMAND...` sends one command: to a virtual robot run with `--inject SOCKET`.
 """
@@ -22,7 +22,7 @@ from sim.sensors import PoseMeasurement
 
 
 class StopSignal:
-    """From its making on, SIGTERM and SIGINT set `requested` and make `fileno()` readable; main thread only."""
+    """Stop request by SIGTERM or SIGINT: sets `requested` and makes `fileno()` readable; main thread only."""
 
     def __init__(self) -> None:
         self.requested = False
@@ -79,7 +79,7 @@ class SocketPathError(Exception):
 
 
 def bind_private(path: Path, kind: socket.SocketKind) -> socket.socket:
-    """A non-blocking Unix socket of `kind` bound to `path` with file mode 0600; a stale socket file is replaced.
+    """Return a non-blocking Unix socket of `kind` bound to `path` with file mode 0600; a stale socket file is replaced.
 
     A connection-oriented socket listens. Raises SocketPathError with one line that names the path and the remedy.
     """
@@ -114,7 +114,7 @@ def _remove_stale(path: Path, kind: socket.SocketKind) -> None:
 
 
 class PoseSender:
-    """To one address; what cannot be sent is lost, as on a network."""
+    """Sender of poses to one address; what cannot be sent is lost, as on a network."""
 
     def __init__(self, address: tuple[str, int]) -> None:
         self._address = address
@@ -137,7 +137,7 @@ class PoseSender:
             self._socket.sendto(text.encode(), self._address)
 
     def close(self) -> None:
-        """Close the socket."""
+        """Close the sender's socket."""
         self._socket.close()
 
 
@@ -172,7 +172,7 @@ class CommandSocket:
                 self.lost_replies += 1
 
     def close(self) -> None:
-        """Remove the socket; safe to call twice."""
+        """Close and remove the socket; safe to call twice."""
         self._socket.close()
         self._path.unlink(missing_ok=True)
 

@@ -45,7 +45,7 @@ class PythonCanLink:
 
     @property
     def address(self) -> str:
-        """Interface and channel."""
+        """Address as interface and channel."""
         return f"{self._interface} {self._channel}"
 
     @property
@@ -54,7 +54,7 @@ class PythonCanLink:
         return 0, 0
 
     def filenos(self) -> list[int]:
-        """The bus's descriptor where it has one; without it the bus is looked at in every step."""
+        """Return the bus's descriptor where it has one; without it the bus is looked at in every step."""
         with contextlib.suppress(NotImplementedError, can.CanError, OSError):
             if self._bus is not None:
                 descriptor = self._bus.fileno()
@@ -62,7 +62,7 @@ class PythonCanLink:
         return []
 
     def next_event_ns(self) -> int | None:
-        """When the bus is opened again."""
+        """Return when the bus is opened again."""
         return self._retry_ns
 
     def collect(self, now_ns: int) -> int:
@@ -88,7 +88,7 @@ class PythonCanLink:
         return [ReceivedFrame(now_ns, self._waiting.popleft()) for _ in range(count)]
 
     def send(self, frames: Sequence[Frame]) -> None:
-        """Send without waiting; what the bus does not take is counted and lost."""
+        """Send frames without waiting; what the bus does not take is counted and lost."""
         for frame in frames:
             if self._bus is None:
                 self.send_failures += 1
@@ -110,7 +110,7 @@ class PythonCanLink:
         self._retry_ns = until_ns
 
     def force_bus_off(self, who: str) -> None:
-        """A controller cannot be made to fail through python-can."""
+        """Raise LinkFaultError, because a controller cannot be made to fail through python-can."""
         raise LinkFaultError(f"bus_off {who}: only on the simulator's own bus (interface unixcan)")
 
     def babble(self, frame: Frame) -> None:
@@ -118,7 +118,7 @@ class PythonCanLink:
         self.send((frame,))
 
     def tamper(self, fault: BusFault) -> None:
-        """The frames of somebody else's bus cannot be changed."""
+        """Raise LinkFaultError, because the frames of a foreign bus cannot be changed."""
         raise LinkFaultError("faults: only on the simulator's own bus (interface unixcan) or a serial line")
 
     def summary(self) -> str:
@@ -129,7 +129,7 @@ class PythonCanLink:
         )
 
     def close(self) -> None:
-        """Leave the bus."""
+        """Leave the CAN bus."""
         self._shut_down()
 
     def _open(self) -> can.BusABC:
@@ -169,7 +169,7 @@ class PythonCanLink:
 
 
 class JoinError(Exception):
-    """What cannot be joined; the message is one line for the user."""
+    """Exception for a bus that cannot be joined; the message is one line for the user."""
 
 
 def joined(words: Sequence[str], now_ns: int, bitrate: int) -> PythonCanLink:

@@ -1,4 +1,4 @@
-"""The robot's sensors: wheel encoders, a pose sensor, and readings of current, voltage and temperature.
+"""Sensors of the robot: wheel encoders, a pose sensor, and readings of current, voltage and temperature.
 
 The pose sensor is one as motion capture or scan matching: sampled, noisy, late, and sometimes wrong or silent.
 """
@@ -28,7 +28,7 @@ BATTERY_HEATING = 0.02
 
 
 class Encoders:
-    """Both encoders, left and right.
+    """Encoders of the left and right wheel.
 
     Ticks are cumulative and never wrap here; the width of a counter is its reader's affair. The speed comes from a
     second-order tracking observer of the ticks (critically damped, rad/s), held at zero below what one tick can mean.
@@ -173,7 +173,7 @@ class SampledPoseSensor:
 
 
 def wrapped(angle_rad: float) -> float:
-    """The same angle in (-pi, pi]."""
+    """Return the same angle in (-pi, pi]."""
     turn = math.remainder(angle_rad, 2.0 * math.pi)
     return math.pi if turn == -math.pi else turn
 
@@ -226,7 +226,7 @@ class Electrics:
         )
 
     def _warmed(self, now_c: float, heat_w: float, cooled: float) -> float:
-        """A motor's temperature on its way to where this heat keeps it."""
+        """Return a motor's temperature on its way to where this heat keeps it."""
         p = self._parameters
         rise_k = p.motor_thermal_resistance_k_per_w * heat_w
         return p.ambient_temperature_c + rise_k + (now_c - p.ambient_temperature_c - rise_k) * cooled

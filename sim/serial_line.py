@@ -108,11 +108,11 @@ class SerialLine:
         return 0, 0
 
     def filenos(self) -> list[int]:
-        """The terminal while a host has it open: a closed one stays readable for ever."""
+        """Return the terminal while a host has it open: a closed one stays readable for ever."""
         return [self._master] if self._connected else []
 
     def next_event_ns(self) -> int | None:
-        """When the next frame has passed or the line is plugged in again."""
+        """Return when the next frame has passed or the line is plugged in again."""
         times = [self._plug_in_ns] if self._plug_in_ns is not None else []
         if self._to_robot:
             times.append(self._to_robot[0].t_ns)
@@ -183,7 +183,7 @@ class SerialLine:
         self._plug_in_ns = until_ns
 
     def force_bus_off(self, who: str) -> None:
-        """A serial line knows no bus-off."""
+        """Raise LinkFaultError, because a serial line has no bus-off."""
         raise LinkFaultError(f"bus_off {who}: a serial line has no bus-off")
 
     def babble(self, frame: Frame) -> None:
@@ -292,7 +292,7 @@ class SerialLine:
 
 
 def _damaged(encoded: bytes, fate: FrameFate) -> bytes:
-    """What of an encoded frame reaches the other end: all, one bit turned, or its beginning."""
+    """Return the bytes of an encoded frame that reach the other end: all, one bit turned, or its beginning."""
     if fate.wire_error_bit is None:
         return encoded
     place = fate.wire_error_bit % (8 * len(encoded))

@@ -53,7 +53,7 @@ class UnixCanBus(can.BusABC):
         return self._socket.fileno()
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Queue one frame; wait at most `timeout` seconds for room (None: for ever, 0: not at all).
+        """Put one frame into the queue; wait at most `timeout` seconds for room (None: for ever, 0: not at all).
 
         Raises `can.CanOperationError` (ENOBUFS when there was no room in time), ValueError for a CAN FD message.
         """

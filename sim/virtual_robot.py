@@ -46,7 +46,7 @@ class Robot(Protocol):
 
     @property
     def outputs(self) -> FirmwareOutputs:
-        """What the controller wanted in the last cycle."""
+        """Outputs of the controller in the last cycle."""
 
     @property
     def truth(self) -> TrueState:
@@ -65,13 +65,13 @@ class Robot(Protocol):
         """Set the controller's clock."""
 
     def reboot(self, cause: ResetCause = ResetCause.POWER_ON) -> None:
-        """Restart the controller."""
+        """Restart the robot's controller."""
 
 
 def sensor_inputs(
     plant: Plant, estop_button: bool, error_counters: tuple[int, int], reset_cause: ResetCause
 ) -> FirmwareInputs:
-    """What a controller's sensors say of the plant, its button and its link (transmit and receive errors) now."""
+    """Return the inputs of a controller now: its sensors, button, and link (transmit and receive errors)."""
     left_ticks, right_ticks = plant.encoder_ticks
     left_speed, right_speed = plant.measured_wheel_speeds_rad_s
     left_current, right_current = plant.motor_currents_a
@@ -120,11 +120,11 @@ class Controller(Protocol):
 
     @property
     def state(self) -> str:
-        """In one word, for the truth record."""
+        """State in one word, for the truth record."""
 
     @property
     def obeyed(self) -> int:
-        """How many speed commands it has taken."""
+        """Number of speed commands accepted since power-on."""
 
     def receive(self, now_us: int, frame: CanFrame) -> Sequence[CanFrame]:
         """Take in one frame; return the replies."""
@@ -137,7 +137,11 @@ class Controller(Protocol):
 
 
 class VendorRobot:
-    """Satisfies `Robot`. `pose_sink` gets each measured pose and the robot time (us) at which it is there."""
+    """Virtual robot with a vendor's controllers.
+
+    `pose_sink` gets each measured pose and the robot time (us) at which it is there. `pose_sink` gets each measured
+    pose and the robot time (us) at which it is there.
+    """
 
     def __init__(
         self,
@@ -166,7 +170,7 @@ class VendorRobot:
 
     @property
     def outputs(self) -> FirmwareOutputs:
-        """What the controller wants now, in the words of the reference firmware."""
+        """Outputs of the controller now, in the terms of the reference firmware."""
         left, right = self.controller.wheels_rad_s
         driven = left is not None or right is not None
         return FirmwareOutputs(
@@ -206,14 +210,14 @@ class VendorRobot:
         self.plant.kidnap(dx_m, dy_m, dyaw_rad)
 
     def jump_clock(self, step_us: int) -> None:
-        """Nothing: these controllers send no time."""
+        """Do nothing, because these controllers send no time."""
 
     def reboot(self, cause: ResetCause = ResetCause.POWER_ON) -> None:
-        """Restart the controller: it forgets everything, and the wheels roll until the next command."""
+        """Restart the controllers, which lose their state; the wheels roll until the next command."""
         self.controller.restart()
 
     def _setpoints(self, wanted: tuple[float | None, float | None]) -> tuple[float, float]:
-        """What the plant is given: a side that is released beside one that is driven keeps its own speed."""
+        """Return the plant's setpoints (rad/s); a released side beside a driven one keeps its own speed."""
         truth = self.plant.truth
         given = []
         for side, (speed, own) in enumerate(
@@ -260,7 +264,7 @@ class ControllerClock:
     skew_ppm: float = 40.0
 
     def at(self, robot_us: int) -> int:
-        """What the counter shows at robot time `robot_us`."""
+        """Return the counter's value (us) at robot time `robot_us`."""
         return self.start_us + robot_us + round(robot_us * self.skew_ppm * 1e-6)
 
 
@@ -300,7 +304,7 @@ class VirtualRobot:
 
     @property
     def outputs(self) -> FirmwareOutputs:
-        """What the firmware wanted in the last cycle."""
+        """Outputs of the firmware in the last cycle."""
         return self._outputs
 
     @property
@@ -314,7 +318,7 @@ class VirtualRobot:
         return self.plant.truth
 
     def device_us(self, robot_us: int) -> int:
-        """What the controller's clock shows at robot time `robot_us`."""
+        """Return the time (us) of the controller's clock at robot time `robot_us`."""
         return self._clock.at(robot_us - self._clock_start_us)
 
     def receive(self, now_us: int, frame: Frame) -> None:
@@ -360,7 +364,7 @@ class VirtualRobot:
         self._clock = ControllerClock(self._clock.start_us + max(step_us, -largest_us), self._clock.skew_ppm)
 
     def reboot(self, cause: ResetCause = ResetCause.POWER_ON) -> None:
-        """Restart the controller: it forgets everything, its clock begins anew, the wheels brake until it is up."""
+        """Restart the controller, which loses its state: its clock begins again, the wheels brake until it is up."""
         last_entropy, self._entropy = self._entropy, self._draw_entropy()
         self._reset_cause = cause
         self._clock_start_us = self.plant.now_us
@@ -376,7 +380,7 @@ class VirtualRobot:
 
 
 def truth_row(robot: Robot, t_ns: int) -> str:
-    """The values of `TRUTH_COLUMNS` at the last step, which was at the monotonic time `t_ns`, separated by commas."""
+    """Return the values of `TRUTH_COLUMNS` at the last step, at the monotonic time `t_ns`, separated by commas."""
     truth, outputs = robot.truth, robot.outputs
     return (
         f"{t_ns},{truth.x_m:.6f},{truth.y_m:.6f},{truth.yaw_rad:.6f},"

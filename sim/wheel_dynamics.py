@@ -1,4 +1,4 @@
-"""From wheel-speed setpoints to wheel angles: command handling, speed profile, PI loop, friction, brake.
+"""Dynamics of the wheels, from speed setpoints to angles: command handling, speed profile, PI loop, friction, brake.
 
 Each motor follows a speed profile w* (first-order lag of the command with limited acceleration, or what a hidden
 effect makes of it). The tracking error e = w - w* obeys J e' = (torque limited - torque asked) - k e + z - load - b e,
@@ -76,7 +76,7 @@ _WHEEL = np.dtype(
 
 @dataclass(frozen=True, slots=True)
 class WheelPieces:
-    """What `WheelMotors.advance` fills: the ends of its integration pieces (us) and the wheel angles there (rad).
+    """Result of `WheelMotors.advance`: the ends of its integration pieces (us) and the wheel angles there (rad).
 
     times_us: shape (capacity,); angles: shape (capacity, 2), left and right.
     """
@@ -86,7 +86,7 @@ class WheelPieces:
 
 
 class WheelMotors:
-    """Both wheels with motors and command handling."""
+    """Motors of both wheels with their command handling."""
 
     def __init__(self, parameters: PlantParameters, effects: HiddenEffects, capacity: int) -> None:
         self.pieces = WheelPieces(np.zeros(capacity, dtype=np.int64), np.zeros((capacity, 2)))

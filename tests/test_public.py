@@ -93,7 +93,7 @@ def test_a_log_becomes_a_table(tmp_path):
 
 
 def run(program, directory, timeout_s=120):
-    """What a program prints that is run in a directory."""
+    """Return what a program prints that is run in a directory."""
     done = subprocess.run(
         [sys.executable, "-c", program],
         cwd=directory,

@@ -1,4 +1,4 @@
-"""Who follows a line best on robots whose parameters are wrong: classical followers and DISCO, on foreign robots.
+"""Comparison of classical followers and DISCO on a line, on foreign robots whose parameters are wrong.
 
 Wheel radius, axle and x_icr of every robot are off by up to 15 %, and nobody is told; the motors' lag and dead band are
 known to all. From rest on the line; figures are of 5 to 30 s, at 50 plans a second. The gains of the classical ones

@@ -65,7 +65,7 @@ _OPERATED = frozenset({
 
 
 def unnamed(page):
-    """Of what can be operated, what a screen reader has no name for, or what no key reaches; by Chromium's own tree."""
+    """Return the controls that a screen reader has no name for, or that no key reaches; by Chromium's own tree."""
     session = page.context.new_cdp_session(page)
     found = []
     for node in session.send("Accessibility.getFullAXTree")["nodes"]:

@@ -26,7 +26,7 @@ QUIET_AT_END_S = 5.0
 
 
 def run_seed(seed: int, duration_s: float, cycle_us: int, planner: str) -> dict[str, Any]:
-    """One run; returns its figures as plain data."""
+    """Run one seed; return its figures as plain data."""
     from disco_hw.runtime.assembly import make_planner  # noqa: PLC0415 - in the worker, after its niceness is set
     from disco_hw.runtime.robot_setup import load_setup  # noqa: PLC0415
     from sim.fault_schedule import KINDS, random_schedule  # noqa: PLC0415

@@ -72,7 +72,7 @@ _BY_CHANCE = {"fusion.poses_gated": 1}
 
 
 class CirclingPlanner:
-    """In the place of DISCO where the planner is not what is tried: goes round the task's circle, for microseconds."""
+    """Planner that goes round the task's circle in microseconds, where DISCO is not what is tried."""
 
     STEPS = 10
     LOOK_AHEAD_RAD = 0.35
@@ -107,10 +107,10 @@ class CirclingPlanner:
         """The circle stays as it is."""
 
     def set_belief(self, belief: Belief) -> None:
-        """It steers by what it sees."""
+        """Do nothing, because it steers by what it sees."""
 
     def sampled_rollouts(self, count: int) -> Rollouts:
-        """Raise NoValidControl: nothing is sampled."""
+        """Raise NoValidControl, because nothing is sampled."""
         raise NoValidControl("this planner samples nothing")
 
 
@@ -121,7 +121,7 @@ class Attendant:
         self._last_ns = 0
 
     def requests(self, now_ns: int, last: CoreTick | None) -> tuple[UserRequest, ...]:
-        """What the person asks for in this tick."""
+        """Return the requests of the operator in this tick."""
         if last is None or now_ns - self._last_ns < 400_000_000:
             return ()
         match last.output.state:
@@ -201,7 +201,7 @@ class FaultOutcome:
 
 @dataclass
 class FaultRunResult:
-    """What one run showed."""
+    """Result of one run with faults."""
 
     moving_s: float = 0.0
     commands_seen: int = 0
@@ -272,7 +272,7 @@ class FaultRun:
         self._start_daemon()
 
     def run(self, duration_s: float) -> FaultRunResult:
-        """Let time pass."""
+        """Advance robot and daemon by a duration; return the result so far."""
         end_us = self.now_us + round(duration_s * 1e6)
         can, robot, player, monitor, cycle_us = self.can, self.robot, self._player, self.monitor, self._cycle_us
         wheels = (0.0, 0.0)

@@ -28,7 +28,9 @@ NOMINAL = (0.061, 0.415, 0.238)
 
 @dataclass(frozen=True, slots=True)
 class ForeignRobot:
-    """What the plant is made of: SI units. `grip_std` is slip as a part of the speed, correlated over `grip_s`.
+    """Parameters of the plant in SI units: `grip_std` is slip as a part of the speed, correlated over `grip_s`.
+
+    `grip_std` is slip as a part of the speed, correlated over `grip_s`.
 
     `believed`: the wheel radius, axle and x_icr that controllers are given of it.
     """
@@ -113,7 +115,7 @@ class ForeignPlant:
 
     @property
     def pose(self) -> tuple[float, float, float]:
-        """True pose."""
+        """True pose of the robot: x, y (m), yaw (rad)."""
         x, y, yaw = self.state[:3].tolist()
         return x, y, yaw
 
@@ -130,11 +132,14 @@ class ForeignPlant:
 
     @property
     def now_ns(self) -> int:
-        """Time."""
+        """Time of the plant, ns."""
         return self.now_ms * 1_000_000
 
     def readings(self) -> Readings:
-        """What the sensors say at this time: wheels every 20 ms, poses every 40 ms, some time after they were true."""
+        """Return the sensors' samples at this time.
+
+        Wheels every 20 ms, poses every 40 ms, some time after they were true.
+        """
         wheels, poses = [], []
         if self.now_ms % _SAMPLES_EVERY == 0:
             tick = 2.0 * math.pi / self.robot.ticks

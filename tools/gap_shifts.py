@@ -93,8 +93,9 @@ def moved(log: DriveLog, part: str, by_s: float) -> DriveLog:
 def compare(
     log: str, part: str, searched: Mapping[float, ChannelResult], columns: Sequence[str], names: Sequence[str]
 ) -> Iterator[Shift]:
-    """The moves of one part of a log against the log itself, which was moved by 0; commands that are late shorten the
-    answer.
+    """The moves of one part of a log against the log itself, which was moved by 0.
+
+    Commands that are late shorten the answer.
     """
     plain, sign = searched[0.0], -1.0 if part == "commands" else 1.0
     for by_s, one in searched.items():

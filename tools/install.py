@@ -30,7 +30,7 @@ AS_UV_SAYS_IT = (
 
 
 def uv_variables(pip_settings: str) -> dict[str, str]:
-    """uv's environment variables that say the same as the lines of `pip config list`.
+    """Environment variables of uv that say the same as the lines of `pip config list`.
 
     A setting of the environment (`:env:.`) comes before one for a command (`install.`), and that before a general one.
     """

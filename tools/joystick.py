@@ -1,4 +1,4 @@
-"""How a person drives a robot that is tried out: with the stick of a joystick, or with the keys of a keyboard."""
+"""Hand-driven commands for a robot that is tried out: with the stick of a joystick, or with the keys of a keyboard."""
 
 from __future__ import annotations
 

@@ -137,7 +137,7 @@ class _Shown(HTMLParser):
 
 
 def in_html(source: str, name: str) -> Iterator[Message]:
-    """What a page shows, labels and says."""
+    """Yield the texts that a page shows, labels and says."""
     parser = _Shown()
     parser.feed(source)
     for line, text in parser.found:

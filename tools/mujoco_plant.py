@@ -56,12 +56,12 @@ class MujocoPlant:
 
     @property
     def now_ms(self) -> int:
-        """Time."""
+        """Time of the plant, ms."""
         return self._sensors.now_ms
 
     @property
     def now_ns(self) -> int:
-        """Time."""
+        """Time of the plant, ns."""
         return self._sensors.now_ns
 
     @property
@@ -76,7 +76,7 @@ class MujocoPlant:
         return float(self._data.qvel[0] * math.cos(yaw_rad) + self._data.qvel[1] * math.sin(yaw_rad))
 
     def readings(self) -> Readings:
-        """What the sensors say at this time."""
+        """Return the sensors' samples at this time."""
         return self._sensors.readings()
 
     def advance(self, left_rad_s: float, right_rad_s: float, count: int, /) -> None:

@@ -61,7 +61,7 @@ Hidden = dict[str, float]
 
 @dataclass(frozen=True, slots=True)
 class Habits:
-    """How a robot is driven, and how its host logs that: one of so many commands, readings and poses that there are.
+    """Habits of a driver and a log: one of so many commands, readings and poses that there are is kept.
 
     A joystick or the keys of a keyboard ask for `pace` of what the robot can. Stamps are late at random, by half a
     normal distribution of `jitter_s`; a share of readings and of poses is lost.
@@ -79,7 +79,7 @@ class Habits:
 
 @dataclass(frozen=True, slots=True)
 class Robot:
-    """One robot: its sizes in m and kg, its servos, encoders and poses; `sizes`: of what is hidden, where not as usual.
+    """Robot with its sizes in m and kg, its servos, encoders and poses; `sizes`: of what is hidden, where not as usual.
 
     `half_m`: half the base's length, width and height; `above_m`: of its middle above the wheels'; `rotor_kg_m2`: of a
     motor, seen from its wheel; `payload_m`: half the edge of the box that is put on, and where.
@@ -212,7 +212,7 @@ _PAYLOAD = '<geom type="box" size="{half} {half} {half}" mass="{kg}" pos="0 {asi
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What was measured, and the truth beside it.
+    """Recording of a drive with the truth beside it.
 
     Times in s from the start, as stamped; commands and counted angles (N, 2), left and right, in rad/s and rad; poses
     (P, 3) in m and rad. `truth`: where the robot was at `truth_s`, (T, 3), its yaw not wrapped; `turned`: its wheels'

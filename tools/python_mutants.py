@@ -327,7 +327,7 @@ def touched_by(name: str) -> set[str]:
 
 @dataclass(frozen=True)
 class Trial:
-    """How mutants of one file are tried: the modules that have to be imported anew, and a folder for its text."""
+    """Trial of mutants of one file: the modules that have to be imported again, and a folder for its text."""
 
     name: str
     file: Path

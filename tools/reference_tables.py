@@ -65,7 +65,7 @@ def settings_table(name: str, present: str) -> str:
 
 
 def allowed(kind: inspect.Type) -> str:
-    """What a value may be, in the fewest words."""
+    """Return the allowed values of a type, in the fewest words."""
     match kind:
         case inspect.Metadata():
             return allowed(kind.type)

@@ -33,7 +33,7 @@ BEGIN, END = "<!-- begin: written by `python -m tools.results` -->", "<!-- end -
 
 
 def machine() -> dict[str, Any]:
-    """What figures have to be read with: the day (UTC), the state of the code, processor, cores, Python, load."""
+    """Return the conditions of a measurement: the day (UTC), the state of the code, processor, cores, Python, load."""
     changed = _git("status", "--porcelain", "--untracked-files=no")
     return {
         "date": datetime.now(UTC).strftime("%d %b %Y"),
@@ -86,7 +86,7 @@ def _numbers(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
 
 
 def measured(kept: Mapping[str, Mapping[str, Any]]) -> str:
-    """Markdown: a table for each command, the quantiles of one figure in one row."""
+    """Return Markdown with a table for each command, the quantiles of one figure in one row."""
     lines: list[str] = []
     for command, run in sorted(kept.items()):
         where = f"{run['date']}, `{run['commit']}`, {run['cpu']}, {run['cores']} cores, Python {run['python']}"

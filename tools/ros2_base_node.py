@@ -38,7 +38,7 @@ RELIABLE = Qos(Policy.Reliability.Reliable(0), Policy.History.KeepLast(10))
 
 
 class BaseNode:
-    """The base: its plant, its own kinematics, and its topics."""
+    """Base on ROS 2 with its plant, its own kinematics, and its topics."""
 
     def __init__(self, config: RobotConfig, settings: Ros2BaseSettings, plant: Plant) -> None:
         self.settings, self.plant = settings, plant
@@ -68,12 +68,12 @@ class BaseNode:
         return self._said if now_s - self._said_s <= self.settings.watchdog_s else (0.0, 0.0)
 
     def wheels_of(self, speeds: tuple[float, float]) -> tuple[float, float]:
-        """What its controller makes of speeds of the body, by the nominal geometry."""
+        """Return the wheel speeds of speeds of the body, by the nominal geometry."""
         half = 0.5 * self.settings.track_m * speeds[1]
         return (speeds[0] - half) / self.settings.wheel_radius_m, (speeds[0] + half) / self.settings.wheel_radius_m
 
     def say(self) -> None:
-        """How the wheels are now."""
+        """Publish the wheels' state now."""
         if self.silent:
             return
         per_tick = math.tau / self.plant.parameters.ticks_per_rev

@@ -50,7 +50,7 @@ class ScriptedDrive:
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """What a driver may ask of the robot: largest wheel speed (rad/s), and how often commands are given (Hz).
+    """Limits of a driver's requests: largest wheel speed (rad/s), and how often commands are given (Hz).
 
     Raises ValueError if either is not a positive number.
     """
@@ -88,11 +88,11 @@ class _Tape:
         self._phase += [phase] * count
 
     def hold(self, phase: str, seconds: float, speed: float, turn: float, sharp: bool = False) -> None:
-        """Append constant speeds."""
+        """Append a phase of constant speeds."""
         self.play(phase, seconds, _constant(speed), _constant(turn), sharp)
 
     def rest(self, seconds: float = REST_S) -> None:
-        """Append standstill."""
+        """Append a phase of standstill."""
         self.hold("rest", seconds, 0.0, 0.0)
 
     def drive(self, name: str, steady: bool = False) -> ScriptedDrive:

@@ -41,7 +41,7 @@ Row = tuple[float, tuple[str, ...]]
 
 @dataclass(frozen=True, slots=True)
 class LogOptions:
-    """How the host samples and stamps.
+    """Options of how the host samples and stamps.
 
     `lateness_s`: mean (exponential) of how late commands and encoder readings happen; `stamp_jitter_s`: standard
     deviation of the error of every time stamp.
@@ -53,12 +53,12 @@ class LogOptions:
 
 
 def dirty_log_options() -> LogOptions:
-    """A busy host: time stamps off by milliseconds."""
+    """Options of a busy host, with time stamps off by milliseconds."""
     return LogOptions(lateness_s=0.002, stamp_jitter_s=0.004)
 
 
 def dirty_parameters(parameters: PlantParameters) -> PlantParameters:
-    """The same robot in a worse world: bursts and wander in the disturbances, poses that jump, drop out and jitter."""
+    """Return the same robot in a worse world: bursts and drift in the disturbances, poses that jump and drop out."""
     return replace(
         parameters,
         volatility=0.5,
@@ -217,7 +217,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _truth(parameters: PlantParameters, effects: HiddenEffects) -> str:
-    """What is true, as JSON; a limit that does not exist is null."""
+    """Return the true parameters and effects as JSON; a limit that does not exist is null."""
     finite = {name: value if math.isfinite(value) else None for name, value in asdict(parameters).items()}
     return json.dumps({"effects": dict(effects.items), "parameters": finite}, indent=1)
 

@@ -63,7 +63,7 @@ MOTORS = ("motor_lag", "command_delay")
 
 @dataclass
 class _Wheel:
-    """One side's state: what is asked of the motor, its speed, heat and angle, and the angle beyond the gear."""
+    """State of one side: what is requested of the motor, its speed, heat and angle, and the angle beyond the gear."""
 
     asked: float = 0.0
     speed: float = 0.0
@@ -114,7 +114,7 @@ class _Body:
 
 @dataclass(frozen=True)
 class Recording:
-    """A drive: what is logged, and the true poses (N, 3) at the times of the measured ones."""
+    """Recording of a drive: what is logged, and the true poses (N, 3) at the times of the measured ones."""
 
     log: DriveLog
     truth: Array
@@ -210,7 +210,7 @@ def _beyond_gear(form: str | None, values: Mapping[str, float], wheel: _Wheel, p
 def _measured(
     asked: Array, angles: Array, path: Array, rng: np.random.Generator, values: Mapping[str, float]
 ) -> Recording:
-    """What is logged of a drive: commands as sent, counted angles, noisy poses."""
+    """Return the recording of a drive: commands as sent, counted angles, noisy poses."""
     steps_per_s = COMMANDS_PER_S * STEPS_A_COMMAND
     reading, posed = (np.arange(every - 1, angles.shape[0], every) for every in (STEPS_A_READING, STEPS_A_POSE))
     count = 2.0 * math.pi / COUNTS_PER_TURN

@@ -87,7 +87,7 @@ def tracks(speed_m_s: float = 0.2) -> dict[str, Track]:
 
 
 def belief(mean: tuple[float, ...] = NOMINAL, spread: float = SPREAD) -> Gaussian:
-    """What is believed of a robot's geometry before it drives."""
+    """Return the belief over a robot's geometry before it drives."""
     values = np.array(mean)
     return Gaussian(NAMES, values, np.diag((spread / math.sqrt(3.0) * values) ** 2))
 
@@ -113,11 +113,11 @@ def fusion(mean: tuple[float, ...], spread: float = SPREAD) -> PoseFusion:
 
 
 class Plant(Protocol):
-    """What is driven: true pose and speed, what the sensors say, and wheel speeds that are held for a while."""
+    """Plant to be driven: true pose and speed, the sensors' samples, and wheel speeds that are held for a while."""
 
     @property
     def now_ms(self) -> int:
-        """Time."""
+        """Time of the plant, ms."""
 
     @property
     def pose(self) -> tuple[float, float, float]:
@@ -129,10 +129,10 @@ class Plant(Protocol):
 
     @property
     def now_ns(self) -> int:
-        """Time."""
+        """Time of the plant, ns."""
 
     def readings(self) -> Readings:
-        """Of this time."""
+        """Return the sensors' samples at this time."""
 
     def advance(self, left_rad_s: float, right_rad_s: float, count: int, /) -> None:
         """Hold these wheel speeds (rad/s) for `count` milliseconds."""
@@ -170,7 +170,10 @@ def disco(settings: DiscoSettings, knows: bool = False, learns: bool = False, se
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """N ticks: time (s), true pose (N, 3), forward speed (m/s), commands (N, 2) rad/s, distance to the right (m)."""
+    """Record of N ticks of a drive.
+
+    Time (s), true pose (N, 3), forward speed (m/s), commands (N, 2) rad/s, distance to the right (m).
+    """
 
     t_s: Array
     pose: Array
@@ -185,7 +188,7 @@ class Drive:
 
     @property
     def rms_mm(self) -> float:
-        """Of the distance."""
+        """Root mean square of the distance, mm."""
         return 1e3 * float(np.sqrt(np.mean(self.off_m**2)))
 
     @property
@@ -201,7 +204,7 @@ class Drive:
 
     @property
     def travel_rot_s2(self) -> float:
-        """How far a command moves in a second."""
+        """Mean change of a command in a second, rotations/s^2."""
         span_s = self.t_s[-1] - self.t_s[0]
         return float(np.abs(np.diff(self.commands, axis=0)).sum() / 2.0 / span_s / ROTATION)
 

@@ -42,7 +42,7 @@ def some_plant(chance: random.Random) -> PlantParameters:
 
 
 def strike(job: Job) -> WheelRun:
-    """One fault."""
+    """Run one fault and return its outcome."""
     driver, fault, speed, track, side, seed = job
     chance = random.Random(seed)
     run = WheelFaultRun(driver, speed, track, seed=seed, plant=some_plant(chance))
@@ -55,7 +55,10 @@ def strike(job: Job) -> WheelRun:
 
 
 def rough_plant(chance: random.Random) -> PlantParameters:
-    """Rough ground: wheels that are braked and pushed, a tenth of the way lost to slip, poses that jump and pause."""
+    """Return a plant on rough ground.
+
+    Wheels that are braked and pushed, a tenth of the way lost to slip, poses that jump and pause.
+    """
     usual = some_plant(chance)
     return replace(
         usual,
@@ -100,7 +103,7 @@ def drive_healthy(number: int, seconds: float) -> tuple[str, list[str]]:
 
 
 def jobs(drivers: Sequence[str], seed: int) -> list[Job]:
-    """All of them; the sides take turns."""
+    """Return the jobs for all faults, speeds and tracks; the sides take turns."""
     every = itertools.product(drivers, FAULTS, SPEEDS_M_S, TRACKS)
     sides = ("left", "right")
     return [

@@ -46,13 +46,13 @@ _FOREVER_NS = 1 << 62
 
 
 class _Poses:
-    """Satisfies `drivers.types.PoseSource`: what the robot's own sensor measured."""
+    """Pose source of what the robot's own sensor measured (a `drivers.types.PoseSource`)."""
 
     def __init__(self) -> None:
         self._waiting: list[PoseSample] = []
 
     def take(self, pose: PoseMeasurement, now_us: int) -> None:
-        """One measured pose."""
+        """Store one measured pose."""
         self._waiting.append(
             PoseSample(
                 1000 * pose.sample_us, 1000 * now_us, pose.x_m, pose.y_m, pose.yaw_rad, pose.position_std_m,
@@ -66,7 +66,7 @@ class _Poses:
         return poses
 
     def close(self) -> None:
-        """Do nothing: this source holds no resources."""
+        """Do nothing, because the source holds no resources."""
 
 
 class VendorInProcess:
@@ -156,7 +156,7 @@ class Law:
 
 @dataclass
 class WheelRun:
-    """What became of one run; times in s from when the fault showed, angles in rad of the worst wheel's true travel."""
+    """Outcome of one run; times in s from when the fault showed, angles in rad of the worst wheel's true travel."""
 
     driver: str
     fault: str
@@ -171,7 +171,7 @@ class WheelRun:
 
     @property
     def is_missed(self) -> bool:
-        """Whether it did not stop within 0.3 rad of true wheel travel or 1 s, whichever is later."""
+        """Whether the robot did not stop within 0.3 rad of true wheel travel or 1 s, whichever is later."""
         return not (self.stopped_s <= 1.0 or self.travel_rad <= 0.3)
 
     @property

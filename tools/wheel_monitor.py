@@ -26,7 +26,7 @@ Pair = tuple[float, float]
 
 
 class Outputs(Protocol):
-    """What the controller under watch puts out after a cycle."""
+    """Outputs of the controller under watch after a cycle."""
 
     @property
     def state(self) -> str:
@@ -34,11 +34,11 @@ class Outputs(Protocol):
 
     @property
     def session(self) -> int:
-        """Of the host that armed it; 0 without one."""
+        """Session of the host that armed it; 0 without one."""
 
     @property
     def accepted_commands(self) -> int:
-        """How many commands it has accepted since it started."""
+        """Number of commands accepted since the controller started."""
 
     @property
     def driver_enabled(self) -> bool:
@@ -46,16 +46,16 @@ class Outputs(Protocol):
 
     @property
     def left_setpoint_rad_s(self) -> float:
-        """Of the left wheels."""
+        """Setpoint of the left wheels, rad/s."""
 
     @property
     def right_setpoint_rad_s(self) -> float:
-        """Of the right wheels."""
+        """Setpoint of the right wheels, rad/s."""
 
 
 @dataclass(frozen=True)
 class MonitoredLimits:
-    """What the robot was built with."""
+    """Limits that the robot was built with."""
 
     max_speed_rad_s: float = 8.0
     max_acceleration_rad_s2: float = 20.0
@@ -102,7 +102,10 @@ class WheelMonitor:
         self._falling_bound = None
 
     def see(self, now_us: int, frames: Sequence[Frame], outputs: Outputs, wheel_speeds: Pair) -> None:
-        """One cycle: the frames that reached the controller since the last one, its outputs after it, true speeds."""
+        """Check one cycle of the controller.
+
+        It gets the frames that reached the controller since the last one, its outputs after it, true speeds.
+        """
         before = self._last
         if before is None:
             self._last, self._last_us = outputs, now_us
@@ -149,7 +152,7 @@ class WheelMonitor:
         self._accepted_us = now_us
 
     def _scaled(self, command: SeenCommand) -> Pair:
-        """What the command comes to within the limits."""
+        """Return the command's wheel speeds within the limits."""
         if command.mode != SPEED_MODE:
             return (0.0, 0.0)
         scale = min(1.0, self.limits.max_speed_rad_s / max(*map(abs, command.speeds), 1e-9))
@@ -251,7 +254,7 @@ _AFTER_A_BYTE = bytes(map(_after_eight_bits, range(256)))
 
 
 def crc8h2f(data: bytes) -> int:
-    """CRC-8H2F (AUTOSAR): polynomial 0x2F, initial value and final xor 0xFF; 0xDF over b"123456789"."""
+    """Return the CRC-8H2F (AUTOSAR): polynomial 0x2F, initial value and final xor 0xFF; 0xDF over b"123456789"."""
     crc = 0xFF
     for byte in data:
         crc = _AFTER_A_BYTE[crc ^ byte]

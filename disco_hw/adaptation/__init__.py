@@ -11,7 +11,7 @@ from drivers.types import Readings
 
 @dataclass(frozen=True, slots=True)
 class AdaptationUpdate:
-    """What one step of adaptation reports: records for the log, and sentences for the operator."""
+    """Result of one step of adaptation: records for the log, and sentences for the operator."""
 
     records: tuple[records.Record, ...] = ()
     events: tuple[str, ...] = ()
@@ -43,11 +43,11 @@ class NoAdaptation:
     """An adaptation that leaves the model file's belief in force."""
 
     def step(self, now_ns: int) -> AdaptationUpdate:
-        """Report no change."""
+        """Return an empty update: nothing is adapted."""
         return AdaptationUpdate()
 
     def feed(self, now_ns: int, readings: Readings) -> None:
-        """Ignore the samples."""
+        """Do nothing: no samples are needed."""
 
     def ask(self, action: str) -> tuple[bool, str]:
         """Refuse the request, with what starts adaptation."""
@@ -58,5 +58,5 @@ class NoAdaptation:
         return None
 
     def counts(self) -> dict[str, int]:
-        """Return no counters."""
+        """Return an empty dict: nothing is counted."""
         return {}

@@ -354,7 +354,7 @@ class GeometryFilter:
         self._log_odds, self._age_s, self._moved_s = np.zeros(1), np.zeros(1), 0.0
 
     def _widest(self) -> Array:
-        """Standard deviations (3,) of what may have changed, within the prior."""
+        """Return standard deviations (3,) of what may have changed, within the prior."""
         return np.minimum(OPENED * np.abs(self.mean), (self._high - self._low) / math.sqrt(12.0))
 
     def _place(self, pose: PoseSample) -> None:

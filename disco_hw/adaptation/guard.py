@@ -35,7 +35,7 @@ class Geometry:
 
     @property
     def std(self) -> Array:
-        """Standard deviations (3,)."""
+        """Standard deviations (3,) of the geometry, in the order of `NAMES`."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
@@ -86,14 +86,14 @@ LEAST_RATE_HZ, MOST_POSITION_STD_M, MOST_YAW_STD_RAD, MOST_LATENCY_S = 10.0, 0.0
 
 @dataclass(frozen=True, slots=True)
 class AdaptationChoice:
-    """Which adaptation runs, and why."""
+    """Choice of the adaptation that runs, with the reason."""
 
     kind: Literal["off", "fast"]
     why: str
 
 
 def choose_adaptation(control: Control, pose: PoseInput, model: Model) -> AdaptationChoice:
-    """What `control.adaptation` asks for; for "auto" the filter where [pose] says poses that are good enough for it.
+    """Return the adaptation for `control.adaptation`; "auto" is the filter where [pose] says poses are good enough.
 
     Raises InputError for one that is asked for and that the model does not allow.
     """
@@ -144,7 +144,7 @@ def possible_range(prior: Prior) -> tuple[Array, Array]:
 
 
 def with_geometry(model: Model, geometry: Geometry) -> Model:
-    """The model with this belief over its geometry, independent of what else it believes."""
+    """Return the model with this belief over its geometry, independent of what else it believes."""
     belief = model.belief
     assert belief is not None
     order = [belief.names.index(name) for name in NAMES]
@@ -157,7 +157,7 @@ def with_geometry(model: Model, geometry: Geometry) -> Model:
 
 
 def geometry_of(change: BeliefChange) -> Geometry | None:
-    """The geometry of a recorded change, None for the model file's."""
+    """Return the geometry of a recorded change, None for the model file's."""
     if change.source == "model":
         return None
     return Geometry(np.array(change.mean), np.array(change.covariance).reshape(3, 3))

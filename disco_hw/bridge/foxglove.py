@@ -87,7 +87,7 @@ class Live:
             self._channels[SCENE].log(self._scene, log_time=time.time_ns())
 
     def close(self) -> None:
-        """End the server; safe to call twice."""
+        """Stop the Foxglove server and its feed; safe to call twice."""
         self._server.stop()
         self._feed.close()
 

@@ -1,4 +1,4 @@
-"""`disco-hw bridge ros2`: poses and commands in, odometry and state out, in a process beside the daemon, over DDS."""
+"""Bridge of `disco-hw bridge ros2` over DDS, beside the daemon: poses and commands in, odometry and state out."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def run_ros2_bridge(robot: Path, model: Path | None = None, link: str | None = N
 
 
 def wire_name(topic: str, namespace: str) -> str:
-    """The name on the wire of a topic, which is in the namespace unless it begins with a slash."""
+    """Return the name on the wire of a topic, which is in the namespace unless it begins with a slash."""
     return (
         "rt" + topic
         if topic.startswith("/")
@@ -98,7 +98,10 @@ def wire_name(topic: str, namespace: str) -> str:
 
 
 class Bridge:
-    """Both directions: what comes is taken in a thread of its own, so that it waits for nothing that goes out."""
+    """Bridge between ROS 2 and the daemon, both ways.
+
+    A thread of its own receives, so that it never waits for what is sent.
+    """
 
     def __init__(self, setup: Setup, link: str | None = None) -> None:
         config = setup.config
@@ -138,7 +141,7 @@ class Bridge:
 
     @property
     def where(self) -> str:
-        """Where it is to be found, in words."""
+        """Text that says in which domain and namespace the bridge is, and what it receives."""
         ros2 = self._config.ros2
         heard = "" if self._pose is None else f"; poses from {self._pose.topic}"
         if self._config.fence.obstacles_port is not None:
@@ -147,7 +150,7 @@ class Bridge:
         return f"ROS 2 domain {_domain(self._config)}, {reach}, namespace /{ros2.namespace.strip('/')}{heard}"
 
     def run(self, should_stop: Callable[[], bool]) -> None:
-        """Carry both ways until asked to stop; what fails on the way in is raised here."""
+        """Carry both ways until requested to stop; what fails on the way in is raised here."""
         # Neither thread waits long for the other's Python, and what was imported is not looked through for garbage.
         sys.setswitchinterval(_SWITCH_S)
         gc.freeze()
@@ -171,7 +174,7 @@ class Bridge:
             raise self._failure
 
     def close(self) -> None:
-        """Leave; safe to call twice."""
+        """Leave the ROS 2 domain and close all connections; safe to call twice."""
         self._ended.set()
         self._asking.close()
         self._stopping.close()
@@ -212,7 +215,7 @@ class Bridge:
             self._failure = failure
 
     def _samples(self, reader: DataReader[Any]) -> Iterator[tuple[Any, int]]:
-        """What a reader has; what is none of its type is counted."""
+        """Yield a reader's valid samples with their source time stamps; count those that cannot be read."""
         try:
             samples = reader.take(_MOST_AT_ONCE)
         except DDSException:
@@ -276,7 +279,7 @@ class Bridge:
             self._stopping.add(self._answer, "estop")
 
     def _answer(self, words: str) -> None:
-        """Ask the daemon; where it is driven by hand, arming lets the speeds drive, and is not the daemon's to do."""
+        """Carry out a request and publish the reply; where the daemon is driven by hand, arming only permits speeds."""
         reply: dict[str, Any]
         refused = ros2_commands.refusal(words, self._config.ros2.may_move)
         if refused is not None:
@@ -324,7 +327,7 @@ class Bridge:
 
 
 def _publisher_of(message: Any) -> str | None:
-    """The writer of a message that came over DDS; None for one of our own."""
+    """Return the writer of a message that came over DDS; None for one of our own."""
     info = getattr(message, "sample_info", None)
     return None if info is None else f"publisher {info.publication_handle:x}"
 
@@ -339,7 +342,7 @@ def _domain(config: RobotConfig) -> int:
 
 
 def join_domain(config: RobotConfig) -> tuple[Domain | None, DomainParticipant]:
-    """Join the domain; beyond this computer as $CYCLONEDDS_URI says, or by multicast."""
+    """Join the ROS 2 domain; beyond this computer as $CYCLONEDDS_URI says, or by multicast."""
     number = _domain(config)
     try:
         domain = Domain(number, LOOPBACK) if config.ros2.localhost_only else None

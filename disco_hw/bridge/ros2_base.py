@@ -1,4 +1,4 @@
-"""`disco-hw bridge ros2-base`: the way to a base that is reached over ROS 2 alone, in a process beside the daemon.
+"""Bridge of `disco-hw bridge ros2-base` to a base that is reached over ROS 2 alone, in a process beside the daemon.
 
 The daemon's driver speaks frames to it on a Unix socket, as to any controller; it speaks DDS to the base. One thread:
 what stops the base waits for nothing.
@@ -84,7 +84,7 @@ def run_base_bridge(robot: Path) -> int:
 
 
 class Clients:
-    """Who speaks to the bridge: the daemon, and an e-stop beside it; each hears what the others say, as on a bus.
+    """Clients of the bridge, the daemon and an e-stop beside it; each receives what the others send, as on a bus.
 
     Only this user and root are let in. Raises InputError for a path that cannot be listened at.
     """
@@ -120,7 +120,7 @@ class Clients:
                     yield client, Frame(can_id & ~_EXTENDED, data[: min(length, 8)], bool(can_id & _EXTENDED))
 
     def send(self, frame: Frame) -> None:
-        """To all; what somebody does not read in time is dropped and counted."""
+        """Send a frame to all clients; what one does not read in time is dropped and counted."""
         self._send(_PACKET.pack(frame.can_id, len(frame.data), frame.data), self._clients)
 
     def close(self) -> None:
@@ -148,7 +148,7 @@ class Clients:
 
 
 class BaseBridge:
-    """Both directions, in one thread."""
+    """Bridge between the daemon's driver and the base, both directions in one thread."""
 
     def __init__(self, config: RobotConfig, settings: wire.Ros2BaseSettings, clients: Clients) -> None:
         self.end = wire.BaseEnd(settings)
@@ -176,7 +176,7 @@ class BaseBridge:
         self._said = ""
 
     def run(self, should_stop: Callable[[], bool]) -> None:
-        """Carry both ways until asked to stop, and leave the base with zeros."""
+        """Carry both ways until requested to stop, and leave the base with zeros."""
         last_ns = time.monotonic_ns()
         try:
             while not should_stop():
@@ -224,7 +224,7 @@ class BaseBridge:
             self._take_button(self._button)
 
     def _take_button(self, reader: DataReader[Any]) -> None:
-        """A button that nobody speaks for, or whose word cannot be read, keeps the base where it is."""
+        """Read the base's button; an unreadable message, or no publisher, keeps the base where it is."""
         unreadable = self._unreadable
         for message, _ in self._taken(reader):
             self.end.button, self.end.hears_button = message.data, True
@@ -260,7 +260,7 @@ class BaseBridge:
             self._unwritten += 1
 
     def _taken(self, reader: DataReader[Any]) -> Iterator[tuple[Any, int]]:
-        """What a reader has; what is none of its type is counted."""
+        """Yield a reader's valid samples with their source time stamps; count those that cannot be read."""
         try:
             samples = reader.take(_MOST_AT_ONCE)
         except Exception:
@@ -272,7 +272,7 @@ class BaseBridge:
                 yield sample, sample.sample_info.source_timestamp
 
     def _tell(self) -> None:
-        """A line for a person at each change."""
+        """Print a line for the operator at each change."""
         end = self.end
         topics = self._settings
         words = [

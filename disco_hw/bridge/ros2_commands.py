@@ -1,4 +1,4 @@
-"""What the bridge hears of commands: /cmd_vel as a hand on the pad of `drive --ros2`, and requests as those of `ctl`.
+"""Commands that the bridge receives: /cmd_vel as a hand on the pad of `drive --ros2`, and requests as those of `ctl`.
 
 A speed drives for 0.2 s from when it was sent, and only after arming was asked for while speeds were coming. A silence
 disarms; then arming has to be asked for again.
@@ -62,7 +62,10 @@ class SpeedInlet:
     def request(
         self, message: msg.Twist | msg.TwistStamped, sent_ns: int, mono_ns: int, wall_ns: int
     ) -> dict[str, Any] | None:
-        """The request to the daemon for a speed heard now; None for what is none. `sent_ns` is wall-clock time."""
+        """Return the request to the daemon for a speed received now; None for what is none.
+
+        `sent_ns` is wall-clock time.
+        """
         twist = message if isinstance(message, msg.Twist) else message.twist
         stamp_ns = 0 if isinstance(message, msg.Twist) else msg.time_of(message.header.stamp)
         age_ns = wall_ns - (stamp_ns or sent_ns)
@@ -119,7 +122,7 @@ class DaemonPad:
             self.close()
 
     def close(self) -> None:
-        """Hang up; safe to call twice."""
+        """Close the connection to the daemon; safe to call twice."""
         if self._connection is not None:
             self._connection.close()
             self._connection, self._rest = None, b""
@@ -164,12 +167,12 @@ class Errands:
         self._pool.submit(work, words).add_done_callback(lambda _: self._room.release())
 
     def close(self) -> None:
-        """Begin nothing more; safe to call twice."""
+        """Start no more errands; safe to call twice."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
 
 def refusal(words: str, may_move: bool) -> str | None:
-    """Why a request is not taken from ROS 2, where nobody knows who sends; stopping is always."""
+    """Return why a request is not accepted from ROS 2, where senders are unknown; None for stops, which always are."""
     if may_move or words.split(" ", 1)[0] in _ALWAYS:
         return None
     return (

@@ -1,4 +1,4 @@
-"""What the bridges hear of poses and wheels: a message of ROS 2 as what goes to the daemon, or why it is none; pure.
+"""Poses and wheel data that the bridges receive: each ROS 2 message as data for the daemon, or why it is refused; pure.
 
 A message's stamp is wall-clock time, the daemon's time is monotonic: an age says the same in both. An Odometry has been
 through the base's own kinematics: its way and turn are taken back to wheels by the nominal geometry. Distances are
@@ -53,7 +53,7 @@ class PoseInlet:
     def datagram(
         self, message: PoseMessage, sent_ns: int, mono_ns: int, wall_ns: int, publisher: Hashable = None
     ) -> bytes | None:
-        """The datagram to send for a message heard now; None for what is not to be passed on.
+        """Return the datagram to send for a message received now; None for what is not to be passed on.
 
         `sent_ns`: when it was sent, by the sender's wall clock, which counts where the message has no stamp. Of a flood
         one pose in 4 ms is passed on, as a daemon has no use for more. `publisher`: who sent it; of several on the
@@ -73,7 +73,7 @@ class PoseInlet:
         return msgspec.msgpack.encode(pose)
 
     def news(self) -> list[str]:
-        """What a person should know since the last call."""
+        """Return messages for the operator since the last call."""
         return self._publishers.news()
 
     def _judge(
@@ -148,7 +148,7 @@ class TransformInlet:
     def poses(
         self, message: msg.TFMessage, sent_ns: int, wall_ns: int, *, static: bool, publisher: Hashable = None
     ) -> Iterator[msg.PoseWithCovarianceStamped]:
-        """The poses that the transforms of a message bring; `sent_ns` is the time of those without a stamp.
+        """Yield the poses that the transforms of a message bring; `sent_ns` is the time of those without a stamp.
 
         `publisher`: who sent it; of several that move one edge the first counts, until it has been silent.
         """
@@ -171,11 +171,11 @@ class TransformInlet:
                     yield pose
 
     def news(self) -> list[str]:
-        """What a person should know since the last call."""
+        """Return messages for the operator since the last call, of all transforms."""
         return [words for one in self._publishers.values() for words in one.news()]
 
     def _publishers_of(self, child: str) -> SenderGate:
-        """Who moves the edge to this frame; there are no more than edges are kept."""
+        """Return the gate of the publishers that move the edge to this frame; there are no more than edges are kept."""
         return self._publishers.setdefault(child, SenderGate(self._silence_s))
 
     def _keep(self, parent: str, child: str, t_ns: int, values: tuple[float, ...], *, static: bool) -> bool:
@@ -196,7 +196,7 @@ class TransformInlet:
         return True
 
     def _pose_by(self, child: str, wall_ns: int) -> msg.PoseWithCovarianceStamped | None:
-        """The chain's end now that `child` has moved; None unless that is the first edge that moves."""
+        """Return the chain's end now that `child` has moved; None unless that is the first edge that moves."""
         if self._chain is None:
             self.refused[f'transforms without a chain from "{self._map[:40]}" to "{self._base[:40]}"'] += 1
             return None
@@ -225,7 +225,7 @@ class TransformInlet:
         return msg.PoseWithCovarianceStamped(msg.Header(msg.stamp_of(t_ns), self._settings.frame), pose)
 
     def _motion(self, child: str, only_ns: int | None) -> Motion:
-        """The transforms of an edge for the chain; of the first, the newest alone, at the time of the pose."""
+        """Return the transforms of an edge for the chain; of the first, the newest alone, at the time of the pose."""
         edge = self._edges[child]
         rows = list(edge.rows) if only_ns is None else [(only_ns, edge.rows[-1][1])]
         return Motion(np.array([t for t, _ in rows]), np.array([values for _, values in rows]), edge.static)
@@ -255,7 +255,7 @@ class WheelInlet:
         self._why, self._why_ns = _NOTHING, -_SECOND_NS
 
     def wheels(self, message: msg.JointState | msg.Odometry, sent_ns: int, mono_ns: int, wall_ns: int) -> Wheels | None:
-        """The wheels by a message heard now; None for what is refused, or says nothing of them.
+        """Return the wheels by a message received now; None for what is refused, or says nothing of them.
 
         `sent_ns`: when it was sent, by the sender's wall clock, which counts where the message has no stamp.
         """
@@ -285,7 +285,7 @@ class WheelInlet:
         return self._before
 
     def why(self, now_ns: int) -> int:
-        """Why nothing usable was heard, of REFUSALS."""
+        """Return why nothing usable was received, as one of REFUSALS."""
         return self._why if now_ns - self._why_ns < _SECOND_NS else _NOTHING
 
     def _refuse(self, why: int, mono_ns: int) -> None:
@@ -293,7 +293,7 @@ class WheelInlet:
         self._why, self._why_ns = why, mono_ns
 
     def _of_joints(self, message: msg.JointState, elapsed_s: float) -> tuple[Both, Both] | None:
-        """The mean of each side; speeds from the angles where there are none. None where a joint is missing."""
+        """Return the mean of each side; speeds from the angles where there are none. None where a joint is missing."""
         at = {name: place for place, name in enumerate(message.name)}
         sides = (self._settings.left_joints, self._settings.right_joints)
         if not at.keys() >= self._joints or len(message.position) < len(message.name):
@@ -307,7 +307,7 @@ class WheelInlet:
         return angles, ((angles[0] - before[0]) / elapsed_s, (angles[1] - before[1]) / elapsed_s)
 
     def _of_pose(self, message: msg.Odometry) -> tuple[Both, Both]:
-        """Where an ideal base with this geometry would have turned its wheels to."""
+        """Return the wheel angles and speeds of an ideal base with this geometry that drove this odometry."""
         pose = _planar(message)
         angles = (0.0, 0.0) if self._before is None else self._before.angles_rad
         if self._pose is not None:

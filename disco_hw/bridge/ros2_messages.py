@@ -21,7 +21,7 @@ class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
 
 @dataclass
 class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
-    """When, and in which frame."""
+    """Header of a message: when, and in which frame."""
 
     stamp: Time = field(default_factory=Time)
     frame_id: str = ""
@@ -29,21 +29,21 @@ class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
 
 @dataclass
 class String(IdlStruct, typename="std_msgs::msg::dds_::String_"):
-    """Text."""
+    """ROS 2 message with a text."""
 
     data: str = ""
 
 
 @dataclass
 class Bool(IdlStruct, typename="std_msgs::msg::dds_::Bool_"):
-    """Yes or no."""
+    """ROS 2 message with a truth value."""
 
     data: bool = False
 
 
 @dataclass
 class Vector3(IdlStruct, typename="geometry_msgs::msg::dds_::Vector3_"):
-    """In m, m/s or rad/s."""
+    """Vector in m, m/s or rad/s."""
 
     x: float64 = 0.0
     y: float64 = 0.0
@@ -52,7 +52,7 @@ class Vector3(IdlStruct, typename="geometry_msgs::msg::dds_::Vector3_"):
 
 @dataclass
 class Point(IdlStruct, typename="geometry_msgs::msg::dds_::Point_"):
-    """In m."""
+    """Point in space, in m."""
 
     x: float64 = 0.0
     y: float64 = 0.0
@@ -61,7 +61,7 @@ class Point(IdlStruct, typename="geometry_msgs::msg::dds_::Point_"):
 
 @dataclass
 class Quaternion(IdlStruct, typename="geometry_msgs::msg::dds_::Quaternion_"):
-    """A rotation."""
+    """Rotation as a unit quaternion."""
 
     x: float64 = 0.0
     y: float64 = 0.0
@@ -71,7 +71,7 @@ class Quaternion(IdlStruct, typename="geometry_msgs::msg::dds_::Quaternion_"):
 
 @dataclass
 class RosPose(IdlStruct, typename="geometry_msgs::msg::dds_::Pose_"):
-    """Place and heading."""
+    """Pose as position and orientation."""
 
     position: Point = field(default_factory=Point)
     orientation: Quaternion = field(default_factory=Quaternion)
@@ -83,7 +83,7 @@ def _zeros() -> list[float]:
 
 @dataclass
 class PoseWithCovariance(IdlStruct, typename="geometry_msgs::msg::dds_::PoseWithCovariance_"):
-    """`covariance`: 6 x 6 of x, y, z and the rotations about them, row by row."""
+    """Pose with its `covariance`: 6 x 6 of x, y, z and the rotations about them, row by row."""
 
     pose: RosPose = field(default_factory=RosPose)
     covariance: array[float64, 36] = field(default_factory=_zeros)
@@ -160,7 +160,7 @@ class JointState(IdlStruct, typename="sensor_msgs::msg::dds_::JointState_"):
 
 @dataclass
 class Transform(IdlStruct, typename="geometry_msgs::msg::dds_::Transform_"):
-    """Where a frame is in another."""
+    """Transform from one frame to another."""
 
     translation: Vector3 = field(default_factory=Vector3)
     rotation: Quaternion = field(default_factory=Quaternion)
@@ -177,7 +177,7 @@ class TransformStamped(IdlStruct, typename="geometry_msgs::msg::dds_::TransformS
 
 @dataclass
 class TFMessage(IdlStruct, typename="tf2_msgs::msg::dds_::TFMessage_"):
-    """Some transforms."""
+    """List of transforms, as published on tf."""
 
     transforms: sequence[TransformStamped] = field(default_factory=list)
 
@@ -192,7 +192,7 @@ class KeyValue(IdlStruct, typename="diagnostic_msgs::msg::dds_::KeyValue_"):
 
 @dataclass
 class DiagnosticStatus(IdlStruct, typename="diagnostic_msgs::msg::dds_::DiagnosticStatus_"):
-    """How one part is: `level` 0 well, 1 a warning, 2 an error, 3 silent."""
+    """Status of one component: `level` 0 well, 1 a warning, 2 an error, 3 silent."""
 
     level: uint8 = 0
     name: str = ""
@@ -203,7 +203,7 @@ class DiagnosticStatus(IdlStruct, typename="diagnostic_msgs::msg::dds_::Diagnost
 
 @dataclass
 class DiagnosticArray(IdlStruct, typename="diagnostic_msgs::msg::dds_::DiagnosticArray_"):
-    """How all parts are."""
+    """List of the statuses of all components."""
 
     header: Header = field(default_factory=Header)
     status: sequence[DiagnosticStatus] = field(default_factory=list)
@@ -211,7 +211,7 @@ class DiagnosticArray(IdlStruct, typename="diagnostic_msgs::msg::dds_::Diagnosti
 
 @dataclass
 class Point32(IdlStruct, typename="geometry_msgs::msg::dds_::Point32_"):
-    """In m."""
+    """Point in single precision, in m."""
 
     x: float32 = 0.0
     y: float32 = 0.0
@@ -227,7 +227,7 @@ class Polygon(IdlStruct, typename="geometry_msgs::msg::dds_::Polygon_"):
 
 @dataclass
 class ObstacleMsg(IdlStruct, typename="costmap_converter_msgs::msg::dds_::ObstacleMsg_"):
-    """An obstacle: a circle if `polygon` is one point, with its `radius` (m) around all points otherwise."""
+    """Obstacle in the plane: a circle if `polygon` is one point, with its `radius` (m) around all points otherwise."""
 
     header: Header = field(default_factory=Header)
     polygon: Polygon = field(default_factory=Polygon)
@@ -239,17 +239,17 @@ class ObstacleMsg(IdlStruct, typename="costmap_converter_msgs::msg::dds_::Obstac
 
 @dataclass
 class ObstacleArrayMsg(IdlStruct, typename="costmap_converter_msgs::msg::dds_::ObstacleArrayMsg_"):
-    """Some obstacles."""
+    """List of obstacles, as costmap_converter publishes it."""
 
     header: Header = field(default_factory=Header)
     obstacles: sequence[ObstacleMsg] = field(default_factory=list)
 
 
 def stamp_of(time_ns: int) -> Time:
-    """A wall-clock time in ns as a message has it."""
+    """Return a wall-clock time in ns as a message has it."""
     return Time(time_ns // 1_000_000_000, time_ns % 1_000_000_000)
 
 
 def time_of(stamp: Time) -> int:
-    """The wall-clock time of a stamp in ns; 0 is none."""
+    """Return the wall-clock time of a stamp in ns; 0 is none."""
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)

@@ -34,7 +34,7 @@ class ObstacleInlet:
         self._frame = frame.lstrip("/")
 
     def datagrams(self, message: msg.ObstacleArrayMsg | msg.String, sent_ns: int, wall_ns: int) -> list[bytes]:
-        """The datagrams to send for a message received now, one for each obstacle.
+        """Return the datagrams to send for a message received now, one for each obstacle.
 
         `sent_ns`, `wall_ns`: when it was sent and received, by the wall clock. The first counts where the message has
         no stamp.
@@ -71,7 +71,7 @@ class ObstacleInlet:
 
 
 def _report_of(one: msg.ObstacleMsg, age_s: float) -> ObstacleReport | None:
-    """The circle around an obstacle's points, each with the obstacle's radius; None for what makes none."""
+    """Return the circle around an obstacle's points, each with the obstacle's radius; None for what makes none."""
     points = [(float(point.x), float(point.y)) for point in one.polygon.points]
     if not points:
         return None

@@ -1,4 +1,4 @@
-"""What the bridge says: the daemon's records as messages of ROS 2; pure.
+"""Conversion of the daemon's records into the ROS 2 messages that the bridge publishes; pure.
 
 `odom` is dead reckoning by the wheels alone, so that it never jumps (REP 105); what the estimator makes of wheels and
 poses together goes out as `disco_hw/pose` in the map's frame.
@@ -68,9 +68,10 @@ class Outgoing:
         self._counters: records.Counters | None = None
 
     def messages(self, received: Sequence[tuple[int, records.Record]], wall_offset_ns: int) -> Iterator[Message]:
-        """What to say of these records; of wheels, estimates and plans only the newest. Wall minus monotonic time.
+        """Yield the messages for these records; of wheels, estimates and plans only the newest.
 
-        Odometry comes first, and each is made when it is asked for: a plan takes longer than all others together.
+        `wall_offset_ns`: wall minus monotonic time. Odometry comes first, and each is made when it is asked for: a plan
+        takes longer than all others together.
         """
         states: list[Message] = []
         wheels: WheelSample | None = None
@@ -101,7 +102,10 @@ class Outgoing:
             yield PLAN, self._path(plan, plan.t_ns + wall_offset_ns)
 
     def diagnostics(self, now_wall_ns: int, heard: bool, bridge: Mapping[str, str], wrong: str) -> Message:
-        """How daemon and bridge are. `heard`: the daemon, of late; `wrong`: what the bridge has to complain of."""
+        """Return the diagnostics of daemon and bridge.
+
+        `heard`: whether the daemon has published lately; `wrong`: what is wrong with the bridge, or empty.
+        """
         state = self._state
         if not heard or state is None:
             daemon = msg.DiagnosticStatus(_SILENT, "disco-hw: daemon", "no daemon found; start it with disco-hw run")
@@ -189,7 +193,7 @@ def _pose(x_m: float, y_m: float, yaw_rad: float) -> msg.RosPose:
 
 
 def _six(covariance: Matrix3) -> list[float]:
-    """The 6 x 6 matrix of x, y, z and the rotations about them."""
+    """Return the 6 x 6 matrix of x, y, z and the rotations about them."""
     full = [0.0] * 36
     for one, row in zip((0, 1, 5), covariance, strict=True):
         for other, value in zip((0, 1, 5), row, strict=True):
@@ -200,7 +204,7 @@ def _six(covariance: Matrix3) -> list[float]:
 
 
 def _figures(counters: records.Counters | None) -> Iterable[tuple[str, int]]:
-    """The counters that a person at a robot asks for first."""
+    """Yield the counters that a person at a robot asks for first."""
     if counters is not None:
         yield "loop overruns", counters.loop.get("overruns", 0)
         yield "ticks skipped", counters.loop.get("skipped", 0)

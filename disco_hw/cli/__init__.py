@@ -1,4 +1,4 @@
-"""The command `disco-hw`: a file for each group of verbs, gathered here, where errors become an exit code.
+"""Command `disco-hw`, gathered from a file for each group of verbs, where errors become an exit code.
 
 Verbs import what they need when they run, so that `--help` and `ctl` need nothing else to be healthy. A stop that is
 written as in the documents goes past the command-line library, which takes as long to load and to list every verb as
@@ -24,7 +24,7 @@ _YOUNG_OBJECTS = 50_000
 
 
 def main() -> None:
-    """Entry point: bad input prints one line and exits with 2, failed work with 1."""
+    """Run the command: bad input prints one line and exits with 2, failed work with 1."""
     parent = os.environ.pop(PARENT_VARIABLE, None)
     if parent is not None:
         end_with_parent(int(parent))
@@ -46,7 +46,10 @@ def main() -> None:
 
 
 def plain_stop(words: Sequence[str]) -> tuple[Path, str | None, bool] | None:
-    """The robot file, --link and --json of `estop`; None for another verb, and for whatever needs help or an error."""
+    """Return the robot file, --link and --json of `estop`.
+
+    None for another verb, and for whatever needs help or an error.
+    """
     if not words or words[0] != "estop":
         return None
     files: list[str] = []
@@ -69,7 +72,7 @@ def plain_stop(words: Sequence[str]) -> tuple[Path, str | None, bool] | None:
 
 
 def app() -> typer.Typer:
-    """Every verb, with its options and its help."""
+    """Return the application with every verb, its options and its help."""
     import typer
 
     from disco_hw.cli import logs, options, robot, virtual

@@ -1,4 +1,4 @@
-"""Verbs on logs: import, infer, gap, log info, recover, export, replay, view; and view of what is running."""
+"""Verbs for logs and for what is running: import, infer, gap, log info, recover, export, replay, view."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ def view(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show the page: a log, or the running daemon."""
+    """Show a log or the running daemon on the page."""
     if foxglove:
         _foxglove(live, robot, log, (model, link, snapshot, video, export), host, port, as_json)
     if live:

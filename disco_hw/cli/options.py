@@ -1,4 +1,4 @@
-"""What several verbs share: their arguments, and how they print; and what the command takes without a verb."""
+"""Arguments and printing that several verbs share, and what the command takes without a verb."""
 
 from __future__ import annotations
 

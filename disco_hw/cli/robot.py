@@ -239,7 +239,10 @@ def check(
     link: LinkOption = None,
     as_json: AsJson = False,
 ) -> None:
-    """Preflight: link, firmware match, latency, bus load, real-time settings, limits. Nothing moves."""
+    """Check link, firmware match, latency, bus load, real-time settings and limits before a drive.
+
+    Nothing moves. Nothing moves.
+    """
     check_named_files(robot)
     from disco_hw.daemon.check import run_check
     from disco_hw.daemon.run import compile_beforehand

@@ -71,7 +71,7 @@ LINK_FORMS = "can, serial, can:INTERFACE:CHANNEL or serial:PORT"
 
 
 def link_fields(option: str | None) -> dict[str, Any]:
-    """The fields of robot.toml's [link] that the option sets; raises InputError for one that says nothing."""
+    """Return the fields of robot.toml's [link] that the option sets; raises InputError for one that says nothing."""
     match None if option is None else option.split(":"):
         case None:
             return {}

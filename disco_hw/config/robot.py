@@ -62,7 +62,7 @@ _OF_THE_PROTOCOL = ("driver", "key_file", "of_driver")
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How the robot is reached; `options` go to the python-can interface as they are.
+    """Section [link] of robot.toml, how the robot is reached; `options` go to the python-can interface as they are.
 
     `driver`: of `drivers.motor`; None is its default. `of_driver`: the fields that are this driver's own, which stand
     in [link] beside the others; None where it is not made by `link_of`.
@@ -82,20 +82,20 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     key_file: str | None = None
 
     def medium_fields(self) -> dict[str, Any]:
-        """What `drivers.transport.make_transport` takes: kind and address, and how a serial line is spoken."""
+        """Return the fields for `drivers.transport.make_transport`: kind and address, and a serial line's exchange."""
         fields = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in _OF_THE_PROTOCOL}
         exchange = find_driver(self.driver).exchange
         return fields if exchange is None else {**fields, "exchange": exchange(self.settings())}
 
     def settings(self) -> Any:
-        """The driver's own settings. Raises msgspec.ValidationError where it needs some that are not there."""
+        """Return the driver's own settings. Raises msgspec.ValidationError where it needs some that are not there."""
         if self.of_driver is not None:
             return self.of_driver
         return msgspec.convert({}, find_driver(self.driver).settings)
 
 
 class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Where measured poses come from: `source` is of `drivers.pose`; None leaves what that source takes by itself.
+    """Section [pose] of robot.toml: `source` is of `drivers.pose`; None leaves what that source takes by itself.
 
     `datum`: latitude and longitude (degrees) of the world frame's origin. For `disco-hw bridge ros2`: the topic, the
     frame that its poses must be in, and the standard deviations of poses that come without. By these, `rate_hz` (how
@@ -135,11 +135,11 @@ class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     also: Annotated[tuple[PoseInput, ...], Meta(max_length=3)] = ()
 
     def every(self) -> tuple[PoseInput, ...]:
-        """This source and the further ones, in the order of their numbers."""
+        """Return this source and the further ones, in the order of their numbers."""
         return (self, *self.also)
 
     def labels(self) -> tuple[str, ...]:
-        """What the sources are called; those of one kind are numbered."""
+        """Return the names of the sources; those of one kind are numbered."""
         names = [one.source for one in self.every()]
         return tuple(
             name if names.count(name) == 1 else f"{name} {names[: number + 1].count(name)}"
@@ -147,11 +147,11 @@ class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         )
 
     def of(self, source: str) -> PoseInput | None:
-        """The first source of this kind; None where there is none."""
+        """Return the first source of this kind; None where there is none."""
         return next((one for one in self.every() if one.source == source), None)
 
     def convention(self) -> PoseConvention:
-        """In what units and about which axes the source speaks."""
+        """Return the units and axes in which the source reports poses."""
         return PoseConvention(
             self.position_unit,
             self.yaw_unit,
@@ -198,13 +198,13 @@ class Estimation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class ModelFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Where the model with its posterior is; without a file the nominal geometry and the prior are used."""
+    """File of the model with its posterior; without a file the nominal geometry and the prior are used."""
 
     file: str | None = None
 
 
 class LogSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Where runs are recorded."""
+    """Settings of the directory in which runs are recorded."""
 
     directory: str = "logs"
     enabled: bool = True
@@ -231,7 +231,9 @@ class Drive(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class Ros2(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What of a bag is read; what is left out is guessed. `pose_topic` "tf" is the chain from map to base frame.
+    """Section [ros2] of robot.toml: what of a bag is read; what is left out is guessed.
+
+    `pose_topic` "tf" is the chain from map to base frame.
 
     `command_joints`: whose the numbers of a Float64MultiArray are, in its order. The last five are the bridge's; a
     domain that is left out is $ROS_DOMAIN_ID, or 0. `may_move`: whether what lets the robot move is taken from ROS 2.

@@ -48,7 +48,7 @@ def refuse_outside_task(path: Path, config: RobotConfig) -> None:
 
 
 def load_daemon_address(path: Path) -> tuple[str, str | None]:
-    """The robot's name and the control socket that robot.toml sets: what a request to the running daemon needs.
+    """Return the robot's name and the control socket that robot.toml sets: what a request to the running daemon needs.
 
     [task] and [fence] are not looked at: a daemon can be asked and stopped whatever has been written there since it
     was started. Raises InputError with one line naming file, field and remedy for any other section that is wrong.
@@ -59,7 +59,7 @@ def load_daemon_address(path: Path) -> tuple[str, str | None]:
 
 
 def _without_task(path: Path, raw: dict[str, Any]) -> RobotConfig:
-    """All that robot.toml says but [task], validated; `task` is None."""
+    """Return all of robot.toml but [task], validated; `task` is None."""
     _check_names(path, raw)
     _check_pose_fields(path, raw.get("pose"))
     common, of_driver = _split_link(path, raw.get("link", {}))
@@ -75,7 +75,7 @@ def _without_task(path: Path, raw: dict[str, Any]) -> RobotConfig:
 
 
 def _split_link(path: Path, section: Any) -> tuple[Any, Any]:
-    """The fields of [link] that every driver has, and the settings of the driver that it names."""
+    """Return the fields of [link] that every driver has, and the settings of the driver that it names."""
     if not isinstance(section, dict):
         return section, None
     if "of_driver" in section:
@@ -127,7 +127,7 @@ def prior_around(robot: Robot) -> Prior:
 
 
 def _task_of(path: Path, section: object) -> RobotTask:
-    """The task that [task] says; its kind knows which fields that has."""
+    """Return the task that [task] says; its kind knows which fields that has."""
     from disco_hw.tasks import ReadField, UnknownKind, kinds, task_class, task_from  # noqa: PLC0415
 
     if not isinstance(section, dict):

@@ -1,4 +1,4 @@
-"""DISCO: the planner, its settings, and the plan as a function of time."""
+"""The planner DISCO, its settings, and the plan as a function of time."""
 
 from disco_hw.control.disco import Disco
 from disco_hw.control.plan import (

@@ -1,4 +1,4 @@
-"""Classical path followers: what DISCO is measured against, and what drives on when it finds no plan.
+"""Classical path followers, against which DISCO is measured and which can drive on when it finds no plan.
 
 A follower has the reference along the line, the place on it and the wheels of a motion; a steering law (pure pursuit,
 Kanayama's, a linear-quadratic regulator) says how it turns. All laws act on the centre of rotation, which moves as a
@@ -43,7 +43,7 @@ _LONGEST_GAP_S = 0.2
 
 @dataclass(frozen=True, slots=True)
 class NominalRobot:
-    """What is known of the robot: geometry (m), motor lag (s) and dead band (rad/s), the drive's limits."""
+    """Nominal properties of the robot: geometry (m), motor lag (s), dead band (rad/s) and the drive's limits."""
 
     wheel_radius_m: float
     axial_distance_m: float
@@ -60,8 +60,11 @@ class NominalRobot:
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """Where the robot is beside its reference: at which `place`; the centre of rotation `left_m` of where it should be
-    and `yaw_rad` further round; the tracked point `off_m` to the left of the line, and that over time, `sum_m_s`.
+    """Tracking errors of the robot against its reference.
+
+    `place`: index of the point on the reference. `left_m`, `yaw_rad`: how far the centre of rotation is to the left of
+    its reference, and turned anticlockwise from it. `off_m`: distance of the tracked point to the left of the line;
+    `sum_m_s`: its integral over time.
     """
 
     place: int
@@ -72,18 +75,18 @@ class Errors:
 
 
 class Law(Protocol):
-    """A steering law."""
+    """Protocol of a steering law: it corrects the turning rate and speed of a reference motion."""
 
     @property
     def preview_s(self) -> float:
-        """How far ahead the reference motion is taken."""
+        """Time (s) by which the reference motion is taken ahead of the robot."""
 
     @property
     def largest_sum_m_s(self) -> float:
         """Bound of the distance's integral."""
 
     def turn(self, reference: Reference, errors: Errors, x_m: float, y_m: float, yaw_rad: float) -> tuple[float, float]:
-        """What to add to the reference's turning rate (rad/s), and the factor of its forward speed."""
+        """Return the correction to add to the reference's turning rate (rad/s), and the factor of its forward speed."""
 
 
 class Follower:
@@ -104,7 +107,7 @@ class Follower:
 
     @property
     def x_icr_m(self) -> float:
-        """That of the robot that the line's headings were made for."""
+        """Place (m) of the centre of rotation ahead of the tracked point, for which the line's headings are made."""
         return self._chassis.x_icr_m
 
     def set_chassis(self, chassis: NominalRobot) -> None:
@@ -112,7 +115,10 @@ class Follower:
         self._chassis = chassis
 
     def watch(self, state: PlannerState) -> None:
-        """Somebody else drives: keep the place on the line, as where a line crosses itself nothing else tells it."""
+        """Update only the place on the line while something else drives.
+
+        Where the line crosses itself, nothing else tells the branches apart.
+        """
         self._place = self._reference.place(state.x_m, state.y_m, self._place)
         self._sum_m_s, self._last_ns = 0.0, None
 
@@ -154,14 +160,14 @@ class Follower:
         return Errors(place, left, math.remainder(state.yaw_rad - yaw, 2.0 * math.pi), off, self._sum_m_s)
 
     def set_task(self, _task: object) -> None:
-        """A line is for good."""
+        """Raise TypeError, because a follower keeps its line."""
         raise TypeError("a follower keeps its line")
 
     def set_belief(self, _belief: object) -> None:
-        """Nothing is believed."""
+        """Do nothing: a follower uses no belief over parameters."""
 
     def sampled_rollouts(self, _count: int) -> Rollouts:
-        """None are sampled."""
+        """Return no rollouts: a follower samples none."""
         return no_rollouts()
 
 
@@ -223,7 +229,7 @@ class Reference:
         return int(near[int(square.argmin())])
 
     def beyond(self, place: int, entries: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Indices so many entries further on: round and round, or up to the ends."""
+        """Return indices so many entries further on: round and round, or up to the ends."""
         count = len(self.places_m)
         return np.asarray((place + entries) % count if self.closed else np.clip(place + entries, 0, count - 1))
 
@@ -237,7 +243,7 @@ class Reference:
         return float((y_m - at_y) * math.cos(along) - (x_m - at_x) * math.sin(along))
 
     def axle_m(self, place: int) -> tuple[float, float]:
-        """Where the centre of rotation is when the tracked point is at a place."""
+        """Return the position x, y (m) of the centre of rotation when the tracked point is at a place of the line."""
         (at_x, at_y), yaw = self.places_m[place].tolist(), float(self.yaw_rad[place])
         return at_x + self.x_icr_m * math.cos(yaw), at_y + self.x_icr_m * math.sin(yaw)
 
@@ -252,7 +258,7 @@ class PurePursuit:
     largest_sum_m_s: float = 0.3
 
     def turn(self, reference: Reference, errors: Errors, x_m: float, y_m: float, yaw_rad: float) -> tuple[float, float]:
-        """The arc through the goal, less the reference's."""
+        """Return the arc through the goal, less the reference's."""
         goal_x, goal_y = reference.axle_m(reference.ahead(errors.place, self.look_ahead_m))
         axle_x, axle_y = x_m + reference.x_icr_m * math.cos(yaw_rad), y_m + reference.x_icr_m * math.sin(yaw_rad)
         to_x, to_y = goal_x - axle_x, goal_y - axle_y
@@ -274,7 +280,7 @@ class Kanayama:
     largest_sum_m_s: float = 0.3
 
     def turn(self, reference: Reference, errors: Errors, x_m: float, y_m: float, yaw_rad: float) -> tuple[float, float]:
-        """The law; the reference's speed is kept but for the cosine of the heading's error."""
+        """Return Kanayama's turning correction (rad/s), and the cosine of the heading error as speed factor."""
         correction = self.left * errors.left_m + self.yaw * math.sin(errors.yaw_rad) + self.integral * errors.sum_m_s
         return -reference.speed_m_s * correction, max(math.cos(errors.yaw_rad), 0.2)
 
@@ -302,7 +308,7 @@ class LinearQuadratic:
         object.__setattr__(self, "gains", (integral, left, yaw))
 
     def turn(self, reference: Reference, errors: Errors, x_m: float, y_m: float, yaw_rad: float) -> tuple[float, float]:
-        """Gains times state."""
+        """Return the gains times the state (rad/s), and the cosine of the heading error as speed factor."""
         integral, left, yaw = self.gains
         length = reference.speed_m_s * errors.sum_m_s
         correction = integral * length + left * errors.left_m + yaw * math.sin(errors.yaw_rad)
@@ -321,10 +327,10 @@ class Line(Protocol):
 
     @property
     def speed_m_s(self) -> float:
-        """Along the line."""
+        """Speed along the line, m/s."""
 
     def line_m(self) -> Array:
-        """Its points (N, 2) in the order of the drive; the last is the first where it is closed."""
+        """Return the line's points (N, 2) in the order of the drive; the last is the first where it is closed."""
 
 
 class BelievedPlanner(Protocol):
@@ -357,7 +363,7 @@ class BelievedPlanner(Protocol):
         """Drive around what stands on this line, points (N, 2)."""
 
     def sampled_rollouts(self, count: int) -> Rollouts:
-        """The weightiest sequences of the last plan."""
+        """Return the weightiest sequences of the last plan."""
 
 
 class WithFallback:
@@ -384,7 +390,7 @@ class WithFallback:
         return NominalRobot(*self._planner.chassis, self._limits)
 
     def plan(self, now_ns: int, state: PlannerState) -> WheelPlan:
-        """The planner's plan, or the follower's; raises NoValidControl where neither can be."""
+        """Return the planner's plan, or the follower's; raises NoValidControl where neither can be."""
         numbers = state.x_m, state.y_m, state.yaw_rad, state.left_speed_rad_s, state.right_speed_rad_s
         finite = all(map(math.isfinite, numbers))
         try:
@@ -429,5 +435,5 @@ class WithFallback:
         self._planner.set_line(line_m)
 
     def sampled_rollouts(self, count: int) -> Rollouts:
-        """The planner's, of its last plan."""
+        """Return the planner's, of its last plan."""
         return self._planner.sampled_rollouts(count)

@@ -27,7 +27,7 @@ _SEEDS_APART = 1_000_003
 
 
 def _shaped(name: str, result: Tensor, shape: torch.Size) -> Tensor:
-    """What a user's function returned; raises ValueError unless it has this shape."""
+    """Return the result of a user's function; raise ValueError unless it has this shape."""
     found = tuple(result.shape) if isinstance(result, Tensor) else type(result).__name__
     if found != tuple(shape):
         raise ValueError(f"{name} returned {found}; must return a tensor of shape {tuple(shape)}")
@@ -93,12 +93,12 @@ class BlackBoxDisco:
         self._weights = self._tensor(shares)
 
     def reset(self) -> None:
-        """Forget the plan; the random numbers go on."""
+        """Clear the plan but continue the sequence of random numbers."""
         self._nominal.zero_()
 
     @torch.no_grad()
     def plan(self, state: NDArray[np.float64], shift_steps: int = 1) -> NDArray[np.float64]:
-        """Controls (T, m) from a state (n,) on, the last plan moved on by whole steps.
+        """Plan controls (T, m) from a state (n,) on, the last plan moved on by whole steps.
 
         Raises NoValidControl, and keeps the last plan, if no sample has a finite cost.
         """

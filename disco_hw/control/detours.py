@@ -28,7 +28,7 @@ _MOVED_M = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Detour:
-    """Around one obstacle: the point and direction of the line beside it, how far to the left, and half its length."""
+    """Detour around one obstacle: point and direction of the line beside it, offset to the left, half its length."""
 
     x_m: float
     y_m: float
@@ -97,7 +97,7 @@ class Detours:
             )  # fmt: skip
 
     def _around(self, bounds: Boundaries, circle: list[float], keep_m: float, before: list[Detour]) -> Detour | None:
-        """The detour around a circle (x, y, radius, velocity); None where it does not stand in the way."""
+        """Return the detour around a circle (x, y, radius, velocity); None where it does not stand in the way."""
         x, y, radius = circle[:3]
         off = np.array([x, y]) - self._line
         at = int(np.hypot(*off.T).argmin())

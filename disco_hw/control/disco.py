@@ -1,4 +1,4 @@
-"""DISCO: stochastic model predictive control that rolls out every command sequence under the belief over parameters."""
+"""Stochastic model predictive control (DISCO) with rollouts of every command sequence under the belief."""
 
 from __future__ import annotations
 
@@ -195,7 +195,7 @@ class Disco:
         return 2.0 * self._limits.speed_rad_s * self._settings.step_s * ratio
 
     def _history_for(self, model: Model, theta: Array) -> int:
-        """Steps of past commands that the points (L, P) and the mean look back on."""
+        """Return the number of past commands that the points (L, P) and the mean look back on."""
         delay_steps = max(self._value(each, DELAYED_BY) for each in (theta, mean_point(model))) / self._settings.step_s
         return 0 if delay_steps == 0.0 else math.floor(delay_steps) + 1
 
@@ -215,7 +215,7 @@ class Disco:
 
     @property
     def task(self) -> PlannedTask:
-        """What is planned for."""
+        """The task that is planned for."""
         return self._task
 
     @property
@@ -225,7 +225,7 @@ class Disco:
 
     @property
     def settings(self) -> DiscoSettings:
-        """How it is planned."""
+        """The settings that plans are made with."""
         return self._settings
 
     def set_task(self, task: PlannedTask) -> None:
@@ -522,7 +522,7 @@ class Disco:
         return np.column_stack(self._disturbance.turning(acting[:, 0], acting[:, 1], self._chassis.axial_distance_m))
 
     def _asked(self, commands: Array) -> Array:
-        """The inverse of `_acting`."""
+        """Return the inverse of `_acting`."""
         if self._turns_as_asked:
             return commands
         left, right = self._disturbance.asked(commands[:, 0], commands[:, 1], self._chassis.axial_distance_m)
@@ -575,7 +575,7 @@ class Disco:
         return np.concatenate([self._earlier, wheel_speeds]) if self._history else wheel_speeds
 
     def sampled_rollouts(self, count: int = 50) -> Rollouts:
-        """The last plan's `count` sequences of the largest weight, rolled out under the mean parameters.
+        """Return the last plan's `count` sequences of the largest weight, rolled out under the mean parameters.
 
         A look from outside: takes under a millisecond for 50, and changes no plan. Empty before the first plan and when
         the last one is a ramp to zero.
@@ -587,7 +587,7 @@ class Disco:
         return Rollouts(np.array([self._asked(one) for one in commands]), trajectories, weights)
 
     def point_trajectories(self) -> Array:
-        """The last plan under each parameter point (sigma point or draw) that is shared: (L, T + 1, 3) x, y, yaw.
+        """Return the last plan under each shared parameter point (or draw): (L, T + 1, 3) x, y, yaw.
 
         As cheap as `sampled_rollouts`, and changes no plan.
         """

@@ -110,7 +110,7 @@ class Optimiser:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the plan; the random numbers go on."""
+        """Clear the plan but continue the sequence of random numbers."""
         self._work.nominal[:] = 0.0
         self._valid = False
         self._work.report[TEMPERATURE] = FIRST_TEMPERATURE
@@ -126,7 +126,7 @@ class Optimiser:
         return int(self._work.costs.size)
 
     def nominal(self) -> Array:
-        """A read-only copy of the plan, (T, C)."""
+        """Return a read-only copy of the plan, (T, C)."""
         copy: Array = self._work.nominal.astype(np.float64)
         copy.setflags(write=False)
         return copy
@@ -171,7 +171,7 @@ class Optimiser:
     def step(
         self, shift_steps: float, gain: float, before: tuple[float, ...], system: System, point_weights: Floats
     ) -> bool:
-        """One step: the plan moves on by `shift_steps` and is improved; False if nothing valid came out.
+        """Shift the plan by `shift_steps` and improve it once; return False if no valid plan came out.
 
         `gain`: how far the plan moves towards the weighted mean of the samples, 0 to 1.
 

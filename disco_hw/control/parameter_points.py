@@ -21,7 +21,7 @@ SAME_RATIO = 1e-9
 
 
 def moving_names(belief: Belief) -> tuple[str, ...]:
-    """Those parameters of a belief that change motion: of effects, then wheel radius and axial distance, then x_icr."""
+    """Return the belief's parameters that change motion: of effects, wheel radius and axial distance, then x_icr."""
     base = {parameter.name for parameter in BASE_PARAMETERS}
     moving = [name for name in belief.names if name in base or effect_of(name.rpartition(".")[0]).moves]
     return tuple(sorted(moving, key=lambda name: (name in base) + (name == X_ICR.name)))
@@ -56,7 +56,7 @@ def moments(belief: Belief) -> tuple[Array, Array]:
 
 
 def point_estimate(model: Model) -> tuple[Array, Array]:
-    """The model's point values as the only point: (1, P), weight (1,)."""
+    """Return the model's point values as the only point: (1, P), weight (1,)."""
     return model.point()[None], np.ones(1)
 
 
@@ -87,7 +87,7 @@ def drawn_points(model: Model, count: int, seed: int, step: int) -> Array:
 
 
 def mean_point(model: Model) -> Array:
-    """The mean of the belief over all parameters of the model, (1, P), within their physical ranges."""
+    """Return the mean of the belief over all parameters of the model, (1, P), within their physical ranges."""
     if model.belief is None:
         return model.point()[None]
     return model.complete(model.belief.mean()[None], model.belief.names)
@@ -130,7 +130,7 @@ def shared_pairs(model: Model, points: Array, step_s: float) -> int:
 
 
 def _wheel_coefficients(model: Model, points: Array, step_s: float) -> Array | None:
-    """What the effects of points (L, P) work with, (L, N); None if one acts after the wheels."""
+    """Return the effects' coefficients (L, N) for points (L, P); None if an effect acts after the wheels."""
     columns = [np.empty((len(points), 0))]
     at = len(BASE_PARAMETERS)
     for setting in model.effects:

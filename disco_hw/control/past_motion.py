@@ -1,4 +1,4 @@
-"""What a model's terms remember of a drive: means kept up from tick to tick, and those where a rollout begins."""
+"""Running means of commands and wheel speeds that a model's terms use, from tick to tick and at a rollout's start."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ class DriveMeans:
 
     @classmethod
     def of(cls, model: Model) -> DriveMeans | None:
-        """Those of a model; None if it remembers nothing."""
+        """Return the running means that a model needs, or None if none of its effects needs any."""
         memories = memories_of(setting.name for setting in model.effects)
         return cls(*memories, 0.5 * model.wheel_radius_m) if any(memories) else None
 
     @property
     def commands(self) -> tuple[tuple[float, float], ...]:
-        """Of both wheels' commands, one pair a term, up to the last one taken in."""
+        """Means of both wheels' commands, one pair for each term, up to the last command added."""
         return self._commands
 
     @property
     def body(self) -> tuple[float, ...]:
-        """Of the wheels' speeds, one a term."""
+        """Means of the wheels' speeds, one for each term."""
         return self._wheels
 
     def add_command(self, left_rad_s: float, right_rad_s: float, held_s: float) -> None:
@@ -81,7 +81,7 @@ class PastMotion:
 
     @classmethod
     def of(cls, model: Model, theta: Array, mean_theta: Array) -> PastMotion | None:
-        """That of the points (L, P) and the mean (1, P) of a model; None if it remembers nothing."""
+        """Return the past motion for points (L, P) and mean (1, P) of a model; None if no effect needs any."""
         if not any(memories_of(setting.name for setting in model.effects)):
             return None
         if DELAYED_BY not in model.parameter_names:

@@ -1,4 +1,4 @@
-"""The paper's pendulum: a rod swung up by a torque at its joint, as a system that DISCO rolls out.
+"""Pendulum of the paper: a rod swung up by a torque at its joint, as a system that DISCO rolls out.
 
 theta is 0 upright; theta'' = 3 g / (2 l) sin(theta) + 3 u / (m l^2), with steps in the order of the Gym environment
 that the paper used: the angle moves with the new speed, then the speed is cut. Stage cost of the state after each step:
@@ -47,7 +47,7 @@ _ANGLE, _SPEED, _SINE, _TOTAL = (U(row) * BLOCK for row in range(4))
 
 
 class PendulumTerms(NamedTuple):
-    """What the kernel needs: `start` (2,) angle and speed, and tables of L points, or of K' for each if `each`.
+    """Terms of the pendulum's kernel: `start` (2,) angle and speed, tables of L points, or of K' for each if `each`.
 
     `gravity` is 3 g step / (2 l), `gain` 3 step / (m l^2); `each` is None or anything else.
     """
@@ -60,7 +60,7 @@ class PendulumTerms(NamedTuple):
 
 
 def instant_cost(angle_rad: float, speed_rad_s: float) -> float:
-    """The stage cost of a state."""
+    """Return the stage cost of a state."""
     return UPRIGHT_WEIGHT * (math.cos(angle_rad) - 1.0) ** 2 + speed_rad_s**2
 
 
@@ -78,7 +78,7 @@ def step(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PendulumPoints:
-    """Parameter points: `theta` (L, 2) length (m) and mass (kg), both positive, and weights (L,).
+    """Parameter points of a pendulum: `theta` (L, 2) length (m) and mass (kg), both positive, and weights (L,).
 
     With `each`, theta holds L points for each of K' samples, (L, K', 2).
     """

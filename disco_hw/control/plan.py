@@ -1,4 +1,4 @@
-"""What a planner takes and gives: every knob of DISCO, the state and the commands before it, and a plan in time.
+"""Inputs and outputs of a planner: the settings of DISCO, the state and the commands before it, and a plan in time.
 
 A control law of your own (`Law`: a function from the robot's state to wheel speeds) is a planner as `LawController`.
 """
@@ -39,20 +39,20 @@ def _require(holds: bool, field: str, remedy: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class CommandLimits:
-    """What a wheel may be asked for: speed (rad/s) and acceleration (rad/s^2)."""
+    """Limits of a wheel command: speed (rad/s) and acceleration (rad/s^2)."""
 
     speed_rad_s: float
     acceleration_rad_s2: float = math.inf
 
     @classmethod
     def of_robot(cls, robot: config.Robot) -> CommandLimits:
-        """The limits of robot.toml."""
+        """Return the limits of robot.toml."""
         return cls(robot.max_wheel_speed_rad_s, robot.max_wheel_acceleration_rad_s2)
 
 
 @dataclass(frozen=True, slots=True)
 class Sampler:
-    """How command sequences are sampled, weighed and carried on; units of a command are the system's.
+    """Settings that say how command sequences are sampled, weighted and carried on, in the system's units.
 
     samples: sequences tried in a step (K). horizon: steps a plan covers (T).
     noise_std: standard deviation of the noise on one knot; of a fifth of the samples it is `wide` times as large, to
@@ -148,7 +148,7 @@ class DiscoSettings:
 
     @classmethod
     def paper(cls, uncertainty: Uncertainty = "ut") -> DiscoSettings:
-        """The paper's skid-steer experiment (appendix): white noise, control cost, UT with alpha = 0.5, Algorithm 1.
+        """Return the paper's skid-steer settings (appendix): white noise, control cost, UT with alpha = 0.5.
 
         K = 400, T = 50, temperature 0.1, control authority 0.25 (rotations per second)^2. Rollouts take Euler steps, as
         those of the skid-steer robot in the code of the same author do (github.com/lubaroli/dust).
@@ -180,7 +180,7 @@ class DiscoSettings:
 
     @classmethod
     def for_speed(cls, speed_m_s: float, rate_hz: float) -> DiscoSettings:
-        """What suits a task of this speed at so many plans a second.
+        """Return the settings for a task of this speed (m/s) at `rate_hz` plans a second.
 
         A slow robot plans over the same way as one at 0.2 m/s, with noise in proportion to its speed; a fast one has
         shorter steps, but no more than one a plan. With these the mean distance from circles of 0.3 to 3 m stays below
@@ -195,7 +195,7 @@ class DiscoSettings:
 
     @classmethod
     def from_config(cls, control: config.Control, speed_m_s: float) -> DiscoSettings:
-        """The settings that robot.toml asks for, for its task's speed."""
+        """Return the settings that robot.toml asks for, for its task's speed."""
         settings = cls.paper() if control.mode == "paper" else cls.for_speed(speed_m_s, control.rate_hz)
         horizon = settings.sampler.horizon if control.horizon is None else control.horizon
         step_s = settings.step_s if control.step_s is None else control.step_s
@@ -240,8 +240,11 @@ class PlannerState(msgspec.Struct, frozen=True, gc=False):
 
 
 class PlanOutcome(enum.Enum):
-    """How a plan came about: at once, after a retry, from scratch, or, because nothing helped, as a ramp to zero or
-    from a classical follower."""
+    """Outcome of a planning step.
+
+    Planned at once, after a retry, from scratch, or, because nothing helped, as a ramp to zero or from a classical
+    follower.
+    """
 
     PLANNED = "planned"
     RETRIED = "retried"
@@ -251,7 +254,7 @@ class PlanOutcome(enum.Enum):
 
 
 class Diagnostics(msgspec.Struct, frozen=True):
-    """How the optimisation went.
+    """Diagnostics of one optimisation.
 
     `ess` effective sample size, `collapsed` whether it is below the alarm; `temperature`; `cost_min`, `cost_mean` of
     the samples and `cost_nominal` of sample 0, which is the plan that they vary; `valid_samples` with a finite cost;
@@ -302,7 +305,7 @@ class WheelPlan(msgspec.Struct, frozen=True, eq=False):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Rollouts:
-    """Some of the sequences that the last plan was made from.
+    """Sampled sequences from which the last plan was made.
 
     `wheel_speeds` (n, T, 2) rad/s, `trajectories` (n, T + 1, 3) x, y, yaw, `weights` (n,) of all that sum to one.
     """
@@ -361,7 +364,7 @@ class LawController:
         self._law, self._model, self._task = law, model, task
 
     def plan(self, now_ns: int, state: PlannerState) -> WheelPlan:
-        """Ask the law; raises NoValidControl."""
+        """Return a plan that holds the law's wheel speeds; raise NoValidControl unless it gives two finite numbers."""
         asked = self._law(state, self._task, self._model)
         try:
             left, right = (float(speed) for speed in asked)
@@ -382,15 +385,15 @@ class LawController:
         self._task = task
 
     def set_belief(self, _belief: Belief) -> None:
-        """Nothing: a law keeps the model that it was given."""
+        """Do nothing: a law keeps the model that it was given."""
 
     def sampled_rollouts(self, _count: int) -> Rollouts:
-        """None are sampled."""
+        """Return no rollouts: a law samples none."""
         return no_rollouts()
 
 
 def held_plan(now_ns: int, state: PlannerState, left_rad_s: float, right_rad_s: float, base: Any) -> WheelPlan:
-    """These wheel speeds for 0.4 s, and where a robot of this base (wheel radius, axial distance, x_icr; m) goes."""
+    """Return a plan that holds these wheel speeds for 0.4 s on this base (wheel radius, axial distance, x_icr; m)."""
     wheel_radius_m, axial_distance_m, x_icr_m = base
     forward = 0.5 * wheel_radius_m * (left_rad_s + right_rad_s)
     turn = wheel_radius_m * (right_rad_s - left_rad_s) / axial_distance_m

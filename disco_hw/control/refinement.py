@@ -42,7 +42,7 @@ BESIDE_PART, FACING = 0.3, 0.5
 
 
 class RefinementStart(NamedTuple):
-    """Where a refinement begins.
+    """Initial state of a refinement.
 
     `terms` of the task and `begin` (11,) as of `SkidSteer`; `start` (5,) in the world; `elapsed_s` there; `slide` (3,)
     as of `Disturbance.slides`; `means` (L, n) or None; `past` (H, 2) commands before the plan and `before` the last.

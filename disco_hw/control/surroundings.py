@@ -31,7 +31,7 @@ TRAPPED_PART = 0.5
 
 
 class Surroundings:
-    """What a planner keeps away from, in the buffers that its kernel reads.
+    """Fence and obstacles that a planner keeps away from, in the buffers that its kernel reads.
 
     `max_breach_probability`: of a plan over its horizon; with the pose's deviation it makes the distance to keep.
     """
@@ -118,7 +118,7 @@ class Surroundings:
 
 
 def _edges(bounds: Boundaries) -> Array:
-    """The edges of all polygons, and of one within the circle to stay in, as capsules of no radius."""
+    """Return the edges of all polygons, and of one within the circle to stay in, as capsules of no radius."""
     outlines = [corners for corners, _ in bounds.polygons]
     circle = bounds.keep_in_circle
     if circle is not None:

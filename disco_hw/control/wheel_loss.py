@@ -1,4 +1,4 @@
-"""How much slower wheels turn than their commands and the model say: an observer with an integral of what is missing.
+"""Observer of the wheel speed that is lost against the commands and the model, with an integral of the difference.
 
 A dead band, a motor's gain or a battery that the model has wrong lose a part of either wheel's command. Wheels that
 scrub over the floor while the robot turns lose a part of the difference between them: the outer one turns slower, the
@@ -30,7 +30,7 @@ LONGEST_GAP_S = 0.2
 
 
 class WheelLoss:
-    """What either wheel, and half the difference of the two, lose of a command (rad/s); negative where they gain."""
+    """Estimated loss of a command (rad/s) at each wheel and in half their difference; negative where they gain."""
 
     def __init__(self) -> None:
         self._loss, self._turn = np.zeros(2), 0.0
@@ -39,13 +39,13 @@ class WheelLoss:
 
     @property
     def rad_s(self) -> Wheels:
-        """Of the left wheel's command and of the right one's."""
+        """Loss (rad/s) of the left wheel's command and of the right one's."""
         left, right = self._loss.tolist()
         return left, right
 
     @property
     def turn_rad_s(self) -> float:
-        """Of half the difference between the two."""
+        """Loss (rad/s) of half the difference between the two commands."""
         return self._turn
 
     @property
@@ -54,7 +54,7 @@ class WheelLoss:
         return self._turn == 0.0 and not self._loss.any()
 
     def pause(self) -> None:
-        """Something else moves the robot for a while; what is known of its wheels stays."""
+        """Interrupt the observer while something else moves the robot; what is known of its wheels stays."""
         self._speeds = None
 
     def step(
@@ -89,7 +89,7 @@ class WheelLoss:
         return _lessened(_turned(commands, self._turn, _lessened), self._loss)
 
     def asked(self, commands: Array) -> Array:
-        """The inverse of `acting`."""
+        """Return the inverse of `acting`."""
         return _turned(_greater(commands, self._loss), self._turn, _greater)
 
 
@@ -97,7 +97,7 @@ _OUTWARDS = np.array([1.0, -1.0])
 
 
 def _part(commands: Array) -> Array:
-    """How much of its loss commands have, and which way."""
+    """Return the signed part of its loss that each command has: proportional when slow, then -1 or 1."""
     return np.clip(commands / WHOLE_RAD_S, -1.0, 1.0)
 
 
@@ -106,7 +106,7 @@ def _lessened(commands: Array, loss: Array | float) -> Array:
 
 
 def _greater(commands: Array, loss: Array | float) -> Array:
-    """The inverse of `_lessened`."""
+    """Return the inverse of `_lessened`."""
     small = commands / (1.0 - loss / WHOLE_RAD_S)
     large = commands + np.sign(commands) * loss
     return np.where(np.abs(small) < WHOLE_RAD_S, small, large)

@@ -55,7 +55,7 @@ def default_socket_path(name: str) -> Path:
 
 
 def passed_over(path: Path) -> tuple[str, ...]:
-    """The directories that `default_socket_path` did not believe before it came to `path`: a line each, with owners."""
+    """Return a line for each directory, with owners, that `default_socket_path` did not accept before `path`."""
     uid = os.geteuid()
     if path.parent.parent != _TEMPORARY or not _numbered(uid).fullmatch(path.parent.name):
         return ()
@@ -109,7 +109,7 @@ def connect(path: Path, timeout_s: float) -> socket.socket:
 
 
 def peer_uid(connection: socket.socket) -> int:
-    """The user whose process has the other end of a Unix socket."""
+    """Return the user whose process has the other end of a Unix socket."""
     credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
     return int(struct.unpack("3i", credentials)[1])
 
@@ -125,7 +125,7 @@ def _numbered(uid: int) -> re.Pattern[str]:
 
 
 def _taken(uid: int) -> list[Path]:
-    """What is there under one of the names in /tmp, in their order."""
+    """Return the existing entries of /tmp that bear one of this user's names, in order of their numbers."""
     numbered = _numbered(uid)
     found = [(int(match[1] or 1), entry) for entry in os.listdir(_TEMPORARY) if (match := numbered.fullmatch(entry))]
     return [_TEMPORARY / entry for _, entry in sorted(found)]
@@ -212,7 +212,7 @@ SERVED = (*ACTIONS, *PAGE_ACTIONS)
 
 
 def socket_path(config: RobotConfig) -> Path:
-    """Where the daemon of this robot listens."""
+    """Return the path of the control socket of this robot's daemon."""
     return _path_of(config.robot.name, config.daemon.control_socket)
 
 
@@ -287,7 +287,7 @@ def _change(text: str) -> tuple[str, float]:
 
 
 def in_words(reply: dict[str, Any], robot: Path) -> str:
-    """A reply of the daemon of `robot` for a person."""
+    """Return a reply of the daemon of `robot` for the operator."""
     if not reply.get("ok"):
         return f"refused: {reply.get('error')}"
     if reply.get("do") != "status":
@@ -325,7 +325,7 @@ def in_words(reply: dict[str, Any], robot: Path) -> str:
 
 
 def _fence_in_words(area: Mapping[str, Any] | None) -> Iterator[str]:
-    """What a status says of fence and obstacles; nothing where there are none."""
+    """Yield lines on fence and obstacles from a status; none where there is no fence."""
     if area is None or area["verdict"] == "idle":
         return
     held = f", {area['reason']}" if area["reason"] else ""
@@ -338,7 +338,7 @@ def _fence_in_words(area: Mapping[str, Any] | None) -> Iterator[str]:
 
 
 def controller_in_words(controller: Mapping[str, Any] | None) -> tuple[str, ...]:
-    """Which controller a status speaks of, and its limits by who says them; nothing before it is known."""
+    """Return which controller a status describes, and its limits by who states them; nothing before it is known."""
     if controller is None:
         return ()
     by_source: dict[SaidBy, list[str]] = {}
@@ -349,7 +349,7 @@ def controller_in_words(controller: Mapping[str, Any] | None) -> tuple[str, ...]
 
 
 def recording_in_words(recorder: Mapping[str, Any]) -> str:
-    """Where every tick that the recorder of a status was given has gone."""
+    """Describe what became of every tick that a status's recorder was given."""
     given = recorder["ticks"] + recorder["dropped_ticks"]
     counts = {"waiting": "waiting_ticks", "dropped": "dropped_ticks", "lost with a deleted file": "lost_ticks"}
     words = [f"{recorder['delivered_ticks']} of {given} ticks"]

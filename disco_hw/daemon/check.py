@@ -1,4 +1,4 @@
-"""`disco-hw check`: is everything ready to drive? Looks and asks; nothing moves and nothing is armed."""
+"""Check for `disco-hw check` that everything is ready to drive, without moving or arming anything."""
 
 from __future__ import annotations
 
@@ -72,14 +72,14 @@ class CheckReport:
         return all(check.level is not Level.FAIL for check in self.checks)
 
     def as_dict(self) -> dict[str, Any]:
-        """The report for machines."""
+        """Return the report as a JSON-serialisable dict."""
         return {
             "ok": self.ok,
             "checks": [{"name": check.name, "level": check.level.value, "text": check.text} for check in self.checks],
         }
 
     def as_text(self) -> str:
-        """The report for a person, one line a check."""
+        """Return the report for the operator, one line a check."""
         return "\n".join(f"{check.level.value:4}  {check.name}: {check.text}" for check in self.checks)
 
 
@@ -124,7 +124,7 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """What the robot answered; `pose_news` is the newest that the pose source said of itself, empty for nothing."""
+    """Replies of the robot during a check; `pose_news` is the pose source's newest message, empty if there is none."""
 
     state: DriverState
     detail: str
@@ -230,7 +230,7 @@ def _ask_robot(transport: Transport, driver: Driver, pose_source: PoseSource) ->
 
 
 def pose_source_checks(source: PoseInput, poses: Sequence[PoseSample]) -> list[Check]:
-    """Each of several pose sources, heard for the time of listening on a robot that stands, and whether they agree."""
+    """Check each of several pose sources on a robot that stands, and whether they agree."""
     labels, every = source.labels(), source.every()
     if len(labels) == 1:
         return []
@@ -256,7 +256,10 @@ def pose_source_checks(source: PoseInput, poses: Sequence[PoseSample]) -> list[C
 
 
 def _apart(one: Sequence[PoseSample], other: Sequence[PoseSample]) -> str:
-    """How far two sources differ, by the medians of what they said of a robot that stands; empty where they agree."""
+    """Describe the offset between two pose sources; empty if they agree.
+
+    Medians taken while the robot stands still are compared.
+    """
     if not one or not other:
         return ""
     dx, dy = (median(getattr(pose, name) for pose in one) - median(getattr(pose, name) for pose in other)

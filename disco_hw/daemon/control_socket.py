@@ -72,7 +72,9 @@ class _Client:
 
 
 class ControlServer:
-    """The daemon's end. `poll()` for requests in each tick, e-stop first; `reply()` to each.
+    """Server of the control socket: `poll()` for requests in each tick, e-stop first; `reply()` to each.
+
+    `poll()` for requests in each tick, e-stop first; `reply()` to each.
 
     Raises InputError if another daemon serves this socket, or the path cannot be used. What a dead daemon left behind
     is replaced: a record lock shows whether one lives, which the kernel drops with the process, however it ends.
@@ -277,7 +279,7 @@ def loop_figures(loop: LoopStats) -> dict[str, Any]:
 
 
 def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> dict[str, Any]:
-    """Everything that a person or a page wants to know now; what does not exist is None.
+    """Return everything that an operator or a page needs to know now; what does not exist is None.
 
     `robot_state_ns`: when the newest frame with the robot's state arrived, on the monotonic clock of this host.
 
@@ -336,7 +338,7 @@ def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> d
 
 
 def _poses(core: DaemonCore) -> list[dict[str, Any]]:
-    """Each pose source: its frame and place on the robot, and how it does."""
+    """Return the status of each pose source: its frame and place on the robot, and how it does."""
     tick, sources = core.last, core.pipeline.fusion.sources
     found = sources.status(0 if tick is None else tick.pipeline.t_ns)
     return [
@@ -360,7 +362,7 @@ def _microseconds(summary: dict[str, float]) -> dict[str, float]:
 def counters(
     core: DaemonCore, loop: LoopStats, recorder: RecorderStats, now_ns: int, stolen_ms: int = 0
 ) -> records.Counters:
-    """Every counter of the stack as one record for the log; `stolen_ms`: of `processes.stolen_ms`, since the start."""
+    """Return every counter of the stack as one record; `stolen_ms`: of `processes.stolen_ms`, since the start."""
     return records.Counters(
         t_ns=now_ns,
         transport=asdict(core.transport.stats),

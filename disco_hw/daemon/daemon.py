@@ -73,7 +73,7 @@ class Daemon:
         self._told_ready = False
 
     def run(self) -> int:
-        """Run the loop until asked to stop; returns the exit code. An exception is reported and ends it."""
+        """Run the loop until requested to stop; returns the exit code. An exception is reported and ends it."""
         try:
             self._loop.run(self._tick, lambda: self._quit or self._signals.received is not None or self._pilot.done)
         except Exception as error:
@@ -175,7 +175,7 @@ class Daemon:
         )
 
     def _look_at_samples(self, now_ns: int) -> tuple[records.Record, ...]:
-        """What the plan was weighed from, once or twice a second, for the next tick's record.
+        """Return sampled rollouts of the plan for the next tick's record, once or twice a second.
 
         After the command has gone out, and only if most of the period is left: it can never make a command late.
         """
@@ -306,7 +306,7 @@ _REQUESTS = frozenset(request.value for request in UserRequest if request is not
 
 
 def _request(message: ControlMessage) -> UserRequest:
-    """What a message asks of the supervisor."""
+    """Return the request to the supervisor that a message stands for."""
     if message.action == UserRequest.ARM.value and message.arguments.get("unrecorded") is True:
         return UserRequest.ARM_UNRECORDED
     return UserRequest(message.action)

@@ -62,7 +62,7 @@ class EstopOutcome:
         return self.link_error is None or self.daemon_error is None
 
     def as_dict(self) -> dict[str, Any]:
-        """The outcome for machines."""
+        """Return the outcome as a JSON-serialisable dict."""
         return {
             "sent": self.sent,
             "confirmed": self.confirmed,
@@ -74,7 +74,7 @@ class EstopOutcome:
         }
 
     def as_text(self) -> str:
-        """The outcome for a person."""
+        """Return the outcome as text."""
         lines = [
             *([] if self.file_error is None else [f"{self.file_error}: used --link alone"]),
             f"{self.link}: {self.link_error or 'e-stop sent'}",
@@ -132,7 +132,7 @@ def stop_robot(robot: Path, link: str | None = None, kept: Mapping[str, Any] | N
 
 
 def read_robot_toml(robot: Path) -> Mapping[str, Any]:
-    """What robot.toml says now, to be kept for `stop_robot`; empty if it cannot be read."""
+    """Read robot.toml as it is now, to be kept for `stop_robot`; empty if it cannot be read."""
     return _read(robot)[0]
 
 
@@ -145,7 +145,7 @@ def _attempt(way: Callable[[], bool]) -> tuple[bool, str | None]:
 
 
 def _read(robot: Path) -> tuple[dict[str, Any], str | None]:
-    """What is in robot.toml, and why it cannot be read."""
+    """Read robot.toml; return its contents and, if it cannot be read, why."""
     try:
         return read_toml(robot, ROBOT_TOML), None
     except InputError as error:
@@ -153,7 +153,7 @@ def _read(robot: Path) -> tuple[dict[str, Any], str | None]:
 
 
 def _settings(robot: Path, raw: dict[str, Any], file_error: str | None, option: str | None) -> tuple[Link, str | None]:
-    """Where the link is, and why robot.toml did not say it."""
+    """Return the settings of the link, and why robot.toml did not give them."""
     given = link_fields(option)
     if file_error is None:
         try:

@@ -59,7 +59,7 @@ class KeptConnection:
                 self._lock.release()
 
     def close(self) -> None:
-        """Close the connection; safe to call twice."""
+        """Close the connection to the daemon; safe to call twice."""
         with self._lock:
             self._drop()
 

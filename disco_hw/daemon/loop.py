@@ -1,4 +1,4 @@
-"""The control loop: absolute deadlines, skipped periods counted and never caught up, every stage timed."""
+"""Control loop with absolute deadlines: skipped periods are counted and never caught up, every stage is timed."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Histogram:
         return self._total_ns / self._count if self._count else math.nan
 
     def record(self, duration_ns: int) -> None:
-        """Count one duration; a negative one counts as 0, one beyond the range in the last bucket."""
+        """Count one duration in its bucket; a negative one counts as 0, one beyond the range in the last bucket."""
         duration_ns = max(duration_ns, 0)
         self._counts[min(_bucket(duration_ns), _BUCKETS - 1)] += 1
         self._count += 1
@@ -122,7 +122,7 @@ def _upper_edge_ns(bucket: int) -> int:
 
 
 class StageTimer:
-    """How long the named parts of a tick take: each lasts from the mark before it, or the tick's start, to its own.
+    """Timer of the named parts of a tick: each lasts from the mark before it, or the tick's start, to its own.
 
     A name that is marked more than once in a tick adds up.
     """
@@ -135,7 +135,7 @@ class StageTimer:
         self._histograms: dict[str, Histogram] = {}
 
     def begin(self, now_ns: int) -> None:
-        """Start a tick: its first stage begins now."""
+        """Start timing a tick, whose first stage begins now."""
         self._since_ns = now_ns
         self._present_ns.clear()
 
@@ -146,7 +146,7 @@ class StageTimer:
         self._since_ns = now_ns
 
     def complete(self) -> None:
-        """End the tick: what was marked becomes `last_ns` and is counted."""
+        """Finish timing a tick: what was marked becomes `last_ns` and is counted."""
         for name, duration_ns in self._present_ns.items():
             if name not in self._histograms:
                 self._histograms[name] = Histogram()

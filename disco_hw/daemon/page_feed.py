@@ -28,12 +28,12 @@ _MOST_RECORDS = 400
 
 
 def feed_path(control_socket: Path) -> Path:
-    """Where the page's feed of the daemon with this control socket is, in the same private directory."""
+    """Return the path of the page's feed, in the private directory of this control socket."""
     return control_socket.with_name(control_socket.name + ".view")
 
 
 def tick_feed_path(control_socket: Path) -> Path:
-    """Where the feed is that publishes each tick at once, for bridges."""
+    """Return the path of the feed for bridges, which publishes each tick at once."""
     return control_socket.with_name(control_socket.name + ".tick")
 
 
@@ -105,7 +105,7 @@ class ViewerFeed:
             del self._pending[:-_MOST_RECORDS]
 
     def _notice_watchers(self) -> None:
-        """A first page subscribes, the last one leaves: the socket reports both."""
+        """Update whether a page watches: the socket reports when a first one subscribes and the last one leaves."""
         with contextlib.suppress(zmq.Again):
             while True:
                 self._watched = self._socket.recv(zmq.NOBLOCK)[:1] == b"\x01"
@@ -131,7 +131,7 @@ class WatchedRecorder:
 
     @property
     def watched(self) -> bool:
-        """Whether somebody looks."""
+        """Whether a page reads the feed."""
         return self._feed.watched
 
     def put(self, now_ns: int, records: Sequence[Record]) -> None:
@@ -147,24 +147,24 @@ class WatchedRecorder:
             self._ticks.put(now_ns, wheels)
 
     def poll(self) -> RecorderStats:
-        """The recorder's counters."""
+        """Return the counters of the recorder."""
         return self._recorder.poll()
 
     def news(self) -> tuple[str, ...]:
-        """The recorder's."""
+        """Return the news of the recorder."""
         return self._recorder.news()
 
     def tend(self) -> None:
-        """Mend the recorder."""
+        """Let the recorder repair what takes milliseconds."""
         self._recorder.tend()
 
     def close(self, timeout_s: float = 5.0) -> RecorderStats:
-        """End the log; the feeds are closed by who made them."""
+        """Close the log and return its counters; the feeds are closed by their owner."""
         return self._recorder.close(timeout_s)
 
 
 class FeedSubscriber:
-    """Receives batches; `missed` counts those that did not get through, `malformed` what is none of the daemon's."""
+    """Receiver of a feed's batches; `missed` counts lost ones, `malformed` those that are none of the daemon's."""
 
     def __init__(self, path: Path) -> None:
         self.missed = 0
@@ -211,7 +211,7 @@ class FeedSubscriber:
             self._connected = True
 
     def close(self) -> None:
-        """Disconnect; safe to call twice."""
+        """Disconnect from the feed; safe to call twice."""
         if not self._socket.closed:
             self._socket.close()
             self._context.term()

@@ -64,7 +64,7 @@ class StopSignals:
 
 @dataclass(frozen=True, slots=True)
 class StepOutcome:
-    """How one step ended; `error` is in words, None if it did what it should."""
+    """Outcome of one step; `error` says what failed, None if nothing did."""
 
     name: str
     error: str | None
@@ -142,7 +142,7 @@ class Notifier:
         self._send("STOPPING=1")
 
     def close(self) -> None:
-        """Release the socket; safe to call twice. What is sent afterwards goes nowhere."""
+        """Release the socket of the service manager; safe to call twice. What is sent afterwards goes nowhere."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None

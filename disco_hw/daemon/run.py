@@ -61,7 +61,7 @@ Adapt = Literal["off", "fast"]
 
 @dataclass(frozen=True, slots=True)
 class DaemonOptions:
-    """What `disco-hw run` was asked; None leaves what robot.toml says."""
+    """Options of `disco-hw run`; None leaves what robot.toml says."""
 
     robot: Path
     model: Path | None = None
@@ -228,7 +228,7 @@ def _progress(text: str) -> None:
 
 
 def _log_path(config: RobotConfig, log_file: Path | None) -> Path | None:
-    """Where is recorded to; None if nothing is."""
+    """Return the path of the log; None if nothing is recorded."""
     if log_file is not None or not config.log.enabled:
         return log_file
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
@@ -260,12 +260,12 @@ _RECORDER = "recorder"
 
 
 def in_text(topic: str, text: str) -> str:
-    """A sentence of the daemon for a person."""
+    """Return a sentence of the daemon for the operator."""
     return f"{topic}: {text}"
 
 
 def in_json(topic: str, text: str) -> str:
-    """A sentence of the daemon for machines."""
+    """Return a sentence of the daemon for machines."""
     return json.dumps({"topic": topic, "text": text})
 
 
@@ -314,7 +314,7 @@ class _Compilation(event.Listener):
 def compile_progress(what: str, say: Callable[[str], None], every_s: float = _EVERY_S) -> Iterator[None]:
     """Within the block, say through `say` what numba compiles and how far it is; nothing where its cache has it all.
 
-    `what`: for a person, as "the planner for a circle". `say` is called from a thread, which ends with the block.
+    `what`: for the operator, as "the planner for a circle". `say` is called from a thread, which ends with the block.
     """
     compilation = _Compilation(what, say, every_s)
     try:
@@ -325,7 +325,7 @@ def compile_progress(what: str, say: Callable[[str], None], every_s: float = _EV
 
 
 class _NothingKeptError(Exception):
-    """Something would have been compiled."""
+    """Error for a function that would have been compiled."""
 
 
 class _Refusal(event.Listener):
@@ -389,13 +389,13 @@ def compile_beforehand(robot: Path, model: Path | None, say: Callable[[str], Non
 
 
 def planner_in_words(setup: Setup) -> str:
-    """What a planner is compiled for."""
+    """Describe the planner that is compiled for a setup, with the model's effects."""
     effects = ", ".join(effect.name for effect in setup.model.effects)
     return f"the planner for this task{f' and a model with {effects}' if effects else ''}"
 
 
 def warm_planner(setup: Setup, new_planner: Callable[[], Planner]) -> Planner:
-    """A new planner, after all that it will need was run once, by another one."""
+    """Return a new planner, after all that it will need was run once, by another one."""
     planner = new_planner()
     warm_up(make_pipeline(setup.config, setup.model, new_planner()))
     return planner

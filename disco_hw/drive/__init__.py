@@ -32,9 +32,11 @@ class ManualInput:
 
 @dataclass(frozen=True, slots=True)
 class RobotView:
-    """What a source may see of the robot: the daemon's state, whether the last tick drove the wheels by hand, and the
-    wheels' measured speeds (rad/s, left and right), None where they are not known; the pose (m, rad), None where
-    there is no valid one; whether the fence guard holds the robot.
+    """State of the robot that a manual source may see.
+
+    The daemon's state, whether the last tick drove the wheels by hand, and the wheels' measured speeds (rad/s, left and
+    right), None where they are not known; the pose (m, rad), None where there is no valid one; whether the fence guard
+    holds the robot.
     """
 
     state: State
@@ -49,22 +51,22 @@ class ManualSource(Protocol):
 
     @property
     def ended(self) -> str | None:
-        """Why there will be no further input, in words; None while there may be."""
+        """Reason why there will be no further input, in words; None while there may be."""
 
     @property
     def completed(self) -> bool:
-        """Whether it ended as it should."""
+        """Whether the source ended as it should."""
 
     @property
     def words(self) -> str:
-        """What is going on or to be done now, for the person."""
+        """Text for the operator on what is going on or to be done now."""
 
     @property
     def task(self) -> str:
-        """What is being carried out and what for; empty where a person decides."""
+        """Name of what is being carried out and what for; empty where the operator decides."""
 
     def poll(self, now_ns: int, robot: RobotView) -> ManualInput | None:
-        """The newest input, however old; None when the device is gone."""
+        """Return the newest input, however old; None when the device is gone."""
 
     def close(self) -> None:
         """Give the device back; safe to call twice."""
@@ -105,13 +107,13 @@ class GamepadSource:
 
     @property
     def words(self) -> str:
-        """What to hold, or to plug in."""
+        """Text for the operator on what to hold, or to plug in."""
         if self._pad is None:
             return f"{self._name} is gone; plug it in again"
         return f"{self._name}: hold the deadman's button; Ctrl-C ends"
 
     def poll(self, now_ns: int, _robot: RobotView) -> ManualInput | None:
-        """The sticks now; None while the device is gone."""
+        """Return the sticks and the deadman now; None while the device is gone."""
         if self._pad is None:
             self._look_for_it(now_ns)
             return None
@@ -126,7 +128,7 @@ class GamepadSource:
         return ManualInput(state.event_ns if silent else now_ns, left, right, state.deadman)
 
     def close(self) -> None:
-        """Close the device."""
+        """Close the gamepad if it is open."""
         if self._pad is not None:
             self._pad.close()
             self._pad = None
@@ -147,7 +149,7 @@ PAD_WORDS = "page: hold the pad to drive; Ctrl-C ends"
 
 @dataclass(frozen=True, slots=True)
 class Steering:
-    """What a page wants: shares of the largest forward speed and left turn in [-1, 1], and whether the pad is held.
+    """Wishes of a page: shares of the largest forward speed and left turn in [-1, 1], and whether the pad is held.
 
     `stamp_ns` is the newest stamp that the page has got in a reply, 0 before the first.
     """
@@ -159,7 +161,7 @@ class Steering:
 
 
 def steering_from(arguments: Mapping[str, Any]) -> Steering:
-    """Read a request's arguments; raises ValueError in words for a person."""
+    """Read a request's arguments; raises ValueError in words for the operator."""
     if set(arguments) != {"forward", "left", "held", "stamp"}:
         raise ValueError("drive takes forward, left, held and stamp")
     forward, left, held = arguments["forward"], arguments["left"], arguments["held"]
@@ -199,7 +201,7 @@ class PageSource:
 
     @property
     def words(self) -> str:
-        """What to hold, and where."""
+        """Text for the operator on what to hold, and where."""
         return self._words
 
     def steer(self, now_ns: int, page: int, wanted: Steering) -> str | None:
@@ -220,7 +222,7 @@ class PageSource:
         return None
 
     def poll(self, now_ns: int, _robot: RobotView) -> ManualInput | None:
-        """The newest input of the page that holds; open while no page does."""
+        """Return the newest input of the page that holds; open while no page does."""
         newest = self._newest
         if newest is not None and now_ns - newest.t_ns <= self._limit_ns:
             return newest
@@ -232,7 +234,7 @@ class PageSource:
         return ManualInput(now_ns, 0.0, 0.0, deadman=False)
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing, because the source holds no resources."""
 
     def _hear_open(self, now_ns: int, page: int) -> None:
         self._open_ns = {one: at for one, at in self._open_ns.items() if now_ns - at <= self._limit_ns}

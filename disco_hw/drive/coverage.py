@@ -1,4 +1,4 @@
-"""What a drive has excited so far, and what is still missing for inference and the search for gaps; pure.
+"""Coverage of a drive: what has been excited so far, and what inference and the search for gaps still miss; pure.
 
 The list is what separates pairs of parameters and effects that look the same otherwise: both turning directions, two
 speeds, backwards, starts and stops, steering, slow ramps through zero, rests.
@@ -37,7 +37,7 @@ class Item:
         return self.found >= self.wanted
 
     def in_words(self) -> str:
-        """Name and amounts."""
+        """Return the name with the found and the wanted amount as text."""
         unit = "" if self.unit == "times" else f" {self.unit}"
         return f"{self.name} {min(self.found, self.wanted):.0f}/{self.wanted:.0f}{unit}"
 
@@ -104,22 +104,22 @@ class Coverage:
             self._count_crossings(t_ns, dt_s, wheel, speed)
 
     def pause(self) -> None:
-        """Driving stops here: nothing is counted across the pause."""
+        """Interrupt the counting, so that nothing is counted across a pause of the drive."""
         self._t_ns = self._still_ns = self._quick_ns = self._swing = None
         self._crossing = [None, None]
 
     def items(self) -> tuple[Item, ...]:
-        """Everything that counts, covered or not."""
+        """Return everything that counts, covered or not."""
         seconds = (Item(name, purpose, "s", wanted, self._found[name]) for name, purpose, wanted in _SECONDS)
         times = (Item(name, purpose, "times", wanted, self._found[name]) for name, purpose, wanted in _TIMES)
         return (*seconds, *times)
 
     def missing(self) -> tuple[Item, ...]:
-        """What there is too little of."""
+        """Return the items of which too little has been driven."""
         return tuple(item for item in self.items() if not item.covered)
 
     def in_words(self) -> str:
-        """One line for a person: how much is done, and the first things that are missing."""
+        """One line for the operator: how much is done, and the first things that are missing."""
         items, missing = self.items(), self.missing()
         done = f"{self.driven_s:.0f} s driven, {len(items) - len(missing)} of {len(items)} excited"
         if not missing:
@@ -128,7 +128,7 @@ class Coverage:
         return f"{done}; missing: {', '.join(item.in_words() for item in missing[:4])}{more}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything for machines; `missing` holds names."""
+        """Return the coverage as a JSON-serialisable dict; `missing` holds names."""
         return {
             "driven_s": round(self.driven_s, 3),
             "items": [
@@ -165,7 +165,7 @@ class Coverage:
             self._swing = (side, t_ns)
 
     def _count_crossings(self, t_ns: int, dt_s: float, wheel: int, speed: float) -> None:
-        """A crossing begins where a wheel was last beyond the band on one side and ends beyond it on the other."""
+        """Count slow crossings of zero: from beyond the band on one side to beyond it on the other."""
         if abs(speed) < _MOVING:
             self._rested_ns[wheel] += round(dt_s * 1e9) if abs(speed) <= _STILL else 0
             return
@@ -180,7 +180,7 @@ class Coverage:
 
 
 def _regime(forward: float, turn: float, size: float) -> str | None:
-    """The kind of motion; None for creeping, which counts for nothing."""
+    """Return the kind of motion; None for creeping, which counts for nothing."""
     if size <= _STILL:
         return "rest"
     if size < _MOVING:

@@ -39,7 +39,7 @@ _STANDARD_INPUT = 0
 
 
 def leads_to_virtual_robot(link: Link) -> bool:
-    """True for the simulator's own bus, Linux's vcan and pseudo-terminals that exist; False when in doubt."""
+    """Return True for the simulator's own bus, Linux's vcan and existing pseudo-terminals; False when in doubt."""
     if link.kind == "serial":
         return os.path.realpath(link.port).startswith(_PSEUDO_TERMINALS)
     if link.interface == "socketcan":
@@ -49,7 +49,7 @@ def leads_to_virtual_robot(link: Link) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class DriveOptions:
-    """What `disco-hw drive` was asked; None leaves what robot.toml says, `seconds` breaks a script off."""
+    """Options of `disco-hw drive`; None leaves what robot.toml says, `seconds` breaks a script off."""
 
     robot: Path
     model: Path | None = None
@@ -67,7 +67,7 @@ class DriveOptions:
 
 @dataclass(frozen=True, slots=True)
 class DriveResult:
-    """How a drive went: its log, what was excited, why it ended, whether that was as wanted, what of the log was lost.
+    """Result of a drive: its log, what was excited, why it ended, whether it was completed, what of the log was lost.
 
     `recording_errors`: sentences, if the log does not prove by its end that every tick is in it; with any of them the
     drive is not `completed`, as it was made for its log.
@@ -81,11 +81,11 @@ class DriveResult:
     recording_errors: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
-        """The result for machines."""
+        """Return the result as a JSON-serialisable dict."""
         return {**asdict(self), "log": str(self.log)}
 
     def as_text(self) -> str:
-        """The result for a person."""
+        """Return the result as text."""
         lost = "".join(f"\nNOT WHOLE: {error}" for error in self.recording_errors)
         return f"{self.ended}\n{self.coverage_words}\nlog {self.log}{lost}"
 
@@ -152,7 +152,7 @@ def _script(options: DriveOptions, config: RobotConfig) -> Script | None:
 
 
 def _announcement(options: DriveOptions, config: RobotConfig, script: Script | None) -> list[str]:
-    """What is said before anything moves."""
+    """Return the lines that are printed before anything moves."""
     lines = []
     if script is not None:
         room = room_needed(script.at, script.duration_s, config.robot)

@@ -72,7 +72,7 @@ def fit_script(
 def _next_that_fits(
     remaining: list[Manoeuvre], scale: float, pose: Pose, robot: ScriptGeometry, bounds: Boundaries, keep_m: float
 ) -> tuple[int, Manoeuvre, Pose] | None:
-    """The first of the next manoeuvres that stays inside in some variant, and where it ends."""
+    """Return the first of the next manoeuvres that stays inside in some variant, and where it ends."""
     finds_limits = any(one.finds_limits for one in remaining)
     for index, manoeuvre in enumerate(remaining[:_LOOK_AHEAD]):
         if manoeuvre.within_limits and finds_limits:
@@ -130,7 +130,7 @@ class FittedScriptSource:
 
     @property
     def ended(self) -> str | None:
-        """That it does not fit, or the end of the script or of the source of the deadman."""
+        """Reason why the drive has ended, or None: the script does not fit or is over, or the deadman ended."""
         return self._refused or (self._deadman.ended if self._playing is None else self._playing.ended)
 
     @property
@@ -140,7 +140,7 @@ class FittedScriptSource:
 
     @property
     def words(self) -> str:
-        """How far it is; what to do where nothing moves."""
+        """Text for the operator on the script's progress, and on what to do where nothing moves."""
         if self._playing is not None:
             return self._playing.words
         return "waiting for a pose, to fit the script into the fence" if self._fitting is None else "fitting the script"

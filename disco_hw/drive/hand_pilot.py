@@ -165,7 +165,7 @@ class HandPilot:
             return str(error)
 
     def status(self) -> dict[str, Any]:
-        """What the source is at, the coverage and the newest messages, as `drive`."""
+        """Return the source's state, the coverage and the newest messages, under the key `drive`."""
         return {
             "drive": {
                 "driving": self._driving,
@@ -213,12 +213,12 @@ class UntilHeading:
 
     @property
     def needs_pose(self) -> bool:
-        """As the task does."""
+        """Whether the task needs a pose."""
         return self._task.needs_pose
 
     @property
     def done(self) -> bool:
-        """As the task's pilot says."""
+        """Whether the task's pilot is done."""
         return self._task.done
 
     def step(self, now_ns: int, last: CoreTick | None) -> PilotTick:
@@ -230,20 +230,20 @@ class UntilHeading:
         return self._now.step(now_ns, last)
 
     def learn(self, now_ns: int, tick: CoreTick, replies: Sequence[Reply]) -> None:
-        """Pass it on."""
+        """Pass the tick to the pilot in charge."""
         self._now.learn(now_ns, tick, replies)
 
     def steer(self, now_ns: int, page: int, wanted: Mapping[str, Any]) -> str | None:
-        """Pass it on."""
+        """Pass the page's steering to the pilot in charge."""
         return self._now.steer(now_ns, page, wanted)
 
     def status(self) -> dict[str, Any]:
-        """Of the one whose turn it is; the page shows its pad by that."""
+        """Return the status of the pilot in charge, by which the page shows its pad."""
         return self._now.status()
 
 
 def task_pilot(config: RobotConfig) -> UntilHeading:
-    """The pilot for this robot's task."""
+    """Return the pilot for this robot's task."""
     top_rad_s = config.drive.speed_share * config.robot.max_wheel_speed_rad_s
     page = PageSource(top_rad_s, config.drive.turn_share)
     return UntilHeading(TaskPilot(), HandPilot(page, Coverage(top_rad_s), page))

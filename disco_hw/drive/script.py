@@ -1,4 +1,4 @@
-"""A scripted drive: manoeuvres one after the other, each wheel speeds as a function of time; pure.
+"""Scripted drive of manoeuvres one after the other, each wheel speeds as a function of time; pure.
 
 Manoeuvres are shares of the largest wheel speed that the robot reaches, which is measured first: the fastest, both
 ways, straight and turning. The script's clock runs while the robot is driven; the deadman is somebody else's.
@@ -36,7 +36,7 @@ class Manoeuvre:
 
 @dataclass(frozen=True, slots=True)
 class Script:
-    """Manoeuvres in order; raises ValueError without any."""
+    """Sequence of named manoeuvres; raises ValueError without any."""
 
     name: str
     manoeuvres: tuple[Manoeuvre, ...]
@@ -56,7 +56,7 @@ class Script:
         return (0.0, 0.0) if place is None else place[0].wheels(t_s - place[1])
 
     def place(self, t_s: float) -> tuple[Manoeuvre, float] | None:
-        """The manoeuvre under way at a time and when it began (s); None before the start and from the end on."""
+        """Return the manoeuvre under way at a time and when it began (s); None before the start and from the end on."""
         start_s = 0.0
         for manoeuvre in self.manoeuvres if t_s >= 0.0 else ():
             if t_s < start_s + manoeuvre.duration_s:
@@ -65,7 +65,7 @@ class Script:
         return None
 
     def cut(self, seconds: float) -> Script:
-        """The script broken off after so long."""
+        """Return the script broken off after so long."""
         kept: list[Manoeuvre] = []
         left_s = seconds
         for manoeuvre in self.manoeuvres:
@@ -78,13 +78,13 @@ class Script:
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """Where a drive leads from its start, x forward and y left (m)."""
+    """Extent of a drive from its start, x forward and y left (m)."""
 
     x_m: tuple[float, float]
     y_m: tuple[float, float]
 
     def in_words(self) -> str:
-        """The room for a person."""
+        """Return the room as text."""
         return (
             f"about {self.x_m[1]:.1f} m ahead, {abs(self.x_m[0]):.1f} m behind, {self.y_m[1]:.1f} m to the left and "
             f"{abs(self.y_m[0]):.1f} m to the right of the tracked point"
@@ -92,7 +92,7 @@ class Room:
 
 
 def room_needed(wheels: Callable[[float], Wheels], duration_s: float, robot: Robot, step_s: float = 0.02) -> Room:
-    """The room that a drive takes on a robot with exactly the nominal geometry; a real one needs more."""
+    """Return the room that a drive takes on a robot with exactly the nominal geometry; a real one needs more."""
     x_m = y_m = yaw_rad = 0.0
     xs, ys = [0.0], [0.0]
     for k in range(math.ceil(duration_s / step_s)):
@@ -122,7 +122,7 @@ REST_S = 0.6
 
 
 def rest(duration_s: float = REST_S, purpose: str = "separates what comes before from what comes after") -> Manoeuvre:
-    """Stand still."""
+    """Create a manoeuvre that stands still."""
     return Manoeuvre("rest", purpose, duration_s, lambda _t_s: (0.0, 0.0))
 
 
@@ -142,7 +142,7 @@ class Pieces:
         return Manoeuvre(name, purpose, duration_s, wheels)
 
     def hold(self, name: str, purpose: str, duration_s: float, forward: float, turn: float) -> Manoeuvre:
-        """Constant shares."""
+        """Create a manoeuvre of constant shares."""
         return self.play(name, purpose, duration_s, lambda _t_s: (forward, turn))
 
     def each(self, purpose: str, *held: tuple[str, float, float, float]) -> list[Manoeuvre]:
@@ -151,7 +151,7 @@ class Pieces:
 
     @staticmethod
     def rest(duration_s: float = REST_S) -> Manoeuvre:
-        """Stand still."""
+        """Create a manoeuvre that stands still."""
         return rest(duration_s)
 
 
@@ -162,7 +162,7 @@ _SETTLED_S = 0.8
 class ScriptSource:
     """Plays a script while the deadman of another source is held.
 
-    A manoeuvre that was broken off by disarming begins anew when driving goes on, so that each is recorded whole once.
+    A manoeuvre that was broken off by disarming begins again when driving goes on, so that each is recorded whole once.
     The wheels' limits are what they reach at the end of the manoeuvres that are to find them.
     """
 
@@ -191,7 +191,7 @@ class ScriptSource:
 
     @property
     def words(self) -> str:
-        """How far it is; what to do where nothing moves."""
+        """Text for the operator on the script's progress, and on what to do where nothing moves."""
         progress = f"{self._driven_ns * 1e-9:.0f} of {self._script.duration_s:.0f} s"
         manoeuvre = self._manoeuvre
         name = "" if manoeuvre is None else f", {manoeuvre.name}"
@@ -208,7 +208,7 @@ class ScriptSource:
         return f"{manoeuvre.name}{limits}: {manoeuvre.purpose}"
 
     def poll(self, now_ns: int, robot: RobotView) -> ManualInput | None:
-        """The script's wheel speeds with the other source's deadman and time."""
+        """Return the script's wheel speeds with the other source's deadman and time."""
         held = self._deadman.poll(now_ns, robot)
         self._advance(now_ns, robot)
         if held is None:
@@ -278,17 +278,17 @@ class Unattended:
 
     @property
     def ended(self) -> str | None:
-        """Why it was released."""
+        """Reason why the deadman was released; None while it was not."""
         return self._ended
 
     @property
     def completed(self) -> bool:
-        """It never ends by itself as it should."""
+        """Always False, because it never ends by itself as it should."""
         return False
 
     @property
     def words(self) -> str:
-        """What it waits for."""
+        """Text for the operator on what it waits for."""
         return "unattended: waiting for the robot" if self._pressed_ns is None else "unattended: deadman held"
 
     @property
@@ -297,7 +297,7 @@ class Unattended:
         return ""
 
     def poll(self, now_ns: int, robot: RobotView) -> ManualInput | None:
-        """The deadman; speeds are zero."""
+        """Return the deadman's state, with wheel speeds of zero."""
         if self._first_ns is None:
             self._first_ns = now_ns
         held = self._pressed_ns is not None and self._ended is None
@@ -317,7 +317,7 @@ class Unattended:
         return ManualInput(now_ns, 0.0, 0.0, deadman=held)
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing, because the source holds no resources."""
 
 
 KEPT = 0.95
@@ -344,7 +344,7 @@ class ReachedLimits:
                 self._asked[wheel, wanted > 0.0] = wanted
 
     def share(self, wheel: int, *, forward: bool) -> float:
-        """Of the speed asked for, in [0, 1], for wheel 0 (left) or 1 (right)."""
+        """Return the reached share, in [0, 1], of the requested speed of wheel 0 (left) or 1 (right)."""
         found = [median(shares) for shares in self._shares[wheel, forward].values()]
         least = min(found, default=_LARGEST)
         return _LARGEST if not least < KEPT else max(0.0, least)
@@ -355,7 +355,7 @@ class ReachedLimits:
         return left, right
 
     def in_words(self) -> str:
-        """The limits for a person."""
+        """Return the limits as text."""
         if len(self._asked) < 4:
             return "limits not found: no wheel speeds were measured"
         reached = {key: asked * self.share(key[0], forward=key[1]) for key, asked in self._asked.items()}

@@ -116,7 +116,7 @@ SEPARATING = tuple(PURPOSES)
 
 
 def separating(name: str, top_rad_s: float) -> Script:
-    """The script of that name with wheel speeds up to `top_rad_s`, from rest to rest; raises KeyError."""
+    """Return the script of that name with wheel speeds up to `top_rad_s`, from rest to rest; raises KeyError."""
     pieces = Pieces(top_rad_s)
     return Script(name, (pieces.rest(1.0), *_built(pieces)[name], pieces.rest(1.0)))
 
@@ -129,7 +129,7 @@ _LAPS = 2.0
 
 
 def make_script(name: str, robot: Robot, task: RobotTask, speed_share: float, seed: int = 1) -> Script:
-    """The script of that name with wheel speeds up to `speed_share` of the robot's limit.
+    """Return the script of that name with wheel speeds up to `speed_share` of the robot's limit.
 
     Raises InputError for an unknown name, and for `circle` if the task is none or too fast for the wheels.
     """
@@ -194,11 +194,10 @@ def steps(top_rad_s: float, seed: int, settling_s: float = 0.0, count: int = STE
 
 
 def excite(top_rad_s: float) -> Script:
-    """A short drive after which nearly all parameters and effects can be distinguished; it ends near its start.
+    """Return a short drive after which nearly all parameters and effects can be distinguished; it ends near its start.
 
     Shares below are of `top_rad_s`: (forward, turn to the left).
     """
-
     pieces = Pieces(top_rad_s)
     found: list[Manoeuvre] = [rest(2.0, "noise of the poses at standstill")]
     found += pieces.each(

@@ -126,7 +126,7 @@ class KeyHold:
         self._last_ns = event.t_ns
 
     def at(self, now_ns: int) -> ManualInput:
-        """What is held now."""
+        """Return the wheel speeds and the deadman at a time."""
         if self._last_ns is None:
             self._last_ns = now_ns
         if self._state is _Hold.HELD and now_ns - self._last_ns > self._limit_ns:
@@ -140,7 +140,7 @@ class KeyHold:
         return ManualInput(self._last_ns, left, right, deadman=True)
 
     def _after(self, t_ns: int) -> _Hold:
-        """The state after a driving key at `t_ns`."""
+        """Return the state after a driving key at `t_ns`."""
         gap_ns = _FIRST_REPEAT_NS if self._last_ns is None else t_ns - self._last_ns
         match self._state:
             case _Hold.PRESSED if gap_ns < _SHORTEST_REPEAT_NS:
@@ -197,7 +197,7 @@ class Keyboard:
 
     @property
     def ended(self) -> str | None:
-        """Why there will be no further input; Ctrl-D, or the terminal has closed."""
+        """Reason why there will be no further input: Ctrl-D, or the terminal has closed."""
         return self._ended
 
     @property
@@ -217,11 +217,11 @@ class Keyboard:
 
     @property
     def task(self) -> str:
-        """A person decides."""
+        """Always empty, because the operator decides."""
         return ""
 
     def poll(self, now_ns: int, _robot: RobotView) -> ManualInput | None:
-        """What is held, after all that has been typed."""
+        """Return the wheel speeds and the deadman after all keys typed so far; None once the terminal is gone."""
         self._take(now_ns)
         if self._gone:
             return None
@@ -229,7 +229,7 @@ class Keyboard:
         return held if self._ended is None else ManualInput(now_ns, 0.0, 0.0, deadman=False)
 
     def typed(self) -> str:
-        """The printable keys that drive nothing, typed since it was asked last and seen by a poll."""
+        """Return the printable keys that drive nothing, typed since it was asked last and seen by a poll."""
         typed, self._typed = self._typed, ""
         return typed
 
@@ -283,13 +283,13 @@ _START_TIMEOUT_S = 60.0
 
 
 def line(status: Mapping[str, Any]) -> str:
-    """The state of the drive in one line."""
+    """Return the state of the drive in one line."""
     drive = status["drive"]
     return f"{status['state']}: {drive['words']} | {drive['coverage_words']}"
 
 
 def table(status: Mapping[str, Any]) -> Group:
-    """The state of the drive as a picture for the terminal."""
+    """Return the state of the drive as a picture for the terminal."""
     from rich.console import Group  # noqa: PLC0415
     from rich.table import Table  # noqa: PLC0415
     from rich.text import Text  # noqa: PLC0415
@@ -337,7 +337,7 @@ def _wait_for(socket: Path) -> None:
 
 
 def _status(socket: Path) -> Mapping[str, Any] | None:
-    """The daemon's status; None without a daemon that is driven by hand."""
+    """Return the daemon's status; None without a daemon that is driven by hand."""
     try:
         status = send_request(socket, {"do": "status"})
     except WorkError:

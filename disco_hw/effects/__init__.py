@@ -1,4 +1,4 @@
-"""What an effect is: a named difference between the ideal robot and a real one, with its equations and its traits.
+"""Definition of an effect: a named difference between the ideal robot and a real one, with equations and traits.
 
 Each file beside this one holds all that anyone needs to know of one of them.
 """
@@ -43,7 +43,7 @@ class Parameter:
 
 
 class Channel(enum.Enum):
-    """Where in the chain from command to measured pose an effect acts."""
+    """Channels, from command to measured pose, in which an effect acts."""
 
     COMMAND_TO_WHEEL = "command_to_wheel"
     WHEEL_TO_BODY = "wheel_to_body"
@@ -51,7 +51,7 @@ class Channel(enum.Enum):
 
 
 class Stage(enum.Enum):
-    """What of a step an effect changes, that is what its `term` and `plain` return, in the order of a step.
+    """Stages of a step that an effect can change, in order; each value says what its `term` and `plain` return.
 
     Both ask by name for what they need: `left`, `right` (commands, rad/s), or `command` and the wheel's `speed` of one
     wheel at a time; of the response `end_left`, `end_right`, `mean_left`, `mean_right` and `wheel_left`, `wheel_right`
@@ -135,8 +135,10 @@ class Symptom(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class CommandedDrive:
-    """A drive as the search for an effect sees it: `commands` (N, 2) rad/s, known ones; wheel radius and axial distance
-    (m) of `geometry`; when its poses begin and end (s).
+    """Drive as the search for an effect sees it.
+
+    `commands` (N, 2) rad/s, known ones; wheel radius and axial distance (m) of `geometry`; when its poses begin and end
+    (s).
     """
 
     commands: Array
@@ -158,8 +160,9 @@ class CommandedDrive:
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """A parameter in which the residual is not smooth, so that values are tried one by one: which ones for a drive, and
-    how close to the best to search on.
+    """Parameter in which the residual is not smooth, so that values are tried one by one.
+
+    It states which ones for a drive, and how close to the best to search on.
     """
 
     parameter: str
@@ -182,13 +185,13 @@ class Mimicked:
 
     @property
     def effect(self) -> Effect:
-        """The other effect."""
+        """Effect that can be mistaken for this one."""
         found: Effect = self.module.EFFECT
         return found
 
 
 def no_coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """None: for what moves nothing."""
+    """Return no coefficients, for effects that move nothing."""
     return ()
 
 
@@ -281,7 +284,7 @@ class Effect:
 
     @property
     def moves(self) -> bool:
-        """Whether it changes motion; if not, it only changes what is measured."""
+        """Whether the effect changes motion, and not only what is measured."""
         return self.stage not in _MEASURING
 
     @property
@@ -296,7 +299,7 @@ class Effect:
 
     @property
     def is_limit(self) -> bool:
-        """Whether it does nothing where its first parameter is large: the largest size is what a drive can show."""
+        """Whether the effect vanishes for a large first parameter: the largest size is what a drive can show."""
         return math.isinf(self.parameters[0].neutral)
 
     @property
@@ -306,5 +309,5 @@ class Effect:
 
 
 def asks_for(function: Callable[..., Any]) -> tuple[str, ...]:
-    """What a `term` or `plain` asks for, by name."""
+    """Return the names of the parameters of a `term` or `plain`."""
     return tuple(inspect.signature(getattr(function, "py_func", function)).parameters)

@@ -21,7 +21,7 @@ def plain(
     left: Value, right: Value, end_left: Value, end_right: Value, mean_left: Value, mean_right: Value,
     wheel_left: Value, wheel_right: Value, values: Values, step_s: float,
 ) -> tuple[Value, Value, Value, Value]:  # fmt: skip
-    """The change of each wheel's speed over a step is cut; one that is to stop takes `stop_share` of the time."""
+    """Cut the change of each wheel's speed over a step; one that is to stop takes `stop_share` of the time."""
     limit, stop_share = values
 
     def within(aim: Value, speed: Value, before: Value, within_s: float) -> Value:
@@ -64,7 +64,7 @@ def term(
 
 
 def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
-    """A fit begins where the fastest wheel that was commanded takes a while, and stops alike or at once."""
+    """Return where a fit begins: the fastest wheel that was commanded takes a while, and stops alike or at once."""
     largest = driven.largest_speed_rad_s
     if largest < 0.1:
         return ()

@@ -11,7 +11,7 @@ LARGEST_SLIP = 0.6
 
 
 def plain(forward: Value, change: Value, values: Values, geometry: Values, step_s: float) -> Value:
-    """v -> v - k |v| dv/dt, at most 60 % of it."""
+    """Map v to v - k |v| dv/dt, at most 60 % of it."""
     (k_s2_m,), (radius, _, _) = values, geometry
     acceleration = radius * change / 2.0 / step_s
     lost: Value = np.abs(forward) * np.clip(k_s2_m * acceleration, -0.6, 0.6)

@@ -13,7 +13,7 @@ LARGEST_LOSS = 0.3
 
 
 def plain(left: Value, right: Value, time_s: float, values: Values) -> tuple[Value, Value]:
-    """u -> u (1 - loss t / 150 s): wheel speed falls linearly with the time since the start, to 70 % at least."""
+    """Map u to u (1 - loss t / 150 s): wheel speed falls linearly with the time since the start, to 70 % at least."""
     (loss,) = values
     kept = 1.0 - np.clip(loss * time_s / 150.0, 0.0, 0.3)
     return left * kept, right * kept

@@ -9,7 +9,7 @@ from disco_hw.jit import scalar_function
 
 
 def plain(values: Values) -> Value:
-    """How old the command in force is (s): pure dead time of a command held constant over each step."""
+    """Return the age (s) of the command in force: pure dead time of a command held constant over each step."""
     (delay_s,) = values
     return delay_s
 
@@ -30,7 +30,7 @@ def term(recent: float, older: float, coefficients: tuple[float, float] | None) 
 
 
 def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
-    """Where a fit begins."""
+    """Return the values from which a fit begins."""
     return (0.03,), (0.12,), (0.3,), (-0.1,), (-0.3,)
 
 

@@ -9,13 +9,13 @@ from disco_hw.jit import scalar_function
 
 
 def plain(command: Value, values: Values) -> Value:
-    """u -> sign(u) max(|u| - width, 0) on each wheel's command."""
+    """Map u to sign(u) max(|u| - width, 0) on each wheel's command."""
     (width,) = values
     return np.sign(command) * np.maximum(np.abs(command) - width, 0.0)
 
 
 def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """The width, (L,)."""
+    """Return the width of the dead band, (L,)."""
     return (values[:, 0],)
 
 
@@ -29,7 +29,7 @@ def term(command: float, coefficients: tuple[float] | None) -> float:
 
 
 def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
-    """Where a fit begins."""
+    """Return the value from which a fit begins."""
     return ((0.2,),)
 
 

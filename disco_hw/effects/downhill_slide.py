@@ -11,7 +11,7 @@ from disco_hw.jit import scalar_function
 def plain(
     x: Value, y: Value, wheel_sum: Value, difference: Value, values: Values, geometry: Values, step_s: float
 ) -> tuple[Value, Value]:
-    """A drift in the world frame in proportion to how fast the wheels say that the robot turns.
+    """Return a drift in the world frame in proportion to how fast the wheels say that the robot turns.
 
     Dry friction acts against the direction in which a tyre is dragged, whole. A pull from aside then meets no
     resistance until the tyre moves with it: by the pull over the friction times the speed of the drag, which grows with

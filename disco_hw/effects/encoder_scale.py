@@ -17,7 +17,7 @@ from disco_hw.effects import (
 
 
 def plain(left: Value, right: Value, values: Values) -> tuple[Value, Value]:
-    """The encoders count (1 + scale) times the wheel's angle, for each side its own."""
+    """Return the encoders' readings: (1 + scale) times the wheel's angle, for each side its own."""
     scale_left, scale_right = values
     return left * (1.0 + scale_left), right * (1.0 + scale_right)
 

@@ -6,7 +6,7 @@ from disco_hw.effects import Channel, Effect, Parameter, Stage, Symptom, Value, 
 
 
 def plain(x: Value, y: Value, yaw: Value, values: Values) -> tuple[Value, Value, Value]:
-    """The measured yaw is the true one plus this (rad, not wrapped)."""
+    """Return the measured pose, whose yaw is the true one plus this (rad, not wrapped)."""
     (bias_rad,) = values
     return x, y, yaw + bias_rad
 

@@ -17,7 +17,7 @@ def plain(end: Value, mean: Value, speed: Value, values: Values, step_s: float) 
 
 
 def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """What of the initial error is left at the end of a step, and in the mean over it; each (L,)."""
+    """Return the share of the initial error left at the end of a step, and in the mean over it; each (L,)."""
     tau_s = np.maximum(values[:, 0], 1e-9)
     left_at_end = np.exp(-step_s / tau_s)
     return left_at_end, (1.0 - left_at_end) * tau_s / step_s
@@ -34,7 +34,7 @@ def term(end: float, mean: float, speed: float, coefficients: tuple[float, float
 
 
 def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
-    """Where a fit begins."""
+    """Return the values from which a fit begins."""
     return (0.05,), (0.25,)
 
 

@@ -6,7 +6,10 @@ from disco_hw.effects import Channel, Effect, Parameter, Stage, Symptom, Value, 
 
 
 def plain(time_s: Value, values: Values) -> Value:
-    """A pose is what was true this long before its time stamp; after it, where that is negative."""
+    """Return the latency (s): a pose is what was true this long before its time stamp.
+
+    After it, where that is negative.
+    """
     (latency_s,) = values
     return time_s - latency_s
 

@@ -8,7 +8,7 @@ from disco_hw.effects import Channel, Effect, Mimicked, Parameter, Stage, Sympto
 
 
 def plain(x: Value, y: Value, yaw: Value, values: Values) -> tuple[Value, Value, Value]:
-    """The sensor sits beside the tracked point, in the body frame: forward and to the left."""
+    """Return the pose of a sensor that sits beside the tracked point, in the body frame: forward and to the left."""
     forward_m, left_m = values
     cosine, sine = np.cos(yaw), np.sin(yaw)
     return x + (forward_m * cosine - left_m * sine), y + (forward_m * sine + left_m * cosine), yaw

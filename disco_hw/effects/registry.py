@@ -48,7 +48,7 @@ MOTION_EFFECTS: tuple[str, ...] = tuple(name for name, effect in REGISTRY.items(
 
 
 def in_stages(*stages: Stage) -> tuple[Effect, ...]:
-    """The effects of some stages, in the order in which they act."""
+    """Return the effects of some stages, in the order in which they act."""
     group = {stage: place for place, stages in enumerate(STAGE_GROUPS) for stage in stages}
     chosen = [effect for effect in REGISTRY.values() if effect.stage in stages]
     return tuple(sorted(chosen, key=lambda effect: (group[effect.stage], effect.order)))

@@ -13,7 +13,7 @@ ONSET_M_S = 0.02
 def plain(
     x: Value, y: Value, wheel_sum: Value, difference: Value, values: Values, geometry: Values, step_s: float
 ) -> tuple[Value, Value]:
-    """A drift in the world frame while the wheels turn; it fades in below a rim speed of 0.02 m/s."""
+    """Return a drift in the world frame while the wheels turn; it fades in below a rim speed of 0.02 m/s."""
     (drift_x_m_s, drift_y_m_s), (radius, _, _) = values, geometry
     left, right = (wheel_sum - difference) / 2.0, (wheel_sum + difference) / 2.0
     rim_speed = radius * (np.abs(left) + np.abs(right)) / 2.0

@@ -11,13 +11,13 @@ from disco_hw.jit import scalar_function
 
 
 def plain(command: Value, values: Values) -> Value:
-    """Each wheel's command is cut at +- the limit."""
+    """Cut each wheel's command at +- the limit."""
     (limit,) = values
     return np.clip(command, -limit, limit)
 
 
 def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """The limit, (L,)."""
+    """Return the limit of the speed, (L,)."""
     return (values[:, 0],)
 
 
@@ -36,7 +36,7 @@ def limited(commands: Array, geometry: tuple[float, float]) -> Array:
 
 
 def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
-    """A fit begins where a part of what was commanded is cut."""
+    """Return where a fit begins: a part of what was commanded is cut."""
     largest = driven.largest_speed_rad_s
     return tuple((share * largest,) for share in (0.92, 0.75, 0.5)) if largest > 0.1 else ()
 

@@ -11,14 +11,14 @@ REST_RAD_S = 0.02
 
 
 def plain(command: Value, speed: Value, values: Values) -> Value:
-    """A wheel at rest, or passing through it, rests until |u| exceeds the threshold; a turning one feels nothing."""
+    """Return the command that acts: a wheel at rest needs |u| above the threshold; a turning one feels nothing."""
     (threshold,) = values
     resting = (np.abs(speed) < 0.02) | (np.asarray(speed * command) < 0.0)
     return np.where(resting & (np.abs(command) <= threshold), 0.0, command)
 
 
 def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """The threshold, (L,)."""
+    """Return the threshold of motion, (L,)."""
     return (values[:, 0],)
 
 

@@ -22,7 +22,7 @@ from disco_hw.jit import cast_like, scalar_function
 
 
 def plain(forward: Value, turn: Value, time_s: float, values: Values, step_s: float) -> tuple[Value, Value]:
-    """From `at_s` on the axial distance is (1 + track) and the wheel radius (1 + radius) times the old."""
+    """Scale the axial distance by (1 + track) and the wheel radius by (1 + radius) from `at_s` on."""
     track, at_s, radius = values
     part = np.clip((time_s + step_s - at_s) / step_s, 0.0, 1.0)
     larger = 1.0 + radius
@@ -49,7 +49,7 @@ def term(
 
 
 def times(driven: CommandedDrive) -> tuple[float, ...]:
-    """Times to try (s); none in a drive too short to have been two."""
+    """Return times to try (s); none in a drive too short to have been two."""
     first, last = driven.first_s, driven.last_s
     if last - first < 30.0:
         return ()

@@ -9,7 +9,7 @@ from disco_hw.jit import cast_like, scalar_function
 
 
 def plain(turn: Value, values: Values) -> Value:
-    """omega -> omega + share |omega|.
+    """Map omega to omega + share |omega|.
 
     The tyres that hold least are dragged most: with a worn one in front on the left the robot turns about another point
     to the left than to the right, and each side drags the other less or more.
@@ -19,7 +19,7 @@ def plain(turn: Value, values: Values) -> Value:
 
 
 def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """The share, (L,)."""
+    """Return the share of the turn, (L,)."""
     return (values[:, 0],)
 
 

@@ -11,7 +11,7 @@ LEAST_KEPT = 0.5
 
 
 def plain(turn: Value, values: Values) -> Value:
-    """omega -> omega (1 - k |omega|), at most half of it lost (or doubled)."""
+    """Map omega to omega (1 - k |omega|), at most half of it lost (or doubled)."""
     (k_s,) = values
     omega = 2.0 * turn
     return 0.5 * omega * np.clip(1.0 - k_s * np.abs(omega), 0.5, 2.0)

@@ -40,7 +40,7 @@ def plain(
 
 
 def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """What half the difference grows by in a step at most, and reaches at once (rad/s), and the share; (L,) each."""
+    """Return half the difference's largest growth in a step, what it reaches at once (rad/s), the share; (L,) each."""
     return values[:, 0] * step_s, values[:, 1], values[:, 2]
 
 
@@ -68,7 +68,7 @@ def term(
 
 
 def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
-    """A fit begins where the fastest turn that was commanded takes one to four seconds."""
+    """Return where a fit begins: the fastest turn that was commanded takes one to four seconds."""
     half = 0.5 * float(np.abs(driven.commands[:, 1] - driven.commands[:, 0]).max(initial=0.0))
     return ((half, 0.0, 0.0), (half, 0.0, 1.0), (half / 4.0, half / 4.0, 0.0)) if half > 0.1 else ()
 

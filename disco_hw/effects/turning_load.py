@@ -24,7 +24,7 @@ def plain(left: Value, right: Value, values: Values) -> tuple[Value, Value]:
 
 
 def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """The load and by how much the wheels are unequal, (L,) each."""
+    """Return the load and by how much the wheels are unequal, (L,) each."""
     return values[:, 0], values[:, 1]
 
 
@@ -40,7 +40,7 @@ def term(left: float, right: float, coefficients: tuple[float, float] | None) ->
 
 
 def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
-    """A fit begins where a part of the turning that was commanded is lost."""
+    """Return where a fit begins: a part of the turning that was commanded is lost."""
     half = 0.5 * np.abs(driven.commands[:, 1] - driven.commands[:, 0])
     turning = half[half > 0.02 * driven.largest_speed_rad_s]
     return tuple((share * float(np.median(turning)), 0.0) for share in (0.1, 0.4)) if turning.size else ()

@@ -7,7 +7,7 @@ from disco_hw.jit import scalar_function
 
 
 def plain(left: Value, right: Value, values: Values) -> tuple[Value, Value]:
-    """u -> u (1 + gain), for each side its own."""
+    """Map u to u (1 + gain), for each side its own."""
     gain_left, gain_right = values
     return left * (1.0 + gain_left), right * (1.0 + gain_right)
 

@@ -14,7 +14,7 @@ def plain(wheel_sum: Value, difference: Value, values: Values) -> tuple[Value, V
 
 
 def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """The ratio, (L,)."""
+    """Return the ratio of the radii, (L,)."""
     return (values[:, 0],)
 
 

@@ -17,7 +17,7 @@ def plain(
     end_left: Value, end_right: Value, mean_left: Value, mean_right: Value, wheel_left: Value, wheel_right: Value,
     values: Values, geometry: Values, step_s: float,
 ) -> tuple[Value, Value, Value, Value]:  # fmt: skip
-    """The change of the yaw rate r (w_R - w_L) / a over a step is cut; the mean of the wheel speeds is kept."""
+    """Cut the change of the yaw rate r (w_R - w_L) / a over a step; the mean of the wheel speeds is kept."""
     (limit,), (radius, axial, _) = values, geometry
     to_rate = radius / axial
 
@@ -55,7 +55,7 @@ def term(
 
 
 def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
-    """A fit begins where the fastest turn that was commanded takes a while."""
+    """Return where a fit begins: the fastest turn that was commanded takes a while."""
     largest = driven.largest_yaw_rate_rad_s
     return tuple((0.92 * largest / rise_s,) for rise_s in RISES_S) if largest > 0.1 else ()
 

@@ -11,7 +11,7 @@ from disco_hw.jit import cast_like, scalar_function
 
 
 def plain(left: Value, right: Value, values: Values, geometry: Values) -> tuple[Value, Value]:
-    """The commanded yaw rate r (u_R - u_L) / a is cut at +- the limit; the mean of the wheel speeds is kept."""
+    """Cut the commanded yaw rate r (u_R - u_L) / a at +- the limit; the mean of the wheel speeds is kept."""
     (limit,), (radius, axial, _) = values, geometry
     rate = radius * (right - left) / axial
     difference = np.clip(rate, -limit, limit) * axial / radius
@@ -42,7 +42,7 @@ def limited(commands: Array, geometry: tuple[float, float]) -> Array:
 
 
 def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
-    """A fit begins where a part of what was commanded is cut."""
+    """Return where a fit begins: a part of what was commanded is cut."""
     largest = driven.largest_yaw_rate_rad_s
     return tuple((share * largest,) for share in (0.92, 0.75, 0.5)) if largest > 0.1 else ()
 

@@ -35,7 +35,7 @@ _UNKNOWN: Matrix3 = ((MAX_POSITION_VARIANCE, 0.0, 0.0), (0.0, MAX_POSITION_VARIA
 
 
 class PoseEstimate(msgspec.Struct, frozen=True, gc=False):
-    """Where the tracked body point is at `t_ns`, and how well this is known.
+    """Estimated pose of the tracked body point at `t_ns` in the world frame, with its uncertainty.
 
     World frame; `covariance` of (x, y, yaw) is 3x3, rows of floats, m and rad, symmetric and positive definite.
     `speed_m_s` is forward, of the centre of rotation; the tracked point also moves sideways by -yaw_rate * x_icr.
@@ -66,12 +66,12 @@ class PoseEstimate(msgspec.Struct, frozen=True, gc=False):
 
     @property
     def pose(self) -> Pose:
-        """The mean."""
+        """Mean of the estimated pose: x, y (m), yaw (rad)."""
         return Pose(self.x_m, self.y_m, self.yaw_rad)
 
     @property
     def ok(self) -> bool:
-        """Whether it rests on fresh wheel samples and fresh poses."""
+        """Whether the estimate rests on fresh wheel samples and fresh poses."""
         return self.initialised and self.wheels_ok and self.pose_ok
 
 
@@ -160,7 +160,7 @@ class PoseFusion:
 
     @property
     def wheel_difference_rad(self) -> float:
-        """How much further the right wheel has turned than the left since the start; zero before the first sample."""
+        """Angle (rad) by which the right wheel has turned more than the left; zero before the first sample."""
         if self._buffer is None:
             return 0.0
         return self._buffer.newest_wheels.right_rad - self._buffer.newest_wheels.left_rad
@@ -365,11 +365,11 @@ class RewindBuffer:
         return judgement
 
     def head(self) -> FilterState:
-        """The state after the last event."""
+        """Return the state after the last event."""
         return self._run(len(self._events) - 1)
 
     def _index_after(self, t_ns: int, include_equal: bool) -> int:
-        """Where an event of this time belongs: from the end, because nearly all are among the newest."""
+        """Return the index of an event of this time, searched from the end: nearly all are among the newest."""
         index = len(self._events)
         while index > 0 and (self._events[index - 1].t_ns > t_ns - (not include_equal)):
             index -= 1

@@ -61,7 +61,7 @@ class _DeferredModule(ModuleType):
 
 
 class _DeferredThing:
-    """Something of a module; using it imports the module."""
+    """Placeholder for something of a module, whose use imports the module."""
 
     def __init__(self, module: str, name: str) -> None:
         self._source = module, name
@@ -84,7 +84,7 @@ MIN_YAW_STD_RAD = 1e-3
 
 
 class PoseReason(enum.Enum):
-    """What the filter did with a measured pose."""
+    """Reasons why the filter accepted or refused a measured pose."""
 
     ACCEPTED = "accepted"
     INITIALISED = "initialised"
@@ -123,7 +123,7 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
     forgets_heading: bool = False
 
     def lever(self, yaw_rad: float) -> tuple[float, float, float, float]:
-        """The lever arm in the world (x, y) of a robot with this heading, and its derivative by the heading."""
+        """Return the lever arm in the world (x, y) of a robot with this heading, and its derivative by the heading."""
         cosine, sine = math.cos(yaw_rad), math.sin(yaw_rad)
         x = cosine * self.lever_x_m - sine * self.lever_y_m
         y = sine * self.lever_x_m + cosine * self.lever_y_m
@@ -225,7 +225,7 @@ class PoseCorrector:
         self._of_positions = ExtendedKalmanFilter(dim_x=3, dim_z=2)
 
     def correct(self, belief: PoseBelief, measurement: Measurement) -> Correction:
-        """Fuse one pose; the caller decides by `distance2` whether to take the result."""
+        """Fuse one pose into a belief; the caller decides by `distance2` whether to take the result."""
         pose, position, yaw = measurement.pose, measurement.position_variance, measurement.yaw_variance
         ahead_x, ahead_y, by_yaw_x, by_yaw_y = measurement.lever(belief.yaw_rad)
         jacobian, predicted = _IDENTITY, np.array((belief.x_m + ahead_x, belief.y_m + ahead_y, belief.yaw_rad))
@@ -296,7 +296,7 @@ LARGEST_FORWARD, LARGEST_LEFT, LARGEST_CURVATURE_PER_M, LARGEST_DRIFT_M_S = 0.15
 
 
 class PoseUpdate(msgspec.Struct, frozen=True, gc=False):
-    """What a measured pose did.
+    """Result of one measured pose in the filter.
 
     `innovation` is measured minus predicted (x m, y m, yaw rad), `innovation_variance` the diagonal of its covariance
     S, `distance2` its squared Mahalanobis distance, `test_ratio` that over the gate's limit (above 1: outside). They
@@ -382,5 +382,5 @@ def _within(value: float, bound: float) -> float:
 
 
 def _less(value: float, explained: float) -> float:
-    """What is left of a value; not more than it, and not beyond zero."""
+    """Subtract what is explained from a value, without raising it and without crossing zero."""
     return value - min(max(explained, min(value, 0.0)), max(value, 0.0))

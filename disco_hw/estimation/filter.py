@@ -50,11 +50,11 @@ class HeadingSearch(msgspec.Struct, frozen=True, gc=False):
     weights: tuple[float, ...]
 
     def each(self, change: Callable[[PoseBelief], PoseBelief]) -> HeadingSearch:
-        """The same with each component changed."""
+        """Return the search with each component changed."""
         return HeadingSearch(tuple(change(belief) for belief in self.beliefs), self.weights)
 
     def merged(self) -> PoseBelief:
-        """The Gaussian with the same mean and covariance; the heading's are those on the circle."""
+        """Return the Gaussian with the same mean and covariance; the heading's are those on the circle."""
         pairs = list(zip(self.weights, self.beliefs, strict=True))
         x = sum(w * b.x_m for w, b in pairs)
         y = sum(w * b.y_m for w, b in pairs)
@@ -85,7 +85,7 @@ class HeadingSearch(msgspec.Struct, frozen=True, gc=False):
 
 
 def any_heading(measurement: Measurement, model: MotionModel) -> HeadingSearch:
-    """Where the sensor was, with every heading alike; a heading that was measured is not looked at."""
+    """Create a search at the sensor's place with all headings equally likely; a measured heading is ignored."""
     tt = _COMPONENT_STD_RAD**2
     beliefs = []
     for k in range(COMPONENTS):
@@ -109,7 +109,7 @@ def any_heading(measurement: Measurement, model: MotionModel) -> HeadingSearch:
 def correct_search(
     search: HeadingSearch, measurement: Measurement, corrector: PoseCorrector
 ) -> tuple[HeadingSearch, Correction]:
-    """The search after a measurement, and the correction of the component that fits it best."""
+    """Update the search with a measurement; return it with the correction of the component that fits it best."""
     corrections = [corrector.correct(belief, measurement) for belief in search.beliefs]
     logs = [math.log(w) + c.log_density for w, c in zip(search.weights, corrections, strict=True)]
     most = max(logs)
@@ -134,7 +134,7 @@ class Judgement(msgspec.Struct, frozen=True, gc=False):
 
 
 class FilterState(msgspec.Struct, frozen=True, gc=False):
-    """Everything that the future depends on, at one instant.
+    """State of the filter at one instant: everything that the future depends on.
 
     `belief` is None before there is any, and a search while the heading is not known. `candidate` is the pose that the
     last rejected measurements agree on, `candidate_count` how many in a row do, and `candidate_of` of which sources.
@@ -180,13 +180,13 @@ class PoseFilter:
         self._corrector = PoseCorrector()
 
     def begin(self, wheels: WheelReading) -> FilterState:
-        """The state at the first wheel sample: no belief, or the origin where no pose is required."""
+        """Return the state at the first wheel sample: no belief, or the origin where no pose is required."""
         origin = belief_at(Pose(0.0, 0.0, 0.0), 1e-6, 1e-6, self._model)
         belief = None if self._pose_required else origin
         return FilterState(wheels.t_ns, wheels.left_rad, wheels.right_rad, belief, None, 0, None, 0, None)
 
     def adopt(self, state: FilterState) -> FilterState:
-        """A state of a filter with other parameters, as one of this filter."""
+        """Return a state of a filter with other parameters, as one of this filter."""
         return msgspec.structs.replace(
             state,
             belief=self._rebased(state.belief),

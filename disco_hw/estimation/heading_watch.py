@@ -30,7 +30,7 @@ REPORTED_AFTER = 10
 
 
 class Heading(enum.Enum):
-    """What is held of the headings of a source."""
+    """States of the headings of one pose source."""
 
     WAITING = "waiting"
     MEASURED = "measured"
@@ -62,7 +62,7 @@ class HeadingWatch:
 
     @property
     def held(self) -> tuple[Heading, ...]:
-        """What is held of the headings of each source."""
+        """State of the headings of each source."""
         return tuple(one.held for one in self._sources)
 
     def screen(self, sample: PoseSample, difference_rad: float, turn_per_rad: float) -> tuple[PoseSample, bool]:
@@ -89,7 +89,7 @@ class HeadingWatch:
         return sample, False
 
     def news(self) -> list[str]:
-        """Return sentences for a person since the last call."""
+        """Return sentences for the operator since the last call."""
         said, self._said = self._said, []
         return said
 
@@ -137,7 +137,7 @@ class HeadingWatch:
 
 
 def _without_heading(sample: PoseSample, offset: tuple[float, float]) -> PoseSample:
-    """The position of the sensor itself, as where the tracked point is from there is not known without a heading."""
+    """Return the sensor's own position, because the tracked point is unknown without a heading."""
     cosine = sine = 0.0
     if math.isfinite(sample.yaw_rad):
         cosine, sine = math.cos(sample.yaw_rad), math.sin(sample.yaw_rad)

@@ -1,4 +1,4 @@
-"""Wheel odometry: continuous readings from samples, the exact arc that they make, and the belief carried along it.
+"""Wheel odometry with continuous readings from samples, the exact arc that they make, and the belief along it.
 
 The belief over the pose is a Gaussian; here are its prediction by odometry, and its bounds.
 """
@@ -172,7 +172,7 @@ class WheelReading(msgspec.Struct, frozen=True, gc=False):
 
 
 class WheelReason(enum.Enum):
-    """Why a wheel sample was refused."""
+    """Reasons why a wheel sample was refused."""
 
     NOT_FINITE = "not_finite"
     OUT_OF_RANGE = "out_of_range"
@@ -189,7 +189,7 @@ class WheelTracker:
         self._right_offset_rad = 0.0
 
     def take(self, sample: WheelSample) -> WheelReading | WheelReason:
-        """The reading of a sample, or why there is none.
+        """Return the reading of a sample, or why there is none.
 
         Angles that jump further than any wheel turns are taken as a restarted counter: no motion, new zero.
         """
@@ -259,7 +259,7 @@ class PoseBelief(msgspec.Struct, frozen=True, gc=False):
 
     @property
     def pose(self) -> Pose:
-        """The mean."""
+        """Mean of the belief: x, y (m), yaw (rad)."""
         return Pose(self.x_m, self.y_m, self.yaw_rad)
 
     @property
@@ -278,9 +278,11 @@ class PoseBelief(msgspec.Struct, frozen=True, gc=False):
 
 
 class MotionModel(msgspec.Struct, frozen=True, gc=False):
-    """What prediction needs to know: geometry, slip as variance per metre rolled or radian turned (so that it does not
-    depend on the sampling rate), and a square root of the covariance of (wheel_radius_m, axial_distance_m, x_icr_m),
-    3x3 row by row, or None if they are known.
+    """Parameters of the prediction by odometry.
+
+    Geometry; slip as variance per metre rolled or radian turned (so that it does not depend on the sampling rate); and
+    a square root of the covariance of (wheel_radius_m, axial_distance_m, x_icr_m), 3x3 row by row, or None if they are
+    known.
     """
 
     parameters: OdometryParameters
@@ -308,14 +310,14 @@ def motion_model(settings: Estimation, parameters: OdometryParameters) -> Motion
 
 
 def belief_at(pose: Pose, position_variance: float, yaw_variance: float, model: MotionModel) -> PoseBelief:
-    """A belief with independent x, y (the same variance, m^2) and yaw (rad^2), independent of the parameters."""
+    """Return a belief with independent x, y (the same variance, m^2) and yaw (rad^2), independent of the parameters."""
     sensitivity: Flat9 | None = None if model.parameter_root is None else (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     x, y, yaw = pose.x_m, pose.y_m, wrap(pose.yaw_rad)
     return PoseBelief(x, y, yaw, position_variance, 0.0, 0.0, position_variance, 0.0, yaw_variance, sensitivity)
 
 
 def rebased(belief: PoseBelief, model: MotionModel) -> PoseBelief:
-    """The same belief under other parameters, whose error has nothing to do with what those before have caused."""
+    """Return the belief under other parameters, whose error is independent of what those before have caused."""
     (xx, xy, xt), (_, yy, yt), (_, _, tt) = belief.covariance
     sensitivity: Flat9 | None = None if model.parameter_root is None else (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     return PoseBelief(belief.x_m, belief.y_m, belief.yaw_rad, xx, xy, xt, yy, yt, tt, sensitivity)

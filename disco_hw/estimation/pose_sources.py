@@ -31,7 +31,7 @@ _NAN3 = (math.nan, math.nan, math.nan)
 
 
 class Standing(enum.Enum):
-    """What is held of a source."""
+    """States of one pose source."""
 
     WAITING = "waiting"
     GOOD = "good"
@@ -42,7 +42,7 @@ class Standing(enum.Enum):
 
 @dataclass(slots=True)
 class TrackedSource:
-    """What one source has done; `came_ns` is when its newest pose came, `good_ns` the stamp of the newest accepted."""
+    """Record of one pose source; `came_ns` is when its newest pose came, `good_ns` the stamp of the newest accepted."""
 
     label: str
     standing: Standing = Standing.WAITING
@@ -63,7 +63,7 @@ class TrackedSource:
     _last: Triple = _NAN3
 
     def forget_course(self) -> None:
-        """The estimate is elsewhere now: what poses were off before says nothing."""
+        """Clear what poses were off by, because the estimate has jumped elsewhere."""
         self.in_a_row, self.left_by_jump, self.means_of = 0, False, 0
         self.innovation, self.variance, self._last = list(_NAN3), list(_NAN3), _NAN3
 
@@ -146,7 +146,7 @@ class PoseSources:
         self.contradiction = apart
 
     def news(self) -> list[str]:
-        """Sentences for a person since the last call."""
+        """Sentences for the operator since the last call."""
         said, self._said = self._said, []
         return said
 
@@ -155,7 +155,7 @@ class PoseSources:
         return len(self.all) < 2 or self.all[number].standing is Standing.GOOD
 
     def counts(self) -> dict[str, int]:
-        """Accepted poses, outliers and refused ones of each source by name, where there are several."""
+        """Return accepted poses, outliers and refused ones of each source by name, where there are several."""
         if len(self.all) < 2:
             return {}
         return {
@@ -165,7 +165,7 @@ class PoseSources:
         }
 
     def status(self, now_ns: int) -> list[dict[str, Any]]:
-        """Each source for a person or page; what is not known is None."""
+        """Return each source's status for the operator or page; what is not known is None."""
         return [
             {
                 "source": one.label,
@@ -204,7 +204,7 @@ class PoseSources:
             self._said.append(f"{source.label}: its poses are used")
 
     def _apart(self) -> str:
-        """Which sources do not agree, and nobody knows who is right."""
+        """Return which sources do not agree where it is unknown which one is right."""
         live = [one for one in self.all if one.standing in (Standing.GOOD, Standing.DEVIATES)]
         for one in live:
             others = [other for other in live if other is not one and other.standing is Standing.GOOD]
@@ -218,7 +218,7 @@ class PoseSources:
 
 
 def _difference(one: TrackedSource, other: TrackedSource) -> str:
-    """By how much two sources differ, where that is more than their noise; else empty."""
+    """Return by how much two sources differ, where that is more than their noise; else empty."""
     (x, y, yaw), (xx, yy, tt) = _minus(one.innovation, other.innovation), _plus(one.variance, other.variance)
     if x * x / xx + y * y / yy > APART_STDS**2:
         return f"{math.hypot(x, y):.2f} m apart,"

@@ -1,4 +1,4 @@
-"""What a person runs to see the whole at work: demo, experiments, and the daemon in simulated time.
+"""Programs that show the whole stack at work: demo, experiments, and the daemon in simulated time.
 
 Here the whole stack in processes of their own: virtual robot and daemon, driven and broken from outside, in real time.
 The operator is a person's part, played by a program: it asks and commands the daemon and waits for what must happen.
@@ -49,18 +49,18 @@ class Child:
     output: Path
 
     def said(self) -> str:
-        """All that it wrote so far."""
+        """Return all that the process wrote so far."""
         return self.output.read_text(encoding="utf-8", errors="replace")
 
     def last_words(self) -> str:
-        """The last line it wrote."""
+        """Return the last line it wrote."""
         lines = self.said().strip().splitlines()
         return lines[-1] if lines else ""
 
 
 @contextmanager
 def disco_hw_process(name: str, arguments: Sequence[str], output: Path) -> Iterator[Child]:
-    """A `disco-hw` process in a session of its own; SIGTERM at the end, SIGKILL if that is ignored.
+    """Run a `disco-hw` process in a session of its own; SIGTERM at the end, SIGKILL if that is ignored.
 
     SIGTERM too if the thread that entered is gone, whatever ended it.
     """
@@ -87,14 +87,14 @@ def disco_hw_process(name: str, arguments: Sequence[str], output: Path) -> Itera
 
 
 class Operator:
-    """Whoever holds the control socket; notices when a process it depends on has ended."""
+    """Program in the operator's place at the control socket; notices when a process it depends on has ended."""
 
     def __init__(self, socket: Path, children: Sequence[Child] = ()) -> None:
         self._socket = socket
         self._children = tuple(children)
 
     def status(self) -> Mapping[str, Any]:
-        """The daemon's status; raises WorkError if a process has ended or the daemon does not answer."""
+        """Return the daemon's status; raise WorkError if a process has ended or the daemon does not answer."""
         self._check_alive()
         return send_request(self._socket, {"do": "status"}, timeout_s=2.0)
 
@@ -105,7 +105,7 @@ class Operator:
             raise WorkError(f"the daemon refused to {what}: {reply.get('error')}")
 
     def arm(self, timeout_s: float = 5.0) -> None:
-        """Once ready, arm; raises WorkError with what kept the robot from it.
+        """Wait until the robot is ready and arm it; raises WorkError with what kept the robot from it.
 
         A busy machine may hold up the robot or its daemon while it arms, who then drop the request, as they must.
         Nothing arms again by itself: it is asked for again here, twice at most, but not in a fault.
@@ -277,12 +277,12 @@ def read_truth(path: Path) -> list[TruthRow]:
 
 
 def link_of_device(device: str) -> str:
-    """The kind of link that a motor controller of `DEVICES` is usually on."""
+    """Return the kind of link that a motor controller of `DEVICES` is usually on."""
     return find_driver(device).kinds[0]
 
 
 def with_device(text: str, device: str) -> str:
-    """A robot.toml's text with another motor controller of `DEVICES`, whose poses come by datagrams."""
+    """Return a robot.toml's text with another motor controller of `DEVICES`, whose poses come by datagrams."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
         opened.bind(("127.0.0.1", 0))
         port = opened.getsockname()[1]
@@ -300,7 +300,7 @@ def write_robot_file(
     device: str | None = None,
     control: str = "",
 ) -> Path:
-    """The shipped robot with addresses of its own.
+    """Return the shipped robot with addresses of its own.
 
     `device`: another motor controller, of `DEVICES`. `control`: a line for that section.
     """

@@ -51,8 +51,10 @@ _SMOOTH_S = 5.0
 
 @dataclass(frozen=True, slots=True)
 class AdaptOptions:
-    """`change` of the parameter, by its size, at `change_s`; costs are means over `compared_s` before it, and over as
-    long from `settled_s` after it on. `seeds` seeds after `seed_offset` are of the plant's noise.
+    """Options of the experiment with adaptation.
+
+    `change` of the parameter, by its size, at `change_s`; costs are means over `compared_s` before it, and over as long
+    from `settled_s` after it on. `seeds` seeds after `seed_offset` are of the plant's noise.
     """
 
     change: float = 0.15
@@ -65,8 +67,10 @@ class AdaptOptions:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AdaptRun:
-    """One drive: `t_s` (N,), instant `cost` (N,), `path` (N, 2) m of the plant; beliefs in force as (t_s, mean (3,),
-    std (3,)), and how often the adapted belief was taken back.
+    """Record of one drive.
+
+    `t_s` (N,), instant `cost` (N,), `path` (N, 2) m of the plant; beliefs in force as (t_s, mean (3,), std (3,)), and
+    how often the adapted belief was taken back.
     """
 
     t_s: Array
@@ -85,7 +89,7 @@ class AdaptResult:
     runs: dict[tuple[str, bool], list[AdaptRun]]
 
     def rows(self) -> list[dict[str, float | str]]:
-        """For each change: costs before it and after it without and with adaptation, and the share won back.
+        """Return, for each change, the costs before and after it, without and with adaptation, and the share won back.
 
         What is lost is what the same stretch costs more than on the plant that nothing happens to: the cost varies
         along the lap. `half_back_s` is how long after the change half of it was won back over 5 s for the first time.
@@ -111,7 +115,7 @@ class AdaptResult:
         return found
 
     def table(self) -> str:
-        """The rows and the options as text."""
+        """Return the rows and the options as text."""
         lines = [
             f"{'what changes':16s} {'before':>8s} {'(adapting)':>10s} {'after':>8s} {'adapting':>9s} {'won back':>9s} "
             f"{'published':>10s} {'half back':>10s}"
@@ -140,8 +144,9 @@ class AdaptResult:
                 writer.writerow([f"{t_s:.3f}", *(f"{run.cost[step]:.6g}" for _, run in named)])
 
     def write_pictures(self, path: Path) -> None:
-        """Cost over time, smoothed and averaged over the seeds, and the belief of the first seed; a PNG file, and PDF
-        and SVG beside it.
+        """Write a PNG file, with PDF and SVG beside it, of cost and belief over time.
+
+        The cost is smoothed and averaged over the seeds; the belief is that of the first seed.
         """
         from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import, needed only here)
 
@@ -287,7 +292,7 @@ def drive(
 
 
 def _beliefs(recorder: MemoryRecorder, model: Geometry) -> tuple[tuple[tuple[float, Array, Array], ...], int]:
-    """The beliefs in force over time, and how often that of the model came back."""
+    """Return the beliefs in force over time, and how often that of the model came back."""
     found = [(0.0, model.mean, model.std)]
     reverted = 0
     for _, tick in recorder.ticks:
@@ -314,7 +319,9 @@ START = (0.75, 0.0, 1.5707963)
 
 @dataclass(frozen=True, slots=True)
 class LiveDrive:
-    """Mean tracking costs on the plant's truth, over 20 s before the change and from 20 s after it on; what changed, by
+    """Result of one drive in real time, with a change of the plant.
+
+    Mean tracking costs on the plant's truth, over 20 s before the change and from 20 s after it on; what changed, by
     its size before, as the robot believed it at last, how long after the change (s) it was first reported, and what the
     loop missed.
     """
@@ -327,8 +334,10 @@ class LiveDrive:
 
 
 def drive_through_change(directory: Path, changes: str, *, adapt: bool) -> LiveDrive:
-    """The paper's circle; the belief is right, and as narrow as after `infer`, until the wheel radius or axial distance
-    (`changes`) grows by 15 %.
+    """Drive the paper's circle through a sudden change of the plant.
+
+    The belief is right, and as narrow as after `infer`, until the wheel radius or axial distance (`changes`) grows by
+    15 %.
     """
     model = load_model(Path(disco_hw.__file__).parent / "robots" / "wombot_model.toml")
     mean = believed_geometry(model).mean
@@ -366,14 +375,14 @@ def drive_through_change(directory: Path, changes: str, *, adapt: bool) -> LiveD
 
 
 def first_truth_s(path: Path) -> float:
-    """When the truth begins, s of the monotonic clock."""
+    """Return when the truth begins, s of the monotonic clock."""
     with path.open(encoding="utf-8") as file:
         file.readline()
         return int(file.readline().partition(",")[0]) * 1e-9
 
 
 def newest_truth_s(path: Path) -> float:
-    """When the newest row on disk was true."""
+    """Return when the newest row on disk was true."""
     with path.open("rb") as file:
         file.seek(0, 2)
         file.seek(max(0, file.tell() - 1000))

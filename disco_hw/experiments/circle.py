@@ -74,7 +74,7 @@ MEMORY_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class CircleOptions:
-    """What the paper leaves open.
+    """Options of the circle experiment that the paper leaves open.
 
     `seeds` seeds from `seed_offset` on draw plant and noise. `belief_scale` multiplies the posterior's standard
     deviations, for the plants that are drawn as for those who know it. `rate_hz` of replanning; `largest_rot_s` and
@@ -122,7 +122,7 @@ class CircleResult:
         return np.asarray(np.hypot(self.distances_m(name), forward - self.circle.speed_m_s))
 
     def rows(self) -> list[dict[str, float | str]]:
-        """For each curve: mean cost, its spread over seeds, cost and distance of the last half, command change.
+        """Return, for each curve, mean cost, its spread over seeds, the last half's cost and distance, command change.
 
         `steady_rms_mm` is the root mean square of the distance over the last half and all seeds, `steady_worst_mm` the
         largest of a seed; `command_change_rot_s` is the mean change of a wheel's command over 0.1 s.
@@ -147,7 +147,7 @@ class CircleResult:
         return found
 
     def table(self) -> str:
-        """The rows and the options as text."""
+        """Return the rows and the options as text."""
         lines = [
             f"{'controller':18s} {'mean cost':>10s} {'std':>8s} {'steady cost':>12s} {'rms (mm)':>9s} {'worst':>6s} "
             f"{'du (rot/s)':>11s}"
@@ -173,8 +173,9 @@ class CircleResult:
                 writer.writerow([f"{(step + 1) / self.options.rate_hz:.3f}", *(f"{value:.6g}" for value in values)])
 
     def write_pictures(self, path: Path) -> None:
-        """Running mean of the instant cost over time, where two thirds of the seeds lie, and the paths of the first;
-        a PNG file, and PDF and SVG beside it.
+        """Write a PNG file, with PDF and SVG beside it, of the cost and the paths.
+
+        The running mean of the instant cost over time, where two thirds of the seeds lie, and the paths of the first.
         """
         from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import, needed only here)
 
@@ -237,7 +238,7 @@ def plants(model: Model, count: int, first: int = 0) -> list[dict[str, float]]:
 
 
 def _knowing(name: str, model: Model, theta: dict[str, float]) -> Model:
-    """The controller's model for a curve."""
+    """Return the controller's model for a curve."""
     bare = replace(model, belief=None)
     match name:
         case "prior":

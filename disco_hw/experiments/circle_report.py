@@ -1,4 +1,4 @@
-"""What a driven circle amounts to: its figures, and the log and the true motion as a table and a picture."""
+"""Report on a driven circle: its figures, and the log and the true motion as a table and a picture."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Path:
 
 @dataclass(frozen=True, slots=True)
 class CircleFigures:
-    """How well a path follows the circle; distances are to the circle's edge.
+    """Figures of how well a path follows the circle; distances are to the circle's edge.
 
     `settled_*` leave out the first quarter lap. Cost: c = sqrt(d^2 + (s - s0)^2) (paper, section V-B).
     """
@@ -167,7 +167,7 @@ class CircleReport:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """The figures for machines."""
+        """Return the figures as a JSON-serialisable dict."""
         return {
             "success": self.success,
             "stopped": self.stopped,
@@ -179,7 +179,7 @@ class CircleReport:
         }
 
     def table(self) -> Table:
-        """The figures for a person."""
+        """Return the figures as text."""
         table = Table(title=f"Circle of {self.task.radius_m} m at {self.task.speed_m_s} m/s", title_justify="left")
         table.add_column("figure")
         table.add_column("value", justify="right")

@@ -1,4 +1,4 @@
-"""The demonstration: virtual robot and daemon as processes of their own, driven round the circle and judged.
+"""Demonstration with virtual robot and daemon as processes of their own, driven round the circle and evaluated.
 
 This process plays the operator: it starts both, talks to the daemon's control socket, and reads the log and the
 simulator's truth afterwards. Nothing here reaches into either process.
@@ -68,7 +68,7 @@ _WATCHDOG = frozenset({"COMMAND_TIMEOUT", "COMMAND_EXPIRED", "HOST_SILENT"})
 
 @dataclass(frozen=True, slots=True)
 class DemoOptions:
-    """What to demonstrate; `laps` are counter-clockwise turns around the circle's centre."""
+    """Options of the demonstration; `laps` are counter-clockwise turns around the circle's centre."""
 
     link: str = "can"
     device: str | None = None
@@ -125,7 +125,7 @@ def run_demo(options: DemoOptions) -> CircleReport:
 
 
 def what_next(options: DemoOptions, log: Path, drawn: Path) -> list[str]:
-    """What to look at now, and what to type next."""
+    """Return lines on what to look at now, and what to type next."""
     again = (
         []
         if options.view
@@ -225,7 +225,7 @@ def start_pose(setup: Setup) -> tuple[float, float, float]:
 
 
 def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
-    """Drive and stop; returns whether daemon and robot both said that the robot stands, disarmed."""
+    """Drive and stop; return whether daemon and robot both reported that the robot stands, disarmed."""
     for old in (files.log, files.truth):
         old.unlink(missing_ok=True)
     setup = load_setup(files.robot)

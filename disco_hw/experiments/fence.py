@@ -1,4 +1,4 @@
-"""The fence, tried: random rooms with tasks, wild manual drives, and planners alone in tight rooms.
+"""Trials of the fence: random rooms with tasks, wild manual drives, and planners alone in tight rooms.
 
 Each drive is one line of `drives.jsonl`, so that a campaign that was broken off goes on where it was. The kinds of
 drives that `tools/fence_peers.py` adds (another controller, another simulation) stand in the same table.
@@ -53,7 +53,7 @@ _POSES_EVERY = 5
 
 @dataclass(frozen=True, slots=True)
 class FenceOptions:
-    """How many of each, how far the true parameters are off, and how long a drive is (s)."""
+    """Options of the trials: how many of each, how far the true parameters are off, and how long a drive is (s)."""
 
     rooms: int = 200
     manual: int = 200
@@ -95,7 +95,7 @@ def alone_drive(
     contender: tuple[str, str, bool],
     planner_of: Callable[[Setup], Planner] | None = None,
 ) -> FencedDrive:
-    """A circle in a tight room, by one of the CONTENDERS alone; the same rooms and robots for all.
+    """Drive a circle in a tight room, by one of the CONTENDERS alone; the same rooms and robots for all.
 
     Who adapts has `LEARNING_S` to do so first. `planner_of` makes another planner for a setup.
     """
@@ -155,13 +155,13 @@ class Campaign:
 
     @property
     def result(self) -> FenceResult:
-        """All that was driven with these options."""
+        """Result of all drives with these options."""
         return FenceResult(self._options, {kind: list(lines.values()) for kind, lines in self._done.items() if lines})
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FenceResult:
-    """What was driven: with the guard, and by the planner alone under each kind of belief."""
+    """Results of all drives: with the guard, and by the planner alone under each kind of belief."""
 
     options: FenceOptions
     drives: dict[str, list[DriveLine]]
@@ -193,7 +193,7 @@ class FenceResult:
         return {"options": asdict(self.options), "drives": rows}
 
     def table(self) -> str:
-        """The result for a person."""
+        """Return the result as text."""
         lines = [f"{'':<42}{'drives':>8}{'breaches':>10}{'least, m':>10}{'stops':>8}{'left, m':>9}{'way, m':>8}"]
         for row in self.rows():
             left = row["left_at_stop_median_m"]

@@ -44,7 +44,7 @@ _WALL_M_S = 0.3
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FencedDrive:
-    """One drive: its fence, the true poses (N, 3), the least true clearance (m), and the guard's stops.
+    """Record of one drive: its fence, the true poses (N, 3), the least true clearance (m), and the guard's stops.
 
     `left_m`: the true clearance at rest after each of the guard's stops; `stops`: how often it stopped. `way_m`: how
     far the tracked point went.
@@ -66,12 +66,12 @@ class _Hand:
 
     @property
     def needs_pose(self) -> bool:
-        """By hand no pose is needed; the fence asks for one."""
+        """Whether a pose is needed: not by hand; the fence asks for one."""
         return False
 
     @property
     def done(self) -> bool:
-        """It drives until it is left off."""
+        """Always False, because it drives until the run is over."""
         return False
 
     def step(self, now_ns: int, last: CoreTick | None) -> PilotTick:
@@ -79,14 +79,14 @@ class _Hand:
         return PilotTick(motion=Manual(*self.wheels), by_hand=True)
 
     def learn(self, now_ns: int, tick: CoreTick, replies: Any) -> None:
-        """Nothing is learnt."""
+        """Ignore the tick, because wheel speeds are set from outside."""
 
     def steer(self, now_ns: int, page: int, wanted: Any) -> str | None:
-        """No page drives."""
+        """Refuse a page's steering, because an experiment drives."""
         return "driven by an experiment"
 
     def status(self) -> dict[str, Any]:
-        """Nothing is added."""
+        """Return an empty dict: the status gets no more entries."""
         return {}
 
 
@@ -94,13 +94,13 @@ class _Overridden(SafeArea):
     """Fence and obstacles of a robot whose planner knows them and whose guard is overridden throughout."""
 
     def begin(self, now_ns: int, by_hand: bool) -> bool:
-        """As of the base class, and overridden."""
+        """Begin a tick as the base class does, and return that the guard is overridden."""
         super().begin(now_ns, by_hand)
         return True
 
 
 def fenced_setup(fence: Fence, task: RobotTask | None = None, base: Setup | None = None) -> Setup:
-    """The shipped robot, or `base`, with this fence and task and a footprint."""
+    """Return the shipped robot, or `base`, with this fence and task and a footprint."""
     setup = base or load_setup(_SHIPPED)
     robot = msgspec.structs.replace(setup.config.robot, footprint_m=FOOTPRINT)
     changes = {"fence": fence, "robot": robot} | ({} if task is None else {"task": task})
@@ -108,7 +108,7 @@ def fenced_setup(fence: Fence, task: RobotTask | None = None, base: Setup | None
 
 
 def untold_plant(rng: np.random.Generator, off: float) -> PlantParameters:
-    """A plant whose geometry is up to `off` away from the model's mean, with other motors and another ground."""
+    """Return a plant whose geometry is up to `off` away from the model's mean, with other motors and another ground."""
     usual = PlantParameters()
     geometry = {
         name: getattr(usual, name) * (1.0 + off * rng.uniform(-1.0, 1.0))
@@ -125,7 +125,7 @@ def untold_plant(rng: np.random.Generator, off: float) -> PlantParameters:
 
 
 def random_room(rng: np.random.Generator, pillars: int) -> Fence:
-    """A room of four to eight corners about the origin, with pillars that leave the middle free."""
+    """Return a room of four to eight corners about the origin, with pillars that leave the middle free."""
     count = int(rng.integers(4, 9))
     angles = np.sort(rng.uniform(0.0, 2.0 * np.pi, count) * 0.2 + 2.0 * np.pi * np.arange(count) / count)
     reach = rng.uniform(1.5, 2.4, count)
@@ -138,7 +138,7 @@ def random_room(rng: np.random.Generator, pillars: int) -> Fence:
 
 
 def random_task_room(rng: np.random.Generator) -> tuple[Fence, CircleTask]:
-    """A room, and a circle in it at which the nominal footprint stays inside."""
+    """Return a room, and a circle in it at which the nominal footprint stays inside."""
     while True:
         radius_m = float(rng.uniform(0.4, 1.0))
         center = rng.uniform(-0.4, 0.4, 2)
@@ -155,7 +155,7 @@ def _drive(
     run: SimulatedRun, seconds: float, fence: Fence, hand: Callable[[float, CoreTick], None] = lambda t_s, tick: None,
     learning_s: float = 0.0,
 ) -> FencedDrive:  # fmt: skip
-    """Follow a run: true poses and clearances, and the guard's stops with what was left when the robot stood.
+    """Follow a run and record true poses and clearances, and the guard's stops with what was left when the robot stood.
 
     What happens in the first `learning_s` does not count.
     """
@@ -243,7 +243,7 @@ def _begin(run: SimulatedRun) -> None:
 
 
 def tight_room(rng: np.random.Generator, beside_m: float) -> tuple[Fence, CircleTask]:
-    """A circle at 0.3 m/s in a square room whose walls come so near to the footprint's way."""
+    """Return a circle at 0.3 m/s in a square room whose walls come so near to the footprint's way."""
     radius_m, turned = float(rng.uniform(0.6, 1.0)), float(rng.uniform(0.0, 2.0 * np.pi))
     reach_m = math.sqrt(2.0) * (_outer_m(radius_m) + beside_m)
     corners = [
@@ -254,12 +254,12 @@ def tight_room(rng: np.random.Generator, beside_m: float) -> tuple[Fence, Circle
 
 
 def _outer_m(radius_m: float) -> float:
-    """How far from a circle's centre the footprint reaches that drives on it."""
+    """Return how far (m) from the circle's centre a footprint reaches that drives on the circle."""
     return max(math.hypot(radius_m + y, x) for x, y in FOOTPRINT.corners_m())
 
 
 def along_drive(rng: np.random.Generator, off: float, seconds: float) -> FencedDrive:
-    """A circle at 0.3 m/s between two fences 0.15 m beside the footprint's way, by a control law that sees neither.
+    """Drive a circle at 0.3 m/s between two fences 0.15 m beside the footprint's way, by a law that sees neither.
 
     The robot slides, so that it faces inwards on a circle: the fences are laid beside that footprint, and it begins so.
     """
@@ -283,14 +283,14 @@ def along_drive(rng: np.random.Generator, off: float, seconds: float) -> FencedD
 
 
 def _distance_m(point: tuple[float, float], begin: tuple[float, float], end: tuple[float, float]) -> float:
-    """How far a point is from a segment."""
+    """Return the distance of a point from a segment, in metres."""
     along = np.subtract(end, begin)
     part = float(np.clip(np.dot(np.subtract(point, begin), along) / np.dot(along, along), 0.0, 1.0))
     return float(np.hypot(*(np.add(begin, part * along) - point)))
 
 
 def room_drive(rng: np.random.Generator, off: float, seconds: float) -> FencedDrive:
-    """A circle in a random room, with the guard."""
+    """Drive a circle in a random room, with the guard."""
     setup = fenced_setup(*random_task_room(rng))
     planner = make_planner(setup.config, setup.model)
     return task_drive(setup, untold_plant(rng, off), planner, seconds, int(rng.integers(1 << 30)))

@@ -47,7 +47,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class GapExperimentOptions:
-    """What to hide and how long to drive; `script` and its share of time are the excitation that is recorded."""
+    """Options of the experiment: what to hide, how long to drive; `script` is the excitation that is recorded."""
 
     robot: Path
     hide: tuple[str, ...]
@@ -79,7 +79,7 @@ class GapExperimentResult:
     task: CircleTask
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines."""
+        """Return the result as a JSON-serialisable dict."""
         return {
             "hidden": {name: list(values) for name, values in self.hidden.items()},
             "found": [effect.name for effect in self.report.effects],
@@ -90,7 +90,7 @@ class GapExperimentResult:
         }
 
     def as_text(self) -> str:
-        """For a terminal."""
+        """Return the result as text for a terminal."""
         lines = [
             *answer(self.report),
             "",
@@ -104,7 +104,7 @@ class GapExperimentResult:
         return "\n".join(lines)
 
     def draw(self, path: Path) -> None:
-        """Write a PNG: the circle as driven with each model, and the distance to it over the laps."""
+        """Write a PNG of the circle as driven with each model, and of the distance to it over the laps."""
         figure = Figure(figsize=(10.0, 4.8), layout="constrained")
         axes = figure.subplot_mosaic([["plan", "distance"], ["plan", "speed"]])
         plan, over, speed = axes["plan"], axes["distance"], axes["speed"]
@@ -175,7 +175,7 @@ def run_gap_experiment(options: GapExperimentOptions, progress: Progress = lambd
 
 
 def without_effects(amended: Model, given: Model) -> Model:
-    """The amended model with the effects of the given one only, and what is believed of the rest."""
+    """Return the amended model with the effects of the given one only, and what is believed of the rest."""
     known = {setting.name for setting in given.effects}
     effects = tuple(setting for setting in amended.effects if setting.name in known)
     kept: list[EffectSetting] = list(effects)
@@ -213,7 +213,7 @@ def _record(
 def _circle(
     setup: Setup, options: GapExperimentOptions, hidden: Mapping[str, tuple[float, ...]], model: Model
 ) -> Track:
-    """The true path of DISCO round the circle with a model."""
+    """Return the true path of DISCO round the circle with a model."""
     task = circle_task(setup.config.task, "experiment gap")
     with_model = replace(setup, model=model)
     run = SimulatedRun(with_model, _robot(setup, options, hidden), make_planner(setup.config, model))

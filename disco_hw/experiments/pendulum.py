@@ -56,7 +56,7 @@ CURVES = PAPER_CURVES | ABLATION
 
 @dataclass(frozen=True, slots=True)
 class PendulumOptions:
-    """How often and how long: `seeds` seeds from `seed_offset` on, `steps` of 0.05 s, spread of the sigma points."""
+    """Options of the experiment: `seeds` seeds from `seed_offset` on, `steps` of 0.05 s, spread of the sigma points."""
 
     seeds: int = 50
     steps: int = 200
@@ -89,7 +89,7 @@ class PendulumResult:
         return found
 
     def table(self) -> str:
-        """The rows as text."""
+        """Return the rows as text."""
         lines = [f"{'controller':18s} {'mean cost':>10s} {'std':>8s} {'std.err.':>8s} {'last quarter':>12s}"]
         lines += [
             f"{row['controller']:18s} {row['mean_cost']:10.2f} {row['std_over_seeds']:8.2f} "
@@ -111,7 +111,10 @@ class PendulumResult:
                 writer.writerow([f"{(step + 1) * pendulum.STEP_S:.2f}", *(f"{value:.6g}" for value in values)])
 
     def write_pictures(self, path: Path) -> None:
-        """The curves over time, and where two thirds of the seeds lie; a PNG file, and PDF and SVG beside it."""
+        """Write a PNG file, with PDF and SVG beside it, of the curves over time.
+
+        With them the band in which two thirds of the seeds lie.
+        """
         from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import, needed only here)
 
         figure = Figure(figsize=(8.0, 5.0), layout="constrained")
@@ -170,7 +173,7 @@ def _swing_up(name: str, seed: int, options: PendulumOptions) -> Array:
 
 
 def _drawn(belief: Belief, count: int, rng: np.random.Generator) -> PendulumPoints:
-    """A draw for each sample, within the physical range."""
+    """Return a draw for each sample, within the physical range."""
     theta = np.maximum(belief.draw(count, rng), [SHORTEST, LIGHTEST])
     return PendulumPoints(theta[None], np.ones(1), each=True)
 
@@ -193,7 +196,10 @@ def pendulum_cost(state: Tensor, t: int) -> Tensor:
 
 
 def skid_steer_transition(step_s: float) -> Transition:
-    """The bare skid-steer model: states (L, K, 4) x, y, yaw and forward speed; theta radius, axial distance, x_icr."""
+    """Return the bare skid-steer model: states (L, K, 4) x, y, yaw and forward speed.
+
+    Theta radius, axial distance, x_icr.
+    """
 
     def transition(state: Tensor, control: Tensor, theta: Tensor) -> Tensor:
         x, y, yaw, _ = state.unbind(-1)
@@ -214,7 +220,7 @@ def skid_steer_transition(step_s: float) -> Transition:
 
 
 def circle_cost(circle: CircleCost) -> StageCost:
-    """The paper's stage cost (L, K) of skid-steer states."""
+    """Return the paper's stage cost (L, K) of skid-steer states."""
 
     def cost(state: Tensor, t: int) -> Tensor:
         x, y, _, forward = state.unbind(-1)

@@ -54,7 +54,7 @@ def virtual_robot(
     effects: Mapping[str, float | Sequence[float]] | None = None,
     seed: int = 1,
 ) -> RobotInProcess:
-    """A robot with this plant whose controller has the limits of robot.toml.
+    """Return a robot with this plant whose controller has the limits of robot.toml.
 
     `effects`: hidden ones, as in `sim.effects`. Raises HiddenEffectError.
     """
@@ -124,7 +124,7 @@ class SimulatedRun:
             yield tick
 
     def run(self, duration_s: float, *requests: UserRequest) -> list[CoreTick]:
-        """Let time pass; the requests come with the first tick. All ticks are returned."""
+        """Run for a duration and return all ticks; the requests come with the first one. All ticks are returned."""
         return list(self.ticks(duration_s, *requests))
 
     def start(self) -> None:
@@ -166,7 +166,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class VirtualDrive:
-    """What a virtual robot did, tick by tick: `t_s` (N,) since the start, and what truly was.
+    """Record of a virtual robot's drive, tick by tick: `t_s` (N,) since the start, and the true motion.
 
     `poses` (N, 3): x, y (m), yaw (rad) of the tracked point; `speeds` (N,) m/s forward; `commands` (N, 2): wheel speeds
     sent, left and right (rad/s), NaN where none was. `laps` of the task; `events`: what the daemon said.

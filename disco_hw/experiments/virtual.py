@@ -1,4 +1,4 @@
-"""`disco-hw sim`: the virtual robot of a robot.toml, its true parameters from the model and what the user hides."""
+"""Virtual robot of `disco-hw sim`, with true parameters from the model of robot.toml and from what the user hides."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _MOST_ACCELERATION_RAD_S2 = 655.0
 
 @dataclass(frozen=True, slots=True)
 class SimOptions:
-    """What `disco-hw sim` was asked; `start` is x, y (m) and yaw (rad), the task's start if None."""
+    """Options of `disco-hw sim`; `start` is x, y (m) and yaw (rad), the task's start if None."""
 
     robot: Path
     model: Path | None = None
@@ -113,7 +113,7 @@ def run_sim(options: SimOptions) -> int:
 
 
 def true_parameters(setup: Setup, plant_seed: int | None) -> PlantParameters:
-    """The plant at the model's mean, or drawn from the model's belief with this seed."""
+    """Return the plant at the model's mean, or drawn from the model's belief with this seed."""
     mean, covariance = geometry(setup.model)
     radius, axial, x_icr = mean
     base = PlantParameters(ticks_per_rev=_whole_ticks(setup))

@@ -1,4 +1,4 @@
-"""Where the robot may be: the fence and the footprint as robot.toml describes them, and what is wrong with them.
+"""Fence and footprint as robot.toml describes them, where the robot may be, and what is wrong with them.
 
 Plain numbers without arrays, because robot.toml is read before anything heavy is imported. `disco_hw.fence.clearance`
 computes distances. Metres in the pose frame.
@@ -45,13 +45,13 @@ class Footprint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return math.hypot(abs(self.ahead) + 0.5 * self.length, 0.5 * self.width)
 
     def corners_m(self) -> tuple[Point, Point, Point, Point]:
-        """The corners relative to the tracked point, ahead and to the left, in counter-clockwise order."""
+        """Return the corners relative to the tracked point, ahead and to the left, in counter-clockwise order."""
         back, front, side = self.ahead - 0.5 * self.length, self.ahead + 0.5 * self.length, 0.5 * self.width
         return (back, -side), (front, -side), (front, side), (back, side)
 
 
 class Fence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """[fence] of robot.toml: where the whole footprint must stay, and where no part of it may be.
+    """Section [fence] of robot.toml: where the whole footprint must stay, and where no part of it may be.
 
     Within `margin_m` of the fence commands that lead towards it are scaled. `max_breach_probability`: of a plan over
     its horizon. `obstacles_port`: UDP port on which obstacles are reported, also by the
@@ -72,7 +72,7 @@ class Fence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class WheelGeometry(Protocol):
-    """What the usual footprint is made from: [robot] of robot.toml has it."""
+    """Geometry from which the usual footprint is made; [robot] of robot.toml has it."""
 
     @property
     def wheel_radius_m(self) -> float:
@@ -84,7 +84,7 @@ class WheelGeometry(Protocol):
 
     @property
     def x_icr_m(self) -> float:
-        """How far ahead of the tracked point the robot turns."""
+        """Distance (m) from the tracked point forward to the point about which the robot turns."""
 
 
 def usual_footprint(robot: WheelGeometry) -> Footprint:
@@ -98,7 +98,7 @@ def usual_footprint(robot: WheelGeometry) -> Footprint:
 
 
 class FenceFault(NamedTuple):
-    """What is wrong with [fence]: the field, the fault, the remedy."""
+    """Fault in the section [fence]: the field, the fault, the remedy."""
 
     field: str
     fault: str
@@ -178,7 +178,7 @@ def _leads_back(begin: Point, corner: Point, end: Point) -> bool:
 
 
 def _meeting(a: Point, b: Point, c: Point, d: Point) -> Point | None:
-    """A point that the segments a-b and c-d have in common; None if there is none."""
+    """Return a point that the segments a-b and c-d have in common; None if there is none."""
     c_side, d_side = _cross(a, b, c), _cross(a, b, d)
     a_side, b_side = _cross(c, d, a), _cross(c, d, b)
     if c_side * d_side < 0.0 and a_side * b_side < 0.0:

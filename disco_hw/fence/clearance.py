@@ -35,7 +35,7 @@ class MovingCircle:
 
 @dataclass(frozen=True, eq=False)
 class _Outline:
-    """A polygon: where its edges begin (E, 2) and the way along each (E, 2)."""
+    """Polygon with its edges as arrays: where they begin (E, 2) and the way along each (E, 2)."""
 
     begin: Array
     way: Array
@@ -43,7 +43,7 @@ class _Outline:
 
 
 class Boundaries:
-    """Everything that a footprint must keep away from."""
+    """Boundaries that a footprint must keep away from."""
 
     def __init__(self, footprint: Footprint, fence: Fence, obstacles: Sequence[MovingCircle] = ()) -> None:
         self.footprint = footprint
@@ -144,7 +144,7 @@ class Boundaries:
         return found
 
     def _near_edges(self, outline: _Outline, centers: Array, within_m: float) -> NDArray[np.bool_]:
-        """Which edges (E,) can be within so far of the footprint at one of the centres."""
+        """Return which edges (E,) can be within so far of the footprint at one of the centres."""
         middle = 0.5 * (centers.min(axis=0) + centers.max(axis=0))
         reach = float(np.hypot(*(centers - middle).T).max()) + float(np.hypot(*self._half)) + within_m
         dx, dy = (middle - outline.begin).T

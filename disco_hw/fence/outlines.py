@@ -12,7 +12,7 @@ _ROUND = np.linspace(0.0, 2.0 * np.pi, 49)
 
 
 def fence_outlines(fence: Fence) -> list[Array]:
-    """The fence's shapes as closed lines (N, 2)."""
+    """Return the fence's shapes as closed lines (N, 2)."""
     shapes = [*(() if fence.keep_in is None else (fence.keep_in,)), *fence.keep_out]
     return [
         circle_outline(*shape.center, shape.radius_m) if isinstance(shape, Circle) else _closed(shape)
@@ -21,14 +21,14 @@ def fence_outlines(fence: Fence) -> list[Array]:
 
 
 def footprint_outline(footprint: Footprint, pose: tuple[float, float, float]) -> Array:
-    """The footprint at a pose of the tracked point as a closed line (5, 2)."""
+    """Return the footprint at a pose of the tracked point as a closed line (5, 2)."""
     x_m, y_m, yaw_rad = pose
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
     return _closed([(x_m + cos * x - sin * y, y_m + sin * x + cos * y) for x, y in footprint.corners_m()])
 
 
 def circle_outline(x_m: float, y_m: float, radius_m: float) -> Array:
-    """A circle as a closed line (N, 2)."""
+    """Return a circle as a closed line (N, 2)."""
     return np.stack((x_m + radius_m * np.cos(_ROUND), y_m + radius_m * np.sin(_ROUND)), axis=1)
 
 

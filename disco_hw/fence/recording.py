@@ -50,7 +50,7 @@ def fence_along(poses: Array, footprint: Footprint) -> Polygon:
 
 
 def _simplified(points: Array, tolerance_m: float) -> Array:
-    """The points without which no other is farther than the tolerance from the line (Douglas and Peucker, 1973)."""
+    """Return the points of a line that are needed to stay within a tolerance of it (Douglas and Peucker, 1973)."""
     keep = np.zeros(len(points), dtype=bool)
     keep[[0, -1]] = True
     waiting = [(0, len(points) - 1)]

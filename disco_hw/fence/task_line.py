@@ -16,10 +16,10 @@ class TaskLine(Protocol):
 
     @property
     def start(self) -> tuple[float, float, float]:
-        """Where to begin and which way to face: x, y (m), yaw (rad)."""
+        """Start of the line and the heading there: x, y (m), yaw (rad)."""
 
     def outline_m(self) -> NDArray[np.float64]:
-        """The line as points (N, 2)."""
+        """Return the line as points (N, 2)."""
 
 
 def task_breach(fence: Fence, footprint: Footprint, course: TaskLine) -> str | None:

@@ -39,7 +39,7 @@ _TOML_TOKEN = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class FileKind:
-    """What a file should be, in words, the most bytes that it may have, and what to do where there is none."""
+    """Kind of a file: what it should be, in words, the most bytes that it may have, what to do where there is none."""
 
     what: str
     most_bytes: int
@@ -57,7 +57,7 @@ LOG = FileKind("a log", 16 * _KIB * _MIB, "give the path of a log")
 
 
 def file_name_of(name: str) -> str:
-    """A robot's name as part of a file name: letters, digits, - and _ stay, so that it cannot leave its directory."""
+    """Return a robot's name as part of a file name: letters, digits, - and _ alone, which leave no directory."""
     return re.sub(r"[^A-Za-z0-9_-]", "_", name)
 
 
@@ -77,7 +77,7 @@ def check_log_file(log_file: Path | None) -> None:
 
 
 def open_file(path: Path, kind: FileKind) -> int:
-    """A descriptor of a plain file that is not too large; raises InputError for anything else."""
+    """Return a descriptor of a plain file that is not too large; raises InputError for anything else."""
     try:
         # A pipe without a writer would hold up a plain open for ever.
         descriptor = os.open(path, _FLAGS)
@@ -92,7 +92,7 @@ def open_file(path: Path, kind: FileKind) -> int:
 
 
 def read_bytes(path: Path, kind: FileKind) -> tuple[bytes, os.stat_result]:
-    """What is in a file, with the status of the very file that was read; raises InputError."""
+    """Return the contents of a file, with the status of the very file that was read; raises InputError."""
     with os.fdopen(open_file(path, kind), "rb") as file:
         status = os.fstat(file.fileno())
         try:
@@ -106,7 +106,7 @@ def read_bytes(path: Path, kind: FileKind) -> tuple[bytes, os.stat_result]:
 
 
 def begin_of(path: Path, kind: FileKind, count: int) -> bytes:
-    """The first bytes of a file, fewer where it has fewer; raises InputError."""
+    """Return the first bytes of a file, fewer where it has fewer; raises InputError."""
     with os.fdopen(open_file(path, kind), "rb") as file:
         try:
             return file.read(count)
@@ -115,7 +115,10 @@ def begin_of(path: Path, kind: FileKind, count: int) -> bytes:
 
 
 def read_lines(path: Path, kind: FileKind) -> Iterator[str]:
-    """The lines of a text file, each with its end, one at a time; raises InputError, also for a line without an end."""
+    """Yield the lines of a text file, each with its end, one at a time.
+
+    Raises InputError, also for a line without an end.
+    """
     # Spreadsheets write a mark before the first column's name.
     with io.TextIOWrapper(os.fdopen(open_file(path, kind), "rb"), encoding="utf-8-sig", newline="") as file:
         taken = number = 0
@@ -137,12 +140,12 @@ def read_lines(path: Path, kind: FileKind) -> Iterator[str]:
 
 
 def read_toml(path: Path, kind: FileKind) -> dict[str, Any]:
-    """A TOML file's table; raises InputError."""
+    """Return a TOML file's table; raises InputError."""
     return parse_toml(read_bytes(path, kind)[0], str(path))
 
 
 def parse_toml(content: bytes, name: str) -> dict[str, Any]:
-    """The table of a TOML file's content, `name` in messages.
+    """Return the table of a TOML file's content, `name` in messages.
 
     Raises InputError, also for what a parser needs for ever or a deep stack for: brackets nested more than 16 deep,
     words, numbers among them, over 64 characters, strings over 4096, keys of more than 8 parts.
@@ -207,9 +210,10 @@ _STEP = re.compile(r"\.(\w+)|\[\.*\d*\.*\]")
 
 
 def in_words(error: msgspec.ValidationError, kinds: Sequence[type], docs: str, within: str = "") -> str:
-    """One line: the field, what is wrong, the values or the name that it could have; `docs` says what each means.
+    """Return one line for an invalid field: its name, what is wrong, and the values or the name that it could have.
 
-    `kinds` are the types that the table could have been converted to, `within` is its section.
+    `docs` says what each value means. `kinds` are the types that the table could have been converted to, `within` is
+    its section.
     """
     roots = [inspect.type_info(kind) for kind in kinds]
     text, _, where = str(error).partition(" - at `$")
@@ -233,12 +237,12 @@ def in_words(error: msgspec.ValidationError, kinds: Sequence[type], docs: str, w
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
-    """The known name that is most like a misspelt one, or None if none is like it."""
+    """Return the known name that is most like a misspelt one, or None if none is like it."""
     return next(iter(difflib.get_close_matches(name, list(known), n=1)), None)
 
 
 def _types_at(roots: Sequence[inspect.Type], place: str) -> list[inspect.Type]:
-    """What may stand at a place as `.link.kind` or `.belief.mean[...]`."""
+    """Return the types that may stand at a place such as `.link.kind` or `.belief.mean[...]`."""
     types = _members(roots)
     for step in _STEP.finditer(place):
         following: list[inspect.Type] = []
@@ -253,7 +257,7 @@ def _types_at(roots: Sequence[inspect.Type], place: str) -> list[inspect.Type]:
 
 
 def _members(types: Sequence[inspect.Type]) -> list[inspect.Type]:
-    """The types with unions taken apart."""
+    """Return the types with unions taken apart."""
     return [member for one in types for member in (one.types if isinstance(one, inspect.UnionType) else (one,))]
 
 
@@ -262,7 +266,7 @@ def _choices(types: Sequence[inspect.Type]) -> list[str]:
 
 
 def _tags(types: Sequence[inspect.Type], field: str) -> list[str]:
-    """The values of the field that distinguishes the structs of a union."""
+    """Return the values of the field that distinguishes the structs of a union."""
     name = field.rpartition(".")[2]
     return [str(one.tag) for one in types if isinstance(one, inspect.StructType) and one.tag_field == name]
 

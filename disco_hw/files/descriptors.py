@@ -1,4 +1,4 @@
-"""How many files this process may open, and descriptors kept free for what must never fail to open one."""
+"""File descriptors: how many this process may open, and some kept free for what must never fail to open one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 
 def free_descriptors() -> int:
-    """How many more descriptors this process may open."""
+    """Return how many more descriptors this process may open."""
     limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     most = 1 << 20 if limit == resource.RLIM_INFINITY else limit
     return most - len(os.listdir("/proc/self/fd"))

@@ -32,7 +32,7 @@ _SECTION = re.compile(r"^\s*\[([^\[\]]+)\]\s*(#.*)?$")
 
 
 def in_toml(value: Any) -> str:
-    """A number, text, truth or list of them as TOML writes it."""
+    """Return a number, text, truth or list of them as TOML writes it."""
     match value:
         case bool():
             return "true" if value else "false"
@@ -45,7 +45,7 @@ def in_toml(value: Any) -> str:
 
 
 def with_fields(text: str, fields: Mapping[tuple[str, str], Any]) -> str:
-    """The text with these fields, by section and name, set; what is not there yet is added to its section.
+    """Return the text with these fields, by section and name, set; what is not there yet is added to its section.
 
     A field whose old value goes over several lines is not understood: look at the result before it is written.
     """
@@ -102,7 +102,7 @@ QUESTIONS = (
 
 @dataclass(frozen=True, slots=True)
 class InitOptions:
-    """What `disco-hw init` was asked; None of a field is asked for, or the usual where nobody is to be asked.
+    """Options of `disco-hw init`; None of a field is asked for, or the usual where nobody is to be asked.
 
     `may_ask`: whether a serial line may be asked for controllers that only answer; None asks the person.
     """
@@ -120,7 +120,7 @@ class InitOptions:
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """What was recognised on a link: the driver, the fields in [link] that its frames show, a serial line's speed."""
+    """Result of listening on a link: the driver, the fields in [link] that its frames show, a serial line's speed."""
 
     driver: str
     fields: dict[str, Any]
@@ -128,13 +128,16 @@ class Heard:
 
 
 def recognised(frames: Sequence[Frame]) -> tuple[Heard, ...]:
-    """The controllers whose frames these are, by the drivers' own judgement."""
+    """Return the controllers whose frames these are, by the drivers' own judgement."""
     found = ((driver.name, driver.recognise(frames)) for driver in motor_drivers().values())
     return tuple(Heard(name, fields) for name, fields in found if fields is not None)
 
 
 def listen(link: dict[str, Any], seconds: float) -> list[Frame]:
-    """The frames that come over a link by themselves; nothing is sent. Raises InputError for what cannot be opened."""
+    """Return the frames that come over a link by themselves; nothing is sent.
+
+    Raises InputError for what cannot be opened.
+    """
     try:
         transport = make_transport(**link)
     except TransportSettingsError as error:
@@ -213,7 +216,7 @@ def run_init(options: InitOptions, ask: Callable[[str], str] | None, say: Callab
 def _controller(
     options: InitOptions, link: dict[str, Any], ask: Callable[[str], str] | None, say: Callable[[str], None]
 ) -> Heard:
-    """The driver that was named, or the one whose frames are heard, or that answers on a line where nobody speaks."""
+    """Return the driver that was named, or whose frames came, or that replies on a silent line."""
     found: tuple[Heard, ...] = ()
     if options.driver is not None:
         try:
@@ -243,7 +246,7 @@ def _controller(
 def _answering(
     options: InitOptions, port: str, ask: Callable[[str], str] | None, say: Callable[[str], None]
 ) -> tuple[Heard, ...]:
-    """The controllers that answer on a silent line: of the driver named, or of all once somebody has allowed it."""
+    """Return the controllers that reply on a silent line: of the driver named, or of all once that was allowed."""
     drivers = [driver for driver in motor_drivers().values() if driver.questions is not None]
     if options.driver is not None:
         drivers = [driver for driver in drivers if driver.name == options.driver]
@@ -282,7 +285,7 @@ def _asked(question: Question, ask: Callable[[str], str] | None) -> float:
 
 
 def robot_text(options: InitOptions, link: dict[str, Any], heard: Heard, measures: dict[str, float]) -> str:
-    """The text of a robot.toml, with a comment where somebody must look."""
+    """Return the text of a robot.toml, with a comment where somebody must look."""
     driver = find_driver(heard.driver)
     lines = [
         "# Written by `disco-hw init`; docs/robot.md says what every field means and what else there is.",
@@ -332,7 +335,7 @@ def robot_text(options: InitOptions, link: dict[str, Any], heard: Heard, measure
 
 
 def driver_settings(driver: Any, fields: dict[str, Any]) -> Any:
-    """The driver's settings of these fields; raises InputError where they are none."""
+    """Return the driver's settings of these fields; raises InputError where they are none."""
     try:
         return msgspec.convert(fields, driver.settings)
     except msgspec.ValidationError as error:
@@ -340,6 +343,6 @@ def driver_settings(driver: Any, fields: dict[str, Any]) -> Any:
 
 
 def _task_speed(slowest_rad_s: float, measures: dict[str, float]) -> float:
-    """A quarter of what the wheels can do, at most 0.2 m/s, and not below what the controller holds."""
+    """Return a quarter of what the wheels can do, at most 0.2 m/s, and not below what the controller holds."""
     radius_m, top = measures["wheel_radius_m"], measures["max_wheel_speed_rad_s"]
     return min(0.8 * top * radius_m, max(1.5 * slowest_rad_s * radius_m, min(0.2, 0.25 * top * radius_m)))

@@ -1,4 +1,4 @@
-"""`disco-hw commission`: the guided first drive over the daemon's own path, what it found, and robot.toml mended."""
+"""Guided first drive of `disco-hw commission` over the daemon's own path, its findings, and robot.toml corrected."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ STAGES = (
 
 @dataclass(frozen=True, slots=True)
 class CommissionOptions:
-    """What `disco-hw commission` was asked; `write`: mend robot.toml, None asks; `stages`: names of `STAGES`."""
+    """Options of `disco-hw commission`; `write`: mend robot.toml, None asks; `stages`: names of `STAGES`."""
 
     robot: Path
     link: str | None = None
@@ -76,17 +76,17 @@ class CommissionOptions:
 
 @dataclass(frozen=True, slots=True)
 class CommissionResult:
-    """What was found, by stage: figures, faults with whether they were mended, and the logs."""
+    """Result of commissioning by stage: figures, faults with whether they were corrected, and the logs."""
 
     stages: tuple[dict[str, Any], ...]
     ok: bool
 
     def as_dict(self) -> dict[str, Any]:
-        """The result for machines."""
+        """Return the result as a JSON-serialisable dict."""
         return {"ok": self.ok, "stages": list(self.stages)}
 
     def as_text(self) -> str:
-        """The result for a person."""
+        """Return the result as text."""
         lines = []
         for stage in self.stages:
             lines += [f"{stage['name']}: {figure}" for figure in stage["figures"]]
@@ -99,13 +99,13 @@ def _how(fault: dict[str, Any]) -> str:
 
 
 def slowest_rad_s(setup: Setup) -> float:
-    """The slowest true speed of a wheel that the controller holds."""
+    """Return the slowest true speed of a wheel that the controller holds."""
     link = setup.config.link
     return find_driver(link.driver).slowest_rad_s(link.settings()) * setup.config.wheels.turn_ratio
 
 
 def as_sent(setup: Setup) -> Setup:
-    """The robot with its poses as the first source sends them, and without those of others."""
+    """Return the robot with its poses as the first source sends them, and without those of others."""
     plain = msgspec.structs.replace(
         setup.config.pose,
         position_unit="m",

@@ -44,7 +44,7 @@ def fence_of_log(log: Path) -> Polygon:
 
 
 def fence_toml(keep_in: Polygon) -> str:
-    """The section for robot.toml."""
+    """Return the section for robot.toml."""
     return f"[fence]\nkeep_in = {in_toml([list(corner) for corner in keep_in])}\n"
 
 

@@ -1,4 +1,4 @@
-"""What the guided first drive says of the robot: faults with the lines of robot.toml that mend them, and figures; pure.
+"""Evaluation of the guided first drive: faults with the lines of robot.toml that mend them, and figures; pure.
 
 A fault is judged against what robot.toml says already: what was mended once and is right now is no fault.
 """
@@ -42,7 +42,7 @@ SETTLED_S = 0.5
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong, in words with the remedy; `edits`: fields of robot.toml, by section and name, that mend it."""
+    """Fault with its remedy in words; `edits`: fields of robot.toml, by section and name, that correct it."""
 
     name: str
     text: str
@@ -51,19 +51,19 @@ class Fault:
 
 @dataclass(frozen=True)
 class Findings:
-    """Faults, and figures for a person: what was measured, in words."""
+    """Faults, and figures for the operator: what was measured, in words."""
 
     faults: tuple[Fault, ...] = ()
     figures: tuple[str, ...] = ()
 
     @property
     def edits(self) -> dict[tuple[str, str], Any]:
-        """Those of all faults together."""
+        """Edits of all faults together, by section and name of the field."""
         return {place: value for fault in self.faults for place, value in fault.edits.items()}
 
 
 def judge_sides(seen: Sequence[SideSeen], wiring: Wiring, robot: Robot) -> Findings:
-    """Which motor and encoder is on which side, and which way round; `wiring`: what robot.toml says of that."""
+    """Find which motor and encoder is on which side, and which way round; `wiring`: that of robot.toml."""
     faults: list[Fault] = []
     figures = [_dead_band(side, one.track) for side, one in enumerate(seen)]
     for side, one in enumerate(seen):
@@ -162,7 +162,7 @@ def _wiring_faults(seen: Sequence[SideSeen], old: Wiring) -> list[Fault]:
 
 
 def _side_of(seen: Sequence[SideSeen], side: int) -> str:
-    """Which asked side turned this one, as a letter."""
+    """Return which commanded side turned this one, as a letter."""
     return "lr"[next(asked for asked, one in enumerate(seen) if "lr".index(one.seen[0]) == side)]
 
 
@@ -171,7 +171,7 @@ def _with(fault: Fault, place: tuple[str, str], value: Any) -> Fault:
 
 
 def _dead_band(side: int, track: Track) -> str:
-    """The command at which a wheel began to turn."""
+    """Return the command at which a wheel began to turn."""
     begun = next(
         (s.t_ns for s in track.wheels if max(abs(s.left_speed_rad_s), abs(s.right_speed_rad_s)) > STILL_RAD_S), None
     )
@@ -230,7 +230,7 @@ def _standing(still_s: float | None) -> str:
 
 
 def _simple(ratio: float) -> float:
-    """A ratio of small numbers where one is as near as a person can tell, else two digits."""
+    """Return a ratio of small numbers where one is as near as a person can tell, else two digits."""
     near = [a / b for b in range(1, 9) for a in range(1, 9) if abs(a / b / ratio - 1.0) < 0.3 * TURN_TOLERANCE]
     whole = [float(n) for n in range(2, 65) if min(abs(n / ratio - 1.0), abs(n * ratio - 1.0)) < 0.3 * TURN_TOLERANCE]
     if whole:
@@ -239,7 +239,7 @@ def _simple(ratio: float) -> float:
 
 
 def _stop_after_silence(track: Track) -> tuple[float, float | None] | None:
-    """When the wheels began to slow down and when they stood, since the last command (s); None if they went on."""
+    """Return when the wheels began to slow down and when they stood, since the last command (s), or None."""
     silent_ns = track.silent_ns or 0
     # What the robot said to be its own stop may show late; what began after the person had let go was not its own.
     let_go_s = (track.ended_ns - silent_ns) * 1e-9 if track.let_go and track.ended_ns is not None else math.inf
@@ -261,7 +261,7 @@ def _faster(left: float, right: float) -> float:
 
 
 def _response(track: Track) -> list[tuple[str, str]]:
-    """How late the wheels follow a command: between the halves of the rises of command and speed."""
+    """Return the figure of the wheels' delay after a command, between the halves of both rises."""
     if not track.commands:
         return []
     top = max(_faster(left, right) for _, left, right in track.commands)
@@ -273,7 +273,7 @@ def _response(track: Track) -> list[tuple[str, str]]:
 
 
 def judge_floor(seen: FloorSeen, told: PoseConvention, robot: Robot) -> Findings:
-    """In what units and about which axes the poses are, where the sensor sits, and how late it is.
+    """Find the units and axes of the poses, the sensor's place, and its delay.
 
     The poses are as the source sent them; `told` is what robot.toml says of them.
     """
@@ -322,7 +322,7 @@ _CHOICES = tuple(
 
 @dataclass(frozen=True)
 class _Fit:
-    """How well a convention explains the drive; `mismatch_rad`: of the sensor's heading in the two straights."""
+    """Fit of one pose convention to the drive; `mismatch_rad`: of the sensor's heading in the two straights."""
 
     convention: PoseConvention
     mismatch_rad: float
@@ -341,7 +341,7 @@ def _same_units(found: PoseConvention, told: PoseConvention) -> bool:
 
 
 def _fit(seen: FloorSeen, choice: PoseConvention, robot: Robot) -> _Fit | None:
-    """The drive in this convention; None where distance or turn cannot be so."""
+    """Return the drive in this convention; None where distance or turn cannot be so."""
     wheels_m = _travel(seen.straight, robot)
     dx, dy, heading = _displacement(seen.straight.poses, choice)
     poses_m = math.hypot(dx, dy)
@@ -376,7 +376,7 @@ def _travel(track: Track, robot: Robot) -> float:
 
 
 def _displacement(poses: Sequence[PoseSample], choice: PoseConvention) -> tuple[float, float, float]:
-    """From the mean of the first poses, at rest, to that of the last; with the mean heading (m, m, rad)."""
+    """Return the way from the first poses' mean, at rest, to the last ones', with the mean heading (m, m, rad)."""
     rest = max(1, min(10, len(poses) // 4))
     found = [choice.converted(pose) for pose in poses]
     first, last = found[:rest], found[-rest:]
@@ -391,7 +391,7 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _turn(poses: Sequence[PoseSample], choice: PoseConvention) -> float:
-    """By how much the yaw has changed (rad), over the steps from pose to pose."""
+    """Return by how much the yaw has changed (rad), over the steps from pose to pose."""
     factor = (-1.0 if choice.clockwise else 1.0) * (math.pi / 180.0 if choice.yaw_unit == "deg" else 1.0)
     yaws = [factor * pose.yaw_rad for pose in poses]
     return math.fsum(math.remainder(b - a, 2.0 * math.pi) for a, b in pairwise(yaws))
@@ -426,7 +426,7 @@ def _clockwise(clockwise: bool) -> str:
 
 
 def _places(seen: FloorSeen, best: _Fit) -> list[str]:
-    """Where the sensor sits beside the centre of the turns, and how much later than the wheels it speaks."""
+    """Return lines on where the sensor sits beside the centre of the turns, and its delay against the wheels."""
     convention = best.convention
     arms = [_arm([convention.converted(pose) for pose in track.poses]) for track in (seen.left, seen.right)]
     forward, left = (_mean([arm[k] for arm in arms]) for k in (0, 1))
@@ -457,7 +457,7 @@ def _arm(poses: Sequence[PoseSample]) -> tuple[float, float]:
 
 
 def _delay_s(track: Track, convention: PoseConvention) -> float:
-    """By how much the yaw of the poses lags behind the wheels' (s): the shift that fits best, to 5 ms."""
+    """Return by how much the poses' yaw lags behind the wheels' (s): the shift that fits best, to 5 ms."""
     wheel_t = np.array([s.t_ns for s in track.wheels]) * 1e-9
     turn = np.array([s.right_angle_rad - s.left_angle_rad for s in track.wheels])
     poses = [convention.converted(pose) for pose in track.poses]

@@ -1,9 +1,9 @@
-"""The guided first drive as steps that wait for a person: what is asked of the wheels, tick by tick, and its pilot.
+"""The guided first drive as steps that wait for the operator: what is asked of the wheels, tick by tick, and its pilot.
 
 The pilot runs a procedure under a deadman held by a person, and takes the keys they answer with. All of it is pure.
 
 A step is a generator: it yields what it wants of the tick and gets what was seen in it, or a person's answer. A step
-that needs the deadman held begins anew when it was let go too early.
+that needs the deadman held begins again when it was let go too early.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ Action = DriveWheels | Silence | Ask | Reset
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What a tick saw: whether the wheels were driven in it, what was commanded (rad/s), and what came in.
+    """Observation of one tick: whether the wheels were driven in it, what was commanded (rad/s), and what came in.
 
     `fault`: the robot has one; `silent`: nothing was sent; `held`: the person held the deadman.
     """
@@ -121,14 +121,14 @@ class Track:
         self.poses += seen.poses
 
     def turned(self) -> Wheels:
-        """How far the wheels have turned since its beginning (rad)."""
+        """Return the angles (rad) by which the wheels have turned since the track began."""
         if not self.wheels:
             return 0.0, 0.0
         first, last = self.wheels[0], self.wheels[-1]
         return last.left_angle_rad - first.left_angle_rad, last.right_angle_rad - first.right_angle_rad
 
     def fastest(self) -> float:
-        """The faster wheel of the newest sample, without its sign (rad/s)."""
+        """Return the faster wheel of the newest sample, without its sign (rad/s)."""
         if not self.wheels:
             return 0.0
         return max(abs(self.wheels[-1].left_speed_rad_s), abs(self.wheels[-1].right_speed_rad_s))
@@ -147,7 +147,7 @@ SAW = {"1": "lf", "2": "lb", "3": "rf", "4": "rb", "0": ""}
 
 
 def speed_of(robot: Robot, slowest_rad_s: float) -> float:
-    """A tenth of the robot's largest wheel speed, or a little above the slowest that its controller holds (rad/s)."""
+    """Return a tenth of the largest wheel speed, or a little above the slowest that the controller holds (rad/s)."""
     return max(SPEED_SHARE * robot.max_wheel_speed_rad_s, _ABOVE_SLOWEST * slowest_rad_s)
 
 
@@ -216,7 +216,10 @@ class TurnsSeen:
 
 
 def turns(robot: Robot, slowest_rad_s: float = 0.0) -> Steps:
-    """Wheels up: ticks a turn, by letting go after exactly one turn; then the watchdog. Returns a TurnsSeen."""
+    """Measure, with the wheels up, ticks a turn by letting go after exactly one turn; then the watchdog.
+
+    Returns a TurnsSeen.
+    """
     speed = speed_of(robot, slowest_rad_s)
     tracks = []
     for side in (0, 1):
@@ -303,7 +306,7 @@ def floor(robot: Robot, slowest_rad_s: float = 0.0) -> Steps:
 
 
 def _leg(robot: Robot, wheels: Wheels, travel_m: float, what: str) -> Steps:
-    """Both wheels at these speeds, one way each, until they have travelled so far; with a rest on both sides.
+    """Drive both wheels at these speeds until they have travelled `travel_m`, with a rest before and after.
 
     Let go on the way, it goes on from there with what is left.
     """
@@ -330,7 +333,7 @@ def _at_rest_long(track: Track) -> bool:
 
 
 class Procedure:
-    """Runs steps: `step` once a tick gives what is wanted, `answer` hands it a key; `result` is what they returned."""
+    """Runner of steps, which `see` moves on and `answer` hands a key; `result` is what the steps returned."""
 
     def __init__(self, steps: Steps) -> None:
         self._steps = steps
@@ -339,7 +342,7 @@ class Procedure:
 
     @property
     def action(self) -> Action | None:
-        """What is wanted now; None when all is done."""
+        """Action that is due now; None when all is done."""
         return self._action
 
     def see(self, seen: Seen) -> None:
@@ -398,7 +401,7 @@ class CommissionPilot:
 
     @property
     def finds_wiring(self) -> bool:
-        """That is what it is for."""
+        """Always True, because this drive is there to find the wiring."""
         return True
 
     @property
@@ -455,7 +458,7 @@ class CommissionPilot:
         return "the robot is being commissioned from its terminal"
 
     def status(self) -> dict[str, Any]:
-        """Nothing is added."""
+        """Return an empty dict: the status gets no more entries."""
         return {}
 
     def _new_words(self) -> list[str]:

@@ -1,1 +1,1 @@
-"""BayesSim: what a logged drive says about the robot's parameters."""
+"""Inference of the robot's parameters from a logged drive (BayesSim)."""

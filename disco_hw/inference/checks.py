@@ -31,7 +31,7 @@ class ScoreTest:
 
     @property
     def meaning(self) -> str:
-        """What it would look like, in words."""
+        """Description of what the deviation would look like."""
         return self.symptom.value
 
     @property
@@ -131,7 +131,7 @@ def _whitened(columns: Array, factor: Whitening) -> Array:
 
 
 def _scores(whitened: tuple[Array, int]) -> Array:
-    """t values of the tested columns, (tested,); the first column is the error, then come the nominal ones."""
+    """Return t values of the tested columns, (tested,); the first column is the error, then come the nominal ones."""
     columns, nominal = whitened
     base, _ = np.linalg.qr(columns[:, 1 : 1 + nominal])
     tested = columns[:, 1 + nominal :]
@@ -154,7 +154,9 @@ _EDGE_WIDTH = 0.1
 
 @dataclass(frozen=True)
 class Predictive:
-    """`deviations` (13,): how far the log's value of each of `CHECKS` is from the simulated ones, in their standard
+    """Comparison of the log with simulations under the posterior.
+
+    `deviations` (13,): how far the log's value of each of `CHECKS` is from the simulated ones, in their standard
     deviations; `estimate_deviations` (3,) the same for the estimates of wheel radius, x_icr and kappa. `edge` names
     parameters whose posterior is pressed against the prior's edge. `unexplained` is the part of the motion that counts
     as noise, and that no comparison with simulations which have that noise could find.
@@ -234,7 +236,7 @@ _DRAWS = 200
 
 @dataclass(frozen=True)
 class Calibration:
-    """From fresh simulations at parameters drawn from the last region.
+    """Calibration from fresh simulations at parameters drawn from the last region.
 
     `ranks` (n, 3) in [0, 1] of the true parameters among posterior draws, uniform if calibrated, and `p_values` (3,) of
     the Kolmogorov-Smirnov test for that; `coverage` (levels,) of the joint highest-density regions of `LEVELS`.
@@ -246,7 +248,7 @@ class Calibration:
 
 
 def widening(fitted: Fitted, simulate: Simulate, draws: Array, seed: int) -> Array:
-    """How many times wider (P,) the network's posteriors have to be to hold what is known as often as they say.
+    """Return the factors (P,) that widen the network's posteriors to hold the truth as often as they state.
 
     Simulates at `draws` (n, P) of the posterior: root mean square of what was simulated minus the mean that the network
     gives, over its standard deviation.
@@ -280,7 +282,7 @@ def calibrate(fitted: Fitted, simulate: Simulate, count: int, seed: int) -> Cali
 
 
 def effective_simulations(fitted: Fitted, observed: Array) -> float:
-    """How many simulations of the last region the posterior rests on: (sum w)^2 / sum w^2 with w its density there."""
+    """Return how many simulations of the last region the posterior rests on: (sum w)^2 / sum w^2, w its density."""
     mixtures = fitted.posteriors(observed[None])
     log_weight = mixtures.log_density(fitted.region.unit(fitted.theta)[None])[0]
     weight = np.exp(log_weight - log_weight.max())
@@ -306,8 +308,10 @@ PAPER = (
 
 @dataclass(frozen=True, slots=True)
 class Driven:
-    """How far the wheels rolled (rad, mean of both) straight ahead, in reverse; their difference in left and right
-    turns (rad); and whether nearly all of the motion was at one speed and one turn.
+    """Summary of the motion in a log.
+
+    How far the wheels rolled (rad, mean of both) straight ahead, in reverse; their difference in left and right turns
+    (rad); and whether nearly all of the motion was at one speed and one turn.
     """
 
     straight_rad: float
@@ -364,7 +368,7 @@ def undetermined(draws: Array, low: Array, high: Array, drive: Excitation, paper
 
 
 def _wide_directions(draws: Array, low: Array, high: Array, drive: Excitation) -> list[str]:
-    """Main axes of the posterior, in units of the prior's standard deviation, that are still wide."""
+    """Return the posterior's main axes, in units of the prior's standard deviation, that are still wide."""
     prior_sd = (high - low) / np.sqrt(12.0)
     variances, axes = np.linalg.eigh(np.cov((draws / prior_sd).T))
     sentences = []

@@ -1,4 +1,4 @@
-"""Mixture density network: statistics -> a mixture of full-covariance Gaussians over the parameters; and its rounds.
+"""Mixture density network from statistics to a mixture of Gaussians over the parameters; and its rounds.
 
 An ensemble of networks is trained side by side as one stack of matrices; the members differ in their start, their
 split into training and validation, and the order of their batches. Each keeps the weights of its best validation.
@@ -31,7 +31,7 @@ _CLIP_NORM = 5.0
 
 @dataclass(frozen=True, slots=True)
 class NetworkSettings:
-    """Size and training.
+    """Settings of a network's size and training.
 
     `patience`: epochs without a better validation before a member counts as done; `decay`: of the weights, per step and
     unit of the learning rate. Without it 90 % regions held 86 % of the truths, with it 89 to 90 %. `fourier`: so many
@@ -181,7 +181,7 @@ class _Stack(torch.nn.Module):
 
 @dataclass(frozen=True)
 class DensityNetwork:
-    """A trained ensemble; all members count alike."""
+    """Trained ensemble of networks; all members count alike."""
 
     scaling: Scaling
     stack: _Stack
@@ -281,7 +281,7 @@ _LARGEST_REJECTION = 30
 
 @dataclass(frozen=True, slots=True)
 class RoundSettings:
-    """How simulations are shared out; `deviations` is the half width of the next round's region.
+    """Settings of the rounds: shares of the simulations; `deviations` is the half width of the next round's region.
 
     The shares are of all simulations; with one share there is one round over the whole prior. `scout` is the network of
     all rounds but the last: it only has to find the region.
@@ -295,7 +295,7 @@ class RoundSettings:
 
 @dataclass(frozen=True)
 class Fitted:
-    """The last round: region, network in the region's coordinates, and the simulations it was trained on.
+    """Result of the last round: region, network in the region's coordinates, and the simulations it was trained on.
 
     `theta` (n, P), `statistics` (n, S); `simulations` counts those of all rounds. `widening` (P,): what the standard
     deviations that the network gives are multiplied by, or None (`checks.widening`).
@@ -309,7 +309,7 @@ class Fitted:
     widening: Array | None = None
 
     def posteriors(self, statistics: Array) -> Mixtures:
-        """The posteriors given statistics (n, S), in the region's coordinates and not cut to it."""
+        """Return the posteriors given statistics (n, S), in the region's coordinates and not cut to it."""
         found = self.network.mixtures(statistics)
         if self.widening is None:
             return found
@@ -317,8 +317,9 @@ class Fitted:
         return found.spread(np.asarray(np.linalg.solve(factor, self.widening[:, None] * factor), dtype=np.float64))
 
     def draw(self, statistics: Array, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Draws (n, count, P) of the posteriors given statistics (n, S), and the share (n,) that had to be drawn again
-        because it fell outside the region.
+        """Draw (n, count, P) samples of the posteriors given statistics (n, S).
+
+        Return with them the share (n,) that had to be drawn again because it fell outside the region.
         """
         return truncated_draws(self.region, self.posteriors(statistics), count, rng)
 
@@ -412,7 +413,7 @@ class Region:
 
     @classmethod
     def box(cls, low: Array, high: Array) -> Region:
-        """A whole box."""
+        """Create a region that is a whole box."""
         return cls(low, high, 0.5 * (low + high), np.diag(0.5 * (high - low)))
 
     def unit(self, theta: Array) -> Array:
@@ -424,7 +425,7 @@ class Region:
         return np.asarray(self.centre + unit @ self.factor.T)
 
     def contains(self, theta: Array) -> Mask:
-        """Which points (n, P) are in it."""
+        """Return which points (n, P) are in the region."""
         inside = ((theta >= self.low) & (theta <= self.high) & (np.abs(self.unit(theta)) <= 1.0)).all(axis=1)
         return np.asarray(inside if self.within is None else inside & self.within.contains(theta))
 
@@ -443,7 +444,7 @@ class Region:
         raise EmptyRegionError("the region to draw parameters from is all but empty")
 
     def shrunk(self, draws: Array, deviations: float) -> Region:
-        """The part of this region within `deviations` standard deviations of draws (n, P), along their main axes."""
+        """Return the region's part within `deviations` standard deviations of draws (n, P), along their main axes."""
         scale = self.high - self.low
         covariance = np.cov((draws / scale).T) + _SMALLEST_DEVIATION**2 * np.eye(scale.size)
         variances, axes = np.linalg.eigh(covariance)

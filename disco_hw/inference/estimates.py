@@ -29,7 +29,9 @@ class Whitening(NamedTuple):
 
 
 def whitening(drive: Excitation, sensor: float, slip: float, grown_s: Array) -> Whitening:
-    """Factor for increments with the sensor's standard deviation and the slip per square root of second of its clock,
+    """Return the factor that makes increments of poses independent.
+
+    It is for increments with the sensor's standard deviation and the slip per square root of second of its clock,
     `grown_s` (P,) from pose to pose.
     """
     variance = 2.0 * sensor**2 + slip**2 * grown_s
@@ -116,7 +118,7 @@ class Estimates:
 
 
 def estimates(drive: Excitation, noise: Noise) -> Estimates:
-    """The statistics of a drive, weighted for its noise."""
+    """Return the statistics of a drive, weighted for its noise."""
     slip_m = math.sqrt(0.5 * (noise.slip_forward_m_sqrt_s**2 + noise.about_the_point().slip_left_m_sqrt_s ** 2))
     _, grown_s = slip_intensity(drive, noise.speed_share)
     return Estimates(
@@ -143,7 +145,7 @@ class PaperStatistics:
 
 
 def paper_statistics(drive: Excitation) -> PaperStatistics:
-    """The statistics of a drive."""
+    """Return the statistics of a drive."""
     return PaperStatistics(drive.starts)
 
 
@@ -176,5 +178,5 @@ class CrossCorrelation:
 
 
 def cross_correlation(drive: Excitation) -> CrossCorrelation:
-    """The statistics of a drive."""
+    """Return the statistics of a drive."""
     return CrossCorrelation(drive.starts, drive.roll_rad)

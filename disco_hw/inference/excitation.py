@@ -38,7 +38,7 @@ class UnusableDriveError(InputError):
 
 @dataclass(frozen=True, slots=True)
 class Excitation:
-    """What was driven and measured.
+    """Drive as inference uses it: the wheel speeds driven and the poses measured.
 
     Nodes (M,) of a grid of `step_s`: `wheel_rad_s` (M, 2) left and right, held from each node to the next; `moving`
     (M,) 1 while the wheels turn, else 0. Poses (P,): `pose` (P, 3) x, y (m), yaw (rad, not wrapped within a run) at
@@ -68,7 +68,7 @@ class Excitation:
 
     @property
     def starts(self) -> NDArray[np.bool_]:
-        """Which poses begin a run, (P,)."""
+        """Mask (P,) of the poses that begin a run."""
         first = np.zeros(self.t_s.size, dtype=bool)
         first[self.run_pose[:-1]] = True
         return first
@@ -124,7 +124,7 @@ def excitation(log: DriveLog, source: Source | None = None) -> Excitation:
 
 
 def _left_out(log: DriveLog, source: Source) -> list[str]:
-    """A note where poses count for nothing, as the wheels beside them were not measured and those of others were."""
+    """Return a note where poses are ignored: the wheels beside them were not measured, those of others were."""
     if source == "commands":
         return []
     lacking = ~np.isin(log.poses.segment, log.wheels.segment)
@@ -253,8 +253,10 @@ _MEAN_OF_HELD_SQUARE = 0.995
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Standard deviations: of a measured position (m, per axis) and yaw (rad), independent from sample to sample; of
-    the slip of a moving body forward, left (m per sqrt(s)) and in yaw (rad per sqrt(s)).
+    """Standard deviations of the measured pose and of slip.
+
+    Of a measured position (m, per axis) and yaw (rad), independent from sample to sample; of the slip of a moving body
+    forward, left (m per sqrt(s)) and in yaw (rad per sqrt(s)).
 
     Slip is a random speed that keeps its direction for `correlation_s` (an Ornstein-Uhlenbeck process; 0: a random
     walk); the standard deviations are of what it adds up to over longer times. Of its variance the part `speed_share`
@@ -272,7 +274,7 @@ class Noise:
     speed_share: float = 0.0
 
     def vector(self) -> Array:
-        """The five standard deviations in order, (5,)."""
+        """Return the five standard deviations in order, (5,)."""
         return np.array(
             [
                 self.position_m,
@@ -284,11 +286,11 @@ class Noise:
         )
 
     def scales(self) -> Array:
-        """The five standard deviations, the correlation time and the lever, (7,)."""
+        """Return the five standard deviations, the correlation time and the lever, (7,)."""
         return np.append(self.vector(), [self.correlation_s, self.lever_m])
 
     def about_the_point(self) -> Noise:
-        """The same variances without a lever."""
+        """Return noise of the same variances without a lever."""
         left = np.hypot(self.slip_left_m_sqrt_s, self.lever_m * self.slip_yaw_rad_sqrt_s)
         return replace(self, slip_left_m_sqrt_s=float(left), lever_m=0.0)
 
@@ -297,8 +299,9 @@ USUAL = Noise(0.005, 0.01, 0.005, 0.005, 0.015)
 
 
 def slip_intensity(drive: Excitation, speed_share: float) -> tuple[Array, Array]:
-    """Growth of the slip's variance beside its mean while moving: at each node (M,), and up to each pose from the one
-    before (P,), s.
+    """Return the growth (s) of the slip's variance, relative to its mean while moving.
+
+    At each node (M,), and up to each pose from the one before (P,).
     """
     window = np.ones(2 * _MOVING_SPREAD_STEPS + 1) / (2 * _MOVING_SPREAD_STEPS + 1)
     square = np.convolve((drive.wheel_rad_s**2).mean(axis=1), window, mode="same")
@@ -311,10 +314,11 @@ def slip_intensity(drive: Excitation, speed_share: float) -> tuple[Array, Array]
 
 @dataclass(frozen=True, slots=True)
 class _Windows:
-    """Errors over windows of one lag (W, 3): forward, left, yaw; time in motion and on the slip's clock (W,), s;
-    `growth` of a random walk from the mean of one end to that of the other, beside that from end to end; `sensor`
-    (W, 3): how often the sensor's variance is in the error's; `independent`: how many windows count, as they overlap by
-    half.
+    """Errors over windows of one lag (W, 3): forward, left, yaw.
+
+    Time in motion and on the slip's clock (W,), s; `growth` of a random walk from the mean of one end to that of the
+    other, beside that from end to end; `sensor` (W, 3): how often the sensor's variance is in the error's;
+    `independent`: how many windows count, as they overlap by half.
     """
 
     error: Array
@@ -326,7 +330,7 @@ class _Windows:
 
 
 def measured_noise(drive: Excitation, theta: Array) -> Noise:
-    """The noise in what a geometry leaves unexplained; `theta` (3,) is x_icr, wheel radius, axial distance (m).
+    """Return the noise in what a geometry leaves unexplained; `theta` (3,) is x_icr, wheel radius, axial distance (m).
 
     Errors of predicted displacement over several lags: sensor noise adds the same variance to each, slip one that grows
     with the time in motion (structure function), slower at first the longer it keeps its direction. Errors beyond three
@@ -389,11 +393,10 @@ def _grown(time_s: Array, correlation_s: float) -> Array:
 
 
 def _two_terms(time_s: Array, sensor: Array, counts: Array, variances: Array) -> tuple[Array, Array, float]:
-    """Sensor variances R (axes,), slip variances q (axes,) per second, and the correlation time of slip in
-    `variance = sensor R + q grown(time)`; `sensor`, `variances` (rows, axes). R and q are not negative.
+    """Fit sensor and slip variances, and the correlation time of slip.
 
-    Slip that keeps its direction for a while grows slower at first; its rate later on is what parameters feel. Errors
-    are relative to the variance and fall with the number of windows.
+    Sensor variances R (axes,), slip variances q (axes,) per second, and the correlation time in `variance = sensor R +
+    q grown(time)`; `sensor`, `variances` (rows, axes). R and q are not negative.
     """
     scales = np.sqrt(counts)[:, None] / np.maximum(variances, 1e-12)
     axes = range(variances.shape[1])
@@ -425,7 +428,7 @@ def _not_negative(columns: Array, values: Array) -> tuple[Array, float]:
 
 
 def _lever(windows: list[_Windows], sensor_yaw: float) -> float:
-    """How far before the tracked point slip turns the body (m): the slope of errors to the left over those in yaw.
+    """Return how far (m) before the tracked point slip turns the body: the slope of errors to the left over yaw's.
 
     Of both in the same windows, without what the sensor adds to those in yaw.
     """
@@ -456,7 +459,7 @@ def _left(rows: list[_Windows], grown_s: Array, sensors: Array, lever_m: float) 
 
 
 def _speed_share(windows: list[_Windows], sensors: Array, slips: Array, correlation_s: float) -> float:
-    """The part of the slip's variance that grows with the square of speed, by likelihood."""
+    """Return the part of the slip's variance that grows with the square of speed, by likelihood."""
     costs = []
     for share in _SPEED_SHARES:
         cost = 0.0
@@ -494,8 +497,10 @@ _LEAST_MOTION = np.array([0.02, 0.02, 0.05])
 
 
 def unexplained_share(drive: Excitation, theta: Array) -> float:
-    """Of the motion within a second, of the position or of the yaw, the part that a geometry (3,) leaves unexplained,
-    the larger (root mean squares): near 0 for a sound log, about 1 for the poses of another drive.
+    """Return the share of the motion within a second that a geometry (3,) leaves unexplained.
+
+    The larger one of position and yaw (root mean squares): near 0 for a sound log, about 1 for the poses of another
+    drive.
     """
     error = _errors(drive, theta)
     lag = max(1, round(_EXPLAINED_OVER_S / float(np.median(np.diff(drive.t_s)[~drive.starts[1:]]))))

@@ -72,8 +72,10 @@ FOURIER_FEATURES = 200
 
 @dataclass(frozen=True, slots=True)
 class InferOptions:
-    """`paper`: the paper's statistics, commands as input, one round; `simulations`: over all rounds, None for 3000
-    (paper: 1000).
+    """Options of the inference.
+
+    `paper`: the paper's statistics, commands as input, one round; `simulations`: over all rounds, None for 3000 (paper:
+    1000).
 
     `random_features` and `cross_correlation` are BayesSim's other density and statistics, for `paper` alone: a mixture
     on random Fourier features (MDRFF) in place of the network, and steps of the state against actions.
@@ -88,7 +90,7 @@ class InferOptions:
 
 @dataclass(frozen=True)
 class Inference:
-    """What the log says: posterior `draws` (D, 3) in the order of `NAMES`, the same as a belief, and how it came about.
+    """Result of the inference: posterior `draws` (D, 3) in the order of `NAMES`, the same as a belief, and its origin.
 
     `observed` (S,) are the log's statistics; `outside_region` is the share of the network's posterior that fell outside
     the region it was trained on; `effective_simulations` is how many the posterior rests on.
@@ -112,7 +114,7 @@ class Inference:
     seconds: float
 
     def model(self, nominal: Model) -> Model:
-        """The nominal model with the posterior's mean and the posterior as belief."""
+        """Return the nominal model with the posterior's mean and the posterior as belief."""
         mean = dict(zip(NAMES, self.belief.mean().tolist(), strict=True))
         return replace(nominal.with_point(mean), belief=self.belief)
 
@@ -205,7 +207,7 @@ def _infer(
 
 
 def prior_region(robot: RobotConfig) -> Region:
-    """The prior of robot.toml as far as it is physically possible; raises InputError if nothing of it is."""
+    """Return the prior of robot.toml as far as it is physically possible; raises InputError if nothing of it is."""
     possible = np.column_stack(physical_range())
     ranges = np.array([getattr(robot.prior, name) for name in NAMES])
     low, high = np.maximum(possible[:, 0], ranges[:, 0]), np.minimum(possible[:, 1], ranges[:, 1])
@@ -235,7 +237,7 @@ def _check_inside(prior: Region, estimate: Array, std: Array) -> None:
 
 
 def noise_of(drive: Excitation) -> Noise:
-    """The noise of a log: estimate the geometry, take what it leaves unexplained, and again with that."""
+    """Return the noise of a log: estimate the geometry, take what it leaves unexplained, and again with that."""
     noise = USUAL
     for _ in range(_NOISE_PASSES):
         theta = estimates(drive, noise).theta(drive.pose[None])[0]
@@ -252,9 +254,10 @@ _SMALLEST_SCALE = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class NoiseSpread:
-    """Noise without the bias of its measurement, and `factor` (7, 7), lower triangular, of the covariance of its
-    logarithms, and of its lever, in the order of `Noise.scales`; `fit_std` (3,) is the scatter of the plain estimates
-    of the parameters.
+    """Noise without the bias of its measurement, and its uncertainty.
+
+    `factor` (7, 7), lower triangular, is of the covariance of its logarithms, and of its lever, in the order of
+    `Noise.scales`; `fit_std` (3,) is the scatter of the plain estimates of the parameters.
     """
 
     noise: Noise

@@ -98,7 +98,7 @@ class InferResult:
     contradictions: tuple[Contradiction, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
-        """For `--json`."""
+        """Return the result as a JSON-serialisable dict, for `--json`."""
         return {
             "contradictions": [{"cause": each.cause, "message": each.message} for each in self.contradictions],
             "posterior": posterior_figures(self.inference),
@@ -116,7 +116,7 @@ class InferResult:
         }
 
     def as_text(self) -> str:
-        """For a person."""
+        """Return the result as text for the user."""
         lines = [f"warning: {each.message}" for each in self.contradictions]
         for name, figures in posterior_figures(self.inference).items():
             low, high = figures["ci90"]
@@ -130,7 +130,7 @@ class InferResult:
         return "\n".join(lines)
 
     def all_warnings(self) -> list[str]:
-        """What contradicts itself in the logs, and what `warnings` say."""
+        """Return the contradictions within the logs, and the sentences of `warnings`."""
         return [*(f"warning: {each.message}" for each in self.contradictions), *self.warnings()]
 
     def warnings(self) -> list[str]:
@@ -152,7 +152,7 @@ class InferResult:
 
 
 def diagnostics(inference: Inference) -> dict[str, Any]:
-    """What a sceptic asks for, as numbers."""
+    """Return the diagnostics of the inference as a JSON-serialisable dict."""
     calibration = inference.calibration
     return {
         "simulations": inference.fitted.simulations,

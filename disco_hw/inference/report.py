@@ -1,4 +1,4 @@
-"""report.html: the posterior, its checks and what it leaves open, self-contained with pictures."""
+"""Self-contained page report.html with the posterior, its checks and what it leaves open."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 def report_html(inference: Inference, posterior: dict[str, dict[str, Any]], warnings: Iterable[str]) -> str:
-    """The page; `posterior` as in the JSON output, `warnings` as sentences."""
+    """Return the HTML page; `posterior` as in the JSON output, `warnings` as sentences."""
     calibration = inference.calibration
     rows = "".join(
         f"<tr><td>{name}</td><td class=n>{one['mean']:.5f}</td><td class=n>{one['sd']:.5f}</td>"
@@ -87,7 +87,7 @@ def pairs_figure(draws: Array) -> Figure:
 
 
 def predictive_figure(deviations: Array) -> Figure:
-    """A bar for each of `CHECKS`."""
+    """Draw a figure with a bar for each of `CHECKS`."""
     figure = Figure(figsize=(7.5, 4.0), layout="constrained")
     axis = figure.subplots()
     colours = [ALARM if abs(value) > LARGEST_DEVIATION else MAIN for value in deviations]

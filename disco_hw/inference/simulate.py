@@ -1,4 +1,4 @@
-"""Simulated logs: a drive's wheel speeds through the model at many parameter points, with the log's own noise.
+"""Simulation of logs: a drive's wheel speeds through the model at many parameter points, with the log's own noise.
 
 The work can be shared out: over this process's threads, or a Dask cluster.
 """
@@ -192,25 +192,25 @@ R = TypeVar("R")
 
 
 class Workers(Protocol):
-    """Where work is done; it is pure, so the results are the same wherever that is."""
+    """Protocol of a place to compute; the work is pure, so the results are the same wherever that is."""
 
     def map(self, work: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[R]:
         """Results of `work(shared, item)` in the order of the items, as they come."""
 
     def call(self, work: Callable[..., R], *arguments: Any) -> R:
-        """The result of one piece of work."""
+        """Return the result of one piece of work."""
 
 
 class LocalWorkers:
     """Threads on all cores this process may use, for work that gives up the interpreter's lock."""
 
     def map(self, work: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[R]:
-        """As `Workers.map`."""
+        """Yield the results of `work(shared, item)` in the order of the items, computed in threads."""
         with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
             yield from pool.map(lambda item: work(shared, item), items)
 
     def call(self, work: Callable[..., R], *arguments: Any) -> R:
-        """As `Workers.call`, in the caller's thread."""
+        """Return the result of one piece of work, computed in the caller's thread."""
         return work(*arguments)
 
 
@@ -227,12 +227,12 @@ class Tally:
         self._stage = ""
 
     def stage(self, text: str) -> None:
-        """A new stage begins."""
+        """Begin a new stage."""
         self._stage = text
         self.add(0)
 
     def add(self, count: int) -> None:
-        """So many more simulations are done."""
+        """Count `count` more simulations as done and report the progress."""
         self._done += count
         self._report_progress(self._stage, min(self._done / self._total, 1.0))
 
@@ -247,13 +247,13 @@ class DaskWorkers:
         self._client = client
 
     def map(self, work: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[R]:
-        """As `Workers.map`."""
+        """Yield the results of `work(shared, item)` in the order of the items, computed on the cluster."""
         sent = self._client.scatter(shared, broadcast=True, hash=False)
         for future in self._client.map(_swapped, list(items), work=work, shared=sent, pure=False):
             yield future.result()
 
     def call(self, work: Callable[..., R], *arguments: Any) -> R:
-        """As `Workers.call`."""
+        """Return the result of one piece of work, computed on the cluster."""
         result: R = self._client.submit(work, *arguments, pure=False).result()
         return result
 

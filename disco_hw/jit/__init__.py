@@ -1,4 +1,4 @@
-"""How functions are compiled: one set of options, constants of the caller's precision, a cache key of all sources.
+"""Compilation of functions: one set of options, constants of the caller's precision, a cache key of all sources.
 
 `numba_internals.py` says how what kernels call is put into them.
 """
@@ -36,7 +36,7 @@ def plugin_modules() -> tuple[str, ...]:
 
 
 def plugin_sources() -> tuple[Path, ...]:
-    """Their files, for whoever keeps compiled code; raises ModuleNotFoundError for a module that is not there."""
+    """Return the plug-in modules' files; raises ModuleNotFoundError for a module that is not there."""
     found = []
     for module in plugin_modules():
         spec = find_spec(module)
@@ -122,7 +122,7 @@ def kernel_function(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def compiled_for(kernel: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
-    """The machine code of a kernel for arguments of these types, compiled or loaded if need be.
+    """Return the machine code of a kernel for arguments of these types, compiled or loaded if need be.
 
     Calling it spares working their types out in every call, which takes 10 us for nested tuples; it must only be called
     with arguments of the same types. Arrays of another kind are refused with a TypeError.

@@ -1,4 +1,4 @@
-"""What of numba's internals kernels are compiled with; nothing else in this project uses them.
+"""Use of numba's internals to compile kernels; nothing else in this project uses them.
 
 What kernels call is put into them as it was lowered, and optimised there alone (`KernelCompiler`). Left to itself numba
 makes of every function that a kernel calls a library of its own: two wrappers that unbox its arguments, an optimised
@@ -34,7 +34,7 @@ class _CalleeLibrary(JITCodeLibrary):
 
     @cached_property
     def own_module(self) -> Any:
-        """Its module without what it calls, to be linked any number of times."""
+        """Module of the function without what it calls, to be linked any number of times."""
         self._ensure_finalized()  # type: ignore[no-untyped-call]
         for function in self._final_module.functions:
             if not function.is_declaration and function.linkage.name == "external":
@@ -42,7 +42,7 @@ class _CalleeLibrary(JITCodeLibrary):
         return self._final_module
 
     def _get_module_for_linking(self) -> Any:
-        """The same with all that it calls, for functions that numba's own library holds."""
+        """Return the module with all that it calls, for functions that numba's own library holds."""
         if self._shared_module is None:
             whole = self.own_module.clone()
             for library in _called_by(self):
@@ -107,7 +107,7 @@ class CalleeCompiler(Compiler):
         super().__init__(typing, target, library, args, return_type, flags, *rest)  # type: ignore[no-untyped-call]
 
     def compile_extra(self, func: Callable[..., Any]) -> CompileResult:
-        """As of the base class, with an entry point that stands for the function in callers, and is never called."""
+        """Compile as the base class does, with an entry point that stands for the function and is never called."""
         result: Any = super().compile_extra(func)  # type: ignore[no-untyped-call]
         # Any built-in method that is no other function's: numba takes nothing else.
         entry = [result.fndesc].index
@@ -127,7 +127,7 @@ class KernelCompiler(Compiler):
         super().__init__(typing, target, library, args, return_type, flags, *rest)  # type: ignore[no-untyped-call]
 
     def compile_extra(self, func: Callable[..., Any]) -> CompileResult:
-        """As of the base class, with what numba does over again for every function done once."""
+        """Compile as the base class does, but do once what numba does again for every function."""
         with _nothing_collected(), _registries_loaded(self.state.targetctx), _overloads_taken_in():
             result: CompileResult = super().compile_extra(func)  # type: ignore[no-untyped-call]
             return result
@@ -206,5 +206,5 @@ class Callee(CPUDispatcher):
         return compiled
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
-        """Call the twin."""
+        """Call the function's compiled twin."""
         return self._twin(*arguments, **named)

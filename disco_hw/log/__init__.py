@@ -1,4 +1,4 @@
-"""Logs: what is recorded, how it gets to the disk without disturbing the loop, and how it is read again.
+"""Recording and reading of logs: what is recorded, how it gets to the disk without disturbing the loop, how it is read.
 
 Here what every log begins with (`Start`), and what recorder, keeper and writer say to each other. The recorder hands
 records to the writer over a stream socket, one frame a tick, and the writer answers on the same socket with how far it
@@ -47,7 +47,7 @@ class TaskScene(msgspec.Struct, frozen=True):
 
 
 class Start(msgspec.Struct, frozen=True):
-    """Everything a writer must know; wall-clock time is monotonic time plus `wall_offset_ns` throughout the log.
+    """Start of a log, all that a writer must know; wall-clock time is monotonic time plus `wall_offset_ns`.
 
     `path` is the first part's. A later part names the file that it continues, of which it is known that ticks up to
     `continues_sequence` are in it.
@@ -100,7 +100,7 @@ class End(msgspec.Struct, frozen=True):
 
 
 class WriterStatus(msgspec.Struct, frozen=True):
-    """How the writer is doing: what is in its file, and the error that ended it, if any.
+    """State of the log writer: what is in its file, and the error that ended it, if any.
 
     All ticks up to number `sequence` that were sent are in the file, apart from `refused` records. `deleted`: the file
     was removed, and all that was in it with it.
@@ -157,7 +157,7 @@ class Frames:
 
 
 def batch_encoder() -> Callable[[int, int, Sequence[Record]], bytes]:
-    """A function (sequence, now_ns, records) -> message; it raises one of ENCODE_ERRORS."""
+    """Return a function (sequence, now_ns, records) -> message; it raises one of ENCODE_ERRORS."""
     encode = msgspec.msgpack.Encoder(enc_hook=_from_numpy).encode
     index = TOPIC_INDEX
 
@@ -184,7 +184,7 @@ class BatchDecoder:
         self._records = tuple(msgspec.msgpack.Decoder(topic.record) for topic in TOPICS)
 
     def batch(self, message: bytes) -> Batch:
-        """The batch of one message, its records still encoded."""
+        """Return the batch of one message, its records still encoded."""
         return self._batch.decode(message)
 
     def record(self, topic_index: int, data: msgspec.Raw) -> Record:
@@ -203,7 +203,7 @@ _MEDIA_TYPES = {".toml": "application/toml", ".json": "application/json", ".csv"
 
 
 def version() -> str:
-    """The package's version, with the commit when it runs from a checkout: "0.1.0+g1a2b3c4" or "...-dirty"."""
+    """Return the package's version, with the commit when it runs from a checkout: "0.1.0+g1a2b3c4" or "...-dirty"."""
     try:
         package = metadata.version("disco-hw")
     except metadata.PackageNotFoundError:
@@ -220,5 +220,5 @@ def version() -> str:
 
 
 def attachment(path: Path, name: str, kind: FileKind) -> Attachment:
-    """A copy of a file for the log, under a name of the log's; raises InputError if it cannot be read."""
+    """Return a copy of a file for the log, under a name of the log's; raises InputError if it cannot be read."""
     return Attachment(name, _MEDIA_TYPES.get(path.suffix, "text/plain"), read_bytes(path, kind)[0])

@@ -207,7 +207,7 @@ class _Poses:
         return fit_body(windows, self._radius_m, self._axial_m, factors, mirrored)
 
     def _put_right(self, fit: BodyFit) -> Contradiction | None:
-        """The one thing that, put right, lets the wheels explain the poses; None if there is none."""
+        """Return the one thing that, put right, lets the wheels explain the poses; None if there is none."""
         good = min(_EXPLAINED, _AS_GOOD * fit.worst)
         for factors, (cause, what) in _ENCODER_FAULTS.items():
             other = self._fit(self._windows, factors)

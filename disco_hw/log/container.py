@@ -94,7 +94,7 @@ class AttachmentRef:
 
 @dataclass(slots=True)
 class Contents:
-    """What a file holds.
+    """Contents of an MCAP file: its index of schemas, channels, chunks, attachments and metadata.
 
     `complete` is False when the index at the end is missing or unusable; then every chunk listed has been checked.
     `damage` says in words what was passed over.
@@ -170,7 +170,7 @@ def _with_unlisted(contents: Contents, count: int) -> Contents:
 
 
 def _next_chunk(fd: int, start: int, size: int) -> int | None:
-    """Where the next chunk record seems to begin at or after `start`: its content has a name of compression in it."""
+    """Return where the next chunk record seems to begin at or after `start`, found by the name of its compression."""
     at = start + _CHUNK_MARK_AT
     while at < size:
         try:
@@ -190,7 +190,7 @@ def _next_chunk(fd: int, start: int, size: int) -> int | None:
 
 
 def read_chunk(fd: int, chunk: ChunkRef) -> bytes:
-    """The records inside a chunk, checked against its CRC; raises DamagedError."""
+    """Return the records inside a chunk, checked against its CRC; raises DamagedError."""
     record = _parse(Chunk, _content(fd, chunk.offset, chunk.length))
     if record.uncompressed_size > min(_LARGEST, _UNPACKED_FREE + _UNPACKED_RATIO * len(record.data)):
         raise DamagedError(f"a chunk that claims to be {record.uncompressed_size} bytes, packed in {len(record.data)}")
@@ -206,7 +206,7 @@ def read_chunk(fd: int, chunk: ChunkRef) -> bytes:
 
 
 def read_attachment(fd: int, attachment: AttachmentRef) -> bytes:
-    """The bytes of an attachment, checked against its CRC; raises DamagedError."""
+    """Return the bytes of an attachment, checked against its CRC; raises DamagedError."""
     return bytes(_checked_attachment(_content(fd, attachment.offset, attachment.length)).data)
 
 
@@ -219,7 +219,7 @@ def _checked_attachment(content: bytes) -> Attachment:
 
 
 def messages(chunk_data: bytes, wanted: Collection[int] | None = None) -> Iterator[Message]:
-    """The messages in a chunk's data, of the wanted channels or of all, in file order; raises DamagedError."""
+    """Yield the messages in a chunk's data, of the wanted channels or of all, in file order; raises DamagedError."""
     # Runs for every message of a log, so its head and its content's head are unpacked at once.
     offset, size, whole = 0, len(chunk_data), _WHOLE_MESSAGE.size
     unpack = _WHOLE_MESSAGE.unpack_from

@@ -62,7 +62,7 @@ _STILL_TURN = 0.15
 
 
 def of_units(fit: BodyFit) -> Contradiction | None:
-    """A heading that turns far more, or far less, than the wheels can make it."""
+    """Return a heading that turns far more, or far less, than the wheels can make it."""
     if fit.turn_unexplained is None:
         return None
     if fit.turn_size > _DEGREES_TURN * max(1.0, fit.radius_ratio):

@@ -102,7 +102,7 @@ class DriveLog:
         return 1 + max((int(segment.max()) for segment in arrays if segment.size), default=-1)
 
     def to_pandas(self) -> Any:
-        """All of it as one `pandas.DataFrame`, a row a sample in order of time, with the columns of our CSV.
+        """Return the drive as one `pandas.DataFrame`, a row a sample in order of time, with our CSV's columns.
 
         `t_s`, `segment`, `cmd_left_rad_s`, ..., `imu_wz_rad_s`; what a row does not hold is NaN. Raises ImportError
         without pandas, which nothing else needs.
@@ -172,7 +172,7 @@ def concatenate(drives: Sequence[DriveLog]) -> DriveLog:
 
 
 def separate(drive: DriveLog) -> list[tuple[str, DriveLog]]:
-    """The logs that were put one after the other, each with its source's name and its own times."""
+    """Return the logs that were put one after the other, each with its source's name and its own times."""
     if len(drive.begins_s) != len(drive.sources):
         return [(", ".join(drive.sources), drive)]
     ends_s = (*drive.begins_s[1:], np.inf)
@@ -231,7 +231,7 @@ class Motion:
 
 
 def chain(edges: Iterable[Edge], map_frame: str, base_frame: str) -> tuple[Edge, ...] | None:
-    """The edges from map to base, in this order, or None; each child has one parent, as tf demands."""
+    """Return the edges from map to base, in this order, or None; each child has one parent, as tf demands."""
     parents = {child: parent for parent, child in edges}
     found: list[Edge] = []
     frame = base_frame
@@ -246,7 +246,7 @@ def chain(edges: Iterable[Edge], map_frame: str, base_frame: str) -> tuple[Edge,
 
 
 def poses(motions: list[Motion]) -> tuple[Index, Array]:
-    """Times (M,), ns, and x, y, yaw (M, 3) of the chain's end in its first frame, the edges from map to base.
+    """Return times (M,), ns, and x, y, yaw (M, 3) of the chain's end in its first frame, the edges from map to base.
 
     A pose is taken where the first moving edge, the localisation's correction, has changed: between two corrections the
     chain only repeats the wheel odometry. The edges after it are interpolated; a pose that they do not reach is left

@@ -56,7 +56,7 @@ def _spelled(value: Any) -> Any:
 
 
 def _restored(data: bytes) -> bytes:
-    """A message with what it says of its fields that are not finite put back into them; raises MsgspecError."""
+    """Return a message with what it says of its fields that are not finite put back into them; raises MsgspecError."""
     fields = msgspec.json.decode(data, type=dict[str, msgspec.Raw])
     if _NOT_FINITE not in fields:
         return data
@@ -77,7 +77,7 @@ class JsonDecoder:
         self._plan_figures = msgspec.json.Decoder(PlanFigures, strict=False)
 
     def decode(self, topic: str, data: bytes) -> Record:
-        """The record of one message of `topic`."""
+        """Return the record of one message of `topic`."""
         return _decoded(self._decoders[topic], data)
 
     def decode_brief(self, topic: str, data: bytes) -> Record | PlanFigures:
@@ -109,7 +109,7 @@ _INTEGERS: dict[type, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 
 def _within_64_bits(record: _R) -> _R:
-    """The record, if every integer of it has a place in an array of numpy's; raises OverflowError."""
+    """Return the record, if every integer of it has a place in an array of numpy's; raises OverflowError."""
     plain, mapped = _INTEGERS[type(record)]
     for name in plain:
         if not -_LIMIT <= getattr(record, name) < _LIMIT:
@@ -122,7 +122,7 @@ def _within_64_bits(record: _R) -> _R:
 
 
 def json_schema(record_type: type[Record]) -> bytes:
-    """The JSON schema of a record type in the plain form that viewers read.
+    """Return the JSON schema of a record type in the plain form that viewers read.
 
     Viewers of recorded data want an object at the root, a single `type` for each property, and no `$ref`.
     """

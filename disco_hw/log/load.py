@@ -68,7 +68,7 @@ def drive_from_log(log: Log) -> DriveLog:
 
 
 def ticks_per_rev(log: Log) -> int | None:
-    """Encoder ticks per wheel revolution from the configuration kept in the log, or None."""
+    """Return the encoder ticks per wheel revolution from the configuration kept in the log, or None."""
     if ROBOT_TOML not in log.attachment_names():
         return None
     try:
@@ -91,7 +91,7 @@ def nominal_geometry(log: Log) -> tuple[float, float] | None:
 
 
 def _columns(log: Log, topic: str) -> dict[str, NDArray[np.generic]]:
-    """A topic whose ticks' times do not decrease."""
+    """Return a topic whose ticks' times do not decrease."""
     columns = log.columns(topic)
     now_ns = columns["now_ns"].astype(np.int64)
     back = np.flatnonzero(np.diff(now_ns) < 0)
@@ -153,7 +153,7 @@ def _ordered(t_ns: NDArray[np.generic], values: Array, keep: Mask, what: str, no
 
 
 def _breaks(log: Log, wheel_ns: Index, notes: list[str]) -> Index:
-    """Times from which on a new segment counts."""
+    """Return times from which on a new segment counts."""
     gaps = log.gaps()
     if gaps:
         notes.append(f"{log.path}: {sum(gap.ticks for gap in gaps)} ticks are missing; each gap starts a new segment")
@@ -193,7 +193,7 @@ def load_drive(
 
 
 def _refuse_copies(paths: Sequence[Path], marks: Sequence[set[tuple[float, ...]]]) -> None:
-    """A log and its recovered, exported or imported copy are one drive under two names."""
+    """Raise LogError for a log and its recovered, exported or imported copy: they are one drive under two names."""
     for place, path in enumerate(paths):
         for other, theirs in zip(paths[:place], marks[:place], strict=True):
             fewest = min(len(marks[place]), len(theirs))
@@ -202,7 +202,7 @@ def _refuse_copies(paths: Sequence[Path], marks: Sequence[set[tuple[float, ...]]
 
 
 def _marks(drive: DriveLog) -> set[tuple[float, ...]]:
-    """The different measured poses, each with the time since the one before (us), as no other drive has them."""
+    """Return the different measured poses, each with the time since the one before (us), as no other drive has them."""
     poses = drive.poses
     since_us = np.rint(np.diff(poses.t_s) * 1e6)
     columns = (since_us, poses.x_m[1:], poses.y_m[1:], poses.yaw_rad[1:])

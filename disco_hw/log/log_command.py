@@ -29,7 +29,7 @@ from drivers.types import SAID_BY_WORDS, Identity, SaidBy
 
 
 def info(path: Path, as_json: bool) -> str:
-    """Summarise a log: its contents and what of it is lost. Raises LogError."""
+    """Summarise the contents of a log and what of it is lost. Raises LogError."""
     with open_log(path) as log:
         summary = log.summary()
         if as_json:
@@ -72,7 +72,7 @@ def export_rosbag(path: Path, out: Path, as_json: bool) -> str:
 
 
 def _controller(record: Controller) -> str:
-    """Which controller answered, and its limits by who says them."""
+    """Return which controller answered, and its limits by who states them."""
     identity = Identity(record.controller, record.firmware, cast(SaidBy, record.said_by), record.details)
     limits: dict[SaidBy, dict[str, float]] = {
         "device": record.told,
@@ -246,7 +246,7 @@ class _Messages:
         self._start_ns = start_ns
 
     def all_of(self, drive: DriveLog, geometry: tuple[float, float] | None) -> Iterator[_Timed]:
-        """All messages in order of time."""
+        """Return all messages in order of time."""
         parts = [self._commands(drive), self._wheels(drive), self._poses(drive)]
         if geometry is not None:
             parts.append(self._twists(drive, *geometry))

@@ -102,7 +102,7 @@ def views(record: Record, wall_ns: int) -> list[tuple[str, bytes]]:
 
 
 def scene_message(scene: TaskScene) -> bytes:
-    """A SceneUpdate in protobuf: the task's course in the world's frame, and the robot's body in its own."""
+    """Return a SceneUpdate in protobuf: the task's course in the world's frame, and the robot's body in its own."""
     line = LinePrimitive(
         type=LinePrimitive.LINE_STRIP,
         pose=Pose(),
@@ -133,7 +133,7 @@ def scene_message(scene: TaskScene) -> bytes:
 
 
 def _stopping(record: GuardVerdict, time: Timestamp) -> SceneUpdate:
-    """The fence guard's stopping path, red where it holds the robot, and the obstacles."""
+    """Return the fence guard's stopping path, red where it holds the robot, and the obstacles."""
     free = record.verdict in {"free", "scaled"}
     colour = Color(r=0.1, g=0.6, b=0.2, a=1.0) if free else Color(r=0.8, g=0.1, b=0.1, a=1.0)
     path = LinePrimitive(
@@ -159,7 +159,7 @@ def _stopping(record: GuardVerdict, time: Timestamp) -> SceneUpdate:
 
 
 def _rollouts(fan: Fan, time: Timestamp) -> SceneUpdate:
-    """A line for each sequence, the fainter the less it weighs."""
+    """Return a line for each sequence, the fainter the less it weighs."""
     # A broken plan must still be seen in the log: neither as many points as weights promise, nor a weight, are certain.
     points = [Point3(x=x, y=y, z=0.0) for x, y in zip(fan.x_m, fan.y_m, strict=False)]
     count, heaviest = len(points) // len(fan.weights), fan.weights[0] or 1.0
@@ -215,7 +215,7 @@ class ByteSink(Protocol):
         """Append all of the bytes; raises OSError if that fails."""
 
     def tell(self) -> int:
-        """The number of bytes written."""
+        """Return the number of bytes written."""
 
     def flush(self) -> None:
         """Hand everything on to the operating system."""
@@ -239,7 +239,7 @@ class Metadata:
     continues_sequence: int | None = None
 
     def as_text(self) -> dict[str, str]:
-        """The form kept in the file."""
+        """Return the metadata in the form kept in the file."""
         return {
             "format": self.format,
             "robot": self.robot,
@@ -281,7 +281,7 @@ class Ending:
     dropped_ticks: int
 
     def as_text(self) -> dict[str, str]:
-        """The form kept in the file."""
+        """Return the form kept in the file."""
         return {"t_ns": str(self.t_ns), "sequence": str(self.sequence), "dropped_ticks": str(self.dropped_ticks)}
 
     @staticmethod
@@ -390,7 +390,7 @@ class McapLog:
         self._writer.add_metadata(ENDING, ending.as_text())
 
     def finish(self) -> None:
-        """Write the index; nothing can be written after it."""
+        """Finish the file with its index; nothing can be written after it."""
         self.flush()
         self._writer.finish()  # type: ignore[no-untyped-call]
 

@@ -1,4 +1,4 @@
-"""Fits between increments: wheels to poses, commands to wheels, and how well each explains what was measured."""
+"""Robust fits between increments, wheels to poses and commands to wheels, and how well each explains the data."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ def fit_pose_clock(log: DriveLog, radius_m: float, axial_m: float, only_offset: 
 
 
 def _of_begin(windows: MotionWindows) -> MotionWindows:
-    """The first windows from where the wheels begin to move."""
+    """Return the first windows from where the wheels begin to move."""
     moving = np.flatnonzero(np.nan_to_num(np.abs(windows.rolled_rad)).max(axis=1, initial=0.0) > MOVING_RAD)
     first = int(moving[0]) if moving.size else 0
     part = slice(max(first - 40, 0), first + _CLOCK_WINDOWS)
@@ -193,7 +193,7 @@ def _of_begin(windows: MotionWindows) -> MotionWindows:
 
 
 def _shifted(windows: MotionWindows, steps: int) -> MotionWindows | None:
-    """The wheels of each window beside the poses of the one `steps` later; None if the log is too short."""
+    """Return the wheels of each window beside the poses of the one `steps` later; None if the log is too short."""
     count = windows.t_s.size - abs(steps)
     if count < FEWEST_WINDOWS:
         return None

@@ -69,7 +69,7 @@ def _of_segment(log: DriveLog, segment: int, poses_rate: float) -> MotionWindows
 
 
 def _integrated(commands: Commands, inside: Mask) -> tuple[Array, Array, Array]:
-    """Times (N,), integral (N, 2) of commands that hold until the next, and how long none was known until then (N,)."""
+    """Return times (N,), the commands' integral (N, 2), each held until the next, and the time without any (N,)."""
     t_s = commands.t_s[inside]
     if not t_s.size:
         return t_s, np.empty((0, 2)), t_s

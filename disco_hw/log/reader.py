@@ -136,7 +136,7 @@ class LogSummary(msgspec.Struct, frozen=True):
 
 
 class Log:
-    """An open log; use it in a `with` statement. Times are monotonic ns unless the name says wall.
+    """Open log, to be used in a `with` statement. Times are monotonic ns unless the name says wall.
 
     Reading raises LogError on a damaged chunk of a log that is complete otherwise; of a log without its index the
     damaged chunks have been left out already, and `damage` says so.
@@ -169,7 +169,7 @@ class Log:
         self.close()
 
     def close(self) -> None:
-        """Close the file; safe to call twice."""
+        """Close the log's file; safe to call twice."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
@@ -209,7 +209,7 @@ class Log:
     def records(
         self, topics: Collection[str] | None = None, start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Entry]:
-        """Records of these topics (all if None) from ticks at start_ns <= now_ns < end_ns, in recorded order.
+        """Yield records of these topics (all if None) from ticks at start_ns <= now_ns < end_ns, in recorded order.
 
         Raises LogError for a topic that no log has, and for damage.
         """
@@ -249,7 +249,7 @@ class Log:
     def columns(
         self, topic: str, start_ns: int | None = None, end_ns: int | None = None
     ) -> dict[str, NDArray[np.generic]]:
-        """All records of a topic as one array a field, shape (N, ...), and the tick's time as `now_ns`.
+        """Return all records of a topic as one array a field, shape (N, ...), and the tick's time as `now_ns`.
 
         Tuples of one length become (N, k) arrays, of different lengths arrays of objects; a mapping gives one array
         `field.key` for each key.
@@ -266,7 +266,7 @@ class Log:
         return tuple(ref.name for ref in self._contents.attachments)
 
     def attachment(self, name: str) -> bytes:
-        """The content of a file kept in the log; raises LogError if it is not there or damaged."""
+        """Return the content of a file kept in the log; raises LogError if it is not there or damaged."""
         for ref in self._contents.attachments:
             if ref.name == name:
                 try:

@@ -95,18 +95,18 @@ class NullRecorder:
     """Recorder that discards every record, for drives without a log."""
 
     def put(self, now_ns: int, records: Sequence[Record]) -> None:
-        """Discard the records."""
+        """Discard the records of a tick."""
 
     def poll(self) -> RecorderStats:
         """Return counters that are all zero."""
         return RecorderStats()
 
     def news(self) -> tuple[str, ...]:
-        """Nothing happens to it."""
+        """Return no messages, because nothing can happen to it."""
         return ()
 
     def tend(self) -> None:
-        """Nothing of it can break."""
+        """Do nothing, because nothing of it can break."""
 
     def close(self, timeout_s: float = 5.0) -> RecorderStats:
         """Return counters that are all zero."""
@@ -128,11 +128,11 @@ class MemoryRecorder:
         return RecorderStats(ticks=len(self.ticks), records=sum(len(records) for _, records in self.ticks))
 
     def news(self) -> tuple[str, ...]:
-        """Nothing happens to it."""
+        """Return no messages, because nothing can happen to it."""
         return ()
 
     def tend(self) -> None:
-        """Nothing of it can break."""
+        """Do nothing, because nothing of it can break."""
 
     def close(self, timeout_s: float = 5.0) -> RecorderStats:
         """Counters of what was kept."""
@@ -303,7 +303,7 @@ class ProcessRecorder:
             self._wait(_CLOSING_STEP_S)
 
     def _encodable(self, now_ns: int, records: Sequence[Record]) -> list[Record]:
-        """The records that can be encoded; the others are counted."""
+        """Return the records that can be encoded; the others are counted."""
         kept = []
         for record in records:
             try:
@@ -476,7 +476,7 @@ class ProcessRecorder:
 
 
 def _cause(line: WriterLine, code: int | None) -> str:
-    """Why a writer has ended, for a person."""
+    """Return why a writer has ended, for the operator."""
     status = line.status
     if status.state == "failed":
         return status.error

@@ -1,4 +1,4 @@
-"""What a log holds: one frozen record type for each topic, the one source of its content and of its schema.
+"""Record types of a log: one frozen type for each topic, the one source of its content and of its schema.
 
 Every record carries `t_ns`, the monotonic host time at which it was true. Left before right, x forward, y left, yaw
 counter-clockwise; SI units. Fields are plain on purpose (numbers, text, flat tuples, string-keyed counts): viewers
@@ -142,7 +142,7 @@ class DaemonState(msgspec.Struct, frozen=True, gc=False):
 
 
 class Event(msgspec.Struct, frozen=True, gc=False):
-    """Something a person should know; `code` is stable for machines, `text` is one sentence."""
+    """Event that the operator should know; `code` is stable for machines, `text` is one sentence."""
 
     t_ns: int
     level: Level
@@ -151,7 +151,7 @@ class Event(msgspec.Struct, frozen=True, gc=False):
 
 
 class Counters(msgspec.Struct, frozen=True, gc=False):
-    """Every counter of the stack, about once a second: totals since the start by name, grouped by who counts.
+    """Counters of the whole stack, about once a second: totals since the start by name, grouped by who counts.
 
     `entered`: how often the daemon has come into each of its states. `plausibility`: what the robot did against its
     commands, and the rest of the stack tolerated. `poses`: of each source, where there are several.
@@ -203,7 +203,7 @@ class Adaptation(msgspec.Struct, frozen=True, gc=False):
 
 
 class Fan(msgspec.Struct, frozen=True, gc=False):
-    """Some of the sequences that the plan made at `t_ns` was weighed from, rolled out under the mean parameters.
+    """Sampled sequences that the plan made at `t_ns` was weighted from, rolled out under the mean parameters.
 
     One path for each of `weights`, which are shares of all samples' total, the largest first. `x_m` and `y_m` hold the
     paths one after the other, of equally many points each, to the millimetre.
@@ -230,7 +230,7 @@ class Task(msgspec.Struct, frozen=True, gc=False):
     speed_m_s: float = nan
 
     def values(self) -> dict[str, float]:
-        """The settings, of old and new logs."""
+        """Return the settings, of old and new logs."""
         old = (self.center_x_m, self.center_y_m, self.radius_m, self.speed_m_s)
         names = ("center_x_m", "center_y_m", "radius_m", "speed_m_s")
         kept = {name: value for name, value in zip(names, old, strict=True) if isfinite(value)}
@@ -238,7 +238,7 @@ class Task(msgspec.Struct, frozen=True, gc=False):
 
 
 class Controller(msgspec.Struct, frozen=True, gc=False):
-    """Which motor controller answers from `t_ns` on, and what it keeps to.
+    """Motor controller that answers from `t_ns` on, and its limits.
 
     `said_by`: who says kind and firmware, "device" or "robot.toml". Limits by name, with their units: what the
     controller reports of itself, what cannot be set otherwise, and what robot.toml declares.
@@ -266,7 +266,7 @@ class UnexplainedMotion(msgspec.Struct, frozen=True, gc=False):
 
 
 class GuardVerdict(msgspec.Struct, frozen=True, gc=False):
-    """What the fence guard made of the command of one tick, while there is a fence or an obstacle.
+    """Verdict of the fence guard on the command of one tick, while there is a fence or an obstacle.
 
     `scale`: of the requested command that was let through. `clearance_m`: least along the stopping path after it, less
     the uncertainty of the pose. The rest in every fifth tick: that path of the tracked point, and the obstacles as x, y
@@ -377,5 +377,5 @@ TOPIC_BY_NAME: Mapping[str, Topic] = MappingProxyType({topic.name: topic for top
 
 
 def topic_of(record_type: type[Record]) -> str:
-    """The topic under which records of this type are found; KeyError if the type is none of ours."""
+    """Return the topic under which records of this type are found; KeyError if the type is none of ours."""
     return TOPICS[TOPIC_INDEX[record_type]].name

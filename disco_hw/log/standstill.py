@@ -39,7 +39,7 @@ def no_common_time(log: DriveLog) -> Contradiction | None:
 
 
 def standing(windows: MotionWindows, radius_m: float, axial_m: float) -> Contradiction | None:
-    """A pose, a heading or both wheels that stand still while the others move."""
+    """Return a pose, a heading or both wheels that stand still while the others move."""
     known = np.isfinite(windows.rolled_rad).all(axis=1) & np.isfinite(windows.turned_rad)
     wheels = windows.rolled_rad[known]
     rolled, way = np.abs(wheels).max(axis=1, initial=0.0), np.abs(windows.moved_m[known])
@@ -82,7 +82,7 @@ def _wheels_standing(rolled_rad: np.ndarray, way_m: np.ndarray, radius_m: float)
 
 
 def dead_encoders(windows: MotionWindows) -> tuple[Contradiction, ...]:
-    """Encoders that count nothing while their wheel is told to turn and the other one does."""
+    """Return the encoders that count nothing while their wheel is told to turn and the other one does."""
     known = np.isfinite(windows.rolled_rad).all(axis=1) & np.isfinite(windows.commanded_rad).all(axis=1)
     rolled, told = np.abs(windows.rolled_rad[known]), np.abs(windows.commanded_rad[known])
     found = []
@@ -99,7 +99,7 @@ def dead_encoders(windows: MotionWindows) -> tuple[Contradiction, ...]:
 
 
 def never_counting(windows: MotionWindows) -> Contradiction | None:
-    """An encoder that counts nothing in the whole of a log without commands while the other one does."""
+    """Return an encoder that counts nothing in the whole of a log without commands while the other one does."""
     rolled = np.nansum(np.abs(windows.rolled_rad), axis=0)
     side = int(np.argmin(rolled))
     if rolled[side] > _STILL * rolled[1 - side]:

@@ -56,7 +56,7 @@ class LogFile:
         return len(data)
 
     def tell(self) -> int:
-        """The number of bytes written."""
+        """Return the number of bytes written."""
         return self._written
 
     def flush(self) -> None:
@@ -78,7 +78,7 @@ class LogFile:
         self._written = self._whole
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file of the log."""
         os.close(self._fd)
 
 

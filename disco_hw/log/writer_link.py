@@ -116,7 +116,9 @@ _BUFFER_BYTES = 1 << 20
 
 
 class KeeperLink:
-    """A keeper process: starts writers that begin their logs with `start`. Raises LogError if it cannot be started.
+    """Link to a keeper process, which starts writers that begin their logs with `start`.
+
+    Raises LogError if it cannot be started.
 
     `pid` is the newest writer's, 0 until it is known; `code` how that one ended, negative for a signal.
     """
@@ -182,7 +184,7 @@ class KeeperLink:
                 self.code = word.code
 
     def renew(self) -> None:
-        """Another keeper in place of this one; takes milliseconds. The writer lives on."""
+        """Start another keeper in place of this one; takes milliseconds. The writer lives on."""
         self._end_process()
         self._make()
 
@@ -281,7 +283,7 @@ class Delivery:
         self.dropped_records += records
 
     def next_frame(self) -> bytes | None:
-        """The first frame that the present writer has not been sent."""
+        """Return the first frame that the present writer has not been sent."""
         return self._waiting[self._sent].frame if self._sent < len(self._waiting) else None
 
     def sent(self) -> None:
@@ -289,7 +291,7 @@ class Delivery:
         self._sent += 1
 
     def acknowledge(self, sequence: int) -> None:
-        """All ticks up to this number that were sent are in the present file."""
+        """Note that all ticks up to this number that were sent are in the present file."""
         while self._sent and self._waiting[0].sequence <= sequence:
             self._waiting.popleft()
             self._sent -= 1
@@ -298,7 +300,7 @@ class Delivery:
         self.last_delivered = max(self.last_delivered, sequence)
 
     def new_file(self) -> None:
-        """Another writer begins another file: it gets what is in none."""
+        """Note that another writer begins another file: it gets what is in none."""
         self._sent = 0
         self._in_file = 0
 

@@ -1,4 +1,4 @@
-"""The model f_theta: one definition of the physics for control, inference, gap and replay.
+"""Model f_theta of the robot, one definition of the physics for control, inference, gap and replay.
 
 Here is the model file: TOML in, TOML out; every error is one line that names file, field and remedy.
 """
@@ -157,7 +157,7 @@ def save_model(model: Model, path: Path | str) -> None:
 
 
 def model_text(model: Model) -> str:
-    """The model as TOML."""
+    """Return the model as TOML text."""
     lines = [
         f"format = {FORMAT}",
         f"name = {msgspec.json.encode(model.name).decode()}",

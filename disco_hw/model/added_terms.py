@@ -1,4 +1,4 @@
-"""What the compiled step adds for a model's terms without a name, and what it remembers for them.
+"""Compiled code for a model's terms without a name: what they add to a step, and the means that they remember.
 
 A term that a model lacks leaves nothing in the machine code. Of a command's term that remembers the means of both
 wheels are kept, of the body's that of the sum or the difference of the wheels' speeds, which no parameter changes.
@@ -52,7 +52,7 @@ _FOLLOWED: Mapping[str, Any] = MappingProxyType(
 
 
 def table_entry(name: str, columns: tuple[NDArray[np.floating], ...]) -> TermCoefficients:
-    """A term's coefficients, arrays (L,), in the form that the step takes."""
+    """Return a term's coefficients, arrays (L,), in the form that the step takes."""
     made: TermCoefficients = _ENTRIES[name](*columns)
     return made
 
@@ -62,12 +62,12 @@ def _terms_of(kinds: Iterable[Any]) -> list[GenericTerm]:
 
 
 def _compiled_terms(terms: Any) -> list[GenericTerm]:
-    """Those of a tuple whose numba type this is."""
+    """Return the terms of a tuple, given the tuple's numba type."""
     return [] if isinstance(terms, types.NoneType) else _terms_of(kind.instance_class for kind in terms.types)
 
 
 def count_means(terms: Terms | None) -> int:
-    """Number of means that are kept for terms; a constant to the compiler."""
+    """Return the number of means that are kept for terms; a constant to the compiler."""
     return sum(term.means for term in _terms_of(map(type, terms or ())))
 
 
@@ -78,7 +78,7 @@ def _count_means(terms: Any) -> Callable[..., Any]:
 
 
 def new_means(effects: Coefficients) -> NDArray[np.float64] | None:
-    """The means (n,) of a model, of commands first, before anything was; None if it remembers nothing."""
+    """Return the means (n,) of a model, of commands first, before anything was; None if it remembers nothing."""
     count = count_means(effects.command_terms) + count_means(effects.body_terms)
     return np.zeros(count) if count else None
 
@@ -86,7 +86,7 @@ def new_means(effects: Coefficients) -> NDArray[np.float64] | None:
 def add_to_commands(
     left: float, right: float, time_s: float, terms: Terms | None, means: Means, at: Any, apart: Any
 ) -> tuple[float, float]:
-    """Both commands (rad/s) with the terms that act on them.
+    """Return both commands (rad/s) with the terms that act on them.
 
     Number n of the means that terms remember is `means[at + n * apart]`, and goes on by a step.
     """
@@ -109,13 +109,13 @@ def add_to_commands(
 
 @scalar_function
 def _within(feature: float, reach: float) -> float:
-    """A feature no larger than the log had it in which its term was found."""
+    """Return a feature no larger than the log had it in which its term was found."""
     return min(max(feature, -reach), reach)
 
 
 @scalar_function
 def _averaged(signal: float, entry: TermCoefficients, means: Means, at: Any) -> float:
-    """A mean over a step in which its signal stays as it is; the mean goes on to its end."""
+    """Return a mean over a step in which its signal stays as it is; the mean goes on to its end."""
     before = means[at]
     means[at] = before + entry.by_end * (signal - before)
     over_step: float = before + entry.over_step * (signal - before)
@@ -124,7 +124,7 @@ def _averaged(signal: float, entry: TermCoefficients, means: Means, at: Any) -> 
 
 @scalar_function
 def _slewed(signal: float, most: float, means: Means, at: Any) -> float:
-    """What follows a signal by at most so much a step, in the mean over one; it goes on to its end."""
+    """Return the mean over a step of a value that follows the signal by at most `most` a step, and move it on."""
     before = means[at]
     moved = min(max(signal - before, -most), most)
     means[at] = before + moved
@@ -172,8 +172,9 @@ def add_to_velocity(
     forward: float, lateral: float | None, turn: float, wheel_sum: float, difference: float, change: float,
     time_s: float, base: Base, terms: Terms | None, means: Means, at: Any, apart: Any,
 ) -> tuple[float, float | None, float]:  # fmt: skip
-    """Forward and lateral speed (m/s) and half the yaw rate (rad/s) with the terms; wheels as for `body_velocity`,
-    means as for `add_to_commands`.
+    """Return forward and lateral speed (m/s) and half the yaw rate (rad/s) with the terms that act on them.
+
+    Wheels as for `body_velocity`, means as for `add_to_commands`.
     """
     if terms is None:
         return forward, lateral, turn
@@ -260,7 +261,7 @@ def _terms_need_change(terms: Any) -> Callable[..., Any]:
 
 
 def _made(name: str, arguments: str, lines: list[str], scope: dict[str, Any]) -> Callable[..., Any]:
-    """A function of these lines; a tuple of mixed types cannot be looped over in compiled code."""
+    """Return a function of these lines; a tuple of mixed types cannot be looped over in compiled code."""
     body = "\n".join(f"    {line}" for line in lines)
     exec(f"def {name}({arguments}):\n{body}", scope)
     made: Callable[..., Any] = scope[name]

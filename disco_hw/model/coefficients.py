@@ -1,4 +1,4 @@
-"""What the compiled step is given: numbers of one parameter point of a model, or tables of many and the pick of one.
+"""Coefficients for the compiled step: of one parameter point of a model, or tables of many and the pick of one.
 
 And the motion that no parameter explains (`Disturbance`), as estimation finds it and as the planner rolls it out.
 """
@@ -35,7 +35,7 @@ class TermCoefficients(Protocol):
 
     @property
     def k(self) -> Any:
-        """The term's number."""
+        """Factor of the term, by which its feature is multiplied."""
 
     @property
     def reach(self) -> Any:
@@ -43,30 +43,32 @@ class TermCoefficients(Protocol):
 
     @property
     def per_s(self) -> Any:
-        """Steps a second."""
+        """Number of steps in a second."""
 
     @property
     def by_end(self) -> Any:
-        """How much of its way the mean goes by the end of a step."""
+        """Share of the way to its signal that the mean has gone by the end of a step."""
 
     @property
     def over_step(self) -> Any:
-        """How much of its way the mean has gone in the mean over a step."""
+        """Share of the way to its signal that the mean has gone, averaged over a step."""
 
     @property
     def most(self) -> Any:
-        """By how much what follows at a limited rate goes on in a step (m/s)."""
+        """Largest step (m/s) of what follows at a limited rate."""
 
     def __iter__(self) -> Iterator[Any]:
-        """Those that it has, in the order of its type."""
+        """Iterate over the coefficients that the term has, in the order of its type."""
 
 
 Terms = tuple[TermCoefficients, ...]
 
 
 class Coefficients(Protocol):
-    """What `Effects` holds: a field for every effect that moves the robot, None where absent, else what its
-    `coefficients` returned; and one each for the terms without a name that act on commands and on the body.
+    """Coefficients of a model's effects, as `Effects` holds them.
+
+    There is a field for every effect that moves the robot, None where absent, else what its `coefficients` returned;
+    and one each for the terms without a name that act on commands and on the body.
     """
 
     @property
@@ -105,7 +107,7 @@ class Integration(NamedTuple):
 
 @scalar_function
 def base_point(base: Base, i: int) -> Base:
-    """Base coefficients of point i."""
+    """Return base coefficients of point i."""
     return Base(base.half_radius_m[i], base.half_turn_ratio[i], base.x_icr_m[i])
 
 
@@ -166,7 +168,7 @@ def _effect_point(effects: types.Type, i: types.Type) -> Callable[..., Any]:
 
 
 def lane_base(base: Base, i: int) -> Base:
-    """Base coefficients of a sample: the point itself, or entry i of a table with a point for every sample."""
+    """Return base coefficients of a sample: the point itself, or entry i of a table with a point for every sample."""
     point: Base = base_point(base, i)
     return point
 
@@ -183,7 +185,7 @@ def _lane_base(base: Any, i: types.Type) -> Callable[..., Any]:
 
 
 def _first_number(kind: types.Type) -> types.Type:
-    """The type of the first number, or array of numbers, in tuples within tuples."""
+    """Return the type of the first number, or array of numbers, in tuples within tuples."""
     while hasattr(kind, "types"):
         kind = kind.types[0]
     return kind
@@ -214,7 +216,7 @@ MOVES_RAD_S = 0.5
 
 
 class Disturbance(msgspec.Struct, frozen=True, gc=False):
-    """What a robot does beside its model, each part in the form in which it is constant while the robot turns.
+    """Motion of a robot beside its model, each part in the form in which it is constant while the robot turns.
 
     Of the body, in proportion to its way, so that a robot that stands is not disturbed: `forward`, the part by which it
     goes farther; `left`, how far it slides to the left for each metre forward; `curvature_per_m`, how far it turns to
@@ -239,22 +241,22 @@ class Disturbance(msgspec.Struct, frozen=True, gc=False):
         return scale * left - more, scale * right + more
 
     def asked(self, left: Number, right: Number, axial_distance_m: float) -> tuple[Number, Number]:
-        """The inverse of `turning`."""
+        """Return the inverse of `turning`."""
         scale = 1.0 + self.forward
         more = 0.25 * self.curvature_per_m * axial_distance_m * (left + right) / scale
         return (left + more) / scale, (right - more) / scale
 
     def moving(self, left_rad_s: float, right_rad_s: float) -> float:
-        """How much the ground carries a robot whose wheels turn so fast: 0 to 1."""
+        """Return how much the ground carries a robot whose wheels turn at these speeds, from 0 (standing) to 1."""
         return min((abs(left_rad_s) + abs(right_rad_s)) / MOVES_RAD_S, 1.0)
 
     @property
     def slides(self) -> Array:
-        """What moves the robot aside, for `FreeRun`: `left`, `drift_x_m_s`, `drift_y_m_s`, (3,)."""
+        """Sideways parts of the disturbance, (3,) for `FreeRun`: `left`, `drift_x_m_s`, `drift_y_m_s`."""
         return np.array([self.left, self.drift_x_m_s, self.drift_y_m_s])
 
     def slide(self, distance_m: float, carried_s: float, yaw_rad: float) -> tuple[float, float]:
-        """How far a robot of this heading slides forward and to the left of it over a short way (m)."""
+        """Return the slide forward and to the left (m) of a robot with this heading over a short way."""
         x, y = self.drift_x_m_s * carried_s, self.drift_y_m_s * carried_s
         cosine, sine = math.cos(yaw_rad), math.sin(yaw_rad)
         return cosine * x + sine * y, cosine * y - sine * x + self.left * distance_m

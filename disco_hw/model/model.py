@@ -1,4 +1,4 @@
-"""A model: base parameters, the effects it has, and the belief over all of them.
+"""Robot model of base parameters, the effects it has, and the belief over all of them.
 
 A belief is a joint Gaussian, a mixture of them, or a uniform box.
 """
@@ -74,7 +74,7 @@ def _checked_vector(vector: Array, size: int, what: str) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Gaussian:
-    """A joint Gaussian; raises ValueError for shapes that disagree, non-finite values or a covariance that is none."""
+    """Belief that is a joint Gaussian; raises ValueError for wrong shapes, non-finite values or a wrong covariance."""
 
     names: tuple[str, ...]
     means: Array
@@ -220,7 +220,7 @@ class EffectSetting:
 
     @property
     def effect(self) -> Effect:
-        """The effect itself."""
+        """Effect that the setting names."""
         return effect_of(self.name)
 
 
@@ -293,7 +293,7 @@ class Model:
 
     @classmethod
     def nominal(cls, robot: config.Robot, prior: config.Prior | None = None) -> Model:
-        """The geometry of robot.toml without effects; with a prior, that uniform prior is the belief."""
+        """Return the geometry of robot.toml without effects; with a prior, that uniform prior is the belief."""
         belief = None
         if prior is not None:
             ranges = {parameter.name: getattr(prior, parameter.name) for parameter in BASE_PARAMETERS}
@@ -306,7 +306,7 @@ class Model:
 
     @property
     def parameters(self) -> dict[str, Parameter]:
-        """Every parameter by its full name: the base ones, then `effect.parameter`."""
+        """Parameters by their full names: the base ones, then `effect.parameter`."""
         found = {parameter.name: parameter for parameter in BASE_PARAMETERS}
         for setting in self.effects:
             found |= {f"{setting.name}.{parameter.name}": parameter for parameter in setting.effect.parameters}
@@ -318,7 +318,7 @@ class Model:
         return tuple(self.parameters)
 
     def point(self) -> Array:
-        """The point values, shape (P,) in the order of `parameter_names`."""
+        """Return the point values, shape (P,) in the order of `parameter_names`."""
         values = [getattr(self, parameter.name) for parameter in BASE_PARAMETERS]
         for setting in self.effects:
             values += setting.values.values()
@@ -333,7 +333,7 @@ class Model:
         return np.clip(full, [p.low for p in bounds], [p.high for p in bounds])
 
     def with_point(self, values: Mapping[str, float]) -> Model:
-        """The same model with other point values for the named parameters; raises ValueError for unknown names."""
+        """Return the model with other point values for the named parameters; raise ValueError for unknown names."""
         point = dict(zip(self.parameter_names, self.point(), strict=True))
         for name, value in values.items():
             if name not in point:

@@ -52,7 +52,7 @@ def delayed(commands: Array, history: int, theta: Theta, step_s: float) -> Array
 
 
 def _sign(x: Value, rest: float) -> Value:
-    """The sign of x, faded out below `rest`."""
+    """Return the sign of x, faded out below `rest`."""
     return np.sign(x) * x**2 / (x**2 + rest**2)
 
 
@@ -115,13 +115,13 @@ class _Memory:
         return value + (before - value) * lag * (1.0 - math.exp(-1.0 / lag))
 
     def after(self, before: Value, value: Value, step_s: float) -> Value:
-        """What comes out at the end of that step."""
+        """Return the memory at the end of a step at whose start it was `before`, under a constant input."""
         return value + (before - value) * math.exp(-step_s / self.time_s)
 
 
 @dataclass(frozen=True)
 class _Slewed:
-    """The same of what comes out of a limit of so much a second (m/s^2)."""
+    """Memory that follows its input by at most `most` a second (m/s^2), with the feature that uses it."""
 
     most: float
     goes_in: Callable[..., Value]
@@ -135,7 +135,7 @@ class _Slewed:
         return 0.5 * (before + end) * arrives + end * (1.0 - arrives)
 
     def after(self, before: Value, value: Value, step_s: float) -> Value:
-        """What comes out at the end of that step."""
+        """Return the memory at the end of a step at whose start it was `before`, under a constant input."""
         return np.clip(value, before - self.most * step_s, before + self.most * step_s)
 
 
@@ -178,13 +178,13 @@ def _terms(theta: Theta, target: str) -> list[tuple[str, Value, Value]]:
 
 
 def _commands_remembered(theta: Theta, left: Value, right: Value) -> dict[str, tuple[_Remembering, tuple[Value, ...]]]:
-    """By feature the memories of commands that act, and what goes into each of their means."""
+    """Return, by feature, the memories of commands that act, and what goes into each of their means."""
     acting = [(name, COMMAND_MEMORIES[name]) for name, *_ in _terms(theta, "command") if name in COMMAND_MEMORIES]
     return {name: (memory, (memory.goes_in(left, right), memory.goes_in(right, left))) for name, memory in acting}
 
 
 def _body_remembered(theta: Theta, v: Value, w: Value) -> dict[str, tuple[_Remembering, tuple[Value, ...]]]:
-    """The same of the body's, which go by forward speed and yaw rate."""
+    """Return the memories of the body's terms and their inputs, which are forward speed and yaw rate."""
     features = [name for target in ("v_x", "omega") for name, *_ in _terms(theta, target)]
     acting = [(name, BODY_MEMORIES[name]) for name in features if name in BODY_MEMORIES]
     return {name: (memory, (memory.goes_in(v, w),)) for name, memory in acting}
@@ -197,7 +197,7 @@ def _ideal(theta: Theta, left: Value, right: Value) -> tuple[Value, Value]:
 
 
 def settled_means(theta: Theta, left: Value, right: Value, wheel_left: Value, wheel_right: Value) -> Means:
-    """What is remembered of a robot whose commands and wheel speeds (rad/s) have been these for ever."""
+    """Return the means once commands and wheel speeds (rad/s) have been constant for ever."""
     body = _body_remembered(theta, *_ideal(theta, wheel_left, wheel_right))
     remembered = _commands_remembered(theta, left, right) | body
     return {name: values for name, (_, values) in remembered.items()}
@@ -212,7 +212,7 @@ def _acting(theta: Theta, *stages: Stage) -> list[Effect]:
 
 
 def _called(effect: Effect, theta: Theta, motion: Mapping[str, Value], step_s: float) -> Any:
-    """What an effect makes of the motion; it asks for what it needs by name."""
+    """Evaluate an effect on the motion, with the arguments that it asks for by name."""
     geometry = theta["wheel_radius_m"], theta["axial_distance_m"], theta["x_icr_m"]
     values = tuple(theta[column] for column in effect.columns)
     known = {**motion, "values": values, "geometry": geometry, "step_s": step_s}

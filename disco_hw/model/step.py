@@ -46,7 +46,7 @@ def integration_series(step_s: float, wide: bool, dtype: type = np.float64) -> N
 
 @scalar_function
 def integration_from(series: NDArray[np.floating], wide: object, euler: object) -> Integration:
-    """What a step needs, from `integration_series`; `wide` and `euler` are None or anything else."""
+    """Build the numbers of a step from `integration_series`; `wide` and `euler` are None or anything else."""
     return Integration(
         series[0], series[1], series[2], series[3], series[4], series[5], series[6], series[7], wide, euler
     )
@@ -150,7 +150,7 @@ def axle_of(x: float, y: float, cos_yaw: float, sin_yaw: float, base: Base) -> t
 
 @scalar_function
 def tracked_of(axle_x: float, axle_y: float, cos_yaw: float, sin_yaw: float, base: Base) -> tuple[float, float]:
-    """The tracked point, from the axle's point."""
+    """Return the tracked point, from the axle's point."""
     return axle_x - base.x_icr_m * cos_yaw, axle_y - base.x_icr_m * sin_yaw
 
 
@@ -159,7 +159,7 @@ def straight(
     euler: object, arc: Pose, axle_x: float, axle_y: float, cos_yaw: float, sin_yaw: float, forward: float,
     lateral: float | None, turn: float, base: Base, step_s: float,
 ) -> Pose:  # fmt: skip
-    """Where an explicit Euler step of the tracked point takes the axle's point, with the heading after the `arc`.
+    """Return the axle point after an explicit Euler step of the tracked point, with the heading after the `arc`.
 
     The arc itself if `euler` is None. The tracked point moves along the heading that the step begins with, and with it
     by -omega x_icr to the left of that; it takes the axle's point along, and this depends on x_icr then.
@@ -181,8 +181,10 @@ def body_step(
     time_s: float, base: Base, effects: Coefficients, integration: Integration,
     means: Means, at: Any, apart: Any,
 ) -> tuple[float, float, float, float, float, float]:  # fmt: skip
-    """The body's half of a step: the axle's point (m), cosine and sine of yaw after it; forward speed (m/s) and half
-    the yaw rate (rad/s) over it. Wheel speeds and means as for `body_velocity`.
+    """Compute the body's half of a step.
+
+    Return the axle's point (m), cosine and sine of yaw after it; forward speed (m/s) and half the yaw rate (rad/s) over
+    it. Wheel speeds and means as for `body_velocity`.
     """
     forward, lateral, turn = body_velocity(wheel_sum, difference, change, time_s, base, effects, means, at, apart)
     arc = move(axle_x, axle_y, cos_yaw, sin_yaw, forward, lateral, turn, integration)
@@ -396,7 +398,7 @@ class FreeRun:
 
 
 def simulate(model: Model, commands: Array, step_s: float = 0.02, start: Array | None = None) -> Array:
-    """Where a model's point values lead: states (N + 1, 5) x, y (m), yaw (rad, not wrapped), wheel speeds (rad/s).
+    """Simulate a model's point values: states (N + 1, 5) x, y (m), yaw (rad, not wrapped), wheel speeds (rad/s).
 
     `commands` (N, 2): wheel speeds wanted, left and right (rad/s), each held for `step_s`; before them the wheels were
     commanded to stand. `start` (5,): the first state, the origin at rest if None. Raises ValueError for other

@@ -54,11 +54,9 @@ def forget(values: Any) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Remembered:
-    """A feature with a memory: `of` the motion is followed, and `feature` gets the motion and that over a step, in
-    which the motion stays as it is.
+    """Feature with a memory: `of` the motion is followed, and `feature` gets the motion and its memory.
 
-    What is older than `time_s` (s) counts little: a mean. Or, with a `most` (m/s^2), it is followed by that much a
-    second and no faster.
+    The memory is that over a step, in which the motion stays as it is.
     """
 
     of: Feature
@@ -68,23 +66,26 @@ class Remembered:
 
     @property
     def slews(self) -> bool:
-        """Whether it follows at a limited rate and is no mean."""
+        """Whether the memory follows at a limited rate instead of as a mean."""
         return self.most < math.inf
 
     def follows(self, step_s: float) -> tuple[float, float]:
-        """How much of its way to `of` the mean goes in a step: by its end, and in the mean over it."""
+        """Return the shares of its way to `of` that the mean goes in a step: by its end, and in the mean over it."""
         gone = -math.expm1(-step_s / self.time_s)
         return gone, 1.0 - gone * self.time_s / step_s
 
     def after(self, before: float, signal: float, for_s: float, unit: float) -> float:
-        """What is remembered after a signal of so long, in signals of which one is `unit` (m/s)."""
+        """Return the memory after a constant signal of duration `for_s`, in signals of which one is `unit` (m/s)."""
         if self.slews:
             most = self.most * max(for_s, 0.0) / unit
             return before + min(max(signal - before, -most), most)
         return signal + (before - signal) * math.exp(-max(for_s, 0.0) / self.time_s)
 
     def at_nodes(self, step_s: float, *motion: Array) -> Array:
-        """The feature of a motion that is known all along, each (M, ...), in steps of `step_s`; nothing was before."""
+        """Return the feature of a motion that is known all along, each (M, ...), in steps of `step_s`.
+
+        Nothing was before.
+        """
         from scipy.signal import lfilter  # noqa: PLC0415  (slow to import, and no robot that drives needs it)
 
         signal = np.asarray(self.of(*motion))
@@ -100,7 +101,7 @@ class Remembered:
 
 @kernel_function
 def _slew(signal: Array, most: float, over: Array) -> None:
-    """What follows a signal (M,) by at most so much a step, in the mean over each."""
+    """Fill `over` (M,) with the mean, over each step, of a value that follows the signal by at most `most` a step."""
     now = 0.0
     for k in range(signal.shape[0]):
         moved = min(max(signal[k] - now, -most), most)
@@ -214,7 +215,7 @@ BODY_MEMORIES: Mapping[str, Mapping[str, Remembered]] = MappingProxyType(
 
 
 def of_wheels(memory: Remembered, left_rad_s: float, right_rad_s: float) -> float:
-    """What a memory of the body averages of wheel speeds: their sum, or right minus left (rad/s)."""
+    """Return the wheel speeds' quantity (rad/s) that a memory of the body averages: their sum, or right minus left."""
     return float(memory.of(left_rad_s + right_rad_s, right_rad_s - left_rad_s))
 
 
@@ -233,8 +234,9 @@ def _coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...
 
 
 def _following(memory: Remembered, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """k, reach, and how the mean follows: by the end of a step and in the mean over it, or by how much at most in a
-    step (m/s); each (L,).
+    """Return k, reach, and how the mean follows; each (L,).
+
+    It follows by the end of a step and in the mean over it, or by how much at most in a step (m/s).
     """
     if memory.slews:
         return values[:, 0], values[:, 1], np.full(values.shape[0], memory.most * step_s)
@@ -247,23 +249,23 @@ REACH = Parameter("reach", "SI", 0.0, 1e9, 1e9, neutral=1e9)
 
 @dataclass(frozen=True, slots=True)
 class GenericTerm:
-    """A term: `target` of `COMMAND` and `BODY_TARGETS` gains k times the feature, which stays within its reach."""
+    """Term of the model without a name: `target` gains k times the feature, which stays within its reach."""
 
     target: str
     feature: str
 
     @property
     def name(self) -> str:
-        """Its equation."""
+        """Name of the term, which is its equation."""
         return term_name(self.target, self.feature)
 
     @property
     def memory(self) -> Remembered | None:
-        """What it remembers; None for a term of what is alone."""
+        """Memory that the feature uses; None for a term of present values alone."""
         return (COMMAND_MEMORIES if self.target == COMMAND else BODY_MEMORIES[self.target]).get(self.feature)
 
     def meaning(self, k: float) -> str | None:
-        """What a robot does of which this is found with such a number; None where the equation is all that is known."""
+        """Describe a robot that shows this term with the factor `k`; None where only the equation is known."""
         if self.memory is None or not self.memory.slews or k > -0.5:
             return None
         return f"tyres slip: the robot follows its wheels by about {self.memory.most:g} m/s^2 at most"
@@ -328,12 +330,12 @@ _TERM_EFFECTS: Mapping[str, Effect] = MappingProxyType({name: term.effect for na
 
 
 def effect_of(name: str) -> Effect:
-    """A named effect or a term; raises KeyError for what is neither."""
+    """Return a named effect or a term; raises KeyError for what is neither."""
     return REGISTRY[name] if name in REGISTRY else _TERM_EFFECTS[name]
 
 
 def memories_of(names: Iterable[str]) -> tuple[tuple[Remembered, ...], tuple[Remembered, ...]]:
-    """What the terms among a model's effects remember, of commands and of the body, in the order of their means."""
+    """Return the memories of a model's terms, of commands and of the body, in the order of their means."""
     remembering = [term for term in (TERMS.get(name) for name in names) if term is not None and term.memory is not None]
     of_commands, of_body = (
         tuple(term.memory for term in remembering if term.memory is not None and (term.target == COMMAND) is wanted)

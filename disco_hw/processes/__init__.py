@@ -1,4 +1,4 @@
-"""How the processes of disco-hw are set up: threads of the numeric libraries, children, and as real-time ones.
+"""Set-up of the processes of disco-hw: threads of the numeric libraries, children, and as real-time ones.
 
 Measured on a loaded two-core machine at 50 Hz, the steps of `enter_real_time` together move the worst wake-up from 13
 ms to 3.5 ms late; a second thread in the numeric libraries alone loses nearly every deadline, because the loop then
@@ -43,7 +43,7 @@ def end_with_parent(parent: int, number: int = signal.SIGTERM) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One measure: whether it was taken, and a line for a person with the remedy where it was not."""
+    """Result of one measure: whether it was taken, and a line for the operator with the remedy where it was not."""
 
     name: str
     done: bool

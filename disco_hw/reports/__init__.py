@@ -1,4 +1,4 @@
-"""What every report shares: whether its files can be written, found out before the work; results as JSON; the look.
+"""Shared parts of all reports: whether files can be written, found out before the work; results as JSON; the look.
 
 One page with one style sheet and the pictures inside it, one resolution, one set of colours.
 """
@@ -54,7 +54,7 @@ def _refuse_place(path: Path) -> None:
 
 
 def as_json(result: Mapping[str, Any], indent: int | None = None) -> str:
-    """One JSON object; JSON knows no infinity and no NaN, so that what is no number is null.
+    """Return a result as one JSON object; infinity and NaN, which JSON does not know, become null.
 
     Scalars and arrays of numpy are written as the numbers they are. Raises TypeError for what JSON has no word for.
     """
@@ -62,7 +62,10 @@ def as_json(result: Mapping[str, Any], indent: int | None = None) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """The value in the types that `json` knows; numpy is recognised by its methods, as importing it takes long."""
+    """Return the value in the types that `json` knows.
+
+    Numpy is recognised by its methods, as importing it takes long.
+    """
     match value:
         case bool() | str() | None:
             return value
@@ -100,7 +103,7 @@ figure{margin:1.2rem 0;overflow:hidden}figcaption{color:#555;font-size:.9rem}h2{
 
 
 def page(title: str, body: str) -> str:
-    """A self-contained HTML page under its title; `body` is HTML."""
+    """Return a self-contained HTML page under its title; `body` is HTML."""
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
         f"<style>{_STYLE_SHEET}</style></head><body><h1>{escape(title)}</h1>{body}</body></html>"
@@ -108,14 +111,14 @@ def page(title: str, body: str) -> str:
 
 
 def picture(data: bytes, name: str, caption: str = "") -> str:
-    """A PNG's bytes as HTML, with a text for who cannot see it and a caption, if any, below."""
+    """Return a PNG's bytes as HTML, with a text for who cannot see it and a caption, if any, below."""
     encoded = base64.b64encode(data).decode("ascii")
     below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
     return f'<figure><img alt="{escape(name)}" src="data:image/png;base64,{encoded}">{below}</figure>'
 
 
 def png(figure: Figure) -> bytes:
-    """A figure as a PNG's bytes, cut to what is drawn."""
+    """Return a figure as a PNG's bytes, cut to what is drawn."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=DPI, bbox_inches="tight")
     return buffer.getvalue()

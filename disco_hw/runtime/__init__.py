@@ -1,6 +1,6 @@
 """One tick of the robot, without a clock, a thread or a file; here the states that all of it is about.
 
-One table has every way between the states, and what each means for a person is in words. Rows are tried from top to
+One table has every way between the states, and what each means for the operator is in words. Rows are tried from top to
 bottom, one transition per step: what takes motion away stands above what gives it. `disco_hw.runtime.supervisor`
 computes the conditions and acts on the state. E-stop is shown in FAULT: the robot's firmware holds the latch, the
 supervisor repeats the request until the firmware shows it.
@@ -19,7 +19,7 @@ from firmware_protocol import status_codes
 
 
 class State(enum.Enum):
-    """Where the daemon is; the wheels can be driven in ARMED only."""
+    """States of the daemon; the wheels can be driven in ARMED only."""
 
     DISCONNECTED = "disconnected"
     HANDSHAKE = "handshake"
@@ -30,7 +30,7 @@ class State(enum.Enum):
 
 
 class Condition(enum.Flag):
-    """What is true now; the table is written in these."""
+    """Conditions that hold in one tick, in which the table of transitions is written."""
 
     NONE = 0
     LINK_UP = enum.auto()
@@ -137,17 +137,17 @@ _NEXT = {
 
 
 def by_button(action: str) -> str:
-    """How a person asks on the page."""
+    """Return how an operator requests an action on the page."""
     return f"press {action.capitalize()}"
 
 
 def by_command(robot: Path) -> Ask:
-    """How a person asks in a terminal."""
+    """Return a function that says how an operator requests an action in a terminal."""
     return lambda action: f"run `disco-hw ctl {robot} {action}`"
 
 
 def connection(link: LinkState, link_error: str | None, driver: DriverState, driver_detail: str) -> str:
-    """What stands between this host and a robot that answers, and what to do about it.
+    """Return why the robot does not answer, and what to do about it.
 
     `link_error` is the link's newest, with its remedy, or None.
     """
@@ -158,13 +158,13 @@ def connection(link: LinkState, link_error: str | None, driver: DriverState, dri
 
 
 def headline(state: str, detail: str, running: bool, estop: bool, by_hand: bool = False) -> tuple[str, str]:
-    """The state in a word or two, and the sentence after it."""
+    """Return the state in a word or two, and the sentence after it."""
     head = "E-STOP" if estop else f"{state} · running" if running else state
     return head, "driven by hand" if by_hand else detail
 
 
 def status_headline(status: Mapping[str, Any]) -> tuple[str, str]:
-    """The same for a status of the daemon that is `ok`."""
+    """Return the headline and its detail for a daemon's status that is `ok`."""
     by_hand = "drive" in status and bool(status["drive"]["driving"])
     return headline(status["state"], status["detail"], status["running"], is_estop(status), by_hand)
 
@@ -200,7 +200,7 @@ def fault_sentence(name: str) -> str:
 
 
 def next_step(status: Mapping[str, Any]) -> str:
-    """The action that leads on from here; empty where there is none."""
+    """Return the action that leads on from here; empty where there is none."""
     state = str(status["state"])
     if "drive" in status and state in {"READY", "ARMED"}:
         return ""
@@ -210,7 +210,7 @@ def next_step(status: Mapping[str, Any]) -> str:
 
 
 def in_words(code: str) -> str:
-    """A code of the protocol as a person reads it: STALL_LEFT becomes Stall left."""
+    """Return a code of the protocol as a person reads it: STALL_LEFT becomes Stall left."""
     return code.replace("_", " ").capitalize()
 
 

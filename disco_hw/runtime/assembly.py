@@ -66,7 +66,7 @@ def make_planner(config: RobotConfig, model: Model) -> control.Disco:
 
 
 def make_surroundings(config: RobotConfig, settings: control.DiscoSettings) -> Surroundings | None:
-    """What DISCO keeps away from; None for a robot.toml without [fence], where the guard alone minds obstacles."""
+    """Create the surroundings that DISCO avoids; None without [fence], where the guard alone minds obstacles."""
     if config.fence == Fence():
         return None
     around = Surroundings(
@@ -107,7 +107,7 @@ def make_pipeline(config: RobotConfig, model: Model, planner: Planner) -> Pipeli
 
 
 def make_guard(config: RobotConfig, model: Model) -> FenceGuard:
-    """The guard of robot.toml's fence; it does nothing until there is a fence or an obstacle.
+    """Return the guard of robot.toml's fence; it does nothing until there is a fence or an obstacle.
 
     The wheels respond as late as the model says, and 50 ms at least.
     """
@@ -122,7 +122,9 @@ def make_guard(config: RobotConfig, model: Model) -> FenceGuard:
 
 
 def make_fast_adaptation(setup: Setup, pipeline: Pipeline) -> FastAdaptation:
-    """The filter that learns the geometry in the tick itself; raises InputError where the model does not allow it.
+    """Return the filter that learns the geometry in the tick itself.
+
+    Raises InputError where the model does not allow it.
 
     `pipeline` has taken no step yet.
     """
@@ -136,7 +138,7 @@ def make_fast_adaptation(setup: Setup, pipeline: Pipeline) -> FastAdaptation:
 
 
 def _rehearsed(setup: Setup, pipeline: Pipeline) -> Geometry:
-    """The model's geometry, after it was put in force and taken back some times.
+    """Return the model's geometry, after it was put in force and taken back some times.
 
     What runs for the first time loads code: three times as long as later, in a tick that then must not be late.
     """
@@ -170,7 +172,10 @@ def assemble_core(
     needs_pose: bool = True,
     adaptation: GeometryAdaptation | None = None,
 ) -> DaemonCore:
-    """The daemon's tick over these parts; without `needs_pose` motion needs no pose, whatever robot.toml says."""
+    """Return the daemon's tick over these parts.
+
+    Without `needs_pose` motion needs no pose, whatever robot.toml says.
+    """
     supervisor = Supervisor(
         SupervisorSettings(
             telemetry_zero_s=config.control.telemetry_zero_s,
@@ -209,7 +214,7 @@ def pose_source_of(config: RobotConfig) -> PoseSource:
 
 
 def _pose_key(named: PoseInput) -> bytes | None:
-    """The key that each datagram must be proven with; None where none is named."""
+    """Return the key that each datagram must be proven with; None where none is named."""
     if named.key_file is None:
         return None
     path = Path(named.key_file)
@@ -225,7 +230,7 @@ def driver_of(config: RobotConfig, key: bytes | None = None) -> Driver:
 
 
 def preflight(config: RobotConfig, driver: Driver, with_task: bool = True) -> tuple[str, ...]:
-    """What robot.toml asks that the robot's firmware or its wheels do not allow, in words; empty if they agree."""
+    """Return, in words, what robot.toml requests beyond the limits of firmware or wheels; empty if they agree."""
     if driver.limits is None:
         return ()
     checks = check_firmware_limits(config.robot, driver.limits)

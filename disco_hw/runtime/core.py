@@ -51,20 +51,20 @@ _FOLLOW_TASK = FollowTask()
 
 
 class ObstacleSource(Protocol):
-    """Where reports of obstacles come from; those of `disco_hw.runtime.obstacles` in each tick."""
+    """Protocol of a source of obstacle reports, read in each tick; `disco_hw.runtime.obstacles` has the reports."""
 
     def receive(self, now_ns: int) -> Sequence[ObstacleReport]:
-        """What was reported since the last call, oldest first; never waits and never raises."""
+        """Return the obstacles reported since the last call, oldest first; never waits and never raises."""
 
     def close(self) -> None:
-        """Close it; safe to call twice."""
+        """Close the source of obstacles; safe to call twice."""
 
 
 class NoObstacles:
-    """In the place of a source of obstacles where there is none."""
+    """Source of obstacles that reports none, for a robot without one."""
 
     def receive(self, now_ns: int) -> Sequence[ObstacleReport]:
-        """Return nothing."""
+        """Return no reports: there is no source."""
         return ()
 
     def close(self) -> None:
@@ -76,7 +76,7 @@ def unannounced(_now_ns: int, _wheels: Sequence[WheelSample]) -> None:
 
 
 class CoreTick(msgspec.Struct, frozen=True, gc=False):
-    """What one tick did: the supervisor's verdict, the pipeline's work, the command sent (None if none was).
+    """Result of one tick: the supervisor's verdict, the pipeline's work, the command sent (None if none was).
 
     `readings`: what it worked from.
     """
@@ -326,7 +326,7 @@ class DaemonCore:
         )
 
     def _to_learn_from(self, readings: Readings) -> Readings:
-        """With the poses of the first source alone, while they are believed: from one to another is no motion."""
+        """Keep only poses of the first source, while it is believed: a switch of source must not look like motion."""
         sources = self.pipeline.fusion.sources
         if len(sources.all) == 1:
             return readings
@@ -334,7 +334,7 @@ class DaemonCore:
         return msgspec.structs.replace(readings, poses=first)
 
     def _command(self, output: Output, result: Tick) -> WheelCommand | None:
-        """The command to send; while the robot is arming the driver sends the zeros that this takes."""
+        """Return the command to send; while the robot is arming the driver sends the zeros that this takes."""
         may_command = output.motion_allowed or output.zero_only
         if not may_command or result.source is Source.SILENT or self.driver.state is not DriverState.ARMED:
             return None
@@ -351,7 +351,7 @@ class DaemonCore:
         return [records_of_tick.frame_out(now_ns, frame, self.transport.send(frame, now_ns)) for frame in outgoing]
 
     def _pose_events(self) -> list[str]:
-        """What pose sources, their headings and the estimate have to say, each as an event."""
+        """Return the news of pose sources, their headings and the estimate, each as an event."""
         source, pipeline = self.pose_source, self.pipeline
         news = [*(source.news() if isinstance(source, SaysWhy) else ()), *pipeline.headings.news()]
         news += [*pipeline.fusion.sources.news(), *self._jumps.news()]
@@ -391,7 +391,7 @@ class DaemonCore:
         )  # fmt: skip
 
     def _state_change(self, now_ns: int, output: Output) -> list[records.Record]:
-        """The record of a change of state or of what is said of it, in the tick in which it happens."""
+        """Return the record of a change of state or of what is said of it, in the tick in which it happens."""
         before, self._state = self._state, output.state
         said, self._said = self._said, (output.detail, output.running, output.estop)
         if output.state is before and self._said == said:
@@ -401,7 +401,7 @@ class DaemonCore:
         return [records.DaemonState(now_ns, output.state.name, before.name, *self._said)]
 
     def _task_change(self, now_ns: int) -> list[records.Record]:
-        """The record of another task, in the first tick that it holds for."""
+        """Return the record of another task, in the first tick that it holds for."""
         changed, self._task_changed = self._task_changed, False
         return [record_of(now_ns, self.task)] if changed else []
 
@@ -420,7 +420,7 @@ def _motion(output: Output, wanted: Motion) -> Motion:
 
 @dataclass(frozen=True, slots=True)
 class PilotTick:
-    """What a pilot wants of one tick: requests as a person makes them, the motion, and events to record.
+    """Wishes of a pilot for one tick: requests as an operator makes them, the motion, and events to record.
 
     `by_hand`: a person holds a deadman and sees where the robot goes, which needs no pose.
     """
@@ -452,7 +452,7 @@ class Pilot(Protocol):
         """Take in how a page, known by a number, wants to drive; returns why that does not count, in words."""
 
     def status(self) -> dict[str, Any]:
-        """What the daemon's status says in addition."""
+        """Return the pilot's own entries of the daemon's status."""
 
 
 @runtime_checkable
@@ -461,7 +461,7 @@ class FindsWiring(Protocol):
 
     @property
     def finds_wiring(self) -> bool:
-        """True."""
+        """Always True, which marks a pilot that finds the wiring."""
 
 
 class TaskPilot:
@@ -478,16 +478,16 @@ class TaskPilot:
         return False
 
     def step(self, now_ns: int, last: CoreTick | None) -> PilotTick:
-        """Follow the task."""
+        """Return a tick that follows the task and requests nothing."""
         return PilotTick()
 
     def learn(self, now_ns: int, tick: CoreTick, replies: Sequence[Reply]) -> None:
-        """Nothing is learnt."""
+        """Do nothing: the task needs no result of a tick."""
 
     def steer(self, now_ns: int, page: int, wanted: Mapping[str, Any]) -> str | None:
-        """A task is followed."""
+        """Refuse a page's steering, because a task is followed."""
         return "this daemon follows its task; stop it and start `disco-hw drive ROBOT.toml --page`"
 
     def status(self) -> dict[str, Any]:
-        """Nothing is added."""
+        """Return an empty dict: the status gets no more entries."""
         return {}

@@ -1,4 +1,4 @@
-"""The fence guard: scales or stops every wheel command whose stopping path would leave the fence.
+"""Fence guard that scales or stops every wheel command whose stopping path would leave the fence.
 
 Independent of planner and driver, without clock or I/O. In each tick it predicts, for a few scales of the requested
 command, how the robot would stop after it: the last command goes on for the response time, the scaled command for the
@@ -37,7 +37,7 @@ STOPPED_RAD_S = 1e-3
 
 
 class FenceVerdict(enum.Enum):
-    """What the guard made of one command."""
+    """Verdicts of the guard on one command."""
 
     IDLE = "idle"
     FREE = "free"
@@ -54,7 +54,7 @@ HOLDS_STILL = frozenset({FenceVerdict.STOPPED, FenceVerdict.NO_POSE, FenceVerdic
 
 @dataclass(frozen=True, slots=True)
 class StoppingSettings:
-    """How the robot stops (s, rad/s^2).
+    """Settings of the predicted stop (s, rad/s^2).
 
     `response_s`: from a command to the wheels. `reaction_s`: how long the wheels are still driven once the host is
     silent, by the driver's safety card. `period_s`: of the control loop.
@@ -72,7 +72,7 @@ class StoppingSettings:
 
 
 class FenceState(msgspec.Struct, frozen=True, gc=False):
-    """What the guard found in one tick.
+    """Result of the fence guard for one tick.
 
     `scale`: of the requested command that is let through. `clearance_m`: least on the stopping path after it, less the
     uncertainty; negative outside; at most the margin and twice the footprint's reach. `path`: that path, x, y (m),
@@ -102,12 +102,12 @@ class FenceGuard:
 
     @property
     def boundaries(self) -> Boundaries | None:
-        """What is kept away from; None without fence and footprint."""
+        """Boundaries that are kept away from; None without fence and footprint."""
         return self._boundaries
 
     @property
     def settings(self) -> StoppingSettings:
-        """How the robot is taken to stop."""
+        """Settings of how the robot is assumed to stop."""
         return self._settings
 
     @property
@@ -232,10 +232,9 @@ class FenceGuard:
         requested: tuple[float, float],
         spread: _Spread,
     ) -> tuple[Array, Array, Array]:
-        """Stopping paths (S, K, 3) for all scales; what is driven to each point (S, K, 2), m and rad; times (S, K), s.
+        """Return the stopping paths (S, K, 3) for all scales.
 
-        The wheels go on for the response time, come to the command, keep it for the reaction time, and slow down.
-        Distances are longer than believed by their spread.
+        With them what is driven to each point (S, K, 2), m and rad; times (S, K), s.
         """
         settings, count = self._settings, len(SCALES)
         now, command = np.array(wheels), SCALES[:, None] * np.array(requested)
@@ -274,7 +273,7 @@ class FenceGuard:
         return poses, np.stack([moved, yawed], axis=2), np.cumsum(np.concatenate(lasting_s, axis=1), axis=1)
 
     def _braking(self, speeds: Array, steps: int) -> Array:
-        """What wheels turn while they slow down from speeds (S, 2) to nothing, in steps (S, steps, 2) of like length.
+        """Return the wheel angles (S, steps, 2) turned in equal steps while braking from speeds (S, 2) to zero.
 
         The slower wheel takes as long as the faster one, so that the path keeps its curvature.
         """
@@ -284,13 +283,13 @@ class FenceGuard:
 
 
 def _braking_parts(steps: int) -> Array:
-    """Which part of its braking time a body that brakes evenly takes for each of so many equal parts of its way."""
+    """Return which part of its braking time an evenly braked body takes for each of so many equal parts of its way."""
     return np.asarray(-np.diff(np.sqrt(np.linspace(1.0, 0.0, steps + 1))))
 
 
 @dataclass(frozen=True, slots=True)
 class _Spread:
-    """What three standard deviations of the belief do: to a distance and a turn, as shares; to the turning centre."""
+    """Effect of three standard deviations of the belief: on a distance and a turn, as shares; on the turning centre."""
 
     distance: float
     turn: float
@@ -311,7 +310,7 @@ def _spread(geometry: OdometryParameters) -> _Spread:
 
 
 def corner_deviation_m(estimate: PoseEstimate, bounds: Boundaries) -> float:
-    """Standard deviation of that corner of the footprint whose place is known least, in its worst direction (m)."""
+    """Return the standard deviation (m) of the least known corner of the footprint, in its worst direction."""
     covariance = np.array(estimate.covariance)
     cos, sin = math.cos(estimate.yaw_rad), math.sin(estimate.yaw_rad)
     largest = 0.0

@@ -43,7 +43,7 @@ def obstacle_source_of(config: RobotConfig) -> ObstacleSource:
 
 
 class UdpObstacles:
-    """Satisfies `core.ObstacleSource`."""
+    """Source of obstacle reports that come as UDP datagrams (a `core.ObstacleSource`)."""
 
     def __init__(self, opened: socket.socket) -> None:
         self._socket = opened
@@ -51,7 +51,7 @@ class UdpObstacles:
         """Number of datagrams that held no report."""
 
     def receive(self, now_ns: int) -> Sequence[ObstacleReport]:
-        """What was reported since the last call, oldest first; never waits and never raises."""
+        """Return the obstacles reported since the last call, oldest first; never waits and never raises."""
         reports: list[ObstacleReport] = []
         with contextlib.suppress(OSError):
             for _ in range(_DATAGRAMS_A_TICK):
@@ -61,7 +61,7 @@ class UdpObstacles:
         return reports
 
     def close(self) -> None:
-        """Close the socket; safe to call twice."""
+        """Close the UDP socket; safe to call twice."""
         self._socket.close()
 
 

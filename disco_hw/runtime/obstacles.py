@@ -28,7 +28,7 @@ _Speed = Annotated[float, Meta(ge=-_FASTEST_M_S, le=_FASTEST_M_S)]
 
 
 class ObstacleReport(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What is said of one obstacle: centre and radius (m) and velocity (m/s) in the pose frame, `age_s` ago.
+    """Report of one obstacle: centre and radius (m) and velocity (m/s) in the pose frame, `age_s` ago.
 
     `age_limit_s`: how long the report may be relied on.
     """
@@ -91,14 +91,14 @@ class Obstacles:
         self._kept[report.name] = _Kept(report, now_ns - round(report.age_s * 1e9))
 
     def remove(self, name: str) -> None:
-        """Forget an obstacle. Raises ObstacleRefused if there is none of that name."""
+        """Remove an obstacle by its name. Raises ObstacleRefused if there is none of that name."""
         if name not in self._kept:
             known = ", ".join(sorted(self._kept)) or "none"
             raise ObstacleRefused(f"obstacle {name}: not known; known are: {known}")
         del self._kept[name]
 
     def step(self, now_ns: int) -> tuple[str, ...]:
-        """Let time pass; returns a sentence for each obstacle whose reports have ceased, and for each that is back."""
+        """Update which obstacles are lost; return a sentence for each whose reports have ceased or are back."""
         lost = frozenset(name for name, one in self._kept.items() if one.age_s(now_ns) > one.report.age_limit_s)
         gone, back = sorted(lost - self._lost), sorted((self._lost - lost) & self._kept.keys())
         self._lost = lost
@@ -112,11 +112,11 @@ class Obstacles:
         return tuple(sorted(self._lost & self._kept.keys()))
 
     def circles(self, now_ns: int) -> tuple[MovingCircle, ...]:
-        """Where the obstacles are now."""
+        """Return the obstacles as moving circles, at their places now."""
         return tuple(one.now(now_ns) for one in self._kept.values())
 
     def status(self, now_ns: int) -> list[dict[str, Any]]:
-        """Each obstacle for a person or a machine: where it is now, and the age of its report."""
+        """Return each obstacle's status: where it is now, and the age of its report."""
         found = []
         for name, one in sorted(self._kept.items()):
             now = one.now(now_ns)

@@ -1,4 +1,4 @@
-"""One tick, pure: samples in, estimate, plan, governed wheel command out.
+"""Pure pipeline of one tick: samples in, estimate, plan, governed wheel command out.
 
 The real-time loop, the replay and the simulated-time harness run this same object; it has no clock, thread or I/O.
 
@@ -38,7 +38,7 @@ _LARGEST_STEP_PERIODS = 1.5
 
 
 class Limited(enum.Flag):
-    """Why a command differs from what was desired; empty if it does not."""
+    """Reasons why a command differs from what was desired; empty if it does not."""
 
     NONE = 0
     SPEED = enum.auto()
@@ -167,7 +167,7 @@ class Planner(Protocol):
         """Plan under this belief from the next plan on; raises ValueError, and keeps the old one, if it cannot."""
 
     def sampled_rollouts(self, count: int) -> Rollouts:
-        """The weightiest sequences of the last plan; changes nothing."""
+        """Return the weightiest sequences of the last plan; changes nothing."""
 
 
 @runtime_checkable
@@ -182,29 +182,29 @@ class AvoidsBoundaries(Protocol):
 
 
 class NoPlanner:
-    """In the place of a planner where the robot is driven by hand: it never has a plan."""
+    """Planner that never has a plan, for a robot that is driven by hand."""
 
     def plan(self, _now_ns: int, _state: PlannerState) -> WheelPlan:
-        """Raise NoValidControl."""
+        """Raise NoValidControl: there is no planner."""
         raise NoValidControl("there is no planner: the robot is driven by hand")
 
     def reset(self) -> None:
-        """Nothing is kept."""
+        """Do nothing: no plan is kept."""
 
     def set_task(self, _task: PlannedTask) -> None:
-        """A person decides."""
+        """Do nothing: the operator decides where to drive."""
 
     def set_belief(self, _belief: Belief) -> None:
-        """Nothing is planned."""
+        """Do nothing: nothing is planned with a belief."""
 
     def sampled_rollouts(self, _count: int) -> Rollouts:
-        """Raise NoValidControl."""
+        """Raise NoValidControl: there is no planner."""
         raise NoValidControl("there is no planner")
 
 
 @dataclass(frozen=True, slots=True)
 class Off:
-    """Nothing is sent to the wheels."""
+    """Motion request under which nothing is sent to the wheels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,7 +231,7 @@ class Silent:
 
 
 class Source(enum.Enum):
-    """Who asked for a tick's wheel speeds."""
+    """Sources of the wheel speeds that are requested in a tick."""
 
     OFF = "off"
     HOLD = "hold"
@@ -247,7 +247,7 @@ Motion = Off | Stand | FollowTask | Manual | Silent
 
 
 class Tick(msgspec.Struct, frozen=True, gc=False):
-    """What one tick made of its samples.
+    """Result of the pipeline for one tick.
 
     `plan` is this tick's new plan or None, `plan_age_ns` the age of the one in force, `planner_failure` why there is no
     new one; `requested` is what `source` wanted, `command` what the governor lets through (rad/s); `disturbance` what
@@ -268,7 +268,7 @@ class Tick(msgspec.Struct, frozen=True, gc=False):
 
 
 def untimed(_stage: str) -> None:
-    """Time nothing: for callers without a clock."""
+    """Do nothing instead of timing a stage, for callers without a clock."""
 
 
 class Pipeline:
@@ -306,7 +306,7 @@ class Pipeline:
 
     @property
     def disturbance(self) -> Disturbance:
-        """How the robot moves beside its model, as far as is known."""
+        """Estimated motion of the robot beside its model; no disturbance where none is estimated."""
         return NO_DISTURBANCE if self._disturbance is None else self._disturbance.value
 
     def set_task(self, task: PlannedTask, line_m: NDArray[np.float64] | None = None) -> None:
@@ -331,7 +331,7 @@ class Pipeline:
         self._fusion.set_parameters(odometry)
 
     def rollouts(self, count: int) -> Rollouts | None:
-        """What the plan in force was weighed from, the `count` of the largest weight; None without one.
+        """Return the plan's `count` sampled rollouts of largest weight; None without a plan in force.
 
         A look from outside: no later tick is changed by it.
         """
@@ -401,7 +401,7 @@ class Pipeline:
     def _guarded(
         self, estimate: PoseEstimate, source: Source, requested: tuple[float, float], overridden: bool
     ) -> tuple[FenceState, tuple[float, float]]:
-        """What the fence guard says of the requested wheel speeds, and the part of them that it lets through."""
+        """Return the fence guard's verdict on the requested wheel speeds, and the part of them that it lets through."""
         if self._guard is None or not self._guard.is_active or source in {Source.OFF, Source.SILENT}:
             return IDLE, requested
         last = (self._sent[-1].left_rad_s, self._sent[-1].right_rad_s) if self._sent else (0.0, 0.0)
@@ -414,7 +414,7 @@ class Pipeline:
 
     @property
     def guard(self) -> FenceGuard | None:
-        """What keeps every command within the fence; None where nothing does."""
+        """Fence guard that checks every command; None where there is none."""
         return self._guard
 
     def _take_pose(self, pose: PoseSample, now_ns: int) -> PoseUpdate:

@@ -30,7 +30,9 @@ _SIDES = ("left", "right")
 
 @dataclass(frozen=True, slots=True)
 class PlausibilityStats:
-    """Times that a wheel began not to follow its commands (`wheel_faults.WheelFaults` counts them), that the supply
+    """Counters of implausible behaviour.
+
+    Times that a wheel began not to follow its commands (`wheel_faults.WheelFaults` counts them), that the supply
     dipped, and that the pose stayed the same to the last digit while the wheels turned.
     """
 
@@ -151,7 +153,7 @@ class Headway:
 
 
 def _obstacle(window: _Window, angles_rad: tuple[float, float] | None, planner_failure: str | None) -> str:
-    """What stands in the way, from the commands down to the ground."""
+    """Return the likely reason why the robot does not move, looked for from the commands down to the ground."""
     if planner_failure is not None:
         return f"the planner has no plan: {planner_failure}"
     if window.largest_rad_s < ASKED_RAD_S:
@@ -206,11 +208,11 @@ class _Start(NamedTuple):
 
     @staticmethod
     def of(pose: PoseSample) -> _Start:
-        """The first one."""
+        """Create the mean from its first pose."""
         return _Start(pose.source, pose.x_m, pose.y_m, pose.yaw_rad, 1)
 
     def take(self, pose: PoseSample) -> _Start:
-        """Take in one more; another source, or a place that noise does not explain, begins anew."""
+        """Take in one more; another source, or a place that noise does not explain, begins again."""
         yaw = math.remainder(pose.yaw_rad - self.yaw_rad, 2.0 * math.pi)
         away_m = math.hypot(pose.x_m - self.x_m, pose.y_m - self.y_m)
         moved = away_m > _MOVED_STD * pose.position_std_m or abs(yaw) > _MOVED_STD * pose.yaw_std_rad
@@ -294,7 +296,7 @@ class Directions:
     def _wait_for_motion(
         self, now_ns: int, wheels: Sequence[WheelSample], poses: Sequence[PoseSample], asked: Pair
     ) -> None:
-        """What turns and moves from here on belongs to a motion that began at rest."""
+        """Update the mean pose at rest, and begin an observed motion once the robot is commanded to move from rest."""
         for pose in poses:
             if pose.has_heading:
                 self._start = _Start.of(pose) if self._start is None else self._start.take(pose)
@@ -308,7 +310,7 @@ class Directions:
         del self._turned[:-1]
 
     def _moved(self, t_ns: int) -> Pair:
-        """How far the wheels have turned at that time, in radians."""
+        """Return by how much (rad) the wheels have turned from the first kept sample to that time."""
         at = max(bisect_right(self._turned, t_ns, key=lambda entry: entry[0]) - 1, 0)
         _, left, right = self._turned[at]
         return left - self._turned[0][1], right - self._turned[0][2]
@@ -333,7 +335,7 @@ class Directions:
         return self._again(self._words_of_opposite(wrong) if wrong else "")
 
     def _by_poses(self, poses: Sequence[PoseSample]) -> str | None:
-        """What else than robot.toml says explains how the robot has moved since it stood."""
+        """Return the wiring, other than that of robot.toml, that explains the motion since rest; None if none does."""
         start, declared = self._start, (False, (1, 1))
         counted = self._moved(self._turned[-1][0])
         if any(abs(turn) < _COUNTED_PART * abs(asked) for turn, asked in zip(counted, self._asked, strict=True)):
@@ -362,7 +364,7 @@ class Directions:
         return self._words_of_wiring(*wired) if self._evidence[wired] > _ENOUGH else None
 
     def _off_m(self, ahead_m: float, yaw_rad: float, turned: Pair, swapped: bool, signs: Sequence[int]) -> float:
-        """How far the pose is from where wheels wired so would have taken it; a turn counts as its arc at a wheel."""
+        """Return the distance (m) of the pose from where wheels wired so lead; a turn counts as its arc at a wheel."""
         left, right = reversed(turned) if swapped else turned
         left, right = signs[0] * left, signs[1] * right
         ahead = 0.5 * self._radius_m * (left + right)
@@ -371,7 +373,7 @@ class Directions:
         return min(math.hypot(ahead_m - ahead, turned_m - part * arc) for part in _TURNED_PARTS)
 
     def _again(self, words: str) -> str | None:
-        """The words, once the same was found so a few times in a row; none are nothing found."""
+        """Return the words once the same was found a few times in a row; no words mean that nothing was found."""
         before, times = self._in_a_row
         self._in_a_row = (words, times + 1 if words == before else 1)
         return words if words and self._in_a_row[1] == SAMPLES else None

@@ -40,7 +40,7 @@ class PoseJumps:
         return words
 
     def news(self) -> list[str]:
-        """Return sentences for a person since the last call."""
+        """Return sentences for the operator since the last call."""
         said, self._said = self._said, []
         return said
 

@@ -34,7 +34,7 @@ class PoseTravel:
 
     @property
     def newest_ns(self) -> int | None:
-        """When the newest pose was true; None before the first."""
+        """Time at which the newest pose was true; None before the first."""
         return self._poses[-1].t_ns if self._poses else None
 
     def add(self, pose: PoseSample) -> bool:

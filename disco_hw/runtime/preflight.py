@@ -54,7 +54,7 @@ _COMMANDS_TO_SPARE = 2
 
 
 class Level(enum.Enum):
-    """What a check's result means for a person."""
+    """Levels of a check's result."""
 
     OK = "ok"
     WARNING = "warn"
@@ -63,7 +63,7 @@ class Level(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One check's result: `text` says what was found, and what to do if it is not ok."""
+    """Result of one check: `text` says what was found, and what to do if it is not ok."""
 
     name: str
     level: Level
@@ -157,7 +157,7 @@ def check_watchdog(limits: Limits) -> Check:
 
 
 def check_safety(robot: Robot, card: SafetyCard) -> list[Check]:
-    """The safety card: who stops the robot when, how far at full speed, and what could not be verified."""
+    """Check the safety card: what stops the robot when, how far it goes at full speed, what could not be verified."""
     speed_m_s = robot.max_wheel_speed_rad_s * robot.wheel_radius_m
     driven_m = speed_m_s * card.reaction_s
     if card.brakes:

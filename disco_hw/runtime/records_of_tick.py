@@ -1,4 +1,4 @@
-"""What is recorded of one tick."""
+"""Records for the log that are made of one tick."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _FAN_DIGITS = 3
 
 
 def frames_in(frames: Sequence[ReceivedFrame]) -> Iterator[records.Record]:
-    """The frames received."""
+    """Yield one record for each received frame."""
     for received in frames:
         yield records.FrameIn(received.t_ns, socketcan_id(received.frame), received.frame.data)
 
@@ -32,7 +32,7 @@ def frame_out(now_ns: int, outgoing: OutgoingFrame, sent: bool) -> records.Recor
 
 
 def controller(now_ns: int, identity: Identity, limits: Limits) -> records.Record:
-    """Which controller answers, and what it keeps to."""
+    """Return the record of the controller that answers, and of its limits."""
     by_origin: dict[SaidBy, dict[str, float]] = {"device": {}, "fixed": {}, "robot.toml": {}}
     for name, limit in limits.known().items():
         by_origin[limit.said_by][name] = limit.value
@@ -49,7 +49,7 @@ def controller(now_ns: int, identity: Identity, limits: Limits) -> records.Recor
 
 
 def samples(readings: Readings) -> Iterator[records.Record]:
-    """What the received frames meant."""
+    """Yield the samples that the received frames contained."""
     yield from readings.wheels
     yield from readings.poses
     yield from readings.motors
@@ -111,7 +111,7 @@ def tick(result: Tick, command: WheelCommand | None, valid_for_s: float) -> Iter
 
 
 def fan(t_ns: int, rollouts: Rollouts) -> records.Fan:
-    """The rollouts of the plan made at `t_ns`, each thinned to 11 points from its first to its last."""
+    """Return the rollouts of the plan made at `t_ns`, each thinned to 11 points from its first to its last."""
     steps = rollouts.trajectories.shape[1]
     kept = np.unique(np.linspace(0, steps - 1, min(_FAN_POINTS, steps)).astype(int))
     places = np.round(rollouts.trajectories[:, kept, :2], _FAN_DIGITS)

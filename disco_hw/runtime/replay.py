@@ -75,7 +75,7 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class ReplayReport:
-    """How many ticks and values were compared, and where they first differ (None if nowhere)."""
+    """Result of a replay: how many ticks and values were compared, and where they first differ (None if nowhere)."""
 
     ticks: int
     values: int
@@ -90,11 +90,11 @@ class ReplayReport:
         return self.difference is None
 
     def as_dict(self) -> dict[str, Any]:
-        """The report for machines."""
+        """Return the report as a JSON-serialisable dict."""
         return {"ok": self.ok, **asdict(self)}
 
     def as_text(self) -> str:
-        """The report for a person."""
+        """Return the report as text."""
         lines = [f"{self.ticks} ticks, {self.values} values compared; recorded by disco-hw {self.recorded_by}"]
         if self.missing_ticks:
             lines.append(f"{self.missing_ticks} ticks are missing from the log: from there on nothing can be equal")
@@ -244,7 +244,7 @@ def _near(old: Any, new: Any, tolerance: float) -> bool:
 
 
 def _bits(value: Any) -> Any:
-    """Something that is equal exactly if the values are: -0.0 differs from 0.0, NaN equals NaN."""
+    """Return a key that is equal exactly if the values are: -0.0 differs from 0.0, NaN equals NaN."""
     if isinstance(value, float):
         return "nan" if math.isnan(value) else _FLOAT.pack(value)
     if isinstance(value, tuple):

@@ -1,4 +1,4 @@
-"""What one robot is and has to do: its files, read and checked together, and what a person changes of its task.
+"""Setup of one robot: its files, read and checked together, and what an operator changes of its task.
 
 The files lie where robot.toml says, or in a log that carries them. A changed task is in the status, in the log and in
 force; it is pure.
@@ -71,7 +71,7 @@ def load_setup(robot: Path, model: Path | None = None, link: str | None = None, 
 
 
 def _with_key_beside(robot: Path, pose: PoseInput) -> PoseInput:
-    """The pose sources with the full paths of their key files, which are written relative to robot.toml."""
+    """Return the pose sources with the full paths of their key files, which are written relative to robot.toml."""
     key_file = None if pose.key_file is None else str(robot.parent / pose.key_file)
     also = tuple(_with_key_beside(robot, one) for one in pose.also)
     return msgspec.structs.replace(pose, key_file=key_file, also=also)
@@ -87,7 +87,10 @@ def refuse_missing_effects(setup: Setup) -> None:
 
 
 def link_key(setup: Setup) -> bytes | None:
-    """The key of authenticated mode from the file that robot.toml names, None if it names none. Raises InputError."""
+    """Return the key of authenticated mode from the file that robot.toml names, None if it names none.
+
+    Raises InputError.
+    """
     name = setup.config.link.key_file
     if name is None:
         return None
@@ -117,14 +120,14 @@ def geometry(model: Model) -> tuple[tuple[float, float, float], Matrix3]:
 
 
 def scene_of(config: RobotConfig) -> TaskScene:
-    """The task's course and the robot's size, for whoever draws a log or a running robot."""
+    """Return the task's course and the robot's size, for whoever draws a log or a running robot."""
     outline = tuple((x, y) for x, y in config.task.course().outline_m().tolist())
     fence = tuple(tuple((x, y) for x, y in line.tolist()) for line in fence_outlines(config.fence))
     return TaskScene(outline, config.robot.axial_distance_m, config.robot.wheel_radius_m, fence)
 
 
 def kept_files(setup: Setup) -> list[Attachment]:
-    """Copies of robot.toml, the model and the task's path for a log; raises InputError if one cannot be read."""
+    """Return copies of robot.toml, the model and the task's path for a log; raises InputError if one cannot be read."""
     named = (
         (ROBOT_TOML, ROBOT_KIND, setup.robot_file),
         (MODEL_TOML, MODEL_KIND, setup.model_file),
@@ -134,7 +137,7 @@ def kept_files(setup: Setup) -> list[Attachment]:
 
 
 def setup_of_log(log: Log, remedy: str) -> Setup:
-    """The robot as it was when a log was recorded, from the copies in it; no other file is read.
+    """Return the robot as it was when a log was recorded, from the copies in it; no other file is read.
 
     The files that the result names are gone. Raises InputError: with `remedy` for a log without a robot.toml or
     without a file that it names, and with log and copy for one that is wrong.
@@ -167,7 +170,7 @@ class TaskRefused(Exception):  # noqa: N818
 
 
 def changed_task(task: RobotTask, asked: Mapping[str, Any], robot: Robot, state: State) -> RobotTask:
-    """The task with the fields in `asked`, all of them editable, m and m/s.
+    """Return the task with the fields in `asked`, all of them editable, m and m/s.
 
     Raises TaskRefused while the robot is armed or stopping, for anything that is no number within the limits, and for a
     speed that the wheels cannot reach on the changed task.
@@ -193,7 +196,7 @@ def changed_task(task: RobotTask, asked: Mapping[str, Any], robot: Robot, state:
 
 
 def with_values(task: RobotTask, values: Mapping[str, float]) -> RobotTask:
-    """The task with those of the values that are fields of it."""
+    """Return the task with those of the values that are fields of it."""
     kept = {name: values[name] for name in task.__struct_fields__ if name in values}
     return cast(RobotTask, msgspec.structs.replace(cast(msgspec.Struct, task), **kept))
 
@@ -204,7 +207,7 @@ def limits(robot: Robot, task: RobotTask) -> dict[str, tuple[float, float]]:
 
 
 def asked_of(task: RobotTask) -> dict[str, Any]:
-    """The task as the daemon's status gives it: its fields, and for what is read from a file a digest of that."""
+    """Return the task as in the daemon's status: its fields, and a digest of what is read from a file."""
     fields: dict[str, Any] = msgspec.to_builtins(task)
     read = tuple(fields.pop(name) for name in task.read_fields)
     digest = {"digest": digest_of(tuple(getattr(task, name) for name in task.read_fields))} if read else {}
@@ -212,7 +215,7 @@ def asked_of(task: RobotTask) -> dict[str, Any]:
 
 
 def task_in_status(asked: Mapping[str, Any], robots: RobotTask) -> RobotTask | None:
-    """The task that `asked_of` gave; None for one with other way-points than those in `robots`, robot.toml's."""
+    """Return the task that `asked_of` gave; None for one with other way-points than those in `robots`, robot.toml's."""
     if "digest" in asked:
         same = asked_of(robots)
         if (same["kind"], same.get("digest")) != (asked["kind"], asked["digest"]):
@@ -226,12 +229,15 @@ def task_in_status(asked: Mapping[str, Any], robots: RobotTask) -> RobotTask | N
 
 @lru_cache(maxsize=4)
 def digest_of(read: tuple[object, ...]) -> str:
-    """A few letters that are the same for the same contents of a task's file only."""
+    """Return a 16-digit hash of the contents of a task's file."""
     return hashlib.sha256(msgspec.json.encode(read)).hexdigest()[:16]
 
 
 def record_of(t_ns: int, task: RobotTask) -> records.Task:
-    """The record of a task that is in force from `t_ns` on; what is read from its file is in the log's copy of that."""
+    """Return the record of a task that is in force from `t_ns` on.
+
+    What is read from its file is in the log's copy of that.
+    """
     fields = {name: getattr(task, name) for name in task.__struct_fields__}
     return records.Task(
         t_ns, kind_of(task), {name: value for name, value in fields.items() if isinstance(value, float)}
@@ -239,7 +245,7 @@ def record_of(t_ns: int, task: RobotTask) -> records.Task:
 
 
 def task_of(record: records.Task, robots: RobotTask) -> RobotTask:
-    """The task of a record: `robots`, robot.toml's, with the values in the record."""
+    """Return the task of a record: `robots`, robot.toml's, with the values in the record."""
     return with_values(robots, record.values())
 
 

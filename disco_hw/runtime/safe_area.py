@@ -1,4 +1,4 @@
-"""What the daemon's tick knows of fence and obstacles: who reported what, the override, and what to say of it; pure."""
+"""Pure state of fence, obstacles and override in the daemon's tick, with what to report of them."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class SafeArea:
 
     @property
     def task_fault(self) -> str:
-        """Why no task may go on, in words; empty if nothing of the fence speaks against it."""
+        """Reason why no task may go on, in words; empty if nothing of the fence speaks against it."""
         return f"fence: {self.last.reason}" if self.last.verdict in HOLDS_STILL else ""
 
     def override(self, now_ns: int, on: bool) -> str:
@@ -139,7 +139,7 @@ class SafeArea:
         return "the fence is changed until the daemon ends; write it into robot.toml to keep it"
 
     def status(self, now_ns: int) -> dict[str, Any]:
-        """What the daemon's status says of fence and obstacles."""
+        """Return the entries for fence and obstacles of the daemon's status."""
         return {
             "fence": msgspec.to_builtins(self.fence),
             "footprint_m": msgspec.to_builtins(self.footprint),
@@ -157,16 +157,16 @@ class SafeArea:
 
 
 def record_of_fence(t_ns: int, fence: Fence) -> records.FenceChange:
-    """The record of a fence that is in force from `t_ns` on."""
+    """Return the record of a fence that is in force from `t_ns` on."""
     return records.FenceChange(t_ns, msgspec.json.encode(fence).decode())
 
 
 def fence_of_record(record: records.FenceChange) -> Fence:
-    """The fence of a record."""
+    """Return the fence of a record."""
     return msgspec.json.decode(record.fence, type=Fence)
 
 
 def report_of_record(record: records.Obstacle) -> ObstacleReport:
-    """The report that a record of an obstacle keeps."""
+    """Return the report that a record of an obstacle keeps."""
     fields: dict[str, Any] = {name: getattr(record, name) for name in ObstacleReport.__struct_fields__}
     return ObstacleReport(**fields)

@@ -41,7 +41,7 @@ _PROBLEM = PROBLEM.value
 
 
 class UserRequest(enum.Enum):
-    """What a person can ask of the daemon."""
+    """Requests that an operator can make of the daemon."""
 
     ARM = "arm"
     ARM_UNRECORDED = "arm_unrecorded"
@@ -66,7 +66,7 @@ class SupervisorSettings:
 
 
 class Inputs(msgspec.Struct, frozen=True, gc=False):
-    """Everything the supervisor looks at in one tick.
+    """Inputs of the supervisor in one tick.
 
     `telemetry_age_s` is the age of the newest wheel sample, None before the first; `wheel_speed_rad_s` the larger
     magnitude of its two speeds. `link_error` is the link's newest error, with its remedy. `preflight_errors` and
@@ -107,7 +107,7 @@ class Reply(msgspec.Struct, frozen=True, gc=False):
 
 
 class Output(msgspec.Struct, frozen=True, gc=False):
-    """What holds for this tick.
+    """Decision of the supervisor for one tick.
 
     `driver_request`: to be handed to the driver; None leaves the last one. `motion_allowed`: the plan may drive the
     wheels. `zero_only`: the command ramps to zero and stays there. Neither: no wheel command is sent. `send_estop`:
@@ -272,7 +272,7 @@ class Supervisor:
         return self._pose_fault(inputs)
 
     def _pose_fault(self, inputs: Inputs) -> str | None:
-        """What of the pose keeps the task from being followed; nothing while nobody follows it."""
+        """Return why the pose does not allow the task to be followed; None if it does, or while driven by hand."""
         if inputs.by_hand:
             return None
         if inputs.pose_jump:
@@ -351,7 +351,10 @@ class Supervisor:
             self._events.append("task stopped: the path's end is reached")
 
     def _trouble_and_remedy(self, remedy: str) -> str:
-        """The trouble with its own remedy if it names one, else with this one; this host's reset always comes last."""
+        """Return the trouble with its own remedy if it names one, else with this one.
+
+        This host's reset always comes last.
+        """
         if self._trouble.endswith(THEN_RESET):
             return self._trouble
         if self._trouble.endswith((BY_ITSELF, THEN_RESTART)):
@@ -444,7 +447,7 @@ def _union(flags: Iterable[tuple[int, bool]]) -> int:
 
 
 def _said_by(robot: DriverState) -> int:
-    """The conditions that the driver's state alone decides."""
+    """Return the conditions that the driver's state alone decides."""
     return _union(
         (
             (_ROBOT_TALKS, robot in _IDLE | _MAY_MOVE),

@@ -46,7 +46,7 @@ _SIDES = ("left", "right")
 
 
 class Cause(enum.Enum):
-    """What is wrong with a wheel, for a person; {side} is filled in."""
+    """Causes of a wheel fault, as text for the operator; {side} is filled in."""
 
     ENCODER_SILENT = (
         "the {side} wheel turns, as the poses show, and its encoder does not count: frozen or disconnected; check the "
@@ -80,7 +80,7 @@ class Cause(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class WheelFault:
-    """What was found, at which wheel or both."""
+    """Cause of a wheel fault, and at which wheel or both."""
 
     cause: Cause
     side: str
@@ -103,7 +103,7 @@ class _Asked(NamedTuple):
 
 
 def _asked(speed: float, other: float, turn_part: float, before: _Asked, elapsed_s: float) -> _Asked:
-    """What one wheel is asked for beside the other, where wheels may differ by up to `turn_part` of what is asked."""
+    """Return the command of one wheel given the other's; wheels may differ by up to `turn_part` of it."""
     mean = 0.5 * (speed + other)
     turned = mean + turn_part * (speed - mean)
     slowest = min((speed, turned), key=abs) if turned * speed > 0.0 else 0.0
@@ -113,7 +113,10 @@ def _asked(speed: float, other: float, turn_part: float, before: _Asked, elapsed
 
 @dataclass(slots=True)
 class _Wheel:
-    """One wheel; angles and speeds are in the direction of its command, `angle_rad` and `speed_rad_s` as counted."""
+    """State of one wheel.
+
+    Angles and speeds are in the direction of its command, `angle_rad` and `speed_rad_s` as counted.
+    """
 
     angle_rad: float = math.nan
     speed_rad_s: float = 0.0
@@ -128,7 +131,7 @@ class _Wheel:
     is_told: bool = False
 
     def rest(self) -> None:
-        """Nothing is commanded: nothing is expected."""
+        """Clear what is expected of the wheel, because nothing is commanded."""
         self.missing_rad = self.beyond_rad = self.expected_rad = self.counted_rad = 0.0
         self.loss_rad_s, self.is_told = UNKNOWN_LOSS_RAD_S, False
 
@@ -173,7 +176,7 @@ class _Wheel:
 
     @property
     def has_followed(self) -> bool:
-        """Whether it has ever counted as commanded, for long enough to know how it is wired."""
+        """Whether the wheel has ever counted as commanded, for long enough to know how it is wired."""
         return self.followed_rad > FOLLOWED_RAD
 
     @property
@@ -182,12 +185,12 @@ class _Wheel:
         return self.missing_rad > 0.5 * MISSING_RAD or self.beyond_rad > 0.5 * BEYOND_RAD
 
     def is_missing(self, now_ns: int) -> bool:
-        """Whether it does not follow, as far as counts can tell."""
+        """Return whether the counts show that the wheel does not follow its command."""
         return self.missing_rad > MISSING_RAD and now_ns - self.since_ns >= SHORTEST_NS
 
     @property
     def is_backward(self) -> bool:
-        """Whether it counted the other way, of what does not follow."""
+        """Whether the wheel counted backward during the motion that does not follow its command."""
         return self.counted_rad < -0.25 * max(self.expected_rad, 0.5 * self.missing_rad)
 
 
@@ -328,7 +331,7 @@ class WheelFaults:
         return WheelFault(causes[turns], _names(found))
 
     def _turns(self, side: int, geometry: OdometryParameters, sure: float = DECIDED) -> int | None:
-        """How a wheel that does not follow truly turns: 1 as commanded, 0 not at all, -1 backward; None if unclear."""
+        """Return how a wheel that does not follow truly turns: 1 as commanded, 0 not, -1 backward; None if unclear."""
         wheel = self._wheels[side]
         seen = self._travel.wheel_speeds(wheel.since_ns + _SETTLED_NS, geometry)
         newest_ns = self._travel.newest_ns
@@ -345,7 +348,7 @@ class WheelFaults:
         return 0 if middle - abs(speed) > sure * std else None
 
     def _unseen(self, geometry: OdometryParameters) -> WheelFault | None:
-        """A wheel that the poses show to turn as it is asked to, and that does not count; the other one does."""
+        """Return a wheel that the poses show to turn as it is asked to, and that does not count; the other one does."""
         since_ns, newest = self._commands[0][0], self._commands[-1][1]
         # One that has turned since it stood is known by what it is expected to do.
         quiet = [

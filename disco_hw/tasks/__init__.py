@@ -1,4 +1,4 @@
-"""What a task is to everything else: the section of robot.toml, its line on the ground, its progress, its cost.
+"""Interface of a task: the section of robot.toml, its line on the ground, its progress, its cost.
 
 Every module of this package with a `TASK` is a kind, and its name is the kind's (docs/add-a-task.md says what such a
 file holds). Only the module of the kind that is asked for is loaded, so that reading robot.toml stays quick.
@@ -58,7 +58,7 @@ Positive = Annotated[float, Meta(gt=0.0)]
 
 
 class Chassis(Protocol):
-    """What a task asks of the robot: [robot] of robot.toml has it."""
+    """Properties of the robot that a task needs; [robot] of robot.toml has them."""
 
     @property
     def wheel_radius_m(self) -> float:
@@ -82,7 +82,7 @@ class Editable(NamedTuple):
 
 
 class TaskFault(NamedTuple):
-    """What is wrong with a task that no single field shows: the field to change, the fault, the remedy."""
+    """Fault of a task that no single field shows: the field to change, the fault, the remedy."""
 
     field: str
     fault: str
@@ -94,7 +94,7 @@ class Course(Protocol):
 
     @property
     def noun(self) -> str:
-        """What it is called."""
+        """Name of the course for panels and pictures."""
 
     @property
     def middle_m(self) -> Point:
@@ -102,7 +102,7 @@ class Course(Protocol):
 
     @property
     def reach_m(self) -> float:
-        """How far it goes from the middle along x or y."""
+        """Farthest distance (m) of the course from its middle along x or y."""
 
     @property
     def length_m(self) -> float:
@@ -110,17 +110,17 @@ class Course(Protocol):
 
     @property
     def start(self) -> tuple[float, float, float]:
-        """Where to begin and which way to face: x, y (m), yaw (rad)."""
+        """Start of the course and the heading there: x, y (m), yaw (rad)."""
 
     def outline_m(self) -> Array:
-        """The line as points (N, 2)."""
+        """Return the line as points (N, 2)."""
 
     def off_m(self, places_m: Array) -> Array:
         """Distance (N,) of positions (N, 2), positive to the right of the way: outside of a circle."""
 
 
 class Progress(Protocol):
-    """How far the task has been driven; follows the robot while the task runs."""
+    """Protocol of a task's progress, which follows the robot while the task runs."""
 
     @property
     def laps(self) -> float:
@@ -131,17 +131,17 @@ class Progress(Protocol):
         """Whether there is nothing left to drive."""
 
     def in_words(self) -> tuple[str, str]:
-        """What is counted, and how much of it, for a person."""
+        """Return the name of what is counted, and how much of it there is, as text."""
 
     def add(self, now_ns: int, x_m: float, y_m: float, yaw_rad: float) -> None:
-        """Take in the pose of one tick; the first one after a pause begins anew."""
+        """Take in the pose of one tick; the first one after a pause begins again."""
 
     def pause(self) -> None:
-        """The task does not run in this tick."""
+        """Note that the task does not run in this tick."""
 
 
 class Prepared(NamedTuple):
-    """What a plan needs of its task.
+    """Inputs of one plan from its task.
 
     `terms`: the compiled cost with its numbers in float32 (see above). `origin_m`: world position that
     rollouts are relative to, so that single precision is fine anywhere; `begin`: the memory that they start with.
@@ -161,7 +161,7 @@ class PlannedTask(Protocol):
         self, time_s: float, x_m: float, y_m: float, yaw_rad: float, memory: float | None, step_s: float, horizon: int,
         x_icr_m: float,
     ) -> Prepared:  # fmt: skip
-        """What a plan from here needs.
+        """Return the task's inputs for a plan that starts here.
 
         `time_s` since the planner's start, the pose in the world, the memory that the last plan handed back (None at
         the first), the steps that will be planned, and how far ahead of the tracked point the robot turns.
@@ -193,37 +193,37 @@ class RobotTask(Protocol):
         """The file that [task] names, relative to robot.toml."""
 
     def with_file(self, file: Path, robot: Chassis, judged: bool) -> Self:
-        """The task with what its file holds, judged for what the robot cannot get past unless it was driven before.
+        """Return the task with its file's contents; unless it was driven before, impossible ones are refused.
 
         Raises InputError naming file, line and remedy.
         """
 
     def fault(self) -> TaskFault | None:
-        """What is wrong with the fields of [task] taken together."""
+        """Return what is wrong with the fields of [task] taken together, or None."""
 
     def fastest_m_s(self, robot: Chassis) -> float:
         """Speed at which a wheel of the nominal robot is at its limit on this task."""
 
     def too_fast(self, robot: Chassis) -> str | None:
-        """Why the wheels of the nominal robot cannot do the task, and the remedy; None if they can."""
+        """Return why the wheels of the nominal robot cannot do the task, and the remedy; None if they can."""
 
     def editable(self, robot: Chassis) -> Mapping[str, Editable]:
-        """The fields that a person may change; the largest speed is that on the present line."""
+        """Return the fields that a person may change; the largest speed is that on the present line."""
 
     def editing_note(self, robot: Chassis) -> str:
-        """What the page says below those fields, and why there are none where there are none."""
+        """Return the text that the page shows below the editable fields, which also says why there are none."""
 
     def in_words(self) -> str:
-        """The task for a person."""
+        """Return the task as text."""
 
     def course(self) -> Course:
-        """Its line on the ground, the same one for every speed."""
+        """Return the task's line on the ground, the same one for every speed."""
 
     def progress(self) -> Progress:
-        """The progress of the task as it begins."""
+        """Return the progress of the task as it begins."""
 
     def planned(self, mode: str) -> PlannedTask:
-        """The task with the cost of the control mode, "default" or "paper"."""
+        """Return the task with the cost of the control mode, "default" or "paper"."""
 
 
 Found = tuple[float, float, float, float, float]
@@ -246,12 +246,12 @@ def norm_of_three(x: float, y: float, z: float) -> float:
 
 
 def single(value: float) -> float:
-    """A number in single precision, for the terms of a cost and its constants."""
+    """Return a number in single precision, for the terms of a cost and its constants."""
     return cast(float, np.float32(value))
 
 
 def constant(value: float, like: float) -> float:
-    """A number in the precision of another one."""
+    """Return a number in the precision of another one."""
     return value
 
 
@@ -284,12 +284,12 @@ def _task_in(module: str) -> type[RobotTask] | None:
 
 
 def kinds() -> tuple[str, ...]:
-    """All kinds of tasks, in alphabetical order."""
+    """Return all kinds of tasks, in alphabetical order."""
     return tuple(sorted(name for name in _modules() if _task_in(name) is not None))
 
 
 def task_class(kind: str) -> type[RobotTask]:
-    """The struct that holds [task] of this kind; raises UnknownKind."""
+    """Return the struct that holds [task] of this kind; raises UnknownKind."""
     found = _task_in(kind) if kind in _modules() else None
     if found is None:
         raise UnknownKind(f"{kind!r} is no kind of task; write one of {', '.join(kinds())}")
@@ -297,17 +297,17 @@ def task_class(kind: str) -> type[RobotTask]:
 
 
 def kind_of(task: RobotTask) -> str:
-    """The kind of a task, as robot.toml names it."""
+    """Return the kind of a task, as robot.toml names it."""
     return type(task).__module__.rpartition(".")[2]
 
 
 def default_task() -> RobotTask:
-    """The task of a robot.toml without [task]."""
+    """Return the task of a robot.toml without [task]."""
     return task_from({})
 
 
 def task_from(section: Mapping[str, Any]) -> RobotTask:
-    """The task that [task] of robot.toml says, validated; the files that it names are not read.
+    """Return the task that [task] of robot.toml says, validated; the files that it names are not read.
 
     Without `kind` it is of the kind that claims one of the section's fields, else of the kind that claims none in
     particular. Raises UnknownKind, ReadField, and msgspec.ValidationError for fields that the kind does not have or

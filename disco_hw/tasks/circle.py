@@ -1,4 +1,4 @@
-"""The paper's task: follow a circle at a constant speed, counter-clockwise (section V-B)."""
+"""Task of the paper: follow a circle at a constant speed, counter-clockwise (section V-B)."""
 
 from __future__ import annotations
 
@@ -60,15 +60,15 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
     @property
     def file(self) -> str | None:
-        """None: the fields say all."""
+        """Always None, because a circle is described by its fields alone."""
         return None
 
     def with_file(self, _file: Path, _robot: Chassis, _judged: bool) -> Self:
-        """Itself."""
+        """Return the task unchanged, because it has no file."""
         return self
 
     def fault(self) -> TaskFault | None:
-        """A circle that goes where no pose is known."""
+        """Return a fault for a circle that goes where no pose is known, else None."""
         for field in ("center_x_m", "center_y_m"):
             farthest_m = abs(getattr(self, field)) + self.radius_m
             if farthest_m > FARTHEST_M:
@@ -85,7 +85,7 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         return robot.max_wheel_speed_rad_s * robot.wheel_radius_m / outer
 
     def too_fast(self, robot: Chassis) -> str | None:
-        """Why the outer wheel cannot do it, and the remedy; None if it can."""
+        """Return why the outer wheel cannot do the task, and the remedy; None if it can."""
         fastest = self.fastest_m_s(robot)
         if self.speed_m_s <= fastest:
             return None
@@ -95,7 +95,7 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         )
 
     def editable(self, robot: Chassis) -> Mapping[str, Editable]:
-        """All fields; the speed's largest value is that on the present radius."""
+        """Return the ranges of all fields; the largest speed is that on the present radius."""
         return {
             "radius_m": Editable(*RADIUS_M, "Radius (m)"),
             "speed_m_s": Editable(SLOWEST_M_S, self.fastest_m_s(robot), "Speed (m/s)"),
@@ -104,7 +104,7 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         }
 
     def editing_note(self, robot: Chassis) -> str:
-        """The range of the radius and the largest speed."""
+        """Return the range of the radius and the largest speed."""
         low, high = RADIUS_M
         return f"Radius {low:g} to {high:g} m; at {self.radius_m:g} m at most {self.fastest_m_s(robot):.3f} m/s."
 
@@ -114,7 +114,7 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         return f"circle of {self.radius_m:g} m about {centre} at {self.speed_m_s:g} m/s"
 
     def course(self) -> CircleCourse:
-        """The circle."""
+        """Return the circle as a course."""
         return CircleCourse(self.center_x_m, self.center_y_m, self.radius_m)
 
     def progress(self) -> LapCounter:
@@ -122,7 +122,7 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         return LapCounter(self.center_x_m, self.center_y_m)
 
     def planned(self, mode: str) -> CircleCost:
-        """The circle with the cost of the control mode."""
+        """Return the circle with the cost of the control mode."""
         cost = CircleCost(self.center_x_m, self.center_y_m, self.radius_m, self.speed_m_s)
         return cost.paper() if mode == "paper" else cost
 
@@ -131,7 +131,7 @@ TASK = CircleTask
 
 
 def circle_task(task: RobotTask, purpose: str) -> CircleTask:
-    """The task, which `purpose` needs to be a circle; raises InputError for another."""
+    """Return the task, which `purpose` needs to be a circle; raises InputError for another."""
     if not isinstance(task, CircleTask):
         raise InputError(f'{purpose} needs a circle: write kind = "circle" with radius_m and speed_m_s in [task]')
     return task
@@ -147,22 +147,22 @@ class CircleCourse:
 
     @property
     def noun(self) -> str:
-        """What it is called."""
+        """Name of the course, "circle"."""
         return "circle"
 
     @property
     def middle_m(self) -> Point:
-        """The centre."""
+        """Centre of the circle: x, y (m)."""
         return self.center_x_m, self.center_y_m
 
     @property
     def reach_m(self) -> float:
-        """The radius."""
+        """Radius of the circle, m."""
         return self.radius_m
 
     @property
     def length_m(self) -> float:
-        """The circumference."""
+        """Circumference of the circle, m."""
         return 2.0 * math.pi * self.radius_m
 
     @property
@@ -197,11 +197,11 @@ class LapCounter:
 
     @property
     def finished(self) -> bool:
-        """Never: a circle has no end."""
+        """Always False, because a circle has no end."""
         return False
 
     def in_words(self) -> tuple[str, str]:
-        """Laps."""
+        """Return the word "laps" and their number as text."""
         return "laps", f"{self.laps:.2f}"
 
     def add(self, _now_ns: int, x_m: float, y_m: float, _yaw_rad: float) -> None:
@@ -214,7 +214,7 @@ class LapCounter:
         self._last_rad = angle
 
     def pause(self) -> None:
-        """The task does not run in this tick."""
+        """Note that the task does not run in this tick."""
         self._paused = True
 
 
@@ -243,7 +243,7 @@ class CircleCost:
     against_m: float = 0.6
 
     def paper(self) -> CircleCost:
-        """The same circle with the paper's cost alone."""
+        """Return a cost of the same circle with the paper's terms alone."""
         return replace(self, progress_weight=0.0, terminal_m=0.0, against_m=0.0)
 
     def prepare(
@@ -254,14 +254,14 @@ class CircleCost:
         return _prepared(self, step_s, horizon, x_icr_m)
 
     def line_m(self) -> Array:
-        """The circle as points (N, 2), counter-clockwise and closed."""
+        """Return the circle as points (N, 2), counter-clockwise and closed."""
         angle = np.linspace(0.0, 2.0 * math.pi, 361)
         return np.array([self.center_x_m, self.center_y_m]) + self.radius_m * np.column_stack(
             [np.cos(angle), np.sin(angle)]
         )
 
     def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
-        """The paper's instant cost of a state."""
+        """Return the paper's instant cost of a state."""
         distance = math.hypot(x_m - self.center_x_m, y_m - self.center_y_m) - self.radius_m
         return math.hypot(distance, forward_m_s - self.speed_m_s)
 
@@ -292,7 +292,7 @@ class CircleTerms(NamedTuple):
         return math.atan2(y, x)
 
     def line_at(self, place: float, ahead_m: float) -> tuple[float, float, float, float, float, float]:
-        """The point so much further round, how a robot that stays on the circle is turned there, and how fast it is."""
+        """Return the point `ahead_m` further round, the robot's heading on the circle there, and its speed."""
         angle = place + ahead_m / self.radius_m
         cosine, sine = math.cos(angle), math.sin(angle)
         head_x = -sine * self.turned_cos - cosine * self.turned_sin
@@ -303,7 +303,10 @@ class CircleTerms(NamedTuple):
         self, memory: float, step: int, x_old: float, y_old: float, x: float, y: float,
         cos_yaw: float, sin_yaw: float, forward: float, found: Found,
     ) -> tuple[float, float]:  # fmt: skip
-        """The paper's c, and the angle swept about the centre (rad); near the centre steps count less than theirs."""
+        """Return the paper's c, and the angle swept about the centre (rad).
+
+        Near the centre steps count less than theirs.
+        """
         rho, inverse = norm_and_inverse(x, y)
         off_edge = rho - self.radius_m
         off_speed = forward - self.speed_m_s
@@ -313,7 +316,7 @@ class CircleTerms(NamedTuple):
         return math.sqrt(off_edge * off_edge + off_speed * off_speed) + against, swept
 
     def terminal(self, memory: float, x: float, y: float, cos_yaw: float, sin_yaw: float, found: Found) -> float:
-        """The progress that is missing at the end, and the distance to the edge and the heading that are left."""
+        """Return the progress missing at the end, and the distance to the edge and the heading that are left."""
         lost = self.progress_weight * max(self.wanted - memory * self.per_rad, _ZERO)
         rho, inverse = norm_and_inverse(x, y)
         along, inwards = (x * sin_yaw - y * cos_yaw) * inverse, -(x * cos_yaw + y * sin_yaw) * inverse

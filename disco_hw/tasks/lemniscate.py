@@ -44,15 +44,15 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
     @property
     def file(self) -> str | None:
-        """None: the fields say all."""
+        """Always None, because a lemniscate is described by its fields alone."""
         return None
 
     def with_file(self, _file: Path, _robot: Chassis, _judged: bool) -> Self:
-        """Itself."""
+        """Return the task unchanged, because it has no file."""
         return self
 
     def fault(self) -> TaskFault | None:
-        """A figure that goes where no pose is known."""
+        """Return a fault for a figure that goes where no pose is known, else None."""
         for field in ("center_x_m", "center_y_m"):
             farthest_m = abs(getattr(self, field)) + self.size_m
             if farthest_m > FARTHEST_M:
@@ -69,7 +69,7 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         return robot.max_wheel_speed_rad_s * robot.wheel_radius_m / outer
 
     def too_fast(self, robot: Chassis) -> str | None:
-        """Why the outer wheel cannot do it, and the remedy; None if it can."""
+        """Return why the outer wheel cannot do the task, and the remedy; None if it can."""
         fastest = self.fastest_m_s(robot)
         if self.speed_m_s <= fastest:
             return None
@@ -79,7 +79,7 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         )
 
     def editable(self, robot: Chassis) -> Mapping[str, Editable]:
-        """All fields; the speed's largest value is that on the present size."""
+        """Return the ranges of all fields; the largest speed is that on the present size."""
         return {
             "size_m": Editable(*SIZE_M, "Size (m)"),
             "speed_m_s": Editable(SLOWEST_M_S, self.fastest_m_s(robot), "Speed (m/s)"),
@@ -88,7 +88,7 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         }
 
     def editing_note(self, robot: Chassis) -> str:
-        """The largest speed."""
+        """Return a sentence with the largest speed on the present size."""
         return f"At a size of {self.size_m:g} m at most {self.fastest_m_s(robot):.3f} m/s."
 
     def in_words(self) -> str:
@@ -97,11 +97,11 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         return f"lemniscate of {self.size_m:g} m about {centre} at {self.speed_m_s:g} m/s"
 
     def points(self) -> tuple[Point, ...]:
-        """The figure as way-points: from the crossing along the lobe to the right, the last on the first."""
+        """Return the figure as way-points: from the crossing along the lobe to the right, the last on the first."""
         return _points(self.center_x_m, self.center_y_m, self.size_m)
 
     def course(self) -> LineCourse:
-        """The line through the figure's points."""
+        """Return the line through the figure's points."""
         return line_course(self.points(), "lemniscate")
 
     def progress(self) -> PathProgress:
@@ -109,7 +109,7 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         return PathProgress(PathTable(np.array(self.points())))
 
     def planned(self, _mode: str) -> PathCost:
-        """The figure with the cost of a path, the same in every mode."""
+        """Return the figure with the cost of a path, the same in every mode."""
         return PathCost(PathTable(np.array(self.points())), self.speed_m_s)
 
 

@@ -45,11 +45,11 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def file(self) -> str | None:
-        """The CSV."""
+        """Path of the CSV file with the way-points."""
         return self.path
 
     def with_file(self, file: Path, _robot: Chassis, judged: bool) -> Self:
-        """The task with the way-points of a CSV.
+        """Return the task with the way-points of a CSV.
 
         Raises InputError as `load_waypoints`, and for times, for too many way-points, for a path that is too short or
         too long, for a way-point further from the origin than poses go, and, if it is `judged`, for hairpins.
@@ -69,7 +69,7 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return msgspec.structs.replace(self, points=points_of(found))
 
     def fault(self) -> TaskFault | None:
-        """None: what can be wrong is in the file."""
+        """Return None: only the way-points' file can be wrong."""
         return None
 
     def fastest_m_s(self, robot: Chassis) -> float:
@@ -77,15 +77,15 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return straight_fastest_m_s(robot)
 
     def too_fast(self, robot: Chassis) -> str | None:
-        """Why the wheels cannot do it, and the remedy; None if they can."""
+        """Return why the wheels cannot do the task, and the remedy; None if they can."""
         return straight_too_fast(self.speed_m_s, robot)
 
     def editable(self, robot: Chassis) -> Mapping[str, Editable]:
-        """The speed."""
+        """Return the range of the speed, the only field to edit."""
         return speed_range(robot)
 
     def editing_note(self, robot: Chassis) -> str:
-        """The largest speed."""
+        """Return a sentence with the largest speed on this path."""
         return f"At most {self.fastest_m_s(robot):.3f} m/s."
 
     def in_words(self) -> str:
@@ -93,7 +93,7 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return f"path {self.path} of {self.course().length_m:.2f} m at {self.speed_m_s:g} m/s"
 
     def course(self) -> LineCourse:
-        """The line through the way-points."""
+        """Return the line through the way-points."""
         return line_course(self.points, "path")
 
     def progress(self) -> PathProgress:
@@ -101,7 +101,7 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return PathProgress(PathTable(np.array(self.points)))
 
     def planned(self, _mode: str) -> PathCost:
-        """The path with its cost, the same in every mode."""
+        """Return the path with its cost, the same in every mode."""
         return PathCost(PathTable(np.array(self.points)), self.speed_m_s)
 
 

@@ -53,16 +53,16 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     @property
     def reference_speed_m_s(self) -> float:
-        """NaN: way-points by time have no one speed."""
+        """Always NaN, because a timed path has no single reference speed."""
         return math.nan
 
     @property
     def file(self) -> str | None:
-        """The CSV."""
+        """Path of the CSV file with the timed way-points."""
         return self.path
 
     def with_file(self, file: Path, robot: Chassis, _judged: bool) -> Self:
-        """The task with the way-points and times of a CSV.
+        """Return the task with the way-points and times of a CSV.
 
         Raises InputError as `load_waypoints`, and for missing times, for a first time before the start, for too many
         way-points, for a path that is too short or too long, for a way-point further from the origin than poses go, and
@@ -93,7 +93,7 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         return msgspec.structs.replace(self, points=points_of(found), times_s=tuple(times.tolist()))
 
     def fault(self) -> TaskFault | None:
-        """None: what can be wrong is in the file."""
+        """Return None: only the way-points' file can be wrong."""
         return None
 
     def fastest_m_s(self, robot: Chassis) -> float:
@@ -101,15 +101,15 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         return straight_fastest_m_s(robot)
 
     def too_fast(self, robot: Chassis) -> str | None:
-        """Why the wheels cannot do it, and the remedy; None if they can."""
+        """Return why the wheels cannot do the task, and the remedy; None if they can."""
         return straight_too_fast(self.speed_m_s, robot)
 
     def editable(self, _robot: Chassis) -> Mapping[str, Editable]:
-        """Nothing."""
+        """Return an empty mapping, because no field can be edited."""
         return {}
 
     def editing_note(self, _robot: Chassis) -> str:
-        """Why nothing can be changed."""
+        """Return a sentence on why nothing can be changed."""
         return "Its way-points have times, which say all; change t_s in their CSV and start anew."
 
     def in_words(self) -> str:
@@ -118,15 +118,15 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         return f"path {self.path} of {length_m:.2f} m in {self.times_s[-1]:g} s, at most {self.speed_m_s:.3g} m/s"
 
     def course(self) -> LineCourse:
-        """The line through the way-points."""
+        """Return the line through the way-points."""
         return line_course(self.points, "timed path")
 
     def progress(self) -> TimedProgress:
-        """The part of the way that is due."""
+        """Create the progress, which is the part of the way that is due."""
         return TimedProgress(self.points, self.times_s)
 
     def planned(self, _mode: str) -> TimedPathCost:
-        """The way-points with their cost, the same in every mode."""
+        """Return the way-points with their cost, the same in every mode."""
         return TimedPathCost(Waypoints(np.array(self.points), np.array(self.times_s)))
 
 
@@ -165,7 +165,7 @@ class TimedProgress:
         self._off_m = math.dist((x_m, y_m), self._end_m)
 
     def pause(self) -> None:
-        """The task does not run in this tick."""
+        """Note that the task does not run in this tick."""
         self._begun_ns = None
 
 
@@ -209,7 +209,7 @@ class TimedPathCost:
 
 
 class TimedPathTerms(NamedTuple):
-    """Where to be at the end of each step: `x`, `y` (T,) m; and which way that goes, `along_x`, `along_y` (T,).
+    """Desired position at each step's end, `x`, `y` (T,) m, and the direction it moves in, `along_x`, `along_y` (T,).
 
     The latter are of length one, or zero while the place rests.
     """
@@ -228,5 +228,5 @@ class TimedPathTerms(NamedTuple):
         return norm(x - self.x[step], y - self.y[step]) + _AGAINST * against, memory
 
     def terminal(self, memory: float, x: float, y: float, cos_yaw: float, sin_yaw: float, found: Found) -> float:
-        """Nothing."""
+        """Return zero, because there is no terminal cost."""
         return _ZERO

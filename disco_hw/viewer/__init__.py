@@ -1,4 +1,4 @@
-"""The page: the robot, its task and why it does what it does, live from the daemon and from a recorded log.
+"""Page that shows the robot, its task and why it does what it does, live from the daemon and from a recorded log.
 
 Here the live page as a process of its own beside a daemon, where it is found, and the token that opens it.
 """
@@ -64,7 +64,7 @@ class PageProcess:
         return news
 
     def close(self) -> None:
-        """End the page; one that does not end in time is killed."""
+        """Stop the page's process; one that does not end in time is killed."""
         with self._lock:
             self._ending.set()
             process = self._process
@@ -134,7 +134,7 @@ def page_beside(
 
 
 def _token_or_given() -> str:
-    """A token for the page; one that the environment gives wrongly stays as it is, and the page refuses it."""
+    """Return a token for the page; one that the environment gives wrongly stays as it is, and the page refuses it."""
     try:
         return page_token()
     except ValueError:
@@ -142,7 +142,7 @@ def _token_or_given() -> str:
 
 
 def page_token() -> str:
-    """The token of the page about to start: what $DISCO_HW_PAGE_TOKEN says, else one that nobody can guess.
+    """Return the token of the page about to start: what $DISCO_HW_PAGE_TOKEN says, else one that nobody can guess.
 
     In a variable, and not in an argument, as other users can read the arguments of a process. Raises ValueError for
     one of less than 16 characters or with others than letters, digits, - and _.

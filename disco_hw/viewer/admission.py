@@ -1,4 +1,4 @@
-"""Which connections to the page's server may stay open before they have shown the token.
+"""Admission of connections that may stay open at the page's server before they have shown the token.
 
 Any user of the machine can connect to the page. Without a bound, connections that send nothing take every file
 descriptor of the process and every turn of its event loop.
@@ -104,7 +104,7 @@ class _CountedConnection(ServerConnection):
 
 
 def counted_connections(admission: Admission) -> Callable[..., ServerConnection]:
-    """What `websockets.asyncio.server.serve` takes as `create_connection`."""
+    """Return a factory for `create_connection` of `websockets.asyncio.server.serve` that counts connections."""
 
     def create(*arguments: Any, **options: Any) -> ServerConnection:
         return _CountedConnection(admission, *arguments, **options)

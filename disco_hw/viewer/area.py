@@ -21,13 +21,13 @@ _NUMBERS_OF_CIRCLE = 3
 
 
 def obstacle_outlines(guard: records.GuardVerdict | None) -> list[Array]:
-    """The obstacles of a record of the guard as closed lines (N, 2)."""
+    """Return the obstacles of a record of the guard as closed lines (N, 2)."""
     numbers = () if guard is None else guard.obstacles
     return [circle_outline(*numbers[k : k + _NUMBERS_OF_CIRCLE]) for k in range(0, len(numbers), _NUMBERS_OF_CIRCLE)]
 
 
 def stopping_outlines(guard: records.GuardVerdict | None, footprint: Footprint) -> list[Array]:
-    """The stopping path of a record of the guard, and the footprint at its beginning and its end, as lines (N, 2)."""
+    """Return a guard record's stopping path, and the footprint at its beginning and end, as lines (N, 2)."""
     if guard is None or not guard.path_x_m:
         return []
     poses = list(zip(guard.path_x_m, guard.path_y_m, guard.path_yaw_rad, strict=True))
@@ -102,10 +102,10 @@ class FenceEditor:
 
 
 def in_text(shapes: Any) -> str:
-    """A shape, or several, as the page's fields show them."""
+    """Return a shape, or several, as the page's fields show them."""
     return "" if shapes is None else json.dumps(msgspec.to_builtins(shapes))
 
 
 def fence_in_force(fence: Fence, record: records.FenceChange | None) -> Fence:
-    """The fence where this record of it is the newest; robot.toml's, `fence`, without one."""
+    """Return the fence where this record of it is the newest; robot.toml's, `fence`, without one."""
     return fence if record is None else fence_of_record(record)

@@ -132,7 +132,7 @@ def _check_folder(out: Path) -> None:
 
 @contextmanager
 def _progress(title: str) -> Iterator[Callable[[float], None]]:
-    """A bar on standard error for the part done."""
+    """Show a bar on standard error for the part done."""
     with Progress(console=Console(stderr=True), transient=True) as bars:
         task = bars.add_task(title, total=1.0)
         yield lambda part: bars.update(task, completed=part)

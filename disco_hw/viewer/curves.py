@@ -237,6 +237,6 @@ def _line(name: str, number: int) -> dict[str, object]:
 
 
 def _columns(drawn: Curves) -> tuple[np.ndarray, ...]:
-    """Times and values without the rows in which a value is missing: the page's plots do not scale with them."""
+    """Return times and values without the rows in which a value is missing: the page's plots do not scale with them."""
     whole = np.all(np.isfinite(np.stack(tuple(drawn.values.values()))), axis=0)
     return (drawn.t_s[whole], *(values[whole] for values in drawn.values.values()))

@@ -72,7 +72,7 @@ class Desk:
         self._watch: asyncio.Task[None] | None = None
 
     def page(self, instance: str, token: str = "") -> bytes:
-        """The desk as HTML; `instance` is what this server says of itself under any of its names.
+        """Return the desk as HTML; `instance` is what this server says of itself under any of its names.
 
         `token` lets the scene in under this machine's other name; without it the scene stays under the desk's.
         """
@@ -128,7 +128,7 @@ class Desk:
         self._drags += 1
 
     def close(self) -> None:
-        """End the threads; safe to call twice."""
+        """Stop the desk's threads; safe to call twice."""
         for pool in (self._asking, self._stopping, self._watching):
             pool.shutdown(wait=False, cancel_futures=True)
         self._stop_line.close()
@@ -265,7 +265,7 @@ class _DriveLine:
         await self.close()
 
     async def close(self) -> None:
-        """Hang up; safe to call twice."""
+        """Close the line to the daemon; safe to call twice."""
         if self._reading is not None:
             self._reading.cancel()
         if self._writer is not None:
@@ -284,7 +284,7 @@ class _DriveLine:
 
 
 def _numbers(values: object) -> dict[str, float] | None:
-    """What a browser says of the task that it edits; None where that is nothing, or nothing but nonsense."""
+    """Return the numbers that a browser sent for the task that it edits; None where it sent no table."""
     if not isinstance(values, dict):
         return None
     return {
@@ -295,7 +295,7 @@ def _numbers(values: object) -> dict[str, float] | None:
 
 
 def _request(message: str | bytes) -> dict[str, Any] | None:
-    """A browser's message as a request, or None if it is none."""
+    """Return a browser's message as a request, or None if it is none."""
     if len(message) > _MOST_BYTES:
         return None
     try:

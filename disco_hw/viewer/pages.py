@@ -1,4 +1,4 @@
-"""The two pages: live, the feed of the daemon drawn some times a second beside the desk with its buttons; and replay.
+"""Pages of the viewer: live, the daemon's feed drawn some times a second beside the desk with its buttons; and replay.
 
 The replay shows one instant of a log at a time: by slider, by tick, by mark, or running.
 """
@@ -38,7 +38,7 @@ _STATUS_OLDER_NS = 2_000_000_000
 
 @dataclass(slots=True)
 class _Due:
-    """Something to do every `period_s`."""
+    """Timer of something to do every `period_s`."""
 
     period_s: float
     next_s: float = 0.0
@@ -174,7 +174,7 @@ class LivePage:
 
 
 def _belief_in_force(now_ns: int, adaptation: Mapping[str, Any] | None) -> BeliefChange:
-    """The belief of a status."""
+    """Return the belief of a status."""
     if adaptation is None or adaptation["belief"] != "adapted":
         return BeliefChange(now_ns, "model")
     mean = adaptation["mean"]
@@ -187,7 +187,7 @@ def _geometry(change: BeliefChange | None) -> tuple[tuple[float, ...], ...]:
 
 
 def run_live(page: LivePage, should_stop: Callable[[], bool]) -> None:
-    """Draw until told to stop."""
+    """Draw until requested to stop."""
     try:
         while not should_stop():
             page.step()
@@ -359,7 +359,7 @@ def _spread(marks: tuple[Mark, ...], count: int) -> list[Mark]:
 
 
 def run_replay(page: ReplayPage, should_stop: Callable[[], bool]) -> None:
-    """Draw until told to stop."""
+    """Draw until requested to stop."""
     before_s = time.monotonic()
     while not should_stop():
         now_s = time.monotonic()

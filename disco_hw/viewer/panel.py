@@ -185,7 +185,7 @@ def events_text(snapshot: Snapshot | None, first_ns: int | None) -> str:
 
 
 def number(value: float | None, digits: int) -> str:
-    """A number, or a dash where there is none."""
+    """Return a number, or a dash where there is none."""
     return _NO_NUMBER if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
 
 

@@ -86,7 +86,7 @@ def _writer(path: Path) -> AbstractMovieWriter:
 
 
 def _ffmpeg() -> str | None:
-    """The system's ffmpeg, or else the one of the extra `video`."""
+    """Return the system's ffmpeg, or else the one of the extra `video`."""
     found = shutil.which("ffmpeg")
     if found is not None:
         return found

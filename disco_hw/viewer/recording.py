@@ -1,4 +1,4 @@
-"""What the page shows: a robot (task, size, model), a log opened for looking at, and one instant of it.
+"""Data for the page: a robot (task, size, model), a log opened for looking at, and one instant of it.
 
 A log's timeline is in memory; its plans are read when one is needed.
 """
@@ -219,23 +219,23 @@ class ShownRobot:
     footprint: Footprint = Footprint(0.5, 0.4)  # noqa: RUF009 - it is frozen
 
     def task_at(self, record: Task | None) -> RobotTask:
-        """The task that is in force where this record of it is the newest; robot.toml's without one."""
+        """Return the task that is in force where this record of it is the newest; robot.toml's without one."""
         return self.task if record is None else task_of(record, self.task)
 
 
 def model_in_force(model: Model, change: BeliefChange | None) -> Model:
-    """The model with the belief that was put in force while driving; itself without one."""
+    """Return the model with the belief that was put in force while driving; itself without one."""
     learnt = None if change is None else geometry_of(change)
     return model if learnt is None else with_geometry(model, learnt)
 
 
 def stage_of_robot(robot_file: Path, model_file: Path | None = None) -> ShownRobot:
-    """From robot.toml and the model it names; raises InputError."""
+    """Create the stage from robot.toml and the model it names; raises InputError."""
     return _stage(load_setup(robot_file, model_file))
 
 
 def stage_of_log(log: Log, robot_file: Path | None = None) -> ShownRobot:
-    """From the files kept in the log, or from `robot_file` instead; raises InputError if there is neither."""
+    """Create the stage from the files kept in the log, or from `robot_file`; raises InputError without either."""
     if robot_file is not None:
         return stage_of_robot(robot_file)
     return _stage(setup_of_log(log, "name the robot with --robot"))
@@ -285,7 +285,7 @@ class Recording:
         self.close()
 
     def close(self) -> None:
-        """Close the file; safe to call twice."""
+        """Close the recording's file; safe to call twice."""
         self._log.close()
 
     @property
@@ -295,7 +295,7 @@ class Recording:
 
     @property
     def duration_s(self) -> float:
-        """From the first tick to the last."""
+        """Duration from the first tick to the last, s."""
         return float(self.ticks[-1] - self.ticks[0]) * 1e-9
 
     @property
@@ -305,12 +305,12 @@ class Recording:
         return (next(driven, self.first_ns) - self.first_ns) * 1e-9
 
     def at(self, t_s: float) -> Snapshot:
-        """The instant of the last tick at or before `t_s` seconds from the first; the ends beyond them."""
+        """Return the instant of the last tick at or before `t_s` seconds from the first; the ends beyond them."""
         t_ns = int(self.ticks[self.tick_at(t_s)])
         return snapshot_at(self.timeline, t_ns, self._plan_at(t_ns))
 
     def tick_at(self, t_s: float) -> int:
-        """Number of the last tick at or before `t_s`, from 0 on."""
+        """Return the number of the last tick at or before `t_s`, from 0 on."""
         t_ns = self.first_ns + round(t_s * 1e9)
         return min(max(int(np.searchsorted(self.ticks, t_ns, "right")) - 1, 0), len(self.ticks) - 1)
 

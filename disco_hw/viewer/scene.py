@@ -1,4 +1,7 @@
-"""The drawn scene: everything of a snapshot that has a place in the world. Live page, replay and export share it."""
+"""Scene of the viewer: everything of a snapshot that has a place in the world.
+
+Live page, replay and export share it. Live page, replay and export share it.
+"""
 
 from __future__ import annotations
 
@@ -320,7 +323,7 @@ def grid_lines(middle_m: tuple[float, float], size_m: float, cell_m: float) -> t
 
 
 def sparse(trail: Array, reach_m: float) -> Array:
-    """The points (N, 2) of a trail that are worth drawing, both ends among them: by distance, fewer where it is palest.
+    """Return the points (N, 2) of a trail worth drawing, with both ends: by distance, fewer where it is palest.
 
     A growing trail keeps the points it has, but for those that fall behind.
     """
@@ -342,7 +345,7 @@ def _line(task: RobotTask) -> Array:
 
 
 def _pose_marks(poses: Array) -> Array:
-    """A short stroke along the heading for each measured pose (N, 3); across, where it has none."""
+    """Return a short stroke along the heading for each measured pose (N, 3); across, where it has none."""
     if not len(poses):
         return np.empty((0, 2, 3))
     poses = np.nan_to_num(poses, nan=0.0)
@@ -407,7 +410,7 @@ def fan_paths(weights: Sequence[float], x_m: Sequence[float], y_m: Sequence[floa
 
 
 def faded(colours: Bytes, trail: Array, length_m: float, background: tuple[float, ...] = LIGHT) -> Bytes:
-    """The colours (N, 3) of a trail (N, 2): the farther behind its end, the nearer to the background, to `length_m`."""
+    """Return the colours (N, 3) of a trail (N, 2), which fade to the background with the distance behind its end."""
     steps_m = np.hypot(*np.diff(trail, axis=0).T)
     behind_m = np.append(np.cumsum(steps_m[::-1])[::-1], 0.0)
     part = np.clip(1.0 - behind_m / length_m, TRAIL_PALEST, 1.0)[:, None]
@@ -444,10 +447,10 @@ def instant_centre(
 
 
 def about_z(yaw_rad: float) -> tuple[float, float, float, float]:
-    """Unit quaternion (w, x, y, z) of a turn about the vertical."""
+    """Return unit quaternion (w, x, y, z) of a turn about the vertical."""
     return (math.cos(yaw_rad / 2.0), 0.0, 0.0, math.sin(yaw_rad / 2.0))
 
 
 def about_y(angle_rad: float) -> tuple[float, float, float, float]:
-    """Unit quaternion (w, x, y, z) of a turn about the axle, positive as a wheel turns that drives forward."""
+    """Return unit quaternion (w, x, y, z) of a turn about the axle, positive as a wheel turns that drives forward."""
     return (math.cos(angle_rad / 2.0), 0.0, math.sin(angle_rad / 2.0), 0.0)

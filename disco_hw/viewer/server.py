@@ -1,4 +1,4 @@
-"""The page's server: viser, closed to everybody but the operator.
+"""Server of the page: viser, closed to everybody but the operator.
 
 By itself viser listens to the whole network, takes another port when its own is in use, lets any web page open in the
 operator's browser press its buttons, and opens a public tunnel for any client that asks for one.
@@ -67,7 +67,7 @@ class Guard:
     alone: bool = False
 
     def refusal(self, path: str, headers: Headers, upgrade: bool) -> Response | None:
-        """The answer to a request that must not go on, or None."""
+        """Return the answer to a request that must not go on, or None."""
         if not self.open:
             return _plain(http.HTTPStatus.SERVICE_UNAVAILABLE, "the page is being made; load it again")
         host = headers.get("Host", "")
@@ -196,14 +196,14 @@ def _guarded(guard: Guard, desk: Desk | None, listener: socket.socket, admission
 
 @functools.lru_cache(maxsize=2)
 def _completed(page: bytes, zipped: bool) -> bytes:
-    """viser's page with ours added to its head."""
+    """Return viser's page with ours added to its head."""
     addition = files("disco_hw.viewer").joinpath("scene_page.html").read_bytes()
     plain = (gzip.decompress(page) if zipped else page).replace(b"</head>", addition + b"</head>", 1)
     return gzip.compress(plain) if zipped else plain
 
 
 def _desk_answer(desk: Desk, instance: str, guard: Guard, request: Request) -> Response | None:
-    """The desk's own pages; None for what belongs to the scene in it."""
+    """Return the desk's own pages; None for what belongs to the scene in it."""
     path = urlsplit(request.path).path
     if path == "/":
         return _answer(
@@ -220,7 +220,7 @@ def _desk_answer(desk: Desk, instance: str, guard: Guard, request: Request) -> R
 
 
 def _framers(request: Request) -> str:
-    """Who may show an answer in a frame: the desk its scene, under any name of this machine; nobody the desk itself."""
+    """Return who may frame a reply: the desk its scene, under any name of this machine; nobody the desk itself."""
     if urlsplit(request.path).path != "/index.html":
         return "'none'"
     port = urlsplit(f"//{request.headers.get('Host', '')}").port

@@ -1,4 +1,4 @@
-"""What is known of a run up to now, in columns that can be cut at any time; live page and replay fill the same one."""
+"""Timeline of a run up to now, in columns that can be cut at any time; live page and replay fill the same one."""
 
 from __future__ import annotations
 
@@ -54,14 +54,14 @@ class Series:
         self._count, self._new_times, self._new_rows = count, [], []
 
     def rows(self, first_ns: int, last_ns: int) -> tuple[Times, Array]:
-        """Times (N,) and rows (N, columns) with first_ns <= time <= last_ns; views, not copies."""
+        """Return times (N,) and rows (N, columns) with first_ns <= time <= last_ns; views, not copies."""
         self._take_in()
         times = self._times[: self._count]
         first, last = np.searchsorted(times, first_ns, "left"), np.searchsorted(times, last_ns, "right")
         return times[first:last], self._rows[first:last]
 
     def last(self, at_ns: int) -> tuple[int, Array] | None:
-        """The newest row known at `at_ns` and its time; None before the first."""
+        """Return the newest row known at `at_ns` and its time; None before the first."""
         self._take_in()
         index = int(np.searchsorted(self._times[: self._count], at_ns, "right")) - 1
         return None if index < 0 else (int(self._times[index]), self._rows[index])
@@ -95,12 +95,12 @@ class Items(Generic[Item]):
         self._items.append(item)
 
     def last(self, at_ns: int) -> Item | None:
-        """The newest one known at `at_ns`; None before the first."""
+        """Return the newest one known at `at_ns`; None before the first."""
         index = bisect_right(self._times, at_ns) - 1
         return None if index < 0 else self._items[index]
 
     def latest(self, at_ns: int, count: int) -> list[tuple[int, Item]]:
-        """The last `count` known at `at_ns`, oldest first."""
+        """Return the last `count` known at `at_ns`, oldest first."""
         end = bisect_right(self._times, at_ns)
         first = max(0, end - count)
         return list(zip(self._times[first:end], self._items[first:end], strict=True))
@@ -123,7 +123,7 @@ POWER = ("voltage_v", "current_a", "temperature_c")
 
 
 class Timeline:
-    """Every series of a run, and whole plans where it is given them; a replay reads these from its log when needed."""
+    """Timeline with every series of a run, and whole plans where it is given them; a replay reads these itself."""
 
     def __init__(self) -> None:
         self.first_ns: int | None = None
@@ -229,7 +229,7 @@ _APART_NS = 500_000_000
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """Something that happened at `t_ns`: its kind, and what it was in words."""
+    """Mark of something that happened at `t_ns`: its kind, and what it was in words."""
 
     t_ns: int
     kind: str
@@ -237,7 +237,7 @@ class Mark:
 
 
 def marks_of(timeline: Timeline) -> tuple[Mark, ...]:
-    """All marks in order of time; of one kind that comes again within half a second only the first."""
+    """Return all marks in order of time; of one kind that comes again within half a second only the first."""
     marks = [
         *_faults(timeline),
         *(Mark(t_ns, EVENT, event.text) for t_ns, event in timeline.events),

@@ -1,4 +1,4 @@
-"""How the scene is looked at: the legend with a box for each layer, the camera's views, and the bar of a replay."""
+"""Views of the scene: the legend with a box for each layer, the camera's views, and the bar of a replay."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def top_camera(task: RobotTask) -> tuple[Point, Point]:
 
 
 def moved(camera: tuple[Point, Point], looks_at: tuple[float, float]) -> tuple[Point, Point]:
-    """The camera carried sideways until it looks at a place of the floor, from where it was beside that."""
+    """Return the camera carried sideways until it looks at a place of the floor, from where it was beside that."""
     (x_m, y_m, z_m), (at_x, at_y, at_z) = camera
     to_x, to_y = looks_at
     return (x_m + to_x - at_x, y_m + to_y - at_y, z_m), (to_x, to_y, at_z)
@@ -64,7 +64,7 @@ class Views:
                 _look(client, moved(_camera(client), self._place))
 
     def follow(self, pose: tuple[float, float, float] | None) -> None:
-        """The robot is here now."""
+        """Move the camera with the robot, which is here now."""
         self._place = self._place if pose is None else pose[:2]
         if self._place is None or not self._followers:
             return
@@ -88,7 +88,7 @@ def _look(client: viser.ClientHandle, camera: tuple[Point, Point]) -> None:
 
 
 def add_layers(server: viser.ViserServer, scene: Scene, changed: Callable[[], None]) -> None:
-    """The legend, one checkbox a layer, and dark or light; `changed` is called after each click."""
+    """Add the legend, one checkbox a layer, and dark or light; `changed` is called after each click."""
     gui = server.gui
     with gui.add_folder("Legend and layers", expand_by_default=False):
         gui.add_html(legend())
@@ -205,7 +205,7 @@ class ScrubBar:
         server.on_client_disconnect(self._remove)
 
     def show(self, t_s: float) -> None:
-        """The replay is here now."""
+        """Show that the replay is here now."""
         self._t_s = round(t_s, 3)
         for _, slider in tuple(self._bars.values()):
             slider.value = self._t_s  # type: ignore[misc]

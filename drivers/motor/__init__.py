@@ -49,7 +49,7 @@ class DriverFieldError(ValueError):
 
 @cache
 def motor_drivers() -> Mapping[str, MotorDriver]:
-    """By name: the `DRIVER` of each module in this folder that has one.
+    """Return the drivers by name: the `DRIVER` of each module in this folder that has one.
 
     Found when first asked for, not on import: `find_driver` reads the one that is asked for, and an e-stop no other.
     """
@@ -69,7 +69,7 @@ def find_driver(name: str | None) -> MotorDriver:
 
 
 def _module_names() -> list[str]:
-    """The modules of this folder; a driver's has its name."""
+    """Return the modules of this folder; a driver's has its name."""
     return [each.name for each in pkgutil.iter_modules(__path__)]
 
 
@@ -83,7 +83,10 @@ def make_driver(name: str | None, settings: Any = None, key: bytes | None = None
 
 
 def own_fields(name: str | None, fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of [link]'s fields that are the driver's own. Raises DriverFieldError for one of another driver's."""
+    """Return the fields of [link] that are the driver's own; raise DriverFieldError for one of another driver's.
+
+    Raises DriverFieldError for one of another driver's.
+    """
     found = find_driver(name)
     own = {field: value for field, value in fields.items() if field in found.settings.__struct_fields__}
     others = motor_drivers().values() if len(own) < len(fields) else ()
@@ -124,56 +127,56 @@ class RewiredDriver:
 
     @property
     def state(self) -> DriverState:
-        """The driver's."""
+        """State of the wrapped driver with its robot."""
         return self._driver.state
 
     @property
     def detail(self) -> str:
-        """The driver's."""
+        """Text of the wrapped driver on why the state is what it is."""
         return self._driver.detail
 
     @property
     def identity(self) -> Identity | None:
-        """The driver's."""
+        """Identity of the controller, from the wrapped driver."""
         return self._driver.identity
 
     @property
     def limits(self) -> Limits | None:
-        """The driver's."""
+        """Limits of the controller, from the wrapped driver."""
         return self._driver.limits
 
     @property
     def stats(self) -> DriverStats:
-        """The driver's."""
+        """Counters of the wrapped driver."""
         return self._driver.stats
 
     @property
     def clock_offset_ns(self) -> int | None:
-        """The driver's."""
+        """Offset from the controller's clock to the host's monotonic clock, in ns, from the wrapped driver."""
         return self._driver.clock_offset_ns
 
     def link_up(self, now_ns: int) -> None:
-        """Pass on."""
+        """Tell the wrapped driver that the link is up."""
         self._driver.link_up(now_ns)
 
     def link_down(self, now_ns: int) -> None:
-        """Pass on."""
+        """Tell the wrapped driver that the link is down."""
         self._driver.link_down(now_ns)
 
     def request(self, request: Request) -> None:
-        """Pass on."""
+        """Pass a request to the wrapped driver."""
         self._driver.request(request)
 
     def release(self, why: str) -> None:
-        """Pass on."""
+        """Pass a release to the wrapped driver."""
         self._driver.release(why)
 
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
-        """Pass on: an e-stop knows no sides."""
+        """Return the wrapped driver's e-stop frames, which are the same for any wiring."""
         return self._driver.estop(now_ns)
 
     def receive(self, now_ns: int, frames: Sequence[ReceivedFrame]) -> Readings:
-        """What the frames meant, of the wheels as they are wired."""
+        """Return the readings of the wrapped driver, with the wheels as they are wired."""
         readings = self._driver.receive(now_ns, frames)
         return msgspec.structs.replace(
             readings,
@@ -224,5 +227,5 @@ class RewiredDriver:
 
 
 def rewired(driver: Driver, wiring: Wiring) -> Driver:
-    """The driver for wheels that are wired so; itself where nothing is to be changed."""
+    """Return the driver for wheels that are wired so; the driver itself where nothing is to be changed."""
     return driver if wiring == AS_TOLD else RewiredDriver(driver, wiring)

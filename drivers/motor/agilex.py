@@ -46,7 +46,7 @@ _HOST_COMMANDS = frozenset({protocol.MOTION_COMMAND, protocol.CONTROL_MODE, prot
 
 
 class AgilexPort:
-    """Satisfies `drivers.motor.vendor_driver.Port`."""
+    """Port of `VendorDriver` for AgileX bases (a `drivers.motor.vendor_driver.Port`)."""
 
     def __init__(self, settings: AgilexSettings) -> None:
         self._settings = settings
@@ -59,7 +59,7 @@ class AgilexPort:
 
     @property
     def seen(self) -> Controllers:
-        """How the base is."""
+        """State of the base, as received last."""
         heard = None not in (self._state_ns, self._motion_ns, self._driven_mm[0].last)
         faulty = self._vehicle == protocol.EXCEPTION or bool(self._error & ~_WARNINGS)
         words = f"the base reports an error ({self._error:#06x}); its manual's table of faults names it"
@@ -74,12 +74,12 @@ class AgilexPort:
 
     @property
     def identity(self) -> Identity | None:
-        """What answers as these bases do."""
+        """Identity of an AgileX base; None before it has reported its state."""
         return None if self._state_ns is None else Identity("AgileX base, CAN v2", "", "robot.toml")
 
     @property
     def limits(self) -> Limits:
-        """What robot.toml declares of the base, and the time-out of them all."""
+        """Limits that robot.toml declares of the base, and the time-out that all of them have."""
         fastest_rad_s = self._settings.max_speed_m_s / self._settings.wheel_radius_m
         return parts.limits(
             Limit(fastest_rad_s, "robot.toml"), Limit(TIMEOUT_S, "fixed"), self.table.stop_deceleration_rad_s2
@@ -131,14 +131,14 @@ class AgilexPort:
         return Heard()
 
     def sources(self) -> Sequence[Source]:
-        """Its state and its motion."""
+        """Return the sources that must report again and again: the base's state and its motion."""
         return (
             Source("the base", self._state_ns, STATE_SILENT_NS, GONE_NS),
             Source("the base's motion", self._motion_ns, MOTION_SILENT_NS),
         )
 
     def objection(self, permit: MotionPermit) -> Objection | None:
-        """A button, an error, or another mode; a person who takes the remote control is no fault."""
+        """Return what keeps the base from being driven: a button, an error, or another mode, but no remote control."""
         seen = self.seen
         if seen.stopped is not None:
             return Objection("a button on the base was pressed")
@@ -160,7 +160,7 @@ class AgilexPort:
         return None
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """The motion of the body, by the nominal geometry."""
+        """Return the frames that command the body's motion, by the nominal geometry."""
         it = self._settings
         body = parts.body_speeds(left_rad_s, right_rad_s, it.wheel_radius_m, it.track_m, it.max_speed_m_s)
         return (protocol.motion(*body),)
@@ -173,7 +173,7 @@ class AgilexPort:
         return (protocol.motion(0.0, 0.0),), False
 
     def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
-        """Bring a base that listens to CAN to standby, standing; clear errors when asked."""
+        """Bring a base that listens to CAN to standby, standing; clear errors when requested."""
         if now_ns - self._repeat_ns < _REPEAT_NS:
             return ()
         seen = self.seen
@@ -188,11 +188,11 @@ class AgilexPort:
         return True
 
     def questions(self, now_ns: int, permit: MotionPermit) -> tuple[OutgoingFrame, ...]:
-        """None: the base sends all by itself."""
+        """Return no frames: the base sends everything by itself."""
         return ()
 
     def stop_frames(self) -> tuple[Frame, ...]:
-        """Zero and standby."""
+        """Return the frames that command zero and standby."""
         return stop_frames(self._settings)
 
     def _take_odometry(self, counts_mm: tuple[int, int], t_ns: int, looked_ns: int) -> Heard:

@@ -29,7 +29,7 @@ _I16 = (-32768, 32767)
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """A message: its name, the bytes by `struct`, and each field with what one step of it is worth."""
+    """Layout of a message: its name, the bytes by `struct`, and each field with what one step of it is worth."""
 
     name: str
     body: str
@@ -126,7 +126,7 @@ max_speed_m_s = 1.5
 
 
 class AgilexSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Its fields in [link]: the base takes speeds of the body, which these turn wheel speeds into and back.
+    """Settings of AgileX bases in [link], which turn wheel speeds into speeds of the body and back.
 
     `wheel_radius_m` and `track_m` are the nominal ones: write those of [robot], and leave them when the model learns
     others. `max_speed_m_s` is what the base can do.
@@ -138,12 +138,12 @@ class AgilexSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
 
     def fault(self) -> SettingsFault | None:
-        """Nothing that a single field does not show."""
+        """Return None, because each field shows its own faults."""
         return None
 
 
 def stop_frames(_settings: AgilexSettings) -> tuple[Frame, ...]:
-    """Zero and standby: the base has no e-stop by frame."""
+    """Return the frames for zero and standby, because the base has no e-stop by frame."""
     return motion(0.0, 0.0), control_mode(STANDBY)
 
 
@@ -154,7 +154,7 @@ def stands(motion: Decoded) -> bool:
 
 
 def cyclic_frames(_settings: AgilexSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:
-    """The command, and what the base sends as its manual says."""
+    """Return the frames of each period: the command, and what the base sends as its manual says."""
     sent = {"state": 10.0, "motion": 50.0, "odometry": 50.0, "motors": 200.0, "drivers": 40.0, "remote control": 50.0}
     return (
         CyclicFrame("motion command", "HOST", 8, command_rate_hz),
@@ -163,13 +163,13 @@ def cyclic_frames(_settings: AgilexSettings, command_rate_hz: float, _authentica
 
 
 def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
-    """Nothing but that it is one: a base says who it is by its state and its motion, and nothing of its measures."""
+    """Return an empty dict if an AgileX base answers, else None: it shows its kind, but none of its measures."""
     heard = [frame.can_id for frame in frames if decode(frame) is not None]
     return {} if min(heard.count(SYSTEM_STATE), heard.count(MOTION_STATE)) >= _HEARD else None
 
 
 def safety_card(settings: AgilexSettings) -> SafetyCard:
-    """Who stops the robot when."""
+    """Return the safety card of AgileX bases."""
     return SafetyCard(
         host_silent=f"the base {TIMEOUT_S:g} s after the last motion command; this cannot be changed",
         stops_by=f"slowing down by itself; at {settings.max_speed_m_s:g} m/s it has gone "

@@ -62,7 +62,7 @@ _QUIET = frozenset({AxisState.UNDEFINED, AxisState.IDLE, AxisState.CLOSED_LOOP})
 
 @dataclass(slots=True)
 class _Axis:
-    """What is known of one node; turns are of the motor."""
+    """State of one ODrive node; turns are of the motor."""
 
     node: int
     heard_ns: int | None = None
@@ -73,7 +73,7 @@ class _Axis:
 
 
 class OdrivePort:
-    """Satisfies `drivers.motor.vendor_driver.Port`."""
+    """Port of `VendorDriver` for ODrive boards (a `drivers.motor.vendor_driver.Port`)."""
 
     def __init__(self, settings: OdriveSettings) -> None:
         self._settings = settings
@@ -86,7 +86,7 @@ class OdrivePort:
 
     @property
     def seen(self) -> Controllers:
-        """How the axes are."""
+        """State of the axes, as received last."""
         silent = ", ".join(str(axis.node) for axis in self._all if axis.heard_ns is None)
         unheard = f"no heartbeat of node {silent}; is it switched on, at this bit rate, at this id?"
         stopped = any(axis.error & ESTOP_ERROR[self._generation] for axis in self._all)
@@ -101,7 +101,7 @@ class OdrivePort:
 
     @property
     def identity(self) -> Identity | None:
-        """What answers as an ODrive; 0.5 does not report its version."""
+        """Identity of the ODrives; firmware 0.5 does not report its version. None before all is known or if refused."""
         if not self._questions.known or self._questions.refusal is not None:
             return None
         if self._questions.version:
@@ -110,7 +110,7 @@ class OdrivePort:
 
     @property
     def limits(self) -> Limits:
-        """What robot.toml declares, and the watchdog where it can be read back."""
+        """Limits that robot.toml declares, and the watchdog where it can be read back."""
         it = self._settings
         fastest = Limit(2.0 * math.pi * it.vel_limit_turns_s / it.gear, "robot.toml")
         return parts.limits(
@@ -126,7 +126,7 @@ class OdrivePort:
         return all(axis.error & estop and axis.state != AxisState.CLOSED_LOOP for axis in self._all)
 
     def begin_anew(self, now_ns: int) -> None:
-        """Forget what the axes said."""
+        """Clear what the axes reported."""
         self._questions.begin_anew(now_ns)
         for axis in self._all:
             axis.heard_ns = None
@@ -161,13 +161,13 @@ class OdrivePort:
         return Heard()
 
     def sources(self) -> Sequence[Source]:
-        """The heartbeats of every axis."""
+        """Return the sources that must report again and again: the heartbeats of every axis."""
         silent_ns = max(SILENT_BEATS * self._settings.heartbeat_s * 1e9, SILENT_AT_LEAST_NS)
         gone_ns = max(2.0 * silent_ns, 5e8)
         return [Source(f"node {axis.node}", axis.heard_ns, silent_ns, gone_ns) for axis in self._all]
 
     def objection(self, permit: MotionPermit) -> Objection | None:
-        """An error, or an axis that has left closed loop by itself."""
+        """Return what ends a drive: an error, or an axis that has left closed loop by itself."""
         for axis in self._all:
             if permit.stage is Stage.ARMED and (axis.error or axis.state != AxisState.CLOSED_LOOP):
                 idles = f"it left closed loop by itself, for state {axis.state}"
@@ -204,7 +204,7 @@ class OdrivePort:
         return Pending(why=why, frames=tuple(frames))
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """The velocity of each axis."""
+        """Return the frames that command the velocity of each axis."""
         limit = self._settings.vel_limit_turns_s
         frames = []
         for side, direction, speed in zip(
@@ -249,7 +249,7 @@ class OdrivePort:
         return ()
 
     def stop_frames(self) -> tuple[Frame, ...]:
-        """The e-stop to every axis."""
+        """Return the e-stop frames to every axis."""
         return stop_frames(self._settings)
 
     @property

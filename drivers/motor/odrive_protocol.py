@@ -28,7 +28,7 @@ Value = float | int
 
 
 class Generation(enum.Enum):
-    """Of the firmware; 0.6 and later speak the same."""
+    """Generations of the firmware; 0.6 and later use the same protocol."""
 
     V05 = "0.5"
     V06 = "0.6"
@@ -243,7 +243,7 @@ _Endpoint = Annotated[int, Meta(ge=0, le=65535)]
 
 
 class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Its fields in [link]: left before right; `gear` is motor turns per wheel turn.
+    """Settings of ODrives in [link]: left before right; `gear` is motor turns per wheel turn.
 
     `watchdog_s`, `vel_limit_turns_s` (of the motor), `heartbeat_s` and `firmware` are what the controller is set to.
     `watchdog_endpoints`: of `axis0.config.enable_watchdog` and `axis0.config.watchdog_timeout` in the
@@ -262,11 +262,11 @@ class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
     @property
     def generation(self) -> Generation:
-        """Of the firmware."""
+        """Generation of the firmware."""
         return Generation(self.firmware)
 
     def fault(self) -> SettingsFault | None:
-        """What no single field shows."""
+        """Return what is wrong with the fields taken together, or None."""
         nodes = all_of(self.nodes)
         if not all(sides_of(self.nodes)):
             return SettingsFault("nodes", "a side has no node", "write [left, right], such as [3, 5]")
@@ -280,13 +280,13 @@ class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 
 def error_words(generation: Generation, error: int) -> str:
-    """What the bits of an axis' error mean, for a person."""
+    """Return the meaning of the bits of an axis' error as text."""
     said = [text for bit, text in _ERRORS[generation].items() if error & bit]
     return "; ".join(said) or f"error {error:#x}"
 
 
 def stop_frames(settings: OdriveSettings) -> tuple[Frame, ...]:
-    """The e-stop to every node: it idles with an error that stays until it is cleared."""
+    """Return the e-stop to every node: it idles with an error that stays until it is cleared."""
     return tuple(encode(settings.generation, node, "Estop") for node in all_of(settings.nodes))
 
 
@@ -303,7 +303,7 @@ def cyclic_frames(settings: OdriveSettings, command_rate_hz: float, _authenticat
 
 
 def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
-    """The nodes whose heartbeats and estimates were heard, split into left and right as they are numbered.
+    """Return the nodes whose heartbeats and estimates were received, split into left and right as they are numbered.
 
     None if there are none: heartbeats alone could be another vendor's frames.
     """
@@ -316,7 +316,7 @@ def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
 
 
 def safety_card(settings: OdriveSettings) -> SafetyCard:
-    """Who stops the robot when."""
+    """Return the safety card of ODrives."""
     return SafetyCard(
         host_silent=f"each axis after {settings.watchdog_s:g} s without a frame, by its watchdog: it idles",
         stops_by="coasting: an ODrive in idle does not brake",
@@ -347,14 +347,14 @@ _SAME_TIMEOUT_S = 0.002
 
 @dataclass(slots=True)
 class _Watchdog:
-    """What a node has said of it."""
+    """Watchdog of a node, as far as the node has reported it."""
 
     is_on: bool | None = None
     timeout_s: float | None = None
 
 
 class Questions:
-    """What is asked of all nodes, and what they have answered since they were met; pure.
+    """Questions to all nodes and their replies since the last start; pure.
 
     First their version, which firmware 0.5 does not know, so that its silence is the answer; then, where robot.toml
     says at which endpoints, their watchdogs; then what keeps those from running out.
@@ -368,7 +368,7 @@ class Questions:
         self.begin_anew(0)
 
     def begin_anew(self, now_ns: int) -> None:
-        """Nothing is known of them."""
+        """Clear everything that is known of the nodes."""
         self.known, self.version = False, ""
         self.refusal: str | None = None
         self._said: str | None = None
@@ -383,7 +383,7 @@ class Questions:
         return said
 
     def due(self, now_ns: int, all_are_heard: bool) -> list[Frame]:
-        """The questions that are due now; only of nodes that idle, as each feeds their watchdogs."""
+        """Return the questions that are due now; only of nodes that idle, as each feeds their watchdogs."""
         waits = self.known or self.refusal is not None
         if now_ns - self._asked_ns < (_ALIVE_PERIOD_NS if waits else _PERIOD_NS):
             return []
@@ -396,7 +396,7 @@ class Questions:
         return self._for_watchdogs() if self._is_met else self._for_version()
 
     def take_version(self, values: Mapping[str, float]) -> None:
-        """An answer for the version."""
+        """Handle a reply with the version."""
         if self._settings.generation is Generation.V05:
             self.refusal = 'the nodes answer for their version, which 0.5 does not; write link.firmware = "0.6"'
         elif not self._is_met:
@@ -437,7 +437,7 @@ class Questions:
         return []
 
     def _for_watchdogs(self) -> list[Frame]:
-        """Until every node has said whether its watchdog is on and how long it waits."""
+        """Return the questions until every node has reported whether its watchdog is on and how long it waits."""
         self._watchdog_tries += 1
         endpoints = self._settings.watchdog_endpoints or ()
         waiting = [node for node, one in self._watchdogs.items() if one.is_on is None or one.timeout_s is None]

@@ -26,7 +26,7 @@ STOPPED_FROM_OUTSIDE = "stopped from outside on the link, by `disco-hw estop` or
 
 
 class Stage(enum.Enum):
-    """Where a driver is between standing by and driving.
+    """Stages of a driver between standing by and driving.
 
     STOPPING is the ramp down, BRAKING what follows it, or replaces it, until the wheels stand.
     """
@@ -43,7 +43,7 @@ _DRIVING = (Stage.ARMING, Stage.ARMED, Stage.STOPPING)
 
 
 class Controllers(msgspec.Struct, frozen=True, kw_only=True):
-    """What a driver has heard of its controllers, in its vendor's meaning of the words; None for what is well.
+    """State of the controllers as received, in their vendor's meaning; None for what is well.
 
     For a person: what is `missing` that must be known of them, why they are `refused`, which e-stop of their own holds
     (`stopped`), what is `faulty`, and why they are `unfit` to be driven now although they are well. `energised`: they
@@ -60,7 +60,7 @@ class Controllers(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
-    """The value; each transition returns the next one.
+    """Immutable state of the permission to move; each transition returns the next one.
 
     `idle`: where a restart or an arming that fails leaves it, `after_loss` where a fault or an e-stop does: BRAKING for
     controllers that must be sent something until they stand. `since_ns`: the first tick of the stage, None before it.
@@ -91,7 +91,7 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return self.stage in _DRIVING
 
     def state(self, seen: Controllers) -> DriverState:
-        """Where the driver is with its controllers; what is latched comes before what is not known."""
+        """Return the driver's state with its controllers; what is latched comes before what is not known."""
         if not self.link_is_up:
             return DriverState.DISCONNECTED
         if self.estopped or seen.stopped is not None:
@@ -113,7 +113,7 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return DriverState.READY if self.wanted is Request.READY else DriverState.STANDBY
 
     def detail(self, seen: Controllers) -> str:
-        """For a person: why the state is what it is, and what to do about it."""
+        """Return why the state is what it is, and what to do about it."""
         match self.state(seen):
             case DriverState.DISCONNECTED:
                 return seen.offline
@@ -142,29 +142,32 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return holds and now_ns - self.fed_ns > timeout_s * 1e9
 
     def silent_ns(self, heard_ns: int) -> int:
-        """How long nothing has come since `heard_ns`, of the time in which the host looked without a pause.
+        """Return how long nothing has come since `heard_ns`, of the time in which the host looked without a pause.
 
         What was not heard in a pause is no silence of the controllers: the host was not there, or has not read yet.
         """
         return self.looked_ns - max(heard_ns, self.attentive_ns)
 
     def looked(self, now_ns: int) -> MotionPermit:
-        """The host looks at its controllers, once in each tick."""
+        """Return the permit after the host has looked at its controllers, once in each tick."""
         paused = now_ns - self.looked_ns > _PAUSE_NS
         return replace(self, looked_ns=now_ns, attentive_ns=now_ns if paused else self.attentive_ns)
 
     def linked(self, is_up: bool) -> MotionPermit:
-        """The medium has come up or is gone: all is void but what is latched."""
+        """Return the permit after the medium has come up or is gone: all is void but what is latched."""
         return replace(self.restarted("the link was lost"), link_is_up=is_up)
 
     def restarted(self, why: str, event: str | None = None) -> MotionPermit:
-        """The controllers must be met anew; what is latched stays."""
+        """Return the permit for controllers that must be synchronised again; what is latched stays."""
         note = f"disarmed: {why}" if self.wanted is Request.ARM else self.note
         met_anew = replace(self._idled(note), shared=False)
         return met_anew if event is None else met_anew.saying(event)
 
     def requested(self, request: Request, seen: Controllers) -> MotionPermit:
-        """What the host wants; ARM only of controllers that stand by and are fit, and each time asked for anew."""
+        """Return the permit after a request of the host.
+
+        ARM is accepted only of controllers that stand by and are fit, and each time it is requested again.
+        """
         if request is self.wanted:
             return self
         if request is Request.ARM:
@@ -178,7 +181,7 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return replace(self, wanted=request)
 
     def begun(self, now_ns: int) -> MotionPermit:
-        """The stage's time runs from its first tick."""
+        """Return the permit with the stage's time running from its first tick."""
         return replace(self, since_ns=now_ns) if self.since_ns is None else self
 
     def lasts_ns(self, now_ns: int) -> int:
@@ -190,19 +193,19 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return replace(self, fed_ns=now_ns, zeros=self.zeros + 1) if self.stage is Stage.ARMING else self
 
     def armed(self, now_ns: int) -> MotionPermit:
-        """All proof is there: commands may move it from now on."""
+        """Return the permit once all proof is there: commands may move it from now on."""
         if self.stage is not Stage.ARMING:
             return self
         return replace(self, stage=Stage.ARMED, note="armed", fed_ns=now_ns, speeds=(0.0, 0.0))
 
     def commanded(self, now_ns: int, command: WheelCommand) -> MotionPermit:
-        """A command is passed on."""
+        """Return the permit after a command is passed on."""
         if self.stage is not Stage.ARMED:
             return self
         return replace(self, fed_ns=now_ns, speeds=(command.left_rad_s, command.right_rad_s))
 
     def slowed(self, now_ns: int, deceleration_rad_s2: float) -> MotionPermit:
-        """A step of the ramp: speeds nearer to zero; a pause counts for 0.1 s at most."""
+        """Return the permit after a step of the ramp: speeds nearer to zero; a pause counts for 0.1 s at most."""
         if self.stage is not Stage.STOPPING:
             return self
         step = deceleration_rad_s2 * min(max(now_ns - self.fed_ns, 0) * 1e-9, _LONGEST_STEP_S)
@@ -210,11 +213,11 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return replace(self.begun(now_ns), fed_ns=now_ns, speeds=(left, right))
 
     def ramped(self) -> MotionPermit:
-        """The ramp is through: brake until the wheels stand."""
+        """Return the permit after the ramp: brake until the wheels stand."""
         return replace(self, stage=Stage.BRAKING, since_ns=None) if self.stage is Stage.STOPPING else self
 
     def rested(self) -> MotionPermit:
-        """The stop is through."""
+        """Return the permit after the stop."""
         stopping = self.stage in (Stage.STOPPING, Stage.BRAKING)
         return replace(self, stage=Stage.REST, since_ns=None) if stopping else self
 
@@ -228,22 +231,22 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return stopped.saying(f"disarmed: {why}")
 
     def stopped(self) -> MotionPermit:
-        """An emergency stop was sent from here."""
+        """Return the permit after an emergency stop was sent from here."""
         return replace(self._idled("emergency stop sent"), stage=self.after_loss, estopped=True)
 
     def stop_heard(self) -> MotionPermit:
-        """An emergency stop was heard that somebody else sent; said once."""
+        """Return the permit after an emergency stop was received that somebody else sent; reported once."""
         stopped = replace(self._idled(self.note), stage=self.after_loss, estopped=True)
         return stopped if self.estopped else stopped.saying(STOPPED_FROM_OUTSIDE)
 
     def command_heard(self, whom: str) -> MotionPermit:
-        """Another host commands `whom`; said once, and a fault unless the controllers are at rest."""
+        """Return the permit after another host has commanded `whom`; a fault unless the controllers are at rest."""
         said = self if self.shared else self.saying(f"another host is on the link: it commands {whom}; disconnect it")
         said = replace(said, shared=True)
         return said if self.stage is Stage.REST else said.lost(f"another host commands {whom}; disconnect it")
 
     def reset(self, seen: Controllers) -> MotionPermit:
-        """Clear what is latched, when that is wanted of controllers at rest that were heard and are well.
+        """Clear what is latched, when that is wanted of controllers at rest that have reported and are well.
 
         Those that are refused may be reset: nothing arms them.
         """
@@ -254,7 +257,7 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return replace(self, fault=None, estopped=False, wanted=Request.STANDBY, note=STANDS_BY)
 
     def saying(self, event: str) -> MotionPermit:
-        """Something that a person should know."""
+        """Return the permit with one more event for the operator."""
         return replace(self, events=(*self.events, event))
 
     def _idled(self, note: str) -> MotionPermit:

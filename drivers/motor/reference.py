@@ -72,7 +72,7 @@ _MAY_ARM = frozenset(DriverState) - {
 
 
 class ReferenceDriver:
-    """Satisfies `drivers.types.Driver`; pure: no clock, thread or I/O, and no frame makes it raise.
+    """Driver of the reference firmware's protocol (a `drivers.types.Driver`); pure, and no frame makes it raise.
 
     `request(ARM)` leads from STANDBY or READY through a new session to ARMED; it is ignored, with the reason in
     `detail`, before the handshake is complete. `transmit` raises ValueError for a command that is not finite or out of
@@ -114,7 +114,7 @@ class ReferenceDriver:
 
     @property
     def state(self) -> DriverState:
-        """Where the driver is with its robot."""
+        """State of the driver with its robot."""
         if not self._link_is_up:
             return DriverState.DISCONNECTED
         if self._handshake.refusal is not None:
@@ -132,7 +132,7 @@ class ReferenceDriver:
 
     @property
     def detail(self) -> str:
-        """One sentence for a person: why the state is what it is and what to do about it."""
+        """One sentence for the operator: why the state is what it is and what to do about it."""
         state, status, note = self.state, self._status, self._arming.note
         if self._released is not None and state is DriverState.FAULT:
             return f"{self._released}; remove the cause, then reset"
@@ -155,12 +155,12 @@ class ReferenceDriver:
 
     @property
     def identity(self) -> Identity | None:
-        """What the robot said of itself in the handshake; None before it is complete."""
+        """Identity that the robot reported in the handshake; None before it is complete."""
         return self._handshake.identity
 
     @property
     def limits(self) -> Limits | None:
-        """What the robot said of its limits in the handshake; None before it is complete."""
+        """Limits that the robot reported in the handshake; None before it is complete."""
         return self._handshake.limits
 
     @property
@@ -194,13 +194,13 @@ class ReferenceDriver:
         return self._clock.synced(self._now_ns)
 
     def link_up(self, now_ns: int) -> None:
-        """The medium has come up (again): start the handshake; any session is void."""
+        """Start the handshake, because the medium has come up (again); any session is void."""
         self._now_ns = now_ns
         self._restart("the link was lost")
         self._link_is_up = True
 
     def link_down(self, now_ns: int) -> None:
-        """The medium is gone: any session is void."""
+        """Drop any session, because the medium is gone."""
         self._now_ns = now_ns
         self._restart("the link was lost")
         self._link_is_up = False
@@ -237,7 +237,7 @@ class ReferenceDriver:
         return Readings(**{kind: tuple(samples) for kind, samples in collected.items()}, events=events)
 
     def transmit(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
-        """Frames due now: the command (only while armed; zeros while arming) and house-keeping.
+        """Return the frames due now: the command (only while armed; zeros while arming) and house-keeping.
 
         Raises ValueError for a command that is not finite, out of the wire's range, or valid for no time.
         """
@@ -278,7 +278,10 @@ class ReferenceDriver:
         return self._released is not None and self._arming.armed
 
     def _coast(self, now_ns: int) -> OutgoingFrame:
-        """The command that switches the motors off; the last one ends the session, and with it the armed state."""
+        """Return the command that switches the motors off.
+
+        The last one ends the session, and with it the armed state.
+        """
         if now_ns - self._released_ns > COASTING_NS:
             self._arming.give_up(f"disarmed: {self._released}")
         return self._wheel_command(now_ns, "COAST", WheelCommand(0.0, 0.0, ZERO_VALID_FOR_S))
@@ -349,7 +352,7 @@ class ReferenceDriver:
             collected.setdefault(kind, []).append(sample)
 
     def _make_handlers(self) -> dict[str, tuple[str, Callable[[Decoded, int], Any]]]:
-        """By message name: the field of `Readings`, and what turns a frame and its reception (ns) into a sample."""
+        """Return, by message name, the field of `Readings` and the function that makes a sample of a frame."""
         return {
             **dict.fromkeys(telemetry.WHEEL_MESSAGES, ("wheels", self._telemetry.wheels)),
             **dict.fromkeys(telemetry.POSE_MESSAGES, ("poses", self._telemetry.pose)),
@@ -522,7 +525,7 @@ def _safety_card(_settings: NoSettings) -> SafetyCard:
 
 
 def _recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
-    """Nothing but that it is one: its frames carry a checksum that no other controller's has."""
+    """Return an empty dict if the frames have the checksum that is the reference controller's alone, else None."""
     reception = FrameReception(Codec())
     believed = [reception.accept(ReceivedFrame(0, frame)) for frame in frames]
     return {} if sum(one is not None for one in believed) >= _FRAMES_OF_OURS else None

@@ -19,7 +19,11 @@ LATE_NS = 150_000_000
 
 
 class ArmedWatch:
-    """Watches both; pure. `late` counts the times that commands were late, `silent` those without the state."""
+    """Monitor of commands and state while armed; pure.
+
+    `late` counts late commands, `silent` times without the state. `late` counts the times that commands were late,
+    `silent` those without the state.
+    """
 
     def __init__(self) -> None:
         self.late = 0
@@ -33,13 +37,13 @@ class ArmedWatch:
         self._echo.sent(number, now_ns)
 
     def rest(self) -> None:
-        """Nothing is commanded: expect nothing."""
+        """Expect nothing, because nothing is commanded."""
         self._echo.forget()
         self._reported_ns = None
         self._late_ns = 0
 
     def reported(self, last_command_counter: int, received_ns: int) -> None:
-        """Take in SYSTEM_STATE."""
+        """Store the reception of SYSTEM_STATE, with the delay of the command that it echoes."""
         self._reported_ns = received_ns
         self._late_ns = self._echo.late_ns(last_command_counter, received_ns)
 
@@ -132,7 +136,7 @@ _AUTHENTICATION = Codec().choice_value("HELLO", "capabilities", "AUTHENTICATION"
 
 
 class HostState(msgspec.Struct, frozen=True, gc=False):
-    """What HOST_STATE is to say."""
+    """Contents of the message HOST_STATE."""
 
     request: str
     session: int
@@ -231,7 +235,7 @@ class Arming:
             self.note = ""
 
     def take_session(self, challenge: int, session: int, blockers: tuple[str, ...], now_ns: int) -> None:
-        """Take in SESSION_STATE; `blockers` by the names of the DBC's value table."""
+        """Handle the message SESSION_STATE; `blockers` by the names of the DBC's value table."""
         if self._challenge != (challenge, session):
             self._challenge = (challenge, session)
             self._answer = challenge_answer(challenge, session, self._dbc_hash)
@@ -297,7 +301,7 @@ class Handshake:
     """
 
     def __init__(self, major: int, minor: int, dbc_hash: int, *, has_key: bool = False) -> None:
-        """`has_key`: whether this host authenticates its commands; a robot that expects otherwise is refused."""
+        """Create a handshake that expects this protocol; `has_key`: whether this host authenticates its commands."""
         self._has_key = has_key
         self._major = major
         self._minor = minor
@@ -323,7 +327,7 @@ class Handshake:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """What has not come yet, by message name."""
+        """Names of the messages that have not come yet."""
         names = {"HELLO": self._hello, "BUILD": self._build, "LIMITS": len(self._pages) == 2 or None}
         return tuple(name for name, value in names.items() if value is None)
 

@@ -286,7 +286,7 @@ class Telemetry:
 
 
 def motor(decoded: Decoded, received_ns: int) -> MotorSample:
-    """Return what a MOTOR frame says."""
+    """Return the sample of a MOTOR frame."""
     values = decoded.values
     return MotorSample(
         t_ns=received_ns,
@@ -298,7 +298,7 @@ def motor(decoded: Decoded, received_ns: int) -> MotorSample:
 
 
 def power(decoded: Decoded, received_ns: int) -> PowerSample:
-    """Return what a POWER frame says."""
+    """Return the sample of a POWER frame."""
     values = decoded.values
     return PowerSample(
         t_ns=received_ns,
@@ -309,7 +309,7 @@ def power(decoded: Decoded, received_ns: int) -> PowerSample:
 
 
 def link_health(decoded: Decoded, received_ns: int) -> RobotLinkHealth:
-    """Return what a LINK_HEALTH frame says."""
+    """Return the sample of a LINK_HEALTH frame."""
     values = {name: int(value) for name, value in decoded.values.items()}
     return RobotLinkHealth(t_ns=received_ns, **values)
 
@@ -400,7 +400,7 @@ class WheelTicks:
 
     @property
     def angles(self) -> tuple[float, float]:
-        """Both angles after the last accepted reading."""
+        """Angles (rad) of the left and right wheel after the last accepted reading."""
         left, right = self._start
         return left + self._left * self._angle_per_tick, right + self._right * self._angle_per_tick
 

@@ -71,7 +71,7 @@ _SETTER_NAMES = {layout.command: name for name, layout in protocol.SETTERS.items
 
 @dataclass(slots=True)
 class Board:
-    """What is known of one board, by question; `turned` of both motors.
+    """State of one board, by question; `turned` of both motors.
 
     `stopped`: it has taken a stop since the last command. `timeout_ds`: its serial timeout in steps of 0.1 s, as read
     since arming began. `waits_ns`: since when it has not answered, `refuses_ns` since when it has taken no command.
@@ -93,18 +93,18 @@ class Board:
 
     @property
     def fastest_counts_s(self) -> float:
-        """What both motors can do at full duty."""
+        """Speed (counts/s) that both motors reach at full duty."""
         return float(min(int(self.known[f"velocity_pid_m{motor}"]["qpps"]) for motor in (1, 2)))
 
     @property
     def speeds(self) -> tuple[float, float]:
-        """As measured, in counts/s."""
+        """Measured speeds of both motors, in counts/s."""
         read = self.known["speeds"]
         return float(read["speed_m1"]), float(read["speed_m2"])
 
     @property
     def is_known(self) -> bool:
-        """Whether it has answered all that must be known of it."""
+        """Whether every reply needed before arming has been read from the board."""
         return all(name in self.known for name in TO_KNOW)
 
     @property
@@ -114,7 +114,7 @@ class Board:
 
     @property
     def error_words(self) -> str:
-        """Its first error, for a person."""
+        """Text of the board's first error, for the operator."""
         if self.is_pressed:
             return f"board {self.address}: its e-stop input is pressed"
         bit = self.errors & -self.errors
@@ -130,14 +130,14 @@ class Board:
         return second.take_wrapping(int(read["encoder_m2"]), t_ns, looked_ns, fastest, 100.0) and is_first_plausible
 
     def meet_anew(self) -> None:
-        """Nothing is known of it but what its motors have turned."""
+        """Clear all that is known of the board but what its motors have turned."""
         self.known, self.waits_ns, self.timeout_ds = {}, None, None
         for motor in self.turned:
             motor.begin_anew()
 
 
 class RoboclawPort:
-    """Satisfies `drivers.motor.vendor_driver.Port`."""
+    """Port of `VendorDriver` for RoboClaw boards (a `drivers.motor.vendor_driver.Port`)."""
 
     def __init__(self, settings: RoboclawSettings) -> None:
         self._settings = settings
@@ -155,7 +155,7 @@ class RoboclawPort:
 
     @property
     def seen(self) -> Controllers:
-        """How the boards are."""
+        """State of the boards, as received last."""
         silent = ", ".join(str(board.address) for board in self._all if not board.is_known)
         missing = f"board {silent} does not answer; is it switched on, in packet serial, at this baud and address?"
         pressed = any(board.is_pressed for board in self._all)
@@ -167,7 +167,7 @@ class RoboclawPort:
 
     @property
     def identity(self) -> Identity | None:
-        """What the first board says of itself."""
+        """Identity that the first board reports; None before all boards are known."""
         if not self._is_known:
             return None
         return Identity("RoboClaw", str(self._all[0].known["version"]["version"]).strip(), "device")
@@ -187,12 +187,12 @@ class RoboclawPort:
         return all(board.stopped and "speeds" in board.known for board in self._all) and self._stands
 
     def begin_anew(self, now_ns: int) -> None:
-        """Forget what the boards said."""
+        """Clear what the boards reported."""
         for board in self._all:
             board.meet_anew()
 
     def end_drive(self) -> None:
-        """Each board is to take a stop from now on."""
+        """Make each board take a stop from now on."""
         self._asked_ns = 0
         for board in self._all:
             board.stopped, board.refuses_ns = False, None
@@ -226,7 +226,7 @@ class RoboclawPort:
         return Heard(counts=IMPLAUSIBLE, is_status=is_status, wheels=wheels, lost=jumped)
 
     def sources(self) -> Sequence[Source]:
-        """The replies of each board that is known."""
+        """Return the sources that must report again and again: each board that is known."""
         return [
             Source(f"board {board.address}", board.waits_ns if board.known else None, SILENT_NS, GONE_NS)
             for board in self._all
@@ -246,7 +246,7 @@ class RoboclawPort:
         return None
 
     def prepare(self, now_ns: int, permit: MotionPermit) -> Pending | None:
-        """The serial timeout, set and read back, and then zeros that each board takes."""
+        """Return what arming still needs: the serial timeout, set and read back, then zeros that each board takes."""
         if permit.lasts_ns(now_ns) == 0:
             self._repeat_ns = 0
             for board in self._all:
@@ -269,7 +269,7 @@ class RoboclawPort:
         return Pending(why="a board does not take zeros", frames=tuple(self.speeds(now_ns, 0.0, 0.0)))
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """The speeds of each board's motors."""
+        """Return the frames that command the speeds of each board's motors."""
         settings, self._velocity_ns = self._settings, now_ns
         per_board = {address: [0.0, 0.0] for address in self._boards}
         fastest, wanted = self._fastest_rad_s, (left_rad_s, right_rad_s)
@@ -297,7 +297,7 @@ class RoboclawPort:
         return [_stop(board.address) for board in waiting], is_over
 
     def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
-        """Reset an e-stop that a board has latched, when asked; it ends its other errors by itself."""
+        """Reset an e-stop that a board has latched, when requested; it ends its other errors by itself."""
         latched = [board.address for board in self._all if board.is_pressed]
         if permit.wanted is not Request.RESET or not latched or now_ns - self._repeat_ns < _REPEAT_NS:
             return ()
@@ -309,7 +309,7 @@ class RoboclawPort:
         return True
 
     def questions(self, now_ns: int, permit: MotionPermit) -> tuple[OutgoingFrame, ...]:
-        """Of boards with a command in this tick; or, in their own pace, of those that have taken a stop.
+        """Return the questions to boards with a command in this tick, or, more slowly, to boards that are stopped.
 
         What is still unknown of a board, one question at a time; of a known one speeds and counts, and of one board in
         turn its errors or its serial timeout.

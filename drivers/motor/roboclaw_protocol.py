@@ -1,4 +1,4 @@
-"""RoboClaw packet serial: the bytes of a command and of its reply. Big-endian.
+"""Packet serial of RoboClaw boards: the bytes of a command and of its reply. Big-endian. Big-endian.
 
 A command that sets something: address, command, arguments, CRC-16/XMODEM of all before; the reply is one byte, 0xFF,
 or nothing. A command that asks: address and command alone; the reply is data and the CRC of address, command and data.
@@ -154,7 +154,7 @@ _Motors = str | tuple[str, ...]
 
 
 class RoboclawSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Its fields in [link]: left before right.
+    """Settings of RoboClaw boards in [link]: left before right.
 
     `motors`: "ADDRESS/MOTOR", address 128 to 135, motor 1 or 2, one or more a side. `counts_per_rev`: of the encoder a
     wheel turn, gear included. `watchdog_s`: the serial timeout, which the driver sets before each arming, in steps of
@@ -176,7 +176,7 @@ class RoboclawSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
     @property
     def addresses(self) -> tuple[int, ...]:
-        """Of the boards, each once."""
+        """Addresses of the boards, each once."""
         return tuple(dict.fromkeys(address for side in self.sides for address, _ in side))
 
     @property
@@ -190,7 +190,7 @@ class RoboclawSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         return round(10.0 * self.watchdog_s)
 
     def fault(self) -> SettingsFault | None:
-        """What no single field shows."""
+        """Return what is wrong with the fields taken together, or None."""
         named = [name for side in self.motors for name in ((side,) if isinstance(side, str) else side)]
         wrong = [name for name in named if not _is_place(name)]
         if wrong or not named or () in self.motors:
@@ -208,21 +208,21 @@ class RoboclawSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
 @dataclass(frozen=True, slots=True)
 class RoboclawExchange:
-    """Satisfies `drivers.types.Exchange`; a frame's identifier is address and command, its data the packet."""
+    """Exchange with RoboClaw boards (a `drivers.types.Exchange`); `can_id` is address and command, data the packet."""
 
     timeout_s: float = 0.02
     quiet_s: float = 0.012
 
     def request(self, frame: Frame) -> bytes:
-        """The packet as it stands."""
+        """Return the packet as it stands."""
         return frame.data
 
     def is_answered(self, _frame: Frame) -> bool:
-        """Every packet is, by one byte or by what it asks for."""
+        """Return True, because every packet is answered, by one byte or by what it asks for."""
         return True
 
     def reply(self, frame: Frame, received: bytes) -> Frame | None:
-        """The reply whole, with the CRC that fits this request alone; of a packet that sets something 0xFF."""
+        """Return the reply whole, with the CRC that fits this request alone; of a packet that sets something 0xFF."""
         address, command = divmod(frame.can_id, 256)
         name = getter_name(command)
         if name is None:
@@ -232,12 +232,12 @@ class RoboclawExchange:
 
 
 def setting(address: int, name: str, **values: int) -> Frame:
-    """The packet that sets something."""
+    """Return the packet that sets something."""
     return Frame(address << 8 | SETTERS[name].command, set_bytes(address, name, **values))
 
 
 def question(address: int, name: str) -> Frame:
-    """The packet that asks for something."""
+    """Return the packet that asks for something."""
     return Frame(address << 8 | GETTERS[name].command, ask_bytes(address, name))
 
 
@@ -248,7 +248,10 @@ QUESTIONS = LineQuestions(
 
 
 def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
-    """The motors of the boards that said their version: one board has both sides, of several the first half is left."""
+    """Return the motors of the boards that reported their version.
+
+    One board has both sides, of several the first half is left.
+    """
     version = GETTERS["version"].command
     asked = [(frame.can_id >> 8, frame) for frame in frames if frame.can_id & 0xFF == version and not frame.extended]
     boards = sorted(
@@ -276,7 +279,7 @@ def stands(settings: RoboclawSettings, *speeds_counts_s: Value) -> bool:
 
 
 def cyclic_frames(settings: RoboclawSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:
-    """A command, speeds and counts of each board in each tick, and one question more; request and reply in turn."""
+    """Return the frames of each period: a command, speeds and counts of each board, and one question more."""
     each = {"speed command": 16 + 1, "speeds": 2 + 10, "encoders": 2 + 10}
     frames = [
         CyclicFrame(f"{name} of {address}", "LINE", length, command_rate_hz, length, _TURNAROUND_S)
@@ -287,7 +290,7 @@ def cyclic_frames(settings: RoboclawSettings, command_rate_hz: float, _authentic
 
 
 def safety_card(settings: RoboclawSettings) -> SafetyCard:
-    """Who stops the robot when."""
+    """Return the safety card of RoboClaw boards."""
     return SafetyCard(
         host_silent=f"each board {settings.watchdog_s:g} s after the last packet of any kind, by its serial timeout, "
         "which is set and read back before each arming",

@@ -41,7 +41,7 @@ _REPEAT_NS = 100_000_000
 
 
 class Ros2BasePort:
-    """Satisfies `drivers.motor.vendor_driver.Port`."""
+    """Port of `VendorDriver` for bases on ROS 2 (a `drivers.motor.vendor_driver.Port`)."""
 
     def __init__(self, settings: wire.Ros2BaseSettings) -> None:
         self._settings = settings
@@ -55,7 +55,7 @@ class Ros2BasePort:
 
     @property
     def seen(self) -> Controllers:
-        """How the bridge and its base are."""
+        """State of the bridge and its base, as received last."""
         stopped = f"a button on the base is pressed{self._or_unheard}" if self._flags & wire.BUTTON else None
         latched = "emergency stop; remove its cause, then reset" if self._flags & wire.LATCHED else None
         return Controllers(
@@ -68,13 +68,13 @@ class Ros2BasePort:
 
     @property
     def identity(self) -> Identity | None:
-        """What answers behind the bridge; a base reports nothing of itself on its topics."""
+        """Identity of the base behind the bridge; a base reports nothing of itself on its topics."""
         is_met = self._state_ns is not None and not self._is_foreign_bridge
         return Identity("ROS 2 base", "", "robot.toml") if is_met else None
 
     @property
     def limits(self) -> Limits:
-        """What robot.toml declares of the base; it reports nothing of that itself."""
+        """Limits that robot.toml declares of the base, which reports none itself."""
         return parts.limits(
             Limit(self._settings.fastest_rad_s, "robot.toml"),
             Limit(self._settings.watchdog_s, "robot.toml"),
@@ -88,7 +88,7 @@ class Ros2BasePort:
         return bool((is_latched and self._wheels_ns is not None and self._stands) or self._flags & wire.BUTTON)
 
     def begin_anew(self, now_ns: int) -> None:
-        """Forget what the bridge said."""
+        """Clear what the bridge reported."""
         self._state_ns: int | None = None
         self._wheels_ns: int | None = None
         self._newest: tuple[int, int] | None = None
@@ -122,14 +122,14 @@ class Ros2BasePort:
         return Heard()
 
     def sources(self) -> Sequence[Source]:
-        """The bridge, and the base behind it."""
+        """Return the sources that must report again and again: the bridge, and the base behind it."""
         return (
             Source("the bridge", self._state_ns, SILENT_NS, GONE_NS),
             Source("the base's odometry", self._wheels_ns, SILENT_NS),
         )
 
     def objection(self, permit: MotionPermit) -> Objection | None:
-        """A button, a stop, other nodes, no odometry, or a bridge that drives no longer."""
+        """Return what ends a drive: a button, a stop, other nodes, no odometry, or a bridge that drives no longer."""
         if self._flags & wire.BUTTON:
             return Objection(f"a button on the base was pressed{self._or_unheard}")
         if self._flags & wire.LATCHED:
@@ -152,7 +152,7 @@ class Ros2BasePort:
         return None
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """The motion of the body, by the nominal geometry."""
+        """Return the frames that command the body's motion, by the nominal geometry."""
         it = self._settings
         body = parts.body_speeds(left_rad_s, right_rad_s, it.wheel_radius_m, it.track_m, it.max_speed_m_s)
         return (wire.speeds(*body),)
@@ -165,7 +165,7 @@ class Ros2BasePort:
         return (wire.speeds(0.0, 0.0),), False
 
     def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
-        """Bring the bridge to standing by, or to a stop that it does not hold yet; reset it when asked."""
+        """Bring the bridge to standing by, or to a stop that it does not hold yet; reset it when requested."""
         is_latched, frames = self._flags & wire.LATCHED, self.stop_frames()
         if permit.wanted is Request.RESET and is_latched:
             frames = (Frame(wire.RESET, b""),)
@@ -181,11 +181,11 @@ class Ros2BasePort:
         return True
 
     def questions(self, now_ns: int, permit: MotionPermit) -> tuple[OutgoingFrame, ...]:
-        """None: the bridge says all by itself."""
+        """Return no frames: the bridge sends everything by itself."""
         return ()
 
     def stop_frames(self) -> tuple[Frame, ...]:
-        """The stop that the bridge latches."""
+        """Return the stop that the bridge latches."""
         return wire.stop_frames(self._settings)
 
     @property
@@ -201,7 +201,7 @@ class Ros2BasePort:
 
     @property
     def _unfit(self) -> str | None:
-        """Why the base may not be driven, whatever is asked."""
+        """Reason why the base may not be driven, whatever is requested; None if it may."""
         topic = self._settings.speed_topic
         if self._flags & wire.OTHERS:
             return f"another node speaks on {topic}; end it, or give it a topic of its own"
@@ -222,7 +222,7 @@ class Ros2BasePort:
         return self._settings.stands(*self._wheel_speeds)
 
     def _take_wheels(self, angles: tuple[int, int], data: bytes, t_ns: int, looked_ns: int) -> Heard:
-        """A sample of ANGLES and WHEELS; what the wheels could not have turned is left out."""
+        """Return a sample of ANGLES and WHEELS; what the wheels could not have turned is left out."""
         self._wheel_speeds, age_s = wire.unpack_wheels(data)
         fastest = 1.5 * self._settings.fastest_rad_s / wire.ANGLE_RAD
         plausible = [

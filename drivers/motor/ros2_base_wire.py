@@ -1,4 +1,4 @@
-"""What the driver of bases on ROS 2 and the bridge say to each other on their local link, and the bridge's end of it.
+"""Protocol between the driver of bases on ROS 2 and the bridge, on their local link, and the bridge's end of it.
 
 Frames as of CAN: the link may be recorded, watched and broken as any other. The bridge's end latches an e-stop, and
 stops the base when the commands fall silent; when the bridge itself dies, only the base's own time-out does.
@@ -51,7 +51,7 @@ watchdog_s = 0.5
 
 
 class Ros2BaseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Its fields in [link]: the base takes speeds of the body, which these turn wheel speeds into and back.
+    """Settings of bases on ROS 2 in [link]: the base takes speeds of the body, converted from wheel speeds by these.
 
     `watchdog_s`: after what silence on its topic the base stops by itself, which nobody can read back. `wheels_topic`:
     JointState where the joints are named, else Odometry. `stop_topic`: a Bool that is true while a button of the base
@@ -95,7 +95,7 @@ class Ros2BaseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         return self.wheel_radius_m * max(abs(left_rad_s), abs(right_rad_s)) < STANDS_M_S
 
     def check_sum(self) -> int:
-        """Of all fields: driver and bridge must have been started with the same."""
+        """Return a CRC-32 of all fields: driver and bridge must have been started with the same."""
         return zlib.crc32(msgspec.json.encode(self))
 
 
@@ -109,7 +109,7 @@ class Wheels:
 
 
 def speeds(linear_m_s: float, angular_rad_s: float) -> Frame:
-    """The command to the base."""
+    """Return the command to the base."""
     return Frame(SPEEDS, struct.pack(">ff", linear_m_s, angular_rad_s))
 
 
@@ -119,7 +119,7 @@ def enable(drive: bool) -> Frame:
 
 
 def wheel_frames(wheels: Wheels) -> tuple[Frame, Frame]:
-    """What the wheels do, for the driver."""
+    """Return the frames that report the wheels' angles and speeds to the driver."""
     angles = (round(angle / ANGLE_RAD) % 2**32 for angle in wheels.angles_rad)
     steps = (max(-32768, min(32767, round(speed / _SPEED_RAD_S))) for speed in wheels.speeds_rad_s)
     age = max(0, min(65535, round(wheels.age_s / _AGE_S)))
@@ -139,13 +139,16 @@ def unpack_wheels(data: bytes) -> tuple[tuple[float, float], float]:
 
 
 def unpack_state(data: bytes) -> tuple[int, int, int]:
-    """Flags, why odometry was refused (an index of REFUSALS), and the check sum of the settings."""
+    """Return flags, why odometry was refused (an index of REFUSALS), and the check sum of the settings."""
     flags, refusal, check_sum = struct.unpack(">BBxxI", data)
     return flags, min(refusal, len(REFUSALS) - 1), check_sum
 
 
 class BaseEnd:
-    """The bridge's end: which speeds the base is commanded now; pure. Who owns it says what is heard of the base."""
+    """State machine of the bridge's end, with the speeds that the base is commanded now; pure.
+
+    Who owns it says what is heard of the base.
+    """
 
     def __init__(self, settings: Ros2BaseSettings) -> None:
         self.driving = self.latched = self.button = self.is_heard = self.others_speak = False
@@ -189,7 +192,10 @@ class BaseEnd:
         return None
 
     def step(self, now_ns: int) -> tuple[float, float] | None:
-        """Each STEP_S: zeros after a stop and while one is latched; while it drives, None: only commands feed it."""
+        """Return the speeds that are due in this STEP_S, or None.
+
+        Zeros after a stop and while one is latched; while it drives, None: only commands feed it.
+        """
         if self.is_held and self.driving:
             return self.stand_by(now_ns)
         self._check_silence(now_ns)
@@ -197,12 +203,12 @@ class BaseEnd:
         return (0.0, 0.0) if due and not self.driving else None
 
     def stand_by(self, now_ns: int) -> tuple[float, float]:
-        """Drive no longer; the zeros that stop the base."""
+        """Stop driving and return the zeros that stop the base."""
         self.driving, self._zeros_until_ns = False, now_ns + round(ZEROS_S * 1e9)
         return 0.0, 0.0
 
     def state(self) -> Frame:
-        """How it is, for the driver."""
+        """Return the frame that reports the bridge's state to the driver."""
         bits = (
             self.driving, self.latched, self.is_held, self.has_odometry, self.is_heard, self.others_speak,
             self._fell_silent,
@@ -217,12 +223,12 @@ class BaseEnd:
 
 
 def stop_frames(_settings: Ros2BaseSettings) -> tuple[Frame, ...]:
-    """The e-stop, which the bridge latches."""
+    """Return the e-stop, which the bridge latches."""
     return (Frame(STOP, b""),)
 
 
 def cyclic_frames(_settings: Ros2BaseSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:
-    """The command, and what the bridge says of a base with 50 messages a second."""
+    """Return the frames of each period: the command, and the bridge's reports of a base with 50 messages a second."""
     return (
         CyclicFrame("speeds", "HOST", 8, command_rate_hz),
         *(CyclicFrame(name, "ROBOT", 8, rate) for name, rate in (("state", 20.0), ("angles", 50.0), ("wheels", 50.0))),
@@ -230,12 +236,12 @@ def cyclic_frames(_settings: Ros2BaseSettings, command_rate_hz: float, _authenti
 
 
 def recognise(frames: Sequence[Frame]) -> dict[str, object] | None:
-    """Nothing: the bridge is started with the robot.toml that would be made."""
+    """Return None, because the bridge is started with the robot.toml that would be made."""
     return None
 
 
 def safety_card(settings: Ros2BaseSettings) -> SafetyCard:
-    """Who stops the robot when."""
+    """Return the safety card of bases on ROS 2."""
     base_s = settings.watchdog_s
     odometry = () if settings.left_joints else (
         "the wheels are taken from an Odometry, which has been through the base's own kinematics: what that leaves "

@@ -53,7 +53,7 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Source(msgspec.Struct, frozen=True):
-    """Something that must be heard again and again, by name: when it was heard last, and how long it may be silent.
+    """Source that must report again and again, by name: when it was received last, and how long it may be silent.
 
     After `silent_ns` a drive ends; after `gone_ns` at rest the controllers must be met anew (None: they need not).
     """
@@ -65,18 +65,18 @@ class Source(msgspec.Struct, frozen=True):
 
 
 class Objection(msgspec.Struct, frozen=True):
-    """Why a drive must end, and whether that is a fault that stays until a reset."""
+    """Reason why a drive must end, and whether that is a fault that stays until a reset."""
 
     why: str
     is_fault: bool = True
 
 
 class Heard(msgspec.Struct, frozen=True, kw_only=True):
-    """What one received frame meant.
+    """Meaning of one received frame.
 
     `counts`: counters of `DriverStats` that it adds to. `is_status`: it says how the controllers are. `is_stop` and
     `commanded`: another host's e-stop, and whom another host commands. `lost`: what ends a drive, and nothing else.
-    `restarted`: why the controllers must be met anew. `said`: for a person.
+    `restarted`: why the controllers must be met anew. `said`: for the operator.
     """
 
     counts: tuple[str, ...] = ("frames_accepted",)
@@ -95,7 +95,7 @@ IMPLAUSIBLE = ("frames_accepted", "implausible_ticks")
 
 
 class Pending(msgspec.Struct, frozen=True, kw_only=True):
-    """What still lacks before zeros may be commanded: the frames that bring it about, and why arming fails without it.
+    """Precondition of arming that is not met yet: the frames that bring it about, and why arming fails without it.
 
     `is_final`: waiting does not help.
     """
@@ -114,34 +114,34 @@ class Port(Protocol):
 
     @property
     def seen(self) -> Controllers:
-        """How the controllers are, as heard last."""
+        """State of the controllers, as received last."""
 
     @property
     def identity(self) -> Identity | None:
-        """Which controller answers; None before all of it is known."""
+        """Identity of the controller; None before all of it is known."""
 
     @property
     def limits(self) -> Limits:
-        """What the controllers keep to, and who says so; asked only when `identity` is known."""
+        """Limits of the controllers, and who states them; requested only when `identity` is known."""
 
     @property
     def is_stopped(self) -> bool:
         """Whether the controllers have confirmed, since they were met, that an e-stop holds."""
 
     def begin_anew(self, now_ns: int) -> None:
-        """Forget what was heard: the link or the controllers have restarted. What the wheels have turned stays."""
+        """Forget what was received: the link or the controllers have restarted. What the wheels have turned stays."""
 
     def end_drive(self) -> None:
-        """The drive is over: what stops the controllers is due at once."""
+        """Prepare the end of the drive: what stops the controllers is due at once."""
 
     def take(self, received: ReceivedFrame, permit: MotionPermit) -> Heard:
         """Take in a frame and return what it meant."""
 
     def sources(self) -> Sequence[Source]:
-        """What must be heard again and again."""
+        """Return the sources that must report again and again."""
 
     def objection(self, permit: MotionPermit) -> Objection | None:
-        """Why the controllers, as heard last, may not be driven on."""
+        """Return why the controllers, as received last, may not be driven on; None if they may."""
 
     def prepare(self, now_ns: int, permit: MotionPermit) -> Pending | None:
         """Return what lacks before zeros may be commanded; None when all proof is there.
@@ -150,22 +150,22 @@ class Port(Protocol):
         """
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """The frames that command these wheel speeds."""
+        """Return the frames that command these wheel speeds."""
 
     def brake(self, now_ns: int, lasts_ns: int) -> tuple[Sequence[Frame], bool]:
-        """The frames that hold the wheels, and whether they stand; `lasts_ns` since braking began."""
+        """Return the frames that hold the wheels, and whether they stand; `lasts_ns` since braking began."""
 
     def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
-        """The frames due at rest: what keeps the controllers there, resets them, and asks for what is not known."""
+        """Return the frames due at rest: what keeps the controllers there, resets them, asks for what is not known."""
 
     def may_reset(self, now_ns: int) -> bool:
         """Whether what is latched here may be cleared, by what `seen` does not show."""
 
     def questions(self, now_ns: int, permit: MotionPermit) -> tuple[OutgoingFrame, ...]:
-        """The questions due in this tick, after its other frames; none may feed a watchdog without a command."""
+        """Return the questions due in this tick, after its other frames; none may feed a watchdog without a command."""
 
     def stop_frames(self) -> tuple[Frame, ...]:
-        """The e-stop to all controllers."""
+        """Return the e-stop to all controllers."""
 
 
 def stop_confirmation(port: Port) -> Callable[[Frame], bool]:
@@ -197,30 +197,30 @@ class VendorDriver:
 
     @property
     def state(self) -> DriverState:
-        """Where the driver is with its controllers."""
+        """State of the driver with its controllers."""
         return self._permit.state(self._port.seen)
 
     @property
     def detail(self) -> str:
-        """For a person: why the state is what it is, and what to do about it."""
+        """Text on why the state is what it is, and what to do about it."""
         return self._permit.detail(self._port.seen)
 
     @property
     def identity(self) -> Identity | None:
-        """Which controller answers; None before all of it is known."""
+        """Identity of the controller; None before all of it is known."""
         return self._port.identity
 
     @property
     def limits(self) -> Limits | None:
-        """What the controllers keep to, and who says so; None before they are known."""
+        """Limits of the controllers, and who states them; None before they are known."""
         return None if self._port.identity is None else self._port.limits
 
     def link_up(self, now_ns: int) -> None:
-        """The medium has come up (again): whatever was agreed is void."""
+        """Start again after the medium has come up: whatever was agreed is void."""
         self._meet_anew(self._permit.linked(True), now_ns)
 
     def link_down(self, now_ns: int) -> None:
-        """The medium is gone: whatever was agreed is void."""
+        """Drop whatever was agreed, because the medium is gone."""
         self._meet_anew(self._permit.linked(False), now_ns)
 
     def request(self, request: Request) -> None:
@@ -248,7 +248,7 @@ class VendorDriver:
         return Readings(wheels=tuple(wheels), status=() if status is None else (status,), events=events)
 
     def transmit(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
-        """Frames due now: the command, or what stops; and the questions.
+        """Return the frames due now: the command or a stop, and the questions.
 
         Raises ValueError for a command that is not finite or valid for no time.
         """
@@ -270,7 +270,7 @@ class VendorDriver:
         return parts.estop_frames(now_ns, self._port.stop_frames())
 
     def _step(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
-        """The frames of the stage, which may end in this tick."""
+        """Return the frames of the stage, which may end in this tick."""
         match self._permit.stage:
             case Stage.ARMED:
                 if command is None:
@@ -289,7 +289,7 @@ class VendorDriver:
         return parts.outgoing(now_ns, *frames)
 
     def _arm(self, now_ns: int) -> Sequence[Frame]:
-        """What lacks, then zeros until there were enough; give up where that takes too long."""
+        """Return the frames that arm: what lacks, then zeros until there were enough; give up after too long."""
         self._permit = self._permit.begun(now_ns)
         pending = self._port.prepare(now_ns, self._permit)
         if pending is None:

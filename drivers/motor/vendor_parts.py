@@ -1,4 +1,4 @@
-"""What the drivers of vendors' controllers share: odometers, layouts of messages, frames as sent, ids as written."""
+"""Parts that the drivers of vendors' controllers share: odometers, layouts of messages, frames as sent, ids."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Sign = Literal[-1, 1]
 
 @dataclass(slots=True)
 class Odometer:
-    """What one motor has turned since the driver began, in the controller's counts.
+    """Distance that one motor has turned since the driver began, in the controller's counts.
 
     `total` goes on over a restart of the controller; `speed` in counts/s carries it on from `t_ns`, when the last count
     was received; it is not older than `looked_ns`, when the host had looked before.
@@ -69,14 +69,17 @@ class Odometer:
         return self.take(count, t_ns, looked_ns, fastest, slack)
 
     def begin_anew(self) -> None:
-        """The controller may have restarted: the next count is compared with none before."""
+        """Compare the next count with none before, because the controller may have restarted."""
         self.last, self.is_new = None, False
 
 
 def wheel_sample(
     t_ns: int, sides: Sequence[Sequence[Odometer]], direction: tuple[int, int], rad_per_count: float
 ) -> WheelSample:
-    """The wheels of both sides, each the mean of its motors; what was counted earlier is carried on to `t_ns`."""
+    """Return the wheels of both sides, each the mean of its motors.
+
+    What was counted earlier is carried on to `t_ns`.
+    """
     angles, speeds = [], []
     for side, sign in zip(sides, direction, strict=True):
         turned = [each.total + each.speed * (t_ns - each.t_ns) * 1e-9 for each in side]
@@ -89,7 +92,7 @@ def wheel_sample(
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """A message: its number, its bytes by `struct` without the byte order, and the names of the fields."""
+    """Layout of a message: its number, its bytes by `struct` without the byte order, and the names of the fields."""
 
     command: int
     order: str
@@ -98,27 +101,27 @@ class Layout:
 
     @property
     def length(self) -> int:
-        """Of the fields in bytes."""
+        """Length of the fields in bytes."""
         return struct.calcsize(self.order + self.body)
 
     def pack(self, *values: float) -> bytes:
-        """The bytes of the fields."""
+        """Return the bytes of the fields."""
         return struct.pack(self.order + self.body, *values)
 
     def unpack(self, data: bytes) -> dict[str, Any]:
-        """The fields by name, of bytes that begin with them."""
+        """Return the fields by name, of bytes that begin with them."""
         return dict(zip(self.fields, struct.unpack_from(self.order + self.body, data), strict=True))
 
 
 def layouts(order: str, *rows: tuple[str, int, str, str]) -> Mapping[str, Layout]:
-    """By name: each row has name, number, body and the fields' names."""
+    """Return layouts by name, from rows of name, number, body and the fields' names."""
     return MappingProxyType(
         {name: Layout(command, order, body, tuple(names.split())) for name, command, body, names in rows}
     )
 
 
 def limits(fastest: Limit, timeout: Limit, stop_deceleration_rad_s2: float) -> Limits:
-    """Of controllers that are slowed down by this host, with what robot.toml declares."""
+    """Return the limits of controllers that this host slows down, with what robot.toml declares."""
     slows = Limit(stop_deceleration_rad_s2, "robot.toml")
     return Limits(max_wheel_speed_rad_s=fastest, command_timeout_s=timeout, stop_deceleration_rad_s2=slows)
 
@@ -146,17 +149,17 @@ def outgoing(now_ns: int, *frames: Frame, life_ns: int = _FRAME_LIFE_NS) -> tupl
 
 
 def commanding(now_ns: int, command: WheelCommand, *frames: Frame) -> tuple[OutgoingFrame, ...]:
-    """The frames of a command: half of its validity may pass on the way."""
+    """Return the frames of a command: half of its validity may pass on the way."""
     return outgoing(now_ns, *frames, life_ns=round(0.5e9 * command.valid_for_s))
 
 
 def estop_frames(now_ns: int, frames: tuple[Frame, ...]) -> tuple[OutgoingFrame, ...]:
-    """The frames of an e-stop, three times over, before all others."""
+    """Return the frames of an e-stop, three times over, before all others."""
     return tuple(OutgoingFrame(frame, now_ns + _ESTOP_LIFE_NS, _ESTOP_RANK) for frame in _ESTOP_REPEATS * frames)
 
 
 def status(t_ns: int, state: DriverState, stop_confirmed: bool) -> RobotStatus:
-    """A status of nothing but the state: these controllers know no sessions and count no refused frames.
+    """Return a status of nothing but the state: these controllers know no sessions and count no refused frames.
 
     An e-stop that is not confirmed yet is a stop under way.
     """
@@ -176,24 +179,24 @@ def status(t_ns: int, state: DriverState, stop_confirmed: bool) -> RobotStatus:
 
 
 def counted(stats: DriverStats, name: str) -> DriverStats:
-    """The counters, with one more of `name`."""
+    """Return the counters, with one more of `name`."""
     return dataclasses.replace(stats, **{name: getattr(stats, name) + 1})
 
 
 def sides_of(nodes: tuple[Nodes, Nodes]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """The ids on the left and on the right."""
+    """Return the ids on the left and on the right."""
     left, right = ((side,) if isinstance(side, int) else side for side in nodes)
     return left, right
 
 
 def all_of(nodes: tuple[Nodes, Nodes]) -> tuple[int, ...]:
-    """Every id, left before right."""
+    """Return every id, left before right."""
     left, right = sides_of(nodes)
     return (*left, *right)
 
 
 def in_sides(nodes: Sequence[int | str]) -> list[Any]:
-    """What was heard of motors as left and right, the lower half first: two numbers, or two lists."""
+    """Split the motors that were received into left and right, the lower half first: two numbers, or two lists."""
     half = len(nodes) // 2
     left, right = list(nodes[:half]), list(nodes[half:])
     return [left[0], right[0]] if len(left) == len(right) == 1 else [left, right]

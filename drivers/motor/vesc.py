@@ -52,7 +52,7 @@ _BRAKE = codec.CAN_COMMANDS["set_brake_current"][0]
 
 @dataclass(slots=True)
 class _Motor:
-    """What is known of one controller; `turned` is in steps of its tachometer, six in an electrical turn."""
+    """State of one controller; `turned` is in steps of its tachometer, six in an electrical turn."""
 
     node: int
     turned: parts.Odometer = field(default_factory=parts.Odometer)
@@ -66,7 +66,7 @@ class _Motor:
 
     @property
     def stands(self) -> bool:
-        """As it said last."""
+        """Whether the motor stands, by its last report."""
         return abs(_ERPM_PER_STEP_S * self.turned.speed) < declared.STANDS_ERPM
 
     @property
@@ -75,12 +75,12 @@ class _Motor:
         return self.timeout is None and self.asked_timeout < TIMEOUT_TRIES
 
     def take_speed(self, erpm: float, t_ns: int) -> None:
-        """Its newest."""
+        """Store the newest speed."""
         self.turned.speed, self.erpm_ns = erpm / _ERPM_PER_STEP_S, t_ns
 
 
 class VescPort:
-    """Satisfies `drivers.motor.vendor_driver.Port`."""
+    """Port of `VendorDriver` for VESC controllers (a `drivers.motor.vendor_driver.Port`)."""
 
     def __init__(self, settings: declared.VescSettings) -> None:
         self._settings = settings
@@ -99,7 +99,7 @@ class VescPort:
 
     @property
     def seen(self) -> Controllers:
-        """How the controllers are."""
+        """State of the controllers, as received last."""
         timeouts = ((motor.node, motor.timeout) for motor in self._all if motor.timeout is not None)
         refusals = (declared.timeout_fault(self._settings, node, *timeout) for node, timeout in timeouts)
         return Controllers(
@@ -111,13 +111,13 @@ class VescPort:
 
     @property
     def identity(self) -> Identity | None:
-        """What answers as VESCs do."""
+        """Identity of the VESCs; None while one is missing or refused."""
         seen = self.seen
         return Identity("VESC", "", "robot.toml") if seen.missing is seen.refused is None else None
 
     @property
     def limits(self) -> Limits:
-        """What robot.toml declares, and the time-out where all of them report it."""
+        """Limits that robot.toml declares, and the time-out where all controllers report it."""
         settings, reported = self._settings, all(motor.timeout is not None for motor in self._all)
         fastest = Limit(settings.max_erpm / settings.erpm_per_rad_s, "robot.toml")
         return parts.limits(
@@ -132,7 +132,7 @@ class VescPort:
         return all(motor.erpm_ns is not None and motor.stands for motor in self._all)
 
     def begin_anew(self, now_ns: int) -> None:
-        """Forget what the controllers said."""
+        """Clear what the controllers reported."""
         self._pinged_ns = now_ns - _PING_PERIOD_NS
         for motor in self._all:
             motor.answered = motor.timed_out = motor.killed = False
@@ -141,7 +141,7 @@ class VescPort:
             motor.turned.begin_anew()
 
     def end_drive(self) -> None:
-        """Nothing to prepare: braking sends its frames in each tick."""
+        """Do nothing, because braking sends its frames in each tick."""
 
     def take(self, received: ReceivedFrame, permit: MotionPermit) -> Heard:
         """Take in a frame of a controller, a part of an answer to this host, or a frame of another host."""
@@ -168,11 +168,11 @@ class VescPort:
         return Heard()
 
     def sources(self) -> Sequence[Source]:
-        """The speed of every motor."""
+        """Return the speed of every motor."""
         return [Source(f"controller {motor.node}", motor.erpm_ns, SILENT_NS, GONE_NS) for motor in self._all]
 
     def objection(self, permit: MotionPermit) -> Objection | None:
-        """A fault, a kill switch, or a timeout that ran out."""
+        """Return what ends a drive: a fault, a kill switch, or a timeout that ran out."""
         # An answer of before the first command is not meant.
         is_armed_long = permit.lasts_ns(permit.looked_ns) > 2 * len(self._all) * _FAULT_PERIOD_NS + SILENT_NS
         for motor in self._all:
@@ -193,7 +193,7 @@ class VescPort:
         return None
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """The electrical speed of each motor."""
+        """Return the electrical speed of each motor."""
         limit, wanted = self._settings.max_erpm, (left_rad_s, right_rad_s)
         frames = []
         for side, direction, speed in zip(self._sides, self._settings.direction, wanted, strict=True):
@@ -211,7 +211,7 @@ class VescPort:
         return [codec.command(motor.node, "set_brake_current", amperes) for motor in self._all], False
 
     def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
-        """Nothing: released motors need no frames."""
+        """Return no frames: released motors need none."""
         return ()
 
     def may_reset(self, now_ns: int) -> bool:
@@ -240,7 +240,7 @@ class VescPort:
         return self._ask(now_ns, self._all[self._next_asked], codec.ask_values(codec.FAULT_AND_STATUS))
 
     def stop_frames(self) -> tuple[Frame, ...]:
-        """Brake every motor."""
+        """Return the frames that brake every motor."""
         return declared.stop_frames(self._settings)
 
     @property

@@ -237,7 +237,7 @@ class Reassembly:
 
 
 def crc(payload: bytes) -> int:
-    """Return CRC-16/XMODEM."""
+    """Return the CRC-16/XMODEM of a payload."""
     return binascii.crc_hqx(payload, 0)
 
 
@@ -276,7 +276,7 @@ class PacketDecoder:
         return found
 
     def _length(self, at: int) -> int | None:
-        """Of the packet that begins here: 0 if none does, None if more bytes are needed to know or to end it."""
+        """Return the length of the packet that begins here: 0 if none does, None if more bytes are needed."""
         pending = self._pending
         start = pending[at]
         if start not in (2, 3):

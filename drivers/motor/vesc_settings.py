@@ -1,4 +1,4 @@
-"""What robot.toml says of VESC controllers, and what follows from that alone: e-stop, bus load, safety card."""
+"""Settings of VESC controllers in robot.toml, and what follows from them alone: e-stop, bus load, safety card."""
 
 from __future__ import annotations
 
@@ -40,8 +40,9 @@ FAULTS = {
 
 
 class VescSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Its fields in [link]: left before right; `gear` is motor turns per wheel turn, `pole_pairs` half the poles.
+    """Settings of VESCs in [link]: left before right; `gear` is motor turns per wheel turn.
 
+    `pole_pairs` is half the motor's poles.
     `watchdog_s` (App Settings, Timeout), `timeout_brake_current_a`, `max_erpm` and `min_erpm` (below which the speed
     loop lets go) are what the controllers are set to. `uart_node`: on a serial link, the controller at its end, through
     which the others are reached on its CAN.
@@ -65,7 +66,7 @@ class VescSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         return 60.0 / (2.0 * math.pi) * self.pole_pairs * self.gear
 
     def fault(self) -> SettingsFault | None:
-        """What no single field shows."""
+        """Return what is wrong with the fields taken together, or None."""
         nodes = all_of(self.nodes)
         if not all(sides_of(self.nodes)):
             return SettingsFault("nodes", "a side has no controller", "write [left, right], such as [23, 51]")
@@ -81,12 +82,12 @@ class VescSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 def slowest_rad_s(settings: VescSettings) -> float:
-    """The slowest speed of a wheel that the speed loop holds."""
+    """Return the slowest speed of a wheel that the speed loop holds."""
     return settings.min_erpm / settings.erpm_per_rad_s
 
 
 def timeout_fault(settings: VescSettings, node: int, timeout_s: float, brake_current_a: float) -> str | None:
-    """How the timeout that a controller reports differs from what robot.toml declares."""
+    """Return how the timeout that a controller reports differs from what robot.toml declares, or None."""
     named = f"controller {node}: its timeout"
     if timeout_s <= 0.0:
         return f"{named} is off; set {1e3 * settings.watchdog_s:g} ms (VESC Tool, App Settings, General)"
@@ -98,7 +99,7 @@ def timeout_fault(settings: VescSettings, node: int, timeout_s: float, brake_cur
 
 
 class VescExchange:
-    """Satisfies `drivers.types.Exchange`: what goes over CAN elsewhere, in packets through the controller on the line.
+    """Exchange with VESCs on a serial line (a `drivers.types.Exchange`): CAN frames in packets through one controller.
 
     A command has no reply. A ping is asked as values, and a packet's answer comes as one fragment that holds it whole.
     """
@@ -110,7 +111,7 @@ class VescExchange:
         self._on_the_line = settings.uart_node
 
     def request(self, frame: Frame) -> bytes:
-        """The packet, forwarded where it is for another controller; for everybody both."""
+        """Return the packet, forwarded where it is for another controller; for everybody both."""
         to, payload = frame.can_id & 0xFF, self._payload(frame)
         sent = b"" if to not in (self._on_the_line, codec.EVERYBODY) else codec.packet(payload)
         return sent if to == self._on_the_line else sent + codec.packet(codec.forward(to, payload))
@@ -120,7 +121,7 @@ class VescExchange:
         return frame.can_id >> 8 in (codec.PING, codec.PROCESS_SHORT)
 
     def reply(self, frame: Frame, received: bytes) -> Frame | None:
-        """The first packet that answers this question, of this controller."""
+        """Return the first packet that answers this question, of this controller."""
         to, asked = frame.can_id & 0xFF, self._payload(frame)
         for payload in codec.PacketDecoder().feed(received):
             if payload[0] == asked[0] == codec.GET_APPCONF and codec.timeout(payload, to) is None:
@@ -148,7 +149,10 @@ class VescExchange:
 
 
 def stop_frames(settings: VescSettings) -> tuple[Frame, ...]:
-    """Brake with the declared current, all at once; nothing latches it. On a serial line also: do the motors stand?"""
+    """Return the frames that brake with the declared current, all at once; nothing latches it.
+
+    On a serial line they also ask whether the motors stand.
+    """
     brake = codec.command(codec.EVERYBODY, "set_brake_current", settings.brake_current_a)
     return (brake,) if settings.uart_node is None else (brake, *questions(settings))
 
@@ -180,14 +184,14 @@ def cyclic_frames(settings: VescSettings, command_rate_hz: float, _authenticated
 
 
 def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
-    """The controllers whose status was heard, split into left and right as they are numbered; None for none."""
+    """Return the controllers whose status was heard, split into left and right as they are numbered; None for none."""
     decoded = [codec.decode(frame) for frame in frames]
     nodes = sorted({one.controller for one in decoded if one is not None and one.name == "status"})
     return {"nodes": in_sides(nodes)} if len(nodes) > 1 else None
 
 
 def safety_card(settings: VescSettings) -> SafetyCard:
-    """Who stops the robot when."""
+    """Return the safety card of VESCs."""
     brakes = settings.timeout_brake_current_a > 0.0
     held = f"braking with {settings.timeout_brake_current_a:g} A"
     return SafetyCard(

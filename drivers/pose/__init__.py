@@ -24,7 +24,7 @@ DEFAULT = robot.SOURCE
 
 @cache
 def pose_sources() -> Mapping[str, Callable[..., PoseSource]]:
-    """By name: the `make_pose_source` of each module in this folder that has a `SOURCE`.
+    """Return the pose sources by name: the `make_pose_source` of each module in this folder that has a `SOURCE`.
 
     It makes a source of the fields of [pose], of which it takes its own and leaves the others.
     """
@@ -45,7 +45,7 @@ OF_THE_HOST = frozenset({"key", "sender_silence_s"})
 
 
 def own_fields(name: str) -> frozenset[str]:
-    """The fields of [pose] that the source of this name takes, and others may not. Raises PoseSourceError."""
+    """Return the fields of [pose] that the source of this name takes, and others may not. Raises PoseSourceError."""
     parameters = inspect.signature(find_pose_source(name)).parameters.values()
     return frozenset(each.name for each in parameters if each.kind is inspect.Parameter.KEYWORD_ONLY) - OF_THE_HOST
 
@@ -60,7 +60,7 @@ _RADIANS = {"rad": 1.0, "deg": math.pi / 180.0}
 
 
 class PoseConvention(msgspec.Struct, frozen=True):
-    """What a source sends: units; `clockwise` yaw; `mirrored`: its y is to the right of its x.
+    """Convention of a pose source: units; `clockwise` yaw; `mirrored`: its y is to the right of its x.
 
     `yaw_offset_rad` (counter-clockwise) is added to its yaw: where the sensor looks aside of the robot's forward.
     `origin` is the pose of the sensor's frame in the world (x, y, yaw), `offset` the place of the sensor on the robot,
@@ -77,7 +77,7 @@ class PoseConvention(msgspec.Struct, frozen=True):
     latency_s: float = 0.0
 
     def converted(self, sample: PoseSample) -> PoseSample:
-        """The pose of the tracked point in metres and radians, counter-clockwise, yaw in (-pi, pi].
+        """Return the pose of the tracked point in metres and radians, counter-clockwise, yaw in (-pi, pi].
 
         Without a heading it is not known where the tracked point is: the position stays the sensor's, which the sample
         then says by its lever arm.
@@ -125,20 +125,20 @@ class ConvertedPoses:
         self._convention = convention
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
-        """The source's poses in our convention."""
+        """Return the source's poses in our convention."""
         return [self._convention.converted(sample) for sample in self._source.receive(now_ns, from_robot)]
 
     def news(self) -> Sequence[str]:
-        """What the source says."""
+        """Return the messages of the converted source."""
         return self._source.news() if isinstance(self._source, SaysWhy) else ()
 
     def close(self) -> None:
-        """Close the source."""
+        """Close the converted source; safe to call twice."""
         self._source.close()
 
 
 def converted(source: PoseSource, convention: PoseConvention) -> PoseSource:
-    """The source in our convention; itself where nothing is to be changed."""
+    """Return the source in our convention; itself where nothing is to be changed."""
     return source if convention == AS_OURS else ConvertedPoses(source, convention)
 
 
@@ -149,7 +149,7 @@ class SeveralPoses:
         self._sources = tuple(zip(labels, sources, strict=True))
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
-        """The poses of all of them by their stamps, each with the number of its source."""
+        """Return the poses of all of them by their stamps, each with the number of its source."""
         found = [
             msgspec.structs.replace(sample, source=number)
             for number, (_, source) in enumerate(self._sources)
@@ -158,7 +158,7 @@ class SeveralPoses:
         return sorted(found, key=lambda sample: (sample.t_ns, sample.source))
 
     def news(self) -> Sequence[str]:
-        """What they say, each under its name."""
+        """Return the messages of all sources, each under its source's name."""
         return [
             f"{label}: {words}"
             for label, source in self._sources

@@ -179,7 +179,10 @@ def make_pose_source(
     sender_silence_s: float = SILENCE_S,
     **_of_other_sources: Any,
 ) -> NatNetPoses:
-    """By the fields of [pose]. Raises PoseSourceError for an address or group that cannot be had."""
+    """Create the NatNet source from the fields of [pose].
+
+    Raises PoseSourceError for an address or group that cannot be had.
+    """
     try:
         senders = SenderGate(sender_silence_s, None if allow is None else parse_allowed(allow))
     except ValueError as error:
@@ -232,7 +235,7 @@ class NatNetPoses:
         self.malformed = self.lost = 0
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
-        """What came since the last call, oldest first; never waits and never raises."""
+        """Return the poses received since the last call, oldest first; never waits and never raises."""
         poses = []
         with contextlib.suppress(OSError):
             self._ask(now_ns)
@@ -249,12 +252,12 @@ class NatNetPoses:
         return sorted(poses, key=lambda pose: pose.t_ns)
 
     def news(self) -> Sequence[str]:
-        """What a person should know since the last call."""
+        """Return messages for the operator since the last call."""
         said, self._said = self._said, []
         return [*said, *self._senders.news()]
 
     def close(self) -> None:
-        """Close the socket; safe to call twice."""
+        """Close the NatNet socket; safe to call twice."""
         self._socket.close()
 
     def _ask(self, now_ns: int) -> None:

@@ -39,7 +39,10 @@ def make_pose_source(
     heading_std_rad: float = 0.02,
     **_of_other_sources: Any,
 ) -> NmeaPoses:
-    """By the fields of [pose]. Raises PoseSourceError for a device that is not named, or the library not there."""
+    """Create the NMEA source from the fields of [pose].
+
+    Raises PoseSourceError for a device that is not named, or the library not there.
+    """
     if not device:
         raise PoseSourceError('no device; write pose.device = "/dev/serial/by-id/..." or "socket://HOST:PORT"')
     if importlib.util.find_spec("pynmeagps") is None:
@@ -68,7 +71,7 @@ class NmeaPoses:
         self._said: list[str] = []
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
-        """What came since the last call, oldest first; never waits and never raises."""
+        """Return the poses received since the last call, oldest first; never waits and never raises."""
         poses = []
         with contextlib.suppress(BlockingIOError):
             for _ in range(MOST_A_TICK):
@@ -83,12 +86,12 @@ class NmeaPoses:
         return poses
 
     def news(self) -> Sequence[str]:
-        """What a person should know since the last call."""
+        """Return messages for the operator since the last call."""
         said, self._said = self._said, []
         return said
 
     def close(self) -> None:
-        """End the reader; safe to call twice."""
+        """Stop the reader process; safe to call twice."""
         self._socket.close()
         self._process.terminate()
         try:
@@ -152,7 +155,7 @@ class TangentPlane:
     height_m: float
 
     def east_north(self, latitude_deg: float, longitude_deg: float, height_m: float) -> tuple[float, float]:
-        """Where a place is, by geocentric coordinates."""
+        """Return the position of a place, east and north (m) of the datum, by geocentric coordinates."""
         here, datum = _geocentric(latitude_deg, longitude_deg, height_m), _geocentric(*self._datum)
         dx, dy, dz = (a - b for a, b in zip(here, datum, strict=True))
         latitude, longitude = math.radians(self.latitude_deg), math.radians(self.longitude_deg)
@@ -186,7 +189,7 @@ class ReceiverClock:
         self._days, self._last_s = 0.0, 0.0
 
     def host_ns(self, time_of_day_s: float, arrival_ns: int) -> int:
-        """When a fix of this time was true, at the latest."""
+        """Return when a fix of this time was true, at the latest."""
         if time_of_day_s < self._last_s - 0.5 * DAY_S:
             self._days += DAY_S
         elif abs(time_of_day_s - self._last_s) > 0.5:
@@ -202,7 +205,7 @@ class ReceiverClock:
 
 @dataclass
 class Fixes:
-    """What sentences mean: `take` them with their arrival, and `flush` now and then; pure, and raises nothing.
+    """Conversion of NMEA sentences into poses: `take` them with their arrival, `flush` now and then; pure.
 
     What they give is a datagram's map (`drivers.pose.udp`), or {"said": sentence} where something changed for the worse
     or the better. A heading belongs to the position that came within 60 ms of it.
@@ -303,7 +306,10 @@ class Fixes:
         return usual * max(hdop, 1.0) if isinstance(hdop, float) else usual
 
     def _height_of(self, said: Any) -> tuple[float, list[dict[str, Any]]]:
-        """The height over the ellipsoid: the fix's, else the last known one, else 0; the plane's scale hangs on it."""
+        """Return the height over the ellipsoid: the fix's, else the last known one, else 0.
+
+        The plane's scale hangs on it.
+        """
         if isinstance(said.alt, float):
             self._height_m = said.alt + (said.sep if isinstance(said.sep, float) else 0.0)
             return self._height_m, []
@@ -318,7 +324,7 @@ class Fixes:
         return {**position, "yaw_rad": yaw_rad, "yaw_std_rad": std_rad}
 
     def _heading_hint(self, arrival_ns: int) -> list[dict[str, Any]]:
-        """Which sentence brings a heading, once, where none has come for a while."""
+        """Return which sentence brings a heading, once, where none has come for a while."""
         first_ns = self._first_ns = arrival_ns if self._first_ns is None else self._first_ns
         if self._heading is not None or arrival_ns - first_ns < _HINT_NS:
             return []

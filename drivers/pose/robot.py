@@ -11,16 +11,16 @@ SOURCE = "robot"
 
 
 class RobotPoses:
-    """Satisfies `drivers.types.PoseSource`: what the motor driver received."""
+    """Pose source of the poses that the motor driver received (a `drivers.types.PoseSource`)."""
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
         """Return the robot's poses."""
         return from_robot
 
     def close(self) -> None:
-        """Hold nothing."""
+        """Do nothing, because the source holds no resources."""
 
 
 def make_pose_source(**_of_other_sources: Any) -> RobotPoses:
-    """Make the source; it has no fields of its own in [pose]."""
+    """Create the robot's pose source; it has no fields of its own in [pose]."""
     return RobotPoses()

@@ -24,7 +24,7 @@ _ROOT = 0
 
 
 def bridge_address(port: int) -> bytes:
-    """Where the daemon of this user hears the bridge: an abstract name, which vanishes with the daemon."""
+    """Return the address at which this user's daemon receives the bridge: an abstract name, gone with the daemon."""
     return f"\0disco-hw/{os.geteuid()}/pose/{port}".encode()
 
 
@@ -38,7 +38,7 @@ def make_pose_source(
     sender_silence_s: float = SILENCE_S,
     **_of_other_sources: Any,
 ) -> BridgePoses:
-    """By the port of [pose]; the other fields are the bridge's.
+    """Create the bridge's source by the port of [pose]; the other fields are the bridge's.
 
     Raises PoseSourceError where another daemon hears the bridge already.
     """
@@ -67,7 +67,7 @@ class BridgePoses:
         self.foreign_users = 0
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
-        """What came since the last call, oldest first; never waits and never raises."""
+        """Return the poses received since the last call, oldest first; never waits and never raises."""
         poses = []
         with contextlib.suppress(OSError):
             for _ in range(MOST_A_TICK):
@@ -80,12 +80,12 @@ class BridgePoses:
         return sorted(poses, key=lambda pose: pose.t_ns)
 
     def news(self) -> Sequence[str]:
-        """What a person should know since the last call."""
+        """Return messages for the operator since the last call."""
         said, self._said = self._said, []
         return [*said, *self._senders.news()]
 
     def close(self) -> None:
-        """Close the socket; safe to call twice."""
+        """Close the bridge's socket; safe to call twice."""
         self._socket.close()
 
     def _take(self, datagram: bytes, sender: str, now_ns: int) -> PoseSample | None:
@@ -102,7 +102,7 @@ class BridgePoses:
 
 
 def _sender(ancillary: Sequence[tuple[int, int, bytes]]) -> tuple[int | None, int | None]:
-    """The process and the user that sent a datagram, as the kernel says."""
+    """Return the process and the user that sent a datagram, as the kernel says."""
     for level, kind, data in ancillary:
         if (level, kind) == (socket.SOL_SOCKET, socket.SCM_CREDENTIALS) and len(data) == _CREDENTIALS.size:
             process, user, _ = _CREDENTIALS.unpack(data)

@@ -1,4 +1,4 @@
-"""Who may send poses to a port: allowed addresses, one sender at a time, and a proof under a key; pure.
+"""Admission of pose senders to a port: allowed addresses, one sender at a time, and a proof under a key; pure.
 
 Any user of this computer can send to a UDP port of it. Two programs that do so by mistake, or one on purpose, would
 pull the estimate to and fro without a word.
@@ -37,7 +37,7 @@ def parse_allowed(addresses: Collection[str]) -> tuple[IPv4Network, ...]:
 
 
 class PoseProof:
-    """Unwraps proven datagrams: each must have been sent later than all before it, and since the port was opened."""
+    """Check of proven datagrams: each must have been sent later than all before it, and since the port was opened."""
 
     def __init__(self, key: bytes, wall_ns: int) -> None:
         self._key = key

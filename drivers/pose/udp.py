@@ -39,7 +39,7 @@ class _Datagram(msgspec.Struct, frozen=True):
 
 
 class _Words(msgspec.Struct, frozen=True):
-    """A sentence for a person, from a process of ours that sends poses."""
+    """A sentence for the operator, from a process of ours that sends poses."""
 
     said: str
 
@@ -61,7 +61,7 @@ def make_pose_source(
     sender_silence_s: float = SILENCE_S,
     **_of_other_sources: Any,
 ) -> UdpPoses:
-    """By the fields of [pose], and the `key` that the host has read from `key_file`.
+    """Create the UDP source from the fields of [pose], and the `key` that the host has read from `key_file`.
 
     Raises PoseSourceError for an address that cannot be had, and for a key that is named and not given.
     """
@@ -98,7 +98,7 @@ class UdpPoses:
         return self._senders.refused
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
-        """What came since the last call, oldest first; never waits and never raises."""
+        """Return the poses received since the last call, oldest first; never waits and never raises."""
         poses = []
         with contextlib.suppress(OSError):
             for _ in range(MOST_A_TICK):
@@ -108,15 +108,15 @@ class UdpPoses:
         return sorted(poses, key=lambda pose: pose.t_ns)
 
     def news(self) -> Sequence[str]:
-        """What a person should know since the last call."""
+        """Return messages for the operator since the last call."""
         return self._senders.news()
 
     def close(self) -> None:
-        """Close the socket; safe to call twice."""
+        """Close the UDP socket; safe to call twice."""
         self._socket.close()
 
     def _take(self, datagram: bytes, sender: tuple[str, int], now_ns: int) -> PoseSample | None:
-        """The pose in a datagram, if its sender counts; the cheap checks first, as anybody can send many."""
+        """Return the pose in a datagram, if its sender counts; the cheap checks first, as anybody can send many."""
         if not self._senders.may_send(sender, now_ns):
             return None
         if self._proof is not None:
@@ -162,7 +162,7 @@ def pose_of(datagram: bytes, now_ns: int) -> PoseSample | None:
 
 
 def words_of(datagram: bytes) -> str | None:
-    """Return the sentence for a person in a datagram of a process of ours; None where there is none."""
+    """Return the sentence for the operator in a datagram of a process of ours; None where there is none."""
     try:
         return _WORDS.decode(datagram).said
     except (msgspec.MsgspecError, UnicodeDecodeError):

@@ -29,7 +29,7 @@ __all__ = [
 
 @cache
 def media() -> Mapping[str, Callable[..., ReconnectingTransport]]:
-    """By `link.kind` of robot.toml: the `make_transport` of each module in this folder that has a `KIND`.
+    """Return the `make_transport` of each module in this folder that has a `KIND`, by `link.kind` of robot.toml.
 
     It makes a link of the fields of [link], of which it takes its own and leaves the others.
     """

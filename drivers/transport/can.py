@@ -144,11 +144,14 @@ class CanMedium:
 
     @property
     def name(self) -> str:
-        """Interface and channel."""
+        """Name of the bus by interface and channel."""
         return f"{self.interface} {self.channel}"
 
     def connect(self, counters: TransportCounters) -> CanConnection:
-        """Open the bus. Raises what python-can raises, LinkLostError for a socketcan interface that cannot work yet."""
+        """Open the CAN bus.
+
+        Raises what python-can raises, LinkLostError for a socketcan interface that cannot work yet.
+        """
         options: dict[str, Any] = {}
         if self.interface == "socketcan":
             require_working_interface(self.channel)
@@ -182,7 +185,7 @@ class CanConnection:
     """
 
     def __init__(self, bus: can.BusABC, counters: TransportCounters, own: OwnFrames | None = None) -> None:
-        """`own`: of a bus that hands a sender its own frames, which then are not received."""
+        """Wrap an open bus; `own` is for a bus that hands a sender its own frames, which then are not received."""
         self._bus = bus
         self._counters = counters
         self._own = own

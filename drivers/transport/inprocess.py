@@ -31,7 +31,7 @@ class InProcessTransport:
 
     @property
     def name(self) -> str:
-        """The name given."""
+        """Name given to this end."""
         return self._name
 
     @property
@@ -60,7 +60,7 @@ class InProcessTransport:
         self._settle_both()
 
     def close(self) -> None:
-        """Disconnect; safe to call twice."""
+        """Disconnect this end; safe to call twice."""
         self._open = False
         self._settle_both()
 
@@ -84,7 +84,7 @@ class InProcessTransport:
         return True
 
     def receive(self) -> Sequence[ReceivedFrame]:
-        """All frames received since the last call, oldest first."""
+        """Return all frames received since the last call, oldest first."""
         received = tuple(self._incoming)
         self._incoming.clear()
         return received

@@ -71,7 +71,7 @@ class TransmitQueue:
         return len(self._heap)
 
     def push(self, outgoing: OutgoingFrame) -> OutgoingFrame | None:
-        """Queue a frame; return the frame that did not fit (the given or an earlier one), or None."""
+        """Add a frame to the queue; return the frame that did not fit (the given or an earlier one), or None."""
         self._sequence += 1
         entry = (_rank(outgoing), self._sequence, outgoing)
         if len(self._heap) < self._capacity:
@@ -103,7 +103,7 @@ class TransmitQueue:
         return expired
 
     def clear(self) -> int:
-        """Drop everything; return how many frames."""
+        """Drop all queued frames; return how many there were."""
         dropped = len(self._heap)
         self._heap.clear()
         return dropped
@@ -142,7 +142,7 @@ class TransmitBusyError(Exception):
 
 
 class LinkLostError(Exception):
-    """The medium said that it is gone; the message is for a person."""
+    """The medium said that it is gone; the message is for the operator."""
 
 
 class LinkMuteError(LinkLostError):
@@ -163,15 +163,15 @@ class Connection(Protocol):
         """Send one frame in bounded time; raises TransmitBusyError if there is no room, anything else if lost."""
 
     def close(self) -> None:
-        """Release the medium; may raise."""
+        """Release the connected medium; may raise."""
 
 
 class Medium(Protocol):
-    """How to connect to one address of one kind of medium."""
+    """Medium of one kind with one address, which can be connected."""
 
     @property
     def name(self) -> str:
-        """Medium and address, for messages to a person."""
+        """Medium and address, for messages to the operator."""
 
     def connect(self, counters: TransportCounters) -> Connection:
         """Connect in bounded time, counting malformed input and bus errors in `counters`; raises if it cannot."""
@@ -196,7 +196,9 @@ class ReconnectingTransport:
         carries_extended: bool = False,
         carries_packets: bool = False,
     ) -> None:
-        """`mute_after_s`: a link on which no frame comes for so long is closed and connected again; None: never.
+        """Create a transport that is closed.
+
+        `mute_after_s`: a link on which no frame comes for so long is closed and connected again; None: never.
 
         `carries_extended`: whether the medium has frames with 29-bit identifiers; `carries_packets`: whether it has
         none, but packets of up to 512 bytes.
@@ -227,7 +229,7 @@ class ReconnectingTransport:
 
     @property
     def name(self) -> str:
-        """Medium and address, for messages to a person."""
+        """Medium and address, for messages to the operator."""
         return self._medium.name
 
     @property
@@ -290,7 +292,7 @@ class ReconnectingTransport:
         return dropped is not outgoing
 
     def receive(self) -> Sequence[ReceivedFrame]:
-        """All frames received since the last call, oldest first, without blocking."""
+        """Return all frames received since the last call, oldest first, without blocking."""
         with self._changed:
             received = tuple(self._incoming)
             self._incoming.clear()
@@ -423,7 +425,7 @@ class ReconnectingTransport:
         return self._connection is not None and not self._lost.is_set() and len(self._outgoing) > 0
 
     def _write(self, connection: Connection, outgoing: OutgoingFrame) -> bool:
-        """Send one frame; False if there was no room for it now."""
+        """Write one frame to the medium; False if there was no room for it now."""
         with self._writing:
             try:
                 if self._connection is not connection:

@@ -72,7 +72,7 @@ class SerialMedium:
 
     @property
     def name(self) -> str:
-        """Port and speed."""
+        """Name of the port with its speed."""
         return f"serial {self.port} at {self.baud} Bd"
 
     def connect(self, counters: TransportCounters) -> Connection:
@@ -123,7 +123,7 @@ class SerialConnection:
         self._line_is_clean = True
 
     def close(self) -> None:
-        """Close the port."""
+        """Close the serial port."""
         self._port.close()
 
 
@@ -179,7 +179,7 @@ class ExchangeConnection:
         return reply
 
     def close(self) -> None:
-        """Close the port."""
+        """Close the serial port."""
         self._port.close()
 
     def _rest(self) -> None:
@@ -213,7 +213,7 @@ class SocketPort(protocol_socket.Serial):  # type: ignore[misc]  # pyserial has 
     _socket: socket.socket | None
 
     def open(self) -> None:
-        """Connect. Raises `serial.SerialException`."""
+        """Connect to the socket of the line; raises `serial.SerialException`. Raises `serial.SerialException`."""
         if not self.portstr.startswith(_UNIX):
             super().open()
             return
@@ -237,7 +237,7 @@ class SocketPort(protocol_socket.Serial):  # type: ignore[misc]  # pyserial has 
         return count[0]
 
     def close(self) -> None:
-        """Leave the line; safe to call twice."""
+        """Disconnect from the line; safe to call twice."""
         line, self._socket, self.is_open = self._socket, None, False
         if line is not None:
             line.close()

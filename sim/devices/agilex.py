@@ -25,7 +25,10 @@ _PERIODS_MS = {0x211: 100, 0x221: 20, 0x311: 20, 0x251: 20, 0x261: 100, 0x241: 2
 
 @dataclass(slots=True)
 class AgilexBase:
-    """One base. `commanded` is what it follows now: speed (m/s) and turn rate (rad/s)."""
+    """State of one base, of which `commanded` is what it follows now: speed (m/s) and turn rate (rad/s).
+
+    `commanded` is what it follows now: speed (m/s) and turn rate (rad/s).
+    """
 
     vehicle_state: int = 0
     control_mode: int = STANDBY
@@ -102,7 +105,7 @@ class AgilexBase:
         return []
 
     def take_remote_control(self, speed_m_s: float, turn_rad_s: float) -> None:
-        """A person switches the remote control on and drives."""
+        """Let an operator switch the remote control on and drive."""
         self.control_mode, self.rc_commanded = RC_MODE, (speed_m_s, turn_rad_s)
 
     def at(self, now_ms: int) -> None:
@@ -120,7 +123,7 @@ class AgilexBase:
         return frames
 
     def message(self, can_id: int) -> CanFrame:
-        """A message of the base by its identifier."""
+        """Return a message of the base by its identifier."""
         return CanFrame(can_id, self._body(can_id))
 
     def _body(self, can_id: int) -> bytes:
@@ -153,7 +156,10 @@ class AgilexBase:
 
 
 class AgilexController:
-    """One base: satisfies `virtual_robot.Controller`. It makes wheel speeds of its own, by the track that it has."""
+    """Controller of one AgileX base (a `virtual_robot.Controller`), which makes wheel speeds by its own track width.
+
+    It makes wheel speeds of its own, by the track that it has.
+    """
 
     brakes = False
 
@@ -176,19 +182,19 @@ class AgilexController:
         return self.base.vehicle_state == 0 and self.base.control_mode in (CAN_MODE, RC_MODE)
 
     def make_loop(self) -> EncoderLoop:
-        """Its wheels' speed loops, assumed to be as simple as can be: the vendor tells nothing of them."""
+        """Create the wheels' speed loops, assumed to be as simple as can be: the vendor documents nothing of them."""
         return EncoderLoop(EncoderUse.SPEED, self._settings.max_speed_m_s / self._settings.wheel_radius_m)
 
     @property
     def state(self) -> str:
-        """In one word."""
+        """State of the base in one word."""
         if self.base.vehicle_state or self.base.error_code:
             return "FAULT"
         return "ARMED" if self.base.control_mode == CAN_MODE else "STANDBY"
 
     @property
     def obeyed(self) -> int:
-        """How many commands it has taken."""
+        """Number of commands accepted since power-on."""
         return len(self.base.obeyed)
 
     def receive(self, now_us: int, frame: CanFrame) -> Sequence[CanFrame]:
@@ -219,5 +225,5 @@ class AgilexController:
 
 
 def make_controller(settings: AgilexSettings, ticks_per_rev: int) -> AgilexController:
-    """The base of a robot whose robot.toml has these settings, with the encoder on the wheel."""
+    """Return the base of a robot whose robot.toml has these settings, with the encoder on the wheel."""
     return AgilexController(settings, ticks_per_rev)

@@ -87,7 +87,7 @@ class Axis:
         self.watchdog_left = int(f32(f32(self.watchdog_timeout_s) * 1000.0 * CHECKS_PER_MS))
 
     def check_watchdog(self, error: int) -> None:
-        """One of the 8 checks in a millisecond."""
+        """Run one of the 8 watchdog checks in a millisecond."""
         if not self.watchdog_enabled:
             return
         if self.watchdog_left > 0:
@@ -125,7 +125,7 @@ class Axis:
 
     @property
     def velocity_turns_s(self) -> float | None:
-        """What the motor is to turn at; None where it is released and coasts."""
+        """Commanded speed (turns/s) within the limit; None where the motor is released and coasts."""
         if self.axis_state != CLOSED_LOOP or self.control_mode != VELOCITY_CONTROL:
             return None
         return min(max(self.input_vel_turns_s, -self.vel_limit_turns_s), self.vel_limit_turns_s)
@@ -163,8 +163,10 @@ class OdriveBoard:
     """The axes of one board at their nodes, on a bus that they share."""
 
     def __init__(self, generation: str, nodes: Sequence[int], periods_ms: dict[str, int] | None = None) -> None:
-        """`generation`: "0.5" or "0.6". `periods_ms`: by the names of `PERIODS`, 0 for never; what is left out is as
-        the firmware has it.
+        """Create a board of firmware `generation` "0.5" or "0.6".
+
+        `periods_ms`: by the names of `PERIODS`, 0 for never; default: the firmware's. `periods_ms`: by the names of
+        `PERIODS`, 0 for never; what is left out is as the firmware has it.
         """
         self.generation = generation
         self.axes = [Axis(node) for node in nodes]
@@ -217,7 +219,7 @@ class OdriveBoard:
                 axis.pos_turns = struct.unpack_from("<f", data)[0]
 
     def clear_errors(self) -> None:
-        """Of every axis of the board, with all their parts; none is energised again by that."""
+        """Clear the errors of every axis of the board; none is energised again by that."""
         for axis in self.axes:
             axis.axis_error = axis.motor_error = axis.encoder_error = 0
             axis.controller_error = axis.sensorless_error = 0
@@ -247,7 +249,7 @@ class OdriveBoard:
         return self.cyclic(now_ms)
 
     def cyclic(self, now_ms: int) -> list[CanFrame]:
-        """The frames due now, axis by axis."""
+        """Return the frames due now, axis by axis."""
         frames = []
         for axis in self.axes:
             for name, command in _CYCLIC.items():
@@ -258,11 +260,11 @@ class OdriveBoard:
         return frames
 
     def message(self, axis: Axis, command: int) -> CanFrame:
-        """A telemetry message of an axis by its command number."""
+        """Return a telemetry message of an axis by its command number."""
         return CanFrame(axis.node_id << 5 | command, self._telemetry_body(axis, command) or b"")
 
     def _telemetry_body(self, axis: Axis, command: int) -> bytes | None:
-        """The data of a message; None for a command that asks for none in this generation."""
+        """Return the data of a message; None for a command that asks for none in this generation."""
         if command == 0x09:
             return struct.pack("<ff", axis.pos_turns, axis.vel_turns_s)
         if command == 0x14:
@@ -325,7 +327,10 @@ class OdriveBoard:
 
 
 class OdriveController:
-    """All axes of one robot: satisfies `sim.virtual_robot.Controller`. Firmware 0.6 has a board for each axis."""
+    """Controller of all axes of one robot (a `sim.virtual_robot.Controller`).
+
+    Firmware 0.6 has a board for each axis.
+    """
 
     brakes = False
 
@@ -352,13 +357,13 @@ class OdriveController:
         return any(axis.axis_state == CLOSED_LOOP for side in self.axes for axis in side)
 
     def make_loop(self) -> EncoderLoop:
-        """Its field-oriented control, whose angle is the encoder's."""
+        """Create the field-oriented control, whose angle is the encoder's."""
         turns_s = self._settings.vel_limit_turns_s
         return EncoderLoop(EncoderUse.COMMUTATION, 2.0 * math.pi * turns_s / self._settings.gear)
 
     @property
     def state(self) -> str:
-        """In one word."""
+        """State of all axes in one word."""
         axes = [axis for side in self.axes for axis in side]
         if any(axis.axis_error for axis in axes):
             return "FAULT"
@@ -366,7 +371,7 @@ class OdriveController:
 
     @property
     def obeyed(self) -> int:
-        """How many frames its axes have taken."""
+        """Number of frames that the axes have accepted."""
         return sum(axis.fed for side in self.axes for axis in side)
 
     def receive(self, now_us: int, frame: CanFrame) -> Sequence[CanFrame]:
@@ -418,5 +423,5 @@ class OdriveController:
 
 
 def make_controller(settings: OdriveSettings, ticks_per_rev: int) -> OdriveController:
-    """The controllers of a robot whose robot.toml has these settings, with the encoder on the wheel."""
+    """Return the controllers of a robot whose robot.toml has these settings, with the encoder on the wheel."""
     return OdriveController(settings, ticks_per_rev)

@@ -23,7 +23,7 @@ QUIET_US = 10_000
 
 @dataclass(slots=True)
 class RoboclawRegisters:
-    """What a host can set and read; motor 1 and 2. Counts wrap at 2^32."""
+    """Registers that a host can set and read; motor 1 and 2. Counts wrap at 2^32. Counts wrap at 2^32."""
 
     timeout_ds: int = 0
     encoder_m1: int = 0
@@ -232,20 +232,20 @@ class RoboclawController:
         return any(board.command is not None and board.command[0] == "speed" for board in self.boards.values())
 
     def make_loop(self) -> EncoderLoop:
-        """Its velocity PID, which full duty (QPPS) ends."""
+        """Create the velocity PID, which full duty (QPPS) ends."""
         qpps = min(board.registers.pid_m1[3] for board in self.boards.values())
         return EncoderLoop(EncoderUse.SPEED, qpps / self._settings.counts_per_rad)
 
     @property
     def state(self) -> str:
-        """In one word."""
+        """State of all boards in one word."""
         if any(board.registers.status & 0xFFFF for board in self.boards.values()):
             return "FAULT"
         return "STANDBY" if all(board.command is None for board in self.boards.values()) else "ARMED"
 
     @property
     def obeyed(self) -> int:
-        """How many speed commands they have taken."""
+        """Number of speed commands that the boards have accepted."""
         return sum(command in _MOVING for board in self.boards.values() for command, _ in board.obeyed)
 
     def receive(self, now_us: int, frame: CanFrame) -> Sequence[CanFrame]:
@@ -303,5 +303,5 @@ _MOVING = frozenset({34, 35, 36, 37, 40})
 
 
 def make_controller(settings: RoboclawSettings, ticks_per_rev: int) -> RoboclawController:
-    """The boards of a robot whose robot.toml has these settings."""
+    """Return the boards of a robot whose robot.toml has these settings."""
     return RoboclawController(settings, ticks_per_rev)

@@ -19,7 +19,10 @@ WHEELS_MS, STATE_MS, STEP_MS = 20, 50, 20
 
 
 class Ros2BaseController:
-    """Satisfies `sim.virtual_robot.Controller`. `joints`: whether the base says how all of its wheels turn."""
+    """Controller of a base on ROS 2 (a `sim.virtual_robot.Controller`).
+
+    `joints`: whether the base reports each wheel. `joints`: whether the base says how all of its wheels turn.
+    """
 
     brakes = False
 
@@ -44,12 +47,12 @@ class Ros2BaseController:
         return self.wheels_rad_s != (0.0, 0.0)
 
     def make_loop(self) -> EncoderLoop:
-        """Its wheels' speed loops."""
+        """Create the wheels' speed loops."""
         return EncoderLoop(EncoderUse.SPEED, self._settings.max_speed_m_s / self._settings.wheel_radius_m)
 
     @property
     def state(self) -> str:
-        """In one word."""
+        """State of the base in one word."""
         return "ESTOP" if self.end.latched else "ARMED" if self.end.driving else "STANDBY"
 
     def receive(self, now_us: int, frame: CanFrame) -> Sequence[CanFrame]:
@@ -92,5 +95,5 @@ class Ros2BaseController:
 
 
 def make_controller(settings: wire.Ros2BaseSettings, ticks_per_rev: int) -> Ros2BaseController:
-    """The base of a robot whose robot.toml has these settings, with the encoder on the wheel."""
+    """Return the base of a robot whose robot.toml has these settings, with the encoder on the wheel."""
     return Ros2BaseController(settings, ticks_per_rev)

@@ -54,7 +54,7 @@ def f32(value: float) -> float:
 
 @dataclass(slots=True)
 class VescValues:
-    """What the controller measures."""
+    """Values that the controller measures."""
 
     t_fet_c: float = 30.0
     t_motor_c: float = 30.0
@@ -83,14 +83,17 @@ class VescValues:
 
 
 def _steps(value: float, scale: float, code: str, number: Callable[[float], float] = f32) -> bytes:
-    """In the vendor's way: multiplied, as a 32-bit float or as `number` says, and cut off toward zero."""
+    """Encode a value as the vendor does: multiplied, as a 32-bit float or as `number` says, and cut off toward zero."""
     bits = 8 * struct.calcsize(">" + code)
     low, high = -(1 << bits - 1), (1 << bits - 1) - 1
     return struct.pack(">" + code, min(max(int(number(f32(value) * scale)), low), high))
 
 
 class Vesc:
-    """One controller. `take_calls` returns the commands that reached its motor, by name and value.
+    """Model of one VESC controller.
+
+    `take_calls` returns the commands that reached its motor, by name and value. `take_calls` returns the commands that
+    reached its motor, by name and value.
 
     `kill_switch_pin`: its kill switch input. Like `timed_out`, the `kill_switch_active` that it reports is the result
     of the last check of the timeout thread (vedderb/bldc, timeout.c), not the state at the time of the request.
@@ -117,7 +120,7 @@ class Vesc:
         self._serial_out = bytearray()
 
     def take_calls(self) -> list[tuple[str, float]]:
-        """The commands that reached the motor since the last call."""
+        """Return the commands that reached the motor since the last call."""
         calls, self._calls = self._calls, []
         return calls
 
@@ -160,7 +163,7 @@ class Vesc:
         return bytes(self._serial_out), frames
 
     def take_packet_answer(self, frame: CanFrame) -> bytes:
-        """What goes out on the serial line for a fragment of another controller's answer to a forwarded packet."""
+        """Return the bytes for the serial line after a fragment of another controller's reply to a forwarded packet."""
         command, to = frame.can_id >> 8, frame.can_id & 0xFF
         if not frame.extended or to != self.controller_id:
             return b""
@@ -176,7 +179,7 @@ class Vesc:
         return b""
 
     def check_timeout(self, now_ms: int) -> float | None:
-        """The check that runs every 10 ms; returns the brake current (A) that it applies, None while all is well.
+        """Run the check of every 10 ms; return the brake current (A) that it applies, None while all is well.
 
         While the kill switch is active the timeout is neither found nor ended, and commands are ignored.
         """
@@ -200,7 +203,7 @@ class Vesc:
         return [self.status(number) for number, period in self.status_ms.items() if period and now_ms % period == 0]
 
     def status(self, number: int) -> CanFrame:
-        """A status message by its command number."""
+        """Return a status message by its command number."""
         v = self.values
         parts: dict[int, tuple[tuple[float, float, str], ...]] = {
             9: ((v.erpm, 1, "i"), (v.current_motor_a, 10, "h"), (v.duty, 1000, "h")),
@@ -217,7 +220,7 @@ class Vesc:
         return CanFrame(number << 8 | self.controller_id, data, extended=True)
 
     def answer_values(self, mask: int) -> bytes:
-        """The bytes of the values that the mask asks for."""
+        """Return the bytes of the values that the mask asks for."""
         v = self.values
         status = int(self.timed_out) | self.kill_switch_active << 1
         parts: tuple[Callable[[], bytes], ...] = (
@@ -309,7 +312,7 @@ class Vesc:
 
 
 def can_packet(to: int, sender: int, payload: bytes, send_mode: int) -> list[CanFrame]:
-    """A packet in fragments."""
+    """Return a packet in fragments."""
     if len(payload) <= 6:
         return [CanFrame(8 << 8 | to, bytes((sender, send_mode)) + payload, extended=True)]
     frames = [
@@ -326,13 +329,13 @@ def can_packet(to: int, sender: int, payload: bytes, send_mode: int) -> list[Can
 
 
 def serial_packet(payload: bytes) -> bytes:
-    """The bytes of a packet on the serial line."""
+    """Return the bytes of a packet on the serial line."""
     size = bytes((2, len(payload))) if len(payload) < 256 else b"\3" + len(payload).to_bytes(2)
     return size + payload + binascii.crc_hqx(payload, 0).to_bytes(2) + b"\3"
 
 
 def wrapped(count: int) -> int:
-    """As a signed 32-bit number that wraps."""
+    """Return a count as a signed 32-bit number that wraps."""
     return (count + 2**31) % 2**32 - 2**31
 
 
@@ -372,7 +375,10 @@ class _PacketParser:
 
 
 class VescController:
-    """All VESCs of one robot: satisfies `sim.virtual_robot.Controller`. Below its least speed a motor is let go."""
+    """Controller of all VESCs of one robot (a `sim.virtual_robot.Controller`).
+
+    Below its least speed a motor is let go.
+    """
 
     def __init__(self, settings: VescSettings, ticks_per_rev: int) -> None:
         self._settings = settings
@@ -403,12 +409,12 @@ class VescController:
         return any(vesc.held[0] == "set_erpm" for side in self.sides for vesc in side)
 
     def make_loop(self) -> EncoderLoop:
-        """Its field-oriented control, whose angle is the encoder's."""
+        """Create the field-oriented control, whose angle is the encoder's."""
         return EncoderLoop(EncoderUse.COMMUTATION, self._settings.max_erpm / self._settings.erpm_per_rad_s)
 
     @property
     def state(self) -> str:
-        """In one word."""
+        """State of all VESCs in one word."""
         vescs = [vesc for side in self.sides for vesc in side]
         if any(vesc.values.fault for vesc in vescs):
             return "FAULT"
@@ -416,7 +422,7 @@ class VescController:
 
     @property
     def obeyed(self) -> int:
-        """How many set commands they have taken."""
+        """Number of set commands that the VESCs have accepted."""
         return sum(vesc.fed for side in self.sides for vesc in side)
 
     def receive(self, now_us: int, frame: CanFrame) -> Sequence[CanFrame]:
@@ -496,5 +502,5 @@ def _brakes(vesc: Vesc) -> bool:
 
 
 def make_controller(settings: VescSettings, ticks_per_rev: int) -> VescController:
-    """The controllers of a robot whose robot.toml has these settings, with the encoder on the wheel."""
+    """Return the controllers of a robot whose robot.toml has these settings, with the encoder on the wheel."""
     return VescController(settings, ticks_per_rev)

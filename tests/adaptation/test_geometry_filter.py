@@ -39,7 +39,7 @@ def truth(robot):
 
 
 def changed(plant, **fields):
-    """The same plant as another robot from now on."""
+    """Continue the same plant as another robot from now on."""
     other = ForeignPlant(replace(plant.robot, **fields), plant.pose, 1)
     plant.robot, plant._numbers = other.robot, other._numbers
 

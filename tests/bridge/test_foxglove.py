@@ -121,7 +121,7 @@ KINDS = {"3D": "ThreeDee", "Plot": "Plot", "StateTransitions": "StateTransitions
 
 
 def faults(value, kind, where):
-    """What Foxglove's own description of its panels does not have: fields, and values of the wrong kind."""
+    """Return what contradicts Foxglove's own description of its panels: unknown fields, values of the wrong kind."""
     origin = typing.get_origin(kind)
     if origin in (typing.Union, types.UnionType):
         each = [faults(value, one, where) for one in typing.get_args(kind)]

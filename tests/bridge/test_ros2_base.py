@@ -319,7 +319,7 @@ class OverDds:
             self.daemon.send(packet(frame))
 
     def flags(self):
-        """Of the next STATE."""
+        """Return the flags of the next STATE."""
         while True:
             received = self.daemon.recv(16)
             if struct.unpack("=I", received[:4])[0] == wire.STATE:

@@ -1,4 +1,4 @@
-"""What the bridge says of wheels, estimates and states: frames, signs, covariances and times."""
+"""Tests of what the bridge publishes of wheels, estimates and states: frames, signs, covariances and times."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""What a command imports: a stop, a question and a wrong file load none of the large libraries.
+"""Tests of what a command imports: a stop, a question and a wrong file load none of the large libraries.
 
 Seconds are for a benchmark (tools/bench/start.py); what makes them is counted here.
 """

@@ -1,4 +1,4 @@
-"""robot.toml: what is accepted, and the one line that a mistake gets."""
+"""Tests of robot.toml: what is accepted, and the one line that a mistake gets."""
 
 from __future__ import annotations
 

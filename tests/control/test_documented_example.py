@@ -1,4 +1,4 @@
-"""What docs/control.md says, and the black-box example of docs/my-controller.md as it stands there."""
+"""Tests of what docs/control.md says, and of the black-box example of docs/my-controller.md as it stands there."""
 
 import math
 import re

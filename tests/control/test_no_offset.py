@@ -1,4 +1,4 @@
-"""With the true parameters the robot drives its circle neither outside nor inside, at any speed, rate and radius."""
+"""Tests that the robot, with true parameters, drives its circle without offset, at any speed, rate and radius."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""What no parameter explains leaves no offset: losses of the wheels, and drives on foreign robots."""
+"""Tests that what no parameter explains leaves no offset: losses of the wheels, and drives on foreign robots."""
 
 from __future__ import annotations
 

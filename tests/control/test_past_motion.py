@@ -1,4 +1,4 @@
-"""What a model remembers where a plan begins: from commands and wheels, in the runtime and in the planner."""
+"""Tests of what a model remembers where a plan begins: from commands and wheels, in the runtime and in the planner."""
 
 import math
 

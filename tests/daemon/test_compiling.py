@@ -1,4 +1,4 @@
-"""What is said while numba compiles, and which process compiles, with numba."""
+"""Tests of what is reported while numba compiles, and which process compiles, with numba."""
 
 import os
 import signal

@@ -143,7 +143,7 @@ def test_a_state_on_the_bus_from_before_the_request_confirms_nothing(tmp_path, m
 
 
 def frames_on(line, settle_s=0.1):
-    """What comes on a line until there are frames in it and nothing follows within that time."""
+    """Return what comes on a line until there are frames in it and nothing follows within that time."""
     decoder, frames = FrameDecoder(), []
     while not frames or select.select([line], [], [], settle_s)[0]:
         frames += decoder.feed(os.read(line, 4096))

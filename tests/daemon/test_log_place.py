@@ -1,4 +1,4 @@
-"""Where a drive is recorded to: inside log.directory, whatever the robot is called."""
+"""Tests of where a drive is recorded: inside log.directory, whatever the robot is called."""
 
 from pathlib import Path
 

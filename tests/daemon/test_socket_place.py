@@ -1,4 +1,4 @@
-"""Where the control socket is and whom to believe there, with a real second user where the tests run as root."""
+"""Tests of the control socket's place and whom to believe there, with a real second user where they run as root."""
 
 import os
 import shutil
@@ -77,7 +77,7 @@ def as_nobody(act):
 
 
 def serve_as_a_daemon(path):
-    """What another user puts at `path`: it answers every request as an e-stopped robot's daemon would."""
+    """Serve at `path` as another user: every request gets the reply of an e-stopped robot's daemon."""
 
     def act(ready):
         path.parent.mkdir(mode=0o755, exist_ok=True)

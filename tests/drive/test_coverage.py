@@ -1,4 +1,4 @@
-"""What counts as excited."""
+"""Tests of which motion counts as excited."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is shown, and that the display ends with the daemon."""
+"""Tests of the display's contents, and that it ends with the daemon."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from tests.runtime.simulated import simulated_stack
 
 
 class Hand:
-    """What a person does, set by the test."""
+    """Source of manual input that the test sets."""
 
     def __init__(self):
         self.wheels, self.held, self.gone, self.silent_since_ns = (3.0, 5.0), False, False, None

@@ -1,4 +1,4 @@
-"""What a piece's shares make the wheels do."""
+"""Tests of what a piece's shares make the wheels do."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What all sources promise: whatever they are, input that is older than the limit no longer drives."""
+"""Tests of what all sources promise: input that is older than the limit no longer drives."""
 
 import pytest
 

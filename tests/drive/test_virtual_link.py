@@ -1,4 +1,4 @@
-"""What may be driven with nobody's hand on it."""
+"""Tests of which links may be driven unattended."""
 
 import os
 

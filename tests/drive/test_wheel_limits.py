@@ -1,4 +1,4 @@
-"""What counts as a wheel's limit."""
+"""Tests of what counts as a wheel's limit."""
 
 import pytest
 

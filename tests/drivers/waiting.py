@@ -50,7 +50,7 @@ def collect(transport, count, timeout_s=10.0):
 
 
 def median_send_s(transport):
-    """How long `send` keeps its caller, over fifty frames that are soon too old to be sent."""
+    """Return how long `send` keeps its caller, over fifty frames that are soon too old to be sent."""
     durations = []
     for _ in range(50):
         started = time.monotonic()

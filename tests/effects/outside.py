@@ -19,7 +19,7 @@ def effect_of_the_page() -> str:
 
 
 def entry_points_of_the_page() -> dict[str, str]:
-    """What the page has a package say of its effects."""
+    """Return the entry points that the page has a package declare for its effects."""
     named: dict[str, str] = tomllib.loads(_block("toml"))["project"]["entry-points"]["disco_hw.effects"]
     return named
 
@@ -56,7 +56,7 @@ class OutsidePackage:
         )  # fmt: skip
 
     def printed(self, program: str, *arguments: str) -> str:
-        """What a program prints; it must not fail."""
+        """Return what a program prints; it must not fail."""
         done = self.python("-c", program, *arguments)
         assert done.returncode == 0, done.stderr
         return done.stdout

@@ -18,7 +18,7 @@ LEFT_RAD_S, RIGHT_RAD_S, STEP_S = 2.5, 4.2, 0.02
 
 
 def driven(true: Disturbance, duration_s: float, jump_m: float = 0.0):
-    """What is estimated of a robot that turns and is disturbed so, and the last error of its place (m)."""
+    """Return what is estimated of a robot that turns and is disturbed so, and the last error of its place (m)."""
     fusion, estimator = PoseFusion(Estimation(), PARAMETERS, 0.1), DisturbanceEstimator()
     axle_x, axle_y, yaw = 0.2, 0.0, 0.0
     left, right = true.turning(LEFT_RAD_S, RIGHT_RAD_S, PARAMETERS.axial_distance_m)

@@ -32,7 +32,7 @@ def driven():
 
 
 def position_only(drive, lever=(0.0, 0.0)):
-    """What an antenna on the robot measures, `lever` ahead and to the left of the tracked point."""
+    """Return what an antenna on the robot measures, `lever` ahead and to the left of the tracked point."""
 
     def sample(seed, index):
         x, y, _ = drive.measured[seed, index].tolist()

@@ -49,8 +49,9 @@ def test_an_adapted_run_replays_bit_for_bit_and_not_without_its_beliefs(tmp_path
 
 
 def made_up(lost: float, adapted: float) -> AdaptRun:
-    """Each lap of 10 s costs 0.01 in its first half and 0.03 in its second; after 60 s so much is lost, and after 67 s
-    so much of it remains.
+    """A run whose laps of 10 s cost 0.01 in their first half and 0.03 in their second.
+
+    After 60 s so much is lost, and after 67 s so much of it remains.
     """
     t_s = np.arange(0.02, 120.0, 0.02)
     cost = np.where(t_s % 10.0 < 5.0, 0.01, 0.03)

@@ -16,7 +16,7 @@ FENCE = Fence(keep_in=Circle((0.0, 0.0), 3.0))
 
 
 class Driver:
-    """In the place of a drive: each ends with a clearance from its generator, and is counted."""
+    """Replacement of a drive: each ends with a clearance from its generator, and is counted."""
 
     def __init__(self, lowest_m: float = 0.1) -> None:
         self.driven, self.lowest_m = 0, lowest_m

@@ -59,7 +59,7 @@ class Bench:
         self.send("WHEEL_COMMAND", **signals | changes)
 
     def step(self, elapsed_us: int | None = None):
-        """One cycle; before it, what the host has due: its state every 50 ms, its command every 20 ms."""
+        """Run one cycle after sending what the host has due: its state every 50 ms, its command every 20 ms."""
         if elapsed_us is None:
             elapsed_us = round(self.config.cycle_s * 1e6)
         self.now_us += elapsed_us

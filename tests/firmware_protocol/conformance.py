@@ -283,7 +283,7 @@ class FirmwareConformance:
     # Restarts.
 
     def challenges_after_a_restart(self, host):
-        """What a controller asks for in its first three sessions, and the first nonce where there is a key."""
+        """Return the challenges of the first three sessions, and the first nonce where there is a key."""
         host.restart()
         seen = [host.latest["MAC_CHALLENGE"]["nonce"]] if self.key is not None else []
         for _ in range(3):

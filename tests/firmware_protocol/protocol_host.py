@@ -132,7 +132,7 @@ class ProtocolHost:
         self._due["request"] = 0
 
     def step(self):
-        """What is due goes out, a millisecond passes, what came is taken in."""
+        """Send what is due, let a millisecond pass, and take in what came."""
         now_ns = self.end.now_ns
         if self.request is not None and now_ns >= self._due["request"]:
             self._due["request"] = now_ns + STATE_PERIOD_NS
@@ -171,7 +171,7 @@ class ProtocolHost:
         return self.wait_for(" or ".join(states), lambda: self.state in states, within_s)
 
     def messages(self, name):
-        """What was heard of one message since `heard` was cleared: (time in ns, decoded)."""
+        """Return what was received of one message since `heard` was cleared: (time in ns, decoded)."""
         return [(t_ns, decoded) for t_ns, decoded in self.heard if decoded.name == name]
 
     def restart(self):

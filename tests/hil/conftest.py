@@ -36,8 +36,9 @@ def watcher() -> Path | None:
 
 @contextmanager
 def held_up_ms() -> Iterator[list[int]]:
-    """How long this machine held up what ran, one entry that is there after the block: the longest time for which a
-    processor ran nobody, or the most that the host took within LOOKS periods.
+    """Yield a list for how long (ms) this machine held up what ran, with one entry after the block.
+
+    The longest time for which a processor ran nobody, or the most that the host took within LOOKS periods.
     """
     most: list[int] = []
     ended = threading.Event()

@@ -1,4 +1,4 @@
-"""What must hold of the whole stack after a fault, and the command as a user runs it."""
+"""Checks of the whole stack after a fault, and the command as a user runs it."""
 
 from __future__ import annotations
 

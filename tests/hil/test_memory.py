@@ -1,4 +1,4 @@
-"""What the daemon locks of the machine's memory, and what it says where it may not have enough."""
+"""Tests of the memory that the daemon locks, and of its message where it may not have enough."""
 
 import re
 import resource

@@ -1,4 +1,4 @@
-"""What must not move the robot: wrong files, wrong firmware, garbage and forgeries on the link."""
+"""Tests of what must not move the robot: wrong files, wrong firmware, garbage and forgeries on the link."""
 
 from __future__ import annotations
 

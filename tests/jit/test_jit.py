@@ -1,4 +1,4 @@
-"""How kernels are compiled: what the compiling process runs is what later ones load."""
+"""Tests of compiled kernels: what the compiling process runs is what later ones load."""
 
 import gc
 import os

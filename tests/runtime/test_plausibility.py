@@ -1,4 +1,4 @@
-"""What the plausibility watch counts, and what it leaves alone."""
+"""Tests of what the plausibility watch counts, and what it leaves alone."""
 
 from __future__ import annotations
 

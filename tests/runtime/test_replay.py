@@ -26,7 +26,7 @@ ROBOTS = Path(disco_hw.__file__).parent / "robots"
 
 @pytest.fixture(scope="module")
 def ticks():
-    """What the daemon records of a start, two seconds of driving and a stop."""
+    """The records of the daemon for a start, two seconds of driving and a stop."""
     stack = simulated_stack()
     stack.run(1.5)
     stack.run(0.5, UserRequest.ARM)

@@ -1,4 +1,4 @@
-"""What a person may ask of the task while the daemon runs, and that the log replays what was made of it."""
+"""Tests of changes to the task while the daemon runs, and that the log replays what was made of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a vendor's motor loop does when its encoder is wrong, and that a sound one changes nothing."""
+"""Tests of a vendor's motor loop with a wrong encoder, and that a sound one changes nothing."""
 
 import pytest
 

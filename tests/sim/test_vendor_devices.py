@@ -1,4 +1,4 @@
-"""What the simulated ODrive and VESC do in the order in which their firmware does it: frames, control loop, timeout."""
+"""Tests that simulated ODrive and VESC act in their firmware's order: frames, control loop, timeout."""
 
 import struct
 

@@ -62,7 +62,7 @@ class Straight:
         return self
 
     def at(self, _now_ns):
-        """The same at all times."""
+        """Return the same wheel speeds at all times."""
         return self._wheels_rad_s, self._wheels_rad_s
 
 

@@ -1,4 +1,4 @@
-"""What is said of a clone: its counts, what failed, and the conditions that it ran under."""
+"""Tests of the report on a clone: its counts, what failed, and the conditions that it ran under."""
 
 import re
 import sys

@@ -1,4 +1,4 @@
-"""What the drives contain, and that they stay within what robot and hand can do."""
+"""Tests of what the drives contain, and that they stay within what robot and hand can do."""
 
 import itertools
 

@@ -26,7 +26,7 @@ def project(point, eye, look_at, width, height):
 
 
 def screenshot(page):
-    """What the page shows, (height, width, 3)."""
+    """Return a screenshot of the page, (height, width, 3)."""
     return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
 
 

@@ -1,4 +1,4 @@
-"""Who may stay connected before the token was shown, and how often an error is written."""
+"""Tests of who may stay connected before the token was shown, and how often an error is written."""
 
 import logging
 

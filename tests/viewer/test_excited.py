@@ -1,4 +1,4 @@
-"""What a log's drive by hand has excited, at any instant of it."""
+"""Tests of what a log's drive by hand has excited, at any instant of it."""
 
 import pytest
 

@@ -29,7 +29,7 @@ def page():
 
 
 def cookie_of(page):
-    """What a browser sends once it has opened the printed address."""
+    """Return the cookie that a browser sends once it has opened the printed address."""
     return {"Cookie": f"disco-hw-token-{port_of(page)}={urlsplit(page.url).query.removeprefix('token=')}"}
 
 

@@ -1,4 +1,4 @@
-"""Where the camera is put, and whom it follows; the browser's part is in test_page.py."""
+"""Tests of where the camera is put, and whom it follows; the browser's part is in test_page.py."""
 
 from contextlib import nullcontext
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""What adaptation costs the loop, and what it wins; `python -m tools.bench.adapt scenarios`: how well it estimates."""
+"""Cost and gain of adaptation in the loop; `python -m tools.bench.adapt scenarios`: how well it estimates."""
 
 from __future__ import annotations
 
@@ -100,9 +100,10 @@ SCENARIOS: dict[str, Scenario] = {
 
 @dataclass(frozen=True, slots=True)
 class Estimated:
-    """One drive: root mean square error (3,) by size, share of time (3,) in which the 90 % interval held the truth.
+    """Result of one drive.
 
-    `known_s` after a step until 80 % of it was known (infinite: never); `changes` that the filter believed in.
+    Root mean square error (3,) by size, share of time (3,) in which the 90 % interval held the truth. `known_s` after a
+    step until 80 % of it was known (infinite: never); `changes` that the filter believed in.
     """
 
     error: Array

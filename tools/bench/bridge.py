@@ -100,7 +100,7 @@ def _cpu_s(process: int) -> float:
 
 
 def _heard(directory: Path) -> np.ndarray:
-    """(N, 3): stamp (wall clock), heard and answered (monotonic, ns) of each odometry."""
+    """Return (N, 3): stamp (wall clock), reception and reply (monotonic, ns) of each odometry."""
     rows = [line.split() for line in (directory / "node.txt").read_text(encoding="utf-8").splitlines()]
     return np.array([list(map(int, row[:3])) for row in rows if len(row) == 5])
 

@@ -1,4 +1,4 @@
-"""The planner: time of a step beside pytorch_mppi, scaling, allocations, and how well the circle is driven.
+"""Benchmark of the planner: time of a step beside pytorch_mppi, scaling, allocations, and driving the circle.
 
 The paper's size throughout: K = 400 sequences, T = 50 steps, L = 7 sigma points; one thread.
 """
@@ -96,9 +96,10 @@ def _multiply_and_add(numbers: Any, rounds: int) -> None:
 
 
 def bare_loop() -> Step:
-    """As many vector instructions as a step has, and nothing else: what it takes longer than its least, a step does.
+    """Return a function of as many vector instructions as a step has, and nothing else.
 
-    A processor whose other thread is somebody else's gives it half of its vector units.
+    What it takes longer than its least, a step does: a processor whose other thread is somebody else's gives it half of
+    its vector units.
     """
     numbers = np.ones(BARE_SIZE, np.float32)
     return lambda _: _multiply_and_add(numbers, BARE_ROUNDS)
@@ -188,7 +189,7 @@ def _empty(
 
 
 def allocations(model: Model, steps: int = 200) -> dict[str, float]:
-    """What a step takes from the heap.
+    """Count the allocations of a step on the heap.
 
     `in_the_step`: allocations of the compiled step beyond those of an empty function with the same arguments, for which
     numba makes a record of each array that it is handed. `bytes_grown_per_step`: Python's memory after `steps` more.
@@ -233,9 +234,10 @@ def torch_times_ms(model: Model, device: str, samples: int, steps: int) -> np.nd
 
 
 def circle_quality(model: Model, seeds: int, duration_s: float) -> dict[str, float]:
-    """How each controller drives the circle: plants drawn from the posterior, lag 0.1 s, 5 % wheel noise, at 10 Hz.
+    """Measure how each controller drives the circle at 10 Hz.
 
-    And the planner with the posterior at 50 Hz: how far its commands move in a second, beside 10 Hz.
+    Plants drawn from the posterior, lag 0.1 s, 5 % wheel noise. And the planner with the posterior at 50 Hz: how far
+    its commands move in a second, beside 10 Hz.
     """
     options = CircleOptions(seeds=seeds, duration_s=duration_s)
     figures: dict[str, float] = {}

@@ -1,4 +1,4 @@
-"""How paths are followed: distance, progress and share of time in reverse, from facing the way and against it.
+"""Benchmark of path following: distance, progress and share of time in reverse, from facing the way and against it.
 
 Plants drawn from the shipped posterior, wheel lag 0.1 s, 5 % wheel noise, plans at 10 Hz. A time counts as in reverse
 below -0.02 m/s. What it takes a robot that faces the wrong way to turn round is left out of the distance: 8 s, and 2 s

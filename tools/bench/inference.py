@@ -61,8 +61,9 @@ def log_scores(result: Inference) -> dict[str, float]:
 
 
 def reference_sd(log: DriveLog, truth: np.ndarray) -> np.ndarray:
-    """Standard deviations (3,) of a synthetic likelihood around the truth: statistics linear in the parameters there,
-    with the covariance that simulations at the truth have.
+    """Standard deviations (3,) of a synthetic likelihood around the truth.
+
+    Its statistics are linear in the parameters there, with the covariance that simulations at the truth have.
     """
     drive = excitation(log)
     noise = noise_of(drive)

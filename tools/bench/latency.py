@@ -1,4 +1,4 @@
-"""End to end: from a frame with an encoder sample on the wire to the wheel command that knew it on the wire.
+"""Latency end to end: from a frame with an encoder sample on the wire to the wheel command that knew it on the wire.
 
 Simulator and daemon are the processes that a user runs, with the real planner; times are those of the wire as the
 simulator keeps it. The daemon commands at 50 Hz and samples come at 100 Hz, so a sample waits up to 10 ms for a tick.
@@ -50,7 +50,7 @@ def _drive(directory: Path, link: str, seconds: float) -> None:
 
 
 def _latencies_ms(directory: Path) -> tuple[np.ndarray, np.ndarray]:
-    """For each command: wire to wire, and of that the time until the tick began."""
+    """Return the latency of each command, wire to wire, and of that the time until the tick began, in ms."""
     passed: dict[tuple[int, bytes], list[float]] = {}
     for line in (directory / "bus.log").read_text(encoding="utf-8").splitlines():
         stamp, _, frame = line.split()

@@ -1,4 +1,4 @@
-"""What recording costs the loop, what the writer does with it, and how fast a log opens."""
+"""Benchmark of recording: what it costs the loop, what the writer does with it, and how fast a log opens."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def run() -> dict[str, float]:
 
 
 def _tick(k: int, now_ns: int) -> list[Record]:
-    """Thirteen records: what one tick of a drive at 50 Hz holds, with a plan in every tick."""
+    """Return the thirteen records of one tick of a drive at 50 Hz, with a plan in every tick."""
     number = random.random
     speeds = tuple(number() for _ in range(HORIZON))
     return [

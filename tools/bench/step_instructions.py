@@ -89,7 +89,7 @@ def instructions_of(call: Callable[[], object]) -> int:
 
 
 def figures_of(planner: Disco, calls: int = 2000) -> dict[str, float]:
-    """Of a step: instructions and bytes per sample; and milliseconds at least of it, and of `plan` without it."""
+    """Return a step's instructions and bytes per sample, and the least milliseconds of it, and of `plan` without it."""
     states = [moving(number) for number in range(200)]
     for one in states[:20]:
         planner.plan(*one)

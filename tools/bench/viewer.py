@@ -1,4 +1,4 @@
-"""What the page costs: the loop that feeds it, its own process, the way from the robot to the page, and a replay."""
+"""Benchmark of the page: the loop that feeds it, its own process, the way from the robot to the page, and a replay."""
 
 from __future__ import annotations
 
@@ -358,7 +358,7 @@ def _ages_ms(feed: Path) -> list[float]:
 
 @contextmanager
 def _reader() -> Iterator[None]:
-    """What a browser does to the page's process: connect, and read all that comes."""
+    """Connect to the page's process as a browser does, and read all that comes."""
     address = f"127.0.0.1:{PORT}"
     token = os.environ[TOKEN_VARIABLE]
     deadline_s = time.monotonic() + 120.0

@@ -30,7 +30,7 @@ OF_THIS_CHECKOUT = ("PYTHONPATH", "NUMBA_CACHE_DIR", "VIRTUAL_ENV", "MAKEFLAGS")
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How one clone did; `load` is the machine's over a minute, before and after."""
+    """Result of one clone; `load` is the machine's over a minute, before and after."""
 
     code: int
     wall_s: float
@@ -67,7 +67,7 @@ def _children_cpu_s() -> float:
 
 @contextmanager
 def busy(count: int) -> Iterator[None]:
-    """That many processes beside, which do nothing but compute."""
+    """Run `count` processes that do nothing but compute, for the block."""
     made = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
     try:
         yield

@@ -45,7 +45,7 @@ _START_S = 20.0
 
 @dataclass(frozen=True, slots=True)
 class Processor:
-    """What to compile for, and QEMU's machine that runs it."""
+    """Target to compile for, and QEMU's machine that runs it."""
 
     flags: tuple[str, ...]
     machine: str
@@ -130,7 +130,7 @@ class Bench:
         self._reader.start()
 
     def do(self, what: str) -> None:
-        """r: restart, b: brown-out, h: hang, p: press or release the emergency stop."""
+        """Send a bench command: r restart, b brown-out, h hang, p press or release the emergency stop."""
         self._socket.sendall(what.encode())
 
     def latest(self, within_s: float = 5.0) -> Truth:
@@ -143,7 +143,7 @@ class Bench:
         return self.rows[-1]
 
     def close(self) -> None:
-        """Leave the line."""
+        """Disconnect from the bench's line."""
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         self._reader.join()
@@ -168,7 +168,7 @@ def _truth(line: bytes) -> Truth | None:
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """A running board: its serial line as `link.port` names it, its bench, and the emulator's process."""
+    """Board that is running: its serial line as `link.port` names it, its bench, and the emulator's process."""
 
     port: str
     bench: Bench

@@ -1,5 +1,4 @@
-"""Holds the hand-written firmware C to account: no compiler warning, no undefined behaviour, every line and branch run,
-ten million random frames survived.
+"""Checks of the hand-written firmware C: warnings, undefined behaviour, coverage, ten million random frames.
 
 Builds the extension in a copy of the tree, once with the undefined-behaviour sanitizer and once with gcov (each adds
 branches of its own, which the other must not see), and runs the firmware's tests on both. Exits 1 if anything is
@@ -34,7 +33,7 @@ FLOOD_FRAMES = 50
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """What of one file was executed."""
+    """Coverage of one file by the tests."""
 
     name: str
     lines: int
@@ -107,7 +106,10 @@ def build_harness(folder: Path, replaced: dict[str, Path] | None = None) -> Path
 def run_harness(
     harness: Path, cycles: int, frames: int, authenticated: bool, timeout_s: float | None = None
 ) -> subprocess.CompletedProcess[str]:
-    """Run it: so many cycles of a host and mad measurements, then random frames; its status is 0 if all was sound."""
+    """Run the harness; its status is 0 if all was sound.
+
+    So many cycles of a host and mad measurements, then random frames.
+    """
     return subprocess.run(
         [str(harness), str(cycles), str(frames), "1" if authenticated else "0"],
         capture_output=True, text=True, check=False, timeout=timeout_s,

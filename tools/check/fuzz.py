@@ -160,7 +160,7 @@ def _input(number: int, seed: int) -> tuple[verb_calls.Call, str, bytes]:
 
 
 def _attacked(number: int, seed: int, directory: Path) -> dict[str, str]:
-    """How a call with a hostile file ended, and what was wrong about that."""
+    """Return how a call with a hostile file ended, and what was wrong about that."""
     one, name, content = _input(number, seed)
     shutil.rmtree(directory)
     directory.mkdir()

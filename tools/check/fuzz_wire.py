@@ -33,7 +33,7 @@ _IDS = tuple(_LAYOUTS)
 
 
 def hostile_frame(generator: random.Random) -> tuple[int, bytes]:
-    """Return a frame: half of them with a CRC that holds, so that they get past the first door."""
+    """Return a hostile frame: half of them with a CRC that holds, so that they get past the first door."""
     can_id = generator.choice(_IDS) if generator.random() < 0.9 else generator.randrange(0x20000000)
     data = generator.randbytes(generator.choice((8, 8, 8, 8, 8, 8, 0, 1, 7, 9, 64)))
     layout = _LAYOUTS.get(can_id)
@@ -104,7 +104,7 @@ TARGETS: dict[str, Callable[[], Callable[[random.Random], None]]] = {
 
 
 def campaign(name: str, count: int, seed: int) -> list[str]:
-    """Feed one target; return what went wrong."""
+    """Feed hostile frames to one target; return what went wrong."""
     take = TARGETS[name]()
     generator = random.Random(seed)
     settled, slowest_s = 0, 0.0
@@ -127,7 +127,7 @@ def campaign(name: str, count: int, seed: int) -> list[str]:
 
 
 def main() -> int:
-    """Run every campaign; exit 1 if anything went wrong."""
+    """Run a campaign for every target; exit 1 if anything went wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=300_000, help="frames for each target")
     parser.add_argument("--seed", type=int, default=1)

@@ -38,7 +38,7 @@ class Mutant:
 
     @property
     def key(self) -> str:
-        """What names it as long as its line stays as it is: the line with the change marked in it."""
+        """Key that names the mutant as long as its line stays as it is: the line with the change marked in it."""
         return f"{self.context} [{self.old} -> {self.new or 'nothing'}]"
 
     def apply(self, source: str) -> str:

@@ -69,7 +69,7 @@ class CannotError(Exception):
 
 
 def run(*command: str, **options: object) -> subprocess.CompletedProcess[str]:
-    """Run a command; its output is kept. Raises CannotError with the last line of it where it fails."""
+    """Run a command and keep its output. Raises CannotError with the last line of it where it fails."""
     done = subprocess.run(command, capture_output=True, text=True, check=False, **options)  # type: ignore[call-overload]
     if done.returncode:
         said = (done.stderr or done.stdout).strip().splitlines() or ["it said nothing"]
@@ -132,7 +132,7 @@ def module_files(unpacked: Path, release: str, names: tuple[str, ...]) -> list[s
 
 
 def executable(path: Path, text: str) -> Path:
-    """Write a script."""
+    """Write an executable script."""
     path.write_text(text, encoding="utf-8")
     path.chmod(path.stat().st_mode | stat.S_IXUSR)
     return path
@@ -183,7 +183,7 @@ busybox poweroff -f
 
 
 def boot_command(emulator: Emulator, unpacked: Path, release: str, image: Path) -> list[str]:
-    """What boots the kernel in the emulator, with this machine's files to read."""
+    """Return the command that boots the kernel in the emulator, with this machine's files to read."""
     return [
         emulator.program, *emulator.arguments, "-accel", "tcg,thread=multi", "-cpu", "max", "-m", "1024", "-smp", "2",
         "-nographic", "-no-reboot", "-nic", "none", "-kernel", str(unpacked / "boot" / f"vmlinuz-{release}"),

@@ -69,7 +69,7 @@ class CannotError(Exception):
 
 
 def run(*command: str, **options: object) -> str:
-    """What a command says. Raises CannotError with the last line of it where it fails."""
+    """Return the output of a command. Raises CannotError with the last line of it where it fails."""
     both = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, **options}
     done = subprocess.run(command, check=False, **both)  # type: ignore[call-overload]
     if done.returncode:
@@ -79,7 +79,7 @@ def run(*command: str, **options: object) -> str:
 
 
 def mirrors(targets: str) -> list[str]:
-    """apt's lines of the Debian among `ADDRESS|RELEASE|COMPONENT|ORIGIN` lines, each once."""
+    """Lines of apt for the Debian among `ADDRESS|RELEASE|COMPONENT|ORIGIN` lines, each once."""
     rows = [line.split("|") for line in targets.splitlines()]
     return list(dict.fromkeys(f"deb {row[0]} {row[1]} {row[2]}" for row in rows if row[3] == "Debian"))
 
@@ -91,7 +91,7 @@ def fetched_mb(said: str) -> float:
 
 
 def requirements(project: str) -> list[str]:
-    """What these tests need as wheels, by the text of a pyproject.toml."""
+    """Return the packages that these tests need as wheels, by the text of a pyproject.toml."""
     asked = tomllib.loads(project)["project"]["dependencies"]
     others = (*LEFT_OUT, COMPILED_THERE)
     return [one for one in asked if re.split(r"[<>=\[ ]", one)[0] not in others] + list(FOR_TESTS)
@@ -143,7 +143,7 @@ def unpack_debian() -> None:
 
 
 def size_mb(folder: Path) -> float:
-    """What a folder takes on its disk."""
+    """Return the size of a folder on its disk, in MB."""
     return int(run("du", "-sxk", str(folder)).split()[0]) * 1024e-6
 
 

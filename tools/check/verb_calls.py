@@ -214,7 +214,7 @@ def without_work() -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """How a call ended: `code` is the exit code, None where its work would have begun."""
+    """Outcome of a call: `code` is the exit code, None where its work would have begun."""
 
     code: int | None
     errors: str

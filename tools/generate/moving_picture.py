@@ -82,7 +82,10 @@ def animated(log_file: Path) -> str:
 
 
 def closed(result: GapExperimentResult) -> str:
-    """The SVG's text: the robot on its circle before and after, true ways side by side; below, the gaps."""
+    """Return the SVG's text of the robot on its circle before and after.
+
+    True ways side by side; below, the gaps.
+    """
     half, foot = 360, 150
     panels, task = [], result.task
     names = {"given": "with the model as given", "amended": f"with {_found(result)}"}

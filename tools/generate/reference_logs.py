@@ -88,7 +88,7 @@ def setup() -> Setup:
 
 
 def planner() -> Planner:
-    """DISCO for it."""
+    """Create the planner DISCO for the robot of these logs."""
     found = setup()
     return make_planner(found.config, found.model)
 
@@ -123,7 +123,7 @@ def adapted() -> SimulatedRun:
 
 
 def drive() -> SimulatedRun:
-    """A person drives."""
+    """Drive by hand and return the run."""
     stack = simulated(NoPlanner(), needs_pose=False)
     stack.pilot = HandPilot(Hand(), Coverage(8.0))
     stack.run(4.5)

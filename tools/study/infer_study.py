@@ -168,7 +168,7 @@ def recover(seed: int, kind: str, drive: str) -> dict[str, object]:
 
 
 def closed_form(seed: int, kind: str, drive: str) -> dict[str, object]:
-    """The same of the closed-form estimates, against simulations at the truth with the noise that was measured."""
+    """Study the closed-form estimates, against simulations at the truth with the noise that was measured."""
     log, truth, robot = study_log(seed, kind, drive)
     began = perf_counter()
     driven, model = excitation(log), Model.nominal(robot.robot)

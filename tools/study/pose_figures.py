@@ -1,4 +1,4 @@
-"""How well a circle is driven by poses of other sources than the robot's own, in simulated time.
+"""Study of a circle that is driven by poses of other sources than the robot's own, in simulated time.
 
 The poses go as datagrams through a real socket and `drivers.pose.udp`, with the rate, noise, delay, losses and outliers
 of the source; those without heading are driven by hand first, as a person would.
@@ -41,7 +41,7 @@ _NEES_EVERY = 25
 
 @dataclass(frozen=True, slots=True)
 class PoseKind:
-    """A pose sensor: fields of PlantParameters, and whether it measures the heading."""
+    """Kind of a pose sensor: fields of PlantParameters, and whether it measures the heading."""
 
     name: str
     sensor: dict[str, float]
@@ -68,8 +68,10 @@ UDP = PoseKind(
 
 @dataclass(frozen=True, slots=True)
 class PoseFigures:
-    """`rms_m` of the true distance to the circle after a quarter of a lap, `nees` the mean normalised error squared of
-    the estimate (3 where its covariance is right), `looks` that it is the mean of, `straight_m` driven by hand before.
+    """Figures of one drive with a pose source.
+
+    `rms_m` of the true distance to the circle after a quarter of a lap, `nees` the mean normalised error squared of the
+    estimate (3 where its covariance is right), `looks` that it is the mean of, `straight_m` driven by hand before.
     """
 
     kind: str
@@ -93,7 +95,7 @@ class Datagrams:
         self._has_heading = has_heading
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
-        """What came over the port."""
+        """Send the robot's poses to the port, and return what came over it."""
         for pose in from_robot:
             message: dict[str, Any] = {
                 "x_m": pose.x_m,
@@ -107,7 +109,7 @@ class Datagrams:
         return self._source.receive(now_ns, ())
 
     def close(self) -> None:
-        """Close both ends."""
+        """Close both ends of the link."""
         self._source.close()
         self._sender.close()
 

@@ -74,7 +74,7 @@ class Parts:
             _end(self.bridge)
 
     def close(self) -> None:
-        """End both."""
+        """Stop the bridge and the node."""
         _end(self.node)
         _end(self.bridge)
 
@@ -91,7 +91,7 @@ def _end(process: subprocess.Popen[bytes] | None) -> None:
 
 @contextmanager
 def stack() -> Iterator[tuple[Operator, Parts, float]]:
-    """Robot and daemon; who asks them, who is struck, and how long a stop may take (s)."""
+    """Run robot and daemon; yield the operator, the parts to fault, and how long a stop may take (s)."""
     with tempfile.TemporaryDirectory() as name:
         directory = Path(name)
         robot_file = write_robot_file(directory, task=FAST_TASK)
@@ -163,7 +163,7 @@ def _lines(record: Path) -> list[dict[str, Any]]:
 
 
 def one(operator: Operator, parts: Parts, fault: str, wait_s: float) -> tuple[float, str]:
-    """One trial: how long the wheels turned after the fault (s), and what went wrong, empty for nothing."""
+    """Run one trial; return how long the wheels turned after the fault (s), and what went wrong, empty for nothing."""
     operator.wait_for_standstill(READY_TIMEOUT_S)
     parts.begin(fault, FAST_START if operator.status()["state"] == "READY" else tuple(operator.status()["pose"]))
     operator.wait_until("without a pose", lambda status: not status["pose_ok"], 10.0)

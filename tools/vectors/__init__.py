@@ -1,1 +1,1 @@
-"""What a test vector of a vendor's protocol says, against this project's codec and simulator; one file a vendor."""
+"""Comparison of vendors' protocol test vectors with this project's codec and simulator; one file a vendor."""

@@ -1,4 +1,4 @@
-"""AgileX: cases of protocol v2."""
+"""Test vectors of AgileX, protocol v2."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ _F32 = struct.Struct("<f")
 
 @dataclass(slots=True)
 class Comparison:
-    """`differences` in words; `rounded`: something differed by no more than the format's rounding allows."""
+    """Comparison with a test vector: `differences` in words; `rounded`: something differed by rounding alone."""
 
     differences: list[str] = field(default_factory=list)
     rounded: bool = False

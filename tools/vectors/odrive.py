@@ -1,4 +1,4 @@
-"""ODrive: cases of firmware 0.5.6 and of the 0.6 message layouts."""
+"""Test vectors of ODrive: firmware 0.5.6 and the 0.6 message layouts."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def check_06(case: Case) -> Comparison:
 
 
 def _check_command(found: Comparison, case: Case, generation: Generation) -> None:
-    """What our codec writes; other forms that the device takes as well are the simulator's alone."""
+    """Compare what our codec writes; other forms that the device takes as well are the simulator's alone."""
     given = case["given"]
     name, frame = given["command"], case["frames"][0]
     layout = protocol.COMMANDS[generation].get(name)

@@ -1,4 +1,4 @@
-"""RoboClaw: cases of packet serial."""
+"""Test vectors of RoboClaw packet serial."""
 
 from __future__ import annotations
 

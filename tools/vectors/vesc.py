@@ -1,4 +1,4 @@
-"""VESC: cases on CAN and on a serial line."""
+"""Test vectors of VESC on CAN and on a serial line."""
 
 from __future__ import annotations
 

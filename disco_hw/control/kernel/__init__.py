@@ -59,7 +59,7 @@ _CACHE_LINE = 64
 
 
 def aligned_zeros(size: int, dtype: type = np.float32) -> NDArray[np.floating]:
-    """A flat array of zeros that starts on a cache line, so that no vector of a row straddles two."""
+    """Return a flat array of zeros that starts on a cache line, so that no vector of a row straddles two."""
     raw = np.zeros(size * np.dtype(dtype).itemsize + _CACHE_LINE, np.uint8)
     offset = -raw.ctypes.data % _CACHE_LINE
     return raw[offset : offset + size * np.dtype(dtype).itemsize].view(dtype)
@@ -113,22 +113,28 @@ def terminal_cost(
 
 
 def follow(terms: object, memory: float, x: float, y: float, forward: float, found: Found) -> tuple[float, float]:
-    """The memory after a step, and a number to keep for its cost: `follow` of terms with a table; compiled only."""
+    """Return the memory after a step, and a number to keep for its cost: `follow` of terms with a table.
+
+    Compiled only.
+    """
     raise TypeError(f"{type(terms).__name__} has no table to follow")
 
 
 def row_of(terms: object, memory: float) -> int:
-    """The table's row for a memory: `row_of` of terms with a table; compiled code only."""
+    """Return the table's row for a memory: `row_of` of terms with a table; compiled code only."""
     raise TypeError(f"{type(terms).__name__} has no table")
 
 
 def place_of(terms: object, place: float, x: float, y: float) -> float:
-    """The place on the line beside a position: `place_of` of terms with a line; compiled code only."""
+    """Return the place on the line beside a position: `place_of` of terms with a line; compiled code only."""
     raise TypeError(f"{type(terms).__name__} has no line")
 
 
 def line_at(terms: object, place: float, ahead_m: float) -> tuple[float, float, float, float, float, float]:
-    """Where and how to be on the line: `line_at` of terms with a line; compiled code only."""
+    """Return the point and motion on the line of a task's terms.
+
+    The order is that of `line_at` of terms with a line; compiled code only.
+    """
     raise TypeError(f"{type(terms).__name__} has no line")
 
 
@@ -138,7 +144,7 @@ def looks_up(terms: object) -> bool | None:
 
 
 def _chosen(terms: Any, name: str) -> Callable[..., object] | None:
-    """The function of that name of the terms whose numba type this is; None if they have none."""
+    """Return the function of that name of the terms whose numba type this is; None if they have none."""
     for function in tasks.HELPERS:
         if function not in _registered:
             _registered.add(function)

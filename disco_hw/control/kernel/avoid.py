@@ -1,4 +1,4 @@
-"""What a rollout pays for touching the fence or an obstacle: the footprint against each near shape at each step.
+"""Cost of a rollout for touching the fence or an obstacle: the footprint against each near shape at each step.
 
 A shape is a capsule: a segment with a radius, which may move. A circle is one of no length, an edge of a polygon one of
 no radius. The rectangle's reach towards the nearest point of the segment is subtracted from the distance, which is
@@ -35,7 +35,7 @@ half the detour's length (1/m), how far to the left it leads (m), and how far as
 
 
 class Area(NamedTuple):
-    """What rollouts keep away from.
+    """The fence and obstacles that rollouts keep away from, as arrays for the kernel.
 
     `shapes` (MOST_SHAPES * COLUMNS,); `number` (1,) of them are there. `body` (7,): half the footprint's length and
     width, how far its centre lies ahead of the tracked point, the distance to keep (m), the length of a step (s), the
@@ -94,7 +94,7 @@ Bends: TypeAlias = tuple[Bend, Bend] | None
 
 
 def bends_of(area: Area | None, straight: bool | None) -> Bends:
-    """The detours of an area, None without one or with `straight`; compiled code only."""
+    """Return the detours of an area, None without one or with `straight`; compiled code only."""
     raise TypeError(f"{type(area).__name__} is no area")
 
 
@@ -120,7 +120,7 @@ def _bends_of(area: Any, straight: Any) -> Callable[[Any, Any], Bends]:
 
 @scalar_function
 def detoured(bends: Bends, place: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Where the task is to see a robot: on the line while it drives around an obstacle as it should; compiled only."""
+    """Return where the task sees the robot: on the line while it drives around an obstacle as planned (compiled)."""
     if bends is None:
         return place
     x, y, forward = place
@@ -131,7 +131,7 @@ def detoured(bends: Bends, place: tuple[float, float, float]) -> tuple[float, fl
 
 @scalar_function
 def _shifted(bend: Bend, x: float, y: float) -> tuple[float, float]:
-    """How far one detour moves a position: most in its middle, smoothly to nothing at both ends."""
+    """Return by how much (x, y) one detour moves a position: most in its middle, smoothly to nothing at both ends."""
     middle_x, middle_y, along_x, along_y, per_half, left_m, aside_m = bend
     off_x, off_y = x - middle_x, y - middle_y
     along = (off_x * along_x + off_y * along_y) * per_half

@@ -1,4 +1,4 @@
-"""The guide: one more sample, the commands of a steering law that follows the task's line from where the robot is.
+"""One more sample, the guide: the commands of a steering law that follows the task's line from where the robot is.
 
 Samples lie around the last plan and cut the corners that it cuts. Turning before a corner comes first, then a worse
 cost, then a better one: no small change of a plan finds it. The law does at once, as it acts on the centre of rotation
@@ -28,7 +28,7 @@ SLOWEST = 0.2
 
 
 class SteeredChassis(NamedTuple):
-    """What the law knows of the robot: geometry (m), how long the wheels take (s), their dead band (rad/s)."""
+    """Parameters of the steered chassis: geometry (m), response time of the wheels (s), their dead band (rad/s)."""
 
     wheel_radius_m: float
     axial_distance_m: float
@@ -42,10 +42,9 @@ def guide(
     commands: Floats, terms: Terms, start: Floats, chassis: SteeredChassis, before_left: float, before_right: float,
     limits: Limits, step_s: float,
 ) -> None:  # fmt: skip
-    """Fill `commands` (T, 2) with the wheel speeds of the law (rad/s), from the state `start` (11,) of `SkidSteer`
-    and the commands before, within the limits.
+    """Fill `commands` (T, 2) with the wheel speeds (rad/s) of the steering law.
 
-    The robot that it steers meanwhile is the chassis alone; `terms` are those of a task with a line.
+    They start from the state `start` (11,) of `SkidSteer` and the commands before, and stay within the limits.
     """
     x, y, cos_yaw, sin_yaw = float(start[0]), float(start[1]), float(start[2]), float(start[3])
     wheel_left, wheel_right = float(start[4]), float(start[5])

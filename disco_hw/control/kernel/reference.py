@@ -1,4 +1,4 @@
-"""The timed reference: where the tracked point should be at the end of each step, on the task's line.
+"""Reference in time on the task's line: where the tracked point should be at the end of each step.
 
 It starts at the place on the line beside the robot and moves on at the task's speed, or as fast as the wheels allow:
 where a robot that stays on the line would turn a wheel faster than its limit, the reference takes longer. So a robot

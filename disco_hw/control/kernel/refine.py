@@ -34,7 +34,7 @@ Array = NDArray[Any]
 
 
 class Problem(NamedTuple):
-    """What is minimised.
+    """Least-squares problem of a refinement: initial state, model coefficients, command bounds and reference.
 
     `start` (5,): x, y (m, relative to the task's origin), yaw (rad), wheel speeds (rad/s); `time_s` of it; `slide` (3,)
     as of `Disturbance.slides`; `means` (L, n) of what the model's terms remember at the start, or None; `base`,
@@ -281,7 +281,7 @@ def _solve(factor: Array, vector: Array) -> None:
 
 @block_function
 def _violation(problem: Problem, buffers: Buffers) -> float:
-    """By how much the commands with the step exceed a limit at most (rad/s)."""
+    """Return by how much the commands with the step exceed a limit at most (rad/s)."""
     commands, history, worst = buffers.commands, problem.history, 0.0
     for t in range(problem.reference.shape[0]):
         for c in range(CHANNELS):

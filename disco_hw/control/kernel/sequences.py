@@ -50,7 +50,7 @@ _COSINE = tuple(np.float32(c) for c in (1.0, -4.9347954, 4.0584474, -1.3320621, 
 
 @scalar_function
 def philox(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[int, int, int, int]:
-    """Philox 4x32-10: four uniform uint32 from a counter of four and a key of two uint32."""
+    """Return four uniform uint32 from a counter of four and a key of two uint32 (Philox 4x32-10)."""
     for _ in range(10):
         product0 = _M0 * np.uint64(c0)
         product1 = _M1 * np.uint64(c2)
@@ -177,7 +177,7 @@ Taps: TypeAlias = tuple[float, float, float, float] | None
 
 
 class Basis(NamedTuple):
-    """How noise at knots becomes noise over time: `first` (T,) int, `weights` (T, 4) or None for one knot a step."""
+    """Basis from noise at knots to noise over time: `first` (T,) int, `weights` (T, 4) or None for one knot a step."""
 
     first: NDArray[np.int64]
     weights: Floats | None
@@ -283,7 +283,7 @@ def _spread(pull: Floats, row: int, channels: int, weights: Taps, value: float) 
 
 @block_function
 def pull_on_knots(pull: Floats, nominal: Floats, basis: Basis) -> None:
-    """How sum_t u_t eps_t grows with each row of noise, `pull` (R,): the nominal u (T, C) through the basis."""
+    """Fill `pull` (R,) with the derivative of sum_t u_t eps_t by each row of knot noise, for the nominal u (T, C)."""
     horizon, channels = nominal.shape
     for r in range(pull.size):
         pull[r] = float32(0.0)
@@ -295,7 +295,7 @@ def pull_on_knots(pull: Floats, nominal: Floats, basis: Basis) -> None:
 
 @block_function
 def add_drawn_control_cost(costs: Floats, first: int, noise: Floats, at: int, pull: Floats, scale: float) -> None:
-    """As `add_control_cost`, but of the noise as drawn, which begins at index `at` of `noise`, by `pull_on_knots`."""
+    """Add the control cost as `add_control_cost` does, but of the noise as drawn, by `pull_on_knots`."""
     tune_loops()
     for r in range(U(pull.size)):
         slope = scale * pull[r]

@@ -193,7 +193,7 @@ def _rolling(wheels: Floats, t: int, b: int, commands: Floats, late: int, horizo
 def _slid(
     slides: Absent, x: float, y: float, step_x: float, step_y: float, wheel_sum: float, difference: float, start: Floats
 ) -> tuple[float, float]:
-    """Where a robot is after this step that slides and is carried beside its model; x and y as they are without."""
+    """Return the position x, y after this step with the side slip and drift that the disturbance adds to the model."""
     if slides is None:
         return x, y
     # The larger of both is the sum of the wheels' sizes.
@@ -236,7 +236,7 @@ def _begin(state: Floats, own: int, b: int, start: Floats, task: Terms, bends: B
 
 @scalar_function
 def _found(looks: Absent, state: Floats, own: int, b: int) -> Found:
-    """What sample b has kept and found in the task's table, in the rows from `own` on; zeros without a table."""
+    """Return what sample b has kept and found in the task's table, in the rows from `own` on; zeros without one."""
     if looks is None:
         zero = cast_like(0.0, state[own])
         return zero, zero, zero, zero, zero
@@ -321,7 +321,7 @@ def _place(state: Floats, b: int, base: Base) -> Place:
 
 @scalar_function
 def _ahead_place(state: Floats, b: int, base: Base, other: Base, start: Floats) -> Place:
-    """As `_place`, for a point equivalent to `base` that differs in x_icr: it turns about the same axle."""
+    """Return the place for a point equivalent to `base` that differs in x_icr: it turns about the same axle."""
     x, y, forward = _place(state, b, base)
     farther = other.x_icr_m - base.x_icr_m
     return x - farther * (state[COS + b] - start[2]), y - farther * (state[SIN + b] - start[3]), forward
@@ -329,7 +329,7 @@ def _ahead_place(state: Floats, b: int, base: Base, other: Base, start: Floats) 
 
 @scalar_function
 def _scaled_place(state: Floats, b: int, base: Base, other: Base, start: Floats) -> Place:
-    """As `_place`, for a point equivalent to `base` whose path is the same at another scale."""
+    """Return the place for a point equivalent to `base` whose path is the same at another scale."""
     scale = other.half_radius_m / base.half_radius_m
     ahead, stays = other.x_icr_m - scale * base.x_icr_m, cast_like(1.0, scale) - scale
     axle_x = scale * state[AXLE_X + b] + (stays * start[0] + ahead * start[2])
@@ -517,13 +517,13 @@ def _roll(
 
 @scalar_function
 def _bases(base: Base, pair: NDArray[np.int64]) -> tuple[Base, Base]:
-    """Base coefficients of a pair of points."""
+    """Return base coefficients of a pair of points."""
     return base_point(base, pair[0]), base_point(base, pair[1])
 
 
 @scalar_function
 def _places(pair: NDArray[np.int64], padded: int, lane: np.uintp) -> CostPlaces:
-    """Where the costs of a pair of points begin."""
+    """Return the indices at which the costs of a pair of points begin."""
     return U(pair[0] * padded) + lane, U(pair[1] * padded) + lane
 
 

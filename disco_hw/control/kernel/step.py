@@ -198,7 +198,9 @@ def charge(work: Workspace, sampling: Sampling, block: int) -> None:
 
 @block_function
 def weigh_all(work: Workspace, sampling: Sampling) -> float:
-    """Weights from costs; fills the report. Returns the sum of the weights, or 0 if no cost is finite.
+    """Compute the samples' weights from their costs and fill the report.
+
+    Returns the sum of the weights, or 0 if no cost is finite.
 
     Without a finite cost the effective sample size is 0, and there is no least and no mean cost.
     """

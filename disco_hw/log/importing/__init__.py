@@ -1,4 +1,4 @@
-"""`disco-hw import`: a foreign log -> our MCAP log.
+"""Import of logs in foreign formats into our MCAP log, for `disco-hw import`.
 
 The formats are modules here, each with a `FORMAT`, recognised by their first bytes. A format gives the arrays of a
 drive; here they become records of the log; `drive_from_log` reads the same arrays from it again.
@@ -38,7 +38,7 @@ LONGEST_BEGIN_BYTES = 64
 
 @dataclass(frozen=True, slots=True)
 class LogFormat:
-    """One format: `recognises` says of the first bytes of a file (64 at most) whether it is this one.
+    """Format of a foreign log: `recognises` tells from the first bytes of a file (64 at most) whether it is this one.
 
     `read` takes path and robot.toml and returns the arrays of the drive; it raises LogError with one line
     that names the file, the place and the remedy. Of two formats that recognise a file the one with the lower `order`
@@ -56,7 +56,7 @@ class LogFormat:
 
 @cache
 def log_formats() -> tuple[LogFormat, ...]:
-    """All formats, in the order in which they are asked."""
+    """Return all formats, in the order in which they are tried."""
     names = [module.name for module in pkgutil.iter_modules(__path__)]
     modules = [importlib.import_module(f"{__name__}.{name}") for name in names]
     found = [module.FORMAT for module in modules if hasattr(module, "FORMAT")]
@@ -64,7 +64,7 @@ def log_formats() -> tuple[LogFormat, ...]:
 
 
 def format_of(begin: bytes) -> LogFormat | None:
-    """The format of a file that begins with these bytes, None if it is none of them."""
+    """Return the format of a file that begins with these bytes, None if it is none of them."""
     return next((each for each in log_formats() if each.recognises(begin)), None)
 
 
@@ -114,7 +114,7 @@ def write_log(drive: DriveLog, path: Path, robot: str, attachments: tuple[Attach
 
 
 def _samples(drive: DriveLog) -> Iterator[_Timed]:
-    """Records with their time (ns) and segment, in order of time."""
+    """Return records with their time (ns) and segment, in order of time."""
     return iter(sorted([*_commands(drive), *_wheels(drive), *_poses(drive)], key=lambda sample: sample[0]))
 
 
@@ -213,7 +213,7 @@ def import_log(path: Path, robot: Path, out: Path, topics: Sequence[str] = (), c
 
 
 def _telling(path: Path) -> Path:
-    """The file that shows the format: of a bag's folder its metadata.yaml, or else the first bag in it."""
+    """Return the file that shows the format: of a bag's folder its metadata.yaml, or else the first bag in it."""
     if not path.is_dir():
         return path
     inside = sorted(one for one in path.iterdir() if one.suffix in SUFFIXES.values())

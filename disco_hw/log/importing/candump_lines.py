@@ -103,7 +103,7 @@ def read_dump(path: Path) -> Dump:
 
 
 def _increasing(path: Path, stamps_ns: Index, notes: list[str]) -> Index:
-    """Times since the first frame that never go back, of stamps in the order of the lines."""
+    """Return times since the first frame that never go back, of stamps in the order of the lines."""
     back = np.diff(stamps_ns) < 0
     if np.count_nonzero(back) > _BACK_SHARE * max(back.size, 1) and stamps_ns.max() < _LARGEST_DIFFERENCE_NS:
         notes.append(f"{path}: the time stamps are differences between frames (candump -td) and were summed up")
@@ -144,7 +144,7 @@ def _parsed(line: str) -> tuple[int, str, Frame | None] | None:
 
 
 def _nanoseconds(text: str) -> int | None:
-    """A time stamp in ns: seconds, or a date and time of day in UTC; None if it is neither."""
+    """Return a time stamp in ns: seconds, or a date and time of day in UTC; None if it is neither."""
     found = _SECONDS.fullmatch(text.strip())
     if found is not None:
         return int(found[1]) * 1_000_000_000 + int((found[2] or "").ljust(9, "0"))

@@ -47,7 +47,7 @@ _RESOLUTION = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Unwrapped:
-    """Counts made continuous: `values` (N,); `span` that was taken out `wraps` times, 0 if the counts did not wrap.
+    """Counts of an encoder made continuous: `values` (N,); `span` that was taken out `wraps` times, 0 without wraps.
 
     `uncertain` (N,) marks values before which so much time passed that the number of wraps is not known. `fault` says
     why the counts cannot be made continuous, and is empty if they can.
@@ -62,7 +62,7 @@ class Unwrapped:
 
 @dataclass(frozen=True, slots=True)
 class _Steps:
-    """From value to value (N - 1,): duration, step, and the motion expected by the neighbours.
+    """Steps from value to value (N - 1,): duration, step, and the motion expected by the neighbours.
 
     A step within `tolerance` of what is expected is motion, and so is one within `longest`, which the fastest of all
     samples would make. `is_inside` is False across a change of segment; `is_jump` marks what is no motion.
@@ -144,7 +144,7 @@ def _steps(t_s: Array, values: Array, begins: Mask | None, reach: float, unit: s
 
 
 def _expected(dt_s: Array, steps: Array, usable: Mask) -> Array:
-    """Steps (N,) at the mean rate of the neighbours that are usable."""
+    """Return the steps (N,) at the mean rate of the neighbours that are usable."""
     known = np.flatnonzero(usable)
     if not known.size:
         return np.zeros_like(steps)
@@ -157,7 +157,7 @@ def _expected(dt_s: Array, steps: Array, usable: Mask) -> Array:
 
 
 def _left_over(motion: _Steps, span: float) -> tuple[Array, Array, Mask]:
-    """Turns of the span in each step (N,), what they leave beside the expected motion, and whether that is motion."""
+    """Return turns of the span in each step (N,), what they leave beside the expected motion, and if that is motion."""
     turns = np.where(motion.is_inside, np.round((motion.steps - motion.expected) / span), 0.0)
     left = motion.steps - span * turns
     beside = np.abs(left - motion.expected)
@@ -165,7 +165,7 @@ def _left_over(motion: _Steps, span: float) -> tuple[Array, Array, Mask]:
 
 
 def _span_of(motion: _Steps, usual: Sequence[float], reach: float, unit: str) -> float | None:
-    """The span that explains the jumps: one of the usual ones, or the one that they show; None if none does."""
+    """Return the span that explains the jumps: one of the usual ones, or the one that they show; None if none does."""
     jumps = motion.is_jump
 
     def fits(span: float) -> int:
@@ -187,7 +187,10 @@ def _span_of(motion: _Steps, usual: Sequence[float], reach: float, unit: str) ->
 
 
 def _span_of_jumps(motion: _Steps, unit: str) -> tuple[float, float] | None:
-    """The span that jumps of one size show, again and again, with its tolerance; None if they are few or differ."""
+    """Return the span that jumps of one size show, again and again, with its tolerance.
+
+    None if they are few or differ.
+    """
     jumps = motion.is_jump
     if np.count_nonzero(jumps) < _OFTEN:
         return None
@@ -259,7 +262,7 @@ def _faster_than_read(span: float, unit: str) -> str:
 
 
 def set_anew(t_s: Array, angles_rad: Array) -> Mask:
-    """Return which samples (N,) begin anew because an encoder was set, from wheel angles (N, 2).
+    """Return which samples (N,) begin again because an encoder was set, from wheel angles (N, 2).
 
     That is a step of more than ten turns, or one of a radian that is several times as fast as the wheel turns else, or
     faster than it turns else and to zero.

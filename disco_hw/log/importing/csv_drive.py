@@ -118,7 +118,7 @@ def length_fault(poses: Poses, wheels: Wheels, commands: Commands, wheel_radius_
 
 
 def _roll(wheels: Wheels, commands: Commands) -> tuple[Array, Array]:
-    """Times (N,) and cumulative wheel angles (N, 2), from the commands where no wheels were measured."""
+    """Return times (N,) and cumulative wheel angles (N, 2), from the commands where no wheels were measured."""
     if wheels.t_s.size:
         return wheels.t_s, np.column_stack([wheels.left_angle_rad, wheels.right_angle_rad])
     t_s, segment = commands.t_s, commands.segment
@@ -230,7 +230,7 @@ def _continuous(sheet: Sheet, ticks: Array, has_ticks: Mask, per_rad: float, not
 def _with_new_segments(
     sheet: Sheet, t_s: Array, angles: Array, uncertain: Mask, segment: Index, notes: list[str]
 ) -> Sheet:
-    """The sheet with a new segment wherever an encoder begins anew (angles (N, 2) at t_s (N,)) or may have wrapped."""
+    """Return the sheet with a new segment wherever an encoder restarts or may have wrapped."""
     inside = np.concatenate([[False], np.diff(segment) == 0])
     anew, uncertain = set_anew(t_s, angles) & ~uncertain & inside, uncertain & inside
     count, unknown = int(np.count_nonzero(anew)), int(np.count_nonzero(uncertain))
@@ -305,7 +305,7 @@ def write_csv(drive: DriveLog, path: Path, ticks_per_rev: int | None) -> int:
 
 
 def _rows(drive: DriveLog) -> tuple[Array, Index]:
-    """All times in order, and their segments."""
+    """Return all times in order, and their segments."""
     parts = (drive.commands, drive.wheels, drive.poses)
     times, first = np.unique(np.concatenate([part.t_s for part in parts]), return_index=True)
     return times, np.concatenate([part.segment for part in parts])[first]

@@ -46,7 +46,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """A file's columns: times (N,) from 0 on, segments (N,), and cells (N,) with NaN where there is no sample."""
+    """Columns of a CSV file: times (N,) from 0 on, segments (N,), and cells (N,) with NaN where there is no sample."""
 
     name: str
     t_s: Array
@@ -116,7 +116,7 @@ class _Lines:
 def _columns(
     header: Sequence[str], rows: Iterator[list[str]], text: _Lines
 ) -> tuple[Sequence[int], dict[str, Array], _Faults]:
-    """The lines of the rows, and their known columns: NaN where a cell is empty, segments numbered from 0."""
+    """Return the lines of the rows, and their known columns: NaN where a cell is empty, segments numbered from 0."""
     lines, faults = array("q"), _Faults()
     columns = {name: array("d") for name in header if name in _KNOWN}
     places = [(header.index(name), name, column) for name, column in columns.items() if name not in (SEGMENT, TIME)]
@@ -154,7 +154,7 @@ def _columns(
 
 
 def _number(text: str) -> tuple[float, bool]:
-    """The finite number in a cell, else NaN; and whether a cell that is not empty holds none."""
+    """Return the finite number in a cell, else NaN; and whether a cell that is not empty holds none."""
     try:
         value = float(text)
     except ValueError:

@@ -1,4 +1,4 @@
-"""What a log loses on its way in: counted by signal, reported with its share, and refused where most is lost."""
+"""Data that a log loses on import: counted by signal, reported with its share, and refused where most is lost."""
 
 from __future__ import annotations
 

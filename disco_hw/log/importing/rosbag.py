@@ -77,13 +77,13 @@ class _Column:
         self.values.extend(row)
 
     def stamps(self) -> Stamps:
-        """The times of its rows."""
+        """Return the times of its rows."""
         table = self.table()
         is_repeat = np.concatenate([[False], _alike(table[1:], table[:-1])]) if len(table) else np.empty(0, dtype=bool)
         return Stamps(np.array(self.log_ns, dtype=np.int64), np.array(self.stamp_ns, dtype=np.int64), is_repeat)
 
     def table(self) -> Array:
-        """Its rows, (N, width)."""
+        """Return the column's rows, (N, width)."""
         return np.array(self.values, dtype=np.float64).reshape(-1, self.width)
 
 
@@ -265,7 +265,7 @@ def _pose_table(
     static: set[str],
     notes: list[str],
 ) -> tuple[Index, Array]:
-    """Times (N,), ns, and x, y, yaw (N, 3) of the poses; yaw is NaN where nobody measured it."""
+    """Return times (N,), ns, and x, y, yaw (N, 3) of the poses; yaw is NaN where nobody measured it."""
     used = choice.used(POSES)
     if used is None:
         return np.empty(0, dtype=np.int64), np.empty((0, 3))
@@ -305,7 +305,7 @@ def _expired(t_ns: Index, speeds: Array) -> tuple[Index, Array]:
 
 
 def _pauses(wheel_ns: Index, others: Sequence[Index]) -> Index:
-    """Where nothing is known of the wheels for half a second; without wheels, of anything for two."""
+    """Return the times (ns) after gaps: half a second without wheel data; without any, two seconds without anything."""
     if wheel_ns.size:
         return wheel_ns[1:][np.diff(wheel_ns) > LONGEST_SILENCE_NS]
     all_ns = np.sort(np.concatenate(others))
@@ -317,12 +317,12 @@ Take = Callable[[Any], Row | None]
 
 
 def finite(row: Row | None) -> Row | None:
-    """A row without infinities, else None. NaN stands for what is not known, and stays."""
+    """Return a row without infinities, else None. NaN stands for what is not known, and stays."""
     return None if row is None or any(map(math.isinf, row)) else row
 
 
 def stamp_of(message: Any) -> int:
-    """The header's stamp, ns; 0 without a header."""
+    """Return the header's stamp, ns; 0 without a header."""
     header = getattr(message, "header", None)
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec) if header is not None else 0
 

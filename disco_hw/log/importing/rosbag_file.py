@@ -75,7 +75,7 @@ class Undecoded:
 
 @dataclass(frozen=True)
 class Bag:
-    """An open bag; its messages can be read as often as wanted."""
+    """Open bag, whose messages can be read any number of times."""
 
     path: Path
     topics: dict[str, BagTopic]
@@ -87,7 +87,7 @@ class Bag:
     _definitions: Definitions
 
     def why_unreadable(self, topic: str) -> str:
-        """Why no message of a topic can be read; empty if one can. Parses the bag's definition of its type."""
+        """Return why no message of a topic can be read; empty if one can. Parses the bag's definition of its type."""
         kind = self.topics[topic].type
         connections = (one for reader in self._readers for one in reader.connections)
         one = next(one for one in connections if (one.topic, one.msgtype) == (topic, kind))
@@ -139,7 +139,7 @@ class DamagedBagError(LogError):
 
 @contextmanager
 def open_bag(path: Path, *, salvage: bool = False) -> Iterator[Bag]:
-    """Open a bag: a folder, its metadata.yaml, or one .mcap, .db3 or .bag; raises LogError and InputError.
+    """Open a bag, which is a folder, its metadata.yaml, or one .mcap, .db3 or .bag; raises LogError and InputError.
 
     A folder whose metadata.yaml is missing or wrong is read by its files. Raises DamagedBagError where a file cannot be
     read; with `salvage` whatever is whole of each file is copied to a temporary place and read from there.
@@ -193,12 +193,12 @@ def _readers(path: Path, stack: ExitStack, notes: list[str], salvage: bool) -> t
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """A key by which log_10 comes after log_9."""
+    """Return a key by which log_10 comes after log_9."""
     return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", name)]
 
 
 def _opened(path: Path, is_ros1: bool, stack: ExitStack, notes: list[str], salvage: bool) -> Any:  # Any: the library's.
-    """An open reader of a bag or file; raises DamagedBagError."""
+    """Return an open reader of a bag or file; raises DamagedBagError."""
     from rosbags import rosbag1, rosbag2  # noqa: PLC0415
 
     if salvage:
@@ -256,7 +256,7 @@ def _check_folder(path: Path) -> None:
 
 
 def _check_unpacked(path: Path) -> None:
-    """The library unpacks a file that was compressed as a whole onto the disk."""
+    """Raise LogError for a compressed file that unpacks to too much, as the library unpacks it onto the disk."""
     import zstandard  # noqa: PLC0415
 
     most = min(LOG.most_bytes, _MOST_UNPACKED_RATIO * max(path.stat().st_size, 4096))

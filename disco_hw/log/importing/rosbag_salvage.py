@@ -1,4 +1,4 @@
-"""What is whole of a damaged bag -> a new file that `rosbags` can read.
+"""Salvage of a damaged bag: all that can be read is copied to a new file that `rosbags` can read.
 
 A recording that ended in a power cut has no index, and a last chunk that is not whole. Its records are read one after
 the other until the damage, and also after a chunk that does not match its checksum or cannot be unpacked.
@@ -203,7 +203,7 @@ def _ros1_records(source: BinaryIO) -> Iterator[Record | None]:
 
 
 def _ros1_fields(block: bytes) -> dict[str, bytes]:
-    """The fields of a header, by name: each a length (4 bytes) and name=value."""
+    """Return the fields of a header, by name: each a length (4 bytes) and name=value."""
     fields, at = {}, 0
     while at < len(block):
         (length,) = struct.unpack_from("<I", block, at)

@@ -45,7 +45,7 @@ class Stamps:
 
 @dataclass(frozen=True, slots=True)
 class BagTimes:
-    """Each topic's times (N,), ns, the times at which something broke off, and what a person should know."""
+    """Times of each topic (N,), ns, the times at which something broke off, and messages for the operator."""
 
     t_ns: dict[str, Index]
     breaks_ns: Index
@@ -111,7 +111,7 @@ _Jump = tuple[int, int, str]
 
 
 def _jumps(stamps: Mapping[str, Stamps]) -> tuple[list[tuple[int, int]], set[str]]:
-    """When (ns of the recording) the clock was set, and by how much (ns); and topics that jump by themselves.
+    """Return when (ns of the recording) the clock was set, and by how much (ns); and topics that jump by themselves.
 
     A clock that is set shows in most of the topics that have stamps before and after.
     """
@@ -174,7 +174,7 @@ def _of_another_clock(stamps: Mapping[str, Stamps]) -> set[str]:
 
 
 def _without_stamps(stamps: Mapping[str, Stamps], names: Iterable[str]) -> dict[str, Stamps]:
-    """The stamps, with none (0) for the topics that are named."""
+    """Return the stamps, with none (0) for the topics that are named."""
     without = set(names)
     return {
         name: Stamps(one.log_ns, np.zeros_like(one.stamp_ns)) if name in without else one
@@ -213,13 +213,13 @@ def _without_jumps(one: Stamps, jumps: Sequence[tuple[int, int]]) -> Stamps:
 
 
 def _pairs(stamps: Iterable[Stamps]) -> Index:
-    """Times of recording and stamps (N, 2), of the topic that has most of both, in order of recording."""
+    """Return times of recording and stamps (N, 2), of the topic that has most of both, in order of recording."""
     both = [np.column_stack([one.log_ns, one.stamp_ns])[one.stamp_ns != 0] for one in stamps]
     return max(both, key=len, default=np.empty((0, 2), dtype=np.int64))
 
 
 def _carried(log_ns: Index, pairs: Index) -> Index:
-    """Times of recording on the clock of the stamps: interpolated between messages that have both, slope 1 beyond."""
+    """Return times of recording on the stamps' clock: interpolated between messages that have both, slope 1 beyond."""
     zero, first = int(pairs[0, 0]), int(pairs[0, 1])
     since, stamp = (pairs[:, 0] - zero).astype(np.float64), (pairs[:, 1] - first).astype(np.float64)
     at = (log_ns - zero).astype(np.float64)

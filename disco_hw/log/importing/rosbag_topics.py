@@ -55,7 +55,10 @@ class TopicCandidate:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What is read; an empty topic is a role that nothing serves. `edges` lead from the map to the robot, if by tf."""
+    """Choice of the topics to read; an empty topic is a role that nothing serves.
+
+    `edges` lead from the map to the robot, if by tf. `edges` lead from the map to the robot, if by tf.
+    """
 
     table: tuple[TopicCandidate, ...]
     edges: tuple[Edge, ...]
@@ -67,7 +70,7 @@ class Choice:
         return next((one for one in self.table if one.role == role and one.used), None)
 
     def as_text(self) -> str:
-        """The table, for a person."""
+        """Return the table of topics as text."""
         head = ("", "role", "topic", "type", "messages", "why")
         rows = [("*" if one.used else "", one.role, one.topic, one.type, str(one.count), one.why) for one in self.table]
         widths = [max(len(row[at]) for row in (head, *rows)) for at in range(len(head))]

@@ -25,7 +25,7 @@ class Definitions:
         self._left_s = PARSE_LIMIT_S
 
     def fault(self, connection: Any) -> str:  # Any: a connection of the library.
-        """Why messages of this connection cannot be read; empty if they can."""
+        """Return why messages of this connection cannot be read; empty if they can."""
         encoding = getattr(connection.ext, "serialization_format", "cdr")
         if encoding != "cdr":
             return f"it is encoded as {encoding}, not as CDR"

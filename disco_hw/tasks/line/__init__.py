@@ -1,7 +1,6 @@
-"""What kinds of tasks share that follow a line of way-points: here their file and the line as a table, with where on it
-a robot is; course, progress and cost lie beside it.
+"""Shared parts of tasks that follow a line of way-points: their file, and the line as a table with places on it.
 
-The table is the way-points of a CSV in equal pieces of arc length.
+Course, progress and cost lie beside this file. The table is the way-points of a CSV in equal pieces of arc length.
 """
 
 from __future__ import annotations
@@ -105,7 +104,9 @@ class PathTable:
         return self._spacing_m
 
     def piece(self, place: float) -> tuple[float, float, float]:
-        """The piece that a place is on: the place, not less than the piece's first entry; its first and last entry.
+        """Return the piece that a place is on: the place, not less than the piece's first entry.
+
+        Its first and last entry.
 
         A piece of a closed path may go past the table's end, and so may the place. A path without sharp turns is one
         piece; of a closed one, which has no end, the last entry is the first again.
@@ -180,7 +181,7 @@ def _rounded(points: Array, closed: bool) -> Array:
 
 
 def sharp_turns(points: Array, closed: bool, reach: int) -> list[int]:
-    """Indices of points (M + 1, 2) where the way turns by more than SHARP_RAD from `reach` points to the next `reach`.
+    """Return indices of points (M + 1, 2) where the way turns by more than SHARP_RAD over `reach` points each way.
 
     The sharpest of any that are within `reach` of one another; in rising order. The last point of a closed way is its
     first, and not listed again.
@@ -240,7 +241,7 @@ def load_waypoints(path: Path) -> Waypoints:
 
 
 def _columns(path: Path) -> tuple[list[int], dict[str, Array]]:
-    """The lines of the rows, and the columns that there are of x_m, y_m and t_s."""
+    """Return the lines of the rows, and the columns that there are of x_m, y_m and t_s."""
     reader = csv.reader(read_lines(path, WAY_POINTS), skipinitialspace=True)
     lines: list[int] = []
     try:
@@ -282,7 +283,7 @@ def check_size(path: Path, found: Waypoints) -> None:
 
 
 def points_of(waypoints: Waypoints) -> tuple[Point, ...]:
-    """The places as plain numbers."""
+    """Return the places as plain numbers."""
     return tuple((float(x), float(y)) for x, y in waypoints.places_m.tolist())
 
 

@@ -80,7 +80,7 @@ class PathCost:
         return Prepared(terms, near.origin_m, 0.0, place)
 
     def line_m(self) -> NDArray[np.float64]:
-        """The path as points (N, 2)."""
+        """Return the path as points (N, 2)."""
         return self.path.table[:, :2]
 
     def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
@@ -116,7 +116,7 @@ class PathTerms(NamedTuple):
     turn_m: float
 
     def follow(self, memory: float, x: float, y: float, forward: float, found: Found) -> tuple[float, float]:
-        """The place after a step, and what the step misses of the wanted speed, weighted."""
+        """Return the place after a step, and what the step misses of the wanted speed, weighted."""
         off_x, off_y, along_x, along_y = _offset(self.last, memory, x, y, found[1:])
         # A `single` of its own makes the compiler round another product: old logs would give other last bits.
         farthest = constant(FARTHEST_STEP_M, x)
@@ -127,7 +127,7 @@ class PathTerms(NamedTuple):
         return min(self.last, max(self.first, memory + along)), missing
 
     def place_of(self, place: float, x: float, y: float) -> float:
-        """The place beside a position, from the one before."""
+        """Return the place beside a position, from the one before."""
         row = 4 * _row(place, self.first, self.last)
         piece = (self.table[row], self.table[row + 1], self.table[row + 2], self.table[row + 3])
         off_x, off_y, along_x, along_y = _offset(self.last, place, x, y, piece)
@@ -135,7 +135,7 @@ class PathTerms(NamedTuple):
         return min(self.last, max(self.first, place + along))
 
     def line_at(self, place: float, ahead_m: float) -> tuple[float, float, float, float, float, float]:
-        """The point so much further on, how a robot that stays on the path is turned there, and how fast it is."""
+        """Return the point `ahead_m` further on, the robot's heading on the path there, and its speed."""
         place = min(place + ahead_m * self.per_m, self.last)
         index = _row(place, self.first, self.last)
         row, part = 4 * index, place - np.floor(min(place, self.last - _ONE))
@@ -149,11 +149,11 @@ class PathTerms(NamedTuple):
         return x, y, along_x * cosine - along_y * sine, along_y * cosine + along_x * sine, cosine, speed
 
     def way_ahead_m(self, time_s: float) -> float:
-        """How far a robot on the path goes in so long; Python only."""
+        """Return the distance (m) that a robot on the path covers in `time_s`, up to the path's end; Python only."""
         return float(min(self.speed_m_s * time_s, max(self.end, 0.0) / self.per_m))
 
     def row_of(self, memory: float) -> int:
-        """The row of the table for a place."""
+        """Return the row of the table for a place."""
         row: int = np.int32(np.floor(min(memory, self.last - _ONE)) - self.first)  # type: ignore[assignment]
         return row
 
@@ -167,7 +167,7 @@ class PathTerms(NamedTuple):
         return norm_of_three(off_x, off_y, found[0]) + _AGAINST * against, memory
 
     def terminal(self, memory: float, x: float, y: float, cos_yaw: float, sin_yaw: float, found: Found) -> float:
-        """The last distance and the error of the last heading."""
+        """Return the last distance and the error of the last heading."""
         off_x, off_y, along_x, along_y = _offset(self.last, memory, x, y, found[1:])
         piece = np.floor(min(memory, self.last - _ONE))
         row = np.int32(piece - self.first) * 2
@@ -181,7 +181,7 @@ class PathTerms(NamedTuple):
 
 @helper
 def _row(place: float, first: float, last: float) -> int:
-    """The row of the table for a place."""
+    """Return the row of the table for a place."""
     return int(np.floor(min(place, last - _ONE)) - first)
 
 
@@ -207,7 +207,7 @@ class _Nearby(NamedTuple):
 
 @lru_cache(maxsize=8)
 def _nearby(path: PathTable, block: int, reach: int, x_icr_m: float) -> _Nearby:
-    """The block of NEAR entries of a path, and `reach` more on both sides: round and round if it is closed."""
+    """Return the block of NEAR entries of a path, and `reach` more on both sides: round and round if it is closed."""
     table, count = path.table, len(path.table) - 1
     first, end = block * NEAR - reach, (block + 1) * NEAR + reach
     if not path.closed:
@@ -224,7 +224,7 @@ def _nearby(path: PathTable, block: int, reach: int, x_icr_m: float) -> _Nearby:
 
 @lru_cache(maxsize=8)
 def _numbers(path: PathTable, speed_m_s: float, step_s: float, x_icr_m: float) -> tuple[float, ...]:
-    """The terms from `per_m` on: those that no plan changes."""
+    """Return the terms from `per_m` on: those that no plan changes."""
     spacing = path.spacing_m
     return tuple(
         single(value)

@@ -62,7 +62,7 @@ class LineCourse:
         return x, y, math.atan2(to_y, to_x)
 
     def outline_m(self) -> Array:
-        """The way-points."""
+        """Return the way-points (N, 2) as outline, m."""
         return self.points_m
 
     def off_m(self, places_m: Array) -> Array:
@@ -89,7 +89,7 @@ class LineCourse:
 
 @lru_cache(maxsize=8)
 def line_course(points: tuple[Point, ...], noun: str) -> LineCourse:
-    """The line through way-points, the same one for the same way-points; `noun` is what it is called."""
+    """Return the line through way-points, the same one for the same way-points; `noun` is what it is called."""
     # Loaded for paths alone: half of the daemon's commands need no course at all.
     from scipy.spatial import KDTree  # noqa: PLC0415
 
@@ -106,7 +106,7 @@ END_M = 0.05
 
 
 def part_in_words(part: float, length_m: float) -> tuple[str, str]:
-    """What is counted along a line and how much of it, for a person."""
+    """Return the word "progress" and the part behind of a line's length as text."""
     return "progress", f"{part * length_m:.2f} of {length_m:.2f} m ({part:.0%})"
 
 
@@ -151,7 +151,7 @@ class PathProgress:
         self._moved += step
 
     def pause(self) -> None:
-        """The task does not run in this tick."""
+        """Note that the task does not run in this tick."""
         self._paused = True
 
 
@@ -161,7 +161,7 @@ def straight_fastest_m_s(robot: Chassis) -> float:
 
 
 def straight_too_fast(speed_m_s: float, robot: Chassis) -> str | None:
-    """Why the wheels cannot do a speed straight ahead, and the remedy; None if they can."""
+    """Return why the wheels cannot do a speed straight ahead, and the remedy; None if they can."""
     fastest = straight_fastest_m_s(robot)
     if speed_m_s <= fastest:
         return None
@@ -172,7 +172,7 @@ def straight_too_fast(speed_m_s: float, robot: Chassis) -> str | None:
 
 
 def speed_range(robot: Chassis) -> Mapping[str, Editable]:
-    """The speed as the field that a person may change."""
+    """Return the speed as the field that a person may change."""
     return {"speed_m_s": Editable(SLOWEST_M_S, straight_fastest_m_s(robot), "Speed (m/s)")}
 
 
@@ -203,7 +203,10 @@ def refuse_hairpins(file: Path, waypoints: Waypoints) -> None:
 
 
 def hairpin(path: PathTable) -> tuple[float, float, float] | None:
-    """The first turns that are too near to one another, and what they need between them, m along the path; or None."""
+    """Return the first turns that are too near to one another, and what they need between them, m along the path.
+
+    Or None.
+    """
     heading = _headings(path)
     length_m = path.spacing_m * (len(path.table) - 1)
     found = [

@@ -81,7 +81,7 @@ class Bench:
         self.robot.receive(self.now_ns, Frame(can_id, data))
 
     def step(self):
-        """One millisecond."""
+        """Advance everything by one millisecond."""
         self.now_ns += MS
         self._deliver()
         for received in self.robot_end.receive():

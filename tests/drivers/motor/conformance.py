@@ -1,4 +1,4 @@
-"""What every driver must do, whatever its controller: inherit `DriverConformance` and say how to make both ends.
+"""Conformance suite of all motor drivers: inherit `DriverConformance` and say how to make both ends.
 
 The robot simulator speaks the controller's bytes. It has: `receive(now_ns, frame)`, `step(now_ns)` at 1 kHz, `drain()`,
 `armed`, `speed_rad_s` and `angle` of the wheels as they really are, `press_estop(pressed)` and `break_down(broken)`.

@@ -9,7 +9,7 @@ CONFIG = FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0)
 
 
 class ReferenceRobot:
-    """What the bench and the conformance suite need of a robot; wheels turn as the core's outputs say."""
+    """Robot for the bench and the conformance suite; wheels turn as the core's outputs say."""
 
     def __init__(self, config=CONFIG, *, boot_ns=0, skew=0.0, first_ticks=(0, 0), entropy=7):
         self.core = FirmwareCore(config, entropy)
@@ -30,7 +30,7 @@ class ReferenceRobot:
 
     @property
     def speed_rad_s(self):
-        """The faster wheel."""
+        """Speed of the faster wheel, rad/s."""
         return max(abs(speed) for speed in self.speed)
 
     @property

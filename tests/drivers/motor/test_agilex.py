@@ -1,4 +1,4 @@
-"""What is AgileX's own: remote control comes first, speeds of the body, a time-out of half a second, buttons."""
+"""Tests of AgileX's own: remote control comes first, speeds of the body, a time-out of half a second, buttons."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""What is ODrive's own: the order of arming, states that fall by themselves, generations, silence, restarts."""
+"""Tests of ODrive's own: the order of arming, states that fall by themselves, generations, silence, restarts."""
 
 import itertools
 import struct

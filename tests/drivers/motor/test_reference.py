@@ -1,4 +1,4 @@
-"""What is particular to the reference driver; the rest is in the conformance suite."""
+"""Tests of what is particular to the reference driver; the rest is in the conformance suite."""
 
 import itertools
 from collections import Counter

@@ -1,4 +1,4 @@
-"""What is RoboClaw's own: its serial timeout, set and read back, stops before questions, and boards that restart."""
+"""Tests of RoboClaw's own: its serial timeout, set and read back, stops before questions, boards that restart."""
 
 import pytest
 

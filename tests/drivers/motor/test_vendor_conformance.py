@@ -1,4 +1,4 @@
-"""What every driver of a vendor's controller must do, against the byte-level simulator of that controller.
+"""Conformance tests of every vendor's driver, against the byte-level simulator of that controller.
 
 These controllers know no session and send no time: what the reference protocol proves is proved by the driver here.
 """

@@ -1,4 +1,4 @@
-"""What each vendor's driver sends in a scripted day does not change by itself: every frame, its time, life and rank.
+"""Tests that each vendor's driver sends the same frames in a scripted day: every frame, its time, life and rank.
 
 Whoever means to change it looks at the frames of the phase that is named, and then writes the new sums here.
 """

@@ -1,4 +1,4 @@
-"""What is VESC's own: speeds that its loop does not hold, a host that pauses, restarts, status that is off."""
+"""Tests of VESC's own: speeds that its loop does not hold, a host that pauses, restarts, status that is off."""
 
 import pytest
 

@@ -35,7 +35,7 @@ class Vendor:
 
     @property
     def is_serial(self):
-        """Whether it is on a line with two ends, which no second host hears or speaks on."""
+        """Whether the controller is on a line with two ends, which no second host hears or speaks on."""
         return self.foreign is None
 
     @property

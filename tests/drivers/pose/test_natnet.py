@@ -83,7 +83,7 @@ def test_every_version_gives_the_body_and_the_clock(version, empty):
 
 @pytest.mark.parametrize("version", VERSIONS.values(), ids=VERSIONS)
 def test_another_library_reads_the_same(version):
-    """natnet 0.3.0 of PyPI, by other authors; of 4.1 it does not know the precise time in the suffix."""
+    """Use natnet 0.3.0 of PyPI, by other authors; of 4.1 it does not know the precise time in the suffix."""
     library = pytest.importorskip("natnet.data_frame", reason="pip install natnet")
     from natnet.packet_buffer import PacketBuffer
     from natnet.version import Version

@@ -232,7 +232,7 @@ def test_without_a_device_it_says_what_to_write():
 
 
 def sentence(text):
-    """With its checksum."""
+    """Return an NMEA sentence with its checksum."""
     checksum = 0
     for byte in text.encode():
         checksum ^= byte
@@ -248,7 +248,7 @@ def said_by(found):
 
 
 def taken(*lines):
-    """What is made of sentences that come 10 ms apart."""
+    """Return what is made of sentences that come 10 ms apart."""
     fixes = Fixes()
     return [each for k, line in enumerate(lines) for each in fixes.take(line, NOW_NS + 10_000_000 * k)]
 

@@ -21,7 +21,7 @@ class PseudoTerminal:
 
     @property
     def lines(self):
-        """What was received, cut at carriage returns."""
+        """Return what was received, cut at carriage returns."""
         return bytes(self.received).split(b"\r")[:-1]
 
     def plug(self):

@@ -26,8 +26,10 @@ hasty = pytest.mark.parametrize("exchange", [HASTY])
 
 
 class Line:
-    """A board at the far end of a pseudo-terminal; `spoil(request, reply)` says in pieces (pause_s, bytes) what of a
-    reply is sent. `requests`: pieces of bytes as they came.
+    """A board at the far end of a pseudo-terminal.
+
+    `spoil(request, reply)` says in pieces (pause_s, bytes) what of a reply is sent. `requests`: pieces of bytes as they
+    came.
     """
 
     def __init__(self, directory):

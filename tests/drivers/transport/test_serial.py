@@ -276,7 +276,7 @@ def test_a_line_over_a_socket_carries_frames_both_ways_and_comes_back(listener):
 
 
 def test_what_waits_on_a_socket_is_read_at_once(listener):
-    """pyserial's own says that one byte waits, however many do: thousands of calls a second."""
+    """The socket port of pyserial says that one byte waits, however many do: thousands of calls a second."""
     with open_port(SerialMedium(listener.url, 115_200), timeout_s=1.0, write_timeout_s=1.0, exclusive=True) as port:
         listener.accept()
         listener.peer.sendall(20 * LINE)

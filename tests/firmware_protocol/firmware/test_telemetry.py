@@ -555,7 +555,7 @@ def test_a_deviation_in_floats_below_zero_is_not_valid(place):
 
 
 def sent_pose(**changes):
-    """What becomes of a pose in units that comes to the core."""
+    """Return whether the core sent a pose in units as valid, and the values of its messages."""
     bench = Bench()
     units = {"x": 0, "y": 0, "yaw": 0, "position_std": 0, "yaw_std": 0, "valid": True} | changes
     lib.disco_firmware_pose(bench.core._core, ffi.new("disco_pose_t *", units), 0)

@@ -1,4 +1,5 @@
 """A slip that saturates is called by its family's name, and said to be of another form; one that does not is not.
+
 A name that only acts like what is missing is disputed, with the reason.
 """
 

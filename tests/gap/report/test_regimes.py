@@ -1,5 +1,6 @@
-"""Residuals by regime: each node lies where the wheels say it does, what disagrees comes first; what is left counts
-where the richest model still gains in several blocks of time.
+"""Residuals sorted by regime: each node lies where the wheels say it does, what disagrees comes first.
+
+What is left counts where the richest model still gains in several blocks of time.
 """
 
 import math
