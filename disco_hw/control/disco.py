@@ -17,7 +17,7 @@ import numpy as np
 
 from disco_hw.control.disturbance_compensation import DisturbanceCompensation
 from disco_hw.control.guidance import Guidance
-from disco_hw.control.kernel import BLOCK, CHANNELS, WHEEL_ROWS, aligned_zeros
+from disco_hw.control.kernel import BLOCK, CHANNELS, START_LEFT, START_RIGHT, START_SIZE, WHEEL_ROWS, aligned_zeros
 from disco_hw.control.kernel.avoid import Area
 from disco_hw.control.kernel.guide import SteeredChassis
 from disco_hw.control.kernel.skid_steer import SkidSteer
@@ -74,7 +74,7 @@ class Disco:
         self._refine_points()
         self._stopping = Stopping(settings, limits)
         # Buffers of the compiled rollout: where it begins, and how the wheels turn in it.
-        self._start = np.zeros(11, np.float32)
+        self._start = np.zeros(START_SIZE, np.float32)
         self._wheels = aligned_zeros(sampler.horizon * WHEEL_ROWS * int(BLOCK))
         # Of the first plan since the last reset, and of the last one.
         self._begun_ns: int | None = None
@@ -234,7 +234,7 @@ class Disco:
         around = self._surroundings
         if around is None:
             return None
-        turning = max(abs(float(self._start[4])), abs(float(self._start[5])))
+        turning = max(abs(float(self._start[START_LEFT])), abs(float(self._start[START_RIGHT])))
         fastest = SPEED_TO_SPARE * max(around.speed_m_s, turning * self.chassis.wheel_radius_m)
         return around.place(x_m, y_m, origin_m, fastest)
 
