@@ -1,13 +1,13 @@
-"""Types that every driver uses: frames on the link, samples from the robot, commands to it.
+"""What every driver speaks: the protocols of drivers and pose sources, and what a driver says of itself.
 
-SI units; left before right; positive wheel speed drives forward; x forward, y left, yaw counter-clockwise.
+Frames and transports are in `drivers/link_types.py`, samples and commands in `drivers/samples.py`; both can be imported
+from here. SI units; left before right; positive wheel speed drives forward; x forward, y left, yaw counter-clockwise.
 Time stamps are nanoseconds of the host's monotonic clock unless the name says otherwise.
 """
 
 from __future__ import annotations
 
 import enum
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from types import MappingProxyType
@@ -15,194 +15,65 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 import msgspec
 
+from drivers.link_types import (
+    MAX_EXTENDED_ID,
+    CyclicFrame,
+    Exchange,
+    Frame,
+    LinkState,
+    OutgoingFrame,
+    ReceivedFrame,
+    Transport,
+    TransportStats,
+    socketcan_id,
+)
+from drivers.samples import (
+    MotorSample,
+    PoseSample,
+    PowerSample,
+    Readings,
+    RobotLinkHealth,
+    RobotStatus,
+    WheelCommand,
+    WheelSample,
+)
 
-class Frame(msgspec.Struct, frozen=True, gc=False):
-    """One classic CAN data frame, `extended` with a 29-bit identifier; serial links tunnel those with 11 bits."""
-
-    can_id: int
-    data: bytes
-    extended: bool = False
-
-
-MAX_EXTENDED_ID = 0x1FFF_FFFF
-_EXTENDED_FLAG = 0x8000_0000
-
-
-def socketcan_id(frame: Frame) -> int:
-    """Return the identifier with Linux's `can_id` flag for 29 bits, as a log keeps it beside a frame's data."""
-    return frame.can_id | _EXTENDED_FLAG if frame.extended else frame.can_id
-
-
-class ReceivedFrame(msgspec.Struct, frozen=True, gc=False):
-    """A frame as it came in, with the host time of its reception (from the kernel where the medium gives one)."""
-
-    t_ns: int
-    frame: Frame
-
-
-class OutgoingFrame(msgspec.Struct, frozen=True, gc=False):
-    """A frame to send, and the host time after which it must be dropped instead of sent late.
-
-    `rank`: its place among those that wait, lowest first and equal ones as they came; None: its identifier, in the
-    order in which a CAN bus would send. A driver whose frames must keep their order gives them one rank, below it an
-    e-stop's.
-    """
-
-    frame: Frame
-    deadline_ns: int
-    rank: int | None = None
-
-
-class LinkState(enum.Enum):
-    """Whether a transport can carry frames now."""
-
-    CLOSED = "closed"
-    CONNECTING = "connecting"
-    UP = "up"
-
-
-@dataclass(frozen=True, slots=True)
-class TransportStats:
-    """Counters of one transport since it was made; nothing is dropped without being counted here."""
-
-    frames_sent: int = 0
-    frames_received: int = 0
-    bytes_received: int = 0
-    send_errors: int = 0
-    receive_errors: int = 0
-    expired: int = 0
-    transmit_queue_full: int = 0
-    receive_overflow: int = 0
-    malformed: int = 0
-    bus_errors: int = 0
-    bus_off: int = 0
-    reconnects: int = 0
-
-
-class Transport(Protocol):
-    """A medium that carries frames; it reconnects by itself with back-off and never raises on what the peer sends."""
-
-    @property
-    def name(self) -> str:
-        """Medium and address, for messages to the operator."""
-
-    @property
-    def state(self) -> LinkState:
-        """Whether frames can be carried now."""
-
-    @property
-    def generation(self) -> int:
-        """Number of times the link has come up; a change means that everything agreed with the peer is void."""
-
-    @property
-    def stats(self) -> TransportStats:
-        """A snapshot of the counters."""
-
-    @property
-    def last_error(self) -> str | None:
-        """The newest error in words, or None if there was none since the link last came up."""
-
-    def open(self) -> None:
-        """Start the receive thread and the first connection attempt; return at once."""
-
-    def send(self, outgoing: OutgoingFrame, now_ns: int) -> bool:
-        """Send a frame without blocking; False (and a counter) if it expired, did not fit or the link is down."""
-
-    def receive(self) -> Sequence[ReceivedFrame]:
-        """Return all frames received since the last call, oldest first, without blocking."""
-
-    def close(self) -> None:
-        """Stop the thread and release the medium; safe to call twice."""
-
-
-class WheelCommand(msgspec.Struct, frozen=True, gc=False):
-    """Wheel speeds to hold for at most `valid_for_s` after reception."""
-
-    left_rad_s: float
-    right_rad_s: float
-    valid_for_s: float
-
-
-class WheelSample(msgspec.Struct, frozen=True, gc=False):
-    """Wheel angles and speeds of one instant; angles are cumulative and do not wrap."""
-
-    t_ns: int
-    received_ns: int
-    left_angle_rad: float
-    right_angle_rad: float
-    left_speed_rad_s: float
-    right_speed_rad_s: float
-
-
-class PoseSample(msgspec.Struct, frozen=True, gc=False):
-    """A measured pose in the world frame; `t_ns` is when it was true, `received_ns` when it arrived.
-
-    `yaw_rad` and `yaw_std_rad` are both NaN where no heading was measured. The position is that of the point
-    `lever_x_m` ahead and `lever_y_m` to the left of the tracked one. `source`: which of robot.toml's, 0 that of [pose],
-    then those of [[pose.also]].
-    """
-
-    t_ns: int
-    received_ns: int
-    x_m: float
-    y_m: float
-    yaw_rad: float
-    position_std_m: float
-    yaw_std_rad: float
-    lever_x_m: float = 0.0
-    lever_y_m: float = 0.0
-    source: int = 0
-
-    @property
-    def has_heading(self) -> bool:
-        """Whether there is a heading beside the position."""
-        return not (math.isnan(self.yaw_rad) and math.isnan(self.yaw_std_rad))
-
-
-class MotorSample(msgspec.Struct, frozen=True, gc=False):
-    """Motor currents and temperatures."""
-
-    t_ns: int
-    left_current_a: float
-    right_current_a: float
-    left_temperature_c: float
-    right_temperature_c: float
-
-
-class PowerSample(msgspec.Struct, frozen=True, gc=False):
-    """Battery voltage, current and temperature."""
-
-    t_ns: int
-    voltage_v: float
-    current_a: float
-    temperature_c: float
-
-
-class RobotStatus(msgspec.Struct, frozen=True, gc=False):
-    """Status that the robot's controller reports; names are those of the DBC's value tables."""
-
-    t_ns: int
-    state: str
-    fault_code: int
-    fault: str
-    estop_source: str
-    stop_cause: str
-    session: int
-    rejected_count: int
-    reject_reason: str
-
-
-class RobotLinkHealth(msgspec.Struct, frozen=True, gc=False):
-    """The robot's own count of trouble on the link."""
-
-    t_ns: int
-    tx_error_count: int
-    rx_error_count: int
-    bus_off_count: int
-    crc_error_count: int
-    sequence_error_count: int
-    watchdog_count: int
-
+__all__ = [
+    "MAX_EXTENDED_ID",
+    "SAID_BY_WORDS",
+    "CyclicFrame",
+    "Driver",
+    "DriverState",
+    "DriverStats",
+    "Exchange",
+    "Frame",
+    "Identity",
+    "Limit",
+    "Limits",
+    "LineQuestions",
+    "LinkState",
+    "MotorDriver",
+    "MotorSample",
+    "NoSettings",
+    "OutgoingFrame",
+    "PoseSample",
+    "PoseSource",
+    "PowerSample",
+    "Readings",
+    "ReceivedFrame",
+    "Request",
+    "RobotLinkHealth",
+    "RobotStatus",
+    "SafetyCard",
+    "SaidBy",
+    "SaysWhy",
+    "SettingsFault",
+    "Transport",
+    "TransportStats",
+    "WheelCommand",
+    "WheelSample",
+    "socketcan_id",
+]
 
 SaidBy = Literal["device", "fixed", "robot.toml"]
 """Who says something of a controller: itself, its documents of what cannot be set otherwise, or robot.toml alone."""
@@ -261,18 +132,6 @@ class Limits:
         """Return the figures that somebody says, by name."""
         each = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: limit for name, limit in each.items() if limit is not None}
-
-
-class Readings(msgspec.Struct, frozen=True, gc=False):
-    """Readings from one batch of received frames, oldest first."""
-
-    wheels: tuple[WheelSample, ...] = ()
-    poses: tuple[PoseSample, ...] = ()
-    motors: tuple[MotorSample, ...] = ()
-    power: tuple[PowerSample, ...] = ()
-    status: tuple[RobotStatus, ...] = ()
-    link_health: tuple[RobotLinkHealth, ...] = ()
-    events: tuple[str, ...] = ()
 
 
 class DriverState(enum.Enum):
@@ -386,56 +245,12 @@ class PoseSource(Protocol):
         """Release what it holds; safe to call twice."""
 
 
-class Exchange(Protocol):
-    """Protocol of a serial line on which one request is under way at a time, and a reply belongs to the last one.
-
-    A frame is a packet here: `can_id` says to whom it goes and what it is. `timeout_s`: how long the device may take to
-    begin; `quiet_s`: how long the line is left alone after a reply that did not come.
-    """
-
-    @property
-    def timeout_s(self) -> float:
-        """Longest time from the last byte of a request to the last of its reply, at infinite line speed."""
-
-    @property
-    def quiet_s(self) -> float:
-        """Silence after which a device that is in the middle of a packet begins again."""
-
-    def request(self, frame: Frame) -> bytes:
-        """Return the bytes of a packet on the line."""
-
-    def is_answered(self, frame: Frame) -> bool:
-        """Whether the device replies to it."""
-
-    def reply(self, frame: Frame, received: bytes) -> Frame | None:
-        """Return the reply to `frame` that the bytes received since then begin with.
-
-        None if it is none, or not whole yet.
-        """
-
-
 @runtime_checkable
 class SaysWhy(Protocol):
     """A pose source that knows why its poses come or fail to come."""
 
     def news(self) -> Sequence[str]:
         """Sentences for the operator since the last call."""
-
-
-@dataclass(frozen=True, slots=True)
-class CyclicFrame:
-    """A frame of `length` data bytes that `sender` sends `rate_hz` times a second.
-
-    `line_bytes`: all of its bytes on a serial line, and `pause_s` how long that rests after it, where the driver speaks
-    a framing of its own there; None: the data and what the reference protocol's framing adds.
-    """
-
-    name: str
-    sender: str
-    length: int
-    rate_hz: float
-    line_bytes: int | None = None
-    pause_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,8 @@ from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
 from disco_hw.experiments.circle import CircleOptions, run_circle
 from disco_hw.gap import missing_effects
 from disco_hw.inference.estimates import estimates
-from disco_hw.inference.excitation import USUAL, excitation
+from disco_hw.inference.excitation import excitation
+from disco_hw.inference.noise import USUAL
 from disco_hw.inference.simulate import Simulator
 from disco_hw.model import EffectSetting, Model
 from disco_hw.model.step import FreeRun

@@ -14,8 +14,11 @@ from disco_hw.control.kernel.avoid import (
     COLUMNS,
     DETOUR_COLUMNS,
     DETOURS,
+    FASTEST,
+    KEEP,
     LOOK_EVERY,
     MOST_SHAPES,
+    STEP_LENGTH,
     TOUCH_COST,
     Area,
     place_shapes,
@@ -86,7 +89,7 @@ class Surroundings:
         moving[:, [0, 1, 5, 6, 7]] = circles
         self._table = np.concatenate((self._edges, moving))
         keep_m = self._margin_m + self._deviations * deviation_m
-        self.area.body[3] = keep_m
+        self.area.body[KEEP] = keep_m
         self._detours.look_around(bounds, keep_m)
 
     def set_line(self, line_m: Array) -> None:
@@ -97,7 +100,7 @@ class Surroundings:
         """Whether a path (N, 3) of x, y, yaw needs no detour and keeps the footprint far enough from everything."""
         if self._bounds is None or self._detours.is_near(path):
             return self._bounds is None
-        keep_m = float(self.area.body[3])
+        keep_m = float(self.area.body[KEEP])
         return bool((self._bounds.clearance_m(path, within_m=2.0 * keep_m + 0.1) >= keep_m).all())
 
     def place(self, x_m: float, y_m: float, origin_m: tuple[float, float], speed_m_s: float) -> Area:
@@ -105,9 +108,9 @@ class Surroundings:
 
         `speed_m_s`: the fastest that the plan may go.
         """
-        time_s = self._horizon * float(self.area.body[4])
-        near_m = self._footprint.reach_m + float(self.area.body[3])
-        self.area.body[5:] = speed_m_s, near_m
+        time_s = self._horizon * float(self.area.body[STEP_LENGTH])
+        near_m = self._footprint.reach_m + float(self.area.body[KEEP])
+        self.area.body[FASTEST:] = speed_m_s, near_m
         reach_m = speed_m_s * time_s + near_m
         arguments = self.area, self._table, x_m, y_m, *origin_m, reach_m, time_s
         if self._place is None:

@@ -14,7 +14,8 @@ from disco_hw.effects import Symptom
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.inference.density_network import Fitted, Simulate
 from disco_hw.inference.estimates import Estimates, Whitening, estimates
-from disco_hw.inference.excitation import Excitation, Noise, unexplained_share
+from disco_hw.inference.excitation import Excitation
+from disco_hw.inference.noise import Noise, unexplained_share
 from disco_hw.inference.simulate import NAMES, Simulator, Workers, draw_seeds
 
 Array = NDArray[np.float64]

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.inference.excitation import Excitation, Noise, slip_intensity
+from disco_hw.inference.excitation import Excitation
+from disco_hw.inference.noise import Noise, slip_intensity
 from disco_hw.jit import parallel_kernel
 
 Array = NDArray[np.float64]

@@ -35,7 +35,8 @@ from disco_hw.inference.density_network import (
     run_rounds,
 )
 from disco_hw.inference.estimates import cross_correlation, estimates, paper_statistics
-from disco_hw.inference.excitation import USUAL, Excitation, Noise, excitation, measured_noise
+from disco_hw.inference.excitation import Excitation, excitation
+from disco_hw.inference.noise import USUAL, Noise, measured_noise
 from disco_hw.inference.simulate import (
     NAMES,
     ReportProgress,

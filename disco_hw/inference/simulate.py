@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.errors import InputError, WorkError
-from disco_hw.inference.excitation import Excitation, Noise, slip_intensity
+from disco_hw.inference.excitation import Excitation
+from disco_hw.inference.noise import Noise, slip_intensity
 from disco_hw.jit import parallel_kernel
 from disco_hw.model.added_terms import new_means
 from disco_hw.model.coefficients import base_point, effect_point

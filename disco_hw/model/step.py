@@ -7,6 +7,20 @@ its argument and leaves nothing of it in the machine code. The same in numpy, fo
 
     v = r (w_R + w_L) / 2        omega = r (w_R - w_L) / a        v_lateral = -omega x_icr
     x' = v cos(yaw) - v_lateral sin(yaw)      y' = v sin(yaw) + v_lateral cos(yaw)      yaw' = omega
+
+A step hands its numbers from stage to stage; what is in brackets is there only if the model has an effect for it:
+
+    commands ─[command_delay]─▶ in force ─[command terms, COMMAND, RESPONSE]─▶ w_L, w_R at the end and in the mean
+    means ─[ROLLING]─▶ sum, difference ─▶ v, v_lateral, omega ─[VELOCITY to LATERAL, body terms]─▶ arc ─[WORLD]─▶ pose
+
+Layout of what a free run works on; each row of commands is held for a step:
+
+    commands (history + N, 2)   | -history | ... | -1 | 0 | 1 | ... | N - 1 |         left, right (rad/s)
+    states (N + 1, 5)                                 | 0 | 1 | ... | N - 1 | N |     x, y, yaw, w_L, w_R
+    means (n,)                  | command term 0: left, right | term 1 ... | body term 0 | term 1 ... |
+    Base, Coefficients          a field for each parameter or effect: columns (L,) of points, numbers of one, or None
+
+In step t the command of row `history + t - delay_steps` is in force, mixed with the one before it (`in_force`).
 """
 
 from __future__ import annotations

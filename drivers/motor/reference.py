@@ -1,6 +1,6 @@
 """The driver of this project's own wheel controller, which speaks firmware_protocol/disco_robot.dbc.
 
-Its parts lie beside it: frames, arming, telemetry, and the watch over an armed robot.
+Its parts lie beside it: frames and telemetry, arming and the watch over an armed robot, house-keeping frames.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ from typing import Any
 from drivers.device_clock import DEVICE_CLOCK_MODULUS_US, DeviceClock
 from drivers.motor import reference_frames as telemetry
 from drivers.motor.reference_arming import MESSAGES as HANDSHAKE_MESSAGES
-from drivers.motor.reference_arming import ArmedWatch, Arming, Handshake, HostState, cyclic_frames
+from drivers.motor.reference_arming import ArmedWatch, Arming, Handshake, cyclic_frames
 from drivers.motor.reference_frames import FrameReception, FrameTransmission
+from drivers.motor.reference_housekeeping import HouseKeeping
 from drivers.types import (
     DriverState,
     DriverStats,
@@ -36,21 +37,12 @@ from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decod
 
 SILENCE_NS = 500_000_000
 REFUSED_SILENCE_NS = 3_000_000_000
-# A little under 10 Hz, so that a loop whose ticks come early by some jitter does not skip one.
-HOST_STATE_PERIOD_NS = 90_000_000
-HELLO_PERIOD_NS = 200_000_000
-REFUSED_HELLO_PERIOD_NS = 1_000_000_000
-FAST_TIME_PERIOD_NS = 200_000_000
-TIME_PERIOD_NS = 1_000_000_000
-FAST_TIME_COUNT = 10
 ZERO_VALID_FOR_S = 0.1
 ESTOP_REPEATS = 3
 SHORTEST_VALID_FOR_S = 0.002
 COASTING_NS = 200_000_000
 """Released wheels roll freely for this long and lose their speed gently; then the controller's brake holds them."""
-_HOUSE_KEEPING_NS = 100_000_000
 _ESTOP_DEADLINE_NS = 1_000_000_000
-_PENDING_TIMES = 8
 _ONE_STOP_NS = 1_000_000_000
 _STATES = {
     "BOOT": DriverState.HANDSHAKE,
@@ -88,6 +80,7 @@ class ReferenceDriver:
         self._has_key = key is not None
         self._reception = FrameReception(codec)
         self._transmission = FrameTransmission(codec, key)
+        self._house_keeping = HouseKeeping(self._transmission, codec.dbc_hash)
         self._clock = DeviceClock()
         self._telemetry = telemetry.Telemetry(self._clock)
         self._handlers = self._make_handlers()
@@ -97,9 +90,6 @@ class ReferenceDriver:
         self._status: RobotStatus | None = None
         self._link_is_up = False
         self._host_accepted = False
-        self._host_state: HostState | None = None
-        self._time_sequence = 0
-        self._time_requests: dict[int, int] = {}
         self._commands_sent = 0
         self._watch = ArmedWatch()
         self._device_us: int | None = None
@@ -257,7 +247,7 @@ class ReferenceDriver:
             frames.append(self._wheel_command(now_ns, "HOLD_ZERO", WheelCommand(0.0, 0.0, ZERO_VALID_FOR_S)))
         else:
             self._watch.rest()
-        return self._transmission.proved((*frames, *self._house_keeping(now_ns)))
+        return self._transmission.proved((*frames, *self._due(now_ns)))
 
     def release(self, why: str) -> None:
         """Switch the motors off (COAST), then disarm, which brakes; without a session only disarm."""
@@ -302,45 +292,12 @@ class ReferenceDriver:
         self._commands_sent += 1
         return frame
 
-    def _house_keeping(self, now_ns: int) -> list[OutgoingFrame]:
-        frames = []
-        transmission = self._transmission
+    def _due(self, now_ns: int) -> list[OutgoingFrame]:
+        """House-keeping frames due now."""
         refused = self._handshake.refusal is not None
         introduced = self._host_accepted and self.identity is not None and not refused
-        hello_period_ns = REFUSED_HELLO_PERIOD_NS if refused else HELLO_PERIOD_NS
-        if not introduced and transmission.due("HELLO_REQUEST", now_ns, hello_period_ns):
-            frames.append(
-                transmission.frame(
-                    "HELLO_REQUEST",
-                    now_ns,
-                    _HOUSE_KEEPING_NS,
-                    protocol_major=PROTOCOL_MAJOR,
-                    protocol_minor=PROTOCOL_MINOR,
-                    dbc_hash=self._codec.dbc_hash,
-                )
-            )
-        state = self._arming.host_state()
-        if state != self._host_state or transmission.due("HOST_STATE", now_ns, HOST_STATE_PERIOD_NS):
-            self._host_state = state
-            frames.append(
-                transmission.frame(
-                    "HOST_STATE",
-                    now_ns,
-                    _HOUSE_KEEPING_NS,
-                    request=state.request,
-                    session=state.session,
-                    challenge_answer=state.challenge_answer,
-                    host_fault=0,
-                )
-            )
-        time_period_ns = FAST_TIME_PERIOD_NS if self._clock.count < FAST_TIME_COUNT else TIME_PERIOD_NS
-        if transmission.due("TIME_REQUEST", now_ns, time_period_ns):
-            self._time_sequence = (self._time_sequence + 1) % 256
-            self._time_requests[self._time_sequence] = now_ns
-            if len(self._time_requests) > _PENDING_TIMES:
-                del self._time_requests[next(iter(self._time_requests))]
-            frames.append(transmission.frame("TIME_REQUEST", now_ns, _HOUSE_KEEPING_NS, sequence=self._time_sequence))
-        return frames
+        state, samples = self._arming.host_state(), self._clock.count
+        return self._house_keeping.frames(now_ns, state, samples, introduced=introduced, refused=refused)
 
     def _handle(self, decoded: Decoded, received_ns: int, collected: dict[str, list[Any]]) -> None:
         handler = self._handlers.get(decoded.name)
@@ -425,7 +382,7 @@ class ReferenceDriver:
             self._events.append("the robot's controller found its clock set back and goes on with a time of its own")
 
     def _on_time(self, decoded: Decoded, received_ns: int) -> None:
-        sent_ns = self._time_requests.pop(int(decoded.values["sequence"]), None)
+        sent_ns = self._house_keeping.asked_time_ns(int(decoded.values["sequence"]))
         if sent_ns is None:
             return
         device_us = int(decoded.values["receive_time"])
@@ -464,7 +421,7 @@ class ReferenceDriver:
         self._arming.reset(why)
         self._telemetry.restart()
         self._clock.forget()
-        self._time_requests.clear()
+        self._house_keeping.forget()
         self._device_us = None
         self._status = None
         self._host_accepted = False

@@ -18,7 +18,7 @@ from disco_hw.control import CommandLimits, Disco, DiscoSettings
 from tests.control.kernel.test_skid_steer import model_of
 for effects in ({"motor_lag": {"tau_s": 0.1}}, {"motor_lag": {"tau_s": 0.1}, "turn_droop": {"k_s": 0.8}}):
     disco = Disco(model_of((0.06, 0.4, 0.1), effects), CircleCost(0.3, -0.2), DiscoSettings(), CommandLimits(8.0, 20.0))
-    print(disco._wheels_differ)
+    print(disco._points.wheels_differ)
 """
 
 

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from disco_hw.inference.estimates import STATISTICS, estimates, whitening
-from disco_hw.inference.excitation import USUAL, excitation
+from disco_hw.inference.excitation import excitation
+from disco_hw.inference.noise import USUAL
 from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds
 from disco_hw.model import Model
 from tests.inference.drives import TRUTH, logged

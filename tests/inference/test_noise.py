@@ -4,14 +4,8 @@ import numpy as np
 import pytest
 
 from disco_hw.inference.estimates import estimates
-from disco_hw.inference.excitation import (
-    USUAL,
-    Noise,
-    _two_terms,
-    excitation,
-    measured_noise,
-    unexplained_share,
-)
+from disco_hw.inference.excitation import excitation
+from disco_hw.inference.noise import USUAL, Noise, _two_terms, measured_noise, unexplained_share
 from disco_hw.inference.simulate import NAMES, Simulator
 from disco_hw.model import Model
 from tests.inference.drives import TRUTH, logged

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from disco_hw.inference.estimates import estimates
-from disco_hw.inference.excitation import Noise, excitation, measured_noise
+from disco_hw.inference.excitation import excitation
 from disco_hw.inference.infer import noise_spread
+from disco_hw.inference.noise import Noise, measured_noise
 from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds
 from disco_hw.model import Model
 from tests.inference.drives import TRUTH, logged

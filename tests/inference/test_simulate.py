@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from disco_hw.inference.excitation import Noise, excitation
+from disco_hw.inference.excitation import excitation
+from disco_hw.inference.noise import Noise
 from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds, physical_range
 from disco_hw.model import EffectSetting, Model
 from disco_hw.model.step import FreeRun

@@ -30,8 +30,9 @@ from disco_hw.config import Prior, Robot, RobotConfig
 from disco_hw.errors import InputError
 from disco_hw.inference.checks import CHECKS, LARGEST_DEVIATION, LARGEST_UNEXPLAINED, Scores
 from disco_hw.inference.estimates import estimates
-from disco_hw.inference.excitation import excitation, unexplained_share
+from disco_hw.inference.excitation import excitation
 from disco_hw.inference.infer import InferOptions, infer, noise_of, noise_spread
+from disco_hw.inference.noise import unexplained_share
 from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels
 from disco_hw.log.load import load_drive

@@ -34,6 +34,10 @@ DETOURS, DETOUR_COLUMNS = 2, 7
 half the detour's length (1/m), how far to the left it leads (m), and how far aside of the line it counts (m)."""
 
 
+HALF_LENGTH, HALF_WIDTH, CENTRE_AHEAD, KEEP, STEP_LENGTH, FASTEST, REACH = range(7)
+"""Places in `Area.body`."""
+
+
 class Area(NamedTuple):
     """The fence and obstacles that rollouts keep away from, as arrays for the kernel.
 
@@ -150,16 +154,15 @@ def touch_cost(
     row, shapes, body = U(shape * COLUMNS), area.shapes, area.body
     x, y, forward = place
     zero = constant(0.0, x)
-    off_x = x + body[2] * cos_yaw - (shapes[row] + time_s * shapes[row + U(6)])
-    off_y = y + body[2] * sin_yaw - (shapes[row + U(1)] + time_s * shapes[row + U(7)])
+    off_x = x + body[CENTRE_AHEAD] * cos_yaw - (shapes[row] + time_s * shapes[row + U(6)])
+    off_y = y + body[CENTRE_AHEAD] * sin_yaw - (shapes[row + U(1)] + time_s * shapes[row + U(7)])
     along = min(max(off_x * shapes[row + U(2)] + off_y * shapes[row + U(3)], zero), shapes[row + U(4)])
     off_x -= along * shapes[row + U(2)]
     off_y -= along * shapes[row + U(3)]
     off, inverse = norm_and_inverse(off_x, off_y)
     ahead = abs(off_x * cos_yaw + off_y * sin_yaw)
     aside = abs(off_y * cos_yaw - off_x * sin_yaw)
-    overlap = (
-        body[3] + abs(forward) * body[4] + shapes[row + U(5)] + (body[0] * ahead + body[1] * aside) * inverse - off
-    )
+    towards = (body[HALF_LENGTH] * ahead + body[HALF_WIDTH] * aside) * inverse
+    overlap = body[KEEP] + abs(forward) * body[STEP_LENGTH] + shapes[row + U(5)] + towards - off
     touches = constant(TOUCH_COST, x) if overlap > zero else zero
     return touches + constant(TOUCH_COST_PER_M, x) * max(overlap, zero)

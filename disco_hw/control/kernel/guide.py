@@ -11,7 +11,22 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from disco_hw.control.kernel import Floats, Terms, line_at, place_of
+from disco_hw.control.kernel import (
+    CARRIED_X,
+    CARRIED_Y,
+    SLIDES_LEFT,
+    START_COS,
+    START_LEFT,
+    START_MEMORY,
+    START_RIGHT,
+    START_SIN,
+    START_X,
+    START_Y,
+    Floats,
+    Terms,
+    line_at,
+    place_of,
+)
 from disco_hw.control.kernel.sequences import Limits, clip
 from disco_hw.jit import kernel_function, scalar_function
 from disco_hw.model.coefficients import MOVES_RAD_S
@@ -46,9 +61,10 @@ def guide(
 
     They start from the state `start` (11,) of `SkidSteer` and the commands before, and stay within the limits.
     """
-    x, y, cos_yaw, sin_yaw = float(start[0]), float(start[1]), float(start[2]), float(start[3])
-    wheel_left, wheel_right = float(start[4]), float(start[5])
-    place = float(start[7])
+    x, y = float(start[START_X]), float(start[START_Y])
+    cos_yaw, sin_yaw = float(start[START_COS]), float(start[START_SIN])
+    wheel_left, wheel_right = float(start[START_LEFT]), float(start[START_RIGHT])
+    place = float(start[START_MEMORY])
     half_axle, x_icr_m, lead_s = 0.5 * chassis.axial_distance_m, chassis.x_icr_m, chassis.response_s
     keep = math.exp(-step_s / lead_s) if lead_s > 0.0 else 0.0
     settled = (1.0 - keep) * lead_s / step_s
@@ -81,10 +97,10 @@ def guide(
         turned = chassis.wheel_radius_m * step_s * (mean_right - mean_left) / chassis.axial_distance_m
         cos_half, sin_half = math.cos(0.5 * turned), math.sin(0.5 * turned)
         cos_yaw, sin_yaw = cos_yaw * cos_half - sin_yaw * sin_half, sin_yaw * cos_half + cos_yaw * sin_half
-        aside = turned * x_icr_m - moved * start[10]
+        aside = turned * x_icr_m - moved * start[SLIDES_LEFT]
         carried = min((abs(mean_left) + abs(mean_right)) / MOVES_RAD_S, 1.0)
-        x += moved * cos_yaw + aside * sin_yaw + carried * start[8]
-        y += moved * sin_yaw - aside * cos_yaw + carried * start[9]
+        x += moved * cos_yaw + aside * sin_yaw + carried * start[CARRIED_X]
+        y += moved * sin_yaw - aside * cos_yaw + carried * start[CARRIED_Y]
         cos_yaw, sin_yaw = cos_yaw * cos_half - sin_yaw * sin_half, sin_yaw * cos_half + cos_yaw * sin_half
 
 

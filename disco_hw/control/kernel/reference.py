@@ -9,7 +9,17 @@ from __future__ import annotations
 
 import math
 
-from disco_hw.control.kernel import Floats, Terms, line_at, place_of
+from disco_hw.control.kernel import (
+    START_COS,
+    START_MEMORY,
+    START_SIN,
+    START_X,
+    START_Y,
+    Floats,
+    Terms,
+    line_at,
+    place_of,
+)
 from disco_hw.control.kernel.guide import SteeredChassis
 from disco_hw.jit import kernel_function
 
@@ -30,8 +40,8 @@ def timed_reference(
     the robot and the heading in which it would stay on the line, the part of the task's speed that the wheels can do,
     at most 1, and that heading at the end (cosine, sine).
     """
-    x, y, cos_yaw, sin_yaw = start[0], start[1], start[2], start[3]
-    place = place_of(terms, start[7], x, y)
+    x, y, cos_yaw, sin_yaw = start[START_X], start[START_Y], start[START_COS], start[START_SIN]
+    place = place_of(terms, start[START_MEMORY], x, y)
     at_x, at_y, head_x, head_y, _, _ = line_at(terms, place, 0.0)
     found[0] = math.hypot(x - at_x, y - at_y)
     found[1] = cos_yaw * head_x + sin_yaw * head_y

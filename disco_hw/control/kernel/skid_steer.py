@@ -7,7 +7,6 @@ them is costed. What is absent is None, in arguments of their own, as the compil
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -20,39 +19,48 @@ from disco_hw.control.kernel import (
     AXLE_Y,
     BLOCK,
     BODY_REMEMBERED,
+    CARRIED_X,
+    CARRIED_Y,
     CHANNELS,
-    COLUMNS,
     COS,
     DIFFERENCE,
     FORWARD,
-    FOUND,
-    KEPT,
     LEFT,
-    MEMORY,
     OWN,
     REMEMBERED,
     RIGHT,
-    ROW,
     SCALED0,
     SCALED1,
     SIN,
+    SLIDES_LEFT,
+    START_COS,
+    START_LEFT,
+    START_RIGHT,
+    START_SIN,
+    START_TIME,
+    START_X,
+    START_Y,
     SUM,
-    TOTAL,
     WHEEL_STRIDE,
     Floats,
     Terms,
     U,
-    X,
-    Y,
-    follow,
     looks_up,
     rolls_out,
-    row_of,
-    stage_cost,
-    terminal_cost,
 )
-from disco_hw.control.kernel.avoid import LOOK_EVERY, Area, Bends, bends_of, detoured, has_detours, touch_cost
-from disco_hw.jit import bits_of_float, block_function, cast_like, float_from_bits, scalar_function, tune_loops
+from disco_hw.control.kernel.avoid import LOOK_EVERY, Area, bends_of, has_detours
+from disco_hw.control.kernel.rollout_costs import (
+    Absent,
+    BasePair,
+    Place,
+    add_costs,
+    avoid_shapes,
+    begin_costs,
+    end_costs,
+    follow_points,
+    look_ups,
+)
+from disco_hw.jit import block_function, cast_like, scalar_function, tune_loops
 from disco_hw.model.added_terms import count_means
 from disco_hw.model.coefficients import (
     MOVES_RAD_S,
@@ -71,23 +79,15 @@ from disco_hw.model.step import (
     in_force,
     integration_from,
     needs_change,
-    tracked_of,
     wheel_step,
     wheels_follow,
 )
-from disco_hw.tasks import Found, constant
+from disco_hw.tasks import constant
 
-Absent: TypeAlias = bool | None
-"""None, or anything else: whether a part is there, known to the compiler."""
 Pairs: TypeAlias = NDArray[np.int64] | None
 """For each of L points the two that are equivalent to it in one way, (L, 2), or None."""
-BasePair: TypeAlias = tuple[Base, Base] | None
 CostPlaces: TypeAlias = tuple[np.uintp, np.uintp] | None
-"""Where the costs of a pair of points begin."""
-SLIDES_FROM_M, MOST_ASIDE = 0.005, 0.4
-"""The least way of a step, and the largest tangent, by which the angle is taken at which a robot slides aside."""
-Place: TypeAlias = tuple[float, float, float]
-"""Tracked point x, y (m) and forward speed (m/s)."""
+"""Return the indices at which the costs of a pair of points begin."""
 
 
 class SkidSteer(NamedTuple):
@@ -143,11 +143,11 @@ def _turn_wheels(
     """Mean wheel speeds of the block's samples over every step, as rows of `wheels`."""
     tune_loops()
     for b in range(BLOCK):
-        state[LEFT + b] = start[4]
-        state[RIGHT + b] = start[5]
+        state[LEFT + b] = start[START_LEFT]
+        state[RIGHT + b] = start[START_RIGHT]
     _begin_means(means, state, REMEMBERED, point, U(0), effects.command_terms)
     for t in range(horizon):
-        time_s = start[6] + cast_like(t, step_s) * step_s
+        time_s = start[START_TIME] + cast_like(t, step_s) * step_s
         recent = U((t + late) * CHANNELS) * BLOCK
         older = U(max(t + late - 1, 0) * CHANNELS) * BLOCK
         row, change_row = U(t) * WHEEL_STRIDE, U(2 * horizon + t) * BLOCK
@@ -199,7 +199,8 @@ def _slid(
     # The larger of both is the sum of the wheels' sizes.
     turned = max(abs(wheel_sum), abs(difference)) * constant(1.0 / MOVES_RAD_S, x)
     carried = min(turned, constant(1.0, x))
-    return x + (carried * start[8] - start[10] * step_y), y + (carried * start[9] + start[10] * step_x)
+    left = start[SLIDES_LEFT]
+    return x + (carried * start[CARRIED_X] - left * step_y), y + (carried * start[CARRIED_Y] + left * step_x)
 
 
 @scalar_function
@@ -223,234 +224,6 @@ def _move(
     state[FORWARD + b] = forward
 
 
-@scalar_function
-def _begin(state: Floats, own: int, b: int, start: Floats, task: Terms, bends: Bends) -> None:
-    """Set the rows from `own` on to the start."""
-    x, y, _ = detoured(bends, (start[0], start[1], start[0]))
-    state[own + X + b] = x
-    state[own + Y + b] = y
-    state[own + MEMORY + b] = start[7]
-    state[own + TOTAL + b] = cast_like(0.0, start[0])
-    _remember(looks_up(task), state, own, b, start[7], task)
-
-
-@scalar_function
-def _found(looks: Absent, state: Floats, own: int, b: int) -> Found:
-    """Return what sample b has kept and found in the task's table, in the rows from `own` on; zeros without one."""
-    if looks is None:
-        zero = cast_like(0.0, state[own])
-        return zero, zero, zero, zero, zero
-    at = own + FOUND + COLUMNS * b
-    return state[own + KEPT + b], state[at], state[at + U(1)], state[at + U(2)], state[at + U(3)]
-
-
-@scalar_function
-def _remember(looks: Absent, state: Floats, own: int, b: int, memory: float, task: Terms) -> None:
-    """Set the memory of sample b, and where to look up for it, in bits; nothing without a table."""
-    if looks is None:
-        return
-    state[own + MEMORY + b] = memory
-    state[own + ROW + b] = float_from_bits(row_of(task, memory))
-
-
-@scalar_function
-def _follow(looks: Absent, state: Floats, own: int, b: int, place: Place, task: Terms) -> None:
-    """Move the memory of sample b on by the step that it has just made; nothing without a table."""
-    if looks is None:
-        return
-    x, y, forward = place
-    found = _found(looks, state, own, b)
-    memory, state[own + KEPT + b] = follow(task, state[own + MEMORY + b], x, y, forward, found)
-    _remember(looks, state, own, b, memory, task)
-
-
-@scalar_function
-def _look_up(table: Floats, state: Floats, own: int) -> None:
-    """Copy every sample's row of the table to the rows from `own` on: apart, as no compiler makes vectors of it.
-
-    A sample's four numbers stay together, and are all read before the first is written: one load and one store.
-    """
-    for b in range(BLOCK):
-        row, at = COLUMNS * U(bits_of_float(state[own + ROW + b])), own + FOUND + COLUMNS * b
-        first, second, third, fourth = table[row], table[row + U(1)], table[row + U(2)], table[row + U(3)]
-        state[at] = first
-        state[at + U(1)] = second
-        state[at + U(2)] = third
-        state[at + U(3)] = fourth
-
-
-@scalar_function
-def _look_ups(looks: Absent, state: Floats, skip_mean: Absent, ahead: BasePair, scaled: BasePair, task: Terms) -> None:
-    """Look up for a point and its equivalent points; nothing without a table."""
-    if looks is None:
-        return
-    table = task.table
-    if skip_mean is None:
-        _look_up(table, state, OWN)
-    if ahead is not None:
-        _look_up(table, state, AHEAD0)
-        _look_up(table, state, AHEAD1)
-    if scaled is not None:
-        _look_up(table, state, SCALED0)
-        _look_up(table, state, SCALED1)
-
-
-@scalar_function
-def _cost(state: Floats, own: int, b: int, t: int, place: Place, task: Terms, last: Absent) -> None:
-    """Add the cost of step t, which sample b has just made, to the rows from `own` on; `last` is None before it."""
-    cos_yaw, sin_yaw = state[COS + b], state[SIN + b]
-    x, y, forward = place
-    cost, memory = stage_cost(
-        task, state[own + MEMORY + b], t, state[own + X + b], state[own + Y + b], x, y, cos_yaw, sin_yaw, forward,
-        _found(looks_up(task), state, own, b),
-    )  # fmt: skip
-    state[own + TOTAL + b] += cost
-    if looks_up(task) is None:
-        state[own + MEMORY + b] = memory
-    if looks_up(task) is None or last is not None:
-        state[own + X + b] = x
-        state[own + Y + b] = y
-
-
-@scalar_function
-def _place(state: Floats, b: int, base: Base) -> Place:
-    """Tracked point of sample b and forward speed over its last step, under the point `base`."""
-    x, y = tracked_of(state[AXLE_X + b], state[AXLE_Y + b], state[COS + b], state[SIN + b], base)
-    return x, y, state[FORWARD + b]
-
-
-@scalar_function
-def _ahead_place(state: Floats, b: int, base: Base, other: Base, start: Floats) -> Place:
-    """Return the place for a point equivalent to `base` that differs in x_icr: it turns about the same axle."""
-    x, y, forward = _place(state, b, base)
-    farther = other.x_icr_m - base.x_icr_m
-    return x - farther * (state[COS + b] - start[2]), y - farther * (state[SIN + b] - start[3]), forward
-
-
-@scalar_function
-def _scaled_place(state: Floats, b: int, base: Base, other: Base, start: Floats) -> Place:
-    """Return the place for a point equivalent to `base` whose path is the same at another scale."""
-    scale = other.half_radius_m / base.half_radius_m
-    ahead, stays = other.x_icr_m - scale * base.x_icr_m, cast_like(1.0, scale) - scale
-    axle_x = scale * state[AXLE_X + b] + (stays * start[0] + ahead * start[2])
-    axle_y = scale * state[AXLE_Y + b] + (stays * start[1] + ahead * start[3])
-    x, y = tracked_of(axle_x, axle_y, state[COS + b], state[SIN + b], other)
-    return x, y, scale * state[FORWARD + b]
-
-
-@scalar_function
-def _follows(
-    looks: Absent,
-    state: Floats,
-    b: int,
-    base: Base,
-    skip_mean: Absent,
-    ahead: BasePair,
-    scaled: BasePair,
-    start: Floats,
-    task: Terms,
-    bends: Bends,
-) -> None:
-    """Move the memories of a point and its equivalent points on; nothing without a table."""
-    if looks is None:
-        return
-    if skip_mean is None:
-        _follow(looks, state, OWN, b, detoured(bends, _place(state, b, base)), task)
-    if ahead is not None:
-        _follow(looks, state, AHEAD0, b, detoured(bends, _ahead_place(state, b, base, ahead[0], start)), task)
-        _follow(looks, state, AHEAD1, b, detoured(bends, _ahead_place(state, b, base, ahead[1], start)), task)
-    if scaled is not None:
-        _follow(looks, state, SCALED0, b, detoured(bends, _scaled_place(state, b, base, scaled[0], start)), task)
-        _follow(looks, state, SCALED1, b, detoured(bends, _scaled_place(state, b, base, scaled[1], start)), task)
-
-
-@scalar_function
-def _costs(
-    state: Floats,
-    b: int,
-    t: int,
-    base: Base,
-    skip_mean: Absent,
-    ahead: BasePair,
-    scaled: BasePair,
-    start: Floats,
-    task: Terms,
-    last: Absent,
-    bends: Bends,
-) -> None:
-    """Costs of step t under a point and its equivalent points, pairs or None."""
-    if skip_mean is None:
-        _cost(state, OWN, b, t, detoured(bends, _place(state, b, base)), task, last)
-    if ahead is not None:
-        _cost(state, AHEAD0, b, t, detoured(bends, _ahead_place(state, b, base, ahead[0], start)), task, last)
-        _cost(state, AHEAD1, b, t, detoured(bends, _ahead_place(state, b, base, ahead[1], start)), task, last)
-    if scaled is not None:
-        _cost(state, SCALED0, b, t, detoured(bends, _scaled_place(state, b, base, scaled[0], start)), task, last)
-        _cost(state, SCALED1, b, t, detoured(bends, _scaled_place(state, b, base, scaled[1], start)), task, last)
-
-
-@scalar_function
-def _avoid(
-    area: Area | None, state: Floats, at: int, t: int, base: Base, skip_mean: Absent, ahead: BasePair,
-    scaled: BasePair, start: Floats,
-) -> None:  # fmt: skip
-    """Add what step t, which the block has just made, costs for touching a shape; nothing without an area."""
-    if area is None:
-        return
-    time_s = cast_like(t + 1, start[0]) * area.body[4]
-    reach_m = area.body[6] + area.body[5] * time_s
-    for k in range(area.number[0]):
-        if area.away[k] > reach_m:
-            continue
-        if skip_mean is None:
-            for b in range(BLOCK):
-                place = _place(state, b, lane_base(base, at + b))
-                state[OWN + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
-        if ahead is not None:
-            for b in range(BLOCK):
-                place = _ahead_place(state, b, base, ahead[0], start)
-                state[AHEAD0 + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
-            for b in range(BLOCK):
-                place = _ahead_place(state, b, base, ahead[1], start)
-                state[AHEAD1 + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
-        if scaled is not None:
-            for b in range(BLOCK):
-                place = _scaled_place(state, b, base, scaled[0], start)
-                state[SCALED0 + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
-            for b in range(BLOCK):
-                place = _scaled_place(state, b, base, scaled[1], start)
-                state[SCALED1 + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
-
-
-@scalar_function
-def sliding_heading(
-    slides: Absent, cos_yaw: float, sin_yaw: float, forward_m: float, start: Floats
-) -> tuple[float, float]:
-    """Heading of an undisturbed robot that would go where this one slides to, which goes so far forward in a step."""
-    if slides is None:
-        return cos_yaw, sin_yaw
-    one = constant(1.0, forward_m)
-    way = max(forward_m, constant(SLIDES_FROM_M, forward_m))
-    aside = start[10] + (cos_yaw * start[9] - sin_yaw * start[8]) / way
-    aside = min(max(aside, -constant(MOST_ASIDE, forward_m)), constant(MOST_ASIDE, forward_m))
-    scale = one / math.sqrt(one + aside * aside)
-    return (cos_yaw - aside * sin_yaw) * scale, (sin_yaw + aside * cos_yaw) * scale
-
-
-@block_function
-def _end(
-    costs: Floats, at: int, state: Floats, own: int, slides: Absent, start: Floats, step_s: float, task: Terms
-) -> None:
-    """Write the costs of the rows from `own` on to `costs[at:at + BLOCK]`."""
-    tune_loops()
-    for b in range(BLOCK):
-        cos_yaw, sin_yaw = sliding_heading(slides, state[COS + b], state[SIN + b], state[FORWARD + b] * step_s, start)
-        costs[at + b] = state[own + TOTAL + b] + terminal_cost(
-            task, state[own + MEMORY + b], state[own + X + b], state[own + Y + b], cos_yaw, sin_yaw,
-            _found(looks_up(task), state, own, b),
-        )  # fmt: skip
-
-
 @block_function
 def _roll(
     costs: Floats, at: int, ahead_at: CostPlaces, scaled_at: CostPlaces, horizon: int, commands: Floats, late: int,
@@ -467,21 +240,21 @@ def _roll(
     """
     tune_loops()
     bends = bends_of(area, straight)
-    x, y, cos_yaw, sin_yaw = start[0], start[1], start[2], start[3]
+    x, y, cos_yaw, sin_yaw = start[START_X], start[START_Y], start[START_COS], start[START_SIN]
     for b in range(BLOCK):
         state[AXLE_X + b], state[AXLE_Y + b] = axle_of(x, y, cos_yaw, sin_yaw, lane_base(base, at + b))
         state[COS + b] = cos_yaw
         state[SIN + b] = sin_yaw
         if skip_mean is None:
-            _begin(state, OWN, b, start, task, bends)
-        _begin(state, AHEAD0, b, start, task, bends)
-        _begin(state, AHEAD1, b, start, task, bends)
-        _begin(state, SCALED0, b, start, task, bends)
-        _begin(state, SCALED1, b, start, task, bends)
+            begin_costs(state, OWN, b, start, task, bends)
+        begin_costs(state, AHEAD0, b, start, task, bends)
+        begin_costs(state, AHEAD1, b, start, task, bends)
+        begin_costs(state, SCALED0, b, start, task, bends)
+        begin_costs(state, SCALED1, b, start, task, bends)
     _begin_means(means, state, BODY_REMEMBERED, point, U(count_means(effects.command_terms)), effects.body_terms)
-    _look_ups(looks_up(task), state, skip_mean, ahead, scaled, task)
+    look_ups(looks_up(task), state, skip_mean, ahead, scaled, task)
     for t in range(horizon):
-        time_s = start[6] + cast_like(t, x) * integration.step_s
+        time_s = start[START_TIME] + cast_like(t, x) * integration.step_s
         if t == 0:
             for b in range(BLOCK):
                 here, acting = lane_base(base, at + b), lane_effects(effects, at + b)
@@ -489,30 +262,30 @@ def _roll(
                     state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting,
                     integration, slides, start,
                 )  # fmt: skip
-                _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task, bends)
+                follow_points(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task, bends)
         else:
             for b in range(BLOCK):
                 here, acting = lane_base(base, at + b), lane_effects(effects, at + b)
-                _costs(state, b, t - 1, here, skip_mean, ahead, scaled, start, task, None, bends)
+                add_costs(state, b, t - 1, here, skip_mean, ahead, scaled, start, task, None, bends)
                 _move(
                     state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting,
                     integration, slides, start,
                 )  # fmt: skip
-                _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task, bends)
-        _look_ups(looks_up(task), state, skip_mean, ahead, scaled, task)
+                follow_points(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task, bends)
+        look_ups(looks_up(task), state, skip_mean, ahead, scaled, task)
         if t % LOOK_EVERY == LOOK_EVERY - 1:
-            _avoid(area, state, at, t, base, skip_mean, ahead, scaled, start)
+            avoid_shapes(area, state, at, t, base, skip_mean, ahead, scaled, start)
     for b in range(BLOCK):
-        _costs(state, b, horizon - 1, lane_base(base, at + b), skip_mean, ahead, scaled, start, task, True, bends)
+        add_costs(state, b, horizon - 1, lane_base(base, at + b), skip_mean, ahead, scaled, start, task, True, bends)
     # One after the other: a loop that wrote to all at once would not be vectorised.
     if skip_mean is None:
-        _end(costs, at, state, OWN, slides, start, integration.step_s, task)
+        end_costs(costs, at, state, OWN, slides, start, integration.step_s, task)
     if ahead_at is not None:
-        _end(costs, ahead_at[0], state, AHEAD0, slides, start, integration.step_s, task)
-        _end(costs, ahead_at[1], state, AHEAD1, slides, start, integration.step_s, task)
+        end_costs(costs, ahead_at[0], state, AHEAD0, slides, start, integration.step_s, task)
+        end_costs(costs, ahead_at[1], state, AHEAD1, slides, start, integration.step_s, task)
     if scaled_at is not None:
-        _end(costs, scaled_at[0], state, SCALED0, slides, start, integration.step_s, task)
-        _end(costs, scaled_at[1], state, SCALED1, slides, start, integration.step_s, task)
+        end_costs(costs, scaled_at[0], state, SCALED0, slides, start, integration.step_s, task)
+        end_costs(costs, scaled_at[1], state, SCALED1, slides, start, integration.step_s, task)
 
 
 @scalar_function
@@ -523,7 +296,7 @@ def _bases(base: Base, pair: NDArray[np.int64]) -> tuple[Base, Base]:
 
 @scalar_function
 def _places(pair: NDArray[np.int64], padded: int, lane: np.uintp) -> CostPlaces:
-    """Return the indices at which the costs of a pair of points begin."""
+    """Where the costs of a pair of points begin."""
     return U(pair[0] * padded) + lane, U(pair[1] * padded) + lane
 
 

@@ -154,11 +154,11 @@ def sampled_commands(disco, before, sampler, state):
     by_knot = noise.T.reshape(sampler.samples, sampler.knots, 2)
     spread = np.einsum("tj,ktjc->ktc", weights, by_knot[:, first[:, None] + np.arange(4)])
     last = state.sent[-1]
-    anchor = np.array(disco._anchor(state))
+    anchor = np.array(disco._prediction.anchor(state))
     assert np.all(np.abs(anchor - (last.left_rad_s, last.right_rad_s)) <= 12.0)
     change = LIMITS.acceleration_rad_s2 * STEP_S
     commands = oracle.limited(before, spread, anchor, LIMITS.speed_rad_s, change)
-    if disco._guide is not None:
+    if disco._guidance.is_made:
         # What the guide is has its own tests.
         commands[1] = work.guide
     return commands
@@ -172,7 +172,7 @@ def check_against_reference(model, state, task, plan_settings, seed):
     disco.plan(now_ns, state)
     work = disco.optimiser.work
 
-    sampler, guided = plan_settings.sampler, disco._guide is not None
+    sampler, guided = plan_settings.sampler, disco._guidance.is_made
     commands = sampled_commands(disco, before, sampler, state)
 
     theta, point_weights = unscented_points(model, plan_settings.ut_alpha)
@@ -181,7 +181,7 @@ def check_against_reference(model, state, task, plan_settings, seed):
     start = physics.RobotState(state.x_m, state.y_m, state.yaw_rad, state.left_speed_rad_s, state.right_speed_rad_s)
 
     def costs_of(sequences, x_m=0.0, y_m=0.0, farther=1.0):
-        cost = sequence_cost(task, disco._memory, disco._x_icr_m, farther)
+        cost = sequence_cost(task, disco._memory, disco.chassis.x_icr_m, farther)
         names = model.parameter_names
         begin = replace(start, x=start.x + x_m, y=start.y + y_m)
         return np.array(
@@ -232,7 +232,7 @@ def check_against_reference(model, state, task, plan_settings, seed):
     assert report["ess"] == pytest.approx(oracle.effective_sample_size(kernel_weights), rel=1e-3)
     # That the guide has the robot where the plan stands has its own test.
     cheaper = work.costs[1] < plan_settings.guide_below * work.costs[0]
-    taken = guided and (cheaper or disco._guided_until_ns is not None)
+    taken = guided and (cheaper or disco._guidance.until_ns is not None)
     updated = commands[1] if taken else oracle.updated(commands, kernel_weights)
     np.testing.assert_allclose(work.nominal, updated, atol=2e-4)
 
@@ -293,7 +293,7 @@ def test_costs_of_a_robot_that_slides_aside_and_drifts(base, values, commands, s
     theta, weights = unscented_points(model, PLAN_SETTINGS.ut_alpha)
     start = physics.RobotState(*values)
     past = command_history(state.sent, state.t_ns, STEP_S, 8, values[3:])
-    cost = circle_cost(CIRCLE, STEP_S, disco._x_icr_m)
+    cost = circle_cost(CIRCLE, STEP_S, disco.chassis.x_icr_m)
     got = disco.optimiser.work.point_costs.reshape(weights.size, -1)[:, :SAMPLES].astype(float)
     for point, costs in zip(theta[weights != 0.0], got[weights != 0.0], strict=True):
         named = physics.theta_of(model.parameter_names, point)

@@ -1,0 +1,290 @@
+"""Costs of a rollout, in the rows of a block's state: of a point and of the points that are equivalent to it.
+
+An equivalent point has the same axle's path, or the same at another scale: it has a tracked point, memory and cost of
+its own, in ten rows of its own (the package's docstring draws them). Pairs of points that are absent are None.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TypeAlias
+
+from disco_hw.control.kernel import (
+    AHEAD0,
+    AHEAD1,
+    AXLE_X,
+    AXLE_Y,
+    BLOCK,
+    CARRIED_X,
+    CARRIED_Y,
+    COLUMNS,
+    COS,
+    FORWARD,
+    FOUND,
+    KEPT,
+    MEMORY,
+    OWN,
+    ROW,
+    SCALED0,
+    SCALED1,
+    SIN,
+    SLIDES_LEFT,
+    START_COS,
+    START_MEMORY,
+    START_SIN,
+    START_X,
+    START_Y,
+    TOTAL,
+    Floats,
+    Terms,
+    U,
+    X,
+    Y,
+    follow,
+    looks_up,
+    row_of,
+    stage_cost,
+    terminal_cost,
+)
+from disco_hw.control.kernel.avoid import FASTEST, REACH, STEP_LENGTH, Area, Bends, detoured, touch_cost
+from disco_hw.jit import bits_of_float, block_function, cast_like, float_from_bits, scalar_function, tune_loops
+from disco_hw.model.coefficients import Base, lane_base
+from disco_hw.model.step import tracked_of
+from disco_hw.tasks import Found, constant
+
+Absent: TypeAlias = bool | None
+"""None, or anything else: whether a part is there, known to the compiler."""
+BasePair: TypeAlias = tuple[Base, Base] | None
+"""Return base coefficients of a pair of points."""
+Place: TypeAlias = tuple[float, float, float]
+"""Tracked point x, y (m) and forward speed (m/s)."""
+SLIDES_FROM_M, MOST_ASIDE = 0.005, 0.4
+"""The least way of a step, and the largest tangent, by which the angle is taken at which a robot slides aside."""
+
+
+@scalar_function
+def _place(state: Floats, b: int, base: Base) -> Place:
+    """Tracked point of sample b and forward speed over its last step, under the point `base`."""
+    x, y = tracked_of(state[AXLE_X + b], state[AXLE_Y + b], state[COS + b], state[SIN + b], base)
+    return x, y, state[FORWARD + b]
+
+
+@scalar_function
+def _ahead_place(state: Floats, b: int, base: Base, other: Base, start: Floats) -> Place:
+    """Return the place for a point equivalent to `base` that differs in x_icr: it turns about the same axle."""
+    x, y, forward = _place(state, b, base)
+    farther = other.x_icr_m - base.x_icr_m
+    return x - farther * (state[COS + b] - start[START_COS]), y - farther * (state[SIN + b] - start[START_SIN]), forward
+
+
+@scalar_function
+def _scaled_place(state: Floats, b: int, base: Base, other: Base, start: Floats) -> Place:
+    """Return the place for a point equivalent to `base` whose path is the same at another scale."""
+    scale = other.half_radius_m / base.half_radius_m
+    ahead, stays = other.x_icr_m - scale * base.x_icr_m, cast_like(1.0, scale) - scale
+    axle_x = scale * state[AXLE_X + b] + (stays * start[START_X] + ahead * start[START_COS])
+    axle_y = scale * state[AXLE_Y + b] + (stays * start[START_Y] + ahead * start[START_SIN])
+    x, y = tracked_of(axle_x, axle_y, state[COS + b], state[SIN + b], other)
+    return x, y, scale * state[FORWARD + b]
+
+
+@scalar_function
+def begin_costs(state: Floats, own: int, b: int, start: Floats, task: Terms, bends: Bends) -> None:
+    """Set the rows from `own` on to the start."""
+    x, y, _ = detoured(bends, (start[START_X], start[START_Y], start[START_X]))
+    state[own + X + b] = x
+    state[own + Y + b] = y
+    state[own + MEMORY + b] = start[START_MEMORY]
+    state[own + TOTAL + b] = cast_like(0.0, start[START_X])
+    _remember(looks_up(task), state, own, b, start[START_MEMORY], task)
+
+
+@scalar_function
+def _found(looks: Absent, state: Floats, own: int, b: int) -> Found:
+    """Return what sample b has kept and found in the task's table, in the rows from `own` on; zeros without one."""
+    if looks is None:
+        zero = cast_like(0.0, state[own])
+        return zero, zero, zero, zero, zero
+    at = own + FOUND + COLUMNS * b
+    return state[own + KEPT + b], state[at], state[at + U(1)], state[at + U(2)], state[at + U(3)]
+
+
+@scalar_function
+def _remember(looks: Absent, state: Floats, own: int, b: int, memory: float, task: Terms) -> None:
+    """Set the memory of sample b, and where to look up for it, in bits; nothing without a table."""
+    if looks is None:
+        return
+    state[own + MEMORY + b] = memory
+    state[own + ROW + b] = float_from_bits(row_of(task, memory))
+
+
+@scalar_function
+def _follow(looks: Absent, state: Floats, own: int, b: int, place: Place, task: Terms) -> None:
+    """Move the memory of sample b on by the step that it has just made; nothing without a table."""
+    if looks is None:
+        return
+    x, y, forward = place
+    found = _found(looks, state, own, b)
+    memory, state[own + KEPT + b] = follow(task, state[own + MEMORY + b], x, y, forward, found)
+    _remember(looks, state, own, b, memory, task)
+
+
+@scalar_function
+def follow_points(
+    looks: Absent,
+    state: Floats,
+    b: int,
+    base: Base,
+    skip_mean: Absent,
+    ahead: BasePair,
+    scaled: BasePair,
+    start: Floats,
+    task: Terms,
+    bends: Bends,
+) -> None:
+    """Move the memories of a point and its equivalent points on; nothing without a table."""
+    if looks is None:
+        return
+    if skip_mean is None:
+        _follow(looks, state, OWN, b, detoured(bends, _place(state, b, base)), task)
+    if ahead is not None:
+        _follow(looks, state, AHEAD0, b, detoured(bends, _ahead_place(state, b, base, ahead[0], start)), task)
+        _follow(looks, state, AHEAD1, b, detoured(bends, _ahead_place(state, b, base, ahead[1], start)), task)
+    if scaled is not None:
+        _follow(looks, state, SCALED0, b, detoured(bends, _scaled_place(state, b, base, scaled[0], start)), task)
+        _follow(looks, state, SCALED1, b, detoured(bends, _scaled_place(state, b, base, scaled[1], start)), task)
+
+
+@scalar_function
+def _look_up(table: Floats, state: Floats, own: int) -> None:
+    """Copy every sample's row of the table to the rows from `own` on: apart, as no compiler makes vectors of it.
+
+    A sample's four numbers stay together, and are all read before the first is written: one load and one store.
+    """
+    for b in range(BLOCK):
+        row, at = COLUMNS * U(bits_of_float(state[own + ROW + b])), own + FOUND + COLUMNS * b
+        first, second, third, fourth = table[row], table[row + U(1)], table[row + U(2)], table[row + U(3)]
+        state[at] = first
+        state[at + U(1)] = second
+        state[at + U(2)] = third
+        state[at + U(3)] = fourth
+
+
+@scalar_function
+def look_ups(looks: Absent, state: Floats, skip_mean: Absent, ahead: BasePair, scaled: BasePair, task: Terms) -> None:
+    """Look up for a point and its equivalent points; nothing without a table."""
+    if looks is None:
+        return
+    table = task.table
+    if skip_mean is None:
+        _look_up(table, state, OWN)
+    if ahead is not None:
+        _look_up(table, state, AHEAD0)
+        _look_up(table, state, AHEAD1)
+    if scaled is not None:
+        _look_up(table, state, SCALED0)
+        _look_up(table, state, SCALED1)
+
+
+@scalar_function
+def _cost(state: Floats, own: int, b: int, t: int, place: Place, task: Terms, last: Absent) -> None:
+    """Add the cost of step t, which sample b has just made, to the rows from `own` on; `last` is None before it."""
+    cos_yaw, sin_yaw = state[COS + b], state[SIN + b]
+    x, y, forward = place
+    cost, memory = stage_cost(
+        task, state[own + MEMORY + b], t, state[own + X + b], state[own + Y + b], x, y, cos_yaw, sin_yaw, forward,
+        _found(looks_up(task), state, own, b),
+    )  # fmt: skip
+    state[own + TOTAL + b] += cost
+    if looks_up(task) is None:
+        state[own + MEMORY + b] = memory
+    if looks_up(task) is None or last is not None:
+        state[own + X + b] = x
+        state[own + Y + b] = y
+
+
+@scalar_function
+def add_costs(
+    state: Floats,
+    b: int,
+    t: int,
+    base: Base,
+    skip_mean: Absent,
+    ahead: BasePair,
+    scaled: BasePair,
+    start: Floats,
+    task: Terms,
+    last: Absent,
+    bends: Bends,
+) -> None:
+    """Costs of step t under a point and its equivalent points, pairs or None."""
+    if skip_mean is None:
+        _cost(state, OWN, b, t, detoured(bends, _place(state, b, base)), task, last)
+    if ahead is not None:
+        _cost(state, AHEAD0, b, t, detoured(bends, _ahead_place(state, b, base, ahead[0], start)), task, last)
+        _cost(state, AHEAD1, b, t, detoured(bends, _ahead_place(state, b, base, ahead[1], start)), task, last)
+    if scaled is not None:
+        _cost(state, SCALED0, b, t, detoured(bends, _scaled_place(state, b, base, scaled[0], start)), task, last)
+        _cost(state, SCALED1, b, t, detoured(bends, _scaled_place(state, b, base, scaled[1], start)), task, last)
+
+
+@scalar_function
+def avoid_shapes(
+    area: Area | None, state: Floats, at: int, t: int, base: Base, skip_mean: Absent, ahead: BasePair,
+    scaled: BasePair, start: Floats,
+) -> None:  # fmt: skip
+    """Add what step t, which the block has just made, costs for touching a shape; nothing without an area."""
+    if area is None:
+        return
+    time_s = cast_like(t + 1, start[START_X]) * area.body[STEP_LENGTH]
+    reach_m = area.body[REACH] + area.body[FASTEST] * time_s
+    for k in range(area.number[0]):
+        if area.away[k] > reach_m:
+            continue
+        if skip_mean is None:
+            for b in range(BLOCK):
+                place = _place(state, b, lane_base(base, at + b))
+                state[OWN + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
+        if ahead is not None:
+            for b in range(BLOCK):
+                place = _ahead_place(state, b, base, ahead[0], start)
+                state[AHEAD0 + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
+            for b in range(BLOCK):
+                place = _ahead_place(state, b, base, ahead[1], start)
+                state[AHEAD1 + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
+        if scaled is not None:
+            for b in range(BLOCK):
+                place = _scaled_place(state, b, base, scaled[0], start)
+                state[SCALED0 + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
+            for b in range(BLOCK):
+                place = _scaled_place(state, b, base, scaled[1], start)
+                state[SCALED1 + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
+
+
+@scalar_function
+def sliding_heading(
+    slides: Absent, cos_yaw: float, sin_yaw: float, forward_m: float, start: Floats
+) -> tuple[float, float]:
+    """Heading of an undisturbed robot that would go where this one slides to, which goes so far forward in a step."""
+    if slides is None:
+        return cos_yaw, sin_yaw
+    one = constant(1.0, forward_m)
+    way = max(forward_m, constant(SLIDES_FROM_M, forward_m))
+    aside = start[SLIDES_LEFT] + (cos_yaw * start[CARRIED_Y] - sin_yaw * start[CARRIED_X]) / way
+    aside = min(max(aside, -constant(MOST_ASIDE, forward_m)), constant(MOST_ASIDE, forward_m))
+    scale = one / math.sqrt(one + aside * aside)
+    return (cos_yaw - aside * sin_yaw) * scale, (sin_yaw + aside * cos_yaw) * scale
+
+
+@block_function
+def end_costs(
+    costs: Floats, at: int, state: Floats, own: int, slides: Absent, start: Floats, step_s: float, task: Terms
+) -> None:
+    """Write the costs of the rows from `own` on to `costs[at:at + BLOCK]`."""
+    tune_loops()
+    for b in range(BLOCK):
+        cos_yaw, sin_yaw = sliding_heading(slides, state[COS + b], state[SIN + b], state[FORWARD + b] * step_s, start)
+        costs[at + b] = state[own + TOTAL + b] + terminal_cost(
+            task, state[own + MEMORY + b], state[own + X + b], state[own + Y + b], cos_yaw, sin_yaw,
+            _found(looks_up(task), state, own, b),
+        )  # fmt: skip

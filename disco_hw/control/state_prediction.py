@@ -1,0 +1,120 @@
+"""Where a plan begins: the state when its first command acts, and what was commanded and remembered before."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from disco_hw.control.disturbance_compensation import DisturbanceCompensation
+from disco_hw.control.plan import Array, CommandLimits, DiscoSettings, PlannerState, command_history
+from disco_hw.control.rollout_points import RolloutPoints
+from disco_hw.model.coefficients import NO_SLIDE
+from disco_hw.model.step import FreeRun
+
+SHORTEST_GAP_S = 1e-6
+"""A state less than this before a plan's start, a thousandth of a tick's jitter, is taken as the start itself."""
+
+
+class PlanStart(NamedTuple):
+    """Where a plan begins, of the undisturbed robot that turns as the real one does.
+
+    `state` (5,): x, y (m), yaw (rad), wheel speeds (rad/s) at `t0_ns`, `elapsed_s` after the drive began. `before`: the
+    commands that the plan's first change is limited from. `earlier` (history, 2): commands before the plan, in its
+    steps. `slide` (3,): `Disturbance.slides`. `mean_means` (n,), `point_means` (L, n): what the model's terms remember,
+    in the mean of what is believed and under each point; None where they remember nothing.
+    """
+
+    t0_ns: int
+    elapsed_s: float
+    state: Array
+    before: tuple[float, float]
+    earlier: Array
+    slide: Array
+    mean_means: Array | None
+    point_means: Array | None
+
+    @classmethod
+    def at_rest(cls, history: int) -> PlanStart:
+        """Return the start of a robot that stands at the origin, with so many commands before."""
+        return cls(0, 0.0, np.zeros(5), (0.0, 0.0), np.zeros((history, 2)), NO_SLIDE, None, None)
+
+    def mean_path(self, run: FreeRun, commands: Array) -> Array:
+        """Poses (T + 1, 3) that commands (T, 2) lead through in the mean of what is believed."""
+        return self._path(run, commands, self.mean_means, 0)
+
+    def point_path(self, run: FreeRun, commands: Array, point: int) -> Array:
+        """Poses (T + 1, 3) that commands (T, 2) lead through under one point."""
+        return self._path(run, commands, None if self.point_means is None else self.point_means[point], point)
+
+    def _path(self, run: FreeRun, commands: Array, means: Array | None, point: int) -> Array:
+        history = len(self.earlier)
+        whole = np.concatenate([self.earlier, commands]) if history else commands
+        # A run overwrites the means.
+        own = None if means is None else means.copy()
+        return run.states(self.state, whole, history, self.elapsed_s, point, self.slide, own)[:, :3]
+
+
+class StatePrediction:
+    """Predicts the state over the latency, under the mean parameters and the commands already sent."""
+
+    def __init__(
+        self, points: RolloutPoints, compensation: DisturbanceCompensation, settings: DiscoSettings,
+        limits: CommandLimits,
+    ) -> None:  # fmt: skip
+        self._points, self._compensation = points, compensation
+        self._settings, self._limits = settings, limits
+
+    def start(self, state: PlannerState, t0_ns: int, elapsed_s: float) -> PlanStart:
+        """Return where a plan that acts from `t0_ns` on begins, `elapsed_s` after the drive began."""
+        points, compensation = self._points, self._compensation
+        before = self.anchor(state)
+        turning = compensation.turning(state.left_speed_rad_s, state.right_speed_rad_s)
+        mean_means = point_means = None
+        if points.past is not None:
+            mean_means = points.past.of_mean(state, state.t_ns, compensation.acting, turning)
+        predicted = self._predicted(state, turning, t0_ns, elapsed_s, mean_means)
+        if points.past is not None and mean_means is not None:
+            point_means = points.past.of_points(state, t0_ns, compensation.acting, mean_means)
+        earlier = np.zeros((0, 2))
+        if points.history:
+            earlier = self.commands_before(state, t0_ns, self._settings.step_s, points.history)
+        return PlanStart(
+            t0_ns, elapsed_s, predicted, before, earlier, compensation.slide, mean_means, point_means
+        )  # fmt: skip
+
+    def anchor(self, state: PlannerState) -> tuple[float, float]:
+        """Commands that the plan's first change is limited from.
+
+        The last ones sent; but no further from the measured wheel speeds than the wheels could be behind them, so that
+        a plan does not run away from wheels that are held back.
+        """
+        left, right = self._compensation.turning(state.left_speed_rad_s, state.right_speed_rad_s)
+        if not state.sent:
+            return left, right
+        last = state.sent[-1]
+        last_left, last_right = last.left_rad_s, last.right_rad_s
+        if not self._compensation.is_none:
+            last_left, last_right = self._compensation.acting(np.array([[last_left, last_right]]))[0].tolist()
+        slack = self._limits.acceleration_rad_s2 * (self._settings.step_s + self._points.response_s)
+        return min(max(last_left, left - slack), left + slack), min(max(last_right, right - slack), right + slack)
+
+    def commands_before(self, state: PlannerState, end_ns: int, step_s: float, count: int) -> Array:
+        """Mean commands (count, 2) that act in each of the steps up to `end_ns`."""
+        wheels = state.left_speed_rad_s, state.right_speed_rad_s
+        return self._compensation.acting(command_history(state.sent, end_ns, step_s, count, wheels))
+
+    def _predicted(
+        self, state: PlannerState, turning: tuple[float, float], t0_ns: int, elapsed_s: float, means: Array | None
+    ) -> Array:
+        """State (5,) at `t0_ns`; sets `means` to what is remembered then."""
+        start = np.array([state.x_m, state.y_m, state.yaw_rad, *turning])
+        gap_s = (t0_ns - state.t_ns) * 1e-9
+        if gap_s < SHORTEST_GAP_S:
+            return start
+        count = math.ceil(gap_s / self._settings.step_s)
+        run = FreeRun(self._points.model, self._points.mean_theta, gap_s / count)
+        past = self.commands_before(state, t0_ns, gap_s / count, run.past_rows + count)
+        slide = self._compensation.slide
+        return np.asarray(run.states(start, past, run.past_rows, elapsed_s - gap_s, 0, slide, means)[-1])
