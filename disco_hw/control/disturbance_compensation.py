@@ -62,7 +62,7 @@ class DisturbanceCompensation:
         return np.column_stack(self._disturbance.turning(acting[:, 0], acting[:, 1], axle_m))
 
     def asked(self, commands: Array) -> Array:
-        """The inverse of `acting`."""
+        """Return the inverse of `acting`."""
         if self.is_none:
             return commands
         left, right = self._disturbance.asked(commands[:, 0], commands[:, 1], self._points.chassis.axial_distance_m)

@@ -135,7 +135,7 @@ def _largest(model: Model, theta: Array, name: str) -> float:
 
 
 def _pair(found: NDArray[np.int64], number: int) -> NDArray[np.int64]:
-    """The two columns (L, 2) of one pair of `equivalent_points`."""
+    """Return the two columns (L, 2) of one pair of `equivalent_points`."""
     return np.ascontiguousarray(found[:, 2 * number : 2 * number + 2])
 
 
