@@ -210,7 +210,7 @@ class Disco:
         return WheelPlan(t0_ns, settings.step_s, self._compensation.asked(nominal), trajectory, diagnostics)
 
     def _system(self, state: PlannerState, begin: PlanStart, task_s: float) -> SkidSteer:
-        """Return what the compiled step rolls out: f_theta from the plan's start under its points, and the task's cost."""
+        """Return what the compiled step rolls out: f_theta from the plan's start, and the task's cost."""
         points, settings = self._points, self._settings
         x, y, yaw, left, right = begin.state.tolist()
         task, (origin_x, origin_y), place, self._memory = self._task.prepare(
