@@ -79,7 +79,7 @@ class CirclingPlanner:
 
     def __init__(self, config: RobotConfig, model_geometry: tuple[float, float, float]) -> None:
         self._task = circle_task(config.task, "the campaign")
-        self._radius_m, self._axial_m, self._x_icr_m = model_geometry
+        self._radius_m, self._axial_m, _ = model_geometry
         self._nowhere = np.zeros((self.STEPS + 1, 3))
         self._found = Diagnostics(1.0, 1.0, 0.0, 0.0, 0.0, 1)
 
