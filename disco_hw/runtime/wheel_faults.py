@@ -324,8 +324,9 @@ class WheelFaults:
         suspect = [side for side in suspect if known[side] or not self._wheels[side].is_backward]
         found = [side for side in suspect if self._wheels[side].is_missing(now_ns)]
         if not found:
-            # Where the poses deny the counts, nothing may be waited for: the loop may be running away.
-            found = [side for side in suspect if self._turns(side, geometry, SEEN) == 1]
+            # Where the poses deny the counts, nothing may be waited for: the loop may be running away. A wheel that
+            # slows down from the middle does not look so, so that the poses count from the first sign on.
+            found = [side for side in suspect if self._turns(side, geometry, SEEN, 0) == 1]
         if not found:
             return None
         wheel = self._wheels[found[0]]
@@ -338,10 +339,12 @@ class WheelFaults:
             causes = {1: Cause.ENCODER_SILENT, -1: Cause.ENCODER_SILENT, 0: Cause.STANDS, None: Cause.SILENT}
         return WheelFault(causes[turns], _names(found))
 
-    def _turns(self, side: int, geometry: OdometryParameters, sure: float = DECIDED) -> int | None:
+    def _turns(
+        self, side: int, geometry: OdometryParameters, sure: float = DECIDED, settled_ns: int = _SETTLED_NS
+    ) -> int | None:
         """How a wheel that does not follow truly turns: 1 as commanded, 0 not at all, -1 backward; None if unclear."""
         wheel = self._wheels[side]
-        seen = self._travel.wheel_speeds(wheel.since_ns + _SETTLED_NS, geometry)
+        seen = self._travel.wheel_speeds(wheel.since_ns + settled_ns, geometry)
         newest_ns = self._travel.newest_ns
         if seen is None or newest_ns is None:
             return None
