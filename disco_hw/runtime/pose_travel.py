@@ -11,7 +11,7 @@ from disco_hw.estimation.odometry import OdometryParameters
 from drivers.types import PoseSample
 
 KEPT_NS = 1_000_000_000
-LEAST_POSES = 5
+LEAST_POSES = 4
 LARGEST_OFF, CURVED_PART = 5.0, 0.2
 """A pose lies so many standard deviations from the line at most, and the part of the way by which a robot that speeds
 up from rest leaves it; a jump is more.

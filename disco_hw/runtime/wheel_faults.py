@@ -32,7 +32,9 @@ MISSING_RAD = 0.08
 SHORTEST_NS = 300_000_000
 """A wheel may stand for less against a stone."""
 LONGEST_NS = 400_000_000
-"""So long after the first sign at most is waited for poses that tell the cause."""
+"""So long after the first sign at most is waited for poses that tell the cause; not with a base that stops by its own
+ramp.
+"""
 UNKNOWN_LOSS_RAD_S = 1.5
 """Dead band and stiction of a wheel that has not turned since it stood."""
 FASTER_PART, FASTER_RAD_S, BEYOND_RAD = 1.25, 0.5, 0.1
@@ -95,11 +97,13 @@ class _Asked(NamedTuple):
     """A command of one wheel (rad/s): the slowest it may mean, as it stands and smoothed, and the fastest.
 
     Smoothed, as a wheel's angle is the integral of its commands: what a planner adds and takes away again is no loss.
+    `widened`: by how much the slowest is less than the command itself, for a base that turns more than it is asked to.
     """
 
     slowest: float = 0.0
     smoothed: float = 0.0
     fastest: float = 0.0
+    widened: float = 0.0
 
 
 def _asked(speed: float, other: float, turn_part: float, before: _Asked, elapsed_s: float) -> _Asked:
@@ -108,7 +112,7 @@ def _asked(speed: float, other: float, turn_part: float, before: _Asked, elapsed
     turned = mean + turn_part * (speed - mean)
     slowest = min((speed, turned), key=abs) if turned * speed > 0.0 else 0.0
     smoothed = before.smoothed + (slowest - before.smoothed) * -math.expm1(-elapsed_s / _SMOOTH_S)
-    return _Asked(slowest, smoothed, max(abs(speed), abs(turned)))
+    return _Asked(slowest, smoothed, max(abs(speed), abs(turned)), abs(speed - slowest))
 
 
 @dataclass(slots=True)
@@ -146,8 +150,9 @@ class _Wheel:
         least = max(low, -high, 0.0)
         most = max(each.fastest for each in commands)
         progress = self.direction * turned_rad
-        self._learn(dt_s, turned_rad, 0.5 * (least + max(abs(low), abs(high))), abs(newest))
-        expected = max(least - self.loss_rad_s, 0.0) * dt_s
+        widened = min(each.widened for each in commands)
+        self._learn(dt_s, turned_rad, 0.5 * (least + max(abs(low), abs(high))), abs(newest), widened)
+        expected = max(least - max(self.loss_rad_s, -widened), 0.0) * dt_s
         self.beyond_rad = max(self.beyond_rad + abs(turned_rad) - (FASTER_PART * most + FASTER_RAD_S) * dt_s, 0.0)
         # Without a command that must be in force by now a wheel may turn either way.
         self.missing_rad = self.missing_rad + EXPECTED_PART * expected - progress if least > 0.0 else 0.0
@@ -162,15 +167,20 @@ class _Wheel:
             self.expected_rad += expected
             self.counted_rad += progress
 
-    def _learn(self, dt_s: float, turned_rad: float, commanded_rad_s: float, newest_rad_s: float) -> None:
-        """Learn what it loses of its commands while it turns by them; a wheel that came to rest may stick again."""
+    def _learn(
+        self, dt_s: float, turned_rad: float, commanded_rad_s: float, newest_rad_s: float, widened_rad_s: float
+    ) -> None:
+        """Learn what it loses of its commands while it turns by them; a wheel that came to rest may stick again.
+
+        The loss is negative, by `widened_rad_s` at most, where the base does not turn more than it is asked to.
+        """
         if dt_s > 0.0:
             self.speed_rad_s += (turned_rad / dt_s - self.speed_rad_s) * -math.expm1(-dt_s / _FILTER_S)
         speed = self.direction * self.speed_rad_s
         if newest_rad_s < RESTS_RAD_S and abs(speed) < RESTS_RAD_S:
             self.loss_rad_s = UNKNOWN_LOSS_RAD_S
         elif speed > EXPECTED_PART * max(commanded_rad_s - self.loss_rad_s, 0.1 * commanded_rad_s):
-            loses = max(commanded_rad_s - speed, 0.0)
+            loses = max(commanded_rad_s - speed, -widened_rad_s)
             time_s = _LOSES_LESS_S if loses < self.loss_rad_s else _LOSES_MORE_S
             self.loss_rad_s += (loses - self.loss_rad_s) * -math.expm1(-dt_s / time_s)
 
@@ -214,6 +224,7 @@ class WheelFaults:
 
     def __init__(self, takes_body_speeds: bool = False) -> None:
         self._turn_part = BODY_TURN_PART if takes_body_speeds else 1.0
+        self._longest_ns = SHORTEST_NS if takes_body_speeds else LONGEST_NS
         self._wheels = (_Wheel(), _Wheel())
         self._travel = PoseTravel()
         self._commands: deque[tuple[int, tuple[_Asked, _Asked]]] = deque()
@@ -316,13 +327,14 @@ class WheelFaults:
         suspect = [side for side in suspect if known[side] or not self._wheels[side].is_backward]
         found = [side for side in suspect if self._wheels[side].is_missing(now_ns)]
         if not found:
-            # Where the poses deny the counts, nothing may be waited for: the loop may be running away.
-            found = [side for side in suspect if self._turns(side, geometry, SEEN) == 1]
+            # Where the poses deny the counts, nothing may be waited for: the loop may be running away. A wheel that
+            # slows down from the middle does not look so, so that the poses count from the first sign on.
+            found = [side for side in suspect if self._turns(side, geometry, SEEN, 0) == 1]
         if not found:
             return None
         wheel = self._wheels[found[0]]
         turns = self._turns(found[0], geometry)
-        if turns is None and self._travel.newest_ns is not None and now_ns - wheel.since_ns < LONGEST_NS:
+        if turns is None and self._travel.newest_ns is not None and now_ns - wheel.since_ns < self._longest_ns:
             return None
         if wheel.is_backward:
             causes = {1: Cause.ENCODER_REVERSED, -1: Cause.TURNS_BACKWARD, 0: Cause.OPPOSED, None: Cause.OPPOSED}
@@ -330,10 +342,12 @@ class WheelFaults:
             causes = {1: Cause.ENCODER_SILENT, -1: Cause.ENCODER_SILENT, 0: Cause.STANDS, None: Cause.SILENT}
         return WheelFault(causes[turns], _names(found))
 
-    def _turns(self, side: int, geometry: OdometryParameters, sure: float = DECIDED) -> int | None:
-        """Return how a wheel that does not follow truly turns: 1 as commanded, 0 not, -1 backward; None if unclear."""
+    def _turns(
+        self, side: int, geometry: OdometryParameters, sure: float = DECIDED, settled_ns: int = _SETTLED_NS
+    ) -> int | None:
+        """Return how a wheel that does not follow turns: 1 as commanded, 0 not, -1 backward; None if unclear."""
         wheel = self._wheels[side]
-        seen = self._travel.wheel_speeds(wheel.since_ns + _SETTLED_NS, geometry)
+        seen = self._travel.wheel_speeds(wheel.since_ns + settled_ns, geometry)
         newest_ns = self._travel.newest_ns
         if seen is None or newest_ns is None:
             return None
