@@ -1,4 +1,4 @@
-"""Frames of classic CAN as a value, SocketCAN bytes, a candump line and bits on the wire; and one controller of a bus.
+"""Classic CAN frames in four forms (object, SocketCAN bytes, candump line, bits), and the state of one controller.
 
 The bits give a frame's exact length with stuff bits and what decides arbitration. A controller has its transmit queue
 and its error confinement; it reports errors in the frames that Linux can-dev gives to a socket. Source: Bosch CAN
@@ -120,6 +120,7 @@ def receive_overflow_frame() -> CanFrame:
 
 
 def _make_crc_table() -> tuple[int, ...]:
+    """Build the table that advances the CRC-15 of CAN by one byte."""
     table = []
     for byte in range(256):
         crc = byte << 7
@@ -130,7 +131,7 @@ def _make_crc_table() -> tuple[int, ...]:
 
 
 def _make_stuffing_table(bits: int) -> tuple[int, ...]:
-    """Build the table of bit stuffing for `bits` more bits.
+    """Build the lookup table that advances bit stuffing by `bits` bits.
 
     Entry [state << bits | value] is next state << 8 | stuff bits inserted. A state is the last bit << 2 | the length of
     its run - 1.
@@ -168,7 +169,7 @@ def _head(can_id: int, extended: bool, remote: bool, length: int) -> tuple[int, 
 
 @lru_cache(maxsize=4096)
 def _after_head(can_id: int, extended: bool, remote: bool, length: int) -> tuple[int, int, int]:
-    """Return CRC and stuffing after the head, which few frames do not share: bits, CRC, state << 8 | stuff bits."""
+    """Return bits, CRC and stuffing (state << 8 | stuff bits) after the head; cached, as most frames repeat a head."""
     head, bits = _head(can_id, extended, remote, length)
     padding = -bits % 8
     crc = 0
@@ -317,7 +318,7 @@ class BusNode:
         return self._confine()
 
     def count_transmit_error(self, acknowledged: bool) -> CanFrame | None:
-        """Count the frame on the wire as destroyed or not acknowledged, and put it back into the queue."""
+        """Requeue the frame and add 8 to `tec`, unless an error-passive node only misses the acknowledgement."""
         self.transmit_errors += 1
         item, self.on_wire = self.on_wire, None
         if self.state is ErrorState.BUS_OFF or item is None:
@@ -330,7 +331,7 @@ class BusNode:
         return self._confine()
 
     def count_received(self) -> CanFrame | None:
-        """Lower the receive error count after a frame of another node; return an error frame if the state changes."""
+        """Lower `rec` by 1, or to 120 from 128 and above; return an error frame if the state changes."""
         if not self.rec:
             return None
         self.rec = self.rec - 1 if self.rec < PASSIVE_LIMIT else 120
@@ -342,7 +343,7 @@ class BusNode:
         return self._confine()
 
     def force_bus_off(self) -> CanFrame | None:
-        """Leave the bus as if the transmit error counter had run over."""
+        """Go bus-off as if `tec` had overflowed; return the error frame, None if already bus-off."""
         self.tec = BUS_OFF_LIMIT
         return self._confine()
 
@@ -354,6 +355,7 @@ class BusNode:
         return restarted_frame()
 
     def _confine(self) -> CanFrame | None:
+        """Derive the error state from the counters; on a change return its error frame, on bus-off empty the queue."""
         worst = max(self.tec, self.rec)
         if self.tec >= BUS_OFF_LIMIT:
             state = ErrorState.BUS_OFF

@@ -1,4 +1,4 @@
-"""Bridge of `disco-hw bridge ros2-base` to a base that is reached over ROS 2 alone, in a process beside the daemon.
+"""Bridge process of `disco-hw bridge ros2-base`: speeds from the daemon to a ROS 2 base, wheel odometry back.
 
 The daemon's driver speaks frames to it on a Unix socket, as to any controller; it speaks DDS to the base. One thread:
 what stops the base waits for nothing.
@@ -191,6 +191,7 @@ class BaseBridge:
             self._drive(self.end.stand_by(time.monotonic_ns()))
 
     def _take_commands(self, received: list[tuple[socket.socket, Frame | None]], now_ns: int, *, late: bool) -> None:
+        """Handle received frames; after a pause (`late`), or if the driving client has gone, stop the base."""
         if late and self.end.driving:
             self._drive(self.end.stand_by(now_ns))
         for client, frame in received:
@@ -201,6 +202,7 @@ class BaseBridge:
                 self._take_command(client, frame, now_ns)
 
     def _take_command(self, client: socket.socket, frame: Frame, now_ns: int) -> None:
+        """Handle one frame; while one client drives, ignore speeds from the others."""
         was_driving = self.end.driving
         if was_driving and frame.can_id == wire.SPEEDS and client is not self._driven_by:
             return
@@ -211,6 +213,7 @@ class BaseBridge:
             self._clients.send(self.end.state())
 
     def _take_messages(self, now_ns: int) -> None:
+        """Read the base's topics: send wheel motion to the clients, note other publishers and the button."""
         wall_ns = time.time_ns()
         for message, sent_ns in self._taken(self._wheels):
             wheels = self._inlet.wheels(message, sent_ns, now_ns, wall_ns)
@@ -224,7 +227,7 @@ class BaseBridge:
             self._take_button(self._button)
 
     def _take_button(self, reader: DataReader[Any]) -> None:
-        """Read the base's button; an unreadable message, or no publisher, keeps the base where it is."""
+        """Read the base's stop button; an unreadable message or no publisher ends driving, as a pressed one does."""
         unreadable = self._unreadable
         for message, _ in self._taken(reader):
             self.end.button, self.end.hears_button = message.data, True
@@ -232,6 +235,7 @@ class BaseBridge:
             self.end.hears_button = False
 
     def _say_due(self, now_ns: int) -> None:
+        """Do the periodic work: look for subscribers, publish the speeds due, and send the state to the clients."""
         end = self.end
         if now_ns >= self._look_ns:
             self._look_ns = now_ns + _LOOK_NS
@@ -249,6 +253,7 @@ class BaseBridge:
             self._clients.send(end.state())
 
     def _drive(self, speeds: tuple[float, float] | None) -> None:
+        """Publish the forward speed (m/s) and yaw rate (rad/s); publish nothing for None."""
         if speeds is None:
             return
         twist = msg.Twist(msg.Vector3(speeds[0], 0.0, 0.0), msg.Vector3(0.0, 0.0, speeds[1]))

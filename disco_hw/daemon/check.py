@@ -159,6 +159,7 @@ def refuse_beside_a_daemon(config: RobotConfig) -> None:
 
 
 def _model_check(setup: Setup) -> Check:
+    """Report the model file and its effects; warn if the robot has none."""
     if setup.model_file is None:
         text = (
             "none is named: plans use the nominal geometry and the whole prior, so that the robot may go at half the "
@@ -170,6 +171,7 @@ def _model_check(setup: Setup) -> Check:
 
 
 def _adaptation_check(setup: Setup) -> Check:
+    """Report the online adaptation chosen for this configuration; fail if the model does not allow it."""
     try:
         chosen = choose_adaptation(setup.config.control, setup.config.pose, setup.model)
     except InputError as error:
@@ -178,6 +180,7 @@ def _adaptation_check(setup: Setup) -> Check:
 
 
 def _link_check(transport: Transport) -> Check:
+    """Wait up to two seconds for the link to come up; fail if it does not."""
     deadline = time.monotonic() + _LINK_TIMEOUT_S
     while transport.state is not LinkState.UP:
         if time.monotonic() > deadline:
@@ -300,6 +303,7 @@ class _Stopwatch:
 
 
 def _firmware_check(found: _Found, has_clock: bool) -> Check:
+    """Fail if the robot did not identify itself, or is refused, faulty or in e-stop; `has_clock`: report clock sync."""
     name = "firmware"
     if found.identity is None:
         return Check(name, Level.FAIL, found.detail)
@@ -327,6 +331,7 @@ def _hearing_check(found: _Found) -> Check:
 
 
 def _telemetry_check(found: _Found) -> Check:
+    """Fail without wheel samples; warn without poses or heading, or if frames were rejected."""
     name = "telemetry"
     rates = f"{found.wheel_samples / _LISTEN_S:.0f} wheel and {len(found.poses) / _LISTEN_S:.0f} pose samples a second"
     if not found.wheel_samples:

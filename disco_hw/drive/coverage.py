@@ -1,4 +1,4 @@
-"""Coverage of a drive: what has been excited so far, and what inference and the search for gaps still miss; pure.
+"""Coverage of a drive: which motions needed to identify the model have been driven, and which are missing; pure.
 
 The list is what separates pairs of parameters and effects that look the same otherwise: both turning directions, two
 speeds, backwards, starts and stops, steering, slow ramps through zero, rests.
@@ -84,7 +84,7 @@ class Coverage:
         self.driven_s = 0.0
 
     def add(self, t_ns: int, left_rad_s: float, right_rad_s: float) -> None:
-        """Take in wheel speeds in force from a time on; what is older than the last or no number changes nothing."""
+        """Count the time since the last call as driven at these wheel speeds; ignore older times and NaN."""
         if self._t_ns is not None and t_ns <= self._t_ns:
             return
         left, right = left_rad_s / self._top_rad_s, right_rad_s / self._top_rad_s
@@ -146,6 +146,7 @@ class Coverage:
         }
 
     def _count_launches(self, t_ns: int, size: float) -> None:
+        """Count hard starts and hard stops; `size` is the faster wheel's speed as a share of the top speed."""
         if size <= _STILL:
             if self._quick_ns is not None and t_ns - self._quick_ns <= _LAUNCH_S * 1e9:
                 self._found["hard stop"] += 1.0
@@ -156,6 +157,7 @@ class Coverage:
             self._still_ns, self._quick_ns = None, t_ns
 
     def _count_swings(self, t_ns: int, turn: float) -> None:
+        """Count quick steering: the turn changes sides within 1.6 s."""
         if abs(turn) < _SWING:
             return
         side = 1 if turn > 0.0 else -1

@@ -1,6 +1,6 @@
-"""Scene of the viewer: everything of a snapshot that has a place in the world.
+"""3D scene of the viewer: draws a snapshot's robot, task, trail, plan, rollouts and fence in the world.
 
-Live page, replay and export share it. Live page, replay and export share it.
+Live page, replay and export share it.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class Scene:
         self._drawn_fan: tuple[records.Fan, tuple[float, ...]] | None = None
 
     def show(self, snapshot: Snapshot, everything: bool = True) -> None:
-        """Draw one snapshot of the run."""
+        """Draw one snapshot; without `everything` leave plan, rollouts, trail, poses, points and fence as they are."""
         layers = self.layers
         with self._server.atomic():
             self._shade()
@@ -212,6 +212,7 @@ class Scene:
         return robot, wheels
 
     def _draw(self, layer: str, lines: Array) -> None:
+        """Replace the lines of a layer; hide it if it is off or has none."""
         node = self._lines[layer]
         if self.layers[layer] and len(lines):
             node.points = lines.astype(np.float32)
@@ -220,6 +221,7 @@ class Scene:
             node.visible = False
 
     def _shade(self) -> None:
+        """Recolour grid and turning centre if the background changed between light and dark."""
         if self.background != self._shaded:
             self._shaded = self.background
             colours = _GRID_DARK if self.background == DARK else _GRID_LIGHT
@@ -273,6 +275,7 @@ class Scene:
         return segments(points, 3.5 * self._wheel_radius)
 
     def _centre(self, snapshot: Snapshot) -> Array:
+        """Return a ray from the robot to its instantaneous centre of rotation, and a cross there."""
         centre = None
         if snapshot.pose is not None:
             centre = instant_centre(
@@ -284,6 +287,7 @@ class Scene:
         return np.concatenate((ray, _crosses(np.array((centre,)), 0.04, 0.01)))
 
     def _points_paths(self, snapshot: Snapshot) -> Array:
+        """Return the trajectories of the plan under the sigma points of the model's parameters."""
         if snapshot.plan is None or snapshot.pose is None or not self.layers["points"]:
             return np.empty((0, 2, 3))
         if snapshot.belief is not self._belief:
@@ -337,6 +341,7 @@ def sparse(trail: Array, reach_m: float) -> Array:
 
 
 def _outlines(lines: list[Array]) -> Array:
+    """Join polylines (N, 2) on the floor into one array of line segments."""
     return np.concatenate([segments(line, _FENCE_M) for line in lines]) if lines else np.empty((0, 2, 3))
 
 
@@ -345,7 +350,7 @@ def _line(task: RobotTask) -> Array:
 
 
 def _pose_marks(poses: Array) -> Array:
-    """Return a short stroke along the heading for each measured pose (N, 3); across, where it has none."""
+    """Return a short stroke along the heading for each measured pose (N, 3); along x if the heading is NaN."""
     if not len(poses):
         return np.empty((0, 2, 3))
     poses = np.nan_to_num(poses, nan=0.0)

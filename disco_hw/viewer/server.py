@@ -1,4 +1,4 @@
-"""Server of the page: viser, closed to everybody but the operator.
+"""Web server of the viewer: viser behind a guard, so that only the operator reaches the page.
 
 By itself viser listens to the whole network, takes another port when its own is in use, lets any web page open in the
 operator's browser press its buttons, and opens a public tunnel for any client that asks for one.
@@ -90,6 +90,7 @@ class Guard:
 
     @property
     def _cookie_name(self) -> str:
+        """Name of the cookie that holds the token, one per port."""
         return f"{_COOKIE}-{self.port}"
 
     def _same(self, offered: str) -> bool:
@@ -106,7 +107,7 @@ class Page:
 
 @contextmanager
 def serving(label: str, host: str = LOOPBACK, port: int = DEFAULT_PORT, desk: Desk | None = None) -> Iterator[Page]:
-    """Serve a page until the block ends; port 0 takes a free one. With a desk that is what opens, with the scene in it.
+    """Serve the page until the block ends; port 0 takes a free one. A `desk` (operator controls) frames the scene.
 
     The address carries the page's token. Raises InputError if the port is taken, the host is none of this machine's, or
     the token of the environment is none.
@@ -203,7 +204,7 @@ def _completed(page: bytes, zipped: bool) -> bytes:
 
 
 def _desk_answer(desk: Desk, instance: str, guard: Guard, request: Request) -> Response | None:
-    """Return the desk's own pages; None for what belongs to the scene in it."""
+    """Return the page of the operator controls, or the server's instance name; None for requests of the scene."""
     path = urlsplit(request.path).path
     if path == "/":
         return _answer(
@@ -220,7 +221,7 @@ def _desk_answer(desk: Desk, instance: str, guard: Guard, request: Request) -> R
 
 
 def _framers(request: Request) -> str:
-    """Return who may frame a reply: the desk its scene, under any name of this machine; nobody the desk itself."""
+    """Return the CSP `frame-ancestors`: this machine for the scene, which the desk frames; none for all other pages."""
     if urlsplit(request.path).path != "/index.html":
         return "'none'"
     port = urlsplit(f"//{request.headers.get('Host', '')}").port
@@ -269,6 +270,7 @@ def _plain(status: http.HTTPStatus, text: str) -> Response:
 
 
 def _answer(status: http.HTTPStatus, text: str, extra: dict[str, str], page: bytes | None = None) -> Response:
+    """Build a response with `extra` headers: the HTML `page` if given, otherwise `text` as plain text."""
     body = (text + "\n").encode() if page is None else page
     kind = "text/plain" if page is None else "text/html"
     headers = Headers(

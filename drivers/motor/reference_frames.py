@@ -255,7 +255,7 @@ class Telemetry:
         )
 
     def _plausible_us(self, sample_us: float, received_ns: int) -> int:
-        """Time of a wheel sample, relative to the first, for judging its motion; it does not wrap.
+        """Return the unwrapped time (us) of a wheel sample since the first, limited by the time between receptions.
 
         It advances as the sample times say, but no more than the receptions allow: the sample times of a device that
         has restarted say anything.
@@ -273,6 +273,7 @@ class Telemetry:
         return t_us
 
     def _stamp_ns(self, sample_us: float, modulus_us: int, oldest_us: float, received_ns: int) -> int:
+        """Return a sample's host time; that of reception if the clock is not synced or the age exceeds `oldest_us`."""
         device_us = self._clock.device_us(received_ns) if self._clock.synced(received_ns) else None
         if device_us is None:
             return received_ns

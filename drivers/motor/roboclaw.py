@@ -71,7 +71,7 @@ _SETTER_NAMES = {layout.command: name for name, layout in protocol.SETTERS.items
 
 @dataclass(slots=True)
 class Board:
-    """State of one board, by question; `turned` of both motors.
+    """State of one board: newest reply to each question in `known`, and the odometers of both motors in `turned`.
 
     `stopped`: it has taken a stop since the last command. `timeout_ds`: its serial timeout in steps of 0.1 s, as read
     since arming began. `waits_ns`: since when it has not answered, `refuses_ns` since when it has taken no command.
@@ -121,7 +121,7 @@ class Board:
         return f"board {self.address}: {_WORDS.get(bit, f'error {self.errors:#06x}')}"
 
     def take_counts(self, read: Mapping[str, protocol.Value], t_ns: int, looked_ns: int) -> bool:
-        """Whether its motors can have turned so far since they were counted last."""
+        """Update the odometers from encoder counts; return False if the motors cannot have turned that far."""
         if not {"velocity_pid_m1", "velocity_pid_m2"} <= self.known.keys():
             return True
         first, second = self.turned
@@ -130,7 +130,7 @@ class Board:
         return second.take_wrapping(int(read["encoder_m2"]), t_ns, looked_ns, fastest, 100.0) and is_first_plausible
 
     def meet_anew(self) -> None:
-        """Clear all that is known of the board but what its motors have turned."""
+        """Clear the board's replies, as for a new connection; the angles that its motors have turned are kept."""
         self.known, self.waits_ns, self.timeout_ds = {}, None, None
         for motor in self.turned:
             motor.begin_anew()
@@ -233,7 +233,7 @@ class RoboclawPort:
         ]
 
     def objection(self, permit: MotionPermit) -> Objection | None:
-        """Errors, commands not taken, and a timeout that is not the one set."""
+        """Return why driving must end: a board error, unacknowledged commands, or a wrong serial timeout."""
         for board in self._all:
             refused_ns = 0 if board.refuses_ns is None else permit.silent_ns(board.refuses_ns)
             if board.errors:
@@ -287,7 +287,7 @@ class RoboclawPort:
         return frames
 
     def brake(self, now_ns: int, lasts_ns: int) -> tuple[Sequence[Frame], bool]:
-        """Zero duty for each board until it takes it, and before that no question, which would feed its timeout."""
+        """Return zero duty for each board that has not acknowledged a stop, and whether braking is over."""
         waiting = [board for board in self._all if not board.stopped]
         is_over = not waiting and self._is_known and (self._stands or lasts_ns > BRAKING_NS)
         if now_ns - self._asked_ns < _PACE_NS:
@@ -305,7 +305,7 @@ class RoboclawPort:
         return [setting(address, "reset_estop") for address in latched]
 
     def may_reset(self, now_ns: int) -> bool:
-        """Whatever matters is seen."""
+        """Return True: all that forbids a reset is in `seen` already."""
         return True
 
     def questions(self, now_ns: int, permit: MotionPermit) -> tuple[OutgoingFrame, ...]:
@@ -340,6 +340,7 @@ class RoboclawPort:
 
     @property
     def _all(self) -> Sequence[Board]:
+        """All boards, in the order of the settings."""
         return tuple(self._boards.values())
 
     @property
@@ -355,6 +356,7 @@ class RoboclawPort:
         return min(board.fastest_counts_s for board in self._all) / self._settings.counts_per_rad
 
     def _take_acknowledgement(self, board: Board, frame: Frame, t_ns: int, stage: Stage) -> Heard:
+        """Take in the acknowledgement of a stop, which counts only while braking, or of a speed command."""
         name = _SETTER_NAMES.get(frame.can_id & 0xFF)
         if name is None or frame.data != protocol.ACKNOWLEDGE:
             return UNKNOWN

@@ -1,4 +1,4 @@
-"""The CSV of logged drives <-> the arrays of a drive.
+"""Read and write CSV logs of drives, with checks of units and unwrapping of encoder ticks.
 
 Header row, columns by name in any order: `t_s`, `cmd_left_rad_s`, `cmd_right_rad_s`, either `enc_*_rad_s` or
 cumulative `enc_*_ticks` or both, `pose_x_m`, `pose_y_m`, `pose_yaw_rad`, optional `imu_wz_rad_s`, optional `segment`.
@@ -67,7 +67,7 @@ def time_fault(t_s: Array) -> str | None:
 
 
 def yaw_fault(t_s: Array, yaw_rad: Array, segment: Index, wheels: Wheels, commands: Commands) -> str | None:
-    """Whether yaw, as written in the file, looks like degrees: field, fault and remedy, or None.
+    """Return field, fault and hint if yaw, as written in the file, looks like degrees; None otherwise.
 
     Yaw that stays within (-pi, pi] is taken as it is. Beyond, it may be radians that were not wrapped: they turn no
     more than the wheels can make them (yaw change <= difference of the wheels' roll x radius / axial distance).
@@ -90,7 +90,7 @@ def yaw_fault(t_s: Array, yaw_rad: Array, segment: Index, wheels: Wheels, comman
 
 
 def length_fault(poses: Poses, wheels: Wheels, commands: Commands, wheel_radius_m: float | None) -> str | None:
-    """Whether path and roll of the wheels give an impossible wheel radius: field, fault and remedy, or None.
+    """Return field, fault and hint if path and wheel rotation give an impossible wheel radius; None otherwise.
 
     The path is the sum of chords between poses that are 2 rad of forward roll apart, so that neither noise at rest nor
     turning on the spot counts. `wheel_radius_m` is the nominal radius if known; within a factor of 4 is believed.
@@ -312,6 +312,7 @@ def _rows(drive: DriveLog) -> tuple[Array, Index]:
 
 
 def _at(t_s: Array, columns: tuple[Array, ...], text: Callable[[float], str]) -> Cells:
+    """Return a function from a time to its cells: the samples at exactly that time, empty if there is none."""
     rows = dict(zip(t_s.tolist(), zip(*(column.tolist() for column in columns), strict=True), strict=True))
     nothing = [""] * len(columns)
 
@@ -323,6 +324,7 @@ def _at(t_s: Array, columns: tuple[Array, ...], text: Callable[[float], str]) ->
 
 
 def _in_force(drive: DriveLog) -> Cells:
+    """Return a function from a time to its command cells: the latest command, empty if none is known."""
     commands = drive.commands
 
     def cells(time: float) -> list[str]:
