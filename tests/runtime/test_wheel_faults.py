@@ -212,3 +212,14 @@ def test_a_base_that_makes_wheel_speeds_of_its_own_may_turn_by_more():
         move = robot._move
         robot._move = lambda _asked, turns, counts, move=move, asked=asked: move(turned(asked), turns, counts)
         assert (robot.drive(2.0, asked) is None) is is_left_alone
+
+
+@pytest.mark.parametrize("speed", [SLOW, FAST])
+@pytest.mark.parametrize(("turns", "counts"), [(lambda wanted: 0.0, None), (None, lambda true: 0.0)])
+def test_a_base_that_has_shown_to_turn_as_it_is_asked_to_is_judged_as_soon_as_single_wheels(turns, counts, speed):
+    found = {}
+    for takes_body_speeds in (True, False):
+        robot = Robot(faults=WheelFaults(takes_body_speeds))
+        assert robot.drive(6.0, around(speed)) is None
+        found[takes_body_speeds], _ = robot.drive(3.0, around(speed), turns, counts)
+    assert found[True] <= found[False]
