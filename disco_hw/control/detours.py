@@ -66,6 +66,9 @@ class Detours:
     def look_around(self, bounds: Boundaries, keep_m: float) -> None:
         """Find the detours anew where an obstacle, or the distance to keep, has changed by a centimetre or more."""
         circles = bounds.circles
+        if not len(circles):
+            self._found, self._seen = [], None
+            return
         seen = self._seen
         same = seen is not None and seen.shape == circles.shape and abs(keep_m - self._keep_m) < _MOVED_M
         if same and seen is not None and np.abs(seen[:, :3] - circles[:, :3]).max(initial=0.0) < _MOVED_M:

@@ -58,6 +58,7 @@ class Surroundings:
         self._table = np.empty((0, COLUMNS))
         self._edges = np.empty((0, COLUMNS))
         self._bounds: Boundaries | None = None
+        self._circles: bytes | None = None
         self._place: Callable[..., None] | None = None
         self.area = Area(
             aligned_zeros(MOST_SHAPES * COLUMNS),
@@ -81,13 +82,15 @@ class Surroundings:
 
     def look_around(self, bounds: Boundaries, deviation_m: float) -> None:
         """Keep away from these boundaries; `deviation_m`: of the corner whose place is known least."""
-        if bounds is not self._bounds:
-            self._bounds = bounds
-            self._edges = _edges(bounds)
         circles = bounds.circles
-        moving = np.zeros((len(circles), COLUMNS))
-        moving[:, [0, 1, 5, 6, 7]] = circles
-        self._table = np.concatenate((self._edges, moving))
+        if bounds is not self._bounds:
+            self._bounds, self._edges, self._circles = bounds, _edges(bounds), None
+        seen = circles.tobytes()
+        if seen != self._circles:
+            self._circles = seen
+            moving = np.zeros((len(circles), COLUMNS))
+            moving[:, [0, 1, 5, 6, 7]] = circles
+            self._table = np.concatenate((self._edges, moving))
         keep_m = self._margin_m + self._deviations * deviation_m
         self.area.body[KEEP] = keep_m
         self._detours.look_around(bounds, keep_m)

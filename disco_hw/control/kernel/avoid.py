@@ -27,6 +27,8 @@ TOUCH_COST, TOUCH_COST_PER_M = 80.0, 800.0
 """What each look costs at which the footprint touches a shape, and each metre of overlap then."""
 LOOK_EVERY = 2
 """Steps from one look to the next."""
+ROUNDING_M = 1e-3
+"""More than distances in single precision are wrong."""
 
 
 DETOURS, DETOUR_COLUMNS = 2, 7
@@ -147,22 +149,51 @@ def _shifted(bend: Bend, x: float, y: float) -> tuple[float, float]:
 
 
 @scalar_function
+def centre_of(area: Area, place: tuple[float, float, float], cos_yaw: float, sin_yaw: float) -> tuple[float, float]:
+    """Return the footprint's centre x, y (m), with the tracked point at a place; compiled code only."""
+    return place[0] + area.body[CENTRE_AHEAD] * cos_yaw, place[1] + area.body[CENTRE_AHEAD] * sin_yaw
+
+
+@scalar_function
+def touch_reach(area: Area, forward: float) -> float:
+    """Return how near (m) to a footprint's centre a shape without radius must be to cost anything; compiled only."""
+    body = area.body
+    corner = math.sqrt(body[HALF_LENGTH] * body[HALF_LENGTH] + body[HALF_WIDTH] * body[HALF_WIDTH])
+    return corner + body[KEEP] + abs(forward) * body[STEP_LENGTH] + constant(ROUNDING_M, forward)
+
+
+@scalar_function
+def _off(area: Area, shape: int, time_s: float, centre: tuple[float, float]) -> tuple[float, float]:
+    """Return the way x, y (m) from the nearest point of a shape's segment to a footprint's centre."""
+    row, shapes = U(shape * COLUMNS), area.shapes
+    off_x = centre[0] - (shapes[row] + time_s * shapes[row + U(6)])
+    off_y = centre[1] - (shapes[row + U(1)] + time_s * shapes[row + U(7)])
+    zero = constant(0.0, off_x)
+    along = min(max(off_x * shapes[row + U(2)] + off_y * shapes[row + U(3)], zero), shapes[row + U(4)])
+    return off_x - along * shapes[row + U(2)], off_y - along * shapes[row + U(3)]
+
+
+@scalar_function
+def is_beyond(area: Area, shape: int, time_s: float, centre: tuple[float, float], around_m: float) -> bool:
+    """Whether a shape is farther than so much from a point, and surely so; compiled code only."""
+    off_x, off_y = _off(area, shape, time_s, centre)
+    within = around_m + area.shapes[U(shape * COLUMNS + 5)]
+    return bool(off_x * off_x + off_y * off_y > within * within)
+
+
+@scalar_function
 def touch_cost(
     area: Area, shape: int, time_s: float, place: tuple[float, float, float], cos_yaw: float, sin_yaw: float
 ) -> float:
     """Cost of one shape at one step, for a robot with its tracked point there; compiled code only."""
-    row, shapes, body = U(shape * COLUMNS), area.shapes, area.body
-    x, y, forward = place
-    zero = constant(0.0, x)
-    off_x = x + body[CENTRE_AHEAD] * cos_yaw - (shapes[row] + time_s * shapes[row + U(6)])
-    off_y = y + body[CENTRE_AHEAD] * sin_yaw - (shapes[row + U(1)] + time_s * shapes[row + U(7)])
-    along = min(max(off_x * shapes[row + U(2)] + off_y * shapes[row + U(3)], zero), shapes[row + U(4)])
-    off_x -= along * shapes[row + U(2)]
-    off_y -= along * shapes[row + U(3)]
+    body, forward = area.body, place[2]
+    zero = constant(0.0, forward)
+    off_x, off_y = _off(area, shape, time_s, centre_of(area, place, cos_yaw, sin_yaw))
     off, inverse = norm_and_inverse(off_x, off_y)
     ahead = abs(off_x * cos_yaw + off_y * sin_yaw)
     aside = abs(off_y * cos_yaw - off_x * sin_yaw)
     towards = (body[HALF_LENGTH] * ahead + body[HALF_WIDTH] * aside) * inverse
-    overlap = body[KEEP] + abs(forward) * body[STEP_LENGTH] + shapes[row + U(5)] + towards - off
-    touches = constant(TOUCH_COST, x) if overlap > zero else zero
-    return touches + constant(TOUCH_COST_PER_M, x) * max(overlap, zero)
+    radius = area.shapes[U(shape * COLUMNS + 5)]
+    overlap = body[KEEP] + abs(forward) * body[STEP_LENGTH] + radius + towards - off
+    touches = constant(TOUCH_COST, forward) if overlap > zero else zero
+    return touches + constant(TOUCH_COST_PER_M, forward) * max(overlap, zero)

@@ -46,8 +46,19 @@ from disco_hw.control.kernel import (
     stage_cost,
     terminal_cost,
 )
-from disco_hw.control.kernel.avoid import FASTEST, REACH, STEP_LENGTH, Area, Bends, detoured, touch_cost
-from disco_hw.jit import bits_of_float, block_function, cast_like, float_from_bits, scalar_function, tune_loops
+from disco_hw.control.kernel.avoid import (
+    FASTEST,
+    REACH,
+    STEP_LENGTH,
+    Area,
+    Bends,
+    centre_of,
+    detoured,
+    is_beyond,
+    touch_cost,
+    touch_reach,
+)
+from disco_hw.jit import bits_of_float, block_function, cast_like, float_from_bits, int32, scalar_function, tune_loops
 from disco_hw.model.coefficients import Base, lane_base
 from disco_hw.model.step import tracked_of
 from disco_hw.tasks import Found, constant
@@ -237,28 +248,61 @@ def avoid_shapes(
     if area is None:
         return
     time_s = cast_like(t + 1, start[START_X]) * area.body[STEP_LENGTH]
+    # Where a plan can be by now, there is often nothing: then no sample is looked at.
     reach_m = area.body[REACH] + area.body[FASTEST] * time_s
+    near = False
     for k in range(area.number[0]):
-        if area.away[k] > reach_m:
+        near |= area.away[k] <= reach_m
+    if not near:
+        return
+    if skip_mean is None:
+        _avoid(area, state, OWN, at, time_s, reach_m, base, None, None, start)
+    if ahead is not None:
+        _avoid(area, state, AHEAD0, at, time_s, reach_m, base, ahead[0], None, start)
+        _avoid(area, state, AHEAD1, at, time_s, reach_m, base, ahead[1], None, start)
+    if scaled is not None:
+        _avoid(area, state, SCALED0, at, time_s, reach_m, base, scaled[0], True, start)
+        _avoid(area, state, SCALED1, at, time_s, reach_m, base, scaled[1], True, start)
+
+
+@scalar_function
+def _avoid(
+    area: Area, state: Floats, own: int, at: int, time_s: float, reach_m: float, base: Base, other: Base | None,
+    is_scaled: Absent, start: Floats,
+) -> None:  # fmt: skip
+    """Add the cost of touching a shape to the rows from `own` on: of those shapes that a circle around all samples meets.
+
+    Sizes are compared by their bits, in which numbers of zero or more have the same order, as the compiler makes
+    vectors of a maximum of integers only.
+    """
+    first = _any_place(state, U(0), lane_base(base, at), other, is_scaled, start)
+    middle = centre_of(area, first, state[COS], state[SIN])
+    farthest, fastest = int32(0), int32(0)
+    for b in range(BLOCK):
+        place = _any_place(state, b, lane_base(base, at + b), other, is_scaled, start)
+        x, y = centre_of(area, place, state[COS + b], state[SIN + b])
+        off_x, off_y = x - middle[0], y - middle[1]
+        farthest = max(farthest, bits_of_float(off_x * off_x + off_y * off_y))
+        fastest = max(fastest, bits_of_float(abs(place[2])))
+    around_m = math.sqrt(float_from_bits(farthest)) + touch_reach(area, float_from_bits(fastest))
+    for k in range(area.number[0]):
+        if area.away[k] > reach_m or is_beyond(area, k, time_s, middle, around_m):
             continue
-        if skip_mean is None:
-            for b in range(BLOCK):
-                place = _place(state, b, lane_base(base, at + b))
-                state[OWN + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
-        if ahead is not None:
-            for b in range(BLOCK):
-                place = _ahead_place(state, b, base, ahead[0], start)
-                state[AHEAD0 + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
-            for b in range(BLOCK):
-                place = _ahead_place(state, b, base, ahead[1], start)
-                state[AHEAD1 + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
-        if scaled is not None:
-            for b in range(BLOCK):
-                place = _scaled_place(state, b, base, scaled[0], start)
-                state[SCALED0 + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
-            for b in range(BLOCK):
-                place = _scaled_place(state, b, base, scaled[1], start)
-                state[SCALED1 + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
+        for b in range(BLOCK):
+            place = _any_place(state, b, lane_base(base, at + b), other, is_scaled, start)
+            state[own + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
+
+
+@scalar_function
+def _any_place(
+    state: Floats, b: int, base: Base, other: Base | None, is_scaled: Absent, start: Floats
+) -> Place:  # fmt: skip
+    """Return the place of sample b under `base`, or under the `other` point that is equivalent to it."""
+    if other is None:
+        return _place(state, b, base)
+    if is_scaled is None:
+        return _ahead_place(state, b, base, other, start)
+    return _scaled_place(state, b, base, other, start)
 
 
 @scalar_function
