@@ -270,7 +270,7 @@ def _avoid(
     area: Area, state: Floats, own: int, at: int, time_s: float, reach_m: float, base: Base, other: Base | None,
     is_scaled: Absent, start: Floats,
 ) -> None:  # fmt: skip
-    """Add the cost of touching a shape to the rows from `own` on: of those shapes that a circle around all samples meets.
+    """Add what touching shapes costs to the rows from `own` on, for the shapes that a circle around all samples meets.
 
     Sizes are compared by their bits, in which numbers of zero or more have the same order, as the compiler makes
     vectors of a maximum of integers only.
