@@ -21,12 +21,13 @@ from disco_hw.config.robot_file import prior_around
 from disco_hw.experiments.fence_drives import (
     FencedDrive,
     along_drive,
+    corridor_setup,
     fenced_setup,
     manual_drive,
     random_room,
     room_drive,
     task_drive,
-    tight_room,
+    tight_setup,
     untold_plant,
     wall_drive,
 )
@@ -43,11 +44,10 @@ Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 DriveOnce = Callable[[np.random.Generator], FencedDrive]
 DRIVES = "drives.jsonl"
-ALONE_STREAM = 99
+ALONE_STREAM, CORRIDOR_STREAM = 99, 98
 ALONE = "guard off: "
 """Begins the names of kinds in which the planner alone keeps inside."""
 LEARNING_S = 12.0
-_BESIDE_M = (0.05, 0.15)
 _POSES_EVERY = 5
 
 
@@ -86,6 +86,7 @@ CONTENDERS: dict[str, tuple[str, str, bool]] = {
     "sigma points, after adaptation": ("ut", "fast", True),
 }
 """Planners without the guard: uncertainty, adaptation, and whether the belief is the prior around the nominal robot."""
+CORRIDOR, ADAPTING = "corridor, ", "sigma points, adapting"
 
 
 def alone_drive(
@@ -94,12 +95,14 @@ def alone_drive(
     seconds: float,
     contender: tuple[str, str, bool],
     planner_of: Callable[[Setup], Planner] | None = None,
+    setup_of: Callable[[np.random.Generator], Setup] = tight_setup,
+    learning_s: float = LEARNING_S,
 ) -> FencedDrive:
-    """Drive a circle in a tight room, by one of the CONTENDERS alone; the same rooms and robots for all.
+    """Drive what `setup_of` returns by one of the CONTENDERS alone; the same rooms and robots for all.
 
-    Who adapts has `LEARNING_S` to do so first. `planner_of` makes another planner for a setup.
+    Who adapts has `learning_s` to do so first. `planner_of` makes another planner for a setup.
     """
-    setup = fenced_setup(*tight_room(rng, float(rng.uniform(*_BESIDE_M))))
+    setup = setup_of(rng)
     plant, noise = untold_plant(rng, off), int(rng.integers(1 << 30))
     uncertainty, adaptation, by_prior = contender
     control = msgspec.structs.replace(setup.config.control, uncertainty=uncertainty, adaptation=adaptation)
@@ -109,11 +112,24 @@ def alone_drive(
         config = msgspec.structs.replace(setup.config, robot=robot, prior=prior_around(robot))
         setup = replace(setup, config=config, model=Model.nominal(robot, config.prior))
     planner = make_planner(setup.config, setup.model) if planner_of is None else planner_of(setup)
-    learning_s = LEARNING_S if adaptation != "off" else 0.0
+    learning_s = learning_s if adaptation != "off" else 0.0
     return task_drive(setup, plant, planner, seconds + learning_s, noise, guarded=False, learning_s=learning_s)
 
 
 _DRIVES = FileKind("the drives of a campaign", 64 * 1024 * 1024, "name another folder with -o")
+
+
+_GUARDED = "with the guard"
+_TITLES = {
+    _GUARDED: _GUARDED,
+    ALONE: "planner alone, circle in a tight room",
+    ALONE + CORRIDOR: "planner alone, closed corridor and soft brakes",
+}
+
+
+def _group(kind: str) -> str:
+    """Return the key of `_TITLES` under which a kind of drive is shown."""
+    return next((group for group in (ALONE + CORRIDOR, ALONE) if kind.startswith(group)), _GUARDED)
 
 
 class Campaign:
@@ -207,25 +223,36 @@ class FenceResult:
         """Write a room with the robot's way, and how near each kind came; PNG, PDF and SVG."""
         from matplotlib.figure import Figure  # noqa: PLC0415
 
-        figure = Figure(figsize=(11.0, 4.2), layout="constrained")
-        axes = figure.subplots(1, 3)
+        figure = Figure(figsize=(11.0, 8.0), layout="constrained")
+        axes = figure.subplots(2, 2).ravel()
         name, drives = max(self.drives.items(), key=lambda item: len(item[1]))
         shown = drives[0]
         for line in fence_outlines(shown.fence):
             axes[0].plot(*line.T, color="firebrick")
         axes[0].plot(*np.array(shown.poses)[:, :2].T, color="navy", linewidth=0.8)
         axes[0].set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=f"one of {len(drives)}: {name}")
-        for axis, alone, title in ((axes[1], False, "with the guard"), (axes[2], True, "planner alone")):
+        for axis, group in zip(axes[1:], _TITLES, strict=True):
             for name, drives in self.drives.items():
-                if name.startswith(ALONE) is alone:
+                if _group(name) == group:
                     least = np.sort([one.least_m for one in drives])
-                    label = name.removeprefix(ALONE)
+                    label = name.removeprefix(group)
                     axis.step(least, np.linspace(0.0, 1.0, len(least)), label=label, where="post")
             axis.axvline(0.0, color="firebrick", linewidth=0.8)
-            axis.set(xlabel="least distance to the fence (m)", ylabel="share of drives", title=title)
+            axis.set(xlabel="least distance to the fence (m)", ylabel="share of drives", title=_TITLES[group])
             if axis.has_data() and len(axis.lines) > 1:
                 axis.legend(fontsize=7)
         write_pictures(figure, path)
+
+
+def gather_corridors(campaign: Campaign, options: FenceOptions) -> None:
+    """Drive the planners alone towards the closed ends of corridors; who adapts has the way there to do so."""
+    for name, contender in CONTENDERS.items():
+        drive = partial(
+            alone_drive, off=options.off, seconds=options.seconds, contender=contender, setup_of=corridor_setup,
+            learning_s=0.0,
+        )  # fmt: skip
+        kind = ALONE + CORRIDOR + (name if contender[1] == "off" else ADAPTING)
+        campaign.gather(kind, options.alone, drive, CORRIDOR_STREAM)
 
 
 def run_fence(options: FenceOptions, out: Path, progress: Progress) -> FenceResult:
@@ -247,5 +274,6 @@ def run_fence(options: FenceOptions, out: Path, progress: Progress) -> FenceResu
     for name, contender in CONTENDERS.items():
         drive = partial(alone_drive, off=off, seconds=seconds, contender=contender)
         campaign.gather(ALONE + name, options.alone, drive, ALONE_STREAM)
+    gather_corridors(campaign, options)
     campaign.gather("task in a random room", options.rooms, lambda rng: room_drive(rng, off, seconds), 3)
     return campaign.result

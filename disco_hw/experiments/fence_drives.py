@@ -32,6 +32,7 @@ from disco_hw.runtime.safe_area import SafeArea
 from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.tasks import RobotTask
 from disco_hw.tasks.circle import CircleTask
+from disco_hw.tasks.path import PathTask
 from sim.body_dynamics import BodyPose
 from sim.plant_parameters import PlantParameters
 
@@ -40,6 +41,9 @@ FOOTPRINT = Footprint(0.50, 0.40, 0.05)
 _SHIPPED = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 _ALONG_M = 0.15
 _WALL_M_S = 0.3
+_BESIDE_M = (0.05, 0.15)
+_RUN_UP_M, _BEYOND_M = (1.5, 2.5), 3.0
+_CORRIDOR_M_S, _SOFT_RAD_S2 = 0.4, 2.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -251,6 +255,27 @@ def tight_room(rng: np.random.Generator, beside_m: float) -> tuple[Fence, Circle
     ]
     task = CircleTask(center_x_m=0.0, center_y_m=0.0, radius_m=radius_m, speed_m_s=_WALL_M_S)
     return Fence(keep_in=tuple(corners), margin_m=0.01), task
+
+
+def tight_setup(rng: np.random.Generator) -> Setup:
+    """Return the shipped robot on a circle in a tight room, whose walls come within 0.05 to 0.15 m of its way."""
+    return fenced_setup(*tight_room(rng, float(rng.uniform(*_BESIDE_M))))
+
+
+def corridor_setup(rng: np.random.Generator) -> Setup:
+    """Return a robot with soft brakes whose line leads on through the closed end of a corridor.
+
+    At 0.4 m/s it needs 0.67 m to stop, and 15 % more or less with wheels that are larger or smaller by so much.
+    """
+    end_m = float(rng.uniform(*_RUN_UP_M)) + FOOTPRINT.ahead + 0.5 * FOOTPRINT.length
+    behind_m, side_m = -2.0 * FOOTPRINT.reach_m, 0.5
+    corners = ((behind_m, -side_m), (end_m, -side_m), (end_m, side_m), (behind_m, side_m))
+    line = ((0.0, 0.0), (end_m + _BEYOND_M, 0.0))
+    setup = fenced_setup(
+        Fence(keep_in=corners, margin_m=0.01), PathTask(path="corridor", points=line, speed_m_s=_CORRIDOR_M_S)
+    )
+    robot = msgspec.structs.replace(setup.config.robot, max_wheel_acceleration_rad_s2=_SOFT_RAD_S2)
+    return replace(setup, config=msgspec.structs.replace(setup.config, robot=robot))
 
 
 def _outer_m(radius_m: float) -> float:
