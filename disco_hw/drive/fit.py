@@ -1,6 +1,7 @@
 """Fits a script into the fence: manoeuvres turned round, mirrored, in another order, and slower where they must be.
 
-Pure. It takes a little time, so it is done a manoeuvre at a time while the robot stands.
+Pure. It takes a little time, so it is done a manoeuvre at a time while the robot stands. The robot is otherwise than its
+model: before each manoeuvre that would lead from its true place too near to the fence, what remains is fitted anew.
 """
 
 from __future__ import annotations
@@ -49,10 +50,12 @@ def fit_script(
     `room`: what the script takes as it is, for the message.
     """
     keep_m = bounds.fence.margin_m + SPARE_M
-    for scale in SCALES:
+    # All at one speed, the largest that there is; else each as fast as it can be.
+    for scales in (*((scale,) for scale in SCALES), SCALES):
         remaining, chosen, pose = list(script.manoeuvres), list[Manoeuvre](), start
         while remaining:
-            found = _next_that_fits(remaining, scale, pose, robot, bounds, keep_m)
+            each = (_next_that_fits(remaining, scale, pose, robot, bounds, keep_m) for scale in scales)
+            found = next((one for one in each if one is not None), None)
             if found is None:
                 break
             index, manoeuvre, pose = found
@@ -127,6 +130,7 @@ class FittedScriptSource:
         self._fitting: Iterator[Script | None] | None = None
         self._playing: ScriptSource | None = None
         self._refused: str | None = None
+        self._checked = 0
 
     @property
     def ended(self) -> str | None:
@@ -152,24 +156,51 @@ class FittedScriptSource:
 
     def poll(self, now_ns: int, robot: RobotView) -> ManualInput | None:
         """Fit one manoeuvre, and hold still meanwhile; once all are, play."""
-        if self._playing is not None:
-            return self._playing.poll(now_ns, robot)
-        self._fit(robot)
-        return ManualInput(now_ns, 0.0, 0.0, deadman=False)
+        playing = self._playing
+        if playing is None:
+            self._fit(self._script, robot)
+            return ManualInput(now_ns, 0.0, 0.0, deadman=False)
+        if self._fitting is None and self._leads_out(playing, robot):
+            self._fitting = self._begin_fit(Script(self._script.name, playing.remaining), robot.pose)
+        if self._fitting is not None:
+            self._fit(self._script, robot)
+            held = self._deadman.poll(now_ns, robot)
+            deadman = held is not None and held.deadman and self._refused is None
+            return None if held is None else ManualInput(held.t_ns, 0.0, 0.0, deadman)
+        return playing.poll(now_ns, robot)
 
     def close(self) -> None:
         """Close the source of the deadman."""
         self._deadman.close()
 
-    def _fit(self, robot: RobotView) -> None:
-        if self._refused is not None or robot.pose is None:
+    def _leads_out(self, playing: ScriptSource, robot: RobotView) -> bool:
+        """Whether a manoeuvre that begins now would lead from where the robot is into the fence's margin."""
+        if playing.finished == self._checked or robot.pose is None or not playing.remaining:
+            return False
+        self._checked = playing.finished
+        path = driven_path(playing.remaining[0], robot.pose, self._robot)
+        return float(self._bounds.clearance_m(path).min()) < self._bounds.fence.margin_m + 0.5 * SPARE_M
+
+    def _begin_fit(self, script: Script, pose: Pose | None) -> Iterator[Script | None] | None:
+        return None if pose is None else fit_script(script, pose, self._robot, self._bounds, self._room)
+
+    def _fit(self, script: Script, robot: RobotView) -> None:
+        """Go on fitting, or begin to; what comes out is played."""
+        if self._refused is not None:
             return
         if self._fitting is None:
-            self._fitting = fit_script(self._script, robot.pose, self._robot, self._bounds, self._room)
+            self._fitting = self._begin_fit(script, robot.pose)
+        if self._fitting is None:
+            return
         try:
             fitted = next(self._fitting)
         except ScriptDoesNotFit as refusal:
             self._refused = str(refusal)
             return
-        if fitted is not None:
+        if fitted is None:
+            return
+        self._fitting = None
+        if self._playing is None:
             self._playing = ScriptSource(fitted, self._deadman)
+        else:
+            self._playing.replace_remaining(fitted.manoeuvres)

@@ -64,6 +64,14 @@ class Script:
             start_s += manoeuvre.duration_s
         return None
 
+    def over(self, t_s: float) -> int:
+        """Return how many manoeuvres are over at a time since the start."""
+        count, end_s = 0, 0.0
+        for manoeuvre in self.manoeuvres:
+            end_s += manoeuvre.duration_s
+            count += t_s >= end_s
+        return count
+
     def cut(self, seconds: float) -> Script:
         """Return the script broken off after so long."""
         kept: list[Manoeuvre] = []
@@ -206,6 +214,22 @@ class ScriptSource:
             return ""
         limits = f" ({self._limits.in_words()})" if manoeuvre.within_limits else ""
         return f"{manoeuvre.name}{limits}: {manoeuvre.purpose}"
+
+    @property
+    def finished(self) -> int:
+        """Number of manoeuvres that are over."""
+        return self._script.over(self._driven_ns * 1e-9)
+
+    @property
+    def remaining(self) -> tuple[Manoeuvre, ...]:
+        """The manoeuvre under way and those after it."""
+        return self._script.manoeuvres[self.finished :]
+
+    def replace_remaining(self, manoeuvres: tuple[Manoeuvre, ...]) -> None:
+        """Play these in place of those that remain, from the beginning of the first."""
+        past = self._script.manoeuvres[: self.finished]
+        self._script = Script(self._script.name, (*past, *manoeuvres))
+        self._driven_ns = math.ceil(math.fsum(one.duration_s for one in past) * 1e9)
 
     def poll(self, now_ns: int, robot: RobotView) -> ManualInput | None:
         """Return the script's wheel speeds with the other source's deadman and time."""

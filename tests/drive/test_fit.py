@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import disco_hw
 from disco_hw.drive import ManualInput, RobotView
 from disco_hw.drive.fit import FittedScriptSource, ScriptDoesNotFit, ScriptGeometry, driven_path, fit_script
 from disco_hw.drive.script import Manoeuvre, Room, Script, ScriptSource
+from disco_hw.drive.scripts import make_script
 from disco_hw.fence import Circle, Fence, Footprint
 from disco_hw.fence.clearance import Boundaries
 from disco_hw.runtime import State
+from disco_hw.runtime.robot_setup import load_setup
 
+ROBOT_FILE = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 ROBOT = ScriptGeometry(0.06, 0.4, 0.1)
 FOOTPRINT = Footprint(0.5, 0.4, 0.05)
 ROOM_NEEDED = Room((-0.5, 2.5), (-1.0, 1.0))
@@ -27,6 +32,11 @@ def straight(name="straight", seconds=5.0, **fields) -> Manoeuvre:
 
 def bend() -> Manoeuvre:
     return Manoeuvre("bend", "turning", 4.0, lambda t_s: (2.0, 5.0))
+
+
+def shipped(name: str) -> Script:
+    setup = load_setup(ROBOT_FILE)
+    return make_script(name, setup.config.robot, setup.config.task, 0.6)
 
 
 def fitted(script: Script, fence: Fence, pose=CENTER) -> Script:
@@ -72,6 +82,16 @@ def test_a_script_is_turned_round_and_reordered_until_it_stays_inside(size):
     assert "backward" in notes or "mirrored" in notes or "at " in notes
 
 
+@pytest.mark.parametrize(("name", "side_m"), [("excite", 2.5), ("steps", 2.5), ("separate", 2.0), ("curves", 2.5)])
+def test_the_shipped_scripts_fit_into_a_small_room(name, side_m):
+    half, script = 0.5 * side_m, shipped(name)
+    fence = Fence(keep_in=((-half, -half), (half, -half), (half, half), (-half, half)))
+    found = fitted(script, fence, (0.0, 0.0, 0.3))
+    assert sorted(one.name for one in found.manoeuvres) == sorted(one.name for one in script.manoeuvres)
+    assert least_m(found, fence, (0.0, 0.0, 0.3)) >= 0.05 + 0.08
+    assert least_m(script, fence, (0.0, 0.0, 0.3)) < 0.05 + 0.08
+
+
 def test_limits_are_found_before_what_is_scaled_into_them():
     manoeuvres = (straight("a", finds_limits=True), straight("b", within_limits=True), straight("c"))
     found = fitted(Script("s", manoeuvres), Fence(keep_in=Circle((0, 0), 2.2)))
@@ -97,6 +117,67 @@ class Held:
 
     def close(self):
         pass
+
+
+def drive(source: FittedScriptSource, robot: ScriptGeometry, bounds: Boundaries) -> float:
+    """Let a robot with another geometry obey until the source ends; returns its least clearance (m)."""
+    pose, held, least = CENTER, False, math.inf
+    for tick in range(20_000):
+        given = source.poll(tick * 20_000_000, RobotView(State.ARMED, held, pose=pose))
+        held = given.deadman
+        wheels = (given.left_rad_s, given.right_rad_s) if held else (0.0, 0.0)
+        path = driven_path(Manoeuvre("tick", "", 0.02, lambda t_s, wheels=wheels: wheels), pose, robot)
+        pose = tuple(path[-1].tolist())
+        if tick % 10 == 0:
+            least = min(least, float(bounds.clearance_m(path).min()))
+        if source.ended is not None:
+            return least
+    raise AssertionError(source.words)
+
+
+def test_a_robot_that_is_otherwise_than_its_model_is_fitted_anew_before_it_leaves_the_fence():
+    fence = Fence(keep_in=((-1.5, -1.5), (1.5, -1.5), (1.5, 1.5), (-1.5, 1.5)))
+    bounds, other = Boundaries(FOOTPRINT, fence), ScriptGeometry(0.068, 0.36, 0.1)
+    script = shipped("steps")
+    pose, planned = CENTER, math.inf
+    for manoeuvre in fitted(script, fence).manoeuvres:
+        path = driven_path(manoeuvre, pose, other)
+        pose, planned = tuple(path[-1].tolist()), min(planned, float(bounds.clearance_m(path).min()))
+    playing = FittedScriptSource(script, Held(), ROBOT, bounds, ROOM_NEEDED)
+    assert planned < 0.0
+    assert drive(playing, other, bounds) > 0.0
+    assert playing.completed
+    assert playing.ended == "script steps completed"
+
+
+def test_while_it_is_fitted_anew_the_robot_stands_and_the_deadman_counts():
+    far = Manoeuvre("far", "", 4.0, lambda t_s: (5.0, 5.0))
+    playing = source(Fence(keep_in=Circle((0, 0), 2.4)), straight(seconds=1.0), far)
+    pose, held, given = CENTER, False, None
+    for tick in range(30):
+        given = playing.poll(tick * 20_000_000, RobotView(State.ARMED, held, pose=pose))
+        held = given.deadman
+    while playing.task.startswith("straight"):
+        tick += 1
+        given = playing.poll(tick * 20_000_000, RobotView(State.ARMED, True, pose=pose))
+    # It is where it must not go on ahead.
+    stands = playing.poll((tick + 1) * 20_000_000, RobotView(State.ARMED, True, pose=(1.5, 0.0, 0.0)))
+    assert (stands.left_rad_s, stands.right_rad_s, stands.deadman) == (0.0, 0.0, True)
+    for more in range(2, 6):
+        given = playing.poll((tick + more) * 20_000_000, RobotView(State.ARMED, True, pose=(1.5, 0.0, 0.0)))
+    assert given.left_rad_s < 0.0
+    assert "backward" in playing.task
+
+
+def test_a_robot_that_came_to_where_nothing_fits_ends_the_script():
+    playing = source(Fence(keep_in=Circle((0, 0), 2.4)), straight(seconds=1.0), straight("far", 4.0))
+    held = False
+    for tick in range(200):
+        pose = (2.2, 0.0, 1.57) if playing.task.startswith("far") else CENTER
+        held = playing.poll(tick * 20_000_000, RobotView(State.ARMED, held, pose=pose)).deadman
+    assert not held
+    assert playing.ended.startswith("script s does not fit into the fence")
+    assert not playing.completed
 
 
 def source(fence: Fence, *manoeuvres: Manoeuvre) -> FittedScriptSource:
