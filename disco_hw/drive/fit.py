@@ -1,7 +1,7 @@
 """Fits a script into the fence: manoeuvres turned round, mirrored, in another order, and slower where they must be.
 
-Pure. It takes a little time, so it is done a manoeuvre at a time while the robot stands. The robot is otherwise than its
-model: before each manoeuvre that would lead from its true place too near to the fence, what remains is fitted anew.
+Pure. It takes a little time, so it is done a manoeuvre at a time while the robot stands. No robot is as its model says:
+before a manoeuvre that would lead from its true place too near to the fence, what remains is fitted anew.
 """
 
 from __future__ import annotations
@@ -84,10 +84,16 @@ def _next_that_fits(
         for words, sign, mirrored in _VARIANTS:
             changed = _changed(manoeuvre, scale, words, sign, mirrored)
             path = driven_path(changed, pose, robot)
-            if bounds.clearance_m(path).min() >= keep_m:
+            if _keeps(path, bounds, keep_m):
                 x_m, y_m, yaw_rad = path[-1].tolist()
                 return index, changed, (x_m, y_m, yaw_rad)
     return None
+
+
+def _keeps(path: Array, bounds: Boundaries, keep_m: float) -> bool:
+    """Whether a path stays so far from the fence; one that begins inside but nearer must not come nearer still."""
+    clearance_m = bounds.clearance_m(path)
+    return bool(clearance_m.min() >= min(keep_m, max(float(clearance_m[0]), 0.0)))
 
 
 def _changed(manoeuvre: Manoeuvre, scale: float, words: str, sign: float, mirrored: bool) -> Manoeuvre:
@@ -179,7 +185,7 @@ class FittedScriptSource:
             return False
         self._checked = playing.finished
         path = driven_path(playing.remaining[0], robot.pose, self._robot)
-        return float(self._bounds.clearance_m(path).min()) < self._bounds.fence.margin_m + 0.5 * SPARE_M
+        return not _keeps(path, self._bounds, self._bounds.fence.margin_m + 0.5 * SPARE_M)
 
     def _begin_fit(self, script: Script, pose: Pose | None) -> Iterator[Script | None] | None:
         return None if pose is None else fit_script(script, pose, self._robot, self._bounds, self._room)

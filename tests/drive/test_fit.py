@@ -99,6 +99,19 @@ def test_limits_are_found_before_what_is_scaled_into_them():
     assert names.index("a") < names.index("b")
 
 
+@pytest.mark.parametrize(("x_m", "fits"), [(1.65, True), (1.72, False)])
+def test_from_beside_the_fence_a_script_leads_away_from_it_but_not_from_outside(x_m, fits):
+    room = Fence(keep_in=((-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0)))
+    script = Script("s", (straight(seconds=2.0),))
+    assert least_m(script, room, (x_m, 0.0, 0.0)) < 0.0
+    assert (0.0 < 2.0 - x_m - 0.3 < 0.13) is fits
+    if not fits:
+        with pytest.raises(ScriptDoesNotFit):
+            fitted(script, room, (x_m, 0.0, 0.0))
+        return
+    assert "backward" in fitted(script, room, (x_m, 0.0, 0.0)).manoeuvres[0].purpose
+
+
 def test_a_script_that_fits_nowhere_says_how_much_room_it_needs():
     with pytest.raises(ScriptDoesNotFit, match=r"does not fit .* needs about 2.5 m ahead, 0.5 m behind"):
         fitted(Script("long", (straight(seconds=20.0),)), Fence(keep_in=Circle((0, 0), 0.8)))

@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from disco_hw.experiments.fence import ALONE, DRIVES, Campaign, FenceOptions
-from disco_hw.experiments.fence_drives import FOOTPRINT, FencedDrive, along_drive, tight_room
+from disco_hw.experiments import fence
+from disco_hw.experiments.fence import ALONE, CONTENDERS, CORRIDOR, DRIVES, Campaign, FenceOptions, gather_corridors
+from disco_hw.experiments.fence_drives import FOOTPRINT, FencedDrive, along_drive, corridor_setup, tight_room
 from disco_hw.fence import Circle, Fence
 from disco_hw.fence.clearance import Boundaries
 
@@ -65,8 +66,42 @@ def test_the_table_counts_breaches_stops_and_ways(tmp_path):
     assert alone["breaches"] == 4
     assert alone["way_median_m"] == 1.5
     assert "guard off: point model" in driven.result.table()
+    driven.gather(f"{ALONE}{CORRIDOR}point model", 2, Driver(), 2)
     driven.result.write_pictures(tmp_path / "fence.png")
     assert (tmp_path / "fence.png").stat().st_size > 10_000
+
+
+def test_from_the_start_of_a_corridor_there_is_more_way_than_its_brakes_need():
+    for seed in range(5):
+        setup = corridor_setup(np.random.default_rng(seed))
+        robot, task, bounds = setup.config.robot, setup.config.task, Boundaries(FOOTPRINT, setup.config.fence)
+        braking_m = 0.5 * task.speed_m_s**2 / (robot.wheel_radius_m * robot.max_wheel_acceleration_rad_s2)
+        x = np.linspace(0.0, 2.6, 2601)
+        clearance = bounds.clearance_m(np.column_stack([x, 0.0 * x, 0.0 * x]))
+        end_m = float(x[clearance <= 0.0].min())
+        assert 1.5 <= end_m <= 2.502
+        assert 0.6 < braking_m < 0.7
+        assert task.course().outline_m()[-1, 0] > end_m + 2.0
+        assert bounds.clearance_m(np.zeros((1, 3)))[0] == pytest.approx(0.3, abs=0.01)
+
+
+def test_all_planners_drive_the_same_corridors(tmp_path, monkeypatch):
+    seen = []
+
+    def drive(rng, *, contender, setup_of, **more):
+        seen.append((contender, setup_of(rng).config.fence, more["learning_s"]))
+        return Driver()(rng)
+
+    monkeypatch.setattr(fence, "alone_drive", drive)
+    driven = campaign(tmp_path, alone=2)
+    gather_corridors(driven, FenceOptions(alone=2))
+    assert [one for one, *_ in seen] == [each for each in CONTENDERS.values() for _ in range(2)]
+    assert [room for _, room, _ in seen[:2]] * len(CONTENDERS) == [room for _, room, _ in seen]
+    assert seen[0][1] != seen[1][1]
+    assert {learning_s for *_, learning_s in seen} == {0.0}
+    names = [row["drives"] for row in driven.result.rows()]
+    assert names[0] == "guard off: corridor, point model"
+    assert names[-1] == "guard off: corridor, sigma points, adapting"
 
 
 def test_in_a_tight_room_the_robot_on_its_line_comes_as_near_as_is_said():
