@@ -14,8 +14,8 @@ PAGE = ROOT / "docs/add-an-effect.md"
 
 
 def effect_of_the_page() -> str:
-    """The file that docs/add-an-effect.md shows."""
-    return _block("python")
+    """Return the example of docs/add-an-effect.md."""
+    return (ROOT / "docs/examples/speed_drag.py").read_text(encoding="utf-8")
 
 
 def entry_points_of_the_page() -> dict[str, str]:

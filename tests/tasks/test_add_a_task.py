@@ -1,8 +1,7 @@
-"""docs/add-a-task.md, as it stands there: its one file makes a kind of task that everything takes."""
+"""docs/add-a-task.md: its example, one file, makes a kind of task that everything takes."""
 
 from __future__ import annotations
 
-import re
 import shutil
 import sys
 from pathlib import Path
@@ -23,12 +22,13 @@ from disco_hw.viewer.timeline import Timeline
 from tests.runtime.path_robot import ROBOTS
 
 DOCUMENT = Path(__file__).parents[2] / "docs/add-a-task.md"
+EXAMPLE = DOCUMENT.parent / "examples/square.py"
 
 
 @pytest.fixture
 def square(tmp_path):
     """The robot with the task of the page, whose file lies beside those of the package."""
-    (example,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text("utf-8"), re.DOTALL)
+    example = EXAMPLE.read_text("utf-8")
     folder = tmp_path / "kinds"
     folder.mkdir()
     (folder / "square.py").write_text(example)
@@ -45,7 +45,7 @@ def square(tmp_path):
 
 
 def test_the_page_names_every_member_of_a_task():
-    table = DOCUMENT.read_text("utf-8").split("```python")[0]
+    table = DOCUMENT.read_text("utf-8")
     members = {name for name in vars(RobotTask) if not name.startswith("_")} - {"speed_m_s"}
     members |= {name for name in RobotTask.__annotations__ if not name.startswith("_")}
     assert {name for name in members if f"`{name}`" not in table} == set()

@@ -1,7 +1,6 @@
-"""The driver that docs/add-a-motor-driver.md shows passes the suite, and robot.toml takes its name."""
+"""The driver of docs/add-a-motor-driver.md passes the suite, and robot.toml takes its name."""
 
 import math
-import re
 import struct
 from pathlib import Path
 from types import ModuleType
@@ -19,10 +18,10 @@ from tests.drivers.motor.bench import Bench
 from tests.drivers.motor.conformance import DriverConformance
 from tests.drivers.motor.test_motor_drivers import robot_toml
 
-PAGE = Path(__file__).parents[3] / "docs/add-a-motor-driver.md"
-(CODE,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
+EXAMPLE = Path(__file__).parents[3] / "docs/examples/toy.py"
+CODE = EXAMPLE.read_text(encoding="utf-8")
 toy = ModuleType("toy")
-exec(compile(CODE, str(PAGE), "exec"), toy.__dict__)
+exec(compile(CODE, str(EXAMPLE), "exec"), toy.__dict__)
 
 TICKS_PER_REV = 1000
 WATCHDOG_NS = 100_000_000
@@ -126,7 +125,7 @@ def test_robot_toml_may_not_ask_for_more_than_its_limits(tmp_path, max_speed_rad
 
 @pytest.fixture
 def in_the_folder(tmp_path, monkeypatch):
-    """The file of the page as if it lay in drivers/motor."""
+    """The example as if it lay in drivers/motor."""
     (tmp_path / "toy.py").write_text(CODE, encoding="utf-8")
     monkeypatch.setattr(drivers.motor, "__path__", [*drivers.motor.__path__, str(tmp_path)])
     motor_drivers.cache_clear()

@@ -1,4 +1,4 @@
-"""The source that docs/add-a-pose-source.md shows gives poses from real datagrams, and robot.toml takes its name."""
+"""The source that docs/add-a-pose-source.md explains gives poses from real datagrams, and robot.toml takes its name."""
 
 import math
 import re
@@ -17,14 +17,14 @@ from tests.config.test_robot import GOOD
 from tests.drivers.waiting import free_port
 
 ROOT = Path(__file__).parents[3]
-PAGE = ROOT / "docs/add-a-pose-source.md"
-(CODE,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
+EXAMPLE = ROOT / "docs/examples/beacon.py"
+CODE = EXAMPLE.read_text(encoding="utf-8")
 FROM_ROBOT = (PoseSample(1, 2, 0.0, 0.0, 0.0, 0.01, 0.02),)
 
 
 @pytest.fixture
 def _in_the_folder(tmp_path, monkeypatch):
-    """The file of the page as if it lay in drivers/pose."""
+    """The example as if it lay in drivers/pose."""
     (tmp_path / "beacon.py").write_text(CODE, encoding="utf-8")
     monkeypatch.setattr(drivers.pose, "__path__", [*drivers.pose.__path__, str(tmp_path)])
     pose_sources.cache_clear()

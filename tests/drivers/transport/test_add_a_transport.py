@@ -1,7 +1,6 @@
-"""The medium that docs/add-a-transport.md shows carries frames, over real sockets, and is found by its kind."""
+"""The medium that docs/add-a-transport.md explains carries frames, over real sockets, and is found by its kind."""
 
 import errno
-import re
 import socket
 import time
 from pathlib import Path
@@ -14,13 +13,13 @@ from drivers.transport import TransportSettingsError, make_transport, media
 from drivers.types import Frame, LinkState
 from tests.drivers.waiting import collect, outgoing, send, wait_until
 
-PAGE = Path(__file__).parents[3] / "docs/add-a-transport.md"
-(CODE,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
+EXAMPLE = Path(__file__).parents[3] / "docs/examples/udp.py"
+CODE = EXAMPLE.read_text(encoding="utf-8")
 
 
 @pytest.fixture
 def _in_the_folder(tmp_path, monkeypatch):
-    """The file of the page as if it lay in drivers/transport."""
+    """The example as if it lay in drivers/transport."""
     (tmp_path / "udp.py").write_text(CODE, encoding="utf-8")
     monkeypatch.setattr(drivers.transport, "__path__", [*drivers.transport.__path__, str(tmp_path)])
     media.cache_clear()

@@ -1,6 +1,5 @@
 """The formats that can be imported, and a new one made as docs/add-a-log-format.md says."""
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from disco_hw.log.importing import format_of, import_log, log_formats
 from disco_hw.log.load import load_drive
 from tests.inference.test_infer_command import ROBOT
 
-PAGE = Path(__file__).parents[3] / "docs" / "add-a-log-format.md"
+EXAMPLE = Path(__file__).parents[3] / "docs/examples/wheel_text.py"
 
 
 @pytest.fixture
@@ -20,8 +19,7 @@ def page_format(tmp_path, monkeypatch):
     """The page's file in the package of the formats."""
     package = tmp_path / "formats"
     package.mkdir()
-    (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.S)
-    (package / "wheel_text.py").write_text(code)
+    (package / "wheel_text.py").write_text(EXAMPLE.read_text(encoding="utf-8"))
     monkeypatch.setattr(disco_hw.log.importing, "__path__", [*disco_hw.log.importing.__path__, str(package)])
     log_formats.cache_clear()
     yield
