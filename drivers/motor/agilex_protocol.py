@@ -176,6 +176,7 @@ def safety_card(settings: AgilexSettings) -> SafetyCard:
         f"{TIMEOUT_S * settings.max_speed_m_s:.2f} m before it begins",
         reaction_s=TIMEOUT_S,
         brakes=True,
+        stops_by_own_ramp=True,
         estop="no frame for it: zero speed and standby are sent, and nothing latches them but this driver; use the "
         "buttons on the base. Whoever holds the remote control comes first",
         wheel_fault="zero and standby at once; no frame takes the torque off its motors, and what a lost encoder does "

@@ -254,6 +254,7 @@ def safety_card(settings: Ros2BaseSettings) -> SafetyCard:
         f"{(DEADMAN_S + base_s) * settings.max_speed_m_s:.2f} m before it begins, if command and network fail together",
         reaction_s=DEADMAN_S + base_s,
         brakes=True,
+        stops_by_own_ramp=True,
         estop="zero speed, which the bridge repeats and latches until it is reset, as long as it lives and the network "
         "carries it; whoever else may speak on the topic can move the base: use the button on it",
         wheel_fault="the bridge says zero at once and stands by; no topic takes the torque off the motors: a base "

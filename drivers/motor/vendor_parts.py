@@ -126,15 +126,6 @@ def limits(fastest: Limit, timeout: Limit, stop_deceleration_rad_s2: float) -> L
     return Limits(max_wheel_speed_rad_s=fastest, command_timeout_s=timeout, stop_deceleration_rad_s2=slows)
 
 
-def body_speeds(
-    left_rad_s: float, right_rad_s: float, wheel_radius_m: float, track_m: float, max_speed_m_s: float
-) -> tuple[float, float]:
-    """Forward speed (m/s) and turn rate (rad/s) of wheel speeds; both scaled down where the base can do less."""
-    left, right = wheel_radius_m * left_rad_s, wheel_radius_m * right_rad_s
-    scale = min(1.0, max_speed_m_s / max(abs(left), abs(right), 1e-9))
-    return scale * (left + right) / 2.0, scale * (right - left) / track_m
-
-
 def check_command(command: WheelCommand | None) -> None:
     """Raise ValueError for a command that is not finite or valid for no time."""
     if command is not None and not (
