@@ -46,6 +46,8 @@ _HOST_COMMANDS = frozenset({protocol.MOTION_COMMAND, protocol.CONTROL_MODE, prot
 class AgilexPort(BodyPort):
     """Port of `VendorDriver` for AgileX bases."""
 
+    settings: AgilexSettings
+
     def __init__(self, settings: AgilexSettings) -> None:
         self.settings = settings
         self.table = Table(
@@ -77,9 +79,10 @@ class AgilexPort(BodyPort):
     @property
     def limits(self) -> Limits:
         """Limits that robot.toml declares of the base, and the time-out that all of them have."""
-        fastest_rad_s = self.settings.max_speed_m_s / self.settings.wheel_radius_m
         return parts.limits(
-            Limit(fastest_rad_s, "robot.toml"), Limit(TIMEOUT_S, "fixed"), self.table.stop_deceleration_rad_s2
+            Limit(self.settings.fastest_rad_s, "robot.toml"),
+            Limit(TIMEOUT_S, "fixed"),
+            self.table.stop_deceleration_rad_s2,
         )
 
     @property
@@ -94,7 +97,8 @@ class AgilexPort(BodyPort):
         """Forget the base's state."""
         self._state_ns: int | None = None
         self._motion_ns: int | None = None
-        self._vehicle, self._mode, self._error, self._stands = protocol.NORMAL, protocol.STANDBY, 0, True
+        self._vehicle, self._mode, self._error = protocol.NORMAL, protocol.STANDBY, 0
+        self._is_still = True
         self._speed = (0.0, 0.0)
         for side in self._driven_mm:
             side.begin_anew()
@@ -116,7 +120,7 @@ class AgilexPort(BodyPort):
                 self._error, self._state_ns = int(values["error_code"]), received.t_ns
                 return Heard(is_status=True)
             case "motion_state":
-                self._motion_ns, self._stands = received.t_ns, stands(decoded)
+                self._motion_ns, self._is_still = received.t_ns, stands(decoded)
                 self._speed = (float(values["linear_m_s"]), float(values["angular_rad_s"]))
             case "odometry":
                 counts = (int(values["left_mm"]), int(values["right_mm"]))
@@ -163,6 +167,10 @@ class AgilexPort(BodyPort):
     def stop_frames(self) -> tuple[Frame, ...]:
         """Return the frames that command zero and standby."""
         return stop_frames(self.settings)
+
+    @property
+    def _stands(self) -> bool:
+        return self._is_still
 
     def _motion(self, linear_m_s: float, angular_rad_s: float) -> Frame:
         return protocol.motion(linear_m_s, angular_rad_s)

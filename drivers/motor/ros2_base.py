@@ -41,6 +41,8 @@ SILENT_NS, GONE_NS = 250_000_000, 1_000_000_000
 class Ros2BasePort(BodyPort):
     """Port of `VendorDriver` for bases on ROS 2."""
 
+    settings: wire.Ros2BaseSettings
+
     def __init__(self, settings: wire.Ros2BaseSettings) -> None:
         self.settings = settings
         self._check_sum = settings.check_sum()

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 import msgspec
 from msgspec.structs import replace
@@ -54,14 +53,6 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
     idle: Idle = Stage.REST
     after_loss: Idle = Stage.REST
     begins: Idle = Stage.REST
-
-
-class BodySettings(Protocol):
-    """Settings of a base that takes speeds of its body: the nominal geometry, and what it can do."""
-
-    wheel_radius_m: float
-    track_m: float
-    max_speed_m_s: float
 
 
 class Source(msgspec.Struct, frozen=True):
@@ -207,8 +198,7 @@ class Port(ABC):
 class BodyPort(Port):
     """Port of a base that takes speed and turn rate of its body, and makes wheel speeds of them by its own track."""
 
-    settings: BodySettings
-    _stands: bool
+    settings: parts.BodySettings
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
         """Return the frame that commands the body's motion, by the nominal geometry."""
@@ -223,6 +213,11 @@ class BodyPort(Port):
             self._repeat_ns = now_ns
             return self._stand_by(), True
         return (self._motion(0.0, 0.0),), False
+
+    @property
+    @abstractmethod
+    def _stands(self) -> bool:
+        """Whether the base says that it does not move."""
 
     @abstractmethod
     def _motion(self, linear_m_s: float, angular_rad_s: float) -> Frame:
