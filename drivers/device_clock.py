@@ -5,14 +5,20 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
+# Time stamps on the wire have 40 bits.
 DEVICE_CLOCK_MODULUS_US = 1 << 40
+# The stages of the clock filter of RFC 5905; half of them is enough to have met one short round trip. Chosen.
 WINDOW = 8
 SYNCED_AFTER = 4
+# Two crystals of 100 ppm each; the spread of what is expected at first is that of one.
 MAX_SKEW = 200e-6
-SLEW_RATE = 1e-3
-RESTART_NS = 100_000_000
-HOLDOVER_NS = 30_000_000_000
 _SKEW_STD = 100e-6
+# How fast a correction is spread, five times faster than the clocks can part. Chosen.
+SLEW_RATE = 1e-3
+# At MAX_SKEW the clocks part by 6 ms in the holdover: an offset beyond RESTART_NS is no skew. Chosen.
+HOLDOVER_NS = 30_000_000_000
+RESTART_NS = 100_000_000
+# Crystals drift with temperature, and no exchange is better than its time stamps. Chosen.
 _SKEW_WALK_PER_SQRT_S = 1e-6
 _FLOOR_NS = 50_000.0
 

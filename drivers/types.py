@@ -259,8 +259,8 @@ class SafetyCard:
 
     `reaction_s`: how long the wheels may still be driven after the host has fallen silent. `brakes`: whether they are
     braked then, or coast. `wheel_fault`: how this computer stops wheels of which one does not obey, without a ramp that
-    would need its encoder. `unverified`: what this computer could not find out. `setup`: what the controller must be
-    set to.
+    would need its encoder; `stops_by_own_ramp`: the controller slows down by a ramp of its own then. `unverified`: what
+    this computer could not find out. `setup`: what the controller must be set to.
     """
 
     host_silent: str
@@ -269,6 +269,7 @@ class SafetyCard:
     brakes: bool
     estop: str
     wheel_fault: str = "by the ramp of every stop"
+    stops_by_own_ramp: bool = False
     unverified: tuple[str, ...] = ()
     setup: tuple[str, ...] = ()
 

@@ -143,3 +143,10 @@ def test_a_long_sentence_would_be_seen(tmp_path):
         "# A title\n\nIt is short. `code` begins another [linked](there.md) one.\n\n| a | table. |\n", "utf-8"
     )
     assert sentences(page) == ["It is short.", "`code` begins another linked one."]
+
+
+def test_each_tool_has_its_line_and_each_line_its_tool():
+    named = set(re.findall(r"`(\w+\.(?:py|c))`", (ROOT / "tools" / "README.md").read_text(encoding="utf-8")))
+    there = {path.name for path in (ROOT / "tools").rglob("*.[pc]*") if path.suffix in {".py", ".c"}}
+    vectors = {path.name for path in (ROOT / "tools" / "vectors").glob("*.py")}
+    assert named == there - vectors - {"__init__.py"}

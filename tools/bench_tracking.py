@@ -2,7 +2,7 @@
 
 Wheel radius, axle and x_icr of every robot are off by up to 15 %, and nobody is told; the motors' lag and dead band are
 known to all. From rest on the line; figures are of 5 to 30 s, at 50 plans a second. The gains of the classical ones
-were found on robots 0 to 4 (`python -m tools.tune_baselines`); these are robots 1000 on, or others with `--first`.
+were found on robots 0 to 4 (`docs/results.md`); these are robots 1000 on, or others with `--first`.
 Names that begin with `mujoco` drive the robot of `tools/mujoco_plant.py`.
 
 `python -m tools.bench_tracking disco_adapting circle,square 20` drives some of it; `... starts 20` begins anywhere.

@@ -3,8 +3,8 @@
 A follower has the reference along the line, the place on it and the wheels of a motion; a steering law (pure pursuit,
 Kanayama's, a linear-quadratic regulator) says how it turns. All laws act on the centre of rotation, which moves as a
 unicycle, beside the reference motion of `Reference`; the integral is of the tracked point's distance from the line.
-Gains are what `python -m tools.tune_baselines` found; those of the regulator are chosen. `WithFallback` lets one take
-over for as long as DISCO finds nothing valid, where robot.toml asks for one.
+Gains are what a simplex search on five training robots found; those of the regulator are chosen. `WithFallback` lets
+one take over for as long as DISCO finds nothing valid, where robot.toml asks for one.
 """
 
 from __future__ import annotations

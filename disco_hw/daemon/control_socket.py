@@ -31,11 +31,13 @@ from disco_hw.runtime.robot_setup import asked_of, limits
 from drivers.private_files import why_not_private
 from drivers.types import Driver
 
+# A poll is a part of the control loop's tick: what all clients together can make it do in one is bounded. Chosen.
 _MAX_CLIENTS = 8
 _ACCEPTS_PER_POLL = 4
 _BYTES_PER_POLL = 1024
-_MAX_LINE_BYTES = 4096
 _REQUESTS_PER_POLL = 4
+# What a client may leave lying about here: a request not ended, requests not answered, replies not read. Chosen.
+_MAX_LINE_BYTES = 4096
 _MAX_WAITING = 16
 _MAX_UNREAD_BYTES = 65536
 _ESTOP = "estop"

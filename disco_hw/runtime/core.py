@@ -124,7 +124,9 @@ class DaemonCore:
         self.recorder = recorder
         self.adaptation = adaptation or NoAdaptation()
         self._plausibility = Plausibility()
-        self._wheel_faults = WheelFaults(find_driver(config.link.driver).takes_body_speeds)
+        kind = find_driver(config.link.driver)
+        card = kind.safety_card(config.link.settings())
+        self._wheel_faults = WheelFaults(kind.takes_body_speeds, card.stops_by_own_ramp)
         robot = config.robot
         self.directions: Directions | None = Directions(robot.wheel_radius_m, robot.axial_distance_m, config.wheels)
         """None where somebody finds out how the wheels are wired, and looks at them: no fault of one stops it then."""

@@ -32,8 +32,8 @@ MISSING_RAD = 0.08
 SHORTEST_NS = 300_000_000
 """A wheel may stand for less against a stone."""
 LONGEST_NS = 400_000_000
-"""So long after the first sign at most is waited for poses that tell the cause; not with a base that stops by its own
-ramp.
+"""So long after the first sign at most is waited for poses that tell the cause; not with a controller that stops
+by a ramp of its own, which takes longer.
 """
 UNKNOWN_LOSS_RAD_S = 1.5
 """Dead band and stiction of a wheel that has not turned since it stood."""
@@ -219,12 +219,12 @@ class WheelFaults:
     """Pure, one step a tick and, after it, the command that the tick sent.
 
     `events` of a step say when a wheel begins not to follow; `not_following` counts them. `takes_body_speeds`: the base
-    makes wheel speeds of its own.
+    makes wheel speeds of its own. `stops_by_own_ramp`: see `SafetyCard`.
     """
 
-    def __init__(self, takes_body_speeds: bool = False) -> None:
+    def __init__(self, takes_body_speeds: bool = False, stops_by_own_ramp: bool = False) -> None:
         self._turn_part = BODY_TURN_PART if takes_body_speeds else 1.0
-        self._longest_ns = SHORTEST_NS if takes_body_speeds else LONGEST_NS
+        self._longest_ns = SHORTEST_NS if stops_by_own_ramp else LONGEST_NS
         self._wheels = (_Wheel(), _Wheel())
         self._travel = PoseTravel()
         self._commands: deque[tuple[int, tuple[_Asked, _Asked]]] = deque()

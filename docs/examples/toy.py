@@ -14,6 +14,7 @@ from drivers.motor.vendor_driver import (
     Heard,
     Objection,
     Pending,
+    Port,
     Source,
     Table,
     VendorDriver,
@@ -28,8 +29,8 @@ SILENT_NS, GONE_NS = 200_000_000, 500_000_000
 DECELERATION_RAD_S2 = 20.0
 
 
-class ToyPort:
-    """Satisfies `drivers.motor.vendor_driver.Port`."""
+class ToyPort(Port):
+    """Port of `VendorDriver` for the toy controller."""
 
     def __init__(self):
         self.table = Table(stop_deceleration_rad_s2=DECELERATION_RAD_S2, zeros_to_arm=0)
@@ -68,9 +69,6 @@ class ToyPort:
         self._state_ns, self._state, self._armed_session, self._cause = None, IDLE, 0, 0
         for side in self._turned:
             side.begin_anew()
-
-    def end_drive(self):
-        """Nothing to prepare: each tick has its frame."""
 
     def take(self, received, permit):
         can_id, data = received.frame.can_id, received.frame.data
@@ -118,12 +116,6 @@ class ToyPort:
 
     def rest(self, now_ns, permit):
         return (self._command(RESET if permit.wanted is Request.RESET else STAND_BY),)
-
-    def may_reset(self, now_ns):
-        return True
-
-    def questions(self, now_ns, permit):
-        return ()
 
     def stop_frames(self):
         return (Frame(STOP_ID, b""),)

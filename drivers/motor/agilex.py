@@ -16,6 +16,7 @@ from drivers.motor.vendor_driver import (
     IMPLAUSIBLE,
     REJECTED_LENGTH,
     UNKNOWN,
+    BodyPort,
     Heard,
     Objection,
     Pending,
@@ -30,31 +31,29 @@ from drivers.types import (
     Limit,
     Limits,
     MotorDriver,
-    OutgoingFrame,
     ReceivedFrame,
     Request,
     WheelSample,
 )
 
 STATE_SILENT_NS, MOTION_SILENT_NS, GONE_NS = 350_000_000, 100_000_000, 1_000_000_000
-BRAKING_NS = 3_000_000_000
-_REPEAT_NS = 100_000_000
 _WARNINGS = 0x0606
 """Bits of the error word that only warn, in the SDK's byte and in the manual's: battery low, remote control lost."""
 _MODES = {protocol.STANDBY: "standby", protocol.UART_MODE: "serial mode", protocol.RC_MODE: "remote control"}
 _HOST_COMMANDS = frozenset({protocol.MOTION_COMMAND, protocol.CONTROL_MODE, protocol.STATE_RESET, protocol.BRAKE})
 
 
-class AgilexPort:
-    """Port of `VendorDriver` for AgileX bases (a `drivers.motor.vendor_driver.Port`)."""
+class AgilexPort(BodyPort):
+    """Port of `VendorDriver` for AgileX bases."""
+
+    settings: AgilexSettings
 
     def __init__(self, settings: AgilexSettings) -> None:
-        self._settings = settings
+        self.settings = settings
         self.table = Table(
             stop_deceleration_rad_s2=settings.stop_deceleration_rad_s2, watchdog_s=TIMEOUT_S, zeros_to_arm=5
         )
         self._driven_mm = (parts.Odometer(), parts.Odometer())
-        self._repeat_ns = 0
         self.begin_anew(0)
 
     @property
@@ -80,9 +79,10 @@ class AgilexPort:
     @property
     def limits(self) -> Limits:
         """Limits that robot.toml declares of the base, and the time-out that all of them have."""
-        fastest_rad_s = self._settings.max_speed_m_s / self._settings.wheel_radius_m
         return parts.limits(
-            Limit(fastest_rad_s, "robot.toml"), Limit(TIMEOUT_S, "fixed"), self.table.stop_deceleration_rad_s2
+            Limit(self.settings.fastest_rad_s, "robot.toml"),
+            Limit(TIMEOUT_S, "fixed"),
+            self.table.stop_deceleration_rad_s2,
         )
 
     @property
@@ -97,20 +97,17 @@ class AgilexPort:
         """Forget the base's state."""
         self._state_ns: int | None = None
         self._motion_ns: int | None = None
-        self._vehicle, self._mode, self._error, self._stands = protocol.NORMAL, protocol.STANDBY, 0, True
+        self._vehicle, self._mode, self._error = protocol.NORMAL, protocol.STANDBY, 0
+        self._is_still = True
         self._speed = (0.0, 0.0)
         for side in self._driven_mm:
             side.begin_anew()
-
-    def end_drive(self) -> None:
-        """Zero and standby are due at once where it still listens."""
-        self._repeat_ns = 0
 
     def take(self, received: ReceivedFrame, permit: MotionPermit) -> Heard:
         """Take in a frame of the base, or of another host."""
         frame = received.frame
         if not frame.extended and frame.can_id in _HOST_COMMANDS:
-            if frame not in stop_frames(self._settings):
+            if frame not in stop_frames(self.settings):
                 return Heard(counts=("unknown_id",), commanded="the base")
             return Heard(counts=("unknown_id",), is_stop=frame.can_id == protocol.CONTROL_MODE)
         decoded = protocol.decode(frame)
@@ -123,7 +120,7 @@ class AgilexPort:
                 self._error, self._state_ns = int(values["error_code"]), received.t_ns
                 return Heard(is_status=True)
             case "motion_state":
-                self._motion_ns, self._stands = received.t_ns, stands(decoded)
+                self._motion_ns, self._is_still = received.t_ns, stands(decoded)
                 self._speed = (float(values["linear_m_s"]), float(values["angular_rad_s"]))
             case "odometry":
                 counts = (int(values["left_mm"]), int(values["right_mm"]))
@@ -159,44 +156,30 @@ class AgilexPort:
             return Pending(why=why, frames=(protocol.control_mode(protocol.CAN_MODE),))
         return None
 
-    def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """Return the frames that command the body's motion, by the nominal geometry."""
-        it = self._settings
-        body = parts.body_speeds(left_rad_s, right_rad_s, it.wheel_radius_m, it.track_m, it.max_speed_m_s)
-        return (protocol.motion(*body),)
-
-    def brake(self, now_ns: int, lasts_ns: int) -> tuple[Sequence[Frame], bool]:
-        """Zero speed until it stands, then standby."""
-        if self._stands or lasts_ns > BRAKING_NS:
-            self._repeat_ns = now_ns
-            return self.stop_frames(), True
-        return (protocol.motion(0.0, 0.0),), False
-
     def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
         """Bring a base that listens to CAN to standby, standing; clear errors when requested."""
-        if now_ns - self._repeat_ns < _REPEAT_NS:
-            return ()
         seen = self.seen
         clears = permit.wanted is Request.RESET and (seen.missing or seen.stopped or seen.faulty)
-        if not clears and not seen.energised:
+        if not (clears or seen.energised) or not self._is_due(now_ns):
             return ()
-        self._repeat_ns = now_ns
         return (protocol.clear_errors(),) if clears else self.stop_frames()
-
-    def may_reset(self, now_ns: int) -> bool:
-        """Whatever matters is seen."""
-        return True
-
-    def questions(self, now_ns: int, permit: MotionPermit) -> tuple[OutgoingFrame, ...]:
-        """Return no frames: the base sends everything by itself."""
-        return ()
 
     def stop_frames(self) -> tuple[Frame, ...]:
         """Return the frames that command zero and standby."""
-        return stop_frames(self._settings)
+        return stop_frames(self.settings)
+
+    @property
+    def _stands(self) -> bool:
+        return self._is_still
+
+    def _motion(self, linear_m_s: float, angular_rad_s: float) -> Frame:
+        return protocol.motion(linear_m_s, angular_rad_s)
+
+    def _stand_by(self) -> tuple[Frame, ...]:
+        return self.stop_frames()
 
     def _take_odometry(self, counts_mm: tuple[int, int], t_ns: int, looked_ns: int) -> Heard:
-        fastest = 1.5e3 * self._settings.max_speed_m_s
+        fastest = 1.5e3 * self.settings.max_speed_m_s
         plausible = [
             side.take_wrapping(count, t_ns, looked_ns, fastest, 10.0)
             for side, count in zip(self._driven_mm, counts_mm, strict=True)
@@ -207,7 +190,7 @@ class AgilexPort:
         return Heard(counts=IMPLAUSIBLE, wheels=wheels, lost="the base has restarted: its odometry jumped")
 
     def _sample(self, t_ns: int) -> WheelSample:
-        radius, track = self._settings.wheel_radius_m, self._settings.track_m
+        radius, track = self.settings.wheel_radius_m, self.settings.track_m
         linear, angular = self._speed
         left, right = (1e-3 * side.total / radius for side in self._driven_mm)
         speeds = (linear - 0.5 * track * angular, linear + 0.5 * track * angular)

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated, Any
 
-import msgspec
 from msgspec import Meta
 
+from drivers.motor.vendor_parts import BodySettings
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 MOTION_COMMAND, LIGHT_COMMAND, BRAKE, CONTROL_MODE, STATE_RESET = 0x111, 0x121, 0x131, 0x421, 0x441
@@ -125,16 +125,9 @@ max_speed_m_s = 1.5
 """
 
 
-class AgilexSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Settings of AgileX bases in [link], which turn wheel speeds into speeds of the body and back.
+class AgilexSettings(BodySettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Settings of AgileX bases in [link], which turn wheel speeds into speeds of the body and back."""
 
-    `wheel_radius_m` and `track_m` are the nominal ones: write those of [robot], and leave them when the model learns
-    others. `max_speed_m_s` is what the base can do.
-    """
-
-    wheel_radius_m: Annotated[float, Meta(gt=0.0, le=2.0)]
-    track_m: Annotated[float, Meta(gt=0.0, le=5.0)]
-    max_speed_m_s: Annotated[float, Meta(gt=0.0, le=10.0)]
     stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
 
     def fault(self) -> SettingsFault | None:
@@ -176,6 +169,7 @@ def safety_card(settings: AgilexSettings) -> SafetyCard:
         f"{TIMEOUT_S * settings.max_speed_m_s:.2f} m before it begins",
         reaction_s=TIMEOUT_S,
         brakes=True,
+        stops_by_own_ramp=True,
         estop="no frame for it: zero speed and standby are sent, and nothing latches them but this driver; use the "
         "buttons on the base. Whoever holds the remote control comes first",
         wheel_fault="zero and standby at once; no frame takes the torque off its motors, and what a lost encoder does "

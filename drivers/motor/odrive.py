@@ -27,10 +27,12 @@ from drivers.motor.permit import Controllers, MotionPermit, Stage
 from drivers.motor.vendor_driver import (
     IMPLAUSIBLE,
     REJECTED_LENGTH,
+    REPEAT_NS,
     UNKNOWN,
     Heard,
     Objection,
     Pending,
+    Port,
     Source,
     Table,
     VendorDriver,
@@ -42,7 +44,6 @@ from drivers.types import (
     Limit,
     Limits,
     MotorDriver,
-    OutgoingFrame,
     ReceivedFrame,
     Request,
     WheelSample,
@@ -52,7 +53,6 @@ BEATS_TO_ARM = 2
 SILENT_BEATS = 3
 # Less, and a pause of the host of a few beats would be taken for the silence of an axis.
 SILENT_AT_LEAST_NS = 100_000_000
-_REPEAT_NS = 100_000_000
 _STANDS_RAD_S = 0.1
 _CLOSED_LOOP_STEP = 3
 _ESTOP = 0x02
@@ -72,8 +72,8 @@ class _Axis:
     turned: parts.Odometer = field(default_factory=parts.Odometer)
 
 
-class OdrivePort:
-    """Port of `VendorDriver` for ODrive boards (a `drivers.motor.vendor_driver.Port`)."""
+class OdrivePort(Port):
+    """Port of `VendorDriver` for ODrive boards. Asks nothing but at rest: it would feed the watchdogs."""
 
     def __init__(self, settings: OdriveSettings) -> None:
         self._settings = settings
@@ -82,7 +82,7 @@ class OdrivePort:
         self._sides = [[_Axis(node) for node in side] for side in parts.sides_of(settings.nodes)]
         self._axes = {axis.node: axis for side in self._sides for axis in side}
         self._questions = Questions(settings)
-        self._arm_step = self._repeat_ns = 0
+        self._arm_step = 0
 
     @property
     def seen(self) -> Controllers:
@@ -132,10 +132,6 @@ class OdrivePort:
             axis.heard_ns = None
             axis.state, axis.error, axis.beats_armed = AxisState.UNDEFINED, 0, 0
             axis.turned.begin_anew()
-
-    def end_drive(self) -> None:
-        """Idle is due at once for all that are still energised."""
-        self._repeat_ns = 0
 
     def take(self, received: ReceivedFrame, permit: MotionPermit) -> Heard:
         """Take in a frame of an axis, or of another host."""
@@ -226,27 +222,16 @@ class OdrivePort:
 
     def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
         """Bring axes that are energised to idle; reset; learn the version; keep idle axes from a watchdog error."""
-        since_ns = now_ns - self._repeat_ns
         if self._any_closed_loop:
-            if since_ns < _REPEAT_NS:
-                return ()
-            self._repeat_ns = now_ns
-            return self._state_frames(AxisState.IDLE)
+            return self._state_frames(AxisState.IDLE) if self._is_due(now_ns) else ()
         if permit.wanted is Request.RESET and self._may_be_cleared:
-            if since_ns < 2 * _REPEAT_NS:
-                return ()
-            self._repeat_ns = now_ns
-            return self._clear_frames()
+            return self._clear_frames() if self._is_due(now_ns, 2 * REPEAT_NS) else ()
         return self._questions.due(now_ns, all(axis.heard_ns is not None for axis in self._all))
 
     def may_reset(self, now_ns: int) -> bool:
         """Whether errors were cleared a while ago, and none has come since."""
-        is_cleared = self._repeat_ns and now_ns - self._repeat_ns >= _REPEAT_NS
+        is_cleared = self._repeat_ns and now_ns - self._repeat_ns >= REPEAT_NS
         return bool(is_cleared and self._may_be_cleared) and not any(axis.error for axis in self._all)
-
-    def questions(self, now_ns: int, permit: MotionPermit) -> tuple[OutgoingFrame, ...]:
-        """None but at rest: they would feed the watchdogs."""
-        return ()
 
     def stop_frames(self) -> tuple[Frame, ...]:
         """Return the e-stop frames to every axis."""

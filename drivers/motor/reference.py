@@ -12,14 +12,14 @@ from typing import Any
 
 from drivers.device_clock import DEVICE_CLOCK_MODULUS_US, DeviceClock
 from drivers.motor import reference_frames as telemetry
+from drivers.motor import reference_protocol as protocol
 from drivers.motor.reference_arming import MESSAGES as HANDSHAKE_MESSAGES
-from drivers.motor.reference_arming import ArmedWatch, Arming, Handshake, cyclic_frames
+from drivers.motor.reference_arming import ArmedWatch, Arming, Handshake
 from drivers.motor.reference_frames import FrameReception, FrameTransmission
-from drivers.motor.reference_housekeeping import HouseKeeping
+from drivers.motor.reference_protocol import HouseKeeping
 from drivers.types import (
     DriverState,
     DriverStats,
-    Frame,
     Identity,
     Limits,
     MotorDriver,
@@ -29,7 +29,6 @@ from drivers.types import (
     ReceivedFrame,
     Request,
     RobotStatus,
-    SafetyCard,
     WheelCommand,
 )
 from firmware_protocol import status_codes
@@ -453,53 +452,16 @@ def _make(_settings: NoSettings, key: bytes | None) -> ReferenceDriver:
     return ReferenceDriver(Codec(), lambda: secrets.randbits(16), key)
 
 
-def _stop_frames(_settings: NoSettings) -> tuple[Frame, ...]:
-    encoded = Codec().encode("ESTOP", reason=1)
-    return (Frame(encoded.can_id, encoded.data),)
-
-
-def _stop_confirmation(_settings: NoSettings) -> Callable[[Frame], bool]:
-    codec = Codec()
-
-    def heard(frame: Frame) -> bool:
-        decoded = None if frame.extended else codec.decode(frame.can_id, frame.data)
-        if not isinstance(decoded, Decoded) or decoded.name != "SYSTEM_STATE":
-            return False
-        return codec.choice_name("SYSTEM_STATE", "state", decoded.values["state"]) == "ESTOP"
-
-    return heard
-
-
-def _safety_card(_settings: NoSettings) -> SafetyCard:
-    return SafetyCard(
-        host_silent="the controller after 0.1 s without an accepted wheel command, by its watchdog that cannot be off",
-        stops_by="braking: it decelerates within its own limit, then brakes",
-        reaction_s=0.1,
-        brakes=True,
-        estop="a frame of any length, also from `disco-hw estop`: it decelerates, latched and confirmed",
-        wheel_fault="the motors are off (COAST) for 0.2 s, then the controller brakes without its speed loop; no ramp",
-    )
-
-
-def _recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
-    """Return an empty dict if the frames have the checksum that is the reference controller's alone, else None."""
-    reception = FrameReception(Codec())
-    believed = [reception.accept(ReceivedFrame(0, frame)) for frame in frames]
-    return {} if sum(one is not None for one in believed) >= _FRAMES_OF_OURS else None
-
-
-_FRAMES_OF_OURS = 5
-
 DRIVER = MotorDriver(
     "reference",
     _make,
-    stop_frames=_stop_frames,
-    stop_confirmation=_stop_confirmation,
-    cyclic_frames=lambda _settings, rate_hz, authenticated: cyclic_frames(
+    stop_frames=protocol.stop_frames,
+    stop_confirmation=protocol.stop_confirmation,
+    cyclic_frames=lambda _settings, rate_hz, authenticated: protocol.cyclic_frames(
         packaged_dbc(), rate_hz, authenticated=authenticated
     ),
-    safety_card=_safety_card,
-    recognise=_recognise,
+    safety_card=protocol.safety_card,
+    recognise=protocol.recognise,
     kinds=("can", "serial"),
     authenticates=True,
     tells_reception=True,

@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 import msgspec
 
-from drivers.types import CyclicFrame, Identity, Limit, Limits, Request
+from drivers.types import Identity, Limit, Limits, Request
 from firmware_protocol import status_codes
-from firmware_protocol.codec import Codec, Decoded, load_protocol
+from firmware_protocol.codec import Codec, Decoded
 from firmware_protocol.protection import COUNTER_MODULUS, challenge_answer
 
 _REMEMBERED = 256
@@ -105,24 +105,6 @@ class CommandEcho:
             if taken <= last:
                 return taken
         return last - (last - counter) % COUNTER_MODULUS
-
-
-_COMMANDS = ("WHEEL_COMMAND", "WHEEL_COMMAND_MAC")
-_AUTHENTICATION_FRAMES = ("WHEEL_COMMAND_MAC", "HOST_STATE_MAC", "MAC_CHALLENGE")
-
-
-def cyclic_frames(dbc: str, command_rate_hz: float, *, authenticated: bool = False) -> tuple[CyclicFrame, ...]:
-    """Return all frames with a cycle time (GenMsgCycleTime, ms) in the DBC's text, each page of a multiplexed one.
-
-    The wheel command counts at the rate of the control loop; proofs and their challenge only if `authenticated`.
-    """
-    frames = []
-    for message in load_protocol(dbc).messages:
-        if message.period_s is not None and (authenticated or message.name not in _AUTHENTICATION_FRAMES):
-            pages = {signal.page for signal in message.signals} - {None}
-            rate_hz = command_rate_hz if message.name in _COMMANDS else 1.0 / message.period_s
-            frames.append(CyclicFrame(message.name, message.sender, message.length, rate_hz * max(1, len(pages))))
-    return tuple(frames)
 
 
 ARMING_TIMEOUT_NS = 1_500_000_000

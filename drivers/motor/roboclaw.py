@@ -15,11 +15,13 @@ from drivers.motor import vendor_parts as parts
 from drivers.motor.permit import Controllers, MotionPermit, Stage
 from drivers.motor.roboclaw_protocol import RoboclawExchange, RoboclawSettings, question, setting, stands, stop_frames
 from drivers.motor.vendor_driver import (
+    BRAKING_NS,
     IMPLAUSIBLE,
     UNKNOWN,
     Heard,
     Objection,
     Pending,
+    Port,
     Source,
     Table,
     VendorDriver,
@@ -58,9 +60,7 @@ TO_KNOW = ("version", "velocity_pid_m1", "velocity_pid_m2", "status", "serial_ti
 
 ZEROS_TO_ARM = 5
 SILENT_NS, GONE_NS = 100_000_000, 500_000_000
-BRAKING_NS = 3_000_000_000
 _PACE_NS = 18_000_000
-_REPEAT_NS = 100_000_000
 _QUESTION_LIFE_NS = 20_000_000
 _QUESTION_RANK = 2
 _LONGEST_LIFE_NS = 60_000_000
@@ -136,8 +136,8 @@ class Board:
             motor.begin_anew()
 
 
-class RoboclawPort:
-    """Port of `VendorDriver` for RoboClaw boards (a `drivers.motor.vendor_driver.Port`)."""
+class RoboclawPort(Port):
+    """Port of `VendorDriver` for RoboClaw boards."""
 
     def __init__(self, settings: RoboclawSettings) -> None:
         self._settings = settings
@@ -150,7 +150,7 @@ class RoboclawPort:
             begins=Stage.BRAKING,
         )
         self._boards = {address: Board(address) for address in settings.addresses}
-        self._velocity_ns = self._asked_ns = self._repeat_ns = 0
+        self._velocity_ns = self._asked_ns = 0
         self._slow = 0
 
     @property
@@ -258,9 +258,8 @@ class RoboclawPort:
         without = [board.address for board in self._all if board.timeout_ds != wanted]
         if without:
             why = f"board {without[0]} does not take its serial timeout"
-            if now_ns - self._repeat_ns < _REPEAT_NS:
+            if not self._is_due(now_ns):
                 return Pending(why=why)
-            self._repeat_ns = now_ns
             sets = (setting(address, "set_serial_timeout", timeout_ds=wanted) for address in without)
             asks = (question(address, "serial_timeout") for address in without)
             return Pending(why=why, frames=tuple(frame for pair in zip(sets, asks, strict=True) for frame in pair))
@@ -299,14 +298,9 @@ class RoboclawPort:
     def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
         """Reset an e-stop that a board has latched, when requested; it ends its other errors by itself."""
         latched = [board.address for board in self._all if board.is_pressed]
-        if permit.wanted is not Request.RESET or not latched or now_ns - self._repeat_ns < _REPEAT_NS:
+        if permit.wanted is not Request.RESET or not latched or not self._is_due(now_ns):
             return ()
-        self._repeat_ns = now_ns
         return [setting(address, "reset_estop") for address in latched]
-
-    def may_reset(self, now_ns: int) -> bool:
-        """Return True: all that forbids a reset is in `seen` already."""
-        return True
 
     def questions(self, now_ns: int, permit: MotionPermit) -> tuple[OutgoingFrame, ...]:
         """Return the questions to boards with a command in this tick, or, more slowly, to boards that are stopped.

@@ -15,6 +15,7 @@ from drivers.motor.vendor_driver import (
     IMPLAUSIBLE,
     REJECTED_LENGTH,
     UNKNOWN,
+    BodyPort,
     Heard,
     Objection,
     Pending,
@@ -29,27 +30,26 @@ from drivers.types import (
     Limit,
     Limits,
     MotorDriver,
-    OutgoingFrame,
     ReceivedFrame,
     Request,
     WheelSample,
 )
 
 SILENT_NS, GONE_NS = 250_000_000, 1_000_000_000
-BRAKING_NS = 3_000_000_000
-_REPEAT_NS = 100_000_000
 
 
-class Ros2BasePort:
-    """Port of `VendorDriver` for bases on ROS 2 (a `drivers.motor.vendor_driver.Port`)."""
+class Ros2BasePort(BodyPort):
+    """Port of `VendorDriver` for bases on ROS 2."""
+
+    settings: wire.Ros2BaseSettings
 
     def __init__(self, settings: wire.Ros2BaseSettings) -> None:
-        self._settings = settings
+        self.settings = settings
         self._check_sum = settings.check_sum()
         self.table = Table(
             stop_deceleration_rad_s2=settings.stop_deceleration_rad_s2, watchdog_s=wire.DEADMAN_S, zeros_to_arm=5
         )
-        self._refusal = self._bridge_sum = self._repeat_ns = 0
+        self._refusal = self._bridge_sum = 0
         self._turned = (parts.Odometer(), parts.Odometer())
         self.begin_anew(0)
 
@@ -76,8 +76,8 @@ class Ros2BasePort:
     def limits(self) -> Limits:
         """Limits that robot.toml declares of the base, which reports none itself."""
         return parts.limits(
-            Limit(self._settings.fastest_rad_s, "robot.toml"),
-            Limit(self._settings.watchdog_s, "robot.toml"),
+            Limit(self.settings.fastest_rad_s, "robot.toml"),
+            Limit(self.settings.watchdog_s, "robot.toml"),
             self.table.stop_deceleration_rad_s2,
         )
 
@@ -95,10 +95,6 @@ class Ros2BasePort:
         self._flags, self._wheel_speeds = 0, (0.0, 0.0)
         for side in self._turned:
             side.begin_anew()
-
-    def end_drive(self) -> None:
-        """Standing by is due at once where the bridge still listens."""
-        self._repeat_ns = 0
 
     def take(self, received: ReceivedFrame, permit: MotionPermit) -> Heard:
         """Take in a frame of the bridge, or of another host."""
@@ -151,42 +147,24 @@ class Ros2BasePort:
             return Pending(why="the bridge did not begin to drive", frames=(wire.enable(True),))
         return None
 
-    def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """Return the frames that command the body's motion, by the nominal geometry."""
-        it = self._settings
-        body = parts.body_speeds(left_rad_s, right_rad_s, it.wheel_radius_m, it.track_m, it.max_speed_m_s)
-        return (wire.speeds(*body),)
-
-    def brake(self, now_ns: int, lasts_ns: int) -> tuple[Sequence[Frame], bool]:
-        """Zero speed until it stands, then stand by."""
-        if self._stands or lasts_ns > BRAKING_NS:
-            self._repeat_ns = now_ns
-            return (wire.enable(False),), True
-        return (wire.speeds(0.0, 0.0),), False
-
     def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
         """Bring the bridge to standing by, or to a stop that it does not hold yet; reset it when requested."""
         is_latched, frames = self._flags & wire.LATCHED, self.stop_frames()
         if permit.wanted is Request.RESET and is_latched:
             frames = (Frame(wire.RESET, b""),)
         elif permit.wanted is Request.RESET or not permit.estopped or is_latched:
-            frames = (wire.enable(False),) if self._flags & wire.DRIVING else ()
-        if not frames or now_ns - self._repeat_ns < _REPEAT_NS:
-            return ()
-        self._repeat_ns = now_ns
-        return frames
-
-    def may_reset(self, now_ns: int) -> bool:
-        """Whatever matters is seen."""
-        return True
-
-    def questions(self, now_ns: int, permit: MotionPermit) -> tuple[OutgoingFrame, ...]:
-        """Return no frames: the bridge sends everything by itself."""
-        return ()
+            frames = self._stand_by() if self._flags & wire.DRIVING else ()
+        return frames if frames and self._is_due(now_ns) else ()
 
     def stop_frames(self) -> tuple[Frame, ...]:
         """Return the stop that the bridge latches."""
-        return wire.stop_frames(self._settings)
+        return wire.stop_frames(self.settings)
+
+    def _motion(self, linear_m_s: float, angular_rad_s: float) -> Frame:
+        return wire.speeds(linear_m_s, angular_rad_s)
+
+    def _stand_by(self) -> tuple[Frame, ...]:
+        return (wire.enable(False),)
 
     @property
     def _missing(self) -> str | None:
@@ -195,14 +173,14 @@ class Ros2BasePort:
         if self._is_foreign_bridge:
             return "the bridge was started with another [link] of robot.toml; start it again"
         if not self._flags & wire.ODOMETRY:
-            return f"no odometry from {self._settings.wheels_from}: {wire.REFUSALS[self._refusal]}"
+            return f"no odometry from {self.settings.wheels_from}: {wire.REFUSALS[self._refusal]}"
         is_alive = self._flags & wire.HEARD and self._turned[0].last is not None
         return None if is_alive else self._unfit or "waiting for the first odometry"
 
     @property
     def _unfit(self) -> str | None:
         """Reason why the base may not be driven, whatever is requested; None if it may."""
-        topic = self._settings.speed_topic
+        topic = self.settings.speed_topic
         if self._flags & wire.OTHERS:
             return f"another node speaks on {topic}; end it, or give it a topic of its own"
         if not self._flags & wire.HEARD:
@@ -215,16 +193,16 @@ class Ros2BasePort:
 
     @property
     def _or_unheard(self) -> str:
-        return f", or {self._settings.stop_topic} says nothing" if self._settings.stop_topic else ""
+        return f", or {self.settings.stop_topic} says nothing" if self.settings.stop_topic else ""
 
     @property
     def _stands(self) -> bool:
-        return self._settings.stands(*self._wheel_speeds)
+        return self.settings.stands(*self._wheel_speeds)
 
     def _take_wheels(self, angles: tuple[int, int], data: bytes, t_ns: int, looked_ns: int) -> Heard:
         """Return a sample of ANGLES and WHEELS; what the wheels could not have turned is left out."""
         self._wheel_speeds, age_s = wire.unpack_wheels(data)
-        fastest = 1.5 * self._settings.fastest_rad_s / wire.ANGLE_RAD
+        fastest = 1.5 * self.settings.fastest_rad_s / wire.ANGLE_RAD
         plausible = [
             # Messages of a base do not come evenly.
             side.take_wrapping(angle, t_ns, looked_ns, fastest, 0.1 * fastest)

@@ -16,6 +16,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
+from drivers.motor.vendor_parts import BodySettings
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 STOP, ENABLE, SPEEDS, RESET = 0x010, 0x011, 0x012, 0x013
@@ -50,7 +51,7 @@ watchdog_s = 0.5
 """
 
 
-class Ros2BaseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class Ros2BaseSettings(BodySettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Settings of bases on ROS 2 in [link]: the base takes speeds of the body, converted from wheel speeds by these.
 
     `watchdog_s`: after what silence on its topic the base stops by itself, which nobody can read back. `wheels_topic`:
@@ -58,9 +59,6 @@ class Ros2BaseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     is pressed.
     """
 
-    wheel_radius_m: Annotated[float, Meta(gt=0.0, le=2.0)]
-    track_m: Annotated[float, Meta(gt=0.0, le=5.0)]
-    max_speed_m_s: Annotated[float, Meta(gt=0.0, le=10.0)]
     watchdog_s: Annotated[float, Meta(gt=0.0, le=1.0)]
     stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
     speed_topic: Annotated[str, Meta(min_length=1, max_length=200)] = "/cmd_vel"
@@ -84,11 +82,6 @@ class Ros2BaseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     def wheels_from(self) -> str:
         """The topic that says how the wheels turn."""
         return self.wheels_topic or ("/joint_states" if self.left_joints else "/odom")
-
-    @property
-    def fastest_rad_s(self) -> float:
-        """The wheel speed of the base's largest speed."""
-        return self.max_speed_m_s / self.wheel_radius_m
 
     def stands(self, left_rad_s: float, right_rad_s: float) -> bool:
         """Whether these are wheels of a base that does not move."""
@@ -254,6 +247,7 @@ def safety_card(settings: Ros2BaseSettings) -> SafetyCard:
         f"{(DEADMAN_S + base_s) * settings.max_speed_m_s:.2f} m before it begins, if command and network fail together",
         reaction_s=DEADMAN_S + base_s,
         brakes=True,
+        stops_by_own_ramp=True,
         estop="zero speed, which the bridge repeats and latches until it is reset, as long as it lives and the network "
         "carries it; whoever else may speak on the topic can move the base: use the button on it",
         wheel_fault="the bridge says zero at once and stands by; no topic takes the torque off the motors: a base "

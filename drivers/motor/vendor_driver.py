@@ -7,8 +7,8 @@ permit to move and hands it to the port as a value; the port never changes it.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 import msgspec
 from msgspec.structs import replace
@@ -31,6 +31,9 @@ from drivers.types import (
 )
 
 ARMING_TIMEOUT_NS = 1_500_000_000
+BRAKING_NS = 3_000_000_000
+"""Wheels that do not say by then that they stand are taken to."""
+REPEAT_NS = 100_000_000
 _LONG_AFTER_NS = 3_600_000_000_000
 
 
@@ -105,67 +108,124 @@ class Pending(msgspec.Struct, frozen=True, kw_only=True):
     is_final: bool = False
 
 
-class Port(Protocol):
-    """One vendor's protocol, as `VendorDriver` needs it. Pure: no clock, thread or I/O, and no frame makes it raise."""
+class Port(ABC):
+    """One vendor's protocol, as `VendorDriver` needs it. Pure: no clock, thread or I/O, and no frame makes it raise.
+
+    `table`: the figures of these controllers, set when it is made.
+    """
+
+    table: Table
+    _repeat_ns = 0
 
     @property
-    def table(self) -> Table:
-        """The figures of these controllers."""
-
-    @property
+    @abstractmethod
     def seen(self) -> Controllers:
         """State of the controllers, as received last."""
 
     @property
+    @abstractmethod
     def identity(self) -> Identity | None:
         """Identity of the controller; None before all of it is known."""
 
     @property
+    @abstractmethod
     def limits(self) -> Limits:
         """Limits of the controllers, and who states them; requested only when `identity` is known."""
 
     @property
+    @abstractmethod
     def is_stopped(self) -> bool:
         """Whether the controllers have confirmed, since they were met, that an e-stop holds."""
 
+    @abstractmethod
     def begin_anew(self, now_ns: int) -> None:
         """Forget what was received: the link or the controllers have restarted. What the wheels have turned stays."""
 
     def end_drive(self) -> None:
-        """Prepare the end of the drive: what stops the controllers is due at once."""
+        """Prepare the end of the drive: what is repeated to stop the controllers (`_is_due`) is due at once."""
+        self._repeat_ns = 0
 
+    @abstractmethod
     def take(self, received: ReceivedFrame, permit: MotionPermit) -> Heard:
         """Take in a frame and return what it meant."""
 
+    @abstractmethod
     def sources(self) -> Sequence[Source]:
         """Return the sources that must report again and again."""
 
+    @abstractmethod
     def objection(self, permit: MotionPermit) -> Objection | None:
         """Return why the controllers, as received last, may not be driven on; None if they may."""
 
+    @abstractmethod
     def prepare(self, now_ns: int, permit: MotionPermit) -> Pending | None:
         """Return what lacks before zeros may be commanded; None when all proof is there.
 
         Called in each tick of an arming, in the first one with `permit.lasts_ns(now_ns)` 0: proof is given anew.
         """
 
+    @abstractmethod
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
         """Return the frames that command these wheel speeds."""
 
+    @abstractmethod
     def brake(self, now_ns: int, lasts_ns: int) -> tuple[Sequence[Frame], bool]:
         """Return the frames that hold the wheels, and whether they stand; `lasts_ns` since braking began."""
 
     def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
         """Return the frames due at rest: what keeps the controllers there, resets them, asks for what is not known."""
+        return ()
 
     def may_reset(self, now_ns: int) -> bool:
         """Whether what is latched here may be cleared, by what `seen` does not show."""
+        return True
 
     def questions(self, now_ns: int, permit: MotionPermit) -> tuple[OutgoingFrame, ...]:
         """Return the questions due in this tick, after its other frames; none may feed a watchdog without a command."""
+        return ()
 
+    @abstractmethod
     def stop_frames(self) -> tuple[Frame, ...]:
         """Return the e-stop to all controllers."""
+
+    def _is_due(self, now_ns: int, every_ns: int = REPEAT_NS) -> bool:
+        """Whether what is repeated until a controller obeys is due; it then counts as sent."""
+        is_due = now_ns - self._repeat_ns >= every_ns
+        self._repeat_ns = now_ns if is_due else self._repeat_ns
+        return is_due
+
+
+class BodyPort(Port):
+    """Port of a base that takes speed and turn rate of its body, and makes wheel speeds of them by its own track."""
+
+    settings: parts.BodySettings
+
+    def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
+        """Return the frame that commands the body's motion, by the nominal geometry."""
+        it = self.settings
+        left_m_s, right_m_s = it.wheel_radius_m * left_rad_s, it.wheel_radius_m * right_rad_s
+        scale = min(1.0, it.max_speed_m_s / max(abs(left_m_s), abs(right_m_s), 1e-9))
+        return (self._motion(scale * (left_m_s + right_m_s) / 2.0, scale * (right_m_s - left_m_s) / it.track_m),)
+
+    def brake(self, now_ns: int, lasts_ns: int) -> tuple[Sequence[Frame], bool]:
+        """Zero speed until the base stands, then what makes it stand by."""
+        if self._stands or lasts_ns > BRAKING_NS:
+            self._repeat_ns = now_ns
+            return self._stand_by(), True
+        return (self._motion(0.0, 0.0),), False
+
+    @property
+    @abstractmethod
+    def _stands(self) -> bool:
+        """Whether the base says that it does not move."""
+
+    @abstractmethod
+    def _motion(self, linear_m_s: float, angular_rad_s: float) -> Frame:
+        """Return the command of these speeds of the body."""
+
+    @abstractmethod
+    def _stand_by(self) -> tuple[Frame, ...]:
+        """Return the frames after which a base that stands takes no speeds."""
 
 
 def stop_confirmation(port: Port) -> Callable[[Frame], bool]:

@@ -8,7 +8,10 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
 
 from drivers.types import (
     DriverState,
@@ -29,6 +32,22 @@ _ESTOP_RANK, _RANK = 0, 1
 Nodes = int | tuple[int, ...]
 """Ids on CAN of one side's controllers, as robot.toml names them."""
 Sign = Literal[-1, 1]
+
+
+class BodySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Settings in [link] of a base that takes speeds of its body: the nominal geometry, and what the base can do.
+
+    Write the geometry of [robot] there, and leave it when the model learns another.
+    """
+
+    wheel_radius_m: Annotated[float, Meta(gt=0.0, le=2.0)]
+    track_m: Annotated[float, Meta(gt=0.0, le=5.0)]
+    max_speed_m_s: Annotated[float, Meta(gt=0.0, le=10.0)]
+
+    @property
+    def fastest_rad_s(self) -> float:
+        """The wheel speed of the base's largest speed."""
+        return self.max_speed_m_s / self.wheel_radius_m
 
 
 @dataclass(slots=True)
@@ -124,15 +143,6 @@ def limits(fastest: Limit, timeout: Limit, stop_deceleration_rad_s2: float) -> L
     """Return the limits of controllers that this host slows down, with what robot.toml declares."""
     slows = Limit(stop_deceleration_rad_s2, "robot.toml")
     return Limits(max_wheel_speed_rad_s=fastest, command_timeout_s=timeout, stop_deceleration_rad_s2=slows)
-
-
-def body_speeds(
-    left_rad_s: float, right_rad_s: float, wheel_radius_m: float, track_m: float, max_speed_m_s: float
-) -> tuple[float, float]:
-    """Forward speed (m/s) and turn rate (rad/s) of wheel speeds; both scaled down where the base can do less."""
-    left, right = wheel_radius_m * left_rad_s, wheel_radius_m * right_rad_s
-    scale = min(1.0, max_speed_m_s / max(abs(left), abs(right), 1e-9))
-    return scale * (left + right) / 2.0, scale * (right - left) / track_m
 
 
 def check_command(command: WheelCommand | None) -> None:

@@ -16,11 +16,13 @@ from drivers.motor import vesc_codec as codec
 from drivers.motor import vesc_settings as declared
 from drivers.motor.permit import Controllers, MotionPermit, Stage
 from drivers.motor.vendor_driver import (
+    BRAKING_NS,
     IMPLAUSIBLE,
     UNKNOWN,
     Heard,
     Objection,
     Pending,
+    Port,
     Source,
     Table,
     VendorDriver,
@@ -40,7 +42,6 @@ from drivers.types import (
 ZEROS_TO_ARM = 10
 TIMEOUT_TRIES = 5
 SILENT_NS, GONE_NS = 100_000_000, 500_000_000
-BRAKING_NS = 3_000_000_000
 _PING_PERIOD_NS = 100_000_000
 _FAULT_PERIOD_NS = 50_000_000
 _POLL_PERIOD_NS = 18_000_000
@@ -79,8 +80,8 @@ class _Motor:
         self.turned.speed, self.erpm_ns = erpm / _ERPM_PER_STEP_S, t_ns
 
 
-class VescPort:
-    """Port of `VendorDriver` for VESC controllers (a `drivers.motor.vendor_driver.Port`)."""
+class VescPort(Port):
+    """Port of `VendorDriver` for VESC controllers, which need nothing at rest: released motors roll."""
 
     def __init__(self, settings: declared.VescSettings) -> None:
         self._settings = settings
@@ -139,9 +140,6 @@ class VescPort:
             motor.erpm_ns = motor.fault = motor.timeout = None
             motor.turned.speed, motor.asked_timeout = 0.0, 0
             motor.turned.begin_anew()
-
-    def end_drive(self) -> None:
-        """Do nothing, because braking sends its frames in each tick."""
 
     def take(self, received: ReceivedFrame, permit: MotionPermit) -> Heard:
         """Take in a frame of a controller, a part of an answer to this host, or a frame of another host."""
@@ -209,10 +207,6 @@ class VescPort:
             return [codec.command(motor.node, "set_current", 0.0) for motor in self._all], True
         amperes = self._settings.brake_current_a
         return [codec.command(motor.node, "set_brake_current", amperes) for motor in self._all], False
-
-    def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
-        """Return no frames: released motors need none."""
-        return ()
 
     def may_reset(self, now_ns: int) -> bool:
         """Whether the faults are known; a controller ends its own when the cause has gone."""

@@ -18,14 +18,21 @@ from typing import Protocol
 from drivers.types import MAX_EXTENDED_ID, Frame, LinkState, OutgoingFrame, ReceivedFrame, TransportStats
 from firmware_protocol.serial_framing import MAX_CAN_ID, MAX_DATA
 
+# A full bus of 1 Mbit/s carries about 8000 full frames a second: half a second in which the loop does not look. Chosen.
 RECEIVE_CAPACITY = 4096
+# Several ticks of commands; each frame has a deadline, and what waits longer is dropped. Chosen.
 TRANSMIT_CAPACITY = 64
+# A frame takes 0.1 to 0.3 ms on a bus of 500 kbit/s: by then there is room for several.
 _BUSY_RETRY_S = 0.001
+# What a VESC takes in one packet.
 _MOST_PACKET = 512
+# A closing link sends what waits, such as a stop, and does not hang where the medium does. Chosen.
 _DRAIN_S = 0.1
 _JOIN_S = 1.0
-_MOST_PATIENT_S = 30.0
+# A mute link is opened anew after this, then after twice its silence, up to the longest: a robot may just be switched
+# off. Chosen.
 MUTE_AFTER_S = 4.0
+_MOST_PATIENT_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)

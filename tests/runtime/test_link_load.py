@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from disco_hw.runtime.preflight import can_load, serial_load, worst_case_bits
-from drivers.motor.reference_arming import cyclic_frames
+from drivers.motor.reference_protocol import cyclic_frames
 from drivers.types import CyclicFrame
 from firmware_protocol.codec import packaged_dbc
 from firmware_protocol.serial_framing import encode_frame

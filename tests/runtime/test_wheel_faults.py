@@ -218,8 +218,8 @@ def test_a_base_that_makes_wheel_speeds_of_its_own_may_turn_by_more():
 @pytest.mark.parametrize(("turns", "counts"), [(lambda wanted: 0.0, None), (None, lambda true: 0.0)])
 def test_a_base_that_has_shown_to_turn_as_it_is_asked_to_is_judged_as_soon_as_single_wheels(turns, counts, speed):
     found = {}
-    for takes_body_speeds in (True, False):
-        robot = Robot(faults=WheelFaults(takes_body_speeds))
+    for is_base in (True, False):
+        robot = Robot(faults=WheelFaults(takes_body_speeds=is_base, stops_by_own_ramp=is_base))
         assert robot.drive(6.0, around(speed)) is None
-        found[takes_body_speeds], _ = robot.drive(3.0, around(speed), turns, counts)
+        found[is_base], _ = robot.drive(3.0, around(speed), turns, counts)
     assert found[True] <= found[False]

@@ -6,7 +6,7 @@ import pytest
 
 from sim.can_protocol import CanFrame
 from sim.devices.odrive import CLOSED_LOOP, IDLE, INVALID_STATE, OdriveBoard
-from sim.devices.vesc import Vesc, serial_packet
+from sim.devices.vesc_firmware import Vesc, serial_packet
 from tests.drivers.motor.vendors import VENDORS
 
 ESTOP, SET_STATE, CLEAR = 0x02, 0x07, 0x18

@@ -8,7 +8,7 @@ from typing import Any
 from drivers.motor import vesc_codec as codec
 from drivers.types import Frame
 from sim.can_protocol import CanFrame
-from sim.devices.vesc import CHECK_MS, Vesc
+from sim.devices.vesc_firmware import CHECK_MS, Vesc
 from tools.vectors.comparison import Case, Comparison, as_case, as_cases, of_driver, on_bus
 
 _OF_VALUES = {"current_a": "current_motor_a"}

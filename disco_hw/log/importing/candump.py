@@ -1,21 +1,164 @@
-"""A candump of a robot that speaks our protocol -> the arrays of a drive."""
+"""A candump of a robot that speaks our protocol -> the arrays of a drive: its lines -> frames -> samples.
+
+`candump -l` and `-L` write `(1700000000.123456) can0 110#0102...`, the screen format is
+`(1700000000.123456)  can0  110   [8]  01 02 ...`. Time stamps are absolute, from zero on (-tz), a date (-tA) or the
+differences between frames (-td), which are summed up.
+"""
 
 from __future__ import annotations
 
+import re
+from array import array
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
 from disco_hw.config import Robot
 from disco_hw.errors import LogError
-from disco_hw.log.drive import Array, Commands, DriveLog, Gyro, Poses, Wheels
+from disco_hw.files import CANDUMP, read_lines
+from disco_hw.log.drive import Array, Commands, DriveLog, Gyro, Index, Poses, Wheels
 from disco_hw.log.importing import LogFormat
-from disco_hw.log.importing.candump_lines import Dump, is_candump, read_dump
 from disco_hw.log.importing.losses import loss_note, warnings_first
 from drivers.device_clock import DeviceClock
 from drivers.motor.reference_frames import POSE_MESSAGES, WHEEL_MESSAGES, FrameReception, Telemetry
+from drivers.types import Frame, ReceivedFrame
 from firmware_protocol.codec import Codec, Decoded
+
+_LINE = re.compile(
+    r"\s*\((?P<time>[^()]{1,40})\)\s+(?P<channel>\S{1,64})\s+(?:[RT]X\s+[-BE\s]*)?(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
+    r"(?:#(?P<packed>\S*)|\s+\[\s*(?P<length>\d{1,2})\]\s*(?P<spaced>[0-9A-Fa-f ]*?|remote request.*)"
+    r"(?:\s+(?:ERRORFRAME.*|'.*'))?)(?:\s+[RT])?\s*"
+)
+_SCREEN = re.compile(r"\s*\S{1,64}\s+(?:[RT]X\s+[-BE\s]*)?[0-9A-Fa-f]{3,8}\s+\[\s*\d{1,2}\]")
+_HEX = re.compile(r"(?:[0-9A-Fa-f]{2}){0,8}")
+_SECONDS = re.compile(r"(\d{1,12})(?:\.(\d{1,9}))?")
+_ERROR_FLAG = 0x20000000
+_LARGEST_DIFFERENCE_NS = 60_000_000_000
+_BACK_SHARE = 0.05
+"""A clock that goes back this often counts from frame to frame."""
+_LARGEST_DISORDER_NS = 100_000_000
+"""Frames of two interfaces are written in another order than they came by less than this."""
+
+
+@dataclass(frozen=True, slots=True)
+class Dump:
+    """A candump that was read once: `t_ns` (N,) of its frames since the first, and how many each channel has."""
+
+    path: Path
+    t_ns: Index
+    channels: dict[str, int]
+    notes: tuple[str, ...]
+
+    def frames(self, channel: str) -> Iterator[ReceivedFrame]:
+        """Yield the data frames with a standard identifier that came on this channel."""
+        number = 0
+        for parsed in map(_parsed, read_lines(self.path, CANDUMP)):
+            if parsed is None:
+                continue
+            _, where, frame = parsed
+            if where == channel and frame is not None:
+                yield ReceivedFrame(int(self.t_ns[number]), frame)
+            number += 1
+
+
+def is_candump(begin: bytes) -> bool:
+    """Return whether a file that begins with these bytes is a candump, in whichever format."""
+    text = begin.decode("ascii", "replace").lstrip()
+    return text.startswith("(") or _SCREEN.match(text) is not None
+
+
+def read_dump(path: Path) -> Dump:
+    """Read times and channels of a candump; lines that are no frame are counted.
+
+    Raises LogError if over half of the lines are none, or if they have no time stamps.
+    """
+    t_ns, channels = array("q"), Counter[str]()
+    filled = bad = first_bad = 0
+    last_is_bad = is_whole = False
+    for number, line in enumerate(read_lines(path, CANDUMP), start=1):
+        if not line.strip():
+            continue
+        filled, is_whole = filled + 1, line.endswith(("\n", "\r"))
+        parsed = _parsed(line)
+        last_is_bad = parsed is None
+        if parsed is None:
+            if _SCREEN.match(line):
+                raise LogError(
+                    f"{path}: line {number}: candump's screen format without time stamps; record with `candump -L`"
+                )
+            bad, first_bad = bad + 1, first_bad or number
+            continue
+        t_ns.append(parsed[0])
+        channels[parsed[1]] += 1
+    notes = []
+    if last_is_bad and not is_whole and channels:
+        notes.append(f"{path}: the last line is cut off and was left out; the recording did not end regularly")
+        bad, filled = bad - 1, filled - 1
+    if bad:
+        what = f"are no frame and were left out, the first is line {first_bad}"
+        remedy = "not a candump; record with `candump -L`" if bad == filled else f"correct them, first line {first_bad}"
+        notes.append(loss_note(str(path), "lines", bad, filled, what, remedy))
+    if not channels:
+        raise LogError(f"{path}: no frame in it; record with `candump -L`")
+    return Dump(path, _increasing(path, np.array(t_ns, dtype=np.int64), notes), dict(channels), tuple(notes))
+
+
+def _increasing(path: Path, stamps_ns: Index, notes: list[str]) -> Index:
+    """Return times since the first frame that never go back, of stamps in the order of the lines."""
+    back = np.diff(stamps_ns) < 0
+    if np.count_nonzero(back) > _BACK_SHARE * max(back.size, 1) and stamps_ns.max() < _LARGEST_DIFFERENCE_NS:
+        notes.append(f"{path}: the time stamps are differences between frames (candump -td) and were summed up")
+        return np.asarray(np.cumsum(stamps_ns) - stamps_ns[0])
+    ahead_ns = np.maximum.accumulate(stamps_ns)[:-1] - stamps_ns[1:]
+    set_back = np.flatnonzero(ahead_ns > _LARGEST_DISORDER_NS)
+    t_ns = stamps_ns.astype(np.int64)
+    jumps = 0
+    for at in set_back.tolist():
+        # Once shifted, what follows is ahead no more.
+        by_ns = int(t_ns[: at + 1].max() - t_ns[at + 1])
+        if by_ns > _LARGEST_DISORDER_NS:
+            t_ns[at + 1 :] += by_ns
+            jumps += 1
+    if jumps:
+        notes.append(f"{path}: the clock was set back {jumps} times, which was taken out")
+    return np.asarray(np.maximum.accumulate(t_ns) - t_ns[0])
+
+
+def _parsed(line: str) -> tuple[int, str, Frame | None] | None:
+    """Time stamp (ns), channel and frame of a line, None for the frame of another kind; None if the line is none."""
+    found = _LINE.fullmatch(line.rstrip("\r\n"))
+    t_ns = None if found is None else _nanoseconds(found["time"])
+    if found is None or t_ns is None:
+        return None
+    can_id = int(found["id"], 16)
+    packed = found["packed"]
+    if packed is None:
+        spaced = found["spaced"]
+        if len(found["id"]) > 3 or can_id & _ERROR_FLAG or not _HEX.fullmatch(spaced.replace(" ", "")):
+            return t_ns, found["channel"], None
+        data = bytes.fromhex(spaced)
+        return (t_ns, found["channel"], Frame(can_id, data)) if len(data) == int(found["length"]) else None
+    if len(found["id"]) > 3 or packed.startswith(("#", "R", "r")):
+        return t_ns, found["channel"], None
+    plain = packed.replace(".", "")
+    return (t_ns, found["channel"], Frame(can_id, bytes.fromhex(plain))) if _HEX.fullmatch(plain) else None
+
+
+def _nanoseconds(text: str) -> int | None:
+    """Return a time stamp in ns: seconds, or a date and time of day in UTC; None if it is neither."""
+    found = _SECONDS.fullmatch(text.strip())
+    if found is not None:
+        return int(found[1]) * 1_000_000_000 + int((found[2] or "").ljust(9, "0"))
+    try:
+        moment = datetime.fromisoformat(text.strip()).replace(tzinfo=UTC)
+    except ValueError:
+        return None
+    return round(moment.timestamp() * 1e6) * 1000
+
 
 _COMMAND = "WHEEL_COMMAND"
 _LONGEST_SILENCE_NS = 500_000_000

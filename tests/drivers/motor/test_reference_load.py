@@ -1,6 +1,6 @@
 """The cyclic frames of the reference protocol."""
 
-from drivers.motor.reference_arming import cyclic_frames
+from drivers.motor.reference_protocol import cyclic_frames
 from drivers.types import CyclicFrame
 from firmware_protocol.codec import packaged_dbc
 

@@ -1,12 +1,22 @@
-"""Frames that the host of a reference controller sends beside its commands: introduction, state, and clock requests."""
+"""The reference controller's protocol beside its commands, in two halves.
+
+What follows from the protocol alone: e-stop, bus load, safety card. And the frames that the host keeps sending:
+introduction, state, and clock requests.
+"""
 
 from __future__ import annotations
 
-from drivers.motor.reference_arming import HostState
-from drivers.motor.reference_frames import FrameTransmission
-from drivers.types import OutgoingFrame
-from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR
+from collections.abc import Callable, Sequence
+from typing import Any
 
+from drivers.motor.reference_arming import HostState
+from drivers.motor.reference_frames import FrameReception, FrameTransmission
+from drivers.types import CyclicFrame, Frame, NoSettings, OutgoingFrame, ReceivedFrame, SafetyCard
+from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded, load_protocol
+
+_FRAMES_OF_OURS = 5
+_COMMANDS = ("WHEEL_COMMAND", "WHEEL_COMMAND_MAC")
+_AUTHENTICATION_FRAMES = ("WHEEL_COMMAND_MAC", "HOST_STATE_MAC", "MAC_CHALLENGE")
 # A little under 10 Hz, so that a loop whose ticks come early by some jitter does not skip one.
 HOST_STATE_PERIOD_NS = 90_000_000
 HELLO_PERIOD_NS = 200_000_000
@@ -19,6 +29,58 @@ FAST_TIME_COUNT = 10
 # Held up for longer, a frame is dropped: the next one takes its place.
 _DEADLINE_NS = 100_000_000
 _PENDING_TIMES = 8
+
+
+def cyclic_frames(dbc: str, command_rate_hz: float, *, authenticated: bool = False) -> tuple[CyclicFrame, ...]:
+    """Return all frames with a cycle time (GenMsgCycleTime, ms) in the DBC's text, each page of a multiplexed one.
+
+    The wheel command counts at the rate of the control loop; proofs and their challenge only if `authenticated`.
+    """
+    frames = []
+    for message in load_protocol(dbc).messages:
+        if message.period_s is not None and (authenticated or message.name not in _AUTHENTICATION_FRAMES):
+            pages = {signal.page for signal in message.signals} - {None}
+            rate_hz = command_rate_hz if message.name in _COMMANDS else 1.0 / message.period_s
+            frames.append(CyclicFrame(message.name, message.sender, message.length, rate_hz * max(1, len(pages))))
+    return tuple(frames)
+
+
+def stop_frames(_settings: NoSettings) -> tuple[Frame, ...]:
+    """Return the e-stop, which the controller latches and confirms."""
+    encoded = Codec().encode("ESTOP", reason=1)
+    return (Frame(encoded.can_id, encoded.data),)
+
+
+def stop_confirmation(_settings: NoSettings) -> Callable[[Frame], bool]:
+    """Return what says, frame by frame heard, whether the controller has confirmed an e-stop."""
+    codec = Codec()
+
+    def heard(frame: Frame) -> bool:
+        decoded = None if frame.extended else codec.decode(frame.can_id, frame.data)
+        if not isinstance(decoded, Decoded) or decoded.name != "SYSTEM_STATE":
+            return False
+        return codec.choice_name("SYSTEM_STATE", "state", decoded.values["state"]) == "ESTOP"
+
+    return heard
+
+
+def safety_card(_settings: NoSettings) -> SafetyCard:
+    """Return the safety card of the reference controller."""
+    return SafetyCard(
+        host_silent="the controller after 0.1 s without an accepted wheel command, by its watchdog that cannot be off",
+        stops_by="braking: it decelerates within its own limit, then brakes",
+        reaction_s=0.1,
+        brakes=True,
+        estop="a frame of any length, also from `disco-hw estop`: it decelerates, latched and confirmed",
+        wheel_fault="the motors are off (COAST) for 0.2 s, then the controller brakes without its speed loop; no ramp",
+    )
+
+
+def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
+    """Return an empty dict if the frames have the checksum that is the reference controller's alone, else None."""
+    reception = FrameReception(Codec())
+    believed = [reception.accept(ReceivedFrame(0, frame)) for frame in frames]
+    return {} if sum(one is not None for one in believed) >= _FRAMES_OF_OURS else None
 
 
 class HouseKeeping:

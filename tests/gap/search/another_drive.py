@@ -1,32 +1,21 @@
-"""`python -m tools.gap_another_drive FORM:SEED...`: what a model that was written predicts of another drive.
+"""What a model that was written predicts of another drive of the same robot of `tools/strange_robot.py`.
 
-A robot with a hidden form of `tools/strange_robot.py` is searched, and its model.toml written and read again. Errors of
-free runs of the model's own step, 2 s ahead from single poses and readings of the wheels, with what the runtime keeps
-of the past: on the log itself, and on another drive of the same robot, where also with nothing remembered, and without
-the model's terms. The table of `docs/results.md`.
+Errors of free runs of the model's own step, 2 s ahead from single poses and readings of the wheels, with what the
+runtime keeps of the past, or with nothing remembered, or without the model's terms.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
-import os
-import sys
-import tempfile
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.control import PlannerState, SentCommand
 from disco_hw.control.past_motion import DriveMeans, PastMotion
-from disco_hw.gap import find_gap
 from disco_hw.log.drive import DriveLog
-from disco_hw.model import Model, load_model, save_model
+from disco_hw.model import Model
 from disco_hw.model.step import FreeRun
 from disco_hw.model.terms import TERMS
 from tools import strange_robot
@@ -86,15 +75,6 @@ def errors_ahead(model: Model, log: DriveLog, remembers: bool = True) -> tuple[f
     return position_m, yaw_rad
 
 
-def written_model(form: str, seed: int) -> Model:
-    """What a search of a robot with this form writes, as it is read again."""
-    report = find_gap(strange_robot.record(form, seed).log, Model(*strange_robot.NOMINAL))
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "model.toml"
-        save_model(report.model, path)
-        return load_model(path)
-
-
 def another_drive(form: str, seed: int) -> DriveLog:
     """The same robot, driven by another joystick."""
     return strange_robot.record(form, seed, joystick(seed + OTHER_SEED, strange_robot.DURATION_S)).log
@@ -103,27 +83,3 @@ def another_drive(form: str, seed: int) -> DriveLog:
 def without_terms(model: Model) -> Model:
     """A model without its terms, the other values as they are."""
     return replace(model, belief=None, effects=tuple(one for one in model.effects if one.name not in TERMS))
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m tools.gap_another_drive", description=(__doc__ or "").split("\n")[0]
-    )
-    parser.add_argument("forms", nargs="+", metavar="FORM:SEED", help=f"of {', '.join(strange_robot.FORMS)}")
-    print("| hidden, seed | its own log, mm / mrad | another drive | nothing remembered | without its terms |")
-    print("|---|---|---|---|---|")
-    for given in parser.parse_args(arguments).forms:
-        form, _, number = given.partition(":")
-        seed, model = int(number), written_model(form, int(number))
-        own, other = strange_robot.record(form, seed).log, another_drive(form, seed)
-        errors = [
-            errors_ahead(model, own), errors_ahead(model, other), errors_ahead(model, other, remembers=False),
-            errors_ahead(without_terms(model), other),
-        ]  # fmt: skip
-        cells = [f"{1e3 * position_m:.1f} / {1e3 * yaw_rad:.0f}" for position_m, yaw_rad in errors]
-        print(f"| {form}, {seed} | {' | '.join(cells)} |", flush=True)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
