@@ -44,6 +44,7 @@ from disco_hw.gap.report.judge import (
     unnamed_findings,
 )
 from disco_hw.gap.report.page import as_text, page
+from disco_hw.gap.report.remains import Remains
 from disco_hw.gap.search import StagePredictions, joint_predictions, prune, stage_predictions
 from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, final_fit
 from disco_hw.gap.search.channel_result import ChannelEstimates
@@ -121,6 +122,12 @@ def find_gap(
     kept = written[0] if written[2] is None or written[2].kept is None else written[2].kept[0]
     offered = offered_stage(gap or _of_wheels(wheels), bool(named or unnamed), kept.adds_to_timed, settings)
     amended, remarks = model_of(offered, model, *written)
+    remains = None
+    if gap and written[2] is not None:
+        handed_out = "written" if offered == "amended" and "written" in gap else offered
+        ahead_s = reached_horizon_s(gap, settings.prediction)
+        timed, left, noise = (gap[stage][ahead_s] for stage in ("timed", handed_out, "floor"))
+        remains = Remains.of(timed, left, noise, written[2].errors_of_body(offered))
     remarks = (*left_out_notes(written[0], written[1], kept), *remarks)
     return GapReport(
         sources=log.sources,
@@ -141,6 +148,7 @@ def find_gap(
         wheels=wheels,
         across=across_logs(analysis),
         warnings=warnings,
+        remains=remains,
     )
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report.blind_spots import BlindSpot
+from disco_hw.gap.report.remains import Remains
 from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.gap.search.cross_validation import (
     PredictionErrors,
@@ -146,6 +147,7 @@ class GapReport:
     across: tuple[AcrossLogs, ...] = ()
     provenance: Provenance | None = None
     warnings: tuple[str, ...] = ()
+    remains: Remains | None = None
 
     @property
     def horizon_s(self) -> float:
@@ -158,9 +160,12 @@ class GapReport:
 
     @property
     def verdict(self) -> str:
-        """`effects_found`, `nothing_missing` or `unexplained`."""
+        """`effects_found`, `partly_explained`, `nothing_missing` or `unexplained`.
+
+        Partly where the model that is handed out errs by more than twice the sensors' noise.
+        """
         if self.effects:
-            return "effects_found"
+            return "effects_found" if self.remains is None or self.remains.is_explained else "partly_explained"
         return "unexplained" if self.unnamed or self.residue or self.doubtful else "nothing_missing"
 
     def as_dict(self) -> dict[str, Any]:
@@ -218,6 +223,7 @@ class GapReport:
                 for horizon in self.wheels.get("nominal", ())
             ],
             "offered": self.offered,
+            "remains": None if self.remains is None else self.remains.as_dict(),
             "across_logs": [
                 {"name": each.name, "values_ci95": [list(value) for value in each.values], "differs": each.differs}
                 for each in self.across

@@ -7,6 +7,7 @@ the heading that they make on the robot's geometry, in the units of the whole ga
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -32,7 +33,8 @@ Index = NDArray[np.int64]
 class PredictionErrors:
     """Root mean square at one horizon with 95 % bootstrap intervals over blocks of time.
 
-    `squares` (B, 2): sums of squares of position and of yaw by block, for a comparison block by block.
+    `squares` (B, 2): sums of squares of position and of yaw by block, for a comparison block by block;
+    `regime_squares`: the same by what the robot was doing.
     """
 
     position_m: float
@@ -42,6 +44,7 @@ class PredictionErrors:
     wheel_rad_s: float
     by_regime_m: dict[str, float]
     squares: Array | None = field(default=None, repr=False, compare=False)
+    regime_squares: Mapping[str, tuple[float, float]] = field(default_factory=dict, repr=False, compare=False)
 
 
 def worse_by(before: PredictionErrors, after: PredictionErrors) -> float:
@@ -356,15 +359,16 @@ def summarise(error: Array, speed_error: Array, starts: Starts, settings: Predic
     regimes = np.array(starts.regime)
     label = np.unique(starts.block, return_inverse=True)[1]
     squares = np.column_stack([np.bincount(label, position), np.bincount(label, yaw)]).astype(np.float64)
-    by_regime = {str(name): float(np.sqrt(position[regimes == name].mean())) for name in np.unique(regimes)}
+    inside = {str(name): regimes == name for name in np.unique(regimes)}
     return PredictionErrors(
         float(np.sqrt(position.mean())),
         _interval(position, starts.block, settings.resamples),
         float(np.sqrt(yaw.mean())),
         _interval(yaw, starts.block, settings.resamples),
         float(np.sqrt((speed_error**2).mean())),
-        by_regime,
+        {name: float(np.sqrt(position[of].mean())) for name, of in inside.items()},
         squares,
+        {name: (float(position[of].sum()), float(yaw[of].sum())) for name, of in inside.items()},
     )
 
 

@@ -39,8 +39,9 @@ def report(amended_m, yaw_rad=0.02, blind=(), offered="amended"):
 
 def test_the_answer_has_the_gap_before_and_after_and_the_noise():
     assert answer(report(0.014))[1] == (
-        "2 s ahead on held-out data the amended model errs by 14 mm and 0.02 rad, one with geometry, delay and lag "
-        "alone (timed) by 47 mm and 0.02 rad; the sensors' noise makes 14 mm and 0.02 rad."
+        "2 s ahead, in parts of the log that were not used, predictions are off by 47 mm and 0.02 rad with a delay "
+        "and a lag alone (timed), by 14 mm and 0.02 rad with what was found (amended); the sensors' noise makes 14 mm "
+        "and 0.02 rad."
     )
 
 
@@ -62,7 +63,7 @@ def test_a_term_is_told_in_words_where_it_is_known_what_it_means():
 def test_a_model_that_predicts_worse_is_not_recommended():
     worse = report(0.052, offered="timed")
     assert answer(worse)[1].endswith(
-        "Drive with the timed one, which is in model.toml. The amended model does not beat it."
+        "Drive with the timed model, which is in model.toml. The amended model does not beat it."
     )
     assert worse.as_dict()["gap"]["offered"] == "timed"
     assert worse.as_dict()["gap"]["why_not_amended"] == "The amended model does not beat it."
@@ -80,9 +81,7 @@ def test_a_model_that_lacks_what_no_model_can_carry_is_judged_without_it(written
     of = without_its_terms(written_m, offered)
     assert offered_stage(of.gap, True, True, DEFAULT_SETTINGS) == offered
     assert of.why_not_amended == (None if offered == "amended" else "The amended model does not beat it.")
-    said = (
-        f"Without the terms that no model can carry, as it is written, the amended one errs by {1e3 * written_m:g} mm"
-    )
+    said = f"Without what no model can hold, as it is written, the amended model errs by {1e3 * written_m:g} mm"
     assert said in answer(of)[1]
     assert of.as_dict()["gap"]["written"]["position_rmse_m"] == written_m
     assert "written" not in report(0.014).as_dict()["gap"]
@@ -184,7 +183,9 @@ def test_a_log_of_short_runs_is_answered_as_far_ahead_as_it_reaches():
     some = report(0.014)
     short = replace(some, gap={s: {h: e if h < 2.0 else nan for h, e in of.items()} for s, of in some.gap.items()})
     assert short.horizon_s == 1.0
-    assert answer(short)[1].startswith("1 s ahead on held-out data the amended model errs by 14 mm")
+    assert answer(short)[1].startswith(
+        "1 s ahead, in parts of the log that were not used, predictions are off by 47 mm"
+    )
     assert short.as_dict()["gap"]["horizon_s"] == 1.0
     assert offered_stage(short.gap, True, True, DEFAULT_SETTINGS) == "amended"
     worse = {**short.gap, "amended": short.gap["nominal"]}
@@ -220,14 +221,14 @@ def test_an_answer_of_many_names_is_short():
     lag = ParameterEstimate(0.2, 0.1, 0.3)
     effects = tuple(EffectFinding("motor_lag", "command_to_wheel", {"tau_s": lag}, 9.0) for _ in range(5))
     lines = answer(replace(report(0.014, blind=FIVE), effects=effects))
-    assert lines[0].endswith("; and 2 more, listed below.")
-    assert lines[0].count("time constant") == 3
-    assert "this log could not have shown 5 effects, listed below, of realistic size" in lines[2]
-    assert "side_slip" not in lines[2]
+    assert lines[2].endswith(". And 2 more, listed below.")
+    assert " ".join(lines).count("time constant") == 3
+    assert "this log could not have shown 5 effects, listed below, of realistic size" in lines[5]
+    assert "side_slip" not in lines[5]
     few = answer(replace(report(0.014, blind=("turn_slip",)), effects=effects[:3]))
-    assert few[0].count("time constant") == 3
-    assert "more" not in few[0]
-    assert few[2].startswith(
+    assert " ".join(few[:3]).count("time constant") == 3
+    assert "more" not in " ".join(few[:3])
+    assert few[5].startswith(
         "Drive next: `disco-hw drive ROBOT.toml --script spins`; this log could not have shown turn_"
     )
 
