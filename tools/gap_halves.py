@@ -177,7 +177,7 @@ def taught(part: Part, others: Sequence[Part], nominal: Model) -> Iterator[Half]
     written = written_of(part.analysis, final, joint_predictions(part.analysis, final))
     assert written[2] is not None
     kept = written[0] if written[2].kept is None else written[2].kept[0]
-    offered = offered_stage(written[2].table(), part.analysis.found_any, kept.adds_to_timed, DEFAULT_SETTINGS)
+    offered = offered_stage(written[2].table(), kept.adds_to_timed, DEFAULT_SETTINGS)
     cpu_s = part.cpu_s + time.process_time() - began
     models = {stage: model_of(stage, nominal, *written)[0] for stage in STAGES}
     names = tuple(

@@ -330,19 +330,8 @@ class PredictionSettings:
     Chosen: a ramp of seconds makes a lag of a second, and a fit that begins there ends there."""
     worse: float = 1.05
     """A larger ratio of errors is worse. Measured: equally good models scatter by some percent."""
-    level: float = 1.01
-    """A mean ratio of errors up to this is level. Chosen."""
     far_worse: float = 1.25
     """A larger ratio is worse whatever the scatter. Chosen."""
-    fewest_stretches: float = 5.0
-    """Where fewer stretches than this hold the errors, leaving one out judges little. Chosen: at 3 and 4, of twelve
-    whole logs of a small robot one passed that was worse than `timed` on six of eleven others; of 32 halves of real
-    logs none passed only by it."""
-    far_better: float = 0.7
-    """There an amended model has to err by so much less. Chosen: what no single stretch makes of nothing."""
-    telling_share: float = 0.1
-    """Or less in each of three stretches or more that hold this share of the errors. Chosen on 32 halves of real logs:
-    of two stretches one half was told that was worse by a third on the other one."""
     worse_sigmas: float = 2.0
     """Standard deviations of the growth over blocks from which on it is worse. Chosen: one in twenty."""
     fitted_horizons_s: tuple[float, ...] = (1.0, 2.0)
@@ -365,10 +354,6 @@ class PredictionSettings:
     """Mean yaw rate above which it drives a curve. Chosen."""
     speeding_m_s2: float = 0.25
     """Mean acceleration above which it speeds up or brakes. Chosen."""
-    worth: float = 0.9
-    """The smaller ratio of errors, of position or heading, from which on down a model is handed out in place of
-    `timed`. Chosen on eight logs of a small robot: one that was ahead by 3 % on circles was behind by half on other
-    drives, one that was ahead by 8 % on squares stood still in others."""
 
 
 @dataclass(frozen=True, slots=True)
