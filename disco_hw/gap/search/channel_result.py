@@ -259,7 +259,7 @@ def wandered(found: ChannelResult) -> dict[str, float]:
     variance: dict[str, float] = {}
     for count in (2, settings.short_parts):
         for name, one in in_equal_parts(found, count).items():
-            goes_on = count == 2 and abs(one.apart(0, 1)) > settings.drift_sigmas
+            goes_on = count == 2 and abs(one.apart(0, 1)) > settings.sure_sigmas
             apart = one.variance_to_next if goes_on else one.variance_between
             variance[name] = max(apart, variance.get(name, 0.0))
     for name, one in in_logs(found).items():
