@@ -135,12 +135,18 @@ class ChannelEstimates:
     covariance: Array
 
 
+def sampling_covariance(found: ChannelResult) -> Array:
+    """Covariance (A, A) of what a channel's accepted set frees, as an estimate of the values of this log."""
+    best, channel = found.told, found.selector.channel
+    factors = np.array([interval_inflation(best, channel, (index,)) for index in best.active])
+    return np.asarray(best.covariance() * np.sqrt(np.outer(factors, factors)))
+
+
 def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
     """Intervals of all parameters that a channel's accepted set frees: where the next drive's values are expected."""
     best, channel = found.told, found.selector.channel
     columns = channel.layout.columns
-    factors = np.array([interval_inflation(best, channel, (index,)) for index in best.active])
-    covariance = best.covariance() * np.sqrt(np.outer(factors, factors))
+    covariance = sampling_covariance(found)
     own = np.maximum(np.diag(covariance), 1e-300)
     wandering, apart, stamped = wandered(found), _weightings_apart(found), _stamped(found)
     more = np.array(
