@@ -2,10 +2,10 @@
 
 `DISCO_HW_DATA=FOLDER python -m tools.gap_halves [--parts N | --days | --others] [NAME...]`: logs whose path holds a
 NAME, all without one. For either half: the stage that is offered, the errors 2 s ahead on the half that was not seen,
-of every stage, and how many of its 95 % intervals hold what the other half says of the same parameters, where that
-knows half as much of them. With `--parts` the same of N parts of each log, and of every other one of it; with `--days`
-of whole logs, each learnt from, and every other one of the same robot predicted; with `--others` each log predicted by
-all others of the robot, searched together. Where those are of windows of 2 s, 1 s ahead.
+of every stage, and how many of its 95 % intervals hold the other half's value of the same parameters, as well as that
+is known, where it is known half as well. With `--parts` the same of N parts of each log, and of every other one of
+it; with `--days` of whole logs, each learnt from, and every other one of the same robot predicted; with `--others`
+each log predicted by all others of the robot, searched together. Where those are of windows of 2 s, 1 s ahead.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
@@ -34,7 +34,7 @@ from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search import joint_predictions
 from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, final_fit
-from disco_hw.gap.search.channel_result import estimate_parameters
+from disco_hw.gap.search.channel_result import estimate_parameters, sampling_covariance
 from disco_hw.gap.search.cross_validation import (
     Chain,
     PredictionErrors,
@@ -56,13 +56,19 @@ ROBOTS = {
     "optiodom": (2796.8, 0.042, 0.2),
 }
 STAGES = ("refitted", "timed", "amended")
+DELAYS = ("command_delay", "motor_lag", "pose_latency")
+GROUPS: dict[str, Callable[[str], bool]] = {
+    "geometry": lambda name: "." not in name,
+    "delays": lambda name: name.partition(".")[0] in DELAYS,
+    "effects": lambda name: "." in name and name.partition(".")[0] not in DELAYS,
+}
 
 
 @dataclass(frozen=True)
 class Half:
     """What a half of a log, or a log, taught: the stage offered, and by stage the errors 2 s ahead on another one.
 
-    `away`: by parameter how far that one's value lies from its own, in standard deviations of its interval.
+    `away`: by parameter how far that one's value lies from its own, in standard deviations of the difference.
     """
 
     learnt_from: str
@@ -122,10 +128,11 @@ def unseen_errors(drive: GriddedDrive, models: dict[str, Model], ahead_s: float 
 
 
 def values_away(analysis: GapAnalysis, final: FinalFit, other: GapAnalysis) -> dict[str, float]:
-    """How far another half's value of a parameter lies from its own, in standard deviations of its interval.
+    """How far another half's value of a parameter lies from its own, in standard deviations of the difference.
 
-    Of the parameters that the other half knows at least half as well; not of how late poses of a clock are that is said
-    to run unevenly, which is each log's own.
+    An interval says where the value of another half is expected. What that half says of it errs, too: its variance
+    is added. Of the parameters that the other half knows at least half as well; not of how late poses of a clock
+    are that is said to run unevenly, which is each log's own.
     """
     away = {}
     uneven = not (analysis.drive.pose_clock_even and other.drive.pose_clock_even)
@@ -137,13 +144,15 @@ def values_away(analysis: GapAnalysis, final: FinalFit, other: GapAnalysis) -> d
         if found is None or own is None or there is None:
             continue
         selector = there.plain or there.selector
-        same = estimate_parameters(replace(there, selector=selector, names=found.names, plain=None, unnamed=()))
+        alike = replace(there, selector=selector, names=found.names, plain=None, unnamed=())
+        same = estimate_parameters(alike)
+        sampled = dict(zip(same.fitted, np.diag(sampling_covariance(alike)) ** 0.5, strict=True))
         for name, estimate in own.by_name.items():
             value = same.by_name.get(name)
             if name not in of_this_log and value is not None and value.deviation <= 2.0 * estimate.deviation:
                 apart = value.value - estimate.value
                 reach = estimate.high - estimate.value if apart > 0.0 else estimate.value - estimate.low
-                away[name] = Z95 * apart / max(reach, 1e-12)
+                away[name] = apart / max(np.hypot(reach / Z95, sampled.get(name, value.deviation)), 1e-12)
     return away
 
 
@@ -177,7 +186,7 @@ def taught(part: Part, others: Sequence[Part], nominal: Model) -> Iterator[Half]
     written = written_of(part.analysis, final, joint_predictions(part.analysis, final))
     assert written[2] is not None
     kept = written[0] if written[2].kept is None else written[2].kept[0]
-    offered = offered_stage(written[2].table(), part.analysis.found_any, kept.adds_to_timed, DEFAULT_SETTINGS)
+    offered = offered_stage(written[2].table(), kept.adds_to_timed, DEFAULT_SETTINGS)
     cpu_s = part.cpu_s + time.process_time() - began
     models = {stage: model_of(stage, nominal, *written)[0] for stage in STAGES}
     names = tuple(
@@ -260,6 +269,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(f"\noffered worse than timed by over 5 %: {len(worse)} of {len(found)}; better by 20 %: {len(better)}")
     asked, missed = sum(len(half.away) for half in found), sum(len(half.missed) for half in found)
     print(f"95 % intervals that hold the other one's value: {asked - missed} of {asked}")
+    for group, of in GROUPS.items():
+        inside = [abs(away) <= Z95 for half in found for name, away in half.away.items() if of(name)]
+        print(f"of them {group}: {sum(inside)} of {len(inside)}")
     names = sorted(
         f"{half.learnt_from} {name} ({away:+.1f} sd)" for half in found for name, away in half.missed.items()
     )

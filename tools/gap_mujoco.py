@@ -330,7 +330,7 @@ def work(hidden: str, seed: int, robot: Robot = ROBOTS["middle"]) -> Result:
     assert written[2] is not None
     kept = written[0] if written[2].kept is None else written[2].kept[0]
     table = written[2].table()
-    offered = offered_stage(table, bool(fits or unnamed), kept.adds_to_timed, DEFAULT_SETTINGS)
+    offered = offered_stage(table, kept.adds_to_timed, DEFAULT_SETTINGS)
     cpu_s = time.process_time() - began
     models = {stage: model_of(stage, nominal, *written)[0] for stage in STAGES}
     unseen = unseen_errors(grid_drive(kept_back.as_drive()), models, AHEAD_S)

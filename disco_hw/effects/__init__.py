@@ -8,7 +8,7 @@ from __future__ import annotations
 import enum
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -206,9 +206,10 @@ class Effect:
     (L, P) in the order of `parameters`, `base` (L, 3) the geometry; arrays of shape (L,). `order` is the place among
     the effects of a stage, ascending.
 
-    How it is reported: `sentence` for a report, with `{parameter}` fields; `besides`, pairs of a parameter and what
-    follows the sentence where that one is known, too; `excitation`, the manoeuvre that shows it, and `script`, the one
-    of `disco-hw drive --script` that drives it; `symptoms`.
+    How it is reported: `sentence` for a report, with `{parameter}` fields, of a time `{parameter_s}` in s or
+    `{parameter_ms}` in ms; `sentence_below` in its place where the first parameter is below zero, with its size;
+    `besides`, pairs of a parameter and what follows the sentence where that one is known, too; `excitation`, the
+    manoeuvre that shows it, and `script`, the one of `disco-hw drive --script` that drives it; `symptoms`.
 
     Traits: `uses_geometry`, whether its coefficients depend on the geometry; `may_turn_more`, whether it can make the
     robot turn faster than its wheels say; `late_by`, the parameter that is a time by which wheels are behind commands,
@@ -235,6 +236,7 @@ class Effect:
     term: Callable[..., Any] | None = None
     coefficients: Callable[[Array, Array, float], tuple[Array, ...]] = no_coefficients
     order: int = 0
+    sentence_below: str | None = None
     besides: tuple[tuple[str, str], ...] = ()
     symptoms: tuple[Symptom, ...] = ()
     uses_geometry: bool = False
@@ -257,8 +259,8 @@ class Effect:
             if key is not None and key not in keys:
                 raise ValueError(f"{self.name}: has no parameter {key!r}, only {', '.join(keys)}")
         try:
-            for text in (self.sentence, *dict(self.besides).values()):
-                text.format(**{parameter.name: parameter.start for parameter in self.parameters})
+            for text in (self.sentence, self.sentence_below or "", *dict(self.besides).values()):
+                self.fill(text, {parameter.name: parameter.start for parameter in self.parameters})
         except (KeyError, IndexError) as error:
             raise ValueError(f"{self.name}: its sentence names {error}, which is no parameter") from None
         if self.stage is Stage.TERMS:
@@ -281,6 +283,19 @@ class Effect:
         differs = any(not np.array_equal(a, b) for a, b in zip(one, other, strict=True))
         if differs and not self.uses_geometry:
             raise ValueError(f"{self.name}: its coefficients depend on the geometry; say uses_geometry=True")
+
+    def describe(self, values: Mapping[str, float]) -> str:
+        """Return the sentence with these values of the parameters."""
+        first = self.parameters[0].name
+        if self.sentence_below is not None and values[first] < 0.0:
+            return self.fill(self.sentence_below, {**values, first: -values[first]})
+        return self.fill(self.sentence, values)
+
+    def fill(self, text: str, values: Mapping[str, float]) -> str:
+        """Fill the fields of a text with values of the parameters, times in s or in ms."""
+        times = {name: value for name, value in values.items() if name.endswith("_s")}
+        in_ms = {f"{name.removesuffix('_s')}_ms": 1e3 * value for name, value in times.items()}
+        return text.format(**in_ms, **values)
 
     @property
     def moves(self) -> bool:

@@ -49,5 +49,6 @@ EFFECT = Effect(
     symptoms=(Symptom.LATE_YAW,),
     excitation="steps of the wheel command: start-stops and fast steering",
     script="starts",
-    sentence="the wheels act on commands {delay_s:.3f} s late",
+    sentence="the wheels act on commands {delay_ms:.0f} ms late",
+    sentence_below="the wheels act on commands {delay_ms:.0f} ms before they come: a clock stamps too late",
 )

@@ -53,5 +53,5 @@ EFFECT = Effect(
     symptoms=(Symptom.LATE_YAW,),
     excitation="steps of the wheel command: start-stops and fast steering",
     script="starts",
-    sentence="the wheels follow their command with a time constant of {tau_s:.3f} s",
+    sentence="the wheels follow their command slowly, with a time constant of {tau_ms:.0f} ms",
 )

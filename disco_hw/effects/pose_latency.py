@@ -23,5 +23,6 @@ EFFECT = Effect(
     symptoms=(Symptom.LATE_POSITIONS, Symptom.LATE_YAW),
     excitation="fast steering and start-stops",
     script="starts",
-    sentence="poses are {latency_s:.3f} s older than their time stamps",
+    sentence="poses are stamped {latency_ms:.0f} ms late",
+    sentence_below="poses are stamped {latency_ms:.0f} ms early",
 )

@@ -21,7 +21,6 @@ from disco_hw.errors import LogError, WorkError
 from disco_hw.gap.data import BASE_COUNT, BODY, DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.report import (
-    STAGES,
     FleetResult,
     FleetRow,
     GapReport,
@@ -44,20 +43,13 @@ from disco_hw.gap.report.judge import (
     unnamed_findings,
 )
 from disco_hw.gap.report.page import as_text, page
+from disco_hw.gap.report.remains import Remains
 from disco_hw.gap.search import StagePredictions, joint_predictions, prune, stage_predictions
 from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, final_fit
 from disco_hw.gap.search.channel_result import ChannelEstimates
 from disco_hw.gap.search.channel_search import search_body, search_wheels, that_models_hold
-from disco_hw.gap.search.cross_validation import (
-    PredictionErrors,
-    beats,
-    clearly_worse,
-    only_timed,
-    outdoes,
-    surely_beats,
-    wheel_table,
-    worse_by,
-)
+from disco_hw.gap.search.cross_validation import PredictionErrors, only_timed, wheel_table, worse_by
+from disco_hw.gap.search.decision import first_as_good
 from disco_hw.gap.search.richest_model import LATE_COLUMNS, candidates_of
 from disco_hw.gap.search.unnamed_terms import with_known_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
@@ -119,8 +111,14 @@ def find_gap(
         spots = proved()
     # Without poses the wheels decide, where geometry says nothing: as given, timed or amended.
     kept = written[0] if written[2] is None or written[2].kept is None else written[2].kept[0]
-    offered = offered_stage(gap or _of_wheels(wheels), bool(named or unnamed), kept.adds_to_timed, settings)
+    offered = offered_stage(gap or _of_wheels(wheels), kept.adds_to_timed, settings)
     amended, remarks = model_of(offered, model, *written)
+    remains = None
+    if gap and written[2] is not None:
+        handed_out = "written" if offered == "amended" and "written" in gap else offered
+        ahead_s = reached_horizon_s(gap, settings.prediction)
+        timed, left, noise = (gap[stage][ahead_s] for stage in ("timed", handed_out, "floor"))
+        remains = Remains.of(timed, left, noise, written[2].errors_of_body(offered))
     remarks = (*left_out_notes(written[0], written[1], kept), *remarks)
     return GapReport(
         sources=log.sources,
@@ -141,6 +139,7 @@ def find_gap(
         wheels=wheels,
         across=across_logs(analysis),
         warnings=warnings,
+        remains=remains,
     )
 
 
@@ -171,26 +170,21 @@ def _of_wheels(wheels: Mapping[str, Mapping[float, PredictionErrors]]) -> dict[s
     return {**wheels, "refitted": wheels["nominal"]} if wheels else {}
 
 
-def offered_stage(
-    gap: Mapping[str, Mapping[float, PredictionErrors]], found: bool, adds: bool, settings: GapSettings
-) -> str:
-    """The stage whose model is handed out: the amended one where it predicts held-out data clearly better than `timed`.
+def offered_stage(gap: Mapping[str, Mapping[float, PredictionErrors]], adds: bool, settings: GapSettings) -> str:
+    """The stage whose model is handed out: the first that is as good as the best, by the rule of `decision`.
 
-    The amended one as it is `written`, where it lacks what no model can carry. Not where it is so by a single stretch
-    only, or by little where few stretches tell: another drive need not have their like. One that `adds` nothing to a
-    delay and a lag has to be level. Where nothing was `found` it is the amended one unless that is clearly worse; where
-    predictions cannot be compared too.
+    First comes `timed`, as every robot is late; but where the amended model `adds` nothing to a delay and a lag, that
+    does. The amended one counts as it is `written`, where it lacks what no model can carry, and is handed out where
+    predictions cannot be compared.
     """
-    horizon_s, prediction = reached_horizon_s(gap, settings.prediction), settings.prediction
+    horizon_s = reached_horizon_s(gap, settings.prediction)
     if not gap or not math.isfinite(gap["amended"][horizon_s].position_m):
         return "amended"
-    refitted, timed, amended = (gap[stage][horizon_s] for stage in STAGES[1:4])
-    amended = gap["written"][horizon_s] if "written" in gap else amended
-    plainer, plain = ("refitted", refitted) if outdoes(timed, refitted, prediction) else ("timed", timed)
-    sure = surely_beats(plain, amended, prediction) or (not adds and beats(plain, amended, prediction))
-    if sure or (not found and not clearly_worse(plain, amended, prediction)):
-        return "amended"
-    return plainer
+    errors = {stage: gap[stage][horizon_s] for stage in ("timed", "refitted")}
+    errors["amended"] = gap.get("written", gap["amended"])[horizon_s]
+    floor = gap["floor"][horizon_s] if "floor" in gap else None
+    order = ("timed", "refitted", "amended") if adds else ("amended", "timed", "refitted")
+    return first_as_good(order, errors.__getitem__, floor)
 
 
 def model_of(

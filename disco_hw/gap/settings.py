@@ -22,7 +22,7 @@ class GridSettings:
     """How a log becomes a drive on an even grid."""
 
     block_s: float = 3.0
-    """Blocks of time that are left out together. Chosen: as long as the windows of the poses."""
+    """Blocks of time that are left out together, and windows of poses, the start of which is unknown. Chosen."""
     longest_s: float = 320.0
     """Of a longer drive so much is judged, stretches with commands first. Chosen: it bounds how long a search takes."""
     stretch_s: float = 20.0
@@ -37,8 +37,8 @@ class GridSettings:
     """Time stamps are made even over so many neighbours either side. Chosen."""
     longest_response_s: float = 1.5
     """Wheels answer a command within this time. Chosen."""
-    no_command_rad_s: float = 0.05
-    """Below this nothing is asked, or turns. Chosen."""
+    rest_rad_s: float = 0.05
+    """Wheels that turn more slowly rest, and commands below ask for nothing. Chosen."""
     turning_rad_s: float = 0.3
     """Wheels that turn so fast without a command are driven by another master. Chosen."""
     loud_rad_s: float = 2.0
@@ -49,8 +49,6 @@ class GridSettings:
     """Fewer poses do not judge the body. Chosen."""
     held_share: float = 0.3
     """Wheel speeds of which more than this share repeat the last one are held. Chosen: a Husky's do in most samples."""
-    held_turning_rad_s: float = 0.05
-    """Only wheels that turn faster say whether speeds are held. Chosen."""
     held_periods: float = 4.0
     """A value that is repeated for longer than so many periods was measured again. Chosen."""
     lead_s: float = 1.0
@@ -98,8 +96,6 @@ class GridSettings:
 class NoiseSettings:
     """The noise of wheels, body and poses, learnt from the log itself."""
 
-    window_s: float = 3.0
-    """Poses are compared in windows of this length, the start of which is unknown. Chosen."""
     by_stamps_share: float = 0.5
     """Poses as they are stamped begin the search in place of those as late as at first sight, where they leave so small
     a share of the misfit. Chosen: what is late by little fits alike, and first sight that errs by 0.3 s far worse."""
@@ -138,8 +134,6 @@ class NoiseSettings:
     """The local size of residuals is a mean over so many samples either side. Chosen."""
     local_excess: float = 1.4
     """Stretches with more than this mean square are weighed down. Chosen: white noise stays below."""
-    rest_rad_s: float = 0.05
-    """Wheels below rest, and read the same whatever the noise. Chosen."""
     least_command_jitter_s: float = 1e-3
     """Commands scatter by as much at least, s. Chosen."""
     command_jitter_ratio: float = 2.0
@@ -185,9 +179,6 @@ class FitSettings:
 class SelectionSettings:
     """Which effects are accepted."""
 
-    ahead_s: float = 2.0
-    """What an effect moves is judged so far ahead, or half or a quarter of it where runs are short. Chosen: about as
-    far as a planner looks."""
     most_moved_share: float = 0.1
     """It is judged where it moves most, on this share of the predictions. Chosen: some are felt in few places only."""
     least_moved_m: float = 1e-3
@@ -196,15 +187,11 @@ class SelectionSettings:
     """Score that a named effect takes at least. Measured: of one parameter it takes twice the gain 13, by chance in one
     log of 3700, of about 18 names in one of 200."""
     unnamed_score: float = 20.0
-    """Score that a term without a name takes at least. Measured: with both, nothing was named in 446 of 450
-    logs with nothing hidden."""
-    rough_score: float = 20.0
-    """Score of the first, rough selection, whose noise is not learnt yet. Chosen."""
+    """Score that a term without a name takes at least, and a name before the noise is learnt. Measured: with both
+    scores, nothing was named in 446 of 450 logs with nothing hidden."""
     heaviest: float = 1.5
     """Scores are raised by up to this factor where the noise has heavy tails. Chosen: noise in bursts wanders too, more
     slowly than any block could show."""
-    gaussian_kurtosis: float = 3.0
-    """Fourth moment of noise without heavy tails. Literature: of the normal distribution."""
     clipped_at: float = 6.0
     """Whitened residuals beyond do not raise it further. Chosen."""
     silent: float = 1e-3
@@ -223,9 +210,9 @@ class SelectionSettings:
     """An effect that makes up this share of what such a fit lacks is taken whatever its score. Chosen."""
     swap_nats: float = 2.0
     """One effect replaces another if it fits better by this. Chosen."""
-    rival_nats: float = 3.0
-    """Effects that are worse by less would do as well. Literature: half a difference of BIC of 6, positive evidence
-    (Kass and Raftery, 1995)."""
+    telling_nats: float = 3.0
+    """One of two explanations is told if it is better by this. Literature: half a difference of BIC of 6, positive
+    evidence (Kass and Raftery, 1995)."""
     block_lengths: tuple[int, ...] = (1, 3, 9)
     """Neighbouring blocks taken as one for the sandwich variance. Chosen: 3, 9 and 27 s."""
     even_rounds: int = 3
@@ -235,17 +222,12 @@ class SelectionSettings:
     less may be chance."""
     fewest_blocks: int = 5
     """Fewer blocks say nothing about their scatter. Chosen."""
-    rest_rad_s: float = 0.05
-    """Wheels below rest, and do not count for the tails of the noise. Chosen."""
     far_off: float = 1.5
     """Where the accepted set costs so many times what is expected, plainer noise is assumed. Chosen."""
     place_nats: float = 6.0
     """A patch of the floor and a change of all of it differ by less: either does. Chosen."""
     encoder_sigmas: float = 3.0
     """An encoder may be the cause if the body agrees within so many standard deviations. Chosen: one in 370."""
-    encoder_nats: float = 3.0
-    """And is the cause if it says so by this. Measured: of gains that are none of an encoder fewer than one in a
-    hundred comes so far by chance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,8 +255,6 @@ class TermSettings:
     """Sizes of patches. Chosen."""
     disc_spacing_m: float = 0.4
     """Distance of the centres that are tried. Chosen: half a patch."""
-    disc_steps_m: tuple[float, ...] = (-0.2, -0.1, 0.0, 0.1, 0.2)
-    """Closer around the best: offsets of the centre. Chosen."""
     disc_size_steps_m: tuple[float, ...] = (-0.15, -0.05, 0.0, 0.05, 0.15)
     """And of the radius. Chosen."""
     least_inside: float = 0.03
@@ -283,8 +263,6 @@ class TermSettings:
     """And at most. Chosen: outside of it the floor must be known too."""
     largest_floor_m2: float = 60.0
     """On larger floors no patch is sought. Chosen: there would be too many."""
-    longest_s: float = 400.0
-    """In longer logs neither. Chosen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,10 +284,9 @@ class PredictionSettings:
     planner looks."""
     folds: Folds = Folds(21.0, 2)
     """Stretches that are left out in turn. Chosen: of seven blocks, longer than `WANDER_S`."""
-    short_s: float = 126.0
-    """Logs shorter than six of these are divided finer. Chosen: half of a minute's log is too little to learn from."""
     short_folds: Folds = Folds(9.0, 4)
-    """Theirs. Chosen on halves of twelve logs of a small robot; learnt from thirds of 15 logs of three robots, so
+    """Those of logs shorter than six of these stretches, as half of a minute's log is too little to learn from. Chosen
+    on halves of twelve logs of a small robot; learnt from thirds of 15 logs of three robots, so
     divided 7 of 90 offered models were worse than `timed`, and 10 as longer logs are; better by a fifth 15 either way.
     """
     pose_reach_s: float = 0.3
@@ -330,25 +307,10 @@ class PredictionSettings:
     Chosen: a ramp of seconds makes a lag of a second, and a fit that begins there ends there."""
     worse: float = 1.05
     """A larger ratio of errors is worse. Measured: equally good models scatter by some percent."""
-    level: float = 1.01
-    """A mean ratio of errors up to this is level. Chosen."""
     far_worse: float = 1.25
     """A larger ratio is worse whatever the scatter. Chosen."""
-    fewest_stretches: float = 5.0
-    """Where fewer stretches than this hold the errors, leaving one out judges little. Chosen: at 3 and 4, of twelve
-    whole logs of a small robot one passed that was worse than `timed` on six of eleven others; of 32 halves of real
-    logs none passed only by it."""
-    far_better: float = 0.7
-    """There an amended model has to err by so much less. Chosen: what no single stretch makes of nothing."""
-    telling_share: float = 0.1
-    """Or less in each of three stretches or more that hold this share of the errors. Chosen on 32 halves of real logs:
-    of two stretches one half was told that was worse by a third on the other one."""
     worse_sigmas: float = 2.0
     """Standard deviations of the growth over blocks from which on it is worse. Chosen: one in twenty."""
-    fitted_horizons_s: tuple[float, ...] = (1.0, 2.0)
-    """Predictions so far ahead are what the whole chain is fitted to. Chosen: what the answer is about, and half."""
-    fit_huber: float = 3.0
-    """Errors of prediction beyond so many times the usual one count linearly. Literature: Huber (1964); size chosen."""
     fit_rounds: int = 2
     """How often the usual error is taken anew in such a fit. Chosen."""
     fit_steps: int = 8
@@ -365,10 +327,6 @@ class PredictionSettings:
     """Mean yaw rate above which it drives a curve. Chosen."""
     speeding_m_s2: float = 0.25
     """Mean acceleration above which it speeds up or brakes. Chosen."""
-    worth: float = 0.9
-    """The smaller ratio of errors, of position or heading, from which on down a model is handed out in place of
-    `timed`. Chosen on eight logs of a small robot: one that was ahead by 3 % on circles was behind by half on other
-    drives, one that was ahead by 8 % on squares stood still in others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -393,8 +351,9 @@ class ReportSettings:
     """Mean square of whitened residuals from which on a regime disagrees. Chosen: noise alone has one."""
     louder: float = 1.1
     """Something is left in a regime with so much more than the richest model leaves. Chosen."""
-    clear_sigmas: float = 3.0
-    """And so many standard deviations of the blocks. Chosen: one in 370."""
+    sure_sigmas: float = 3.0
+    """What differs by so many standard deviations is no chance: regimes and their noise, parts of a log, logs. Chosen:
+    one in 370."""
     nats_each: float = 1.0
     """And nats for each parameter of the richest model. Chosen: the price of Akaike's criterion."""
     least_nats: float = 20.0
@@ -405,8 +364,6 @@ class ReportSettings:
     """At most so many are listed, the loudest. Chosen."""
     at_bound: float = 0.9
     """A jitter of the commands above this share of its bound is no jitter. Chosen."""
-    form_sigmas: float = 1.96
-    """An effect has another form than its name's if this sure. Literature: 95 % of the normal distribution."""
     largest_ratio: float = 9.9
     """Ratios of strength beyond are not distinguished. Chosen."""
     end_share: float = 0.01
@@ -422,8 +379,6 @@ class ReportSettings:
     """For so long in all at least. Chosen."""
     beyond_share: float = 0.005
     """And for so much of the log. Chosen."""
-    taken_share: float = 0.1
-    """A name that takes less than this of what its channel lacks, where it still disagrees, is disputed. Chosen."""
     times_unnamed: float = 3.0
     """So is one that is worth less than so many times what a term without a name beside it is. Chosen: half an order of
     magnitude."""
@@ -436,17 +391,13 @@ class ReportSettings:
     """By so many standard deviations. Chosen: of some twenty comparisons in a log one in a hundred logs by chance."""
     regime_known_share: float = 0.05
     """A regime that holds less of what is known of a value says nothing of it. Chosen."""
-    halves_apart: float = 0.1
-    """Slow and fast differ by this share or more from the median. Chosen: wheels' speeds scatter by less."""
     regime_blocks: int = 3
     """Neighbouring blocks taken as one for the scatter of regimes. Chosen: 9 s."""
     short_parts: int = 4
     """Beside halves a log is divided into so many parts to see how parameters change along it. Chosen."""
-    drift_sigmas: float = 3.0
-    """A parameter drifts whose first and last third of a log lie so many standard deviations apart, the second between
-    them; logs of one robot differ by as much, and halves of which the next drive goes on. Chosen: one in 370."""
-    drift_share: float = 0.1
-    """And by so much of itself. Chosen: less than that nobody drives differently for."""
+    worth_share: float = 0.1
+    """A value that changes by less of itself is the same to whoever drives; a name that takes less of what its channel
+    lacks, where it still disagrees, is disputed. Chosen."""
     differ_share: float = 0.03
     """Logs of one robot differ in its geometry by so much of it at least. Chosen: another floor changes more."""
     lever_m: float = 0.2

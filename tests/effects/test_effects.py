@@ -66,11 +66,23 @@ def test_effects_describe_themselves(effect):
     for parameter in effect.parameters:
         assert parameter.low < parameter.high
         assert parameter.low <= parameter.start <= parameter.high
-    for text in (effect.sentence, *dict(effect.besides).values()):
-        sentence = text.format(**{p.name: p.start for p in effect.parameters})
+    for text in (effect.sentence, effect.sentence_below or effect.sentence, *dict(effect.besides).values()):
+        sentence = effect.fill(text, {p.name: p.start for p in effect.parameters})
         assert sentence[0].islower()
         assert "{" not in sentence
     assert effect.excitation
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("pose_latency", 0.065, "poses are stamped 65 ms late"),
+        ("pose_latency", -0.065, "poses are stamped 65 ms early"),
+        ("command_delay", -0.02, "the wheels act on commands 20 ms before they come: a clock stamps too late"),
+    ],
+)
+def test_a_time_is_told_in_words_and_none_is_negative(name, value, said):
+    assert REGISTRY[name].describe({REGISTRY[name].parameters[0].name: value}) == said
 
 
 @pytest.mark.parametrize("besides", [(("no", "no"),), (("unequal", "wheels are {no}"),)])

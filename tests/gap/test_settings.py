@@ -58,7 +58,7 @@ def test_a_setting_of_the_selection_is_felt_by_who_selects():
 def test_a_setting_of_the_noise_is_felt_by_the_channel():
     channel, drive = body_channel()
     assert np.unique(channel.window).size > 10
-    wide = replace(DEFAULT_SETTINGS, noise=replace(DEFAULT_SETTINGS.noise, window_s=1000.0))
+    wide = replace(DEFAULT_SETTINGS, grid=replace(DEFAULT_SETTINGS.grid, block_s=1000.0))
     assert (
         np.unique(type(channel).build(replace(drive, settings=wide), channel.noise, channel.neutral).window).size == 1
     )

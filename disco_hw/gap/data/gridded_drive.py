@@ -105,7 +105,8 @@ class GriddedDrive:
     def folds(self) -> Folds:
         """How it is divided to be predicted by what the rest of it says."""
         prediction = self.settings.prediction
-        return prediction.folds if self.duration_s >= prediction.short_s else prediction.short_folds
+        is_long = self.duration_s >= 3 * prediction.folds.count * prediction.folds.stretch_s
+        return prediction.folds if is_long else prediction.short_folds
 
     def late_commands(self, late_s: float) -> Array:
         """Commands at the nodes (M, 2) that are in force after a dead time, negative of commands that are stamped late.
@@ -375,8 +376,8 @@ def _foreign(command: Array, speed: Array, span_s: float, settings: GridSettings
     before = maximum_filter1d(asked, span, origin=(span - 1) // 2)
     most = np.maximum(before, maximum_filter1d(asked, 2 * math.ceil(span_s / GRID_STEP_S) + 3))
     least = minimum_filter1d(asked, span, origin=(span - 1) // 2)
-    unasked = (most < settings.no_command_rad_s) & (turning > settings.turning_rad_s)
-    unheard = (least > settings.loud_rad_s) & np.isfinite(asked) & (turning < settings.no_command_rad_s)
+    unasked = (most < settings.rest_rad_s) & (turning > settings.turning_rad_s)
+    unheard = (least > settings.loud_rad_s) & np.isfinite(asked) & (turning < settings.rest_rad_s)
     return np.asarray(maximum_filter1d((unasked | unheard).astype(np.uint8), 2 * span) > 0)
 
 
@@ -425,7 +426,7 @@ def undo_sample_hold(wheels: Wheels, settings: GridSettings) -> Wheels:
     speed = np.column_stack([wheels.left_speed_rad_s, wheels.right_speed_rad_s])
     same_run = np.diff(wheels.segment) == 0
     repeated = (np.diff(speed, axis=0) == 0.0).all(axis=1) & same_run
-    turning = (np.abs(speed[1:]) > settings.held_turning_rad_s).any(axis=1)
+    turning = (np.abs(speed[1:]) > settings.rest_rad_s).any(axis=1)
     if turning.sum() < 20 or float(repeated[turning].mean()) < settings.held_share:
         return wheels
     new = np.concatenate([[True], ~repeated])

@@ -71,7 +71,7 @@ def wheel_misfit(channel: WheelChannel, raw: Array) -> Callable[[Array], float]:
     """Minus the robust log likelihood of what a model leaves of the angles (E, 2), by logarithms of the noise (7,)."""
     motion, settings = channel.motion, channel.settings.noise
     # A wheel at rest reads the same however coarse its encoder is, and would speak for readings without error.
-    counted = motion.use & ~motion.restart & (np.abs(motion.speed_rad_s).max(axis=1) > settings.rest_rad_s)
+    counted = motion.use & ~motion.restart & (np.abs(motion.speed_rad_s).max(axis=1) > channel.settings.grid.rest_rad_s)
     likelihood = wheel_likelihood(motion, counted, raw)
 
     def misfit(logs: Array) -> float:
@@ -196,7 +196,7 @@ def sensor_noise(channel: BodyChannel, p: Array) -> SensorNoise:
         _least(_second(t_s, beside[:, columns], window, use), _third(t_s, measured[:, columns], window, use))
         for columns in (slice(0, 2), slice(2, 3))
     ]
-    resting = (np.abs(channel.drive.speed_rad_s).max(axis=1) < channel.settings.noise.rest_rad_s)[channel.samples.node]
+    resting = (np.abs(channel.drive.speed_rad_s).max(axis=1) < channel.settings.grid.rest_rad_s)[channel.samples.node]
     still = [
         _scatter(measured[:, columns], np.cumsum(np.diff(window + 1e6 * ~resting, prepend=-1.0) != 0), resting & use)
         for columns in (slice(0, 2), slice(2, 3))

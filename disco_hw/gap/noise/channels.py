@@ -140,7 +140,7 @@ class WheelChannel:
         settings, samples = self.settings.noise, self.drive.encoder
         raw = self.raw_residual(p, extra)
         apart = max(round(settings.even_span_s / max(float(np.median(np.diff(samples.t_s))), 1e-3)), 1)
-        moving = np.abs(self.drive.speed_rad_s[samples.node]).max(axis=1) > settings.rest_rad_s
+        moving = np.abs(self.drive.speed_rad_s[samples.node]).max(axis=1) > self.settings.grid.rest_rad_s
         counted = self.gains.use & moving
         grown = (raw[apart:] - raw[:-apart])[counted[apart:] & counted[:-apart]]
         off_rad = float(np.sqrt((grown**2).mean())) if grown.size else 0.0
@@ -393,14 +393,14 @@ def total_perturbation(drive: GriddedDrive, width: int, *perturbations: Array | 
 def _windows(drive: GriddedDrive) -> tuple[Index, Mask]:
     """Window of each kept pose, numbered from 0, and which poses are kept (those in windows that are too thin are not).
 
-    A window ends after `window_s`, with its run, and where poses fail to come for long.
+    A window ends after a block of time, with its run, and where poses fail to come for long.
     """
-    t, node, settings = drive.pose.t_s, drive.pose.node, drive.settings.noise
+    t, node, settings, block_s = drive.pose.t_s, drive.pose.node, drive.settings.noise, drive.settings.grid.block_s
     run = np.searchsorted(np.flatnonzero(drive.first), node, side="right")
     number = np.zeros(t.size, dtype=np.int64)
     current, begin = 0, 0
     for k in range(1, t.size):
-        if run[k] != run[k - 1] or t[k] - t[begin] > settings.window_s or t[k] - t[k - 1] > settings.longest_pose_gap_s:
+        if run[k] != run[k - 1] or t[k] - t[begin] > block_s or t[k] - t[k - 1] > settings.longest_pose_gap_s:
             current, begin = current + 1, k
         number[k] = current
     sizes = np.bincount(number, minlength=current + 1)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from numpy.typing import NDArray
 
 from disco_hw.gap.noise.channels import WheelChannel
@@ -45,7 +46,7 @@ def pictures(analysis: GapAnalysis, gap: dict[str, dict[float, PredictionErrors]
 
 
 def _worst_stretch(wheels: ChannelResult) -> bytes:
-    """Wheel speed over the six seconds in which the model as it was is furthest off."""
+    """Wheel speed over the six seconds in which the refitted model is furthest off."""
     channel = wheels.channel
     assert isinstance(channel, WheelChannel)
     drive = channel.drive
@@ -58,9 +59,18 @@ def _worst_stretch(wheels: ChannelResult) -> bytes:
     return stretch(drive.t_s[part], drive.speed_rad_s[part, 0], before[part, 0], after[part, 0], "left wheel, rad/s")
 
 
-def _legend_above(axes: Axes) -> None:
-    """A legend that covers nothing."""
-    axes.legend(frameon=False, ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, fontsize=9)
+def _legend_beside(axes: Axes) -> None:
+    """A legend to the right of the axes, that covers nothing."""
+    axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0, fontsize=9)
+
+
+def _plain_log(axes: Axes, upward: bool) -> None:
+    """Make the `upward` axis or the other one logarithmic, with plain numbers at 1, 2 and 5 of each decade."""
+    (axes.set_yscale if upward else axes.set_xscale)("log")
+    axis = axes.yaxis if upward else axes.xaxis
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(NullLocator())
 
 
 def gap_by_horizon(gap: dict[str, dict[float, PredictionErrors]]) -> bytes:
@@ -83,8 +93,9 @@ def gap_by_horizon(gap: dict[str, dict[float, PredictionErrors]]) -> bytes:
             axes.fill_between(horizons, ends[:, 0], ends[:, 1], color=_COLOURS[stage], alpha=0.15, linewidth=0)
         axes.set_xlabel("predicted ahead, s")
         axes.set_ylabel(label)
-        axes.set_yscale("log")
-        axes.legend(frameon=False)
+        _plain_log(axes, upward=True)
+    _legend_beside(axes)
+    figure.set_layout_engine("constrained")
     return png(figure)
 
 
@@ -99,7 +110,7 @@ def gap_by_regime(gap: dict[str, dict[float, PredictionErrors]], ahead_s: float)
         axes.barh(rows, values, height=0.25, color=_COLOURS[stage], label=stage)
     axes.set_yticks(range(len(names)), names)
     axes.set_xlabel(f"position error {ahead_s:g} s ahead, mm")
-    _legend_above(axes)
+    _legend_beside(axes)
     return png(figure)
 
 
@@ -111,7 +122,7 @@ def disagreement(title: str, regimes: list[Regime]) -> bytes:
     rows = np.arange(len(ordered))
     before = np.sqrt([regime.before for regime in ordered])
     after = np.sqrt([regime.after for regime in ordered])
-    axes.barh(rows, before, color=_COLOURS["refitted"], label="as it was")
+    axes.barh(rows, before, color=_COLOURS["refitted"], label="refitted")
     axes.barh(rows, after, height=0.4, color=_COLOURS["amended"], label="amended")
     axes.axvline(1.0, color="black", linewidth=0.8)
     axes.set_yticks(rows, [regime.name for regime in ordered])
@@ -119,11 +130,11 @@ def disagreement(title: str, regimes: list[Regime]) -> bytes:
     axes.set_title(title, loc="left", fontsize=10)
     largest = float(before.max()) if before.size else 1.0
     if largest > 20.0:
-        axes.set_xscale("log")
+        _plain_log(axes, upward=False)
     else:
         # Where there is nothing but noise the bars stay short, so that it looks like nothing.
         axes.set_xlim(0.0, max(1.05 * largest, _LEAST_SHOWN))
-    _legend_above(axes)
+    _legend_beside(axes)
     return png(figure)
 
 
@@ -132,9 +143,9 @@ def stretch(t_s: Array, measured: Array, before: Array, after: Array, label: str
     figure = Figure(figsize=(9.0, 2.8))
     axes = figure.add_subplot()
     axes.plot(t_s, measured, color="black", linewidth=1.4, label="measured")
-    axes.plot(t_s, before, color=_COLOURS["refitted"], linewidth=1.1, label="as it was")
+    axes.plot(t_s, before, color=_COLOURS["refitted"], linewidth=1.1, label="refitted")
     axes.plot(t_s, after, color=_COLOURS["amended"], linewidth=1.1, label="amended")
     axes.set_xlabel("time, s")
     axes.set_ylabel(label)
-    _legend_above(axes)
+    _legend_beside(axes)
     return png(figure)

@@ -183,8 +183,8 @@ def drifting_parameters(analysis: GapAnalysis, final: FinalFit) -> tuple[str, ..
         for name, parts in (in_equal_parts(found, 2) | in_equal_parts(found, 3)).items():
             values = [float(value) for value in parts.values]
             size = max(abs(values[0]), abs(values[-1]))
-            far = abs(values[-1] - values[0]) > settings.drift_share * size
-            sure = abs(parts.apart(0, len(values) - 1)) > settings.drift_sigmas
+            far = abs(values[-1] - values[0]) > settings.worth_share * size
+            sure = abs(parts.apart(0, len(values) - 1)) > settings.sure_sigmas
             if "." in name and far and sure and sorted(values) in (values, values[::-1]):
                 said = [
                     f"{value:.3g} in the {place}" for value, place in zip(values, _PLACES[len(values)], strict=True)
@@ -205,12 +205,12 @@ def across_logs(analysis: GapAnalysis) -> tuple[AcrossLogs, ...]:
             low, high = int(np.argmin(logs.values)), int(np.argmax(logs.values))
             # A point of turning near the axle is compared with the robot's size.
             size = found.fit.vector[1] if name == "x_icr_m" else np.abs(logs.values).max()
-            share = settings.drift_share if "." in name else settings.differ_share
+            share = settings.worth_share if "." in name else settings.differ_share
             far = logs.values[high] - logs.values[low] > share * size
             reach = Z95 * logs.deviations
             ends = np.column_stack([logs.values, logs.values - reach, logs.values + reach]).tolist()
             values = tuple((value, least, most) for value, least, most in ends)
-            out.append(AcrossLogs(name, values, bool(far and logs.apart(low, high) > settings.drift_sigmas)))
+            out.append(AcrossLogs(name, values, bool(far and logs.apart(low, high) > settings.sure_sigmas)))
     return tuple(out)
 
 

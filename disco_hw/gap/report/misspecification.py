@@ -27,7 +27,7 @@ from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.least_squares import Fit, fit, inverse
 from disco_hw.gap.search.richest_model import CANDIDATES, LATE, indices
-from disco_hw.gap.search.selection import Split, inflation
+from disco_hw.gap.search.selection import Z95, Split, inflation
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms
 from disco_hw.gap.settings import GRID_STEP_S, ReportSettings
 
@@ -54,7 +54,7 @@ def misspecified_effects(found: ChannelResult) -> list[str]:
         wide = WithTerms.of(channel, (*(one.term for one in found.unnamed), Term("", more)))
         now = found.fit
         free = fit(wide, np.append(now.vector, 0.0), indices(wide, found.names))
-        if 2.0 * (now.cost - free.cost) < settings.form_sigmas**2 * inflation(free, wide, (free.vector.size - 1,)):
+        if 2.0 * (now.cost - free.cost) < Z95**2 * inflation(free, wide, (free.vector.size - 1,)):
             continue
         again = _perturbation_of(wide.split(free.vector), name, channel)
         share = float((again * perturbation).sum() / (perturbation**2).sum())
@@ -157,7 +157,7 @@ def _takes_little(found: ChannelResult, name: str) -> str | None:
     best = 0.5 * float(found.richest @ found.richest)
     left = found.fit.cost - best - settings.nats_each * found.richest_parameters
     taken = max(_gain(found, name), 0.0)
-    if taken > settings.taken_share * (taken + left):
+    if taken > settings.worth_share * (taken + left):
         return None
     return f"it takes {100.0 * taken / (taken + left):.2g} % of what its channel lacks"
 
@@ -264,8 +264,8 @@ def masks_at_nodes(drive: GriddedDrive) -> Mapping[str, Mask]:
     moving = size > settings.rest_rad_s
     steady = moving & (np.abs(growth) < settings.speeding_rad_s2)
     turning = np.abs(half) > 0.3
-    slow, fast = _halves(size, moving, settings.halves_apart)
-    turning_slowly, turning_fast = _halves(np.abs(half), turning, settings.halves_apart)
+    slow, fast = _halves(size, moving, settings.worth_share)
+    turning_slowly, turning_fast = _halves(np.abs(half), turning, settings.worth_share)
     times = np.linspace(drive.t_s[0], drive.t_s[-1], 4)
     return {
         "standstill": ~moving,
@@ -354,7 +354,7 @@ def loud_regimes(found: ChannelResult) -> list[tuple[float, str]]:
             continue
         gain, spread = gain_by_block(0.5 * (now - best)[inside], samples.block[inside], settings.fewest_blocks)
         ratio = float(now[inside].sum() / max(best[inside].sum(), 1e-9))
-        if gain > price and gain > settings.clear_sigmas * spread and ratio > settings.louder:
+        if gain > price and gain > settings.sure_sigmas * spread and ratio > settings.louder:
             loud.append((math.sqrt(ratio), name))
     return sorted(loud, reverse=True)[: settings.most_regimes]
 

@@ -24,31 +24,37 @@ def known_besides(effect: EffectFinding, settings: ReportSettings = DEFAULT_SETT
 def sentence(effect: EffectFinding, settings: ReportSettings = DEFAULT_SETTINGS.report) -> str:
     """What a missing effect does, with its values."""
     described = REGISTRY[effect.name]
+    values = {name: estimate.value for name, estimate in effect.parameters.items()}
     besides = dict(described.besides)
-    texts = (described.sentence, *(besides[name] for name in known_besides(effect, settings)))
-    said = "; ".join(text.format(**{name: e.value for name, e in effect.parameters.items()}) for text in texts)
-    early = any(effect.parameters[p.name].value < p.low for p in described.parameters if p.least_fitted is not None)
-    return f"{said} (before they come: a clock stamps too late)" if early else said
+    also = (described.fill(besides[name], values) for name in known_besides(effect, settings))
+    return "; ".join((described.describe(values), *also))
 
 
 _MOST_NAMES = 3
 
 
 def answer(report: GapReport) -> list[str]:
-    """The answer in at most four lines: what is missing, how far predictions are off, what to drive next, going on."""
-    if report.effects:
-        more = len(report.effects) - _MOST_NAMES
-        first = "; ".join(sentence(effect, report.settings.report) for effect in report.effects[:_MOST_NAMES])
-        first += f"; and {more} more, listed below." if more > 0 else "."
-    elif report.unnamed:
-        first = f"Something is missing that has no name: {_in_words(report.unnamed[0])}."
-    elif report.residue or report.doubtful:
-        first = "Something is missing that none of the known effects explains."
-    else:
-        first = "Nothing is missing that this log could show."
-    lines = [first[0].upper() + first[1:]]
+    """The answer in at most ten lines, for somebody who drives the robot.
+
+    What is missing and how sure that is, how much it matters, what is left, which model to drive with, what to do next.
+    """
+    effects = report.effects[:_MOST_NAMES]
+    lines = [f"{said[0].upper()}{said[1:]}." for said in (sentence(each, report.settings.report) for each in effects)]
+    more = len(report.effects) - len(effects)
+    if more:
+        lines[-1] += f" And {more} more, listed below."
+    if not effects and report.unnamed:
+        lines.append(f"Something is missing that has no name: {_in_words(report.unnamed[0])}.")
+    elif not effects and (report.residue or report.doubtful):
+        lines.append("Something is missing that none of the known effects explains.")
+    elif not effects:
+        lines.append("Nothing is missing that this log could show.")
+    if effects:
+        lines.append(f"How sure: with 95 % probability {'; '.join(_range(each) for each in effects)}.")
     if report.gap or report.wheels:
         lines.append(_gap_line(report))
+    if report.remains is not None:
+        lines.append(report.remains.in_words())
     blind = [spot.name for spot in report.blind_spots if spot.blind]
     if blind:
         names = ", ".join(blind) if len(blind) <= _MOST_NAMES else f"{len(blind)} effects, listed below,"
@@ -59,7 +65,20 @@ def answer(report: GapReport) -> list[str]:
     return lines
 
 
+def _range(effect: EffectFinding) -> str:
+    """Between what ends the first parameter of an effect lies; its size, where words tell the sign."""
+    described = REGISTRY[effect.name]
+    parameter = described.parameters[0]
+    estimate = effect.parameters[parameter.name]
+    ends = estimate.low, estimate.high
+    if described.sentence_below is not None and estimate.value < 0.0:
+        ends = -estimate.high, -estimate.low
+    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    return f"{effect.name} is between {ends[0]:.2g} and {ends[1]:.2g}{unit}"
+
+
 def _gap_line(report: GapReport) -> str:
+    """How far predictions are off before and after, what the sensors' noise makes, and which model to drive with."""
     horizon, of = f"{report.horizon_s:g} s", report.gap or report.wheels
     if not math.isfinite(of["timed"][report.horizon_s].position_m):
         return f"No stretch of the logs is long enough to see how far {horizon} predictions are off."
@@ -69,18 +88,16 @@ def _gap_line(report: GapReport) -> str:
     }
     last = f"the sensors' noise makes {off['floor']}" if "floor" in off else f"the model as given by {off['nominal']}"
     said = (
-        f"{horizon} ahead on held-out data {'the amended model errs' if report.gap else 'the amended wheels err'} by "
-        f"{off['amended']}, {'one with geometry, delay and' if report.gap else 'with a delay and a'} "
-        f"lag alone (timed) by {off['timed']}; {last}."
+        f"{horizon} ahead, in parts of the log that were not used, {'predictions' if report.gap else 'the wheels'} "
+        f"are off by {off['timed']} with a delay and a lag alone (timed), by {off['amended']} with what was found "
+        f"(amended); {last}."
     )
     if "written" in off:
-        said += (
-            f" Without the terms that no model can carry, as it is written, the amended one errs by {off['written']}."
-        )
+        said += f" Without what no model can hold, as it is written, the amended model errs by {off['written']}."
     if report.why_not_amended is None:
         return said
     offered = report.offered if report.gap or report.offered == "timed" else "given"
-    return f"{said} Drive with the {offered} one, which is in model.toml. {report.why_not_amended}"
+    return f"{said} Drive with the {offered} model, which is in model.toml. {report.why_not_amended}"
 
 
 def as_text(report: GapReport) -> str:
@@ -137,7 +154,7 @@ _CAPTIONS = {
     "gap_by_regime": "The same as far ahead as the answer looks, by what the robot was doing.",
     "where_command_to_wheel": "Where commands and wheels disagree. Bars that end at the line hold nothing but noise.",
     "where_wheel_to_body": "Where wheels and poses disagree. Bars that end at the line hold nothing but noise.",
-    "worst_stretch": "The stretch in which the wheels and the model as it was lie furthest apart.",
+    "worst_stretch": "The stretch in which the wheels and the refitted model lie furthest apart.",
 }
 _DEFINITIONS = {
     "nominal": "the model as given",

@@ -78,6 +78,13 @@ class StagePredictions:
         ahead_s = self.judged_horizon_s if ahead_s is None else ahead_s
         return errors_of(self.body, self.wheels, self.chains[stage], ahead_s, self.poses)
 
+    def errors_of_body(self, stage: str) -> PredictionErrors | None:
+        """Errors of one stage with the wheels as they were measured; None where they are measured in any case."""
+        if self.wheels is None:
+            return None
+        measured = {held: replace(chain, wheels=None) for held, chain in self.chains[stage].items()}
+        return errors_of(self.body, None, measured, self.judged_horizon_s, self.poses)
+
     def table(self) -> dict[str, dict[float, PredictionErrors]]:
         """Errors by stage and horizon, with the floor, for which the wheels' path is that of the geometry alone."""
         horizons = self.body.settings.prediction.horizons_s

@@ -83,7 +83,7 @@ def one_encoder(
     variance = deviation**2 + spread**2
     possible = abs(value - expected) < settings.encoder_sigmas * variance**0.5
     nats = 0.5 * (value**2 - (value - expected) ** 2) / variance
-    return possible, possible and nats > settings.encoder_nats
+    return possible, possible and nats > settings.telling_nats
 
 
 def confounded_with(names: tuple[str, ...], encoder_possible: bool) -> dict[str, tuple[str, ...]]:

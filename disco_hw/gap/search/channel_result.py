@@ -135,12 +135,18 @@ class ChannelEstimates:
     covariance: Array
 
 
+def sampling_covariance(found: ChannelResult) -> Array:
+    """Covariance (A, A) of what a channel's accepted set frees, as an estimate of the values of this log."""
+    best, channel = found.told, found.selector.channel
+    factors = np.array([interval_inflation(best, channel, (index,)) for index in best.active])
+    return np.asarray(best.covariance() * np.sqrt(np.outer(factors, factors)))
+
+
 def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
     """Intervals of all parameters that a channel's accepted set frees: where the next drive's values are expected."""
     best, channel = found.told, found.selector.channel
     columns = channel.layout.columns
-    factors = np.array([interval_inflation(best, channel, (index,)) for index in best.active])
-    covariance = best.covariance() * np.sqrt(np.outer(factors, factors))
+    covariance = sampling_covariance(found)
     own = np.maximum(np.diag(covariance), 1e-300)
     wandering, apart, stamped = wandered(found), _weightings_apart(found), _stamped(found)
     more = np.array(
@@ -259,7 +265,7 @@ def wandered(found: ChannelResult) -> dict[str, float]:
     variance: dict[str, float] = {}
     for count in (2, settings.short_parts):
         for name, one in in_equal_parts(found, count).items():
-            goes_on = count == 2 and abs(one.apart(0, 1)) > settings.drift_sigmas
+            goes_on = count == 2 and abs(one.apart(0, 1)) > settings.sure_sigmas
             apart = one.variance_to_next if goes_on else one.variance_between
             variance[name] = max(apart, variance.get(name, 0.0))
     for name, one in in_logs(found).items():

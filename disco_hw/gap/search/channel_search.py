@@ -43,6 +43,8 @@ from disco_hw.gap.search.selection import (
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms, body_terms, places, places_near, wheel_terms
 from disco_hw.gap.settings import SelectionSettings
 
+# Fourth moment of normal noise over its variance squared.
+_GAUSSIAN_KURTOSIS = 3.0
 Array = NDArray[np.float64]
 
 
@@ -57,7 +59,7 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
     settings = drive.settings.selection
     # What is left of a rough fit becomes the noise of all that follow.
     seen = with_delay(channel, start)
-    limits = Thresholds(settings.rough_score, 0.0, settings.rough_score)
+    limits = Thresholds(settings.unnamed_score, 0.0, settings.unnamed_score)
     rough = Selector(channel, moves, limits, given=given, start=seen, closely=True)
     begin = tuple(dict.fromkeys((*given, *LATE)))
     responding(rough, begin)
@@ -70,7 +72,7 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
 
     def searched(channel: WheelChannel) -> ChannelResult:
         white = whiten_wheels(left, channel.gains)
-        rolling = np.abs(drive.speed_rad_s[drive.encoder.node]).max(axis=1) > settings.rest_rad_s
+        rolling = np.abs(drive.speed_rad_s[drive.encoder.node]).max(axis=1) > drive.settings.grid.rest_rad_s
         limits = _thresholds(white, channel.gains.use & rolling, settings)
         selector = timed(Selector(channel, moves, limits, given=given, start=rough.fit(given).vector))
         selector.fits[frozenset(names)] = fit(channel, rough.fit(names).vector, indices(channel, names))
@@ -182,7 +184,7 @@ def search_body(drive: GriddedDrive, start: Array, given: Names = ()) -> Channel
     errs = nominal.cost < drive.settings.noise.by_stamps_share * delayed.cost
     channel = learn_body_noise(channel, (nominal if errs else delayed).vector, iterations=4)
     settings = drive.settings.selection
-    limits = Thresholds(settings.rough_score, 0.0, settings.rough_score)
+    limits = Thresholds(settings.unnamed_score, 0.0, settings.unnamed_score)
     rough = Selector(channel, body_moves(channel), limits, given=given, start=delayed.vector, closely=True)
     names = rough.greedy(tuple(dict.fromkeys((*given, *delays_of(BODY)))))
     rich = (*names, *(name for name in smooth_of(BODY) if name not in names))
@@ -244,7 +246,7 @@ def _thresholds(white: Array, use: NDArray[np.bool_], settings: SelectionSetting
     if not sound.size:
         return Thresholds(settings.named_score, settings.least_moved_m, settings.unnamed_score)
     sound = np.clip(sound / np.sqrt((sound**2).mean()), -settings.clipped_at, settings.clipped_at)
-    heavy = float((sound**4).mean()) / settings.gaussian_kurtosis
+    heavy = float((sound**4).mean()) / _GAUSSIAN_KURTOSIS
     times = min(max(heavy, 1.0), settings.heaviest)
     return Thresholds(times * settings.named_score, settings.least_moved_m, times * settings.unnamed_score)
 

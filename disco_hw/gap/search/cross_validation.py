@@ -7,6 +7,7 @@ the heading that they make on the robot's geometry, in the units of the whole ga
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -32,7 +33,8 @@ Index = NDArray[np.int64]
 class PredictionErrors:
     """Root mean square at one horizon with 95 % bootstrap intervals over blocks of time.
 
-    `squares` (B, 2): sums of squares of position and of yaw by block, for a comparison block by block.
+    `squares` (B, 2): sums of squares of position and of yaw by block, for a comparison block by block;
+    `folds`: in how many the drive is divided; `regime_squares`: sums of squares by what the robot was doing.
     """
 
     position_m: float
@@ -42,6 +44,15 @@ class PredictionErrors:
     wheel_rad_s: float
     by_regime_m: dict[str, float]
     squares: Array | None = field(default=None, repr=False, compare=False)
+    folds: int = field(default=2, repr=False, compare=False)
+    regime_squares: Mapping[str, tuple[float, float]] = field(default_factory=dict, repr=False, compare=False)
+
+    @property
+    def by_stretch(self) -> Array:
+        """Sums of squares of position and of yaw by stretch of time (B, 2); all of it as one where that is not kept."""
+        if self.squares is None:
+            return np.array([[self.position_m**2, self.yaw_rad**2]])
+        return self.squares
 
 
 def worse_by(before: PredictionErrors, after: PredictionErrors) -> float:
@@ -52,62 +63,6 @@ def worse_by(before: PredictionErrors, after: PredictionErrors) -> float:
 def _ratios(before: PredictionErrors, after: PredictionErrors) -> tuple[float, float]:
     """Errors after over those before, of position and of heading."""
     return after.position_m / before.position_m, after.yaw_rad / before.yaw_rad
-
-
-def beats(before: PredictionErrors, after: PredictionErrors, settings: PredictionSettings) -> bool:
-    """Whether errors after are no larger, of position and heading together and within 5 % of each; ties beat."""
-    return _no_larger(_ratios(before, after), settings)
-
-
-def beats_throughout(before: PredictionErrors, after: PredictionErrors, settings: PredictionSettings) -> bool:
-    """Whether errors after beat those before whichever one block of time is left out: not by a single stretch."""
-    if not beats(before, after, settings):
-        return False
-    if before.squares is None or after.squares is None:
-        return True
-    without = [np.maximum(of.sum(axis=0) - of, 1e-30) for of in (before.squares, after.squares)]
-    return all(_no_larger((float(a), float(b)), settings) for a, b in np.sqrt(without[1] / without[0]))
-
-
-def stretches_telling(errors: PredictionErrors) -> float:
-    """How many stretches of time hold the errors, of position or of heading, whichever fewer (Kish, 1965)."""
-    if errors.squares is None:
-        return math.inf
-    return float((errors.squares.sum(axis=0) ** 2 / np.maximum((errors.squares**2).sum(axis=0), 1e-300)).min())
-
-
-def outdoes(before: PredictionErrors, after: PredictionErrors, settings: PredictionSettings) -> bool:
-    """Whether errors after beat those before, and one of them by enough to be worth another model."""
-    return beats(before, after, settings) and min(_ratios(before, after)) <= settings.worth
-
-
-def surely_beats(before: PredictionErrors, after: PredictionErrors, settings: PredictionSettings) -> bool:
-    """Whether errors after outdo those before and beat them throughout.
-
-    Where few stretches tell, both have to be worth it together, in each stretch that tells, or all of them by far.
-    """
-    if not (outdoes(before, after, settings) and beats_throughout(before, after, settings)):
-        return False
-    together = math.prod(_ratios(before, after)) ** 0.5
-    if stretches_telling(before) >= settings.fewest_stretches or together <= settings.far_better:
-        return True
-    return together <= settings.worth and beats_in_each(before, after, settings)
-
-
-def beats_in_each(before: PredictionErrors, after: PredictionErrors, settings: PredictionSettings) -> bool:
-    """Whether errors after are smaller, position and heading together, in each stretch that holds a share of those
-    before, and there are three of these.
-    """
-    if before.squares is None or after.squares is None:
-        return False
-    shares = before.squares / np.maximum(before.squares.sum(axis=0), 1e-300)
-    tells = shares.max(axis=1) >= settings.telling_share
-    smaller = after.squares[tells].prod(axis=1) < before.squares[tells].prod(axis=1)
-    return bool(np.count_nonzero(tells) > 2 and smaller.all())
-
-
-def _no_larger(ratios: tuple[float, float], settings: PredictionSettings) -> bool:
-    return max(ratios) <= settings.worse and math.prod(ratios) ** 0.5 <= settings.level
 
 
 def clearly_worse(before: PredictionErrors, after: PredictionErrors, settings: PredictionSettings) -> bool:
@@ -344,10 +299,12 @@ def errors_of(
         error[inside] = prediction_error(body, starts, chain.body, track, ahead_s)[inside]
         there = starts.node[inside] + ahead
         speed_error[inside] = (body.drive.speed_rad_s[there] - speed[there]).mean(axis=1)
-    return summarise(error, speed_error, starts, body.settings.prediction)
+    return summarise(error, speed_error, starts, body.settings.prediction, len(chains))
 
 
-def summarise(error: Array, speed_error: Array, starts: Starts, settings: PredictionSettings) -> PredictionErrors:
+def summarise(
+    error: Array, speed_error: Array, starts: Starts, settings: PredictionSettings, folds: int = 2
+) -> PredictionErrors:
     """Root mean squares, their bootstrap intervals over blocks, and position by regime."""
     position, yaw = error[:, 0] ** 2 + error[:, 1] ** 2, error[:, 2] ** 2
     if not position.size:
@@ -356,15 +313,17 @@ def summarise(error: Array, speed_error: Array, starts: Starts, settings: Predic
     regimes = np.array(starts.regime)
     label = np.unique(starts.block, return_inverse=True)[1]
     squares = np.column_stack([np.bincount(label, position), np.bincount(label, yaw)]).astype(np.float64)
-    by_regime = {str(name): float(np.sqrt(position[regimes == name].mean())) for name in np.unique(regimes)}
+    inside = {str(name): regimes == name for name in np.unique(regimes)}
     return PredictionErrors(
         float(np.sqrt(position.mean())),
         _interval(position, starts.block, settings.resamples),
         float(np.sqrt(yaw.mean())),
         _interval(yaw, starts.block, settings.resamples),
         float(np.sqrt((speed_error**2).mean())),
-        by_regime,
+        {name: float(np.sqrt(position[of].mean())) for name, of in inside.items()},
         squares,
+        folds,
+        {name: (float(position[of].sum()), float(yaw[of].sum())) for name, of in inside.items()},
     )
 
 
@@ -459,4 +418,4 @@ def _errors(channel: WheelChannel, of: Angles, ahead_s: float) -> PredictionErro
     way, heading = 0.5 * radius * turned.sum(axis=1), radius / axial * (turned[:, 1] - turned[:, 0])
     poses = np.zeros((node.size, 3))
     starts = Starts(node, poses, poses, block, tuple(regimes_driven(channel, node, ahead)))
-    return summarise(np.column_stack([way, np.zeros(node.size), heading]), speed, starts, settings.prediction)
+    return summarise(np.column_stack([way, np.zeros(node.size), heading]), speed, starts, settings.prediction, len(of))

@@ -114,7 +114,8 @@ class Ahead:
     def of(cls, body: BodyChannel, wheels: WheelChannel | None, poses: tuple[Array, Array]) -> Ahead:
         """The predictions of a drive from smoothed `poses`, as far ahead as the settings say, or runs are long."""
         longest_s = judged_horizon_s(body, poses)
-        horizons = sorted({min(ahead_s, longest_s) for ahead_s in body.settings.prediction.fitted_horizons_s})
+        usual_s = body.settings.prediction.reported_horizon_s
+        horizons = sorted({min(ahead_s, longest_s) for ahead_s in (0.5 * usual_s, usual_s)})
         every = [(ahead_s, find_starts(body, poses, ahead_s)) for ahead_s in horizons]
         return cls(body, wheels, tuple((ahead_s, starts) for ahead_s, starts in every if starts.node.size))
 
@@ -175,7 +176,7 @@ class Ahead:
 
             found = least_squares(
                 residual, values, slope, bounds=(low, high), x_scale=10.0 * step, loss="huber",
-                f_scale=settings.fit_huber * max(shares), max_nfev=settings.fit_steps, ftol=1e-5, xtol=1e-8,
+                f_scale=self.body.settings.noise.huber * max(shares), max_nfev=settings.fit_steps, ftol=1e-5, xtol=1e-8,
             )  # fmt: skip
             values, cost, normal = found.x, float(found.cost), np.asarray(found.jac.T @ found.jac)
         return JointFit(tuple(of.vectors(values)), cost, of.names, within(inverse(normal), low, high))

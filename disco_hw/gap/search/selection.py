@@ -159,7 +159,8 @@ def wheel_moves(channel: WheelChannel, geometry: Array) -> Callable[[Split, Spli
     drive = channel.drive
     settings = channel.settings.selection
     usable = np.isfinite(drive.command_rad_s[:, 0])
-    start, ahead_s = starts_as_far_as(drive.first, usable, settings.ahead_s, channel.settings.grid)
+    usual_s = channel.settings.prediction.reported_horizon_s
+    start, ahead_s = starts_as_far_as(drive.first, usable, usual_s, channel.settings.grid)
     ahead = round(ahead_s / GRID_STEP_S)
 
     def moves(small: Split, big: Split) -> float:
@@ -181,7 +182,8 @@ def body_moves(channel: BodyChannel) -> Callable[[Split, Split], float]:
     drive = channel.drive
     settings = channel.settings.selection
     everywhere = np.ones(drive.t_s.size, dtype=bool)
-    start, ahead_s = starts_as_far_as(drive.first, everywhere, settings.ahead_s, channel.settings.grid)
+    usual_s = channel.settings.prediction.reported_horizon_s
+    start, ahead_s = starts_as_far_as(drive.first, everywhere, usual_s, channel.settings.grid)
     heading = np.interp(drive.t_s[start], channel.samples.t_s, channel.measured[:, 2])
 
     def moves(small: Split, big: Split) -> float:
@@ -475,7 +477,7 @@ class Selector:
     def rivals(self, accepted: Names, name: str) -> Names:
         """Effects that would do in place of an accepted one: not clearly worse, the price of parameters paid."""
         rest = tuple(other for other in accepted if other != name)
-        worth = self._worth(rest, accepted, name) - self.settings.rival_nats
+        worth = self._worth(rest, accepted, name) - self.settings.telling_nats
         others = (other for other in candidates_of(self.channel.layout) if other not in accepted)
         return tuple(other for other in others if self.promise(rest, other) > worth)
 

@@ -183,12 +183,10 @@ def _with_place(name: str) -> str:
 
 def places(channel: BodyChannel, p: Array) -> Iterator[Term]:
     """Discs of the floor in which turning is different."""
-    drive, settings = channel.drive, channel.settings.terms
+    settings = channel.settings.terms
     x, y = _where(channel)
     low_x, high_x, low_y, high_y = (*np.quantile(x, (0.02, 0.98)), *np.quantile(y, (0.02, 0.98)))
-    if (high_x - low_x) * (
-        high_y - low_y
-    ) > settings.largest_floor_m2 or drive.t_s.size * GRID_STEP_S > settings.longest_s:
+    if (high_x - low_x) * (high_y - low_y) > settings.largest_floor_m2:
         return
     across, along = (
         np.arange(low, high + 1e-9, settings.disc_spacing_m) for low, high in ((low_x, high_x), (low_y, high_y))
@@ -203,7 +201,7 @@ def places_near(channel: BodyChannel, p: Array, disc: tuple[float, float, float]
     x, y, radius = disc
     settings = channel.settings.terms
     sizes = [size for size in (radius + step for step in settings.disc_size_steps_m) if size > 0.0]
-    steps = settings.disc_steps_m
+    steps = [settings.disc_spacing_m * share for share in (-0.5, -0.25, 0.0, 0.25, 0.5)]
     yield from _discs(channel, p, ((x + dx, y + dy, size) for dx in steps for dy in steps for size in sizes))
 
 

@@ -14,20 +14,14 @@ from disco_hw.gap.search.cross_validation import (
     Chain,
     PredictionErrors,
     _sigmas,
-    beats,
-    beats_in_each,
-    beats_throughout,
     clearly_worse,
     errors_of,
     floor_errors,
     fold_of,
     fold_vectors,
     judged_horizon_s,
-    outdoes,
     regimes_driven,
     smoothed_poses,
-    stretches_telling,
-    surely_beats,
     within_one_standard_error,
     worse_by,
 )
@@ -157,116 +151,10 @@ def in_stretches(position, yaw):
     return PredictionErrors(size[0], (0.0, 1.0), size[1], (0.0, 1.0), 0.0, {}, squares)
 
 
-def test_what_few_stretches_tell_has_to_be_better_by_far():
-    settings = DEFAULT_SETTINGS.prediction
-    many, few = in_stretches([1.0] * 6, [1.0] * 6), in_stretches([1.0] * 6, [3.0, 3.0, 0.1, 0.1, 0.1, 0.1])
-
-    def times(of, factor):
-        return in_stretches(*(factor**2 * of.squares.T))
-
-    assert stretches_telling(many) == pytest.approx(6.0)
-    assert stretches_telling(few) == pytest.approx(6.4**2 / 18.04)
-    assert surely_beats(many, times(many, 0.89), settings)
-    assert not surely_beats(many, times(many, 0.91), settings)
-    # Nine tenths in all, but more in one of those that tell.
-    uneven = few.squares * np.array([[0.4], [1.005], [0.7], [0.7], [0.7], [0.7]])
-    assert 0.7 < worse_by(few, in_stretches(*uneven.T)) < 0.9
-    assert not surely_beats(few, in_stretches(*uneven.T), settings)
-    assert surely_beats(few, times(few, 0.89), settings)
-    assert not surely_beats(few, times(few, 0.91), settings)
-    assert surely_beats(few, in_stretches(*(0.45 * few.squares.T)), settings)
-
-
-def test_stretches_that_are_just_enough_need_not_each_be_better():
-    settings, alike = DEFAULT_SETTINGS.prediction, in_stretches([1.0] * 6, [1.0] * 6)
-    worse_in_one = in_stretches(*[[0.6, 0.6, 0.6, 0.6, 0.6, 1.05]] * 2)
-    for fewest, better in ((6.0, True), (6.1, False)):
-        assert surely_beats(alike, worse_in_one, replace(settings, fewest_stretches=fewest)) is better
-
-
-@pytest.mark.parametrize(
-    ("position", "yaw", "each"),
-    [
-        ([0.8, 0.8, 0.8, 1.0, 1.0], [0.8, 0.8, 0.8, 1.0, 1.0], True),
-        # One pays for the other, in the same stretch alone.
-        ([0.5, 0.5, 0.5, 1.0, 1.0], [1.9, 1.9, 1.9, 1.0, 1.0], True),
-        ([0.5, 0.5, 0.5, 1.0, 1.0], [1.9, 1.9, 2.1, 1.0, 1.0], False),
-        ([0.8, 0.8, 1.0, 1.0, 1.0], [0.8, 0.8, 1.0, 1.0, 1.0], False),
-        # What hardly errs tells nothing.
-        ([0.8, 0.8, 0.8, 3.0, 3.0], [0.8, 0.8, 0.8, 3.0, 3.0], True),
-    ],
-)
-def test_in_each_stretch_that_tells_errors_have_to_be_smaller(position, yaw, each):
-    settings, size = DEFAULT_SETTINGS.prediction, np.array([1.0, 1.0, 1.0, 0.05, 0.05])
-    before = in_stretches(size, size)
-    assert beats_in_each(before, in_stretches(size * position, size * yaw), settings) == each
-    assert not beats_in_each(before, replace(before, squares=None), settings)
-    assert not beats_in_each(replace(before, squares=None), before, settings)
-
-
-def test_two_stretches_that_tell_are_not_each_of_several():
-    settings, size = DEFAULT_SETTINGS.prediction, np.array([1.0, 1.0, 0.05, 0.04])
-    assert not beats_in_each(in_stretches(size, size), in_stretches(0.5 * size, 0.5 * size), settings)
-    # A share of the heading's errors tells as much as one of the position's.
-    assert beats_in_each(in_stretches(size, size[::-1]), in_stretches(0.5 * size, 0.5 * size[::-1]), settings)
-    # At the share itself it tells.
-    even = np.ones(10)
-    assert beats_in_each(in_stretches(even, even), in_stretches(0.9 * even, even), settings)
-    assert not beats_in_each(in_stretches(even, even), in_stretches([*(0.9 * even[1:]), 1.1], even), settings)
-
-
-def test_what_beats_by_one_stretch_alone_does_not_beat():
-    settings = DEFAULT_SETTINGS.prediction
-    before = in_stretches([1.0] * 6, [1.0] * 6)
-    for quantity in (0, 1):
-        after = [[1.0] * 6, [1.0] * 6]
-        after[quantity] = [0.01, 1.05, 1.05, 1.05, 1.05, 1.05]
-        assert beats(before, in_stretches(*after), settings)
-        assert not surely_beats(before, in_stretches(*after), settings)
-    # Heading may not pay for position.
-    assert not beats(before, in_stretches([0.25] * 6, [1.2] * 6), settings)
-    assert beats(before, in_stretches([0.25] * 6, [1.1] * 6), settings)
-
-
 def test_the_larger_growth_of_position_and_heading_counts():
     before = in_stretches([1.0] * 6, [4.0] * 6)
     assert worse_by(before, in_stretches([4.0] * 6, [9.0] * 6)) == pytest.approx(2.0)
     assert worse_by(before, in_stretches([1.0] * 6, [9.0] * 6)) == pytest.approx(1.5)
-
-
-def test_at_its_bounds_a_model_still_beats():
-    before = in_stretches([1.0] * 6, [1.0] * 6)
-    settings = replace(DEFAULT_SETTINGS.prediction, worse=2.0, level=1.0, far_better=0.5, fewest_stretches=7.0)
-    settings = replace(settings, telling_share=1.0)
-    assert beats(before, in_stretches([4.0] * 6, [0.25] * 6), settings)
-    assert not beats(before, in_stretches([4.4] * 6, [0.2] * 6), settings)
-    assert surely_beats(before, in_stretches([0.25] * 6, [0.25] * 6), settings)
-    assert not surely_beats(before, in_stretches([0.26] * 6, [0.25] * 6), settings)
-    settings = replace(settings, worth=0.5, far_better=0.4, telling_share=0.1)
-    assert surely_beats(before, in_stretches([0.25] * 6, [0.25] * 6), settings)
-
-
-def test_what_beats_throughout_beats_in_all_too():
-    before, settings = in_stretches([1.0] * 6, [1.0] * 6), DEFAULT_SETTINGS.prediction
-    better, worse = in_stretches([0.9] * 6, [0.9] * 6), in_stretches([1.2] * 6, [1.2] * 6)
-    for of in (before, replace(before, squares=None)):
-        assert beats_throughout(of, better, settings)
-        assert not beats_throughout(of, worse, settings)
-
-
-def test_a_model_that_is_worth_another_errs_by_no_more_than_its_share():
-    before, settings = in_stretches([1.0] * 6, [1.0] * 6), replace(DEFAULT_SETTINGS.prediction, worth=0.5)
-    assert outdoes(before, in_stretches([0.25] * 6, [0.25] * 6), settings)
-    assert outdoes(before, in_stretches([0.25] * 6, [1.0] * 6), settings)
-    assert outdoes(before, in_stretches([1.0] * 6, [0.25] * 6), settings)
-    assert not outdoes(before, in_stretches([0.26] * 6, [0.26] * 6), settings)
-
-
-def test_two_models_are_level_within_a_hundredth_of_their_mean_errors():
-    before, settings = in_stretches([1.0] * 6, [1.0] * 6), DEFAULT_SETTINGS.prediction
-    for times, level in ((1.0095, True), (1.0115, False)):
-        after = in_stretches([times**2] * 6, [times**2] * 6)
-        assert beats(before, after, settings) == level
 
 
 def test_at_its_bounds_nothing_is_clearly_worse_and_without_stretches_the_size_alone_decides():
@@ -330,27 +218,6 @@ def test_without_errors_by_stretch_the_best_is_what_errs_least_in_position_times
     bare = [replace(one, squares=None) for one in (best, other)]
     for pair in ((bare[0], bare[1]), (best, bare[1]), (bare[0], other)):
         assert within_one_standard_error(*pair) == within
-
-
-def test_of_two_stretches_each_has_to_be_better():
-    settings = replace(DEFAULT_SETTINGS.prediction, fewest_stretches=0.0)
-    before = in_stretches([1.0, 1.0], [1.0, 1.0])
-    by_one = in_stretches([0.1, 1.1], [0.1, 1.1])
-    assert not surely_beats(before, by_one, settings)
-    # Where one is not known by stretch, the whole has to do.
-    assert surely_beats(replace(before, squares=None), by_one, settings)
-    assert surely_beats(before, replace(by_one, squares=None), settings)
-
-
-def test_without_errors_by_stretch_the_whole_decides():
-    whole = PredictionErrors(1.0, (0.0, 1.0), 1.0, (0.0, 1.0), 0.0, {})
-    one = in_stretches([1.0], [1.0])
-    settings = DEFAULT_SETTINGS.prediction
-    assert surely_beats(whole, replace(whole, position_m=0.8), settings)
-    assert not surely_beats(whole, replace(whole, position_m=1.1), settings)
-    # A single stretch has to be better by far.
-    assert surely_beats(one, in_stretches([0.25], [0.25]), settings)
-    assert not surely_beats(one, in_stretches([0.81], [0.81]), settings)
 
 
 def test_what_the_robot_did_is_told_of_every_start():

@@ -219,7 +219,7 @@ def of_rough_and_smooth(found, noted, layout):
     rough, chosen, *trials = noted.selectors
     settings = DEFAULT_SETTINGS.selection
     # What moves no prediction would pass for noise too.
-    assert (rough.thresholds.score, rough.thresholds.moves_m, rough.closely) == (settings.rough_score, 0.0, True)
+    assert (rough.thresholds.score, rough.thresholds.moves_m, rough.closely) == (settings.unnamed_score, 0.0, True)
     assert found.selector.channel is found.channel
     # Of the wheels the same, but for where commands are stamped.
     assert chosen.channel.gains is found.channel.gains
@@ -243,7 +243,9 @@ def test_the_noise_of_wheels_is_learnt_of_a_rough_selection_and_all_that_is_smoo
     settings = DEFAULT_SETTINGS.selection
     # Heavy tails are those of wheels of which one turns at least.
     ((white, use, of, limits),) = noted.tails
-    turning = np.abs(found.channel.drive.speed_rad_s[found.channel.drive.encoder.node]) > settings.rest_rad_s
+    turning = (
+        np.abs(found.channel.drive.speed_rad_s[found.channel.drive.encoder.node]) > DEFAULT_SETTINGS.grid.rest_rad_s
+    )
     np.testing.assert_array_equal(use, found.channel.gains.use & turning.any(axis=1))
     assert turning.any(axis=1).mean() > turning.all(axis=1).mean() + 0.2
     np.testing.assert_array_equal((white * found.channel.weight).ravel(), found.richest)

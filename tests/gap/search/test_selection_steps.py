@@ -75,7 +75,7 @@ def test_what_the_others_make_unnecessary_goes_and_what_is_given_stays():
 
 
 def test_rivals_are_those_that_are_worse_by_less_than_it_takes_to_tell():
-    told = Told({(A, B): 9.0, (B,): 0.0, (C, B): 9.0 - SETTINGS.rival_nats, (D, B): 9.1 - SETTINGS.rival_nats})
+    told = Told({(A, B): 9.0, (B,): 0.0, (C, B): 9.0 - SETTINGS.telling_nats, (D, B): 9.1 - SETTINGS.telling_nats})
     assert told.rivals((A, B), A) == (D,)
     assert C in candidates_of(BODY)
 

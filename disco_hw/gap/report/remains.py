@@ -1,0 +1,94 @@
+"""How much of the prediction error is explained, and where most of the rest lies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from disco_hw.effects import Channel
+from disco_hw.gap.search.cross_validation import PredictionErrors
+
+# What regimes are called in a sentence.
+_WHILE = {
+    "standstill": "the robot stands still",
+    "turning on the spot": "the robot turns on the spot",
+    "speeding up and braking": "the robot speeds up and brakes",
+    "curves": "the robot drives curves",
+    "straight ahead": "the robot drives straight ahead",
+    "straight back": "the robot drives straight back",
+}
+# Errors of more than so many times the sensors' noise are only partly explained.
+_EXPLAINED = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Remains:
+    """Errors of `timed`, of the model that is handed out, and of the sensors' noise, in position (m) and heading (rad).
+
+    `regime` and `channel`: what the robot does, and which half of the way from command to pose it is, where most of the
+    rest lies, in position or in heading, whichever is the larger in units of the noise. None where that is not known.
+    """
+
+    before: tuple[float, float]
+    after: tuple[float, float]
+    floor: tuple[float, float]
+    regime: str | None
+    channel: Channel | None
+
+    @classmethod
+    def of(
+        cls, timed: PredictionErrors, offered: PredictionErrors, floor: PredictionErrors, body: PredictionErrors | None
+    ) -> Remains | None:
+        """What remains of held-out errors; `body`: those with wheels as measured. None where nothing was predicted."""
+        if not math.isfinite(offered.position_m):
+            return None
+        before, after, noise = ((one.position_m, one.yaw_rad) for one in (timed, offered, floor))
+        larger = int(after[1] * noise[0] > after[0] * noise[1])
+        above = {
+            regime: squares[larger] - floor.regime_squares[regime][larger]
+            for regime, squares in offered.regime_squares.items()
+        }
+        channel = None
+        if body is not None:
+            own = (body.position_m, body.yaw_rad)[larger]
+            channel = Channel.WHEEL_TO_BODY if own**2 > 0.5 * after[larger] ** 2 else Channel.COMMAND_TO_WHEEL
+        return cls(before, after, noise, max(above, key=above.__getitem__, default=None), channel)
+
+    @property
+    def closed(self) -> tuple[float | None, float | None]:
+        """Share of the gap between `timed` and the noise that is closed, in position and heading; None without one."""
+        ends = zip(self.before, self.after, self.floor, strict=True)
+        position, heading = ((b - a) / (b - f) if b > f else None for b, a, f in ends)
+        return position, heading
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether errors are at most twice what the sensors' noise makes, in position and in heading."""
+        return all(after <= _EXPLAINED * floor for after, floor in zip(self.after, self.floor, strict=True))
+
+    def in_words(self) -> str:
+        """Which share of the gap is closed, and where most of the rest lies."""
+        shares = [
+            f"{share:.0%} in {name}" for share, name in zip(self.closed, ("position", "heading"), strict=True)
+            if share is not None
+        ]  # fmt: skip
+        said = f"Of what is more than the sensors' noise this explains {' and '.join(shares)}." if shares else ""
+        if self.is_explained:
+            return said or "What is left is the sensors' noise."
+        if self.regime is None:
+            return said
+        part = {Channel.WHEEL_TO_BODY: ", between wheels and body", Channel.COMMAND_TO_WHEEL: ", from command to wheel"}
+        where = f"while {_WHILE.get(self.regime, self.regime)}{part[self.channel] if self.channel else ''}"
+        return f"{said} Most of the rest is {where}.".strip()
+
+    def as_dict(self) -> Mapping[str, object]:
+        """The content of `remains` in report.json."""
+        position, heading = self.closed
+        return {
+            "closed_position": position,
+            "closed_heading": heading,
+            "explained": self.is_explained,
+            "regime": self.regime,
+            "channel": None if self.channel is None else self.channel.value,
+        }

@@ -1,0 +1,92 @@
+"""Which share of the prediction error is explained, and where most of the rest lies."""
+
+from dataclasses import replace
+
+import pytest
+
+from disco_hw.effects import Channel
+from disco_hw.gap.report import EffectFinding
+from disco_hw.gap.report.page import answer, page
+from disco_hw.gap.report.remains import Remains
+from disco_hw.gap.search.channel_result import ParameterEstimate
+from disco_hw.gap.search.cross_validation import PredictionErrors
+from tests.gap.report.test_findings import report
+from tests.gap.test_write_report import report_of
+
+
+def errors(position_m, yaw_rad, **by_regime):
+    squares = by_regime or {"curves": (position_m**2, yaw_rad**2)}
+    return PredictionErrors(position_m, (0.0, 1.0), yaw_rad, (0.0, 1.0), 0.1, {}, regime_squares=squares)
+
+
+TIMED, FLOOR = errors(0.05, 0.10), errors(0.01, 0.02)
+
+
+def test_the_share_of_the_gap_to_the_noise_that_is_closed_is_of_position_and_of_heading():
+    remains = Remains.of(TIMED, errors(0.02, 0.10), FLOOR, None)
+    assert remains.closed == pytest.approx((0.75, 0.0))
+    assert remains.as_dict()["closed_position"] == pytest.approx(0.75)
+    # Where `timed` errs by the noise there is no gap, and a model that errs by more has closed less than none.
+    assert Remains.of(FLOOR, FLOOR, FLOOR, None).closed == (None, None)
+    assert Remains.of(TIMED, errors(0.07, 0.06), FLOOR, None).closed == pytest.approx((-0.5, 0.5))
+
+
+@pytest.mark.parametrize(
+    ("position_m", "yaw_rad", "explained"), [(0.02, 0.04, True), (0.021, 0.02, False), (0.01, 0.041, False)]
+)
+def test_above_twice_the_noise_it_is_only_partly_explained(position_m, yaw_rad, explained):
+    remains = Remains.of(TIMED, errors(position_m, yaw_rad), FLOOR, None)
+    assert remains.is_explained is explained
+    found = replace(report_of("motor_lag", 0.05, 0.02), remains=remains)
+    assert found.verdict == ("effects_found" if explained else "partly_explained")
+    assert ("Most of the rest" in remains.in_words()) is not explained
+    # What is not found at all is not explained in part.
+    assert replace(found, effects=()).verdict == "unexplained"
+
+
+@pytest.mark.parametrize(("yaw_rad", "regime"), [(0.04, "curves"), (0.2, "standstill")])
+def test_most_of_the_rest_lies_where_squared_errors_are_furthest_above_those_of_the_noise(yaw_rad, regime):
+    # Of position in curves, of heading at standstill: that counts which is the larger in units of the noise.
+    offered = errors(0.05, yaw_rad, curves=(3.0, 1.0), standstill=(4.0, 2.0))
+    floor = errors(0.01, 0.02, curves=(0.1, 0.5), standstill=(3.5, 0.5))
+    remains = Remains.of(TIMED, offered, floor, None)
+    assert remains.regime == regime
+    said = {"curves": "the robot drives curves", "standstill": "the robot stands still"}[regime]
+    assert remains.in_words().endswith(f"Most of the rest is while {said}.")
+
+
+@pytest.mark.parametrize(
+    ("body", "channel", "said"),
+    [
+        (errors(0.045, 0.09), Channel.WHEEL_TO_BODY, "between wheels and body"),
+        (errors(0.02, 0.03), Channel.COMMAND_TO_WHEEL, "from command to wheel"),
+    ],
+)
+def test_what_is_left_with_the_wheels_as_measured_is_of_the_body(body, channel, said):
+    remains = Remains.of(TIMED, errors(0.05, 0.1), FLOOR, body)
+    assert remains.channel is channel
+    assert said in remains.in_words()
+    assert remains.as_dict()["channel"] == channel.value
+
+
+def test_without_predictions_nothing_is_said_of_the_rest():
+    nan = errors(float("nan"), float("nan"))
+    assert Remains.of(nan, nan, nan, None) is None
+    assert report(0.014).as_dict()["remains"] is None
+
+
+def test_the_answer_says_how_sure_how_much_is_explained_and_in_at_most_ten_lines():
+    found = replace(report_of("motor_lag", 0.05, 0.02), remains=Remains.of(TIMED, errors(0.02, 0.10), FLOOR, None))
+    lines = answer(found)
+    assert lines[0] == "The wheels follow their command slowly, with a time constant of 123 ms."
+    assert lines[1] == "How sure: with 95 % probability motor_lag is between 0.1 and 0.15 s."
+    assert lines[3].startswith(
+        "Of what is more than the sensors' noise this explains 75% in position and 0% in heading."
+    )
+    assert lines[3] in page(found).replace("&#x27;", "'")
+    assert len(lines) <= 10
+    early = EffectFinding("pose_latency", "pose_sensor", {"latency_s": ParameterEstimate(-0.065, -0.07, -0.06)}, 9.0)
+    assert answer(replace(found, effects=(early,)))[:2] == [
+        "Poses are stamped 65 ms early.",
+        "How sure: with 95 % probability pose_latency is between 0.06 and 0.07 s.",
+    ]
