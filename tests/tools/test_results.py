@@ -87,7 +87,7 @@ def test_a_file_without_figures_is_one_line(tmp_path, capsys):
 def test_every_figure_in_words_has_its_day_and_a_command_that_is_there(row):
     what, _, noted, shown_by = row
     assert re.match(r"\d+ \w{3} `[0-9a-f]{7}`", noted), what
-    gone = re.findall(r"`(tools/\w+\.py)[^`]*` of `[0-9a-f]{7}`", shown_by)
+    gone = re.findall(r"`(tools/[\w/]+\.py)[^`]*` of `[0-9a-f]{7}`", shown_by)
     assert not [tool for tool in gone if (results.ROOT / tool).exists()], what
     commands = [] if gone else re.findall(r"`([^`]+)`", shown_by)
     assert commands or gone, what
