@@ -30,9 +30,8 @@ from disco_hw.runtime.pipeline import Manual, NoPlanner, Planner
 from disco_hw.runtime.robot_setup import Setup, load_setup
 from disco_hw.runtime.safe_area import SafeArea
 from disco_hw.runtime.supervisor import UserRequest
-from disco_hw.tasks import RobotTask
+from disco_hw.tasks import RobotTask, task_from
 from disco_hw.tasks.circle import CircleTask
-from disco_hw.tasks.path import PathTask
 from sim.body_dynamics import BodyPose
 from sim.plant_parameters import PlantParameters
 
@@ -271,11 +270,16 @@ def corridor_setup(rng: np.random.Generator) -> Setup:
     behind_m, side_m = -2.0 * FOOTPRINT.reach_m, 0.5
     corners = ((behind_m, -side_m), (end_m, -side_m), (end_m, side_m), (behind_m, side_m))
     line = ((0.0, 0.0), (end_m + _BEYOND_M, 0.0))
-    setup = fenced_setup(
-        Fence(keep_in=corners, margin_m=0.01), PathTask(path="corridor", points=line, speed_m_s=_CORRIDOR_M_S)
-    )
+    # Its way-points stand in no file.
+    task = _task(path="corridor", speed_m_s=_CORRIDOR_M_S)
+    setup = fenced_setup(Fence(keep_in=corners, margin_m=0.01), msgspec.structs.replace(task, points=line))
     robot = msgspec.structs.replace(setup.config.robot, max_wheel_acceleration_rad_s2=_SOFT_RAD_S2)
     return replace(setup, config=msgspec.structs.replace(setup.config, robot=robot))
+
+
+def _task(**section: Any) -> Any:
+    """Return the task that these fields in [task] of robot.toml would choose."""
+    return task_from(section)
 
 
 def _outer_m(radius_m: float) -> float:

@@ -20,8 +20,8 @@ PACKAGE = Path(disco_hw.__file__).parent
 # path, as the recorder's status holds it, is no task.
 ELSEWHERE = {
     "circle": ("experiments/", "drive/scripts.py"),
-    # The word is the name of a field there: of the way-points' file, of a reply. The fence's experiment drives a line.
-    "path": ("daemon/__init__.py", "viewer/panel.py", "experiments/fence_drives.py"),
+    # The word is the name of a field there: of the way-points' file, of a reply.
+    "path": ("daemon/__init__.py", "viewer/panel.py"),
 }
 
 
