@@ -46,7 +46,7 @@ class Remains:
         before, after, noise = ((one.position_m, one.yaw_rad) for one in (timed, offered, floor))
         larger = int(after[1] * noise[0] > after[0] * noise[1])
         above = {
-            regime: squares[larger] - floor.regime_squares[regime][larger]
+            regime: squares[larger] - floor.regime_squares.get(regime, (0.0, 0.0))[larger]
             for regime, squares in offered.regime_squares.items()
         }
         channel = None

@@ -49,7 +49,8 @@ def excess(best: PredictionErrors, other: PredictionErrors, floor: PredictionErr
     growth = score(other, floor) - score(best, floor)
     if growth.size < 2:
         return float(growth.mean()), 0.0
-    share = 2.0 / growth.size + 1.0 / (best.folds - 1)
+    # Stretches of a single fold were predicted by one model: it is taken for one of two.
+    share = 2.0 / growth.size + 1.0 / max(best.folds - 1, 1)
     error = float(growth.std(ddof=1)) * math.sqrt(share)
     return float(growth.mean()), float(stdtrit(growth.size - 1, _ONE_SIGMA)) * error
 

@@ -55,6 +55,11 @@ def test_most_of_the_rest_lies_where_squared_errors_are_furthest_above_those_of_
     assert remains.in_words().endswith(f"Most of the rest is while {said}.")
 
 
+def test_a_regime_of_which_the_noise_is_not_known_counts_whole():
+    offered = errors(0.05, 0.04, curves=(3.0, 1.0), standstill=(4.0, 2.0))
+    assert Remains.of(TIMED, offered, errors(0.01, 0.02, curves=(0.1, 0.5)), None).regime == "standstill"
+
+
 @pytest.mark.parametrize(
     ("body", "channel", "said"),
     [

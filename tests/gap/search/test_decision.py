@@ -44,6 +44,11 @@ def test_the_standard_error_is_that_of_another_drive_by_how_the_excess_scatters_
     assert excess(in_stretches([1.0]), in_stretches([np.e]), None) == (pytest.approx(2.0), 0.0)
 
 
+def test_stretches_of_a_single_fold_count_as_those_of_one_of_two():
+    one, two = (excess(in_stretches([1.0, 2.0], folds=folds), in_stretches([3.0, 2.5]), None) for folds in (1, 2))
+    assert one == two
+
+
 def test_one_drive_in_six_lies_beyond_a_standard_error_of_what_another_says():
     # Stretches differ by chance alone; models share what they learn from, so that a drive moves them all.
     chance, stretches, folds = np.random.default_rng(7), 12, 4
