@@ -3,6 +3,7 @@
 import json
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -28,7 +29,12 @@ def searched():
         log,
         analysis,
         notes,
-        SimpleNamespace(table=predictions.table().copy, joint=predictions.joint, kept=predictions.kept),
+        SimpleNamespace(
+            table=predictions.table().copy,
+            joint=predictions.joint,
+            kept=predictions.kept,
+            errors_of_body=cache(predictions.errors_of_body),
+        ),
     )
 
 
