@@ -159,7 +159,7 @@ def test_delay_and_lag_in_the_model_help_a_plant_that_has_them():
     assert costs[0] < costs[1]
 
 
-@pytest.mark.parametrize("uncertainty", ["mc", "joint", "point"])
+@pytest.mark.parametrize("uncertainty", ["joint", "point", pytest.param("mc", marks=pytest.mark.thorough)])
 def test_every_form_of_uncertainty_drives(uncertainty):
     costs, _ = drive(planner(uncertainty=uncertainty), 15.0)
     assert costs[75:].mean() < 0.06
@@ -171,6 +171,7 @@ def test_risk_averse_plans_drive(risk):
     assert costs[75:].mean() < 0.06
 
 
+@pytest.mark.thorough
 def test_own_draws_repeat_bit_for_bit():
     one, other = (planner(uncertainty="mc", common_draws=False, draws=3) for _ in range(2))
     np.testing.assert_array_equal(one.plan(0, TANGENT).wheel_speeds, other.plan(0, TANGENT).wheel_speeds)
