@@ -20,7 +20,7 @@ COASTING_S = 2.5
 
 
 # Of several boards with one driver all are tried by `make test-all`; of the quick ones, each driver has its first.
-FURTHER = ("odrive-0.5", "vesc-four-braking", "roboclaw-a-board-a-side")
+FURTHER = ("odrive-0.5", "odrive-four-axes", "vesc-four-braking", "vesc-uart", "roboclaw-a-board-a-side")
 
 
 @pytest.fixture(
