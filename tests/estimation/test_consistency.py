@@ -12,7 +12,7 @@ from drivers.types import PoseSample
 from tests.estimation.truth import POSE_EVERY, WHEEL_PERIOD_NS, Geometry, Slip, drives, pose_error
 
 # Half as many seeds have bounds 1.4 times as wide.
-SEEDS = [50, pytest.param(100, marks=pytest.mark.long)]
+SEEDS = [pytest.param(50, marks=pytest.mark.thorough), pytest.param(100, marks=pytest.mark.long)]
 NOMINAL = OdometryParameters(0.061, 0.415, 0.238)
 
 
@@ -61,7 +61,7 @@ def slipping():
     return drives(100, 8.0)
 
 
-@pytest.mark.parametrize("seeds", SEEDS)
+@pytest.mark.parametrize("seeds", [25, *SEEDS])
 def test_nees_and_nis_are_inside_their_bounds(slipping, seeds):
     nees, nis = [], []
     for seed in range(seeds):
