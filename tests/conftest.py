@@ -85,7 +85,7 @@ def pytest_xdist_make_scheduler(config, log):
     return FilesToWorkers(config, log) if config.getvalue("dist") == "loadscope" else None
 
 
-def _is_in_part(path, part):
+def is_in_part(path, part):
     """Whether a file or folder belongs to a part of the tests, or has what does."""
     if not path.is_relative_to(TESTS) or path == TESTS:
         return True
@@ -97,7 +97,7 @@ def _is_in_part(path, part):
 def pytest_ignore_collect(collection_path, config):
     """With a robot only its tests are run, without one all others; a worker with a part has no other."""
     part = getattr(config, "workerinput", {}).get("part")
-    if part is not None and not _is_in_part(collection_path, part):
+    if part is not None and not is_in_part(collection_path, part):
         return True
     of_robot = collection_path == ROBOT_TESTS or ROBOT_TESTS in collection_path.parents
     on_the_way = collection_path in ROBOT_TESTS.parents
