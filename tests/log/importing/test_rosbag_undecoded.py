@@ -7,6 +7,7 @@ from disco_hw.log.importing.losses import WARNING
 from disco_hw.log.importing.rosbag import read_rosbag
 from tests.inference.drives import robot_config
 from tests.log.importing.bags import Maker, recorded
+from tests.tables import thinned
 
 WHOLE = 646
 """Wheel samples of the drive."""
@@ -30,7 +31,7 @@ def record_damaged(path, monkeypatch, topic, every, storage="mcap"):
         recorded(path, storage)
 
 
-@pytest.mark.parametrize(("every", "lost", "is_warned"), [(200, 3, False), (10, 64, True), (3, 215, True)])
+@thinned(("every", "lost", "is_warned"), [(10, 64, True), (200, 3, False), (3, 215, True)], quick=1)
 def test_a_message_that_cannot_be_decoded_is_left_out_and_counted(tmp_path, monkeypatch, every, lost, is_warned):
     record_damaged(tmp_path / "b", monkeypatch, "/joint_states", every)
     drive = read_rosbag(tmp_path / "b", robot_config())
@@ -50,6 +51,7 @@ def test_a_topic_of_which_most_cannot_be_decoded_is_refused(tmp_path, monkeypatc
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.thorough
 def test_a_topic_of_which_no_message_can_be_decoded_is_not_chosen_and_named(tmp_path, monkeypatch):
     record_damaged(tmp_path / "b", monkeypatch, "/joint_states", 1)
     drive = read_rosbag(tmp_path / "b", robot_config())
