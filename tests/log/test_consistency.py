@@ -13,6 +13,7 @@ from disco_hw.log.drive import concatenate
 from disco_hw.log.load import load_drive
 from sim.effects import EFFECTS
 from tests.log.contradictory_drives import AXIAL_M, FAULTS, RADIUS_M, rotated, sound, without_commands
+from tests.tables import thinned
 from tools.gap_logs import realistic, simulated_drive
 
 REAL = os.environ.get("DISCO_HW_DATA")
@@ -29,7 +30,7 @@ def found(log):
     return find_contradictions(log, RADIUS_M, AXIAL_M)
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@thinned("fault", FAULTS, quick=4)
 def test_the_cause_is_named_first_with_its_remedy(fault):
     change, cause, remedy = FAULTS[fault]
     first, *_ = found(change(sound()))
