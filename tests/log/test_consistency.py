@@ -40,14 +40,14 @@ def test_the_cause_is_named_first_with_its_remedy(fault):
     assert "\n" not in first.message
 
 
-@pytest.mark.parametrize("drive", ["free", "rich", "circle", "straight", "poor", "random_steps"])
+@thinned("drive", ["free", "rich", "circle", "straight", "poor", "random_steps"], quick=2)
 def test_a_sound_log_is_sound_also_in_another_frame_and_without_commands(drive):
     log = sound(drive)
     assert found(log) == found(rotated(1.1)(log)) == found(without_commands(log)) == ()
 
 
 @pytest.mark.parametrize("drive", ["poor", pytest.param("free", marks=pytest.mark.long)])
-@pytest.mark.parametrize("name", EFFECTS)
+@thinned("name", EFFECTS, quick=10)
 def test_what_a_robot_may_do_is_no_contradiction(name, drive):
     assert found(simulated_drive(realistic(name, 5), seed=5, drive=drive, dirty=True, motors="real")) == ()
 

@@ -20,6 +20,7 @@ from drivers.types import PoseSample
 from tests.drive.test_hand_pilot import Hand
 from tests.drivers.waiting import free_port
 from tests.runtime.simulated import ROBOT_FILE, simulated_stack
+from tests.tables import thinned
 from tools.fault_run import CirclingPlanner
 
 
@@ -103,7 +104,7 @@ def containing(said, words):
     return [text for text in said if words in text]
 
 
-@pytest.mark.parametrize("off_m", [1.0, -0.3])
+@thinned("off_m", [1.0, -0.3], quick=1)
 def test_a_robot_that_is_carried_stops_its_task_and_says_so_and_its_operator_starts_it_again(bench, off_m):
     made = bench()
     carried = []
