@@ -108,6 +108,7 @@ def test_a_drive_whose_model_remembers_replays_bit_for_bit(tmp_path, monkeypatch
             assert not replay(log).ok
 
 
+@pytest.mark.thorough
 def test_a_follower_takes_over_from_a_planner_that_finds_nothing_and_replays_bit_for_bit(tmp_path, monkeypatch):
     step = Optimiser.step
 

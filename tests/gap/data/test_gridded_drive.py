@@ -51,6 +51,7 @@ def test_one_row_alone_says_nothing_of_how_close_rows_are(rows, tick):
     assert tick_s(t, t[:0]) == 0.0
 
 
+@pytest.mark.thorough
 def test_what_rows_of_a_log_stamp_is_known_as_closely_as_they_follow_one_another():
     t = np.arange(0.0, 10.0, 0.05)
     turned = np.sin(t)
@@ -94,6 +95,7 @@ def test_commands_in_force_are_earlier_ones_or_later_ones_where_their_stamps_are
     np.testing.assert_array_equal(in_force[0 if cells > 0 else -1], edge)
 
 
+@pytest.mark.thorough
 @thinned("by_s", [-0.3, -0.203, 0.107, 0.4], quick=1)
 def test_a_log_whose_stamps_are_moved_lies_on_the_grid_as_if_they_were_not(by_s):
     rng = np.random.default_rng(7)

@@ -280,6 +280,7 @@ def test_where_nothing_that_is_known_comes_near_the_noise_is_what_that_leaves(no
     assert plainer.names == ("motor_lag",)
 
 
+@pytest.mark.thorough
 def test_the_noise_of_a_body_is_learnt_of_a_rough_selection_and_all_that_is_smooth(noted):
     channel, line = body_channel(turn_slip=0.08)
     found = search_body(line, channel.neutral)

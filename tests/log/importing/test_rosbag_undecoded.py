@@ -60,13 +60,13 @@ def test_a_topic_of_which_no_message_can_be_decoded_is_not_chosen_and_named(tmp_
     assert any("hides what that leaves out; record /joint_states" in note for note in drive.notes)
 
 
-@pytest.mark.parametrize("topic", ["/rtabmap/odom", "/cmd_vel", "/tf", "/camera/image_raw"])
+@thinned("topic", ["/rtabmap/odom", "/cmd_vel", "/tf", "/camera/image_raw"], quick=1)
 def test_damage_in_one_topic_costs_no_wheel_sample(tmp_path, monkeypatch, topic):
     record_damaged(tmp_path / "b", monkeypatch, topic, 5)
     assert read_rosbag(tmp_path / "b", robot_config()).wheels.t_s.size == WHOLE
 
 
-@pytest.mark.parametrize("share", [0.3, 0.6, 0.97])
+@thinned("share", [0.3, 0.6, 0.97], quick=1)
 def test_a_sqlite3_file_is_read_to_its_damage(tmp_path, share):
     recorded(tmp_path / "b", "sqlite3")
     (path,) = (tmp_path / "b").glob("*.db3")
