@@ -158,7 +158,7 @@ def test_once_all_poses_are_in_the_late_run_equals_the_ordered_run_to_the_bit(sl
     assert follow(slipping, 0, survivors)[0][-1] == follow(slipping, 0, late)[0][-1]
 
 
-@thinned("delay_ns", [0, 200_000_000], quick=1)
+@thinned("delay_ns", [200_000_000, 0], quick=1)
 def test_a_robot_moved_by_half_a_metre_is_found_again(slipping, delay_ns):
     moved_at = 100
     shift = np.array([0.3, -0.4, 0.0])
