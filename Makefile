@@ -43,21 +43,17 @@ BEGAN := $(shell date +%s)
 REST ?= long or thorough
 TOOK = echo "make $@ took $$(($$(date +%s) - $(BEGAN))) s, set-up included."
 # One thread of linear algebra a process: pools of them on two cores only wait for one another.
-PYTEST := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest --dist loadscope --no-loadscope-reorder
+PYTEST := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-# The types are checked beside the compiler and the tests, in what these leave of the processors. The tests are collected
-# once before, so that their modules are rewritten and compiled by one process, not by each of the three.
+# Types and unused code are looked for beside the compiler and the tests, in what these leave of the processors.
 test: $(STAMP) chromium
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/vulture
-	nice $(BIN)/mypy & types=$$!; \
-		$(BIN)/python -m pytest -n 0 --collect-only -m "long or thorough" > $(VENV)/.rest 2>&1 & \
+	nice sh -c '$(BIN)/mypy && $(BIN)/vulture' & static=$$!; \
 		$(BIN)/python -m tools.compile_kernels && \
-		$(PYTEST) -n 3 -m "not long and not thorough$(if $(CHROMIUM), or browser)"; \
-		tests=$$?; wait $$types && exit $$tests
-	@$(TOOK) "make test-all also runs $$(tail -n 1 $(VENV)/.rest | grep -o '^[0-9]*') tests:" \
-		"more cases of the same rules, closed loops, studies, clusters and the page in a browser."
+		$(PYTEST) -n 3 --dist each -m "not long and not thorough$(if $(CHROMIUM), or browser)"; \
+		tests=$$?; wait $$static && exit $$tests
+	@$(TOOK)
 
 # The cross-compiler and emulator of a Cortex-M: 113 MB to download, 923 MB on disk. Without them their tests are skipped.
 cross-tools:
@@ -82,7 +78,7 @@ ros: $(STAMP)
 
 # What `make test` leaves out; REST=thorough has only what takes no other tools and no minutes for one test.
 test-rest: $(STAMP) $(if $(findstring long,$(REST)),chromium cross-tools ros)
-	$(PYTEST) -n 2 -m "$(REST)"
+	$(PYTEST) -n 2 --dist loadscope --no-loadscope-reorder -m "$(REST)"
 	@$(TOOK)
 
 test-all: test

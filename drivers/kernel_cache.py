@@ -6,6 +6,7 @@ planner's kernels and the simulated plant share no other room.
 
 from __future__ import annotations
 
+import fcntl
 import os
 import stat
 import sys
@@ -77,6 +78,18 @@ class _Index(IndexDataCacheFile):
         except Exception:
             # Another version of the sources left it, with types that are elsewhere now: nothing is there.
             return {}
+
+    def save(self, key: Any, data: Any) -> None:
+        """Save a compiled form, while no other process saves one in this directory.
+
+        Two that did so at a time would give two forms one file name, or drop one from the index.
+        """
+        directory = os.open(self._cache_path, os.O_RDONLY)
+        try:
+            fcntl.flock(directory, fcntl.LOCK_EX)
+            super().save(key, data)  # type: ignore[no-untyped-call]
+        finally:
+            os.close(directory)
 
 
 class _KernelCache(FunctionCache):

@@ -17,14 +17,56 @@ ROBOT_TESTS = Path(__file__).parent / "robot"
 REAL_TIME = ("tests/hil/", "tests/firmware_protocol/emulated/")
 # What does not drive may run beside what does.
 STANDING = tuple(f"tests/hil/test_{name}.py" for name in ("check", "held_up", "path", "waiting"))
+TESTS = Path(__file__).parent
+# With `--dist each` a worker reads and runs only its own folders, as reading all tests takes as long as a tenth of them
+# does to run. The first has the stacks in real time, one the folders that compute most, and the last all others.
+PARTS = (
+    ("hil", "firmware_protocol/emulated"),
+    ("adaptation", "control", "estimation", "gap", "inference", "model", "tasks"),
+)
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_configure(config):
+    if config.getvalue("dist") == "each":
+        if len(config.getvalue("tx")) != len(PARTS) + 1:
+            raise pytest.UsageError(f"--dist each: the tests have {len(PARTS) + 1} parts; give -n {len(PARTS) + 1}")
+        config.pluginmanager.register(PartsOfTests())
     if settings().derandomize:
         # Examples take constants from what a process has imported so far, which is chance on three workers.
         assert callable(providers._get_local_constants)
         providers._get_local_constants = lambda: providers._local_constants
+
+
+class PartsOfTests:
+    """Gives each worker its part, and says at the end how many tests were left out of them all."""
+
+    def __init__(self):
+        self.collected = self.left_out = 0
+        self.session = None
+
+    def pytest_sessionstart(self, session):
+        self.session = session
+
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_configure_node(self, node):
+        node.workerinput["part"] = int(node.workerinput["workerid"].removeprefix("gw"))
+
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_xdist_node_collection_finished(self, node, ids):
+        self.collected += len(ids)
+
+    def pytest_runtest_logstart(self):
+        # xdist takes the last worker's for all.
+        self.session.testscollected = self.collected
+
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_testnodedown(self, node, error):
+        self.left_out += getattr(node, "workeroutput", {}).get("left_out", 0)
+
+    def pytest_terminal_summary(self, terminalreporter):
+        what = "more cases of the same rules, closed loops, studies, clusters and the page in a browser"
+        terminalreporter.write_line(f"make test-all also runs {self.left_out} tests: {what}.")
 
 
 class FilesToWorkers(LoadScopeScheduling):
@@ -43,13 +85,30 @@ def pytest_xdist_make_scheduler(config, log):
     return FilesToWorkers(config, log) if config.getvalue("dist") == "loadscope" else None
 
 
+def is_in_part(path, part):
+    """Whether a file or folder belongs to a part of the tests, or has what does."""
+    if not path.is_relative_to(TESTS) or path == TESTS:
+        return True
+    within = [at for at, folders in enumerate(PARTS) if any(path.is_relative_to(TESTS / folder) for folder in folders)]
+    has = [at for at, folders in enumerate(PARTS) if any((TESTS / folder).is_relative_to(path) for folder in folders)]
+    return part in within if within else part in (*has, len(PARTS))
+
+
 def pytest_ignore_collect(collection_path, config):
-    """With a robot only its tests are run, without one all others."""
+    """With a robot only its tests are run, without one all others; a worker with a part has no other."""
+    part = getattr(config, "workerinput", {}).get("part")
+    if part is not None and not is_in_part(collection_path, part):
+        return True
     of_robot = collection_path == ROBOT_TESTS or ROBOT_TESTS in collection_path.parents
     on_the_way = collection_path in ROBOT_TESTS.parents
     if of_robot or not on_the_way:
         return of_robot != bool(config.getoption("--robot")) or None
     return None
+
+
+def pytest_deselected(items):
+    output = getattr(items[0].config, "workeroutput", {}) if items else {}
+    output["left_out"] = output.get("left_out", 0) + len(items)
 
 
 def pytest_collection_modifyitems(config, items):

@@ -1,11 +1,12 @@
-"""Tables of cases, of which `make test` runs a few and `make test-all` runs all."""
+"""Tables of cases and examples, of which `make test` runs a few and `make test-all` runs all."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
 
 
 def thinned(names: str | Sequence[str], cases: Sequence[Any], *, quick: int, **options: Any) -> pytest.MarkDecorator:
@@ -20,6 +21,23 @@ def thinned(names: str | Sequence[str], cases: Sequence[Any], *, quick: int, **o
     single = isinstance(names, str) and "," not in names
     parameters = [case if at in kept else _thorough(case, single) for at, case in enumerate(cases)]
     return pytest.mark.parametrize(names, parameters, **options)
+
+
+def examples(*, quick: int, every: int, **strategies: Any) -> Callable[[Callable[..., None]], Callable[[int], None]]:
+    """Make a test of a property, which takes these strategies' values: `make test` tries `quick` examples of it."""
+
+    def decorate(test: Callable[..., None]) -> Callable[[int], None]:
+        tried = {count: settings(max_examples=count)(given(**strategies)(test)) for count in (quick, every)}
+
+        @pytest.mark.parametrize("count", [quick, pytest.param(every, marks=pytest.mark.thorough)])
+        def run(count: int) -> None:
+            tried[count]()
+
+        run.__name__, run.__qualname__, run.__doc__ = test.__name__, test.__qualname__, test.__doc__
+        run.__module__ = test.__module__
+        return run
+
+    return decorate
 
 
 def _thorough(case: Any, single: bool) -> Any:

@@ -67,7 +67,7 @@ def settled():
 
 
 @thinned("factor", [0.85, 1.15], quick=1)
-@pytest.mark.parametrize(("index", "field"), [(0, "radius_m"), (1, "axle_m"), (2, "x_icr_m")])
+@thinned(("index", "field"), [(1, "axle_m"), (0, "radius_m"), (2, "x_icr_m")], quick=1)
 def test_four_fifths_of_a_change_are_known_after_two_and_a_half_seconds(settled, index, field, factor):
     known_part = []
     for one in settled:
@@ -120,6 +120,7 @@ def test_beginning_and_ending_turns_is_no_change():
     assert np.abs(found.mean / MEAN - 1.0).max() < 0.03
 
 
+@pytest.mark.thorough
 def test_a_body_that_slides_by_chance_is_no_change():
     # Forward, to the left (m/s) and in heading (rad/s) for 0.3 s at a time: what the virtual robot's body does.
     std, keep = np.array([0.005, 0.004, 0.018]), np.exp(-0.02 / 0.3)
@@ -138,6 +139,7 @@ def test_a_body_that_slides_by_chance_is_no_change():
     assert changes == 0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("way", "number"), [("square", 1001), ("slalom", 1000)])
 def test_corners_are_no_change_and_teach_the_geometry(way, number):
     robot, found = robots(number, 1)[0], learner()

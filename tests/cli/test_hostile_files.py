@@ -11,6 +11,7 @@ import pytest
 
 from disco_hw.cli import app
 from disco_hw.files import LOG
+from tests.tables import thinned
 from tools.check.verb_calls import CALLS, call, good_files, without_work, write_good
 
 STUCK_S = 60
@@ -108,8 +109,11 @@ def test_good_files_get_as_far_as_the_work(tmp_path, calling, one):
         assert said.code in (None, 0), said.errors
 
 
-@pytest.mark.parametrize(
-    ("one", "name", "kind"), CASES, ids=lambda value: value if isinstance(value, str) else value.verb
+@thinned(
+    ("one", "name", "kind"),
+    CASES,
+    quick=len(CASES) // 4,
+    ids=lambda value: value if isinstance(value, str) else value.verb,
 )
 def test_what_is_no_file_is_refused_in_one_line_that_names_it(tmp_path, calling, one, name, kind):
     write_good(tmp_path)

@@ -22,6 +22,7 @@ from disco_hw.control.kernel.step import disco_step
 from disco_hw.experiments.circle import KinematicPlant
 from disco_hw.model import EffectSetting, Gaussian, load_model
 from disco_hw.tasks.circle import CircleCost
+from tests.tables import thinned
 
 MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
 MEAN = {"wheel_radius_m": 0.061, "axial_distance_m": 0.415, "x_icr_m": 0.238}
@@ -130,6 +131,7 @@ def test_a_state_from_before_is_predicted_to_the_plans_start():
     np.testing.assert_allclose(plan.trajectory[0], [0.061 * 4.0 * 0.07, 0.0, 0.0], atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_commands_on_their_way_are_in_the_prediction():
     delayed = replace(MODEL, belief=None, effects=(EffectSetting("command_delay", {"delay_s": 0.25}),))
     sent = (SentCommand(-1_000_000_000, 0.0, 0.0), SentCommand(-100_000_000, 5.0, 5.0))
@@ -159,7 +161,7 @@ def test_delay_and_lag_in_the_model_help_a_plant_that_has_them():
     assert costs[0] < costs[1]
 
 
-@pytest.mark.parametrize("uncertainty", ["mc", "joint", "point"])
+@thinned("uncertainty", ["joint", "point", "mc"], quick=1)
 def test_every_form_of_uncertainty_drives(uncertainty):
     costs, _ = drive(planner(uncertainty=uncertainty), 15.0)
     assert costs[75:].mean() < 0.06
@@ -171,6 +173,7 @@ def test_risk_averse_plans_drive(risk):
     assert costs[75:].mean() < 0.06
 
 
+@pytest.mark.thorough
 def test_own_draws_repeat_bit_for_bit():
     one, other = (planner(uncertainty="mc", common_draws=False, draws=3) for _ in range(2))
     np.testing.assert_array_equal(one.plan(0, TANGENT).wheel_speeds, other.plan(0, TANGENT).wheel_speeds)

@@ -15,6 +15,7 @@ from disco_hw.tasks.circle import CircleCost
 from disco_hw.tasks.line import PathTable
 from disco_hw.tasks.line.cost import PathCost
 from disco_hw.tasks.timed_path import TimedPathCost
+from tests.tables import thinned
 
 BASE = (0.061, 0.415, 0.238)
 LIMITS = CommandLimits(8.0, 20.0)
@@ -67,7 +68,7 @@ def driven(planner, start, seconds):
 
 
 @pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("outcome", [None, PlanOutcome.STOPPING])
+@thinned("outcome", [None, PlanOutcome.STOPPING], quick=1)
 def test_every_law_drives_the_circle_on_while_the_planner_finds_nothing(law, outcome):
     planted = Planted()
     planted.outcome = outcome

@@ -40,6 +40,7 @@ def within(theta, angle, speed, torques, got):
     return np.abs(got - costs) <= 1e-4 * costs + spread
 
 
+@pytest.mark.thorough
 @settings(max_examples=40)
 @given(THETA, st.floats(-10.0, 10.0), st.floats(-8.0, 8.0), st.integers(0, 2**63 - 1))
 @example([(1.0, 1.0)] * 4 + [(0.5, 1.0)], 1.5, -6.5, 245)

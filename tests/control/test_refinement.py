@@ -40,11 +40,13 @@ def drive_on() -> dict[float, tuple[np.ndarray, np.ndarray]]:
     return found
 
 
+@pytest.mark.thorough
 def test_a_refined_plan_stays_on_the_line(drive_on: dict[float, tuple[np.ndarray, np.ndarray]]) -> None:
     """A robot on the circle is planned to stay within a millimetre of it; sampling alone is not as near."""
     assert np.abs(drive_on[0.2][1]).max() < 1e-3
 
 
+@pytest.mark.thorough
 def test_a_line_too_fast_for_the_wheels_is_followed_slower(
     drive_on: dict[float, tuple[np.ndarray, np.ndarray]],
 ) -> None:
@@ -55,6 +57,7 @@ def test_a_line_too_fast_for_the_wheels_is_followed_slower(
     assert np.abs(off_m).max() < 5e-3
 
 
+@pytest.mark.thorough
 def test_warming_up_compiles_the_refinement() -> None:
     """The refinement is compiled before the robot reaches its line, though warming up plans far from it."""
     planner = Disco(MODEL, CircleCost(radius_m=RADIUS_M), SETTINGS, LIMITS)

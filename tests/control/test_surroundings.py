@@ -13,7 +13,16 @@ import pytest
 import disco_hw
 from disco_hw.control import NoValidControl, PlannerState, PlanOutcome
 from disco_hw.control.detours import SPARE_M, Detours
-from disco_hw.control.kernel.avoid import COLUMNS, DETOUR_COLUMNS, DETOURS, MOST_SHAPES
+from disco_hw.control.kernel.avoid import (
+    COLUMNS,
+    DETOUR_COLUMNS,
+    DETOURS,
+    KEEP,
+    MOST_SHAPES,
+    TOUCH_COST,
+    TOUCH_COST_PER_M,
+    touch_cost,
+)
 from disco_hw.control.surroundings import Surroundings
 from disco_hw.fence import Circle, Fence, Footprint
 from disco_hw.fence.clearance import Boundaries, MovingCircle
@@ -60,6 +69,18 @@ def test_of_many_shapes_the_nearest_are_kept():
 def test_the_distance_to_keep_follows_from_the_probability_asked_for():
     assert around(Fence(keep_in=ROOM)).area.body[3] == pytest.approx(0.05)
     assert around(Fence(keep_in=ROOM), deviation_m=0.01).area.body[3] == pytest.approx(0.05 + 3.0902 * 0.01, rel=1e-4)
+
+
+@pytest.mark.parametrize("yaw", [0.0, math.pi])
+@pytest.mark.parametrize("x_m", [-1.0, 0.3, 0.44, 0.46, 0.6])
+def test_a_place_costs_what_the_footprint_lacks_of_the_distance_to_keep(x_m, yaw):
+    bounds = bounds_of(obstacles=[MovingCircle(1.0, 0.0, 0.25)])
+    area = around(Fence(), [MovingCircle(1.0, 0.0, 0.25)]).place(0.0, 0.0, (0.0, 0.0), 0.25)
+    place = tuple(map(np.float32, (x_m, 0.0, 0.0)))
+    got = touch_cost(area, 0, np.float32(0.0), place, np.float32(math.cos(yaw)), np.float32(math.sin(yaw)))
+    lacking_m = area.body[KEEP] - bounds.clearance_m(np.array([[x_m, 0.0, yaw]]))[0]
+    expected = TOUCH_COST + TOUCH_COST_PER_M * lacking_m if lacking_m > 0.0 else 0.0
+    assert got == pytest.approx(expected, abs=0.05)
 
 
 def detours(bounds: Boundaries, keep_m: float = 0.05, known: Detours | None = None) -> np.ndarray:
@@ -133,6 +154,7 @@ def drive(planner, bounds: Boundaries, seconds: float, state=(0.75, 0.0, 1.57)):
     return np.array(poses), outcomes
 
 
+@pytest.mark.thorough
 def test_a_pillar_on_the_line_is_driven_around_and_the_line_rejoined(planner):
     pillar = bounds_of(Fence(keep_in=ROOM), [MovingCircle(0.0, 0.75, 0.12)])
     poses, _ = drive(planner, pillar, 20.0)
@@ -143,11 +165,13 @@ def test_a_pillar_on_the_line_is_driven_around_and_the_line_rejoined(planner):
     assert off[angle > math.radians(205)].max() < 0.05
 
 
+@pytest.mark.thorough
 def test_without_a_pillar_the_line_is_kept(planner):
     poses, _ = drive(planner, bounds_of(Fence(keep_in=ROOM)), 8.0)
     assert np.abs(np.hypot(poses[40:, 0], poses[40:, 1]) - 0.75).max() < 0.02
 
 
+@pytest.mark.thorough
 def test_where_there_is_no_way_the_robot_stands_before_it(planner):
     ring = [MovingCircle(0.45 * k - 1.8, 0.75, 0.25) for k in range(9)]
     blocked = bounds_of(Fence(keep_in=ROOM), ring)
@@ -156,6 +180,7 @@ def test_where_there_is_no_way_the_robot_stands_before_it(planner):
     assert np.hypot(*(poses[-1, :2] - poses[-20, :2])) < 0.1
 
 
+@pytest.mark.thorough
 def test_a_robot_that_nothing_can_free_is_told_so(planner):
     buried = bounds_of(Fence(keep_in=ROOM), [MovingCircle(0.75, 0.0, 1.9)])
     _, outcomes = drive(planner, buried, 2.0)
@@ -172,6 +197,7 @@ def test_a_robot_without_a_fence_plans_as_ever():
     assert plan.diagnostics.outcome is PlanOutcome.PLANNED
 
 
+@pytest.mark.thorough
 def test_a_circle_to_stay_in_is_kept():
     inner = Fence(keep_in=Circle((0.0, 0.0), 1.02))
     poses, _ = drive(planner_in(inner), bounds_of(inner), 8.0)

@@ -91,6 +91,7 @@ def start(tmp_path):
     return run
 
 
+@pytest.mark.thorough
 def test_a_first_start_compiles_in_another_process_and_the_next_one_not_at_all(start):
     own, compiled_by, result = start(START)
     assert len(compiled_by) == 1

@@ -156,6 +156,7 @@ def test_the_end_of_the_source_is_the_pilots():
     assert "the end" in bench.stack.pilot.status()["drive"]["messages"]
 
 
+@pytest.mark.thorough
 def test_steps_are_driven_within_the_limits_that_the_robot_showed():
     """The robot's wheels stop at 5 rad/s; 6.4 were asked for."""
     bench = Bench()

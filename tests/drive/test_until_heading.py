@@ -83,6 +83,7 @@ def test_by_hand_a_metre_and_then_the_task_is_armed_anew(bench):
     assert any(tick.output.running for tick in started)
 
 
+@pytest.mark.thorough
 def test_carried_off_the_task_stops_and_the_hand_is_asked_again(bench):
     bench.run(2.0)
     bench.hand.held = True

@@ -6,12 +6,14 @@ import os
 import pickle
 import runpy
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numba
 import pytest
 
-from drivers.kernel_cache import compiled
+from drivers.kernel_cache import _Index, compiled
 
 NOBODY = 65534
 KERNELS = {
@@ -179,3 +181,17 @@ def test_a_compiled_function_computes_what_its_source_says_and_is_compiled():
     assert fast(3.0, 4.0) == 5.0
     assert fast.py_func is _hypotenuse
     assert len(fast.signatures) == 1
+
+
+def test_forms_that_several_processes_save_at_a_time_get_a_file_each_and_none_is_forgotten(tmp_path):
+    together = threading.Barrier(8)
+
+    def save(form):
+        together.wait()
+        _Index(str(tmp_path), "kernel", "stamp").save(form, form * 1000)
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(save, "abcdefgh"))
+    assert [_Index(str(tmp_path), "kernel", "stamp").load(form) for form in "abcdefgh"] == [
+        form * 1000 for form in "abcdefgh"
+    ]

@@ -129,7 +129,7 @@ REFUSALS = {
 }
 
 
-@thinned(("text", "line"), list(REFUSALS.values()), quick=2, ids=REFUSALS)
+@thinned(("text", "line"), list(REFUSALS.values()), quick=1, ids=REFUSALS)
 def test_a_wrong_description_is_refused_in_one_line(tmp_path, text, line):
     package = OutsidePackage(tmp_path, turn_droop=text)
     done = package.python("-m", "disco_hw", "check", str(ROOT / "disco_hw/robots/wombot.toml"))

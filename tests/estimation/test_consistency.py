@@ -10,9 +10,10 @@ from disco_hw.estimation.correction import PoseReason
 from disco_hw.estimation.odometry import OdometryParameters
 from drivers.types import PoseSample
 from tests.estimation.truth import POSE_EVERY, WHEEL_PERIOD_NS, Geometry, Slip, drives, pose_error
+from tests.tables import thinned
 
 # Half as many seeds have bounds 1.4 times as wide.
-SEEDS = [50, pytest.param(100, marks=pytest.mark.long)]
+SEEDS = [pytest.param(50, marks=pytest.mark.thorough), pytest.param(100, marks=pytest.mark.long)]
 NOMINAL = OdometryParameters(0.061, 0.415, 0.238)
 
 
@@ -61,7 +62,7 @@ def slipping():
     return drives(100, 8.0)
 
 
-@pytest.mark.parametrize("seeds", SEEDS)
+@pytest.mark.parametrize("seeds", [25, *SEEDS])
 def test_nees_and_nis_are_inside_their_bounds(slipping, seeds):
     nees, nis = [], []
     for seed in range(seeds):
@@ -157,7 +158,7 @@ def test_once_all_poses_are_in_the_late_run_equals_the_ordered_run_to_the_bit(sl
     assert follow(slipping, 0, survivors)[0][-1] == follow(slipping, 0, late)[0][-1]
 
 
-@pytest.mark.parametrize("delay_ns", [0, 200_000_000])
+@thinned("delay_ns", [200_000_000, 0], quick=1)
 def test_a_robot_moved_by_half_a_metre_is_found_again(slipping, delay_ns):
     moved_at = 100
     shift = np.array([0.3, -0.4, 0.0])

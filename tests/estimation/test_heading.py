@@ -12,6 +12,7 @@ from disco_hw.estimation.odometry import OdometryParameters
 from drivers.types import PoseSample, WheelSample
 from tests.estimation.test_consistency import NOMINAL, assert_consistent, follow, mean_bounds, squared_error
 from tests.estimation.truth import POSE_EVERY, Geometry, drives
+from tests.tables import thinned
 
 SEEDS = 40
 EVERY_NS = 200_000_000
@@ -50,7 +51,7 @@ def arrivals(drive, late_ns=150_000_000):
     return [(drive.wheels[i * POSE_EVERY].t_ns + late_ns, i) for i in range(0, drive.measured.shape[1], step)]
 
 
-@pytest.mark.parametrize("lever", [(0.0, 0.0), LEVER])
+@thinned("lever", [LEVER, (0.0, 0.0)], quick=1)
 def test_the_heading_found_is_as_uncertain_as_it_says(driven, lever):
     nees, found_at_m, yaw_errors = [], [], []
     for seed in range(SEEDS):

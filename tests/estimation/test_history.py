@@ -10,6 +10,7 @@ from disco_hw.estimation import RewindBuffer
 from disco_hw.estimation.correction import Measurement, PoseReason
 from disco_hw.estimation.filter import Judgement, PoseFilter
 from disco_hw.estimation.odometry import OdometryParameters, Pose, WheelReading
+from tests.tables import thinned
 
 PARAMETERS = OdometryParameters(0.061, 0.415, 0.238)
 MS = 1_000_000
@@ -60,7 +61,7 @@ def test_every_order_of_arrival_gives_the_same_bits():
         assert run([*wheels, *permutation]) == in_order
 
 
-@pytest.mark.parametrize("seed", range(20))
+@thinned("seed", range(20), quick=5)
 def test_random_delays_with_outliers_and_a_lockout_give_the_same_bits(seed):
     rng = random.Random(seed)
     wheels = [10 * k for k in range(1, 90)]

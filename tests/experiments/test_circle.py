@@ -99,6 +99,7 @@ def short():
     ), reported
 
 
+@pytest.mark.thorough
 def test_every_curve_is_driven_and_reported(short):
     result, reported = short
     assert tuple(result.runs) == CURVES

@@ -56,6 +56,7 @@ def test_the_papers_ordering(swings):
     assert result.costs["UT, prior"][:, 0].min() > 150.0
 
 
+@pytest.mark.thorough
 def test_what_it_knows_of_the_mean_matters_and_what_it_knows_of_the_spread_does_not(swings):
     mean = {name: costs.mean() for name, costs in swings[0].costs.items()}
     assert mean["posterior mean"] == pytest.approx(mean["UT, posterior"], rel=0.02)
@@ -66,6 +67,7 @@ def test_what_it_knows_of_the_mean_matters_and_what_it_knows_of_the_spread_does_
         assert not np.array_equal(swings[0].costs[one], swings[0].costs[other])
 
 
+@pytest.mark.thorough
 def test_seeds_repeat(swings):
     result, _ = swings
     again = run_pendulum(PendulumOptions(seeds=1, steps=15))
@@ -74,23 +76,33 @@ def test_seeds_repeat(swings):
         assert not np.array_equal(result.costs[name][0], result.costs[name][1])
 
 
+@pytest.mark.thorough
 def test_an_offset_goes_on_where_other_seeds_ended(swings):
     result, _ = swings
     last = run_pendulum(PendulumOptions(seeds=1, steps=15, seed_offset=2))
     np.testing.assert_array_equal(last.costs["MC, posterior"], result.costs["MC, posterior"][2:, :15])
 
 
-def test_the_band_of_costs_is_never_below_zero(swings, tmp_path, monkeypatch):
+@pytest.fixture
+def made_up():
+    """What a run could have given."""
+    random = np.random.default_rng(1)
+    return PendulumResult(
+        PendulumOptions(seeds=3, steps=200), {name: random.exponential(50.0, (3, 200)) for name in CURVES}
+    )
+
+
+def test_the_band_of_costs_is_never_below_zero(made_up, tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr("disco_hw.experiments.pendulum.write_pictures", lambda figure, path: drawn.append(figure))
-    swings[0].write_pictures(tmp_path / "pendulum.png")
+    made_up.write_pictures(tmp_path / "pendulum.png")
     axes = drawn[0].axes[0]
     assert "rad²/s²" in axes.get_ylabel()
     assert all(band.get_paths()[0].vertices[:, 1].min() >= 0.0 for band in axes.collections)
 
 
-def test_table_csv_and_picture(swings, tmp_path):
-    result, _ = swings
+def test_table_csv_and_picture(made_up, tmp_path):
+    result = made_up
     for said in (*CURVES, "3 seeds from 0 on, 200 steps of 0.05 s"):
         assert said in result.table()
     result.write_csv(tmp_path / "pendulum.csv")

@@ -27,6 +27,7 @@ def report_of(*hidden, seed=902, drive="rich", dirty=False):
     return find_gap(simulated_drive(dict(hidden), seed=seed, drive=drive, dirty=dirty), MODEL, pictures=pictures)
 
 
+@pytest.mark.thorough
 def test_nothing_is_missing_in_a_log_with_nothing_hidden():
     report = report_of(seed=900)
     assert report.verdict == "nothing_missing"

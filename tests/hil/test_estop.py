@@ -18,8 +18,8 @@ pytestmark = pytest.mark.hil
 @pytest.mark.parametrize(
     ("daemon", "link"),
     [
-        ("healthy", "can"),
         ("frozen", "serial"),
+        pytest.param("healthy", "can", marks=pytest.mark.thorough),
         pytest.param("healthy", "serial", marks=pytest.mark.long),
         pytest.param("frozen", "can", marks=pytest.mark.long),
     ],

@@ -63,6 +63,7 @@ def ticks_in(path: Path) -> list[int]:
         return [entry.tick for entry in log.records(("/loop",))]
 
 
+@pytest.mark.thorough
 def test_a_recorder_frozen_killed_and_deleted_on_the_way_is_reported_counted_and_replaced(tmp_path):
     first, second, third, fourth = (tmp_path / f"run{part}.mcap" for part in ("", ".part2", ".part3", ".part4"))
     with running_stack(tmp_path) as stack:
@@ -115,6 +116,7 @@ def test_a_recorder_frozen_killed_and_deleted_on_the_way_is_reported_counted_and
     assert f"continues {first}" in info(second, as_json=False)
 
 
+@pytest.mark.thorough
 def test_where_nothing_can_be_recorded_arming_is_refused_unless_that_is_asked_for(tmp_path):
     logs = tmp_path / "logs"
     with running_stack(tmp_path, run_arguments=("--log", str(logs / "run.mcap"))) as stack:

@@ -27,7 +27,7 @@ def each_device(marks, faults):
 
 
 @pytest.mark.parametrize(
-    ("device", "fault"), each_device({("odrive", "SIGKILL"): ()}, ("SIGKILL", "SIGSTOP", "unplug"))
+    ("device", "fault"), each_device({("odrive", "SIGKILL"): pytest.mark.thorough}, ("SIGKILL", "SIGSTOP", "unplug"))
 )
 def test_the_robot_stops_and_nothing_arms_again(tmp_path, device, fault):
     with running_stack(tmp_path, device=device) as stack:

@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from disco_hw.inference.checks import CHECKS, Scores
 from disco_hw.inference.estimates import estimates
@@ -39,6 +40,7 @@ def test_a_drive_that_cannot_show_it_scores_no_false_alarm():
     assert np.isfinite(list(scores(drive="circle").values())).all()
 
 
+@pytest.mark.thorough
 @thinned(("track", "radius", "name"), [(0.1, 0.0, "turning changes"), (0.0, 0.04, "distance changes")], quick=1)
 def test_a_change_during_the_drive_stands_out_and_says_which_way_it_went(track, radius, name):
     for sign in (1.0, -1.0):

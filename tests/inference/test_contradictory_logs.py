@@ -35,7 +35,7 @@ def run(tmp_path, monkeypatch):
     return infer
 
 
-@thinned("fault", SPOILED, quick=4)
+@thinned("fault", SPOILED, quick=2)
 def test_a_log_that_says_nothing_of_the_robot_is_refused_with_the_cause(run, fault, tmp_path):
     change, _, remedy = FAULTS[fault]
     log = change(sound())
@@ -56,7 +56,7 @@ def test_wheels_that_count_double_are_warned_of_in_the_first_line(run):
     assert told["posterior"]["wheel_radius_m"]["mean"] == pytest.approx(0.5 * RADIUS_M, rel=0.1)
 
 
-@pytest.mark.parametrize("error", [EmptyRegionError("empty"), np.linalg.LinAlgError("singular")])
+@thinned("error", [EmptyRegionError("empty"), np.linalg.LinAlgError("singular")], quick=1)
 def test_a_region_without_parameters_is_one_line(monkeypatch, error):
     def fail(*_):
         raise error

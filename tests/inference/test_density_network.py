@@ -23,6 +23,7 @@ def test_a_linear_problem_is_learned_with_its_correlation():
     assert np.cov(draws.T) == pytest.approx(np.array([[0.01, 0.008], [0.008, 0.01]]), rel=0.3)
 
 
+@pytest.mark.thorough
 def test_two_hills_are_both_found():
     rng = np.random.default_rng(0)
     targets = rng.uniform(-1.0, 1.0, (1500, 1))

@@ -12,6 +12,7 @@ from tests.inference.drives import logged, robot_config
 NOMINAL = Model.nominal(robot_config().robot)
 
 
+@pytest.mark.thorough
 def test_an_effect_that_the_log_shows_is_named_by_a_process_beside():
     with gap_check_beside(logged("poor", hidden=(("pose_latency", 0.15),)), NOMINAL) as searched:
         assert searched().missing == ("pose_latency",)

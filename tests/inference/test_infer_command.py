@@ -184,6 +184,7 @@ def known(inferred, monkeypatch):
     monkeypatch.setattr(verb, "infer", lambda *_: inferred[1].inference)
 
 
+@pytest.mark.thorough
 def test_a_log_unlike_the_simulations_is_warned_of_with_the_next_step(robot, tmp_path):
     log = write_log(tmp_path / "late.csv", "poor", 5, {"pose_latency": 0.2})
     text = infer_command([log], robot, options=FEW, search=finds()).as_text()
@@ -191,6 +192,7 @@ def test_a_log_unlike_the_simulations_is_warned_of_with_the_next_step(robot, tmp
     assert f"next: disco-hw gap {log} --robot {robot} -o gap" in text
 
 
+@pytest.mark.thorough
 def test_a_model_that_lacks_a_found_effect_is_marked_and_says_so(known, robot, tmp_path):
     log = write_log(tmp_path / "log.csv", "poor")
     model, report = tmp_path / "model.toml", tmp_path / "report.html"

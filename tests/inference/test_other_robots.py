@@ -34,6 +34,7 @@ def inferred(robot: Path, log: Path) -> dict[str, float]:
     return dict(zip(NAMES, infer(drive, config, FEW).draws.mean(axis=0).tolist(), strict=True))
 
 
+@pytest.mark.thorough
 @thinned(
     ("radius_m", "track_m", "truth"),
     [

@@ -48,6 +48,7 @@ def test_steps_are_correlated_with_what_either_wheel_rolled():
     assert found["variance of dx"] == pytest.approx(0.25)
 
 
+@pytest.mark.thorough
 def test_random_features_learn_a_density_that_no_line_fits_and_are_not_trained():
     rng = np.random.default_rng(1)
     statistics = rng.uniform(-2.0, 2.0, (1500, 1))
@@ -68,6 +69,7 @@ def test_what_is_the_papers_is_refused_without_it(option):
         infer(None, None, InferOptions(**{option: True}))
 
 
+@pytest.mark.thorough
 def test_what_is_asked_for_is_what_learns():
     options = InferOptions(paper=True, simulations=200, random_features=True, cross_correlation=True)
     found = infer(logged("poor"), robot_config(), options)

@@ -32,6 +32,7 @@ def test_rounds_close_in_on_a_posterior_far_narrower_than_the_prior():
     assert fitted.simulations == 1200
 
 
+@pytest.mark.thorough
 def test_one_round_is_blunter_than_several():
     truth = np.array([0.6, 0.3])
 
@@ -42,6 +43,7 @@ def test_one_round_is_blunter_than_several():
     assert (spread(SETTINGS) < 0.8 * spread(replace(SETTINGS, shares=(1.0,)))).any()
 
 
+@pytest.mark.thorough
 def test_a_posterior_at_the_priors_edge_stays_inside():
     truth = np.array([1.0, 0.3])
     fitted = run_rounds(simulate, observed(truth), PRIOR, 800, SETTINGS, 1)

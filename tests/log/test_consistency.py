@@ -13,6 +13,7 @@ from disco_hw.log.drive import concatenate
 from disco_hw.log.load import load_drive
 from sim.effects import EFFECTS
 from tests.log.contradictory_drives import AXIAL_M, FAULTS, RADIUS_M, rotated, sound, without_commands
+from tests.tables import thinned
 from tools.gap_logs import realistic, simulated_drive
 
 REAL = os.environ.get("DISCO_HW_DATA")
@@ -29,7 +30,7 @@ def found(log):
     return find_contradictions(log, RADIUS_M, AXIAL_M)
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@thinned("fault", FAULTS, quick=4)
 def test_the_cause_is_named_first_with_its_remedy(fault):
     change, cause, remedy = FAULTS[fault]
     first, *_ = found(change(sound()))
@@ -39,14 +40,14 @@ def test_the_cause_is_named_first_with_its_remedy(fault):
     assert "\n" not in first.message
 
 
-@pytest.mark.parametrize("drive", ["free", "rich", "circle", "straight", "poor", "random_steps"])
+@thinned("drive", ["free", "rich", "circle", "straight", "poor", "random_steps"], quick=2)
 def test_a_sound_log_is_sound_also_in_another_frame_and_without_commands(drive):
     log = sound(drive)
     assert found(log) == found(rotated(1.1)(log)) == found(without_commands(log)) == ()
 
 
 @pytest.mark.parametrize("drive", ["poor", pytest.param("free", marks=pytest.mark.long)])
-@pytest.mark.parametrize("name", EFFECTS)
+@thinned("name", EFFECTS, quick=10)
 def test_what_a_robot_may_do_is_no_contradiction(name, drive):
     assert found(simulated_drive(realistic(name, 5), seed=5, drive=drive, dirty=True, motors="real")) == ()
 

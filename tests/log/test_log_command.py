@@ -12,6 +12,7 @@ from disco_hw.log.container import MAGIC
 from disco_hw.log.log_command import export, info, recover, recover_log
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Controller
+from tests.tables import thinned
 from tools.log_samples import ATTACHMENTS, PERIOD_NS, bits, drive_ticks, log_bytes, tick, with_damaged_chunk, write_log
 
 
@@ -130,7 +131,7 @@ def entries(path):
         return [(entry.topic, entry.now_ns, entry.tick, bits(entry.record)) for entry in log.records()]
 
 
-@pytest.mark.parametrize("tenth", range(1, 11))
+@thinned("tenth", range(1, 11), quick=3)
 def test_every_whole_chunk_comes_over_and_the_loss_is_named(tmp_path, tenth):
     source, target = tmp_path / "cut.mcap", tmp_path / "mended.mcap"
     source.write_bytes(WHOLE[: len(WHOLE) * tenth // 10])

@@ -11,6 +11,7 @@ from disco_hw.log.reader import Gap, open_log
 from disco_hw.log.records import Counters, Estimate, Event, Innovation, Plan
 from disco_hw.runtime.replay import replay
 from disco_hw.viewer.recording import Recording
+from tests.tables import thinned
 from tools.log_samples import (
     ANY_RECORD,
     ATTACHMENTS,
@@ -98,7 +99,7 @@ def test_the_summary_counts_what_was_dropped_on_the_way(tmp_path):
     assert summary.start.startswith("2023-11-14T22:13:20")
 
 
-@pytest.mark.parametrize("tenth", range(1, 10))
+@thinned("tenth", range(1, 10), quick=3)
 def test_cut_at_every_tenth_the_log_reads_and_says_what_is_lost(tmp_path, tenth):
     whole = log_bytes(drive_ticks(300), flush_every=10)
     path = tmp_path / "cut.mcap"

@@ -317,6 +317,7 @@ def test_no_process_no_thread_and_no_file_is_left_behind(path, runtime_root):
     assert len(os.listdir("/proc/self/task")) <= threads
 
 
+@pytest.mark.thorough
 def test_open_files_do_not_add_up(tmp_path):
     def count():
         return len(os.listdir("/proc/self/fd"))

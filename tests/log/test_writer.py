@@ -232,7 +232,7 @@ def test_a_disk_full_from_the_start_is_one_line(tmp_path):
 @pytest.mark.parametrize("arguments", [[], ["1"], ["a", "b"]])
 def test_wrong_usage_of_the_keeper_is_one_line(arguments):
     command = [sys.executable, "-m", "disco_hw.log.writer", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
 

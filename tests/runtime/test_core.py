@@ -30,6 +30,7 @@ from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
 from sim.virtual_robot import VirtualRobot
 from tests.runtime.simulated import START, simulated_stack
+from tests.tables import thinned
 
 ROBOT = FilePath(disco_hw.__file__).parent / "robots" / "wombot.toml"
 
@@ -123,7 +124,7 @@ def exchanged(stack, **firmware):
     stack.robot.board = Robot()
 
 
-@pytest.mark.parametrize("limits", [{"max_wheel_speed_rad_s": 4.0}, {"ticks_per_rev": 1024}])
+@thinned("limits", [{"max_wheel_speed_rad_s": 4.0}, {"ticks_per_rev": 1024}], quick=1)
 def test_a_controller_exchanged_on_a_living_link_is_judged_anew(limits):
     stack = simulated_stack(NoPlanner(), needs_pose=False)
     assert stack.run(1.5)[-1].output.state is State.READY

@@ -87,7 +87,7 @@ def first_doubt(vendor, reported, true, speeds, seconds=3.0):
     return None
 
 
-@pytest.mark.parametrize(("wiring", "speeds", "said"), WRONG)
+@thinned(("wiring", "speeds", "said"), WRONG, quick=12)
 @pytest.mark.parametrize("vendor", ONE_OF_EACH, ids=str)
 def test_a_wrong_wiring_is_noticed_in_the_first_half_second_of_motion(vendor, wiring, speeds, said):
     after_s, found = first_doubt(vendor, AS_TOLD, wiring, speeds)
@@ -96,7 +96,7 @@ def test_a_wrong_wiring_is_noticed_in_the_first_half_second_of_motion(vendor, wi
 
 
 @thinned("speeds", [(3.0, 2.0), (-2.0, 2.0), (6.0, 6.0), (-1.0, -3.0), (1.0, 3.0)], quick=2)
-@pytest.mark.parametrize("vendor", ONE_OF_EACH, ids=str)
+@thinned("vendor", ONE_OF_EACH, ids=str, quick=3)
 def test_a_right_wiring_is_let_alone(vendor, speeds):
     assert first_doubt(vendor, AS_TOLD, AS_TOLD, speeds) is None
 
@@ -133,7 +133,7 @@ def test_what_was_already_written_is_what_changes():
     assert "wheels.encoder_direction = [1, 1] if it turned as it should" in found[1]
 
 
-@pytest.mark.parametrize("wiring", [RIGHT_REVERSED, Wiring(sides_swapped=True), Wiring(encoder_direction=(1, -1))])
+@thinned("wiring", [RIGHT_REVERSED, Wiring(sides_swapped=True), Wiring(encoder_direction=(1, -1))], quick=1)
 def test_the_daemons_tick_stops_the_robot_and_says_what_to_change(wiring):
     run = simulated_stack()
     run.core.driver = rewired(run.core.driver, wiring)
@@ -160,6 +160,7 @@ def test_a_robot_that_is_wired_as_declared_is_let_alone():
     assert all(tick.output.motion_allowed for tick in run.ticks(6.0))
 
 
+@pytest.mark.thorough
 def test_ten_minutes_of_driving_keep_no_more_than_the_first_seconds():
     directions = Directions(RADIUS_M, TRACK_M, AS_TOLD)
     command, floor = WheelCommand(2.0, 2.0, 0.1), Floor()
@@ -180,7 +181,7 @@ def test_ten_minutes_of_driving_keep_no_more_than_the_first_seconds():
     assert after - before < 10_000
 
 
-@pytest.mark.parametrize(("radius", "axle", "seed"), [(1.0, 1.0, 2), (0.85, 1.2, 3), (1.18, 0.8, 4), (1.15, 1.15, 5)])
+@thinned(("radius", "axle", "seed"), [(1.0, 1.0, 2), (0.85, 1.2, 3), (1.18, 0.8, 4), (1.15, 1.15, 5)], quick=1)
 def test_a_robot_whose_geometry_is_written_down_wrongly_is_not_taken_for_miswired(radius, axle, seed):
     reported = PlantParameters()
     run = simulated_stack(

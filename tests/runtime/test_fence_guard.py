@@ -7,7 +7,6 @@ from collections import deque
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from disco_hw.estimation import PoseEstimate
@@ -23,6 +22,7 @@ from disco_hw.runtime.fence_guard import (
     StoppingSettings,
 )
 from disco_hw.runtime.pipeline import Governor, WheelLimits
+from tests.tables import examples
 
 FOOTPRINT = Footprint(0.5, 0.4, 0.05)
 CELL = ((-1.0, -1.0), (1.4, -1.0), (1.4, 0.9), (-1.0, 0.9))
@@ -447,8 +447,9 @@ rounds = st.integers(4, 7).flatmap(
 )  # fmt: skip
 
 
-@settings(max_examples=120)
-@given(
+@examples(
+    quick=25,
+    every=120,
     room=rounds,
     pillar=st.tuples(unit, unit, st.floats(0.05, 0.3)),
     commands=st.lists(st.tuples(st.floats(-8, 8), st.floats(-8, 8), st.integers(5, 40)), min_size=1, max_size=5),

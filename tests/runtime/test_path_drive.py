@@ -95,6 +95,7 @@ def test_an_open_path_ends_with_the_robot_standing_and_is_replayed_and_shown_wit
     assert (tmp_path / "end.png").stat().st_size > 10_000
 
 
+@pytest.mark.thorough
 def test_another_speed_is_recorded_and_replayed(tmp_path):
     robot_file = path_robot(tmp_path, CORNER)
     setup = load_setup(robot_file)

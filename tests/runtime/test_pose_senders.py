@@ -20,6 +20,7 @@ from drivers.types import PoseSample
 from tests.drive.test_hand_pilot import Hand
 from tests.drivers.waiting import free_port
 from tests.runtime.simulated import ROBOT_FILE, simulated_stack
+from tests.tables import thinned
 from tools.fault_run import CirclingPlanner
 
 
@@ -103,7 +104,7 @@ def containing(said, words):
     return [text for text in said if words in text]
 
 
-@pytest.mark.parametrize("off_m", [1.0, -0.3])
+@thinned("off_m", [1.0, -0.3], quick=1)
 def test_a_robot_that_is_carried_stops_its_task_and_says_so_and_its_operator_starts_it_again(bench, off_m):
     made = bench()
     carried = []
@@ -142,9 +143,10 @@ def test_a_jump_while_nothing_runs_is_said_and_keeps_nobody_from_starting_later(
     assert made.stack.run(0.5, UserRequest.START)[-1].output.running
 
 
-@pytest.mark.parametrize(
+@thinned(
     ("rate_hz", "stranger_hz", "off"),
     [(2.0, 25.0, lambda t_s: 1.0), (25.0, 250.0, lambda t_s: 0.03 * t_s), (25.0, 25.0, lambda t_s: 0.05)],
+    quick=1,
 )
 def test_a_second_sender_is_refused_and_named_and_the_robot_stays_on_its_circle(bench, rate_hz, stranger_hz, off):
     made = bench()
@@ -189,7 +191,7 @@ def constant(yaw_rad):
     return lambda pose: {**pose, "yaw_rad": yaw_rad}
 
 
-@pytest.mark.parametrize(
+@thinned(
     "said",
     [
         lambda pose: {**pose, "yaw_rad": 0.0, "yaw_std_rad": 0.0},
@@ -197,6 +199,7 @@ def constant(yaw_rad):
         lambda pose: {**pose, "yaw_rad": 0.3, "yaw_std_rad": 316.0},
     ],
     ids=["identity", "minus one", "large"],
+    quick=1,
 )
 def test_a_heading_that_is_said_to_be_unknown_is_not_used_and_the_operator_is_told(bench, said):
     made = bench()
@@ -224,6 +227,7 @@ def test_a_heading_that_never_moves_is_found_out_by_the_first_turn_and_the_estim
     assert status(made.stack.core, {}, RecorderStats())["poses"][0]["heading"] == "stands still"
 
 
+@pytest.mark.thorough
 def test_a_heading_sensor_that_dies_is_left_out_and_the_drive_goes_on_by_positions(bench):
     made = bench("offset = [0.1, 0.0]\n")
     dead = []
@@ -247,6 +251,7 @@ def test_a_heading_sensor_that_dies_is_left_out_and_the_drive_goes_on_by_positio
     assert made.error_m() < 0.03
 
 
+@pytest.mark.thorough
 def test_a_drive_whose_heading_is_left_out_on_the_way_is_replayed_bit_for_bit(tmp_path):
     """By hand, as the harness' planner is not the one that a replay makes."""
     stack = simulated_stack(NoPlanner())

@@ -20,6 +20,7 @@ from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.supervisor import UserRequest
 from tests.runtime.simulated import simulated_stack
+from tests.tables import thinned
 
 ROBOTS = Path(disco_hw.__file__).parent / "robots"
 
@@ -107,6 +108,7 @@ def test_a_drive_whose_model_remembers_replays_bit_for_bit(tmp_path, monkeypatch
             assert not replay(log).ok
 
 
+@pytest.mark.thorough
 def test_a_follower_takes_over_from_a_planner_that_finds_nothing_and_replays_bit_for_bit(tmp_path, monkeypatch):
     step = Optimiser.step
 
@@ -137,7 +139,7 @@ def test_a_follower_takes_over_from_a_planner_that_finds_nothing_and_replays_bit
     assert not replay(other).ok
 
 
-@pytest.mark.parametrize(
+@thinned(
     ("file", "old", "new", "field"),
     [
         ("model", "wheel_radius_m = 0.061", "wheel_radius_m = 0.0611", "Plan."),
@@ -145,6 +147,7 @@ def test_a_follower_takes_over_from_a_planner_that_finds_nothing_and_replays_bit
         ("robot", "max_wheel_acceleration_rad_s2 = 20.0", "max_wheel_acceleration_rad_s2 = 10.0", ""),
         ("robot", "[log]", "[estimation]\nslip_std_m_per_sqrt_m = 0.021\n[log]", "Estimate."),
     ],
+    quick=1,
 )
 def test_another_robot_shows_where_it_first_differs(tmp_path, ticks, file, old, new, field):
     text = (ROBOTS / ("wombot.toml" if file == "robot" else "wombot_model.toml")).read_text()

@@ -333,6 +333,7 @@ def test_a_bad_option_is_one_clear_line_and_exit_code_2(tmp_path, capsys, option
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.thorough
 def test_a_full_disk_ends_the_records_not_the_robot(start):
     robot = start("--truth", "/dev/full", "--bus-log", "/dev/full")
     time.sleep(1.3)

@@ -53,6 +53,7 @@ class SimProcess:
         return code
 
 
+@pytest.mark.thorough
 @pytest.mark.hil
 def test_a_board_drives_a_virtual_robot_and_stops_when_it_goes(tmp_path, program):
     with running_board(program) as board:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from sim.process import SocketPathError, TextRecord, bind_private
+from tests.tables import thinned
 
 SCRIPT = """
 import select, sys
@@ -22,7 +23,7 @@ sys.exit(7 if stop.requested else 1)
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@thinned("number", [signal.SIGTERM, signal.SIGINT], quick=1)
 def test_signal_wakes_and_is_remembered(number):
     with subprocess.Popen([sys.executable, "-c", SCRIPT], stdout=subprocess.PIPE) as process:
         assert process.stdout.readline() == b"ready\n"

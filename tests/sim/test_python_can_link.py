@@ -163,6 +163,7 @@ def drive_beside_another_node(path):
             host.end.close()
 
 
+@pytest.mark.thorough
 @pytest.mark.hil
 def test_a_board_behind_slcan_sits_on_the_mock_bus_beside_other_nodes(tmp_path):
     with (

@@ -17,6 +17,7 @@ import pytest
 
 from sim.can_protocol import CanFrame, pack_frame
 from sim.unixcan import UnixCanBus
+from tests.tables import thinned
 
 FLOOD = 20_000
 
@@ -147,7 +148,7 @@ def test_a_full_transmit_buffer_is_enobufs(start_hub):
         bus.send(MESSAGES[0], timeout=30)
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+@thinned("number", [signal.SIGKILL, signal.SIGTERM], quick=1)
 def test_death_of_the_hub_is_an_error_on_both_ways(start_hub, number):
     path, process = start_hub()
     with UnixCanBus(path) as bus:
@@ -198,6 +199,7 @@ def _flood(path, start):
             bus.send(can.Message(arbitration_id=0x100 + number % 7, is_extended_id=False, data=number.to_bytes(4)))
 
 
+@pytest.mark.thorough
 def test_twenty_thousand_frames_between_processes_arrive_all_and_in_order(start_hub):
     path, _ = start_hub("--no-pacing")
     context = multiprocessing.get_context("spawn")

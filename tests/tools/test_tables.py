@@ -1,8 +1,11 @@
 """Which cases of a table `make test` runs."""
 
-import pytest
+from types import SimpleNamespace
 
-from tests.tables import thinned
+import pytest
+from hypothesis import strategies as st
+
+from tests.tables import examples, thinned
 
 
 def split(decorator):
@@ -33,3 +36,26 @@ def test_a_case_keeps_its_name_and_its_marks():
     case = thinned("number", cases, quick=1).mark.args[1][1]
     assert case.id == "two"
     assert {mark.name for mark in case.marks} == {"long", "thorough"}
+
+
+def test_a_property_is_tried_on_few_examples_at_first_and_fails_where_it_is_false():
+    tried = []
+
+    @examples(quick=3, every=30, number=st.integers(0, 10**6))
+    def test_it(number):
+        tried.append(number)
+        assert number < 10**7
+
+    (mark,) = test_it.pytestmark
+    assert split(SimpleNamespace(mark=mark)) == ([3], [(30,)])
+    test_it(3)
+    assert 1 <= len(tried) <= 3
+    test_it(30)
+    assert len(tried) > 10
+
+    @examples(quick=3, every=30, number=st.integers())
+    def test_false(number):
+        assert number is None
+
+    with pytest.raises(AssertionError):
+        test_false(3)

@@ -32,6 +32,7 @@ def test_a_snapshot_shows_circle_and_robot(log_file, tmp_path):
     assert np.abs(np.asarray(end).astype(int) - np.asarray(start)).max() > 100, "nothing moved"
 
 
+@pytest.mark.thorough
 @thinned(("ending", "kind"), [("gif", "GIF"), ("webp", "WEBP"), ("apng", "PNG")], quick=1)
 def test_a_clip_moves_with_nothing_installed(log_file, tmp_path, monkeypatch, ending, kind):
     monkeypatch.setenv("PATH", str(tmp_path))

@@ -23,6 +23,7 @@ from disco_hw.control.kernel.sequences import (
 )
 from disco_hw.control.optimiser import spline_basis
 from tests.control import oracle
+from tests.tables import thinned
 
 B, T, C, KNOTS, HISTORY = int(BLOCK), 12, 2, 5, 3
 FIRST, TAPS = spline_basis(KNOTS, T)
@@ -86,7 +87,7 @@ def expanded(basis, noise, nominal, largest, change, before):
     return commands
 
 
-@pytest.mark.parametrize("basis", [SPLINE, WHITE], ids=["spline", "white"])
+@thinned("basis", [SPLINE, WHITE], ids=["spline", "white"], quick=1)
 @settings(max_examples=25)
 @given(
     seed=st.integers(0, 10_000),
@@ -116,7 +117,7 @@ def test_the_control_cost_is_of_the_noise_as_applied():
     np.testing.assert_allclose(costs, 1.0 + oracle.control_cost(nominal, applied, 1.0, 0.7), atol=2e-4)
 
 
-@pytest.mark.parametrize("basis", [SPLINE, WHITE], ids=["spline", "white"])
+@thinned("basis", [SPLINE, WHITE], ids=["spline", "white"], quick=1)
 def test_or_of_the_noise_as_drawn(basis):
     noise, over_time, nominal = drawn(basis, 5)
     costs, pull = np.ones(B, F32), np.full(noise.size // B, 9.0, F32)

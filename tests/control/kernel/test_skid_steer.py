@@ -302,6 +302,7 @@ def test_costs_of_a_robot_that_slides_aside_and_drifts(base, values, commands, s
         assert apart.mean() < FEW / 10
 
 
+@pytest.mark.thorough
 @settings(max_examples=15)
 @given(SLOW_TURNING, STATES, COMMANDS, st.integers(0, 2**63 - 1))
 def test_costs_and_update_with_euler_steps(base, values, commands, seed):
@@ -343,6 +344,12 @@ def test_costs_and_update_with_all_effects(base, effects, values, commands, seed
 STRAIGHT_BACK = np.array([[0.0, 0.0], [-1.61291931, 0.66600324], [0.0, 0.0]])
 
 
+def test_costs_and_update_on_a_way_straight_back():
+    path, state = PathCost(PathTable(STRAIGHT_BACK), 0.5), state_of((0.0,) * 5, [(0.5, 0.0)])
+    check_against_reference(model_of((0.078125, 0.5, 0.0)), state, path, PLAN_SETTINGS, 0)
+
+
+@pytest.mark.thorough
 @settings(max_examples=40)
 @example(PathCost(PathTable(STRAIGHT_BACK), 0.5), (0.078125, 0.5, 0.0), (0.0,) * 5, [(0.5, 0.0)], 0)
 @given(paths(), SLOW_TURNING, STATES, COMMANDS, st.integers(0, 2**63 - 1))
@@ -392,6 +399,7 @@ def test_costs_and_update_along_a_path_with_all_effects(path, base, effects, val
     check_against_reference(model_of(base, effects), state_of(values, commands), path, PLAN_SETTINGS, seed)
 
 
+@pytest.mark.thorough
 @settings(max_examples=20)
 @given(timed_paths(), SLOW_TURNING, STATES, COMMANDS, st.integers(0, 2**63 - 1))
 def test_costs_and_update_along_a_path_by_time(path, base, values, commands, seed):

@@ -12,6 +12,7 @@ import pytest
 
 from drivers.types import Driver, DriverState, Request, WheelCommand
 from tests.drivers.motor.bench import Bench
+from tests.tables import thinned
 
 FORWARD = (3.0, 2.0)
 STILL = (DriverState.STANDBY, DriverState.READY)
@@ -222,7 +223,7 @@ class DriverConformance:
         bench.run(1.0)
         assert bench.wheels[-1].left_angle_rad > angle
 
-    @pytest.mark.parametrize("unplugged_after_ms", range(20))
+    @thinned("unplugged_after_ms", range(20), quick=4)
     def test_unplugged_at_any_instant(self, bench, unplugged_after_ms):
         bench.arm()
         bench.run(0.3 + unplugged_after_ms * 1e-3, FORWARD)

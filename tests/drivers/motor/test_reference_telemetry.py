@@ -19,6 +19,7 @@ from drivers.motor.reference_frames import (
     WheelTicks,
 )
 from firmware_protocol.codec import Decoded
+from tests.tables import thinned
 
 MS = 1_000_000
 BOOT_NS = 777 * MS
@@ -286,7 +287,7 @@ def test_plausible_steps_add_up_wherever_the_ring_is_and_whichever_way_it_turns(
         assert angles == ((left - start[0]) * PER_TICK, (right - start[1]) * PER_TICK)
 
 
-@pytest.mark.parametrize("step", [LIMIT, -LIMIT])
+@thinned("step", [LIMIT, -LIMIT], quick=1)
 def test_once_round_the_whole_ring(step):
     ticks = wheel_ticks()
     count = TICKS_MODULUS // abs(step) + 10

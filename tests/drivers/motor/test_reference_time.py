@@ -9,6 +9,7 @@ from drivers.types import DriverState, WheelCommand
 from firmware_protocol.codec import Codec
 from tests.drivers.motor.bench import MS, START_NS, Bench
 from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot
+from tests.tables import thinned
 
 STILL = (DriverState.STANDBY, DriverState.READY)
 
@@ -18,7 +19,7 @@ def make_bench(robot=None, **options):
     return Bench(driver, robot or ReferenceRobot(), **options)
 
 
-@pytest.mark.parametrize("jitter_ms", [0.0, 3.0])
+@thinned("jitter_ms", [3.0, 0.0], quick=1)
 @pytest.mark.parametrize("skew", [0.0, 80e-6, -80e-6])
 def test_samples_carry_the_time_of_their_measurement(jitter_ms, skew):
     """Over a link that delays every frame by 2 ms and some; the robot samples in each of its 1 ms cycles."""

@@ -10,6 +10,7 @@ from drivers.types import DriverState
 from firmware_protocol.codec import Codec
 from tests.drivers.motor.bench import MS, Bench
 from tests.drivers.motor.reference_robot import ReferenceRobot
+from tests.tables import thinned
 
 CODEC = Codec()
 
@@ -34,7 +35,7 @@ def test_it_objects_to_late_commands_and_to_silence_and_forgets_at_rest():
     assert watch.objection(10**12) is None
 
 
-@pytest.mark.parametrize("rate_hz", [20, 50, 100])
+@thinned("rate_hz", [50, 20, 100], quick=1)
 @pytest.mark.parametrize("growth", [0.05, 0.2, 1.0, 3.0])
 def test_commands_that_come_later_and_later_disarm(growth, rate_hz):
     bench = make_bench(rate_hz=rate_hz)
@@ -77,7 +78,7 @@ def test_a_link_that_is_slow_but_not_slower_and_slower_does_not_disarm():
     assert bench.driver.stats.late_commands == 0
 
 
-@pytest.mark.parametrize("rate_hz", [20, 50, 100])
+@thinned("rate_hz", [50, 20, 100], quick=1)
 def test_lost_frames_are_no_lateness(rate_hz):
     bench = make_bench(rate_hz=rate_hz, loses=lambda generator: generator.random() < (0.02 if rate_hz == 20 else 0.2))
     bench.arm()

@@ -20,7 +20,7 @@ COASTING_S = 2.5
 
 
 # Of several boards with one driver all are tried by `make test-all`; of the quick ones, each driver has its first.
-FURTHER = ("odrive-0.5", "vesc-four-braking", "roboclaw-a-board-a-side")
+FURTHER = ("odrive-0.5", "odrive-four-axes", "vesc-four-braking", "vesc-uart", "roboclaw-a-board-a-side")
 
 
 @pytest.fixture(
@@ -258,7 +258,7 @@ def test_an_error_cleared_does_not_energise_again(vendor, bench):
     assert bench.robot.speed == pytest.approx(FORWARD, abs=0.02)
 
 
-@thinned("when", ["before", "standby", "arming", "armed", "stopping", "fault"], quick=3)
+@thinned("when", ["armed", "before", "standby", "arming", "stopping", "fault"], quick=2)
 def test_the_emergency_stop_stops_in_every_state(vendor, bench, when):
     if when != "before":
         bench.run_until(*STILL)
@@ -377,7 +377,7 @@ def test_a_fault_is_latched_although_the_line_was_out_since(vendor, bench):
     bench.run_until(*STILL)
 
 
-@thinned("out_for_s", [0.03, 0.09, 0.15], quick=2)
+@thinned("out_for_s", [0.03, 0.09, 0.15], quick=1)
 def test_a_short_interruption_disarms_too(vendor, bench, out_for_s):
     drive(bench)
     bench.host_end.plug(False)

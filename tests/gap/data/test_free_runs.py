@@ -8,6 +8,7 @@ from disco_hw.gap.data.free_runs import pose_residual, run_body, run_wheels
 from disco_hw.gap.settings import GRID_STEP_S
 from disco_hw.model import Model
 from disco_hw.model.step import FreeRun
+from tests.tables import thinned
 from tools.compile_kernels import model_with_every_effect
 
 N = 800
@@ -26,7 +27,7 @@ OF_BODY = {
 }
 
 
-@pytest.mark.parametrize("effects", [OF_WHEELS, OF_BODY, {}], ids=["wheels", "body", "none"])
+@thinned("effects", [OF_WHEELS, OF_BODY, {}], ids=["wheels", "body", "none"], quick=1)
 def test_two_channels_in_a_row_are_the_model(effects):
     model = model_with_every_effect(effects, BASE) if effects else Model(*BASE)
     t = np.arange(N) * GRID_STEP_S

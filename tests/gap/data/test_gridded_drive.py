@@ -51,6 +51,7 @@ def test_one_row_alone_says_nothing_of_how_close_rows_are(rows, tick):
     assert tick_s(t, t[:0]) == 0.0
 
 
+@pytest.mark.thorough
 def test_what_rows_of_a_log_stamp_is_known_as_closely_as_they_follow_one_another():
     t = np.arange(0.0, 10.0, 0.05)
     turned = np.sin(t)
@@ -82,7 +83,7 @@ def test_what_rows_of_a_log_stamp_is_known_as_closely_as_they_follow_one_another
     assert not any(note.startswith("commands are") for note in line.notes)
 
 
-@pytest.mark.parametrize("cells", [-7, 0, 7])
+@thinned("cells", [-7, 0, 7], quick=1)
 def test_commands_in_force_are_earlier_ones_or_later_ones_where_their_stamps_are_late(cells):
     t = np.arange(0.0, 10.0, 0.02)
     line = grid_drive(drive(t, np.sin(t), t, np.sin(t)))
@@ -94,7 +95,8 @@ def test_commands_in_force_are_earlier_ones_or_later_ones_where_their_stamps_are
     np.testing.assert_array_equal(in_force[0 if cells > 0 else -1], edge)
 
 
-@thinned("by_s", [-0.3, -0.203, 0.107, 0.4], quick=2)
+@pytest.mark.thorough
+@thinned("by_s", [-0.3, -0.203, 0.107, 0.4], quick=1)
 def test_a_log_whose_stamps_are_moved_lies_on_the_grid_as_if_they_were_not(by_s):
     rng = np.random.default_rng(7)
     t = np.arange(0.0, 40.0, 0.02)
@@ -122,7 +124,7 @@ def test_a_log_whose_stamps_are_moved_lies_on_the_grid_as_if_they_were_not(by_s)
 
 
 @thinned("off_s", [0.0, 0.0004, 0.002, 0.003, 0.0062, -0.2026], quick=2)
-@pytest.mark.parametrize("begin_s", [0.0, 3.304])
+@thinned("begin_s", [0.0, 3.304], quick=1)
 def test_commands_are_laid_so_that_they_change_at_the_borders_of_cells(off_s, begin_s):
     rng = np.random.default_rng(9)
     t = np.arange(0.0, 40.0, 0.02)
@@ -136,13 +138,14 @@ def test_commands_are_laid_so_that_they_change_at_the_borders_of_cells(off_s, be
     assert line.commands_moved_s == pytest.approx(-0.02 - off_s)
 
 
-@pytest.mark.parametrize(
+@thinned(
     ("clock", "even"),
     [
         (StampClock(0.1), True),
         (StampClock(0.1, 5.0, 10.0, -0.06), False),
         (StampClock(0.1, jump_s=-0.2, jump_at_s=4.0), False),
     ],
+    quick=1,
 )
 def test_a_drive_knows_whether_its_poses_clock_runs_evenly(monkeypatch, clock, even):
     monkeypatch.setitem(grid_drive.__globals__, "pose_clock", lambda *of: clock)
@@ -216,6 +219,7 @@ def test_of_a_long_drive_the_stretches_with_commands_are_judged_first(commanded_
     assert line.first.sum() == (3 if end_s < 200.0 else 6)
 
 
+@pytest.mark.thorough
 @thinned("lag_s", [0.2, 4.0], quick=1)
 def test_wheels_that_answer_slower_than_any_lag_do_not_say_how_late_commands_are(lag_s):
     rng = np.random.default_rng(4)

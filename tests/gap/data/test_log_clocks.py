@@ -120,6 +120,7 @@ def log_of(seed, late_s, heard_s):
     )
 
 
+@pytest.mark.thorough
 def test_logs_whose_clocks_differ_lie_on_the_grid_beside_their_own_wheels():
     logs = [log_of(1, 0.1, 0.06), log_of(2, 0.42, 0.06), log_of(3, -0.2, 0.5)]
     each = [grid_drive(log) for log in logs]

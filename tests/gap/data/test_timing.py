@@ -176,14 +176,14 @@ def commanded(late_s, lag_s=0.0, seed=0, unlike=0.0):
     return wheels, Commands(t_s[every] - late_s, *asked[every].T, one)
 
 
-@pytest.mark.parametrize(("late_s", "lag_s"), [(-0.7, 0.0), (-0.2, 0.12), (0.0, 0.25), (0.15, 0.06)])
+@thinned(("late_s", "lag_s"), [(-0.7, 0.0), (-0.2, 0.12), (0.0, 0.25), (0.15, 0.06)], quick=2)
 def test_a_delay_of_commands_of_either_sign_is_parted_from_a_lag(late_s, lag_s):
     found = answered(*commanded(late_s, lag_s))
     assert found.known
     assert found.delay_s == pytest.approx(late_s, abs=0.02)
 
 
-@pytest.mark.parametrize("lag_s", [0.0, 0.11])
+@thinned("lag_s", [0.0, 0.11], quick=1)
 @thinned("by_s", [-0.317, -0.2, 0.107, 0.213], quick=2)
 def test_commands_whose_stamps_are_moved_by_no_steps_of_the_scan_are_seen_moved_by_as_much(by_s, lag_s):
     wheels, commands = commanded(0.1, lag_s)
@@ -230,12 +230,13 @@ def test_a_link_that_drifts_is_made_even_and_said_to_drift():
     assert "commands' clock drifts" in clock.notes("commands'")[0]
 
 
+@pytest.mark.thorough
 def test_a_drive_that_ramps_answers_late_by_what_it_is_asked_and_no_clock_jumps():
     drive = simulated_drive(realistic("acceleration_limit", 1), seed=1)
     assert not [note for note in grid_drive(drive).notes if "commands' clock" in note]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@thinned("seed", range(3), quick=1)
 def test_an_even_link_is_left_alone(seed):
     wheels, commands = commanded(0.1, 0.05, seed=seed)
     clock, known = command_clock(wheels, commands, FEW_PAIRS)

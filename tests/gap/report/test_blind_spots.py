@@ -27,9 +27,10 @@ from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.richest_model import candidates_of
 from disco_hw.gap.search.selection import Selector, body_moves, wheel_moves
 from tests.gap.synthetic import GEOMETRY, LIMITS, body_channel, line_of
+from tests.tables import thinned
 
 
-@pytest.mark.parametrize("name", candidates_of(BODY))
+@thinned("name", candidates_of(BODY), quick=4)
 def test_poses_of_a_log_into_which_an_effect_is_put_are_those_of_a_robot_that_has_it(name):
     channel, drive = body_channel()
     found = ChannelResult(Selector(channel, body_moves(channel), LIMITS), (), channel)
@@ -265,7 +266,7 @@ def test_every_effect_that_was_not_found_is_listed_with_the_drive_that_shows_it(
     assert spots["pose_offset"].smallest_visible == spots["lateral_icr"].smallest_visible
 
 
-@pytest.mark.parametrize("name", ["turn_slip", "wheel_radius_asymmetry", "lateral_icr"])
+@thinned("name", ["turn_slip", "wheel_radius_asymmetry", "lateral_icr"], quick=1)
 def test_twice_the_smallest_visible_size_is_found_and_a_third_of_it_is_not(name):
     size = spots_of(body_channel()[0])[name].smallest_visible
     for share, found in ((2.0, True), (1.0 / 3.0, False)):
@@ -331,7 +332,7 @@ def test_no_limit_shows_above_what_was_asked_of_the_robot():
     assert not spots_at(3.0, 5.0, None)["speed_limit"].blind
 
 
-@pytest.mark.parametrize("top_rad_s", [0.5, 2.0, 5.0, 8.0, 50.0, None])
+@thinned("top_rad_s", [0.5, 2.0, 5.0, 8.0, 50.0, None], quick=2)
 def test_whether_a_drive_is_blind_is_a_plain_truth_value_however_slowly_the_robot_turns(top_rad_s):
     geometry = np.array(GEOMETRY)
     for speeds in ((0.0, 0.0), (4.0, 4.0), (-1.5, 1.5), (-40.0, 40.0)):

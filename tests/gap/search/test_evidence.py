@@ -10,6 +10,7 @@ from scipy import stats
 from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.selection import EffectEvidence, compare, held_out_by_block, inflation, interval_inflation
 from disco_hw.gap.settings import DEFAULT_SETTINGS
+from tests.tables import thinned
 
 N, EACH = 3000, 50
 
@@ -178,7 +179,7 @@ def test_an_interval_is_known_by_the_blocks_that_scatter_most_and_no_worse_than_
     assert times == pytest.approx(stats.t.ppf(0.975, freedom) / 1.96, rel=1e-6)
 
 
-@pytest.mark.parametrize("blocks", [3, 6, 20])
+@thinned("blocks", [3, 6, 20], quick=1)
 def test_of_few_blocks_too_intervals_hold_nearly_as_often_as_they_say(blocks):
     rng, held = np.random.default_rng(22), []
     for _ in range(300):

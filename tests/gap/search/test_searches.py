@@ -64,6 +64,7 @@ def test_what_a_model_knows_of_the_wheels_is_refitted_and_not_found():
     assert found.base.vector[WHEEL.place["motor_lag.tau_s"]] == pytest.approx(0.15, abs=0.002)
 
 
+@pytest.mark.thorough
 @thinned("curved", [0.0, -0.02], quick=1)
 def test_commands_are_searched_alike_to_the_last_bit_wherever_they_are_stamped(curved):
     """A delay that is counted from other stamps is rounded otherwise, and what it leads to may be another set."""
@@ -84,6 +85,7 @@ def test_commands_are_searched_alike_to_the_last_bit_wherever_they_are_stamped(c
     np.testing.assert_array_equal(np.delete(ends[0].vector, late), np.delete(ends[1].vector, late))
 
 
+@pytest.mark.thorough
 @thinned("late_s", [0.0, 0.3], quick=1)
 def test_poses_are_searched_alike_to_the_last_bit_wherever_they_are_stamped(late_s):
     channel, line = body_channel(turn_slip=0.08)
@@ -104,6 +106,7 @@ def test_poses_are_searched_alike_to_the_last_bit_wherever_they_are_stamped(late
     np.testing.assert_array_equal(np.delete(ends[0].vector, late), np.delete(ends[1].vector, late))
 
 
+@pytest.mark.thorough
 def test_wheels_with_a_term_that_has_no_name_have_it_found_with_its_number():
     line = wheels_of(lambda u: -0.02 * u * np.abs(u), drive=DRIVE * 2)
     found = search_wheels(line, np.array(GEOMETRY), WHEEL.neutral)
@@ -131,6 +134,7 @@ def test_what_slips_is_named_and_the_rest_is_the_noise_of_the_poses():
     assert found.richest_parameters in (smooth + terms, smooth + terms + 1)
 
 
+@pytest.mark.thorough
 def test_poses_that_are_late_at_first_sight_are_named_late_and_their_noise_is_not_that_of_slip():
     channel, line = body_channel()
     late = np.clip(line.pose.node - 30, 0, None)
@@ -169,6 +173,7 @@ def test_the_first_noise_is_of_poses_as_late_as_at_first_sight_unless_that_errs(
     assert begun.value.args == (begun_s,)
 
 
+@pytest.mark.thorough
 def test_what_a_model_knows_of_the_body_is_refitted_and_not_found():
     channel, line = body_channel(turn_slip=0.08)
     start = channel.neutral.copy()
@@ -253,6 +258,7 @@ def test_the_noise_of_wheels_is_learnt_of_a_rough_selection_and_all_that_is_smoo
     assert limits is chosen.thresholds
 
 
+@pytest.mark.thorough
 def test_where_nothing_that_is_known_comes_near_the_noise_is_what_that_leaves(noted):
     drive = ((4, 4), (-3, 3), (0, 0), (2, 5)) * 5
 
@@ -276,6 +282,7 @@ def test_where_nothing_that_is_known_comes_near_the_noise_is_what_that_leaves(no
     assert plainer.names == ("motor_lag",)
 
 
+@pytest.mark.thorough
 def test_the_noise_of_a_body_is_learnt_of_a_rough_selection_and_all_that_is_smooth(noted):
     channel, line = body_channel(turn_slip=0.08)
     found = search_body(line, channel.neutral)

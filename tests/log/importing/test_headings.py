@@ -14,6 +14,7 @@ from disco_hw.log.importing.headings import without_standing_headings
 from disco_hw.log.load import load_drive
 from tests.inference.test_infer_command import ROBOT
 from tests.log.importing.test_csv_faults import as_text, table
+from tests.tables import thinned
 
 
 def csv_drive(tmp_path, yaw, count=800) -> DriveLog:
@@ -131,7 +132,7 @@ def bag_drive(path, yaw_variance, yaw=lambda _: 0.0):
     return without_standing_headings(read_rosbag(path, robot_config()))
 
 
-@pytest.mark.parametrize("variance", [0.0, 99999.0, -1.0, math.nan, 0.01])
+@thinned("variance", [0.0, 99999.0, -1.0, math.nan, 0.01], quick=2)
 def test_a_position_without_heading_in_a_bag_is_a_position_only(tmp_path, variance):
     drive = bag_drive(tmp_path / "b", variance)
     assert drive.poses.t_s.size == 150
@@ -141,7 +142,7 @@ def test_a_position_without_heading_in_a_bag_is_a_position_only(tmp_path, varian
     assert "heading" in warnings[0]
 
 
-@pytest.mark.parametrize(("variance", "is_used"), [(0.0, True), (0.01, True), (99999.0, False), (-1.0, False)])
+@thinned(("variance", "is_used"), [(0.0, True), (0.01, True), (99999.0, False), (-1.0, False)], quick=2)
 def test_a_heading_that_turns_is_used_unless_its_covariance_says_unknown(tmp_path, variance, is_used):
     drive = bag_drive(tmp_path / "b", variance, lambda yaw: yaw)
     assert np.isfinite(drive.poses.yaw_rad[1:]).all() == is_used

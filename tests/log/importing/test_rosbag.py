@@ -54,7 +54,7 @@ def assert_same_wheels(drive, truth):
     np.testing.assert_allclose(drive.wheels.right_speed_rad_s, truth.wheels.right_speed_rad_s, atol=1e-9)
 
 
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3", "ros1"])
+@thinned("storage", ["mcap", "sqlite3", "ros1"], quick=1)
 def test_four_wheels_commands_and_the_chain_of_frames_are_read(tmp_path, storage):
     truth = recorded(place(tmp_path, storage), storage)
     drive = read_rosbag(place(tmp_path, storage), robot_config())
@@ -72,7 +72,7 @@ def test_four_wheels_commands_and_the_chain_of_frames_are_read(tmp_path, storage
 
 
 @thinned("distro", [Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY, Stores.ROS2_KILTED], quick=1)
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@thinned("storage", ["mcap", "sqlite3"], quick=1)
 def test_bags_of_all_releases_are_read(tmp_path, distro, storage):
     truth = recorded(place(tmp_path), storage, distro)
     assert_same_wheels(read_rosbag(place(tmp_path), robot_config()), truth)
@@ -139,7 +139,7 @@ def test_a_gap_in_the_recording_starts_a_new_segment(tmp_path):
     assert np.isnan(drive.commands.left_rad_s[np.searchsorted(drive.commands.t_s, 5.0) - 1])
 
 
-@pytest.mark.parametrize("by_s", [-30.0, 30.0])
+@thinned("by_s", [-30.0, 30.0], quick=1)
 def test_a_clock_that_is_set_is_said_and_taken_out(tmp_path, by_s):
     truth = recorded(place(tmp_path), clock=lambda t_s: by_s if t_s > 5.0 else 0.0)
     drive = read_rosbag(place(tmp_path), robot_config())
@@ -272,7 +272,7 @@ def test_no_topics_are_taken_for_what_has_none(robot, tmp_path):
         import_log(tmp_path / "a.csv", robot, tmp_path / "log.mcap", ["poses=/pose"])
 
 
-@pytest.mark.parametrize("topic", ["poses", "poses=", "pose=/x"])
+@thinned("topic", ["poses", "poses=", "pose=/x"], quick=1)
 def test_a_topic_that_is_no_role_and_name_is_refused(robot, tmp_path, topic):
     with pytest.raises(Exception, match="is not ROLE=NAME"):
         recorded(place(tmp_path)) and import_log(place(tmp_path), robot, tmp_path / "log.mcap", [topic])

@@ -84,7 +84,7 @@ def whole_bags(tmp_path_factory):
 ENDINGS = {"mcap": "mcap", "sqlite3": "db3", "ros1": "bag"}
 
 
-@pytest.mark.parametrize("storage", ENDINGS)
+@thinned("storage", ENDINGS, quick=2)
 @thinned("share", [0.55, 0.7, 0.9, 0.99], quick=2)
 def test_a_truncated_bag_is_read_as_far_as_it_is_whole(tmp_path, whole_bags, storage, share):
     contents, samples = whole_bags
@@ -107,6 +107,7 @@ def test_a_bag_that_was_cut_before_its_first_message_is_one_line(tmp_path, whole
     assert one_line(error)
 
 
+@pytest.mark.thorough
 def test_wherever_an_mcap_is_cut_it_is_a_drive_with_a_warning_or_one_line(tmp_path, whole_bags):
     content, rng, path = whole_bags[0]["mcap"], random.Random(7), tmp_path / "b.mcap"
     for _ in range(10):

@@ -3,6 +3,8 @@
 import msgspec
 import pytest
 
+from tests.tables import thinned
+
 pytest.importorskip("rosbags", reason="pip install 'disco-hw[ros2]'")
 
 from disco_hw.config import Ros2
@@ -49,7 +51,7 @@ def test_a_definition_that_nobody_needs_is_not_parsed(tmp_path, parsed, definiti
     assert parsed == []
 
 
-@pytest.mark.parametrize("definition", HOSTILE.values(), ids=HOSTILE)
+@thinned("definition", HOSTILE.values(), ids=HOSTILE, quick=1)
 def test_needed_definitions_of_a_bag_are_given_up_after_half_a_second_together(tmp_path, parsed, definition):
     path = drive_beside(tmp_path / "b", [f"a{k}_msgs/msg/Drive" for k in range(20)], definition)
     drive = read_rosbag(path, robot_config())

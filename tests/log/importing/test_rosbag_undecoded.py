@@ -7,6 +7,7 @@ from disco_hw.log.importing.losses import WARNING
 from disco_hw.log.importing.rosbag import read_rosbag
 from tests.inference.drives import robot_config
 from tests.log.importing.bags import Maker, recorded
+from tests.tables import thinned
 
 WHOLE = 646
 """Wheel samples of the drive."""
@@ -30,7 +31,7 @@ def record_damaged(path, monkeypatch, topic, every, storage="mcap"):
         recorded(path, storage)
 
 
-@pytest.mark.parametrize(("every", "lost", "is_warned"), [(200, 3, False), (10, 64, True), (3, 215, True)])
+@thinned(("every", "lost", "is_warned"), [(10, 64, True), (200, 3, False), (3, 215, True)], quick=1)
 def test_a_message_that_cannot_be_decoded_is_left_out_and_counted(tmp_path, monkeypatch, every, lost, is_warned):
     record_damaged(tmp_path / "b", monkeypatch, "/joint_states", every)
     drive = read_rosbag(tmp_path / "b", robot_config())
@@ -50,6 +51,7 @@ def test_a_topic_of_which_most_cannot_be_decoded_is_refused(tmp_path, monkeypatc
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.thorough
 def test_a_topic_of_which_no_message_can_be_decoded_is_not_chosen_and_named(tmp_path, monkeypatch):
     record_damaged(tmp_path / "b", monkeypatch, "/joint_states", 1)
     drive = read_rosbag(tmp_path / "b", robot_config())
@@ -58,13 +60,13 @@ def test_a_topic_of_which_no_message_can_be_decoded_is_not_chosen_and_named(tmp_
     assert any("hides what that leaves out; record /joint_states" in note for note in drive.notes)
 
 
-@pytest.mark.parametrize("topic", ["/rtabmap/odom", "/cmd_vel", "/tf", "/camera/image_raw"])
+@thinned("topic", ["/rtabmap/odom", "/cmd_vel", "/tf", "/camera/image_raw"], quick=1)
 def test_damage_in_one_topic_costs_no_wheel_sample(tmp_path, monkeypatch, topic):
     record_damaged(tmp_path / "b", monkeypatch, topic, 5)
     assert read_rosbag(tmp_path / "b", robot_config()).wheels.t_s.size == WHOLE
 
 
-@pytest.mark.parametrize("share", [0.3, 0.6, 0.97])
+@thinned("share", [0.3, 0.6, 0.97], quick=1)
 def test_a_sqlite3_file_is_read_to_its_damage(tmp_path, share):
     recorded(tmp_path / "b", "sqlite3")
     (path,) = (tmp_path / "b").glob("*.db3")

@@ -1,0 +1,26 @@
+"""How `make test` shares the tests between its workers."""
+
+from pathlib import Path
+
+from tests.conftest import PARTS, is_in_part
+
+TESTS = Path(__file__).parents[1]
+
+
+def readers(path):
+    """Numbers of the workers that come to a file, through all folders on the way to it."""
+    way = [path, *(folder for folder in path.parents if folder.is_relative_to(TESTS))]
+    return [part for part in range(len(PARTS) + 1) if all(is_in_part(one, part) for one in way)]
+
+
+def test_every_file_is_read_by_one_worker():
+    found = {str(path.relative_to(TESTS)): readers(path) for path in TESTS.rglob("test_*.py")}
+    assert {path: workers for path, workers in found.items() if len(workers) != 1} == {}
+    assert readers(TESTS / "hil" / "test_estop.py") == [0]
+    assert readers(TESTS / "firmware_protocol" / "emulated" / "test_board.py") == [0]
+    assert readers(TESTS / "firmware_protocol" / "test_codec.py") == [len(PARTS)]
+    assert readers(TESTS / "gap" / "search" / "test_needed.py") == [1]
+
+
+def test_every_part_names_folders_that_there_are():
+    assert all((TESTS / folder).is_dir() for part in PARTS for folder in part)
