@@ -54,7 +54,7 @@ GOOD = PoseInput(rate_hz=25.0, position_std_m=0.005, yaw_std_rad=0.005, latency_
 def test_the_geometry_is_learnt_where_robot_toml_says_good_poses():
     assert choose_adaptation(Control(), GOOD, MODEL).kind == "fast"
     chosen = choose_adaptation(Control(), PoseInput(), MODEL)
-    assert chosen.kind == "off"
+    assert chosen.kind == "measured"
     assert "pose.rate_hz" in chosen.why
 
 
