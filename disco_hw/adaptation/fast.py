@@ -31,7 +31,7 @@ class FastAdaptation:
     """Learns from `model`, within `low` and `high` (order of NAMES).
 
     `put_in_force` makes planner and estimator use a geometry, None for the model file's; it raises ValueError for one
-    that they cannot take. With a `watch` learning begins once the poses are good enough.
+    that they cannot take. With a `watch` estimation begins once the poses are good enough.
     """
 
     def __init__(

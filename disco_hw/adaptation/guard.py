@@ -85,6 +85,7 @@ LEAST_RATE_HZ, MOST_POSITION_STD_M, MOST_YAW_STD_RAD, MOST_LATENCY_S = 10.0, 0.0
 
 
 AdaptationKind = Literal["off", "fast", "measured"]
+REPORT_ON, REPORT_OFF = "the geometry is estimated while driving", "the geometry is not estimated"
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +94,13 @@ class AdaptationChoice:
 
     kind: AdaptationKind
     why: str
+
+    @property
+    def report(self) -> str:
+        """Return what runs and why, for the operator; empty for "measured", where `PoseWatch` reports it later."""
+        if self.kind == "measured":
+            return ""
+        return f"{REPORT_ON if self.kind == 'fast' else REPORT_OFF}: {self.why}"
 
 
 def choose_adaptation(control: Control, pose: PoseInput, model: Model) -> AdaptationChoice:
@@ -113,7 +121,7 @@ def choose_adaptation(control: Control, pose: PoseInput, model: Model) -> Adapta
         return AdaptationChoice("off", str(error))
     if pose.rate_hz is None:
         text = (
-            f"pose.rate_hz is not given: the geometry is learnt once poses come at {LEAST_RATE_HZ:g} Hz or more, "
+            f"pose.rate_hz is not given: the geometry is estimated once poses come at {LEAST_RATE_HZ:g} Hz or more, "
             f"with {1e3 * MOST_POSITION_STD_M:g} mm, {MOST_YAW_STD_RAD:g} rad and {MOST_LATENCY_S:g} s or less"
         )
         return AdaptationChoice("measured", text)

@@ -9,7 +9,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.adaptation.guard import LEAST_RATE_HZ, MOST_LATENCY_S, MOST_POSITION_STD_M, MOST_YAW_STD_RAD
+from disco_hw.adaptation.guard import (
+    LEAST_RATE_HZ,
+    MOST_LATENCY_S,
+    MOST_POSITION_STD_M,
+    MOST_YAW_STD_RAD,
+    REPORT_OFF,
+    REPORT_ON,
+)
 from drivers.types import PoseSample
 
 WINDOW_S = 2.0
@@ -71,22 +78,22 @@ def measured_quality(poses: Sequence[PoseSample], span_s: float) -> PoseQuality:
 
 
 def _noise(values: NDArray[np.float64]) -> float:
-    """Standard deviation of white noise on a smooth series (N, ...)."""
+    """Return the standard deviation of white noise on a smooth series (N, ...)."""
     return float(np.median(np.abs(np.diff(values, 2, axis=0)))) / (_MEDIAN_OF_NORMAL * _SECOND_DIFFERENCE)
 
 
 @dataclass
 class PoseWatch:
-    """Judges the poses of the first source, window by window; `is_good` from the first good window on."""
+    """Evaluates the poses of the first source, window by window; `is_good` from the first good window on."""
 
     is_good: bool = False
     text: str = "measuring the poses"
     _poses: list[PoseSample] = field(default_factory=list)
     _since_ns: int | None = None
-    _told: str = ""
+    _reported: str = ""
 
     def step(self, now_ns: int, poses: Sequence[PoseSample]) -> str:
-        """Take in poses, and return what to tell the operator: a sentence where the judgement changes, or nothing."""
+        """Take in poses, and return what to report to the operator: a sentence where the fault changes, or nothing."""
         if self.is_good:
             return ""
         self._poses += [pose for pose in poses if pose.source == 0]
@@ -99,11 +106,11 @@ class PoseWatch:
             return ""
         quality = measured_quality(self._poses, span_s)
         self._poses, self._since_ns = [], None
-        # Of "poses come at 4.1 Hz, fewer than 10" the words without the value.
+        # "poses come" of "poses come at 4.1 Hz, fewer than 10": the kind of fault without its value.
         kind = " ".join(quality.fault.split()[:2])
         self.is_good = not quality.fault
         self.text = quality.fault or str(quality)
         if self.is_good:
-            return f"adapt: the geometry is learnt while driving: {quality}"
-        news, self._told = kind != self._told, kind
-        return f"adapt: the geometry is not learnt: {quality.fault}" if news else ""
+            return f"adapt: {REPORT_ON}: {quality}"
+        is_new, self._reported = kind != self._reported, kind
+        return f"adapt: {REPORT_OFF}: {quality.fault}" if is_new else ""

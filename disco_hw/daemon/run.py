@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 from numba.core import event
 
 from disco_hw import processes
-from disco_hw.adaptation.guard import AdaptationKind, check_adaptable, choose_adaptation
+from disco_hw.adaptation.guard import AdaptationChoice, AdaptationKind, check_adaptable, choose_adaptation
 from disco_hw.config import RobotConfig
 from disco_hw.control.plan import Law, LawController
 from disco_hw.daemon import SERVED, passed_over, recording_in_words, socket_path
@@ -107,19 +107,21 @@ def run_daemon(
     setup = load_setup(options.robot, options.model, options.link)
     if not options.accept_missing_effects:
         refuse_missing_effects(setup)
-    adapt: AdaptationKind = "fast"
+    chosen = AdaptationChoice("fast", "--adapt")
     if options.adapt:
         check_adaptable(setup.model, setup.config.control.uncertainty)
     else:
-        adapt = choose_adaptation(setup.config.control, setup.config.pose, setup.model).kind
+        chosen = choose_adaptation(setup.config.control, setup.config.pose, setup.model)
     with closing(AsyncPrinter(STANDARD_OUTPUT, in_json if options.as_json else in_text)) as say:
+        if chosen.report:
+            say("adapt", chosen.report)
         return serve(
             setup,
             options.log_file,
             say,
             make_pilot(setup.config),
             lambda: make_planner(setup.config, setup.model) if law is None else _controller(law, setup),
-            adapt,
+            chosen.kind,
             by_command(options.robot),
             page_news,
         )

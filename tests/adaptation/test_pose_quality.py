@@ -67,7 +67,7 @@ def test_good_poses_are_found_in_seconds_and_told_once():
     assert watch.is_good
     assert len(told) == 1
     assert 2.0 <= told[0][0] < 2.2
-    assert "learnt while driving: poses at 2" in told[0][1]
+    assert "estimated while driving: poses at 2" in told[0][1]
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_poses_that_are_not_good_enough_are_told_once_with_the_cause(change, wor
     assert not watch.is_good
     assert len(told) == 1
     assert words in told[0][1]
-    assert "not learnt" in told[0][1]
+    assert "not estimated" in told[0][1]
 
 
 def test_another_source_than_the_first_is_not_judged():
