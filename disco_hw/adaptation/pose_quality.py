@@ -20,6 +20,9 @@ from disco_hw.adaptation.guard import (
 from drivers.types import PoseSample
 
 WINDOW_S = 2.0
+# Windows without a good one before a fault is reported: the noise of 2 s is known to about 15 %, so that poses near a
+# limit may seem worse than they are at first.
+REPORTED_AFTER = 5
 # The median of the absolute value of a standard normal variable, and the gain of a second difference for white noise.
 _MEDIAN_OF_NORMAL, _SECOND_DIFFERENCE = 0.6745, math.sqrt(6.0)
 
@@ -90,6 +93,7 @@ class PoseWatch:
     text: str = "measuring the poses"
     _poses: list[PoseSample] = field(default_factory=list)
     _since_ns: int | None = None
+    _bad_windows: int = 0
     _reported: str = ""
 
     def step(self, now_ns: int, poses: Sequence[PoseSample]) -> str:
@@ -112,5 +116,8 @@ class PoseWatch:
         self.text = quality.fault or str(quality)
         if self.is_good:
             return f"adapt: {REPORT_ON}: {quality}"
+        self._bad_windows += 1
+        if self._bad_windows < REPORTED_AFTER:
+            return ""
         is_new, self._reported = kind != self._reported, kind
         return f"adapt: {REPORT_OFF}: {quality.fault}" if is_new else ""

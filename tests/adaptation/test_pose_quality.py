@@ -2,6 +2,7 @@
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -86,6 +87,21 @@ def test_poses_that_are_not_good_enough_are_told_once_with_the_cause(change, wor
     assert len(told) == 1
     assert words in told[0][1]
     assert "not estimated" in told[0][1]
+
+
+def test_one_window_that_seems_worse_than_the_poses_are_is_not_reported():
+    watch = PoseWatch()
+    told = watched(watch, [*stream(4.0, noise_rad=0.02), *(later(pose, 4.0) for pose in stream(6.0))])
+    assert watch.is_good
+    assert len(told) == 1
+    assert "estimated while driving" in told[0][1]
+
+
+def later(pose, by_s):
+    """The pose of another time."""
+    return msgspec.structs.replace(
+        pose, t_ns=pose.t_ns + round(by_s * S), received_ns=pose.received_ns + round(by_s * S)
+    )
 
 
 def test_another_source_than_the_first_is_not_judged():
