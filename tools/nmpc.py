@@ -133,10 +133,10 @@ class NonlinearMpc:
         return np.column_stack([np.interp(at, np.arange(HORIZON), column) for column in self._commands.T])
 
 
-def _solver(lag_s: float, forward: bool) -> Any:
+def _solver(lag_s: float, only_forward: bool) -> Any:
     """Build the SQP solver for commands beyond the dead band; the state and the reference are parameters.
 
-    Its constraints are the changes of the commands, and with `forward` their sums in each step.
+    Its constraints are the changes of the commands, and with `only_forward` their sums in each step.
     """
     import casadi as ca  # noqa: PLC0415  (of [bench])
 
@@ -151,7 +151,7 @@ def _solver(lag_s: float, forward: bool) -> Any:
     for t in range(HORIZON):
         ask_left, ask_right = commands[2 * t], commands[2 * t + 1]
         changes += [ask_left - last_left, ask_right - last_right]
-        sums += [ask_left + ask_right] if forward else []
+        sums += [ask_left + ask_right] if only_forward else []
         last_left, last_right = ask_left, ask_right
         mean_left, mean_right = ask_left + settled * (left - ask_left), ask_right + settled * (right - ask_right)
         left, right = ask_left + keep * (left - ask_left), ask_right + keep * (right - ask_right)
