@@ -8,7 +8,8 @@ Names that begin with `mujoco` drive the robot of `tools/mujoco_plant.py`.
 `python -m tools.bench_tracking disco_adapting circle,square 20` drives some of it; `... starts 20` begins anywhere.
 `... --first 5000 --count 20` drives robots that nothing was chosen on; `--speeds 0.1,0.2,0.3` at these speeds (m/s),
 and `--json` prints the figures as JSON. `nmpc` is a textbook nonlinear MPC (`tools/nmpc.py`, of [bench]). `forward` is
-the part of the time in which a robot moves forward: nothing in the cost of that MPC asks for it.
+the part of the time in which a robot moves forward: nothing in the cost of that MPC asks for it. `nmpc_forward` is the
+same MPC, which may not drive backwards.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ MUJOCO = "mujoco_"
 def contenders(speed_m_s: float = SPEED_M_S) -> dict[str, Contender]:
     """Return the rows of the table, by name, for tracks of this speed."""
     settings = DiscoSettings.for_speed(speed_m_s, RATE_HZ)
-    nmpc = Contender(partial(_nmpc, speed_m_s), learns=True)
+    nmpc = Contender(partial(_nmpc, speed_m_s, False), learns=True)
     integral = classical(PurePursuit(look_ahead_m=0.081, integral=3.04, preview_s=0.142), speed_m_s)
     adapting = disco(settings, learns=True)
     offset_free = disco(replace(settings, offset_free=True), learns=True)
@@ -52,6 +53,7 @@ def contenders(speed_m_s: float = SPEED_M_S) -> dict[str, Contender]:
         "lqr": classical(LinearQuadratic(), speed_m_s),
         "pytorch_mppi": Contender(_peer),
         "nmpc": nmpc,
+        "nmpc_forward": Contender(partial(_nmpc, speed_m_s, True), learns=True),
         "disco_point": disco(replace(settings, uncertainty="point")),
         "disco_ut": disco(settings),
         "disco_ut_offset_free": disco(replace(settings, offset_free=True)),
@@ -68,9 +70,9 @@ def contenders(speed_m_s: float = SPEED_M_S) -> dict[str, Contender]:
     }
 
 
-def _nmpc(speed_m_s: float, robot: ForeignRobot, track: Track) -> Planner:
+def _nmpc(speed_m_s: float, forward: bool, robot: ForeignRobot, track: Track) -> Planner:
     """Make the nonlinear MPC that begins with the geometry which is believed."""
-    return NonlinearMpc(robot, track, speed_m_s, robot.believed)
+    return NonlinearMpc(robot, track, speed_m_s, robot.believed, forward)
 
 
 def _peer(robot: ForeignRobot, track: Track) -> Planner:

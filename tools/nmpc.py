@@ -60,17 +60,24 @@ class TimedReference:
 
 
 class NonlinearMpc:
-    """Plans wheel speeds by nonlinear MPC, under the mean of the belief that it is given."""
+    """Plans wheel speeds by nonlinear MPC, under the mean of the belief that it is given.
+
+    `forward`: the wheels together may not turn backwards. Without it the robot turns round where that is easier: its
+    tracked point lies behind the centre of rotation, and following a line forwards is unstable without a term for it.
+    """
 
     def __init__(
-        self, robot: ForeignRobot, track: Track, speed_m_s: float, geometry: tuple[float, float, float]
-    ) -> None:
+        self, robot: ForeignRobot, track: Track, speed_m_s: float, geometry: tuple[float, float, float],
+        forward: bool = False,
+    ) -> None:  # fmt: skip
         self._reference = TimedReference(track.points_m, speed_m_s)
         self._geometry, self._lag_s, self._dead_rad_s = np.array(geometry), robot.lag_s, robot.dead_rad_s
-        self._solver = _solver(robot.lag_s)
+        self._solver = _solver(robot.lag_s, forward)
         largest = LIMITS.speed_rad_s - robot.dead_rad_s
         self._bounds = np.full(2 * HORIZON, largest)
-        self._change = np.full(2 * HORIZON, LIMITS.acceleration_rad_s2 * STEP_S)
+        change = np.full(2 * HORIZON, LIMITS.acceleration_rad_s2 * STEP_S)
+        sums = np.full(HORIZON if forward else 0, 2.0 * largest)
+        self._lowest, self._highest = np.concatenate([-change, 0.0 * sums]), np.concatenate([change, sums])
         self.reset()
 
     @property
@@ -106,7 +113,7 @@ class NonlinearMpc:
         reference = self._reference.points(state.x_m, state.y_m)
         parameters = np.concatenate([start, last, self._geometry, reference.ravel()])
         found = self._solver(
-            x0=guess.ravel(), p=parameters, lbx=-self._bounds, ubx=self._bounds, lbg=-self._change, ubg=self._change
+            x0=guess.ravel(), p=parameters, lbx=-self._bounds, ubx=self._bounds, lbg=self._lowest, ubg=self._highest
         )
         commands = np.array(found["x"]).reshape(HORIZON, 2)
         if not np.isfinite(commands).all():
@@ -126,8 +133,11 @@ class NonlinearMpc:
         return np.column_stack([np.interp(at, np.arange(HORIZON), column) for column in self._commands.T])
 
 
-def _solver(lag_s: float) -> Any:
-    """Build the SQP solver for commands beyond the dead band; the state and the reference are parameters."""
+def _solver(lag_s: float, only_forward: bool) -> Any:
+    """Build the SQP solver for commands beyond the dead band; the state and the reference are parameters.
+
+    Its constraints are the changes of the commands, and with `only_forward` their sums in each step.
+    """
     import casadi as ca  # noqa: PLC0415  (of [bench])
 
     commands = ca.MX.sym("u", 2 * HORIZON)
@@ -137,10 +147,11 @@ def _solver(lag_s: float) -> Any:
     radius, axle, x_icr = parameters[7], parameters[8], parameters[9]
     keep = math.exp(-STEP_S / lag_s)
     settled = (1.0 - keep) * lag_s / STEP_S
-    cost, changes = 0.0, []
+    cost, changes, sums = 0.0, [], []
     for t in range(HORIZON):
         ask_left, ask_right = commands[2 * t], commands[2 * t + 1]
         changes += [ask_left - last_left, ask_right - last_right]
+        sums += [ask_left + ask_right] if only_forward else []
         last_left, last_right = ask_left, ask_right
         mean_left, mean_right = ask_left + settled * (left - ask_left), ask_right + settled * (right - ask_right)
         left, right = ask_left + keep * (left - ask_left), ask_right + keep * (right - ask_right)
@@ -153,7 +164,7 @@ def _solver(lag_s: float) -> Any:
         cost += (x - parameters[10 + 2 * t]) ** 2 + (y - parameters[11 + 2 * t]) ** 2
     change = ca.vertcat(*changes)
     problem = {
-        "x": commands, "p": parameters, "g": change,
+        "x": commands, "p": parameters, "g": ca.vertcat(change, *sums),
         "f": DISTANCE_WEIGHT * cost + CHANGE_WEIGHT * ca.sumsqr(change),
     }  # fmt: skip
     quiet = {"print_iter": False, "print_header": False, "print_info": False, "error_on_fail": False}

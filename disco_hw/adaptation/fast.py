@@ -14,6 +14,7 @@ import numpy as np
 from disco_hw.adaptation import AdaptationUpdate
 from disco_hw.adaptation.geometry_filter import GeometryFilter
 from disco_hw.adaptation.guard import NAMES, Geometry, geometry_fault
+from disco_hw.adaptation.pose_quality import PoseWatch
 from disco_hw.log import records
 from drivers.types import Readings
 
@@ -30,13 +31,15 @@ class FastAdaptation:
     """Learns from `model`, within `low` and `high` (order of NAMES).
 
     `put_in_force` makes planner and estimator use a geometry, None for the model file's; it raises ValueError for one
-    that they cannot take.
+    that they cannot take. With a `watch` estimation begins once the poses are good enough.
     """
 
     def __init__(
         self, model: Geometry, low: np.ndarray, high: np.ndarray, put_in_force: Callable[[Geometry | None], None],
-        drifts: bool = False,
+        drifts: bool = False, watch: PoseWatch | None = None,
     ) -> None:  # fmt: skip
+        self._watch = PoseWatch(is_good=True) if watch is None else watch
+        self._news: list[str] = []
         self._model, self._in_force, self._put_in_force = model, model, put_in_force
         self._low, self._high = low, high
         order = np.ix_(_FROM_NAMES, _FROM_NAMES)
@@ -87,11 +90,18 @@ class FastAdaptation:
 
     def feed(self, now_ns: int, readings: Readings) -> None:
         """Take in the wheel and pose samples that the tick received."""
-        self._filter.add(readings.wheels, readings.poses)
+        if self._watch.is_good:
+            self._filter.add(readings.wheels, readings.poses)
+            return
+        news = self._watch.step(now_ns, readings.poses)
+        self._news += [news] if news else []
+        self._text = self._watch.text
 
     def ask(self, action: str) -> tuple[bool, str]:
         """Handle "revert" or "adapt" at the next step."""
         self._asked = action
+        if action == "adapt" and not self._watch.is_good:
+            return True, f"not learning yet: {self._watch.text}"
         if action == "revert":
             return True, "back to the model file's belief; `ctl adapt` learns again"
         return True, "learning" if self._paused else "was learning already"
@@ -121,8 +131,8 @@ class FastAdaptation:
         return bool(moved.any() or (width < NEWS_WIDTH).any() or (width > 1.0 / NEWS_WIDTH).any())
 
     def _told(self) -> tuple[str, ...]:
-        """Sentences on what the filter noticed since the last time."""
-        found = []
+        """Sentences on the poses and on what the filter noticed since the last time."""
+        found, self._news = self._news, []
         if self._filter.changes > self._changes:
             found.append("adapt: the robot moves differently from what was learnt; learning again")
         if self._filter.carried > self._carried:

@@ -81,15 +81,26 @@ def check_adaptable(model: Model, uncertainty: str, asked_by: str = "--adapt") -
 
 
 LEAST_RATE_HZ, MOST_POSITION_STD_M, MOST_YAW_STD_RAD, MOST_LATENCY_S = 10.0, 0.01, 0.01, 0.3
-"""Poses from which the filter learns without being asked to."""
+"""Limits of poses from which the filter learns without being asked to."""
+
+
+AdaptationKind = Literal["off", "fast", "measured"]
+REPORT_ON, REPORT_OFF = "the geometry is estimated while driving", "the geometry is not estimated"
 
 
 @dataclass(frozen=True, slots=True)
 class AdaptationChoice:
-    """Choice of the adaptation that runs, with the reason."""
+    """Choice of the adaptation that runs, with the reason; "measured" waits for poses that are good enough."""
 
-    kind: Literal["off", "fast"]
+    kind: AdaptationKind
     why: str
+
+    @property
+    def report(self) -> str:
+        """Return what runs and why, for the operator; empty for "measured", where `PoseWatch` reports it later."""
+        if self.kind == "measured":
+            return ""
+        return f"{REPORT_ON if self.kind == 'fast' else REPORT_OFF}: {self.why}"
 
 
 def choose_adaptation(control: Control, pose: PoseInput, model: Model) -> AdaptationChoice:
@@ -110,10 +121,10 @@ def choose_adaptation(control: Control, pose: PoseInput, model: Model) -> Adapta
         return AdaptationChoice("off", str(error))
     if pose.rate_hz is None:
         text = (
-            f"pose.rate_hz is not given; write it, pose.position_std_m and pose.yaw_std_rad where poses come at "
-            f"{LEAST_RATE_HZ:g} Hz or more with {MOST_POSITION_STD_M:g} m and {MOST_YAW_STD_RAD:g} rad or less"
+            f"pose.rate_hz is not given: the geometry is estimated once poses come at {LEAST_RATE_HZ:g} Hz or more, "
+            f"with {1e3 * MOST_POSITION_STD_M:g} mm, {MOST_YAW_STD_RAD:g} rad and {MOST_LATENCY_S:g} s or less"
         )
-        return AdaptationChoice("off", text)
+        return AdaptationChoice("measured", text)
     if pose.rate_hz < LEAST_RATE_HZ:
         return AdaptationChoice("off", f"pose.rate_hz is {pose.rate_hz:g}, less than {LEAST_RATE_HZ:g}")
     for name, most in (

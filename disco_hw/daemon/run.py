@@ -20,12 +20,12 @@ from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 from numba.core import event
 
 from disco_hw import processes
-from disco_hw.adaptation.guard import check_adaptable, choose_adaptation
+from disco_hw.adaptation.guard import AdaptationChoice, AdaptationKind, check_adaptable, choose_adaptation
 from disco_hw.config import RobotConfig
 from disco_hw.control.plan import Law, LawController
 from disco_hw.daemon import SERVED, passed_over, recording_in_words, socket_path
@@ -43,7 +43,7 @@ from disco_hw.runtime import Ask, by_command
 from disco_hw.runtime.assembly import (
     assemble_core,
     driver_of,
-    make_fast_adaptation,
+    make_adaptation,
     make_link,
     make_pipeline,
     make_planner,
@@ -54,9 +54,6 @@ from disco_hw.runtime.robot_setup import Setup, kept_files, link_key, load_setup
 from drivers.kernel_cache import are_kernels_kept
 from drivers.types import PoseSample, Readings, Transport, WheelSample
 from firmware_protocol.codec import packaged_dbc
-
-Adapt = Literal["off", "fast"]
-"""What learns the geometry while driving: nothing, or the filter in the tick."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,19 +107,21 @@ def run_daemon(
     setup = load_setup(options.robot, options.model, options.link)
     if not options.accept_missing_effects:
         refuse_missing_effects(setup)
-    adapt: Adapt = "fast"
+    chosen = AdaptationChoice("fast", "--adapt")
     if options.adapt:
         check_adaptable(setup.model, setup.config.control.uncertainty)
     else:
-        adapt = choose_adaptation(setup.config.control, setup.config.pose, setup.model).kind
+        chosen = choose_adaptation(setup.config.control, setup.config.pose, setup.model)
     with closing(AsyncPrinter(STANDARD_OUTPUT, in_json if options.as_json else in_text)) as say:
+        if chosen.report:
+            say("adapt", chosen.report)
         return serve(
             setup,
             options.log_file,
             say,
             make_pilot(setup.config),
             lambda: make_planner(setup.config, setup.model) if law is None else _controller(law, setup),
-            adapt,
+            chosen.kind,
             by_command(options.robot),
             page_news,
         )
@@ -138,7 +137,7 @@ def serve(
     say: Say,
     pilot: Pilot,
     new_planner: Callable[[], Planner] = NoPlanner,
-    adapt: Adapt = "off",
+    adapt: AdaptationKind = "off",
     ask: Ask | None = None,
     page_news: Callable[[], tuple[str, ...]] = lambda: (),
 ) -> int:
@@ -178,7 +177,7 @@ def _start(
     stop: StopPath,
     say: Say,
     pilot: Pilot,
-    adapt: Adapt,
+    adapt: AdaptationKind,
     ask: Ask | None,
     page_news: Callable[[], tuple[str, ...]],
 ) -> Daemon:
@@ -196,7 +195,7 @@ def _start(
     if ask is not None and log is not None:
         stop.add("log", lambda: say("log", f"look at it: disco-hw view {log}, or disco-hw log info {log}"))
     stop.add(_RECORDER, lambda: _close_recorder(recorder, say))
-    adaptation = make_fast_adaptation(setup, pipeline) if adapt == "fast" else None
+    adaptation = make_adaptation(setup, pipeline, adapt)
     for step in processes.enter_real_time(config.daemon.realtime_priority):
         say("real time", str(step))
     for line in passed_over(server.path):

@@ -28,7 +28,7 @@ from disco_hw.reports import refuse_file
 from disco_hw.runtime.assembly import (
     assemble_core,
     driver_of,
-    make_fast_adaptation,
+    make_adaptation,
     make_pipeline,
     make_planner,
 )
@@ -105,7 +105,7 @@ class SimulatedRun:
     @staticmethod
     def _adaptation(setup: Setup, pipeline: Pipeline) -> GeometryAdaptation | None:
         chosen = choose_adaptation(setup.config.control, setup.config.pose, setup.model)
-        return None if chosen.kind == "off" else make_fast_adaptation(setup, pipeline)
+        return make_adaptation(setup, pipeline, chosen.kind)
 
     def ticks(self, duration_s: float, *requests: UserRequest) -> Iterator[CoreTick]:
         """Let time pass and give every tick as it comes; the requests come with the first one."""
@@ -225,11 +225,12 @@ def drive_virtual(
 def _at_the_reference_controller(setup: Setup) -> Setup:
     usual = {field.name: field.default for field in msgspec.structs.fields(RobotConfig)}
     asked = choose_adaptation(setup.config.control, setup.config.pose, setup.model)
+    kind = "auto" if asked.kind == "measured" else asked.kind
     changed = {
         "link": usual["link"],
         "wheels": usual["wheels"],
         "pose": usual["pose"],
-        "control": msgspec.structs.replace(setup.config.control, adaptation=asked.kind),
+        "control": msgspec.structs.replace(setup.config.control, adaptation=kind),
     }
     return replace(setup, config=msgspec.structs.replace(setup.config, **changed))
 

@@ -11,12 +11,14 @@ from disco_hw.adaptation import GeometryAdaptation
 from disco_hw.adaptation.fast import FastAdaptation
 from disco_hw.adaptation.guard import (
     ASKED_BY_FILE,
+    AdaptationKind,
     Geometry,
     believed_geometry,
     check_adaptable,
     possible_range,
     with_geometry,
 )
+from disco_hw.adaptation.pose_quality import PoseWatch
 from disco_hw.config import PoseInput, RobotConfig
 from disco_hw.control.baselines import LAWS, WithFallback
 from disco_hw.control.past_motion import DriveMeans
@@ -121,12 +123,10 @@ def make_guard(config: RobotConfig, model: Model) -> FenceGuard:
     return FenceGuard(Boundaries(config.robot.footprint, config.fence), settings, config.fence.margin_m)
 
 
-def make_fast_adaptation(setup: Setup, pipeline: Pipeline) -> FastAdaptation:
-    """Return the filter that learns the geometry in the tick itself.
+def make_fast_adaptation(setup: Setup, pipeline: Pipeline, watch: PoseWatch | None = None) -> FastAdaptation:
+    """Return the filter that learns the geometry, from the first pose on or once `watch` finds the poses good enough.
 
-    Raises InputError where the model does not allow it.
-
-    `pipeline` has taken no step yet.
+    `pipeline` has taken no step yet. Raises InputError where the model does not allow it.
     """
     check_adaptable(setup.model, setup.config.control.uncertainty, ASKED_BY_FILE)
     return FastAdaptation(
@@ -134,7 +134,15 @@ def make_fast_adaptation(setup: Setup, pipeline: Pipeline) -> FastAdaptation:
         *possible_range(setup.config.prior),
         lambda geometry: put_in_force(pipeline, setup.model, geometry),
         setup.config.control.disturbance,
+        watch,
     )
+
+
+def make_adaptation(setup: Setup, pipeline: Pipeline, kind: AdaptationKind) -> GeometryAdaptation | None:
+    """Return what learns the geometry, as `choose_adaptation` says; None for "off"."""
+    if kind == "off":
+        return None
+    return make_fast_adaptation(setup, pipeline, PoseWatch() if kind == "measured" else None)
 
 
 def _rehearsed(setup: Setup, pipeline: Pipeline) -> Geometry:

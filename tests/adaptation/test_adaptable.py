@@ -54,8 +54,17 @@ GOOD = PoseInput(rate_hz=25.0, position_std_m=0.005, yaw_std_rad=0.005, latency_
 def test_the_geometry_is_learnt_where_robot_toml_says_good_poses():
     assert choose_adaptation(Control(), GOOD, MODEL).kind == "fast"
     chosen = choose_adaptation(Control(), PoseInput(), MODEL)
-    assert chosen.kind == "off"
+    assert chosen.kind == "measured"
     assert "pose.rate_hz" in chosen.why
+
+
+def test_one_line_reports_what_runs_and_why():
+    assert choose_adaptation(Control(), GOOD, MODEL).report.startswith("the geometry is estimated while driving: poses")
+    assert choose_adaptation(Control(adaptation="off"), GOOD, MODEL).report == (
+        'the geometry is not estimated: control.adaptation = "off"'
+    )
+    # Where the poses are measured first, that line comes once they are.
+    assert choose_adaptation(Control(), PoseInput(), MODEL).report == ""
 
 
 @pytest.mark.parametrize(

@@ -97,10 +97,15 @@ def test_a_law_that_has_no_answer_for_a_while_stops_the_robot_until_it_has_one(t
         assert log.summary().missing_ticks == 0
 
 
-@pytest.mark.parametrize(("pose", "learnt"), [("", False), (GOOD_POSES, True)], ids=["unknown", "good poses"])
-def test_the_geometry_is_learnt_where_the_real_robot_would_learn_it(tmp_path, pose, learnt):
+@pytest.mark.parametrize(
+    ("pose", "control", "learnt"),
+    [("", "", True), (GOOD_POSES, "", True), ("[pose]\nrate_hz = 4.0\n", "", False), ("", 'adaptation = "off"', False)],
+    ids=["measured", "good poses", "slow poses", "off"],
+)
+def test_the_geometry_is_learnt_where_the_real_robot_would_learn_it(tmp_path, pose, control, learnt):
     robot, log = tmp_path / "robot.toml", tmp_path / "log.mcap"
     text = ROBOT.read_text("utf-8").replace("wombot_model.toml", str(ROBOT.with_name("wombot_model.toml")))
+    text = text.replace("[control]\n", f"[control]\n{control}\n")
     robot.write_text(f"{text}\n{pose}", encoding="utf-8")
     drive_virtual(robot, lambda *_: (2.0, 4.0), 4.0, log=log)
     with open_log(log) as opened:

@@ -39,7 +39,7 @@ def test_check_fails_without_a_robot_and_says_what_to_do(tmp_path):
     code, output = disco("check", str(write_robot_file(tmp_path)))
     assert code == 1
     assert "fail  link" in output
-    assert "adaptation: off, as pose.rate_hz is not given" in output
+    assert "adaptation: measured, as pose.rate_hz is not given" in output
 
 
 def wait_for_line(path, word: str, timeout_s: float = 30.0) -> None:
