@@ -49,9 +49,9 @@ class DeviceClock:
         self._base_us = 0
         self._last_ns = 0
         self._slew_from_ns = 0
-        self.forget()
+        self.clear()
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Start afresh with the next exchange."""
         self._window.clear()
         self._filter: _OffsetFilter | None = None
@@ -71,8 +71,8 @@ class DeviceClock:
         if self._filter is not None:
             error_ns = self._deviation(middle_ns, device_us) - self._filter.at(middle_ns)
             # What the estimate rests on may have waited on one of its two ways alone.
-            doubt_ns = min(exchange.round_trip_ns for exchange in self._window)
-            restarted = abs(error_ns) > RESTART_NS + doubt_ns + (received_ns - sent_ns)
+            uncertainty_ns = min(exchange.round_trip_ns for exchange in self._window)
+            restarted = abs(error_ns) > RESTART_NS + uncertainty_ns + (received_ns - sent_ns)
         if self._filter is None or restarted:
             self._start(middle_ns, device_us)
         shown_ns = self._shown(received_ns) if self.synced(received_ns) else None
@@ -118,7 +118,7 @@ class DeviceClock:
         return None if offset_ns is None else ((now_ns - offset_ns) / 1000) % DEVICE_CLOCK_MODULUS_US
 
     def _start(self, host_ns: int, device_us: int) -> None:
-        self.forget()
+        self.clear()
         self._filter = _OffsetFilter(host_ns)
         self._base_host_ns, self._base_us = host_ns, device_us
 

@@ -111,7 +111,7 @@ class Gamepad:
             events = list(self._device.read())
             self._gone = not events
             for event in events:
-                self._take(event)
+                self._handle(event)
                 self._event_ns = now_ns
         except BlockingIOError:
             pass
@@ -125,7 +125,7 @@ class Gamepad:
         """Close the gamepad's device."""
         self._device.close()
 
-    def _take(self, event: InputEvent) -> None:
+    def _handle(self, event: InputEvent) -> None:
         if event.type == _EV_SYN:
             if self._dropping and event.code == _SYN_REPORT:
                 self._dropping = False

@@ -37,7 +37,7 @@ def kept_on_disk(dispatcher: _Dispatcher) -> _Dispatcher:
     try:
         compiled._cache = _KernelCache(compiled.py_func)
     except RuntimeError:
-        _tell(_NOT_KEPT)
+        _print_line(_NOT_KEPT)
     return dispatcher
 
 
@@ -59,7 +59,7 @@ class _PrivateLocator:
     def from_function(cls, py_func: Any, py_file: str) -> Any:
         locator = super().from_function(py_func, py_file)  # type: ignore[misc]
         if locator is not None and (why := _why_not_believed(locator.get_cache_path())) is not None:
-            _tell(f"{why}; kernels there are not loaded but compiled anew")
+            _print_line(f"{why}; kernels there are not loaded but compiled anew")
             return None
         return locator
 
@@ -119,7 +119,7 @@ def _why_not_believed(cache_path: str) -> str | None:
     return None
 
 
-def _tell(line: str) -> None:
+def _print_line(line: str) -> None:
     if line not in _printed:
         _printed.add(line)
         print(f"disco-hw: {line}", file=sys.stderr)

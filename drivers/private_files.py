@@ -10,7 +10,7 @@ from pathlib import Path
 
 from firmware_protocol.protection import parse_key
 
-_MAKE = "make one with `(umask 077; openssl rand -hex 16 > FILE)`"
+_CREATE_HINT = "make one with `(umask 077; openssl rand -hex 16 > FILE)`"
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
@@ -28,7 +28,7 @@ def key_of_file(path: Path, content: bytes, status: os.stat_result) -> bytes:
     try:
         return parse_key(content.decode("ascii"))
     except (ValueError, UnicodeDecodeError):
-        raise KeyFileError(f"{path}: is no key of 32 hexadecimal digits; {_MAKE}") from None
+        raise KeyFileError(f"{path}: is no key of 32 hexadecimal digits; {_CREATE_HINT}") from None
 
 
 def _check(path: Path, status: os.stat_result) -> None:

@@ -40,7 +40,7 @@ from drivers.samples import (
 
 __all__ = [
     "MAX_EXTENDED_ID",
-    "SAID_BY_WORDS",
+    "SOURCE_TEXTS",
     "CyclicFrame",
     "Driver",
     "DriverState",
@@ -52,6 +52,7 @@ __all__ = [
     "Limits",
     "LineQuestions",
     "LinkState",
+    "MessageSource",
     "MotorDriver",
     "MotorSample",
     "NoSettings",
@@ -66,7 +67,6 @@ __all__ = [
     "RobotStatus",
     "SafetyCard",
     "SaidBy",
-    "SaysWhy",
     "SettingsFault",
     "Transport",
     "TransportStats",
@@ -77,7 +77,7 @@ __all__ = [
 
 SaidBy = Literal["device", "fixed", "robot.toml"]
 """Who says something of a controller: itself, its documents of what cannot be set otherwise, or robot.toml alone."""
-SAID_BY_WORDS: Mapping[SaidBy, str] = MappingProxyType(
+SOURCE_TEXTS: Mapping[SaidBy, str] = MappingProxyType(
     {
         "device": "reported by the controller",
         "fixed": "which cannot be set otherwise",
@@ -98,11 +98,11 @@ class Identity:
     said_by: SaidBy
     details: str = ""
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """Return the whole identity as text, with who states it."""
         version = self.firmware and f"firmware {self.firmware}"
         known = ", ".join(text for text in (self.controller, version, self.details) if text)
-        return f"{known} ({SAID_BY_WORDS.get(self.said_by, self.said_by)})"
+        return f"{known} ({SOURCE_TEXTS.get(self.said_by, self.said_by)})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,10 +246,10 @@ class PoseSource(Protocol):
 
 
 @runtime_checkable
-class SaysWhy(Protocol):
+class MessageSource(Protocol):
     """A pose source that knows why its poses come or fail to come."""
 
-    def news(self) -> Sequence[str]:
+    def new_messages(self) -> Sequence[str]:
         """Sentences for the operator since the last call."""
 
 
@@ -280,7 +280,7 @@ class SettingsFault:
 
     field: str
     fault: str
-    remedy: str
+    hint: str
 
 
 class NoSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -336,4 +336,4 @@ class MotorDriver:
     latches_stop: bool = True
     takes_body_speeds: bool = False
     authenticates: bool = False
-    tells_reception: bool = False
+    reports_reception: bool = False

@@ -74,7 +74,7 @@ def declarations(header: str) -> str:
     return _WRAPPER.sub("", _COMMENT.sub("", header.replace("\\\n", " ")))
 
 
-def make_ffi() -> FFI:
+def create_ffi() -> FFI:
     """Return the extension's definition; paths are relative to the project's root, as setuptools wants them."""
     builder = FFI()
     for header in HEADERS:
@@ -92,7 +92,7 @@ def make_ffi() -> FFI:
     return builder
 
 
-ffi = make_ffi()
+ffi = create_ffi()
 
 if __name__ == "__main__":
     ffi.compile(tmpdir=str(PACKAGE.parent), verbose=True)

@@ -133,7 +133,7 @@ class FirmwareOutputs(msgspec.Struct, frozen=True, gc=False):
     watchdog_events: int
 
 
-def drawn_entropy() -> int:
+def random_entropy() -> int:
     """Return 64 bits from the system that are not all 0."""
     return 1 + secrets.randbelow(_ENTROPY_MASK)
 
@@ -222,8 +222,8 @@ class FirmwareCore:
         self._data = _ffi.buffer(self._frame.data)
         c_config = _ffi.new("disco_config_t *")
         _fill_config(c_config, config)
-        drawn = drawn_entropy() if entropy is None else entropy
-        _lib.disco_firmware_init(self._core, c_config, drawn & _ENTROPY_MASK, last_entropy & _ENTROPY_MASK)
+        random_bits = random_entropy() if entropy is None else entropy
+        _lib.disco_firmware_init(self._core, c_config, random_bits & _ENTROPY_MASK, last_entropy & _ENTROPY_MASK)
 
     def receive(self, now_us: int, can_id: int, data: bytes) -> None:
         """Take in one frame from the bus; anything may come."""

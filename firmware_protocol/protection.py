@@ -208,7 +208,7 @@ class Prover:
         self._freshness.setdefault(value, {})
         self._nonce = value
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Clear the nonce, because the robot may be another one."""
         self._nonce = None
 

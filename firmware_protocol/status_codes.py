@@ -91,7 +91,7 @@ class Fault:
 
     code: int
     name: str
-    remedy: str
+    hint: str
 
     @property
     def latches(self) -> bool:
@@ -113,7 +113,7 @@ class Fault:
     @property
     def advice(self) -> str:
         """Text on what to do, from the cause to the end of the fault."""
-        return f"{self.remedy}; {self.ending}"
+        return f"{self.hint}; {self.ending}"
 
 
 def _table() -> dict[str, Fault]:

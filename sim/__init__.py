@@ -60,7 +60,7 @@ class RobotLink(Protocol):
     def babble(self, frame: Frame) -> None:
         """Let a further, faulty node send `frame` once. Raises LinkFaultError if this link cannot."""
 
-    def tamper(self, fault: BusFault) -> None:
+    def set_bus_fault(self, fault: BusFault) -> None:
         """Let `fault` decide what becomes of each frame. Raises LinkFaultError if the link is not its own."""
 
     def summary(self) -> str:

@@ -37,7 +37,7 @@ TRUTH_STEPS = 10
 WARM_UP_STEPS = 200
 BOARD_S = 5.0
 NOT_OF_BOARDS = ("clock_jump", "brown_out", "reboot")
-MOST_STEPS_AT_ONCE = 200
+MAX_STEPS_PER_CALL = 200
 """After a pause the backlog is worked off in pieces of so many steps, so that signals and sockets are still served."""
 
 
@@ -165,7 +165,7 @@ class _Process:
         now_ns = time.monotonic_ns()
         link, robot = self.link, self.robot
         behind = (now_ns - self._start_ns) // STEP_NS - self._steps
-        due = min(behind, MOST_STEPS_AT_ONCE)
+        due = min(behind, MAX_STEPS_PER_CALL)
         waiting = link.collect(now_ns)
         for step in range(due):
             self._steps += 1
@@ -194,7 +194,7 @@ def _set_up(options: VirtualRobotOptions, records: list[TextRecord], resources: 
             _check_faults_of_board(options.faults)
         else:
             _check_faults(options.faults, options.kind, options.interface)
-    robot = _make_robot(options)
+    robot = _create_robot(options)
     if isinstance(robot, VendorRobot) and options.pose_address is not None:
         sender = PoseSender(options.pose_address)
         resources.callback(sender.close)
@@ -205,7 +205,7 @@ def _set_up(options: VirtualRobotOptions, records: list[TextRecord], resources: 
     link = _open_link(options, log)
     resources.callback(link.close)
     if isinstance(robot, BoardRobot):
-        _meet(robot, link, options)
+        _synchronise(robot, link, options)
     commands = None if options.inject is None else CommandSocket(options.inject)
     if commands is not None:
         resources.callback(commands.close)
@@ -248,7 +248,7 @@ def _check_faults_of_board(schedule: FaultSchedule) -> None:
             )
 
 
-def _meet(robot: BoardRobot, link: RobotLink, options: VirtualRobotOptions) -> None:
+def _synchronise(robot: BoardRobot, link: RobotLink, options: VirtualRobotOptions) -> None:
     """Wait until the board has said what it is."""
     deadline = time.monotonic() + BOARD_S
     while robot.about is None:
@@ -275,7 +275,7 @@ def _meet(robot: BoardRobot, link: RobotLink, options: VirtualRobotOptions) -> N
         )
 
 
-def _make_robot(options: VirtualRobotOptions) -> Robot:
+def _create_robot(options: VirtualRobotOptions) -> Robot:
     plant = Plant(options.plant, hidden_effects(options.effects), options.seed, options.start)
     if options.board is not None:
         return BoardRobot(plant)
@@ -289,7 +289,7 @@ def _make_robot(options: VirtualRobotOptions) -> Robot:
 
 def _rehearse(options: VirtualRobotOptions) -> None:
     """Load or compile the machine code, which must not happen while a host waits; see that the firmware starts."""
-    robot = _make_robot(options)
+    robot = _create_robot(options)
     for step in range(1, WARM_UP_STEPS + 1):
         robot.step(step * STEP_US)
     if options.controller is None and robot.outputs.state == "FAULT":

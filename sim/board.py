@@ -54,7 +54,7 @@ class BoardRobot:
         self._setpoints = (0.0, 0.0)
         self._state = (0, 0, 0, 0)
         self._session = 0
-        self._heard_us = -SILENT_US
+        self._received_us = -SILENT_US
         self._steps = 0
         codec = Codec()
         self._state_names = tuple(codec.choice_name("SYSTEM_STATE", "state", value) for value in range(256))
@@ -67,7 +67,7 @@ class BoardRobot:
     @property
     def silent(self) -> bool:
         """Whether the board has not been heard for so long that its wheels are braked."""
-        return self.now_us - self._heard_us >= SILENT_US
+        return self.now_us - self._received_us >= SILENT_US
 
     @property
     def outputs(self) -> FirmwareOutputs:
@@ -92,7 +92,7 @@ class BoardRobot:
         if frame.can_id == SETPOINTS:
             left, right = struct.unpack("<ff", frame.data)
             self._setpoints = (left, right) if math.isfinite(left) and math.isfinite(right) else (0.0, 0.0)
-            self._heard_us = now_us
+            self._received_us = now_us
         elif frame.can_id == STATE:
             self._state = struct.unpack("<BBHI", frame.data)
         elif frame.can_id == ABOUT:
@@ -101,14 +101,14 @@ class BoardRobot:
 
     def step(self, now_us: int, error_counters: tuple[int, int] = (0, 0)) -> Sequence[Frame]:
         """Move on to robot time `now_us`; return what the board's sensors say then."""
-        plant, faults, wanted = self.plant, self.faults, self.outputs
-        asked = (wanted.left_setpoint_rad_s, wanted.right_setpoint_rad_s)
-        turned = asked if faults is None else faults.setpoints(*asked, is_driven=wanted.driver_enabled)
-        poses: Sequence[PoseMeasurement] = plant.step(now_us, *turned, wanted.driver_enabled, wanted.brake)
+        plant, faults, outputs = self.plant, self.faults, self.outputs
+        setpoints = (outputs.left_setpoint_rad_s, outputs.right_setpoint_rad_s)
+        turned = setpoints if faults is None else faults.setpoints(*setpoints, is_driven=outputs.driver_enabled)
+        poses: Sequence[PoseMeasurement] = plant.step(now_us, *turned, outputs.driver_enabled, outputs.brake)
         inputs = self._inputs()
         if faults is not None:
             poses = faults.poses(now_us, poses)
-            inputs = faults.inputs(inputs, asked, wanted.driver_enabled)
+            inputs = faults.inputs(inputs, setpoints, outputs.driver_enabled)
         frames = [_wheels(inputs)] if self._steps % WHEELS_STEPS == 0 else []
         if self._steps % POWER_STEPS == 0:
             frames.append(_power(inputs))
@@ -183,7 +183,7 @@ class PlantLine:
         self._waiting: deque[Frame] = deque()
         self._unsent = b""
         self._retry_ns: int | None = None
-        self._heard_ns: int | None = None
+        self._received_ns: int | None = None
         self.frames_in = 0
         self.frames_out = 0
         self.send_failures = 0
@@ -219,7 +219,7 @@ class PlantLine:
             self._lose(error, now_ns)
         frames = [Frame(can_id, data) for can_id, data in self._decoder.feed(received)]
         self.frames_in += len(frames)
-        self._mind_silence(now_ns, heard=bool(frames))
+        self._monitor_silence(now_ns, received=bool(frames))
         self._waiting += frames
         return len(self._waiting)
 
@@ -238,14 +238,14 @@ class PlantLine:
             return
         try:
             # pyserial's own write would wait here for ever: it tries again at once as long as there is no room.
-            taken = os.write(self._port.fileno(), data)
+            written = os.write(self._port.fileno(), data)
         except BlockingIOError:
-            taken = 0
+            written = 0
         except (OSError, serial.SerialException) as error:
             self._lose(error, time.monotonic_ns())
             return
         self.frames_out += len(frames)
-        self._unsent = data[taken:]
+        self._unsent = data[written:]
 
     def unplug(self, until_ns: int) -> None:
         """Leave the line until then."""
@@ -260,7 +260,7 @@ class PlantLine:
         """Raise LinkFaultError, because faults of frames are not possible on the board's own link."""
         raise LinkFaultError("babble: the board's own link is not the simulator's")
 
-    def tamper(self, fault: BusFault) -> None:
+    def set_bus_fault(self, fault: BusFault) -> None:
         """Do nothing, because faults of frames are those of the board's own link, and `sim.app` refuses them."""
 
     def summary(self) -> str:
@@ -288,14 +288,14 @@ class PlantLine:
         except (OSError, serial.SerialException):
             self._retry_ns = now_ns + RETRY_NS
 
-    def _mind_silence(self, now_ns: int, *, heard: bool) -> None:
-        if heard:
-            if self._heard_ns is None and self.frames_in > 1:
+    def _monitor_silence(self, now_ns: int, *, received: bool) -> None:
+        if received:
+            if self._received_ns is None and self.frames_in > 1:
                 print(f"{self.address}: heard", file=sys.stderr, flush=True)
-            self._heard_ns = now_ns
-        elif self._heard_ns is not None and now_ns - self._heard_ns > SILENCE_NS:
+            self._received_ns = now_ns
+        elif self._received_ns is not None and now_ns - self._received_ns > SILENCE_NS:
             print(f"{self.address}: says nothing; the wheels brake", file=sys.stderr, flush=True)
-            self._heard_ns = None
+            self._received_ns = None
 
     def _lose(self, error: Exception, now_ns: int) -> None:
         self.errors += 1

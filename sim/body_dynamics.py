@@ -189,9 +189,9 @@ def _parameter_record(p: PlantParameters, effects: HiddenEffects) -> npt.NDArray
 
 
 @compiled
-def _kept(lost: float) -> float:
+def _kept(loss: float) -> float:
     """Return the share of a yaw rate that slip leaves."""
-    return min(max(1.0 - lost, LEAST_TURN_LEFT), 1.0 / LEAST_TURN_LEFT)
+    return min(max(1.0 - loss, LEAST_TURN_LEFT), 1.0 / LEAST_TURN_LEFT)
 
 
 @compiled

@@ -37,7 +37,7 @@ _LOG_CHANNEL = "can0"
 
 
 @dataclass(frozen=True, slots=True)
-class FrameFate:
+class FrameOutcome:
     """Effect of a fault on one transmission; the default is none.
 
     `wire_error_bit` inverts that bit of the stuffed frame: an error frame follows, and the sender tries again. All
@@ -55,14 +55,14 @@ class FrameFate:
     cut: bool = False
 
 
-UNHARMED = FrameFate()
+UNHARMED = FrameOutcome()
 """Nothing happens to it: the one that is carried fastest."""
 
 
 class BusFault(Protocol):
     """Decides the fate of each transmission, retransmissions included."""
 
-    def fate(self, now_ns: int, sender: str, frame: CanFrame) -> FrameFate:
+    def outcome(self, now_ns: int, sender: str, frame: CanFrame) -> FrameOutcome:
         """Return what happens to `frame`; called once when it starts on the wire."""
 
 
@@ -79,7 +79,7 @@ class _Transmission(msgspec.Struct, frozen=True, gc=False):
     end_ns: int
     senders: list[BusNode]
     frame: CanFrame
-    fate: FrameFate
+    outcome: FrameOutcome
     intact: bool
     acknowledged: bool
 
@@ -255,12 +255,12 @@ class CanBus:
                     node.arbitrations_lost += 1
         frames = [node.start() for node in senders]
         frame = frames[0]
-        fate = UNHARMED if self.fault is None else self.fault.fate(now_ns, senders[0].name, frame)
+        outcome = UNHARMED if self.fault is None else self.fault.outcome(now_ns, senders[0].name, frame)
         bits = frame_bits(frame)
         after_error_flag = ERROR_DELIMITER_BITS + INTERFRAME_BITS
         error_bit = _first_difference(frames) if len(frames) > 1 else None
         if error_bit is None:
-            error_bit = fate.wire_error_bit
+            error_bit = outcome.wire_error_bit
         if error_bit is not None:
             error_bit = min(max(error_bit, 0), bits - INTERFRAME_BITS - 1)
             # The flag breaks the stuffing rule for the others, who answer with a flag of their own.
@@ -274,7 +274,7 @@ class CanBus:
         if self._recovering:
             self._count_idle(now_ns)
         end_ns = now_ns + self._bits_ns(bits - INTERFRAME_BITS)
-        self._on_wire = _Transmission(end_ns, senders, frame, fate, error_bit is None and acknowledged, acknowledged)
+        self._on_wire = _Transmission(end_ns, senders, frame, outcome, error_bit is None and acknowledged, acknowledged)
         self.busy_ns += self._bits_ns(bits)
 
     def _end(self, transmission: _Transmission) -> None:
@@ -302,29 +302,31 @@ class CanBus:
             self._log(candump_line(end_ns, _LOG_CHANNEL, transmission.frame if intact else protocol_error_frame()))
         if intact:
             receivers.extend([node for node in senders if node.echo])
-            self._deliver(DeliveredFrame(end_ns, senders[0], transmission.frame, tuple(receivers)), transmission.fate)
+            self._deliver(
+                DeliveredFrame(end_ns, senders[0], transmission.frame, tuple(receivers)), transmission.outcome
+            )
 
     def _listeners(self, senders: Sequence[BusNode]) -> list[BusNode]:
         """Return the nodes that receive what these nodes send, without the senders."""
         return [node for node in self._nodes if node.state is not _BUS_OFF and node not in senders]
 
-    def _deliver(self, delivery: DeliveredFrame, fate: FrameFate) -> None:
+    def _deliver(self, delivery: DeliveredFrame, outcome: FrameOutcome) -> None:
         receivers = delivery.receivers
-        if fate is UNHARMED:
+        if outcome is UNHARMED:
             for node in receivers:
                 node.received += 1
             if receivers:
                 self._out.append(delivery)
             return
         frame = delivery.frame
-        if fate.data is not None:
-            frame = replace(frame, data=fate.data)
-        receivers = () if fate.lost else tuple(node for node in receivers if node.name not in fate.lost_at)
-        delivery = DeliveredFrame(delivery.t_ns + fate.delay_ns, delivery.sender, frame, receivers)
+        if outcome.data is not None:
+            frame = replace(frame, data=outcome.data)
+        receivers = () if outcome.lost else tuple(node for node in receivers if node.name not in outcome.lost_at)
+        delivery = DeliveredFrame(delivery.t_ns + outcome.delay_ns, delivery.sender, frame, receivers)
         for node in receivers:
-            node.received += fate.copies
-        for _ in range(fate.copies if receivers else 0):
-            if fate.delay_ns > 0:
+            node.received += outcome.copies
+        for _ in range(outcome.copies if receivers else 0):
+            if outcome.delay_ns > 0:
                 self._sequence += 1
                 heapq.heappush(self._delayed, (delivery.t_ns, self._sequence, delivery))
             else:

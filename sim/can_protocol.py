@@ -119,7 +119,7 @@ def receive_overflow_frame() -> CanFrame:
     return CanFrame(0x004, bytes((0, 0x01, 0, 0, 0, 0, 0, 0)), error=True)
 
 
-def _make_crc_table() -> tuple[int, ...]:
+def _crc_table() -> tuple[int, ...]:
     """Build the table that advances the CRC-15 of CAN by one byte."""
     table = []
     for byte in range(256):
@@ -130,7 +130,7 @@ def _make_crc_table() -> tuple[int, ...]:
     return tuple(table)
 
 
-def _make_stuffing_table(bits: int) -> tuple[int, ...]:
+def _stuffing_table(bits: int) -> tuple[int, ...]:
     """Build the lookup table that advances bit stuffing by `bits` bits.
 
     Entry [state << bits | value] is next state << 8 | stuff bits inserted. A state is the last bit << 2 | the length of
@@ -150,13 +150,13 @@ def _make_stuffing_table(bits: int) -> tuple[int, ...]:
     return tuple(table)
 
 
-_CRC_TABLE = _make_crc_table()
+_CRC_TABLE = _crc_table()
 
 
-_STUFFING_8 = _make_stuffing_table(8)
+_STUFFING_8 = _stuffing_table(8)
 
 
-_STUFFING_7 = _make_stuffing_table(7)
+_STUFFING_7 = _stuffing_table(7)
 
 
 def _head(can_id: int, extended: bool, remote: bool, length: int) -> tuple[int, int]:

@@ -337,7 +337,7 @@ def effects_table() -> str:
                 continue
             lines.append(f"  {_signature(spec)}")
             lines.append(f"      {spec.meaning}")
-            lines.extend(f"      {_in_words(value)}" for value in spec.values)
+            lines.extend(f"      {_describe(value)}" for value in spec.values)
     return "\n".join(lines)
 
 
@@ -381,7 +381,7 @@ def _signature(spec: EffectSpec) -> str:
     return text
 
 
-def _in_words(value: EffectValue) -> str:
+def _describe(value: EffectValue) -> str:
     low, high = value.realistic
     default = "" if value.default is None else f"; {value.default:g} if left out"
     return f"{value.name}: {value.unit}, realistic {low:g} to {high:g}{default}"

@@ -39,30 +39,30 @@ class EncoderLoop:
     _denied_rad: list[float] = field(default_factory=lambda: [0.0, 0.0])
 
     def see(
-        self, wanted_rad_s: Sequence[float], true: FirmwareInputs, reported: FirmwareInputs, dt_s: float,
+        self, setpoints_rad_s: Sequence[float], true: FirmwareInputs, reported: FirmwareInputs, dt_s: float,
         regulates: bool,
     ) -> None:  # fmt: skip
         """Take in what was wanted, what the encoders saw, and what the controller was told of it."""
         seen = (true.left_speed_rad_s, true.right_speed_rad_s)
-        told = (reported.left_speed_rad_s, reported.right_speed_rad_s)
+        measured = (reported.left_speed_rad_s, reported.right_speed_rad_s)
         for side in (0, 1):
-            denied = seen[side] - told[side]
+            denied = seen[side] - measured[side]
             # A field whose angle was lost finds it again only when it is aligned anew.
             self._denied_rad[side] = self._denied_rad[side] + denied * dt_s if regulates else 0.0
             if not regulates or denied == 0.0:
                 # A loop that is let go, or that sees its motor again, forgets.
                 self._error_rad_s[side] = self._error_rad[side] = 0.0
                 continue
-            self._error_rad_s[side] = wanted_rad_s[side] - told[side]
+            self._error_rad_s[side] = setpoints_rad_s[side] - measured[side]
             self._error_rad[side] += self._error_rad_s[side] * dt_s
 
-    def drive(self, wanted_rad_s: Sequence[float]) -> tuple[float, float]:
+    def drive(self, setpoints_rad_s: Sequence[float]) -> tuple[float, float]:
         """Return the speeds that the motors are driven at while the loop holds the wanted ones."""
-        left, right = (self._drive(side, wanted) for side, wanted in enumerate(wanted_rad_s))
+        left, right = (self._drive(side, setpoint) for side, setpoint in enumerate(setpoints_rad_s))
         return left, right
 
-    def _drive(self, side: int, wanted: float) -> float:
+    def _drive(self, side: int, setpoint: float) -> float:
         if self.use is EncoderUse.COMMUTATION:
-            return 0.0 if abs(self._denied_rad[side]) > LOCKED_RAD else wanted
-        driven = wanted + PROPORTIONAL * self._error_rad_s[side] + INTEGRAL_PER_S * self._error_rad[side]
-        return math.copysign(min(abs(driven), max(self.full_rad_s, abs(wanted))), driven)
+            return 0.0 if abs(self._denied_rad[side]) > LOCKED_RAD else setpoint
+        driven = setpoint + PROPORTIONAL * self._error_rad_s[side] + INTEGRAL_PER_S * self._error_rad[side]
+        return math.copysign(min(abs(driven), max(self.full_rad_s, abs(setpoint))), driven)

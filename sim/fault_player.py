@@ -102,7 +102,7 @@ class FaultPlayer:
         self._sensors = RobotFaults()
         self._unplug_until_ns = 0
         robot.faults = self._sensors
-        link.tamper(self.frames)
+        link.set_bus_fault(self.frames)
 
     def step(self, now_ns: int) -> tuple[tuple[ScheduledFault, ...], tuple[ScheduledFault, ...]]:
         """Do what is due at `now_ns`; return the faults that have begun and ended."""

@@ -352,7 +352,7 @@ class HubLink:
         """Send `frame` from a third node; if its queue is full it is on the bus as often as the bus allows."""
         self._robot.babble(frame)
 
-    def tamper(self, fault: BusFault) -> None:
+    def set_bus_fault(self, fault: BusFault) -> None:
         """Let `fault` decide what becomes of each frame."""
         self.hub.bus.fault = fault
 

@@ -78,7 +78,7 @@ class SimulatedCan:
         """Send `frame` from a third node."""
         self.robot.babble(frame)
 
-    def tamper(self, fault: BusFault) -> None:
+    def set_bus_fault(self, fault: BusFault) -> None:
         """Let `fault` decide what becomes of each frame."""
         self.bus.fault = fault
 

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from firmware_protocol.firmware_core import FirmwareInputs
 from sim import ROBOT_NODE
-from sim.bus import UNHARMED, FrameFate
+from sim.bus import UNHARMED, FrameOutcome
 from sim.can_protocol import CanFrame
 from sim.fault_schedule import ScheduledFault, Site
 from sim.sensors import PoseMeasurement
@@ -49,11 +49,11 @@ class FrameFaults:
         """Take those of `active` that concern frames as the faults in force."""
         self._active = tuple(f for f in active if f.kind.site is Site.FRAMES or f.kind.name == "one_way")
 
-    def fate(self, now_ns: int, sender: str, frame: CanFrame) -> FrameFate:
+    def outcome(self, now_ns: int, sender: str, frame: CanFrame) -> FrameOutcome:
         """Return what happens to one frame; frames of the node "robot" go to the host, all others to the robot."""
         if self.break_next:
             self.break_next, self.broken = False, True
-            return FrameFate(wire_error_bit=LONGEST_FRAME_BITS // 2, cut=True)
+            return FrameOutcome(wire_error_bit=LONGEST_FRAME_BITS // 2, cut=True)
         for fault in self._active:
             to = "host" if sender == ROBOT_NODE else "robot"
             if fault["to"] not in (to, "both"):
@@ -61,33 +61,33 @@ class FrameFaults:
             if fault.kind.site is Site.FRAMES and not self._picks(fault, frame):
                 continue
             self.struck[fault.number] = self.struck.get(fault.number, 0) + 1
-            return self._fate(now_ns, fault, to, frame)
+            return self._outcome(now_ns, fault, to, frame)
         return UNHARMED
 
     def _picks(self, fault: ScheduledFault, frame: CanFrame) -> bool:
         return fault["id"] in (-1, frame.can_id) and self._chance.random() < fault["probability"]
 
-    def _fate(self, now_ns: int, fault: ScheduledFault, to: str, frame: CanFrame) -> FrameFate:
+    def _outcome(self, now_ns: int, fault: ScheduledFault, to: str, frame: CanFrame) -> FrameOutcome:
         chance = self._chance
         match fault.kind.name:
             case "drop" | "one_way":
-                return FrameFate(lost=True) if to == "host" else FrameFate(lost_at=(ROBOT_NODE,))
+                return FrameOutcome(lost=True) if to == "host" else FrameOutcome(lost_at=(ROBOT_NODE,))
             case "duplicate":
-                return FrameFate(copies=2)
+                return FrameOutcome(copies=2)
             case "delay":
                 lasted_ns = now_ns - self._since_ns.setdefault(fault.number, now_ns)
-                return FrameFate(delay_ns=round(fault["delay_s"] * 1e9 + fault["growth"] * lasted_ns))
+                return FrameOutcome(delay_ns=round(fault["delay_s"] * 1e9 + fault["growth"] * lasted_ns))
             case "reorder":
-                return FrameFate(delay_ns=round(chance.random() * fault["window_s"] * 1e9))
+                return FrameOutcome(delay_ns=round(chance.random() * fault["window_s"] * 1e9))
             case "flip_before_crc":
-                return FrameFate(wire_error_bit=chance.randrange(LONGEST_FRAME_BITS))
+                return FrameOutcome(wire_error_bit=chance.randrange(LONGEST_FRAME_BITS))
             case "flip_after_crc" if frame.data:
                 data = bytearray(frame.data)
                 data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
-                return FrameFate(data=bytes(data))
+                return FrameOutcome(data=bytes(data))
             case "wrong_length":
                 length = chance.choice([n for n in range(9) if n != len(frame.data)])
-                return FrameFate(data=frame.data[:length] + bytes(max(0, length - len(frame.data))))
+                return FrameOutcome(data=frame.data[:length] + bytes(max(0, length - len(frame.data))))
         return UNHARMED
 
 
@@ -127,7 +127,7 @@ class RobotFaults:
         self._jumps: list[ScheduledFault] = []
         self._late: deque[tuple[int, PoseMeasurement]] = deque()
         self._last_pose: PoseMeasurement | None = None
-        self._sort_out()
+        self._classify()
 
     def set_active(self, active: Sequence[ScheduledFault], begun: Sequence[ScheduledFault] = ()) -> None:
         """Take what concerns the robot out of `active`; of `begun`, what happens once."""
@@ -135,7 +135,7 @@ class RobotFaults:
         self._jumps += [fault for fault in begun if fault.kind.name == "encoder_jump"]
         self._changed = True
         self._touched = self._touched or any(f.kind.name.startswith("encoder") for f in (*self.active, *begun))
-        self._sort_out()
+        self._classify()
 
     def setpoints(self, left_rad_s: float, right_rad_s: float, *, is_driven: bool) -> tuple[float, float]:
         """Return what the motors make of the setpoints (rad/s); one runs away only while its controller drives it."""
@@ -219,7 +219,7 @@ class RobotFaults:
                     return replace(pose, x_m=math.nan, yaw_rad=math.nan)
         return pose
 
-    def _sort_out(self) -> None:
+    def _classify(self) -> None:
         """Look up, once for all cycles, what each cycle needs of the active faults."""
         self._by_wheel = {
             kind: {fault["wheel"]: fault for fault in self.active if fault.kind.name == kind} for kind in _OF_ONE_WHEEL

@@ -72,7 +72,7 @@ class Plant:
         self._step_us = self.parameters.integration_step_us
         self._delay_us = round(self.effects.values("command_delay")[0] * 1e6)
         self._now_us = 0
-        self._asked = (0.0, 0.0)
+        self._commanded = (0.0, 0.0)
         self._in_force = (0.0, 0.0)
         self._delayed: deque[tuple[int, tuple[float, float]]] = deque()
         self._poses: list[PoseMeasurement] = []
@@ -130,7 +130,7 @@ class Plant:
         """
         if until_us < self._now_us:
             raise ValueError(f"plant time is {self._now_us} us and cannot go back to {until_us} us")
-        self._ask((left_setpoint_rad_s, right_setpoint_rad_s))
+        self._set_command((left_setpoint_rad_s, right_setpoint_rad_s))
         while self._now_us < until_us:
             self._advance(self._apply_due(until_us), enabled, brake)
         if not self._poses:
@@ -143,9 +143,9 @@ class Plant:
         """Carry the robot off: a step in the world frame and a turn about the tracked point, wheels untouched."""
         self._body.displace(dx_m, dy_m, dyaw_rad)
 
-    def _ask(self, setpoints: tuple[float, float]) -> None:
-        if setpoints != self._asked:
-            self._asked = setpoints
+    def _set_command(self, setpoints: tuple[float, float]) -> None:
+        if setpoints != self._commanded:
+            self._commanded = setpoints
             self._delayed.append((self._now_us + self._delay_us, setpoints))
 
     def _apply_due(self, until_us: int) -> int:

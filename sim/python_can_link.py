@@ -117,7 +117,7 @@ class PythonCanLink:
         """Send `frame` as if it came from another node."""
         self.send((frame,))
 
-    def tamper(self, fault: BusFault) -> None:
+    def set_bus_fault(self, fault: BusFault) -> None:
         """Raise LinkFaultError, because the frames of a foreign bus cannot be changed."""
         raise LinkFaultError("faults: only on the simulator's own bus (interface unixcan) or a serial line")
 
@@ -172,20 +172,20 @@ class JoinError(Exception):
     """Exception for a bus that cannot be joined; the message is one line for the user."""
 
 
-def joined(words: Sequence[str], now_ns: int, bitrate: int) -> PythonCanLink:
+def joined(given: Sequence[str], now_ns: int, bitrate: int) -> PythonCanLink:
     """Open the bus of `[interface, channel, "key=JSON", ...]`. Raises JoinError."""
-    interface, *rest = words
+    interface, *rest = given
     channel, options = rest[0] if rest else "", {}
-    for word in rest[1:]:
-        key, _, value = word.partition("=")
+    for option in rest[1:]:
+        key, _, value = option.partition("=")
         try:
             options[key] = json.loads(value)
         except json.JSONDecodeError:
-            raise JoinError(f'--join: {word}: write KEY=JSON, such as sleep_after_open=0 or name="text"') from None
+            raise JoinError(f'--join: {option}: write KEY=JSON, such as sleep_after_open=0 or name="text"') from None
     try:
         return PythonCanLink(interface, channel, now_ns, bitrate=bitrate, **options)
     except (can.CanError, OSError, ValueError, NotImplementedError, TypeError) as error:
-        raise JoinError(f"--join {' '.join(words)}: cannot be opened ({error}); check interface and channel") from None
+        raise JoinError(f"--join {' '.join(given)}: cannot be opened ({error}); check interface and channel") from None
 
 
 class Guest:

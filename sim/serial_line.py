@@ -21,7 +21,7 @@ from pathlib import Path
 from drivers.types import Frame, ReceivedFrame
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 from sim import ROBOT_NODE, LinkFaultError
-from sim.bus import UNHARMED, BusFault, FrameFate
+from sim.bus import UNHARMED, BusFault, FrameOutcome
 from sim.can_protocol import CanFrame, candump_line
 
 BITS_PER_BYTE = 10
@@ -138,15 +138,15 @@ class SerialLine:
         """Let frames pass in both directions up to `now_ns`."""
         for _ in range(len(self._waiting) if admit is None else admit):
             frame, size = self._waiting.popleft()
-            fate = self._fate("host", frame)
-            if fate.wire_error_bit is not None:
+            outcome = self._outcome("host", frame)
+            if outcome.wire_error_bit is not None:
                 self.stats.garbled_bytes += 1
                 continue
-            if fate.data is not None:
-                frame = Frame(frame.can_id, fate.data)
-            for _ in range(0 if fate.lost or ROBOT_NODE in fate.lost_at else fate.copies):
+            if outcome.data is not None:
+                frame = Frame(frame.can_id, outcome.data)
+            for _ in range(0 if outcome.lost or ROBOT_NODE in outcome.lost_at else outcome.copies):
                 begin_ns = max(now_ns, self._to_robot[-1].t_ns) if self._to_robot else now_ns
-                self._to_robot.append(ReceivedFrame(begin_ns + fate.delay_ns + size * self._byte_ns, frame))
+                self._to_robot.append(ReceivedFrame(begin_ns + outcome.delay_ns + size * self._byte_ns, frame))
         self._now_ns = now_ns
         while self._to_host and self._to_host[0][0] <= now_ns:
             end_ns, encoded, frame = self._to_host.popleft()
@@ -163,12 +163,12 @@ class SerialLine:
         if not self._connected:
             return
         for frame in frames:
-            fate = self._fate(ROBOT_NODE, frame)
-            data = frame.data if fate.data is None else fate.data
-            encoded = _damaged(self._encoded(frame.can_id, data), fate)
-            for _ in range(0 if fate.lost else fate.copies):
+            outcome = self._outcome(ROBOT_NODE, frame)
+            data = frame.data if outcome.data is None else outcome.data
+            encoded = _damaged(self._encoded(frame.can_id, data), outcome)
+            for _ in range(0 if outcome.lost else outcome.copies):
                 begin_ns = max(self._now_ns, self._to_host[-1][0]) if self._to_host else self._now_ns
-                self._to_host.append((begin_ns + fate.delay_ns + len(encoded) * self._byte_ns, encoded, frame))
+                self._to_host.append((begin_ns + outcome.delay_ns + len(encoded) * self._byte_ns, encoded, frame))
             self.stats.frames_out += 1
 
     def unplug(self, until_ns: int) -> None:
@@ -190,7 +190,7 @@ class SerialLine:
         """Nobody else is on a serial line."""
         raise LinkFaultError(f"babble {frame.can_id:#x}: a serial line has two ends only")
 
-    def tamper(self, fault: BusFault) -> None:
+    def set_bus_fault(self, fault: BusFault) -> None:
         """Let `fault` decide what becomes of each frame; a delayed one holds up those behind it."""
         self._fault = fault
 
@@ -206,10 +206,10 @@ class SerialLine:
         if self._log is not None:
             self._log(candump_line(t_ns, "serial", CanFrame(frame.can_id, frame.data)))
 
-    def _fate(self, sender: str, frame: Frame) -> FrameFate:
+    def _outcome(self, sender: str, frame: Frame) -> FrameOutcome:
         if self._fault is None:
             return UNHARMED
-        return self._fault.fate(self._now_ns, sender, CanFrame(frame.can_id, frame.data))
+        return self._fault.outcome(self._now_ns, sender, CanFrame(frame.can_id, frame.data))
 
     def _plug_in(self) -> None:
         self._plug_in_ns = None
@@ -223,7 +223,7 @@ class SerialLine:
         self._poll = select.poll()
         self._poll.register(self._master, select.POLLIN)
         if self._path is not None:
-            self._make_link(self._path)
+            self._create_link(self._path)
 
     def _set_connected(self, connected: bool) -> None:
         self._connected = connected
@@ -273,7 +273,7 @@ class SerialLine:
     def _garbled(self, data: bytes) -> bytes:
         return bytes(self._noise.randrange(256) for _ in data)
 
-    def _make_link(self, path: Path) -> None:
+    def _create_link(self, path: Path) -> None:
         if path.is_symlink():
             if not os.readlink(path).startswith("/dev/pts/"):
                 raise SerialPathError(f"{path}: links to something else; remove it or choose another path")
@@ -291,12 +291,12 @@ class SerialLine:
             self._path.unlink()
 
 
-def _damaged(encoded: bytes, fate: FrameFate) -> bytes:
+def _damaged(encoded: bytes, outcome: FrameOutcome) -> bytes:
     """Return the bytes of an encoded frame that reach the other end: all, one bit turned, or its beginning."""
-    if fate.wire_error_bit is None:
+    if outcome.wire_error_bit is None:
         return encoded
-    place = fate.wire_error_bit % (8 * len(encoded))
-    if fate.cut:
+    place = outcome.wire_error_bit % (8 * len(encoded))
+    if outcome.cut:
         return encoded[: place // 8]
     damaged = bytearray(encoded)
     damaged[place // 8] ^= 1 << place % 8

@@ -20,7 +20,7 @@ from firmware_protocol.firmware_core import (
     FirmwareInputs,
     FirmwareOutputs,
     ResetCause,
-    drawn_entropy,
+    random_entropy,
 )
 from sim.body_dynamics import BodyPose
 from sim.can_protocol import CanFrame
@@ -115,7 +115,7 @@ class Controller(Protocol):
     def regulates(self) -> bool:
         """Whether its speed loops run; without them a motor has a fixed duty, is released or braked."""
 
-    def make_loop(self) -> EncoderLoop:
+    def create_loop(self) -> EncoderLoop:
         """Return the motor loops at rest, as they are with an encoder that reports wrongly."""
 
     @property
@@ -155,7 +155,7 @@ class VendorRobot:
         self.faults: RobotFaults | None = None
         self.pose_sink = pose_sink
         self._coasting = [0.0, 0.0]
-        self._loop = controller.make_loop()
+        self._loop = controller.create_loop()
         self._replies: list[CanFrame] = []
 
     @property
@@ -185,12 +185,12 @@ class VendorRobot:
     def step(self, now_us: int, error_counters: tuple[int, int] = (0, 0)) -> Sequence[Frame]:
         """Move on to robot time `now_us` and run one cycle; return the frames that the controller sends, in order."""
         plant, faults = self.plant, self.faults
-        wanted, regulates = self.controller.wheels_rad_s, self.controller.regulates
-        asked = self._setpoints(wanted)
-        turned = self._loop.drive(asked) if regulates else asked
+        wheels, regulates = self.controller.wheels_rad_s, self.controller.regulates
+        setpoints = self._setpoints(wheels)
+        turned = self._loop.drive(setpoints) if regulates else setpoints
         if faults is not None:
             turned = faults.setpoints(*turned, is_driven=regulates)
-        enabled = wanted != (None, None)
+        enabled = wheels != (None, None)
         dt_s = 1e-6 * (now_us - plant.now_us)
         poses: Sequence[PoseMeasurement] = plant.step(now_us, *turned, enabled, self.controller.brakes)
         if faults is not None:
@@ -200,8 +200,8 @@ class VendorRobot:
                 self.pose_sink(pose, now_us)
         inputs = sensor_inputs(plant, self.estop_button, error_counters, ResetCause.POWER_ON)
         if faults is not None:
-            true, inputs = inputs, faults.inputs(inputs, asked, enabled)
-            self._loop.see(asked, true, inputs, dt_s, regulates)
+            true, inputs = inputs, faults.inputs(inputs, setpoints, enabled)
+            self._loop.see(setpoints, true, inputs, dt_s, regulates)
         frames, self._replies = [*self._replies, *self.controller.step(now_us, inputs)], []
         return [Frame(frame.can_id, frame.data, frame.extended) for frame in frames]
 
@@ -216,12 +216,12 @@ class VendorRobot:
         """Restart the controllers, which lose their state; the wheels roll until the next command."""
         self.controller.restart()
 
-    def _setpoints(self, wanted: tuple[float | None, float | None]) -> tuple[float, float]:
+    def _setpoints(self, wheels: tuple[float | None, float | None]) -> tuple[float, float]:
         """Return the plant's setpoints (rad/s); a released side beside a driven one keeps its own speed."""
         truth = self.plant.truth
         given = []
         for side, (speed, own) in enumerate(
-            zip(wanted, (truth.left_speed_rad_s, truth.right_speed_rad_s), strict=True)
+            zip(wheels, (truth.left_speed_rad_s, truth.right_speed_rad_s), strict=True)
         ):
             if speed is not None:
                 self._coasting[side] = own
@@ -335,9 +335,9 @@ class VirtualRobot:
         """
         plant = self.plant
         outputs, faults = self._outputs, self.faults
-        asked = turned = (outputs.left_setpoint_rad_s, outputs.right_setpoint_rad_s)
+        setpoints = turned = (outputs.left_setpoint_rad_s, outputs.right_setpoint_rad_s)
         if faults is not None:
-            turned = faults.setpoints(*asked, is_driven=outputs.driver_enabled)
+            turned = faults.setpoints(*setpoints, is_driven=outputs.driver_enabled)
         poses: Sequence[PoseMeasurement] = plant.step(now_us, *turned, outputs.driver_enabled, outputs.brake)
         if faults is not None:
             poses = faults.poses(now_us, poses)
@@ -350,7 +350,7 @@ class VirtualRobot:
             )
         inputs = sensor_inputs(plant, self.estop_button, error_counters, self._reset_cause)
         if faults is not None:
-            inputs = faults.inputs(inputs, asked, outputs.driver_enabled)
+            inputs = faults.inputs(inputs, setpoints, outputs.driver_enabled)
         self._outputs = self._firmware.step(self.device_us(now_us), inputs)
         return [Frame(can_id, data) for can_id, data in self._firmware.drain()]
 
@@ -374,7 +374,7 @@ class VirtualRobot:
 
     def _draw_entropy(self) -> int:
         if self._challenge_seed is None:
-            return drawn_entropy()
+            return random_entropy()
         self._challenge_seed += 1
         return self._challenge_seed
 

@@ -203,9 +203,9 @@ def _handled(p: Any, left: float, right: float, now_s: float) -> tuple[float, fl
         right -= p["droop"] * right * abs(right)
     if p["shared_supply"] != 0.0:
         loss = p["shared_supply"]
-        taken_left, taken_right = loss * abs(right), loss * abs(left)
-        left = math.copysign(max(abs(left) - taken_left, 0.0), left)
-        right = math.copysign(max(abs(right) - taken_right, 0.0), right)
+        loss_left, loss_right = loss * abs(right), loss * abs(left)
+        left = math.copysign(max(abs(left) - loss_left, 0.0), left)
+        right = math.copysign(max(abs(right) - loss_right, 0.0), right)
     supply = 1.0 - min(p["sag_per_s"] * now_s, LARGEST_SAG)
     return left * p["left_factor"] * supply, right * p["right_factor"] * supply
 
@@ -257,10 +257,10 @@ def _profile(p: Any, wheel: Any, reference: float, dt: float) -> float:
 def _track(p: Any, wheel: Any, acceleration: float, load: float, dt: float) -> None:
     """Move tracking error, integral and torque on by one piece."""
     speed = wheel["profile"] + wheel["error"]
-    asked = p["inertia"] * acceleration + p["viscous"] * wheel["profile"]
+    torque = p["inertia"] * acceleration + p["viscous"] * wheel["profile"]
     if speed != 0.0:
-        asked += math.copysign(p["dry"], speed)
-    demand = asked - p["gain"] * wheel["error"] + wheel["integral"]
+        torque += math.copysign(p["dry"], speed)
+    demand = torque - p["gain"] * wheel["error"] + wheel["integral"]
     limit = p["torque_limit"]
     if abs(demand) <= limit:
         wheel["torque"] = demand
@@ -272,7 +272,7 @@ def _track(p: Any, wheel: Any, acceleration: float, load: float, dt: float) -> N
         wheel["error"] = error
         return
     wheel["torque"] = math.copysign(limit, demand)
-    missing = wheel["torque"] - asked - load - p["viscous"] * wheel["error"]
+    missing = wheel["torque"] - torque - load - p["viscous"] * wheel["error"]
     wheel["error"] += dt * missing / p["inertia"]
 
 

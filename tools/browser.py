@@ -45,10 +45,10 @@ def opened(browser, url, width=800, height=540, scene=True):
     """
     page = browser.new_page(viewport={"width": width, "height": height})
     page.set_default_timeout(120_000)
-    page.said, broken = [], []
+    page.output_lines, broken = [], []
     page.on("pageerror", lambda error: broken.append(str(error)))
-    page.on("console", lambda message: page.said.append(message.text))
-    page.on("request", lambda request: page.said.append(f"request {request.url}"))
+    page.on("console", lambda message: page.output_lines.append(message.text))
+    page.on("request", lambda request: page.output_lines.append(f"request {request.url}"))
     if not scene:
         page.route("**/index.html*", lambda route: route.abort())
     page.goto(url)

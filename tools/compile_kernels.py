@@ -24,7 +24,7 @@ from disco_hw.inference.noise import USUAL
 from disco_hw.inference.simulate import Simulator
 from disco_hw.model import EffectSetting, Model
 from disco_hw.model.step import FreeRun
-from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.tasks import task_from
 from disco_hw.tasks.circle import CircleCost
@@ -48,7 +48,7 @@ def model_with_every_effect(values: Mapping[str, Mapping[str, float]], base: tup
 
 def plan_the_shipped_tasks() -> None:
     setup = load_setup(ROBOT)
-    make_planner(setup.config, setup.model)
+    create_planner(setup.config, setup.model)
     limits = CommandLimits.of_robot(setup.config.robot)
     for task in (task_from({"kind": "lemniscate"}).planned("default"), TimedPathCost(CORNER)):
         Disco(setup.model, task, DiscoSettings(), limits).warm_up()

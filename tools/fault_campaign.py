@@ -27,7 +27,7 @@ QUIET_AT_END_S = 5.0
 
 def run_seed(seed: int, duration_s: float, cycle_us: int, planner: str) -> dict[str, Any]:
     """Run one seed; return its figures as plain data."""
-    from disco_hw.runtime.assembly import make_planner  # noqa: PLC0415 - in the worker, after its niceness is set
+    from disco_hw.runtime.assembly import create_planner  # noqa: PLC0415 - in the worker, after its niceness is set
     from disco_hw.runtime.robot_setup import load_setup  # noqa: PLC0415
     from sim.fault_schedule import KINDS, random_schedule  # noqa: PLC0415
     from tools.fault_run import ROBOT_FILE, FaultRun  # noqa: PLC0415
@@ -37,7 +37,7 @@ def run_seed(seed: int, duration_s: float, cycle_us: int, planner: str) -> dict[
     disco = None
     if planner == "disco":
         setup = load_setup(ROBOT_FILE)
-        disco = make_planner(setup.config, setup.model)
+        disco = create_planner(setup.config, setup.model)
     run = FaultRun(schedule, seed=seed, cycle_us=cycle_us, planner=disco)
     run.run(0.1)
     began_s, began_cpu_s = time.perf_counter(), time.process_time()

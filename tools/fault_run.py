@@ -23,7 +23,7 @@ from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.model import Belief
 from disco_hw.runtime import State
-from disco_hw.runtime.assembly import assemble_core, make_pipeline
+from disco_hw.runtime.assembly import assemble_core, create_pipeline
 from disco_hw.runtime.core import CoreTick, DaemonCore
 from disco_hw.runtime.pipeline import Planner
 from disco_hw.runtime.robot_setup import load_setup
@@ -175,11 +175,11 @@ class LogReader:
         """Nothing is lost in memory."""
         return RecorderStats()
 
-    def news(self) -> tuple[str, ...]:
+    def new_messages(self) -> tuple[str, ...]:
         """Nothing happens to it."""
         return ()
 
-    def tend(self) -> None:
+    def repair(self) -> None:
         """Nothing of it can break."""
 
     def close(self, timeout_s: float = 5.0) -> RecorderStats:
@@ -332,7 +332,9 @@ class FaultRun:
         setup, config = self._setup, self.config
         planner: Planner = self._planner or CirclingPlanner(config, (0.061, 0.415, 0.238))
         driver = ReferenceDriver(Codec(), draw_session=lambda: self._chance.getrandbits(16))
-        self.core = assemble_core(config, self.can.host, driver, make_pipeline(config, setup.model, planner), self.log)
+        self.core = assemble_core(
+            config, self.can.host, driver, create_pipeline(config, setup.model, planner), self.log
+        )
         self.can.host.open()
         if self.now_us:
             self.log.events.append((self.now_us * 1000, "the daemon was started"))
@@ -400,10 +402,10 @@ class FaultRun:
         if not self._open:
             return
         outputs = self.robot.outputs
-        stands = outputs.left_setpoint_rad_s == outputs.right_setpoint_rad_s == 0.0
+        is_stationary = outputs.left_setpoint_rad_s == outputs.right_setpoint_rad_s == 0.0
         for opened in self._open:
             opened.left_armed = opened.left_armed or outputs.state != "ARMED"
-            if opened.left_armed and stands and opened.outcome.stopped_s is None:
+            if opened.left_armed and is_stationary and opened.outcome.stopped_s is None:
                 opened.outcome.stopped_s = (now_us - opened.outcome.fault.begin_ns // 1000) * 1e-6
         while self._closing and self._closing[0][0] <= now_us:
             opened = self._closing.pop(0)[1]

@@ -20,7 +20,7 @@ from disco_hw.control import PlannerState
 from disco_hw.experiments.fence_drives import FOOTPRINT
 from disco_hw.fence import Fence
 from disco_hw.fence.clearance import Boundaries
-from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.robot_setup import load_setup
 
 PERIOD_NS = 100_000_000
@@ -47,7 +47,7 @@ def main() -> int:
     planners, took_s = [], np.zeros((FIRST + given.plans, len(fences)))
     for fence in fences.values():
         config = msgspec.structs.replace(setup.config, robot=robot, fence=fence)
-        planners.append(make_planner(config, replace(setup, config=config).model))
+        planners.append(create_planner(config, replace(setup, config=config).model))
     bounds = [Boundaries(FOOTPRINT, fence) for fence in fences.values()]
     for row in range(len(took_s)):
         angle, now_ns = 0.04 * row, row * PERIOD_NS

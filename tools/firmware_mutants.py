@@ -22,7 +22,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from firmware_protocol.build_firmware import PACKAGE, SOURCES, make_ffi
+from firmware_protocol.build_firmware import PACKAGE, SOURCES, create_ffi
 from tools.check.firmware_check import build_harness, run_harness
 from tools.check.mutation import QUICK, Mutant, mutants
 
@@ -80,7 +80,7 @@ class Builder:
         self.folder = folder
         self.objects = {}
         wrapper = folder / "_firmware.c"
-        make_ffi().emit_c_code(str(wrapper))
+        create_ffi().emit_c_code(str(wrapper))
         include = subprocess.run(
             [sys.executable, "-c", "import sysconfig; print(sysconfig.get_path('include'))"],
             capture_output=True, text=True, check=True,

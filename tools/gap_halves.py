@@ -39,7 +39,7 @@ from disco_hw.gap.search.cross_validation import (
     Chain,
     PredictionErrors,
     errors_of,
-    judged_horizon_s,
+    scored_horizon_s,
     smoothed_poses,
 )
 from disco_hw.gap.search.selection import Z95
@@ -122,7 +122,7 @@ def unseen_errors(drive: GriddedDrive, models: dict[str, Model], ahead_s: float 
         chain = Chain(body_vector, None if wheels is None else wheel_vector)
         # Of windows of 2 s nothing is known so far ahead.
         errors[stage] = errors_of(
-            body, wheels, {0: chain, 1: chain}, min(ahead_s, judged_horizon_s(body, poses)), poses
+            body, wheels, {0: chain, 1: chain}, min(ahead_s, scored_horizon_s(body, poses)), poses
         )
     return errors
 

@@ -29,8 +29,8 @@ from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap import model_of, offered_stage, search_log, written_of
 from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.report import EffectFinding
-from disco_hw.gap.report.judge import Measured, effect_findings, sort_out, unnamed_findings
-from disco_hw.gap.report.page import known_besides
+from disco_hw.gap.report.judge import Measured, classify_findings, effect_findings, unnamed_findings
+from disco_hw.gap.report.page import other_known_symptoms
 from disco_hw.gap.search import joint_predictions
 from disco_hw.gap.search.analysis import final_fit
 from disco_hw.gap.settings import DEFAULT_SETTINGS
@@ -325,7 +325,7 @@ def work(hidden: str, seed: int, robot: Robot = ROBOTS["middle"]) -> Result:
     analysis, _ = search_log(seen.as_drive(), nominal)
     final = final_fit(analysis)
     fits, unnamed = effect_findings(analysis, final), unnamed_findings(analysis)
-    named, doubtful = sort_out(fits, Measured.of(analysis, final))
+    named, doubtful = classify_findings(fits, Measured.of(analysis, final))
     written = written_of(analysis, final, joint_predictions(analysis, final))
     assert written[2] is not None
     kept = written[0] if written[2].kept is None else written[2].kept[0]
@@ -353,7 +353,9 @@ def work(hidden: str, seed: int, robot: Robot = ROBOTS["middle"]) -> Result:
 def _values(named: Iterable[EffectFinding]) -> dict[str, dict[str, float]]:
     """Values of what is named, by name; of what a parameter says by itself by its own name, too."""
     values = {each.name: {key: part.value for key, part in each.parameters.items()} for each in named}
-    besides = {f"{each.name}.{key}": {key: each.parameters[key].value} for each in named for key in known_besides(each)}
+    besides = {
+        f"{each.name}.{key}": {key: each.parameters[key].value} for each in named for key in other_known_symptoms(each)
+    }
     return values | besides
 
 

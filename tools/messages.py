@@ -153,7 +153,7 @@ def main() -> int:
         message
         for message in messages()
         if given.kind in (None, message.kind)
-        and (not given.words or any(word.lower() in message.text.lower() for word in given.words))
+        and (not given.status_text or any(word.lower() in message.text.lower() for word in given.status_text))
     ]
     kind = file = ""
     for message in chosen:

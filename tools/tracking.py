@@ -25,7 +25,7 @@ from disco_hw.estimation.correction import DisturbanceEstimator
 from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.model import Gaussian, Model
 from disco_hw.model.model import EffectSetting
-from disco_hw.runtime.assembly import put_in_force
+from disco_hw.runtime.assembly import apply_geometry
 from disco_hw.runtime.pipeline import FollowTask, Governor, Pipeline, Planner, WheelLimits
 from disco_hw.tasks import PlannedTask
 from disco_hw.tasks.circle import CircleCost, CircleCourse
@@ -252,5 +252,5 @@ def _learner(robot: ForeignRobot, pipeline: Pipeline, drifts: bool) -> FastAdapt
     believed = model(robot)
     mean = believed_geometry(believed)
     return FastAdaptation(
-        mean, 0.5 * mean.mean, 1.5 * mean.mean, lambda geometry: put_in_force(pipeline, believed, geometry), drifts
+        mean, 0.5 * mean.mean, 1.5 * mean.mean, lambda geometry: apply_geometry(pipeline, believed, geometry), drifts
     )

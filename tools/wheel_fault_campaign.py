@@ -49,7 +49,7 @@ def strike(job: Job) -> WheelRun:
     stopped = run.drive(chance.uniform(*WARM_UP_S))
     outcome = WheelRun(driver, fault, speed, track, side)
     if stopped:
-        outcome.words = f"stopped before the fault: {stopped[-1]}"
+        outcome.status_text = f"stopped before the fault: {stopped[-1]}"
         return outcome
     return run.strike(outcome, WATCHED_S)
 
@@ -155,7 +155,7 @@ def main() -> int:
     for name, which in (("missed", missed), ("wrong cause", wrong)):
         for run in which:
             print(f"{name}: {run.driver}, {run.fault}, {run.speed_m_s} m/s, {run.track}, {run.side}: "
-                  f"{run.stopped_s:.2f} s, {run.travel_rad:.2f} rad: {run.words}")  # fmt: skip
+                  f"{run.stopped_s:.2f} s, {run.travel_rad:.2f} rad: {run.status_text}")  # fmt: skip
     for which, events in stopped:
         print(f"stopped: {which}: {events}")
     return 1 if missed or wrong or stopped else 0

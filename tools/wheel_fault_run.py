@@ -166,7 +166,7 @@ class WheelRun:
     stopped_s: float = math.nan
     travel_rad: float = math.nan
     noticed_s: float = math.nan
-    words: str = ""
+    status_text: str = ""
     events: list[str] = field(default_factory=list)
 
     @property
@@ -177,7 +177,7 @@ class WheelRun:
     @property
     def is_wrong(self) -> bool:
         """Whether what was said names another wheel, or what cannot be the cause; a wiring advice always is wrong."""
-        if not self.words:
+        if not self.status_text:
             return False
         allowed = {
             "frozen": ("does not count", "stands although"),
@@ -190,14 +190,14 @@ class WheelRun:
             # What its firmware finds by itself.
             firmware = {"frozen": "ENCODER_MISSING", "disconnected": "ENCODER_MISSING", "reversed": "WRONG_DIRECTION",
                         "blocked": "STALL"}.get(self.fault, "WRONG_DIRECTION")  # fmt: skip
-            if f"{firmware}_{self.side.upper()}" in self.words:
+            if f"{firmware}_{self.side.upper()}" in self.status_text:
                 return False
         other = {"left": "right", "right": "left"}[self.side]
         if self.fault in ("frozen", "disconnected", "reversed") and self.driver in ("odrive", "vesc"):
             # Turned by its encoder, such a motor locks: the wheel does stand.
             allowed = ("stands although", "does not count", "counts backwards", "counts against")
-        named = f"the {self.side} " in self.words and f"the {other} " not in self.words
-        return "robot.toml" in self.words or not named or not any(part in self.words for part in allowed)
+        named = f"the {self.side} " in self.status_text and f"the {other} " not in self.status_text
+        return "robot.toml" in self.status_text or not named or not any(part in self.status_text for part in allowed)
 
 
 class WheelFaultRun:
@@ -257,9 +257,9 @@ class WheelFaultRun:
             run.events += tick.events
             if math.isnan(run.noticed_s) and tick.output.state is not State.ARMED and shows_us is not None:
                 run.noticed_s = 1e-6 * (now_us - shows_us)
-                run.words = tick.output.detail
-            stands = max(map(abs, true)) < STANDS_RAD_S and not tick.output.motion_allowed
-            stood_us = (stood_us or now_us) if stands and not math.isnan(run.noticed_s) else None
+                run.status_text = tick.output.detail
+            is_stationary = max(map(abs, true)) < STANDS_RAD_S and not tick.output.motion_allowed
+            stood_us = (stood_us or now_us) if is_stationary and not math.isnan(run.noticed_s) else None
             if stood_us == now_us:
                 run.stopped_s, run.travel_rad = 1e-6 * (now_us - (shows_us or begun_us)), travel
             if stood_us is not None and now_us - stood_us > 500_000:

@@ -26,7 +26,7 @@ class GeometryAdaptation(Protocol):
     def feed(self, now_ns: int, readings: Readings) -> None:
         """Take in the wheel and pose samples that the tick received."""
 
-    def ask(self, action: str) -> tuple[bool, str]:
+    def handle_request(self, action: str) -> tuple[bool, str]:
         """Handle "revert" (back to the model file's belief, and stay there) or "adapt" (learn again).
 
         Returns whether the request is accepted, and a sentence for the operator.
@@ -49,7 +49,7 @@ class NoAdaptation:
     def feed(self, now_ns: int, readings: Readings) -> None:
         """Do nothing: no samples are needed."""
 
-    def ask(self, action: str) -> tuple[bool, str]:
+    def handle_request(self, action: str) -> tuple[bool, str]:
         """Refuse the request, with what starts adaptation."""
         return False, "this daemon does not adapt; start it with `disco-hw run ROBOT.toml --adapt`"
 

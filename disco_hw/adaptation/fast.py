@@ -19,7 +19,7 @@ from disco_hw.log import records
 from drivers.types import Readings
 
 PERIOD_S = 0.5
-NEWS_STD, NEWS_WIDTH = 0.1, 0.97
+SIGNIFICANT_STD, SIGNIFICANT_WIDTH = 0.1, 0.97
 """A belief goes into force when its mean has moved by so many standard deviations, or its width by this factor."""
 LEAST_POSES = 10
 """Poses taken before the first belief goes into force."""
@@ -30,17 +30,17 @@ _TO_NAMES, _FROM_NAMES = [2, 0, 1], [1, 2, 0]
 class FastAdaptation:
     """Learns from `model`, within `low` and `high` (order of NAMES).
 
-    `put_in_force` makes planner and estimator use a geometry, None for the model file's; it raises ValueError for one
+    `apply_geometry` makes planner and estimator use a geometry, None for the model file's; it raises ValueError for one
     that they cannot take. With a `watch` estimation begins once the poses are good enough.
     """
 
     def __init__(
-        self, model: Geometry, low: np.ndarray, high: np.ndarray, put_in_force: Callable[[Geometry | None], None],
+        self, model: Geometry, low: np.ndarray, high: np.ndarray, apply_geometry: Callable[[Geometry | None], None],
         drifts: bool = False, watch: PoseWatch | None = None,
     ) -> None:  # fmt: skip
         self._watch = PoseWatch(is_good=True) if watch is None else watch
-        self._news: list[str] = []
-        self._model, self._in_force, self._put_in_force = model, model, put_in_force
+        self._messages: list[str] = []
+        self._model, self._in_force, self._apply_geometry = model, model, apply_geometry
         self._low, self._high = low, high
         order = np.ix_(_FROM_NAMES, _FROM_NAMES)
         self._filter = GeometryFilter(
@@ -49,16 +49,16 @@ class FastAdaptation:
         self._next_ns: int | None = None
         self._poses = self._changes = self._carried = 0
         self._adapted = self._paused = False
-        self._asked: str | None = None
+        self._requested: str | None = None
         self._text = "nothing driven yet"
         self._counts = dict.fromkeys(("published", "refused", "reverted", "changes", "carried"), 0)
 
     def step(self, now_ns: int) -> AdaptationUpdate:
         """Put the newest estimate in force if it passes the checks; twice a second."""
-        asked, self._asked = self._asked, None
-        if asked == "revert":
+        requested, self._requested = self._requested, None
+        if requested == "revert":
             return self._revert(now_ns)
-        if asked == "adapt" and self._paused:
+        if requested == "adapt" and self._paused:
             self._paused = False
             self._filter.reset()
             return AdaptationUpdate(events=("adapt: learning again",))
@@ -66,17 +66,17 @@ class FastAdaptation:
             self._next_ns = now_ns if self._next_ns is None else self._next_ns
             return AdaptationUpdate()
         self._next_ns = now_ns + round(PERIOD_S * 1e9)
-        events = self._told()
+        events = self._new_messages()
         filtered = self._filter
         moved = filtered.poses > max(self._poses, LEAST_POSES)
         self._poses = filtered.poses
         geometry = Geometry(filtered.mean[_TO_NAMES], filtered.covariance[np.ix_(_TO_NAMES, _TO_NAMES)])
-        if not moved or not self._is_news(geometry):
+        if not moved or not self._is_significant(geometry):
             return AdaptationUpdate(events=events)
         fault = geometry_fault(geometry, self._low, self._high)
         if not fault:
             try:
-                self._put_in_force(geometry)
+                self._apply_geometry(geometry)
             except ValueError as error:
                 fault = f"the planner cannot take it: {error}"
         if fault:
@@ -93,13 +93,13 @@ class FastAdaptation:
         if self._watch.is_good:
             self._filter.add(readings.wheels, readings.poses)
             return
-        news = self._watch.step(now_ns, readings.poses)
-        self._news += [news] if news else []
+        messages = self._watch.step(now_ns, readings.poses)
+        self._messages += [messages] if messages else []
         self._text = self._watch.text
 
-    def ask(self, action: str) -> tuple[bool, str]:
+    def handle_request(self, action: str) -> tuple[bool, str]:
         """Handle "revert" or "adapt" at the next step."""
-        self._asked = action
+        self._requested = action
         if action == "adapt" and not self._watch.is_good:
             return True, f"not learning yet: {self._watch.text}"
         if action == "revert":
@@ -116,7 +116,7 @@ class FastAdaptation:
             "mean": dict(zip(NAMES, self._in_force.mean.tolist(), strict=True)),
             "std": dict(zip(NAMES, self._in_force.std.tolist(), strict=True)),
             "covariance": self._in_force.covariance.ravel().tolist(),
-            "misfit": self._filter.misfit,
+            "misfit": self._filter.innovation_ratio,
             **self._counts,
         }
 
@@ -124,15 +124,15 @@ class FastAdaptation:
         """Return the counters that are written to the log."""
         return dict(self._counts)
 
-    def _is_news(self, geometry: Geometry) -> bool:
+    def _is_significant(self, geometry: Geometry) -> bool:
         old = self._in_force
         width = geometry.std / old.std
-        moved = np.abs(geometry.mean - old.mean) > NEWS_STD * np.minimum(geometry.std, old.std)
-        return bool(moved.any() or (width < NEWS_WIDTH).any() or (width > 1.0 / NEWS_WIDTH).any())
+        moved = np.abs(geometry.mean - old.mean) > SIGNIFICANT_STD * np.minimum(geometry.std, old.std)
+        return bool(moved.any() or (width < SIGNIFICANT_WIDTH).any() or (width > 1.0 / SIGNIFICANT_WIDTH).any())
 
-    def _told(self) -> tuple[str, ...]:
+    def _new_messages(self) -> tuple[str, ...]:
         """Sentences on the poses and on what the filter noticed since the last time."""
-        found, self._news = self._news, []
+        found, self._messages = self._messages, []
         if self._filter.changes > self._changes:
             found.append("adapt: the robot moves differently from what was learnt; learning again")
         if self._filter.carried > self._carried:
@@ -147,7 +147,7 @@ class FastAdaptation:
         if self._adapted:
             self._adapted, self._in_force = False, self._model
             self._counts["reverted"] += 1
-            self._put_in_force(None)
+            self._apply_geometry(None)
             found.append(change_record(now_ns, "model", None, "asked for"))
         found.append(records.Adaptation(now_ns, "reverted", "the model file's belief is in force, as requested"))
         return AdaptationUpdate(tuple(found), ("adapt: back to the model file's belief, as requested",))

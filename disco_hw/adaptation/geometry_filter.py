@@ -39,14 +39,14 @@ OPENED = 0.12
 """Standard deviation, by size, that a parameter is opened to where it may have changed."""
 KINDS = np.array([(1.0, 1.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
 """What may change at once: all three, or one."""
-DOUBTERS, DOUBT_S, DOUBT_LASTS_S = 16, 0.5, 4.0
+DOUBTERS, HYPOTHESIS_S, HYPOTHESIS_LASTS_S = 16, 0.5, 4.0
 """Filters beside the one that is believed, how much driving lies between their beginnings, and how much proves none."""
 CHANGE_LOG_ODDS = -5.0
 """Of a change of one kind having come with one of these beginnings."""
 MOST_BY_A_POSE = 0.7
 """Log odds that one pose can win or lose for a change: a jolt, or a wrong pose, is short. All of a pose's are scaled
 together, as what explains it best must stay ahead."""
-MISFIT_POSES = 50.0
+INNOVATION_POSES = 50.0
 """Over how many poses the size of the innovations is averaged, by which standard deviations are scaled in that test."""
 RUN_POSES, RUNS, LARGEST_RUN = 25, 10.0, 6.0
 """Innovations that are summed, over how many sums the size of these is averaged, and what one counts for at most: a
@@ -62,7 +62,7 @@ _GAP_NS = 300_000_000
 _WAIT_NS = 600_000_000
 """Wheel samples wait so long for a pose, and a pose stamped later than that after them is none: the tick that takes
 them in must not have to follow seconds of wheels at once, nor keep them for ever."""
-_STANDS_RAD = 1e-4
+_STATIONARY_RAD = 1e-4
 _SLIDING_S, _SLIDING_STD_S = 0.04, 0.04
 """How long the body's sideways speed lags behind its turning."""
 _STRIDE_S = 0.045
@@ -211,8 +211,8 @@ class GeometryFilter:
         self._placed = False
         self._at: WheelSample | None = None
         self._rolled_rad, self._due = 0.0, np.zeros(3)
-        self._misfit, self._astray = 1.0, 0
-        self._run, self._run_poses, self._run_misfit = np.zeros(3), 0, 1.0
+        self._innovation_ratio, self._astray = 1.0, 0
+        self._run, self._run_poses, self._run_innovation_ratio = np.zeros(3), 0, 1.0
 
     @property
     def mean(self) -> Array:
@@ -232,12 +232,12 @@ class GeometryFilter:
     @property
     def _variance_scale(self) -> float:
         """Ratio of the innovations' variance to the expected one, of single poses or of sums of them; at least 1."""
-        return max(self._misfit, self._run_misfit**2, 1.0)
+        return max(self._innovation_ratio, self._run_innovation_ratio**2, 1.0)
 
     @property
-    def misfit(self) -> float:
+    def innovation_ratio(self) -> float:
         """Running mean of the squared innovations over their expectation: 1 if all is as believed."""
-        return self._misfit
+        return self._innovation_ratio
 
     def add(self, wheels: tuple[WheelSample, ...], poses: tuple[PoseSample, ...]) -> None:
         """Take in what has come; a pose waits until the wheels are known up to its time."""
@@ -248,14 +248,14 @@ class GeometryFilter:
             self._wheels.popleft()
         newest_ns = self._wheels[-1].t_ns if self._wheels else self._at.t_ns if self._at is not None else 0
         for pose in poses:
-            whole = math.isfinite(pose.x_m + pose.y_m + pose.yaw_rad)
-            if whole and pose.position_std_m <= WORST_POSE_STD_M and pose.t_ns - newest_ns <= _WAIT_NS:
+            is_complete = math.isfinite(pose.x_m + pose.y_m + pose.yaw_rad)
+            if is_complete and pose.position_std_m <= WORST_POSE_STD_M and pose.t_ns - newest_ns <= _WAIT_NS:
                 self._poses.append(pose)
         while self._poses and self._wheels and self._wheels[-1].t_ns >= self._poses[0].t_ns:
             pose = self._poses.popleft()
             self._roll_to(pose.t_ns)
             if self._at is not None and self._at.t_ns <= pose.t_ns:
-                self._take(pose)
+                self._update(pose)
 
     def _roll_to(self, t_ns: int) -> None:
         """Follow the wheels up to a time; between two samples they turn evenly."""
@@ -278,7 +278,7 @@ class GeometryFilter:
             return
         left, right = sample.left_angle_rad - before.left_angle_rad, sample.right_angle_rad - before.right_angle_rad
         turned = abs(left) + abs(right)
-        if turned < _STANDS_RAD or not self._placed:
+        if turned < _STATIONARY_RAD or not self._placed:
             return
         self._rolled_rad += turned
         self._due += (left, right, (sample.t_ns - before.t_ns) * 1e-9)
@@ -293,11 +293,11 @@ class GeometryFilter:
         if dt_s > 0.0:
             self._bank.predict(left, right, dt_s)
 
-    def _take(self, pose: PoseSample) -> None:
+    def _update(self, pose: PoseSample) -> None:
         if not self._placed:
             self._place(pose)
             return
-        if self._rolled_rad < _STANDS_RAD:
+        if self._rolled_rad < _STATIONARY_RAD:
             return
         self._rolled_rad = 0.0
         self._predict()
@@ -314,7 +314,7 @@ class GeometryFilter:
         self._astray = 0
         self.poses += 1
         squares = np.einsum("ni,ni->n", innovations, np.linalg.solve(spreads, innovations[:, :, None])[:, :, 0])
-        self._misfit += (min(float(squares[0]) / 3.0, 20.0) - self._misfit) / MISFIT_POSES
+        self._innovation_ratio += (min(float(squares[0]) / 3.0, 20.0) - self._innovation_ratio) / INNOVATION_POSES
         self._follow_run(innovation, expected)
         surprise = 0.5 * (squares / self._variance_scale + np.linalg.slogdet(spreads)[1])
         won = surprise[0] - surprise
@@ -324,8 +324,8 @@ class GeometryFilter:
         if best:
             self.changes += 1
             self._only(best)
-        elif self._moved_s > DOUBT_S:
-            self._doubt()
+        elif self._moved_s > HYPOTHESIS_S:
+            self._add_hypotheses()
 
     def _follow_run(self, innovation: Array, expected: Array) -> None:
         """Take one innovation into the sum, and the sum into the mean of their sizes: 1 if they are independent."""
@@ -333,14 +333,14 @@ class GeometryFilter:
         self._run_poses += 1
         if self._run_poses == RUN_POSES:
             size = min(float(self._run @ self._run) / (3.0 * RUN_POSES), LARGEST_RUN)
-            self._run_misfit += (size - self._run_misfit) / RUNS
+            self._run_innovation_ratio += (size - self._run_innovation_ratio) / RUNS
             self._run[:], self._run_poses = 0.0, 0
 
-    def _doubt(self) -> None:
+    def _add_hypotheses(self) -> None:
         """Let new filters, one of each kind, say that the robot changes now; the least likely go."""
         self._moved_s = 0.0
-        self._age_s[1:] += DOUBT_S
-        young = np.flatnonzero(self._age_s < DOUBT_LASTS_S)
+        self._age_s[1:] += HYPOTHESIS_S
+        young = np.flatnonzero(self._age_s < HYPOTHESIS_LASTS_S)
         kept = np.sort(young[np.argsort(-self._log_odds[young], kind="stable")[: 1 + DOUBTERS - len(KINDS)]])
         self._bank.keep(np.concatenate([kept, np.zeros(len(KINDS), dtype=np.int64)]))
         self._log_odds = np.concatenate([self._log_odds[kept], np.full(len(KINDS), CHANGE_LOG_ODDS)])

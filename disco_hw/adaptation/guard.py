@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 NAMES = ("x_icr_m", "wheel_radius_m", "axial_distance_m")
 """Order of the geometry in arrays and in records."""
-ASKED_BY_FILE = "control.adaptation"
+REQUESTED_BY_FILE = "control.adaptation"
 
 _LEAST_VARIANCE, _LARGEST_VARIANCE, _LEAST_EIGENVALUE = 1e-14, 1e4, 1e-9
 """Variances in m^2, and the smallest eigenvalue of a correlation matrix, that a float64 filter can still hold."""
@@ -60,23 +60,23 @@ def geometry_fault(geometry: Geometry, low: Array, high: Array) -> str:
     return ""
 
 
-def check_adaptable(model: Model, uncertainty: str, asked_by: str = "--adapt") -> None:
+def check_adaptable(model: Model, uncertainty: str, requested_by: str = "--adapt") -> None:
     """Raise InputError for a model or a planner that cannot be adapted, with what to do.
 
-    `asked_by`: the option or field that asked for adaptation.
+    `requested_by`: the option or field that asked for adaptation.
     """
     if uncertainty == "point":
-        raise InputError(f'{asked_by}: control.uncertainty = "point" plans without a belief; write "ut" or "mc"')
+        raise InputError(f'{requested_by}: control.uncertainty = "point" plans without a belief; write "ut" or "mc"')
     if model.belief is None or not set(NAMES) <= set(model.belief.names):
         raise InputError(
-            f"{asked_by}: the model has no belief over wheel radius, axial distance and x_icr; "
+            f"{requested_by}: the model has no belief over wheel radius, axial distance and x_icr; "
             "write one with `disco-hw infer`"
         )
     others = [s.name for s in model.effects if s.effect.channel is not Channel.COMMAND_TO_WHEEL]
     if others:
         raise InputError(
-            f"{asked_by}: the model has the effect {others[0]}, which adaptation would take for a change of the "
-            f"geometry; leave {asked_by} out"
+            f"{requested_by}: the model has the effect {others[0]}, which adaptation would take for a change of the "
+            f"geometry; leave {requested_by} out"
         )
 
 
@@ -108,15 +108,15 @@ def choose_adaptation(control: Control, pose: PoseInput, model: Model) -> Adapta
 
     Raises InputError for one that is asked for and that the model does not allow.
     """
-    asked = control.adaptation
-    if asked == "off":
-        return AdaptationChoice("off", f'{ASKED_BY_FILE} = "off"')
-    if asked != "auto":
-        check_adaptable(model, control.uncertainty, ASKED_BY_FILE)
-        deprecated = '; write "fast": its second estimator was no better and is gone' if asked == "audited" else ""
-        return AdaptationChoice("fast", f'{ASKED_BY_FILE} = "{asked}"{deprecated}')
+    requested = control.adaptation
+    if requested == "off":
+        return AdaptationChoice("off", f'{REQUESTED_BY_FILE} = "off"')
+    if requested != "auto":
+        check_adaptable(model, control.uncertainty, REQUESTED_BY_FILE)
+        deprecated = '; write "fast": its second estimator was no better and is gone' if requested == "audited" else ""
+        return AdaptationChoice("fast", f'{REQUESTED_BY_FILE} = "{requested}"{deprecated}')
     try:
-        check_adaptable(model, control.uncertainty, ASKED_BY_FILE)
+        check_adaptable(model, control.uncertainty, REQUESTED_BY_FILE)
     except InputError as error:
         return AdaptationChoice("off", str(error))
     if pose.rate_hz is None:

@@ -45,7 +45,7 @@ LOOPBACK = """<CycloneDDS><Domain><General><AllowMulticast>false</AllowMulticast
 _SECOND_NS = 1_000_000_000
 _WAIT_S = 0.05
 _SWITCH_S = 0.0005
-_MOST_AT_ONCE = 20
+_MAX_BATCH = 20
 
 SENSOR = Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, Policy.History.KeepLast(5))
 RELIABLE = Qos(
@@ -62,7 +62,7 @@ _STATIC = Qos(
     Policy.History.KeepLast(100),
 )
 
-_SAID: tuple[tuple[str, type, Qos], ...] = (
+_PUBLISHED: tuple[tuple[str, type, Qos], ...] = (
     (out.ODOM, msg.Odometry, RELIABLE),
     (out.JOINT_STATES, msg.JointState, RELIABLE),
     (out.TF, msg.TFMessage, RELIABLE),
@@ -73,7 +73,7 @@ _SAID: tuple[tuple[str, type, Qos], ...] = (
     (REPLY, msg.String, RELIABLE),
 )
 _OF_THE_BASE = (out.ODOM, out.JOINT_STATES, out.TF)
-_Take = Callable[[Any, int], None]  # Any: a message of the reader's type.
+_Handler = Callable[[Any, int], None]  # Any: a message of the reader's type.
 
 
 def run_ros2_bridge(robot: Path, model: Path | None = None, link: str | None = None) -> int:
@@ -123,7 +123,7 @@ class Bridge:
         self._to_daemon = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._to_daemon.setblocking(False)
         self._unsent = self._obstacles_unsent = self._malformed = self._unwritten = self._unread = 0
-        self._heard_ns = self._next_diagnosis_ns = 0
+        self._received_ns = self._next_diagnosis_ns = 0
         self._failure: BaseException | None = None
         self._ended = threading.Event()
         # An e-stop must not wait behind a request that the daemon is slow to answer.
@@ -134,39 +134,39 @@ class Bridge:
         self._writers = {
             # A topic without qualities of its own, as one that is said may be heard too.
             name: DataWriter(self._participant, Topic(self._participant, wire_name(name, namespace), kind), qos)
-            for name, kind, qos in _SAID
+            for name, kind, qos in _PUBLISHED
             if not (self._base_on_ros and name in _OF_THE_BASE)
         }
-        self._readers = list(self._make_readers(namespace))
+        self._readers = list(self._create_readers(namespace))
 
     @property
     def where(self) -> str:
         """Text that says in which domain and namespace the bridge is, and what it receives."""
         ros2 = self._config.ros2
-        heard = "" if self._pose is None else f"; poses from {self._pose.topic}"
+        poses_text = "" if self._pose is None else f"; poses from {self._pose.topic}"
         if self._config.fence.obstacles_port is not None:
-            heard += f"; obstacles from {ros2_obstacles.TOPIC}"
+            poses_text += f"; obstacles from {ros2_obstacles.TOPIC}"
         reach = "this computer only" if ros2.localhost_only else "the network"
-        return f"ROS 2 domain {_domain(self._config)}, {reach}, namespace /{ros2.namespace.strip('/')}{heard}"
+        return f"ROS 2 domain {_domain(self._config)}, {reach}, namespace /{ros2.namespace.strip('/')}{poses_text}"
 
     def run(self, should_stop: Callable[[], bool]) -> None:
         """Carry both ways until requested to stop; what fails on the way in is raised here."""
         # Neither thread waits long for the other's Python, and what was imported is not looked through for garbage.
         sys.setswitchinterval(_SWITCH_S)
         gc.freeze()
-        inward = threading.Thread(target=self._take_in, name="in", daemon=True)
+        inward = threading.Thread(target=self._receive, name="in", daemon=True)
         inward.start()
         try:
             while not should_stop() and self._failure is None:
                 received = self._feed.receive(_WAIT_S)
                 mono_ns, wall_ns = time.monotonic_ns(), time.time_ns()
                 if received:
-                    self._heard_ns = mono_ns
+                    self._received_ns = mono_ns
                     for topic, message in self._outgoing.messages(received, wall_ns - mono_ns):
-                        self._say(topic, message)
+                        self._publish(topic, message)
                 if mono_ns >= self._next_diagnosis_ns:
                     self._next_diagnosis_ns = mono_ns + _SECOND_NS
-                    self._say(*self._diagnosis(mono_ns, wall_ns))
+                    self._publish(*self._diagnosis(mono_ns, wall_ns))
         finally:
             self._ended.set()
             inward.join(2.0)
@@ -183,41 +183,41 @@ class Bridge:
         self._to_daemon.close()
         self._obstacle_link.close()
 
-    def _make_readers(self, namespace: str) -> Iterator[tuple[DataReader[Any], _Take]]:
+    def _create_readers(self, namespace: str) -> Iterator[tuple[DataReader[Any], _Handler]]:
         # One for each type that a topic may have: only the one that the sender has is ever matched.
         if self._pose is not None and self._pose.topic == ros2_inlets.TRANSFORMS:
-            yield self._reader(out.TF, msg.TFMessage, _TRANSFORMS, namespace), self._take_transforms
-            yield self._reader(TF_STATIC, msg.TFMessage, _STATIC, namespace), self._take_static_transforms
+            yield self._reader(out.TF, msg.TFMessage, _TRANSFORMS, namespace), self._handle_transforms
+            yield self._reader(TF_STATIC, msg.TFMessage, _STATIC, namespace), self._handle_static_transforms
         elif self._pose is not None:
             for pose in ros2_inlets.TYPES:
-                yield self._reader(self._pose.topic, pose, SENSOR, namespace), self._take_pose
+                yield self._reader(self._pose.topic, pose, SENSOR, namespace), self._handle_pose
         for speed in () if self._base_on_ros else ros2_commands.TYPES:
-            yield self._reader(CMD_VEL, speed, SENSOR, namespace), self._take_speed
+            yield self._reader(CMD_VEL, speed, SENSOR, namespace), self._handle_speed
         for obstacles in () if self._config.fence.obstacles_port is None else ros2_obstacles.TYPES:
-            yield self._reader(ros2_obstacles.TOPIC, obstacles, SENSOR, namespace), self._take_obstacles
-        yield self._reader(CTL, msg.String, RELIABLE, namespace), self._take_request
-        yield self._reader(ESTOP, msg.Bool, RELIABLE, namespace), self._take_estop
+            yield self._reader(ros2_obstacles.TOPIC, obstacles, SENSOR, namespace), self._handle_obstacles
+        yield self._reader(CTL, msg.String, RELIABLE, namespace), self._handle_request
+        yield self._reader(ESTOP, msg.Bool, RELIABLE, namespace), self._handle_estop
 
     def _reader(self, topic: str, kind: Any, qos: Qos, namespace: str) -> DataReader[Any]:
         return DataReader(self._participant, Topic(self._participant, wire_name(topic, namespace), kind), qos)
 
-    def _take_in(self) -> None:
+    def _receive(self) -> None:
         try:
             waiting = WaitSet(self._participant)
             for reader, _ in self._readers:
                 waiting.attach(ReadCondition(reader, ViewState.Any | InstanceState.Any | SampleState.NotRead))
             while not self._ended.is_set():
                 waiting.wait(duration(milliseconds=50))
-                for reader, take in self._readers:
+                for reader, handle in self._readers:
                     for message, sent_ns in self._samples(reader):
-                        take(message, sent_ns)
+                        handle(message, sent_ns)
         except BaseException as failure:
             self._failure = failure
 
     def _samples(self, reader: DataReader[Any]) -> Iterator[tuple[Any, int]]:
         """Yield a reader's valid samples with their source time stamps; count those that cannot be read."""
         try:
-            samples = reader.take(_MOST_AT_ONCE)
+            samples = reader.take(_MAX_BATCH)
         except DDSException:
             self._unread += 1
             return
@@ -229,19 +229,19 @@ class Bridge:
             if sample.sample_info.valid_data:
                 yield sample, sample.sample_info.source_timestamp
 
-    def _take_transforms(self, message: msg.TFMessage, sent_ns: int, *, static: bool = False) -> None:
+    def _handle_transforms(self, message: msg.TFMessage, sent_ns: int, *, static: bool = False) -> None:
         publisher = _publisher_of(message)
         for pose in self._transforms.poses(message, sent_ns, time.time_ns(), static=static, publisher=publisher):
-            self._take_pose(pose, sent_ns)
+            self._handle_pose(pose, sent_ns)
 
-    def _take_static_transforms(self, message: msg.TFMessage, sent_ns: int) -> None:
-        self._take_transforms(message, sent_ns, static=True)
+    def _handle_static_transforms(self, message: msg.TFMessage, sent_ns: int) -> None:
+        self._handle_transforms(message, sent_ns, static=True)
 
-    def _take_pose(self, message: ros2_inlets.PoseMessage, sent_ns: int) -> None:
+    def _handle_pose(self, message: ros2_inlets.PoseMessage, sent_ns: int) -> None:
         publisher = _publisher_of(message)
         datagram = self._poses.datagram(message, sent_ns, time.monotonic_ns(), time.time_ns(), publisher)
-        for words in (*self._poses.news(), *self._transforms.news()):
-            self._send_to_daemon(json.dumps({"said": words}).encode())
+        for text in (*self._poses.new_messages(), *self._transforms.new_messages()):
+            self._send_to_daemon(json.dumps({"said": text}).encode())
         if datagram is not None:
             self._send_to_daemon(datagram)
 
@@ -254,7 +254,7 @@ class Bridge:
             # No daemon, or one that does not keep up: the next pose is worth more than this one.
             self._unsent += 1
 
-    def _take_obstacles(self, message: msg.ObstacleArrayMsg | msg.String, sent_ns: int) -> None:
+    def _handle_obstacles(self, message: msg.ObstacleArrayMsg | msg.String, sent_ns: int) -> None:
         fence = self._config.fence
         for datagram in self._obstacles.datagrams(message, sent_ns, time.time_ns()):
             try:
@@ -263,37 +263,37 @@ class Bridge:
                 # As with poses: the next report is worth more.
                 self._obstacles_unsent += 1
 
-    def _take_speed(self, message: msg.Twist | msg.TwistStamped, sent_ns: int) -> None:
+    def _handle_speed(self, message: msg.Twist | msg.TwistStamped, sent_ns: int) -> None:
         now_ns = time.monotonic_ns()
         request = self._speeds.request(message, sent_ns, now_ns, time.time_ns())
         if request is not None:
             self._pad.send(now_ns, request)
 
-    def _take_request(self, message: msg.String, _: int) -> None:
-        words = message.data.strip()
-        errands = self._stopping if words == "estop" else self._asking
-        errands.add(self._answer, words)
+    def _handle_request(self, message: msg.String, _: int) -> None:
+        request = message.data.strip()
+        errands = self._stopping if request == "estop" else self._asking
+        errands.add(self._reply_to, request)
 
-    def _take_estop(self, message: msg.Bool, _: int) -> None:
+    def _handle_estop(self, message: msg.Bool, _: int) -> None:
         if message.data:
-            self._stopping.add(self._answer, "estop")
+            self._stopping.add(self._reply_to, "estop")
 
-    def _answer(self, words: str) -> None:
+    def _reply_to(self, request: str) -> None:
         """Carry out a request and publish the reply; where the daemon is driven by hand, arming only permits speeds."""
         reply: dict[str, Any]
-        refused = ros2_commands.refusal(words, self._config.ros2.may_move)
+        refused = ros2_commands.refusal(request, self._config.ros2.may_move)
         if refused is not None:
-            reply = {"do": words, "ok": False, "error": refused}
-        elif words == "arm" and self._is_hand_driven():
+            reply = {"do": request, "ok": False, "error": refused}
+        elif request == "arm" and self._is_hand_driven():
             refusal = self._speeds.permit(time.monotonic_ns())
-            reply = {"do": words, "ok": refusal is None, "text": "cmd_vel drives"}
+            reply = {"do": request, "ok": refusal is None, "text": "cmd_vel drives"}
             if refusal is not None:
-                reply = {"do": words, "ok": False, "error": refusal}
+                reply = {"do": request, "ok": False, "error": refusal}
         else:
-            if words != "status":
+            if request != "status":
                 self._speeds.forbid()
-            reply = ros2_commands.asked(self._setup.robot_file, words, self._link)
-        self._say(REPLY, msg.String(json.dumps(reply)))
+            reply = ros2_commands.request_daemon(self._setup.robot_file, request, self._link)
+        self._publish(REPLY, msg.String(json.dumps(reply)))
 
     def _is_hand_driven(self) -> bool:
         with contextlib.suppress(WorkError):
@@ -315,10 +315,12 @@ class Bridge:
         figures |= {"messages not sent": self._unwritten}
         figures |= {"batches of the daemon missed": self._feed.missed}
         wrong = f"poses refused: {self._poses.why}" if self._poses.why else self._pad.refusal
-        heard = mono_ns - self._heard_ns < _SECOND_NS
-        return self._outgoing.diagnostics(wall_ns, heard, {name: str(count) for name, count in figures.items()}, wrong)
+        is_connected = mono_ns - self._received_ns < _SECOND_NS
+        return self._outgoing.diagnostics(
+            wall_ns, is_connected, {name: str(count) for name, count in figures.items()}, wrong
+        )
 
-    def _say(self, topic: str, message: object) -> None:
+    def _publish(self, topic: str, message: object) -> None:
         try:
             if topic in self._writers:
                 self._writers[topic].write(message)

@@ -41,10 +41,10 @@ _PACKET = struct.Struct("=IB3x8s")
 """Linux `struct can_frame`."""
 _EXTENDED = 0x8000_0000
 _WAIT_S = 0.004
-_LATE_NS = 100_000_000
+_DELAYED_NS = 100_000_000
 _STATE_NS, _LOOK_NS = 50_000_000, 100_000_000
 _FRESH_NS, _OTHERS_NS = 250_000_000, 1_000_000_000
-_MOST_CLIENTS, _MOST_AT_ONCE = 8, 64
+_MOST_CLIENTS, _MAX_BATCH = 8, 64
 _ROOT = 0
 _SPEED_QOS = Qos(
     Policy.Reliability.Reliable(duration(milliseconds=5)), Policy.Durability.Volatile, Policy.History.KeepLast(1)
@@ -102,7 +102,7 @@ class Clients:
             ready.remove(self._listener)
             self._accept()
         for client in ready:
-            for _ in range(_MOST_AT_ONCE):
+            for _ in range(_MAX_BATCH):
                 try:
                     packet = client.recv(_PACKET.size + 1)
                 except BlockingIOError:
@@ -169,11 +169,11 @@ class BaseBridge:
         self._wheels = DataReader(self._participant, topic(settings.wheels_from, wheels), SENSOR)
         buttons = topic(settings.stop_topic, msg.Bool) if settings.stop_topic else None
         self._button = None if buttons is None else DataReader(self._participant, buttons, RELIABLE)
-        self.end.hears_button = self._button is None
+        self.end.receives_button = self._button is None
         self._others_ns = self._wheels_ns = -_OTHERS_NS
         self._step_ns = self._state_ns = self._look_ns = 0
         self._unreadable = self._unwritten = 0
-        self._said = ""
+        self._last_line = ""
 
     def run(self, should_stop: Callable[[], bool]) -> None:
         """Carry both ways until requested to stop, and leave the base with zeros."""
@@ -183,25 +183,27 @@ class BaseBridge:
                 received = list(self._clients.receive(_WAIT_S))
                 now_ns = time.monotonic_ns()
                 # After a pause of this process nobody knows how old the commands are that wait.
-                self._take_commands(received, now_ns, late=now_ns - last_ns > _LATE_NS)
+                self._handle_commands(received, now_ns, is_delayed=now_ns - last_ns > _DELAYED_NS)
                 last_ns = now_ns
-                self._take_messages(now_ns)
-                self._say_due(now_ns)
+                self._handle_messages(now_ns)
+                self._send_due(now_ns)
         finally:
-            self._drive(self.end.stand_by(time.monotonic_ns()))
+            self._drive(self.end.hold_standstill(time.monotonic_ns()))
 
-    def _take_commands(self, received: list[tuple[socket.socket, Frame | None]], now_ns: int, *, late: bool) -> None:
+    def _handle_commands(
+        self, received: list[tuple[socket.socket, Frame | None]], now_ns: int, *, is_delayed: bool
+    ) -> None:
         """Handle received frames; after a pause (`late`), or if the driving client has gone, stop the base."""
-        if late and self.end.driving:
-            self._drive(self.end.stand_by(now_ns))
+        if is_delayed and self.end.driving:
+            self._drive(self.end.hold_standstill(now_ns))
         for client, frame in received:
             if frame is None:
                 if client is self._driven_by and self.end.driving:
-                    self._drive(self.end.stand_by(now_ns))
-            elif frame.can_id == wire.STOP or not late:
-                self._take_command(client, frame, now_ns)
+                    self._drive(self.end.hold_standstill(now_ns))
+            elif frame.can_id == wire.STOP or not is_delayed:
+                self._handle_command(client, frame, now_ns)
 
-    def _take_command(self, client: socket.socket, frame: Frame, now_ns: int) -> None:
+    def _handle_command(self, client: socket.socket, frame: Frame, now_ns: int) -> None:
         """Handle one frame; while one client drives, ignore speeds from the others."""
         was_driving = self.end.driving
         if was_driving and frame.can_id == wire.SPEEDS and client is not self._driven_by:
@@ -212,36 +214,36 @@ class BaseBridge:
         if self.end.driving is not was_driving or frame.can_id in (wire.STOP, wire.RESET):
             self._clients.send(self.end.state())
 
-    def _take_messages(self, now_ns: int) -> None:
+    def _handle_messages(self, now_ns: int) -> None:
         """Read the base's topics: send wheel motion to the clients, note other publishers and the button."""
         wall_ns = time.time_ns()
-        for message, sent_ns in self._taken(self._wheels):
+        for message, sent_ns in self._samples(self._wheels):
             wheels = self._inlet.wheels(message, sent_ns, now_ns, wall_ns)
             if wheels is not None:
                 self._wheels_ns = now_ns
                 for frame in wire.wheel_frames(wheels):
                     self._clients.send(frame)
-        if any(True for _ in self._taken(self._others)):
+        if any(True for _ in self._samples(self._others)):
             self._others_ns = now_ns
         if self._button is not None:
-            self._take_button(self._button)
+            self._handle_button(self._button)
 
-    def _take_button(self, reader: DataReader[Any]) -> None:
+    def _handle_button(self, reader: DataReader[Any]) -> None:
         """Read the base's stop button; an unreadable message or no publisher ends driving, as a pressed one does."""
         unreadable = self._unreadable
-        for message, _ in self._taken(reader):
-            self.end.button, self.end.hears_button = message.data, True
+        for message, _ in self._samples(reader):
+            self.end.button, self.end.receives_button = message.data, True
         if self._unreadable != unreadable or not reader.get_matched_publications():
-            self.end.hears_button = False
+            self.end.receives_button = False
 
-    def _say_due(self, now_ns: int) -> None:
+    def _send_due(self, now_ns: int) -> None:
         """Do the periodic work: look for subscribers, publish the speeds due, and send the state to the clients."""
         end = self.end
         if now_ns >= self._look_ns:
             self._look_ns = now_ns + _LOOK_NS
             # Its own reader of the topic, which ignores what this process says, is not among them.
-            end.is_heard = bool(self._writer.get_matched_subscriptions())
-            self._tell()
+            end.has_listener = bool(self._writer.get_matched_subscriptions())
+            self._print_state()
         end.others_speak = now_ns - self._others_ns < _OTHERS_NS
         end.has_odometry = now_ns - self._wheels_ns < _FRESH_NS
         end.refusal = self._inlet.why(now_ns)
@@ -264,10 +266,10 @@ class BaseBridge:
         except DDSException:
             self._unwritten += 1
 
-    def _taken(self, reader: DataReader[Any]) -> Iterator[tuple[Any, int]]:
+    def _samples(self, reader: DataReader[Any]) -> Iterator[tuple[Any, int]]:
         """Yield a reader's valid samples with their source time stamps; count those that cannot be read."""
         try:
-            samples = reader.take(_MOST_AT_ONCE)
+            samples = reader.take(_MAX_BATCH)
         except Exception:
             # Whatever bytes a stranger sends under this type's name.
             self._unreadable += 1
@@ -276,17 +278,17 @@ class BaseBridge:
             if sample.sample_info.valid_data:
                 yield sample, sample.sample_info.source_timestamp
 
-    def _tell(self) -> None:
+    def _print_state(self) -> None:
         """Print a line for the operator at each change."""
         end = self.end
         topics = self._settings
-        words = [
-            f"{topics.speed_topic} {'has a listener' if end.is_heard else 'has no listener'}",
+        parts = [
+            f"{topics.speed_topic} {'has a listener' if end.has_listener else 'has no listener'}",
             *([f"another node speaks on {topics.speed_topic}"] if end.others_speak else []),
             "odometry comes" if end.has_odometry else f"no odometry: {wire.REFUSALS[end.refusal]}",
             *(["e-stop"] if end.latched else []),
             *(["button pressed"] if end.button else []),
-            *([] if end.hears_button else [f"{topics.stop_topic} says nothing"]),
+            *([] if end.receives_button else [f"{topics.stop_topic} says nothing"]),
             "driving" if end.driving else "standing by",
         ]
         counts = {
@@ -294,20 +296,20 @@ class BaseBridge:
             "messages that were none": self._unreadable,
             "speeds not sent": self._unwritten,
         }
-        line = "; ".join(words)
-        if line != self._said:
-            self._said = line
+        line = "; ".join(parts)
+        if line != self._last_line:
+            self._last_line = line
             print(line + "".join(f"; {name}: {count}" for name, count in counts.items() if count), flush=True)
 
 
 def _listen(path: Path) -> socket.socket:
-    remedy = "write a path in a directory of your own, such as one below $XDG_RUNTIME_DIR"
+    hint = "write a path in a directory of your own, such as one below $XDG_RUNTIME_DIR"
     try:
         why = why_not_private(path.parent, (os.geteuid(), _ROOT))
         if why is not None:
-            raise InputError(f"{path.parent}: {why}; {remedy}")
+            raise InputError(f"{path.parent}: {why}; {hint}")
         if path.exists() and not stat.S_ISSOCK(path.lstat().st_mode):
-            raise InputError(f"{path} is there and no socket; {remedy}")
+            raise InputError(f"{path} is there and no socket; {hint}")
         if path.exists():
             _remove_stale(path)
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -316,7 +318,7 @@ def _listen(path: Path) -> socket.socket:
         path.chmod(0o600)
         listener.listen(_MOST_CLIENTS)
     except OSError as error:
-        raise InputError(f"{path}: cannot be listened at ({error.strerror or error}); {remedy}") from None
+        raise InputError(f"{path}: cannot be listened at ({error.strerror or error}); {hint}") from None
     return listener
 
 

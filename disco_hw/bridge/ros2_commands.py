@@ -82,10 +82,10 @@ class SpeedInlet:
             self.permitted = False
         self._sent_ns = sent_mono_ns
         self.passed += 1
-        held = self.permitted and not self._openings
+        is_held = self.permitted and not self._openings
         self._openings = max(0, self._openings - 1)
         forward, left = self._shares(speed, turn)
-        return {"do": "drive", "forward": forward, "left": left, "held": held, "stamp": str(sent_mono_ns)}
+        return {"do": "drive", "forward": forward, "left": left, "held": is_held, "stamp": str(sent_mono_ns)}
 
     def _shares(self, speed_m_s: float, turn_rad_s: float) -> tuple[float, float]:
         """Shares of the largest wheel speed and turn; what is too fast is slowed down on the same curve."""
@@ -159,21 +159,21 @@ class Errands:
         self._pool = ThreadPoolExecutor(1)
         self._room = threading.BoundedSemaphore(most)
 
-    def add(self, work: Callable[[str], None], words: str) -> None:
+    def add(self, work: Callable[[str], None], request: str) -> None:
         """Do `work(words)` when those before are done, unless too many are waiting."""
         if not self._room.acquire(blocking=False):
             self.refused += 1
             return
-        self._pool.submit(work, words).add_done_callback(lambda _: self._room.release())
+        self._pool.submit(work, request).add_done_callback(lambda _: self._room.release())
 
     def close(self) -> None:
         """Start no more errands; safe to call twice."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
 
-def refusal(words: str, may_move: bool) -> str | None:
+def refusal(request: str, may_move: bool) -> str | None:
     """Return why a request is not accepted from ROS 2, where senders are unknown; None for stops, which always are."""
-    if may_move or words.split(" ", 1)[0] in _ALWAYS:
+    if may_move or request.split(" ", 1)[0] in _ALWAYS:
         return None
     return (
         "not taken from ROS 2, where anybody in the domain could have sent it; set ros2.may_move = true in robot.toml, "
@@ -181,15 +181,15 @@ def refusal(words: str, may_move: bool) -> str | None:
     )
 
 
-def asked(robot: Path, words: str, link: str | None) -> dict[str, Any]:
+def request_daemon(robot: Path, request: str, link: str | None) -> dict[str, Any]:
     """Ask the daemon as `disco-hw ctl ROBOT.toml WORDS` does, and return its answer; never raises.
 
     Where it does not confirm an e-stop, the robot is stopped on its link, as by `disco-hw estop`.
     """
     try:
-        action, *changes = shlex.split(words) or [""]
+        action, *changes = shlex.split(request) or [""]
     except ValueError as error:
-        return {"do": words[:80], "ok": False, "error": str(error)}
+        return {"do": request[:80], "ok": False, "error": str(error)}
     unrecorded = "--unrecorded" in changes
     try:
         reply = ask(robot, action, [change for change in changes if change != "--unrecorded"], unrecorded)

@@ -62,7 +62,7 @@ class PoseInlet:
         if not self._publishers.may_send(publisher, mono_ns):
             self.refused["of a second publisher on the topic"] += 1
             return None
-        reason, pose = self._judge(message, sent_ns, mono_ns, wall_ns)
+        reason, pose = self._check(message, sent_ns, mono_ns, wall_ns)
         if pose is None:
             self.refused[reason] += 1
             self.why = reason
@@ -72,17 +72,17 @@ class PoseInlet:
         self._publishers.note_pose(publisher, mono_ns)
         return msgspec.msgpack.encode(pose)
 
-    def news(self) -> list[str]:
+    def new_messages(self) -> list[str]:
         """Return messages for the operator since the last call."""
-        return self._publishers.news()
+        return self._publishers.new_messages()
 
-    def _judge(
+    def _check(
         self, message: PoseMessage, sent_ns: int, mono_ns: int, wall_ns: int
     ) -> tuple[str, dict[str, float] | None]:
-        wanted = self._settings
+        settings = self._settings
         frame = message.header.frame_id.lstrip("/")
-        if frame != wanted.frame.lstrip("/"):
-            return f'in frame "{frame[:40]}", not pose.frame "{wanted.frame}"', None
+        if frame != settings.frame.lstrip("/"):
+            return f'in frame "{frame[:40]}", not pose.frame "{settings.frame}"', None
         age_ns = wall_ns - (msg.time_of(message.header.stamp) or sent_ns)
         if not -_AHEAD_NS <= age_ns <= _OLDEST_POSE_NS:
             return "stamped by another clock, or too late; synchronise the clocks and leave use_sim_time off", None
@@ -105,14 +105,14 @@ class PoseInlet:
             "t_ns": t_ns,
             "x_m": place.x,
             "y_m": place.y,
-            "position_std_m": math.sqrt(max(xx, yy)) or wanted.position_std_m,
+            "position_std_m": math.sqrt(max(xx, yy)) or settings.position_std_m,
         }
         yaw = math.atan2(
             2.0 * (turned.w * turned.z + turned.x * turned.y), 1.0 - 2.0 * (turned.y * turned.y + turned.z * turned.z)
         )
         # Where no covariance says that the heading is unknown, the daemon sees whether it stands still.
         if spread is None or is_heading_measured(yaw, tt):
-            found |= {"yaw_rad": yaw, "yaw_std_rad": math.sqrt(tt) or wanted.yaw_std_rad}
+            found |= {"yaw_rad": yaw, "yaw_std_rad": math.sqrt(tt) or settings.yaw_std_rad}
         else:
             self.without_heading += 1
         return "", found
@@ -143,7 +143,7 @@ class TransformInlet:
         self._map, self._base = _frame(settings.frame), _frame(base_frame)
         self._edges: dict[str, _Followed] = {}
         self._chain: tuple[Edge, ...] | None = None
-        self._spoken_ns = 0
+        self._received_ns = 0
 
     def poses(
         self, message: msg.TFMessage, sent_ns: int, wall_ns: int, *, static: bool, publisher: Hashable = None
@@ -170,9 +170,9 @@ class TransformInlet:
                 if pose is not None:
                     yield pose
 
-    def news(self) -> list[str]:
+    def new_messages(self) -> list[str]:
         """Return messages for the operator since the last call, of all transforms."""
-        return [words for one in self._publishers.values() for words in one.news()]
+        return [text for one in self._publishers.values() for text in one.new_messages()]
 
     def _publishers_of(self, child: str) -> SenderGate:
         """Return the gate of the publishers that move the edge to this frame; there are no more than edges are kept."""
@@ -210,9 +210,9 @@ class TransformInlet:
             self.refused["transforms that the ones after them in the chain do not reach"] += 1
             return None
         repeated = bool(after) and len(leading) > 1 and leading[-1][1] == leading[-2][1]
-        if repeated and t_ns < self._spoken_ns + _REPEAT_NS:
+        if repeated and t_ns < self._received_ns + _REPEAT_NS:
             return None
-        self._spoken_ns = t_ns
+        self._received_ns = t_ns
         motions = [self._motion(name, t_ns if name == child else None) for _, name in self._chain]
         x, y, yaw = along(motions)[1][0].tolist()
         position, heading = self._settings.position_std_m, self._settings.yaw_std_rad

@@ -82,8 +82,8 @@ class Outgoing:
                 wheels = self._reckon(record) or wheels
             elif isinstance(record, records.DaemonState):
                 self._state = record
-                words = f"{record.state}{' running' if record.running else ''}{' e-stop' if record.estop else ''}"
-                states.append((STATE, msg.String(f"{words}: {record.reason}")))
+                text = f"{record.state}{' running' if record.running else ''}{' e-stop' if record.estop else ''}"
+                states.append((STATE, msg.String(f"{text}: {record.reason}")))
             elif isinstance(record, records.Counters):
                 self._counters = record
         return self._made(wheels, states, newest, wall_offset_ns)
@@ -101,13 +101,13 @@ class Outgoing:
         if isinstance(plan, records.Plan) and plan.path_x_m:
             yield PLAN, self._path(plan, plan.t_ns + wall_offset_ns)
 
-    def diagnostics(self, now_wall_ns: int, heard: bool, bridge: Mapping[str, str], wrong: str) -> Message:
+    def diagnostics(self, now_wall_ns: int, is_connected: bool, bridge: Mapping[str, str], wrong: str) -> Message:
         """Return the diagnostics of daemon and bridge.
 
         `heard`: whether the daemon has published lately; `wrong`: what is wrong with the bridge, or empty.
         """
         state = self._state
-        if not heard or state is None:
+        if not is_connected or state is None:
             daemon = msg.DiagnosticStatus(_SILENT, "disco-hw: daemon", "no daemon found; start it with disco-hw run")
         else:
             level = _ERROR if state.estop else _LEVELS.get(state.state, _WELL)
@@ -115,12 +115,12 @@ class Outgoing:
             daemon.values = [msg.KeyValue(name, str(value)) for name, value in _figures(self._counters)]
         daemon.hardware_id = self._config.robot.name
         values = [msg.KeyValue(name, text) for name, text in bridge.items()]
-        own = msg.DiagnosticStatus(_WARNING if wrong else _WELL, "disco-hw: bridge", wrong or "well", "", values)
-        return DIAGNOSTICS, msg.DiagnosticArray(msg.Header(msg.stamp_of(now_wall_ns)), [daemon, own])
+        status = msg.DiagnosticStatus(_WARNING if wrong else _WELL, "disco-hw: bridge", wrong or "well", "", values)
+        return DIAGNOSTICS, msg.DiagnosticArray(msg.Header(msg.stamp_of(now_wall_ns)), [daemon, status])
 
     def _reckon(self, sample: WheelSample) -> WheelSample | None:
         """Follow the wheels to a sample; None for one that cannot be."""
-        reading = self._tracker.take(sample)
+        reading = self._tracker.add_sample(sample)
         if not isinstance(reading, WheelReading):
             return None
         before = self._reckoned
@@ -170,10 +170,10 @@ class Outgoing:
         fused = msg.PoseWithCovariance(_pose(estimate.x_m, estimate.y_m, estimate.yaw_rad), _six(spread))
         yield POSE, msg.PoseWithCovarianceStamped(msg.Header(msg.stamp_of(wall_ns), self._map), fused)
         if self._gives_map and self._reckoned is not None:
-            held = self._reckoned.belief
-            yaw = estimate.yaw_rad - held.yaw_rad
-            x = estimate.x_m - (math.cos(yaw) * held.x_m - math.sin(yaw) * held.y_m)
-            y = estimate.y_m - (math.sin(yaw) * held.x_m + math.cos(yaw) * held.y_m)
+            belief = self._reckoned.belief
+            yaw = estimate.yaw_rad - belief.yaw_rad
+            x = estimate.x_m - (math.cos(yaw) * belief.x_m - math.sin(yaw) * belief.y_m)
+            y = estimate.y_m - (math.sin(yaw) * belief.x_m + math.cos(yaw) * belief.y_m)
             yield TF, msg.TFMessage([self._transform(self._map, ODOM_FRAME, (x, y, yaw), wall_ns)])
 
     def _path(self, plan: records.Plan, wall_ns: int) -> msg.RosPath:

@@ -33,9 +33,9 @@ def main() -> None:
     try:
         stop = plain_stop(sys.argv[1:])
         if stop is not None:
-            from disco_hw.daemon.emergency import stop_and_say
+            from disco_hw.daemon.emergency import stop_and_report
 
-            raise SystemExit(stop_and_say(*stop))
+            raise SystemExit(stop_and_report(*stop))
         app()(prog_name="disco-hw")
     except InputError as error:
         print(f"disco-hw: {error}", file=sys.stderr)
@@ -45,29 +45,29 @@ def main() -> None:
         raise SystemExit(1) from None
 
 
-def plain_stop(words: Sequence[str]) -> tuple[Path, str | None, bool] | None:
+def plain_stop(arguments: Sequence[str]) -> tuple[Path, str | None, bool] | None:
     """Return the robot file, --link and --json of `estop`.
 
     None for another verb, and for whatever needs help or an error.
     """
-    if not words or words[0] != "estop":
+    if not arguments or arguments[0] != "estop":
         return None
     files: list[str] = []
     link, as_json = None, False
-    left = iter(words[1:])
-    for word in left:
-        if word == "--json":
+    left = iter(arguments[1:])
+    for argument in left:
+        if argument == "--json":
             as_json = True
-        elif word == "--link":
+        elif argument == "--link":
             link = next(left, None)
             if link is None:
                 return None
-        elif word.startswith("--link="):
-            link = word.removeprefix("--link=")
-        elif word.startswith("-"):
+        elif argument.startswith("--link="):
+            link = argument.removeprefix("--link=")
+        elif argument.startswith("-"):
             return None
         else:
-            files.append(word)
+            files.append(argument)
     return (Path(files[0]), link, as_json) if len(files) == 1 else None
 
 

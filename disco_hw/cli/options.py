@@ -57,8 +57,8 @@ def print_result(result: dict[str, Any], as_json: bool, text: str) -> None:
     print(json_of(result) if as_json else text)
 
 
-def _version(asked: bool) -> None:
-    if asked:
+def _version(requested: bool) -> None:
+    if requested:
         from importlib import metadata
 
         print(f"disco-hw {metadata.version('disco-hw')}")

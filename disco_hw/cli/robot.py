@@ -30,12 +30,12 @@ PagePort = Annotated[int, typer.Option("--port", min=1, max=65535, help="Port of
 def _page(
     view: bool, robot: Path, model: Path | None, port: int, link: str | None
 ) -> AbstractContextManager[PageProcess | None]:
-    from disco_hw.viewer import page_beside
+    from disco_hw.viewer import page_in_background
 
-    return page_beside(robot, model, LOOPBACK, port, link) if view else nullcontext()
+    return page_in_background(robot, model, LOOPBACK, port, link) if view else nullcontext()
 
 
-def _no_news() -> tuple[str, ...]:
+def _no_messages() -> tuple[str, ...]:
     return ()
 
 
@@ -64,7 +64,7 @@ def run(
 
     with _page(view, robot, model, port, link) as page:
         options = DaemonOptions(robot, model, link, log_file, as_json, accept_missing_effects, adapt)
-        code = run_daemon(options, task_pilot, page_news=_no_news if page is None else page.news)
+        code = run_daemon(options, task_pilot, page_messages=_no_messages if page is None else page.new_messages)
     raise typer.Exit(code)
 
 
@@ -117,7 +117,7 @@ def drive(
                 seed=seed,
                 as_json=as_json,
             ),
-            _no_news if served is None else served.news,
+            _no_messages if served is None else served.new_messages,
         )
     print_result(result.as_dict(), as_json, result.as_text())
     if not result.completed:
@@ -162,13 +162,15 @@ def init(
     }
     given = tuple((field, value) for field, value in measures.items() if value is not None)
     options = InitOptions(out, link, driver, name, given, listen_s, pose_source, overwrite, ask)
-    is_asked = not yes and sys.stdin.isatty()
-    written = run_init(options, input if is_asked else None, progress_line)
+    is_interactive = not yes and sys.stdin.isatty()
+    written = run_init(options, input if is_interactive else None, progress_line)
     from disco_hw.first_use.fence_drive import OFFER, record_fence
 
     print(f"written: {written}\nnext: disco-hw check {written}", flush=True)
     # Its wiring is not known to be right yet.
-    if not is_asked or not record_fence(written, input, "push it, disarmed; drive it after `commission` only", link):
+    if not is_interactive or not record_fence(
+        written, input, "push it, disarmed; drive it after `commission` only", link
+    ):
         print(OFFER.format(robot=written))
 
 
@@ -226,10 +228,10 @@ def ctl(
     as_json: AsJson = False,
 ) -> None:
     """Send the running daemon a command, or ask for its status."""
-    from disco_hw.daemon import ask, in_words
+    from disco_hw.daemon import ask, describe
 
     reply = ask(robot, do, changes or (), unrecorded)
-    print_result(reply, as_json, in_words(reply, robot))
+    print_result(reply, as_json, describe(reply, robot))
     if not reply.get("ok", False):
         raise typer.Exit(1)
 
@@ -260,9 +262,9 @@ def estop(
     as_json: AsJson = False,
 ) -> None:
     """Stop the robot now, whatever state the daemon is in."""
-    from disco_hw.daemon.emergency import stop_and_say
+    from disco_hw.daemon.emergency import stop_and_report
 
-    raise typer.Exit(stop_and_say(robot, link, as_json))
+    raise typer.Exit(stop_and_report(robot, link, as_json))
 
 
 bridge_app = typer.Typer(no_args_is_help=True, help="Carry poses, commands and state between the daemon and ROS 2.")
@@ -292,11 +294,11 @@ def ros2_base(robot: RobotFile) -> None:
 
 
 @contextmanager
-def _ros2_extra(word: str) -> Iterator[None]:
+def _ros2_extra(bridge: str) -> Iterator[None]:
     """Say what to install where DDS is not."""
     try:
         yield
     except ModuleNotFoundError as error:
         if error.name != "cyclonedds":
             raise
-        raise InputError(f"bridge {word}: needs cyclonedds; pip install 'disco-hw[ros2]'") from None
+        raise InputError(f"bridge {bridge}: needs cyclonedds; pip install 'disco-hw[ros2]'") from None

@@ -8,7 +8,7 @@ import msgspec
 from msgspec import Meta
 
 from disco_hw.fence import Fence, Footprint, usual_footprint
-from drivers.motor import AS_TOLD, Wiring, find_driver
+from drivers.motor import AS_CONFIGURED, Wiring, find_driver
 from drivers.pose import DEFAULT, PoseConvention
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     key_file: str | None = None
 
     def medium_fields(self) -> dict[str, Any]:
-        """Return the fields for `drivers.transport.make_transport`: kind and address, and a serial line's exchange."""
+        """Return the fields for `drivers.transport.create_transport`: kind, address, and a serial line's exchange."""
         fields = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in _OF_THE_PROTOCOL}
         exchange = find_driver(self.driver).exchange
         return fields if exchange is None else {**fields, "exchange": exchange(self.settings())}
@@ -265,7 +265,7 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     robot: Robot
     prior: Prior = Prior()
     link: Link = Link()
-    wheels: Wiring = AS_TOLD
+    wheels: Wiring = AS_CONFIGURED
     pose: PoseInput = PoseInput()
     control: Control = Control()
     estimation: Estimation = Estimation()

@@ -12,10 +12,10 @@ import msgspec
 from disco_hw.config.robot import Link, PoseInput, Prior, Robot, RobotConfig
 from disco_hw.errors import InputError
 from disco_hw.fence import fence_fault
-from disco_hw.files import ROBOT_TOML, control_character_in, in_words, read_toml
-from drivers.motor import DriverFieldError, UnknownDriverError, find_driver, own_fields
+from disco_hw.files import ROBOT_TOML, control_character_in, describe, read_toml
+from drivers.motor import DriverFieldError, UnknownDriverError, fields_of, find_driver
 from drivers.pose import DEFAULT, PoseSourceError, find_pose_source, pose_sources
-from drivers.pose import own_fields as own_pose_fields
+from drivers.pose import fields_of as own_pose_fields
 from drivers.pose.senders import parse_allowed
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def _without_task(path: Path, raw: dict[str, Any]) -> RobotConfig:
     try:
         config = msgspec.convert({**raw, "link": common, "task": None}, RobotConfig)
     except msgspec.ValidationError as error:
-        raise InputError(f"{path}: {in_words(error, [RobotConfig], 'docs/robot.md')}") from None
+        raise InputError(f"{path}: {describe(error, [RobotConfig], 'docs/robot.md')}") from None
     config = msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, of_driver=of_driver))
     given = {name: getattr(config.prior, name) for name in raw.get("prior", {})}
     config = msgspec.structs.replace(config, prior=msgspec.structs.replace(prior_around(config.robot), **given))
@@ -82,18 +82,18 @@ def _split_link(path: Path, section: Any) -> tuple[Any, Any]:
         raise InputError(f"{path}: link.of_driver: no such field; remove it")
     name = section.get("driver")
     try:
-        own = own_fields(name, section)
+        fields = fields_of(name, section)
     except DriverFieldError as error:
         raise InputError(f"{path}: link.{error}; remove it, or name that driver") from None
     kind = find_driver(name).settings
     try:
-        settings = msgspec.convert(own, kind)
+        settings = msgspec.convert(fields, kind)
     except msgspec.ValidationError as error:
-        raise InputError(f"{path}: {in_words(error, [kind], 'docs/robot.md', 'link')}") from None
+        raise InputError(f"{path}: {describe(error, [kind], 'docs/robot.md', 'link')}") from None
     fault = settings.fault()
     if fault is not None:
-        raise InputError(f"{path}: link.{fault.field}: {fault.fault}; {fault.remedy}")
-    return {field: value for field, value in section.items() if field not in own}, settings
+        raise InputError(f"{path}: link.{fault.field}: {fault.fault}; {fault.hint}")
+    return {field: value for field, value in section.items() if field not in fields}, settings
 
 
 def link_of(path: Path, section: dict[str, Any]) -> Link:
@@ -102,8 +102,8 @@ def link_of(path: Path, section: dict[str, Any]) -> Link:
     Raises InputError.
     """
     _check_names(path, {"link": section})
-    own = find_driver(section.get("driver")).settings.__struct_fields__
-    _, of_driver = _split_link(path, {name: section[name] for name in section if name in (*own, "driver")})
+    fields = find_driver(section.get("driver")).settings.__struct_fields__
+    _, of_driver = _split_link(path, {name: section[name] for name in section if name in (*fields, "driver")})
     common = {name: section[name] for name in section if name in Link.__struct_fields__ and name != "of_driver"}
     try:
         link = msgspec.convert(common, Link)
@@ -139,8 +139,8 @@ def _task_of(path: Path, section: object) -> RobotTask:
     except ReadField as error:
         raise InputError(f"{path}: [task] {error}") from None
     except msgspec.ValidationError as error:
-        words = in_words(error, [task_class(kind) for kind in kinds()], "docs/robot.md", "task")
-        raise InputError(f"{path}: {words}") from None
+        fault = describe(error, [task_class(kind) for kind in kinds()], "docs/robot.md", "task")
+        raise InputError(f"{path}: {fault}") from None
 
 
 def _check_names(path: Path, raw: dict[str, Any]) -> None:
@@ -178,9 +178,9 @@ def _check_pose_fields(path: Path, section: Any) -> None:
         if one is not section and "source" not in one:
             _refuse(path, where, "does not say which source", f"add source, one of {', '.join(pose_sources())}")
         name = str(one.get("source", DEFAULT))
-        own = own_pose_fields(name)
+        fields = own_pose_fields(name)
         for other in pose_sources():
-            for field in sorted(own_pose_fields(other) - own - _OF_EVERY_SOURCE):
+            for field in sorted(own_pose_fields(other) - fields - _OF_EVERY_SOURCE):
                 if field in one:
                     fault = f'a field of the source "{other}", and {where}.source is "{name}"'
                     _refuse(path, f"{where}.{field}", fault, "remove it")
@@ -191,8 +191,8 @@ def _check_pose_fields(path: Path, section: Any) -> None:
             _refuse(path, f"{where}.rate_hz", fault, "remove it")
 
 
-def _refuse(path: Path, field: str, fault: str, remedy: str) -> NoReturn:
-    raise InputError(f"{path}: {field}: {fault}; {remedy}")
+def _refuse(path: Path, field: str, fault: str, hint: str) -> NoReturn:
+    raise InputError(f"{path}: {field}: {fault}; {hint}")
 
 
 def _check_values(path: Path, name: str, section: Any) -> None:  # Any: a section's struct, or a kind of task.
@@ -219,7 +219,7 @@ def _check(path: Path, config: RobotConfig) -> None:
             _refuse(path, f"prior.{field}", f"[{low}, {high}] is not a range", "write [low, high] with low < high")
     fault = fence_fault(config.fence, config.robot.footprint)
     if fault is not None:
-        _refuse(path, f"fence.{fault.field}", fault.fault, fault.remedy)
+        _refuse(path, f"fence.{fault.field}", fault.fault, fault.hint)
     control = config.control
     if control.command_valid_for_s < 1.5 / control.rate_hz:
         _refuse(
@@ -238,8 +238,8 @@ def _check(path: Path, config: RobotConfig) -> None:
         )
     field = driver.serial_field
     if field and (getattr(config.link.settings(), field) is None) is (config.link.kind == "serial"):
-        remedy = "remove it" if config.link.kind != "serial" else "add it (docs/robot.md says what it is)"
-        _refuse(path, f"link.{field}", "belongs to a serial line, and to no other link", remedy)
+        hint = "remove it" if config.link.kind != "serial" else "add it (docs/robot.md says what it is)"
+        _refuse(path, f"link.{field}", "belongs to a serial line, and to no other link", hint)
     if config.link.key_file is not None and not driver.authenticates:
         _refuse(path, "link.key_file", f"the driver {driver.name} has no authenticated mode", "remove it")
 
@@ -269,7 +269,7 @@ def _check_task(path: Path, config: RobotConfig) -> None:
         _refuse(path, "control.fallback", "way-points by time have no speed to follow them at", 'write "ramp"')
     fault = config.task.fault()
     if fault is not None:
-        _refuse(path, f"task.{fault.field}", fault.fault, fault.remedy)
+        _refuse(path, f"task.{fault.field}", fault.fault, fault.hint)
     if config.task.speed_m_s > config.robot.max_wheel_speed_rad_s * config.robot.wheel_radius_m:
         _refuse(
             path,

@@ -28,7 +28,7 @@ from disco_hw.control.plan import (
     PlanOutcome,
     Rollouts,
     WheelPlan,
-    held_plan,
+    constant_plan,
     no_rollouts,
 )
 from disco_hw.fence.clearance import Boundaries
@@ -139,7 +139,7 @@ class Follower:
         # Too fast for a wheel: as fast as it can, on the same curve.
         commands /= max(1.0, float(np.abs(commands).max()) / chassis.limits.speed_rad_s)
         base = chassis.wheel_radius_m, chassis.axial_distance_m, chassis.x_icr_m
-        return held_plan(now_ns, state, float(commands[0]), float(commands[1]), base)
+        return constant_plan(now_ns, state, float(commands[0]), float(commands[1]), base)
 
     def _reference_wheels(self, place: int) -> Array:
         return self._chassis.wheels(self._reference.forward_m_s[place], self._reference.turn_rad_s[place])
@@ -264,9 +264,9 @@ class PurePursuit:
         to_x, to_y = goal_x - axle_x, goal_y - axle_y
         left = to_y * math.cos(yaw_rad) - to_x * math.sin(yaw_rad)
         arc = 2.0 * left / max(to_x * to_x + to_y * to_y, 1e-4)
-        wanted = float(reference.forward_m_s[errors.place]) * arc
-        wanted -= self.integral * reference.speed_m_s * errors.sum_m_s
-        return wanted - float(reference.turn_rad_s[errors.place]), 1.0
+        desired = float(reference.forward_m_s[errors.place]) * arc
+        desired -= self.integral * reference.speed_m_s * errors.sum_m_s
+        return desired - float(reference.turn_rad_s[errors.place]), 1.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -108,18 +108,18 @@ class BlackBoxDisco:
             raise ValueError(f"shift_steps: {shift_steps}; must be 0 or more")
         sampler = self._sampler
         nominal = self._shifted(shift_steps if self.step_number else 0)
-        drawn = self._noise()
-        applied = self._limited(nominal + drawn)
+        sampled = self._noise()
+        applied = self._limited(nominal + sampled)
         costs = self._combined(self._rolled(self._tensor(state), applied))
         if sampler.control_cost_weight > 0.0:
-            noise = drawn if sampler.update_from == "drawn" else applied - nominal
+            noise = sampled if sampler.update_from == "drawn" else applied - nominal
             term = torch.einsum("tm,ktm->k", nominal, noise) / sampler.noise_std**2
             costs = costs + sampler.control_cost_weight * term
         weights = self._sample_weights(costs)
         self.step_number += 1
         if not bool(torch.isfinite(weights).all()):
             raise NoValidControl("no control sequence has a finite cost; check the state and the transition function")
-        base = nominal + drawn if sampler.update_from == "drawn" else applied
+        base = nominal + sampled if sampler.update_from == "drawn" else applied
         self._nominal = torch.einsum("k,ktm->tm", weights, base).clamp(-self._largest, self._largest)
         self.ess = float(1.0 / (weights**2).sum())
         return self._nominal.cpu().numpy().astype(np.float64)
@@ -172,8 +172,8 @@ class BlackBoxDisco:
             return costs.max(dim=0).values
         ordered, order = costs.sort(dim=0, descending=True)
         shares = weights[order]
-        taken = (sampler.worst_part - (shares.cumsum(0) - shares)).clamp(min=0.0).minimum(shares)
-        return (taken * ordered).sum(0) / taken.sum(0)
+        used = (sampler.worst_part - (shares.cumsum(0) - shares)).clamp(min=0.0).minimum(shares)
+        return (used * ordered).sum(0) / used.sum(0)
 
     def _sample_weights(self, costs: Tensor) -> Tensor:
         """Weights (K,) that sum to one; NaN throughout if no cost is finite."""

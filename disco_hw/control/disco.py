@@ -202,12 +202,12 @@ class Disco:
         # Beside the line the plan is refined; where it stands, the guide takes its place.
         refined = self._refined(state, begin, system, nominal) if outcome in REFINED else None
         if guided and self._is_guided(now_ns, system, trajectory):
-            optimiser.take_guide()
+            optimiser.use_guide()
             nominal = optimiser.nominal()
             trajectory = begin.mean_path(self._points.mean_run, nominal)
         elif refined is not None:
             return WheelPlan(t0_ns, REFINED_STEP_S, *refined, diagnostics)
-        return WheelPlan(t0_ns, settings.step_s, self._compensation.asked(nominal), trajectory, diagnostics)
+        return WheelPlan(t0_ns, settings.step_s, self._compensation.commanded(nominal), trajectory, diagnostics)
 
     def _system(self, state: PlannerState, begin: PlanStart, task_s: float) -> SkidSteer:
         """Return what the compiled step rolls out: f_theta from the plan's start, and the task's cost."""
@@ -221,7 +221,7 @@ class Disco:
         self._start[:] = x - origin_x, y - origin_y, *direction, left, right, begin.elapsed_s, place, *slides
         if points.history:
             self._optimiser.set_command_history(begin.earlier)
-        if points.is_drawn:
+        if points.is_sampled:
             points.draw(self._optimiser.step_number, self._optimiser.padded_samples)
         means = None if begin.point_means is None else begin.point_means.astype(np.float32)
         return SkidSteer(
@@ -259,7 +259,7 @@ class Disco:
         points, shared = self._points, self._settings.uncertainty == "ut"
         theta = points.theta if shared else points.mean_theta
         weights = points.weights.astype(np.float64) if shared else np.ones(1)
-        self._refinement.take_points(points.model, theta, weights, points.chassis)
+        self._refinement.set_points(points.model, theta, weights, points.chassis)
 
     def _refined(
         self, state: PlannerState, begin: PlanStart, system: SkidSteer, nominal: Array
@@ -281,7 +281,7 @@ class Disco:
         # The refinement knows the line and nothing else: near an obstacle or a fence the sampled plan stands.
         if self._surroundings is not None and not self._surroundings.allows(path):
             return None
-        return self._compensation.asked(commands), path
+        return self._compensation.commanded(commands), path
 
     def sampled_rollouts(self, count: int = 50) -> Rollouts:
         """Return the last plan's `count` sequences of the largest weight, rolled out under the mean parameters.
@@ -293,7 +293,7 @@ class Disco:
         trajectories = np.empty((len(commands), self._settings.sampler.horizon + 1, 3))
         for row, one in enumerate(commands):
             trajectories[row] = self._begin.mean_path(self._points.mean_run, one)
-        return Rollouts(np.array([self._compensation.asked(one) for one in commands]), trajectories, weights)
+        return Rollouts(np.array([self._compensation.commanded(one) for one in commands]), trajectories, weights)
 
     def point_trajectories(self) -> Array:
         """Return the last plan under each shared parameter point (or draw): (L, T + 1, 3) x, y, yaw.

@@ -61,12 +61,12 @@ class DisturbanceCompensation:
         axle_m = self._points.chassis.axial_distance_m
         return np.column_stack(self._disturbance.turning(acting[:, 0], acting[:, 1], axle_m))
 
-    def asked(self, commands: Array) -> Array:
+    def commanded(self, commands: Array) -> Array:
         """Return the inverse of `acting`."""
         if self.is_none:
             return commands
-        left, right = self._disturbance.asked(commands[:, 0], commands[:, 1], self._points.chassis.axial_distance_m)
-        return self._loss.asked(np.column_stack([left, right]))
+        left, right = self._disturbance.commanded(commands[:, 0], commands[:, 1], self._points.chassis.axial_distance_m)
+        return self._loss.commanded(np.column_stack([left, right]))
 
     def _wheels_after(self, wheels: tuple[float, float], gap_s: float, state: PlannerState) -> tuple[float, float]:
         """Wheel speeds (rad/s) that the model makes of these and what was sent over so long up to the state."""

@@ -11,7 +11,7 @@ from disco_hw.control.optimiser import Optimiser
 from disco_hw.control.plan import Array, DiscoSettings
 from disco_hw.jit import compiled_for
 
-NOWHERE = 0.25
+NEAR_ZERO_SPEED = 0.25
 """A plan stands that in its first half gets nowhere further away than this part of the way that it is to go."""
 
 
@@ -58,6 +58,6 @@ class Guidance:
         way_m = system.task.way_ahead_m(half * settings.step_s)
         # From the last place on: that of a plan which does not stand is far enough.
         begin, *places = trajectory[: half + 1, :2].tolist()
-        if all(math.dist(begin, place) < NOWHERE * way_m for place in reversed(places)):
+        if all(math.dist(begin, place) < NEAR_ZERO_SPEED * way_m for place in reversed(places)):
             self.until_ns = now_ns + round(horizon_s * 1e9)
         return self.until_ns is not None and now_ns < self.until_ns

@@ -135,10 +135,10 @@ class Optimiser:
         """Continue from this plan, (T, C)."""
         self._work.nominal[:] = commands
 
-    def sample_guide(self, wanted: bool) -> None:
+    def sample_guide(self, desired: bool) -> None:
         """Whether sample 1 is the commands that stand in `work.guide` at a step, from the next one on."""
-        if wanted != self._with_guide:
-            self._with_guide = self._samplings["with_guide"] = wanted
+        if desired != self._with_guide:
+            self._with_guide = self._samplings["with_guide"] = desired
 
     @property
     def limits(self) -> Limits:
@@ -159,7 +159,7 @@ class Optimiser:
         """Whether the guide had a cost in the last step."""
         return bool(self._work.costs[1] < INVALID)
 
-    def take_guide(self) -> None:
+    def use_guide(self) -> None:
         """Continue from the guide."""
         self._work.nominal[:] = self._work.guide
 
@@ -247,7 +247,7 @@ class Optimiser:
         change, largest = float(self._limits.change), float(self._limits.largest)
         previous = np.broadcast_to(self._before.astype(np.float64), commands[:, 0].shape)
         for t in range(horizon):
-            wanted = np.minimum(np.maximum(commands[:, t], previous - change), previous + change)
-            previous = np.minimum(np.maximum(wanted, -largest), largest)
+            desired = np.minimum(np.maximum(commands[:, t], previous - change), previous + change)
+            previous = np.minimum(np.maximum(desired, -largest), largest)
             commands[:, t] = previous
         return commands

@@ -70,7 +70,7 @@ def unscented_points(model: Model, alpha: float) -> tuple[Array, Array]:
     return model.complete(sigma.points, names), sigma.mean_weights
 
 
-def drawn_points(model: Model, count: int, seed: int, step: int) -> Array:
+def sampled_points(model: Model, count: int, seed: int, step: int) -> Array:
     """Draws of the belief over all parameters of the model, (count, P), within their physical ranges.
 
     A pure function of seed and step number. The command delay keeps its mean: it shifts whole rows of commands.

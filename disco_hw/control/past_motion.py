@@ -47,12 +47,12 @@ class DriveMeans:
         """Means of the wheels' speeds, one for each term."""
         return self._wheels
 
-    def add_command(self, left_rad_s: float, right_rad_s: float, held_s: float) -> None:
+    def add_command(self, left_rad_s: float, right_rad_s: float, duration_s: float) -> None:
         """Take in a command that was held for so long."""
         self._commands = tuple(
             (
-                memory.after(left, memory.of(left_rad_s, right_rad_s), held_s, 1.0),
-                memory.after(right, memory.of(right_rad_s, left_rad_s), held_s, 1.0),
+                memory.after(left, memory.of(left_rad_s, right_rad_s), duration_s, 1.0),
+                memory.after(right, memory.of(right_rad_s, left_rad_s), duration_s, 1.0),
             )
             for memory, (left, right) in zip(self._memories, self._commands, strict=True)
         )
@@ -109,15 +109,15 @@ class PastMotion:
     def _of_commands(self, state: PlannerState, t_ns: int, delay_s: float, acting: Acting) -> Array:
         if not self._commands or not state.sent:
             return np.zeros(2 * len(self._commands))
-        asked = np.array([(one.left_rad_s, one.right_rad_s) for one in state.sent])
-        moved = acting(asked)
+        commanded = np.array([(one.left_rad_s, one.right_rad_s) for one in state.sent])
+        moved = acting(commanded)
         begins_s = np.array([(one.t_ns - t_ns) * 1e-9 + delay_s for one in state.sent])
         begins_s = np.minimum(begins_s, 0.0)
         ends_s = np.append(begins_s[1:], 0.0)
         found = np.empty((len(self._commands), 2))
         before = state.command_means or np.zeros_like(found)
         for n, memory in enumerate(self._commands):
-            first = memory.of(moved[0], moved[0, ::-1]) - memory.of(asked[0], asked[0, ::-1])
+            first = memory.of(moved[0], moved[0, ::-1]) - memory.of(commanded[0], commanded[0, ::-1])
             share = np.exp(ends_s / memory.time_s) - np.exp(begins_s / memory.time_s)
             left = np.exp(begins_s[0] / memory.time_s)
             found[n] = left * (np.array(before[n]) + first) + share @ memory.of(moved, moved[:, ::-1])

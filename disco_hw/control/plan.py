@@ -32,9 +32,9 @@ Uncertainty = Literal["ut", "mc", "joint", "point"]
 Risk = Literal["mean", "cvar", "worst"]
 
 
-def _require(holds: bool, field: str, remedy: str) -> None:
+def _require(holds: bool, field: str, hint: str) -> None:
     if not holds:
-        raise ValueError(f"{field}: must be {remedy}")
+        raise ValueError(f"{field}: must be {hint}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -349,7 +349,7 @@ def command_history(
 Law = Callable[[PlannerState, Any, Model], tuple[float, float]]
 """State, task ([task] of robot.toml) and model to wheel speeds, left and right (rad/s); asked once a control period."""
 
-HELD_STEPS, _STEP_S = 4, 0.1
+CONSTANT_STEPS, _STEP_S = 4, 0.1
 
 
 class LawController:
@@ -365,14 +365,14 @@ class LawController:
 
     def plan(self, now_ns: int, state: PlannerState) -> WheelPlan:
         """Return a plan that holds the law's wheel speeds; raise NoValidControl unless it gives two finite numbers."""
-        asked = self._law(state, self._task, self._model)
+        desired = self._law(state, self._task, self._model)
         try:
-            left, right = (float(speed) for speed in asked)
+            left, right = (float(speed) for speed in desired)
         except (TypeError, ValueError):
             left = right = math.nan
         if not (math.isfinite(left) and math.isfinite(right)):
-            raise NoValidControl(f"the control law gave {asked!r}; it has to give two finite wheel speeds, rad/s")
-        return held_plan(now_ns, state, left, right, self._model.point()[:3])
+            raise NoValidControl(f"the control law gave {desired!r}; it has to give two finite wheel speeds, rad/s")
+        return constant_plan(now_ns, state, left, right, self._model.point()[:3])
 
     def reset(self) -> None:
         """Hand on that a drive begins."""
@@ -392,20 +392,20 @@ class LawController:
         return no_rollouts()
 
 
-def held_plan(now_ns: int, state: PlannerState, left_rad_s: float, right_rad_s: float, base: Any) -> WheelPlan:
+def constant_plan(now_ns: int, state: PlannerState, left_rad_s: float, right_rad_s: float, base: Any) -> WheelPlan:
     """Return a plan that holds these wheel speeds for 0.4 s on this base (wheel radius, axial distance, x_icr; m)."""
     wheel_radius_m, axial_distance_m, x_icr_m = base
     forward = 0.5 * wheel_radius_m * (left_rad_s + right_rad_s)
     turn = wheel_radius_m * (right_rad_s - left_rad_s) / axial_distance_m
-    yaw = state.yaw_rad + turn * _STEP_S * np.arange(HELD_STEPS + 1)
+    yaw = state.yaw_rad + turn * _STEP_S * np.arange(CONSTANT_STEPS + 1)
     x_step = _STEP_S * (forward * np.cos(yaw) + turn * x_icr_m * np.sin(yaw))
     y_step = _STEP_S * (forward * np.sin(yaw) - turn * x_icr_m * np.cos(yaw))
     x, y = (np.concatenate([[0.0], np.cumsum(step[:-1])]) for step in (x_step, y_step))
     trajectory = np.column_stack([state.x_m + x, state.y_m + y, yaw])
     nothing = Diagnostics(1.0, 0.0, 0.0, 0.0, 0.0, 1, outcome=PlanOutcome.PLANNED)
-    return WheelPlan(now_ns, _STEP_S, np.tile([left_rad_s, right_rad_s], (HELD_STEPS, 1)), trajectory, nothing)
+    return WheelPlan(now_ns, _STEP_S, np.tile([left_rad_s, right_rad_s], (CONSTANT_STEPS, 1)), trajectory, nothing)
 
 
 def no_rollouts() -> Rollouts:
     """For a planner that samples nothing."""
-    return Rollouts(np.empty((0, HELD_STEPS, 2)), np.empty((0, HELD_STEPS + 1, 3)), np.empty(0))
+    return Rollouts(np.empty((0, CONSTANT_STEPS, 2)), np.empty((0, CONSTANT_STEPS + 1, 3)), np.empty(0))

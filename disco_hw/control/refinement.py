@@ -38,7 +38,7 @@ CHANGE_S = 0.2
 END_X_ICR = 5.0
 LEAST_END_WEIGHT = 10.0
 # The robot is beside the line within this part of the way that the horizon covers, and facing within this cosine.
-BESIDE_PART, FACING = 0.3, 0.5
+LATERAL_PART, FACING = 0.3, 0.5
 
 
 class RefinementStart(NamedTuple):
@@ -87,7 +87,7 @@ class Refinement:
         self._last = None
         self._found[:] = 1.0
 
-    def take_points(self, model: Model, theta: Array, weights: Array, chassis: SteeredChassis) -> None:
+    def set_points(self, model: Model, theta: Array, weights: Array, chassis: SteeredChassis) -> None:
         """Refine under these points (L, P) of these weights (L,) from now on."""
         counted = np.flatnonzero(weights > 0.0)
         self._chassis = chassis
@@ -120,7 +120,7 @@ class Refinement:
         if not self.is_compiled:
             # Off the line too, so that no compilation waits for the robot to reach it.
             self._call("refine", refine, problem, buffers, 0)
-        if not (distance_m < max(BESIDE_PART * way_m, 0.02) and facing > FACING):
+        if not (distance_m < max(LATERAL_PART * way_m, 0.02) and facing > FACING):
             self._last = None
             return None
         buffers.commands[: self.history] = initial.past

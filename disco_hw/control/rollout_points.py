@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from disco_hw.control.kernel.guide import SteeredChassis
 from disco_hw.control.parameter_points import (
-    drawn_points,
     equivalent_points,
     mean_point,
     point_estimate,
+    sampled_points,
     shared_pairs,
     unscented_points,
 )
@@ -46,21 +46,23 @@ class RolloutPoints:
     def __init__(self, model: Model, settings: DiscoSettings, limits: CommandLimits, seed: int) -> None:
         self._settings, self._limits, self._seed = settings, limits, seed
         self.model = model
-        self.is_drawn = settings.uncertainty in ("mc", "joint")
-        own_draws = settings.uncertainty == "joint" or (settings.uncertainty == "mc" and not settings.common_draws)
-        self.each = True if own_draws else None
+        self.is_sampled = settings.uncertainty in ("mc", "joint")
+        has_own_samples = settings.uncertainty == "joint" or (
+            settings.uncertainty == "mc" and not settings.common_draws
+        )
+        self.each = True if has_own_samples else None
         theta, weights = self._shared(model)
         self.weights = weights.astype(np.float32)
-        self.skip_mean = True if self.weights[0] == 0.0 and not own_draws else None
+        self.skip_mean = True if self.weights[0] == 0.0 and not has_own_samples else None
         delay_is_believed = model.belief is not None and DELAYED_BY in model.belief.names
         self.history = self._history_for(model, theta) + (SPARE_HISTORY if delay_is_believed else 0)
-        may_turn_more = self.is_drawn or any(s.effect.may_turn_more for s in model.effects)
+        may_turn_more = self.is_sampled or any(s.effect.may_turn_more for s in model.effects)
         self.wide = True if may_turn_more or self._largest_turn_rad(theta) > NARROW_TURN_RAD else None
         self.series = integration_series(settings.step_s, self.wide is not None, np.float32)
         self.euler = True if settings.euler else None
         # The axle's path under Euler steps depends on x_icr.
         self._pairs = 0 if settings.euler else shared_pairs(model, theta, settings.step_s)
-        self._take(model, theta)
+        self._set_parameters(model, theta)
 
     def set_belief(self, belief: Belief) -> None:
         """Take the points of another belief; raises ValueError, and keeps the old ones, where they do not fit."""
@@ -76,12 +78,12 @@ class RolloutPoints:
             raise ValueError(f"{DELAYED_BY}: longer than the {self.history} steps of commands that the planner keeps")
         if self.wide is None and self._largest_turn_rad(theta) > NARROW_TURN_RAD:
             raise ValueError(f"the wheels would turn the robot by more than {NARROW_TURN_RAD} rad in a step")
-        self._take(model, theta)
+        self._set_parameters(model, theta)
 
     def draw(self, step_number: int, samples: int) -> None:
         """Draw the points of `mc` and `joint` anew; `samples` of the optimiser, each with points of its own."""
         count = self.weights.size * (1 if self.each is None else samples)
-        theta = drawn_points(self.model, count, self._seed, step_number)
+        theta = sampled_points(self.model, count, self._seed, step_number)
         self.base, self.effects = coefficient_tables(self.model, theta, self._settings.step_s, np.float32)
 
     def _shared(self, model: Model) -> tuple[Array, Array]:
@@ -96,16 +98,16 @@ class RolloutPoints:
                 count = settings.draws
             case "joint":
                 count = 1
-        return drawn_points(model, count, self._seed, 0), np.full(count, 1.0 / count)
+        return sampled_points(model, count, self._seed, 0), np.full(count, 1.0 / count)
 
-    def _take(self, model: Model, theta: Array) -> None:
+    def _set_parameters(self, model: Model, theta: Array) -> None:
         """Put the points (L, P) of a model in force."""
         step_s = self._settings.step_s
         self.model, self.theta, self.mean_theta = model, theta, mean_point(model)
         self.mean_run, self.run = FreeRun(model, self.mean_theta, step_s), FreeRun(model, theta, step_s)
-        late = [f"{s.name}.{s.effect.late_by}" for s in model.effects if s.effect.late_by is not None]
+        delayed = [f"{s.name}.{s.effect.delayed_by}" for s in model.effects if s.effect.delayed_by is not None]
         dead = [f"{s.name}.{s.effect.dead_by}" for s in model.effects if s.effect.dead_by is not None]
-        self.response_s = sum(_largest(model, self.mean_theta, name) for name in late)
+        self.response_s = sum(_largest(model, self.mean_theta, name) for name in delayed)
         dead_rad_s = sum(_largest(model, self.mean_theta, name) for name in dead)
         radius_m, axle_m = (_largest(model, self.mean_theta, one.name) for one in BASE_PARAMETERS if one is not X_ICR)
         x_icr_m = _largest(model, self.mean_theta, X_ICR.name)

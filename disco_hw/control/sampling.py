@@ -42,7 +42,7 @@ class Sampling:
         if not usable:
             return PlanOutcome.STOPPING, retries
         if guided and optimiser.guide_is_better(settings.guide_below):
-            optimiser.take_guide()
+            optimiser.use_guide()
         if first or outcome is PlanOutcome.RESTARTED:
             for _ in range(settings.iterations_at_start - 1):
                 optimiser.step(0.0, 1.0, before, system, weights)

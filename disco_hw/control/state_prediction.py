@@ -50,10 +50,10 @@ class PlanStart(NamedTuple):
 
     def _path(self, run: FreeRun, commands: Array, means: Array | None, point: int) -> Array:
         history = len(self.earlier)
-        whole = np.concatenate([self.earlier, commands]) if history else commands
+        history_and_plan = np.concatenate([self.earlier, commands]) if history else commands
         # A run overwrites the means.
-        own = None if means is None else means.copy()
-        return run.states(self.state, whole, history, self.elapsed_s, point, self.slide, own)[:, :3]
+        slip_means = None if means is None else means.copy()
+        return run.states(self.state, history_and_plan, history, self.elapsed_s, point, self.slide, slip_means)[:, :3]
 
 
 class StatePrediction:

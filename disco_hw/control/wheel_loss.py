@@ -23,7 +23,7 @@ Wheels = tuple[float, float]
 CORRECTED_S, FOLLOWED_S = 0.3, 0.5
 """Time constants of the speeds and of the losses."""
 LARGEST_RAD_S = 0.6
-WHOLE_RAD_S = 1.0
+FULL_RAD_S = 1.0
 """A command, or half a difference, of this size loses all of it, a smaller one in proportion, so that one of zero stays
 zero."""
 LONGEST_GAP_S = 0.2
@@ -73,22 +73,22 @@ class WheelLoss:
         # Missing is sign * loss of a wheel, and `turns` * turn more on the right one and less on the left one.
         sides = np.array([last.left_rad_s, last.right_rad_s])
         turns = float(_part(0.5 * (sides[1] - sides[0])))
-        sign = _part(_turned(sides, self._turn, _lessened))
+        sign = _part(_turned(sides, self._turn, _reduced))
         share = turns * turns / (1.0 + 2.0 * turns * turns)
         apart = float(missing[1] - missing[0])
-        own = missing + share * apart * _OUTWARDS
+        loss_by_wheel = missing + share * apart * _OUTWARDS
         follow = gap_s / FOLLOWED_S
-        self._loss = np.clip(self._loss + follow * sign * own, -LARGEST_RAD_S, LARGEST_RAD_S)
-        turn = self._turn + follow * turns * float(own[1] - own[0])
+        self._loss = np.clip(self._loss + follow * sign * loss_by_wheel, -LARGEST_RAD_S, LARGEST_RAD_S)
+        turn = self._turn + follow * turns * float(loss_by_wheel[1] - loss_by_wheel[0])
         self._turn = min(max(turn, -LARGEST_RAD_S), LARGEST_RAD_S)
         left, right = (expected - min(gap_s / CORRECTED_S, 1.0) * missing).tolist()
         self._speeds = left, right
 
     def acting(self, commands: Array) -> Array:
         """Commands (N, 2) to a robot that loses nothing and turns as this one does with these."""
-        return _lessened(_turned(commands, self._turn, _lessened), self._loss)
+        return _reduced(_turned(commands, self._turn, _reduced), self._loss)
 
-    def asked(self, commands: Array) -> Array:
+    def commanded(self, commands: Array) -> Array:
         """Return the inverse of `acting`."""
         return _turned(_greater(commands, self._loss), self._turn, _greater)
 
@@ -98,18 +98,18 @@ _OUTWARDS = np.array([1.0, -1.0])
 
 def _part(commands: Array) -> Array:
     """Return the signed part of its loss that each command has: proportional when slow, then -1 or 1."""
-    return np.clip(commands / WHOLE_RAD_S, -1.0, 1.0)
+    return np.clip(commands / FULL_RAD_S, -1.0, 1.0)
 
 
-def _lessened(commands: Array, loss: Array | float) -> Array:
+def _reduced(commands: Array, loss: Array | float) -> Array:
     return commands - loss * _part(commands)
 
 
 def _greater(commands: Array, loss: Array | float) -> Array:
     """Return the inverse of `_lessened`."""
-    small = commands / (1.0 - loss / WHOLE_RAD_S)
+    small = commands / (1.0 - loss / FULL_RAD_S)
     large = commands + np.sign(commands) * loss
-    return np.where(np.abs(small) < WHOLE_RAD_S, small, large)
+    return np.where(np.abs(small) < FULL_RAD_S, small, large)
 
 
 def _turned(commands: Array, turn: float, change: Callable[[Array, float], Array]) -> Array:

@@ -25,10 +25,10 @@ from disco_hw.errors import InputError, WorkError
 from disco_hw.files import file_name_of
 from disco_hw.runtime import advice, by_command, status_headline
 from drivers.private_files import placed_by, user_name, why_not_private
-from drivers.types import SAID_BY_WORDS, SaidBy
+from drivers.types import SOURCE_TEXTS, SaidBy
 from firmware_protocol import status_codes
 
-REMEDY = "set daemon.control_socket to a path in a directory of your own"
+HINT = "set daemon.control_socket to a path in a directory of your own"
 _ROOT = 0
 _TEMPORARY = Path("/tmp")
 
@@ -46,12 +46,14 @@ def default_socket_path(name: str) -> Path:
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     if runtime:
         directory = Path(runtime) / "disco-hw"
-        if _is_own(Path(runtime), uid) and (_is_own(directory, uid) or not _exists(directory)):
+        if _belongs_to(Path(runtime), uid) and (_belongs_to(directory, uid) or not _exists(directory)):
             return directory / file_name
         if uid == _ROOT and (directory / file_name).is_socket():
             return directory / file_name
-    own = next((directory for directory in _taken(uid) if _is_own(directory, uid)), None)
-    return (own or next(directory for directory in _names(uid) if not _exists(directory))) / file_name
+    private_directory = next(
+        (directory for directory in _runtime_directories(uid) if _belongs_to(directory, uid)), None
+    )
+    return (private_directory or next(directory for directory in _names(uid) if not _exists(directory))) / file_name
 
 
 def passed_over(path: Path) -> tuple[str, ...]:
@@ -59,7 +61,7 @@ def passed_over(path: Path) -> tuple[str, ...]:
     uid = os.geteuid()
     if path.parent.parent != _TEMPORARY or not _numbered(uid).fullmatch(path.parent.name):
         return ()
-    candidates = _taken(uid)
+    candidates = _runtime_directories(uid)
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     if runtime:
         candidates = [Path(runtime), Path(runtime) / "disco-hw", *candidates]
@@ -85,7 +87,7 @@ def believed_users(path: Path) -> frozenset[int]:
         if why_not_private(directory, {owner}) is None and placed_by(directory, {owner, _ROOT}):
             return believed | {owner}
     if why is not None:
-        raise WorkError(f"{directory}: {why}; nothing is sent there, {REMEDY}")
+        raise WorkError(f"{directory}: {why}; nothing is sent there, {HINT}")
     return believed
 
 
@@ -101,7 +103,7 @@ def connect(path: Path, timeout_s: float) -> socket.socket:
         connection.connect(str(path))
         listener = peer_uid(connection)
         if listener not in believed:
-            raise WorkError(f"{path}: a process of {user_name(listener)} listens there; nothing is sent, {REMEDY}")
+            raise WorkError(f"{path}: a process of {user_name(listener)} listens there; nothing is sent, {HINT}")
     except BaseException:
         connection.close()
         raise
@@ -124,14 +126,14 @@ def _numbered(uid: int) -> re.Pattern[str]:
     return re.compile(rf"disco-hw-{uid}(?:-([2-9]|[1-9][0-9]{{1,6}}))?")
 
 
-def _taken(uid: int) -> list[Path]:
+def _runtime_directories(uid: int) -> list[Path]:
     """Return the existing entries of /tmp that bear one of this user's names, in order of their numbers."""
     numbered = _numbered(uid)
     found = [(int(match[1] or 1), entry) for entry in os.listdir(_TEMPORARY) if (match := numbered.fullmatch(entry))]
     return [_TEMPORARY / entry for _, entry in sorted(found)]
 
 
-def _is_own(directory: Path, uid: int) -> bool:
+def _belongs_to(directory: Path, uid: int) -> bool:
     try:
         return why_not_private(directory, {uid}) is None
     except OSError:
@@ -202,11 +204,11 @@ ACTIONS = ("arm", "start", "stop", "disarm", "estop", "reset", "status", "quit",
 TASK = "task"
 UNRECORDED = "unrecorded"
 """What `arm` must say where nothing is being recorded although it should be."""
-UNRECORDED_REMEDY = "correct that, or arm with --unrecorded"
+UNRECORDED_HINT = "correct that, or arm with --unrecorded"
 OBSTACLE, FENCE = "obstacle", "fence"
 PAGE_ACTIONS = (TASK, OBSTACLE, FENCE, "drive")
 """What takes arguments: another circle, an obstacle, the fence, and a hand on the page's pad."""
-ASKED = (*ACTIONS, TASK, OBSTACLE, FENCE)
+REQUESTS = (*ACTIONS, TASK, OBSTACLE, FENCE)
 """What a person may ask for here; a hand on a pad is no matter of single requests."""
 SERVED = (*ACTIONS, *PAGE_ACTIONS)
 
@@ -228,13 +230,15 @@ def ask(robot: Path, action: str, changes: Sequence[str] = (), unrecorded: bool 
     Raises InputError for an unknown action and for changes that are none, and WorkError without a daemon; for an e-stop
     with what stops the robot all the same.
     """
-    if action not in ASKED:
-        raise InputError(f"{action}: no such request; write one of {', '.join(ASKED)}")
+    if action not in REQUESTS:
+        raise InputError(f"{action}: no such request; write one of {', '.join(REQUESTS)}")
     if (action in _EXAMPLES) != bool(changes):
         taking = ", ".join(_EXAMPLES)
-        said = "say what to change" if action in _EXAMPLES else f"{action} takes no further arguments; only {taking} do"
+        fault = (
+            "say what to change" if action in _EXAMPLES else f"{action} takes no further arguments; only {taking} do"
+        )
         shown = action if action in _EXAMPLES else TASK
-        raise InputError(f"{said}: ctl {robot} {shown} {_EXAMPLES[shown]}")
+        raise InputError(f"{fault}: ctl {robot} {shown} {_EXAMPLES[shown]}")
     if unrecorded and action != "arm":
         raise InputError(f"--unrecorded: only arm takes it, and not {action}; leave it out")
     request: dict[str, Any] = {"do": action} | _arguments(action, changes) | ({UNRECORDED: True} if unrecorded else {})
@@ -246,8 +250,8 @@ def ask(robot: Path, action: str, changes: Sequence[str] = (), unrecorded: bool 
     except (InputError, WorkError) as error:
         if action != "estop":
             raise
-        remedy = f"use `disco-hw estop {robot}` or the robot's own e-stop button, now"
-        raise type(error)(f"NOT SENT: {remedy} ({error})") from None
+        hint = f"use `disco-hw estop {robot}` or the robot's own e-stop button, now"
+        raise type(error)(f"NOT SENT: {hint} ({error})") from None
 
 
 _EXAMPLES = {
@@ -269,9 +273,9 @@ def _arguments(action: str, changes: Sequence[str]) -> dict[str, Any]:
     if action == FENCE and list(changes) in (["override"], ["hold"]):
         return {"override": changes[0] == "override"}
     if action != TASK:
-        words = {OBSTACLE: "add or remove, and then NAME=VALUE", FENCE: "override or hold"}[action]
+        usage = {OBSTACLE: "add or remove, and then NAME=VALUE", FENCE: "override or hold"}[action]
         example = f"{action} {_EXAMPLES[action]}"
-        raise InputError(f"{action} {' '.join(changes)}: not understood; write {words}, as {example}")
+        raise InputError(f"{action} {' '.join(changes)}: not understood; write {usage}, as {example}")
     return dict(map(_change, changes))
 
 
@@ -286,7 +290,7 @@ def _change(text: str) -> tuple[str, float]:
     return name, number
 
 
-def in_words(reply: dict[str, Any], robot: Path) -> str:
+def describe(reply: dict[str, Any], robot: Path) -> str:
     """Return a reply of the daemon of `robot` for the operator."""
     if not reply.get("ok"):
         return f"refused: {reply.get('error')}"
@@ -297,12 +301,12 @@ def in_words(reply: dict[str, Any], robot: Path) -> str:
         ": ".join(status_headline(reply)),
         *(f"next: {sentence}" for sentence in advice(reply, by_command(robot))),
         f"robot {reply['robot_state']}, link {reply['link']}, fault {status_codes.fault(reply['fault'])}",
-        *controller_in_words(reply.get("controller")),
+        *describe_controller(reply.get("controller")),
         f"{' '.join(task['progress'])}, distance {task['distance_m'] * 1e3:.0f} mm, speed {task['speed_m_s']:.3f} m/s",
         f"loop lateness p99 {loop['lateness_us']['p99']:.0f} us, max {loop['lateness_us']['max']:.0f} us, "
         f"overruns {loop['overruns']}, skipped {loop['skipped']}",
     ]
-    lines += _fence_in_words(reply.get("area"))
+    lines += _describe_fence(reply.get("area"))
     adaptation = reply.get("adaptation")
     if adaptation is not None:
         paused = ", paused" if adaptation["paused"] else ""
@@ -318,44 +322,44 @@ def in_words(reply: dict[str, Any], robot: Path) -> str:
     if recorder["fault"]:
         lines.append(f"RECORDING: {recorder['fault']}")
     if recorder["path"]:
-        lines.append(f"recording {recording_in_words(recorder)}")
+        lines.append(f"recording {describe_recording(recorder)}")
     if recorder["last_error"] and recorder["last_error"] not in recorder["fault"]:
         lines.append(f"recording, last error: {recorder['last_error']}")
     return "\n".join(lines)
 
 
-def _fence_in_words(area: Mapping[str, Any] | None) -> Iterator[str]:
+def _describe_fence(area: Mapping[str, Any] | None) -> Iterator[str]:
     """Yield lines on fence and obstacles from a status; none where there is no fence."""
     if area is None or area["verdict"] == "idle":
         return
-    held = f", {area['reason']}" if area["reason"] else ""
+    reason = f", {area['reason']}" if area["reason"] else ""
     left = "" if area["clearance_m"] is None else f"; {area['clearance_m']:.2f} m left on the stopping path"
-    yield f"fence: {area['verdict']}{held}{left}"
+    yield f"fence: {area['verdict']}{reason}{left}"
     for one in area["obstacles"]:
-        lost = ", LOST: report it again or remove it" if one["lost"] else ""
+        missing = ", LOST: report it again or remove it" if one["lost"] else ""
         place = f"({one['x_m']:.2f}, {one['y_m']:.2f}), radius {one['radius_m']:.2f} m"
-        yield f"obstacle {one['name']}: {place}, reported {one['age_s']:.1f} of {one['age_limit_s']:g} s ago{lost}"
+        yield f"obstacle {one['name']}: {place}, reported {one['age_s']:.1f} of {one['age_limit_s']:g} s ago{missing}"
 
 
-def controller_in_words(controller: Mapping[str, Any] | None) -> tuple[str, ...]:
+def describe_controller(controller: Mapping[str, Any] | None) -> tuple[str, ...]:
     """Return which controller a status describes, and its limits by who states them; nothing before it is known."""
     if controller is None:
         return ()
     by_source: dict[SaidBy, list[str]] = {}
     for name, limit in controller["limits"].items():
         by_source.setdefault(limit["said_by"], []).append(f"{name} {limit['value']:g}")
-    limits = (f"{', '.join(said)} ({SAID_BY_WORDS[source]})" for source, said in by_source.items())
+    limits = (f"{', '.join(names)} ({SOURCE_TEXTS[source]})" for source, names in by_source.items())
     return (f"controller: {controller['words']}", f"limits: {'; '.join(limits)}")
 
 
-def recording_in_words(recorder: Mapping[str, Any]) -> str:
+def describe_recording(recorder: Mapping[str, Any]) -> str:
     """Describe what became of every tick that a status's recorder was given."""
     given = recorder["ticks"] + recorder["dropped_ticks"]
     counts = {"waiting": "waiting_ticks", "dropped": "dropped_ticks", "lost with a deleted file": "lost_ticks"}
-    words = [f"{recorder['delivered_ticks']} of {given} ticks"]
-    words += [f"{recorder[count]} {what}" for what, count in counts.items() if recorder[count]]
+    parts = [f"{recorder['delivered_ticks']} of {given} ticks"]
+    parts += [f"{recorder[count]} {what}" for what, count in counts.items() if recorder[count]]
     if recorder["refused"]:
-        words.append(f"{recorder['refused']} records refused")
+        parts.append(f"{recorder['refused']} records refused")
     if recorder["writer_deaths"]:
-        words.append(f"restarted {recorder['writer_deaths']} times")
-    return f"{recorder['path']}: {', '.join(words)}"
+        parts.append(f"restarted {recorder['writer_deaths']} times")
+    return f"{recorder['path']}: {', '.join(parts)}"

@@ -19,7 +19,7 @@ from disco_hw.errors import InputError, WorkError
 from disco_hw.estimation.pose_sources import APART_STDS
 from disco_hw.processes import can_lock_memory, can_use_fifo
 from disco_hw.runtime import connection
-from disco_hw.runtime.assembly import driver_of, make_link, pose_source_of
+from disco_hw.runtime.assembly import create_link, driver_of, pose_source_of
 from disco_hw.runtime.preflight import (
     Check,
     Level,
@@ -42,12 +42,12 @@ from drivers.types import (
     Identity,
     Limits,
     LinkState,
+    MessageSource,
     OutgoingFrame,
     PoseSample,
     PoseSource,
     ReceivedFrame,
     RobotStatus,
-    SaysWhy,
     Transport,
 )
 from firmware_protocol import status_codes
@@ -89,8 +89,8 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
     Raises InputError if a file is wrong, WorkError while a daemon drives this robot: the two would speak at once.
     """
     setup = load_setup(robot, None, link)
-    key, transport = link_key(setup), make_link(setup)
-    refuse_beside_a_daemon(setup.config)
+    key, transport = link_key(setup), create_link(setup)
+    refuse_while_daemon_runs(setup.config)
     checks = [_model_check(setup), _adaptation_check(setup), check_task(setup.config.robot, setup.config.task)]
     checks.append(check_link_load(setup.config.link, setup.config.control))
     checks += check_fence(setup.config.robot, setup.config.fence)
@@ -105,9 +105,9 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
     try:
         checks.append(_link_check(transport))
         if checks[-1].level is Level.OK:
-            found = _ask_robot(transport, driver_of(setup.config, key), pose_source)
-            checks.append(_firmware_check(found, kind.tells_reception))
-            if kind.tells_reception:
+            found = _query_robot(transport, driver_of(setup.config, key), pose_source)
+            checks.append(_firmware_check(found, kind.reports_reception))
+            if kind.reports_reception:
                 checks.append(_hearing_check(found))
                 checks.append(check_round_trip(found.round_trips_s, 1.0 / control.rate_hz))
             checks.append(_telemetry_check(found))
@@ -124,7 +124,7 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """Replies of the robot during a check; `pose_news` is the pose source's newest message, empty if there is none."""
+    """Replies of the robot during a check; `pose_message` is the pose source's newest message, or empty."""
 
     state: DriverState
     detail: str
@@ -133,13 +133,13 @@ class _Found:
     clock_synchronised: bool
     wheel_samples: int
     poses: tuple[PoseSample, ...]
-    pose_news: str
+    pose_message: str
     rejected: int
     reported: tuple[RobotStatus, ...]
     round_trips_s: tuple[float, ...]
 
 
-def refuse_beside_a_daemon(config: RobotConfig) -> None:
+def refuse_while_daemon_runs(config: RobotConfig) -> None:
     """Raise WorkError while a daemon drives this robot, InputError where that cannot be seen."""
     path = socket_path(config)
     try:
@@ -184,18 +184,18 @@ def _link_check(transport: Transport) -> Check:
     deadline = time.monotonic() + _LINK_TIMEOUT_S
     while transport.state is not LinkState.UP:
         if time.monotonic() > deadline:
-            said = connection(transport.state, transport.last_error, DriverState.DISCONNECTED, "")
-            return Check("link", Level.FAIL, said)
+            state = connection(transport.state, transport.last_error, DriverState.DISCONNECTED, "")
+            return Check("link", Level.FAIL, state)
         time.sleep(_STEP_S)
     return Check("link", Level.OK, transport.name)
 
 
-def _ask_robot(transport: Transport, driver: Driver, pose_source: PoseSource) -> _Found:
+def _query_robot(transport: Transport, driver: Driver, pose_source: PoseSource) -> _Found:
     """Shake hands, listen for three seconds and time the answers to the driver's own clock requests."""
     stopwatch = _Stopwatch()
     wheels = 0
     poses: list[PoseSample] = []
-    pose_news = ""
+    pose_message = ""
     reported: list[RobotStatus] = []
     # What came while nobody listened would count as of the time of listening.
     transport.receive()
@@ -209,8 +209,8 @@ def _ask_robot(transport: Transport, driver: Driver, pose_source: PoseSource) ->
         wheels += len(readings.wheels)
         came = pose_source.receive(now_ns, readings.poses)
         poses += came
-        if isinstance(pose_source, SaysWhy):
-            pose_news = next(reversed(pose_source.news()), pose_news)
+        if isinstance(pose_source, MessageSource):
+            pose_message = next(reversed(pose_source.new_messages()), pose_message)
         reported += [status for status in readings.status if status.t_ns - start_ns > _SETTLED_S * 1e9]
         for outgoing in driver.transmit(now_ns, None):
             if transport.send(outgoing, now_ns):
@@ -225,7 +225,7 @@ def _ask_robot(transport: Transport, driver: Driver, pose_source: PoseSource) ->
         clock_synchronised=driver.clock_offset_ns is not None,
         wheel_samples=wheels,
         poses=tuple(poses),
-        pose_news=pose_news,
+        pose_message=pose_message,
         rejected=stats.rejected_crc + stats.rejected_sequence + stats.rejected_length + transport.stats.malformed,
         reported=tuple(reported),
         round_trips_s=tuple(stopwatch.round_trips_s),
@@ -239,16 +239,15 @@ def pose_source_checks(source: PoseInput, poses: Sequence[PoseSample]) -> list[C
         return []
     checks: list[Check] = []
     for number, (label, named) in enumerate(zip(labels, every, strict=True)):
-        own = [pose for pose in poses if pose.source == number]
+        poses_here = [pose for pose in poses if pose.source == number]
         frame = f"frame at {list(named.origin)}, sensor at {list(named.offset)}"
-        if not own:
+        if not poses_here:
             checks.append(Check(f"poses {label}", Level.WARNING, f"none came; {frame}; see that it sends"))
             continue
-        age_s = median((pose.received_ns - pose.t_ns) * 1e-9 for pose in own)
-        heading = f"{own[-1].yaw_std_rad:.3g} rad" if own[-1].has_heading else "no heading"
-        text = (
-            f"{len(own) / _LISTEN_S:.0f} a second, {1e3 * age_s:.0f} ms old, {own[-1].position_std_m:.3g} m, {heading}"
-        )
+        age_s = median((pose.received_ns - pose.t_ns) * 1e-9 for pose in poses_here)
+        heading = f"{poses_here[-1].yaw_std_rad:.3g} rad" if poses_here[-1].has_heading else "no heading"
+        position = f"{poses_here[-1].position_std_m:.3g} m"
+        text = f"{len(poses_here) / _LISTEN_S:.0f} a second, {1e3 * age_s:.0f} ms old, {position}, {heading}"
         checks.append(Check(f"poses {label}", Level.OK, f"{text}; {frame}"))
     for one, other in combinations(range(len(labels)), 2):
         apart = _apart(*([pose for pose in poses if pose.source == number] for number in (one, other)))
@@ -314,7 +313,7 @@ def _firmware_check(found: _Found, has_clock: bool) -> Check:
             name, Level.FAIL, f"{found.state.value}: the robot reports {status_codes.fault(found.reported[-1].fault)}"
         )
     clock = f", clock {'synchronised' if found.clock_synchronised else 'NOT synchronised'}" if has_clock else ""
-    return Check(name, Level.OK, f"{found.identity.in_words()}, {found.state.value}{clock}")
+    return Check(name, Level.OK, f"{found.identity.describe()}, {found.state.value}{clock}")
 
 
 def _hearing_check(found: _Found) -> Check:
@@ -337,7 +336,7 @@ def _telemetry_check(found: _Found) -> Check:
     if not found.wheel_samples:
         return Check(name, Level.FAIL, f"{rates}; check the encoders and the firmware")
     if not found.poses:
-        why = found.pose_news and f"; {found.pose_news}"
+        why = found.pose_message and f"; {found.pose_message}"
         return Check(
             name, Level.WARNING, f"{rates}{why}; without a pose the task does not start if estimation.pose_required"
         )

@@ -21,13 +21,13 @@ import msgspec
 import numpy as np
 from msgspec.structs import asdict as asdict_of
 
-from disco_hw.daemon import REMEDY, peer_uid
+from disco_hw.daemon import HINT, peer_uid
 from disco_hw.daemon.loop import LoopStats
 from disco_hw.errors import InputError
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.runtime.core import DaemonCore
-from disco_hw.runtime.robot_setup import asked_of, limits
+from disco_hw.runtime.robot_setup import limits, requested_task
 from drivers.private_files import why_not_private
 from drivers.types import Driver
 
@@ -89,7 +89,7 @@ class ControlServer:
         self._allowed_uids = frozenset({os.geteuid(), 0} if allowed_uids is None else allowed_uids)
         self._clients: dict[int, _Client] = {}
         self._activity = 0
-        _make_private_directory(path.parent)
+        _create_private_directory(path.parent)
         self._lock_fd = _lock(path)
         try:
             self._listener = _listen(path)
@@ -170,13 +170,13 @@ class ControlServer:
         client.incoming = bytearray(rest)
         for line in lines:
             if line.strip():
-                self._take_line(number, client, line)
+                self._handle_line(number, client, line)
             if client.finished:
                 return
         if len(rest) > _MAX_LINE_BYTES:
             self._refuse(client, f"a request may have {_MAX_LINE_BYTES} bytes")
 
-    def _take_line(self, number: int, client: _Client, line: bytes) -> None:
+    def _handle_line(self, number: int, client: _Client, line: bytes) -> None:
         try:
             request = msgspec.json.decode(line, type=dict[str, Any])
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
@@ -220,16 +220,16 @@ class ControlServer:
             client.connection.close()
 
 
-def _make_private_directory(directory: Path) -> None:
+def _create_private_directory(directory: Path) -> None:
     """Create the directory for its owner alone; refuse one in which others could swap the socket."""
     try:
         with contextlib.suppress(FileExistsError):
             directory.mkdir(mode=0o700, parents=True)
         why = why_not_private(directory, {os.geteuid(), 0})
     except OSError as error:
-        raise InputError(f"{directory}: cannot hold the control socket ({error.strerror}); {REMEDY}") from None
+        raise InputError(f"{directory}: cannot hold the control socket ({error.strerror}); {HINT}") from None
     if why is not None:
-        raise InputError(f"{directory}: {why}; {REMEDY}")
+        raise InputError(f"{directory}: {why}; {HINT}")
 
 
 def _lock(path: Path) -> int:
@@ -238,7 +238,7 @@ def _lock(path: Path) -> int:
     try:
         descriptor = os.open(lock_path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     except OSError as error:
-        raise InputError(f"{lock_path}: cannot be opened ({error.strerror}); {REMEDY}") from None
+        raise InputError(f"{lock_path}: cannot be opened ({error.strerror}); {HINT}") from None
     try:
         # A record lock, as a child made by fork() does not hold it on when the daemon dies.
         fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -256,7 +256,7 @@ def _listen(path: Path) -> socket.socket:
     if path.is_socket():
         path.unlink()
     elif os.path.lexists(path):
-        raise InputError(f"{path}: not a socket; remove it, or {REMEDY}")
+        raise InputError(f"{path}: not a socket; remove it, or {HINT}")
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         # On Linux the mode of the unbound socket becomes that of the file, so it is never open to others.
@@ -266,7 +266,7 @@ def _listen(path: Path) -> socket.socket:
         listener.setblocking(False)
     except OSError as error:
         listener.close()
-        raise InputError(f"{path}: cannot be made ({error.strerror or error}); {REMEDY}") from None
+        raise InputError(f"{path}: cannot be made ({error.strerror or error}); {HINT}") from None
     return listener
 
 
@@ -316,11 +316,11 @@ def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> d
         "source": tick.pipeline.source.value,
         "task": {
             "laps": core.progress.laps,
-            "progress": core.progress.in_words(),
+            "progress": core.progress.describe(),
             "length_m": core.course.length_m,
             "distance_m": distance,
             "speed_m_s": estimate.speed_m_s,
-            "asked": asked_of(task),
+            "asked": requested_task(task),
             "limits": limits(core.config.robot, task),
             "labels": {name: field.label for name, field in task.editable(core.config.robot).items()},
             "note": task.editing_note(core.config.robot),
@@ -345,7 +345,7 @@ def _poses(core: DaemonCore) -> list[dict[str, Any]]:
     found = sources.status(0 if tick is None else tick.pipeline.t_ns)
     return [
         {**one, "heading": heading.value, "origin": list(named.origin), "offset": list(named.offset)}
-        for one, heading, named in zip(found, core.pipeline.headings.held, core.config.pose.every(), strict=True)
+        for one, heading, named in zip(found, core.pipeline.headings.current, core.config.pose.every(), strict=True)
     ]
 
 
@@ -353,8 +353,8 @@ def _controller(driver: Driver) -> dict[str, Any] | None:
     identity, kept = driver.identity, driver.limits
     if identity is None or kept is None:
         return None
-    said = {name: asdict(limit) for name, limit in kept.known().items()}
-    return {**asdict(identity), "words": identity.in_words(), "limits": said}
+    known_limits = {name: asdict(limit) for name, limit in kept.known().items()}
+    return {**asdict(identity), "words": identity.describe(), "limits": known_limits}
 
 
 def _microseconds(summary: dict[str, float]) -> dict[str, float]:

@@ -7,14 +7,14 @@ from collections.abc import Callable
 from typing import Any
 
 from disco_hw import processes
-from disco_hw.daemon import ADAPT_ACTIONS, FENCE, OBSTACLE, PAGE_ACTIONS, TASK, UNRECORDED_REMEDY
+from disco_hw.daemon import ADAPT_ACTIONS, FENCE, OBSTACLE, PAGE_ACTIONS, TASK, UNRECORDED_HINT
 from disco_hw.daemon.control_socket import ControlMessage, ControlServer, counters, loop_figures, status
 from disco_hw.daemon.loop import Clock, Loop
 from disco_hw.daemon.page_feed import WatchedRecorder
 from disco_hw.daemon.process import Notifier, StopSignals, Waiting
 from disco_hw.fence.task_line import task_breach
 from disco_hw.log import records
-from disco_hw.runtime import Ask, State, advice, headline, records_of_tick
+from disco_hw.runtime import AdviceStyle, State, advice, headline, records_of_tick
 from disco_hw.runtime.core import CoreTick, DaemonCore, Pilot
 from disco_hw.runtime.obstacles import ObstacleRefused
 from disco_hw.runtime.robot_setup import TaskRefused, changed_task
@@ -30,7 +30,7 @@ _FAN_NS = _SECOND_NS
 _WATCHED_FAN_NS = _SECOND_NS // 2
 _FAN_PATHS = 16
 
-Say = Callable[[str, str], None]
+Report = Callable[[str, str], None]
 
 
 class Daemon:
@@ -43,19 +43,19 @@ class Daemon:
         recorder: WatchedRecorder,
         clock: Clock,
         signals: StopSignals,
-        say: Say,
+        report: Report,
         pilot: Pilot,
-        ask: Ask | None = None,
-        page_news: Callable[[], tuple[str, ...]] = lambda: (),
+        advice_style: AdviceStyle | None = None,
+        page_messages: Callable[[], tuple[str, ...]] = lambda: (),
     ) -> None:
-        self._ask = ask
-        self._page_news = page_news
+        self._advice_style = advice_style
+        self._page_messages = page_messages
         self._waiting = Waiting()
         self._core = core
         self._server = server
         self._recorder = recorder
         self._clock = clock
-        self._say = say
+        self._report = report
         self._loop = Loop(clock, core.config.control.rate_hz)
         self._loop_figures = loop_figures(self._loop.stats)
         self._recorder_stats = recorder.poll()
@@ -70,7 +70,7 @@ class Daemon:
         self._next_collect_ns = 0
         self._next_fan_ns = 0
         self._fan: tuple[records.Record, ...] = ()
-        self._told_ready = False
+        self._ready_reported = False
 
     def run(self) -> int:
         """Run the loop until requested to stop; returns the exit code. An exception is reported and ends it."""
@@ -78,10 +78,10 @@ class Daemon:
             self._loop.run(self._tick, lambda: self._quit or self._signals.received is not None or self._pilot.done)
         except Exception as error:
             self._failed = True
-            self._say("failed", f"{type(error).__name__}: {error}; stopping the robot")
+            self._report("failed", f"{type(error).__name__}: {error}; stopping the robot")
             raise
         if self._signals.received is not None:
-            self._say("daemon", f"{self._signals.received.name}: stopping")
+            self._report("daemon", f"{self._signals.received.name}: stopping")
         return 0
 
     def stop_wheels(self) -> None:
@@ -134,28 +134,28 @@ class Daemon:
                 self._change_task(message)
             elif message.action in {OBSTACLE, FENCE}:
                 self._change_area(now_ns, message)
-        wanted = self._pilot.step(now_ns, self._core.last)
-        events = tuple(records.Event(now_ns, "info", "drive", text) for text in wanted.events)
+        desired = self._pilot.step(now_ns, self._core.last)
+        events = tuple(records.Event(now_ns, "info", "drive", text) for text in desired.events)
         mark("control")
         tick = self._core.tick(
             now_ns,
-            (*requests, *wanted.requests),
-            (self._timing(now_ns), *self._mind_recorder(now_ns), *self._every_second(now_ns), *self._fan, *events),
+            (*requests, *desired.requests),
+            (self._timing(now_ns), *self._monitor_recorder(now_ns), *self._every_second(now_ns), *self._fan, *events),
             mark,
-            wanted.motion,
-            wanted.by_hand,
+            desired.motion,
+            desired.by_hand,
         )
-        self._answer(messages, tick.replies)
+        self._handle_messages(messages, tick.replies)
         self._fan = self._look_at_samples(now_ns) if tick.pipeline.plan is not None else ()
         self._pilot.learn(now_ns, tick, tick.replies[len(requests) :])
-        for text in wanted.events:
-            self._say("drive", text)
+        for text in desired.events:
+            self._report("drive", text)
         for text in tick.events:
-            self._say("event", text)
+            self._report("event", text)
         state = tick.output.state
-        if not self._told_ready:
+        if not self._ready_reported:
             self._notifier.ready()
-            self._told_ready = True
+            self._ready_reported = True
         self._notifier.watchdog(now_ns)
         if state is not State.ARMED and now_ns >= self._next_collect_ns:
             # The collector is off; what cycles there are go while nobody depends on the loop.
@@ -188,21 +188,24 @@ class Daemon:
         self._next_fan_ns = now_ns + (_WATCHED_FAN_NS if self._recorder.watched else _FAN_NS)
         return (records_of_tick.fan(now_ns, rollouts),)
 
-    def _mind_recorder(self, now_ns: int) -> tuple[records.Record, ...]:
+    def _monitor_recorder(self, now_ns: int) -> tuple[records.Record, ...]:
         """Look after the recorder ten times a second; what happens to it and to the page becomes events."""
         if now_ns < self._next_recorder_ns:
             return ()
         self._next_recorder_ns = now_ns + _RECORDER_NS
         last = self._core.last
         if last is None or last.output.state not in {State.ARMED, State.STOPPING}:
-            self._recorder.tend()
+            self._recorder.repair()
         self._recorder_stats = self._recorder.poll()
         self._core.recording_fault = self._recorder_stats.fault
-        news = self._recorder.news()
-        for sentence in news:
-            self._say("recording", sentence)
+        messages = self._recorder.new_messages()
+        for sentence in messages:
+            self._report("recording", sentence)
         # What becomes of the page is on standard error already.
-        coded = [*(("recording", sentence) for sentence in news), *(("page", text) for text in self._page_news())]
+        coded = [
+            *(("recording", sentence) for sentence in messages),
+            *(("page", text) for text in self._page_messages()),
+        ]
         return tuple(records.Event(now_ns, "warning", code, sentence) for code, sentence in coded)
 
     def _every_second(self, now_ns: int) -> tuple[records.Record, ...]:
@@ -212,16 +215,16 @@ class Daemon:
         self._loop_figures = loop_figures(self._loop.stats)
         last = self._core.last
         if last is not None:
-            self._tell_state(last)
+            self._report_state(last)
         stolen_ms = processes.stolen_ms() - self._stolen_before_ms
         return (counters(self._core, self._loop.stats, self._recorder_stats, now_ns, stolen_ms),)
 
-    def _tell_state(self, last: CoreTick) -> None:
+    def _report_state(self, last: CoreTick) -> None:
         """Say how things are and what to do, to the service manager and to whoever reads the output."""
         output, robot = last.output, self._core.robot_status
         head, detail = headline(output.state.name, output.detail, output.running, output.estop)
         self._notifier.status(f"{head}: {detail}")
-        if self._ask is None:
+        if self._advice_style is None:
             return
         known = {
             **self._pilot.status(),
@@ -231,9 +234,9 @@ class Daemon:
             "robot_state": "UNKNOWN" if robot is None else robot.state,
             "fault": "UNKNOWN" if robot is None else robot.fault,
         }
-        words = " ".join((f"{head}: {detail}.", *advice(known, self._ask)))
-        if self._waiting.is_worth_saying(output.state, words):
-            self._say("state", words)
+        text = " ".join((f"{head}: {detail}.", *advice(known, self._advice_style)))
+        if self._waiting.should_report(output.state, text):
+            self._report("state", text)
 
     def _steer(self, now_ns: int, message: ControlMessage) -> None:
         """Hand what a page wants to the pilot; the reply's stamp is what its next request must carry."""
@@ -250,7 +253,7 @@ class Daemon:
         state = State.DISCONNECTED if last is None else last.output.state
         try:
             if message.action == OBSTACLE:
-                text = area.ask(now_ns, message.arguments)
+                text = area.handle_request(now_ns, message.arguments)
             elif set(message.arguments) == {"override"}:
                 text = area.override(now_ns, message.arguments["override"] is True)
             else:
@@ -258,7 +261,7 @@ class Daemon:
         except (ObstacleRefused, FenceRefused) as refused:
             self._server.reply(message, {"ok": False, "error": str(refused)})
             return
-        self._say("fence", text)
+        self._report("fence", text)
         self._server.reply(message, {"ok": True, "text": text})
 
     def _change_task(self, message: ControlMessage) -> None:
@@ -275,11 +278,11 @@ class Daemon:
             self._server.reply(message, {"ok": False, "error": str(refused)})
             return
         self._core.set_task(task)
-        text = task.in_words()
-        self._say("task", text)
+        text = task.describe()
+        self._report("task", text)
         self._server.reply(message, {"ok": True, "text": text})
 
-    def _answer(self, messages: list[ControlMessage], replies: tuple[Reply, ...]) -> None:
+    def _handle_messages(self, messages: list[ControlMessage], replies: tuple[Reply, ...]) -> None:
         """Answer what is not answered yet: requests to the supervisor with its words, the others here."""
         remaining = list(replies)
         for message in messages:
@@ -290,9 +293,9 @@ class Daemon:
                 body: dict[str, Any] = {"ok": reply.accepted}
                 body["text" if reply.accepted else "error"] = reply.text
                 if reply.request is UserRequest.ARM and not reply.accepted and reply.text == self._core.recording_fault:
-                    body |= {"error": f"{reply.text}; {UNRECORDED_REMEDY}", "unrecorded": True}
+                    body |= {"error": f"{reply.text}; {UNRECORDED_HINT}", "unrecorded": True}
             elif message.action in ADAPT_ACTIONS:
-                obeyed, text = self._core.adaptation.ask(message.action)
+                obeyed, text = self._core.adaptation.handle_request(message.action)
                 body = {"ok": obeyed, "text" if obeyed else "error": text}
             elif message.action == "quit":
                 self._quit = True

@@ -34,7 +34,7 @@ _REPEATS = 3
 _CONNECT_S = 1.0
 _CONFIRM_S = 0.5
 _FRAME_LIFE_NS = 1_000_000_000
-_REMEDY = (
+_HINT = (
     "to stop it all the same give --link can:INTERFACE:CHANNEL or --link serial:PORT, "
     "or use the robot's own e-stop button, now"
 )
@@ -109,25 +109,25 @@ def stop_robot(robot: Path, link: str | None = None, kept: Mapping[str, Any] | N
     try:
         settings, file_error = _settings(robot, raw, file_error, link)
     except InputError as error:
-        confirmed, daemon_error = _ask_daemon(socket_path)
+        confirmed, daemon_error = _request_stop(socket_path)
         if daemon_error is not None:
-            raise InputError(f"{error}; {_REMEDY}") from None
+            raise InputError(f"{error}; {_HINT}") from None
         return EstopOutcome("link", str(error), None, confirmed, refused)
     driver = find_driver(settings.driver)
-    frames, heard = driver.stop_frames(settings.settings()), driver.stop_confirmation(settings.settings())
+    frames, is_confirmation = driver.stop_frames(settings.settings()), driver.stop_confirmation(settings.settings())
     is_serial = settings.kind == "serial"
     way = _stop_over_serial if is_serial else _stop_over_transport
     address = settings.port if is_serial else f"{settings.interface} {settings.channel}"
     outcome = EstopOutcome(address, None, None, False, refused, file_error, driver.latches_stop)
     if is_serial and driver.exchange is not None:
         # Two that speak at once on such a line spoil each other's packets: the daemon first, which has it.
-        daemon_confirmed, daemon_error = _ask_daemon(socket_path)
+        daemon_confirmed, daemon_error = _request_stop(socket_path)
         if daemon_error is None:
             return replace(outcome, link_error="left to the daemon, which has it", confirmed=daemon_confirmed)
-        confirmed, link_error = _attempt(partial(_stop_over_exchange, settings, frames, heard))
+        confirmed, link_error = _attempt(partial(_stop_over_exchange, settings, frames, is_confirmation))
     else:
-        confirmed, link_error = _attempt(partial(way, settings, frames, heard))
-        daemon_confirmed, daemon_error = _ask_daemon(socket_path)
+        confirmed, link_error = _attempt(partial(way, settings, frames, is_confirmation))
+        daemon_confirmed, daemon_error = _request_stop(socket_path)
     return replace(outcome, link_error=link_error, daemon_error=daemon_error, confirmed=confirmed or daemon_confirmed)
 
 
@@ -180,7 +180,7 @@ def _socket_path(raw: dict[str, Any]) -> Path | None:
     return None
 
 
-def _stop_over_transport(settings: Link, frames: Sequence[Frame], heard: Callable[[Frame], bool]) -> bool:
+def _stop_over_transport(settings: Link, frames: Sequence[Frame], is_confirmation: Callable[[Frame], bool]) -> bool:
     transport = open_transport(**settings.medium_fields())
     try:
         deadline_ns = time.monotonic_ns() + round(_CONNECT_S * 1e9)
@@ -188,18 +188,18 @@ def _stop_over_transport(settings: Link, frames: Sequence[Frame], heard: Callabl
             if time.monotonic_ns() > deadline_ns:
                 raise ConnectionError(transport.last_error or "the link did not come up")
             time.sleep(0.002)
-        asked_ns = time.monotonic_ns()
+        requested_ns = time.monotonic_ns()
         for frame in _REPEATS * tuple(frames):
             now_ns = time.monotonic_ns()
             if not transport.send(OutgoingFrame(frame, now_ns + _FRAME_LIFE_NS), now_ns):
                 raise ConnectionError(transport.last_error or "the frame could not be queued")
         # What was under way before says nothing about this request.
-        return _confirmed(lambda: [r.frame for r in transport.receive() if r.t_ns >= asked_ns], heard)
+        return _confirmed(lambda: [r.frame for r in transport.receive() if r.t_ns >= requested_ns], is_confirmation)
     finally:
         transport.close()
 
 
-def _stop_over_serial(settings: Link, frames: Sequence[Frame], heard: Callable[[Frame], bool]) -> bool:
+def _stop_over_serial(settings: Link, frames: Sequence[Frame], is_confirmation: Callable[[Frame], bool]) -> bool:
     # Not exclusive: the daemon may hold the port, and must not be able to keep the stop from the robot.
     medium = SerialMedium(settings.port, settings.baud, settings.dtr, settings.rts)
     with open_port(medium, timeout_s=0.01, write_timeout_s=0.5, exclusive=False) as port:
@@ -214,10 +214,10 @@ def _stop_over_serial(settings: Link, frames: Sequence[Frame], heard: Callable[[
                 return [Frame(*each) for each in decoder.feed(port.read(max(1, port.in_waiting)))]
             return []
 
-        return _confirmed(receive, heard)
+        return _confirmed(receive, is_confirmation)
 
 
-def _stop_over_exchange(settings: Link, frames: Sequence[Frame], heard: Callable[[Frame], bool]) -> bool:
+def _stop_over_exchange(settings: Link, frames: Sequence[Frame], is_confirmation: Callable[[Frame], bool]) -> bool:
     """Packet by packet, each with its reply, again and again until the robot confirms or the time is over."""
     driver = find_driver(settings.driver)
     assert driver.exchange is not None
@@ -236,18 +236,18 @@ def _stop_over_exchange(settings: Link, frames: Sequence[Frame], heard: Callable
                         raise
                 else:
                     went_out = True
-                    confirmed = (reply is not None and heard(reply)) or confirmed
+                    confirmed = (reply is not None and is_confirmation(reply)) or confirmed
             if time.monotonic_ns() > deadline_ns:
                 break
     return confirmed
 
 
-def _confirmed(receive: Callable[[], list[Frame]], heard: Callable[[Frame], bool]) -> bool:
+def _confirmed(receive: Callable[[], list[Frame]], is_confirmation: Callable[[Frame], bool]) -> bool:
     """Whether the robot reports the e-stop within the waiting time."""
     deadline_ns = time.monotonic_ns() + round(_CONFIRM_S * 1e9)
     while time.monotonic_ns() < deadline_ns:
         # Each frame counts: several controllers confirm one after the other.
-        if True in [heard(frame) for frame in receive()]:
+        if True in [is_confirmation(frame) for frame in receive()]:
             return True
         time.sleep(0.002)
     return False
@@ -262,11 +262,11 @@ def _is_served(socket_path: Path) -> bool:
     return socket_path.exists()
 
 
-def _ask_daemon(socket_path: Path | None) -> tuple[bool, str | None]:
+def _request_stop(socket_path: Path | None) -> tuple[bool, str | None]:
     try:
         if socket_path is None or not _is_served(socket_path):
             return False, "not running"
-        asked_ns = time.monotonic_ns()
+        requested_ns = time.monotonic_ns()
         reply = send_request(socket_path, {"do": "estop"}, timeout_s=0.5)
         if not reply.get("ok"):
             return False, str(reply.get("error"))
@@ -275,7 +275,7 @@ def _ask_daemon(socket_path: Path | None) -> tuple[bool, str | None]:
         while time.monotonic_ns() < deadline_ns:
             status = send_request(socket_path, {"do": "status"}, timeout_s=0.5)
             # What the robot said before the request is no answer to it.
-            if status.get("robot_state") == "ESTOP" and status["robot_state_ns"] >= asked_ns:
+            if status.get("robot_state") == "ESTOP" and status["robot_state_ns"] >= requested_ns:
                 return True, None
             link = status.get("link")
             time.sleep(0.02)
@@ -286,7 +286,7 @@ def _ask_daemon(socket_path: Path | None) -> tuple[bool, str | None]:
     return False, None
 
 
-def stop_and_say(robot: Path, link: str | None, as_json: bool) -> int:
+def stop_and_report(robot: Path, link: str | None, as_json: bool) -> int:
     """Stop the robot, print the outcome, and return the exit code: 0 only if the robot confirmed that it is stopped."""
     outcome = stop_robot(robot, link)
     print(json_of(outcome.as_dict()) if as_json else outcome.as_text())

@@ -91,11 +91,11 @@ class Histogram:
         if not self._count:
             return math.nan
         # Rounded first: 99.9 % of 41000 is 40959, not the next integer above 40959.00000000001.
-        wanted = max(1, math.ceil(round(percent * self._count / 100.0, 6)))
+        rank = max(1, math.ceil(round(percent * self._count / 100.0, 6)))
         seen = 0
         for bucket, count in enumerate(self._counts):
             seen += count
-            if seen >= wanted:
+            if seen >= rank:
                 return float(min(_upper_edge_ns(bucket), self._max_ns))
         return float(self._max_ns)
 

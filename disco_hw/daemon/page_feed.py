@@ -150,13 +150,13 @@ class WatchedRecorder:
         """Return the counters of the recorder."""
         return self._recorder.poll()
 
-    def news(self) -> tuple[str, ...]:
+    def new_messages(self) -> tuple[str, ...]:
         """Return the news of the recorder."""
-        return self._recorder.news()
+        return self._recorder.new_messages()
 
-    def tend(self) -> None:
+    def repair(self) -> None:
         """Let the recorder repair what takes milliseconds."""
-        self._recorder.tend()
+        self._recorder.repair()
 
     def close(self, timeout_s: float = 5.0) -> RecorderStats:
         """Close the log and return its counters; the feeds are closed by their owner."""

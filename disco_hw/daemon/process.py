@@ -200,14 +200,14 @@ class AsyncPrinter:
             self._thread = threading.Thread(target=self._write, name="async printer", daemon=True)
             self._thread.start()
         if self._lines.qsize() < self._most:
-            self._put(topic, text)
+            self._enqueue(topic, text)
         else:
             self.dropped += 1
 
     def close(self, timeout_s: float = 1.0) -> None:
         """Wait at most `timeout_s` until everything is written; safe to call twice."""
         if self.dropped:
-            self._put(
+            self._enqueue(
                 "output", f"{self.dropped} messages are missing here, because the output was not read fast enough"
             )
             self.dropped = 0
@@ -215,7 +215,7 @@ class AsyncPrinter:
             self._lines.put(None)
             self._thread.join(timeout_s)
 
-    def _put(self, topic: str, text: str) -> None:
+    def _enqueue(self, topic: str, text: str) -> None:
         self._lines.put(f"{self._line_of(topic, text)}\n".encode(errors="surrogateescape"))
 
     def _write(self) -> None:
@@ -235,13 +235,13 @@ class Waiting:
     """Asked once a second; what stays the same for a minute is then said once a minute, as a journal is not endless."""
 
     def __init__(self) -> None:
-        self._said = ""
+        self._last_detail = ""
         self._repeated = 0
 
-    def is_worth_saying(self, state: State, words: str) -> bool:
+    def should_report(self, state: State, detail: str) -> bool:
         """Whether these words of this state should be said now."""
-        if words != self._said:
-            self._said, self._repeated = words, 0
+        if detail != self._last_detail:
+            self._last_detail, self._repeated = detail, 0
             return True
         self._repeated += 1
         return state in _WAITS_FOR_ROBOT and (self._repeated < _PATIENT_AFTER or self._repeated % _EVERY == 0)

@@ -28,9 +28,9 @@ from disco_hw import processes
 from disco_hw.adaptation.guard import AdaptationChoice, AdaptationKind, check_adaptable, choose_adaptation
 from disco_hw.config import RobotConfig
 from disco_hw.control.plan import Law, LawController
-from disco_hw.daemon import SERVED, passed_over, recording_in_words, socket_path
+from disco_hw.daemon import SERVED, describe_recording, passed_over, socket_path
 from disco_hw.daemon.control_socket import ControlServer
-from disco_hw.daemon.daemon import Daemon, Say
+from disco_hw.daemon.daemon import Daemon, Report
 from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path, tick_feed_path
 from disco_hw.daemon.process import STANDARD_OUTPUT, AsyncPrinter, StopPath, StopSignals
@@ -39,17 +39,17 @@ from disco_hw.files import check_log_file, file_name_of
 from disco_hw.log import DBC, Attachment, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, RecordingSettings
 from disco_hw.processes import end_with_parent
-from disco_hw.runtime import Ask, by_command
+from disco_hw.runtime import AdviceStyle, by_command
 from disco_hw.runtime.assembly import (
     assemble_core,
+    create_link,
+    create_pipeline,
+    create_planner,
     driver_of,
     make_adaptation,
-    make_link,
-    make_pipeline,
-    make_planner,
 )
 from disco_hw.runtime.core import FindsWiring, Pilot, TaskPilot
-from disco_hw.runtime.pipeline import FollowTask, NoPlanner, Off, Pipeline, Planner, Stand
+from disco_hw.runtime.pipeline import FollowTask, NoPlanner, Off, Pipeline, Planner, StandstillTracker
 from disco_hw.runtime.robot_setup import Setup, kept_files, link_key, load_setup, refuse_missing_effects, scene_of
 from drivers.kernel_cache import are_kernels_kept
 from drivers.types import PoseSample, Readings, Transport, WheelSample
@@ -92,14 +92,14 @@ def run_robot(
 
 def run_daemon(
     options: DaemonOptions,
-    make_pilot: Callable[[RobotConfig], Pilot] = lambda _config: TaskPilot(),
+    create_pilot: Callable[[RobotConfig], Pilot] = lambda _config: TaskPilot(),
     law: Law | None = None,
-    page_news: Callable[[], tuple[str, ...]] = lambda: (),
+    page_messages: Callable[[], tuple[str, ...]] = lambda: (),
 ) -> int:
     """Run until SIGTERM, SIGINT or a quit request; returns the exit code, after a stop was sent to the robot.
 
-    `make_pilot`: of who drives; the task alone, unless it is said. `law`: plans in DISCO's place. `page_news`: what
-    happened to the page, to be recorded.
+    `create_pilot`: of who drives; the task alone, unless it is said. `law`: plans in DISCO's place. `page_messages`:
+    what happened to the page, to be recorded.
     Raises InputError, before anything is opened, if a file or an option is wrong. An exception in the loop is reported,
     the robot stopped, and the exception passed on.
     """
@@ -112,18 +112,18 @@ def run_daemon(
         check_adaptable(setup.model, setup.config.control.uncertainty)
     else:
         chosen = choose_adaptation(setup.config.control, setup.config.pose, setup.model)
-    with closing(AsyncPrinter(STANDARD_OUTPUT, in_json if options.as_json else in_text)) as say:
+    with closing(AsyncPrinter(STANDARD_OUTPUT, in_json if options.as_json else in_text)) as report:
         if chosen.report:
-            say("adapt", chosen.report)
+            report("adapt", chosen.report)
         return serve(
             setup,
             options.log_file,
-            say,
-            make_pilot(setup.config),
-            lambda: make_planner(setup.config, setup.model) if law is None else _controller(law, setup),
+            report,
+            create_pilot(setup.config),
+            lambda: create_planner(setup.config, setup.model) if law is None else _controller(law, setup),
             chosen.kind,
             by_command(options.robot),
-            page_news,
+            page_messages,
         )
 
 
@@ -134,12 +134,12 @@ def _controller(law: Law, setup: Setup) -> LawController:
 def serve(
     setup: Setup,
     log_file: Path | None,
-    say: Say,
+    report: Report,
     pilot: Pilot,
     new_planner: Callable[[], Planner] = NoPlanner,
     adapt: AdaptationKind = "off",
-    ask: Ask | None = None,
-    page_news: Callable[[], tuple[str, ...]] = lambda: (),
+    advice_style: AdviceStyle | None = None,
+    page_messages: Callable[[], tuple[str, ...]] = lambda: (),
 ) -> int:
     """Run until SIGTERM, SIGINT, a quit request or the pilot's end, as `run_daemon`; returns the exit code.
 
@@ -148,22 +148,33 @@ def serve(
     while driving; not where an operator drives. `ask`: how a person asks for what comes next; with it the daemon says
     what it waits for, what to do, and where the log is. Raises InputError.
     """
-    key, transport = link_key(setup), make_link(setup)
+    key, transport = link_key(setup), create_link(setup)
     # Before the signals are caught: whoever has enough of a compilation may break it off, as nothing is open yet.
-    planner = compiled_elsewhere(lambda: warm_planner(setup, new_planner), planner_in_words(setup), _progress)
-    pipeline = make_pipeline(setup.config, setup.model, planner)
+    planner = compiled_elsewhere(lambda: warm_planner(setup, new_planner), describe_planner(setup), _progress)
+    pipeline = create_pipeline(setup.config, setup.model, planner)
     stop = StopPath()
     with StopSignals() as signals:
         try:
             code = _start(
-                setup, key, transport, pipeline, log_file, signals, stop, say, pilot, adapt, ask, page_news
+                setup,
+                key,
+                transport,
+                pipeline,
+                log_file,
+                signals,
+                stop,
+                report,
+                pilot,
+                adapt,
+                advice_style,
+                page_messages,
             ).run()
         finally:
             # Whatever is interrupted here, the wheels come first: they were added last.
             outcomes = stop.run()
             for outcome in outcomes:
                 if not outcome.ok:
-                    say("stop", f"{outcome.name}: {outcome.error}")
+                    report("stop", f"{outcome.name}: {outcome.error}")
         return code or int(any(outcome.name == _RECORDER and not outcome.ok for outcome in outcomes))
 
 
@@ -175,11 +186,11 @@ def _start(
     log_file: Path | None,
     signals: StopSignals,
     stop: StopPath,
-    say: Say,
+    report: Report,
     pilot: Pilot,
     adapt: AdaptationKind,
-    ask: Ask | None,
-    page_news: Callable[[], tuple[str, ...]],
+    advice_style: AdviceStyle | None,
+    page_messages: Callable[[], tuple[str, ...]],
 ) -> Daemon:
     """Make everything, in the order that real time needs, and add to the stop path what must be undone."""
     config = setup.config
@@ -191,15 +202,15 @@ def _start(
     ticks = ViewerFeed(tick_feed_path(server.path), period_s=0.0)
     stop.add("tick feed", ticks.close)
     log = _log_path(config, log_file)
-    recorder = WatchedRecorder(_make_recorder(setup, log), feed, ticks)
-    if ask is not None and log is not None:
-        stop.add("log", lambda: say("log", f"look at it: disco-hw view {log}, or disco-hw log info {log}"))
-    stop.add(_RECORDER, lambda: _close_recorder(recorder, say))
+    recorder = WatchedRecorder(_create_recorder(setup, log), feed, ticks)
+    if advice_style is not None and log is not None:
+        stop.add("log", lambda: report("log", f"look at it: disco-hw view {log}, or disco-hw log info {log}"))
+    stop.add(_RECORDER, lambda: _close_recorder(recorder, report))
     adaptation = make_adaptation(setup, pipeline, adapt)
     for step in processes.enter_real_time(config.daemon.realtime_priority):
-        say("real time", str(step))
+        report("real time", str(step))
     for line in passed_over(server.path):
-        say("control socket", line)
+        report("control socket", line)
     transport.open()
     stop.add("link", transport.close)
     driver = driver_of(config, key)
@@ -209,14 +220,14 @@ def _start(
     stop.add("obstacle source", core.obstacle_source.close)
     if isinstance(pilot, FindsWiring):
         core.directions = None
-    daemon = Daemon(core, server, recorder, MonotonicClock(), signals, say, pilot, ask, page_news)
+    daemon = Daemon(core, server, recorder, MonotonicClock(), signals, report, pilot, advice_style, page_messages)
     stop.add("wheels", daemon.stop_wheels)
     if config.daemon.realtime_priority:
-        say("real time", str(processes.raise_loop_thread(config.daemon.realtime_priority)))
-    say("daemon", f"{transport.name}, control socket {server.path}")
-    if ask is not None:
-        say("log", f"recording to {log}" if log is not None else "nothing is recorded, as log.enabled is false")
-        say("next", f"once it says READY, {ask('arm')}, then {ask('start')}")
+        report("real time", str(processes.raise_loop_thread(config.daemon.realtime_priority)))
+    report("daemon", f"{transport.name}, control socket {server.path}")
+    if advice_style is not None:
+        report("log", f"recording to {log}" if log is not None else "nothing is recorded, as log.enabled is false")
+        report("next", f"once it says READY, {advice_style('arm')}, then {advice_style('start')}")
     return daemon
 
 
@@ -234,7 +245,7 @@ def _log_path(config: RobotConfig, log_file: Path | None) -> Path | None:
     return Path(config.log.directory) / f"{file_name_of(config.robot.name)}-{stamp}.mcap"
 
 
-def _make_recorder(setup: Setup, log: Path | None) -> Recorder:
+def _create_recorder(setup: Setup, log: Path | None) -> Recorder:
     if log is None:
         return NullRecorder()
     attachments = [*kept_files(setup), Attachment(DBC, "text/plain", packaged_dbc().encode())]
@@ -243,14 +254,14 @@ def _make_recorder(setup: Setup, log: Path | None) -> Recorder:
     return ProcessRecorder(RecordingSettings(log, name, version=version(), attachments=tuple(attachments), scene=scene))
 
 
-def _close_recorder(recorder: Recorder, say: Say) -> None:
+def _close_recorder(recorder: Recorder, report: Report) -> None:
     """End the log and report where its ticks are; raises LogError if some are in no file."""
     stats = recorder.close()
-    for sentence in recorder.news():
-        say("recording", sentence)
+    for sentence in recorder.new_messages():
+        report("recording", sentence)
     if stats.path:
         # No fault: of those `drive` makes a drive that is not whole.
-        say("log", recording_in_words(asdict(stats)))
+        report("log", describe_recording(asdict(stats)))
     if stats.waiting_ticks or stats.dropped_ticks:
         raise LogError("the log is not whole; free space on its disk before the next drive")
 
@@ -277,8 +288,8 @@ _EVERY_S = 1.0
 class _Compilation(event.Listener):
     """Counts the functions that are compiled, and says so again and again from a thread that begins with the first."""
 
-    def __init__(self, what: str, say: Callable[[str], None], every_s: float) -> None:
-        self._what, self._say, self._every_s = what, say, every_s
+    def __init__(self, what: str, report: Callable[[str], None], every_s: float) -> None:
+        self._what, self._report, self._every_s = what, report, every_s
         self._count = 0
         self._began_ns = 0
         self._ended = threading.Event()
@@ -286,9 +297,9 @@ class _Compilation(event.Listener):
 
     def on_start(self, event: Any) -> None:
         if self._thread is None:
-            self._say(f"compiling {self._what}: takes some seconds, only once; the result is kept")
+            self._report(f"compiling {self._what}: takes some seconds, only once; the result is kept")
             self._began_ns = time.monotonic_ns()
-            self._thread = threading.Thread(target=self._tell, name="compile progress", daemon=True)
+            self._thread = threading.Thread(target=self._report_progress, name="compile progress", daemon=True)
             self._thread.start()
 
     def on_end(self, event: Any) -> None:
@@ -299,23 +310,23 @@ class _Compilation(event.Listener):
         self._ended.set()
         if self._thread is not None:
             self._thread.join()
-            self._say(f"compiled {self._so_far()}")
+            self._report(f"compiled {self._so_far()}")
 
-    def _tell(self) -> None:
+    def _report_progress(self) -> None:
         while not self._ended.wait(self._every_s):
-            self._say(f"compiling: {self._so_far()}")
+            self._report(f"compiling: {self._so_far()}")
 
     def _so_far(self) -> str:
         return f"{self._count} functions, {(time.monotonic_ns() - self._began_ns) * 1e-9:.0f} s"
 
 
 @contextmanager
-def compile_progress(what: str, say: Callable[[str], None], every_s: float = _EVERY_S) -> Iterator[None]:
+def compile_progress(what: str, report: Callable[[str], None], every_s: float = _EVERY_S) -> Iterator[None]:
     """Within the block, say through `say` what numba compiles and how far it is; nothing where its cache has it all.
 
     `what`: for the operator, as "the planner for a circle". `say` is called from a thread, which ends with the block.
     """
-    compilation = _Compilation(what, say, every_s)
+    compilation = _Compilation(what, report, every_s)
     try:
         with event.install_listener(_COMPILE, compilation):
             yield
@@ -337,7 +348,7 @@ class _Refusal(event.Listener):
         pass
 
 
-def compiled_elsewhere(make: Callable[[], T], what: str, say: Callable[[str], None]) -> T:
+def compiled_elsewhere(build: Callable[[], T], what: str, report: Callable[[str], None]) -> T:
     """Return `make()`, after another process has compiled and kept on disk all that it needs.
 
     `make` is called up to three times, once in a fork of this process; so it must open nothing, and no thread may run
@@ -347,21 +358,21 @@ def compiled_elsewhere(make: Callable[[], T], what: str, say: Callable[[str], No
     if are_kernels_kept():
         try:
             with event.install_listener(_COMPILE, _Refusal()):
-                return make()
+                return build()
         except _NothingKeptError:
-            _make_in_a_fork(make, what, say)
-    with compile_progress(what, say):
-        return make()
+            _build_in_fork(build, what, report)
+    with compile_progress(what, report):
+        return build()
 
 
-def _make_in_a_fork(make: Callable[[], object], what: str, say: Callable[[str], None]) -> None:
+def _build_in_fork(build: Callable[[], object], what: str, report: Callable[[str], None]) -> None:
     parent = os.getpid()
 
     def compile_all() -> None:
         end_with_parent(parent, signal.SIGKILL)
         # Whatever is wrong is found, and said, by the caller's own attempt.
-        with suppress(Exception), compile_progress(what, say):
-            make()
+        with suppress(Exception), compile_progress(what, report):
+            build()
 
     process = multiprocessing.get_context("fork").Process(target=compile_all, daemon=True)
     process.start()
@@ -371,7 +382,7 @@ def _make_in_a_fork(make: Callable[[], object], what: str, say: Callable[[str], 
         process.kill()
 
 
-def compile_beforehand(robot: Path, model: Path | None, say: Callable[[str], None]) -> None:
+def compile_beforehand(robot: Path, model: Path | None, report: Callable[[str], None]) -> None:
     """Compile and keep what `run` will need for these files, so that no start waits for it.
 
     Nothing is done where it is kept already, where nothing can be kept, and for files that `run` would refuse.
@@ -383,11 +394,11 @@ def compile_beforehand(robot: Path, model: Path | None, say: Callable[[str], Non
         refuse_missing_effects(setup)
     except InputError:
         return
-    with compile_progress(planner_in_words(setup), say):
-        warm_planner(setup, lambda: make_planner(setup.config, setup.model))
+    with compile_progress(describe_planner(setup), report):
+        warm_planner(setup, lambda: create_planner(setup.config, setup.model))
 
 
-def planner_in_words(setup: Setup) -> str:
+def describe_planner(setup: Setup) -> str:
     """Describe the planner that is compiled for a setup, with the model's effects."""
     effects = ", ".join(effect.name for effect in setup.model.effects)
     return f"the planner for this task{f' and a model with {effects}' if effects else ''}"
@@ -396,7 +407,7 @@ def planner_in_words(setup: Setup) -> str:
 def warm_planner(setup: Setup, new_planner: Callable[[], Planner]) -> Planner:
     """Return a new planner, after all that it will need was run once, by another one."""
     planner = new_planner()
-    warm_up(make_pipeline(setup.config, setup.model, new_planner()))
+    warm_up(create_pipeline(setup.config, setup.model, new_planner()))
     return planner
 
 
@@ -412,7 +423,7 @@ def warm_up(pipeline: Pipeline) -> None:
     pipeline.step(0, Readings(), Off())
     for tick in range(1, _TICKS):
         now_ns = tick * _PERIOD_NS
-        pipeline.step(now_ns, _readings(now_ns, tick), FollowTask() if tick > _ON_THE_WAY else Stand())
+        pipeline.step(now_ns, _readings(now_ns, tick), FollowTask() if tick > _ON_THE_WAY else StandstillTracker())
         pipeline.rollouts(1)
 
 

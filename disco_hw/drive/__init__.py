@@ -58,7 +58,7 @@ class ManualSource(Protocol):
         """Whether the source ended as it should."""
 
     @property
-    def words(self) -> str:
+    def status_text(self) -> str:
         """Text for the operator on what is going on or to be done now."""
 
     @property
@@ -106,7 +106,7 @@ class GamepadSource:
         self._name = pad.name
 
     @property
-    def words(self) -> str:
+    def status_text(self) -> str:
         """Text for the operator on what to hold, or to plug in."""
         if self._pad is None:
             return f"{self._name} is gone; plug it in again"
@@ -144,7 +144,7 @@ class GamepadSource:
         self._name = self._pad.name
 
 
-PAD_WORDS = "page: hold the pad to drive; Ctrl-C ends"
+PAD_STATUS_TEXT = "page: hold the pad to drive; Ctrl-C ends"
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,9 +189,9 @@ class PageSource:
     completed, task = True, ""
 
     def __init__(
-        self, top_rad_s: float, turn_share: float, words: str = PAD_WORDS, limit_ns: int = INPUT_LIMIT_NS
+        self, top_rad_s: float, turn_share: float, status_text: str = PAD_STATUS_TEXT, limit_ns: int = INPUT_LIMIT_NS
     ) -> None:
-        self._words = words
+        self._status_text = status_text
         self._top_rad_s = top_rad_s
         self._turn_share = turn_share
         self._limit_ns = limit_ns
@@ -200,16 +200,16 @@ class PageSource:
         self._newest: ManualInput | None = None
 
     @property
-    def words(self) -> str:
+    def status_text(self) -> str:
         """Text for the operator on what to hold, and where."""
-        return self._words
+        return self._status_text
 
-    def steer(self, now_ns: int, page: int, wanted: Steering) -> str | None:
+    def steer(self, now_ns: int, page: int, steering: Steering) -> str | None:
         """Take in what one page wants; returns why it does not count, in words."""
-        if not wanted.held:
-            self._hear_open(now_ns, page)
+        if not steering.held:
+            self._handle_open(now_ns, page)
             return None
-        if wanted.stamp_ns > now_ns:
+        if steering.stamp_ns > now_ns:
             return "the stamp is from another daemon; release the pad and hold it again"
         if self._holder is None:
             if now_ns - self._open_ns.get(page, -self._limit_ns - 1) > self._limit_ns:
@@ -217,8 +217,8 @@ class PageSource:
             self._holder = page
         if self._holder != page:
             return "another page is driving"
-        left, right = wheel_speeds(wanted.forward, wanted.left * self._turn_share, self._top_rad_s)
-        self._newest = ManualInput(wanted.stamp_ns, left, right, deadman=True)
+        left, right = wheel_speeds(steering.forward, steering.left * self._turn_share, self._top_rad_s)
+        self._newest = ManualInput(steering.stamp_ns, left, right, deadman=True)
         return None
 
     def poll(self, now_ns: int, _robot: RobotView) -> ManualInput | None:
@@ -236,7 +236,7 @@ class PageSource:
     def close(self) -> None:
         """Do nothing, because the source holds no resources."""
 
-    def _hear_open(self, now_ns: int, page: int) -> None:
+    def _handle_open(self, now_ns: int, page: int) -> None:
         self._open_ns = {one: at for one, at in self._open_ns.items() if now_ns - at <= self._limit_ns}
         self._open_ns[page] = now_ns
         if self._holder == page:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-_STILL = 0.02
+_STATIONARY = 0.02
 _MOVING = 0.08
 _FAST = 0.5
 _STRAIGHT = 0.08
@@ -28,18 +28,18 @@ class Item:
     name: str
     purpose: str
     unit: str
-    wanted: float
+    target: float
     found: float = 0.0
 
     @property
     def covered(self) -> bool:
         """Whether there is enough."""
-        return self.found >= self.wanted
+        return self.found >= self.target
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """Return the name with the found and the wanted amount as text."""
         unit = "" if self.unit == "times" else f" {self.unit}"
-        return f"{self.name} {min(self.found, self.wanted):.0f}/{self.wanted:.0f}{unit}"
+        return f"{self.name} {min(self.found, self.target):.0f}/{self.target:.0f}{unit}"
 
 
 _SECONDS = (
@@ -76,8 +76,8 @@ class Coverage:
         self._top_rad_s = top_rad_s
         self._found: dict[str, float] = dict.fromkeys([name for name, *_ in (*_SECONDS, *_TIMES)], 0.0)
         self._t_ns: int | None = None
-        self._still_ns: int | None = None
-        self._quick_ns: int | None = None
+        self._stationary_ns: int | None = None
+        self._fast_ns: int | None = None
         self._swing: tuple[int, int] | None = None
         self._crossing: list[tuple[int, int] | None] = [None, None]
         self._rested_ns = [0, 0]
@@ -105,27 +105,27 @@ class Coverage:
 
     def pause(self) -> None:
         """Interrupt the counting, so that nothing is counted across a pause of the drive."""
-        self._t_ns = self._still_ns = self._quick_ns = self._swing = None
+        self._t_ns = self._stationary_ns = self._fast_ns = self._swing = None
         self._crossing = [None, None]
 
     def items(self) -> tuple[Item, ...]:
         """Return everything that counts, covered or not."""
-        seconds = (Item(name, purpose, "s", wanted, self._found[name]) for name, purpose, wanted in _SECONDS)
-        times = (Item(name, purpose, "times", wanted, self._found[name]) for name, purpose, wanted in _TIMES)
+        seconds = (Item(name, purpose, "s", target, self._found[name]) for name, purpose, target in _SECONDS)
+        times = (Item(name, purpose, "times", target, self._found[name]) for name, purpose, target in _TIMES)
         return (*seconds, *times)
 
     def missing(self) -> tuple[Item, ...]:
         """Return the items of which too little has been driven."""
         return tuple(item for item in self.items() if not item.covered)
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """One line for the operator: how much is done, and the first things that are missing."""
         items, missing = self.items(), self.missing()
         done = f"{self.driven_s:.0f} s driven, {len(items) - len(missing)} of {len(items)} excited"
         if not missing:
             return f"{done}; nothing is missing"
         more = f" and {len(missing) - 4} more" if len(missing) > 4 else ""
-        return f"{done}; missing: {', '.join(item.in_words() for item in missing[:4])}{more}"
+        return f"{done}; missing: {', '.join(item.describe() for item in missing[:4])}{more}"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the coverage as a JSON-serialisable dict; `missing` holds names."""
@@ -137,7 +137,7 @@ class Coverage:
                     "purpose": item.purpose,
                     "unit": item.unit,
                     "found": round(item.found, 3),
-                    "wanted": item.wanted,
+                    "wanted": item.target,
                     "covered": item.covered,
                 }
                 for item in self.items()
@@ -147,14 +147,14 @@ class Coverage:
 
     def _count_launches(self, t_ns: int, size: float) -> None:
         """Count hard starts and hard stops; `size` is the faster wheel's speed as a share of the top speed."""
-        if size <= _STILL:
-            if self._quick_ns is not None and t_ns - self._quick_ns <= _LAUNCH_S * 1e9:
+        if size <= _STATIONARY:
+            if self._fast_ns is not None and t_ns - self._fast_ns <= _LAUNCH_S * 1e9:
                 self._found["hard stop"] += 1.0
-            self._still_ns, self._quick_ns = t_ns, None
+            self._stationary_ns, self._fast_ns = t_ns, None
         elif size >= _LAUNCH:
-            if self._still_ns is not None and t_ns - self._still_ns <= _LAUNCH_S * 1e9:
+            if self._stationary_ns is not None and t_ns - self._stationary_ns <= _LAUNCH_S * 1e9:
                 self._found["hard start"] += 1.0
-            self._still_ns, self._quick_ns = None, t_ns
+            self._stationary_ns, self._fast_ns = None, t_ns
 
     def _count_swings(self, t_ns: int, turn: float) -> None:
         """Count quick steering: the turn changes sides within 1.6 s."""
@@ -169,7 +169,7 @@ class Coverage:
     def _count_crossings(self, t_ns: int, dt_s: float, wheel: int, speed: float) -> None:
         """Count slow crossings of zero: from beyond the band on one side to beyond it on the other."""
         if abs(speed) < _MOVING:
-            self._rested_ns[wheel] += round(dt_s * 1e9) if abs(speed) <= _STILL else 0
+            self._rested_ns[wheel] += round(dt_s * 1e9) if abs(speed) <= _STATIONARY else 0
             return
         side = 1 if speed > 0.0 else -1
         before, self._crossing[wheel] = self._crossing[wheel], (side, t_ns)
@@ -183,7 +183,7 @@ class Coverage:
 
 def _regime(forward: float, turn: float, size: float) -> str | None:
     """Return the kind of motion; None for creeping, which counts for nothing."""
-    if size <= _STILL:
+    if size <= _STATIONARY:
         return "rest"
     if size < _MOVING:
         return None

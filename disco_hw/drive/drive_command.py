@@ -18,12 +18,12 @@ from disco_hw.daemon import socket_path
 from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.process import STANDARD_ERROR, STANDARD_OUTPUT, AsyncPrinter
 from disco_hw.daemon.run import in_text, serve
-from disco_hw.drive import PAD_WORDS, GamepadSource, ManualSource, PageSource
+from disco_hw.drive import PAD_STATUS_TEXT, GamepadSource, ManualSource, PageSource
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.fit import FittedScriptSource, ScriptGeometry
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.script import Script, ScriptSource, Unattended, in_table, room_needed
-from disco_hw.drive.scripts import make_script
+from disco_hw.drive.scripts import create_script
 from disco_hw.drive.terminal import HELP, Keyboard, KeyHold
 from disco_hw.errors import InputError, LogError
 from disco_hw.fence.clearance import Boundaries
@@ -77,7 +77,7 @@ class DriveResult:
     ended: str
     completed: bool
     coverage: dict[str, Any]
-    coverage_words: str
+    coverage_text: str
     recording_errors: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
@@ -86,12 +86,12 @@ class DriveResult:
 
     def as_text(self) -> str:
         """Return the result as text."""
-        lost = "".join(f"\nNOT WHOLE: {error}" for error in self.recording_errors)
-        return f"{self.ended}\n{self.coverage_words}\nlog {self.log}{lost}"
+        missing = "".join(f"\nNOT WHOLE: {error}" for error in self.recording_errors)
+        return f"{self.ended}\n{self.coverage_text}\nlog {self.log}{missing}"
 
 
-def run_drive(options: DriveOptions, page_news: Callable[[], tuple[str, ...]] = lambda: ()) -> DriveResult:
-    """Drive by keyboard, gamepad or script until that ends, and record it; `page_news` as for `run_daemon`.
+def run_drive(options: DriveOptions, page_messages: Callable[[], tuple[str, ...]] = lambda: ()) -> DriveResult:
+    """Drive by keyboard, gamepad or script until that ends, and record it; `page_messages` as for `run_daemon`.
 
     Runs the daemon's loop with its governor, supervisor and recorder; there is no planner, and no pose is needed.
     Raises InputError for wrong options, files and devices.
@@ -102,37 +102,37 @@ def run_drive(options: DriveOptions, page_news: Callable[[], tuple[str, ...]] = 
     script = _script(options, config)
     log_file = options.log_file or _new_log(config)
     top_rad_s = config.drive.speed_share * config.robot.max_wheel_speed_rad_s
-    words = "cmd_vel: ask the bridge to arm, then it drives; Ctrl-C ends" if options.ros2 else PAD_WORDS
-    page = PageSource(top_rad_s, config.drive.turn_share, words) if options.page or options.ros2 else None
+    prompt = "cmd_vel: ask the bridge to arm, then it drives; Ctrl-C ends" if options.ros2 else PAD_STATUS_TEXT
+    page = PageSource(top_rad_s, config.drive.turn_share, prompt) if options.page or options.ros2 else None
     source = _source(options, setup, script, top_rad_s, page)
     try:
         if not options.as_json:
             print("\n".join(_announcement(options, config, script)), flush=True)
         coverage = Coverage(top_rad_s)
-        said: list[str] = []
-        with _display(socket_path(config), shown=not options.as_json) as say:
+        errors: list[str] = []
+        with _display(socket_path(config), shown=not options.as_json) as show:
 
             def report(topic: str, text: str) -> None:
                 if topic == "recording":
-                    said.append(text)
-                say(topic, text)
+                    errors.append(text)
+                show(topic, text)
 
-            serve(setup, log_file, report, HandPilot(source, coverage, page), page_news=page_news)
+            serve(setup, log_file, report, HandPilot(source, coverage, page), page_messages=page_messages)
     finally:
         source.close()
     # A writer that was slow for a second and then wrote all that had waited has lost nothing.
-    lost = () if not said or _is_whole(log_file) else tuple(said)
+    missing = () if not errors or _is_complete(log_file) else tuple(errors)
     return DriveResult(
         log=log_file,
         ended=source.ended or "stopped on request",
-        completed=source.completed and not lost,
+        completed=source.completed and not missing,
         coverage=coverage.as_dict(),
-        coverage_words=coverage.in_words(),
-        recording_errors=lost,
+        coverage_text=coverage.describe(),
+        recording_errors=missing,
     )
 
 
-def _is_whole(log_file: Path) -> bool:
+def _is_complete(log_file: Path) -> bool:
     """Whether the log has the recorder's last word, and every tick up to it."""
     try:
         with open_log(log_file) as log:
@@ -147,7 +147,7 @@ def _script(options: DriveOptions, config: RobotConfig) -> Script | None:
         if options.unattended or options.seconds is not None:
             raise InputError("--unattended and --seconds belong to a script; add --script circle, steps or excite")
         return None
-    script = make_script(options.script, config.robot, config.task, config.drive.speed_share, options.seed)
+    script = create_script(options.script, config.robot, config.task, config.drive.speed_share, options.seed)
     return script if options.seconds is None else script.cut(options.seconds)
 
 
@@ -156,7 +156,7 @@ def _announcement(options: DriveOptions, config: RobotConfig, script: Script | N
     lines = []
     if script is not None:
         room = room_needed(script.at, script.duration_s, config.robot)
-        lines += [*in_table(script), f"{script.duration_s:.0f} s, needs {room.in_words()}"]
+        lines += [*in_table(script), f"{script.duration_s:.0f} s, needs {room.describe()}"]
     if not (options.gamepad or options.page or options.ros2 or options.unattended):
         lines.append(HELP)
     return lines
@@ -175,50 +175,50 @@ def _source(
     chosen = [name for name, given in deadmen.items() if given]
     if len(chosen) > 1:
         raise InputError(f"{' and '.join(chosen)}: one deadman only; leave one of them out")
-    held: ManualSource
+    source: ManualSource
     if options.unattended:
         if not leads_to_virtual_robot(config.link):
             raise InputError(
-                f"--unattended: {_words(config.link)} may lead to a real robot; hold a deadman (keyboard, --gamepad, "
+                f"--unattended: {_option(config.link)} may lead to a real robot; hold a deadman (keyboard, --gamepad, "
                 "--page, --ros2), or start the virtual robot first"
             )
-        held = Unattended()
+        source = Unattended()
     elif page is not None:
-        held = page
+        source = page
     elif options.gamepad:
-        held = _gamepad(config, top_rad_s)
+        source = _gamepad(config, top_rad_s)
     else:
-        held = Keyboard(_STANDARD_INPUT, KeyHold(top_rad_s), MonotonicClock())
+        source = Keyboard(_STANDARD_INPUT, KeyHold(top_rad_s), MonotonicClock())
     if script is None:
-        return held
+        return source
     if not config.fence.is_set:
-        return ScriptSource(script, held)
+        return ScriptSource(script, source)
     robot = ScriptGeometry(*geometry(setup.model)[0])
     room = room_needed(script.at, script.duration_s, config.robot)
-    return FittedScriptSource(script, held, robot, Boundaries(config.robot.footprint, config.fence), room)
+    return FittedScriptSource(script, source, robot, Boundaries(config.robot.footprint, config.fence), room)
 
 
-def _words(link: Link) -> str:
+def _option(link: Link) -> str:
     return f"link.port {link.port}" if link.kind == "serial" else f"link.interface {link.interface} {link.channel}"
 
 
 def _gamepad(config: RobotConfig, top_rad_s: float) -> GamepadSource:
-    wanted = config.drive
+    settings = config.drive
     mapping = GamepadMapping(
-        forward_axis=wanted.gamepad_forward_axis,
-        left_axis=wanted.gamepad_left_axis,
-        deadman_button=wanted.gamepad_deadman,
-        dead_zone=wanted.gamepad_dead_zone,
+        forward_axis=settings.gamepad_forward_axis,
+        left_axis=settings.gamepad_left_axis,
+        deadman_button=settings.gamepad_deadman,
+        dead_zone=settings.gamepad_dead_zone,
     )
 
     def open_pad(now_ns: int) -> Gamepad:
-        return open_gamepad(mapping, now_ns, wanted.gamepad_device)
+        return open_gamepad(mapping, now_ns, settings.gamepad_device)
 
     try:
         pad = open_pad(MonotonicClock().now_ns())
     except GamepadError as error:
         raise InputError(f"--gamepad: {error}") from None
-    return GamepadSource(pad, open_pad, top_rad_s, wanted.turn_share, wanted.gamepad_silence_s)
+    return GamepadSource(pad, open_pad, top_rad_s, settings.turn_share, settings.gamepad_silence_s)
 
 
 def _new_log(config: RobotConfig) -> Path:

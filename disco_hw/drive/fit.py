@@ -67,7 +67,7 @@ def fit_script(
             return
     slowest = f"at {SCALES[-1]:.0%} of its speed either"
     raise ScriptDoesNotFit(
-        f"script {script.name} does not fit into the fence from here, {slowest}; as it is it needs {room.in_words()}. "
+        f"script {script.name} does not fit into the fence from here, {slowest}; as it is it needs {room.describe()}. "
         "Make room, or put the robot in the middle"
     )
 
@@ -81,8 +81,8 @@ def _next_that_fits(
         if manoeuvre.within_limits and finds_limits:
             # The limits that it is scaled into are not found yet.
             continue
-        for words, sign, mirrored in _VARIANTS:
-            changed = _changed(manoeuvre, scale, words, sign, mirrored)
+        for description, sign, mirrored in _VARIANTS:
+            changed = _changed(manoeuvre, scale, description, sign, mirrored)
             path = driven_path(changed, pose, robot)
             if _keeps(path, bounds, keep_m):
                 x_m, y_m, yaw_rad = path[-1].tolist()
@@ -96,8 +96,8 @@ def _keeps(path: Array, bounds: Boundaries, keep_m: float) -> bool:
     return bool(clearance_m.min() >= min(keep_m, max(float(clearance_m[0]), 0.0)))
 
 
-def _changed(manoeuvre: Manoeuvre, scale: float, words: str, sign: float, mirrored: bool) -> Manoeuvre:
-    if scale == 1.0 and not words:
+def _changed(manoeuvre: Manoeuvre, scale: float, description: str, sign: float, mirrored: bool) -> Manoeuvre:
+    if scale == 1.0 and not description:
         return manoeuvre
     original = manoeuvre.wheels
 
@@ -107,7 +107,7 @@ def _changed(manoeuvre: Manoeuvre, scale: float, words: str, sign: float, mirror
         return sign * scale * left, sign * scale * right
 
     slower = "" if scale == 1.0 else f"at {scale:.0%}"
-    note = ", ".join(part for part in (words, slower) if part)
+    note = ", ".join(part for part in (description, slower) if part)
     return replace(manoeuvre, wheels=wheels, purpose=f"{manoeuvre.purpose} ({note})")
 
 
@@ -149,10 +149,10 @@ class FittedScriptSource:
         return self._playing is not None and self._playing.completed
 
     @property
-    def words(self) -> str:
+    def status_text(self) -> str:
         """Text for the operator on the script's progress, and on what to do where nothing moves."""
         if self._playing is not None:
-            return self._playing.words
+            return self._playing.status_text
         return "waiting for a pose, to fit the script into the fence" if self._fitting is None else "fitting the script"
 
     @property

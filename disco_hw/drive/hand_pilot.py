@@ -12,8 +12,8 @@ from disco_hw.drive import INPUT_LIMIT_NS, ManualInput, ManualSource, PageSource
 from disco_hw.drive.coverage import Coverage
 from disco_hw.runtime import State
 from disco_hw.runtime.core import CoreTick, Pilot, PilotTick, TaskPilot
-from disco_hw.runtime.fence_guard import HOLDS_STILL
-from disco_hw.runtime.pipeline import Manual, Source, Stand
+from disco_hw.runtime.fence_guard import STOPS_MOTION
+from disco_hw.runtime.pipeline import Manual, Source, StandstillTracker
 from disco_hw.runtime.supervisor import Reply, UserRequest
 
 
@@ -22,7 +22,7 @@ class DeadmanVerdict:
     """One tick's requests, the motion while motion is allowed, and a sentence where something changed."""
 
     requests: tuple[UserRequest, ...]
-    motion: Manual | Stand
+    motion: Manual | StandstillTracker
     event: str | None = None
 
 
@@ -39,7 +39,7 @@ class Deadman:
         self._seen_open = False
         self._engaged = False
         self._was_armed = False
-        self._asked_to_let_go = False
+        self._release_requested = False
 
     @property
     def engaged(self) -> bool:
@@ -49,41 +49,41 @@ class Deadman:
     def step(self, now_ns: int, newest: ManualInput | None, state: State) -> DeadmanVerdict:
         """Judge the newest input (None: the device is gone) in the daemon's present state."""
         fresh = newest is not None and 0 <= now_ns - newest.t_ns <= self._limit_ns
-        held = newest is not None and fresh and newest.deadman
-        requests, event = self._hold(newest, fresh, held, state) if self._engaged else self._press(held, state)
+        is_held = newest is not None and fresh and newest.deadman
+        requests, event = self._hold(newest, fresh, is_held, state) if self._engaged else self._press(is_held, state)
         if state is State.ARMED and not self._engaged and not requests:
             requests = (UserRequest.DISARM,)
-        self._seen_open = fresh and not held
+        self._seen_open = fresh and not is_held
         if self._seen_open or self._engaged:
-            self._asked_to_let_go = False
+            self._release_requested = False
         self._was_armed = state is State.ARMED
         if self._engaged and newest is not None:
             return DeadmanVerdict(requests, Manual(newest.left_rad_s, newest.right_rad_s), event)
-        return DeadmanVerdict(requests, Stand(), event)
+        return DeadmanVerdict(requests, StandstillTracker(), event)
 
     def refused(self, why: str) -> str:
         """Take in that the daemon refused to arm or start; returns the sentence for the person."""
-        self._engaged, self._asked_to_let_go = False, True
+        self._engaged, self._release_requested = False, True
         return f"not armed: {why}; release the deadman and press it again"
 
-    def _press(self, held: bool, state: State) -> tuple[tuple[UserRequest, ...], str | None]:
-        if not held:
+    def _press(self, is_held: bool, state: State) -> tuple[tuple[UserRequest, ...], str | None]:
+        if not is_held:
             return (), None
         if not self._seen_open:
-            if state is not State.READY or self._asked_to_let_go:
+            if state is not State.READY or self._release_requested:
                 return (), None
-            self._asked_to_let_go = True
+            self._release_requested = True
             return (), "the deadman is held already; release it and press it again"
         if state is not State.READY:
-            self._asked_to_let_go = True
+            self._release_requested = True
             return (), f"the robot is {state.value}, not ready; release the deadman and press it again once it is"
         self._engaged = True
         return (UserRequest.ARM, UserRequest.START), "deadman pressed: arming"
 
     def _hold(
-        self, newest: ManualInput | None, fresh: bool, held: bool, state: State
+        self, newest: ManualInput | None, fresh: bool, is_held: bool, state: State
     ) -> tuple[tuple[UserRequest, ...], str | None]:
-        if not held:
+        if not is_held:
             self._engaged = False
             if newest is None:
                 return (UserRequest.DISARM,), "the input device is gone: stopping"
@@ -92,7 +92,7 @@ class Deadman:
                 return (UserRequest.DISARM,), f"no input for more than {limit_ms} ms: stopping"
             return (UserRequest.DISARM,), "deadman released: stopping"
         if state not in {State.READY, State.ARMED} or (self._was_armed and state is State.READY):
-            self._engaged, self._asked_to_let_go = False, True
+            self._engaged, self._release_requested = False, True
             return (), "no longer armed; release the deadman and press it again"
         return (), None
 
@@ -111,7 +111,7 @@ class HandPilot:
         self._deadman = Deadman()
         self._driving = False
         self._task = ""
-        self._told: deque[str] = deque()
+        self._pending_messages: deque[str] = deque()
         self._messages: deque[str] = deque(maxlen=_MESSAGES)
 
     @property
@@ -131,14 +131,14 @@ class HandPilot:
         newest = self._source.poll(now_ns, view)
         verdict = self._deadman.step(now_ns, newest, state)
         if self._source.ended is not None:
-            self._told.append(self._source.ended)
+            self._pending_messages.append(self._source.ended)
         elif verdict.event is not None:
-            self._told.append(verdict.event)
+            self._pending_messages.append(verdict.event)
         if self._driving and self._source.task not in {"", self._task}:
             self._task = self._source.task
-            self._told.append(self._task)
-        events = tuple(self._told)
-        self._told.clear()
+            self._pending_messages.append(self._task)
+        events = tuple(self._pending_messages)
+        self._pending_messages.clear()
         self._messages += events
         return PilotTick(verdict.requests, verdict.motion, events, by_hand=True)
 
@@ -146,7 +146,7 @@ class HandPilot:
         """Count what was excited; take in that arming was refused."""
         refusals = [reply.text for reply in replies if not reply.accepted]
         if refusals:
-            self._told.append(self._deadman.refused(refusals[0]))
+            self._pending_messages.append(self._deadman.refused(refusals[0]))
         self._messages += tick.events
         command = tick.command
         self._driving = command is not None and tick.pipeline.source is Source.MANUAL
@@ -155,12 +155,12 @@ class HandPilot:
         else:
             self._coverage.pause()
 
-    def steer(self, now_ns: int, page: int, wanted: Mapping[str, Any]) -> str | None:
+    def steer(self, now_ns: int, page: int, steering: Mapping[str, Any]) -> str | None:
         """Pass on what a page wants, if pages drive."""
         if self._page is None:
             return "this drive does not listen to the page; start it with --page"
         try:
-            return self._page.steer(now_ns, page, steering_from(wanted))
+            return self._page.steer(now_ns, page, steering_from(steering))
         except ValueError as error:
             return str(error)
 
@@ -170,11 +170,11 @@ class HandPilot:
             "drive": {
                 "driving": self._driving,
                 "by_page": self._page is not None,
-                "words": self._source.words,
+                "words": self._source.status_text,
                 "task": self._source.task,
                 "messages": list(self._messages),
                 "coverage": self._coverage.as_dict(),
-                "coverage_words": self._coverage.in_words(),
+                "coverage_words": self._coverage.describe(),
             }
         }
 
@@ -193,7 +193,7 @@ def _pose(last: CoreTick | None) -> tuple[float, float, float] | None:
 
 
 def _is_held(last: CoreTick | None) -> bool:
-    return last is not None and last.pipeline.fence.verdict in HOLDS_STILL
+    return last is not None and last.pipeline.fence.verdict in STOPS_MOTION
 
 
 _IN_USE = frozenset({State.ARMED, State.STOPPING})
@@ -233,9 +233,9 @@ class UntilHeading:
         """Pass the tick to the pilot in charge."""
         self._now.learn(now_ns, tick, replies)
 
-    def steer(self, now_ns: int, page: int, wanted: Mapping[str, Any]) -> str | None:
+    def steer(self, now_ns: int, page: int, steering: Mapping[str, Any]) -> str | None:
         """Pass the page's steering to the pilot in charge."""
-        return self._now.steer(now_ns, page, wanted)
+        return self._now.steer(now_ns, page, steering)
 
     def status(self) -> dict[str, Any]:
         """Return the status of the pilot in charge, by which the page shows its pad."""

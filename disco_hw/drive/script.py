@@ -91,7 +91,7 @@ class Room:
     x_m: tuple[float, float]
     y_m: tuple[float, float]
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """Return the room as text."""
         return (
             f"about {self.x_m[1]:.1f} m ahead, {abs(self.x_m[0]):.1f} m behind, {self.y_m[1]:.1f} m to the left and "
@@ -153,9 +153,9 @@ class Pieces:
         """Create a manoeuvre of constant shares."""
         return self.play(name, purpose, duration_s, lambda _t_s: (forward, turn))
 
-    def each(self, purpose: str, *held: tuple[str, float, float, float]) -> list[Manoeuvre]:
+    def each(self, purpose: str, *state: tuple[str, float, float, float]) -> list[Manoeuvre]:
         """Several held ones (name, duration, forward, turn), each followed by a rest."""
-        return [part for one in held for part in (self.hold(one[0], purpose, *one[1:]), self.rest())]
+        return [part for one in state for part in (self.hold(one[0], purpose, *one[1:]), self.rest())]
 
     @staticmethod
     def rest(duration_s: float = REST_S) -> Manoeuvre:
@@ -198,13 +198,13 @@ class ScriptSource:
         return self._over
 
     @property
-    def words(self) -> str:
+    def status_text(self) -> str:
         """Text for the operator on the script's progress, and on what to do where nothing moves."""
         progress = f"{self._driven_ns * 1e-9:.0f} of {self._script.duration_s:.0f} s"
         manoeuvre = self._manoeuvre
         name = "" if manoeuvre is None else f", {manoeuvre.name}"
-        held = "" if self._driving else f"; {self._deadman.words}"
-        return f"{progress}{name}{held}"
+        state = "" if self._driving else f"; {self._deadman.status_text}"
+        return f"{progress}{name}{state}"
 
     @property
     def task(self) -> str:
@@ -212,7 +212,7 @@ class ScriptSource:
         manoeuvre = self._manoeuvre
         if manoeuvre is None:
             return ""
-        limits = f" ({self._limits.in_words()})" if manoeuvre.within_limits else ""
+        limits = f" ({self._limits.describe()})" if manoeuvre.within_limits else ""
         return f"{manoeuvre.name}{limits}: {manoeuvre.purpose}"
 
     @property
@@ -233,14 +233,14 @@ class ScriptSource:
 
     def poll(self, now_ns: int, robot: RobotView) -> ManualInput | None:
         """Return the script's wheel speeds with the other source's deadman and time."""
-        held = self._deadman.poll(now_ns, robot)
+        state = self._deadman.poll(now_ns, robot)
         self._advance(now_ns, robot)
-        if held is None:
+        if state is None:
             return None
         if self._over or self._fenced:
             return ManualInput(now_ns, 0.0, 0.0, deadman=False)
         left, right = self._wheels()
-        return ManualInput(held.t_ns, left, right, held.deadman)
+        return ManualInput(state.t_ns, left, right, state.deadman)
 
     def close(self) -> None:
         """Close the source of the deadman."""
@@ -311,7 +311,7 @@ class Unattended:
         return False
 
     @property
-    def words(self) -> str:
+    def status_text(self) -> str:
         """Text for the operator on what it waits for."""
         return "unattended: waiting for the robot" if self._pressed_ns is None else "unattended: deadman held"
 
@@ -324,7 +324,7 @@ class Unattended:
         """Return the deadman's state, with wheel speeds of zero."""
         if self._first_ns is None:
             self._first_ns = now_ns
-        held = self._pressed_ns is not None and self._ended is None
+        state = self._pressed_ns is not None and self._ended is None
         if self._pressed_ns is None:
             if robot.state is State.READY:
                 # Held from the next tick on: a deadman counts only after it was seen open.
@@ -338,7 +338,7 @@ class Unattended:
         elif now_ns - self._waiting_ns > self._driving_within_ns:
             hold = f"the robot held still for {self._driving_within_ns * 1e-9:g} s before the script was over"
             self._ended = self._ended or (hold if self._driven else "the robot did not start to drive")
-        return ManualInput(now_ns, 0.0, 0.0, deadman=held)
+        return ManualInput(now_ns, 0.0, 0.0, deadman=state)
 
     def close(self) -> None:
         """Do nothing, because the source holds no resources."""
@@ -358,14 +358,14 @@ class ReachedLimits:
 
     def __init__(self) -> None:
         self._shares: dict[tuple[int, bool], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-        self._asked: dict[tuple[int, bool], float] = {}
+        self._commanded: dict[tuple[int, bool], float] = {}
 
-    def observe(self, manoeuvre: str, asked: Wheels, measured: Wheels) -> None:
+    def observe(self, manoeuvre: str, commanded: Wheels, measured: Wheels) -> None:
         """Take in wheel speeds (rad/s, left and right) after they had time to settle."""
-        for wheel, (wanted, reached) in enumerate(zip(asked, measured, strict=True)):
-            if wanted != 0.0:
-                self._shares[wheel, wanted > 0.0][manoeuvre].append(reached / wanted)
-                self._asked[wheel, wanted > 0.0] = wanted
+        for wheel, (command, reached) in enumerate(zip(commanded, measured, strict=True)):
+            if command != 0.0:
+                self._shares[wheel, command > 0.0][manoeuvre].append(reached / command)
+                self._commanded[wheel, command > 0.0] = command
 
     def share(self, wheel: int, *, forward: bool) -> float:
         """Return the reached share, in [0, 1], of the requested speed of wheel 0 (left) or 1 (right)."""
@@ -373,15 +373,15 @@ class ReachedLimits:
         least = min(found, default=_LARGEST)
         return _LARGEST if not least < KEPT else max(0.0, least)
 
-    def within(self, asked: Wheels) -> Wheels:
+    def within(self, commanded: Wheels) -> Wheels:
         """Wheel speeds scaled into the limits that were found."""
-        left, right = (speed * self.share(wheel, forward=speed > 0.0) for wheel, speed in enumerate(asked))
+        left, right = (speed * self.share(wheel, forward=speed > 0.0) for wheel, speed in enumerate(commanded))
         return left, right
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """Return the limits as text."""
-        if len(self._asked) < 4:
+        if len(self._commanded) < 4:
             return "limits not found: no wheel speeds were measured"
-        reached = {key: asked * self.share(key[0], forward=key[1]) for key, asked in self._asked.items()}
+        reached = {key: commanded * self.share(key[0], forward=key[1]) for key, commanded in self._commanded.items()}
         left, right = (f"{reached[wheel, False]:+.1f} to {reached[wheel, True]:+.1f}" for wheel in (0, 1))
         return f"found: left {left}, right {right} rad/s"

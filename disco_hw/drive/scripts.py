@@ -128,7 +128,7 @@ STEPS = 20
 _LAPS = 2.0
 
 
-def make_script(name: str, robot: Robot, task: RobotTask, speed_share: float, seed: int = 1) -> Script:
+def create_script(name: str, robot: Robot, task: RobotTask, speed_share: float, seed: int = 1) -> Script:
     """Return the script of that name with wheel speeds up to `speed_share` of the robot's limit.
 
     Raises InputError for an unknown name, and for `circle` if the task is none or too fast for the wheels.
@@ -164,7 +164,9 @@ def circle(robot: Robot, task: CircleTask, top_rad_s: float) -> Script:
         )
     laps_s = _LAPS * 2.0 * math.pi / yaw_rate_rad_s
     purpose = "the paper's drive; cannot distinguish the wheel radius from slip, nor left from right"
-    return Script("circle", (rest(1.0), Manoeuvre("circle to the left", purpose, laps_s, _held(left, right)), rest()))
+    return Script(
+        "circle", (rest(1.0), Manoeuvre("circle to the left", purpose, laps_s, _constant(left, right)), rest())
+    )
 
 
 def steps(top_rad_s: float, seed: int, settling_s: float = 0.0, count: int = STEPS) -> Script:
@@ -174,7 +176,7 @@ def steps(top_rad_s: float, seed: int, settling_s: float = 0.0, count: int = STE
     """
     pieces = Pieces(top_rad_s)
     search = "finds the largest wheel speed that is reached"
-    held_s = FIND_S + settling_s
+    hold_s = FIND_S + settling_s
     found: list[Manoeuvre] = []
     for name, forward, turn in (
         ("as fast as it goes", 1.0, 0.0),
@@ -182,12 +184,12 @@ def steps(top_rad_s: float, seed: int, settling_s: float = 0.0, count: int = STE
         ("as fast as it turns left", 0.0, 1.0),
         ("as fast as it turns right", 0.0, -1.0),
     ):
-        found += [replace(pieces.hold(name, search, held_s, forward, turn), finds_limits=True), rest()]
+        found += [replace(pieces.hold(name, search, hold_s, forward, turn), finds_limits=True), rest()]
     draw = random.Random(seed)
     purpose = "steady motion anywhere within the limits, and the step to it"
     for number in range(1, count + 1):
         left, right = draw.uniform(-1.0, 1.0), draw.uniform(-1.0, 1.0)
-        wheels = _held(left * top_rad_s, right * top_rad_s)
+        wheels = _constant(left * top_rad_s, right * top_rad_s)
         name = f"step {number}: {left:+.0%} {right:+.0%} of the limits"
         found.append(Manoeuvre(name, purpose, STEP_S, wheels, within_limits=True))
     return Script("steps", (*found, rest()))
@@ -238,7 +240,7 @@ def excite(top_rad_s: float) -> Script:
     return Script("excite", tuple(found))
 
 
-def _held(left_rad_s: float, right_rad_s: float) -> Callable[[float], tuple[float, float]]:
+def _constant(left_rad_s: float, right_rad_s: float) -> Callable[[float], tuple[float, float]]:
     return lambda _t_s: (left_rad_s, right_rad_s)
 
 

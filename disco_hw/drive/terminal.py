@@ -39,7 +39,7 @@ _FIRST_REPEAT_NS = 1_000_000_000
 # Shorter than this between two holds may be a stutter of the connection, and must not arm again.
 _RELEASE_NS = 500_000_000
 # Repeats of a key that does not count, after which the operator is warned.
-_VAIN_EVENTS = 10
+_MAX_IGNORED_EVENTS = 10
 # No hand and no terminal repeats faster; pasted text does.
 _SHORTEST_REPEAT_NS = 10_000_000
 
@@ -100,15 +100,15 @@ class KeyHold:
         self._state = _Hold.LAPSED
         self._direction = (0.0, 0.0)
         self._last_ns: int | None = None
-        self._vain = 0
+        self._ignored = 0
 
     @property
-    def in_vain(self) -> bool:
+    def is_ignored(self) -> bool:
         """Whether a key has been held for a while that does not count before all keys were released."""
-        return self._vain >= _VAIN_EVENTS
+        return self._ignored >= _MAX_IGNORED_EVENTS
 
     @property
-    def words(self) -> str:
+    def status_text(self) -> str:
         """The speed that is chosen, and what to do where a held key does not count."""
         lapsed = "; release all keys for half a second" if self._state is _Hold.LAPSED else ""
         return f"keyboard, {self._share:.0%} speed{lapsed}"
@@ -122,7 +122,7 @@ class KeyHold:
             self._state = _Hold.LAPSED
             if event.key in _DIGITS:
                 self._share = int(event.key) / 9.0
-        self._vain = self._vain + 1 if self._state is _Hold.LAPSED and event.key in DIRECTIONS else 0
+        self._ignored = self._ignored + 1 if self._state is _Hold.LAPSED and event.key in DIRECTIONS else 0
         self._last_ns = event.t_ns
 
     def at(self, now_ns: int) -> ManualInput:
@@ -132,7 +132,7 @@ class KeyHold:
         if self._state is _Hold.HELD and now_ns - self._last_ns > self._limit_ns:
             self._state = _Hold.LAPSED
         if self._state is _Hold.LAPSED and now_ns - self._last_ns >= _RELEASE_NS:
-            self._state, self._vain = _Hold.OPEN, 0
+            self._state, self._ignored = _Hold.OPEN, 0
         if self._state is not _Hold.HELD:
             return ManualInput(now_ns, 0.0, 0.0, deadman=False)
         forward, turn = self._direction
@@ -206,14 +206,14 @@ class Keyboard:
         return not self._gone
 
     @property
-    def words(self) -> str:
+    def status_text(self) -> str:
         """The speed chosen, and what keeps a held key from counting."""
-        return self._hold.words
+        return self._hold.status_text
 
     @property
-    def in_vain(self) -> bool:
+    def is_ignored(self) -> bool:
         """Whether a key is held that does not count before all keys were released for half a second."""
-        return self._hold.in_vain
+        return self._hold.is_ignored
 
     @property
     def task(self) -> str:
@@ -222,7 +222,7 @@ class Keyboard:
 
     def poll(self, now_ns: int, _robot: RobotView) -> ManualInput | None:
         """Return the wheel speeds and the deadman after all keys typed so far; None once the terminal is gone."""
-        self._take(now_ns)
+        self._handle(now_ns)
         if self._gone:
             return None
         held = self._hold.at(now_ns)
@@ -246,7 +246,7 @@ class Keyboard:
         with contextlib.suppress(termios.error):
             termios.tcsetattr(self._descriptor, termios.TCSANOW, former)
 
-    def _take(self, now_ns: int) -> None:
+    def _handle(self, now_ns: int) -> None:
         """Act on what has arrived: one event in all, which keeps a poll short however much was typed."""
         keys: list[bytes] = []
         t_ns = now_ns

@@ -119,7 +119,7 @@ INPUTS = {
 class Symptom(enum.Enum):
     """A pattern that an effect leaves between measured wheels and poses when only the geometry is fitted."""
 
-    LATE_POSITIONS = "positions lag behind the wheels' motion"
+    DELAYED_POSITIONS = "positions lag behind the wheels' motion"
     SIDEWAYS_WITH_SPEED = "the robot moves sideways on straights"
     SIDEWAYS_IN_FAST_TURNS = "the robot slides outwards the faster it turns"
     FORWARD_WITH_TURNING = "turning shifts the robot forward or back"
@@ -128,7 +128,7 @@ class Symptom(enum.Enum):
     DISTANCE_CHANGES = "the distance per turn of the wheels changes during the drive"
     TURNS_ON_STRAIGHTS = "the robot turns with equal wheel speeds"
     LESS_TURN_AT_SPEED = "turning falls short the faster it is"
-    LATE_YAW = "yaw lags behind the wheels' turning"
+    DELAYED_YAW = "yaw lags behind the wheels' turning"
     LEFT_UNLIKE_RIGHT = "left and right turns differ"
     TURNING_CHANGES = "turning per turn of the wheels changes during the drive"
 
@@ -237,13 +237,13 @@ class Effect:
     coefficients: Callable[[Array, Array, float], tuple[Array, ...]] = no_coefficients
     order: int = 0
     sentence_below: str | None = None
-    besides: tuple[tuple[str, str], ...] = ()
+    other_symptoms: tuple[tuple[str, str], ...] = ()
     symptoms: tuple[Symptom, ...] = ()
     uses_geometry: bool = False
     may_turn_more: bool = False
-    late_by: str | None = None
+    delayed_by: str | None = None
     dead_by: str | None = None
-    late_starts: tuple[float, ...] = ()
+    delay_starts: tuple[float, ...] = ()
     also_seen_as: tuple[Any, str] | None = None
     like_a_patch: str | None = None
     mimics: Mimicked | None = None
@@ -255,11 +255,11 @@ class Effect:
     def __post_init__(self) -> None:
         keys = [parameter.name for parameter in self.parameters]
         scanned = None if self.scan is None else self.scan.parameter
-        for key in (self.late_by, self.dead_by, scanned, *dict(self.besides)):
+        for key in (self.delayed_by, self.dead_by, scanned, *dict(self.other_symptoms)):
             if key is not None and key not in keys:
                 raise ValueError(f"{self.name}: has no parameter {key!r}, only {', '.join(keys)}")
         try:
-            for text in (self.sentence, self.sentence_below or "", *dict(self.besides).values()):
+            for text in (self.sentence, self.sentence_below or "", *dict(self.other_symptoms).values()):
                 self.fill(text, {parameter.name: parameter.start for parameter in self.parameters})
         except (KeyError, IndexError) as error:
             raise ValueError(f"{self.name}: its sentence names {error}, which is no parameter") from None
@@ -273,9 +273,9 @@ class Effect:
         self._check_geometry()
 
     def _check_inputs(self, what: str, function: Callable[..., Any] | None, known: tuple[str, ...]) -> None:
-        for asked in () if function is None else asks_for(function):
-            if asked not in known:
-                raise ValueError(f"{self.name}: its `{what}` asks for {asked!r}, but may for {', '.join(known)}")
+        for argument in () if function is None else arguments_of(function):
+            if argument not in known:
+                raise ValueError(f"{self.name}: its `{what}` asks for {argument!r}, but may for {', '.join(known)}")
 
     def _check_geometry(self) -> None:
         values = np.array([[parameter.start for parameter in self.parameters]])
@@ -323,6 +323,6 @@ class Effect:
         return self.scan is None and self.limited is None and not self.trials
 
 
-def asks_for(function: Callable[..., Any]) -> tuple[str, ...]:
+def arguments_of(function: Callable[..., Any]) -> tuple[str, ...]:
     """Return the names of the parameters of a `term` or `plain`."""
     return tuple(inspect.signature(getattr(function, "py_func", function)).parameters)

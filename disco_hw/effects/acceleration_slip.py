@@ -14,8 +14,8 @@ def plain(forward: Value, change: Value, values: Values, geometry: Values, step_
     """Map v to v - k |v| dv/dt, at most 60 % of it."""
     (k_s2_m,), (radius, _, _) = values, geometry
     acceleration = radius * change / 2.0 / step_s
-    lost: Value = np.abs(forward) * np.clip(k_s2_m * acceleration, -0.6, 0.6)
-    return forward - lost
+    loss: Value = np.abs(forward) * np.clip(k_s2_m * acceleration, -0.6, 0.6)
+    return forward - loss
 
 
 def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
@@ -43,7 +43,7 @@ EFFECT = Effect(
     coefficients=coefficients,
     term=term,
     uses_geometry=True,
-    symptoms=(Symptom.LATE_POSITIONS, Symptom.SHORTER_AT_SPEED),
+    symptoms=(Symptom.DELAYED_POSITIONS, Symptom.SHORTER_AT_SPEED),
     excitation="start-stops on a straight, forward and back",
     script="starts",
     sentence="speeding up slips: {k_s2_m:.1%} of the speed is lost for every m/s^2",

@@ -30,8 +30,8 @@ def term(left: float, right: float, time_s: float, coefficients: tuple[float] | 
     if coefficients is None:
         return left, right
     (loss_per_s,) = coefficients
-    lost = min(max(loss_per_s * time_s, cast_like(0.0, time_s)), cast_like(LARGEST_LOSS, time_s))
-    return left - left * lost, right - right * lost
+    loss = min(max(loss_per_s * time_s, cast_like(0.0, time_s)), cast_like(LARGEST_LOSS, time_s))
+    return left - left * loss, right - right * loss
 
 
 EFFECT = Effect(

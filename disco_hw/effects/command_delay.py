@@ -17,8 +17,8 @@ def plain(values: Values) -> Value:
 def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
     """Whole steps of delay and the fraction on top, each (L,)."""
     steps = np.maximum(values[:, 0], 0.0) / step_s
-    whole = np.floor(steps)
-    return whole, steps - whole
+    steps_floor = np.floor(steps)
+    return steps_floor, steps - steps_floor
 
 
 @scalar_function
@@ -43,10 +43,10 @@ EFFECT = Effect(
     plain=plain,
     coefficients=coefficients,
     term=term,
-    late_by="delay_s",
-    late_starts=(0.02, 0.1, 0.3, -0.25),
+    delayed_by="delay_s",
+    delay_starts=(0.02, 0.1, 0.3, -0.25),
     starts=starts,
-    symptoms=(Symptom.LATE_YAW,),
+    symptoms=(Symptom.DELAYED_YAW,),
     excitation="steps of the wheel command: start-stops and fast steering",
     script="starts",
     sentence="the wheels act on commands {delay_ms:.0f} ms late",

@@ -20,7 +20,7 @@ EFFECT = Effect(
     stage=Stage.POSE_TIME,
     parameters=(Parameter("latency_s", "s", -1.0, 2.0, 0.05, realistic=0.04),),
     plain=plain,
-    symptoms=(Symptom.LATE_POSITIONS, Symptom.LATE_YAW),
+    symptoms=(Symptom.DELAYED_POSITIONS, Symptom.DELAYED_YAW),
     excitation="fast steering and start-stops",
     script="starts",
     sentence="poses are stamped {latency_ms:.0f} ms late",

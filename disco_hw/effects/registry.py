@@ -17,8 +17,8 @@ from disco_hw.jit import plugin_modules
 
 
 def _discover() -> dict[str, Effect]:
-    beside = (import_module(each.name) for each in pkgutil.iter_modules(effects.__path__, f"{effects.__name__}."))
-    found: dict[str, Effect] = {module.EFFECT.name: module.EFFECT for module in beside if hasattr(module, "EFFECT")}
+    submodules = (import_module(each.name) for each in pkgutil.iter_modules(effects.__path__, f"{effects.__name__}."))
+    found: dict[str, Effect] = {module.EFFECT.name: module.EFFECT for module in submodules if hasattr(module, "EFFECT")}
     delayed_by = next(name for name, effect in found.items() if effect.stage is Stage.DELAY)
     for name in plugin_modules():
         effect = _of_plugin(name)

@@ -21,12 +21,12 @@ def plain(
     give all they have leave the mean of both sides where it is, as long as it lies within l of its own aim; `shared`
     is the part of l for which that is so.
     """
-    limit, at_once, shared = values
+    limit, immediate, shared = values
     before, mean_before = (wheel_right - wheel_left) / 2.0, (wheel_left + wheel_right) / 2.0
 
     def within(turning: Value, within_s: float) -> Value:
-        most = np.maximum(before, at_once) + limit * within_s
-        least = np.minimum(before, -at_once) - limit * within_s
+        most = np.maximum(before, immediate) + limit * within_s
+        least = np.minimum(before, -immediate) - limit * within_s
         return np.clip(turning, least, most)
 
     turning = within((end_right - end_left) / 2.0, step_s)
@@ -52,10 +52,10 @@ def term(
     """Wheel speeds at the end of the step, left and right, and their means over it (rad/s)."""
     if coefficients is None:
         return end_left, end_right, mean_left, mean_right
-    growth, at_once, shared = coefficients
+    growth, immediate, shared = coefficients
     half, none = cast_like(0.5, end_left), cast_like(0.0, end_left)
     before, mean_before = half * (wheel_right - wheel_left), half * (wheel_left + wheel_right)
-    most, least = max(before, at_once), min(before, -at_once)
+    most, least = max(before, immediate), min(before, -immediate)
     turning = min(max(half * (end_right - end_left), least - growth), most + growth)
     # A ramp that takes the whole step has gone half its way on average.
     mean_turning = min(max(half * (mean_right - mean_left), least - half * growth), most + half * growth)

@@ -19,8 +19,8 @@ def plain(left: Value, right: Value, values: Values) -> tuple[Value, Value]:
     """
     load, unequal = values
     half = (right - left) / 2.0 + unequal * (left + right) / 2.0
-    taken = np.clip(half, -load, load)
-    return left + taken, right - taken
+    loss = np.clip(half, -load, load)
+    return left + loss, right - loss
 
 
 def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
@@ -35,8 +35,8 @@ def term(left: float, right: float, coefficients: tuple[float, float] | None) ->
         return left, right
     load, unequal = coefficients
     half = cast_like(0.5, left)
-    taken = min(max(half * (right - left + unequal * (left + right)), -load), load)
-    return left + taken, right - taken
+    loss = min(max(half * (right - left + unequal * (left + right)), -load), load)
+    return left + loss, right - loss
 
 
 def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
@@ -62,7 +62,7 @@ EFFECT = Effect(
     excitation="turning on the spot at two rates, both ways",
     script="spins",
     sentence="turning takes {load_rad_s:.2f} rad/s from each side's wheels, however fast the robot turns",
-    besides=(
+    other_symptoms=(
         (
             "unequal",
             "as it acts on the two sides, the right wheels are {unequal:+.2%} larger than the mean and the left "

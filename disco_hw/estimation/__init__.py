@@ -13,7 +13,7 @@ import msgspec
 
 from disco_hw.config import Estimation
 from disco_hw.estimation.correction import Measurement, PoseReason, PoseUpdate, screen
-from disco_hw.estimation.filter import FilterState, HeadingSearch, Judgement, PoseFilter
+from disco_hw.estimation.filter import Evaluation, FilterState, HeadingSearch, PoseFilter
 from disco_hw.estimation.odometry import (
     FUTURE_TOLERANCE_NS,
     MAX_POSITION_VARIANCE,
@@ -165,7 +165,7 @@ class PoseFusion:
             return 0.0
         return self._buffer.newest_wheels.right_rad - self._buffer.newest_wheels.left_rad
 
-    def forget_heading(self) -> None:
+    def reset_heading(self) -> None:
         """Take the heading for unknown from the next position without one on: what it rests on was no measurement."""
         self._forgets_heading = True
 
@@ -175,7 +175,7 @@ class PoseFusion:
 
     def add_wheels(self, sample: WheelSample) -> None:
         """Take in a wheel sample; it must be newer than all before, otherwise it is dropped and counted."""
-        reading = self._tracker.take(sample)
+        reading = self._tracker.add_sample(sample)
         if isinstance(reading, WheelReason):
             self._counts[f"wheels_{reading.value}"] += 1
             return
@@ -190,12 +190,12 @@ class PoseFusion:
     def add_pose(self, sample: PoseSample, now_ns: int) -> PoseUpdate:
         """Take in a measured pose at its own stamp, and say what it did as far as is known by now."""
         self._note_arrival(now_ns)
-        outcome = self._judge(sample, now_ns)
+        outcome = self._check(sample, now_ns)
         if isinstance(outcome, PoseReason):
-            outcome = Judgement(outcome)
+            outcome = Evaluation(outcome)
         self._counts[f"poses_{outcome.reason.value}"] += 1
         stds = (sample.position_std_m, sample.yaw_std_rad)
-        self.sources.take(
+        self.sources.add_sample(
             sample.source, sample.t_ns, now_ns, stds, outcome.reason, outcome.innovation, outcome.innovation_variance
         )
         return PoseUpdate(
@@ -261,7 +261,7 @@ class PoseFusion:
         weight = 1.0 if self._pose_interval_ns == 0.0 else INTERVAL_WEIGHT
         self._pose_interval_ns += weight * (now_ns - last_ns - self._pose_interval_ns)
 
-    def _judge(self, sample: PoseSample, now_ns: int) -> Judgement | PoseReason:
+    def _check(self, sample: PoseSample, now_ns: int) -> Evaluation | PoseReason:
         measurement = screen(sample)
         if isinstance(measurement, PoseReason):
             return measurement
@@ -273,7 +273,7 @@ class PoseFusion:
             measurement = msgspec.structs.replace(measurement, forgets_heading=True)
             self._forgets_heading = False
         outcome = self._buffer.add_pose(measurement)
-        self._counts["pose_std_floored"] += measurement.floored and isinstance(outcome, Judgement)
+        self._counts["pose_std_floored"] += measurement.floored and isinstance(outcome, Evaluation)
         return outcome
 
 
@@ -339,7 +339,7 @@ class RewindBuffer:
         self._newest_wheels = reading
         self._trim()
 
-    def add_pose(self, measurement: Measurement) -> Judgement | PoseReason:
+    def add_pose(self, measurement: Measurement) -> Evaluation | PoseReason:
         """Insert a pose at its stamp; what the filter made of it, or why it cannot be inserted."""
         if measurement.t_ns < self._events[0].t_ns:
             return PoseReason.TOO_OLD
@@ -358,11 +358,11 @@ class RewindBuffer:
         self._events.insert(index, measurement)
         self._poses += 1
         self._outdate(index)
-        judgement = self._run(index).judgement
+        evaluation = self._run(index).evaluation
         self._trim()
-        if judgement is None:
+        if evaluation is None:
             raise AssertionError("the state at a pose holds its judgement")
-        return judgement
+        return evaluation
 
     def head(self) -> FilterState:
         """Return the state after the last event."""

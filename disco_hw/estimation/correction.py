@@ -42,12 +42,12 @@ def deferred(*names: str) -> Iterator[None]:
     What the block takes from them by `from NAME import THING` is a stand-in for that function or object. Whoever
     imports the modules afterwards gets them as ever. Nothing happens to one that is imported already.
     """
-    put_off = {name: _DeferredModule(name) for name in names if name not in sys.modules}
-    sys.modules.update(put_off)
+    deferred_modules = {name: _DeferredModule(name) for name in names if name not in sys.modules}
+    sys.modules.update(deferred_modules)
     try:
         yield
     finally:
-        for name in put_off:
+        for name in deferred_modules:
             del sys.modules[name]
 
 
@@ -57,22 +57,22 @@ class _DeferredModule(ModuleType):
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        return _DeferredThing(self.__name__, name)
+        return _DeferredImport(self.__name__, name)
 
 
-class _DeferredThing:
+class _DeferredImport:
     """Placeholder for something of a module, whose use imports the module."""
 
     def __init__(self, module: str, name: str) -> None:
         self._source = module, name
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._thing(), name)
+        return getattr(self._loaded(), name)
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
-        return self._thing()(*arguments, **named)
+        return self._loaded()(*arguments, **named)
 
-    def _thing(self) -> Any:
+    def _loaded(self) -> Any:
         module, name = self._source
         return getattr(importlib.import_module(module), name)
 
@@ -324,7 +324,7 @@ class DisturbanceEstimator:
         self.value = NO_DISTURBANCE
         self._before_ns: dict[int, int] = {}
 
-    def take(
+    def add_sample(
         self, sample: PoseSample, update: PoseUpdate, parameters: OdometryParameters, wheels_rad_s: tuple[float, float]
     ) -> None:
         """Take in what a pose did to the estimate of a robot with this geometry, its wheels turning so fast."""

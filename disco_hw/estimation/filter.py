@@ -123,7 +123,7 @@ def correct_search(
 Belief = PoseBelief | HeadingSearch
 
 
-class Judgement(msgspec.Struct, frozen=True, gc=False):
+class Evaluation(msgspec.Struct, frozen=True, gc=False):
     """The filter's answer to a pose; numbers as in PoseUpdate, None where there was nothing to compare with."""
 
     reason: PoseReason
@@ -150,7 +150,7 @@ class FilterState(msgspec.Struct, frozen=True, gc=False):
     candidate_count: int
     pose_t_ns: int | None
     reinitialisations: int
-    judgement: Judgement | None
+    evaluation: Evaluation | None
     candidate_of: frozenset[int] = frozenset()
     accepted: tuple[tuple[int, int], ...] = ()
 
@@ -228,24 +228,24 @@ class PoseFilter:
         they say.
         """
         if state.belief is None:
-            return self._after(state, measurement, self._fresh(measurement), Judgement(PoseReason.INITIALISED))
+            return self._after(state, measurement, self._fresh(measurement), Evaluation(PoseReason.INITIALISED))
         if state.pose_t_ns is None:
             jumps = self._corrected(state.belief, measurement)[1].distance2 > self._limit(measurement)
-            first = self._after(state, measurement, self._fresh(measurement), Judgement(PoseReason.INITIALISED))
+            first = self._after(state, measurement, self._fresh(measurement), Evaluation(PoseReason.INITIALISED))
             return msgspec.structs.replace(first, reinitialisations=state.reinitialisations + jumps)
-        is_lost = isinstance(state.belief, PoseBelief) and not state.heading_known
-        if measurement.yaw_variance is None and (is_lost or measurement.forgets_heading):
-            return self._after(state, measurement, self._fresh(measurement), Judgement(PoseReason.REINITIALISED))
+        lacks_heading = isinstance(state.belief, PoseBelief) and not state.heading_known
+        if measurement.yaw_variance is None and (lacks_heading or measurement.forgets_heading):
+            return self._after(state, measurement, self._fresh(measurement), Evaluation(PoseReason.REINITIALISED))
         belief, correction = self._corrected(state.belief, measurement)
         limit = self._limit(measurement)
         if correction.distance2 <= limit:
-            return self._after(state, measurement, belief, _judged(PoseReason.ACCEPTED, correction, limit))
+            return self._after(state, measurement, belief, _evaluation(PoseReason.ACCEPTED, correction, limit))
         candidate, count, sources = self._candidate(state, measurement)
         if count >= self._lockout_count and not self._contested(state, measurement.t_ns, sources):
-            return self._after(state, measurement, candidate, _judged(PoseReason.REINITIALISED, correction, limit))
-        judgement = _judged(PoseReason.GATED, correction, limit)
+            return self._after(state, measurement, candidate, _evaluation(PoseReason.REINITIALISED, correction, limit))
+        evaluation = _evaluation(PoseReason.GATED, correction, limit)
         return msgspec.structs.replace(
-            state, candidate=candidate, candidate_count=count, candidate_of=sources, judgement=judgement
+            state, candidate=candidate, candidate_count=count, candidate_of=sources, evaluation=evaluation
         )
 
     def _contested(self, state: FilterState, t_ns: int, sources: frozenset[int]) -> bool:
@@ -290,7 +290,9 @@ class PoseFilter:
             return belief.each(lambda each: rebased(each, self._model))
         return None if belief is None else rebased(belief, self._model)
 
-    def _after(self, state: FilterState, measurement: Measurement, belief: Belief, judgement: Judgement) -> FilterState:
+    def _after(
+        self, state: FilterState, measurement: Measurement, belief: Belief, evaluation: Evaluation
+    ) -> FilterState:
         return FilterState(
             state.t_ns,
             state.left_rad,
@@ -299,8 +301,8 @@ class PoseFilter:
             None,
             0,
             measurement.t_ns,
-            state.reinitialisations + (judgement.reason is PoseReason.REINITIALISED),
-            judgement,
+            state.reinitialisations + (evaluation.reason is PoseReason.REINITIALISED),
+            evaluation,
             accepted=(
                 *(each for each in state.accepted if each[0] != measurement.source),
                 (measurement.source, measurement.t_ns),
@@ -354,8 +356,8 @@ class PoseFilter:
         )
 
 
-def _judged(reason: PoseReason, correction: Correction, limit: float) -> Judgement:
-    return Judgement(
+def _evaluation(reason: PoseReason, correction: Correction, limit: float) -> Evaluation:
+    return Evaluation(
         reason,
         correction.innovation,
         correction.innovation_variance,

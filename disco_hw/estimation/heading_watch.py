@@ -35,14 +35,14 @@ class Heading(enum.Enum):
     WAITING = "waiting"
     MEASURED = "measured"
     NONE = "none"
-    STANDS_STILL = "stands still"
+    FROZEN = "stands still"
 
 
 @dataclass(slots=True)
 class _Source:
     label: str
     offset: tuple[float, float]
-    held: Heading = Heading.WAITING
+    current: Heading = Heading.WAITING
     yaw_rad: float = math.nan
     repeats: int = 0
     least_rad: float = 0.0
@@ -58,12 +58,12 @@ class HeadingWatch:
     def __init__(self, labels: Sequence[str], offsets: Sequence[tuple[float, float]] = ()) -> None:
         places = [*offsets, *((0.0, 0.0) for _ in labels[len(offsets) :])]
         self._sources = [_Source(label, place) for label, place in zip(labels, places, strict=True)]
-        self._said: list[str] = []
+        self._messages: list[str] = []
 
     @property
-    def held(self) -> tuple[Heading, ...]:
+    def current(self) -> tuple[Heading, ...]:
         """State of the headings of each source."""
-        return tuple(one.held for one in self._sources)
+        return tuple(one.current for one in self._sources)
 
     def screen(self, sample: PoseSample, difference_rad: float, turn_per_rad: float) -> tuple[PoseSample, bool]:
         """Return the pose, without its heading where that is no measurement.
@@ -82,16 +82,16 @@ class HeadingWatch:
         if not math.isfinite(sample.yaw_rad) or not is_variance_known(math.copysign(std_rad * std_rad, std_rad)):
             self._note(one, Heading.NONE)
             return _without_heading(sample, one.offset), False
-        stands_still, never_measured = self._follow(one, sample.yaw_rad, difference_rad, turn_per_rad)
-        if stands_still:
+        is_frozen, never_measured = self._follow(one, sample.yaw_rad, difference_rad, turn_per_rad)
+        if is_frozen:
             return _without_heading(sample, one.offset), never_measured
         self._note(one, Heading.MEASURED)
         return sample, False
 
-    def news(self) -> list[str]:
+    def new_messages(self) -> list[str]:
         """Return sentences for the operator since the last call."""
-        said, self._said = self._said, []
-        return said
+        messages, self._messages = self._messages, []
+        return messages
 
     def _follow(self, one: _Source, yaw_rad: float, difference_rad: float, turn_per_rad: float) -> tuple[bool, bool]:
         """Whether the heading stands still by now, and whether this pose shows that it always has."""
@@ -103,15 +103,15 @@ class HeadingWatch:
             one.yaw_rad, one.repeats = yaw_rad, 1
             one.least_rad = one.most_rad = difference_rad
             one.changes += 1
-        if one.held is Heading.STANDS_STILL and one.changes < CHANGES:
+        if one.current is Heading.FROZEN and one.changes < CHANGES:
             return True, False
         turn_rad = abs(turn_per_rad) * (one.most_rad - one.least_rad)
         if one.repeats < LEAST_POSES or turn_rad < LEFT_OUT_RAD:
             return False, False
         never_measured = not one.has_varied and turn_rad >= NEVER_MEASURED_RAD
         if one.has_varied or never_measured:
-            one.held, one.changes, one.others_in_a_row = Heading.STANDS_STILL, 0, 0
-            self._said.append(
+            one.current, one.changes, one.others_in_a_row = Heading.FROZEN, 0, 0
+            self._messages.append(
                 f"{one.label}: the heading stands still at {one.yaw_rad:.2f} rad while the wheels turn the robot by "
                 f"{turn_rad:.2f} rad; it is not used, and the estimator runs on positions"
             )
@@ -119,21 +119,21 @@ class HeadingWatch:
 
     def _note(self, one: _Source, seen: Heading) -> None:
         """Change what is held of a source: at once in the beginning, then after enough poses in a row."""
-        if seen is one.held:
+        if seen is one.current:
             one.others_in_a_row = 0
             return
         one.others_in_a_row += 1
-        is_first = one.held is Heading.WAITING
+        is_first = one.current is Heading.WAITING
         if not is_first and one.others_in_a_row < REPORTED_AFTER:
             return
-        one.held, one.others_in_a_row = seen, 0
+        one.current, one.others_in_a_row = seen, 0
         if seen is Heading.NONE:
-            self._said.append(
+            self._messages.append(
                 f"{one.label}: its poses have no heading, or one whose covariance says that it is unknown; the "
                 "estimator runs on positions"
             )
         elif not is_first:
-            self._said.append(f"{one.label}: its headings are used again")
+            self._messages.append(f"{one.label}: its headings are used again")
 
 
 def _without_heading(sample: PoseSample, offset: tuple[float, float]) -> PoseSample:

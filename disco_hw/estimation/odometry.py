@@ -188,7 +188,7 @@ class WheelTracker:
         self._left_offset_rad = 0.0
         self._right_offset_rad = 0.0
 
-    def take(self, sample: WheelSample) -> WheelReading | WheelReason:
+    def add_sample(self, sample: WheelSample) -> WheelReading | WheelReason:
         """Return the reading of a sample, or why there is none.
 
         Angles that jump further than any wheel turns are taken as a restarted counter: no motion, new zero.

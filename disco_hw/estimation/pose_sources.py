@@ -62,12 +62,12 @@ class TrackedSource:
     means_of: int = 0
     _last: Triple = _NAN3
 
-    def forget_course(self) -> None:
+    def reset_course(self) -> None:
         """Clear what poses were off by, because the estimate has jumped elsewhere."""
         self.in_a_row, self.left_by_jump, self.means_of = 0, False, 0
         self.innovation, self.variance, self._last = list(_NAN3), list(_NAN3), _NAN3
 
-    def judged(self, reason: PoseReason, innovation: Triple | None, variance: Triple | None) -> None:
+    def add_evaluation(self, reason: PoseReason, innovation: Triple | None, variance: Triple | None) -> None:
         """Take in what the filter made of a pose."""
         if reason is PoseReason.GATED and innovation is not None and variance is not None:
             if self.in_a_row > 0:
@@ -85,12 +85,12 @@ class TrackedSource:
 
     def _jumped(self, innovation: Triple) -> bool:
         """Whether nearly all of the way out of the gate was made since the pose before."""
-        step = whole = 0.0
+        step = total = 0.0
         for new, old, spread in zip(innovation, self._last, self.variance, strict=True):
             if math.isfinite(new - old) and spread > 0.0:
                 step += (new - old) ** 2 / spread
-                whole += new**2 / spread
-        return step > JUMP_PART * whole > 0.0
+                total += new**2 / spread
+        return step > JUMP_PART * total > 0.0
 
     def _average(self, innovation: Triple, variance: Triple) -> None:
         self.means_of += 1
@@ -111,9 +111,9 @@ class PoseSources:
         self.contradiction = ""
         """Which two contradict each other, in words, while the estimate must not be driven by; else empty."""
         self._timeout_ns = round(timeout_s * 1e9)
-        self._said: list[str] = []
+        self._messages: list[str] = []
 
-    def take(
+    def add_sample(
         self, number: int, t_ns: int, now_ns: int, stds: tuple[float, float], reason: PoseReason,
         innovation: Triple | None, variance: Triple | None,
     ) -> None:  # fmt: skip
@@ -127,8 +127,8 @@ class PoseSources:
         source.came_ns, (source.position_std_m, source.yaw_std_rad) = now_ns, stds
         if reason is PoseReason.REINITIALISED:
             for one in self.all:
-                one.forget_course()
-        source.judged(reason, innovation, variance)
+                one.reset_course()
+        source.add_evaluation(reason, innovation, variance)
         if reason.accepted:
             source.good_ns = max(t_ns, source.good_ns or t_ns)
 
@@ -137,18 +137,18 @@ class PoseSources:
         if len(self.all) < 2:
             return
         for source in self.all:
-            self._judge(source, now_ns)
+            self._update_standing(source, now_ns)
         apart = self._apart()
         if apart and not self.contradiction:
-            self._said.append(f"{apart}; the task stops, because it is unknown which is right")
+            self._messages.append(f"{apart}; the task stops, because it is unknown which is right")
         if self.contradiction and not apart:
-            self._said.append("no source contradicts another any more")
+            self._messages.append("no source contradicts another any more")
         self.contradiction = apart
 
-    def news(self) -> list[str]:
+    def new_messages(self) -> list[str]:
         """Sentences for the operator since the last call."""
-        said, self._said = self._said, []
-        return said
+        messages, self._messages = self._messages, []
+        return messages
 
     def is_good(self, number: int) -> bool:
         """Whether poses of this source are believed; of a single one they always are."""
@@ -181,7 +181,7 @@ class PoseSources:
             for one in self.all
         ]
 
-    def _judge(self, source: TrackedSource, now_ns: int) -> None:
+    def _update_standing(self, source: TrackedSource, now_ns: int) -> None:
         before = source.standing
         if source.came_ns is None:
             return
@@ -196,12 +196,12 @@ class PoseSources:
         good = ", ".join(one.label for one in self.all if one.standing is Standing.GOOD)
         going_on = f"going on with {good}" if good else "no other is left"
         if source.standing is Standing.LOST:
-            source.forget_course()
-            self._said.append(f"{source.label}: lost, no pose for {self._timeout_ns * 1e-9:g} s; {going_on}")
+            source.reset_course()
+            self._messages.append(f"{source.label}: lost, no pose for {self._timeout_ns * 1e-9:g} s; {going_on}")
         elif source.standing is Standing.JUMPED:
-            self._said.append(f"{source.label}: jumped against the wheels and is left out; {going_on}")
+            self._messages.append(f"{source.label}: jumped against the wheels and is left out; {going_on}")
         elif source.standing is Standing.GOOD:
-            self._said.append(f"{source.label}: its poses are used")
+            self._messages.append(f"{source.label}: its poses are used")
 
     def _apart(self) -> str:
         """Return which sources do not agree where it is unknown which one is right."""
@@ -211,9 +211,9 @@ class PoseSources:
             if one.standing is Standing.DEVIATES and others:
                 return f"{one.label} and {others[0].label} contradict each other beyond their stated noise"
         for one, other in combinations([one for one in live if one.means_of >= LEAST_POSES], 2):
-            words = _difference(one, other)
-            if words:
-                return f"{one.label} and {other.label} contradict each other: {words} beyond their stated noise"
+            difference = _difference(one, other)
+            if difference:
+                return f"{one.label} and {other.label} contradict each other: {difference} beyond their stated noise"
         return ""
 
 

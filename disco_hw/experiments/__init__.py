@@ -34,7 +34,7 @@ READY_TIMEOUT_S = 180.0
 """A first start compiles the planner: more than a minute on a busy machine. A daemon that ends is noticed at once."""
 _POLL_S = 0.05
 _END_TIMEOUT_S = 10.0
-_STILL_RAD_S = 0.05
+_STATIONARY_RAD_S = 0.05
 _STARTS = 3
 _CAUSES_OF_THIS_HOST = ("COMMAND_TIMEOUT", "COMMAND_EXPIRED", "HOST_SILENT")
 _ROBOT_SILENT = "-> stopping: telemetry lost"
@@ -48,13 +48,13 @@ class Child:
     process: subprocess.Popen[bytes]
     output: Path
 
-    def said(self) -> str:
+    def output_lines(self) -> str:
         """Return all that the process wrote so far."""
         return self.output.read_text(encoding="utf-8", errors="replace")
 
-    def last_words(self) -> str:
+    def last_line(self) -> str:
         """Return the last line it wrote."""
-        lines = self.said().strip().splitlines()
+        lines = self.output_lines().strip().splitlines()
         return lines[-1] if lines else ""
 
 
@@ -131,24 +131,24 @@ class Operator:
         """
         deadline = time.monotonic() + timeout_s
         latest = deadline + 9.0 * timeout_s
-        words = "no answer yet"
+        detail = "no answer yet"
         while time.monotonic() < deadline:
             self._check_alive()
-            compiling = [said for child in self._children if (said := child.last_words()).startswith("compiling")]
+            compiling = [line for child in self._children if (line := child.last_line()).startswith("compiling")]
             if compiling:
-                words, deadline = compiling[0], min(time.monotonic() + timeout_s, latest)
+                detail, deadline = compiling[0], min(time.monotonic() + timeout_s, latest)
             if self._socket.exists():
                 try:
                     status = send_request(self._socket, {"do": "status"}, timeout_s=2.0)
                 except WorkError as error:
-                    words = str(error)
+                    detail = str(error)
                     continue
                 if status.get("ok") and condition(status):
                     return status
-                words = f"{status.get('state')}: {status.get('detail')}"
+                detail = f"{status.get('state')}: {status.get('detail')}"
             time.sleep(_POLL_S)
-        said = "".join(f"; the {child.name} last said: {child.last_words()}" for child in self._children)
-        raise WorkError(f"not {what} within {timeout_s:g} s ({words}{said})")
+        line = "".join(f"; the {child.name} last said: {child.last_line()}" for child in self._children)
+        raise WorkError(f"not {what} within {timeout_s:g} s ({detail}{line})")
 
     def wait_for(self, state: str, timeout_s: float) -> Mapping[str, Any]:
         """Wait for a state of the daemon."""
@@ -156,19 +156,19 @@ class Operator:
 
     def wait_for_standstill(self, timeout_s: float) -> Mapping[str, Any]:
         """Wait until the measured wheel speeds are below 0.05 rad/s."""
-        return self.wait_until("standing still", stands, timeout_s)
+        return self.wait_until("standing still", is_stationary, timeout_s)
 
     def _check_alive(self) -> None:
         for child in self._children:
             code = child.process.poll()
             if code is not None:
-                raise WorkError(f"the {child.name} ended with exit code {code}: {child.last_words()}")
+                raise WorkError(f"the {child.name} ended with exit code {code}: {child.last_line()}")
 
 
-def stands(status: Mapping[str, Any]) -> bool:
+def is_stationary(status: Mapping[str, Any]) -> bool:
     """Whether the wheels are measured and stand still."""
     wheels = status["wheels"]
-    return wheels is not None and max(abs(wheels[0]), abs(wheels[1])) < _STILL_RAD_S
+    return wheels is not None and max(abs(wheels[0]), abs(wheels[1])) < _STATIONARY_RAD_S
 
 
 FAST_TASK = 'kind = "circle"\nradius_m = 3.0\nspeed_m_s = 0.45\n'
@@ -192,7 +192,7 @@ class TruthRow:
         return max(abs(self.wheels[0]), abs(self.wheels[1]))
 
     @property
-    def asked(self) -> float:
+    def requested(self) -> float:
         """The larger setpoint, rad/s."""
         return max(abs(self.setpoints[0]), abs(self.setpoints[1]))
 
@@ -224,21 +224,23 @@ class Stack:
         A robot that stops because this busy machine held up the daemon or the robot is started again, twice at most.
         """
         for _ in range(_STARTS - 1):
-            said = len(self.daemon.said())
+            lines_before = len(self.daemon.output_lines())
             self.start()
-            over = partial(self._over, reached, said)
+            over = partial(self._over, reached, lines_before)
             status = self.operator.wait_until(what, over, timeout_s)
             if reached(status):
                 return status
         self.start()
         return self.operator.wait_until(what, reached, timeout_s)
 
-    def _over(self, reached: Callable[[Mapping[str, Any]], bool], said: int, status: Mapping[str, Any]) -> bool:
+    def _over(self, reached: Callable[[Mapping[str, Any]], bool], lines_before: int, status: Mapping[str, Any]) -> bool:
         """Whether that is reached, or the robot stopped as it, or the daemon, heard nothing of the other.
 
         `said`: so many characters the daemon had said before.
         """
-        silent = status["stop_cause"] in _CAUSES_OF_THIS_HOST or _ROBOT_SILENT in self.daemon.said()[said:]
+        silent = (
+            status["stop_cause"] in _CAUSES_OF_THIS_HOST or _ROBOT_SILENT in self.daemon.output_lines()[lines_before:]
+        )
         return reached(status) or bool(status["state"] != "ARMED" and silent)
 
     def start(self) -> None:

@@ -27,7 +27,7 @@ from disco_hw.log.reader import open_log
 from disco_hw.log.recorder import MemoryRecorder
 from disco_hw.model import load_model, model_text
 from disco_hw.reports import write_pictures
-from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.robot_setup import Setup
 from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.tasks.circle import CircleTask, circle_task
@@ -202,8 +202,8 @@ class AdaptResult:
         """Inf where it never is."""
         t_s = self.runs[name, True][0].t_s - self.options.change_s
         without, adapted = self._smooth(name, adapted=False), self._smooth(name, adapted=True)
-        lost = without - self._smooth("nothing", adapted=False)
-        back = np.flatnonzero((t_s >= _SMOOTH_S) & (lost > 0.0) & (without - adapted >= 0.5 * lost))
+        loss = without - self._smooth("nothing", adapted=False)
+        back = np.flatnonzero((t_s >= _SMOOTH_S) & (loss > 0.0) & (without - adapted >= 0.5 * loss))
         return float(t_s[back[0]]) if back.size else math.inf
 
     def _published_s(self, name: str) -> float:
@@ -270,7 +270,7 @@ def drive(
     run = SimulatedRun(
         setup,
         virtual_robot(setup, plant, start, effects=effects, seed=seed),
-        make_planner(config, setup.model),
+        create_planner(config, setup.model),
         recorder=recorder,
     )
     rows: list[tuple[float, float, float, float]] = []

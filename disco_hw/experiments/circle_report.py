@@ -141,7 +141,7 @@ class CircleReport:
     estimation: EstimationFigures
     loop: LoopFigures
     frames: dict[str, int]
-    laps_wanted: float
+    laps_requested: float
     stopped: bool
     truth: Path
     estimate: Path
@@ -163,7 +163,7 @@ class CircleReport:
         return (
             (left is None or left > 0.0)
             and self.stopped
-            and self.circle.laps >= self.laps_wanted - _COMPLETED_TOLERANCE_LAPS
+            and self.circle.laps >= self.laps_requested - _COMPLETED_TOLERANCE_LAPS
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -237,7 +237,7 @@ class CircleReport:
 
 
 def load_circle_report(
-    log_file: FilePath, truth_file: FilePath, task: CircleTask, laps_wanted: float, stopped: bool
+    log_file: FilePath, truth_file: FilePath, task: CircleTask, laps_requested: float, stopped: bool
 ) -> CircleReport:
     """Read log and truth of one run; raises WorkError when the task never ran or a file does not fit."""
     log = open_log(log_file)
@@ -262,7 +262,7 @@ def load_circle_report(
         estimation=estimation_figures(estimate, truth),
         loop=_loop_figures(log, first_ns, last_ns),
         frames=_frame_counts(log),
-        laps_wanted=laps_wanted,
+        laps_requested=laps_requested,
         stopped=stopped,
         truth=truth,
         estimate=estimate,

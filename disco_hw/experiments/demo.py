@@ -32,8 +32,8 @@ from disco_hw.experiments import (
     DEVICES,
     Operator,
     disco_hw_process,
+    is_stationary,
     link_of_device,
-    stands,
     with_device,
 )
 from disco_hw.experiments.circle_report import (
@@ -115,16 +115,16 @@ def run_demo(options: DemoOptions) -> CircleReport:
     report = load_circle_report(files.log, files.truth, task, options.laps, stopped)
     if options.obstacle:
         report = replace(report, pillar=PILLAR, footprint=FOOTPRINT)
-    drawn = options.out / "circle.png"
-    report.draw(drawn)
+    picture_file = options.out / "circle.png"
+    report.draw(picture_file)
     console.print(report.table())
-    console.print(f"log {files.log}   picture {drawn}   truth {files.truth}")
-    for line in what_next(options, files.log, drawn):
+    console.print(f"log {files.log}   picture {picture_file}   truth {files.truth}")
+    for line in what_next(options, files.log, picture_file):
         console.print(line, soft_wrap=True, highlight=False)
     return report
 
 
-def what_next(options: DemoOptions, log: Path, drawn: Path) -> list[str]:
+def what_next(options: DemoOptions, log: Path, picture_file: Path) -> list[str]:
     """Return lines on what to look at now, and what to type next."""
     again = (
         []
@@ -132,7 +132,7 @@ def what_next(options: DemoOptions, log: Path, drawn: Path) -> list[str]:
         else ["  disco-hw demo --view           the same, with the page in your browser while it drives"]
     )
     return [
-        f"look at {drawn}: the circle, what was driven, what was estimated",
+        f"look at {picture_file}: the circle, what was driven, what was estimated",
         "type next:",
         f"  disco-hw view {log}    the drive again, on the page, with a bar to scrub",
         f"  disco-hw replay {log}  the controller again on the recorded inputs, bit for bit",
@@ -257,11 +257,11 @@ def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
         operator.request("stop")
         operator.wait_for_standstill(5.0)
         operator.request("disarm")
-        stopped = stands(operator.wait_for("READY", 5.0))
+        stopped = is_stationary(operator.wait_for("READY", 5.0))
         operator.request("quit")
         code = daemon.process.wait(_STOP_TIMEOUT_S)
         if code != 0:
-            raise WorkError(f"the daemon ended with exit code {code}: {daemon.last_words()}")
+            raise WorkError(f"the daemon ended with exit code {code}: {daemon.last_line()}")
     return stopped
 
 
@@ -332,21 +332,21 @@ class _Floor:
         return Text("\n".join(picture(layers, low, high, _PICTURE_ROWS)))
 
 
-def _why_stopped(operator: Operator, status: Mapping[str, Any], taken_ms: int) -> WorkError:
+def _why_stopped(operator: Operator, status: Mapping[str, Any], elapsed_ms: int) -> WorkError:
     """Return what to raise for a drive that ended before its laps; `taken_ms`: CPU time lost to the host just before.
 
     What the host takes bit by bit over a whole drive excuses nothing, hence only the last half second.
     """
-    words = f"the daemon left ARMED for {status['state']}: {status['detail']}"
+    detail = f"the daemon left ARMED for {status['state']}: {status['detail']}"
     # After a long stall the wheels may already stand at the first status: READY in place of STOPPING.
-    if status["state"] not in ("STOPPING", "READY") or taken_ms < _STALL_MS:
-        return WorkError(words)
+    if status["state"] not in ("STOPPING", "READY") or elapsed_ms < _STALL_MS:
+        return WorkError(detail)
     # The daemon may notice a stall before the robot has reported its own stop.
     after = operator.wait_until("stopped", lambda status: bool(status["state"] != "STOPPING"), 5.0)
     if after["stop_cause"] not in _WATCHDOG:
-        return WorkError(words)
+        return WorkError(detail)
     return _HostStallError(
-        f"{words}\nthe host of this virtual machine took {taken_ms} ms of its processors just before"
+        f"{detail}\nthe host of this virtual machine took {elapsed_ms} ms of its processors just before"
     )
 
 

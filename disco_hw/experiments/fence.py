@@ -36,13 +36,13 @@ from disco_hw.fence.outlines import fence_outlines
 from disco_hw.files import FileKind, read_bytes
 from disco_hw.model import Model
 from disco_hw.reports import write_pictures
-from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.pipeline import Planner
 from disco_hw.runtime.robot_setup import Setup
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
-DriveOnce = Callable[[np.random.Generator], FencedDrive]
+RunDrive = Callable[[np.random.Generator], FencedDrive]
 DRIVES = "drives.jsonl"
 ALONE_STREAM, CORRIDOR_STREAM = 99, 98
 ALONE = "guard off: "
@@ -111,7 +111,7 @@ def alone_drive(
         robot = msgspec.structs.replace(setup.config.robot, axial_distance_m=0.415, x_icr_m=0.238, wheel_radius_m=0.061)
         config = msgspec.structs.replace(setup.config, robot=robot, prior=prior_around(robot))
         setup = replace(setup, config=config, model=Model.nominal(robot, config.prior))
-    planner = make_planner(setup.config, setup.model) if planner_of is None else planner_of(setup)
+    planner = create_planner(setup.config, setup.model) if planner_of is None else planner_of(setup)
     learning_s = learning_s if adaptation != "off" else 0.0
     return task_drive(setup, plant, planner, seconds + learning_s, noise, guarded=False, learning_s=learning_s)
 
@@ -149,7 +149,7 @@ class Campaign:
             if (one.off, one.seconds, one.seed) == (options.off, options.seconds, options.seed):
                 self._done.setdefault(one.kind, {})[one.number] = one
 
-    def gather(self, kind: str, count: int, drive: DriveOnce, stream: int) -> None:
+    def gather(self, kind: str, count: int, drive: RunDrive, stream: int) -> None:
         """Drive what is missing of `count` drives; those of one `stream` have the same rooms and robots."""
         options, done = self._options, self._done.setdefault(kind, {})
         for number in range(count):

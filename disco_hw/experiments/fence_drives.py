@@ -23,7 +23,7 @@ from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.fence import Circle, Fence, Footprint
 from disco_hw.fence.clearance import Boundaries
 from disco_hw.fence.task_line import task_breach
-from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.core import CoreTick, PilotTick
 from disco_hw.runtime.fence_guard import FenceVerdict
 from disco_hw.runtime.pipeline import Manual, NoPlanner, Planner
@@ -84,7 +84,7 @@ class _Hand:
     def learn(self, now_ns: int, tick: CoreTick, replies: Any) -> None:
         """Ignore the tick, because wheel speeds are set from outside."""
 
-    def steer(self, now_ns: int, page: int, wanted: Any) -> str | None:
+    def steer(self, now_ns: int, page: int, steering: Any) -> str | None:
         """Refuse a page's steering, because an experiment drives."""
         return "driven by an experiment"
 
@@ -245,10 +245,10 @@ def _begin(run: SimulatedRun) -> None:
     run.run(0.02, UserRequest.START)
 
 
-def tight_room(rng: np.random.Generator, beside_m: float) -> tuple[Fence, CircleTask]:
+def tight_room(rng: np.random.Generator, clearance_m: float) -> tuple[Fence, CircleTask]:
     """Return a circle at 0.3 m/s in a square room whose walls come so near to the footprint's way."""
     radius_m, turned = float(rng.uniform(0.6, 1.0)), float(rng.uniform(0.0, 2.0 * np.pi))
-    reach_m = math.sqrt(2.0) * (_outer_m(radius_m) + beside_m)
+    reach_m = math.sqrt(2.0) * (_outer_m(radius_m) + clearance_m)
     corners = [
         (reach_m * math.cos(turned + k * 0.5 * np.pi), reach_m * math.sin(turned + k * 0.5 * np.pi)) for k in range(4)
     ]
@@ -321,5 +321,5 @@ def _distance_m(point: tuple[float, float], begin: tuple[float, float], end: tup
 def room_drive(rng: np.random.Generator, off: float, seconds: float) -> FencedDrive:
     """Drive a circle in a random room, with the guard."""
     setup = fenced_setup(*random_task_room(rng))
-    planner = make_planner(setup.config, setup.model)
+    planner = create_planner(setup.config, setup.model)
     return task_drive(setup, untold_plant(rng, off), planner, seconds, int(rng.integers(1 << 30)))

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.script import ScriptSource, Unattended
-from disco_hw.drive.scripts import make_script
+from disco_hw.drive.scripts import create_script
 from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments.circle_report import Path as Track
 from disco_hw.experiments.circle_report import circle_figures
@@ -27,11 +27,11 @@ from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.experiments.virtual import true_parameters
 from disco_hw.gap import WRITTEN, gap
 from disco_hw.gap.report import STAGES, GapReport
-from disco_hw.gap.report.page import answer
+from disco_hw.gap.report.page import summary_lines
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model.model import BASE_PARAMETERS
 from disco_hw.reports import BASELINE, MAIN, REFERENCE, as_json, refuse_directory, write_png
-from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.robot_setup import Setup, load_setup
 from disco_hw.tasks.circle import CircleTask, circle_task
@@ -92,7 +92,7 @@ class GapExperimentResult:
     def as_text(self) -> str:
         """Return the result as text for a terminal."""
         lines = [
-            *answer(self.report),
+            *summary_lines(self.report),
             "",
             f"{'model':<20} {'cost':>8} {'rms d':>9} {'max d':>9} {'rms speed error':>16}",
         ]
@@ -200,7 +200,7 @@ def _record(
 ) -> None:
     """Drive the script by the daemon's core and write the log."""
     config = setup.config
-    script = make_script(options.script, config.robot, config.task, config.drive.speed_share)
+    script = create_script(options.script, config.robot, config.task, config.drive.speed_share)
     pilot = HandPilot(
         ScriptSource(script, Unattended()), Coverage(config.drive.speed_share * config.robot.max_wheel_speed_rad_s)
     )
@@ -216,7 +216,7 @@ def _circle(
     """Return the true path of DISCO round the circle with a model."""
     task = circle_task(setup.config.task, "experiment gap")
     with_model = replace(setup, model=model)
-    run = SimulatedRun(with_model, _robot(setup, options, hidden), make_planner(setup.config, model))
+    run = SimulatedRun(with_model, _robot(setup, options, hidden), create_planner(setup.config, model))
     run.start()
     lap_s = 2.0 * math.pi * task.radius_m / task.speed_m_s
     rows = []

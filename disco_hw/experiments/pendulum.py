@@ -154,7 +154,7 @@ def _swing_up(name: str, seed: int, options: PendulumOptions) -> Array:
     rng = np.random.default_rng([seed, 1])
     middle = TRUE if name in KNOW_TRUTH else belief.mean()
     if draws:
-        points = _drawn(belief, padded, rng)
+        points = _sample_points(belief, padded, rng)
     elif not name.startswith("UT"):
         points = PendulumPoints(middle[None], np.ones(1))
     else:
@@ -165,14 +165,14 @@ def _swing_up(name: str, seed: int, options: PendulumOptions) -> Array:
     costs = np.empty(options.steps)
     for step in range(options.steps):
         if draws and step > 0:
-            planner.set_points(_drawn(belief, padded, rng))
+            planner.set_points(_sample_points(belief, padded, rng))
         torque = float(planner.plan(angle, speed)[0])
         angle, speed = pendulum.step(angle, speed, torque, TRUE[0], TRUE[1], PLANT_GRAVITY_M_S2)
         costs[step] = pendulum.instant_cost(angle, speed)
     return costs
 
 
-def _drawn(belief: Belief, count: int, rng: np.random.Generator) -> PendulumPoints:
+def _sample_points(belief: Belief, count: int, rng: np.random.Generator) -> PendulumPoints:
     """Return a draw for each sample, within the physical range."""
     theta = np.maximum(belief.draw(count, rng), [SHORTEST, LIGHTEST])
     return PendulumPoints(theta[None], np.ones(1), each=True)

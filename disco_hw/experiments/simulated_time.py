@@ -27,10 +27,10 @@ from disco_hw.model import model_text
 from disco_hw.reports import refuse_file
 from disco_hw.runtime.assembly import (
     assemble_core,
+    create_pipeline,
+    create_planner,
     driver_of,
     make_adaptation,
-    make_pipeline,
-    make_planner,
 )
 from disco_hw.runtime.core import CoreTick, DaemonCore, FindsWiring, Pilot, TaskPilot
 from disco_hw.runtime.pipeline import Pipeline, Planner
@@ -88,7 +88,7 @@ class SimulatedRun:
         self.recorder = recorder or MemoryRecorder()
         self.now_us = 0
         self._setup = setup
-        pipeline = make_pipeline(setup.config, setup.model, planner)
+        pipeline = create_pipeline(setup.config, setup.model, planner)
         self.core: DaemonCore = assemble_core(
             setup.config,
             robot.host,
@@ -117,8 +117,10 @@ class SimulatedRun:
             if self.now_us // self._period_us == (self.now_us - STEP_US) // self._period_us:
                 continue
             now_ns = self.now_us * 1000
-            wanted = self.pilot.step(now_ns, self.core.last)
-            tick = self.core.tick(now_ns, (*requests, *wanted.requests), motion=wanted.motion, by_hand=wanted.by_hand)
+            desired = self.pilot.step(now_ns, self.core.last)
+            tick = self.core.tick(
+                now_ns, (*requests, *desired.requests), motion=desired.motion, by_hand=desired.by_hand
+            )
             self.pilot.learn(now_ns, tick, tick.replies[len(requests) :])
             requests = ()
             yield tick
@@ -224,8 +226,8 @@ def drive_virtual(
 
 def _at_the_reference_controller(setup: Setup) -> Setup:
     usual = {field.name: field.default for field in msgspec.structs.fields(RobotConfig)}
-    asked = choose_adaptation(setup.config.control, setup.config.pose, setup.model)
-    kind = "auto" if asked.kind == "measured" else asked.kind
+    requested = choose_adaptation(setup.config.control, setup.config.pose, setup.model)
+    kind = "auto" if requested.kind == "measured" else requested.kind
     changed = {
         "link": usual["link"],
         "wheels": usual["wheels"],
@@ -237,5 +239,5 @@ def _at_the_reference_controller(setup: Setup) -> Setup:
 
 def _planner(setup: Setup, law: Law | None) -> Planner:
     if law is None:
-        return make_planner(setup.config, setup.model)
+        return create_planner(setup.config, setup.model)
     return LawController(law, setup.model, setup.config.task.planned(setup.config.control.mode))

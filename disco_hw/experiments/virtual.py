@@ -60,16 +60,18 @@ def run_sim(options: SimOptions) -> int:
         raise InputError(str(error)) from None
     if options.start is not None and not all(map(math.isfinite, options.start)):
         raise InputError(f"--start: {' '.join(map(str, options.start))} is no place; write finite numbers")
-    ticks_per_rev = _whole_ticks(setup)
+    ticks_per_rev = _tick_count(setup)
     driver = find_driver(config.link.driver)
-    make_controller = None if driver.name == DEFAULT else find_controller(driver.name)
-    if not driver.name == DEFAULT and make_controller is None:
+    create_controller = None if driver.name == DEFAULT else find_controller(driver.name)
+    if not driver.name == DEFAULT and create_controller is None:
         raise InputError(f"{setup.robot_file}: link.driver: there is no simulator of {driver.name}")
     if options.board is not None and not driver.name == DEFAULT:
         raise InputError(f"--board: {setup.robot_file} has link.driver {driver.name}; a board speaks our own protocol")
     if options.board is not None and options.bus_log is not None:
         raise InputError("--bus-log: not with --board, whose link is its own; take one of them out")
-    controller = None if make_controller is None else partial(make_controller, config.link.settings(), ticks_per_rev)
+    controller = (
+        None if create_controller is None else partial(create_controller, config.link.settings(), ticks_per_rev)
+    )
     x_m, y_m, yaw_rad = options.start or config.task.course().start
     # The robot that a model without effects describes; what its motors should lack is hidden by the user.
     plant, key = true_parameters(setup, options.plant_seed).with_ideal_motors(), link_key(setup)
@@ -116,7 +118,7 @@ def true_parameters(setup: Setup, plant_seed: int | None) -> PlantParameters:
     """Return the plant at the model's mean, or drawn from the model's belief with this seed."""
     mean, covariance = geometry(setup.model)
     radius, axial, x_icr = mean
-    base = PlantParameters(ticks_per_rev=_whole_ticks(setup))
+    base = PlantParameters(ticks_per_rev=_tick_count(setup))
     if plant_seed is None:
         return replace(base, wheel_radius_m=radius, axial_distance_m=axial, x_icr_m=x_icr)
     order = (2, 0, 1)
@@ -128,7 +130,7 @@ def true_parameters(setup: Setup, plant_seed: int | None) -> PlantParameters:
         raise InputError(f"{setup.model_file or setup.robot_file}: {error}") from None
 
 
-def _whole_ticks(setup: Setup) -> int:
+def _tick_count(setup: Setup) -> int:
     """Ticks of the virtual robot's encoder, which counts whole ones as its firmware's LIMITS message does."""
     ticks = setup.config.robot.ticks_per_rev
     if ticks != round(ticks):

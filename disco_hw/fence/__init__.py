@@ -102,7 +102,7 @@ class FenceFault(NamedTuple):
 
     field: str
     fault: str
-    remedy: str
+    hint: str
 
 
 def fence_fault(fence: Fence, footprint: Footprint) -> FenceFault | None:
@@ -156,12 +156,12 @@ def _polygon_fault(points: Sequence[Point]) -> tuple[str, str] | None:
                 first, second = (edges[k], edges[j]) if j - k == 1 else (edges[j], edges[k])
                 if not _leads_back(*first, second[1]):
                     continue
-                meet = second[0]
+                crossing = second[0]
             elif (found := _meeting(*edges[k], *edges[j])) is None:
                 continue
             else:
-                meet = found
-            where = f"crosses itself near ({meet[0]:.2f}, {meet[1]:.2f})"
+                crossing = found
+            where = f"crosses itself near ({crossing[0]:.2f}, {crossing[1]:.2f})"
             pair = f"edges {k} and {j}"
             return f"{where}: {pair}", "list the corners in the order in which one walks along the fence"
     return None

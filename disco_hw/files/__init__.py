@@ -22,7 +22,7 @@ from msgspec import inspect
 
 from disco_hw.errors import InputError
 
-LONGEST_LINE, LONGEST_WORD, LONGEST_STRING = 65_536, 64, 4096
+LONGEST_LINE, LONGEST_NAME, LONGEST_STRING = 65_536, 64, 4096
 DEEPEST_NESTING, MOST_KEY_PARTS = 16, 8
 _KIB, _MIB = 1024, 1024 * 1024
 _FLAGS = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
@@ -43,7 +43,7 @@ class FileKind:
 
     what: str
     most_bytes: int
-    remedy: str
+    hint: str
 
 
 ROBOT_TOML = FileKind("a robot.toml", 256 * _KIB, "give the path of a robot.toml")
@@ -82,7 +82,7 @@ def open_file(path: Path, kind: FileKind) -> int:
         # A pipe without a writer would hold up a plain open for ever.
         descriptor = os.open(path, _FLAGS)
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({_why(error)}); {kind.remedy}") from None
+        raise InputError(f"{path}: cannot be read ({_why(error)}); {kind.hint}") from None
     try:
         _refuse_unfit(path, kind, os.fstat(descriptor))
     except BaseException:
@@ -99,7 +99,7 @@ def read_bytes(path: Path, kind: FileKind) -> tuple[bytes, os.stat_result]:
             # A file may grow, and those of /proc have no size to begin with.
             content = file.read(kind.most_bytes + 1)
         except OSError as error:
-            raise InputError(f"{path}: cannot be read ({_why(error)}); {kind.remedy}") from None
+            raise InputError(f"{path}: cannot be read ({_why(error)}); {kind.hint}") from None
     if len(content) > kind.most_bytes:
         raise _too_large(path, kind)
     return content, status
@@ -111,7 +111,7 @@ def begin_of(path: Path, kind: FileKind, count: int) -> bytes:
         try:
             return file.read(count)
         except OSError as error:
-            raise InputError(f"{path}: cannot be read ({_why(error)}); {kind.remedy}") from None
+            raise InputError(f"{path}: cannot be read ({_why(error)}); {kind.hint}") from None
 
 
 def read_lines(path: Path, kind: FileKind) -> Iterator[str]:
@@ -121,20 +121,20 @@ def read_lines(path: Path, kind: FileKind) -> Iterator[str]:
     """
     # Spreadsheets write a mark before the first column's name.
     with io.TextIOWrapper(os.fdopen(open_file(path, kind), "rb"), encoding="utf-8-sig", newline="") as file:
-        taken = number = 0
+        size = number = 0
         while True:
             try:
                 line = file.readline(LONGEST_LINE + 1)
             except OSError as error:
-                raise InputError(f"{path}: cannot be read ({_why(error)}); {kind.remedy}") from None
+                raise InputError(f"{path}: cannot be read ({_why(error)}); {kind.hint}") from None
             except UnicodeDecodeError as error:
-                raise InputError(f"{path}: not {kind.what} (not UTF-8: {error.reason}); {kind.remedy}") from None
+                raise InputError(f"{path}: not {kind.what} (not UTF-8: {error.reason}); {kind.hint}") from None
             if not line:
                 return
-            number, taken = number + 1, taken + len(line)
+            number, size = number + 1, size + len(line)
             if len(line) > LONGEST_LINE:
-                raise InputError(f"{path}: line {number}: over {LONGEST_LINE} characters long; {kind.remedy}")
-            if taken > kind.most_bytes:
+                raise InputError(f"{path}: line {number}: over {LONGEST_LINE} characters long; {kind.hint}")
+            if size > kind.most_bytes:
                 raise _too_large(path, kind)
             yield line
 
@@ -183,8 +183,8 @@ def _refuse_hostile(text: str, name: str) -> None:
                 dots += 1
                 if dots >= MOST_KEY_PARTS:
                     raise refuse(f"a key of more than {MOST_KEY_PARTS} parts", token.start())
-            case "word" if token.end() - token.start() > LONGEST_WORD:
-                raise refuse(f"a number or key of more than {LONGEST_WORD} characters", token.start())
+            case "word" if token.end() - token.start() > LONGEST_NAME:
+                raise refuse(f"a number or key of more than {LONGEST_NAME} characters", token.start())
             case "string" if token.end() - token.start() > LONGEST_STRING:
                 raise refuse(f"a string of more than {LONGEST_STRING} characters", token.start())
 
@@ -192,14 +192,14 @@ def _refuse_hostile(text: str, name: str) -> None:
 def _refuse_unfit(path: Path, kind: FileKind, status: os.stat_result) -> None:
     if not stat.S_ISREG(status.st_mode):
         found = _NOT_PLAIN.get(stat.S_IFMT(status.st_mode), "a device")
-        raise InputError(f"{path}: cannot be read ({found}, not a plain file); {kind.remedy}")
+        raise InputError(f"{path}: cannot be read ({found}, not a plain file); {kind.hint}")
     if status.st_size > kind.most_bytes:
         raise _too_large(path, kind)
 
 
 def _too_large(path: Path, kind: FileKind) -> InputError:
     most = f"{kind.most_bytes // _MIB} MiB" if kind.most_bytes >= _MIB else f"{kind.most_bytes // _KIB} KiB"
-    return InputError(f"{path}: too large to be {kind.what} (over {most}); {kind.remedy}")
+    return InputError(f"{path}: too large to be {kind.what} (over {most}); {kind.hint}")
 
 
 def _why(error: OSError | ValueError) -> str:
@@ -209,7 +209,7 @@ def _why(error: OSError | ValueError) -> str:
 _STEP = re.compile(r"\.(\w+)|\[\.*\d*\.*\]")
 
 
-def in_words(error: msgspec.ValidationError, kinds: Sequence[type], docs: str, within: str = "") -> str:
+def describe(error: msgspec.ValidationError, kinds: Sequence[type], docs: str, within: str = "") -> str:
     """Return one line for an invalid field: its name, what is wrong, and the values or the name that it could have.
 
     `docs` says what each value means. `kinds` are the types that the table could have been converted to, `within` is
@@ -223,8 +223,8 @@ def in_words(error: msgspec.ValidationError, kinds: Sequence[type], docs: str, w
     found = re.match(r"Object (contains unknown|missing required) field `(.*)`", text)
     if found is None:
         choices = _choices(here) or _tags(_types_at(roots, place.rpartition(".")[0]), field)
-        remedy = f"write {_one_of(choices)}" if choices else "correct the value"
-        return f"{field or 'top level'}: {text[:1].lower()}{text[1:]}; {remedy}"
+        hint = f"write {_one_of(choices)}" if choices else "correct the value"
+        return f"{field or 'top level'}: {text[:1].lower()}{text[1:]}; {hint}"
     section, name = f"[{field}] " if field else "", found[2]
     if found[1] == "missing required":
         choices = _tags(here, name)
@@ -232,8 +232,8 @@ def in_words(error: msgspec.ValidationError, kinds: Sequence[type], docs: str, w
         return f"{section}{name}: missing; {add} ({docs} says what it means)"
     fields = (one.encode_name for kind in here if isinstance(kind, inspect.StructType) for one in kind.fields)
     near = nearest(name, fields)
-    remedy = f"did you mean {near}?" if near else "check the spelling or remove it"
-    return f"{section}{name}: no such field; {remedy} ({docs} lists every field)"
+    hint = f"did you mean {near}?" if near else "check the spelling or remove it"
+    return f"{section}{name}: no such field; {hint} ({docs} lists every field)"
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:

@@ -22,7 +22,7 @@ class DescriptorReserve:
     def __init__(self, count: int) -> None:
         self._count = count
         self._lock = threading.Lock()
-        self._held: list[int] = []
+        self._reserved: list[int] = []
         self._fill()
 
     @contextmanager
@@ -41,12 +41,12 @@ class DescriptorReserve:
             self._free()
 
     def _fill(self) -> None:
-        while len(self._held) < self._count:
+        while len(self._reserved) < self._count:
             try:
-                self._held.append(os.eventfd(0, os.EFD_CLOEXEC))
+                self._reserved.append(os.eventfd(0, os.EFD_CLOEXEC))
             except OSError:
                 return
 
     def _free(self) -> None:
-        while self._held:
-            os.close(self._held.pop())
+        while self._reserved:
+            os.close(self._reserved.pop())

@@ -23,7 +23,7 @@ from disco_hw.files import parse_toml
 from disco_hw.reports import refuse_file
 from drivers.motor import DEFAULT, UnknownDriverError, find_driver, motor_drivers
 from drivers.pose import DEFAULT as POSE_SOURCE
-from drivers.transport import SerialMedium, TransportSettingsError, make_transport
+from drivers.transport import SerialMedium, TransportSettingsError, create_transport
 from drivers.transport.reconnecting import TransportCounters
 from drivers.transport.serial import ExchangeConnection, open_port
 from drivers.types import Frame, LinkState, MotorDriver
@@ -83,20 +83,20 @@ _MOST_FRAMES = 20_000
 
 
 @dataclass(frozen=True, slots=True)
-class Question:
+class FieldPrompt:
     """A field of [robot]: what is asked of a person, the comment that is written beside it, and what is usual."""
 
     name: str
-    asked: str
+    prompt: str
     comment: str
     usual: float
 
 
 QUESTIONS = (
-    Question("wheel_radius_m", "radius of a wheel, m", "nominal; `infer` learns what it really is", 0.06),
-    Question("axial_distance_m", "from left to right wheels, m", "nominal; a skid-steer seems wider", 0.31),
-    Question("ticks_per_rev", "encoder ticks a turn of a wheel", "what the controller counts in one turn", 2048.0),
-    Question("max_wheel_speed_rad_s", "fastest speed of a wheel, rad/s", "no command is ever faster than this", 8.0),
+    FieldPrompt("wheel_radius_m", "radius of a wheel, m", "nominal; `infer` learns what it really is", 0.06),
+    FieldPrompt("axial_distance_m", "from left to right wheels, m", "nominal; a skid-steer seems wider", 0.31),
+    FieldPrompt("ticks_per_rev", "encoder ticks a turn of a wheel", "what the controller counts in one turn", 2048.0),
+    FieldPrompt("max_wheel_speed_rad_s", "fastest speed of a wheel, rad/s", "no command is ever faster than this", 8.0),
 )
 
 
@@ -115,11 +115,11 @@ class InitOptions:
     listen_s: float = 3.0
     pose_source: str | None = None
     overwrite: bool = False
-    may_ask: bool | None = None
+    is_interactive: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class FoundController:
     """Result of listening on a link: the driver, the fields in [link] that its frames show, a serial line's speed."""
 
     driver: str
@@ -127,10 +127,10 @@ class Heard:
     baud: int | None = None
 
 
-def recognised(frames: Sequence[Frame]) -> tuple[Heard, ...]:
+def recognised(frames: Sequence[Frame]) -> tuple[FoundController, ...]:
     """Return the controllers whose frames these are, by the drivers' own judgement."""
     found = ((driver.name, driver.recognise(frames)) for driver in motor_drivers().values())
-    return tuple(Heard(name, fields) for name, fields in found if fields is not None)
+    return tuple(FoundController(name, fields) for name, fields in found if fields is not None)
 
 
 def listen(link: dict[str, Any], seconds: float) -> list[Frame]:
@@ -139,7 +139,7 @@ def listen(link: dict[str, Any], seconds: float) -> list[Frame]:
     Raises InputError for what cannot be opened.
     """
     try:
-        transport = make_transport(**link)
+        transport = create_transport(**link)
     except TransportSettingsError as error:
         raise InputError(f"--link: {error}") from None
     frames: list[Frame] = []
@@ -159,7 +159,7 @@ def listen(link: dict[str, Any], seconds: float) -> list[Frame]:
     return frames
 
 
-def ask_on_line(port: str, driver: MotorDriver) -> Heard | None:
+def query_line(port: str, driver: MotorDriver) -> FoundController | None:
     """Put a driver's questions, which move and write nothing, on a serial line; what the replies show.
 
     Nothing is asked of a line on which anything speaks by itself. Raises InputError for a port that cannot be used.
@@ -183,11 +183,11 @@ def ask_on_line(port: str, driver: MotorDriver) -> Heard | None:
             raise InputError(f"--link: {medium.explain(error)}") from None
         fields = driver.recognise([frame for frame in replies if frame is not None])
         if fields is not None:
-            return Heard(driver.name, fields, baud)
+            return FoundController(driver.name, fields, baud)
     return None
 
 
-def run_init(options: InitOptions, ask: Callable[[str], str] | None, say: Callable[[str], None]) -> Path:
+def run_init(options: InitOptions, ask: Callable[[str], str] | None, show: Callable[[str], None]) -> Path:
     """Listen, ask, and write a robot.toml that `check` reads; the file written.
 
     `ask` puts a question to a person, None where there is none. Raises InputError for wrong options, for a file that is
@@ -197,8 +197,8 @@ def run_init(options: InitOptions, ask: Callable[[str], str] | None, say: Callab
     if os.path.lexists(options.out) and not options.overwrite:
         raise InputError(f"{options.out}: is there already; name another file, or give --overwrite")
     link = link_fields(options.link)
-    heard = _controller(options, link, ask, say)
-    text = robot_text(options, link, heard, _measures(options, ask))
+    controller = _controller(options, link, ask, show)
+    text = robot_text(options, link, controller, _measures(options, ask))
     trial = options.out.with_name(f".{options.out.name}.new")
     try:
         options.out.parent.mkdir(parents=True, exist_ok=True)
@@ -214,25 +214,25 @@ def run_init(options: InitOptions, ask: Callable[[str], str] | None, say: Callab
 
 
 def _controller(
-    options: InitOptions, link: dict[str, Any], ask: Callable[[str], str] | None, say: Callable[[str], None]
-) -> Heard:
+    options: InitOptions, link: dict[str, Any], ask: Callable[[str], str] | None, show: Callable[[str], None]
+) -> FoundController:
     """Return the driver that was named, or whose frames came, or that replies on a silent line."""
-    found: tuple[Heard, ...] = ()
+    found: tuple[FoundController, ...] = ()
     if options.driver is not None:
         try:
             find_driver(options.driver)
         except UnknownDriverError as error:
             raise InputError(f"--driver: {error}") from None
     if names_address(link) and options.listen_s > 0.0:
-        say(f"listening for {options.listen_s:g} s; nothing is sent")
+        show(f"listening for {options.listen_s:g} s; nothing is sent")
         frames = listen(link, options.listen_s)
         found = recognised(frames)
-        said = ", ".join(f"{one.driver} {one.fields or ''}".strip() for one in found)
-        say(f"{len(frames)} frames received: {said or 'no controller that is known by its own frames'}")
+        controllers = ", ".join(f"{one.driver} {one.fields or ''}".strip() for one in found)
+        show(f"{len(frames)} frames received: {controllers or 'no controller that is known by its own frames'}")
         if not frames and "port" in link:
-            found = _answering(options, str(link["port"]), ask, say)
+            found = _answering(options, str(link["port"]), ask, show)
     if options.driver is not None:
-        return next((one for one in found if one.driver == options.driver), Heard(options.driver, {}))
+        return next((one for one in found if one.driver == options.driver), FoundController(options.driver, {}))
     if len(found) == 1:
         return found[0]
     why = "several controllers answered" if found else "no controller was recognised"
@@ -244,8 +244,8 @@ def _controller(
 
 
 def _answering(
-    options: InitOptions, port: str, ask: Callable[[str], str] | None, say: Callable[[str], None]
-) -> tuple[Heard, ...]:
+    options: InitOptions, port: str, ask: Callable[[str], str] | None, show: Callable[[str], None]
+) -> tuple[FoundController, ...]:
     """Return the controllers that reply on a silent line: of the driver named, or of all once that was allowed."""
     drivers = [driver for driver in motor_drivers().values() if driver.questions is not None]
     if options.driver is not None:
@@ -253,65 +253,69 @@ def _answering(
     if not drivers:
         return ()
     names = ", ".join(driver.name for driver in drivers)
-    allowed = options.may_ask if options.driver is None else options.may_ask is not False
+    allowed = options.is_interactive if options.driver is None else options.is_interactive is not False
     if allowed is None and ask is not None:
-        say("a controller that is set to take single bytes as speeds could move: lift the wheels, or cut motor power")
+        show("a controller that is set to take single bytes as speeds could move: lift the wheels, or cut motor power")
         allowed = ask(f"nothing is sent here unasked; ask for {names} (its version, no more)? [y/n] ").strip() == "y"
     if not allowed:
         return ()
-    found = [heard for driver in drivers if (heard := ask_on_line(port, driver)) is not None]
-    for heard in found:
-        say(f"answers at {heard.baud} baud: {heard.driver} {heard.fields}")
+    found = [controller for driver in drivers if (controller := query_line(port, driver)) is not None]
+    for controller in found:
+        show(f"answers at {controller.baud} baud: {controller.driver} {controller.fields}")
     if not found:
-        say(f"no answer from {names}; is it switched on, and set to answer (packet serial)?")
+        show(f"no answer from {names}; is it switched on, and set to answer (packet serial)?")
     return tuple(found)
 
 
 def _measures(options: InitOptions, ask: Callable[[str], str] | None) -> dict[str, float]:
     given = dict(options.measures)
-    return {one.name: given[one.name] if one.name in given else _asked(one, ask) for one in QUESTIONS}
+    return {one.name: given[one.name] if one.name in given else _prompt_for(one, ask) for one in QUESTIONS}
 
 
-def _asked(question: Question, ask: Callable[[str], str] | None) -> float:
+def _prompt_for(prompt: FieldPrompt, ask: Callable[[str], str] | None) -> float:
     while ask is not None:
-        answer = ask(f"{question.asked} [{question.usual:g}]: ").strip()
-        if not answer:
+        reply = ask(f"{prompt.prompt} [{prompt.usual:g}]: ").strip()
+        if not reply:
             break
         try:
-            return float(answer)
+            return float(reply)
         except ValueError:
             continue
-    return question.usual
+    return prompt.usual
 
 
-def robot_text(options: InitOptions, link: dict[str, Any], heard: Heard, measures: dict[str, float]) -> str:
+def robot_text(
+    options: InitOptions, link: dict[str, Any], controller: FoundController, measures: dict[str, float]
+) -> str:
     """Return the text of a robot.toml, with a comment where somebody must look."""
-    driver = find_driver(heard.driver)
+    driver = find_driver(controller.driver)
     lines = [
         "# Written by `disco-hw init`; docs/robot.md says what every field means and what else there is.",
         "# Next: `disco-hw check` on this file (nothing moves), then `disco-hw commission` (wheels off the ground).",
         "[robot]",
         f"name = {in_toml(options.name or 'robot')}",
     ]
-    for question in QUESTIONS:
-        value = measures[question.name]
-        written = in_toml(int(value)) if question.name == "ticks_per_rev" and value == int(value) else in_toml(value)
-        lines.append(f"{question.name} = {written:<12}  # {question.comment}")
+    for prompt in QUESTIONS:
+        value = measures[prompt.name]
+        written = in_toml(int(value)) if prompt.name == "ticks_per_rev" and value == int(value) else in_toml(value)
+        lines.append(f"{prompt.name} = {written:<12}  # {prompt.comment}")
     kind = link.get("kind", driver.kinds[0])
-    lines += ["", "[link]", f"driver = {in_toml(heard.driver)}", f"kind = {in_toml(kind)}"]
+    lines += ["", "[link]", f"driver = {in_toml(controller.driver)}", f"kind = {in_toml(kind)}"]
     lines += [f"{name} = {in_toml(link[name])}" for name in ("interface", "channel", "port") if name in link]
     if kind == "can":
         lines.append("bitrate = 500000               # as the bus is set")
     elif driver.questions is not None:
-        baud = heard.baud or driver.questions.bauds[0]
-        lines.append(f"baud = {baud:<20}   # {'it answered at this' if heard.baud else 'as the controller is set'}")
-    fields = {**parse_toml(driver.example.encode(), driver.name), **heard.fields}
+        baud = controller.baud or driver.questions.bauds[0]
+        lines.append(
+            f"baud = {baud:<20}   # {'it answered at this' if controller.baud else 'as the controller is set'}"
+        )
+    fields = {**parse_toml(driver.example.encode(), driver.name), **controller.fields}
     if "wheel_radius_m" in fields:
         fields |= {"wheel_radius_m": measures["wheel_radius_m"], "track_m": measures["axial_distance_m"]}
     if fields:
         lines.append("# LOOK: what is not marked as heard is an example; write what your controller is set to.")
     for name, value in fields.items():
-        note = "  # heard: see that left stands before right" if name in heard.fields else ""
+        note = "  # heard: see that left stands before right" if name in controller.fields else ""
         lines.append(f"{name} = {in_toml(value)}{note}")
     source = options.pose_source or (POSE_SOURCE if driver.name == DEFAULT else "udp")
     lines += [

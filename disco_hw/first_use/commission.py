@@ -21,7 +21,7 @@ from disco_hw.drive.terminal import Keyboard, KeyHold
 from disco_hw.errors import InputError, WorkError
 from disco_hw.files import ROBOT_TOML, file_name_of, read_bytes
 from disco_hw.first_use import in_toml, with_fields
-from disco_hw.first_use.judgement import Findings, judge_floor, judge_sides, judge_turns
+from disco_hw.first_use.judgement import Findings, evaluate_floor, evaluate_sides, evaluate_turns
 from disco_hw.first_use.procedure import CommissionPilot, Procedure, Steps, floor, sides, turns
 from disco_hw.reports import refuse_directory
 from disco_hw.runtime.robot_setup import Setup, link_key, load_setup
@@ -40,24 +40,24 @@ class GuidedStage:
     name: str
     where: str
     steps: Callable[[Robot, float], Steps]
-    judge: Callable[[Any, Setup], Findings]
+    evaluate: Callable[[Any, Setup], Findings]
     raw_poses: bool = False
 
 
-def _judge_turns(seen: Any, setup: Setup) -> Findings:
+def _evaluate_turns(seen: Any, setup: Setup) -> Findings:
     link = setup.config.link
     card = find_driver(link.driver).safety_card(link.settings())
-    return judge_turns(seen, setup.config.wheels, card.reaction_s, card.brakes)
+    return evaluate_turns(seen, setup.config.wheels, card.reaction_s, card.brakes)
 
 
 STAGES = (
-    GuidedStage("sides", _UP, sides, lambda seen, of: judge_sides(seen, of.config.wheels, of.config.robot)),
-    GuidedStage("turns", _UP, turns, _judge_turns),
+    GuidedStage("sides", _UP, sides, lambda seen, of: evaluate_sides(seen, of.config.wheels, of.config.robot)),
+    GuidedStage("turns", _UP, turns, _evaluate_turns),
     GuidedStage(
         "floor",
         _DOWN,
         floor,
-        lambda seen, of: judge_floor(seen, of.config.pose.convention(), of.config.robot),
+        lambda seen, of: evaluate_floor(seen, of.config.pose.convention(), of.config.robot),
         raw_poses=True,
     ),
 )
@@ -134,30 +134,30 @@ def run_commission(options: CommissionOptions, ask: Callable[[str], str] = input
     if not os.isatty(_STANDARD_INPUT):
         raise InputError("commission: standard input is no terminal; it needs a person's hand and eye: use a terminal")
     if setup.config.pose.also:
-        _say("poses", "only the first source is examined; `disco-hw check` compares those of [[pose.also]] with it")
-    told: list[dict[str, Any]] = []
+        _print("poses", "only the first source is examined; `disco-hw check` compares those of [[pose.also]] with it")
+    reports: list[dict[str, Any]] = []
     for name in options.stages:
-        if not _through(known[name], options, ask, told):
-            return CommissionResult(tuple(told), ok=False)
-    return CommissionResult(tuple(told), ok=True)
+        if not _through(known[name], options, ask, reports):
+            return CommissionResult(tuple(reports), ok=False)
+    return CommissionResult(tuple(reports), ok=True)
 
 
 def _through(
-    stage: GuidedStage, options: CommissionOptions, ask: Callable[[str], str], told: list[dict[str, Any]]
+    stage: GuidedStage, options: CommissionOptions, ask: Callable[[str], str], reports: list[dict[str, Any]]
 ) -> bool:
     """Drive one stage until it finds nothing; whether it did."""
     ask(f"\n{stage.name}: put the robot {stage.where}, somebody at its stop button; then press Enter ")
     for _ in range(_MOST_TRIES):
         setup = load_setup(options.robot, None, options.link)
-        judgement = stage.judge(_drive(stage, setup, options), setup)
-        for line in (*judgement.figures, *(f"{fault.name.upper()}: {fault.text}" for fault in judgement.faults)):
-            _say("found", line)
-        mended = bool(judgement.edits) and all(fault.edits for fault in judgement.faults)
+        findings = stage.evaluate(_drive(stage, setup, options), setup)
+        for line in (*findings.figures, *(f"{fault.name.upper()}: {fault.text}" for fault in findings.faults)):
+            _print("found", line)
+        mended = bool(findings.edits) and all(fault.edits for fault in findings.faults)
         if mended:
-            mended = write_fields(options, judgement.edits, ask)
-        faults = [{"name": f.name, "text": f.text, "mended": mended} for f in judgement.faults]
-        told.append({"name": stage.name, "figures": list(judgement.figures), "faults": faults})
-        if not judgement.faults:
+            mended = write_fields(options, findings.edits, ask)
+        faults = [{"name": f.name, "text": f.text, "mended": mended} for f in findings.faults]
+        reports.append({"name": stage.name, "figures": list(findings.figures), "faults": faults})
+        if not findings.faults:
             return True
         if not mended:
             return False
@@ -204,15 +204,15 @@ def _drive(stage: GuidedStage, setup: Setup, options: CommissionOptions) -> Any:
     log = _log_directory(options, setup) / f"{name}-commission-{stage.name}-{stamp}.mcap"
     keyboard = Keyboard(_STANDARD_INPUT, KeyHold(0.0), MonotonicClock())
     procedure = Procedure(stage.steps(setup.config.robot, slowest_rad_s(setup)))
-    pilot = CommissionPilot(procedure, keyboard, keyboard.typed, lambda: keyboard.in_vain)
+    pilot = CommissionPilot(procedure, keyboard, keyboard.typed, lambda: keyboard.is_ignored)
     try:
-        _say("keys", "hold the space bar to drive, let go to stop; Ctrl-D gives up")
-        with closing(AsyncPrinter(STANDARD_ERROR, in_text)) as say:
-            serve(as_sent(setup) if stage.raw_poses else setup, log, say, pilot)
+        _print("keys", "hold the space bar to drive, let go to stop; Ctrl-D gives up")
+        with closing(AsyncPrinter(STANDARD_ERROR, in_text)) as show:
+            serve(as_sent(setup) if stage.raw_poses else setup, log, show, pilot)
     finally:
         keyboard.close()
-    if pilot.trouble is not None:
-        raise WorkError(f"commission: in the stage {stage.name}: {pilot.trouble}")
+    if pilot.fault_text is not None:
+        raise WorkError(f"commission: in the stage {stage.name}: {pilot.fault_text}")
     if pilot.procedure.action is not None:
         raise WorkError(f"commission: ended in the stage {stage.name}; begin again with --stage {stage.name}")
     return pilot.procedure.result
@@ -222,5 +222,5 @@ def _log_directory(options: CommissionOptions, setup: Setup) -> Path:
     return options.log_directory or Path(setup.config.log.directory)
 
 
-def _say(topic: str, text: str) -> None:
+def _print(topic: str, text: str) -> None:
     print(in_text(topic, text), file=sys.stderr, flush=True)

@@ -23,7 +23,7 @@ OFFER = (
     "`disco-hw log fence LOG` writes the [fence] (docs/fence.md)"
 )
 """What `init` and `commission` print at their end where nobody can be asked, or who is asked says no."""
-_QUESTION = "record the fence now, by taking the robot once round along the edge? Poses must come. [y/n] "
+_PROMPT = "record the fence now, by taking the robot once round along the edge? Poses must come. [y/n] "
 _AGAIN = "once more? [y/n] "
 _EVERY = 5
 
@@ -60,19 +60,19 @@ def record_fence(
     `how`: what the operator does once the recording runs. `ask`: how the operator is asked. A way that makes no fence
     can be driven again. Raises InputError and WorkError as the drive does.
     """
-    question = _QUESTION
-    while _is_yes(ask(question)):
+    prompt = _PROMPT
+    while _is_yes(ask(prompt)):
         print(f"{how}; Ctrl-D ends the recording", file=sys.stderr, flush=True)
         log = drive(DriveOptions(robot, link=link)).log
         try:
             keep_in = fence_of_log(log)
         except InputError as error:
             print(error, file=sys.stderr, flush=True)
-            question = _AGAIN
+            prompt = _AGAIN
             continue
         return write_fields(CommissionOptions(robot), {("fence", "keep_in"): [list(one) for one in keep_in]}, ask)
     return False
 
 
-def _is_yes(answer: str) -> bool:
-    return answer.strip().lower() in {"y", "yes"}
+def _is_yes(reply: str) -> bool:
+    return reply.strip().lower() in {"y", "yes"}

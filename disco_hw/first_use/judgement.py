@@ -31,7 +31,7 @@ from drivers.types import PoseSample
 
 Edits = Mapping[tuple[str, str], Any]
 
-STILL_RAD_S = 0.05
+STATIONARY_RAD_S = 0.05
 COUNTS_RAD = 0.1
 """A wheel that was seen turning has moved its own encoder by more, another one by less."""
 TURN_TOLERANCE = 0.15
@@ -62,7 +62,7 @@ class Findings:
         return {place: value for fault in self.faults for place, value in fault.edits.items()}
 
 
-def judge_sides(seen: Sequence[SideSeen], wiring: Wiring, robot: Robot) -> Findings:
+def evaluate_sides(seen: Sequence[SideSeen], wiring: Wiring, robot: Robot) -> Findings:
     """Find which motor and encoder is on which side, and which way round; `wiring`: that of robot.toml."""
     faults: list[Fault] = []
     figures = [_dead_band(side, one.track) for side, one in enumerate(seen)]
@@ -78,7 +78,7 @@ def judge_sides(seen: Sequence[SideSeen], wiring: Wiring, robot: Robot) -> Findi
                 )
             )
         if not one.seen:
-            faults.append(Fault(f"{SIDES[side]} still", _still(side, one.track)))
+            faults.append(Fault(f"{SIDES[side]} still", _stationary_text(side, one.track)))
     turned = ["lr".index(one.seen[0]) for one in seen if one.seen]
     if len(turned) == 2 and turned[0] == turned[1]:
         both = f"both commands turned the {SIDES[turned[0]]} side; give each side its own node, or look at the cables"
@@ -88,7 +88,7 @@ def judge_sides(seen: Sequence[SideSeen], wiring: Wiring, robot: Robot) -> Findi
     return Findings(tuple(_wiring_faults(seen, wiring)), tuple(figures))
 
 
-def _still(side: int, track: Track) -> str:
+def _stationary_text(side: int, track: Track) -> str:
     counted = [SIDES[k] for k, rad in enumerate(track.turned()) if abs(rad) > COUNTS_RAD]
     if counted:
         return f"nothing was seen turning, yet the {' and '.join(counted)} encoder counts; look again"
@@ -103,18 +103,18 @@ def _wiring_faults(seen: Sequence[SideSeen], old: Wiring) -> list[Fault]:
     motors, encoders = [0, 0], [0, 0]
     dead: list[int] = []
     swapped = crossed = False
-    for asked, one in enumerate(seen):
+    for commanded, one in enumerate(seen):
         side, way = "lr".index(one.seen[0]), 1 if one.seen[1] == "f" else -1
-        channel = asked ^ old.sides_swapped
-        motors[side] = way * old.motor_direction[asked]
+        channel = commanded ^ old.sides_swapped
+        motors[side] = way * old.motor_direction[commanded]
         swapped = bool(channel ^ side)
         counted = one.track.turned()
         reader = max((0, 1), key=lambda k: abs(counted[k]))
         if abs(counted[reader]) < COUNTS_RAD:
             dead.append(side)
             continue
-        own = reader ^ (old.sides_swapped != old.encoders_swapped)
-        crossed = swapped != bool(own ^ side)
+        expected = reader ^ (old.sides_swapped != old.encoders_swapped)
+        crossed = swapped != bool(expected ^ side)
         encoders[side] = way * (1 if counted[reader] > 0.0 else -1) * old.encoder_direction[reader]
     if dead:
         names = " and ".join(SIDES[side] for side in dead)
@@ -163,7 +163,7 @@ def _wiring_faults(seen: Sequence[SideSeen], old: Wiring) -> list[Fault]:
 
 def _side_of(seen: Sequence[SideSeen], side: int) -> str:
     """Return which commanded side turned this one, as a letter."""
-    return "lr"[next(asked for asked, one in enumerate(seen) if "lr".index(one.seen[0]) == side)]
+    return "lr"[next(commanded for commanded, one in enumerate(seen) if "lr".index(one.seen[0]) == side)]
 
 
 def _with(fault: Fault, place: tuple[str, str], value: Any) -> Fault:
@@ -173,7 +173,8 @@ def _with(fault: Fault, place: tuple[str, str], value: Any) -> Fault:
 def _dead_band(side: int, track: Track) -> str:
     """Return the command at which a wheel began to turn."""
     begun = next(
-        (s.t_ns for s in track.wheels if max(abs(s.left_speed_rad_s), abs(s.right_speed_rad_s)) > STILL_RAD_S), None
+        (s.t_ns for s in track.wheels if max(abs(s.left_speed_rad_s), abs(s.right_speed_rad_s)) > STATIONARY_RAD_S),
+        None,
     )
     if begun is None:
         return f"{SIDES[side]}: never turned"
@@ -181,7 +182,7 @@ def _dead_band(side: int, track: Track) -> str:
     return f"{SIDES[side]}: begins to turn at a command of {command:.2f} rad/s"
 
 
-def judge_turns(seen: TurnsSeen, wiring: Wiring, reaction_s: float, brakes: bool) -> Findings:
+def evaluate_turns(seen: TurnsSeen, wiring: Wiring, reaction_s: float, brakes: bool) -> Findings:
     """Ticks a turn, and whether the robot stopped by itself; `reaction_s`: how soon the driver's safety card says."""
     faults, figures = [], []
     shares = [abs(track.turned()[side]) / (2.0 * math.pi) for side, track in enumerate(seen.turns)]
@@ -214,27 +215,29 @@ def judge_turns(seen: TurnsSeen, wiring: Wiring, reaction_s: float, brakes: bool
             )
         )
     else:
-        begun_s, still_s = stopped
+        begun_s, stationary_s = stopped
         how = "braking" if brakes else "coasting"
-        figures.append(f"watchdog: slowing {begun_s:.2f} s after the last command, {_standing(still_s)} ({how})")
+        figures.append(f"watchdog: slowing {begun_s:.2f} s after the last command, {_standing(stationary_s)} ({how})")
         if begun_s > reaction_s + SETTLED_S:
-            late = (
+            delayed = (
                 f"the robot began to stop {begun_s:.2f} s after the last command, and should within {reaction_s:.2f} s"
             )
-            faults.append(Fault("watchdog late", f"{late}; set its time as `disco-hw check` says"))
+            faults.append(Fault("watchdog late", f"{delayed}; set its time as `disco-hw check` says"))
     return Findings(tuple(faults), tuple(figures))
 
 
-def _standing(still_s: float | None) -> str:
-    return "still rolling at the end" if still_s is None else f"standing after {still_s:.2f} s"
+def _standing(stationary_s: float | None) -> str:
+    return "still rolling at the end" if stationary_s is None else f"standing after {stationary_s:.2f} s"
 
 
 def _simple(ratio: float) -> float:
     """Return a ratio of small numbers where one is as near as a person can tell, else two digits."""
     near = [a / b for b in range(1, 9) for a in range(1, 9) if abs(a / b / ratio - 1.0) < 0.3 * TURN_TOLERANCE]
-    whole = [float(n) for n in range(2, 65) if min(abs(n / ratio - 1.0), abs(n * ratio - 1.0)) < 0.3 * TURN_TOLERANCE]
-    if whole:
-        return whole[0] if ratio > 1.0 else 1.0 / whole[0]
+    integers = [
+        float(n) for n in range(2, 65) if min(abs(n / ratio - 1.0), abs(n * ratio - 1.0)) < 0.3 * TURN_TOLERANCE
+    ]
+    if integers:
+        return integers[0] if ratio > 1.0 else 1.0 / integers[0]
     return min(near, key=lambda value: abs(value - ratio)) if near else float(f"{ratio:.2g}")
 
 
@@ -253,7 +256,7 @@ def _stop_after_silence(track: Track) -> tuple[float, float | None] | None:
     slow = next((t_s for t_s, speed in after if speed < SLOWING * steady), None)
     if slow is None or slow > let_go_s + 0.05 or after[-1][1] > 0.5 * steady:
         return None
-    return slow, next((t_s for t_s, speed in after if speed < STILL_RAD_S), None)
+    return slow, next((t_s for t_s, speed in after if speed < STATIONARY_RAD_S), None)
 
 
 def _faster(left: float, right: float) -> float:
@@ -265,14 +268,14 @@ def _response(track: Track) -> list[tuple[str, str]]:
     if not track.commands:
         return []
     top = max(_faster(left, right) for _, left, right in track.commands)
-    asked = next((t for t, left, right in track.commands if _faster(left, right) >= 0.5 * top), None)
+    commanded_s = next((t for t, left, right in track.commands if _faster(left, right) >= 0.5 * top), None)
     came = next((s.t_ns for s in track.wheels if _faster(s.left_speed_rad_s, s.right_speed_rad_s) >= 0.5 * top), None)
-    if asked is None or came is None:
+    if commanded_s is None or came is None:
         return [("command to wheel", "no response seen")]
-    return [("command to wheel", f"{max(0.0, (came - asked) * 1e-6):.0f} ms")]
+    return [("command to wheel", f"{max(0.0, (came - commanded_s) * 1e-6):.0f} ms")]
 
 
-def judge_floor(seen: FloorSeen, told: PoseConvention, robot: Robot) -> Findings:
+def evaluate_floor(seen: FloorSeen, configured: PoseConvention, robot: Robot) -> Findings:
     """Find the units and axes of the poses, the sensor's place, and its delay.
 
     The poses are as the source sent them; `told` is what robot.toml says of them.
@@ -290,9 +293,10 @@ def judge_floor(seen: FloorSeen, told: PoseConvention, robot: Robot) -> Findings
         return Findings((Fault("poses do not follow", text),))
     # What robot.toml says is believed where it explains the drive.
     best = min(
-        fits, key=lambda fit: (fit.mismatch_rad > _SAME_RAD, not _same_units(fit.convention, told), fit.mismatch_rad)
+        fits,
+        key=lambda fit: (fit.mismatch_rad > _SAME_RAD, not _same_units(fit.convention, configured), fit.mismatch_rad),
     )
-    faults = list(_pose_faults(best, told))
+    faults = list(_pose_faults(best, configured))
     figures = [
         f"straight: the wheels say {best.wheels_m:.3f} m, the poses {best.poses_m:.3f} m",
         f"half a turn by the nominal axle was {math.degrees(best.turned_rad):.0f} degrees",
@@ -331,12 +335,12 @@ class _Fit:
     turned_rad: float
 
 
-def _same_units(found: PoseConvention, told: PoseConvention) -> bool:
+def _same_units(found: PoseConvention, configured: PoseConvention) -> bool:
     return (found.position_unit, found.yaw_unit, found.clockwise, found.mirrored) == (
-        told.position_unit,
-        told.yaw_unit,
-        told.clockwise,
-        told.mirrored,
+        configured.position_unit,
+        configured.yaw_unit,
+        configured.clockwise,
+        configured.mirrored,
     )
 
 
@@ -397,7 +401,7 @@ def _turn(poses: Sequence[PoseSample], choice: PoseConvention) -> float:
     return math.fsum(math.remainder(b - a, 2.0 * math.pi) for a, b in pairwise(yaws))
 
 
-def _pose_faults(found: _Fit, told: PoseConvention) -> list[Fault]:
+def _pose_faults(found: _Fit, configured: PoseConvention) -> list[Fault]:
     names = {
         "position_unit": ("pose in other units", f"positions come in {found.convention.position_unit}"),
         "yaw_unit": ("yaw in other units", f"the yaw comes in {found.convention.yaw_unit}"),
@@ -407,10 +411,10 @@ def _pose_faults(found: _Fit, told: PoseConvention) -> list[Fault]:
     faults = [
         Fault(name, f"{text}; robot.toml says otherwise", {("pose", key): getattr(found.convention, key)})
         for key, (name, text) in names.items()
-        if getattr(found.convention, key) != getattr(told, key)
+        if getattr(found.convention, key) != getattr(configured, key)
     ]
     offset = found.convention.yaw_offset_rad
-    if abs(math.remainder(offset - told.yaw_offset_rad, 2.0 * math.pi)) > _OFFSET_RAD:
+    if abs(math.remainder(offset - configured.yaw_offset_rad, 2.0 * math.pi)) > _OFFSET_RAD:
         faults.append(
             Fault(
                 "sensor looks aside",
@@ -433,12 +437,12 @@ def _places(seen: FloorSeen, best: _Fit) -> list[str]:
     delays = [_delay_s(track, convention) for track in (seen.left, seen.right)]
     ahead = "ahead of" if forward > 0.0 else "behind"
     aside = "left" if left > 0.0 else "right"
-    late = "behind" if _mean(delays) > 0.0 else "ahead of"
+    direction = "behind" if _mean(delays) > 0.0 else "ahead of"
     lines = [
         f"lever arm: the sensor is {abs(forward):.2f} m {ahead} and {abs(left):.2f} m to the {aside} of the point "
         f"about which the robot turns (x_icr_m = {-forward:.2f})",
         f"poses: {_rate(seen):.0f} a second, {_age_ms(seen):.0f} ms old when they come, their stamps "
-        f"{abs(1e3 * _mean(delays)):.0f} ms {late} the wheels'",
+        f"{abs(1e3 * _mean(delays)):.0f} ms {direction} the wheels'",
     ]
     if abs(left) > POSE_STD_LEFT_M:
         lines.append("the sensor is far from the middle of the robot: the circle that it drives is not the robot's own")
@@ -464,10 +468,10 @@ def _delay_s(track: Track, convention: PoseConvention) -> float:
     pose_t = np.array([pose.t_ns for pose in poses]) * 1e-9
     yaw = np.unwrap([pose.yaw_rad for pose in poses])
     shifts = np.arange(-0.3, 0.6, 0.005)
-    return float(min(shifts, key=lambda shift: _misfit(pose_t - shift, yaw, wheel_t, turn)))
+    return float(min(shifts, key=lambda shift: _mismatch(pose_t - shift, yaw, wheel_t, turn)))
 
 
-def _misfit(
+def _mismatch(
     at: NDArray[np.float64], yaw: NDArray[np.float64], t: NDArray[np.float64], turn: NDArray[np.float64]
 ) -> float:
     base = np.column_stack([np.ones_like(at), np.interp(at, t, turn)])

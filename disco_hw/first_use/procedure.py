@@ -62,10 +62,10 @@ class Silence:
 
 
 @dataclass(frozen=True, slots=True)
-class Ask:
+class Prompt:
     """Stand, and wait for one of the keys."""
 
-    question: str
+    prompt: str
     keys: str
 
 
@@ -76,7 +76,7 @@ class Reset:
     todo: str
 
 
-Action = DriveWheels | Silence | Ask | Reset
+Action = DriveWheels | Silence | Prompt | Reset
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +160,7 @@ def sides(robot: Robot, _slowest_rad_s: float = 0.0) -> Steps:
     found = []
     for side in (0, 1):
         track, ran_away = yield from _ramp(side, top)
-        key = yield Ask(
+        key = yield Prompt(
             f"asked the {SIDES[side]} side to turn forward. What turned? "
             "1 left forward, 2 left backward, 3 right forward, 4 right backward, 0 nothing",
             "12340",
@@ -227,7 +227,7 @@ def turns(robot: Robot, slowest_rad_s: float = 0.0) -> Steps:
         todo = f"put a mark on the {SIDES[side]} wheel; hold, and let go when it has gone round exactly once"
         while True:
             track = yield from _until_let_go(wheels, todo)
-            key = yield Ask(f"was that one turn of the {SIDES[side]} wheel? y yes, n again", "yn")
+            key = yield Prompt(f"was that one turn of the {SIDES[side]} wheel? y yes, n again", "yn")
             if key == "y":
                 break
         tracks.append(track)
@@ -347,12 +347,12 @@ class Procedure:
 
     def see(self, seen: Seen) -> None:
         """Hand on what the tick saw; a question waits for its answer instead."""
-        if self._action is not None and not isinstance(self._action, Ask):
+        if self._action is not None and not isinstance(self._action, Prompt):
             self._send(seen)
 
     def answer(self, key: str) -> bool:
         """Answer the question that waits; whether this key is one of its answers."""
-        if not isinstance(self._action, Ask) or key not in self._action.keys:
+        if not isinstance(self._action, Prompt) or key not in self._action.keys:
             return False
         self._send(key)
         return True
@@ -370,7 +370,7 @@ _FAULT_NS = 1_000_000_000
 class CommissionPilot:
     """Drives as the procedure says while the deadman of `source` is held; satisfies `disco_hw.runtime.core.Pilot`.
 
-    `keys`: those typed since it was asked last, for the procedure's questions. `in_vain`: whether a key is held that
+    `keys`: those typed since it was asked last, for the procedure's questions. `is_ignored`: whether a key is held that
     does not count, which the person is told once.
     """
 
@@ -379,19 +379,19 @@ class CommissionPilot:
         procedure: Procedure,
         source: ManualSource,
         keys: Callable[[], str],
-        in_vain: Callable[[], bool] = lambda: False,
+        is_ignored: Callable[[], bool] = lambda: False,
     ) -> None:
         self.procedure = procedure
         self._source = source
         self._keys = keys
-        self._in_vain = in_vain
-        self._was_in_vain = False
+        self._is_ignored = is_ignored
+        self._was_ignored = False
         self._deadman = Deadman()
         self._driving = self._held = self._was_ready = False
-        self._said = ""
-        self._told: list[str] = []
+        self._last_prompt = ""
+        self._messages: list[str] = []
         self._fault_ns: int | None = None
-        self.trouble: str | None = None
+        self.fault_text: str | None = None
         """The fault that ended the drive, in words."""
 
     @property
@@ -407,7 +407,7 @@ class CommissionPilot:
     @property
     def done(self) -> bool:
         """Whether the procedure is over, or the person gave up."""
-        return self.procedure.action is None or self._source.ended is not None or self.trouble is not None
+        return self.procedure.action is None or self._source.ended is not None or self.fault_text is not None
 
     def step(self, now_ns: int, last: CoreTick | None) -> PilotTick:
         """Hear the person, and want what the procedure wants."""
@@ -425,11 +425,11 @@ class CommissionPilot:
         if isinstance(action, Silence) and isinstance(motion, Manual):
             motion = Silent()
         self._was_ready |= state is State.READY
-        before, self._was_in_vain = self._was_in_vain, self._in_vain()
-        if self._was_in_vain and not before:
-            self._told.append("the key does not count yet: release all keys for half a second, then hold it again")
-        events = [*self._told, *([verdict.event] if verdict.event is not None else []), *self._new_words()]
-        self._told.clear()
+        before, self._was_ignored = self._was_ignored, self._is_ignored()
+        if self._was_ignored and not before:
+            self._messages.append("the key does not count yet: release all keys for half a second, then hold it again")
+        events = [*self._messages, *([verdict.event] if verdict.event is not None else []), *self._new_prompt()]
+        self._messages.clear()
         requests = verdict.requests
         if isinstance(action, Reset) and state is State.FAULT:
             requests = (*requests, UserRequest.RESET)
@@ -439,7 +439,7 @@ class CommissionPilot:
         """Hand the procedure what the tick saw."""
         refusals = [reply.text for reply in replies if not reply.accepted]
         if refusals and not isinstance(self.procedure.action, Reset):
-            self._told.append(self._deadman.refused(refusals[0]))
+            self._messages.append(self._deadman.refused(refusals[0]))
         command = tick.command
         self._driving = command is not None and tick.pipeline.source is Source.MANUAL
         commanded = (command.left_rad_s, command.right_rad_s) if command is not None and self._driving else None
@@ -448,12 +448,12 @@ class CommissionPilot:
             (self._fault_ns or now_ns) if fault and isinstance(self.procedure.action, DriveWheels) else None
         )
         if self._fault_ns is not None and now_ns - self._fault_ns > _FAULT_NS:
-            self.trouble = tick.output.detail
+            self.fault_text = tick.output.detail
         self.procedure.see(
             Seen(now_ns, self._driving, commanded, tick.readings.wheels, tick.readings.poses, fault, silent, self._held)
         )
 
-    def steer(self, now_ns: int, page: int, wanted: Mapping[str, Any]) -> str | None:
+    def steer(self, now_ns: int, page: int, steering: Mapping[str, Any]) -> str | None:
         """No page drives here."""
         return "the robot is being commissioned from its terminal"
 
@@ -461,11 +461,11 @@ class CommissionPilot:
         """Return an empty dict: the status gets no more entries."""
         return {}
 
-    def _new_words(self) -> list[str]:
+    def _new_prompt(self) -> list[str]:
         action = self.procedure.action
-        words = "" if action is None else action.question if isinstance(action, Ask) else action.todo
+        prompt = "" if action is None else action.prompt if isinstance(action, Prompt) else action.todo
         # Who is told to hold a key before the robot is ready holds it in vain.
-        if words == self._said or not self._was_ready:
+        if prompt == self._last_prompt or not self._was_ready:
             return []
-        self._said = words
-        return [words] if words else []
+        self._last_prompt = prompt
+        return [prompt] if prompt else []

@@ -35,11 +35,11 @@ from disco_hw.gap.report.judge import (
     blind_spot_findings,
     candidate_evidence,
     channel_findings,
+    classify_findings,
     drifting_parameters,
     effect_findings,
     left_out_notes,
     residue_sentences,
-    sort_out,
     unnamed_findings,
 )
 from disco_hw.gap.report.page import as_text, page
@@ -50,7 +50,7 @@ from disco_hw.gap.search.channel_result import ChannelEstimates
 from disco_hw.gap.search.channel_search import search_body, search_wheels, that_models_hold
 from disco_hw.gap.search.cross_validation import PredictionErrors, only_timed, wheel_table, worse_by
 from disco_hw.gap.search.decision import first_as_good
-from disco_hw.gap.search.richest_model import LATE_COLUMNS, candidates_of
+from disco_hw.gap.search.richest_model import DELAY_COLUMNS, candidates_of
 from disco_hw.gap.search.unnamed_terms import with_known_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
 from disco_hw.log import version
@@ -85,18 +85,20 @@ def find_gap(
     LogError if the logs hold too little to judge either channel.
     """
     began = time.perf_counter()
-    say = progress or (lambda text: None)
+    report_progress = progress or (lambda text: None)
     log = logs if isinstance(logs, DriveLog) else concatenate(logs)
     warnings = check_consistency(log, model)
-    analysis, notes = search_log(log, model, say, settings)
-    say("intervals, blind spots and the gap on held-out data")
+    analysis, notes = search_log(log, model, report_progress, settings)
+    report_progress("intervals, blind spots and the gap on held-out data")
     final = final_fit(analysis)
     named, unnamed = effect_findings(analysis, final), unnamed_findings(analysis)
-    effects, doubtful = sort_out(named, Measured.of(analysis, final))
+    effects, doubtful = classify_findings(named, Measured.of(analysis, final))
     spots = blind_spot_findings(analysis, named, top_rad_s)
     claims = boldest_claims(spots, settings.report.proved_claims) if prove else ()
     if claims:
-        say(f"proof of what this log shows: {', '.join(claim.name for claim in claims)} put in and searched for")
+        report_progress(
+            f"proof of what this log shows: {', '.join(claim.name for claim in claims)} put in and searched for"
+        )
     with being_proved(spots, claims, finder(analysis)) as proved:
         predictions = joint_predictions(analysis, final) if analysis.body is not None else None
         gap = {} if predictions is None else predictions.table()
@@ -107,7 +109,7 @@ def find_gap(
                 gap["written"] = written[2].table()["amended"]
             if wheels:
                 wheels = {**wheels, "written": wheel_table(written[0])["amended"]}
-        drawn = _drawn(analysis, gap) if pictures else {}
+        images = _draw_images(analysis, gap) if pictures else {}
         spots = proved()
     # Without poses the wheels decide, where geometry says nothing: as given, timed or amended.
     kept = written[0] if written[2] is None or written[2].kept is None else written[2].kept[0]
@@ -133,7 +135,7 @@ def find_gap(
         doubtful=doubtful,
         notes=(*log.notes, *analysis.drive.notes, *notes, *remarks),
         candidates=candidate_evidence(analysis),
-        pictures=drawn,
+        pictures=images,
         seconds=time.perf_counter() - began,
         settings=settings,
         wheels=wheels,
@@ -154,16 +156,16 @@ def written_of(
     analysis: GapAnalysis, final: FinalFit, predictions: StagePredictions | None
 ) -> tuple[GapAnalysis, FinalFit, StagePredictions | None]:
     """What the model is written from: with other terms in place of those that no model can carry, and other values."""
-    held = analysis
+    written = analysis
     if analysis.body is not None and (body := that_models_hold(analysis.body)) is not analysis.body:
-        held = replace(held, body=body)
-    if analysis.wheels is not None and (own := that_models_hold(analysis.wheels)) is not analysis.wheels:
-        held = replace(held, wheels=own)
-    if held is analysis:
+        written = replace(written, body=body)
+    if analysis.wheels is not None and (refitted := that_models_hold(analysis.wheels)) is not analysis.wheels:
+        written = replace(written, wheels=refitted)
+    if written is analysis:
         return analysis, final, predictions
-    held = prune(held)
-    final = final_fit(held)
-    return held, final, joint_predictions(held, final) if held.body is not None else None
+    written = prune(written)
+    final = final_fit(written)
+    return written, final, joint_predictions(written, final) if written.body is not None else None
 
 
 def _of_wheels(wheels: Mapping[str, Mapping[float, PredictionErrors]]) -> dict[str, Mapping[float, PredictionErrors]]:
@@ -215,14 +217,14 @@ def model_of(
     named = {effect.name: effect.parameters for effect in effect_findings(analysis, final, given=True)}
     if final.wheel_estimates is not None:
         values = final.wheel_estimates.by_name
-        for column in LATE_COLUMNS:
+        for column in DELAY_COLUMNS:
             name, _, key = column.partition(".")
             if name not in named and column in values:
                 named[name] = {key: values[column]}
     return amended_model(model, named, carried_terms(analysis, final), channel_estimates(analysis, final))
 
 
-def _drawn(analysis: GapAnalysis, gap: dict[str, dict[float, PredictionErrors]]) -> dict[str, bytes]:
+def _draw_images(analysis: GapAnalysis, gap: dict[str, dict[float, PredictionErrors]]) -> dict[str, bytes]:
     from disco_hw.gap.report import figures  # noqa: PLC0415  (matplotlib, slow to import)
 
     return figures.pictures(analysis, gap)
@@ -238,7 +240,7 @@ def missing_effects(log: DriveLog, model: Model) -> tuple[str, ...]:
     check_consistency(log, model)
     analysis, _ = search_log(log, model)
     final = final_fit(analysis)
-    sure, doubtful = sort_out(effect_findings(analysis, final), Measured.of(analysis, final))
+    sure, doubtful = classify_findings(effect_findings(analysis, final), Measured.of(analysis, final))
     names = tuple(effect.name for effect in sure or doubtful)
     if analysis.body is None or not names:
         return names
@@ -250,7 +252,7 @@ def missing_effects(log: DriveLog, model: Model) -> tuple[str, ...]:
 def search_log(
     log: DriveLog,
     model: Model,
-    say: Progress = lambda text: None,
+    report_progress: Progress = lambda text: None,
     settings: GapSettings = DEFAULT_SETTINGS,
 ) -> tuple[GapAnalysis, list[str]]:
     """Both channels searched, without what makes predictions worse; and notes on what could not be judged."""
@@ -266,13 +268,13 @@ def search_log(
     body = wheels = None
     notes: list[str] = []
     if drive.has_poses:
-        say("wheel to body: which effects are missing")
+        report_progress("wheel to body: which effects are missing")
         body = search_body(drive, nominal_body, _given(model, BODY))
         geometry = body.fit.vector[:BASE_COUNT]
     else:
         notes.append("no poses: only the way from command to wheel is judged")
     if drive.has_commands:
-        say("command to wheel: which effects are missing")
+        report_progress("command to wheel: which effects are missing")
         wheels = search_wheels(drive, geometry, nominal_wheels, _given(model, WHEEL))
     else:
         notes.append("no commands: the way from command to wheel is not judged")
@@ -403,7 +405,7 @@ def gap_fleet(
     judged gets a row that says so. Raises as `gap` does.
     """
     task, loaded = _prepared(logs, robot, out, model, FLEET_WRITTEN)
-    drives, say = [loaded([log]) for log in logs], progress or (lambda text: None)
+    drives, report_progress = [loaded([log]) for log in logs], progress or (lambda text: None)
     # Logs of two directories may have one name.
     stems = [log.stem for log in logs]
     places = [
@@ -419,7 +421,7 @@ def gap_fleet(
             rows.append(FleetRow(log, place, None, found))
         else:
             rows.append(FleetRow(log, place, _written(found, robot, model, place, task.robot_name).report))
-        say(f"{len(rows)} of {len(logs)}: {log}")
+        report_progress(f"{len(rows)} of {len(logs)}: {log}")
     result = FleetResult(tuple(rows), out)
     try:
         out.mkdir(parents=True, exist_ok=True)

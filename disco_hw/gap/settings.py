@@ -13,7 +13,7 @@ from dataclasses import dataclass
 # Compiled into the free runs and the filters, and so no settings.
 GRID_STEP_S = 0.01
 """Grid of the free runs, s. Chosen: half the period of commands at 50 Hz."""
-WANDER_S = 20.0
+DRIFT_S = 20.0
 """Correlation time of the slow error of a wheel's speed, s. Chosen: longer than any manoeuvre of a log."""
 
 
@@ -47,9 +47,9 @@ class GridSettings:
     """Fewer encoder readings do not judge the wheels. Chosen: 80 s of readings that are held leave as many."""
     fewest_poses: int = 60
     """Fewer poses do not judge the body. Chosen."""
-    held_share: float = 0.3
+    repeated_share: float = 0.3
     """Wheel speeds of which more than this share repeat the last one are held. Chosen: a Husky's do in most samples."""
-    held_periods: float = 4.0
+    repeated_periods: float = 4.0
     """A value that is repeated for longer than so many periods was measured again. Chosen."""
     lead_s: float = 1.0
     """After a run's start so long nothing is predicted: what was commanded before is not known. Chosen."""
@@ -236,7 +236,7 @@ class TermSettings:
 
     most_terms: int = 3
     """More terms are not added. Chosen."""
-    least_own_share: float = 0.1
+    least_independent_share: float = 0.1
     """A term of which what is fitted already does the rest is left out: it would only pull against it. Chosen."""
     worth_trying_nats: float = 18.0
     """Gain to first order from which on a term is fitted. Chosen: below what acceptance takes."""
@@ -302,7 +302,7 @@ class PredictionSettings:
     joint_trust: float = 3.0
     """Before the whole chain is fitted, channels are trusted to so many of their standard deviations. Measured: halves
     of real logs predict each other best with 3 to 10."""
-    late_far_s: float = 0.2
+    delay_far_s: float = 0.2
     """Where `timed` has a delay or a lag so far from that of the wheels' channel, the last fit begins from either.
     Chosen: a ramp of seconds makes a lag of a second, and a fit that begins there ends there."""
     worse: float = 1.05
@@ -337,7 +337,7 @@ class ReportSettings:
     """Inflation of the variance that is expected of an effect that is not there. Chosen."""
     proved_claims: int = 3
     """So many claims of what a log shows are proved by putting the effect in. Chosen: each takes a search or two."""
-    asked_share: float = 0.75
+    commanded_share: float = 0.75
     """A limit shows only where this share of what the robot can do is asked. Chosen."""
     rest_rad_s: float = 0.1
     """Regimes: wheels below rest. Chosen."""

@@ -31,7 +31,7 @@ class ScoreTest:
     symptom: Symptom
 
     @property
-    def meaning(self) -> str:
+    def description(self) -> str:
         """Description of what the deviation would look like."""
         return self.symptom.value
 
@@ -42,7 +42,7 @@ class ScoreTest:
 
 
 CHECKS = (
-    ScoreTest("late positions", Symptom.LATE_POSITIONS),
+    ScoreTest("late positions", Symptom.DELAYED_POSITIONS),
     ScoreTest("sideways with speed", Symptom.SIDEWAYS_WITH_SPEED),
     ScoreTest("sideways in fast turns", Symptom.SIDEWAYS_IN_FAST_TURNS),
     ScoreTest("forward with turning", Symptom.FORWARD_WITH_TURNING),
@@ -52,7 +52,7 @@ CHECKS = (
     ScoreTest("distance changes", Symptom.DISTANCE_CHANGES),
     ScoreTest("turns on straights", Symptom.TURNS_ON_STRAIGHTS),
     ScoreTest("less turn at speed", Symptom.LESS_TURN_AT_SPEED),
-    ScoreTest("late yaw", Symptom.LATE_YAW),
+    ScoreTest("late yaw", Symptom.DELAYED_YAW),
     ScoreTest("left unlike right", Symptom.LEFT_UNLIKE_RIGHT),
     ScoreTest("turning changes", Symptom.TURNING_CHANGES),
 )
@@ -290,7 +290,7 @@ def effective_simulations(fitted: Fitted, observed: Array) -> float:
     return float(weight.sum() ** 2 / (weight**2).sum())
 
 
-WORDS = ("x_icr", "the wheel radius", "the axial distance")
+PARAMETER_NAMES = ("x_icr", "the wheel radius", "the axial distance")
 WIDE = 0.2
 _SHARE = 0.45
 _STRAIGHT = 0.08
@@ -378,11 +378,11 @@ def _wide_directions(draws: Array, low: Array, high: Array, drive: Excitation) -
         if wide < WIDE:
             continue
         involved = [index for index in range(len(NAMES)) if abs(axis[index]) > _SHARE]
-        names = " and ".join(WORDS[index] for index in involved)
+        names = " and ".join(PARAMETER_NAMES[index] for index in involved)
         together = " together" if len(involved) > 1 else ""
         sentences.append(
             f"{names}{together} {'are' if together else 'is'} left open: {100.0 * min(wide, 1.0):.0f} % of the prior's "
-            f"width remains{_combination(involved, axis)}; {_remedy(involved, driven(drive))}"
+            f"width remains{_combination(involved, axis)}; {_hint(involved, driven(drive))}"
         )
     return sentences
 
@@ -394,7 +394,7 @@ def _combination(involved: list[int], axis: Array) -> str:
     return ", they can grow together" if same else ", one can grow while the other shrinks"
 
 
-def _remedy(involved: list[int], done: Driven) -> str:
+def _hint(involved: list[int], done: Driven) -> str:
     wishes = []
     if 1 in involved and done.straight_rad < _LITTLE_ROLL_RAD:
         wishes.append("drive straight lines of a metre or more")

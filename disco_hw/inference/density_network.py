@@ -109,8 +109,8 @@ class Mixtures:
         rows = np.arange(n)[:, None]
         inverse = np.linalg.inv(self.factor)
         normal = rng.standard_normal((n, count, size))
-        drawn: Array = self.mean[rows, which] + np.einsum("nmij,nmj->nmi", inverse[rows, which], normal)
-        return drawn
+        samples: Array = self.mean[rows, which] + np.einsum("nmij,nmj->nmi", inverse[rows, which], normal)
+        return samples
 
 
 class _Stack(torch.nn.Module):
@@ -236,9 +236,9 @@ def _least_squares(features: Array, targets: Array) -> tuple[Array, Array]:
 def _fit(stack: _Stack, x: torch.Tensor, y: torch.Tensor, settings: NetworkSettings) -> None:
     """Train an ensemble in place, with early stopping by the log density of held-out pairs."""
     members, count = settings.members, x.shape[0]
-    held = max(8, round(_VALIDATION_SHARE * count))
+    validation_count = max(8, round(_VALIDATION_SHARE * count))
     order = torch.stack([torch.randperm(count) for _ in range(members)])
-    validation, training = order[:, :held], order[:, held:]
+    validation, training = order[:, :validation_count], order[:, validation_count:]
     valid_x, valid_y = x[validation], y[validation]
     batches = max(1, training.shape[1] // _BATCH)
     optimiser = torch.optim.AdamW(stack.parameters(), lr=settings.rate, weight_decay=settings.decay)
@@ -270,7 +270,7 @@ def _fit(stack: _Stack, x: torch.Tensor, y: torch.Tensor, settings: NetworkSetti
 
 
 Simulate = Callable[[Array, Seeds], Array]
-Say = Callable[[str], None]
+Report = Callable[[str], None]
 
 SCOUT = NetworkSettings(members=2, epochs=60, patience=8)
 FULL = NetworkSettings()
@@ -327,7 +327,7 @@ class Fitted:
 def truncated_draws(region: Region, mixtures: Mixtures, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
     """Draws (n, count, P) of mixtures over a region's coordinates, inside it, and the share (n,) first outside."""
     n, _, size = mixtures.mean.shape
-    drawn = np.empty((n, count, size))
+    samples = np.empty((n, count, size))
     missing = np.ones((n, count), dtype=bool)
     outside = np.zeros(n)
     for attempt in range(_LARGEST_REJECTION):
@@ -335,16 +335,16 @@ def truncated_draws(region: Region, mixtures: Mixtures, count: int, rng: np.rand
         good = region.contains(fresh.reshape(-1, size)).reshape(n, count)
         if attempt == 0:
             outside = 1.0 - good.mean(axis=1)
-        take = missing & good
-        drawn[take] = fresh[take]
+        accepted = missing & good
+        samples[accepted] = fresh[accepted]
         missing &= ~good
         if not missing.any():
-            return drawn, outside
+            return samples, outside
     # What never falls inside is put on the edge: the posterior is all but outside, and `outside` says so.
     edge = region.points(np.clip(region.unit(region.points(mixtures.draw(count, rng)).reshape(-1, size)), -1.0, 1.0))
-    held = np.clip(edge, region.low, region.high).reshape(n, count, size)
-    drawn[missing] = held[missing]
-    return drawn, outside
+    clipped = np.clip(edge, region.low, region.high).reshape(n, count, size)
+    samples[missing] = clipped[missing]
+    return samples, outside
 
 
 def run_rounds(
@@ -354,7 +354,7 @@ def run_rounds(
     simulations: int,
     settings: RoundSettings,
     seed: int,
-    say: Say = lambda _: None,
+    report: Report = lambda _: None,
     workers: Workers | None = None,
 ) -> Fitted:
     """Infer from observed statistics (S,); `simulate` gives statistics (n, S) of points (n, P) and seeds (n,).
@@ -368,11 +368,11 @@ def run_rounds(
     fitted: Fitted | None = None
     for number, share in enumerate(settings.shares, start=1):
         count = max(64, round(share * simulations))
-        say(f"round {number} of {len(settings.shares)}: {count} simulations")
+        report(f"round {number} of {len(settings.shares)}: {count} simulations")
         fresh = region.draw(count, rng)
         theta = np.concatenate([theta, fresh])
         statistics = np.concatenate([statistics, simulate(fresh, draw_seeds(count, rng))])
-        say(f"round {number} of {len(settings.shares)}: density network")
+        report(f"round {number} of {len(settings.shares)}: density network")
         # Draws of earlier rounds that fall inside were uniform there too.
         used = region.contains(theta)
         size = settings.network if number == len(settings.shares) else settings.scout

@@ -85,7 +85,7 @@ class _Roll:
 
     t_s: Array
     angle_rad: Array
-    lost_s: Array
+    unknown_s: Array
 
 
 def excitation(log: DriveLog, source: Source | None = None) -> Excitation:
@@ -147,8 +147,8 @@ def _check_motion(name: str, drive: Excitation) -> None:
         raise UnusableDriveError(
             f"{name}: the wheels turn by {roll_rad:.2g} rad in all; record a drive of a minute or two"
         )
-    still = drive.pose - np.repeat(drive.pose[drive.run_pose[:-1]], np.diff(drive.run_pose), axis=0)
-    reach = float(np.hypot(still[:, 0], still[:, 1]).max() + 0.05 * np.abs(still[:, 2]).max())
+    displacement = drive.pose - np.repeat(drive.pose[drive.run_pose[:-1]], np.diff(drive.run_pose), axis=0)
+    reach = float(np.hypot(displacement[:, 0], displacement[:, 1]).max() + 0.05 * np.abs(displacement[:, 2]).max())
     if reach < _LEAST_PATH_RADIUS_M * min(roll_rad, 50.0):
         raise UnusableDriveError(
             f"{name}: the wheels turn by {roll_rad:.3g} rad and the pose stays within {reach:.2g} m; "
@@ -169,9 +169,9 @@ def _runs(log: DriveLog, source: Source, segment: int) -> list[Excitation]:
     t_s, pose = t_s[covered], pose[covered]
     if t_s.size < 2:
         return []
-    lost_s = np.interp(t_s, roll.t_s, roll.lost_s)
+    unknown_s = np.interp(t_s, roll.t_s, roll.unknown_s)
     gap_s = np.diff(t_s)
-    breaks = (gap_s > _POSE_GAP_PERIODS * np.median(gap_s)) | (np.diff(lost_s) > 1e-9)
+    breaks = (gap_s > _POSE_GAP_PERIODS * np.median(gap_s)) | (np.diff(unknown_s) > 1e-9)
     edges = [0, *(np.flatnonzero(breaks) + 1).tolist(), t_s.size]
     return [
         _run(t_s[lo:hi], pose[lo:hi], roll, source)
@@ -229,7 +229,7 @@ def _commanded(commands: Commands, segment: int) -> _Roll:
     known = np.isfinite(speed).all(axis=1)
     # The last command is in force for a while after it was given; how long is not in the log.
     t_s = np.append(t_s, t_s[-1] + _LONGEST_WHEEL_GAP_S)
-    held_s = np.diff(t_s)
-    angle = np.cumsum(np.where(known[:, None], speed, 0.0) * held_s[:, None], axis=0)
-    lost_s = np.cumsum(np.where(known, 0.0, held_s))
-    return _Roll(t_s, np.vstack([np.zeros(2), angle]), np.append(0.0, lost_s))
+    interval_s = np.diff(t_s)
+    angle = np.cumsum(np.where(known[:, None], speed, 0.0) * interval_s[:, None], axis=0)
+    unknown_s = np.cumsum(np.where(known, 0.0, interval_s))
+    return _Roll(t_s, np.vstack([np.zeros(2), angle]), np.append(0.0, unknown_s))

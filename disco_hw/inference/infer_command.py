@@ -37,7 +37,7 @@ class GapCheck:
     """Names of `missing` effects, the surest first; `not_judged` says why the log could not be searched, if so."""
 
     missing: tuple[str, ...] = ()
-    not_judged: str | None = None
+    why_not_checked: str | None = None
 
 
 def gap_check(log: DriveLog, model: Model) -> GapCheck:
@@ -47,11 +47,11 @@ def gap_check(log: DriveLog, model: Model) -> GapCheck:
     try:
         return GapCheck(missing_effects(log, model))
     except InputError as error:
-        return GapCheck(not_judged=str(error))
+        return GapCheck(why_not_checked=str(error))
 
 
 @contextmanager
-def gap_check_beside(log: DriveLog, model: Model) -> Iterator[Callable[[], GapCheck]]:
+def gap_check_in_parallel(log: DriveLog, model: Model) -> Iterator[Callable[[], GapCheck]]:
     """Begin the search in a process of its own; yields what waits for its result, which raises WorkError."""
     context = get_context("spawn")
     result, send = context.Pipe(duplex=False)
@@ -105,7 +105,7 @@ class InferResult:
             "undetermined": list(self.inference.undetermined),
             "outside_simulated": self.inference.predictive.outside_simulated,
             "missing_effects": list(self.gap.missing),
-            "gap_not_judged": self.gap.not_judged,
+            "gap_not_judged": self.gap.why_not_checked,
             "disagreements": [
                 {"check": check.name, "deviation": deviation, "effects": list(check.effects)}
                 for check, deviation in self.inference.predictive.disagreements
@@ -141,8 +141,8 @@ class InferResult:
                 f"warning: the robot shows {', '.join(self.gap.missing)}, which the model lacks; fitted alone, the "
                 "parameters absorb it"
             )
-        if self.gap.not_judged is not None:
-            lines.append(f"warning: whether an effect is missing was not judged: {self.gap.not_judged}")
+        if self.gap.why_not_checked is not None:
+            lines.append(f"warning: whether an effect is missing was not judged: {self.gap.why_not_checked}")
         elif self.gap.missing or self.inference.predictive.outside_simulated:
             logs = " ".join(map(str, self.logs))
             lines.append(
@@ -174,7 +174,7 @@ def diagnostics(inference: Inference) -> dict[str, Any]:
 def _disagreements(inference: Inference) -> list[str]:
     check = inference.predictive
     lines = [
-        f"warning: {one.name}: {one.meaning}, {abs(deviation):.0f} standard deviations from every simulation "
+        f"warning: {one.name}: {one.description}, {abs(deviation):.0f} standard deviations from every simulation "
         f"(as {' or '.join(one.effects)} would do)"
         for one, deviation in check.disagreements
     ]
@@ -212,7 +212,7 @@ def infer_command(
     options: InferOptions | None = None,
     dask: str | None = None,
     report_progress: ReportProgress = lambda *_: None,
-    search: Search = gap_check_beside,
+    search: Search = gap_check_in_parallel,
 ) -> InferResult:
     """Infer the geometry from logs; write the model to `out` and, if asked for, a page with pictures to `report`.
 

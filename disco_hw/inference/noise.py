@@ -234,14 +234,14 @@ def _left(rows: list[_Windows], grown_s: Array, sensors: Array, lever_m: float) 
 
     The errors there themselves are taken: of two variances that are nearly the same a difference tells little.
     """
-    part = whole = 0.0
+    part = total = 0.0
     for one, grown in zip(rows, grown_s.tolist(), strict=True):
         variance = float(_variance((one.error[:, [1]] + lever_m * one.error[:, [2]]) ** 2)[0])
         sensor, sensor_yaw = one.sensor[:, 1:].mean(axis=0) * sensors[1:]
         weight = one.independent / max(variance, 1e-12) ** 2
         part += weight * grown * (variance - float(sensor + lever_m**2 * sensor_yaw))
-        whole += weight * grown**2
-    return max(part / whole, 0.0) if whole > 0.0 else 0.0
+        total += weight * grown**2
+    return max(part / total, 0.0) if total > 0.0 else 0.0
 
 
 def _speed_share(windows: list[_Windows], sensors: Array, slips: Array, correlation_s: float) -> float:
@@ -314,15 +314,15 @@ def _in_body(drive: Excitation, error: Array) -> tuple[Array, Array]:
 
     Over a second of turning, what slips forward would be counted to the left otherwise.
     """
-    own, turned = np.zeros_like(error), np.zeros(error.shape[0])
+    in_body, turned = np.zeros_like(error), np.zeros(error.shape[0])
     for lo, hi in _bounds(drive):
         yaw = drive.pose[lo:hi, 2]
         turn = np.diff(yaw)
         cosine, sine = np.cos(yaw[:-1] + 0.5 * turn), np.sin(yaw[:-1] + 0.5 * turn)
         x, y, off = np.diff(error[lo:hi], axis=0).T
-        own[lo + 1 : hi] = np.cumsum(np.column_stack([x * cosine + y * sine, y * cosine - x * sine, off]), axis=0)
+        in_body[lo + 1 : hi] = np.cumsum(np.column_stack([x * cosine + y * sine, y * cosine - x * sine, off]), axis=0)
         turned[lo + 1 : hi] = np.cumsum(turn**2)
-    return own, turned
+    return in_body, turned
 
 
 def _windows(drive: Excitation, error: Array, turned: Array, by_speed_s: Array, lag: int) -> _Windows:

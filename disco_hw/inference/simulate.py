@@ -25,7 +25,7 @@ from disco_hw.model.added_terms import new_means
 from disco_hw.model.coefficients import base_point, effect_point
 from disco_hw.model.model import BASE_PARAMETERS, Model, coefficient_tables
 from disco_hw.model.step import axle_of, integration_from, integration_series, step, tracked_of
-from disco_hw.model.terms import forget
+from disco_hw.model.terms import clear_memory
 
 Array = NDArray[np.float64]
 Seeds = NDArray[np.uint32]
@@ -63,7 +63,7 @@ def simulate_kernel(
     """
     integration = integration_from(series, True, None)
     root = math.sqrt(integration.step_s)
-    unit, noise, wander = np.empty(7), np.empty(7), np.empty(3)
+    unit, noise, drift = np.empty(7), np.empty(7), np.empty(3)
     for i in range(seeds.shape[0]):
         np.random.seed(seeds[i])
         for row in range(7):
@@ -75,7 +75,7 @@ def simulate_kernel(
         keep = math.exp(-integration.step_s / max(noise[5], 1e-4))
         fresh, long_run = math.sqrt(1.0 - keep * keep), math.sqrt((1.0 - keep) / (1.0 + keep))
         here, effects_here = base_point(base, i), effect_point(effects, i)
-        forget(means)
+        clear_memory(means)
         for run in range(run_node.shape[0] - 1):
             x, y, yaw = starts[run, 0], starts[run, 1], starts[run, 2]
             cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
@@ -83,7 +83,7 @@ def simulate_kernel(
             wheel_left, wheel_right = wheel[run_node[run], 0], wheel[run_node[run], 1]
             sample, last = run_pose[run], run_pose[run + 1]
             for axis in range(3):
-                wander[axis] = np.random.standard_normal()
+                drift[axis] = np.random.standard_normal()
             for k in range(run_node[run], run_node[run + 1]):
                 before_x, before_y, before_yaw = x, y, yaw
                 axle_x, axle_y, cos_yaw, sin_yaw, wheel_left, wheel_right, _, turn = step(
@@ -95,10 +95,10 @@ def simulate_kernel(
                 if intensity[k] > 0.0:
                     size = long_run * root * math.sqrt(intensity[k])
                     for axis in range(3):
-                        wander[axis] = keep * wander[axis] + fresh * np.random.standard_normal()
-                    slip_yaw = size * noise[4] * wander[2]
-                    along = size * noise[2] * wander[0]
-                    across = size * noise[3] * wander[1] - noise[6] * slip_yaw
+                        drift[axis] = keep * drift[axis] + fresh * np.random.standard_normal()
+                    slip_yaw = size * noise[4] * drift[2]
+                    along = size * noise[2] * drift[0]
+                    across = size * noise[3] * drift[1] - noise[6] * slip_yaw
                     x += along * cos_yaw - across * sin_yaw
                     y += along * sin_yaw + across * cos_yaw
                     yaw += slip_yaw

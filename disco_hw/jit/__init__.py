@@ -214,7 +214,7 @@ def _newton(square: float) -> tuple[float, float, float]:
 
 
 @scalar_function
-def quick_norm_and_inverse(x: float, y: float) -> tuple[float, float]:
+def fast_norm_and_inverse(x: float, y: float) -> tuple[float, float]:
     """Length of a vector and its reciprocal, by Newton's step from an estimate, to 2e-7; of zero, 1e-15 and 1e15."""
     square = x * x + (y * y + cast_like(1e-30, x))
     estimate, norm, step = _newton(square)
@@ -222,7 +222,7 @@ def quick_norm_and_inverse(x: float, y: float) -> tuple[float, float]:
 
 
 @scalar_function
-def quick_length(x: float, y: float, z: float) -> float:
+def fast_length(x: float, y: float, z: float) -> float:
     """Length of a vector of three, as of `quick_norm_and_inverse`."""
     square = x * x + (y * y + (z * z + cast_like(1e-30, x)))
     norm: float
@@ -232,8 +232,8 @@ def quick_length(x: float, y: float, z: float) -> float:
 
 
 @scalar_function
-def quick_norm(x: float, y: float) -> float:
+def fast_norm(x: float, y: float) -> float:
     """Length of a vector, as of `quick_norm_and_inverse`."""
     norm: float
-    norm, _ = quick_norm_and_inverse(x, y)
+    norm, _ = fast_norm_and_inverse(x, y)
     return norm

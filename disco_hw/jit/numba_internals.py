@@ -33,7 +33,7 @@ class _CalleeLibrary(JITCodeLibrary):
         self._finalized = True
 
     @cached_property
-    def own_module(self) -> Any:
+    def callee_module(self) -> Any:
         """Module of the function without what it calls, to be linked any number of times."""
         self._ensure_finalized()  # type: ignore[no-untyped-call]
         for function in self._final_module.functions:
@@ -44,10 +44,10 @@ class _CalleeLibrary(JITCodeLibrary):
     def _get_module_for_linking(self) -> Any:
         """Return the module with all that it calls, for functions that numba's own library holds."""
         if self._shared_module is None:
-            whole = self.own_module.clone()
+            linked = self.callee_module.clone()
             for library in _called_by(self):
-                whole.link_in(_module_of(library), preserve=True)
-            self._shared_module = whole
+                linked.link_in(_module_of(library), preserve=True)
+            self._shared_module = linked
         return self._shared_module
 
 
@@ -72,7 +72,7 @@ def _called_by(library: CodeLibrary) -> list[CodeLibrary]:
 
 
 def _module_of(library: Any) -> Any:
-    return library.own_module if isinstance(library, _CalleeLibrary) else library._get_module_for_linking()
+    return library.callee_module if isinstance(library, _CalleeLibrary) else library._get_module_for_linking()
 
 
 class _KernelLibrary(JITCodeLibrary):
@@ -128,7 +128,7 @@ class KernelCompiler(Compiler):
 
     def compile_extra(self, func: Callable[..., Any]) -> CompileResult:
         """Compile as the base class does, but do once what numba does again for every function."""
-        with _nothing_collected(), _registries_loaded(self.state.targetctx), _overloads_taken_in():
+        with _nothing_collected(), _registries_loaded(self.state.targetctx), _overloads_recorded():
             result: CompileResult = super().compile_extra(func)  # type: ignore[no-untyped-call]
             return result
 
@@ -163,7 +163,7 @@ def _registries_loaded(target: Any) -> Iterator[None]:
 
 
 @contextmanager
-def _overloads_taken_in() -> Iterator[None]:
+def _overloads_recorded() -> Iterator[None]:
     """Compile numba's own overloads, such as `min`, as what kernels call."""
     usual = jit_registry.pop(CPU)
     jit_registry[CPU] = partial(jit, pipeline_class=CalleeCompiler)

@@ -147,7 +147,7 @@ _UNEXPLAINED = 0.6
 _EXPLAINED = 0.4
 _WELL_EXPLAINED = 0.2
 _AS_GOOD = 0.5
-_LEAST_LATE_S = 0.75
+_LEAST_DELAY_S = 0.75
 _USUAL_GAIN = (0.55, 1.5)
 _UNEQUAL = 1.4
 # In a second of a slow drive a wheel may lack so much of its command by its deadband alone.
@@ -192,10 +192,10 @@ def _of_one(log: DriveLog, radius_m: float, axial_m: float) -> tuple[Contradicti
     if dead:
         return dead
     poses = _Poses(log, windows, radius_m, axial_m)
-    beside_commands = _of_commands(windows, commands)
-    if beside_commands is None:
+    compared_with_commands = _of_commands(windows, commands)
+    if compared_with_commands is None:
         return poses.contradictions(has_commands=commands is not None)
-    of_wheels, of_commands, as_commanded = beside_commands
+    of_wheels, of_commands, as_commanded = compared_with_commands
     if poses.fits(as_commanded):
         return (replace(of_wheels, message=f"{of_wheels.message} (the poses say so too)"),)
     if poses.fits(windows):
@@ -217,10 +217,10 @@ def _of_commands(
     if swapped is not None and swapped.worst < _EXPLAINED:
         far_better = swapped.worst < _AS_GOOD * min(fit.unexplained)
         if far_better or (_are_usual(swapped.gains) and not _are_usual(fit.gains)):
-            said = "each wheel follows the command of the other side: the left and right"
+            explanation = "each wheel follows the command of the other side: the left and right"
             return (
-                Contradiction("sides_swapped", f"{said} encoders are swapped", ("body", "response")),
-                Contradiction("sides_swapped", f"{said} commands are swapped", ("response",)),
+                Contradiction("sides_swapped", f"{explanation} encoders are swapped", ("body", "response")),
+                Contradiction("sides_swapped", f"{explanation} commands are swapped", ("response",)),
                 _with_wheels(windows, np.sign(swapped.gains)[::-1], swap=True),
             )
     if fit.worst > _UNEXPLAINED:
@@ -246,13 +246,15 @@ def _of_commands(
     ratio = float(gains[0] / gains[1])
     if not 1.0 / _UNEQUAL < ratio < _UNEQUAL and not _are_usual(fit.gains):
         more, times = (0, ratio) if ratio > 1.0 else (1, 1.0 / ratio)
-        said = (
+        explanation = (
             f"the {SIDES[more]} wheel counts {times:.2f} times what the {SIDES[1 - more]} one does for a command "
             f"({gains[more]:.2f} and {gains[1 - more]:.2f} times the command)"
         )
         return (
-            Contradiction("encoder_count", f"{said}: check ticks_per_rev and gear", ("body", "response")),
-            Contradiction("command_scale", f"{said}, and the poses bear the wheels out: check commands", ("response",)),
+            Contradiction("encoder_count", f"{explanation}: check ticks_per_rev and gear", ("body", "response")),
+            Contradiction(
+                "command_scale", f"{explanation}, and the poses bear the wheels out: check commands", ("response",)
+            ),
             _with_wheels(windows, 1.0 / gains),
         )
     gain = float(np.sqrt(gains[0] * gains[1]))
@@ -304,7 +306,7 @@ class _Poses:
         if fit is None or (fit.worst < _WELL_EXPLAINED and fit.is_usual):
             return ()
         dead = None if has_commands else never_counting(self._windows)
-        cause = dead or of_units(fit) or self._put_right(fit)
+        cause = dead or of_units(fit) or self._correction(fit)
         if cause is not None:
             return (cause,)
         if fit.worst > _UNEXPLAINED:
@@ -319,7 +321,7 @@ class _Poses:
     ) -> BodyFit | None:
         return fit_body(windows, self._radius_m, self._axial_m, factors, mirrored)
 
-    def _put_right(self, fit: BodyFit) -> Contradiction | None:
+    def _correction(self, fit: BodyFit) -> Contradiction | None:
         """Return the one thing that, put right, lets the wheels explain the poses; None if there is none."""
         good = min(_EXPLAINED, _AS_GOOD * fit.worst)
         for factors, (cause, what) in _ENCODER_FAULTS.items():
@@ -328,19 +330,19 @@ class _Poses:
             # On a steady circle a reversed encoder explains no better than a geometry that no robot has.
             limit = _EXPLAINED if reversed_count and not fit.has_clear_axes else good
             if other is not None and other.is_usual and other.worst < limit:
-                remedy = (
+                hint = (
                     "set the sign of its ticks (link.direction)"
                     if reversed_count
                     else "check ticks_per_rev and gear there"
                 )
-                return Contradiction(cause, f"{what}, by the poses: {remedy}", ("body", "response"))
+                return Contradiction(cause, f"{what}, by the poses: {hint}", ("body", "response"))
         mirrored = self._fit(self._windows, mirrored=True)
         if mirrored is not None and mirrored.worst < good:
             return _mirrored(mirrored)
         clock = fit_pose_clock(self._log, self._radius_m, self._axial_m, only_offset=fit.worst < _UNEXPLAINED)
         if clock is None or clock.fit.worst > good or not clock.fit.is_usual:
             return None
-        return of_clock(clock) if clock.rate != 1.0 or abs(clock.later_s) > _LEAST_LATE_S else None
+        return of_clock(clock) if clock.rate != 1.0 or abs(clock.later_s) > _LEAST_DELAY_S else None
 
 
 def _mirrored(fit: BodyFit) -> Contradiction:

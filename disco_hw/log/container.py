@@ -39,7 +39,7 @@ MAGIC = b"\x89MCAP0\r\n"
 
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
-_WHOLE_MESSAGE = struct.Struct("<BQHIQQ")
+_COMPLETE_MESSAGE = struct.Struct("<BQHIQQ")
 _MESSAGE_OPCODE = int(Opcode.MESSAGE)
 _FOOTER_BYTES = _HEAD.size + 8 + 8 + 4
 _LARGEST_OFFSET = 2**63 - 1
@@ -140,22 +140,22 @@ def _walked(fd: int, size: int) -> tuple[Contents, bool]:
         follows = offset + _HEAD.size + length
         if opcode == Opcode.DATA_END:
             return _with_unlisted(contents, unlisted), True
-        trouble = ""
+        damage_text = ""
         if not Opcode.HEADER <= opcode <= Opcode.DATA_END:
-            trouble = "no record"
+            damage_text = "no record"
         elif follows > size:
-            trouble = "an unfinished record"
+            damage_text = "an unfinished record"
         else:
             try:
-                _take(fd, contents, opcode, offset + _HEAD.size, length)
+                _index_record(fd, contents, opcode, offset + _HEAD.size, length)
             except DamagedError as damage:
-                trouble = str(damage)
-        if trouble and (opcode not in _FRONT_MATTER or follows > size):
+                damage_text = str(damage)
+        if damage_text and (opcode not in _FRONT_MATTER or follows > size):
             # Of a damaged chunk the length is in doubt as well.
             follows = _next_chunk(fd, offset + 1, size) or size
-        if trouble and len(contents.damage) < _MOST_DAMAGE:
-            contents.damage.append(f"at byte {offset}: {trouble}; {follows - offset} bytes are lost")
-        elif trouble:
+        if damage_text and len(contents.damage) < _MOST_DAMAGE:
+            contents.damage.append(f"at byte {offset}: {damage_text}; {follows - offset} bytes are lost")
+        elif damage_text:
             unlisted += 1
         offset = follows
     _with_unlisted(contents, unlisted)
@@ -218,22 +218,22 @@ def _checked_attachment(content: bytes) -> Attachment:
     return record
 
 
-def messages(chunk_data: bytes, wanted: Collection[int] | None = None) -> Iterator[Message]:
+def messages(chunk_data: bytes, channels: Collection[int] | None = None) -> Iterator[Message]:
     """Yield the messages in a chunk's data, of the wanted channels or of all, in file order; raises DamagedError."""
     # Runs for every message of a log, so its head and its content's head are unpacked at once.
-    offset, size, whole = 0, len(chunk_data), _WHOLE_MESSAGE.size
-    unpack = _WHOLE_MESSAGE.unpack_from
-    while size - offset >= whole:
+    offset, size, header = 0, len(chunk_data), _COMPLETE_MESSAGE.size
+    unpack = _COMPLETE_MESSAGE.unpack_from
+    while size - offset >= header:
         opcode, length, channel_id, sequence, log_time, publish_time = unpack(chunk_data, offset)
         begin, offset = offset, offset + _HEAD.size + length
         if offset > size:
             raise DamagedError("a record that reaches beyond its chunk")
         if opcode != _MESSAGE_OPCODE:
             continue
-        if offset - begin < whole:
+        if offset - begin < header:
             raise DamagedError("a message that is too short")
-        if wanted is None or channel_id in wanted:
-            yield Message(channel_id, sequence, log_time, publish_time, chunk_data[begin + whole : offset])
+        if channels is None or channel_id in channels:
+            yield Message(channel_id, sequence, log_time, publish_time, chunk_data[begin + header : offset])
     # What is left is too short for a message.
     for opcode, _, _ in _inner(chunk_data, offset):
         if opcode == _MESSAGE_OPCODE:
@@ -302,10 +302,10 @@ def _indexed(fd: int, size: int) -> Contents:
     return contents
 
 
-def _take(fd: int, contents: Contents, opcode: int, offset: int, length: int) -> None:
+def _index_record(fd: int, contents: Contents, opcode: int, offset: int, length: int) -> None:
     """Note one top-level record; raises DamagedError."""
     if opcode == Opcode.CHUNK:
-        _take_chunk(fd, contents, offset, length)
+        _index_chunk(fd, contents, offset, length)
     elif opcode == Opcode.ATTACHMENT:
         record = _checked_attachment(_content(fd, offset, length))
         contents.attachments.append(
@@ -315,7 +315,7 @@ def _take(fd: int, contents: Contents, opcode: int, offset: int, length: int) ->
         contents.metadata.append(_parse(Metadata, _content(fd, offset, length)))
 
 
-def _take_chunk(fd: int, contents: Contents, offset: int, length: int) -> None:
+def _index_chunk(fd: int, contents: Contents, offset: int, length: int) -> None:
     chunk = ChunkRef(offset, length, 0, 0)
     data = read_chunk(fd, chunk)
     schemas: dict[int, Schema] = {}

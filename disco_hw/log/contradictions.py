@@ -58,7 +58,7 @@ def of_axes(fit: BodyFit) -> Contradiction | None:
 
 
 _DEGREES_TURN = 5.0
-_STILL_TURN = 0.15
+_STATIONARY_TURN = 0.15
 
 
 def of_units(fit: BodyFit) -> Contradiction | None:
@@ -71,7 +71,7 @@ def of_units(fit: BodyFit) -> Contradiction | None:
             f"pose_yaw_rad turns {fit.turn_size:.3g} times as much as the wheels can make it, like degrees: write "
             "radians",
         )
-    if fit.turn_size < _STILL_TURN * min(1.0, fit.radius_ratio):
+    if fit.turn_size < _STATIONARY_TURN * min(1.0, fit.radius_ratio):
         return Contradiction(
             "heading_still",
             f"pose_yaw_rad turns by {fit.turn_size:.0%} of what the wheels make: it hardly follows the robot; record a "
@@ -85,8 +85,8 @@ _ANGLES = {57.296: "degrees", 9.549: "revolutions per minute", 0.15915: "revolut
 _NEAR = 0.06
 
 
-def _is_near(value: float, wanted: float) -> bool:
-    return abs(value / wanted - 1.0) < _NEAR
+def _is_near(value: float, expected: float) -> bool:
+    return abs(value / expected - 1.0) < _NEAR
 
 
 def of_scale(fit: BodyFit, radius_m: float) -> Contradiction | None:
@@ -115,21 +115,21 @@ def of_counts(times: float, by: str, spoils: tuple[Link, ...], otherwise: str = 
                 f"the wheels count {times:.4g} times the expected roll{by}, as {unit} do: write rad and rad/s",
                 ("body", "response"),
             )
-    whole = max(times, 1.0 / times)
-    count = f"{times:.2f}" if _is_near(whole, round(whole)) and whole < 20.0 else f"{times:.3g}"
+    ratio = max(times, 1.0 / times)
+    count = f"{times:.2f}" if _is_near(ratio, round(ratio)) and ratio < 20.0 else f"{times:.3g}"
     message = f"the wheels count {count} times the expected ticks{by}: check ticks_per_rev and gear{otherwise}"
     return Contradiction("encoder_count", message, spoils)
 
 
 def of_clock(clock: ClockFit) -> Contradiction:
     """Poses that another clock stamps."""
-    said = (
+    explanation = (
         f"run at {clock.rate:.3g} times the rate of the wheels' stamps"
         if clock.rate != 1.0
         else f"are stamped {abs(clock.later_s):.3g} s {'late' if clock.later_s > 0.0 else 'early'}"
     )
     return Contradiction(
-        "time_base", f"t_s: the poses {said}: they are on two time bases; stamp poses and wheels with one clock"
+        "time_base", f"t_s: the poses {explanation}: they are on two time bases; stamp poses and wheels with one clock"
     )
 
 

@@ -256,18 +256,18 @@ def poses(motions: list[Motion]) -> tuple[Index, Array]:
     if not moving:
         return np.empty(0, dtype=np.int64), np.empty((0, 3))
     leading = motions[moving[0]]
-    taken = np.ones(leading.t_ns.size, dtype=bool)
+    usable = np.ones(leading.t_ns.size, dtype=bool)
     if len(moving) > 1:
-        taken[1:] = np.any(np.diff(leading.values, axis=0) != 0.0, axis=1)
+        usable[1:] = np.any(np.diff(leading.values, axis=0) != 0.0, axis=1)
         for at in moving[1:]:
-            taken &= (leading.t_ns >= motions[at].t_ns[0]) & (leading.t_ns <= motions[at].t_ns[-1])
-    t_ns = leading.t_ns[taken]
+            usable &= (leading.t_ns >= motions[at].t_ns[0]) & (leading.t_ns <= motions[at].t_ns[-1])
+    t_ns = leading.t_ns[usable]
     rotation, position = np.tile(np.eye(3), (t_ns.size, 1, 1)), np.zeros((t_ns.size, 3))
     for at, one in enumerate(motions):
         if one.static:
             values = np.repeat(one.values[-1:], t_ns.size, axis=0)
         else:
-            values = one.values[taken] if at == moving[0] else _interpolated(one, t_ns)
+            values = one.values[usable] if at == moving[0] else _interpolated(one, t_ns)
         position = position + np.einsum("nij,nj->ni", rotation, values[:, :3])
         rotation = rotation @ rotations(values[:, 3:])
     yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])

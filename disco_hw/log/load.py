@@ -121,12 +121,12 @@ def _poses(log: Log, notes: list[str]) -> tuple[Index, Array]:
     bare = np.isnan(values[:, 2]) & np.isnan(_floats(columns["yaw_std_rad"])) & np.isfinite(values[:, :2]).all(axis=1)
     finite = np.asarray(np.isfinite(values).all(axis=1))
     source = columns["source"].astype(np.int64)
-    whole = np.bincount(source[finite]) if finite.any() else np.zeros(1, dtype=np.int64)
-    if np.count_nonzero(whole) > 1:
+    counts = np.bincount(source[finite]) if finite.any() else np.zeros(1, dtype=np.int64)
+    if np.count_nonzero(counts) > 1:
         # Each has an error of its own that lasts: from one to the other is no motion.
-        kept = finite & (source == int(whole.argmax()))
+        kept = finite & (source == int(counts.argmax()))
         notes.append(
-            f"{log.path}: poses of several sources; those of the one with most, number {int(whole.argmax())} of "
+            f"{log.path}: poses of several sources; those of the one with most, number {int(counts.argmax())} of "
             f"[pose], are used, {np.count_nonzero(finite & ~kept)} others left out"
         )
     else:

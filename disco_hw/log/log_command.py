@@ -25,7 +25,7 @@ from disco_hw.log.load import drive_from_log, nominal_geometry, ticks_per_rev
 from disco_hw.log.mcap_log import CHUNK_BYTES, LIBRARY, PROFILE, RECOVERY
 from disco_hw.log.reader import LogSummary, open_log
 from disco_hw.log.records import Controller
-from drivers.types import SAID_BY_WORDS, Identity, SaidBy
+from drivers.types import SOURCE_TEXTS, Identity, SaidBy
 
 
 def info(path: Path, as_json: bool) -> str:
@@ -35,8 +35,8 @@ def info(path: Path, as_json: bool) -> str:
         if as_json:
             return msgspec.json.encode(summary).decode()
         answered = list(log.records(("/controller",))) if "/controller" in summary.topics else []
-    said = [_controller(entry.record) for entry in answered if isinstance(entry.record, Controller)]
-    return "\n".join([_in_words(summary), *dict.fromkeys(said)])
+    controllers = [_controller(entry.record) for entry in answered if isinstance(entry.record, Controller)]
+    return "\n".join([_describe(summary), *dict.fromkeys(controllers)])
 
 
 def recover(path: Path, out: Path, as_json: bool) -> str:
@@ -79,15 +79,15 @@ def _controller(record: Controller) -> str:
         "fixed": record.fixed,
         "robot.toml": record.declared,
     }
-    words = [
-        f"{', '.join(f'{name} {value:g}' for name, value in values.items())} ({SAID_BY_WORDS[said_by]})"
-        for said_by, values in limits.items()
+    parts = [
+        f"{', '.join(f'{name} {value:g}' for name, value in values.items())} ({SOURCE_TEXTS[source]})"
+        for source, values in limits.items()
         if values
     ]
-    return f"controller: {identity.in_words()}; {'; '.join(words)}"
+    return f"controller: {identity.describe()}; {'; '.join(parts)}"
 
 
-def _end_in_words(summary: LogSummary) -> str:
+def _describe_end(summary: LogSummary) -> str:
     """Describe in words whether the log ended properly."""
     if summary.ended:
         return "ended properly" if summary.complete else "ended by its recorder, but the file is not whole"
@@ -97,12 +97,12 @@ def _end_in_words(summary: LogSummary) -> str:
     return f"nothing after {summary.end}: the daemon or its recorder was gone then, or the log is still being written"
 
 
-def _in_words(summary: LogSummary) -> str:
+def _describe(summary: LogSummary) -> str:
     size_mb = summary.bytes / 1e6
     lines = [
         f"{summary.path}: {summary.robot}, {summary.duration_s:.1f} s from {summary.start}, {size_mb:.2f} MB",
         f"recorded by disco-hw {summary.version or 'of unknown version'}, part {summary.part}",
-        f"{summary.ticks} ticks, {summary.missing_ticks} missing; {_end_in_words(summary)}",
+        f"{summary.ticks} ticks, {summary.missing_ticks} missing; {_describe_end(summary)}",
     ]
     lines += [f"continues {summary.continues}"] if summary.continues else []
     lines += [
@@ -153,7 +153,7 @@ def recover_log(source: Path, target: Path) -> Recovered:
 
 
 def _copy(fd: int, contents: Contents, writer: Writer, name: str) -> Recovered:
-    lost = list(contents.damage)
+    all_damage = list(contents.damage)
     writer.start(profile=PROFILE, library=LIBRARY)
     for metadata in contents.metadata:
         writer.add_metadata(metadata.name, metadata.metadata)
@@ -163,7 +163,7 @@ def _copy(fd: int, contents: Contents, writer: Writer, name: str) -> Recovered:
             writer.add_attachment(ref.log_time, ref.log_time, ref.name, ref.media_type, read_attachment(fd, ref))
             attachments += 1
         except DamagedError as damage:
-            lost.append(str(damage))
+            all_damage.append(str(damage))
     schemas = {
         schema.id: writer.register_schema(schema.name, schema.encoding, schema.data)
         for schema in contents.schemas.values()
@@ -179,7 +179,7 @@ def _copy(fd: int, contents: Contents, writer: Writer, name: str) -> Recovered:
         try:
             found = list(messages(read_chunk(fd, chunk)))
         except DamagedError as damage:
-            lost.append(f"at byte {chunk.offset}: {damage}; {chunk.length} bytes are lost")
+            all_damage.append(f"at byte {chunk.offset}: {damage}; {chunk.length} bytes are lost")
             continue
         chunks += 1
         for message in found:
@@ -192,9 +192,9 @@ def _copy(fd: int, contents: Contents, writer: Writer, name: str) -> Recovered:
                     message.sequence,
                 )
                 count += 1
-    writer.add_metadata(RECOVERY, {"source": name, "lost": "\n".join(lost)})
+    writer.add_metadata(RECOVERY, {"source": name, "lost": "\n".join(all_damage)})
     writer.finish()  # type: ignore[no-untyped-call]
-    return Recovered(count, chunks, attachments, tuple(lost))
+    return Recovered(count, chunks, attachments, tuple(all_damage))
 
 
 MAP_FRAME, BASE_FRAME = "map", "base_link"
@@ -220,12 +220,12 @@ def write_rosbag(drive: DriveLog, path: Path, start_ns: int, geometry: tuple[flo
     if path.exists():
         raise LogError(f"{path}: already exists; give another name")
     store = get_typestore(Stores.ROS2_HUMBLE)
-    make = _Messages(store.types, max(start_ns, _EARLIEST_NS))
+    messages = _Messages(store.types, max(start_ns, _EARLIEST_NS))
     count = 0
     try:
         with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
             connections: dict[str, Any] = {}  # Any: the library's.
-            for t_ns, topic, message in make.all_of(drive, geometry):
+            for t_ns, topic, message in messages.all_of(drive, geometry):
                 kind = message.__msgtype__
                 if topic not in connections:
                     connections[topic] = writer.add_connection(topic, kind, typestore=store)

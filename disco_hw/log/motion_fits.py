@@ -197,8 +197,8 @@ def fit_body(
     ahead, lever = radius_m * rolled, 1j * nominal_turn
     row = np.array([[0.0, _LEVER_PRIOR * np.linalg.norm(lever)]])
     columns = np.vstack([np.column_stack([ahead, lever]), row]).astype(np.complex128)
-    own_way = (np.conj(way) if mirrored else way) * np.exp(-1j * heading)
-    gain, way_unexplained = fit_robustly(columns, np.append(own_way, 0.0))
+    body_way = (np.conj(way) if mirrored else way) * np.exp(-1j * heading)
+    gain, way_unexplained = fit_robustly(columns, np.append(body_way, 0.0))
     # Windows overlap by three quarters.
     enough_turn = 0.25 * float(np.abs(nominal_turn).sum()) > _LEAST_TURNED_RAD
     enough_way = 0.25 * float(np.abs(rolled).sum()) > _LEAST_ROLLED_RAD

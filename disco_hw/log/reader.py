@@ -332,22 +332,22 @@ class Log:
         unknown = [topic for topic in topics or () if topic not in TOPIC_BY_NAME]
         if unknown:
             raise LogError(f"{unknown[0]}: no such topic; there are {', '.join(TOPIC_BY_NAME)}")
-        wanted = {channel for channel, topic in self._topics.items() if topics is None or topic in topics}
+        channels = {channel for channel, topic in self._topics.items() if topics is None or topic in topics}
         offset = self._metadata.wall_offset_ns
         start = None if start_ns is None else start_ns + offset
         end = None if end_ns is None else end_ns + offset
         for chunk in self._contents.chunks:
             if (start is not None and chunk.end_time < start) or (end is not None and chunk.start_time >= end):
                 continue
-            for message in self._chunk_messages(chunk, wanted):
+            for message in self._chunk_messages(chunk, channels):
                 if not _EARLIEST_NS <= message.log_time - offset <= _LATEST_NS:
                     raise LogError(f"{self._path}: {_NO_TIME}")
                 if (start is None or message.log_time >= start) and (end is None or message.log_time < end):
                     yield message
 
-    def _chunk_messages(self, chunk: ChunkRef, wanted: Collection[int]) -> Iterator[Message]:
+    def _chunk_messages(self, chunk: ChunkRef, channels: Collection[int]) -> Iterator[Message]:
         try:
-            yield from messages(read_chunk(self._fd, chunk), wanted)
+            yield from messages(read_chunk(self._fd, chunk), channels)
         except DamagedError as damage:
             raise LogError(f"{self._path}: at byte {chunk.offset}: {damage}; {_RECOVER}") from None
 

@@ -81,10 +81,10 @@ class Recorder(Protocol):
     def poll(self) -> RecorderStats:
         """Look after the writer and return the counters; call it ten times a second."""
 
-    def news(self) -> tuple[str, ...]:
+    def new_messages(self) -> tuple[str, ...]:
         """Return messages about the recording since the last call, for the operator."""
 
-    def tend(self) -> None:
+    def repair(self) -> None:
         """Mend what takes milliseconds; call it only while the robot is not armed."""
 
     def close(self, timeout_s: float = 5.0) -> RecorderStats:
@@ -101,11 +101,11 @@ class NullRecorder:
         """Return counters that are all zero."""
         return RecorderStats()
 
-    def news(self) -> tuple[str, ...]:
+    def new_messages(self) -> tuple[str, ...]:
         """Return no messages, because nothing can happen to it."""
         return ()
 
-    def tend(self) -> None:
+    def repair(self) -> None:
         """Do nothing, because nothing of it can break."""
 
     def close(self, timeout_s: float = 5.0) -> RecorderStats:
@@ -127,11 +127,11 @@ class MemoryRecorder:
         """Counters of what was kept."""
         return RecorderStats(ticks=len(self.ticks), records=sum(len(records) for _, records in self.ticks))
 
-    def news(self) -> tuple[str, ...]:
+    def new_messages(self) -> tuple[str, ...]:
         """Return no messages, because nothing can happen to it."""
         return ()
 
-    def tend(self) -> None:
+    def repair(self) -> None:
         """Do nothing, because nothing of it can break."""
 
     def close(self, timeout_s: float = 5.0) -> RecorderStats:
@@ -176,7 +176,7 @@ class ProcessRecorder:
         self._refused = 0
         self._deaths = 0
         self._last_error = ""
-        self._news: list[str] = []
+        self._messages: list[str] = []
         self._fault = ""
         self._retries = 0
         self._retry_s = 0.0
@@ -248,21 +248,21 @@ class ProcessRecorder:
         self._look_after(time.monotonic())
         return self._stats()
 
-    def news(self) -> tuple[str, ...]:
+    def new_messages(self) -> tuple[str, ...]:
         """Return messages about the recording since the last call, for the operator."""
-        news, self._news = tuple(self._news), []
-        return news
+        messages, self._messages = tuple(self._messages), []
+        return messages
 
-    def tend(self) -> None:
+    def repair(self) -> None:
         """Start the keeper again if it has died or does not answer: takes milliseconds."""
         if self._final is None and self._keeper.needs_renewal(time.monotonic()):
             try:
                 self._keeper.renew()
             except LogError as error:
-                self._tell(str(error))
+                self._note(str(error))
                 return
-            self._tell("the process that starts log writers had ended or did not answer; there is another one now")
-            if self._line is None or not self._line.heard:
+            self._note("the process that starts log writers had ended or did not answer; there is another one now")
+            if self._line is None or not self._line.has_received:
                 self._line = None
                 self._retry_s = 0.0
 
@@ -310,7 +310,7 @@ class ProcessRecorder:
                 self._encode(0, now_ns, (record,))
             except ENCODE_ERRORS as error:
                 self._refused += 1
-                self._tell(f"a {type(record).__name__} could not be recorded: {error}")
+                self._note(f"a {type(record).__name__} could not be recorded: {error}")
             else:
                 kept.append(record)
         return kept
@@ -349,7 +349,7 @@ class ProcessRecorder:
                 self._retries, self._patience_s = 0, _PATIENCE_S
                 self._kept_status = status
             if status.state != "failed" and status.error and status.error != refusal:
-                self._tell(f"a record was refused by the log writer: {status.error}")
+                self._note(f"a record was refused by the log writer: {status.error}")
 
     def _look_after(self, now_s: float) -> None:
         line = self._line
@@ -370,12 +370,12 @@ class ProcessRecorder:
             if line.recording:
                 self._recovered()
             return
-        if line.heard:
+        if line.has_received:
             self._fault = f"the log writer has not answered for {silent_s:.1f} s; what comes is kept and waits"
             if not self._frozen:
                 self._frozen = True
-                self._tell(self._fault)
-        if silent_s >= (self._patience_s if line.heard else _START_PATIENCE_S):
+                self._note(self._fault)
+        if silent_s >= (self._patience_s if line.has_received else _START_PATIENCE_S):
             pid = self._keeper.pid
             if pid:
                 with suppress(ProcessLookupError):
@@ -394,7 +394,7 @@ class ProcessRecorder:
             self._delivery.file_deleted()
         if status.state == "failed" and not status.sequence:
             self._status = self._kept_status
-        elif line.heard:
+        elif line.has_received:
             self._next_part = status.part + 1
             self._continues = status.path
         self._delivery.new_file()
@@ -406,7 +406,7 @@ class ProcessRecorder:
         pause_s = _RETRY_S[min(self._retries, len(_RETRY_S) - 1)]
         self._retry_s = now_s + (pause_s if self._end is None else min(pause_s, _CLOSING_RETRY_S))
         self._retries += 1
-        self._tell(cause)
+        self._note(cause)
         self._look_after(now_s)
 
     def _launch(self) -> None:
@@ -418,13 +418,13 @@ class ProcessRecorder:
         else:
             self._retry_s = time.monotonic() + _RETRY_S[-1]
             self._fault = "nothing is being recorded: the process that starts log writers has ended; disarm to renew it"
-            self._tell(self._fault)
+            self._note(self._fault)
 
     def _recovered(self) -> None:
         """Report that ticks are in a file again, if they were not; a file without a tick may still come to nothing."""
         if self._fault and self._status.sequence:
             self._fault, self._frozen = "", False
-            self._news.append(f"recording goes on in {self._status.path}")
+            self._messages.append(f"recording goes on in {self._status.path}")
 
     def _report_losses(self) -> None:
         """Report at the end how many ticks are in no file, and why."""
@@ -434,12 +434,12 @@ class ProcessRecorder:
             given = delivery.ticks + delivery.dropped_ticks
             busy = "too many waited for a slow disk" if not delivery.waiting_ticks else "the log writer is still busy"
             self._fault = f"{missing} of {given} ticks are in no log: {self._last_error or busy}"
-            self._news.append(self._fault)
+            self._messages.append(self._fault)
 
-    def _tell(self, sentence: str) -> None:
+    def _note(self, sentence: str) -> None:
         """Report a failure, but not again while it only repeats itself."""
         if sentence != self._last_error or self._retries <= 1:
-            self._news.append(sentence)
+            self._messages.append(sentence)
         self._last_error = sentence
 
     def _unfinished(self) -> bool:
@@ -464,7 +464,7 @@ class ProcessRecorder:
             delivered_ticks=delivery.delivered_ticks,
             waiting_ticks=delivery.waiting_ticks,
             lost_ticks=delivery.lost_ticks,
-            refused=self._refused + (status.refused if line is not None and line.heard else 0),
+            refused=self._refused + (status.refused if line is not None and line.has_received else 0),
             written=status.records,
             bytes=status.bytes,
             writer_deaths=self._deaths,

@@ -39,7 +39,7 @@ class LogFile:
     def __init__(self, path: Path) -> None:
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         self._written = 0
-        self._whole = 0
+        self._complete_bytes = 0
         directory = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
         try:
             os.fsync(directory)
@@ -61,7 +61,7 @@ class LogFile:
 
     def flush(self) -> None:
         """Note that what has been written is whole: nothing is buffered."""
-        self._whole = self._written
+        self._complete_bytes = self._written
 
     def sync(self) -> None:
         """Return when what was written is on the disk."""
@@ -72,10 +72,10 @@ class LogFile:
         """Whether no directory names the file any more."""
         return os.fstat(self._fd).st_nlink == 0
 
-    def cut_to_whole(self) -> None:
+    def truncate_to_complete(self) -> None:
         """Drop what came after the last flush, so that the file holds what was confirmed and nothing else."""
-        os.ftruncate(self._fd, self._whole)
-        self._written = self._whole
+        os.ftruncate(self._fd, self._complete_bytes)
+        self._written = self._complete_bytes
 
     def close(self) -> None:
         """Close the file of the log."""
@@ -109,7 +109,7 @@ class Session:
         self._grace_ends_s: float | None = None
         self._log = McapLog(file, start)
         self._file.sync()
-        self._say("recording")
+        self._report("recording")
 
     @property
     def sequence(self) -> int:
@@ -127,20 +127,20 @@ class Session:
         next_flush_s, next_beat_s = now_s + self._start.flush_s, now_s + self._start.beat_s
         ended = False
         while not ended:
-            ended = self._take(max(0.0, min(next_flush_s, next_beat_s) - time.monotonic()))
+            ended = self._receive(max(0.0, min(next_flush_s, next_beat_s) - time.monotonic()))
             now_s = time.monotonic()
             if now_s >= next_flush_s:
                 self._flush("recording")
                 now_s = time.monotonic()
                 next_flush_s = now_s + self._start.flush_s
             if now_s >= next_beat_s:
-                self._say("recording")
+                self._report("recording")
                 next_beat_s = now_s + self._start.beat_s
             ended = ended or (self._grace_ends_s is not None and now_s > self._grace_ends_s)
         self._log.finish()
         self._flush("finished")
 
-    def _take(self, timeout_s: float) -> bool:
+    def _receive(self, timeout_s: float) -> bool:
         """Wait for ticks and write them; True if no more will come."""
         if not select.select([self._connection], [], [], timeout_s)[0]:
             return False
@@ -156,20 +156,20 @@ class Session:
                 return True
             self._log.write(payload)
         if self.sequence != before:
-            self._say("recording")
+            self._report("recording")
         return not data
 
     def _flush(self, state: Literal["recording", "finished"]) -> None:
         if state == "recording":
             self._log.flush()
             # What is in the file outlives this process; the disk may take its time to make it outlive a power cut.
-            self._say(state)
+            self._report(state)
         self._file.sync()
         if self._file.deleted:
             raise FileNotFoundError("it was deleted while it was written, and what it held is gone")
-        self._say(state)
+        self._report(state)
 
-    def _say(self, state: Literal["recording", "finished"]) -> None:
+    def _report(self, state: Literal["recording", "finished"]) -> None:
         log, start = self._log, self._start
         self._line.send(
             WriterStatus(
@@ -185,8 +185,8 @@ def run(start: Start, connection: socket.socket) -> int:
     try:
         start, file = _create(start)
     except OSError as error:
-        words = f"{start.path}: cannot be created ({_reason(error)})"
-        line.send(WriterStatus("failed", start.path, start.part, error=words))
+        fault = f"{start.path}: cannot be created ({_reason(error)})"
+        line.send(WriterStatus("failed", start.path, start.part, error=fault))
         return EXIT_CANNOT_CREATE
     sequence = 0
     try:
@@ -221,7 +221,7 @@ def _give_up(start: Start, file: LogFile, line: StatusLine, error: OSError, sequ
     """Leave what is whole in the file, and no file that holds nothing."""
     deleted = file.deleted
     with contextlib.suppress(OSError):
-        file.cut_to_whole()
+        file.truncate_to_complete()
         if not sequence and not deleted:
             os.unlink(start.path)
     line.send(
@@ -248,7 +248,7 @@ def keep(channel: socket.socket, start: Start) -> None:
             pid = living.pop(descriptor)
             os.close(descriptor)
             _, how = os.waitpid(pid, 0)
-            _say(channel, Ended(pid, os.waitstatus_to_exitcode(how)))
+            _send_message(channel, Ended(pid, os.waitstatus_to_exitcode(how)))
         if channel.fileno() not in readable:
             continue
         try:
@@ -263,7 +263,7 @@ def keep(channel: socket.socket, start: Start) -> None:
             pid = os.fork()
         except OSError as error:
             connection.close()
-            _say(channel, Started(0, f"no process can be made ({error.strerror})"))
+            _send_message(channel, Started(0, f"no process can be made ({error.strerror})"))
             continue
         if pid == 0:
             # A writer that kept these would hide the end of the keeper and of other writers.
@@ -273,7 +273,7 @@ def keep(channel: socket.socket, start: Start) -> None:
             _write(start, launch, connection)
         connection.close()
         living[os.pidfd_open(pid)] = pid
-        _say(channel, Started(pid))
+        _send_message(channel, Started(pid))
 
 
 def _write(start: Start, launch: Launch, connection: socket.socket) -> None:
@@ -297,10 +297,10 @@ def _write(start: Start, launch: Launch, connection: socket.socket) -> None:
         os._exit(code)
 
 
-def _say(channel: socket.socket, word: Started | Ended) -> None:
+def _send_message(channel: socket.socket, message: Started | Ended) -> None:
     """Report to the recorder; one that is gone or does not read costs nothing."""
     with contextlib.suppress(OSError):
-        channel.send(msgspec.msgpack.encode(word), socket.MSG_DONTWAIT)
+        channel.send(msgspec.msgpack.encode(message), socket.MSG_DONTWAIT)
 
 
 def main() -> int:

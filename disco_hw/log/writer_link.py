@@ -32,19 +32,19 @@ class WriterLine:
 
     def __init__(self, connection: socket.socket, path: str, part: int) -> None:
         self.status = WriterStatus("recording", path, part)
-        self.heard = False
+        self.has_received = False
         self.ended = False
         self.ending = False
         self._connection = connection
         self._rest = memoryview(b"")
         self._received = b""
         self._decode = msgspec.json.Decoder(WriterStatus).decode
-        self._heard_s = time.monotonic()
+        self._received_s = time.monotonic()
 
     @property
     def recording(self) -> bool:
         """Whether the writer said last that it records; what it says of a failure comes before it hangs up."""
-        return self.heard and not self.ended and self.status.state == "recording"
+        return self.has_received and not self.ended and self.status.state == "recording"
 
     @property
     def full(self) -> bool:
@@ -54,7 +54,7 @@ class WriterLine:
     @property
     def silent_s(self) -> float:
         """Time since anything came."""
-        return time.monotonic() - self._heard_s
+        return time.monotonic() - self._received_s
 
     def fileno(self) -> int:
         """Return the socket's file descriptor, for `select`."""
@@ -97,12 +97,12 @@ class WriterLine:
         if not data:
             self.ended = True
             return False
-        self._heard_s = time.monotonic()
+        self._received_s = time.monotonic()
         *lines, self._received = (self._received + data).split(b"\n")
         for line in lines[-1:]:
             with suppress(msgspec.MsgspecError):
                 self.status = self._decode(line)
-                self.heard = True
+                self.has_received = True
         return bool(lines)
 
     def close(self) -> None:
@@ -111,7 +111,7 @@ class WriterLine:
 
 
 _MESSAGE_BYTES = 65_536
-_ANSWER_S = 5.0
+_REPLY_TIMEOUT_S = 5.0
 _BUFFER_BYTES = 1 << 20
 
 
@@ -128,10 +128,10 @@ class KeeperLink:
         self._decode = msgspec.msgpack.Decoder(Started | Ended).decode
         self.pid = 0
         self.code: int | None = None
-        self._asked_s: float | None = None
+        self._requested_s: float | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._channel: socket.socket | None = None
-        self._make()
+        self._open_writer()
 
     @property
     def alive(self) -> bool:
@@ -145,7 +145,7 @@ class KeeperLink:
 
     def needs_renewal(self, now_s: float) -> bool:
         """Whether the keeper process is dead, or has not started a requested writer in time."""
-        return not self.alive or (self._asked_s is not None and now_s - self._asked_s > _ANSWER_S)
+        return not self.alive or (self._requested_s is not None and now_s - self._requested_s > _REPLY_TIMEOUT_S)
 
     def launch(self, launch: Launch) -> socket.socket | None:
         """Ask for a writer; returns the recorder's end of the socket to it, or None without a keeper."""
@@ -162,7 +162,7 @@ class KeeperLink:
                 self._hang_up()
                 return None
         self.pid, self.code = 0, None
-        self._asked_s = time.monotonic()
+        self._requested_s = time.monotonic()
         return ours
 
     def read(self) -> None:
@@ -177,16 +177,16 @@ class KeeperLink:
             if not data:
                 self._hang_up()
                 return
-            word = self._decode(data)
-            if isinstance(word, Started):
-                self.pid, self._asked_s = word.pid, None
-            elif word.pid == self.pid:
-                self.code = word.code
+            message = self._decode(data)
+            if isinstance(message, Started):
+                self.pid, self._requested_s = message.pid, None
+            elif message.pid == self.pid:
+                self.code = message.code
 
     def renew(self) -> None:
         """Start another keeper in place of this one; takes milliseconds. The writer lives on."""
         self._end_process()
-        self._make()
+        self._open_writer()
 
     def close(self) -> None:
         """Let the keeper end; safe to call twice."""
@@ -200,7 +200,7 @@ class KeeperLink:
                 self._process.stdout.close()
             self._process = None
 
-    def _make(self) -> None:
+    def _open_writer(self) -> None:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         # The attachments are too long for a message, and the place for logs may have no room for a file.
         memory = os.memfd_create("log-start")
@@ -218,7 +218,7 @@ class KeeperLink:
         finally:
             os.close(memory)
         self._channel = ours
-        self._asked_s = None
+        self._requested_s = None
 
     def _hang_up(self) -> None:
         if self._channel is not None:

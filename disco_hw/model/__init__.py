@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Meta
 
 from disco_hw.errors import InputError
-from disco_hw.files import MODEL_TOML, in_words, read_toml
+from disco_hw.files import MODEL_TOML, describe, read_toml
 from disco_hw.model.model import Belief, EffectSetting, Gaussian, Mixture, Model, Uniform
 
 __all__ = ["Belief", "EffectSetting", "Gaussian", "Mixture", "Model", "Uniform", "load_model", "save_model"]
@@ -69,7 +69,7 @@ def load_model(path: Path | str) -> Model:
     try:
         content = msgspec.convert(raw, _File)
     except msgspec.ValidationError as error:
-        raise InputError(f"{path}: {in_words(error, [_File], 'docs/control.md')}") from None
+        raise InputError(f"{path}: {describe(error, [_File], 'docs/control.md')}") from None
     try:
         return _model(content)
     except ValueError as error:

@@ -240,7 +240,7 @@ class Disturbance(msgspec.Struct, frozen=True, gc=False):
         scale = 1.0 + self.forward
         return scale * left - more, scale * right + more
 
-    def asked(self, left: Number, right: Number, axial_distance_m: float) -> tuple[Number, Number]:
+    def commanded(self, left: Number, right: Number, axial_distance_m: float) -> tuple[Number, Number]:
         """Return the inverse of `turning`."""
         scale = 1.0 + self.forward
         more = 0.25 * self.curvature_per_m * axial_distance_m * (left + right) / scale

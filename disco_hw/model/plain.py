@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from disco_hw.effects import Array, Effect, Stage, Value, Values, asks_for
+from disco_hw.effects import Array, Effect, Stage, Value, Values, arguments_of
 from disco_hw.effects.registry import DELAY, in_stages
 
 Theta = Mapping[str, Value]
@@ -42,11 +42,11 @@ def theta_of(names: tuple[str, ...], values: Array) -> dict[str, Value]:
 def delayed(commands: Array, history: int, theta: Theta, step_s: float) -> Array:
     """Commands in force over each step, from commands (history + T, ...) of which the first rows were sent before."""
     horizon = commands.shape[0] - history
-    late_s = float(_called(DELAY, theta, {}, step_s)) if _acts(DELAY, theta) else 0.0
-    steps = late_s / step_s
-    whole = int(np.floor(steps))
-    fraction = steps - whole
-    rows = history - whole + np.arange(horizon)
+    delay_s = float(_called(DELAY, theta, {}, step_s)) if _acts(DELAY, theta) else 0.0
+    steps = delay_s / step_s
+    cells = int(np.floor(steps))
+    fraction = steps - cells
+    rows = history - cells + np.arange(horizon)
     recent, older = np.maximum(rows, 0), np.maximum(rows - 1, 0)
     return np.asarray((1.0 - fraction) * commands[recent] + fraction * commands[older])
 
@@ -216,7 +216,7 @@ def _called(effect: Effect, theta: Theta, motion: Mapping[str, Value], step_s: f
     geometry = theta["wheel_radius_m"], theta["axial_distance_m"], theta["x_icr_m"]
     values = tuple(theta[column] for column in effect.columns)
     known = {**motion, "values": values, "geometry": geometry, "step_s": step_s}
-    return effect.plain(**{name: known[name] for name in asks_for(effect.plain)})
+    return effect.plain(**{name: known[name] for name in arguments_of(effect.plain)})
 
 
 def wheel_targets(
@@ -237,7 +237,7 @@ def wheel_targets(
         right = right + k * np.clip(COMMAND_FEATURES[feature](u_right, u_left, time_s), -reach, reach)
     for effect in _acting(theta, Stage.COMMAND):
         at_start = {"wheel_left": state.wheel_left, "wheel_right": state.wheel_right, "time_s": time_s}
-        if "command" in asks_for(effect.plain):
+        if "command" in arguments_of(effect.plain):
             left = _called(effect, theta, {**at_start, "command": left, "speed": state.wheel_left}, step_s)
             right = _called(effect, theta, {**at_start, "command": right, "speed": state.wheel_right}, step_s)
         else:
@@ -250,7 +250,7 @@ def responded(theta: Theta, state: RobotState, left: Value, right: Value, time_s
     end_left = mean_left = left
     end_right = mean_right = right
     for effect in _acting(theta, Stage.RESPONSE):
-        if "end" in asks_for(effect.plain):
+        if "end" in arguments_of(effect.plain):
             of_left = {"end": end_left, "mean": mean_left, "speed": state.wheel_left, "time_s": time_s}
             of_right = {"end": end_right, "mean": mean_right, "speed": state.wheel_right, "time_s": time_s}
             end_left, mean_left = _called(effect, theta, of_left, step_s)

@@ -32,7 +32,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.effects import Effect, Stage, asks_for
+from disco_hw.effects import Effect, Stage, arguments_of
 from disco_hw.effects.registry import DELAY, REGISTRY, in_stages
 from disco_hw.jit import cast_like, compiled_for, kernel_function, scalar_function
 from disco_hw.model.added_terms import (
@@ -247,26 +247,26 @@ _BEGIN_RESPONSE = "end_left, mean_left, end_right, mean_right = left, left, righ
 _ROLL = ("forward = base.half_radius_m * wheel_sum", "turn = base.half_turn_ratio * difference")
 
 
-def _asked(effect: Effect) -> tuple[str, ...]:
+def _arguments_of(effect: Effect) -> tuple[str, ...]:
     assert effect.term is not None
-    return asks_for(effect.term)
+    return arguments_of(effect.term)
 
 
 def _call(effect: Effect, **instead: str) -> str:
-    arguments = (f"effects.{effect.name}" if a == "coefficients" else instead.get(a, a) for a in _asked(effect))
+    arguments = (f"effects.{effect.name}" if a == "coefficients" else instead.get(a, a) for a in _arguments_of(effect))
     return f"term_{effect.name}({', '.join(arguments)})"
 
 
 def _wheel_lines() -> list[str]:
     lines: list[str] = []
     for effect in in_stages(Stage.COMMAND):
-        if "command" not in _asked(effect):
+        if "command" not in _arguments_of(effect):
             lines.append(f"left, right = {_call(effect)}")
             continue
         lines += [f"{side} = {_call(effect, command=side, speed=f'wheel_{side}')}" for side in ("left", "right")]
     lines.append(_BEGIN_RESPONSE)
     for effect in in_stages(Stage.RESPONSE):
-        if "end" not in _asked(effect):
+        if "end" not in _arguments_of(effect):
             lines.append(f"{_BOTH_RESPOND} = {_call(effect)}")
             continue
         for side in ("left", "right"):
@@ -294,7 +294,7 @@ def _world_lines() -> list[str]:
 
 
 def _change_lines() -> list[str]:
-    asking = [f"effects.{effect.name} is not None" for effect in in_stages(*_BODY) if "change" in _asked(effect)]
+    asking = [f"effects.{effect.name} is not None" for effect in in_stages(*_BODY) if "change" in _arguments_of(effect)]
     return [f"return {' or '.join([*asking, 'terms_need_change(effects.body_terms)'])}"]
 
 
@@ -313,7 +313,7 @@ def _plus(lateral: float | None, more: float | None) -> float | None:
 
 
 @scalar_function
-def _whole(coefficients: tuple[float, ...] | None) -> int:
+def _delay_cells(coefficients: tuple[float, ...] | None) -> int:
     if coefficients is None:
         return 0
     return int(coefficients[0])
@@ -321,7 +321,7 @@ def _whole(coefficients: tuple[float, ...] | None) -> int:
 
 def _made(name: str, arguments: str, lines: list[str], summary: str) -> Callable[..., Any]:
     scope: dict[str, Any] = {f"term_{effect.name}": effect.term for effect in REGISTRY.values() if effect.moves}
-    scope |= {"plus": _plus, "whole": _whole, "terms_need_change": terms_need_change}
+    scope |= {"plus": _plus, "whole": _delay_cells, "terms_need_change": terms_need_change}
     body = "\n".join(f"    {line}" for line in lines)
     exec(f"def {name}({arguments}):\n{body}", scope)
     scope[name].__doc__ = summary
@@ -385,7 +385,7 @@ class FreeRun:
         delay = getattr(self._effects, DELAY.name)
         self._run: Callable[..., None] | None = None
         self.past_rows = 0 if delay is None else int(delay[0].max()) + 1
-        self._remembers = new_means(self._effects) is not None
+        self._has_memory = new_means(self._effects) is not None
 
     def states(
         self, start: Array, commands: Array, history: int, time_s: float = 0.0, point: int = 0,
@@ -402,9 +402,9 @@ class FreeRun:
         states = np.empty((commands.shape[0] - history + 1, 5))
         states[0] = start
         # A fresh copy, as a read-only array or a strided one is another type and would be compiled anew, in mid-loop.
-        own = np.array(commands, dtype=np.float64, order="C")
-        kept = None if not self._remembers else new_means(self._effects) if means is None else means
-        arguments = states, own, history, float(time_s), point, slide, kept, self._base, self._effects, self._series
+        copied = np.array(commands, dtype=np.float64, order="C")
+        kept = None if not self._has_memory else new_means(self._effects) if means is None else means
+        arguments = states, copied, history, float(time_s), point, slide, kept, self._base, self._effects, self._series
         if self._run is None:
             self._run = compiled_for(run_states, *arguments)
         self._run(*arguments)
@@ -418,17 +418,17 @@ def simulate(model: Model, commands: Array, step_s: float = 0.02, start: Array |
     commanded to stand. `start` (5,): the first state, the origin at rest if None. Raises ValueError for other
     shapes and for what is not finite.
     """
-    wanted = np.asarray(commands, dtype=np.float64)
+    commanded = np.asarray(commands, dtype=np.float64)
     begin = np.zeros(5) if start is None else np.asarray(start, dtype=np.float64)
-    if wanted.ndim != 2 or wanted.shape[1] != 2 or begin.shape != (5,):
+    if commanded.ndim != 2 or commanded.shape[1] != 2 or begin.shape != (5,):
         raise ValueError(
-            f"commands of shape (N, 2) and a start of shape (5,) are needed, not {wanted.shape}, {begin.shape}"
+            f"commands of shape (N, 2) and a start of shape (5,) are needed, not {commanded.shape}, {begin.shape}"
         )
-    if not (np.isfinite(wanted).all() and np.isfinite(begin).all()):
+    if not (np.isfinite(commanded).all() and np.isfinite(begin).all()):
         raise ValueError("commands and start have to be finite numbers")
     run = FreeRun(model, model.point()[None], step_s)
     before = np.zeros((run.past_rows, 2))
-    return run.states(begin, np.vstack([before, wanted]), run.past_rows)
+    return run.states(begin, np.vstack([before, commanded]), run.past_rows)
 
 
 @kernel_function
@@ -444,10 +444,10 @@ def run_states(
     cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
     axle_x, axle_y = axle_of(x, y, cos_yaw, sin_yaw, here)
     begin_x, begin_y, carried_s = axle_x, axle_y, 0.0
-    late = history - delay_steps(acting)
+    first_row = history - delay_steps(acting)
     for t in range(states.shape[0] - 1):
         was_left, was_right = wheel_left, wheel_right
-        recent, older = max(t + late, 0), max(t + late - 1, 0)
+        recent, older = max(t + first_row, 0), max(t + first_row - 1, 0)
         left = in_force(commands[recent, 0], commands[older, 0], acting)
         right = in_force(commands[recent, 1], commands[older, 1], acting)
         axle_x, axle_y, cos_yaw, sin_yaw, wheel_left, wheel_right, _, turn = step(

@@ -44,7 +44,7 @@ _STEADY_RAD_S = 0.1
 
 
 @scalar_function
-def forget(values: Any) -> None:
+def clear_memory(values: Any) -> None:
     """Set all of a buffer of means to nothing; None if there is none."""
     if values is None:
         return
@@ -264,7 +264,7 @@ class GenericTerm:
         """Memory that the feature uses; None for a term of present values alone."""
         return (COMMAND_MEMORIES if self.target == COMMAND else BODY_MEMORIES[self.target]).get(self.feature)
 
-    def meaning(self, k: float) -> str | None:
+    def describe(self, k: float) -> str | None:
         """Describe a robot that shows this term with the factor `k`; None where only the equation is known."""
         if self.memory is None or not self.memory.slews or k > -0.5:
             return None
@@ -338,7 +338,7 @@ def memories_of(names: Iterable[str]) -> tuple[tuple[Remembered, ...], tuple[Rem
     """Return the memories of a model's terms, of commands and of the body, in the order of their means."""
     remembering = [term for term in (TERMS.get(name) for name in names) if term is not None and term.memory is not None]
     of_commands, of_body = (
-        tuple(term.memory for term in remembering if term.memory is not None and (term.target == COMMAND) is wanted)
-        for wanted in (True, False)
+        tuple(term.memory for term in remembering if term.memory is not None and (term.target == COMMAND) is has_memory)
+        for has_memory in (True, False)
     )
     return of_commands, of_body

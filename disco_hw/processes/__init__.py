@@ -58,7 +58,7 @@ def limit_thread_pools(environment: MutableMapping[str, str] = os.environ) -> St
 
     Torch and numba are also held if they are imported already; a BLAS that is loaded keeps the threads it has.
     """
-    numpy_is_late = "numpy" in sys.modules and environment.get("OPENBLAS_NUM_THREADS") != "1"
+    numpy_is_loaded = "numpy" in sys.modules and environment.get("OPENBLAS_NUM_THREADS") != "1"
     for name in _COUNTED_BY:
         # Numba reads its variable again at each compilation and raises if it then differs from the threads it has.
         if not (name.startswith("NUMBA") and "numba" in sys.modules):
@@ -66,7 +66,7 @@ def limit_thread_pools(environment: MutableMapping[str, str] = os.environ) -> St
     for name in ("torch", "numba"):
         if (module := sys.modules.get(name)) is not None:
             module.set_num_threads(1)
-    if numpy_is_late:
+    if numpy_is_loaded:
         return Step("threads", False, "numpy was loaded before; start with OPENBLAS_NUM_THREADS=1 in the environment")
     return Step("threads", True, "numeric libraries use one thread")
 
@@ -154,8 +154,8 @@ def enter_real_time(priority: int, cpus: Collection[int] = ()) -> tuple[Step, ..
     """
     steps = [_set_switch_interval(), _freeze_garbage()]
     if cpus:
-        done, remedy = f"runs on {sorted(cpus)}", "name CPUs that this computer has"
-        steps.append(_try("cpus", lambda: os.sched_setaffinity(0, cpus), done, remedy))
+        done, hint = f"runs on {sorted(cpus)}", "name CPUs that this computer has"
+        steps.append(_try("cpus", lambda: os.sched_setaffinity(0, cpus), done, hint))
     if priority == 0:
         return (*steps, Step("scheduler", False, "left alone, as daemon.realtime_priority is 0"))
     steps.append(_lock_memory())
@@ -204,8 +204,8 @@ def _freeze_garbage() -> Step:
 def _lock_memory() -> Step:
     if not can_lock_memory():
         # Under a finite limit the lock may succeed now and make a later allocation fail in mid-run.
-        remedy = "set LimitMEMLOCK=infinity in the service, or a memlock line in /etc/security/limits.conf"
-        return Step("memory", False, f"not locked, as the limit is finite; {remedy}")
+        hint = "set LimitMEMLOCK=infinity in the service, or a memlock line in /etc/security/limits.conf"
+        return Step("memory", False, f"not locked, as the limit is finite; {hint}")
     libc = ctypes.CDLL(None, use_errno=True)
 
     def lock() -> None:
@@ -235,11 +235,11 @@ def _set_fifo(name: str, priority: int) -> Step:
     )
 
 
-def _try(name: str, action: Callable[[], None], done: str, remedy: str) -> Step:
+def _try(name: str, action: Callable[[], None], done: str, hint: str) -> Step:
     try:
         action()
     except (OSError, ValueError) as error:
-        return Step(name, False, f"refused ({getattr(error, 'strerror', None) or error}); {remedy}")
+        return Step(name, False, f"refused ({getattr(error, 'strerror', None) or error}); {hint}")
     return Step(name, True, done)
 
 

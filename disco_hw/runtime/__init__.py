@@ -44,17 +44,17 @@ class Condition(enum.Flag):
     ROBOT_ESTOP = enum.auto()
     TELEMETRY_FRESH = enum.auto()
     TELEMETRY_LOST = enum.auto()
-    WHEELS_STILL = enum.auto()
+    WHEELS_STATIONARY = enum.auto()
     ARM_PENDING = enum.auto()
-    DISARM_ASKED = enum.auto()
-    ESTOP_ASKED = enum.auto()  # held from the request until a reset is accepted
+    DISARM_REQUESTED = enum.auto()
+    ESTOP_REQUESTED = enum.auto()  # held from the request until a reset is accepted
     RESET_PENDING = enum.auto()
     PREFLIGHT_ERROR = enum.auto()
     DAEMON_ERROR = enum.auto()
 
 
 C = Condition
-PROBLEM = C.DAEMON_ERROR | C.ESTOP_ASKED | C.ROBOT_ESTOP | C.ROBOT_FAULT | C.ROBOT_REFUSED | C.PREFLIGHT_ERROR
+PROBLEM = C.DAEMON_ERROR | C.ESTOP_REQUESTED | C.ROBOT_ESTOP | C.ROBOT_FAULT | C.ROBOT_REFUSED | C.PREFLIGHT_ERROR
 _CONNECTED = frozenset(State) - {State.DISCONNECTED}
 _UNTROUBLED = _CONNECTED - {State.FAULT}
 
@@ -85,14 +85,14 @@ TRANSITIONS: tuple[Transition, ...] = (
     _row(_CONNECTED, S.DISCONNECTED, C.LINK_RENEWED, C.NONE, "the link was interrupted"),
     # Problems latch until a reset.
     _row(_UNTROUBLED, S.FAULT, C.DAEMON_ERROR, C.NONE, "the daemon failed"),
-    _row(_UNTROUBLED, S.FAULT, C.ESTOP_ASKED, C.NONE, "e-stop requested here"),
+    _row(_UNTROUBLED, S.FAULT, C.ESTOP_REQUESTED, C.NONE, "e-stop requested here"),
     _row(_UNTROUBLED, S.FAULT, C.ROBOT_ESTOP, C.NONE, "the robot is in e-stop"),
     _row(_UNTROUBLED, S.FAULT, C.ROBOT_FAULT, C.NONE, "the robot reports a fault"),
     _row(_UNTROUBLED, S.FAULT, C.ROBOT_REFUSED, C.NONE, "the handshake was refused"),
     _row(_UNTROUBLED, S.FAULT, C.PREFLIGHT_ERROR, C.NONE, "a preflight check failed"),
     _row(_from(S.FAULT), S.HANDSHAKE, C.RESET_PENDING, PROBLEM, "reset"),
     # Motion is taken away.
-    _row(_from(S.ARMED), S.STOPPING, C.DISARM_ASKED, C.NONE, "disarm requested"),
+    _row(_from(S.ARMED), S.STOPPING, C.DISARM_REQUESTED, C.NONE, "disarm requested"),
     _row(_from(S.ARMED), S.STOPPING, C.TELEMETRY_LOST, C.NONE, "telemetry lost"),
     _row(_from(S.ARMED), S.STOPPING, C.NONE, C.ROBOT_ARMED, "the robot is no longer armed"),
     _row(_from(S.READY), S.STOPPING, C.ROBOT_MAY_MOVE, C.ARM_PENDING, "the robot armed without being asked"),
@@ -104,7 +104,13 @@ TRANSITIONS: tuple[Transition, ...] = (
     _row(_from(S.DISCONNECTED), S.HANDSHAKE, C.LINK_UP, C.NONE, "the link is up"),
     _row(_from(S.HANDSHAKE), S.READY, C.ROBOT_IDLE | C.TELEMETRY_FRESH, C.NONE, "handshake complete"),
     _row(_from(S.READY), S.ARMED, C.ARM_PENDING | C.ROBOT_ARMED | C.TELEMETRY_FRESH, C.NONE, "armed on request"),
-    _row(_from(S.STOPPING), S.READY, C.ROBOT_IDLE | C.WHEELS_STILL | C.TELEMETRY_FRESH, C.NONE, "the wheels are still"),
+    _row(
+        _from(S.STOPPING),
+        S.READY,
+        C.ROBOT_IDLE | C.WHEELS_STATIONARY | C.TELEMETRY_FRESH,
+        C.NONE,
+        "the wheels are still",
+    ),
 )
 
 
@@ -115,18 +121,18 @@ _ROWS_FROM = {
 }
 
 
-def next_transition(state: State, held: int) -> Transition | None:
+def next_transition(state: State, conditions: int) -> Transition | None:
     """Return the first row that leads out of `state`, or None to stay; `held` is the value of all that is true now."""
     for needs, blocked_by, row in _ROWS_FROM[state]:
-        if held & needs == needs and not held & blocked_by:
+        if conditions & needs == needs and not conditions & blocked_by:
             return row
     return None
 
 
-Ask = Callable[[str], str]
+AdviceStyle = Callable[[str], str]
 """How a person asks for an action, as "arm": in words that begin with a verb."""
 
-ESTOP_REMEDY = "The stop is latched. Make the place safe, release the robot's own button, then {reset}."
+ESTOP_HINT = "The stop is latched. Make the place safe, release the robot's own button, then {reset}."
 _NEXT = {
     "DISCONNECTED": "Check the robot's power and the cable to it.",
     "HANDSHAKE": "The robot is being asked who it is; wait.",
@@ -141,7 +147,7 @@ def by_button(action: str) -> str:
     return f"press {action.capitalize()}"
 
 
-def by_command(robot: Path) -> Ask:
+def by_command(robot: Path) -> AdviceStyle:
     """Return a function that says how an operator requests an action in a terminal."""
     return lambda action: f"run `disco-hw ctl {robot} {action}`"
 
@@ -174,29 +180,29 @@ def is_estop(status: Mapping[str, Any]) -> bool:
     return bool(status["estop"]) or status["robot_state"] == "ESTOP"
 
 
-def advice(status: Mapping[str, Any], ask: Ask = by_button) -> tuple[str, ...]:
+def advice(status: Mapping[str, Any], advice_style: AdviceStyle = by_button) -> tuple[str, ...]:
     """Sentences on what to do now, the most urgent first, for a status of the daemon that is `ok`."""
-    said = []
+    sentences = []
     if is_estop(status):
-        said.append(f"E-STOP. {_asking(ESTOP_REMEDY, ask)}")
+        sentences.append(f"E-STOP. {_asking(ESTOP_HINT, advice_style)}")
     fault = str(status["fault"])
     if fault not in {"NONE", "UNKNOWN"}:
-        said.append(fault_sentence(fault))
+        sentences.append(fault_sentence(fault))
     state = str(status["state"])
-    if said:
-        return tuple(said)
+    if sentences:
+        return tuple(sentences)
     if "drive" in status and state in {"READY", "ARMED"}:
         return (str(status["drive"]["words"]),)
     if state == "ARMED":
         sentence = "{stop} to hold still, or {disarm} to end." if status["running"] else "{start} to drive the task."
-        return (_asking(sentence, ask),)
-    return (_asking(_NEXT[state], ask),) if state in _NEXT else ()
+        return (_asking(sentence, advice_style),)
+    return (_asking(_NEXT[state], advice_style),) if state in _NEXT else ()
 
 
 def fault_sentence(name: str) -> str:
     """Return what a fault is and what to do about it."""
     todo = status_codes.advice(name) or "not known here: look it up where the robot's firmware comes from"
-    return f"{in_words(name)}. {todo[0].upper()}{todo[1:]}."
+    return f"{describe(name)}. {todo[0].upper()}{todo[1:]}."
 
 
 def next_step(status: Mapping[str, Any]) -> str:
@@ -209,11 +215,11 @@ def next_step(status: Mapping[str, Any]) -> str:
     return {"READY": "arm", "FAULT": "reset"}.get(state, "")
 
 
-def in_words(code: str) -> str:
+def describe(code: str) -> str:
     """Return a code of the protocol as a person reads it: STALL_LEFT becomes Stall left."""
     return code.replace("_", " ").capitalize()
 
 
-def _asking(sentence: str, ask: Ask) -> str:
-    words = sentence.format(**{action: ask(action) for action in ("arm", "start", "stop", "disarm", "reset")})
-    return words[0].upper() + words[1:]
+def _asking(sentence: str, advice_style: AdviceStyle) -> str:
+    text = sentence.format(**{action: advice_style(action) for action in ("arm", "start", "stop", "disarm", "reset")})
+    return text[0].upper() + text[1:]

@@ -10,7 +10,7 @@ from disco_hw import control
 from disco_hw.adaptation import GeometryAdaptation
 from disco_hw.adaptation.fast import FastAdaptation
 from disco_hw.adaptation.guard import (
-    ASKED_BY_FILE,
+    REQUESTED_BY_FILE,
     AdaptationKind,
     Geometry,
     believed_geometry,
@@ -41,17 +41,17 @@ from disco_hw.runtime.pipeline import Governor, Pipeline, Planner, WheelLimits
 from disco_hw.runtime.preflight import check_firmware_limits, check_task, failures
 from disco_hw.runtime.robot_setup import Setup, geometry
 from disco_hw.runtime.supervisor import Supervisor, SupervisorSettings
-from drivers.motor import find_driver, make_driver, rewired
-from drivers.pose import PoseSourceError, SeveralPoses, converted, make_pose_source
+from drivers.motor import create_driver, find_driver, rewired
+from drivers.pose import PoseSourceError, SeveralPoses, converted, create_pose_source
 from drivers.private_files import KeyFileError, key_of_file
-from drivers.transport import ReconnectingTransport, TransportSettingsError, make_transport
+from drivers.transport import ReconnectingTransport, TransportSettingsError, create_transport
 from drivers.types import Driver, PoseSource, Transport
 
 _REHEARSALS = 5
 _LEAST_RESPONSE_S = 0.05
 
 
-def make_planner(config: RobotConfig, model: Model) -> control.Disco:
+def create_planner(config: RobotConfig, model: Model) -> control.Disco:
     """DISCO for this robot's task, compiled and warmed up: takes seconds."""
     task = config.task.planned(config.control.mode)
     settings = control.DiscoSettings.from_config(config.control, config.task.speed_m_s)
@@ -61,13 +61,13 @@ def make_planner(config: RobotConfig, model: Model) -> control.Disco:
         settings,
         control.CommandLimits.of_robot(config.robot),
         config.control.seed,
-        make_surroundings(config, settings),
+        create_surroundings(config, settings),
     )
     planner.warm_up()
     return planner
 
 
-def make_surroundings(config: RobotConfig, settings: control.DiscoSettings) -> Surroundings | None:
+def create_surroundings(config: RobotConfig, settings: control.DiscoSettings) -> Surroundings | None:
     """Create the surroundings that DISCO avoids; None without [fence], where the guard alone minds obstacles."""
     if config.fence == Fence():
         return None
@@ -84,7 +84,7 @@ def make_surroundings(config: RobotConfig, settings: control.DiscoSettings) -> S
     return around
 
 
-def make_pipeline(config: RobotConfig, model: Model, planner: Planner) -> Pipeline:
+def create_pipeline(config: RobotConfig, model: Model, planner: Planner) -> Pipeline:
     """Estimator, planner and governor with the limits of robot.toml; the planner with the fallback that it names."""
     if isinstance(planner, control.Disco) and config.control.fallback != "ramp":
         largest = control.CommandLimits.of_robot(config.robot)
@@ -104,35 +104,37 @@ def make_pipeline(config: RobotConfig, model: Model, planner: Planner) -> Pipeli
         disturbance=DisturbanceEstimator() if config.control.disturbance else None,
         means=DriveMeans.of(model),
         headings=HeadingWatch(config.pose.labels(), [one.offset for one in config.pose.every()]),
-        guard=make_guard(config, model),
+        guard=create_guard(config, model),
     )
 
 
-def make_guard(config: RobotConfig, model: Model) -> FenceGuard:
+def create_guard(config: RobotConfig, model: Model) -> FenceGuard:
     """Return the guard of robot.toml's fence; it does nothing until there is a fence or an obstacle.
 
     The wheels respond as late as the model says, and 50 ms at least.
     """
     card = find_driver(config.link.driver).safety_card(config.link.settings())
     names, mean = model.parameter_names, model.point()
-    late = [f"{one.name}.{one.effect.late_by}" for one in model.effects if one.effect.late_by is not None]
-    response_s = max(_LEAST_RESPONSE_S, sum(float(mean[names.index(name)]) for name in late if name in names))
+    delay_columns = [
+        f"{one.name}.{one.effect.delayed_by}" for one in model.effects if one.effect.delayed_by is not None
+    ]
+    response_s = max(_LEAST_RESPONSE_S, sum(float(mean[names.index(name)]) for name in delay_columns if name in names))
     settings = StoppingSettings(
         response_s, card.reaction_s, config.robot.max_wheel_acceleration_rad_s2, 1.0 / config.control.rate_hz
     )
     return FenceGuard(Boundaries(config.robot.footprint, config.fence), settings, config.fence.margin_m)
 
 
-def make_fast_adaptation(setup: Setup, pipeline: Pipeline, watch: PoseWatch | None = None) -> FastAdaptation:
+def create_fast_adaptation(setup: Setup, pipeline: Pipeline, watch: PoseWatch | None = None) -> FastAdaptation:
     """Return the filter that learns the geometry, from the first pose on or once `watch` finds the poses good enough.
 
     `pipeline` has taken no step yet. Raises InputError where the model does not allow it.
     """
-    check_adaptable(setup.model, setup.config.control.uncertainty, ASKED_BY_FILE)
+    check_adaptable(setup.model, setup.config.control.uncertainty, REQUESTED_BY_FILE)
     return FastAdaptation(
         _rehearsed(setup, pipeline),
         *possible_range(setup.config.prior),
-        lambda geometry: put_in_force(pipeline, setup.model, geometry),
+        lambda geometry: apply_geometry(pipeline, setup.model, geometry),
         setup.config.control.disturbance,
         watch,
     )
@@ -142,7 +144,7 @@ def make_adaptation(setup: Setup, pipeline: Pipeline, kind: AdaptationKind) -> G
     """Return what learns the geometry, as `choose_adaptation` says; None for "off"."""
     if kind == "off":
         return None
-    return make_fast_adaptation(setup, pipeline, PoseWatch() if kind == "measured" else None)
+    return create_fast_adaptation(setup, pipeline, PoseWatch() if kind == "measured" else None)
 
 
 def _rehearsed(setup: Setup, pipeline: Pipeline) -> Geometry:
@@ -152,14 +154,14 @@ def _rehearsed(setup: Setup, pipeline: Pipeline) -> Geometry:
     """
     believed = believed_geometry(setup.model)
     for _ in range(_REHEARSALS):
-        put_in_force(pipeline, setup.model, believed)
-        put_in_force(pipeline, setup.model, None)
+        apply_geometry(pipeline, setup.model, believed)
+        apply_geometry(pipeline, setup.model, None)
     return believed
 
 
-def put_in_force(pipeline: Pipeline, model: Model, learnt: Geometry | None) -> None:
+def apply_geometry(pipeline: Pipeline, model: Model, geometry: Geometry | None) -> None:
     """Plan and estimate with this geometry, or with the model file's for None; raises ValueError if that cannot be."""
-    adapted = model if learnt is None else with_geometry(model, learnt)
+    adapted = model if geometry is None else with_geometry(model, geometry)
     if adapted.belief is None:
         raise ValueError("the model has no belief")
     pipeline.set_belief(adapted.belief, odometry_parameters(adapted))
@@ -211,7 +213,9 @@ def pose_source_of(config: RobotConfig) -> PoseSource:
     silence_s = TAKE_OVER_TIMEOUTS * config.estimation.pose_timeout_s
     for label, named in zip(config.pose.labels(), config.pose.every(), strict=True):
         try:
-            source = make_pose_source(**msgspec.structs.asdict(named), key=_pose_key(named), sender_silence_s=silence_s)
+            source = create_pose_source(
+                **msgspec.structs.asdict(named), key=_pose_key(named), sender_silence_s=silence_s
+            )
         except (KeyFileError, PoseSourceError) as error:
             for one in opened:
                 one.close()
@@ -234,7 +238,7 @@ def _pose_key(named: PoseInput) -> bytes | None:
 
 def driver_of(config: RobotConfig, key: bytes | None = None) -> Driver:
     """Return the driver that robot.toml names, for wheels that are wired as it says."""
-    return rewired(make_driver(config.link.driver, config.link.settings(), key), config.wheels)
+    return rewired(create_driver(config.link.driver, config.link.settings(), key), config.wheels)
 
 
 def preflight(config: RobotConfig, driver: Driver, with_task: bool = True) -> tuple[str, ...]:
@@ -247,9 +251,9 @@ def preflight(config: RobotConfig, driver: Driver, with_task: bool = True) -> tu
     return failures(checks)
 
 
-def make_link(setup: Setup) -> ReconnectingTransport:
+def create_link(setup: Setup) -> ReconnectingTransport:
     """Return the link that robot.toml names, not yet opened. Raises InputError for what no device could satisfy."""
     try:
-        return make_transport(**setup.config.link.medium_fields())
+        return create_transport(**setup.config.link.medium_fields())
     except TransportSettingsError as error:
         raise InputError(f"{setup.robot_file}: {error}") from None

@@ -20,7 +20,7 @@ from disco_hw.log import records
 from disco_hw.log.recorder import Recorder
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.obstacles import ObstacleRefused, ObstacleReport
-from disco_hw.runtime.pipeline import FollowTask, Motion, Off, Pipeline, Source, Stand, Tick, untimed
+from disco_hw.runtime.pipeline import FollowTask, Motion, Off, Pipeline, Source, StandstillTracker, Tick, untimed
 from disco_hw.runtime.plausibility import Directions, Headway, Plausibility, PlausibilityStats
 from disco_hw.runtime.pose_jumps import PoseJumps
 from disco_hw.runtime.robot_setup import record_of
@@ -36,10 +36,10 @@ from drivers.types import (
     Identity,
     Limits,
     LinkState,
+    MessageSource,
     PoseSource,
     Readings,
     RobotStatus,
-    SaysWhy,
     Transport,
     WheelCommand,
     WheelSample,
@@ -152,7 +152,7 @@ class DaemonCore:
         self._link_up = False
         self._planner_failing = self._planner_collapsed = self._fell_back = False
         self._state = supervisor.state
-        self._said: tuple[str, bool, bool] | None = None
+        self._last_reported: tuple[str, bool, bool] | None = None
         self.entered: dict[str, int] = {}
         self._task_changed = False
 
@@ -189,14 +189,14 @@ class DaemonCore:
         readings = self.driver.receive(now_ns, frames)
         poses = self.pose_source.receive(now_ns, readings.poses)
         readings = msgspec.structs.replace(readings, poses=tuple(poses))
-        self._remember(now_ns, readings)
+        self._store(now_ns, readings)
         believed = self.pipeline.screen(readings)
         if readings.wheels:
             self.announce(now_ns, readings.wheels)
         self._watch_wheels(now_ns, believed)
         output = self._supervisor.step(now_ns, self._inputs(now_ns, requests, by_hand))
         mark("receive")
-        learnt = self.adaptation.step(now_ns)
+        estimated = self.adaptation.step(now_ns)
         overridden = self._begin_fence(now_ns, by_hand)
         result = self.pipeline.step(now_ns, believed, _motion(output, motion), mark, overridden)
         self._jump = self._jumps.step(result.estimate, result.pose_updates)
@@ -211,7 +211,7 @@ class DaemonCore:
             *readings.events,
             *self._pose_events(),
             *output.events,
-            *learnt.events,
+            *estimated.events,
             *self._planner_events(result),
             *doubts,
         )
@@ -227,7 +227,7 @@ class DaemonCore:
                 *sent,
                 *self._state_change(now_ns, output),
                 *self._task_change(now_ns),
-                *learnt.records,
+                *estimated.records,
                 *fence_records,
                 *(records.Event(now_ns, "info", "daemon", text) for text in events),
                 *extra_records,
@@ -242,10 +242,10 @@ class DaemonCore:
         """Stop a robot of which a wheel does not obey: by its driver, without torque, as a ramp would need encoders."""
         geometry = self.pipeline.fusion.parameters
         directions = self.directions
-        is_wiring_known = directions is not None and directions.is_judged
+        is_wiring_known = directions is not None and directions.is_evaluated
         fault = self._wheel_faults.step(now_ns, readings.wheels, readings.poses, geometry, is_wiring_known)
         if fault is not None and directions is not None and self.driver.state is DriverState.ARMED:
-            self.driver.release(fault.words)
+            self.driver.release(fault.status_text)
 
     def _watch_wiring(self, now_ns: int, readings: Readings, command: WheelCommand | None) -> None:
         """Stop a robot that is wired otherwise than declared, until the daemon has read what was mended."""
@@ -284,7 +284,7 @@ class DaemonCore:
             self.driver.link_up(now_ns)
             self._link_up = True
 
-    def _remember(self, now_ns: int, readings: Readings) -> None:
+    def _store(self, now_ns: int, readings: Readings) -> None:
         if readings.wheels:
             self.newest_wheels = readings.wheels[-1]
         if readings.status:
@@ -355,9 +355,12 @@ class DaemonCore:
     def _pose_events(self) -> list[str]:
         """Return the news of pose sources, their headings and the estimate, each as an event."""
         source, pipeline = self.pose_source, self.pipeline
-        news = [*(source.news() if isinstance(source, SaysWhy) else ()), *pipeline.headings.news()]
-        news += [*pipeline.fusion.sources.news(), *self._jumps.news()]
-        return [f"poses: {words}" for words in news]
+        messages = [
+            *(source.new_messages() if isinstance(source, MessageSource) else ()),
+            *pipeline.headings.new_messages(),
+        ]
+        messages += [*pipeline.fusion.sources.new_messages(), *self._jumps.new_messages()]
+        return [f"poses: {text}" for text in messages]
 
     def _planner_events(self, result: Tick) -> tuple[str, ...]:
         """Say when the planner begins and ceases to fail, or to plan from too few samples, not in every tick."""
@@ -395,12 +398,12 @@ class DaemonCore:
     def _state_change(self, now_ns: int, output: Output) -> list[records.Record]:
         """Return the record of a change of state or of what is said of it, in the tick in which it happens."""
         before, self._state = self._state, output.state
-        said, self._said = self._said, (output.detail, output.running, output.estop)
-        if output.state is before and self._said == said:
+        last, self._last_reported = self._last_reported, (output.detail, output.running, output.estop)
+        if output.state is before and self._last_reported == last:
             return []
         if output.state is not before:
             self.entered[output.state.value] = self.entered.get(output.state.value, 0) + 1
-        return [records.DaemonState(now_ns, output.state.name, before.name, *self._said)]
+        return [records.DaemonState(now_ns, output.state.name, before.name, *self._last_reported)]
 
     def _task_change(self, now_ns: int) -> list[records.Record]:
         """Return the record of another task, in the first tick that it holds for."""
@@ -414,10 +417,10 @@ class DaemonCore:
             self.progress.pause()
 
 
-def _motion(output: Output, wanted: Motion) -> Motion:
+def _motion(output: Output, steering: Motion) -> Motion:
     if output.motion_allowed:
-        return wanted
-    return Stand() if output.zero_only else Off()
+        return steering
+    return StandstillTracker() if output.zero_only else Off()
 
 
 @dataclass(frozen=True, slots=True)
@@ -450,7 +453,7 @@ class Pilot(Protocol):
     def learn(self, now_ns: int, tick: CoreTick, replies: Sequence[Reply]) -> None:
         """Take in the result: the replies to its own requests."""
 
-    def steer(self, now_ns: int, page: int, wanted: Mapping[str, Any]) -> str | None:
+    def steer(self, now_ns: int, page: int, steering: Mapping[str, Any]) -> str | None:
         """Take in how a page, known by a number, wants to drive; returns why that does not count, in words."""
 
     def status(self) -> dict[str, Any]:
@@ -486,7 +489,7 @@ class TaskPilot:
     def learn(self, now_ns: int, tick: CoreTick, replies: Sequence[Reply]) -> None:
         """Do nothing: the task needs no result of a tick."""
 
-    def steer(self, now_ns: int, page: int, wanted: Mapping[str, Any]) -> str | None:
+    def steer(self, now_ns: int, page: int, steering: Mapping[str, Any]) -> str | None:
         """Refuse a page's steering, because a task is followed."""
         return "this daemon follows its task; stop it and start `disco-hw drive ROBOT.toml --page`"
 

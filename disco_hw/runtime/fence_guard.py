@@ -32,7 +32,7 @@ SCALES = np.array([0.0, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875, 1.0])
 """Parts of a command that are tried; the first is the stop itself."""
 RELEASED_FROM = 3
 """A command that was stopped goes on once so large a scale (an index) is allowed, so that it does not flutter."""
-_HELD, _COASTED, _BRAKED = 3, 2, 3
+_RESPONDING, _COASTED, _BRAKED = 3, 2, 3
 STOPPED_RAD_S = 1e-3
 
 
@@ -48,7 +48,7 @@ class FenceVerdict(enum.Enum):
     OVERRIDDEN = "overridden"
 
 
-HOLDS_STILL = frozenset({FenceVerdict.STOPPED, FenceVerdict.NO_POSE, FenceVerdict.OBSTACLE_LOST})
+STOPS_MOTION = frozenset({FenceVerdict.STOPPED, FenceVerdict.NO_POSE, FenceVerdict.OBSTACLE_LOST})
 """Verdicts that let no motion through."""
 
 
@@ -97,7 +97,7 @@ class FenceGuard:
         self._settings = settings
         self._margin_m = margin_m
         self._obstacles: tuple[MovingCircle, ...] = ()
-        self._lost: tuple[str, ...] = ()
+        self._missing: tuple[str, ...] = ()
         self._is_stopped = False
 
     @property
@@ -114,7 +114,7 @@ class FenceGuard:
     def is_active(self) -> bool:
         """Whether there is a fence or an obstacle."""
         bounds = self._boundaries
-        return bounds is not None and (bounds.fence.is_set or bool(self._obstacles) or bool(self._lost))
+        return bounds is not None and (bounds.fence.is_set or bool(self._obstacles) or bool(self._missing))
 
     def set_boundaries(self, boundaries: Boundaries, margin_m: float) -> None:
         """Keep within another fence from the next step on."""
@@ -128,9 +128,9 @@ class FenceGuard:
             settings.response_s, settings.reaction_s, deceleration_rad_s2, settings.period_s
         )
 
-    def set_obstacles(self, obstacles: Sequence[MovingCircle], lost: Sequence[str] = ()) -> None:
+    def set_obstacles(self, obstacles: Sequence[MovingCircle], missing: Sequence[str] = ()) -> None:
         """Keep away from these circles, true now; `lost`: names of those whose reports have ceased."""
-        self._obstacles, self._lost = tuple(obstacles), tuple(lost)
+        self._obstacles, self._missing = tuple(obstacles), tuple(missing)
         if self._boundaries is not None:
             self._boundaries.set_obstacles(self._obstacles)
 
@@ -151,28 +151,28 @@ class FenceGuard:
             return IDLE
         if overridden:
             return FenceState(FenceVerdict.OVERRIDDEN, 1.0, math.nan, reason="moved by hand in spite of the fence")
-        if self._lost:
-            names = ", ".join(self._lost)
+        if self._missing:
+            names = ", ".join(self._missing)
             return FenceState(
                 FenceVerdict.OBSTACLE_LOST, 0.0, math.nan,
                 reason=f"obstacle {names} is reported no longer; report it again or remove it",
             )  # fmt: skip
         if not estimate.ok or not _are_finite(estimate, geometry, last_sent):
             return FenceState(FenceVerdict.NO_POSE, 0.0, math.nan, reason="no valid pose, and a fence is set")
-        asks = max(map(abs, requested)) > STOPPED_RAD_S if all(map(math.isfinite, requested)) else False
-        wanted = requested if asks else (0.0, 0.0)
+        is_motion_requested = max(map(abs, requested)) > STOPPED_RAD_S if all(map(math.isfinite, requested)) else False
+        desired = requested if is_motion_requested else (0.0, 0.0)
         # A path that overflows has no clearance, which stops the robot: a warning would say nothing more.
         with np.errstate(over="ignore", invalid="ignore"):
-            poses, clearance, driven = self._stopping_paths(bounds, estimate, geometry, last_sent, wanted)
+            poses, clearance, driven = self._stopping_paths(bounds, estimate, geometry, last_sent, desired)
         if not np.isfinite(clearance).all():
             return FenceState(FenceVerdict.NO_POSE, 0.0, math.nan, reason="the stopping path is not finite")
         chosen = self._largest_scale(clearance, driven)
         if self._is_stopped and chosen < RELEASED_FROM:
             chosen = 0
-        self._is_stopped = asks and chosen == 0
+        self._is_stopped = is_motion_requested and chosen == 0
         path = tuple(map(tuple, poses[chosen].tolist()))
         least = float(clearance[chosen].min())
-        if not asks:
+        if not is_motion_requested:
             return FenceState(FenceVerdict.FREE, 1.0, least, path)
         if chosen == 0:
             x, y, _ = poses[-1][clearance[-1].min(axis=1).argmin()].tolist()
@@ -238,24 +238,24 @@ class FenceGuard:
         """
         settings, count = self._settings, len(SCALES)
         now, command = np.array(wheels), SCALES[:, None] * np.array(requested)
-        held_s = settings.response_s + spread.distance * (estimate.pose_age_s or 0.0)
+        reaction_s = settings.response_s + spread.distance * (estimate.pose_age_s or 0.0)
         tail_s = 1.5 * settings.period_s + settings.reaction_s
         # What of the present speed exceeds the command; all of it where the command is the other way.
         slowed = now - np.clip(command, np.minimum(now, 0.0), np.maximum(now, 0.0))
         turned = [
             np.zeros((count, 1, 2)),
-            np.broadcast_to(now * (held_s / _HELD), (count, _HELD, 2)),
+            np.broadcast_to(now * (reaction_s / _RESPONDING), (count, _RESPONDING, 2)),
             self._braking(slowed, _COASTED),
-            np.repeat(command[:, None, :] * (tail_s / _HELD), _HELD, axis=1),
+            np.repeat(command[:, None, :] * (tail_s / _RESPONDING), _RESPONDING, axis=1),
             self._braking(command, _BRAKED),
         ]
         wheel_rad = np.concatenate(turned, axis=1)
         coast_s, brake_s = (np.abs(one).max(axis=1) / settings.deceleration_rad_s2 for one in (slowed, command))
         lasting_s = [
             np.zeros((count, 1)),
-            np.full((count, _HELD), held_s / _HELD),
+            np.full((count, _RESPONDING), reaction_s / _RESPONDING),
             coast_s[:, None] * _braking_parts(_COASTED),
-            np.full((count, _HELD), tail_s / _HELD),
+            np.full((count, _RESPONDING), tail_s / _RESPONDING),
             brake_s[:, None] * _braking_parts(_BRAKED),
         ]
         radius, axle, x_icr = geometry.wheel_radius_m, geometry.axial_distance_m, geometry.x_icr_m
@@ -278,8 +278,8 @@ class FenceGuard:
         The slower wheel takes as long as the faster one, so that the path keeps its curvature.
         """
         lasting_s = np.abs(speeds).max(axis=1, keepdims=True) / self._settings.deceleration_rad_s2
-        whole = 0.5 * speeds * lasting_s
-        return np.repeat(whole[:, None, :] / steps, steps, axis=1)
+        distance = 0.5 * speeds * lasting_s
+        return np.repeat(distance[:, None, :] / steps, steps, axis=1)
 
 
 def _braking_parts(steps: int) -> Array:

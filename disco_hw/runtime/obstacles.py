@@ -79,7 +79,7 @@ class Obstacles:
 
     def __init__(self) -> None:
         self._kept: dict[str, _Kept] = {}
-        self._lost: frozenset[str] = frozenset()
+        self._missing: frozenset[str] = frozenset()
         self.refused = 0
         """Number of reports that found no room."""
 
@@ -99,17 +99,19 @@ class Obstacles:
 
     def step(self, now_ns: int) -> tuple[str, ...]:
         """Update which obstacles are lost; return a sentence for each whose reports have ceased or are back."""
-        lost = frozenset(name for name, one in self._kept.items() if one.age_s(now_ns) > one.report.age_limit_s)
-        gone, back = sorted(lost - self._lost), sorted((self._lost - lost) & self._kept.keys())
-        self._lost = lost
+        missing = frozenset(name for name, one in self._kept.items() if one.age_s(now_ns) > one.report.age_limit_s)
+        gone, back = sorted(missing - self._missing), sorted((self._missing - missing) & self._kept.keys())
+        self._missing = missing
         limits = {name: self._kept[name].report.age_limit_s for name in gone}
-        said = [f"fence: obstacle {name} not reported for {limits[name]:g} s; the robot must stand" for name in gone]
-        return (*said, *(f"fence: obstacle {name} is reported again" for name in back))
+        messages = [
+            f"fence: obstacle {name} not reported for {limits[name]:g} s; the robot must stand" for name in gone
+        ]
+        return (*messages, *(f"fence: obstacle {name} is reported again" for name in back))
 
     @property
     def lost(self) -> tuple[str, ...]:
         """Names of the obstacles whose reports had ceased at the last step."""
-        return tuple(sorted(self._lost & self._kept.keys()))
+        return tuple(sorted(self._missing & self._kept.keys()))
 
     def circles(self, now_ns: int) -> tuple[MovingCircle, ...]:
         """Return the obstacles as moving circles, at their places now."""
@@ -130,7 +132,7 @@ class Obstacles:
                     "vy_m_s": now.vy_m_s,
                     "age_s": one.age_s(now_ns),
                     "age_limit_s": one.report.age_limit_s,
-                    "lost": name in self._lost,
+                    "lost": name in self._missing,
                 }
             )
         return found

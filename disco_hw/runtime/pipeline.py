@@ -29,7 +29,7 @@ from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.fence.clearance import Boundaries
 from disco_hw.model import Belief
 from disco_hw.model.coefficients import NO_DISTURBANCE, Disturbance
-from disco_hw.runtime.fence_guard import HOLDS_STILL, IDLE, FenceGuard, FenceState, corner_deviation_m
+from disco_hw.runtime.fence_guard import IDLE, STOPS_MOTION, FenceGuard, FenceState, corner_deviation_m
 from disco_hw.tasks import PlannedTask
 from drivers.types import PoseSample, Readings
 
@@ -208,7 +208,7 @@ class Off:
 
 
 @dataclass(frozen=True, slots=True)
-class Stand:
+class StandstillTracker:
     """Come to zero wheel speed within the limits and hold it."""
 
 
@@ -243,7 +243,7 @@ class Source(enum.Enum):
     SILENT = "silent"
 
 
-Motion = Off | Stand | FollowTask | Manual | Silent
+Motion = Off | StandstillTracker | FollowTask | Manual | Silent
 
 
 class Tick(msgspec.Struct, frozen=True, gc=False):
@@ -348,7 +348,7 @@ class Pipeline:
             pose, never_measured = self.headings.screen(sample, difference_rad, turn_per_rad)
             poses.append(pose)
             if never_measured:
-                self._fusion.forget_heading()
+                self._fusion.reset_heading()
         return msgspec.structs.replace(readings, poses=tuple(poses))
 
     def step(
@@ -366,7 +366,7 @@ class Pipeline:
         """
         for wheels in readings.wheels:
             self._fusion.add_wheels(wheels)
-        updates = tuple(self._take_pose(pose, now_ns) for pose in readings.poses)
+        updates = tuple(self._handle_pose(pose, now_ns) for pose in readings.poses)
         self._fusion.sources.step(now_ns)
         estimate = self._fusion.estimate(now_ns)
         if self._means is not None and self._last_ns is not None:
@@ -378,7 +378,7 @@ class Pipeline:
             plan, failure = self._replan(now_ns, estimate)
         else:
             self._plan, self._following = None, False
-        source, requested = self._wanted(now_ns, motion, plan)
+        source, requested = self._desired(now_ns, motion, plan)
         fence, allowed = self._guarded(estimate, source, requested, fence_overridden)
         command = self._govern(now_ns, source, allowed)
         if allowed is not requested:
@@ -406,7 +406,7 @@ class Pipeline:
             return IDLE, requested
         last = (self._sent[-1].left_rad_s, self._sent[-1].right_rad_s) if self._sent else (0.0, 0.0)
         found = self._guard.step(estimate, self._fusion.parameters, last, requested, overridden)
-        if found.verdict in HOLDS_STILL:
+        if found.verdict in STOPS_MOTION:
             return found, (0.0, 0.0) if requested != (0.0, 0.0) else requested
         if found.scale == 1.0:
             return found, requested
@@ -417,10 +417,10 @@ class Pipeline:
         """Fence guard that checks every command; None where there is none."""
         return self._guard
 
-    def _take_pose(self, pose: PoseSample, now_ns: int) -> PoseUpdate:
+    def _handle_pose(self, pose: PoseSample, now_ns: int) -> PoseUpdate:
         update = self._fusion.add_pose(pose, now_ns)
         if self._disturbance is not None:
-            self._disturbance.take(pose, update, self._fusion.parameters, self._fusion.wheels_rad_s)
+            self._disturbance.add_sample(pose, update, self._fusion.parameters, self._fusion.wheels_rad_s)
             self._fusion.set_disturbance(self._disturbance.value)
         return update
 
@@ -449,11 +449,11 @@ class Pipeline:
         self._plan, self._plan_made_ns = plan, now_ns
         return plan, None
 
-    def _wanted(self, now_ns: int, motion: Motion, new: WheelPlan | None) -> tuple[Source, tuple[float, float]]:
+    def _desired(self, now_ns: int, motion: Motion, new: WheelPlan | None) -> tuple[Source, tuple[float, float]]:
         match motion:
             case Off():
                 return Source.OFF, (0.0, 0.0)
-            case Stand():
+            case StandstillTracker():
                 return Source.HOLD, (0.0, 0.0)
             case Silent():
                 return Source.SILENT, (0.0, 0.0)

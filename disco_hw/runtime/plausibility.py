@@ -107,7 +107,7 @@ LEAST_M = 0.05
 """Who gets no further than this within the window makes no progress; less for a task that is slower than that."""
 LEAST_WAY_PART = 0.25
 """Of what the task's speed makes in the window."""
-ASKED_RAD_S = 0.05
+COMMANDED_RAD_S = 0.05
 """A command below this asks for no motion."""
 ROLLED_RAD = 0.5
 """Wheels that have turned less in the window stand."""
@@ -122,7 +122,7 @@ class _Window:
     y_m: float
     angles_rad: tuple[float, float] | None
     largest_rad_s: float = 0.0
-    said: bool = False
+    is_reported: bool = False
 
 
 class Headway:
@@ -144,11 +144,11 @@ class Headway:
         window = self._window
         if window is None or math.hypot(place_m[0] - window.x_m, place_m[1] - window.y_m) > self._least_m:
             self._window = _Window(now_ns, *place_m, angles)
-            return ("task: makes progress again",) if window is not None and window.said else ()
+            return ("task: makes progress again",) if window is not None and window.is_reported else ()
         window.largest_rad_s = max(window.largest_rad_s, *map(abs, command_rad_s))
-        if window.said or now_ns - window.begun_ns < WINDOW_NS:
+        if window.is_reported or now_ns - window.begun_ns < WINDOW_NS:
             return ()
-        window.said = True
+        window.is_reported = True
         return (f"task: no progress for 5 s: {_obstacle(window, angles, planner_failure)}",)
 
 
@@ -156,7 +156,7 @@ def _obstacle(window: _Window, angles_rad: tuple[float, float] | None, planner_f
     """Return the likely reason why the robot does not move, looked for from the commands down to the ground."""
     if planner_failure is not None:
         return f"the planner has no plan: {planner_failure}"
-    if window.largest_rad_s < ASKED_RAD_S:
+    if window.largest_rad_s < COMMANDED_RAD_S:
         return "the planner commands no motion; check the task and the position of the robot"
     if angles_rad is None or window.angles_rad is None:
         return f"commanded up to {window.largest_rad_s:.2f} rad/s, but no wheel data arrive; check the encoders"
@@ -172,10 +172,10 @@ def _obstacle(window: _Window, angles_rad: tuple[float, float] | None, planner_f
     )
 
 
-JUDGED_NS = 5_000_000_000
+EVALUATED_NS = 5_000_000_000
 """Of motion: what turned the right way so long does so."""
 MOVES_RAD_S = 0.3
-STANDS_RAD_S = 0.15
+STATIONARY_RAD_S = 0.15
 LEAST_RAD = 0.15
 LEAST_SUM_RAD = 0.4
 LEAST_PART = 0.1
@@ -211,7 +211,7 @@ class _Start(NamedTuple):
         """Create the mean from its first pose."""
         return _Start(pose.source, pose.x_m, pose.y_m, pose.yaw_rad, 1)
 
-    def take(self, pose: PoseSample) -> _Start:
+    def with_pose(self, pose: PoseSample) -> _Start:
         """Take in one more; another source, or a place that noise does not explain, begins again."""
         yaw = math.remainder(pose.yaw_rad - self.yaw_rad, 2.0 * math.pi)
         away_m = math.hypot(pose.x_m - self.x_m, pose.y_m - self.y_m)
@@ -235,10 +235,10 @@ class Directions:
         self._start: _Start | None = None
         self._begun_ns: int | None = None
         self._last_ns = 0
-        self._asked: Pair = (0.0, 0.0)
+        self._commanded: Pair = (0.0, 0.0)
         self._before: Pair = (0.0, 0.0)
         self._signs: tuple[float, ...] = (0.0, 0.0)
-        self._reversed = self._found = self.is_judged = False
+        self._reversed = self._found = self.is_evaluated = False
         self._in_a_row = ("", 0)
         self._evidence: dict[tuple[bool, tuple[int, ...]], float] = {}
         self._reset()
@@ -260,21 +260,24 @@ class Directions:
         if command is None:
             self._reset()
             return None
-        self.is_judged = self.is_judged or (self._begun_ns is not None and now_ns - self._begun_ns > JUDGED_NS)
-        if self._found or self.is_judged:
+        self.is_evaluated = self.is_evaluated or (self._begun_ns is not None and now_ns - self._begun_ns > EVALUATED_NS)
+        if self._found or self.is_evaluated:
             return None
         for sample in wheels:
             self._turned.append((sample.t_ns, sample.left_angle_rad, sample.right_angle_rad))
-        asked = (command.left_rad_s, command.right_rad_s)
+        commanded = (command.left_rad_s, command.right_rad_s)
         if self._begun_ns is None:
-            self._wait_for_motion(now_ns, wheels, poses, asked)
+            self._wait_for_motion(now_ns, wheels, poses, commanded)
         else:
-            signs = [math.copysign(1.0, speed) if abs(speed) > MOVES_RAD_S else 0.0 for speed in asked]
+            signs = [math.copysign(1.0, speed) if abs(speed) > MOVES_RAD_S else 0.0 for speed in commanded]
             self._reversed = self._reversed or any(a * b < 0.0 for a, b in zip(signs, self._signs, strict=True))
             self._signs = tuple(new or old for new, old in zip(signs, self._signs, strict=True))
             step_s = (now_ns - self._last_ns) * 1e-9
-            self._asked = (self._asked[0] + step_s * self._before[0], self._asked[1] + step_s * self._before[1])
-            self._before, self._last_ns = asked, now_ns
+            self._commanded = (
+                self._commanded[0] + step_s * self._before[0],
+                self._commanded[1] + step_s * self._before[1],
+            )
+            self._before, self._last_ns = commanded, now_ns
             found = self._by_commands(wheels, has_followed) or (None if is_suspect else self._by_poses(poses))
             self._found = found is not None
             return found
@@ -285,7 +288,7 @@ class Directions:
         self._start = None
         self._begun_ns = None
         self._last_ns = 0
-        self._asked = (0.0, 0.0)
+        self._commanded = (0.0, 0.0)
         self._before = (0.0, 0.0)
         self._signs = (0.0, 0.0)
         self._reversed = self._found = False
@@ -294,19 +297,19 @@ class Directions:
         self._evidence = {wired: 0.0 for wired in every if wired != (False, (1, 1))}
 
     def _wait_for_motion(
-        self, now_ns: int, wheels: Sequence[WheelSample], poses: Sequence[PoseSample], asked: Pair
+        self, now_ns: int, wheels: Sequence[WheelSample], poses: Sequence[PoseSample], commanded: Pair
     ) -> None:
         """Update the mean pose at rest, and begin an observed motion once the robot is commanded to move from rest."""
         for pose in poses:
             if pose.has_heading:
-                self._start = _Start.of(pose) if self._start is None else self._start.take(pose)
-        stands = all(
-            max(abs(wheel.left_speed_rad_s), abs(wheel.right_speed_rad_s)) < STANDS_RAD_S for wheel in wheels[-1:]
+                self._start = _Start.of(pose) if self._start is None else self._start.with_pose(pose)
+        is_stationary = all(
+            max(abs(wheel.left_speed_rad_s), abs(wheel.right_speed_rad_s)) < STATIONARY_RAD_S for wheel in wheels[-1:]
         )
-        if max(map(abs, asked)) > MOVES_RAD_S and stands and self._turned:
+        if max(map(abs, commanded)) > MOVES_RAD_S and is_stationary and self._turned:
             self._begun_ns = self._last_ns = now_ns
-            self._before = asked
-            self._signs = tuple(math.copysign(1.0, speed) if abs(speed) > MOVES_RAD_S else 0.0 for speed in asked)
+            self._before = commanded
+            self._signs = tuple(math.copysign(1.0, speed) if abs(speed) > MOVES_RAD_S else 0.0 for speed in commanded)
         del self._turned[:-1]
 
     def _moved(self, t_ns: int) -> Pair:
@@ -319,26 +322,29 @@ class Directions:
         """Sides that turn against what was commanded, or as the other was."""
         if not wheels or self._reversed:
             return None
-        turned, asked = self._moved(wheels[-1].t_ns), self._asked
+        turned, commanded = self._moved(wheels[-1].t_ns), self._commanded
         wrong = [
             side
             for side in (0, 1)
             if not has_followed[side]
-            and turned[side] * math.copysign(1.0, asked[side]) < -max(LEAST_RAD, _OPPOSITE_PART * abs(asked[side]))
+            and turned[side] * math.copysign(1.0, commanded[side])
+            < -max(LEAST_RAD, _OPPOSITE_PART * abs(commanded[side]))
         ]
-        crossed = (asked[1], asked[0])
+        crossed = (commanded[1], commanded[0])
         enough = abs(turned[0]) + abs(turned[1]) > LEAST_SUM_RAD and min(map(abs, turned)) > LEAST_PART * max(
             map(abs, turned)
         )
-        if enough and _cosine(turned, crossed) > _CROSSED_COSINE and _cosine(turned, asked) < _STRAIGHT_COSINE:
-            return self._again(self._words_of_crossed())
-        return self._again(self._words_of_opposite(wrong) if wrong else "")
+        if enough and _cosine(turned, crossed) > _CROSSED_COSINE and _cosine(turned, commanded) < _STRAIGHT_COSINE:
+            return self._again(self._describe_crossed())
+        return self._again(self._describe_opposite(wrong) if wrong else "")
 
     def _by_poses(self, poses: Sequence[PoseSample]) -> str | None:
         """Return the wiring, other than that of robot.toml, that explains the motion since rest; None if none does."""
         start, declared = self._start, (False, (1, 1))
         counted = self._moved(self._turned[-1][0])
-        if any(abs(turn) < _COUNTED_PART * abs(asked) for turn, asked in zip(counted, self._asked, strict=True)):
+        if any(
+            abs(turn) < _COUNTED_PART * abs(commanded) for turn, commanded in zip(counted, self._commanded, strict=True)
+        ):
             # A wheel that does not count says nothing of how it is wired.
             return None
         for pose in poses:
@@ -361,7 +367,7 @@ class Directions:
                 gain = 0.5 * (off_declared**2 - off**2) / max(variance, 1e-9)
                 self._evidence[wired] += min(max(gain, -_MOST_OF_ONE), _MOST_OF_ONE)
         wired = max(self._evidence, key=self._evidence.__getitem__)
-        return self._words_of_wiring(*wired) if self._evidence[wired] > _ENOUGH else None
+        return self._describe_wiring(*wired) if self._evidence[wired] > _ENOUGH else None
 
     def _off_m(self, ahead_m: float, yaw_rad: float, turned: Pair, swapped: bool, signs: Sequence[int]) -> float:
         """Return the distance (m) of the pose from where wheels wired so lead; a turn counts as its arc at a wheel."""
@@ -372,13 +378,13 @@ class Directions:
         turned_m = 0.5 * self._track_m * yaw_rad
         return min(math.hypot(ahead_m - ahead, turned_m - part * arc) for part in _TURNED_PARTS)
 
-    def _again(self, words: str) -> str | None:
+    def _again(self, text: str) -> str | None:
         """Return the words once the same was found a few times in a row; no words mean that nothing was found."""
         before, times = self._in_a_row
-        self._in_a_row = (words, times + 1 if words == before else 1)
-        return words if words and self._in_a_row[1] == SAMPLES else None
+        self._in_a_row = (text, times + 1 if text == before else 1)
+        return text if text and self._in_a_row[1] == SAMPLES else None
 
-    def _words_of_opposite(self, wrong: Sequence[int]) -> str:
+    def _describe_opposite(self, wrong: Sequence[int]) -> str:
         names = " and the ".join(f"{_SIDES[side]} wheel" for side in wrong)
         encoder = list(self._wiring.encoder_direction)
         motor = list(self._wiring.motor_direction)
@@ -389,7 +395,7 @@ class Directions:
             f"if it turned as it should, or wheels.motor_direction = {motor} if it turned the other way"
         )
 
-    def _words_of_crossed(self) -> str:
+    def _describe_crossed(self) -> str:
         crossed = str(not self._wiring.encoders_swapped).lower()
         sides = str(not self._wiring.sides_swapped).lower()
         return (
@@ -397,27 +403,27 @@ class Directions:
             f"{crossed}, and wheels.sides_swapped = {sides} as well if the robot turned the other way"
         )
 
-    def _words_of_wiring(self, swapped: bool, signs: Sequence[int]) -> str:
+    def _describe_wiring(self, swapped: bool, signs: Sequence[int]) -> str:
         turned = self._moved(self._turned[-1][0])
         backward = [side for side in (0, 1) if signs[side] < 0]
-        counted = [side for side in backward if not swapped and turned[side] * self._asked[side] < 0.0]
+        counted = [side for side in backward if not swapped and turned[side] * self._commanded[side] < 0.0]
         motors, encoders = list(self._wiring.motor_direction), list(self._wiring.encoder_direction)
         for side in backward:
             encoders[side] = -encoders[side]
             motors[side] = motors[side] if side in counted else -motors[side]
-        changes, said = [], []
+        changes, texts = [], []
         if swapped:
-            said.append("left and right are swapped")
+            texts.append("left and right are swapped")
             changes.append(f"wheels.sides_swapped = {str(not self._wiring.sides_swapped).lower()}")
         for side in backward:
             way = "counted against what was commanded and turned as it should" if side in counted else "turns backward"
-            said.append(f"the {_SIDES[side]} wheel {way}")
+            texts.append(f"the {_SIDES[side]} wheel {way}")
         if motors != list(self._wiring.motor_direction):
             changes.append(f"wheels.motor_direction = {motors}")
         if encoders != list(self._wiring.encoder_direction):
             changes.append(f"wheels.encoder_direction = {encoders}")
         return (
-            f"the robot moved differently from its wheels: {', '.join(said)}; in robot.toml write "
+            f"the robot moved differently from its wheels: {', '.join(texts)}; in robot.toml write "
             f"{' and '.join(changes)}, unless it is the poses' frame that is wrong ([pose])"
         )
 

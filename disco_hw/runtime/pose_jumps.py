@@ -20,8 +20,8 @@ class PoseJumps:
     def __init__(self) -> None:
         self._before: PoseEstimate | None = None
         self._in_a_row = 0
-        self._is_misfit = False
-        self._said: list[str] = []
+        self._is_mismatch = False
+        self._messages: list[str] = []
 
     def step(self, estimate: PoseEstimate, updates: Sequence[PoseUpdate]) -> str:
         """Return in words how the estimate has jumped since the tick before; empty if it followed the wheels."""
@@ -32,25 +32,25 @@ class PoseJumps:
             return ""
         moved_m = math.hypot(estimate.x_m - before.x_m, estimate.y_m - before.y_m)
         if not (before.heading_known and estimate.heading_known):
-            words = f"the pose jumped by {moved_m:.2f} m, and its heading is not known any more"
+            text = f"the pose jumped by {moved_m:.2f} m, and its heading is not known any more"
         else:
             turned_rad = abs(math.remainder(estimate.yaw_rad - before.yaw_rad, math.tau))
-            words = f"the pose jumped by {moved_m:.2f} m and {turned_rad:.2f} rad, which the wheels do not explain"
-        self._said.append(f"{words}: the robot was carried or has slipped, or its poses are wrong")
-        return words
+            text = f"the pose jumped by {moved_m:.2f} m and {turned_rad:.2f} rad, which the wheels do not explain"
+        self._messages.append(f"{text}: the robot was carried or has slipped, or its poses are wrong")
+        return text
 
-    def news(self) -> list[str]:
+    def new_messages(self) -> list[str]:
         """Return sentences for the operator since the last call."""
-        said, self._said = self._said, []
-        return said
+        messages, self._messages = self._messages, []
+        return messages
 
     def _count(self, update: PoseUpdate) -> None:
         if update.reason is PoseReason.GATED and update.innovation is not None:
             self._in_a_row = min(self._in_a_row, 0) - 1
-            if self._in_a_row == -MISFITS and not self._is_misfit:
-                self._is_misfit = True
+            if self._in_a_row == -MISFITS and not self._is_mismatch:
+                self._is_mismatch = True
                 off_m = math.hypot(*update.innovation[:2])
-                self._said.append(f"{MISFITS} in a row do not fit the wheels, {off_m:.2f} m off: not used")
+                self._messages.append(f"{MISFITS} in a row do not fit the wheels, {off_m:.2f} m off: not used")
         elif update.accepted:
             self._in_a_row = max(self._in_a_row, 0) + 1
-            self._is_misfit = self._is_misfit and self._in_a_row < FITS
+            self._is_mismatch = self._is_mismatch and self._in_a_row < FITS

@@ -40,9 +40,9 @@ class PoseTravel:
     def add(self, pose: PoseSample) -> bool:
         """Take in a pose; returns whether it is used."""
         newest_ns = self.newest_ns
-        is_late = newest_ns is not None and pose.t_ns <= newest_ns
+        is_out_of_order = newest_ns is not None and pose.t_ns <= newest_ns
         finite = math.isfinite(pose.x_m) and math.isfinite(pose.y_m) and math.isfinite(pose.yaw_rad)
-        if pose.source != 0 or not pose.has_heading or not finite or is_late:
+        if pose.source != 0 or not pose.has_heading or not finite or is_out_of_order:
             return False
         self._poses.append(pose)
         while pose.t_ns - self._poses[0].t_ns > KEPT_NS:

@@ -12,7 +12,7 @@ from disco_hw.config import Control, Link, Robot
 from disco_hw.fence import Fence
 from disco_hw.tasks import RobotTask
 from drivers.motor import find_driver
-from drivers.types import SAID_BY_WORDS, CyclicFrame, Limits, SafetyCard
+from drivers.types import SOURCE_TEXTS, CyclicFrame, Limits, SafetyCard
 
 _SERIAL_BITS_PER_BYTE = 10
 _SERIAL_OVERHEAD_BYTES = 7
@@ -38,12 +38,12 @@ def serial_load(frames: Iterable[CyclicFrame], baud: int) -> float:
     A frame is tunnelled with 7 bytes of kind, identifier, CRC, stuffing and delimiter, unless it says otherwise; a byte
     is 10 bits on the line.
     """
-    taken: dict[str, float] = {}
+    load: dict[str, float] = {}
     for frame in frames:
         count = frame.length + _SERIAL_OVERHEAD_BYTES if frame.line_bytes is None else frame.line_bytes
         busy_s = count * _SERIAL_BITS_PER_BYTE / baud + frame.pause_s
-        taken[frame.sender] = taken.get(frame.sender, 0.0) + busy_s * frame.rate_hz
-    return max(taken.values(), default=0.0)
+        load[frame.sender] = load.get(frame.sender, 0.0) + busy_s * frame.rate_hz
+    return max(load.values(), default=0.0)
 
 
 _SPEED_RESOLUTION_RAD_S = 0.002
@@ -81,16 +81,16 @@ def check_link_load(link: Link, control: Control) -> Check:
     if link.kind == "can":
         load = can_load(frames, link.bitrate)
         found = f"{load:.1%} of the bus at {link.bitrate / 1e3:g} kbit/s with the most stuff bits"
-        remedy = "raise link.bitrate on both ends, or lower control.rate_hz"
+        hint = "raise link.bitrate on both ends, or lower control.rate_hz"
     else:
         load = serial_load(frames, link.baud)
         shared = any(frame.line_bytes is not None for frame in frames)
         found = f"{load:.1%} of the {'line' if shared else 'busier direction'} at {link.baud} baud"
-        remedy = "raise link.baud on both ends, or lower control.rate_hz"
+        hint = "raise link.baud on both ends, or lower control.rate_hz"
     if load > _LOAD_LIMIT:
-        return Check("link load", Level.FAIL, f"{found} is too much; {remedy}")
+        return Check("link load", Level.FAIL, f"{found} is too much; {hint}")
     if load > _LOAD_BUDGET:
-        return Check("link load", Level.WARNING, f"{found} is above {_LOAD_BUDGET:.0%}; {remedy}")
+        return Check("link load", Level.WARNING, f"{found} is above {_LOAD_BUDGET:.0%}; {hint}")
     return Check("link load", Level.OK, found)
 
 
@@ -104,12 +104,12 @@ def check_firmware_limits(robot: Robot, limits: Limits) -> list[Check]:
         limits.max_wheel_acceleration_rad_s2,
         limits.ticks_per_rev,
     )
-    found = [f"{robot.max_wheel_speed_rad_s:g} rad/s of {speed.value:g}, {SAID_BY_WORDS[speed.said_by]}"]
+    found = [f"{robot.max_wheel_speed_rad_s:g} rad/s of {speed.value:g}, {SOURCE_TEXTS[speed.said_by]}"]
     if acceleration is not None:
-        asked, said = robot.max_wheel_acceleration_rad_s2, SAID_BY_WORDS[acceleration.said_by]
-        found.append(f"{asked:g} rad/s^2 of {acceleration.value:g}, {said}")
+        configured, source = robot.max_wheel_acceleration_rad_s2, SOURCE_TEXTS[acceleration.said_by]
+        found.append(f"{configured:g} rad/s^2 of {acceleration.value:g}, {source}")
     if ticks is not None:
-        found.append(f"{ticks.value:g} ticks a turn, {SAID_BY_WORDS[ticks.said_by]}")
+        found.append(f"{ticks.value:g} ticks a turn, {SOURCE_TEXTS[ticks.said_by]}")
     return [Check("firmware limits", Level.OK, "; ".join(found))]
 
 
@@ -118,7 +118,7 @@ def check_task(robot: Robot, task: RobotTask) -> Check:
     refusal = task.too_fast(robot)
     if refusal is not None:
         return Check("task", Level.FAIL, f"task.speed_m_s: {refusal}")
-    return Check("task", Level.OK, f"{task.in_words()}; the wheels can do {task.fastest_m_s(robot):.2f} m/s on it")
+    return Check("task", Level.OK, f"{task.describe()}; the wheels can do {task.fastest_m_s(robot):.2f} m/s on it")
 
 
 def check_fence(robot: Robot, fence: Fence) -> list[Check]:
@@ -150,10 +150,10 @@ def check_command_timing(control: Control, limits: Limits) -> Check:
 def check_watchdog(limits: Limits) -> Check:
     """Whether how long the controller waits for a command is known of itself, or declared alone."""
     timeout = limits.command_timeout_s
-    said = f"{timeout.value:g} s, {SAID_BY_WORDS[timeout.said_by]}"
+    described = f"{timeout.value:g} s, {SOURCE_TEXTS[timeout.said_by]}"
     if timeout.said_by == "robot.toml":
-        return Check("watchdog", Level.WARNING, f"{said}; it could not be read back")
-    return Check("watchdog", Level.OK, said)
+        return Check("watchdog", Level.WARNING, f"{described}; it could not be read back")
+    return Check("watchdog", Level.OK, described)
 
 
 def check_safety(robot: Robot, card: SafetyCard) -> list[Check]:
@@ -162,8 +162,8 @@ def check_safety(robot: Robot, card: SafetyCard) -> list[Check]:
     driven_m = speed_m_s * card.reaction_s
     if card.brakes:
         braking_m = speed_m_s**2 / (2.0 * robot.max_wheel_acceleration_rad_s2 * robot.wheel_radius_m)
-        stands_s = card.reaction_s + speed_m_s / (robot.max_wheel_acceleration_rad_s2 * robot.wheel_radius_m)
-        far = f"about {driven_m + braking_m:.2f} m and {stands_s:.2f} s at {speed_m_s:.2f} m/s"
+        stop_time_s = card.reaction_s + speed_m_s / (robot.max_wheel_acceleration_rad_s2 * robot.wheel_radius_m)
+        far = f"about {driven_m + braking_m:.2f} m and {stop_time_s:.2f} s at {speed_m_s:.2f} m/s"
     else:
         far = f"{driven_m:.2f} m, {card.reaction_s:.2f} s, at {speed_m_s:.2f} m/s, and then as far as the robot rolls"
     checks = [
@@ -184,13 +184,13 @@ def check_realtime(priority: int, fifo_allowed: bool, memory_lock_allowed: bool,
     elif fifo_allowed:
         checks.append(Check("scheduler", Level.OK, f"SCHED_FIFO {priority} is allowed"))
     else:
-        remedy = "set LimitRTPRIO=99 in the service, or an rtprio line in /etc/security/limits.conf"
-        checks.append(Check("scheduler", Level.WARNING, f"SCHED_FIFO is not allowed; {remedy}"))
+        hint = "set LimitRTPRIO=99 in the service, or an rtprio line in /etc/security/limits.conf"
+        checks.append(Check("scheduler", Level.WARNING, f"SCHED_FIFO is not allowed; {hint}"))
     if memory_lock_allowed:
         checks.append(Check("memory", Level.OK, "may be locked"))
     else:
-        remedy = "set LimitMEMLOCK=infinity in the service, or a memlock line in /etc/security/limits.conf"
-        checks.append(Check("memory", Level.WARNING, f"may not be locked; {remedy}"))
+        hint = "set LimitMEMLOCK=infinity in the service, or a memlock line in /etc/security/limits.conf"
+        checks.append(Check("memory", Level.WARNING, f"may not be locked; {hint}"))
     if cpu_count < 2:
         checks.append(Check("CPUs", Level.WARNING, "one CPU serves the loop and all else; use one with more"))
     return checks
@@ -208,15 +208,15 @@ def check_round_trip(round_trips_s: Sequence[float], period_s: float) -> Check:
     count, worst_s = len(round_trips_s), max(round_trips_s)
     found = f"median {statistics.median(round_trips_s) * 1e3:.2f} ms, worst {worst_s * 1e3:.2f} ms of {count}"
     period = f"a control period of {period_s * 1e3:g} ms"
-    remedy = "look for a USB adapter without low-latency mode, or a loaded bus"
-    late = sum(round_trip_s >= period_s for round_trip_s in round_trips_s)
-    if 4 * late >= count:
-        return Check(name, Level.FAIL, f"{found}; {late} are longer than {period}; {remedy}")
-    if late:
-        text = f"{found}; {late} longer than {period}; see what else runs on this computer, and check again"
+    hint = "look for a USB adapter without low-latency mode, or a loaded bus"
+    too_slow = sum(round_trip_s >= period_s for round_trip_s in round_trips_s)
+    if 4 * too_slow >= count:
+        return Check(name, Level.FAIL, f"{found}; {too_slow} are longer than {period}; {hint}")
+    if too_slow:
+        text = f"{found}; {too_slow} longer than {period}; see what else runs on this computer, and check again"
         return Check(name, Level.WARNING, text)
     if worst_s >= period_s / 2:
-        return Check(name, Level.WARNING, f"{found}; the worst is longer than half of {period}; {remedy}")
+        return Check(name, Level.WARNING, f"{found}; the worst is longer than half of {period}; {hint}")
     return Check(name, Level.OK, found)
 
 
@@ -232,7 +232,7 @@ def check_limits(
     plans wrongly. Equal within the resolution on the wire (0.002 rad/s, 0.01 rad/s^2) is within.
     """
     errors = []
-    asked = (
+    configured = (
         ("max_wheel_speed_rad_s", max_wheel_speed_rad_s, limits.max_wheel_speed_rad_s, _SPEED_RESOLUTION_RAD_S),
         (
             "max_wheel_acceleration_rad_s2",
@@ -241,10 +241,10 @@ def check_limits(
             _ACCELERATION_RESOLUTION_RAD_S2,
         ),
     )
-    for name, wanted, limit, resolution in asked:
-        if limit is not None and not wanted <= limit.value + resolution:
+    for name, value, limit, resolution in configured:
+        if limit is not None and not value <= limit.value + resolution:
             errors.append(
-                f"robot.{name}: {wanted:g} is above the controller's limit, {SAID_BY_WORDS[limit.said_by]}; "
+                f"robot.{name}: {value:g} is above the controller's limit, {SOURCE_TEXTS[limit.said_by]}; "
                 f"write at most {limit.value:g}, or set the controller to more"
             )
     ticks = limits.ticks_per_rev

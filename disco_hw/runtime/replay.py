@@ -32,9 +32,9 @@ from disco_hw.log.records import (
     UnexplainedMotion,
 )
 from disco_hw.runtime import records_of_tick
-from disco_hw.runtime.assembly import make_pipeline, make_planner, put_in_force
+from disco_hw.runtime.assembly import apply_geometry, create_pipeline, create_planner
 from disco_hw.runtime.obstacles import Obstacles
-from disco_hw.runtime.pipeline import FollowTask, Manual, Motion, Off, Pipeline, Silent, Source, Stand
+from disco_hw.runtime.pipeline import FollowTask, Manual, Motion, Off, Pipeline, Silent, Source, StandstillTracker
 from disco_hw.runtime.robot_setup import setup_of_log, task_of
 from disco_hw.runtime.safe_area import fence_of_record, report_of_record
 from drivers.types import PoseSample, Readings, WheelSample
@@ -122,7 +122,7 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
                 f"{path}: its commands are from {first.source!r}, not from a planner or a hand; {_REPLAYED}"
             )
         setup = setup_of_log(log, _REPLAYED)
-        pipeline = make_pipeline(setup.config, setup.model, make_planner(setup.config, setup.model))
+        pipeline = create_pipeline(setup.config, setup.model, create_planner(setup.config, setup.model))
         area = _ReplayedArea(pipeline, setup.config)
         ticks = values = 0
         difference: Difference | None = None
@@ -133,7 +133,7 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
                 line_m = changed.course().outline_m()
                 pipeline.set_task(changed.planned(setup.config.control.mode), line_m)
             for change in (entry.record for entry in recorded if isinstance(entry.record, BeliefChange)):
-                put_in_force(pipeline, setup.model, geometry_of(change))
+                apply_geometry(pipeline, setup.model, geometry_of(change))
             area.take(recorded)
             outcome = _replay_tick(pipeline, recorded, area.begin(recorded[0].now_ns))
             ticks += 1
@@ -169,8 +169,8 @@ class _ReplayedArea:
                 case Obstacle() as reported:
                     self._obstacles.report(reported.t_ns, report_of_record(reported))
                 case Controller() as answers if self._guard is not None:
-                    said = {**answers.told, **answers.fixed, **answers.declared}
-                    stops = said.get("stop_deceleration_rad_s2", self._fastest_rad_s2)
+                    limits = {**answers.told, **answers.fixed, **answers.declared}
+                    stops = limits.get("stop_deceleration_rad_s2", self._fastest_rad_s2)
                     self._guard.set_deceleration(min(stops, self._fastest_rad_s2))
                 case GuardVerdict() as found:
                     self._overridden = found.overridden
@@ -201,7 +201,7 @@ def _motion(command: Command) -> Motion:
         case Source.OFF:
             return Off()
         case Source.HOLD:
-            return Stand()
+            return StandstillTracker()
         case Source.SILENT:
             return Silent()
         case Source.MANUAL:

@@ -56,24 +56,24 @@ def load_setup(robot: Path, model: Path | None = None, link: str | None = None, 
     if config.task.file is None:
         path_file = None
     else:
-        judged, path_file = path_file is None, path_file or robot.parent / config.task.file
-        config = msgspec.structs.replace(config, task=config.task.with_file(path_file, config.robot, judged))
-        if judged:
+        is_checked, path_file = path_file is None, path_file or robot.parent / config.task.file
+        config = msgspec.structs.replace(config, task=config.task.with_file(path_file, config.robot, is_checked))
+        if is_checked:
             refuse_outside_task(robot, config)
     if link is not None:
         config = msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, **link_fields(link)))
     model_file = model
     if model_file is None and config.model.file is not None:
         model_file = robot.parent / config.model.file
-    config = msgspec.structs.replace(config, pose=_with_key_beside(robot, config.pose))
+    config = msgspec.structs.replace(config, pose=_with_key_from_file(robot, config.pose))
     loaded = Model.nominal(config.robot, config.prior) if model_file is None else load_model(model_file)
     return Setup(robot, model_file, path_file, config, loaded)
 
 
-def _with_key_beside(robot: Path, pose: PoseInput) -> PoseInput:
+def _with_key_from_file(robot: Path, pose: PoseInput) -> PoseInput:
     """Return the pose sources with the full paths of their key files, which are written relative to robot.toml."""
     key_file = None if pose.key_file is None else str(robot.parent / pose.key_file)
-    also = tuple(_with_key_beside(robot, one) for one in pose.also)
+    also = tuple(_with_key_from_file(robot, one) for one in pose.also)
     return msgspec.structs.replace(pose, key_file=key_file, also=also)
 
 
@@ -136,7 +136,7 @@ def kept_files(setup: Setup) -> list[Attachment]:
     return [attachment(file, name, kind) for name, kind, file in named if file is not None]
 
 
-def setup_of_log(log: Log, remedy: str) -> Setup:
+def setup_of_log(log: Log, hint: str) -> Setup:
     """Return the robot as it was when a log was recorded, from the copies in it; no other file is read.
 
     The files that the result names are gone. Raises InputError: with `remedy` for a log without a robot.toml or
@@ -144,7 +144,7 @@ def setup_of_log(log: Log, remedy: str) -> Setup:
     """
     names = log.attachment_names()
     if ROBOT_TOML not in names:
-        raise InputError(f"{log.path}: carries no {ROBOT_TOML}; {remedy}")
+        raise InputError(f"{log.path}: carries no {ROBOT_TOML}; {hint}")
     with TemporaryDirectory(prefix="disco-hw-log-") as scratch:
         files = {name: Path(scratch) / name for name in (ROBOT_TOML, MODEL_TOML, PATH_CSV) if name in names}
         for name, file in files.items():
@@ -152,9 +152,9 @@ def setup_of_log(log: Log, remedy: str) -> Setup:
         try:
             config = load_robot_config(files[ROBOT_TOML])
             if config.model.file is not None and MODEL_TOML not in names:
-                raise InputError(f"{log.path}: carries no {MODEL_TOML}, which its {ROBOT_TOML} names; {remedy}")
+                raise InputError(f"{log.path}: carries no {MODEL_TOML}, which its {ROBOT_TOML} names; {hint}")
             if config.task.file is not None and PATH_CSV not in names:
-                raise InputError(f"{log.path}: carries no {PATH_CSV}, which its {ROBOT_TOML} names; {remedy}")
+                raise InputError(f"{log.path}: carries no {PATH_CSV}, which its {ROBOT_TOML} names; {hint}")
             return load_setup(files[ROBOT_TOML], files.get(MODEL_TOML), path_file=files.get(PATH_CSV))
         except InputError as error:
             # Nobody can look into the scratch copies, which are gone by then.
@@ -169,7 +169,7 @@ class TaskRefused(Exception):  # noqa: N818
     """The change is not made; the message says why and what to do."""
 
 
-def changed_task(task: RobotTask, asked: Mapping[str, Any], robot: Robot, state: State) -> RobotTask:
+def changed_task(task: RobotTask, requested: Mapping[str, Any], robot: Robot, state: State) -> RobotTask:
     """Return the task with the fields in `asked`, all of them editable, m and m/s.
 
     Raises TaskRefused while the robot is armed or stopping, for anything that is no number within the limits, and for a
@@ -180,11 +180,11 @@ def changed_task(task: RobotTask, asked: Mapping[str, Any], robot: Robot, state:
     editable = task.editable(robot)
     if not editable:
         raise TaskRefused(task.editing_note(robot))
-    unknown = sorted(set(asked) - set(editable))
-    if unknown or not asked:
+    unknown = sorted(set(requested) - set(editable))
+    if unknown or not requested:
         raise TaskRefused(f"give one or more of {', '.join(editable)}" + (f", not {unknown[0]}" if unknown else ""))
     values = {}
-    for name, value in asked.items():
+    for name, value in requested.items():
         low, high, _ = editable[name]
         # What the wheels can do depends on the other fields too, and is judged below.
         values[name] = _number(name, value, low, _FASTEST_M_S if name == "speed_m_s" else high)
@@ -206,7 +206,7 @@ def limits(robot: Robot, task: RobotTask) -> dict[str, tuple[float, float]]:
     return {name: (field.low, field.high) for name, field in task.editable(robot).items()}
 
 
-def asked_of(task: RobotTask) -> dict[str, Any]:
+def requested_task(task: RobotTask) -> dict[str, Any]:
     """Return the task as in the daemon's status: its fields, and a digest of what is read from a file."""
     fields: dict[str, Any] = msgspec.to_builtins(task)
     read = tuple(fields.pop(name) for name in task.read_fields)
@@ -214,15 +214,15 @@ def asked_of(task: RobotTask) -> dict[str, Any]:
     return {"kind": kind_of(task), **fields, **digest}
 
 
-def task_in_status(asked: Mapping[str, Any], robots: RobotTask) -> RobotTask | None:
-    """Return the task that `asked_of` gave; None for one with other way-points than those in `robots`, robot.toml's."""
-    if "digest" in asked:
-        same = asked_of(robots)
-        if (same["kind"], same.get("digest")) != (asked["kind"], asked["digest"]):
+def task_in_status(requested: Mapping[str, Any], robots: RobotTask) -> RobotTask | None:
+    """Return the task that `requested_task` gave; None if its way-points are not those of `robots`, robot.toml's."""
+    if "digest" in requested:
+        same = requested_task(robots)
+        if (same["kind"], same.get("digest")) != (requested["kind"], requested["digest"]):
             return None
-        return with_values(robots, {name: value for name, value in asked.items() if isinstance(value, float)})
+        return with_values(robots, {name: value for name, value in requested.items() if isinstance(value, float)})
     try:
-        return task_from(asked)
+        return task_from(requested)
     except (ValueError, msgspec.ValidationError):
         return None
 

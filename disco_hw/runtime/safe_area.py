@@ -11,7 +11,7 @@ from disco_hw.fence import Fence, Footprint, fence_fault
 from disco_hw.fence.clearance import Boundaries
 from disco_hw.log import records
 from disco_hw.runtime import State
-from disco_hw.runtime.fence_guard import HOLDS_STILL, IDLE, FenceGuard, FenceState, FenceVerdict
+from disco_hw.runtime.fence_guard import IDLE, STOPS_MOTION, FenceGuard, FenceState, FenceVerdict
 from disco_hw.runtime.obstacles import ENTERED_AGE_LIMIT_S, ObstacleRefused, ObstacleReport, Obstacles, report_from
 
 OVERRIDE_NS = 60_000_000_000
@@ -35,7 +35,7 @@ class SafeArea:
         self._override_until_ns: int | None = None
         self._pending: list[records.Record] = []
         self._events: list[str] = []
-        self._said = FenceVerdict.IDLE
+        self._last_verdict = FenceVerdict.IDLE
         self._ticks = 0
         self.last: FenceState = IDLE
 
@@ -52,12 +52,12 @@ class SafeArea:
         """Take in what the guard found; returns what to say and what to record of this tick."""
         self.last = found
         verdict = found.verdict
-        if verdict is not self._said:
-            if verdict in HOLDS_STILL:
+        if verdict is not self._last_verdict:
+            if verdict in STOPS_MOTION:
                 self._events.append(f"fence: stopped: {found.reason}")
-            elif self._said in HOLDS_STILL and verdict is not FenceVerdict.IDLE:
+            elif self._last_verdict in STOPS_MOTION and verdict is not FenceVerdict.IDLE:
                 self._events.append("fence: motion is allowed again")
-        changed, self._said = verdict is not self._said, verdict
+        changed, self._last_verdict = verdict is not self._last_verdict, verdict
         events, self._events = tuple(self._events), []
         written, self._pending = self._pending, []
         if verdict is not FenceVerdict.IDLE:
@@ -85,7 +85,7 @@ class SafeArea:
     @property
     def task_fault(self) -> str:
         """Reason why no task may go on, in words; empty if nothing of the fence speaks against it."""
-        return f"fence: {self.last.reason}" if self.last.verdict in HOLDS_STILL else ""
+        return f"fence: {self.last.reason}" if self.last.verdict in STOPS_MOTION else ""
 
     def override(self, now_ns: int, on: bool) -> str:
         """Let a person drive in spite of the fence for a minute, or end that; returns the answer in words."""
@@ -94,18 +94,18 @@ class SafeArea:
             self._events.append("fence: the manual override was taken back; the fence holds again")
             return "the fence holds again"
         self._override_until_ns = now_ns + OVERRIDE_NS
-        words = f"manual driving in spite of the fence for {OVERRIDE_NS // 1_000_000_000} s"
-        self._events.append(f"fence: OVERRIDDEN by request: {words}")
-        return words
+        text = f"manual driving in spite of the fence for {OVERRIDE_NS // 1_000_000_000} s"
+        self._events.append(f"fence: OVERRIDDEN by request: {text}")
+        return text
 
     def report(self, now_ns: int, report: ObstacleReport) -> None:
         """Take in one obstacle. Raises ObstacleRefused."""
         self.obstacles.report(now_ns, report)
         self._pending.append(records.Obstacle(now_ns, *msgspec.structs.astuple(report)))
 
-    def ask(self, now_ns: int, asked: Mapping[str, Any]) -> str:
+    def handle_request(self, now_ns: int, requested: Mapping[str, Any]) -> str:
         """Add or remove the obstacle that a person names; returns the answer in words. Raises ObstacleRefused."""
-        fields = dict(asked)
+        fields = dict(requested)
         match fields.pop("change", None):
             case "add":
                 report = report_from(fields, ENTERED_AGE_LIMIT_S)
@@ -118,7 +118,7 @@ class SafeArea:
                 return f"obstacle {name}: removed"
         raise ObstacleRefused("obstacle: say add or remove; write obstacle remove name=pillar, for example")
 
-    def change_fence(self, now_ns: int, asked: Mapping[str, Any], state: State) -> str:
+    def change_fence(self, now_ns: int, requested: Mapping[str, Any], state: State) -> str:
         """Put another fence in force, with the fields of [fence] in `asked`; returns the answer in words.
 
         Raises FenceRefused while the robot is armed or stopping, and for a fence that is none.
@@ -126,12 +126,12 @@ class SafeArea:
         if state in _LOCKED:
             raise FenceRefused(f"the fence can be changed while the robot is disarmed, and it is {state.name}")
         try:
-            fence = msgspec.convert({**msgspec.to_builtins(self.fence), **asked}, Fence)
+            fence = msgspec.convert({**msgspec.to_builtins(self.fence), **requested}, Fence)
         except msgspec.ValidationError as error:
             raise FenceRefused(f"fence: {str(error).replace('`', '')}; correct the value") from None
         fault = fence_fault(fence, self.footprint)
         if fault is not None:
-            raise FenceRefused(f"fence.{fault.field}: {fault.fault}; {fault.remedy}")
+            raise FenceRefused(f"fence.{fault.field}: {fault.fault}; {fault.hint}")
         self.fence = fence
         self.guard.set_boundaries(Boundaries(self.footprint, fence), fence.margin_m)
         self._pending.append(record_of_fence(now_ns, fence))

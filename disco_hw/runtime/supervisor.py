@@ -28,14 +28,14 @@ _ROBOT_FAULT = Condition.ROBOT_FAULT.value
 _ROBOT_ESTOP = Condition.ROBOT_ESTOP.value
 _TELEMETRY_FRESH = Condition.TELEMETRY_FRESH.value
 _TELEMETRY_LOST = Condition.TELEMETRY_LOST.value
-_WHEELS_STILL = Condition.WHEELS_STILL.value
+_WHEELS_STATIONARY = Condition.WHEELS_STATIONARY.value
 _ARM_PENDING = Condition.ARM_PENDING.value
-_DISARM_ASKED = Condition.DISARM_ASKED.value
-_ESTOP_ASKED = Condition.ESTOP_ASKED.value
+_DISARM_REQUESTED = Condition.DISARM_REQUESTED.value
+_ESTOP_REQUESTED = Condition.ESTOP_REQUESTED.value
 _RESET_PENDING = Condition.RESET_PENDING.value
 _PREFLIGHT_ERROR = Condition.PREFLIGHT_ERROR.value
 _DAEMON_ERROR = Condition.DAEMON_ERROR.value
-_ROBOT_TROUBLE = _ROBOT_ESTOP | _ROBOT_FAULT | _ROBOT_REFUSED
+_ROBOT_HAS_FAULT = _ROBOT_ESTOP | _ROBOT_FAULT | _ROBOT_REFUSED
 _MOVABLE = _TELEMETRY_FRESH | _ROBOT_ARMED
 _PROBLEM = PROBLEM.value
 
@@ -150,9 +150,9 @@ class Supervisor:
         self._start_pending = False
         self._arming: _Pending | None = None
         self._resetting: _Pending | None = None
-        self._estop_asked = False
-        self._disarm_asked = False
-        self._trouble = ""
+        self._estop_requested = False
+        self._disarm_requested = False
+        self._fault_reason = ""
         self._stop_reason = ""
         self._events: list[str] = []
 
@@ -164,35 +164,35 @@ class Supervisor:
     def step(self, now_ns: int, inputs: Inputs) -> Output:
         """Take in one tick's inputs, make at most one transition, and return what holds until the next step."""
         self._events = []
-        self._disarm_asked = False
+        self._disarm_requested = False
         seen = self._observe(inputs)
         estop_now = UserRequest.ESTOP in inputs.requests
-        replies = tuple(self._answer(now_ns, request, estop_now, inputs, seen) for request in inputs.requests)
+        replies = tuple(self._reply_to(now_ns, request, estop_now, inputs, seen) for request in inputs.requests)
         self._drop_what_failed(now_ns, inputs, seen)
         before = self._state
-        row = next_transition(before, seen | self._asked())
+        row = next_transition(before, seen | self._requested_conditions())
         if row is not None:
             self._enter(row, inputs)
-        if self._state is State.FAULT and _PROBLEM & (seen | self._asked()):
-            self._trouble = self._words(inputs)
+        if self._state is State.FAULT and _PROBLEM & (seen | self._requested_conditions()):
+            self._fault_reason = self._fault_text(inputs)
         if row is not None:
-            words = f"{row.reason}: {self._trouble}" if row.target is State.FAULT else _reason(row, inputs)
-            self._events.append(f"{before.value} -> {row.target.value}: {words}")
-        self._mind_task(inputs)
+            text = f"{row.reason}: {self._fault_reason}" if row.target is State.FAULT else _reason(row, inputs)
+            self._events.append(f"{before.value} -> {row.target.value}: {text}")
+        self._monitor_task(inputs)
         return self._output(inputs, seen, replies)
 
     def _observe(self, inputs: Inputs) -> int:
         """Return the conditions that the inputs alone decide."""
         age_s = inputs.telemetry_age_s
         link_up = inputs.link_state is LinkState.UP
-        seen = _SAID_BY[inputs.driver_state] | _union(
+        seen = _CONDITIONS[inputs.driver_state] | _union(
             (
                 (_LINK_UP, link_up),
                 (_LINK_RENEWED, link_up and inputs.link_generation != self._generation),
                 # Written so that an age or a speed that is not a number counts as no telemetry and as moving.
                 (_TELEMETRY_FRESH, age_s is not None and age_s <= self._settings.telemetry_zero_s),
                 (_TELEMETRY_LOST, age_s is None or not age_s <= self._settings.telemetry_disarm_s),
-                (_WHEELS_STILL, inputs.wheel_speed_rad_s < self._settings.still_rad_s),
+                (_WHEELS_STATIONARY, inputs.wheel_speed_rad_s < self._settings.still_rad_s),
                 (_PREFLIGHT_ERROR, bool(inputs.preflight_errors)),
                 (_DAEMON_ERROR, inputs.daemon_error is not None),
             )
@@ -201,28 +201,28 @@ class Supervisor:
             self._generation = inputs.link_generation
         return seen
 
-    def _asked(self) -> int:
+    def _requested_conditions(self) -> int:
         """Return the conditions that requests have set."""
         return _union(
             (
                 (_ARM_PENDING, self._arming is not None),
-                (_DISARM_ASKED, self._disarm_asked),
-                (_ESTOP_ASKED, self._estop_asked),
+                (_DISARM_REQUESTED, self._disarm_requested),
+                (_ESTOP_REQUESTED, self._estop_requested),
                 (_RESET_PENDING, self._resetting is not None),
             )
         )
 
-    def _answer(self, now_ns: int, request: UserRequest, estop_now: bool, inputs: Inputs, seen: int) -> Reply:
+    def _reply_to(self, now_ns: int, request: UserRequest, estop_now: bool, inputs: Inputs, seen: int) -> Reply:
         """Take up or refuse one request, in words; an e-stop beats all that could lead to motion in the same tick."""
         refusal: str | None = None
         text = ""
         match request:
             case UserRequest.ESTOP:
-                self._estop_asked, self._resetting = True, None
+                self._estop_requested, self._resetting = True, None
                 self._drop_pending("e-stop")
                 text = "e-stop" if seen & _LINK_UP else "e-stop requested; it is sent as soon as the link is up"
             case UserRequest.DISARM:
-                self._disarm_asked = True
+                self._disarm_requested = True
                 self._drop_pending("disarm")
                 text = "disarming" if self._state is State.ARMED else "not armed"
             case UserRequest.STOP:
@@ -243,7 +243,7 @@ class Supervisor:
             case UserRequest.RESET:
                 refusal = "an e-stop was requested at the same time" if estop_now else self._why_not_reset(inputs, seen)
                 if refusal is None:
-                    self._estop_asked, self._resetting = False, self._resetting or _Pending(now_ns)
+                    self._estop_requested, self._resetting = False, self._resetting or _Pending(now_ns)
                 text = "resetting"
         return Reply(request, refusal is None, text if refusal is None else refusal)
 
@@ -253,16 +253,16 @@ class Supervisor:
                 return None
             case State.READY if not seen & _TELEMETRY_FRESH:
                 return "no fresh wheel samples"
-            case State.READY if not seen & _WHEELS_STILL:
+            case State.READY if not seen & _WHEELS_STATIONARY:
                 return "the wheels are turning; wait until they stand still"
             case State.READY:
                 return None
             case State.STOPPING:
                 return "still stopping; ask again when ready"
             case State.FAULT:
-                return self._trouble_and_remedy("correct the fault, then reset")
+                return self._fault_and_hint("correct the fault, then reset")
             case State.DISCONNECTED | State.HANDSHAKE:
-                return f"not connected to the robot: {self._words(inputs)}"
+                return f"not connected to the robot: {self._fault_text(inputs)}"
 
     def _why_not_start(self, inputs: Inputs, seen: int) -> str | None:
         if self._state is not State.ARMED and self._arming is None:
@@ -292,7 +292,7 @@ class Supervisor:
             return f"the daemon failed ({inputs.daemon_error}); restart it"
         if inputs.preflight_errors:
             return f"{inputs.preflight_errors[0]}; correct it and restart the daemon"
-        if self._estop_asked and not seen & _ROBOT_ESTOP:
+        if self._estop_requested and not seen & _ROBOT_ESTOP:
             return "the robot has not confirmed the e-stop yet"
         return None
 
@@ -327,7 +327,7 @@ class Supervisor:
             self._running = False
         self._resetting = None
 
-    def _mind_task(self, inputs: Inputs) -> None:
+    def _monitor_task(self, inputs: Inputs) -> None:
         """Start the task once armed, and stop it without a pose and at its end."""
         if self._state is not State.ARMED:
             return
@@ -350,25 +350,25 @@ class Supervisor:
             self._running = False
             self._events.append("task stopped: the path's end is reached")
 
-    def _trouble_and_remedy(self, remedy: str) -> str:
+    def _fault_and_hint(self, hint: str) -> str:
         """Return the trouble with its own remedy if it names one, else with this one.
 
         This host's reset always comes last.
         """
-        if self._trouble.endswith(THEN_RESET):
-            return self._trouble
-        if self._trouble.endswith((BY_ITSELF, THEN_RESTART)):
-            return f"{self._trouble}, {THEN_RESET}"
-        return f"{self._trouble}; {remedy}"
+        if self._fault_reason.endswith(THEN_RESET):
+            return self._fault_reason
+        if self._fault_reason.endswith((BY_ITSELF, THEN_RESTART)):
+            return f"{self._fault_reason}, {THEN_RESET}"
+        return f"{self._fault_reason}; {hint}"
 
-    def _words(self, inputs: Inputs) -> str:
+    def _fault_text(self, inputs: Inputs) -> str:
         """Return what a person should know of the present state."""
         if inputs.daemon_error is not None:
             return inputs.daemon_error
         if inputs.link_state is LinkState.UP and self._state is State.FAULT:
             if inputs.preflight_errors:
                 return "; ".join(inputs.preflight_errors)
-            if self._estop_asked:
+            if self._estop_requested:
                 return "e-stop requested here"
         age_s = inputs.telemetry_age_s
         silent = age_s is None or not age_s <= self._settings.telemetry_disarm_s
@@ -394,9 +394,9 @@ class Supervisor:
             case State.STOPPING:
                 return f"{self._stop_reason}; waiting until the robot is disarmed and its wheels are still"
             case State.FAULT:
-                return self._trouble_and_remedy("correct it, then reset")
+                return self._fault_and_hint("correct it, then reset")
             case State.DISCONNECTED | State.HANDSHAKE:
-                return self._words(inputs)
+                return self._fault_text(inputs)
 
     def _output(self, inputs: Inputs, seen: int, replies: tuple[Reply, ...]) -> Output:
         armed = self._state is State.ARMED
@@ -412,8 +412,8 @@ class Supervisor:
             motion_allowed=motion_allowed,
             zero_only=(armed and not motion_allowed) or braking,
             running=self._running,
-            send_estop=self._estop_asked and seen & (_LINK_UP | _ROBOT_ESTOP) == _LINK_UP,
-            estop=self._estop_asked or bool(seen & _ROBOT_ESTOP),
+            send_estop=self._estop_requested and seen & (_LINK_UP | _ROBOT_ESTOP) == _LINK_UP,
+            estop=self._estop_requested or bool(seen & _ROBOT_ESTOP),
             events=tuple(self._events),
             replies=replies,
         )
@@ -423,9 +423,9 @@ class Supervisor:
         if self._state is State.ARMED:
             return None
         if self._state is State.READY:
-            return _once(self._arming, Request.ARM) if self._arming is not None else Request.READY
-        if self._state is State.FAULT and self._resetting is not None and seen & _ROBOT_TROUBLE:
-            return _once(self._resetting, Request.RESET)
+            return _first_request(self._arming, Request.ARM) if self._arming is not None else Request.READY
+        if self._state is State.FAULT and self._resetting is not None and seen & _ROBOT_HAS_FAULT:
+            return _first_request(self._resetting, Request.RESET)
         return Request.STANDBY
 
 
@@ -434,7 +434,7 @@ def _reason(row: Transition, inputs: Inputs) -> str:
     return f"{row.reason}: {inputs.driver_detail}" if Condition.ROBOT_ARMED in row.blocked_by else row.reason
 
 
-def _once(pending: _Pending, request: Request) -> Request | None:
+def _first_request(pending: _Pending, request: Request) -> Request | None:
     """Return the request the first time, None from then on."""
     if pending.sent:
         return None
@@ -446,7 +446,7 @@ def _union(flags: Iterable[tuple[int, bool]]) -> int:
     return sum([flag for flag, holds in flags if holds])
 
 
-def _said_by(robot: DriverState) -> int:
+def _condition_of(robot: DriverState) -> int:
     """Return the conditions that the driver's state alone decides."""
     return _union(
         (
@@ -461,4 +461,4 @@ def _said_by(robot: DriverState) -> int:
     )
 
 
-_SAID_BY = {robot: _said_by(robot) for robot in DriverState}
+_CONDITIONS = {robot: _condition_of(robot) for robot in DriverState}

@@ -24,7 +24,7 @@ from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.runtime.pose_travel import KEPT_NS, PoseTravel
 from drivers.types import PoseSample, WheelCommand, WheelSample
 
-LATE_NS = 600_000_000
+DELAY_NS = 600_000_000
 """Delay and lag of a wheel together: what was commanded so long ago may still be on its way."""
 EXPECTED_PART = 0.5
 """A wheel that turns by this part of what it is expected to follows; drift of the CUSUM between sound and standing."""
@@ -88,12 +88,12 @@ class WheelFault:
     side: str
 
     @property
-    def words(self) -> str:
+    def status_text(self) -> str:
         """For a person, with what to look at."""
         return self.cause.value.format(side=self.side)
 
 
-class _Asked(NamedTuple):
+class _Commanded(NamedTuple):
     """A command of one wheel (rad/s): the slowest it may mean, as it stands and smoothed, and the fastest.
 
     Smoothed, as a wheel's angle is the integral of its commands: what a planner adds and takes away again is no loss.
@@ -106,13 +106,13 @@ class _Asked(NamedTuple):
     widened: float = 0.0
 
 
-def _asked(speed: float, other: float, turn_part: float, before: _Asked, elapsed_s: float) -> _Asked:
+def _commanded(speed: float, other: float, turn_part: float, before: _Commanded, elapsed_s: float) -> _Commanded:
     """Return the command of one wheel given the other's; wheels may differ by up to `turn_part` of it."""
     mean = 0.5 * (speed + other)
     turned = mean + turn_part * (speed - mean)
     slowest = min((speed, turned), key=abs) if turned * speed > 0.0 else 0.0
     smoothed = before.smoothed + (slowest - before.smoothed) * -math.expm1(-elapsed_s / _SMOOTH_S)
-    return _Asked(slowest, smoothed, max(abs(speed), abs(turned)), abs(speed - slowest))
+    return _Commanded(slowest, smoothed, max(abs(speed), abs(turned)), abs(speed - slowest))
 
 
 @dataclass(slots=True)
@@ -132,14 +132,14 @@ class _Wheel:
     counted_rad: float = 0.0
     followed_rad: float = 0.0
     direction: float = 1.0
-    is_told: bool = False
+    is_reported: bool = False
 
     def rest(self) -> None:
         """Clear what is expected of the wheel, because nothing is commanded."""
         self.missing_rad = self.beyond_rad = self.expected_rad = self.counted_rad = 0.0
-        self.loss_rad_s, self.is_told = UNKNOWN_LOSS_RAD_S, False
+        self.loss_rad_s, self.is_reported = UNKNOWN_LOSS_RAD_S, False
 
-    def step(self, t_ns: int, dt_s: float, turned_rad: float, commands: Sequence[_Asked]) -> None:
+    def step(self, t_ns: int, dt_s: float, turned_rad: float, commands: Sequence[_Commanded]) -> None:
         """Take in by how much it was counted, and the commands that may be in force meanwhile."""
         newest = commands[-1].slowest
         smoothed = [each.smoothed for each in commands]
@@ -161,7 +161,7 @@ class _Wheel:
         if self.missing_rad <= 0.0:
             self.missing_rad, self.since_ns = 0.0, t_ns
             self.expected_rad = self.counted_rad = 0.0
-            self.is_told = False
+            self.is_reported = False
             self.followed_rad += max(progress, 0.0) if is_one_way else 0.0
         else:
             self.expected_rad += expected
@@ -227,7 +227,7 @@ class WheelFaults:
         self._longest_ns = SHORTEST_NS if stops_by_own_ramp else LONGEST_NS
         self._wheels = (_Wheel(), _Wheel())
         self._travel = PoseTravel()
-        self._commands: deque[tuple[int, tuple[_Asked, _Asked]]] = deque()
+        self._commands: deque[tuple[int, tuple[_Commanded, _Commanded]]] = deque()
         self._counted: deque[tuple[int, float, float]] = deque()
         self.not_following = 0
         self.events: tuple[str, ...] = ()
@@ -251,13 +251,13 @@ class WheelFaults:
                 wheel.rest()
             return
         left, right = command.left_rad_s, command.right_rad_s
-        before_ns, before = self._commands[-1] if self._commands else (now_ns, (_Asked(), _Asked()))
+        before_ns, before = self._commands[-1] if self._commands else (now_ns, (_Commanded(), _Commanded()))
         elapsed_s = max(now_ns - before_ns, 0) * 1e-9
-        asked = (
-            _asked(left, right, self._turn_part, before[0], elapsed_s),
-            _asked(right, left, self._turn_part, before[1], elapsed_s),
+        commanded = (
+            _commanded(left, right, self._turn_part, before[0], elapsed_s),
+            _commanded(right, left, self._turn_part, before[1], elapsed_s),
         )
-        self._commands.append((now_ns, asked))
+        self._commands.append((now_ns, commanded))
 
     def step(
         self, now_ns: int, wheels: Sequence[WheelSample], poses: Sequence[PoseSample], geometry: OdometryParameters,
@@ -270,10 +270,10 @@ class WheelFaults:
         has_new_pose = sum(self._travel.add(pose) for pose in poses) > 0
         events: list[str] = []
         for sample in wheels:
-            self._take(sample)
+            self._handle(sample)
             events += self._begun()
         self.events = tuple(events)
-        if not self._commands or now_ns - self._commands[0][0] < LATE_NS // 2:
+        if not self._commands or now_ns - self._commands[0][0] < DELAY_NS // 2:
             return None
         return (
             self._runaway(geometry)
@@ -281,33 +281,33 @@ class WheelFaults:
             or (self._unseen(geometry) if has_new_pose else None)
         )
 
-    def _take(self, sample: WheelSample) -> None:
+    def _handle(self, sample: WheelSample) -> None:
         counted = self._counted
         dt_s = max(sample.t_ns - counted[-1][0], 0) * 1e-9 if counted else 0.0
         counted.append((sample.t_ns, sample.left_angle_rad, sample.right_angle_rad))
         while sample.t_ns - counted[0][0] > KEPT_NS:
             counted.popleft()
         sent = self._commands
-        while len(sent) > 1 and sample.t_ns - sent[1][0] > LATE_NS:
+        while len(sent) > 1 and sample.t_ns - sent[1][0] > DELAY_NS:
             sent.popleft()
         for side, angle in enumerate((sample.left_angle_rad, sample.right_angle_rad)):
             wheel = self._wheels[side]
             turned, wheel.angle_rad = angle - wheel.angle_rad, angle
             if sent and math.isfinite(turned):
-                wheel.step(sample.t_ns, dt_s, turned, [asked[side] for _, asked in sent])
+                wheel.step(sample.t_ns, dt_s, turned, [commanded[side] for _, commanded in sent])
 
     def _begun(self) -> list[str]:
         """Words for each wheel that begins not to follow."""
-        said = []
+        messages = []
         for wheel, name in zip(self._wheels, _SIDES, strict=True):
-            if wheel.is_suspect and not wheel.is_told:
-                wheel.is_told = True
+            if wheel.is_suspect and not wheel.is_reported:
+                wheel.is_reported = True
                 self.not_following += 1
-                asked = self._commands[-1][1][_SIDES.index(name)].slowest
-                said.append(
-                    f"the {name} wheel does not follow: {wheel.speed_rad_s:.1f} rad/s, commanded {asked:.1f} rad/s"
+                commanded = self._commands[-1][1][_SIDES.index(name)].slowest
+                messages.append(
+                    f"the {name} wheel does not follow: {wheel.speed_rad_s:.1f} rad/s, commanded {commanded:.1f} rad/s"
                 )
-        return said
+        return messages
 
     def _runaway(self, geometry: OdometryParameters) -> WheelFault | None:
         found = [side for side in (0, 1) if self._wheels[side].beyond_rad > BEYOND_RAD]
@@ -376,12 +376,12 @@ class WheelFaults:
         if seen is None or counted is None:
             return None
         (side,) = quiet
-        asked = newest[side].slowest
-        speed = math.copysign(1.0, asked) * seen[side]
+        commanded = newest[side].slowest
+        speed = math.copysign(1.0, commanded) * seen[side]
         std = math.hypot(seen.std_rad_s, SLIP_PART * max(map(abs, seen[:2])))
         counts = abs(counted[side]) > COUNTED_PART * speed
         agrees = abs(seen[1 - side] - counted[1 - side]) < DECIDED * std + 0.2 * abs(speed)
-        if counts or not agrees or speed < max(SEEN * std, 0.5 * abs(asked)):
+        if counts or not agrees or speed < max(SEEN * std, 0.5 * abs(commanded)):
             return None
         return WheelFault(Cause.ENCODER_SILENT, _SIDES[side])
 

@@ -86,7 +86,7 @@ class TaskFault(NamedTuple):
 
     field: str
     fault: str
-    remedy: str
+    hint: str
 
 
 class Course(Protocol):
@@ -130,7 +130,7 @@ class Progress(Protocol):
     def finished(self) -> bool:
         """Whether there is nothing left to drive."""
 
-    def in_words(self) -> tuple[str, str]:
+    def describe(self) -> tuple[str, str]:
         """Return the name of what is counted, and how much of it there is, as text."""
 
     def add(self, now_ns: int, x_m: float, y_m: float, yaw_rad: float) -> None:
@@ -192,7 +192,7 @@ class RobotTask(Protocol):
     def file(self) -> str | None:
         """The file that [task] names, relative to robot.toml."""
 
-    def with_file(self, file: Path, robot: Chassis, judged: bool) -> Self:
+    def with_file(self, file: Path, robot: Chassis, is_checked: bool) -> Self:
         """Return the task with its file's contents; unless it was driven before, impossible ones are refused.
 
         Raises InputError naming file, line and remedy.
@@ -213,7 +213,7 @@ class RobotTask(Protocol):
     def editing_note(self, robot: Chassis) -> str:
         """Return the text that the page shows below the editable fields, which also says why there are none."""
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """Return the task as text."""
 
     def course(self) -> Course:

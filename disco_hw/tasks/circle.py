@@ -63,7 +63,7 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         """Always None, because a circle is described by its fields alone."""
         return None
 
-    def with_file(self, _file: Path, _robot: Chassis, _judged: bool) -> Self:
+    def with_file(self, _file: Path, _robot: Chassis, _is_checked: bool) -> Self:
         """Return the task unchanged, because it has no file."""
         return self
 
@@ -108,7 +108,7 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         low, high = RADIUS_M
         return f"Radius {low:g} to {high:g} m; at {self.radius_m:g} m at most {self.fastest_m_s(robot):.3f} m/s."
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """Size, place and speed."""
         centre = f"({self.center_x_m:g}, {self.center_y_m:g}) m"
         return f"circle of {self.radius_m:g} m about {centre} at {self.speed_m_s:g} m/s"
@@ -200,7 +200,7 @@ class LapCounter:
         """Always False, because a circle has no end."""
         return False
 
-    def in_words(self) -> tuple[str, str]:
+    def describe(self) -> tuple[str, str]:
         """Return the word "laps" and their number as text."""
         return "laps", f"{self.laps:.2f}"
 
@@ -278,7 +278,7 @@ class CircleTerms(NamedTuple):
     radius_m: float
     speed_m_s: float
     progress_weight: float
-    wanted: float
+    desired: float
     per_rad: float
     closest: float
     terminal_steps: float
@@ -317,12 +317,12 @@ class CircleTerms(NamedTuple):
 
     def terminal(self, memory: float, x: float, y: float, cos_yaw: float, sin_yaw: float, found: Found) -> float:
         """Return the progress missing at the end, and the distance to the edge and the heading that are left."""
-        lost = self.progress_weight * max(self.wanted - memory * self.per_rad, _ZERO)
+        shortfall = self.progress_weight * max(self.desired - memory * self.per_rad, _ZERO)
         rho, inverse = norm_and_inverse(x, y)
         along, inwards = (x * sin_yaw - y * cos_yaw) * inverse, -(x * cos_yaw + y * sin_yaw) * inverse
         turn = abs(inwards * self.turned_cos - along * self.turned_sin)
         turn = turn if along * self.turned_cos + inwards * self.turned_sin > _ZERO else _TWO - turn
-        return lost + self.terminal_steps * norm(rho - self.radius_m, self.terminal_turn_m * turn)
+        return shortfall + self.terminal_steps * norm(rho - self.radius_m, self.terminal_turn_m * turn)
 
 
 def inwards_sine(radius_m: float, x_icr_m: float) -> float:

@@ -47,7 +47,7 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         """Always None, because a lemniscate is described by its fields alone."""
         return None
 
-    def with_file(self, _file: Path, _robot: Chassis, _judged: bool) -> Self:
+    def with_file(self, _file: Path, _robot: Chassis, _is_checked: bool) -> Self:
         """Return the task unchanged, because it has no file."""
         return self
 
@@ -91,7 +91,7 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         """Return a sentence with the largest speed on the present size."""
         return f"At a size of {self.size_m:g} m at most {self.fastest_m_s(robot):.3f} m/s."
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """Size, place and speed."""
         centre = f"({self.center_x_m:g}, {self.center_y_m:g}) m"
         return f"lemniscate of {self.size_m:g} m about {centre} at {self.speed_m_s:g} m/s"

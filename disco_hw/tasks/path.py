@@ -48,7 +48,7 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         """Path of the CSV file with the way-points."""
         return self.path
 
-    def with_file(self, file: Path, _robot: Chassis, judged: bool) -> Self:
+    def with_file(self, file: Path, _robot: Chassis, is_checked: bool) -> Self:
         """Return the task with the way-points of a CSV.
 
         Raises InputError as `load_waypoints`, and for times, for too many way-points, for a path that is too short or
@@ -61,7 +61,7 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
                 'time with kind = "timed_path" in [task]'
             )
         check_size(file, found)
-        if judged:
+        if is_checked:
             # Loaded where it is needed alone: half of the daemon's commands need no path.
             from disco_hw.tasks.line.course import refuse_hairpins  # noqa: PLC0415
 
@@ -88,7 +88,7 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         """Return a sentence with the largest speed on this path."""
         return f"At most {self.fastest_m_s(robot):.3f} m/s."
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """File, length and speed."""
         return f"path {self.path} of {self.course().length_m:.2f} m at {self.speed_m_s:g} m/s"
 

@@ -20,8 +20,8 @@ from disco_hw.tasks.line.cost import AGAINST_M
 from disco_hw.tasks.line.course import (
     END_M,
     LineCourse,
+    describe_part,
     line_course,
-    part_in_words,
     straight_fastest_m_s,
     straight_too_fast,
 )
@@ -61,7 +61,7 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         """Path of the CSV file with the timed way-points."""
         return self.path
 
-    def with_file(self, file: Path, robot: Chassis, _judged: bool) -> Self:
+    def with_file(self, file: Path, robot: Chassis, _is_checked: bool) -> Self:
         """Return the task with the way-points and times of a CSV.
 
         Raises InputError as `load_waypoints`, and for missing times, for a first time before the start, for too many
@@ -81,9 +81,9 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
             )
         check_size(file, found)
         way_m = np.hypot(*np.diff(found.places_m, axis=0).T)
-        late = way_m > fastest_m_s * np.diff(times)
-        if late.any():
-            at = int(np.argmax(late)) + 1
+        too_fast = way_m > fastest_m_s * np.diff(times)
+        if too_fast.any():
+            at = int(np.argmax(too_fast)) + 1
             soonest_s = math.ceil(1e3 * (times[at - 1] + way_m[at - 1] / fastest_m_s)) / 1e3
             raise InputError(
                 f"{file}: line {found.lines[at]}: t_s: {way_m[at - 1]:g} m from line {found.lines[at - 1]} in "
@@ -112,7 +112,7 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         """Return a sentence on why nothing can be changed."""
         return "Its way-points have times, which say all; change t_s in their CSV and start anew."
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """File, length, time and the largest speed."""
         length_m = self.course().length_m
         return f"path {self.path} of {length_m:.2f} m in {self.times_s[-1]:g} s, at most {self.speed_m_s:.3g} m/s"
@@ -153,9 +153,9 @@ class TimedProgress:
         """Whether the last time is over and the robot is at the last way-point."""
         return self._begun_ns is not None and self._elapsed_s >= self._times_s[-1] and self._off_m <= END_M
 
-    def in_words(self) -> tuple[str, str]:
+    def describe(self) -> tuple[str, str]:
         """Metres that are due, and the part of the whole."""
-        return part_in_words(self.laps, self._length_m)
+        return describe_part(self.laps, self._length_m)
 
     def add(self, now_ns: int, x_m: float, y_m: float, _yaw_rad: float) -> None:
         """Take in the pose of one tick; the first one after a pause is the start, from which the times count."""

@@ -34,7 +34,7 @@ class PageProcess:
         # The same token again, so that an open page connects to the next process.
         self._environment = {**os.environ, TOKEN_VARIABLE: _token_or_given()}
         self._lock = threading.Lock()
-        self._news: list[str] = []
+        self._messages: list[str] = []
         self._ending = threading.Event()
         self._process = self._start()
         self._thread = threading.Thread(target=self._watch, name="page watch", daemon=True)
@@ -57,11 +57,11 @@ class PageProcess:
             raise TimeoutError(f"the page still runs after {timeout_s:g} s")
         return self._process.returncode
 
-    def news(self) -> tuple[str, ...]:
+    def new_messages(self) -> tuple[str, ...]:
         """Return messages about the page's process since the last call."""
         with self._lock:
-            news, self._news = tuple(self._news), []
-        return news
+            messages, self._messages = tuple(self._messages), []
+        return messages
 
     def close(self) -> None:
         """Stop the page's process; one that does not end in time is killed."""
@@ -94,13 +94,13 @@ class PageProcess:
                 try:
                     self._process = self._start()
                 except OSError as error:
-                    self._news.append(f"the page cannot be started again ({error.strerror}); use `disco-hw estop`")
+                    self._messages.append(f"the page cannot be started again ({error.strerror}); use `disco-hw estop`")
                     return
 
     def _report(self, sentence: str) -> None:
         if not self._ending.is_set():
             with self._lock:
-                self._news.append(sentence)
+                self._messages.append(sentence)
             print(f"page: {sentence}", file=sys.stderr, flush=True)
 
 
@@ -112,7 +112,7 @@ def _signal_name(number: int) -> str:
 
 
 @contextmanager
-def page_beside(
+def page_in_background(
     robot: Path, model: Path | None, host: str, port: int, link: str | None = None
 ) -> Iterator[PageProcess]:
     """Run the live page of `robot` while the block does, and end it with the block or with this process.

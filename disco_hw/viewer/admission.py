@@ -112,7 +112,7 @@ def counted_connections(admission: Admission) -> Callable[..., ServerConnection]
     return create
 
 
-class OncePerSecond(logging.Filter):
+class RateLimit(logging.Filter):
     """Lets each kind of message through once a second, with the count of those left out, in one line each."""
 
     def __init__(self) -> None:

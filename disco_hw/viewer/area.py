@@ -87,7 +87,7 @@ class FenceEditor:
     def use(self) -> None:
         """Ask the daemon for the fence that the fields say, and show its answer."""
         try:
-            asked = {
+            requested = {
                 "keep_in": json.loads(self._keep_in.value or "null"),
                 "keep_out": json.loads(self._keep_out.value or "[]"),
                 "margin_m": float(self._margin.value),
@@ -95,7 +95,7 @@ class FenceEditor:
         except ValueError as error:
             self._reply.content = f"Not understood: {error}. Write corners as `[[x, y], ...]`."
             return
-        reply = self._request({"do": "fence", **asked})
+        reply = self._request({"do": "fence", **requested})
         if reply.get("ok"):
             self._corners = []
         self._reply.content = str(reply.get("text") if reply.get("ok") else f"Refused: {reply.get('error')}")

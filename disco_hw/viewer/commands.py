@@ -55,7 +55,7 @@ def view_live(
         serving(f"disco-hw: {stage.name}", host, port, desk) as page,
     ):
         live = LivePage(page.server, stage, socket, desk)
-        _tell({"page": page.url}, as_json)
+        _print_served({"page": page.url}, as_json)
         run_live(live, lambda: signals.received is not None or ended())
     return 0
 
@@ -73,7 +73,7 @@ def view_log(
         serving(f"disco-hw: {log.name}", host, port) as page,
     ):
         replay = ReplayPage(page.server, recording)
-        _tell({"page": page.url, **in_figures(recording)}, as_json)
+        _print_served({"page": page.url, **in_figures(recording)}, as_json)
         run_replay(replay, lambda: signals.received is not None)
     return 0
 
@@ -120,7 +120,7 @@ def export_log(log: Path, out: Path, robot: Path | None = None) -> None:
         export_html(recording, out, progress)
 
 
-def _tell(served: Mapping[str, Any], as_json: bool) -> None:
+def _print_served(served: Mapping[str, Any], as_json: bool) -> None:
     """Say where the page is, at once: whoever started it waits for the line."""
     print(json.dumps(served) if as_json else f"page: {served['page']}", flush=True)
 

@@ -63,11 +63,11 @@ def wheels(timeline: Timeline, first_ns: int, last_ns: int) -> Curves:
     in_force = commands[:, COMMAND.index("in_force")] > 0.0
     values: dict[str, Array] = {}
     for side in ("left", "right"):
-        asked = np.where(in_force, commands[:, COMMAND.index(f"{side}_rad_s")], 0.0)
+        requested = np.where(in_force, commands[:, COMMAND.index(f"{side}_rad_s")], 0.0)
         measured = np.full(len(t_s), np.nan)
         known = at >= 0
         measured[known] = samples[at[known], WHEELS.index(f"{side}_speed_rad_s")]
-        values |= {f"{side} asked": asked, f"{side} measured": measured}
+        values |= {f"{side} asked": requested, f"{side} measured": measured}
     return Curves(t_s, values)
 
 
@@ -200,10 +200,10 @@ def _any_task(cut: Callable[[Timeline, int, int], Curves]) -> Cut:
 
 
 def _add_uplot(
-    gui: viser.GuiApi, title: str, drawn: Curves, right: tuple[str, ...], least: float | None = None
+    gui: viser.GuiApi, title: str, curves: Curves, right: tuple[str, ...], least: float | None = None
 ) -> viser.GuiUplotHandle:
     series: list[dict[str, object]] = [{"label": "s"}]
-    for number, name in enumerate(drawn.values):
+    for number, name in enumerate(curves.values):
         scale = {"scale": "right"} if name in right else {}
         series.append({"label": name, "width": 1.5, "spanGaps": False, **_line(name, number), **scale})
     axes: list[dict[str, object]] = [{}, {"size": 55}]
@@ -216,12 +216,12 @@ def _add_uplot(
         axes.append({"scale": "right", "side": 1, "size": 50, "grid": {"show": False}})
         scales["right"] = {}
     return gui.add_uplot(
-        data=_columns(drawn),
+        data=_columns(curves),
         series=tuple(series),  # type: ignore[arg-type]
         title=title,
         axes=tuple(axes),  # type: ignore[arg-type]
         scales=scales,  # type: ignore[arg-type]
-        legend={"show": len(drawn.values) > 1},
+        legend={"show": len(curves.values) > 1},
         height=_HEIGHT,
         padding=_PADDING_PX,
     )
@@ -236,7 +236,7 @@ def _line(name: str, number: int) -> dict[str, object]:
     return {"stroke": _ORANGE if name.startswith("right") or (number == 1 and "measured" not in name) else _BLUE}
 
 
-def _columns(drawn: Curves) -> tuple[np.ndarray, ...]:
+def _columns(curves: Curves) -> tuple[np.ndarray, ...]:
     """Return times and values without the rows in which a value is missing: the page's plots do not scale with them."""
-    whole = np.all(np.isfinite(np.stack(tuple(drawn.values.values()))), axis=0)
-    return (drawn.t_s[whole], *(values[whole] for values in drawn.values.values()))
+    is_complete = np.all(np.isfinite(np.stack(tuple(curves.values.values()))), axis=0)
+    return (curves.t_s[is_complete], *(values[is_complete] for values in curves.values.values()))

@@ -96,12 +96,12 @@ class Desk:
                 if request is None:
                     await connection.close(1003, "not a request")
                 elif request["do"] == "drive":
-                    await drive.ask(request)
+                    await drive.query(request)
                 elif request["do"] == "draft":
                     self.draft = _numbers(request.get("values"))
                     edits = self.draft is not None
                 else:
-                    task = asyncio.create_task(self._ask(request, send))
+                    task = asyncio.create_task(self._forward_request(request, send))
                     replies.add(task)
                     task.add_done_callback(replies.discard)
         except ConnectionClosed:
@@ -135,7 +135,7 @@ class Desk:
         self._status_line.close()
         self._reserve.close()
 
-    async def _ask(self, request: dict[str, Any], send: Send) -> None:
+    async def _forward_request(self, request: dict[str, Any], send: Send) -> None:
         loop = asyncio.get_running_loop()
         if request["do"] == "estop":
             reply = await asyncio.shield(loop.run_in_executor(self._stopping, self.estop))
@@ -169,8 +169,8 @@ class Desk:
                 outcome = stop_robot(self._robot_file, self._link, self._robot_toml)
         except InputError as error:
             return {"do": "estop", "ok": False, "error": f"{refused}; NOT SENT: {error}"}
-        words = "text" if outcome.confirmed else "error"
-        return {"do": "estop", "ok": outcome.confirmed, words: f"{refused}; {outcome.as_text()}"}
+        kind = "text" if outcome.confirmed else "error"
+        return {"do": "estop", "ok": outcome.confirmed, kind: f"{refused}; {outcome.as_text()}"}
 
     def _begin_watching(self) -> None:
         self._watchers += 1
@@ -186,10 +186,10 @@ class Desk:
     async def _keep_watching(self) -> None:
         loop = asyncio.get_running_loop()
         while True:
-            self.status, self.error = await loop.run_in_executor(self._watching, self._ask_status)
+            self.status, self.error = await loop.run_in_executor(self._watching, self._request_status)
             await asyncio.sleep(STATUS_S)
 
-    def _ask_status(self) -> tuple[dict[str, Any] | None, str]:
+    def _request_status(self) -> tuple[dict[str, Any] | None, str]:
         self._stop_line.ensure_connected()
         try:
             return self._status_line.request({"do": "status"}, _STATUS_TIMEOUT_S), ""
@@ -200,8 +200,8 @@ class Desk:
         """Send the browser the status; also how it notices that nobody is here any more."""
         while True:
             try:
-                drawn = {"dark": self.dark, "draft": self.draft, "drags": self._drags}
-                await send({**shown(self.status, self.error), **drawn})
+                drawing = {"dark": self.dark, "draft": self.draft, "drags": self._drags}
+                await send({**shown(self.status, self.error), **drawing})
             except ConnectionClosed:
                 return
             await asyncio.sleep(STATUS_S)
@@ -244,7 +244,7 @@ class _DriveLine:
         self._writer: asyncio.StreamWriter | None = None
         self._reading: asyncio.Task[None] | None = None
 
-    async def ask(self, request: Mapping[str, Any]) -> None:
+    async def query(self, request: Mapping[str, Any]) -> None:
         """Pass on what the pad says; the answer goes to the browser when it comes."""
         try:
             if self._writer is None:

@@ -78,16 +78,16 @@ class LivePage:
 
     def step(self) -> None:
         """Wait at most a twentieth of a second for records, then draw: each batch of the feed moves the robot."""
-        self.take(self._subscriber.receive(WAIT_S))
+        self.ingest(self._subscriber.receive(WAIT_S))
         if self._server.get_clients():
             self.draw(self._redraw(time.monotonic()))
 
-    def take(self, received: list[tuple[int, Record]]) -> None:
+    def ingest(self, received: list[tuple[int, Record]]) -> None:
         """Take in records of the feed."""
         for now_ns, record in received:
             self.timeline.add(now_ns, record)
         if received:
-            self.timeline.forget_before(received[-1][0] - round(KEEP_S * 1e9))
+            self.timeline.drop_before(received[-1][0] - round(KEEP_S * 1e9))
 
     def draw(self, everything: bool) -> None:
         """Draw the newest instant; the panel and long lines only if `everything`."""
@@ -134,15 +134,15 @@ class LivePage:
         newest = self.timeline.last_ns
         if newest is None or status is None or not status.get("ok"):
             return
-        asked = task_in_status(status["task"]["asked"], self._stage.task)
-        self.scene.knows_task = asked is not None
-        if asked is None:
+        requested = task_in_status(status["task"]["asked"], self._stage.task)
+        self.scene.knows_task = requested is not None
+        if requested is None:
             return
         record = self.timeline.tasks.last(newest)
         if record is not None and newest - record.t_ns < _STATUS_OLDER_NS:
             return
-        if self._stage.task_at(record) != asked:
-            self.timeline.add(newest, record_of(newest, asked))
+        if self._stage.task_at(record) != requested:
+            self.timeline.add(newest, record_of(newest, requested))
 
     def _learn_fence(self, status: dict[str, Any] | None) -> None:
         """Take over the daemon's fence: it may have been changed before this page was opened."""

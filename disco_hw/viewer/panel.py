@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from disco_hw.daemon import recording_in_words
-from disco_hw.runtime import fault_sentence, headline, in_words
+from disco_hw.daemon import describe_recording
+from disco_hw.runtime import describe, fault_sentence, headline
 from disco_hw.runtime.pipeline import Source
 from disco_hw.tasks import RobotTask
 from disco_hw.viewer.recording import Snapshot
@@ -37,8 +37,8 @@ def live_summary(status: Mapping[str, Any] | None, snapshot: Snapshot | None, kn
         rows += [_speed(snapshot), _battery(snapshot)]
     if status is not None and status.get("ok"):
         loop = status["loop"]
-        late = f"{number(loop['lateness_us']['p99'], 0)} us late (99 %), {_overruns(loop['overruns'])}"
-        rows.append(("loop", late))
+        lateness = f"{number(loop['lateness_us']['p99'], 0)} us late (99 %), {_overruns(loop['overruns'])}"
+        rows.append(("loop", lateness))
     return _table(rows)
 
 
@@ -75,7 +75,7 @@ def _status_rows(status: Mapping[str, Any]) -> Rows:
     ]
     recorder = status["recorder"]
     if recorder["path"]:
-        rows.append(("recording", recording_in_words(recorder)))
+        rows.append(("recording", describe_recording(recorder)))
     if len(status.get("poses", ())) > 1:
         rows += [(f"poses {which}", _source(one)) for which, one in enumerate(status["poses"], 1)]
     return rows
@@ -196,8 +196,8 @@ def escaped(text: str) -> str:
 
 
 def _robot(state: str, fault: str, stop_cause: str) -> str:
-    fault_words = "no fault" if fault == "NONE" else f"fault: {in_words(fault).lower()}"
-    return f"{state}, {fault_words}" + ("" if stop_cause == "NONE" else f", last stop: {in_words(stop_cause).lower()}")
+    fault_text = "no fault" if fault == "NONE" else f"fault: {describe(fault).lower()}"
+    return f"{state}, {fault_text}" + ("" if stop_cause == "NONE" else f", last stop: {describe(stop_cause).lower()}")
 
 
 def _pair(values: tuple[float, float] | None) -> str:

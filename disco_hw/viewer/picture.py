@@ -197,12 +197,12 @@ def export_html(recording: Recording, path: Path, progress: Progress) -> None:
     period_s = recording.duration_s / count
     # Serialising needs a server; nobody can reach this one but from this machine, and it is gone at the end.
     with serving(path.name, port=0) as page:
-        drawn = Scene(page.server, recording.stage)
+        scene = Scene(page.server, recording.stage)
         clock = page.server.scene.add_label("/clock", "0.0 s", position=_clock_place(recording))
         serializer = page.server.get_scene_serializer()
         for number in range(count + 1):
             t_s = number * period_s
-            drawn.show(recording.at(t_s), everything=number % _REDRAW_PICTURES == 0)
+            scene.show(recording.at(t_s), everything=number % _REDRAW_PICTURES == 0)
             clock.text = f"{t_s:.1f} s"
             serializer.insert_sleep(period_s)
             progress(number / count)

@@ -225,8 +225,8 @@ class ShownRobot:
 
 def model_in_force(model: Model, change: BeliefChange | None) -> Model:
     """Return the model with the belief that was put in force while driving; itself without one."""
-    learnt = None if change is None else geometry_of(change)
-    return model if learnt is None else with_geometry(model, learnt)
+    estimated = None if change is None else geometry_of(change)
+    return model if estimated is None else with_geometry(model, estimated)
 
 
 def stage_of_robot(robot_file: Path, model_file: Path | None = None) -> ShownRobot:

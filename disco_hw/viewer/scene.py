@@ -120,7 +120,7 @@ class Scene:
         }
         self._trail = add_lines(server, "trail", empty, shades, _WIDTH_PX["trail"])
         self._fan = add_lines(server, "fan", empty, shades, _WIDTH_PX["fan"])
-        self._drawn_fan: tuple[records.Fan, tuple[float, ...]] | None = None
+        self._shown_fan: tuple[records.Fan, tuple[float, ...]] | None = None
 
     def show(self, snapshot: Snapshot, everything: bool = True) -> None:
         """Draw one snapshot; without `everything` leave plan, rollouts, trail, poses, points and fence as they are."""
@@ -166,7 +166,7 @@ class Scene:
         ]
         self._shaded = LIGHT
         self._task = add_lines(self._server, "task", _line(task), TASK_COLOUR, _WIDTH_PX["task"], visible=True)
-        self._drawn_task = task
+        self._shown_task = task
         camera = self._server.initial_camera
         camera.position, camera.look_at = first_camera(task)
 
@@ -231,20 +231,20 @@ class Scene:
             self._lines["centre"].colors = np.array(centre, np.uint8)
 
     def _draw_task(self, task: RobotTask) -> None:
-        if task != self._drawn_task:
+        if task != self._shown_task:
             self._task.points = _line(task).astype(np.float32)
-            self._drawn_task = task
+            self._shown_task = task
 
     def _draw_fan(self, fan: records.Fan | None) -> None:
         paths = np.empty((0, 0, 2))
         if fan is not None and self.layers["fan"]:
             paths = fan_paths(fan.weights, fan.x_m, fan.y_m)
         if not len(paths):
-            self._drawn_fan = None
+            self._shown_fan = None
             if self._fan.visible:
                 self._fan.visible = False
             return
-        if fan is None or (fan, self.background) == self._drawn_fan:
+        if fan is None or (fan, self.background) == self._shown_fan:
             return
         colours = weight_colours(fan.weights, FAN_COLOUR, FAN_PALEST, self.background)
         # The weightiest on top of the others.
@@ -252,7 +252,7 @@ class Scene:
         lines = [segments(path, height) for path, height in zip(paths, heights, strict=True)]
         self._fan.points = np.concatenate(lines).astype(np.float32)
         self._fan.colors = np.repeat(np.repeat(colours[:, None], paths.shape[1] - 1, axis=0), 2, axis=1)
-        self._fan.visible, self._drawn_fan = True, (fan, self.background)
+        self._fan.visible, self._shown_fan = True, (fan, self.background)
 
     def _draw_trail(self, snapshot: Snapshot) -> None:
         visible = self.layers["trail"] and len(snapshot.trail) >= 2

@@ -34,8 +34,8 @@ from disco_hw.viewer.admission import (
     ACCEPTED_PER_TURN,
     REQUEST_TIMEOUT_S,
     Admission,
-    OncePerSecond,
     PacedListener,
+    RateLimit,
     counted_connections,
 )
 from disco_hw.viewer.operator_controls import Desk
@@ -45,7 +45,7 @@ _COOKIE = "disco-hw-token"
 _DESK_PATH = "/desk"
 _INSTANCE_PATH = "/instance"
 _WAITING_CONNECTIONS = 256
-Answer = Callable[[Any, Request], Response | None]
+Respond = Callable[[Any, Request], Response | None]
 Handler = Callable[[Any], Awaitable[None]]
 
 
@@ -83,7 +83,7 @@ class Guard:
             if upgrade or address.path != "/":
                 return None
             cookie = f"{self._cookie_name}={self.token}; HttpOnly; SameSite=Strict; Path=/"
-            return _answer(http.HTTPStatus.SEE_OTHER, "welcome", {"Location": "/", "Set-Cookie": cookie})
+            return _respond(http.HTTPStatus.SEE_OTHER, "welcome", {"Location": "/", "Set-Cookie": cookie})
         return _plain(
             http.HTTPStatus.FORBIDDEN, "open the address with its token, as printed where the page was started"
         )
@@ -123,16 +123,16 @@ def serving(label: str, host: str = LOOPBACK, port: int = DEFAULT_PORT, desk: De
     # What waits to be accepted may be many, though the event loop takes few at a turn.
     listener.listen(_WAITING_CONNECTIONS)
     try:
-        elsewhere = _held_on_ipv6(server.get_port()) if guard.local else None
+        elsewhere = _bound_on_ipv6(server.get_port()) if guard.local else None
         # Looked up when a client asks for it, so this is enough to keep the tunnel shut.
         server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
-        taken = server.get_port()
+        actual_port = server.get_port()
         server.gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=False)
-        guard.port = taken
+        guard.port = actual_port
         guard.alone = elsewhere is not None
         guard.open = True
         with elsewhere or nullcontext():
-            yield Page(server, page_address(host, taken, guard.token))
+            yield Page(server, page_address(host, actual_port, guard.token))
     finally:
         with redirect_stdout(io.StringIO()):
             server.stop()
@@ -147,11 +147,11 @@ def _guarded(guard: Guard, desk: Desk | None, listener: socket.socket, admission
     serve = websockets.asyncio.server.serve
     instance = secrets.token_hex(8)
     logger = logging.getLogger("websockets.server")
-    limit = OncePerSecond()
+    limit = RateLimit()
     for repeating in (logger, logging.getLogger("asyncio")):
         repeating.addFilter(limit)
 
-    def guarded_serve(handler: Handler, _host: str, _port: int, process_request: Answer, **options: Any) -> Any:
+    def guarded_serve(handler: Handler, _host: str, _port: int, process_request: Respond, **options: Any) -> Any:
         @functools.wraps(process_request)
         def process(connection: Any, request: Request) -> Response | None:
             upgrade = request.headers.get("Upgrade", "").lower() == "websocket"
@@ -159,7 +159,7 @@ def _guarded(guard: Guard, desk: Desk | None, listener: socket.socket, admission
             if response is None and urlsplit(request.path).path != _INSTANCE_PATH:
                 admission.prove(connection.transport)
             if response is None and desk is not None and not upgrade:
-                response = _desk_answer(desk, instance, guard, request)
+                response = _desk_response(desk, instance, guard, request)
             if response is None:
                 response = process_request(connection, request)
                 if response is not None and not upgrade and urlsplit(request.path).path in {"/", "/index.html"}:
@@ -203,11 +203,11 @@ def _completed(page: bytes, zipped: bool) -> bytes:
     return gzip.compress(plain) if zipped else plain
 
 
-def _desk_answer(desk: Desk, instance: str, guard: Guard, request: Request) -> Response | None:
+def _desk_response(desk: Desk, instance: str, guard: Guard, request: Request) -> Response | None:
     """Return the page of the operator controls, or the server's instance name; None for requests of the scene."""
     path = urlsplit(request.path).path
     if path == "/":
-        return _answer(
+        return _respond(
             http.HTTPStatus.OK,
             "",
             {"Cache-Control": "no-store"},
@@ -215,8 +215,8 @@ def _desk_answer(desk: Desk, instance: str, guard: Guard, request: Request) -> R
         )
     if path == _INSTANCE_PATH:
         origin = request.headers.get("Origin", "")
-        own = urlsplit(origin).hostname in _LOOPBACK_NAMES
-        return _answer(http.HTTPStatus.OK, instance, {"Access-Control-Allow-Origin": origin} if own else {})
+        is_local = urlsplit(origin).hostname in _LOOPBACK_NAMES
+        return _respond(http.HTTPStatus.OK, instance, {"Access-Control-Allow-Origin": origin} if is_local else {})
     return None
 
 
@@ -228,24 +228,24 @@ def _framers(request: Request) -> str:
     return "'self' " + " ".join(f"http://{name}:{port}" for name in sorted(_LOOPBACK_NAMES))
 
 
-def _held_on_ipv6(port: int) -> socket.socket | None:
+def _bound_on_ipv6(port: int) -> socket.socket | None:
     """Keep other users from listening at [::1], where a browser looks for "localhost" first; None if one does already.
 
     The scene is asked for under that name with the token in its address.
     """
     try:
-        held = socket.socket(socket.AF_INET6, socket.SOCK_STREAM)
+        listener = socket.socket(socket.AF_INET6, socket.SOCK_STREAM)
     except OSError:
         # A machine without IPv6 has nobody there.
         return socket.socket()
     try:
         # Bound and not listening: the browser is refused there, and goes on to 127.0.0.1.
-        held.bind(("::1", port))
+        listener.bind(("::1", port))
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
-            held.close()
+            listener.close()
             return None
-    return held
+    return listener
 
 
 def _listen(host: str, port: int) -> socket.socket:
@@ -266,10 +266,10 @@ def _cookie(headers: Headers, name: str) -> str:
 
 
 def _plain(status: http.HTTPStatus, text: str) -> Response:
-    return _answer(status, text, {})
+    return _respond(status, text, {})
 
 
-def _answer(status: http.HTTPStatus, text: str, extra: dict[str, str], page: bytes | None = None) -> Response:
+def _respond(status: http.HTTPStatus, text: str, extra: dict[str, str], page: bytes | None = None) -> Response:
     """Build a response with `extra` headers: the HTML `page` if given, otherwise `text` as plain text."""
     body = (text + "\n").encode() if page is None else page
     kind = "text/plain" if page is None else "text/html"

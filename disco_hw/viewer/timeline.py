@@ -40,7 +40,7 @@ class Series:
         self._new_times.append(now_ns)
         self._new_rows.append(row)
 
-    def _take_in(self) -> None:
+    def _merge(self) -> None:
         """Put what was added into the arrays, all at once: one row costs as much as a hundred together."""
         count = self._count + len(self._new_times)
         if count == self._count:
@@ -55,20 +55,20 @@ class Series:
 
     def rows(self, first_ns: int, last_ns: int) -> tuple[Times, Array]:
         """Return times (N,) and rows (N, columns) with first_ns <= time <= last_ns; views, not copies."""
-        self._take_in()
+        self._merge()
         times = self._times[: self._count]
         first, last = np.searchsorted(times, first_ns, "left"), np.searchsorted(times, last_ns, "right")
         return times[first:last], self._rows[first:last]
 
     def last(self, at_ns: int) -> tuple[int, Array] | None:
         """Return the newest row known at `at_ns` and its time; None before the first."""
-        self._take_in()
+        self._merge()
         index = int(np.searchsorted(self._times[: self._count], at_ns, "right")) - 1
         return None if index < 0 else (int(self._times[index]), self._rows[index])
 
-    def forget_before(self, oldest_ns: int) -> None:
+    def drop_before(self, oldest_ns: int) -> None:
         """Drop rows from before `oldest_ns`, once they are at least half of all."""
-        self._take_in()
+        self._merge()
         first = int(np.searchsorted(self._times[: self._count], oldest_ns, "left"))
         if 2 * first >= self._count > 0:
             self._times = self._times[first : max(self._count, first + _FIRST_ROWS)].copy()
@@ -105,7 +105,7 @@ class Items(Generic[Item]):
         first = max(0, end - count)
         return list(zip(self._times[first:end], self._items[first:end], strict=True))
 
-    def forget_before(self, oldest_ns: int) -> None:
+    def drop_before(self, oldest_ns: int) -> None:
         """Drop those from before `oldest_ns`, but never the newest."""
         first = min(bisect_right(self._times, oldest_ns), max(len(self._times) - 1, 0))
         del self._times[:first], self._items[:first]
@@ -207,23 +207,23 @@ class Timeline:
             case _:
                 pass
 
-    def forget_before(self, oldest_ns: int) -> None:
+    def drop_before(self, oldest_ns: int) -> None:
         """Drop what is older, so that a page that stays open does not grow."""
         for series in (
             self.estimate, self.wheels, self.command, self.pose, self.innovation, self.planner, self.loop, self.power
         ):  # fmt: skip
-            series.forget_before(oldest_ns)
+            series.drop_before(oldest_ns)
         for items in (
             self.plans, self.status, self.link, self.state, self.source, self.events, self.counters, self.fans,
             self.tasks, self.beliefs, self.adaptations, self.guards, self.fences,
         ):  # fmt: skip
-            items.forget_before(oldest_ns)
+            items.drop_before(oldest_ns)
 
 
 FAULT, EVENT, OVERRUN, REJECTED_FRAMES, GATED = "fault", "event", "overrun", "rejected frames", "pose rejected"
 ADAPTED = "adaptation"
 KINDS = (FAULT, ADAPTED, EVENT, OVERRUN, REJECTED_FRAMES, GATED)
-_TELLING = frozenset({"refused", "reverted", "lost", "taken_over"})
+_INFORMATIVE = frozenset({"refused", "reverted", "lost", "taken_over"})
 _APART_NS = 500_000_000
 
 
@@ -245,7 +245,7 @@ def marks_of(timeline: Timeline) -> tuple[Mark, ...]:
         *_rejected_frames(timeline),
         *_gated(timeline),
         *(Mark(t_ns, ADAPTED, f"belief {change.source}: {change.reason}") for t_ns, change in timeline.beliefs),
-        *_spaced([Mark(t_ns, ADAPTED, it.text) for t_ns, it in timeline.adaptations if it.outcome in _TELLING]),
+        *_spaced([Mark(t_ns, ADAPTED, it.text) for t_ns, it in timeline.adaptations if it.outcome in _INFORMATIVE]),
     ]
     return tuple(sorted(marks, key=lambda mark: mark.t_ns))
 

@@ -131,7 +131,7 @@ class TaskEditor:
     def __init__(self, server: viser.ViserServer, dragged: Callable[[Mapping[str, float]], None]) -> None:
         scene = server.scene
         self._dragged = dragged
-        self._drawn: tuple[RobotTask, Mapping[str, float]] | None = None
+        self._shown: tuple[RobotTask, Mapping[str, float]] | None = None
         self._line = scene.add_line_segments("/draft", np.zeros((1, 2, 3)), DRAFT_COLOUR, thickness=0.02, visible=False)
         self.balls = {
             name: scene.add_icosphere(
@@ -150,9 +150,9 @@ class TaskEditor:
 
     def pull(self, ball: str, place: tuple[float, float]) -> None:
         """Move one handle of the edited circle to a point on the floor."""
-        if self._drawn is None:
+        if self._shown is None:
             return
-        values = self._drawn[1]
+        values = self._shown[1]
         if ball == "middle":
             self._dragged({"center_x_m": place[0], "center_y_m": place[1]})
         else:
@@ -162,13 +162,13 @@ class TaskEditor:
         """Draw the draft of a change of `task`, or nothing: no other field than these has a place on the floor."""
         editable = draft is not None and {"center_x_m", "center_y_m"} <= draft.keys()
         if not editable or draft is None:
-            if self._drawn is not None:
+            if self._shown is not None:
                 self._line.visible = self.balls["middle"].visible = self.balls["rim"].visible = False
-                self._drawn = None
+                self._shown = None
             return
-        if self._drawn == (task, draft):
+        if self._shown == (task, draft):
             return
-        self._drawn = (task, draft)
+        self._shown = (task, draft)
         outline = with_values(task, draft).course().outline_m()
         size_m = 0.04 + 0.03 * float(np.ptp(outline[:, 0]))
         places = {"middle": (draft["center_x_m"], draft["center_y_m"])}

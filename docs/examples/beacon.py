@@ -15,7 +15,7 @@ POSE = struct.Struct("<6d")
 MOST_A_TICK = 100
 
 
-def make_pose_source(*, beacon_port: int = 5005, **_of_other_sources: Any) -> "BeaconPoses":
+def create_pose_source(*, beacon_port: int = 5005, **_of_other_sources: Any) -> "BeaconPoses":
     """By the fields of [pose]. Raises PoseSourceError for a port that cannot be had."""
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     opened.setblocking(False)

@@ -38,7 +38,7 @@ class SquareTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     def editing_note(self, robot):
         return f"At most {self.fastest_m_s(robot):.3f} m/s."
 
-    def in_words(self):
+    def describe(self):
         return f"square of {self.side_m:g} m at {self.speed_m_s:g} m/s"
 
     def points(self):

@@ -11,7 +11,7 @@ from drivers.motor.vendor_driver import (
     IMPLAUSIBLE,
     REJECTED_LENGTH,
     UNKNOWN,
-    Heard,
+    FrameReport,
     Objection,
     Pending,
     Port,
@@ -37,7 +37,7 @@ class ToyPort(Port):
         self._session = 0
         self._turned = (parts.Odometer(), parts.Odometer())
         self._ticks_per_rev, self._fastest_rad_s = 1, 0.0
-        self.begin_anew(0)
+        self.reset_state(0)
 
     @property
     def seen(self):
@@ -65,29 +65,29 @@ class ToyPort(Port):
     def is_stopped(self):
         return self._state == ESTOP
 
-    def begin_anew(self, now_ns):
+    def reset_state(self, now_ns):
         self._state_ns, self._state, self._armed_session, self._cause = None, IDLE, 0, 0
         for side in self._turned:
-            side.begin_anew()
+            side.reset_state()
 
-    def take(self, received, permit):
+    def handle(self, received, permit):
         can_id, data = received.frame.can_id, received.frame.data
         if can_id == STOP_ID:
-            return Heard(counts=("unknown_id",), is_stop=True)
+            return FrameReport(counts=("unknown_id",), is_stop=True)
         if can_id == COMMAND_ID:
-            return Heard(counts=("unknown_id",), commanded="the controller")
+            return FrameReport(counts=("unknown_id",), commanded="the controller")
         if can_id not in (STATE_ID, WHEELS_ID):
             return UNKNOWN
         if len(data) != 8:
             return REJECTED_LENGTH
         if data[0] != checksum(can_id, data[1:]):
-            return Heard(counts=("rejected_crc",))
+            return FrameReport(counts=("rejected_crc",))
         if can_id == WHEELS_ID:
-            return self._take_wheels(data, received.t_ns, permit.looked_ns)
+            return self._handle_wheels(data, received.t_ns, permit.looked_ns)
         _, state, self._armed_session, self._cause, self._ticks_per_rev, speed = struct.unpack("<BBBBHH", data)
         self._state, self._state_ns = state if state <= ESTOP else FAULT, received.t_ns
         self._ticks_per_rev, self._fastest_rad_s = max(1, self._ticks_per_rev), 1e-3 * speed
-        return Heard(is_status=True)
+        return FrameReport(is_status=True)
 
     def sources(self):
         return (Source("the controller", self._state_ns, SILENT_NS, GONE_NS),)
@@ -115,7 +115,7 @@ class ToyPort(Port):
         return (self._command(STAND_BY),), self._state != ARMED
 
     def rest(self, now_ns, permit):
-        return (self._command(RESET if permit.wanted is Request.RESET else STAND_BY),)
+        return (self._command(RESET if permit.target is Request.RESET else STAND_BY),)
 
     def stop_frames(self):
         return (Frame(STOP_ID, b""),)
@@ -129,22 +129,22 @@ class ToyPort(Port):
         payload = struct.pack("<BBBhh", request, self._session, HOLDS_MS, *speeds)
         return Frame(COMMAND_ID, bytes([checksum(COMMAND_ID, payload)]) + payload)
 
-    def _take_wheels(self, data, t_ns, looked_ns):
+    def _handle_wheels(self, data, t_ns, looked_ns):
         if self._state_ns is None:
-            return Heard()
+            return FrameReport()
         _, *speeds = struct.unpack("<Bhh", data[:5])
         ticks = divmod(int.from_bytes(data[5:]), 4096)
         per_tick = 2.0 * math.pi / self._ticks_per_rev
         fastest = 1.5 * self._fastest_rad_s / per_tick
         plausible = [
-            side.take_wrapping(count, t_ns, looked_ns, fastest, 4.0, bits=12)
+            side.add_wrapping(count, t_ns, looked_ns, fastest, 4.0, bits=12)
             for side, count in zip(self._turned, ticks, strict=True)
         ]
         for side, speed in zip(self._turned, speeds, strict=True):
             side.speed = 1e-3 * speed / per_tick
         wheels = parts.wheel_sample(t_ns, [[side] for side in self._turned], (1, 1), per_tick)
-        return Heard(
-            counts=Heard().counts if all(plausible) else IMPLAUSIBLE, wheels=wheels if all(plausible) else None
+        return FrameReport(
+            counts=FrameReport().counts if all(plausible) else IMPLAUSIBLE, wheels=wheels if all(plausible) else None
         )
 
 

@@ -13,7 +13,7 @@ from firmware_protocol.serial_framing import MAX_CAN_ID, MAX_DATA
 KIND = "udp"
 
 
-def make_transport(*, channel: str, **_of_other_media: Any) -> ReconnectingTransport:
+def create_transport(*, channel: str, **_of_other_media: Any) -> ReconnectingTransport:
     """By the fields of [link], not yet opened. Raises TransportSettingsError for an address that cannot be one."""
     host, _, port = channel.rpartition(":")
     if not (host and port.isdigit() and int(port) < 65536):

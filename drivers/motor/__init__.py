@@ -60,8 +60,8 @@ def motor_drivers() -> Mapping[str, MotorDriver]:
 
 def find_driver(name: str | None) -> MotorDriver:
     """Return the driver of this name, the default one for None. Raises UnknownDriverError for a name not known."""
-    asked = DEFAULT if name is None else name
-    module = import_module(f"{__name__}.{asked}") if asked in _module_names() else None
+    requested = DEFAULT if name is None else name
+    module = import_module(f"{__name__}.{requested}") if requested in _module_names() else None
     found: MotorDriver | None = getattr(module, "DRIVER", None)
     if found is None:
         raise UnknownDriverError(f'there is no driver "{name}"; write one of {", ".join(motor_drivers())}')
@@ -73,7 +73,7 @@ def _module_names() -> list[str]:
     return [each.name for each in pkgutil.iter_modules(__path__)]
 
 
-def make_driver(name: str | None, settings: Any = None, key: bytes | None = None) -> Driver:
+def create_driver(name: str | None, settings: Any = None, key: bytes | None = None) -> Driver:
     """Make the driver that `link.driver` names, the default one for None.
 
     `settings`: of its type, None for its defaults. `key` (16 bytes): of authenticated mode. Raises UnknownDriverError.
@@ -82,19 +82,19 @@ def make_driver(name: str | None, settings: Any = None, key: bytes | None = None
     return found.make(found.settings() if settings is None else settings, key)
 
 
-def own_fields(name: str | None, fields: Mapping[str, Any]) -> dict[str, Any]:
+def fields_of(name: str | None, fields: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields of [link] that are the driver's own; raise DriverFieldError for one of another driver's.
 
     Raises DriverFieldError for one of another driver's.
     """
     found = find_driver(name)
-    own = {field: value for field, value in fields.items() if field in found.settings.__struct_fields__}
-    others = motor_drivers().values() if len(own) < len(fields) else ()
+    accepted = {field: value for field, value in fields.items() if field in found.settings.__struct_fields__}
+    others = motor_drivers().values() if len(accepted) < len(fields) else ()
     for other in others:
         for field in fields:
-            if field in other.settings.__struct_fields__ and field not in own:
+            if field in other.settings.__struct_fields__ and field not in accepted:
                 raise DriverFieldError(field, f"a field of the driver {other.name}, and link.driver is {found.name}")
-    return own
+    return accepted
 
 
 _Sign = Literal[-1, 1]
@@ -115,7 +115,7 @@ class Wiring(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     turn_ratio: Annotated[float, Meta(ge=0.01, le=100.0)] = 1.0
 
 
-AS_TOLD = Wiring()
+AS_CONFIGURED = Wiring()
 
 
 class RewiredDriver:
@@ -228,4 +228,4 @@ class RewiredDriver:
 
 def rewired(driver: Driver, wiring: Wiring) -> Driver:
     """Return the driver for wheels that are wired so; the driver itself where nothing is to be changed."""
-    return driver if wiring == AS_TOLD else RewiredDriver(driver, wiring)
+    return driver if wiring == AS_CONFIGURED else RewiredDriver(driver, wiring)

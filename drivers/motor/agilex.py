@@ -10,14 +10,14 @@ from collections.abc import Sequence
 
 from drivers.motor import agilex_protocol as protocol
 from drivers.motor import vendor_parts as parts
-from drivers.motor.agilex_protocol import TIMEOUT_S, AgilexSettings, stands, stop_frames
+from drivers.motor.agilex_protocol import TIMEOUT_S, AgilexSettings, is_stationary, stop_frames
 from drivers.motor.permit import Controllers, MotionPermit, Stage
 from drivers.motor.vendor_driver import (
     IMPLAUSIBLE,
     REJECTED_LENGTH,
     UNKNOWN,
     BodyPort,
-    Heard,
+    FrameReport,
     Objection,
     Pending,
     Source,
@@ -54,19 +54,19 @@ class AgilexPort(BodyPort):
             stop_deceleration_rad_s2=settings.stop_deceleration_rad_s2, watchdog_s=TIMEOUT_S, zeros_to_arm=5
         )
         self._driven_mm = (parts.Odometer(), parts.Odometer())
-        self.begin_anew(0)
+        self.reset_state(0)
 
     @property
     def seen(self) -> Controllers:
         """State of the base, as received last."""
-        heard = None not in (self._state_ns, self._motion_ns, self._driven_mm[0].last)
+        is_complete = None not in (self._state_ns, self._motion_ns, self._driven_mm[0].last)
         faulty = self._vehicle == protocol.EXCEPTION or bool(self._error & ~_WARNINGS)
-        words = f"the base reports an error ({self._error:#06x}); its manual's table of faults names it"
+        text = f"the base reports an error ({self._error:#06x}); its manual's table of faults names it"
         driven = "a person drives it by remote control; switch that off to drive it from here"
         return Controllers(
-            missing=None if heard else "no answer from the base; is it switched on, and the bus at 500 kbit/s?",
+            missing=None if is_complete else "no answer from the base; is it switched on, and the bus at 500 kbit/s?",
             stopped="a button on the base is pressed" if self._vehicle == protocol.EMERGENCY_STOP else None,
-            faulty=words if faulty else None,
+            faulty=text if faulty else None,
             unfit=driven if self._mode == protocol.RC_MODE else None,
             energised=self._mode == protocol.CAN_MODE,
         )
@@ -90,10 +90,10 @@ class AgilexPort(BodyPort):
         """Whether the base stands in a mode that CAN cannot drive, or one of its buttons is pressed."""
         if self._state_ns is None or self._motion_ns is None:
             return False
-        standing_by = self._stands and self._mode != protocol.CAN_MODE
+        standing_by = self._is_stationary and self._mode != protocol.CAN_MODE
         return standing_by or self._vehicle == protocol.EMERGENCY_STOP
 
-    def begin_anew(self, now_ns: int) -> None:
+    def reset_state(self, now_ns: int) -> None:
         """Forget the base's state."""
         self._state_ns: int | None = None
         self._motion_ns: int | None = None
@@ -101,15 +101,15 @@ class AgilexPort(BodyPort):
         self._is_still = True
         self._speed = (0.0, 0.0)
         for side in self._driven_mm:
-            side.begin_anew()
+            side.reset_state()
 
-    def take(self, received: ReceivedFrame, permit: MotionPermit) -> Heard:
+    def handle(self, received: ReceivedFrame, permit: MotionPermit) -> FrameReport:
         """Take in a frame of the base, or of another host."""
         frame = received.frame
         if not frame.extended and frame.can_id in _HOST_COMMANDS:
             if frame not in stop_frames(self.settings):
-                return Heard(counts=("unknown_id",), commanded="the base")
-            return Heard(counts=("unknown_id",), is_stop=frame.can_id == protocol.CONTROL_MODE)
+                return FrameReport(counts=("unknown_id",), commanded="the base")
+            return FrameReport(counts=("unknown_id",), is_stop=frame.can_id == protocol.CONTROL_MODE)
         decoded = protocol.decode(frame)
         if decoded is None:
             return REJECTED_LENGTH if frame.can_id in protocol.LAYOUTS and not frame.extended else UNKNOWN
@@ -118,14 +118,14 @@ class AgilexPort(BodyPort):
             case "system_state":
                 self._vehicle, self._mode = int(values["vehicle_state"]), int(values["control_mode"])
                 self._error, self._state_ns = int(values["error_code"]), received.t_ns
-                return Heard(is_status=True)
+                return FrameReport(is_status=True)
             case "motion_state":
-                self._motion_ns, self._is_still = received.t_ns, stands(decoded)
+                self._motion_ns, self._is_still = received.t_ns, is_stationary(decoded)
                 self._speed = (float(values["linear_m_s"]), float(values["angular_rad_s"]))
             case "odometry":
                 counts = (int(values["left_mm"]), int(values["right_mm"]))
-                return self._take_odometry(counts, received.t_ns, permit.looked_ns)
-        return Heard()
+                return self._handle_odometry(counts, received.t_ns, permit.looked_ns)
+        return FrameReport()
 
     def sources(self) -> Sequence[Source]:
         """Return the sources that must report again and again: the base's state and its motion."""
@@ -149,7 +149,7 @@ class AgilexPort(BodyPort):
 
     def prepare(self, now_ns: int, permit: MotionPermit) -> Pending | None:
         """Let the base listen to CAN."""
-        if not self._stands:
+        if not self._is_stationary:
             return Pending(why="the base moves; wait until it stands", is_final=True)
         if self._mode != protocol.CAN_MODE:
             why = "the base did not take its CAN mode; switch the remote control off"
@@ -159,7 +159,7 @@ class AgilexPort(BodyPort):
     def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
         """Bring a base that listens to CAN to standby, standing; clear errors when requested."""
         seen = self.seen
-        clears = permit.wanted is Request.RESET and (seen.missing or seen.stopped or seen.faulty)
+        clears = permit.target is Request.RESET and (seen.missing or seen.stopped or seen.faulty)
         if not (clears or seen.energised) or not self._is_due(now_ns):
             return ()
         return (protocol.clear_errors(),) if clears else self.stop_frames()
@@ -169,7 +169,7 @@ class AgilexPort(BodyPort):
         return stop_frames(self.settings)
 
     @property
-    def _stands(self) -> bool:
+    def _is_stationary(self) -> bool:
         return self._is_still
 
     def _motion(self, linear_m_s: float, angular_rad_s: float) -> Frame:
@@ -178,16 +178,16 @@ class AgilexPort(BodyPort):
     def _stand_by(self) -> tuple[Frame, ...]:
         return self.stop_frames()
 
-    def _take_odometry(self, counts_mm: tuple[int, int], t_ns: int, looked_ns: int) -> Heard:
+    def _handle_odometry(self, counts_mm: tuple[int, int], t_ns: int, looked_ns: int) -> FrameReport:
         fastest = 1.5e3 * self.settings.max_speed_m_s
         plausible = [
-            side.take_wrapping(count, t_ns, looked_ns, fastest, 10.0)
+            side.add_wrapping(count, t_ns, looked_ns, fastest, 10.0)
             for side, count in zip(self._driven_mm, counts_mm, strict=True)
         ]
         wheels = None if self._motion_ns is None else self._sample(t_ns)
         if all(plausible):
-            return Heard(wheels=wheels)
-        return Heard(counts=IMPLAUSIBLE, wheels=wheels, lost="the base has restarted: its odometry jumped")
+            return FrameReport(wheels=wheels)
+        return FrameReport(counts=IMPLAUSIBLE, wheels=wheels, lost="the base has restarted: its odometry jumped")
 
     def _sample(self, t_ns: int) -> WheelSample:
         radius, track = self.settings.wheel_radius_m, self.settings.track_m

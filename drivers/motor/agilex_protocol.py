@@ -37,7 +37,7 @@ class Layout:
 
 
 def _fields(text: str) -> tuple[tuple[str, float], ...]:
-    pairs = (word.partition(":") for word in text.split())
+    pairs = (item.partition(":") for item in text.split())
     return tuple((name, float(scale) if scale else 1.0) for name, _, scale in pairs)
 
 
@@ -117,8 +117,8 @@ def decode(frame: Frame) -> Decoded | None:
 
 
 TIMEOUT_S = 0.5
-_HEARD = 3
-STANDS_M_S, STANDS_RAD_S = 0.01, 0.02
+_RECEIVED = 3
+STATIONARY_M_S, STATIONARY_RAD_S = 0.01, 0.02
 EXAMPLE = """wheel_radius_m = 0.06
 track_m = 0.31
 max_speed_m_s = 1.5
@@ -140,10 +140,10 @@ def stop_frames(_settings: AgilexSettings) -> tuple[Frame, ...]:
     return motion(0.0, 0.0), control_mode(STANDBY)
 
 
-def stands(motion: Decoded) -> bool:
+def is_stationary(motion: Decoded) -> bool:
     """Whether the base says that it does not move."""
     speed, turn = motion.values["linear_m_s"], motion.values["angular_rad_s"]
-    return abs(float(speed)) < STANDS_M_S and abs(float(turn)) < STANDS_RAD_S
+    return abs(float(speed)) < STATIONARY_M_S and abs(float(turn)) < STATIONARY_RAD_S
 
 
 def cyclic_frames(_settings: AgilexSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:
@@ -157,8 +157,8 @@ def cyclic_frames(_settings: AgilexSettings, command_rate_hz: float, _authentica
 
 def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
     """Return an empty dict if an AgileX base answers, else None: it shows its kind, but none of its measures."""
-    heard = [frame.can_id for frame in frames if decode(frame) is not None]
-    return {} if min(heard.count(SYSTEM_STATE), heard.count(MOTION_STATE)) >= _HEARD else None
+    received = [frame.can_id for frame in frames if decode(frame) is not None]
+    return {} if min(received.count(SYSTEM_STATE), received.count(MOTION_STATE)) >= _RECEIVED else None
 
 
 def safety_card(settings: AgilexSettings) -> SafetyCard:

@@ -20,7 +20,7 @@ from drivers.motor.odrive_protocol import (
     Generation,
     OdriveSettings,
     Questions,
-    error_words,
+    error_text,
     stop_frames,
 )
 from drivers.motor.permit import Controllers, MotionPermit, Stage
@@ -29,7 +29,7 @@ from drivers.motor.vendor_driver import (
     REJECTED_LENGTH,
     REPEAT_NS,
     UNKNOWN,
-    Heard,
+    FrameReport,
     Objection,
     Pending,
     Port,
@@ -53,7 +53,7 @@ BEATS_TO_ARM = 2
 SILENT_BEATS = 3
 # Less, and a pause of the host of a few beats would be taken for the silence of an axis.
 SILENT_AT_LEAST_NS = 100_000_000
-_STANDS_RAD_S = 0.1
+_STATIONARY_RAD_S = 0.1
 _CLOSED_LOOP_STEP = 3
 _ESTOP = 0x02
 _HOST_COMMANDS = frozenset({0x06, 0x07, 0x0B, 0x0C, 0x0D, 0x0E, 0x0F, 0x16, 0x18, 0x19, 0x1A, 0x1B})
@@ -65,7 +65,7 @@ class _Axis:
     """State of one ODrive node; turns are of the motor."""
 
     node: int
-    heard_ns: int | None = None
+    received_ns: int | None = None
     state: int = AxisState.UNDEFINED
     error: int = 0
     beats_armed: int = 0
@@ -87,7 +87,7 @@ class OdrivePort(Port):
     @property
     def seen(self) -> Controllers:
         """State of the axes, as received last."""
-        silent = ", ".join(str(axis.node) for axis in self._all if axis.heard_ns is None)
+        silent = ", ".join(str(axis.node) for axis in self._all if axis.received_ns is None)
         unheard = f"no heartbeat of node {silent}; is it switched on, at this bit rate, at this id?"
         stopped = any(axis.error & ESTOP_ERROR[self._generation] for axis in self._all)
         faulty = [axis for axis in self._all if axis.error and not self._is_idle_watchdog(axis)]
@@ -95,7 +95,7 @@ class OdrivePort(Port):
             missing=None if self._questions.known else unheard if silent else "asking the nodes for their version",
             refused=self._questions.refusal,
             stopped="emergency stop; the wheels coast. Remove its cause, then reset" if stopped else None,
-            faulty="; ".join(f"node {axis.node}: {self._words(axis)}" for axis in faulty) or None,
+            faulty="; ".join(f"node {axis.node}: {self._fault_text(axis)}" for axis in faulty) or None,
             energised=self._any_closed_loop,
         )
 
@@ -125,19 +125,19 @@ class OdrivePort(Port):
         estop = ESTOP_ERROR[self._generation]
         return all(axis.error & estop and axis.state != AxisState.CLOSED_LOOP for axis in self._all)
 
-    def begin_anew(self, now_ns: int) -> None:
+    def reset_state(self, now_ns: int) -> None:
         """Clear what the axes reported."""
-        self._questions.begin_anew(now_ns)
+        self._questions.reset_state(now_ns)
         for axis in self._all:
-            axis.heard_ns = None
+            axis.received_ns = None
             axis.state, axis.error, axis.beats_armed = AxisState.UNDEFINED, 0, 0
-            axis.turned.begin_anew()
+            axis.turned.reset_state()
 
-    def take(self, received: ReceivedFrame, permit: MotionPermit) -> Heard:
+    def handle(self, received: ReceivedFrame, permit: MotionPermit) -> FrameReport:
         """Take in a frame of an axis, or of another host."""
         frame, t_ns = received.frame, received.t_ns
-        if self._questions.take_parameter(frame):
-            return Heard(said=self._questions.news())
+        if self._questions.handle_parameter(frame):
+            return FrameReport(message=self._questions.new_messages())
         decoded = protocol.decode(self._generation, frame)
         if decoded is None and self._generation is Generation.V05:
             # What 0.5 never sends: an answer for the version.
@@ -148,30 +148,30 @@ class OdrivePort(Port):
         axis = self._axes[decoded.node]
         match decoded.name:
             case "Heartbeat":
-                return self._take_heartbeat(axis, decoded.values, t_ns)
+                return self._handle_heartbeat(axis, decoded.values, t_ns)
             case "Get_Version":
-                self._questions.take_version(decoded.values)
-                return Heard(said=self._questions.news())
+                self._questions.handle_version(decoded.values)
+                return FrameReport(message=self._questions.new_messages())
             case "Get_Encoder_Estimates":
-                return self._take_estimate(axis, decoded.values, t_ns, permit.looked_ns)
-        return Heard()
+                return self._handle_estimate(axis, decoded.values, t_ns, permit.looked_ns)
+        return FrameReport()
 
     def sources(self) -> Sequence[Source]:
         """Return the sources that must report again and again: the heartbeats of every axis."""
         silent_ns = max(SILENT_BEATS * self._settings.heartbeat_s * 1e9, SILENT_AT_LEAST_NS)
         gone_ns = max(2.0 * silent_ns, 5e8)
-        return [Source(f"node {axis.node}", axis.heard_ns, silent_ns, gone_ns) for axis in self._all]
+        return [Source(f"node {axis.node}", axis.received_ns, silent_ns, gone_ns) for axis in self._all]
 
     def objection(self, permit: MotionPermit) -> Objection | None:
         """Return what ends a drive: an error, or an axis that has left closed loop by itself."""
         for axis in self._all:
             if permit.stage is Stage.ARMED and (axis.error or axis.state != AxisState.CLOSED_LOOP):
                 idles = f"it left closed loop by itself, for state {axis.state}"
-                return Objection(f"node {axis.node}: {self._words(axis) if axis.error else idles}")
+                return Objection(f"node {axis.node}: {self._fault_text(axis) if axis.error else idles}")
             if permit.stage is Stage.ARMING and axis.error and not self._is_idle_watchdog(axis):
-                return Objection(f"node {axis.node} did not arm: {self._words(axis)}")
+                return Objection(f"node {axis.node} did not arm: {self._fault_text(axis)}")
             if permit.stage in (Stage.STOPPING, Stage.BRAKING) and axis.error:
-                return Objection(f"node {axis.node}: {self._words(axis)}")
+                return Objection(f"node {axis.node}: {self._fault_text(axis)}")
         return None
 
     def prepare(self, now_ns: int, permit: MotionPermit) -> Pending | None:
@@ -224,9 +224,9 @@ class OdrivePort(Port):
         """Bring axes that are energised to idle; reset; learn the version; keep idle axes from a watchdog error."""
         if self._any_closed_loop:
             return self._state_frames(AxisState.IDLE) if self._is_due(now_ns) else ()
-        if permit.wanted is Request.RESET and self._may_be_cleared:
+        if permit.target is Request.RESET and self._may_be_cleared:
             return self._clear_frames() if self._is_due(now_ns, 2 * REPEAT_NS) else ()
-        return self._questions.due(now_ns, all(axis.heard_ns is not None for axis in self._all))
+        return self._questions.due(now_ns, all(axis.received_ns is not None for axis in self._all))
 
     def may_reset(self, now_ns: int) -> bool:
         """Whether errors were cleared a while ago, and none has come since."""
@@ -260,7 +260,7 @@ class OdrivePort(Port):
         if silent:
             return f"node {', '.join(silent)} sends no encoder estimates; switch them on (odrivetool)"
         fastest = max(abs(axis.turned.speed) for axis in self._all) * 2.0 * math.pi / self._settings.gear
-        return "a motor turns; wait until it stands" if fastest > _STANDS_RAD_S else None
+        return "a motor turns; wait until it stands" if fastest > _STATIONARY_RAD_S else None
 
     def _each(self, name: str, **values: int) -> list[Frame]:
         return [protocol.encode(self._generation, axis.node, name, **values) for axis in self._all]
@@ -271,30 +271,30 @@ class OdrivePort(Port):
     def _clear_frames(self) -> list[Frame]:
         return self._each("Clear_Errors", **({"identify": 0} if self._generation is Generation.V06 else {}))
 
-    def _take_heartbeat(self, axis: _Axis, values: Mapping[str, float], t_ns: int) -> Heard:
+    def _handle_heartbeat(self, axis: _Axis, values: Mapping[str, float], t_ns: int) -> FrameReport:
         state, error = int(values["axis_state"]), int(values["axis_error"])
         busy = f"node {axis.node} is in state"
         restarted = None
         if state not in _QUIET:
             restarted = f"node {axis.node} calibrates or moves by itself (state {state})"
-            self.begin_anew(t_ns)
+            self.reset_state(t_ns)
             self._questions.refusal = f"{busy} {state}: wait until odrivetool has done with it"
         elif self._questions.refusal is not None and self._questions.refusal.startswith(busy):
             self._questions.refusal = None
-        axis.heard_ns, axis.state, axis.error = t_ns, state, error
+        axis.received_ns, axis.state, axis.error = t_ns, state, error
         energised = state == AxisState.CLOSED_LOOP and error == 0
         axis.beats_armed = axis.beats_armed + 1 if energised and self._arm_step > _CLOSED_LOOP_STEP else 0
-        return Heard(is_status=True, restarted=restarted, said=self._questions.news())
+        return FrameReport(is_status=True, restarted=restarted, message=self._questions.new_messages())
 
-    def _take_estimate(self, axis: _Axis, values: Mapping[str, float], t_ns: int, looked_ns: int) -> Heard:
+    def _handle_estimate(self, axis: _Axis, values: Mapping[str, float], t_ns: int, looked_ns: int) -> FrameReport:
         position, speed = float(values["pos_turns"]), float(values["vel_turns_s"])
         if not (math.isfinite(position) and math.isfinite(speed)):
-            return Heard(counts=("frames_accepted", "implausible_values"), wheels=self._sample(t_ns))
+            return FrameReport(counts=("frames_accepted", "implausible_values"), wheels=self._sample(t_ns))
         # A 32-bit float's own steps grow with the distance.
         slack = 0.05 + 2.0**-22 * abs(position)
-        plausible = axis.turned.take(position, t_ns, looked_ns, 1.5 * self._settings.vel_limit_turns_s, slack)
+        plausible = axis.turned.add(position, t_ns, looked_ns, 1.5 * self._settings.vel_limit_turns_s, slack)
         axis.turned.speed = speed
-        return Heard(counts=Heard().counts if plausible else IMPLAUSIBLE, wheels=self._sample(t_ns))
+        return FrameReport(counts=FrameReport().counts if plausible else IMPLAUSIBLE, wheels=self._sample(t_ns))
 
     def _sample(self, t_ns: int) -> WheelSample | None:
         if not all(axis.turned.is_new for axis in self._all):
@@ -302,18 +302,18 @@ class OdrivePort(Port):
         turned = [[axis.turned for axis in side] for side in self._sides]
         return parts.wheel_sample(t_ns, turned, self._settings.direction, 2.0 * math.pi / self._settings.gear)
 
-    def _unused(self, frame: Frame) -> Heard:
+    def _unused(self, frame: Frame) -> FrameReport:
         node, command = protocol.split(frame.can_id)
         if frame.extended or node not in self._axes:
             return UNKNOWN
         if command == _ESTOP:
-            return Heard(counts=("unknown_id",), is_stop=True)
+            return FrameReport(counts=("unknown_id",), is_stop=True)
         if command in _HOST_COMMANDS and frame.data:
-            return Heard(counts=("unknown_id",), commanded=f"node {node}")
+            return FrameReport(counts=("unknown_id",), commanded=f"node {node}")
         return UNKNOWN if len(frame.data) == 8 else REJECTED_LENGTH
 
-    def _words(self, axis: _Axis) -> str:
-        return error_words(self._generation, axis.error)
+    def _fault_text(self, axis: _Axis) -> str:
+        return error_text(self._generation, axis.error)
 
 
 DRIVER = MotorDriver(

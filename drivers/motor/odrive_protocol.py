@@ -153,7 +153,7 @@ def encode(generation: Generation, node: int, name: str, **values: Value) -> Fra
     return Frame(identifier(node, layout.command), data)
 
 
-def ask(node: int, command: int) -> Frame:
+def request_frame(node: int, command: int) -> Frame:
     """Return the frame that asks for a telemetry message once; on 0.5 it feeds the watchdog."""
     return Frame(identifier(node, command), b"")
 
@@ -238,7 +238,7 @@ _ERRORS: Mapping[Generation, Mapping[int, str]] = MappingProxyType(
     }
 )
 
-_HEARD = 3
+_RECEIVED = 3
 _Endpoint = Annotated[int, Meta(ge=0, le=65535)]
 
 
@@ -279,10 +279,10 @@ class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         return None
 
 
-def error_words(generation: Generation, error: int) -> str:
+def error_text(generation: Generation, error: int) -> str:
     """Return the meaning of the bits of an axis' error as text."""
-    said = [text for bit, text in _ERRORS[generation].items() if error & bit]
-    return "; ".join(said) or f"error {error:#x}"
+    texts = [text for bit, text in _ERRORS[generation].items() if error & bit]
+    return "; ".join(texts) or f"error {error:#x}"
 
 
 def stop_frames(settings: OdriveSettings) -> tuple[Frame, ...]:
@@ -311,7 +311,7 @@ def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
     beats, estimates = (
         [one.node for one in decoded if one.name == name] for name in ("Heartbeat", "Get_Encoder_Estimates")
     )
-    nodes = sorted({node for node in beats if min(beats.count(node), estimates.count(node)) >= _HEARD})
+    nodes = sorted({node for node in beats if min(beats.count(node), estimates.count(node)) >= _RECEIVED})
     return {"nodes": in_sides(nodes)} if len(nodes) > 1 else None
 
 
@@ -365,45 +365,45 @@ class Questions:
     def __init__(self, settings: OdriveSettings) -> None:
         self._settings = settings
         self._nodes = all_of(settings.nodes)
-        self.begin_anew(0)
+        self.reset_state(0)
 
-    def begin_anew(self, now_ns: int) -> None:
+    def reset_state(self, now_ns: int) -> None:
         """Clear everything that is known of the nodes."""
         self.known, self.version = False, ""
         self.refusal: str | None = None
-        self._said: str | None = None
+        self._message: str | None = None
         self._is_met = False
         self._watchdogs = {node: _Watchdog() for node in self._nodes}
         self._version_tries = self._watchdog_tries = 0
-        self._asked_ns = now_ns - _PERIOD_NS
+        self._requested_ns = now_ns - _PERIOD_NS
 
-    def news(self) -> str | None:
+    def new_messages(self) -> str | None:
         """Return what is to be said, once."""
-        said, self._said = self._said, None
-        return said
+        message, self._message = self._message, None
+        return message
 
-    def due(self, now_ns: int, all_are_heard: bool) -> list[Frame]:
+    def due(self, now_ns: int, all_are_received: bool) -> list[Frame]:
         """Return the questions that are due now; only of nodes that idle, as each feeds their watchdogs."""
         waits = self.known or self.refusal is not None
-        if now_ns - self._asked_ns < (_ALIVE_PERIOD_NS if waits else _PERIOD_NS):
+        if now_ns - self._requested_ns < (_ALIVE_PERIOD_NS if waits else _PERIOD_NS):
             return []
-        if not (waits or self._is_met or all_are_heard):
+        if not (waits or self._is_met or all_are_received):
             return []
-        self._asked_ns = now_ns
+        self._requested_ns = now_ns
         if waits:
             number = TELEMETRY[self._settings.generation]["Get_Bus_Voltage_Current"].command
-            return [ask(node, number) for node in self._nodes]
+            return [request_frame(node, number) for node in self._nodes]
         return self._for_watchdogs() if self._is_met else self._for_version()
 
-    def take_version(self, values: Mapping[str, float]) -> None:
+    def handle_version(self, values: Mapping[str, float]) -> None:
         """Handle a reply with the version."""
         if self._settings.generation is Generation.V05:
             self.refusal = 'the nodes answer for their version, which 0.5 does not; write link.firmware = "0.6"'
         elif not self._is_met:
             version = ".".join(str(values[f"fw_{part}"]) for part in ("major", "minor", "revision"))
-            self._meet(version)
+            self._complete_handshake(version)
 
-    def take_parameter(self, frame: Frame) -> bool:
+    def handle_parameter(self, frame: Frame) -> bool:
         """Whether the frame answers for a watchdog, which is then judged."""
         node, _ = split(frame.can_id)
         if node not in self._watchdogs or self._settings.watchdog_endpoints is None or not self._is_met:
@@ -416,22 +416,22 @@ class Questions:
         watchdog = self._watchdogs[node]
         watchdog.is_on = watchdog.is_on if is_on is None else bool(is_on)
         watchdog.timeout_s = watchdog.timeout_s if timeout_s is None else float(timeout_s)
-        wanted_s = self._settings.watchdog_s
+        configured_s = self._settings.watchdog_s
         if watchdog.is_on is False:
             self.refusal = f"node {node}: its watchdog is off; set axis0.config.enable_watchdog (odrivetool)"
-        elif watchdog.timeout_s is not None and not abs(watchdog.timeout_s - wanted_s) <= _SAME_TIMEOUT_S:
-            self.refusal = f"node {node}: its watchdog waits {watchdog.timeout_s:g} s; set {wanted_s:g} s there"
+        elif watchdog.timeout_s is not None and not abs(watchdog.timeout_s - configured_s) <= _SAME_TIMEOUT_S:
+            self.refusal = f"node {node}: its watchdog waits {watchdog.timeout_s:g} s; set {configured_s:g} s there"
         elif not self.known and all(one.is_on and one.timeout_s is not None for one in self._watchdogs.values()):
-            self._announce(f", watchdog {wanted_s:g} s")
+            self._announce(f", watchdog {configured_s:g} s")
         return True
 
     def _for_version(self) -> list[Frame]:
         self._version_tries += 1
         if self._version_tries <= VERSION_TRIES:
-            return [ask(node, GET_VERSION) for node in self._nodes]
+            return [request_frame(node, GET_VERSION) for node in self._nodes]
         if self._settings.generation is Generation.V05:
             # That generation does not know the question.
-            self._meet()
+            self._complete_handshake()
         else:
             self.refusal = 'the nodes do not answer for their version as 0.6 does; write link.firmware = "0.5"'
         return []
@@ -446,7 +446,7 @@ class Questions:
             return []
         return [read_parameter(node, number) for node in waiting for number in endpoints]
 
-    def _meet(self, version: str = "") -> None:
+    def _complete_handshake(self, version: str = "") -> None:
         self._is_met, self.version = True, version
         if self._settings.watchdog_endpoints is None:
             self._announce()
@@ -455,4 +455,4 @@ class Questions:
         self.known = True
         nodes = ", ".join(map(str, self._nodes))
         version = self.version and f", firmware {self.version}"
-        self._said = f"nodes {nodes} are there: ODrive {self._settings.firmware}{version}{watchdog}"
+        self._message = f"nodes {nodes} are there: ODrive {self._settings.firmware}{version}{watchdog}"

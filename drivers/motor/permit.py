@@ -21,7 +21,7 @@ _LONGEST_STEP_S = 0.1
 # Longer than a period at the slowest rate, 50 ms; with the 20 ms between two messages still shorter than the 100 ms
 # after which the first driver calls its controllers silent.
 _PAUSE_NS = 75_000_000
-STANDS_BY = "it stands by"
+ON_STANDBY = "it stands by"
 STOPPED_FROM_OUTSIDE = "stopped from outside on the link, by `disco-hw estop` or another host"
 
 
@@ -73,8 +73,8 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
     link_is_up: bool = False
     stage: Stage = Stage.REST
     since_ns: int | None = None
-    wanted: Request = Request.STANDBY
-    note: str = STANDS_BY
+    target: Request = Request.STANDBY
+    note: str = ON_STANDBY
     fault: str | None = None
     estopped: bool = False
     shared: bool = False
@@ -110,7 +110,7 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
             return DriverState.STOPPING
         if self.stage is Stage.ARMING:
             return DriverState.ARMING
-        return DriverState.READY if self.wanted is Request.READY else DriverState.STANDBY
+        return DriverState.READY if self.target is Request.READY else DriverState.STANDBY
 
     def detail(self, seen: Controllers) -> str:
         """Return why the state is what it is, and what to do about it."""
@@ -141,12 +141,12 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         holds = self.stage is Stage.ARMED or (self.stage is Stage.STOPPING and any(self.speeds))
         return holds and now_ns - self.fed_ns > timeout_s * 1e9
 
-    def silent_ns(self, heard_ns: int) -> int:
-        """Return how long nothing has come since `heard_ns`, of the time in which the host looked without a pause.
+    def silent_ns(self, received_ns: int) -> int:
+        """Return how long nothing has come since `received_ns`, of the time in which the host looked without a pause.
 
         What was not heard in a pause is no silence of the controllers: the host was not there, or has not read yet.
         """
-        return self.looked_ns - max(heard_ns, self.attentive_ns)
+        return self.looked_ns - max(received_ns, self.attentive_ns)
 
     def looked(self, now_ns: int) -> MotionPermit:
         """Return the permit after the host has looked at its controllers, once in each tick."""
@@ -159,26 +159,26 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
 
     def restarted(self, why: str, event: str | None = None) -> MotionPermit:
         """Return the permit for controllers that must be synchronised again; what is latched stays."""
-        note = f"disarmed: {why}" if self.wanted is Request.ARM else self.note
-        met_anew = replace(self._idled(note), shared=False)
-        return met_anew if event is None else met_anew.saying(event)
+        note = f"disarmed: {why}" if self.target is Request.ARM else self.note
+        permit_after = replace(self._idled(note), shared=False)
+        return permit_after if event is None else permit_after.with_event(event)
 
     def requested(self, request: Request, seen: Controllers) -> MotionPermit:
         """Return the permit after a request of the host.
 
         ARM is accepted only of controllers that stand by and are fit, and each time it is requested again.
         """
-        if request is self.wanted:
+        if request is self.target:
             return self
         if request is Request.ARM:
             if not self.may_arm(seen):
                 return replace(self, note=f"not arming: {self.detail(seen)}")
             return replace(
-                self, wanted=request, stage=Stage.ARMING, since_ns=None, zeros=0, speeds=(0.0, 0.0), note="arming"
+                self, target=request, stage=Stage.ARMING, since_ns=None, zeros=0, speeds=(0.0, 0.0), note="arming"
             )
         if self.stage in (Stage.ARMING, Stage.ARMED):
-            return replace(self, wanted=request, stage=Stage.STOPPING, since_ns=None, note="stopping as asked")
-        return replace(self, wanted=request)
+            return replace(self, target=request, stage=Stage.STOPPING, since_ns=None, note="stopping as asked")
+        return replace(self, target=request)
 
     def begun(self, now_ns: int) -> MotionPermit:
         """Return the permit with the stage's time running from its first tick."""
@@ -228,37 +228,39 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
     def lost(self, why: str) -> MotionPermit:
         """One controller, or its host, is lost: all stop, and that stays a fault until a reset."""
         stopped = replace(self._idled(f"disarmed: {why}"), stage=self.after_loss, fault=why)
-        return stopped.saying(f"disarmed: {why}")
+        return stopped.with_event(f"disarmed: {why}")
 
     def stopped(self) -> MotionPermit:
         """Return the permit after an emergency stop was sent from here."""
         return replace(self._idled("emergency stop sent"), stage=self.after_loss, estopped=True)
 
-    def stop_heard(self) -> MotionPermit:
+    def stop_received(self) -> MotionPermit:
         """Return the permit after an emergency stop was received that somebody else sent; reported once."""
         stopped = replace(self._idled(self.note), stage=self.after_loss, estopped=True)
-        return stopped if self.estopped else stopped.saying(STOPPED_FROM_OUTSIDE)
+        return stopped if self.estopped else stopped.with_event(STOPPED_FROM_OUTSIDE)
 
-    def command_heard(self, whom: str) -> MotionPermit:
+    def command_received(self, whom: str) -> MotionPermit:
         """Return the permit after another host has commanded `whom`; a fault unless the controllers are at rest."""
-        said = self if self.shared else self.saying(f"another host is on the link: it commands {whom}; disconnect it")
-        said = replace(said, shared=True)
-        return said if self.stage is Stage.REST else said.lost(f"another host commands {whom}; disconnect it")
+        noted = (
+            self if self.shared else self.with_event(f"another host is on the link: it commands {whom}; disconnect it")
+        )
+        noted = replace(noted, shared=True)
+        return noted if self.stage is Stage.REST else noted.lost(f"another host commands {whom}; disconnect it")
 
     def reset(self, seen: Controllers) -> MotionPermit:
         """Clear what is latched, when that is wanted of controllers at rest that have reported and are well.
 
         Those that are refused may be reset: nothing arms them.
         """
-        heard = seen.missing is None or seen.refused is not None
-        well = heard and seen.stopped is None and seen.faulty is None and not seen.energised
-        if self.stage is not Stage.REST or self.wanted is not Request.RESET or not well:
+        is_known = seen.missing is None or seen.refused is not None
+        well = is_known and seen.stopped is None and seen.faulty is None and not seen.energised
+        if self.stage is not Stage.REST or self.target is not Request.RESET or not well:
             return self
-        return replace(self, fault=None, estopped=False, wanted=Request.STANDBY, note=STANDS_BY)
+        return replace(self, fault=None, estopped=False, target=Request.STANDBY, note=ON_STANDBY)
 
-    def saying(self, event: str) -> MotionPermit:
+    def with_event(self, event: str) -> MotionPermit:
         """Return the permit with one more event for the operator."""
         return replace(self, events=(*self.events, event))
 
     def _idled(self, note: str) -> MotionPermit:
-        return replace(self, wanted=Request.STANDBY, stage=self.idle, since_ns=None, note=note)
+        return replace(self, target=Request.STANDBY, stage=self.idle, since_ns=None, note=note)

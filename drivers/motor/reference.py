@@ -82,7 +82,7 @@ class ReferenceDriver:
         self._house_keeping = HouseKeeping(self._transmission, codec.dbc_hash)
         self._clock = DeviceClock()
         self._telemetry = telemetry.Telemetry(self._clock)
-        self._handlers = self._make_handlers()
+        self._handlers = self._create_handlers()
         self._arming = Arming(codec.dbc_hash, draw_session)
         self._handshake = self._new_handshake()
         self._blocker_bits = codec.choices("SESSION_STATE", "blockers")
@@ -94,7 +94,7 @@ class ReferenceDriver:
         self._device_us: int | None = None
         self._reported_clock_errors: int | None = None
         self._clock_errors = 0
-        self._last_heard_ns = 0
+        self._last_received_ns = 0
         self._events: list[str] = []
         self._foreign_reported = False
         self._released: str | None = None
@@ -115,7 +115,7 @@ class ReferenceDriver:
             return DriverState.FAULT
         if self._arming.armed:
             return DriverState.ARMED
-        if state is DriverState.STANDBY and self._arming.wanted is Request.ARM:
+        if state is DriverState.STANDBY and self._arming.target is Request.ARM:
             return DriverState.ARMING
         return DriverState.READY if self._arming.ready else state
 
@@ -215,7 +215,7 @@ class ReferenceDriver:
             decoded = self._reception.accept(received)
             if decoded is None:
                 continue
-            self._last_heard_ns = min(received.t_ns, now_ns)
+            self._last_received_ns = min(received.t_ns, now_ns)
             self._handle(decoded, received.t_ns, collected)
         self._check_liveness(now_ns)
         self._report_outside_stop(stopped_ns)
@@ -307,7 +307,7 @@ class ReferenceDriver:
         if sample is not None:
             collected.setdefault(kind, []).append(sample)
 
-    def _make_handlers(self) -> dict[str, tuple[str, Callable[[Decoded, int], Any]]]:
+    def _create_handlers(self) -> dict[str, tuple[str, Callable[[Decoded, int], Any]]]:
         """Return, by message name, the field of `Readings` and the function that makes a sample of a frame."""
         return {
             **dict.fromkeys(telemetry.WHEEL_MESSAGES, ("wheels", self._telemetry.wheels)),
@@ -327,7 +327,7 @@ class ReferenceDriver:
 
     def _on_handshake(self, decoded: Decoded, _received_ns: int) -> None:
         before, refusal = (self.identity, self.limits), self._handshake.refusal
-        self._handshake.take(decoded)
+        self._handshake.handle(decoded)
         identity, limits = self.identity, self.limits
         ticks_per_rev = limits and limits.ticks_per_rev
         if identity and limits and ticks_per_rev and (identity, limits) != before:
@@ -355,7 +355,7 @@ class ReferenceDriver:
             fault = f", fault {status_codes.fault(status.fault)}" if status.fault_code else ""
             came_from = before.state if before is not None else "unknown"
             self._events.append(f"robot {came_from} -> {status.state}{fault}")
-        self._arming.take_status(status.state, status.session, status.stop_cause, status.reject_reason)
+        self._arming.handle_status(status.state, status.session, status.stop_cause, status.reject_reason)
         self._watch.reported(int(values["last_command_counter"]), received_ns)
         return status
 
@@ -364,7 +364,7 @@ class ReferenceDriver:
         self._host_accepted = bool(values["host_accepted"])
         bits = int(values["blockers"])
         blockers = tuple(name for bit, name in self._blocker_bits.items() if bits & bit)
-        self._arming.take_session(int(values["challenge"]), int(values["session"]), blockers, received_ns)
+        self._arming.handle_session(int(values["challenge"]), int(values["session"]), blockers, received_ns)
         self._count_clock_errors(int(values["clock_error_count"]))
 
     def _report_outside_stop(self, before_ns: int | None) -> None:
@@ -381,7 +381,7 @@ class ReferenceDriver:
             self._events.append("the robot's controller found its clock set back and goes on with a time of its own")
 
     def _on_time(self, decoded: Decoded, received_ns: int) -> None:
-        sent_ns = self._house_keeping.asked_time_ns(int(decoded.values["sequence"]))
+        sent_ns = self._house_keeping.requested_time_ns(int(decoded.values["sequence"]))
         if sent_ns is None:
             return
         device_us = int(decoded.values["receive_time"])
@@ -401,7 +401,7 @@ class ReferenceDriver:
         """Start afresh with a robot that has fallen silent or has sample times that contradict its clock."""
         refused = self._handshake.refusal is not None
         known = refused or self._status is not None or self.identity is not None
-        if known and now_ns - self._last_heard_ns > (REFUSED_SILENCE_NS if refused else SILENCE_NS):
+        if known and now_ns - self._last_received_ns > (REFUSED_SILENCE_NS if refused else SILENCE_NS):
             self._restart("the robot fell silent")
             self._events.append("the robot fell silent: new handshake")
         objection = self._watch.objection(now_ns) if self._arming.armed else None
@@ -409,18 +409,18 @@ class ReferenceDriver:
             self._arming.give_up(f"disarmed: {objection}")
             self._events.append(f"disarmed: {objection}")
         if self._telemetry.distrusts_clock:
-            self._clock.forget()
+            self._clock.clear()
             self._telemetry.restart()
             self._events.append("sample times contradict the robot's clock: synchronising anew")
 
     def _restart(self, why: str) -> None:
         self._handshake = self._new_handshake()
         self._reception.reset()
-        self._transmission.forget()
+        self._transmission.clear()
         self._arming.reset(why)
         self._telemetry.restart()
-        self._clock.forget()
-        self._house_keeping.forget()
+        self._clock.clear()
+        self._house_keeping.clear()
         self._device_us = None
         self._status = None
         self._host_accepted = False
@@ -447,14 +447,14 @@ def _check(command: WheelCommand) -> None:
         raise ValueError(f"not a wheel command: {command}")
 
 
-def _make(_settings: NoSettings, key: bytes | None) -> ReferenceDriver:
+def _create(_settings: NoSettings, key: bytes | None) -> ReferenceDriver:
     # Session ids are unpredictable, so that no old one fits by accident.
     return ReferenceDriver(Codec(), lambda: secrets.randbits(16), key)
 
 
 DRIVER = MotorDriver(
     "reference",
-    _make,
+    _create,
     stop_frames=protocol.stop_frames,
     stop_confirmation=protocol.stop_confirmation,
     cyclic_frames=lambda _settings, rate_hz, authenticated: protocol.cyclic_frames(
@@ -464,5 +464,5 @@ DRIVER = MotorDriver(
     recognise=protocol.recognise,
     kinds=("can", "serial"),
     authenticates=True,
-    tells_reception=True,
+    reports_reception=True,
 )

@@ -15,7 +15,7 @@ from firmware_protocol.protection import COUNTER_MODULUS, challenge_answer
 _REMEMBERED = 256
 STATE_TIMEOUT_NS = 500_000_000
 # Above the 100 ms after which the robot stops by itself, so that no pause of this host alone looks like a slow link.
-LATE_NS = 150_000_000
+DELAY_NS = 150_000_000
 
 
 class ArmedWatch:
@@ -30,7 +30,7 @@ class ArmedWatch:
         self.silent = 0
         self._echo = CommandEcho()
         self._reported_ns: int | None = None
-        self._late_ns = 0
+        self._delay_ns = 0
 
     def sent(self, number: int, now_ns: int) -> None:
         """Remember a wheel command, by its number since the driver was made."""
@@ -38,20 +38,20 @@ class ArmedWatch:
 
     def rest(self) -> None:
         """Expect nothing, because nothing is commanded."""
-        self._echo.forget()
+        self._echo.clear()
         self._reported_ns = None
-        self._late_ns = 0
+        self._delay_ns = 0
 
     def reported(self, last_command_counter: int, received_ns: int) -> None:
         """Store the reception of SYSTEM_STATE, with the delay of the command that it echoes."""
         self._reported_ns = received_ns
-        self._late_ns = self._echo.late_ns(last_command_counter, received_ns)
+        self._delay_ns = self._echo.delay_ns(last_command_counter, received_ns)
 
     def objection(self, now_ns: int) -> str | None:
         """Return why a robot that is armed must not stay so, None while all is well; counts each call that objects."""
-        if self._late_ns > LATE_NS:
+        if self._delay_ns > DELAY_NS:
             self.late += 1
-            return f"commands reach the robot over {self._late_ns * 1e-9:.2f} s late; see what holds up the link"
+            return f"commands reach the robot over {self._delay_ns * 1e-9:.2f} s late; see what holds up the link"
         if self._reported_ns is not None and now_ns - self._reported_ns > STATE_TIMEOUT_NS:
             self.silent += 1
             return f"the robot has not sent its state for {STATE_TIMEOUT_NS * 1e-9:g} s"
@@ -69,19 +69,19 @@ class CommandEcho:
         self._waiting: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)
         self._last = 0
         self._last_when_reported = 0
-        self._taken: int | None = None
+        self._accepted: int | None = None
 
     def sent(self, number: int, now_ns: int) -> None:
         """Remember the command of this number, whose frame has the number modulo 16 as its counter."""
         self._waiting.append((number, now_ns))
         self._last = number
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Expect no more of what was sent so far."""
         self._waiting.clear()
-        self._taken = None
+        self._accepted = None
 
-    def late_ns(self, counter: int, received_ns: int) -> int:
+    def delay_ns(self, counter: int, received_ns: int) -> int:
         """Return how long before `received_ns` the oldest command was sent that the robot had not taken; 0 for none.
 
         `counter` is that of the last command it took. It has four bits: where sixteen commands or more were sent since
@@ -90,20 +90,20 @@ class CommandEcho:
         waiting = self._waiting
         if not waiting:
             return 0
-        taken = self._find_taken(counter)
-        if taken >= waiting[0][0] or self._taken is not None:
-            self._taken = taken
+        accepted = self._find_accepted(counter)
+        if accepted >= waiting[0][0] or self._accepted is not None:
+            self._accepted = accepted
         self._last_when_reported = self._last
-        while waiting and waiting[0][0] <= taken:
+        while waiting and waiting[0][0] <= accepted:
             waiting.popleft()
         return received_ns - waiting[0][1] if waiting else 0
 
-    def _find_taken(self, counter: int) -> int:
-        last, before = self._last, self._taken
+    def _find_accepted(self, counter: int) -> int:
+        last, before = self._last, self._accepted
         if before is not None and last - self._last_when_reported < COUNTER_MODULUS:
-            taken = before + (counter - before) % COUNTER_MODULUS
-            if taken <= last:
-                return taken
+            accepted = before + (counter - before) % COUNTER_MODULUS
+            if accepted <= last:
+                return accepted
         return last - (last - counter) % COUNTER_MODULUS
 
 
@@ -137,7 +137,7 @@ class Arming:
         """`draw_session` returns any non-negative integer, best at random."""
         self._dbc_hash = dbc_hash
         self._draw_session = draw_session
-        self.wanted = Request.STANDBY
+        self.target = Request.STANDBY
         self.session = 0
         self.sessions = 0
         self.note = ""
@@ -146,23 +146,23 @@ class Arming:
         self._opened = False
         self._spent = False
         self._was_armed = False
-        self._asked_ns: int | None = None
+        self._requested_ns: int | None = None
         self._robot_state = "BOOT"
         self._robot_session = 0
         self._reject_reason = "NONE"
         self._blockers: tuple[str, ...] = ()
         self._challenge = (0, 0)
-        self._answer = challenge_answer(0, 0, dbc_hash)
+        self._response = challenge_answer(0, 0, dbc_hash)
 
     @property
     def armed(self) -> bool:
         """Whether the robot is armed in our session and is to stay so."""
-        return self.wanted is Request.ARM and self._robot_state == "ARMED" and self._ours and not self._spent
+        return self.target is Request.ARM and self._robot_state == "ARMED" and self._ours and not self._spent
 
     @property
     def needs_zeros(self) -> bool:
         """Whether the robot waits for zero commands before it arms."""
-        return self.wanted is Request.ARM and self._robot_state == "READY" and self._ours and not self._spent
+        return self.target is Request.ARM and self._robot_state == "READY" and self._ours and not self._spent
 
     @property
     def ready(self) -> bool:
@@ -175,14 +175,14 @@ class Arming:
 
     def request(self, request: Request) -> None:
         """Set what the host wants; only asking for ARM keeps an armed session."""
-        if request is self.wanted:
+        if request is self.target:
             return
         if request is Request.ARM:
             self.note = ""
-        elif self._opened and (self.wanted is Request.ARM or request is not Request.READY):
+        elif self._opened and (self.target is Request.ARM or request is not Request.READY):
             self._spent = True
-        self.wanted = request
-        self._asked_ns = None
+        self.target = request
+        self._requested_ns = None
         self._was_armed = False
 
     def give_up(self, why: str) -> None:
@@ -193,13 +193,13 @@ class Arming:
 
     def reset(self, why: str) -> None:
         """Void everything agreed with the robot: the link or the robot is another one."""
-        if self.wanted is Request.ARM:
+        if self.target is Request.ARM:
             self.note = f"disarmed: {why}"
         self._void_session()
         self._set_standby()
         self._robot_state, self._robot_session = "BOOT", 0
 
-    def take_status(self, state: str, session: int, stop_cause: str, reject_reason: str) -> None:
+    def handle_status(self, state: str, session: int, stop_cause: str, reject_reason: str) -> None:
         """Take in SYSTEM_STATE, by the names of the DBC's value tables."""
         before, self._robot_state = self._robot_state, state
         self._robot_session = session
@@ -210,17 +210,17 @@ class Arming:
             self._void_session()
         if self.armed:
             self._was_armed = True
-        elif self._was_armed or (self.wanted is Request.ARM and state in _LATCHED):
+        elif self._was_armed or (self.target is Request.ARM and state in _LATCHED):
             self.give_up(f"the robot disarmed itself: {status_codes.stop_cause(stop_cause)}" if self._was_armed else "")
-        if self.wanted is Request.RESET and before in _LATCHED and state not in _LATCHED:
+        if self.target is Request.RESET and before in _LATCHED and state not in _LATCHED:
             self._set_standby()
             self.note = ""
 
-    def take_session(self, challenge: int, session: int, blockers: tuple[str, ...], now_ns: int) -> None:
+    def handle_session(self, challenge: int, session: int, blockers: tuple[str, ...], now_ns: int) -> None:
         """Handle the message SESSION_STATE; `blockers` by the names of the DBC's value table."""
         if self._challenge != (challenge, session):
             self._challenge = (challenge, session)
-            self._answer = challenge_answer(challenge, session, self._dbc_hash)
+            self._response = challenge_answer(challenge, session, self._dbc_hash)
         self._blockers = blockers
         refused = "SESSION" in blockers and self._robot_state == "STANDBY" and self.session != 0
         if refused and now_ns - self._session_since_ns > SESSION_REFUSED_AFTER_NS:
@@ -229,24 +229,24 @@ class Arming:
 
     def step(self, now_ns: int) -> None:
         """Give up an arming that takes too long, and choose a session where one is needed."""
-        if self.wanted is Request.ARM and not self._was_armed:
-            if self._asked_ns is None:
-                self._asked_ns = now_ns
-            elif now_ns - self._asked_ns > ARMING_TIMEOUT_NS:
+        if self.target is Request.ARM and not self._was_armed:
+            if self._requested_ns is None:
+                self._requested_ns = now_ns
+            elif now_ns - self._requested_ns > ARMING_TIMEOUT_NS:
                 self.give_up(f"not armed within {ARMING_TIMEOUT_NS * 1e-9:g} s: {self._why_not()}")
-        wanted = self.wanted in (Request.READY, Request.ARM)
-        if wanted and self.session == 0 and self._robot_state in ("STANDBY", "READY"):
+        is_arming = self.target in (Request.READY, Request.ARM)
+        if is_arming and self.session == 0 and self._robot_state in ("STANDBY", "READY"):
             self._choose_session(now_ns)
 
     def host_state(self) -> HostState:
         """Return the fields of HOST_STATE to send now."""
-        if self._spent or self.wanted is Request.STANDBY:
+        if self._spent or self.target is Request.STANDBY:
             return HostState("STANDBY", self.session, 0)
-        if self.wanted is Request.RESET:
+        if self.target is Request.RESET:
             return HostState("RESET", self.session, 0)
-        may_answer = self._ours and self._challenge[1] == self.session and self._robot_state in _OPEN
-        if self.wanted is Request.ARM and may_answer:
-            return HostState("ARM", self.session, self._answer)
+        may_respond = self._ours and self._challenge[1] == self.session and self._robot_state in _OPEN
+        if self.target is Request.ARM and may_respond:
+            return HostState("ARM", self.session, self._response)
         return HostState("READY", self.session, 0)
 
     def _choose_session(self, now_ns: int) -> None:
@@ -262,7 +262,7 @@ class Arming:
         self._opened = self._spent = False
 
     def _set_standby(self) -> None:
-        self.wanted = Request.STANDBY
+        self.target = Request.STANDBY
         self._was_armed = False
 
     def _why_not(self) -> str:
@@ -295,7 +295,7 @@ class Handshake:
         self.identity: Identity | None = None
         self.limits: Limits | None = None
 
-    def take(self, decoded: Decoded) -> None:
+    def handle(self, decoded: Decoded) -> None:
         """Take in a frame of one of `MESSAGES`."""
         match decoded.name:
             case "HELLO":
@@ -304,7 +304,7 @@ class Handshake:
                 self._build = decoded.values
             case _:
                 self._pages[int(decoded.values["page"])] = decoded.values
-        self.refusal = self._judge()
+        self.refusal = self._fault()
         self._gather()
 
     @property
@@ -313,7 +313,7 @@ class Handshake:
         names = {"HELLO": self._hello, "BUILD": self._build, "LIMITS": len(self._pages) == 2 or None}
         return tuple(name for name, value in names.items() if value is None)
 
-    def _judge(self) -> str | None:
+    def _fault(self) -> str | None:
         if self._hello is not None and int(self._hello["protocol_major"]) != self._major:
             theirs = f"{int(self._hello['protocol_major'])}.{int(self._hello['protocol_minor'])}"
             return (
@@ -333,13 +333,13 @@ class Handshake:
                     "give the robot's firmware the key, or take link.key_file out of robot.toml"
                 )
             return "the robot obeys only who holds its key: write link.key_file in robot.toml, the file with that key"
-        if len(self._pages) == 2 and not self._limits_make_sense():
+        if len(self._pages) == 2 and not self._limits_are_valid():
             return "the robot reports limits that make no sense (a zero among them); correct its configuration"
         return None
 
     def _gather(self) -> None:
         hello, build = self._hello, self._build
-        if hello is None or build is None or self.missing or not self._limits_make_sense():
+        if hello is None or build is None or self.missing or not self._limits_are_valid():
             self.identity = self.limits = None
             return
         speed, times = self._pages[0], self._pages[1]
@@ -359,7 +359,7 @@ class Handshake:
             drive_off_timeout_s=Limit(times["drive_off_timeout"], "device"),
         )
 
-    def _limits_make_sense(self) -> bool:
+    def _limits_are_valid(self) -> bool:
         values = {name: value for page in self._pages.values() for name, value in page.items() if name != "page"}
         return all(value > 0 for value in values.values())
 

@@ -126,11 +126,11 @@ class FrameTransmission:
         sent_ns = self._sent_ns.get(name)
         return sent_ns is None or now_ns - sent_ns >= period_ns
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Make every cyclic message due; the counters go on, so that no old frame can pass for a new one."""
         self._sent_ns.clear()
         if self._prover is not None:
-            self._prover.forget()
+            self._prover.clear()
 
     def challenge(self, nonce: int) -> None:
         """Take in the robot's nonce, to which proofs are bound."""
@@ -209,7 +209,7 @@ class Telemetry:
         """Take the next samples as they are, as after an interruption: the angles go on from where they are."""
         self._odd_stamps = 0
         if self._ticks is not None:
-            self._ticks.forget()
+            self._ticks.clear()
 
     def wheels(self, decoded: Decoded, received_ns: int) -> WheelSample | None:
         """Take in a frame of `WHEEL_MESSAGES`; return the sample that it completes."""
@@ -378,7 +378,7 @@ class WheelTicks:
         self._ticks_right = 0
         self._t_us = 0
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Take the next reading as it is: the angles go on from where they are."""
         self._ticks_left = None
 

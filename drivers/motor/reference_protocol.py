@@ -92,11 +92,11 @@ class HouseKeeping:
         self._time_sequence = 0
         self._time_requests: dict[int, int] = {}
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Expect no answer to any clock request, as after a new link."""
         self._time_requests.clear()
 
-    def asked_time_ns(self, sequence: int) -> int | None:
+    def requested_time_ns(self, sequence: int) -> int | None:
         """When the clock request of this number was sent, once; None if no such answer is expected."""
         return self._time_requests.pop(sequence, None)
 

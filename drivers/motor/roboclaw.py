@@ -13,12 +13,19 @@ from dataclasses import dataclass, field
 from drivers.motor import roboclaw_protocol as protocol
 from drivers.motor import vendor_parts as parts
 from drivers.motor.permit import Controllers, MotionPermit, Stage
-from drivers.motor.roboclaw_protocol import RoboclawExchange, RoboclawSettings, question, setting, stands, stop_frames
+from drivers.motor.roboclaw_protocol import (
+    RoboclawExchange,
+    RoboclawSettings,
+    is_stationary,
+    query,
+    setting,
+    stop_frames,
+)
 from drivers.motor.vendor_driver import (
     BRAKING_NS,
     IMPLAUSIBLE,
     UNKNOWN,
-    Heard,
+    FrameReport,
     Objection,
     Pending,
     Port,
@@ -40,7 +47,7 @@ from drivers.types import (
 )
 
 _ESTOP, _ERRORS = 0x1, 0xFFFF
-_WORDS = {
+_ERROR_TEXTS = {
     0x2: "it is too hot",
     0x4: "it is too hot",
     0x8: "the main supply's voltage is too high",
@@ -61,8 +68,8 @@ TO_KNOW = ("version", "velocity_pid_m1", "velocity_pid_m2", "status", "serial_ti
 ZEROS_TO_ARM = 5
 SILENT_NS, GONE_NS = 100_000_000, 500_000_000
 _PACE_NS = 18_000_000
-_QUESTION_LIFE_NS = 20_000_000
-_QUESTION_RANK = 2
+_QUERY_LIFE_NS = 20_000_000
+_QUERY_RANK = 2
 _LONGEST_LIFE_NS = 60_000_000
 _TIMEOUT_EVERY = 8
 """Of the slow questions every so many is for the serial timeout, the others for the errors."""
@@ -113,27 +120,27 @@ class Board:
         return bool(self.errors & _ESTOP)
 
     @property
-    def error_words(self) -> str:
+    def error_text(self) -> str:
         """Text of the board's first error, for the operator."""
         if self.is_pressed:
             return f"board {self.address}: its e-stop input is pressed"
         bit = self.errors & -self.errors
-        return f"board {self.address}: {_WORDS.get(bit, f'error {self.errors:#06x}')}"
+        return f"board {self.address}: {_ERROR_TEXTS.get(bit, f'error {self.errors:#06x}')}"
 
-    def take_counts(self, read: Mapping[str, protocol.Value], t_ns: int, looked_ns: int) -> bool:
+    def handle_counts(self, read: Mapping[str, protocol.Value], t_ns: int, looked_ns: int) -> bool:
         """Update the odometers from encoder counts; return False if the motors cannot have turned that far."""
         if not {"velocity_pid_m1", "velocity_pid_m2"} <= self.known.keys():
             return True
         first, second = self.turned
         fastest = 1.5 * self.fastest_counts_s
-        is_first_plausible = first.take_wrapping(int(read["encoder_m1"]), t_ns, looked_ns, fastest, 100.0)
-        return second.take_wrapping(int(read["encoder_m2"]), t_ns, looked_ns, fastest, 100.0) and is_first_plausible
+        is_first_plausible = first.add_wrapping(int(read["encoder_m1"]), t_ns, looked_ns, fastest, 100.0)
+        return second.add_wrapping(int(read["encoder_m2"]), t_ns, looked_ns, fastest, 100.0) and is_first_plausible
 
-    def meet_anew(self) -> None:
+    def reset_state(self) -> None:
         """Clear the board's replies, as for a new connection; the angles that its motors have turned are kept."""
         self.known, self.waits_ns, self.timeout_ds = {}, None, None
         for motor in self.turned:
-            motor.begin_anew()
+            motor.reset_state()
 
 
 class RoboclawPort(Port):
@@ -150,7 +157,7 @@ class RoboclawPort(Port):
             begins=Stage.BRAKING,
         )
         self._boards = {address: Board(address) for address in settings.addresses}
-        self._velocity_ns = self._asked_ns = 0
+        self._velocity_ns = self._requested_ns = 0
         self._slow = 0
 
     @property
@@ -162,7 +169,7 @@ class RoboclawPort(Port):
         return Controllers(
             missing=missing if silent else None,
             stopped="its e-stop input is pressed" if pressed else None,
-            faulty="; ".join(board.error_words for board in self._all if board.errors) or None,
+            faulty="; ".join(board.error_text for board in self._all if board.errors) or None,
         )
 
     @property
@@ -184,20 +191,20 @@ class RoboclawPort(Port):
     @property
     def is_stopped(self) -> bool:
         """Whether every board has taken a stop, and its motors stand."""
-        return all(board.stopped and "speeds" in board.known for board in self._all) and self._stands
+        return all(board.stopped and "speeds" in board.known for board in self._all) and self._is_stationary
 
-    def begin_anew(self, now_ns: int) -> None:
+    def reset_state(self, now_ns: int) -> None:
         """Clear what the boards reported."""
         for board in self._all:
-            board.meet_anew()
+            board.reset_state()
 
     def end_drive(self) -> None:
         """Make each board take a stop from now on."""
-        self._asked_ns = 0
+        self._requested_ns = 0
         for board in self._all:
             board.stopped, board.refuses_ns = False, None
 
-    def take(self, received: ReceivedFrame, permit: MotionPermit) -> Heard:
+    def handle(self, received: ReceivedFrame, permit: MotionPermit) -> FrameReport:
         """Take in a reply."""
         frame, t_ns = received.frame, received.t_ns
         address, command = divmod(frame.can_id, 256)
@@ -206,12 +213,12 @@ class RoboclawPort(Port):
             return UNKNOWN
         name = protocol.getter_name(command)
         if name is None:
-            return self._take_acknowledgement(board, frame, t_ns, permit.stage)
+            return self._handle_acknowledgement(board, frame, t_ns, permit.stage)
         read = protocol.reply(address, name, frame.data)
         if read is None:
-            return Heard(counts=("rejected_crc",))
+            return FrameReport(counts=("rejected_crc",))
         board.waits_ns = None
-        plausible = name != "encoders" or board.take_counts(read[0], t_ns, permit.looked_ns)
+        plausible = name != "encoders" or board.handle_counts(read[0], t_ns, permit.looked_ns)
         board.known[name] = read[0]
         if name == "speeds":
             board.turned[0].speed, board.turned[1].speed = board.speeds
@@ -221,9 +228,9 @@ class RoboclawPort(Port):
         is_new = is_status and all(each.is_new for one in self._all for each in one.turned)
         wheels = self._sample(t_ns) if is_new else None
         if plausible:
-            return Heard(is_status=is_status, wheels=wheels)
+            return FrameReport(is_status=is_status, wheels=wheels)
         jumped = f"board {address} has restarted: its counts jumped"
-        return Heard(counts=IMPLAUSIBLE, is_status=is_status, wheels=wheels, lost=jumped)
+        return FrameReport(counts=IMPLAUSIBLE, is_status=is_status, wheels=wheels, lost=jumped)
 
     def sources(self) -> Sequence[Source]:
         """Return the sources that must report again and again: each board that is known."""
@@ -237,7 +244,7 @@ class RoboclawPort(Port):
         for board in self._all:
             refused_ns = 0 if board.refuses_ns is None else permit.silent_ns(board.refuses_ns)
             if board.errors:
-                return Objection(board.error_words)
+                return Objection(board.error_text)
             if refused_ns > SILENT_NS:
                 return Objection(f"board {board.address} does not take its commands")
             if permit.stage is Stage.ARMED and board.timeout_ds != self._settings.timeout_ds:
@@ -252,17 +259,17 @@ class RoboclawPort(Port):
             for board in self._all:
                 # A board that has restarted since has forgotten its timeout.
                 board.zeros, board.stopped, board.timeout_ds = 0, False, None
-        if not self._stands:
+        if not self._is_stationary:
             return Pending(why="a motor turns; wait until it stands", is_final=True)
-        wanted = self._settings.timeout_ds
-        without = [board.address for board in self._all if board.timeout_ds != wanted]
+        configured = self._settings.timeout_ds
+        without = [board.address for board in self._all if board.timeout_ds != configured]
         if without:
             why = f"board {without[0]} does not take its serial timeout"
             if not self._is_due(now_ns):
                 return Pending(why=why)
-            sets = (setting(address, "set_serial_timeout", timeout_ds=wanted) for address in without)
-            asks = (question(address, "serial_timeout") for address in without)
-            return Pending(why=why, frames=tuple(frame for pair in zip(sets, asks, strict=True) for frame in pair))
+            sets = (setting(address, "set_serial_timeout", timeout_ds=configured) for address in without)
+            questions = (query(address, "serial_timeout") for address in without)
+            return Pending(why=why, frames=tuple(frame for pair in zip(sets, questions, strict=True) for frame in pair))
         if all(board.zeros >= ZEROS_TO_ARM for board in self._all):
             return None
         return Pending(why="a board does not take zeros", frames=tuple(self.speeds(now_ns, 0.0, 0.0)))
@@ -271,8 +278,8 @@ class RoboclawPort(Port):
         """Return the frames that command the speeds of each board's motors."""
         settings, self._velocity_ns = self._settings, now_ns
         per_board = {address: [0.0, 0.0] for address in self._boards}
-        fastest, wanted = self._fastest_rad_s, (left_rad_s, right_rad_s)
-        for side, direction, speed in zip(settings.sides, settings.direction, wanted, strict=True):
+        fastest, commanded = self._fastest_rad_s, (left_rad_s, right_rad_s)
+        for side, direction, speed in zip(settings.sides, settings.direction, commanded, strict=True):
             for address, motor in side:
                 per_board[address][motor] = direction * min(max(speed, -fastest), fastest) * settings.counts_per_rad
         accel = max(1, round(settings.acceleration_rad_s2 * settings.counts_per_rad))
@@ -288,8 +295,8 @@ class RoboclawPort(Port):
     def brake(self, now_ns: int, lasts_ns: int) -> tuple[Sequence[Frame], bool]:
         """Return zero duty for each board that has not acknowledged a stop, and whether braking is over."""
         waiting = [board for board in self._all if not board.stopped]
-        is_over = not waiting and self._is_known and (self._stands or lasts_ns > BRAKING_NS)
-        if now_ns - self._asked_ns < _PACE_NS:
+        is_over = not waiting and self._is_known and (self._is_stationary or lasts_ns > BRAKING_NS)
+        if now_ns - self._requested_ns < _PACE_NS:
             return (), is_over
         for board in waiting:
             board.waits_ns = now_ns if board.waits_ns is None else board.waits_ns
@@ -298,7 +305,7 @@ class RoboclawPort(Port):
     def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
         """Reset an e-stop that a board has latched, when requested; it ends its other errors by itself."""
         latched = [board.address for board in self._all if board.is_pressed]
-        if permit.wanted is not Request.RESET or not latched or not self._is_due(now_ns):
+        if permit.target is not Request.RESET or not latched or not self._is_due(now_ns):
             return ()
         return [setting(address, "reset_estop") for address in latched]
 
@@ -310,12 +317,12 @@ class RoboclawPort(Port):
         """
         boards = self._all
         if permit.stage in (Stage.REST, Stage.BRAKING):
-            if now_ns - self._asked_ns < _PACE_NS:
+            if now_ns - self._requested_ns < _PACE_NS:
                 return ()
             boards = [board for board in self._all if board.stopped]
         elif self._velocity_ns != now_ns:
             return ()
-        self._asked_ns = now_ns
+        self._requested_ns = now_ns
         frames = []
         self._slow += 1
         turn, number = divmod(self._slow, len(self._all))
@@ -325,8 +332,8 @@ class RoboclawPort(Port):
             names = unknown[:1] or ["speeds", "encoders"]
             if not unknown and board is self._all[number]:
                 names.append("serial_timeout" if turn % _TIMEOUT_EVERY == 0 else "status")
-            frames += [question(board.address, name) for name in names]
-        return tuple(OutgoingFrame(frame, now_ns + _QUESTION_LIFE_NS, _QUESTION_RANK) for frame in frames)
+            frames += [query(board.address, name) for name in names]
+        return tuple(OutgoingFrame(frame, now_ns + _QUERY_LIFE_NS, _QUERY_RANK) for frame in frames)
 
     def stop_frames(self) -> tuple[Frame, ...]:
         """Zero duty for every board."""
@@ -342,14 +349,14 @@ class RoboclawPort(Port):
         return all(board.is_known for board in self._all)
 
     @property
-    def _stands(self) -> bool:
-        return all(stands(self._settings, *board.speeds) for board in self._all)
+    def _is_stationary(self) -> bool:
+        return all(is_stationary(self._settings, *board.speeds) for board in self._all)
 
     @property
     def _fastest_rad_s(self) -> float:
         return min(board.fastest_counts_s for board in self._all) / self._settings.counts_per_rad
 
-    def _take_acknowledgement(self, board: Board, frame: Frame, t_ns: int, stage: Stage) -> Heard:
+    def _handle_acknowledgement(self, board: Board, frame: Frame, t_ns: int, stage: Stage) -> FrameReport:
         """Take in the acknowledgement of a stop, which counts only while braking, or of a speed command."""
         name = _SETTER_NAMES.get(frame.can_id & 0xFF)
         if name is None or frame.data != protocol.ACKNOWLEDGE:
@@ -361,7 +368,7 @@ class RoboclawPort(Port):
         elif name == "speed_accel_m1m2":
             board.refuses_ns = None
             board.zeros += 1
-        return Heard()
+        return FrameReport()
 
     def _sample(self, t_ns: int) -> WheelSample:
         settings = self._settings

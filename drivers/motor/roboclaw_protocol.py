@@ -83,11 +83,11 @@ def set_bytes(address: int, name: str, **values: int) -> bytes:
     Raises ValueError for an address outside 0x80 to 0x87.
     """
     layout = SETTERS[name]
-    arguments = [_held(values[field], code) for field, code in zip(layout.fields, layout.body, strict=True)]
+    arguments = [_in_range(values[field], code) for field, code in zip(layout.fields, layout.body, strict=True)]
     return with_crc(_head(address, layout.command) + layout.pack(*arguments))
 
 
-def ask_bytes(address: int, name: str) -> bytes:
+def request_bytes(address: int, name: str) -> bytes:
     """Return the bytes that ask for something. Raises ValueError for an address outside 0x80 to 0x87."""
     return _head(address, GETTERS[name].command)
 
@@ -136,13 +136,13 @@ def _checks(head: bytes, received: bytes, length: int) -> bool:
     return binascii.crc_hqx(head + received[:length], 0) == int.from_bytes(received[length:end])
 
 
-def _held(value: int, code: str) -> int:
+def _in_range(value: int, code: str) -> int:
     bits = 8 * struct.calcsize(">" + code)
     low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if code.islower() else (0, (1 << bits) - 1)
     return min(max(value, low), high)
 
 
-STANDS_RAD_S = 0.1
+STATIONARY_RAD_S = 0.1
 _TURNAROUND_S = 0.0009
 _MOTOR = re.compile(r"(\d{1,3})/([12])")
 EXAMPLE = """motors = ["128/1", "128/2"]
@@ -236,13 +236,13 @@ def setting(address: int, name: str, **values: int) -> Frame:
     return Frame(address << 8 | SETTERS[name].command, set_bytes(address, name, **values))
 
 
-def question(address: int, name: str) -> Frame:
+def query(address: int, name: str) -> Frame:
     """Return the packet that asks for something."""
-    return Frame(address << 8 | GETTERS[name].command, ask_bytes(address, name))
+    return Frame(address << 8 | GETTERS[name].command, request_bytes(address, name))
 
 
 QUESTIONS = LineQuestions(
-    tuple(question(address, "version") for address in range(FIRST_ADDRESS, LAST_ADDRESS + 1)), (115_200, 38_400)
+    tuple(query(address, "version") for address in range(FIRST_ADDRESS, LAST_ADDRESS + 1)), (115_200, 38_400)
 )
 """The version, of each address; at the usual speeds of a UART, of which USB takes any. They feed a serial timeout."""
 
@@ -253,11 +253,11 @@ def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
     One board has both sides, of several the first half is left.
     """
     version = GETTERS["version"].command
-    asked = [(frame.can_id >> 8, frame) for frame in frames if frame.can_id & 0xFF == version and not frame.extended]
+    queries = [(frame.can_id >> 8, frame) for frame in frames if frame.can_id & 0xFF == version and not frame.extended]
     boards = sorted(
         {
             address
-            for address, frame in asked
+            for address, frame in queries
             if FIRST_ADDRESS <= address <= LAST_ADDRESS and reply(address, "version", frame.data) is not None
         }
     )
@@ -269,13 +269,13 @@ def stop_frames(settings: RoboclawSettings) -> tuple[Frame, ...]:
     """Zero duty for every board, and the question whether its motors stand; nothing latches it."""
     return (
         *(setting(address, "duty_m1m2", duty_m1=0, duty_m2=0) for address in settings.addresses),
-        *(question(address, "speeds") for address in settings.addresses),
+        *(query(address, "speeds") for address in settings.addresses),
     )
 
 
-def stands(settings: RoboclawSettings, *speeds_counts_s: Value) -> bool:
+def is_stationary(settings: RoboclawSettings, *speeds_counts_s: Value) -> bool:
     """Whether these motors' speeds are those of wheels at rest."""
-    return all(abs(float(speed)) < STANDS_RAD_S * settings.counts_per_rad for speed in speeds_counts_s)
+    return all(abs(float(speed)) < STATIONARY_RAD_S * settings.counts_per_rad for speed in speeds_counts_s)
 
 
 def cyclic_frames(settings: RoboclawSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:

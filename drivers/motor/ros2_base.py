@@ -16,7 +16,7 @@ from drivers.motor.vendor_driver import (
     REJECTED_LENGTH,
     UNKNOWN,
     BodyPort,
-    Heard,
+    FrameReport,
     Objection,
     Pending,
     Source,
@@ -51,7 +51,7 @@ class Ros2BasePort(BodyPort):
         )
         self._refusal = self._bridge_sum = 0
         self._turned = (parts.Odometer(), parts.Odometer())
-        self.begin_anew(0)
+        self.reset_state(0)
 
     @property
     def seen(self) -> Controllers:
@@ -85,18 +85,18 @@ class Ros2BasePort(BodyPort):
     def is_stopped(self) -> bool:
         """Whether the bridge has latched a stop and the base stands, or a button of it is pressed."""
         is_latched = self._flags & wire.LATCHED and not self._flags & wire.DRIVING
-        return bool((is_latched and self._wheels_ns is not None and self._stands) or self._flags & wire.BUTTON)
+        return bool((is_latched and self._wheels_ns is not None and self._is_stationary) or self._flags & wire.BUTTON)
 
-    def begin_anew(self, now_ns: int) -> None:
+    def reset_state(self, now_ns: int) -> None:
         """Clear what the bridge reported."""
         self._state_ns: int | None = None
         self._wheels_ns: int | None = None
         self._newest: tuple[int, int] | None = None
         self._flags, self._wheel_speeds = 0, (0.0, 0.0)
         for side in self._turned:
-            side.begin_anew()
+            side.reset_state()
 
-    def take(self, received: ReceivedFrame, permit: MotionPermit) -> Heard:
+    def handle(self, received: ReceivedFrame, permit: MotionPermit) -> FrameReport:
         """Take in a frame of the bridge, or of another host."""
         frame, data = received.frame, received.frame.data
         if frame.extended or frame.can_id not in wire.LENGTHS:
@@ -104,18 +104,18 @@ class Ros2BasePort(BodyPort):
         if len(data) != wire.LENGTHS[frame.can_id]:
             return REJECTED_LENGTH
         if frame.can_id == wire.STOP:
-            return Heard(counts=("unknown_id",), is_stop=True)
+            return FrameReport(counts=("unknown_id",), is_stop=True)
         if frame.can_id in wire.HOST_FRAMES:
-            return Heard(counts=("unknown_id",), commanded="the base")
+            return FrameReport(counts=("unknown_id",), commanded="the base")
         if frame.can_id == wire.STATE:
             self._state_ns = received.t_ns
             self._flags, self._refusal, self._bridge_sum = wire.unpack_state(data)
-            return Heard(is_status=True)
+            return FrameReport(is_status=True)
         if frame.can_id == wire.ANGLES:
             self._newest = wire.unpack_angles(data)
         elif self._newest is not None:
-            return self._take_wheels(self._newest, data, received.t_ns, permit.looked_ns)
-        return Heard()
+            return self._handle_wheels(self._newest, data, received.t_ns, permit.looked_ns)
+        return FrameReport()
 
     def sources(self) -> Sequence[Source]:
         """Return the sources that must report again and again: the bridge, and the base behind it."""
@@ -141,7 +141,7 @@ class Ros2BasePort(BodyPort):
 
     def prepare(self, now_ns: int, permit: MotionPermit) -> Pending | None:
         """Have the bridge drive."""
-        if not self._stands:
+        if not self._is_stationary:
             return Pending(why="the base moves; wait until it stands", is_final=True)
         if not self._flags & wire.DRIVING:
             return Pending(why="the bridge did not begin to drive", frames=(wire.enable(True),))
@@ -150,9 +150,9 @@ class Ros2BasePort(BodyPort):
     def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
         """Bring the bridge to standing by, or to a stop that it does not hold yet; reset it when requested."""
         is_latched, frames = self._flags & wire.LATCHED, self.stop_frames()
-        if permit.wanted is Request.RESET and is_latched:
+        if permit.target is Request.RESET and is_latched:
             frames = (Frame(wire.RESET, b""),)
-        elif permit.wanted is Request.RESET or not permit.estopped or is_latched:
+        elif permit.target is Request.RESET or not permit.estopped or is_latched:
             frames = self._stand_by() if self._flags & wire.DRIVING else ()
         return frames if frames and self._is_due(now_ns) else ()
 
@@ -174,7 +174,7 @@ class Ros2BasePort(BodyPort):
             return "the bridge was started with another [link] of robot.toml; start it again"
         if not self._flags & wire.ODOMETRY:
             return f"no odometry from {self.settings.wheels_from}: {wire.REFUSALS[self._refusal]}"
-        is_alive = self._flags & wire.HEARD and self._turned[0].last is not None
+        is_alive = self._flags & wire.RECEIVED and self._turned[0].last is not None
         return None if is_alive else self._unfit or "waiting for the first odometry"
 
     @property
@@ -183,7 +183,7 @@ class Ros2BasePort(BodyPort):
         topic = self.settings.speed_topic
         if self._flags & wire.OTHERS:
             return f"another node speaks on {topic}; end it, or give it a topic of its own"
-        if not self._flags & wire.HEARD:
+        if not self._flags & wire.RECEIVED:
             return f"nobody hears {topic}; is the base switched on, and in this domain?"
         return None
 
@@ -196,24 +196,24 @@ class Ros2BasePort(BodyPort):
         return f", or {self.settings.stop_topic} says nothing" if self.settings.stop_topic else ""
 
     @property
-    def _stands(self) -> bool:
-        return self.settings.stands(*self._wheel_speeds)
+    def _is_stationary(self) -> bool:
+        return self.settings.is_stationary(*self._wheel_speeds)
 
-    def _take_wheels(self, angles: tuple[int, int], data: bytes, t_ns: int, looked_ns: int) -> Heard:
+    def _handle_wheels(self, angles: tuple[int, int], data: bytes, t_ns: int, looked_ns: int) -> FrameReport:
         """Return a sample of ANGLES and WHEELS; what the wheels could not have turned is left out."""
         self._wheel_speeds, age_s = wire.unpack_wheels(data)
         fastest = 1.5 * self.settings.fastest_rad_s / wire.ANGLE_RAD
         plausible = [
             # Messages of a base do not come evenly.
-            side.take_wrapping(angle, t_ns, looked_ns, fastest, 0.1 * fastest)
+            side.add_wrapping(angle, t_ns, looked_ns, fastest, 0.1 * fastest)
             for side, angle in zip(self._turned, angles, strict=True)
         ]
         self._newest, self._wheels_ns = None, t_ns
         left, right = (wire.ANGLE_RAD * side.total for side in self._turned)
         wheels = WheelSample(t_ns - round(age_s * 1e9), t_ns, left, right, *self._wheel_speeds)
         if all(plausible):
-            return Heard(wheels=wheels)
-        return Heard(counts=IMPLAUSIBLE, wheels=wheels, lost="the base has restarted: its wheels' angles jumped")
+            return FrameReport(wheels=wheels)
+        return FrameReport(counts=IMPLAUSIBLE, wheels=wheels, lost="the base has restarted: its wheels' angles jumped")
 
 
 DRIVER = MotorDriver(

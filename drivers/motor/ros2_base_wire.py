@@ -30,11 +30,11 @@ int32, 0.1 mrad, modulo 2^32. WHEELS, after the ANGLES of the same instant: left
 long ago both were true (0.1 ms), uint16. STATE: flags, why odometry was refused, a check sum of the settings. All of
 them big endian.
 """
-DRIVING, LATCHED, BUTTON, ODOMETRY, HEARD, OTHERS, FELL_SILENT = (1 << bit for bit in range(7))
+DRIVING, LATCHED, BUTTON, ODOMETRY, RECEIVED, OTHERS, FELL_SILENT = (1 << bit for bit in range(7))
 DEADMAN_S = 0.2
 ZEROS_S = 0.5
 STEP_S = 0.02
-STANDS_M_S = 0.02
+STATIONARY_M_S = 0.02
 ANGLE_RAD = 1e-4
 _SPEED_RAD_S, _AGE_S = 2e-3, 1e-4
 REFUSALS = (
@@ -83,9 +83,9 @@ class Ros2BaseSettings(BodySettings, frozen=True, forbid_unknown_fields=True, kw
         """The topic that says how the wheels turn."""
         return self.wheels_topic or ("/joint_states" if self.left_joints else "/odom")
 
-    def stands(self, left_rad_s: float, right_rad_s: float) -> bool:
+    def is_stationary(self, left_rad_s: float, right_rad_s: float) -> bool:
         """Whether these are wheels of a base that does not move."""
-        return self.wheel_radius_m * max(abs(left_rad_s), abs(right_rad_s)) < STANDS_M_S
+        return self.wheel_radius_m * max(abs(left_rad_s), abs(right_rad_s)) < STATIONARY_M_S
 
     def check_sum(self) -> int:
         """Return a CRC-32 of all fields: driver and bridge must have been started with the same."""
@@ -144,9 +144,9 @@ class BaseEnd:
     """
 
     def __init__(self, settings: Ros2BaseSettings) -> None:
-        self.driving = self.latched = self.button = self.is_heard = self.others_speak = False
+        self.driving = self.latched = self.button = self.has_listener = self.others_speak = False
         self.has_odometry = False
-        self.hears_button = True
+        self.receives_button = True
         self.refusal = 0
         self._check_sum = settings.check_sum()
         self._fell_silent = False
@@ -155,9 +155,9 @@ class BaseEnd:
         self.refused_speeds = 0
 
     @property
-    def is_held(self) -> bool:
+    def is_stopped(self) -> bool:
         """Whether a button is pressed, or nobody says that it is not."""
-        return self.button or not self.hears_button
+        return self.button or not self.receives_button
 
     def receive(self, now_ns: int, frame: Frame) -> tuple[float, float] | None:
         """Take in a frame of the driver; the speeds to say at once (m/s, rad/s), None for nothing."""
@@ -166,11 +166,11 @@ class BaseEnd:
         match frame.can_id:
             case 0x010:
                 self.latched = True
-                return self.stand_by(now_ns)
+                return self.hold_standstill(now_ns)
             case 0x011 if frame.data[0] != 1:
-                return self.stand_by(now_ns)
+                return self.hold_standstill(now_ns)
             case 0x011:
-                if not (self.driving or self.latched or self.is_held):
+                if not (self.driving or self.latched or self.is_stopped):
                     # The time-out runs from here on, and only speeds feed it.
                     self.driving, self._fell_silent, self._fed_ns = True, False, now_ns
             case 0x012:
@@ -189,13 +189,13 @@ class BaseEnd:
 
         Zeros after a stop and while one is latched; while it drives, None: only commands feed it.
         """
-        if self.is_held and self.driving:
-            return self.stand_by(now_ns)
+        if self.is_stopped and self.driving:
+            return self.hold_standstill(now_ns)
         self._check_silence(now_ns)
         due = self.latched or self.button or now_ns < self._zeros_until_ns
         return (0.0, 0.0) if due and not self.driving else None
 
-    def stand_by(self, now_ns: int) -> tuple[float, float]:
+    def hold_standstill(self, now_ns: int) -> tuple[float, float]:
         """Stop driving and return the zeros that stop the base."""
         self.driving, self._zeros_until_ns = False, now_ns + round(ZEROS_S * 1e9)
         return 0.0, 0.0
@@ -203,7 +203,7 @@ class BaseEnd:
     def state(self) -> Frame:
         """Return the frame that reports the bridge's state to the driver."""
         bits = (
-            self.driving, self.latched, self.is_held, self.has_odometry, self.is_heard, self.others_speak,
+            self.driving, self.latched, self.is_stopped, self.has_odometry, self.has_listener, self.others_speak,
             self._fell_silent,
         )  # fmt: skip
         flags = sum(1 << bit for bit, is_set in enumerate(bits) if is_set)
@@ -212,7 +212,7 @@ class BaseEnd:
     def _check_silence(self, now_ns: int) -> None:
         if self.driving and now_ns - self._fed_ns > DEADMAN_S * 1e9:
             self._fell_silent = True
-            self.stand_by(now_ns)
+            self.hold_standstill(now_ns)
 
 
 def stop_frames(_settings: Ros2BaseSettings) -> tuple[Frame, ...]:

@@ -14,7 +14,7 @@ import msgspec
 from msgspec.structs import replace
 
 from drivers.motor import vendor_parts as parts
-from drivers.motor.permit import STANDS_BY, Controllers, Idle, MotionPermit, Stage
+from drivers.motor.permit import ON_STANDBY, Controllers, Idle, MotionPermit, Stage
 from drivers.types import (
     DriverState,
     DriverStats,
@@ -62,7 +62,7 @@ class Source(msgspec.Struct, frozen=True):
     """
 
     name: str
-    heard_ns: int | None
+    received_ns: int | None
     silent_ns: float
     gone_ns: float | None = None
 
@@ -74,12 +74,12 @@ class Objection(msgspec.Struct, frozen=True):
     is_fault: bool = True
 
 
-class Heard(msgspec.Struct, frozen=True, kw_only=True):
+class FrameReport(msgspec.Struct, frozen=True, kw_only=True):
     """Meaning of one received frame.
 
     `counts`: counters of `DriverStats` that it adds to. `is_status`: it says how the controllers are. `is_stop` and
     `commanded`: another host's e-stop, and whom another host commands. `lost`: what ends a drive, and nothing else.
-    `restarted`: why the controllers must be met anew. `said`: for the operator.
+    `restarted`: why the controllers must be met anew. `message`: for the operator.
     """
 
     counts: tuple[str, ...] = ("frames_accepted",)
@@ -89,11 +89,11 @@ class Heard(msgspec.Struct, frozen=True, kw_only=True):
     commanded: str | None = None
     lost: str | None = None
     restarted: str | None = None
-    said: str | None = None
+    message: str | None = None
 
 
-UNKNOWN = Heard(counts=("unknown_id",))
-REJECTED_LENGTH = Heard(counts=("rejected_length",))
+UNKNOWN = FrameReport(counts=("unknown_id",))
+REJECTED_LENGTH = FrameReport(counts=("rejected_length",))
 IMPLAUSIBLE = ("frames_accepted", "implausible_ticks")
 
 
@@ -138,7 +138,7 @@ class Port(ABC):
         """Whether the controllers have confirmed, since they were met, that an e-stop holds."""
 
     @abstractmethod
-    def begin_anew(self, now_ns: int) -> None:
+    def reset_state(self, now_ns: int) -> None:
         """Forget what was received: the link or the controllers have restarted. What the wheels have turned stays."""
 
     def end_drive(self) -> None:
@@ -146,7 +146,7 @@ class Port(ABC):
         self._repeat_ns = 0
 
     @abstractmethod
-    def take(self, received: ReceivedFrame, permit: MotionPermit) -> Heard:
+    def handle(self, received: ReceivedFrame, permit: MotionPermit) -> FrameReport:
         """Take in a frame and return what it meant."""
 
     @abstractmethod
@@ -209,14 +209,14 @@ class BodyPort(Port):
 
     def brake(self, now_ns: int, lasts_ns: int) -> tuple[Sequence[Frame], bool]:
         """Zero speed until the base stands, then what makes it stand by."""
-        if self._stands or lasts_ns > BRAKING_NS:
+        if self._is_stationary or lasts_ns > BRAKING_NS:
             self._repeat_ns = now_ns
             return self._stand_by(), True
         return (self._motion(0.0, 0.0),), False
 
     @property
     @abstractmethod
-    def _stands(self) -> bool:
+    def _is_stationary(self) -> bool:
         """Whether the base says that it does not move."""
 
     @abstractmethod
@@ -235,12 +235,12 @@ def stop_confirmation(port: Port) -> Callable[[Frame], bool]:
     """
     permit = MotionPermit(link_is_up=True, stage=Stage.BRAKING)
 
-    def heard(frame: Frame) -> bool:
+    def is_confirmation(frame: Frame) -> bool:
         # Long after any command: none of this connection's can be under way.
-        port.take(ReceivedFrame(_LONG_AFTER_NS, frame), permit)
+        port.handle(ReceivedFrame(_LONG_AFTER_NS, frame), permit)
         return port.is_stopped
 
-    return heard
+    return is_confirmation
 
 
 class VendorDriver:
@@ -277,16 +277,16 @@ class VendorDriver:
 
     def link_up(self, now_ns: int) -> None:
         """Start again after the medium has come up: whatever was agreed is void."""
-        self._meet_anew(self._permit.linked(True), now_ns)
+        self._restart_handshake(self._permit.linked(True), now_ns)
 
     def link_down(self, now_ns: int) -> None:
         """Drop whatever was agreed, because the medium is gone."""
-        self._meet_anew(self._permit.linked(False), now_ns)
+        self._restart_handshake(self._permit.linked(False), now_ns)
 
     def request(self, request: Request) -> None:
         """Set what the host wants; ARM only from standing by, and consumed when the controllers stop."""
         before, self._permit = self._permit, self._permit.requested(request, self._port.seen)
-        if self._permit.wanted is Request.ARM is not before.wanted:
+        if self._permit.target is Request.ARM is not before.target:
             self._count("sessions")
 
     def receive(self, now_ns: int, frames: Sequence[ReceivedFrame]) -> Readings:
@@ -294,12 +294,12 @@ class VendorDriver:
         wheels: list[WheelSample] = []
         status: RobotStatus | None = None
         for received in frames if self._permit.link_is_up else ():
-            heard = self._port.take(received, self._permit)
-            self._react(heard)
-            if heard.is_status:
+            report = self._port.handle(received, self._permit)
+            self._react(report)
+            if report.is_status:
                 status = parts.status(received.t_ns, self.state, self._port.is_stopped)
-            if heard.wheels is not None:
-                wheels.append(heard.wheels)
+            if report.wheels is not None:
+                wheels.append(report.wheels)
         if self._permit.link_is_up:
             self._permit = self._permit.looked(now_ns)
             self._check_silence(now_ns)
@@ -372,33 +372,33 @@ class VendorDriver:
 
     def _brake(self, now_ns: int) -> Sequence[Frame]:
         self._permit = self._permit.begun(now_ns)
-        frames, stands = self._port.brake(now_ns, self._permit.lasts_ns(now_ns))
-        if stands:
+        frames, is_stationary = self._port.brake(now_ns, self._permit.lasts_ns(now_ns))
+        if is_stationary:
             self._permit = self._permit.rested()
         return frames
 
     def _rest(self, now_ns: int) -> Sequence[Frame]:
-        if self._permit.wanted is Request.RESET and self._port.may_reset(now_ns):
+        if self._permit.target is Request.RESET and self._port.may_reset(now_ns):
             self._permit = self._permit.reset(self._port.seen)
-            if self._permit.wanted is not Request.RESET:
+            if self._permit.target is not Request.RESET:
                 return ()
         return self._port.rest(now_ns, self._permit)
 
-    def _react(self, heard: Heard) -> None:
-        for name in heard.counts:
+    def _react(self, report: FrameReport) -> None:
+        for name in report.counts:
             self._count(name)
-        if heard.restarted is not None:
-            self._end(self._permit.restarted(heard.restarted))
-        if heard.said is not None:
-            self._permit = replace(self._permit, note=STANDS_BY).saying(heard.said)
-        if heard.is_stop:
-            self._end(self._permit.stop_heard())
-        elif heard.commanded is not None:
-            before, self._permit = self._permit, self._permit.command_heard(heard.commanded)
+        if report.restarted is not None:
+            self._end(self._permit.restarted(report.restarted))
+        if report.message is not None:
+            self._permit = replace(self._permit, note=ON_STANDBY).with_event(report.message)
+        if report.is_stop:
+            self._end(self._permit.stop_received())
+        elif report.commanded is not None:
+            before, self._permit = self._permit, self._permit.command_received(report.commanded)
             if before.stage is not self._permit.stage:
                 self._port.end_drive()
-        if heard.lost is not None and self._permit.is_driving:
-            self._end(self._permit.lost(heard.lost))
+        if report.lost is not None and self._permit.is_driving:
+            self._end(self._permit.lost(report.lost))
         self._check_objection()
 
     def _check_objection(self) -> None:
@@ -408,18 +408,18 @@ class VendorDriver:
         if objection is not None and objection.is_fault:
             self._end(self._permit.lost(objection.why))
         elif objection is not None:
-            self._end(self._permit.given_up(objection.why).saying(objection.why))
+            self._end(self._permit.given_up(objection.why).with_event(objection.why))
 
     def _check_silence(self, now_ns: int) -> None:
         for source in self._port.sources():
-            silent_ns = 0 if source.heard_ns is None else self._permit.silent_ns(source.heard_ns)
+            silent_ns = 0 if source.received_ns is None else self._permit.silent_ns(source.received_ns)
             why = f"{source.name} fell silent"
             if self._may_lose:
                 if silent_ns > source.silent_ns:
                     self._end(self._permit.lost(f"{why}: nothing came for {source.silent_ns * 1e-9:g} s"))
                     return
             elif self._is_idle and source.gone_ns is not None and silent_ns > source.gone_ns:
-                self._meet_anew(self._permit.restarted(why, f"{why}: waiting for it"), now_ns)
+                self._restart_handshake(self._permit.restarted(why, f"{why}: waiting for it"), now_ns)
                 return
 
     @property
@@ -435,9 +435,9 @@ class VendorDriver:
         self._permit = permit
         self._port.end_drive()
 
-    def _meet_anew(self, permit: MotionPermit, now_ns: int) -> None:
+    def _restart_handshake(self, permit: MotionPermit, now_ns: int) -> None:
         self._end(permit)
-        self._port.begin_anew(now_ns)
+        self._port.reset_state(now_ns)
 
     def _count(self, name: str) -> None:
         self.stats = parts.counted(self.stats, name)

@@ -65,7 +65,7 @@ class Odometer:
     last: float | None = None
     is_new: bool = False
 
-    def take(self, count: float, t_ns: int, looked_ns: int, fastest: float, slack: float) -> bool:
+    def add(self, count: float, t_ns: int, looked_ns: int, fastest: float, slack: float) -> bool:
         """Whether the motor can have turned so far since the count before; if not, it goes on from this one.
 
         `fastest` in counts/s, and `slack` counts more. A pause of the host brings the stamps of two counts together,
@@ -78,16 +78,16 @@ class Odometer:
         self.last, self.t_ns, self.looked_ns, self.is_new = count, t_ns, looked_ns, True
         return plausible
 
-    def take_wrapping(
+    def add_wrapping(
         self, count: int, t_ns: int, looked_ns: int, fastest: float, slack: float, *, bits: int = 32
     ) -> bool:
         """As `take`, of a count that wraps."""
         last, half = count if self.last is None else int(self.last), 2 ** (bits - 1)
         moved = (count - last + half) % (2 * half) - half
         self.last = None if self.last is None else count - moved
-        return self.take(count, t_ns, looked_ns, fastest, slack)
+        return self.add(count, t_ns, looked_ns, fastest, slack)
 
-    def begin_anew(self) -> None:
+    def reset_state(self) -> None:
         """Compare the next count with none before, because the controller may have restarted."""
         self.last, self.is_new = None, False
 

@@ -19,7 +19,7 @@ from drivers.motor.vendor_driver import (
     BRAKING_NS,
     IMPLAUSIBLE,
     UNKNOWN,
-    Heard,
+    FrameReport,
     Objection,
     Pending,
     Port,
@@ -63,19 +63,19 @@ class _Motor:
     timed_out: bool = False
     killed: bool = False
     timeout: tuple[float, float] | None = None
-    asked_timeout: int = 0
+    requested_timeout: int = 0
 
     @property
-    def stands(self) -> bool:
+    def is_stationary(self) -> bool:
         """Whether the motor stands, by its last report."""
-        return abs(_ERPM_PER_STEP_S * self.turned.speed) < declared.STANDS_ERPM
+        return abs(_ERPM_PER_STEP_S * self.turned.speed) < declared.STATIONARY_ERPM
 
     @property
     def may_report_timeout(self) -> bool:
         """Whether its timeout is not known yet, and it has not been asked often enough to give up."""
-        return self.timeout is None and self.asked_timeout < TIMEOUT_TRIES
+        return self.timeout is None and self.requested_timeout < TIMEOUT_TRIES
 
-    def take_speed(self, erpm: float, t_ns: int) -> None:
+    def handle_speed(self, erpm: float, t_ns: int) -> None:
         """Store the newest speed."""
         self.turned.speed, self.erpm_ns = erpm / _ERPM_PER_STEP_S, t_ns
 
@@ -96,7 +96,7 @@ class VescPort(Port):
         self._sides = [[_Motor(node) for node in side] for side in parts.sides_of(settings.nodes)]
         self._motors = {motor.node: motor for side in self._sides for motor in side}
         self._reassembly = codec.Reassembly(declared.HOST_ID)
-        self._pinged_ns = self._asked_ns = self._next_asked = 0
+        self._pinged_ns = self._requested_ns = self._next_requested = 0
 
     @property
     def seen(self) -> Controllers:
@@ -107,7 +107,7 @@ class VescPort(Port):
             missing=self._missing,
             refused=next(filter(None, refusals), None),
             stopped="its kill switch is pressed" if any(motor.killed for motor in self._all) else None,
-            faulty="; ".join(_in_words(motor) for motor in self._all if motor.fault) or None,
+            faulty="; ".join(_describe(motor) for motor in self._all if motor.fault) or None,
         )
 
     @property
@@ -130,25 +130,25 @@ class VescPort(Port):
     @property
     def is_stopped(self) -> bool:
         """Whether every motor stands, as it said last: nothing else confirms a stop here."""
-        return all(motor.erpm_ns is not None and motor.stands for motor in self._all)
+        return all(motor.erpm_ns is not None and motor.is_stationary for motor in self._all)
 
-    def begin_anew(self, now_ns: int) -> None:
+    def reset_state(self, now_ns: int) -> None:
         """Clear what the controllers reported."""
         self._pinged_ns = now_ns - _PING_PERIOD_NS
         for motor in self._all:
             motor.answered = motor.timed_out = motor.killed = False
             motor.erpm_ns = motor.fault = motor.timeout = None
-            motor.turned.speed, motor.asked_timeout = 0.0, 0
-            motor.turned.begin_anew()
+            motor.turned.speed, motor.requested_timeout = 0.0, 0
+            motor.turned.reset_state()
 
-    def take(self, received: ReceivedFrame, permit: MotionPermit) -> Heard:
+    def handle(self, received: ReceivedFrame, permit: MotionPermit) -> FrameReport:
         """Take in a frame of a controller, a part of an answer to this host, or a frame of another host."""
         frame, t_ns = received.frame, received.t_ns
         if frame.extended and frame.can_id & 0xFF == declared.HOST_ID and frame.can_id >> 8 != codec.PONG:
-            heard = self._take_packet(received, permit)
+            report = self._handle_packet(received, permit)
             if self._settings.uart_node is None or not all(motor.turned.is_new for motor in self._all):
-                return heard
-            return Heard(counts=heard.counts, lost=heard.lost, is_status=True, wheels=self._sample(t_ns))
+                return report
+            return FrameReport(counts=report.counts, lost=report.lost, is_status=True, wheels=self._sample(t_ns))
         decoded = codec.decode(frame)
         if decoded is None or decoded.controller not in self._motors:
             return self._unused(frame)
@@ -157,13 +157,15 @@ class VescPort(Port):
             case "pong":
                 motor.answered = True
             case "status":
-                motor.take_speed(decoded.values["erpm"], t_ns)
-                return Heard(is_status=True)
+                motor.handle_speed(decoded.values["erpm"], t_ns)
+                return FrameReport(is_status=True)
             case "status5":
-                heard = self._take_tachometer(motor, int(decoded.values["tachometer"]), t_ns, permit)
+                report = self._handle_tachometer(motor, int(decoded.values["tachometer"]), t_ns, permit)
                 is_new = all(each.turned.is_new and each.erpm_ns is not None for each in self._all)
-                return Heard(counts=heard.counts, lost=heard.lost, wheels=self._sample(t_ns) if is_new else None)
-        return Heard()
+                return FrameReport(
+                    counts=report.counts, lost=report.lost, wheels=self._sample(t_ns) if is_new else None
+                )
+        return FrameReport()
 
     def sources(self) -> Sequence[Source]:
         """Return the speed of every motor."""
@@ -175,7 +177,7 @@ class VescPort(Port):
         is_armed_long = permit.lasts_ns(permit.looked_ns) > 2 * len(self._all) * _FAULT_PERIOD_NS + SILENT_NS
         for motor in self._all:
             if motor.fault:
-                return Objection(_in_words(motor))
+                return Objection(_describe(motor))
             if motor.killed:
                 return Objection(f"controller {motor.node}: its kill switch is pressed")
             if permit.stage is Stage.ARMED and motor.timed_out and is_armed_long:
@@ -192,9 +194,9 @@ class VescPort(Port):
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
         """Return the electrical speed of each motor."""
-        limit, wanted = self._settings.max_erpm, (left_rad_s, right_rad_s)
+        limit, commanded = self._settings.max_erpm, (left_rad_s, right_rad_s)
         frames = []
-        for side, direction, speed in zip(self._sides, self._settings.direction, wanted, strict=True):
+        for side, direction, speed in zip(self._sides, self._settings.direction, commanded, strict=True):
             erpm = min(max(direction * speed * self._settings.erpm_per_rad_s, -limit), limit)
             frames += [codec.command(motor.node, "set_erpm", erpm) for motor in side]
         return frames
@@ -202,8 +204,8 @@ class VescPort(Port):
     def brake(self, now_ns: int, lasts_ns: int) -> tuple[Sequence[Frame], bool]:
         """Brake by a current until the motors stand, then let go."""
         # One that still says that it turns may be on a slope; of one that has fallen silent nobody knows.
-        says_it_turns = any(not m.stands and now_ns - (m.erpm_ns or 0) < SILENT_NS for m in self._all)
-        if self.is_stopped or (lasts_ns > BRAKING_NS and not says_it_turns):
+        reports_turning = any(not m.is_stationary and now_ns - (m.erpm_ns or 0) < SILENT_NS for m in self._all)
+        if self.is_stopped or (lasts_ns > BRAKING_NS and not reports_turning):
             return [codec.command(motor.node, "set_current", 0.0) for motor in self._all], True
         amperes = self._settings.brake_current_a
         return [codec.command(motor.node, "set_brake_current", amperes) for motor in self._all], False
@@ -220,18 +222,18 @@ class VescPort(Port):
             self._pinged_ns = now_ns
             return parts.outgoing(now_ns, *(codec.ping(motor.node, declared.HOST_ID) for motor in self._all))
         polled = self._settings.uart_node is not None
-        if now_ns - self._asked_ns < (_POLL_PERIOD_NS if polled else _FAULT_PERIOD_NS):
+        if now_ns - self._requested_ns < (_POLL_PERIOD_NS if polled else _FAULT_PERIOD_NS):
             return ()
-        self._asked_ns = now_ns
+        self._requested_ns = now_ns
         mute = [motor for motor in self._all if motor.may_report_timeout]
         if mute and permit.stage is Stage.REST:
-            motor = min(mute, key=lambda each: each.asked_timeout)
-            motor.asked_timeout += 1
-            return self._ask(now_ns, motor, bytes([codec.GET_APPCONF]))
+            motor = min(mute, key=lambda each: each.requested_timeout)
+            motor.requested_timeout += 1
+            return self._request(now_ns, motor, bytes([codec.GET_APPCONF]))
         if polled:
             return parts.outgoing(now_ns, *declared.questions(self._settings))
-        self._next_asked = (self._next_asked + 1) % len(self._all)
-        return self._ask(now_ns, self._all[self._next_asked], codec.ask_values(codec.FAULT_AND_STATUS))
+        self._next_requested = (self._next_requested + 1) % len(self._all)
+        return self._request(now_ns, self._all[self._next_requested], codec.request_values(codec.FAULT_AND_STATUS))
 
     def stop_frames(self) -> tuple[Frame, ...]:
         """Return the frames that brake every motor."""
@@ -253,13 +255,13 @@ class VescPort(Port):
             None if complete else "no status messages 1 and 5; switch them on, at 50 Hz (VESC Tool, App Settings, CAN)"
         )
 
-    def _ask(self, now_ns: int, motor: _Motor, payload: bytes) -> tuple[OutgoingFrame, ...]:
+    def _request(self, now_ns: int, motor: _Motor, payload: bytes) -> tuple[OutgoingFrame, ...]:
         return parts.outgoing(now_ns, *codec.fragments(motor.node, declared.HOST_ID, payload))
 
-    def _take_packet(self, received: ReceivedFrame, permit: MotionPermit) -> Heard:
+    def _handle_packet(self, received: ReceivedFrame, permit: MotionPermit) -> FrameReport:
         found = self._reassembly.feed(received.frame)
         if found is None or found[0] not in self._motors:
-            return Heard(counts=())
+            return FrameReport(counts=())
         read: Mapping[str, float] = codec.values(found[2]) or {}
         motor = self._motors[found[0]]
         motor.timeout = codec.timeout(found[2], motor.node) or motor.timeout
@@ -267,31 +269,31 @@ class VescPort(Port):
         byte = int(read.get("status_byte", 0))
         motor.timed_out, motor.killed = bool(byte & codec.TIMED_OUT), bool(byte & codec.KILL_SWITCH)
         if "erpm" not in read:
-            return Heard()
-        motor.take_speed(read["erpm"], received.t_ns)
-        return self._take_tachometer(motor, int(read["tachometer"]), received.t_ns, permit)
+            return FrameReport()
+        motor.handle_speed(read["erpm"], received.t_ns)
+        return self._handle_tachometer(motor, int(read["tachometer"]), received.t_ns, permit)
 
-    def _take_tachometer(self, motor: _Motor, tachometer: int, t_ns: int, permit: MotionPermit) -> Heard:
+    def _handle_tachometer(self, motor: _Motor, tachometer: int, t_ns: int, permit: MotionPermit) -> FrameReport:
         fastest = 1.5 * self._settings.max_erpm / _ERPM_PER_STEP_S
-        if motor.turned.take_wrapping(tachometer, t_ns, permit.looked_ns, fastest, 12.0):
-            return Heard()
-        return Heard(counts=IMPLAUSIBLE, lost=f"controller {motor.node} has restarted")
+        if motor.turned.add_wrapping(tachometer, t_ns, permit.looked_ns, fastest, 12.0):
+            return FrameReport()
+        return FrameReport(counts=IMPLAUSIBLE, lost=f"controller {motor.node} has restarted")
 
     def _sample(self, t_ns: int) -> WheelSample:
         per_step = 2.0 * math.pi / (6.0 * self._settings.pole_pairs * self._settings.gear)
         turned = [[motor.turned for motor in side] for side in self._sides]
         return parts.wheel_sample(t_ns, turned, self._settings.direction, per_step)
 
-    def _unused(self, frame: Frame) -> Heard:
+    def _unused(self, frame: Frame) -> FrameReport:
         number, to = frame.can_id >> 8, frame.can_id & 0xFF
         is_addressed = frame.extended and (to in self._motors or to == codec.EVERYBODY)
         if not (is_addressed and number in _SET_COMMANDS):
             return UNKNOWN
         is_stop = number == _BRAKE
-        return Heard(counts=("unknown_id",), is_stop=is_stop, commanded=None if is_stop else f"controller {to}")
+        return FrameReport(counts=("unknown_id",), is_stop=is_stop, commanded=None if is_stop else f"controller {to}")
 
 
-def _in_words(motor: _Motor) -> str:
+def _describe(motor: _Motor) -> str:
     return f"controller {motor.node}: {declared.FAULTS.get(motor.fault or 0, f'fault {motor.fault}')}"
 
 

@@ -52,7 +52,7 @@ _FILL_BYTES, _FILL_REACH, _LONG_BYTES, _SHORT_BYTES = 7, 255, 6, 6
 
 
 def _fields(text: str) -> tuple[tuple[str, float], ...]:
-    pairs = (word.partition(":") for word in text.split())
+    pairs = (item.partition(":") for item in text.split())
     return tuple((name, float(steps) if steps else 1.0) for name, _, steps in pairs)
 
 
@@ -147,7 +147,7 @@ def packet_command(name: str, value: float) -> bytes:
     return struct.pack(">Bi", number, _steps(value, steps))
 
 
-def ask_values(mask: int) -> bytes:
+def request_values(mask: int) -> bytes:
     """Return the payload that asks for some of a controller's values; it feeds no timeout."""
     return struct.pack(">BI", GET_VALUES_SELECTIVE, mask)
 
@@ -208,20 +208,20 @@ def fragments(controller: int, sender: int, payload: bytes, send_mode: int = 0) 
 class Reassembly:
     """The packets that come to one CAN identifier in fragments, from any number of senders one after the other."""
 
-    def __init__(self, own_id: int) -> None:
-        self._own_id = own_id
+    def __init__(self, node_id: int) -> None:
+        self._node_id = node_id
         self._buffer = bytearray(MAX_PAYLOAD)
 
     def feed(self, frame: Frame) -> tuple[int, int, bytes] | None:
         """Take in a frame; return sender, send mode and payload of the packet that it completes, if it does."""
         number, to = frame.can_id >> 8, frame.can_id & 0xFF
         data = frame.data
-        if not frame.extended or to != self._own_id:
+        if not frame.extended or to != self._node_id:
             return None
         if number == FILL and len(data) >= 1:
-            self._put(data[0], data[1:])
+            self._insert(data[0], data[1:])
         elif number == FILL_LONG and len(data) >= 2:
-            self._put(int.from_bytes(data[:2]), data[2:])
+            self._insert(int.from_bytes(data[:2]), data[2:])
         elif number == PROCESS_SHORT and len(data) >= 2:
             return data[0], data[1], data[2:]
         elif number == PROCESS and len(data) == 6:
@@ -231,7 +231,7 @@ class Reassembly:
                 return sender, mode, payload
         return None
 
-    def _put(self, at: int, data: bytes) -> None:
+    def _insert(self, at: int, data: bytes) -> None:
         if at + len(data) <= MAX_PAYLOAD:
             self._buffer[at : at + len(data)] = data
 
@@ -266,7 +266,7 @@ class PacketDecoder:
             if length is None:
                 break
             end = at + length
-            if length == 0 or not self._is_whole(at, end):
+            if length == 0 or not self._is_complete(at, end):
                 at += 1
                 self.skipped += 1
                 continue
@@ -287,10 +287,10 @@ class PacketDecoder:
         # A length that fits one byte is not said with two.
         if not (255 if start == 3 else 1) <= payload <= MAX_PAYLOAD:
             return 0
-        whole = start + payload + 3
-        return whole if len(pending) - at >= whole else None
+        packet_end = start + payload + 3
+        return packet_end if len(pending) - at >= packet_end else None
 
-    def _is_whole(self, at: int, end: int) -> bool:
+    def _is_complete(self, at: int, end: int) -> bool:
         pending = self._pending
         payload = bytes(pending[at + pending[at] : end - 3])
         return pending[end - 1] == 3 and int.from_bytes(pending[end - 3 : end - 1]) == crc(payload)

@@ -15,7 +15,7 @@ from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 HOST_ID = 253
 STATUS_PERIOD_S = 0.02
-STANDS_ERPM = 60.0
+STATIONARY_ERPM = 60.0
 _SAME_TIMEOUT_S, _SAME_CURRENT_A = 0.002, 0.1
 EXAMPLE = """nodes = [23, 51]
 direction = [1, -1]
@@ -122,15 +122,15 @@ class VescExchange:
 
     def reply(self, frame: Frame, received: bytes) -> Frame | None:
         """Return the first packet that answers this question, of this controller."""
-        to, asked = frame.can_id & 0xFF, self._payload(frame)
+        to, query = frame.can_id & 0xFF, self._payload(frame)
         for payload in codec.PacketDecoder().feed(received):
-            if payload[0] == asked[0] == codec.GET_APPCONF and codec.timeout(payload, to) is None:
+            if payload[0] == query[0] == codec.GET_APPCONF and codec.timeout(payload, to) is None:
                 continue
             if payload[0] == codec.GET_VALUES_SELECTIVE:
                 read = codec.values(payload)
-                if payload[:5] != asked or read is None or read.get("controller_id") != to:
+                if payload[:5] != query or read is None or read.get("controller_id") != to:
                     continue
-            elif payload[0] != asked[0]:
+            elif payload[0] != query[0]:
                 continue
             if frame.can_id >> 8 == codec.PING:
                 return Frame(codec.PONG << 8 | HOST_ID, bytes((to, 0)), extended=True)
@@ -142,7 +142,7 @@ class VescExchange:
         if number == codec.PROCESS_SHORT:
             return frame.data[2:]
         if number == codec.PING:
-            return codec.ask_values(codec.ALL_OF_A_MOTOR)
+            return codec.request_values(codec.ALL_OF_A_MOTOR)
         name = next(name for name, (command, _) in codec.CAN_COMMANDS.items() if command == number)
         # Both kinds of command have the value in the same steps.
         return bytes([codec.PACKET_COMMANDS[name][0]]) + frame.data
@@ -159,8 +159,8 @@ def stop_frames(settings: VescSettings) -> tuple[Frame, ...]:
 
 def questions(settings: VescSettings) -> tuple[Frame, ...]:
     """On a serial line, for all that must be known of each motor; no status messages come there."""
-    ask = codec.ask_values(codec.ALL_OF_A_MOTOR)
-    return tuple(frame for node in all_of(settings.nodes) for frame in codec.fragments(node, HOST_ID, ask))
+    query = codec.request_values(codec.ALL_OF_A_MOTOR)
+    return tuple(frame for node in all_of(settings.nodes) for frame in codec.fragments(node, HOST_ID, query))
 
 
 def cyclic_frames(settings: VescSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:
@@ -193,10 +193,10 @@ def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
 def safety_card(settings: VescSettings) -> SafetyCard:
     """Return the safety card of VESCs."""
     brakes = settings.timeout_brake_current_a > 0.0
-    held = f"braking with {settings.timeout_brake_current_a:g} A"
+    braking = f"braking with {settings.timeout_brake_current_a:g} A"
     return SafetyCard(
         host_silent=f"each controller {settings.watchdog_s:g} s after the last set command, by its timeout",
-        stops_by=held if brakes else "coasting: timeout_brake_current_a is 0",
+        stops_by=braking if brakes else "coasting: timeout_brake_current_a is 0",
         reaction_s=settings.watchdog_s + 0.01,
         brakes=brakes,
         estop=f"a frame to all: brakes with {settings.brake_current_a:g} A; nothing latches it but this driver, and "

@@ -17,19 +17,21 @@ from typing import Any, Literal
 import msgspec
 
 from drivers.pose import robot
-from drivers.types import PoseSample, PoseSource, SaysWhy
+from drivers.types import MessageSource, PoseSample, PoseSource
 
 DEFAULT = robot.SOURCE
 
 
 @cache
 def pose_sources() -> Mapping[str, Callable[..., PoseSource]]:
-    """Return the pose sources by name: the `make_pose_source` of each module in this folder that has a `SOURCE`.
+    """Return the pose sources by name: the `create_pose_source` of each module in this folder that has a `SOURCE`.
 
     It makes a source of the fields of [pose], of which it takes its own and leaves the others.
     """
     modules = (import_module(each.name) for each in pkgutil.iter_modules(__path__, f"{__name__}."))
-    return MappingProxyType({module.SOURCE: module.make_pose_source for module in modules if hasattr(module, "SOURCE")})
+    return MappingProxyType(
+        {module.SOURCE: module.create_pose_source for module in modules if hasattr(module, "SOURCE")}
+    )
 
 
 def find_pose_source(name: str) -> Callable[..., PoseSource]:
@@ -44,13 +46,13 @@ OF_THE_HOST = frozenset({"key", "sender_silence_s"})
 """What a source is given beside the fields of [pose]: the key that `key_file` names, and how long a sender is kept."""
 
 
-def own_fields(name: str) -> frozenset[str]:
+def fields_of(name: str) -> frozenset[str]:
     """Return the fields of [pose] that the source of this name takes, and others may not. Raises PoseSourceError."""
     parameters = inspect.signature(find_pose_source(name)).parameters.values()
     return frozenset(each.name for each in parameters if each.kind is inspect.Parameter.KEYWORD_ONLY) - OF_THE_HOST
 
 
-def make_pose_source(source: str, **fields: Any) -> PoseSource:
+def create_pose_source(source: str, **fields: Any) -> PoseSource:
     """Make the source that `pose.source` names of the fields of [pose]; None is a default. Raises PoseSourceError."""
     return find_pose_source(source)(**{name: value for name, value in fields.items() if value is not None})
 
@@ -128,9 +130,9 @@ class ConvertedPoses:
         """Return the source's poses in our convention."""
         return [self._convention.converted(sample) for sample in self._source.receive(now_ns, from_robot)]
 
-    def news(self) -> Sequence[str]:
+    def new_messages(self) -> Sequence[str]:
         """Return the messages of the converted source."""
-        return self._source.news() if isinstance(self._source, SaysWhy) else ()
+        return self._source.new_messages() if isinstance(self._source, MessageSource) else ()
 
     def close(self) -> None:
         """Close the converted source; safe to call twice."""
@@ -157,13 +159,13 @@ class SeveralPoses:
         ]
         return sorted(found, key=lambda sample: (sample.t_ns, sample.source))
 
-    def news(self) -> Sequence[str]:
+    def new_messages(self) -> Sequence[str]:
         """Return the messages of all sources, each under its source's name."""
         return [
-            f"{label}: {words}"
+            f"{label}: {text}"
             for label, source in self._sources
-            if isinstance(source, SaysWhy)
-            for words in source.news()
+            if isinstance(source, MessageSource)
+            for text in source.new_messages()
         ]
 
     def close(self) -> None:

@@ -30,7 +30,7 @@ _MOST_BYTES_A_TICK = 65_536
 """After so many bytes the next datagram waits for the next tick: whoever floods the port must not hold up the loop."""
 _MOST_ITEMS = 3000
 """In a frame, all kinds together: NatNet's own SDK has room for 1000 of a kind, and more would take milliseconds."""
-_ASK_NS = 1_000_000_000
+_REQUEST_NS = 1_000_000_000
 _NAME_LENGTH = 256
 _CLOCK_LEAST_S = 0.5
 _OLDEST_S = 10.0
@@ -63,7 +63,7 @@ class _Reader:
         self._data, self._at = data, at
         self._items_left = _MOST_ITEMS
 
-    def take(self, layout: str) -> tuple[Any, ...]:
+    def unpack(self, layout: str) -> tuple[Any, ...]:
         form = struct.Struct("<" + layout)
         values = form.unpack_from(self._data, self._at)
         self._at += form.size
@@ -79,7 +79,7 @@ class _Reader:
         self.skip(12 * self.count())
 
     def count(self) -> int:
-        (value,) = self.take("i")
+        (value,) = self.unpack("i")
         if not 0 <= value <= len(self._data):
             raise struct.error("a count that cannot be")
         return int(value)
@@ -102,10 +102,10 @@ def parse_frame(datagram: bytes, version: Version) -> MotiveFrame | None:
 
 def _parse(datagram: bytes, version: Version) -> MotiveFrame | None:
     reader = _Reader(datagram, 0)
-    kind, size = reader.take("HH")
+    kind, size = reader.unpack("HH")
     if kind != FRAME or size > len(datagram) - 4:
         return None
-    reader.take("i")
+    reader.unpack("i")
     _section(reader, version, reader.skip_marker_set)
     _section(reader, version, lambda: reader.skip(12))
     bodies: list[Body] = []
@@ -113,7 +113,7 @@ def _parse(datagram: bytes, version: Version) -> MotiveFrame | None:
     _section(
         reader,
         version,
-        lambda: (reader.take("i"), [_body(reader, version) for _ in reader.expect_items(reader.count())]),
+        lambda: (reader.unpack("i"), [_body(reader, version) for _ in reader.expect_items(reader.count())]),
     )
     if version >= (4, 1):
         _section(reader, version, lambda: None)
@@ -121,9 +121,9 @@ def _parse(datagram: bytes, version: Version) -> MotiveFrame | None:
     for since in ((2, 9), (2, 11)):
         if version >= since:
             _section(reader, version, lambda: _channels(reader))
-    reader.take("II")
-    (timestamp_s,) = reader.take("d" if version >= (2, 7) else "f")
-    exposed_ticks, _, sent_ticks = reader.take("QQQ") if version >= (3, 0) else (0, 0, 0)
+    reader.unpack("II")
+    (timestamp_s,) = reader.unpack("d" if version >= (2, 7) else "f")
+    exposed_ticks, _, sent_ticks = reader.unpack("QQQ") if version >= (3, 0) else (0, 0, 0)
     if not math.isfinite(timestamp_s):
         return None
     return MotiveFrame(tuple(bodies), timestamp_s, exposed_ticks, sent_ticks)
@@ -142,16 +142,16 @@ def _section(reader: _Reader, version: Version, each: Callable[[], object], alwa
 
 
 def _body(reader: _Reader, version: Version) -> Body:
-    number, x, y, z, qx, qy, qz, qw = reader.take("i3f4f")
+    number, x, y, z, qx, qy, qz, qw = reader.unpack("i3f4f")
     if version < (3, 0):
         # The body's markers: place, number and size of each.
         reader.skip(20 * reader.count())
-    _, flags = reader.take("fh")
+    _, flags = reader.unpack("fh")
     return Body(number, (x, y, z), (qx, qy, qz, qw), bool(flags & 1))
 
 
 def _channels(reader: _Reader) -> None:
-    reader.take("i")
+    reader.unpack("i")
     for _ in reader.expect_items(reader.count()):
         reader.skip(4 * reader.count())
 
@@ -164,7 +164,7 @@ def plane_pose(body: Body, up_axis: str) -> tuple[float, float, float]:
     return x, y, math.atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
 
 
-def make_pose_source(
+def create_pose_source(
     *,
     address: str = "127.0.0.1",
     data_port: int = 1511,
@@ -202,12 +202,12 @@ def make_pose_source(
             f"{server or group}:{data_port} at {address}: {error.strerror or error}; correct pose.group, pose.server, "
             "or pose.address, which is this computer's in Motive's network"
         ) from None
-    wanted = (body, up_axis, position_std_m, yaw_std_rad)
-    return NatNetPoses(opened, senders, server, VERSIONS[natnet_version], *wanted)
+    settings = (body, up_axis, position_std_m, yaw_std_rad)
+    return NatNetPoses(opened, senders, server, VERSIONS[natnet_version], *settings)
 
 
 class NatNetPoses:
-    """Satisfies `drivers.types.PoseSource` and `drivers.types.SaysWhy`.
+    """Satisfies `drivers.types.PoseSource` and `drivers.types.MessageSource`.
 
     With a server's address it asks that one once a second, which keeps a server that sends unicast going, and whose
     answer has the version and the clock's frequency.
@@ -227,43 +227,43 @@ class NatNetPoses:
         self._socket, self._senders, self._server = opened, senders, server
         self._version, self._body, self._up_axis = version, body, up_axis
         self._stds = position_std_m, yaw_std_rad
-        self._asked_ns: int | None = None
+        self._requested_ns: int | None = None
         self._ticks_per_s: float | None = None
         self._first: MotiveFrame | None = None
         self._state = ""
-        self._said: list[str] = []
+        self._messages: list[str] = []
         self.malformed = self.lost = 0
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
         """Return the poses received since the last call, oldest first; never waits and never raises."""
         poses = []
         with contextlib.suppress(OSError):
-            self._ask(now_ns)
-            taken = 0
+            self._request_info(now_ns)
+            count = 0
             for _ in range(_MOST_A_TICK):
-                if taken >= _MOST_BYTES_A_TICK:
+                if count >= _MOST_BYTES_A_TICK:
                     break
                 datagram, sender = self._socket.recvfrom(_LONGEST_DATAGRAM)
-                taken += len(datagram)
-                pose = self._take(datagram, now_ns) if self._counts(datagram, sender, now_ns) else None
+                count += len(datagram)
+                pose = self._handle(datagram, now_ns) if self._counts(datagram, sender, now_ns) else None
                 if pose is not None:
                     self._senders.note_pose(sender, now_ns)
                     poses.append(pose)
         return sorted(poses, key=lambda pose: pose.t_ns)
 
-    def news(self) -> Sequence[str]:
+    def new_messages(self) -> Sequence[str]:
         """Return messages for the operator since the last call."""
-        said, self._said = self._said, []
-        return [*said, *self._senders.news()]
+        messages, self._messages = self._messages, []
+        return [*messages, *self._senders.new_messages()]
 
     def close(self) -> None:
         """Close the NatNet socket; safe to call twice."""
         self._socket.close()
 
-    def _ask(self, now_ns: int) -> None:
-        if not self._server or (self._asked_ns is not None and now_ns - self._asked_ns < _ASK_NS):
+    def _request_info(self, now_ns: int) -> None:
+        if not self._server or (self._requested_ns is not None and now_ns - self._requested_ns < _REQUEST_NS):
             return
-        self._asked_ns = now_ns
+        self._requested_ns = now_ns
         for message in (CONNECT, KEEP_ALIVE):
             text = b"Ping\0" if message == CONNECT else b"\0"
             self._socket.sendto(struct.pack("<HH", message, len(text)) + text, (self._server, COMMAND_PORT))
@@ -274,35 +274,35 @@ class NatNetPoses:
             return True
         return self._senders.may_send(sender, now_ns)
 
-    def _take(self, datagram: bytes, now_ns: int) -> PoseSample | None:
+    def _handle(self, datagram: bytes, now_ns: int) -> PoseSample | None:
         if datagram[:2] == struct.pack("<H", SERVER_INFO):
-            self._take_server_info(datagram)
+            self._handle_server_info(datagram)
             return None
         frame = parse_frame(datagram, self._version)
         if frame is None:
             self.malformed += 1
-            self._say(f"datagrams that are no frames of NatNet {_text(self._version)}; correct pose.natnet_version")
+            self._note(f"datagrams that are no frames of NatNet {_text(self._version)}; correct pose.natnet_version")
             return None
         body = next((each for each in frame.bodies if each.number == self._body), None)
         if body is None:
             there = ", ".join(str(each.number) for each in frame.bodies) or "none"
-            self._say(f"no rigid body {self._body} in Motive's frames, but {there}; correct pose.body")
+            self._note(f"no rigid body {self._body} in Motive's frames, but {there}; correct pose.body")
             return None
         if not body.tracked or not all(map(math.isfinite, (*body.position, *body.rotation))):
             self.lost += 1
-            self._say(f"the cameras have lost rigid body {self._body}")
+            self._note(f"the cameras have lost rigid body {self._body}")
             return None
-        self._say(f"rigid body {self._body} is tracked")
+        self._note(f"rigid body {self._body} is tracked")
         age_s = self._age_s(frame)
         return PoseSample(now_ns - round(1e9 * age_s), now_ns, *plane_pose(body, self._up_axis), *self._stds)
 
-    def _take_server_info(self, datagram: bytes) -> None:
+    def _handle_server_info(self, datagram: bytes) -> None:
         with contextlib.suppress(struct.error):
             version = struct.unpack_from("<4B", datagram, 4 + _NAME_LENGTH + 4)[:2]
             if version in VERSIONS.values():
                 self._version = version
             else:
-                self._say(f"the server speaks NatNet {_text(version)}, known are {', '.join(VERSIONS)}")
+                self._note(f"the server speaks NatNet {_text(version)}, known are {', '.join(VERSIONS)}")
             if version >= (3, 0):
                 (ticks_per_s,) = struct.unpack_from("<Q", datagram, 4 + _NAME_LENGTH + 8)
                 self._ticks_per_s = float(ticks_per_s) or None
@@ -319,10 +319,10 @@ class NatNetPoses:
         age_s = (frame.sent_ticks - frame.exposed_ticks) / self._ticks_per_s
         return age_s if 0.0 <= age_s <= _OLDEST_S else 0.0
 
-    def _say(self, words: str) -> None:
-        if words != self._state:
-            self._state = words
-            self._said.append(words)
+    def _note(self, sentence: str) -> None:
+        if sentence != self._state:
+            self._state = sentence
+            self._messages.append(sentence)
 
 
 def _text(version: Version) -> str:

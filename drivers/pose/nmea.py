@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from drivers.pose import PoseSourceError
-from drivers.pose.udp import LONGEST_DATAGRAM, MOST_A_TICK, pose_of, words_of
+from drivers.pose.udp import LONGEST_DATAGRAM, MOST_A_TICK, message_of, pose_of
 from drivers.types import PoseSample
 
 SOURCE = "nmea"
@@ -31,7 +31,7 @@ _READER = "drivers.pose.nmea"
 _END_TIMEOUT_S = 1.0
 
 
-def make_pose_source(
+def create_pose_source(
     *,
     device: str = "",
     baud: int = 115_200,
@@ -62,13 +62,13 @@ def make_pose_source(
 
 
 class NmeaPoses:
-    """Satisfies `drivers.types.PoseSource` and `drivers.types.SaysWhy`."""
+    """Satisfies `drivers.types.PoseSource` and `drivers.types.MessageSource`."""
 
     def __init__(self, opened: socket.socket, process: subprocess.Popen[bytes]) -> None:
         self._socket = opened
         self._process = process
         self._ended = False
-        self._said: list[str] = []
+        self._messages: list[str] = []
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
         """Return the poses received since the last call, oldest first; never waits and never raises."""
@@ -81,14 +81,14 @@ class NmeaPoses:
                 pose = pose_of(message, now_ns)
                 if pose is not None:
                     poses.append(pose)
-                elif (words := words_of(message)) is not None:
-                    self._said.append(words)
+                elif (text := message_of(message)) is not None:
+                    self._messages.append(text)
         return poses
 
-    def news(self) -> Sequence[str]:
+    def new_messages(self) -> Sequence[str]:
         """Return messages for the operator since the last call."""
-        said, self._said = self._said, []
-        return said
+        messages, self._messages = self._messages, []
+        return messages
 
     def close(self) -> None:
         """Stop the reader process; safe to call twice."""
@@ -109,7 +109,7 @@ class NmeaPoses:
             message = b""
         if not message:
             self._ended = True
-            self._said.append("the process that reads the GPS receiver has ended; restart the daemon")
+            self._messages.append("the process that reads the GPS receiver has ended; restart the daemon")
         return message
 
 
@@ -223,33 +223,33 @@ class Fixes:
     _height_m: float | None = None
     _first_ns: int | None = None
     _heading_mode: str = "A"
-    _told: set[str] = field(default_factory=set)
+    _reported: set[str] = field(default_factory=set)
     _far: bool = False
     _clock: ReceiverClock = field(default_factory=ReceiverClock)
 
-    def take(self, line: bytes, arrival_ns: int) -> list[dict[str, Any]]:
+    def add_line(self, line: bytes, arrival_ns: int) -> list[dict[str, Any]]:
         """Take in one line as it came."""
         from pynmeagps import NMEAReader  # noqa: PLC0415
         from pynmeagps.exceptions import NMEAMessageError, NMEAParseError, NMEATypeError  # noqa: PLC0415
 
         ready = self.flush(arrival_ns)
         try:
-            said = NMEAReader.parse(line)
+            message = NMEAReader.parse(line)
         except (NMEAParseError, NMEAMessageError, NMEATypeError, ValueError, IndexError, KeyError):
             self.malformed += 1
             return ready
-        kind = "" if said is None else said.msgID
+        kind = "" if message is None else message.msgID
         if kind == "GST":
-            self._take_deviation(said)
+            self._handle_deviation(message)
         elif kind == "HDT":
-            ready += self._take_heading(said.headingT, arrival_ns)
+            ready += self._handle_heading(message.headingT, arrival_ns)
         elif kind == "THS":
-            mode = str(said.mi)
-            ready += self._mode_words(mode)
+            mode = str(message.mi)
+            ready += self._mode_messages(mode)
             if mode == MEASURED_MODE:
-                ready += self._take_heading(said.headt, arrival_ns)
+                ready += self._handle_heading(message.headt, arrival_ns)
         elif kind == "GGA":
-            ready += self._take_position(said, arrival_ns)
+            ready += self._handle_position(message, arrival_ns)
         return ready
 
     def flush(self, now_ns: int) -> list[dict[str, Any]]:
@@ -259,45 +259,47 @@ class Fixes:
         waiting, self._waiting = self._waiting, None
         return [waiting]
 
-    def _take_deviation(self, said: Any) -> None:
-        time_s, deviations = _time_of_day_s(said.time), (said.stdLat, said.stdLong)
+    def _handle_deviation(self, message: Any) -> None:
+        time_s, deviations = _time_of_day_s(message.time), (message.stdLat, message.stdLong)
         if time_s is not None and all(isinstance(one, float) and one > 0.0 for one in deviations):
             self._gst = (time_s, max(deviations))
 
-    def _take_heading(self, heading_deg: Any, arrival_ns: int) -> list[dict[str, Any]]:
+    def _handle_heading(self, heading_deg: Any, arrival_ns: int) -> list[dict[str, Any]]:
         if not isinstance(heading_deg, float) or not 0.0 <= heading_deg <= 360.0:
             return []
         self._heading = _HeadingSentence(arrival_ns, heading_deg, self._quality in WIDE_HEADING_QUALITIES)
         waiting, self._waiting = self._waiting, None
         return [] if waiting is None else [self._with_heading(waiting, self._heading)]
 
-    def _take_position(self, said: Any, arrival_ns: int) -> list[dict[str, Any]]:
-        quality, time_s = said.quality, _time_of_day_s(said.time)
-        words = self._quality_words(quality)
+    def _handle_position(self, message: Any, arrival_ns: int) -> list[dict[str, Any]]:
+        quality, time_s = message.quality, _time_of_day_s(message.time)
+        notes = self._quality_messages(quality)
         if quality not in QUALITY_STD_M:
-            return words
-        if time_s is None or not (isinstance(said.lat, float) and isinstance(said.lon, float)):
-            return words + self._once("GGA sentences come without time, latitude or longitude: no positions of those")
-        height_m, told = self._height_of(said)
-        words += told + self._heading_hint(arrival_ns)
+            return notes
+        if time_s is None or not (isinstance(message.lat, float) and isinstance(message.lon, float)):
+            return notes + self._without_repeats(
+                "GGA sentences come without time, latitude or longitude: no positions of those"
+            )
+        height_m, height_notes = self._height_of(message)
+        notes += height_notes + self._heading_hint(arrival_ns)
         if self._plane is None:
-            latitude, longitude = self.datum or (said.lat, said.lon)
+            latitude, longitude = self.datum or (message.lat, message.lon)
             self._plane = TangentPlane(latitude, longitude, height_m)
-            words.append({"said": f"datum: latitude {latitude:.8f}, longitude {longitude:.8f}"})
-        east_m, north_m = self._plane.east_north(said.lat, said.lon, height_m)
-        words += self._range_words(math.hypot(east_m, north_m))
+            notes.append({"said": f"datum: latitude {latitude:.8f}, longitude {longitude:.8f}"})
+        east_m, north_m = self._plane.east_north(message.lat, message.lon, height_m)
+        notes += self._range_messages(math.hypot(east_m, north_m))
         position = {
             "t_ns": self._clock.host_ns(time_s, arrival_ns),
             "x_m": east_m,
             "y_m": north_m,
-            "position_std_m": self._deviation_m(quality, time_s, said.HDOP),
+            "position_std_m": self._deviation_m(quality, time_s, message.HDOP),
         }
         if self._heading is None or arrival_ns - self._heading.arrival_ns > _HEADING_HOLDS_NS:
-            return [*words, position]
+            return [*notes, position]
         if arrival_ns - self._heading.arrival_ns < _PAIR_NS:
-            return [*words, self._with_heading(position, self._heading)]
+            return [*notes, self._with_heading(position, self._heading)]
         self._waiting, self._waits_since_ns = position, arrival_ns
-        return words
+        return notes
 
     def _deviation_m(self, quality: int, time_s: float, hdop: Any) -> float:
         if self._gst is not None and abs(math.remainder(time_s - self._gst[0], DAY_S)) < _GST_HOLDS_S:
@@ -305,16 +307,18 @@ class Fixes:
         usual = QUALITY_STD_M[quality]
         return usual * max(hdop, 1.0) if isinstance(hdop, float) else usual
 
-    def _height_of(self, said: Any) -> tuple[float, list[dict[str, Any]]]:
+    def _height_of(self, message: Any) -> tuple[float, list[dict[str, Any]]]:
         """Return the height over the ellipsoid: the fix's, else the last known one, else 0.
 
         The plane's scale hangs on it.
         """
-        if isinstance(said.alt, float):
-            self._height_m = said.alt + (said.sep if isinstance(said.sep, float) else 0.0)
+        if isinstance(message.alt, float):
+            self._height_m = message.alt + (message.sep if isinstance(message.sep, float) else 0.0)
             return self._height_m, []
-        taken_at = "0 m" if self._height_m is None else f"the last height, {self._height_m:.1f} m"
-        return self._height_m or 0.0, self._once(f"GGA sentences come without an altitude: taken at {taken_at}")
+        source_text = "0 m" if self._height_m is None else f"the last height, {self._height_m:.1f} m"
+        return self._height_m or 0.0, self._without_repeats(
+            f"GGA sentences come without an altitude: taken at {source_text}"
+        )
 
     def _with_heading(self, position: dict[str, Any], heading: _HeadingSentence) -> dict[str, Any]:
         """Clockwise from north, as the receiver says it, to counter-clockwise from east."""
@@ -328,11 +332,11 @@ class Fixes:
         first_ns = self._first_ns = arrival_ns if self._first_ns is None else self._first_ns
         if self._heading is not None or arrival_ns - first_ns < _HINT_NS:
             return []
-        return self._once(
+        return self._without_repeats(
             "no heading comes: positions only; if the receiver has two antennas, switch on its sentence HDT or THS"
         )
 
-    def _mode_words(self, mode: str) -> list[dict[str, Any]]:
+    def _mode_messages(self, mode: str) -> list[dict[str, Any]]:
         before, self._heading_mode = self._heading_mode, mode
         if mode == before:
             return []
@@ -340,19 +344,19 @@ class Fixes:
         used = mode == MEASURED_MODE
         return [{"said": f"THS: the heading is {'measured again' if used else f'{why} ({mode}) and not used'}"}]
 
-    def _once(self, words: str) -> list[dict[str, Any]]:
-        if words in self._told:
+    def _without_repeats(self, text: str) -> list[dict[str, Any]]:
+        if text in self._reported:
             return []
-        self._told.add(words)
-        return [{"said": words}]
+        self._reported.add(text)
+        return [{"said": text}]
 
-    def _range_words(self, away_m: float) -> list[dict[str, Any]]:
+    def _range_messages(self, away_m: float) -> list[dict[str, Any]]:
         before, self._far = self._far, away_m > FARTHEST_M
         if self._far is before or not self._far:
             return []
         return [{"said": f"{away_m:.0f} m from the datum, and {FARTHEST_M:.0f} m is the farthest; correct pose.datum"}]
 
-    def _quality_words(self, quality: int) -> list[dict[str, Any]]:
+    def _quality_messages(self, quality: int) -> list[dict[str, Any]]:
         before, self._quality = self._quality, quality
         if quality == before:
             return []
@@ -361,10 +365,10 @@ class Fixes:
         return [{"said": f"fix quality {quality}: {names.get(quality, 'not RTK')}{unused}"}]
 
 
-def _time_of_day_s(said: Any) -> float | None:
-    if not hasattr(said, "microsecond"):
+def _time_of_day_s(message: Any) -> float | None:
+    if not hasattr(message, "microsecond"):
         return None
-    return float(3600.0 * said.hour + 60.0 * said.minute + said.second + 1e-6 * said.microsecond)
+    return float(3600.0 * message.hour + 60.0 * message.minute + message.second + 1e-6 * message.microsecond)
 
 
 def _lines(device: str, baud: int) -> Iterator[tuple[bytes, str | None]]:
@@ -376,17 +380,17 @@ def _lines(device: str, baud: int) -> Iterator[tuple[bytes, str | None]]:
         try:
             with serial.serial_for_url(device, baudrate=baud, timeout=_READ_S) as port:
                 yield b"", f"{device}: open"
-                heard_s, kept, said_silent = time.monotonic(), b"", False
+                received_s, kept, is_silence_reported = time.monotonic(), b"", False
                 while True:
                     kept += port.read(max(1, min(port.in_waiting, _LONGEST_LINE)))
                     *lines, kept = kept.split(b"\n")
                     for line in lines:
                         if line.startswith(b"$"):
-                            heard_s, said_silent, tries = time.monotonic(), False, 0
+                            received_s, is_silence_reported, tries = time.monotonic(), False, 0
                         yield line + b"\n", None
                     kept = kept[-_LONGEST_LINE:]
-                    if time.monotonic() - heard_s > _SILENT_S and not said_silent:
-                        said_silent = True
+                    if time.monotonic() - received_s > _SILENT_S and not is_silence_reported:
+                        is_silence_reported = True
                         yield b"", f"{device}: no NMEA sentence for {_SILENT_S:.0f} s; check the receiver and pose.baud"
                     yield b"", None
         except (OSError, ValueError) as error:
@@ -403,15 +407,15 @@ def _lines(device: str, baud: int) -> Iterator[tuple[bytes, str | None]]:
 def main(descriptor: int, settings: dict[str, Any]) -> None:
     """Read until the daemon has gone."""
     to_daemon = socket.socket(fileno=descriptor)
-    parent, last_words = os.getppid(), ""
+    parent, last_message = os.getppid(), ""
     datum = settings["datum"]
     fixes = Fixes(None if datum is None else tuple(datum), settings["heading_std_rad"])
-    for line, words in _lines(settings["device"], settings["baud"]):
+    for line, messages in _lines(settings["device"], settings["baud"]):
         now_ns = time.monotonic_ns()
-        ready = fixes.take(line, now_ns) if line else fixes.flush(now_ns)
-        if words is not None and words != last_words:
-            ready.append({"said": words})
-        last_words = words or last_words
+        ready = fixes.add_line(line, now_ns) if line else fixes.flush(now_ns)
+        if messages is not None and messages != last_message:
+            ready.append({"said": messages})
+        last_message = messages or last_message
         if os.getppid() != parent:
             return
         try:

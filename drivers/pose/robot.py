@@ -21,6 +21,6 @@ class RobotPoses:
         """Do nothing, because the source holds no resources."""
 
 
-def make_pose_source(**_of_other_sources: Any) -> RobotPoses:
+def create_pose_source(**_of_other_sources: Any) -> RobotPoses:
     """Create the robot's pose source; it has no fields of its own in [pose]."""
     return RobotPoses()

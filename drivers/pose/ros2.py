@@ -15,7 +15,7 @@ from typing import Any
 
 from drivers.pose import PoseSourceError
 from drivers.pose.senders import SILENCE_S, SenderGate
-from drivers.pose.udp import LONGEST_DATAGRAM, MOST_A_TICK, pose_of, words_of
+from drivers.pose.udp import LONGEST_DATAGRAM, MOST_A_TICK, message_of, pose_of
 from drivers.types import PoseSample
 
 SOURCE = "ros2"
@@ -28,7 +28,7 @@ def bridge_address(port: int) -> bytes:
     return f"\0disco-hw/{os.geteuid()}/pose/{port}".encode()
 
 
-def make_pose_source(
+def create_pose_source(
     *,
     port: int = 5005,
     topic: str = "",
@@ -56,13 +56,13 @@ def make_pose_source(
 
 
 class BridgePoses:
-    """Satisfies `drivers.types.PoseSource` and `drivers.types.SaysWhy`."""
+    """Satisfies `drivers.types.PoseSource` and `drivers.types.MessageSource`."""
 
     def __init__(self, opened: socket.socket, senders: SenderGate) -> None:
         self._socket = opened
         self._users = {os.geteuid(), _ROOT}
         self._senders = senders
-        self._said: list[str] = []
+        self._messages: list[str] = []
         self.malformed = 0
         self.foreign_users = 0
 
@@ -75,27 +75,27 @@ class BridgePoses:
                 process, user = _sender(ancillary)
                 if user not in self._users:
                     self.foreign_users += 1
-                elif (pose := self._take(datagram, f"bridge process {process}", now_ns)) is not None:
+                elif (pose := self._handle(datagram, f"bridge process {process}", now_ns)) is not None:
                     poses.append(pose)
         return sorted(poses, key=lambda pose: pose.t_ns)
 
-    def news(self) -> Sequence[str]:
+    def new_messages(self) -> Sequence[str]:
         """Return messages for the operator since the last call."""
-        said, self._said = self._said, []
-        return [*said, *self._senders.news()]
+        messages, self._messages = self._messages, []
+        return [*messages, *self._senders.new_messages()]
 
     def close(self) -> None:
         """Close the bridge's socket; safe to call twice."""
         self._socket.close()
 
-    def _take(self, datagram: bytes, sender: str, now_ns: int) -> PoseSample | None:
+    def _handle(self, datagram: bytes, sender: str, now_ns: int) -> PoseSample | None:
         if not self._senders.may_send(sender, now_ns):
             return None
         pose = pose_of(datagram, now_ns)
         if pose is not None:
             self._senders.note_pose(sender, now_ns)
-        elif (words := words_of(datagram)) is not None:
-            self._said.append(words)
+        elif (text := message_of(datagram)) is not None:
+            self._messages.append(text)
         else:
             self.malformed += 1
         return pose

@@ -45,16 +45,16 @@ class PoseProof:
 
     def unwrap(self, datagram: bytes, wall_ns: int) -> bytes | str:
         """Return the body of a datagram that arrives at this UNIX time (ns), or in words why it is refused."""
-        told, proof = datagram[:-PROOF_BYTES], datagram[-PROOF_BYTES:]
-        if len(told) < TIME_BYTES or not hmac.compare_digest(hmac.digest(self._key, told, hashlib.sha256), proof):
+        payload, proof = datagram[:-PROOF_BYTES], datagram[-PROOF_BYTES:]
+        if len(payload) < TIME_BYTES or not hmac.compare_digest(hmac.digest(self._key, payload, hashlib.sha256), proof):
             return "without the proof of pose.key_file"
-        sent_ns = int.from_bytes(told[:TIME_BYTES], "big")
+        sent_ns = int.from_bytes(payload[:TIME_BYTES], "big")
         if abs(wall_ns - sent_ns) > CLOCKS_APART_NS:
             return f"{abs(wall_ns - sent_ns) * 1e-9:.0f} s old or ahead by their sender's clock; synchronise the clocks"
         if sent_ns <= self._newest_ns:
             return "sent again, or out of order"
         self._newest_ns = sent_ns
-        return told[TIME_BYTES:]
+        return payload[TIME_BYTES:]
 
 
 class SenderGate:
@@ -70,7 +70,7 @@ class SenderGate:
         self._known: dict[str, bool] = {}
         self._kept: Hashable | None = None
         self._came_ns = 0
-        self._said: list[str] = []
+        self._messages: list[str] = []
         self._next_report_ns = 0
         self._unreported = 0
 
@@ -96,25 +96,25 @@ class SenderGate:
     def note_pose(self, sender: Hashable, now_ns: int) -> None:
         """Take in that a good pose came from this sender, which is kept to from now on."""
         if self._kept not in (None, sender):
-            self._said.append(
+            self._messages.append(
                 f"poses come from {_name(sender)} now; {_name(self._kept)} has been silent for "
                 f"{(now_ns - self._came_ns) * 1e-9:.1f} s"
             )
         self._kept, self._came_ns = sender, now_ns
 
-    def refuse(self, now_ns: int, words: str, hint: str) -> None:
+    def refuse(self, now_ns: int, text: str, hint: str) -> None:
         """Count a refused datagram, and report it unless another was reported in the last ten seconds."""
         self.refused += 1
         self._unreported += 1
         if now_ns >= self._next_report_ns:
             self._next_report_ns = now_ns + REPORT_AGAIN_NS
-            self._said.append(f"{words}: not used ({self._unreported} datagrams); {hint}")
+            self._messages.append(f"{text}: not used ({self._unreported} datagrams); {hint}")
             self._unreported = 0
 
-    def news(self) -> list[str]:
+    def new_messages(self) -> list[str]:
         """Return what a person should know since the last call."""
-        said, self._said = self._said, []
-        return said
+        messages, self._messages = self._messages, []
+        return messages
 
     def _is_silent(self, now_ns: int) -> bool:
         return now_ns - self._came_ns >= self._silence_ns

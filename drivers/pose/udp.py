@@ -38,20 +38,20 @@ class _Datagram(msgspec.Struct, frozen=True):
     t_ns: int | None = None
 
 
-class _Words(msgspec.Struct, frozen=True):
+class _Message(msgspec.Struct, frozen=True):
     """A sentence for the operator, from a process of ours that sends poses."""
 
     said: str
 
 
-_WORDS = msgspec.json.Decoder(_Words)
+_MESSAGE = msgspec.json.Decoder(_Message)
 _DECODERS: tuple[Callable[[bytes], _Datagram], ...] = (
     msgspec.json.Decoder(_Datagram).decode,
     msgspec.msgpack.Decoder(_Datagram).decode,
 )
 
 
-def make_pose_source(
+def create_pose_source(
     *,
     address: str = "127.0.0.1",
     port: int = 5005,
@@ -84,7 +84,7 @@ def make_pose_source(
 
 
 class UdpPoses:
-    """Satisfies `drivers.types.PoseSource` and `drivers.types.SaysWhy`."""
+    """Satisfies `drivers.types.PoseSource` and `drivers.types.MessageSource`."""
 
     def __init__(self, opened: socket.socket, senders: SenderGate, proof: PoseProof | None = None) -> None:
         self._socket = opened
@@ -102,28 +102,28 @@ class UdpPoses:
         poses = []
         with contextlib.suppress(OSError):
             for _ in range(MOST_A_TICK):
-                pose = self._take(*self._socket.recvfrom(LONGEST_DATAGRAM), now_ns)
+                pose = self._handle(*self._socket.recvfrom(LONGEST_DATAGRAM), now_ns)
                 if pose is not None:
                     poses.append(pose)
         return sorted(poses, key=lambda pose: pose.t_ns)
 
-    def news(self) -> Sequence[str]:
+    def new_messages(self) -> Sequence[str]:
         """Return messages for the operator since the last call."""
-        return self._senders.news()
+        return self._senders.new_messages()
 
     def close(self) -> None:
         """Close the UDP socket; safe to call twice."""
         self._socket.close()
 
-    def _take(self, datagram: bytes, sender: tuple[str, int], now_ns: int) -> PoseSample | None:
+    def _handle(self, datagram: bytes, sender: tuple[str, int], now_ns: int) -> PoseSample | None:
         """Return the pose in a datagram, if its sender counts; the cheap checks first, as anybody can send many."""
         if not self._senders.may_send(sender, now_ns):
             return None
         if self._proof is not None:
             opened = self._proof.unwrap(datagram, time.time_ns())
             if isinstance(opened, str):
-                words = f"{sender[0]}:{sender[1]} sends poses {opened}"
-                self._senders.refuse(now_ns, words, "docs/poses.md says what a sender with a key does")
+                text = f"{sender[0]}:{sender[1]} sends poses {opened}"
+                self._senders.refuse(now_ns, text, "docs/poses.md says what a sender with a key does")
                 return None
             datagram = opened
         pose = pose_of(datagram, now_ns)
@@ -161,9 +161,9 @@ def pose_of(datagram: bytes, now_ns: int) -> PoseSample | None:
     return PoseSample(t_ns, now_ns, read.x_m, read.y_m, yaw_rad, read.position_std_m, yaw_std_rad)
 
 
-def words_of(datagram: bytes) -> str | None:
+def message_of(datagram: bytes) -> str | None:
     """Return the sentence for the operator in a datagram of a process of ours; None where there is none."""
     try:
-        return _WORDS.decode(datagram).said
+        return _MESSAGE.decode(datagram).said
     except (msgspec.MsgspecError, UnicodeDecodeError):
         return None

@@ -21,7 +21,7 @@ __all__ = [
     "SerialMedium",
     "TransportSettingsError",
     "connect_pair",
-    "make_transport",
+    "create_transport",
     "media",
     "open_transport",
 ]
@@ -29,15 +29,15 @@ __all__ = [
 
 @cache
 def media() -> Mapping[str, Callable[..., ReconnectingTransport]]:
-    """Return the `make_transport` of each module in this folder that has a `KIND`, by `link.kind` of robot.toml.
+    """Return the `create_transport` of each module in this folder that has a `KIND`, by `link.kind` of robot.toml.
 
     It makes a link of the fields of [link], of which it takes its own and leaves the others.
     """
     modules = (import_module(each.name) for each in pkgutil.iter_modules(__path__, f"{__name__}."))
-    return MappingProxyType({module.KIND: module.make_transport for module in modules if hasattr(module, "KIND")})
+    return MappingProxyType({module.KIND: module.create_transport for module in modules if hasattr(module, "KIND")})
 
 
-def make_transport(kind: str, **fields: Any) -> ReconnectingTransport:
+def create_transport(kind: str, **fields: Any) -> ReconnectingTransport:
     """Make a link by the fields of robot.toml's [link]; it holds nothing before it is opened.
 
     Raises TransportSettingsError for a kind that does not exist and for what its medium refuses.
@@ -50,7 +50,7 @@ def make_transport(kind: str, **fields: Any) -> ReconnectingTransport:
 
 
 def open_transport(kind: str, **fields: Any) -> ReconnectingTransport:
-    """Make a link as `make_transport` does, and open it; a device that is absent is waited for, not an error."""
-    transport = make_transport(kind, **fields)
+    """Make a link as `create_transport` does, and open it; a device that is absent is waited for, not an error."""
+    transport = create_transport(kind, **fields)
     transport.open()
     return transport

@@ -73,7 +73,7 @@ _ECHOING_INTERFACES = frozenset({"udp_multicast"})
 SLCAN_BITRATES = (10_000, 20_000, 50_000, 83_300, 100_000, 125_000, 250_000, 500_000, 750_000, 1_000_000)
 MAY_STAY_MUTE = frozenset({"slcan", "serial", "seeedstudio", "robotell", "socketcand"})
 """Interfaces over a serial port or a connection: these can be open and lead nowhere."""
-_FIELDS_OF_THEIR_OWN = ("interface", "channel", "bitrate", "ignore_config")
+_NAMED_FIELDS = ("interface", "channel", "bitrate", "ignore_config")
 _NEEDED_OPTIONS = {"socketcand": ("host", "port")}
 _PACKAGES = {
     "canalystii": ("canalystii", "canalystii"),
@@ -85,7 +85,7 @@ _PACKAGES = {
 """By interface: the module that it imports, and the package that holds it."""
 
 
-def make_transport(
+def create_transport(
     *,
     interface: str = "socketcan",
     channel: str = "can0",
@@ -112,7 +112,7 @@ def _check_can(interface: str, bitrate: int, options: Mapping[str, Any]) -> None
     if interface == "slcan" and bitrate not in SLCAN_BITRATES:
         known = ", ".join(map(str, SLCAN_BITRATES))
         raise TransportSettingsError(f"link.bitrate: slcan has no {bitrate} bit/s; write one of {known}")
-    for name in _FIELDS_OF_THEIR_OWN:
+    for name in _NAMED_FIELDS:
         if name in options:
             raise TransportSettingsError(f"link.options: {name} has a field of its own; write it as link.{name}")
     missing = [name for name in _NEEDED_OPTIONS.get(interface, ()) if name not in options]
@@ -166,7 +166,7 @@ class CanMedium:
         # Without ignore_config a file in the user's home could change what is opened.
         bus = can.Bus(interface=self.interface, channel=self.channel, ignore_config=True, **options)
         echoes = self.interface in _ECHOING_INTERFACES or bool(self.options.get(_ECHO_OPTION))
-        return CanConnection(bus, counters, OwnFrames() if echoes else None)
+        return CanConnection(bus, counters, SentFrames() if echoes else None)
 
     def explain(self, error: Exception) -> str:
         """Say in one line what the error means and what to do."""
@@ -184,11 +184,11 @@ class CanConnection:
     Whether a frame "is_rx" is not asked: on a virtual CAN every frame of another local process says it is not.
     """
 
-    def __init__(self, bus: can.BusABC, counters: TransportCounters, own: OwnFrames | None = None) -> None:
+    def __init__(self, bus: can.BusABC, counters: TransportCounters, sent_frames: SentFrames | None = None) -> None:
         """Wrap an open bus; `own` is for a bus that hands a sender its own frames, which then are not received."""
         self._bus = bus
         self._counters = counters
-        self._own = own
+        self._sent_frames = sent_frames
         self._garbage = 0
 
     def read(self) -> Sequence[ReceivedFrame]:
@@ -196,19 +196,19 @@ class CanConnection:
         try:
             message = self._bus.recv(READ_TIMEOUT_S)
         except (ValueError, IndexError) as error:
-            self._take_garbage(error)
+            self._handle_garbage(error)
             return ()
         except can.CanError as error:
             # slcan: a byte that is no text makes every later call fail until the buffer is flushed.
             if not isinstance(error.__cause__, ValueError):
                 raise
-            self._take_garbage(error)
+            self._handle_garbage(error)
             return ()
         if message is None:
             return ()
         now_ns, wall_now_ns = time.monotonic_ns(), time.time_ns()
         if message.is_error_frame:
-            self._take_error_frame(message)
+            self._handle_error_frame(message)
             return ()
         data = bytes(message.data)
         if (
@@ -222,20 +222,20 @@ class CanConnection:
             return ()
         self._garbage = 0
         frame = Frame(message.arbitration_id, data, message.is_extended_id)
-        if self._own is not None and self._own.is_echo(now_ns, frame):
+        if self._sent_frames is not None and self._sent_frames.is_echo(now_ns, frame):
             return ()
         return (ReceivedFrame(monotonic_stamp_ns(message.timestamp, wall_now_ns, now_ns), frame),)
 
     def write(self, frame: Frame) -> None:
         """Send one frame, waiting 0.05 s at most; raises TransmitBusyError if there was no room."""
         message = can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=frame.extended, check=True)
-        if self._own is not None:
-            self._own.sent(time.monotonic_ns(), frame)
+        if self._sent_frames is not None:
+            self._sent_frames.sent(time.monotonic_ns(), frame)
         try:
             self._bus.send(message, timeout=WRITE_TIMEOUT_S)
         except (can.CanError, OSError) as error:
-            if self._own is not None:
-                self._own.not_sent(frame)
+            if self._sent_frames is not None:
+                self._sent_frames.not_sent(frame)
             if is_busy(error):
                 raise TransmitBusyError(str(error)) from error
             raise
@@ -250,7 +250,7 @@ class CanConnection:
             if port is not None:
                 port.close()
 
-    def _take_garbage(self, error: Exception) -> None:
+    def _handle_garbage(self, error: Exception) -> None:
         flush = getattr(self._bus, "flush", None)
         if flush is not None:
             flush()
@@ -261,7 +261,7 @@ class CanConnection:
                 f"nothing but garbage arrives ({error}); check the adapter's firmware and serial speed"
             ) from error
 
-    def _take_error_frame(self, message: can.Message) -> None:
+    def _handle_error_frame(self, message: can.Message) -> None:
         bus_error = decode_error_frame(message.arbitration_id, bytes(message.data))
         self._counters.add(
             bus_off=int(bus_error.bus_off),
@@ -356,7 +356,7 @@ def explain_can(interface: str, channel: str, bitrate: int, error: BaseException
     return f"{where}: {plain(error)}"
 
 
-class OwnFrames:
+class SentFrames:
     """For buses that hand a sender its own frames; a sending and a receiving thread may use it at once.
 
     Each frame sent excuses one equal frame received within a second. So a second host is seen even if it sends the
@@ -370,7 +370,7 @@ class OwnFrames:
     def sent(self, now_ns: int, frame: Frame) -> None:
         """Note a frame, before it is handed to the bus: its echo can be faster than the call that sends it."""
         with self._lock:
-            self._forget(now_ns)
+            self._drop_old(now_ns)
             self._sent.append((now_ns, frame))
 
     def not_sent(self, frame: Frame) -> None:
@@ -384,14 +384,14 @@ class OwnFrames:
     def is_echo(self, now_ns: int, frame: Frame) -> bool:
         """Whether a received frame is one's own; each note counts once."""
         with self._lock:
-            self._forget(now_ns)
+            self._drop_old(now_ns)
             for index, (_, sent) in enumerate(self._sent):
                 if sent == frame:
                     del self._sent[index]
                     return True
         return False
 
-    def _forget(self, now_ns: int) -> None:
+    def _drop_old(self, now_ns: int) -> None:
         while self._sent and now_ns - self._sent[0][0] > ECHO_NS:
             self._sent.popleft()
 
@@ -415,20 +415,20 @@ def decode_error_frame(error_class: int, data: bytes) -> CanBusError:
     """
     detail = data.ljust(8, b"\0")
     controller = detail[1] if error_class & _CONTROLLER else 0
-    words = [text for bit, text in _CLASSES if error_class & bit]
-    words += [text for bit, text in _CONTROLLER_STATES if controller & bit]
+    texts = [text for bit, text in _CLASSES if error_class & bit]
+    texts += [text for bit, text in _CONTROLLER_STATES if controller & bit]
     bus_off = bool(error_class & _BUS_OFF)
     if bus_off:
-        words.insert(0, "bus-off: the controller has left the bus after too many errors")
-    harmful = bool(words)
+        texts.insert(0, "bus-off: the controller has left the bus after too many errors")
+    harmful = bool(texts)
     if error_class & _RESTARTED:
-        words.append("controller restarted")
+        texts.append("controller restarted")
     counted = bool(error_class & _COUNTERS)
     return CanBusError(
         bus_off=bus_off,
         harmful=harmful,
         receive_overflow=bool(controller & _RECEIVE_OVERFLOW),
-        text=", ".join(words) or "controller is error-active",
+        text=", ".join(texts) or "controller is error-active",
         tx_error_count=detail[6] if counted else None,
         rx_error_count=detail[7] if counted else None,
     )

@@ -80,7 +80,7 @@ class InProcessTransport:
             self._counters.add(send_errors=1)
             return False
         self._counters.add(frames_sent=1)
-        self._peer._take(ReceivedFrame(now_ns, outgoing.frame))
+        self._peer._handle(ReceivedFrame(now_ns, outgoing.frame))
         return True
 
     def receive(self) -> Sequence[ReceivedFrame]:
@@ -89,7 +89,7 @@ class InProcessTransport:
         self._incoming.clear()
         return received
 
-    def _take(self, received: ReceivedFrame) -> None:
+    def _handle(self, received: ReceivedFrame) -> None:
         if len(self._incoming) >= QUEUE_CAPACITY:
             self._incoming.popleft()
             self._counters.add(receive_overflow=1)

@@ -95,7 +95,7 @@ class TransmitQueue:
         """Take out the frame to send next, or None."""
         return heapq.heappop(self._heap)[2] if self._heap else None
 
-    def put_back(self, outgoing: OutgoingFrame) -> None:
+    def requeue(self, outgoing: OutgoingFrame) -> None:
         """Return the frame taken out last: it stays the first of its identifier and counts against no limit."""
         self._front -= 1
         heapq.heappush(self._heap, (_rank(outgoing), self._front, outgoing))
@@ -219,7 +219,7 @@ class ReconnectingTransport:
         self._backoff = backoff
         self._mute_after_s = mute_after_s
         self._patience_s = mute_after_s
-        self._mute_words: str | None = None
+        self._mute_reason: str | None = None
         self._counters = TransportCounters()
         self._changed = threading.Condition()
         self._writing = threading.Lock()
@@ -334,34 +334,34 @@ class ReconnectingTransport:
             self._stop.wait(delay_s)
 
     def _pump(self, connection: Connection) -> None:
-        heard_ns = time.monotonic_ns()
+        received_ns = time.monotonic_ns()
         while not (self._stop.is_set() or self._lost.is_set()):
             try:
                 frames = connection.read()
                 if not frames:
-                    self._refuse_silence(heard_ns)
+                    self._refuse_silence(received_ns)
             except Exception as error:  # whatever a backend raises, this thread must outlive it
                 self._counters.add(receive_errors=1)
                 self._note(error)
-                self._mute_words = self._last_error if isinstance(error, LinkMuteError) else None
+                self._mute_reason = self._last_error if isinstance(error, LinkMuteError) else None
                 return
             if frames:
-                heard_ns = time.monotonic_ns()
+                received_ns = time.monotonic_ns()
                 self._deliver(frames)
 
-    def _refuse_silence(self, heard_ns: int) -> None:
+    def _refuse_silence(self, received_ns: int) -> None:
         """Raise LinkMuteError when nothing has come for too long, and be twice as patient the next time.
 
         An adapter that comes back under another name can leave an open port behind that says nothing and never fails.
         """
-        if self._patience_s is not None and time.monotonic_ns() - heard_ns > self._patience_s * 1e9:
+        if self._patience_s is not None and time.monotonic_ns() - received_ns > self._patience_s * 1e9:
             silent_s = self._patience_s
             self._patience_s = min(2.0 * silent_s, _MOST_PATIENT_S)
             raise LinkMuteError(f"open, but no frame has come for {silent_s:g} s")
 
     def _deliver(self, frames: Sequence[ReceivedFrame]) -> None:
-        if self._mute_words is not None:
-            self._last_error = self._mute_words = None
+        if self._mute_reason is not None:
+            self._last_error = self._mute_reason = None
         self._patience_s = self._mute_after_s
         with self._changed:
             self._incoming.extend(frames)
@@ -381,7 +381,7 @@ class ReconnectingTransport:
             self._incoming.clear()
             self._connection = connection
             # That it was mute is worth saying until it is not.
-            self._last_error = self._mute_words
+            self._last_error = self._mute_reason
             # Counted before it shows, so that nobody sees a link that came back and was not counted.
             self._counters.add(reconnects=1 if self._generation else 0)
             self._generation += 1
@@ -416,7 +416,7 @@ class ReconnectingTransport:
             done = self._write(connection, outgoing)
             with self._changed:
                 if not done and self._connection is connection:
-                    self._outgoing.put_back(outgoing)
+                    self._outgoing.requeue(outgoing)
                 self._sending = False
                 self._changed.notify_all()
             if not done:

@@ -40,7 +40,7 @@ _TCP, _UNIX = "socket://", "unix://"
 _CONNECT_S = 5.0
 
 
-def make_transport(
+def create_transport(
     *,
     port: str = "/dev/ttyUSB0",
     baud: int = 921_600,
@@ -79,7 +79,7 @@ class SerialMedium:
         """Open the port for this process alone. Raises what pyserial raises."""
         timeout_s = READ_TIMEOUT_S if self.exchange is None else _EXCHANGE_READ_S
         port = open_port(self, timeout_s=timeout_s, write_timeout_s=WRITE_TIMEOUT_S, exclusive=True)
-        ask_for_low_latency(port)
+        request_low_latency(port)
         if self.exchange is not None:
             return ExchangeConnection(port, counters, self.exchange)
         return SerialConnection(port, counters)
@@ -259,13 +259,13 @@ def open_port(medium: SerialMedium, *, timeout_s: float, write_timeout_s: float,
     return port
 
 
-def ask_for_low_latency(port: serial.Serial) -> None:
+def request_low_latency(port: serial.Serial) -> None:
     """Ask for delivery byte by byte: FTDI adapters otherwise hold received bytes back for 16 ms."""
-    ask = getattr(port, "set_low_latency_mode", None)
-    if ask is None:
+    request = getattr(port, "set_low_latency_mode", None)
+    if request is None:
         return
     try:
-        ask(True)
+        request(True)
     except (ValueError, OSError, NotImplementedError):
         # Pseudo-terminals, CDC-ACM and network ports have no such mode, and no latency timer either.
         return

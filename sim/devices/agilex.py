@@ -54,7 +54,7 @@ class AgilexBase:
     motor_speeds: tuple[int, int, int, int] = (0, 0, 0, 0)
     count: int = 0
     last_motion_ms: int | None = None
-    asked_motion: tuple[int, int] = (0, 0)
+    commanded_motion: tuple[int, int] = (0, 0)
     obeyed: list[tuple[int, tuple[int, ...]]] = field(default_factory=list)
     _now_ms: int = 0
 
@@ -69,7 +69,7 @@ class AgilexBase:
             return 0.0, 0.0
         if self._now_ms - self.last_motion_ms > TIMEOUT_MS:
             return 0.0, 0.0
-        return 1e-3 * self.asked_motion[0], 1e-3 * self.asked_motion[1]
+        return 1e-3 * self.commanded_motion[0], 1e-3 * self.commanded_motion[1]
 
     def receive(self, frame: CanFrame) -> list[CanFrame]:
         """Take in one frame; return the replies."""
@@ -81,7 +81,7 @@ class AgilexBase:
                 linear, angular, lateral, steering = struct.unpack(">hhhh", data)
                 self.obeyed.append((frame.can_id, (linear, angular, lateral, steering)))
                 if self.control_mode == CAN_MODE:
-                    self.asked_motion, self.last_motion_ms = (linear, angular), self._now_ms
+                    self.commanded_motion, self.last_motion_ms = (linear, angular), self._now_ms
             case 0x121:
                 self.light = struct.unpack(">BBBBB", data[:5])
                 self.obeyed.append((frame.can_id, self.light))
@@ -93,7 +93,7 @@ class AgilexBase:
                 # Who holds the remote control decides.
                 if self.control_mode != RC_MODE:
                     self.control_mode = data[0]
-                    self.asked_motion, self.last_motion_ms = (0, 0), None
+                    self.commanded_motion, self.last_motion_ms = (0, 0), None
             case 0x441:
                 self.obeyed.append((frame.can_id, (data[0],)))
                 self.error_code = 0
@@ -104,7 +104,7 @@ class AgilexBase:
                     return [self.message(0x4A1)]
         return []
 
-    def take_remote_control(self, speed_m_s: float, turn_rad_s: float) -> None:
+    def use_remote_control(self, speed_m_s: float, turn_rad_s: float) -> None:
         """Let an operator switch the remote control on and drive."""
         self.control_mode, self.rc_commanded = RC_MODE, (speed_m_s, turn_rad_s)
 
@@ -181,7 +181,7 @@ class AgilexController:
         """Whether its wheels' loops run: in the modes in which somebody drives it, standing too."""
         return self.base.vehicle_state == 0 and self.base.control_mode in (CAN_MODE, RC_MODE)
 
-    def make_loop(self) -> EncoderLoop:
+    def create_loop(self) -> EncoderLoop:
         """Create the wheels' speed loops, assumed to be as simple as can be: the vendor documents nothing of them."""
         return EncoderLoop(EncoderUse.SPEED, self._settings.max_speed_m_s / self._settings.wheel_radius_m)
 
@@ -224,6 +224,6 @@ class AgilexController:
         self.base = AgilexBase()
 
 
-def make_controller(settings: AgilexSettings, ticks_per_rev: int) -> AgilexController:
+def create_controller(settings: AgilexSettings, ticks_per_rev: int) -> AgilexController:
     """Return the base of a robot whose robot.toml has these settings, with the encoder on the wheel."""
     return AgilexController(settings, ticks_per_rev)

@@ -109,19 +109,19 @@ class Axis:
 
         A request clears an INVALID_STATE that an earlier one has left.
         """
-        wanted, self.requested_state = self.requested_state, 0
-        if wanted == 0:
+        requested, self.requested_state = self.requested_state, 0
+        if requested == 0:
             return
         self.axis_error &= ~INVALID_STATE
-        self.obeyed_states.append(wanted)
-        if wanted == CLOSED_LOOP and not self.calibrated:
+        self.obeyed_states.append(requested)
+        if requested == CLOSED_LOOP and not self.calibrated:
             self.axis_error |= INVALID_STATE
             self.axis_state = IDLE
-        elif wanted == CLOSED_LOOP and self.axis_error == 0:
+        elif requested == CLOSED_LOOP and self.axis_error == 0:
             self.feed()
             self.axis_state = CLOSED_LOOP
-        elif wanted != CLOSED_LOOP:
-            self.axis_state = wanted
+        elif requested != CLOSED_LOOP:
+            self.axis_state = requested
 
     @property
     def velocity_turns_s(self) -> float | None:
@@ -188,8 +188,8 @@ class OdriveBoard:
         axis.feed()
         if command == 0x1D and self.generation == "0.5":
             return [self.message(axis, command)]
-        asked = (frame.remote or not frame.data) and command != 0x01
-        if asked and self._telemetry_body(axis, command) is not None:
+        is_request = (frame.remote or not frame.data) and command != 0x01
+        if is_request and self._telemetry_body(axis, command) is not None:
             return [self.message(axis, command)]
         if command == 0x04 and self.generation == "0.6":
             return self._parameter(axis, data)
@@ -338,7 +338,7 @@ class OdriveController:
         self._settings = settings
         self._ticks_per_rev = ticks_per_rev
         self._received_us = 0
-        self.boards = self._make_boards()
+        self.boards = self._create_boards()
         self.axes = self._axes_by_side()
 
     @property
@@ -346,8 +346,8 @@ class OdriveController:
         """The speeds that the motors hold; a side of which one motor is released has what the others hold."""
         wheels = []
         for side, direction in zip(self.axes, self._settings.direction, strict=True):
-            held = [speed for axis in side if (speed := axis.velocity_turns_s) is not None]
-            turns = sum(held) / len(held) if held else None
+            known_speeds = [speed for axis in side if (speed := axis.velocity_turns_s) is not None]
+            turns = sum(known_speeds) / len(known_speeds) if known_speeds else None
             wheels.append(None if turns is None else direction * turns * 2.0 * math.pi / self._settings.gear)
         return wheels[0], wheels[1]
 
@@ -356,7 +356,7 @@ class OdriveController:
         """Whether an axis is in closed loop."""
         return any(axis.axis_state == CLOSED_LOOP for side in self.axes for axis in side)
 
-    def make_loop(self) -> EncoderLoop:
+    def create_loop(self) -> EncoderLoop:
         """Create the field-oriented control, whose angle is the encoder's."""
         turns_s = self._settings.vel_limit_turns_s
         return EncoderLoop(EncoderUse.COMMUTATION, 2.0 * math.pi * turns_s / self._settings.gear)
@@ -398,10 +398,10 @@ class OdriveController:
 
     def restart(self) -> None:
         """Switch off and on: nothing is asked, nothing latched, the watchdog as it is set."""
-        self.boards = self._make_boards()
+        self.boards = self._create_boards()
         self.axes = self._axes_by_side()
 
-    def _make_boards(self) -> list[OdriveBoard]:
+    def _create_boards(self) -> list[OdriveBoard]:
         settings = self._settings
         left, right = sides_of(settings.nodes)
         pairs = list(zip(left, right, strict=True)) if settings.firmware == "0.5" else [(n,) for n in (*left, *right)]
@@ -422,6 +422,6 @@ class OdriveController:
         return [by_node[node] for node in left], [by_node[node] for node in right]
 
 
-def make_controller(settings: OdriveSettings, ticks_per_rev: int) -> OdriveController:
+def create_controller(settings: OdriveSettings, ticks_per_rev: int) -> OdriveController:
     """Return the controllers of a robot whose robot.toml has these settings, with the encoder on the wheel."""
     return OdriveController(settings, ticks_per_rev)

@@ -213,13 +213,13 @@ class RoboclawController:
     @property
     def wheels_rad_s(self) -> tuple[float | None, float | None]:
         """The mean of what a side's motors hold; None where one is released."""
-        held: list[float | None] = []
+        known_speeds: list[float | None] = []
         for side, direction in zip(self._settings.sides, self._settings.direction, strict=True):
             speeds = [self._ramped.get(place) for place in side]
             known = [speed for speed in speeds if speed is not None]
             mean = direction * sum(known) / len(side) / self._settings.counts_per_rad
-            held.append(mean if len(known) == len(side) else None)
-        return held[0], held[1]
+            known_speeds.append(mean if len(known) == len(side) else None)
+        return known_speeds[0], known_speeds[1]
 
     @property
     def brakes(self) -> bool:
@@ -231,7 +231,7 @@ class RoboclawController:
         """Whether a motor has a speed to hold; a fixed duty needs no encoder."""
         return any(board.command is not None and board.command[0] == "speed" for board in self.boards.values())
 
-    def make_loop(self) -> EncoderLoop:
+    def create_loop(self) -> EncoderLoop:
         """Create the velocity PID, which full duty (QPPS) ends."""
         qpps = min(board.registers.pid_m1[3] for board in self.boards.values())
         return EncoderLoop(EncoderUse.SPEED, qpps / self._settings.counts_per_rad)
@@ -289,19 +289,19 @@ class RoboclawController:
             self._ramped.pop(place, None)
             return
         kind, *values = board.command
-        wanted = values[motor]
+        target = values[motor]
         if kind == "duty":
             qpps = (board.registers.pid_m1, board.registers.pid_m2)[motor][3]
-            self._ramped[place] = wanted / 32767.0 * qpps
+            self._ramped[place] = target / 32767.0 * qpps
             return
         now = self._ramped.get(place, measured_counts_s)
         step = math.inf if board.accel is None else 1e-3 * board.accel
-        self._ramped[place] = now + min(max(wanted - now, -step), step)
+        self._ramped[place] = now + min(max(target - now, -step), step)
 
 
 _MOVING = frozenset({34, 35, 36, 37, 40})
 
 
-def make_controller(settings: RoboclawSettings, ticks_per_rev: int) -> RoboclawController:
+def create_controller(settings: RoboclawSettings, ticks_per_rev: int) -> RoboclawController:
     """Return the boards of a robot whose robot.toml has these settings."""
     return RoboclawController(settings, ticks_per_rev)

@@ -37,7 +37,7 @@ class Ros2BaseController:
     @property
     def wheels_rad_s(self) -> tuple[float | None, float | None]:
         """The speeds of its wheels: it always holds them."""
-        linear, angular = self._said if self._now_ms - self._said_ms <= 1e3 * self._settings.watchdog_s else (0.0, 0.0)
+        linear, angular = self._speeds if self._now_ms - self._set_ms <= 1e3 * self._settings.watchdog_s else (0.0, 0.0)
         turn = 0.5 * self._settings.track_m * angular
         return (linear - turn) / self._settings.wheel_radius_m, (linear + turn) / self._settings.wheel_radius_m
 
@@ -46,7 +46,7 @@ class Ros2BaseController:
         """Whether its wheels' loops run; they are reset by a speed of zero, as in the usual firmware of small bases."""
         return self.wheels_rad_s != (0.0, 0.0)
 
-    def make_loop(self) -> EncoderLoop:
+    def create_loop(self) -> EncoderLoop:
         """Create the wheels' speed loops."""
         return EncoderLoop(EncoderUse.SPEED, self._settings.max_speed_m_s / self._settings.wheel_radius_m)
 
@@ -58,7 +58,9 @@ class Ros2BaseController:
     def receive(self, now_us: int, frame: CanFrame) -> Sequence[CanFrame]:
         """Take in one frame; the bridge answers nothing at once."""
         if not frame.remote and not frame.error:
-            self._say(now_us // 1000, self.end.receive(1000 * now_us, Frame(frame.can_id, frame.data, frame.extended)))
+            self._apply(
+                now_us // 1000, self.end.receive(1000 * now_us, Frame(frame.can_id, frame.data, frame.extended))
+            )
         return ()
 
     def step(self, now_us: int, inputs: FirmwareInputs) -> Sequence[CanFrame]:
@@ -68,7 +70,7 @@ class Ros2BaseController:
         self.end.button, self.end.has_odometry = inputs.estop_button, self.joints
         frames: list[Frame] = []
         if now_ms % STEP_MS == 0:
-            self._say(now_ms, self.end.step(1000 * now_us))
+            self._apply(now_ms, self.end.step(1000 * now_us))
         if now_ms % STATE_MS == 0:
             frames.append(self.end.state())
         if now_ms % WHEELS_MS == 0 and self.joints:
@@ -86,14 +88,14 @@ class Ros2BaseController:
 
     def _begin(self) -> None:
         self.end = wire.BaseEnd(self._settings)
-        self.end.is_heard = True
-        self._said, self._said_ms, self._now_ms = (0.0, 0.0), 0, 0
+        self.end.has_listener = True
+        self._speeds, self._set_ms, self._now_ms = (0.0, 0.0), 0, 0
 
-    def _say(self, now_ms: int, speeds: tuple[float, float] | None) -> None:
+    def _apply(self, now_ms: int, speeds: tuple[float, float] | None) -> None:
         if speeds is not None:
-            self._said, self._said_ms, self.obeyed = speeds, now_ms, self.obeyed + 1
+            self._speeds, self._set_ms, self.obeyed = speeds, now_ms, self.obeyed + 1
 
 
-def make_controller(settings: wire.Ros2BaseSettings, ticks_per_rev: int) -> Ros2BaseController:
+def create_controller(settings: wire.Ros2BaseSettings, ticks_per_rev: int) -> Ros2BaseController:
     """Return the base of a robot whose robot.toml has these settings, with the encoder on the wheel."""
     return Ros2BaseController(settings, ticks_per_rev)

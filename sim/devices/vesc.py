@@ -24,7 +24,7 @@ class VescController:
         self._zero_ticks = (0, 0)
         self._ticks = (0, 0)
         self._now_ms = 0
-        self.sides = self._make()
+        self.sides = self._create_boards()
 
     @property
     def brakes(self) -> bool:
@@ -36,17 +36,17 @@ class VescController:
         """The speeds that the motors hold, zero where they brake."""
         wheels: list[float | None] = []
         for side, direction in zip(self.sides, self._settings.direction, strict=True):
-            held = [speed for vesc in side if (speed := self._held_erpm(vesc)) is not None]
-            erpm = sum(held) / len(held) if held else None
+            known_speeds = [speed for vesc in side if (speed := self._commanded_erpm(vesc)) is not None]
+            erpm = sum(known_speeds) / len(known_speeds) if known_speeds else None
             wheels.append(None if erpm is None else direction * erpm / self._settings.erpm_per_rad_s)
         return wheels[0], wheels[1]
 
     @property
     def regulates(self) -> bool:
         """Whether a motor has a speed to hold; currents need no loop of speed."""
-        return any(vesc.held[0] == "set_erpm" for side in self.sides for vesc in side)
+        return any(vesc.last_command[0] == "set_erpm" for side in self.sides for vesc in side)
 
-    def make_loop(self) -> EncoderLoop:
+    def create_loop(self) -> EncoderLoop:
         """Create the field-oriented control, whose angle is the encoder's."""
         return EncoderLoop(EncoderUse.COMMUTATION, self._settings.max_erpm / self._settings.erpm_per_rad_s)
 
@@ -72,7 +72,7 @@ class VescController:
             for vesc in side:
                 vesc.at(now_us // 1000)
                 replies += vesc.receive(frame)
-                vesc.take_calls()
+                vesc.pop_calls()
         return replies
 
     def step(self, now_us: int, inputs: FirmwareInputs) -> Sequence[CanFrame]:
@@ -96,7 +96,7 @@ class VescController:
     def restart(self) -> None:
         """Switch off and on: the tachometers begin at zero."""
         self._zero_ticks = self._ticks
-        self.sides = self._make()
+        self.sides = self._create_boards()
 
     def _receive_bytes(self, now_ms: int, received: bytes) -> Sequence[CanFrame]:
         """Bytes from the serial line; what is forwarded goes over the bus between the controllers, and back."""
@@ -108,12 +108,12 @@ class VescController:
         for frame in forwarded:
             for vesc in everyone:
                 if vesc is not near:
-                    out += b"".join(near.take_packet_answer(answer) for answer in vesc.receive(frame))
+                    out += b"".join(near.handle_packet_reply(reply) for reply in vesc.receive(frame))
         for vesc in everyone:
-            vesc.take_calls()
+            vesc.pop_calls()
         return [CanFrame(0, out)] if out else []
 
-    def _make(self) -> tuple[list[Vesc], list[Vesc]]:
+    def _create_boards(self) -> tuple[list[Vesc], list[Vesc]]:
         settings = self._settings
         left, right = (
             [Vesc(node, round(1e3 * settings.watchdog_s), settings.timeout_brake_current_a) for node in side]
@@ -124,10 +124,10 @@ class VescController:
             vesc.last_fed_ms = self._now_ms
         return left, right
 
-    def _held_erpm(self, vesc: Vesc) -> float | None:
+    def _commanded_erpm(self, vesc: Vesc) -> float | None:
         if _brakes(vesc):
             return 0.0
-        name, value = vesc.held
+        name, value = vesc.last_command
         limit = self._settings.max_erpm
         stopped = vesc.values.fault or vesc.kill_switch_active
         lets_go = stopped or name != "set_erpm" or abs(value) < self._settings.min_erpm
@@ -135,10 +135,10 @@ class VescController:
 
 
 def _brakes(vesc: Vesc) -> bool:
-    name, value = vesc.held
+    name, value = vesc.last_command
     return name == "set_brake_current" and value > 0.0 and not vesc.values.fault
 
 
-def make_controller(settings: VescSettings, ticks_per_rev: int) -> VescController:
+def create_controller(settings: VescSettings, ticks_per_rev: int) -> VescController:
     """Return the controllers of a robot whose robot.toml has these settings, with the encoder on the wheel."""
     return VescController(settings, ticks_per_rev)

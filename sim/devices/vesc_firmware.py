@@ -105,7 +105,7 @@ class Vesc:
         self.kill_switch_active = False
         self.fed = 0
         self.last_fed_ms = 0
-        self.held: tuple[str, float] = ("set_current", 0.0)
+        self.last_command: tuple[str, float] = ("set_current", 0.0)
         self.firmware = b"\x07\x01" + b"sim\0" + bytes(12) + b"\0\1" + bytes(12)
         self._now_ms = 0
         self._ignores_until_ms = 0
@@ -114,7 +114,7 @@ class Vesc:
         self._serial = _PacketParser()
         self._serial_out = bytearray()
 
-    def take_calls(self) -> list[tuple[str, float]]:
+    def pop_calls(self) -> list[tuple[str, float]]:
         """Return the commands that reached the motor since the last call."""
         calls, self._calls = self._calls, []
         return calls
@@ -157,7 +157,7 @@ class Vesc:
                 self._serial_out += serial_packet(answer)
         return bytes(self._serial_out), frames
 
-    def take_packet_answer(self, frame: CanFrame) -> bytes:
+    def handle_packet_reply(self, frame: CanFrame) -> bytes:
         """Return the bytes for the serial line after a fragment of another controller's reply to a forwarded packet."""
         command, to = frame.can_id >> 8, frame.can_id & 0xFF
         if not frame.extended or to != self.controller_id:
@@ -187,7 +187,7 @@ class Vesc:
             self.timed_out = expired
         if not (expired or self.kill_switch_active):
             return None
-        self.held = ("set_brake_current", self.timeout_brake_current_a)
+        self.last_command = ("set_brake_current", self.timeout_brake_current_a)
         return self.timeout_brake_current_a
 
     def step(self, now_ms: int) -> list[CanFrame]:
@@ -214,7 +214,7 @@ class Vesc:
             data = b"".join(_steps(value, scale, code, float) for value, scale, code in parts[number])
         return CanFrame(number << 8 | self.controller_id, data, extended=True)
 
-    def answer_values(self, mask: int) -> bytes:
+    def reply_values(self, mask: int) -> bytes:
         """Return the bytes of the values that the mask asks for."""
         v = self.values
         status = int(self.timed_out) | self.kill_switch_active << 1
@@ -263,7 +263,7 @@ class Vesc:
         self._calls.append((name, value))
         # The layer below ignores it; the timeout is fed all the same.
         if self._now_ms >= self._ignores_until_ms:
-            self.held = (name, value)
+            self.last_command = (name, value)
         self._feed()
 
     def _feed(self) -> None:
@@ -294,13 +294,13 @@ class Vesc:
         elif command == 0:
             return b"\0" + self.firmware, []
         elif command == 4:
-            return b"\4" + self.answer_values((1 << 22) - 1), []
+            return b"\4" + self.reply_values((1 << 22) - 1), []
         elif command == 17:
             head = struct.pack(">BIBIf", 17, APPCONF_SIGNATURE, self.controller_id, self.timeout_ms, brake_a)
             return head + bytes(_APPCONF_REST), []
         elif command == 50:
             mask = int.from_bytes(payload[1:5].ljust(4, b"\0"))
-            return b"\x32" + mask.to_bytes(4) + self.answer_values(mask), []
+            return b"\x32" + mask.to_bytes(4) + self.reply_values(mask), []
         elif command == 34 and len(payload) >= 2:
             return None, can_packet(payload[1], self.controller_id, payload[2:], send_mode=0)
         return None, []

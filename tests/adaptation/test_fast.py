@@ -10,7 +10,7 @@ from disco_hw.adaptation.fast import FastAdaptation
 from disco_hw.adaptation.guard import Geometry, believed_geometry
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.log.records import Adaptation, BeliefChange
-from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import load_setup
 from sim.body_dynamics import BodyPose
@@ -38,7 +38,7 @@ def driven(directory, seconds):
         PlantParameters(ticks_per_rev=2048), x_icr_m=x_icr, wheel_radius_m=0.88 * radius, axial_distance_m=1.12 * axial
     )
     robot = virtual_robot(setup, plant, BodyPose(0.75, 0.0, 1.57), seed=1)
-    run = SimulatedRun(setup, robot, make_planner(setup.config, setup.model))
+    run = SimulatedRun(setup, robot, create_planner(setup.config, setup.model))
     run.start()
     run.run(seconds)
     return run, (x_icr, 0.88 * radius, 1.12 * axial)
@@ -55,11 +55,11 @@ def test_the_geometry_is_learnt_logged_and_taken_back_when_asked(tmp_path):
     assert len(changes(run)) > 3
     np.testing.assert_allclose(changes(run)[-1].mean, truth, rtol=0.05)
 
-    assert adaptation.ask("revert")[0]
+    assert adaptation.handle_request("revert")[0]
     run.run(1.2)
     assert adaptation.status()["belief"] == "model"
     assert changes(run)[-1].source == "model"
-    assert adaptation.ask("adapt")[0]
+    assert adaptation.handle_request("adapt")[0]
     run.run(1.6)
     assert adaptation.status()["belief"] == "adapted"
 
@@ -73,9 +73,9 @@ MEAN = np.array(NOMINAL)[[2, 0, 1]]
 MODEL = Geometry(MEAN, np.diag((0.05 * MEAN) ** 2))
 
 
-def learning(put_in_force, spoil=lambda adaptation: None):
+def learning(apply_geometry, spoil=lambda adaptation: None):
     """Drive a robot unlike MODEL for 4 s; returns the adaptation and the records that it wrote."""
-    adaptation = FastAdaptation(MODEL, 0.5 * MEAN, 1.6 * MEAN, put_in_force)
+    adaptation = FastAdaptation(MODEL, 0.5 * MEAN, 1.6 * MEAN, apply_geometry)
     plant, written = ForeignPlant(robots(8001, 1)[0], (0.0, 0.0, 0.3), 1), []
     for _ in range(200):
         adaptation.feed(plant.now_ns, plant.readings())
@@ -112,7 +112,7 @@ def test_an_estimate_of_absurd_variance_never_reaches_the_planner():
 
 
 def test_without_adaptation_a_request_is_refused_with_what_starts_it():
-    accepted, text = NoAdaptation().ask("adapt")
+    accepted, text = NoAdaptation().handle_request("adapt")
     assert not accepted
     assert "--adapt" in text
     assert NoAdaptation().status() is None

@@ -90,7 +90,7 @@ def test_a_client_gets_all_topics_and_what_the_daemon_records(live):
 def test_the_daemon_has_its_recorder_write_the_scene(tmp_path, monkeypatch):
     setup = load_setup(write_robot_file(tmp_path))
     monkeypatch.setattr(run, "ProcessRecorder", lambda settings: settings)
-    assert run._make_recorder(setup, tmp_path / "log.mcap").scene == scene_of(setup.config)
+    assert run._create_recorder(setup, tmp_path / "log.mcap").scene == scene_of(setup.config)
 
 
 def test_a_port_that_is_taken_is_refused_in_one_line(live, tmp_path):

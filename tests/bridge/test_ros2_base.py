@@ -149,8 +149,8 @@ def test_frames_carry_the_wheels_over_the_wrap_of_their_count():
         turned = []
         for before, now in zip(*(wire.unpack_angles(frames[0].data) for frames in (first, second)), strict=True):
             side = Odometer()
-            assert side.take_wrapping(before, 0, 0, 1e5, 0.0)
-            assert side.take_wrapping(now, 10**9, 0, 1e5, 0.0)
+            assert side.add_wrapping(before, 0, 0, 1e5, 0.0)
+            assert side.add_wrapping(now, 10**9, 0, 1e5, 0.0)
             turned.append(wire.ANGLE_RAD * side.total)
         assert turned == pytest.approx((1.5, -1.5), abs=2e-4)
         speeds, age_s = wire.unpack_wheels(first[1].data)
@@ -222,7 +222,7 @@ class TestBaseEnd:
 
     def test_a_button_that_nobody_speaks_for_any_more_stops_it_and_leaves_the_topic_to_others(self, end):
         end.receive(0, wire.enable(True))
-        end.hears_button = False
+        end.receives_button = False
         assert end.step(20 * MS) == (0.0, 0.0)
         assert end.step(1000 * MS) is None
         end.receive(1000 * MS, wire.enable(True))
@@ -345,7 +345,7 @@ def over_dds(tmp_path, request):
 
 
 def test_over_dds_a_base_is_found_and_driven_until_another_node_speaks(over_dds):
-    over_dds.until(lambda flags: flags & wire.HEARD and flags & wire.ODOMETRY and not flags & wire.OTHERS)
+    over_dds.until(lambda flags: flags & wire.RECEIVED and flags & wire.ODOMETRY and not flags & wire.OTHERS)
     over_dds.send(wire.enable(True))
     over_dds.until(lambda flags: flags & wire.DRIVING)
     heard = over_dds.until(
@@ -359,7 +359,7 @@ def test_over_dds_a_base_is_found_and_driven_until_another_node_speaks(over_dds)
 
 @pytest.mark.parametrize("over_dds", ["/button"], indirect=True)
 def test_over_dds_the_button_and_the_daemons_end_stop_the_base(over_dds):
-    over_dds.until(lambda flags: flags & wire.HEARD and flags & wire.ODOMETRY and flags & wire.BUTTON)
+    over_dds.until(lambda flags: flags & wire.RECEIVED and flags & wire.ODOMETRY and flags & wire.BUTTON)
     over_dds.send(wire.enable(True))
     over_dds.until(lambda flags: not flags & wire.DRIVING and flags & wire.BUTTON)
     button = DataWriter(over_dds.participant, Topic(over_dds.participant, "rt/button", msg.Bool), RELIABLE)

@@ -23,7 +23,7 @@ from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.runtime import State
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
-from drivers.pose.ros2 import make_pose_source
+from drivers.pose.ros2 import create_pose_source
 from drivers.pose.udp import pose_of
 from tests.first_use.miswired import robot_file
 
@@ -371,7 +371,7 @@ class TestTransforms:
             heard(at_ms, 3.0, "slam")
             assert not heard(at_ms + 10, 9.0, "amcl")
         assert inlet.refused["transforms of a second publisher of the same edge"] == 10
-        (said,) = inlet.news()
+        (said,) = inlet.new_messages()
         assert said.startswith("amcl sends poses beside slam: not used")
 
     def test_a_clock_that_was_set_back_begins_anew(self, inlet):
@@ -387,7 +387,7 @@ def test_over_dds_the_bridges_own_odometry_and_a_localisation_make_poses_for_the
     text = file.read_text(encoding="utf-8").split("[pose]")[0]
     text += f'[pose]\nsource = "ros2"\ntopic = "tf"\nport = {port}\n[ros2]\ndomain = {12 + os.getpid() % 20 * 3}\n'
     file.write_text(f'{text}[daemon]\ncontrol_socket = "{tmp_path / "control"}"\n', encoding="utf-8")
-    daemon, bridge, ended = make_pose_source(port=port), Bridge(load_setup(file)), []
+    daemon, bridge, ended = create_pose_source(port=port), Bridge(load_setup(file)), []
     thread = threading.Thread(target=bridge.run, args=(lambda: bool(ended),))
     thread.start()
     heard, deadline = [], time.monotonic() + 100.0
@@ -398,7 +398,7 @@ def test_over_dds_the_bridges_own_odometry_and_a_localisation_make_poses_for_the
                 msg.Vector3(x + 1e-12 * (now_ns % 1000), 0.0, 0.0), msg.Quaternion(0.0, 0.0, 0.0, 1.0)
             )
             header = msg.Header(msg.stamp_of(now_ns + ahead_ns), parent)
-            bridge._say("/tf", msg.TFMessage([msg.TransformStamped(header, child, place)]))
+            bridge._publish("/tf", msg.TFMessage([msg.TransformStamped(header, child, place)]))
         heard = daemon.receive(time.monotonic_ns(), ())
         time.sleep(0.01)
     ended.append(True)
@@ -434,9 +434,9 @@ def test_of_two_publishers_on_the_topic_the_first_counts_until_it_is_silent_and_
     assert [passes(40 * k, "publisher a") for k in range(3)] == [True] * 3
     assert [passes(90 + k, "publisher b") for k in range(5)] == [False] * 5
     assert inlet.refused["of a second publisher on the topic"] == 5
-    (said,) = inlet.news()
+    (said,) = inlet.new_messages()
     assert said.startswith("publisher b sends poses beside publisher a: not used")
     assert "kept until it has been silent for 2 s" in said
     assert passes(120, "publisher a")
     assert passes(2200, "publisher b")
-    assert inlet.news() == ["poses come from publisher b now; publisher a has been silent for 2.1 s"]
+    assert inlet.new_messages() == ["poses come from publisher b now; publisher a has been silent for 2.1 s"]

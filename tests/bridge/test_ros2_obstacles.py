@@ -163,5 +163,5 @@ def test_over_dds_both_types_come_to_the_daemons_source(tmp_path):
 def test_without_a_port_for_obstacles_none_are_read(tmp_path):
     bridge = Bridge(load_setup(robot_file(tmp_path)))
     assert "obstacles" not in bridge.where
-    assert not any(take == bridge._take_obstacles for _, take in bridge._readers)
+    assert not any(take == bridge._handle_obstacles for _, take in bridge._readers)
     bridge.close()

@@ -124,7 +124,7 @@ def test_verbs_and_options_are_completed_and_nothing_heavy_is_loaded_for_it():
 )  # fmt: skip
 def test_a_stop_that_goes_past_the_library_is_read_as_the_library_reads_it(monkeypatch, words):
     asked = []
-    monkeypatch.setattr(emergency, "stop_and_say", lambda *given: asked.append(given) or 0)
+    monkeypatch.setattr(emergency, "stop_and_report", lambda *given: asked.append(given) or 0)
     result = CliRunner().invoke(app(), ["estop", *words.split()])
     plain = plain_stop(["estop", *words.split()])
     assert plain is None or asked == [plain]

@@ -10,7 +10,7 @@ import torch
 
 from disco_hw.control import NoValidControl, Sampler, pendulum
 from disco_hw.control.black_box import BlackBoxDisco
-from disco_hw.control.parameter_points import drawn_points, unscented_points
+from disco_hw.control.parameter_points import sampled_points, unscented_points
 from disco_hw.control.pendulum import PAPER_SAMPLER
 from disco_hw.experiments.pendulum import circle_cost, pendulum_cost, pendulum_transition, skid_steer_transition
 from disco_hw.model import load_model
@@ -41,7 +41,7 @@ def costs_of(disco, commands):
 @pytest.mark.parametrize("each", [False, True])
 def test_costs_are_those_of_the_reference(each):
     theta, weights = (
-        (drawn_points(MODEL, 3 * K, 1, 0).reshape(3, K, 3), np.full(3, 1 / 3)) if each else (POINTS, WEIGHTS)
+        (sampled_points(MODEL, 3 * K, 1, 0).reshape(3, K, 3), np.full(3, 1 / 3)) if each else (POINTS, WEIGHTS)
     )
     commands = np.random.default_rng(1).uniform(-6.0, 6.0, (K, T, 2))
     got = costs_of(skid_steer(theta=theta, weights=weights), commands)

@@ -10,7 +10,7 @@ import pytest
 from disco_hw.control import CommandLimits, NoValidControl, PlannerState
 from disco_hw.control.baselines import LAWS, WithFallback
 from disco_hw.control.kernel.guide import SteeredChassis
-from disco_hw.control.plan import PlanOutcome, held_plan
+from disco_hw.control.plan import PlanOutcome, constant_plan
 from disco_hw.tasks.circle import CircleCost
 from disco_hw.tasks.line import PathTable
 from disco_hw.tasks.line.cost import PathCost
@@ -34,7 +34,7 @@ class Planted:
     def plan(self, now_ns, state):
         if self.outcome is None:
             raise NoValidControl("planted")
-        plan = held_plan(now_ns, state, 1.0, 1.0, BASE)
+        plan = constant_plan(now_ns, state, 1.0, 1.0, BASE)
         return msgspec.structs.replace(
             plan, diagnostics=msgspec.structs.replace(plan.diagnostics, outcome=self.outcome)
         )

@@ -43,7 +43,7 @@ def test_what_either_wheel_loses_is_found_in_either_direction(lost, sign):
     assert loss.rad_s == pytest.approx(lost, abs=0.02)
     assert loss.turn_rad_s == pytest.approx(0.0, abs=0.02)
     commands = np.array([[0.0, 0.0], [0.3, -0.3], [2.0, -2.0], [5.0, 5.0], [0.1, 4.0]])
-    assert loss.asked(loss.acting(commands)) == pytest.approx(commands)
+    assert loss.commanded(loss.acting(commands)) == pytest.approx(commands)
 
 
 @pytest.mark.parametrize("wanted", [(0.0, 3.2), (3.0, 0.1), (-2.5, 0.0), (2.0, 5.0)])
@@ -54,7 +54,7 @@ def test_an_inner_wheel_that_the_robot_drags_along_is_planned_with(wanted):
     assert loss.acting(np.array([wanted]))[0] == pytest.approx([wanted[0] + apart, wanted[1] - apart], abs=0.02)
     straight = np.array([[0.0, 0.0], [4.0, 4.0]])
     assert loss.acting(straight)[0] == pytest.approx([0.0, 0.0])
-    assert loss.asked(loss.acting(np.array([wanted]))) == pytest.approx(np.array([wanted]))
+    assert loss.commanded(loss.acting(np.array([wanted]))) == pytest.approx(np.array([wanted]))
 
 
 def test_what_turning_takes_is_told_from_what_the_wheels_lose():

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from disco_hw.control.parameter_points import (
-    drawn_points,
     equivalent_points,
     mean_point,
     moments,
     point_estimate,
+    sampled_points,
     shared_pairs,
     unscented_points,
 )
@@ -92,7 +92,7 @@ def test_points_at_the_end_of_their_range_are_no_twins():
 def test_points_are_kept_in_their_physical_range():
     belief = Gaussian(("wheel_radius_m", "motor_lag.tau_s"), np.array([0.06, 0.05]), np.diag([0.01, 0.01]))
     model = Model(0.06, 0.4, effects=(LAG,), belief=belief)
-    for points in (unscented_points(model, 1.0)[0], drawn_points(model, 500, 1, 0)):
+    for points in (unscented_points(model, 1.0)[0], sampled_points(model, 500, 1, 0)):
         assert points[:, 0].min() == 0.005
         assert points[:, 3].min() == 0.0
 
@@ -114,17 +114,17 @@ def test_a_mixture_counts_by_its_dominant_component_or_as_a_whole(weight, mean):
 
 
 def test_draws_are_a_function_of_seed_and_step():
-    one, same = (drawn_points(PAPER, 50, 7, 3) for _ in range(2))
+    one, same = (sampled_points(PAPER, 50, 7, 3) for _ in range(2))
     np.testing.assert_array_equal(one, same)
-    assert not np.any(drawn_points(PAPER, 50, 7, 4)[:, 0] == one[:, 0])
-    assert not np.any(drawn_points(PAPER, 50, 8, 3)[:, 0] == one[:, 0])
+    assert not np.any(sampled_points(PAPER, 50, 7, 4)[:, 0] == one[:, 0])
+    assert not np.any(sampled_points(PAPER, 50, 8, 3)[:, 0] == one[:, 0])
 
 
 def test_the_command_delay_is_drawn_at_its_mean():
     names = ("wheel_radius_m", "command_delay.delay_s")
     belief = Gaussian(names, np.array([0.06, 0.1]), np.diag([1e-5, 1e-3]))
     model = Model(0.06, 0.4, effects=(EffectSetting("command_delay", {"delay_s": 0.2}),), belief=belief)
-    draws = drawn_points(model, 20, 1, 0)
+    draws = sampled_points(model, 20, 1, 0)
     np.testing.assert_array_equal(draws[:, 3], 0.1)
     assert np.ptp(draws[:, 0]) > 0.0
 

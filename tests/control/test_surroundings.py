@@ -26,7 +26,7 @@ from disco_hw.control.kernel.avoid import (
 from disco_hw.control.surroundings import Surroundings
 from disco_hw.fence import Circle, Fence, Footprint
 from disco_hw.fence.clearance import Boundaries, MovingCircle
-from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.robot_setup import load_setup
 
 FOOTPRINT = Footprint(0.5, 0.4, 0.05)
@@ -128,7 +128,7 @@ def planner_in(fence: Fence):
     setup = load_setup(ROBOT_FILE)
     robot = msgspec.structs.replace(setup.config.robot, footprint_m=FOOTPRINT)
     config = msgspec.structs.replace(setup.config, robot=robot, fence=fence)
-    return make_planner(config, replace(setup, config=config).model)
+    return create_planner(config, replace(setup, config=config).model)
 
 
 @pytest.fixture(scope="module")
@@ -190,7 +190,7 @@ def test_a_robot_that_nothing_can_free_is_told_so(planner):
 
 def test_a_robot_without_a_fence_plans_as_ever():
     setup = load_setup(ROBOT_FILE)
-    plain = make_planner(setup.config, setup.model)
+    plain = create_planner(setup.config, setup.model)
     plain.look_around(bounds_of(obstacles=[MovingCircle(0.0, 0.75, 0.12)]), 0.0)
     plain.set_line(LINE)
     plan = plain.plan(0, PlannerState(0, 0.75, 0.0, 1.57, 0.0, 0.0))

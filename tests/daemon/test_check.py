@@ -12,7 +12,7 @@ from disco_hw.daemon import check
 from disco_hw.errors import InputError
 from disco_hw.runtime.preflight import Level
 from disco_hw.runtime.robot_setup import load_setup
-from drivers.motor import make_driver
+from drivers.motor import create_driver
 from drivers.pose.robot import RobotPoses
 from drivers.transport import connect_pair
 from drivers.types import Frame, OutgoingFrame, PoseSample
@@ -60,12 +60,12 @@ def brief(monkeypatch):
 
 @pytest.mark.parametrize("key", [b"", KEY])
 def test_a_robot_that_takes_what_it_is_sent(key):
-    found = check._ask_robot(RobotInTime(key), make_driver(None, None, key or None), RobotPoses())
+    found = check._query_robot(RobotInTime(key), create_driver(None, None, key or None), RobotPoses())
     assert check._hearing_check(found).level is Level.OK
 
 
 def test_a_key_that_is_not_the_robots_fails():
-    found = check._ask_robot(RobotInTime(KEY), make_driver(None, None, KEY[::-1]), RobotPoses())
+    found = check._query_robot(RobotInTime(KEY), create_driver(None, None, KEY[::-1]), RobotPoses())
     heard = check._hearing_check(found)
     assert heard.level is Level.FAIL
     assert "link.key_file" in heard.text
@@ -74,7 +74,7 @@ def test_a_key_that_is_not_the_robots_fails():
 def test_a_fault_that_does_not_latch_fails_with_what_to_do():
     robot = RobotInTime(b"")
     robot.robot.inputs["right_temperature_c"] = 100.0
-    firmware = check._firmware_check(check._ask_robot(robot, make_driver(None), RobotPoses()), has_clock=True)
+    firmware = check._firmware_check(check._query_robot(robot, create_driver(None), RobotPoses()), has_clock=True)
     assert (firmware.level, firmware.text) == (
         Level.FAIL,
         "standby: the robot reports OVER_TEMPERATURE_RIGHT: " + FAULTS["OVER_TEMPERATURE_RIGHT"].advice,
@@ -84,7 +84,7 @@ def test_a_fault_that_does_not_latch_fails_with_what_to_do():
 def test_what_else_the_robot_rejects_is_a_warning():
     robot = RobotInTime(b"")
     robot.disturb = Frame(0x101, bytes(8))
-    heard = check._hearing_check(check._ask_robot(robot, make_driver(None), RobotPoses()))
+    heard = check._hearing_check(check._query_robot(robot, create_driver(None), RobotPoses()))
     assert heard.level is Level.WARNING
     assert "checksum" in heard.text
 
@@ -98,7 +98,7 @@ class Antenna:
     def receive(self, now_ns, from_robot):
         return [] if self.silent else [PoseSample(now_ns, now_ns, 1.0, 2.0, math.nan, 0.02, math.nan)]
 
-    def news(self):
+    def new_messages(self):
         said, self._said = self._said, []
         return said
 
@@ -107,13 +107,13 @@ class Antenna:
 
 
 def test_positions_without_heading_are_a_warning_with_what_to_do():
-    reported = check._telemetry_check(check._ask_robot(RobotInTime(b""), make_driver(None), Antenna(silent=False)))
+    reported = check._telemetry_check(check._query_robot(RobotInTime(b""), create_driver(None), Antenna(silent=False)))
     assert reported.level is Level.WARNING
     assert "heading not known; the poses have none: drive a metre" in reported.text
 
 
 def test_a_pose_source_that_is_silent_says_why():
-    reported = check._telemetry_check(check._ask_robot(RobotInTime(b""), make_driver(None), Antenna(silent=True)))
+    reported = check._telemetry_check(check._query_robot(RobotInTime(b""), create_driver(None), Antenna(silent=True)))
     assert reported.level is Level.WARNING
     assert "0 pose samples a second; fix quality 0: no fix; without a pose" in reported.text
 
@@ -140,4 +140,4 @@ def test_a_socket_that_cannot_be_looked_at_is_one_line():
     setup = load_setup(ROBOT_FILE)
     daemon = msgspec.structs.replace(setup.config.daemon, control_socket=f"/tmp/{'x' * 300}")
     with pytest.raises(InputError, match="cannot be read"):
-        check.refuse_beside_a_daemon(msgspec.structs.replace(setup.config, daemon=daemon))
+        check.refuse_while_daemon_runs(msgspec.structs.replace(setup.config, daemon=daemon))

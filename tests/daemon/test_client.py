@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import disco_hw
-from disco_hw.daemon import ask, controller_in_words
+from disco_hw.daemon import ask, describe_controller
 from disco_hw.errors import InputError, WorkError
 
 ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
@@ -48,13 +48,13 @@ def test_only_arming_is_done_unrecorded():
 
 
 def test_a_status_says_of_each_limit_who_says_it():
-    assert controller_in_words(None) == ()
+    assert describe_controller(None) == ()
     limits = {
         "max_wheel_speed_rad_s": {"value": 15.0, "said_by": "robot.toml"},
         "command_timeout_s": {"value": 0.5, "said_by": "fixed"},
         "stop_deceleration_rad_s2": {"value": 10.0, "said_by": "robot.toml"},
     }
-    assert controller_in_words({"words": "AgileX base", "limits": limits})[1] == (
+    assert describe_controller({"words": "AgileX base", "limits": limits})[1] == (
         "limits: max_wheel_speed_rad_s 15, stop_deceleration_rad_s2 10 (declared in robot.toml, not reported by "
         "the controller); command_timeout_s 0.5 (which cannot be set otherwise)"
     )

@@ -125,8 +125,8 @@ def test_what_a_start_will_need_is_compiled_beforehand_with_words_and_nothing_fo
         made.append([effect.name for effect in model.effects])
         njit(lambda x: x + 1.0)(2.0)
 
-    monkeypatch.setattr(run, "make_planner", make)
-    monkeypatch.setattr(run, "make_pipeline", lambda *_: None)
+    monkeypatch.setattr(run, "create_planner", make)
+    monkeypatch.setattr(run, "create_pipeline", lambda *_: None)
     monkeypatch.setattr(run, "warm_up", lambda _: None)
     shipped = load_model(ROBOT.parent / "wombot_model.toml")
     with_deadband = replace(shipped, effects=(EffectSetting("deadband", {"width_rad_s": 0.5}),))

@@ -16,7 +16,7 @@ import pytest
 import disco_hw
 from disco_hw.daemon import SERVED, emergency
 from disco_hw.daemon.control_socket import ControlServer
-from disco_hw.daemon.emergency import stop_and_say, stop_robot
+from disco_hw.daemon.emergency import stop_and_report, stop_robot
 from disco_hw.errors import InputError
 from drivers.motor import find_driver
 from drivers.types import Frame, LinkState, ReceivedFrame
@@ -258,5 +258,5 @@ def test_only_a_robot_that_confirms_ends_the_command_with_0(tmp_path, daemon, co
     after = time.monotonic_ns() + 10**10
     daemon.status = {**daemon.status, "robot_state": "ESTOP", "robot_state_ns": after if confirmed else 0}
     robot = robot_file(tmp_path, daemon.socket, link="interface = 7")
-    assert stop_and_say(robot, None, as_json=False) == (0 if confirmed else 1)
+    assert stop_and_report(robot, None, as_json=False) == (0 if confirmed else 1)
     assert ("has not confirmed" in capsys.readouterr().out) is not confirmed

@@ -44,9 +44,9 @@ def test_what_no_device_could_satisfy_is_refused_before_anything_is_opened(tmp_p
 
 def test_what_robot_toml_says_of_the_link_reaches_it(tmp_path, monkeypatch):
     asked = {}
-    monkeypatch.setattr(assembly, "make_transport", lambda kind, **settings: asked.update(settings))
+    monkeypatch.setattr(assembly, "create_transport", lambda kind, **settings: asked.update(settings))
     robot = tmp_path / "robot.toml"
     robot.write_text(ROBOT + 'options = { host = "10.0.0.1", port = 29536 }\ndtr = true\nrts = true\n')
-    assembly.make_link(load_setup(robot))
+    assembly.create_link(load_setup(robot))
     assert asked["options"] == {"host": "10.0.0.1", "port": 29536}
     assert (asked["dtr"], asked["rts"]) == (True, True)

@@ -3,7 +3,7 @@ from disco_hw.runtime import State
 
 
 def said(waiting, state, words, seconds):
-    return sum(waiting.is_worth_saying(state, words) for _ in range(seconds))
+    return sum(waiting.should_report(state, words) for _ in range(seconds))
 
 
 def test_a_missing_robot_is_reported_every_second_and_after_a_minute_every_minute():

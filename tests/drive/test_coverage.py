@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import disco_hw
 from disco_hw.config import load_robot_config
 from disco_hw.drive.coverage import Coverage
-from disco_hw.drive.scripts import make_script
+from disco_hw.drive.scripts import create_script
 from disco_hw.runtime.pipeline import Governor, WheelLimits
 
 CONFIG = load_robot_config(Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
@@ -35,14 +35,14 @@ def found(coverage):
 
 
 def script(name):
-    made = make_script(name, CONFIG.robot, CONFIG.task, 0.8)
+    made = create_script(name, CONFIG.robot, CONFIG.task, 0.8)
     return covered(made.at, made.duration_s)
 
 
 def test_the_excitation_script_leaves_nothing_missing():
     coverage = script("excite")
-    assert [item.in_words() for item in coverage.missing()] == []
-    assert coverage.in_words().endswith("nothing is missing")
+    assert [item.describe() for item in coverage.missing()] == []
+    assert coverage.describe().endswith("nothing is missing")
 
 
 def test_a_circle_lacks_nearly_everything():
@@ -128,8 +128,8 @@ def test_words_and_json_agree():
     reported = coverage.as_dict()
     assert "straight slow" not in reported["missing"]
     assert len(reported["missing"]) == len(reported["items"]) - 1
-    assert "1 of 17 excited" in coverage.in_words()
-    assert "straight fast 0/2 s" in coverage.in_words()
+    assert "1 of 17 excited" in coverage.describe()
+    assert "straight fast 0/2 s" in coverage.describe()
 
 
 speeds = st.floats(allow_nan=True, allow_infinity=True)

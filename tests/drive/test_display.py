@@ -30,7 +30,7 @@ STATUS = {
         "task": "straight: radius",
         "messages": ["deadman pressed: arming"],
         "coverage": COVERAGE.as_dict(),
-        "coverage_words": COVERAGE.in_words(),
+        "coverage_words": COVERAGE.describe(),
     },
 }
 

@@ -13,7 +13,7 @@ import disco_hw
 from disco_hw.drive import ManualInput, RobotView
 from disco_hw.drive.fit import FittedScriptSource, ScriptDoesNotFit, ScriptGeometry, driven_path, fit_script
 from disco_hw.drive.script import Manoeuvre, Room, Script, ScriptSource
-from disco_hw.drive.scripts import make_script
+from disco_hw.drive.scripts import create_script
 from disco_hw.fence import Circle, Fence, Footprint
 from disco_hw.fence.clearance import Boundaries
 from disco_hw.runtime import State
@@ -36,7 +36,7 @@ def bend() -> Manoeuvre:
 
 def shipped(name: str) -> Script:
     setup = load_setup(ROBOT_FILE)
-    return make_script(name, setup.config.robot, setup.config.task, 0.6)
+    return create_script(name, setup.config.robot, setup.config.task, 0.6)
 
 
 def fitted(script: Script, fence: Fence, pose=CENTER) -> Script:
@@ -122,7 +122,7 @@ class Held:
 
     ended = None
     completed = False
-    words = "held"
+    status_text = "held"
     task = ""
 
     def poll(self, now_ns, robot):
@@ -145,7 +145,7 @@ def drive(source: FittedScriptSource, robot: ScriptGeometry, bounds: Boundaries)
             least = min(least, float(bounds.clearance_m(path).min()))
         if source.ended is not None:
             return least
-    raise AssertionError(source.words)
+    raise AssertionError(source.status_text)
 
 
 def test_a_robot_that_is_otherwise_than_its_model_is_fitted_anew_before_it_leaves_the_fence():
@@ -200,7 +200,7 @@ def source(fence: Fence, *manoeuvres: Manoeuvre) -> FittedScriptSource:
 def test_the_deadman_is_open_until_the_script_fits():
     fits = source(Fence(keep_in=Circle((0, 0), 9.0)), straight(), bend())
     assert not fits.poll(0, RobotView(State.READY, False)).deadman
-    assert fits.words.startswith("waiting for a pose")
+    assert fits.status_text.startswith("waiting for a pose")
     inputs = [fits.poll(k, RobotView(State.READY, False, pose=CENTER)) for k in range(5)]
     held = [one.deadman for one in inputs]
     assert [False, True] in [list(pair) for pair in pairwise(held)]

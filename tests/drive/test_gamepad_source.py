@@ -73,7 +73,7 @@ def test_a_gone_pad_is_closed_and_looked_for_once_a_second():
     first.state = None
     assert bench.poll() is None
     assert first.closed
-    assert "plug it in again" in bench.source.words
+    assert "plug it in again" in bench.source.status_text
     for _ in range(99):
         assert bench.poll() is None
     assert bench.opened == 1

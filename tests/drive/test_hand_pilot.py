@@ -11,7 +11,7 @@ from disco_hw.drive import ManualInput
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.script import ScriptSource, Unattended
-from disco_hw.drive.scripts import STEP_S, STEPS, make_script
+from disco_hw.drive.scripts import STEP_S, STEPS, create_script
 from disco_hw.log import records
 from disco_hw.runtime import State
 from disco_hw.runtime.pipeline import NoPlanner, Source
@@ -24,7 +24,7 @@ class Hand:
 
     def __init__(self):
         self.wheels, self.held, self.gone, self.silent_since_ns = (3.0, 5.0), False, False, None
-        self.ended, self.completed, self.words, self.task = None, True, "words", ""
+        self.ended, self.completed, self.status_text, self.task = None, True, "words", ""
 
     def poll(self, now_ns, robot):
         self.robot = robot
@@ -161,7 +161,7 @@ def test_steps_are_driven_within_the_limits_that_the_robot_showed():
     """The robot's wheels stop at 5 rad/s; 6.4 were asked for."""
     bench = Bench()
     bench.stack = simulated_stack(NoPlanner(), hide={"speed_limit": 5.0})
-    script = make_script("steps", bench.stack.core.config.robot, bench.stack.core.task, 0.8, seed=1)
+    script = create_script("steps", bench.stack.core.config.robot, bench.stack.core.task, 0.8, seed=1)
     bench.hand = ScriptSource(script, Unattended())
     bench.stack.pilot = HandPilot(bench.hand, bench.coverage)
     search_s = script.duration_s - STEPS * STEP_S

@@ -64,13 +64,13 @@ def test_a_key_held_from_the_start_holds_nothing_and_is_reported():
     typist.keys = KeyHold(8.0)
     typist.keys.at(typist.now_ns)
     assert not any(held(typist.hold(UP, 300)))
-    assert not typist.keys.in_vain
+    assert not typist.keys.is_ignored
     assert not any(held(typist.hold(UP, 700, delay_ms=30)))
-    assert typist.keys.in_vain
+    assert typist.keys.is_ignored
     typist.wait(500)
-    assert not typist.keys.in_vain
+    assert not typist.keys.is_ignored
     assert any(held(typist.hold(UP, 1000)))
-    assert not typist.keys.in_vain
+    assert not typist.keys.is_ignored
 
 
 def test_a_tap_holds_nothing():
@@ -118,9 +118,9 @@ def test_a_stutter_of_the_connection_does_not_hold_again():
     typist.hold(UP, 600)
     typist.wait(300)
     assert not any(held(typist.hold(UP, 2000, delay_ms=30)))
-    assert "release all keys" in typist.keys.words
+    assert "release all keys" in typist.keys.status_text
     typist.wait(600)
-    assert "release" not in typist.keys.words
+    assert "release" not in typist.keys.status_text
     assert any(held(typist.hold(UP, 1000)))
 
 
@@ -137,7 +137,7 @@ def test_digits_choose_the_speed_and_stop():
     typist.press(b"9")
     assert not any(held(typist.wait(600)))
     assert typist.hold(UP, 600)[-1].left_rad_s == pytest.approx(8.0)
-    assert "100% speed" in typist.keys.words
+    assert "100% speed" in typist.keys.status_text
 
 
 @given(st.lists(st.tuples(st.integers(0, 1500), st.sampled_from([*DIRECTIONS, b"5", b"?"])), max_size=60))

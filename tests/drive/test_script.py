@@ -57,7 +57,7 @@ def test_room_of_a_straight_and_of_a_circle():
     circle = room_needed(lambda _t: (2.5, 7.5), 2.0 * math.pi, ROBOT)
     assert circle.x_m == pytest.approx((-0.5, 0.5), abs=1e-3)
     assert circle.y_m == pytest.approx((0.0, 1.0), abs=1e-3)
-    assert circle.in_words().startswith("about 0.5 m ahead, 0.5 m behind, 1.0 m to the left and 0.0 m to the right")
+    assert circle.describe().startswith("about 0.5 m ahead, 0.5 m behind, 1.0 m to the left and 0.0 m to the right")
 
 
 def test_the_table_says_when_what_and_what_for():

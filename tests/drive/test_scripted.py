@@ -19,7 +19,7 @@ class Finger:
 
     def __init__(self):
         self.held, self.gone, self.ended, self.completed = True, False, None, True
-        self.words, self.task, self.closed = "hold it", "", False
+        self.status_text, self.task, self.closed = "hold it", "", False
 
     def poll(self, now_ns, _robot):
         return None if self.gone else ManualInput(now_ns - 7, 9.0, 9.0, self.held)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from disco_hw.config import Robot
 from disco_hw.drive.script import room_needed
-from disco_hw.drive.scripts import SCRIPTS, SEPARATING, STEP_S, STEPS, make_script
+from disco_hw.drive.scripts import SCRIPTS, SEPARATING, STEP_S, STEPS, create_script
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.errors import InputError
 from disco_hw.tasks.circle import CircleTask
@@ -24,21 +24,21 @@ def robot(top=8.0):
     st.sampled_from(["steps", "excite", *SEPARATING]), st.floats(0.5, 60.0), st.floats(0.05, 1.0), st.integers(0, 1000)
 )
 def test_wheels_stay_within_the_share_of_the_limit(name, top, share, seed):
-    script = make_script(name, robot(top), CircleTask(), share, seed)
+    script = create_script(name, robot(top), CircleTask(), share, seed)
     for k in range(0, math.ceil(script.duration_s * 5)):
         assert max(map(abs, script.at(k * 0.2))) <= top * share * (1 + 1e-12)
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_scripts_end_at_rest_and_say_what_for(name):
-    script = make_script(name, robot(), CircleTask(), 0.8)
+    script = create_script(name, robot(), CircleTask(), 0.8)
     assert script.at(script.duration_s - 0.01) == (0.0, 0.0)
     assert all(manoeuvre.purpose for manoeuvre in script.manoeuvres)
 
 
 def test_the_circle_is_the_tasks_circle():
     task = CircleTask(radius_m=0.75, speed_m_s=0.2)
-    script = make_script("circle", robot(), task, 0.8)
+    script = create_script("circle", robot(), task, 0.8)
     room = room_needed(script.at, script.duration_s, robot())
     assert room.x_m == pytest.approx((-0.75, 0.75), abs=0.01)
     assert room.y_m == pytest.approx((0.0, 1.5), abs=0.01)
@@ -46,19 +46,19 @@ def test_the_circle_is_the_tasks_circle():
 
 def test_a_circle_beyond_the_wheels_is_refused():
     with pytest.raises(InputError, match=r"max_wheel_speed_rad_s.*lower"):
-        make_script("circle", robot(), CircleTask(radius_m=0.05, speed_m_s=0.3), 0.8)
+        create_script("circle", robot(), CircleTask(radius_m=0.05, speed_m_s=0.3), 0.8)
 
 
 def test_a_circle_beyond_the_share_of_the_limit_is_refused():
     task = CircleTask(radius_m=0.75, speed_m_s=0.38)
     fastest = (task.speed_m_s + task.speed_m_s / task.radius_m * 0.155) / 0.06
-    make_script("circle", robot(), task, fastest / 8.0 + 1e-6)
+    create_script("circle", robot(), task, fastest / 8.0 + 1e-6)
     with pytest.raises(InputError, match=r"drive\.speed_share.*lower task\.speed_m_s"):
-        make_script("circle", robot(), task, fastest / 8.0 - 1e-6)
+        create_script("circle", robot(), task, fastest / 8.0 - 1e-6)
 
 
 def steps_of(seed):
-    script = make_script("steps", robot(), CircleTask(), 1.0, seed)
+    script = create_script("steps", robot(), CircleTask(), 1.0, seed)
     return script, [manoeuvre for manoeuvre in script.manoeuvres if manoeuvre.within_limits]
 
 
@@ -82,7 +82,7 @@ def test_steps_begin_with_the_search_for_the_limits_of_each_wheel_both_ways():
 
 
 def test_excite_takes_about_two_minutes_and_little_room():
-    script = make_script("excite", robot(), CircleTask(), 0.8)
+    script = create_script("excite", robot(), CircleTask(), 0.8)
     assert 100.0 < script.duration_s < 150.0
     room = room_needed(script.at, script.duration_s, robot())
     assert room.x_m[1] - room.x_m[0] < 4.0
@@ -91,12 +91,12 @@ def test_excite_takes_about_two_minutes_and_little_room():
 
 def test_an_unknown_script_is_refused_with_the_names_there_are():
     with pytest.raises(InputError, match="circle, steps, excite"):
-        make_script("dance", robot(), CircleTask(), 0.8)
+        create_script("dance", robot(), CircleTask(), 0.8)
 
 
 @pytest.mark.parametrize("name", SEPARATING)
 def test_a_drive_that_a_report_asks_for_takes_a_minute_at_most(name):
-    assert make_script(name, robot(), CircleTask(), 0.8).duration_s <= 60.0
+    assert create_script(name, robot(), CircleTask(), 0.8).duration_s <= 60.0
 
 
 def test_every_effect_names_a_script_that_can_be_driven():

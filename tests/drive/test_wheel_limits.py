@@ -19,7 +19,7 @@ def test_what_was_reached_is_the_limit_each_way():
     assert found.within((6.0, 6.0)) == (4.5, 6.0)
     assert found.within((-6.0, -6.0)) == (-3.0, -6.0)
     assert found.within((2.0, 0.0)) == (1.5, 0.0)
-    assert found.in_words() == "found: left -3.0 to +4.5, right -6.0 to +6.0 rad/s"
+    assert found.describe() == "found: left -3.0 to +4.5, right -6.0 to +6.0 rad/s"
 
 
 def test_the_manoeuvre_where_it_reached_least_counts():

@@ -71,8 +71,8 @@ def test_requests_that_waited_together_at_a_link_that_opens_late_make_it_no_wise
     now_ns, opens_ns = START_NS, START_NS + round(open_after_s * SECOND)
     synced_ns = None
     for _ in range(30):
-        heard_ns = max(now_ns + 400_000, opens_ns)
-        assert not clock.add(now_ns, heard_ns + 400_000, device.us(heard_ns)), "taken for a restart of the device"
+        received_ns = max(now_ns + 400_000, opens_ns)
+        assert not clock.add(now_ns, received_ns + 400_000, device.us(received_ns)), "taken for a restart of the device"
         now_ns += SECOND // 5
         if clock.synced(now_ns):
             assert clock.offset_ns(now_ns) == pytest.approx(device.true_offset_ns(now_ns), abs=1_000_000)

@@ -66,7 +66,7 @@ def test_effects_describe_themselves(effect):
     for parameter in effect.parameters:
         assert parameter.low < parameter.high
         assert parameter.low <= parameter.start <= parameter.high
-    for text in (effect.sentence, effect.sentence_below or effect.sentence, *dict(effect.besides).values()):
+    for text in (effect.sentence, effect.sentence_below or effect.sentence, *dict(effect.other_symptoms).values()):
         sentence = effect.fill(text, {p.name: p.start for p in effect.parameters})
         assert sentence[0].islower()
         assert "{" not in sentence
@@ -88,7 +88,7 @@ def test_a_time_is_told_in_words_and_none_is_negative(name, value, said):
 @pytest.mark.parametrize("besides", [(("no", "no"),), (("unequal", "wheels are {no}"),)])
 def test_what_follows_a_sentence_is_of_a_parameter_and_names_parameters(besides):
     with pytest.raises(ValueError, match=r"turning_load: .*'no'"):
-        replace(REGISTRY["turning_load"], besides=besides)
+        replace(REGISTRY["turning_load"], other_symptoms=besides)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from disco_hw.effects import Stage, Symptom, asks_for
+from disco_hw.effects import Stage, Symptom, arguments_of
 from disco_hw.effects.registry import REGISTRY, in_stages
 from disco_hw.inference.checks import CHECKS
 
@@ -18,7 +18,7 @@ def drawn(effect, rng):
 
 def called(effect, values, **motion):
     known = {**motion, "values": values, "geometry": GEOMETRY, "step_s": 0.1}
-    return effect.plain(**{name: known[name] for name in asks_for(effect.plain)})
+    return effect.plain(**{name: known[name] for name in arguments_of(effect.plain)})
 
 
 def turns_more(effect, rng):
@@ -28,13 +28,13 @@ def turns_more(effect, rng):
     at_start = {"wheel_left": was_left, "wheel_right": was_right, "time_s": time_s}
     most = 2.0 * TOP_RAD_S + 1e-9
     if effect.stage is Stage.COMMAND:
-        if "command" in asks_for(effect.plain):
+        if "command" in arguments_of(effect.plain):
             left = called(effect, values, command=-TOP_RAD_S, speed=was_left, **at_start)
             right = called(effect, values, command=TOP_RAD_S, speed=was_right, **at_start)
         else:
             left, right = called(effect, values, left=-TOP_RAD_S, right=TOP_RAD_S, **at_start)
         return abs(right - left) > most
-    if effect.stage is Stage.RESPONSE and "end" not in asks_for(effect.plain):
+    if effect.stage is Stage.RESPONSE and "end" not in arguments_of(effect.plain):
         ends = {"end_left": left, "end_right": right, "mean_left": left, "mean_right": right}
         ends |= {"left": left, "right": right}
         end_left, end_right, mean_left, mean_right = called(effect, values, **ends, **at_start)
@@ -67,12 +67,12 @@ def test_an_effect_says_whether_it_uses_the_geometry(effect):
 
 
 def test_what_makes_wheels_late_is_a_time():
-    late = [effect for effect in REGISTRY.values() if effect.late_by is not None]
+    late = [effect for effect in REGISTRY.values() if effect.delayed_by is not None]
     assert len(late) == 2
     for effect in late:
-        (unit,) = [parameter.unit for parameter in effect.parameters if parameter.name == effect.late_by]
+        (unit,) = [parameter.unit for parameter in effect.parameters if parameter.name == effect.delayed_by]
         assert unit == "s"
-        assert effect.late_starts
+        assert effect.delay_starts
 
 
 def test_every_symptom_is_tested_for_and_some_effect_shows_it():

@@ -31,7 +31,7 @@ def driven(true: Disturbance, duration_s: float, jump_m: float = 0.0):
         x, y = axle_x - 0.2 * math.cos(yaw), axle_y - 0.2 * math.sin(yaw)
         off_m = jump_m if 2 * k > round(duration_s / STEP_S) else 0.0
         sample = PoseSample(now_ns, now_ns, x + off_m, y, math.remainder(yaw, math.tau), 0.003, 0.004)
-        estimator.take(sample, fusion.add_pose(sample, now_ns), PARAMETERS, fusion.wheels_rad_s)
+        estimator.add_sample(sample, fusion.add_pose(sample, now_ns), PARAMETERS, fusion.wheels_rad_s)
         fusion.set_disturbance(estimator.value)
         middle = yaw + 0.5 * turn * STEP_S
         axle_x += STEP_S * (speed * (math.cos(middle) - true.left * math.sin(middle)) + true.drift_x_m_s)
@@ -84,6 +84,6 @@ def test_another_geometry_takes_off_what_it_explains_and_no_more():
 
 def test_wheels_asked_for_turn_the_robot_as_wanted():
     found = Disturbance(0.05, 0.0, 0.2, 0.0, 0.0)
-    assert found.asked(*found.turning(2.0, 3.0, 0.4), 0.4) == pytest.approx((2.0, 3.0))
+    assert found.commanded(*found.turning(2.0, 3.0, 0.4), 0.4) == pytest.approx((2.0, 3.0))
     assert NO_DISTURBANCE.is_none
     assert not found.is_none

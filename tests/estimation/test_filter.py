@@ -36,7 +36,7 @@ def reasons_of(pose_filter, state, poses):
         t_ns = state.t_ns + STEP_NS
         state = pose_filter.move(state, t_ns, state.left_rad, state.right_rad, False)
         state = pose_filter.fuse(state, measured(t_ns, *pose))
-        reasons.append(state.judgement.reason)
+        reasons.append(state.evaluation.reason)
     return state, reasons
 
 
@@ -44,7 +44,7 @@ def test_the_first_pose_sets_the_belief():
     pose_filter, state = started()
     assert state.belief is None
     state = pose_filter.fuse(state, measured(0, 3.0, 4.0, 2.0))
-    assert state.judgement.reason is PoseReason.INITIALISED
+    assert state.evaluation.reason is PoseReason.INITIALISED
     assert state.belief.pose == Pose(3.0, 4.0, 2.0)
     np.testing.assert_allclose(state.belief.covariance, np.diag([1e-4, 1e-4, 4e-4]))
     assert (state.pose_t_ns, state.reinitialisations) == (0, 0)
@@ -56,7 +56,7 @@ def test_where_no_pose_is_required_odometry_starts_at_the_origin_until_the_first
     assert state.belief.x_m == pytest.approx(0.61)
     assert state.pose_t_ns is None
     state = pose_filter.fuse(state, measured(10**9, 5.0, 5.0, 1.0))
-    assert state.judgement.reason is PoseReason.INITIALISED
+    assert state.evaluation.reason is PoseReason.INITIALISED
     assert state.belief.pose == Pose(5.0, 5.0, 1.0)
 
 
@@ -66,11 +66,11 @@ def test_the_gate_opens_at_its_limit():
     edge = math.sqrt(gate_limit(0.999) * 2e-4)
     inside = pose_filter.fuse(state, measured(0, 0.999 * edge, 0.0, 0.0))
     outside = pose_filter.fuse(state, measured(0, 1.001 * edge, 0.0, 0.0))
-    assert inside.judgement.reason is PoseReason.ACCEPTED
-    assert inside.judgement.test_ratio == pytest.approx(0.999**2, rel=1e-4)
-    assert outside.judgement.reason is PoseReason.GATED
-    assert outside.judgement.test_ratio == pytest.approx(1.001**2, rel=1e-4)
-    assert outside.judgement.distance2 == pytest.approx(1.001**2 * gate_limit(0.999), rel=1e-4)
+    assert inside.evaluation.reason is PoseReason.ACCEPTED
+    assert inside.evaluation.test_ratio == pytest.approx(0.999**2, rel=1e-4)
+    assert outside.evaluation.reason is PoseReason.GATED
+    assert outside.evaluation.test_ratio == pytest.approx(1.001**2, rel=1e-4)
+    assert outside.evaluation.distance2 == pytest.approx(1.001**2 * gate_limit(0.999), rel=1e-4)
     assert outside.belief == state.belief
     assert outside.pose_t_ns == 0
 
@@ -99,7 +99,7 @@ def test_agreeing_outliers_in_a_row_move_it_to_where_they_are():
     assert reasons == [PoseReason.GATED] * 4 + [PoseReason.REINITIALISED]
     assert after.reinitialisations == 1
     assert after.candidate is None
-    assert after.judgement.test_ratio > 1.0
+    assert after.evaluation.test_ratio > 1.0
     # At the mean of the five, which is better than any one of them.
     np.testing.assert_allclose([after.belief.x_m, after.belief.y_m], np.mean(poses, axis=0)[:2], atol=1e-4)
     assert math.sqrt(after.belief.xx) == pytest.approx(0.01 / math.sqrt(5), rel=0.01)
@@ -122,7 +122,7 @@ def test_agreement_is_judged_with_the_motion_in_between():
             pose = advance(PARAMETERS, pose, [(0.3 / 0.061, 0.3 / 0.061, 0.4)]) if follow else pose
             state = pose_filter.move(state, i * STEP_NS, turn, turn, False)
             state = pose_filter.fuse(state, measured(i * STEP_NS, pose.x_m, pose.y_m, 0.0))
-        return state.judgement.reason
+        return state.evaluation.reason
 
     assert last_reason(follow=True) is PoseReason.REINITIALISED
     assert last_reason(follow=False) is PoseReason.GATED
@@ -148,9 +148,9 @@ def test_extrapolation_keeps_the_speed_for_a_bounded_time_and_doubts_it_for_long
     near = pose_filter.extrapolate(state, wheels, 100_000_000)
     expected = advance(PARAMETERS, Pose(0.0, 0.0, 0.0), [(5.0, 6.0, 0.1)])
     assert (near.belief.x_m, near.belief.yaw_rad) == pytest.approx((expected.x_m, expected.yaw_rad))
-    held = pose_filter.extrapolate(state, wheels, round(MAX_EXTRAPOLATION_S * 1e9))
+    current = pose_filter.extrapolate(state, wheels, round(MAX_EXTRAPOLATION_S * 1e9))
     later = pose_filter.extrapolate(state, wheels, 2 * 10**9)
-    assert later.belief.pose == held.belief.pose
+    assert later.belief.pose == current.belief.pose
     # Without the slip of the moved part, a quarter of all the path there may have been: 0.061 * 5.5 * 2 s.
     assert math.sqrt(later.belief.xx) == pytest.approx(0.25 * 0.061 * 5.5 * 2.0, rel=0.02)
     assert math.sqrt(later.belief.tt) == pytest.approx(0.25 * 0.061 / 0.415 * math.hypot(5.0, 6.0) * 2.0, rel=0.02)

@@ -26,8 +26,8 @@ def test_a_heading_that_turns_as_the_wheels_do_and_one_that_stands_with_the_robo
     watch = HeadingWatch(["udp"])
     assert all(kept(watch, [0.02 * k for k in range(200)]))
     assert all(kept(watch, [1.0] * 500, turn_each_rad=0.0))
-    assert watch.held == (Heading.MEASURED,)
-    assert watch.news() == []
+    assert watch.current == (Heading.MEASURED,)
+    assert watch.new_messages() == []
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -38,13 +38,13 @@ def test_one_that_repeats_itself_while_the_wheels_turn_is_left_out_until_it_has_
     found = kept(watch, [1.0] * 50, turn_each_rad=sign * 0.02)
     assert found == [True] * found.index(False) + [False] * (50 - found.index(False))
     assert 5 <= found.index(False) <= 9
-    assert watch.held == (Heading.STANDS_STILL,)
-    (said,) = watch.news()
+    assert watch.current == (Heading.FROZEN,)
+    (said,) = watch.new_messages()
     assert said.startswith("udp: the heading stands still at 1.00 rad while the wheels turn the robot by 0.1")
     again = kept(watch, [1.0 + 0.02 * k for k in range(1, 40)])
     assert again[:9] == [False] * 9
     assert all(again[9:])
-    assert watch.news() == ["udp: its headings are used again"]
+    assert watch.new_messages() == ["udp: its headings are used again"]
 
 
 def test_one_that_never_was_another_is_no_measurement_from_the_first_on():
@@ -62,7 +62,7 @@ def test_a_deviation_that_says_nothing_leaves_the_heading_out(std_rad):
     watch = HeadingWatch(["udp"])
     found, never_measured = watch.screen(pose(0.5, std_rad), 0.0, PER_RAD)
     assert (found.x_m, found.y_m, found.has_heading, never_measured) == (1.0, 2.0, False, False)
-    (said,) = watch.news()
+    (said,) = watch.new_messages()
     assert said.endswith("the estimator runs on positions")
 
 
@@ -84,4 +84,4 @@ def test_sources_are_followed_each_by_itself():
     for k in range(40):
         assert watch.screen(pose(0.02 * k), 0.02 * k / PER_RAD, PER_RAD)[0].has_heading
         watch.screen(pose(1.0, source=1), 0.02 * k / PER_RAD, PER_RAD)
-    assert watch.held == (Heading.MEASURED, Heading.STANDS_STILL)
+    assert watch.current == (Heading.MEASURED, Heading.FROZEN)

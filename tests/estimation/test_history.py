@@ -8,7 +8,7 @@ import pytest
 from disco_hw.config import Estimation
 from disco_hw.estimation import RewindBuffer
 from disco_hw.estimation.correction import Measurement, PoseReason
-from disco_hw.estimation.filter import Judgement, PoseFilter
+from disco_hw.estimation.filter import Evaluation, PoseFilter
 from disco_hw.estimation.odometry import OdometryParameters, Pose, WheelReading
 from tests.tables import thinned
 
@@ -46,7 +46,7 @@ def run(events, first=0):
     buffer = buffer_with([first])
     for event in events:
         if isinstance(event, Measurement):
-            assert isinstance(buffer.add_pose(event), Judgement)
+            assert isinstance(buffer.add_pose(event), Evaluation)
         else:
             buffer.add_wheels(reading(event))
     return buffer.head()
@@ -123,7 +123,7 @@ def test_a_pose_inside_a_gap_shares_its_doubt():
 def test_a_pose_older_than_the_buffer_is_refused():
     buffer = buffer_with([10 * k for k in range(251)])
     assert buffer.add_pose(measured(1499.0)) is PoseReason.TOO_OLD
-    assert isinstance(buffer.add_pose(measured(1500.0)), Judgement)
+    assert isinstance(buffer.add_pose(measured(1500.0)), Evaluation)
 
 
 def test_a_pose_at_the_far_end_of_the_buffer_gives_the_same_bits():
@@ -139,14 +139,14 @@ def test_a_repeated_stamp_is_refused():
     before = buffer.head()
     assert buffer.add_pose(measured(10.0, 5.0)) is PoseReason.DUPLICATE
     assert buffer.head() == before
-    assert isinstance(buffer.add_pose(near(30.0)), Judgement)
+    assert isinstance(buffer.add_pose(near(30.0)), Evaluation)
     buffer.add_wheels(reading(30))
     assert buffer.add_pose(near(30.0)) is PoseReason.DUPLICATE
 
 
 def test_poses_far_beyond_the_newest_reading_have_no_odometry():
     buffer = buffer_with([0, 10])
-    assert isinstance(buffer.add_pose(measured(1010.0)), Judgement)
+    assert isinstance(buffer.add_pose(measured(1010.0)), Evaluation)
     assert buffer.add_pose(measured(1011.0)) is PoseReason.NO_ODOMETRY
 
 
@@ -163,10 +163,10 @@ def test_length_is_bounded_whatever_the_rates():
 def test_a_flood_of_poses_is_refused_and_passes_with_time():
     buffer = buffer_with([0])
     outcomes = [buffer.add_pose(measured(1.0 + k * 0.001)) for k in range(150)]
-    assert [isinstance(outcome, Judgement) for outcome in outcomes] == [True] * 100 + [False] * 50
+    assert [isinstance(outcome, Evaluation) for outcome in outcomes] == [True] * 100 + [False] * 50
     assert outcomes[-1] is PoseReason.OVERFLOW
     buffer.add_wheels(reading(1500))
-    assert isinstance(buffer.add_pose(measured(1499.0)), Judgement)
+    assert isinstance(buffer.add_pose(measured(1499.0)), Evaluation)
 
 
 def test_a_gap_longer_than_the_buffer_loses_no_distance():

@@ -34,7 +34,7 @@ class Run:
 
     def __init__(self, off_fast=lambda t: (0.0, 0.0), off_slow=lambda t: (0.0, 0.0), **settings):
         self.fusion = PoseFusion(Estimation(**settings), GEOMETRY, 0.15, ("natnet", "nmea"))
-        self.said, self.ok, self.updates = [], [], []
+        self.output_lines, self.ok, self.updates = [], [], []
         rng = np.random.default_rng(3)
         arrivals = []
         for number, wheels in enumerate(DRIVE.wheels):
@@ -52,7 +52,9 @@ class Run:
                 continue
             self.fusion.add_wheels(sample)
             self.fusion.sources.step(now_ns)
-            self.said += [((now_ns - self.start_ns) * 1e-9, words) for words in self.fusion.sources.news()]
+            self.output_lines += [
+                ((now_ns - self.start_ns) * 1e-9, words) for words in self.fusion.sources.new_messages()
+            ]
             self.ok.append(self.fusion.estimate(now_ns).pose_ok)
         self.end_ns = DRIVE.wheels[-1].t_ns
 
@@ -62,8 +64,8 @@ class Run:
     def standings(self):
         return [one.standing.value for one in self.fusion.sources.all]
 
-    def words(self):
-        return " | ".join(words for _, words in self.said)
+    def status_text(self):
+        return " | ".join(words for _, words in self.output_lines)
 
 
 def test_two_that_agree_are_fused_each_late_pose_at_its_own_time():
@@ -101,7 +103,9 @@ def test_a_lost_one_is_said_and_the_other_goes_on(silent):
 
     run = Run(off_fast=off) if silent == FAST else Run(off_slow=off)
     label = ("natnet", "nmea")[silent]
-    lost = [at_s for at_s, words in run.said if words.startswith(f"{label}: lost, no pose for 1 s; going on with ")]
+    lost = [
+        at_s for at_s, words in run.output_lines if words.startswith(f"{label}: lost, no pose for 1 s; going on with ")
+    ]
     assert len(lost) == 1
     assert 3.8 < lost[0] < 4.3
     assert run.standings()[silent] == "lost"
@@ -112,7 +116,7 @@ def test_a_lost_one_is_said_and_the_other_goes_on(silent):
 def test_all_lost_is_no_pose():
     run = Run(off_fast=lambda t: None if t > 3.0 else (0.0, 0.0), off_slow=lambda t: None if t > 3.0 else (0.0, 0.0))
     assert not any(run.ok[420:])
-    assert run.words().count("no other is left") == 1
+    assert run.status_text().count("no other is left") == 1
 
 
 @pytest.mark.parametrize("liar", [FAST, SLOW])
@@ -124,7 +128,7 @@ def test_one_that_jumps_is_left_out_even_if_it_speaks_more_often(liar):
     settings = {"gate_lockout_count": 3}
     run = Run(off_fast=off, **settings) if liar == FAST else Run(off_slow=off, **settings)
     label = ("natnet", "nmea")[liar]
-    assert f"{label}: jumped against the wheels and is left out; going on with" in run.words()
+    assert f"{label}: jumped against the wheels and is left out; going on with" in run.status_text()
     assert run.standings()[liar] == "jumped"
     assert all(run.ok[40:])
     assert run.off_m() < 0.1
@@ -134,7 +138,7 @@ def test_one_that_jumps_is_left_out_even_if_it_speaks_more_often(liar):
 def test_one_that_jumped_and_came_back_is_used_again():
     run = Run(off_slow=lambda t: (0.5, 0.0) if 2.0 < t < 4.5 else (0.0, 0.0))
     assert run.standings() == ["good", "good"]
-    assert [words for _, words in run.said if words.startswith("nmea: ")][-1] == "nmea: its poses are used"
+    assert [words for _, words in run.output_lines if words.startswith("nmea: ")][-1] == "nmea: its poses are used"
 
 
 def test_a_single_outlier_of_one_is_counted_and_changes_nothing():
@@ -151,8 +155,8 @@ def test_two_that_drift_apart_stop_as_nobody_knows_who_is_right(liar, m_s):
         return (max(0.0, t - 2.0) * m_s, 0.0)
 
     run = Run(off_fast=off) if liar == FAST else Run(off_slow=off)
-    assert "contradict each other" in run.words()
-    assert "jumped" not in run.words()
+    assert "contradict each other" in run.status_text()
+    assert "jumped" not in run.status_text()
     assert not run.ok[-1]
     assert run.fusion.sources.contradiction
 
@@ -176,7 +180,7 @@ def test_two_of_equal_weight_that_pull_the_estimate_between_them_contradict_each
 def test_two_that_never_agreed_do_not_even_start():
     run = Run(off_slow=lambda t: (0.7, 0.0))
     assert not any(run.ok[60:])
-    assert "nmea and natnet contradict each other beyond their stated noise; the task stops" in run.words()
+    assert "nmea and natnet contradict each other beyond their stated noise; the task stops" in run.status_text()
 
 
 def test_both_carried_off_together_are_believed():
@@ -212,6 +216,6 @@ def test_one_alone_behaves_as_ever_and_says_nothing():
         if number % 4 == 0:
             fusion.add_pose(sample_of_fast(number // 4, (1.0, 0.0) if number > 200 else (0.0, 0.0)), wheels.t_ns)
         fusion.sources.step(wheels.t_ns)
-        assert not fusion.sources.news()
+        assert not fusion.sources.new_messages()
     assert fusion.estimate(DRIVE.wheels[399].t_ns).reinitialisations == 1
     assert fusion.sources.counts() == {}

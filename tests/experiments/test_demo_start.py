@@ -83,7 +83,7 @@ class Driven:
     """An operator whose first `lost` drives end for this reason, and all others at speed."""
 
     def __init__(self, daemon, lost, cause, said):
-        self.output, self.lost, self.cause, self.said, self.started = daemon, lost, cause, said, 0
+        self.output, self.lost, self.cause, self.output_lines, self.started = daemon, lost, cause, said, 0
 
     def arm(self):
         pass
@@ -91,7 +91,7 @@ class Driven:
     def request(self, what):
         self.started += 1
         if self.started <= self.lost:
-            self.output.write_bytes(self.output.read_bytes() + self.said)
+            self.output.write_bytes(self.output.read_bytes() + self.output_lines)
 
     def wait_until(self, what, accept, timeout_s):
         fails = self.started <= self.lost
@@ -130,7 +130,7 @@ class Compiling:
     def __init__(self, looks):
         self.name, self.process, self.looks = "daemon", SimpleNamespace(poll=lambda: None), looks
 
-    def last_words(self):
+    def last_line(self):
         self.looks -= 1
         return "compiling: 7 functions, 3 s" if self.looks > 0 else "waiting"
 

@@ -45,7 +45,7 @@ def test_a_fence_that_cannot_be_meant_is_named(fence, field, words):
     fault = fence_fault(fence, FOOTPRINT)
     assert fault is not None
     assert (fault.field, words in fault.fault) == (field, True), fault
-    assert fault.remedy
+    assert fault.hint
 
 
 @pytest.mark.parametrize(

@@ -217,7 +217,7 @@ def test_wrong_nonces_in_between_do_not_set_the_counters_back(wrong):
     for nonce in range(wrong):
         prover.challenge(nonce)
         prover.prove(COMMAND)
-    prover.forget()
+    prover.clear()
     prover.challenge(int.from_bytes(bytes(c.nonce), "little"))
     assert c_holds(c, lib.DISCO_PROOF_WHEEL_COMMAND, prover.prove(COMMAND), COMMAND)
 
@@ -229,7 +229,7 @@ def test_nothing_is_proved_without_a_nonce_or_need():
     prover.challenge(1)
     with pytest.raises(ValueError, match="none needed"):
         prover.prove(EncodedFrame(0x150, bytes(8)))
-    prover.forget()
+    prover.clear()
     assert not prover.ready
 
 

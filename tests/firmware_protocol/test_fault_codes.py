@@ -18,7 +18,7 @@ def test_every_code_of_the_dbc_has_a_row_and_no_other():
         code: name for code, name in choices.items() if code
     }
     assert set(FAULTS) == set(_REMEDIES)
-    assert all(name == fault.name and fault.remedy for name, fault in FAULTS.items())
+    assert all(name == fault.name and fault.hint for name, fault in FAULTS.items())
 
 
 def bad_input(field, value):
@@ -139,6 +139,6 @@ def test_what_ends_a_fault_is_said_with_the_remedy():
     assert FAULTS["STALL_LEFT"].advice.endswith("; then reset")
     assert FAULTS["OVER_TEMPERATURE_LEFT"].advice.endswith("; it clears by itself")
     assert FAULTS["SELF_TEST_FAILED"].advice.endswith("; then restart the controller")
-    assert not any(word in fault.remedy for fault in FAULTS.values() for word in ("reset", "clear"))
+    assert not any(word in fault.hint for fault in FAULTS.values() for word in ("reset", "clear"))
     assert advice("NONE") == advice("NO_SUCH_FAULT") == ""
     assert status_codes.fault("BUS_OFF") == f"BUS_OFF: {FAULTS['BUS_OFF'].advice}"

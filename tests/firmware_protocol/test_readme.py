@@ -46,7 +46,7 @@ def test_states_are_those_of_the_c_table():
 def test_faults_are_those_of_the_table():
     documented = [tuple(row) for row in rows("Faults")]
     assert documented == [
-        (f"`{fault.name}`", f"0x{fault.code:04X}", "yes" if fault.latches else "no", fault.remedy, fault.ending)
+        (f"`{fault.name}`", f"0x{fault.code:04X}", "yes" if fault.latches else "no", fault.hint, fault.ending)
         for fault in FAULTS.values()
     ]
 

@@ -15,7 +15,7 @@ from disco_hw.errors import WorkError
 from disco_hw.experiments import with_device
 from disco_hw.experiments.simulated_time import SimulatedRun
 from disco_hw.first_use.commission import as_sent, slowest_rad_s
-from disco_hw.first_use.procedure import Ask, CommissionPilot, DriveWheels, Procedure, speed_of
+from disco_hw.first_use.procedure import CommissionPilot, DriveWheels, Procedure, Prompt, speed_of
 from disco_hw.runtime import State
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.robot_setup import load_setup
@@ -164,12 +164,12 @@ class MiswiredRobot:
 class Person:
     """Holds the deadman while something is to be driven, looks at the wheels, answers; satisfies ManualSource."""
 
-    completed, words, task, ended = True, "a person", "", None
+    completed, status_text, task, ended = True, "a person", "", None
 
     def __init__(self, plant):
         self.plant, self.pilot = plant, None
         self.angles, self.last_us = [0.0, 0.0], None
-        self._open_ns = self._asked_ns = None
+        self._open_ns = self._requested_ns = None
         self._from, self._held_ns, self._let_go = (0.0, 0.0), None, False
         self.strokes = 0
 
@@ -191,7 +191,7 @@ class Person:
 
     def poll(self, now_ns, robot):
         self.look()
-        wanted = self.action is not None and not isinstance(self.action, Ask)
+        wanted = self.action is not None and not isinstance(self.action, Prompt)
         counting = isinstance(self.action, DriveWheels) and "exactly once" in self.action.todo
         if counting and max(map(abs, self.turned())) >= 2.0 * math.pi:
             self._let_go = True
@@ -215,11 +215,11 @@ class Person:
         return ManualInput(now_ns, 0.0, 0.0, deadman=held)
 
     def keys(self):
-        if not isinstance(self.action, Ask):
-            self._asked_ns = None
+        if not isinstance(self.action, Prompt):
+            self._requested_ns = None
             return ""
         self.strokes += 1
-        if "exactly" in self.action.question or "one turn" in self.action.question:
+        if "exactly" in self.action.prompt or "one turn" in self.action.prompt:
             self._let_go, self._from = False, tuple(self.angles)
             return "y"
         turned = self.turned()
@@ -266,6 +266,6 @@ def stage(path, steps, wrong, plant=None, effects=None, seed=1, raw_poses=False,
         robot.close()
         run.core.pose_source.close()
     assert pilot.done, f"stuck at {pilot.procedure.action}: {run.core.last.output}"
-    if pilot.trouble is not None:
-        raise WorkError(pilot.trouble)
+    if pilot.fault_text is not None:
+        raise WorkError(pilot.fault_text)
     return pilot.procedure.result, run, person

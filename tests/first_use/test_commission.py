@@ -72,7 +72,7 @@ def judged(path, name, wrong, **options):
     """Drive one stage and judge it; the judgement, the run."""
     one = next(stage for stage in STAGES if stage.name == name)
     seen, run, _person = stage(path, one.steps, wrong, raw_poses=one.raw_poses, **options)
-    return one.judge(seen, load_setup(path)), run
+    return one.evaluate(seen, load_setup(path)), run
 
 
 def commissioned(path, wrong, names=("sides", "turns", "floor"), **options):

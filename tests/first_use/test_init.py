@@ -156,7 +156,7 @@ ONE, TWO = ["128/1", "128/2"], [["128/1", "128/2"], ["129/1", "129/2"]]
 def test_a_roboclaw_is_found_by_its_version_and_by_nothing_that_moves_or_writes(tmp_path, addresses, motors):
     boards = [Roboclaw(address) for address in addresses]
     with line_with(*boards) as (port, heard):
-        out = from_line(tmp_path, port, may_ask=True)
+        out = from_line(tmp_path, port, is_interactive=True)
     link = load_robot_config(out).link
     found = [list(side) if isinstance(side, tuple) else side for side in link.settings().motors]
     assert (link.driver, link.port, link.baud, found) == ("roboclaw", port, 115_200, motors)
@@ -191,7 +191,7 @@ def test_who_names_the_controller_has_given_leave(tmp_path):
 def test_a_line_on_which_something_speaks_is_not_asked(tmp_path):
     with line_with(Roboclaw(), says=b"$GPGGA,1*00\r\n") as (port, heard):
         with pytest.raises(InputError, match="no controller was recognised"):
-            from_line(tmp_path, port, may_ask=True)
+            from_line(tmp_path, port, is_interactive=True)
         assert not heard
 
 

@@ -31,11 +31,11 @@ def no_search(monkeypatch):
 
 @thinned("fault", FAULTS, quick=2)
 def test_what_says_nothing_is_refused_before_the_search_and_the_rest_is_searched(fault):
-    change, _, remedy = FAULTS[fault]
+    change, _, hint = FAULTS[fault]
     log = change(sound())
     spoilt = any(each.spoils for each in find_contradictions(log, RADIUS_M, AXIAL_M))
     assert spoilt == (fault not in {"a heading that stops for a third", "encoders doubled, no commands"})
-    with pytest.raises(LogError if spoilt else SearchedError, match=re.escape(remedy) if spoilt else None):
+    with pytest.raises(LogError if spoilt else SearchedError, match=re.escape(hint) if spoilt else None):
         find_gap(log, MODEL)
 
 

@@ -14,7 +14,7 @@ from disco_hw.cli import app
 from disco_hw.config import load_robot_config
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.errors import InputError, LogError
-from disco_hw.gap.report import STAGES, Doubt, EffectFinding, FleetRow, GapReport, UnnamedFinding
+from disco_hw.gap.report import STAGES, EffectFinding, FleetRow, GapReport, LowConfidence, UnnamedFinding
 from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.log.importing import write_log
@@ -74,7 +74,7 @@ def report_of(name, timed_m, amended_m, offered="amended"):
     )
     return GapReport(
         (name,), (), (effect,), (UnnamedFinding("wheel_to_body", "v_x += 3 v", 30.0),), (), gap, Model(0.06, 0.4),
-        1.0, offered, doubtful=(Doubt("slope", "at its bound"),),
+        1.0, offered, doubtful=(LowConfidence("slope", "at its bound"),),
     )  # fmt: skip
 
 

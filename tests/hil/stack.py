@@ -63,12 +63,12 @@ def assert_stopped_in_time(rows: list[TruthRow], cut_s: float) -> None:
     final = rows[-1].accepted
     last_accepted = next(row for row in rows if row.accepted == final)
     # The firmware still slews towards the last command while it waits for the next one.
-    held = [row.asked for row in rows if last_accepted.t_s <= row.t_s <= last_accepted.t_s + COMMAND_TIMEOUT_S]
+    held = [row.requested for row in rows if last_accepted.t_s <= row.t_s <= last_accepted.t_s + COMMAND_TIMEOUT_S]
     ramp_s = max(held) / DECELERATION_RAD_S2
     asked_zero_by = last_accepted.t_s + COMMAND_TIMEOUT_S + ramp_s + 0.02
     stands_by = asked_zero_by + MOTOR_SETTLING_S
-    late_asks = [row for row in rows if row.t_s > asked_zero_by and row.asked > 1e-6]
-    assert not late_asks, f"asked for {late_asks[0].asked} rad/s {late_asks[0].t_s - last_accepted.t_s:.3f} s later"
+    late_asks = [row for row in rows if row.t_s > asked_zero_by and row.requested > 1e-6]
+    assert not late_asks, f"asked for {late_asks[0].requested} rad/s {late_asks[0].t_s - last_accepted.t_s:.3f} s later"
     turning = [row for row in rows if row.t_s > stands_by and row.fastest >= STILL_RAD_S]
     assert not turning, f"{turning[0].fastest} rad/s {turning[0].t_s - last_accepted.t_s:.3f} s later"
     assert rows[-1].t_s > stands_by + 0.5, "the truth ends too early to judge"

@@ -29,25 +29,25 @@ class Terminal:
             command, cwd=cwd, stdin=slave, stdout=slave, stderr=slave, start_new_session=True
         )
         os.close(slave)
-        self.said, self.holding, self._next_s = "", False, 0.0
+        self.output_lines, self.holding, self._next_s = "", False, 0.0
 
     def pump(self, until, timeout_s=120.0):
         """Read, and repeat the key that is held, until `until` of what was said since this call; that text."""
-        begin, deadline_s = len(self.said), time.monotonic() + timeout_s
-        while not until(self.said[begin:]):
-            assert time.monotonic() < deadline_s, self.said[-2000:]
+        begin, deadline_s = len(self.output_lines), time.monotonic() + timeout_s
+        while not until(self.output_lines[begin:]):
+            assert time.monotonic() < deadline_s, self.output_lines[-2000:]
             if select.select([self.master], [], [], _REPEAT_S / 2)[0]:
                 try:
                     fresh = os.read(self.master, 65536).decode(errors="replace")
                 except OSError:
                     break
-                self.said += fresh
+                self.output_lines += fresh
                 if any(words in fresh for words in _IN_VAIN):
                     self._next_s = time.monotonic() + _RELEASE_S
             if self.holding and time.monotonic() >= self._next_s:
                 self.type(" ")
                 self._next_s = time.monotonic() + _REPEAT_S
-        return self.said[begin:]
+        return self.output_lines[begin:]
 
     def type(self, keys):
         os.write(self.master, keys.encode())
@@ -83,5 +83,5 @@ def test_the_first_stage_goes_through_at_a_terminal(tmp_path):
             terminal.process.kill()
             terminal.process.wait()
             os.close(terminal.master)
-    assert "begins to turn at a command of" in terminal.said
-    assert list(tmp_path.glob("*commission-sides*.mcap")), terminal.said
+    assert "begins to turn at a command of" in terminal.output_lines
+    assert list(tmp_path.glob("*commission-sides*.mcap")), terminal.output_lines

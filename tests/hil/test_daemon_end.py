@@ -125,4 +125,4 @@ def test_a_planner_without_a_valid_control_follows_the_tail_then_ramps_down(tmp_
 def test_child_helper_reports_last_words(tmp_path):
     output = tmp_path / "out.txt"
     output.write_text("one\ntwo\n")
-    assert Child("x", None, output).last_words() == "two"
+    assert Child("x", None, output).last_line() == "two"

@@ -136,7 +136,7 @@ def test_a_script_is_driven_unattended_and_recorded_as_executed(tmp_path, monkey
     assert np.abs(np.diff(given, axis=0)).max() <= 20.0 * 0.03 + 1e-9
     assert np.abs(wheels[-1]).max() < STILL_RAD_S
     # No plan was made, so the replay needs no planner either, which takes long to compile.
-    monkeypatch.setattr("disco_hw.runtime.replay.make_planner", lambda *_: NoPlanner())
+    monkeypatch.setattr("disco_hw.runtime.replay.create_planner", lambda *_: NoPlanner())
     assert replay(made.log).ok
     with open_log(made.log) as log:
         assert {"off", "hold", "manual"} == set(log.columns("/command")["source"])

@@ -94,7 +94,7 @@ class Reader:
             yield terminal
             terminal.pump(lambda _said: terminal.process.poll() is not None, PATIENCE_S)
             code = terminal.process.wait(10.0)
-            assert code == 0 or may_fail, f"{line}: {terminal.said[-3000:]}"
+            assert code == 0 or may_fail, f"{line}: {terminal.output_lines[-3000:]}"
         finally:
             terminal.process.kill()
             terminal.process.wait()
@@ -103,16 +103,16 @@ class Reader:
     def run(self, line):
         with self.type(line) as terminal:
             pass
-        return terminal.said
+        return terminal.output_lines
 
     def check(self):
         """Typed anew where nothing failed but the round trip: a busy computer holds up the one that answers."""
         for again in (False, True, True, True, True):
             with self.type(TYPED[1], again=again, may_fail=True) as terminal:
                 pass
-            if re.findall(r"^fail +([^:]+):", terminal.said, re.MULTILINE) != ["round trip"]:
+            if re.findall(r"^fail +([^:]+):", terminal.output_lines, re.MULTILINE) != ["round trip"]:
                 break
-        assert terminal.process.returncode == 0, terminal.said
+        assert terminal.process.returncode == 0, terminal.output_lines
 
     def press(self, terminal, keys):
         self.keys += len(keys)
@@ -152,7 +152,7 @@ class Reader:
                 self.answer(terminal, "[y/n]", "y\n")
             for asked, value in MEASURES.items():
                 self.answer(terminal, asked, value + "\n")
-        assert tomllib.loads(self.robot_file.read_text("utf-8"))["link"]["driver"] == self.driver, terminal.said
+        assert tomllib.loads(self.robot_file.read_text("utf-8"))["link"]["driver"] == self.driver, terminal.output_lines
         if self.driver != "reference":
             self.write_poses()
 
@@ -189,7 +189,7 @@ class Reader:
             terminal.pause(0.7)
             with self.holding(terminal):
                 terminal.pump(lambda said: "let go:" in said or "press Enter" in said, PATIENCE_S)
-            if "press Enter" not in terminal.said.rsplit("both sides turn", 1)[1]:
+            if "press Enter" not in terminal.output_lines.rsplit("both sides turn", 1)[1]:
                 terminal.wait("press Enter", PATIENCE_S)
             terminal.pause(0.7)
             self.press(terminal, "\n")
@@ -197,7 +197,7 @@ class Reader:
             terminal.pause(0.7)
             with self.holding(terminal):
                 terminal.pump(lambda said: "commissioned" in said, PATIENCE_S)
-        assert "\nnot commissioned" not in terminal.said
+        assert "\nnot commissioned" not in terminal.output_lines
 
     def until_one_turn(self, terminal, side):
         turned, last_s = 0.0, time.monotonic()
@@ -241,7 +241,7 @@ class Reader:
                 continue
             if status.get("ok") and holds(status):
                 return
-        raise AssertionError(f"{status}\n{terminal.said[-2000:]}")
+        raise AssertionError(f"{status}\n{terminal.output_lines[-2000:]}")
 
 
 def follow(directory, driver):
@@ -250,7 +250,7 @@ def follow(directory, driver):
     arguments = ["sim", str(reader.device), "--inject", str(reader.hidden / "inject")]
     with disco_hw_process("virtual robot", arguments, directory / "sim.txt") as robot:
         while "ready" not in robot.output.read_text("utf-8"):
-            assert robot.process.poll() is None, robot.last_words()
+            assert robot.process.poll() is None, robot.last_line()
             time.sleep(0.1)
         reader.settings()
         reader.check()

@@ -12,7 +12,7 @@ import pytest
 
 from disco_hw.daemon import send_request
 from disco_hw.drive import INPUT_LIMIT_NS
-from disco_hw.experiments import disco_hw_process, running_stack, stands
+from disco_hw.experiments import disco_hw_process, is_stationary, running_stack
 from disco_hw.log.reader import open_log
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.viewer import scene
@@ -121,7 +121,7 @@ def assert_drawn(tab, stack, line=True, beside=(0.0, 0.0)):
     `beside` is a place where neither of them is.
     """
     task = load_setup(stack.robot_file).config.task
-    x_m, y_m, _ = stack.operator.wait_until("standing still", stands, 5.0)["pose"]
+    x_m, y_m, _ = stack.operator.wait_until("standing still", is_stationary, 5.0)["pose"]
     canvas = scene_canvas(tab)
     eye, look_at = scene.first_camera(task)
 

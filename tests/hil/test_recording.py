@@ -191,7 +191,7 @@ def test_a_page_that_is_killed_is_started_again_and_its_end_is_in_the_log(tmp_pa
         wait_until(lambda: set(pages()) - {first}, 60.0)
         stack.operator.request("quit")
         assert stack.daemon.process.wait(60.0) == 0
-        assert "page: the page was ended by SIGKILL; it is started again" in stack.daemon.said()
+        assert "page: the page was ended by SIGKILL; it is started again" in stack.daemon.output_lines()
     with open_log(tmp_path / "run.mcap") as log:
         events = [entry.record for entry in log.records(("/event",)) if entry.record.code == "page"]
     assert [(event.level, event.text) for event in events] == [

@@ -176,7 +176,7 @@ def test_neither_forgeries_on_the_bus_nor_a_second_daemon_ever_turn_a_wheel(tmp_
                 pass
         time.sleep(0.5)
         rows = stack.truth()
-    assert max(row.asked for row in rows) == 0.0
+    assert max(row.requested for row in rows) == 0.0
     assert max(row.fastest for row in rows) < STILL_RAD_S
 
 
@@ -215,7 +215,7 @@ def test_a_replayed_session_never_turns_a_wheel(tmp_path):
         rows = stack.truth()
     assert max(row.fastest for row in rows) > 5.0
     after = [row for row in rows if row.t_s > stopped_s]
-    assert max(row.asked for row in after) == 0.0
+    assert max(row.requested for row in after) == 0.0
     assert max(row.fastest for row in after) < STILL_RAD_S
 
 
@@ -280,7 +280,7 @@ def test_a_session_recorded_before_a_restart_does_not_arm_after_it(tmp_path, see
     rows = read_truth(truth)
     assert ({row.state for row in rows} >= {"ARMED"}) == seeded
     assert (max(row.fastest for row in rows) > STILL_RAD_S) == seeded
-    assert (max(row.asked for row in rows) > 0.0) == seeded
+    assert (max(row.requested for row in rows) > 0.0) == seeded
     assert "READY" in {row.state for row in rows}, "the recording does not even begin a session"
 
 

@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
 
 from disco_hw import experiments
-from disco_hw.experiments import FAST_START, disco_hw_process, stands
+from disco_hw.experiments import FAST_START, disco_hw_process, is_stationary
 from tests.hil.test_drive import Bench
 
 pytestmark = [pytest.mark.hil, pytest.mark.timeout(400)]
@@ -122,7 +122,9 @@ def test_real_ros_arms_and_drives_by_its_speeds(tmp_path):
         bridge = ["bridge", "ros2", str(bench.robot_file)]
         stack.enter_context(disco_hw_process("bridge", bridge, tmp_path / "bridge.txt"))
         process = stack.enter_context(real_node(tmp_path / "node.txt", "speed", 0.15, 0.3))
-        bench.operator.wait_until("driving", lambda status: status["drive"]["driving"] and not stands(status), 30.0)
+        bench.operator.wait_until(
+            "driving", lambda status: status["drive"]["driving"] and not is_stationary(status), 30.0
+        )
         process.kill()
         bench.operator.wait_for("READY", 20.0)
         bench.operator.wait_for_standstill(20.0)
@@ -184,7 +186,7 @@ def test_speeds_drive_once_asked_to_arm_and_their_silence_disarms_for_good(whom,
         speaker = stack.enter_context(node("speed", said, (0.15, 0.0, 0.3)))
         operator = bench.operator
         ask_until(speaker, said, "arm", '"ok": true')
-        operator.wait_until("driving", lambda status: status["drive"]["driving"] and not stands(status), 20.0)
+        operator.wait_until("driving", lambda status: status["drive"]["driving"] and not is_stationary(status), 20.0)
         {"node": speaker, "bridge": bridge.process}[whom].send_signal(how)
         operator.wait_for("READY", 20.0)
         operator.wait_for_standstill(20.0)
@@ -206,7 +208,7 @@ def test_an_estop_from_ros_is_latched_until_it_is_reset(words, tmp_path):
         stack.enter_context(disco_hw_process("bridge", bridge, tmp_path / "bridge.txt"))
         speaker, operator = stack.enter_context(node("speed", said, (0.15, 0.0, 0.3))), bench.operator
         ask_until(speaker, said, "arm", '"ok": true')
-        operator.wait_until("driving", lambda status: status["drive"]["driving"] and not stands(status), 20.0)
+        operator.wait_until("driving", lambda status: status["drive"]["driving"] and not is_stationary(status), 20.0)
         speaker.stdin.write(f"{words}\n".encode())
         operator.wait_until("stopped", lambda status: status["estop"], 10.0)
         operator.wait_for_standstill(10.0)

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
 
 from disco_hw.config import load_robot_config
-from disco_hw.experiments import FAST_START, FAST_TASK, READY_TIMEOUT_S, Operator, stands, write_robot_file
+from disco_hw.experiments import FAST_START, FAST_TASK, READY_TIMEOUT_S, Operator, is_stationary, write_robot_file
 from disco_hw.experiments import disco_hw_process as process_of
 from tests.hil.test_ros2 import real_node, real_ros
 
@@ -29,7 +29,7 @@ class Base:
         text = self.robot_file.read_text(encoding="utf-8").replace("watchdog_s = 0.5\n", f"watchdog_s = 0.5\n{lines}")
         text += f"[ros2]\ndomain = {100 + os.getpid() % 100}\n"
         self.robot_file.write_text(text, encoding="utf-8")
-        self.said = directory / "node.txt"
+        self.output_lines = directory / "node.txt"
         self.node = self.begin_real_node() if real else self.begin_node()
         self.bridge = self.begin_bridge()
         daemon = ["run", str(self.robot_file), "--log", str(directory / "run.mcap")]
@@ -37,7 +37,7 @@ class Base:
         self.operator = Operator(directory / "control.sock")
 
     def begin_node(self):
-        sink = self.stack.enter_context(self.said.open("ab"))
+        sink = self.stack.enter_context(self.output_lines.open("ab"))
         node = subprocess.Popen(
             [sys.executable, "-m", "tools.ros2_base_node", str(self.robot_file), *map(str, FAST_START)], stdout=sink
         )
@@ -50,7 +50,7 @@ class Base:
         config = load_robot_config(self.robot_file)
         settings = config.link.settings()
         numbers = (config.pose.port, settings.wheel_radius_m, settings.track_m, *FAST_START)
-        return self.stack.enter_context(real_node(self.said, "base", *numbers))
+        return self.stack.enter_context(real_node(self.output_lines, "base", *numbers))
 
     def begin_bridge(self):
         words = ["bridge", "ros2-base", str(self.robot_file)]
@@ -72,7 +72,7 @@ class Base:
 
     def truth(self):
         """(monotonic ns, faster true wheel, rad/s, forward speed in force, m/s) of each line of the node."""
-        rows = [line.split() for line in self.said.read_text(encoding="utf-8").splitlines()]
+        rows = [line.split() for line in self.output_lines.read_text(encoding="utf-8").splitlines()]
         return [
             (int(row[0]), max(abs(float(row[1])), abs(float(row[2]))), float(row[3])) for row in rows if len(row) == 5
         ]
@@ -139,7 +139,7 @@ def test_it_stops_whoever_dies_or_freezes_and_does_not_go_on_by_itself(tmp_path,
             base.operator.request("reset")
             base.operator.wait_for("READY", 30.0)
         time.sleep(1.0)
-        assert stands(base.operator.status())
+        assert is_stationary(base.operator.status())
 
 
 @pytest.mark.parametrize(

@@ -47,8 +47,8 @@ def test_the_robot_stops_and_nothing_arms_again(tmp_path, device, fault):
     moving = [row for row in rows if row.t_s <= cut_s]
     assert moving[-1].fastest > 5.0, "the robot was not at speed when the fault struck"
     # What each controller holds at most after the last command, and a little.
-    driven = [row for row in rows if row.t_s > cut_s + 0.8 and row.asked > 1e-6]
-    assert not driven, f"asked for {driven[0].asked} rad/s {driven[0].t_s - cut_s:.2f} s later"
+    driven = [row for row in rows if row.t_s > cut_s + 0.8 and row.requested > 1e-6]
+    assert not driven, f"asked for {driven[0].requested} rad/s {driven[0].t_s - cut_s:.2f} s later"
     stopped = [row for row in rows if row.t_s > cut_s + ROLLS_S - 0.5]
     assert stopped
     assert max(row.fastest for row in stopped) < STILL_RAD_S

@@ -37,9 +37,9 @@ def run(tmp_path, monkeypatch):
 
 @thinned("fault", SPOILED, quick=2)
 def test_a_log_that_says_nothing_of_the_robot_is_refused_with_the_cause(run, fault, tmp_path):
-    change, _, remedy = FAULTS[fault]
+    change, _, hint = FAULTS[fault]
     log = change(sound())
-    with pytest.raises(InputError, match=re.escape(remedy)) as caught:
+    with pytest.raises(InputError, match=re.escape(hint)) as caught:
         run(log)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "model.toml").exists()

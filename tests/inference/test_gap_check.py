@@ -5,7 +5,7 @@ import pytest
 
 from disco_hw.errors import WorkError
 from disco_hw.inference import infer_command
-from disco_hw.inference.infer_command import gap_check_beside
+from disco_hw.inference.infer_command import gap_check_in_parallel
 from disco_hw.model import Model
 from tests.inference.drives import logged, robot_config
 
@@ -14,15 +14,15 @@ NOMINAL = Model.nominal(robot_config().robot)
 
 @pytest.mark.thorough
 def test_an_effect_that_the_log_shows_is_named_by_a_process_beside():
-    with gap_check_beside(logged("poor", hidden=(("pose_latency", 0.15),)), NOMINAL) as searched:
+    with gap_check_in_parallel(logged("poor", hidden=(("pose_latency", 0.15),)), NOMINAL) as searched:
         assert searched().missing == ("pose_latency",)
 
 
 @pytest.mark.thorough
 def test_a_robot_like_its_model_lacks_nothing():
-    with gap_check_beside(logged("circle"), NOMINAL) as searched:
+    with gap_check_in_parallel(logged("circle"), NOMINAL) as searched:
         found = searched()
-    assert (found.missing, found.not_judged) == ((), None)
+    assert (found.missing, found.why_not_checked) == ((), None)
 
 
 def test_a_log_that_cannot_be_searched_is_not_judged(monkeypatch):
@@ -32,7 +32,7 @@ def test_a_log_that_cannot_be_searched_is_not_judged(monkeypatch):
     )
     found = infer_command.gap_check(short, NOMINAL)
     assert found.missing == ()
-    assert "too little to judge" in found.not_judged
+    assert "too little to judge" in found.why_not_checked
 
 
 def cut(part):
@@ -47,7 +47,7 @@ def die(send, log, model):
 @pytest.mark.thorough
 def test_a_search_that_breaks_off_is_an_error_of_the_work(monkeypatch):
     monkeypatch.setattr(infer_command, "_search", die)
-    with gap_check_beside(logged("poor"), NOMINAL) as searched, pytest.raises(WorkError, match="broke off"):
+    with gap_check_in_parallel(logged("poor"), NOMINAL) as searched, pytest.raises(WorkError, match="broke off"):
         searched()
 
 
@@ -58,6 +58,6 @@ def sleep(send, log, model):
 def test_leaving_early_ends_the_search(monkeypatch):
     monkeypatch.setattr(infer_command, "_search", sleep)
     began = time.monotonic()
-    with pytest.raises(KeyboardInterrupt), gap_check_beside(logged("poor"), NOMINAL):
+    with pytest.raises(KeyboardInterrupt), gap_check_in_parallel(logged("poor"), NOMINAL):
         raise KeyboardInterrupt
     assert time.monotonic() - began < 30.0

@@ -31,9 +31,9 @@ max_wheel_speed_rad_s = 8.0
 FEW = InferOptions(simulations=300)
 
 
-def finds(*missing, not_judged=None):
+def finds(*missing, why_not_checked=None):
     """A search for missing effects that finds these."""
-    return lambda log, model: nullcontext(lambda: GapCheck(missing, not_judged))
+    return lambda log, model: nullcontext(lambda: GapCheck(missing, why_not_checked))
 
 
 @pytest.fixture(scope="module")
@@ -206,7 +206,7 @@ def test_a_model_that_lacks_a_found_effect_is_marked_and_says_so(known, robot, t
 
 def test_a_log_that_the_search_cannot_judge_gives_a_model_with_a_warning(known, robot, tmp_path):
     log = write_log(tmp_path / "log.csv", "poor")
-    search = finds(not_judged="too little to judge")
+    search = finds(why_not_checked="too little to judge")
     result = infer_command([log], robot, tmp_path / "model.toml", options=FEW, search=search)
     assert load_model(tmp_path / "model.toml").missing_effects == ()
     assert "was not judged: too little to judge" in result.as_text()

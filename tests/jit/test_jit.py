@@ -13,7 +13,7 @@ from numba import config, float32, njit
 from numba.core.target_extension import CPU, jit_registry
 
 from disco_hw import jit
-from disco_hw.jit import block_function, kernel_function, quick_norm_and_inverse, tune_loops
+from disco_hw.jit import block_function, fast_norm_and_inverse, kernel_function, tune_loops
 
 PLANS = """
 from pathlib import Path
@@ -95,7 +95,7 @@ def test_plans_are_the_same_bits_from_the_process_that_compiles_as_from_one_that
 def inverse_lengths(x, y, found):
     tune_loops()
     for i in range(x.size):
-        found[i] = quick_norm_and_inverse(x[i], y[i])[1]
+        found[i] = fast_norm_and_inverse(x[i], y[i])[1]
 
 
 def test_inverse_lengths_are_good_to_single_precision():

@@ -32,10 +32,10 @@ def found(log):
 
 @thinned("fault", FAULTS, quick=4)
 def test_the_cause_is_named_first_with_its_remedy(fault):
-    change, cause, remedy = FAULTS[fault]
+    change, cause, hint = FAULTS[fault]
     first, *_ = found(change(sound()))
     assert first.cause == cause
-    assert remedy in first.message
+    assert hint in first.message
     assert first.message.startswith("simulated: ")
     assert "\n" not in first.message
 

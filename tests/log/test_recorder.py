@@ -79,14 +79,14 @@ def test_a_stopped_writer_is_reported_within_a_second_replaced_and_nothing_is_lo
     polls_s = [time.monotonic()]
     os.kill(stopped, signal.SIGSTOP)
     following = kept_going(recorder, following, lambda stats: polls_s.append(time.monotonic()) or stats.fault)
-    (reported,) = recorder.news()
+    (reported,) = recorder.new_messages()
     silent_s = float(re.search(r"the log writer has not answered for (\d+\.\d) s", reported)[1])
     # Within a second, but for what this machine withheld from the one who looks.
     assert silent_s < 0.9 + max(later - earlier for earlier, later in pairwise(polls_s))
     following = kept_going(recorder, following, lambda stats: stats.writer_deaths == 1)
     following = kept_going(recorder, following, lambda stats: not stats.fault)
     wait_until(lambda: not alive(stopped))
-    news = recorder.news()
+    news = recorder.new_messages()
     assert "was ended" in news[0]
     assert news[1] == f"recording goes on in {path.with_name('run.part2.mcap')}"
     final = recorder.close()
@@ -146,7 +146,7 @@ def test_a_writer_that_is_only_slow_goes_on_with_its_file(path):
     following = kept_going(recorder, following, lambda stats: not stats.fault)
     final = recorder.close()
     assert final.writer_deaths == 0
-    assert recorder.news()[-1] == f"recording goes on in {path}"
+    assert recorder.new_messages()[-1] == f"recording goes on in {path}"
     assert recorded_ticks(path) == list(range(1, following))
 
 
@@ -160,7 +160,7 @@ def test_a_file_deleted_while_it_is_written_is_reported_counted_and_begun_anew(p
         shutil.rmtree(path.parent)
     following = kept_going(recorder, following, lambda stats: stats.writer_deaths == 1)
     following = kept_going(recorder, following, lambda stats: not stats.fault)
-    assert "was deleted while it was written" in recorder.news()[0]
+    assert "was deleted while it was written" in recorder.new_messages()[0]
     final = recorder.close()
     assert recorder.path == path.with_name("run.part2.mcap")
     assert not path.exists()
@@ -183,7 +183,7 @@ def test_a_keeper_that_died_is_made_again_while_disarmed_and_the_writer_lives_on
     os.kill(recorder.writer_pid, signal.SIGKILL)
     following = kept_going(recorder, 6, lambda stats: "disarm to renew" in stats.fault)
     assert recorder.keeper_pid is None
-    recorder.tend()
+    recorder.repair()
     following = kept_going(recorder, following, lambda stats: not stats.fault)
     assert recorder.keeper_pid is not None
     final = recorder.close()

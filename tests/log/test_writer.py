@@ -154,7 +154,7 @@ def test_a_full_disk_ends_the_log_and_with_room_again_another_begins(tmp_path):
         wait_until(lambda: recorder.poll().writer_deaths > 2)
         # It tries again and again, and leaves nothing lying about when that fails.
         assert sum(entry.suffix == ".mcap" for entry in disk.iterdir()) <= 2
-        assert len([line for line in recorder.news() if "No space" in line]) <= 3
+        assert len([line for line in recorder.new_messages() if "No space" in line]) <= 3
         filler.unlink()
         wait_until(lambda: not recorder.poll().fault and recorder.poll().waiting_ticks == 0)
         final = recorder.close()
@@ -176,10 +176,10 @@ def full_recorder(disk):
 def test_the_last_words_with_a_full_disk_count_the_ticks_that_are_lost_and_name_files_that_exist(tmp_path):
     with SmallDisk(tmp_path, 4160) as disk:
         recorder, _, given = full_recorder(disk)
-        recorder.news()
+        recorder.new_messages()
         final = recorder.close(1.0)
         assert final.waiting_ticks == given - final.delivered_ticks > 0
-        words = recorder.news()
+        words = recorder.new_messages()
         assert f"{final.waiting_ticks} of {given} ticks are in no log: " in words[-1]
         assert "No space left on device" in words[-1]
         assert not [line for line in words if "goes on" in line]
@@ -201,11 +201,11 @@ def test_a_disk_with_room_again_at_the_end_loses_nothing_and_the_part_begins_bef
         recorder, filler, given = full_recorder(disk)
         # The next attempt is seconds away.
         wait_until(lambda: recorder.poll().writer_deaths > 3)
-        recorder.news()
+        recorder.new_messages()
         filler.unlink()
         final = recorder.close()
         assert (final.delivered_ticks, final.waiting_ticks, final.fault) == (given, 0, "")
-        assert recorder.news() == (f"recording goes on in {final.path}",)
+        assert recorder.new_messages() == (f"recording goes on in {final.path}",)
         assert ticks_of(disk / "run.mcap") + ticks_of(Path(final.path)) == list(range(1, given + 1))
         with open_log(Path(final.path)) as log:
             assert log.summary().start < log.summary().end
@@ -265,7 +265,7 @@ def test_a_half_written_end_is_cut_off(path):
     finally:
         resource.prlimit(0, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     assert path.read_bytes() == b"wholehal"
-    file.cut_to_whole()
+    file.truncate_to_complete()
     assert path.read_bytes() == b"whole"
     assert file.tell() == 5
     file.close()

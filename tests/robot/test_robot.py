@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.daemon.check import refuse_beside_a_daemon
+from disco_hw.daemon.check import refuse_while_daemon_runs
 from disco_hw.errors import InputError, WorkError
-from disco_hw.runtime.assembly import make_link
+from disco_hw.runtime.assembly import create_link
 from disco_hw.runtime.robot_setup import link_key, load_setup
 from drivers.motor import DEFAULT
 from tests.firmware_protocol.conformance import FirmwareConformance
@@ -22,8 +22,8 @@ class TestRobot(FirmwareConformance):
             setup = load_setup(Path(config.getoption("--robot")))
             if setup.config.link.driver not in (None, DEFAULT):
                 pytest.skip("another controller answers: tests/robot/test_vendor_robot.py")
-            cls.key, transport = link_key(setup), make_link(setup)
-            refuse_beside_a_daemon(setup.config)
+            cls.key, transport = link_key(setup), create_link(setup)
+            refuse_while_daemon_runs(setup.config)
         except InputError as error:
             pytest.exit(str(error), returncode=2)
         except WorkError as error:

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.daemon.check import refuse_beside_a_daemon
+from disco_hw.daemon.check import refuse_while_daemon_runs
 from disco_hw.errors import InputError, WorkError
-from disco_hw.runtime.assembly import driver_of, make_link
+from disco_hw.runtime.assembly import create_link, driver_of
 from disco_hw.runtime.robot_setup import load_setup
 from drivers.motor import DEFAULT, find_driver
 from drivers.types import DriverState, LinkState, Request, WheelCommand
@@ -37,7 +37,7 @@ class Robot:
         if self.transport is not None:
             self.transport.close()
             self.driver.link_down(time.monotonic_ns())
-        self.transport, self._generation = make_link(self._setup), 0
+        self.transport, self._generation = create_link(self._setup), 0
         self.transport.open()
 
     def step(self):
@@ -110,7 +110,7 @@ def talk(request):
         setup = load_setup(Path(request.config.getoption("--robot")))
         if setup.config.link.driver in (None, DEFAULT):
             pytest.skip("the reference controller answers: tests/robot/test_robot.py")
-        refuse_beside_a_daemon(setup.config)
+        refuse_while_daemon_runs(setup.config)
         made = Robot(setup)
     except InputError as error:
         pytest.exit(str(error), returncode=2)

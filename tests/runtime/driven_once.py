@@ -15,7 +15,7 @@ import disco_hw
 from disco_hw.adaptation.guard import believed_geometry
 from disco_hw.daemon.run import warm_up
 from disco_hw.runtime import State
-from disco_hw.runtime.assembly import make_pipeline, make_planner, put_in_force
+from disco_hw.runtime.assembly import apply_geometry, create_pipeline, create_planner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
 from tests.runtime.simulated import simulated_stack
@@ -32,8 +32,8 @@ def main(uncertainty: str) -> None:
     setup = load_setup(Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
     control = msgspec.structs.replace(setup.config.control, uncertainty=uncertainty)
     setup = replace(setup, config=msgspec.structs.replace(setup.config, control=control))
-    warm_up(make_pipeline(setup.config, setup.model, make_planner(setup.config, setup.model)))
-    stack = simulated_stack(make_planner(setup.config, setup.model))
+    warm_up(create_pipeline(setup.config, setup.model, create_planner(setup.config, setup.model)))
+    stack = simulated_stack(create_planner(setup.config, setup.model))
     before = compiled_forms()
     stack.run(1.0)
     stack.run(1.0, UserRequest.ARM)
@@ -45,7 +45,7 @@ def main(uncertainty: str) -> None:
         assert len(found.weights) == 16
     if uncertainty == "ut":
         believed = believed_geometry(setup.model)
-        put_in_force(stack.core.pipeline, setup.model, replace(believed, covariance=0.5 * believed.covariance))
+        apply_geometry(stack.core.pipeline, setup.model, replace(believed, covariance=0.5 * believed.covariance))
         stack.run(0.5)
     stack.run(1.0, UserRequest.STOP)
     stack.core.set_task(msgspec.structs.replace(stack.core.task, radius_m=1.0))

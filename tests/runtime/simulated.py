@@ -7,7 +7,7 @@ from pathlib import Path
 
 import disco_hw
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
-from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.pipeline import Planner
 from disco_hw.runtime.robot_setup import load_setup
 from sim.body_dynamics import BodyPose
@@ -29,4 +29,4 @@ def simulated_stack(
     """The shipped robot with a plant at the posterior's mean; `hide`: effects, `changes`: fields of PlantParameters."""
     setup = load_setup(robot_file)
     robot = virtual_robot(setup, replace(PlantParameters(), **changes), start, effects=hide, seed=seed)
-    return SimulatedRun(setup, robot, planner or make_planner(setup.config, setup.model), needs_pose=needs_pose)
+    return SimulatedRun(setup, robot, planner or create_planner(setup.config, setup.model), needs_pose=needs_pose)

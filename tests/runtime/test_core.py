@@ -11,14 +11,14 @@ from msgspec.structs import replace
 
 import disco_hw
 from disco_hw.control import NoValidControl
-from disco_hw.daemon import in_words
+from disco_hw.daemon import describe
 from disco_hw.daemon.control_socket import loop_figures, status
 from disco_hw.daemon.loop import LoopStats
 from disco_hw.experiments.circle_report import Path, circle_figures
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.runtime import State, records_of_tick
-from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.pipeline import NoPlanner, Source
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
@@ -153,7 +153,7 @@ def test_the_log_says_which_controller_answers_and_who_says_its_limits():
     assert first.fixed == first.declared == {}
     shown = status(stack.core, loop_figures(LoopStats()), RecorderStats())
     assert shown["controller"]["limits"]["max_wheel_speed_rad_s"] == {"value": 8.0, "said_by": "device"}
-    assert "controller: reference controller, firmware" in in_words({**shown, "do": "status"}, ROBOT)
+    assert "controller: reference controller, firmware" in describe({**shown, "do": "status"}, ROBOT)
     exchanged(stack, max_wheel_speed_rad_s=4.0)
     stack.run(3.0)
     assert recorded()[-1].told["max_wheel_speed_rad_s"] == 4.0
@@ -215,7 +215,7 @@ class Moody:
 
 def test_a_planner_that_gives_up_is_followed_on_its_tail_then_the_wheels_ramp_down():
     setup = load_setup(ROBOT)
-    stack = simulated_stack(Moody(make_planner(setup.config, setup.model), 4_000_000_000))
+    stack = simulated_stack(Moody(create_planner(setup.config, setup.model), 4_000_000_000))
     stack.run(1.5)
     stack.run(0.5, UserRequest.ARM)
     ticks = stack.run(4.0, UserRequest.START)
@@ -274,7 +274,7 @@ class Collapsing:
 
 def test_plans_that_hang_on_too_few_samples_are_reported_once():
     setup = load_setup(ROBOT)
-    stack = simulated_stack(Collapsing(make_planner(setup.config, setup.model), 2_500_000_000, 3_000_000_000))
+    stack = simulated_stack(Collapsing(create_planner(setup.config, setup.model), 2_500_000_000, 3_000_000_000))
     stack.run(1.5)
     stack.run(0.5, UserRequest.ARM)
     ticks = stack.run(2.0, UserRequest.START)

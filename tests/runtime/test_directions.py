@@ -9,7 +9,7 @@ import pytest
 from disco_hw.runtime import State
 from disco_hw.runtime.plausibility import Directions
 from disco_hw.runtime.supervisor import UserRequest
-from drivers.motor import AS_TOLD, Wiring, rewired
+from drivers.motor import AS_CONFIGURED, Wiring, rewired
 from drivers.types import PoseSample, WheelCommand, WheelSample
 from sim.plant_parameters import PlantParameters
 from tests.drivers.motor.vendors import VENDORS
@@ -90,7 +90,7 @@ def first_doubt(vendor, reported, true, speeds, seconds=3.0):
 @thinned(("wiring", "speeds", "said"), WRONG, quick=12)
 @pytest.mark.parametrize("vendor", ONE_OF_EACH, ids=str)
 def test_a_wrong_wiring_is_noticed_in_the_first_half_second_of_motion(vendor, wiring, speeds, said):
-    after_s, found = first_doubt(vendor, AS_TOLD, wiring, speeds)
+    after_s, found = first_doubt(vendor, AS_CONFIGURED, wiring, speeds)
     assert after_s <= 0.5
     assert all(part in found for part in said.split(".*"))
 
@@ -98,7 +98,7 @@ def test_a_wrong_wiring_is_noticed_in_the_first_half_second_of_motion(vendor, wi
 @thinned("speeds", [(3.0, 2.0), (-2.0, 2.0), (6.0, 6.0), (-1.0, -3.0), (1.0, 3.0)], quick=2)
 @thinned("vendor", ONE_OF_EACH, ids=str, quick=3)
 def test_a_right_wiring_is_let_alone(vendor, speeds):
-    assert first_doubt(vendor, AS_TOLD, AS_TOLD, speeds) is None
+    assert first_doubt(vendor, AS_CONFIGURED, AS_CONFIGURED, speeds) is None
 
 
 def drive(watch, asked, turned, poses=()):
@@ -121,7 +121,7 @@ def test_wheels_that_lag_while_the_command_swings_are_let_alone():
         speeds = asked[tick - 12] if tick >= 12 else (0.0, 0.0)
         angle = (angle[0] + 0.02 * speeds[0], angle[1] + 0.02 * speeds[1])
         turned.append(angle)
-    assert drive(Directions(RADIUS_M, TRACK_M, AS_TOLD), asked, turned) is None
+    assert drive(Directions(RADIUS_M, TRACK_M, AS_CONFIGURED), asked, turned) is None
 
 
 def test_what_was_already_written_is_what_changes():
@@ -162,7 +162,7 @@ def test_a_robot_that_is_wired_as_declared_is_let_alone():
 
 @pytest.mark.thorough
 def test_ten_minutes_of_driving_keep_no_more_than_the_first_seconds():
-    directions = Directions(RADIUS_M, TRACK_M, AS_TOLD)
+    directions = Directions(RADIUS_M, TRACK_M, AS_CONFIGURED)
     command, floor = WheelCommand(2.0, 2.0, 0.1), Floor()
 
     def drive(ticks):
@@ -193,7 +193,7 @@ def test_a_robot_whose_geometry_is_written_down_wrongly_is_not_taken_for_miswire
 
 @pytest.mark.parametrize("runs_at", [3.0, 9.0])
 def test_a_wheel_that_does_not_count_gets_no_wiring_advice_however_it_turns(runs_at):
-    watch, floor, found = Directions(RADIUS_M, TRACK_M, AS_TOLD), Floor(), []
+    watch, floor, found = Directions(RADIUS_M, TRACK_M, AS_CONFIGURED), Floor(), []
     for tick in range(150):
         now_ns, moves = tick * TICK_NS, tick > 12
         floor.roll(0.02 * runs_at * moves, 0.06 * moves)
@@ -209,7 +209,7 @@ def test_a_wheel_that_counts_backward_after_it_has_followed_gets_no_wiring_advic
     turned = [(0.0, 0.0)] + [(0.04 * (tick if tick < 10 else 20 - tick), 0.04 * tick) for tick in range(60)]
     last, found = (0.0, 0.0), {}
     for followed in (False, True):
-        watch = Directions(RADIUS_M, TRACK_M, AS_TOLD)
+        watch = Directions(RADIUS_M, TRACK_M, AS_CONFIGURED)
         for tick, (speeds, angles) in enumerate(zip(asked, turned, strict=True)):
             now_ns = tick * TICK_NS
             rates = [(now - was) / 0.02 for now, was in zip(angles, last, strict=True)]

@@ -14,9 +14,9 @@ from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.fence import Circle, Fence, Footprint
 from disco_hw.fence.clearance import Boundaries, MovingCircle
 from disco_hw.runtime.fence_guard import (
-    HOLDS_STILL,
     IDLE,
     SCALES,
+    STOPS_MOTION,
     FenceGuard,
     FenceVerdict,
     StoppingSettings,
@@ -63,7 +63,7 @@ def test_without_a_fence_and_obstacles_nothing_is_judged():
     assert FenceGuard(None, STOPS, 0.05).step(estimate(), EXACT, (0, 0), (5, 5)) is IDLE
     assert not FenceGuard(None, STOPS, 0.05).is_active
     assert IDLE.scale == 1.0
-    assert IDLE.verdict not in HOLDS_STILL
+    assert IDLE.verdict not in STOPS_MOTION
 
 
 def integrated(
@@ -363,13 +363,13 @@ def test_without_a_pose_that_is_a_pose_nothing_moves(seen):
     found = guard_of(Fence(keep_in=ROOM)).step(seen, EXACT, (0, 0), (5, 5))
     assert (found.verdict, found.scale) == (FenceVerdict.NO_POSE, 0.0)
     assert found.reason == "no valid pose, and a fence is set"
-    assert found.verdict in HOLDS_STILL
+    assert found.verdict in STOPS_MOTION
 
 
 def test_a_pose_so_large_that_the_path_has_no_numbers_moves_nothing():
     found = judge(Fence(keep_in=ROOM), estimate(x=1e308), (1e308, 1e308), last=(1e308, 1e308))
     assert found.scale == 0.0
-    assert found.verdict in HOLDS_STILL
+    assert found.verdict in STOPS_MOTION
 
 
 @pytest.mark.parametrize("requested", [(math.nan, 0.0), (math.inf, 1.0), (0.0, 0.0), (1e-4, -1e-4)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
@@ -21,7 +21,7 @@ def test_robot_toml_asks_for_joint_sampling_and_it_drives_and_replays(tmp_path):
     text = ROBOT_FILE.read_text().replace("[control]\n", '[control]\nuncertainty = "joint"\n')
     robot_file.write_text(text.replace('"wombot_model.toml"', f'"{ROBOT_FILE.parent / "wombot_model.toml"}"'))
     setup = load_setup(robot_file)
-    planner = make_planner(setup.config, setup.model)
+    planner = create_planner(setup.config, setup.model)
     assert planner.settings.uncertainty == "joint"
     stack = simulated_stack(planner, robot_file=robot_file)
     stack.run(1.5)

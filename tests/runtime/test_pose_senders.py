@@ -75,7 +75,7 @@ class Bench:
         self.stack.run(0.5, UserRequest.ARM)
         return self.stack.run(0.5, UserRequest.START)[-1].output.running
 
-    def said(self):
+    def output_lines(self):
         return [
             record.text for _, tick in self.stack.recorder.ticks for record in tick if isinstance(record, records.Event)
         ]
@@ -111,12 +111,12 @@ def test_a_robot_that_is_carried_stops_its_task_and_says_so_and_its_operator_sta
     made.send(25.0, lambda _t_s: off_m if carried else 0.0)
     assert made.start()
     assert made.stack.run(4.0)[-1].output.running
-    assert not containing(made.said(), "jump")
+    assert not containing(made.output_lines(), "jump")
     carried.append(True)
     last = made.stack.run(2.0)[-1]
     assert not last.output.running
     assert last.command.left_rad_s == last.command.right_rad_s == 0.0
-    said = made.said()
+    said = made.output_lines()
     (jump,) = containing(said, "poses: the pose jumped by")
     assert f"by {abs(off_m):.2f} m" in jump
     assert "which the wheels do not explain: the robot was carried or has slipped, or its poses are wrong" in jump
@@ -138,7 +138,7 @@ def test_a_jump_while_nothing_runs_is_said_and_keeps_nobody_from_starting_later(
     made.stack.run(1.5)
     carried.append(True)
     made.stack.run(1.0)
-    assert containing(made.said(), "poses: the pose jumped by 1.00 m")
+    assert containing(made.output_lines(), "poses: the pose jumped by 1.00 m")
     made.stack.run(0.5, UserRequest.ARM)
     assert made.stack.run(0.5, UserRequest.START)[-1].output.running
 
@@ -156,7 +156,7 @@ def test_a_second_sender_is_refused_and_named_and_the_robot_stays_on_its_circle(
     last = made.stack.run(12.0)[-1]
     assert last.output.running
     assert made.error_m() < 0.05
-    named = containing(made.said(), f"poses: {stranger.name} sends poses beside {first.name}: not used")
+    named = containing(made.output_lines(), f"poses: {stranger.name} sends poses beside {first.name}: not used")
     assert 1 <= len(named) <= 2
     assert f"stop one of them; {first.name} is kept until it has been silent for 2 s" in named[0]
     assert made.stack.core.pose_source.refused > 11.0 * stranger_hz
@@ -172,7 +172,7 @@ def test_another_sender_takes_over_only_after_the_task_has_stopped_for_want_of_p
     first.is_silent = True
     seen = made.stack.run(4.0)
     assert not seen[-1].output.running
-    said = made.said()
+    said = made.output_lines()
     stopped = said.index("task stopped: no pose; check the pose sensor, or set estimation.pose_required = false")
     (taken,) = containing(said, f"poses: poses come from {second.name} now; {first.name} has been silent for 2.0 s")
     assert stopped < said.index(taken)
@@ -183,7 +183,7 @@ def test_only_allowed_addresses_may_send(bench):
     made = bench('allow = ["10.0.0.0/8"]\n')
     sender = made.send(25.0)
     assert not made.start()
-    (said,) = containing(made.said(), "is not in pose.allow")
+    (said,) = containing(made.output_lines(), "is not in pose.allow")
     assert said.startswith(f"poses: {sender.name} sends poses and is not in pose.allow: not used (1 datagrams)")
 
 
@@ -209,7 +209,7 @@ def test_a_heading_that_is_said_to_be_unknown_is_not_used_and_the_operator_is_to
     assert (last.pipeline.estimate.initialised, last.pipeline.estimate.heading_known) == (True, False)
     assert last.output.detail == "armed, holding zero"
     assert made.error_m() < 0.05
-    (told,) = containing(made.said(), "the estimator runs on positions")
+    (told,) = containing(made.output_lines(), "the estimator runs on positions")
     assert told.startswith("poses: udp: its poses have no heading, or one whose covariance says that it is unknown")
     assert status(made.stack.core, {}, RecorderStats())["poses"][0]["heading"] == "none"
 
@@ -222,7 +222,7 @@ def test_a_heading_that_never_moves_is_found_out_by_the_first_turn_and_the_estim
     last = made.stack.run(3.0)[-1]
     assert not last.output.running
     assert not last.pipeline.estimate.heading_known
-    (told,) = containing(made.said(), "the heading stands still at 1.57 rad while the wheels turn the robot by")
+    (told,) = containing(made.output_lines(), "the heading stands still at 1.57 rad while the wheels turn the robot by")
     assert told.endswith("it is not used, and the estimator runs on positions")
     assert status(made.stack.core, {}, RecorderStats())["poses"][0]["heading"] == "stands still"
 
@@ -242,11 +242,11 @@ def test_a_heading_sensor_that_dies_is_left_out_and_the_drive_goes_on_by_positio
     made.send(25.0, said=said)
     assert made.start()
     last = made.stack.run(10.0)[-1]
-    assert containing(made.said(), "udp: the heading stands still at")
-    assert last.output.running, made.said()
+    assert containing(made.output_lines(), "udp: the heading stands still at")
+    assert last.output.running, made.output_lines()
     assert made.error_m() < 0.05
     last = made.stack.run(5.0)[-1]
-    assert containing(made.said(), "udp: its headings are used again")
+    assert containing(made.output_lines(), "udp: its headings are used again")
     assert last.output.running
     assert made.error_m() < 0.03
 

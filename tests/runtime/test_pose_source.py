@@ -80,6 +80,6 @@ def test_a_source_that_cannot_be_had_is_bad_input(monkeypatch):
     def refuse(**_fields):
         raise PoseSourceError("port 5005: in use; choose another")
 
-    monkeypatch.setattr(assembly, "make_pose_source", refuse)
+    monkeypatch.setattr(assembly, "create_pose_source", refuse)
     with pytest.raises(InputError, match=r"pose\.source: port 5005: in use; choose another$"):
         pose_source_of(load_setup(ROBOT_FILE).config)

@@ -192,7 +192,7 @@ def test_within_or_equal_is_fine():
 
 
 @pytest.mark.parametrize(
-    ("speed", "acceleration", "ticks", "field", "remedy"),
+    ("speed", "acceleration", "ticks", "field", "hint"),
     [
         (8.01, 20.0, 2048, "robot.max_wheel_speed_rad_s: 8.01", "write at most 8,"),
         (8.0, 25.0, 2048, "robot.max_wheel_acceleration_rad_s2: 25", "write at most 20,"),
@@ -200,10 +200,10 @@ def test_within_or_equal_is_fine():
         (math.nan, 20.0, 2048, "robot.max_wheel_speed_rad_s: nan", "write at most 8,"),
     ],
 )
-def test_what_does_not_fit_is_one_line_with_field_and_remedy(speed, acceleration, ticks, field, remedy):
+def test_what_does_not_fit_is_one_line_with_field_and_remedy(speed, acceleration, ticks, field, hint):
     (line,) = check_limits(ROBOT, speed, acceleration, ticks)
     assert field in line
-    assert remedy in line
+    assert hint in line
     assert "\n" not in line
 
 

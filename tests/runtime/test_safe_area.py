@@ -181,7 +181,7 @@ def test_an_obstacle_is_kept_to_its_age_limit_and_then_stops_the_robot(robot_fil
         "fence: stopped: obstacle cart is reported no longer; report it again or remove it",
     ]
     assert run.core.area.task_fault.startswith("fence: obstacle cart")
-    run.core.area.ask(run.now_us * 1000, {"change": "remove", "name": "cart"})
+    run.core.area.handle_request(run.now_us * 1000, {"change": "remove", "name": "cart"})
     assert run.run(0.5)[-1].command.left_rad_s > 0.5
 
 
@@ -269,15 +269,15 @@ def test_reports_come_over_udp(robot_file):
 
 def test_a_person_adds_and_removes_obstacles_and_all_is_recorded():
     area = area_of(Fence(keep_in=ROOM))
-    added = area.ask(5, {"change": "add", "name": "pillar", "x_m": 0.5, "y_m": 0.0, "radius_m": 0.1})
+    added = area.handle_request(5, {"change": "add", "name": "pillar", "x_m": 0.5, "y_m": 0.0, "radius_m": 0.1})
     assert added == "obstacle pillar: kept for 600 s, then the robot stops"
-    assert area.ask(6, {"change": "remove", "name": "pillar"}) == "obstacle pillar: removed"
+    assert area.handle_request(6, {"change": "remove", "name": "pillar"}) == "obstacle pillar: removed"
     _, written = area.end(7, area.last, overridden=False)
     assert [one.removed for one in written] == [False, True]
     assert report_of_record(written[0]).radius_m == 0.1
     for wrong in ({}, {"change": "add"}, {"change": "remove"}, {"change": "remove", "name": "x", "x_m": 1.0}):
         with pytest.raises(ObstacleRefused):
-            area.ask(8, wrong)
+            area.handle_request(8, wrong)
 
 
 def test_the_fence_is_changed_while_disarmed_only():

@@ -12,7 +12,7 @@ from disco_hw.errors import InputError
 from disco_hw.log import records
 from disco_hw.log.load import load_drive
 from disco_hw.log.recorder import RecorderStats
-from disco_hw.runtime.assembly import make_planner, pose_source_of
+from disco_hw.runtime.assembly import create_planner, pose_source_of
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
@@ -43,7 +43,7 @@ class Bench:
         also = f'[[pose.also]]\nsource = "udp"\nport = {port}\norigin = [1.0, 0.0, 0.0]\n'
         file = robot_toml(directory, f'[pose]\nsource = "robot"\n{also}')
         setup = load_setup(file)
-        self.stack = simulated_stack(make_planner(setup.config, setup.model), robot_file=file)
+        self.stack = simulated_stack(create_planner(setup.config, setup.model), robot_file=file)
         self.off_m = 0.0
         self._sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._sender.connect(("127.0.0.1", port))
@@ -66,7 +66,7 @@ class Bench:
         self._sender.close()
         self.stack.core.pose_source.close()
 
-    def said(self):
+    def output_lines(self):
         return " | ".join(
             record.text for _, tick in self.stack.recorder.ticks for record in tick if isinstance(record, records.Event)
         )
@@ -95,8 +95,8 @@ def test_both_are_fused_shown_recorded_and_replayed_bit_for_bit(bench, tmp_path)
     assert now[1]["origin"] == [1.0, 0.0, 0.0]
     assert now[1]["outliers"] >= 12
     assert now[0]["latency_s"] == pytest.approx(0.03, abs=0.02)
-    assert "poses: udp: jumped against the wheels and is left out; going on with robot" in bench.said()
-    assert "poses: udp: lost, no pose for 1 s; going on with robot" in bench.said()
+    assert "poses: udp: jumped against the wheels and is left out; going on with robot" in bench.output_lines()
+    assert "poses: udp: lost, no pose for 1 s; going on with robot" in bench.output_lines()
     assert {pose.source for pose in bench.poses()} == {0, 1}
     log = tmp_path / "run.mcap"
     bench.stack.write_log(log)
@@ -114,7 +114,7 @@ def test_two_that_contradict_each_other_stop_the_task_and_say_so(bench):
         bench.stack.run(0.1)
     assert not bench.stack.core.last.output.running
     why = "udp and robot contradict each other beyond their stated noise; find out which is wrong and take it out of"
-    assert f"task stopped: {why} [pose]" in bench.said()
+    assert f"task stopped: {why} [pose]" in bench.output_lines()
 
 
 def test_what_is_learnt_is_learnt_from_the_first_alone(bench):
@@ -202,5 +202,5 @@ def test_a_key_beside_robot_toml_is_read_and_one_that_others_can_read_or_is_none
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         stranger.sendto(b'{"x_m":1,"y_m":2,"position_std_m":0.1,"age_s":0}', ("127.0.0.1", port))
         assert list(source.receive(10**12, ())) == []
-    assert any("without the proof of pose.key_file" in words for words in source.news())
+    assert any("without the proof of pose.key_file" in words for words in source.new_messages())
     source.close()

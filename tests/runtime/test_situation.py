@@ -9,8 +9,8 @@ from disco_hw.runtime import (
     advice,
     by_command,
     connection,
+    describe,
     headline,
-    in_words,
     next_step,
 )
 from drivers.types import DriverState, LinkState
@@ -22,7 +22,7 @@ STATUS = {"estop": False, "robot_state": "READY", "fault": "NONE", "state": "REA
 @pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
 def test_every_fault_of_the_protocol_has_its_sentence(fault):
     (said,) = advice({**STATUS, "fault": fault.name})
-    assert said.startswith(f"{in_words(fault.name)}. ")
+    assert said.startswith(f"{describe(fault.name)}. ")
     assert said.lower().endswith(f"{fault.advice.lower()}.")
 
 
@@ -103,4 +103,4 @@ def test_driving_by_hand_has_its_own_words():
 
 
 def test_codes_in_words():
-    assert in_words("OVER_CURRENT_RIGHT") == "Over current right"
+    assert describe("OVER_CURRENT_RIGHT") == "Over current right"

@@ -10,10 +10,10 @@ ROWS = [(row, source) for row in TRANSITIONS for source in sorted(row.sources, k
 QUIET = {
     State.DISCONNECTED: C.NONE,
     State.HANDSHAKE: C.LINK_UP | C.TELEMETRY_FRESH,
-    State.READY: C.LINK_UP | C.ROBOT_TALKS | C.ROBOT_IDLE | C.TELEMETRY_FRESH | C.WHEELS_STILL,
+    State.READY: C.LINK_UP | C.ROBOT_TALKS | C.ROBOT_IDLE | C.TELEMETRY_FRESH | C.WHEELS_STATIONARY,
     State.ARMED: C.LINK_UP | C.ROBOT_TALKS | C.ROBOT_ARMED | C.ROBOT_MAY_MOVE | C.TELEMETRY_FRESH,
     State.STOPPING: C.LINK_UP | C.ROBOT_TALKS | C.ROBOT_MAY_MOVE | C.TELEMETRY_FRESH,
-    State.FAULT: C.LINK_UP | C.ROBOT_TALKS | C.ROBOT_IDLE | C.TELEMETRY_FRESH | C.WHEELS_STILL,
+    State.FAULT: C.LINK_UP | C.ROBOT_TALKS | C.ROBOT_IDLE | C.TELEMETRY_FRESH | C.WHEELS_STATIONARY,
 }
 
 
@@ -39,7 +39,7 @@ def test_each_row_fires_when_its_conditions_hold_and_not_when_one_is_missing_or_
 @pytest.mark.parametrize("problem", PROBLEM, ids=lambda problem: problem.name)
 @pytest.mark.parametrize("source", [State.HANDSHAKE, State.READY, State.ARMED, State.STOPPING])
 def test_every_problem_leads_to_fault_whatever_else_is_asked(source, problem):
-    everything_asked = C.ARM_PENDING | C.RESET_PENDING | C.DISARM_ASKED
+    everything_asked = C.ARM_PENDING | C.RESET_PENDING | C.DISARM_REQUESTED
     row = next_transition(source, (QUIET[source] | everything_asked | problem).value)
     assert row is not None
     assert row.target is State.FAULT

@@ -34,10 +34,10 @@ def test_a_link_that_is_down_means_disconnected_and_no_command(start):
 def test_without_a_link_it_says_why_and_what_to_do():
     bench = Bench()
     assert bench.tick(link_state=LinkState.CONNECTING).detail == "the link is connecting"
-    remedy = "serial /dev/ttyUSB0: no such device; plug the adapter in"
-    out = bench.tick(ARM, link_state=LinkState.CONNECTING, link_error=remedy)
-    assert out.detail == remedy
-    assert remedy in refusal(out)
+    hint = "serial /dev/ttyUSB0: no such device; plug the adapter in"
+    out = bench.tick(ARM, link_state=LinkState.CONNECTING, link_error=hint)
+    assert out.detail == hint
+    assert hint in refusal(out)
     bench.tick(link_state=LinkState.UP, driver_state=DriverState.HANDSHAKE)
     mute = "/dev/ttyUSB0: open, but no frame has come for 4 s"
     assert bench.tick(driver_state=DriverState.HANDSHAKE, link_error=mute).detail == mute

@@ -13,10 +13,10 @@ from disco_hw.runtime import State
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import (
     TaskRefused,
-    asked_of,
     changed_task,
     limits,
     record_of,
+    requested_task,
     task_in_status,
     task_of,
 )
@@ -128,25 +128,25 @@ def test_of_a_path_only_the_speed_can_be_changed():
 
 def test_a_status_and_a_record_hold_a_path_without_its_way_points():
     other = msgspec.structs.replace(LINE, speed_m_s=0.1)
-    asked = asked_of(other)
+    asked = requested_task(other)
     assert "points" not in asked
     assert task_in_status(asked, LINE) == other
     assert task_in_status(asked, msgspec.structs.replace(LINE, points=((0.0, 0.0), (2.0, 0.1)))) is None
     assert task_in_status(asked, CircleTask()) is None
-    assert task_in_status(asked_of(CircleTask(radius_m=2.0)), LINE) == CircleTask(radius_m=2.0)
+    assert task_in_status(requested_task(CircleTask(radius_m=2.0)), LINE) == CircleTask(radius_m=2.0)
     assert task_of(record_of(7, other), LINE) == other
-    assert other.in_words() == "path line.csv of 2.00 m at 0.1 m/s"
+    assert other.describe() == "path line.csv of 2.00 m at 0.1 m/s"
 
 
 def test_of_way_points_by_time_nothing_can_be_changed():
     with pytest.raises(TaskRefused, match="have times, which say all; change t_s in their CSV"):
         changed_task(TIMED, {"speed_m_s": 0.3}, ROBOT, State.READY)
     assert limits(ROBOT, TIMED) == {}
-    assert TIMED.in_words() == "path line.csv of 2.00 m in 10 s, at most 0.2 m/s"
-    assert task_in_status(asked_of(TIMED), TIMED) == TIMED
-    assert task_in_status(asked_of(TIMED), msgspec.structs.replace(TIMED, times_s=(0.0, 11.0))) is None
-    assert task_in_status(asked_of(TIMED), LINE) is None
-    assert task_in_status(asked_of(LINE), TIMED) is None
+    assert TIMED.describe() == "path line.csv of 2.00 m in 10 s, at most 0.2 m/s"
+    assert task_in_status(requested_task(TIMED), TIMED) == TIMED
+    assert task_in_status(requested_task(TIMED), msgspec.structs.replace(TIMED, times_s=(0.0, 11.0))) is None
+    assert task_in_status(requested_task(TIMED), LINE) is None
+    assert task_in_status(requested_task(LINE), TIMED) is None
     assert task_of(record_of(7, TIMED), TIMED) == TIMED
 
 

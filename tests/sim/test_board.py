@@ -58,7 +58,7 @@ class SimProcess:
 def test_a_board_drives_a_virtual_robot_and_stops_when_it_goes(tmp_path, program):
     with running_board(program) as board:
         sim = SimProcess(tmp_path, board.plant)
-        transport = serial.make_transport(port=board.link)
+        transport = serial.create_transport(port=board.link)
         transport.open()
         host = ProtocolHost(LinkEnd(transport), first_session=3, valid_for_s=0.5)
         try:

@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.bus import CanBus, DeliveredFrame, FrameFate
+from sim.bus import CanBus, DeliveredFrame, FrameOutcome
 from sim.can_protocol import CanFrame, ErrorState, TransmitOrder, frame_bits, stuffed_bits
 
 BIT_NS = 2000  # 500 kbit/s
@@ -18,9 +18,9 @@ def fates(*given_fates):
             self.left = list(given_fates)
             self.asked = []
 
-        def fate(self, now_ns, sender, frame):
+        def outcome(self, now_ns, sender, frame):
             self.asked.append((now_ns, sender, frame))
-            return self.left.pop(0) if self.left else FrameFate()
+            return self.left.pop(0) if self.left else FrameOutcome()
 
     return Fates()
 
@@ -129,7 +129,7 @@ def test_a_full_queue_refuses():
 
 
 def test_a_destroyed_frame_is_sent_again_after_an_error_frame():
-    bus = CanBus(fault=fates(FrameFate(wire_error_bit=30)))
+    bus = CanBus(fault=fates(FrameOutcome(wire_error_bit=30)))
     a, b = bus.attach("a"), bus.attach("b")
     bus.send(a, FRAME)
     (delivery,) = bus.advance(LONG_NS)
@@ -139,7 +139,7 @@ def test_a_destroyed_frame_is_sent_again_after_an_error_frame():
 
 
 def test_a_frame_destroyed_for_ever_ends_in_bus_off_and_the_bus_is_free_again():
-    bus = CanBus(fault=fates(*[FrameFate(wire_error_bit=20)] * 32))
+    bus = CanBus(fault=fates(*[FrameOutcome(wire_error_bit=20)] * 32))
     a, b = bus.attach("a"), bus.attach("b")
     bus.send(a, FRAME)
     bus.send(a, FRAME)
@@ -155,7 +155,7 @@ def test_a_frame_destroyed_for_ever_ends_in_bus_off_and_the_bus_is_free_again():
 
 
 def test_an_error_passive_sender_waits_eight_bits_before_it_sends_again():
-    bus = CanBus(fault=fates(*[FrameFate(wire_error_bit=20)] * 16))
+    bus = CanBus(fault=fates(*[FrameOutcome(wire_error_bit=20)] * 16))
     a, b = bus.attach("a"), bus.attach("b")
     bus.send(a, CanFrame(0x100))
     bus.advance(16 * (20 + 1 + 6 + 6 + 8 + 3) * BIT_NS)
@@ -259,7 +259,7 @@ def test_recovery_needs_bus_off():
 
 
 def test_lost_frame_is_acknowledged_and_reaches_nobody():
-    bus = CanBus(fault=fates(FrameFate(lost=True)))
+    bus = CanBus(fault=fates(FrameOutcome(lost=True)))
     a, b = bus.attach("a"), bus.attach("b")
     bus.send(a, FRAME)
     assert bus.advance(LONG_NS) == []
@@ -267,7 +267,7 @@ def test_lost_frame_is_acknowledged_and_reaches_nobody():
 
 
 def test_one_way_loss():
-    bus = CanBus(fault=fates(FrameFate(lost_at=("b",)), FrameFate(lost_at=("b",))))
+    bus = CanBus(fault=fates(FrameOutcome(lost_at=("b",)), FrameOutcome(lost_at=("b",))))
     a, b, c = (bus.attach(name) for name in "abc")
     bus.send(a, FRAME)
     bus.send(b, CanFrame(0x700))
@@ -275,7 +275,7 @@ def test_one_way_loss():
 
 
 def test_duplicate():
-    bus = CanBus(fault=fates(FrameFate(copies=2)))
+    bus = CanBus(fault=fates(FrameOutcome(copies=2)))
     a, b = bus.attach("a"), bus.attach("b")
     bus.send(a, FRAME)
     assert [d.frame for d in bus.advance(LONG_NS)] == [FRAME, FRAME]
@@ -283,7 +283,7 @@ def test_duplicate():
 
 
 def test_delay_reorders():
-    bus = CanBus(fault=fates(FrameFate(delay_ns=1_000_000)))
+    bus = CanBus(fault=fates(FrameOutcome(delay_ns=1_000_000)))
     a, _ = bus.attach("a", order=TransmitOrder.FIFO), bus.attach("b")
     bus.send(a, CanFrame(1))
     bus.send(a, CanFrame(2))
@@ -294,7 +294,7 @@ def test_delay_reorders():
 
 
 def test_deliveries_are_in_order_of_time_even_over_a_long_stride():
-    bus = CanBus(fault=fates(FrameFate(delay_ns=1_000_000)))
+    bus = CanBus(fault=fates(FrameOutcome(delay_ns=1_000_000)))
     a, _ = bus.attach("a"), bus.attach("b")
     bus.send(a, CanFrame(1))
     bus.advance(0)
@@ -307,7 +307,7 @@ def test_deliveries_are_in_order_of_time_even_over_a_long_stride():
 
 @pytest.mark.parametrize("data", [b"", b"\x01", bytes(7), bytes.fromhex("8d306902b4fb2c02")])
 def test_payload_corrupted_behind_the_crc(data):
-    bus = CanBus(fault=fates(FrameFate(data=data)))
+    bus = CanBus(fault=fates(FrameOutcome(data=data)))
     a, _ = bus.attach("a"), bus.attach("b")
     bus.send(a, FRAME)
     (delivery,) = bus.advance(LONG_NS)
@@ -366,7 +366,7 @@ def test_a_babbling_node_starves_higher_identifiers_only():
 
 def test_log_is_candump():
     lines = []
-    bus = CanBus(fault=fates(FrameFate(wire_error_bit=0)), log=lines.append)
+    bus = CanBus(fault=fates(FrameOutcome(wire_error_bit=0)), log=lines.append)
     a, _ = bus.attach("a"), bus.attach("b")
     bus.send(a, FRAME)
     bus.advance(LONG_NS)

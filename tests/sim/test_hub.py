@@ -11,7 +11,7 @@ import pytest
 
 from drivers.types import Frame
 from sim import RESTART_DELAY_NS, LinkFaultError
-from sim.bus import FrameFate
+from sim.bus import FrameOutcome
 from sim.can_protocol import ECHO_OWN_FRAMES, FRAME_BYTES, CanFrame, ErrorState, frame_bits, pack_frame, unpack_frame
 from sim.hub import READER_QUEUE, READER_STALL_NS, Hub, HubLink
 from sim.process import SocketPathError
@@ -125,8 +125,8 @@ def test_a_lone_node_is_acknowledged(hub):
 
 def test_faults_and_log_reach_the_bus(make_hub):
     class LoseAll:
-        def fate(self, now_ns, sender, frame):
-            return FrameFate(lost=True)
+        def outcome(self, now_ns, sender, frame):
+            return FrameOutcome(lost=True)
 
     lines = []
     hub = make_hub(fault=LoseAll(), log=lines.append)

@@ -178,7 +178,7 @@ def test_the_timeline_reports_each_beginning_and_end_once():
 def fates(text, count=400, sender="host", frame=FRAME, seed=1):
     faults = FrameFaults(seed)
     faults.set_active(schedule(text).faults)
-    return faults, [faults.fate(k, sender, frame) for k in range(count)]
+    return faults, [faults.outcome(k, sender, frame) for k in range(count)]
 
 
 @pytest.mark.parametrize(
@@ -253,7 +253,7 @@ def test_an_empty_frame_has_no_bit_to_flip():
 def test_the_line_breaks_within_the_next_frame_and_only_there():
     faults = FrameFaults(0)
     faults.break_next = True
-    first, second = (faults.fate(k, "robot", FRAME) for k in range(2))
+    first, second = (faults.outcome(k, "robot", FRAME) for k in range(2))
     assert first.cut
     assert first.wire_error_bit is not None
     assert faults.broken
@@ -264,5 +264,5 @@ def test_a_growing_delay_grows_from_the_first_frame_on():
     faults = FrameFaults(1)
     faults.set_active(schedule('kind="delay"\nat_s=0\nfor_s=9\nprobability=1\ndelay_s=0.05\ngrowth=0.2').faults)
     begin_ns = 70_000 * MS
-    found = [faults.fate(begin_ns + ms * MS, "host", FRAME).delay_ns for ms in (0, 100, 1000)]
+    found = [faults.outcome(begin_ns + ms * MS, "host", FRAME).delay_ns for ms in (0, 100, 1000)]
     assert found == [50 * MS, 70 * MS, 250 * MS]

@@ -142,7 +142,7 @@ class HubProcess:
 
 def drive_beside_another_node(path):
     """Drive a board that is a node of the bus at `path`; then a third node stops it."""
-    transport = can_transport.make_transport(interface="unixcan", channel=str(path))
+    transport = can_transport.create_transport(interface="unixcan", channel=str(path))
     transport.open()
     with can.Bus(interface="unixcan", channel=str(path)) as other:
         host = ProtocolHost(LinkEnd(transport), first_session=5, valid_for_s=0.5)

@@ -10,7 +10,7 @@ import serial
 from drivers.types import Frame
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 from sim import LinkFaultError
-from sim.bus import FrameFate
+from sim.bus import FrameOutcome
 from sim.serial_line import SerialLine, SerialPathError
 from tests.drivers.waiting import wait_until
 
@@ -257,10 +257,10 @@ class Fate:
     """Does the same to every frame from one side."""
 
     def __init__(self, sender, **fate):
-        self.sender, self.what = sender, FrameFate(**fate)
+        self.sender, self.what = sender, FrameOutcome(**fate)
 
-    def fate(self, now_ns, sender, frame):
-        return self.what if sender == self.sender else FrameFate()
+    def outcome(self, now_ns, sender, frame):
+        return self.what if sender == self.sender else FrameOutcome()
 
 
 @pytest.mark.parametrize(
@@ -276,7 +276,7 @@ class Fate:
 )
 def test_faults_on_the_way_to_the_host_are_what_the_host_reads(fate, frames):
     line = SerialLine(None, 0, pacing=False)
-    line.tamper(Fate("robot", **fate))
+    line.set_bus_fault(Fate("robot", **fate))
     with serial.Serial(line.port, 921_600, timeout=0.2) as host:
         line.collect(1)
         line.send([Frame(0x110, b"12345678")])
@@ -297,7 +297,7 @@ def test_faults_on_the_way_to_the_host_are_what_the_host_reads(fate, frames):
 )
 def test_faults_on_the_way_to_the_robot_are_what_the_robot_reads(fate, expected):
     line = SerialLine(None, 0, pacing=False)
-    line.tamper(Fate("host", **fate))
+    line.set_bus_fault(Fate("host", **fate))
     with serial.Serial(line.port, 921_600) as host:
         line.collect(1)
         host.write(encode_frame(0x100, b"abc"))

@@ -122,16 +122,16 @@ def test_the_kill_switch_is_read_at_the_check_brakes_and_ignores_commands():
     vesc.kill_switch_pin = True
     assert status_byte(vesc) == 0
     vesc.step(10)
-    assert (status_byte(vesc), vesc.held) == (2, ("set_brake_current", 7.0))
+    assert (status_byte(vesc), vesc.last_command) == (2, ("set_brake_current", 7.0))
     vesc.at(15)
     vesc.receive_bytes(SET_RPM)
-    assert vesc.held == ("set_brake_current", 7.0)
+    assert vesc.last_command == ("set_brake_current", 7.0)
     vesc.kill_switch_pin = False
     vesc.step(20)
     assert status_byte(vesc) == 0
     vesc.at(31)
     vesc.receive_bytes(SET_RPM)
-    assert vesc.held == ("set_erpm", 3000.0)
+    assert vesc.last_command == ("set_erpm", 3000.0)
 
 
 def test_the_timeout_is_neither_found_nor_ended_while_the_kill_switch_is_active():

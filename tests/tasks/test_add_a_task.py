@@ -15,7 +15,7 @@ from disco_hw.errors import InputError
 from disco_hw.log import records
 from disco_hw.log.encoding import JsonDecoder, encode_json
 from disco_hw.runtime import State
-from disco_hw.runtime.robot_setup import asked_of, changed_task, load_setup, record_of, task_in_status, task_of
+from disco_hw.runtime.robot_setup import changed_task, load_setup, record_of, requested_task, task_in_status, task_of
 from disco_hw.tasks import RobotTask, kinds
 from disco_hw.viewer import curves
 from disco_hw.viewer.timeline import Timeline
@@ -61,7 +61,7 @@ def test_its_file_is_a_kind_from_robot_toml_to_the_log(square):
     record = record_of(7, changed)
     assert record == records.Task(7, "square", {"side_m": 2.0, "speed_m_s": 0.2})
     assert task_of(JsonDecoder().decode("/task", encode_json(record)), task) == changed
-    assert task_in_status(asked_of(changed), task) == changed
+    assert task_in_status(requested_task(changed), task) == changed
     assert task.course().noun == "square"
     away = curves.distance(task, Timeline(), 0, 0)
     assert list(away.values) == ["distance (m)"]

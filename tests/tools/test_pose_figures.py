@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import disco_hw
-from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.robot_setup import load_setup
 from tools.study.pose_figures import OWN, RTK, UDP, drive_circle, with_circle
 
@@ -14,7 +14,7 @@ from tools.study.pose_figures import OWN, RTK, UDP, drive_circle, with_circle
 @pytest.fixture(scope="module")
 def driven():
     setup = with_circle(load_setup(Path(disco_hw.__file__).parent / "robots" / "wombot.toml"), 3.0, 0.5)
-    planner = make_planner(setup.config, setup.model)
+    planner = create_planner(setup.config, setup.model)
     return lambda kind, seeds: [drive_circle(setup, planner, kind, seed) for seed in seeds]
 
 

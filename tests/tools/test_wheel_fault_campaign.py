@@ -24,8 +24,8 @@ SUBSET = [
 def test_a_wheel_that_ceases_to_obey_stops_the_robot_in_time_and_for_the_right_cause(job):
     run = strike(job)
     assert not run.is_missed, f"{run.stopped_s:.2f} s, {run.travel_rad:.2f} rad"
-    assert run.words
-    assert not run.is_wrong, run.words
+    assert run.status_text
+    assert not run.is_wrong, run.status_text
 
 
 @pytest.mark.parametrize("driver", ["reference", "roboclaw"])

@@ -2,7 +2,7 @@
 
 import logging
 
-from disco_hw.viewer.admission import Admission, OncePerSecond
+from disco_hw.viewer.admission import Admission, RateLimit
 
 
 class Transport:
@@ -43,7 +43,7 @@ def record(created, text="opening handshake failed"):
 
 
 def test_a_repeated_error_is_one_line_a_second_with_the_count_of_the_others():
-    limit = OncePerSecond()
+    limit = RateLimit()
     kept = [made for t in range(25) if limit.filter(made := record(100.0 + 0.1 * t))]
     assert [made.getMessage() for made in kept] == [
         "page: opening handshake failed",

@@ -11,7 +11,7 @@ from disco_hw.adaptation.guard import NAMES
 from disco_hw.daemon.page_feed import ViewerFeed, feed_path
 from disco_hw.drive.coverage import Coverage
 from disco_hw.log import records
-from disco_hw.runtime.robot_setup import asked_of
+from disco_hw.runtime.robot_setup import requested_task
 from disco_hw.tasks.circle import CircleTask
 from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.pages import KEEP_S, LivePage, _Due
@@ -41,7 +41,7 @@ def ticks(first, last):
 
 def test_the_newest_instant_is_drawn(page):
     live, _ = page
-    live.take(ticks(0, 51))
+    live.ingest(ticks(0, 51))
     live.draw(everything=True)
     assert tuple(live.scene._robot.position[:2]) == pytest.approx(pose_at(50)[:2])
     assert live.scene._lines["plan"].visible
@@ -81,7 +81,7 @@ def test_records_come_over_the_feed(page):
         assert time.monotonic() < deadline
         feed.put(*tick_records(tick))
         tick += 1
-        live.take(live._subscriber.receive(0.01))
+        live.ingest(live._subscriber.receive(0.01))
     feed.close()
 
 
@@ -90,7 +90,7 @@ def test_a_page_that_stays_open_does_not_grow(page):
     count = round(KEEP_S * 50)
     estimate = next(record for _, record in ticks(0, 1) if isinstance(record, records.Estimate))
     for number in range(0, 3 * count, 500):
-        live.take([(START_NS + tick * PERIOD_NS, estimate) for tick in range(number, number + 500)])
+        live.ingest([(START_NS + tick * PERIOD_NS, estimate) for tick in range(number, number + 500)])
     assert count <= len(live.timeline.estimate) <= 2 * count + 500
 
 
@@ -101,7 +101,7 @@ def status_with(**task):
 
 def test_a_task_that_was_changed_before_the_page_was_opened_is_taken_over(page):
     live, _ = page
-    live.take(ticks(0, 51))
+    live.ingest(ticks(0, 51))
     live._learn_task(status_with(none=True))
     live._learn_task(status_with())
     assert not len(live.timeline.tasks)
@@ -121,12 +121,12 @@ def status_of(change):
 
 def test_a_belief_from_before_the_page_was_opened_is_taken_over(page):
     live, _ = page
-    live.take(ticks(0, 51))
+    live.ingest(ticks(0, 51))
     learnt = adapted(START_NS)
     live._learn_belief(status_of(learnt))
     in_force = live._snapshot().belief
     assert (in_force.names, in_force.mean, in_force.covariance) == (learnt.names, learnt.mean, learnt.covariance)
-    live.take(ticks(51, 200))
+    live.ingest(ticks(51, 200))
     live._learn_belief(status_of(learnt))
     assert len(live.timeline.beliefs) == 1
     live._learn_belief(status_of(adapted(START_NS, 0.062)))
@@ -135,14 +135,14 @@ def test_a_belief_from_before_the_page_was_opened_is_taken_over(page):
 
 def test_a_belief_of_a_daemon_that_has_gone_is_not_the_next_ones(page):
     live, _ = page
-    live.take(ticks(0, 2))
-    live.take(
+    live.ingest(ticks(0, 2))
+    live.ingest(
         [(live.timeline.last_ns, adapted(START_NS)), (live.timeline.last_ns, records.Adaptation(START_NS, "a", ""))]
     )
     live._learn_belief({"ok": True, "adaptation": None})
     # So soon after it the status may be the older one.
     assert live._snapshot().belief.source == "adapted"
-    live.take(ticks(2, 200))
+    live.ingest(ticks(2, 200))
     live._learn_belief({"ok": True, "adaptation": None})
     assert live._snapshot().belief.source == "model"
     assert live._snapshot().adaptation is None
@@ -150,7 +150,7 @@ def test_a_belief_of_a_daemon_that_has_gone_is_not_the_next_ones(page):
 
 def test_a_status_that_says_nothing_of_adaptation_leaves_the_models_belief(page):
     live, _ = page
-    live.take(ticks(0, 51))
+    live.ingest(ticks(0, 51))
     live._learn_belief({"ok": True})
     assert live._snapshot().belief is None or live._snapshot().belief.source == "model"
     assert live._snapshot().adaptation is None
@@ -158,8 +158,8 @@ def test_a_status_that_says_nothing_of_adaptation_leaves_the_models_belief(page)
 
 def test_a_task_on_the_feed_is_newer_than_a_status_from_before_it(page):
     live, _ = page
-    live.take(ticks(0, 51))
-    live.take(
+    live.ingest(ticks(0, 51))
+    live.ingest(
         [
             (
                 live.timeline.last_ns,
@@ -173,7 +173,7 @@ def test_a_task_on_the_feed_is_newer_than_a_status_from_before_it(page):
     )
     live._learn_task(status_with(radius_m=0.75))
     assert live._snapshot().task.settings["radius_m"] == 0.5
-    live.take(ticks(51, 200))
+    live.ingest(ticks(51, 200))
     live._learn_task(status_with(radius_m=0.75))
     assert live._snapshot().task.settings["radius_m"] == 0.75
 
@@ -185,15 +185,15 @@ def test_what_is_due_is_due_once_a_period():
 
 def test_a_path_that_is_not_the_daemons_is_not_drawn_and_told(tmp_path):
     stage = stage_of_robot(path_robot(tmp_path))
-    told = {"ok": True, "task": {"asked": asked_of(replace(stage.task, speed_m_s=0.1))}}
+    told = {"ok": True, "task": {"asked": requested_task(replace(stage.task, speed_m_s=0.1))}}
     other = replace(stage.task, points=stage.task.points[:-1])
     with serving("test", port=0) as served, closing(Desk(tmp_path / "control.sock", ROBOT_FILE)) as desk:
         live = LivePage(served.server, stage, tmp_path / "control.sock", desk)
-        live.take(ticks(0, 51))
+        live.ingest(ticks(0, 51))
         live._learn_task(told)
         assert live._stage.task_at(live._snapshot().task).speed_m_s == 0.1
         assert live.scene.knows_task
-        live._learn_task({"ok": True, "task": {"asked": asked_of(other)}})
+        live._learn_task({"ok": True, "task": {"asked": requested_task(other)}})
         live.scene.show(live._snapshot())
         assert not live.scene._task.visible
         assert "TASK NOT DRAWN" in live_summary(None, None, live.scene.knows_task)

@@ -311,7 +311,7 @@ def test_a_latched_stop_and_a_drive_by_page_are_shown():
 
 
 def test_a_request_still_unanswered_when_the_browser_goes_goes_on_and_leaves_no_task(daemon, monkeypatch):
-    tasks, answer, asked, answered = [], Desk._ask, threading.Event(), threading.Event()
+    tasks, answer, asked, answered = [], Desk._forward_request, threading.Event(), threading.Event()
 
     async def watched(self, *arguments):
         tasks.append(asyncio.current_task())
@@ -321,7 +321,7 @@ def test_a_request_still_unanswered_when_the_browser_goes_goes_on_and_leaves_no_
         asked.set()
         return {"ok": answered.wait(60.0)}
 
-    monkeypatch.setattr(Desk, "_ask", watched)
+    monkeypatch.setattr(Desk, "_forward_request", watched)
     monkeypatch.setattr(Desk, "request", unanswered)
     with desk_of(daemon.server.path) as (_, port):
         with line_to(port) as line:

@@ -136,7 +136,9 @@ def test_circle_and_robot_are_drawn_at_their_places_and_replay_is_sought(browser
             tab.get_by_text("0.020 s", exact=True).wait_for()
             assert len(served.server.get_clients()) == 2
         elsewhere = [
-            text for text in tab.said if text.startswith("request http") and served.url.split("?")[0] not in text
+            text
+            for text in tab.output_lines
+            if text.startswith("request http") and served.url.split("?")[0] not in text
         ]
         assert elsewhere == []
 
@@ -193,9 +195,9 @@ def test_an_exported_page_plays_from_the_file_alone(browser, log_file, tmp_path)
     export_log(log_file, tmp_path / "run.html")
     with opened(browser, (tmp_path / "run.html").as_uri()) as tab:
         tab.locator("canvas").first.wait_for()
-        wait_for(tab, lambda: any("Embedded data loaded" in text for text in tab.said))
+        wait_for(tab, lambda: any("Embedded data loaded" in text for text in tab.output_lines))
         keep(tab, "export")
-        asked = [text for text in tab.said if text.startswith("request") and "http" in text]
+        asked = [text for text in tab.output_lines if text.startswith("request") and "http" in text]
         assert asked == []
 
 
@@ -217,7 +219,7 @@ def test_the_circle_is_dragged_with_the_mouse_and_set(browser, tmp_path):
     desk, ending = Desk(daemon.server.path, ROBOT_FILE), threading.Event()
     with serving("test", port=0, desk=desk) as page:
         live = LivePage(page.server, stage_of_robot(ROBOT_FILE), daemon.server.path, desk)
-        live.take([(now_ns, record) for now_ns, got in map(tick_records, range(20)) for record in got])
+        live.ingest([(now_ns, record) for now_ns, got in map(tick_records, range(20)) for record in got])
         thread = threading.Thread(target=run_live, args=(live, ending.is_set))
         thread.start()
         try:
@@ -250,7 +252,7 @@ def test_the_fence_is_typed_and_cornered_by_the_robots_nose_and_put_in_force(bro
     desk, ending = Desk(daemon.server.path, ROBOT_FILE), threading.Event()
     with serving("test", port=0, desk=desk) as page:
         live = LivePage(page.server, stage_of_robot(ROBOT_FILE), daemon.server.path, desk)
-        live.take([(now_ns, record) for now_ns, got in map(tick_records, range(20)) for record in got])
+        live.ingest([(now_ns, record) for now_ns, got in map(tick_records, range(20)) for record in got])
         thread = threading.Thread(target=run_live, args=(live, ending.is_set))
         thread.start()
         try:

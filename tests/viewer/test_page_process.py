@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.viewer import page_beside
+from disco_hw.viewer import page_in_background
 from tests.drivers.waiting import free_port, wait_until
 from tools.viewer_run import ROBOT_FILE
 
@@ -35,7 +35,7 @@ def gone(pid):
 def test_the_page_lives_as_long_as_the_block_and_prints_on_standard_error_alone(capfd):
     port = free_port()
     said = []
-    with page_beside(ROBOT_FILE, None, "127.0.0.1", port) as page:
+    with page_in_background(ROBOT_FILE, None, "127.0.0.1", port) as page:
         wait_until(lambda: said.append(capfd.readouterr()) or f":{port}/" in "".join(it.err for it in said), 60.0)
         wait_until(lambda: listens(port), 60.0)
         assert os.getsid(page.pid) == page.pid
@@ -58,22 +58,22 @@ def test_the_page_ends_when_its_parent_is_killed():
 
 
 def test_a_page_that_cannot_start_is_reported_and_not_started_again(tmp_path, capfd):
-    with page_beside(tmp_path / "none.toml", None, "127.0.0.1", 0) as page:
+    with page_in_background(tmp_path / "none.toml", None, "127.0.0.1", 0) as page:
         assert page.wait(60) == 2
-        assert page.news() == ("the page ended with exit code 2; start it again with `disco-hw view`",)
+        assert page.new_messages() == ("the page ended with exit code 2; start it again with `disco-hw view`",)
     assert "none.toml" in capfd.readouterr().err
 
 
 @pytest.mark.thorough
 def test_the_link_that_the_daemon_was_given_is_the_pages_too(capfd):
-    with page_beside(ROBOT_FILE, None, "127.0.0.1", 0, "carrier pigeon") as page:
+    with page_in_background(ROBOT_FILE, None, "127.0.0.1", 0, "carrier pigeon") as page:
         assert page.wait(60) == 2
     assert "--link carrier pigeon" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
 def test_what_the_block_raises_is_passed_on(error):
-    with pytest.raises(error), page_beside(ROBOT_FILE, None, "127.0.0.1", free_port()):
+    with pytest.raises(error), page_in_background(ROBOT_FILE, None, "127.0.0.1", free_port()):
         raise error
 
 
@@ -86,15 +86,15 @@ def test_a_killed_page_is_started_again_under_the_same_token_and_one_that_hangs_
         said += "".join(capfd.readouterr())
         return re.findall(rf"http://127\.0\.0\.1:{port}/\?token=\S+", said)
 
-    with page_beside(ROBOT_FILE, None, "127.0.0.1", port) as page:
+    with page_in_background(ROBOT_FILE, None, "127.0.0.1", port) as page:
         wait_until(lambda: len(addresses()) == 1, 60.0)
         first = page.pid
         os.kill(first, signal.SIGKILL)
         wait_until(lambda: len(addresses()) == 2, 60.0)
         assert len(set(addresses())) == 1
         assert not Path(f"/proc/{first}").exists(), "a zombie is left"
-        assert page.news() == ("the page was ended by SIGKILL; it is started again",)
-        assert page.news() == ()
+        assert page.new_messages() == ("the page was ended by SIGKILL; it is started again",)
+        assert page.new_messages() == ()
         # From here on it would end in order.
         wait_until(lambda: listens(port), 60.0)
         os.kill(page.pid, signal.SIGSTOP)

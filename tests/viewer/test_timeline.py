@@ -31,14 +31,14 @@ def test_series_forgets_the_old_and_goes_on():
     series = Series(("a",))
     for k in range(600):
         series.append(k, (k,))
-    series.forget_before(100)
+    series.drop_before(100)
     assert len(series) == 600, "not worth the copy yet"
-    series.forget_before(590)
+    series.drop_before(590)
     assert series.rows(0, 10_000)[0].tolist() == list(range(590, 600))
     for k in range(600, 2000):
         series.append(k, (k,))
     assert series.rows(0, 10_000)[1].ravel().tolist() == list(range(590, 2000))
-    series.forget_before(10_000)
+    series.drop_before(10_000)
     assert len(series) == 0
     series.append(3000, (1.0,))
     assert series.last(3000)[1].tolist() == [1.0]
@@ -47,14 +47,14 @@ def test_series_forgets_the_old_and_goes_on():
 def test_items_find_the_newest_and_never_forget_it():
     items = Items()
     assert items.last(5) is None
-    items.forget_before(5)
+    items.drop_before(5)
     for t_ns in (10, 20, 30):
         items.append(t_ns, f"at {t_ns}")
     assert items.last(9) is None
     assert items.last(29) == "at 20"
     assert items.latest(29, 5) == [(10, "at 10"), (20, "at 20")]
     assert items.latest(100, 1) == [(30, "at 30")]
-    items.forget_before(1000)
+    items.drop_before(1000)
     assert list(items) == [(30, "at 30")]
 
 
@@ -81,6 +81,6 @@ def test_plans_are_left_out_where_they_can_be_read_again():
 
 
 def test_forgetting_bounds_everything(timeline):
-    timeline.forget_before(timeline.last_ns)
+    timeline.drop_before(timeline.last_ns)
     assert len(timeline.estimate) == len(timeline.plans) == 1
     assert isinstance(timeline.plans.last(timeline.last_ns), records.Plan)

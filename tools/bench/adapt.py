@@ -20,7 +20,7 @@ from disco_hw.adaptation.guard import Geometry, believed_geometry
 from disco_hw.daemon.run import warm_up
 from disco_hw.experiments import FAST_START, FAST_TASK, running_stack
 from disco_hw.experiments.adapt import AdaptOptions, drive_through_change, run_adapt
-from disco_hw.runtime.assembly import make_fast_adaptation, make_pipeline, make_planner, put_in_force
+from disco_hw.runtime.assembly import apply_geometry, create_fast_adaptation, create_pipeline, create_planner
 from disco_hw.runtime.robot_setup import Setup, load_setup
 from drivers.types import PoseSample, Readings, WheelSample
 from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots
@@ -189,10 +189,10 @@ def _as_good(readings: Readings, poses: tuple[int, float, float], noise: np.rand
 
 def _calls(setup: Setup) -> dict[str, float]:
     """Times of the calls that the loop makes."""
-    planner = make_planner(setup.config, setup.model)
-    pipeline = make_pipeline(setup.config, setup.model, planner)
+    planner = create_planner(setup.config, setup.model)
+    pipeline = create_pipeline(setup.config, setup.model, planner)
     warm_up(pipeline)
-    adaptation = make_fast_adaptation(setup, pipeline)
+    adaptation = create_fast_adaptation(setup, pipeline)
 
     def readings(k: int) -> Readings:
         t_ns, angle_rad = k * 20_000_000, 0.08 * k
@@ -205,7 +205,7 @@ def _calls(setup: Setup) -> dict[str, float]:
     figures |= _timed("adapt.step", 2000, lambda k: adaptation.step(k * 20_000_000))
     believed = believed_geometry(setup.model)
     beliefs = [Geometry(believed.mean * (1.0 + 1e-4 * k), believed.covariance) for k in range(300)]
-    figures |= _timed("adapt.put_in_force", 300, lambda k: put_in_force(pipeline, setup.model, beliefs[k]))
+    figures |= _timed("adapt.apply_geometry", 300, lambda k: apply_geometry(pipeline, setup.model, beliefs[k]))
     return figures
 
 

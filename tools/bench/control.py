@@ -28,7 +28,7 @@ from disco_hw.experiments.circle import CircleOptions, CircleResult, Command, dr
 from disco_hw.experiments.pendulum import POSTERIOR, circle_cost, skid_steer_transition
 from disco_hw.jit import block_function, float32, tune_loops
 from disco_hw.model import Model, load_model
-from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.tasks.circle import CircleCost
 from tools.bench.step_times import summary, times_ms, undisturbed
@@ -76,7 +76,7 @@ def moving(number: int, period_ns: int = PERIOD_NS) -> tuple[int, PlannerState]:
 def on_the_robot(steps: int) -> dict[str, float]:
     """The whole of `plan` as the daemon calls it, with the shipped robot's task, model and settings, at 50 Hz."""
     setup = load_setup(ROBOTS / "wombot.toml")
-    planner = make_planner(setup.config, setup.model)
+    planner = create_planner(setup.config, setup.model)
     calls = [moving(number) for number in range(CALLS)]
     return summary("control.plan_ms", times_ms(lambda number: planner.plan(*calls[number % CALLS]), steps))
 

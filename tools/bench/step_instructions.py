@@ -17,7 +17,7 @@ from functools import partial
 import msgspec
 
 from disco_hw.control import Disco
-from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.tasks import task_from
 from tools.bench.control import ROBOTS, moving
@@ -115,7 +115,7 @@ def figures_of(planner: Disco, calls: int = 2000) -> dict[str, float]:
 def shipped_planner(kind: str) -> Disco:
     """The shipped robot's planner for a kind of task, compiled."""
     setup = load_setup(ROBOTS / "wombot.toml")
-    return make_planner(msgspec.structs.replace(setup.config, task=task_from({"kind": kind})), setup.model)
+    return create_planner(msgspec.structs.replace(setup.config, task=task_from({"kind": kind})), setup.model)
 
 
 COLUMNS = {

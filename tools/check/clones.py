@@ -39,7 +39,7 @@ class Outcome:
     stolen_s: float
     output: str
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         lines = self.output.splitlines()
         counts = ", ".join(COUNT.findall(" ".join(lines[-3:]))) or "no counts"
         told = [line for line in lines if line.startswith(("FAILED", "ERROR"))]
@@ -97,7 +97,7 @@ def main() -> int:
         codes.append(outcome.code or int(late))
         print(
             f"{number} of {asked.clones}{f', beside {beside} busy processes' * bool(beside)}: "
-            f"{outcome.in_words()}{', too long' * late}",
+            f"{outcome.describe()}{', too long' * late}",
             flush=True,
         )
     print(f"{codes.count(0)} of {asked.clones} passed")

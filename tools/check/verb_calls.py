@@ -168,7 +168,7 @@ _WORK = (
     "disco_hw.bridge.ros2_base.Clients",
     "disco_hw.daemon.check.refuse_beside_a_daemon",
     "disco_hw.daemon.send_request",
-    "disco_hw.daemon.run._make_recorder",
+    "disco_hw.daemon.run._create_recorder",
     "disco_hw.daemon.emergency.open_transport",
     "disco_hw.daemon.emergency.open_port",
     "disco_hw.daemon.emergency.send_request",
@@ -181,12 +181,12 @@ _WORK = (
 )
 _ENDS_AFTER = (
     "disco_hw.inference.infer_command.excitation",
-    "disco_hw.daemon.run.make_link",
+    "disco_hw.daemon.run.create_link",
     "disco_hw.first_use.commission.link_key",
 )
 _WITHOUT = {
-    "disco_hw.daemon.run.make_planner": lambda *_: NoPlanner(),
-    "disco_hw.runtime.replay.make_planner": lambda *_: NoPlanner(),
+    "disco_hw.daemon.run.create_planner": lambda *_: NoPlanner(),
+    "disco_hw.runtime.replay.create_planner": lambda *_: NoPlanner(),
     "disco_hw.drive.drive_command.leads_to_virtual_robot": lambda _: True,
 }
 

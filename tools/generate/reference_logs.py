@@ -26,7 +26,7 @@ from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.log import MODEL_TOML, ROBOT_TOML, Attachment, version
 from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
 from disco_hw.log.records import BeliefChange, FrameIn, FrameOut
-from disco_hw.runtime.assembly import make_planner, put_in_force
+from disco_hw.runtime.assembly import apply_geometry, create_planner
 from disco_hw.runtime.pipeline import NoPlanner, Planner
 from disco_hw.runtime.robot_setup import Setup, load_setup
 from disco_hw.runtime.supervisor import UserRequest
@@ -54,7 +54,7 @@ class LearntOnce(NoAdaptation):
         mean = believed.mean.copy()
         mean[NAMES.index("wheel_radius_m")] *= 1.02
         learnt = replace(believed, mean=mean)
-        put_in_force(self._stack.core.pipeline, self._model, learnt)
+        apply_geometry(self._stack.core.pipeline, self._model, learnt)
         change = BeliefChange(now_ns, "adapted", NAMES, tuple(mean.tolist()), tuple(learnt.covariance.ravel().tolist()))
         return AdaptationUpdate((change,))
 
@@ -90,7 +90,7 @@ def setup() -> Setup:
 def planner() -> Planner:
     """Create the planner DISCO for the robot of these logs."""
     found = setup()
-    return make_planner(found.config, found.model)
+    return create_planner(found.config, found.model)
 
 
 def simulated(chosen: Planner, needs_pose: bool = True) -> SimulatedRun:

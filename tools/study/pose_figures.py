@@ -24,7 +24,7 @@ from disco_hw.drive.hand_pilot import HandPilot, UntilHeading
 from disco_hw.errors import WorkError
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.experiments.virtual import true_parameters
-from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.core import CoreTick, TaskPilot
 from disco_hw.runtime.pipeline import Planner
 from disco_hw.runtime.robot_setup import Setup, load_setup
@@ -120,7 +120,7 @@ class _Straight:
     def __init__(self, wheel_rad_s: float) -> None:
         self.held = False
         self.ended: str | None = None
-        self.completed, self.words, self.task = True, "", ""
+        self.completed, self.status_text, self.task = True, "", ""
         self._wheel_rad_s = wheel_rad_s
 
     def poll(self, now_ns: int, _robot: RobotView) -> ManualInput | None:
@@ -217,7 +217,7 @@ def with_circle(setup: Setup, radius_m: float, speed_m_s: float) -> Setup:
 def main() -> None:
     """Print the figures of docs/poses.md: eight robots each."""
     setup = with_circle(load_setup(Path(disco_hw.__file__).parent / "robots" / "wombot.toml"), 3.0, 0.5)
-    planner = make_planner(setup.config, setup.model)
+    planner = create_planner(setup.config, setup.model)
     for kind in (RTK, OWN, UDP):
         for seed in range(1, 9):
             found = drive_circle(setup, planner, kind, seed)

@@ -178,7 +178,7 @@ def _check_telemetry(found: Comparison, case: Case, generation: Generation) -> N
         request = given["request"]
         command = request["id"] & _SILENT
         if not request.get("rtr") and not request["data"]:
-            found.same("request", as_case(protocol.ask(node, command)), request)
+            found.same("request", as_case(protocol.request_frame(node, command)), request)
         fed_before = axis.fed
         found.same("reply", as_cases(board.receive(on_bus(request))), case["frames"])
         found.same("fed", axis.fed > fed_before, "watchdog_fed_nodes" not in then or node in then["watchdog_fed_nodes"])

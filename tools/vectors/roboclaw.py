@@ -66,7 +66,7 @@ def _check_getter(found: Comparison, case: Case) -> None:
         found.differences.append(f"command {given['command']} is not known")
         return
     address, received = given["address"], bytes.fromhex(case["bytes"])
-    found.same("request", protocol.ask_bytes(address, name).hex(), given["request"])
+    found.same("request", protocol.request_bytes(address, name).hex(), given["request"])
     verdict = case["then"].get("both") or case["then"]["python"]
     read = protocol.reply(address, name, received)
     found.same("accepted", read is not None, verdict["accepted"])
@@ -155,7 +155,7 @@ def _check_late(found: Comparison, case: Case) -> None:
             continue
         name = protocol.getter_name(step["host_asks"]) or ""
         for request in step["requests"]:
-            found.same("request", protocol.ask_bytes(address, name).hex(), request)
+            found.same("request", protocol.request_bytes(address, name).hex(), request)
         for answer in step["replies"]:
             if late:
                 found.same("late bytes first", protocol.reply(address, name, late + bytes.fromhex(answer)), None)

@@ -125,7 +125,7 @@ def _check_effect(found: Comparison, device: Vesc, case: Case) -> None:
 
 
 def _check_motor(found: Comparison, device: Vesc, then: Mapping[str, Any]) -> None:
-    found.same("motor", device.take_calls(), then["motor_calls"])
+    found.same("motor", device.pop_calls(), then["motor_calls"])
     found.same("fed", device.fed > 0, then["timeout_fed"])
 
 
@@ -142,7 +142,7 @@ def _check_status(found: Comparison, device: Vesc, case: Case) -> None:
 def _check_answer(found: Comparison, device: Vesc, case: Case) -> None:
     given, then = case["given"], case["then"]
     mask = given.get("mask")
-    payload = bytes([codec.GET_VALUES]) if mask is None else codec.ask_values(mask)
+    payload = bytes([codec.GET_VALUES]) if mask is None else codec.request_values(mask)
     asked = codec.fragments(given["controller_id"], given["host_id"], payload)
     found.same("request", as_cases(asked), [given["request"]])
     found.same("answer", as_cases(device.receive(on_bus(given["request"]))), case["frames"])
@@ -187,16 +187,18 @@ def _check_serial_answer(found: Comparison, device: Vesc, case: Case) -> None:
     payload = bytes.fromhex(then["payload"])
     request = bytes.fromhex(given["request"])
     if "far_id" in given:
-        found.same("request", codec.packet(codec.forward(given["far_id"], codec.ask_values(given["mask"]))), request)
+        found.same(
+            "request", codec.packet(codec.forward(given["far_id"], codec.request_values(given["mask"]))), request
+        )
         far = Vesc(given["far_id"])
         far.values = device.values
         _, frames = device.receive_bytes(request)
         answers = [answer for frame in frames for answer in far.receive(frame)]
         found.same("on CAN", as_cases(answers), given["can_frames_of_far_vesc"])
-        answer = b"".join(device.take_packet_answer(frame) for frame in answers)
+        answer = b"".join(device.handle_packet_reply(frame) for frame in answers)
     else:
         if "mask" in given:
-            found.same("request", codec.packet(codec.ask_values(given["mask"])), request)
+            found.same("request", codec.packet(codec.request_values(given["mask"])), request)
         device.firmware = payload[1:] if payload[:1] == b"\0" else device.firmware
         device.timed_out = bool(then.get("status_byte", 0) & codec.TIMED_OUT)
         device.kill_switch_active = bool(then.get("status_byte", 0) & codec.KILL_SWITCH)
@@ -248,7 +250,7 @@ def _check_timeout(found: Comparison, device: Vesc, given: Mapping[str, Any], th
         for at, can_id, data in given["sent_ms_id_data"]:
             if at == ms:
                 device.receive(CanFrame(can_id, bytes.fromhex(data), extended=True))
-                obeyed += [[ms, *call] for call in device.take_calls()]
+                obeyed += [[ms, *call] for call in device.pop_calls()]
         clocked.check(ms)
     _check_clocked(found, clocked, then)
     found.same("obeyed", obeyed, then["obeyed_ms_call_value"])
@@ -262,7 +264,7 @@ def _check_serial_timeout(found: Comparison, device: Vesc, given: Mapping[str, A
         for at, sent in given["sent_ms_bytes"]:
             if at == ms:
                 answer, _ = device.receive_bytes(bytes.fromhex(sent))
-                events += [[ms, *call] for call in device.take_calls()]
+                events += [[ms, *call] for call in device.pop_calls()]
                 events += [[ms, "reply", answer.hex()]] if answer else []
         clocked.check(ms)
     _check_clocked(found, clocked, then)

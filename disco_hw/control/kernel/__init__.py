@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw import tasks
-from disco_hw.jit import cast_like, quick_length, quick_norm, quick_norm_and_inverse, specialise
+from disco_hw.jit import cast_like, fast_length, fast_norm, fast_norm_and_inverse, specialise
 from disco_hw.tasks import Found
 
 Floats: TypeAlias = NDArray[np.float32]
@@ -49,7 +49,7 @@ BLOCK = U(80)
 # The rows of a block's state, in the order of docs/kernel.md. What all points of a rollout share:
 AXLE_X, AXLE_Y, COS, SIN, FORWARD = (U(row) * BLOCK for row in range(5))
 # Then ten rows for the rollout's own point and for each of the four that are equivalent to it.
-OWN, AHEAD0, AHEAD1, SCALED0, SCALED1 = (U(row) * BLOCK for row in (5, 15, 25, 35, 45))
+POINT, AHEAD0, AHEAD1, SCALED0, SCALED1 = (U(row) * BLOCK for row in (5, 15, 25, 35, 45))
 # Within those ten: the tracked point, the task's memory, the cost so far; then, for a task with a table, what was kept
 # for the cost, the row to look up, and the four numbers found there, of one sample after the other.
 X, Y, MEMORY, TOTAL, KEPT, ROW, FOUND = (U(row) * BLOCK for row in range(7))
@@ -190,17 +190,17 @@ def _looks_up(terms: Any) -> Callable[[Any], bool | None] | None:
 
 @specialise(tasks.norm)
 def _norm(x: Any, y: Any) -> Callable[..., float]:
-    return lambda x, y: quick_norm(x, y)  # noqa: PLW0108 - the compiler wants Python code
+    return lambda x, y: fast_norm(x, y)  # noqa: PLW0108 - the compiler wants Python code
 
 
 @specialise(tasks.norm_and_inverse)
 def _norm_and_inverse(x: Any, y: Any) -> Callable[..., tuple[float, float]]:
-    return lambda x, y: quick_norm_and_inverse(x, y)  # noqa: PLW0108 - the compiler wants Python code
+    return lambda x, y: fast_norm_and_inverse(x, y)  # noqa: PLW0108 - the compiler wants Python code
 
 
 @specialise(tasks.norm_of_three)
 def _norm_of_three(x: Any, y: Any, z: Any) -> Callable[..., float]:
-    return lambda x, y, z: quick_length(x, y, z)  # noqa: PLW0108 - the compiler wants Python code
+    return lambda x, y, z: fast_length(x, y, z)  # noqa: PLW0108 - the compiler wants Python code
 
 
 @specialise(tasks.constant)

@@ -101,9 +101,9 @@ def _roll(
     base: Base, effects: Coefficients, integration: Integration,
 ) -> None:  # fmt: skip
     """Fill the rows of `states` behind row `first` from that row."""
-    late = history - delay_steps(effects)
+    first_input = history - delay_steps(effects)
     for t in range(first, states.shape[0] - 1):
-        recent, older = max(t + late, 0), max(t + late - 1, 0)
+        recent, older = max(t + first_input, 0), max(t + first_input - 1, 0)
         left = in_force(commands[recent, 0], commands[older, 0], effects)
         right = in_force(commands[recent, 1], commands[older, 1], effects)
         was_left, was_right = states[t, LEFT], states[t, RIGHT]
@@ -122,7 +122,7 @@ def _roll(
 
 
 @block_function
-def _remember(remembered: Array | None, means: Array | None, point: int) -> None:
+def _store_memory(remembered: Array | None, means: Array | None, point: int) -> None:
     """Set what the model's terms remember to what they do at the start."""
     if remembered is None or means is None:
         return
@@ -157,7 +157,7 @@ def _cost(problem: Problem, buffers: Buffers, commands: Array) -> float:
     cost = 0.0
     for i in range(problem.weights.shape[0]):
         base, effects = base_point(problem.base, i), effect_point(problem.effects, i)
-        _remember(buffers.remembered, problem.means, i)
+        _store_memory(buffers.remembered, problem.means, i)
         _begin(states, problem.start, base)
         _roll(
             states, 0, commands, history, problem.time_s, problem.slide, buffers.remembered, base, effects, integration
@@ -190,7 +190,7 @@ def _linearise(problem: Problem, buffers: Buffers) -> None:
     gradient[:] = 0.0
     for i in range(problem.weights.shape[0]):
         base, effects = base_point(problem.base, i), effect_point(problem.effects, i)
-        _remember(buffers.remembered, problem.means, i)
+        _store_memory(buffers.remembered, problem.means, i)
         _begin(states, problem.start, base)
         _roll(
             states, 0, commands, history, problem.time_s, problem.slide, buffers.remembered, base, effects, integration
@@ -202,7 +202,7 @@ def _linearise(problem: Problem, buffers: Buffers) -> None:
             k, c = j // CHANNELS, j % CHANNELS
             # What terms remember is not kept along a rollout: with such it is rolled out from its start.
             first = 0 if buffers.remembered is not None else k
-            _remember(buffers.remembered, problem.means, i)
+            _store_memory(buffers.remembered, problem.means, i)
             for column in range(STATE_COLUMNS):
                 moved[first, column] = states[first, column]
             moved[0, AXLE_X], moved[0, AXLE_Y] = states[0, AXLE_X], states[0, AXLE_Y]
@@ -285,11 +285,11 @@ def _violation(problem: Problem, buffers: Buffers) -> float:
     commands, history, worst = buffers.commands, problem.history, 0.0
     for t in range(problem.reference.shape[0]):
         for c in range(CHANNELS):
-            asked = commands[history + t, c] + buffers.step[CHANNELS * t + c]
+            command = commands[history + t, c] + buffers.step[CHANNELS * t + c]
             last = problem.before[c]
             if t > 0:
                 last = commands[history + t - 1, c] + buffers.step[CHANNELS * (t - 1) + c]
-            worst = max(worst, abs(asked) - problem.largest, abs(asked - last) - problem.change)
+            worst = max(worst, abs(command) - problem.largest, abs(command - last) - problem.change)
     return worst
 
 
@@ -333,7 +333,7 @@ def _move_within(problem: Problem, buffers: Buffers) -> None:
 
 
 @block_function
-def _take(problem: Problem, buffers: Buffers, share: float) -> None:
+def _apply_step(problem: Problem, buffers: Buffers, share: float) -> None:
     """Set `tried` to the commands with this share of the step, within the limits exactly."""
     history = problem.history
     for row in range(history):
@@ -342,9 +342,9 @@ def _take(problem: Problem, buffers: Buffers, share: float) -> None:
     for c in range(CHANNELS):
         last = problem.before[c]
         for t in range(problem.reference.shape[0]):
-            asked = buffers.commands[history + t, c] + share * buffers.step[CHANNELS * t + c]
-            asked = min(max(asked, last - problem.change), last + problem.change)
-            last = min(max(asked, -problem.largest), problem.largest)
+            command = buffers.commands[history + t, c] + share * buffers.step[CHANNELS * t + c]
+            command = min(max(command, last - problem.change), last + problem.change)
+            last = min(max(command, -problem.largest), problem.largest)
             buffers.tried[history + t, c] = last
 
 
@@ -352,7 +352,7 @@ def _take(problem: Problem, buffers: Buffers, share: float) -> None:
 def refine(problem: Problem, buffers: Buffers, iterations: int) -> float:
     """Bring `buffers.commands` within the limits and improve them; returns the cost that is left."""
     buffers.step[:] = 0.0
-    _take(problem, buffers, 0.0)
+    _apply_step(problem, buffers, 0.0)
     buffers.commands[:, :] = buffers.tried
     cost = _cost(problem, buffers, buffers.commands)
     for _ in range(iterations):
@@ -365,7 +365,7 @@ def refine(problem: Problem, buffers: Buffers, iterations: int) -> float:
             _move_within(problem, buffers)
         share, improved = 1.0, False
         for _ in range(HALVINGS):
-            _take(problem, buffers, share)
+            _apply_step(problem, buffers, share)
             tried = _cost(problem, buffers, buffers.tried)
             if tried < cost:
                 cost, improved = tried, True

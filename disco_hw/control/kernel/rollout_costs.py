@@ -23,7 +23,7 @@ from disco_hw.control.kernel import (
     FOUND,
     KEPT,
     MEMORY,
-    OWN,
+    POINT,
     ROW,
     SCALED0,
     SCALED1,
@@ -100,44 +100,44 @@ def _scaled_place(state: Floats, b: int, base: Base, other: Base, start: Floats)
 
 
 @scalar_function
-def begin_costs(state: Floats, own: int, b: int, start: Floats, task: Terms, bends: Bends) -> None:
+def begin_costs(state: Floats, point: int, b: int, start: Floats, task: Terms, bends: Bends) -> None:
     """Set the rows from `own` on to the start."""
     x, y, _ = detoured(bends, (start[START_X], start[START_Y], start[START_X]))
-    state[own + X + b] = x
-    state[own + Y + b] = y
-    state[own + MEMORY + b] = start[START_MEMORY]
-    state[own + TOTAL + b] = cast_like(0.0, start[START_X])
-    _remember(looks_up(task), state, own, b, start[START_MEMORY], task)
+    state[point + X + b] = x
+    state[point + Y + b] = y
+    state[point + MEMORY + b] = start[START_MEMORY]
+    state[point + TOTAL + b] = cast_like(0.0, start[START_X])
+    _store_memory(looks_up(task), state, point, b, start[START_MEMORY], task)
 
 
 @scalar_function
-def _found(looks: Absent, state: Floats, own: int, b: int) -> Found:
+def _found(looks: Absent, state: Floats, point: int, b: int) -> Found:
     """Return what sample b has kept and found in the task's table, in the rows from `own` on; zeros without one."""
     if looks is None:
-        zero = cast_like(0.0, state[own])
+        zero = cast_like(0.0, state[point])
         return zero, zero, zero, zero, zero
-    at = own + FOUND + COLUMNS * b
-    return state[own + KEPT + b], state[at], state[at + U(1)], state[at + U(2)], state[at + U(3)]
+    at = point + FOUND + COLUMNS * b
+    return state[point + KEPT + b], state[at], state[at + U(1)], state[at + U(2)], state[at + U(3)]
 
 
 @scalar_function
-def _remember(looks: Absent, state: Floats, own: int, b: int, memory: float, task: Terms) -> None:
+def _store_memory(looks: Absent, state: Floats, point: int, b: int, memory: float, task: Terms) -> None:
     """Set the memory of sample b, and where to look up for it, in bits; nothing without a table."""
     if looks is None:
         return
-    state[own + MEMORY + b] = memory
-    state[own + ROW + b] = float_from_bits(row_of(task, memory))
+    state[point + MEMORY + b] = memory
+    state[point + ROW + b] = float_from_bits(row_of(task, memory))
 
 
 @scalar_function
-def _follow(looks: Absent, state: Floats, own: int, b: int, place: Place, task: Terms) -> None:
+def _follow(looks: Absent, state: Floats, point: int, b: int, place: Place, task: Terms) -> None:
     """Move the memory of sample b on by the step that it has just made; nothing without a table."""
     if looks is None:
         return
     x, y, forward = place
-    found = _found(looks, state, own, b)
-    memory, state[own + KEPT + b] = follow(task, state[own + MEMORY + b], x, y, forward, found)
-    _remember(looks, state, own, b, memory, task)
+    found = _found(looks, state, point, b)
+    memory, state[point + KEPT + b] = follow(task, state[point + MEMORY + b], x, y, forward, found)
+    _store_memory(looks, state, point, b, memory, task)
 
 
 @scalar_function
@@ -157,7 +157,7 @@ def follow_points(
     if looks is None:
         return
     if skip_mean is None:
-        _follow(looks, state, OWN, b, detoured(bends, _place(state, b, base)), task)
+        _follow(looks, state, POINT, b, detoured(bends, _place(state, b, base)), task)
     if ahead is not None:
         _follow(looks, state, AHEAD0, b, detoured(bends, _ahead_place(state, b, base, ahead[0], start)), task)
         _follow(looks, state, AHEAD1, b, detoured(bends, _ahead_place(state, b, base, ahead[1], start)), task)
@@ -167,13 +167,13 @@ def follow_points(
 
 
 @scalar_function
-def _look_up(table: Floats, state: Floats, own: int) -> None:
+def _look_up(table: Floats, state: Floats, point: int) -> None:
     """Copy every sample's row of the table to the rows from `own` on: apart, as no compiler makes vectors of it.
 
     A sample's four numbers stay together, and are all read before the first is written: one load and one store.
     """
     for b in range(BLOCK):
-        row, at = COLUMNS * U(bits_of_float(state[own + ROW + b])), own + FOUND + COLUMNS * b
+        row, at = COLUMNS * U(bits_of_float(state[point + ROW + b])), point + FOUND + COLUMNS * b
         first, second, third, fourth = table[row], table[row + U(1)], table[row + U(2)], table[row + U(3)]
         state[at] = first
         state[at + U(1)] = second
@@ -188,7 +188,7 @@ def look_ups(looks: Absent, state: Floats, skip_mean: Absent, ahead: BasePair, s
         return
     table = task.table
     if skip_mean is None:
-        _look_up(table, state, OWN)
+        _look_up(table, state, POINT)
     if ahead is not None:
         _look_up(table, state, AHEAD0)
         _look_up(table, state, AHEAD1)
@@ -198,20 +198,20 @@ def look_ups(looks: Absent, state: Floats, skip_mean: Absent, ahead: BasePair, s
 
 
 @scalar_function
-def _cost(state: Floats, own: int, b: int, t: int, place: Place, task: Terms, last: Absent) -> None:
+def _cost(state: Floats, point: int, b: int, t: int, place: Place, task: Terms, last: Absent) -> None:
     """Add the cost of step t, which sample b has just made, to the rows from `own` on; `last` is None before it."""
     cos_yaw, sin_yaw = state[COS + b], state[SIN + b]
     x, y, forward = place
     cost, memory = stage_cost(
-        task, state[own + MEMORY + b], t, state[own + X + b], state[own + Y + b], x, y, cos_yaw, sin_yaw, forward,
-        _found(looks_up(task), state, own, b),
+        task, state[point + MEMORY + b], t, state[point + X + b], state[point + Y + b], x, y, cos_yaw, sin_yaw, forward,
+        _found(looks_up(task), state, point, b),
     )  # fmt: skip
-    state[own + TOTAL + b] += cost
+    state[point + TOTAL + b] += cost
     if looks_up(task) is None:
-        state[own + MEMORY + b] = memory
+        state[point + MEMORY + b] = memory
     if looks_up(task) is None or last is not None:
-        state[own + X + b] = x
-        state[own + Y + b] = y
+        state[point + X + b] = x
+        state[point + Y + b] = y
 
 
 @scalar_function
@@ -230,7 +230,7 @@ def add_costs(
 ) -> None:
     """Costs of step t under a point and its equivalent points, pairs or None."""
     if skip_mean is None:
-        _cost(state, OWN, b, t, detoured(bends, _place(state, b, base)), task, last)
+        _cost(state, POINT, b, t, detoured(bends, _place(state, b, base)), task, last)
     if ahead is not None:
         _cost(state, AHEAD0, b, t, detoured(bends, _ahead_place(state, b, base, ahead[0], start)), task, last)
         _cost(state, AHEAD1, b, t, detoured(bends, _ahead_place(state, b, base, ahead[1], start)), task, last)
@@ -256,7 +256,7 @@ def avoid_shapes(
     if not near:
         return
     if skip_mean is None:
-        _avoid(area, state, OWN, at, time_s, reach_m, base, None, None, start)
+        _avoid(area, state, POINT, at, time_s, reach_m, base, None, None, start)
     if ahead is not None:
         _avoid(area, state, AHEAD0, at, time_s, reach_m, base, ahead[0], None, start)
         _avoid(area, state, AHEAD1, at, time_s, reach_m, base, ahead[1], None, start)
@@ -267,7 +267,7 @@ def avoid_shapes(
 
 @scalar_function
 def _avoid(
-    area: Area, state: Floats, own: int, at: int, time_s: float, reach_m: float, base: Base, other: Base | None,
+    area: Area, state: Floats, point: int, at: int, time_s: float, reach_m: float, base: Base, other: Base | None,
     is_scaled: Absent, start: Floats,
 ) -> None:  # fmt: skip
     """Add what touching shapes costs to the rows from `own` on, for the shapes that a circle around all samples meets.
@@ -290,7 +290,7 @@ def _avoid(
             continue
         for b in range(BLOCK):
             place = _any_place(state, b, lane_base(base, at + b), other, is_scaled, start)
-            state[own + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
+            state[point + TOTAL + b] += touch_cost(area, k, time_s, place, state[COS + b], state[SIN + b])
 
 
 @scalar_function
@@ -322,13 +322,13 @@ def sliding_heading(
 
 @block_function
 def end_costs(
-    costs: Floats, at: int, state: Floats, own: int, slides: Absent, start: Floats, step_s: float, task: Terms
+    costs: Floats, at: int, state: Floats, point: int, slides: Absent, start: Floats, step_s: float, task: Terms
 ) -> None:
     """Write the costs of the rows from `own` on to `costs[at:at + BLOCK]`."""
     tune_loops()
     for b in range(BLOCK):
         cos_yaw, sin_yaw = sliding_heading(slides, state[COS + b], state[SIN + b], state[FORWARD + b] * step_s, start)
-        costs[at + b] = state[own + TOTAL + b] + terminal_cost(
-            task, state[own + MEMORY + b], state[own + X + b], state[own + Y + b], cos_yaw, sin_yaw,
-            _found(looks_up(task), state, own, b),
+        costs[at + b] = state[point + TOTAL + b] + terminal_cost(
+            task, state[point + MEMORY + b], state[point + X + b], state[point + Y + b], cos_yaw, sin_yaw,
+            _found(looks_up(task), state, point, b),
         )  # fmt: skip

@@ -41,7 +41,7 @@ _SQRT_HALF_BITS = np.int32(0x3F3504F3)
 _MANTISSA_BITS = np.int32(23)
 _TO_UNIT = np.float32(2.0**-24)
 _TO_HALF_TURNS = np.float32(2.0**-32)
-_WHOLE = np.float32(1.5 * 2.0**23)
+_ROUND_TO_INTEGER = np.float32(1.5 * 2.0**23)
 _SIGN = np.uint32(0x80000000)
 # Of sin(pi x) / x and cos(pi x) in x^2, least error for |x| <= 1/2 in single precision.
 _SINE = tuple(np.float32(c) for c in (3.1415925, -5.1677022, 2.5499578, -0.5976252, 0.07643289))
@@ -98,8 +98,8 @@ def _cos_sin_part(part: float, sign: int) -> tuple[float, float]:
 def cos_sin_half_turns(half_turns: float) -> tuple[float, float]:
     """Cosine and sine of pi * half_turns for |half_turns| < 2^22, absolute error below 3e-7 on top of its rounding."""
     # The sum's last bit is whether the nearest whole number is odd, and then both signs change.
-    shifted = half_turns + _WHOLE
-    return _cos_sin_part(half_turns - (shifted - _WHOLE), int32(bits_of_float(shifted) << np.int32(31)))
+    shifted = half_turns + _ROUND_TO_INTEGER
+    return _cos_sin_part(half_turns - (shifted - _ROUND_TO_INTEGER), int32(bits_of_float(shifted) << np.int32(31)))
 
 
 @scalar_function
@@ -294,7 +294,7 @@ def pull_on_knots(pull: Floats, nominal: Floats, basis: Basis) -> None:
 
 
 @block_function
-def add_drawn_control_cost(costs: Floats, first: int, noise: Floats, at: int, pull: Floats, scale: float) -> None:
+def add_sampled_control_cost(costs: Floats, first: int, noise: Floats, at: int, pull: Floats, scale: float) -> None:
     """Add the control cost as `add_control_cost` does, but of the noise as drawn, by `pull_on_knots`."""
     tune_loops()
     for r in range(U(pull.size)):

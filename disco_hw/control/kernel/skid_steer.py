@@ -26,7 +26,7 @@ from disco_hw.control.kernel import (
     DIFFERENCE,
     FORWARD,
     LEFT,
-    OWN,
+    POINT,
     REMEMBERED,
     RIGHT,
     SCALED0,
@@ -137,7 +137,7 @@ def _turn_wheels(
     means: Floats | None,
     point: int,
     effects: Coefficients,
-    late: int,
+    first_input: int,
     step_s: float,
 ) -> None:
     """Mean wheel speeds of the block's samples over every step, as rows of `wheels`."""
@@ -148,8 +148,8 @@ def _turn_wheels(
     _begin_means(means, state, REMEMBERED, point, U(0), effects.command_terms)
     for t in range(horizon):
         time_s = start[START_TIME] + cast_like(t, step_s) * step_s
-        recent = U((t + late) * CHANNELS) * BLOCK
-        older = U(max(t + late - 1, 0) * CHANNELS) * BLOCK
+        recent = U((t + first_input) * CHANNELS) * BLOCK
+        older = U(max(t + first_input - 1, 0) * CHANNELS) * BLOCK
         row, change_row = U(t) * WHEEL_STRIDE, U(2 * horizon + t) * BLOCK
         for b in range(BLOCK):
             acting = lane_effects(effects, at + b)
@@ -179,10 +179,12 @@ def _begin_means(means: Floats | None, state: Floats, row: int, point: int, firs
 
 
 @scalar_function
-def _rolling(wheels: Floats, t: int, b: int, commands: Floats, late: int, horizon: int, effects: Coefficients) -> Place:
+def _rolling(
+    wheels: Floats, t: int, b: int, commands: Floats, first_input: int, horizon: int, effects: Coefficients
+) -> Place:
     """Sum of the mean wheel speeds of sample b over step t, right minus left, and the sum's change (rad/s)."""
     if wheels_follow(effects) and not needs_change(effects):
-        row = U(t + late) * WHEEL_STRIDE
+        row = U(t + first_input) * WHEEL_STRIDE
         left, right = commands[row + LEFT + b], commands[row + RIGHT + b]
         return left + right, right - left, cast_like(0.0, left)
     row, change_row = U(t) * WHEEL_STRIDE, U(2 * horizon + t) * BLOCK
@@ -226,10 +228,10 @@ def _move(
 
 @block_function
 def _roll(
-    costs: Floats, at: int, ahead_at: CostPlaces, scaled_at: CostPlaces, horizon: int, commands: Floats, late: int,
-    wheels: Floats, state: Floats, slides: Absent, start: Floats, means: Floats | None, point: int, base: Base,
-    skip_mean: Absent, ahead: BasePair, scaled: BasePair, effects: Coefficients, integration: Integration, task: Terms,
-    area: Area | None, straight: Absent,
+    costs: Floats, at: int, ahead_at: CostPlaces, scaled_at: CostPlaces, horizon: int, commands: Floats,
+    first_input: int, wheels: Floats, state: Floats, slides: Absent, start: Floats, means: Floats | None, point: int,
+    base: Base, skip_mean: Absent, ahead: BasePair, scaled: BasePair, effects: Coefficients, integration: Integration,
+    task: Terms, area: Area | None, straight: Absent,
 ) -> None:  # fmt: skip
     """Roll the block out from `start` with its wheels turning as in `wheels`; writes `costs[at:at + BLOCK]`.
 
@@ -246,7 +248,7 @@ def _roll(
         state[COS + b] = cos_yaw
         state[SIN + b] = sin_yaw
         if skip_mean is None:
-            begin_costs(state, OWN, b, start, task, bends)
+            begin_costs(state, POINT, b, start, task, bends)
         begin_costs(state, AHEAD0, b, start, task, bends)
         begin_costs(state, AHEAD1, b, start, task, bends)
         begin_costs(state, SCALED0, b, start, task, bends)
@@ -259,7 +261,7 @@ def _roll(
             for b in range(BLOCK):
                 here, acting = lane_base(base, at + b), lane_effects(effects, at + b)
                 _move(
-                    state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting,
+                    state, b, _rolling(wheels, t, b, commands, first_input, horizon, acting), time_s, here, acting,
                     integration, slides, start,
                 )  # fmt: skip
                 follow_points(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task, bends)
@@ -268,7 +270,7 @@ def _roll(
                 here, acting = lane_base(base, at + b), lane_effects(effects, at + b)
                 add_costs(state, b, t - 1, here, skip_mean, ahead, scaled, start, task, None, bends)
                 _move(
-                    state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting,
+                    state, b, _rolling(wheels, t, b, commands, first_input, horizon, acting), time_s, here, acting,
                     integration, slides, start,
                 )  # fmt: skip
                 follow_points(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task, bends)
@@ -279,7 +281,7 @@ def _roll(
         add_costs(state, b, horizon - 1, lane_base(base, at + b), skip_mean, ahead, scaled, start, task, True, bends)
     # One after the other: a loop that wrote to all at once would not be vectorised.
     if skip_mean is None:
-        end_costs(costs, at, state, OWN, slides, start, integration.step_s, task)
+        end_costs(costs, at, state, POINT, slides, start, integration.step_s, task)
     if ahead_at is not None:
         end_costs(costs, ahead_at[0], state, AHEAD0, slides, start, integration.step_s, task)
         end_costs(costs, ahead_at[1], state, AHEAD1, slides, start, integration.step_s, task)
@@ -312,19 +314,31 @@ def _roll_points(
     for i in range(points):
         at = U(i * padded) + lane
         here, acting = base_point(system.base, i), effect_point(system.effects, i)
-        late = system.history - delay_steps(acting)
+        first_input = system.history - delay_steps(acting)
         if each is not None:
             if needs_change(acting) or not wheels_follow(acting):
                 _turn_wheels(
-                    wheels, at, horizon, commands, state, start, means, i, system.effects, late, integration.step_s
+                    wheels,
+                    at,
+                    horizon,
+                    commands,
+                    state,
+                    start,
+                    means,
+                    i,
+                    system.effects,
+                    first_input,
+                    integration.step_s,
                 )
             _roll(
-                costs, at, None, None, horizon, commands, late, wheels, state, slides, start, means, i, system.base,
-                None, None, None, system.effects, integration, task, system.area, straight,
+                costs, at, None, None, horizon, commands, first_input, wheels, state, slides, start, means, i,
+                system.base, None, None, None, system.effects, integration, task, system.area, straight,
             )  # fmt: skip
         else:
             if (i == 0 or system.wheels_differ) and (needs_change(acting) or not wheels_follow(acting)):
-                _turn_wheels(wheels, at, horizon, commands, state, start, means, i, acting, late, integration.step_s)
+                _turn_wheels(
+                    wheels, at, horizon, commands, state, start, means, i, acting, first_input, integration.step_s
+                )
             alone = i > 0 or skip_mean is None
             if ahead is not None:
                 # Whatever leads equivalent points beside the first point is costed in a rollout of its own.
@@ -332,22 +346,21 @@ def _roll_points(
                 if ahead[i, 0] >= 0:
                     if scaled is None:
                         _roll(
-                            costs, at, _places(ahead[i], padded, lane), None, horizon, commands, late, wheels, state,
-                            slides, start, means, i, here, skip_mean, _bases(system.base, ahead[i]), None, acting,
-                            integration, task, system.area, straight,
+                            costs, at, _places(ahead[i], padded, lane), None, horizon, commands, first_input, wheels,
+                            state, slides, start, means, i, here, skip_mean, _bases(system.base, ahead[i]), None,
+                            acting, integration, task, system.area, straight,
                         )  # fmt: skip
                     else:
                         _roll(
                             costs, at, _places(ahead[i], padded, lane), _places(scaled[i], padded, lane), horizon,
-                            commands, late, wheels, state, slides, start, means, i, here, skip_mean,
+                            commands, first_input, wheels, state, slides, start, means, i, here, skip_mean,
                             _bases(system.base, ahead[i]), _bases(system.base, scaled[i]), acting, integration, task,
                             system.area, straight,
                         )  # fmt: skip
             if alone:
                 _roll(
-                    costs, at, None, None, horizon, commands, late, wheels, state, slides, start, means, i, here, None,
-                    None, None, acting, integration, task,
-                            system.area, straight,
+                    costs, at, None, None, horizon, commands, first_input, wheels, state, slides, start, means, i, here,
+                    None, None, None, acting, integration, task, system.area, straight,
                 )  # fmt: skip
 
 

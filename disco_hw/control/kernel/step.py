@@ -17,7 +17,7 @@ from disco_hw.control.kernel.sequences import (
     Basis,
     Limits,
     add_control_cost,
-    add_drawn_control_cost,
+    add_sampled_control_cost,
     add_weighted,
     expand,
     fill_normal_block,
@@ -110,7 +110,7 @@ def disco_step(
     sampling = samplings[0]
     # RollControlActions: here by the time that has passed since the last step.
     shift(work.nominal, work.updated, shift_steps, sampling.hold)
-    if charges_drawn(sampling):
+    if charges_sampled(sampling):
         pull_on_knots(work.pull, work.nominal, basis)
     for block in range(sampling.blocks):
         # Sample E^k, eps ~ N(0, Sigma), and V = U + E within the limits.
@@ -137,15 +137,15 @@ def disco_step(
 def shift(nominal: Floats, scratch: Floats, steps: float, hold: bool) -> None:
     """Move the sequence (T, C) on by a fraction of steps; beyond its end it holds the last command or is zero."""
     horizon, channels = nominal.shape
-    whole = int(min(steps, float(horizon)))
-    fraction = float32(min(steps - whole, 1.0))
+    steps_ahead = int(min(steps, float(horizon)))
+    fraction = float32(min(steps - steps_ahead, 1.0))
     for t in range(horizon):
-        at, after = min(t + whole, horizon - 1), min(t + whole + 1, horizon - 1)
+        at, after = min(t + steps_ahead, horizon - 1), min(t + steps_ahead + 1, horizon - 1)
         for c in range(channels):
             first, second = nominal[at, c], nominal[after, c]
             if not hold:
-                first = first if t + whole < horizon else float32(0.0)
-                second = second if t + whole + 1 < horizon else float32(0.0)
+                first = first if t + steps_ahead < horizon else float32(0.0)
+                second = second if t + steps_ahead + 1 < horizon else float32(0.0)
             scratch[t, c] = first + fraction * (second - first)
     for t in range(horizon):
         for c in range(channels):
@@ -153,7 +153,7 @@ def shift(nominal: Floats, scratch: Floats, steps: float, hold: bool) -> None:
 
 
 @block_function
-def charges_drawn(sampling: Sampling) -> bool:
+def charges_sampled(sampling: Sampling) -> bool:
     """Whether the control cost is of the noise as drawn."""
     return sampling.drawn and sampling.control_cost > float32(0.0)
 
@@ -189,7 +189,7 @@ def charge(work: Workspace, sampling: Sampling, block: int) -> None:
     if sampling.control_cost > float32(0.0):
         if sampling.drawn:
             first_noise = U(block * sampling.rows) * BLOCK
-            add_drawn_control_cost(work.costs, first, work.noise, first_noise, work.pull, sampling.control_cost)
+            add_sampled_control_cost(work.costs, first, work.noise, first_noise, work.pull, sampling.control_cost)
         else:
             add_control_cost(
                 work.costs, first, work.commands[block], sampling.history, work.nominal, sampling.control_cost
@@ -275,8 +275,8 @@ _SUM, _SQUARES = U(0), BLOCK
 def exp_nonpositive(value: float) -> float:
     """Exponential of a float32 <= 0, relative error below 3e-7; anything below -87 counts as -87."""
     value = value if value > _LOWEST else _LOWEST
-    whole = int32(value * _LOG2_E - float32(0.5))
-    rest = value - float32(whole) * _LN2_HIGH - float32(whole) * _LN2_LOW
+    steps_ahead = int32(value * _LOG2_E - float32(0.5))
+    rest = value - float32(steps_ahead) * _LN2_HIGH - float32(steps_ahead) * _LN2_LOW
     series = float32(1.0) + rest * (
         float32(1.0)
         + rest
@@ -285,7 +285,7 @@ def exp_nonpositive(value: float) -> float:
             + rest * (float32(1 / 6) + rest * (float32(1 / 24) + rest * (float32(1 / 120) + rest * float32(1 / 720))))
         )
     )
-    return series * float_from_bits(int32(int32(whole + int32(127)) << int32(23)))
+    return series * float_from_bits(int32(int32(steps_ahead + int32(127)) << int32(23)))
 
 
 @block_function
@@ -354,9 +354,9 @@ def temperature_for(
     """
     low, high = math.log(1e-6), math.log(1e6)
     at = min(max(math.log(guess), low), high)
-    wanted = math.log(target)
+    target_log = math.log(target)
     total, size = weigh(weights, scratch, costs, blocks, samples, least, float32(math.exp(at)))
-    last_at, last_miss = at, math.log(size) - wanted
+    last_at, last_miss = at, math.log(size) - target_log
     at += -0.5 if last_miss > 0.0 else 0.5
     for _ in range(40):
         if abs(last_miss) < 0.01:
@@ -370,7 +370,7 @@ def temperature_for(
         if not low < at < high:
             at = 0.5 * (low + high)
         total, size = weigh(weights, scratch, costs, blocks, samples, least, float32(math.exp(at)))
-        miss = math.log(size) - wanted
+        miss = math.log(size) - target_log
         slope = (miss - last_miss) / (at - last_at)
         last_at, last_miss = at, miss
         at = at - miss / slope if slope > 1e-3 else (low - 1.0)
@@ -415,8 +415,8 @@ def worst_over_points(
         left = part
         total = cast_like(0.0, part)
         for i in range(points):
-            taken = min(left, weights[order[i]])
-            if taken > 0.0:
-                total += taken * point_costs[order[i] * padded + k]
-                left -= taken
+            used = min(left, weights[order[i]])
+            if used > 0.0:
+                total += used * point_costs[order[i] * padded + k]
+                left -= used
         costs[k] += total / (part - left)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.effects import Channel, Effect, Parameter, Stage, asks_for
+from disco_hw.effects import Channel, Effect, Parameter, Stage, arguments_of
 from disco_hw.effects.registry import DELAY, MOTION_EFFECTS, REGISTRY, in_stages
 from disco_hw.gap.settings import GRID_STEP_S
 from disco_hw.model.coefficients import Base, Coefficients, Effects
@@ -132,7 +132,7 @@ DELAYED_BY = DELAY.columns[0]
 _ENCODERS = in_stages(Stage.ENCODERS)
 ENCODER_COLUMNS = tuple(column for effect in _ENCODERS for column in effect.columns)
 _POSE_TIME, _POSE, _WORLD = in_stages(Stage.POSE_TIME), in_stages(Stage.POSE), in_stages(Stage.WORLD)
-_ASKED = {effect.name: asks_for(effect.plain) for effect in (*_ENCODERS, *_POSE_TIME, *_POSE, *_WORLD)}
+_ARGUMENTS = {effect.name: arguments_of(effect.plain) for effect in (*_ENCODERS, *_POSE_TIME, *_POSE, *_WORLD)}
 _SENSED = np.array(
     [
         *range(BASE_COUNT),
@@ -146,7 +146,7 @@ class PoseSensor(NamedTuple):
     left of the tracked point (m), and how far its yaw is off (rad).
     """
 
-    late_s: float
+    delay_s: float
     forward_m: float
     left_m: float
     bias_rad: float
@@ -161,11 +161,11 @@ def pose_sensor(p: Array) -> PoseSensor:
 def _sensor(values: tuple[float, ...]) -> PoseSensor:
     p = BODY.neutral.copy()
     p[_SENSED] = values
-    late_s = -sum(float(_plain(BODY, p, effect, time_s=0.0)) for effect in _POSE_TIME)
+    delay_s = -sum(float(_plain(BODY, p, effect, time_s=0.0)) for effect in _POSE_TIME)
     mount = 0.0, 0.0, 0.0
     for effect in _POSE:
         mount = _plain(BODY, p, effect, x=mount[0], y=mount[1], yaw=mount[2])
-    return PoseSensor(late_s, *(float(each) for each in mount))
+    return PoseSensor(delay_s, *(float(each) for each in mount))
 
 
 def carried(p: Array, speed_rad_s: Array, t_s: Array) -> Array:
@@ -206,7 +206,7 @@ def _plain(layout: Layout, p: Array, effect: Effect, **motion: float | Array) ->
         **motion,
     }
     known["geometry"] = tuple(p[:BASE_COUNT].tolist())
-    return effect.plain(**{name: known[name] for name in _ASKED[effect.name]})
+    return effect.plain(**{name: known[name] for name in _ARGUMENTS[effect.name]})
 
 
 def wheel_effects(p: Array, geometry: Array) -> Coefficients:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.data.stamp_clock import StampClock, clock_of
-from disco_hw.gap.data.timing import apart, lowest, misfit_of
+from disco_hw.gap.data.timing import apart, lowest, mismatch_of
 from disco_hw.gap.settings import GridSettings
 from disco_hw.jit import kernel_function
 from disco_hw.log.drive import Commands, Wheels
@@ -65,61 +65,61 @@ class Turned:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class WheelResponse:
     """What wheels would turn that follow both commands behind a lag: speeds and way (N, 2) at the commands' times."""
 
     commands: Commands
     lag_s: float
-    asked: Array
+    commanded: Array
     speed: Array
     angle: Array
-    lost_s: Array
+    unknown_s: Array
 
     @classmethod
-    def of(cls, commands: Commands, lag_s: float) -> Answer:
+    def of(cls, commands: Commands, lag_s: float) -> WheelResponse:
         """Commands that are not known ask for nothing, and are counted as `lost_s`."""
-        asked = np.column_stack([commands.left_rad_s, commands.right_rad_s])
-        unknown = np.isnan(asked[:, 0])
-        asked = np.nan_to_num(asked)
-        speed, angle = np.empty(asked.shape), np.empty(asked.shape)
-        _answer(commands.t_s, asked, commands.segment, lag_s, speed, angle)
-        lost_s = np.concatenate([[0.0], np.cumsum(np.diff(commands.t_s) * unknown[:-1])])
-        return cls(commands, lag_s, asked, speed, angle, lost_s)
+        commanded = np.column_stack([commands.left_rad_s, commands.right_rad_s])
+        unknown = np.isnan(commanded[:, 0])
+        commanded = np.nan_to_num(commanded)
+        speed, angle = np.empty(commanded.shape), np.empty(commanded.shape)
+        _integrate_response(commands.t_s, commanded, commands.segment, lag_s, speed, angle)
+        unknown_s = np.concatenate([[0.0], np.cumsum(np.diff(commands.t_s) * unknown[:-1])])
+        return cls(commands, lag_s, commanded, speed, angle, unknown_s)
 
     def best(self, turned: Turned, about_s: float, step_s: float, fewest: int) -> tuple[float, float]:
         """The delay within a step of one at which the misfit is least, and that."""
-        return lowest(lambda some: self.misfits(turned, some, fewest), about_s, step_s)
+        return lowest(lambda some: self.mismatches(turned, some, fewest), about_s, step_s)
 
-    def misfits(self, turned: Turned, delays: Array, fewest: int) -> Array:
+    def mismatches(self, turned: Turned, delays: Array, fewest: int) -> Array:
         """Minus the log likelihood per pair and wheel at each of some delays (D,); infinite for too few pairs."""
-        misfit = np.full(delays.size, np.inf)
+        mismatch = np.full(delays.size, np.inf)
         for place, delay_s in enumerate(delays.tolist()):
             known = self.known(turned, delay_s)
             if np.count_nonzero(known) >= fewest:
-                misfit[place] = self._misfit(turned.pick(known), delay_s)
-        return misfit
+                mismatch[place] = self._mismatch(turned.pick(known), delay_s)
+        return mismatch
 
-    def stands_out(self, turned: Turned, delay_s: float, reach_s: float) -> bool:
+    def is_distinct(self, turned: Turned, delay_s: float, reach_s: float) -> bool:
         """Whether the same pairs fit worse at a delay that is shorter, and at one that is longer, by `reach_s`."""
         delays = (delay_s - reach_s, delay_s, delay_s + reach_s)
         shared = turned.pick(np.all([self.known(turned, each) for each in delays], axis=0))
         if not shared.begin_s.size:
             return False
-        shorter, there, longer = (self._misfit(shared, each) for each in delays)
+        shorter, there, longer = (self._mismatch(shared, each) for each in delays)
         return min(shorter, longer) > there + _SAME_NATS
 
     def known(self, turned: Turned, delay_s: float) -> Mask:
         """Between which pairs (n,) commands are known at a delay."""
-        (_, lost_s, inside), (_, more_s, still) = (
+        (_, unknown_s, inside), (_, more_s, also_inside) = (
             self._at(at - delay_s, turned.segment) for at in (turned.begin_s, turned.end_s)
         )
-        return np.asarray(inside & still & (more_s - lost_s < 1e-9))
+        return np.asarray(inside & also_inside & (more_s - unknown_s < 1e-9))
 
-    def _misfit(self, turned: Turned, delay_s: float) -> float:
+    def _mismatch(self, turned: Turned, delay_s: float) -> float:
         began, ended = (self._at(at - delay_s, turned.segment)[0] for at in (turned.begin_s, turned.end_s))
         left, right = (ended - began).T
         sides = (turned.left_rad, turned.right_rad)
-        return float(sum(misfit_of(right - left, right + left, measured) for measured in sides))
+        return float(sum(mismatch_of(right - left, right + left, measured) for measured in sides))
 
     def _at(self, t_s: Array, segment: Index) -> tuple[Array, Array, Mask]:
         """Way (n, 2) and time without a known command (n,) up to some times, and whether commands of a segment are in
@@ -130,26 +130,26 @@ class Answer:
         # Before the first command nothing is known, and is not counted below.
         since = np.maximum(t_s - commands.t_s[k], 0.0)[:, None]
         slow = lag_s * (1.0 - np.exp(-since / lag_s)) if lag_s > 0.0 else 0.0
-        now = self.asked[k]
+        now = self.commanded[k]
         way = self.angle[k] + now * since + (self.speed[k] - now) * slow
         inside = (commands.segment[k] == segment) & (t_s >= commands.t_s[0]) & (t_s <= commands.t_s[-1])
-        return way, self.lost_s[k] + since[:, 0] * np.isnan(commands.left_rad_s[k]), inside
+        return way, self.unknown_s[k] + since[:, 0] * np.isnan(commands.left_rad_s[k]), inside
 
 
 @kernel_function
-def _answer(t_s: Array, asked: Array, segment: Index, lag_s: float, state: Array, angle: Array) -> None:
+def _integrate_response(t_s: Array, commanded: Array, segment: Index, lag_s: float, state: Array, angle: Array) -> None:
     """Speeds (N, 2) of wheels that follow commands with a lag at the instants of these, and the way turned by then.
 
     A segment begins with wheels that follow its first command: nothing is known of what was before.
     """
-    for side in range(asked.shape[1]):
-        state[0, side], angle[0, side] = asked[0, side], 0.0
+    for side in range(commanded.shape[1]):
+        state[0, side], angle[0, side] = commanded[0, side], 0.0
         for k in range(1, t_s.shape[0]):
-            step_s, before = t_s[k] - t_s[k - 1], asked[k - 1, side]
+            step_s, before = t_s[k] - t_s[k - 1], commanded[k - 1, side]
             left = math.exp(-step_s / lag_s) if lag_s > 0.0 else 0.0
             behind = state[k - 1, side] - before
             angle[k, side] = angle[k - 1, side] + before * step_s + behind * lag_s * (1.0 - left)
-            state[k, side] = before + behind * left if segment[k] == segment[k - 1] else asked[k, side]
+            state[k, side] = before + behind * left if segment[k] == segment[k - 1] else commanded[k, side]
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +162,7 @@ class Response:
 
     delay_s: float = 0.0
     lag_s: float = 0.0
-    misfit: float = 0.0
+    mismatch: float = 0.0
     known: bool = True
 
 
@@ -175,12 +175,12 @@ def response(turned: Turned, commands: Commands, settings: GridSettings) -> Resp
     """
     if commands.t_s.size < 2:
         return Response()
-    answers = {lag_s: Answer.of(commands, lag_s) for lag_s in (0.0, *settings.lags_s)}
+    responses = {lag_s: WheelResponse.of(commands, lag_s) for lag_s in (0.0, *settings.lags_s)}
     step_s, coarse_s = settings.delay_step_s, 2.0 * settings.delay_step_s
     delays = _delays(settings.most_pose_delay_s, coarse_s)
-    most = max(int(answers[0.0].known(turned, delay_s).sum()) for delay_s in delays.tolist())
+    most = max(int(responses[0.0].known(turned, delay_s).sum()) for delay_s in delays.tolist())
     fewest = max(settings.fewest_poses, 3 * most // 4)
-    scanned = {lag_s: answers[lag_s].misfits(turned, delays, fewest) for lag_s in (0.0, *settings.lags_s[1::3])}
+    scanned = {lag_s: responses[lag_s].mismatches(turned, delays, fewest) for lag_s in (0.0, *settings.lags_s[1::3])}
     ordinary = scanned[0.0][np.isfinite(scanned[0.0])]
     if not ordinary.size:
         return Response()
@@ -188,22 +188,22 @@ def response(turned: Turned, commands: Commands, settings: GridSettings) -> Resp
     least = int(np.argmin(scanned[lag_s]))
     if not (0 < least < delays.size - 1 and np.isfinite(scanned[lag_s][least - 1 : least + 2]).all()):
         return Response(known=False)
-    centre_s, _ = answers[lag_s].best(turned, float(delays[least]), coarse_s, fewest)
+    centre_s, _ = responses[lag_s].best(turned, float(delays[least]), coarse_s, fewest)
     near = {}
-    for other_s, answer in answers.items():
+    for other_s, response_model in responses.items():
         about = centre_s + lag_s - other_s + _delays(settings.lag_reach_s, step_s)
-        misfit = answer.misfits(turned, about, fewest)
-        near[other_s] = float(misfit.min()), float(about[int(np.argmin(misfit))])
+        mismatch = response_model.mismatches(turned, about, fewest)
+        near[other_s] = float(mismatch.min()), float(about[int(np.argmin(mismatch))])
     # Between steps some fit better than where the scan met them.
     bound = min(near.values())[0] + settings.least_delay_nats
     found = Response(centre_s, lag_s, math.inf)
-    for other_s, (misfit_there, about_s) in near.items():
-        if misfit_there <= bound:
-            delay_s, best = answers[other_s].best(turned, about_s, step_s, fewest)
-            if best < found.misfit:
+    for other_s, (mismatch_there, about_s) in near.items():
+        if mismatch_there <= bound:
+            delay_s, best = responses[other_s].best(turned, about_s, step_s, fewest)
+            if best < found.mismatch:
                 found = Response(delay_s, other_s, best, other_s < max(settings.lags_s))
-    deep = float(np.median(ordinary)) - found.misfit >= settings.least_delay_nats
-    shown = deep and answers[found.lag_s].stands_out(turned, found.delay_s, settings.lag_reach_s)
+    deep = float(np.median(ordinary)) - found.mismatch >= settings.least_delay_nats
+    shown = deep and responses[found.lag_s].is_distinct(turned, found.delay_s, settings.lag_reach_s)
     return found if shown else Response(known=False)
 
 
@@ -219,13 +219,13 @@ class CommandAlignment:
 
     turned: Turned
     first: Response
-    answer: Answer
+    response_model: WheelResponse
     settings: GridSettings
 
     @property
     def span_s(self) -> tuple[float, float]:
         """Stamps of the first and of the last known command."""
-        known = self.answer.commands.t_s[np.isfinite(self.answer.commands.left_rad_s)]
+        known = self.response_model.commands.t_s[np.isfinite(self.response_model.commands.left_rad_s)]
         return (float(known[0]), float(known[-1])) if known.size else (0.0, 0.0)
 
     @property
@@ -237,28 +237,28 @@ class CommandAlignment:
 
     def fitted(self, clock: StampClock) -> tuple[float, float]:
         """Age of all commands, their stamps corrected by a clock, and the misfit of a pair and wheel."""
-        commands = self.answer.commands
+        commands = self.response_model.commands
         found = self.first if clock.even else response(self.turned, clock.corrected(commands), self.settings)
-        return -found.delay_s, found.misfit if found.known else math.inf
+        return -found.delay_s, found.mismatch if found.known else math.inf
 
     def part_delay_s(self, low_s: float, high_s: float) -> float | None:
         """Age of the commands in force in a stretch; None where it does not show."""
         step_s = 2.0 * self.settings.delay_step_s
         delays = _delays(self.settings.most_pose_delay_s, step_s)
-        misfit = self._misfits(low_s, high_s, delays)
-        ordinary, least = misfit[np.isfinite(misfit)], int(np.argmin(misfit))
-        if not ordinary.size or float(np.median(ordinary)) - misfit[least] < self.settings.least_delay_nats:
+        mismatch = self._mismatches(low_s, high_s, delays)
+        ordinary, least = mismatch[np.isfinite(mismatch)], int(np.argmin(mismatch))
+        if not ordinary.size or float(np.median(ordinary)) - mismatch[least] < self.settings.least_delay_nats:
             return None
-        return -lowest(lambda some: self._misfits(low_s, high_s, some), float(delays[least]), step_s)[0]
+        return -lowest(lambda some: self._mismatches(low_s, high_s, some), float(delays[least]), step_s)[0]
 
-    def part_misfit(self, low_s: float, high_s: float, delay_s: float) -> float:
+    def part_mismatch(self, low_s: float, high_s: float, delay_s: float) -> float:
         """Misfit of all pairs of a stretch at an age."""
-        misfit = float(self._misfits(low_s, high_s, np.full(1, -delay_s))[0])
+        mismatch = float(self._mismatches(low_s, high_s, np.full(1, -delay_s))[0])
         count = self.turned.between(low_s, high_s).begin_s.size
-        return count * misfit if np.isfinite(misfit) else 0.0
+        return count * mismatch if np.isfinite(mismatch) else 0.0
 
-    def _misfits(self, low_s: float, high_s: float, delays: Array) -> Array:
-        return self.answer.misfits(self.turned.between(low_s, high_s), delays, self.settings.fewest_poses)
+    def _mismatches(self, low_s: float, high_s: float, delays: Array) -> Array:
+        return self.response_model.mismatches(self.turned.between(low_s, high_s), delays, self.settings.fewest_poses)
 
 
 def command_clock(wheels: Wheels, commands: Commands, settings: GridSettings) -> tuple[StampClock, bool]:
@@ -269,5 +269,5 @@ def command_clock(wheels: Wheels, commands: Commands, settings: GridSettings) ->
     first = response(turned, commands, settings)
     if not first.known or not first.delay_s:
         return StampClock(-first.delay_s), first.known
-    align = CommandAlignment(turned, first, Answer.of(commands, first.lag_s), settings)
+    align = CommandAlignment(turned, first, WheelResponse.of(commands, first.lag_s), settings)
     return clock_of(align, settings, settings.least_link_error_s, settings.least_link_nats), True

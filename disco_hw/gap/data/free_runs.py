@@ -37,10 +37,10 @@ def _at(command: Any, place: int, part: float, begin: int, end: int, side: int) 
 
 @kernel_function
 def _run_wheels(
-    effects: Any, late: float, command: Array, extra: Array, first: Mask, t_s: Array, start: Array, angle: Array
+    effects: Any, delay_cells: float, command: Array, extra: Array, first: Mask, t_s: Array, start: Array, angle: Array
 ) -> None:
-    earlier = math.floor(-late)
-    part = -late - earlier
+    earlier = math.floor(-delay_cells)
+    part = -delay_cells - earlier
     begin = end = 0
     left_speed, right_speed = 0.0, 0.0
     known = False
@@ -130,8 +130,8 @@ def run_wheels(
     later than they are stamped.
     """
     angle = np.empty_like(command)
-    late = (WHEEL.at(p, DELAYED_BY) - moved_s) / GRID_STEP_S
-    _run_wheels(wheel_effects(p, geometry), late, command, extra, first, t_s, start, angle)
+    delay_cells = (WHEEL.at(p, DELAYED_BY) - moved_s) / GRID_STEP_S
+    _run_wheels(wheel_effects(p, geometry), delay_cells, command, extra, first, t_s, start, angle)
     turns = counted(WHEEL, p)
     if turns != (1.0, 1.0):
         angle *= turns
@@ -168,8 +168,8 @@ def read_angles(angle: Array, node: Index, fraction: Array, out: Array) -> None:
 
 
 @kernel_function
-def _lay(
-    late: float, bias: float, ground: Array, track: Array, node: Index,
+def _propagate(
+    delay_cells: float, bias: float, ground: Array, track: Array, node: Index,
     fraction: Array, window: Index, first_node: Index, last_node: Index, use: Mask, measured: Array, out: Array,
 ) -> None:  # fmt: skip
     count = node.shape[0]
@@ -178,7 +178,7 @@ def _lay(
         end = begin
         turned = used = 0.0
         while end < count and window[end] == window[begin]:
-            place = min(max(node[end] + fraction[end] - late, float(first_node[end])), last_node[end] - 1e-6)
+            place = min(max(node[end] + fraction[end] - delay_cells, float(first_node[end])), last_node[end] - 1e-6)
             low = math.floor(place)
             part = place - low
             for column in range(3):
@@ -192,7 +192,7 @@ def _lay(
         cosine, sine = math.cos(turned), math.sin(turned)
         mean_x = mean_y = 0.0
         for k in range(begin, end):
-            place = min(max(node[k] + fraction[k] - late, float(first_node[k])), last_node[k] - 1e-6)
+            place = min(max(node[k] + fraction[k] - delay_cells, float(first_node[k])), last_node[k] - 1e-6)
             low = math.floor(place)
             part = place - low
             moved_x = ground[low, 0] + part * (ground[low + 1, 0] - ground[low, 0])
@@ -223,8 +223,10 @@ def pose_residual(
     """
     out = np.empty_like(measured)
     sensor = pose_sensor(p)
-    late = (sensor.late_s - moved_s) / GRID_STEP_S
-    _lay(late, sensor.bias_rad, ground, track, node, fraction, window, first_node, last_node, use, measured, out)
+    delay_cells = (sensor.delay_s - moved_s) / GRID_STEP_S
+    _propagate(
+        delay_cells, sensor.bias_rad, ground, track, node, fraction, window, first_node, last_node, use, measured, out
+    )
     return out
 
 
@@ -232,11 +234,11 @@ def pose_residual(
 def _displace(
     p: Any, track: Any, ground: Any, start: Any, low: Any, high: Any, heading: Any, ahead: int, out: Any
 ) -> None:
-    late = p[0] / GRID_STEP_S
+    delay_cells = p[0] / GRID_STEP_S
     top = track.shape[0] - 2
     for k in range(start.shape[0]):
-        a = max(start[k] - late, float(low[k]))
-        b = max(start[k] + ahead - late, float(low[k]))
+        a = max(start[k] - delay_cells, float(low[k]))
+        b = max(start[k] + ahead - delay_cells, float(low[k]))
         # Poses that are true later than stamped may be so after the run's end: the last speed is kept.
         i, j = min(math.floor(a), high[k] - 1), min(math.floor(b), high[k] - 1)
         f, g = a - i, b - j
@@ -270,7 +272,7 @@ def displacement(
     low, high = begins[run], np.append(begins[1:], first.size)[run] - 1
     out = np.empty((start.size, 3))
     sensor = pose_sensor(p)
-    world = np.array([sensor.late_s - moved_s, sensor.bias_rad])
+    world = np.array([sensor.delay_s - moved_s, sensor.bias_rad])
     _displace(world, track, ground, start, low, high, heading_rad, round(ahead_s / GRID_STEP_S), out)
     return out
 

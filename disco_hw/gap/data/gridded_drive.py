@@ -108,13 +108,13 @@ class GriddedDrive:
         is_long = self.duration_s >= 3 * prediction.folds.count * prediction.folds.stretch_s
         return prediction.folds if is_long else prediction.short_folds
 
-    def late_commands(self, late_s: float) -> Array:
+    def delayed_commands(self, delay_s: float) -> Array:
         """Commands at the nodes (M, 2) that are in force after a dead time, negative of commands that are stamped late.
 
         Zero where none is known, before the first and after the last as these.
         """
         raw = np.nan_to_num(self.command_rad_s)
-        cells = round((late_s - self.commands_moved_s) / GRID_STEP_S)
+        cells = round((delay_s - self.commands_moved_s) / GRID_STEP_S)
         return raw[np.clip(np.arange(raw.shape[0]) - cells, 0, raw.shape[0] - 1)]
 
 
@@ -125,7 +125,7 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
     timed = _timed(log, wheels, grid_settings)
     ticks_s = {"commands": tick_s(log.commands.t_s, log.wheels.t_s), "poses": tick_s(log.poses.t_s, log.wheels.t_s)}
     scatter_s = {whose: each_s / 12.0**0.5 for whose, each_s in ticks_s.items()}
-    asked, poses, notes = timed.commands.samples, timed.poses.samples, [*timed.notes]
+    command_samples, poses, notes = timed.commands.samples, timed.poses.samples, [*timed.notes]
     notes += [
         f"{whose} are stamped by the rows of the log, {1e3 * ticks_s[whose]:.0f} ms apart: how late they are is known "
         f"to {2e3 * each_s:.0f} ms at best"
@@ -138,7 +138,7 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
     runs = _runs(wheels.t_s, wheels.segment, grid_settings)
     driven_s = sum(float(wheels.t_s[hi - 1] - wheels.t_s[lo]) for lo, hi in runs)
     if driven_s > grid_settings.longest_s:
-        runs = _spread(wheels.t_s, runs, driven_s, _commanded(asked, wheels), grid_settings)
+        runs = _spread(wheels.t_s, runs, driven_s, _commanded(command_samples, wheels), grid_settings)
         notes.append(
             f"{driven_s:.0f} s of driving: {grid_settings.longest_s:.0f} s of it, evenly spread and those with "
             "commands first, are judged"
@@ -150,7 +150,7 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
         segment = int(wheels.segment[lo])
         grid = t[0] + GRID_STEP_S * np.arange(int((t[-1] - t[0]) / GRID_STEP_S) + 1)
         at = np.column_stack([np.interp(grid, t, angle[:, side]) for side in (0, 1)])
-        command, change = _command_cells(asked, segment, grid)
+        command, change = _command_cells(command_samples, segment, grid)
         span_s = max(grid_settings.speed_span_s, float(np.median(np.diff(t))))
         speed = _speeds(grid, t, angle, span_s)
         foreign = _foreign(command, speed, span_s, grid_settings)
@@ -223,19 +223,25 @@ def _timed(log: DriveLog, wheels: Wheels, settings: GridSettings) -> _Timed:
         return command_clock(wheels, commands, settings)
 
     poses = aligned(wheels, log.poses, log.begins_s, of_poses, settings.least_clock_error_s, "poses'")
-    asked = aligned(wheels, log.commands, log.begins_s, of_commands, settings.least_link_error_s, "commands'")
-    notes = (*poses.notes, *asked.notes)
-    if not asked.known:
-        said = (
+    aligned_commands = aligned(
+        wheels, log.commands, log.begins_s, of_commands, settings.least_link_error_s, "commands'"
+    )
+    notes = (*poses.notes, *aligned_commands.notes)
+    if not aligned_commands.known:
+        text = (
             f"wheels answer commands more slowly than behind a lag of {max(settings.lags_s):g} s, or more than "
             f"{settings.most_pose_delay_s:g} s late or early, or commands hardly change: how late commands are stamped "
             "is not known from this log"
         )
-        notes = (*notes, said)
-    later_s = _to_borders(asked.samples, float(wheels.t_s[0]), -asked.delay_s) if wheels.t_s.size else 0.0
-    commands = replace(asked.samples, t_s=_moved(asked.samples.t_s, later_s))
+        notes = (*notes, text)
+    later_s = (
+        _to_borders(aligned_commands.samples, float(wheels.t_s[0]), -aligned_commands.delay_s)
+        if wheels.t_s.size
+        else 0.0
+    )
+    commands = replace(aligned_commands.samples, t_s=_moved(aligned_commands.samples.t_s, later_s))
     seen = replace(poses.samples, t_s=_moved(poses.samples.t_s, -poses.delay_s))
-    return _Timed(replace(asked, samples=commands), replace(poses, samples=seen), later_s, notes)
+    return _Timed(replace(aligned_commands, samples=commands), replace(poses, samples=seen), later_s, notes)
 
 
 def _to_borders(commands: Commands, begin_s: float, later_s: float) -> float:
@@ -243,8 +249,8 @@ def _to_borders(commands: Commands, begin_s: float, later_s: float) -> float:
 
     A delay of a part of a cell is made by a mean of neighbouring cells: a change within a cell would be smeared twice.
     """
-    asked = np.nan_to_num(np.column_stack([commands.left_rad_s, commands.right_rad_s]))
-    changes = (np.diff(asked, axis=0) ** 2).sum(axis=1)
+    speeds = np.nan_to_num(np.column_stack([commands.left_rad_s, commands.right_rad_s]))
+    changes = (np.diff(speeds, axis=0) ** 2).sum(axis=1)
     turn = 2.0j * np.pi / GRID_STEP_S
     mean = complex(np.sum(changes * np.exp(turn * (commands.t_s[1:] - begin_s))))
     within_s = float(np.angle(mean)) / abs(turn)
@@ -356,8 +362,8 @@ def _command_cells(commands: Commands, segment: int, grid: Array) -> tuple[Array
     knots = np.append(t, ends[-1])
     means = np.column_stack([np.diff(np.interp(edges, knots, integral[:, side])) for side in (0, 1)]) / GRID_STEP_S
     unknown = np.concatenate([[0.0], np.cumsum((~known) * (ends - t))])
-    lost = np.diff(np.interp(edges, knots, unknown)) > 1e-9
-    means[lost | (grid < t[0] - 1e-9)] = np.nan
+    is_unknown = np.diff(np.interp(edges, knots, unknown)) > 1e-9
+    means[is_unknown | (grid < t[0] - 1e-9)] = np.nan
     jumps = np.zeros(grid.size)
     steps = (np.diff(filled, axis=0) ** 2).mean(axis=1)
     where = np.clip(((t[1:] - grid[0]) / GRID_STEP_S).astype(np.int64), 0, grid.size - 1)
@@ -370,14 +376,14 @@ def _foreign(command: Array, speed: Array, span_s: float, settings: GridSettings
 
     A speed taken over `span_s` either side rises that much before the command that it follows.
     """
-    asked = np.nan_to_num(np.abs(command).max(axis=1), nan=np.inf)
+    largest = np.nan_to_num(np.abs(command).max(axis=1), nan=np.inf)
     turning = np.abs(speed).max(axis=1)
     span = round(settings.longest_response_s / GRID_STEP_S)
-    before = maximum_filter1d(asked, span, origin=(span - 1) // 2)
-    most = np.maximum(before, maximum_filter1d(asked, 2 * math.ceil(span_s / GRID_STEP_S) + 3))
-    least = minimum_filter1d(asked, span, origin=(span - 1) // 2)
+    before = maximum_filter1d(largest, span, origin=(span - 1) // 2)
+    most = np.maximum(before, maximum_filter1d(largest, 2 * math.ceil(span_s / GRID_STEP_S) + 3))
+    least = minimum_filter1d(largest, span, origin=(span - 1) // 2)
     unasked = (most < settings.rest_rad_s) & (turning > settings.turning_rad_s)
-    unheard = (least > settings.loud_rad_s) & np.isfinite(asked) & (turning < settings.rest_rad_s)
+    unheard = (least > settings.loud_rad_s) & np.isfinite(largest) & (turning < settings.rest_rad_s)
     return np.asarray(maximum_filter1d((unasked | unheard).astype(np.uint8), 2 * span) > 0)
 
 
@@ -427,14 +433,14 @@ def undo_sample_hold(wheels: Wheels, settings: GridSettings) -> Wheels:
     same_run = np.diff(wheels.segment) == 0
     repeated = (np.diff(speed, axis=0) == 0.0).all(axis=1) & same_run
     turning = (np.abs(speed[1:]) > settings.rest_rad_s).any(axis=1)
-    if turning.sum() < 20 or float(repeated[turning].mean()) < settings.held_share:
+    if turning.sum() < 20 or float(repeated[turning].mean()) < settings.repeated_share:
         return wheels
     new = np.concatenate([[True], ~repeated])
     period_s = float(np.median(np.diff(wheels.t_s[new])))
     keep, last_s = new.copy(), wheels.t_s[0]
     # Wheels that rest repeat their zeros: those are measured too, as often as the robot measures.
     for k in range(1, wheels.t_s.size):
-        if not keep[k] and wheels.t_s[k] - last_s > settings.held_periods * period_s:
+        if not keep[k] and wheels.t_s[k] - last_s > settings.repeated_periods * period_s:
             keep[k] = True
         if keep[k]:
             last_s = wheels.t_s[k]

@@ -37,7 +37,7 @@ class Alignment(Protocol):
     def part_delay_s(self, low_s: float, high_s: float) -> float | None:
         """Age of the samples of a stretch; None where it does not show."""
 
-    def part_misfit(self, low_s: float, high_s: float, delay_s: float) -> float:
+    def part_mismatch(self, low_s: float, high_s: float, delay_s: float) -> float:
         """Misfit of all samples of a stretch at an age, nats."""
 
 
@@ -114,8 +114,8 @@ def clock_of(align: Alignment, settings: GridSettings, least_error_s: float, lea
     # The step that the stretches show best lies between two of them.
     steps = []
     for k in range(2, delays.size - 1):
-        (before, early_s), (after, late_s) = _level(delays[:k], far_s), _level(delays[k:], far_s)
-        steps.append((before + after, k, early_s, late_s))
+        (before, begin_s), (after, end_s) = _level(delays[:k], far_s), _level(delays[k:], far_s)
+        steps.append((before + after, k, begin_s, end_s))
     squares, place, *sides = min(steps)
     drifting = StampClock(delay_s, 0.5 * (first + last), last - first, drift_s=drift_s)
     at_s = float(0.5 * (middles[place - 1] + middles[place]))
@@ -130,9 +130,9 @@ def clock_of(align: Alignment, settings: GridSettings, least_error_s: float, lea
             break
         at_s = jump_instant(align, (sides[0], sides[1]), clock.jump_at_s) if clock.jump_s else clock.jump_at_s
         tried = replace(clock, jump_at_s=at_s)
-        delay_s, misfit = align.fitted(tried)
-        if misfit < least:
-            best, least = replace(tried, delay_s=delay_s), misfit
+        delay_s, mismatch = align.fitted(tried)
+        if mismatch < least:
+            best, least = replace(tried, delay_s=delay_s), mismatch
     return best
 
 
@@ -177,7 +177,7 @@ def jump_instant(align: Alignment, sides: tuple[float, float], about_s: float) -
     """When samples jumped from one age to another, to a second: where both sides together fit best."""
     reach = np.arange(about_s - align.stretch_s, about_s + align.stretch_s, 1.0)
     costs = [
-        align.part_misfit(-np.inf, at_s, sides[0]) + align.part_misfit(at_s, np.inf, sides[1])
+        align.part_mismatch(-np.inf, at_s, sides[0]) + align.part_mismatch(at_s, np.inf, sides[1])
         for at_s in reach.tolist()
     ]
     return float(reach[int(np.argmin(costs))])
@@ -228,8 +228,8 @@ def aligned(
     parts: list[Samples] = []
     uneven: list[str] = []
     notes: list[str] = []
-    for number, ((_, own), (clock, known)) in enumerate(zip(logs, clocks, strict=True), 1):
-        even = clock.corrected(own)
+    for number, ((_, one_clock), (clock, known)) in enumerate(zip(logs, clocks, strict=True), 1):
+        even = clock.corrected(one_clock)
         parts.append(replace(even, t_s=even.t_s - (clock.delay_s - middle_s)) if apart and known else even)
         if not clock.even:
             how = f"{1e3 * clock.drift_s:+.0f} ms over" if clock.drift_s else f"{1e3 * clock.jump_s:+.0f} ms at once in"
@@ -240,10 +240,10 @@ def aligned(
             "synchronise the clocks"
         )
     if apart:
-        said = ", ".join(f"{clock.delay_s:.3g} s" if known else "not known" for clock, known in clocks)
+        listed = ", ".join(f"{clock.delay_s:.3g} s" if known else "not known" for clock, known in clocks)
         notes.append(
-            f"the {whose} delay against the wheels differs from log to log ({said}): each log is laid by its own, as if"
-            f" it were {middle_s:.3g} s in all; synchronise the clocks"
+            f"the {whose} delay against the wheels differs from log to log ({listed}): each log is laid by its own, as"
+            f" if it were {middle_s:.3g} s in all; synchronise the clocks"
         )
     joined = {each.name: np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(samples)}
     return Aligned(

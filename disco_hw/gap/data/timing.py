@@ -26,7 +26,7 @@ _ROUNDS = 4
 # Finer than any pose is measured; keeps a log without any noise finite.
 _LEAST_SQUARE = 1e-10
 # A column of which the other one leaves less than this share of its square says nothing of its own.
-_LEAST_OWN = 1e-12
+_LEAST_INDEPENDENT = 1e-12
 # Stamps are alike to the microsecond.
 _STAMP_DIGITS = 6
 # So closely the least of a misfit is searched: a hundredth of what a cell of the grid holds.
@@ -56,16 +56,16 @@ class PoseAlignment:
         """Age of all poses, their stamps corrected by a clock, and the misfit of a pose."""
         even = clock.corrected(self.poses)
         delay_s = pose_delay_s(self.wheels, even, self.settings)
-        return delay_s, _misfit_at(self.wheels, even, delay_s, self.settings)
+        return delay_s, _mismatch_at(self.wheels, even, delay_s, self.settings)
 
     def part_delay_s(self, low_s: float, high_s: float) -> float | None:
         """Age of the poses of a stretch; None where it does not show."""
         return pose_delay_s(self.wheels, self._part(low_s, high_s), self.settings) or None
 
-    def part_misfit(self, low_s: float, high_s: float, delay_s: float) -> float:
+    def part_mismatch(self, low_s: float, high_s: float, delay_s: float) -> float:
         """Misfit of all poses of a stretch at an age."""
         part = self._part(low_s, high_s)
-        return part.t_s.size * _misfit_at(self.wheels, part, delay_s, self.settings)
+        return part.t_s.size * _mismatch_at(self.wheels, part, delay_s, self.settings)
 
     def _part(self, low_s: float, high_s: float) -> Poses:
         return picked(self.poses, (self.poses.t_s >= low_s) & (self.poses.t_s < high_s))
@@ -86,12 +86,14 @@ def pose_delay_s(wheels: Wheels, poses: Poses, settings: GridSettings) -> float:
     """
     steps = round(settings.most_pose_delay_s / settings.delay_step_s)
     delays: Array = settings.delay_step_s * np.arange(-steps, steps + 1, dtype=np.float64)
-    misfit = _misfits(wheels, poses, delays, settings)
-    best = int(np.argmin(misfit))
-    ordinary = misfit[np.isfinite(misfit)]
-    if not ordinary.size or float(np.median(ordinary)) - misfit[best] < settings.least_delay_nats:
+    mismatch = _mismatches(wheels, poses, delays, settings)
+    best = int(np.argmin(mismatch))
+    ordinary = mismatch[np.isfinite(mismatch)]
+    if not ordinary.size or float(np.median(ordinary)) - mismatch[best] < settings.least_delay_nats:
         return 0.0
-    return lowest(lambda some: _misfits(wheels, poses, some, settings), float(delays[best]), settings.delay_step_s)[0]
+    return lowest(lambda some: _mismatches(wheels, poses, some, settings), float(delays[best]), settings.delay_step_s)[
+        0
+    ]
 
 
 def tick_s(t_s: Array, rows_s: Array) -> float:
@@ -105,15 +107,15 @@ def tick_s(t_s: Array, rows_s: Array) -> float:
     return float(np.median(np.diff(rows_s))) if shared.all() else 0.0
 
 
-def _misfit_at(wheels: Wheels, poses: Poses, delay_s: float, settings: GridSettings) -> float:
+def _mismatch_at(wheels: Wheels, poses: Poses, delay_s: float, settings: GridSettings) -> float:
     """Minus the log likelihood per pose at a delay; 0 where the poses are too few."""
-    misfit = float(_misfits(wheels, poses, np.full(1, delay_s), settings)[0])
-    return misfit if np.isfinite(misfit) else 0.0
+    mismatch = float(_mismatches(wheels, poses, np.full(1, delay_s), settings)[0])
+    return mismatch if np.isfinite(mismatch) else 0.0
 
 
-def _misfits(wheels: Wheels, poses: Poses, delays: Array, settings: GridSettings) -> Array:
+def _mismatches(wheels: Wheels, poses: Poses, delays: Array, settings: GridSettings) -> Array:
     """Minus the log likelihood per pose at each of some delays (D,); infinite where the poses are too few."""
-    misfit = np.full(delays.size, np.inf)
+    mismatch = np.full(delays.size, np.inf)
     before, after = _pairs(poses, settings.delay_span_s)
     turn = np.remainder(poses.yaw_rad[after] - poses.yaw_rad[before] + np.pi, 2.0 * np.pi) - np.pi
     heading = poses.yaw_rad[before] + 0.5 * turn
@@ -131,8 +133,8 @@ def _misfits(wheels: Wheels, poses: Poses, delays: Array, settings: GridSettings
             for at in (np.interp(t_s, wheels.t_s, angle) for angle in (wheels.left_angle_rad, wheels.right_angle_rad))
         )
         difference, total = right - left, right + left
-        misfit[place] = sum(misfit_of(difference, total, measured[known]) for measured in (turn, way))
-    return misfit
+        mismatch[place] = sum(mismatch_of(difference, total, measured[known]) for measured in (turn, way))
+    return mismatch
 
 
 def _pairs(poses: Poses, span_s: float) -> tuple[Index, Index]:
@@ -177,13 +179,13 @@ def projected(aa: float, ab: float, bb: float, ay: float, by: float) -> tuple[fl
     """Coefficients of two columns by normal equations, `aa` not the smaller; of the second 0 where they are alike."""
     if aa == 0.0:
         return 0.0, 0.0
-    own = bb - ab * ab / aa
-    second = (by - ab * ay / aa) / own if own > _LEAST_OWN * bb else 0.0
+    independent = bb - ab * ab / aa
+    second = (by - ab * ay / aa) / independent if independent > _LEAST_INDEPENDENT * bb else 0.0
     return (ay - ab * second) / aa, second
 
 
 @kernel_function
-def misfit_of(difference: Array, total: Array, measured: Array) -> float:
+def mismatch_of(difference: Array, total: Array, measured: Array) -> float:
     """Minus the log likelihood per sample of a robust regression on two columns (n,) whose variance is unknown."""
     count = measured.shape[0]
     left = np.zeros(count)

@@ -67,28 +67,28 @@ def largest_command_jitter_s(drive: GriddedDrive) -> float:
     return settings.least_command_jitter_s + scattered_s + settings.command_jitter_share * drive.encoder_period_s
 
 
-def wheel_misfit(channel: WheelChannel, raw: Array) -> Callable[[Array], float]:
+def wheel_mismatch(channel: WheelChannel, raw: Array) -> Callable[[Array], float]:
     """Minus the robust log likelihood of what a model leaves of the angles (E, 2), by logarithms of the noise (7,)."""
     motion, settings = channel.motion, channel.settings.noise
     # A wheel at rest reads the same however coarse its encoder is, and would speak for readings without error.
     counted = motion.use & ~motion.restart & (np.abs(motion.speed_rad_s).max(axis=1) > channel.settings.grid.rest_rad_s)
     likelihood = wheel_likelihood(motion, counted, raw)
 
-    def misfit(logs: Array) -> float:
+    def mismatch(logs: Array) -> float:
         white, weight = likelihood(logs)
         return 0.5 * _huber(white, settings.huber) - weight
 
-    return misfit
+    return mismatch
 
 
 def fit_wheel_noise(channel: WheelChannel, raw: Array) -> WheelNoise:
     """Noise of the wheels by maximum likelihood of what a model leaves of the angles, (E, 2)."""
     drive, settings = channel.drive, channel.settings.noise
     start = channel.noise.vector()
-    misfit = wheel_misfit(channel, raw)
+    mismatch = wheel_mismatch(channel, raw)
 
     def objective(logs: Array) -> float:
-        return misfit(logs) + _pull(logs, start, settings.prior_sd)
+        return mismatch(logs) + _pull(logs, start, settings.prior_sd)
 
     # A speed that may be wrong by any amount for any time would explain wheels that do not turn at all.
     most = np.minimum(start + 5.0, WheelNoise(*settings.largest_wheel_noise).vector())
@@ -190,20 +190,20 @@ def sensor_noise(channel: BodyChannel, p: Array) -> SensorNoise:
     differences of the poses themselves, in which motion is nothing and noise is whole. Of resting ones the scatter
     about the middle of a rest, which shows slow noise too; the larger of both.
     """
-    beside, measured = channel.raw_residual(p), channel.measured
+    raw, measured = channel.raw_residual(p), channel.measured
     t_s, window, use = channel.samples.t_s, channel.window, channel.use
     moving = [
-        _least(_second(t_s, beside[:, columns], window, use), _third(t_s, measured[:, columns], window, use))
+        _least(_second(t_s, raw[:, columns], window, use), _third(t_s, measured[:, columns], window, use))
         for columns in (slice(0, 2), slice(2, 3))
     ]
     resting = (np.abs(channel.drive.speed_rad_s).max(axis=1) < channel.settings.grid.rest_rad_s)[channel.samples.node]
-    still = [
+    at_rest = [
         _scatter(measured[:, columns], np.cumsum(np.diff(window + 1e6 * ~resting, prepend=-1.0) != 0), resting & use)
         for columns in (slice(0, 2), slice(2, 3))
     ]
     speed = channel.drive.speed_rad_s.mean(axis=1)[channel.samples.node]
     of_speed = _second(t_s, speed[:, None], window, use & ~resting)
-    return SensorNoise(max(moving[0], still[0]), max(moving[1], still[1]), _sigma(of_speed))
+    return SensorNoise(max(moving[0], at_rest[0]), max(moving[1], at_rest[1]), _sigma(of_speed))
 
 
 def _second(t_s: Array, values: Array, window: NDArray[np.int64], use: Mask) -> Array:

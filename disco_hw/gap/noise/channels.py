@@ -32,7 +32,7 @@ Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 # A noise parameter that is as good as zero; the logarithm of it is taken.
-_HARDLY = 1e-5
+_NEGLIGIBLE = 1e-5
 
 
 class ResidualChannel(Protocol):
@@ -147,9 +147,9 @@ class WheelChannel:
         # Readings and time stamps err as they do.
         noise = replace(
             self.noise,
-            relative=_HARDLY,
-            wander=_HARDLY,
-            drift_rad_sqrt_s=max(off_rad, _HARDLY) / settings.even_span_s**0.5,
+            relative=_NEGLIGIBLE,
+            drift_std=_NEGLIGIBLE,
+            drift_rad_sqrt_s=max(off_rad, _NEGLIGIBLE) / settings.even_span_s**0.5,
         )
         even = self.with_noise(noise)
         white = even.whitened(p, extra)
@@ -420,6 +420,6 @@ def _turned_as_the_wheels(drive: GriddedDrive, samples: GridSamples, measured: A
 
 
 def _no_motion(samples: GridSamples) -> BodyMotion:
-    still = np.zeros(samples.t_s.size)
+    zeros = np.zeros(samples.t_s.size)
     flags = np.zeros(samples.t_s.size, dtype=bool)
-    return BodyMotion(still, still, still, still, still, still, still, ~flags, ~flags)
+    return BodyMotion(zeros, zeros, zeros, zeros, zeros, zeros, zeros, ~flags, ~flags)

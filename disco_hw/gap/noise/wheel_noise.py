@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from disco_hw.gap.settings import WANDER_S, NoiseSettings
+from disco_hw.gap.settings import DRIFT_S, NoiseSettings
 from disco_hw.jit import kernel_function, scalar_function
 
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ class WheelNoise:
     stamp_s: float = 5e-4
     command_stamp_s: float = 1e-3
     drift_rad_sqrt_s: float = 1e-3
-    wander: float = 6e-3
+    drift_std: float = 6e-3
 
     def vector(self) -> Array:
         """Logarithms, (7,)."""
@@ -47,7 +47,7 @@ class WheelNoise:
             self.stamp_s,
             self.command_stamp_s,
             self.drift_rad_sqrt_s,
-            self.wander,
+            self.drift_std,
         )
         return np.asarray(np.log(np.array(values)))
 
@@ -104,7 +104,7 @@ def _begin(noise: Any) -> Any:
 
 
 @scalar_function
-def _learnt(c: Any, ka: float, kq: float, ks: float) -> Any:
+def _estimate(c: Any, ka: float, kq: float, ks: float) -> Any:
     """Covariance after a sample with these gains."""
     aa, aq, as_, qq, qs, ss = c
     return aa - ka * aa, aq - ka * aq, as_ - ka * as_, qq - kq * aq, qs - kq * as_, ss - ks * as_
@@ -118,7 +118,7 @@ def _gains(
     for side in range(2):
         c = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         for k in range(dt.shape[0]):
-            keep, hold = math.exp(-dt[k] / noise[1]), math.exp(-dt[k] / WANDER_S)
+            keep, hold = math.exp(-dt[k] / noise[1]), math.exp(-dt[k] / DRIFT_S)
             decay[k, 0], decay[k, 1] = keep, hold
             # Signed: a wheel that turns too fast does so ahead and back.
             go, far = speed[k, side] * dt[k], expected[k, side] * dt[k]
@@ -129,7 +129,7 @@ def _gains(
             if use[k]:
                 ka, kq, ks = c[0] / variance, c[1] / variance, c[2] / variance
                 gain[k, side, 0], gain[k, side, 1], gain[k, side, 2] = ka, kq, ks
-                c = _learnt(c, ka, kq, ks)
+                c = _estimate(c, ka, kq, ks)
             else:
                 gain[k, side, 0] = gain[k, side, 1] = gain[k, side, 2] = 0.0
 
@@ -142,19 +142,19 @@ def _likelihood(
     total = 0.0
     for side in range(2):
         c = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        drift = quick = slow = 0.0
+        drift = fast = slow = 0.0
         before, keep, hold = -1.0, 0.0, 0.0
         for k in range(dt.shape[0]):
             if dt[k] != before:
-                before, keep, hold = dt[k], math.exp(-dt[k] / noise[1]), math.exp(-dt[k] / WANDER_S)
+                before, keep, hold = dt[k], math.exp(-dt[k] / noise[1]), math.exp(-dt[k] / DRIFT_S)
             if restart[k]:
                 c = _begin(noise)
-                drift = quick = slow = 0.0
+                drift = fast = slow = 0.0
             else:
                 go, far = speed[k, side] * dt[k], expected[k, side] * dt[k]
                 c = _spread(c, noise, go, far, keep, hold, dt[k], jumps[k])
-                drift += go * quick + far * slow
-                quick *= keep
+                drift += go * fast + far * slow
+                fast *= keep
                 slow *= hold
             out[k, side] = 0.0
             if not use[k]:
@@ -166,9 +166,9 @@ def _likelihood(
                 total -= 0.5 * math.log(variance)
             ka, kq, ks = c[0] / variance, c[1] / variance, c[2] / variance
             drift += ka * surprise
-            quick += kq * surprise
+            fast += kq * surprise
             slow += ks * surprise
-            c = _learnt(c, ka, kq, ks)
+            c = _estimate(c, ka, kq, ks)
     return total
 
 
@@ -184,16 +184,16 @@ def _whiten(
     out: Array,
 ) -> None:
     # Both wheels in one loop: each one's filter waits for itself, and neither for the other.
-    drift = quick = slow = other_drift = other_quick = other_slow = 0.0
+    drift = fast = slow = other_drift = other_fast = other_slow = 0.0
     for k in range(residual.shape[0]):
         if restart[k]:
-            drift = quick = slow = other_drift = other_quick = other_slow = 0.0
+            drift = fast = slow = other_drift = other_fast = other_slow = 0.0
         else:
-            drift += reach[k, 0, 0] * quick + reach[k, 0, 1] * slow
-            other_drift += reach[k, 1, 0] * other_quick + reach[k, 1, 1] * other_slow
-            quick *= decay[k, 0]
+            drift += reach[k, 0, 0] * fast + reach[k, 0, 1] * slow
+            other_drift += reach[k, 1, 0] * other_fast + reach[k, 1, 1] * other_slow
+            fast *= decay[k, 0]
             slow *= decay[k, 1]
-            other_quick *= decay[k, 0]
+            other_fast *= decay[k, 0]
             other_slow *= decay[k, 1]
         if not use[k]:
             out[k, 0] = out[k, 1] = 0.0
@@ -203,10 +203,10 @@ def _whiten(
         out[k, 0] = 0.0 if restart[k] else surprise * scale[k, 0]
         out[k, 1] = 0.0 if restart[k] else other * scale[k, 1]
         drift += gain[k, 0, 0] * surprise
-        quick += gain[k, 0, 1] * surprise
+        fast += gain[k, 0, 1] * surprise
         slow += gain[k, 0, 2] * surprise
         other_drift += gain[k, 1, 0] * other
-        other_quick += gain[k, 1, 1] * other
+        other_fast += gain[k, 1, 1] * other
         other_slow += gain[k, 1, 2] * other
 
 

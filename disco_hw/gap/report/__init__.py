@@ -68,7 +68,7 @@ class UnnamedFinding:
 
 
 @dataclass(frozen=True, slots=True)
-class Doubt:
+class LowConfidence:
     """An effect that fits and is not reported as found, and why."""
 
     name: str
@@ -132,7 +132,7 @@ class GapReport:
     seconds: float
     offered: str = "amended"
     residue: tuple[str, ...] = ()
-    doubtful: tuple[Doubt, ...] = ()
+    doubtful: tuple[LowConfidence, ...] = ()
     notes: tuple[str, ...] = ()
     candidates: tuple[CandidateEvidence, ...] = ()
     pictures: dict[str, bytes] = field(default_factory=dict, repr=False)
@@ -196,7 +196,7 @@ class GapReport:
                 }
                 for term in self.unnamed
             ],
-            "doubtful": [{"name": doubt.name, "why": doubt.why} for doubt in self.doubtful],
+            "doubtful": [{"name": one.name, "why": one.why} for one in self.doubtful],
             "residue": list(self.residue),
             "blind_spots": [
                 {
@@ -294,7 +294,7 @@ class FleetRow:
                 for effect in report.effects
             },
             "unnamed": [term.form for term in report.unnamed],
-            "doubtful": [doubt.name for doubt in report.doubtful],
+            "doubtful": [one.name for one in report.doubtful],
             "offered": report.offered,
             "horizon_s": report.horizon_s,
             "held_out": {stage: _errors_dict(of[report.horizon_s]) for stage, of in errors.items()},
@@ -324,7 +324,7 @@ class FleetRow:
         return (
             str(self.log),
             "; ".join([*values, *(term.form for term in report.unnamed)]) or "nothing",
-            ", ".join(doubt.name for doubt in report.doubtful) or "-",
+            ", ".join(one.name for one in report.doubtful) or "-",
             f"{horizon_s:g} s",
             cell("timed"),
             cell(offered),
@@ -347,8 +347,10 @@ class FleetResult:
     def table(self) -> str:
         """One line a log under a line of headings; errors are held out, as far ahead as the row says."""
         lines = [_COLUMNS, *(row.cells() for row in self.rows)]
-        judged = [line for row, line in zip((None, *self.rows), lines, strict=True) if row is None or row.report]
-        widths = [max(len(line[k]) for line in (lines if k == 0 else judged)) for k in range(len(_COLUMNS))]
+        lines_with_report = [
+            line for row, line in zip((None, *self.rows), lines, strict=True) if row is None or row.report
+        ]
+        widths = [max(len(line[k]) for line in (lines if k == 0 else lines_with_report)) for k in range(len(_COLUMNS))]
         padded = ("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) for line in lines)
         return "\n".join(line.rstrip() for line in padded)
 

@@ -32,25 +32,25 @@ def channel_estimates(analysis: GapAnalysis, final: FinalFit) -> tuple[ChannelEs
     )
 
 
-def at_joint_fit(part: ChannelEstimates, own: Part, of: Freed, joint: JointFit) -> ChannelEstimates:
+def at_joint_fit(part: ChannelEstimates, own_part: Part, of: Freed, joint: JointFit) -> ChannelEstimates:
     """A channel's estimates moved to where the fit of the whole chain has them, and by as much less sure.
 
     What the whole chain frees of the channel (`own`) beyond what was found in it comes with its own variance.
     """
     by_name, off = dict(part.by_name), np.zeros(len(part.fitted))
     for name, old in part.by_name.items():
-        value = joint.value(name, of, own)
+        value = joint.value(name, of, own_part)
         if value is None:
             continue
         deviation = float(np.hypot(old.deviation, value - old.value))
         by_name[name] = ParameterEstimate(value, value - Z95 * deviation, value + Z95 * deviation)
         if name in part.fitted:
             off[part.fitted.index(name)] = value - old.value
-    new = [name for name in (own.layout.columns[place] for place in own.active) if name not in by_name]
+    new = [name for name in (own_part.layout.columns[place] for place in own_part.active) if name not in by_name]
     places = [joint.names.index(name) for name in new]
     added = joint.covariance[np.ix_(places, places)]
     for name, variance in zip(new, np.diag(added), strict=True):
-        value, half = float(joint.value(name, of, own) or 0.0), Z95 * float(variance) ** 0.5
+        value, half = float(joint.value(name, of, own_part) or 0.0), Z95 * float(variance) ** 0.5
         by_name[name] = ParameterEstimate(value, value - half, value + half)
     covariance = block_diag(part.covariance + np.diag(off**2), added) if new else part.covariance + np.diag(off**2)
     return ChannelEstimates(by_name, (*part.fitted, *new), covariance)
@@ -147,10 +147,10 @@ def amended_model(
         found, before = estimates[f"{name}.k"], known[name].value if name in known else 0.0
         known[name] = ParameterEstimate(before + found.value, before + found.low, before + found.high)
         reach[name] = max(largest, reach.get(name, 0.0))
-    wanted = {name: values for name, values in effects.items() if not _takes_no_time(name, values)}
-    wanted |= {name: {"k": estimate} for name, estimate in known.items()}
+    kept = {name: values for name, values in effects.items() if not _takes_no_time(name, values)}
+    kept |= {name: {"k": estimate} for name, estimate in known.items()}
     settings = []
-    for name, values in wanted.items():
+    for name, values in kept.items():
         inside = {}
         for parameter in effect_of(name).parameters:
             key = parameter.name
@@ -164,7 +164,7 @@ def amended_model(
         effects=tuple(settings),
         name=model.name,
     )
-    names, covariance = _joint(bare, wanted, estimates, parts)
+    names, covariance = _joint(bare, kept, estimates, parts)
     if not names:
         return bare, tuple(notes)
     point = dict(zip(bare.parameter_names, bare.point(), strict=True))
@@ -179,7 +179,7 @@ _LEAST_TIME_S = 1e-3
 def _takes_no_time(name: str, values: Mapping[str, ParameterEstimate]) -> bool:
     """Whether an effect that is a time alone is shorter than anything that a robot's loop resolves."""
     effect = effect_of(name)
-    is_time = effect.late_by is not None or effect.stage is Stage.POSE_TIME
+    is_time = effect.delayed_by is not None or effect.stage is Stage.POSE_TIME
     return is_time and all(abs(values[p.name].value) < _LEAST_TIME_S for p in effect.parameters if p.name in values)
 
 

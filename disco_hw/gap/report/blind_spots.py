@@ -29,7 +29,7 @@ from disco_hw.gap.search.analysis import GapAnalysis
 from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.channel_search import search_body, search_wheels
 from disco_hw.gap.search.least_squares import inverse, sensitivity, solve
-from disco_hw.gap.search.richest_model import CANDIDATES, LATE_COLUMNS, candidates_of
+from disco_hw.gap.search.richest_model import CANDIDATES, DELAY_COLUMNS, candidates_of
 from disco_hw.gap.settings import GRID_STEP_S
 from disco_hw.log.drive import Poses, Wheels
 
@@ -107,7 +107,7 @@ def _limit(found: ChannelResult, name: str, top_rad_s: float | None) -> BlindSpo
         geometry = (float(channel.geometry[0]), float(channel.geometry[1]))
         largest = _largest(channel, effect.limited, geometry)
         if top_rad_s is not None:
-            possible = channel.settings.report.asked_share * float(
+            possible = channel.settings.report.commanded_share * float(
                 effect.limited(np.array([[-top_rad_s, top_rad_s]]), geometry)[0]
             )
     enough = min(possible, _realistic(parameter))
@@ -131,17 +131,17 @@ def _largest_tried(found: ChannelResult, effect: Effect) -> float | None:
     channel, best = found.selector.channel, found.fit
     layout, limits = channel.layout, found.selector.thresholds
     places = tuple(
-        layout.place[name] for name in LATE_COLUMNS if name in layout.place and layout.place[name] not in best.active
+        layout.place[name] for name in DELAY_COLUMNS if name in layout.place and layout.place[name] not in best.active
     )
     slope = np.column_stack([best.jacobian, sensitivity(channel, best.vector, places, best.residual)])
     vector = best.vector.copy()
     for limit in effect.trials:
         vector[layout.place[effect.columns[0]]] = limit
         moved = channel.residual(vector) - best.residual
-        own = moved - slope @ solve(slope, slope.T @ moved)
+        residual = moved - slope @ solve(slope, slope.T @ moved)
         enough = (limits.score + math.log(max(channel.count, 2))) * channel.settings.report.usual_inflation
         ahead_m = found.selector.moves(channel.split(best.vector), channel.split(vector))
-        if float(own @ own) > enough and ahead_m > limits.moves_m:
+        if float(residual @ residual) > enough and ahead_m > limits.moves_m:
             return limit
     return None
 
@@ -225,28 +225,28 @@ def being_proved(
     then; else the log is blind to it.
     """
     spots = tuple(spots)
-    with side_by_side(lambda spot: _judged(spot, finds), claims) as all_judged:
+    with side_by_side(lambda spot: _evaluated(spot, finds), claims) as all_evaluated:
 
         def finished() -> tuple[BlindSpot, ...]:
-            judged = {spot.name: spot for spot in all_judged()}
+            evaluated = {spot.name: spot for spot in all_evaluated()}
             # What is another effect by algebra shows as that one does.
             for spot in spots:
                 mimics = REGISTRY[spot.name].mimics
-                other = None if mimics is None else judged.get(mimics.effect.name)
+                other = None if mimics is None else evaluated.get(mimics.effect.name)
                 if other is not None and spot.smallest_visible is not None:
-                    judged[spot.name] = replace(
+                    evaluated[spot.name] = replace(
                         spot, smallest_visible=other.smallest_visible, blind=other.blind, proved=other.proved
                     )
-            return tuple(sorted((judged.get(spot.name, spot) for spot in spots), key=lambda spot: not spot.blind))
+            return tuple(sorted((evaluated.get(spot.name, spot) for spot in spots), key=lambda spot: not spot.blind))
 
         yield finished
 
 
-Judge = Callable[[BlindSpot], BlindSpot]
+Evaluate = Callable[[BlindSpot], BlindSpot]
 
 
 @contextlib.contextmanager
-def side_by_side(judge: Judge, claims: Sequence[BlindSpot]) -> Iterator[Callable[[], list[BlindSpot]]]:
+def side_by_side(evaluate: Evaluate, claims: Sequence[BlindSpot]) -> Iterator[Callable[[], list[BlindSpot]]]:
     """Claims judged in a process for every other processor; what is given judges the rest here, and gives them all.
 
     Each process takes the next claim that nobody has. Where processes cannot be copied all are judged here. A copy of a
@@ -254,7 +254,7 @@ def side_by_side(judge: Judge, claims: Sequence[BlindSpot]) -> Iterator[Callable
     """
     spare = len(os.sched_getaffinity(0)) - 1 if hasattr(os, "sched_getaffinity") else 0
     if not spare or threading.active_count() > 1 or multiprocessing.current_process().daemon:
-        yield lambda: [judge(claim) for claim in claims]
+        yield lambda: [evaluate(claim) for claim in claims]
         return
     fork = multiprocessing.get_context("fork")
     others: list[tuple[Connection, BaseProcess]] = []
@@ -263,22 +263,22 @@ def side_by_side(judge: Judge, claims: Sequence[BlindSpot]) -> Iterator[Callable
     os.write(writer, bytes(range(len(claims))))
     os.close(writer)
 
-    def judge_next() -> Iterator[tuple[int, BlindSpot]]:
+    def evaluate_next() -> Iterator[tuple[int, BlindSpot]]:
         while number := os.read(left, 1):
-            yield number[0], judge(claims[number[0]])
+            yield number[0], evaluate(claims[number[0]])
 
     def finished() -> list[BlindSpot]:
-        judged = dict(judge_next())
+        evaluated = dict(evaluate_next())
         for receiver, _ in others:
             with receiver, contextlib.suppress(EOFError):
-                judged |= receiver.recv()
+                evaluated |= receiver.recv()
         # What failed there fails here too, and says why.
-        return [judged[number] if number in judged else judge(claim) for number, claim in enumerate(claims)]
+        return [evaluated[number] if number in evaluated else evaluate(claim) for number, claim in enumerate(claims)]
 
     try:
         for _ in range(min(spare, len(claims))):
             receiver, sender = fork.Pipe(duplex=False)
-            copy: BaseProcess = fork.Process(target=_send, args=(judge_next, sender), daemon=True)
+            copy: BaseProcess = fork.Process(target=_send, args=(evaluate_next, sender), daemon=True)
             copy.start()
             sender.close()
             others.append((receiver, copy))
@@ -290,13 +290,13 @@ def side_by_side(judge: Judge, claims: Sequence[BlindSpot]) -> Iterator[Callable
         os.close(left)
 
 
-def _send(judge_next: Callable[[], Iterator[tuple[int, BlindSpot]]], sender: Connection) -> None:
+def _send(evaluate_next: Callable[[], Iterator[tuple[int, BlindSpot]]], sender: Connection) -> None:
     """In a copy of the process: judge claims and hand them over; where that fails, or is interrupted, nothing comes."""
     with contextlib.suppress(Exception, KeyboardInterrupt):
-        sender.send(dict(judge_next()))
+        sender.send(dict(evaluate_next()))
 
 
-def _judged(spot: BlindSpot, finds: Finds) -> BlindSpot:
+def _evaluated(spot: BlindSpot, finds: Finds) -> BlindSpot:
     size, realistic = spot.smallest_visible, REGISTRY[spot.name].parameters[0].realistic
     assert size is not None
     assert realistic is not None
@@ -388,10 +388,10 @@ def _moved(
     measured = drive.pose_values
     turned = after[:, 2] - before[:, 2]
     step = _rotated(np.diff(measured[:, :2], axis=0, prepend=measured[:1, :2]), _earlier(turned))
-    own = [
+    residual = [
         _rotated(np.diff(path[:, :2], axis=0, prepend=path[:1, :2]), -_earlier(path[:, 2])) for path in (before, after)
     ]
-    step += _rotated(own[1] - own[0], _earlier(measured[:, 2] - old.bias_rad + turned))
+    step += _rotated(residual[1] - residual[0], _earlier(measured[:, 2] - old.bias_rad + turned))
     # A drift of the world's has its directions, not the robot's.
     ground = channel.carried(then[0]) - channel.carried(now[0])
     seen = np.column_stack([np.interp(drive.pose.t_s, drive.t_s, ground[:, axis]) for axis in (0, 1)])
@@ -406,8 +406,8 @@ def _path(drive: GriddedDrive, channel: BodyChannel, vector: Array, extra: Array
     begins = np.flatnonzero(drive.first)
     run = np.searchsorted(begins, drive.pose.node, side="right") - 1
     low, high = begins[run], np.append(begins[1:], drive.first.size)[run] - 1
-    late = (pose_sensor(vector).late_s - drive.poses_moved_s) / GRID_STEP_S
-    place = np.clip(drive.pose.node + drive.pose.fraction - late, low, high - 1e-6)
+    delay_cells = (pose_sensor(vector).delay_s - drive.poses_moved_s) / GRID_STEP_S
+    place = np.clip(drive.pose.node + drive.pose.fraction - delay_cells, low, high - 1e-6)
     node = np.floor(place).astype(np.int64)
     out = np.empty((place.size, 3))
     read_angles(channel.track(vector, extra), node, place - node, out)

@@ -16,15 +16,15 @@ from disco_hw.gap.report import (
     AcrossLogs,
     CandidateEvidence,
     ChannelFinding,
-    Doubt,
     EffectFinding,
+    LowConfidence,
     UnnamedFinding,
 )
 from disco_hw.gap.report.blind_spots import BlindSpot, blind_spots, experiment_of
 from disco_hw.gap.report.misspecification import (
     Regime,
+    describe,
     disputed_names,
-    in_words,
     misspecified_effects,
     regimes,
     remaining_disagreements,
@@ -94,8 +94,10 @@ def unnamed_findings(analysis: GapAnalysis) -> tuple[UnnamedFinding, ...]:
             same = found.either if one.term.disc is not None else ()
             test = REGISTRY[same[0]].like_a_patch if same else None
             name = one.term.model_name
-            meaning = None if name is None else TERMS[name].meaning(float(one.form.split()[2]))
-            out.append(UnnamedFinding(place.value, one.form, one.evidence.score, name is not None, same, test, meaning))
+            description = None if name is None else TERMS[name].describe(float(one.form.split()[2]))
+            out.append(
+                UnnamedFinding(place.value, one.form, one.evidence.score, name is not None, same, test, description)
+            )
     return tuple(out)
 
 
@@ -107,7 +109,7 @@ def channel_findings(
     excess = analysis.drive.settings.report.excess
     out = []
     for place, found in ((Channel.COMMAND_TO_WHEEL, analysis.wheels), (Channel.WHEEL_TO_BODY, analysis.body)):
-        where = "not measured in this log" if found is None else in_words(regimes_of(found), excess)
+        where = "not measured in this log" if found is None else describe(regimes_of(found), excess)
         out.append(ChannelFinding(place.value, place.value in guilty, where))
     sensor = Channel.POSE_SENSOR.value
     out.append(ChannelFinding(sensor, sensor in guilty, out[-1].where))
@@ -186,10 +188,10 @@ def drifting_parameters(analysis: GapAnalysis, final: FinalFit) -> tuple[str, ..
             far = abs(values[-1] - values[0]) > settings.worth_share * size
             sure = abs(parts.apart(0, len(values) - 1)) > settings.sure_sigmas
             if "." in name and far and sure and sorted(values) in (values, values[::-1]):
-                said = [
+                texts = [
                     f"{value:.3g} in the {place}" for value, place in zip(values, _PLACES[len(values)], strict=True)
                 ]
-                out.append(f"{name} drifts: {', '.join(said)}")
+                out.append(f"{name} drifts: {', '.join(texts)}")
     return tuple(out)
 
 
@@ -225,8 +227,8 @@ def blind_spot_findings(
             spots += [spot for spot in blind_spots(found, top_rad_s) if spot.name not in named]
     seen = {spot.name for spot in spots} | named
     for name, effect in REGISTRY.items():
-        judged = analysis.wheels if effect.channel is Channel.COMMAND_TO_WHEEL else analysis.body
-        if name not in seen and judged is None:
+        searched = analysis.wheels if effect.channel is Channel.COMMAND_TO_WHEEL else analysis.body
+        if name not in seen and searched is None:
             first = effect.parameters[0]
             spots.append(BlindSpot(name, first.name, first.unit, None, True, experiment_of(name)))
     return tuple(sorted(spots, key=lambda spot: not spot.blind))
@@ -261,36 +263,36 @@ class Measured:
 
 def _confirmed(effect: Effect, estimated: Mapping[str, ParameterEstimate]) -> bool:
     """Whether the other channel, from other measurements, says the same of an effect, and clearly not nothing."""
-    own, other = estimated.get(effect.columns[0]), estimated.get(effect.witness or "")
-    if own is None or other is None:
+    estimate, other = estimated.get(effect.columns[0]), estimated.get(effect.witness or "")
+    if estimate is None or other is None:
         return False
     nothing = effect.parameters[0].neutral
-    overlap = own.low <= other.high and other.low <= own.high
-    return overlap and not (own.low <= nothing <= own.high or other.low <= nothing <= other.high)
+    overlap = estimate.low <= other.high and other.low <= estimate.high
+    return overlap and not (estimate.low <= nothing <= estimate.high or other.low <= nothing <= other.high)
 
 
-def sort_out(
+def classify_findings(
     effects: Iterable[EffectFinding], measured: Measured
-) -> tuple[tuple[EffectFinding, ...], tuple[Doubt, ...]]:
+) -> tuple[tuple[EffectFinding, ...], tuple[LowConfidence, ...]]:
     """Effects that may be reported as found, and those that may not, each with the reason."""
     sure, doubtful = [], []
     for effect in effects:
-        why = doubt_of(effect, measured)
+        why = low_confidence_of(effect, measured)
         if why is None:
             sure.append(effect)
         else:
-            doubtful.append(Doubt(effect.name, why))
+            doubtful.append(LowConfidence(effect.name, why))
     return tuple(sure), tuple(doubtful)
 
 
-def doubt_of(effect: EffectFinding, measured: Measured) -> str | None:
+def low_confidence_of(effect: EffectFinding, measured: Measured) -> str | None:
     """Why an effect is not reported as found; None if nothing speaks against it."""
     described, settings = REGISTRY[effect.name], measured.drive.settings.report
     pairs = [(parameter, effect.parameters[parameter.name]) for parameter in described.parameters]
     for parameter, estimate in pairs:
         if _at_end(parameter, estimate.value, settings):
             return f"{_written(parameter, estimate)} lies at the end of its range"
-    if all(hardly_known(parameter, estimate, settings) for parameter, estimate in pairs):
+    if all(is_weakly_known(parameter, estimate, settings) for parameter, estimate in pairs):
         said = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
         return f"{said} is hardly known: its interval is wider than the value"
     if holds_no_effect(effect):
@@ -314,7 +316,7 @@ def _at_end(parameter: Parameter, value: float, settings: ReportSettings) -> boo
     return any(abs(value - end) <= settings.end_share * abs(end) for end in ends)
 
 
-def hardly_known(parameter: Parameter, estimate: ParameterEstimate, settings: ReportSettings) -> bool:
+def is_weakly_known(parameter: Parameter, estimate: ParameterEstimate, settings: ReportSettings) -> bool:
     """Whether an interval is so wide that the value says little: wider than how far it is from neutral, nearly so of a
     limit.
     """

@@ -26,7 +26,7 @@ from disco_hw.gap.noise import largest_command_jitter_s
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.least_squares import Fit, fit, inverse
-from disco_hw.gap.search.richest_model import CANDIDATES, LATE, indices
+from disco_hw.gap.search.richest_model import CANDIDATES, DELAY_NAMES, indices
 from disco_hw.gap.search.selection import Z95, Split, inflation
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms
 from disco_hw.gap.settings import GRID_STEP_S, ReportSettings
@@ -128,7 +128,7 @@ def disputed_names(found: ChannelResult) -> dict[str, str]:
         why = (
             _answers_otherwise(found, name)
             or _takes_little(found, name)
-            or _beside_as_much(found, name)
+            or _has_equal_alternative(found, name)
             or _changes_with_regime(found, name)
         )
         if why is not None:
@@ -144,7 +144,7 @@ def _gain(found: ChannelResult, name: str) -> float:
 
 def _answers_otherwise(found: ChannelResult, name: str) -> str | None:
     """That wheels do not answer as they do behind a delay and a lag, of what makes them late."""
-    if name in LATE and not found.channel.drive.commands_timed:
+    if name in DELAY_NAMES and not found.channel.drive.commands_timed:
         return "wheels answer more slowly, or later, than behind any delay and lag that were tried before"
     return None
 
@@ -156,13 +156,13 @@ def _takes_little(found: ChannelResult, name: str) -> str | None:
         return None
     best = 0.5 * float(found.richest @ found.richest)
     left = found.fit.cost - best - settings.nats_each * found.richest_parameters
-    taken = max(_gain(found, name), 0.0)
-    if taken > settings.worth_share * (taken + left):
+    explained = max(_gain(found, name), 0.0)
+    if explained > settings.worth_share * (explained + left):
         return None
-    return f"it takes {100.0 * taken / (taken + left):.2g} % of what its channel lacks"
+    return f"it takes {100.0 * explained / (explained + left):.2g} % of what its channel lacks"
 
 
-def _beside_as_much(found: ChannelResult, name: str) -> str | None:
+def _has_equal_alternative(found: ChannelResult, name: str) -> str | None:
     """That a term without a name, in the same channel, is worth about as much, or more if its traces are of another
     kind: such a term explains something else, beside which a name may be true that takes more.
     """
@@ -185,14 +185,14 @@ def _alike(found: ChannelResult, name: str, places: Iterable[int]) -> float:
     indices = [first + place for place in places]
     term = best.jacobian[:, [best.active.index(index) for index in indices]] @ best.vector[indices]
     columns = [best.active.index(layout.place[c]) for c in CANDIDATES[name].columns if layout.place[c] in best.active]
-    own = best.jacobian[:, columns]
-    pull = own.T @ term
-    return float(pull @ inverse(own.T @ own) @ pull) / max(float(term @ term), 1e-300)
+    column = best.jacobian[:, columns]
+    pull = column.T @ term
+    return float(pull @ inverse(column.T @ column) @ pull) / max(float(term @ term), 1e-300)
 
 
 def _changes_with_regime(found: ChannelResult, name: str) -> str | None:
     """That a value is another where the robot drives differently, by more than its noise and by much of itself."""
-    best, channel, settings = found.told, found.selector.channel, found.channel.settings.report
+    best, channel, settings = found.reported, found.selector.channel, found.channel.settings.report
     layout, drive = channel.layout, found.channel.drive
     columns = [column for column in CANDIDATES[name].columns if layout.place[column] in best.active]
     sizes = [abs(best.vector[layout.place[column]] - layout.neutral[layout.place[column]]) for column in columns]
@@ -208,8 +208,8 @@ def _changes_with_regime(found: ChannelResult, name: str) -> str | None:
             continue
         moved, moved_too, sigmas = apart
         if abs(moved - moved_too) > settings.form_share * (abs(value) if math.isinf(size) else size):
-            said = f"{column} is {value + moved:.3g} {one} and {value + moved_too:.3g} {other}"
-            clearest = max(clearest, (abs(sigmas), said))
+            text = f"{column} is {value + moved:.3g} {one} and {value + moved_too:.3g} {other}"
+            clearest = max(clearest, (abs(sigmas), text))
     return clearest[1] or None
 
 
@@ -220,9 +220,9 @@ def _apart(
     them, all others being fitted with it; None where either says little of it.
     """
     slope = best.jacobian[:, place]
-    own = float(slope @ slope)
+    column = float(slope @ slope)
     parts = np.column_stack([np.where(mask, slope, 0.0) for mask in inside])
-    if min((parts**2).sum(axis=0)) < settings.regime_known_share * own:
+    if min((parts**2).sum(axis=0)) < settings.regime_known_share * column:
         return None
     wide = np.column_stack([best.jacobian, parts])
     covariance = inverse(wide.T @ wide)
@@ -310,7 +310,7 @@ def regimes(
     return sorted(found, key=lambda regime: -(regime.before - regime.after) * regime.samples**0.5)
 
 
-def in_words(found: list[Regime], excess: float) -> str:
+def describe(found: list[Regime], excess: float) -> str:
     """The regimes that disagree most, with more than `excess` times the mean square of noise, for a person."""
     loud = [regime for regime in found if regime.before > excess]
     if not loud:

@@ -9,31 +9,33 @@ from html import escape
 from disco_hw import reports
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report import STAGES, EffectFinding, GapReport, UnnamedFinding
-from disco_hw.gap.report.judge import hardly_known
+from disco_hw.gap.report.judge import is_weakly_known
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.settings import DEFAULT_SETTINGS, ReportSettings
 
 
-def known_besides(effect: EffectFinding, settings: ReportSettings = DEFAULT_SETTINGS.report) -> tuple[str, ...]:
+def other_known_symptoms(effect: EffectFinding, settings: ReportSettings = DEFAULT_SETTINGS.report) -> tuple[str, ...]:
     """The parameters of a missing effect that say something by themselves, and are known."""
     described = {parameter.name: parameter for parameter in REGISTRY[effect.name].parameters}
-    by_themselves = dict(REGISTRY[effect.name].besides)
-    return tuple(name for name in by_themselves if not hardly_known(described[name], effect.parameters[name], settings))
+    by_themselves = dict(REGISTRY[effect.name].other_symptoms)
+    return tuple(
+        name for name in by_themselves if not is_weakly_known(described[name], effect.parameters[name], settings)
+    )
 
 
 def sentence(effect: EffectFinding, settings: ReportSettings = DEFAULT_SETTINGS.report) -> str:
     """What a missing effect does, with its values."""
     described = REGISTRY[effect.name]
     values = {name: estimate.value for name, estimate in effect.parameters.items()}
-    besides = dict(described.besides)
-    also = (described.fill(besides[name], values) for name in known_besides(effect, settings))
+    others = dict(described.other_symptoms)
+    also = (described.fill(others[name], values) for name in other_known_symptoms(effect, settings))
     return "; ".join((described.describe(values), *also))
 
 
 _MOST_NAMES = 3
 
 
-def answer(report: GapReport) -> list[str]:
+def summary_lines(report: GapReport) -> list[str]:
     """The answer in at most ten lines, for somebody who drives the robot.
 
     What is missing and how sure that is, how much it matters, what is left, which model to drive with, what to do next.
@@ -44,7 +46,7 @@ def answer(report: GapReport) -> list[str]:
     if more:
         lines[-1] += f" And {more} more, listed below."
     if not effects and report.unnamed:
-        lines.append(f"Something is missing that has no name: {_in_words(report.unnamed[0])}.")
+        lines.append(f"Something is missing that has no name: {_describe(report.unnamed[0])}.")
     elif not effects and (report.residue or report.doubtful):
         lines.append("Something is missing that none of the known effects explains.")
     elif not effects:
@@ -54,12 +56,12 @@ def answer(report: GapReport) -> list[str]:
     if report.gap or report.wheels:
         lines.append(_gap_line(report))
     if report.remains is not None:
-        lines.append(report.remains.in_words())
+        lines.append(report.remains.describe())
     blind = [spot.name for spot in report.blind_spots if spot.blind]
     if blind:
         names = ", ".join(blind) if len(blind) <= _MOST_NAMES else f"{len(blind)} effects, listed below,"
-        ask = f"Drive next: `{report.drive}`; this" if report.drive else "This"
-        lines.append(f"{ask} log could not have shown {names} of realistic size.")
+        advice = f"Drive next: `{report.drive}`; this" if report.drive else "This"
+        lines.append(f"{advice} log could not have shown {names} of realistic size.")
     if report.provenance is not None:
         lines.append(f"Go on: `{report.provenance.go_on}`.")
     return lines
@@ -87,28 +89,28 @@ def _gap_line(report: GapReport) -> str:
         for stage, errors in of.items()
     }
     last = f"the sensors' noise makes {off['floor']}" if "floor" in off else f"the model as given by {off['nominal']}"
-    said = (
+    line = (
         f"{horizon} ahead, in parts of the log that were not used, {'predictions' if report.gap else 'the wheels'} "
         f"are off by {off['timed']} with a delay and a lag alone (timed), by {off['amended']} with what was found "
         f"(amended); {last}."
     )
     if "written" in off:
-        said += f" Without what no model can hold, as it is written, the amended model errs by {off['written']}."
+        line += f" Without what no model can hold, as it is written, the amended model errs by {off['written']}."
     if report.why_not_amended is None:
-        return said
+        return line
     offered = report.offered if report.gap or report.offered == "timed" else "given"
-    return f"{said} Drive with the {offered} model, which is in model.toml. {report.why_not_amended}"
+    return f"{line} Drive with the {offered} model, which is in model.toml. {report.why_not_amended}"
 
 
 def as_text(report: GapReport) -> str:
     """The report for a terminal."""
-    lines = [*(f"warning: {warning}" for warning in report.warnings), *answer(report), ""]
+    lines = [*(f"warning: {warning}" for warning in report.warnings), *summary_lines(report), ""]
     for effect in report.effects:
         values = ", ".join(f"{n} {e.value:.4g} [{e.low:.4g}, {e.high:.4g}]" for n, e in effect.parameters.items())
         lines.append(f"{effect.channel}: {effect.name}: {values}{_confounded(effect)}")
-    lines += [f"{term.channel}: unnamed: {_in_words(term)}{_confounded(term)}" for term in report.unnamed]
-    lines += [f"doubtful: {doubt.name}: {doubt.why}" for doubt in report.doubtful]
-    lines += [*report.residue, *_logs_in_words(report), *report.notes]
+    lines += [f"{term.channel}: unnamed: {_describe(term)}{_confounded(term)}" for term in report.unnamed]
+    lines += [f"doubtful: {one.name}: {one.why}" for one in report.doubtful]
+    lines += [*report.residue, *_describe_logs(report), *report.notes]
     of = report.gap or report.wheels
     if of:
         title = "" if report.gap else "way and heading that the wheels make:"
@@ -119,7 +121,7 @@ def as_text(report: GapReport) -> str:
     return "\n".join(lines)
 
 
-def _logs_in_words(report: GapReport) -> list[str]:
+def _describe_logs(report: GapReport) -> list[str]:
     """What several logs have in common, and what differs from one to the next."""
     if len(report.sources) < 2:
         return []
@@ -138,7 +140,7 @@ def _in_cell(errors: PredictionErrors) -> str:
     return f"{1e3 * errors.position_m:9.1f} mm {errors.yaw_rad:6.3f} rad"
 
 
-def _in_words(term: UnnamedFinding) -> str:
+def _describe(term: UnnamedFinding) -> str:
     """The equation of a term, and what it means where that is known."""
     return term.form if term.meaning is None else f"{term.form} ({term.meaning})"
 
@@ -170,17 +172,22 @@ _DEFINITIONS = {
 
 def page(report: GapReport) -> str:
     """The whole page: the answer, the definitions in the margin, pictures, findings; expert tables folded."""
-    lines = "".join(f"<p>{_with_code(line)}</p>" for line in answer(report))
-    words = "".join(f"<dt>{name}</dt><dd>{escape(text)}</dd>" for name, text in _DEFINITIONS.items())
+    lines = "".join(f"<p>{_with_code(line)}</p>" for line in summary_lines(report))
+    glossary = "".join(f"<dt>{name}</dt><dd>{escape(text)}</dd>" for name, text in _DEFINITIONS.items())
     warned = "".join(f'<p class="warn">{escape(warning)}</p>' for warning in report.warnings)
-    parts = [warned, f'<div class="answer">{lines}</div>', _whence(report), f"<aside><dl>{words}</dl></aside>"]
+    parts = [
+        warned,
+        f'<div class="answer">{lines}</div>',
+        _format_source(report),
+        f"<aside><dl>{glossary}</dl></aside>",
+    ]
     parts += [
         reports.picture(data, name, _CAPTIONS.get(name, name.replace("_", " ")))
         for name, data in report.pictures.items()
     ]
     parts.append("<h2>What is missing</h2>" + _effects(report))
     if report.doubtful:
-        doubts = (f"{doubt.name}: {doubt.why}" for doubt in report.doubtful)
+        doubts = (f"{one.name}: {one.why}" for one in report.doubtful)
         parts.append("<h2>What fits and is not to be believed</h2>" + _list(doubts))
     if report.residue:
         parts.append("<h2>What is still left</h2>" + _list(report.residue))
@@ -205,15 +212,15 @@ def _with_code(line: str) -> str:
     return "".join(f"<code>{piece}</code>" if k % 2 else piece for k, piece in enumerate(pieces))
 
 
-def _whence(report: GapReport) -> str:
+def _format_source(report: GapReport) -> str:
     """Verdict, logs, and whose, when and by what."""
-    said = f"Verdict: <b>{report.verdict}</b>. Logs: {escape(', '.join(report.sources))}."
+    line = f"Verdict: <b>{report.verdict}</b>. Logs: {escape(', '.join(report.sources))}."
     made = report.provenance
     if made is not None:
         model = "its nominal model" if made.model_file is None else made.model_file
-        said += f" Robot: {escape(made.robot)} ({escape(made.robot_file)}), compared with {escape(model)}. "
-        said += f"Made {escape(made.date)} by disco-hw {escape(made.version)} in {report.seconds:.0f} s."
-    return f"<p>{said}</p>"
+        line += f" Robot: {escape(made.robot)} ({escape(made.robot_file)}), compared with {escape(model)}. "
+        line += f"Made {escape(made.date)} by disco-hw {escape(made.version)} in {report.seconds:.0f} s."
+    return f"<p>{line}</p>"
 
 
 def _folded(title: str, content: str) -> str:
@@ -256,7 +263,7 @@ def _effects(report: GapReport) -> str:
             "in the amended model" if term.in_model else "not in the model: it depends on what no model's state holds"
         )
         also, test = ", ".join(term.indistinguishable_from), f"; {term.experiment}" if term.experiment else ""
-        rows.append(("unnamed", term.channel, _in_words(term), f"{term.evidence:.0f}", also, place + test))
+        rows.append(("unnamed", term.channel, _describe(term), f"{term.evidence:.0f}", also, place + test))
     if not rows:
         return "<p>Nothing that this log shows.</p>"
     head = (
@@ -318,5 +325,5 @@ def _blind(report: GapReport) -> str:
         rows.append(
             (spot.name, size, _PROOFS[spot.proved], "blind to realistic sizes" if spot.blind else "", spot.experiment)
         )
-    ask = f"<p>All of it in a minute: <code>{escape(report.drive)}</code>.</p>" if report.drive else ""
-    return ask + _table(("effect", "smallest visible", "proof", "", "the drive that shows it"), rows)
+    advice = f"<p>All of it in a minute: <code>{escape(report.drive)}</code>.</p>" if report.drive else ""
+    return advice + _table(("effect", "smallest visible", "proof", "", "the drive that shows it"), rows)

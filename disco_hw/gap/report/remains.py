@@ -67,7 +67,7 @@ class Remains:
         """Whether errors are at most twice what the sensors' noise makes, in position and in heading."""
         return all(after <= _EXPLAINED * floor for after, floor in zip(self.after, self.floor, strict=True))
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """Which share of the gap is closed, and where most of the rest lies."""
         shares = [
             f"{share:.0%} in {name}" for share, name in zip(self.closed, ("position", "heading"), strict=True)

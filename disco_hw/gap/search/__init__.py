@@ -41,14 +41,14 @@ from disco_hw.gap.search.cross_validation import (
     floor_errors,
     fold_of,
     fold_vectors,
-    judged_horizon_s,
+    scored_horizon_s,
     smoothed_poses,
     within_one_standard_error,
     worse_by,
 )
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
 from disco_hw.gap.search.least_squares import Fit, inverse
-from disco_hw.gap.search.richest_model import LATE_COLUMNS, LATE_STARTS_S, with_delay
+from disco_hw.gap.search.richest_model import DELAY_COLUMNS, DELAY_STARTS_S, with_delay
 
 Array = NDArray[np.float64]
 
@@ -69,13 +69,13 @@ class StagePredictions:
     kept: tuple[GapAnalysis, FinalFit] | None = None
 
     @property
-    def judged_horizon_s(self) -> float:
+    def scored_horizon_s(self) -> float:
         """How far ahead stages are compared."""
-        return judged_horizon_s(self.body, self.poses)
+        return scored_horizon_s(self.body, self.poses)
 
     def errors(self, stage: str, ahead_s: float | None = None) -> PredictionErrors:
         """Errors of one stage on held-out data so far ahead, or as far as stages are compared."""
-        ahead_s = self.judged_horizon_s if ahead_s is None else ahead_s
+        ahead_s = self.scored_horizon_s if ahead_s is None else ahead_s
         return errors_of(self.body, self.wheels, self.chains[stage], ahead_s, self.poses)
 
     def errors_of_body(self, stage: str) -> PredictionErrors | None:
@@ -83,7 +83,7 @@ class StagePredictions:
         if self.wheels is None:
             return None
         measured = {held: replace(chain, wheels=None) for held, chain in self.chains[stage].items()}
-        return errors_of(self.body, None, measured, self.judged_horizon_s, self.poses)
+        return errors_of(self.body, None, measured, self.scored_horizon_s, self.poses)
 
     def table(self) -> dict[str, dict[float, PredictionErrors]]:
         """Errors by stage and horizon, with the floor, for which the wheels' path is that of the geometry alone."""
@@ -109,7 +109,7 @@ def stage_predictions(analysis: GapAnalysis, final: FinalFit | None = None) -> S
     assert wheel_channel is None or isinstance(wheel_channel, WheelChannel)
     chains = {
         stage: _chains(analysis, final, _by_fold(analysis, fits))
-        for stage, fits in (("refitted", _base(analysis)), ("amended", _whole(analysis, final)))
+        for stage, fits in (("refitted", _base(analysis)), ("amended", _all_fits(analysis, final)))
     }
     poses = smoothed_poses(channel, final.final_body.vector)
     return StagePredictions(channel, wheel_channel, chains, poses)
@@ -128,16 +128,16 @@ class _Fitted:
         """Fit all data, and each of the `folds` from where it begins; without them, from the fit of all data."""
         joint = ahead.fit(of)
         begin = dict.fromkeys(range(ahead.folds), of.at(joint.vectors)) if folds is None else folds
-        return cls(of, joint, {held: ahead.fit(start, held) for held, start in begin.items()})
+        return cls(of, joint, {fold: ahead.fit(start, fold) for fold, start in begin.items()})
 
-    def at(self, held: int | None = None) -> Freed:
+    def at(self, fold: int | None = None) -> Freed:
         """What was freed, around the fit of all data or around that without one fold."""
-        return self.of.at((self.joint if held is None else self.folds[held]).vectors)
+        return self.of.at((self.joint if fold is None else self.folds[fold]).vectors)
 
     @property
     def chains(self) -> dict[int, Chain]:
         """The chains of the folds."""
-        return {held: self.of.chain(fitted.vectors) for held, fitted in self.folds.items()}
+        return {fold: self.of.chain(fitted.vectors) for fold, fitted in self.folds.items()}
 
 
 def joint_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePredictions:
@@ -184,25 +184,25 @@ class _Candidate:
     def of_channels(cls, analysis: GapAnalysis, apart: StagePredictions) -> _Candidate:
         """All that was found, from where the channels apart have it."""
         trust, final = apart.body.settings.prediction.joint_trust**-2.0, final_fit(analysis)
-        whole = _whole(analysis, final)
+        fits = _all_fits(analysis, final)
 
         def chain(vectors: Sequence[Array]) -> Chain:
             return _chain(analysis, final, vectors)
 
         of_all = tuple(
             Part(one.selector.channel.layout, fitted.vector, fitted.active, trust * fitted.information())
-            for one, fitted in zip((analysis.body, analysis.wheels), whole, strict=False)
+            for one, fitted in zip((analysis.body, analysis.wheels), fits, strict=False)
             if one is not None
         )
         by_fold = {}
-        for held, vectors in _by_fold(analysis, whole).items():
-            inside = zip(of_all, vectors, whole, (apart.body, apart.wheels), strict=False)
+        for fold, vectors in _by_fold(analysis, fits).items():
+            inside = zip(of_all, vectors, fits, (apart.body, apart.wheels), strict=False)
             folded = tuple(
-                replace(part, vector=vector, information=trust * _information(one, channel, held))
+                replace(part, vector=vector, information=trust * _information(one, channel, fold))
                 for part, vector, one, channel in inside
                 if channel is not None
             )
-            by_fold[held] = Freed(folded, chain)
+            by_fold[fold] = Freed(folded, chain)
         return cls(analysis, final, Freed(of_all, chain), by_fold)
 
     def on_top(self, timed: _Fitted) -> tuple[_Candidate, ...]:
@@ -215,7 +215,7 @@ class _Candidate:
             replace(
                 self,
                 of=_on_top(self.of, timed.at(), there),
-                by_fold={held: _on_top(of, timed.at(held), there) for held, of in self.by_fold.items()},
+                by_fold={fold: _on_top(of, timed.at(fold), there) for fold, of in self.by_fold.items()},
             )
             for there in starts
         )
@@ -224,21 +224,21 @@ class _Candidate:
         """Whether `timed` makes wheels late by much more or less than their channel."""
         if len(timed.parts) == 1:
             return False
-        own, plain = self.of.parts[1], timed.parts[1].vector
-        late = [own.layout.place[name] for name in LATE_COLUMNS]
-        far_s: float = self.analysis.drive.settings.prediction.late_far_s
-        return bool(np.abs(own.vector[late] - plain[late]).max() > far_s)
+        amended, plain = self.of.parts[1], timed.parts[1].vector
+        delay_places = [amended.layout.place[name] for name in DELAY_COLUMNS]
+        far_s: float = self.analysis.drive.settings.prediction.delay_far_s
+        return bool(np.abs(amended.vector[delay_places] - plain[delay_places]).max() > far_s)
 
-    def judged(self, ahead: Ahead, apart: StagePredictions) -> _Judged:
+    def evaluate(self, ahead: Ahead, apart: StagePredictions) -> _Evaluated:
         """What it errs by on held-out data."""
-        folds = {held: ahead.fit(of, held) for held, of in self.by_fold.items()}
-        chains = {held: of.chain(folds[held].vectors) for held, of in self.by_fold.items()}
-        errors = errors_of(apart.body, apart.wheels, chains, apart.judged_horizon_s, apart.poses)
-        return _Judged(self, folds, errors)
+        folds = {fold: ahead.fit(of, fold) for fold, of in self.by_fold.items()}
+        chains = {fold: of.chain(folds[fold].vectors) for fold, of in self.by_fold.items()}
+        errors = errors_of(apart.body, apart.wheels, chains, apart.scored_horizon_s, apart.poses)
+        return _Evaluated(self, folds, errors)
 
 
 @dataclass(frozen=True)
-class _Judged:
+class _Evaluated:
     """A candidate, its fits without each fold, and their errors on that."""
 
     candidate: _Candidate
@@ -278,22 +278,22 @@ def of_every_log(analysis: GapAnalysis, final: FinalFit) -> GapAnalysis:
     return analysis
 
 
-def _needed(analysis: GapAnalysis, timed: _Fitted, ahead: Ahead, apart: StagePredictions) -> _Judged:
+def _needed(analysis: GapAnalysis, timed: _Fitted, ahead: Ahead, apart: StagePredictions) -> _Evaluated:
     """The candidate that has what predictions need of all that was found.
 
     What goes, the least evident first, is what held-out data are predicted as well without as by the best, within one
     standard error (Breiman et al., Classification and Regression Trees, 1984, ch. 3): what a log does not need is as
     likely of this log alone.
     """
-    whole = _Candidate.of_channels(analysis, apart)
-    kept = whole.judged(ahead, apart)
+    of_channels = _Candidate.of_channels(analysis, apart)
+    kept = of_channels.evaluate(ahead, apart)
     if not analysis.found_any:
         return kept
 
-    def topped(candidate: _Candidate) -> _Judged:
-        return min((one.judged(ahead, apart) for one in candidate.on_top(timed)), key=lambda one: one.size)
+    def topped(candidate: _Candidate) -> _Evaluated:
+        return min((one.evaluate(ahead, apart) for one in candidate.on_top(timed)), key=lambda one: one.size)
 
-    kept = best = min(kept, topped(whole), key=lambda one: one.size)
+    kept = best = min(kept, topped(of_channels), key=lambda one: one.size)
     for which, name in least_evident_first(analysis):
         fewer = lacking(kept.candidate.analysis, which, name)
         if not fewer.found_any:
@@ -314,15 +314,15 @@ def _on_top(amended: Freed, timed: Freed, there: bool) -> Freed:
     than it should be.
     """
     parts = []
-    for own, plain in zip(amended.parts, timed.parts, strict=True):
-        active = (*plain.active, *(place for place in own.active if place not in plain.active))
-        others = [k for k, place in enumerate(own.active) if place not in plain.active]
-        trusted = inverse(inverse(own.information)[np.ix_(others, others)])
-        vector, low, both = own.vector.copy(), own.layout.low.copy(), list(plain.active)
+    for part, plain in zip(amended.parts, timed.parts, strict=True):
+        active = (*plain.active, *(place for place in part.active if place not in plain.active))
+        others = [k for k, place in enumerate(part.active) if place not in plain.active]
+        trusted = inverse(inverse(part.information)[np.ix_(others, others)])
+        vector, low, both = part.vector.copy(), part.layout.low.copy(), list(plain.active)
         low[both] = plain.layout.low[both]
         vector[both] = plain.vector[both] if there else np.maximum(vector[both], low[both])
         information = block_diag(plain.information, trusted) if others else plain.information
-        parts.append(Part(replace(own.layout, low=low), vector, active, information))
+        parts.append(Part(replace(part.layout, low=low), vector, active, information))
     return replace(amended, parts=tuple(parts))
 
 
@@ -346,7 +346,7 @@ def _timed(ahead: Ahead, refitted: Freed) -> Freed:
     if len(refitted.parts) == 1:
         return refitted
     body, wheels = refitted.parts
-    places = tuple(wheels.layout.place[column] for column in LATE_COLUMNS)
+    places = tuple(wheels.layout.place[column] for column in DELAY_COLUMNS)
     new = tuple(place for place in places if place not in wheels.active)
     information = block_diag(wheels.information, np.zeros((len(new),) * 2))
     # Wheels are never ahead of their command in a model that drives.
@@ -355,9 +355,9 @@ def _timed(ahead: Ahead, refitted: Freed) -> Freed:
     layout = replace(wheels.layout, low=low)
     wider = replace(wheels, layout=layout, active=(*wheels.active, *new), information=information)
     options = []
-    for late_s in LATE_STARTS_S:
+    for delays_s in DELAY_STARTS_S:
         vector = wider.vector.copy()
-        vector[list(places)] = late_s
+        vector[list(places)] = delays_s
         options.append(replace(refitted, parts=(body, replace(wider, vector=vector))))
     fitted = [option.at(ahead.fit(option).vectors) for option in options]
     return min(fitted, key=lambda one: ahead.usual_cost(one.chain([part.vector for part in one.parts])))
@@ -368,10 +368,10 @@ def _base(analysis: GapAnalysis) -> list[Fit]:
     return [found.base for found in (analysis.body, analysis.wheels) if found is not None]
 
 
-def _whole(analysis: GapAnalysis, final: FinalFit) -> list[Fit]:
+def _all_fits(analysis: GapAnalysis, final: FinalFit) -> list[Fit]:
     """Fits of both channels, or of the body, with all that was found."""
     assert final.final_body is not None
-    return [final.final_body, *([] if analysis.wheels is None else [analysis.wheels.told])]
+    return [final.final_body, *([] if analysis.wheels is None else [analysis.wheels.reported])]
 
 
 def _by_fold(analysis: GapAnalysis, fits: Sequence[Fit]) -> dict[int, list[Array]]:
@@ -382,11 +382,11 @@ def _by_fold(analysis: GapAnalysis, fits: Sequence[Fit]) -> dict[int, list[Array
         fold_vectors(one, fold_of(found.channel), count, found.selector.channel.neutral, settings)
         for found, one in zip(channels, fits, strict=True)
     ]
-    return {held: [vectors[held] for vectors in by_channel] for held in range(count)}
+    return {fold: [vectors[fold] for vectors in by_channel] for fold in range(count)}
 
 
 def _chains(analysis: GapAnalysis, final: FinalFit, by_fold: Mapping[int, Sequence[Array]]) -> dict[int, Chain]:
-    return {held: _chain(analysis, final, vectors) for held, vectors in by_fold.items()}
+    return {fold: _chain(analysis, final, vectors) for fold, vectors in by_fold.items()}
 
 
 def _chain(analysis: GapAnalysis, final: FinalFit, vectors: Sequence[Array]) -> Chain:

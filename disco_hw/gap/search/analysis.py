@@ -18,7 +18,7 @@ from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.search.channel_result import ChannelEstimates, ChannelResult, ParameterEstimate, estimate_parameters
 from disco_hw.gap.search.least_squares import Fit, fit
-from disco_hw.gap.search.richest_model import LATE, indices
+from disco_hw.gap.search.richest_model import DELAY_NAMES, indices
 from disco_hw.gap.search.selection import inflation
 from disco_hw.gap.settings import SelectionSettings
 
@@ -120,7 +120,7 @@ class GapAnalysis:
     def adds_to_timed(self) -> bool:
         """Whether anything is missing beyond a delay and a lag."""
         channels = [found for found in (self.body, self.wheels) if found is not None]
-        return any(found.unnamed or set(found.names) - {*found.selector.given, *LATE} for found in channels)
+        return any(found.unnamed or set(found.names) - {*found.selector.given, *DELAY_NAMES} for found in channels)
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,7 @@ def _with_encoder(body: ChannelResult, wheels: ChannelResult) -> tuple[Fit, Chan
     vector = body.fit.vector.copy()
     vector[channel.layout.place[ASYMMETRY_COLUMN]] = 0.0
     for side in ("left", "right"):
-        gain = wheels.told.vector[wheels.selector.channel.layout.place[f"{GAIN}.{side}"]]
+        gain = wheels.reported.vector[wheels.selector.channel.layout.place[f"{GAIN}.{side}"]]
         vector[channel.layout.place[f"{ENCODER}.{side}"]] = gain
     refitted = fit(channel, vector, indices(channel, names))
     selector = replace(body.selector, fits={frozenset(names): refitted}, proofs={})
@@ -197,7 +197,7 @@ def least_evident_first(analysis: GapAnalysis) -> list[tuple[str, str | None]]:
         if found is None:
             continue
         for name, rest in each_name(found):
-            if name not in LATE:
+            if name not in DELAY_NAMES:
                 out.append((found.selector.evidence(rest, found.names).score, which, name))
         if found.unnamed:
             out.append((max(term.evidence.score for term in found.unnamed), which, None))

@@ -61,9 +61,9 @@ class ChannelResult:
         return _evenly(self)
 
     @cached_property
-    def told(self) -> Fit:
+    def reported(self) -> Fit:
         """The fit that values are told of and predictions made with: where the noise model does not hold, another."""
-        return _told(self)
+        return _reported_fit(self)
 
     @property
     def base(self) -> Fit:
@@ -86,7 +86,7 @@ def _evenly(found: ChannelResult) -> Fit | None:
     return other
 
 
-def _told(found: ChannelResult) -> Fit:
+def _reported_fit(found: ChannelResult) -> Fit:
     """The accepted set as it was fitted, or to errors that are alike at every speed, if blocks agree better on that.
 
     The noise of wheels is taken to grow with their speed, and weighs slow ones most. What the accepted set cannot
@@ -137,21 +137,21 @@ class ChannelEstimates:
 
 def sampling_covariance(found: ChannelResult) -> Array:
     """Covariance (A, A) of what a channel's accepted set frees, as an estimate of the values of this log."""
-    best, channel = found.told, found.selector.channel
+    best, channel = found.reported, found.selector.channel
     factors = np.array([interval_inflation(best, channel, (index,)) for index in best.active])
     return np.asarray(best.covariance() * np.sqrt(np.outer(factors, factors)))
 
 
 def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
     """Intervals of all parameters that a channel's accepted set frees: where the next drive's values are expected."""
-    best, channel = found.told, found.selector.channel
+    best, channel = found.reported, found.selector.channel
     columns = channel.layout.columns
     covariance = sampling_covariance(found)
-    own = np.maximum(np.diag(covariance), 1e-300)
-    wandering, apart, stamped = wandered(found), _weightings_apart(found), _stamped(found)
+    variances = np.maximum(np.diag(covariance), 1e-300)
+    wandering, apart, stamped = drifted(found), _weightings_apart(found), _stamped(found)
     more = np.array(
         [
-            (wandering.get(columns[index], 0.0) + apart[place] + stamped.get(columns[index], 0.0)) / own[place]
+            (wandering.get(columns[index], 0.0) + apart[place] + stamped.get(columns[index], 0.0)) / variances[place]
             for place, index in enumerate(best.active)
         ]
     )
@@ -176,7 +176,7 @@ def _weightings_apart(found: ChannelResult) -> Array:
     (Hausman, 1978); as it is not, either finds what its own mixture of slow and fast wheels makes of it. Two values
     that differ by d vary by d^2 / 2.
     """
-    best, evenly = found.told, found.evenly
+    best, evenly = found.reported, found.evenly
     if evenly is None:
         return np.zeros(len(best.active))
     chosen = list(best.active)
@@ -254,7 +254,7 @@ class InParts:
         return float((self.values[other] - self.values[one]) / np.hypot(self.deviations[one], self.deviations[other]))
 
 
-def wandered(found: ChannelResult) -> dict[str, float]:
+def drifted(found: ChannelResult) -> dict[str, float]:
     """Variance of each parameter from this log to the next, by full name.
 
     What halves surely differ by goes on from drive to drive, as a random walk does. Of what changes more quickly a
@@ -292,7 +292,7 @@ def in_parts(found: ChannelResult, parts: NDArray[np.int64], some: bool = False)
     `parts` (B,): the part of each block of time of the channel, in order; `some`: those that say enough of a parameter,
     where there are two.
     """
-    best, channel, layout = found.told, found.selector.channel, found.selector.channel.layout
+    best, channel, layout = found.reported, found.selector.channel, found.selector.channel.layout
     labels = np.unique(parts)
     settings = channel.settings
     each = settings.selection.block_lengths[1]
@@ -301,11 +301,11 @@ def in_parts(found: ChannelResult, parts: NDArray[np.int64], some: bool = False)
     least = settings.fit.part_known_share / labels.size
     # What a part cannot tell from others it does not know, however much depends on it: a circle has one axial distance
     # for every pair of wheels.
-    whole = 1.0 / np.diag(inverse(normal.sum(axis=0)))
-    enough = np.array([1.0 / np.diag(inverse(normal[of].sum(axis=0))) > least * whole for of in inside])
+    pooled = 1.0 / np.diag(inverse(normal.sum(axis=0)))
+    enough = np.array([1.0 / np.diag(inverse(normal[of].sum(axis=0))) > least * pooled for of in inside])
     if not some:
         enough[:] = enough.all(axis=0)
-    said: dict[int, list[tuple[float, float]]] = {index: [] for index in best.active}
+    estimates: dict[int, list[tuple[float, float]]] = {index: [] for index in best.active}
     for of, knows in zip(inside, enough, strict=True):
         places = np.array(best.active)[knows]
         if not places.size:
@@ -322,5 +322,5 @@ def in_parts(found: ChannelResult, parts: NDArray[np.int64], some: bool = False)
         variance = np.maximum(np.diag(covariance), (left**2).sum(axis=0))
         values = np.clip(best.vector[places] + step, layout.low[places], layout.high[places])
         for index, value, deviation in zip(places.tolist(), values.tolist(), np.sqrt(variance).tolist(), strict=True):
-            said[index].append((value, deviation))
-    return {layout.columns[index]: InParts(*np.array(of).T) for index, of in said.items() if len(of) > 1}
+            estimates[index].append((value, deviation))
+    return {layout.columns[index]: InParts(*np.array(of).T) for index, of in estimates.items() if len(of) > 1}

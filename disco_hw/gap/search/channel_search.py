@@ -20,9 +20,9 @@ from disco_hw.gap.noise.wheel_noise import WheelNoise, whiten_wheels
 from disco_hw.gap.search.channel_result import ChannelResult, UnnamedTerm
 from disco_hw.gap.search.least_squares import Fit, fit, inverse
 from disco_hw.gap.search.richest_model import (
-    LATE,
-    LATE_COLUMNS,
-    LATE_STARTS_S,
+    DELAY_COLUMNS,
+    DELAY_NAMES,
+    DELAY_STARTS_S,
     delay_columns,
     delays_of,
     indices,
@@ -54,14 +54,14 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
     `geometry` (3,) is how far they move the robot; `start` is the vector without what is missing, in which effects
     `given` are known already.
     """
-    channel = WheelChannel.build(_as_laid(drive), WheelNoise(reading_rad=max(drive.quantum_rad, 2e-4)), geometry)
+    channel = WheelChannel.build(_on_own_clock(drive), WheelNoise(reading_rad=max(drive.quantum_rad, 2e-4)), geometry)
     moves = wheel_moves(channel, geometry)
     settings = drive.settings.selection
     # What is left of a rough fit becomes the noise of all that follow.
     seen = with_delay(channel, start)
     limits = Thresholds(settings.unnamed_score, 0.0, settings.unnamed_score)
     rough = Selector(channel, moves, limits, given=given, start=seen, closely=True)
-    begin = tuple(dict.fromkeys((*given, *LATE)))
+    begin = tuple(dict.fromkeys((*given, *DELAY_NAMES)))
     responding(rough, begin)
     names = rough.greedy(begin, responding)
     rich = (*names, *(name for name in smooth_of(WHEEL) if name not in names))
@@ -78,7 +78,7 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
         selector.fits[frozenset(names)] = fit(channel, rough.fit(names).vector, indices(channel, names))
         richest = (white * channel.weight).ravel()
         found = ChannelResult(selector, selector.select(names), channel, richest=richest, richest_parameters=many)
-        return judged(stamped(with_unnamed(found, _wheel_options), drive), given, start)
+        return evaluated_channel(stamped(with_unnamed(found, _wheel_options), drive), given, start)
 
     found = searched(sound)
     # Where nothing known comes near, the noise is too little to compare what is all wrong: the family shows in the
@@ -86,13 +86,13 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
     return searched(plain) if found.fit.cost > settings.far_off * 0.5 * sound.count else found
 
 
-def _as_laid(drive: GriddedDrive) -> GriddedDrive:
+def _on_own_clock(drive: GriddedDrive) -> GriddedDrive:
     """A drive as if commands and poses were stamped where they lie.
 
     So a search is the same wherever their stamps are, to the last bit.
     """
-    late_s = drive.pose_delay_s - drive.poses_moved_s
-    return replace(drive, commands_moved_s=0.0, poses_moved_s=0.0, pose_delay_s=late_s)
+    delay_s = drive.pose_delay_s - drive.poses_moved_s
+    return replace(drive, commands_moved_s=0.0, poses_moved_s=0.0, pose_delay_s=delay_s)
 
 
 def stamped(found: ChannelResult, drive: GriddedDrive) -> ChannelResult:
@@ -131,7 +131,7 @@ def timed(selector: Selector) -> Selector:
     return replace(selector, given=given, start=with_delay(channel, start), fits={}, proofs={})
 
 
-def judged(found: ChannelResult, given: Names, start: Array) -> ChannelResult:
+def evaluated_channel(found: ChannelResult, given: Names, start: Array) -> ChannelResult:
     """The same when a delay must be worth its name as all else: against none, in a vector that has `given` alone.
 
     The others stay as they were found beside it: one that is too short for a name would change them too.
@@ -148,8 +148,8 @@ def judged(found: ChannelResult, given: Names, start: Array) -> ChannelResult:
         start = _extended(plain, found.selector.channel)
     selector = against_none(found.selector, start)
     layout = selector.channel.layout
-    delays, late = delays_of(layout), LATE if layout.of_wheels else ()
-    names = selector.needed(selector.swapped(selector.needed(found.names, delays), late), delays)
+    delays, delay_names = delays_of(layout), DELAY_NAMES if layout.of_wheels else ()
+    names = selector.needed(selector.swapped(selector.needed(found.names, delays), delay_names), delays)
     return _written(replace(found, selector=selector, plain=plain, names=names))
 
 
@@ -160,12 +160,12 @@ def responding(selector: Selector, names: Names) -> None:
     other. And what stops the wheels looks slow until it is named: then the others are fitted without a response first.
     """
     channel, before = selector.channel, selector.fits.get(frozenset(names))
-    others = tuple(name for name in names if name in selector.given or name not in LATE)
+    others = tuple(name for name in names if name in selector.given or name not in DELAY_NAMES)
     active = indices(channel, names)
-    places = [channel.layout.place[column] for column in LATE_COLUMNS]
+    places = [channel.layout.place[column] for column in DELAY_COLUMNS]
     plain = selector.fit(others).vector
     options = [] if before is None else [before, fit(channel, plain, active)]
-    for response_s in LATE_STARTS_S if before is None else ():
+    for response_s in DELAY_STARTS_S if before is None else ():
         vector = plain.copy()
         vector[places] = response_s
         vector += with_delay(channel, channel.layout.neutral) - channel.layout.neutral
@@ -175,7 +175,7 @@ def responding(selector: Selector, names: Names) -> None:
 
 def search_body(drive: GriddedDrive, start: Array, given: Names = ()) -> ChannelResult:
     """Effects between measured wheel angles and measured poses; `start` and `given` as for the wheels."""
-    here, begin = _as_laid(drive), start.copy()
+    here, begin = _on_own_clock(drive), start.copy()
     begin[[BODY.place[column] for column in delay_columns(BODY)]] = here.pose_delay_s
     channel = BodyChannel.build(here, BodyNoise(), begin)
     nominal = fit(channel, _later(start, drive, BODY, -1.0), indices(channel, given))
@@ -196,7 +196,7 @@ def search_body(drive: GriddedDrive, start: Array, given: Names = ()) -> Channel
     selector = timed(Selector(channel, body_moves(channel), limits, given=given, start=rough.fit(given).vector))
     richest = channel.residual(fullest, extra)
     found = ChannelResult(selector, selector.select(), channel, richest=richest, richest_parameters=many)
-    return judged(stamped(_time_or_place(found), drive), given, _later(nominal.vector, drive, BODY, 1.0))
+    return evaluated_channel(stamped(_time_or_place(found), drive), given, _later(nominal.vector, drive, BODY, 1.0))
 
 
 def _time_or_place(found: ChannelResult) -> ChannelResult:
@@ -282,8 +282,8 @@ def _written(found: ChannelResult) -> ChannelResult:
     """The same, its terms with the coefficients that are told."""
     if not found.unnamed:
         return found
-    told, ends = found.told.vector, np.cumsum([len(one.term.features) for one in found.unnamed])
-    coefficients = np.split(told[told.size - ends[-1] :], ends[:-1])
+    vector, ends = found.reported.vector, np.cumsum([len(one.term.features) for one in found.unnamed])
+    coefficients = np.split(vector[vector.size - ends[-1] :], ends[:-1])
     written = zip(found.unnamed, coefficients, strict=True)
     return replace(found, unnamed=tuple(replace(one, form=one.term.written(values)) for one, values in written))
 
@@ -361,9 +361,9 @@ def best_terms(small: Fit, channel: ResidualChannel, options: Iterator[Term]) ->
     settings = channel.settings.terms
     promising: list[tuple[float, Term]] = []
     tried = 0
-    core, held = channel.split(small.vector)
+    core, fixed = channel.split(small.vector)
     inner = channel.inner
-    base = inner.residual(core, held)
+    base = inner.residual(core, fixed)
     solved, gradient = inverse(small.information()), small.gradient
     for term in options:
         tried += 1
@@ -373,17 +373,17 @@ def best_terms(small: Fit, channel: ResidualChannel, options: Iterator[Term]) ->
             if size < 1e-9:
                 continue
             epsilon = 1e-3 / size
-            perturbation = epsilon * feature if held is None else held + epsilon * feature
+            perturbation = epsilon * feature if fixed is None else fixed + epsilon * feature
             columns.append((inner.residual(core, perturbation) - base) / epsilon)
         if not columns:
             continue
         slope = np.column_stack(columns)
         across = small.jacobian.T @ slope
-        own = slope.T @ slope - across.T @ solved @ across
+        information = slope.T @ slope - across.T @ solved @ across
         pull = slope.T @ small.residual - across.T @ solved @ gradient
-        if np.trace(own) < settings.least_own_share * float((slope**2).sum()):
+        if np.trace(information) < settings.least_independent_share * float((slope**2).sum()):
             continue
-        coefficients = -inverse(own) @ pull
+        coefficients = -inverse(information) @ pull
         gain = -0.5 * float(pull @ coefficients) - 0.5 * (len(columns) - 1) * math.log(channel.count)
         if gain > settings.worth_trying_nats and coefficients.max() <= term.highest:
             promising.append((gain, term))

@@ -22,7 +22,7 @@ from disco_hw.gap.search.analysis import GapAnalysis
 from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.channel_search import responding
 from disco_hw.gap.search.least_squares import Fit, by_block, inverse, known
-from disco_hw.gap.search.richest_model import LATE
+from disco_hw.gap.search.richest_model import DELAY_NAMES
 from disco_hw.gap.settings import GRID_STEP_S, GapSettings, PredictionSettings
 
 Array = NDArray[np.float64]
@@ -174,7 +174,7 @@ def find_starts(channel: BodyChannel, poses: tuple[Array, Array], ahead_s: float
     return Starts(node, smooth[node], alone[node + ahead], block, tuple(regimes_driven(channel, node, ahead)))
 
 
-def judged_horizon_s(channel: BodyChannel, poses: tuple[Array, Array]) -> float:
+def scored_horizon_s(channel: BodyChannel, poses: tuple[Array, Array]) -> float:
     """How far ahead stages are compared: as the answer looks, or the longest below that runs are long enough for."""
     settings = channel.settings.prediction
     shorter = sorted((each for each in settings.horizons_s if each <= settings.reported_horizon_s), reverse=True)
@@ -269,7 +269,7 @@ def fold_vectors(found: Fit, fold: Index, count: int, neutral: Array, settings: 
     # What was expected before any log was looked at is expected of each fold.
     precision = np.zeros(active.size) if found.precision is None else found.precision
     pull = precision * (found.vector[active] - neutral[active])
-    for place, held in enumerate(present.tolist()):
+    for place, left_out in enumerate(present.tolist()):
         vector, others = found.vector.copy(), np.delete(normal, place, axis=0).sum(axis=0)
         pulled = np.delete(gradient, place, axis=0).sum(axis=0) + pull
         determined = known(others, normal.sum(axis=0), settings.fit)
@@ -277,7 +277,7 @@ def fold_vectors(found: Fit, fold: Index, count: int, neutral: Array, settings: 
         here = (others + np.diag(precision))[np.ix_(determined, determined)]
         vector[active[determined]] -= inverse(here) @ pulled[determined]
         vector[active[~determined]] = neutral[active[~determined]]
-        out[held] = vector
+        out[left_out] = vector
     return out
 
 
@@ -293,8 +293,8 @@ def errors_of(
     error = np.zeros((starts.node.size, 3))
     speed_error = np.zeros(starts.node.size)
     ahead = round(ahead_s / GRID_STEP_S)
-    for held, chain in chains.items():
-        inside = starts.block % len(chains) == held
+    for left_out, chain in chains.items():
+        inside = starts.block % len(chains) == left_out
         track, speed = chain_track(body, wheels, chain)
         error[inside] = prediction_error(body, starts, chain.body, track, ahead_s)[inside]
         there = starts.node[inside] + ahead
@@ -365,7 +365,7 @@ Angles = dict[int, Array]
 def only_timed(found: ChannelResult) -> ChannelResult:
     """The wheels with a delay and a lag in place of what was found: what a careful engineer fits by hand."""
     plain = found.plain or found.selector
-    names = tuple(dict.fromkeys((*plain.given, *LATE)))
+    names = tuple(dict.fromkeys((*plain.given, *DELAY_NAMES)))
     selector = replace(plain, fits=dict(plain.fits), proofs={})
     selector.fits.pop(frozenset(names), None)
     responding(selector, names)
@@ -398,8 +398,8 @@ def _by_fold(found: ChannelResult) -> Angles:
     channel, selector = found.channel, found.selector
     assert isinstance(channel, WheelChannel)
     folds = channel.drive.folds.count
-    vectors = fold_vectors(found.told, fold_of(channel), folds, selector.channel.neutral, channel.settings)
-    return {held: channel.angles(*selector.channel.split(vector)) for held, vector in vectors.items()}
+    vectors = fold_vectors(found.reported, fold_of(channel), folds, selector.channel.neutral, channel.settings)
+    return {fold: channel.angles(*selector.channel.split(vector)) for fold, vector in vectors.items()}
 
 
 def _errors(channel: WheelChannel, of: Angles, ahead_s: float) -> PredictionErrors:
@@ -408,8 +408,8 @@ def _errors(channel: WheelChannel, of: Angles, ahead_s: float) -> PredictionErro
     ahead = round(ahead_s / GRID_STEP_S)
     block = np.floor(drive.t_s[node] / drive.folds.stretch_s).astype(np.int64)
     turned, speed = np.zeros((node.size, 2)), np.zeros(node.size)
-    for held, angle in of.items():
-        inside = block % len(of) == held
+    for fold, angle in of.items():
+        inside = block % len(of) == fold
         off = drive.angle_rad - angle
         turned[inside] = (off[node + ahead] - off[node])[inside]
         faster = drive.speed_rad_s[node + ahead] - np.gradient(angle, GRID_STEP_S, axis=0)[node + ahead]

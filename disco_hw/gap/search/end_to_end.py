@@ -23,8 +23,8 @@ from disco_hw.gap.search.cross_validation import (
     chain_track,
     chain_wheels,
     find_starts,
-    judged_horizon_s,
     prediction_error,
+    scored_horizon_s,
 )
 from disco_hw.gap.search.least_squares import inverse, within
 
@@ -35,7 +35,7 @@ Mask = NDArray[np.bool_]
 _OF_MEDIAN = 1.4826
 _LEAST_SCALE = 1e-5
 # How surely entries of which nothing is known stay where they are: enough where predictions say nothing of them.
-_HARDLY = 1e-4
+_NEGLIGIBLE = 1e-4
 # A fit begins inside its bounds, by this many difference steps.
 _INSIDE = 1e-6
 
@@ -65,8 +65,8 @@ class Freed:
         """The channels' vectors with freed values (A,)."""
         counts = np.cumsum([len(part.active) for part in self.parts])
         out = [part.vector.copy() for part in self.parts]
-        for vector, part, own in zip(out, self.parts, np.split(values, counts[:-1]), strict=True):
-            vector[list(part.active)] = own
+        for vector, part, values_of_part in zip(out, self.parts, np.split(values, counts[:-1]), strict=True):
+            vector[list(part.active)] = values_of_part
         return out
 
     def at(self, vectors: Sequence[Array]) -> Freed:
@@ -89,17 +89,17 @@ class JointFit:
     names: tuple[str, ...]
     covariance: Array
 
-    def value(self, name: str, of: Freed, own: Part | None = None) -> float | None:
+    def value(self, name: str, of: Freed, own_channel: Part | None = None) -> float | None:
         """One entry by its full name, that of the part `own` if it has one; None if it is in no channel's vector.
 
         Both channels number their unnamed terms alike.
         """
         found = [
-            (part is own, float(vector[part.layout.place[name]]))
+            (part is own_channel, float(vector[part.layout.place[name]]))
             for vector, part in zip(self.vectors, of.parts, strict=True)
             if name in part.layout.place
         ]
-        return next((value for is_own, value in found if is_own), found[0][1] if found else None)
+        return next((value for is_of_part, value in found if is_of_part), found[0][1] if found else None)
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Ahead:
     @classmethod
     def of(cls, body: BodyChannel, wheels: WheelChannel | None, poses: tuple[Array, Array]) -> Ahead:
         """The predictions of a drive from smoothed `poses`, as far ahead as the settings say, or runs are long."""
-        longest_s = judged_horizon_s(body, poses)
+        longest_s = scored_horizon_s(body, poses)
         usual_s = body.settings.prediction.reported_horizon_s
         horizons = sorted({min(ahead_s, longest_s) for ahead_s in (0.5 * usual_s, usual_s)})
         every = [(ahead_s, find_starts(body, poses, ahead_s)) for ahead_s in horizons]
@@ -150,7 +150,7 @@ class Ahead:
         # Effects of the body leave the wheels alone; its geometry may not.
         first = np.array(of.parts[0].active)
         of_body = np.concatenate([first >= BASE_COUNT, np.zeros(step.size - first.size, dtype=bool)])
-        root = np.linalg.cholesky(precision + np.diag((_HARDLY / step) ** 2)).T
+        root = np.linalg.cholesky(precision + np.diag((_NEGLIGIBLE / step) ** 2)).T
         first_at = start if begin is None else of.at(begin).joined(lambda part: part.vector)
         values, cost, normal = np.clip(first_at, low + _INSIDE * step, high - _INSIDE * step), math.inf, root.T @ root
         for _ in range(settings.fit_rounds if any(mask.any() for mask in chosen) else 0):

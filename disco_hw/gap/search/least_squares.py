@@ -79,12 +79,12 @@ def within(covariance: Array, low: Array, high: Array) -> Array:
     return np.asarray(covariance * np.outer(share, share))
 
 
-def known(part: Array, whole: Array, settings: FitSettings) -> NDArray[np.bool_]:
+def known(part: Array, total: Array, settings: FitSettings) -> NDArray[np.bool_]:
     """Which parameters (A,) a part of a log determines, from its normal matrix and the whole log's, (A, A) each.
 
     What is hardly determined, a limit that was reached elsewhere only, would be moved anywhere.
     """
-    return np.asarray(np.diag(part) > settings.least_known_share * np.diag(whole))
+    return np.asarray(np.diag(part) > settings.least_known_share * np.diag(total))
 
 
 def jacobian(
@@ -141,11 +141,11 @@ def fit(
     chosen = list(active)
     low, high = layout.low[chosen], layout.high[chosen]
     precision, expected = layout.precision[chosen], layout.neutral[chosen]
-    held = bool(precision.any())
+    has_prior = bool(precision.any())
 
     def total(residual: Array, vector: Array) -> float:
         cost = 0.5 * float(residual @ residual)
-        return cost + 0.5 * float(precision @ (vector[chosen] - expected) ** 2) if held else cost
+        return cost + 0.5 * float(precision @ (vector[chosen] - expected) ** 2) if has_prior else cost
 
     residual = channel.residual
     if isinstance(start, Fit):
@@ -161,7 +161,7 @@ def fit(
         slope = slope() if callable(slope) else slope
         enough_nats = settings.enough_carried_nats if carried else settings.enough_nats
         normal, gradient = slope.T @ slope, slope.T @ now
-        if held:
+        if has_prior:
             normal, gradient = normal + np.diag(precision), gradient + precision * (vector[chosen] - expected)
         scale = np.maximum(np.diag(normal), 1e-12 * max(float(np.max(np.diag(normal))), 1e-30))
         gained, before, was = 0.0, vector, now
@@ -185,13 +185,13 @@ def fit(
             carried, damping = False, 1e-3
         else:
             break
-        taken = partial(jacobian, residual, vector, active, layout, now)
-        slope = _carried(slope, moved, now - was, scale) if carried else taken
+        partial_jacobian = partial(jacobian, residual, vector, active, layout, now)
+        slope = _carried(slope, moved, now - was, scale) if carried else partial_jacobian
         if 0.0 < gained < enough_nats:
             break
     if carried:
         slope = partial(jacobian, residual, vector, active, layout, now)
-    return Fit(vector, active, 0.5 * float(now @ now), now, slope, precision if held else None, loose)
+    return Fit(vector, active, 0.5 * float(now @ now), now, slope, precision if has_prior else None, loose)
 
 
 def _as_promised(gained: float, gradient: Array, normal: Array, step: Array, settings: FitSettings) -> bool:

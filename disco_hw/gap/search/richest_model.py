@@ -19,7 +19,7 @@ from disco_hw.effects import CommandedDrive, Effect, Stage
 from disco_hw.effects.registry import REGISTRY, in_stages
 from disco_hw.gap.data import DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.data.free_runs import read_angles
-from disco_hw.gap.noise import learn_body_noise, learn_wheel_noise, wheel_misfit
+from disco_hw.gap.noise import learn_body_noise, learn_wheel_noise, wheel_mismatch
 from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise, whiten_wheels
 from disco_hw.gap.search.least_squares import sensitivity
@@ -49,15 +49,17 @@ def learn_saturated_wheels(channel: WheelChannel, vector: Array) -> tuple[WheelC
     misfits: list[float] = []
     best, least = channel, raw
     for begin in (channel, channel.with_noise(WheelNoise(reading_rad=channel.noise.reading_rad))):
-        learnt = begin
+        estimated = begin
         for _ in range(channel.settings.fit.richest_rounds):
-            slope = np.column_stack([(whiten_wheels(c, learnt.gains) * learnt.weight).ravel() for c in columns])
-            found = _ridge(slope, (whiten_wheels(raw, learnt.gains) * learnt.weight).ravel(), channel.settings.fit)
+            slope = np.column_stack([(whiten_wheels(c, estimated.gains) * estimated.weight).ravel() for c in columns])
+            found = _ridge(
+                slope, (whiten_wheels(raw, estimated.gains) * estimated.weight).ravel(), channel.settings.fit
+            )
             left = raw + np.tensordot(np.stack(columns, axis=-1), found, axes=1)
-            learnt = learn_wheel_noise(learnt, left)
-            misfits.append(wheel_misfit(channel, left)(learnt.noise.vector()))
+            estimated = learn_wheel_noise(estimated, left)
+            misfits.append(wheel_mismatch(channel, left)(estimated.noise.vector()))
             if misfits[-1] == min(misfits):
-                best, least = learnt, left
+                best, least = estimated, left
     return best, least, many
 
 
@@ -110,9 +112,9 @@ def _integrated(speed: Array, first: NDArray[np.bool_]) -> Array:
 def _wheel_shapes(channel: WheelChannel, vector: Array) -> Iterator[Array]:
     """Speeds (M, 2) of the wheels that a command may make in ways the named effects do not have."""
     drive, settings = channel.drive, channel.settings.fit
-    asked = drive.late_commands(WHEEL.at(vector, DELAYED_BY))
-    response_s = sum(WHEEL.at(vector, column) for column in LATE_COLUMNS if column != DELAYED_BY)
-    u = _slow(asked, max(response_s, 1e-3))
+    commanded = drive.delayed_commands(WHEEL.at(vector, DELAYED_BY))
+    response_s = sum(WHEEL.at(vector, column) for column in DELAY_COLUMNS if column != DELAYED_BY)
+    u = _slow(commanded, max(response_s, 1e-3))
     largest = float(np.abs(u).max(initial=0.0))
     if largest <= 0.0:
         return
@@ -128,7 +130,7 @@ def _wheel_shapes(channel: WheelChannel, vector: Array) -> Iterator[Array]:
         yield behind[:, ::-1]
         yield _slow(behind, response_s)
     for full_s in settings.slews_s:
-        yield _slewed(asked, largest / full_s) - asked
+        yield _slewed(commanded, largest / full_s) - commanded
 
 
 def _slow(u: Array, response_s: float) -> Array:
@@ -156,10 +158,10 @@ def _follow(u: Array, most: float, out: Array) -> None:
 Starts = tuple[tuple[float, ...], ...]
 
 # What makes wheels late, from the wheel back to the command.
-_LATE = [effect for effect in reversed(in_stages(Stage.DELAY, Stage.COMMAND, Stage.RESPONSE)) if effect.late_by]
-LATE = tuple(effect.name for effect in _LATE)
-LATE_COLUMNS = tuple(f"{effect.name}.{effect.late_by}" for effect in _LATE)
-LATE_STARTS_S = tuple(zip(*(effect.late_starts for effect in _LATE), strict=False))
+_DELAYS = [effect for effect in reversed(in_stages(Stage.DELAY, Stage.COMMAND, Stage.RESPONSE)) if effect.delayed_by]
+DELAY_NAMES = tuple(effect.name for effect in _DELAYS)
+DELAY_COLUMNS = tuple(f"{effect.name}.{effect.delayed_by}" for effect in _DELAYS)
+DELAY_STARTS_S = tuple(zip(*(effect.delay_starts for effect in _DELAYS), strict=False))
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +185,7 @@ class Candidate:
     columns: tuple[str, ...]
     starts: Callable[[ResidualChannel], Starts] | None = None
     profile: Profile | None = None
-    once: bool = False
+    is_alternative: bool = False
 
     @property
     def parameters(self) -> int:

@@ -20,7 +20,7 @@ from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChann
 from disco_hw.gap.search.least_squares import Fit, by_block, fit, inverse, known, sensitivity
 from disco_hw.gap.search.richest_model import (
     CANDIDATES,
-    LATE,
+    DELAY_NAMES,
     Candidate,
     candidates_of,
     delays_of,
@@ -373,16 +373,16 @@ class Selector:
             return False
         proof = self.evidence(smaller, larger)
         # What begins at some time can be begun before whatever happened once.
-        once = any(CANDIDATES[name].once for name in set(larger) - set(smaller))
+        is_alternative = any(CANDIDATES[name].is_alternative for name in set(larger) - set(smaller))
         price = parameters_of(larger) - parameters_of(smaller)
         # A delay is wrong by as much as a lag beside it is missing, however little that moves.
         layout, new = self.channel.layout, set(larger) - set(smaller)
         delays = set(delays_of(layout))
-        lags_too = new <= set(LATE) - delays and not delays.isdisjoint(smaller)
+        lags_too = new <= set(DELAY_NAMES) - delays and not delays.isdisjoint(smaller)
         # All commands are late alike: that few of them change says nothing against it.
         repeats = (layout.of_wheels and new <= delays) or proof.holds_without_two_best(self.channel.count)
         return (
-            (not once or proof.score_without_best(price, self.channel.count) > 0.0)
+            (not is_alternative or proof.score_without_best(price, self.channel.count) > 0.0)
             and (proof.score > limits.score or self._dominant(smaller, gain))
             and repeats
             and (

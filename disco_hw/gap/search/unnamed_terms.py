@@ -51,25 +51,25 @@ class Term:
     model_name: str | None = None
     geometry: tuple[float, float] = (1.0, 1.0)
     disc: tuple[float, float, float] | None = None
-    beside: tuple[Array, ...] = ()
+    nuisance: tuple[Array, ...] = ()
     usual: float = math.inf
     highest: float = math.inf
 
     @property
     def features(self) -> tuple[Array, ...]:
         """What its coefficients stand before."""
-        return (self.perturbation, *self.beside)
+        return (self.perturbation, *self.nuisance)
 
     def written(self, coefficients: Array) -> str:
         """The form with its number, from one coefficient a feature: of waves the root of their mean square."""
-        size = float(coefficients[0]) if not self.beside else float(np.sqrt(0.5 * (coefficients**2).sum()))
+        size = float(coefficients[0]) if not self.nuisance else float(np.sqrt(0.5 * (coefficients**2).sum()))
         return self.form.format(size)
 
 
-def wheel_terms(channel: WheelChannel, late_s: float) -> Iterator[Term]:
+def wheel_terms(channel: WheelChannel, delay_s: float) -> Iterator[Term]:
     """What may be added to both wheels' commands; `late_s` is the dead time that was found."""
     drive = channel.drive
-    u = drive.late_commands(late_s)
+    u = drive.delayed_commands(delay_s)
     other, t = u[:, ::-1], drive.t_s[:, None]
     for form, feature in COMMAND_FEATURES.items():
         name = term_name(COMMAND, form)
@@ -135,12 +135,14 @@ def _waves(drive: GriddedDrive, v: Array, w: Array) -> Iterator[Term]:
     waves = [np.cos(math.pi * number * since_s / float(since_s[-1])) for number in range(1, settings.waves + 1)]
     for axis, speed, name in ((0, v, "v_x += {:.2g} v"), (2, w, "omega += {:.2g} omega")):
         first, *others = (_on(axis, wave * speed) for wave in waves)
-        yield Term(f"{name} times what varies slowly with time", first, beside=tuple(others), usual=settings.usual_wave)
+        yield Term(
+            f"{name} times what varies slowly with time", first, nuisance=tuple(others), usual=settings.usual_wave
+        )
 
 
-def with_known_terms(drive: GriddedDrive, effects: Iterable[EffectSetting], p: Array, late_s: float) -> GriddedDrive:
+def with_known_terms(drive: GriddedDrive, effects: Iterable[EffectSetting], p: Array, delay_s: float) -> GriddedDrive:
     """The drive with what the terms among a given model's effects add; `p` is its vector of the body."""
-    u, (v, w, a) = drive.late_commands(late_s), motion(drive, p)
+    u, (v, w, a) = drive.delayed_commands(delay_s), motion(drive, p)
     command = motion_perturbation = None
     for setting in effects:
         term = TERMS.get(setting.name)

@@ -188,7 +188,7 @@ def import_log(path: Path, robot: Path, out: Path, topics: Sequence[str] = (), c
     Raises LogError for what can be no such file, and InputError.
     """
     config = load_robot_config(robot)
-    begin = begin_of(_telling(path), LOG, LONGEST_BEGIN_BYTES)
+    begin = begin_of(_existing_path(path), LOG, LONGEST_BEGIN_BYTES)
     log_format = format_of(begin)
     if begin.startswith(MAGIC) and (log_format is None or not log_format.has_topics):
         raise LogError(f"{path}: an MCAP log; ours needs no import, and of others only those of ROS 2 can be imported")
@@ -212,7 +212,7 @@ def import_log(path: Path, robot: Path, out: Path, topics: Sequence[str] = (), c
     return Imported(out, records, drive.segments, drive.end_s, notes)
 
 
-def _telling(path: Path) -> Path:
+def _existing_path(path: Path) -> Path:
     """Return the file that shows the format: of a bag's folder its metadata.yaml, or else the first bag in it."""
     if not path.is_dir():
         return path

@@ -100,8 +100,8 @@ def read_dump(path: Path) -> Dump:
         bad, filled = bad - 1, filled - 1
     if bad:
         what = f"are no frame and were left out, the first is line {first_bad}"
-        remedy = "not a candump; record with `candump -L`" if bad == filled else f"correct them, first line {first_bad}"
-        notes.append(loss_note(str(path), "lines", bad, filled, what, remedy))
+        hint = "not a candump; record with `candump -L`" if bad == filled else f"correct them, first line {first_bad}"
+        notes.append(loss_note(str(path), "lines", bad, filled, what, hint))
     if not channels:
         raise LogError(f"{path}: no frame in it; record with `candump -L`")
     return Dump(path, _increasing(path, np.array(t_ns, dtype=np.int64), notes), dict(channels), tuple(notes))
@@ -192,8 +192,8 @@ def read_candump(path: Path, robot: Robot, channel: str = "", usual_channel: str
     dump = read_dump(path)
     if channel and channel not in dump.channels:
         raise LogError(f"{path}: no channel {channel}; it has {', '.join(dump.channels)}")
-    wanted = [channel] if channel else list(dump.channels)
-    found = {each: _decoded(dump, each, robot) for each in wanted}
+    selected = [channel] if channel else list(dump.channels)
+    found = {each: _decoded(dump, each, robot) for each in selected}
     robots = {each: rows for each, rows in found.items() if rows.count}
     if not robots:
         frames = sum(rows.frames for rows in found.values())
@@ -201,15 +201,15 @@ def read_candump(path: Path, robot: Robot, channel: str = "", usual_channel: str
     if len(robots) > 1 and usual_channel not in robots:
         counts = ", ".join(f"{each} with {rows.count} records" for each, rows in robots.items())
         raise LogError(f"{path}: several channels hold a robot ({counts}); name one with --channel")
-    taken = usual_channel if usual_channel in robots else next(iter(robots))
-    rows, notes = robots[taken], list(dump.notes)
+    bus = usual_channel if usual_channel in robots else next(iter(robots))
+    rows, notes = robots[bus], list(dump.notes)
     if len(dump.channels) > 1:
-        others = ", ".join(each for each in dump.channels if each != taken)
-        notes.append(f"{path}: channel {taken} was read, and {others} left out; --channel takes another")
+        others = ", ".join(each for each in dump.channels if each != bus)
+        notes.append(f"{path}: channel {bus} was read, and {others} left out; --channel takes another")
     if rows.refused:
         notes.append(
             loss_note(
-                str(path), f"frames of {taken}", rows.refused, rows.frames,
+                str(path), f"frames of {bus}", rows.refused, rows.frames,
                 "failed their check and were left out", "look for a second sender, or name another channel",
             )
         )  # fmt: skip

@@ -105,7 +105,7 @@ def unwrap_counter(
     if span is not None:
         if _is_too_fast(motion, speeds, span):
             return Unwrapped(values, unchanged.uncertain, fault=_faster_than_read(span, unit))
-        found = _taken_out(motion, values, span)
+        found = _without_wraps(motion, values, span)
         if found is not None:
             return found
     return Unwrapped(values, unchanged.uncertain, fault=_too_fast(motion, speeds, reach, usual, unit))
@@ -160,8 +160,8 @@ def _left_over(motion: _Steps, span: float) -> tuple[Array, Array, Mask]:
     """Return turns of the span in each step (N,), what they leave beside the expected motion, and if that is motion."""
     turns = np.where(motion.is_inside, np.round((motion.steps - motion.expected) / span), 0.0)
     left = motion.steps - span * turns
-    beside = np.abs(left - motion.expected)
-    return turns, beside, (beside <= motion.tolerance) | (np.abs(left) <= motion.longest)
+    difference = np.abs(left - motion.expected)
+    return turns, difference, (difference <= motion.tolerance) | (np.abs(left) <= motion.longest)
 
 
 def _span_of(motion: _Steps, usual: Sequence[float], reach: float, unit: str) -> float | None:
@@ -204,7 +204,7 @@ def _span_of_jumps(motion: _Steps, unit: str) -> tuple[float, float] | None:
     )
 
 
-def _taken_out(motion: _Steps, values: Array, span: float) -> Unwrapped | None:
+def _without_wraps(motion: _Steps, values: Array, span: float) -> Unwrapped | None:
     """Take the span out of some values (N,); None if many steps are so long that they could be one way or the other.
 
     Jumps that leave something else than motion are those of a counter that was set anew: they stay as they are.
@@ -261,7 +261,7 @@ def _faster_than_read(span: float, unit: str) -> str:
     )
 
 
-def set_anew(t_s: Array, angles_rad: Array) -> Mask:
+def restarts(t_s: Array, angles_rad: Array) -> Mask:
     """Return which samples (N,) begin again because an encoder was set, from wheel angles (N, 2).
 
     That is a step of more than ten turns, or one of a radian that is several times as fast as the wheel turns else, or

@@ -30,7 +30,7 @@ from disco_hw.log.drive import (
     integrate_angle,
 )
 from disco_hw.log.importing import LogFormat
-from disco_hw.log.importing.counter_wrap import Mask, set_anew, unwrap_wheels
+from disco_hw.log.importing.counter_wrap import Mask, restarts, unwrap_wheels
 from disco_hw.log.importing.csv_sheet import (
     COMMAND,
     GYRO,
@@ -49,7 +49,7 @@ _LONGEST_PERIOD_S = 2.0
 _SHORTEST_PERIOD_S = 1e-4
 _WHEEL_RADIUS_M = (0.005, 1.5)
 _AGAINST_NOMINAL = 4.0
-_STANDS_STILL = 100.0
+_STATIONARY_COUNTS = 100.0
 _CHORD_ROLL_RAD = 2.0
 _ENOUGH_CHORDS = 5
 _LARGEST_TURN_RATIO = 3.0
@@ -111,7 +111,7 @@ def length_fault(poses: Poses, wheels: Wheels, commands: Commands, wheel_radius_
     if wheel_radius_m is not None:
         low, high = wheel_radius_m / _AGAINST_NOMINAL, wheel_radius_m * _AGAINST_NOMINAL
     # Poses that do not move at all are lifted wheels or a dead sensor, not a unit.
-    if low <= radius_m <= high or radius_m < low / _STANDS_STILL:
+    if low <= radius_m <= high or radius_m < low / _STATIONARY_COUNTS:
         return None
     fault = f"{path_m:.3g} m of path for {roll_rad:.3g} rad of wheel would be a wheel radius of {radius_m:.2g} m"
     return f"pose_x_m, pose_y_m against the wheels: {fault}; write metres, rad/s and the encoder's true ticks_per_rev"
@@ -127,7 +127,7 @@ def _roll(wheels: Wheels, commands: Commands) -> tuple[Array, Array]:
 
 
 _LONGEST_HOLD_S = 0.5
-_MOST_SET_ANEW_SHARE = 0.05
+_MAX_RESTART_SHARE = 0.05
 
 
 def read_csv(path: Path, ticks_per_rev: float | None = None, wheel_radius_m: float | None = None) -> DriveLog:
@@ -232,16 +232,16 @@ def _with_new_segments(
 ) -> Sheet:
     """Return the sheet with a new segment wherever an encoder restarts or may have wrapped."""
     inside = np.concatenate([[False], np.diff(segment) == 0])
-    anew, uncertain = set_anew(t_s, angles) & ~uncertain & inside, uncertain & inside
-    count, unknown = int(np.count_nonzero(anew)), int(np.count_nonzero(uncertain))
-    if count > _MOST_SET_ANEW_SHARE * t_s.size:
+    restart, uncertain = restarts(t_s, angles) & ~uncertain & inside, uncertain & inside
+    count, unknown = int(np.count_nonzero(restart)), int(np.count_nonzero(uncertain))
+    if count > _MAX_RESTART_SHARE * t_s.size:
         raise LogError(
-            f"{sheet.name}: an encoder jumps {count} times, first at t_s {t_s[anew][0]:.9g}, further than a "
+            f"{sheet.name}: an encoder jumps {count} times, first at t_s {t_s[restart][0]:.9g}, further than a "
             f"wheel turns; {TICKS[0]} and {TICKS[1]} must be cumulative, and ticks_per_rev the true one"
         )
     if count:
         notes.append(
-            f"{sheet.name}: an encoder was set anew {count} times, first at t_s {t_s[anew][0]:.9g}; "
+            f"{sheet.name}: an encoder was set anew {count} times, first at t_s {t_s[restart][0]:.9g}; "
             "new segments begin there"
         )
     if unknown:
@@ -249,7 +249,7 @@ def _with_new_segments(
             f"{sheet.name}: ticks are missing for so long that they may have wrapped unseen, {unknown} times, first "
             f"at t_s {t_s[uncertain][0]:.9g}; new segments begin there"
         )
-    breaks_s = t_s[anew | uncertain]
+    breaks_s = t_s[restart | uncertain]
     return replace(sheet, segment=sheet.segment + np.searchsorted(breaks_s, sheet.t_s, side="right"))
 
 

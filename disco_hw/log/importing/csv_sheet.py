@@ -38,7 +38,7 @@ SIGNALS = {
 LARGEST_DISORDER_S = 1.0
 """Rows whose times go back by less are sorted; by more, the clock was set or another run begins."""
 _KNOWN = frozenset({TIME, SEGMENT, *(name for names in SIGNALS.values() for name in names)})
-_EMPTY_WORDS = frozenset({"", "nan", "na", "n/a", "null", "none", "-"})
+_EMPTY_TEXTS = frozenset({"", "nan", "na", "n/a", "null", "none", "-"})
 """What programs write, in any case of letters, for a cell without a sample."""
 
 Mask = NDArray[np.bool_]
@@ -102,14 +102,14 @@ class _Lines:
     """The lines of a file, with whether the last one that was taken ends where a line ends."""
 
     def __init__(self, lines: Iterator[str]) -> None:
-        self._lines, self.is_whole = lines, True
+        self._lines, self.is_complete = lines, True
 
     def __iter__(self) -> Iterator[str]:
         return self
 
     def __next__(self) -> str:
         line = next(self._lines)
-        self.is_whole = line.endswith(("\n", "\r"))
+        self.is_complete = line.endswith(("\n", "\r"))
         return line
 
 
@@ -127,7 +127,7 @@ def _columns(
             continue
         faults.lines += 1
         if len(row) != len(header):
-            if text.is_whole:
+            if text.is_complete:
                 faults.uneven.append(line)
             else:
                 faults.is_cut = True
@@ -158,7 +158,7 @@ def _number(text: str) -> tuple[float, bool]:
     try:
         value = float(text)
     except ValueError:
-        return math.nan, text.strip().lower() not in _EMPTY_WORDS
+        return math.nan, text.strip().lower() not in _EMPTY_TEXTS
     return (value, False) if math.isfinite(value) else (math.nan, not math.isnan(value))
 
 
@@ -248,12 +248,12 @@ def _merged(path: Path, place: Index, columns: dict[str, Array], several: int, n
             continue
         before = np.column_stack([columns[name] for name in there])
         kept = np.column_stack([found[name] for name in there])[place]
-        lost = int(np.count_nonzero((np.isfinite(before) & (before != kept)).any(axis=1)))
+        conflicts = int(np.count_nonzero((np.isfinite(before) & (before != kept)).any(axis=1)))
         total = int(np.count_nonzero(np.isfinite(before).any(axis=1)))
-        if lost:
+        if conflicts:
             notes.append(
                 loss_note(
-                    str(path), signal, lost, total, "samples have the time of another sample and were left out",
+                    str(path), signal, conflicts, total, "samples have the time of another sample and were left out",
                     f"the clock stands still; give each sample the {TIME} at which it was true",
                 )
             )  # fmt: skip

@@ -16,7 +16,7 @@ Mask = NDArray[np.bool_]
 _FEWEST_POSES = 10
 _TURNED_RAD = 4.0
 """Difference of the wheels' angles while a heading stands still: half a radian or more of turning."""
-_STILL_RAD = 1e-9
+_STATIONARY_RAD = 1e-9
 
 
 def standing_headings(poses: Poses, wheels: Wheels) -> Mask:
@@ -29,7 +29,7 @@ def standing_headings(poses: Poses, wheels: Wheels) -> Mask:
     if poses.t_s.size < _FEWEST_POSES or wheels.t_s.size < 2:
         return standing
     turned = np.interp(poses.t_s, wheels.t_s, wheels.right_angle_rad - wheels.left_angle_rad)
-    moves = ~(np.abs(np.diff(poses.yaw_rad)) <= _STILL_RAD)
+    moves = ~(np.abs(np.diff(poses.yaw_rad)) <= _STATIONARY_RAD)
     moves |= np.diff(poses.segment) != 0
     ends = np.concatenate([[0], np.flatnonzero(moves) + 1, [poses.t_s.size]])
     for first, last in pairwise(ends.tolist()):

@@ -10,15 +10,15 @@ WARNED_SHARE, REFUSED_SHARE = 0.05, 0.5
 """Shares of a signal whose loss is a warning, and an error."""
 
 
-def loss_note(source: str, signal: str, lost: int, total: int, what: str, remedy: str) -> str:
+def loss_note(source: str, signal: str, dropped: int, total: int, what: str, hint: str) -> str:
     """Return the sentence on `lost` of `total` samples of a signal; `what` says what is wrong with them.
 
     It begins with WARNING if over 5 % of the signal is lost. Raises LogError if over half of it is.
     """
-    share = lost / total
-    text = f"{signal}: {lost} of {total} {what} ({_percent(share)})"
+    share = dropped / total
+    text = f"{signal}: {dropped} of {total} {what} ({_percent(share)})"
     if share > REFUSED_SHARE:
-        raise LogError(f"{source}: {text}; {remedy}")
+        raise LogError(f"{source}: {text}; {hint}")
     return f"{WARNING if share > WARNED_SHARE else ''}{source}: {text}"
 
 

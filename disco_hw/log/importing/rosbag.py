@@ -27,10 +27,10 @@ from disco_hw.log.drive import (
     rotations,
 )
 from disco_hw.log.importing import LogFormat
-from disco_hw.log.importing.counter_wrap import set_anew
+from disco_hw.log.importing.counter_wrap import restarts
 from disco_hw.log.importing.csv_drive import length_fault
 from disco_hw.log.importing.losses import WARNING, loss_note
-from disco_hw.log.importing.rosbag_file import Bag, DamagedBagError, Undecoded, is_bag, open_bag, words_of
+from disco_hw.log.importing.rosbag_file import Bag, DamagedBagError, Undecoded, is_bag, message_of, open_bag
 from disco_hw.log.importing.rosbag_times import Stamps, timeline
 from disco_hw.log.importing.rosbag_topics import (
     ARRAY,
@@ -127,13 +127,13 @@ def _notes_on_undecoded(bag: Bag, undecoded: dict[str, Undecoded]) -> list[str]:
 def _columns(bag: Bag, choice: Choice, config: RobotConfig, undecoded: dict[str, Undecoded]) -> dict[str, _Column]:
     """One pass through the chosen topics; messages that cannot be decoded are counted."""
     columns: dict[str, _Column] = {}
-    takes: dict[str, list[tuple[str, Take]]] = {}
+    takes: dict[str, list[tuple[str, ReadRow]]] = {}
     for role in ROLES:
         used = choice.used(role)
         if used is not None and used.topic != TF:
-            width, take = take_of(role, used.type, choice, config)
+            width, read_row = row_reader(role, used.type, choice, config)
             columns[role] = _Column(width)
-            takes.setdefault(used.topic, []).append((role, take))
+            takes.setdefault(used.topic, []).append((role, read_row))
     by_tf = choice.used(POSES) is not None and POSES not in columns
     edges = {edge: _Column(7) for edge in choice.edges} if by_tf else {}
     static: set[Edge] = set()
@@ -141,11 +141,11 @@ def _columns(bag: Bag, choice: Choice, config: RobotConfig, undecoded: dict[str,
     for number, message in enumerate(bag.messages({*takes, *transforms}, undecoded=undecoded)):
         if number >= _MOST_MESSAGES:
             raise LogError(f"{bag.path}: over {_MOST_MESSAGES} messages of its topics; record its topics alone")
-        for role, take in takes.get(message.topic, ()):
+        for role, read_row in takes.get(message.topic, ()):
             try:
-                columns[role].add(message.log_ns, stamp_of(message.value), finite(take(message.value)))
+                columns[role].add(message.log_ns, stamp_of(message.value), finite(read_row(message.value)))
             except (IndexError, ValueError, TypeError, AttributeError, OverflowError) as error:
-                fault = f"not as its type has it ({words_of(error)})"
+                fault = f"not as its type has it ({message_of(error)})"
                 undecoded.setdefault(message.topic, Undecoded()).add(fault)
         if message.topic in transforms:
             for one in message.value.transforms:
@@ -190,7 +190,7 @@ def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: R
             [
                 times.breaks_ns,
                 _pauses(wheel_ns, (command_ns, pose_ns)),
-                wheel_ns[set_anew((wheel_ns - began_ns).astype(np.float64) * 1e-9, wheel[:, :2]) | uncertain],
+                wheel_ns[restarts((wheel_ns - began_ns).astype(np.float64) * 1e-9, wheel[:, :2]) | uncertain],
             ]
         )
     )
@@ -245,10 +245,10 @@ def _of_the_choice(choice: Choice) -> list[str]:
 def _ordered(path: Path, name: str, t_ns: Index, table: Array, notes: list[str]) -> tuple[Index, Array]:
     """Sort messages by time, and keep the first of several with one time; one that is sent again is no loss."""
     unique, first, place = np.unique(t_ns, return_index=True, return_inverse=True)
-    lost = int(np.count_nonzero(~_alike(table, table[first][place])))
-    if lost:
+    conflicts = int(np.count_nonzero(~_alike(table, table[first][place])))
+    if conflicts:
         what = "messages have the time of another and were left out"
-        notes.append(loss_note(str(path), name, lost, t_ns.size, what, "record it again, or name another topic"))
+        notes.append(loss_note(str(path), name, conflicts, t_ns.size, what, "record it again, or name another topic"))
     return unique, table[first]
 
 
@@ -296,10 +296,10 @@ def _expired(t_ns: Index, speeds: Array) -> tuple[Index, Array]:
     """Commands with a row of NaN where one has run out before the next came."""
     speeds = np.where(np.isfinite(speeds), speeds, np.nan)
     ends = t_ns + _LONGEST_COMMAND_NS
-    late = np.append(np.diff(t_ns) > _LONGEST_COMMAND_NS, True) if t_ns.size else np.empty(0, dtype=bool)
-    late &= np.isfinite(speeds).all(axis=1)
-    times = np.concatenate([t_ns, ends[late]])
-    rows = np.concatenate([speeds, np.full((np.count_nonzero(late), 2), np.nan)])
+    is_expired = np.append(np.diff(t_ns) > _LONGEST_COMMAND_NS, True) if t_ns.size else np.empty(0, dtype=bool)
+    is_expired &= np.isfinite(speeds).all(axis=1)
+    times = np.concatenate([t_ns, ends[is_expired]])
+    rows = np.concatenate([speeds, np.full((np.count_nonzero(is_expired), 2), np.nan)])
     order = np.argsort(times, kind="stable")
     return times[order], rows[order]
 
@@ -313,7 +313,7 @@ def _pauses(wheel_ns: Index, others: Sequence[Index]) -> Index:
 
 
 Row = tuple[float, ...]
-Take = Callable[[Any], Row | None]
+ReadRow = Callable[[Any], Row | None]
 
 
 def finite(row: Row | None) -> Row | None:
@@ -327,7 +327,7 @@ def stamp_of(message: Any) -> int:
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec) if header is not None else 0
 
 
-def take_of(role: str, kind: str, choice: Choice, config: RobotConfig) -> tuple[int, Take]:
+def row_reader(role: str, kind: str, choice: Choice, config: RobotConfig) -> tuple[int, ReadRow]:
     """Return how many numbers a message of this type gives in this role, and the function that reads them."""
     if role == POSES:
         return 7, _odometry_pose if kind == ODOMETRY else _measured_pose
@@ -348,36 +348,36 @@ def _wheel_pair(robot: Robot, forward: float, turning: float) -> Row:
     return (forward - half) / robot.wheel_radius_m, (forward + half) / robot.wheel_radius_m
 
 
-def _twist_command(robot: Robot) -> Take:
-    def take(message: Any) -> Row:
+def _twist_command(robot: Robot) -> ReadRow:
+    def read_row(message: Any) -> Row:
         twist = getattr(message, "twist", message)
         return _wheel_pair(robot, float(twist.linear.x), float(twist.angular.z))
 
-    return take
+    return read_row
 
 
-def _mean_of(values: Any, names: Sequence[str], wanted: Sequence[str]) -> float:
+def _mean_of(values: Any, names: Sequence[str], joints: Sequence[str]) -> float:
     """Mean over several joints; NaN where the array does not hold one of them."""
-    found = [float(values[names.index(name)]) for name in wanted if names.index(name) < len(values)]
-    return sum(found) / len(found) if len(found) == len(wanted) else math.nan
+    found = [float(values[names.index(name)]) for name in joints if names.index(name) < len(values)]
+    return sum(found) / len(found) if len(found) == len(joints) else math.nan
 
 
-def _joint_wheels(choice: Choice) -> Take:
-    wanted = {*choice.left_joints, *choice.right_joints}
+def _joint_wheels(choice: Choice) -> ReadRow:
+    joints = {*choice.left_joints, *choice.right_joints}
 
-    def take(message: Any) -> Row | None:
+    def read_row(message: Any) -> Row | None:
         names = list(message.name)
         # Other joints of the robot may come in messages of their own.
-        if not wanted <= set(names):
+        if not joints <= set(names):
             return None
         sides = (choice.left_joints, choice.right_joints)
         return tuple(_mean_of(values, names, side) for values in (message.position, message.velocity) for side in sides)
 
-    return take
+    return read_row
 
 
-def _joint_command(choice: Choice) -> Take:
-    def take(message: Any) -> Row | None:
+def _joint_command(choice: Choice) -> ReadRow:
+    def read_row(message: Any) -> Row | None:
         names = list(message.name)
         if not {*choice.left_joints, *choice.right_joints} <= set(names):
             return None
@@ -386,16 +386,16 @@ def _joint_command(choice: Choice) -> Take:
             return math.nan, math.nan
         return tuple(_mean_of(message.velocity, names, side) for side in (choice.left_joints, choice.right_joints))
 
-    return take
+    return read_row
 
 
-def _array_command(choice: Choice, joints: Sequence[str]) -> Take:
-    def take(message: Any) -> Row | None:
+def _array_command(choice: Choice, joints: Sequence[str]) -> ReadRow:
+    def read_row(message: Any) -> Row | None:
         if not joints:
             return (float(message.data[0]), float(message.data[1])) if len(message.data) == 2 else None
         return tuple(_mean_of(message.data, list(joints), side) for side in (choice.left_joints, choice.right_joints))
 
-    return take
+    return read_row
 
 
 def _drivers(message: Any) -> Row | None:
@@ -407,12 +407,12 @@ def _wheel_speeds(message: Any) -> Row:
     return float(message.velocity_left), float(message.velocity_right)
 
 
-def _odometry_wheels(robot: Robot) -> Take:
-    def take(message: Any) -> Row:
+def _odometry_wheels(robot: Robot) -> ReadRow:
+    def read_row(message: Any) -> Row:
         twist = message.twist.twist
         return (math.nan, math.nan, *_wheel_pair(robot, float(twist.linear.x), float(twist.angular.z)))
 
-    return take
+    return read_row
 
 
 def _odometry_pose(message: Any) -> Row | None:

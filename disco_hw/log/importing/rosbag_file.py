@@ -32,7 +32,7 @@ BAG_METADATA = FileKind("the metadata of a bag", 4 * 1024 * 1024, "give the path
 _MOST_MEMORY_BYTES = 1536 * 1024 * 1024
 _MOST_UNPACKED_RATIO = 256
 _MOST_TOPICS = 10_000
-_REMEDY = "record it again, or convert it to an MCAP where it was recorded"
+_HINT = "record it again, or convert it to an MCAP where it was recorded"
 
 
 def is_bag(begin: bytes) -> bool:
@@ -106,15 +106,15 @@ class Bag:
         """
         found: dict[str, Undecoded] = {} if undecoded is None else undecoded
         for reader in self._readers:
-            wanted = [one for one in reader.connections if one.topic in topics and self._is_readable(one)]
-            if wanted and (start_ns is None or reader.end_time > start_ns):
-                yield from self._of_a_reader(reader, wanted, start_ns, found)
+            connections = [one for one in reader.connections if one.topic in topics and self._is_readable(one)]
+            if connections and (start_ns is None or reader.end_time > start_ns):
+                yield from self._of_a_reader(reader, connections, start_ns, found)
 
     def _of_a_reader(
-        self, reader: Any, wanted: Sequence[Any], start_ns: int | None, undecoded: dict[str, Undecoded]
+        self, reader: Any, connections: Sequence[Any], start_ns: int | None, undecoded: dict[str, Undecoded]
     ) -> Iterator[BagMessage]:
         with _in_one_line(self.path):
-            found = reader.messages(connections=wanted, start=start_ns)
+            found = reader.messages(connections=connections, start=start_ns)
         while True:
             with _in_one_line(self.path):
                 one = next(found, None)
@@ -125,7 +125,7 @@ class Bag:
                 with _in_one_line(self.path, f"a message of {connection.topic} ({connection.msgtype})"):
                     value = self._read(data, connection.msgtype)
             except DamagedBagError as error:
-                undecoded.setdefault(connection.topic, Undecoded()).add(words_of(error.__cause__ or error))
+                undecoded.setdefault(connection.topic, Undecoded()).add(message_of(error.__cause__ or error))
                 continue
             yield BagMessage(connection.topic, log_ns, value)
 
@@ -204,9 +204,9 @@ def _opened(path: Path, is_ros1: bool, stack: ExitStack, notes: list[str], salva
     if salvage:
         found = salvaged(path, Path(stack.enter_context(TemporaryDirectory(prefix="disco-hw-bag-"))))
         if found is None:
-            raise DamagedBagError(f"{path}: nothing in it can be read; {_REMEDY}")
-        path, said = found[0], f"{path}: damaged, or its recording did not end regularly: {found[1]}"
-        notes.append(f"{WARNING}{said}")
+            raise DamagedBagError(f"{path}: nothing in it can be read; {_HINT}")
+        path, damage = found[0], f"{path}: damaged, or its recording did not end regularly: {found[1]}"
+        notes.append(f"{WARNING}{damage}")
     try:
         with _in_one_line(path):
             reader = rosbag1.Reader(path) if is_ros1 else rosbag2.Reader(path)
@@ -246,12 +246,12 @@ def _check_file(path: Path) -> bool:
 def _check_folder(path: Path) -> None:
     """Refuse what the library would wait for or fill a disk with."""
     content = read_bytes(path / METADATA, BAG_METADATA)[0] if (path / METADATA).exists() else b""
-    unpacked_whole = b"compression_mode: FILE" in content.upper().replace(b"COMPRESSION_MODE", b"compression_mode")
+    is_file_compressed = b"compression_mode: FILE" in content.upper().replace(b"COMPRESSION_MODE", b"compression_mode")
     for one in sorted(path.iterdir()):
         if one.is_dir():
             continue
         os.close(open_file(one, LOG))
-        if unpacked_whole and one.suffix in {".zstd", ".zst"}:
+        if is_file_compressed and one.suffix in {".zstd", ".zst"}:
             _check_unpacked(one)
 
 
@@ -292,12 +292,12 @@ def _in_one_line(path: Path, what: str = "the bag") -> Iterator[None]:
         raise
     except MemoryError:
         most = f"{_MOST_MEMORY_BYTES / 2**30:.1f} GiB"
-        raise LogError(f"{path}: {what} needs over {most} of memory, as sizes in it say; {_REMEDY}") from None
+        raise LogError(f"{path}: {what} needs over {most} of memory, as sizes in it say; {_HINT}") from None
     except Exception as error:
-        raise DamagedBagError(f"{path}: {what} cannot be read ({words_of(error)}); {_REMEDY}") from error
+        raise DamagedBagError(f"{path}: {what} cannot be read ({message_of(error)}); {_HINT}") from error
 
 
-def words_of(error: BaseException) -> str:
+def message_of(error: BaseException) -> str:
     """Format the message of a library's exception as one short line."""
     return " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
 

@@ -38,10 +38,10 @@ def salvage(path: Path, folder: Path) -> tuple[Path, str] | None:
         return None
     target = folder / path.name
     try:
-        said = copy(path, target)
+        damage = copy(path, target)
     except Exception:  # Foreign bytes in the hands of three libraries; whoever opened the bag says what is wrong.
         return None
-    return (target, said) if said else None
+    return (target, damage) if damage else None
 
 
 def _copy_mcap(path: Path, target: Path) -> str:
@@ -82,10 +82,10 @@ def _extent(messages: int, damaged: int = 0) -> str:
 
 def _records(source: BinaryIO) -> Iterator[Any]:  # Any: the library's records, None for a damaged chunk.
     reader = StreamReader(source, emit_chunks=True, record_size_limit=_LARGEST_RECORD_BYTES)
-    whole = 0
+    readable = 0
     with contextlib.suppress(Exception):
         for record in reader.records:
-            whole = source.tell()
+            readable = source.tell()
             if not isinstance(record, Chunk):
                 yield record
             elif record.uncompressed_size <= _LARGEST_UNPACKED_BYTES:
@@ -97,7 +97,7 @@ def _records(source: BinaryIO) -> Iterator[Any]:  # Any: the library's records, 
                 yield from inside
             else:
                 yield None
-    source.seek(whole)
+    source.seek(readable)
     rest = source.read(_LARGEST_RECORD_BYTES)
     # What is whole of a last chunk that was cut: a short recording may have no other.
     if rest[:1] == _MCAP_CHUNK:
@@ -164,12 +164,12 @@ def _copy_ros1(path: Path, target: Path) -> str:
                     continue
                 header, data = record
                 if header["op"] == _CONNECTION and header["conn"] not in connections:
-                    said = _ros1_fields(data)
+                    fields = _ros1_fields(data)
                     connections[header["conn"]] = writer.add_connection(
                         header["topic"].decode(),
-                        said["type"].decode().replace("/", "/msg/"),
-                        msgdef=said["message_definition"].decode(),
-                        md5sum=said["md5sum"].decode(),
+                        fields["type"].decode().replace("/", "/msg/"),
+                        msgdef=fields["message_definition"].decode(),
+                        md5sum=fields["md5sum"].decode(),
                         # Two publishers of one topic are two connections.
                         callerid=str(len(connections)),
                     )

@@ -24,7 +24,7 @@ _LEAD_NS = 50_000_000
 _LARGEST_NS = 4 * 10**18
 _SAME_CLOCK_NS = 30_000_000_000
 """Stamps of one clock may come so much apart, as where messages wait; those of another clock are further off."""
-_STANDS_NS, _REPEATS_NS = 20_000_000, 300_000_000
+_CONSTANT_NS, _REPEATS_NS = 20_000_000, 300_000_000
 """Messages recorded further apart than this were not true at one time: those that differ, and those that are alike, as
 where the last measurement is sent again."""
 _STANDING_SHARE = 0.02
@@ -115,7 +115,9 @@ def _jumps(stamps: Mapping[str, Stamps]) -> tuple[list[tuple[int, int]], set[str
 
     A clock that is set shows in most of the topics that have stamps before and after.
     """
-    found = sorted((int(one.log_ns[at]), by_ns, name) for name, one in stamps.items() for at, by_ns in _own_jumps(one))
+    found = sorted(
+        (int(one.log_ns[at]), by_ns, name) for name, one in stamps.items() for at, by_ns in _clock_jumps(one)
+    )
     clusters: list[list[_Jump]] = []
     for jump in found:
         if clusters and jump[0] - clusters[-1][0][0] <= _ONE_JUMP_NS:
@@ -150,7 +152,7 @@ def _standing(one: Stamps) -> str:
     changes = np.concatenate([[True], (np.diff(one.stamp_ns) != 0) | (one.stamp_ns[1:] == 0)])
     began_ns = one.log_ns[np.maximum.accumulate(np.where(changes, np.arange(changes.size), 0))]
     is_repeat = np.zeros(changes.size, dtype=bool) if one.is_repeat is None else one.is_repeat
-    same = one.log_ns - began_ns > np.where(is_repeat, _REPEATS_NS, _STANDS_NS)
+    same = one.log_ns - began_ns > np.where(is_repeat, _REPEATS_NS, _CONSTANT_NS)
     share = np.count_nonzero(same) / one.stamp_ns.size
     return f"stand still while the recording goes on ({100.0 * share:.0f} %)" if share > _STANDING_SHARE else ""
 
@@ -182,7 +184,7 @@ def _without_stamps(stamps: Mapping[str, Stamps], names: Iterable[str]) -> dict[
     }
 
 
-def _own_jumps(one: Stamps) -> list[tuple[int, int]]:
+def _clock_jumps(one: Stamps) -> list[tuple[int, int]]:
     """Places in a topic's messages at which its stamps jump, and by how much against the recording."""
     rows = np.flatnonzero(one.stamp_ns)
     log_ns, stamp_ns = one.log_ns[rows], one.stamp_ns[rows]
@@ -204,9 +206,9 @@ def _own_jumps(one: Stamps) -> list[tuple[int, int]]:
 
 def _without_jumps(one: Stamps, jumps: Sequence[tuple[int, int]]) -> Stamps:
     stamp_ns = one.stamp_ns.copy()
-    own = [at for at, _ in _own_jumps(one)]
+    places = [at for at, _ in _clock_jumps(one)]
     for log_ns, by_ns in jumps:
-        near = [at for at in own if 0 <= one.log_ns[at] - log_ns <= _ONE_JUMP_NS]
+        near = [at for at in places if 0 <= one.log_ns[at] - log_ns <= _ONE_JUMP_NS]
         first = near[0] if near else int(np.searchsorted(one.log_ns, log_ns))
         stamp_ns[first:] = np.where(stamp_ns[first:] != 0, stamp_ns[first:] - by_ns, 0)
     return Stamps(one.log_ns, stamp_ns)

@@ -87,10 +87,10 @@ def choose(bag: Bag, settings: Ros2) -> Choice:
     route = _route(bag, edges, settings)
     left, right = _wheel_joints(bag, settings)
     candidates: list[TopicCandidate] = []
-    wanted = {COMMANDS: settings.command_topic, WHEELS: settings.wheel_topic, POSES: settings.pose_topic}
+    configured = {COMMANDS: settings.command_topic, WHEELS: settings.wheel_topic, POSES: settings.pose_topic}
     for role in ROLES:
         found = [*_of_role(bag, role, left, right, settings), *(_by_tf(bag, route) if role == POSES else ())]
-        candidates += _one_used(bag, role, found, wanted[role])
+        candidates += _one_used(bag, role, found, configured[role])
     if not any(one.used for one in candidates):
         why = {one.topic: f", {one.why}" for one in candidates if one.rank >= _UNREADABLE_RANK}
         some = (
@@ -102,13 +102,13 @@ def choose(bag: Bag, settings: Ros2) -> Choice:
     return Choice(tuple(candidates), route or (), left, right)
 
 
-def _one_used(bag: Bag, role: str, found: list[TopicCandidate], wanted: str) -> list[TopicCandidate]:
+def _one_used(bag: Bag, role: str, found: list[TopicCandidate], configured: str) -> list[TopicCandidate]:
     found.sort(key=lambda one: (one.rank, -one.count, one.topic))
-    if wanted:
-        named = next((one for one in found if one.topic == wanted and one.rank < _UNREADABLE_RANK), None) or _named(
-            bag, role, wanted
+    if configured:
+        named = next((one for one in found if one.topic == configured and one.rank < _UNREADABLE_RANK), None) or _named(
+            bag, role, configured
         )
-        others = [one for one in found if one.topic != wanted]
+        others = [one for one in found if one.topic != configured]
         return [replace(named, used=True, why=f"asked for; {named.why}"), *others]
     # What ranks 100 and more is never taken unasked, 200 cannot be read.
     return [replace(one, used=at == 0 and one.rank < 100) for at, one in enumerate(found)]
@@ -148,15 +148,17 @@ def _of_role(
         if why := bag.why_unreadable(topic.name):
             yield TopicCandidate(role, topic.name, topic.type, topic.count, _UNREADABLE_RANK, why)
             continue
-        judged = {COMMANDS: _as_command, WHEELS: _as_wheels, POSES: _as_pose}[role](bag, topic, left, right, settings)
-        if judged is not None:
-            yield TopicCandidate(role, topic.name, topic.type, topic.count, *judged)
+        evaluated = {COMMANDS: _as_command, WHEELS: _as_wheels, POSES: _as_pose}[role](
+            bag, topic, left, right, settings
+        )
+        if evaluated is not None:
+            yield TopicCandidate(role, topic.name, topic.type, topic.count, *evaluated)
 
 
-Judged = tuple[int, str] | None
+Evaluated = tuple[int, str] | None
 
 
-def _as_command(bag: Bag, topic: BagTopic, left: tuple[str, ...], right: tuple[str, ...], settings: Ros2) -> Judged:
+def _as_command(bag: Bag, topic: BagTopic, left: tuple[str, ...], right: tuple[str, ...], settings: Ros2) -> Evaluated:
     name = topic.name.lower()
     is_command = re.search(r"cmd|command", name) is not None
     if topic.type == JOINTS:
@@ -182,7 +184,7 @@ def _as_command(bag: Bag, topic: BagTopic, left: tuple[str, ...], right: tuple[s
     return (5, f"a Twist by name a command, {through}") if is_command else None
 
 
-def _as_wheels(bag: Bag, topic: BagTopic, left: tuple[str, ...], right: tuple[str, ...], settings: Ros2) -> Judged:
+def _as_wheels(bag: Bag, topic: BagTopic, left: tuple[str, ...], right: tuple[str, ...], settings: Ros2) -> Evaluated:
     name = topic.name.lower()
     if topic.type == JOINTS:
         if re.search(r"cmd|command", name) or not _has_joints(bag, topic, left, right):
@@ -193,7 +195,7 @@ def _as_wheels(bag: Bag, topic: BagTopic, left: tuple[str, ...], right: tuple[st
     return 10, "no JointState of wheels is as good: its twist, back through wheel_radius_m and axial_distance_m"
 
 
-def _as_pose(bag: Bag, topic: BagTopic, left: tuple[str, ...], right: tuple[str, ...], settings: Ros2) -> Judged:
+def _as_pose(bag: Bag, topic: BagTopic, left: tuple[str, ...], right: tuple[str, ...], settings: Ros2) -> Evaluated:
     name = topic.name.lower()
     first = next(_first(bag, topic.name), None)
     frame = first.value.header.frame_id.lstrip("/") if first is not None else ""
@@ -232,8 +234,8 @@ def _first(bag: Bag, topic: str, count: int = _PEEKED) -> Iterator[BagMessage]:
 
 
 def _has_joints(bag: Bag, topic: BagTopic, left: Sequence[str], right: Sequence[str]) -> bool:
-    wanted = {*left, *right}
-    return bool(left and right) and any(wanted <= set(one.value.name) for one in _first(bag, topic.name))
+    expected = {*left, *right}
+    return bool(left and right) and any(expected <= set(one.value.name) for one in _first(bag, topic.name))
 
 
 def _wheel_joints(bag: Bag, settings: Ros2) -> tuple[tuple[str, ...], tuple[str, ...]]:

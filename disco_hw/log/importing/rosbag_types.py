@@ -56,8 +56,8 @@ class Definitions:
             register()
         except Exception as error:
             # A type that cannot be read must not spoil the bag.
-            words = " ".join(str(error).split())[:_LONGEST_TEXT].rstrip(".") or type(error).__name__
-            return f"the bag's definition of {kind} cannot be read ({words})"
+            reason = " ".join(str(error).split())[:_LONGEST_TEXT].rstrip(".") or type(error).__name__
+            return f"the bag's definition of {kind} cannot be read ({reason})"
         return "" if kind in self._store.fielddefs else f"the bag does not define its type {kind}"
 
     def _register(self, kind: str, text: str, is_msg: bool) -> None:

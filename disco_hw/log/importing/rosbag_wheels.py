@@ -32,8 +32,10 @@ def measured_columns(path: Path, t_ns: Index, wheel: Array, notes: list[str]) ->
             "set ros2.left_joints and ros2.right_joints"
         )
     if not kept.all():
-        lost, what = int(np.count_nonzero(~kept)), "messages lack a position or velocity and were left out"
-        notes.append(loss_note(str(path), WHEELS, lost, kept.size, what, "set ros2.left_joints and ros2.right_joints"))
+        dropped, what = int(np.count_nonzero(~kept)), "messages lack a position or velocity and were left out"
+        notes.append(
+            loss_note(str(path), WHEELS, dropped, kept.size, what, "set ros2.left_joints and ros2.right_joints")
+        )
     wheel = wheel[kept]
     if has_angle and has_speed and (wheel[:, 2:] == 0.0).all() and np.ptp(wheel[:, 0]) > 1.0:
         notes.append("wheels: the velocities are all zero while the wheels turn; they were taken from the positions")

@@ -121,8 +121,8 @@ class PathTerms(NamedTuple):
         # A `single` of its own makes the compiler round another product: old logs would give other last bits.
         farthest = constant(FARTHEST_STEP_M, x)
         along = min(max(off_x * along_x + off_y * along_y, -farthest), farthest) * self.per_m
-        wanted = min(self.speed_m_s, (self.end - memory) * self.slow_per_entry)
-        missing = self.speed_weight * (wanted - min(along * self.speed_per_entry, forward + wanted))
+        desired = min(self.speed_m_s, (self.end - memory) * self.slow_per_entry)
+        missing = self.speed_weight * (desired - min(along * self.speed_per_entry, forward + desired))
         # In this order, so that what is no number becomes a place, and the cost shows it.
         return min(self.last, max(self.first, memory + along)), missing
 

@@ -105,7 +105,7 @@ END_M = 0.05
 """The end of an open path is reached so far before it: the planner slows down to nothing there."""
 
 
-def part_in_words(part: float, length_m: float) -> tuple[str, str]:
+def describe_part(part: float, length_m: float) -> tuple[str, str]:
     """Return the word "progress" and the part behind of a line's length as text."""
     return "progress", f"{part * length_m:.2f} of {length_m:.2f} m ({part:.0%})"
 
@@ -134,9 +134,9 @@ class PathProgress:
             return False
         return (self._entries - self._place) * self._path.spacing_m <= END_M
 
-    def in_words(self) -> tuple[str, str]:
+    def describe(self) -> tuple[str, str]:
         """Metres, and the part of the whole."""
-        return part_in_words(self.laps, self._entries * self._path.spacing_m)
+        return describe_part(self.laps, self._entries * self._path.spacing_m)
 
     def add(self, _now_ns: int, x_m: float, y_m: float, yaw_rad: float) -> None:
         """Take in the pose of one tick; the first one after a pause is looked for on the whole path."""

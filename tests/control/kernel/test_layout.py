@@ -40,13 +40,13 @@ def test_the_document_draws_the_rows_as_they_are():
     rows = {name: int(number) for number, name in re.findall(r"(\d+) ([a-z]+)\b", own)}
     drawn = {"x": layout.X, "y": layout.Y, "memory": layout.MEMORY, "cost": layout.TOTAL, "kept": layout.KEPT}
     drawn |= {"row": layout.ROW}
-    assert {name: int((layout.OWN + at) // layout.BLOCK) for name, at in drawn.items()}.items() <= rows.items()
-    assert f"{int((layout.OWN + layout.FOUND) // layout.BLOCK)}..14 found" in own
+    assert {name: int((layout.POINT + at) // layout.BLOCK) for name, at in drawn.items()}.items() <= rows.items()
+    assert f"{int((layout.POINT + layout.FOUND) // layout.BLOCK)}..14 found" in own
     others = [layout.AHEAD0, layout.AHEAD1, layout.SCALED0, layout.SCALED1]
     begins = [int(number) for number in re.findall(r"^row +(\d+) \.\.", text, re.MULTILINE)]
     assert [int(at // layout.BLOCK) for at in others] == begins
     # The four numbers found of every sample end where the next point's rows begin.
-    assert layout.FOUND + layout.COLUMNS * layout.BLOCK == layout.AHEAD0 - layout.OWN
+    assert layout.FOUND + layout.COLUMNS * layout.BLOCK == layout.AHEAD0 - layout.POINT
     assert begins[-1] + 10 == layout.STATE_ROWS
 
 

@@ -8,7 +8,7 @@ import pytest
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand
 from disco_hw.control import kernel as layout
 from disco_hw.control.kernel import BLOCK
-from disco_hw.control.parameter_points import drawn_points, unscented_points
+from disco_hw.control.parameter_points import sampled_points, unscented_points
 from disco_hw.control.plan import command_history
 from disco_hw.model import EffectSetting, Gaussian, Model, plain
 from disco_hw.model.terms import BODY_MEMORIES, COMMAND_MEMORIES
@@ -140,7 +140,7 @@ def test_costs_where_only_commands_or_only_the_body_are_remembered(terms):
 def test_costs_under_a_draw_for_every_sample():
     model = model_of(ALL)
     disco, commands, (got,) = planned(model, replace(SETTINGS, uncertainty="joint"))
-    theta = drawn_points(model, disco.optimiser.padded_samples, 3, disco.optimiser.step_number - 1)
+    theta = sampled_points(model, disco.optimiser.padded_samples, 3, disco.optimiser.step_number - 1)
     expected = costs_of(model, theta[:SAMPLES], commands, state_of(model))
     np.testing.assert_allclose(got, expected, rtol=2e-5, atol=2e-4)
 

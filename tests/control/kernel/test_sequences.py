@@ -13,7 +13,7 @@ from disco_hw.control.kernel.sequences import (
     Basis,
     Limits,
     add_control_cost,
-    add_drawn_control_cost,
+    add_sampled_control_cost,
     add_weighted,
     clip,
     expand,
@@ -50,7 +50,7 @@ def run_control_cost(costs, commands, history, nominal, scale):
 @njit
 def run_drawn_control_cost(costs, noise, pull, nominal, basis, scale):
     pull_on_knots(pull, nominal, basis)
-    add_drawn_control_cost(costs, U(0), noise, U(0), pull, scale)
+    add_sampled_control_cost(costs, U(0), noise, U(0), pull, scale)
 
 
 @njit

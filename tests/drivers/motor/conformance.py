@@ -25,7 +25,7 @@ class DriverConformance:
     deceleration_rad_s2 = 20.0
     frame_ids: range
 
-    def make_driver(self):
+    def create_driver(self):
         raise AssertionError("say how to make the driver")
 
     def make_robot(self, first_ticks=(0, 0)):
@@ -37,7 +37,7 @@ class DriverConformance:
 
     @pytest.fixture
     def bench(self):
-        return Bench(self.make_driver(), self.make_robot())
+        return Bench(self.create_driver(), self.make_robot())
 
     def stop_time_s(self, speed_rad_s):
         return self.watchdog_s + speed_rad_s / self.deceleration_rad_s2 + 0.05
@@ -191,7 +191,7 @@ class DriverConformance:
         assert bench.largest_speed == 0.0
 
     def test_encoders_wrap_in_both_directions(self):
-        bench = Bench(self.make_driver(), self.make_robot(first_ticks=self.near_the_wrap()))
+        bench = Bench(self.create_driver(), self.make_robot(first_ticks=self.near_the_wrap()))
         bench.arm()
         for command in ((4.0, -4.0), (-4.0, 4.0), (4.0, -4.0)):
             bench.run(2.0, command)

@@ -12,7 +12,7 @@ import drivers.motor
 from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError
 from disco_hw.runtime.assembly import preflight
-from drivers.motor import make_driver, motor_drivers
+from drivers.motor import create_driver, motor_drivers
 from drivers.types import DriverState, Frame
 from tests.drivers.motor.bench import Bench
 from tests.drivers.motor.conformance import DriverConformance
@@ -102,7 +102,7 @@ class TestToyDriver(DriverConformance):
     frame_ids = range(0x210, 0x213)
     estop_id = toy.STOP_ID
 
-    def make_driver(self):
+    def create_driver(self):
         return toy.DRIVER.make(None, None)
 
     def make_robot(self, first_ticks=(0, 0)):
@@ -136,7 +136,7 @@ def in_the_folder(tmp_path, monkeypatch):
 @pytest.mark.usefixtures("in_the_folder")
 def test_robot_toml_takes_its_name_and_no_key(tmp_path):
     assert load_robot_config(robot_toml(tmp_path, 'driver = "toy"')).link.driver == "toy"
-    assert make_driver("toy").state is DriverState.DISCONNECTED
+    assert create_driver("toy").state is DriverState.DISCONNECTED
     with pytest.raises(InputError, match=r"link\.key_file: the driver toy has no authenticated mode; remove it"):
         load_robot_config(robot_toml(tmp_path, 'driver = "toy"\nkey_file = "robot.key"'))
 

@@ -21,7 +21,7 @@ def bench():
 def test_a_person_who_takes_the_remote_control_drives_and_that_is_no_fault(bench):
     bench.arm()
     bench.run(0.5, FORWARD)
-    bench.robot.controller.base.take_remote_control(0.3, 0.0)
+    bench.robot.controller.base.use_remote_control(0.3, 0.0)
     bench.run(0.3, FORWARD)
     assert bench.driver.state in STILL
     assert "remote control" in bench.driver.detail
@@ -35,7 +35,7 @@ def test_a_person_who_takes_the_remote_control_drives_and_that_is_no_fault(bench
 def test_after_the_person_has_let_go_it_does_not_drive_on(bench):
     bench.arm()
     bench.run(0.5, FORWARD)
-    bench.robot.controller.base.take_remote_control(0.3, 0.0)
+    bench.robot.controller.base.use_remote_control(0.3, 0.0)
     bench.run(0.3, FORWARD)
     bench.robot.controller.base.control_mode = CAN_MODE
     bench.run(1.0, FORWARD)
@@ -80,7 +80,7 @@ def test_an_error_in_either_byte_stops_it(bench, error):
 def test_turning_on_the_spot_is_a_turn_rate_by_the_nominal_track(bench):
     bench.arm()
     bench.run(0.5, (-2.0, 2.0))
-    linear, angular = bench.robot.controller.base.asked_motion
+    linear, angular = bench.robot.controller.base.commanded_motion
     assert (linear, angular) == (0, round(1e3 * 0.06 * 4.0 / 0.31))
     assert bench.robot.speed == pytest.approx((-2.0, 2.0), abs=0.02)
 
@@ -135,7 +135,7 @@ def test_a_person_who_takes_the_remote_control_while_it_slows_down_ends_that(ben
     bench.run(0.5, (20.0, 20.0))
     bench.driver.request(Request.STANDBY)
     bench.run(0.1)
-    bench.robot.controller.base.take_remote_control(0.0, 0.0)
+    bench.robot.controller.base.use_remote_control(0.0, 0.0)
     bench.run(0.2)
     bench.robot.received.clear()
     bench.robot.controller.base.control_mode = CAN_MODE

@@ -12,7 +12,7 @@ from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot
 class TestReferenceDriver(DriverConformance):
     frame_ids = range(0x100, 0x162)
 
-    def make_driver(self):
+    def create_driver(self):
         return ReferenceDriver(Codec(), itertools.count(41).__next__)
 
     def make_robot(self, first_ticks=(0, 0)):
@@ -27,7 +27,7 @@ class TestAuthenticatedReferenceDriver(TestReferenceDriver):
 
     key = bytes(range(16))
 
-    def make_driver(self):
+    def create_driver(self):
         return ReferenceDriver(Codec(), itertools.count(41).__next__, self.key)
 
     def make_robot(self, first_ticks=(0, 0)):

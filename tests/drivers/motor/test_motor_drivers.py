@@ -12,7 +12,7 @@ import pytest
 
 from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError
-from drivers.motor import DEFAULT, UnknownDriverError, find_driver, make_driver, motor_drivers
+from drivers.motor import DEFAULT, UnknownDriverError, create_driver, find_driver, motor_drivers
 from drivers.types import DriverState
 
 OWN = {name: driver.example for name, driver in motor_drivers().items()}
@@ -35,7 +35,7 @@ def test_every_driver_is_made_by_its_name_and_begins_without_a_link():
     for name, driver in motor_drivers().items():
         assert driver.name == name
         settings = msgspec.convert(tomllib.loads(OWN[name]), driver.settings)
-        assert make_driver(name, settings).state is DriverState.DISCONNECTED
+        assert create_driver(name, settings).state is DriverState.DISCONNECTED
 
 
 def test_every_driver_is_found_by_its_name_and_none_without_one_is_the_default():
@@ -47,7 +47,7 @@ def test_every_driver_is_found_by_its_name_and_none_without_one_is_the_default()
 def test_what_needs_one_driver_reads_no_other():
     """An e-stop is not to wait for five vendors' protocols."""
     code = (
-        "import sys; from drivers.motor import find_driver, own_fields; find_driver(None); own_fields('vesc', {})\n"
+        "import sys; from drivers.motor import find_driver, fields_of; find_driver(None); fields_of('vesc', {})\n"
         "print(*sorted(name for name in sys.modules if name.startswith('drivers.motor.')))"
     )
     names = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
@@ -62,7 +62,7 @@ def test_a_module_beside_the_drivers_is_none():
 
 def test_a_name_that_no_driver_has_is_refused_with_those_that_there_are():
     with pytest.raises(UnknownDriverError, match=f'no driver "oddrive"; write one of {", ".join(motor_drivers())}$'):
-        make_driver("oddrive")
+        create_driver("oddrive")
 
 
 def test_robot_toml_with_an_unknown_driver_is_refused_in_one_line(tmp_path):

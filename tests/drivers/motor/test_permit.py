@@ -20,12 +20,12 @@ STANDBY, READY, ARM, RESET = Request
 
 AT = {
     "rest": MotionPermit(link_is_up=True),
-    "ready": MotionPermit(link_is_up=True, wanted=READY, speeds=(2.0, 1.0), zeros=9, since_ns=NOW - 3),
-    "resetting": MotionPermit(link_is_up=True, wanted=RESET, fault="old"),
+    "ready": MotionPermit(link_is_up=True, target=READY, speeds=(2.0, 1.0), zeros=9, since_ns=NOW - 3),
+    "resetting": MotionPermit(link_is_up=True, target=RESET, fault="old"),
     "e-stopped": MotionPermit(link_is_up=True, estopped=True),
-    "arming": MotionPermit(link_is_up=True, stage=ARMING, wanted=ARM, since_ns=NOW - 5, zeros=3, fed_ns=NOW - 20 * MS),
+    "arming": MotionPermit(link_is_up=True, stage=ARMING, target=ARM, since_ns=NOW - 5, zeros=3, fed_ns=NOW - 20 * MS),
     "armed": MotionPermit(
-        link_is_up=True, stage=ARMED, wanted=ARM, since_ns=NOW - 5, speeds=(1.0, -0.1), fed_ns=NOW - 20 * MS
+        link_is_up=True, stage=ARMED, target=ARM, since_ns=NOW - 5, speeds=(1.0, -0.1), fed_ns=NOW - 20 * MS
     ),
     "stopping": MotionPermit(link_is_up=True, stage=STOPPING, speeds=(1.0, -0.1), fed_ns=NOW - 20 * MS),
     "braking": MotionPermit(link_is_up=True, stage=BRAKING, since_ns=NOW - 5),
@@ -50,23 +50,23 @@ EVENTS = {
     "given up": lambda permit: permit.given_up("why"),
     "lost": lambda permit: permit.lost("why"),
     "e-stop": lambda permit: permit.stopped(),
-    "e-stop heard": lambda permit: permit.stop_heard(),
-    "command heard": lambda permit: permit.command_heard("wheel 3"),
+    "e-stop heard": lambda permit: permit.stop_received(),
+    "command heard": lambda permit: permit.command_received("wheel 3"),
     "reset": lambda permit: permit.reset(WELL),
 }
 
-GONE = {"stage": REST, "wanted": STANDBY, "since_ns": None}
+GONE = {"stage": REST, "target": STANDBY, "since_ns": None}
 LOST_LINK = {**GONE, "note": "disarmed: the link was lost"}
 MET = {**GONE, "events": ("met anew",)}
 LOST = {**GONE, "note": "disarmed: why", "fault": "why", "events": ("disarmed: why",)}
 STOPPED = {**GONE, "note": "emergency stop sent", "estopped": True}
-HEARD = {**GONE, "estopped": True, "events": (STOPPED_FROM_OUTSIDE,)}
+RECEIVED = {**GONE, "estopped": True, "events": (STOPPED_FROM_OUTSIDE,)}
 SHARED = "another host is on the link: it commands wheel 3; disconnect it"
 TAKEN = "another host commands wheel 3; disconnect it"
 FOREIGN = {
     **GONE, "shared": True, "note": f"disarmed: {TAKEN}", "fault": TAKEN, "events": (SHARED, f"disarmed: {TAKEN}"),
 }  # fmt: skip
-ARMS = {"wanted": ARM, "stage": ARMING, "note": "arming", "since_ns": None, "zeros": 0, "speeds": (0.0, 0.0)}
+ARMS = {"target": ARM, "stage": ARMING, "note": "arming", "since_ns": None, "zeros": 0, "speeds": (0.0, 0.0)}
 SLOWS = {"stage": STOPPING, "note": "stopping as asked", "since_ns": None}
 GIVEN_UP = {**GONE, "note": "why"}
 LOOKED = {"looked_ns": NOW, "attentive_ns": NOW}
@@ -75,14 +75,14 @@ SAME = {
     "link up": GONE,
     "link down": {**GONE, "link_is_up": False},
     "restarted": MET,
-    "stand by": {"wanted": STANDBY},
-    "be ready": {"wanted": READY},
-    "do reset": {"wanted": RESET},
+    "stand by": {"target": STANDBY},
+    "be ready": {"target": READY},
+    "do reset": {"target": RESET},
     "begun": {"since_ns": NOW},
     "given up": GIVEN_UP,
     "lost": LOST,
     "e-stop": STOPPED,
-    "e-stop heard": HEARD,
+    "e-stop heard": RECEIVED,
     "command heard": FOREIGN,
     "arm": {"note": "not arming: it stands by"},
     "arm, unfit": {"note": "not arming: it stands by"},
@@ -98,7 +98,7 @@ OTHERWISE = {
         **AT_REST,
         "arm": LATCHED_FAULT,
         "arm, unfit": LATCHED_FAULT,
-        "reset": {"fault": None, "wanted": STANDBY},
+        "reset": {"fault": None, "target": STANDBY},
     },
     "e-stopped": {
         **AT_REST,
@@ -112,9 +112,9 @@ OTHERWISE = {
         "restarted": {**MET, "note": "disarmed: it restarted"},
         "arm": {},
         "arm, unfit": {},
-        "stand by": {**SLOWS, "wanted": STANDBY},
-        "be ready": {**SLOWS, "wanted": READY},
-        "do reset": {**SLOWS, "wanted": RESET},
+        "stand by": {**SLOWS, "target": STANDBY},
+        "be ready": {**SLOWS, "target": READY},
+        "do reset": {**SLOWS, "target": RESET},
         "begun": {},
         "zero": {"zeros": 4, "fed_ns": NOW},
         "proof": {"stage": ARMED, "note": "armed", "fed_ns": NOW, "speeds": (0.0, 0.0)},
@@ -125,9 +125,9 @@ OTHERWISE = {
         "restarted": {**MET, "note": "disarmed: it restarted"},
         "arm": {},
         "arm, unfit": {},
-        "stand by": {**SLOWS, "wanted": STANDBY},
-        "be ready": {**SLOWS, "wanted": READY},
-        "do reset": {**SLOWS, "wanted": RESET},
+        "stand by": {**SLOWS, "target": STANDBY},
+        "be ready": {**SLOWS, "target": READY},
+        "do reset": {**SLOWS, "target": RESET},
         "begun": {},
         "command": {"fed_ns": NOW, "speeds": (3.0, -2.0)},
     },
@@ -162,15 +162,15 @@ STATES = [
     ({"stage": ARMED}, Controllers(missing="this", faulty="that"), DriverState.HANDSHAKE, "this"),
     ({"stage": ARMED}, ILL["faulty"], DriverState.FAULT, "why; remove the cause, then reset"),
     ({"stage": ARMED, "note": "armed"}, HOT, DriverState.ARMED, "armed"),
-    ({"stage": ARMING, "wanted": ARM, "note": "arming"}, HOT, DriverState.ARMING, "arming"),
-    ({"stage": STOPPING, "wanted": READY}, WELL, DriverState.STOPPING, "it stands by"),
-    ({"stage": BRAKING, "wanted": READY}, WELL, DriverState.STOPPING, "it stands by"),
-    ({"wanted": READY}, HOT, DriverState.STOPPING, "it stands by"),
-    ({"wanted": READY}, WELL, DriverState.READY, "it stands by"),
-    ({"wanted": READY}, ILL["unfit"], DriverState.READY, "why"),
+    ({"stage": ARMING, "target": ARM, "note": "arming"}, HOT, DriverState.ARMING, "arming"),
+    ({"stage": STOPPING, "target": READY}, WELL, DriverState.STOPPING, "it stands by"),
+    ({"stage": BRAKING, "target": READY}, WELL, DriverState.STOPPING, "it stands by"),
+    ({"target": READY}, HOT, DriverState.STOPPING, "it stands by"),
+    ({"target": READY}, WELL, DriverState.READY, "it stands by"),
+    ({"target": READY}, ILL["unfit"], DriverState.READY, "why"),
     ({}, WELL, DriverState.STANDBY, "it stands by"),
     ({}, ILL["unfit"], DriverState.STANDBY, "why"),
-    ({"wanted": RESET}, WELL, DriverState.STANDBY, "it stands by"),
+    ({"target": RESET}, WELL, DriverState.STANDBY, "it stands by"),
 ]
 
 
@@ -185,7 +185,7 @@ def test_what_is_latched_comes_before_what_is_not_known_and_that_before_the_stag
 def test_only_controllers_that_are_well_and_at_rest_are_armed(ill):
     refused = AT["rest"].requested(ARM, ill)
     assert refused.stage is REST
-    assert refused.wanted is STANDBY
+    assert refused.target is STANDBY
     assert refused.note.startswith("not arming: ")
     assert AT["rest"].requested(ARM, WELL).stage is ARMING
 
@@ -195,7 +195,7 @@ def test_what_is_latched_is_not_cleared_of_controllers_that_were_not_heard_to_be
     latched = replace(AT["resetting"], estopped=True)
     assert latched.reset(ill) == latched
     cleared = latched.reset(WELL)
-    assert (cleared.fault, cleared.estopped, cleared.wanted) == (None, False, STANDBY)
+    assert (cleared.fault, cleared.estopped, cleared.target) == (None, False, STANDBY)
 
 
 def test_refused_controllers_are_reset_for_nothing_arms_them():
@@ -214,15 +214,15 @@ def test_a_loss_and_an_emergency_stop_end_where_the_driver_says(event):
 
 
 def test_whoever_else_is_on_the_link_is_said_once_and_again_after_a_restart():
-    once = AT["rest"].command_heard("wheel 3")
-    assert once.command_heard("wheel 4").events == (SHARED,)
-    assert once.restarted("it restarted").command_heard("wheel 3").events == (SHARED, SHARED)
-    stopped = AT["armed"].stop_heard()
-    assert stopped.stop_heard().events == (STOPPED_FROM_OUTSIDE,)
+    once = AT["rest"].command_received("wheel 3")
+    assert once.command_received("wheel 4").events == (SHARED,)
+    assert once.restarted("it restarted").command_received("wheel 3").events == (SHARED, SHARED)
+    stopped = AT["armed"].stop_received()
+    assert stopped.stop_received().events == (STOPPED_FROM_OUTSIDE,)
 
 
 def test_an_emergency_stop_that_is_heard_again_stops_again():
-    assert replace(AT["e-stopped"], after_loss=BRAKING).stop_heard().stage is BRAKING
+    assert replace(AT["e-stopped"], after_loss=BRAKING).stop_received().stage is BRAKING
 
 
 @pytest.mark.parametrize("stage", [ARMING, ARMED, STOPPING, BRAKING])
@@ -300,7 +300,7 @@ def test_no_order_of_events_moves_it_without_proof_or_clears_what_is_latched_wit
             assert (name, before.stage) == ("command", ARMED)
         assert permit.estopped or not before.estopped or name == "reset"
         assert permit.fault is not None or before.fault is None or name == "reset"
-        assert (permit.wanted is ARM) == (permit.stage in (ARMING, ARMED))
+        assert (permit.target is ARM) == (permit.stage in (ARMING, ARMED))
         assert permit.events[: len(before.events)] == before.events
         permit = replace(permit, events=())
     assert reached == set(Stage)

@@ -17,16 +17,16 @@ CODEC = Codec()
 STILL = (DriverState.STANDBY, DriverState.READY)
 
 
-def make_driver():
+def create_driver():
     return ReferenceDriver(CODEC, itertools.count(3).__next__)
 
 
 def make_bench(robot=None, **options):
-    return Bench(make_driver(), robot or ReferenceRobot(), **options)
+    return Bench(create_driver(), robot or ReferenceRobot(), **options)
 
 
 def test_says_what_it_waits_for():
-    driver = make_driver()
+    driver = create_driver()
     assert driver.detail == "the link is down"
     assert driver.transmit(0, None) == ()
     driver.link_up(0)
@@ -239,7 +239,7 @@ def hello():
 
 
 def test_says_which_part_of_the_handshake_is_missing():
-    driver = make_driver()
+    driver = create_driver()
     driver.link_up(START_NS)
     driver.receive(START_NS, [hello(), limits(0)])
     assert driver.detail == "waiting for the robot's BUILD, LIMITS"
@@ -251,7 +251,7 @@ def test_says_which_part_of_the_handshake_is_missing():
 
 
 def test_a_response_to_a_request_of_the_last_link_teaches_nothing():
-    driver = make_driver()
+    driver = create_driver()
     driver.link_up(START_NS)
     driver.transmit(START_NS, None)
     driver.link_up(START_NS)
@@ -288,14 +288,19 @@ def test_a_silence_counts_only_beyond_its_limit_which_is_longer_for_a_robot_that
     """One that is refused says less, and should stay refused in words until it is gone."""
     bench = make_bench(ReferenceRobot(replace(CONFIG, **protocol)))
     bench.run_until(DriverState.REFUSED if protocol else DriverState.STANDBY)
-    heard_ns = bench.driver._last_heard_ns
-    assert bench.driver.receive(heard_ns + silence_ms * MS, ()).events == ()
-    assert bench.driver.receive(heard_ns + silence_ms * MS + 1, ()).events == ("the robot fell silent: new handshake",)
+    received_ns = bench.driver._last_received_ns
+    assert bench.driver.receive(received_ns + silence_ms * MS, ()).events == ()
+    assert bench.driver.receive(received_ns + silence_ms * MS + 1, ()).events == (
+        "the robot fell silent: new handshake",
+    )
     assert bench.driver.state is DriverState.HANDSHAKE
 
 
 def test_a_robot_that_has_shown_only_its_state_can_fall_silent_too():
-    driver, status = make_driver(), {"state": 1, "fault": 0, "session": 0, "estop_source": 0, "last_command_counter": 0}
+    driver, status = (
+        create_driver(),
+        {"state": 1, "fault": 0, "session": 0, "estop_source": 0, "last_command_counter": 0},
+    )
     driver.link_up(START_NS)
     for counter in range(4):
         frame = CODEC.encode("SYSTEM_STATE", counter, **status, rejected_count=0, reject_reason=0, stop_cause=0)
@@ -306,7 +311,7 @@ def test_a_robot_that_has_shown_only_its_state_can_fall_silent_too():
 
 
 def test_a_robot_that_has_shown_all_but_its_state_can_fall_silent_too():
-    driver = make_driver()
+    driver = create_driver()
     driver.link_up(START_NS)
     build = answer("BUILD", dbc_hash=CODEC.dbc_hash, board_id=1)
     driver.receive(START_NS, [hello(), limits(0), limits(1), build])
@@ -388,7 +393,7 @@ def names(frames):
 
 
 def test_house_keeping_is_sent_as_often_as_it_should():
-    driver, robot = make_driver(), ReferenceRobot()
+    driver, robot = create_driver(), ReferenceRobot()
     counts = []
     bench = Bench(driver, robot)
     transmit = driver.transmit
@@ -408,7 +413,7 @@ def test_house_keeping_is_sent_as_often_as_it_should():
 
 
 def test_emergency_stop_frames():
-    driver = make_driver()
+    driver = create_driver()
     frames = driver.estop(1_000)
     assert len(frames) == ESTOP_REPEATS == 3
     assert {outgoing.frame.can_id for outgoing in frames} == {0x080}

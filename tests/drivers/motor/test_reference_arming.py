@@ -17,7 +17,7 @@ def arming(draw=None):
 
 
 def report(arming, state, session=None, stop_cause="NONE", reject_reason="NONE"):
-    arming.take_status(state, arming.session if session is None else session, stop_cause, reject_reason)
+    arming.handle_status(state, arming.session if session is None else session, stop_cause, reject_reason)
 
 
 def armed():
@@ -27,7 +27,7 @@ def armed():
     one.request(Request.ARM)
     one.step(0)
     report(one, "READY")
-    one.take_session(0x1234, one.session, (), 0)
+    one.handle_session(0x1234, one.session, (), 0)
     report(one, "ARMED")
     assert one.armed
     return one
@@ -45,7 +45,7 @@ def test_the_way_up_step_by_step():
     assert not one.needs_zeros
     report(one, "READY")
     assert one.host_state().request == "READY", "no ARM without an answer to the challenge"
-    one.take_session(0x1234, one.session, ("CHALLENGE", "ZERO_COMMANDS"), 0)
+    one.handle_session(0x1234, one.session, ("CHALLENGE", "ZERO_COMMANDS"), 0)
     assert one.host_state().request == "ARM"
     assert one.host_state().challenge_answer == protection.challenge_answer(0x1234, one.session, HASH)
     assert one.needs_zeros
@@ -66,7 +66,7 @@ def test_ready_alone_opens_a_session_and_asks_for_no_more():
     assert not one.ready, "that session is another host's"
     report(one, "READY")
     assert one.ready
-    one.take_session(0x1234, one.session, (), 0)
+    one.handle_session(0x1234, one.session, (), 0)
     one.step(10 * ARMING_TIMEOUT_NS)
     assert one.host_state().request == "READY"
     assert not one.needs_zeros
@@ -103,7 +103,7 @@ def test_a_challenge_of_another_session_is_not_answered():
     report(one, "STANDBY", 0)
     one.request(Request.ARM)
     one.step(0)
-    one.take_session(0x1234, one.session + 1, (), 0)
+    one.handle_session(0x1234, one.session + 1, (), 0)
     report(one, "READY")
     assert one.host_state().request == "READY"
 
@@ -130,7 +130,7 @@ def test_asking_for_less_ends_the_session_at_once(request_):
 def test_arm_is_consumed_when_the_robot_leaves_armed(state):
     one = armed()
     report(one, state, 0, stop_cause="COMMAND_TIMEOUT")
-    assert one.wanted is Request.STANDBY
+    assert one.target is Request.STANDBY
     assert "no wheel command arrived in time" in one.note
     for later in ("STANDBY", "READY", "ARMED"):
         report(one, later, 0, stop_cause="ESTOP")
@@ -144,7 +144,7 @@ def test_arm_is_consumed_when_the_robot_leaves_armed(state):
 def test_arm_is_consumed_when_the_link_or_robot_is_another_one():
     one = armed()
     one.reset("the link was lost")
-    assert one.wanted is Request.STANDBY
+    assert one.target is Request.STANDBY
     assert one.session == 0
     assert one.note == "disarmed: the link was lost"
     report(one, "ARMED", 17)
@@ -187,11 +187,11 @@ def test_arming_that_takes_too_long_is_given_up_with_the_robots_reason():
     start_ns = 10**15
     one.step(start_ns)
     report(one, "READY", reject_reason="CHALLENGE")
-    one.take_session(1, one.session, ("CHALLENGE", "WHEELS_MOVING"), start_ns)
+    one.handle_session(1, one.session, ("CHALLENGE", "WHEELS_MOVING"), start_ns)
     one.step(start_ns + ARMING_TIMEOUT_NS)
-    assert one.wanted is Request.ARM
+    assert one.target is Request.ARM
     one.step(start_ns + ARMING_TIMEOUT_NS + 1)
-    assert one.wanted is Request.STANDBY
+    assert one.target is Request.STANDBY
     for words in ("not armed within 1.5 s", "challenge is not answered", "wheels are turning", "was wrong"):
         assert words in one.note
     report(one, "ARMED")
@@ -210,9 +210,9 @@ def test_a_new_request_to_arm_has_all_the_time_again():
     one.request(Request.READY)
     one.request(Request.ARM)
     one.step(10 * ARMING_TIMEOUT_NS)
-    assert one.wanted is Request.ARM
+    assert one.target is Request.ARM
     one.step(11 * ARMING_TIMEOUT_NS + 1)
-    assert one.wanted is Request.STANDBY
+    assert one.target is Request.STANDBY
     assert "the robot gave no reason" in one.note
 
 
@@ -225,7 +225,7 @@ def test_reset_is_held_until_the_robot_has_left_its_latch(state):
     report(one, state, 0)
     assert one.host_state().request == "RESET"
     report(one, "STANDBY", 0)
-    assert one.wanted is Request.STANDBY
+    assert one.target is Request.STANDBY
     assert one.note == "", "what was said of the fault is over"
     report(one, state, 0)
     assert one.host_state().request == "STANDBY", "a later stop is not reset by an earlier request"
@@ -237,7 +237,7 @@ def test_arm_is_consumed_by_a_latch(state):
     report(one, "STANDBY", 0)
     one.request(Request.ARM)
     report(one, state, 0)
-    assert one.wanted is Request.STANDBY
+    assert one.target is Request.STANDBY
 
 
 @given(st.lists(st.integers(0, 2**64), min_size=1, max_size=40), st.integers(0, 255))
@@ -261,16 +261,16 @@ def test_a_session_that_the_robot_has_had_before_is_replaced():
     start_ns = 10**15
     one.step(start_ns)
     refused = one.session
-    one.take_session(1, 0, ("SESSION",), start_ns + SESSION_REFUSED_AFTER_NS)
+    one.handle_session(1, 0, ("SESSION",), start_ns + SESSION_REFUSED_AFTER_NS)
     assert one.session == refused
     later_ns = start_ns + SESSION_REFUSED_AFTER_NS + 1
-    one.take_session(1, 0, ("CHALLENGE",), later_ns)
+    one.handle_session(1, 0, ("CHALLENGE",), later_ns)
     assert one.session == refused
-    one.take_session(1, 0, ("SESSION",), later_ns)
+    one.handle_session(1, 0, ("SESSION",), later_ns)
     one.step(later_ns)
     assert one.session not in (0, refused)
     report(one, "READY")
-    one.take_session(1, one.session, ("SESSION",), 2 * later_ns)
+    one.handle_session(1, one.session, ("SESSION",), 2 * later_ns)
     assert one.ready, "open sessions are not refused"
 
 
@@ -305,7 +305,7 @@ FRAMES = (("HELLO", HELLO), ("BUILD", BUILD), ("LIMITS", PAGE0), ("LIMITS", PAGE
 
 def take(handshake, *frames):
     for name, values in frames:
-        handshake.take(Decoded(name, 0, 0, values))
+        handshake.handle(Decoded(name, 0, 0, values))
     return handshake
 
 

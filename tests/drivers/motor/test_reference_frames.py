@@ -174,7 +174,7 @@ def test_due_after_a_period_or_when_forgotten():
     transmission.frame("TIME_REQUEST", 100, 7, sequence=0)
     assert not transmission.due("TIME_REQUEST", 149, 50)
     assert transmission.due("TIME_REQUEST", 150, 50)
-    transmission.forget()
+    transmission.clear()
     assert transmission.due("TIME_REQUEST", 101, 50)
 
 
@@ -193,7 +193,7 @@ def test_with_a_key_a_proof_goes_before_each_frame_that_needs_one_with_the_same_
     proved = transmission.proved(frames)
     assert outgoing_ids(proved) == [0x0F0, 0x100, 0x150]
     assert [outgoing.deadline_ns for outgoing in proved] == [7, 7, 9]
-    transmission.forget()
+    transmission.clear()
     assert outgoing_ids(transmission.proved(frames)) == [0x150]
 
 

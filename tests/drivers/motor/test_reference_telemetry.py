@@ -341,7 +341,7 @@ def test_after_forgetting_the_angles_go_on_from_where_they_are():
     ticks = wheel_ticks()
     ticks.update(0, 0, 0)
     ticks.update(20, 10, PERIOD_US)
-    ticks.forget()
+    ticks.clear()
     assert ticks.update(9_000_000, 77, 2 * PERIOD_US) == (20 * PER_TICK, 10 * PER_TICK)
 
 

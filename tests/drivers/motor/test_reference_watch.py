@@ -5,7 +5,7 @@ import itertools
 import pytest
 
 from drivers.motor.reference import ReferenceDriver
-from drivers.motor.reference_arming import LATE_NS, STATE_TIMEOUT_NS, ArmedWatch, CommandEcho
+from drivers.motor.reference_arming import DELAY_NS, STATE_TIMEOUT_NS, ArmedWatch, CommandEcho
 from drivers.types import DriverState
 from firmware_protocol.codec import Codec
 from tests.drivers.motor.bench import MS, Bench
@@ -23,13 +23,13 @@ def test_it_objects_to_late_commands_and_to_silence_and_forgets_at_rest():
     watch = ArmedWatch()
     assert watch.objection(10**12) is None
     watch.sent(0, 0)
-    watch.reported(15, LATE_NS)
-    assert watch.objection(LATE_NS) is None
-    watch.reported(15, LATE_NS + 1)
-    assert "0.15 s late" in watch.objection(LATE_NS + 1)
-    watch.reported(0, LATE_NS + 1)
-    assert watch.objection(LATE_NS + 1 + STATE_TIMEOUT_NS) is None
-    assert "not sent its state for 0.5 s" in watch.objection(LATE_NS + 2 + STATE_TIMEOUT_NS)
+    watch.reported(15, DELAY_NS)
+    assert watch.objection(DELAY_NS) is None
+    watch.reported(15, DELAY_NS + 1)
+    assert "0.15 s late" in watch.objection(DELAY_NS + 1)
+    watch.reported(0, DELAY_NS + 1)
+    assert watch.objection(DELAY_NS + 1 + STATE_TIMEOUT_NS) is None
+    assert "not sent its state for 0.5 s" in watch.objection(DELAY_NS + 2 + STATE_TIMEOUT_NS)
     assert (watch.late, watch.silent) == (1, 1)
     watch.rest()
     assert watch.objection(10**12) is None
@@ -120,13 +120,13 @@ def echo_of(count, first=0):
 
 
 def test_the_oldest_command_not_taken_says_how_late_the_robot_is():
-    assert echo_of(10).late_ns(9, 10 * PERIOD_NS) == 0
-    assert echo_of(10).late_ns(7, 10 * PERIOD_NS) == 2 * PERIOD_NS
-    assert CommandEcho().late_ns(5, 10 * PERIOD_NS) == 0
+    assert echo_of(10).delay_ns(9, 10 * PERIOD_NS) == 0
+    assert echo_of(10).delay_ns(7, 10 * PERIOD_NS) == 2 * PERIOD_NS
+    assert CommandEcho().delay_ns(5, 10 * PERIOD_NS) == 0
 
 
 def test_none_taken_since_the_beginning():
-    assert echo_of(5, first=100).late_ns(99 % 16, 105 * PERIOD_NS) == 5 * PERIOD_NS
+    assert echo_of(5, first=100).delay_ns(99 % 16, 105 * PERIOD_NS) == 5 * PERIOD_NS
 
 
 def test_the_counter_is_followed_past_its_wrap():
@@ -135,19 +135,19 @@ def test_the_counter_is_followed_past_its_wrap():
         echo.sent(number, number * PERIOD_NS)
         behind = number // 5
         if number % 5 == 4:
-            assert echo.late_ns((number - behind) % 16, (number + 1) * PERIOD_NS) == behind * PERIOD_NS
+            assert echo.delay_ns((number - behind) % 16, (number + 1) * PERIOD_NS) == behind * PERIOD_NS
 
 
 def test_a_gap_in_telemetry_is_no_lateness():
     echo = echo_of(1)
-    assert echo.late_ns(0, PERIOD_NS) == 0
+    assert echo.delay_ns(0, PERIOD_NS) == 0
     for number in range(1, 40):
         echo.sent(number, number * PERIOD_NS)
-    assert echo.late_ns(38 % 16, 40 * PERIOD_NS) == PERIOD_NS
+    assert echo.delay_ns(38 % 16, 40 * PERIOD_NS) == PERIOD_NS
 
 
 def test_what_was_sent_before_does_not_count_after_forgetting():
     echo = echo_of(10)
-    echo.forget()
+    echo.clear()
     echo.sent(10, 500 * PERIOD_NS)
-    assert echo.late_ns(5, 501 * PERIOD_NS) == PERIOD_NS
+    assert echo.delay_ns(5, 501 * PERIOD_NS) == PERIOD_NS

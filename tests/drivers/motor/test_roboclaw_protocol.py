@@ -18,7 +18,7 @@ def test_a_value_is_held_to_what_the_wire_can_say():
 
 def test_an_answer_is_read_with_its_sign():
     received = bytes.fromhex("00000001fffffffffb04")
-    assert protocol.ask_bytes(0x80, "encoders") == b"\x80\x4e"
+    assert protocol.request_bytes(0x80, "encoders") == b"\x80\x4e"
     assert protocol.reply(0x80, "encoders", received) == ({"encoder_m1": 1, "encoder_m2": -1}, 10)
 
 
@@ -42,7 +42,7 @@ def test_the_status_may_have_two_bytes():
 
 def test_an_address_that_no_board_has_is_refused():
     with pytest.raises(ValueError, match="0x7f"):
-        protocol.ask_bytes(0x7F, "status")
+        protocol.request_bytes(0x7F, "status")
 
 
 @given(st.binary(max_size=60), st.sampled_from(sorted(protocol.GETTERS)))

@@ -39,7 +39,7 @@ def test_what_the_base_cannot_do_is_slowed_down_on_the_same_curve(bench):
     ("fault", "words", "state"),
     [
         ("others_speak", "another node speaks on /cmd_vel", DriverState.STANDBY),
-        ("is_heard", "nobody hears /cmd_vel", DriverState.HANDSHAKE),
+        ("has_listener", "nobody hears /cmd_vel", DriverState.HANDSHAKE),
     ],
 )
 def test_a_base_that_others_drive_or_that_hears_nobody_is_not_armed_and_disarmed(bench, end, fault, words, state):

@@ -97,7 +97,7 @@ def test_it_says_who_it_is_and_of_each_limit_whether_it_was_reported_or_declared
     bench.run_until(*STILL)
     identity, limits = bench.driver.identity, bench.driver.limits
     begin, others = TELLS.get(str(vendor)) or TELLS[vendor.name]
-    assert identity.in_words().startswith(begin)
+    assert identity.describe().startswith(begin)
     declared = dict.fromkeys(("max_wheel_speed_rad_s", "command_timeout_s", "stop_deceleration_rad_s2"), "robot.toml")
     assert {name: limit.said_by for name, limit in limits.known().items()} == declared | others
     assert all(limit.value > 0.0 for limit in limits.known().values())

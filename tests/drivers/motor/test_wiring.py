@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from drivers.motor import AS_TOLD, Wiring, make_driver, rewired
+from drivers.motor import AS_CONFIGURED, Wiring, create_driver, rewired
 from drivers.types import DriverState, MotorSample, Readings, WheelCommand, WheelSample
 
 
@@ -66,6 +66,6 @@ def test_currents_change_sides_with_the_motors():
 
 
 def test_without_a_wiring_the_driver_stays_itself():
-    driver = make_driver(None)
-    assert rewired(driver, AS_TOLD) is driver
+    driver = create_driver(None)
+    assert rewired(driver, AS_CONFIGURED) is driver
     assert rewired(driver, Wiring(sides_swapped=True)).state is DriverState.DISCONNECTED

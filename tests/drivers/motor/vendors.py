@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import msgspec
 
-from drivers.motor import find_driver, make_driver
+from drivers.motor import create_driver, find_driver
 from sim.can_protocol import CanFrame
 from sim.devices import find_controller
 from tests.drivers.motor.bench import Bench
@@ -47,7 +47,7 @@ class Vendor:
         controller = find_controller(self.name)(self.settings, TICKS_PER_REV)
         exchange = find_driver(self.name).exchange(self.settings) if self.is_serial else None
         rig = VendorRig(controller, exchange)
-        return Bench(make_driver(self.name, self.settings), rig, **options)
+        return Bench(create_driver(self.name, self.settings), rig, **options)
 
     def __str__(self):
         return self.label

@@ -11,7 +11,7 @@ import pytest
 import drivers.pose
 from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError
-from drivers.pose import DEFAULT, PoseSourceError, make_pose_source, pose_sources
+from drivers.pose import DEFAULT, PoseSourceError, create_pose_source, pose_sources
 from drivers.types import PoseSample
 from tests.config.test_robot import GOOD
 from tests.drivers.waiting import free_port
@@ -45,7 +45,7 @@ def robot_toml(folder, section):
 
 @pytest.mark.usefixtures("_in_the_folder")
 def test_it_gives_what_was_sent_and_leaves_out_what_is_no_pose(port):
-    source = make_pose_source("beacon", beacon_port=port)
+    source = create_pose_source("beacon", beacon_port=port)
     assert source.receive(5, FROM_ROBOT) == []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as beacon:
         beacon.connect(("127.0.0.1", port))
@@ -63,9 +63,9 @@ def test_it_gives_what_was_sent_and_leaves_out_what_is_no_pose(port):
 
 @pytest.mark.usefixtures("_in_the_folder")
 def test_a_port_that_cannot_be_had_is_one_line(port):
-    source = make_pose_source("beacon", beacon_port=port)
+    source = create_pose_source("beacon", beacon_port=port)
     with pytest.raises(PoseSourceError, match=rf"^port {port}: Address already in use; choose another beacon_port$"):
-        make_pose_source("beacon", beacon_port=port)
+        create_pose_source("beacon", beacon_port=port)
     source.close()
 
 
@@ -81,7 +81,7 @@ def test_another_name_is_refused_with_those_that_there_are(tmp_path, wrong):
 
 
 def test_the_default_source_is_the_motor_controller():
-    source = make_pose_source(DEFAULT)
+    source = create_pose_source(DEFAULT)
     assert source.receive(5, FROM_ROBOT) == FROM_ROBOT
 
 

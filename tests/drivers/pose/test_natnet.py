@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from drivers.pose import PoseSourceError, make_pose_source
+from drivers.pose import PoseSourceError, create_pose_source
 from drivers.pose.natnet import VERSIONS, parse_frame, plane_pose
 from tests.drivers.pose.test_nmea import until
 from tests.drivers.waiting import free_port
@@ -154,7 +154,7 @@ def port():
 
 def test_by_multicast_with_the_exposures_age_and_a_lost_body(port):
     version, motive = (3, 0), Motive()
-    source = make_pose_source("natnet", data_port=port, body=3, position_std_m=0.002, yaw_std_rad=0.004)
+    source = create_pose_source("natnet", data_port=port, body=3, position_std_m=0.002, yaw_std_rad=0.004)
     body = rigid_body(version, 3, (1.5, 0.1, -2.0), TURNED)
     # The clock's frequency shows in half a second of the server's own time.
     motive.send(port, frame(version, [body], timestamp_s=1.0, exposed=TEN_MHZ))
@@ -186,7 +186,7 @@ def test_by_unicast_it_asks_and_takes_version_and_clock_from_the_answer(port, mo
         server.bind(("127.0.0.1", 0))
         server.settimeout(60.0)
         monkeypatch.setattr("drivers.pose.natnet.COMMAND_PORT", server.getsockname()[1])
-        source = make_pose_source("natnet", data_port=port, server="127.0.0.1", natnet_version="2.9", body=3)
+        source = create_pose_source("natnet", data_port=port, server="127.0.0.1", natnet_version="2.9", body=3)
         assert list(source.receive(0, ())) == []
         connect, client = server.recvfrom(100)
         keep_alive, _ = server.recvfrom(100)
@@ -203,12 +203,12 @@ def test_by_unicast_it_asks_and_takes_version_and_clock_from_the_answer(port, mo
 
 def test_an_address_that_is_not_this_computers_is_one_line():
     with pytest.raises(PoseSourceError, match=r"correct pose\.group, pose\.server, or pose\.address"):
-        make_pose_source("natnet", address="203.0.113.7")
+        create_pose_source("natnet", address="203.0.113.7")
 
 
 def test_frames_of_a_second_server_are_refused_and_named(port):
     version = (3, 0)
-    source = make_pose_source("natnet", data_port=port, server="127.0.0.1", body=3)
+    source = create_pose_source("natnet", data_port=port, server="127.0.0.1", body=3)
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as two,
@@ -235,7 +235,7 @@ def test_a_frame_with_more_than_motive_can_send_is_none():
 
 
 def test_a_flood_of_long_datagrams_waits_for_the_next_tick(port):
-    source = make_pose_source("natnet", data_port=port, server="127.0.0.1", body=3)
+    source = create_pose_source("natnet", data_port=port, server="127.0.0.1", body=3)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for _ in range(3):
             sender.sendto(bytes(40_000), ("127.0.0.1", port))

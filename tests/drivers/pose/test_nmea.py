@@ -11,7 +11,7 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 from disco_hw.runtime.pipeline import NoPlanner
-from drivers.pose import PoseSourceError, make_pose_source
+from drivers.pose import PoseSourceError, create_pose_source
 from drivers.pose.nmea import QUALITY_STD_M, Fixes, ReceiverClock, TangentPlane
 from tests.runtime.simulated import simulated_stack
 
@@ -46,14 +46,14 @@ def poses(found):
 
 def test_the_vendors_sentences_are_positions_with_their_quality():
     fixes = Fixes()
-    (first,) = poses(fixes.take(GGA_ALONE, NOW_NS))
+    (first,) = poses(fixes.add_line(GGA_ALONE, NOW_NS))
     assert first == {"t_ns": NOW_NS, "x_m": 0.0, "y_m": 0.0, "position_std_m": pytest.approx(3.0 * 1.01)}
-    assert poses(fixes.take(VTG, NOW_NS)) == poses(fixes.take(RMC, NOW_NS)) == []
+    assert poses(fixes.add_line(VTG, NOW_NS)) == poses(fixes.add_line(RMC, NOW_NS)) == []
     assert fixes.malformed == 0
     differential = Fixes()
-    assert poses(differential.take(GGA_DIFFERENTIAL, NOW_NS))[0]["position_std_m"] == pytest.approx(0.8 * 1.2)
-    differential.take(GST, NOW_NS)
-    assert poses(differential.take(GGA_DIFFERENTIAL, NOW_NS))[0]["position_std_m"] == 0.023
+    assert poses(differential.add_line(GGA_DIFFERENTIAL, NOW_NS))[0]["position_std_m"] == pytest.approx(0.8 * 1.2)
+    differential.add_line(GST, NOW_NS)
+    assert poses(differential.add_line(GGA_DIFFERENTIAL, NOW_NS))[0]["position_std_m"] == 0.023
 
 
 def test_east_and_north_agree_with_the_lengths_of_a_degree():
@@ -62,7 +62,7 @@ def test_east_and_north_agree_with_the_lengths_of_a_degree():
     moved = [(45.0, 7.0), (45.0 + 1e-3, 7.0), (45.0, 7.0 + 1e-3), (45.0 - 2e-3, 7.0 - 2e-3)]
     found = []
     for k, (latitude, longitude) in enumerate(moved):
-        (pose,) = poses(fixes.take(gga(0.2 * k, latitude, longitude, height=0.0), NOW_NS + k * 200_000_000))
+        (pose,) = poses(fixes.add_line(gga(0.2 * k, latitude, longitude, height=0.0), NOW_NS + k * 200_000_000))
         found.append((pose["x_m"], pose["y_m"]))
     assert found[0] == pytest.approx((0.0, 0.0), abs=1e-3)
     assert found[1] == pytest.approx((0.0, 111.1317), abs=3e-3)
@@ -86,29 +86,29 @@ def test_east_and_north_agree_with_the_lengths_of_a_degree():
     ],
 )
 def test_what_is_no_fix_gives_none_and_breaks_nothing(broken):
-    assert poses(Fixes().take(broken, NOW_NS)) == []
+    assert poses(Fixes().add_line(broken, NOW_NS)) == []
 
 
 def test_a_datum_of_another_town_is_said():
     fixes = Fixes(datum=(47.0, 8.5))
-    said = [each["said"] for each in fixes.take(GGA_ALONE, NOW_NS) if "said" in each]
+    said = [each["said"] for each in fixes.add_line(GGA_ALONE, NOW_NS) if "said" in each]
     assert "32097 m from the datum, and 838 m is the farthest; correct pose.datum" in said
-    assert len(fixes.take(GGA_ALONE, NOW_NS)) == 1
+    assert len(fixes.add_line(GGA_ALONE, NOW_NS)) == 1
 
 
 @pytest.mark.parametrize("quality", [0, 6, 7, 8])
 def test_what_is_not_measured_is_not_used_and_said_so(quality):
     fixes = Fixes()
-    (said,) = fixes.take(gga(1.0, 47.0, 8.0, quality=quality), NOW_NS)
+    (said,) = fixes.add_line(gga(1.0, 47.0, 8.0, quality=quality), NOW_NS)
     assert f"fix quality {quality}" in said["said"]
     assert "not used" in said["said"]
-    assert fixes.take(gga(1.2, 47.0, 8.0, quality=quality), NOW_NS) == []
+    assert fixes.add_line(gga(1.2, 47.0, 8.0, quality=quality), NOW_NS) == []
 
 
 def test_the_deviation_follows_the_quality():
     fixes = Fixes()
     for k, (quality, std_m) in enumerate(QUALITY_STD_M.items()):
-        (pose,) = poses(fixes.take(gga(10.0 * k, 47.0, 8.0, quality=quality), NOW_NS + 10**10 * k))
+        (pose,) = poses(fixes.add_line(gga(10.0 * k, 47.0, 8.0, quality=quality), NOW_NS + 10**10 * k))
         assert pose["position_std_m"] == std_m
 
 
@@ -117,13 +117,13 @@ def test_a_heading_goes_with_the_position_of_the_same_burst(order):
     """Clockwise from north; the position is given as soon as it is clear that no heading comes."""
     fixes = Fixes()
     # That there are headings at all is known from the first on.
-    fixes.take(HDT, NOW_NS - 200_000_000)
+    fixes.add_line(HDT, NOW_NS - 200_000_000)
     lines = [(GGA_ALONE, NOW_NS + order[0] * 10_000_000), (HDT, NOW_NS + order[1] * 10_000_000)]
-    found = [pose for line, at in sorted(lines, key=lambda one: one[1]) for pose in poses(fixes.take(line, at))]
+    found = [pose for line, at in sorted(lines, key=lambda one: one[1]) for pose in poses(fixes.add_line(line, at))]
     (pose,) = found
     assert pose["yaw_rad"] == pytest.approx(math.radians(90.0 - 123.456))
     assert pose["yaw_std_rad"] == 0.02
-    assert poses(fixes.take(GGA_ALONE, NOW_NS + 10**9)) == []
+    assert poses(fixes.add_line(GGA_ALONE, NOW_NS + 10**9)) == []
     assert fixes.flush(NOW_NS + 10**9 + 10_000_000) == []
     (bare,) = fixes.flush(NOW_NS + 10**9 + 70_000_000)
     assert "yaw_rad" not in bare
@@ -157,7 +157,7 @@ def until(source, enough):
     while not enough(found, said):
         assert time.monotonic() < end_s, (found, said)
         found += source.receive(time.monotonic_ns(), ())
-        said += source.news()
+        said += source.new_messages()
         time.sleep(0.01)
     return found, said
 
@@ -170,7 +170,7 @@ def opened(source):
 def test_over_a_serial_port_that_goes_away(ended):
     master, slave = os.openpty()
     tty.setraw(slave)
-    source = make_pose_source("nmea", device=os.ttyname(slave), baud=115_200)
+    source = create_pose_source("nmea", device=os.ttyname(slave), baud=115_200)
     ended(source)
     _, said = until(source, lambda _, said: said)
     assert said[0].endswith(": open")
@@ -188,7 +188,7 @@ def test_over_a_serial_port_that_goes_away(ended):
 def test_over_tcp_with_a_server_that_comes_late_and_sends_garbage(ended):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-        source = make_pose_source("nmea", device=f"socket://127.0.0.1:{port}", datum=(47.0, 8.5))
+        source = create_pose_source("nmea", device=f"socket://127.0.0.1:{port}", datum=(47.0, 8.5))
         ended(source)
         receiver, _ = server.accept()
         opened(source)
@@ -207,7 +207,7 @@ def test_over_tcp_with_a_server_that_comes_late_and_sends_garbage(ended):
 
 def test_a_reader_that_is_killed_is_said_and_one_whose_daemon_has_gone_ends(ended):
     with socket.create_server(("127.0.0.1", 0)) as server:
-        source = make_pose_source("nmea", device=f"socket://127.0.0.1:{server.getsockname()[1]}")
+        source = create_pose_source("nmea", device=f"socket://127.0.0.1:{server.getsockname()[1]}")
         ended(source)
         receiver, _ = server.accept()
         opened(source)
@@ -221,14 +221,14 @@ def test_a_reader_that_is_killed_is_said_and_one_whose_daemon_has_gone_ends(ende
         assert "poses: the process that reads the GPS receiver has ended; restart the daemon" in tick.events
         assert stack.run(1.0)[-1].pipeline.estimate.pose_ok is False
         receiver.close()
-        orphan = make_pose_source("nmea", device="/dev/does/not/exist")
+        orphan = create_pose_source("nmea", device="/dev/does/not/exist")
         orphan._socket.close()
         assert orphan._process.wait(60.0) == 0
 
 
 def test_without_a_device_it_says_what_to_write():
     with pytest.raises(PoseSourceError, match=r'no device; write pose\.device = "/dev/serial'):
-        make_pose_source("nmea")
+        create_pose_source("nmea")
 
 
 def sentence(text):
@@ -250,7 +250,7 @@ def said_by(found):
 def taken(*lines):
     """Return what is made of sentences that come 10 ms apart."""
     fixes = Fixes()
-    return [each for k, line in enumerate(lines) for each in fixes.take(line, NOW_NS + 10_000_000 * k)]
+    return [each for k, line in enumerate(lines) for each in fixes.add_line(line, NOW_NS + 10_000_000 * k)]
 
 
 @pytest.mark.parametrize("quality", QUALITY_STD_M)
@@ -317,8 +317,8 @@ def test_the_heading_that_came_without_a_fix_is_wide():
 def test_where_no_heading_comes_the_sentences_that_bring_one_are_named_once():
     def said_over(seconds, *first):
         fixes = Fixes()
-        found = [each for line in first for each in fixes.take(line, NOW_NS)]
-        found += [each for k in range(5 * seconds) for each in fixes.take(fix(4), NOW_NS + 200_000_000 * (k + 1))]
+        found = [each for line in first for each in fixes.add_line(line, NOW_NS)]
+        found += [each for k in range(5 * seconds) for each in fixes.add_line(fix(4), NOW_NS + 200_000_000 * (k + 1))]
         return [words for words in said_by(found) if "HDT or THS" in words]
 
     assert len(said_over(30)) == 1

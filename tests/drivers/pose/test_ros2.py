@@ -8,7 +8,7 @@ import sys
 import msgspec
 import pytest
 
-from drivers.pose import PoseSourceError, make_pose_source
+from drivers.pose import PoseSourceError, create_pose_source
 from drivers.pose.ros2 import bridge_address
 
 PORT = 40_000 + os.getpid() % 20_000
@@ -23,7 +23,7 @@ socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM).sendto(sys.stdin.buffer.read(),
 
 @pytest.fixture
 def source():
-    made = make_pose_source("ros2", port=PORT)
+    made = create_pose_source("ros2", port=PORT)
     yield made
     made.close()
 
@@ -61,17 +61,17 @@ def test_a_second_bridge_is_refused_and_named(source):
     address = bridge_address(PORT).hex()
     subprocess.run([sys.executable, "-c", ANOTHER_BRIDGE, address], input=datagram, check=True, timeout=60)
     assert [pose.x_m for pose in source.receive(NOW_NS, ())] == [1.0]
-    words, refused = source.news()
+    words, refused = source.new_messages()
     assert words == "hello"
     assert f"sends poses beside bridge process {os.getpid()}: not used" in refused
 
 
 def test_a_second_daemon_is_asked_to_take_another_port(source):
     with pytest.raises(PoseSourceError, match=rf"port {PORT}: .*; choose another pose\.port"):
-        make_pose_source("ros2", port=PORT)
+        create_pose_source("ros2", port=PORT)
 
 
 def test_a_source_that_was_closed_says_nothing_and_leaves_its_place(source):
     source.close()
     assert list(source.receive(NOW_NS, ())) == []
-    make_pose_source("ros2", port=PORT).close()
+    create_pose_source("ros2", port=PORT).close()

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.pose import PoseSourceError, make_pose_source
+from drivers.pose import PoseSourceError, create_pose_source
 from drivers.pose.senders import PoseProof, SenderGate, parse_allowed
 from tests.drivers.waiting import free_port
 
@@ -51,11 +51,11 @@ def test_a_flood_of_refused_datagrams_is_reported_once_in_ten_seconds_with_their
     for t_ns in range(0, 21 * SECOND_NS, SECOND_NS // 100):
         gate.note_pose(FIRST, t_ns)
         gate.may_send(SECOND, t_ns)
-    said = gate.news()
+    said = gate.new_messages()
     assert len(said) == 3
     assert "127.0.0.1:4002 sends poses beside 127.0.0.1:4001: not used (1 datagrams); stop one of them" in said[0]
     assert "(1000 datagrams)" in said[1]
-    assert gate.news() == []
+    assert gate.new_messages() == []
 
 
 def test_made_up_addresses_do_not_fill_the_memory():
@@ -74,7 +74,7 @@ def test_what_is_no_address_is_refused(addresses, words):
     with pytest.raises(ValueError, match=words):
         parse_allowed(addresses)
     with pytest.raises(PoseSourceError, match=rf"pose\.allow: .*{words}"):
-        make_pose_source("udp", port=free_port(socket.SOCK_DGRAM), allow=addresses)
+        create_pose_source("udp", port=free_port(socket.SOCK_DGRAM), allow=addresses)
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_each_proven_datagram_counts_once_and_none_from_before_the_port_was_open
 
 def test_over_a_real_socket_only_the_holder_of_the_key_is_heard():
     port = free_port(socket.SOCK_DGRAM)
-    source = make_pose_source("udp", port=port, key_file="pose.key", key=KEY)
+    source = create_pose_source("udp", port=port, key_file="pose.key", key=KEY)
     body = json.dumps(POSE).encode()
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
@@ -121,7 +121,7 @@ def test_over_a_real_socket_only_the_holder_of_the_key_is_heard():
         poses = source.receive(NOW_NS, ())
     assert [(pose.x_m, pose.y_m) for pose in poses] == [(1.0, -2.0)]
     assert source.refused == 2
-    (said,) = source.news()
+    (said,) = source.new_messages()
     assert "sends poses without the proof of pose.key_file: not used" in said
     source.close()
 
@@ -132,7 +132,7 @@ def test_the_pages_sender_with_a_key(tmp_path, monkeypatch):
     port = free_port(socket.SOCK_DGRAM)
     (tmp_path / "pose.key").write_text(KEY.hex() + "\n", encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    source, names = make_pose_source("udp", port=port, key=KEY), {}
+    source, names = create_pose_source("udp", port=port, key=KEY), {}
     exec(textwrap.dedent(code).replace("5005", str(port)), names)
     names["send"](POSE)
     assert [pose.x_m for pose in source.receive(NOW_NS, ())] == [1.0]
@@ -142,4 +142,4 @@ def test_the_pages_sender_with_a_key(tmp_path, monkeypatch):
 
 def test_a_key_that_is_named_and_was_not_read_opens_nothing():
     with pytest.raises(PoseSourceError, match=r"the key of pose\.key was not read"):
-        make_pose_source("udp", port=free_port(socket.SOCK_DGRAM), key_file="pose.key")
+        create_pose_source("udp", port=free_port(socket.SOCK_DGRAM), key_file="pose.key")

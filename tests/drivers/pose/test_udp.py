@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.pose import PoseSourceError, make_pose_source
+from drivers.pose import PoseSourceError, create_pose_source
 from drivers.pose.udp import pose_of
 from tests.drivers.waiting import free_port
 
@@ -89,7 +89,7 @@ def test_no_bytes_break_it(datagram):
 
 
 def test_over_a_real_socket_in_order_and_the_malformed_counted(port):
-    source = make_pose_source("udp", port=port)
+    source = create_pose_source("udp", port=port)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for age_s in (0.01, 0.05):
             sender.sendto(json.dumps({**POSE, "age_s": age_s}).encode(), ("127.0.0.1", port))
@@ -103,9 +103,9 @@ def test_over_a_real_socket_in_order_and_the_malformed_counted(port):
 
 
 def test_a_port_that_is_taken_is_refused_in_one_line(port):
-    first = make_pose_source("udp", port=port)
+    first = create_pose_source("udp", port=port)
     with pytest.raises(PoseSourceError, match=rf"127\.0\.0\.1:{port}: .*; choose another pose\.port"):
-        make_pose_source("udp", port=port)
+        create_pose_source("udp", port=port)
     first.close()
 
 
@@ -127,7 +127,7 @@ def arrived(source):
 
 
 def test_the_pages_sender_in_python(port):
-    source, names = make_pose_source("udp", port=port), {}
+    source, names = create_pose_source("udp", port=port), {}
     exec(sent_from_the_page("python", port), names)
     names["send"](1.5, -2.0, 0.25, 0.04)
     assert arrived(source) == (1.5, -2.0, 0.25, 40_000_000)
@@ -142,6 +142,6 @@ def test_the_pages_sender_in_cpp(port, tmp_path):
     )
     command = [compiler, "-std=c++11", "-Wall", "-Wextra", "-Werror", "-o", tmp_path / "send", tmp_path / "send.cpp"]
     subprocess.run(command, check=True, timeout=120)
-    source = make_pose_source("udp", port=port)
+    source = create_pose_source("udp", port=port)
     subprocess.run([tmp_path / "send"], check=True, timeout=60)
     assert arrived(source) == (1.5, -2.0, 0.25, 40_000_000)

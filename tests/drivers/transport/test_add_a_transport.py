@@ -9,7 +9,7 @@ import pytest
 
 import drivers.transport
 from disco_hw.config.robot import Link
-from drivers.transport import TransportSettingsError, make_transport, media
+from drivers.transport import TransportSettingsError, create_transport, media
 from drivers.types import Frame, LinkState
 from tests.drivers.waiting import collect, outgoing, send, wait_until
 
@@ -38,7 +38,7 @@ def controller():
 @pytest.fixture
 def transport(_in_the_folder, controller):
     link = Link(kind="udp", channel=f"127.0.0.1:{controller.getsockname()[1]}")
-    transport = make_transport(**link.medium_fields())
+    transport = create_transport(**link.medium_fields())
     transport.open()
     wait_until(lambda: transport.state is LinkState.UP)
     yield transport
@@ -77,9 +77,9 @@ def test_a_controller_that_goes_and_comes_back_is_a_new_link(transport, controll
 @pytest.mark.usefixtures("_in_the_folder")
 def test_an_address_that_is_none_is_refused_in_one_line():
     with pytest.raises(TransportSettingsError, match=r'^link\.channel: "can0" is no address; write host:port$'):
-        make_transport("udp", channel="can0")
+        create_transport("udp", channel="can0")
 
 
 def test_without_the_file_there_is_no_such_kind():
     with pytest.raises(TransportSettingsError, match='"udp" is no kind of link; write "can" or "serial"'):
-        make_transport("udp", channel="127.0.0.1:1")
+        create_transport("udp", channel="127.0.0.1:1")

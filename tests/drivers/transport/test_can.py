@@ -22,7 +22,7 @@ from drivers.transport.can import (
     WRITE_TIMEOUT_S,
     CanConnection,
     CanMedium,
-    OwnFrames,
+    SentFrames,
     decode_error_frame,
     is_busy,
     monotonic_stamp_ns,
@@ -87,7 +87,7 @@ A, B = Frame(0x100, b"\1"), Frame(0x100, b"\2")
 
 @pytest.fixture
 def own():
-    return OwnFrames()
+    return SentFrames()
 
 
 def test_each_frame_sent_excuses_one_that_is_equal(own):
@@ -121,7 +121,7 @@ def test_a_frame_that_was_not_sent_excuses_nothing(own):
 @given(st.lists(st.tuples(st.sampled_from([A, B]), st.booleans()), max_size=40))
 def test_whoever_else_sends_is_heard_as_often_as_he_sends(events):
     """Echoes and another host's frames of the same contents, in any order: what is not excused is as many as his."""
-    own = OwnFrames()
+    own = SentFrames()
     for frame, is_ours in events:
         if is_ours:
             own.sent(0, frame)
@@ -285,7 +285,7 @@ def test_a_frame_that_found_no_room_excuses_no_other_hosts():
         def recv(self, timeout):
             return message(0x100, b"\1")
 
-    connection = CanConnection(Full(), TransportCounters(), OwnFrames())
+    connection = CanConnection(Full(), TransportCounters(), SentFrames())
     with pytest.raises(TransmitBusyError):
         connection.write(Frame(0x100, b"\1"))
     assert [received.frame for received in connection.read()] == [Frame(0x100, b"\1")]

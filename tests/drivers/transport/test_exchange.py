@@ -8,7 +8,7 @@ import tty
 import pytest
 
 from drivers.motor import roboclaw_protocol as protocol
-from drivers.motor.roboclaw_protocol import RoboclawExchange, question, setting
+from drivers.motor.roboclaw_protocol import RoboclawExchange, query, setting
 from drivers.transport.reconnecting import BackoffPolicy, ReconnectingTransport
 from drivers.transport.serial import SerialMedium
 from drivers.types import Frame, LinkState, OutgoingFrame
@@ -16,7 +16,7 @@ from sim.devices.roboclaw import Roboclaw
 from tests.drivers.waiting import collect, send, wait_until
 
 FAST = BackoffPolicy(first_s=0.01, longest_s=0.05, steady_s=0.1)
-ENCODERS, SPEEDS, STATUS = (question(0x80, name) for name in ("encoders", "speeds", "status"))
+ENCODERS, SPEEDS, STATUS = (query(0x80, name) for name in ("encoders", "speeds", "status"))
 STOP = setting(0x80, "duty_m1m2", duty_m1=0, duty_m2=0)
 # Thirty times what a board is given: on a host whose processors are all taken no reply is late here,
 PATIENT = RoboclawExchange(timeout_s=1.0, quiet_s=0.2)
@@ -150,7 +150,7 @@ def test_a_reply_that_does_not_fit_the_question_is_counted_and_the_next_is_whole
 
 @hasty
 def test_a_board_that_is_silent_holds_up_the_others_for_a_moment_only(line, transport):
-    silent = [question(0x81, "status")] * 3
+    silent = [query(0x81, "status")] * 3
     send(transport, *ask(*silent, STATUS))
     assert [received.frame.can_id for received in collect(transport, 1)] == [STATUS.can_id]
     assert transport.stats.receive_errors == 3

@@ -1,6 +1,6 @@
 import pytest
 
-from drivers.transport import TransportSettingsError, can, make_transport, open_transport
+from drivers.transport import TransportSettingsError, can, create_transport, open_transport
 from drivers.types import LinkState
 
 
@@ -34,7 +34,7 @@ def test_an_interface_without_its_package_says_what_to_install(monkeypatch, inte
 
 def test_an_interface_with_its_package_is_not_refused(monkeypatch):
     monkeypatch.setattr(can, "find_spec", lambda module: object())
-    assert make_transport("can", interface="gs_usb", channel="0").name == "gs_usb 0"
+    assert create_transport("can", interface="gs_usb", channel="0").name == "gs_usb 0"
 
 
 def test_an_interface_name_is_known_to_include_ours():

@@ -127,13 +127,13 @@ def test_a_frame_put_back_stays_before_its_equals():
     queue.push(second)
     assert queue.pop() is first
     queue.push(urgent)
-    queue.put_back(first)
+    queue.requeue(first)
     assert drain(queue) == [urgent, first, second]
     queue.push(first)
     queue.push(second)
     taken = [queue.pop(), queue.pop()]
     for one in reversed(taken):
-        queue.put_back(one)
+        queue.requeue(one)
     assert drain(queue) == [first, second]
     queue.push(first)
     assert queue.clear() == 1

@@ -9,7 +9,7 @@ import pytest
 import serial
 
 from drivers.transport.reconnecting import BackoffPolicy, ReconnectingTransport, TransportCounters
-from drivers.transport.serial import WRITE_TIMEOUT_S, SerialMedium, ask_for_low_latency, open_port
+from drivers.transport.serial import WRITE_TIMEOUT_S, SerialMedium, open_port, request_low_latency
 from drivers.types import Frame, LinkState
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 from tests.drivers.transport.pseudo_terminal import PseudoTerminal
@@ -215,14 +215,14 @@ class FtdiPort:
 
 def test_an_adapter_that_holds_bytes_back_is_set_not_to():
     port = FtdiPort()
-    ask_for_low_latency(port)
+    request_low_latency(port)
     assert port.low_latency
 
 
 @pytest.mark.parametrize("error", [ValueError("no such mode"), OSError(25, "ENOTTY"), NotImplementedError("not here")])
 def test_a_port_without_low_latency_is_used_as_it_is(error):
-    ask_for_low_latency(FtdiPort(error))
-    ask_for_low_latency(object())
+    request_low_latency(FtdiPort(error))
+    request_low_latency(object())
 
 
 class Listener:

@@ -33,9 +33,11 @@ class BoardEnd(LinkEnd):
 
     def connected(self):
         if self.slcan:
-            transport = can.make_transport(interface="slcan", channel=self.board.port, options={"sleep_after_open": 0})
+            transport = can.create_transport(
+                interface="slcan", channel=self.board.port, options={"sleep_after_open": 0}
+            )
         else:
-            transport = serial.make_transport(port=self.board.port)
+            transport = serial.create_transport(port=self.board.port)
         transport.open()
         return transport
 

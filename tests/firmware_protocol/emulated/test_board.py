@@ -152,10 +152,10 @@ def test_a_thousand_frames_of_garbage_move_nothing_and_leave_it_sound(host_at_a_
 
 FROZEN_HOST = """
     import sys, time
-    from drivers.transport.serial import make_transport
+    from drivers.transport.serial import create_transport
     from tests.firmware_protocol.other_end import LinkEnd
     from tests.firmware_protocol.protocol_host import ProtocolHost
-    transport = make_transport(port=sys.argv[1])
+    transport = create_transport(port=sys.argv[1])
     transport.open()
     host = ProtocolHost(LinkEnd(transport))
     host.settle()
@@ -202,7 +202,7 @@ def test_it_drives_a_virtual_robot_over_its_plants_line(tmp_path, processor):
     image = build_board(processor, tmp_path, plant_line=True)
     with running_bare_board(image, processor) as (link, plant):
         sim = SimProcess(tmp_path, plant)
-        transport = serial.make_transport(port=link)
+        transport = serial.create_transport(port=link)
         transport.open()
         host = ProtocolHost(LinkEnd(transport), first_session=3)
         try:

@@ -91,7 +91,7 @@ def run(directory, robot_file, others):
         operator.request("disarm")
         operator.wait_for("READY", 5.0)
         operator.request("quit")
-        assert daemon.process.wait(20.0) == 0, daemon.last_words()
+        assert daemon.process.wait(20.0) == 0, daemon.last_line()
     return [open_log(part) for part in (log, *sorted(directory.glob("run.part*.mcap")))]
 
 

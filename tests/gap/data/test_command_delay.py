@@ -5,7 +5,14 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.command_timing import Answer, Response, Turned, _answer, command_clock, response
+from disco_hw.gap.data.command_timing import (
+    Response,
+    Turned,
+    WheelResponse,
+    _integrate_response,
+    command_clock,
+    response,
+)
 from disco_hw.gap.data.stamp_clock import StampClock, picked
 from disco_hw.gap.settings import GridSettings
 from disco_hw.log.drive import Commands, Wheels
@@ -35,7 +42,7 @@ def commands_at(t_s, asked, segment=0):
 def test_wheels_answer_each_change_of_a_command_by_itself(lag_s):
     commands = commands_at([2.0, 2.3, 2.5, 3.1, 4.0], [(1.0, -2.0), (4.0, 0.0), (-3.0, 0.5), (2.0, 2.0), (0.0, 1.0)])
     asked = np.column_stack([commands.left_rad_s, commands.right_rad_s])
-    answer = Answer.of(commands, lag_s)
+    answer = WheelResponse.of(commands, lag_s)
     state, angle = answer.speed, answer.angle
     speed, way = answered(commands, lag_s, commands.t_s)
     if lag_s:
@@ -50,8 +57,8 @@ def test_wheels_answer_each_change_of_a_command_by_itself(lag_s):
 def test_two_commands_at_one_instant_count_as_the_later_one(lag_s):
     t_s, asked = np.array([2.0, 2.5, 2.5, 3.0]), np.array([(1.0, -2.0), (4.0, 0.0), (-3.0, 0.5), (2.0, 2.0)])
     speed, angle = np.full((2, 4, 2), np.nan)
-    _answer(t_s, asked, np.zeros(4, np.int64), lag_s, speed, angle)
-    alone = Answer.of(commands_at(t_s[[0, 2, 3]], asked[[0, 2, 3]]), lag_s)
+    _integrate_response(t_s, asked, np.zeros(4, np.int64), lag_s, speed, angle)
+    alone = WheelResponse.of(commands_at(t_s[[0, 2, 3]], asked[[0, 2, 3]]), lag_s)
     np.testing.assert_allclose(speed[[0, 1, 3]], alone.speed, atol=1e-12)
     np.testing.assert_allclose(angle[[0, 1, 3]], alone.angle, atol=1e-12)
 
@@ -59,8 +66,8 @@ def test_two_commands_at_one_instant_count_as_the_later_one(lag_s):
 def test_a_segment_begins_with_wheels_that_follow_its_first_command():
     asked = [(1.0, -2.0), (4.0, 0.0), (-3.0, 0.5), (2.0, 2.0)]
     both = replace(commands_at([2.0, 2.3, 2.5, 3.1], asked), segment=np.array([0, 0, 1, 1]))
-    late = Answer.of(both, 0.3)
-    own = Answer.of(commands_at([2.5, 3.1], asked[2:]), 0.3)
+    late = WheelResponse.of(both, 0.3)
+    own = WheelResponse.of(commands_at([2.5, 3.1], asked[2:]), 0.3)
     np.testing.assert_allclose(late.speed[2:], own.speed, atol=1e-12)
     np.testing.assert_allclose(late.angle[3] - late.angle[2], own.angle[1], atol=1e-12)
 
@@ -104,9 +111,9 @@ def test_what_wheels_turn_is_fitted_by_what_both_commands_make_them_turn(delay_s
     commands, turned = driven()
     count, misfit = by_hand(commands, turned, delay_s, lag_s)
     assert 100 < count < 140
-    delays, answer = np.array([90.0, delay_s, -90.0]), Answer.of(commands, lag_s)
-    assert answer.misfits(turned, delays, count) == pytest.approx([np.inf, misfit, np.inf], rel=1e-9)
-    assert (answer.misfits(turned, delays, count + 1) == np.inf).all()
+    delays, answer = np.array([90.0, delay_s, -90.0]), WheelResponse.of(commands, lag_s)
+    assert answer.mismatches(turned, delays, count) == pytest.approx([np.inf, misfit, np.inf], rel=1e-9)
+    assert (answer.mismatches(turned, delays, count + 1) == np.inf).all()
     assert np.count_nonzero(answer.known(turned, delay_s)) == count
 
 
@@ -117,14 +124,14 @@ def test_a_pair_is_known_from_the_first_command_to_the_last_and_up_to_one_that_i
         (5.0, 6.0, True), (5.5, 6.01, False),
     ):  # fmt: skip
         pair = Turned(*(np.array([each]) for each in (begin_s, end_s, 0, 1.0, 1.0)))
-        assert Answer.of(commands, 0.0).known(pair, 0.0).tolist() == [known]
+        assert WheelResponse.of(commands, 0.0).known(pair, 0.0).tolist() == [known]
 
 
 def test_what_was_not_known_right_after_the_first_command_is_not_known():
     commands = commands_at([1.0, 2.0, 2.25, 3.0], [(1, 2), (np.nan, np.nan), (2, 2), (4, 4)])
     for begin_s, end_s, known in ((1.5, 2.0, True), (1.5, 2.125, False), (1.5, 2.5, False), (2.25, 2.5, True)):
         pair = Turned(*(np.array([each]) for each in (begin_s, end_s, 0, 1.0, 1.0)))
-        assert Answer.of(commands, 0.0).known(pair, 0.0).tolist() == [known]
+        assert WheelResponse.of(commands, 0.0).known(pair, 0.0).tolist() == [known]
 
 
 def sampled(count=400, period_s=0.05, segment=0):
@@ -155,9 +162,9 @@ def scanned(monkeypatch):
             # One pair in three is lost where commands are not known.
             return (np.arange(turned.begin_s.size) % 3 > 0) | (abs(delay_s) <= known_s)
 
-        monkeypatch.setattr(Answer, "misfits", misfits)
-        monkeypatch.setattr(Answer, "known", known)
-        monkeypatch.setattr(Answer, "stands_out", lambda *_: shared)
+        monkeypatch.setattr(WheelResponse, "misfits", misfits)
+        monkeypatch.setattr(WheelResponse, "known", known)
+        monkeypatch.setattr(WheelResponse, "is_distinct", lambda *_: shared)
         chosen = replace(SETTINGS, **({"lags_s": (0.1, 0.3), "lag_reach_s": 0.12} | settings))
         return response(Turned.of(sampled() if wheels is None else wheels, chosen), commands, chosen)
 
@@ -248,11 +255,11 @@ def test_the_same_pairs_fit_worse_at_a_shorter_and_at_a_longer_delay(by_s, told)
     begin = np.arange(2.0, 55.0, 0.2)
     way = [answered(commands, 0.0, at)[1] for at in (begin - 0.2, begin + 0.2)]
     turned = Turned(begin, begin + 0.4, np.zeros(begin.size, np.int64), *(way[1] - way[0]).T)
-    answer = Answer.of(commands, 0.0)
-    assert answer.stands_out(turned, 0.2 + by_s, 0.15) == told
-    steady = Answer.of(commands_at(t_s, np.ones((600, 2))), 0.0)
-    assert not steady.stands_out(turned, 0.2, 0.15)
-    assert not answer.stands_out(turned, 90.0, 0.15)
+    answer = WheelResponse.of(commands, 0.0)
+    assert answer.is_distinct(turned, 0.2 + by_s, 0.15) == told
+    steady = WheelResponse.of(commands_at(t_s, np.ones((600, 2))), 0.0)
+    assert not steady.is_distinct(turned, 0.2, 0.15)
+    assert not answer.is_distinct(turned, 90.0, 0.15)
 
 
 @pytest.mark.parametrize(
@@ -268,10 +275,10 @@ def test_both_fit_worse_for_the_pairs_that_are_known_at_all_three(monkeypatch, s
         seen.append(turned.begin_s.tolist())
         return misfits[round(delay_s, 9)]
 
-    monkeypatch.setattr(Answer, "known", lambda answer, turned, delay_s: np.array(known[round(delay_s, 9)]) > 0)
-    monkeypatch.setattr(Answer, "_misfit", misfit)
+    monkeypatch.setattr(WheelResponse, "known", lambda answer, turned, delay_s: np.array(known[round(delay_s, 9)]) > 0)
+    monkeypatch.setattr(WheelResponse, "_mismatch", misfit)
     pairs = Turned(np.arange(4.0), *(np.arange(4.0),) * 4)
-    assert Answer.of(ONE, 0.0).stands_out(pairs, 0.3, 0.2) is told
+    assert WheelResponse.of(ONE, 0.0).is_distinct(pairs, 0.3, 0.2) is told
     assert seen == [[0.0]] * 3
 
 
@@ -302,7 +309,7 @@ def test_a_single_sample_makes_no_pair():
 def test_too_few_samples_or_commands_have_no_delay_and_nothing_is_asked_of_it(scanned):
     found = {0.0: (0.24, 1.0)}
     none = picked(ONE, np.array([True, False]))
-    assert scanned(found, commands=none) == Response(delay_s=0.0, lag_s=0.0, misfit=0.0, known=True)
+    assert scanned(found, commands=none) == Response(delay_s=0.0, lag_s=0.0, mismatch=0.0, known=True)
     # Two samples make one pair.
     assert scanned(found, sampled(2, 0.4), fewest_poses=1).delay_s == pytest.approx(0.24, abs=1e-3)
     assert scanned(found, sampled(1, 0.4), fewest_poses=1) == Response()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.data import command_timing
-from disco_hw.gap.data.command_timing import Answer, CommandAlignment, Response, Turned, command_clock
+from disco_hw.gap.data.command_timing import CommandAlignment, Response, Turned, WheelResponse, command_clock
 from disco_hw.gap.data.stamp_clock import StampClock
 from disco_hw.gap.settings import GridSettings
 from disco_hw.log.drive import Commands
@@ -23,7 +23,7 @@ PLAIN = Response()
 
 
 def beside(begin_s=range(30), first=PLAIN, commands=COMMANDS):
-    return CommandAlignment(pairs(begin_s), first, Answer.of(commands, 0.1), SETTINGS)
+    return CommandAlignment(pairs(begin_s), first, WheelResponse.of(commands, 0.1), SETTINGS)
 
 
 @pytest.mark.parametrize(("period_s", "stretch_s"), [(0.05, 12.0), (0.1333, 12.0), (0.1334, 12.006), (0.5, 45.0)])
@@ -72,7 +72,7 @@ def shown(monkeypatch):
             there = -np.maximum(depth - 100.0 * (delays - at_s) ** 2, 0.0)
             return np.where(np.abs(delays) <= known_s, there, np.inf)
 
-        monkeypatch.setattr(Answer, "misfits", misfits)
+        monkeypatch.setattr(WheelResponse, "misfits", misfits)
         return beside(begin_s)
 
     told.asked = asked
@@ -94,9 +94,9 @@ def test_the_age_of_commands_in_a_stretch_is_minus_the_delay_that_stands_out_in_
 def test_the_misfit_of_a_stretch_at_an_age_is_that_of_all_its_pairs(shown):
     align = shown(0.2, 3.0)
     # At 0.1 s of 0.2 s a nat less for each of four.
-    assert align.part_misfit(5.0, 9.0, -0.1) == pytest.approx(-8.0)
+    assert align.part_mismatch(5.0, 9.0, -0.1) == pytest.approx(-8.0)
     assert [(begin_s, delays.tolist()) for begin_s, delays in shown.asked] == [([5.0, 6.0, 7.0, 8.0], [0.1])]
-    assert align.part_misfit(5.0, 9.0, -0.95) == 0.0
+    assert align.part_mismatch(5.0, 9.0, -0.95) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,10 @@ def test_what_rows_of_a_log_stamp_is_known_as_closely_as_they_follow_one_another
 def test_commands_in_force_are_earlier_ones_or_later_ones_where_their_stamps_are_late(cells):
     t = np.arange(0.0, 10.0, 0.02)
     line = grid_drive(drive(t, np.sin(t), t, np.sin(t)))
-    own, in_force = np.nan_to_num(line.command_rad_s), line.late_commands(line.commands_moved_s + cells * GRID_STEP_S)
+    own, in_force = (
+        np.nan_to_num(line.command_rad_s),
+        line.delayed_commands(line.commands_moved_s + cells * GRID_STEP_S),
+    )
     assert in_force.shape == own.shape
     node = np.arange(20, own.shape[0] - 20)
     np.testing.assert_array_equal(in_force[node], own[node - cells])
@@ -115,7 +118,7 @@ def test_a_log_whose_stamps_are_moved_lies_on_the_grid_as_if_they_were_not(by_s)
     # And what is in force after a delay is counted from the stamps.
     late_s = commands.commands_moved_s + 0.05
     np.testing.assert_allclose(
-        commands.late_commands(late_s)[inside][5:], plain.late_commands(plain.commands_moved_s + 0.05)[inside][5:]
+        commands.delayed_commands(late_s)[inside][5:], plain.delayed_commands(plain.commands_moved_s + 0.05)[inside][5:]
     )
     poses = grid_drive(replace(log, poses=replace(log.poses, t_s=log.poses.t_s + by_s)))
     assert poses.poses_moved_s == poses.pose_delay_s == pytest.approx(plain.pose_delay_s + by_s, abs=1e-3)

@@ -86,7 +86,7 @@ class Stamped:
         self.asked.append((low_s, high_s))
         return self.delays[len(self.asked) - 1]
 
-    def part_misfit(self, low_s, high_s, delay_s):
+    def part_mismatch(self, low_s, high_s, delay_s):
         return self.wrong(low_s, high_s, delay_s)
 
 
@@ -290,18 +290,18 @@ def test_a_delay_is_told_where_it_stands_out_and_between_those_that_are_tried(mo
         out = np.minimum(((delays - 0.1234) / 0.02) ** 2 - 0.17**2, 4.0) * 0.25 * depth
         return np.where(delays > 0.95, np.inf, out)
 
-    monkeypatch.setattr(timing, "_misfits", misfits)
+    monkeypatch.setattr(timing, "_mismatches", misfits)
     assert pose_delay_s(None, None, SETTINGS) == pytest.approx(found_s, abs=2e-4)
     assert tried[0] == pytest.approx(np.arange(-50, 51) * 0.02)
-    monkeypatch.setattr(timing, "_misfits", lambda wheels, poses, delays, settings: np.full(delays.size, np.inf))
+    monkeypatch.setattr(timing, "_mismatches", lambda wheels, poses, delays, settings: np.full(delays.size, np.inf))
     assert pose_delay_s(None, None, SETTINGS) == 0.0
-    assert timing._misfit_at(None, None, 0.1, SETTINGS) == 0.0
+    assert timing._mismatch_at(None, None, 0.1, SETTINGS) == 0.0
 
 
 def test_a_delay_that_stands_out_by_just_enough_is_told(monkeypatch):
     settings = replace(SETTINGS, least_delay_nats=0.5)
     monkeypatch.setattr(
-        timing, "_misfits", lambda wheels, poses, delays, settings: -0.5 * (np.abs(delays - 0.2) < 0.01)
+        timing, "_mismatches", lambda wheels, poses, delays, settings: -0.5 * (np.abs(delays - 0.2) < 0.01)
     )
     assert pose_delay_s(None, None, settings) == pytest.approx(0.2, abs=0.01)
 
@@ -360,8 +360,8 @@ def test_turns_and_ways_of_poses_are_fitted_by_those_of_the_wheels_at_a_delay(de
     assert count > 250
     # Headings go past half a turn.
     assert np.abs(np.diff(poses.yaw_rad)).max() > 6.0
-    assert timing._misfit_at(wheels, poses, delay_s, SETTINGS) == pytest.approx(misfit, rel=1e-9)
-    many = timing._misfits(wheels, poses, np.array([-90.0, delay_s, 90.0]), SETTINGS)
+    assert timing._mismatch_at(wheels, poses, delay_s, SETTINGS) == pytest.approx(misfit, rel=1e-9)
+    many = timing._mismatches(wheels, poses, np.array([-90.0, delay_s, 90.0]), SETTINGS)
     assert many == pytest.approx([np.inf, misfit, np.inf], rel=1e-9)
 
 
@@ -370,16 +370,16 @@ def test_too_few_pairs_are_not_fitted(fewest, known):
     wheels, poses = winding()
     count, _ = by_hand(wheels, poses, 0.12)
     settings = replace(SETTINGS, fewest_poses=count + fewest)
-    assert np.isfinite(timing._misfits(wheels, poses, np.array([0.12]), settings))[0] == known
+    assert np.isfinite(timing._mismatches(wheels, poses, np.array([0.12]), settings))[0] == known
     pairs = timing._pairs(poses, 0.4)[0].size
     for more, wanted in ((0, True), (1, False)):
         settings = replace(SETTINGS, fewest_poses=pairs + more)
         unlimited = replace(wheels, t_s=wheels.t_s.copy(), segment=wheels.segment)
-        assert np.isfinite(timing._misfits(unlimited, poses, np.array([0.0]), settings))[0] == wanted
+        assert np.isfinite(timing._mismatches(unlimited, poses, np.array([0.0]), settings))[0] == wanted
     for few in (0, 1):
         hardly = replace(wheels, **{name: getattr(wheels, name)[:few] for name in wheels.__slots__[:6]})
-        assert timing._misfits(hardly, poses, np.array([0.0]), SETTINGS)[0] == np.inf
-        assert timing._misfits(hardly, poses_at([]), np.array([0.0]), SETTINGS)[0] == np.inf
+        assert timing._mismatches(hardly, poses, np.array([0.0]), SETTINGS)[0] == np.inf
+        assert timing._mismatches(hardly, poses_at([]), np.array([0.0]), SETTINGS)[0] == np.inf
 
 
 def test_two_columns_are_solved_as_normal_equations_and_like_columns_as_one():

@@ -132,22 +132,22 @@ def test_a_regression_by_normal_equations_fits_as_one_by_decomposition(alike, sc
     difference = scale * (0.4 * total + alike * rng.normal(0.0, 1.0, 300))
     measured = 0.11 * total + 0.05 / scale * difference + 0.01 * rng.normal(0.0, 1.0, 300)
     measured[::17] += 0.8
-    found = timing.misfit_of(difference, total, measured)
+    found = timing.mismatch_of(difference, total, measured)
     assert found == pytest.approx(by_decomposition(difference, total, measured), abs=1e-8)
-    assert timing.misfit_of(difference, total, measured + 0.1 * total**2) > found + 0.1
+    assert timing.mismatch_of(difference, total, measured + 0.1 * total**2) > found + 0.1
 
 
 def test_wheels_that_do_not_turn_leave_all_that_is_measured():
     nothing, measured = np.zeros(100), np.random.default_rng(6).normal(0.0, 0.1, 100)
-    assert timing.misfit_of(nothing, nothing, measured) == pytest.approx(by_decomposition(nothing, nothing, measured))
+    assert timing.mismatch_of(nothing, nothing, measured) == pytest.approx(by_decomposition(nothing, nothing, measured))
 
 
 def test_wheels_that_only_turn_alike_or_against_each_other_tell_all_that_they_do():
     nothing, turned, noise = np.random.default_rng(8).normal(0.0, 0.1, (3, 100)) * [[0.0], [1.0], [0.1]]
     measured = 2.0 * turned + noise
     expected = by_decomposition(nothing, turned, measured)
-    assert timing.misfit_of(nothing, turned, measured) == pytest.approx(expected)
-    assert timing.misfit_of(turned, nothing, measured) == pytest.approx(expected)
+    assert timing.mismatch_of(nothing, turned, measured) == pytest.approx(expected)
+    assert timing.mismatch_of(turned, nothing, measured) == pytest.approx(expected)
 
 
 # As many pairs as tell a delay to 20 ms.

@@ -118,7 +118,7 @@ def test_a_slow_error_acts_on_the_speed_that_is_expected_and_tells_nothing_of_a_
     # Starts and stops: a gain shows in each, and so does an error of the speed that is slower than all of them.
     asked = np.repeat(np.where(np.arange(60) % 2 == 0, 4.0, 0.0), 100)[:, None].repeat(2, axis=1)
     line = line_of(asked)
-    stamped = WheelNoise(relative=1e-4, reading_rad=1e-3, stamp_s=4e-3, command_stamp_s=1e-5, wander=0.01)
+    stamped = WheelNoise(relative=1e-4, reading_rad=1e-3, stamp_s=4e-3, command_stamp_s=1e-5, drift_std=0.01)
     channel = WheelChannel.build(line, stamped, np.array(GEOMETRY)).expecting(WHEEL.neutral)
     gained = WHEEL.neutral.copy()
     gained[WHEEL.place["wheel_gain.left"]] = 0.01

@@ -5,7 +5,7 @@ import pytest
 
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report import EffectFinding
-from disco_hw.gap.report.judge import Measured, _confirmed, doubt_of, sort_out
+from disco_hw.gap.report.judge import Measured, _confirmed, classify_findings, low_confidence_of
 from disco_hw.gap.search.channel_result import ParameterEstimate
 from tests.gap.synthetic import line_of
 
@@ -55,7 +55,7 @@ def effect(name, **values):
     ],
 )
 def test_only_what_is_known_and_not_contradicted_is_told(name, values, why):
-    found = doubt_of(effect(name, **values), drive())
+    found = low_confidence_of(effect(name, **values), drive())
     assert (found is None) == (why is None)
     assert why is None or why in found
 
@@ -63,12 +63,15 @@ def test_only_what_is_known_and_not_contradicted_is_told(name, values, why):
 def test_a_moment_beyond_a_limit_contradicts_nothing():
     speed = np.full((4000, 2), 3.0)
     speed[1000:1004] = 6.0
-    assert doubt_of(effect("speed_limit", limit_rad_s=(3.2, 3.1, 3.3)), Measured(line_of(speed), GEOMETRY)) is None
+    assert (
+        low_confidence_of(effect("speed_limit", limit_rad_s=(3.2, 3.1, 3.3)), Measured(line_of(speed), GEOMETRY))
+        is None
+    )
 
 
 def test_effects_are_parted_and_keep_their_order():
     effects = [effect("motor_lag", tau_s=(0.2, 0.19, 0.21)), effect("speed_limit", limit_rad_s=(3.5, 3.4, 3.6))]
-    sure, doubtful = sort_out(effects, drive())
+    sure, doubtful = classify_findings(effects, drive())
     assert [one.name for one in sure] == ["motor_lag"]
     assert [(one.name, "exceeded" in one.why) for one in doubtful] == [("speed_limit", True)]
 

@@ -9,7 +9,7 @@ import pytest
 from disco_hw.gap import offered_stage
 from disco_hw.gap.report import STAGES, AcrossLogs, EffectFinding, GapReport, Provenance, UnnamedFinding
 from disco_hw.gap.report.blind_spots import BlindSpot
-from disco_hw.gap.report.page import answer, as_text, page, sentence
+from disco_hw.gap.report.page import as_text, page, sentence, summary_lines
 from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.settings import DEFAULT_SETTINGS
@@ -37,7 +37,7 @@ def report(amended_m, yaw_rad=0.02, blind=(), offered="amended"):
 
 
 def test_the_answer_has_the_gap_before_and_after_and_the_noise():
-    assert answer(report(0.014))[1] == (
+    assert summary_lines(report(0.014))[1] == (
         "2 s ahead, in parts of the log that were not used, predictions are off by 47 mm and 0.02 rad with a delay "
         "and a lag alone (timed), by 14 mm and 0.02 rad with what was found (amended); the sensors' noise makes 14 mm "
         "and 0.02 rad."
@@ -46,22 +46,22 @@ def test_the_answer_has_the_gap_before_and_after_and_the_noise():
 
 def test_a_term_is_told_in_words_where_it_is_known_what_it_means():
     plain = report(0.014)
-    assert answer(plain)[0] == "Something is missing that has no name: v_x += -0.4 v^3."
-    meaning = TERMS["v_x += k (v - slewed_6.3(v))"].meaning(-0.97)
+    assert summary_lines(plain)[0] == "Something is missing that has no name: v_x += -0.4 v^3."
+    meaning = TERMS["v_x += k (v - slewed_6.3(v))"].describe(-0.97)
     slipping = UnnamedFinding("wheel_to_body", "v_x += -0.97 (v - slewed_6.3(v))", 99.0, meaning=meaning)
     told = "v_x += -0.97 (v - slewed_6.3(v)) (tyres slip: the robot follows its wheels by about 6.3 m/s^2 at most)"
-    assert answer(replace(plain, unnamed=(slipping,)))[0] == f"Something is missing that has no name: {told}."
+    assert summary_lines(replace(plain, unnamed=(slipping,)))[0] == f"Something is missing that has no name: {told}."
     assert f"unnamed: {told}" in as_text(replace(plain, unnamed=(slipping,)))
     assert replace(plain, unnamed=(slipping,)).as_dict()["unnamed"][0]["meaning"] == meaning
     # Half of it is something else, and so is any other form.
-    assert TERMS["v_x += k (v - slewed_6.3(v))"].meaning(-0.4) is None
-    assert TERMS["v_x += k (v - mean_1s(v))"].meaning(-1.0) is None
-    assert TERMS["v_x += k v^3"].meaning(-1.0) is None
+    assert TERMS["v_x += k (v - slewed_6.3(v))"].describe(-0.4) is None
+    assert TERMS["v_x += k (v - mean_1s(v))"].describe(-1.0) is None
+    assert TERMS["v_x += k v^3"].describe(-1.0) is None
 
 
 def test_a_model_that_predicts_worse_is_not_recommended():
     worse = report(0.052, offered="timed")
-    assert answer(worse)[1].endswith(
+    assert summary_lines(worse)[1].endswith(
         "Drive with the timed model, which is in model.toml. "
         "The amended model has more effects and does not clearly predict better."
     )
@@ -87,7 +87,7 @@ def test_a_model_that_lacks_what_no_model_can_carry_is_judged_without_it(written
         None if offered == "amended" else "The amended model has more effects and does not clearly predict better."
     )
     said = f"Without what no model can hold, as it is written, the amended model errs by {1e3 * written_m:g} mm"
-    assert said in answer(of)[1]
+    assert said in summary_lines(of)[1]
     assert of.as_dict()["gap"]["written"]["position_rmse_m"] == written_m
     assert "written" not in report(0.014).as_dict()["gap"]
     assert said in page(of)
@@ -98,7 +98,7 @@ def test_one_drive_is_asked_for():
     assert report(0.014, blind=("turn_slip", "yaw_rate_limit")).drive == "disco-hw drive ROBOT.toml --script spins"
     several = report(0.014, blind=("turn_slip", "deadband"))
     assert several.drive == "disco-hw drive ROBOT.toml --script separate"
-    assert several.drive in answer(several)[2]
+    assert several.drive in summary_lines(several)[2]
     assert several.drive in page(several)
 
 
@@ -114,7 +114,7 @@ def test_a_log_of_short_stretches_says_that_it_does_not_tell_the_gap():
     nan = PredictionErrors(math.nan, (math.nan, math.nan), math.nan, (math.nan, math.nan), math.nan, {})
     some = report(0.014)
     short = replace(some, gap={s: dict.fromkeys(of, nan) for s, of in some.gap.items()})
-    assert answer(short)[1] == "No stretch of the logs is long enough to see how far 2 s predictions are off."
+    assert summary_lines(short)[1] == "No stretch of the logs is long enough to see how far 2 s predictions are off."
     told = json.loads(as_json(short.as_dict()), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     assert told["gap"]["amended"]["position_rmse_m"] is None
     assert told["gap"]["amended"]["position_ci95_m"] == [None, None]
@@ -140,8 +140,10 @@ def test_that_wheels_are_unequal_is_said_where_only_their_load_shows_it_and_it_i
         9.0,
     )
     found = replace(report(0.014), effects=(load,))
-    assert answer(found)[0].startswith("Turning takes 0.53 rad/s from each side's wheels, however fast the robot turns")
-    assert ("the right wheels are -0.95% larger than the mean" in answer(found)[0]) is said
+    assert summary_lines(found)[0].startswith(
+        "Turning takes 0.53 rad/s from each side's wheels, however fast the robot turns"
+    )
+    assert ("the right wheels are -0.95% larger than the mean" in summary_lines(found)[0]) is said
 
 
 @pytest.mark.parametrize(("delay_s", "wrong"), [(0.12, False), (-0.17, True)])
@@ -157,7 +159,7 @@ def test_a_log_of_short_runs_is_answered_as_far_ahead_as_it_reaches():
     some = report(0.014)
     short = replace(some, gap={s: {h: e if h < 2.0 else nan for h, e in of.items()} for s, of in some.gap.items()})
     assert short.horizon_s == 1.0
-    assert answer(short)[1].startswith(
+    assert summary_lines(short)[1].startswith(
         "1 s ahead, in parts of the log that were not used, predictions are off by 47 mm"
     )
     assert short.as_dict()["gap"]["horizon_s"] == 1.0
@@ -194,12 +196,12 @@ def test_the_page_defines_its_words_in_the_margin_and_folds_what_is_for_experts(
 def test_an_answer_of_many_names_is_short():
     lag = ParameterEstimate(0.2, 0.1, 0.3)
     effects = tuple(EffectFinding("motor_lag", "command_to_wheel", {"tau_s": lag}, 9.0) for _ in range(5))
-    lines = answer(replace(report(0.014, blind=FIVE), effects=effects))
+    lines = summary_lines(replace(report(0.014, blind=FIVE), effects=effects))
     assert lines[2].endswith(". And 2 more, listed below.")
     assert " ".join(lines).count("time constant") == 3
     assert "this log could not have shown 5 effects, listed below, of realistic size" in lines[5]
     assert "side_slip" not in lines[5]
-    few = answer(replace(report(0.014, blind=("turn_slip",)), effects=effects[:3]))
+    few = summary_lines(replace(report(0.014, blind=("turn_slip",)), effects=effects[:3]))
     assert " ".join(few[:3]).count("time constant") == 3
     assert "more" not in " ".join(few[:3])
     assert few[5].startswith(

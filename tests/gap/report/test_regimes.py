@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.data import BODY
-from disco_hw.gap.report.misspecification import Regime, gain_by_block, in_words, masks_at_nodes, regimes
+from disco_hw.gap.report.misspecification import Regime, describe, gain_by_block, masks_at_nodes, regimes
 from tests.gap.synthetic import body_channel, line_of
 
 
@@ -54,8 +54,8 @@ def test_a_fault_shows_in_its_regime_and_goes_with_its_effect():
 
 def test_only_what_is_louder_than_noise_is_worth_words():
     quiet, loud = Regime("straight", 1.1, 1.0, 100), Regime("turning left", 9.0, 1.0, 100)
-    assert in_words([quiet], 1.5) == "nowhere more than noise"
-    assert in_words([quiet, loud], 1.5) == "most turning left (3.0 times the noise)"
+    assert describe([quiet], 1.5) == "nowhere more than noise"
+    assert describe([quiet, loud], 1.5) == "most turning left (3.0 times the noise)"
 
 
 def test_gain_and_its_scatter_come_from_blocks():
@@ -63,8 +63,8 @@ def test_gain_and_its_scatter_come_from_blocks():
     even = np.full(600, 0.1)
     assert math.isclose(gain_by_block(even, block, 4)[0], 60.0)
     assert gain_by_block(even, block, 4)[1] < 1e-9
-    once = np.where(block == 3, 2.0, 0.0)
-    total, spread = gain_by_block(once, block, 4)
+    is_alternative = np.where(block == 3, 2.0, 0.0)
+    total, spread = gain_by_block(is_alternative, block, 4)
     assert total == 60.0
     assert total < 3.0 * spread
 

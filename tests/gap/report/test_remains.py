@@ -6,7 +6,7 @@ import pytest
 
 from disco_hw.effects import Channel
 from disco_hw.gap.report import EffectFinding
-from disco_hw.gap.report.page import answer, page
+from disco_hw.gap.report.page import page, summary_lines
 from disco_hw.gap.report.remains import Remains
 from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors
@@ -39,7 +39,7 @@ def test_above_twice_the_noise_it_is_only_partly_explained(position_m, yaw_rad, 
     assert remains.is_explained is explained
     found = replace(report_of("motor_lag", 0.05, 0.02), remains=remains)
     assert found.verdict == ("effects_found" if explained else "partly_explained")
-    assert ("Most of the rest" in remains.in_words()) is not explained
+    assert ("Most of the rest" in remains.describe()) is not explained
     # What is not found at all is not explained in part.
     assert replace(found, effects=()).verdict == "unexplained"
 
@@ -52,7 +52,7 @@ def test_most_of_the_rest_lies_where_squared_errors_are_furthest_above_those_of_
     remains = Remains.of(TIMED, offered, floor, None)
     assert remains.regime == regime
     said = {"curves": "the robot drives curves", "standstill": "the robot stands still"}[regime]
-    assert remains.in_words().endswith(f"Most of the rest is while {said}.")
+    assert remains.describe().endswith(f"Most of the rest is while {said}.")
 
 
 def test_a_regime_of_which_the_noise_is_not_known_counts_whole():
@@ -70,7 +70,7 @@ def test_a_regime_of_which_the_noise_is_not_known_counts_whole():
 def test_what_is_left_with_the_wheels_as_measured_is_of_the_body(body, channel, said):
     remains = Remains.of(TIMED, errors(0.05, 0.1), FLOOR, body)
     assert remains.channel is channel
-    assert said in remains.in_words()
+    assert said in remains.describe()
     assert remains.as_dict()["channel"] == channel.value
 
 
@@ -82,7 +82,7 @@ def test_without_predictions_nothing_is_said_of_the_rest():
 
 def test_the_answer_says_how_sure_how_much_is_explained_and_in_at_most_ten_lines():
     found = replace(report_of("motor_lag", 0.05, 0.02), remains=Remains.of(TIMED, errors(0.02, 0.10), FLOOR, None))
-    lines = answer(found)
+    lines = summary_lines(found)
     assert lines[0] == "The wheels follow their command slowly, with a time constant of 123 ms."
     assert lines[1] == "How sure: with 95 % probability motor_lag is between 0.1 and 0.15 s."
     assert lines[3].startswith(
@@ -91,7 +91,7 @@ def test_the_answer_says_how_sure_how_much_is_explained_and_in_at_most_ten_lines
     assert lines[3] in page(found).replace("&#x27;", "'")
     assert len(lines) <= 10
     early = EffectFinding("pose_latency", "pose_sensor", {"latency_s": ParameterEstimate(-0.065, -0.07, -0.06)}, 9.0)
-    assert answer(replace(found, effects=(early,)))[:2] == [
+    assert summary_lines(replace(found, effects=(early,)))[:2] == [
         "Poses are stamped 65 ms early.",
         "How sure: with 95 % probability pose_latency is between 0.06 and 0.07 s.",
     ]

@@ -19,8 +19,8 @@ from disco_hw.gap.search.cross_validation import (
     floor_errors,
     fold_of,
     fold_vectors,
-    judged_horizon_s,
     regimes_driven,
+    scored_horizon_s,
     smoothed_poses,
     within_one_standard_error,
     worse_by,
@@ -138,7 +138,7 @@ def test_stages_are_compared_as_far_ahead_as_runs_are_long(window_s, judged_s):
         first = np.arange(line.t_s.size) % round(window_s / GRID_STEP_S) == 0
         channel = BodyChannel.build(replace(line, first=first), NOISE, channel.neutral)
     poses = smoothed_poses(channel, channel.neutral)
-    assert judged_horizon_s(channel, poses) == judged_s
+    assert scored_horizon_s(channel, poses) == judged_s
     ahead = Ahead.of(channel, None, poses)
     assert [ahead_s for ahead_s, _ in ahead.starts] == ([1.0, 2.0] if window_s is None else [judged_s])
     assert np.isfinite(errors_of(channel, None, both(channel.neutral), judged_s, poses).position_m)

@@ -10,11 +10,11 @@ from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.search import channel_result
 from disco_hw.gap.search.channel_result import (
     InParts,
+    drifted,
     estimate_parameters,
     in_equal_parts,
     in_logs,
     in_parts,
-    wandered,
 )
 from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.settings import DEFAULT_SETTINGS, FitSettings, GapSettings
@@ -28,7 +28,7 @@ def test_an_interval_is_widened_by_how_blocks_scatter_and_by_how_a_value_wanders
     channel = SimpleNamespace(layout=layout)
     found = SimpleNamespace(told=told, selector=SimpleNamespace(channel=channel), names=())
     monkeypatch.setattr(channel_result, "interval_inflation", lambda best, of, active: {2: 4.0, 0: 1.44}[active[0]])
-    monkeypatch.setattr(channel_result, "wandered", lambda of: {"c": 6.0})
+    monkeypatch.setattr(channel_result, "drifted", lambda of: {"c": 6.0})
     monkeypatch.setattr(channel_result, "_weightings_apart", lambda of: np.array([3.0, 0.0]))
     monkeypatch.setattr(channel_result, "_stamped", lambda of: {"a": 2.0})
     estimates = estimate_parameters(found)
@@ -116,21 +116,21 @@ def test_a_value_wanders_by_what_halves_surely_differ_or_by_the_most_that_shorte
     monkeypatch.setattr(channel_result, "in_logs", lambda found: logs)
     # Squares of half their distance, twice, less one expected.
     of_sure, of_unsure = 3.1**2 - 1.0, 2.9**2 - 1.0
-    told = wandered(of_blocks(np.arange(12)))
+    told = drifted(of_blocks(np.arange(12)))
     assert told == {
         "sure": pytest.approx(4.0 * of_sure), "unsure": pytest.approx(of_unsure), "both": pytest.approx(4.0 * of_sure),
         "short": pytest.approx((16.0 - 3.0) / 3.0),
     }  # fmt: skip
     # What goes on from drive to drive is seen in halves alone.
     shown[2] = {"short": unsure}
-    assert wandered(of_blocks(np.arange(12)))["short"] == pytest.approx(of_unsure)
+    assert drifted(of_blocks(np.arange(12)))["short"] == pytest.approx(of_unsure)
     # And by what logs differ, where that is more.
     logs |= {"short": quarters, "new": quarters, "little": InParts(np.array([0.0, 0.5]), np.full(2, 0.1))}
     most = {"short": of_unsure, "new": 13.0 / 3.0, "little": 0.125 - 0.01}
-    told = wandered(of_blocks(np.arange(12)))
+    told = drifted(of_blocks(np.arange(12)))
     assert {name: told[name] for name in most} == pytest.approx(most)
     logs["short"] = InParts(np.array([0.0, 5.0]), np.ones(2))
-    assert wandered(of_blocks(np.arange(12)))["short"] == pytest.approx(12.5 - 1.0)
+    assert drifted(of_blocks(np.arange(12)))["short"] == pytest.approx(12.5 - 1.0)
 
 
 def test_parts_of_a_log_are_as_long_as_each_other(monkeypatch):
@@ -175,7 +175,7 @@ def test_of_several_logs_those_that_say_enough_speak_where_there_are_two():
     thirds = np.repeat([0, 1, 2], (6, 3, 3))
     assert in_parts(found, thirds) == {}
     two = in_parts(found, thirds, some=True)["x"]
-    alone = in_parts(of_blocks(np.arange(6), later(found.told)), np.repeat([0, 1], 3))["x"]
+    alone = in_parts(of_blocks(np.arange(6), later(found.reported)), np.repeat([0, 1], 3))["x"]
     np.testing.assert_allclose((two.values, two.deviations), (alone.values, alone.deviations))
 
 

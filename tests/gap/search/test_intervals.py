@@ -19,10 +19,10 @@ from disco_hw.gap.search.channel_result import (
     InParts,
     ParameterEstimate,
     deviations_of,
+    drifted,
     estimate_parameters,
     in_equal_parts,
     in_logs,
-    wandered,
 )
 from disco_hw.gap.search.selection import Selector, body_moves, wheel_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
@@ -232,11 +232,11 @@ def test_what_halves_surely_differ_by_goes_on_and_what_quarters_differ_by_comes_
         assert np.bincount(parts).tolist() == [12 // count] * count
         return {"motor_lag.tau_s": InParts(np.array([0.0, (2.0 * spread[count]) ** 0.5]), np.full(2, noise))}
 
-    monkeypatch.setitem(wandered.__globals__, "in_parts", in_parts)
-    monkeypatch.setitem(wandered.__globals__, "in_logs", lambda found: {})
+    monkeypatch.setitem(drifted.__globals__, "in_parts", in_parts)
+    monkeypatch.setitem(drifted.__globals__, "in_logs", lambda found: {})
     channel = SimpleNamespace(block=np.repeat(np.arange(12), 5), settings=DEFAULT_SETTINGS)
     found = SimpleNamespace(channel=channel, selector=SimpleNamespace(channel=channel))
-    assert wandered(found) == {"motor_lag.tau_s": pytest.approx(expected)}
+    assert drifted(found) == {"motor_lag.tau_s": pytest.approx(expected)}
 
 
 def wheels_that_lose(lost_on_the_spot):
@@ -252,7 +252,7 @@ def wheels_that_lose(lost_on_the_spot):
     error = lfilter([(1.0 - keep**2) ** 0.5], [1.0, -keep], rng.standard_normal(turned.shape), axis=0)
     speed = turned * (1.0 + 0.015 * error) + 0.02 * rng.standard_normal(turned.shape)
     line = replace(line_of(speed), command_rad_s=np.repeat(commands, 50, axis=0))
-    noise = WheelNoise(relative=0.015, correlation_s=0.15, stamp_s=1e-6, wander=1e-3, drift_rad_sqrt_s=2e-3)
+    noise = WheelNoise(relative=0.015, correlation_s=0.15, stamp_s=1e-6, drift_std=1e-3, drift_rad_sqrt_s=2e-3)
     channel = WheelChannel.build(line, noise, np.array(GEOMETRY))
     return ChannelResult(Selector(channel, wheel_moves(channel, np.array(GEOMETRY)), LIMITS), ("deadband",), channel)
 
@@ -264,7 +264,7 @@ def wheels_that_stick(thresholds):
     command = np.tile(ramp, thresholds.size)[:, None] * (1.0, 1.0)
     turned = np.where(command > np.repeat(thresholds, ramp.size)[:, None], command, 0.0)
     line = replace(line_of(turned + 0.02 * rng.standard_normal(turned.shape)), command_rad_s=command)
-    noise = WheelNoise(relative=0.015, correlation_s=0.15, stamp_s=1e-6, wander=1e-3, drift_rad_sqrt_s=2e-3)
+    noise = WheelNoise(relative=0.015, correlation_s=0.15, stamp_s=1e-6, drift_std=1e-3, drift_rad_sqrt_s=2e-3)
     channel = WheelChannel.build(line, noise, np.array(GEOMETRY))
     return ChannelResult(Selector(channel, wheel_moves(channel, np.array(GEOMETRY)), LIMITS), ("stiction",), channel)
 
@@ -284,7 +284,7 @@ def test_a_threshold_is_known_no_better_than_blocks_agree_on_it(monkeypatch, sca
 
 def test_where_the_noise_model_holds_its_fit_is_told():
     found = wheels_that_lose(lambda rng, count: np.full(count, 0.5))
-    assert found.told is found.fit
+    assert found.reported is found.fit
     # Either weighting finds the same.
     estimated = estimate_parameters(found).by_name["deadband.width_rad_s"]
     assert estimated.low < 0.5 < estimated.high
@@ -296,12 +296,12 @@ def test_where_slow_wheels_contradict_each_other_the_value_of_all_is_told():
     found = wheels_that_lose(lambda rng, count: rng.uniform(0.0, 0.5, count))
     place, column = WHEEL.place["deadband.width_rad_s"], "deadband.width_rad_s"
     assert found.fit.vector[place] < 0.4
-    assert found.told.vector[place] == pytest.approx(0.5, abs=0.08)
+    assert found.reported.vector[place] == pytest.approx(0.5, abs=0.08)
     estimated = estimate_parameters(found).by_name[column]
-    assert estimated.value == found.told.vector[place]
-    assert deviations_of(found.told, found.channel)[0] < 0.7 * deviations_of(found.fit, found.channel)[0]
+    assert estimated.value == found.reported.vector[place]
+    assert deviations_of(found.reported, found.channel)[0] < 0.7 * deviations_of(found.fit, found.channel)[0]
     # That slow wheels say otherwise is part of what is not known.
-    assert found.told.vector[place] - found.fit.vector[place] > 2.0 * deviations_of(found.fit, found.channel)[0]
+    assert found.reported.vector[place] - found.fit.vector[place] > 2.0 * deviations_of(found.fit, found.channel)[0]
     assert estimated.low < found.fit.vector[place]
 
 

@@ -68,14 +68,14 @@ class Candidate:
         # From where the channels have it, which is far off, it errs by more.
         return type(self)(self.analysis, "far"), type(self)(self.analysis, True)
 
-    def judged(self, ahead, apart):
+    def evaluate(self, ahead, apart):
         assert (ahead, apart) == ("ahead", "apart")
         wheels, body, _ = told(self.analysis)
         has = frozenset((*(wheels or ()), *(body or ())))
         if self.is_on_top != "far":
             self.judged_so_far.append((has, self.is_on_top))
         square = self.squares.get((has, self.is_on_top), 9.0)
-        return stages._Judged(self, {}, errors(*[square] * 4))
+        return stages._Evaluated(self, {}, errors(*[square] * 4))
 
 
 def needed(monkeypatch, squares, wheels=None, body=None):

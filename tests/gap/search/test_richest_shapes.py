@@ -163,7 +163,7 @@ def test_wheels_are_fitted_anew_with_each_noise_that_is_learnt_and_the_likeliest
     monkeypatch.setattr(richest_model, "learn_wheel_noise", learn)
     monkeypatch.setattr(richest_model, "whiten_wheels", lambda residual, of: of * residual)
     monkeypatch.setattr(
-        richest_model, "wheel_misfit", lambda of, left: lambda noise: next(taken) if of is channel else None
+        richest_model, "wheel_mismatch", lambda of, left: lambda noise: next(taken) if of is channel else None
     )
     learnt, left, many = learn_saturated_wheels(channel, None)
     # From its own noise twice, then from the usual one.
@@ -322,4 +322,4 @@ def test_effects_compete_in_their_own_channel_with_all_their_parameters():
     assert "surface_change" not in smooth_of(BODY)
     assert (delays_of(WHEEL), delays_of(BODY)) == (("command_delay",), ("pose_latency",))
     # What begins at some time of the drive.
-    assert [name for name, candidate in CANDIDATES.items() if candidate.once] == ["surface_change"]
+    assert [name for name, candidate in CANDIDATES.items() if candidate.is_alternative] == ["surface_change"]

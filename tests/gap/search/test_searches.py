@@ -12,9 +12,9 @@ from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search import channel_search
 from disco_hw.gap.search.channel_result import ChannelResult
-from disco_hw.gap.search.channel_search import judged, responding, search_body, search_wheels, stamped, timed
+from disco_hw.gap.search.channel_search import evaluated_channel, responding, search_body, search_wheels, stamped, timed
 from disco_hw.gap.search.least_squares import Fit
-from disco_hw.gap.search.richest_model import LATE, LATE_COLUMNS, LATE_STARTS_S, indices, smooth_of
+from disco_hw.gap.search.richest_model import DELAY_COLUMNS, DELAY_NAMES, DELAY_STARTS_S, indices, smooth_of
 from disco_hw.gap.search.selection import Selector
 from disco_hw.gap.search.unnamed_terms import WithTerms, body_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
@@ -295,7 +295,7 @@ def test_the_noise_of_a_body_is_learnt_of_a_rough_selection_and_all_that_is_smoo
     assert limits is chosen.thresholds
 
 
-LATE_PLACES = [WHEEL.place[column] for column in LATE_COLUMNS]
+LATE_PLACES = [WHEEL.place[column] for column in DELAY_COLUMNS]
 
 
 def begun(names, given=(), before=None, best=0, seen_s=0.0):
@@ -305,7 +305,7 @@ def begun(names, given=(), before=None, best=0, seen_s=0.0):
     selector = Selector(channel, lambda small, big: 0.0, LIMITS, given=given)
     plain = WHEEL.neutral.copy()
     plain[WHEEL.place["deadband.width_rad_s"]] = 0.4
-    others = tuple(name for name in names if name in given or name not in LATE)
+    others = tuple(name for name in names if name in given or name not in DELAY_NAMES)
     selector.fits[frozenset(others)] = Fit(plain, (), 50.0, np.empty(0), np.empty((0, 0)))
     if before is not None:
         selector.fits[frozenset(names)] = before
@@ -322,17 +322,17 @@ def begun(names, given=(), before=None, best=0, seen_s=0.0):
 
 @pytest.mark.parametrize("seen_s", [0.0, -0.4])
 def test_lateness_is_fitted_from_quick_and_slow_responses_after_what_is_seen_at_first_sight(monkeypatch, seen_s):
-    selector, starts, fitted = begun((*LATE, "deadband"), best=2, seen_s=seen_s)
+    selector, starts, fitted = begun((*DELAY_NAMES, "deadband"), best=2, seen_s=seen_s)
     monkeypatch.setattr(channel_search, "fit", fitted)
-    responding(selector, (*LATE, "deadband"))
-    later = [seen_s * (name == "command_delay") for name in LATE]
-    assert [tuple(start[LATE_PLACES]) for start in starts] == [tuple(np.add(each, later)) for each in LATE_STARTS_S]
+    responding(selector, (*DELAY_NAMES, "deadband"))
+    later = [seen_s * (name == "command_delay") for name in DELAY_NAMES]
+    assert [tuple(start[LATE_PLACES]) for start in starts] == [tuple(np.add(each, later)) for each in DELAY_STARTS_S]
     assert {start[WHEEL.place["deadband.width_rad_s"]] for start in starts} == {0.4}
-    assert selector.fits[frozenset((*LATE, "deadband"))].vector is starts[2]
+    assert selector.fits[frozenset((*DELAY_NAMES, "deadband"))].vector is starts[2]
 
 
 def test_lateness_on_top_of_what_was_accepted_is_fitted_from_none(monkeypatch):
-    names = (*LATE, "deadband")
+    names = (*DELAY_NAMES, "deadband")
     for before_cost, kept in ((5.0, True), (15.0, False)):
         before = Fit(WHEEL.neutral, (), before_cost, np.empty(0), np.empty((0, 0)))
         selector, starts, fitted = begun(names, before=before)
@@ -343,10 +343,10 @@ def test_lateness_on_top_of_what_was_accepted_is_fitted_from_none(monkeypatch):
 
 
 def test_lateness_that_is_known_already_is_fitted_from_these_too(monkeypatch):
-    selector, starts, fitted = begun(LATE, given=("motor_lag",))
+    selector, starts, fitted = begun(DELAY_NAMES, given=("motor_lag",))
     monkeypatch.setattr(channel_search, "fit", fitted)
-    responding(selector, LATE)
-    assert [tuple(start[LATE_PLACES]) for start in starts] == list(LATE_STARTS_S)
+    responding(selector, DELAY_NAMES)
+    assert [tuple(start[LATE_PLACES]) for start in starts] == list(DELAY_STARTS_S)
 
 
 def test_a_result_has_the_fits_with_and_without_what_is_missing_and_of_a_search_with_terms_those_before():
@@ -422,7 +422,7 @@ def test_a_delay_alone_is_judged_against_none_and_fits_that_have_it_stay():
     sets = [frozenset(names) for names in ((), ("command_delay",), ("command_delay", "deadband"), ("deadband",))]
     selector = Held(SimpleNamespace(layout=WHEEL), ("command_delay",), None, dict.fromkeys(sets, "fit"), {1: 2})
     start = WHEEL.neutral
-    found = judged(ChannelResult(selector, ("deadband",), None), (), start)
+    found = evaluated_channel(ChannelResult(selector, ("deadband",), None), (), start)
     of, late = "of ('command_delay',)", "of ('motor_lag', 'command_delay')"
     assert found.names == ("deadband", f"needed {of}", f"swapped {late}", f"needed {of}")
     assert set(found.selector.fits) == {sets[1], sets[2]}

@@ -13,7 +13,7 @@ from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search import selection
 from disco_hw.gap.search.least_squares import Fit, fit
-from disco_hw.gap.search.richest_model import CANDIDATES, LATE, candidates_of, indices
+from disco_hw.gap.search.richest_model import CANDIDATES, DELAY_NAMES, candidates_of, indices
 from disco_hw.gap.search.selection import EffectEvidence, Selector, Thresholds, body_moves, wheel_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from tests.gap.synthetic import GEOMETRY, LIMITS, body_channel, line_of
@@ -90,7 +90,7 @@ def test_what_only_turning_loses_is_told_from_what_every_wheel_loses(hidden):
     channel = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
     found = Selector(channel, wheel_moves(channel, np.array(GEOMETRY)), LIMITS)
     # Starts and stops within a cell of the grid look like a short delay.
-    assert [name for name in found.select() if name not in LATE] == [hidden]
+    assert [name for name in found.select() if name not in DELAY_NAMES] == [hidden]
     column = REGISTRY[hidden].columns[0]
     assert found.fit((hidden,)).vector[WHEEL.place[column]] == pytest.approx(0.35, abs=0.02)
 

@@ -14,7 +14,7 @@ from disco_hw.gap.search.analysis import final_fit
 from disco_hw.gap.search.cross_validation import Chain, PredictionErrors
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
 from disco_hw.gap.search.least_squares import Fit
-from disco_hw.gap.search.richest_model import LATE_STARTS_S
+from disco_hw.gap.search.richest_model import DELAY_STARTS_S
 from disco_hw.gap.settings import DEFAULT_SETTINGS, Folds
 from tests.gap.search.test_stages import LAG, SLIP, analysed
 
@@ -150,11 +150,11 @@ def two_parts(active=()):
     )
 
 
-@pytest.mark.parametrize("best", range(len(LATE_STARTS_S)))
+@pytest.mark.parametrize("best", range(len(DELAY_STARTS_S)))
 def test_lateness_is_freed_from_every_start_and_kept_from_the_best(best):
-    ahead = Noted(0.001, [0.0 if k == best else 1.0 + k for k in range(len(LATE_STARTS_S))])
+    ahead = Noted(0.001, [0.0 if k == best else 1.0 + k for k in range(len(DELAY_STARTS_S))])
     found = _timed(ahead, two_parts((13,)))
-    for (of, left_out), start in zip(ahead.asked, LATE_STARTS_S, strict=True):
+    for (of, left_out), start in zip(ahead.asked, DELAY_STARTS_S, strict=True):
         assert left_out is None
         body, wheels = of.parts
         assert body.active == (0, 1, 2)
@@ -164,12 +164,12 @@ def test_lateness_is_freed_from_every_start_and_kept_from_the_best(best):
         # Real wheels are never ahead of their command, though a wrong clock may let them seem so.
         assert (wheels.layout.low[[LAG, DELAY]] == 0.0).all()
         assert wheels.layout.low[13] == WHEEL.low[13]
-    assert tuple(found.parts[1].vector[[LAG, DELAY]]) == pytest.approx(tuple(x + 0.001 for x in LATE_STARTS_S[best]))
+    assert tuple(found.parts[1].vector[[LAG, DELAY]]) == pytest.approx(tuple(x + 0.001 for x in DELAY_STARTS_S[best]))
     assert found.parts[1].vector is ahead.costed[best].wheels
 
 
 def test_lateness_that_is_free_already_is_freed_once_and_without_wheels_none():
-    ahead = Noted(costs=[1.0] * len(LATE_STARTS_S))
+    ahead = Noted(costs=[1.0] * len(DELAY_STARTS_S))
     assert _timed(ahead, two_parts((LAG,))).parts[1].active == (LAG, DELAY)
     alone = replace(two_parts(), parts=two_parts().parts[:1])
     assert _timed(ahead, alone) is alone
@@ -196,7 +196,7 @@ def test_the_fit_of_all_data_begins_from_those_of_the_folds_too_and_the_best_is_
     lags = [0.001, 0.201, 0.401]
     folds = {held: JointFit((BODY.neutral, WHEEL.neutral + 0.2 * (1 + held)), 0.0, (), np.eye(0)) for held in (0, 1)}
     ahead = Noted(0.001, [0.0 if k == best else 1.0 + k for k in range(3)])
-    found = stages._Judged(SimpleNamespace(of=of), folds, None).fit(ahead)
+    found = stages._Evaluated(SimpleNamespace(of=of), folds, None).fit(ahead)
     assert [chain.wheels[LAG] for chain in ahead.costed] == pytest.approx(lags)
     assert [left_out for _, left_out in ahead.asked] == [None] * 3
     assert found.vectors[1][LAG] == pytest.approx(lags[best])
@@ -243,7 +243,7 @@ def test_what_channels_say_is_trusted_to_three_of_their_deviations_and_folds_by_
     errors_in_turn(monkeypatch, (0.1, 0.1), (0.2, 0.2))
     analysis = analysed()
     joint_predictions(analysis, final_fit(analysis))
-    body, wheels = analysis.body.told, analysis.wheels.told
+    body, wheels = analysis.body.reported, analysis.wheels.reported
     refitted = [of for of, left_out in unfitted if of.names == ("wheel_radius_m", "axial_distance_m", "x_icr_m")]
     np.testing.assert_allclose(
         refitted[0].parts[0].information, _roughly(analysis.body.channel, analysis.body.base), rtol=1e-9

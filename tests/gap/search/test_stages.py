@@ -80,7 +80,7 @@ def test_each_stage_has_what_it_may_have_and_no_more():
 def test_each_stage_predicts_better_than_the_one_before_and_the_last_as_well_as_the_poses_allow():
     _, stages = predicted()
     table = stages.table()
-    assert stages.judged_horizon_s == 2.0
+    assert stages.scored_horizon_s == 2.0
     assert set(table["floor"]) == set(DEFAULT_SETTINGS.prediction.horizons_s)
     sizes = [table[stage][2.0].position_m for stage in ("nominal", "refitted", "timed", "amended")]
     assert sizes == sorted(sizes, reverse=True)

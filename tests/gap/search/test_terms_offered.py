@@ -160,7 +160,7 @@ def test_terms_of_a_given_model_are_added_up_by_channel():
         EffectSetting("v_y += k v", {"k": 0.5}), EffectSetting("omega += k v", {"k": 0.6}),
     ]  # fmt: skip
     known = with_known_terms(line, settings, p, 0.5)
-    u, v, w = line.late_commands(0.5), 0.03 * 8.0, 0.15 * 2.0
+    u, v, w = line.delayed_commands(0.5), 0.03 * 8.0, 0.15 * 2.0
     np.testing.assert_allclose(known.known_command, 0.1 * u * np.abs(u) - 0.2 * u[:, ::-1], atol=1e-12)
     expected = np.broadcast_to((0.0, 0.4 * v * w + 0.5 * v, 0.6 * v), (COUNT, 3))
     np.testing.assert_allclose(known.known_motion, expected, atol=1e-12)

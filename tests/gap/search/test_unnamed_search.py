@@ -113,7 +113,7 @@ def test_a_term_of_which_what_is_fitted_does_the_most_is_not_tried(own, tried):
 
 def two(first, second):
     """A term of two features along some of the residuals."""
-    return replace(along(*first), beside=(along(*second).perturbation,))
+    return replace(along(*first), nuisance=(along(*second).perturbation,))
 
 
 def test_features_that_belong_together_pay_for_each_but_one():
@@ -272,7 +272,7 @@ class Searched:
     vector: tuple = ()
 
     @property
-    def told(self):
+    def reported(self):
         return SimpleNamespace(vector=np.array(self.vector))
 
     @property
@@ -312,7 +312,7 @@ def test_terms_are_added_until_none_is_accepted_and_no_more_than_three(monkeypat
 
 
 def test_all_coefficients_are_told_as_they_are_when_all_terms_are_in():
-    waves = UnnamedTerm("", None, replace(NOTHING, form="waves {:.2f}", beside=(NOTHING.perturbation,)))
+    waves = UnnamedTerm("", None, replace(NOTHING, form="waves {:.2f}", nuisance=(NOTHING.perturbation,)))
     single = UnnamedTerm("", None, replace(NOTHING, form="single {:.2f}"))
     last = UnnamedTerm("", None, replace(NOTHING, form="last {:.2f}"))
     found = Searched(unnamed=(single, waves, last), vector=(9.0, 9.0, 0.25, 0.6, -0.8, 0.5))
@@ -326,14 +326,14 @@ def one_more(monkeypatch):
     """Adds the first of some terms that is accepted; which were offered and tried, with how many, in turn."""
     offers, tries = [], []
 
-    def made(options, accepted=(), once=(), closer=(), patches=True, channel=None):
+    def made(options, accepted=(), is_alternative=(), closer=(), patches=True, channel=None):
         def best(fit, channel, offered):
             offers.append(terms := [*offered])
             return terms, len(terms)
 
         def tried(found, term, among):
             tries.append((term, among))
-            return (("with", term), True) if term in accepted else (None, term not in once)
+            return (("with", term), True) if term in accepted else (None, term not in is_alternative)
 
         offers.clear()
         tries.clear()
@@ -366,7 +366,7 @@ def test_the_first_term_that_is_accepted_is_added(one_more):
 
 
 def test_where_a_patch_did_not_happen_again_none_is_looked_for_any_more(one_more):
-    larger, patches, offers, tries = one_more([DISC, NEAR, FIRST], accepted=[NEAR, FIRST], once=[DISC])
+    larger, patches, offers, tries = one_more([DISC, NEAR, FIRST], accepted=[NEAR, FIRST], is_alternative=[DISC])
     assert (larger, patches) == (("with", FIRST), False)
     assert offers == [[DISC, NEAR, FIRST], [FIRST]]
     assert tries == [(DISC, 3), (FIRST, 1)]

@@ -11,7 +11,7 @@ from disco_hw.gap.data.free_runs import run_wheels
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report import GapReport
-from disco_hw.gap.report.page import answer, as_text, page
+from disco_hw.gap.report.page import as_text, page, summary_lines
 from disco_hw.gap.search.analysis import GapAnalysis, final_fit
 from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.cross_validation import _errors, only_timed, wheel_table
@@ -96,7 +96,7 @@ def test_a_wheel_that_turns_too_far_makes_way_forward_and_heading_to_its_other_s
 
 def test_a_log_without_poses_is_answered_with_the_way_that_its_wheels_make():
     report = report_of(analysed(("deadband",), motor_lag=0.2))
-    line = answer(report)[1]
+    line = summary_lines(report)[1]
     assert line.startswith("2 s ahead, in parts of the log that were not used, the wheels are off by ")
     assert "with a delay and a lag alone (timed), by" in line
     assert line.endswith(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from disco_hw.errors import LogError
-from disco_hw.log.importing.counter_wrap import set_anew, unwrap_counter, unwrap_wheels
+from disco_hw.log.importing.counter_wrap import restarts, unwrap_counter, unwrap_wheels
 from disco_hw.log.importing.csv_drive import read_csv
 
 DT_S = 0.05
@@ -77,11 +77,11 @@ def test_an_encoder_that_returns_to_zero_is_seen_at_any_rate(period_s, turned_ra
     angles = speed_rad_s * period_s * np.arange(1 + round(2.0 * turned_rad / abs(speed_rad_s) / period_s))
     other, at = angles.copy(), angles.size // 2
     angles[at:] -= angles[at]
-    anew = set_anew(period_s * np.arange(angles.size), np.column_stack([angles, other]))
+    anew = restarts(period_s * np.arange(angles.size), np.column_stack([angles, other]))
     assert np.flatnonzero(anew).tolist() == [at]
 
 
 def test_samples_that_were_held_and_come_in_bursts_are_no_reset():
     t_s = 0.02 * np.arange(1000)
     held = 6.0 * 0.1 * np.floor(t_s / 0.1 + 1e-9)
-    assert not set_anew(t_s, np.column_stack([held, held])).any()
+    assert not restarts(t_s, np.column_stack([held, held])).any()

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from disco_hw.log.importing.counter_wrap import set_anew, unwrap_counter
+from disco_hw.log.importing.counter_wrap import restarts, unwrap_counter
 
 DT_S = 0.02
 T_S = DT_S * np.arange(1500)
@@ -100,11 +100,11 @@ def test_an_encoder_of_few_ticks_shows_no_wrap_and_no_reset():
     counts = np.round(np.cumsum(np.full(T_S.size, 0.07)))
     assert unwrap_counter(T_S, counts, (12.0,)).wraps == 0
     angles = counts * 2.0 * math.pi / 12.0
-    assert not set_anew(T_S, np.column_stack([angles, angles])).any()
+    assert not restarts(T_S, np.column_stack([angles, angles])).any()
 
 
 @pytest.mark.parametrize("size", [0, 1, 2, 5])
 def test_few_samples_stay_as_they_are(size):
     counts = np.arange(float(size)) * 100.0
     assert unwrap_counter(T_S[:size], counts).values.tolist() == counts.tolist()
-    assert not set_anew(T_S[:size], np.column_stack([counts, counts])[:, :2] * 0.0).any()
+    assert not restarts(T_S[:size], np.column_stack([counts, counts])[:, :2] * 0.0).any()

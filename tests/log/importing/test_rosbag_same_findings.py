@@ -11,7 +11,7 @@ from disco_hw.cli import app
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.script import ScriptSource, Unattended
-from disco_hw.drive.scripts import make_script
+from disco_hw.drive.scripts import create_script
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.experiments.virtual import true_parameters
 from disco_hw.runtime.pipeline import NoPlanner
@@ -29,7 +29,7 @@ def logs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("drive")
     setup = load_setup(ROBOT)
     config = setup.config
-    script = make_script("separate", config.robot, config.task, config.drive.speed_share)
+    script = create_script("separate", config.robot, config.task, config.drive.speed_share)
     pilot = HandPilot(ScriptSource(script, Unattended()), Coverage(1.0))
     robot = virtual_robot(
         setup, true_parameters(setup, 3), BodyPose(*config.task.course().start), effects={"deadband": (0.8,)}, seed=1

@@ -24,9 +24,9 @@ def test_a_start_near_a_self_crossing_is_on_the_branch_that_the_heading_fits(pat
         # Within 0.3 m of the crossing along a branch, 5 cm beside it, and 15 degrees off its direction.
         place = (crossing[draw % 2] + rng.integers(-15, 16)) % count
         x, y, along_x, along_y = path.table[place]
-        beside_m, off_rad = rng.normal(0.0, 0.05), rng.normal(0.0, math.radians(15.0))
+        clearance_m, off_rad = rng.normal(0.0, 0.05), rng.normal(0.0, math.radians(15.0))
         yaw = math.atan2(along_y, along_x) + off_rad
-        found = path.place(x - beside_m * along_y, y + beside_m * along_x, yaw, None)
+        found = path.place(x - clearance_m * along_y, y + clearance_m * along_x, yaw, None)
         wrong += abs(math.remainder(found - place, count)) > 30
     assert wrong == 0
 
