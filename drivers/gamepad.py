@@ -170,7 +170,7 @@ def open_gamepad(mapping: GamepadMapping, now_ns: int, path: str = "") -> Gamepa
         except OSError as error:
             if path:
                 raise GamepadError(
-                    f"{path}: cannot be opened ({error.strerror}); is it plugged in, and yours?"
+                    f"{path}: cannot be opened ({error.strerror}); check that it is plugged in and that you may read it"
                 ) from None
             continue
         if axes <= set(found.get(_EV_ABS, ())) and button in found.get(_EV_KEY, ()):
@@ -178,8 +178,8 @@ def open_gamepad(mapping: GamepadMapping, now_ns: int, path: str = "") -> Gamepa
         device.close()
     if path:
         raise GamepadError(
-            f"{path}: has not {mapping.forward_axis}, {mapping.left_axis} and {mapping.deadman_button}; "
-            "change the [drive] section of robot.toml"
+            f"{path}: lacks {mapping.forward_axis}, {mapping.left_axis} or {mapping.deadman_button}; change the "
+            "[drive] section of robot.toml"
         )
     raise GamepadError("no gamepad found; plug one in, and let its user read /dev/input (group input)")
 
@@ -204,5 +204,5 @@ def _sign(name: str) -> float:
 def _code(name: str, prefix: str) -> int:
     codes = _evdev().ecodes.ecodes
     if not name.startswith(prefix) or name not in codes:
-        raise GamepadError(f"{name}: evdev knows no such name with {prefix}; see the [drive] section in docs/robot.md")
+        raise GamepadError(f"{name}: evdev has no such name with {prefix}; see the [drive] section in docs/robot.md")
     return int(codes[name])

@@ -21,7 +21,7 @@ from drivers.private_files import user_name, why_not_private
 
 _Dispatcher = TypeVar("_Dispatcher")
 _printed: set[str] = set()
-_NOT_KEPT = "kernels are compiled anew in each process, as no directory to keep them is this user's alone"
+_NOT_KEPT = "kernels are compiled again in each process, because no directory to keep them belongs to this user alone"
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -59,7 +59,7 @@ class _PrivateLocator:
     def from_function(cls, py_func: Any, py_file: str) -> Any:
         locator = super().from_function(py_func, py_file)  # type: ignore[misc]
         if locator is not None and (why := _why_not_believed(locator.get_cache_path())) is not None:
-            _print_line(f"{why}; kernels there are not loaded but compiled anew")
+            _print_line(f"{why}; kernels there are not loaded but compiled again")
             return None
         return locator
 

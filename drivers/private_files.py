@@ -28,7 +28,7 @@ def key_of_file(path: Path, content: bytes, status: os.stat_result) -> bytes:
     try:
         return parse_key(content.decode("ascii"))
     except (ValueError, UnicodeDecodeError):
-        raise KeyFileError(f"{path}: is no key of 32 hexadecimal digits; {_CREATE_HINT}") from None
+        raise KeyFileError(f"{path}: is not a key of 32 hexadecimal digits; {_CREATE_HINT}") from None
 
 
 def _check(path: Path, status: os.stat_result) -> None:

@@ -236,7 +236,9 @@ def _check_faults(schedule: FaultSchedule, kind: str, interface: str) -> None:
         if fault.kind.site is Site.PROCESS and name != "cpu_hog":
             raise OptionError(f"fault {fault.number}: {name}: other processes are not the simulator's; use tests/hil")
         if kind == "serial" and name in BUS_ONLY:
-            raise OptionError(f"fault {fault.number}: {name}: a serial line has none; take it out or use a CAN bus")
+            raise OptionError(
+                f"fault {fault.number}: {name}: a serial line has no such fault; remove it, or use a CAN bus"
+            )
 
 
 def _check_faults_of_board(schedule: FaultSchedule) -> None:
@@ -244,7 +246,8 @@ def _check_faults_of_board(schedule: FaultSchedule) -> None:
         name, site = fault.kind.name, fault.kind.site
         if name != "cpu_hog" and (site in (Site.FRAMES, Site.LINK, Site.PROCESS) or name in NOT_OF_BOARDS):
             raise OptionError(
-                f"fault {fault.number}: {name}: not with --board, whose link and clock are its own; leave it out"
+                f"fault {fault.number}: {name}: cannot be used with --board, whose link and clock are its own; "
+                "leave it out"
             )
 
 
@@ -255,8 +258,8 @@ def _synchronise(robot: BoardRobot, link: RobotLink, options: VirtualRobotOption
         left_s = deadline - time.monotonic()
         if left_s <= 0.0:
             raise OptionError(
-                f"--board {options.board}: no plant's line answers here; name the board's second serial line, "
-                "and build its firmware with -DDISCO_PLANT_LINE (docs/port.md)"
+                f"--board {options.board}: no answer on the plant's line; name the board's second serial line, and "
+                "build its firmware with -DDISCO_PLANT_LINE (docs/port.md)"
             )
         select.select(link.filenos(), (), (), left_s)
         now_ns = time.monotonic_ns()
@@ -266,7 +269,8 @@ def _synchronise(robot: BoardRobot, link: RobotLink, options: VirtualRobotOption
     version, ticks = robot.about
     if version != VERSION:
         raise OptionError(
-            f"--board {options.board}: its plant's line is version {version}, and {VERSION} here; flash it anew"
+            f"--board {options.board}: its plant's line has version {version}, this computer {VERSION}; flash the "
+            "board again"
         )
     if ticks != options.plant.ticks_per_rev:
         raise OptionError(

@@ -346,7 +346,7 @@ def _spec(name: str) -> EffectSpec:
         return EFFECTS[name]
     except KeyError:
         near = "".join(f"did you mean {one}? " for one in difflib.get_close_matches(name, EFFECTS, n=1))
-        raise UnknownEffectError(f"{name!r} is no effect; {near}the names are {', '.join(EFFECTS)}") from None
+        raise UnknownEffectError(f"{name!r} is not an effect; {near}the names are {', '.join(EFFECTS)}") from None
 
 
 def _complete(spec: EffectSpec, numbers: tuple[float, ...]) -> tuple[float, ...]:

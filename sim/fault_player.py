@@ -195,7 +195,7 @@ class Injection:
         try:
             handler = self._handlers.get(name)
             if handler is None:
-                raise CommandError(f"{name!r} is no command; say one of {', '.join(self._handlers)}")
+                raise CommandError(f"{name!r} is not a command; write one of {', '.join(self._handlers)}")
             return handler(arguments, now_ns)
         except (CommandError, LinkFaultError) as error:
             self.refused += 1
@@ -223,7 +223,7 @@ class Injection:
     def _estop_button(self, arguments: list[str], _now_ns: int) -> str:
         _expect("estop_button", arguments, 1, 1)
         if arguments[0] not in ("on", "off"):
-            raise CommandError(f"estop_button {arguments[0]}: say on or off")
+            raise CommandError(f"estop_button {arguments[0]}: write on or off")
         self._robot.estop_button = arguments[0] == "on"
         return "ok"
 
@@ -255,7 +255,7 @@ class Injection:
         causes = {"power_on": ResetCause.POWER_ON, "watchdog": ResetCause.WATCHDOG, "brown_out": ResetCause.BROWN_OUT}
         cause = causes.get(arguments[0] if arguments else "power_on")
         if cause is None:
-            raise CommandError(f"reboot {arguments[0]}: say one of {', '.join(causes)}")
+            raise CommandError(f"reboot {arguments[0]}: write one of {', '.join(causes)}")
         self._robot.reboot(cause)
         return "ok"
 

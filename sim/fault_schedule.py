@@ -166,7 +166,7 @@ def parse_schedule(text: str, name: str = "schedule") -> FaultSchedule:
     try:
         return schedule_of(tomllib.loads(text), name)
     except (ValueError, RecursionError) as error:
-        raise FaultFileError(f"{name}: not TOML ({' '.join(str(error).split())}); correct that place") from None
+        raise FaultFileError(f"{name}: not TOML ({' '.join(str(error).split())}); correct that line") from None
 
 
 def schedule_of(table: Mapping[str, Any], name: str) -> FaultSchedule:
@@ -206,7 +206,7 @@ def _fault(entry: dict[str, Any], where: str) -> ScheduledFault:
     kind = KINDS.get(entry.get("kind", "")) if isinstance(entry.get("kind"), str) else None
     if kind is None:
         raise FaultFileError(
-            f"{where}: kind: {entry.get('kind')!r} is no kind of fault; write one of {', '.join(KINDS)}"
+            f"{where}: kind: {entry.get('kind')!r} is not a kind of fault; write one of {', '.join(KINDS)}"
         )
     where = f"{where}: {kind.name}"
     known = {parameter.name: parameter for parameter in kind.parameters}

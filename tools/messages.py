@@ -153,7 +153,7 @@ def main() -> int:
         message
         for message in messages()
         if given.kind in (None, message.kind)
-        and (not given.status_text or any(word.lower() in message.text.lower() for word in given.status_text))
+        and (not given.words or any(word.lower() in message.text.lower() for word in given.words))
     ]
     kind = file = ""
     for message in chosen:

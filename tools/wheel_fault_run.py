@@ -180,10 +180,10 @@ class WheelRun:
         if not self.status_text:
             return False
         allowed = {
-            "frozen": ("does not count", "stands although"),
-            "disconnected": ("does not count", "stands although"),
-            "reversed": ("counts backwards", "counts against", "runs away"),
-            "blocked": ("stands although", "whether it turns"),
+            "frozen": ("does not count", "does not turn although"),
+            "disconnected": ("does not count", "does not turn although"),
+            "reversed": ("counts backwards", "counts opposite", "runs away"),
+            "blocked": ("does not turn although", "whether it turns"),
             "runs away": ("runs away",),
         }[self.fault]
         if self.driver == "reference":
@@ -195,7 +195,7 @@ class WheelRun:
         other = {"left": "right", "right": "left"}[self.side]
         if self.fault in ("frozen", "disconnected", "reversed") and self.driver in ("odrive", "vesc"):
             # Turned by its encoder, such a motor locks: the wheel does stand.
-            allowed = ("stands although", "does not count", "counts backwards", "counts against")
+            allowed = ("does not turn although", "does not count", "counts backwards", "counts opposite")
         named = f"the {self.side} " in self.status_text and f"the {other} " not in self.status_text
         return "robot.toml" in self.status_text or not named or not any(part in self.status_text for part in allowed)
 

@@ -78,7 +78,7 @@ class FastAdaptation:
             try:
                 self._apply_geometry(geometry)
             except ValueError as error:
-                fault = f"the planner cannot take it: {error}"
+                fault = f"the planner does not accept it: {error}"
         if fault:
             self._counts["refused"] += 1
             self._text = fault
@@ -104,7 +104,7 @@ class FastAdaptation:
             return True, f"not learning yet: {self._watch.text}"
         if action == "revert":
             return True, "back to the model file's belief; `ctl adapt` learns again"
-        return True, "learning" if self._paused else "was learning already"
+        return True, "learning" if self._paused else "already learning"
 
     def status(self) -> dict[str, Any]:
         """Return the belief in force and the progress of learning as a JSON-serialisable dict."""

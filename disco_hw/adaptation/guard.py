@@ -75,8 +75,8 @@ def check_adaptable(model: Model, uncertainty: str, requested_by: str = "--adapt
     others = [s.name for s in model.effects if s.effect.channel is not Channel.COMMAND_TO_WHEEL]
     if others:
         raise InputError(
-            f"{requested_by}: the model has the effect {others[0]}, which adaptation would take for a change of the "
-            f"geometry; leave {requested_by} out"
+            f"{requested_by}: the model has the effect {others[0]}, which adaptation would mistake for a change of "
+            f"the geometry; leave {requested_by} out"
         )
 
 

@@ -60,7 +60,7 @@ class Live:
             )
         except (RuntimeError, OSError, ValueError) as error:
             self._feed.close()
-            raise InputError(f"--port {port}: cannot be listened to on {host} ({error}); choose another") from None
+            raise InputError(f"--port {port}: cannot listen on {host} ({error}); choose another port") from None
         self.url = f"ws://{host}:{self._server.port}"
         shown = [topic for topic in TOPICS if topic.record not in (FrameIn, FrameOut)]
         self._channels: dict[str, Any] = {

@@ -339,7 +339,7 @@ def _domain(config: RobotConfig) -> int:
         return config.ros2.domain
     given = os.environ.get("ROS_DOMAIN_ID", "0")
     if not (given.isascii() and given.isdigit() and int(given) <= 232):
-        raise InputError(f"ROS_DOMAIN_ID: {given} is no domain; set it to a number from 0 to 232")
+        raise InputError(f"ROS_DOMAIN_ID: {given} is not a domain; set it to a number from 0 to 232")
     return int(given)
 
 

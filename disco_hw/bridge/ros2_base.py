@@ -284,12 +284,12 @@ class BaseBridge:
         topics = self._settings
         parts = [
             f"{topics.speed_topic} {'has a listener' if end.has_listener else 'has no listener'}",
-            *([f"another node speaks on {topics.speed_topic}"] if end.others_speak else []),
-            "odometry comes" if end.has_odometry else f"no odometry: {wire.REFUSALS[end.refusal]}",
+            *([f"another node publishes on {topics.speed_topic}"] if end.others_speak else []),
+            "odometry received" if end.has_odometry else f"no odometry: {wire.REFUSALS[end.refusal]}",
             *(["e-stop"] if end.latched else []),
             *(["button pressed"] if end.button else []),
-            *([] if end.receives_button else [f"{topics.stop_topic} says nothing"]),
-            "driving" if end.driving else "standing by",
+            *([] if end.receives_button else [f"{topics.stop_topic} sends nothing"]),
+            "driving" if end.driving else "on standby",
         ]
         counts = {
             "messages refused": sum(self._inlet.refused.values()),
@@ -309,7 +309,7 @@ def _listen(path: Path) -> socket.socket:
         if why is not None:
             raise InputError(f"{path.parent}: {why}; {hint}")
         if path.exists() and not stat.S_ISSOCK(path.lstat().st_mode):
-            raise InputError(f"{path} is there and no socket; {hint}")
+            raise InputError(f"{path}: exists and is not a socket; {hint}")
         if path.exists():
             _remove_stale(path)
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -318,7 +318,7 @@ def _listen(path: Path) -> socket.socket:
         path.chmod(0o600)
         listener.listen(_MOST_CLIENTS)
     except OSError as error:
-        raise InputError(f"{path}: cannot be listened at ({error.strerror or error}); {hint}") from None
+        raise InputError(f"{path}: cannot listen there ({error.strerror or error}); {hint}") from None
     return listener
 
 
@@ -331,4 +331,4 @@ def _remove_stale(path: Path) -> None:
                 raise
             path.unlink()
             return
-    raise InputError(f"{path}: another bridge or a virtual robot listens there; end it first")
+    raise InputError(f"{path}: another bridge or a virtual robot listens there; stop it first")

@@ -51,7 +51,7 @@ class SpeedInlet:
     def permit(self, now_ns: int) -> str | None:
         """Let the speeds drive from now on, until they fall silent; returns why not, in words."""
         if now_ns - self._sent_ns > INPUT_LIMIT_NS:
-            return "no speeds on cmd_vel; publish zeros at 10 Hz or more, then ask again"
+            return "no speeds received on cmd_vel; publish zeros at 10 Hz or more, then send the request again"
         self.permitted, self._openings = True, _OPENINGS
         return None
 
@@ -118,7 +118,7 @@ class DaemonPad:
         except BlockingIOError:
             return
         except OSError as error:
-            self.refusal = f"the daemon hung up ({error.strerror or error})"
+            self.refusal = f"the daemon closed the connection ({error.strerror or error})"
             self.close()
 
     def close(self) -> None:
@@ -176,8 +176,8 @@ def refusal(request: str, may_move: bool) -> str | None:
     if may_move or request.split(" ", 1)[0] in _ALWAYS:
         return None
     return (
-        "not taken from ROS 2, where anybody in the domain could have sent it; set ros2.may_move = true in robot.toml, "
-        "or use disco-hw ctl"
+        "not accepted from ROS 2, because any node in the domain could have sent it; set ros2.may_move = true in "
+        "robot.toml, or use disco-hw ctl"
     )
 
 

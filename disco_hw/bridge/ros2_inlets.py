@@ -99,7 +99,7 @@ class PoseInlet:
             return "not finite, or without a heading", None
         xx, yy, tt = (0.0, 0.0, 0.0) if spread is None else (spread[0], spread[7], spread[35])
         if not (math.isfinite(xx + yy) and min(xx, yy) >= 0.0):
-            return "with a covariance of the position that is unknown or cannot be", None
+            return "with a covariance of the position that is unknown or impossible", None
         self._newest_ns, self._passed_ns = t_ns, mono_ns
         found = {
             "t_ns": t_ns,

@@ -65,10 +65,10 @@ def gap(
     out: Annotated[Path, typer.Option("-o", "--out", help="Directory for report, pictures and amended model.")],
     model: ModelOption = None,
     fleet: Annotated[
-        bool, typer.Option("--fleet", help="Search each log by itself, and end in one table of all.")
+        bool, typer.Option("--fleet", help="Search each log separately, and print one table of all.")
     ] = False,
     dask: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="As --fleet, on the Dask cluster of this scheduler.")
+        str | None, typer.Option(metavar="ADDRESS", help="Like --fleet, on the Dask cluster of this scheduler.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -109,7 +109,7 @@ def import_log(
         typer.Option("--topic", metavar="ROLE=NAME", help="Read commands, wheels or poses of a bag from this topic."),
     ] = None,
     channel: Annotated[
-        str, typer.Option("--channel", metavar="NAME", help="Read this channel of a candump of several.")
+        str, typer.Option("--channel", metavar="NAME", help="Read this channel of a candump that has several.")
     ] = "",
     as_json: AsJson = False,
 ) -> None:
@@ -179,17 +179,20 @@ def view(
     link: LinkOption = None,
     snapshot: Annotated[Path | None, typer.Option(help="Write a picture of the log instead.")] = None,
     at: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="When in the log the picture is of; its end if not given.")
+        float | None,
+        typer.Option(metavar="SECONDS", help="Time in the log that the picture shows; by default its end."),
     ] = None,
     video: Annotated[Path | None, typer.Option(help="Write a clip of the log instead.")] = None,
-    speed: Annotated[float, typer.Option(min=0.1, max=1000.0, help="How much faster the clip runs.")] = 1.0,
+    speed: Annotated[
+        float, typer.Option(min=0.1, max=1000.0, help="Playback speed of the clip, relative to real time.")
+    ] = 1.0,
     export: Annotated[Path | None, typer.Option(help="Write one HTML file that plays without Python instead.")] = None,
     host: Annotated[
-        str, typer.Option(help="Address to listen on; on every one the page asks for the token of the printed address.")
+        str, typer.Option(help="Address to listen on; on each, the page requires the token of the printed address.")
     ] = LOOPBACK,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page.")] = DEFAULT_PORT,
     foxglove: Annotated[
-        bool, typer.Option("--foxglove", help="With --live: serve Foxglove, port 8765, instead of the page.")
+        bool, typer.Option("--foxglove", help="With --live: serve Foxglove on port 8765 instead of the page.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -229,7 +232,7 @@ def _foxglove(
     live: bool, robot: Path | None, log: Path | None, others: tuple[object, ...], host: str, port: int, as_json: bool
 ) -> None:
     if not live or robot is None or log is not None or any(other is not None for other in others):
-        raise InputError("view --foxglove: give --live and --robot ROBOT.toml, and of the rest --port alone")
+        raise InputError("view --foxglove: give --live and --robot ROBOT.toml, and of the other options only --port")
     if host != LOOPBACK:
         raise InputError(f"--host {host}: Foxglove's protocol has no token; leave it out, and tunnel by ssh -L 8765")
     check_named_files(robot)
@@ -246,7 +249,9 @@ def replay(
     log: Annotated[Path, typer.Argument(metavar="LOG")],
     tolerance: Annotated[
         float,
-        typer.Option(min=0.0, max=1.0, help="What numbers may differ by, absolutely or relatively; 0: not a bit."),
+        typer.Option(
+            min=0.0, max=1.0, help="Largest absolute or relative difference of two numbers; 0: equal bit for bit."
+        ),
     ] = 0.0,
     as_json: AsJson = False,
 ) -> None:

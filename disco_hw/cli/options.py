@@ -22,7 +22,7 @@ LinkOption = Annotated[
 LogFileOption = Annotated[Path | None, typer.Option("--log", help="Record to this file.")]
 Logs = Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs of driving: MCAP or CSV.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object for machines.")]
-View = Annotated[bool, typer.Option("--view", help="Serve the page beside it, for this host only.")]
+View = Annotated[bool, typer.Option("--view", help="Also serve the page, for this host only.")]
 
 
 def progress_line(text: str) -> None:

@@ -46,7 +46,9 @@ def run(
     log_file: LogFileOption = None,
     view: View = False,
     port: PagePort = DEFAULT_PORT,
-    adapt: Annotated[bool, typer.Option("--adapt", help="Learn the geometry on the way (docs/adapt.md).")] = False,
+    adapt: Annotated[
+        bool, typer.Option("--adapt", help="Estimate the geometry while driving (docs/adapt.md).")
+    ] = False,
     accept_missing_effects: Annotated[
         bool, typer.Option("--accept-missing-effects", help="Use a model that is marked as lacking an effect.")
     ] = False,
@@ -78,13 +80,13 @@ def drive(
     script: Annotated[
         str | None,
         typer.Option(
-            help="Drive by itself while the deadman is held: circle, steps, excite, or one that a report asks for."
+            help="Drive by a script while the deadman is held: circle, steps, excite, or one that a report names."
         ),
     ] = None,
     unattended: Annotated[
         bool, typer.Option("--unattended", help="Let the script hold the deadman: for virtual robots.")
     ] = False,
-    seconds: Annotated[float | None, typer.Option(min=0.1, help="End the script after so many seconds.")] = None,
+    seconds: Annotated[float | None, typer.Option(min=0.1, help="End the script after this many seconds.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random steps.")] = 1,
     model: ModelOption = None,
     link: LinkOption = None,
@@ -128,14 +130,16 @@ def init(
     out: Annotated[Path, typer.Option("-o", "--out", help="Where to write the robot.toml.")] = Path("robot.toml"),
     link: LinkOption = None,
     driver: Annotated[
-        str | None, typer.Option(help="The motor controller's driver, where listening does not find it.")
+        str | None, typer.Option(help="The motor controller's driver, if it is not found by listening.")
     ] = None,
     name: Annotated[str | None, typer.Option(help="The robot's name.")] = None,
     wheel_radius_m: Annotated[float | None, typer.Option(min=0.0, help="Radius of a wheel, m.")] = None,
-    axial_distance_m: Annotated[float | None, typer.Option(min=0.0, help="From left to right wheels, m.")] = None,
-    ticks_per_rev: Annotated[float | None, typer.Option(min=1.0, help="Encoder ticks a turn of a wheel.")] = None,
+    axial_distance_m: Annotated[
+        float | None, typer.Option(min=0.0, help="Distance from left to right wheels, m.")
+    ] = None,
+    ticks_per_rev: Annotated[float | None, typer.Option(min=1.0, help="Encoder ticks per turn of a wheel.")] = None,
     max_wheel_speed_rad_s: Annotated[
-        float | None, typer.Option(min=0.0, help="Fastest speed of a wheel, rad/s.")
+        float | None, typer.Option(min=0.0, help="Largest speed of a wheel, rad/s.")
     ] = None,
     pose_source: Annotated[str | None, typer.Option(help="Where measured poses come from.")] = None,
     listen_s: Annotated[float, typer.Option(min=0.0, help="How long to listen on the link.")] = 3.0,
@@ -146,8 +150,10 @@ def init(
             help="Ask on a serial line for a controller that only answers (RoboClaw: its version); else you are asked.",
         ),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Write over a file that is there.")] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing: take the usual value of what is not given.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing file.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Ask nothing: take the usual value for what is not given.")
+    ] = False,
 ) -> None:
     """Write a robot.toml from what is heard on the robot's link, and from what you say; nothing moves."""
     import sys
@@ -180,7 +186,8 @@ def commission(
         list[str] | None, typer.Option(help="Only this stage, or these: sides, turns, floor.", show_default=False)
     ] = None,
     write: Annotated[
-        bool | None, typer.Option("--write/--no-write", help="Correct robot.toml, or never; without it you are asked.")
+        bool | None,
+        typer.Option("--write/--no-write", help="Correct robot.toml, or never; without this option you are asked."),
     ] = None,
     link: LinkOption = None,
     log_directory: Annotated[Path | None, typer.Option(help="Directory for the logs.")] = None,
@@ -223,7 +230,7 @@ def ctl(
         ),
     ] = None,
     unrecorded: Annotated[
-        bool, typer.Option("--unrecorded", help="Arm although nothing is being recorded that should be.")
+        bool, typer.Option("--unrecorded", help="Arm even though the log is not being recorded.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:

@@ -27,9 +27,11 @@ def demo(
     plant_seed: Annotated[int, typer.Option(min=0, help="Seed of the virtual robot's true parameters.")] = 1,
     uncertainty: Annotated[str, typer.Option(help="ut, mc, joint or point.")] = "ut",
     view: View = False,
-    adapt: Annotated[bool, typer.Option("--adapt", help="Learn the geometry on the way (docs/adapt.md).")] = False,
+    adapt: Annotated[
+        bool, typer.Option("--adapt", help="Estimate the geometry while driving (docs/adapt.md).")
+    ] = False,
     obstacle: Annotated[
-        bool, typer.Option("--obstacle", help="Put a pillar on the circle, and drive around it (docs/fence.md).")
+        bool, typer.Option("--obstacle", help="Put a pillar on the circle and drive around it (docs/fence.md).")
     ] = False,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page.")] = DEFAULT_PORT,
     as_json: AsJson = False,
@@ -122,7 +124,10 @@ def sim(
 
 
 SeedOffset = Annotated[
-    int, typer.Option(min=0, help="First seed: 50 seeds at 50 are others than 50 at 0, and both are 100 at 0.")
+    int,
+    typer.Option(
+        min=0, help="First seed: 50 seeds from 50 on differ from 50 from 0 on; together they are 100 from 0 on."
+    ),
 ]
 
 experiment_app = typer.Typer(help="The paper's experiments, as table, CSV and picture.", no_args_is_help=True)
@@ -149,19 +154,22 @@ def pendulum(
 @experiment_app.command()
 def circle(
     robot: Annotated[
-        Path | None, typer.Option(help="robot.toml whose model to use; the shipped robot's if none.")
+        Path | None, typer.Option(help="robot.toml whose model to use; by default the shipped robot's.")
     ] = None,
     mode: Annotated[str, typer.Option(help="default or paper.")] = "default",
     seeds: Annotated[int, typer.Option(min=1, help="Plants drawn from the posterior.")] = 8,
     seed_offset: SeedOffset = 0,
     duration_s: Annotated[float, typer.Option(min=1.0, help="Length of a drive.")] = 40.0,
-    rate_hz: Annotated[float, typer.Option(min=1.0, max=200.0, help="Plans a second.")] = 10.0,
-    largest_rot_s: Annotated[float, typer.Option(min=0.1, help="Largest wheel speed, rotations a second.")] = 1.0,
-    largest_rot_s2: Annotated[float, typer.Option(min=0.1, help="Largest change of it in a second.")] = math.inf,
+    rate_hz: Annotated[float, typer.Option(min=1.0, max=200.0, help="Plans per second.")] = 10.0,
+    largest_rot_s: Annotated[float, typer.Option(min=0.1, help="Largest wheel speed, rotations per second.")] = 1.0,
+    largest_rot_s2: Annotated[
+        float, typer.Option(min=0.1, help="Largest change of a command in a second, rotations per second.")
+    ] = math.inf,
     lag_s: Annotated[float, typer.Option(min=0.0, help="Lag of the plant's wheels.")] = 0.1,
-    wheel_noise: Annotated[float, typer.Option(min=0.0, help="Noise of a wheel's speed, part of it.")] = 0.05,
+    wheel_noise: Annotated[float, typer.Option(min=0.0, help="Noise of a wheel's speed, as a share of it.")] = 0.05,
     belief_scale: Annotated[
-        float, typer.Option(min=0.1, max=10.0, help="Times the posterior's standard deviations, of plants too.")
+        float,
+        typer.Option(min=0.1, max=10.0, help="Factor on the posterior's standard deviations, also for the plants."),
     ] = 1.0,
     out: Annotated[Path, typer.Option("-o", "--out", help="Directory for CSV and picture.")] = Path("out/circle"),
     as_json: AsJson = False,
@@ -191,12 +199,10 @@ def circle(
 @experiment_app.command()
 def adapt(
     robot: Annotated[
-        Path | None, typer.Option(help="robot.toml whose model to use; the shipped robot's if none.")
+        Path | None, typer.Option(help="robot.toml whose model to use; by default the shipped robot's.")
     ] = None,
-    change: Annotated[
-        float, typer.Option(min=-0.3, max=0.3, help="By how much of its size the parameter changes.")
-    ] = 0.15,
-    seeds: Annotated[int, typer.Option(min=1, help="Runs of each.")] = 3,
+    change: Annotated[float, typer.Option(min=-0.3, max=0.3, help="Relative change of the parameter.")] = 0.15,
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each configuration.")] = 3,
     seed_offset: SeedOffset = 0,
     out: Annotated[Path, typer.Option("-o", "--out", help="Directory for CSV and picture.")] = Path("out/adapt"),
     as_json: AsJson = False,
@@ -221,7 +227,7 @@ def gap(
         list[str] | None,
         typer.Option(metavar="EFFECT=VALUE", help="Hide this effect in the virtual robot; may be repeated."),
     ] = None,
-    robot: Annotated[Path | None, typer.Option(help="robot.toml to drive; the shipped robot's if none.")] = None,
+    robot: Annotated[Path | None, typer.Option(help="robot.toml to drive; by default the shipped robot's.")] = None,
     laps: Annotated[float, typer.Option(min=0.5, max=20.0, help="Laps of each circle.")] = 1.5,
     script: Annotated[str, typer.Option(help="Script whose log is searched (docs/drive.md).")] = "excite",
     plant_seed: Annotated[
@@ -251,16 +257,12 @@ def fence(
     rooms: Annotated[int, typer.Option(min=1, help="Random rooms with a task.")] = 200,
     manual: Annotated[int, typer.Option(min=1, help="Wild drives by hand.")] = 200,
     alone: Annotated[int, typer.Option(min=1, help="Tight rooms for each planner without the guard.")] = 40,
-    off: Annotated[
-        float, typer.Option(min=0.0, max=0.3, help="By how much of its size a true parameter may be off.")
-    ] = 0.15,
+    off: Annotated[float, typer.Option(min=0.0, max=0.3, help="Largest relative error of a true parameter.")] = 0.15,
     seconds: Annotated[float, typer.Option(min=2.0, help="Length of a drive.")] = 12.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of rooms, robots and commands.")] = 1,
     out: Annotated[
         Path,
-        typer.Option(
-            "-o", "--out", help="Directory for drives and picture; what is there already is not driven again."
-        ),
+        typer.Option("-o", "--out", help="Directory for drives and picture; drives already there are not repeated."),
     ] = Path("out/fence"),
     as_json: AsJson = False,
 ) -> None:

@@ -182,7 +182,7 @@ def _check_pose_fields(path: Path, section: Any) -> None:
         for other in pose_sources():
             for field in sorted(own_pose_fields(other) - fields - _OF_EVERY_SOURCE):
                 if field in one:
-                    fault = f'a field of the source "{other}", and {where}.source is "{name}"'
+                    fault = f'belongs to the source "{other}", but {where}.source is "{name}"'
                     _refuse(path, f"{where}.{field}", fault, "remove it")
         if one is not section and "also" in one:
             _refuse(path, f"{where}.also", "sources are not nested", "write another [[pose.also]]")
@@ -262,11 +262,11 @@ def _check_task(path: Path, config: RobotConfig) -> None:
         _refuse(
             path,
             "task.speed_m_s",
-            f"{config.task.speed_m_s} m/s is slower than the controller holds",
-            f"write at least {slowest:.2f}, or set the controller for less",
+            f"{config.task.speed_m_s} m/s is slower than the motor controller can hold",
+            f"write at least {slowest:.2f}, or set the motor controller for lower speeds",
         )
     if config.control.fallback != "ramp" and math.isnan(config.task.reference_speed_m_s):
-        _refuse(path, "control.fallback", "way-points by time have no speed to follow them at", 'write "ramp"')
+        _refuse(path, "control.fallback", "way-points with times have no single speed to follow", 'write "ramp"')
     fault = config.task.fault()
     if fault is not None:
         _refuse(path, f"task.{fault.field}", fault.fault, fault.hint)

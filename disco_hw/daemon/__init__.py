@@ -170,7 +170,7 @@ def exchange(connection: socket.socket, path: Path, request: Mapping[str, Any], 
         connection.settimeout(max(1e-3, deadline_s - time.monotonic()))
         data = connection.recv(65536)
         if not data or len(line) > _MAX_REPLY_BYTES:
-            raise HungUpError(f"{path}: the daemon hung up without an answer; see its output")
+            raise HungUpError(f"{path}: the daemon closed the connection without an answer; see its output")
         line += data
     try:
         reply = json.loads(line)
@@ -195,7 +195,9 @@ def errors_in_one_line(path: Path, timeout_s: float) -> Iterator[None]:
     except (FileNotFoundError, ConnectionRefusedError):
         raise WorkError(f"{path}: no daemon listens there; start it with `disco-hw run`") from None
     except OSError as error:
-        raise WorkError(f"{path}: the daemon cannot be asked ({error.strerror or error}); be its user") from None
+        raise WorkError(
+            f"{path}: no connection to the daemon ({error.strerror or error}); run this as the daemon's user"
+        ) from None
 
 
 ADAPT_ACTIONS = ("revert", "adapt")
@@ -235,12 +237,12 @@ def ask(robot: Path, action: str, changes: Sequence[str] = (), unrecorded: bool 
     if (action in _EXAMPLES) != bool(changes):
         taking = ", ".join(_EXAMPLES)
         fault = (
-            "say what to change" if action in _EXAMPLES else f"{action} takes no further arguments; only {taking} do"
+            "name what to change" if action in _EXAMPLES else f"{action} takes no further arguments; only {taking} do"
         )
         shown = action if action in _EXAMPLES else TASK
         raise InputError(f"{fault}: ctl {robot} {shown} {_EXAMPLES[shown]}")
     if unrecorded and action != "arm":
-        raise InputError(f"--unrecorded: only arm takes it, and not {action}; leave it out")
+        raise InputError(f"--unrecorded: belongs to arm, not to {action}; leave it out")
     request: dict[str, Any] = {"do": action} | _arguments(action, changes) | ({UNRECORDED: True} if unrecorded else {})
     try:
         path = _path_of(*load_daemon_address(robot))
@@ -275,7 +277,7 @@ def _arguments(action: str, changes: Sequence[str]) -> dict[str, Any]:
     if action != TASK:
         usage = {OBSTACLE: "add or remove, and then NAME=VALUE", FENCE: "override or hold"}[action]
         example = f"{action} {_EXAMPLES[action]}"
-        raise InputError(f"{action} {' '.join(changes)}: not understood; write {usage}, as {example}")
+        raise InputError(f"{action} {' '.join(changes)}: not understood; write {usage}, such as {example}")
     return dict(map(_change, changes))
 
 
@@ -286,7 +288,7 @@ def _change(text: str) -> tuple[str, float]:
     except ValueError:
         number = math.nan
     if name == "do" or not math.isfinite(number):
-        raise InputError(f"{text}: not a change of the task; write NAME=NUMBER, as radius_m=0.8")
+        raise InputError(f"{text}: not a change of the task; write NAME=NUMBER, such as radius_m=0.8")
     return name, number
 
 
@@ -336,7 +338,7 @@ def _describe_fence(area: Mapping[str, Any] | None) -> Iterator[str]:
     left = "" if area["clearance_m"] is None else f"; {area['clearance_m']:.2f} m left on the stopping path"
     yield f"fence: {area['verdict']}{reason}{left}"
     for one in area["obstacles"]:
-        missing = ", LOST: report it again or remove it" if one["lost"] else ""
+        missing = ", NO LONGER REPORTED: report it again or remove it" if one["lost"] else ""
         place = f"({one['x_m']:.2f}, {one['y_m']:.2f}), radius {one['radius_m']:.2f} m"
         yield f"obstacle {one['name']}: {place}, reported {one['age_s']:.1f} of {one['age_limit_s']:g} s ago{missing}"
 

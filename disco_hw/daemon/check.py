@@ -154,7 +154,7 @@ def refuse_while_daemon_runs(config: RobotConfig) -> None:
     except WorkError:
         return
     raise WorkError(
-        f"{path}: a daemon drives this robot; ask it with `disco-hw ctl ROBOT.toml status`, or stop it first"
+        f"{path}: a daemon is connected to this robot; see `disco-hw ctl ROBOT.toml status`, or stop the daemon first"
     )
 
 
@@ -162,8 +162,8 @@ def _model_check(setup: Setup) -> Check:
     """Report the model file and its effects; warn if the robot has none."""
     if setup.model_file is None:
         text = (
-            "none is named: plans use the nominal geometry and the whole prior, so that the robot may go at half the "
-            "task's speed; `disco-hw infer` makes one of a log"
+            "no model file is named: plans use the nominal geometry and the whole prior, and the robot may drive "
+            "at half the task's speed; write a model from a log with `disco-hw infer`"
         )
         return Check("model", Level.WARNING, text)
     effects = ", ".join(effect.name for effect in setup.model.effects) or "none"
@@ -242,7 +242,9 @@ def pose_source_checks(source: PoseInput, poses: Sequence[PoseSample]) -> list[C
         poses_here = [pose for pose in poses if pose.source == number]
         frame = f"frame at {list(named.origin)}, sensor at {list(named.offset)}"
         if not poses_here:
-            checks.append(Check(f"poses {label}", Level.WARNING, f"none came; {frame}; see that it sends"))
+            checks.append(
+                Check(f"poses {label}", Level.WARNING, f"no pose received; {frame}; check that the sensor sends")
+            )
             continue
         age_s = median((pose.received_ns - pose.t_ns) * 1e-9 for pose in poses_here)
         heading = f"{poses_here[-1].yaw_std_rad:.3g} rad" if poses_here[-1].has_heading else "no heading"
@@ -252,7 +254,7 @@ def pose_source_checks(source: PoseInput, poses: Sequence[PoseSample]) -> list[C
     for one, other in combinations(range(len(labels)), 2):
         apart = _apart(*([pose for pose in poses if pose.source == number] for number in (one, other)))
         if apart:
-            text = f"{apart} beyond their stated noise; correct origin, offset or the standard deviations of one"
+            text = f"{apart} more than their stated noise; correct origin, offset or the standard deviations of one"
             checks.append(Check(f"poses {labels[one]} and {labels[other]}", Level.FAIL, text))
     return checks
 
@@ -324,7 +326,7 @@ def _hearing_check(found: _Found) -> Check:
     first, last = found.reported[0], found.reported[-1]
     rejected = (last.rejected_count - first.rejected_count) % 256
     if not rejected:
-        return Check(name, Level.OK, "the robot rejects nothing")
+        return Check(name, Level.OK, "the robot rejects no frames")
     level = Level.FAIL if last.reject_reason == "AUTHENTICATION" else Level.WARNING
     return Check(name, level, f"the robot rejected {rejected} frames: {status_codes.reject_reason(last.reject_reason)}")
 
@@ -338,12 +340,16 @@ def _telemetry_check(found: _Found) -> Check:
     if not found.poses:
         why = found.pose_message and f"; {found.pose_message}"
         return Check(
-            name, Level.WARNING, f"{rates}{why}; without a pose the task does not start if estimation.pose_required"
+            name,
+            Level.WARNING,
+            f"{rates}{why}; without a pose the task does not start while estimation.pose_required is true",
         )
     if not any(pose.has_heading for pose in found.poses):
         return Check(name, Level.WARNING, f"{rates}; heading not known; {FIND_HEADING}")
     if found.rejected:
         return Check(
-            name, Level.WARNING, f"{rates}, {found.rejected} frames rejected; check the cable and other senders"
+            name,
+            Level.WARNING,
+            f"{rates}, {found.rejected} frames rejected; check the cable, and look for other senders",
         )
     return Check(name, Level.OK, f"{rates}, none rejected")

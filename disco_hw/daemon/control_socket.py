@@ -174,13 +174,13 @@ class ControlServer:
             if client.finished:
                 return
         if len(rest) > _MAX_LINE_BYTES:
-            self._refuse(client, f"a request may have {_MAX_LINE_BYTES} bytes")
+            self._refuse(client, f"a request may have at most {_MAX_LINE_BYTES} bytes")
 
     def _handle_line(self, number: int, client: _Client, line: bytes) -> None:
         try:
             request = msgspec.json.decode(line, type=dict[str, Any])
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-            self._refuse(client, 'not a JSON object; send one a line, as {"do": "status"}')
+            self._refuse(client, 'not a JSON object; send one object a line, such as {"do": "status"}')
             return
         action = request.pop("do", None)
         if not isinstance(action, str) or action not in self._actions:
@@ -245,7 +245,7 @@ def _lock(path: Path) -> int:
     except OSError:
         owner = os.read(descriptor, 32).decode(errors="replace").strip() or "unknown"
         os.close(descriptor)
-        raise InputError(f"{path}: a daemon serves this socket already (process {owner}); stop it first") from None
+        raise InputError(f"{path}: a daemon already serves this socket (process {owner}); stop it first") from None
     os.ftruncate(descriptor, 0)
     os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
     return descriptor

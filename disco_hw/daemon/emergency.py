@@ -35,8 +35,8 @@ _CONNECT_S = 1.0
 _CONFIRM_S = 0.5
 _FRAME_LIFE_NS = 1_000_000_000
 _HINT = (
-    "to stop it all the same give --link can:INTERFACE:CHANNEL or --link serial:PORT, "
-    "or use the robot's own e-stop button, now"
+    "to stop the robot all the same, give --link can:INTERFACE:CHANNEL or --link serial:PORT, or use the robot's "
+    "own e-stop button, now"
 )
 
 
@@ -76,19 +76,20 @@ class EstopOutcome:
     def as_text(self) -> str:
         """Return the outcome as text."""
         lines = [
-            *([] if self.file_error is None else [f"{self.file_error}: used --link alone"]),
+            *([] if self.file_error is None else [f"{self.file_error}: only --link was used"]),
             f"{self.link}: {self.link_error or 'e-stop sent'}",
             *(f"daemon: {line}" for line in self.passed_over),
             f"daemon: {self.daemon_error or 'e-stop accepted'}",
         ]
         if self.confirmed and not self.latches:
             lines.append(
-                "the robot stands; its controller latches nothing, so that the next command moves it: use its button"
+                "the robot stands still, but its controller does not latch the stop: the next command moves it. "
+                "Use the robot's own e-stop button"
             )
         elif self.confirmed:
             lines.append("the robot reports ESTOP; it stays latched until `disco-hw ctl ROBOT.toml reset`")
         elif self.sent:
-            lines.append("sent, but the robot has not confirmed: look at the robot, use its button")
+            lines.append("e-stop sent, but the robot has not confirmed it: look at the robot, use its e-stop button")
         else:
             lines.append("NOT SENT: use the robot's own e-stop button, now")
         return "\n".join(lines)
@@ -123,7 +124,7 @@ def stop_robot(robot: Path, link: str | None = None, kept: Mapping[str, Any] | N
         # Two that speak at once on such a line spoil each other's packets: the daemon first, which has it.
         daemon_confirmed, daemon_error = _request_stop(socket_path)
         if daemon_error is None:
-            return replace(outcome, link_error="left to the daemon, which has it", confirmed=daemon_confirmed)
+            return replace(outcome, link_error="left to the daemon, which holds the line", confirmed=daemon_confirmed)
         confirmed, link_error = _attempt(partial(_stop_over_exchange, settings, frames, is_confirmation))
     else:
         confirmed, link_error = _attempt(partial(way, settings, frames, is_confirmation))
@@ -280,7 +281,7 @@ def _request_stop(socket_path: Path | None) -> tuple[bool, str | None]:
             link = status.get("link")
             time.sleep(0.02)
         if link not in {None, LinkState.UP.value}:
-            return False, f"holds the e-stop until its link is up; it is {link}"
+            return False, f"will send the e-stop as soon as its link is up; the link is {link}"
     except Exception as error:  # a hung or dying daemon must not look like a failure of the link
         return False, str(error) or type(error).__name__
     return False, None

@@ -65,7 +65,7 @@ class ViewerFeed:
             self._socket.close()
             self._context.term()
             raise InputError(
-                f"{path}: the page's feed cannot be made ({error.strerror}); shorten daemon.control_socket"
+                f"{path}: the page's socket cannot be created ({error.strerror}); shorten daemon.control_socket"
             ) from None
         finally:
             os.umask(mask)

@@ -227,7 +227,7 @@ def _start(
     report("daemon", f"{transport.name}, control socket {server.path}")
     if advice_style is not None:
         report("log", f"recording to {log}" if log is not None else "nothing is recorded, as log.enabled is false")
-        report("next", f"once it says READY, {advice_style('arm')}, then {advice_style('start')}")
+        report("next", f"when the state is READY, {advice_style('arm')}, then {advice_style('start')}")
     return daemon
 
 
@@ -263,7 +263,7 @@ def _close_recorder(recorder: Recorder, report: Report) -> None:
         # No fault: of those `drive` makes a drive that is not whole.
         report("log", describe_recording(asdict(stats)))
     if stats.waiting_ticks or stats.dropped_ticks:
-        raise LogError("the log is not whole; free space on its disk before the next drive")
+        raise LogError("the log is not complete; free space on its disk before the next drive")
 
 
 _RECORDER = "recorder"
@@ -297,7 +297,7 @@ class _Compilation(event.Listener):
 
     def on_start(self, event: Any) -> None:
         if self._thread is None:
-            self._report(f"compiling {self._what}: takes some seconds, only once; the result is kept")
+            self._report(f"compiling {self._what}: this takes some seconds, only once; the result is kept")
             self._began_ns = time.monotonic_ns()
             self._thread = threading.Thread(target=self._report_progress, name="compile progress", daemon=True)
             self._thread.start()

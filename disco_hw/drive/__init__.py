@@ -109,7 +109,7 @@ class GamepadSource:
     def status_text(self) -> str:
         """Text for the operator on what to hold, or to plug in."""
         if self._pad is None:
-            return f"{self._name} is gone; plug it in again"
+            return f"{self._name} is disconnected; plug it in again"
         return f"{self._name}: hold the deadman's button; Ctrl-C ends"
 
     def poll(self, now_ns: int, _robot: RobotView) -> ManualInput | None:
@@ -173,7 +173,7 @@ def steering_from(arguments: Mapping[str, Any]) -> Steering:
     stamp = arguments["stamp"]
     # As text, since a browser's numbers would lose the last digits.
     if not (isinstance(stamp, str) and stamp.isascii() and stamp.isdigit() and len(stamp) < 20):
-        raise ValueError("stamp: not the digits of the last reply's stamp")
+        raise ValueError("stamp: must be the digits of the last reply's stamp")
     return Steering(float(forward), float(left), held, int(stamp))
 
 

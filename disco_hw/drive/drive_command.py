@@ -86,7 +86,7 @@ class DriveResult:
 
     def as_text(self) -> str:
         """Return the result as text."""
-        missing = "".join(f"\nNOT WHOLE: {error}" for error in self.recording_errors)
+        missing = "".join(f"\nLOG NOT COMPLETE: {error}" for error in self.recording_errors)
         return f"{self.ended}\n{self.coverage_text}\nlog {self.log}{missing}"
 
 
@@ -102,7 +102,7 @@ def run_drive(options: DriveOptions, page_messages: Callable[[], tuple[str, ...]
     script = _script(options, config)
     log_file = options.log_file or _new_log(config)
     top_rad_s = config.drive.speed_share * config.robot.max_wheel_speed_rad_s
-    prompt = "cmd_vel: ask the bridge to arm, then it drives; Ctrl-C ends" if options.ros2 else PAD_STATUS_TEXT
+    prompt = "cmd_vel: arm through the bridge, then it drives; Ctrl-C ends" if options.ros2 else PAD_STATUS_TEXT
     page = PageSource(top_rad_s, config.drive.turn_share, prompt) if options.page or options.ros2 else None
     source = _source(options, setup, script, top_rad_s, page)
     try:
@@ -174,7 +174,7 @@ def _source(
     }
     chosen = [name for name, given in deadmen.items() if given]
     if len(chosen) > 1:
-        raise InputError(f"{' and '.join(chosen)}: one deadman only; leave one of them out")
+        raise InputError(f"{' and '.join(chosen)}: only one deadman can be used; leave one of them out")
     source: ManualSource
     if options.unattended:
         if not leads_to_virtual_robot(config.link):

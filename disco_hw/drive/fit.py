@@ -67,8 +67,8 @@ def fit_script(
             return
     slowest = f"at {SCALES[-1]:.0%} of its speed either"
     raise ScriptDoesNotFit(
-        f"script {script.name} does not fit into the fence from here, {slowest}; as it is it needs {room.describe()}. "
-        "Make room, or put the robot in the middle"
+        f"script {script.name} does not fit into the fence from here, {slowest}; at its own speed it needs "
+        f"{room.describe()}. Make room, or put the robot in the middle"
     )
 
 

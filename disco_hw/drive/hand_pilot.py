@@ -73,10 +73,13 @@ class Deadman:
             if state is not State.READY or self._release_requested:
                 return (), None
             self._release_requested = True
-            return (), "the deadman is held already; release it and press it again"
+            return (), "the deadman was pressed before the robot was ready; release it and press it again"
         if state is not State.READY:
             self._release_requested = True
-            return (), f"the robot is {state.value}, not ready; release the deadman and press it again once it is"
+            return (
+                (),
+                f"the robot is not ready but {state.value}; when it is ready, release the deadman and press again",
+            )
         self._engaged = True
         return (UserRequest.ARM, UserRequest.START), "deadman pressed: arming"
 
@@ -86,14 +89,14 @@ class Deadman:
         if not is_held:
             self._engaged = False
             if newest is None:
-                return (UserRequest.DISARM,), "the input device is gone: stopping"
+                return (UserRequest.DISARM,), "the input device is disconnected: stopping"
             if not fresh:
                 limit_ms = self._limit_ns // 1_000_000
                 return (UserRequest.DISARM,), f"no input for more than {limit_ms} ms: stopping"
             return (UserRequest.DISARM,), "deadman released: stopping"
         if state not in {State.READY, State.ARMED} or (self._was_armed and state is State.READY):
             self._engaged, self._release_requested = False, True
-            return (), "no longer armed; release the deadman and press it again"
+            return (), "the robot is no longer armed; release the deadman and press it again"
         return (), None
 
 
@@ -158,7 +161,7 @@ class HandPilot:
     def steer(self, now_ns: int, page: int, steering: Mapping[str, Any]) -> str | None:
         """Pass on what a page wants, if pages drive."""
         if self._page is None:
-            return "this drive does not listen to the page; start it with --page"
+            return "this drive takes no input from the page; start it with --page"
         try:
             return self._page.steer(now_ns, page, steering_from(steering))
         except ValueError as error:

@@ -189,7 +189,10 @@ class ScriptSource:
     def ended(self) -> str | None:
         """The end of the script or of the source of the deadman."""
         if self._fenced:
-            return f"the fence stopped the script {self._script.name} in {self._fenced}; see the event before it"
+            return (
+                f"the fence stopped the script {self._script.name} in {self._fenced}; the event before this one "
+                "says where"
+            )
         return f"script {self._script.name} completed" if self._over else self._deadman.ended
 
     @property
@@ -330,13 +333,16 @@ class Unattended:
                 # Held from the next tick on: a deadman counts only after it was seen open.
                 self._pressed_ns = self._waiting_ns = now_ns
             elif now_ns - self._first_ns > self._ready_within_ns:
-                self._ended = f"the robot was not ready within {self._ready_within_ns * 1e-9:g} s"
+                self._ended = (
+                    f"the robot was not ready within {self._ready_within_ns * 1e-9:g} s; `disco-hw ctl ROBOT.toml "
+                    "status` says why"
+                )
         elif robot.driving:
             self._driven, self._waiting_ns = True, now_ns
         elif self._driven and robot.state is not State.ARMED:
             self._ended = self._ended or "the robot was disarmed before the script was over"
         elif now_ns - self._waiting_ns > self._driving_within_ns:
-            hold = f"the robot held still for {self._driving_within_ns * 1e-9:g} s before the script was over"
+            hold = f"the robot stood still for {self._driving_within_ns * 1e-9:g} s before the script was over"
             self._ended = self._ended or (hold if self._driven else "the robot did not start to drive")
         return ManualInput(now_ns, 0.0, 0.0, deadman=state)
 

@@ -50,7 +50,10 @@ DIRECTIONS = {
     b"q": (1.0, 0.5), b"e": (1.0, -0.5), b"z": (-1.0, -0.5), b"c": (-1.0, 0.5),
     b" ": (0.0, 0.0), b"s": (0.0, 0.0),
 }  # fmt: skip
-HELP = "Hold arrows or w x a d to go and turn, q e z c for curves, space to stand; 1-9 speed; others stop; Ctrl-D ends."
+HELP = (
+    "Hold arrows or w x a d to drive and turn, q e z c for curves, space to hold still; 1-9 speed; others stop; "
+    "Ctrl-D ends."
+)
 
 
 def parse(data: bytes) -> list[bytes]:
@@ -182,7 +185,8 @@ class Keyboard:
             self._former: list[Any] | None = termios.tcgetattr(descriptor)
         except termios.error:
             raise InputError(
-                "the keyboard: standard input is no terminal; use a terminal, --gamepad or --script with --unattended"
+                "the keyboard: standard input is not a terminal; use a terminal, --gamepad or --script with "
+                "--unattended"
             ) from None
         raw = termios.tcgetattr(descriptor)
         # Without IXON, as a stray Ctrl-S would hold what is written.
@@ -253,10 +257,10 @@ class Keyboard:
         while self._arrived and self._ended is None:
             t_ns, data = self._arrived.popleft()
             if not data:
-                self._gone, self._ended = True, "the terminal has closed"
+                self._gone, self._ended = True, "the terminal was closed"
             keys += parse(data)
             if b"\x04" in keys:
-                self._ended = "ended from the keyboard"
+                self._ended = "the operator ended the drive at the keyboard"
         if keys and self._ended is None:
             # Any other key among them wins: it means stop.
             odd = [key for key in keys if key not in DIRECTIONS]

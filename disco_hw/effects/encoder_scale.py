@@ -43,5 +43,6 @@ EFFECT = Effect(
     symptoms=(Symptom.TURNS_ON_STRAIGHTS,),
     excitation="straights and turns at several speeds, with poses",
     script="straights",
-    sentence="the left encoder counts {left:+.1%} and the right encoder {right:+.1%} from what the wheel turns",
+    sentence="relative to the turning of its wheel, the left encoder counts {left:+.1%} and the right encoder "
+    "{right:+.1%}",
 )

@@ -23,7 +23,7 @@ def _discover() -> dict[str, Effect]:
     for name in plugin_modules():
         effect = _of_plugin(name)
         if effect.name in found:
-            raise InputError(f"{name}: an effect {effect.name!r} is there already; give it another name")
+            raise InputError(f"{name}: an effect {effect.name!r} already exists; give it another name")
         if effect.stage is Stage.DELAY:
             raise InputError(f"{name}: a model has one delay, {delayed_by!r}; choose another stage for {effect.name!r}")
         found[effect.name] = effect

@@ -38,5 +38,5 @@ EFFECT = Effect(
     may_turn_more=True,
     excitation="straights and turns at several speeds",
     script="straights",
-    sentence="the left wheel turns {left:+.1%} and the right wheel {right:+.1%} from what was commanded",
+    sentence="relative to its command, the left wheel turns {left:+.1%} and the right wheel {right:+.1%}",
 )

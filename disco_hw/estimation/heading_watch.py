@@ -112,8 +112,8 @@ class HeadingWatch:
         if one.has_varied or never_measured:
             one.current, one.changes, one.others_in_a_row = Heading.FROZEN, 0, 0
             self._messages.append(
-                f"{one.label}: the heading stands still at {one.yaw_rad:.2f} rad while the wheels turn the robot by "
-                f"{turn_rad:.2f} rad; it is not used, and the estimator runs on positions"
+                f"{one.label}: the heading stays at {one.yaw_rad:.2f} rad while the wheels turn the robot by "
+                f"{turn_rad:.2f} rad; only the positions are used; check the pose sensor"
             )
         return True, never_measured
 
@@ -129,8 +129,8 @@ class HeadingWatch:
         one.current, one.others_in_a_row = seen, 0
         if seen is Heading.NONE:
             self._messages.append(
-                f"{one.label}: its poses have no heading, or one whose covariance says that it is unknown; the "
-                "estimator runs on positions"
+                f"{one.label}: its poses have no heading, or a covariance that marks it as unknown; only the "
+                "positions are used"
             )
         elif not is_first:
             self._messages.append(f"{one.label}: its headings are used again")

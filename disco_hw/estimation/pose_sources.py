@@ -140,9 +140,9 @@ class PoseSources:
             self._update_standing(source, now_ns)
         apart = self._apart()
         if apart and not self.contradiction:
-            self._messages.append(f"{apart}; the task stops, because it is unknown which is right")
+            self._messages.append(f"{apart}; the task stops, because it is unknown which source is right")
         if self.contradiction and not apart:
-            self._messages.append("no source contradicts another any more")
+            self._messages.append("the pose sources agree again")
         self.contradiction = apart
 
     def new_messages(self) -> list[str]:
@@ -194,12 +194,14 @@ class PoseSources:
         if source.standing is before:
             return
         good = ", ".join(one.label for one in self.all if one.standing is Standing.GOOD)
-        going_on = f"going on with {good}" if good else "no other is left"
+        going_on = f"continuing with {good}" if good else "no other source is left"
         if source.standing is Standing.LOST:
             source.reset_course()
-            self._messages.append(f"{source.label}: lost, no pose for {self._timeout_ns * 1e-9:g} s; {going_on}")
+            self._messages.append(f"{source.label}: no pose for {self._timeout_ns * 1e-9:g} s; {going_on}")
         elif source.standing is Standing.JUMPED:
-            self._messages.append(f"{source.label}: jumped against the wheels and is left out; {going_on}")
+            self._messages.append(
+                f"{source.label}: its poses jumped, which the wheels do not explain, and are not used; {going_on}"
+            )
         elif source.standing is Standing.GOOD:
             self._messages.append(f"{source.label}: its poses are used")
 
@@ -209,11 +211,11 @@ class PoseSources:
         for one in live:
             others = [other for other in live if other is not one and other.standing is Standing.GOOD]
             if one.standing is Standing.DEVIATES and others:
-                return f"{one.label} and {others[0].label} contradict each other beyond their stated noise"
+                return f"{one.label} and {others[0].label} disagree by more than their stated noise"
         for one, other in combinations([one for one in live if one.means_of >= LEAST_POSES], 2):
             difference = _difference(one, other)
             if difference:
-                return f"{one.label} and {other.label} contradict each other: {difference} beyond their stated noise"
+                return f"{one.label} and {other.label} disagree: {difference} more than their stated noise"
         return ""
 
 

@@ -37,7 +37,7 @@ _END_TIMEOUT_S = 10.0
 _STATIONARY_RAD_S = 0.05
 _STARTS = 3
 _CAUSES_OF_THIS_HOST = ("COMMAND_TIMEOUT", "COMMAND_EXPIRED", "HOST_SILENT")
-_ROBOT_SILENT = "-> stopping: telemetry lost"
+_ROBOT_SILENT = "-> stopping: no wheel data"
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +147,7 @@ class Operator:
                     return status
                 detail = f"{status.get('state')}: {status.get('detail')}"
             time.sleep(_POLL_S)
-        line = "".join(f"; the {child.name} last said: {child.last_line()}" for child in self._children)
+        line = "".join(f"; last line of the {child.name}: {child.last_line()}" for child in self._children)
         raise WorkError(f"not {what} within {timeout_s:g} s ({detail}{line})")
 
     def wait_for(self, state: str, timeout_s: float) -> Mapping[str, Any]:

@@ -97,7 +97,9 @@ def run_demo(options: DemoOptions) -> CircleReport:
     if options.device is not None and options.device not in DEVICES:
         raise InputError(f"--device {options.device}: no such device; write one of {', '.join(DEVICES)}")
     if options.device is not None and options.link != "can":
-        raise InputError(f"--link {options.link}: not beside --device, which brings its own; leave --link out")
+        raise InputError(
+            f"--link {options.link}: cannot be used with --device, which sets its own link; leave --link out"
+        )
     options.out.mkdir(parents=True, exist_ok=True)
     console = Console(stderr=not options.show_progress)
     with _ended_by_signals(), tempfile.TemporaryDirectory(prefix="disco-hw-demo-") as scratch:
@@ -311,8 +313,8 @@ def _watch_laps(operator: Operator, options: DemoOptions, limit_s: float, consol
                 return
             if time.monotonic() > deadline:
                 raise WorkError(
-                    f"only {laps:.2f} of {options.laps} laps were driven in {limit_s:.0f} s; "
-                    "end what else keeps this computer busy, and try again"
+                    f"only {laps:.2f} of {options.laps} laps were driven in {limit_s:.0f} s; stop other programs on "
+                    "this computer, and try again"
                 )
             time.sleep(_POLL_S)
 

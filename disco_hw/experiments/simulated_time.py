@@ -160,7 +160,7 @@ class SimulatedRun:
             recorder.put(now_ns, records)
         stats = recorder.close(_CLOSING_S)
         if stats.dropped_ticks or stats.refused:
-            raise WorkError(f"{path}: could not be written whole; look at the disk")
+            raise WorkError(f"{path}: could not be written completely; check the disk")
 
 
 Array = NDArray[np.float64]

@@ -59,16 +59,18 @@ def run_sim(options: SimOptions) -> int:
     except FaultFileError as error:
         raise InputError(str(error)) from None
     if options.start is not None and not all(map(math.isfinite, options.start)):
-        raise InputError(f"--start: {' '.join(map(str, options.start))} is no place; write finite numbers")
+        raise InputError(f"--start: {' '.join(map(str, options.start))} is not a pose; write finite numbers")
     ticks_per_rev = _tick_count(setup)
     driver = find_driver(config.link.driver)
     create_controller = None if driver.name == DEFAULT else find_controller(driver.name)
     if not driver.name == DEFAULT and create_controller is None:
         raise InputError(f"{setup.robot_file}: link.driver: there is no simulator of {driver.name}")
     if options.board is not None and not driver.name == DEFAULT:
-        raise InputError(f"--board: {setup.robot_file} has link.driver {driver.name}; a board speaks our own protocol")
+        raise InputError(
+            f"--board: {setup.robot_file} has link.driver {driver.name}; a board needs the driver reference"
+        )
     if options.board is not None and options.bus_log is not None:
-        raise InputError("--bus-log: not with --board, whose link is its own; take one of them out")
+        raise InputError("--bus-log: cannot be used with --board, which has its own link; leave one of them out")
     controller = (
         None if create_controller is None else partial(create_controller, config.link.settings(), ticks_per_rev)
     )

@@ -24,10 +24,10 @@ def fence_along(poses: Array, footprint: Footprint) -> Polygon:
     does not come back to where it began, or that crosses itself.
     """
     if len(poses) < 3:
-        raise NoFence("there are no poses; drive once round along the edge, with poses")
+        raise NoFence("the log holds no poses; drive once round along the edge, with poses")
     gap_m = float(np.hypot(*(poses[-1, :2] - poses[0, :2])))
     if gap_m > _CLOSED_M:
-        raise NoFence(f"the way ends {gap_m:.1f} m from where it began; drive once round, back to the start")
+        raise NoFence(f"the path ends {gap_m:.1f} m from its start; drive once round, back to the start")
     x, y = poses[:, 0], poses[:, 1]
     is_left_turning = float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()) > 0.0
     aside = -0.5 * footprint.width if is_left_turning else 0.5 * footprint.width
@@ -45,7 +45,7 @@ def fence_along(poses: Array, footprint: Footprint) -> Polygon:
     polygon = tuple((round(a, 3), round(b, 3)) for a, b in kept.tolist())
     fault = fence_fault(Fence(keep_in=polygon), footprint)
     if fault is not None:
-        raise NoFence(f"the way makes no fence: it {fault.fault}; drive once round, without crossing the way")
+        raise NoFence(f"the path makes no fence: it {fault.fault}; drive once round, without crossing the path")
     return polygon
 
 

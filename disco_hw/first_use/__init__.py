@@ -239,7 +239,11 @@ def _controller(
     known = ", ".join(motor_drivers())
     raise InputError(
         f"init: {why}; name it: --driver with one of {known}"
-        + ("; or give --ask, which asks on the line for one that only answers" if "port" in link else "")
+        + (
+            ("; or give --ask, which sends a question on the line, for a controller that only answers")
+            if "port" in link
+            else ""
+        )
     )
 
 
@@ -255,15 +259,21 @@ def _answering(
     names = ", ".join(driver.name for driver in drivers)
     allowed = options.is_interactive if options.driver is None else options.is_interactive is not False
     if allowed is None and ask is not None:
-        show("a controller that is set to take single bytes as speeds could move: lift the wheels, or cut motor power")
-        allowed = ask(f"nothing is sent here unasked; ask for {names} (its version, no more)? [y/n] ").strip() == "y"
+        show(
+            "a controller that takes single bytes as speeds could move: lift the wheels off the ground, or cut the "
+            "motor power"
+        )
+        allowed = (
+            ask(f"nothing is sent without your consent; request the version of {names}, and no more? [y/n] ").strip()
+            == "y"
+        )
     if not allowed:
         return ()
     found = [controller for driver in drivers if (controller := query_line(port, driver)) is not None]
     for controller in found:
         show(f"answers at {controller.baud} baud: {controller.driver} {controller.fields}")
     if not found:
-        show(f"no answer from {names}; is it switched on, and set to answer (packet serial)?")
+        show(f"no answer from {names}; check that it is switched on and set to answer (packet serial)")
     return tuple(found)
 
 
@@ -303,7 +313,9 @@ def robot_text(
     lines += ["", "[link]", f"driver = {in_toml(controller.driver)}", f"kind = {in_toml(kind)}"]
     lines += [f"{name} = {in_toml(link[name])}" for name in ("interface", "channel", "port") if name in link]
     if kind == "can":
-        lines.append("bitrate = 500000               # as the bus is set")
+        lines.append(
+            "# LOOK: what is not marked as found on the link is an example; write what your controller is set to."
+        )
     elif driver.questions is not None:
         baud = controller.baud or driver.questions.bauds[0]
         lines.append(
@@ -315,7 +327,7 @@ def robot_text(
     if fields:
         lines.append("# LOOK: what is not marked as heard is an example; write what your controller is set to.")
     for name, value in fields.items():
-        note = "  # heard: see that left stands before right" if name in controller.fields else ""
+        note = "# found on the link: check that left stands before right" if name in controller.fields else ""
         lines.append(f"{name} = {in_toml(value)}{note}")
     source = options.pose_source or (POSE_SOURCE if driver.name == DEFAULT else "udp")
     lines += [

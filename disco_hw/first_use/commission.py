@@ -30,7 +30,7 @@ from drivers.motor import find_driver
 _STANDARD_INPUT = 0
 _MOST_TRIES = 3
 _UP = "wheels off the ground"
-_DOWN = "on the floor, with one and a half metres free around it"
+_DOWN = "on the floor, with 1.5 m free around it"
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,7 @@ class CommissionResult:
 
 
 def _how(fault: dict[str, Any]) -> str:
-    return "mended" if fault["mended"] else str(fault["text"])
+    return "corrected" if fault["mended"] else str(fault["text"])
 
 
 def slowest_rad_s(setup: Setup) -> float:
@@ -132,7 +132,9 @@ def run_commission(options: CommissionOptions, ask: Callable[[str], str] = input
     refuse_directory(_log_directory(options, setup))
     link_key(setup)
     if not os.isatty(_STANDARD_INPUT):
-        raise InputError("commission: standard input is no terminal; it needs a person's hand and eye: use a terminal")
+        raise InputError(
+            "commission: standard input is not a terminal; it needs an operator at the robot: use a terminal"
+        )
     if setup.config.pose.also:
         _print("poses", "only the first source is examined; `disco-hw check` compares those of [[pose.also]] with it")
     reports: list[dict[str, Any]] = []
@@ -146,7 +148,7 @@ def _through(
     stage: GuidedStage, options: CommissionOptions, ask: Callable[[str], str], reports: list[dict[str, Any]]
 ) -> bool:
     """Drive one stage until it finds nothing; whether it did."""
-    ask(f"\n{stage.name}: put the robot {stage.where}, somebody at its stop button; then press Enter ")
+    ask(f"\n{stage.name}: put the robot {stage.where}, with somebody at its stop button; then press Enter ")
     for _ in range(_MOST_TRIES):
         setup = load_setup(options.robot, None, options.link)
         findings = stage.evaluate(_drive(stage, setup, options), setup)
@@ -161,7 +163,7 @@ def _through(
             return True
         if not mended:
             return False
-        ask("corrected; to test it again press Enter ")
+        ask("corrected; press Enter to test it again ")
     return False
 
 
@@ -189,7 +191,7 @@ def write_fields(
     except InputError as error:
         trial.unlink()
         raise WorkError(
-            f"{options.robot}: not changed, as the result would be refused ({error}); edit it by hand"
+            f"{options.robot}: not changed, as the corrected file would be refused ({error}); edit it by hand"
         ) from None
     except OSError as error:
         trial.unlink(missing_ok=True)
@@ -212,9 +214,9 @@ def _drive(stage: GuidedStage, setup: Setup, options: CommissionOptions) -> Any:
     finally:
         keyboard.close()
     if pilot.fault_text is not None:
-        raise WorkError(f"commission: in the stage {stage.name}: {pilot.fault_text}")
+        raise WorkError(f"commission: stopped in the stage {stage.name}: {pilot.fault_text}")
     if pilot.procedure.action is not None:
-        raise WorkError(f"commission: ended in the stage {stage.name}; begin again with --stage {stage.name}")
+        raise WorkError(f"commission: ended in the stage {stage.name}; continue with --stage {stage.name}")
     return pilot.procedure.result
 
 

@@ -19,11 +19,11 @@ from disco_hw.log.records import Estimate
 from disco_hw.runtime.robot_setup import setup_of_log
 
 OFFER = (
-    "to fence it in: push or drive it once round along the edge with `disco-hw drive {robot}`, then "
-    "`disco-hw log fence LOG` writes the [fence] (docs/fence.md)"
+    "to set a fence: push or drive the robot once round along the edge with `disco-hw drive {robot}`, then "
+    "`disco-hw log fence LOG` writes [fence] (docs/fence.md)"
 )
 """What `init` and `commission` print at their end where nobody can be asked, or who is asked says no."""
-_PROMPT = "record the fence now, by taking the robot once round along the edge? Poses must come. [y/n] "
+_PROMPT = "record the fence now, by moving the robot once round along the edge? It needs poses. [y/n] "
 _AGAIN = "once more? [y/n] "
 _EVERY = 5
 

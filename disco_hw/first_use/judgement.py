@@ -72,8 +72,8 @@ def evaluate_sides(seen: Sequence[SideSeen], wiring: Wiring, robot: Robot) -> Fi
             faults.append(
                 Fault(
                     "runaway",
-                    f"asked for a slow start of the {SIDES[side]} side, a wheel came to more than {limit:.1f} rad/s; "
-                    "its controller and its encoder disagree about forward: exchange the encoder's channels A and B, "
+                    f"at a slow start of the {SIDES[side]} side a wheel reached more than {limit:.1f} rad/s: its "
+                    "controller and its encoder disagree about forward; exchange the encoder's channels A and B, "
                     "or run the controller's own calibration",
                 )
             )
@@ -81,7 +81,7 @@ def evaluate_sides(seen: Sequence[SideSeen], wiring: Wiring, robot: Robot) -> Fi
             faults.append(Fault(f"{SIDES[side]} still", _stationary_text(side, one.track)))
     turned = ["lr".index(one.seen[0]) for one in seen if one.seen]
     if len(turned) == 2 and turned[0] == turned[1]:
-        both = f"both commands turned the {SIDES[turned[0]]} side; give each side its own node, or look at the cables"
+        both = f"both commands turned the {SIDES[turned[0]]} side; give each side its own node, or check the cables"
         faults.append(Fault("one side for both", both))
     if faults:
         return Findings(tuple(faults), tuple(figures))
@@ -91,10 +91,10 @@ def evaluate_sides(seen: Sequence[SideSeen], wiring: Wiring, robot: Robot) -> Fi
 def _stationary_text(side: int, track: Track) -> str:
     counted = [SIDES[k] for k, rad in enumerate(track.turned()) if abs(rad) > COUNTS_RAD]
     if counted:
-        return f"nothing was seen turning, yet the {' and '.join(counted)} encoder counts; look again"
+        return f"you saw nothing turn, but the {' and '.join(counted)} encoder counts; look again"
     return (
-        f"the {SIDES[side]} side does not turn at {max(map(abs, track.commands[-1][1:]), default=0.0):.1f} rad/s; look "
-        "at its motor's cable, the motor supply and the controller's limits of current and speed"
+        f"the {SIDES[side]} side does not turn at {max(map(abs, track.commands[-1][1:]), default=0.0):.1f} rad/s; "
+        "check its motor's cable, the motor supply and the controller's limits of current and speed"
     )
 
 
@@ -118,7 +118,7 @@ def _wiring_faults(seen: Sequence[SideSeen], old: Wiring) -> list[Fault]:
         encoders[side] = way * (1 if counted[reader] > 0.0 else -1) * old.encoder_direction[reader]
     if dead:
         names = " and ".join(SIDES[side] for side in dead)
-        return [Fault("encoder dead", f"the {names} wheel turned and its encoder did not count; look at its cable")]
+        return [Fault("encoder dead", f"the {names} wheel turned but its encoder did not count; check its cable")]
     faults = []
     if swapped != old.sides_swapped:
         faults.append(
@@ -132,7 +132,7 @@ def _wiring_faults(seen: Sequence[SideSeen], old: Wiring) -> list[Fault]:
         faults.append(
             Fault(
                 "encoders swapped",
-                "the encoders of left and right are exchanged",
+                "the left and right encoders are exchanged",
                 {("wheels", "encoders_swapped"): crossed},
             )
         )
@@ -199,8 +199,8 @@ def evaluate_turns(seen: TurnsSeen, wiring: Wiring, reaction_s: float, brakes: b
         faults.append(
             Fault(
                 "wrong ticks",
-                f"the wheels make {ratio:.2f} turns for each that is counted: ticks_per_rev, gear or pole_pairs is "
-                "wrong; set it right where it stands, or let turn_ratio make up for it",
+                f"the wheels make {ratio:.2f} turns for each counted turn: ticks_per_rev, gear or pole_pairs is "
+                "wrong; correct the wrong one, or write turn_ratio",
                 {("wheels", "turn_ratio"): _simple(wiring.turn_ratio * ratio)},
             )
         )
@@ -210,24 +210,26 @@ def evaluate_turns(seen: TurnsSeen, wiring: Wiring, reaction_s: float, brakes: b
         faults.append(
             Fault(
                 "watchdog off",
-                "this computer fell silent and the wheels turned on: the controller's watchdog is off or far too long; "
-                "set it as `disco-hw check` says, and do not put the robot on the floor before",
+                "this computer stopped sending and the wheels kept turning: the controller's watchdog is off or "
+                "far too long; set it as `disco-hw check` says, and do not put the robot on the floor before",
             )
         )
     else:
         begun_s, stationary_s = stopped
         how = "braking" if brakes else "coasting"
-        figures.append(f"watchdog: slowing {begun_s:.2f} s after the last command, {_standing(stationary_s)} ({how})")
+        figures.append(
+            f"watchdog: slowing down {begun_s:.2f} s after the last command, {_standing(stationary_s)} ({how})"
+        )
         if begun_s > reaction_s + SETTLED_S:
             delayed = (
-                f"the robot began to stop {begun_s:.2f} s after the last command, and should within {reaction_s:.2f} s"
+                f"the robot began to stop {begun_s:.2f} s after the last command, but should within {reaction_s:.2f} s"
             )
             faults.append(Fault("watchdog late", f"{delayed}; set its time as `disco-hw check` says"))
     return Findings(tuple(faults), tuple(figures))
 
 
 def _standing(stationary_s: float | None) -> str:
-    return "still rolling at the end" if stationary_s is None else f"standing after {stationary_s:.2f} s"
+    return "still rolling at the end" if stationary_s is None else f"at rest after {stationary_s:.2f} s"
 
 
 def _simple(ratio: float) -> float:
@@ -282,13 +284,13 @@ def evaluate_floor(seen: FloorSeen, configured: PoseConvention, robot: Robot) ->
     """
     legs = (seen.straight, seen.left, seen.right, seen.straight_again)
     if any(len(leg.poses) < 5 for leg in legs):
-        where = "no pose came" if not any(leg.poses for leg in legs) else "poses came only now and then"
-        return Findings((Fault("no poses", f"{where} while driving; look at [pose] and at what sends them"),))
+        where = "no pose received" if not any(leg.poses for leg in legs) else "poses received only now and then"
+        return Findings((Fault("no poses", f"{where} while driving; check [pose] and the sender of the poses"),))
     fits = [fit for choice in _CHOICES if (fit := _fit(seen, choice, robot)) is not None]
     if not fits:
         text = (
-            "the poses do not follow the robot in any units or axes; does the sensor see this robot, is its frame "
-            "fixed to the floor, and did the wheels slip?"
+            "the poses do not follow the robot in any units or axes; check that the sensor tracks this robot, that "
+            "its frame is fixed to the floor, and that the wheels did not slip"
         )
         return Findings((Fault("poses do not follow", text),))
     # What robot.toml says is believed where it explains the drive.
@@ -298,15 +300,16 @@ def evaluate_floor(seen: FloorSeen, configured: PoseConvention, robot: Robot) ->
     )
     faults = list(_pose_faults(best, configured))
     figures = [
-        f"straight: the wheels say {best.wheels_m:.3f} m, the poses {best.poses_m:.3f} m",
-        f"half a turn by the nominal axle was {math.degrees(best.turned_rad):.0f} degrees",
+        f"straight ahead: {best.wheels_m:.3f} m by the wheels, {best.poses_m:.3f} m by the poses",
+        f"half a turn with the nominal axial distance was {math.degrees(best.turned_rad):.0f} degrees",
     ]
     if not 0.75 < best.poses_m / best.wheels_m < 1.33:
         faults.append(
             Fault(
                 "wrong distance",
-                f"the wheels say {best.wheels_m:.2f} m where the poses say {best.poses_m:.2f} m: wheel_radius_m or the "
-                "ticks are wrong; measure the wheel, and count its turns again with its wheels up",
+                f"the wheels measure {best.wheels_m:.2f} m where the poses measure {best.poses_m:.2f} m: "
+                "wheel_radius_m or the ticks are wrong; measure the wheel, and count its turns again with the "
+                "wheels off the ground",
             )
         )
     figures += _places(seen, best)
@@ -406,10 +409,10 @@ def _pose_faults(found: _Fit, configured: PoseConvention) -> list[Fault]:
         "position_unit": ("pose in other units", f"positions come in {found.convention.position_unit}"),
         "yaw_unit": ("yaw in other units", f"the yaw comes in {found.convention.yaw_unit}"),
         "clockwise": ("yaw the other way round", _clockwise(found.convention.clockwise)),
-        "mirrored": ("axes mirrored", "left and right are exchanged in the source's frame"),
+        "mirrored": ("axes mirrored", "left and right are exchanged in the frame of the poses"),
     }
     faults = [
-        Fault(name, f"{text}; robot.toml says otherwise", {("pose", key): getattr(found.convention, key)})
+        Fault(name, f"{text}, unlike robot.toml", {("pose", key): getattr(found.convention, key)})
         for key, (name, text) in names.items()
         if getattr(found.convention, key) != getattr(configured, key)
     ]
@@ -418,7 +421,8 @@ def _pose_faults(found: _Fit, configured: PoseConvention) -> list[Fault]:
         faults.append(
             Fault(
                 "sensor looks aside",
-                f"driving straight on, the yaw is {math.degrees(-offset):.0f} degrees off the way",
+                "when the robot drives straight ahead, the yaw differs from its direction by "
+                f"{math.degrees(-offset):.0f} degrees",
                 {("pose", "yaw_offset_rad"): round(offset, 4)},
             )
         )
@@ -441,11 +445,11 @@ def _places(seen: FloorSeen, best: _Fit) -> list[str]:
     lines = [
         f"lever arm: the sensor is {abs(forward):.2f} m {ahead} and {abs(left):.2f} m to the {aside} of the point "
         f"about which the robot turns (x_icr_m = {-forward:.2f})",
-        f"poses: {_rate(seen):.0f} a second, {_age_ms(seen):.0f} ms old when they come, their stamps "
+        f"poses: {_rate(seen):.0f} a second, {_age_ms(seen):.0f} ms old on arrival, their stamps "
         f"{abs(1e3 * _mean(delays)):.0f} ms {direction} the wheels'",
     ]
     if abs(left) > POSE_STD_LEFT_M:
-        lines.append("the sensor is far from the middle of the robot: the circle that it drives is not the robot's own")
+        lines.append("the sensor is far from the middle of the robot: the circle it drives differs from the robot's")
     return lines
 
 

@@ -161,8 +161,8 @@ def sides(robot: Robot, _slowest_rad_s: float = 0.0) -> Steps:
     for side in (0, 1):
         track, ran_away = yield from _ramp(side, top)
         key = yield Prompt(
-            f"asked the {SIDES[side]} side to turn forward. What turned? "
-            "1 left forward, 2 left backward, 3 right forward, 4 right backward, 0 nothing",
+            f"the {SIDES[side]} side was commanded forward. What turned? 1 left forward, 2 left backward, 3 right "
+            "forward, 4 right backward, 0 nothing",
             "12340",
         )
         found.append(SideSeen(SAW[key], track, ran_away))
@@ -224,7 +224,7 @@ def turns(robot: Robot, slowest_rad_s: float = 0.0) -> Steps:
     tracks = []
     for side in (0, 1):
         wheels = (speed, 0.0) if side == 0 else (0.0, speed)
-        todo = f"put a mark on the {SIDES[side]} wheel; hold, and let go when it has gone round exactly once"
+        todo = f"mark the {SIDES[side]} wheel; hold, and let go when it has made exactly one turn"
         while True:
             track = yield from _until_let_go(wheels, todo)
             key = yield Prompt(f"was that one turn of the {SIDES[side]} wheel? y yes, n again", "yn")
@@ -253,7 +253,7 @@ def _watchdog(wheels: Wheels) -> Steps:
         track = Track()
         while not track.commands or (track.commands[-1][0] - track.commands[0][0]) * 1e-9 < _BEFORE_SILENCE_S:
             seen: Seen = yield DriveWheels(
-                wheels, "hold: both sides turn, then this computer falls silent for a moment"
+                wheels, "hold: both sides turn, then this computer stops sending for a moment"
             )
             if not seen.driving and track.commands:
                 break
@@ -277,7 +277,7 @@ def _clear(seen: Seen) -> Steps:
     """Have a fault cleared that was brought about on purpose."""
     begun_ns = seen.now_ns
     while seen.fault and (seen.now_ns - begun_ns) * 1e-9 < _RESET_S:
-        seen = yield Reset("let go: the controller reports what was done to it as a fault, which is cleared")
+        seen = yield Reset("let go: the controller reports the test as a fault, which is then cleared")
 
 
 @dataclass(frozen=True)

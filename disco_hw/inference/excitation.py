@@ -104,8 +104,8 @@ def excitation(log: DriveLog, source: Source | None = None) -> Excitation:
     runs = [run for segment in range(log.segments) for run in _runs(log, source, segment)]
     if not runs:
         raise UnusableDriveError(
-            f"{name}: no stretch of {_SHORTEST_RUN_S:g} s in which both {source} and poses are known; "
-            "record them together"
+            f"{name}: no period of {_SHORTEST_RUN_S:g} s in which both {source} and poses are known; record them "
+            "together"
         )
     nodes = np.cumsum([0, *(run.wheel_rad_s.shape[0] for run in runs)])
     poses = np.cumsum([0, *(run.t_s.size for run in runs)])

@@ -136,8 +136,9 @@ def infer(
         return _infer(log, robot, options or InferOptions(), report_progress, workers)
     except (EmptyRegionError, np.linalg.LinAlgError):
         raise InputError(
-            f"{', '.join(log.sources)}: no parameters within the prior of robot.toml explain this log: poses, wheels "
-            "and commands are not of one drive, or their units or robot.toml are wrong; check them, or widen the prior"
+            f"{', '.join(log.sources)}: no parameters within the prior of robot.toml explain this log: poses, "
+            "wheels and commands are not of one drive, or their units or robot.toml are wrong; check them, or "
+            "widen the prior"
         ) from None
 
 
@@ -147,7 +148,7 @@ def _infer(
     began = perf_counter()
     simulations = options.simulations or (PAPER_SIMULATIONS if options.paper else DEFAULT_SIMULATIONS)
     if not options.paper and (options.random_features or options.cross_correlation):
-        raise InputError("--random-features and --cross-correlation are the paper's: give --paper too")
+        raise InputError("--random-features and --cross-correlation belong to the paper's method: give --paper too")
     if simulations < _FEWEST_SIMULATIONS:
         raise InputError(f"--simulations {simulations}: too few to train a network; give {_FEWEST_SIMULATIONS} or more")
     prior = prior_region(robot)

@@ -63,7 +63,7 @@ def gap_check_in_parallel(log: DriveLog, model: Model) -> Iterator[Callable[[], 
         try:
             found: GapCheck = result.recv()
         except EOFError:
-            raise WorkError("the search for missing effects broke off; run `disco-hw gap` to see why") from None
+            raise WorkError("the search for missing effects was aborted; run `disco-hw gap` to see why") from None
         return found
 
     try:
@@ -142,7 +142,7 @@ class InferResult:
                 "parameters absorb it"
             )
         if self.gap.why_not_checked is not None:
-            lines.append(f"warning: whether an effect is missing was not judged: {self.gap.why_not_checked}")
+            lines.append(f"warning: whether an effect is missing was not checked: {self.gap.why_not_checked}")
         elif self.gap.missing or self.inference.predictive.outside_simulated:
             logs = " ".join(map(str, self.logs))
             lines.append(
@@ -179,17 +179,18 @@ def _disagreements(inference: Inference) -> list[str]:
         for one, deviation in check.disagreements
     ]
     lines += [
-        f"warning: the posterior of {name} is pressed against the prior's edge; widen prior.{name} in robot.toml"
+        f"warning: the posterior of {name} lies at the edge of its prior; widen prior.{name} in robot.toml"
         for name in check.edge
     ]
     if check.unexplained > LARGEST_UNEXPLAINED:
         lines.append(
-            f"warning: {check.unexplained:.0%} of the motion within a second is not the wheels' in any geometry; "
-            "are the poses and wheels those of one drive, on one clock?"
+            f"warning: no geometry of the wheels explains {check.unexplained:.0%} of the motion within a second; "
+            "check that the poses and wheels are of one drive and on one clock"
         )
     if check.outside_simulated:
         lines.append(
-            "warning: the log lies outside what was simulated, so the parameters may have absorbed what the model lacks"
+            "warning: the log lies outside the simulated range, so the parameters may have absorbed what the model "
+            "lacks"
         )
     return lines
 

@@ -290,4 +290,7 @@ def dask_workers(address: str) -> Iterator[DaskWorkers]:
             raise WorkError(f"--dask {address}: a worker lacks {error.name}; install disco-hw there too") from None
         except (distributed.KilledWorker, distributed.client.FutureCancelledError, OSError) as error:
             reason = str(error).partition("\n")[0]
-            raise WorkError(f"--dask {address}: the cluster was lost ({reason}); start it again, then this") from None
+            raise WorkError(
+                f"--dask {address}: the connection to the cluster was lost ({reason}); restart the cluster, then "
+                "this command"
+            ) from None

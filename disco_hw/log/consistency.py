@@ -83,8 +83,9 @@ def standing(windows: MotionWindows, radius_m: float, axial_m: float) -> Contrad
     if most_way < _STILL * radius_m and most_turn < max(_STILL * could, _EXACTLY):
         return Contradiction(
             "poses_still",
-            f"the poses stand still while the wheels turn by {STEP_S * rolled[moving].sum():.3g} rad: the wheels are "
-            "off the ground or the pose sensor is dead; leave its columns empty to compare commands and wheels alone",
+            f"the poses do not change while the wheels turn by {STEP_S * rolled[moving].sum():.3g} rad: the wheels "
+            "are off the ground or the pose sensor is dead; leave its columns empty to compare commands and wheels "
+            "alone",
         )
     turning = could_turn > TURNING_RAD
     if np.count_nonzero(turning) < FEWEST_WINDOWS:
@@ -95,8 +96,8 @@ def standing(windows: MotionWindows, radius_m: float, axial_m: float) -> Contrad
         return None
     return Contradiction(
         "heading_still",
-        f"pose_yaw_rad stands still in {share:.0%} of the turns that the wheels make: it is no measured heading; "
-        "record a source that measures the heading, or leave the pose columns empty",
+        f"pose_yaw_rad does not change in {share:.0%} of the turns that the wheels make: it is not a measured "
+        "heading; record a source that measures the heading, or leave the pose columns empty",
         ("body",) if share > _MOSTLY else (),
     )
 
@@ -107,7 +108,7 @@ def _wheels_standing(rolled_rad: np.ndarray, way_m: np.ndarray, radius_m: float)
         return None
     return Contradiction(
         "wheels_still",
-        f"the poses move by {STEP_S * way_m[travels].sum():.3g} m while both wheels stand still: the encoders are not "
+        f"the poses move by {STEP_S * way_m[travels].sum():.3g} m while neither wheel counts: the encoders are not "
         "read, or the poses are of another drive; check the encoders' cables and columns",
     )
 
@@ -122,8 +123,8 @@ def dead_encoders(windows: MotionWindows) -> tuple[Contradiction, ...]:
         share = float(np.mean(rolled[could, side] < _STILL)) if np.count_nonzero(could) >= FEWEST_WINDOWS else 0.0
         if share > _DEAD_SHARE:
             message = (
-                f"the {name} encoder stands still in {share:.0%} of the time in which its wheel is told to turn and "
-                "the other one turns: check its cable and its channel, or the motor"
+                f"the {name} encoder does not count in {share:.0%} of the time in which its wheel is commanded to "
+                "turn and the other one turns: check its cable and its channel, or the motor"
             )
             found.append(Contradiction("encoder_dead", message, ("body", "response") if share > _MOSTLY else ()))
     return tuple(found)
@@ -137,8 +138,8 @@ def never_counting(windows: MotionWindows) -> Contradiction | None:
         return None
     return Contradiction(
         "encoder_dead",
-        f"the {SIDES[side]} encoder stands still throughout, and the poses are not those of a robot that turns about "
-        "that wheel: check its cable and its channel",
+        f"the {SIDES[side]} encoder never counts, and the poses are not those of a robot that turns about that "
+        "wheel: check its cable and its channel",
     )
 
 
@@ -197,7 +198,7 @@ def _of_one(log: DriveLog, radius_m: float, axial_m: float) -> tuple[Contradicti
         return poses.contradictions(has_commands=commands is not None)
     of_wheels, of_commands, as_commanded = compared_with_commands
     if poses.fits(as_commanded):
-        return (replace(of_wheels, message=f"{of_wheels.message} (the poses say so too)"),)
+        return (replace(of_wheels, message=f"{of_wheels.message} (the poses show it too)"),)
     if poses.fits(windows):
         return (of_commands,)
     return (*poses.contradictions(has_commands=True), of_wheels)
@@ -253,7 +254,7 @@ def _of_commands(
         return (
             Contradiction("encoder_count", f"{explanation}: check ticks_per_rev and gear", ("body", "response")),
             Contradiction(
-                "command_scale", f"{explanation}, and the poses bear the wheels out: check commands", ("response",)
+                "command_scale", f"{explanation}, and the poses confirm the wheels: check commands", ("response",)
             ),
             _with_wheels(windows, 1.0 / gains),
         )
@@ -264,7 +265,7 @@ def _of_commands(
         of_counts(gain, " by the commands", ("response",)),
         Contradiction(
             "command_scale",
-            f"commands are {1.0 / gain:.3g} times what the wheels do, and the poses bear the wheels out: write "
+            f"commands are {1.0 / gain:.3g} times what the wheels do, and the poses confirm the wheels: write "
             "cmd_left_rad_s and cmd_right_rad_s in rad/s of the wheel (behind the gear)",
             ("response",),
         ),

@@ -185,7 +185,7 @@ def load_drive(
         raise LogError("no log given; give at least one")
     for place, path in enumerate(several):
         if any(_same(path, other) for other in several[:place]):
-            raise LogError(f"{path}: given twice, and what it says would count twice; give each log once")
+            raise LogError(f"{path}: given twice, so that its data would count twice; give each log once")
     drives = [_load(path, ticks_per_rev, wheel_radius_m) for path in several]
     if len(drives) > 1:
         _refuse_copies(several, [_marks(drive) for drive in drives])
@@ -198,7 +198,7 @@ def _refuse_copies(paths: Sequence[Path], marks: Sequence[set[tuple[float, ...]]
         for other, theirs in zip(paths[:place], marks[:place], strict=True):
             fewest = min(len(marks[place]), len(theirs))
             if fewest >= _FEWEST_POSES and len(marks[place] & theirs) > _COPIED_SHARE * fewest:
-                raise LogError(f"{path}: holds what {other} holds, which would count twice; give one of them")
+                raise LogError(f"{path}: holds the same data as {other}, which would count twice; give one of them")
 
 
 def _marks(drive: DriveLog) -> set[tuple[float, ...]]:

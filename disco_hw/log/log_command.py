@@ -94,7 +94,9 @@ def _describe_end(summary: LogSummary) -> str:
     if summary.ended is None:
         index = "whole" if summary.complete else "without its end"
         return f"the file is {index}, and its version did not record whether its recorder ended it"
-    return f"nothing after {summary.end}: the daemon or its recorder was gone then, or the log is still being written"
+    return (
+        f"nothing recorded after {summary.end}: the daemon or its recorder had ended, or the log is still being written"
+    )
 
 
 def _describe(summary: LogSummary) -> str:

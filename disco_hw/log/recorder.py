@@ -261,7 +261,7 @@ class ProcessRecorder:
             except LogError as error:
                 self._note(str(error))
                 return
-            self._note("the process that starts log writers had ended or did not answer; there is another one now")
+            self._note("the process that starts log writers ended or did not answer; it was restarted")
             if self._line is None or not self._line.has_received:
                 self._line = None
                 self._retry_s = 0.0
@@ -299,7 +299,7 @@ class ProcessRecorder:
                 error = self._line.status.error or f"{self._recording.path}: the log writer did not start"
                 self._line.close()
                 self._keeper.close()
-                raise LogError(f"{error}; see what is said above it, or give another path with --log")
+                raise LogError(f"{error}; see the message above, or give another path with --log")
             self._wait(_CLOSING_STEP_S)
 
     def _encodable(self, now_ns: int, records: Sequence[Record]) -> list[Record]:
@@ -371,7 +371,7 @@ class ProcessRecorder:
                 self._recovered()
             return
         if line.has_received:
-            self._fault = f"the log writer has not answered for {silent_s:.1f} s; what comes is kept and waits"
+            self._fault = f"the log writer has not answered for {silent_s:.1f} s; new ticks are kept until it does"
             if not self._frozen:
                 self._frozen = True
                 self._note(self._fault)
@@ -381,7 +381,7 @@ class ProcessRecorder:
                 with suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGKILL)
             self._patience_s *= 2.0
-            self._writer_ended(now_s, f"the log writer did not answer for {silent_s:.1f} s and was ended")
+            self._writer_ended(now_s, f"the log writer did not answer for {silent_s:.1f} s and was stopped")
 
     def _writer_ended(self, now_s: float, cause: str) -> None:
         line = self._line
@@ -417,7 +417,9 @@ class ProcessRecorder:
             self._next_part = max(2, self._next_part)
         else:
             self._retry_s = time.monotonic() + _RETRY_S[-1]
-            self._fault = "nothing is being recorded: the process that starts log writers has ended; disarm to renew it"
+            self._fault = (
+                "nothing is being recorded: the process that starts log writers has ended; disarm to restart it"
+            )
             self._note(self._fault)
 
     def _recovered(self) -> None:
@@ -432,8 +434,9 @@ class ProcessRecorder:
         missing = delivery.waiting_ticks + delivery.dropped_ticks
         if missing:
             given = delivery.ticks + delivery.dropped_ticks
-            busy = "too many waited for a slow disk" if not delivery.waiting_ticks else "the log writer is still busy"
-            self._fault = f"{missing} of {given} ticks are in no log: {self._last_error or busy}"
+            slow = "too many ticks waited for a slow disk"
+            busy = slow if not delivery.waiting_ticks else "the log writer is still busy"
+            self._fault = f"{missing} of {given} ticks are not in the log: {self._last_error or busy}"
             self._messages.append(self._fault)
 
     def _note(self, sentence: str) -> None:
@@ -492,7 +495,7 @@ def _check_place(path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise LogError(
-            f"{path.parent}: cannot be made ({error.strerror}); give a directory that can be written to"
+            f"{path.parent}: cannot be created ({error.strerror}); give a directory that can be written to"
         ) from None
     if path.exists():
         raise LogError(f"{path}: already exists and a log is never overwritten; give another name")

@@ -166,7 +166,7 @@ class Session:
             self._report(state)
         self._file.sync()
         if self._file.deleted:
-            raise FileNotFoundError("it was deleted while it was written, and what it held is gone")
+            raise FileNotFoundError("it was deleted while it was being written, and its content is lost")
         self._report(state)
 
     def _report(self, state: Literal["recording", "finished"]) -> None:

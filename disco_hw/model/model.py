@@ -270,7 +270,7 @@ class Model:
             if effect not in REGISTRY:
                 raise ValueError(f"missing_effects: unknown effect {effect!r}; known are {', '.join(REGISTRY)}")
             if effect in names:
-                raise ValueError(f"missing_effects: {effect!r} is among the effects; take it out of one of them")
+                raise ValueError(f"missing_effects: {effect!r} is also listed in effects; remove it from one of them")
         if self.belief is not None:
             for believed in self.belief.names:
                 if believed not in self.parameter_names:
@@ -337,7 +337,7 @@ class Model:
         point = dict(zip(self.parameter_names, self.point(), strict=True))
         for name, value in values.items():
             if name not in point:
-                raise ValueError(f"{name!r} is no parameter of this model; it has {', '.join(point)}")
+                raise ValueError(f"{name!r} is not a parameter of this model; it has {', '.join(point)}")
             point[name] = float(value)
         effects = tuple(
             EffectSetting(s.name, {key: point[f"{s.name}.{key}"] for key in s.values}) for s in self.effects

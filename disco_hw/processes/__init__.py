@@ -157,7 +157,7 @@ def enter_real_time(priority: int, cpus: Collection[int] = ()) -> tuple[Step, ..
         done, hint = f"runs on {sorted(cpus)}", "name CPUs that this computer has"
         steps.append(_try("cpus", lambda: os.sched_setaffinity(0, cpus), done, hint))
     if priority == 0:
-        return (*steps, Step("scheduler", False, "left alone, as daemon.realtime_priority is 0"))
+        return (*steps, Step("scheduler", False, "unchanged, because daemon.realtime_priority is 0"))
     steps.append(_lock_memory())
     steps.append(_set_fifo("scheduler", max(1, priority - _OTHER_THREADS_BELOW)))
     return tuple(steps)

@@ -22,7 +22,7 @@ from disco_hw.errors import InputError
 def refuse_directory(path: Path, names: Iterable[str] = (), inputs: Iterable[Path] = ()) -> None:
     """Raise InputError if a directory cannot be made or written, or if a file of these names in it is an input."""
     if os.path.exists(path) and not os.path.isdir(path):
-        raise InputError(f"{path}: is there and is no directory; give another directory")
+        raise InputError(f"{path}: exists and is not a directory; give another directory")
     _refuse_place(path)
     for name in names:
         _refuse_input(path / name, inputs)
@@ -39,7 +39,7 @@ def refuse_file(path: Path, inputs: Iterable[Path] = ()) -> None:
 def _refuse_input(path: Path, inputs: Iterable[Path]) -> None:
     for given in inputs:
         if path == given or (os.path.exists(path) and os.path.exists(given) and path.samefile(given)):
-            raise InputError(f"{path}: would be written over, and is read here; give another path")
+            raise InputError(f"{path}: is read here and would be overwritten; give another path")
 
 
 def _refuse_place(path: Path) -> None:
@@ -48,9 +48,9 @@ def _refuse_place(path: Path) -> None:
     while not os.path.exists(there) and there != there.parent:
         there = there.parent
     if there != path and not os.path.isdir(there):
-        raise InputError(f"{path}: {there} is no directory; give another path")
+        raise InputError(f"{path}: {there} is not a directory; give another path")
     if not os.access(there, os.W_OK):
-        raise InputError(f"{path}: {there} cannot be written; give another path")
+        raise InputError(f"{path}: {there} cannot be written to; give another path")
 
 
 def as_json(result: Mapping[str, Any], indent: int | None = None) -> str:

@@ -79,13 +79,14 @@ def _from(*states: State) -> frozenset[State]:
 
 
 S = State
+_NO_WHEEL_DATA = "no wheel data from the robot; check the cable and the robot's power"
 TRANSITIONS: tuple[Transition, ...] = (
     # A lost link ends everything agreed with the robot.
     _row(_CONNECTED, S.DISCONNECTED, C.NONE, C.LINK_UP, "the link is down"),
     _row(_CONNECTED, S.DISCONNECTED, C.LINK_RENEWED, C.NONE, "the link was interrupted"),
     # Problems latch until a reset.
     _row(_UNTROUBLED, S.FAULT, C.DAEMON_ERROR, C.NONE, "the daemon failed"),
-    _row(_UNTROUBLED, S.FAULT, C.ESTOP_REQUESTED, C.NONE, "e-stop requested here"),
+    _row(_UNTROUBLED, S.FAULT, C.ESTOP_REQUESTED, C.NONE, "e-stop requested by the operator"),
     _row(_UNTROUBLED, S.FAULT, C.ROBOT_ESTOP, C.NONE, "the robot is in e-stop"),
     _row(_UNTROUBLED, S.FAULT, C.ROBOT_FAULT, C.NONE, "the robot reports a fault"),
     _row(_UNTROUBLED, S.FAULT, C.ROBOT_REFUSED, C.NONE, "the handshake was refused"),
@@ -93,13 +94,21 @@ TRANSITIONS: tuple[Transition, ...] = (
     _row(_from(S.FAULT), S.HANDSHAKE, C.RESET_PENDING, PROBLEM, "reset"),
     # Motion is taken away.
     _row(_from(S.ARMED), S.STOPPING, C.DISARM_REQUESTED, C.NONE, "disarm requested"),
-    _row(_from(S.ARMED), S.STOPPING, C.TELEMETRY_LOST, C.NONE, "telemetry lost"),
+    _row(_from(S.ARMED), S.STOPPING, C.TELEMETRY_LOST, C.NONE, _NO_WHEEL_DATA),
     _row(_from(S.ARMED), S.STOPPING, C.NONE, C.ROBOT_ARMED, "the robot is no longer armed"),
-    _row(_from(S.READY), S.STOPPING, C.ROBOT_MAY_MOVE, C.ARM_PENDING, "the robot armed without being asked"),
-    _row(_from(S.HANDSHAKE), S.STOPPING, C.ROBOT_MAY_MOVE, C.NONE, "the robot was found armed"),
+    _row(
+        _from(S.READY), S.STOPPING, C.ROBOT_MAY_MOVE, C.ARM_PENDING, "the robot armed without a request from this host"
+    ),
+    _row(
+        _from(S.HANDSHAKE),
+        S.STOPPING,
+        C.ROBOT_MAY_MOVE,
+        C.NONE,
+        "the robot was already armed when this daemon connected",
+    ),
     # The robot restarted or fell silent.
     _row(_from(S.READY, S.STOPPING), S.HANDSHAKE, C.NONE, C.ROBOT_TALKS, "the robot started a new handshake"),
-    _row(_from(S.READY), S.HANDSHAKE, C.TELEMETRY_LOST, C.NONE, "telemetry lost"),
+    _row(_from(S.READY), S.HANDSHAKE, C.TELEMETRY_LOST, C.NONE, _NO_WHEEL_DATA),
     # The way up.
     _row(_from(S.DISCONNECTED), S.HANDSHAKE, C.LINK_UP, C.NONE, "the link is up"),
     _row(_from(S.HANDSHAKE), S.READY, C.ROBOT_IDLE | C.TELEMETRY_FRESH, C.NONE, "handshake complete"),
@@ -109,7 +118,7 @@ TRANSITIONS: tuple[Transition, ...] = (
         S.READY,
         C.ROBOT_IDLE | C.WHEELS_STATIONARY | C.TELEMETRY_FRESH,
         C.NONE,
-        "the wheels are still",
+        "the wheels have stopped",
     ),
 )
 
@@ -135,10 +144,10 @@ AdviceStyle = Callable[[str], str]
 ESTOP_HINT = "The stop is latched. Make the place safe, release the robot's own button, then {reset}."
 _NEXT = {
     "DISCONNECTED": "Check the robot's power and the cable to it.",
-    "HANDSHAKE": "The robot is being asked who it is; wait.",
-    "READY": "{arm}; nothing moves yet.",
+    "HANDSHAKE": "Wait: the daemon is identifying the robot.",
+    "READY": "{arm}; arming does not move the robot.",
     "STOPPING": "Wait until the wheels stand still.",
-    "FAULT": "Mend what is said above, then {reset}.",
+    "FAULT": "Correct the fault shown above, then {reset}.",
 }
 
 
@@ -201,7 +210,9 @@ def advice(status: Mapping[str, Any], advice_style: AdviceStyle = by_button) -> 
 
 def fault_sentence(name: str) -> str:
     """Return what a fault is and what to do about it."""
-    todo = status_codes.advice(name) or "not known here: look it up where the robot's firmware comes from"
+    todo = status_codes.advice(name) or (
+        "this version does not know the fault: look it up in the documentation of the robot's firmware"
+    )
     return f"{describe(name)}. {todo[0].upper()}{todo[1:]}."
 
 

@@ -375,9 +375,9 @@ class DaemonCore:
             if fell_back is not self._fell_back:
                 law = self.config.control.fallback
                 events.append(
-                    f"planner: no valid plan; {law} follows the line instead"
+                    f"planner: no valid plan; the fallback controller {law} follows the line instead"
                     if fell_back
-                    else "planner: valid plan again; it drives"
+                    else "planner: valid plan again; the planner drives"
                 )
             self._fell_back = fell_back
             if found.collapsed != self._planner_collapsed:

@@ -150,22 +150,27 @@ class FenceGuard:
         if bounds is None or not self.is_active:
             return IDLE
         if overridden:
-            return FenceState(FenceVerdict.OVERRIDDEN, 1.0, math.nan, reason="moved by hand in spite of the fence")
+            return FenceState(FenceVerdict.OVERRIDDEN, 1.0, math.nan, reason="manual driving with the fence overridden")
         if self._missing:
             names = ", ".join(self._missing)
             return FenceState(
                 FenceVerdict.OBSTACLE_LOST, 0.0, math.nan,
-                reason=f"obstacle {names} is reported no longer; report it again or remove it",
+                reason=f"obstacle {names} is no longer reported; report it again or remove it",
             )  # fmt: skip
         if not estimate.ok or not _are_finite(estimate, geometry, last_sent):
-            return FenceState(FenceVerdict.NO_POSE, 0.0, math.nan, reason="no valid pose, and a fence is set")
+            return FenceState(
+                FenceVerdict.NO_POSE,
+                0.0,
+                math.nan,
+                reason="no valid pose while a fence is set; check the pose sensor",
+            )
         is_motion_requested = max(map(abs, requested)) > STOPPED_RAD_S if all(map(math.isfinite, requested)) else False
         desired = requested if is_motion_requested else (0.0, 0.0)
         # A path that overflows has no clearance, which stops the robot: a warning would say nothing more.
         with np.errstate(over="ignore", invalid="ignore"):
             poses, clearance, driven = self._stopping_paths(bounds, estimate, geometry, last_sent, desired)
         if not np.isfinite(clearance).all():
-            return FenceState(FenceVerdict.NO_POSE, 0.0, math.nan, reason="the stopping path is not finite")
+            return FenceState(FenceVerdict.NO_POSE, 0.0, math.nan, reason="the predicted stopping path is not finite")
         chosen = self._largest_scale(clearance, driven)
         if self._is_stopped and chosen < RELEASED_FROM:
             chosen = 0
@@ -176,7 +181,7 @@ class FenceGuard:
             return FenceState(FenceVerdict.FREE, 1.0, least, path)
         if chosen == 0:
             x, y, _ = poses[-1][clearance[-1].min(axis=1).argmin()].tolist()
-            where = f"the stopping path would leave the fence at ({x:.2f}, {y:.2f})"
+            where = f"the stopping path would leave the fence at ({x:.2f}, {y:.2f}); drive the robot away from there"
             return FenceState(FenceVerdict.STOPPED, 0.0, least, path, where)
         scale = float(SCALES[chosen])
         return FenceState(FenceVerdict.FREE if scale == 1.0 else FenceVerdict.SCALED, scale, least, path)

@@ -94,7 +94,7 @@ class Obstacles:
         """Remove an obstacle by its name. Raises ObstacleRefused if there is none of that name."""
         if name not in self._kept:
             known = ", ".join(sorted(self._kept)) or "none"
-            raise ObstacleRefused(f"obstacle {name}: not known; known are: {known}")
+            raise ObstacleRefused(f"obstacle {name}: not known; known obstacles: {known}")
         del self._kept[name]
 
     def step(self, now_ns: int) -> tuple[str, ...]:
@@ -103,9 +103,7 @@ class Obstacles:
         gone, back = sorted(missing - self._missing), sorted((self._missing - missing) & self._kept.keys())
         self._missing = missing
         limits = {name: self._kept[name].report.age_limit_s for name in gone}
-        messages = [
-            f"fence: obstacle {name} not reported for {limits[name]:g} s; the robot must stand" for name in gone
-        ]
+        messages = [f"fence: obstacle {name} not reported for {limits[name]:g} s; the robot stops" for name in gone]
         return (*messages, *(f"fence: obstacle {name} is reported again" for name in back))
 
     @property

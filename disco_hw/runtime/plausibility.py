@@ -144,7 +144,7 @@ class Headway:
         window = self._window
         if window is None or math.hypot(place_m[0] - window.x_m, place_m[1] - window.y_m) > self._least_m:
             self._window = _Window(now_ns, *place_m, angles)
-            return ("task: makes progress again",) if window is not None and window.is_reported else ()
+            return ("task: the robot makes progress again",) if window is not None and window.is_reported else ()
         window.largest_rad_s = max(window.largest_rad_s, *map(abs, command_rad_s))
         if window.is_reported or now_ns - window.begun_ns < WINDOW_NS:
             return ()
@@ -159,16 +159,19 @@ def _obstacle(window: _Window, angles_rad: tuple[float, float] | None, planner_f
     if window.largest_rad_s < COMMANDED_RAD_S:
         return "the planner commands no motion; check the task and the position of the robot"
     if angles_rad is None or window.angles_rad is None:
-        return f"commanded up to {window.largest_rad_s:.2f} rad/s, but no wheel data arrive; check the encoders"
+        return (
+            f"the wheels are commanded up to {window.largest_rad_s:.2f} rad/s, but no wheel data arrive; check the "
+            "encoders"
+        )
     turned = max(abs(now - then) for now, then in zip(angles_rad, window.angles_rad, strict=True))
     if turned < ROLLED_RAD:
         return (
-            f"the wheels do not turn although commanded up to {window.largest_rad_s:.2f} rad/s: blocked, or a dead "
-            "band that the model does not know (disco-hw gap finds it)"
+            f"the wheels do not turn although commanded up to {window.largest_rad_s:.2f} rad/s: they are blocked, "
+            "or have a dead band that the model lacks; free them, or find the dead band with `disco-hw gap`"
         )
     return (
-        f"the wheels have turned by {turned:.1f} rad, and the pose has not moved: slip, an obstacle, "
-        "or a frozen pose sensor"
+        f"the wheels have turned by {turned:.1f} rad, but the pose has not changed: check for slip, an obstacle or "
+        "a frozen pose sensor"
     )
 
 
@@ -391,15 +394,15 @@ class Directions:
         for side in wrong:
             encoder[side], motor[side] = -encoder[side], -motor[side]
         return (
-            f"the {names} counted against what was commanded: in robot.toml write wheels.encoder_direction = {encoder} "
-            f"if it turned as it should, or wheels.motor_direction = {motor} if it turned the other way"
+            f"the {names} counted opposite to the command: in robot.toml write wheels.encoder_direction = {encoder} "
+            f"if it turned as commanded, or wheels.motor_direction = {motor} if it turned the other way"
         )
 
     def _describe_crossed(self) -> str:
         crossed = str(not self._wiring.encoders_swapped).lower()
         sides = str(not self._wiring.sides_swapped).lower()
         return (
-            "each side counted what the other was commanded: in robot.toml write wheels.encoders_swapped = "
+            "each side counted what the other side was commanded: in robot.toml write wheels.encoders_swapped = "
             f"{crossed}, and wheels.sides_swapped = {sides} as well if the robot turned the other way"
         )
 
@@ -416,15 +419,15 @@ class Directions:
             texts.append("left and right are swapped")
             changes.append(f"wheels.sides_swapped = {str(not self._wiring.sides_swapped).lower()}")
         for side in backward:
-            way = "counted against what was commanded and turned as it should" if side in counted else "turns backward"
+            way = "counted opposite to its command but turned as commanded" if side in counted else "turns backward"
             texts.append(f"the {_SIDES[side]} wheel {way}")
         if motors != list(self._wiring.motor_direction):
             changes.append(f"wheels.motor_direction = {motors}")
         if encoders != list(self._wiring.encoder_direction):
             changes.append(f"wheels.encoder_direction = {encoders}")
         return (
-            f"the robot moved differently from its wheels: {', '.join(texts)}; in robot.toml write "
-            f"{' and '.join(changes)}, unless it is the poses' frame that is wrong ([pose])"
+            f"the poses and the wheels show different motion: {', '.join(texts)}; in robot.toml write "
+            f"{' and '.join(changes)}, or correct [pose] if the frame of the poses is wrong"
         )
 
 

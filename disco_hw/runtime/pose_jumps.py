@@ -32,11 +32,16 @@ class PoseJumps:
             return ""
         moved_m = math.hypot(estimate.x_m - before.x_m, estimate.y_m - before.y_m)
         if not (before.heading_known and estimate.heading_known):
-            text = f"the pose jumped by {moved_m:.2f} m, and its heading is not known any more"
+            text = f"the pose jumped by {moved_m:.2f} m, and the heading is no longer known"
         else:
             turned_rad = abs(math.remainder(estimate.yaw_rad - before.yaw_rad, math.tau))
-            text = f"the pose jumped by {moved_m:.2f} m and {turned_rad:.2f} rad, which the wheels do not explain"
-        self._messages.append(f"{text}: the robot was carried or has slipped, or its poses are wrong")
+            text = (
+                f"the pose jumped by {moved_m:.2f} m and {turned_rad:.2f} rad, which the motion of the wheels does "
+                "not explain"
+            )
+        self._messages.append(
+            f"{text}: the robot was carried or has slipped, or the measured poses are wrong; check the pose sensor"
+        )
         return text
 
     def new_messages(self) -> list[str]:
@@ -50,7 +55,10 @@ class PoseJumps:
             if self._in_a_row == -MISFITS and not self._is_mismatch:
                 self._is_mismatch = True
                 off_m = math.hypot(*update.innovation[:2])
-                self._messages.append(f"{MISFITS} in a row do not fit the wheels, {off_m:.2f} m off: not used")
+                self._messages.append(
+                    f"{MISFITS} poses in a row disagree with the wheels, by {off_m:.2f} m, and are not used; check "
+                    "the pose sensor"
+                )
         elif update.accepted:
             self._in_a_row = max(self._in_a_row, 0) + 1
             self._is_mismatch = self._is_mismatch and self._in_a_row < FITS

@@ -80,7 +80,7 @@ def check_link_load(link: Link, control: Control) -> Check:
     frames = find_driver(link.driver).cyclic_frames(link.settings(), control.rate_hz, link.key_file is not None)
     if link.kind == "can":
         load = can_load(frames, link.bitrate)
-        found = f"{load:.1%} of the bus at {link.bitrate / 1e3:g} kbit/s with the most stuff bits"
+        found = f"{load:.1%} of the bus at {link.bitrate / 1e3:g} kbit/s with the largest number of stuff bits"
         hint = "raise link.bitrate on both ends, or lower control.rate_hz"
     else:
         load = serial_load(frames, link.baud)
@@ -104,10 +104,10 @@ def check_firmware_limits(robot: Robot, limits: Limits) -> list[Check]:
         limits.max_wheel_acceleration_rad_s2,
         limits.ticks_per_rev,
     )
-    found = [f"{robot.max_wheel_speed_rad_s:g} rad/s of {speed.value:g}, {SOURCE_TEXTS[speed.said_by]}"]
+    found = [f"{robot.max_wheel_speed_rad_s:g} rad/s of at most {speed.value:g}, {SOURCE_TEXTS[speed.said_by]}"]
     if acceleration is not None:
         configured, source = robot.max_wheel_acceleration_rad_s2, SOURCE_TEXTS[acceleration.said_by]
-        found.append(f"{configured:g} rad/s^2 of {acceleration.value:g}, {source}")
+        found.append(f"{configured:g} rad/s^2 of at most {acceleration.value:g}, {source}")
     if ticks is not None:
         found.append(f"{ticks.value:g} ticks a turn, {SOURCE_TEXTS[ticks.said_by]}")
     return [Check("firmware limits", Level.OK, "; ".join(found))]
@@ -128,7 +128,13 @@ def check_fence(robot: Robot, fence: Fence) -> list[Check]:
     size = robot.footprint
     found = f"footprint {size.length:.2f} m x {size.width:.2f} m, {size.ahead:+.2f} m ahead of the tracked point"
     if robot.footprint_m is None:
-        return [Check("fence", Level.WARNING, f"{found}, guessed from the wheels; measure it: robot.footprint_m")]
+        return [
+            Check(
+                "fence",
+                Level.WARNING,
+                f"{found}, estimated from the wheels; measure the robot and write robot.footprint_m",
+            )
+        ]
     return [Check("fence", Level.OK, found)]
 
 
@@ -137,14 +143,16 @@ def check_command_timing(control: Control, limits: Limits) -> Check:
     timeout_s = min(control.command_valid_for_s, limits.command_timeout_s.value)
     # The last command received holds for the timeout; the next that arrives must do so within it.
     spare = math.ceil(round(timeout_s * control.rate_hz, 6)) - 2
-    found = f"the firmware stops {timeout_s * 1e3:g} ms after a command; at {control.rate_hz:g} Hz "
+    found = f"the firmware stops the robot {timeout_s * 1e3:g} ms after the last command; at {control.rate_hz:g} Hz "
     if spare < 0:
-        return Check("command timing", Level.FAIL, f"{found}it stops between two commands; raise control.rate_hz")
+        return Check(
+            "command timing", Level.FAIL, f"{found}the robot stops between two commands; raise control.rate_hz"
+        )
     if spare < _COMMANDS_TO_SPARE:
         few = f"only {spare}" if spare else "not one"
-        text = f"{found}{few} may be lost; raise control.rate_hz or control.command_valid_for_s"
+        text = f"{found}{few} command may be lost; raise control.rate_hz or control.command_valid_for_s"
         return Check("command timing", Level.WARNING, text)
-    return Check("command timing", Level.OK, f"{found}{spare} in a row may be lost")
+    return Check("command timing", Level.OK, f"{found}{spare} commands in a row may be lost")
 
 
 def check_watchdog(limits: Limits) -> Check:
@@ -152,7 +160,7 @@ def check_watchdog(limits: Limits) -> Check:
     timeout = limits.command_timeout_s
     described = f"{timeout.value:g} s, {SOURCE_TEXTS[timeout.said_by]}"
     if timeout.said_by == "robot.toml":
-        return Check("watchdog", Level.WARNING, f"{described}; it could not be read back")
+        return Check("watchdog", Level.WARNING, f"{described}; it could not be read back from the controller")
     return Check("watchdog", Level.OK, described)
 
 
@@ -180,7 +188,9 @@ def check_realtime(priority: int, fifo_allowed: bool, memory_lock_allowed: bool,
     """Say which real-time measures this process may take; none is required, each makes the loop more punctual."""
     checks = []
     if priority == 0:
-        checks.append(Check("scheduler", Level.WARNING, "left alone: daemon.realtime_priority is 0; write 80"))
+        checks.append(
+            Check("scheduler", Level.WARNING, "real-time scheduling is off: daemon.realtime_priority is 0; write 80")
+        )
     elif fifo_allowed:
         checks.append(Check("scheduler", Level.OK, f"SCHED_FIFO {priority} is allowed"))
     else:
@@ -192,7 +202,13 @@ def check_realtime(priority: int, fifo_allowed: bool, memory_lock_allowed: bool,
         hint = "set LimitMEMLOCK=infinity in the service, or a memlock line in /etc/security/limits.conf"
         checks.append(Check("memory", Level.WARNING, f"may not be locked; {hint}"))
     if cpu_count < 2:
-        checks.append(Check("CPUs", Level.WARNING, "one CPU serves the loop and all else; use one with more"))
+        checks.append(
+            Check(
+                "CPUs",
+                Level.WARNING,
+                "the loop shares the only CPU with everything else; use a computer with more CPUs",
+            )
+        )
     return checks
 
 
@@ -208,12 +224,12 @@ def check_round_trip(round_trips_s: Sequence[float], period_s: float) -> Check:
     count, worst_s = len(round_trips_s), max(round_trips_s)
     found = f"median {statistics.median(round_trips_s) * 1e3:.2f} ms, worst {worst_s * 1e3:.2f} ms of {count}"
     period = f"a control period of {period_s * 1e3:g} ms"
-    hint = "look for a USB adapter without low-latency mode, or a loaded bus"
+    hint = "check the USB adapter's low-latency mode and the load of the bus"
     too_slow = sum(round_trip_s >= period_s for round_trip_s in round_trips_s)
     if 4 * too_slow >= count:
         return Check(name, Level.FAIL, f"{found}; {too_slow} are longer than {period}; {hint}")
     if too_slow:
-        text = f"{found}; {too_slow} longer than {period}; see what else runs on this computer, and check again"
+        text = f"{found}; {too_slow} longer than {period}; stop other programs on this computer, and check again"
         return Check(name, Level.WARNING, text)
     if worst_s >= period_s / 2:
         return Check(name, Level.WARNING, f"{found}; the worst is longer than half of {period}; {hint}")
@@ -244,8 +260,8 @@ def check_limits(
     for name, value, limit, resolution in configured:
         if limit is not None and not value <= limit.value + resolution:
             errors.append(
-                f"robot.{name}: {value:g} is above the controller's limit, {SOURCE_TEXTS[limit.said_by]}; "
-                f"write at most {limit.value:g}, or set the controller to more"
+                f"robot.{name}: {value:g} is above the controller's limit, {SOURCE_TEXTS[limit.said_by]}; write at "
+                f"most {limit.value:g}, or raise the controller's limit"
             )
     ticks = limits.ticks_per_rev
     if ticks is not None and ticks_per_rev != ticks.value:

@@ -176,7 +176,9 @@ def changed_task(task: RobotTask, requested: Mapping[str, Any], robot: Robot, st
     speed that the wheels cannot reach on the changed task.
     """
     if state in _LOCKED:
-        raise TaskRefused(f"the task can be changed while the robot is disarmed, and it is {state.name}; disarm first")
+        raise TaskRefused(
+            f"the task can be changed only while the robot is disarmed (it is {state.name}); disarm first"
+        )
     editable = task.editable(robot)
     if not editable:
         raise TaskRefused(task.editing_note(robot))

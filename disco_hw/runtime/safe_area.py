@@ -45,7 +45,7 @@ class SafeArea:
         self.guard.set_obstacles(self.obstacles.circles(now_ns), self.obstacles.lost)
         if self._override_until_ns is not None and now_ns >= self._override_until_ns:
             self._override_until_ns = None
-            self._events.append("fence: the manual override has ended; the fence holds again")
+            self._events.append("fence: the manual override has ended; the fence is in force again")
         return self._override_until_ns is not None and by_hand
 
     def end(self, now_ns: int, found: FenceState, overridden: bool) -> tuple[tuple[str, ...], list[records.Record]]:
@@ -91,11 +91,11 @@ class SafeArea:
         """Let a person drive in spite of the fence for a minute, or end that; returns the answer in words."""
         if not on:
             self._override_until_ns = None
-            self._events.append("fence: the manual override was taken back; the fence holds again")
-            return "the fence holds again"
+            self._events.append("fence: the operator ended the manual override; the fence is in force again")
+            return "the fence is in force again"
         self._override_until_ns = now_ns + OVERRIDE_NS
-        text = f"manual driving in spite of the fence for {OVERRIDE_NS // 1_000_000_000} s"
-        self._events.append(f"fence: OVERRIDDEN by request: {text}")
+        text = f"manual driving may leave the fence for {OVERRIDE_NS // 1_000_000_000} s"
+        self._events.append(f"fence: OVERRIDDEN by the operator: {text}")
         return text
 
     def report(self, now_ns: int, report: ObstacleReport) -> None:
@@ -110,13 +110,16 @@ class SafeArea:
             case "add":
                 report = report_from(fields, ENTERED_AGE_LIMIT_S)
                 self.report(now_ns, report)
-                return f"obstacle {report.name}: kept for {report.age_limit_s:g} s, then the robot stops"
+                return (
+                    f"obstacle {report.name}: valid for {report.age_limit_s:g} s; without a newer report the robot "
+                    "then stops"
+                )
             case "remove" if set(fields) == {"name"}:
                 name = str(fields["name"])
                 self.obstacles.remove(name)
                 self._pending.append(records.Obstacle(now_ns, name, removed=True))
                 return f"obstacle {name}: removed"
-        raise ObstacleRefused("obstacle: say add or remove; write obstacle remove name=pillar, for example")
+        raise ObstacleRefused("obstacle: write add or remove, such as obstacle remove name=pillar")
 
     def change_fence(self, now_ns: int, requested: Mapping[str, Any], state: State) -> str:
         """Put another fence in force, with the fields of [fence] in `asked`; returns the answer in words.
@@ -124,7 +127,9 @@ class SafeArea:
         Raises FenceRefused while the robot is armed or stopping, and for a fence that is none.
         """
         if state in _LOCKED:
-            raise FenceRefused(f"the fence can be changed while the robot is disarmed, and it is {state.name}")
+            raise FenceRefused(
+                f"the fence can be changed only while the robot is disarmed (it is {state.name}); disarm first"
+            )
         try:
             fence = msgspec.convert({**msgspec.to_builtins(self.fence), **requested}, Fence)
         except msgspec.ValidationError as error:
@@ -135,7 +140,7 @@ class SafeArea:
         self.fence = fence
         self.guard.set_boundaries(Boundaries(self.footprint, fence), fence.margin_m)
         self._pending.append(record_of_fence(now_ns, fence))
-        self._events.append("fence: changed; it holds until the daemon ends, robot.toml keeps its own")
+        self._events.append("fence: changed until the daemon ends; robot.toml is not changed")
         return "the fence is changed until the daemon ends; write it into robot.toml to keep it"
 
     def status(self, now_ns: int) -> dict[str, Any]:

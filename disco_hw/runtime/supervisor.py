@@ -12,8 +12,8 @@ from disco_hw.runtime import PROBLEM, Condition, State, Transition, connection, 
 from drivers.types import DriverState, LinkState, Request
 from firmware_protocol.status_codes import BY_ITSELF, THEN_RESET, THEN_RESTART
 
-FIND_HEADING = "the poses have none: drive a metre straight on, by hand on the page, and it is found"
-AFTER_A_JUMP = "see that the robot is where the page shows it, then start again"
+FIND_HEADING = "the pose sensor measures none: drive one metre straight ahead by hand, on the page, to find it"
+AFTER_A_JUMP = "check that the robot is where the page shows it, then start again"
 _IDLE = frozenset({DriverState.STANDBY, DriverState.READY})
 _MAY_MOVE = frozenset({DriverState.ARMING, DriverState.ARMED, DriverState.STOPPING})
 # Conditions as integers: flags cost a microsecond an operation in Python 3.11, and this runs in every tick.
@@ -252,13 +252,13 @@ class Supervisor:
             case State.ARMED:
                 return None
             case State.READY if not seen & _TELEMETRY_FRESH:
-                return "no fresh wheel samples"
+                return "no recent wheel data from the robot; check the cable and the encoders"
             case State.READY if not seen & _WHEELS_STATIONARY:
                 return "the wheels are turning; wait until they stand still"
             case State.READY:
                 return None
             case State.STOPPING:
-                return "still stopping; ask again when ready"
+                return "the robot is still stopping; try again when its state is READY"
             case State.FAULT:
                 return self._fault_and_hint("correct the fault, then reset")
             case State.DISCONNECTED | State.HANDSHAKE:
@@ -266,9 +266,9 @@ class Supervisor:
 
     def _why_not_start(self, inputs: Inputs, seen: int) -> str | None:
         if self._state is not State.ARMED and self._arming is None:
-            return "not armed; arm first"
+            return "the robot is not armed; arm it first"
         if self._state is State.ARMED and not seen & _TELEMETRY_FRESH:
-            return "no fresh wheel samples"
+            return "no recent wheel data from the robot; check the cable and the encoders"
         return self._pose_fault(inputs)
 
     def _pose_fault(self, inputs: Inputs) -> str | None:
@@ -278,11 +278,11 @@ class Supervisor:
         if inputs.pose_jump:
             return f"{inputs.pose_jump}; {AFTER_A_JUMP}"
         if inputs.poses_contradict:
-            return f"{inputs.poses_contradict}; find out which is wrong and take it out of [pose]"
+            return f"{inputs.poses_contradict}; find the source that is wrong and remove it from [pose] in robot.toml"
         if self._settings.heading_required and inputs.heading_missing:
             return f"heading not known; {FIND_HEADING}"
         if self._settings.pose_required and not inputs.pose_ok:
-            return "no pose; check the pose sensor, or set estimation.pose_required = false"
+            return "no valid pose; check the pose sensor, or set estimation.pose_required = false"
         return inputs.fence_fault or None
 
     def _why_not_reset(self, inputs: Inputs, seen: int) -> str | None:
@@ -293,7 +293,7 @@ class Supervisor:
         if inputs.preflight_errors:
             return f"{inputs.preflight_errors[0]}; correct it and restart the daemon"
         if self._estop_requested and not seen & _ROBOT_ESTOP:
-            return "the robot has not confirmed the e-stop yet"
+            return "the robot has not confirmed the e-stop yet; wait, then reset again"
         return None
 
     def _drop_what_failed(self, now_ns: int, inputs: Inputs, seen: int) -> None:
@@ -304,10 +304,14 @@ class Supervisor:
             if arming.begun and seen & _ROBOT_IDLE:
                 self._drop_pending(f"the robot did not arm: {inputs.driver_detail}")
             elif now_ns - arming.since_ns > self._settings.arming_timeout_s * 1e9:
-                self._drop_pending(f"not armed within {self._settings.arming_timeout_s:g} s: {inputs.driver_detail}")
+                self._drop_pending(
+                    f"the robot did not arm within {self._settings.arming_timeout_s:g} s: {inputs.driver_detail}"
+                )
         if resetting is not None and now_ns - resetting.since_ns > self._settings.reset_timeout_s * 1e9:
             self._resetting = None
-            self._events.append(f"no reset within {self._settings.reset_timeout_s:g} s: {inputs.driver_detail}")
+            self._events.append(
+                f"the robot did not reset within {self._settings.reset_timeout_s:g} s: {inputs.driver_detail}"
+            )
 
     def _drop_pending(self, why: str) -> None:
         if self._arming is not None:
@@ -333,7 +337,7 @@ class Supervisor:
             return
         pose_fault = self._pose_fault(inputs)
         if self._start_pending and inputs.by_hand is not self._by_hand:
-            self._drop_pending("another pilot's turn")
+            self._drop_pending("control changed between manual driving and the task")
         elif self._start_pending and pose_fault is not None:
             self._drop_pending(pose_fault)
         elif self._start_pending:
@@ -345,10 +349,14 @@ class Supervisor:
         elif self._running and inputs.by_hand is not self._by_hand:
             # Whoever started one has not asked for the other.
             self._running = False
-            self._events.append("stopped: start again to follow the task" if self._by_hand else "task stopped")
+            self._events.append(
+                ("manual driving stopped: start again to follow the task")
+                if self._by_hand
+                else ("task stopped: manual driving takes over")
+            )
         elif self._running and inputs.task_finished:
             self._running = False
-            self._events.append("task stopped: the path's end is reached")
+            self._events.append("task stopped: the end of the path is reached")
 
     def _fault_and_hint(self, hint: str) -> str:
         """Return the trouble with its own remedy if it names one, else with this one.
@@ -369,7 +377,7 @@ class Supervisor:
             if inputs.preflight_errors:
                 return "; ".join(inputs.preflight_errors)
             if self._estop_requested:
-                return "e-stop requested here"
+                return "e-stop requested by the operator"
         age_s = inputs.telemetry_age_s
         silent = age_s is None or not age_s <= self._settings.telemetry_disarm_s
         if (
@@ -378,7 +386,7 @@ class Supervisor:
             and inputs.driver_state in _IDLE
             and silent
         ):
-            return "it sends no wheel samples; check the encoders and the controller"
+            return "the robot sends no wheel data; check the encoders and the controller"
         return connection(inputs.link_state, inputs.link_error, inputs.driver_state, inputs.driver_detail)
 
     def _detail(self, inputs: Inputs, seen: int) -> str:
@@ -388,11 +396,11 @@ class Supervisor:
                     return f"heading not known; {FIND_HEADING}"
                 return "arming" if self._arming is not None else "ready to be armed"
             case State.ARMED if not seen & _TELEMETRY_FRESH:
-                return "no fresh wheel samples: holding zero"
+                return "no recent wheel data from the robot: commanding zero speed"
             case State.ARMED:
-                return "running the task" if self._running else "armed, holding zero"
+                return "running the task" if self._running else "armed, commanding zero speed"
             case State.STOPPING:
-                return f"{self._stop_reason}; waiting until the robot is disarmed and its wheels are still"
+                return f"{self._stop_reason}; waiting until the robot is disarmed and its wheels have stopped"
             case State.FAULT:
                 return self._fault_and_hint("correct it, then reset")
             case State.DISCONNECTED | State.HANDSHAKE:

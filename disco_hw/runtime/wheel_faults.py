@@ -51,32 +51,32 @@ class Cause(enum.Enum):
     """Causes of a wheel fault, as text for the operator; {side} is filled in."""
 
     ENCODER_SILENT = (
-        "the {side} wheel turns, as the poses show, and its encoder does not count: frozen or disconnected; check the "
-        "encoder's plug and cable"
+        "the {side} wheel turns, as the poses show, but its encoder does not count: the encoder is frozen or "
+        "disconnected; check its plug and cable"
     )
     ENCODER_REVERSED = (
-        "the {side} wheel's encoder suddenly counts backwards, and the poses show that the wheel turns as commanded: "
-        "check the encoder's cable and channels"
+        "the {side} wheel's encoder suddenly counts backwards, but the poses show that the wheel turns as "
+        "commanded; check the encoder's cable and channels"
     )
     STANDS = (
-        "the {side} wheel stands although it is commanded to turn: blocked, its motor without power, or its encoder "
-        "lost where the controller turns the motor by it; free the wheel, check the cables of motor and encoder"
+        "the {side} wheel does not turn although it is commanded to: it is blocked, its motor has no power, or "
+        "the motor controller has lost its encoder; free the wheel, check the cables of motor and encoder"
     )
     RUNS_AWAY = (
         "the {side} wheel runs away: it turns much faster than commanded; check the motor controller, and the cables "
         "of motor and encoder"
     )
     TURNS_BACKWARD = (
-        "the {side} wheel turns backward, as counts and poses show, although it is commanded forward or the other way "
-        "round; check the motor controller and the motor's cable"
+        "the {side} wheel turns opposite to its command, as its encoder and the poses show; check the motor "
+        "controller and the motor's cable"
     )
     SILENT = (
-        "the {side} wheel does not count although it is commanded to turn, and the poses do not show whether it turns: "
-        "its encoder is frozen or disconnected, or the wheel is blocked; check both"
+        "the {side} wheel's encoder does not count although the wheel is commanded to turn, and the poses do not "
+        "show whether it turns: the encoder is frozen or disconnected, or the wheel is blocked; check both"
     )
     OPPOSED = (
-        "the {side} wheel suddenly counts against its commands, and the poses do not show which way it turns: its "
-        "encoder is reversed, or its motor runs the wrong way; check the cables of both"
+        "the {side} wheel suddenly counts opposite to its command, and the poses do not show which way it turns: "
+        "its encoder is reversed, or its motor turns the wrong way; check the cables of both"
     )
 
 
@@ -305,7 +305,8 @@ class WheelFaults:
                 self.not_following += 1
                 commanded = self._commands[-1][1][_SIDES.index(name)].slowest
                 messages.append(
-                    f"the {name} wheel does not follow: {wheel.speed_rad_s:.1f} rad/s, commanded {commanded:.1f} rad/s"
+                    f"the {name} wheel does not follow its command: {wheel.speed_rad_s:.1f} rad/s, commanded "
+                    f"{commanded:.1f} rad/s"
                 )
         return messages
 

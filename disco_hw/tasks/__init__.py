@@ -292,7 +292,7 @@ def task_class(kind: str) -> type[RobotTask]:
     """Return the struct that holds [task] of this kind; raises UnknownKind."""
     found = _task_in(kind) if kind in _modules() else None
     if found is None:
-        raise UnknownKind(f"{kind!r} is no kind of task; write one of {', '.join(kinds())}")
+        raise UnknownKind(f"{kind!r} is not a kind of task; write one of {', '.join(kinds())}")
     return found
 
 
@@ -318,7 +318,7 @@ def task_from(section: Mapping[str, Any]) -> RobotTask:
     if kind is None:
         kind = _implied_kind(fields)
     if not isinstance(kind, str):
-        raise UnknownKind(f"{kind!r} is no kind of task; write one of {', '.join(kinds())}")
+        raise UnknownKind(f"{kind!r} is not a kind of task; write one of {', '.join(kinds())}")
     task_type = task_class(kind)
     for name in task_type.read_fields:
         if name in fields:

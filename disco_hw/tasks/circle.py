@@ -74,7 +74,8 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             if farthest_m > FARTHEST_M:
                 return TaskFault(
                     field,
-                    f"with radius_m the circle goes {farthest_m:g} m from the origin, and poses only {FARTHEST_M:g} m",
+                    f"with this radius_m the circle reaches {farthest_m:g} m from the origin; poses reach "
+                    f"{FARTHEST_M:g} m at most",
                     "write a circle in the frame of the poses",
                 )
         return None
@@ -90,8 +91,9 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         if self.speed_m_s <= fastest:
             return None
         return (
-            f"{self.speed_m_s:g} m/s on a radius of {self.radius_m:g} m asks the outer wheel for more than "
-            f"{robot.max_wheel_speed_rad_s:g} rad/s; at most {math.floor(fastest * 1000.0) / 1000.0:g} m/s, or widen it"
+            f"{self.speed_m_s:g} m/s on a radius of {self.radius_m:g} m needs more than "
+            f"{robot.max_wheel_speed_rad_s:g} rad/s of the outer wheel; write at most "
+            f"{math.floor(fastest * 1000.0) / 1000.0:g} m/s, or a larger radius"
         )
 
     def editable(self, robot: Chassis) -> Mapping[str, Editable]:

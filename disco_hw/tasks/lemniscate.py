@@ -58,7 +58,8 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
             if farthest_m > FARTHEST_M:
                 return TaskFault(
                     field,
-                    f"with size_m the figure goes {farthest_m:g} m from the origin, and poses only {FARTHEST_M:g} m",
+                    f"with this size_m the figure reaches {farthest_m:g} m from the origin; poses reach "
+                    f"{FARTHEST_M:g} m at most",
                     "write a figure in the frame of the poses",
                 )
         return None
@@ -74,8 +75,9 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         if self.speed_m_s <= fastest:
             return None
         return (
-            f"{self.speed_m_s:g} m/s on a figure of {self.size_m:g} m asks the outer wheel for more than "
-            f"{robot.max_wheel_speed_rad_s:g} rad/s; at most {math.floor(fastest * 1000.0) / 1000.0:g} m/s, or widen it"
+            f"{self.speed_m_s:g} m/s on a figure of {self.size_m:g} m needs more than "
+            f"{robot.max_wheel_speed_rad_s:g} rad/s of the outer wheel; write at most "
+            f"{math.floor(fastest * 1000.0) / 1000.0:g} m/s, or a larger size"
         )
 
     def editable(self, robot: Chassis) -> Mapping[str, Editable]:

@@ -57,8 +57,8 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         found = load_waypoints(file)
         if found.times_s is not None:
             raise InputError(
-                f"{file}: line 1: column t_s: the robot follows at task.speed_m_s; remove the column, or follow it by "
-                'time with kind = "timed_path" in [task]'
+                f"{file}: line 1: column t_s: a path is followed at task.speed_m_s; remove the column, or follow it "
+                'by time with kind = "timed_path" in [task]'
             )
         check_size(file, found)
         if is_checked:

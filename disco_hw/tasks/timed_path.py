@@ -87,7 +87,7 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
             soonest_s = math.ceil(1e3 * (times[at - 1] + way_m[at - 1] / fastest_m_s)) / 1e3
             raise InputError(
                 f"{file}: line {found.lines[at]}: t_s: {way_m[at - 1]:g} m from line {found.lines[at - 1]} in "
-                f"{times[at] - times[at - 1]:g} s, and the wheels can do {fastest_m_s:.3g} m/s; be there at "
+                f"{times[at] - times[at - 1]:g} s, but the wheels reach {fastest_m_s:.3g} m/s at most; write "
                 f"{soonest_s:g} or later"
             )
         return msgspec.structs.replace(self, points=points_of(found), times_s=tuple(times.tolist()))
@@ -110,7 +110,7 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     def editing_note(self, _robot: Chassis) -> str:
         """Return a sentence on why nothing can be changed."""
-        return "Its way-points have times, which say all; change t_s in their CSV and start anew."
+        return "The times of the way-points set the speed; change t_s in their CSV and restart the daemon."
 
     def describe(self) -> str:
         """File, length, time and the largest speed."""

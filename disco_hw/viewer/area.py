@@ -75,14 +75,14 @@ class FenceEditor:
     def add_corner(self) -> None:
         """Add the middle of the footprint's front edge to the corners; the first one begins a new fence."""
         if self._pose is None:
-            self._reply.content = "There is no pose to take a corner from."
+            self._reply.content = "There is no pose to take a corner from. Check the pose sensor."
             return
         x_m, y_m, yaw_rad = self._pose
         ahead = self._footprint.ahead + 0.5 * self._footprint.length
         nose = x_m + ahead * float(np.cos(yaw_rad)), y_m + ahead * float(np.sin(yaw_rad))
         self._corners.append([round(value, 3) for value in nose])
         self._keep_in.value = json.dumps(self._corners)  # type: ignore[misc]
-        self._reply.content = f"{len(self._corners)} corners; three or more make a fence."
+        self._reply.content = f"{len(self._corners)} corners; a fence needs at least three."
 
     def use(self) -> None:
         """Ask the daemon for the fence that the fields say, and show its answer."""

@@ -94,7 +94,7 @@ class Desk:
             async for message in connection:
                 request = _request(message)
                 if request is None:
-                    await connection.close(1003, "not a request")
+                    await connection.close(1003, 'not a request; send a JSON object with a "do"')
                 elif request["do"] == "drive":
                     await drive.query(request)
                 elif request["do"] == "draft":
@@ -210,7 +210,7 @@ class Desk:
 def shown(status: Mapping[str, Any] | None, error: str) -> dict[str, Any]:
     """Return the part of a status that the desk shows; `error` says why there is none."""
     if status is None or not status.get("ok"):
-        why = error or str((status or {}).get("error") or "the daemon has not started its loop yet")
+        why = error or str((status or {}).get("error") or "the daemon is starting: its loop does not run yet")
         return {"kind": "status", "ok": False, "state": "NO DAEMON", "detail": why}
     drive = status.get("drive")
     head, detail = status_headline(status)
@@ -256,7 +256,13 @@ class _DriveLine:
                 await self._writer.drain()
         except (OSError, TimeoutError, WorkError):
             await self.close()
-            await self._send({"kind": "drive", "ok": False, "error": "no daemon hears the pad"})
+            await self._send(
+                {
+                    "kind": "drive",
+                    "ok": False,
+                    "error": "no daemon receives the pad; start `disco-hw drive ROBOT.toml --page`",
+                }
+            )
 
     async def let_go(self) -> None:
         """Open the pad of a page that has gone, and hang up."""

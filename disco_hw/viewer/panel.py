@@ -83,7 +83,7 @@ def _status_rows(status: Mapping[str, Any]) -> Rows:
 
 def _source(one: Mapping[str, Any]) -> str:
     """Describe the standing of one of several pose sources."""
-    age = "none yet" if one["age_s"] is None else f"the last {one['age_s']:.2f} s ago"
+    age = "none received" if one["age_s"] is None else f"the last {one['age_s']:.2f} s ago"
     return f"{one['source']}: {one['standing']}, {age}, {one['outliers']} outliers"
 
 
@@ -137,7 +137,7 @@ def motion_rows(snapshot: Snapshot) -> Rows:
         trust = "" if snapshot.pose_healthy else " (no fresh pose)"
         rows.append(("pose", f"{x_m:.3f}, {y_m:.3f} m, {math.degrees(yaw_rad):.1f}°{trust}"))
     rows.append(("wheels", _pair(snapshot.wheel_speeds)))
-    commanded = _pair(snapshot.command) if snapshot.in_force else "nothing in force"
+    commanded = _pair(snapshot.command) if snapshot.in_force else "none in force"
     rows.append(("commanded", f"{commanded} ({snapshot.source})" if snapshot.source else commanded))
     if snapshot.plan is not None:
         plan = snapshot.plan

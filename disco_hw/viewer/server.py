@@ -69,7 +69,7 @@ class Guard:
     def refusal(self, path: str, headers: Headers, upgrade: bool) -> Response | None:
         """Return the answer to a request that must not go on, or None."""
         if not self.open:
-            return _plain(http.HTTPStatus.SERVICE_UNAVAILABLE, "the page is being made; load it again")
+            return _plain(http.HTTPStatus.SERVICE_UNAVAILABLE, "the page is being prepared; load it again")
         host = headers.get("Host", "")
         if self.local and urlsplit(f"//{host}").hostname not in _LOOPBACK_NAMES:
             return _plain(http.HTTPStatus.FORBIDDEN, "this page is for this machine only")
@@ -252,9 +252,7 @@ def _listen(host: str, port: int) -> socket.socket:
     try:
         return socket.create_server((host, port), reuse_port=False)
     except OSError as error:
-        raise InputError(
-            f"--host {host} --port {port}: cannot be listened to ({error.strerror}); give another"
-        ) from None
+        raise InputError(f"--host {host} --port {port}: cannot listen there ({error.strerror}); give another") from None
 
 
 def _cookie(headers: Headers, name: str) -> str:

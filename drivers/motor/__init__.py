@@ -93,7 +93,7 @@ def fields_of(name: str | None, fields: Mapping[str, Any]) -> dict[str, Any]:
     for other in others:
         for field in fields:
             if field in other.settings.__struct_fields__ and field not in accepted:
-                raise DriverFieldError(field, f"a field of the driver {other.name}, and link.driver is {found.name}")
+                raise DriverFieldError(field, f"belongs to the driver {other.name}, but link.driver is {found.name}")
     return accepted
 
 

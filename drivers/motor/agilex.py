@@ -62,9 +62,11 @@ class AgilexPort(BodyPort):
         is_complete = None not in (self._state_ns, self._motion_ns, self._driven_mm[0].last)
         faulty = self._vehicle == protocol.EXCEPTION or bool(self._error & ~_WARNINGS)
         text = f"the base reports an error ({self._error:#06x}); its manual's table of faults names it"
-        driven = "a person drives it by remote control; switch that off to drive it from here"
+        driven = "an operator drives it by remote control; switch that off to drive it from here"
         return Controllers(
-            missing=None if is_complete else "no answer from the base; is it switched on, and the bus at 500 kbit/s?",
+            missing=None
+            if is_complete
+            else ("no answer from the base; check that it is switched on and the bus runs at 500 kbit/s"),
             stopped="a button on the base is pressed" if self._vehicle == protocol.EMERGENCY_STOP else None,
             faulty=text if faulty else None,
             unfit=driven if self._mode == protocol.RC_MODE else None,
@@ -142,17 +144,17 @@ class AgilexPort(BodyPort):
         if seen.faulty is not None:
             return Objection(seen.faulty)
         if permit.stage is not Stage.ARMING and self._mode == protocol.RC_MODE:
-            return Objection("disarmed: a person has taken the remote control", is_fault=False)
+            return Objection("disarmed: an operator has taken the remote control", is_fault=False)
         if permit.stage is Stage.ARMED and self._mode != protocol.CAN_MODE:
-            return Objection(f"the base left its CAN mode by itself, for {_MODES.get(self._mode, self._mode)}")
+            return Objection(f"the base left its CAN mode without a request, for {_MODES.get(self._mode, self._mode)}")
         return None
 
     def prepare(self, now_ns: int, permit: MotionPermit) -> Pending | None:
         """Let the base listen to CAN."""
         if not self._is_stationary:
-            return Pending(why="the base moves; wait until it stands", is_final=True)
+            return Pending(why="the base is moving; wait until it stands still", is_final=True)
         if self._mode != protocol.CAN_MODE:
-            why = "the base did not take its CAN mode; switch the remote control off"
+            why = "the base did not enter its CAN mode; switch the remote control off"
             return Pending(why=why, frames=(protocol.control_mode(protocol.CAN_MODE),))
         return None
 

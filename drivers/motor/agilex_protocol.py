@@ -164,18 +164,19 @@ def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
 def safety_card(settings: AgilexSettings) -> SafetyCard:
     """Return the safety card of AgileX bases."""
     return SafetyCard(
-        host_silent=f"the base {TIMEOUT_S:g} s after the last motion command; this cannot be changed",
-        stops_by=f"slowing down by itself; at {settings.max_speed_m_s:g} m/s it has gone "
-        f"{TIMEOUT_S * settings.max_speed_m_s:.2f} m before it begins",
+        host_silent=f"the base, {TIMEOUT_S:g} s after the last motion command; this time cannot be changed",
+        stops_by=f"slowing down by itself; at {settings.max_speed_m_s:g} m/s the base drives "
+        f"{TIMEOUT_S * settings.max_speed_m_s:.2f} m before it begins to slow down",
         reaction_s=TIMEOUT_S,
         brakes=True,
         stops_by_own_ramp=True,
-        estop="no frame for it: zero speed and standby are sent, and nothing latches them but this driver; use the "
-        "buttons on the base. Whoever holds the remote control comes first",
-        wheel_fault="zero and standby at once; no frame takes the torque off its motors, and what a lost encoder does "
-        "to them is the base's own matter: use the buttons on the base",
+        estop="no e-stop frame exists: zero speed and standby are sent, and only this driver latches them; use the "
+        "buttons on the base. The remote control has priority",
+        wheel_fault="zero speed and standby at once; no frame takes the torque off the motors, and how the base "
+        "reacts to a lost encoder is up to the base: use the buttons on it",
         unverified=(
-            "how it slows down, and its time-out, are the manual's words",
-            "not tried on hardware: the driver was tried against a simulator made from the manual and the vendor's SDK",
+            "how the base slows down, and its time-out, are taken from the manual",
+            "not tested on hardware: the driver was tested against a simulator made from the manual and the "
+            "vendor's SDK",
         ),
     )

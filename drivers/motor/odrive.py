@@ -88,11 +88,11 @@ class OdrivePort(Port):
     def seen(self) -> Controllers:
         """State of the axes, as received last."""
         silent = ", ".join(str(axis.node) for axis in self._all if axis.received_ns is None)
-        unheard = f"no heartbeat of node {silent}; is it switched on, at this bit rate, at this id?"
+        unheard = f"no heartbeat of node {silent}; check that it is switched on and has this bit rate and this id"
         stopped = any(axis.error & ESTOP_ERROR[self._generation] for axis in self._all)
         faulty = [axis for axis in self._all if axis.error and not self._is_idle_watchdog(axis)]
         return Controllers(
-            missing=None if self._questions.known else unheard if silent else "asking the nodes for their version",
+            missing=None if self._questions.known else unheard if silent else "requesting the version of the nodes",
             refused=self._questions.refusal,
             stopped="emergency stop; the wheels coast. Remove its cause, then reset" if stopped else None,
             faulty="; ".join(f"node {axis.node}: {self._fault_text(axis)}" for axis in faulty) or None,
@@ -166,7 +166,7 @@ class OdrivePort(Port):
         """Return what ends a drive: an error, or an axis that has left closed loop by itself."""
         for axis in self._all:
             if permit.stage is Stage.ARMED and (axis.error or axis.state != AxisState.CLOSED_LOOP):
-                idles = f"it left closed loop by itself, for state {axis.state}"
+                idles = f"it left closed loop without a request, for state {axis.state}"
                 return Objection(f"node {axis.node}: {self._fault_text(axis) if axis.error else idles}")
             if permit.stage is Stage.ARMING and axis.error and not self._is_idle_watchdog(axis):
                 return Objection(f"node {axis.node} did not arm: {self._fault_text(axis)}")
@@ -196,7 +196,7 @@ class OdrivePort(Port):
             for axis in self._all:
                 axis.beats_armed = 0
             frames = self._state_frames(AxisState.CLOSED_LOOP)
-        why = f"node {waiting} did not go to closed loop; is it calibrated (odrivetool)?"
+        why = f"node {waiting} did not enter closed loop; check that it is calibrated (odrivetool)"
         return Pending(why=why, frames=tuple(frames))
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
@@ -260,7 +260,7 @@ class OdrivePort(Port):
         if silent:
             return f"node {', '.join(silent)} sends no encoder estimates; switch them on (odrivetool)"
         fastest = max(abs(axis.turned.speed) for axis in self._all) * 2.0 * math.pi / self._settings.gear
-        return "a motor turns; wait until it stands" if fastest > _STATIONARY_RAD_S else None
+        return "a motor is turning; wait until it stands still" if fastest > _STATIONARY_RAD_S else None
 
     def _each(self, name: str, **values: int) -> list[Frame]:
         return [protocol.encode(self._generation, axis.node, name, **values) for axis in self._all]
@@ -276,9 +276,9 @@ class OdrivePort(Port):
         busy = f"node {axis.node} is in state"
         restarted = None
         if state not in _QUIET:
-            restarted = f"node {axis.node} calibrates or moves by itself (state {state})"
+            restarted = f"node {axis.node} calibrates or moves without a request (state {state})"
             self.reset_state(t_ns)
-            self._questions.refusal = f"{busy} {state}: wait until odrivetool has done with it"
+            self._questions.refusal = f"{busy} {state}: wait until odrivetool has finished with it"
         elif self._questions.refusal is not None and self._questions.refusal.startswith(busy):
             self._questions.refusal = None
         axis.received_ns, axis.state, axis.error = t_ns, state, error

@@ -210,7 +210,7 @@ _ERRORS: Mapping[Generation, Mapping[int, str]] = MappingProxyType(
             0x80: "the sensorless estimator failed",
             0x100: "the encoder failed; check its cable and calibration",
             0x200: "the controller failed, such as by overspeed",
-            0x800: "its watchdog ran out: no command came in time",
+            0x800: "its watchdog expired: no command came in time",
             0x1000: "an end stop was pressed",
             0x2000: "an end stop was pressed",
             0x4000: "emergency stop",
@@ -218,9 +218,9 @@ _ERRORS: Mapping[Generation, Mapping[int, str]] = MappingProxyType(
         },
         Generation.V06: {
             0x1: "still starting",
-            0x4: "it missed its own deadlines",
+            0x4: "it missed its own control deadlines",
             0x8: "no position or velocity estimate; check the encoder",
-            0x10: "its configuration is bad; mend it with odrivetool",
+            0x10: "its configuration is invalid; correct it with odrivetool",
             0x20: "the gate driver failed",
             0x40: "an input is missing",
             0x100: "the supply's voltage is too high",
@@ -230,7 +230,7 @@ _ERRORS: Mapping[Generation, Mapping[int, str]] = MappingProxyType(
             0x2000: "the motor is too hot; let it cool",
             0x4000: "the inverter is too hot; let it cool",
             0x8000: "it turns faster than its limit",
-            0x0100_0000: "its watchdog ran out: no command came in time",
+            0x0100_0000: "its watchdog expired: no command came in time",
             0x0200_0000: "emergency stop",
             0x0400_0000: "the encoder contradicts the motor (spin-out)",
             0x4000_0000: "calibration failed",
@@ -271,11 +271,13 @@ class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         if not all(sides_of(self.nodes)):
             return SettingsFault("nodes", "a side has no node", "write [left, right], such as [3, 5]")
         if any(not 0 <= node <= LARGEST_NODE for node in nodes):
-            return SettingsFault("nodes", f"a node is outside 0 to {LARGEST_NODE}", "write those of odrivetool")
+            return SettingsFault(
+                "nodes", f"a node is outside 0 to {LARGEST_NODE}", "write the ids that odrivetool shows"
+            )
         if self.watchdog_endpoints is not None and self.firmware != "0.6":
             return SettingsFault("watchdog_endpoints", "firmware 0.5 has none that CAN could read", "remove it")
         if len(set(nodes)) != len(nodes):
-            return SettingsFault("nodes", "a node stands there twice", "write each motor's own")
+            return SettingsFault("nodes", "a node is listed twice", "write the id of each motor's own node")
         return None
 
 
@@ -318,16 +320,17 @@ def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
 def safety_card(settings: OdriveSettings) -> SafetyCard:
     """Return the safety card of ODrives."""
     return SafetyCard(
-        host_silent=f"each axis after {settings.watchdog_s:g} s without a frame, by its watchdog: it idles",
+        host_silent=f"each axis, {settings.watchdog_s:g} s after the last frame, by its watchdog: the axis idles",
         stops_by="coasting: an ODrive in idle does not brake",
         reaction_s=settings.watchdog_s,
         brakes=False,
-        estop="a frame to each axis (0x02): it idles and coasts, latched, reported in its heartbeat",
+        estop="a frame to each axis (0x02): the axis idles and coasts; the stop is latched and reported in its "
+        "heartbeat",
         wheel_fault="each axis idles at once, without torque: it coasts",
         unverified=(
             f"watchdog ({settings.watchdog_s:g} s), velocity limit and heartbeat period are declared in robot.toml "
             "and were not read back; any frame to an axis may feed its watchdog",
-            "not tried on hardware: the driver was tried against a simulator made from the vendor's source",
+            "not tested on hardware: the driver was tested against a simulator made from the vendor's source",
         ),
         setup=(
             f"odrv0.axis0.config.watchdog_timeout = {settings.watchdog_s:g}",
@@ -398,7 +401,7 @@ class Questions:
     def handle_version(self, values: Mapping[str, float]) -> None:
         """Handle a reply with the version."""
         if self._settings.generation is Generation.V05:
-            self.refusal = 'the nodes answer for their version, which 0.5 does not; write link.firmware = "0.6"'
+            self.refusal = 'the nodes report their version, which firmware 0.5 does not; write link.firmware = "0.6"'
         elif not self._is_met:
             version = ".".join(str(values[f"fw_{part}"]) for part in ("major", "minor", "revision"))
             self._complete_handshake(version)
@@ -420,7 +423,7 @@ class Questions:
         if watchdog.is_on is False:
             self.refusal = f"node {node}: its watchdog is off; set axis0.config.enable_watchdog (odrivetool)"
         elif watchdog.timeout_s is not None and not abs(watchdog.timeout_s - configured_s) <= _SAME_TIMEOUT_S:
-            self.refusal = f"node {node}: its watchdog waits {watchdog.timeout_s:g} s; set {configured_s:g} s there"
+            self.refusal = f"node {node}: its watchdog is set to {watchdog.timeout_s:g} s; set it to {configured_s:g} s"
         elif not self.known and all(one.is_on and one.timeout_s is not None for one in self._watchdogs.values()):
             self._announce(f", watchdog {configured_s:g} s")
         return True
@@ -433,7 +436,7 @@ class Questions:
             # That generation does not know the question.
             self._complete_handshake()
         else:
-            self.refusal = 'the nodes do not answer for their version as 0.6 does; write link.firmware = "0.5"'
+            self.refusal = 'the nodes do not report their version as firmware 0.6 does; write link.firmware = "0.5"'
         return []
 
     def _for_watchdogs(self) -> list[Frame]:

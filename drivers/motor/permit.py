@@ -21,8 +21,8 @@ _LONGEST_STEP_S = 0.1
 # Longer than a period at the slowest rate, 50 ms; with the 20 ms between two messages still shorter than the 100 ms
 # after which the first driver calls its controllers silent.
 _PAUSE_NS = 75_000_000
-ON_STANDBY = "it stands by"
-STOPPED_FROM_OUTSIDE = "stopped from outside on the link, by `disco-hw estop` or another host"
+ON_STANDBY = "on standby"
+STOPPED_FROM_OUTSIDE = "e-stop received on the link, sent by `disco-hw estop` or another host"
 
 
 class Stage(enum.Enum):
@@ -177,7 +177,7 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
                 self, target=request, stage=Stage.ARMING, since_ns=None, zeros=0, speeds=(0.0, 0.0), note="arming"
             )
         if self.stage in (Stage.ARMING, Stage.ARMED):
-            return replace(self, target=request, stage=Stage.STOPPING, since_ns=None, note="stopping as asked")
+            return replace(self, target=request, stage=Stage.STOPPING, since_ns=None, note="stopping as requested")
         return replace(self, target=request)
 
     def begun(self, now_ns: int) -> MotionPermit:

@@ -139,7 +139,7 @@ class ReferenceDriver:
             case DriverState.ESTOP:
                 return status_codes.estop(status.estop_source)
             case DriverState.STOPPING if status.state == "ARMED":
-                return note or "the robot is armed, but not by us or no longer wanted: it is being stopped"
+                return note or "the robot is armed without a request from this host; it is being stopped"
         return note or f"the robot is in {status.state}"
 
     @property
@@ -371,14 +371,16 @@ class ReferenceDriver:
         """Say that somebody else sent an e-stop, once for frames that come within a second."""
         newest_ns = self._reception.outside_stop_ns
         if newest_ns is not None and (before_ns is None or newest_ns - before_ns > _ONE_STOP_NS):
-            self._events.append("e-stop from outside on the link, by `disco-hw estop` or another host")
+            self._events.append("e-stop received on the link, sent by `disco-hw estop` or another host")
 
     def _count_clock_errors(self, reported: int) -> None:
         before, self._reported_clock_errors = self._reported_clock_errors, reported
         # A smaller count is that of a robot that has restarted meanwhile.
         if before is not None and reported > before:
             self._clock_errors += reported - before
-            self._events.append("the robot's controller found its clock set back and goes on with a time of its own")
+            self._events.append(
+                "the robot's controller saw its clock go backwards and counted a nominal period instead"
+            )
 
     def _on_time(self, decoded: Decoded, received_ns: int) -> None:
         sent_ns = self._house_keeping.requested_time_ns(int(decoded.values["sequence"]))
@@ -389,8 +391,10 @@ class ReferenceDriver:
         if not self._clock.add(sent_ns, received_ns, device_us):
             return
         if before_us is not None and (device_us - before_us) % DEVICE_CLOCK_MODULUS_US < DEVICE_CLOCK_MODULUS_US // 2:
-            why = "its clock leapt"
-            event = "the robot's clock leapt: this computer slept, or the controller's clock is over 200 ppm off"
+            why = "its clock jumped"
+            event = (
+                "the robot's clock jumped: this computer was suspended, or the controller's clock is over 200 ppm off"
+            )
         else:
             why = "the robot has restarted"
             event = f"{why}: its clock was set back"
@@ -402,8 +406,10 @@ class ReferenceDriver:
         refused = self._handshake.refusal is not None
         known = refused or self._status is not None or self.identity is not None
         if known and now_ns - self._last_received_ns > (REFUSED_SILENCE_NS if refused else SILENCE_NS):
-            self._restart("the robot fell silent")
-            self._events.append("the robot fell silent: new handshake")
+            self._restart("the robot stopped sending")
+            self._events.append(
+                "the robot stopped sending: starting a new handshake; check the cable and the robot's power"
+            )
         objection = self._watch.objection(now_ns) if self._arming.armed else None
         if objection is not None:
             self._arming.give_up(f"disarmed: {objection}")
@@ -411,7 +417,7 @@ class ReferenceDriver:
         if self._telemetry.distrusts_clock:
             self._clock.clear()
             self._telemetry.restart()
-            self._events.append("sample times contradict the robot's clock: synchronising anew")
+            self._events.append("sample times disagree with the robot's clock: synchronising the clocks again")
 
     def _restart(self, why: str) -> None:
         self._handshake = self._new_handshake()
@@ -433,7 +439,7 @@ class ReferenceDriver:
     def _handshake_detail(self) -> str:
         missing = self._handshake.missing
         if len(missing) == 3:
-            return "no answer from the robot; is it switched on, and does it use the same bit rate?"
+            return "no answer from the robot; check that it is switched on and uses the same bit rate"
         if missing:
             return f"waiting for the robot's {', '.join(missing)}"
         if self._status is None:

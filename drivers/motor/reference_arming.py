@@ -51,10 +51,16 @@ class ArmedWatch:
         """Return why a robot that is armed must not stay so, None while all is well; counts each call that objects."""
         if self._delay_ns > DELAY_NS:
             self.late += 1
-            return f"commands reach the robot over {self._delay_ns * 1e-9:.2f} s late; see what holds up the link"
+            return (
+                f"commands reach the robot over {self._delay_ns * 1e-9:.2f} s late; check the load of the link and "
+                "of this computer"
+            )
         if self._reported_ns is not None and now_ns - self._reported_ns > STATE_TIMEOUT_NS:
             self.silent += 1
-            return f"the robot has not sent its state for {STATE_TIMEOUT_NS * 1e-9:g} s"
+            return (
+                f"the robot has not sent its state for {STATE_TIMEOUT_NS * 1e-9:g} s; check the cable and the load "
+                "of the link"
+            )
         return None
 
 
@@ -233,7 +239,7 @@ class Arming:
             if self._requested_ns is None:
                 self._requested_ns = now_ns
             elif now_ns - self._requested_ns > ARMING_TIMEOUT_NS:
-                self.give_up(f"not armed within {ARMING_TIMEOUT_NS * 1e-9:g} s: {self._why_not()}")
+                self.give_up(f"the robot did not arm within {ARMING_TIMEOUT_NS * 1e-9:g} s: {self._why_not()}")
         is_arming = self.target in (Request.READY, Request.ARM)
         if is_arming and self.session == 0 and self._robot_state in ("STANDBY", "READY"):
             self._choose_session(now_ns)
@@ -322,19 +328,22 @@ class Handshake:
             )
         if self._build is not None and int(self._build["dbc_hash"]) != self._dbc_hash:
             return (
-                f"the robot's DBC hash is {int(self._build['dbc_hash']):08x}, this host's {self._dbc_hash:08x}: "
-                f"telemetry only; flash the firmware built from this host's disco_robot.dbc, "
-                f"or install the host that matches the firmware"
+                f"the robot's DBC hash is {int(self._build['dbc_hash']):08x}, this host's {self._dbc_hash:08x}: the "
+                "robot can be read but not driven; flash the firmware built from this host's disco_robot.dbc, or "
+                "install the host that matches the firmware"
             )
         if self._hello is not None and bool(int(self._hello["capabilities"]) & _AUTHENTICATION) != self._has_key:
             if self._has_key:
                 return (
-                    "the robot takes commands from anybody, and this host has a key: "
-                    "give the robot's firmware the key, or take link.key_file out of robot.toml"
+                    "the robot accepts commands without authentication, but this host has a key: put the key into "
+                    "the robot's firmware, or remove link.key_file from robot.toml"
                 )
-            return "the robot obeys only who holds its key: write link.key_file in robot.toml, the file with that key"
+            return (
+                "the robot accepts authenticated commands only: in robot.toml set link.key_file to the file with "
+                "the robot's key"
+            )
         if len(self._pages) == 2 and not self._limits_are_valid():
-            return "the robot reports limits that make no sense (a zero among them); correct its configuration"
+            return "the robot reports limits that are not above zero; correct its configuration"
         return None
 
     def _gather(self) -> None:

@@ -52,26 +52,28 @@ def stop_frames(_settings: NoSettings) -> tuple[Frame, ...]:
 
 
 def stop_confirmation(_settings: NoSettings) -> Callable[[Frame], bool]:
-    """Return what says, frame by frame heard, whether the controller has confirmed an e-stop."""
+    """Return a function that tells of a received frame whether the controller has confirmed an e-stop."""
     codec = Codec()
 
-    def heard(frame: Frame) -> bool:
+    def is_confirmation(frame: Frame) -> bool:
         decoded = None if frame.extended else codec.decode(frame.can_id, frame.data)
         if not isinstance(decoded, Decoded) or decoded.name != "SYSTEM_STATE":
             return False
         return codec.choice_name("SYSTEM_STATE", "state", decoded.values["state"]) == "ESTOP"
 
-    return heard
+    return is_confirmation
 
 
 def safety_card(_settings: NoSettings) -> SafetyCard:
     """Return the safety card of the reference controller."""
     return SafetyCard(
-        host_silent="the controller after 0.1 s without an accepted wheel command, by its watchdog that cannot be off",
-        stops_by="braking: it decelerates within its own limit, then brakes",
+        host_silent="the controller, 0.1 s after the last accepted wheel command, by its watchdog; the watchdog "
+        "cannot be switched off",
+        stops_by="braking: the robot decelerates within its own limit, then brakes",
         reaction_s=0.1,
         brakes=True,
-        estop="a frame of any length, also from `disco-hw estop`: it decelerates, latched and confirmed",
+        estop="an e-stop frame of any length, also from `disco-hw estop`: the robot decelerates; the stop is latched "
+        "and confirmed",
         wheel_fault="the motors are off (COAST) for 0.2 s, then the controller brakes without its speed loop; no ramp",
     )
 

@@ -55,10 +55,10 @@ _ERROR_TEXTS = {
     0x20: "the logic supply's voltage is too low",
     0x40: "the power stage of motor 1 failed",
     0x80: "the power stage of motor 2 failed",
-    0x100: "motor 1 does not keep its speed",
-    0x200: "motor 2 does not keep its speed",
-    0x1000: "motor 1 takes too much current",
-    0x2000: "motor 2 takes too much current",
+    0x100: "motor 1 does not reach its speed",
+    0x200: "motor 2 does not reach its speed",
+    0x1000: "motor 1 draws too much current",
+    0x2000: "motor 2 draws too much current",
     0x4000: "the main supply's voltage is too low",
     0x8000: "the main supply's voltage is too high",
 }
@@ -164,7 +164,9 @@ class RoboclawPort(Port):
     def seen(self) -> Controllers:
         """State of the boards, as received last."""
         silent = ", ".join(str(board.address) for board in self._all if not board.is_known)
-        missing = f"board {silent} does not answer; is it switched on, in packet serial, at this baud and address?"
+        missing = (
+            f"board {silent} does not answer; check that it is switched on, in packet serial, at this baud and address"
+        )
         pressed = any(board.is_pressed for board in self._all)
         return Controllers(
             missing=missing if silent else None,
@@ -246,9 +248,9 @@ class RoboclawPort(Port):
             if board.errors:
                 return Objection(board.error_text)
             if refused_ns > SILENT_NS:
-                return Objection(f"board {board.address} does not take its commands")
+                return Objection(f"board {board.address} does not accept its commands")
             if permit.stage is Stage.ARMED and board.timeout_ds != self._settings.timeout_ds:
-                why = "its serial timeout is not the one that was set"
+                why = "its serial timeout differs from the one that was set"
                 return Objection(f"board {board.address} has restarted: {why}")
         return None
 
@@ -260,11 +262,11 @@ class RoboclawPort(Port):
                 # A board that has restarted since has forgotten its timeout.
                 board.zeros, board.stopped, board.timeout_ds = 0, False, None
         if not self._is_stationary:
-            return Pending(why="a motor turns; wait until it stands", is_final=True)
+            return Pending(why="a motor is turning; wait until it stands still", is_final=True)
         configured = self._settings.timeout_ds
         without = [board.address for board in self._all if board.timeout_ds != configured]
         if without:
-            why = f"board {without[0]} does not take its serial timeout"
+            why = f"board {without[0]} does not accept its serial timeout"
             if not self._is_due(now_ns):
                 return Pending(why=why)
             sets = (setting(address, "set_serial_timeout", timeout_ds=configured) for address in without)
@@ -272,7 +274,7 @@ class RoboclawPort(Port):
             return Pending(why=why, frames=tuple(frame for pair in zip(sets, questions, strict=True) for frame in pair))
         if all(board.zeros >= ZEROS_TO_ARM for board in self._all):
             return None
-        return Pending(why="a board does not take zeros", frames=tuple(self.speeds(now_ns, 0.0, 0.0)))
+        return Pending(why="a board does not accept commands of zero", frames=tuple(self.speeds(now_ns, 0.0, 0.0)))
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
         """Return the frames that command the speeds of each board's motors."""

@@ -200,9 +200,9 @@ class RoboclawSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
             )
         places = [place for side in self.sides for place in side]
         if len(set(places)) != len(places):
-            return SettingsFault("motors", "a motor stands there twice", "write each once")
+            return SettingsFault("motors", "a motor is listed twice", "write each once")
         if abs(10.0 * self.watchdog_s - self.timeout_ds) > 1e-6:
-            return SettingsFault("watchdog_s", f"{self.watchdog_s:g} is no multiple of 0.1", "write 0.2")
+            return SettingsFault("watchdog_s", f"{self.watchdog_s:g} is not a multiple of 0.1", "write 0.2")
         return None
 
 
@@ -292,19 +292,19 @@ def cyclic_frames(settings: RoboclawSettings, command_rate_hz: float, _authentic
 def safety_card(settings: RoboclawSettings) -> SafetyCard:
     """Return the safety card of RoboClaw boards."""
     return SafetyCard(
-        host_silent=f"each board {settings.watchdog_s:g} s after the last packet of any kind, by its serial timeout, "
-        "which is set and read back before each arming",
-        stops_by="stopping both motors, braking or coasting as the board is set",
+        host_silent=f"each board, {settings.watchdog_s:g} s after the last packet of any kind, by its serial "
+        "timeout, which is set and read back before each arming",
+        stops_by="stopping both motors; whether they brake or coast is set in the board",
         reaction_s=settings.watchdog_s,
         brakes=False,
-        estop="through the daemon first, as two must not speak at once; zero duty for every board, which nothing "
-        "latches but this driver and nothing confirms but standing motors: wire a button to S3, S4 or S5",
-        wheel_fault="zero duty for every motor at once, which needs no encoder; its PID, which runs to full speed with "
-        "a lost one, gets no speed any more",
+        estop="through the daemon first, as two hosts must not send at once; zero duty for every board; only this "
+        "driver latches the stop, and only motors at rest confirm it: wire a button to S3, S4 or S5",
+        wheel_fault="zero duty for every motor at once, which needs no encoder; the board's PID, which runs to full "
+        "speed with a lost encoder, receives no more speeds",
         unverified=(
-            "whether a motor that is stopped brakes or coasts; which packets feed the timeout is the manual's word",
-            "not tried on hardware: the driver was tried against a simulator made from the manual and the vendor's "
-            "host libraries",
+            "whether a stopped motor brakes or coasts; which packets feed the timeout is taken from the manual",
+            "not tested on hardware: the driver was tested against a simulator made from the manual and the "
+            "vendor's host libraries",
         ),
         setup=(
             "Motion Studio: packet serial at link.baud, each board its own address, encoders and velocity PID tuned "

@@ -129,22 +129,26 @@ class Ros2BasePort(BodyPort):
         if self._flags & wire.BUTTON:
             return Objection(f"a button on the base was pressed{self._or_unheard}")
         if self._flags & wire.LATCHED:
-            return Objection("stopped from outside, by `disco-hw estop` or another host")
+            return Objection("e-stop received, sent by `disco-hw estop` or another host")
         if self._unfit is not None:
             return Objection(self._unfit)
         if not self._flags & wire.ODOMETRY:
             return Objection(f"no odometry: {wire.REFUSALS[self._refusal]}")
         if permit.stage is Stage.ARMED and not self._flags & wire.DRIVING:
             silent = self._flags & wire.FELL_SILENT
-            return Objection("commands reached the bridge too late" if silent else "the bridge drives no longer")
+            return Objection(
+                ("commands reached the bridge too late; check the load of the network and of both computers")
+                if silent
+                else ("the bridge no longer drives the base")
+            )
         return None
 
     def prepare(self, now_ns: int, permit: MotionPermit) -> Pending | None:
         """Have the bridge drive."""
         if not self._is_stationary:
-            return Pending(why="the base moves; wait until it stands", is_final=True)
+            return Pending(why="the base is moving; wait until it stands still", is_final=True)
         if not self._flags & wire.DRIVING:
-            return Pending(why="the bridge did not begin to drive", frames=(wire.enable(True),))
+            return Pending(why="the bridge did not start to drive", frames=(wire.enable(True),))
         return None
 
     def rest(self, now_ns: int, permit: MotionPermit) -> Sequence[Frame]:
@@ -171,7 +175,7 @@ class Ros2BasePort(BodyPort):
         if self._state_ns is None:
             return "no answer from the bridge; start disco-hw bridge ros2-base ROBOT.toml"
         if self._is_foreign_bridge:
-            return "the bridge was started with another [link] of robot.toml; start it again"
+            return "the bridge runs with another [link] of robot.toml; restart it"
         if not self._flags & wire.ODOMETRY:
             return f"no odometry from {self.settings.wheels_from}: {wire.REFUSALS[self._refusal]}"
         is_alive = self._flags & wire.RECEIVED and self._turned[0].last is not None
@@ -182,9 +186,9 @@ class Ros2BasePort(BodyPort):
         """Reason why the base may not be driven, whatever is requested; None if it may."""
         topic = self.settings.speed_topic
         if self._flags & wire.OTHERS:
-            return f"another node speaks on {topic}; end it, or give it a topic of its own"
+            return f"another node publishes on {topic}; end it, or give it a topic of its own"
         if not self._flags & wire.RECEIVED:
-            return f"nobody hears {topic}; is the base switched on, and in this domain?"
+            return f"no node subscribes to {topic}; check that the base is switched on and in this domain"
         return None
 
     @property
@@ -193,7 +197,7 @@ class Ros2BasePort(BodyPort):
 
     @property
     def _or_unheard(self) -> str:
-        return f", or {self.settings.stop_topic} says nothing" if self.settings.stop_topic else ""
+        return f", or nothing is received on {self.settings.stop_topic}" if self.settings.stop_topic else ""
 
     @property
     def _is_stationary(self) -> bool:
@@ -213,7 +217,9 @@ class Ros2BasePort(BodyPort):
         wheels = WheelSample(t_ns - round(age_s * 1e9), t_ns, left, right, *self._wheel_speeds)
         if all(plausible):
             return FrameReport(wheels=wheels)
-        return FrameReport(counts=IMPLAUSIBLE, wheels=wheels, lost="the base has restarted: its wheels' angles jumped")
+        return FrameReport(
+            counts=IMPLAUSIBLE, wheels=wheels, lost="the base has restarted: the angles of its wheels jumped"
+        )
 
 
 DRIVER = MotorDriver(

@@ -38,11 +38,11 @@ STATIONARY_M_S = 0.02
 ANGLE_RAD = 1e-4
 _SPEED_RAD_S, _AGE_S = 2e-3, 1e-4
 REFUSALS = (
-    "nothing is heard on link.wheels_topic",
-    "it is stamped by another clock, or late; synchronise the clocks of both computers and leave use_sim_time off",
-    "it lacks joints of link.left_joints or link.right_joints, or their positions",
-    "it is not finite, or turns faster than the base can",
-    "it comes out of order",
+    "nothing is received on link.wheels_topic",
+    "its stamps are late or of another clock; synchronise the clocks of both computers and leave use_sim_time off",
+    "joints of link.left_joints or link.right_joints, or their positions, are missing",
+    "its values are not finite, or faster than the base can turn",
+    "its messages come out of order",
 )
 EXAMPLE = """wheel_radius_m = 0.06
 track_m = 0.31
@@ -73,9 +73,11 @@ class Ros2BaseSettings(BodySettings, frozen=True, forbid_unknown_fields=True, kw
         joints = (*self.left_joints, *self.right_joints)
         if bool(self.left_joints) is not bool(self.right_joints):
             side = "right_joints" if self.left_joints else "left_joints"
-            return SettingsFault(side, "empty, and the other side's are not", "name those of both sides, or of none")
+            return SettingsFault(
+                side, "empty, but the other side's are given", "name the joints of both sides, or of none"
+            )
         if len(set(joints)) < len(joints):
-            return SettingsFault("left_joints", "a joint stands there twice", "write each once, on its side")
+            return SettingsFault("left_joints", "a joint is listed twice", "write each once, on its side")
         return None
 
     @property
@@ -237,25 +239,28 @@ def safety_card(settings: Ros2BaseSettings) -> SafetyCard:
     """Return the safety card of bases on ROS 2."""
     base_s = settings.watchdog_s
     odometry = () if settings.left_joints else (
-        "the wheels are taken from an Odometry, which has been through the base's own kinematics: what that leaves "
-        "out, neither inference nor gap can see",
+        "the wheel data come from an Odometry, which the base has computed with its own kinematics: inference and "
+        "gap cannot see what that leaves out",
     )  # fmt: skip
     return SafetyCard(
-        host_silent=f"the bridge says zero {DEADMAN_S:g} s after the last command, or at once when the daemon dies; "
-        f"when the bridge or the network fails, only the base's own time-out of {base_s:g} s stops it",
-        stops_by=f"slowing down as the base does; at {settings.max_speed_m_s:g} m/s it has gone "
-        f"{(DEADMAN_S + base_s) * settings.max_speed_m_s:.2f} m before it begins, if command and network fail together",
+        host_silent=f"the bridge commands zero {DEADMAN_S:g} s after the last command, or at once when the daemon "
+        f"dies; when the bridge or the network fails, only the base's own time-out of {base_s:g} s stops the robot",
+        stops_by=f"slowing down as the base does; at {settings.max_speed_m_s:g} m/s the base drives "
+        f"{(DEADMAN_S + base_s) * settings.max_speed_m_s:.2f} m before it begins to slow down, if command and "
+        "network fail together",
         reaction_s=DEADMAN_S + base_s,
         brakes=True,
         stops_by_own_ramp=True,
-        estop="zero speed, which the bridge repeats and latches until it is reset, as long as it lives and the network "
-        "carries it; whoever else may speak on the topic can move the base: use the button on it",
-        wheel_fault="the bridge says zero at once and stands by; no topic takes the torque off the motors: a base "
-        "whose speed loops are not reset by a speed of zero may run on with a lost encoder: use the button on it",
+        estop="zero speed, which the bridge repeats and latches until a reset, as long as the bridge and the network "
+        "work; any other node on the topic can move the base: use the button on the base",
+        wheel_fault="the bridge commands zero at once and stays on standby; no topic takes the torque off the "
+        "motors: a base whose speed loops are not reset by a speed of zero may run on with a lost encoder: use the "
+        "button on the base",
         unverified=(
-            f"link.watchdog_s = {base_s:g} is declared: ROS 2 has no way to read it back. With the wheels up, kill the "
-            f"bridge while they turn: they must stop",
-            "nobody proves who speaks on a topic: other nodes are noticed and stop the robot, but not kept off",
+            f"link.watchdog_s = {base_s:g} is declared: ROS 2 cannot read it back. Test it: with the wheels off the "
+            "ground, kill the bridge while they turn; they must stop",
+            "senders on a topic are not authenticated: other nodes are detected and stop the robot, but cannot be "
+            "blocked",
             *odometry,
         ),
         setup=(f"the base's time-out for {settings.speed_topic} (cmd_vel_timeout or the like): {base_s:g} s or less",),

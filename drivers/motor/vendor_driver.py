@@ -316,7 +316,11 @@ class VendorDriver:
         if not self._permit.link_is_up:
             return ()
         if self._table.watchdog_s is not None and self._permit.is_late(now_ns, self._table.watchdog_s):
-            self._end(self._permit.lost("no command for longer than the controllers' time-out"))
+            self._end(
+                self._permit.lost(
+                    "no command was sent for longer than the controllers' time-out; check the load of this computer"
+                )
+            )
         sent = self._step(now_ns, command)
         return (*sent, *self._port.questions(now_ns, self._permit))
 
@@ -413,10 +417,14 @@ class VendorDriver:
     def _check_silence(self, now_ns: int) -> None:
         for source in self._port.sources():
             silent_ns = 0 if source.received_ns is None else self._permit.silent_ns(source.received_ns)
-            why = f"{source.name} fell silent"
+            why = f"{source.name} stopped reporting"
             if self._may_lose:
                 if silent_ns > source.silent_ns:
-                    self._end(self._permit.lost(f"{why}: nothing came for {source.silent_ns * 1e-9:g} s"))
+                    self._end(
+                        self._permit.lost(
+                            f"{why}: no frame for {source.silent_ns * 1e-9:g} s; check its power and the cable"
+                        )
+                    )
                     return
             elif self._is_idle and source.gone_ns is not None and silent_ns > source.gone_ns:
                 self._restart_handshake(self._permit.restarted(why, f"{why}: waiting for it"), now_ns)

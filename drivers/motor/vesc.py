@@ -181,15 +181,15 @@ class VescPort(Port):
             if motor.killed:
                 return Objection(f"controller {motor.node}: its kill switch is pressed")
             if permit.stage is Stage.ARMED and motor.timed_out and is_armed_long:
-                return Objection(f"controller {motor.node}: its timeout ran out, no command came in time")
+                return Objection(f"controller {motor.node}: its timeout expired, no command came in time")
         return None
 
     def prepare(self, now_ns: int, permit: MotionPermit) -> Pending | None:
         """Wait until every controller has said whether it has a fault."""
         if not self.is_stopped:
-            return Pending(why="a motor turns; wait until it stands", is_final=True)
+            return Pending(why="a motor is turning; wait until it stands still", is_final=True)
         if any(motor.fault is None for motor in self._all):
-            return Pending(why="a controller does not say whether it has a fault")
+            return Pending(why="a controller does not report whether it has a fault")
         return None
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
@@ -247,7 +247,10 @@ class VescPort(Port):
     def _missing(self) -> str | None:
         silent = [str(motor.node) for motor in self._all if not motor.answered]
         if silent:
-            return f"controller {', '.join(silent)} does not answer; is it switched on, at this bit rate, at this id?"
+            return (
+                f"controller {', '.join(silent)} does not answer; check that it is switched on and has this bit "
+                "rate and this id"
+            )
         complete = all(
             m.erpm_ns is not None and m.turned.last is not None and not m.may_report_timeout for m in self._all
         )

@@ -71,13 +71,17 @@ class VescSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         if not all(sides_of(self.nodes)):
             return SettingsFault("nodes", "a side has no controller", "write [left, right], such as [23, 51]")
         if any(not 0 <= node <= codec.LARGEST_ID or node == HOST_ID for node in nodes):
-            return SettingsFault("nodes", f"an id is outside 0 to 254, or {HOST_ID}, which is this host's", "change it")
+            return SettingsFault(
+                "nodes", f"an id is outside 0 to 254, or is {HOST_ID}, the id of this host", "change it"
+            )
         if len(set(nodes)) != len(nodes):
-            return SettingsFault("nodes", "an id stands there twice", "give each controller its own (VESC Tool)")
+            return SettingsFault("nodes", "an id is listed twice", "give each controller an id of its own (VESC Tool)")
         if self.uart_node is not None and self.uart_node not in nodes:
-            return SettingsFault("uart_node", f"{self.uart_node} is none of link.nodes", "write the one on the line")
+            return SettingsFault(
+                "uart_node", f"{self.uart_node} is not in link.nodes", "write the id of the controller on the line"
+            )
         if self.min_erpm >= self.max_erpm:
-            return SettingsFault("max_erpm", "not above min_erpm", "write what the motor can turn")
+            return SettingsFault("max_erpm", "not above min_erpm", "write the largest erpm of the motor")
         return None
 
 
@@ -94,7 +98,7 @@ def timeout_fault(settings: VescSettings, node: int, timeout_s: float, brake_cur
     if abs(timeout_s - settings.watchdog_s) > _SAME_TIMEOUT_S:
         return f"{named} is {timeout_s:g} s; set {settings.watchdog_s:g} s there, or write link.watchdog_s"
     if not abs(brake_current_a - settings.timeout_brake_current_a) <= _SAME_CURRENT_A:
-        return f"{named} brakes with {brake_current_a:g} A; write that in link.timeout_brake_current_a"
+        return f"{named} brakes with {brake_current_a:g} A; write that value in link.timeout_brake_current_a"
     return None
 
 
@@ -195,18 +199,18 @@ def safety_card(settings: VescSettings) -> SafetyCard:
     brakes = settings.timeout_brake_current_a > 0.0
     braking = f"braking with {settings.timeout_brake_current_a:g} A"
     return SafetyCard(
-        host_silent=f"each controller {settings.watchdog_s:g} s after the last set command, by its timeout",
+        host_silent=f"each controller, {settings.watchdog_s:g} s after the last set command, by its timeout",
         stops_by=braking if brakes else "coasting: timeout_brake_current_a is 0",
         reaction_s=settings.watchdog_s + 0.01,
         brakes=brakes,
-        estop=f"a frame to all: brakes with {settings.brake_current_a:g} A; nothing latches it but this driver, and "
-        "nothing confirms it but standing motors",
-        wheel_fault=f"a brake current of {settings.brake_current_a:g} A while a motor says that it turns, then a "
+        estop=f"a frame to all controllers: they brake with {settings.brake_current_a:g} A; only this driver latches "
+        "the stop, and only motors at rest confirm it",
+        wheel_fault=f"a brake current of {settings.brake_current_a:g} A while a motor reports that it turns, then a "
         "current of zero; neither needs the speed loop",
         unverified=(
             "the speeds are declared in robot.toml and were not read back; the timeout and its brake current are, "
             "where the firmware reports them",
-            "not tried on hardware: the driver was tried against a simulator made from what the vendor's code does",
+            "not tested on hardware: the driver was tested against a simulator made from the vendor's code",
         ),
         setup=(
             f"App Settings, General: Timeout {1e3 * settings.watchdog_s:g} ms, Timeout Brake Current "

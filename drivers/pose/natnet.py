@@ -281,16 +281,18 @@ class NatNetPoses:
         frame = parse_frame(datagram, self._version)
         if frame is None:
             self.malformed += 1
-            self._note(f"datagrams that are no frames of NatNet {_text(self._version)}; correct pose.natnet_version")
+            self._note(
+                f"datagrams received that are not frames of NatNet {_text(self._version)}; correct pose.natnet_version"
+            )
             return None
         body = next((each for each in frame.bodies if each.number == self._body), None)
         if body is None:
             there = ", ".join(str(each.number) for each in frame.bodies) or "none"
-            self._note(f"no rigid body {self._body} in Motive's frames, but {there}; correct pose.body")
+            self._note(f"rigid body {self._body} is not in Motive's frames, which have {there}; correct pose.body")
             return None
         if not body.tracked or not all(map(math.isfinite, (*body.position, *body.rotation))):
             self.lost += 1
-            self._note(f"the cameras have lost rigid body {self._body}")
+            self._note(f"the cameras do not see rigid body {self._body}; check its markers")
             return None
         self._note(f"rigid body {self._body} is tracked")
         age_s = self._age_s(frame)
@@ -302,7 +304,7 @@ class NatNetPoses:
             if version in VERSIONS.values():
                 self._version = version
             else:
-                self._note(f"the server speaks NatNet {_text(version)}, known are {', '.join(VERSIONS)}")
+                self._note(f"the server uses NatNet {_text(version)}, supported are {', '.join(VERSIONS)}")
             if version >= (3, 0):
                 (ticks_per_s,) = struct.unpack_from("<Q", datagram, 4 + _NAME_LENGTH + 8)
                 self._ticks_per_s = float(ticks_per_s) or None

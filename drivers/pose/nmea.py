@@ -46,7 +46,7 @@ def create_pose_source(
     if not device:
         raise PoseSourceError('no device; write pose.device = "/dev/serial/by-id/..." or "socket://HOST:PORT"')
     if importlib.util.find_spec("pynmeagps") is None:
-        raise PoseSourceError("the library pynmeagps is not there; run `pip install 'disco-hw[rtk]'`")
+        raise PoseSourceError("the library pynmeagps is not installed; run `pip install 'disco-hw[rtk]'`")
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.setblocking(False)
     settings = {"device": device, "baud": baud, "datum": datum, "heading_std_rad": heading_std_rad}
@@ -277,9 +277,7 @@ class Fixes:
         if quality not in QUALITY_STD_M:
             return notes
         if time_s is None or not (isinstance(message.lat, float) and isinstance(message.lon, float)):
-            return notes + self._without_repeats(
-                "GGA sentences come without time, latitude or longitude: no positions of those"
-            )
+            return notes + self._without_repeats("GGA sentences lack time, latitude or longitude and give no position")
         height_m, height_notes = self._height_of(message)
         notes += height_notes + self._heading_hint(arrival_ns)
         if self._plane is None:
@@ -317,7 +315,7 @@ class Fixes:
             return self._height_m, []
         source_text = "0 m" if self._height_m is None else f"the last height, {self._height_m:.1f} m"
         return self._height_m or 0.0, self._without_repeats(
-            f"GGA sentences come without an altitude: taken at {source_text}"
+            f"GGA sentences lack an altitude; used instead: {source_text}"
         )
 
     def _with_heading(self, position: dict[str, Any], heading: _HeadingSentence) -> dict[str, Any]:
@@ -333,14 +331,16 @@ class Fixes:
         if self._heading is not None or arrival_ns - first_ns < _HINT_NS:
             return []
         return self._without_repeats(
-            "no heading comes: positions only; if the receiver has two antennas, switch on its sentence HDT or THS"
+            "the receiver sends no heading, positions only; if it has two antennas, switch on its sentence HDT or THS"
         )
 
     def _mode_messages(self, mode: str) -> list[dict[str, Any]]:
         before, self._heading_mode = self._heading_mode, mode
         if mode == before:
             return []
-        why = {"V": "not valid", "E": "reckoned", "M": "typed in", "S": "simulated"}.get(mode, "of an unknown mode")
+        why = {"V": "not valid", "E": "reckoned", "M": "entered by hand", "S": "simulated"}.get(
+            mode, "of an unknown mode"
+        )
         used = mode == MEASURED_MODE
         return [{"said": f"THS: the heading is {'measured again' if used else f'{why} ({mode}) and not used'}"}]
 
@@ -354,13 +354,18 @@ class Fixes:
         before, self._far = self._far, away_m > FARTHEST_M
         if self._far is before or not self._far:
             return []
-        return [{"said": f"{away_m:.0f} m from the datum, and {FARTHEST_M:.0f} m is the farthest; correct pose.datum"}]
+        return [
+            {
+                "said": f"the position is {away_m:.0f} m from the datum, and {FARTHEST_M:.0f} m is the farthest "
+                "allowed; correct pose.datum"
+            }
+        ]
 
     def _quality_messages(self, quality: int) -> list[dict[str, Any]]:
         before, self._quality = self._quality, quality
         if quality == before:
             return []
-        names = {0: "no fix: the antenna needs a free sky", 4: "RTK fix", 5: "RTK without whole wavelengths"}
+        names = {0: "no fix: the antenna needs a clear view of the sky", 4: "RTK fix", 5: "RTK with float ambiguities"}
         unused = "" if quality in QUALITY_STD_M else "; its positions are not used"
         return [{"said": f"fix quality {quality}: {names.get(quality, 'not RTK')}{unused}"}]
 
@@ -395,7 +400,7 @@ def _lines(device: str, baud: int) -> Iterator[tuple[bytes, str | None]]:
                     yield b"", None
         except (OSError, ValueError) as error:
             # serial.SerialException is an OSError.
-            yield b"", f"{device}: {error}; tried again until it is there"
+            yield b"", f"{device}: {error}; trying again until it is there"
         wait_s = _RETRY_S[min(tries, len(_RETRY_S) - 1)]
         tries += 1
         until_s = time.monotonic() + wait_s

@@ -32,7 +32,7 @@ def parse_allowed(addresses: Collection[str]) -> tuple[IPv4Network, ...]:
         try:
             networks.append(IPv4Network(text, strict=False))
         except (AddressValueError, NetmaskValueError, ValueError):
-            raise ValueError(f'"{text[:60]}" is no IPv4 address') from None
+            raise ValueError(f'"{text[:60]}" is not an IPv4 address') from None
     return tuple(networks)
 
 
@@ -47,7 +47,7 @@ class PoseProof:
         """Return the body of a datagram that arrives at this UNIX time (ns), or in words why it is refused."""
         payload, proof = datagram[:-PROOF_BYTES], datagram[-PROOF_BYTES:]
         if len(payload) < TIME_BYTES or not hmac.compare_digest(hmac.digest(self._key, payload, hashlib.sha256), proof):
-            return "without the proof of pose.key_file"
+            return "without the authentication code of pose.key_file"
         sent_ns = int.from_bytes(payload[:TIME_BYTES], "big")
         if abs(wall_ns - sent_ns) > CLOCKS_APART_NS:
             return f"{abs(wall_ns - sent_ns) * 1e-9:.0f} s old or ahead by their sender's clock; synchronise the clocks"
@@ -82,14 +82,17 @@ class SenderGate:
     def may_send(self, sender: Hashable, now_ns: int) -> bool:
         """Return whether a datagram of this sender is worth reading; one that is not is counted and reported."""
         if self._allowed is not None and not self._is_allowed(sender):
-            self.refuse(now_ns, f"{_name(sender)} sends poses and is not in pose.allow", "add it there, or stop it")
+            self.refuse(
+                now_ns, f"{_name(sender)} sends poses but is not in pose.allow", "add it there, or stop that sender"
+            )
             return False
         if self._kept in (None, sender) or self._is_silent(now_ns):
             return True
         self.refuse(
             now_ns,
-            f"{_name(sender)} sends poses beside {_name(self._kept)}",
-            f"stop one of them; {_name(self._kept)} is kept until it has been silent for {self._silence_ns * 1e-9:g} s",
+            f"{_name(sender)} sends poses while {_name(self._kept)} does",
+            f"stop one of them; {_name(self._kept)} is used until it has sent nothing for "
+            f"{self._silence_ns * 1e-9:g} s",
         )
         return False
 
@@ -97,7 +100,7 @@ class SenderGate:
         """Take in that a good pose came from this sender, which is kept to from now on."""
         if self._kept not in (None, sender):
             self._messages.append(
-                f"poses come from {_name(sender)} now; {_name(self._kept)} has been silent for "
+                f"poses now come from {_name(sender)}; {_name(self._kept)} has sent nothing for "
                 f"{(now_ns - self._came_ns) * 1e-9:.1f} s"
             )
         self._kept, self._came_ns = sender, now_ns

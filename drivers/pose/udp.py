@@ -66,7 +66,7 @@ def create_pose_source(
     Raises PoseSourceError for an address that cannot be had, and for a key that is named and not given.
     """
     if key_file and key is None:
-        raise PoseSourceError(f"the key of {key_file} was not read; poses without it would be believed")
+        raise PoseSourceError(f"the key of {key_file} was not read; poses without authentication would be accepted")
     try:
         allowed = None if allow is None else parse_allowed(allow)
     except ValueError as error:
@@ -123,7 +123,7 @@ class UdpPoses:
             opened = self._proof.unwrap(datagram, time.time_ns())
             if isinstance(opened, str):
                 text = f"{sender[0]}:{sender[1]} sends poses {opened}"
-                self._senders.refuse(now_ns, text, "docs/poses.md says what a sender with a key does")
+                self._senders.refuse(now_ns, text, "docs/poses.md describes what a sender with a key sends")
                 return None
             datagram = opened
         pose = pose_of(datagram, now_ns)

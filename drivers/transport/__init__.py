@@ -45,7 +45,7 @@ def create_transport(kind: str, **fields: Any) -> ReconnectingTransport:
     medium = media().get(kind)
     if medium is None:
         known = " or ".join(f'"{name}"' for name in media())
-        raise TransportSettingsError(f'link.kind: "{kind}" is no kind of link; write {known}')
+        raise TransportSettingsError(f'link.kind: "{kind}" is not a kind of link; write {known}')
     return medium(**fields)
 
 

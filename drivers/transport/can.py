@@ -45,7 +45,7 @@ _CLASSES = (
     (_LOST_ARBITRATION, "arbitration lost"),
     (_PROTOCOL, "protocol violation"),
     (_TRANSCEIVER, "transceiver fault (wiring)"),
-    (_NO_ACK, "no acknowledgement: nobody else is on the bus, or at another bit rate"),
+    (_NO_ACK, "no acknowledgement: no other node is on the bus, or it uses another bit rate"),
     (_BUS_ERROR, "bus error"),
 )
 _CONTROLLER_STATES = (
@@ -171,7 +171,7 @@ class CanMedium:
     def explain(self, error: Exception) -> str:
         """Say in one line what the error means and what to do."""
         if isinstance(error, LinkMuteError):
-            where = "the adapter (its number may have changed: name it as in /dev/serial/by-id)"
+            where = "the adapter (its number may have changed: use its name in /dev/serial/by-id)"
             return f"{self.name}: {error}; check the robot's power, the bit rate and {where}"
         if isinstance(error, LinkLostError):
             return f"{self.name}: {error}"
@@ -258,7 +258,7 @@ class CanConnection:
         self._garbage += 1
         if self._garbage >= GARBAGE_LIMIT:
             raise LinkLostError(
-                f"nothing but garbage arrives ({error}); check the adapter's firmware and serial speed"
+                f"only invalid data arrive ({error}); check the adapter's firmware and serial speed"
             ) from error
 
     def _handle_error_frame(self, message: can.Message) -> None:
@@ -348,7 +348,9 @@ def explain_can(interface: str, channel: str, bitrate: int, error: BaseException
         if number == errno.EAFNOSUPPORT:
             return f"{where}: this kernel has no CAN; load it with: sudo modprobe can_raw, or use another interface"
         if number == errno.ENOBUFS:
-            return f"{where}: transmit queue full; is anybody else on the bus? (ip -details link show {channel})"
+            return (
+                f"{where}: transmit queue full; check that another node is on the bus (ip -details link show {channel})"
+            )
     if interface in _OVER_A_TTY and number is not None:
         return explain_port(channel, error)
     if number in (errno.ENOENT, errno.ECONNREFUSED):

@@ -357,7 +357,7 @@ class ReconnectingTransport:
         if self._patience_s is not None and time.monotonic_ns() - received_ns > self._patience_s * 1e9:
             silent_s = self._patience_s
             self._patience_s = min(2.0 * silent_s, _MOST_PATIENT_S)
-            raise LinkMuteError(f"open, but no frame has come for {silent_s:g} s")
+            raise LinkMuteError(f"open, but no frame received for {silent_s:g} s")
 
     def _deliver(self, frames: Sequence[ReceivedFrame]) -> None:
         if self._mute_reason is not None:

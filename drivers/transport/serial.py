@@ -34,7 +34,7 @@ WRITE_TIMEOUT_S = 0.05
 _EXCHANGE_READ_S = 0.002
 _BITS_PER_BYTE = 10
 _LONGEST_REPLY = 600
-_FULL = "the line takes no more bytes; is the other end reading?"
+_FULL = "the line accepts no more bytes; check that the other end reads"
 _DELIMITER = b"\0"
 _TCP, _UNIX = "socket://", "unix://"
 _CONNECT_S = 5.0
@@ -287,7 +287,7 @@ def explain_port(port: str, error: BaseException) -> str:
     """Say what went wrong with a serial port and what to do about it."""
     number = error_number(error)
     if port.startswith((_TCP, _UNIX)) and number in (*_GONE, errno.ECONNREFUSED):
-        return f"{port}: nobody listens there; start the serial server or the emulator, or correct the port"
+        return f"{port}: nothing listens there; start the serial server or the emulator, or correct the port"
     if number in _GONE:
         return f"{port}: no such device; plug the adapter in, or correct the port (ls /dev/serial/by-id shows them)"
     if number in (errno.EACCES, errno.EPERM):
@@ -300,8 +300,8 @@ def explain_port(port: str, error: BaseException) -> str:
 def explain_mute(port: str, error: BaseException) -> str:
     """Say what to look at when a serial port is open and nothing comes from it."""
     return (
-        f"{port}: {error}; is the robot switched on, and is this its port? Adapters change their numbers: name it as "
-        "in /dev/serial/by-id. Some USB boards speak only with link.dtr = true"
+        f"{port}: {error}; check that the robot is switched on and that this is its port. The numbers of adapters "
+        "change: use the name in /dev/serial/by-id. Some USB boards send only with link.dtr = true"
     )
 
 

@@ -95,7 +95,7 @@ def test_the_daemon_has_its_recorder_write_the_scene(tmp_path, monkeypatch):
 
 def test_a_port_that_is_taken_is_refused_in_one_line(live, tmp_path):
     config = load_robot_config(write_robot_file(tmp_path))
-    with pytest.raises(InputError, match=r"--port \d+: cannot be listened to .*; choose another"):
+    with pytest.raises(InputError, match=r"--port \d+: cannot listen on .*; choose another port"):
         Live(config, "127.0.0.1", int(live.url.rpartition(":")[2]))
 
 

@@ -95,7 +95,7 @@ def test_joints_of_an_arm_alone_are_nothing_and_not_refused():
     [
         (joints(-600), "another clock"),
         (joints(200), "another clock"),
-        (joints(0, names=("fl", "fr", "rl")), "lacks joints"),
+        (joints(0, names=("fl", "fr", "rl")), "link.right_joints, or their positions, are missing"),
         (joints(0, (math.nan, 0.0)), "not finite"),
         (joints(0, speeds=(0.0, math.inf)), "not finite"),
         (joints(0, speeds=(0.0, 21.0)), "faster than the base can"),
@@ -116,7 +116,7 @@ def test_what_comes_out_of_order_is_refused():
     assert taken(inlet, joints(0), 0)
     assert taken(inlet, joints(-10), 10) is None
     assert taken(inlet, joints(0), 10) is None
-    assert list(inlet.refused) == ["it comes out of order"]
+    assert list(inlet.refused) == ["its messages come out of order"]
 
 
 def test_odometry_is_turned_back_into_wheels_whatever_was_lost_between():
@@ -283,7 +283,7 @@ def test_the_socket_of_a_bridge_that_was_killed_is_taken_over_and_a_living_ones_
     killed.close()
     clients = Clients(path)
     assert path.stat().st_mode & 0o777 == 0o600
-    with pytest.raises(InputError, match="listens there; end it first"):
+    with pytest.raises(InputError, match="listens there; stop it first"):
         Clients(path)
     clients.close()
 
@@ -396,9 +396,9 @@ def refused(tmp_path, old, new, words):
         (
             "watchdog_s = 0.5",
             'watchdog_s = 0.5\nleft_joints = ["l"]\nright_joints = ["l"]',
-            "a joint stands there twice",
+            "a joint is listed twice",
         ),
-        ("watchdog_s = 0.5", "watchdog_s = 0.5\nnodes = [3, 5]", r"link\.nodes: a field of the driver odrive"),
+        ("watchdog_s = 0.5", "watchdog_s = 0.5\nnodes = [3, 5]", r"link\.nodes: belongs to the driver odrive"),
         ('interface = "unixcan"', 'interface = "socketcan"', r'link\.interface: .*; write "unixcan"'),
         ("ros2_base", "agilex", "watchdog_s"),
     ],

@@ -177,7 +177,7 @@ def test_every_kind_of_task_is_documented():
 
 def test_an_unknown_kind_of_task_gets_one_line_with_those_that_there_are(tmp_path):
     with pytest.raises(
-        InputError, match=r"task.kind: 'spiral' is no kind of task; write one of circle, lemniscate, path"
+        InputError, match=r"task.kind: 'spiral' is not a kind of task; write one of circle, lemniscate, path"
     ):
         load(tmp_path, GOOD + '[task]\nkind = "spiral"\n')
 
@@ -231,7 +231,7 @@ def test_way_points_by_time_take_no_fallback(tmp_path):
     file = tmp_path / "robot.toml"
     task = '[task]\nkind = "timed_path"\npath = "way.csv"\n'
     file.write_text(GOOD.split("[task]", maxsplit=1)[0] + task + '[control]\nfallback = "lqr"\n')
-    with pytest.raises(InputError, match=r"control\.fallback: way-points by time have no speed"):
+    with pytest.raises(InputError, match=r"control\.fallback: way-points with times have no single speed"):
         load_robot_config(file)
     file.write_text(file.read_text().replace('"lqr"', '"ramp"'))
     assert load_robot_config(file).control.fallback == "ramp"

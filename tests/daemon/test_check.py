@@ -109,7 +109,7 @@ class Antenna:
 def test_positions_without_heading_are_a_warning_with_what_to_do():
     reported = check._telemetry_check(check._query_robot(RobotInTime(b""), create_driver(None), Antenna(silent=False)))
     assert reported.level is Level.WARNING
-    assert "heading not known; the poses have none: drive a metre" in reported.text
+    assert "heading not known; the pose sensor measures none: drive one metre" in reported.text
 
 
 def test_a_pose_source_that_is_silent_says_why():
@@ -128,7 +128,7 @@ def test_the_conformance_suite_keeps_out_of_a_daemons_way_too(tmp_path):
     )
     daemon = Daemon(tmp_path / "control.sock", {})
     try:
-        with pytest.raises(pytest.exit.Exception, match="a daemon drives this robot") as caught:
+        with pytest.raises(pytest.exit.Exception, match="a daemon is connected to this robot") as caught:
             test_robot.TestRobot.make_end(SimpleNamespace(getoption=lambda _: str(robot)))
     finally:
         daemon.close()

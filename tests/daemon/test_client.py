@@ -16,7 +16,7 @@ ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
     [
         ("jump", (), "jump: no such request"),
         ("drive", ("forward=1",), "drive: no such request"),
-        ("task", (), "say what to change"),
+        ("task", (), "name what to change"),
         ("arm", ("radius_m=1",), "arm takes no further arguments"),
         ("task", ("radius_m",), "radius_m: not a change"),
         ("task", ("radius_m=wide",), "radius_m=wide: not a change"),
@@ -43,7 +43,7 @@ def test_an_estop_that_reaches_nobody_says_what_does(tmp_path, robot):
 
 
 def test_only_arming_is_done_unrecorded():
-    with pytest.raises(InputError, match="--unrecorded: only arm takes it, and not start"):
+    with pytest.raises(InputError, match="--unrecorded: belongs to arm, not to start"):
         ask(ROBOT, "start", unrecorded=True)
 
 

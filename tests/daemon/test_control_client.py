@@ -117,7 +117,12 @@ def test_a_stranger_that_drips_without_end_is_given_up(tmp_path):
 
 @pytest.mark.parametrize(
     ("answer", "words"),
-    [(b"", "hung up"), (b"half", "hung up"), (b"HTTP/1.1 400\n", "is not a disco"), (b"5\n", "is not")],
+    [
+        (b"", "closed the connection"),
+        (b"half", "closed the connection"),
+        (b"HTTP/1.1 400\n", "is not a disco"),
+        (b"5\n", "is not"),
+    ],
 )
 def test_a_stranger_on_the_socket_is_reported(tmp_path, answer, words):
     path = tmp_path / "robot.sock"

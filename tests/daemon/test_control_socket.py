@@ -338,7 +338,7 @@ def test_a_living_daemon_is_not_displaced(tmp_path):
     path = tmp_path / "robot.sock"
     process = serve_in_another_process(path)
     try:
-        with pytest.raises(InputError, match=rf"serves this socket already \(process {process.pid}\); stop it first"):
+        with pytest.raises(InputError, match=rf"already serves this socket \(process {process.pid}\); stop it first"):
             ControlServer(path, ACTIONS)
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
             client.connect(str(path))

@@ -247,7 +247,7 @@ def test_a_link_option_that_says_nothing_is_refused_with_what_to_write(tmp_path,
         stop_robot(robot_file(tmp_path, tmp_path / "none"), option)
 
 
-@pytest.mark.parametrize(("latches", "word"), [(True, "stays latched"), (False, "latches nothing")])
+@pytest.mark.parametrize(("latches", "word"), [(True, "stays latched"), (False, "does not latch the stop")])
 def test_what_is_said_of_a_confirmed_stop_is_what_the_controller_does(latches, word):
     outcome = emergency.EstopOutcome("can0", None, "not running", confirmed=True, latches=latches)
     assert word in outcome.as_text()

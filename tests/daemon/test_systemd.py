@@ -38,9 +38,9 @@ def test_messages_arrive_over_path_and_abstract_sockets(manager):
     listener, environment = manager
     notifier = Notifier(environment)
     notifier.ready()
-    notifier.status("ARMED:\nholding zero")
+    notifier.status("ARMED:\ncommanding zero speed")
     notifier.stopping()
-    assert received(listener) == ["READY=1", "STATUS=ARMED: holding zero", "STOPPING=1"]
+    assert received(listener) == ["READY=1", "STATUS=ARMED: commanding zero speed", "STOPPING=1"]
     assert notifier.unsent == 0
     notifier.close()
     notifier.close()

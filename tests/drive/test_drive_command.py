@@ -21,8 +21,8 @@ from tools.viewer_run import write_log
         ({"script": "dance"}, "--script dance: no such script; write one of circle, steps, excite"),
         ({"unattended": True}, "--unattended and --seconds belong to a script"),
         ({"seconds": 3.0}, "--unattended and --seconds belong to a script"),
-        ({"script": "steps", "unattended": True, "gamepad": True}, "one deadman only"),
-        ({"gamepad": True, "page": True}, "--gamepad and --page: one deadman only"),
+        ({"script": "steps", "unattended": True, "gamepad": True}, "only one deadman"),
+        ({"gamepad": True, "page": True}, "--gamepad and --page: only one deadman"),
         ({"link": "wifi"}, "--link wifi"),
     ],
 )
@@ -52,7 +52,7 @@ def test_nobody_drives_a_robot_that_may_be_real_unattended(tmp_path, interface, 
 def test_without_a_terminal_one_line_says_what_to_use(tmp_path, monkeypatch):
     with (tmp_path / "nothing").open("w+b") as file:
         monkeypatch.setattr("disco_hw.drive.drive_command._STANDARD_INPUT", file.fileno())
-        with pytest.raises(InputError, match="no terminal; use a terminal, --gamepad or --script with --unattended"):
+        with pytest.raises(InputError, match="not a terminal; use a terminal, --gamepad or --script with --unattended"):
             run_drive(DriveOptions(write_robot_file(tmp_path)))
 
 
@@ -90,14 +90,14 @@ def test_a_drive_whose_log_is_not_whole_is_not_completed(tmp_path, monkeypatch, 
     result = run_drive(DriveOptions(write_robot_file(tmp_path), page=True, as_json=True))
     whole = said[0] != "recording"
     assert result.completed is whole
-    assert ("NOT WHOLE: the log writer died" in result.as_text()) is not whole
+    assert ("LOG NOT COMPLETE: the log writer died" in result.as_text()) is not whole
     assert result.as_dict()["recording_errors"] == (() if whole else (said[1],))
 
 
 @pytest.mark.parametrize("cut_off", [0, 40])
 def test_a_writer_that_was_slow_has_lost_nothing_where_the_log_proves_it(tmp_path, monkeypatch, cut_off):
     log = tmp_path / "drive.mcap"
-    pauses = "the log writer has not answered for 0.8 s; what comes is kept and waits"
+    pauses = "the log writer has not answered for 0.8 s; new ticks are kept until it does"
 
     def served(_setup, path, say, _pilot, **_options):
         write_log(path, ticks=60)

@@ -221,5 +221,5 @@ def test_a_script_that_the_fence_stops_ends_and_is_not_complete():
     assert playing.poll(0, RobotView(State.ARMED, True)).deadman
     stopped = playing.poll(20_000_000, RobotView(State.ARMED, True, fence_stopped=True))
     assert not stopped.deadman
-    assert playing.ended == "the fence stopped the script s in far; see the event before it"
+    assert playing.ended == "the fence stopped the script s in far; the event before this one says where"
     assert not playing.completed

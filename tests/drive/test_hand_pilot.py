@@ -128,9 +128,9 @@ def test_a_press_while_not_ready_is_reported_and_sends_nothing():
 
 def test_a_refusal_is_reported_and_needs_a_new_press():
     bench = Bench().driving()
-    bench.stack.pilot.learn(0, bench.stack.core.last, [Reply(UserRequest.ARM, False, "no fresh wheel samples")])
+    bench.stack.pilot.learn(0, bench.stack.core.last, [Reply(UserRequest.ARM, False, "no recent wheel data")])
     assert bench.run(0.02)[0].output.state is State.STOPPING
-    assert any("no fresh wheel samples" in text for text in reported(bench))
+    assert any("no recent wheel data" in text for text in reported(bench))
     assert bench.run(1.5)[-1].output.state is State.READY
 
 

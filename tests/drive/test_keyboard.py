@@ -108,7 +108,7 @@ def test_ctrl_d_ends(terminal):
     for _ in range(5):
         terminal.type(b"w")
     assert not terminal.type(b"\x04").deadman
-    assert terminal.keyboard.ended == "ended from the keyboard"
+    assert terminal.keyboard.ended == "the operator ended the drive at the keyboard"
     assert terminal.keyboard.completed
     os.write(terminal.master, b"w")
     assert not terminal.poll(100).deadman
@@ -130,7 +130,7 @@ def test_a_terminal_that_closes_is_a_device_that_is_gone(terminal):
     os.close(terminal.master)
     terminal.arrived(0)
     assert terminal.poll() is None
-    assert terminal.keyboard.ended == "the terminal has closed"
+    assert terminal.keyboard.ended == "the terminal was closed"
     assert not terminal.keyboard.completed
     assert terminal.poll() is None
 
@@ -150,5 +150,5 @@ def test_ctrl_c_still_is_a_signal_and_output_looks_as_before(terminal):
 
 
 def test_what_is_no_terminal_is_refused(tmp_path):
-    with (tmp_path / "file").open("w+b") as file, pytest.raises(InputError, match="no terminal; use"):
+    with (tmp_path / "file").open("w+b") as file, pytest.raises(InputError, match="not a terminal; use"):
         Keyboard(file.fileno(), KeyHold(8.0), SimulatedClock())

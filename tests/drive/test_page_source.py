@@ -125,7 +125,7 @@ def test_a_request_is_read():
     ],
 )  # fmt: skip
 def test_a_request_that_is_none_is_refused_in_words(change):
-    with pytest.raises(ValueError, match=r"drive takes|not a number|not true|not the digits"):
+    with pytest.raises(ValueError, match=r"drive takes|not a number|not true|must be the digits"):
         steering_from({**GOOD, **change})
 
 

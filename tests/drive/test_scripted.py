@@ -81,8 +81,8 @@ def test_the_end_opens_the_deadman():
 
 def test_the_end_of_the_deadman_is_the_end():
     bench = Bench()
-    bench.finger.ended = "the terminal has closed"
-    assert bench.source.ended == "the terminal has closed"
+    bench.finger.ended = "the terminal was closed"
+    assert bench.source.ended == "the terminal was closed"
     assert not bench.source.completed
     bench.source.close()
     assert bench.finger.closed
@@ -147,7 +147,7 @@ def test_unattended_goes_on_after_a_short_hold_however_late():
     assert held(source, HOLDING, 50, 102 * TICK) == [True] * 50
     assert held(source, DRIVING, 1, 152 * TICK) == [True]
     assert held(source, HOLDING, 60, 153 * TICK)[-1] is False
-    assert "held still for 1 s" in source.ended
+    assert "stood still for 1 s" in source.ended
 
 
 def test_unattended_gives_up():

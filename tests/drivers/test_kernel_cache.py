@@ -126,7 +126,7 @@ def test_a_pickle_in_a_directory_that_others_can_write_to_is_not_run(script, tmp
     place.chmod(0o777)
     loaded, reported = run(script, cache, home)
     assert not loaded
-    assert reported == f"disco-hw: {place}: others can write to it; kernels there are not loaded but compiled anew\n"
+    assert reported == f"disco-hw: {place}: others can write to it; kernels there are not loaded but compiled again\n"
     assert not marker.exists()
     # It is kept in the next directory, which is this user's alone.
     assert run(script, cache, home)[0]
@@ -138,7 +138,7 @@ def test_a_pickle_that_others_can_write_is_not_run_though_its_directory_is_ones_
     run(script, cache, tmp_path)
     plant(cache, marker)
     next(cache.rglob("*.nbi")).chmod(0o666)
-    assert "not loaded but compiled anew" in run(script, cache, tmp_path)[1]
+    assert "not loaded but compiled again" in run(script, cache, tmp_path)[1]
     assert not marker.exists()
 
 
@@ -168,7 +168,7 @@ def test_a_pickle_beside_the_source_is_not_run_either_and_where_none_is_private_
     module.chmod(0o777)
     loaded, reported = run(script, None, home)
     assert not loaded
-    assert "kernels are compiled anew in each process" in reported
+    assert "kernels are compiled again in each process" in reported
     assert not marker.exists()
 
 

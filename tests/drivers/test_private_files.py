@@ -33,7 +33,7 @@ def test_a_key_open_to_others_is_refused(tmp_path, mode):
 @pytest.mark.parametrize("text", ["", "secret", DIGITS[:-1], DIGITS + "0", "é" * 32, DIGITS + "\n" + DIGITS])
 def test_what_is_no_key_is_refused_without_being_shown(tmp_path, text):
     path = write(tmp_path / "key", text)
-    with pytest.raises(KeyFileError, match="is no key of 32 hexadecimal digits; make one with") as error:
+    with pytest.raises(KeyFileError, match="is not a key of 32 hexadecimal digits; make one with") as error:
         read_key_file(path)
     assert "secret" not in str(error.value)
     assert "\n" not in str(error.value)

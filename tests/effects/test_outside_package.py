@@ -114,7 +114,7 @@ def test_the_virtual_robot_refuses_to_hide_it_in_one_line(tmp_path):
 REFUSALS = {
     "an effect that another one has the name of": (
         TURN_DROOP.replace('"turn_droop"', '"slope"'),
-        "turn_droop: an effect 'slope' is there already; give it another name",
+        "turn_droop: an effect 'slope' already exists; give it another name",
     ),
     "one that says nothing of the geometry it uses": (
         TURN_DROOP.replace("    uses_geometry=True,\n", ""),

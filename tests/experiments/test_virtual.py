@@ -59,7 +59,7 @@ def test_a_fractional_encoder_is_refused(tmp_path):
     with pytest.raises(InputError, match="whole number"):
         run_sim(SimOptions(path))
     # Checked before the encoder, so that this ends even where the start is not looked at.
-    with pytest.raises(InputError, match=r"--start: nan 0\.0 0\.0 is no place"):
+    with pytest.raises(InputError, match=r"--start: nan 0\.0 0\.0 is not a pose"):
         run_sim(SimOptions(path, start=(float("nan"), 0.0, 0.0)))
 
 
@@ -76,7 +76,7 @@ def test_a_robot_is_needed_to_run():
 
 
 def test_a_board_that_has_a_link_of_its_own_is_refused_what_the_simulators_link_does(tmp_path):
-    with pytest.raises(InputError, match="--bus-log: not with --board"):
+    with pytest.raises(InputError, match="--bus-log: cannot be used with --board"):
         run_sim(SimOptions(ROBOT, board="/dev/ttyUSB1", bus_log=tmp_path / "bus.log"))
     vendors = tmp_path / "robot.toml"
     text = ROBOT.read_text("utf-8").replace("wombot_model.toml", str(ROBOT.with_name("wombot_model.toml")))

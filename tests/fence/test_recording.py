@@ -36,10 +36,10 @@ def test_a_round_way_has_no_more_corners_than_a_fence_may_have():
 @pytest.mark.parametrize(
     ("poses", "words"),
     [
-        (np.empty((0, 3)), "there are no poses"),
-        (along_line(SQUARE[:-1]), "the way ends 3.0 m from where it began"),
+        (np.empty((0, 3)), "the log holds no poses"),
+        (along_line(SQUARE[:-1]), "the path ends 3.0 m from its start"),
         (along_line(np.array([[0, 0], [2, 2], [2, 0], [0, 2], [0, 0]], float)), "crosses itself"),
-        (along_line(np.array([[0, 0], [0.1, 0], [0.1, 0.1], [0, 0]], float)), "the way makes no fence"),
+        (along_line(np.array([[0, 0], [0.1, 0], [0.1, 0.1], [0, 0]], float)), "the path makes no fence"),
     ],
 )
 def test_a_way_that_makes_no_fence_is_refused(poses, words):

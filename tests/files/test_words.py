@@ -53,7 +53,7 @@ def test_every_choice_of_robot_toml_is_listed(tmp_path, section, field, values, 
 
 def test_the_kinds_of_task_and_belief_are_listed(tmp_path):
     said = refusal(load_robot_config, tmp_path / "robot.toml", GOOD + '[task]\nkind = "square"\n')
-    assert "task.kind: 'square' is no kind of task; write one of circle, " in said
+    assert "task.kind: 'square' is not a kind of task; write one of circle, " in said
     said = refusal(load_model, tmp_path / "model.toml", MODEL + '[belief]\nkind = "cauchy"\nnames = []\n')
     assert "belief.kind: invalid value 'cauchy'; write one of gaussian, mixture, uniform" in said
     said = refusal(load_model, tmp_path / "model.toml", MODEL + "[belief]\nnames = []\n")

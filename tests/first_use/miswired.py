@@ -192,7 +192,7 @@ class Person:
     def poll(self, now_ns, robot):
         self.look()
         wanted = self.action is not None and not isinstance(self.action, Prompt)
-        counting = isinstance(self.action, DriveWheels) and "exactly once" in self.action.todo
+        counting = isinstance(self.action, DriveWheels) and "exactly one turn" in self.action.todo
         if counting and max(map(abs, self.turned())) >= 2.0 * math.pi:
             self._let_go = True
         if not counting:

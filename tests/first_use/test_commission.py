@@ -244,7 +244,7 @@ def test_a_place_that_cannot_be_written_is_one_line_and_leaves_robot_toml(tmp_pa
 
 def test_logs_that_could_not_be_kept_are_refused_before_anybody_is_asked(tmp_path):
     path = robot_file(tmp_path)
-    with pytest.raises(InputError, match=r"is there and is no directory"):
+    with pytest.raises(InputError, match=r"exists and is not a directory"):
         run_commission(CommissionOptions(path, log_directory=path))
 
 

@@ -61,7 +61,7 @@ def test_a_way_that_makes_no_fence_says_so_and_can_be_driven_again(tmp_path, mon
     def made(log):
         found = next(ways)
         if found is None:
-            raise InputError(f"{log}: the way ends 1.2 m from where it began; drive once round, back to the start")
+            raise InputError(f"{log}: the path ends 1.2 m from its start; drive once round, back to the start")
         return found
 
     monkeypatch.setattr("disco_hw.first_use.fence_drive.fence_of_log", made)
@@ -70,5 +70,5 @@ def test_a_way_that_makes_no_fence_says_so_and_can_be_driven_again(tmp_path, mon
     assert record_fence(robot, operator, "push it", drive=drive)
     assert len(drive.drives) == 2
     assert operator.asked[1].startswith("once more?")
-    assert "edge.mcap: the way ends 1.2 m from where it began" in capsys.readouterr().err
+    assert "edge.mcap: the path ends 1.2 m from its start" in capsys.readouterr().err
     assert load_robot_config(robot).fence.keep_in == EDGE

@@ -86,7 +86,7 @@ def test_a_file_that_is_there_stays_unless_told_otherwise(tmp_path):
 
 UNFIT = {
     "a directory": (lambda path: path, "is a directory"),
-    "under a file": (lambda path: Path(__file__) / "robot.toml", "is no directory"),
+    "under a file": (lambda path: Path(__file__) / "robot.toml", "is not a directory"),
     "a name that is too long": (lambda path: path / ("x" * 300), r"cannot be written \(File name too long\)"),
     "a file system of the kernel": (lambda path: Path("/proc/self/robot.toml"), "cannot be written"),
 }

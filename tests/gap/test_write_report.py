@@ -52,9 +52,9 @@ def test_a_directory_that_cannot_be_used_is_refused_before_the_search(monkeypatc
     robot = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
     given = tmp_path / "model.toml"
     given.write_bytes((robot.parent / "wombot_model.toml").read_bytes())
-    with pytest.raises(InputError, match="is there and is no directory"):
+    with pytest.raises(InputError, match="exists and is not a directory"):
         gap.gap([], robot, given)
-    with pytest.raises(InputError, match=r"model\.toml: would be written over, and is read here"):
+    with pytest.raises(InputError, match=r"model\.toml: is read here and would be overwritten"):
         gap.gap([], robot, tmp_path, given)
     with pytest.raises(EnoughError):
         gap.gap([], robot, tmp_path / "gap", given)
@@ -154,7 +154,7 @@ def test_reports_of_a_fleet_are_written_over_no_log(fleet, tmp_path):
     inside = tmp_path / "out" / "drive" / "model.toml"
     inside.parent.mkdir(parents=True)
     inside.write_bytes(b"a log too")
-    with pytest.raises(InputError, match="would be written over, and is read here"):
+    with pytest.raises(InputError, match="is read here and would be overwritten"):
         gap.gap_fleet([fleet[0], inside], ROBOT, tmp_path / "out")
 
 

@@ -72,7 +72,7 @@ def test_the_first_stage_goes_through_at_a_terminal(tmp_path):
             terminal.pause(3.0)
             for side, answer in (("left", "1"), ("right", "3")):
                 terminal.holding = True
-                terminal.wait(f"asked the {side} side to turn forward")
+                terminal.wait(f"the {side} side was commanded forward")
                 terminal.holding = False
                 terminal.pause(0.5)
                 terminal.type(answer)

@@ -55,7 +55,7 @@ def test_estop_stops_and_latches(tmp_path, link, daemon):
     # The daemon hears the frames of `disco-hw estop` on a bus that all share.
     assert "another host is on the link" not in said
     if (link, daemon) == ("can", "healthy"):
-        assert said.count("e-stop from outside on the link") == 1
+        assert said.count("e-stop received on the link") == 1
     stopped = [row for row in rows if row.t_s > told_s + 0.5]
     assert any(row.state == "ESTOP" for row in rows)
     assert max(row.fastest for row in stopped) < STILL_RAD_S

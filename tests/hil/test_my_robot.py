@@ -176,7 +176,7 @@ class Reader:
                 terminal.wait(f"the {side} side speeds up", PATIENCE_S)
                 terminal.pause(0.7)
                 with self.holding(terminal):
-                    terminal.wait(f"asked the {side} side to turn forward", PATIENCE_S)
+                    terminal.wait(f"the {side} side was commanded forward", PATIENCE_S)
                 self.answer(terminal, "", key)
             self.answer(terminal, "press Enter", "\n")
             for side in (0, 1):

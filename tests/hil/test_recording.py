@@ -91,7 +91,13 @@ def test_a_recorder_frozen_killed_and_deleted_on_the_way_is_reported_counted_and
         rows = stack.truth()
         output = (tmp_path / "daemon.txt").read_text()
     assert next(row for row in reversed(rows) if row.t_s < ended_s).fastest < STILL_RAD_S
-    for words in ("has not answered for", "was ended", "signal 9", "deleted while it was written", "goes on in"):
+    for words in (
+        "has not answered for",
+        "was stopped",
+        "signal 9",
+        "deleted while it was being written",
+        "goes on in",
+    ):
         assert any(line.startswith("recording: ") and words in line for line in output.splitlines()), words
     assert not third.exists()
     # A killed writer may have written more than it had confirmed: those ticks are in the next file, too.
@@ -166,7 +172,7 @@ def test_a_drive_that_ends_with_a_full_disk_says_which_ticks_are_lost_and_exits_
             output = (tmp_path / "daemon.txt").read_text()
         last = output[output.index("SIGTERM") :]
         assert "Traceback" not in output
-        assert re.search(r"recording: [1-9]\d* of \d+ ticks are in no log: .*No space left on device", last)
+        assert re.search(r"recording: [1-9]\d* of \d+ ticks are not in the log: .*No space left on device", last)
         assert "stop: recorder: " in last
         assert "free space on its disk before the next drive" in last
         # The attempts that failed name a file that could not be made; what is left to look at must be there.

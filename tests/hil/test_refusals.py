@@ -127,13 +127,13 @@ def assert_others_keep_out(stack):
     """`check`, requests that are refused and a second daemon leave the daemon that drives this robot as it is."""
     code, output = disco_here("check", str(stack.robot_file))
     assert code == 1
-    assert "a daemon drives this robot" in output
+    assert "a daemon is connected to this robot" in output
     code, output = disco("ctl", str(stack.robot_file), "status")
     assert code == 0
     assert output.startswith("READY")
     code, output = disco_here("ctl", str(stack.robot_file), "start")
     assert code == 1
-    assert "arm first" in output
+    assert "arm it first" in output
     code, output = disco_here("ctl", str(stack.robot_file), "jump")
     assert code == 2
     code, output = disco_here("ctl", str(stack.robot_file), "task", "radius_m=1.25", "speed_m_s=0.25")
@@ -145,7 +145,7 @@ def assert_others_keep_out(stack):
     assert stack.operator.status()["task"]["asked"]["speed_m_s"] == 0.25
     code, output = disco("run", str(stack.robot_file))
     assert code == 2
-    assert "a daemon serves this socket already" in output
+    assert "a daemon already serves this socket" in output
 
 
 @pytest.mark.parametrize(
@@ -322,8 +322,12 @@ def test_garbage_on_a_serial_line_leaves_the_daemon_waiting(tmp_path):
         ("run", "x_m,y_m\n0,0\n1,one\n", "line 3: y_m: 'one' is not a finite number; write one"),
         ("sim", "x_m,y_m\n0,0\n", "1 way-points; write at least two"),
         ("check", "x,y\n0,0\n1,1\n", "line 1: column x_m: missing; name x_m and y_m there"),
-        ("view", "x_m,y_m\n0,0\n0,0\n", "line 3: the same way-point again; remove it"),
-        ("check", "x_m,y_m\n0,0\n1,0\n1,0.2\n0,0.2\n", "lines 3 to 4: the way turns twice within 0.28 m, too near"),
+        ("view", "x_m,y_m\n0,0\n0,0\n", "line 3: repeats the way-point before it; remove it"),
+        (
+            "check",
+            "x_m,y_m\n0,0\n1,0\n1,0.2\n0,0.2\n",
+            "lines 3 to 4: the path turns twice within 0.28 m, where the robot may stop",
+        ),
         ("run", None, "cannot be read"),
     ],
 )

@@ -96,7 +96,7 @@ def test_it_drives_the_circle_and_stops_when_the_daemon_dies(tmp_path):
         base.daemon.kill()
         base.wait_for_true_standstill()
         # The bridge goes on and says that nobody drives.
-        assert (tmp_path / "bridge.txt").read_text(encoding="utf-8").splitlines()[-1].endswith("standing by")
+        assert (tmp_path / "bridge.txt").read_text(encoding="utf-8").splitlines()[-1].endswith("on standby")
 
 
 @real_ros
@@ -157,7 +157,8 @@ def test_it_keeps_to_the_circle_by_joint_states_and_by_odometry(tmp_path, lines)
 
 
 @pytest.mark.parametrize(
-    ("fault", "words"), [(signal.SIGUSR1, "angles jumped"), (signal.SIGUSR2, "no odometry"), (None, "another node")]
+    ("fault", "words"),
+    [(signal.SIGUSR1, "the angles of its wheels jumped"), (signal.SIGUSR2, "no odometry"), (None, "another node")],
 )
 def test_a_base_that_restarts_falls_silent_or_hears_another_stops(tmp_path, fault, words):
     with ExitStack() as stack:

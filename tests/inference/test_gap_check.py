@@ -47,7 +47,7 @@ def die(send, log, model):
 @pytest.mark.thorough
 def test_a_search_that_breaks_off_is_an_error_of_the_work(monkeypatch):
     monkeypatch.setattr(infer_command, "_search", die)
-    with gap_check_in_parallel(logged("poor"), NOMINAL) as searched, pytest.raises(WorkError, match="broke off"):
+    with gap_check_in_parallel(logged("poor"), NOMINAL) as searched, pytest.raises(WorkError, match="was aborted"):
         searched()
 
 

@@ -209,7 +209,7 @@ def test_a_log_that_the_search_cannot_judge_gives_a_model_with_a_warning(known, 
     search = finds(why_not_checked="too little to judge")
     result = infer_command([log], robot, tmp_path / "model.toml", options=FEW, search=search)
     assert load_model(tmp_path / "model.toml").missing_effects == ()
-    assert "was not judged: too little to judge" in result.as_text()
+    assert "was not checked: too little to judge" in result.as_text()
     assert "next: disco-hw gap" not in result.as_text()
 
 
@@ -256,12 +256,12 @@ def test_nothing_that_is_read_is_written_over(robot, tmp_path):
     log = write_log(tmp_path / "circle.csv")
     before = log.read_bytes(), robot.read_bytes()
     for out, report in ((log, None), (robot, None), (None, log), (tmp_path / "new", tmp_path / "new")):
-        with pytest.raises(InputError, match="would be written over, and is read here; give another path"):
+        with pytest.raises(InputError, match="is read here and would be overwritten; give another path"):
             infer_command([log], robot, out, report, FEW, search=finds())
     assert (log.read_bytes(), robot.read_bytes()) == before
 
 
 def test_a_file_that_cannot_be_written_is_told_before_the_work(robot, tmp_path):
     log = write_log(tmp_path / "circle.csv")
-    with pytest.raises(InputError, match=r"circle\.csv is no directory; give another path"):
+    with pytest.raises(InputError, match=r"circle\.csv is not a directory; give another path"):
         infer_command([log], robot, log / "model.toml", options=FEW, search=finds())

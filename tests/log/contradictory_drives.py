@@ -120,8 +120,12 @@ FAULTS: dict[str, tuple[Change, str, str]] = {
         "heading_backwards",
         "mounting of the pose sensor",
     ),
-    "a standing heading": (with_poses(yaw_rad=lambda p: np.zeros(p.t_s.size)), "heading_still", "no measured heading"),
-    "a heading that stops for a third": (heading_stops, "heading_still", "no measured heading"),
+    "a standing heading": (
+        with_poses(yaw_rad=lambda p: np.zeros(p.t_s.size)),
+        "heading_still",
+        "not a measured heading",
+    ),
+    "a heading that stops for a third": (heading_stops, "heading_still", "not a measured heading"),
     "encoders doubled": (with_wheels(2.0, 2.0), "encoder_count", "wheels count 2.00 times the expected ticks"),
     "encoders halved": (with_wheels(0.5, 0.5), "encoder_count", "wheels count 0.50 times the expected ticks"),
     "encoders doubled, no commands": (
@@ -130,7 +134,7 @@ FAULTS: dict[str, tuple[Change, str, str]] = {
         "check ticks_per_rev and gear",
     ),
     "left encoder doubled": (with_wheels(2.0, 1.0), "encoder_count", "left wheel counts"),
-    "encoders swapped": (with_wheels(swap=True), "sides_swapped", "encoders are swapped (the poses say so too)"),
+    "encoders swapped": (with_wheels(swap=True), "sides_swapped", "encoders are swapped (the poses show it too)"),
     "encoders swapped, no commands": (
         then(with_wheels(swap=True), without_commands),
         "mirrored",
@@ -147,11 +151,11 @@ FAULTS: dict[str, tuple[Change, str, str]] = {
         "wheels_reversed",
         "both encoders count backwards",
     ),
-    "left encoder dead": (with_wheels(0.0, 1.0), "encoder_dead", "left encoder stands still"),
+    "left encoder dead": (with_wheels(0.0, 1.0), "encoder_dead", "left encoder never counts"),
     "right encoder dead, no commands": (
         then(with_wheels(1.0, 0.0), without_commands),
         "encoder_dead",
-        "right encoder stands still",
+        "right encoder never counts",
     ),
     "both encoders dead": (with_wheels(0.0, 0.0), "wheels_still", "encoders are not read"),
     "commands in rpm": (with_commands(9.549), "command_scale", "in rad/s of the wheel"),

@@ -57,7 +57,7 @@ def test_a_log_given_twice_is_refused_by_whatever_name(tmp_path, mcap, table):
     link = tmp_path / "link"
     link.symlink_to(mcap)
     for again in (mcap, link, tmp_path / "." / mcap.name):
-        with pytest.raises(LogError, match="given twice, and what it says would count twice; give each log once"):
+        with pytest.raises(LogError, match="given twice, so that its data would count twice; give each log once"):
             load_drive([mcap, table, again])
 
 
@@ -68,7 +68,7 @@ def test_a_log_and_its_copy_are_one_drive(tmp_path, share):
     whole.write_bytes(data)
     cut.write_bytes(data[: int(len(data) * share)])
     recover_log(cut, mended)
-    with pytest.raises(LogError, match=r"mended\.mcap: holds what .*whole\.mcap holds, which would count twice"):
+    with pytest.raises(LogError, match=r"mended\.mcap: holds the same data as .*whole\.mcap, which would count twice"):
         load_drive([whole, mended])
 
 

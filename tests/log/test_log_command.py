@@ -58,7 +58,7 @@ def test_an_index_alone_does_not_prove_that_the_log_was_ended(tmp_path):
     gone = write_log(tmp_path / "gone.mcap", drive_ticks(100))
     text = info(gone, as_json=False)
     assert "ended properly" not in text
-    assert "nothing after 2023-11-14T22:13:22.000+00:00: the daemon or its recorder was gone then" in text
+    assert "nothing recorded after 2023-11-14T22:13:22.000+00:00: the daemon or its recorder had ended" in text
     summary = json.loads(info(gone, as_json=True))
     assert (summary["complete"], summary["ended"], summary["missing_ticks"]) == (True, False, 0)
 
@@ -89,7 +89,7 @@ def test_of_a_log_from_before_the_recorders_last_word_nothing_is_claimed(tmp_pat
 
 def test_info_says_what_is_lost(cut):
     text = info(cut, as_json=False)
-    assert "; nothing after 2023-11-14T22:13:21" in text
+    assert "; nothing recorded after 2023-11-14T22:13:21" in text
     assert "ended properly" not in text
     assert "lost: at byte" in text
     assert json.loads(info(cut, as_json=True))["damage"]

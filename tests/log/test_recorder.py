@@ -87,7 +87,7 @@ def test_a_stopped_writer_is_reported_within_a_second_replaced_and_nothing_is_lo
     following = kept_going(recorder, following, lambda stats: not stats.fault)
     wait_until(lambda: not alive(stopped))
     news = recorder.new_messages()
-    assert "was ended" in news[0]
+    assert "was stopped" in news[0]
     assert news[1] == f"recording goes on in {path.with_name('run.part2.mcap')}"
     final = recorder.close()
     assert all_accounted(final, following - 1)
@@ -100,7 +100,7 @@ def test_a_stopped_writer_is_reported_within_a_second_replaced_and_nothing_is_lo
     with open_log(recorder.path) as log:
         assert (log.metadata.continues, log.metadata.continues_sequence) == (str(path), first_part[-1])
         assert (log.summary().missing_ticks, log.summary().ended) == (0, True)
-    assert "nothing after" in info(path, as_json=False)
+    assert "nothing recorded after" in info(path, as_json=False)
     assert f"continues {path}" in info(recorder.path, as_json=False)
 
 
@@ -160,7 +160,7 @@ def test_a_file_deleted_while_it_is_written_is_reported_counted_and_begun_anew(p
         shutil.rmtree(path.parent)
     following = kept_going(recorder, following, lambda stats: stats.writer_deaths == 1)
     following = kept_going(recorder, following, lambda stats: not stats.fault)
-    assert "was deleted while it was written" in recorder.new_messages()[0]
+    assert "was deleted while it was being written" in recorder.new_messages()[0]
     final = recorder.close()
     assert recorder.path == path.with_name("run.part2.mcap")
     assert not path.exists()
@@ -181,7 +181,7 @@ def test_a_keeper_that_died_is_made_again_while_disarmed_and_the_writer_lives_on
     stats = recorder.poll()
     assert (stats.writer_alive, stats.fault) == (True, "")
     os.kill(recorder.writer_pid, signal.SIGKILL)
-    following = kept_going(recorder, 6, lambda stats: "disarm to renew" in stats.fault)
+    following = kept_going(recorder, 6, lambda stats: "disarm to restart" in stats.fault)
     assert recorder.keeper_pid is None
     recorder.repair()
     following = kept_going(recorder, following, lambda stats: not stats.fault)
@@ -339,7 +339,7 @@ def test_a_log_is_never_overwritten(path):
 
 def test_a_directory_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").write_text("", encoding="utf-8")
-    with pytest.raises(LogError, match=r"file.*cannot be made"):
+    with pytest.raises(LogError, match=r"file.*cannot be created"):
         ProcessRecorder(recording(tmp_path / "file" / "run.mcap"))
 
 

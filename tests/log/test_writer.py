@@ -56,7 +56,7 @@ def test_when_the_recording_process_is_killed_the_file_is_finished(path):
         assert log.complete
         assert log.ending is None
         assert (log.summary().missing_ticks, log.summary().ended) == (0, False)
-    assert "nothing after" in info(path, as_json=False)
+    assert "nothing recorded after" in info(path, as_json=False)
     assert len(ticks_of(path)) > 20
 
 
@@ -180,7 +180,7 @@ def test_the_last_words_with_a_full_disk_count_the_ticks_that_are_lost_and_name_
         final = recorder.close(1.0)
         assert final.waiting_ticks == given - final.delivered_ticks > 0
         words = recorder.new_messages()
-        assert f"{final.waiting_ticks} of {given} ticks are in no log: " in words[-1]
+        assert f"{final.waiting_ticks} of {given} ticks are not in the log: " in words[-1]
         assert "No space left on device" in words[-1]
         assert not [line for line in words if "goes on" in line]
         assert final.fault == words[-1]

@@ -144,7 +144,9 @@ def test_the_mark_of_missing_effects_is_kept(tmp_path):
     assert load_model(tmp_path / "marked.toml").missing_effects == ("turn_slip", "slope")
 
 
-@pytest.mark.parametrize(("name", "fault"), [("wind", "unknown effect 'wind'"), ("motor_lag", "is among the effects")])
+@pytest.mark.parametrize(
+    ("name", "fault"), [("wind", "unknown effect 'wind'"), ("motor_lag", "is also listed in effects")]
+)
 def test_a_mark_must_name_an_effect_that_the_model_lacks(tmp_path, name, fault):
     with pytest.raises(InputError, match=f"missing_effects: .*{fault}"):
         read(tmp_path, GOOD.replace("format = 1", f'format = 1\nmissing_effects = ["{name}"]'))

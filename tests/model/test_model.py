@@ -43,7 +43,7 @@ def test_completing_points_fills_in_and_keeps_to_physical_ranges():
 def test_with_point_changes_values_by_full_name():
     model = Model(0.06, 0.4, 0.1, (LAG,)).with_point({"motor_lag.tau_s": 0.3, "x_icr_m": 0.2})
     np.testing.assert_allclose(model.point(), [0.06, 0.4, 0.2, 0.3])
-    with pytest.raises(ValueError, match="'tau' is no parameter of this model"):
+    with pytest.raises(ValueError, match="'tau' is not a parameter of this model"):
         model.with_point({"tau": 1.0})
 
 

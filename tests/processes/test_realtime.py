@@ -75,7 +75,7 @@ def test_priority_zero_leaves_scheduler_and_memory_alone_and_says_so():
     seen = run("from disco_hw import processes\nreport(processes.enter_real_time(0))")
     assert seen["policy"] == os.SCHED_OTHER
     assert seen["locked_kib"] == 0
-    assert seen["steps"][-1][1:] == [False, "scheduler: left alone, as daemon.realtime_priority is 0"]
+    assert seen["steps"][-1][1:] == [False, "scheduler: unchanged, because daemon.realtime_priority is 0"]
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root to become another user")

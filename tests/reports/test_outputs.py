@@ -30,18 +30,18 @@ def test_what_can_be_written_is_not_refused_and_nothing_is_made(tmp_path, file):
 
 def test_a_place_that_cannot_be_written_is_refused(monkeypatch, tmp_path, file):
     for path, fault in (
-        (file, "is there and is no directory"),
-        (file / "deep" / "er", "drive.csv is no directory"),
+        (file, "exists and is not a directory"),
+        (file / "deep" / "er", "drive.csv is not a directory"),
     ):
         with pytest.raises(InputError, match=fault):
             refuse_directory(path)
     with pytest.raises(InputError, match="is a directory; give the path of a file"):
         refuse_file(tmp_path)
-    with pytest.raises(InputError, match=r"drive\.csv is no directory"):
+    with pytest.raises(InputError, match=r"drive\.csv is not a directory"):
         refuse_file(file / "model.toml")
     monkeypatch.setattr("os.access", lambda path, mode: path != tmp_path)
     for refuse in (refuse_directory, refuse_file):
-        with pytest.raises(InputError, match="cannot be written; give another path"):
+        with pytest.raises(InputError, match="cannot be written to; give another path"):
             refuse(tmp_path / "some" / "where")
 
 
@@ -49,11 +49,11 @@ def test_an_input_is_not_written_over_by_whatever_name(tmp_path, file):
     link = tmp_path / "link.csv"
     link.symlink_to(file)
     for path in (file, link, tmp_path / "." / ".." / tmp_path.name / "drive.csv"):
-        with pytest.raises(InputError, match="would be written over, and is read here"):
+        with pytest.raises(InputError, match="is read here and would be overwritten"):
             refuse_file(path, [file])
-    with pytest.raises(InputError, match="would be written over"):
+    with pytest.raises(InputError, match="would be overwritten"):
         refuse_directory(tmp_path, ["drive.csv"], [link])
-    with pytest.raises(InputError, match="would be written over"):
+    with pytest.raises(InputError, match="would be overwritten"):
         refuse_file(tmp_path / "new", [tmp_path / "new"])
 
 
@@ -62,7 +62,7 @@ def test_an_experiment_looks_at_its_directory_and_its_numbers_first(file):
         circle(None, seeds=1, duration_s=duration_s, lag_s=lag_s, wheel_noise=wheel_noise, out=out)
 
     for begin in (lambda: pendulum(seeds=1, out=file), lambda: drive(file), lambda: adapt(None, seeds=1, out=file)):
-        with pytest.raises(InputError, match="is there and is no directory"):
+        with pytest.raises(InputError, match="exists and is not a directory"):
             begin()
     for option, numbers in (("duration-s", {"duration_s": math.inf}), ("lag-s", {"lag_s": math.inf})):
         with pytest.raises(InputError, match=f"--{option} inf: not a finite number"):

@@ -32,11 +32,11 @@ WRONG = [
     pytest.param(Wiring(sides_swapped=True), (1.0, 3.0), "left and right are swapped; .*sides_swapped = true",
                  id="sides-swapped"),
     pytest.param(Wiring(sides_swapped=True), (-2.0, 2.0), "", id="sides-swapped-on-the-spot"),
-    pytest.param(Wiring(encoder_direction=(-1, 1)), (3.0, 3.0), "the left wheel counted against .*"
+    pytest.param(Wiring(encoder_direction=(-1, 1)), (3.0, 3.0), "the left wheel counted opposite .*"
                  "encoder_direction = [-1, 1]", id="left-encoder-reversed"),
-    pytest.param(Wiring(encoder_direction=(1, -1)), (3.0, 3.0), "the right wheel counted against",
+    pytest.param(Wiring(encoder_direction=(1, -1)), (3.0, 3.0), "the right wheel counted opposite",
                  id="right-encoder-reversed"),
-    pytest.param(Wiring(motor_direction=(-1, 1)), (3.0, 2.0), "the left wheel counted against .*"
+    pytest.param(Wiring(motor_direction=(-1, 1)), (3.0, 2.0), "the left wheel counted opposite .*"
                  "motor_direction = [-1, 1]", id="left-motor-reversed"),
     pytest.param(Wiring(encoders_swapped=True), (1.5, 4.0), "encoders_swapped = true", id="encoders-swapped"),
 ]  # fmt: skip
@@ -130,7 +130,7 @@ def test_what_was_already_written_is_what_changes():
         [(0.0, 0.0)] + [(2.0, 2.0)] * 30,
         [(0.04 * max(tick - 2, 0), -0.04 * max(tick - 2, 0)) for tick in range(31)],
     )
-    assert "wheels.encoder_direction = [1, 1] if it turned as it should" in found[1]
+    assert "wheels.encoder_direction = [1, 1] if it turned as commanded" in found[1]
 
 
 @thinned("wiring", [RIGHT_REVERSED, Wiring(sides_swapped=True), Wiring(encoder_direction=(1, -1))], quick=1)

@@ -214,7 +214,10 @@ def test_a_command_is_free_scaled_and_stopped_as_the_wall_comes_nearer(speed):
     assert (found.verdict, found.scale) == (FenceVerdict.STOPPED, 0.0)
     assert found.clearance_m == pytest.approx(-0.001)
     end_m = 1.7 - at_once_m + 0.001 + needed_m
-    assert found.reason == f"the stopping path would leave the fence at ({end_m:.2f}, 0.00)"
+    assert (
+        found.reason
+        == f"the stopping path would leave the fence at ({end_m:.2f}, 0.00); drive the robot away from there"
+    )
 
 
 def test_the_margin_is_kept_in_part_by_scaled_commands():
@@ -362,7 +365,7 @@ def test_settings_that_cannot_be_are_refused(broken):
 def test_without_a_pose_that_is_a_pose_nothing_moves(seen):
     found = guard_of(Fence(keep_in=ROOM)).step(seen, EXACT, (0, 0), (5, 5))
     assert (found.verdict, found.scale) == (FenceVerdict.NO_POSE, 0.0)
-    assert found.reason == "no valid pose, and a fence is set"
+    assert found.reason == "no valid pose while a fence is set; check the pose sensor"
     assert found.verdict in STOPS_MOTION
 
 
@@ -385,7 +388,7 @@ def test_an_obstacle_that_is_reported_no_longer_stops_the_robot():
     guard.set_obstacles([MovingCircle(50.0, 0.0, 0.1)], ["person", "cart"])
     found = guard.step(estimate(), EXACT, (0, 0), (1, 1))
     assert (found.verdict, found.scale) == (FenceVerdict.OBSTACLE_LOST, 0.0)
-    assert found.reason == "obstacle person, cart is reported no longer; report it again or remove it"
+    assert found.reason == "obstacle person, cart is no longer reported; report it again or remove it"
     guard.set_obstacles([], ["person"])
     assert guard.step(estimate(), EXACT, (0, 0), (1, 1)).scale == 0.0
     guard.set_obstacles([MovingCircle(50.0, 0.0, 0.1)])
@@ -396,7 +399,7 @@ def test_an_override_lets_all_through_where_there_is_a_fence():
     guard = guard_of(Fence(keep_in=ROOM))
     found = guard.step(estimate(pose_ok=False), EXACT, (0, 0), (5, 5), overridden=True)
     assert (found.verdict, found.scale) == (FenceVerdict.OVERRIDDEN, 1.0)
-    assert "in spite of the fence" in found.reason
+    assert "with the fence overridden" in found.reason
     assert guard_of(Fence()).step(estimate(), EXACT, (0, 0), (5, 5), overridden=True) is IDLE
 
 
@@ -662,7 +665,7 @@ def test_a_path_of_which_only_the_end_has_no_numbers_moves_nothing():
     with np.errstate(all="ignore"):
         found = judge(Fence(keep_in=ROOM), estimate(), (1e200, 1e200))
     assert (found.verdict, found.scale) == (FenceVerdict.NO_POSE, 0.0)
-    assert found.reason == "the stopping path is not finite"
+    assert found.reason == "the predicted stopping path is not finite"
 
 
 def test_the_place_that_is_said_is_where_the_full_command_would_be_deepest():

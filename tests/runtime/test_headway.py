@@ -34,7 +34,7 @@ def said(seconds, speed_m_s=0.2, robot_m_s=0.0, wheels_rad_s=0.0, command=COMMAN
         ({}, "the wheels do not turn although commanded up to 0.50 rad/s"),
         ({"command": (0.0, 0.0)}, "the planner commands no motion"),
         ({"failure": "nothing finite"}, "the planner has no plan: nothing finite"),
-        ({"wheels_rad_s": 2.0}, "the wheels have turned by 10.0 rad, and the pose has not moved"),
+        ({"wheels_rad_s": 2.0}, "the wheels have turned by 10.0 rad, but the pose has not changed"),
     ],
 )
 def test_a_robot_that_stays_is_reported_once_with_what_stands_in_the_way(what, words):
@@ -59,7 +59,7 @@ def test_it_is_reported_when_the_robot_gets_on_again():
     for tick in range(500):
         x_m = 0.0 if tick < 300 else 0.004 * (tick - 300)
         found += headway.step(tick * TICK_NS, True, (x_m, 0.0), COMMAND, None, None)
-    assert [text.split(":")[1] for text in found] == [" no progress for 5 s", " makes progress again"]
+    assert [text.split(":")[1] for text in found] == [" no progress for 5 s", " the robot makes progress again"]
 
 
 def started(**changes):
@@ -80,4 +80,4 @@ def test_the_daemon_says_that_a_robot_stands_within_a_dead_band_that_its_model_d
 def test_wheels_that_stand_beyond_any_dead_band_stop_the_robot():
     *_, tick = started(hide={"deadband": 20.0}).run(3.0)
     assert tick.output.state is State.FAULT
-    assert "although it is commanded to turn" in tick.output.detail
+    assert "although the wheel is commanded to turn" in tick.output.detail

@@ -72,7 +72,7 @@ def test_an_open_path_ends_with_the_robot_standing_and_is_replayed_and_shown_wit
     places, _ = drive(stack, lambda: not stack.core.last.output.running, 20.0)
     stack.run(0.5)
     reported = [text for _, tick in stack.recorder.ticks for text in (getattr(r, "text", "") for r in tick)]
-    assert "task stopped: the path's end is reached" in reported
+    assert "task stopped: the end of the path is reached" in reported
     assert stack.core.last.output.state is State.ARMED
     assert stack.core.last.pipeline.source is Source.HOLD
     assert abs(stack.robot.truth.left_speed_rad_s) < 0.05

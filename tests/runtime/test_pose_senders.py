@@ -119,11 +119,14 @@ def test_a_robot_that_is_carried_stops_its_task_and_says_so_and_its_operator_sta
     said = made.output_lines()
     (jump,) = containing(said, "poses: the pose jumped by")
     assert f"by {abs(off_m):.2f} m" in jump
-    assert "which the wheels do not explain: the robot was carried or has slipped, or its poses are wrong" in jump
+    assert (
+        "which the motion of the wheels does not explain: the robot was carried or has slipped, or the measured poses"
+        in jump
+    )
     (stop,) = containing(said, "task stopped: the pose jumped by")
-    assert stop.endswith("see that the robot is where the page shows it, then start again")
-    (misfit,) = containing(said, "poses: 3 in a row do not fit the wheels")
-    assert f"{abs(off_m):.2f} m off: not used" in misfit
+    assert stop.endswith("check that the robot is where the page shows it, then start again")
+    (misfit,) = containing(said, "poses: 3 poses in a row disagree with the wheels")
+    assert f"{abs(off_m):.2f} m, and are not used" in misfit
     # It never goes on by itself.
     assert not made.stack.run(3.0)[-1].output.running
     (reply,) = [reply for tick in made.stack.run(0.1, UserRequest.START) for reply in tick.replies]
@@ -156,9 +159,9 @@ def test_a_second_sender_is_refused_and_named_and_the_robot_stays_on_its_circle(
     last = made.stack.run(12.0)[-1]
     assert last.output.running
     assert made.error_m() < 0.05
-    named = containing(made.output_lines(), f"poses: {stranger.name} sends poses beside {first.name}: not used")
+    named = containing(made.output_lines(), f"poses: {stranger.name} sends poses while {first.name} does: not used")
     assert 1 <= len(named) <= 2
-    assert f"stop one of them; {first.name} is kept until it has been silent for 2 s" in named[0]
+    assert f"stop one of them; {first.name} is used until it has sent nothing for 2 s" in named[0]
     assert made.stack.core.pose_source.refused > 11.0 * stranger_hz
     assert made.stack.core.pipeline.fusion.stats.poses_gated <= 2
 
@@ -173,8 +176,8 @@ def test_another_sender_takes_over_only_after_the_task_has_stopped_for_want_of_p
     seen = made.stack.run(4.0)
     assert not seen[-1].output.running
     said = made.output_lines()
-    stopped = said.index("task stopped: no pose; check the pose sensor, or set estimation.pose_required = false")
-    (taken,) = containing(said, f"poses: poses come from {second.name} now; {first.name} has been silent for 2.0 s")
+    stopped = said.index("task stopped: no valid pose; check the pose sensor, or set estimation.pose_required = false")
+    (taken,) = containing(said, f"poses: poses now come from {second.name}; {first.name} has sent nothing for 2.0 s")
     assert stopped < said.index(taken)
     assert seen[-1].pipeline.estimate.pose_ok
 
@@ -184,7 +187,7 @@ def test_only_allowed_addresses_may_send(bench):
     sender = made.send(25.0)
     assert not made.start()
     (said,) = containing(made.output_lines(), "is not in pose.allow")
-    assert said.startswith(f"poses: {sender.name} sends poses and is not in pose.allow: not used (1 datagrams)")
+    assert said.startswith(f"poses: {sender.name} sends poses but is not in pose.allow: not used (1 datagrams)")
 
 
 def constant(yaw_rad):
@@ -207,10 +210,10 @@ def test_a_heading_that_is_said_to_be_unknown_is_not_used_and_the_operator_is_to
     assert not made.start()
     last = made.stack.core.last
     assert (last.pipeline.estimate.initialised, last.pipeline.estimate.heading_known) == (True, False)
-    assert last.output.detail == "armed, holding zero"
+    assert last.output.detail == "armed, commanding zero speed"
     assert made.error_m() < 0.05
-    (told,) = containing(made.output_lines(), "the estimator runs on positions")
-    assert told.startswith("poses: udp: its poses have no heading, or one whose covariance says that it is unknown")
+    (told,) = containing(made.output_lines(), "only the positions are used")
+    assert told.startswith("poses: udp: its poses have no heading, or a covariance that marks it as unknown")
     assert status(made.stack.core, {}, RecorderStats())["poses"][0]["heading"] == "none"
 
 
@@ -222,8 +225,8 @@ def test_a_heading_that_never_moves_is_found_out_by_the_first_turn_and_the_estim
     last = made.stack.run(3.0)[-1]
     assert not last.output.running
     assert not last.pipeline.estimate.heading_known
-    (told,) = containing(made.output_lines(), "the heading stands still at 1.57 rad while the wheels turn the robot by")
-    assert told.endswith("it is not used, and the estimator runs on positions")
+    (told,) = containing(made.output_lines(), "the heading stays at 1.57 rad while the wheels turn the robot by")
+    assert told.endswith("only the positions are used; check the pose sensor")
     assert status(made.stack.core, {}, RecorderStats())["poses"][0]["heading"] == "stands still"
 
 
@@ -242,7 +245,7 @@ def test_a_heading_sensor_that_dies_is_left_out_and_the_drive_goes_on_by_positio
     made.send(25.0, said=said)
     assert made.start()
     last = made.stack.run(10.0)[-1]
-    assert containing(made.output_lines(), "udp: the heading stands still at")
+    assert containing(made.output_lines(), "udp: the heading stays at")
     assert last.output.running, made.output_lines()
     assert made.error_m() < 0.05
     last = made.stack.run(5.0)[-1]

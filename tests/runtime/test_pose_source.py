@@ -66,7 +66,7 @@ def test_without_wheels_poses_are_recorded_and_nothing_is_armed(monkeypatch):
     (reply,) = [reply for tick in stack.run(0.1, UserRequest.ARM) for reply in tick.replies]
     assert (reply.accepted, reply.text) == (
         False,
-        "not connected to the robot: it sends no wheel samples; check the encoders and the controller",
+        "not connected to the robot: the robot sends no wheel data; check the encoders and the controller",
     )
     assert recorded(stack, PoseSample)
     assert not recorded(stack, WheelSample)

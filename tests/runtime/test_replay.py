@@ -131,7 +131,10 @@ def test_a_follower_takes_over_from_a_planner_that_finds_nothing_and_replays_bit
     assert sources[last:] == [Source.PLAN] * (len(sources) - last) != []
     assert all(tick.command.left_rad_s > 0.5 for tick in driven[first:last])
     said = [text for tick in driven for text in tick.events if text.startswith("planner")]
-    assert said == ["planner: no valid plan; lqr follows the line instead", "planner: valid plan again; it drives"]
+    assert said == [
+        "planner: no valid plan; the fallback controller lqr follows the line instead",
+        "planner: valid plan again; the planner drives",
+    ]
     log = write_log(tmp_path / "run.mcap", stack.recorder.ticks, text)
     report = replay(log)
     assert report.ok, report.as_text()

@@ -130,12 +130,12 @@ def test_without_a_pose_only_an_override_moves_the_robot(robot_file, tmp_path):
     hand.wheels = (3.0, 3.0)
     ticks = run.run(1.0)
     assert all(tick.command.left_rad_s == 0.0 for tick in ticks)
-    assert ticks[-1].pipeline.fence.reason == "no valid pose, and a fence is set"
-    assert run.core.area.task_fault == "fence: no valid pose, and a fence is set"
-    assert run.core.area.override(run.now_us * 1000, on=True) == "manual driving in spite of the fence for 60 s"
+    assert ticks[-1].pipeline.fence.reason == "no valid pose while a fence is set; check the pose sensor"
+    assert run.core.area.task_fault == "fence: no valid pose while a fence is set; check the pose sensor"
+    assert run.core.area.override(run.now_us * 1000, on=True) == "manual driving may leave the fence for 60 s"
     ticks = run.run(1.0)
     assert ticks[-1].command.left_rad_s == pytest.approx(3.0)
-    assert events_of(ticks)[0].startswith("fence: OVERRIDDEN by request")
+    assert events_of(ticks)[0].startswith("fence: OVERRIDDEN by the operator")
     assert run.core.area.status(run.now_us * 1000)["overridden_s"] == pytest.approx(59.0, abs=0.1)
     assert any(
         one.overridden for _, tick in run.recorder.ticks for one in tick if isinstance(one, records.GuardVerdict)
@@ -144,7 +144,7 @@ def test_without_a_pose_only_an_override_moves_the_robot(robot_file, tmp_path):
     run.pilot.step = lambda now_ns, last: PilotTick(motion=Manual(3.0, 3.0))
     assert run.run(1.0)[-1].command.left_rad_s == 0.0
     run.pilot.step = lambda now_ns, last: PilotTick(motion=Manual(3.0, 3.0), by_hand=True)
-    assert run.core.area.override(run.now_us * 1000, on=False) == "the fence holds again"
+    assert run.core.area.override(run.now_us * 1000, on=False) == "the fence is in force again"
     assert run.run(1.0)[-1].command.left_rad_s == 0.0
     log = tmp_path / "run.mcap"
     run.write_log(log)
@@ -158,7 +158,7 @@ def test_an_override_ends_by_itself():
     assert not area.begin(OVERRIDE_NS - 1, by_hand=False)
     assert not area.begin(OVERRIDE_NS, by_hand=True)
     events, _ = area.end(OVERRIDE_NS, area.last, overridden=False)
-    assert events[-1] == "fence: the manual override has ended; the fence holds again"
+    assert events[-1] == "fence: the manual override has ended; the fence is in force again"
 
 
 def area_of(fence: Fence) -> SafeArea:
@@ -177,8 +177,8 @@ def test_an_obstacle_is_kept_to_its_age_limit_and_then_stops_the_robot(robot_fil
     ticks = run.run(0.5)
     assert ticks[-1].command.left_rad_s == 0.0
     assert events_of(ticks) == [
-        "fence: obstacle cart not reported for 0.5 s; the robot must stand",
-        "fence: stopped: obstacle cart is reported no longer; report it again or remove it",
+        "fence: obstacle cart not reported for 0.5 s; the robot stops",
+        "fence: stopped: obstacle cart is no longer reported; report it again or remove it",
     ]
     assert run.core.area.task_fault.startswith("fence: obstacle cart")
     run.core.area.handle_request(run.now_us * 1000, {"change": "remove", "name": "cart"})
@@ -198,7 +198,7 @@ def test_an_obstacle_goes_on_with_its_velocity():
     assert (circle.x_m, circle.y_m, circle.vx_m_s, circle.vy_m_s, circle.radius_m) == (1.75, 0.5, 0.5, -1.0, 0.3)
     assert obstacles.step(round(2.5 * SECOND_NS)) == ()
     assert obstacles.step(round(2.5 * SECOND_NS) + 1) == (
-        "fence: obstacle person not reported for 2 s; the robot must stand",
+        "fence: obstacle person not reported for 2 s; the robot stops",
     )
     assert obstacles.lost == ("person",)
     assert obstacles.status(3 * SECOND_NS)[0]["lost"]
@@ -218,7 +218,7 @@ def test_thirty_two_obstacles_are_kept_and_no_more():
     assert obstacles.refused == 1
     obstacles.remove("one3")
     obstacles.report(0, report("another"))
-    with pytest.raises(ObstacleRefused, match="obstacle one3: not known; known are: another, one0"):
+    with pytest.raises(ObstacleRefused, match="obstacle one3: not known; known obstacles: another, one0"):
         obstacles.remove("one3")
 
 
@@ -270,7 +270,7 @@ def test_reports_come_over_udp(robot_file):
 def test_a_person_adds_and_removes_obstacles_and_all_is_recorded():
     area = area_of(Fence(keep_in=ROOM))
     added = area.handle_request(5, {"change": "add", "name": "pillar", "x_m": 0.5, "y_m": 0.0, "radius_m": 0.1})
-    assert added == "obstacle pillar: kept for 600 s, then the robot stops"
+    assert added == "obstacle pillar: valid for 600 s; without a newer report the robot then stops"
     assert area.handle_request(6, {"change": "remove", "name": "pillar"}) == "obstacle pillar: removed"
     _, written = area.end(7, area.last, overridden=False)
     assert [one.removed for one in written] == [False, True]
@@ -283,7 +283,7 @@ def test_a_person_adds_and_removes_obstacles_and_all_is_recorded():
 def test_the_fence_is_changed_while_disarmed_only():
     area = area_of(Fence(keep_in=ROOM))
     for state in (State.ARMED, State.STOPPING):
-        with pytest.raises(FenceRefused, match=f"while the robot is disarmed, and it is {state.name}"):
+        with pytest.raises(FenceRefused, match=rf"only while the robot is disarmed \(it is {state.name}\)"):
             area.change_fence(0, {"margin_m": 0.1}, state)
     for wrong in ({"keep_in": [[0, 0], [1, 1]]}, {"keep_in": 3}, {"margin": 0.1}, {"margin_m": -1.0}):
         with pytest.raises(FenceRefused, match="fence"):
@@ -294,7 +294,7 @@ def test_the_fence_is_changed_while_disarmed_only():
     assert area.guard.boundaries.fence == area.fence
     events, (record,) = area.end(4, area.last, overridden=False)
     assert fence_of_record(record) == area.fence
-    assert events == ("fence: changed; it holds until the daemon ends, robot.toml keeps its own",)
+    assert events == ("fence: changed until the daemon ends; robot.toml is not changed",)
 
 
 def test_the_log_of_a_drive_round_the_edge_makes_its_fence(tmp_path):
@@ -321,5 +321,5 @@ def test_the_log_of_a_drive_round_the_edge_makes_its_fence(tmp_path):
     short = SimulatedRun(setup, virtual_robot(setup, PlantParameters(), MIDDLE), NoPlanner(), Hand())
     short.run(0.1)
     short.write_log(tmp_path / "short.mcap")
-    with pytest.raises(InputError, match=r"short\.mcap: there are no poses; drive once round"):
+    with pytest.raises(InputError, match=r"short\.mcap: the log holds no poses; drive once round"):
         fence_of_log(tmp_path / "short.mcap")

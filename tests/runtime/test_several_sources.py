@@ -95,8 +95,11 @@ def test_both_are_fused_shown_recorded_and_replayed_bit_for_bit(bench, tmp_path)
     assert now[1]["origin"] == [1.0, 0.0, 0.0]
     assert now[1]["outliers"] >= 12
     assert now[0]["latency_s"] == pytest.approx(0.03, abs=0.02)
-    assert "poses: udp: jumped against the wheels and is left out; going on with robot" in bench.output_lines()
-    assert "poses: udp: lost, no pose for 1 s; going on with robot" in bench.output_lines()
+    assert (
+        "poses: udp: its poses jumped, which the wheels do not explain, and are not used; continuing with robot"
+        in bench.output_lines()
+    )
+    assert "poses: udp: no pose for 1 s; continuing with robot" in bench.output_lines()
     assert {pose.source for pose in bench.poses()} == {0, 1}
     log = tmp_path / "run.mcap"
     bench.stack.write_log(log)
@@ -113,8 +116,9 @@ def test_two_that_contradict_each_other_stop_the_task_and_say_so(bench):
         bench.off_m = 0.005 * tenth
         bench.stack.run(0.1)
     assert not bench.stack.core.last.output.running
-    why = "udp and robot contradict each other beyond their stated noise; find out which is wrong and take it out of"
-    assert f"task stopped: {why} [pose]" in bench.output_lines()
+    why = "udp and robot disagree by more than their stated noise"
+    hint = "find the source that is wrong and remove it from [pose] in robot.toml"
+    assert f"task stopped: {why}; {hint}" in bench.output_lines()
 
 
 def test_what_is_learnt_is_learnt_from_the_first_alone(bench):
@@ -141,13 +145,14 @@ class LoopFigures:
     [
         ('[[pose.also]]\nsource = "sonar"\n', r'pose\.also\[0\]\.source: there is no source "sonar"; write one of'),
         ('[[pose.also]]\nport = 7\n', r"pose\.also\[0\]: does not say which source; add source, one of"),
-        ('[[pose.also]]\nsource = "udp"\nbaud = 9600\n', r'also\[0\]\.baud: a field of the source "nmea", and'),
+        ('[[pose.also]]\nsource = "udp"\nbaud = 9600\n', r'also\[0\]\.baud: belongs to the source "nmea", but'),
         ('[[pose.also]]\nsource = "udp"\nrate_hz = 50.0\n', r"also\[0\]\.rate_hz: .*; remove it"),
         ('[[pose.also]]\nsource = "udp"\noffset = [inf, 0.0]\n', r"also\[0\]\.offset: not a finite number"),
         ('[pose]\nsource = "udp"\nallow = []\n', r"pose\.allow: empty, which allows no sender at all; write addr"),
-        ('[pose]\nsource = "natnet"\nallow = ["host"]\n', r'pose\.allow: "host" is no IPv4 address; write addr'),
-        ('[[pose.also]]\nsource = "udp"\nallow = ["10.0.0.0/99"]\n', r'also\[0\]\.allow: "10\.0\.0\.0/99" is no IPv4'),
-        ('[pose]\nsource = "robot"\nkey_file = "k"\n', r'pose\.key_file: a field of the source "udp", and'),
+        ('[pose]\nsource = "natnet"\nallow = ["host"]\n', r'pose\.allow: "host" is not an IPv4 address; write addr'),
+        ('[[pose.also]]\nsource = "udp"\nallow = ["10.0.0.0/99"]\n',
+         r'also\[0\]\.allow: "10\.0\.0\.0/99" is not an IPv4'),
+        ('[pose]\nsource = "robot"\nkey_file = "k"\n', r'pose\.key_file: belongs to the source "udp", but'),
         ('[[pose.also]]\nsource = "udp"\nprot = 7\n', r"pose\.also.*prot: no such field; did you mean port"),
         ('[[pose.also]]\nsource = "udp"\nposition_unit = "km"\n', r"pose\.also.*position_unit: .*write one of"),
         ('[[pose.also]]\nsource = "udp"\n[[pose.also.also]]\nsource = "robot"\n', r"also\[0\]\.also: sources are not"),
@@ -179,8 +184,10 @@ def test_check_shows_each_and_that_two_disagree(tmp_path):
     poses += [PoseSample(t, t + 5_000_000, 1.5, 2.0, 0.5, 0.01, 0.02, source=1) for t in range(9)]
     found = {check.name: f"{check.level.value} {check.text}" for check in pose_source_checks(reported, poses)}
     assert found["poses udp"].startswith("ok 10 a second, 30 ms old, 0.01 m, 0.02 rad; frame at [0.0, 0.0, 0.0]")
-    assert found["poses nmea"].endswith("none came; frame at [0.0, 0.0, 0.0], sensor at [0.1, 0.0]; see that it sends")
-    assert "0.50 m apart, beyond their stated noise" in found["poses udp and robot"]
+    assert found["poses nmea"].endswith(
+        "no pose received; frame at [0.0, 0.0, 0.0], sensor at [0.1, 0.0]; check that the sensor sends"
+    )
+    assert "0.50 m apart, more than their stated noise" in found["poses udp and robot"]
     turned = [PoseSample(t, t, 1.0, 2.0, 0.9, 0.01, 0.02, source=1) for t in range(9)]
     (last,) = [each for each in pose_source_checks(reported, [*poses[:30], *turned]) if "apart" in each.text]
     assert last.text.startswith("0.40 rad apart,")
@@ -202,5 +209,5 @@ def test_a_key_beside_robot_toml_is_read_and_one_that_others_can_read_or_is_none
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         stranger.sendto(b'{"x_m":1,"y_m":2,"position_std_m":0.1,"age_s":0}', ("127.0.0.1", port))
         assert list(source.receive(10**12, ())) == []
-    assert any("without the proof of pose.key_file" in words for words in source.new_messages())
+    assert any("without the authentication code of pose.key_file" in words for words in source.new_messages())
     source.close()

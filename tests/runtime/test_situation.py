@@ -92,7 +92,7 @@ def test_a_fault_and_a_latched_stop_come_before_everything_else():
 
 
 def test_an_unknown_fault_is_reported_too():
-    assert advice({**STATUS, "fault": "NEW_TROUBLE"})[0].startswith("New trouble. Not known here")
+    assert advice({**STATUS, "fault": "NEW_TROUBLE"})[0].startswith("New trouble. This version does not know the fault")
 
 
 def test_driving_by_hand_has_its_own_words():

@@ -39,7 +39,7 @@ def test_without_a_link_it_says_why_and_what_to_do():
     assert out.detail == hint
     assert hint in refusal(out)
     bench.tick(link_state=LinkState.UP, driver_state=DriverState.HANDSHAKE)
-    mute = "/dev/ttyUSB0: open, but no frame has come for 4 s"
+    mute = "/dev/ttyUSB0: open, but no frame received for 4 s"
     assert bench.tick(driver_state=DriverState.HANDSHAKE, link_error=mute).detail == mute
     assert bench.tick(driver_state=DriverState.HANDSHAKE, link_error=None).detail == "detail of the driver"
 
@@ -239,7 +239,7 @@ def test_a_lost_pose_stops_the_task_for_good():
     bench = Bench().running()
     out = bench.tick(pose_ok=False)
     assert (out.state, out.motion_allowed, out.zero_only) == (State.ARMED, False, True)
-    assert "no pose" in out.events[-1]
+    assert "no valid pose" in out.events[-1]
     assert not bench.tick(pose_ok=True, count=10).motion_allowed
 
 
@@ -253,7 +253,7 @@ def test_without_a_heading_no_task_is_started_and_a_running_one_stops(pose_requi
     bench = Bench(replace(SETTINGS, pose_required=pose_required)).armed()
     out = bench.tick(START, heading_missing=True)
     assert "heading not known" in refusal(out)
-    assert "drive a metre" in refusal(out)
+    assert "drive one metre" in refusal(out)
     assert not bench.tick(heading_missing=True, count=5).motion_allowed
     running = Bench(replace(SETTINGS, pose_required=pose_required)).running()
     out = running.tick(heading_missing=True)
@@ -271,7 +271,7 @@ def test_start_during_arming_is_dropped_where_the_heading_is_lost_meanwhile():
 
 
 def test_ready_says_that_the_heading_is_missing():
-    assert "drive a metre" in Bench().ready().tick(heading_missing=True).detail
+    assert "drive one metre" in Bench().ready().tick(heading_missing=True).detail
 
 
 def test_by_hand_the_robot_moves_without_pose_and_heading():
@@ -337,7 +337,7 @@ def test_arming_that_the_robot_never_finishes_is_given_up():
     assert bench.out.detail == "arming"
     bench.tick(count=3)
     assert bench.out.state is State.STOPPING
-    assert any("not armed within 2 s: detail of the driver" in event for event in bench.events)
+    assert any("the robot did not arm within 2 s: detail of the driver" in event for event in bench.events)
 
 
 def test_arming_that_the_robot_refuses_is_given_up_at_once():
@@ -366,7 +366,7 @@ def test_a_reset_without_effect_is_given_up_and_said():
     assert bench.out.driver_request is None
     bench.tick(count=2)
     assert bench.out.driver_request is Request.STANDBY
-    assert any("no reset within 3 s: detail of the driver" in event for event in bench.events)
+    assert any("did not reset within 3 s: detail of the driver" in event for event in bench.events)
 
 
 def test_estop_during_a_reset_ends_the_reset():
@@ -406,15 +406,15 @@ def test_arm_is_refused_with_the_reason():
     bench.tick()
     assert "detail of the driver" in refusal(bench.tick(ARM))
     assert "turning" in refusal(Bench().ready().tick(ARM, wheel_speed_rad_s=0.06))
-    assert "wheel samples" in refusal(Bench().ready().tick(ARM, telemetry_age_s=0.06))
+    assert "no recent wheel data" in refusal(Bench().ready().tick(ARM, telemetry_age_s=0.06))
     assert "stopping" in refusal(Bench().stopping().tick(ARM))
-    assert "e-stop requested here" in refusal(Bench().faulted().tick(ARM))
+    assert "e-stop requested by the operator" in refusal(Bench().faulted().tick(ARM))
 
 
 def test_start_is_refused_with_the_reason():
-    assert "arm first" in refusal(Bench().ready().tick(START))
+    assert "arm it first" in refusal(Bench().ready().tick(START))
     assert "pose" in refusal(Bench().armed().tick(START, pose_ok=False))
-    assert "wheel samples" in refusal(Bench().armed().tick(START, telemetry_age_s=0.06))
+    assert "no recent wheel data" in refusal(Bench().armed().tick(START, telemetry_age_s=0.06))
 
 
 def test_reset_is_refused_with_the_reason():
@@ -445,11 +445,11 @@ def test_what_it_says_of_each_state():
     assert bench.ready().out.detail == "ready to be armed"
     assert bench.tick(ARM).detail == "arming"
     bench.tick(count=3)
-    assert (bench.out.state, bench.out.detail) == (State.ARMED, "armed, holding zero")
+    assert (bench.out.state, bench.out.detail) == (State.ARMED, "armed, commanding zero speed")
     assert bench.tick(START).detail == "running the task"
-    assert bench.tick(telemetry_age_s=0.06).detail == "no fresh wheel samples: holding zero"
+    assert bench.tick(telemetry_age_s=0.06).detail == "no recent wheel data from the robot: commanding zero speed"
     assert bench.tick(telemetry_age_s=0.01).detail == "running the task"
-    assert bench.tick(STOP).detail == "armed, holding zero"
+    assert bench.tick(STOP).detail == "armed, commanding zero speed"
 
 
 def test_asking_twice_is_harmless():
@@ -543,8 +543,8 @@ def test_to_arm_unrecorded_needs_all_else_that_arming_needs(state):
 
 
 def test_a_pose_that_jumps_stops_the_task_and_refuses_a_start_while_it_does():
-    jump = "the pose jumped by 1.00 m and 0.10 rad, which the wheels do not explain"
-    words = f"{jump}; see that the robot is where the page shows it, then start again"
+    jump = "the pose jumped by 1.00 m and 0.10 rad, which the motion of the wheels does not explain"
+    words = f"{jump}; check that the robot is where the page shows it, then start again"
     bench = Bench().running()
     out = bench.tick(pose_jump=jump)
     assert (out.state, out.motion_allowed, out.zero_only) == (State.ARMED, False, True)

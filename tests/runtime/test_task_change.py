@@ -62,7 +62,7 @@ def test_an_armed_robot_keeps_its_task(state):
         ({"speed_m_s": -0.2}, "speed_m_s"),
         ({"center_x_m": 1e6}, "center_x_m"),
         ({"speed_m_s": 0.45}, "at most 0.397 m/s"),
-        ({"radius_m": 0.1, "speed_m_s": 0.2}, "outer wheel for more than 8 rad/s"),
+        ({"radius_m": 0.1, "speed_m_s": 0.2}, "needs more than 8 rad/s of the outer wheel"),
     ],
 )
 def test_what_the_robot_cannot_do_is_refused_in_words(asked, words):
@@ -120,7 +120,7 @@ def test_of_a_path_only_the_speed_can_be_changed():
     assert limits(ROBOT, LINE)["speed_m_s"] == (SLOWEST_M_S, pytest.approx(fastest))
     with pytest.raises(TaskRefused, match="give one or more of speed_m_s, not radius_m"):
         changed_task(LINE, {"radius_m": 0.5}, ROBOT, State.READY)
-    with pytest.raises(TaskRefused, match="asks the wheels for more than 8 rad/s; at most"):
+    with pytest.raises(TaskRefused, match="needs more than 8 rad/s of the wheels; write at most"):
         changed_task(LINE, {"speed_m_s": 1.01 * fastest}, ROBOT, State.READY)
     with pytest.raises(TaskRefused, match="disarm first"):
         changed_task(LINE, {"speed_m_s": 0.3}, ROBOT, State.ARMED)
@@ -139,7 +139,7 @@ def test_a_status_and_a_record_hold_a_path_without_its_way_points():
 
 
 def test_of_way_points_by_time_nothing_can_be_changed():
-    with pytest.raises(TaskRefused, match="have times, which say all; change t_s in their CSV"):
+    with pytest.raises(TaskRefused, match="times of the way-points set the speed; change t_s in their CSV"):
         changed_task(TIMED, {"speed_m_s": 0.3}, ROBOT, State.READY)
     assert limits(ROBOT, TIMED) == {}
     assert TIMED.describe() == "path line.csv of 2.00 m in 10 s, at most 0.2 m/s"

@@ -38,7 +38,7 @@ def test_way_points_are_met_at_their_times_to_the_end_and_replayed_and_shown_wit
     assert 11.0 < 0.02 * len(places) < 14.0
     assert np.hypot(*(places[-1] - (1.4, 0.7))) < 0.08
     reported = [text for _, tick in stack.recorder.ticks for text in (getattr(r, "text", "") for r in tick)]
-    assert "task stopped: the path's end is reached" in reported
+    assert "task stopped: the end of the path is reached" in reported
     stack.run(0.5)
     assert stack.core.last.output.state is State.ARMED
     assert stack.core.last.pipeline.source is Source.HOLD

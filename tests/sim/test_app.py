@@ -271,7 +271,7 @@ def test_faults_at_run_time(start):
     assert robot.state()["x_m"] == pytest.approx(0.5, abs=0.01)
     assert robot.command("estop_button on") == "ok"
     wait_until(lambda: robot.state()["state"] == "ESTOP", 30.0)
-    assert robot.command("nonsense").startswith("error: 'nonsense' is no command")
+    assert robot.command("nonsense").startswith("error: 'nonsense' is not a command")
     assert robot.command("babble 0x100 200") == "ok"
     with UnixCanBus(str(robot.channel), can_filters=[{"can_id": 0x100, "can_mask": 0x7FF}]) as bus:
         assert [bus.recv(30).arbitration_id for _ in range(20)] == [0x100] * 20

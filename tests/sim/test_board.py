@@ -185,7 +185,7 @@ def test_a_line_on_which_no_virtual_robot_is_awaited_is_refused(line, capsys, mo
     monkeypatch.setattr(app, "BOARD_S", 0.3)
     port = line(0x130, bytes(8))
     reported = refused(capsys, board=port)
-    assert f"--board {port}: no plant's line answers here" in reported
+    assert f"--board {port}: no answer on the plant's line" in reported
     assert "-DDISCO_PLANT_LINE" in reported
 
 
@@ -202,4 +202,4 @@ def test_a_port_that_is_not_there_is_refused(monkeypatch, capsys, tmp_path):
 @pytest.mark.parametrize(("kind", "lasts"), [("reboot", {}), ("clock_jump", {}), ("unplug", {"for_s": 1.0})])
 def test_faults_of_what_is_the_boards_own_are_refused(line, capsys, kind, lasts):
     faults = schedule_of({"fault": [{"kind": kind, "at_s": 1.0, **lasts}]}, "faults.toml")
-    assert f"{kind}: not with --board" in refused(capsys, board=line(ABOUT, bytes(8)), faults=faults)
+    assert f"{kind}: cannot be used with --board" in refused(capsys, board=line(ABOUT, bytes(8)), faults=faults)

@@ -268,14 +268,14 @@ def test_state_answers_with_a_row_of_the_truth(injection):
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("", "no command"),
-        ("explode", "'explode' is no command; say one of bus_off, unplug"),
+        ("", "not a command"),
+        ("explode", "'explode' is not a command; write one of bus_off, unplug"),
         ("unplug", "0 arguments given; usage: unplug SECONDS"),
         ("unplug x", "not a number"),
         ("unplug nan", "not within 0 to 3600"),
         ("unplug -1", "not within"),
         ("unplug 1e9", "not within"),
-        ("estop_button maybe", "say on or off"),
+        ("estop_button maybe", "write on or off"),
         ("estop_button on off", "2 arguments given"),
         ("kidnap 1 2", "usage: kidnap DX_M DY_M DYAW_RAD"),
         ("kidnap inf 0 0", "not within"),
@@ -283,7 +283,7 @@ def test_state_answers_with_a_row_of_the_truth(injection):
         ("babble x 1", "write it as 0x100 or 256"),
         ("babble 1 1e12", "not within"),
         ("bus_off moon", "say host or robot"),
-        ("reboot moon", "say one of power_on, watchdog, brown_out"),
+        ("reboot moon", "write one of power_on, watchdog, brown_out"),
         ("state now", "1 arguments given"),
     ],
 )
@@ -310,7 +310,7 @@ def test_what_a_link_cannot_do_is_refused(robot):
 
 def test_every_command_is_described(injection):
     answer = injection.execute("help", 0)
-    named = answer.partition("say one of ")[2].split(", ")
+    named = answer.partition("write one of ")[2].split(", ")
     assert named == [line.split()[0] for line in COMMANDS.splitlines()]
 
 

@@ -40,7 +40,7 @@ def test_a_lemniscate_is_driven_changed_recorded_and_replayed_bit_for_bit(tmp_pa
     setup = load_setup(robot_file)
     stack = simulated_stack(robot_file=robot_file, start=BodyPose(*setup.config.task.course().start))
     stack.run(1.5)
-    with pytest.raises(TaskRefused, match=r"at most .* m/s, or widen it"):
+    with pytest.raises(TaskRefused, match=r"at most .* m/s, or a larger size"):
         changed_task(stack.core.task, {"speed_m_s": 3.0}, setup.config.robot, State.READY)
     changed = changed_task(stack.core.task, {"size_m": 1.0, "speed_m_s": 0.3}, setup.config.robot, State.READY)
     stack.core.set_task(changed)

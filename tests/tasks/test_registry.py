@@ -44,7 +44,7 @@ def test_another_kind_is_refused_with_those_that_there_are(kind):
     if kind is None:
         assert task_from(section) == CircleTask()
         return
-    with pytest.raises(UnknownKind, match="is no kind of task; write one of circle, lemniscate, path, timed_path"):
+    with pytest.raises(UnknownKind, match="is not a kind of task; write one of circle, lemniscate, path, timed_path"):
         task_from(section)
 
 
@@ -107,4 +107,4 @@ def test_the_lemniscate_crosses_itself_in_its_middle_and_is_as_large_as_it_says(
     assert (y.min(), y.max()) == pytest.approx((-0.5 - 2.0**-0.5, -0.5 + 2.0**-0.5), abs=1e-3)
     assert task.points()[0] == task.points()[-1] == pytest.approx((1.0, -0.5))
     assert task.course().length_m == pytest.approx(5.2441 * 2.0, rel=1e-3)
-    assert "with size_m the figure goes" in LemniscateTask(center_x_m=830.0, size_m=10.0).fault().fault
+    assert "with this size_m the figure reaches" in LemniscateTask(center_x_m=830.0, size_m=10.0).fault().fault

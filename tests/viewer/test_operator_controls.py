@@ -289,7 +289,7 @@ def test_the_desk_is_what_opens_and_nobody_else_may_frame_it(daemon):
 @pytest.mark.parametrize(
     ("status", "error", "words"),
     [(None, "no daemon listens", "no daemon listens"), ({"ok": False, "error": "not started"}, "", "not started"),
-     ({"ok": False}, "", "not started its loop")],
+     ({"ok": False}, "", "its loop does not run yet")],
 )  # fmt: skip
 def test_without_a_status_it_says_why(status, error, words):
     said = shown(status, error)

@@ -32,15 +32,15 @@ STATES = {
     "disconnected": {"state": "DISCONNECTED", "detail": LINK_ERROR, "robot_state": "UNKNOWN"},
     "handshake": {
         "state": "HANDSHAKE",
-        "detail": "no answer from the robot; is it switched on, and does it use the same bit rate?",
+        "detail": "no answer from the robot; check that it is switched on and uses the same bit rate",
     },
     "ready": {},
-    "armed": {"state": "ARMED", "detail": "armed, holding zero"},
+    "armed": {"state": "ARMED", "detail": "armed, commanding zero speed"},
     "running": {"state": "ARMED", "detail": "running the task", "running": True},
     "stopping": {
         "state": "STOPPING",
-        "detail": "the robot is no longer armed: no wheel command arrived in time; the link or this host was too slow; "
-        "waiting until the robot is disarmed and its wheels are still",
+        "detail": "the robot is no longer armed: no wheel command arrived in time: the link or this host was too slow; "
+        "check the load of both; waiting until the robot is disarmed and its wheels have stopped",
     },
     "fault": {
         "state": "FAULT",
@@ -51,7 +51,7 @@ STATES = {
         "state": "FAULT",
         "estop": True,
         "robot_state": "ESTOP",
-        "detail": "e-stop requested here; mend it, then reset",
+        "detail": "e-stop requested by the operator; mend it, then reset",
     },
     "by hand": {"state": "READY", "drive": HELD},
 }

@@ -191,7 +191,9 @@ def import_log(path: Path, robot: Path, out: Path, topics: Sequence[str] = (), c
     begin = begin_of(_existing_path(path), LOG, LONGEST_BEGIN_BYTES)
     log_format = format_of(begin)
     if begin.startswith(MAGIC) and (log_format is None or not log_format.has_topics):
-        raise LogError(f"{path}: an MCAP log; ours needs no import, and of others only those of ROS 2 can be imported")
+        raise LogError(
+            f"{path}: an MCAP log; a log of disco-hw needs no import, and of others only those of ROS 2 can be imported"
+        )
     if log_format is None:
         names = ", ".join(each.name for each in log_formats())
         raise LogError(f"{path}: none of the formats that can be imported ({names}); write a CSV")

@@ -103,7 +103,7 @@ def read_dump(path: Path) -> Dump:
         hint = "not a candump; record with `candump -L`" if bad == filled else f"correct them, first line {first_bad}"
         notes.append(loss_note(str(path), "lines", bad, filled, what, hint))
     if not channels:
-        raise LogError(f"{path}: no frame in it; record with `candump -L`")
+        raise LogError(f"{path}: holds no frame; record with `candump -L`")
     return Dump(path, _increasing(path, np.array(t_ns, dtype=np.int64), notes), dict(channels), tuple(notes))
 
 
@@ -197,7 +197,9 @@ def read_candump(path: Path, robot: Robot, channel: str = "", usual_channel: str
     robots = {each: rows for each, rows in found.items() if rows.count}
     if not robots:
         frames = sum(rows.frames for rows in found.values())
-        raise LogError(f"{path}: {frames} frames, none of them a command, wheel sample or pose of our protocol")
+        raise LogError(
+            f"{path}: {frames} frames, none of them a command, wheel sample or pose of the reference protocol"
+        )
     if len(robots) > 1 and usual_channel not in robots:
         counts = ", ".join(f"{each} with {rows.count} records" for each, rows in robots.items())
         raise LogError(f"{path}: several channels hold a robot ({counts}); name one with --channel")

@@ -241,8 +241,8 @@ def _with_new_segments(
         )
     if count:
         notes.append(
-            f"{sheet.name}: an encoder was set anew {count} times, first at t_s {t_s[restart][0]:.9g}; "
-            "new segments begin there"
+            f"{sheet.name}: an encoder was reset {count} times, first at t_s {t_s[restart][0]:.9g}; new segments "
+            "begin there"
         )
     if unknown:
         notes.append(

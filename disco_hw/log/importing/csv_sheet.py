@@ -91,7 +91,7 @@ def read_sheet(path: Path) -> Sheet:
         raise LogError(f"{path}: not a CSV file ({error}); give an MCAP log or a CSV file") from None
     notes = [*_notes_on_rows(path, header, faults), *_notes_on_cells(path, columns, faults)]
     if not lines:
-        raise LogError(f"{path}: a header and no rows; nothing was recorded in it")
+        raise LogError(f"{path}: has a header but no rows; nothing was recorded in it")
     ignored = [name for name in header if name not in _KNOWN]
     if ignored:
         notes.append(f"{path}: ignored columns: {', '.join(ignored)}")
@@ -165,7 +165,7 @@ def _number(text: str) -> tuple[float, bool]:
 def _check_header(path: Path, header: Sequence[str]) -> None:
     doubled = sorted({name for name in header if header.count(name) > 1})
     if doubled:
-        raise LogError(f"{path}: column {doubled[0]} is there twice; keep one")
+        raise LogError(f"{path}: column {doubled[0]} appears twice; keep one")
     missing = [name for name in (TIME, *COMMAND) if name not in header]
     for group in (SPEED, TICKS, POSITION):
         if any(name in header for name in (*group, *((YAW,) if group == POSITION else ()))):
@@ -184,7 +184,7 @@ def _notes_on_rows(path: Path, header: Sequence[str], faults: _Faults) -> Iterat
     if faults.is_cut:
         yield f"{path}: the last line is cut off and was left out; the recording did not end regularly"
     for bad, what in (
-        (faults.uneven, f"have not the {len(header)} cells of the header"),
+        (faults.uneven, f"do not have the {len(header)} cells of the header"),
         (faults.timeless, f"have no {TIME}"),
     ):
         if bad:
@@ -204,7 +204,7 @@ def _notes_on_cells(path: Path, columns: dict[str, Array], faults: _Faults) -> I
             total = max(int(np.count_nonzero(filled)), len(bad))
             yield loss_note(
                 str(path), signal, len(bad), total,
-                f"have a cell that is no number and were left out, the first in line {line}: {name} is {text!r}",
+                f"have a cell that is not a number and were left out, the first in line {line}: {name} is {text!r}",
                 "leave a cell without sample empty",
             )  # fmt: skip
 
@@ -254,7 +254,7 @@ def _merged(path: Path, place: Index, columns: dict[str, Array], several: int, n
             notes.append(
                 loss_note(
                     str(path), signal, conflicts, total, "samples have the time of another sample and were left out",
-                    f"the clock stands still; give each sample the {TIME} at which it was true",
+                    f"the clock does not advance; give each sample the {TIME} at which it was true",
                 )
             )  # fmt: skip
     return found

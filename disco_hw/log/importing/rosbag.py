@@ -140,7 +140,9 @@ def _columns(bag: Bag, choice: Choice, config: RobotConfig, undecoded: dict[str,
     transforms = {one.name for one in bag.topics.values() if one.type in TRANSFORMS} if by_tf else set()
     for number, message in enumerate(bag.messages({*takes, *transforms}, undecoded=undecoded)):
         if number >= _MOST_MESSAGES:
-            raise LogError(f"{bag.path}: over {_MOST_MESSAGES} messages of its topics; record its topics alone")
+            raise LogError(
+                f"{bag.path}: over {_MOST_MESSAGES} messages on the topics that are read; record only these topics"
+            )
         for role, read_row in takes.get(message.topic, ()):
             try:
                 columns[role].add(message.log_ns, stamp_of(message.value), finite(read_row(message.value)))

@@ -109,7 +109,7 @@ def _one_used(bag: Bag, role: str, found: list[TopicCandidate], configured: str)
             bag, role, configured
         )
         others = [one for one in found if one.topic != configured]
-        return [replace(named, used=True, why=f"asked for; {named.why}"), *others]
+        return [replace(named, used=True, why=f"requested; {named.why}"), *others]
     # What ranks 100 and more is never taken unasked, 200 cannot be read.
     return [replace(one, used=at == 0 and one.rank < 100) for at, one in enumerate(found)]
 

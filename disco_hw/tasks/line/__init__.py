@@ -233,7 +233,7 @@ def load_waypoints(path: Path) -> Waypoints:
         apart = np.hypot(*np.diff(places, axis=0).T)
         if np.any(apart < LEAST_DISTANCE_M):
             line = lines[int(np.argmax(apart < LEAST_DISTANCE_M)) + 1]
-            raise InputError(f"{path}: line {line}: the same way-point again; remove it, or give times in t_s")
+            raise InputError(f"{path}: line {line}: repeats the way-point before it; remove it, or give times in t_s")
     elif np.any(np.diff(times) <= 0.0):
         line = lines[int(np.argmax(np.diff(times) <= 0.0)) + 1]
         raise InputError(f"{path}: line {line}: t_s does not increase; sort the way-points by time")
@@ -277,8 +277,8 @@ def check_size(path: Path, found: Waypoints) -> None:
     if beyond.size:
         row, column = beyond[0].tolist()
         raise InputError(
-            f"{path}: line {found.lines[row]}: {'xy'[column]}_m: {found.places_m[row, column]:g}, and poses go "
-            f"{FARTHEST_M:g} m from the origin at most; write way-points in the frame of the poses"
+            f"{path}: line {found.lines[row]}: {'xy'[column]}_m: {found.places_m[row, column]:g} is more than "
+            f"{FARTHEST_M:g} m from the origin; write way-points in the frame of the poses"
         )
 
 

@@ -166,8 +166,8 @@ def straight_too_fast(speed_m_s: float, robot: Chassis) -> str | None:
     if speed_m_s <= fastest:
         return None
     return (
-        f"{speed_m_s:g} m/s asks the wheels for more than {robot.max_wheel_speed_rad_s:g} rad/s; "
-        f"at most {math.floor(fastest * 1000.0) / 1000.0:g} m/s"
+        f"{speed_m_s:g} m/s needs more than {robot.max_wheel_speed_rad_s:g} rad/s of the wheels; write at most "
+        f"{math.floor(fastest * 1000.0) / 1000.0:g} m/s"
     )
 
 
@@ -197,8 +197,8 @@ def refuse_hairpins(file: Path, waypoints: Waypoints) -> None:
     at_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(waypoints.places_m, axis=0).T))])
     first, last = (waypoints.lines[int(np.argmin(np.abs(at_m - there_m)))] for there_m in (begin_m, end_m))
     raise InputError(
-        f"{file}: lines {first} to {last}: the way turns twice within {least_m:g} m, too near for the robot, which may "
-        f"stop there for good; leave {math.ceil(10.0 * least_m) / 10.0:g} m between the turns, or turn at one way-point"
+        f"{file}: lines {first} to {last}: the path turns twice within {least_m:g} m, where the robot may stop and "
+        f"not continue; leave {math.ceil(10.0 * least_m) / 10.0:g} m between the turns, or turn at one way-point"
     )
 
 

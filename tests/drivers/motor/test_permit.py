@@ -67,7 +67,7 @@ FOREIGN = {
     **GONE, "shared": True, "note": f"disarmed: {TAKEN}", "fault": TAKEN, "events": (SHARED, f"disarmed: {TAKEN}"),
 }  # fmt: skip
 ARMS = {"target": ARM, "stage": ARMING, "note": "arming", "since_ns": None, "zeros": 0, "speeds": (0.0, 0.0)}
-SLOWS = {"stage": STOPPING, "note": "stopping as asked", "since_ns": None}
+SLOWS = {"stage": STOPPING, "note": "stopping as requested", "since_ns": None}
 GIVEN_UP = {**GONE, "note": "why"}
 LOOKED = {"looked_ns": NOW, "attentive_ns": NOW}
 SAME = {
@@ -84,8 +84,8 @@ SAME = {
     "e-stop": STOPPED,
     "e-stop heard": RECEIVED,
     "command heard": FOREIGN,
-    "arm": {"note": "not arming: it stands by"},
-    "arm, unfit": {"note": "not arming: it stands by"},
+    "arm": {"note": "not arming: on standby"},
+    "arm, unfit": {"note": "not arming: on standby"},
 }
 """What an event changes wherever nothing else is said below; nothing where it is not named either."""
 AT_REST = {"command heard": {"shared": True, "events": (SHARED,)}}
@@ -163,14 +163,14 @@ STATES = [
     ({"stage": ARMED}, ILL["faulty"], DriverState.FAULT, "why; remove the cause, then reset"),
     ({"stage": ARMED, "note": "armed"}, HOT, DriverState.ARMED, "armed"),
     ({"stage": ARMING, "target": ARM, "note": "arming"}, HOT, DriverState.ARMING, "arming"),
-    ({"stage": STOPPING, "target": READY}, WELL, DriverState.STOPPING, "it stands by"),
-    ({"stage": BRAKING, "target": READY}, WELL, DriverState.STOPPING, "it stands by"),
-    ({"target": READY}, HOT, DriverState.STOPPING, "it stands by"),
-    ({"target": READY}, WELL, DriverState.READY, "it stands by"),
+    ({"stage": STOPPING, "target": READY}, WELL, DriverState.STOPPING, "on standby"),
+    ({"stage": BRAKING, "target": READY}, WELL, DriverState.STOPPING, "on standby"),
+    ({"target": READY}, HOT, DriverState.STOPPING, "on standby"),
+    ({"target": READY}, WELL, DriverState.READY, "on standby"),
     ({"target": READY}, ILL["unfit"], DriverState.READY, "why"),
-    ({}, WELL, DriverState.STANDBY, "it stands by"),
+    ({}, WELL, DriverState.STANDBY, "on standby"),
     ({}, ILL["unfit"], DriverState.STANDBY, "why"),
-    ({"target": RESET}, WELL, DriverState.STANDBY, "it stands by"),
+    ({"target": RESET}, WELL, DriverState.STANDBY, "on standby"),
 ]
 
 

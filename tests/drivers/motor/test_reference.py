@@ -33,7 +33,7 @@ def test_says_what_it_waits_for():
     assert driver.state is DriverState.HANDSHAKE
     assert "no answer from the robot" in driver.detail
     driver.request(Request.ARM)
-    assert driver.detail == "no answer from the robot; is it switched on, and does it use the same bit rate?"
+    assert driver.detail == "no answer from the robot; check that it is switched on and uses the same bit rate"
     bench = make_bench()
     bench.driver = driver
     bench.run_until(*STILL)
@@ -105,7 +105,7 @@ def test_a_robot_that_falls_silent_starts_a_new_handshake():
     bench.loses = None
     bench.largest_speed = 0.0
     bench.run_until(*STILL)
-    assert bench.driver.detail == "disarmed: the robot fell silent"
+    assert bench.driver.detail == "disarmed: the robot stopped sending"
     bench.run(2.0)
     assert bench.largest_speed == 0.0
 
@@ -128,7 +128,7 @@ def test_arming_is_given_up_with_the_robots_own_reason():
     bench.driver.request(Request.ARM)
     assert bench.driver.state is DriverState.ARMING
     bench.run_until(*STILL, timeout_s=1.6)
-    assert "not armed within 1.5 s" in bench.driver.detail
+    assert "the robot did not arm within 1.5 s" in bench.driver.detail
     assert "the wheels are turning" in bench.driver.detail
     bench.robot.pushed = 0.0
     bench.run(2.0)
@@ -174,7 +174,7 @@ def test_an_estop_from_outside_is_no_second_host_and_is_said_once_a_stop():
     """As `disco-hw estop` sends it beside the daemon: three frames, which the robot and the driver both receive."""
     bench = make_bench()
     bench.arm()
-    reported = "e-stop from outside on the link, by `disco-hw estop` or another host"
+    reported = "e-stop received on the link, sent by `disco-hw estop` or another host"
     for stops in (1, 2):
         for _ in range(3):
             bench.inject_to_robot(*CODEC.encode("ESTOP", reason="UNSPECIFIED"))
@@ -268,7 +268,10 @@ def test_silence_is_noticed_by_each_half_of_a_tick(call):
     bench.run_until(*STILL)
     driver, later_ns = bench.driver, bench.now_ns + 501 * MS
     if call == "receive":
-        assert "the robot fell silent: new handshake" in driver.receive(later_ns, ()).events
+        assert (
+            "the robot stopped sending: starting a new handshake; check the cable and the robot's power"
+            in driver.receive(later_ns, ()).events
+        )
     else:
         driver.transmit(later_ns, None)
     assert driver.state is DriverState.HANDSHAKE
@@ -291,7 +294,7 @@ def test_a_silence_counts_only_beyond_its_limit_which_is_longer_for_a_robot_that
     received_ns = bench.driver._last_received_ns
     assert bench.driver.receive(received_ns + silence_ms * MS, ()).events == ()
     assert bench.driver.receive(received_ns + silence_ms * MS + 1, ()).events == (
-        "the robot fell silent: new handshake",
+        "the robot stopped sending: starting a new handshake; check the cable and the robot's power",
     )
     assert bench.driver.state is DriverState.HANDSHAKE
 
@@ -307,7 +310,9 @@ def test_a_robot_that_has_shown_only_its_state_can_fall_silent_too():
         now_ns = START_NS + counter * MS
         driver.receive(now_ns, [ReceivedFrame(now_ns, Frame(*frame))])
     assert driver.identity is driver.limits is None
-    assert driver.receive(START_NS + 504 * MS, ()).events == ("the robot fell silent: new handshake",)
+    assert driver.receive(START_NS + 504 * MS, ()).events == (
+        "the robot stopped sending: starting a new handshake; check the cable and the robot's power",
+    )
 
 
 def test_a_robot_that_has_shown_all_but_its_state_can_fall_silent_too():
@@ -316,7 +321,10 @@ def test_a_robot_that_has_shown_all_but_its_state_can_fall_silent_too():
     build = answer("BUILD", dbc_hash=CODEC.dbc_hash, board_id=1)
     driver.receive(START_NS, [hello(), limits(0), limits(1), build])
     assert driver.identity is not None
-    assert "the robot fell silent: new handshake" in driver.receive(START_NS + 501 * MS, ()).events
+    assert (
+        "the robot stopped sending: starting a new handshake; check the cable and the robot's power"
+        in driver.receive(START_NS + 501 * MS, ()).events
+    )
 
 
 def test_a_robot_that_turns_out_to_be_another_is_commanded_no_more():
@@ -335,7 +343,7 @@ def test_an_emergency_stop_of_ours_ends_the_wish_to_be_armed():
     bench.arm()
     bench.driver.estop(bench.now_ns)
     assert bench.driver.state is DriverState.STOPPING
-    assert "no longer wanted" in bench.driver.detail
+    assert "without a request from this host" in bench.driver.detail
     bench.run(1.0, (1.0, 1.0))
     assert not bench.robot.armed, "even if the frames themselves are lost"
 

@@ -192,7 +192,7 @@ def test_arming_that_takes_too_long_is_given_up_with_the_robots_reason():
     assert one.target is Request.ARM
     one.step(start_ns + ARMING_TIMEOUT_NS + 1)
     assert one.target is Request.STANDBY
-    for words in ("not armed within 1.5 s", "challenge is not answered", "wheels are turning", "was wrong"):
+    for words in ("the robot did not arm within 1.5 s", "challenge is not answered", "wheels are turning", "was wrong"):
         assert words in one.note
     report(one, "ARMED")
     assert not one.armed, "an arming that comes too late is not taken"
@@ -336,7 +336,7 @@ def test_another_major_version_is_refused_at_the_first_frame():
 def test_another_hash_may_be_read_but_is_refused():
     handshake = take(Handshake(1, 0, 0x0000BEEF), *FRAMES)
     assert handshake.limits is not None
-    for words in ("cafe1234", "0000beef", "telemetry only", "flash"):
+    for words in ("cafe1234", "0000beef", "can be read but not driven", "flash"):
         assert words in handshake.refusal
 
 
@@ -352,11 +352,12 @@ def test_limits_that_make_no_sense_are_refused(page, name):
     broken = [(kind, {**values, name: 0} if values.get("page") == page else values) for kind, values in FRAMES]
     handshake = take(Handshake(1, 0, 0xCAFE1234), *broken)
     assert handshake.identity is handshake.limits is None
-    assert "make no sense" in handshake.refusal
+    assert "that are not above zero" in handshake.refusal
 
 
 @pytest.mark.parametrize(
-    ("has_key", "bits", "refusal"), [(False, 64, "obeys only who holds"), (True, 63, "takes commands from anybody")]
+    ("has_key", "bits", "refusal"),
+    [(False, 64, "accepts authenticated commands only"), (True, 63, "accepts commands without authentication")],
 )
 def test_a_key_on_one_end_alone_is_refused_in_words(has_key, bits, refusal):
     frames = [(name, {**values, "capabilities": bits} if name == "HELLO" else values) for name, values in FRAMES]

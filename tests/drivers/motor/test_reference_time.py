@@ -70,7 +70,7 @@ def test_a_restarted_robot_is_noticed_and_moves_nothing():
     bench.run(3.0)
     assert bench.driver.state in STILL
     assert bench.largest_speed == 0.0
-    assert bench.events.count("sample times contradict the robot's clock: synchronising anew") == 1
+    assert bench.events.count("sample times disagree with the robot's clock: synchronising the clocks again") == 1
     assert bench.wheels[-1].left_angle_rad == pytest.approx(angle, abs=0.05), "the encoder's new zero is no motion"
     assert bench.driver.synced
     bench.arm()
@@ -94,7 +94,7 @@ def test_a_clock_that_leaps_ahead_is_distinguished_from_a_restart():
     bench.run(4.0)
     bench.robot.boot_ns -= 3 * 1_310_720_000
     bench.run(3.0)
-    reported = "the robot's clock leapt: this computer slept, or the controller's clock is over 200 ppm off"
+    reported = "the robot's clock jumped: this computer was suspended, or the controller's clock is over 200 ppm off"
     assert bench.events.count(reported) == 1
     assert not any("restarted" in event for event in bench.events)
     assert bench.driver.state in STILL
@@ -104,7 +104,7 @@ def test_a_controller_whose_clock_goes_back_is_counted_and_goes_on():
     bench = make_bench(ReferenceRobot(boot_ns=START_NS - 10**10))
     bench.arm()
     bench.run(1.0, (3.0, 3.0))
-    reported = "the robot's controller found its clock set back and goes on with a time of its own"
+    reported = "the robot's controller saw its clock go backwards and counted a nominal period instead"
     for times in (1, 2):
         bench.robot.boot_ns += 15 * 10**6
         bench.run(1.0)

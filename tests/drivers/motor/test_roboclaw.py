@@ -85,7 +85,7 @@ def test_a_board_that_takes_no_commands_is_lost_though_it_answers(bench):
     bench.robot.receive = lambda now_ns, frame: None if frame.can_id & 0xFF == 40 else take(now_ns, frame)
     bench.run(0.3, FORWARD)
     assert bench.driver.state is DriverState.FAULT
-    assert "does not take its commands" in bench.driver.detail
+    assert "does not accept its commands" in bench.driver.detail
     assert bench.robot.controller.wheels_rad_s == (0.0, 0.0)
 
 

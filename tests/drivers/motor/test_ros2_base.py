@@ -38,8 +38,8 @@ def test_what_the_base_cannot_do_is_slowed_down_on_the_same_curve(bench):
 @pytest.mark.parametrize(
     ("fault", "words", "state"),
     [
-        ("others_speak", "another node speaks on /cmd_vel", DriverState.STANDBY),
-        ("has_listener", "nobody hears /cmd_vel", DriverState.HANDSHAKE),
+        ("others_speak", "another node publishes on /cmd_vel", DriverState.STANDBY),
+        ("has_listener", "no node subscribes to /cmd_vel", DriverState.HANDSHAKE),
     ],
 )
 def test_a_base_that_others_drive_or_that_hears_nobody_is_not_armed_and_disarmed(bench, end, fault, words, state):
@@ -103,7 +103,7 @@ def test_a_restart_of_the_base_alone_is_seen_by_its_angles(bench, end):
     bench.robot.controller._zero_ticks = (-50_000, 50_000)
     bench.run(0.1, FORWARD)
     assert bench.driver.state is DriverState.FAULT
-    assert "angles jumped" in bench.driver.detail
+    assert "the angles of its wheels jumped" in bench.driver.detail
     assert bench.driver.stats.implausible_ticks == 1
 
 

@@ -138,12 +138,12 @@ def test_a_host_that_was_frozen_blames_itself_and_not_a_controller_whose_replies
     bench.host_runs = True
     late, bench.host_end.receive = bench.host_end.receive, lambda: ()
     bench.run(0.05)
-    assert "silent" not in bench.driver.detail
-    assert "does not take" not in bench.driver.detail
+    assert "stopped reporting" not in bench.driver.detail
+    assert "does not accept" not in bench.driver.detail
     bench.host_end.receive = late
     bench.largest_speed = 0.0
     bench.run(1.0)
-    assert "silent" not in f"{bench.driver.detail} {bench.events}"
+    assert "stopped reporting" not in f"{bench.driver.detail} {bench.events}"
     assert bench.driver.state is not DriverState.ARMED
     assert bench.largest_speed < 0.05
 
@@ -461,7 +461,7 @@ def test_a_controller_that_fell_silent_while_it_drove_is_a_fault_until_a_reset_t
     bench.robot.drain = drain
     bench.run(1.0)
     assert bench.driver.state is DriverState.FAULT
-    assert "silent" in bench.driver.detail
+    assert "stopped reporting" in bench.driver.detail
     bench.driver.request(Request.RESET)
     bench.run_until(*STILL)
 
@@ -509,8 +509,8 @@ def test_an_emergency_stop_that_is_heard_is_taken_at_once_and_said_once(vendor, 
         bench.robot_end.send(OutgoingFrame(frame, bench.now_ns), bench.now_ns)
     bench.run(0.02)
     assert bench.driver.state is DriverState.ESTOP
-    assert [event for event in bench.events if "outside" in event or "another host is" in event] == [
-        "stopped from outside on the link, by `disco-hw estop` or another host"
+    assert [event for event in bench.events if "received on the link" in event or "another host is" in event] == [
+        "e-stop received on the link, sent by `disco-hw estop` or another host"
     ]
 
 

@@ -57,7 +57,7 @@ def test_settings_of_another_layout_or_controller_are_not_used(payload):
     ("number", "value", "said"),
     [
         (220, bytes(4), "node 5: its watchdog is off"),
-        (221, struct.pack("<f", 2.0), "node 5: its watchdog waits 2 s; set 0.1 s there"),
+        (221, struct.pack("<f", 2.0), "node 5: its watchdog is set to 2 s; set it to 0.1 s"),
     ],
 )
 def test_an_odrive_whose_watchdog_is_another_is_refused(number, value, said):

@@ -107,6 +107,6 @@ def test_a_place_that_is_no_number_is_refused(load, line):
 )
 def test_a_field_of_another_source_is_refused_by_name(load, line, other):
     field = line.split()[0]
-    with pytest.raises(InputError, match=rf'pose\.{field}: a field of the source ".*", and pose\.source is "robot"'):
+    with pytest.raises(InputError, match=rf'pose\.{field}: belongs to the source ".*", but pose\.source is "robot"'):
         load(f"[pose]\n{line}\n")
     assert load(f'[pose]\nsource = "{other}"\n{line}\n').pose.source == other

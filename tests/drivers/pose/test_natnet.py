@@ -172,9 +172,9 @@ def test_by_multicast_with_the_exposures_age_and_a_lost_body(port):
     )
     found, said = until(source, lambda _, said: len(said) == 3)
     assert found == []
-    assert said[0] == "the cameras have lost rigid body 3"
-    assert said[1] == "datagrams that are no frames of NatNet 3.0; correct pose.natnet_version"
-    assert said[2] == "no rigid body 3 in Motive's frames, but none; correct pose.body"
+    assert said[0] == "the cameras do not see rigid body 3; check its markers"
+    assert said[1] == "datagrams received that are not frames of NatNet 3.0; correct pose.natnet_version"
+    assert said[2] == "rigid body 3 is not in Motive's frames, which have none; correct pose.body"
     assert (source.lost, source.malformed) == (3, 1)
     source.close()
     source.close()
@@ -218,7 +218,7 @@ def test_frames_of_a_second_server_are_refused_and_named(port):
         names = [f"127.0.0.1:{sender.getsockname()[1]}" for sender in (one, two)]
         found, said = until(source, lambda found, _: len(found) == 2)
     assert [pose.x_m for pose in found] == pytest.approx([1.0, 1.1])
-    assert any(f"{names[1]} sends poses beside {names[0]}: not used" in words for words in said)
+    assert any(f"{names[1]} sends poses while {names[0]} does: not used" in words for words in said)
     source.close()
 
 

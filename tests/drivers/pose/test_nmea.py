@@ -92,7 +92,7 @@ def test_what_is_no_fix_gives_none_and_breaks_nothing(broken):
 def test_a_datum_of_another_town_is_said():
     fixes = Fixes(datum=(47.0, 8.5))
     said = [each["said"] for each in fixes.add_line(GGA_ALONE, NOW_NS) if "said" in each]
-    assert "32097 m from the datum, and 838 m is the farthest; correct pose.datum" in said
+    assert "the position is 32097 m from the datum, and 838 m is the farthest allowed; correct pose.datum" in said
     assert len(fixes.add_line(GGA_ALONE, NOW_NS)) == 1
 
 
@@ -182,7 +182,7 @@ def test_over_a_serial_port_that_goes_away(ended):
     os.close(slave)
     os.close(master)
     _, said = until(source, lambda _, said: said)
-    assert "tried again until it is there" in said[-1]
+    assert "trying again until it is there" in said[-1]
 
 
 def test_over_tcp_with_a_server_that_comes_late_and_sends_garbage(ended):
@@ -196,7 +196,7 @@ def test_over_tcp_with_a_server_that_comes_late_and_sends_garbage(ended):
             receiver.sendall(bytes(range(256)) * 20 + b"\n" + GGA_ALONE)
             (pose,), _ = until(source, lambda found, _: found)
         assert (pose.x_m, pose.y_m) != (0.0, 0.0)
-        until(source, lambda _, said: any("tried again" in words for words in said))
+        until(source, lambda _, said: any("trying again" in words for words in said))
         again, _ = server.accept()
         opened(source)
         with again:
@@ -258,8 +258,8 @@ def test_a_fix_without_an_altitude_is_a_position_and_said_once(quality):
     found = taken(fix(quality, ""), fix(quality, ""), fix(quality), fix(quality, ""), fix(quality, ""))
     assert [(pose["x_m"], pose["y_m"]) for pose in poses(found)] == [pytest.approx((0.0, 0.0), abs=1e-6)] * 5
     assert [words for words in said_by(found) if "altitude" in words] == [
-        "GGA sentences come without an altitude: taken at 0 m",
-        "GGA sentences come without an altitude: taken at the last height, 547.6 m",
+        "GGA sentences lack an altitude; used instead: 0 m",
+        "GGA sentences lack an altitude; used instead: the last height, 547.6 m",
     ]
 
 
@@ -267,7 +267,7 @@ def test_a_fix_without_an_altitude_is_a_position_and_said_once(quality):
 def test_a_fix_without_time_or_place_is_no_position_and_said_once(broken):
     found = taken(fix(4, **broken), fix(4, **broken))
     assert poses(found) == []
-    assert said_by(found)[1:] == ["GGA sentences come without time, latitude or longitude: no positions of those"]
+    assert said_by(found)[1:] == ["GGA sentences lack time, latitude or longitude and give no position"]
 
 
 @pytest.mark.parametrize("talker", ["GP", "GN", "GL", "GA", "GB", "BD", "GQ"])
@@ -280,7 +280,7 @@ def test_a_heading_of_any_talker_is_read(talker, heading):
 
 @pytest.mark.parametrize(
     ("ths", "why"),
-    [("THS,123.4,V", "not valid"), ("THS,123.4,E", "reckoned"), ("THS,123.4,M", "typed in"),
+    [("THS,123.4,V", "not valid"), ("THS,123.4,E", "reckoned"), ("THS,123.4,M", "entered by hand"),
      ("THS,123.4,S", "simulated"), ("THS,,V", "not valid"), ("THS,123.4,", "unknown mode")],
 )  # fmt: skip
 def test_a_heading_that_the_receiver_does_not_measure_is_refused_and_said_once(ths, why):

@@ -63,7 +63,7 @@ def test_a_second_bridge_is_refused_and_named(source):
     assert [pose.x_m for pose in source.receive(NOW_NS, ())] == [1.0]
     words, refused = source.new_messages()
     assert words == "hello"
-    assert f"sends poses beside bridge process {os.getpid()}: not used" in refused
+    assert f"sends poses while bridge process {os.getpid()} does: not used" in refused
 
 
 def test_a_second_daemon_is_asked_to_take_another_port(source):

@@ -53,7 +53,7 @@ def test_a_flood_of_refused_datagrams_is_reported_once_in_ten_seconds_with_their
         gate.may_send(SECOND, t_ns)
     said = gate.new_messages()
     assert len(said) == 3
-    assert "127.0.0.1:4002 sends poses beside 127.0.0.1:4001: not used (1 datagrams); stop one of them" in said[0]
+    assert "127.0.0.1:4002 sends poses while 127.0.0.1:4001 does: not used (1 datagrams); stop one of them" in said[0]
     assert "(1000 datagrams)" in said[1]
     assert gate.new_messages() == []
 
@@ -68,7 +68,12 @@ def test_made_up_addresses_do_not_fill_the_memory():
 
 @pytest.mark.parametrize(
     ("addresses", "words"),
-    [((), "empty"), (("localhost",), '"localhost" is no IPv4'), (("10.0.0.0/40",), "no IPv4"), (("::1",), "no IPv4")],
+    [
+        ((), "empty"),
+        (("localhost",), '"localhost" is not an IPv4'),
+        (("10.0.0.0/40",), "not an IPv4"),
+        (("::1",), "not an IPv4"),
+    ],
 )
 def test_what_is_no_address_is_refused(addresses, words):
     with pytest.raises(ValueError, match=words):
@@ -80,11 +85,11 @@ def test_what_is_no_address_is_refused(addresses, words):
 @pytest.mark.parametrize(
     ("datagram", "words"),
     [
-        (b"", "without the proof"),
-        (b"x" * 39, "without the proof"),
-        (json.dumps(POSE).encode(), "without the proof"),
-        (proven(b"{}", key=bytes(16)), "without the proof"),
-        (proven(b"{}")[:-1] + b"\0", "without the proof"),
+        (b"", "without the authentication code"),
+        (b"x" * 39, "without the authentication code"),
+        (json.dumps(POSE).encode(), "without the authentication code"),
+        (proven(b"{}", key=bytes(16)), "without the authentication code"),
+        (proven(b"{}")[:-1] + b"\0", "without the authentication code"),
         (proven(b"{}", WALL_NS - 1_100_000_000), "1 s old or ahead by their sender's clock"),
         (proven(b"{}", WALL_NS + 3_000_000_000), "3 s old or ahead by their sender's clock"),
         (proven(b"{}", WALL_NS - 500_000_000), "sent again, or out of order"),
@@ -122,7 +127,7 @@ def test_over_a_real_socket_only_the_holder_of_the_key_is_heard():
     assert [(pose.x_m, pose.y_m) for pose in poses] == [(1.0, -2.0)]
     assert source.refused == 2
     (said,) = source.new_messages()
-    assert "sends poses without the proof of pose.key_file: not used" in said
+    assert "sends poses without the authentication code of pose.key_file: not used" in said
     source.close()
 
 

@@ -81,5 +81,5 @@ def test_an_address_that_is_none_is_refused_in_one_line():
 
 
 def test_without_the_file_there_is_no_such_kind():
-    with pytest.raises(TransportSettingsError, match='"udp" is no kind of link; write "can" or "serial"'):
+    with pytest.raises(TransportSettingsError, match='"udp" is not a kind of link; write "can" or "serial"'):
         create_transport("udp", channel="127.0.0.1:1")

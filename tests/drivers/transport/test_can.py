@@ -398,7 +398,7 @@ def test_a_bus_over_a_port_that_stays_mute_is_opened_again():
     transport.open()
     try:
         up(transport, generation=2)
-        assert "no frame has come for 0.2 s" in transport.last_error
+        assert "no frame received for 0.2 s" in transport.last_error
     finally:
         transport.close()
         terminal.remove()

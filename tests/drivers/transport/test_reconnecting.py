@@ -454,6 +454,6 @@ def test_a_link_is_left_open_while_frames_come_and_connected_again_when_none_doe
     try:
         assert second.wait(10.0)
         assert (reads[0], transport.generation) == (46, 2)
-        assert "no frame has come for 0.5 s" in transport.last_error
+        assert "no frame received for 0.5 s" in transport.last_error
     finally:
         transport.close()

@@ -115,7 +115,7 @@ def test_a_device_that_reads_nothing_blocks_nobody(transport, terminal):
     terminal.stop_reading()
     wait_until(lambda: median_send_s(transport) and transport.stats.expired and transport.stats.transmit_queue_full)
     assert median_send_s(transport) < WRITE_TIMEOUT_S / 2, "shorter by far than one write that waits for room"
-    wait_until(lambda: median_send_s(transport) and "takes no more bytes" in (transport.last_error or ""), 60.0)
+    wait_until(lambda: median_send_s(transport) and "accepts no more bytes" in (transport.last_error or ""), 60.0)
     assert transport.state is LinkState.UP
     time.sleep(0.1)
     terminal.received.clear()
@@ -144,7 +144,7 @@ def test_an_adapter_that_comes_back_under_another_number_is_found_by_its_lasting
         by_id.unlink()
         by_id.symlink_to(after.path)
         wait_until(lambda: transport.generation > generation)
-        assert re.search(r"no frame has come for 0\.[36] s", transport.last_error)
+        assert re.search(r"no frame received for 0\.[36] s", transport.last_error)
         assert "/dev/serial/by-id" in transport.last_error
         assert answer_of(after)[-1].frame == FRAME
         wait_until(lambda: transport.last_error is None)
@@ -294,5 +294,5 @@ def test_a_socket_at_which_nobody_listens_is_reported_in_one_line(listener):
     with pytest.raises(serial.SerialException) as refused:
         medium.connect(TransportCounters())
     assert medium.explain(refused.value) == (
-        f"{listener.url}: nobody listens there; start the serial server or the emulator, or correct the port"
+        f"{listener.url}: nothing listens there; start the serial server or the emulator, or correct the port"
     )

@@ -92,7 +92,7 @@ def test_frames_that_fail_their_check_are_left_out_and_counted(tmp_path):
         ("(1.0) can0 7FF#00\n(1.1) can0 7FF#00\n(1.", "2 frames, none of them a command"),
         ("(1.0) can0 7FF#00\nx\ny\n", r"lines: 2 of 3 are no frame .*the first is line 2 \(67 %\); correct them"),
         ("can0  110   [8]  00 01 02 03 04 05 06 07\n", "screen format without time stamps; record with `candump -L`"),
-        ("\n\n", "no frame in it"),
+        ("\n\n", "holds no frame"),
     ],
 )
 def test_what_is_no_such_dump_is_refused(tmp_path, text, message):

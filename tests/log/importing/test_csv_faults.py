@@ -87,7 +87,7 @@ def test_a_cell_that_is_no_number_costs_its_sample_and_no_other(tmp_path, text, 
         rows[k][column] = text
     drive = read(tmp_path, as_text(rows))
     assert sizes(drive) == expected
-    assert f"{signal}: 3 of 100 have a cell that is no number" in only_note(drive)
+    assert f"{signal}: 3 of 100 have a cell that is not a number" in only_note(drive)
     assert f"the first in line 22: {column} is '{text}' (3.0 %)" in only_note(drive)
     assert not only_note(drive).startswith("warning: ")
 
@@ -102,7 +102,7 @@ def test_over_5_percent_of_a_signal_is_a_warning_and_over_half_an_error(tmp_path
     assert not only_note(read(tmp_path, spoilt(5))).startswith("warning: ")
     assert only_note(read(tmp_path, spoilt(6))).startswith("warning: ")
     assert only_note(read(tmp_path, spoilt(50))).startswith("warning: ")
-    assert "positions: 51 of 100 have a cell that is no number" in refusal(tmp_path, spoilt(51))
+    assert "positions: 51 of 100 have a cell that is not a number" in refusal(tmp_path, spoilt(51))
 
 
 def test_rows_of_another_width_are_left_out(tmp_path):
@@ -111,7 +111,7 @@ def test_rows_of_another_width_are_left_out(tmp_path):
     lines[20] = "1.0,2.0"
     drive = read(tmp_path, "\n".join(lines) + "\n")
     assert sizes(drive) == (98, 98, 98)
-    assert "2 of 100 have not the 8 cells of the header and were left out, the first in line 11" in only_note(drive)
+    assert "2 of 100 do not have the 8 cells of the header and were left out, the first in line 11" in only_note(drive)
 
 
 def test_a_row_without_a_time_is_left_out(tmp_path):
@@ -204,7 +204,7 @@ def test_rows_of_one_time_that_contradict_each_other_are_counted_by_signal(tmp_p
     assert "positions: 10 of 70 samples have the time of another sample and were left out (14 %)" in drive.notes[0]
     assert not any("wheel speeds" in note for note in drive.notes)
     standing = [row | {"t_s": f"{0.05 * (k // 4):.2f}"} for k, row in enumerate(table())]
-    assert "the clock stands still" in refusal(tmp_path, as_text(standing))
+    assert "the clock does not advance" in refusal(tmp_path, as_text(standing))
 
 
 def test_positions_without_a_yaw_column_are_read(tmp_path):
@@ -246,7 +246,7 @@ def test_ticks_that_wrap_are_made_continuous_wheel_by_wheel(tmp_path, span, both
 def test_an_encoder_that_is_set_anew_begins_a_new_segment(tmp_path):
     drive = read_ticks(tmp_path, with_ticks(lambda ticks: ticks if ticks < 5000 else ticks - 5000))
     assert drive.segments == 2
-    assert "an encoder was set anew 1 times, first at t_s 7.7; new segments begin there" in only_note(drive)
+    assert "an encoder was reset 1 times, first at t_s 7.7; new segments begin there" in only_note(drive)
     assert np.abs(drive.wheels.left_speed_rad_s).max() < 2.1
     assert drive.poses.segment[-1] == drive.commands.segment[-1] == 1
 

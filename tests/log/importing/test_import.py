@@ -45,7 +45,7 @@ def test_a_candump_is_distinguished_from_a_csv_file_by_its_content(robot, tmp_pa
 
 def test_our_own_logs_need_no_import(robot, tmp_path):
     import_log(write_log(tmp_path / "log.csv", "poor"), robot, tmp_path / "log.mcap")
-    with pytest.raises(LogError, match="an MCAP log; ours needs no import"):
+    with pytest.raises(LogError, match="an MCAP log; a log of disco-hw needs no import"):
         import_log(tmp_path / "log.mcap", robot, tmp_path / "again.mcap")
 
 

@@ -117,8 +117,8 @@ def test_it_is_refused_with_its_lines_and_the_remedy(tmp_path):
     with pytest.raises(InputError) as caught:
         load_setup(path_robot(tmp_path, csv))
     assert str(caught.value) == (
-        f"{tmp_path}/path.csv: lines 4 to 5: the way turns twice within 0.28 m, too near for the robot, which may stop "
-        "there for good; leave 0.3 m between the turns, or turn at one way-point"
+        f"{tmp_path}/path.csv: lines 4 to 5: the path turns twice within 0.28 m, where the robot may stop and not "
+        "continue; leave 0.3 m between the turns, or turn at one way-point"
     )
     assert load_setup(path_robot(tmp_path, csv.replace("0.2", "0.4"))).config.task.points[2] == (1.0, 0.4)
 

@@ -41,7 +41,7 @@ def test_columns_by_name_in_any_order_others_ignored(tmp_path):
         ("x_m,y_m\n0,0\n1,one\n", "line 3: y_m: 'one' is not a finite number; write one"),
         ("x_m,y_m\n0,0\nnan,1\n", "line 3: x_m: 'nan' is not a finite number"),
         ("x_m,y_m\n0,0\n1\n", "line 3: y_m: None is not a finite number"),
-        ("x_m,y_m\n0,0\n1,1\n1,1\n", "line 4: the same way-point again; remove it"),
+        ("x_m,y_m\n0,0\n1,1\n1,1\n", "line 4: repeats the way-point before it; remove it"),
         ("x_m,y_m,t_s\n0,0,0\n1,1,1\n2,2,1\n", "line 4: t_s does not increase; sort"),
     ],
 )
@@ -68,12 +68,12 @@ def test_lines_are_counted_as_an_editor_does_and_a_spreadsheets_mark_is_no_name(
     [
         (
             "x_m,y_m,t_s\n0,0,0\n1,1,1\n",
-            "line 1: column t_s: the robot follows at task.speed_m_s; remove the column.*timed_path",
+            "line 1: column t_s: a path is followed at task.speed_m_s; remove the column.*timed_path",
         ),
         ("x_m,y_m\n0,0\n0.05,0\n", "0.05 m long; between 0.1 and 2000 m"),
         ("x_m,y_m\n0,0\n1e30,0\n", "long; between 0.1 and 2000 m"),
-        ("x_m,y_m\n0,0\n1,-839\n", "line 3: y_m: -839, and poses go 838 m from the origin at most"),
-        ("x_m,y_m\n500000,838\n500010,838\n", "line 2: x_m: 500000, and poses go.*in the frame of the poses"),
+        ("x_m,y_m\n0,0\n1,-839\n", "line 3: y_m: -839 is more than 838 m from the origin"),
+        ("x_m,y_m\n500000,838\n500010,838\n", "line 2: x_m: 500000 is more than.*in the frame of the poses"),
         (
             "x_m,y_m\n" + "".join(f"{0.001 * k},0\n" for k in range(10_001)),
             "over 10000 way-points; write at most",
@@ -106,7 +106,7 @@ def test_way_points_to_meet_may_rest_and_pass_one_place_twice(tmp_path):
         ("t_s,x_m,y_m\n-1,0,0\n4,1,1\n", "line 2: t_s: -1 is before the start; begin at 0 or later"),
         (
             "t_s,x_m,y_m\n0,0,0\n4,1,0\n\n5,1,0.6\n",
-            "line 5: t_s: 0.6 m from line 3 in 1 s, and the wheels can do 0.5 m/s; be there at 5.2 or later",
+            "line 5: t_s: 0.6 m from line 3 in 1 s, but the wheels reach 0.5 m/s at most; write 5.2 or later",
         ),
         ("t_s,x_m,y_m\n0,0,0\n4,0,0\n", "0 m long; between 0.1 and 2000 m"),
         ("t_s,x_m,y_m\n4,0,0\n4,1,0\n", "line 3: t_s does not increase"),
