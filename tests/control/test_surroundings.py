@@ -154,7 +154,6 @@ def drive(planner, bounds: Boundaries, seconds: float, state=(0.75, 0.0, 1.57)):
     return np.array(poses), outcomes
 
 
-@pytest.mark.thorough
 def test_a_pillar_on_the_line_is_driven_around_and_the_line_rejoined(planner):
     pillar = bounds_of(Fence(keep_in=ROOM), [MovingCircle(0.0, 0.75, 0.12)])
     poses, _ = drive(planner, pillar, 20.0)
@@ -180,7 +179,6 @@ def test_where_there_is_no_way_the_robot_stands_before_it(planner):
     assert np.hypot(*(poses[-1, :2] - poses[-20, :2])) < 0.1
 
 
-@pytest.mark.thorough
 def test_a_robot_that_nothing_can_free_is_told_so(planner):
     buried = bounds_of(Fence(keep_in=ROOM), [MovingCircle(0.75, 0.0, 1.9)])
     _, outcomes = drive(planner, buried, 2.0)

@@ -80,7 +80,7 @@ def test_who_holds_in_vain_is_asked_once_to_let_go_when_the_robot_is_ready():
     ("loss", "words"),
     [
         ({"held": False}, "released"),
-        ({"held": True, "gone": True}, "gone"),
+        ({"held": True, "gone": True}, "disconnected"),
         ({"held": True, "age_ns": 200 * MS + 1}, "200 ms"),
         ({"held": True, "age_ns": -1}, "200 ms"),
     ],

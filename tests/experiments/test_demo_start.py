@@ -105,16 +105,23 @@ class Driven:
     ("lost", "cause", "said", "drives"),
     [
         (2, "COMMAND_TIMEOUT", b"", 3),
-        (2, "REQUESTED", b"event: armed -> stopping: telemetry lost\n", 3),
+        (
+            2,
+            "REQUESTED",
+            b"event: armed -> stopping: no wheel data from the robot; check the cable and the robot's power\n",
+            3,
+        ),
         (1, "REQUESTED", b"event: armed -> stopping: an e-stop\n", None),
         (3, "COMMAND_TIMEOUT", b"", None),
     ],
 )
 def test_a_drive_that_a_busy_machine_held_up_is_begun_anew(tmp_path, lost, cause, said, drives):
     output = tmp_path / "daemon.txt"
-    output.write_bytes(b"event: armed -> stopping: telemetry lost\n")
+    output.write_bytes(
+        b"event: armed -> stopping: no wheel data from the robot; check the cable and the robot's power\n"
+    )
     operator = Driven(output, lost, cause, said)
-    stack = Stack(tmp_path, tmp_path, None, SimpleNamespace(said=output.read_text), operator, None)
+    stack = Stack(tmp_path, tmp_path, None, SimpleNamespace(output_lines=output.read_text), operator, None)
     at_speed = lambda status: status["state"] == "ARMED"  # noqa: E731
     if drives is None:
         with pytest.raises(WorkError, match="not at speed"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import socket
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
@@ -249,6 +249,13 @@ def robot_file(directory, driver=None):
 def stage(path, steps, wrong, plant=None, effects=None, seed=1, raw_poses=False, limit_s=300.0):
     """Go through one stage of the guided drive; its result and the run."""
     setup = load_setup(path)
+    # As in `commission`, nothing is learnt while wheels are off the ground.
+    setup = replace(
+        setup,
+        config=msgspec.structs.replace(
+            setup.config, control=msgspec.structs.replace(setup.config.control, adaptation="off")
+        ),
+    )
     if raw_poses:
         setup = as_sent(setup)
     robot = MiswiredRobot(setup, plant or PlantParameters(), wrong, effects, seed)

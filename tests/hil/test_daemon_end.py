@@ -85,7 +85,6 @@ def daemon_that_fails(monkeypatch, error: str):
     monkeypatch.undo()
 
 
-@pytest.mark.thorough
 def test_an_exception_in_the_loop_stops_the_wheels_and_is_reported(tmp_path, monkeypatch):
     error = "RuntimeError"
     with daemon_that_fails(monkeypatch, error), running_stack(tmp_path) as stack:

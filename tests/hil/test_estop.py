@@ -19,7 +19,7 @@ pytestmark = pytest.mark.hil
     ("daemon", "link"),
     [
         ("frozen", "serial"),
-        pytest.param("healthy", "can", marks=pytest.mark.thorough),
+        ("healthy", "can"),
         pytest.param("healthy", "serial", marks=pytest.mark.long),
         pytest.param("frozen", "can", marks=pytest.mark.long),
     ],

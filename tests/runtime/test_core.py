@@ -212,6 +212,9 @@ class Moody:
     def reset(self) -> None:
         self.inner.reset()
 
+    def set_belief(self, belief) -> None:
+        self.inner.set_belief(belief)
+
 
 def test_a_planner_that_gives_up_is_followed_on_its_tail_then_the_wheels_ramp_down():
     setup = load_setup(ROBOT)
@@ -239,6 +242,9 @@ def test_the_wheels_of_a_tick_are_announced_before_it_is_planned_and_recorded():
             raise NoValidControl("planted")
 
         def reset(self):
+            pass
+
+        def set_belief(self, belief):
             pass
 
     stack = simulated_stack(Planner())
@@ -270,6 +276,9 @@ class Collapsing:
 
     def reset(self) -> None:
         self.inner.reset()
+
+    def set_belief(self, belief) -> None:
+        self.inner.set_belief(belief)
 
 
 def test_plans_that_hang_on_too_few_samples_are_reported_once():

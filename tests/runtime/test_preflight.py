@@ -72,7 +72,7 @@ def test_limits_within_the_firmwares_are_ok():
 def test_limits_that_nobody_has_looked_at_are_said_to_be_declared():
     declared = limits("robot.toml", ticks_per_rev=None, max_wheel_acceleration_rad_s2=None)
     (check,) = check_firmware_limits(robot(), declared)
-    assert check.text == "8 rad/s of 8, declared in robot.toml, not reported by the controller"
+    assert check.text == "8 rad/s of at most 8, declared in robot.toml, not reported by the controller"
     (check,) = check_firmware_limits(robot(max_wheel_speed_rad_s=8.1), declared)
     assert check.level is Level.FAIL
     assert "declared in robot.toml" in check.text
@@ -100,10 +100,10 @@ def test_each_difference_is_a_check_of_its_own():
 @pytest.mark.parametrize(
     ("rate_hz", "valid_for_s", "timeout_s", "level", "words"),
     [
-        (50.0, 0.1, 0.1, Level.OK, "3 in a row"),
-        (100.0, 0.1, 0.1, Level.OK, "8 in a row"),
-        (50.0, 0.1, 0.08, Level.OK, "2 in a row"),
-        (100.0, 0.1, 0.07, Level.OK, "5 in a row"),
+        (50.0, 0.1, 0.1, Level.OK, "3 commands in a row"),
+        (100.0, 0.1, 0.1, Level.OK, "8 commands in a row"),
+        (50.0, 0.1, 0.08, Level.OK, "2 commands in a row"),
+        (100.0, 0.1, 0.07, Level.OK, "5 commands in a row"),
         (50.0, 0.06, 0.1, Level.WARNING, "only 1"),
         (20.0, 0.1, 0.1, Level.WARNING, "not one"),
         (20.0, 0.1, 0.05, Level.FAIL, "between two commands"),

@@ -15,8 +15,8 @@ from tools.viewer_run import ROBOT_FILE
 _PARENT = """
 import sys, time
 from pathlib import Path
-from disco_hw.viewer import page_beside
-with page_beside(Path(sys.argv[1]), None, "127.0.0.1", int(sys.argv[2])) as page:
+from disco_hw.viewer import page_in_background
+with page_in_background(Path(sys.argv[1]), None, "127.0.0.1", int(sys.argv[2])) as page:
     print(page.pid, flush=True)
     time.sleep(60)
 """
@@ -79,12 +79,12 @@ def test_what_the_block_raises_is_passed_on(error):
 
 def test_a_killed_page_is_started_again_under_the_same_token_and_one_that_hangs_is_ended(capfd):
     port = free_port()
-    said = ""
+    output = ["", ""]
 
     def addresses():
-        nonlocal said
-        said += "".join(capfd.readouterr())
-        return re.findall(rf"http://127\.0\.0\.1:{port}/\?token=\S+", said)
+        output[:] = [before + new for before, new in zip(output, capfd.readouterr(), strict=True)]
+        pattern = rf"http://127\.0\.0\.1:{port}/\?token=\S+(?=\s)"
+        return [found for text in output for found in re.findall(pattern, text)]
 
     with page_in_background(ROBOT_FILE, None, "127.0.0.1", port) as page:
         wait_until(lambda: len(addresses()) == 1, 60.0)
@@ -99,5 +99,5 @@ def test_a_killed_page_is_started_again_under_the_same_token_and_one_that_hangs_
         wait_until(lambda: listens(port), 60.0)
         os.kill(page.pid, signal.SIGSTOP)
     assert page.returncode == -signal.SIGKILL
-    assert "page: the page was ended by SIGKILL; it is started again" in said
+    assert "page: the page was ended by SIGKILL; it is started again" in "".join(output)
     assert not listens(port)

@@ -166,7 +166,7 @@ def _after(name: str) -> Callable[..., Any]:
 _WORK = (
     "disco_hw.bridge.ros2.join_domain",
     "disco_hw.bridge.ros2_base.Clients",
-    "disco_hw.daemon.check.refuse_beside_a_daemon",
+    "disco_hw.daemon.check.refuse_while_daemon_runs",
     "disco_hw.daemon.send_request",
     "disco_hw.daemon.run._create_recorder",
     "disco_hw.daemon.emergency.open_transport",

@@ -42,7 +42,7 @@ class Term:
     `form` has a place for the coefficient. `model_name`: the term of `disco_hw.model.terms` that it is; None if a model
     cannot carry it, because it depends on what a model's state does not hold. `geometry`: wheel radius and axial
     distance (m) that the speeds in it are made with. `disc`: x, y and radius (m) of the floor that it is about.
-    `beside`: further waves of which it is the first, each with a coefficient of its own, and `usual` the standard
+    `further_waves`: those of which it is the first, each with a coefficient of its own, and `usual` the standard
     deviation that is expected of these. `highest`: a coefficient can be no larger.
     """
 
@@ -51,18 +51,18 @@ class Term:
     model_name: str | None = None
     geometry: tuple[float, float] = (1.0, 1.0)
     disc: tuple[float, float, float] | None = None
-    nuisance: tuple[Array, ...] = ()
+    further_waves: tuple[Array, ...] = ()
     usual: float = math.inf
     highest: float = math.inf
 
     @property
     def features(self) -> tuple[Array, ...]:
         """What its coefficients stand before."""
-        return (self.perturbation, *self.nuisance)
+        return (self.perturbation, *self.further_waves)
 
     def written(self, coefficients: Array) -> str:
         """The form with its number, from one coefficient a feature: of waves the root of their mean square."""
-        size = float(coefficients[0]) if not self.nuisance else float(np.sqrt(0.5 * (coefficients**2).sum()))
+        size = float(coefficients[0]) if not self.further_waves else float(np.sqrt(0.5 * (coefficients**2).sum()))
         return self.form.format(size)
 
 
@@ -136,7 +136,7 @@ def _waves(drive: GriddedDrive, v: Array, w: Array) -> Iterator[Term]:
     for axis, speed, name in ((0, v, "v_x += {:.2g} v"), (2, w, "omega += {:.2g} omega")):
         first, *others = (_on(axis, wave * speed) for wave in waves)
         yield Term(
-            f"{name} times what varies slowly with time", first, nuisance=tuple(others), usual=settings.usual_wave
+            f"{name} times what varies slowly with time", first, further_waves=tuple(others), usual=settings.usual_wave
         )
 
 

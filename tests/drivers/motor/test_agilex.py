@@ -112,7 +112,7 @@ def test_it_does_not_arm_while_the_base_moves(bench):
     bench.driver.request(Request.ARM)
     bench.run(0.3, FORWARD)
     assert bench.driver.state in STILL
-    assert "moves" in bench.driver.detail
+    assert "moving" in bench.driver.detail
     assert not [frame for frame in bench.robot.received if AGILEX.is_motion(frame)]
 
 

@@ -100,7 +100,10 @@ def test_armed_it_goes_on_hearing_the_robots_state_or_stops(lost):
     bench.run(0.55)
     assert not bench.robot.armed
     assert bench.robot.speed_rad_s == 0.0
-    assert bench.driver.detail == "disarmed: the robot has not sent its state for 0.5 s"
+    assert (
+        bench.driver.detail
+        == "disarmed: the robot has not sent its state for 0.5 s; check the cable and the load of the link"
+    )
     assert sum("has not sent its state" in event for event in bench.events) == 1
     lost_before = bench.driver.stats.lost_frames
     bench.robot.drain = drain

@@ -61,7 +61,7 @@ def test_it_does_not_arm_while_a_motor_turns():
     bench.driver.request(Request.ARM)
     bench.run(0.05, FORWARD)
     assert bench.driver.state in STILL
-    assert "turns" in bench.driver.detail
+    assert "is turning" in bench.driver.detail
     assert not [frame for frame in bench.robot.received if VESC.is_motion(frame)]
 
 

@@ -162,7 +162,7 @@ def scanned(monkeypatch):
             # One pair in three is lost where commands are not known.
             return (np.arange(turned.begin_s.size) % 3 > 0) | (abs(delay_s) <= known_s)
 
-        monkeypatch.setattr(WheelResponse, "misfits", misfits)
+        monkeypatch.setattr(WheelResponse, "mismatches", misfits)
         monkeypatch.setattr(WheelResponse, "known", known)
         monkeypatch.setattr(WheelResponse, "is_distinct", lambda *_: shared)
         chosen = replace(SETTINGS, **({"lags_s": (0.1, 0.3), "lag_reach_s": 0.12} | settings))
@@ -213,7 +213,7 @@ def test_lags_are_told_apart_where_they_fit_best_and_not_at_the_steps_of_the_sca
     # At the steps of the scan about 0.247 a lag of 0.1 s fits no better.
     told = scanned({0.0: (0.247, 1.0), 0.1: (0.157, 1.005)})
     assert (told.delay_s, told.lag_s) == (pytest.approx(0.157, abs=1e-3), 0.1)
-    assert told.misfit == pytest.approx(-1.005, abs=1e-3)
+    assert told.mismatch == pytest.approx(-1.005, abs=1e-3)
 
 
 def test_where_the_longest_delay_or_lag_fits_best_no_delay_is_known(scanned):

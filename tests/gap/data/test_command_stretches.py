@@ -72,7 +72,7 @@ def shown(monkeypatch):
             there = -np.maximum(depth - 100.0 * (delays - at_s) ** 2, 0.0)
             return np.where(np.abs(delays) <= known_s, there, np.inf)
 
-        monkeypatch.setattr(WheelResponse, "misfits", misfits)
+        monkeypatch.setattr(WheelResponse, "mismatches", misfits)
         return beside(begin_s)
 
     told.asked = asked
@@ -110,7 +110,7 @@ def test_the_misfit_of_a_stretch_at_an_age_is_that_of_all_its_pairs(shown):
 )
 def test_a_clock_is_sought_where_a_delay_is_known(monkeypatch, first, told):
     def clock_of(align, settings, least_error_s, least_nats):
-        assert (align.first, align.answer.lag_s) == (first, 0.1)
+        assert (align.first, align.response_model.lag_s) == (first, 0.1)
         assert (least_error_s, least_nats) == (settings.least_link_error_s, settings.least_link_nats)
         return "sought"
 

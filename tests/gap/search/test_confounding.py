@@ -215,7 +215,7 @@ def test_with_the_encoders_the_body_has_their_scale_and_no_asymmetry(monkeypatch
         SimpleNamespace(vector=np.array([0.5, 0.0, 0.0, 0.9])),
     )  # fmt: skip
     gains = SimpleNamespace(layout=SimpleNamespace(place={"wheel_gain.left": 0, "wheel_gain.right": 1}))
-    wheels = SimpleNamespace(told=SimpleNamespace(vector=np.array([0.11, 0.22])), selector=Selected(gains))
+    wheels = SimpleNamespace(reported=SimpleNamespace(vector=np.array([0.11, 0.22])), selector=Selected(gains))
     refitted, estimated = _with_encoder(body, wheels)
     assert refitted == ("fit", [0.5, 0.11, 0.22, 0.0], ("free", "slope"))
     assert estimated.names == ("slope",)

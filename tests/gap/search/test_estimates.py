@@ -26,7 +26,7 @@ def test_an_interval_is_widened_by_how_blocks_scatter_and_by_how_a_value_wanders
     low, high = np.array([-60.0, 0.0, -np.inf]), np.array([60.0, 1.0, np.inf])
     layout = SimpleNamespace(columns=("a", "b", "c"), low=low, high=high)
     channel = SimpleNamespace(layout=layout)
-    found = SimpleNamespace(told=told, selector=SimpleNamespace(channel=channel), names=())
+    found = SimpleNamespace(reported=told, selector=SimpleNamespace(channel=channel), names=())
     monkeypatch.setattr(channel_result, "interval_inflation", lambda best, of, active: {2: 4.0, 0: 1.44}[active[0]])
     monkeypatch.setattr(channel_result, "drifted", lambda of: {"c": 6.0})
     monkeypatch.setattr(channel_result, "_weightings_apart", lambda of: np.array([3.0, 0.0]))
@@ -60,10 +60,10 @@ def test_two_weightings_lie_apart_by_what_is_beyond_the_difference_of_their_vari
     evenly = SimpleNamespace(active=(2, 0, 1), vector=np.array([2.0, 0.0, 7.0]))
     deviations = {id(evenly): np.array([3.0, 1.0, 1.0]), id(told): np.array([2.0, 2.0, 1.0])}
     monkeypatch.setattr(channel_result, "deviations_of", lambda best, channel: deviations[id(best)])
-    found = SimpleNamespace(told=told, fit=told, evenly=evenly, channel=None)
+    found = SimpleNamespace(reported=told, fit=told, evenly=evenly, channel=None)
     # Half of 16 beyond 9 - 4, of 1 within 4 - 1, and of 4 beyond none.
     assert channel_result._weightings_apart(found).tolist() == [5.5, 0.0, 2.0]
-    assert channel_result._weightings_apart(SimpleNamespace(told=told, evenly=None)).tolist() == [0.0] * 3
+    assert channel_result._weightings_apart(SimpleNamespace(reported=told, evenly=None)).tolist() == [0.0] * 3
 
 
 def test_a_delay_is_known_as_well_as_the_stamps_are():
@@ -103,7 +103,7 @@ def test_a_profile_reaches_to_where_the_cost_has_risen_or_blocks_scatter(monkeyp
 def of_blocks(block, told=None, settings=DEFAULT_SETTINGS):
     layout = SimpleNamespace(columns=("x",), low=np.array([-np.inf]), high=np.array([np.inf]))
     channel = SimpleNamespace(block=np.asarray(block), settings=settings, layout=layout)
-    return SimpleNamespace(told=told, channel=channel, selector=SimpleNamespace(channel=channel))
+    return SimpleNamespace(reported=told, channel=channel, selector=SimpleNamespace(channel=channel))
 
 
 def test_a_value_wanders_by_what_halves_surely_differ_or_by_the_most_that_shorter_parts_do(monkeypatch):

@@ -60,7 +60,7 @@ def test_features_that_belong_together_have_a_coefficient_each_and_pay_for_each(
     found, rate = turning_less()
     half = np.where(np.arange(rate.size) < rate.size // 2, 1.0, 0.0)
     both = on_turning("{:.3g}", rate * half)
-    both = replace(both, beside=(on_turning("", rate * (1.0 - half)).perturbation,), usual=0.1)
+    both = replace(both, further_waves=(on_turning("", rate * (1.0 - half)).perturbation,), usual=0.1)
     channel = WithTerms.of(found.channel, (both, on_turning("{}", rate**3)))
     width = len(found.channel.layout.columns)
     assert channel.layout.columns[width:] == ("term0", "term0.1", "term1")

@@ -113,7 +113,7 @@ def test_a_term_of_which_what_is_fitted_does_the_most_is_not_tried(own, tried):
 
 def two(first, second):
     """A term of two features along some of the residuals."""
-    return replace(along(*first), nuisance=(along(*second).perturbation,))
+    return replace(along(*first), further_waves=(along(*second).perturbation,))
 
 
 def test_features_that_belong_together_pay_for_each_but_one():
@@ -312,7 +312,7 @@ def test_terms_are_added_until_none_is_accepted_and_no_more_than_three(monkeypat
 
 
 def test_all_coefficients_are_told_as_they_are_when_all_terms_are_in():
-    waves = UnnamedTerm("", None, replace(NOTHING, form="waves {:.2f}", nuisance=(NOTHING.perturbation,)))
+    waves = UnnamedTerm("", None, replace(NOTHING, form="waves {:.2f}", further_waves=(NOTHING.perturbation,)))
     single = UnnamedTerm("", None, replace(NOTHING, form="single {:.2f}"))
     last = UnnamedTerm("", None, replace(NOTHING, form="last {:.2f}"))
     found = Searched(unnamed=(single, waves, last), vector=(9.0, 9.0, 0.25, 0.6, -0.8, 0.5))
