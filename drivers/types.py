@@ -1,4 +1,4 @@
-"""What every driver speaks: the protocols of drivers and pose sources, and what a driver says of itself.
+"""Interfaces of drivers and pose sources, and the identity, limits and safety card that a driver reports.
 
 Frames and transports are in `drivers/link_types.py`, samples and commands in `drivers/samples.py`; both can be imported
 from here. SI units; left before right; positive wheel speed drives forward; x forward, y left, yaw counter-clockwise.

@@ -227,7 +227,7 @@ def start_pose(setup: Setup) -> tuple[float, float, float]:
 
 
 def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
-    """Drive and stop; return whether daemon and robot both reported that the robot stands, disarmed."""
+    """Drive and stop the robot; return whether daemon and robot both reported it standing and disarmed."""
     for old in (files.log, files.truth):
         old.unlink(missing_ok=True)
     setup = load_setup(files.robot)
