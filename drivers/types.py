@@ -309,7 +309,7 @@ class MotorDriver:
     each frame that is heard then, whether the robot has confirmed it. `slowest_rad_s`: the slowest wheel speed that
     it holds. `cyclic_frames` (of settings, command rate in Hz, whether authenticated): what the link carries.
     `authenticates`: whether there is such a mode; without one `link.key_file` is refused. `kinds`: of links that it
-    speaks over, the usual one first. `tells_reception`: whether the controller counts the frames that it rejects and
+    speaks over, the usual one first. `reports_reception`: whether the controller counts the frames that it rejects and
     answers for its clock, so that `check` can ask. `exchange` makes what a serial line is spoken with; None: the
     reference protocol's frames. `serial_field`: of the settings, one that belongs to a serial link, where it must be
     given, and to no other. `example`: its fields in [link] for a robot as the demonstration drives it; none where its

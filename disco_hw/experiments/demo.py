@@ -335,7 +335,7 @@ class _Floor:
 
 
 def _why_stopped(operator: Operator, status: Mapping[str, Any], elapsed_ms: int) -> WorkError:
-    """Return what to raise for a drive that ended before its laps; `taken_ms`: CPU time lost to the host just before.
+    """Return what to raise for a drive that ended before its laps; `elapsed_ms`: CPU time lost to the host just before.
 
     What the host takes bit by bit over a whole drive excuses nothing, hence only the last half second.
     """

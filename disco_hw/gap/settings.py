@@ -283,7 +283,7 @@ class PredictionSettings:
     """The one that the answer is about, or the longest below that runs are long enough for. Chosen: about as far as a
     planner looks."""
     folds: Folds = Folds(21.0, 2)
-    """Stretches that are left out in turn. Chosen: of seven blocks, longer than `WANDER_S`."""
+    """Stretches that are left out in turn. Chosen: of seven blocks, longer than `DRIFT_S`."""
     short_folds: Folds = Folds(9.0, 4)
     """Those of logs shorter than six of these stretches, as half of a minute's log is too little to learn from. Chosen
     on halves of twelve logs of a small robot; learnt from thirds of 15 logs of three robots, so

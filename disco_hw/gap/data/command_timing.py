@@ -77,7 +77,7 @@ class WheelResponse:
 
     @classmethod
     def of(cls, commands: Commands, lag_s: float) -> WheelResponse:
-        """Commands that are not known ask for nothing, and are counted as `lost_s`."""
+        """Return the response to commands; unknown commands count as zero, and their time as `unknown_s`."""
         commanded = np.column_stack([commands.left_rad_s, commands.right_rad_s])
         unknown = np.isnan(commanded[:, 0])
         commanded = np.nan_to_num(commanded)

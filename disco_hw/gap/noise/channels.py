@@ -230,7 +230,7 @@ class WheelChannel:
 
 @dataclass(frozen=True)
 class BodyChannel:
-    """Measured wheel angles in, poses out, in windows of `window_s` whose start pose is unknown."""
+    """Channel from measured wheel angles to poses, in windows of time whose start pose is unknown."""
 
     drive: GriddedDrive
     samples: GridSamples

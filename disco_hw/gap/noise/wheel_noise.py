@@ -27,7 +27,7 @@ _START_VARIANCE = 0.04
 class WheelNoise:
     """Relative speed error (1) and its correlation time (s); reading error (rad); jitter of the encoder's and of the
     command's time stamps (s); drift of the angle (rad per square root of s); slow relative speed error (1), which
-    wanders with `WANDER_S`.
+    drifts with `DRIFT_S`.
     """
 
     relative: float = 0.015

@@ -33,9 +33,9 @@ def channel_estimates(analysis: GapAnalysis, final: FinalFit) -> tuple[ChannelEs
 
 
 def at_joint_fit(part: ChannelEstimates, own_part: Part, of: Freed, joint: JointFit) -> ChannelEstimates:
-    """A channel's estimates moved to where the fit of the whole chain has them, and by as much less sure.
+    """Move a channel's estimates to those of the fit of the whole chain, and widen their intervals by as much.
 
-    What the whole chain frees of the channel (`own`) beyond what was found in it comes with its own variance.
+    What the whole chain frees of the channel (`own_part`) beyond what was found in it comes with its own variance.
     """
     by_name, off = dict(part.by_name), np.zeros(len(part.fitted))
     for name, old in part.by_name.items():

@@ -90,7 +90,7 @@ class JointFit:
     covariance: Array
 
     def value(self, name: str, of: Freed, own_channel: Part | None = None) -> float | None:
-        """One entry by its full name, that of the part `own` if it has one; None if it is in no channel's vector.
+        """Return an entry by its full name, from `own_channel` if it has one; None if it is in no channel's vector.
 
         Both channels number their unnamed terms alike.
         """

@@ -178,7 +178,7 @@ class Candidate:
     """An effect in the competition.
 
     `columns` are fitted from each of the `starts`, none of which means from neutral, where the effect is smooth.
-    `once`: it begins at some time of the drive.
+    `is_alternative`: it begins at some time of the drive, as a patch of the floor would.
     """
 
     name: str
@@ -259,7 +259,7 @@ def _candidate(effect: Effect) -> Candidate:
 
 
 def _competing() -> dict[str, Candidate]:
-    # What mimics another effect is decided after the others, in `confounding`.
+    # What mimics another effect is decided after the others, in `analysis`.
     return {name: _candidate(effect) for name, effect in REGISTRY.items() if effect.mimics is None}
 
 
