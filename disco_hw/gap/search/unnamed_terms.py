@@ -42,7 +42,7 @@ class Term:
     `form` has a place for the coefficient. `model_name`: the term of `disco_hw.model.terms` that it is; None if a model
     cannot carry it, because it depends on what a model's state does not hold. `geometry`: wheel radius and axial
     distance (m) that the speeds in it are made with. `disc`: x, y and radius (m) of the floor that it is about.
-    `nuisance`: further waves of which it is the first, each with a coefficient of its own, and `usual` the standard
+    `beside`: further waves of which it is the first, each with a coefficient of its own, and `usual` the standard
     deviation that is expected of these. `highest`: a coefficient can be no larger.
     """
 
@@ -57,7 +57,7 @@ class Term:
 
     @property
     def features(self) -> tuple[Array, ...]:
-        """Features that the term's coefficients multiply."""
+        """What its coefficients stand before."""
         return (self.perturbation, *self.nuisance)
 
     def written(self, coefficients: Array) -> str:
