@@ -1,4 +1,4 @@
-"""What every driver speaks: the protocols of drivers and pose sources, and what a driver says of itself.
+"""Interfaces of drivers and pose sources, and the identity, limits and safety card that a driver reports.
 
 Frames and transports are in `drivers/link_types.py`, samples and commands in `drivers/samples.py`; both can be imported
 from here. SI units; left before right; positive wheel speed drives forward; x forward, y left, yaw counter-clockwise.
@@ -309,7 +309,7 @@ class MotorDriver:
     each frame that is heard then, whether the robot has confirmed it. `slowest_rad_s`: the slowest wheel speed that
     it holds. `cyclic_frames` (of settings, command rate in Hz, whether authenticated): what the link carries.
     `authenticates`: whether there is such a mode; without one `link.key_file` is refused. `kinds`: of links that it
-    speaks over, the usual one first. `tells_reception`: whether the controller counts the frames that it rejects and
+    speaks over, the usual one first. `reports_reception`: whether the controller counts the frames that it rejects and
     answers for its clock, so that `check` can ask. `exchange` makes what a serial line is spoken with; None: the
     reference protocol's frames. `serial_field`: of the settings, one that belongs to a serial link, where it must be
     given, and to no other. `example`: its fields in [link] for a robot as the demonstration drives it; none where its

@@ -230,7 +230,7 @@ class FirmwareCore:
         _lib.disco_firmware_receive(self._core, now_us, can_id & 0xFFFF_FFFF, data, min(len(data), 0xFF))
 
     def step(self, now_us: int, inputs: FirmwareInputs) -> FirmwareOutputs:
-        """Run one cycle; to be called once in `cycle_s`."""
+        """Run one cycle of the firmware; call it once in `cycle_s`."""
         c = self._inputs
         c.ticks = (inputs.left_ticks & _TICKS_MASK, inputs.right_ticks & _TICKS_MASK)
         c.wheel_speed = (inputs.left_speed_rad_s, inputs.right_speed_rad_s)

@@ -87,7 +87,7 @@ _ESTOP_SOURCES: Mapping[str, str] = {
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault of the value table of SYSTEM_STATE.fault; `remedy` is what to do about its cause."""
+    """One fault of the value table of SYSTEM_STATE.fault; `hint` is what to do about its cause."""
 
     code: int
     name: str

@@ -190,7 +190,7 @@ class Injection:
         }
 
     def execute(self, text: str, now_ns: int) -> str:
-        """Execute one command; return "ok", what was requested, or "error: " and why."""
+        """Execute one command of the socket; return "ok", the requested value, or "error: " with the reason."""
         name, *arguments = text.split() or [""]
         try:
             handler = self._handlers.get(name)

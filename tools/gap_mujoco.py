@@ -76,8 +76,8 @@ NAMES = {
 class Result:
     """What was found in one drive: errors 2 s ahead on the unseen one by stage, mm and mrad.
 
-    `truth`: of the parameter that stands for what is hidden, None where nothing does. `floor_mm`: what the report
-    gives as the sensors' noise, and what the noise that was put in makes; yaw in mrad.
+    `truth`: of the parameter that stands for what is hidden, None where nothing does. `floor`: the report's
+    error by the sensors' noise; `injected`: that of the noise that was added; yaw in mrad.
     """
 
     hidden: str

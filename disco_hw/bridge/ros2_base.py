@@ -193,7 +193,7 @@ class BaseBridge:
     def _handle_commands(
         self, received: list[tuple[socket.socket, Frame | None]], now_ns: int, *, is_delayed: bool
     ) -> None:
-        """Handle received frames; after a pause (`late`), or if the driving client has gone, stop the base."""
+        """Handle received frames; stop the base after a pause (`is_delayed`) or if the driving client has gone."""
         if is_delayed and self.end.driving:
             self._drive(self.end.hold_standstill(now_ns))
         for client, frame in received:
@@ -204,7 +204,7 @@ class BaseBridge:
                 self._handle_command(client, frame, now_ns)
 
     def _handle_command(self, client: socket.socket, frame: Frame, now_ns: int) -> None:
-        """Handle one frame; while one client drives, ignore speeds from the others."""
+        """Handle one frame of a client; while one client drives, ignore speeds from the others."""
         was_driving = self.end.driving
         if was_driving and frame.can_id == wire.SPEEDS and client is not self._driven_by:
             return

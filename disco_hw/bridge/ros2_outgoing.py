@@ -104,7 +104,7 @@ class Outgoing:
     def diagnostics(self, now_wall_ns: int, is_connected: bool, bridge: Mapping[str, str], wrong: str) -> Message:
         """Return the diagnostics of daemon and bridge.
 
-        `heard`: whether the daemon has published lately; `wrong`: what is wrong with the bridge, or empty.
+        `is_connected`: whether the daemon has published lately; `wrong`: what is wrong with the bridge, or empty.
         """
         state = self._state
         if not is_connected or state is None:

@@ -31,7 +31,7 @@ class DisturbanceCompensation:
         self._runs_of = points.model
 
     def slides_in(self, step_s: float) -> tuple[float, float, float]:
-        """How far the ground carries the robot in a step along x and y (m), and how far it slides left per metre."""
+        """Return the drift of the robot in a step along x and y (m), and its slide to the left per metre."""
         found = self._disturbance
         return found.drift_x_m_s * step_s, found.drift_y_m_s * step_s, found.left
 

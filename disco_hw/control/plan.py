@@ -95,7 +95,7 @@ class Sampler:
 
 @dataclass(frozen=True, slots=True)
 class DiscoSettings:
-    """Settings of DISCO; the defaults are what the robot runs.
+    """Settings of the planner DISCO; the robot runs with the defaults.
 
     sampler: how sequences are sampled; its commands are wheel speeds in rad/s. step_s: length of a step.
     uncertainty: what every sequence is rolled out under: `ut` sigma points of the belief; `mc` `draws` of it, fresh

@@ -1,4 +1,4 @@
-"""Where a plan begins: the state when its first command acts, and what was commanded and remembered before."""
+"""Start of a plan: the state when its first command acts, earlier commands, and means of past motion."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SHORTEST_GAP_S = 1e-6
 
 
 class PlanStart(NamedTuple):
-    """Where a plan begins, of the undisturbed robot that turns as the real one does.
+    """Start of a plan, for the undisturbed robot that turns as the real one does.
 
     `state` (5,): x, y (m), yaw (rad), wheel speeds (rad/s) at `t0_ns`, `elapsed_s` after the drive began. `before`: the
     commands that the plan's first change is limited from. `earlier` (history, 2): commands before the plan, in its

@@ -106,7 +106,7 @@ def _reduced(commands: Array, loss: Array | float) -> Array:
 
 
 def _greater(commands: Array, loss: Array | float) -> Array:
-    """Return the inverse of `_lessened`."""
+    """Return the inverse of `_reduced`."""
     small = commands / (1.0 - loss / FULL_RAD_S)
     large = commands + np.sign(commands) * loss
     return np.where(np.abs(small) < FULL_RAD_S, small, large)

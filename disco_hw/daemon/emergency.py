@@ -146,7 +146,7 @@ def _attempt(way: Callable[[], bool]) -> tuple[bool, str | None]:
 
 
 def _read(robot: Path) -> tuple[dict[str, Any], str | None]:
-    """Read robot.toml; return its contents and, if it cannot be read, why."""
+    """Read robot.toml, and return its contents and, if it cannot be read, the reason."""
     try:
         return read_toml(robot, ROBOT_TOML), None
     except InputError as error:

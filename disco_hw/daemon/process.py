@@ -178,7 +178,7 @@ _MOST_LINES = 1000
 
 
 class AsyncPrinter:
-    """Writes a line for each sentence to a descriptor, from a thread of its own: called as `say(topic, text)`.
+    """Writes a line for each sentence to a descriptor, from a thread of its own: called as `report(topic, text)`.
 
     Who holds the output, by Ctrl-S, a pager or a connection that hangs, would hold up the control loop with it. What
     comes while a thousand lines wait is dropped and counted; a reader that has gone gets nothing more. The thread

@@ -143,10 +143,10 @@ def serve(
 ) -> int:
     """Run until SIGTERM, SIGINT, a quit request or the pilot's end, as `run_daemon`; returns the exit code.
 
-    `say` is called in the loop, and so must not wait. `pilot` decides what the robot does while motion is allowed;
+    `report` is called in the loop, and so must not wait. `pilot` decides what the robot does while motion is allowed;
     `new_planner` is called twice, as one planner is used up in the warm-up. `adapt`: whether the geometry is learnt
-    while driving; not where an operator drives. `ask`: how a person asks for what comes next; with it the daemon says
-    what it waits for, what to do, and where the log is. Raises InputError.
+    while driving; not where an operator drives. `advice_style`: how the operator requests the next step; with it
+    the daemon reports what it waits for, what to do, and where the log is. Raises InputError.
     """
     key, transport = link_key(setup), create_link(setup)
     # Before the signals are caught: whoever has enough of a compilation may break it off, as nothing is open yet.
@@ -322,9 +322,9 @@ class _Compilation(event.Listener):
 
 @contextmanager
 def compile_progress(what: str, report: Callable[[str], None], every_s: float = _EVERY_S) -> Iterator[None]:
-    """Within the block, say through `say` what numba compiles and how far it is; nothing where its cache has it all.
+    """Within the block, report what numba compiles and how far it is; nothing if its cache has it all.
 
-    `what`: for the operator, as "the planner for a circle". `say` is called from a thread, which ends with the block.
+    `what`: for the operator, as "the planner for a circle". `report` is called from a thread that ends with the block.
     """
     compilation = _Compilation(what, report, every_s)
     try:
@@ -349,10 +349,10 @@ class _Refusal(event.Listener):
 
 
 def compiled_elsewhere(build: Callable[[], T], what: str, report: Callable[[str], None]) -> T:
-    """Return `make()`, after another process has compiled and kept on disk all that it needs.
+    """Return `build()`, after another process has compiled and kept on disk all that it needs.
 
-    `make` is called up to three times, once in a fork of this process; so it must open nothing, and no thread may run
-    yet. Where nothing can be kept, or the other process fails, this process compiles by itself. `what` and `say` as
+    `build` is called up to three times, once in a fork of this process; so it must open nothing, and no thread may run
+    yet. Where nothing can be kept, or the other process fails, this process compiles by itself. `what` and `report` as
     for `compile_progress`.
     """
     if are_kernels_kept():

@@ -157,7 +157,7 @@ class Coverage:
             self._stationary_ns, self._fast_ns = None, t_ns
 
     def _count_swings(self, t_ns: int, turn: float) -> None:
-        """Count quick steering: the turn changes sides within 1.6 s."""
+        """Count fast changes of the turn from one side to the other, within 1.6 s."""
         if abs(turn) < _SWING:
             return
         side = 1 if turn > 0.0 else -1

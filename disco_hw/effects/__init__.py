@@ -208,12 +208,12 @@ class Effect:
 
     How it is reported: `sentence` for a report, with `{parameter}` fields, of a time `{parameter_s}` in s or
     `{parameter_ms}` in ms; `sentence_below` in its place where the first parameter is below zero, with its size;
-    `besides`, pairs of a parameter and what follows the sentence where that one is known, too; `excitation`, the
+    `other_symptoms`, pairs of a parameter and what follows the sentence where that one is known, too; `excitation`, the
     manoeuvre that shows it, and `script`, the one of `disco-hw drive --script` that drives it; `symptoms`.
 
     Traits: `uses_geometry`, whether its coefficients depend on the geometry; `may_turn_more`, whether it can make the
-    robot turn faster than its wheels say; `late_by`, the parameter that is a time by which wheels are behind commands,
-    fitted from `late_starts`; `dead_by`, the parameter that is what a drive takes off a command;
+    robot turn faster than its wheels say; `delayed_by`, the parameter that is the delay of the wheels behind commands,
+    fitted from `delay_starts`; `dead_by`, the parameter that is what a drive takes off a command;
     `also_seen_as`, an effect of the other channel, by its module, and its parameter that is the same quantity as the
     first one here; `like_a_patch`, what decides between it and a patch of the floor if that leaves the same traces;
     `mimics`, an effect that competes in its place.

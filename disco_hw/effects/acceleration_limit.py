@@ -1,4 +1,4 @@
-"""Acceleration limit: the drive ramps each wheel from one speed to another; many brake at once when told to stop."""
+"""Acceleration limit: the drive ramps each wheel from one speed to another; many brake at once at a stop."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Command delay: the wheels act on what was commanded a while ago."""
+"""Command delay: the wheels act on a command after a dead time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""All effects that a model can gain: every module beside this one that has an `EFFECT`, found by itself.
+"""All effects that a model can gain: `EFFECT` of every module beside this one.
 
 So is one of another package that names it in the entry-point group `disco_hw.effects`.
 """

@@ -1,4 +1,4 @@
-"""Turn asymmetry: the robot turns further one way than the other, as where the tyres do not all hold alike."""
+"""Turn asymmetry: the robot turns further one way than the other, as with tyres of unequal grip."""
 
 from __future__ import annotations
 

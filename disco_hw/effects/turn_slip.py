@@ -1,4 +1,4 @@
-"""Turn slip: the faster it turns, the more of the turn is lost."""
+"""Turn slip: the faster the robot turns, the more of the turn is lost."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ def plain(
     left: Value, right: Value, end_left: Value, end_right: Value, mean_left: Value, mean_right: Value,
     wheel_left: Value, wheel_right: Value, values: Values, step_s: float,
 ) -> tuple[Value, Value, Value, Value]:  # fmt: skip
-    """Half the difference of the wheels, d, grows in size by no more than the limit; up to `at_once` it is free.
+    """Half the difference of the wheels, d, grows in size by no more than the limit; up to `immediate` it is free.
 
     A motor of largest torque T against a scrub S turns the robot up with T - S and down with T + S, of which only the
     first is little (Wong, Theory of Ground Vehicles, 2008, ch. 6). While d lacks l of what is aimed for, motors that

@@ -1,4 +1,4 @@
-"""Wheel gain: the drive answers with more or less than it was asked for."""
+"""Wheel gain: the drive turns the wheels faster or slower than commanded."""
 
 from __future__ import annotations
 

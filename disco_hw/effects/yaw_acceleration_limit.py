@@ -1,4 +1,4 @@
-"""Yaw-acceleration limit: the drive turns the robot no faster than this from one yaw rate to another."""
+"""Yaw-acceleration limit: the drive limits the change of the yaw rate in a second."""
 
 from __future__ import annotations
 

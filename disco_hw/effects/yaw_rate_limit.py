@@ -1,4 +1,4 @@
-"""Yaw-rate limit: the drive cuts how fast it is asked to turn."""
+"""Yaw-rate limit: the drive limits the commanded yaw rate."""
 
 from __future__ import annotations
 

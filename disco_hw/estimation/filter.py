@@ -139,7 +139,7 @@ class FilterState(msgspec.Struct, frozen=True, gc=False):
     `belief` is None before there is any, and a search while the heading is not known. `candidate` is the pose that the
     last rejected measurements agree on, `candidate_count` how many in a row do, and `candidate_of` of which sources.
     `pose_t_ns` is the stamp of the last accepted pose, None before the first, and `accepted` those of each source.
-    `judgement` is that of the pose at this very instant, None after wheel motion.
+    `evaluation` is that of the pose at this very instant, None after wheel motion.
     """
 
     t_ns: int

@@ -236,7 +236,7 @@ class Stack:
     def _over(self, reached: Callable[[Mapping[str, Any]], bool], lines_before: int, status: Mapping[str, Any]) -> bool:
         """Whether that is reached, or the robot stopped as it, or the daemon, heard nothing of the other.
 
-        `said`: so many characters the daemon had said before.
+        `lines_before`: number of lines that the daemon had printed before.
         """
         silent = (
             status["stop_cause"] in _CAUSES_OF_THIS_HOST or _ROBOT_SILENT in self.daemon.output_lines()[lines_before:]

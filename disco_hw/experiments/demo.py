@@ -227,7 +227,7 @@ def start_pose(setup: Setup) -> tuple[float, float, float]:
 
 
 def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
-    """Drive and stop; return whether daemon and robot both reported that the robot stands, disarmed."""
+    """Drive and stop the robot; return whether daemon and robot both reported it standing and disarmed."""
     for old in (files.log, files.truth):
         old.unlink(missing_ok=True)
     setup = load_setup(files.robot)
@@ -335,7 +335,7 @@ class _Floor:
 
 
 def _why_stopped(operator: Operator, status: Mapping[str, Any], elapsed_ms: int) -> WorkError:
-    """Return what to raise for a drive that ended before its laps; `taken_ms`: CPU time lost to the host just before.
+    """Return what to raise for a drive that ended before its laps; `elapsed_ms`: CPU time lost to the host just before.
 
     What the host takes bit by bit over a whole drive excuses nothing, hence only the last half second.
     """

@@ -1,4 +1,4 @@
-"""File descriptors: how many this process may open, and some kept free for what must never fail to open one."""
+"""Limit of open file descriptors, with some kept free for callers that must never fail to open one."""
 
 from __future__ import annotations
 

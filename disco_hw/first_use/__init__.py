@@ -102,9 +102,9 @@ QUESTIONS = (
 
 @dataclass(frozen=True, slots=True)
 class InitOptions:
-    """Options of `disco-hw init`; None of a field is asked for, or the usual where nobody is to be asked.
+    """Options of `disco-hw init`; a field that is None is asked for, or has the usual value if nobody is to be asked.
 
-    `may_ask`: whether a serial line may be asked for controllers that only answer; None asks the person.
+    `is_interactive`: whether a serial line may be asked for controllers that only reply; None asks the operator.
     """
 
     out: Path

@@ -280,7 +280,7 @@ def _response(track: Track) -> list[tuple[str, str]]:
 def evaluate_floor(seen: FloorSeen, configured: PoseConvention, robot: Robot) -> Findings:
     """Find the units and axes of the poses, the sensor's place, and its delay.
 
-    The poses are as the source sent them; `told` is what robot.toml says of them.
+    The poses are as the source sent them; `configured` is what robot.toml says of them.
     """
     legs = (seen.straight, seen.left, seen.right, seen.straight_again)
     if any(len(leg.poses) < 5 for leg in legs):

@@ -1,6 +1,6 @@
-"""Where simulation and data disagree, which effect is missing, the amended model, and how far the gap shrinks.
+"""Analysis of the gap between simulation and data: the missing effect, the amended model, the gap that is left.
 
-Here the analysis is one call: logs and a model in, the report out; and what `disco-hw gap` writes of it.
+This module has the analysis as one call, from logs and a model to the report, and the command `disco-hw gap`.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ def check_consistency(log: DriveLog, model: Model) -> tuple[str, ...]:
 def written_of(
     analysis: GapAnalysis, final: FinalFit, predictions: StagePredictions | None
 ) -> tuple[GapAnalysis, FinalFit, StagePredictions | None]:
-    """What the model is written from: with other terms in place of those that no model can carry, and other values."""
+    """Return the analysis to write the model from: refitted without the terms that no model can hold."""
     written = analysis
     if analysis.body is not None and (body := that_models_hold(analysis.body)) is not analysis.body:
         written = replace(written, body=body)
@@ -255,7 +255,7 @@ def search_log(
     report_progress: Progress = lambda text: None,
     settings: GapSettings = DEFAULT_SETTINGS,
 ) -> tuple[GapAnalysis, list[str]]:
-    """Both channels searched, without what makes predictions worse; and notes on what could not be judged."""
+    """Search both channels, and leave out what makes predictions worse; return notes on what could not be evaluated."""
     drive = grid_drive(log, settings)
     if not (drive.has_poses or drive.has_commands):
         raise LogError(
@@ -310,7 +310,7 @@ class GapResult:
         return self.report.as_dict()
 
     def as_text(self) -> str:
-        """For a terminal."""
+        """Return the report as text for a terminal."""
         return f"{as_text(self.report)}\n\nwritten: {self.directory}/report.html, report.json, model.toml"
 
 
@@ -333,14 +333,14 @@ def gap(
 
 @dataclass(frozen=True)
 class _Task:
-    """What every log of a robot is searched with."""
+    """Inputs that the searches of all logs of one robot share."""
 
     model: Model
     top_rad_s: float
     robot_name: str
 
     def report(self, drive: DriveLog, progress: Progress | None = None) -> GapReport:
-        """What is missing in a drive, with pictures and proofs."""
+        """Return the report on a drive, with pictures and proofs."""
         return find_gap(drive, self.model, progress, pictures=True, prove=True, top_rad_s=self.top_rad_s)
 
 
@@ -355,7 +355,7 @@ def _searched(task: _Task, drive: DriveLog) -> GapReport | str:
 def _prepared(
     logs: Sequence[Path], robot: Path, out: Path, model: Path | None, names: Sequence[str] = WRITTEN
 ) -> tuple[_Task, Callable[[list[Path]], DriveLog]]:
-    """How to search logs of a robot, and what loads them; refuses what cannot be read or written."""
+    """Return the task of searching a robot's logs, and their loader; refuse files that cannot be read or written."""
     refuse_directory(out, names, [*logs, robot, *([model] if model is not None else [])])
     config = load_robot_config(robot).robot
     start = load_model(model) if model is not None else Model.nominal(config)

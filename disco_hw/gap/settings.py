@@ -19,7 +19,7 @@ DRIFT_S = 20.0
 
 @dataclass(frozen=True, slots=True)
 class GridSettings:
-    """How a log becomes a drive on an even grid."""
+    """Settings of the conversion of a log to a drive on an even grid."""
 
     block_s: float = 3.0
     """Blocks of time that are left out together, and windows of poses, the start of which is unknown. Chosen."""
@@ -267,7 +267,7 @@ class TermSettings:
 
 @dataclass(frozen=True, slots=True)
 class Folds:
-    """How a log is divided to be predicted by what the rest of it says: every `count`-th stretch is of one fold."""
+    """Division of a log into folds, each predicted from the others: every `count`-th stretch belongs to one fold."""
 
     stretch_s: float
     count: int
@@ -283,7 +283,7 @@ class PredictionSettings:
     """The one that the answer is about, or the longest below that runs are long enough for. Chosen: about as far as a
     planner looks."""
     folds: Folds = Folds(21.0, 2)
-    """Stretches that are left out in turn. Chosen: of seven blocks, longer than `WANDER_S`."""
+    """Stretches that are left out in turn. Chosen: of seven blocks, longer than `DRIFT_S`."""
     short_folds: Folds = Folds(9.0, 4)
     """Those of logs shorter than six of these stretches, as half of a minute's log is too little to learn from. Chosen
     on halves of twelve logs of a small robot; learnt from thirds of 15 logs of three robots, so
@@ -331,7 +331,7 @@ class PredictionSettings:
 
 @dataclass(frozen=True, slots=True)
 class ReportSettings:
-    """What is said of disagreements that are left, and of what a log could not show."""
+    """Settings of the report on remaining disagreements and on effects that a log could not show."""
 
     usual_inflation: float = 1.5
     """Inflation of the variance that is expected of an effect that is not there. Chosen."""
@@ -406,7 +406,7 @@ class ReportSettings:
 
 @dataclass(frozen=True, slots=True)
 class GapSettings:
-    """All of it; the defaults are what every figure of the documents was made with."""
+    """All settings of the analysis; every figure of the documentation was made with the defaults."""
 
     grid: GridSettings = GridSettings()
     noise: NoiseSettings = NoiseSettings()

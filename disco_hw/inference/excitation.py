@@ -81,7 +81,7 @@ class Excitation:
 
 @dataclass(frozen=True, slots=True)
 class _Roll:
-    """Wheel angles (K, 2) at times (K,), straight in between; `lost_s` (K,) time before each that is not known."""
+    """Wheel angles (K, 2) at times (K,), straight in between; `unknown_s` (K,) is the unknown time before each."""
 
     t_s: Array
     angle_rad: Array

@@ -34,7 +34,7 @@ from disco_hw.reports import refuse_file
 
 @dataclass(frozen=True, slots=True)
 class GapCheck:
-    """Names of `missing` effects, the surest first; `not_judged` says why the log could not be searched, if so."""
+    """Names of `missing` effects, the surest first; `why_not_checked`: why the log could not be searched, if so."""
 
     missing: tuple[str, ...] = ()
     why_not_checked: str | None = None

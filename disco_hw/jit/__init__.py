@@ -223,7 +223,7 @@ def fast_norm_and_inverse(x: float, y: float) -> tuple[float, float]:
 
 @scalar_function
 def fast_length(x: float, y: float, z: float) -> float:
-    """Length of a vector of three, as of `quick_norm_and_inverse`."""
+    """Length of a vector of three, as of `fast_norm_and_inverse`."""
     square = x * x + (y * y + (z * z + cast_like(1e-30, x)))
     norm: float
     step: float
@@ -233,7 +233,7 @@ def fast_length(x: float, y: float, z: float) -> float:
 
 @scalar_function
 def fast_norm(x: float, y: float) -> float:
-    """Length of a vector, as of `quick_norm_and_inverse`."""
+    """Length of a vector, as of `fast_norm_and_inverse`."""
     norm: float
     norm, _ = fast_norm_and_inverse(x, y)
     return norm

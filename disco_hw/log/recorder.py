@@ -165,7 +165,7 @@ class ProcessRecorder:
 
     Make it before the loop starts: that takes as long as starting Python. A replacement is a fork of another process
     and costs the loop some microseconds; it begins a file of its own, with all that is not in the former one. Raises
-    LogError when the file exists or cannot be made; every later failure is counted, reported by `news` and mended.
+    LogError if the file exists or cannot be made; later failures are counted, reported by `new_messages` and mended.
     """
 
     def __init__(self, recording: RecordingSettings) -> None:

@@ -26,8 +26,8 @@ _STATUS_BYTES = 65_536
 class WriterLine:
     """Sends frames, of which one may be on its way in part, and keeps the newest status.
 
-    `heard`: a status has come. `ended`: the writer has hung up. `ending`: it has been sent the end. `full`: it cannot
-    take more now.
+    `has_received`: a status has come. `ended`: the writer has hung up. `ending`: it has been sent the end. `full`: it
+    cannot take more now.
     """
 
     def __init__(self, connection: socket.socket, path: str, part: int) -> None:
@@ -246,8 +246,8 @@ class _Parcel(NamedTuple):
 class Delivery:
     """Keeps each tick until the writer says that it is in the file; a new writer is sent again what was not.
 
-    given = delivered + lost + waiting + dropped, in ticks. `dropped`: `most` were waiting already. `lost`: they were in
-    a file that was deleted.
+    given = delivered + lost + waiting + dropped, in ticks. `dropped_ticks`: `most` were waiting already. `lost_ticks`:
+    they were in a file that was deleted.
     """
 
     def __init__(self, most: int) -> None:

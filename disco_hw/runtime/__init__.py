@@ -131,7 +131,7 @@ _ROWS_FROM = {
 
 
 def next_transition(state: State, conditions: int) -> Transition | None:
-    """Return the first row that leads out of `state`, or None to stay; `held` is the value of all that is true now."""
+    """Return the first row that leads out of `state`, or None to stay; `conditions` is the mask of those that hold."""
     for needs, blocked_by, row in _ROWS_FROM[state]:
         if conditions & needs == needs and not conditions & blocked_by:
             return row

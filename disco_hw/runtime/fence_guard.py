@@ -129,7 +129,7 @@ class FenceGuard:
         )
 
     def set_obstacles(self, obstacles: Sequence[MovingCircle], missing: Sequence[str] = ()) -> None:
-        """Keep away from these circles, true now; `lost`: names of those whose reports have ceased."""
+        """Keep away from these circles, true now; `missing`: names of those whose reports have ceased."""
         self._obstacles, self._missing = tuple(obstacles), tuple(missing)
         if self._boundaries is not None:
             self._boundaries.set_obstacles(self._obstacles)

@@ -139,7 +139,7 @@ def kept_files(setup: Setup) -> list[Attachment]:
 def setup_of_log(log: Log, hint: str) -> Setup:
     """Return the robot as it was when a log was recorded, from the copies in it; no other file is read.
 
-    The files that the result names are gone. Raises InputError: with `remedy` for a log without a robot.toml or
+    The files that the result names are gone. Raises InputError: with `hint` for a log without a robot.toml or
     without a file that it names, and with log and copy for one that is wrong.
     """
     names = log.attachment_names()
@@ -170,7 +170,7 @@ class TaskRefused(Exception):  # noqa: N818
 
 
 def changed_task(task: RobotTask, requested: Mapping[str, Any], robot: Robot, state: State) -> RobotTask:
-    """Return the task with the fields in `asked`, all of them editable, m and m/s.
+    """Return the task with the fields in `requested`, all of them editable, m and m/s.
 
     Raises TaskRefused while the robot is armed or stopping, for anything that is no number within the limits, and for a
     speed that the wheels cannot reach on the changed task.

@@ -122,7 +122,7 @@ class SafeArea:
         raise ObstacleRefused("obstacle: write add or remove, such as obstacle remove name=pillar")
 
     def change_fence(self, now_ns: int, requested: Mapping[str, Any], state: State) -> str:
-        """Put another fence in force, with the fields of [fence] in `asked`; returns the answer in words.
+        """Put another fence in force, with the fields of [fence] in `requested`; returns the answer in words.
 
         Raises FenceRefused while the robot is armed or stopping, and for a fence that is none.
         """

@@ -52,7 +52,7 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         """Return the task with the way-points of a CSV.
 
         Raises InputError as `load_waypoints`, and for times, for too many way-points, for a path that is too short or
-        too long, for a way-point further from the origin than poses go, and, if it is `judged`, for hairpins.
+        too long, for a way-point further from the origin than poses go, and, if it `is_checked`, for hairpins.
         """
         found = load_waypoints(file)
         if found.times_s is not None:

@@ -123,7 +123,7 @@ class Scene:
         self._shown_fan: tuple[records.Fan, tuple[float, ...]] | None = None
 
     def show(self, snapshot: Snapshot, everything: bool = True) -> None:
-        """Draw one snapshot; without `everything` leave plan, rollouts, trail, poses, points and fence as they are."""
+        """Draw one snapshot of a drive; without `everything` leave plan, rollouts, trail, poses, points and fence."""
         layers = self.layers
         with self._server.atomic():
             self._shade()

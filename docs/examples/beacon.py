@@ -1,4 +1,8 @@
-"""Poses in datagrams from another process on this computer."""
+"""Poses in datagrams from another process on this computer.
+
+Each is six little-endian doubles: time (s, monotonic clock), x, y (m), yaw (rad), and the standard deviations of
+position (m) and yaw (rad).
+"""
 
 import contextlib
 import math

@@ -1,4 +1,10 @@
-"""The toy controller."""
+"""Driver of a toy controller, with three frames on CAN, each with a checksum in its first byte.
+
+0x210 to the robot: request (0 stand by, 2 arm, 3 reset), session, time it holds (ms), left and right speed (mrad/s).
+0x211 from the robot: state (0 idle, 1 armed, 2 fault, 3 e-stop), session, cause, ticks per turn, top speed (mrad/s).
+0x212 from the robot: left and right speed (mrad/s), left and right ticks modulo 4096.
+A frame 0x010 stops it in any state.
+"""
 
 import math
 import secrets

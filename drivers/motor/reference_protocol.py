@@ -105,10 +105,10 @@ class HouseKeeping:
     def frames(
         self, now_ns: int, state: HostState, clock_samples: int, *, introduced: bool, refused: bool
     ) -> list[OutgoingFrame]:
-        """Frames due now.
+        """Return the frames that are due now.
 
         `introduced`: whether host and robot have accepted each other; `refused`: whether the host refuses this robot.
-        `clock_samples`: how many answers the estimate of the robot's clock is made of.
+        `clock_samples`: number of responses in the estimate of the robot's clock.
         """
         frames = []
         transmission = self._transmission

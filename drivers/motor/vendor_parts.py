@@ -81,7 +81,7 @@ class Odometer:
     def add_wrapping(
         self, count: int, t_ns: int, looked_ns: int, fastest: float, slack: float, *, bits: int = 32
     ) -> bool:
-        """As `take`, of a count that wraps."""
+        """Add a count that wraps, as `add` does one that does not."""
         last, half = count if self.last is None else int(self.last), 2 ** (bits - 1)
         moved = (count - last + half) % (2 * half) - half
         self.last = None if self.last is None else count - moved

@@ -205,7 +205,7 @@ class ReceiverClock:
 
 @dataclass
 class Fixes:
-    """Conversion of NMEA sentences into poses: `take` them with their arrival, `flush` now and then; pure.
+    """Conversion of NMEA sentences into poses: `add_line` each with its arrival, `flush` now and then; pure.
 
     What they give is a datagram's map (`drivers.pose.udp`), or {"said": sentence} where something changed for the worse
     or the better. A heading belongs to the position that came within 60 ms of it.

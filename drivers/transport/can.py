@@ -185,7 +185,7 @@ class CanConnection:
     """
 
     def __init__(self, bus: can.BusABC, counters: TransportCounters, sent_frames: SentFrames | None = None) -> None:
-        """Wrap an open bus; `own` is for a bus that hands a sender its own frames, which then are not received."""
+        """Wrap an open bus; `sent_frames` is for a bus that returns a sender's own frames, which are then dropped."""
         self._bus = bus
         self._counters = counters
         self._sent_frames = sent_frames

@@ -88,7 +88,7 @@ def _steps(value: float, scale: float, code: str, number: Callable[[float], floa
 class Vesc:
     """Model of one VESC controller.
 
-    `take_calls` returns the commands that reached its motor, by name and value.
+    `pop_calls` returns the commands that reached its motor, by name and value.
 
     `kill_switch_pin`: its kill switch input. Like `timed_out`, the `kill_switch_active` that it reports is the result
     of the last check of the timeout thread (vedderb/bldc, timeout.c), not the state at the time of the request.

@@ -101,7 +101,7 @@ def _scaled_place(state: Floats, b: int, base: Base, other: Base, start: Floats)
 
 @scalar_function
 def begin_costs(state: Floats, point: int, b: int, start: Floats, task: Terms, bends: Bends) -> None:
-    """Set the rows from `own` on to the start."""
+    """Set the rows from `point` on to the start."""
     x, y, _ = detoured(bends, (start[START_X], start[START_Y], start[START_X]))
     state[point + X + b] = x
     state[point + Y + b] = y
@@ -112,7 +112,7 @@ def begin_costs(state: Floats, point: int, b: int, start: Floats, task: Terms, b
 
 @scalar_function
 def _found(looks: Absent, state: Floats, point: int, b: int) -> Found:
-    """Return what sample b has kept and found in the task's table, in the rows from `own` on; zeros without one."""
+    """Return what sample b has kept and found in the task's table, in the rows from `point` on; zeros without one."""
     if looks is None:
         zero = cast_like(0.0, state[point])
         return zero, zero, zero, zero, zero
@@ -168,7 +168,7 @@ def follow_points(
 
 @scalar_function
 def _look_up(table: Floats, state: Floats, point: int) -> None:
-    """Copy every sample's row of the table to the rows from `own` on: apart, as no compiler makes vectors of it.
+    """Copy every sample's row of the table to the rows from `point` on: apart, as no compiler makes vectors of it.
 
     A sample's four numbers stay together, and are all read before the first is written: one load and one store.
     """
@@ -199,7 +199,7 @@ def look_ups(looks: Absent, state: Floats, skip_mean: Absent, ahead: BasePair, s
 
 @scalar_function
 def _cost(state: Floats, point: int, b: int, t: int, place: Place, task: Terms, last: Absent) -> None:
-    """Add the cost of step t, which sample b has just made, to the rows from `own` on; `last` is None before it."""
+    """Add the cost of step t, which sample b has just made, to the rows from `point` on; `last` is None before it."""
     cos_yaw, sin_yaw = state[COS + b], state[SIN + b]
     x, y, forward = place
     cost, memory = stage_cost(
@@ -270,7 +270,7 @@ def _avoid(
     area: Area, state: Floats, point: int, at: int, time_s: float, reach_m: float, base: Base, other: Base | None,
     is_scaled: Absent, start: Floats,
 ) -> None:  # fmt: skip
-    """Add what touching shapes costs to the rows from `own` on, for the shapes that a circle around all samples meets.
+    """Add the cost of touching shapes to the rows from `point` on, for shapes that a circle around all samples meets.
 
     Sizes are compared by their bits, in which numbers of zero or more have the same order, as the compiler makes
     vectors of a maximum of integers only.
@@ -324,7 +324,7 @@ def sliding_heading(
 def end_costs(
     costs: Floats, at: int, state: Floats, point: int, slides: Absent, start: Floats, step_s: float, task: Terms
 ) -> None:
-    """Write the costs of the rows from `own` on to `costs[at:at + BLOCK]`."""
+    """Write the costs of the rows from `point` on to `costs[at:at + BLOCK]`."""
     tune_loops()
     for b in range(BLOCK):
         cos_yaw, sin_yaw = sliding_heading(slides, state[COS + b], state[SIN + b], state[FORWARD + b] * step_s, start)

@@ -298,7 +298,7 @@ def _bases(base: Base, pair: NDArray[np.int64]) -> tuple[Base, Base]:
 
 @scalar_function
 def _places(pair: NDArray[np.int64], padded: int, lane: np.uintp) -> CostPlaces:
-    """Where the costs of a pair of points begin."""
+    """Return the places at which the costs of a pair of points begin."""
     return U(pair[0] * padded) + lane, U(pair[1] * padded) + lane
 
 

@@ -1,7 +1,7 @@
-"""What the search reads: a drive on an even grid, parameter vectors, free runs of the model.
+"""Data of the search: a drive on an even grid, parameter vectors, free runs of the model.
 
-Here is the parameter vector of each channel: every parameter of every effect in the registry, by full name. At its
-neutral value an effect changes nothing, so one vector and one compiled free run serve every set of effects.
+This module has the parameter vector of each channel: every parameter of every effect in the registry, by full name. At
+its neutral value an effect changes nothing, so one vector and one compiled free run serve every set of effects.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ BODY = _layout(
 
 
 def _spans(layout: Layout) -> Mapping[str, slice]:
-    """Where each effect's parameters lie, which follow each other."""
+    """Return the slice of each effect's parameters, which follow each other."""
     first: dict[str, int] = {}
     count: dict[str, int] = {}
     for k, column in enumerate(layout.columns):
@@ -142,8 +142,8 @@ _SENSED = np.array(
 
 
 class PoseSensor(NamedTuple):
-    """What a vector of the body channel says of the poses: how old they are (s), where the sensor sits ahead and to the
-    left of the tracked point (m), and how far its yaw is off (rad).
+    """Pose sensor by a vector of the body channel: delay of the poses (s), position ahead and left of the tracked point
+    (m), error of the yaw (rad).
     """
 
     delay_s: float
@@ -169,9 +169,9 @@ def _sensor(values: tuple[float, ...]) -> PoseSensor:
 
 
 def carried(p: Array, speed_rad_s: Array, t_s: Array) -> Array:
-    """How far the ground has carried a robot by each node (M, 2), m in the world, at a vector of the body channel.
+    """Return how far the ground has carried a robot by each node (M, 2), m in the world frame.
 
-    `speed_rad_s` (M, 2) its measured wheel speeds, `t_s` (M,).
+    `p`: vector of the body channel; `speed_rad_s` (M, 2): measured wheel speeds; `t_s` (M,): times of the nodes.
     """
     moved = np.zeros_like(speed_rad_s)
     places = [(effect, _SPANS[False][effect.name]) for effect in _WORLD]
@@ -191,7 +191,7 @@ def carried(p: Array, speed_rad_s: Array, t_s: Array) -> Array:
 
 
 def counted(layout: Layout, p: Array) -> tuple[float, float]:
-    """How many turns the left and right encoder count for one of their wheel."""
+    """Return how many turns the left and right encoder count for one turn of their wheel."""
     turns = 1.0, 1.0
     for effect in _ENCODERS:
         turns = _plain(layout, p, effect, left=turns[0], right=turns[1])
@@ -199,7 +199,7 @@ def counted(layout: Layout, p: Array) -> tuple[float, float]:
 
 
 def _plain(layout: Layout, p: Array, effect: Effect, **motion: float | Array) -> Any:
-    """What an effect makes of the motion in a second, at a vector."""
+    """Evaluate an effect's plain equation for the motion of one second, with the parameters of a vector."""
     known: dict[str, Any] = {
         "values": tuple(p[_SPANS[layout.of_wheels][effect.name]].tolist()),
         "step_s": 1.0,
@@ -210,7 +210,7 @@ def _plain(layout: Layout, p: Array, effect: Effect, **motion: float | Array) ->
 
 
 def wheel_effects(p: Array, geometry: Array) -> Coefficients:
-    """What the model's wheel step needs at a vector of the wheel channel; `geometry` (3,) serves yaw-rate limits."""
+    """Return the coefficients of the model's wheel step at a vector; `geometry` (3,) serves yaw-rate limits."""
     base = tuple(geometry[:BASE_COUNT].tolist())
     absent = [name for name in _HOLDING if (p[_SPANS[True][name]] == WHEEL.neutral[_SPANS[True][name]]).all()]
     given = {name: _coefficients(WHEEL, p, name, base) for name in WHEEL_MOTION if name not in absent}
@@ -219,7 +219,7 @@ def wheel_effects(p: Array, geometry: Array) -> Coefficients:
 
 
 def body_effects(p: Array) -> tuple[Base, Coefficients]:
-    """What the model's body velocity needs at a vector of the body channel."""
+    """Return geometry and coefficients of the model's body velocity at a vector of the body channel."""
     base = tuple(p[:BASE_COUNT].tolist())
     given = {name: _coefficients(BODY, p, name, base) for name in BODY_MOTION}
     radius, axial, x_icr = base

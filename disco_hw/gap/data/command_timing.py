@@ -1,6 +1,6 @@
-"""How late commands are acted on, found from what the wheels turn before anything is fitted.
+"""Delay after which the wheels act on commands, estimated from the wheel angles before any other fit.
 
-A search that begins without a delay of 0.3 s does not find it: it takes what the delay makes for effects and noise.
+A search that begins without a delay of 0.3 s does not find it: it takes the traces of the delay for effects and noise.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _SAME_NATS = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class Turned:
-    """What both wheels turned between two samples (n,), in pairs of one segment: times, segment, angles."""
+    """Rotation of both wheels between pairs of samples (n,) of one segment: times, segment, angles."""
 
     begin_s: Array
     end_s: Array
@@ -50,11 +50,11 @@ class Turned:
         return cls(wheels.t_s[first], wheels.t_s[second], wheels.segment[first], left, right)
 
     def between(self, low_s: float, high_s: float) -> Turned:
-        """Those that begin in a span of time."""
+        """Return the pairs that begin in a span of time."""
         return self.pick((self.begin_s >= low_s) & (self.begin_s < high_s))
 
     def pick(self, chosen: Mask) -> Turned:
-        """Some of them."""
+        """Return the chosen pairs."""
         return Turned(
             self.begin_s[chosen],
             self.end_s[chosen],
@@ -66,7 +66,7 @@ class Turned:
 
 @dataclass(frozen=True, slots=True)
 class WheelResponse:
-    """What wheels would turn that follow both commands behind a lag: speeds and way (N, 2) at the commands' times."""
+    """Ideal wheels that follow both commands through a lag: speeds and angles (N, 2) at the commands' times."""
 
     commands: Commands
     lag_s: float
@@ -77,7 +77,7 @@ class WheelResponse:
 
     @classmethod
     def of(cls, commands: Commands, lag_s: float) -> WheelResponse:
-        """Commands that are not known ask for nothing, and are counted as `lost_s`."""
+        """Return the response to commands; unknown commands count as zero, and their time as `unknown_s`."""
         commanded = np.column_stack([commands.left_rad_s, commands.right_rad_s])
         unknown = np.isnan(commanded[:, 0])
         commanded = np.nan_to_num(commanded)
@@ -154,10 +154,10 @@ def _integrate_response(t_s: Array, commanded: Array, segment: Index, lag_s: flo
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """How wheels answer commands at first sight: `delay_s` after their stamps, behind a lag, with a misfit in nats.
+    """First estimate of the response to commands: `delay_s` after their stamps, a lag, and the mismatch in nats.
 
-    `known`: whether a shorter and a longer delay and a longer lag fit worse, so that this delay is the one. Where no
-    delay stands out it is 0, and not known; of too few commands nothing is asked.
+    `known`: whether a shorter and a longer delay and a longer lag fit worse. A delay that does not stand out is 0 and
+    not known; with too few commands it is 0 and known.
     """
 
     delay_s: float = 0.0
@@ -262,9 +262,7 @@ class CommandAlignment:
 
 
 def command_clock(wheels: Wheels, commands: Commands, settings: GridSettings) -> tuple[StampClock, bool]:
-    """How much later than their stamps commands are acted on, as a clock, whether that drifts or jumps; and whether it
-    is known.
-    """
+    """Return the delay of the commands as a clock, which may drift or jump, and whether it is known."""
     turned = Turned.of(wheels, settings)
     first = response(turned, commands, settings)
     if not first.known or not first.delay_s:

@@ -30,7 +30,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class GridSamples:
-    """Where measurements lie on the grid, all (S,): node before, fraction of a cell after it, time, block of time."""
+    """Positions of measurements on the grid, all (S,): node before, fraction of a cell after it, time, time block."""
 
     node: Index
     fraction: Array
@@ -38,7 +38,7 @@ class GridSamples:
     block: Index
 
     def pick(self, chosen: Mask | Index) -> GridSamples:
-        """Some of them."""
+        """Return the chosen samples."""
         return GridSamples(self.node[chosen], self.fraction[chosen], self.t_s[chosen], self.block[chosen])
 
 
@@ -103,7 +103,7 @@ class GriddedDrive:
 
     @property
     def folds(self) -> Folds:
-        """How it is divided to be predicted by what the rest of it says."""
+        """Division of the drive into folds, each of which is predicted from the others."""
         prediction = self.settings.prediction
         is_long = self.duration_s >= 3 * prediction.folds.count * prediction.folds.stretch_s
         return prediction.folds if is_long else prediction.short_folds

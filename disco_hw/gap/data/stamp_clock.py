@@ -1,6 +1,6 @@
-"""How the clock that stamped some samples runs against that of the wheels: evenly, adrift, or with a jump.
+"""Clock of time stamps against that of the wheels: it runs evenly, drifts, or jumps.
 
-Of logs that are searched together each has clocks of its own.
+Logs that are searched together have a clock each.
 """
 
 from __future__ import annotations
@@ -57,11 +57,11 @@ class StampClock:
 
     @property
     def even(self) -> bool:
-        """Whether it neither drifts nor jumps."""
+        """Whether the clock neither drifts nor jumps."""
         return not (self.drift_s or self.jump_s)
 
     def off_s(self, t_s: Array) -> Array:
-        """How much more than by `delay_s` samples stamped so are older."""
+        """Return by how much more than `delay_s` samples with these time stamps are delayed."""
         drift = self.drift_s * (t_s - self.middle_s) / self.span_s
         return np.asarray(drift + self.jump_s * ((t_s >= self.jump_at_s) - 0.5))
 
@@ -72,7 +72,7 @@ class StampClock:
         return replace(picked(samples, keep), t_s=t_s[keep])
 
     def notes(self, whose: str) -> tuple[str, ...]:
-        """What a person has to know of it; `whose`: "poses'" or "commands'"."""
+        """Describe a drift or a jump for the operator; `whose`: "poses'" or "commands'"."""
         if self.drift_s:
             per_s = 1e3 * self.drift_s / self.span_s
             return (
@@ -94,11 +94,11 @@ def picked(samples: Samples, chosen: NDArray[np.bool_]) -> Samples:
 
 
 def clock_of(align: Alignment, settings: GridSettings, least_error_s: float, least_nats: float) -> StampClock:
-    """How old samples are, and whether that drifts or jumps, from stretches looked at one by one.
+    """Estimate the delay of samples, and its drift or jump, from one stretch of the log after the other.
 
-    A drift or a jump is believed where the stretches agree on it far beyond their scatter, where it is no less than
-    `least_error_s`, and where the whole log fits better with it by `least_nats` per sample; of both the one with which
-    it fits better. One stretch that is off looks like a jump to the others.
+    A drift or a jump is accepted if the stretches agree on it far beyond their scatter, if it is no less than
+    `least_error_s`, and if the whole log fits better with it by `least_nats` per sample; of both the one that fits
+    better. One stretch that is off looks like a jump to the others.
     """
     delay_s, least = align.fitted(StampClock(0.0))
     plain = StampClock(delay_s)
@@ -147,7 +147,7 @@ def _level(delays: Array, far_s: float) -> tuple[float, float]:
 
 
 def _line(x: Array, delays: Array, far_s: float) -> tuple[float, float]:
-    """The same about the line over `x` (n,) that most agree on, and its slope."""
+    """Fit a robust line of delays over `x` (n,); return its sum of squares, cut off at `far_s`, and its slope."""
     first, second = np.triu_indices(x.size, 1)
     slopes = (delays[second] - delays[first]) / (x[second] - x[first])
     off = delays - delays[first, None] - slopes[:, None] * (x - x[first, None])

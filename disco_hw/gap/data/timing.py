@@ -1,7 +1,7 @@
-"""How much earlier or later than the wheels poses are stamped, found before anything is fitted.
+"""Delay of the poses against the wheels, estimated before any other fit.
 
-A search that begins without a delay of 0.3 s does not find it: it takes what the delay makes for slip and noise. Below
-is what every search for a delay shares: pairs of samples, a robust regression on both wheels, the least of a scan.
+A search that begins without a delay of 0.3 s does not find it: it takes its traces for slip and noise. All searches
+for a delay share the code below: pairs of samples, a robust regression on both wheels, the least of a scan.
 """
 
 from __future__ import annotations
@@ -164,7 +164,7 @@ def apart(t_s: Array, segment: Index, span_s: float) -> tuple[Index, Index]:
 
 
 def lowest(misfits: Callable[[Array], Array], about_s: float, step_s: float) -> tuple[float, float]:
-    """Where a misfit is least within a step of a delay (s), wherever a scan's steps lie, and what it is there."""
+    """Return the delay (s) of the least mismatch, within a step of a scan's best one, and the mismatch there."""
 
     def at(delay_s: float) -> float:
         return min(float(misfits(np.full(1, delay_s))[0]), 1e3)

@@ -1,8 +1,8 @@
-"""What is left when the model is right: noise of the wheels and of the body, learnt from the log.
+"""Noise of the wheels and of the body, estimated from the log.
 
-Here the noise of a channel, from what the richest model leaves of this log, then held for every comparison. And that of
-the sensors alone, from what needs no model: neighbouring samples, and poses of a robot that rests. A model's own
-residuals say how far it is off, not how well poses are measured: what is missing would count as noise.
+The noise of a channel comes from the residuals of the richest model, and is then held for every comparison. That of the
+sensors alone needs no model: it comes from neighbouring samples, and from poses of a robot that rests. In a model's own
+residuals, what is missing would count as noise.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ def _minimise(objective, start: Array, low: Array, high: Array, most: int, step:
 
 
 def largest_command_jitter_s(drive: GriddedDrive) -> float:
-    """How far commands may plausibly come early or late, s, by how the encoder's time stamps scatter.
+    """Return the largest plausible jitter of the commands (s), from the scatter of the encoder's time stamps.
 
-    More than that is no jitter but a response that the model does not have, and must not pass for noise.
+    More than that is a response that the model lacks, and must not count as noise.
     """
     settings = drive.settings.noise
     scattered_s = settings.command_jitter_ratio * drive.stamp_scatter_s
@@ -184,11 +184,11 @@ class SensorNoise:
 
 
 def sensor_noise(channel: BodyChannel, p: Array) -> SensorNoise:
-    """What single samples of a drive err by; `p`, a vector of the body, only says roughly where the wheels lead to.
+    """Estimate the noise of single samples; `p`, a vector of the body, is needed only for a rough path of the wheels.
 
-    Of moving robots the smaller of two bounds: second differences of what poses are off the wheels' path, and third
-    differences of the poses themselves, in which motion is nothing and noise is whole. Of resting ones the scatter
-    about the middle of a rest, which shows slow noise too; the larger of both.
+    For a moving robot it is the smaller of two bounds: second differences of poses against the wheels' path, and third
+    differences of the poses themselves, in which no motion is left. For a resting one it is the scatter about the
+    middle of a rest, which shows slow noise too. The larger of moving and resting counts.
     """
     raw, measured = channel.raw_residual(p), channel.measured
     t_s, window, use = channel.samples.t_s, channel.window, channel.use
@@ -207,7 +207,7 @@ def sensor_noise(channel: BodyChannel, p: Array) -> SensorNoise:
 
 
 def _second(t_s: Array, values: Array, window: NDArray[np.int64], use: Mask) -> Array:
-    """What values (P, C) are off the line between their neighbours, in units of their own noise, (n, C)."""
+    """Return distances of values (P, C) from the line between their neighbours, scaled to their own noise, (n, C)."""
     before, after = t_s[1:-1] - t_s[:-2], t_s[2:] - t_s[1:-1]
     good = (window[:-2] == window[2:]) & use[:-2] & use[1:-1] & use[2:] & (before > 0.0) & (after > 0.0)
     good &= np.maximum(before, after) < _UNEVEN * np.minimum(before, after)

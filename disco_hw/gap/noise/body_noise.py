@@ -1,4 +1,4 @@
-"""What is left of the poses when the model is right: noise of the pose sensor and slip of the body.
+"""Noise of the poses under a right model: that of the pose sensor, and slip of the body.
 
 A Kalman filter with the states error of x, y, yaw, slip velocity (forward, left, yaw rate) and correlated pose noise
 turns the residuals of a window, whose start is unknown, into independent ones of unit variance. Its gains depend on
@@ -44,7 +44,7 @@ class BodyNoise:
     noise_correlation_s: float = 0.02
 
     def vector(self) -> Array:
-        """Logarithms, (9,)."""
+        """Return the logarithms of all nine values, (9,)."""
         values = (
             self.position_m,
             self.yaw_rad,
@@ -99,7 +99,7 @@ def _transit(
     t: Any, noise: Any, dt: float, dx: float, dy: float, cosine: float, sine: float, moving: float, speed: float,
     rate: float,
 ) -> None:  # fmt: skip
-    """How errors go over into the next sample: x and y from yaw and slip, yaw from slip, what slip and noise keep."""
+    """Compute the transition of errors to the next sample: x and y from yaw and slip, yaw from slip, decay of both."""
     forward = (noise[3] * moving + noise[7] * abs(speed)) * dt
     left = (noise[4] * moving + noise[7] * abs(speed)) * dt
     t[0], t[1], t[2] = -dy, cosine * forward, -sine * left

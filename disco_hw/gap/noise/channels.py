@@ -36,7 +36,7 @@ _NEGLIGIBLE = 1e-5
 
 
 class ResidualChannel(Protocol):
-    """What fitting and selecting need of a channel; n is the number of its residuals."""
+    """Interface of a channel for fitting and selection; n is the number of its residuals."""
 
     @property
     def settings(self) -> GapSettings:
@@ -44,7 +44,7 @@ class ResidualChannel(Protocol):
 
     @property
     def layout(self) -> Layout:
-        """What the parameter vector's entries are."""
+        """Layout of the parameter vector: names, ranges and neutral values."""
 
     @property
     def neutral(self) -> Array:
@@ -68,7 +68,7 @@ class ResidualChannel(Protocol):
 
     @property
     def trusted_blocks(self) -> float:
-        """How many blocks of time that agree with the noise model it is worth, before the log is looked at."""
+        """Weight of the noise model before the log is seen, as a number of blocks of time that agree with it."""
 
     def residual(self, p: Array) -> Array:
         """Whitened residuals (n,) at a parameter vector."""
@@ -116,26 +116,26 @@ class WheelChannel:
         return cls(drive, motion, wheel_gains(noise, motion), np.ones((place.t_s.size, 2)), noise, geometry)
 
     def with_noise(self, noise: WheelNoise, use: Mask | None = None) -> WheelChannel:
-        """The same data under another noise model, weights reset; `use` (E,) leaves samples out."""
+        """Return the channel with another noise model and weights of 1; `use` (E,) leaves samples out."""
         motion = self.motion if use is None else replace(self.motion, use=self.motion.use & use)
         return replace(
             self, motion=motion, gains=wheel_gains(noise, motion), weight=np.ones(self.weight.shape), noise=noise
         )
 
     def expecting(self, p: Array) -> WheelChannel:
-        """The same, whose wheels' slow error acts on the speed that a parameter vector gives; weights reset."""
+        """Return the channel whose slow wheel error acts on the speed predicted by a vector; weights are 1."""
         turned = np.diff(self._predicted(p), axis=0, prepend=np.nan)
         moving = (self.motion.dt_s > 0.0) & ~self.motion.restart
         expected = np.where(moving[:, None], turned / np.maximum(self.motion.dt_s, 1e-9)[:, None], 0.0)
         return replace(self, motion=replace(self.motion, expected_rad_s=expected)).with_noise(self.noise)
 
     def weighted(self, weight: Array) -> WheelChannel:
-        """The same with other weights (E, 2)."""
+        """Return the channel with other weights (E, 2)."""
         return replace(self, weight=weight)
 
     def evenly(self, p: Array, extra: Array | None = None) -> WheelChannel:
-        """The same, as if wheels erred by as much at every speed; errors that are large beside what a vector leaves
-        count less (Huber, 1964).
+        """Return the channel whose wheels err equally at every speed; errors far above a vector's residuals count less
+        (Huber, 1964).
         """
         settings, samples = self.settings.noise, self.drive.encoder
         raw = self.raw_residual(p, extra)
@@ -163,7 +163,7 @@ class WheelChannel:
 
     @property
     def layout(self) -> Layout:
-        """What the parameter vector's entries are."""
+        """Layout of the parameter vector: names, ranges and neutral values."""
         return WHEEL
 
     @property
@@ -173,7 +173,7 @@ class WheelChannel:
 
     @property
     def inner(self) -> WheelChannel:
-        """The channel itself."""
+        """Channel without unnamed terms: this one."""
         return self
 
     @property
@@ -182,7 +182,7 @@ class WheelChannel:
         return ()
 
     def split(self, p: Array) -> tuple[Array, Array | None]:
-        """The vector; there are no unnamed terms in it."""
+        """Return the vector and None: this channel has no unnamed terms."""
         return p, None
 
     @property
@@ -197,7 +197,7 @@ class WheelChannel:
 
     @property
     def trusted_blocks(self) -> float:
-        """How many blocks of time that agree with the noise model it is worth."""
+        """Weight of the noise model, as a number of blocks of time that agree with it."""
         return self.settings.noise.trusted_wheel_blocks
 
     def angles(self, p: Array, extra: Array | None = None) -> Array:
@@ -230,7 +230,7 @@ class WheelChannel:
 
 @dataclass(frozen=True)
 class BodyChannel:
-    """Measured wheel angles in, poses out, in windows of `window_s` whose start pose is unknown."""
+    """Channel from measured wheel angles to poses, in windows of time whose start pose is unknown."""
 
     drive: GriddedDrive
     samples: GridSamples
@@ -274,7 +274,7 @@ class BodyChannel:
         return replace(channel, gains=body_gains(noise, channel.motion(rim)))
 
     def motion(self, rim_m_s: Array) -> BodyMotion:
-        """How the robot moved between the pose samples, from the wheels and the rough geometry."""
+        """Return the robot's motion between the pose samples, from the wheels and the rough geometry."""
         drive, samples, p = self.drive, self.samples, self.geometry
         speeds = drive.speed_rad_s[samples.node]
         v = 0.5 * p[0] * (speeds[:, 0] + speeds[:, 1])
@@ -289,7 +289,7 @@ class BodyChannel:
         return BodyMotion(dt, step[:, 0], step[:, 1], predicted[:, 2], moving, v, omega, restart, self.use)
 
     def with_noise(self, noise: BodyNoise, geometry: Array | None = None, use: Mask | None = None) -> BodyChannel:
-        """The same data under another noise model, weights reset; `use` is over this channel's samples."""
+        """Return the channel with another noise model and weights of 1; `use` is over this channel's samples."""
         changed = replace(
             self,
             noise=noise,
@@ -302,7 +302,7 @@ class BodyChannel:
         )
 
     def weighted(self, weight: Array) -> BodyChannel:
-        """The same with other weights (P, 3)."""
+        """Return the channel with other weights (P, 3)."""
         return replace(self, weight=weight)
 
     @property
@@ -312,7 +312,7 @@ class BodyChannel:
 
     @property
     def layout(self) -> Layout:
-        """What the parameter vector's entries are."""
+        """Layout of the parameter vector: names, ranges and neutral values."""
         return BODY
 
     @property
@@ -322,7 +322,7 @@ class BodyChannel:
 
     @property
     def inner(self) -> BodyChannel:
-        """The channel itself."""
+        """Channel without unnamed terms: this one."""
         return self
 
     @property
@@ -331,7 +331,7 @@ class BodyChannel:
         return tuple(range(BASE_COUNT))
 
     def split(self, p: Array) -> tuple[Array, Array | None]:
-        """The vector; there are no unnamed terms in it."""
+        """Return the vector and None: this channel has no unnamed terms."""
         return p, None
 
     @property
@@ -346,7 +346,7 @@ class BodyChannel:
 
     @property
     def trusted_blocks(self) -> float:
-        """How many blocks of time that agree with the noise model it is worth."""
+        """Weight of the noise model, as a number of blocks of time that agree with it."""
         return self.settings.noise.trusted_body_blocks
 
     def track(self, p: Array, extra: Array | None = None) -> Array:
@@ -356,7 +356,7 @@ class BodyChannel:
         return run_body(p, drive.angle_rad, drive.speed_rad_s, perturbation, drive.first, drive.t_s)
 
     def carried(self, p: Array) -> Array:
-        """How far the ground has carried the robot by each node, (M, 2), m in the world."""
+        """Return how far the ground has carried the robot by each node, (M, 2), m in the world frame."""
         return carried(p, self.drive.speed_rad_s, self.drive.t_s)
 
     def raw_residual(self, p: Array, extra: Array | None = None) -> Array:

@@ -1,4 +1,4 @@
-"""What is left of the wheels' angles when the model is right: quantisation, time stamps, wandering wheel speed.
+"""Noise of the wheel angles under a right model: quantisation, time stamps, drift of the wheel speed.
 
 A Kalman filter per wheel with three states, drift of the angle, quick and slow relative error of the speed, turns angle
 residuals into independent ones of unit variance. Its gains depend on the measured speed only, so whitening is linear.
@@ -27,7 +27,7 @@ _START_VARIANCE = 0.04
 class WheelNoise:
     """Relative speed error (1) and its correlation time (s); reading error (rad); jitter of the encoder's and of the
     command's time stamps (s); drift of the angle (rad per square root of s); slow relative speed error (1), which
-    wanders with `WANDER_S`.
+    drifts with `DRIFT_S`.
     """
 
     relative: float = 0.015
@@ -39,7 +39,7 @@ class WheelNoise:
     drift_std: float = 6e-3
 
     def vector(self) -> Array:
-        """Logarithms, (7,)."""
+        """Return the logarithms of all seven values, (7,)."""
         values = (
             self.relative,
             self.correlation_s,
@@ -59,7 +59,7 @@ class WheelNoise:
 
 @dataclass(frozen=True, slots=True)
 class WheelMotion:
-    """How the wheels were driven between samples: what the filter's transition needs.
+    """Inputs of the filter's transition: how the wheels were driven between samples.
 
     `dt_s` (E,) since the sample before, measured `speed_rad_s` (E, 2), `expected_rad_s` (E, 2) that a model gives,
     squared `jumps` of the command since then (E,); `restart` begins a run; `use` is False for samples left out.

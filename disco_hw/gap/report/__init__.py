@@ -1,6 +1,6 @@
-"""What is said of it: findings, what a log could not show, the amended model, page and figures.
+"""Report of a search: findings, effects that a log could not show, the amended model, page and figures.
 
-Here is the answer as data: verdict, effects with intervals, what is unnamed, what could not be seen, the held-out gap.
+This module has the report as data: verdict, effects with intervals, unnamed terms, blind spots, the held-out gap.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ALL_IN_ONE = "separate"
 
 
 def reached_horizon_s(gap: Mapping[str, Mapping[float, PredictionErrors]], settings: PredictionSettings) -> float:
-    """How far ahead an answer looks: as the settings say, or the longest below that runs are long enough for."""
+    """Return the horizon of the report (s): that of the settings, or the longest below it that the runs reach."""
     errors = gap.get("timed", {})
     reached = [s for s, e in errors.items() if s <= settings.reported_horizon_s and math.isfinite(e.position_m)]
     return max(reached, default=settings.reported_horizon_s)
@@ -103,7 +103,7 @@ class Provenance:
 
 @dataclass(frozen=True, slots=True)
 class CandidateEvidence:
-    """What a candidate's fit promised on top of what was accepted, or, if accepted, is worth."""
+    """Evidence of a candidate: the gain that its fit promised beside the accepted ones, or its own if accepted."""
 
     channel: str
     name: str
@@ -114,7 +114,7 @@ class CandidateEvidence:
 
 @dataclass(frozen=True)
 class GapReport:
-    """What `find_gap` returns; `model` is the one of the stage `offered`: the amended one, if it predicts best.
+    """Result of `find_gap`; `model` is the one of the stage `offered`: the amended one, if it predicts best.
 
     `gap` holds errors of poses by stage and horizon, `wheels` those of the wheels alone; either is empty where it could
     not be judged. `written` in them: the amended model as it is written, where that lacks a term which no model can
@@ -145,7 +145,7 @@ class GapReport:
 
     @property
     def horizon_s(self) -> float:
-        """How far ahead the answer looks."""
+        """Horizon of the report's errors (s)."""
         return reached_horizon_s(self.gap or self.wheels, self.settings.prediction)
 
     def at_horizon(self, stage: str) -> PredictionErrors:
@@ -273,7 +273,7 @@ _COLUMNS = ("log", "found", "doubtful", "ahead", "timed", "offered", "floor", "m
 
 @dataclass(frozen=True)
 class FleetRow:
-    """What one log of a fleet was found to lack, `directory` with its report, or why there is none."""
+    """Result for one log of a fleet: `directory` has its report; `why_not` says why there is none."""
 
     log: Path
     directory: Path
@@ -355,5 +355,5 @@ class FleetResult:
         return "\n".join(line.rstrip() for line in padded)
 
     def as_text(self) -> str:
-        """For a terminal."""
+        """Return the table and the paths of its files as text for a terminal."""
         return f"{self.table()}\n\nwritten: {self.directory}/fleet.txt, fleet.json, and a directory for each log"

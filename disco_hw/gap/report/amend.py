@@ -1,4 +1,4 @@
-"""The amended model: nominal geometry refitted, what is missing added, joint uncertainty of old and new parameters."""
+"""Creation of the amended model: refitted geometry, added effects, joint uncertainty of old and new parameters."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def channel_estimates(analysis: GapAnalysis, final: FinalFit) -> tuple[ChannelEs
 
 
 def at_joint_fit(part: ChannelEstimates, own_part: Part, of: Freed, joint: JointFit) -> ChannelEstimates:
-    """A channel's estimates moved to where the fit of the whole chain has them, and by as much less sure.
+    """Move a channel's estimates to those of the fit of the whole chain, and widen their intervals by as much.
 
-    What the whole chain frees of the channel (`own`) beyond what was found in it comes with its own variance.
+    What the whole chain frees of the channel (`own_part`) beyond what was found in it comes with its own variance.
     """
     by_name, off = dict(part.by_name), np.zeros(len(part.fitted))
     for name, old in part.by_name.items():
@@ -77,7 +77,7 @@ def simple_model(model: Model, of: Freed, joint: JointFit) -> tuple[Model, tuple
 
 
 def _given(model: Model, name: str, key: str) -> ParameterEstimate | None:
-    """What a model says of a parameter that was not fitted."""
+    """Return a parameter that was not fitted as the model has it; None if the model lacks its effect."""
     values = [setting.values[key] for setting in model.effects if setting.name == name]
     return ParameterEstimate(values[0], values[0], values[0]) if values else None
 
@@ -209,7 +209,7 @@ def _joint(
     estimates: Mapping[str, ParameterEstimate],
     parts: tuple[ChannelEstimates, ...],
 ) -> tuple[tuple[str, ...], Array]:
-    """Names and covariance: joint within a channel, independent between channels."""
+    """Return names and covariance of the parameters: joint within a channel, independent between channels."""
     full = {f"{effect}.{key}": estimate for effect, values in effects.items() for key, estimate in values.items()}
     known = {p.name: estimates[p.name] for p in BASE_PARAMETERS if p.name in estimates} | full
     names = tuple(name for name in bare.parameter_names if name in known)

@@ -1,6 +1,6 @@
-"""What a log could not have shown: for each effect that was not found, the smallest size that would have been seen.
+"""Blind spots of a log: for each effect that was not found, the smallest size that would have been seen.
 
-The boldest claims are proved: the effect is put into that very log, and the search is run again.
+The boldest claims are proved: the effect is added to that very log, which is searched again.
 """
 
 from __future__ import annotations
@@ -291,7 +291,7 @@ def side_by_side(evaluate: Evaluate, claims: Sequence[BlindSpot]) -> Iterator[Ca
 
 
 def _send(evaluate_next: Callable[[], Iterator[tuple[int, BlindSpot]]], sender: Connection) -> None:
-    """In a copy of the process: judge claims and hand them over; where that fails, or is interrupted, nothing comes."""
+    """Evaluate claims in a copy of the process, and send them; on failure or interruption send nothing."""
     with contextlib.suppress(Exception, KeyboardInterrupt):
         sender.send(dict(evaluate_next()))
 
@@ -415,7 +415,7 @@ def _path(drive: GriddedDrive, channel: BodyChannel, vector: Array, extra: Array
 
 
 def _earlier(values: Array) -> Array:
-    """Each value's predecessor; the first is its own."""
+    """Return the predecessor of each value; the first value is its own predecessor."""
     return np.concatenate([values[:1], values[:-1]])
 
 

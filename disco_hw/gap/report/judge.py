@@ -85,7 +85,7 @@ def _score(found: ChannelResult, name: str) -> float:
 
 
 def unnamed_findings(analysis: GapAnalysis) -> tuple[UnnamedFinding, ...]:
-    """What is missing and none of the named effects."""
+    """Return the findings that no named effect explains, as terms without a name."""
     out = []
     for place, found in ((Channel.COMMAND_TO_WHEEL, analysis.wheels), (Channel.WHEEL_TO_BODY, analysis.body)):
         if found is None:
@@ -145,7 +145,7 @@ def candidate_evidence(analysis: GapAnalysis) -> tuple[CandidateEvidence, ...]:
 
 
 def residue_sentences(analysis: GapAnalysis) -> tuple[str, ...]:
-    """What fits and was left out, and what is still missing after naming, by regime."""
+    """Describe effects that fit and were left out, and disagreements that naming has left, by regime."""
     out = [
         f"{REGISTRY[name].channel.value if name in REGISTRY else 'unnamed'}: {name} fits, and yet makes held-out "
         "predictions worse: it only stands for what is missing"
@@ -239,8 +239,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Measured:
-    """What sentences are checked against: the drive, its geometry (radius and axial distance, m), and names that the
-    residuals dispute, with the reason.
+    """Measured facts against which findings are checked: the drive, its geometry (radius and axial distance, m), and
+    names that the residuals dispute, with the reason.
     """
 
     drive: GriddedDrive
@@ -249,7 +249,7 @@ class Measured:
 
     @classmethod
     def of(cls, analysis: GapAnalysis, final: FinalFit) -> Measured:
-        """What a searched drive says."""
+        """Collect the facts of a searched drive."""
         vector = analysis.nominal_body if final.final_body is None else final.final_body.vector
         disputed: dict[str, str] = {}
         for found in (analysis.body, analysis.wheels):
@@ -332,7 +332,7 @@ def _written(parameter: Parameter, estimate: ParameterEstimate) -> str:
 
 
 def _exceeded(effect: Effect, limit: ParameterEstimate, measured: Measured) -> str | None:
-    """That the wheels themselves went beyond a limit, for how long and how far."""
+    """Describe for how long and how far the wheels exceeded a limit; None if they did not."""
     if not effect.is_limit or effect.limited is None:
         return None
     drive, settings = measured.drive, measured.drive.settings.report

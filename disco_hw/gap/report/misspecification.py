@@ -1,12 +1,12 @@
-"""Where simulation and data disagree: residuals by regime, what naming has left, and names whose form is another.
+"""Misspecification of accepted effects: residuals by regime, disagreements that are left, names of the wrong form.
 
-A stand-in of the right family and the wrong form leaves something. The accepted set is compared with the richest model
-of its channel, from which the noise was learnt: where that one still gains far more than its many parameters buy, in
-several blocks of time, something is left. And a named effect of the body has to be as strong where little of it acts as
-where much: a slip that saturates passes for one that grows for ever.
+An effect of the right family and the wrong form leaves a residue. The accepted set is compared with the richest model
+of its channel, from which the noise was estimated. If that gains far more than its many parameters explain, in several
+blocks of time, something is left. A named effect of the body must be as strong where little of it acts as where much
+acts: otherwise a slip that saturates would pass for one that grows without limit.
 
-A name is disputed where it only acts like what is missing: it takes little of that, a form without a name beside it
-explains as much, or its value is another wherever the robot drives differently (parameter constancy; Hansen, 1992).
+A name is disputed if it explains little of what is missing, if a form without a name beside it explains as much, or if
+its value changes with the regime (parameter constancy; Hansen, 1992).
 """
 
 from __future__ import annotations
@@ -67,14 +67,14 @@ def misspecified_effects(found: ChannelResult) -> list[str]:
 
 
 def _ratio(small: float, large: float, most: float) -> float:
-    """How much stronger where small, within what can be said."""
+    """Return the ratio of the strengths where small and where large, limited to `most` and its inverse."""
     if large <= small / most:
         return most
     return max(small / large, 1.0 / most)
 
 
 def _perturbation_of(split: Split, name: str, channel: BodyChannel) -> Array:
-    """What an effect adds to the body's velocity at the nodes of a fit, (M, 3) in m/s, m/s, rad/s."""
+    """Return an effect's contribution to the body's velocity at the nodes of a fit, (M, 3) in m/s, m/s, rad/s."""
     place = channel.layout.place
     vector, extra = split
     without = vector.copy()
@@ -137,20 +137,20 @@ def disputed_names(found: ChannelResult) -> dict[str, str]:
 
 
 def _gain(found: ChannelResult, name: str) -> float:
-    """What a name is worth in nats, the others kept."""
+    """Return the gain of a name in nats, with the others kept."""
     rest = tuple(other for other in found.names if other != name)
     return found.selector.exact(rest).cost - found.fit.cost
 
 
 def _answers_otherwise(found: ChannelResult, name: str) -> str | None:
-    """That wheels do not answer as they do behind a delay and a lag, of what makes them late."""
+    """Describe why a delay or lag is disputed: the wheels respond otherwise than behind any that was tried."""
     if name in DELAY_NAMES and not found.channel.drive.commands_timed:
         return "wheels answer more slowly, or later, than behind any delay and lag that were tried before"
     return None
 
 
 def _takes_little(found: ChannelResult, name: str) -> str | None:
-    """That a name leaves many times what it takes, where its channel still disagrees."""
+    """Describe why a name is disputed that leaves much more than it explains, if its channel still disagrees."""
     settings = found.channel.settings.report
     if found.richest is None or not loud_regimes(found):
         return None
@@ -163,8 +163,10 @@ def _takes_little(found: ChannelResult, name: str) -> str | None:
 
 
 def _has_equal_alternative(found: ChannelResult, name: str) -> str | None:
-    """That a term without a name, in the same channel, is worth about as much, or more if its traces are of another
-    kind: such a term explains something else, beside which a name may be true that takes more.
+    """Describe an unnamed term of the channel that explains about as much as a name; None if there is none.
+
+    A term whose traces are of another kind must explain more: it stands for something else, beside which the name may
+    be true.
     """
     settings, taken = found.channel.settings.report, _gain(found, name)
     end = 0
@@ -191,7 +193,7 @@ def _alike(found: ChannelResult, name: str, places: Iterable[int]) -> float:
 
 
 def _changes_with_regime(found: ChannelResult, name: str) -> str | None:
-    """That a value is another where the robot drives differently, by more than its noise and by much of itself."""
+    """Describe a value that changes with the regime by more than its noise and by much of itself; None if none does."""
     best, channel, settings = found.reported, found.selector.channel, found.channel.settings.report
     layout, drive = channel.layout, found.channel.drive
     columns = [column for column in CANDIDATES[name].columns if layout.place[column] in best.active]
@@ -216,8 +218,9 @@ def _changes_with_regime(found: ChannelResult, name: str) -> str | None:
 def _apart(
     best: Fit, block: Index, place: int, inside: tuple[Mask, Mask], settings: ReportSettings
 ) -> tuple[float, float, float] | None:
-    """How far one of the active entries is from its value in each of two regimes, and standard deviations between
-    them, all others being fitted with it; None where either says little of it.
+    """Return the change of an active entry in each of two regimes, and their difference in standard deviations.
+
+    All other entries are fitted with it. None if either regime says little of it.
     """
     slope = best.jacobian[:, place]
     column = float(slope @ slope)

@@ -24,7 +24,7 @@ def other_known_symptoms(effect: EffectFinding, settings: ReportSettings = DEFAU
 
 
 def sentence(effect: EffectFinding, settings: ReportSettings = DEFAULT_SETTINGS.report) -> str:
-    """What a missing effect does, with its values."""
+    """Describe what a missing effect does, with its values."""
     described = REGISTRY[effect.name]
     values = {name: estimate.value for name, estimate in effect.parameters.items()}
     others = dict(described.other_symptoms)
@@ -80,7 +80,7 @@ def _range(effect: EffectFinding) -> str:
 
 
 def _gap_line(report: GapReport) -> str:
-    """How far predictions are off before and after, what the sensors' noise makes, and which model to drive with."""
+    """Describe the prediction errors before and after, those of the sensors' noise, and the model to drive with."""
     horizon, of = f"{report.horizon_s:g} s", report.gap or report.wheels
     if not math.isfinite(of["timed"][report.horizon_s].position_m):
         return f"No stretch of the logs is long enough to see how far {horizon} predictions are off."
@@ -122,7 +122,7 @@ def as_text(report: GapReport) -> str:
 
 
 def _describe_logs(report: GapReport) -> list[str]:
-    """What several logs have in common, and what differs from one to the next."""
+    """Describe which parameters agree in several logs, and which differ from one to the next."""
     if len(report.sources) < 2:
         return []
     common = ", ".join(each.name for each in report.across if not each.differs)
@@ -171,7 +171,7 @@ _DEFINITIONS = {
 
 
 def page(report: GapReport) -> str:
-    """The whole page: the answer, the definitions in the margin, pictures, findings; expert tables folded."""
+    """Return the HTML of the report: answer, definitions in the margin, pictures, findings, folded expert tables."""
     lines = "".join(f"<p>{_with_code(line)}</p>" for line in summary_lines(report))
     glossary = "".join(f"<dt>{name}</dt><dd>{escape(text)}</dd>" for name, text in _DEFINITIONS.items())
     warned = "".join(f'<p class="warn">{escape(warning)}</p>' for warning in report.warnings)

@@ -1,4 +1,4 @@
-"""How much of the prediction error is explained, and where most of the rest lies."""
+"""Summary of the prediction error: the share that is explained, and where most of the rest lies."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Remains:
     def of(
         cls, timed: PredictionErrors, offered: PredictionErrors, floor: PredictionErrors, body: PredictionErrors | None
     ) -> Remains | None:
-        """What remains of held-out errors; `body`: those with wheels as measured. None where nothing was predicted."""
+        """Evaluate held-out errors; `body`: those with measured wheels. Return None if nothing was predicted."""
         if not math.isfinite(offered.position_m):
             return None
         before, after, noise = ((one.position_m, one.yaw_rad) for one in (timed, offered, floor))

@@ -70,7 +70,7 @@ class StagePredictions:
 
     @property
     def scored_horizon_s(self) -> float:
-        """How far ahead stages are compared."""
+        """Horizon at which stages are compared (s)."""
         return scored_horizon_s(self.body, self.poses)
 
     def errors(self, stage: str, ahead_s: float | None = None) -> PredictionErrors:
@@ -131,7 +131,7 @@ class _Fitted:
         return cls(of, joint, {fold: ahead.fit(start, fold) for fold, start in begin.items()})
 
     def at(self, fold: int | None = None) -> Freed:
-        """What was freed, around the fit of all data or around that without one fold."""
+        """Return the freed entries around the fit to all data, or to those without one fold."""
         return self.of.at((self.joint if fold is None else self.folds[fold]).vectors)
 
     @property
@@ -206,9 +206,9 @@ class _Candidate:
         return cls(analysis, final, Freed(of_all, chain), by_fold)
 
     def on_top(self, timed: _Fitted) -> tuple[_Candidate, ...]:
-        """The same on top of `timed`; beside it from where the channels have it, if that is far from there.
+        """Return the candidate on top of `timed`, and once more from the channels' values if these are far from it.
 
-        A lag that stands for something else is where a fit with that in it should not begin.
+        A fit should not begin at a lag that stands for something that it contains.
         """
         starts = (True, False) if self._begins_far(timed.at()) else (True,)
         return tuple(
@@ -230,7 +230,7 @@ class _Candidate:
         return bool(np.abs(amended.vector[delay_places] - plain[delay_places]).max() > far_s)
 
     def evaluate(self, ahead: Ahead, apart: StagePredictions) -> _Evaluated:
-        """What it errs by on held-out data."""
+        """Evaluate the candidate's errors on held-out data."""
         folds = {fold: ahead.fit(of, fold) for fold, of in self.by_fold.items()}
         chains = {fold: of.chain(folds[fold].vectors) for fold, of in self.by_fold.items()}
         errors = errors_of(apart.body, apart.wheels, chains, apart.scored_horizon_s, apart.poses)
@@ -306,12 +306,12 @@ def _needed(analysis: GapAnalysis, timed: _Fitted, ahead: Ahead, apart: StagePre
 
 
 def _on_top(amended: Freed, timed: Freed, there: bool) -> Freed:
-    """What was found freed on top of `timed`: its geometry and its lateness as free as there, the rest as trusted.
+    """Free the entries of `amended` on top of `timed`: geometry and delays as free as in `timed`, the rest as trusted.
 
-    They begin `there`, or else as near to it as where the channels have them.
+    `there`: whether they begin at the values of `timed`, or at those of the channels.
 
-    Where a channel's form is none of the known ones, its best fit may be far from what predicts best, and surer of it
-    than it should be.
+    If a channel's form is none of the known ones, its best fit may be far from what predicts best, with too narrow an
+    interval.
     """
     parts = []
     for part, plain in zip(amended.parts, timed.parts, strict=True):
@@ -327,14 +327,14 @@ def _on_top(amended: Freed, timed: Freed, there: bool) -> Freed:
 
 
 def _information(found: Fit, channel: BodyChannel | WheelChannel, left_out: int) -> Array:
-    """What the data without one fold say of the active entries of a fit, with what was expected of them, (A, A)."""
+    """Return the information of the data without one fold about a fit's active entries, with its prior, (A, A)."""
     inside = fold_of(channel) != left_out
     slope = found.jacobian[inside]
     return np.asarray(slope.T @ slope) + (0.0 if found.precision is None else np.diag(found.precision))
 
 
 def _roughly(channel: BodyChannel | WheelChannel, found: Fit) -> Array:
-    """That the geometry is about what the body alone has it to be, for logs with few commands; of the rest nothing."""
+    """Return a weak prior that keeps the geometry near the body's, for logs with few commands; zero for the rest."""
     known = np.zeros(len(found.active))
     share = channel.settings.prediction.rough_geometry
     known[: len(channel.free)] = (share * found.vector[[0, 1, 1]][: len(channel.free)]) ** -2.0
@@ -342,7 +342,7 @@ def _roughly(channel: BodyChannel | WheelChannel, found: Fit) -> Array:
 
 
 def _timed(ahead: Ahead, refitted: Freed) -> Freed:
-    """The same with what makes wheels late freed too, from the start that comes nearest; as it is without commands."""
+    """Free delay and lag of the wheels too, from the start that fits best; unchanged without commands."""
     if len(refitted.parts) == 1:
         return refitted
     body, wheels = refitted.parts
@@ -436,7 +436,7 @@ def prune(analysis: GapAnalysis) -> GapAnalysis:
 def _best(
     than: PredictionErrors, below: float, options: Iterable[GapAnalysis]
 ) -> tuple[GapAnalysis, PredictionErrors] | None:
-    """Of some analyses the one that predicts best, if its errors are less than `below` times those of another."""
+    """Return the analysis that predicts best, if its errors are below `below` times those of `than`; else None."""
     best, least = None, below
     for option in options:
         errors = stage_predictions(option).errors("amended")

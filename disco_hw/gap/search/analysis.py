@@ -1,7 +1,7 @@
-"""What the searches of both channels ended with, and the one fit of it that every finding rests on.
+"""Result of the searches of both channels, and the one fit to it on which every finding rests.
 
-Here is also what is confounded by algebra: effects with the same equations, and one cause seen in two channels; and an
-analysis that has less than another, or another name in the place of one.
+It also has what algebra confounds, effects with the same equations and one cause seen in two channels, and analyses
+without one of the names or with another in its place.
 """
 
 from __future__ import annotations
@@ -97,10 +97,10 @@ def confounded_with(names: tuple[str, ...], encoder_possible: bool) -> dict[str,
 
 @dataclass(frozen=True)
 class GapAnalysis:
-    """What was found in the channels of one drive; a channel that could not be judged is None.
+    """Findings in the channels of one drive; a channel that could not be evaluated is None.
 
-    `nominal_body`, `nominal_wheels` are the vectors of the model as given; `pruned` what fits and was left out, as
-    predictions are worse with it.
+    `nominal_body`, `nominal_wheels` are the vectors of the model as given; `pruned` names what fits but was left out,
+    as predictions are worse with it.
     """
 
     drive: GriddedDrive
@@ -190,7 +190,7 @@ def _with_encoder(body: ChannelResult, wheels: ChannelResult) -> tuple[Fit, Chan
 
 
 def least_evident_first(analysis: GapAnalysis) -> list[tuple[str, str | None]]:
-    """What was found and `timed` does not have, as its channel and its name, or None for the terms of a channel."""
+    """List findings beyond `timed` by evidence, least first: channel and name, or None for a channel's terms."""
     out: list[tuple[float, str, str | None]] = []
     for which in ("wheels", "body"):
         found: ChannelResult | None = getattr(analysis, which)

@@ -1,4 +1,4 @@
-"""What the search of a channel ended with: its fits, parameters with their intervals, and what parts of a log say.
+"""Result of a channel's search: its fits, parameters with intervals, and the values of parts of a log.
 
 95 % intervals and the joint covariance of what was fitted are widened where the noise model is too narrow, and by how
 far another drive's values may lie from those of this one.
@@ -35,7 +35,7 @@ class UnnamedTerm:
 
 @dataclass(frozen=True)
 class ChannelResult:
-    """What a channel's search ended with: its selector (noise held, all fits kept), accepted effects and terms.
+    """Result of a channel's search: its selector (noise held, all fits kept), accepted effects and terms.
 
     `richest` (n,): whitened residuals of the channel's richest model, which had `richest_parameters`. `either`:
     effects that explain what a patch of the floor does as well.
@@ -117,7 +117,7 @@ class ParameterEstimate:
 
     @classmethod
     def around(cls, value: float, deviation: float) -> ParameterEstimate:
-        """One of a normal distribution."""
+        """Return the estimate of a normally distributed value, with its 95 % interval."""
         return cls(value, value - Z95 * deviation, value + Z95 * deviation)
 
     @property
@@ -250,7 +250,7 @@ class InParts:
         return 4.0 * self.variance_between
 
     def apart(self, one: int, other: int) -> float:
-        """How far two parts lie apart, in standard deviations of the difference."""
+        """Return the difference of two parts, in standard deviations of the difference."""
         return float((self.values[other] - self.values[one]) / np.hypot(self.deviations[one], self.deviations[other]))
 
 
@@ -274,23 +274,23 @@ def drifted(found: ChannelResult) -> dict[str, float]:
 
 
 def in_equal_parts(found: ChannelResult, count: int) -> dict[str, InParts]:
-    """What each of so many parts of a log, of equal length, says of the parameters."""
+    """Return the parameters from each of `count` parts of a log of equal length."""
     blocks = np.unique(found.selector.channel.block).size
     return in_parts(found, count * np.arange(blocks) // max(blocks, 1))
 
 
 def in_logs(found: ChannelResult) -> dict[str, InParts]:
-    """What each of several logs that were searched together says, without those that say little of a parameter."""
+    """Return the parameters from each of several logs searched together, without logs that say little of one."""
     channel = found.selector.channel
     ends_s = (np.unique(channel.block) + 1) * channel.settings.grid.block_s
     return in_parts(found, np.searchsorted(channel.inner.drive.log_begins_s, ends_s), some=True)
 
 
 def in_parts(found: ChannelResult, parts: NDArray[np.int64], some: bool = False) -> dict[str, InParts]:
-    """What each part of a log says of the parameters, to second order; of which one says little, none does.
+    """Return the parameters from each part of a log, to second order.
 
-    `parts` (B,): the part of each block of time of the channel, in order; `some`: those that say enough of a parameter,
-    where there are two.
+    `parts` (B,): the part of each block of time of the channel, in order. A parameter of which one part says little is
+    left out; with `some`, only that part is, if two others are left.
     """
     best, channel, layout = found.reported, found.selector.channel, found.selector.channel.layout
     labels = np.unique(parts)

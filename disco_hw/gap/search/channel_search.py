@@ -96,7 +96,7 @@ def _on_own_clock(drive: GriddedDrive) -> GriddedDrive:
 
 
 def stamped(found: ChannelResult, drive: GriddedDrive) -> ChannelResult:
-    """What was found in a drive as it is laid, with delays counted from the stamps of commands or poses."""
+    """Return the result of an aligned drive with delays counted from the time stamps of commands or poses."""
     channel: WheelChannel | BodyChannel = replace(found.channel, drive=drive)
     moves = wheel_moves(channel, channel.geometry) if isinstance(channel, WheelChannel) else body_moves(channel)
 
@@ -132,9 +132,9 @@ def timed(selector: Selector) -> Selector:
 
 
 def evaluated_channel(found: ChannelResult, given: Names, start: Array) -> ChannelResult:
-    """The same when a delay must be worth its name as all else: against none, in a vector that has `given` alone.
+    """Evaluate the result again with delays tested like all other effects: against a vector that has `given` alone.
 
-    The others stay as they were found beside it: one that is too short for a name would change them too.
+    Other effects stay as they were found beside the delay: one that is too short for a name would change them too.
     """
 
     def against_none(selector: Selector, start: Array) -> Selector:
@@ -200,10 +200,10 @@ def search_body(drive: GriddedDrive, start: Array, given: Names = ()) -> Channel
 
 
 def _time_or_place(found: ChannelResult) -> ChannelResult:
-    """With unnamed terms; where the floor seems to have changed, a patch of it instead if that does as well.
+    """Add unnamed terms; replace a change of the floor by a patch of it, if that does as well.
 
     A patch that was left and not entered again looks like a change. No floor changes while one drives on it, so the
-    patch is reported then, and that a change would do as well is kept.
+    patch is reported then, and the change is kept as an alternative.
     """
     named = with_unnamed(found, _body_options)
     alike = tuple(name for name in found.names if REGISTRY[name].like_a_patch and name not in found.selector.given)
@@ -279,7 +279,7 @@ def with_unnamed(found: ChannelResult, options: Callable[[ChannelResult], Iterat
 
 
 def _written(found: ChannelResult) -> ChannelResult:
-    """The same, its terms with the coefficients that are told."""
+    """Return the result with the reported coefficients in the forms of its terms."""
     if not found.unnamed:
         return found
     vector, ends = found.reported.vector, np.cumsum([len(one.term.features) for one in found.unnamed])
@@ -289,7 +289,7 @@ def _written(found: ChannelResult) -> ChannelResult:
 
 
 def that_models_hold(found: ChannelResult) -> ChannelResult:
-    """With other terms in place of those that no model can carry, and the names that are needed then."""
+    """Replace terms that no model can hold by others, and select names again."""
     if found.plain is None or all(one.term.model_name is not None for one in found.unnamed):
         return found
     options = _wheel_options if isinstance(found.channel, WheelChannel) else _body_options
@@ -300,7 +300,7 @@ def that_models_hold(found: ChannelResult) -> ChannelResult:
 def _with_one_more(
     found: ChannelResult, options: Callable[[ChannelResult], Iterator[Term]], patches: bool
 ) -> tuple[ChannelResult | None, bool]:
-    """With the first of the most promising terms that is accepted, None if none is; and whether a patch may be one."""
+    """Add the first of the most promising terms that is accepted, or return None; and whether patches may follow."""
     offered = (term for term in options(found) if patches or term.disc is None)
     promising, tried = best_terms(found.fit, found.selector.channel, offered)
     for promised in promising:
@@ -318,8 +318,9 @@ def _with_one_more(
 
 
 def _with_term(found: ChannelResult, term: Term, tried: int) -> tuple[ChannelResult | None, bool]:
-    """With one more term, which was chosen among `tried`, None if it is not worth that; and whether, if it is a patch,
-    it is worth that without the block that says most.
+    """Add a term that was chosen among `tried`; None if its evidence is too small.
+
+    The second value says, for a patch, whether its evidence holds without the most informative block.
     """
     plain, small = found.plain or found.selector, found.fit
     terms = (*(one.term for one in found.unnamed), term)
@@ -348,7 +349,7 @@ def _with_term(found: ChannelResult, term: Term, tried: int) -> tuple[ChannelRes
 
 
 def _extended(plain: Selector, channel: WithTerms) -> Array:
-    """Where the fits of a channel with terms begin."""
+    """Return the start of the fits of a channel with terms."""
     start = plain.fit(plain.given).vector
     return np.append(start, np.zeros(channel.neutral.size - start.size))
 

@@ -97,7 +97,7 @@ def within_one_standard_error(best: PredictionErrors, other: PredictionErrors) -
 
 @dataclass(frozen=True)
 class Starts:
-    """Where predictions begin: nodes (K,), poses there (K, 3) smoothed, poses measured at the end (K, 3)."""
+    """Starts of predictions: nodes (K,), smoothed poses there (K, 3), poses measured at the end (K, 3)."""
 
     node: Index
     pose: Array
@@ -108,7 +108,7 @@ class Starts:
 
 @dataclass(frozen=True)
 class Chain:
-    """Both channels with one parameter vector each: commands in, poses out; without wheels the measured ones.
+    """Chain of both channels, a parameter vector each, from commands to poses; without `wheels` from measured wheels.
 
     The perturbations are what unnamed terms add at the nodes.
     """
@@ -175,7 +175,7 @@ def find_starts(channel: BodyChannel, poses: tuple[Array, Array], ahead_s: float
 
 
 def scored_horizon_s(channel: BodyChannel, poses: tuple[Array, Array]) -> float:
-    """How far ahead stages are compared: as the answer looks, or the longest below that runs are long enough for."""
+    """Return the horizon at which stages are compared (s): that of the report, or the longest that runs reach."""
     settings = channel.settings.prediction
     shorter = sorted((each for each in settings.horizons_s if each <= settings.reported_horizon_s), reverse=True)
     reached = (ahead_s for ahead_s in shorter if find_starts(channel, poses, ahead_s).node.size)
@@ -183,7 +183,7 @@ def scored_horizon_s(channel: BodyChannel, poses: tuple[Array, Array]) -> float:
 
 
 def regimes_driven(channel: BodyChannel | WheelChannel, node: Index, ahead: int) -> list[str]:
-    """What the robot mostly does between start and end."""
+    """Return the regime of the robot's motion from each node to `ahead` nodes later."""
     if not node.size:
         return []
     drive, p, settings = channel.drive, channel.geometry, channel.settings.prediction
@@ -337,7 +337,7 @@ def _interval(squares: Array, block: Index, resamples: int) -> tuple[float, floa
 
 
 def floor_errors(body: BodyChannel, noise: SensorNoise, ahead_s: float, poses: tuple[Array, Array]) -> PredictionErrors:
-    """What a model that is exactly right would err so far ahead, as the sensors say a little else than what is true."""
+    """Return the errors of an exactly right model at a horizon, from the sensors' noise alone."""
     starts = find_starts(body, poses, ahead_s)
     settings = body.settings.prediction
     period_s = max(float(np.median(np.diff(body.samples.t_s))), 1e-3)

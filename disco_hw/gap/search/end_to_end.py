@@ -1,7 +1,7 @@
-"""The last fit: the whole chain at once, commands in and poses out, to its own predictions some seconds ahead.
+"""Final fit of the whole chain, from commands to poses, to its own predictions some seconds ahead.
 
-What is right of each channel alone need not be right of both in a row: where the true form is none of the known ones,
-each channel's best fit errs in its own way. Output-error method (Ljung, System Identification, 1999, ch. 3 and 7).
+What is best for each channel alone need not be best for both in a row: if the true form is none of the known ones, each
+channel's best fit errs in its own way. Output-error method (Ljung, System Identification, 1999, ch. 3 and 7).
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _INSIDE = 1e-6
 
 @dataclass(frozen=True)
 class Part:
-    """Of one channel's vector the `active` places that a fit frees; `information` (A, A) of what is known of them."""
+    """Part of a channel's vector that a fit frees: the `active` places, with prior `information` (A, A) about them."""
 
     layout: Layout
     vector: Array
@@ -52,7 +52,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Freed:
-    """What a fit of the chain frees: of each of its channels some entries; `chain` joins their vectors."""
+    """Entries of each channel that a fit of the chain frees; `chain` joins the channels' vectors."""
 
     parts: tuple[Part, ...]
     chain: Callable[[Sequence[Array]], Chain]
@@ -70,7 +70,7 @@ class Freed:
         return out
 
     def at(self, vectors: Sequence[Array]) -> Freed:
-        """The same around other vectors."""
+        """Return the same freed entries around other vectors."""
         pairs = zip(self.parts, vectors, strict=True)
         return replace(self, parts=tuple(replace(part, vector=vector) for part, vector in pairs))
 
@@ -90,7 +90,7 @@ class JointFit:
     covariance: Array
 
     def value(self, name: str, of: Freed, own_channel: Part | None = None) -> float | None:
-        """One entry by its full name, that of the part `own` if it has one; None if it is in no channel's vector.
+        """Return an entry by its full name, from `own_channel` if it has one; None if it is in no channel's vector.
 
         Both channels number their unnamed terms alike.
         """
@@ -121,7 +121,7 @@ class Ahead:
 
     @property
     def folds(self) -> int:
-        """In how many folds the drive is divided."""
+        """Number of folds into which the drive is divided."""
         return self.body.drive.folds.count
 
     def errors(self, chain: Chain, turned: tuple[Array, Array] | None = None) -> list[Array]:
@@ -130,7 +130,7 @@ class Ahead:
         return [prediction_error(self.body, starts, chain.body, track, ahead_s) for ahead_s, starts in self.starts]
 
     def usual_cost(self, chain: Chain) -> float:
-        """How far off predictions usually are, on a scale that compares chains: log of the sizes of both errors."""
+        """Return the usual size of prediction errors, to compare chains: the sum of the logs of both errors' sizes."""
         return sum(float(np.log(_usual(error)[1:]).sum()) for error in self.errors(chain))
 
     def fit(self, of: Freed, left_out: int | None = None, begin: Sequence[Array] | None = None) -> JointFit:

@@ -178,7 +178,7 @@ class Candidate:
     """An effect in the competition.
 
     `columns` are fitted from each of the `starts`, none of which means from neutral, where the effect is smooth.
-    `once`: it begins at some time of the drive.
+    `is_alternative`: it begins at some time of the drive, as a patch of the floor would.
     """
 
     name: str
@@ -207,7 +207,7 @@ OLD_POSE_COLUMNS = tuple(f"{effect.name}.{effect.parameters[0].name}" for effect
 
 
 def delay_columns(layout: Layout) -> tuple[str, ...]:
-    """What moves one side of a channel in time against the other."""
+    """Return the parameters that delay one side of a channel against the other."""
     return (DELAYED_BY,) if layout.of_wheels else OLD_POSE_COLUMNS
 
 
@@ -226,13 +226,13 @@ def with_delay(channel: ResidualChannel, vector: Array) -> Array:
 
 
 def _pose_starts(channel: ResidualChannel) -> Starts:
-    """Where the fit of a pose's age begins: at first sight."""
+    """Return the start of the fit of the poses' delay: its first estimate."""
     seen = with_delay(channel, channel.neutral)
     return ((float(seen[channel.layout.place[OLD_POSE_COLUMNS[0]]]),),)
 
 
 def _delay_starts(channel: ResidualChannel, starts: Starts) -> Starts:
-    """Where the fit of a dead time begins: its starts, from what is seen at first sight on."""
+    """Return the starts of the fit of a dead time, moved by its first estimate."""
     return tuple((start + channel.inner.drive.commands_moved_s, *rest) for start, *rest in starts)
 
 
@@ -259,7 +259,7 @@ def _candidate(effect: Effect) -> Candidate:
 
 
 def _competing() -> dict[str, Candidate]:
-    # What mimics another effect is decided after the others, in `confounding`.
+    # What mimics another effect is decided after the others, in `analysis`.
     return {name: _candidate(effect) for name, effect in REGISTRY.items() if effect.mimics is None}
 
 
@@ -272,7 +272,7 @@ def candidates_of(layout: Layout) -> tuple[str, ...]:
 
 
 def smooth_of(layout: Layout) -> tuple[str, ...]:
-    """Those of them that a fit finds from neutral, in the order in which they act."""
+    """Return the candidates that a fit finds from their neutral values, in the order in which they act."""
     acting = [effect.name for effect in in_stages(*Stage) if effect.smooth]
     return tuple(name for name in acting if name in candidates_of(layout))
 

@@ -91,10 +91,10 @@ def inflation(found: Fit, channel: ResidualChannel, added: tuple[int, ...]) -> f
 
 
 def interval_inflation(found: Fit, channel: ResidualChannel, added: tuple[int, ...]) -> float:
-    """The same of the variance of which 1.96 standard deviations hold 95 %.
+    """Return the inflation of the variance with which 1.96 standard deviations hold 95 %.
 
-    How blocks scatter is known as well as there are blocks: the interval is that of Student's t (Bell and McCaffrey,
-    2002), wide where a parameter shows at two or three moments of a log.
+    The scatter of blocks is known only as well as there are blocks. So the interval is that of Student's t (Bell and
+    McCaffrey, 2002), and wide if a parameter shows at only two or three moments of a log.
     """
     factor, freedom = _scatter(found, channel, added)
     return factor * (float(stdtrit(max(freedom, 1.0), 0.975)) / Z95) ** 2
@@ -155,7 +155,7 @@ Split = tuple[Array, Array | None]
 
 
 def wheel_moves(channel: WheelChannel, geometry: Array) -> Callable[[Split, Split], float]:
-    """How far two fits of the wheels lie apart `ahead_s` ahead, m (lever arm of half the way)."""
+    """Return a function for the distance (m) of two fits' wheel predictions, with half the way as lever arm."""
     drive = channel.drive
     settings = channel.settings.selection
     usable = np.isfinite(drive.command_rad_s[:, 0])
@@ -178,7 +178,7 @@ def wheel_moves(channel: WheelChannel, geometry: Array) -> Callable[[Split, Spli
 
 
 def body_moves(channel: BodyChannel) -> Callable[[Split, Split], float]:
-    """How far two fits of the body lie apart `ahead_s` ahead, m."""
+    """Return a function for the distance (m) of two fits' body predictions at the usual horizon."""
     drive = channel.drive
     settings = channel.settings.selection
     everywhere = np.ones(drive.t_s.size, dtype=bool)
@@ -238,7 +238,7 @@ class Selector:
 
     @property
     def settings(self) -> SelectionSettings:
-        """What decides between effects."""
+        """Settings that decide between effects."""
         return self.channel.settings.selection
 
     def exact(self, names: Names) -> Fit:

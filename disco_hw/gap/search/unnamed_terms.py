@@ -67,7 +67,7 @@ class Term:
 
 
 def wheel_terms(channel: WheelChannel, delay_s: float) -> Iterator[Term]:
-    """What may be added to both wheels' commands; `late_s` is the dead time that was found."""
+    """Yield the terms that may be added to both wheels' commands; `delay_s` is the dead time that was found."""
     drive = channel.drive
     u = drive.delayed_commands(delay_s)
     other, t = u[:, ::-1], drive.t_s[:, None]
@@ -99,7 +99,7 @@ def motion(drive: GriddedDrive, p: Array) -> tuple[Array, Array, Array]:
 
 
 def body_terms(channel: BodyChannel, p: Array) -> Iterator[Term]:
-    """What may be added to the body's velocity; `p` is the vector of the channel."""
+    """Yield the terms that may be added to the body's velocity; `p` is the vector of the channel."""
     drive = channel.drive
     v, w, a = motion(drive, p)
     dw = np.gradient(smoothed(w, drive.settings.terms), GRID_STEP_S)
@@ -159,7 +159,7 @@ def with_known_terms(drive: GriddedDrive, effects: Iterable[EffectSetting], p: A
 
 
 def _times(setting: EffectSetting, feature: Array) -> Array:
-    """What a model's term adds for a feature at the nodes."""
+    """Return the contribution of a model's term for a feature at the nodes."""
     reach = setting.values[REACH.name]
     return np.asarray(setting.values["k"] * np.clip(feature, -reach, reach))
 
@@ -214,7 +214,7 @@ def _where(channel: BodyChannel) -> tuple[Array, Array]:
 
 
 def _discs(channel: BodyChannel, p: Array, discs: Iterable[tuple[float, float, float]]) -> Iterator[Term]:
-    """Those in which a good part of all turning was done, and outside of which too."""
+    """Yield terms for the discs inside and outside of which much of all turning was done."""
     x, y = _where(channel)
     settings = channel.settings.terms
     speed = channel.drive.speed_rad_s
@@ -257,7 +257,7 @@ class WithTerms:
 
     @classmethod
     def of(cls, inner: WheelChannel | BodyChannel, terms: tuple[Term, ...]) -> WithTerms:
-        """Extend a channel."""
+        """Return a channel extended by unnamed terms."""
         plain = inner.layout
         names = tuple(
             f"term{k}" if part == 0 else f"term{k}.{part}"
@@ -292,7 +292,7 @@ class WithTerms:
 
     @property
     def many(self) -> int:
-        """Number of coefficients."""
+        """Number of coefficients of all terms."""
         return sum(len(term.features) for term in self.terms)
 
     @property
@@ -313,7 +313,7 @@ class WithTerms:
 
     @property
     def trusted_blocks(self) -> float:
-        """How many blocks of time that agree with the noise model it is worth."""
+        """Weight of the noise model, as a number of blocks of time that agree with it."""
         return self.inner.trusted_blocks
 
     def split(self, p: Array) -> tuple[Array, Array | None]:
@@ -331,6 +331,6 @@ class WithTerms:
         return p[:width], self.kept[key]
 
     def residual(self, p: Array) -> Array:
-        """Whitened residuals."""
+        """Return the whitened residuals at a vector."""
         core, perturbation = self.split(p)
         return self.inner.residual(core, perturbation)

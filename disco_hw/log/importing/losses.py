@@ -11,7 +11,7 @@ WARNED_SHARE, REFUSED_SHARE = 0.05, 0.5
 
 
 def loss_note(source: str, signal: str, dropped: int, total: int, what: str, hint: str) -> str:
-    """Return the sentence on `lost` of `total` samples of a signal; `what` says what is wrong with them.
+    """Return the sentence on `dropped` of `total` samples of a signal; `what` says what is wrong with them.
 
     It begins with WARNING if over 5 % of the signal is lost. Raises LogError if over half of it is.
     """
