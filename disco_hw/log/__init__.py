@@ -38,12 +38,16 @@ class Attachment(msgspec.Struct, frozen=True):
 
 
 class TaskScene(msgspec.Struct, frozen=True):
-    """Static content that a viewer draws beside the records: the task's line, the fence, and the robot's size (m)."""
+    """Static content that a viewer draws beside the records, in metres: the task's line, the fence, and the robot.
+
+    `footprint_m`: its outline in the robot's own frame.
+    """
 
     outline_m: tuple[tuple[float, float], ...]
     axial_distance_m: float
     wheel_radius_m: float
     fence_m: tuple[tuple[tuple[float, float], ...], ...] = ()
+    footprint_m: tuple[tuple[float, float], ...] = ()
 
 
 class Start(msgspec.Struct, frozen=True):

@@ -12,6 +12,7 @@ a plug-in; nothing of ours reads them back. Planar poses become poses in space w
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import IO, Any, Protocol, cast
 
@@ -102,32 +103,18 @@ def views(record: Record, wall_ns: int) -> list[tuple[str, bytes]]:
 
 
 def scene_message(scene: TaskScene) -> bytes:
-    """Return a SceneUpdate in protobuf: the task's course in the world's frame, and the robot's body in its own."""
-    line = LinePrimitive(
-        type=LinePrimitive.LINE_STRIP,
-        pose=Pose(),
-        thickness=0.02,
-        color=Color(r=0.2, g=0.6, b=0.3, a=1.0),
-        points=[Point3(x=x, y=y, z=0.0) for x, y in scene.outline_m],
-    )
+    """Return a SceneUpdate in protobuf: course and fence in the world, body and footprint in the robot's frame."""
+    line = _line(scene.outline_m, Color(r=0.2, g=0.6, b=0.3, a=1.0))
     width, radius = scene.axial_distance_m, scene.wheel_radius_m
     body = CubePrimitive(
         pose=Pose(position=Vector3(x=0.0, y=0.0, z=1.5 * radius)),
         size=Vector3(x=1.5 * width, y=0.75 * width, z=radius),
         color=Color(r=0.9, g=0.6, b=0.1, a=0.8),
     )
-    fence = [
-        LinePrimitive(
-            type=LinePrimitive.LINE_STRIP,
-            pose=Pose(),
-            thickness=0.02,
-            color=Color(r=0.75, g=0.1, b=0.1, a=1.0),
-            points=[Point3(x=x, y=y, z=0.0) for x, y in outline],
-        )
-        for outline in scene.fence_m
-    ]
+    fence = [_line(outline, Color(r=0.75, g=0.1, b=0.1, a=1.0)) for outline in scene.fence_m]
+    footprint = _line(scene.footprint_m, Color(r=0.9, g=0.6, b=0.1, a=1.0))
     task = SceneEntity(id="task", frame_id=_WORLD, lines=[line, *fence])
-    robot = SceneEntity(id="robot", frame_id=_ROBOT, frame_locked=True, cubes=[body])
+    robot = SceneEntity(id="robot", frame_id=_ROBOT, frame_locked=True, cubes=[body], lines=[footprint])
     message: bytes = SceneUpdate(entities=[task, robot]).SerializeToString()
     return message
 
@@ -136,13 +123,7 @@ def _stopping(record: GuardVerdict, time: Timestamp) -> SceneUpdate:
     """Return the fence guard's stopping path, red where it holds the robot, and the obstacles."""
     free = record.verdict in {"free", "scaled"}
     colour = Color(r=0.1, g=0.6, b=0.2, a=1.0) if free else Color(r=0.8, g=0.1, b=0.1, a=1.0)
-    path = LinePrimitive(
-        type=LinePrimitive.LINE_STRIP,
-        pose=_pose(0.0, 0.0, 0.0),
-        thickness=0.02,
-        color=colour,
-        points=[Point3(x=x, y=y, z=0.0) for x, y in zip(record.path_x_m, record.path_y_m, strict=False)],
-    )
+    path = _line(zip(record.path_x_m, record.path_y_m, strict=False), colour)
     numbers = record.obstacles
     obstacles = [
         CylinderPrimitive(
@@ -156,6 +137,17 @@ def _stopping(record: GuardVerdict, time: Timestamp) -> SceneUpdate:
     ]
     entity = SceneEntity(timestamp=time, id="stopping path", frame_id=_WORLD, lines=[path], cylinders=obstacles)
     return SceneUpdate(entities=[entity])
+
+
+def _line(points: Iterable[tuple[float, float]], colour: Color) -> LinePrimitive:
+    """Return a line of 2 cm through these points on the floor."""
+    return LinePrimitive(
+        type=LinePrimitive.LINE_STRIP,
+        pose=_pose(0.0, 0.0, 0.0),
+        thickness=0.02,
+        color=colour,
+        points=[Point3(x=x, y=y, z=0.0) for x, y in points],
+    )
 
 
 def _rollouts(fan: Fan, time: Timestamp) -> SceneUpdate:

@@ -18,7 +18,7 @@ import msgspec
 
 from disco_hw.config import PoseInput, Robot, RobotConfig, link_fields, load_robot_config, refuse_outside_task
 from disco_hw.errors import InputError
-from disco_hw.fence.outlines import fence_outlines
+from disco_hw.fence.outlines import fence_outlines, footprint_outline
 from disco_hw.files import KEY, WAY_POINTS, read_bytes
 from disco_hw.files import MODEL_TOML as MODEL_KIND
 from disco_hw.files import ROBOT_TOML as ROBOT_KIND
@@ -123,7 +123,9 @@ def scene_of(config: RobotConfig) -> TaskScene:
     """Return the task's course and the robot's size, for whoever draws a log or a running robot."""
     outline = tuple((x, y) for x, y in config.task.course().outline_m().tolist())
     fence = tuple(tuple((x, y) for x, y in line.tolist()) for line in fence_outlines(config.fence))
-    return TaskScene(outline, config.robot.axial_distance_m, config.robot.wheel_radius_m, fence)
+    around = footprint_outline(config.robot.footprint, (0.0, 0.0, 0.0))
+    footprint = tuple((x, y) for x, y in around.tolist())
+    return TaskScene(outline, config.robot.axial_distance_m, config.robot.wheel_radius_m, fence, footprint)
 
 
 def kept_files(setup: Setup) -> list[Attachment]:

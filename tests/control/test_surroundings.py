@@ -28,6 +28,7 @@ from disco_hw.fence import Circle, Fence, Footprint
 from disco_hw.fence.clearance import Boundaries, MovingCircle
 from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.robot_setup import load_setup
+from tests.control.kernel.test_step import allocations
 
 FOOTPRINT = Footprint(0.5, 0.4, 0.05)
 ROBOT_FILE = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
@@ -162,6 +163,16 @@ def test_a_pillar_on_the_line_is_driven_around_and_the_line_rejoined(planner):
     off = np.abs(np.hypot(poses[:, 0], poses[:, 1]) - 0.75)
     assert angle[-1] > math.radians(220)
     assert off[angle > math.radians(205)].max() < 0.05
+
+
+def test_beside_a_pillar_the_step_allocates_nothing(planner):
+    drive(planner, bounds_of(Fence(keep_in=ROOM), [MovingCircle(0.0, 0.75, 0.12)]), 2.0)
+    arguments = planner.optimiser.arguments
+    (area,) = [one.area for one in arguments if hasattr(one, "area")]
+    assert area.number[0] > 0
+    assert area.detours[DETOUR_COLUMNS - 2] != 0.0
+    of_step, of_nothing = allocations(arguments)
+    assert of_step == of_nothing > 0
 
 
 @pytest.mark.thorough

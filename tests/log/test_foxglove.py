@@ -1,14 +1,22 @@
 import math
 import typing
+from pathlib import Path
 
+import msgspec
 import pytest
 
-from disco_hw.log.mcap_log import VIEWS, views
-from disco_hw.log.records import Command, Estimate, Event, Fan, Level, Plan
+import disco_hw
+from disco_hw.config import load_robot_config
+from disco_hw.fence import Circle, Fence, Footprint
+from disco_hw.log.mcap_log import VIEWS, scene_message, views
+from disco_hw.log.records import Command, Estimate, Event, Fan, GuardVerdict, Level, Plan
+from disco_hw.runtime.robot_setup import scene_of
 from drivers.types import PoseSample
 
 WALL_NS = 1_700_000_000_123_456_789
 CLASSES = dict(VIEWS)
+ROBOT_FILE = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
+FOOTPRINT = Footprint(0.5, 0.4, 0.05)
 
 
 def shown(record):
@@ -78,6 +86,44 @@ def test_rollouts_are_lines_the_fainter_the_less_they_weigh():
 def test_broken_rollouts_are_shown_as_far_as_they_go(fan, points):
     (line,) = shown(fan)["/view/rollouts"].entities[0].lines
     assert len(line.points) == points
+
+
+def points_of(line):
+    return [(point.x, point.y) for point in line.points]
+
+
+def test_the_scene_shows_the_fence_in_the_world_and_the_footprint_on_the_robot():
+    config = load_robot_config(ROBOT_FILE)
+    corners = ((-2.0, -1.5), (2.0, -1.5), (2.0, 1.5))
+    fence = Fence(keep_in=corners, keep_out=(Circle((0.0, 0.0), 0.3),))
+    robot = msgspec.structs.replace(config.robot, footprint_m=FOOTPRINT)
+    config = msgspec.structs.replace(config, robot=robot, fence=fence)
+    update = CLASSES["/view/fence"]()
+    update.ParseFromString(scene_message(scene_of(config)))
+    task, body = update.entities
+    _, keep_in, pillar = task.lines
+    assert points_of(keep_in) == [*corners, corners[0]]
+    assert {round(math.hypot(x, y), 9) for x, y in points_of(pillar)} == {0.3}
+    (outline,) = body.lines
+    assert (body.frame_id, body.frame_locked) == ("robot", True)
+    assert points_of(outline)[:4] == [pytest.approx(corner) for corner in FOOTPRINT.corners_m()]
+    assert points_of(outline)[4] == points_of(outline)[0]
+
+
+@pytest.mark.parametrize(("verdict", "is_red"), [("free", False), ("scaled", False), ("stopped", True)])
+def test_the_stopping_path_is_red_where_the_guard_holds_the_robot(verdict, is_red):
+    found = GuardVerdict(
+        1, verdict, 0.5, 0.1, path_x_m=(0.0, 0.2), path_y_m=(1.0, 1.1), path_yaw_rad=(0.0, 0.1),
+        obstacles=(1.0, 2.0, 0.3, 4.0, 5.0, 0.6),
+    )  # fmt: skip
+    (entity,) = shown(found)["/view/fence"].entities
+    (path,) = entity.lines
+    assert points_of(path) == [(0.0, 1.0), (0.2, 1.1)]
+    assert (path.color.r > path.color.g) is is_red
+    assert [(one.pose.position.x, one.pose.position.y, one.size.x) for one in entity.cylinders] == [
+        (1.0, 2.0, 0.6),
+        (4.0, 5.0, 1.2),
+    ]
 
 
 def test_nothing_is_shown_of_a_plan_without_path_or_a_command():
