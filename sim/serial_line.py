@@ -19,12 +19,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drivers.types import Frame, ReceivedFrame
-from firmware_protocol.serial_framing import FrameDecoder, encode_frame
+from firmware_protocol.serial_framing import BITS_PER_BYTE, FrameDecoder, encode_frame
 from sim import ROBOT_NODE, LinkFaultError
 from sim.bus import UNHARMED, BusFault, FrameOutcome
 from sim.can_protocol import CanFrame, candump_line
 
-BITS_PER_BYTE = 10
 BAUD_TOLERANCE = 0.03
 READ_BYTES = 4096
 

@@ -25,14 +25,13 @@ from drivers.transport.reconnecting import (
     TransportCounters,
 )
 from drivers.types import Exchange, Frame, ReceivedFrame
-from firmware_protocol.serial_framing import FrameDecoder, encode_frame
+from firmware_protocol.serial_framing import BITS_PER_BYTE, FrameDecoder, encode_frame
 
 _GONE = (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO)
 KIND = "serial"
 READ_TIMEOUT_S = 0.1
 WRITE_TIMEOUT_S = 0.05
 _EXCHANGE_READ_S = 0.002
-_BITS_PER_BYTE = 10
 _LONGEST_REPLY = 600
 _FULL = "the line accepts no more bytes; check that the other end reads"
 _DELIMITER = b"\0"
@@ -187,7 +186,7 @@ class ExchangeConnection:
 
     def _wait_for_reply(self, frame: Frame, sent_bytes: int) -> Frame | None:
         received = b""
-        byte_s = _BITS_PER_BYTE / self._port.baudrate
+        byte_s = BITS_PER_BYTE / self._port.baudrate
         deadline = time.monotonic() + self._exchange.timeout_s + sent_bytes * byte_s
         latest = deadline + _LONGEST_REPLY * byte_s
         while time.monotonic() < deadline and len(received) <= _LONGEST_REPLY:
