@@ -27,7 +27,7 @@ from drivers.motor import find_driver
 from drivers.motor.vendor_parts import ESTOP_LIFE_NS, ESTOP_REPEATS
 from drivers.transport import SerialMedium, open_transport
 from drivers.transport.reconnecting import TransportCounters
-from drivers.transport.serial import ExchangeConnection, open_port
+from drivers.transport.serial import EXCHANGE_READ_S, ExchangeConnection, open_port
 from drivers.types import Frame, LinkState, OutgoingFrame
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 
@@ -222,7 +222,7 @@ def _stop_over_exchange(settings: Link, frames: Sequence[Frame], is_confirmation
     driver = find_driver(settings.driver)
     assert driver.exchange is not None
     medium = SerialMedium(settings.port, settings.baud, settings.dtr, settings.rts)
-    with open_port(medium, timeout_s=0.002, write_timeout_s=0.5, exclusive=False) as port:
+    with open_port(medium, timeout_s=EXCHANGE_READ_S, write_timeout_s=0.5, exclusive=False) as port:
         line = ExchangeConnection(port, TransportCounters(), driver.exchange(settings.settings()))
         deadline_ns = time.monotonic_ns() + round(_CONFIRM_S * 1e9)
         went_out, confirmed = False, False
