@@ -31,7 +31,9 @@ from drivers.transport.serial import EXCHANGE_READ_S, ExchangeConnection, open_p
 from drivers.types import Frame, LinkState, OutgoingFrame
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 
+# Chosen: longer than a link takes to open, and short enough for an operator who waits to reach for the button.
 _CONNECT_S = 1.0
+# Chosen: five periods of SYSTEM_STATE (0.1 s); slower confirmations are reported as missing.
 _CONFIRM_S = 0.5
 _HINT = (
     "to stop the robot all the same, give --link can:INTERFACE:CHANNEL or --link serial:PORT, or use the robot's "

@@ -13,10 +13,10 @@ from typing import Annotated, NamedTuple, Protocol
 import msgspec
 from msgspec import Meta
 
+from drivers.samples import FARTHEST_M
+
 Point = tuple[float, float]
 Polygon = Annotated[tuple[Point, ...], Meta(max_length=128)]
-FARTHEST_M = 838.0
-"""Largest coordinate of a fence: the frames of a pose hold 838.86 m along x and y."""
 _LONGEST_FOOTPRINT_M = 20.0
 _SHORTEST_EDGE_M = 1e-3
 MOST_KEEP_OUT, MOST_CORNERS = 32, 256

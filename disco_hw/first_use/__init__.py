@@ -75,9 +75,13 @@ def _name_of(line: str) -> str | None:
     return None if found is None else found[1].strip()
 
 
+# Chosen: short beside the seconds of listening.
 _POLL_S = 0.01
+# Chosen: longer than a link takes to open; then it is reported as one that does not.
 _OPEN_S = 2.0
+# Chosen: longer than the pause of any device that sends by itself, which a question would disturb.
 _SILENT_S = 0.3
+# Chosen: some seconds of a full bus at 500 kbit/s; a kind of controller shows within far fewer.
 _MOST_FRAMES = 20_000
 
 

@@ -14,8 +14,8 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from disco_hw.fence import FARTHEST_M
 from disco_hw.fence.clearance import MovingCircle
+from drivers.samples import FARTHEST_M
 
 # Chosen: each takes time of the fence guard and the planner in every tick; further ones are refused.
 MOST_OBSTACLES = 32

@@ -12,10 +12,11 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from disco_hw.tasks import CENTER_M, FARTHEST_M, SLOWEST_M_S, Chassis, Editable, Point, Positive, TaskFault
+from disco_hw.tasks import CENTER_M, SLOWEST_M_S, Chassis, Editable, Point, Positive, TaskFault
 from disco_hw.tasks.line import PathTable
 from disco_hw.tasks.line.cost import PathCost
 from disco_hw.tasks.line.course import LineCourse, PathProgress, line_course
+from drivers.samples import FARTHEST_M
 
 SIZE_M = (0.3, 50.0)
 _POINTS = 400

@@ -24,7 +24,7 @@ from typing import Any
 
 from drivers.pose import PoseSourceError
 from drivers.pose.udp import LONGEST_DATAGRAM, MOST_A_TICK, message_of, pose_of
-from drivers.types import PoseSample
+from drivers.samples import FARTHEST_M, PoseSample
 
 SOURCE = "nmea"
 _READER = "drivers.pose.nmea"
@@ -119,8 +119,6 @@ DAY_S = 86_400.0
 QUALITY_STD_M = {1: 3.0, 2: 0.8, 3: 2.0, 4: 0.02, 5: 0.4}
 """Of a coordinate, where the receiver says none (GST), by the quality of GGA: 1 alone, 2 differential, 3 precise, 4 RTK
 with whole wavelengths, 5 without. 0 is no fix; 6, 7 and 8 are reckoned, typed in and simulated: no measurement."""
-FARTHEST_M = 838.0
-"""As far as the estimator and the frames of a pose go."""
 MEASURED_MODE = "A"
 """Of THS; E, M, S and V are reckoned, typed in, simulated and not valid: no measurement."""
 # 0.4 m over a metre between two antennas, as said below.

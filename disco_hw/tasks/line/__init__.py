@@ -14,7 +14,8 @@ import numpy as np
 
 from disco_hw.errors import InputError
 from disco_hw.files import WAY_POINTS, read_lines
-from disco_hw.tasks import FARTHEST_M, Array, Point
+from disco_hw.tasks import Array, Point
+from drivers.samples import FARTHEST_M
 
 SPACING_M = 0.02
 # Entries closer than this part of the spacing lie on either side of a turn straight back.
