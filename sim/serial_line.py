@@ -24,7 +24,9 @@ from sim import ROBOT_NODE, LinkFaultError
 from sim.bus import UNHARMED, BusFault, FrameOutcome
 from sim.can_protocol import CanFrame, candump_line
 
+# Chosen: below the 5 % or so at which a UART misses the stop bit.
 BAUD_TOLERANCE = 0.03
+# Chosen: above what a line brings between two reads.
 READ_BYTES = 4096
 
 _BAUD_OF_CODE = {
