@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+# linux/input-event-codes.h.
 _EV_SYN, _EV_KEY, _EV_ABS = 0, 1, 3
 _SYN_REPORT, _SYN_DROPPED = 0, 3
 

@@ -21,6 +21,7 @@ class Frame(msgspec.Struct, frozen=True, gc=False):
     extended: bool = False
 
 
+# CAN_EFF_MASK and CAN_EFF_FLAG of linux/can.h.
 MAX_EXTENDED_ID = 0x1FFF_FFFF
 _EXTENDED_FLAG = 0x8000_0000
 

@@ -10,6 +10,9 @@ import math
 
 import msgspec
 
+FARTHEST_M = 838.0
+"""Largest coordinate of a place: the frames of a pose hold 838.86 m along x and y (disco_robot.dbc)."""
+
 
 class WheelCommand(msgspec.Struct, frozen=True, gc=False):
     """Wheel speeds to hold for at most `valid_for_s` after reception."""

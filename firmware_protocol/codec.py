@@ -173,6 +173,7 @@ def _signal_layout(signal: cantools.database.can.Signal) -> SignalLayout:
 
 
 _FLOAT = struct.Struct("<f")
+# Data bytes of a classic CAN frame.
 _MAX_DATA = 8
 
 PROTOCOL = packaged_protocol()

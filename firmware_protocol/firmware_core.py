@@ -13,8 +13,11 @@ from firmware_protocol.codec import Codec
 
 _lib: Any = _firmware.lib
 _ffi: Any = _firmware.ffi
+# Widths of the C core's uint32_t ticks and uint64_t entropy.
 _TICKS_MASK = 0xFFFF_FFFF
 _ENTROPY_MASK = 0xFFFF_FFFF_FFFF_FFFF
+# Steps of POSE_POSITION and POSE_HEADING in disco_robot.dbc, and the C core's integers, which hold more than the frames
+# do.
 _POSITION_UNIT_M = 0.0001
 _YAW_UNIT_RAD = 0.0001
 _DEVIATION_UNIT = 0.001

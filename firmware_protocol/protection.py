@@ -18,15 +18,20 @@ import re
 import struct
 from typing import NamedTuple, Protocol
 
+# firmware_protocol/README.md: 4-bit counter; as few bad frames as these reject a sender, as few good ones bring it
+# back.
 COUNTER_MODULUS = 16
 QUALIFY_AFTER = 3
 DISQUALIFY_AT = 5
 MAX_LOST = 2
+# CRC-8 of AUTOSAR's profiles (CRC8H2F).
 _POLYNOMIAL = 0x2F
 
+# AES-128; a nonce as in MAC_CHALLENGE; a MAC that fills a frame with 16 bits of its counter.
 KEY_LENGTH = 16
 NONCE_LENGTH = 6
 MAC_LENGTH = 6
+# Chosen: so many wrong nonces in between do not make the right one's counters begin again.
 REMEMBERED_NONCES = 8
 PROVED = ("WHEEL_COMMAND", "HOST_STATE", "PARAM_REQUEST")
 _KEY = re.compile(rf"[0-9a-fA-F]{{{2 * KEY_LENGTH}}}")

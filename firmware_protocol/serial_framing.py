@@ -9,10 +9,15 @@ from dataclasses import dataclass
 
 from cobs import cobs
 
+# A start bit, eight data bits and a stop bit (8N1).
+BITS_PER_BYTE = 10
+# Of this framing: the one kind there is, and the longest bytes between two delimiters that may be a frame.
 KIND_CAN_FRAME = 1
 MAX_FRAME = 64
+# Of a classic CAN frame with an 11-bit identifier (ISO 11898-1).
 MAX_CAN_ID = 0x7FF
 MAX_DATA = 8
+# Bytes of kind and identifier, and of the check sum.
 _HEADER = 3
 _CRC = 2
 

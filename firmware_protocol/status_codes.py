@@ -14,6 +14,7 @@ from firmware_protocol.codec import PROTOCOL
 THEN_RESET, THEN_RESTART, BY_ITSELF = "then reset", "then restart the controller", "it clears by itself"
 """What ends a fault in the robot once its cause is gone: the last words of its advice."""
 
+# Bits of the fault's code (firmware_protocol/README.md).
 _LATCHING = 0x0800
 _PERMANENT = 0x0400
 

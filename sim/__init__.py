@@ -14,6 +14,7 @@ from sim.bus import BusFault, CanBus, DeliveredFrame
 from sim.can_protocol import CanFrame, ErrorState
 
 ROBOT_NODE = "robot"
+# Chosen: as of a controller with a software queue; the babbler's, so that it always has a frame to send.
 ROBOT_QUEUE = 64
 BABBLER_QUEUE = 32
 _BUS_OFF = ErrorState.BUS_OFF

@@ -33,8 +33,11 @@ from sim.serial_line import SerialLine, SerialPathError
 from sim.virtual_robot import STEP_US, Controller, ControllerClock, Robot, TruthRecorder, VendorRobot, VirtualRobot
 
 STEP_NS = STEP_US * 1000
+# Every 10 ms, as often as WHEEL_SPEED is sent.
 TRUTH_STEPS = 10
+# Chosen: compiles and loads what a step needs, before real time begins.
 WARM_UP_STEPS = 200
+# Chosen: longer than a board takes to boot and to say what it is.
 BOARD_S = 5.0
 NOT_OF_BOARDS = ("clock_jump", "brown_out", "reboot")
 MAX_STEPS_PER_CALL = 200

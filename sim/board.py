@@ -25,16 +25,19 @@ from sim import LinkFaultError
 from sim.bus import BusFault
 from sim.injected_faults import RobotFaults
 from sim.plant import Plant, TrueState
+from sim.python_can_link import RETRY_NS
 from sim.sensors import PoseMeasurement
 
+# Frames of the plant's line, as firmware_protocol/ports/plant_line.c has them, which also brakes after SILENT_US.
 WHEELS, POWER, POSITION, HEADING = 0x7E0, 0x7E1, 0x7E2, 0x7E3
 SETPOINTS, STATE, ABOUT = 0x7E8, 0x7E9, 0x7EA
 VERSION = 1
 WHEELS_STEPS = 2
 POWER_STEPS = 20
 SILENT_US = 100_000
-RETRY_NS = 500_000_000
+# Chosen: longer than a board takes to restart, which is no reason for a message.
 SILENCE_NS = 1_000_000_000
+# Speeds in 16 bits, by plant_line.c's SPEED_UNIT.
 _PER_RAD_S = 500
 _LARGEST_I16 = 2**15 - 1
 

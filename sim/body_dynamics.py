@@ -20,9 +20,12 @@ from sim.effects import HiddenEffects
 from sim.plant_parameters import PlantParameters
 from sim.wheel_dynamics import WheelPieces
 
+# Chosen: slower wheels slip and drift less, so that a robot at rest stays where it is.
 SLIP_ONSET_M_S = 0.05
 DRIFT_ONSET_M_S = 0.02
+# Chosen: shorter than any motor's lag, and longer than a step, whose difference would be rough.
 ACCELERATION_FILTER_S = 0.02
+# Chosen: limits, so that extreme parameters leave a robot that still moves and turns.
 LARGEST_ACCELERATION_SLIP = 0.6
 LEAST_TURN_LEFT = 0.5
 

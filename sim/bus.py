@@ -28,10 +28,12 @@ from sim.can_protocol import (
     stuffed_bits,
 )
 
+# ISO 11898-1: recovery from bus-off, and what an error-passive node waits after its own frame.
 RECOVERY_SEQUENCES = 128
 RECESSIVE_SEQUENCE_BITS = 11
 SUSPEND_TRANSMISSION_BITS = 8
 
+# In a second.
 _NANOSECONDS = 1_000_000_000
 _LOG_CHANNEL = "can0"
 

@@ -19,6 +19,7 @@ FRAME_BYTES = 16
 """Length of Linux `struct can_frame`."""
 ECHO_OWN_FRAMES = b"\x01"
 """Packet by which a client of the hub asks for its own frames as well."""
+# CAN_EFF_FLAG, CAN_RTR_FLAG, CAN_ERR_FLAG, CAN_EFF_MASK and CAN_SFF_MASK of linux/can.h.
 _EXTENDED_FLAG = 0x8000_0000
 _REMOTE_FLAG = 0x4000_0000
 _ERROR_FLAG = 0x2000_0000
@@ -29,10 +30,12 @@ INTERFRAME_BITS = 3
 """Intermission: recessive bits between the end of a frame and the next start of frame."""
 ACK_AND_END_BITS = 9
 """ACK slot, ACK delimiter and end of frame: sent after the CRC delimiter, never stuffed."""
+# ISO 11898-1: an active error flag, its delimiter, and the delimiter of the CRC.
 ERROR_FLAG_BITS = 6
 ERROR_DELIMITER_BITS = 8
 _CRC_DELIMITER_BITS = 1
 _TAIL_BITS = _CRC_DELIMITER_BITS + ACK_AND_END_BITS + INTERFRAME_BITS
+# ISO 11898-1: CRC-15.
 _CRC_POLYNOMIAL = 0x4599
 _CRC_BITS = 15
 
@@ -229,6 +232,7 @@ def arbitration_key(frame: CanFrame) -> int:
     return can_id << 21 | frame.remote << 20
 
 
+# ISO 11898-1: counts of error-passive and bus-off; the warning is that of usual controllers.
 WARNING_LIMIT = 96
 PASSIVE_LIMIT = 128
 BUS_OFF_LIMIT = 256

@@ -50,6 +50,7 @@ class EffectSpec:
     lone: tuple[int, ...] = (0,)
 
 
+# Ranges of a value: above 0 where it divides, and below 1 where it would leave nothing or turn round.
 _POSITIVE = (1e-6, math.inf)
 _NOT_NEGATIVE = (0.0, math.inf)
 _RATIO = (-0.95, 0.95)

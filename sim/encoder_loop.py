@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 
 from firmware_protocol.firmware_core import FirmwareInputs
 
+# Chosen: larger runs away sooner when the encoder does not count.
 PROPORTIONAL = 1.5
 INTEGRAL_PER_S = 12.0
 LOCKED_RAD = 0.05

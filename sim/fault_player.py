@@ -24,6 +24,7 @@ babble ID RATE_HZ             another node sends frames of zeros under this iden
 reboot [watchdog|brown_out]   restart the robot's controller
 state                         answer with the true state, as a line of the truth table
 """
+# Chosen: above what any bus carries; a larger number is a mistake in typing, as is a longer pull of the plug.
 MAX_BABBLE_HZ = 100_000.0
 MAX_UNPLUG_S = 3600.0
 _BABBLE_DATA = bytes(8)

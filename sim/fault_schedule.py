@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
+# Chosen: eleven days; larger is nanoseconds or milliseconds read as seconds.
 MAX_TIME_S = 1e6
 
 

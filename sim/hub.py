@@ -32,6 +32,7 @@ from sim.can_protocol import (
 from sim.process import SocketPathError, StopSignal, bind_private
 from sim.python_can_link import Guest, JoinError, joined
 
+# Chosen: shallow, as of a CAN interface; the rest waits in the sender's socket.
 CLIENT_TRANSMIT_QUEUE = 32
 READER_QUEUE = 1024
 """Frames kept for a client that does not read, beyond the kernel's 280 or so; more are dropped and counted."""

@@ -6,14 +6,15 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict
 
+from drivers.transport.reconnecting import RECEIVE_CAPACITY
 from drivers.types import Frame, LinkState, OutgoingFrame, ReceivedFrame, TransportStats
 from sim import LinkFaultError, RobotNode
 from sim.bus import BusFault, CanBus, DeliveredFrame
 from sim.can_protocol import BusNode, CanFrame, ErrorState, TransmitOrder
 
+# Chosen: as a client's of the hub.
 HOST_QUEUE = 32
 _BUS_OFF = ErrorState.BUS_OFF
-RECEIVE_CAPACITY = 4096
 REOPEN_NS = 100_000_000
 """After bus-off or a lost line the host's transport opens the bus again so much later."""
 

@@ -20,7 +20,9 @@ from sim.can_protocol import CanFrame
 from sim.fault_schedule import ScheduledFault, Site
 from sim.sensors import PoseMeasurement
 
+# ISO 11898-1: 8 data bytes and an 11-bit identifier, without stuff bits, with the intermission.
 LONGEST_FRAME_BITS = 111
+# Chosen: so large that a stalled motor shows in the reading.
 STALL_CURRENT_A = 18.0
 _SIDES = ("left", "right")
 _OF_ONE_WHEEL = (

@@ -23,8 +23,10 @@ from sim.plant_parameters import PlantParameters
 from sim.sensors import Battery, Electrics, Encoders, PoseMeasurement, SampledPoseSensor, wrapped
 from sim.wheel_dynamics import WheelMotors
 
+# Chosen: random numbers are drawn for so many cells at once; more wait longer for each block.
 CELLS = 1024
 Array = npt.NDArray[np.float64]
+# Chosen: voltages and temperatures change slowly beside it.
 ELECTRICS_STEP_US = 10_000
 _available_us = attrgetter("available_us")
 

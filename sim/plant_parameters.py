@@ -9,8 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 DRAWN_FIELDS = ("x_icr_m", "wheel_radius_m", "axial_distance_m")
+# Chosen: wider than any robot this project drives; beyond, the Gaussian is not of a robot.
 SMALLEST_DRAWN = (-1.0, 0.01, 0.05)
 LARGEST_DRAWN = (1.0, 1.0, 2.0)
+# Chosen: a Gaussian with less than about one draw in so many inside lies outside.
 MAX_DRAWS = 10_000
 
 _MAY_BE_ZERO_OR_LESS = frozenset({"x_icr_m", "ambient_temperature_c"})

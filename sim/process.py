@@ -141,6 +141,7 @@ class PoseSender:
         self._socket.close()
 
 
+# Chosen: above any line of text of commands and answers.
 MAX_COMMAND_BYTES = 4096
 
 

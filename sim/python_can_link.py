@@ -16,8 +16,11 @@ from sim import LinkFaultError
 from sim.bus import BusFault, CanBus, DeliveredFrame
 from sim.can_protocol import CanFrame
 
+# Chosen: soon enough for an adapter that is plugged in again, and no load while it is away.
 RETRY_NS = 500_000_000
+# Chosen: a flood of frames must not hold up the plant's steps.
 MAX_FRAMES_PER_READ = 64
+# Chosen: as the robot's own.
 GUEST_QUEUE = 64
 
 

@@ -18,12 +18,15 @@ from sim.effects import HiddenEffects
 from sim.plant_parameters import PlantParameters
 from sim.wheel_dynamics import WheelPieces
 
+# Below half a period, so that samples keep their order.
 LARGEST_JITTER_PERIODS = 0.45
 _ENCODER = np.dtype(
     [("scale", "f8"), ("start", "i8"), ("ticks", "i8"), ("observed_ticks", "f8"), ("speed", "f8")], align=True
 )
+# Chosen: share of the voltage that an empty battery has lost, about a lithium cell's.
 VOLTAGE_LOST_WHEN_EMPTY = 0.2
 SECONDS_PER_HOUR = 3600.0
+# Chosen: K for each A^2, a few at usual currents.
 BATTERY_HEATING = 0.02
 
 

@@ -19,13 +19,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drivers.types import Frame, ReceivedFrame
-from firmware_protocol.serial_framing import FrameDecoder, encode_frame
+from firmware_protocol.serial_framing import BITS_PER_BYTE, FrameDecoder, encode_frame
 from sim import ROBOT_NODE, LinkFaultError
 from sim.bus import UNHARMED, BusFault, FrameOutcome
 from sim.can_protocol import CanFrame, candump_line
 
-BITS_PER_BYTE = 10
+# Chosen: below the 5 % or so at which a UART misses the stop bit.
 BAUD_TOLERANCE = 0.03
+# Chosen: above what a line brings between two reads.
 READ_BYTES = 4096
 
 _BAUD_OF_CODE = {

@@ -12,6 +12,7 @@ import can
 
 from sim.can_protocol import ECHO_OWN_FRAMES, FRAME_BYTES, CanFrame, pack_frame, unpack_frame
 
+# Chosen: as below, for about the frames that a CAN interface queues.
 _SEND_BUFFER_BYTES = 16_384
 
 

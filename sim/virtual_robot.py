@@ -232,7 +232,9 @@ class VendorRobot:
         return given[0], given[1]
 
 
+# A cycle of the firmware core (cycle_us of robot_config.c).
 STEP_US = 1000
+# Chosen: keeps the controller's clock away from 0, before which it has no times.
 EARLIEST_JUMP_US = 10_000_000
 _RELEASED = FirmwareOutputs(0.0, 0.0, False, True, False, "BOOT", 0, 0, "NONE", "NONE", 0, 0, 0, 0, 0)
 TRUTH_COLUMNS = (
@@ -253,6 +255,7 @@ TRUTH_COLUMNS = (
     "accepted_commands",
     "fault",
 )
+# Chosen: what a crash may lose of the record; more often writes more.
 FLUSH_NS = 1_000_000_000
 
 
@@ -408,6 +411,7 @@ class TruthRecorder:
             self._record.flush()
 
 
+# A century and more: these frames have no deadline.
 _FOREVER_NS = 1 << 62
 
 

@@ -19,7 +19,9 @@ from drivers.kernel_cache import compiled
 from sim.effects import HiddenEffects
 from sim.plant_parameters import PlantParameters
 
+# Chosen: a long run must not turn the supply round.
 LARGEST_SAG = 0.9
+# Chosen: slower counts as at rest, for stiction; smooth onset of the load that turning makes.
 REST_RAD_S = 0.02
 LOAD_ONSET_RAD_S = 0.5
 

@@ -58,10 +58,12 @@ WORST_POSE_STD_M = 0.03
 """Poses worse than this are left to the fusion."""
 DRIFT_STD_M_S, DRIFT_WALK_M_S = 0.01, 0.001
 """What the ground carries a robot on a slope by, in the world frame, and how it changes in a second."""
+# Chosen: over longer gaps the motion between two wheel samples is no arc.
 _GAP_NS = 300_000_000
 _WAIT_NS = 600_000_000
 """Wheel samples wait so long for a pose, and a pose stamped later than that after them is none: the tick that takes
 them in must not have to follow seconds of wheels at once, nor keep them for ever."""
+# Below a count of usual encoders: nothing turned.
 _STATIONARY_RAD = 1e-4
 _SLIDING_S, _SLIDING_STD_S = 0.04, 0.04
 """How long the body's sideways speed lags behind its turning."""
@@ -70,6 +72,7 @@ _STRIDE_S = 0.045
 _ROUGH_M, _ASIDE_M, _ROUGH_RAD = 5e-4, 7e-4, 5e-4
 """Random part of a centimetre driven, along it, to its sides and in heading, which the wheels do not show."""
 _X, _Y, _YAW, _RADIUS, _AXLE, _X_ICR, _LEFT, _RIGHT, _LAG, _DRIFT_X, _DRIFT_Y = range(11)
+# Length of the state above.
 _SIZE = 11
 _DRIFTS = [_DRIFT_X, _DRIFT_Y]
 _THETA = slice(_RADIUS, _X_ICR + 1)

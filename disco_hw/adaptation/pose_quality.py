@@ -19,6 +19,7 @@ from disco_hw.adaptation.guard import (
 )
 from drivers.types import PoseSample
 
+# Chosen: longer knows the noise better, shorter reports a fault sooner.
 WINDOW_S = 2.0
 # Windows without a good one before a fault is reported: the noise of 2 s is known to about 15 %, so that poses near a
 # limit may seem worse than they are at first.

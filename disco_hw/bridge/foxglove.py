@@ -25,9 +25,12 @@ from disco_hw.log.mcap_log import SCENE, VIEWS, scene_message, views
 from disco_hw.log.records import TOPICS, FrameIn, FrameOut, Record, topic_of
 from disco_hw.runtime.robot_setup import scene_of
 
+# The usual port of Foxglove's WebSocket.
 DEFAULT_PORT = 8765
 LAYOUT = Path(__file__).with_name("foxglove_layout.json")
+# Chosen: who connects sees the scene within it.
 _SCENE_S = 1.0
+# Chosen: how late an end is noticed.
 _WAIT_S = 0.1
 
 

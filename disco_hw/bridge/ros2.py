@@ -31,6 +31,7 @@ from disco_hw.daemon.page_feed import FeedSubscriber, tick_feed_path
 from disco_hw.daemon.process import StopSignals
 from disco_hw.errors import InputError, WorkError
 from disco_hw.estimation.filter import TAKE_OVER_TIMEOUTS
+from disco_hw.processes import SWITCH_INTERVAL_S
 from disco_hw.runtime.assembly import odometry_parameters
 from disco_hw.runtime.robot_setup import Setup, load_setup
 from drivers.motor.ros2_base_wire import Ros2BaseSettings
@@ -42,9 +43,11 @@ LOOPBACK = """<CycloneDDS><Domain><General><AllowMulticast>false</AllowMulticast
 <Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces></General>
 <Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>60</MaxAutoParticipantIndex>
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
+# Diagnostics come once a second; a feed that is silent for longer is no connection.
 _SECOND_NS = 1_000_000_000
+# Chosen: how late an end is noticed, and a diagnosis made.
 _WAIT_S = 0.05
-_SWITCH_S = 0.0005
+# Chosen: a flood on one topic must not hold up the others.
 _MAX_BATCH = 20
 
 SENSOR = Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, Policy.History.KeepLast(5))
@@ -152,7 +155,7 @@ class Bridge:
     def run(self, should_stop: Callable[[], bool]) -> None:
         """Carry both ways until requested to stop; what fails on the way in is raised here."""
         # Neither thread waits long for the other's Python, and what was imported is not looked through for garbage.
-        sys.setswitchinterval(_SWITCH_S)
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
         gc.freeze()
         inward = threading.Thread(target=self._receive, name="in", daemon=True)
         inward.start()

@@ -39,12 +39,19 @@ from drivers.types import Frame
 INTERFACE = "unixcan"
 _PACKET = struct.Struct("=IB3x8s")
 """Linux `struct can_frame`."""
+# CAN_EFF_FLAG of linux/can.h.
 _EXTENDED = 0x8000_0000
+# Chosen: a fifth of STEP_S, by which what is due is late at most.
 _WAIT_S = 0.004
+# Chosen: half of DEADMAN_S: commands that waited through such a pause of this process are too old to drive by.
 _DELAYED_NS = 100_000_000
+# State: five within SILENT_NS of the driver; chosen: how often subscribers are looked for.
 _STATE_NS, _LOOK_NS = 50_000_000, 100_000_000
+# As SILENT_NS of the driver; chosen: how long another publisher of speeds counts as one.
 _FRESH_NS, _OTHERS_NS = 250_000_000, 1_000_000_000
+# Chosen: the daemon, `estop` and some that listen; and a flood must not hold up the base's speeds.
 _MOST_CLIENTS, _MAX_BATCH = 8, 64
+# User id of the superuser (POSIX).
 _ROOT = 0
 _SPEED_QOS = Qos(
     Policy.Reliability.Reliable(duration(milliseconds=5)), Policy.Durability.Volatile, Policy.History.KeepLast(1)

@@ -20,6 +20,7 @@ from typing import Any
 import msgspec
 
 from disco_hw.bridge import ros2_messages as msg
+from disco_hw.bridge.ros2_inlets import AHEAD_NS
 from disco_hw.config import Drive, Robot
 from disco_hw.daemon import ask, connect
 from disco_hw.daemon.emergency import stop_robot
@@ -28,9 +29,11 @@ from disco_hw.errors import InputError, WorkError
 from disco_hw.estimation.odometry import OdometryParameters
 
 TYPES = (msg.Twist, msg.TwistStamped)
-_AHEAD_NS = 50_000_000
+# Chosen: so many messages open the deadman before one may hold it, as only a new press drives.
 _OPENINGS = 2
+# As of `disco_hw.daemon.kept_connection`: a local socket that takes longer has no daemon that listens.
 _CONNECT_S = 0.2
+# Chosen: above any reply, which are not looked at.
 _REPLY_BYTES = 1 << 16
 _ALWAYS = ("estop", "stop", "disarm", "status")
 
@@ -69,7 +72,7 @@ class SpeedInlet:
         twist = message if isinstance(message, msg.Twist) else message.twist
         stamp_ns = 0 if isinstance(message, msg.Twist) else msg.time_of(message.header.stamp)
         age_ns = wall_ns - (stamp_ns or sent_ns)
-        if not -_AHEAD_NS <= age_ns <= INPUT_LIMIT_NS:
+        if not -AHEAD_NS <= age_ns <= INPUT_LIMIT_NS:
             self.refused["older than 0.2 s, or by another clock; synchronise the clocks"] += 1
             return None
         speed, turn = twist.linear.x, twist.angular.z

@@ -26,7 +26,7 @@ from drivers.pose.senders import SILENCE_S, SenderGate
 TYPES = (msg.PoseStamped, msg.PoseWithCovarianceStamped, msg.Odometry)
 PoseMessage = msg.PoseStamped | msg.PoseWithCovarianceStamped | msg.Odometry
 # Clocks of two computers differ, and some transforms are dated ahead; further ahead the stamp is of another clock.
-_AHEAD_NS = 50_000_000
+AHEAD_NS = 50_000_000
 _OLDEST_POSE_NS = 1_000_000_000
 _SHORTEST_NS = 4_000_000
 _UNIT_MARGIN = 0.02
@@ -84,7 +84,7 @@ class PoseInlet:
         if frame != settings.frame.lstrip("/"):
             return f'in frame "{frame[:40]}", not pose.frame "{settings.frame}"', None
         age_ns = wall_ns - (msg.time_of(message.header.stamp) or sent_ns)
-        if not -_AHEAD_NS <= age_ns <= _OLDEST_POSE_NS:
+        if not -AHEAD_NS <= age_ns <= _OLDEST_POSE_NS:
             return "stamped by another clock, or too late; synchronise the clocks and leave use_sim_time off", None
         t_ns = mono_ns - max(0, age_ns)
         if t_ns <= self._newest_ns:
@@ -235,9 +235,12 @@ def _frame(name: str) -> str:
     return name.lstrip("/")
 
 
+# Chosen: longer than any delay on a network that could be driven over; older is another clock.
 _OLDEST_WHEELS_NS = 500_000_000
+# How long a refusal is reported after its message.
 _SECOND_NS = 1_000_000_000
 _NOTHING, _CLOCK, _JOINTS, _VALUES, _ORDER = range(len(REFUSALS))
+# Chosen: above an overshoot; larger is another unit or a wrong radius.
 _FASTER = 2.0
 Both = tuple[float, float]
 
@@ -262,7 +265,7 @@ class WheelInlet:
         age_ns = wall_ns - (msg.time_of(message.header.stamp) or sent_ns)
         if isinstance(message, msg.JointState) and not self._joints & set(message.name):
             return None
-        if not -_AHEAD_NS <= age_ns <= _OLDEST_WHEELS_NS:
+        if not -AHEAD_NS <= age_ns <= _OLDEST_WHEELS_NS:
             self._refuse(_CLOCK, mono_ns)
             return None
         true_ns = mono_ns - max(0, age_ns)

@@ -13,12 +13,14 @@ from collections.abc import Sequence
 import msgspec
 
 from disco_hw.bridge import ros2_messages as msg
+from disco_hw.bridge.ros2_inlets import AHEAD_NS
 from disco_hw.runtime.obstacle_source import reports_in
 from disco_hw.runtime.obstacles import MOST_OBSTACLES, ObstacleReport
 
 TOPIC = "disco_hw/obstacles"
 TYPES = (msg.ObstacleArrayMsg, msg.String)
-_AHEAD_NS, _OLDEST_NS = 50_000_000, 1_000_000_000
+# Chosen: as REPORTED_AGE_LIMIT_S, after which a report holds no longer.
+_OLDEST_NS = 1_000_000_000
 
 
 class ObstacleInlet:
@@ -59,7 +61,7 @@ class ObstacleInlet:
             age_ns = wall_ns - stamp_ns
             if frame != self._frame:
                 self.refused[f'in frame "{frame[:40]}", not "{self._frame}"'] += 1
-            elif not -_AHEAD_NS <= age_ns <= _OLDEST_NS:
+            elif not -AHEAD_NS <= age_ns <= _OLDEST_NS:
                 self.refused["stamped by another clock, or over 1 s late; synchronise the clocks"] += 1
             elif (found := _report_of(one, max(0, age_ns) * 1e-9)) is None:
                 self.refused["without a place, too large, too fast or not finite"] += 1

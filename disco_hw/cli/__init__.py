@@ -20,6 +20,7 @@ from disco_hw.processes import PARENT_VARIABLE, end_with_parent
 if TYPE_CHECKING:
     import typer
 
+# Chosen: above what imports make; the reason is at its use.
 _YOUNG_OBJECTS = 50_000
 
 

@@ -29,6 +29,7 @@ from drivers.types import SOURCE_TEXTS, SaidBy
 from firmware_protocol import status_codes
 
 HINT = "set daemon.control_socket to a path in a directory of your own"
+# User id of the superuser (POSIX).
 _ROOT = 0
 _TEMPORARY = Path("/tmp")
 
@@ -144,6 +145,7 @@ def _exists(directory: Path) -> bool:
     return os.path.lexists(directory)
 
 
+# Chosen: far above any reply; a peer that sends without an end must not fill the memory.
 _MAX_REPLY_BYTES = 1 << 20
 
 

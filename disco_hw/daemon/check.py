@@ -53,7 +53,9 @@ from drivers.types import (
 from firmware_protocol import status_codes
 from firmware_protocol.codec import Codec, Decoded
 
+# Chosen: longer than a link takes to open; then the check says that it does not.
 _LINK_TIMEOUT_S = 2.0
+# Above _SETTLED_S, so that half of it counts; three of what comes once a second.
 _LISTEN_S = 3.0
 # By then the handshake is over: what the robot rejects from now on it would reject while driving.
 _SETTLED_S = 1.5

@@ -22,12 +22,15 @@ from disco_hw.runtime.safe_area import FenceRefused
 from disco_hw.runtime.supervisor import Reply, UserRequest
 from drivers.types import Request
 
+# Chosen: periods of what the loop does beside its ticks; shorter ones would take more of their time.
 _SECOND_NS = 1_000_000_000
 _RECORDER_NS = _SECOND_NS // 10
 _COLLECT_NS = 5 * _SECOND_NS
+# Chosen: longer than a stop by the ramp takes from usual speeds; afterwards the e-stop, and the robot's own watchdog.
 _STOP_LIMIT_NS = 1_500_000_000
 _FAN_NS = _SECOND_NS
 _WATCHED_FAN_NS = _SECOND_NS // 2
+# Chosen: enough to see where the plans go; each costs time of the tick and space in the log.
 _FAN_PATHS = 16
 
 Report = Callable[[str, str], None]

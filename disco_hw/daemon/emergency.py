@@ -24,16 +24,17 @@ from disco_hw.errors import InputError
 from disco_hw.files import ROBOT_TOML, read_toml
 from disco_hw.reports import as_json as json_of
 from drivers.motor import find_driver
+from drivers.motor.vendor_parts import ESTOP_LIFE_NS, ESTOP_REPEATS
 from drivers.transport import SerialMedium, open_transport
 from drivers.transport.reconnecting import TransportCounters
-from drivers.transport.serial import ExchangeConnection, open_port
+from drivers.transport.serial import EXCHANGE_READ_S, ExchangeConnection, open_port
 from drivers.types import Frame, LinkState, OutgoingFrame
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 
-_REPEATS = 3
+# Chosen: longer than a link takes to open, and short enough for an operator who waits to reach for the button.
 _CONNECT_S = 1.0
+# Chosen: five periods of SYSTEM_STATE (0.1 s); slower confirmations are reported as missing.
 _CONFIRM_S = 0.5
-_FRAME_LIFE_NS = 1_000_000_000
 _HINT = (
     "to stop the robot all the same, give --link can:INTERFACE:CHANNEL or --link serial:PORT, or use the robot's "
     "own e-stop button, now"
@@ -190,9 +191,9 @@ def _stop_over_transport(settings: Link, frames: Sequence[Frame], is_confirmatio
                 raise ConnectionError(transport.last_error or "the link did not come up")
             time.sleep(0.002)
         requested_ns = time.monotonic_ns()
-        for frame in _REPEATS * tuple(frames):
+        for frame in ESTOP_REPEATS * tuple(frames):
             now_ns = time.monotonic_ns()
-            if not transport.send(OutgoingFrame(frame, now_ns + _FRAME_LIFE_NS), now_ns):
+            if not transport.send(OutgoingFrame(frame, now_ns + ESTOP_LIFE_NS), now_ns):
                 raise ConnectionError(transport.last_error or "the frame could not be queued")
         # What was under way before says nothing about this request.
         return _confirmed(lambda: [r.frame for r in transport.receive() if r.t_ns >= requested_ns], is_confirmation)
@@ -205,7 +206,7 @@ def _stop_over_serial(settings: Link, frames: Sequence[Frame], is_confirmation: 
     medium = SerialMedium(settings.port, settings.baud, settings.dtr, settings.rts)
     with open_port(medium, timeout_s=0.01, write_timeout_s=0.5, exclusive=False) as port:
         # Opening threw away what came in before. The delimiter ends what another sender may be in the middle of.
-        port.write(b"\0" + _REPEATS * b"".join(encode_frame(frame.can_id, frame.data) for frame in frames))
+        port.write(b"\0" + ESTOP_REPEATS * b"".join(encode_frame(frame.can_id, frame.data) for frame in frames))
         port.flush()
         decoder = FrameDecoder()
 
@@ -223,7 +224,7 @@ def _stop_over_exchange(settings: Link, frames: Sequence[Frame], is_confirmation
     driver = find_driver(settings.driver)
     assert driver.exchange is not None
     medium = SerialMedium(settings.port, settings.baud, settings.dtr, settings.rts)
-    with open_port(medium, timeout_s=0.002, write_timeout_s=0.5, exclusive=False) as port:
+    with open_port(medium, timeout_s=EXCHANGE_READ_S, write_timeout_s=0.5, exclusive=False) as port:
         line = ExchangeConnection(port, TransportCounters(), driver.exchange(settings.settings()))
         deadline_ns = time.monotonic_ns() + round(_CONFIRM_S * 1e9)
         went_out, confirmed = False, False

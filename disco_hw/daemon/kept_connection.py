@@ -13,6 +13,7 @@ from typing import Any
 from disco_hw.daemon import HungUpError, connect, errors_in_one_line, exchange
 from disco_hw.errors import WorkError
 
+# Chosen: a local socket that takes longer has no daemon that listens.
 _CONNECT_S = 0.2
 
 

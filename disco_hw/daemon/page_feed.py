@@ -21,9 +21,12 @@ from disco_hw.log.recorder import Recorder, RecorderStats
 from disco_hw.log.records import FrameIn, FrameOut, Plan, Record
 from drivers.types import WheelSample
 
+# Chosen: 25 pictures a second look smooth; a shorter period takes more of the processor.
 PERIOD_S = 0.04
+# Batches of PERIOD_S: 1.6 s at this end and 8 s at the reader's, after which a slow reader loses some.
 _QUEUED_BATCHES = 40
 _UNREAD_BATCHES = 200
+# Chosen: above what a period brings; further ones are dropped, oldest first, so that no reader fills the memory.
 _MOST_RECORDS = 400
 
 

@@ -173,7 +173,9 @@ def _watchdog_ns(environment: Mapping[str, str]) -> int | None:
     return None
 
 
+# File descriptors (POSIX).
 STANDARD_OUTPUT, STANDARD_ERROR = 1, 2
+# Chosen: lines for a terminal that has stopped reading; further ones are dropped and counted.
 _MOST_LINES = 1000
 
 
@@ -227,6 +229,7 @@ class AsyncPrinter:
 
 
 _WAITS_FOR_ROBOT = frozenset({State.DISCONNECTED, State.HANDSHAKE})
+# Times that it is asked, once a second: a minute.
 _PATIENT_AFTER = 60
 _EVERY = 60
 

@@ -282,6 +282,7 @@ def in_json(topic: str, text: str) -> str:
 T = TypeVar("T")
 
 _COMPILE = "numba:compile"
+# Chosen: a line a second shows that compiling goes on.
 _EVERY_S = 1.0
 
 
@@ -411,6 +412,7 @@ def warm_planner(setup: Setup, new_planner: Callable[[], Planner]) -> Planner:
     return planner
 
 
+# Chosen: a usual drive at 50 Hz, long enough to stand, start, drive and lose poses once.
 _PERIOD_NS = 20_000_000
 _POSE_DELAY_NS = 30_000_000
 _TICKS = 60

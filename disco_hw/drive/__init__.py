@@ -14,6 +14,7 @@ from typing import Any, Protocol
 from disco_hw.runtime import State
 from drivers.gamepad import Gamepad, GamepadError
 
+# docs/safety.md names it: shorter stops for every pause of a source, longer drives on when its operator is gone.
 INPUT_LIMIT_NS = 200_000_000
 
 
@@ -79,6 +80,7 @@ def wheel_speeds(forward: float, turn: float, top_rad_s: float) -> tuple[float, 
     return left * scale, right * scale
 
 
+# Chosen: opening the device each tick would hold up the loop; a gamepad that is plugged in is found within this.
 _RETRY_NS = 1_000_000_000
 
 

@@ -9,15 +9,22 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+# Chosen: shares of the top speed, below which a robot stands, above which it moves and is fast; between the first two
+# it creeps.
 _STATIONARY = 0.02
 _MOVING = 0.08
 _FAST = 0.5
+# Chosen: share of turn in forward speed, or the other way round, that is no curve.
 _STRAIGHT = 0.08
+# Chosen: a pause of the samples counts as driving for no longer.
 _LONGEST_SAMPLE_S = 0.1
+# Chosen: to this share of the top speed, or from it, within this time is a hard start or stop.
 _LAUNCH_S = 0.7
 _LAUNCH = 0.3
+# Chosen: a turn of this share of the top speed that changes sides within this time is quick steering.
 _SWING = 0.12
 _SWING_S = 1.6
+# Chosen: a faster change of direction shows nothing of dead band and stiction.
 _SLOW_CROSSING_S = 0.25
 
 

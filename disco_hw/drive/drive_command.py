@@ -34,7 +34,9 @@ from drivers.gamepad import Gamepad, GamepadError, GamepadMapping, open_gamepad
 
 _VIRTUAL_INTERFACES = ("unixcan", "virtual")
 _PSEUDO_TERMINALS = "/dev/pts/"
+# Chosen: longer than the display's process takes to end by itself; then it is killed.
 _DISPLAY_TIMEOUT_S = 2.0
+# File descriptor (POSIX).
 _STANDARD_INPUT = 0
 
 

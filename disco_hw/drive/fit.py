@@ -23,7 +23,9 @@ SCALES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.3)
 """Parts of a script's speeds that are tried, the largest first."""
 SPARE_M = 0.08
 """Distance kept from the fence beyond its margin, for what the robot does otherwise than its model."""
+# Chosen: more finds a manoeuvre that fits sooner, and leaves the script's order further.
 _LOOK_AHEAD = 8
+# Chosen: shorter finds a smaller excursion between two points, and takes longer.
 _STEP_S = 0.05
 # As it is, mirrored, backward, and both.
 _VARIANTS = (("", 1.0, False), ("mirrored", 1.0, True), ("backward", -1.0, False), ("mirrored, backward", -1.0, True))

@@ -100,6 +100,7 @@ class Deadman:
         return (), None
 
 
+# Chosen: the newest, until they are shown; older ones are of no use any more.
 _MESSAGES = 5
 
 

@@ -126,6 +126,7 @@ def in_table(script: Script) -> Sequence[str]:
 
 
 Profile = Callable[[float], tuple[float, float]]
+# Chosen: longer than wheels take to stop from a script's speeds; longer rests lengthen every script.
 REST_S = 0.6
 
 
@@ -163,7 +164,9 @@ class Pieces:
         return rest(duration_s)
 
 
+# Five periods at 50 Hz: after a longer pause of the loop the script goes on from where it was.
 _LONGEST_TICK_NS = 100_000_000
+# Chosen: the end of a manoeuvre, at which its speed is reached if it ever is.
 _SETTLED_S = 0.8
 
 
@@ -353,6 +356,7 @@ class Unattended:
 KEPT = 0.95
 """Reached is what comes so close to what was asked."""
 
+# All of the requested speed.
 _LARGEST = 1.0
 
 

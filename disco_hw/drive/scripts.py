@@ -122,9 +122,13 @@ def separating(name: str, top_rad_s: float) -> Script:
 
 
 SCRIPTS = ("circle", "steps", "excite", *SEPARATING)
+# Chosen: long enough for poses to show the step's steady motion; more steps of it make a longer drive.
 STEP_S = 6.0
+# Chosen: holds the largest speed for this, beyond the time that the ramp to it takes.
 FIND_S = 2.0
+# Chosen: with STEP_S two minutes.
 STEPS = 20
+# Chosen: a second lap shows what repeats.
 _LAPS = 2.0
 
 

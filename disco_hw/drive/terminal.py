@@ -161,8 +161,11 @@ class KeyHold:
 _DIGITS = frozenset(b"%d" % digit for digit in range(1, 10))
 
 
+# Chosen: above what is typed between two readings; more is read at once afterwards.
 _MOST_BYTES = 4096
+# Chosen: the newest letters that no question has read yet.
 _MOST_TYPED = 16
+# Chosen: the thread is woken and ends at once, unless the terminal holds it.
 _JOIN_TIMEOUT_S = 1.0
 
 
@@ -281,8 +284,10 @@ class Keyboard:
                 return
 
 
+# Chosen: what an eye follows on a terminal, and what a file of lines can bear.
 _TABLE_PERIOD_S = 0.4
 _LINE_PERIOD_S = 1.0
+# Chosen: above the compiling of a planner; then the display ends.
 _START_TIMEOUT_S = 60.0
 
 

@@ -29,7 +29,9 @@ from disco_hw.estimation.pose_sources import PoseSources
 from disco_hw.model.coefficients import Disturbance
 from drivers.types import PoseSample, WheelSample
 
+# Chosen: two poses in a row that are missing count as a gap; a single late one does not.
 GAP_INTERVALS = 3.0
+# Chosen: smaller averages more jitter out, larger follows a change of the sensor's rate sooner.
 INTERVAL_WEIGHT = 0.1
 _UNKNOWN: Matrix3 = ((MAX_POSITION_VARIANCE, 0.0, 0.0), (0.0, MAX_POSITION_VARIANCE, 0.0), (0.0, 0.0, MAX_YAW_VARIANCE))
 

@@ -77,8 +77,10 @@ class _DeferredImport:
         return getattr(importlib.import_module(module), name)
 
 
+# Above FARTHEST_M, which a place may lie away; a pose beyond these numbers is an error of the sensor.
 MAX_POSITION_M = 1000.0
 MAX_YAW_RAD = 1e4
+# Chosen: less than any sensor achieves; a pose that claims to be exact would leave no room for odometry.
 MIN_POSITION_STD_M = 1e-3
 MIN_YAW_STD_RAD = 1e-3
 

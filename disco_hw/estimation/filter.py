@@ -37,6 +37,7 @@ TAKE_OVER_TIMEOUTS = 2.0
 # A heading that was known and is less certain than this counts as unknown, and positions alone find it anew.
 MAX_HEADING_STD_RAD = 0.3
 
+# Chosen: more begin nearer to the true heading, and take longer for each pose.
 COMPONENTS = 16
 # Gaussians at two standard deviations from one another add up to a uniform density within 1.5 %.
 _COMPONENT_STD_RAD = math.pi / COMPONENTS

@@ -18,6 +18,7 @@ from drivers.types import PoseSample
 
 SAME_RAD = 1e-6
 """Headings that differ by less are the same one, repeated."""
+# Chosen: a sensor may repeat a heading for some poses where its own measurement is slower.
 LEAST_POSES = 5
 LEFT_OUT_RAD = 0.15
 """A repeated heading is not used once the wheels have turned the robot by so much meanwhile."""

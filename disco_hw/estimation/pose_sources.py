@@ -22,11 +22,13 @@ MEAN_WEIGHT = 0.2
 """Of a pose in the running mean of its source's innovations."""
 LEAST_POSES = 10
 """So many poses of a source make that mean worth a comparison; of as few in a row does a source come back."""
+# Chosen: one or two outliers in a row do not make a source suspect.
 LEAST_GATED = 3
 JUMP_PART = 0.7
 """Of the squared way out of the gate, made at once."""
 APART_STDS = 3.0
 """Two sources contradict each other where their mean innovations are further apart than this, by their own noise."""
+# For x, y and yaw, of which nothing is known yet.
 _NAN3 = (math.nan, math.nan, math.nan)
 
 

@@ -13,12 +13,15 @@ from typing import Annotated, NamedTuple, Protocol
 import msgspec
 from msgspec import Meta
 
+from drivers.samples import FARTHEST_M
+
 Point = tuple[float, float]
 Polygon = Annotated[tuple[Point, ...], Meta(max_length=128)]
-FARTHEST_M = 838.0
-"""Largest coordinate of a fence: the frames of a pose hold 838.86 m along x and y."""
+# Chosen: a longer robot is centimetres read as metres.
 _LONGEST_FOOTPRINT_M = 20.0
+# Chosen: shorter edges are one point, written twice, and have no direction.
 _SHORTEST_EDGE_M = 1e-3
+# Chosen: each shape and corner takes time of every tick.
 MOST_KEEP_OUT, MOST_CORNERS = 32, 256
 
 

@@ -19,6 +19,7 @@ from disco_hw.fence import Circle, Fence, Footprint, Point, Polygon
 Array = NDArray[np.float64]
 FREE_M = 1e6
 """Clearance where there is nothing to keep away from."""
+# Chosen: a longer outline is looked at less closely, rather than for longer.
 _MOST_POSES = 4000
 
 

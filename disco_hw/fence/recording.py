@@ -8,8 +8,11 @@ from numpy.typing import NDArray
 from disco_hw.fence import Fence, Footprint, Polygon, fence_fault
 
 Array = NDArray[np.float64]
+# Chosen: smaller keeps more corners of the noise of the poses, larger cuts corners of the edge.
 TOLERANCE_M = 0.03
+# Below the 128 that a polygon of robot.toml may have.
 _MOST_CORNERS = 100
+# Chosen: a path that ends further from its start has not gone round.
 _CLOSED_M = 0.5
 
 

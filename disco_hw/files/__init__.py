@@ -22,6 +22,7 @@ from msgspec import inspect
 
 from disco_hw.errors import InputError
 
+# Chosen: far above any file of this project, and small enough that no file stalls or exhausts its parser.
 LONGEST_LINE, LONGEST_NAME, LONGEST_STRING = 65_536, 64, 4096
 DEEPEST_NESTING, MOST_KEY_PARTS = 16, 8
 _KIB, _MIB = 1024, 1024 * 1024

@@ -25,7 +25,7 @@ from drivers.motor import DEFAULT, UnknownDriverError, find_driver, motor_driver
 from drivers.pose import DEFAULT as POSE_SOURCE
 from drivers.transport import SerialMedium, TransportSettingsError, create_transport
 from drivers.transport.reconnecting import TransportCounters
-from drivers.transport.serial import ExchangeConnection, open_port
+from drivers.transport.serial import EXCHANGE_READ_S, ExchangeConnection, open_port
 from drivers.types import Frame, LinkState, MotorDriver
 
 _SECTION = re.compile(r"^\s*\[([^\[\]]+)\]\s*(#.*)?$")
@@ -75,10 +75,13 @@ def _name_of(line: str) -> str | None:
     return None if found is None else found[1].strip()
 
 
+# Chosen: short beside the seconds of listening.
 _POLL_S = 0.01
+# Chosen: longer than a link takes to open; then it is reported as one that does not.
 _OPEN_S = 2.0
-_EXCHANGE_READ_S = 0.002
+# Chosen: longer than the pause of any device that sends by itself, which a question would disturb.
 _SILENT_S = 0.3
+# Chosen: some seconds of a full bus at 500 kbit/s; a kind of controller shows within far fewer.
 _MOST_FRAMES = 20_000
 
 
@@ -170,7 +173,7 @@ def query_line(port: str, driver: MotorDriver) -> FoundController | None:
     for baud in driver.questions.bauds:
         medium = SerialMedium(port, baud)
         try:
-            with open_port(medium, timeout_s=_EXCHANGE_READ_S, write_timeout_s=_OPEN_S, exclusive=True) as line:
+            with open_port(medium, timeout_s=EXCHANGE_READ_S, write_timeout_s=_OPEN_S, exclusive=True) as line:
                 time.sleep(_SILENT_S)
                 if line.in_waiting:
                     return None

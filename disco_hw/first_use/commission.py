@@ -27,7 +27,9 @@ from disco_hw.reports import refuse_directory
 from disco_hw.runtime.robot_setup import Setup, link_key, load_setup
 from drivers.motor import find_driver
 
+# File descriptor (POSIX).
 _STANDARD_INPUT = 0
+# Chosen: a fault may hide another; what is not mended by then needs a person who looks.
 _MOST_TRIES = 3
 _UP = "wheels off the ground"
 _DOWN = "on the floor, with 1.5 m free around it"

@@ -25,6 +25,7 @@ OFFER = (
 """What `init` and `commission` print at their end where nobody can be asked, or who is asked says no."""
 _PROMPT = "record the fence now, by moving the robot once round along the edge? It needs poses. [y/n] "
 _AGAIN = "once more? [y/n] "
+# Chosen: estimates come with each tick; fewer points do for the edge.
 _EVERY = 5
 
 

@@ -31,12 +31,15 @@ from drivers.types import PoseSample
 
 Edits = Mapping[tuple[str, str], Any]
 
+# Chosen: above the noise of a measured speed, below the slowest motion of the procedure.
 STATIONARY_RAD_S = 0.05
 COUNTS_RAD = 0.1
 """A wheel that was seen turning has moved its own encoder by more, another one by less."""
 TURN_TOLERANCE = 0.15
 """What a person's eye and finger may miss of a turn."""
+# Chosen: less may be skid-steering's own; more is a sensor beside the middle.
 POSE_STD_LEFT_M = 0.1
+# Chosen: allowance for the delay of the samples and for the wheel's own slowing down.
 SETTLED_S = 0.5
 
 
@@ -316,8 +319,11 @@ def evaluate_floor(seen: FloorSeen, configured: PoseConvention, robot: Robot) ->
     return Findings(tuple(faults), tuple(figures))
 
 
+# Chosen: an angle that matches the drive to this is explained; conventions differ by far more.
 _SAME_RAD = 0.35
+# Chosen: sensors are mounted in quarter turns, and half a metre of driving shows an angle no better.
 _OFFSET_RAD = 0.2
+# The nearest multiple of it is what the mounting was meant to be.
 _QUARTER = 0.5 * math.pi
 _METRES: tuple[Literal["m", "cm", "mm"], ...] = ("m", "cm", "mm")
 _RADIANS: tuple[Literal["rad", "deg"], ...] = ("rad", "deg")

@@ -31,17 +31,27 @@ MOST_SHARE = 0.3
 RUNAWAY_SHARE = 0.25
 """Of it: a wheel that is measured faster has got out of hand."""
 SIDES = ("left", "right")
+# Chosen: a controller holds its slowest speed only roughly.
 _ABOVE_SLOWEST = 1.2
+# Chosen: slow enough to let go in time if a wheel runs away.
 _RAMP_S = 6.0
+# Chosen: an operator sees it, and it is far above play of the gears.
 _MOVED_RAD = 0.4
+# Chosen: longer than wheels take to stop from the procedure's speed.
 _REST_S = 1.0
+# Chosen: longer than the turns that are asked for take; then the step ends by itself.
 _TURNS_LIMIT_S = 90.0
+# Chosen: the speed is steady by then.
 _BEFORE_SILENCE_S = 1.5
+# Chosen: above the longest watchdog of any driver and the ramp that follows it.
 _SILENCE_S = 2.5
+# Shorter than _SILENCE_S: an operator who lets go after it has still seen the watchdog.
 _LONG_ENOUGH_S = 1.5
 SLOWING = 0.8
 """A wheel is slowing down below this share of its speed."""
+# Chosen: longer than a reset and its confirmation take.
 _RESET_S = 3.0
+# Fit into the free 1.5 m that the operator is asked for; longer shows slip and directions better.
 _STRAIGHT_M = 0.5
 _SHORT_M = 0.25
 
@@ -364,6 +374,7 @@ class Procedure:
             self._action, self.result = None, end.value
 
 
+# Chosen: a fault that the procedure clears by itself lasts for less.
 _FAULT_NS = 1_000_000_000
 
 

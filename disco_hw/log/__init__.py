@@ -25,6 +25,8 @@ ENCODE_ERRORS = (TypeError, ValueError, OverflowError, KeyError)
 
 TICK, END = 0, 1
 """Kinds of frames to the writer: a `Batch`, and the `End` after which none follows."""
+# Chosen: above any message to or from the keeper and any status of a writer, whose longest parts are paths.
+MESSAGE_BYTES = 65_536
 
 _HEAD = struct.Struct(">BI")
 

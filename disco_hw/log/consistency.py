@@ -40,12 +40,19 @@ from disco_hw.log.motion_fits import (
     motion_windows,
 )
 
+# Chosen: share of what the wheels show; less is no motion but noise.
 _STILL = 0.02
+# Below the last digit of any log: a value that was repeated, not measured.
 _EXACTLY = 1e-9
+# Chosen: fewer repeats are a sensor slower than the log.
 _STANDING_SHARE = 0.05
+# Chosen: fewer are slip, starts and stops.
 _DEAD_SHARE = 0.2
+# Above half, the data are of no use for what depends on them; below, only a part is lost.
 _MOSTLY = 0.5
+# Chosen: shorter logs may have parts apart by chance.
 _FEWEST_COMMON_S = 2.0
+# Chosen: less in common, or one this many times longer, are recordings on two clocks or of two drives.
 _COMMON_SHARE = 0.1
 _LARGEST_SPAN_RATIO = 5.0
 

@@ -42,7 +42,9 @@ _MESSAGE = struct.Struct("<HIQQ")
 _COMPLETE_MESSAGE = struct.Struct("<BQHIQQ")
 _MESSAGE_OPCODE = int(Opcode.MESSAGE)
 _FOOTER_BYTES = _HEAD.size + 8 + 8 + 4
+# Largest offset of a file (int64 of POSIX).
 _LARGEST_OFFSET = 2**63 - 1
+# Chosen: above any record of a log; a larger one is damage, and would fill the memory.
 _LARGEST = 256 * 1024 * 1024
 # Of what one tick after the other writes, a chunk shrinks to a tenth; more than this is made to exhaust a reader.
 _UNPACKED_FREE = 16 * 1024

@@ -57,6 +57,7 @@ def of_axes(fit: BodyFit) -> Contradiction | None:
     return None
 
 
+# Chosen: between 1 and the 57 of degrees read as radians; below the other, the heading does not turn with the wheels.
 _DEGREES_TURN = 5.0
 _STATIONARY_TURN = 0.15
 
@@ -82,6 +83,7 @@ def of_units(fit: BodyFit) -> Contradiction | None:
 
 _LENGTHS = {1000.0: "millimetres", 100.0: "centimetres", 0.001: "kilometres"}
 _ANGLES = {57.296: "degrees", 9.549: "revolutions per minute", 0.15915: "revolutions"}
+# Chosen: the factors of units are further apart, and a robot's geometry is nearer.
 _NEAR = 0.06
 
 

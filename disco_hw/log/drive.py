@@ -15,7 +15,12 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+# Chosen: above both limits below, so that nothing is held or joined from one log to the next.
 _BETWEEN_LOGS_S = 10.0
+LONGEST_SILENCE_NS = 500_000_000
+"""A longer pause of the wheels begins a new segment."""
+LONGEST_COMMAND_S = 0.5
+"""How long a command of a log that does not say is in force at most."""
 _WHEEL_COLUMNS = {
     "enc_left_rad_s": "left_speed_rad_s",
     "enc_right_rad_s": "right_speed_rad_s",

@@ -15,6 +15,7 @@ import msgspec
 
 from disco_hw.log.records import TOPICS, Plan, PlanFigures, Record, topic_of
 
+# Integers are int64 in the schemas.
 _LIMIT = 2**63
 _R = TypeVar("_R")
 _PLAN = topic_of(Plan)

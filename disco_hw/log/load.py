@@ -12,15 +12,13 @@ from disco_hw.errors import InputError, LogError
 from disco_hw.files import LOG, begin_of, parse_toml
 from disco_hw.log import ROBOT_TOML
 from disco_hw.log.container import MAGIC
-from disco_hw.log.drive import Array, Commands, DriveLog, Gyro, Index, Poses, Wheels, concatenate
+from disco_hw.log.drive import LONGEST_SILENCE_NS, Array, Commands, DriveLog, Gyro, Index, Poses, Wheels, concatenate
 from disco_hw.log.importing.csv_drive import read_csv
 from disco_hw.log.importing.headings import with_headings_only, without_standing_headings
 from disco_hw.log.importing.rosbag_file import is_bag
 from disco_hw.log.reader import Log, open_log
 
 Mask = NDArray[np.bool_]
-
-_LARGEST_WHEEL_GAP_NS = 500_000_000
 
 
 def drive_from_log(log: Log) -> DriveLog:
@@ -157,7 +155,7 @@ def _breaks(log: Log, wheel_ns: Index, notes: list[str]) -> Index:
     gaps = log.gaps()
     if gaps:
         notes.append(f"{log.path}: {sum(gap.ticks for gap in gaps)} ticks are missing; each gap starts a new segment")
-    silent = wheel_ns[1:][np.diff(wheel_ns) > _LARGEST_WHEEL_GAP_NS]
+    silent = wheel_ns[1:][np.diff(wheel_ns) > LONGEST_SILENCE_NS]
     missing = np.asarray([gap.before_ns for gap in gaps], dtype=np.int64)
     return np.unique(np.concatenate([silent, missing]))
 
@@ -166,6 +164,7 @@ def _floats(column: NDArray[np.generic]) -> Array:
     return column.astype(np.float64)
 
 
+# Chosen: fewer equal poses, or a smaller share of them, may be chance in short logs.
 _FEWEST_POSES = 20
 _COPIED_SHARE = 0.5
 

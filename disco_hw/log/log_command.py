@@ -203,6 +203,7 @@ MAP_FRAME, BASE_FRAME = "map", "base_link"
 JOINTS = ("left_wheel_joint", "right_wheel_joint")
 COMMAND_TOPIC, WHEEL_TOPIC, POSE_TOPIC, TWIST_TOPIC = "/wheel_commands", "/joint_states", "/pose", "/cmd_vel"
 
+# A stamp of 0 counts as none on import, so times are moved to begin at 1 s at least.
 _EARLIEST_NS = 1_000_000_000
 _Timed = tuple[int, str, Any]  # Any: a message, whose class `rosbags` makes.
 

@@ -193,10 +193,14 @@ ENDING = "disco-hw-end"
 """Metadata: about the log, of a mended one, and the recorder's last word, without which nobody ended the log."""
 FORMAT = "2"
 """Since 2 a log that its recorder ended has a last word."""
+# Chosen: larger chunks pack better, and lose more where a file is cut.
 CHUNK_BYTES = 64 * 1024
 
+# The writer never ends a chunk itself: `flush` does, between two ticks.
 _NO_LIMIT = 2**62
+# MCAP specification: opcode 1, length 8, channel 2, sequence 4 and two times of 8.
 _MESSAGE_OVERHEAD = 31
+# MCAP times are uint64.
 _MAX_TIME_NS = 2**64 - 1
 
 

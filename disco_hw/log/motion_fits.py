@@ -17,9 +17,13 @@ from numpy.typing import NDArray
 
 from disco_hw.log.drive import Array, Commands, DriveLog
 
+# Chosen: longer than delays of wheels and poses, so that they hardly show, and short beside the manoeuvres.
 WINDOW_S = 1.0
+# A quarter of the window: more windows, which overlap, add little.
 STEP_S = 0.25
+# Chosen: a shorter gap is bridged by a straight line, of a window with a longer one nothing is known.
 _LONGEST_GAP_S = 0.6
+# Rounding of sums of times.
 _LEAST_GAP_S = 1e-9
 
 Mask = NDArray[np.bool_]
@@ -103,17 +107,27 @@ def _increments(t_s: Array, values: Array, lost_s: Array, begin: Array) -> Array
     return np.where(known[:, None], np.column_stack(columns), np.nan)
 
 
+# Chosen: in a window, above the noise of counts and poses.
 MOVING_RAD = 0.3
+# Chosen: in a window, above the noise of a heading.
 TURNING_RAD = 0.05
 STRAIGHT_ON_RAD = math.radians(30.0)
+# Chosen: of the nominal one, what a pneumatic tyre, wear or a guess leave it at; beyond is another fault.
 USUAL_RADIUS = (0.7, 1.4)
+# Chosen: skid-steering may turn by a third of the nominal, and by no more than the radius explains.
 USUAL_TURN = (0.3, 1.4)
+# Chosen: two seconds of overlapping windows; fewer decide nothing.
 FEWEST_WINDOWS = 8
+# Chosen: iteratively reweighted least squares changes little afterwards.
 _PASSES = 4
+# Chosen: shares of the residuals that count in full, and that count at all: outliers are at most a tenth.
 _TRUSTED = 0.8
 _KEPT = 0.9
+# Chosen: with less turning, noise decides on the ratio of the turns.
 _LEAST_TURNED_RAD = 1.0
+# Chosen: small beside real turning, enough to decide where the lever cannot be told.
 _LEVER_PRIOR = 0.1
+# Chosen: with less rolling, noise decides on the ratio of the ways.
 _LEAST_ROLLED_RAD = 3.0
 # What counts as not moved at all, so that a fit to nothing explains nothing.
 _NOTHING = 1e-9

@@ -80,6 +80,7 @@ def _objects(values: list[Any]) -> Column:
 
 
 _R = TypeVar("_R")
+# Times are int64 in our records.
 _EARLIEST_NS, _LATEST_NS = -(2**63), 2**63 - 1
 _NO_TIME = "a time or count in it is beyond 64 bits; leave this log out"
 _RECOVER = "run `disco-hw log recover` and use the recovered log"

@@ -34,13 +34,21 @@ from disco_hw.log import (
 from disco_hw.log.records import Record
 from disco_hw.log.writer_link import Delivery, KeeperLink, WriterLine
 
+# Chosen: catches up after a pause of the writer, without holding up the tick.
 _SENT_PER_TICK = 16
+# Chosen: a second at 50 Hz, above what answers of a healthy writer lag behind.
 _UNREAD_TICKS = 50
+# Chosen: above a slow disk's pauses, which are no fault; then the operator is told.
 _SILENCE_S = 0.7
+# Chosen: a writer that is silent for longer is ended and replaced.
 _PATIENCE_S = 2.0
+# Chosen: longer, as the first writer loads its code from a cold disk.
 _START_PATIENCE_S = 15.0
+# Chosen: the exit code comes after the socket has closed; it says why.
 _CAUSE_S = 0.3
+# Chosen: at once after the first end, then ever more seldom, so that a full disk does not cost processor time.
 _RETRY_S = (0.0, 1.0, 2.0, 5.0)
+# Chosen: how often the end is looked for while the log closes.
 _CLOSING_STEP_S = 0.02
 _CLOSING_RETRY_S = 0.2
 

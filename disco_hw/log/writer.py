@@ -22,14 +22,18 @@ from typing import Literal
 
 import msgspec
 
-from disco_hw.log import END, End, Ended, Frames, Launch, Start, Started, WriterStatus
+from disco_hw.log import END, MESSAGE_BYTES, End, Ended, Frames, Launch, Start, Started, WriterStatus
 from disco_hw.log.mcap_log import McapLog
 
+# EX_CANTCREAT and EX_IOERR of sysexits.h.
 EXIT_CANNOT_CREATE = 73
 EXIT_CANNOT_WRITE = 74
 
+# Chosen: many ticks in one call.
 _RECEIVE_BYTES = 1 << 18
+# Chosen: a status stays shorter than MESSAGE_BYTES.
 _LONGEST_ERROR = 300
+# Chosen: a directory that holds so many parts is no place to go on in.
 _MOST_PARTS = 1000
 
 
@@ -236,9 +240,6 @@ def _reason(error: OSError) -> str:
     return error.strerror or str(error)
 
 
-_MESSAGE_BYTES = 65_536
-
-
 def keep(channel: socket.socket, start: Start) -> None:
     """Start a writer for each request until the other end of the channel is closed."""
     living: dict[int, int] = {}
@@ -252,7 +253,7 @@ def keep(channel: socket.socket, start: Start) -> None:
         if channel.fileno() not in readable:
             continue
         try:
-            message, descriptors, _, _ = socket.recv_fds(channel, _MESSAGE_BYTES, 1)
+            message, descriptors, _, _ = socket.recv_fds(channel, MESSAGE_BYTES, 1)
         except OSError:
             return
         if not message:

@@ -17,10 +17,8 @@ from typing import NamedTuple
 import msgspec
 
 from disco_hw.errors import LogError
-from disco_hw.log import END, Ended, Launch, Start, Started, WriterStatus, frame
+from disco_hw.log import END, MESSAGE_BYTES, Ended, Launch, Start, Started, WriterStatus, frame
 from disco_hw.processes import spawn_at_normal_priority
-
-_STATUS_BYTES = 65_536
 
 
 class WriterLine:
@@ -89,7 +87,7 @@ class WriterLine:
         if self.ended:
             return False
         try:
-            data = self._connection.recv(_STATUS_BYTES)
+            data = self._connection.recv(MESSAGE_BYTES)
         except BlockingIOError:
             return False
         except OSError:
@@ -110,8 +108,9 @@ class WriterLine:
         self._connection.close()
 
 
-_MESSAGE_BYTES = 65_536
+# Chosen: above a fork on a loaded computer.
 _REPLY_TIMEOUT_S = 5.0
+# Chosen: holds ticks while the writer's disk pauses; more are kept in the recorder.
 _BUFFER_BYTES = 1 << 20
 
 
@@ -169,7 +168,7 @@ class KeeperLink:
         """Take in what the keeper says, and notice its death."""
         while self._channel is not None:
             try:
-                data = self._channel.recv(_MESSAGE_BYTES)
+                data = self._channel.recv(MESSAGE_BYTES)
             except BlockingIOError:
                 return
             except OSError:

@@ -20,6 +20,7 @@ from disco_hw.model.model import Belief, EffectSetting, Gaussian, Mixture, Model
 
 __all__ = ["Belief", "EffectSetting", "Gaussian", "Mixture", "Model", "Uniform", "load_model", "save_model"]
 
+# Of the file; a later one that cannot be read as this gets a new number.
 FORMAT = 1
 Vector = list[float]
 Matrix = list[list[float]]

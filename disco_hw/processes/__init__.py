@@ -25,6 +25,7 @@ from disco_hw.errors import InputError, LogError
 _COUNTED_BY = ("OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "NUMBA_NUM", "VECLIB_MAXIMUM")
 """Of the environment, with _THREADS after each: how many threads a numeric library makes."""
 _LIBC = ctypes.CDLL(None)
+# linux/prctl.h.
 _PR_SET_PDEATHSIG = 1
 PARENT_VARIABLE = "DISCO_HW_ENDS_WITH"
 """Of the environment: the process id of the parent with which a `disco-hw` that is started shall end."""
@@ -107,15 +108,21 @@ def spawn_at_normal_priority(command: list[str], pass_fds: Sequence[int] = ()) -
     return process
 
 
+# Chosen: short beside a tick of 20 ms, in which the loop may wait for another thread.
 SWITCH_INTERVAL_S = 0.0005
+# sys/mman.h; linux/capability.h.
 _MCL_CURRENT = 1
 _MCL_FUTURE = 2
 _CAP_IPC_LOCK = 14
 _CAP_SYS_NICE = 23
+# Chosen: the loop comes before its process's other threads, and these before other programs.
 _OTHER_THREADS_BELOW = 10
+# proc(5): `steal` in the first line of /proc/stat.
 _STOLEN_COLUMN = 8
+# malloc.h of glibc; above its sizeof(pthread_attr_t) on any processor.
 _M_ARENA_MAX = -8
 _PTHREAD_ATTRIBUTES_BYTES = 64
+# Chosen: locked memory takes each thread's stack whole, and none needs more.
 _STACK_BYTES = 1 << 20
 # The loop compiles nothing: of its 150 MB it needs none.
 _COMPILER = "libllvmlite"

@@ -47,7 +47,9 @@ from drivers.private_files import KeyFileError, key_of_file
 from drivers.transport import ReconnectingTransport, TransportSettingsError, create_transport
 from drivers.types import Driver, PoseSource, Transport
 
+# Chosen: one loads the code; more cost start-up time alone.
 _REHEARSALS = 5
+# Chosen: a model without a delay would promise the fence guard an instant response; larger stops the robot earlier.
 _LEAST_RESPONSE_S = 0.05
 
 

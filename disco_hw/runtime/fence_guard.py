@@ -32,7 +32,10 @@ SCALES = np.array([0.0, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875, 1.0])
 """Parts of a command that are tried; the first is the stop itself."""
 RELEASED_FROM = 3
 """A command that was stopped goes on once so large a scale (an index) is allowed, so that it does not flutter."""
+# Chosen: points on each part of the stopping path; more see a clearance between two of them, and take longer in every
+# tick.
 _RESPONDING, _COASTED, _BRAKED = 3, 2, 3
+# Less than any command that is meant as motion; what counts as stopped is held at zero.
 STOPPED_RAD_S = 1e-3
 
 

@@ -18,7 +18,11 @@ from disco_hw.errors import InputError
 from disco_hw.runtime.core import NoObstacles, ObstacleSource
 from disco_hw.runtime.obstacles import MOST_OBSTACLES, ObstacleReport
 
+# Chosen: one for each obstacle that there may be; the rest waits for the next tick, so that no sender holds up the
+# loop.
 _DATAGRAMS_A_TICK = 32
+# Chosen: room for MOST_OBSTACLES reports with short numbers as JSON; a longer datagram is cut off and counts as
+# malformed.
 _LONGEST_DATAGRAM = 8192
 _Content = ObstacleReport | list[ObstacleReport]
 _JSON = msgspec.json.Decoder(_Content)

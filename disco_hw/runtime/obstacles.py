@@ -14,14 +14,16 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from disco_hw.fence import FARTHEST_M
 from disco_hw.fence.clearance import MovingCircle
+from drivers.samples import FARTHEST_M
 
+# Chosen: each takes time of the fence guard and the planner in every tick; further ones are refused.
 MOST_OBSTACLES = 32
 REPORTED_AGE_LIMIT_S = 1.0
 """Age limit of a report over UDP or ROS 2 that says none."""
 ENTERED_AGE_LIMIT_S = 600.0
 """Age limit of an obstacle that a person enters and says none."""
+# Chosen: above what moves near such a robot; a report of more is taken for an error of units and refused.
 _FASTEST_M_S = 20.0
 _Coordinate = Annotated[float, Meta(ge=-FARTHEST_M, le=FARTHEST_M)]
 _Speed = Annotated[float, Meta(ge=-_FASTEST_M_S, le=_FASTEST_M_S)]

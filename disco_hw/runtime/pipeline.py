@@ -148,6 +148,8 @@ class Governor:
         return (abs(start) + self._limits.max_acceleration_rad_s2 * (dt_s - to_standstill_s)) / change
 
 
+# Chosen: commands are kept to predict from late samples, older ones only in the means; shorter than a delay would lose
+# its commands.
 HISTORY_NS = 2_000_000_000
 
 

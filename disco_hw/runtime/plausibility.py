@@ -20,10 +20,14 @@ from typing import NamedTuple
 from drivers.motor import Wiring
 from drivers.types import PoseSample, PowerSample, WheelCommand, WheelSample
 
+# Chosen: longer than a dip, so that it hardly moves the mean, and shorter than the emptying of a battery.
 SUPPLY_MEAN_S = 10.0
+# Chosen: parts of the mean at which a dip begins and ends; apart, so that noise does not count one dip twice.
 DIP_PART = 0.94
 DIP_OVER_PART = 0.97
+# Two repeats are three equal poses: one repeat may be the same measurement, sent twice.
 REPEATS = 2
+# Chosen: slower wheels may leave a pose unchanged in its digits.
 MOVING_RAD_S = 0.3
 _SIDES = ("left", "right")
 
@@ -102,6 +106,8 @@ class Plausibility:
         return events
 
 
+# Chosen: shorter reports a robot that only turns on the spot; longer reports a robot that is stuck later. A message
+# names it.
 WINDOW_NS = 5_000_000_000
 LEAST_M = 0.05
 """Who gets no further than this within the window makes no progress; less for a task that is slower than that."""
@@ -177,21 +183,31 @@ def _obstacle(window: _Window, angles_rad: tuple[float, float] | None, planner_f
 
 EVALUATED_NS = 5_000_000_000
 """Of motion: what turned the right way so long does so."""
+# Chosen: a slower command may turn no wheel, so it shows nothing of the wiring.
 MOVES_RAD_S = 0.3
+# Chosen: half of MOVES_RAD_S, so that the noise of a measured speed is no motion.
 STATIONARY_RAD_S = 0.15
+# Chosen: less than this against the command may be play or a push; more is a wheel that turns the wrong way.
 LEAST_RAD = 0.15
+# Chosen: of both wheels together; with less, noise decides which side turned more.
 LEAST_SUM_RAD = 0.4
 LEAST_PART = 0.1
 """Of the other wheel's turning: one that turned by less stood, and shows nothing of which side it is on."""
+# Chosen: the same finding in so many ticks in a row, as one odd sample must not stop a robot.
 SAMPLES = 3
+# Chosen: part of the commanded turn, so that a long command needs more evidence than LEAST_RAD.
 _OPPOSITE_PART = 0.25
+# Chosen: crossed must fit well and straight badly, so that commands that are nearly equal decide nothing.
 _CROSSED_COSINE, _STRAIGHT_COSINE = 0.97, 0.93
+# Chosen: standard deviation, as part of the way, of what a robot moves otherwise than its wheels count.
 _SLIP_PART = 0.15
+# Chosen: part of the commanded turn; a wheel that counts less may have an encoder that fails.
 _COUNTED_PART = 0.25
 _UNKNOWN_PART = 0.2
 """Of the way: a radius that is written down wrongly and slip that lasts, which every pose shows equally."""
 _ENOUGH, _MOST_OF_ONE = 10.0, 4.0
 """Of log-likelihood against what robot.toml says, in all and by one pose."""
+# Chosen: under a quarter turn; the line between two poses says too little of a longer arc.
 _LARGEST_TURN_RAD = 1.5
 _MOVED_STD, _START_STD, _MOST_STARTS = 6.0, 2.0, 50
 """Standard deviations of a pose at rest that are no motion, and of their mean; how many count."""

@@ -10,7 +10,9 @@ from typing import NamedTuple
 from disco_hw.estimation.odometry import OdometryParameters
 from drivers.types import PoseSample
 
+# Chosen: longer averages more noise out, and shows a change of speed later.
 KEPT_NS = 1_000_000_000
+# Two lie on a line always; two more show whether it is one.
 LEAST_POSES = 4
 LARGEST_OFF, CURVED_PART = 5.0, 0.2
 """A pose lies so many standard deviations from the line at most, and the part of the way by which a robot that speeds

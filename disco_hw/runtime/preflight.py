@@ -13,8 +13,9 @@ from disco_hw.fence import Fence
 from disco_hw.tasks import RobotTask
 from drivers.motor import find_driver
 from drivers.types import SOURCE_TEXTS, CyclicFrame, Limits, SafetyCard
+from firmware_protocol.serial_framing import BITS_PER_BYTE
 
-_SERIAL_BITS_PER_BYTE = 10
+# Of firmware_protocol.serial_framing: kind 1, identifier 2, CRC 2, COBS 1, delimiter 1.
 _SERIAL_OVERHEAD_BYTES = 7
 
 
@@ -41,15 +42,19 @@ def serial_load(frames: Iterable[CyclicFrame], baud: int) -> float:
     load: dict[str, float] = {}
     for frame in frames:
         count = frame.length + _SERIAL_OVERHEAD_BYTES if frame.line_bytes is None else frame.line_bytes
-        busy_s = count * _SERIAL_BITS_PER_BYTE / baud + frame.pause_s
+        busy_s = count * BITS_PER_BYTE / baud + frame.pause_s
         load[frame.sender] = load.get(frame.sender, 0.0) + busy_s * frame.rate_hz
     return max(load.values(), default=0.0)
 
 
+# Steps of LIMITS in firmware_protocol/disco_robot.dbc: a limit that was rounded to one is still the same limit.
 _SPEED_RESOLUTION_RAD_S = 0.002
 _ACCELERATION_RESOLUTION_RAD_S2 = 0.01
+# Chosen: the rest is room for retransmissions and other nodes; above the limit, frames of low priority may wait too
+# long.
 _LOAD_BUDGET = 0.4
 _LOAD_LIMIT = 0.8
+# Chosen: a disturbed frame and a late tick, one after the other, must not stop the robot.
 _COMMANDS_TO_SPARE = 2
 
 

@@ -15,8 +15,11 @@ from disco_hw.log import records
 from disco_hw.runtime.pipeline import Limited, Source, Tick
 from drivers.types import Identity, Limits, OutgoingFrame, Readings, ReceivedFrame, SaidBy, WheelCommand, socketcan_id
 
+# One number for each of x, y and yaw.
 _NO_NUMBERS = (float("nan"),) * 3
+# Chosen: enough for the curve on the page; each costs space in the log of every plan.
 _FAN_POINTS = 11
+# To a millimetre: the page shows no more, and shorter numbers take less space.
 _FAN_DIGITS = 3
 
 

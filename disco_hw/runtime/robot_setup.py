@@ -163,6 +163,7 @@ def setup_of_log(log: Log, hint: str) -> Setup:
             raise InputError(str(error).replace(f"{scratch}/", f"{log.path}: ")) from None
 
 
+# Above any robot: what its own wheels can do is judged afterwards and says more.
 _FASTEST_M_S = 100.0
 _LOCKED = frozenset({State.ARMED, State.STOPPING})
 

@@ -28,6 +28,7 @@ DELAY_NS = 600_000_000
 """Delay and lag of a wheel together: what was commanded so long ago may still be on its way."""
 EXPECTED_PART = 0.5
 """A wheel that turns by this part of what it is expected to follows; drift of the CUSUM between sound and standing."""
+# Chosen: smaller stops a robot for a stone or loose gears; larger lets a blocked wheel turn the robot further first.
 MISSING_RAD = 0.08
 SHORTEST_NS = 300_000_000
 """A wheel may stand for less against a stone."""
@@ -37,12 +38,18 @@ by a ramp of its own, which takes longer.
 """
 UNKNOWN_LOSS_RAD_S = 1.5
 """Dead band and stiction of a wheel that has not turned since it stood."""
+# Chosen: an overshoot of the speed loop stays below part and amount; the angle lets no single sample decide.
 FASTER_PART, FASTER_RAD_S, BEYOND_RAD = 1.25, 0.5, 0.1
 BODY_TURN_PART = 1.5
 """A base that is given speeds of the body may turn by wheels that differ by so much more than those asked for."""
+# Chosen: as LEAST_RAD of plausibility, more than play or a push.
 FOLLOWED_RAD = 0.15
+# Chosen: below it, commanded and counted, a wheel is at rest, and may stick when it starts again.
 RESTS_RAD_S = 0.1
+# Chosen: time constant of a command as a speed loop may follow it; longer expects less after each change.
 _SMOOTH_S = 0.15
+# Chosen: a smaller loss is learnt sooner than a larger one, so that a failing wheel is not soon taken for what is
+# expected.
 _FILTER_S, _LOSES_LESS_S, _LOSES_MORE_S = 0.3, 0.5, 2.0
 _SIDES = ("left", "right")
 
@@ -212,6 +219,7 @@ SLIP_PART = 0.1
 """By so much of its speed a wheel may slip."""
 SEEN = 4.0
 """Standard deviations of a motion that the counts deny."""
+# Chosen: sooner after the first sign, poses may show the motion before it.
 _SETTLED_NS = 60_000_000
 
 

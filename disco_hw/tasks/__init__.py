@@ -49,8 +49,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Point = tuple[float, float]
-FARTHEST_M = 838.0
-"""How far from the origin a task may go: the frames of a pose hold 838.86 m along x and y (disco_robot.dbc)."""
+# Chosen: slower is inside the dead band of most robots.
 SLOWEST_M_S = 0.01
 CENTER_M = (-1000.0, 1000.0)
 """The slowest speed, and the least and largest coordinate of a centre, that a person may change a task to."""

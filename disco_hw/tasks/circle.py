@@ -15,7 +15,6 @@ import numpy as np
 from disco_hw.errors import InputError
 from disco_hw.tasks import (
     CENTER_M,
-    FARTHEST_M,
     SLOWEST_M_S,
     Array,
     Chassis,
@@ -30,6 +29,7 @@ from disco_hw.tasks import (
     norm_and_inverse,
     single,
 )
+from drivers.samples import FARTHEST_M
 
 RADIUS_M = (0.1, 50.0)
 """Least and largest radius that a person may change it to."""

@@ -12,13 +12,17 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from disco_hw.tasks import CENTER_M, FARTHEST_M, SLOWEST_M_S, Chassis, Editable, Point, Positive, TaskFault
+from disco_hw.tasks import CENTER_M, SLOWEST_M_S, Chassis, Editable, Point, Positive, TaskFault
 from disco_hw.tasks.line import PathTable
 from disco_hw.tasks.line.cost import PathCost
 from disco_hw.tasks.line.course import LineCourse, PathProgress, line_course
+from drivers.samples import FARTHEST_M
 
+# Chosen: smaller than most robots turn in, up to far larger than a hall.
 SIZE_M = (0.3, 50.0)
+# Chosen: more follows the curve more closely; each piece of the largest is under a metre.
 _POINTS = 400
+# Chosen: smaller is a robot turning on the spot.
 _SMALLEST_M = 0.05
 
 

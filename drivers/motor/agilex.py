@@ -36,6 +36,8 @@ from drivers.types import (
     WheelSample,
 )
 
+# The base sends its state at 10 Hz and its motion at 50 Hz: three and five messages. Gone: longer than a disturbance of
+# the bus.
 STATE_SILENT_NS, MOTION_SILENT_NS, GONE_NS = 350_000_000, 100_000_000, 1_000_000_000
 _WARNINGS = 0x0606
 """Bits of the error word that only warn, in the SDK's byte and in the manual's: battery low, remote control lost."""

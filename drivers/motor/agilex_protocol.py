@@ -19,11 +19,13 @@ from msgspec import Meta
 from drivers.motor.vendor_parts import BodySettings
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
+# Identifiers of protocol v2 (ugv_sdk).
 MOTION_COMMAND, LIGHT_COMMAND, BRAKE, CONTROL_MODE, STATE_RESET = 0x111, 0x121, 0x131, 0x421, 0x441
 SYSTEM_STATE, MOTION_STATE, LIGHT_STATE, RC_STATE, ODOMETRY = 0x211, 0x221, 0x231, 0x241, 0x311
 VERSION, MOTOR_SPEED = 0x4A1, 0x281
 STANDBY, CAN_MODE, UART_MODE, RC_MODE = range(4)
 NORMAL, EMERGENCY_STOP, EXCEPTION = range(3)
+# Speeds are 16-bit integers on the wire.
 _I16 = (-32768, 32767)
 
 
@@ -116,8 +118,11 @@ def decode(frame: Frame) -> Decoded | None:
     return Decoded(layout.name, MappingProxyType(values), motor)
 
 
+# By the manual; the base offers no way to change or read it.
 TIMEOUT_S = 0.5
+# Chosen: so many frames of both kinds are no chance on a bus of another vendor.
 _RECEIVED = 3
+# Chosen: some steps of 0.001 on the wire, so that noise does not keep a base that stands from standing by.
 STATIONARY_M_S, STATIONARY_RAD_S = 0.01, 0.02
 EXAMPLE = """wheel_radius_m = 0.06
 track_m = 0.31

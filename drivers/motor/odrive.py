@@ -49,7 +49,9 @@ from drivers.types import (
     WheelSample,
 )
 
+# The first heartbeat may have been on its way before the request; the second shows the new state.
 BEATS_TO_ARM = 2
+# Chosen: two lost heartbeats in a row are no silence yet; docs/safety.md names three.
 SILENT_BEATS = 3
 # Less, and a pause of the host of a few beats would be taken for the silence of an axis.
 SILENT_AT_LEAST_NS = 100_000_000

@@ -22,6 +22,7 @@ from msgspec import Meta
 from drivers.motor.vendor_parts import Layout, Nodes, Sign, all_of, in_sides, layouts, sides_of
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
+# CAN Simple: six bits of node, of which 0x3F is no axis, and five of command.
 LARGEST_NODE = 0x3E
 _NODE_SHIFT, _COMMAND_MASK = 5, 0x1F
 Value = float | int
@@ -42,6 +43,7 @@ class AxisState(enum.IntEnum):
     CLOSED_LOOP = 8
 
 
+# ControlMode and InputMode of ODrive's API.
 VELOCITY_CONTROL = 2
 PASSTHROUGH = 1
 
@@ -115,6 +117,7 @@ TELEMETRY: Mapping[Generation, Mapping[str, Layout]] = MappingProxyType(
         ),
     }
 )
+# Get_Version of CAN Simple in firmware 0.6; 0.5 has no such command.
 GET_VERSION = 0x00
 _BY_NUMBER = {
     generation: {layout.command: (name, layout) for name, layout in table.items()}
@@ -122,6 +125,7 @@ _BY_NUMBER = {
 }
 _SDO_VALUES = MappingProxyType({"f32": "f", "u32": "I", "i32": "i", "u16": "H", "u8": "B", "bool": "?"})
 _SDO_HEAD = struct.Struct("<BHB")
+# RxSdo and TxSdo of CAN Simple in firmware 0.6, as the node names them.
 SDO_REQUEST, SDO_REPLY = 0x04, 0x05
 
 
@@ -238,6 +242,7 @@ _ERRORS: Mapping[Generation, Mapping[int, str]] = MappingProxyType(
     }
 )
 
+# Chosen: so many of each message of a node are no chance on a bus of another vendor.
 _RECEIVED = 3
 _Endpoint = Annotated[int, Meta(ge=0, le=65535)]
 
@@ -341,10 +346,15 @@ def safety_card(settings: OdriveSettings) -> SafetyCard:
     )
 
 
+# Chosen: with _PERIOD_NS, 0.3 s for the version, which firmware 0.5 never answers, and 0.5 s for the watchdog, which
+# 0.6 must.
 VERSION_TRIES = 3
 WATCHDOG_TRIES = 5
+# Chosen: longer than a reply takes on a loaded bus.
 _PERIOD_NS = 100_000_000
+# Questions feed an idle node's watchdog, so often enough for a short one.
 _ALIVE_PERIOD_NS = 30_000_000
+# Chosen: equal but for the rounding of a number that was typed in.
 _SAME_TIMEOUT_S = 0.002
 
 

@@ -17,6 +17,7 @@ from msgspec.structs import replace
 
 from drivers.types import DriverState, Request, WheelCommand
 
+# Chosen: after a longer pause of the host the ramp goes on from where it was, rather than jump to zero.
 _LONGEST_STEP_S = 0.1
 # Longer than a period at the slowest rate, 50 ms; with the 20 ms between two messages still shorter than the 100 ms
 # after which the first driver calls its controllers silent.

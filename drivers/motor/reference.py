@@ -17,6 +17,7 @@ from drivers.motor.reference_arming import MESSAGES as HANDSHAKE_MESSAGES
 from drivers.motor.reference_arming import ArmedWatch, Arming, Handshake
 from drivers.motor.reference_frames import FrameReception, FrameTransmission
 from drivers.motor.reference_protocol import HouseKeeping
+from drivers.motor.vendor_parts import ESTOP_LIFE_NS, ESTOP_REPEATS
 from drivers.types import (
     DriverState,
     DriverStats,
@@ -34,14 +35,17 @@ from drivers.types import (
 from firmware_protocol import status_codes
 from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded, packaged_dbc
 
+# Five periods of SYSTEM_STATE (0.1 s): then the handshake begins anew.
 SILENCE_NS = 500_000_000
+# Chosen: longer, as a robot that was refused is not to be refused again for each short pause.
 REFUSED_SILENCE_NS = 3_000_000_000
+# Five periods of WHEEL_COMMAND at 50 Hz, as for any command that may lose some.
 ZERO_VALID_FOR_S = 0.1
-ESTOP_REPEATS = 3
+# Chosen: a shorter command would have run out before its frame has crossed the bus.
 SHORTEST_VALID_FOR_S = 0.002
 COASTING_NS = 200_000_000
 """Released wheels roll freely for this long and lose their speed gently; then the controller's brake holds them."""
-_ESTOP_DEADLINE_NS = 1_000_000_000
+# Chosen: frames of one e-stop come within it, as they are repeated; a later one is another.
 _ONE_STOP_NS = 1_000_000_000
 _STATES = {
     "BOOT": DriverState.HANDSHAKE,
@@ -258,7 +262,7 @@ class ReferenceDriver:
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Frames that stop the robot in any state; whatever was wanted is dropped."""
         self._arming.request(Request.STANDBY)
-        frame = self._transmission.frame("ESTOP", now_ns, _ESTOP_DEADLINE_NS, reason="UNSPECIFIED")
+        frame = self._transmission.frame("ESTOP", now_ns, ESTOP_LIFE_NS, reason="UNSPECIFIED")
         return (frame,) * ESTOP_REPEATS
 
     @property

@@ -7,12 +7,15 @@ from collections.abc import Callable
 
 import msgspec
 
+from drivers.motor.vendor_driver import ARMING_TIMEOUT_NS
 from drivers.types import Identity, Limit, Limits, Request
 from firmware_protocol import status_codes
 from firmware_protocol.codec import Codec, Decoded
 from firmware_protocol.protection import COUNTER_MODULUS, challenge_answer
 
+# At 100 Hz more than two seconds: well above STATE_TIMEOUT_NS, at which the watch disarms anyway.
 _REMEMBERED = 256
+# Five periods of SYSTEM_STATE (0.1 s).
 STATE_TIMEOUT_NS = 500_000_000
 # Above the 100 ms after which the robot stops by itself, so that no pause of this host alone looks like a slow link.
 DELAY_NS = 150_000_000
@@ -113,12 +116,14 @@ class CommandEcho:
         return last - (last - counter) % COUNTER_MODULUS
 
 
-ARMING_TIMEOUT_NS = 1_500_000_000
+# Three periods of SESSION_STATE (0.1 s): one that was sent before the session was chosen is no refusal.
 SESSION_REFUSED_AFTER_NS = 300_000_000
 _OPEN = ("READY", "ARMED")
 _LATCHED = ("FAULT", "ESTOP")
+# Eight bits in HOST_STATE, of which 0 is no session.
 _SESSIONS = 255
 MESSAGES = frozenset({"HELLO", "BUILD", "LIMITS"})
+# Top bit of BUILD.board_id (firmware_protocol/README.md).
 _VIRTUAL_BOARD = 0x8000
 _AUTHENTICATION = Codec().choice_value("HELLO", "capabilities", "AUTHENTICATION")
 

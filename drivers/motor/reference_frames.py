@@ -23,6 +23,7 @@ from drivers.types import (
 from firmware_protocol.codec import PROTOCOL, Codec, Decoded, DecodeFault, FaultReason
 from firmware_protocol.protection import COUNTER_MODULUS, E2EReceiver, E2EStatus, EncodedFrame, Prover
 
+# Five periods of the slowest cyclic messages: 0.1 s of most, 1 s of LINK_HEALTH; a few lost frames lose no sender.
 TIMEOUT_NS = 500_000_000
 SLOW_TIMEOUT_NS = 5_000_000_000
 _SLOW = frozenset({"POWER", "LINK_HEALTH"})
@@ -161,18 +162,27 @@ class FrameTransmission:
         return OutgoingFrame(Frame(encoded.can_id, encoded.data), now_ns + valid_for_ns)
 
 
+# Shorter than 160 ms, after which the 4-bit counter of a message sent every 10 ms comes again.
 LONGEST_APART_NS = 50_000_000
+# 24-bit counters in WHEEL_TICKS.
 TICKS_MODULUS = 1 << 24
+# Chosen: an overshoot of the wheel and jitter of its time are no implausible count.
 SPEED_MARGIN = 1.5
 SLACK_TICKS = 4.0
+# Chosen: so many implausible counts in a row are a counter that has restarted, fewer are noise.
 REANCHOR_AFTER = 5
 WHEEL_MESSAGES = frozenset({"WHEEL_SPEED", "WHEEL_TICKS"})
 POSE_MESSAGES = frozenset({"POSE_POSITION", "POSE_HEADING"})
+# sample_time: 16 bits, in steps of 20 us in WHEEL_SPEED and of 100 us in POSE_HEADING.
 WHEEL_TIME_MODULUS_US = 20 << 16
 POSE_TIME_MODULUS_US = 100 << 16
+# Chosen: below half of the modulus, so that a stamp of the future does not look like an old one.
 OLDEST_WHEEL_US = 300_000.0
 OLDEST_POSE_US = 3_000_000.0
+# Chosen: so many odd stamps in a row are a device that has restarted, fewer are disturbed samples.
 DISTRUST_CLOCK_AFTER = 20
+# Chosen: by how much a reading thread may be late; the device's time cannot have gone on for longer than the host's and
+# this.
 RECEPTION_JITTER_US = 50_000.0
 
 

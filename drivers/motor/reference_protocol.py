@@ -14,6 +14,7 @@ from drivers.motor.reference_frames import FrameReception, FrameTransmission
 from drivers.types import CyclicFrame, Frame, NoSettings, OutgoingFrame, ReceivedFrame, SafetyCard
 from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded, load_protocol
 
+# Chosen: each has an 8-bit check sum that fits a foreign frame by chance, five do not.
 _FRAMES_OF_OURS = 5
 _COMMANDS = ("WHEEL_COMMAND", "WHEEL_COMMAND_MAC")
 _AUTHENTICATION_FRAMES = ("WHEEL_COMMAND_MAC", "HOST_STATE_MAC", "MAC_CHALLENGE")

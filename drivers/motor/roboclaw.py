@@ -46,6 +46,7 @@ from drivers.types import (
     WheelSample,
 )
 
+# User manual, status: the e-stop input, and the bits of errors, above which those of warnings begin.
 _ESTOP, _ERRORS = 0x1, 0xFFFF
 _ERROR_TEXTS = {
     0x2: "it is too hot",
@@ -65,11 +66,17 @@ _ERROR_TEXTS = {
 TO_KNOW = ("version", "velocity_pid_m1", "velocity_pid_m2", "status", "serial_timeout", "speeds", "encoders")
 
 
+# As many as the reference controller asks for (firmware/command.c).
 ZEROS_TO_ARM = 5
+# Chosen: five replies at 50 Hz; gone when a board could have been switched off and on.
 SILENT_NS, GONE_NS = 100_000_000, 500_000_000
+# A little under the 20 ms of a tick at 50 Hz, so that a tick that comes early is not left out.
 _PACE_NS = 18_000_000
+# A tick: a question that waited for longer would hold up the commands of the next one.
 _QUERY_LIFE_NS = 20_000_000
+# After e-stop and commands.
 _QUERY_RANK = 2
+# Longer than a command may wait to be sent: half of its validity, which is 0.1 s at most.
 _LONGEST_LIFE_NS = 60_000_000
 _TIMEOUT_EVERY = 8
 """Of the slow questions every so many is for the serial timeout, the others for the errors."""

@@ -24,6 +24,7 @@ from msgspec import Meta
 from drivers.motor.vendor_parts import Sign, in_sides, layouts
 from drivers.types import CyclicFrame, Frame, LineQuestions, SafetyCard, SettingsFault
 
+# User manual, packet serial: eight addresses; the version is at most 48 bytes; CRC-16 ends every reply.
 FIRST_ADDRESS, LAST_ADDRESS = 0x80, 0x87
 ACKNOWLEDGE = b"\xff"
 _VERSION_END = b"\n\0"
@@ -142,7 +143,9 @@ def _in_range(value: int, code: str) -> int:
     return min(max(value, low), high)
 
 
+# Chosen: above the noise of a counted speed, and below any motion that could matter.
 STATIONARY_RAD_S = 0.1
+# Estimate of how long a board takes to answer, for the load of the line alone.
 _TURNAROUND_S = 0.0009
 _MOTOR = re.compile(r"(\d{1,3})/([12])")
 EXAMPLE = """motors = ["128/1", "128/2"]

@@ -35,6 +35,7 @@ from drivers.types import (
     WheelSample,
 )
 
+# Chosen: five reports of the bridge, which come every 50 ms; gone, longer than a disturbance of the network.
 SILENT_NS, GONE_NS = 250_000_000, 1_000_000_000
 
 

@@ -19,6 +19,7 @@ from msgspec import Meta
 from drivers.motor.vendor_parts import BodySettings
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
+# Chosen for this link alone: e-stop first, as low identifiers go first on CAN.
 STOP, ENABLE, SPEEDS, RESET = 0x010, 0x011, 0x012, 0x013
 STATE, ANGLES, WHEELS = 0x110, 0x111, 0x112
 HOST_FRAMES = frozenset({STOP, ENABLE, SPEEDS, RESET})
@@ -31,10 +32,16 @@ long ago both were true (0.1 ms), uint16. STATE: flags, why odometry was refused
 them big endian.
 """
 DRIVING, LATCHED, BUTTON, ODOMETRY, RECEIVED, OTHERS, FELL_SILENT = (1 << bit for bit in range(7))
+# Chosen: longer than a burst of lost commands at 50 Hz; added to the base's own time-out it is the reaction time of the
+# safety card.
 DEADMAN_S = 0.2
+# Chosen: zeros are repeated for so long, so that a base that misses some still stops.
 ZEROS_S = 0.5
+# Period of those zeros: 50 Hz, as the commands.
 STEP_S = 0.02
+# Chosen: above the noise of odometry.
 STATIONARY_M_S = 0.02
+# Steps on the wire; WHEELS' speeds in 16 bits reach 65 rad/s, and the age 6.5 s.
 ANGLE_RAD = 1e-4
 _SPEED_RAD_S, _AGE_S = 2e-3, 1e-4
 REFUSALS = (

@@ -30,10 +30,13 @@ from drivers.types import (
     WheelSample,
 )
 
+# Chosen: longer than any controller should take to arm; then the operator is told why it did not.
 ARMING_TIMEOUT_NS = 1_500_000_000
 BRAKING_NS = 3_000_000_000
 """Wheels that do not say by then that they stand are taken to."""
+# Chosen: a lost frame costs 0.1 s; more often would load the bus of a controller that does not answer.
 REPEAT_NS = 100_000_000
+# An hour, so above any time for which a driver counts a command as under way.
 _LONG_AFTER_NS = 3_600_000_000_000
 
 

@@ -25,9 +25,12 @@ from drivers.types import (
     WheelSample,
 )
 
+# Chosen: a frame that waited for longer is of an older tick than the next ones.
 _FRAME_LIFE_NS = 50_000_000
-_ESTOP_LIFE_NS = 1_000_000_000
-_ESTOP_REPEATS = 3
+# Chosen: a late e-stop is better than none, so it outlives other frames; three of it, as one may be lost.
+ESTOP_LIFE_NS = 1_000_000_000
+ESTOP_REPEATS = 3
+# Lower ranks are sent first (`drivers.types.OutgoingFrame`).
 _ESTOP_RANK, _RANK = 0, 1
 Nodes = int | tuple[int, ...]
 """Ids on CAN of one side's controllers, as robot.toml names them."""
@@ -165,7 +168,7 @@ def commanding(now_ns: int, command: WheelCommand, *frames: Frame) -> tuple[Outg
 
 def estop_frames(now_ns: int, frames: tuple[Frame, ...]) -> tuple[OutgoingFrame, ...]:
     """Return the frames of an e-stop, three times over, before all others."""
-    return tuple(OutgoingFrame(frame, now_ns + _ESTOP_LIFE_NS, _ESTOP_RANK) for frame in _ESTOP_REPEATS * frames)
+    return tuple(OutgoingFrame(frame, now_ns + ESTOP_LIFE_NS, _ESTOP_RANK) for frame in ESTOP_REPEATS * frames)
 
 
 def status(t_ns: int, state: DriverState, stop_confirmed: bool) -> RobotStatus:

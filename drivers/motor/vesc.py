@@ -39,11 +39,16 @@ from drivers.types import (
     WheelSample,
 )
 
+# Chosen: twice as many as of the others, 0.2 s at 50 Hz, as a VESC acknowledges no command.
 ZEROS_TO_ARM = 10
+# Chosen: a controller that does not answer so often reports no timeout, and the operator is told.
 TIMEOUT_TRIES = 5
+# Five status messages at 50 Hz; gone when a controller could have been switched off and on.
 SILENT_NS, GONE_NS = 100_000_000, 500_000_000
+# Chosen: pings go out until all controllers have answered; faults are asked for one controller at a time.
 _PING_PERIOD_NS = 100_000_000
 _FAULT_PERIOD_NS = 50_000_000
+# A little under the 20 ms of a tick at 50 Hz, so that a tick that comes early is not left out.
 _POLL_PERIOD_NS = 18_000_000
 _SET_COMMANDS = frozenset(number for number, _ in codec.CAN_COMMANDS.values())
 _ERPM_PER_STEP_S = 10.0

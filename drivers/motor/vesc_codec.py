@@ -15,9 +15,11 @@ from types import MappingProxyType
 
 from drivers.types import Frame
 
+# comm_can of the firmware: identifier 255 is all controllers; packets have at most PACKET_MAX_PL_LEN bytes.
 EVERYBODY = 255
 LARGEST_ID = 254
 MAX_PAYLOAD = 512
+# Values are 32-bit integers on the wire.
 _I32 = (-(2**31), 2**31 - 1)
 
 CAN_COMMANDS: Mapping[str, tuple[int, float]] = MappingProxyType(
@@ -44,8 +46,10 @@ PACKET_COMMANDS: Mapping[str, tuple[int, float]] = MappingProxyType(
         "set_handbrake": (10, 1e3),
     }
 )
+# COMM_PACKET_ID of datatypes.h.
 GET_VALUES, GET_APPCONF, ALIVE, FORWARD_CAN, GET_VALUES_SELECTIVE = 4, 17, 30, 34, 50
 _TIMEOUT = struct.Struct(">BIBIf")
+# CAN_PACKET_ID of datatypes.h; FILL frames have one byte of offset, up to 255, and FILL_LONG frames two.
 PING, PONG = 17, 18
 FILL, FILL_LONG, PROCESS, PROCESS_SHORT = 5, 6, 7, 8
 _FILL_BYTES, _FILL_REACH, _LONG_BYTES, _SHORT_BYTES = 7, 255, 6, 6
@@ -94,6 +98,7 @@ _VALUES: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = tuple(
     )
 )
 """Of COMM_GET_VALUES, in the order of the bits of the selective form's mask."""
+# Bits of the mask of COMM_GET_VALUES_SELECTIVE, and of the status byte that it returns.
 FAULT_AND_STATUS = 1 << 15 | 1 << 21
 ALL_OF_A_MOTOR = 1 << 7 | 1 << 13 | 1 << 17 | FAULT_AND_STATUS
 TIMED_OUT, KILL_SWITCH = 1, 2

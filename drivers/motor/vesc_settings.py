@@ -13,9 +13,13 @@ from drivers.motor import vesc_codec as codec
 from drivers.motor.vendor_parts import Nodes, Sign, all_of, in_sides, sides_of
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
+# Chosen: unlikely to be a controller's, and refused for one.
 HOST_ID = 253
+# 50 Hz, which the safety card asks for.
 STATUS_PERIOD_S = 0.02
+# Chosen: above the noise of a motor at rest, and below speeds that it can hold.
 STATIONARY_ERPM = 60.0
+# Chosen: equal but for the rounding of numbers that were typed in.
 _SAME_TIMEOUT_S, _SAME_CURRENT_A = 0.002, 0.1
 EXAMPLE = """nodes = [23, 51]
 direction = [1, -1]

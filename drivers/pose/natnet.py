@@ -20,19 +20,26 @@ from drivers.pose.senders import SILENCE_S, SenderGate, parse_allowed
 from drivers.types import PoseSample
 
 SOURCE = "natnet"
+# NatNet: Motive's command port, and NAT_CONNECT, NAT_SERVERINFO, NAT_FRAMEOFDATA and NAT_KEEPALIVE of the SDK's
+# NatNetTypes.h.
 COMMAND_PORT = 1510
 CONNECT, SERVER_INFO, FRAME, KEEP_ALIVE = 0, 1, 7, 10
 VERSIONS = {text: tuple(int(part) for part in text.split(".")) for text in ("2.6", "2.7", "2.8", "2.9", "2.10", "2.11")}
 VERSIONS |= {text: tuple(int(part) for part in text.split(".")) for text in ("3.0", "3.1", "4.0", "4.1")}
+# Chosen, as in `drivers.pose.udp`; the longest datagram is UDP's.
 _MOST_A_TICK = 100
 _LONGEST_DATAGRAM = 65_535
 _MOST_BYTES_A_TICK = 65_536
 """After so many bytes the next datagram waits for the next tick: whoever floods the port must not hold up the loop."""
 _MOST_ITEMS = 3000
 """In a frame, all kinds together: NatNet's own SDK has room for 1000 of a kind, and more would take milliseconds."""
+# Chosen: oftener finds a server that starts later sooner, and sends it more.
 _REQUEST_NS = 1_000_000_000
+# MAX_NAMELENGTH of NatNetTypes.h.
 _NAME_LENGTH = 256
+# Chosen: over less, the resolution of the server's seconds shows in the frequency.
 _CLOCK_LEAST_S = 0.5
+# Chosen: a larger age is of a clock that was misread, and counts as none.
 _OLDEST_S = 10.0
 
 Version = tuple[int, ...]

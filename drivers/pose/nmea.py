@@ -24,10 +24,11 @@ from typing import Any
 
 from drivers.pose import PoseSourceError
 from drivers.pose.udp import LONGEST_DATAGRAM, MOST_A_TICK, message_of, pose_of
-from drivers.types import PoseSample
+from drivers.samples import FARTHEST_M, PoseSample
 
 SOURCE = "nmea"
 _READER = "drivers.pose.nmea"
+# Chosen: the reader wakes every _READ_S; what does not end by then is killed.
 _END_TIMEOUT_S = 1.0
 
 
@@ -113,27 +114,39 @@ class NmeaPoses:
         return message
 
 
+# NMEA 0183 gives times of day, which begin anew at midnight.
 DAY_S = 86_400.0
 QUALITY_STD_M = {1: 3.0, 2: 0.8, 3: 2.0, 4: 0.02, 5: 0.4}
 """Of a coordinate, where the receiver says none (GST), by the quality of GGA: 1 alone, 2 differential, 3 precise, 4 RTK
 with whole wavelengths, 5 without. 0 is no fix; 6, 7 and 8 are reckoned, typed in and simulated: no measurement."""
-FARTHEST_M = 838.0
-"""As far as the estimator and the frames of a pose go."""
 MEASURED_MODE = "A"
 """Of THS; E, M, S and V are reckoned, typed in, simulated and not valid: no measurement."""
+# 0.4 m over a metre between two antennas, as said below.
 WIDE_HEADING_STD_RAD = 0.4
 WIDE_HEADING_QUALITIES = frozenset({0, 5, 6, 7, 8})
 """With a float fix, or none, the heading of two antennas is off by as much as 0.4 m over a metre between them."""
+# Chosen: a receiver may report less than its antenna's place on the robot is known.
 _LEAST_STD_M = 0.005
+# Chosen: longer than the period of any sentence, so that a heading that comes is not missed.
 _HINT_NS = 10_000_000_000
+# Chosen: GST may come less often than GGA; two of it may be missed at 1 Hz.
 _GST_HOLDS_S = 2.5
+# docs/poses.md: a heading belongs to the position within it; longer than an epoch's sentences take on the line, shorter
+# than 10 Hz.
 _PAIR_NS = 60_000_000
+# Chosen: a receiver that sent no heading for so long no longer makes positions wait for one.
 _HEADING_HOLDS_NS = 2_000_000_000
+# Chosen: longer finds a smaller delay, shorter follows a drifting clock sooner.
 _CLOCK_WINDOW_S = 30.0
+# WGS 84.
 _SEMI_MAJOR_M, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563
+# Above NMEA 0183's 82 characters, which receivers exceed in fields of their own.
 _LONGEST_LINE = 256
+# docs/poses.md: above the period of a receiver at 1 Hz, with a sentence or two lost.
 _SILENT_S = 3.0
+# Chosen: how late a heading's wait ends and an end is noticed.
 _READ_S = 0.05
+# Chosen: soon after a plug was pulled, later without flooding the console.
 _RETRY_S = (0.5, 1.0, 2.0, 5.0)
 
 

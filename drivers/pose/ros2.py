@@ -20,6 +20,7 @@ from drivers.types import PoseSample
 
 SOURCE = "ros2"
 _CREDENTIALS = struct.Struct("3i")
+# User id of the superuser (POSIX): its processes can send as anybody.
 _ROOT = 0
 
 

@@ -16,9 +16,11 @@ from ipaddress import AddressValueError, IPv4Address, IPv4Network, NetmaskValueE
 
 SILENCE_S = 2.0
 """A sender is kept until it has been silent for so long, unless the host says otherwise."""
+# Chosen: often enough to be seen, without a line for each of many datagrams.
 REPORT_AGAIN_NS = 10_000_000_000
 CLOCKS_APART_NS = 1_000_000_000
 """A proven datagram was sent at most so long ago, by the sender's clock, or so far ahead of this computer's."""
+# UNIX time in ns as 64-bit integer, and HMAC-SHA-256.
 TIME_BYTES, PROOF_BYTES = 8, 32
 Sender = tuple[str, int]
 

@@ -23,8 +23,11 @@ from drivers.pose.senders import SILENCE_S, PoseProof, SenderGate, parse_allowed
 from drivers.types import PoseSample
 
 SOURCE = "udp"
+# Chosen: far above any sensor's rate; who floods the port must not hold up the loop.
 MOST_A_TICK = 100
+# Chosen: above any pose as JSON; a longer one is cut off and counts as malformed.
 LONGEST_DATAGRAM = 1024
+# Chosen: longer than any sensor's delay; an older pose is of a clock that is not synchronised.
 OLDEST_S = 10.0
 
 

@@ -26,10 +26,11 @@ from drivers.transport.reconnecting import (
     TransportCounters,
     TransportSettingsError,
 )
-from drivers.transport.serial import error_number, explain_port, plain
+from drivers.transport.serial import READ_TIMEOUT_S, WRITE_TIMEOUT_S, error_number, explain_port, plain
 from drivers.types import MAX_EXTENDED_ID, Frame, ReceivedFrame
 from firmware_protocol.serial_framing import MAX_CAN_ID, MAX_DATA
 
+# Classes and controller states of an error frame: linux/can/error.h.
 _TX_TIMEOUT = 0x001
 _LOST_ARBITRATION = 0x002
 _CONTROLLER = 0x004
@@ -56,17 +57,21 @@ _CONTROLLER_STATES = (
     (0x10, "receive errors at passive level"),
     (0x20, "transmit errors at passive level"),
 )
+# CAN_ERR_CRTL_RX_OVERFLOW of linux/can/error.h.
 _RECEIVE_OVERFLOW = 0x01
+# Chosen: longer than a frame waits for a loaded bus; until then an equal frame of another host counts as the echo.
 ECHO_NS = 1_000_000_000
 # Of a bus whose library or system is not here; where a library was not loaded, some of python-can use it all the same.
 _NOT_HERE = (can.CanInterfaceNotImplementedError, ImportError, NameError)
 _OVER_A_TTY = ("slcan", "serial", "seeedstudio", "robotell")
 KIND = "can"
-READ_TIMEOUT_S = 0.1
-WRITE_TIMEOUT_S = 0.05
+# Chosen: longer than a frame waits for the reading thread, and shorter than most steps of a clock.
 MAX_STAMP_AGE_S = 1.0
+# Chosen: a few invalid lines follow every opening of an adapter; so many are a wrong speed or firmware.
 GARBAGE_LIMIT = 50
+# IFF_UP of linux/if.h.
 _INTERFACE_UP_FLAG = 0x1
+# Chosen: longer than a server of the local network takes to answer; a connection that fails is tried again.
 _PROBE_TIMEOUT_S = 1.0
 _ECHO_OPTION = "receive_own_messages"
 _ECHOING_INTERFACES = frozenset({"udp_multicast"})

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 
-from drivers.transport.reconnecting import TransportCounters
+from drivers.transport.reconnecting import RECEIVE_CAPACITY, TransportCounters
 from drivers.types import LinkState, OutgoingFrame, ReceivedFrame, TransportStats
 
-QUEUE_CAPACITY = 4096
+# As of a real link, so that an overflow shows in tests as it would there.
+QUEUE_CAPACITY = RECEIVE_CAPACITY
 
 
 class InProcessTransport:

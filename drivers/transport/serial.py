@@ -25,18 +25,23 @@ from drivers.transport.reconnecting import (
     TransportCounters,
 )
 from drivers.types import Exchange, Frame, ReceivedFrame
-from firmware_protocol.serial_framing import FrameDecoder, encode_frame
+from firmware_protocol.serial_framing import BITS_PER_BYTE, FrameDecoder, encode_frame
 
 _GONE = (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO)
 KIND = "serial"
+# Chosen: how soon the reading thread notices that the link is to be closed, on CAN too.
 READ_TIMEOUT_S = 0.1
+# Chosen: longer than a full buffer of the adapter takes to make room for one frame; then the frame is given back to the
+# queue.
 WRITE_TIMEOUT_S = 0.05
-_EXCHANGE_READ_S = 0.002
-_BITS_PER_BYTE = 10
+# Chosen: how soon a reply's end is noticed; longer delays the next request, shorter wakes the thread for nothing.
+EXCHANGE_READ_S = 0.002
+# Above the longest packet of a VESC, 512 bytes and its frame: what is longer is noise.
 _LONGEST_REPLY = 600
 _FULL = "the line accepts no more bytes; check that the other end reads"
 _DELIMITER = b"\0"
 _TCP, _UNIX = "socket://", "unix://"
+# Chosen: longer than a connection over a radio link takes.
 _CONNECT_S = 5.0
 
 
@@ -77,7 +82,7 @@ class SerialMedium:
 
     def connect(self, counters: TransportCounters) -> Connection:
         """Open the port for this process alone. Raises what pyserial raises."""
-        timeout_s = READ_TIMEOUT_S if self.exchange is None else _EXCHANGE_READ_S
+        timeout_s = READ_TIMEOUT_S if self.exchange is None else EXCHANGE_READ_S
         port = open_port(self, timeout_s=timeout_s, write_timeout_s=WRITE_TIMEOUT_S, exclusive=True)
         request_low_latency(port)
         if self.exchange is not None:
@@ -187,7 +192,7 @@ class ExchangeConnection:
 
     def _wait_for_reply(self, frame: Frame, sent_bytes: int) -> Frame | None:
         received = b""
-        byte_s = _BITS_PER_BYTE / self._port.baudrate
+        byte_s = BITS_PER_BYTE / self._port.baudrate
         deadline = time.monotonic() + self._exchange.timeout_s + sent_bytes * byte_s
         latest = deadline + _LONGEST_REPLY * byte_s
         while time.monotonic() < deadline and len(received) <= _LONGEST_REPLY:

@@ -16,6 +16,7 @@ from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_protocol import CanFrame
 from sim.encoder_loop import EncoderLoop, EncoderUse
 
+# By the manual.
 TIMEOUT_MS = 500
 STANDBY, CAN_MODE, UART_MODE, RC_MODE = range(4)
 MOTORS = 8

@@ -19,10 +19,13 @@ from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_protocol import CanFrame
 from sim.encoder_loop import EncoderLoop, EncoderUse
 
+# The control loop of the open firmware runs at 8 kHz.
 CHECKS_PER_MS = 8
+# AxisState, ControlMode and InputMode of ODrive's API.
 IDLE, CLOSED_LOOP, POSITION_CONTROL, VELOCITY_CONTROL, PASSTHROUGH = 1, 8, 3, 2, 1
 WATCHDOG_ERROR = {"0.5": 0x800, "0.6": 0x0100_0000}
 ESTOP_ERROR = {"0.5": 0x4000, "0.6": 0x0200_0000}
+# AxisError of ODrive's API.
 INVALID_STATE = 0x1
 _F32 = struct.Struct("<f")
 

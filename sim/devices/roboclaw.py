@@ -18,6 +18,7 @@ from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_protocol import CanFrame
 from sim.encoder_loop import EncoderLoop, EncoderUse
 
+# User manual, packet serial: a longer pause discards what has begun.
 QUIET_US = 10_000
 
 

@@ -15,6 +15,7 @@ from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_protocol import CanFrame
 from sim.encoder_loop import EncoderLoop, EncoderUse
 
+# As of the bridge (disco_hw/bridge/ros2_base.py): odometry at 50 Hz, its state at 20 Hz.
 WHEELS_MS, STATE_MS, STEP_MS = 20, 50, 20
 
 

@@ -14,12 +14,15 @@ from dataclasses import dataclass, field
 
 from sim.can_protocol import CanFrame
 
+# Room for the longest payload, PACKET_MAX_PL_LEN (512) of packet.h, and some bytes.
 BUFFER = 520
+# APPCONF_SIGNATURE of a firmware's confgenerator.h; the driver skips it.
 APPCONF_SIGNATURE = 3264926020
 _APPCONF_REST = 300
 """Bytes of the application's settings that follow, of no meaning here."""
 KILL_SWITCH_IGNORES_MS = 20
 """For so long after a check that found the kill switch active, commands do not reach the motor."""
+# Period of the thread in timeout.c.
 CHECK_MS = 10
 _F32 = struct.Struct("<f")
 _CAN_SET = {

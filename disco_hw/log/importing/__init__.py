@@ -24,7 +24,7 @@ from disco_hw.files import LOG, begin_of
 from disco_hw.files import ROBOT_TOML as ROBOT_FILE
 from disco_hw.log import ROBOT_TOML, Attachment, End, Start, attachment, batch_encoder, version
 from disco_hw.log.container import MAGIC
-from disco_hw.log.drive import DriveLog
+from disco_hw.log.drive import LONGEST_COMMAND_S, DriveLog
 from disco_hw.log.importing.headings import without_standing_headings
 from disco_hw.log.importing.losses import WARNING, warnings_first
 from disco_hw.log.importing.rosbag_file import METADATA, SUFFIXES, is_bag
@@ -33,6 +33,7 @@ from disco_hw.log.records import Command, Record
 from disco_hw.log.writer import LogFile
 from drivers.types import PoseSample, WheelSample
 
+# Chosen: enough of a file's beginning to tell its format.
 LONGEST_BEGIN_BYTES = 64
 
 
@@ -69,7 +70,6 @@ def format_of(begin: bytes) -> LogFormat | None:
 
 
 SOURCE = "import"
-_LONGEST_COMMAND_S = 0.5
 _LONGEST_S = 9e9
 """Nanoseconds of more do not fit into the 64 bits that a log has for them."""
 
@@ -130,7 +130,7 @@ def _commands(drive: DriveLog) -> Iterator[_Timed]:
         yield (
             t_ns,
             segment,
-            Command(t_ns, now_left, now_right, now_left, now_right, _LONGEST_COMMAND_S, in_force=known, source=SOURCE),
+            Command(t_ns, now_left, now_right, now_left, now_right, LONGEST_COMMAND_S, in_force=known, source=SOURCE),
         )
 
 

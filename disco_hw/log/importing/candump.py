@@ -20,7 +20,7 @@ import numpy as np
 from disco_hw.config import Robot
 from disco_hw.errors import LogError
 from disco_hw.files import CANDUMP, read_lines
-from disco_hw.log.drive import Array, Commands, DriveLog, Gyro, Index, Poses, Wheels
+from disco_hw.log.drive import LONGEST_SILENCE_NS, Array, Commands, DriveLog, Gyro, Index, Poses, Wheels
 from disco_hw.log.importing import LogFormat
 from disco_hw.log.importing.losses import loss_note, warnings_first
 from drivers.device_clock import DeviceClock
@@ -36,7 +36,9 @@ _LINE = re.compile(
 _SCREEN = re.compile(r"\s*\S{1,64}\s+(?:[RT]X\s+[-BE\s]*)?[0-9A-Fa-f]{3,8}\s+\[\s*\d{1,2}\]")
 _HEX = re.compile(r"(?:[0-9A-Fa-f]{2}){0,8}")
 _SECONDS = re.compile(r"(\d{1,12})(?:\.(\d{1,9}))?")
+# CAN_ERR_FLAG of linux/can.h.
 _ERROR_FLAG = 0x20000000
+# Chosen: no pause between frames lasts a minute, and a clock that goes back is not that young.
 _LARGEST_DIFFERENCE_NS = 60_000_000_000
 _BACK_SHARE = 0.05
 """A clock that goes back this often counts from frame to frame."""
@@ -161,7 +163,6 @@ def _nanoseconds(text: str) -> int | None:
 
 
 _COMMAND = "WHEEL_COMMAND"
-_LONGEST_SILENCE_NS = 500_000_000
 Row = tuple[float, ...]
 
 
@@ -265,7 +266,7 @@ def _drive(path: Path, commands: list[Row], wheels: list[Row], poses: list[Row],
     command, wheel, pose = _table(commands, 3), _table(wheels, 5), _table(poses, 4)
     wheel_ns = wheel[:, 0]
     # What was driven while no wheel was heard is not known.
-    breaks_ns = wheel_ns[1:][np.diff(wheel_ns) > _LONGEST_SILENCE_NS]
+    breaks_ns = wheel_ns[1:][np.diff(wheel_ns) > LONGEST_SILENCE_NS]
 
     def when(t_ns: Array) -> tuple[Array, np.ndarray]:
         return (t_ns - began_ns) * 1e-9, np.searchsorted(breaks_ns, t_ns, side="right").astype(np.int64)

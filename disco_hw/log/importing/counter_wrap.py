@@ -34,6 +34,7 @@ _FULL_SHARE = 0.5
 """Counts of a counter that wraps all the time fill at least this share of its span."""
 _TOO_FAST_SHARE = 0.05
 """A counter of which more steps than this may be over half its span cannot be read."""
+# Chosen: of the steps; fewer jumps can be mended one by one.
 _JUMPS_ALL_THE_TIME_SHARE = 0.1
 _OFTEN = 3
 """Without a usual width, so many jumps of one size are a span."""
@@ -283,6 +284,10 @@ def restarts(t_s: Array, angles_rad: Array) -> Mask:
     return np.concatenate([[False], ((steps > _LARGEST_STEP_RAD) | sudden | to_zero).any(axis=1)])
 
 
+# Chosen: ten turns from sample to sample are no wheel, however fast.
 _LARGEST_STEP_RAD = 20.0 * math.pi
+# Chosen: a step this long at this speed and so many times above the usual is no wheel; so many steps may be the usual
+# fastest.
 _NO_WHEELS_STEP_RAD, _FAST_WHEEL_RAD_S, _FEW = 1.0, 30.0, 3
+# Chosen: a step to zero needs less than others, as it is where a counter begins.
 _TIMES_AS_FAST, _FASTER_TO_ZERO = 3.0, 2.0

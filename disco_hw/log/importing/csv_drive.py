@@ -19,6 +19,7 @@ import numpy as np
 
 from disco_hw.errors import LogError
 from disco_hw.log.drive import (
+    LONGEST_COMMAND_S,
     Array,
     Commands,
     DriveLog,
@@ -45,13 +46,19 @@ from disco_hw.log.importing.csv_sheet import (
 )
 from disco_hw.log.importing.losses import warnings_first
 
+# Chosen: a median from row to row outside these is milliseconds or nanoseconds read as seconds.
 _LONGEST_PERIOD_S = 2.0
 _SHORTEST_PERIOD_S = 1e-4
+# Chosen: of any robot's wheels; a factor of 10 or more from wrong units leaves this range, or that around the nominal
+# radius.
 _WHEEL_RADIUS_M = (0.005, 1.5)
 _AGAINST_NOMINAL = 4.0
+# Chosen: poses that move so many times less than the wheels do not move at all.
 _STATIONARY_COUNTS = 100.0
+# Chosen: chords this long are far above a pose's noise and little shorter than their arcs; fewer say too little.
 _CHORD_ROLL_RAD = 2.0
 _ENOUGH_CHORDS = 5
+# Chosen: no robot turns so many times further, or faster, than this; degrees read as radians do.
 _LARGEST_TURN_RATIO = 3.0
 _LARGEST_YAW_RATE_RAD_S = 6.0
 
@@ -126,7 +133,7 @@ def _roll(wheels: Wheels, commands: Commands) -> tuple[Array, Array]:
     return t_s, np.column_stack([integrate_angle(t_s, left, segment), integrate_angle(t_s, right, segment)])
 
 
-_LONGEST_HOLD_S = 0.5
+# Chosen: an encoder that begins anew oftener is not one, but a column that is none.
 _MAX_RESTART_SHARE = 0.05
 
 
@@ -174,7 +181,7 @@ def _commands(sheet: Sheet) -> Commands:
     before = np.concatenate([np.zeros(1, dtype=bool), given[:-1]])
     for start in np.flatnonzero(~given & (before | (np.arange(t_s.size) == 0))):
         following = int(np.searchsorted(rows, start))
-        holds = start > 0 and following < rows.size and t_s[rows[following]] - t_s[start - 1] <= _LONGEST_HOLD_S
+        holds = start > 0 and following < rows.size and t_s[rows[following]] - t_s[start - 1] <= LONGEST_COMMAND_S
         # One row of NaN says that from here on no command is known.
         kept[start] = not holds
     return Commands(t_s[kept], values[kept, 0], values[kept, 1], sheet.segment[kept])

@@ -13,9 +13,11 @@ from disco_hw.log.importing.losses import WARNING
 
 Mask = NDArray[np.bool_]
 
+# Chosen: so many equal headings in a row are no slower sensor.
 _FEWEST_POSES = 10
 _TURNED_RAD = 4.0
 """Difference of the wheels' angles while a heading stands still: half a radian or more of turning."""
+# Below the last digit of any log: repeated, not measured.
 _STATIONARY_RAD = 1e-9
 
 

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from disco_hw.config import Robot, RobotConfig
 from disco_hw.errors import LogError
 from disco_hw.log.drive import (
+    LONGEST_COMMAND_S,
+    LONGEST_SILENCE_NS,
     Array,
     Commands,
     DriveLog,
@@ -47,11 +49,13 @@ from disco_hw.log.importing.rosbag_topics import (
     Choice,
     choose,
 )
-from disco_hw.log.importing.rosbag_wheels import LONGEST_SILENCE_NS, measured_columns, unwrapped, wheels_of
+from disco_hw.log.importing.rosbag_wheels import measured_columns, unwrapped, wheels_of
 from drivers.pose.headings import is_heading_measured
 
-_LONGEST_COMMAND_NS = 500_000_000
+_LONGEST_COMMAND_NS = round(LONGEST_COMMAND_S * 1e9)
+# Chosen: where no wheels show a pause, nothing at all for this long is one.
 _LONGEST_PAUSE_NS = 2_000_000_000
+# Chosen: hours of a robot's topics; more would take minutes and fill the memory.
 _MOST_MESSAGES = 20_000_000
 _YAW_VARIANCE = 35
 """Place of the yaw's variance among the 36 of a pose's covariance."""

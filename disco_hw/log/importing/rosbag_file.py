@@ -29,8 +29,11 @@ SQLITE_MAGIC = b"SQLite format 3\0"
 METADATA_BEGIN = b"rosbag2_bagfile_information"
 BAG_METADATA = FileKind("the metadata of a bag", 4 * 1024 * 1024, "give the path of a bag's folder or of its file")
 
+# Chosen: room for a large bag; a damaged size in one would ask for more.
 _MOST_MEMORY_BYTES = 1536 * 1024 * 1024
+# Chosen: above what recorded messages shrink by; more is made to fill a disk.
 _MOST_UNPACKED_RATIO = 256
+# Chosen: far above any robot's; a damaged bag may claim any number.
 _MOST_TOPICS = 10_000
 _HINT = "record it again, or convert it to an MCAP where it was recorded"
 

@@ -22,9 +22,11 @@ from mcap.writer import CompressionType, Writer
 
 from disco_hw.files import LOG, open_file
 
+# Chosen: as of our own logs (`disco_hw.log.container`): a larger record is damage.
 _LARGEST_RECORD_BYTES = 256 * 1024 * 1024
 _LARGEST_MESSAGE_BYTES = 1024 * 1024
 """Images and clouds are left behind: nothing that is imported is as large."""
+# Chosen: a chunk that claims more is damage, and would fill the memory.
 _LARGEST_UNPACKED_BYTES = 512 * 1024 * 1024
 
 

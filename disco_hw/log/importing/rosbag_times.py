@@ -17,10 +17,15 @@ from disco_hw.log.importing.losses import WARNING
 
 Mask = NDArray[np.bool_]
 
+# Chosen: smaller steps are late messages; larger ones, that last, are a clock that was set.
 _JUMP_NS = 500_000_000
+# Chosen: topics show one jump within this time, by when their next messages come.
 _ONE_JUMP_NS = 3_000_000_000
+# Chosen: a usual difference above it is more than any delay.
 _OTHER_CLOCK_NS = 1_000_000_000
+# Chosen: a topic that is stamped further ahead is stamped with when it ends to be valid.
 _LEAD_NS = 50_000_000
+# Year 2096: later stamps are damage, and sums of two still fit into 64 bits.
 _LARGEST_NS = 4 * 10**18
 _SAME_CLOCK_NS = 30_000_000_000
 """Stamps of one clock may come so much apart, as where messages wait; those of another clock are further off."""

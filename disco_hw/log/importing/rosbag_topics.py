@@ -27,8 +27,11 @@ TRANSFORMS = frozenset({"tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"})
 DRIVERS = re.compile(r".*_msgs/msg/Drive")
 WHEEL_SPEEDS = re.compile(r".*_msgs/msg/WheelVels")
 
+# Chosen: enough messages to see what a topic holds, without reading the bag.
 _PEEKED = 20
+# Chosen: a slower topic says too little of a drive and is taken last.
 _FEWEST_HZ = 2.0
+# Chosen: /tf mixes many transforms, so that rare ones need more messages to be seen.
 _PEEKED_TRANSFORMS = 2000
 _LEFT = re.compile(r"(^|[_\W])(left|l|fl|lf|rl|lr|bl|ml)([_\W]|$)|left")
 _RIGHT = re.compile(r"(^|[_\W])(right|r|fr|rf|rr|br|mr)([_\W]|$)|right")
@@ -78,6 +81,7 @@ class Choice:
         return "\n".join(["topics; * is read, `--topic ROLE=NAME` takes another", *(line.rstrip() for line in lines)])
 
 
+# Above all ranks of topics that can be read.
 _UNREADABLE_RANK = 200
 
 

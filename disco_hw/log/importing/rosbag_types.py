@@ -13,6 +13,7 @@ from typing import Any
 
 PARSE_LIMIT_S = 0.5
 """CPU time for all definitions of a bag together; a usual one takes some milliseconds."""
+# Chosen: a line or two; a parser's error may quote the whole definition.
 _LONGEST_TEXT = 200
 
 

@@ -9,13 +9,10 @@ import numpy as np
 
 from disco_hw.config import Robot
 from disco_hw.errors import LogError
-from disco_hw.log.drive import Array, Index, Wheels, differentiate_angle, integrate_angle
+from disco_hw.log.drive import LONGEST_SILENCE_NS, Array, Index, Wheels, differentiate_angle, integrate_angle
 from disco_hw.log.importing.counter_wrap import WIDTHS_BITS, Mask, unwrap_wheels
 from disco_hw.log.importing.losses import loss_note
 from disco_hw.log.importing.rosbag_topics import WHEELS
-
-LONGEST_SILENCE_NS = 500_000_000
-"""A longer pause of the wheels begins a new segment."""
 
 
 def measured_columns(path: Path, t_ns: Index, wheel: Array, notes: list[str]) -> tuple[Index, Array, tuple[bool, bool]]:

@@ -14,8 +14,10 @@ import numpy as np
 
 from disco_hw.errors import InputError
 from disco_hw.files import WAY_POINTS, read_lines
-from disco_hw.tasks import FARTHEST_M, Array, Point
+from disco_hw.tasks import Array, Point
+from drivers.samples import FARTHEST_M
 
+# Chosen: smaller follows corners more closely, and makes the table, which must stay in a cache, longer.
 SPACING_M = 0.02
 # Entries closer than this part of the spacing lie on either side of a turn straight back.
 FOLDED = 0.01
@@ -202,7 +204,9 @@ def sharp_turns(points: Array, closed: bool, reach: int) -> list[int]:
     return sorted(found)
 
 
+# Below the digits of a file: the same point, written twice.
 LEAST_DISTANCE_M = 1e-6
+# Chosen: a shorter path is a robot at rest; a longer one makes a table too large for the planner, as do more points.
 SHORTEST_M = 0.1
 LONGEST_M = 2000.0
 MOST_POINTS = 10_000

@@ -14,7 +14,9 @@ from disco_hw.tasks import Found, Prepared, constant, helper, norm_and_inverse, 
 from disco_hw.tasks.line import PathTable
 from disco_hw.tasks.line.course import turned_sines
 
+# Chosen: time constant of coming to the end; shorter brakes later and harder.
 SLOW_DOWN_S = 1.0
+# Chosen: further than a step of the plan can drive; keeps the place from jumping to another part of the path.
 FARTHEST_STEP_M = 0.5
 # Facing straight against the way costs as much as being so far off it.
 AGAINST_M = 0.6

@@ -19,8 +19,11 @@ from disco_hw.tasks.line import SHARP_RAD, PathTable, Waypoints
 if TYPE_CHECKING:
     from scipy.spatial import KDTree
 
+# Chosen: shorter finds the nearest piece more surely, and makes the tree larger.
 _PIECE_M = 0.05
+# Chosen: a path may come near itself that often.
 _NEAREST = 4
+# Against a division by 0, and what counts as another place than the first.
 _NO_LENGTH_M2 = 1e-18
 _ELSEWHERE_M = 1e-6
 
@@ -251,7 +254,9 @@ def _turn_back(path: PathTable, heading: Array, turned_rad: float, least_m: floa
     return None
 
 
+# Chosen: the heading's equation grows stiff towards 0, where its solution is the line's direction.
 SMALLEST_X_ICR_M = 0.01
+# Chosen: the heading of a closed line has then forgotten where it began.
 _LAPS = 3
 
 

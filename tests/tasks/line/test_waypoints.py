@@ -10,10 +10,10 @@ import firmware_protocol
 from disco_hw.config import Robot
 from disco_hw.errors import InputError
 from disco_hw.estimation.correction import MAX_POSITION_M
-from disco_hw.tasks import FARTHEST_M
 from disco_hw.tasks.line import load_waypoints
 from disco_hw.tasks.path import PathTask
 from disco_hw.tasks.timed_path import TimedPathTask
+from drivers.samples import FARTHEST_M
 
 # Its wheels do 0.5 m/s.
 ROBOT = Robot(name="r", wheel_radius_m=0.1, axial_distance_m=0.4, ticks_per_rev=1024, max_wheel_speed_rad_s=5.0)
