@@ -69,7 +69,7 @@ def written(searched, monkeypatch, folder, seeds):
     # None depends on the robot's limits, and each takes long.
     monkeypatch.setattr(gap, "joint_predictions", lambda *_: predictions)
     monkeypatch.setattr(gap, "being_proved", lambda spots, *_: nullcontext(lambda: spots))
-    monkeypatch.setattr(gap, "_drawn", lambda *_: {"picture": b"PNG"})
+    monkeypatch.setattr(gap, "_draw_images", lambda *_: {"picture": b"PNG"})
     for seed in seeds:
         (radius_m, axial_m, fastest_rad_s), text = robot_toml(np.random.default_rng([23, seed]))
         robot, out = folder / f"{seed}.toml", folder / str(seed)

@@ -151,7 +151,7 @@ FAULTS: dict[str, tuple[Change, str, str]] = {
         "wheels_reversed",
         "both encoders count backwards",
     ),
-    "left encoder dead": (with_wheels(0.0, 1.0), "encoder_dead", "left encoder never counts"),
+    "left encoder dead": (with_wheels(0.0, 1.0), "encoder_dead", "left encoder does not count"),
     "right encoder dead, no commands": (
         then(with_wheels(1.0, 0.0), without_commands),
         "encoder_dead",
