@@ -57,8 +57,6 @@ CHECKS = (
     ScoreTest("left unlike right", Symptom.LEFT_UNLIKE_RIGHT),
     ScoreTest("turning changes", Symptom.TURNING_CHANGES),
 )
-# Chosen: times along the log at which positions are compared; more are nearly the same.
-_POSITION_CHECKS = 8
 
 
 @dataclass(frozen=True, slots=True)
