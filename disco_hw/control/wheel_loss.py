@@ -22,7 +22,7 @@ Wheels = tuple[float, float]
 
 CORRECTED_S, FOLLOWED_S = 0.3, 0.5
 """Time constants of the speeds and of the losses."""
-# Chosen: more than dead band and sag take; a larger loss is a fault, not to be made up for.
+# Chosen: a limit, so that a wheel that does not turn at all is not made up for.
 LARGEST_RAD_S = 0.6
 FULL_RAD_S = 1.0
 """A command, or half a difference, of this size loses all of it, a smaller one in proportion, so that one of zero stays

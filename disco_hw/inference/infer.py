@@ -61,7 +61,7 @@ CALIBRATION_SIMULATIONS = 300
 DEFAULT_SIMULATIONS = 3000
 PAPER_SIMULATIONS = 1000
 _FEWEST_SIMULATIONS = 200
-# Chosen: noise and geometry agree by then.
+# Chosen: each pass takes the noise from a better geometry, and takes as long.
 _NOISE_PASSES = 3
 # Further outside the prior than this is excluded by it; nearer, the posterior is pressed against the edge, and says so.
 _EXCLUDED_DEVIATIONS = 8.0

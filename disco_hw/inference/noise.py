@@ -16,7 +16,7 @@ from disco_hw.inference.excitation import MOVING_SPREAD_STEPS, Excitation
 
 Array = NDArray[np.float64]
 
-# Chosen: grids from a period of the poses to what slip needs to show; finer ones change the noise little.
+# Chosen: grids that are searched; finer ones take longer.
 _LAGS_S = (0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.0)
 _CORRELATIONS_S = (1e-3, 0.03, 0.06, 0.1, 0.15, 0.2, 0.3, 0.4, 0.55, 0.75)
 _SPEED_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)

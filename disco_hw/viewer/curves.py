@@ -23,7 +23,7 @@ POINTS = 400
 NORMAL_99 = 2.5758293035489004
 """Two-sided 99 % bound of a standard normal."""
 
-# Chosen: a circle at usual speed; longer hides what a tick does.
+# Chosen: longer hides what single ticks do.
 WINDOW_NS = 20_000_000_000
 # Pixels, chosen: several plots fit beside the scene.
 _HEIGHT = 170

@@ -36,7 +36,7 @@ WAIT_S = 0.05
 LIVE_REDRAW_S = 0.5
 # Chosen: longer takes more memory of a page that stays open; a log holds all.
 KEEP_S = 300.0
-# Chosen: above the delay of the feed; a record that is newer than the status is believed.
+# Chosen: a record that is younger is believed before the daemon's status.
 _STATUS_OLDER_NS = 2_000_000_000
 
 
