@@ -29,7 +29,7 @@ from drivers.pose.udp import SOURCE as UDP_POSES
 
 DEVICES = MappingProxyType({driver.name: driver.example for driver in motor_drivers().values() if driver.example})
 """By name of a driver whose controller can be simulated: its lines in [link]."""
-# As in the drivers' examples; a USB port takes any.
+# As docs/controllers.md asks for at least.
 _VENDORS_BAUD = 115_200
 READY_TIMEOUT_S = 180.0
 """A first start compiles the planner: more than a minute on a busy machine. A daemon that ends is noticed at once."""

@@ -48,7 +48,7 @@ DRIVES = "drives.jsonl"
 ALONE_STREAM, CORRIDOR_STREAM = 99, 98
 ALONE = "guard off: "
 """Begins the names of kinds in which the planner alone keeps inside."""
-# Chosen: adaptation has learnt before the room becomes tight.
+# Chosen: what adaptation may learn in before the drive counts.
 LEARNING_S = 12.0
 # Chosen: at 50 Hz ten a second, enough to draw the drive.
 _POSES_EVERY = 5
