@@ -18,7 +18,7 @@ from disco_hw.adaptation.pose_quality import PoseWatch
 from disco_hw.log import records
 from drivers.types import Readings
 
-# Chosen: shorter follows a change sooner, and takes the planner's prepared tables more often.
+# Chosen: shorter follows a change sooner, and has the planner prepare its tables more often.
 PERIOD_S = 0.5
 SIGNIFICANT_STD, SIGNIFICANT_WIDTH = 0.1, 0.97
 """A belief goes into force when its mean has moved by so many standard deviations, or its width by this factor."""

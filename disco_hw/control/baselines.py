@@ -38,6 +38,7 @@ from disco_hw.tasks.line.course import SMALLEST_X_ICR_M, stable_yaw
 
 Array = NDArray[np.float64]
 
+# Chosen: after a longer pause the integral goes on as if that much had passed.
 _LONGEST_GAP_S = 0.2
 
 
@@ -171,7 +172,9 @@ class Follower:
         return no_rollouts()
 
 
+# Chosen: smaller finds a nearer place on the line, and looks at more.
 SPACING_M = 0.01
+# Chosen: where the robot may be since the last place; further, a path that crosses itself would be taken elsewhere.
 LOOK_BACK_M, LOOK_AHEAD_M = 0.3, 0.6
 
 

@@ -22,7 +22,9 @@ TerminalCost = Callable[[Tensor], Tensor]
 
 WEIGHTS_SUM_TO = 1e-4
 """By how much the weights of the points may miss a sum of one."""
+# Of a range of e^28 to far below the precision of float32.
 _BISECTIONS = 40
+# A prime: no two seeds share a step's noise within so many steps.
 _SEEDS_APART = 1_000_003
 
 

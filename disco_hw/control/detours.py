@@ -23,6 +23,7 @@ LENGTH_PER_SHIFT, SHORTEST_M = 2.2, 0.5
 """Half the length of a detour for each metre that it leads aside, and the least."""
 OTHER_SIDE_M = 0.1
 """A detour goes over to the other side of an obstacle only if that is shorter by so much."""
+# Chosen: detours are made anew only for a change that shows in them.
 _MOVED_M = 0.01
 
 

@@ -14,6 +14,7 @@ from disco_hw.control.plan import Sampler
 from disco_hw.jit import compiled_for
 from disco_hw.tasks import single
 
+# Cubic: the lowest degree whose second derivative has no jumps.
 DEGREE = 3
 
 
@@ -42,6 +43,7 @@ def spline_basis(knots: int, horizon: int) -> tuple[NDArray[np.int64], NDArray[n
 
 
 Array = NDArray[np.float64]
+# Chosen: where the search for the temperature of a first plan begins.
 FIRST_TEMPERATURE = 0.1
 
 

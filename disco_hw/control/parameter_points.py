@@ -15,8 +15,10 @@ from disco_hw.model.model import BASE_PARAMETERS, X_ICR
 from disco_hw.model.terms import effect_of
 
 Array = NDArray[np.float64]
+# Chosen: with a lighter first component the whole mixture's mean and covariance are taken.
 DOMINANT_WEIGHT = 0.9
 SCALED = ("wheel_radius_m", "axial_distance_m")
+# Rounding of equal numbers.
 SAME_RATIO = 1e-9
 
 

@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 # Any: numbers or arrays of any shape, and the same come back.
 Values: TypeAlias = Any
 
+# Step and limits of the Gym environment, gravity of the model, and weight of the cost, as said above.
 STEP_S = 0.05
 LARGEST_TORQUE_NM = 2.0
 LARGEST_SPEED_RAD_S = 8.0

@@ -20,8 +20,10 @@ from disco_hw.model import Belief, Model
 from disco_hw.model.coefficients import NO_DISTURBANCE, Disturbance
 
 Array = NDArray[np.float64]
+# Radians in a turn.
 ROTATION = 2.0 * math.pi
 USUAL_SPEED_M_S, USUAL_STEP_S, USUAL_NOISE = 0.2, 0.1, 0.1 * ROTATION
+# Chosen: longer steps of a slow robot would answer too late to what happens on the way.
 LONGEST_STEP_S = 0.25
 # Noise of a fast robot grows with this power of its speed: with less it stays beside tight circles, with more it is
 # pulled off them.
@@ -349,6 +351,7 @@ def command_history(
 Law = Callable[[PlannerState, Any, Model], tuple[float, float]]
 """State, task ([task] of robot.toml) and model to wheel speeds, left and right (rad/s); asked once a control period."""
 
+# Chosen: a plan of 0.4 s, with the same command throughout.
 CONSTANT_STEPS, _STEP_S = 4, 0.1
 
 

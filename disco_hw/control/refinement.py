@@ -28,7 +28,9 @@ from disco_hw.model.step import FreeRun, integration_series
 
 Array = NDArray[np.float64]
 
+# Chosen: longer looks further ahead, and takes more than its share of time.
 STEPS, STEP_S = 15, 0.1
+# Chosen: each takes its time of the tick; the next tick begins from what this one found.
 ITERATIONS = 2
 # A change of a wheel's rim speed costs as much as the distance that it covers in this time.
 CHANGE_S = 0.2

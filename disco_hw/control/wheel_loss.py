@@ -22,10 +22,12 @@ Wheels = tuple[float, float]
 
 CORRECTED_S, FOLLOWED_S = 0.3, 0.5
 """Time constants of the speeds and of the losses."""
+# Chosen: a limit, so that a wheel that does not turn at all is not made up for.
 LARGEST_RAD_S = 0.6
 FULL_RAD_S = 1.0
 """A command, or half a difference, of this size loses all of it, a smaller one in proportion, so that one of zero stays
 zero."""
+# Chosen: over longer gaps nothing can be said of what was expected.
 LONGEST_GAP_S = 0.2
 
 

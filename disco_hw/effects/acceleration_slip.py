@@ -7,6 +7,7 @@ import numpy as np
 from disco_hw.effects import Array, Channel, Effect, Parameter, Stage, Symptom, Value, Values
 from disco_hw.jit import cast_like, scalar_function
 
+# Chosen: a limit, so that an extreme parameter leaves a robot that still moves.
 LARGEST_SLIP = 0.6
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from disco_hw.effects import Array, Channel, Effect, Parameter, Stage, Value, Values
 from disco_hw.jit import cast_like, scalar_function
 
+# The time over which the effect's value says what is lost; chosen: a usual drive.
 REFERENCE_S = 150.0
 LARGEST_LOSS = 0.3
 """A pack is empty before its voltage has fallen further: a lithium cell from 4.2 V to 3.0 V."""

@@ -7,6 +7,7 @@ import numpy as np
 from disco_hw.effects import Array, Channel, Effect, Parameter, Stage, Symptom, Value, Values
 from disco_hw.jit import cast_like, scalar_function
 
+# Chosen: a robot at rest is not pulled, and one that begins to move is pulled without a jump.
 ONSET_M_S = 0.02
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from disco_hw.effects import Array, Channel, CommandedDrive, Effect, Parameter, Scan, Stage, Value, Values
 from disco_hw.jit import cast_like, scalar_function
 
+# Chosen: slower counts as at rest; smaller and a step of the integration may pass over it.
 REST_RAD_S = 0.02
 
 

@@ -29,9 +29,11 @@ from drivers.pose.udp import SOURCE as UDP_POSES
 
 DEVICES = MappingProxyType({driver.name: driver.example for driver in motor_drivers().values() if driver.example})
 """By name of a driver whose controller can be simulated: its lines in [link]."""
+# As docs/controllers.md asks for at least.
 _VENDORS_BAUD = 115_200
 READY_TIMEOUT_S = 180.0
 """A first start compiles the planner: more than a minute on a busy machine. A daemon that ends is noticed at once."""
+# Chosen: how late a state is noticed, an end waited for, standing told from noise, and a busy machine tried again.
 _POLL_S = 0.05
 _END_TIMEOUT_S = 10.0
 _STATIONARY_RAD_S = 0.05
@@ -172,6 +174,7 @@ def is_stationary(status: Mapping[str, Any]) -> bool:
 
 
 FAST_TASK = 'kind = "circle"\nradius_m = 3.0\nspeed_m_s = 0.45\n'
+# On the circle of FAST_TASK, facing along it: x, y (m) and a quarter turn.
 FAST_START = (3.0, 0.0, 1.5707963)
 
 

@@ -45,7 +45,9 @@ CHANGES: Mapping[str, tuple[float, float]] = MappingProxyType(
 BELIEVED_STD = np.array([0.002, 0.005, 0.005])
 """What `infer` leaves of x_icr (m), wheel radius and axial distance (by their size) after a drive of two minutes."""
 
+# Chosen: poses are fused before arming, and the robot is armed before the start.
 _ARM_S, _START_S = 1.5, 2.0
+# Chosen: above the noise of single moments, below the time that adaptation takes.
 _SMOOTH_S = 5.0
 
 
@@ -309,11 +311,13 @@ def _beliefs(recorder: MemoryRecorder, model: Geometry) -> tuple[tuple[tuple[flo
     return tuple(found), reverted
 
 
+# Chosen for the live drive: the size of the change, when it comes, and what is left out and compared after it.
 GROWTH = 0.15
 CHANGE_S = 75.0
 SETTLED_S = 20.0
 COMPARED_S = 20.0
 TASK = 'kind = "circle"\nradius_m = 0.75\nspeed_m_s = 0.2\n'
+# On the circle of TASK, facing along it: x, y (m) and a quarter turn.
 START = (0.75, 0.0, 1.5707963)
 
 

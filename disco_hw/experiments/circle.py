@@ -24,6 +24,7 @@ from disco_hw.model.model import BASE_PARAMETERS
 from disco_hw.reports import TWO_THIRDS, write_pictures
 from disco_hw.tasks.circle import CircleCost, CircleTask
 
+# Chosen: a fifth of a plan's usual step, so that the plant is finer than the model.
 SUBSTEP_S = 0.02
 
 
@@ -69,6 +70,7 @@ Command = Callable[[int, PlannerState], tuple[float, float]]
 
 POINT_ESTIMATE = {"x_icr_m": 0.12, "wheel_radius_m": 0.06, "axial_distance_m": 0.47}
 CURVES = ("prior", "posterior", "posterior mean", "point estimate", "true parameters")
+# As HISTORY_NS of the daemon's pipeline.
 MEMORY_S = 2.0
 
 

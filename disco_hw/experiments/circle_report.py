@@ -114,6 +114,7 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+# The usual, the rare and the worst; within the tolerance a circle is complete, as it ends between two samples.
 PERCENTILES = (50.0, 99.0, 99.9, 100.0)
 _COMPLETED_TOLERANCE_LAPS = 0.02
 
@@ -329,6 +330,7 @@ def _microseconds(values: tuple[float, ...]) -> str:
 
 
 _DOTS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))
+# Unicode's block of braille patterns.
 _BLANK = 0x2800
 NARROWEST = 60
 """Columns of a terminal in which a picture still leaves room for what stands beside it."""

@@ -50,6 +50,7 @@ from disco_hw.runtime.robot_setup import Setup, geometry, load_setup
 from disco_hw.tasks.circle import CircleTask, circle_task, inwards_sine
 from disco_hw.viewer import DEFAULT_PORT, LOOPBACK, TOKEN_VARIABLE, page_address, page_token
 
+# Chosen: how often the picture in the terminal is drawn.
 _POLL_S = 0.1
 _STOP_TIMEOUT_S = 10.0
 _STALL_MS = 100

@@ -44,10 +44,13 @@ Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 RunDrive = Callable[[np.random.Generator], FencedDrive]
 DRIVES = "drives.jsonl"
+# Streams of random numbers apart from those of the other kinds, which count from 0.
 ALONE_STREAM, CORRIDOR_STREAM = 99, 98
 ALONE = "guard off: "
 """Begins the names of kinds in which the planner alone keeps inside."""
+# Chosen: what adaptation may learn in before the drive counts.
 LEARNING_S = 12.0
+# Chosen: at 50 Hz ten a second, enough to draw the drive.
 _POSES_EVERY = 5
 
 

@@ -38,10 +38,12 @@ from sim.plant_parameters import PlantParameters
 Array = NDArray[np.float64]
 FOOTPRINT = Footprint(0.50, 0.40, 0.05)
 _SHIPPED = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
+# Chosen: room, speed and distance of the trials; less room, or more speed, makes them harder.
 _ALONG_M = 0.15
 _WALL_M_S = 0.3
 _BESIDE_M = (0.05, 0.15)
 _RUN_UP_M, _BEYOND_M = (1.5, 2.5), 3.0
+# Chosen: fast, and soft on the wheels, so that the stop takes its way.
 _CORRIDOR_M_S, _SOFT_RAD_S2 = 0.4, 2.0
 
 

@@ -41,6 +41,7 @@ from sim.virtual_robot import RobotInProcess
 
 RUNS = ("given", "geometry refitted", "amended")
 _COLOURS = {"given": REFERENCE, "geometry refitted": BASELINE, "amended": MAIN}
+# Chosen: for the way to the circle and for the first lap's beginning.
 _SETTLING_S = 20.0
 Progress = Callable[[str], None]
 

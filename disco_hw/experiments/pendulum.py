@@ -37,8 +37,11 @@ PARAMETERS = ("length_m", "mass_kg")
 PRIOR = Uniform(PARAMETERS, np.array([0.1, 0.1]), np.array([5.0, 5.0]))
 POSTERIOR = Gaussian(PARAMETERS, np.array([0.8918, 0.8985]), np.diag([0.0093, 0.0027]))
 TRUE = np.array([1.0, 1.0])
+# The plant's, which the paper gives; the model has another.
 PLANT_GRAVITY_M_S2 = 10.0
+# Chosen: below, a pendulum of the belief's tail has no step that could be integrated.
 SHORTEST, LIGHTEST = 0.02, 0.02
+# 2 n + 1 of the unscented transform, for two parameters.
 SIGMA_POINTS = 5
 
 PAPER_CURVES = {

@@ -42,7 +42,9 @@ from sim.effects import HiddenEffectError
 from sim.plant_parameters import PlantParameters
 from sim.virtual_robot import STEP_US, RobotInProcess
 
+# Chosen: handshake and first poses, and arming, take less.
 _READY_S, _ARMED_S = 1.5, 0.5
+# Chosen: simulated time makes a log faster than a disk takes it.
 _CLOSING_S = 60.0
 
 

@@ -20,6 +20,7 @@ from disco_hw.inference.simulate import NAMES, Simulator, Workers, draw_seeds
 
 Array = NDArray[np.float64]
 
+# What is left of a direction below this share is rounding.
 _LEAST_LEFT = 1e-4
 
 
@@ -56,7 +57,6 @@ CHECKS = (
     ScoreTest("left unlike right", Symptom.LEFT_UNLIKE_RIGHT),
     ScoreTest("turning changes", Symptom.TURNING_CHANGES),
 )
-_POSITION_CHECKS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,6 +231,7 @@ def _deviations(observed: Array, simulated: Array) -> Array:
     return np.asarray(np.where(seen, (observed - simulated.mean(axis=0)) / np.where(seen, spread, 1.0), 0.0))
 
 
+# Chosen: usual levels of a region; draws for ranks, of which more take longer.
 LEVELS = (0.5, 0.8, 0.9, 0.95)
 _DRAWS = 200
 
@@ -291,6 +292,7 @@ def effective_simulations(fitted: Fitted, observed: Array) -> float:
 
 
 PARAMETER_NAMES = ("x_icr", "the wheel radius", "the axial distance")
+# Chosen: what counts as wide, involved, straight, little and steady where a report says what a log leaves open.
 WIDE = 0.2
 _SHARE = 0.45
 _STRAIGHT = 0.08

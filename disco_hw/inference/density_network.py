@@ -22,7 +22,10 @@ from disco_hw.inference.simulate import LocalWorkers, Seeds, Workers, draw_seeds
 
 Array = NDArray[np.float64]
 
+# Chosen: a statistic further out says no more than that it is out.
 _LARGEST_FEATURE = 8.0
+# Chosen, as usual for networks of this size: batch, held-out share, ridge of the linear start, and the clip of a
+# gradient.
 _BATCH = 256
 _VALIDATION_SHARE = 0.15
 _RIDGE = 1e-3
@@ -275,6 +278,7 @@ Report = Callable[[str], None]
 SCOUT = NetworkSettings(members=2, epochs=60, patience=8)
 FULL = NetworkSettings()
 
+# Chosen: of a posterior, to shrink the region around; and how often draws outside the region are drawn again.
 _DRAWS = 4000
 _LARGEST_REJECTION = 30
 
@@ -389,6 +393,7 @@ def run_rounds(
 
 Mask = NDArray[np.bool_]
 
+# Chosen: a region of which less lies in the prior is not worth the time.
 _LARGEST_TRIES = 400
 # Of the box: keeps a region open where all draws press against an edge.
 _SMALLEST_DEVIATION = 1e-5

@@ -16,6 +16,7 @@ from disco_hw.jit import parallel_kernel
 Array = NDArray[np.float64]
 
 STATISTICS = ("r", "kappa", "a", "x_icr")
+# Against a division by 0; and no robot's axle is longer.
 _SMALLEST = 1e-3
 _LARGEST_AXIAL_M = 3.0
 # Standard deviations of a vague prior on (r, x_icr, kappa), which keeps estimates finite where nothing moves.

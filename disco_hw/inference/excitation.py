@@ -25,6 +25,7 @@ MOVING_RAD_S = 0.05
 """Wheels slower than this count as standing, so that what their encoders jitter is no motion."""
 MOVING_SPREAD_STEPS = 5
 """A body counts as moving for so many steps before and after its wheels turn: it may lag behind them."""
+# Chosen: of fewer, neither noise nor geometry can be told.
 FEWEST_POSES = 50
 
 # Longer gaps between wheel samples (s), or between poses (in median periods), leave the motion in between unknown.

@@ -53,6 +53,7 @@ from disco_hw.model import Gaussian, Mixture, Model
 
 Array = NDArray[np.float64]
 
+# Chosen: more are more exact and take longer, in proportion; the paper's number where it gives one.
 POSTERIOR_DRAWS = 4000
 PREDICTIVE_SIMULATIONS = 120
 WIDENING_SIMULATIONS = 400
@@ -60,6 +61,7 @@ CALIBRATION_SIMULATIONS = 300
 DEFAULT_SIMULATIONS = 3000
 PAPER_SIMULATIONS = 1000
 _FEWEST_SIMULATIONS = 200
+# Chosen: each pass takes the noise from a better geometry, and takes as long.
 _NOISE_PASSES = 3
 # Further outside the prior than this is excluded by it; nearer, the posterior is pressed against the edge, and says so.
 _EXCLUDED_DEVIATIONS = 8.0
@@ -247,6 +249,7 @@ def noise_of(drive: Excitation) -> Noise:
     return noise
 
 
+# Chosen: the spread of so many is known to a tenth.
 _REPEATS = 48
 # What vanishes in a simulation counts as a third, what explodes as three times.
 _LARGEST_RATIO = 3.0
@@ -289,8 +292,10 @@ def noise_spread(simulator: Simulator, theta: Array, seed: int, repeats: int = _
 
 Component = tuple[float, Array, Array]
 
+# Chosen: draws of each component, of which fewer inside say nothing of its shape.
 _DRAWS = 4000
 _FEWEST_INSIDE = 20
+# Chosen: lighter components are left out, and nearly equal ones merged, as each costs the planner points.
 _LEAST_WEIGHT = 1e-4
 _MERGE_COST = 0.1
 _MOST_COMPONENTS = 4

@@ -16,6 +16,7 @@ from disco_hw.inference.excitation import MOVING_SPREAD_STEPS, Excitation
 
 Array = NDArray[np.float64]
 
+# Chosen: grids that are searched; finer ones take longer.
 _LAGS_S = (0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.0)
 _CORRELATIONS_S = (1e-3, 0.03, 0.06, 0.1, 0.15, 0.2, 0.3, 0.4, 0.55, 0.75)
 _SPEED_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -278,6 +279,7 @@ def _errors(drive: Excitation, theta: Array) -> Array:
     return np.concatenate(parts)
 
 
+# Chosen: long enough for motion to show beside the sensor's noise.
 _EXPLAINED_OVER_S = 1.0
 _LEAST_MOTION = np.array([0.02, 0.02, 0.05])
 

@@ -32,6 +32,7 @@ Seeds = NDArray[np.uint32]
 Summary = Callable[[Array], Array]
 
 NAMES = ("x_icr_m", "wheel_radius_m", "axial_distance_m")
+# Chosen: larger shares the work less evenly, smaller hands over more often.
 _CHUNK = 32
 
 
@@ -238,6 +239,7 @@ class Tally:
         self._report_progress(self._stage, min(self._done / self._total, 1.0))
 
 
+# Chosen: longer than a scheduler of the local network takes to answer.
 _CONNECT_TIMEOUT_S = 5.0
 
 

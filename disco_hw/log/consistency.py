@@ -44,7 +44,7 @@ from disco_hw.log.motion_fits import (
 _STILL = 0.02
 # Below the last digit of any log: a value that was repeated, not measured.
 _EXACTLY = 1e-9
-# Chosen: fewer repeats are a sensor slower than the log.
+# Chosen: a smaller share may be single repeats.
 _STANDING_SHARE = 0.05
 # Chosen: fewer are slip, starts and stops.
 _DEAD_SHARE = 0.2

@@ -118,7 +118,7 @@ USUAL_RADIUS = (0.7, 1.4)
 USUAL_TURN = (0.3, 1.4)
 # Chosen: two seconds of overlapping windows; fewer decide nothing.
 FEWEST_WINDOWS = 8
-# Chosen: iteratively reweighted least squares changes little afterwards.
+# Chosen: passes of iteratively reweighted least squares; more take longer.
 _PASSES = 4
 # Chosen: shares of the residuals that count in full, and that count at all: outliers are at most a tenth.
 _TRUSTED = 0.8

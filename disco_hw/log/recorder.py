@@ -36,9 +36,9 @@ from disco_hw.log.writer_link import Delivery, KeeperLink, WriterLine
 
 # Chosen: catches up after a pause of the writer, without holding up the tick.
 _SENT_PER_TICK = 16
-# Chosen: a second at 50 Hz, above what answers of a healthy writer lag behind.
+# Chosen: a second at 50 Hz without a look at the writer's answers.
 _UNREAD_TICKS = 50
-# Chosen: above a slow disk's pauses, which are no fault; then the operator is told.
+# Chosen: shorter would report pauses of a slow disk; then the operator is told.
 _SILENCE_S = 0.7
 # Chosen: a writer that is silent for longer is ended and replaced.
 _PATIENCE_S = 2.0

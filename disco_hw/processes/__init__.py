@@ -119,10 +119,10 @@ _CAP_SYS_NICE = 23
 _OTHER_THREADS_BELOW = 10
 # proc(5): `steal` in the first line of /proc/stat.
 _STOLEN_COLUMN = 8
-# malloc.h of glibc; above its sizeof(pthread_attr_t) on any processor.
+# malloc.h of glibc; room for its pthread_attr_t, of 56 bytes on x86-64 and 64 on AArch64.
 _M_ARENA_MAX = -8
 _PTHREAD_ATTRIBUTES_BYTES = 64
-# Chosen: locked memory takes each thread's stack whole, and none needs more.
+# Chosen: where memory is locked, each thread's stack counts whole.
 _STACK_BYTES = 1 << 20
 # The loop compiles nothing: of its 150 MB it needs none.
 _COMPILER = "libllvmlite"

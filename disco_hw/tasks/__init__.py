@@ -49,7 +49,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Point = tuple[float, float]
-# Chosen: slower is inside the dead band of most robots.
+# Chosen: slower could hardly be told from a robot that stands.
 SLOWEST_M_S = 0.01
 CENTER_M = (-1000.0, 1000.0)
 """The slowest speed, and the least and largest coordinate of a centre, that a person may change a task to."""

@@ -15,10 +15,14 @@ from contextlib import contextmanager
 from pathlib import Path
 
 LOOPBACK = "127.0.0.1"
+# Chosen: the usual port of a web server that needs no rights.
 DEFAULT_PORT = 8080
 TOKEN_VARIABLE = "DISCO_HW_PAGE_TOKEN"
+# Chosen: of a token that somebody makes; shorter ones can be guessed.
 _SHORTEST = 16
+# Chosen: longer than the page's process takes to end; then it is killed.
 _END_TIMEOUT_S = 3.0
+# Chosen: a page that cannot start must not take the processor.
 _RESTART_PAUSE_S = 1.0
 
 

@@ -19,9 +19,12 @@ from disco_hw.files.descriptors import free_descriptors
 
 REQUEST_TIMEOUT_S = 3.0
 """How long a connection may take for its request and the opening of a WebSocket."""
+# Chosen: connections without a token, as a part of the free descriptors: a browser opens a few, and a flood must leave
+# the others.
 _MOST_UNPROVEN = 64
 _LEAST_UNPROVEN = 8
 _FREE_PER_UNPROVEN = 4
+# Chosen: a flood must not fill the console, nor take the processor from the page.
 _REPEAT_S = 1.0
 _FLOOD_S = 1.0
 _FLOOD_PAUSE_S = 0.002

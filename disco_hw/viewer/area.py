@@ -17,6 +17,7 @@ from disco_hw.log import records
 from disco_hw.runtime.safe_area import fence_of_record
 
 Array = NDArray[np.float64]
+# x, y and radius.
 _NUMBERS_OF_CIRCLE = 3
 
 

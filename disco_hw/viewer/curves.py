@@ -18,11 +18,14 @@ from disco_hw.viewer.recording import ShownRobot, model_in_force
 from disco_hw.viewer.timeline import COMMAND, ESTIMATE, INNOVATION, PLANNER, WHEELS, Series, Timeline
 
 Array = NDArray[np.float64]
+# Chosen: about the pixels of a plot's width; more would only be sent.
 POINTS = 400
 NORMAL_99 = 2.5758293035489004
 """Two-sided 99 % bound of a standard normal."""
 
+# Chosen: longer hides what single ticks do.
 WINDOW_NS = 20_000_000_000
+# Pixels, chosen: several plots fit beside the scene.
 _HEIGHT = 170
 _BLUE, _ORANGE, _GREY = "#0072b2", "#d55e00", "#777777"
 _DASHES = [6, 4]

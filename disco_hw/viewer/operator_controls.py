@@ -26,13 +26,18 @@ from disco_hw.files.descriptors import DescriptorReserve
 from disco_hw.runtime import advice, is_estop, next_step, status_headline
 
 REQUESTS = ("arm", "start", "stop", "disarm", "reset", "task")
+# Chosen: the buttons follow the robot's state within it.
 STATUS_S = 0.25
+# Chosen: the daemon answers within a tick; an operator must see soon that it does not.
 _STATUS_TIMEOUT_S = 0.5
 _REQUEST_TIMEOUT_S = 1.0
 _ESTOP_TIMEOUT_S = 0.5
 _DRIVE_TIMEOUT_S = 0.5
+# Chosen: for the connections of an e-stop when a flood has taken all others.
 _RESERVED_DESCRIPTORS = 16
+# Above any message of the page.
 _MOST_BYTES = 4096
+# Chosen: further than any task; the daemon judges what is nearer.
 _MOST_M = 1e6
 
 _OPEN = {"do": "drive", "forward": 0, "left": 0, "held": False, "stamp": "0"}

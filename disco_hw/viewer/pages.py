@@ -30,9 +30,13 @@ from disco_hw.viewer.scene import DARK, Scene
 from disco_hw.viewer.timeline import KINDS, Excited, Items, Mark, Timeline, marks_of
 from disco_hw.viewer.views import ScrubBar, TaskEditor, Views, add_layers
 
+# Chosen: how late an end is noticed.
 WAIT_S = 0.05
+# Chosen: for what changes slowly; the robot itself moves with each batch.
 LIVE_REDRAW_S = 0.5
+# Chosen: longer takes more memory of a page that stays open; a log holds all.
 KEEP_S = 300.0
+# Chosen: a record that is younger is believed before the daemon's status.
 _STATUS_OLDER_NS = 2_000_000_000
 
 
@@ -202,8 +206,11 @@ def _set(element: viser.GuiMarkdownHandle, text: str) -> None:
 
 
 SPEEDS = {"1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0, "4": 4.0, "8": 8.0}
+# Chosen: 20 pictures a second.
 STEP_S = 0.05
+# Chosen: for what costs more to draw than to look at.
 REPLAY_REDRAW_S = 0.4
+# Chosen: more could not be told apart on the slider, or be found in the list.
 _SLIDER_MARKS = 40
 _LISTED_MARKS = 200
 _NO_MARK = "go to ..."

@@ -26,9 +26,12 @@ from disco_hw.viewer.server import serving
 from disco_hw.viewer.timeline import Timeline
 
 Array = NDArray[np.float64]
+# Chosen: smooth enough for a robot, and small as a file.
 FRAMES_PER_S = 10
+# Chosen: a picture is looked at closely, a clip must be small.
 _PICTURE_DPI = 110
 _CLIP_DPI = 70
+# Chosen: a longer clip takes minutes to draw; a higher speed makes it shorter.
 _LONGEST_S = 600.0
 # All pictures of these formats are held until the last one is drawn, about 1 MB each.
 _LONGEST_IN_MEMORY_S = 60.0
@@ -183,8 +186,11 @@ def _web(colour: tuple[int, int, int]) -> str:
     return "#{:02x}{:02x}{:02x}".format(*colour)
 
 
+# Chosen: as above, for the page that is written to a file.
 PICTURES_PER_S = 10
+# Chosen: what costs more to draw, twice a second.
 _REDRAW_PICTURES = 5
+# Ten minutes of them: of a longer log fewer a second, as a browser holds them all.
 _MOST_PICTURES = 6000
 
 

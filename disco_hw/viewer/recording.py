@@ -29,11 +29,15 @@ from drivers.types import MotorSample, RobotLinkHealth, RobotStatus
 
 Array = NDArray[np.float64]
 
+# Chosen: an older plan, rollout or pose says nothing of now; rollouts come once a second, with some delay.
 PLAN_AGE_NS = 500_000_000
 FAN_AGE_NS = 1_100_000_000
 POSES_NS = 3_000_000_000
+# Chosen: more would slow the browser down.
 TRAIL_POINTS = 1500
+# Chosen: more would cover one another.
 _POSES = 100
+# Chosen: lines of the list on the page.
 _EVENTS = 8
 
 

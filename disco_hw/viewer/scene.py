@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 Point = tuple[float, float, float]
 
+# Chosen: red, green and blue, apart from one another on the light and the dark ground.
 TASK_COLOUR = (40, 110, 230)
 BODY_COLOUR = (200, 60, 160)
 WHEEL_COLOUR = (45, 45, 50)

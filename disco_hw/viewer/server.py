@@ -44,6 +44,7 @@ _LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost"})
 _COOKIE = "disco-hw-token"
 _DESK_PATH = "/desk"
 _INSTANCE_PATH = "/instance"
+# Chosen: a flood waits in the kernel's queue, and the operator's browser behind it, rather than be refused.
 _WAITING_CONNECTIONS = 256
 Respond = Callable[[Any, Request], Response | None]
 Handler = Callable[[Any], Awaitable[None]]

@@ -18,6 +18,7 @@ from drivers.types import PoseSample, PowerSample, RobotLinkHealth, RobotStatus,
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 Item = TypeVar("Item")
+# Chosen: room to begin with, which grows twofold.
 _FIRST_ROWS = 256
 
 
@@ -224,6 +225,7 @@ FAULT, EVENT, OVERRUN, REJECTED_FRAMES, GATED = "fault", "event", "overrun", "re
 ADAPTED = "adaptation"
 KINDS = (FAULT, ADAPTED, EVENT, OVERRUN, REJECTED_FRAMES, GATED)
 _INFORMATIVE = frozenset({"refused", "reverted", "lost", "taken_over"})
+# Chosen: marks that are nearer are of one cause.
 _APART_NS = 500_000_000
 
 
@@ -294,6 +296,7 @@ def _spaced(marks: list[Mark]) -> list[Mark]:
     return kept
 
 
+# Chosen: steps in which a replay can say what had been driven.
 _STEP_NS = 500_000_000
 ExcitationRows = Sequence[Mapping[str, Any]]
 

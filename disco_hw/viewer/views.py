@@ -14,10 +14,13 @@ from disco_hw.runtime.robot_setup import with_values
 from disco_hw.tasks import RobotTask
 from disco_hw.viewer.scene import DARK, LAYER_COLOURS, LAYERS, LIGHT, Point, Scene, first_camera, segments
 
+# Chosen: as of what may be driven.
 DRAFT_COLOUR = (0, 150, 60)
+# Chosen: above the task's line, so that both are seen.
 _DRAFT_M = 0.015
 FREE, TOP, FOLLOW = "free", "top", "follow"
 VIEWS = (FREE, TOP, FOLLOW)
+# Of the bar in the page.
 _BAR_HEIGHT_PX, _MARGIN_PX = 96.0, 12.0
 # Looking straight down, no direction would be up on the screen.
 _SOUTH_M = 0.01

@@ -22,6 +22,7 @@ from disco_hw.tasks import constant, norm_and_inverse
 
 COLUMNS = 8
 """Of a shape: begin x, y, direction x, y, length, radius, velocity x, y (m, m/s), relative to the task's origin."""
+# Chosen: the nearest ones; each takes time of every rollout.
 MOST_SHAPES = 12
 TOUCH_COST, TOUCH_COST_PER_M = 80.0, 800.0
 """What each look costs at which the footprint touches a shape, and each metre of overlap then."""

@@ -17,6 +17,7 @@ from disco_hw.jit import block_function, kernel_function, scalar_function
 from disco_hw.model.coefficients import MOVES_RAD_S, Base, Coefficients, Integration, base_point, effect_point
 from disco_hw.model.step import axle_of, delay_steps, in_force, integration_from, step, tracked_of
 
+# Left and right, as of `disco_hw.control.kernel`.
 CHANNELS = 2
 # Residuals of one step: the distance to the reference along x and y. At the end comes one of the last heading.
 RESIDUALS = 2

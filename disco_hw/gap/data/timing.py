@@ -22,6 +22,7 @@ from disco_hw.log.drive import Poses, Wheels
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+# Chosen: each round reweights the outliers anew, and takes as long.
 _ROUNDS = 4
 # Finer than any pose is measured; keeps a log without any noise finite.
 _LEAST_SQUARE = 1e-10

@@ -20,7 +20,9 @@ from disco_hw.jit import kernel_function, scalar_function
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+# Position and heading, slip, and the correlated noise of the poses: three of each.
 STATES = 9
+# Chosen: far above the noise of a pose, so that the first one decides.
 _START_M = 0.3
 _START_RAD = 0.3
 

@@ -20,6 +20,7 @@ from disco_hw.jit import kernel_function, scalar_function
 
 Array = NDArray[np.float64]
 
+# Chosen: 0.2 rad, far above the noise of an encoder, so that the first count decides.
 _START_VARIANCE = 0.04
 
 

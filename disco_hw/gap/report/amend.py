@@ -173,6 +173,7 @@ def amended_model(
     return replace(bare, belief=belief), tuple(notes)
 
 
+# Chosen: a shorter delay or lag is none that a controller could feel.
 _LEAST_TIME_S = 1e-3
 
 

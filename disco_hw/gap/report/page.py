@@ -32,6 +32,7 @@ def sentence(effect: EffectFinding, settings: ReportSettings = DEFAULT_SETTINGS.
     return "; ".join((described.describe(values), *also))
 
 
+# Chosen: more is a table, not a sentence.
 _MOST_NAMES = 3
 
 

@@ -19,6 +19,7 @@ Mask = NDArray[np.bool_]
 
 WIDTHS_BITS = (8, 10, 12, 14, 16, 20, 24, 32)
 """Widths of counters and of absolute encoders that are in use."""
+# Chosen: longer finds more neighbours, which a change of speed makes less alike.
 _WINDOW_S = 0.25
 _NEIGHBOURS = 5
 """The motion expected of a step is that of the neighbours within this time, and of so many at least."""

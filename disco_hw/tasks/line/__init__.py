@@ -17,7 +17,7 @@ from disco_hw.files import WAY_POINTS, read_lines
 from disco_hw.tasks import Array, Point
 from drivers.samples import FARTHEST_M
 
-# Chosen: smaller follows corners more closely, and makes the table, which must stay in a cache, longer.
+# Chosen: smaller follows corners more closely, and makes the table longer.
 SPACING_M = 0.02
 # Entries closer than this part of the spacing lie on either side of a turn straight back.
 FOLDED = 0.01
