@@ -158,7 +158,7 @@ class _Wheel:
         most = max(each.fastest for each in commands)
         progress = self.direction * turned_rad
         widened = min(each.widened for each in commands)
-        self._learn(dt_s, turned_rad, 0.5 * (least + max(abs(low), abs(high))), abs(newest), widened)
+        self._learn(dt_s, turned_rad, least, max(abs(low), abs(high)), abs(newest), widened)
         expected = max(least - max(self.loss_rad_s, -widened), 0.0) * dt_s
         self.beyond_rad = max(self.beyond_rad + abs(turned_rad) - (FASTER_PART * most + FASTER_RAD_S) * dt_s, 0.0)
         # Without a command that must be in force by now a wheel may turn either way.
@@ -175,21 +175,25 @@ class _Wheel:
             self.counted_rad += progress
 
     def _learn(
-        self, dt_s: float, turned_rad: float, commanded_rad_s: float, newest_rad_s: float, widened_rad_s: float
-    ) -> None:
+        self, dt_s: float, turned_rad: float, least_rad_s: float, most_rad_s: float, newest_rad_s: float,
+        widened_rad_s: float,
+    ) -> None:  # fmt: skip
         """Learn what it loses of its commands while it turns by them; a wheel that came to rest may stick again.
 
+        While commands change, a wheel that lags behind them seems to lose less, or more, than it does. So it loses less
+        than was known only if that holds by the largest command that may be in force, and more only by the least.
         The loss is negative, by `widened_rad_s` at most, where the base does not turn more than it is asked to.
         """
         if dt_s > 0.0:
             self.speed_rad_s += (turned_rad / dt_s - self.speed_rad_s) * -math.expm1(-dt_s / _FILTER_S)
-        speed = self.direction * self.speed_rad_s
+        speed, commanded_rad_s = self.direction * self.speed_rad_s, 0.5 * (least_rad_s + most_rad_s)
         if newest_rad_s < RESTS_RAD_S and abs(speed) < RESTS_RAD_S:
             self.loss_rad_s = UNKNOWN_LOSS_RAD_S
         elif speed > EXPECTED_PART * max(commanded_rad_s - self.loss_rad_s, 0.1 * commanded_rad_s):
-            loses = max(commanded_rad_s - speed, -widened_rad_s)
-            time_s = _LOSES_LESS_S if loses < self.loss_rad_s else _LOSES_MORE_S
-            self.loss_rad_s += (loses - self.loss_rad_s) * -math.expm1(-dt_s / time_s)
+            known = self.loss_rad_s
+            loses = max(min(max(known, least_rad_s - speed), most_rad_s - speed), -widened_rad_s)
+            time_s = _LOSES_LESS_S if loses < known else _LOSES_MORE_S
+            self.loss_rad_s += (loses - known) * -math.expm1(-dt_s / time_s)
 
     @property
     def has_followed(self) -> bool:

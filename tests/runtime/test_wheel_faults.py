@@ -146,6 +146,24 @@ def test_a_robot_that_obeys_as_well_as_it_can_is_left_alone(robot, speed):
     assert robot.drive(15.0, around(speed)) is None
 
 
+@pytest.mark.parametrize("lag_s", [0.05, 0.1, 0.2])
+@pytest.mark.parametrize("dead_rad_s", [0.4, 0.8])
+def test_a_dead_band_is_known_as_well_after_a_stop_as_before(dead_rad_s, lag_s):
+    def turns_stops_and_curves(t_s):
+        if t_s < 5.4:
+            turn = max(min(4.8, 20.0 * t_s, 20.0 * (5.0 - t_s)), 0.0)
+            return turn, -turn
+        part = min((t_s - 5.4) / 0.15, 1.0)
+        return 1.02 * part, 2.82 * part
+
+    robot = Robot(lag_s=lag_s, dead_rad_s=dead_rad_s)
+    assert robot.drive(12.0, turns_stops_and_curves) is None
+    assert robot.faults.not_following == 0
+    # And a wheel that ceases to turn then is found.
+    found = robot.drive(3.0, (1.6, 2.82), turns=lambda wanted: 0.0)
+    assert found is not None
+
+
 def swinging(time_s):
     return 3.0 * math.sin(2.5 * time_s), 4.0 * math.sin(1.7 * time_s)
 
