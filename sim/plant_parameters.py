@@ -15,7 +15,7 @@ LARGEST_DRAWN = (1.0, 1.0, 2.0)
 # Chosen: a Gaussian with less than about one draw in so many inside lies outside.
 MAX_DRAWS = 10_000
 
-_MAY_BE_ZERO_OR_LESS = frozenset({"x_icr_m", "ambient_temperature_c"})
+_MAY_BE_NEGATIVE = frozenset({"x_icr_m", "ambient_temperature_c"})
 _MUST_BE_POSITIVE = frozenset(
     {
         "wheel_radius_m",
@@ -156,7 +156,7 @@ class PlantParameters:
     def _check(self, name: str, value: float) -> None:
         if math.isinf(value) and value > 0.0 and name in _MAY_BE_INFINITE:
             return
-        low = -math.inf if name in _MAY_BE_ZERO_OR_LESS or name.startswith("encoder_start") else 0.0
+        low = -math.inf if name in _MAY_BE_NEGATIVE or name.startswith("encoder_start") else 0.0
         high = 1.0 if name in _PROBABILITIES else math.inf
         if not math.isfinite(value) or not low <= value <= high or (value == 0.0 and name in _MUST_BE_POSITIVE):
             raise ValueError(f"PlantParameters.{name} = {value:g} is impossible")

@@ -187,6 +187,7 @@ class Bridge:
         self._obstacle_link.close()
 
     def _create_readers(self, namespace: str) -> Iterator[tuple[DataReader[Any], _Handler]]:
+        """Yield each reader of a topic with the method that handles its messages."""
         # One for each type that a topic may have: only the one that the sender has is ever matched.
         if self._pose is not None and self._pose.topic == ros2_inlets.TRANSFORMS:
             yield self._reader(out.TF, msg.TFMessage, _TRANSFORMS, namespace), self._handle_transforms
@@ -304,6 +305,7 @@ class Bridge:
         return False
 
     def _diagnosis(self, mono_ns: int, wall_ns: int) -> out.Message:
+        """Return the topic and the message of the bridge's diagnostics."""
         figures = {"poses passed on": self._poses.passed, "poses not taken by the daemon": self._unsent}
         figures |= {
             f"poses refused: {why}": count for why, count in (self._poses.refused + self._transforms.refused).items()
@@ -332,7 +334,7 @@ class Bridge:
 
 
 def _publisher_of(message: Any) -> str | None:
-    """Return the writer of a message that came over DDS; None for one of our own."""
+    """Return text that identifies the DDS writer of a message; None for a message made here."""
     info = getattr(message, "sample_info", None)
     return None if info is None else f"publisher {info.publication_handle:x}"
 
@@ -347,7 +349,10 @@ def _domain(config: RobotConfig) -> int:
 
 
 def join_domain(config: RobotConfig) -> tuple[Domain | None, DomainParticipant]:
-    """Join the ROS 2 domain; beyond this computer as $CYCLONEDDS_URI says, or by multicast."""
+    """Join the ROS 2 domain; return the domain, None unless it is for this computer only, and the participant.
+
+    Beyond this computer others are found as $CYCLONEDDS_URI says, or by multicast. Raises WorkError.
+    """
     number = _domain(config)
     try:
         domain = Domain(number, LOOPBACK) if config.ros2.localhost_only else None

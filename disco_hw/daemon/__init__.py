@@ -118,6 +118,7 @@ def peer_uid(connection: socket.socket) -> int:
 
 
 def _names(uid: int) -> Iterator[Path]:
+    """Yield the directories in /tmp that may hold this user's socket, in order of preference, without an end."""
     yield _TEMPORARY / f"disco-hw-{uid}"
     for number in count(2):
         yield _TEMPORARY / f"disco-hw-{uid}-{number}"
@@ -227,7 +228,10 @@ def _path_of(name: str, configured: str | None) -> Path:
 
 
 def ask(robot: Path, action: str, changes: Sequence[str] = (), unrecorded: bool = False) -> dict[str, Any]:
-    """Send one request to the daemon of `robot`; `changes`, as "radius_m=0.8", are for `task` alone.
+    """Send one request to the daemon of `robot`, and return its reply.
+
+    `changes`: the request's further words, such as "radius_m=0.8"; `task`, `obstacle` and `fence` need them, and no
+    other request takes any.
 
     `unrecorded`, for `arm` alone: arm even though nothing is recorded that should be.
 
@@ -346,7 +350,7 @@ def _describe_fence(area: Mapping[str, Any] | None) -> Iterator[str]:
 
 
 def describe_controller(controller: Mapping[str, Any] | None) -> tuple[str, ...]:
-    """Return which controller a status describes, and its limits by who states them; nothing before it is known."""
+    """Return a line on the motor controller and one on its limits, by who states them; empty before it is known."""
     if controller is None:
         return ()
     by_source: dict[SaidBy, list[str]] = {}

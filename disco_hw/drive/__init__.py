@@ -207,7 +207,7 @@ class PageSource:
         return self._status_text
 
     def steer(self, now_ns: int, page: int, steering: Steering) -> str | None:
-        """Take in what one page wants; returns why it does not count, in words."""
+        """Take in what one page wants; return why it is refused, in words, or None if it is accepted."""
         if not steering.held:
             self._handle_open(now_ns, page)
             return None
@@ -224,7 +224,7 @@ class PageSource:
         return None
 
     def poll(self, now_ns: int, _robot: RobotView) -> ManualInput | None:
-        """Return the newest input of the page that holds; open while no page does."""
+        """Return the newest input of the page that holds its pad; zero speeds with the deadman released without one."""
         newest = self._newest
         if newest is not None and now_ns - newest.t_ns <= self._limit_ns:
             return newest
@@ -239,6 +239,7 @@ class PageSource:
         """Do nothing, because the source holds no resources."""
 
     def _handle_open(self, now_ns: int, page: int) -> None:
+        """Note that a page has reported its pad released, and end its hold if it had one."""
         self._open_ns = {one: at for one, at in self._open_ns.items() if now_ns - at <= self._limit_ns}
         self._open_ns[page] = now_ns
         if self._holder == page:

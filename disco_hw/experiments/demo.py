@@ -335,21 +335,21 @@ class _Floor:
         return Text("\n".join(picture(layers, low, high, _PICTURE_ROWS)))
 
 
-def _why_stopped(operator: Operator, status: Mapping[str, Any], elapsed_ms: int) -> WorkError:
-    """Return what to raise for a drive that ended before its laps; `elapsed_ms`: CPU time lost to the host just before.
+def _why_stopped(operator: Operator, status: Mapping[str, Any], stolen_ms: int) -> WorkError:
+    """Return what to raise for a drive that ended before its laps; `stolen_ms`: CPU time lost to the host just before.
 
     What the host takes bit by bit over a whole drive excuses nothing, hence only the last half second.
     """
     detail = f"the daemon left ARMED for {status['state']}: {status['detail']}"
     # After a long stall the wheels may already stand at the first status: READY in place of STOPPING.
-    if status["state"] not in ("STOPPING", "READY") or elapsed_ms < _STALL_MS:
+    if status["state"] not in ("STOPPING", "READY") or stolen_ms < _STALL_MS:
         return WorkError(detail)
     # The daemon may notice a stall before the robot has reported its own stop.
     after = operator.wait_until("stopped", lambda status: bool(status["state"] != "STOPPING"), 5.0)
     if after["stop_cause"] not in _WATCHDOG:
         return WorkError(detail)
     return _HostStallError(
-        f"{detail}\nthe host of this virtual machine took {elapsed_ms} ms of its processors just before"
+        f"{detail}\nthe host of this virtual machine took {stolen_ms} ms of its processors just before"
     )
 
 

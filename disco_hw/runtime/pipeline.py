@@ -99,7 +99,10 @@ class Governor:
         self._right_rad_s = 0.0
 
     def step(self, desired_left_rad_s: float, desired_right_rad_s: float, dt_s: float) -> Governed:
-        """Return the command nearest to the desired one that the limits allow `dt_s` after the last one.
+        """Return the wheel speeds that the limits allow `dt_s` after the last command.
+
+        The desired speeds are scaled to the speed limit by a common factor. The result is the point on the line from
+        the last command to them that is as far as both wheels' accelerations allow.
 
         A desired command that is not finite counts as standstill. A `dt_s` that is negative or not a
         number counts as none, one beyond 1.5 nominal periods as 1.5 periods.
@@ -169,7 +172,10 @@ class Planner(Protocol):
         """Plan under this belief from the next plan on; raises ValueError, and keeps the old one, if it cannot."""
 
     def sampled_rollouts(self, count: int) -> Rollouts:
-        """Return the weightiest sequences of the last plan; changes nothing."""
+        """Return wheel speeds, trajectories (n, T + 1, 3) and weights of the last plan's sequences of largest weight.
+
+        At most `count` of them; no plan is changed.
+        """
 
 
 @runtime_checkable
@@ -177,7 +183,10 @@ class AvoidsBoundaries(Protocol):
     """A planner that keeps away from fence and obstacles by itself."""
 
     def look_around(self, bounds: Boundaries, deviation_m: float) -> None:
-        """Keep away from these boundaries from the next plan on; `deviation_m`: of the footprint's place."""
+        """Keep away from these boundaries from the next plan on.
+
+        `deviation_m`: standard deviation of the footprint's corner whose position is known least.
+        """
 
     def set_line(self, line_m: NDArray[np.float64]) -> None:
         """Drive around what stands on this line, points (N, 2)."""
@@ -236,13 +245,21 @@ class Source(enum.Enum):
     """Sources of the wheel speeds that are requested in a tick."""
 
     OFF = "off"
+    """Motion is off: nothing is sent to the wheels."""
     HOLD = "hold"
+    """Standstill is requested: zero speeds, to be reached within the limits and held."""
     PLAN = "plan"
+    """This tick's new plan."""
     TAIL = "tail"
+    """An older plan that is still in force, because this tick made none."""
     FALLBACK = "fallback"
+    """This tick's new plan, whose outcome is FALLBACK: a classical follower made it."""
     RAMP = "ramp"
+    """Zero speeds, because no plan is in force or its tail is over."""
     MANUAL = "manual"
+    """Wheel speeds of an operator or a script."""
     SILENT = "silent"
+    """No frame is sent at all."""
 
 
 Motion = Off | StandstillTracker | FollowTask | Manual | Silent
@@ -403,7 +420,7 @@ class Pipeline:
     def _guarded(
         self, estimate: PoseEstimate, source: Source, requested: tuple[float, float], overridden: bool
     ) -> tuple[FenceState, tuple[float, float]]:
-        """Return the fence guard's verdict on the requested wheel speeds, and the part of them that it lets through."""
+        """Return the fence guard's verdict on the requested wheel speeds, and the speeds (rad/s) that it allows."""
         if self._guard is None or not self._guard.is_active or source in {Source.OFF, Source.SILENT}:
             return IDLE, requested
         last = (self._sent[-1].left_rad_s, self._sent[-1].right_rad_s) if self._sent else (0.0, 0.0)

@@ -85,7 +85,7 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return speed_range(robot)
 
     def editing_note(self, robot: Chassis) -> str:
-        """Return a sentence with the largest speed on this path."""
+        """Return a sentence with the largest speed straight ahead of the robot's wheels, whatever the path."""
         return f"At most {self.fastest_m_s(robot):.3f} m/s."
 
     def describe(self) -> str:
@@ -93,7 +93,7 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return f"path {self.path} of {self.course().length_m:.2f} m at {self.speed_m_s:g} m/s"
 
     def course(self) -> LineCourse:
-        """Return the line through the way-points."""
+        """Return the `LineCourse` through the way-points."""
         return line_course(self.points, "path")
 
     def progress(self) -> PathProgress:
@@ -101,7 +101,7 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return PathProgress(PathTable(np.array(self.points)))
 
     def planned(self, _mode: str) -> PathCost:
-        """Return the path with its cost, the same in every mode."""
+        """Return the cost of following the path, for the planner; the same in every mode."""
         return PathCost(PathTable(np.array(self.points)), self.speed_m_s)
 
 

@@ -1,4 +1,4 @@
-"""Packet serial of RoboClaw boards: the bytes of a command and of its reply. Big-endian. Big-endian.
+"""Packet serial of RoboClaw boards: the bytes of a command and of its reply. Big-endian.
 
 A command that sets something: address, command, arguments, CRC-16/XMODEM of all before; the reply is one byte, 0xFF,
 or nothing. A command that asks: address and command alone; the reply is data and the CRC of address, command and data.

@@ -180,7 +180,7 @@ class Port(ABC):
         return ()
 
     def may_reset(self, now_ns: int) -> bool:
-        """Whether what is latched here may be cleared, by what `seen` does not show."""
+        """Whether the vendor's conditions that `seen` does not show allow what is latched here to be cleared."""
         return True
 
     def questions(self, now_ns: int, permit: MotionPermit) -> tuple[OutgoingFrame, ...]:
@@ -332,7 +332,7 @@ class VendorDriver:
         self._end(self._permit.lost(why))
 
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
-        """Frames that stop in any state; whatever was wanted is dropped, and nothing is commanded again."""
+        """Return frames that stop the wheels in any state; requests are dropped, and no motion follows until a reset."""
         self._end(self._permit.stopped())
         return parts.estop_frames(now_ns, self._port.stop_frames())
 

@@ -101,7 +101,10 @@ Bends: TypeAlias = tuple[Bend, Bend] | None
 
 
 def bends_of(area: Area | None, straight: bool | None) -> Bends:
-    """Return the detours of an area, None without one or with `straight`; compiled code only."""
+    """Return an area's detours, two tuples of seven numbers; None without an area or if `straight` is not None.
+
+    Compiled code only.
+    """
     raise TypeError(f"{type(area).__name__} is no area")
 
 
@@ -127,7 +130,10 @@ def _bends_of(area: Any, straight: Any) -> Callable[[Any, Any], Bends]:
 
 @scalar_function
 def detoured(bends: Bends, place: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return where the task sees the robot: on the line while it drives around an obstacle as planned (compiled)."""
+    """Return x, y and forward speed of `place`, with x and y shifted by the planned detours back onto the line.
+
+    The task thus sees the robot on its line while it drives around an obstacle as planned. Compiled code only.
+    """
     if bends is None:
         return place
     x, y, forward = place

@@ -34,7 +34,11 @@ _OF_TURNING = tuple(
 
 
 def in_motion(wheels: ChannelEstimates, body: ChannelEstimates) -> ChannelEstimates:
-    """The wheels' estimates, where those of the robot's motion are no better known than its geometry in `body`."""
+    """Return the wheels' estimates, with the uncertainty of the geometry in `body` added to the turning parameters.
+
+    Those parameters are of the robot's motion, and the wheels show them only times wheel radius over axial distance. So
+    the relative variance of this ratio adds to each one's own, and to their covariance.
+    """
     slope = np.zeros(len(body.fitted))
     for name, sign in (("wheel_radius_m", 1.0), ("axial_distance_m", -1.0)):
         if name in body.fitted:
@@ -87,7 +91,11 @@ def one_encoder(
 
 
 def confounded_with(names: tuple[str, ...], encoder_possible: bool) -> dict[str, tuple[str, ...]]:
-    """For each accepted effect what is confounded with it in every drive."""
+    """Map each accepted effect to the effects that are confounded with it in every drive.
+
+    The pairs are those of `Effect.mimics` in `disco_hw.effects`; one that shows in two channels counts only if it is
+    `encoder_possible`.
+    """
     found: dict[str, tuple[str, ...]] = {}
     for other, mimicked in _MIMICS.items():
         if mimicked.effect.name in names and (mimicked.seen_too is None or encoder_possible):
@@ -176,7 +184,10 @@ def _free_asymmetry(found: ChannelResult) -> tuple[float, float]:
 
 
 def _with_encoder(body: ChannelResult, wheels: ChannelResult) -> tuple[Fit, ChannelEstimates]:
-    """The body's fit with the scale of the encoders, as the wheels' gains give it, in place of the asymmetry."""
+    """Refit the body with encoder scales in place of the asymmetry; return the fit and its estimates.
+
+    The scales are the gains that were found in the wheels.
+    """
     names = tuple(name for name in body.names if name != ASYMMETRY)
     channel = body.selector.channel
     vector = body.fit.vector.copy()

@@ -57,7 +57,7 @@ class Term:
 
     @property
     def features(self) -> tuple[Array, ...]:
-        """What its coefficients stand before."""
+        """Return the columns that the term's coefficients multiply, one array a coefficient."""
         return (self.perturbation, *self.further_waves)
 
     def written(self, coefficients: Array) -> str:

@@ -57,10 +57,10 @@ class PathCost:
         self, time_s: float, x_m: float, y_m: float, yaw_rad: float, memory: float | None, step_s: float, horizon: int,
         x_icr_m: float = 0.0,
     ) -> Prepared:  # fmt: skip
-        """Terms for the kernel; the memory is the place on the path, in entries of the table.
+        """Return the kernel's terms, the rollouts' origin and initial memory, and the place on the path for the next plan.
 
-        Rollouts count it from where they begin, and are relative to a point of the path nearby, so that a long path is
-        as precise as a short one.
+        Places count in entries of the table. Rollouts count them from where they begin, hence 0 as their memory, and
+        are relative to a point of the path nearby, so that a long path is as precise as a short one.
         """
         path = self.path
         place, first, last = path.piece(path.place(x_m, y_m, yaw_rad, memory))
@@ -137,7 +137,10 @@ class PathTerms(NamedTuple):
         return min(self.last, max(self.first, place + along))
 
     def line_at(self, place: float, ahead_m: float) -> tuple[float, float, float, float, float, float]:
-        """Return the point `ahead_m` further on, the robot's heading on the path there, and its speed."""
+        """Return x, y, cosine and sine of the heading, cosine of heading against path, and speed, `ahead_m` further on.
+
+        The heading is that of a robot that stays on the path; its angle with the path is `turned`'s.
+        """
         place = min(place + ahead_m * self.per_m, self.last)
         index = _row(place, self.first, self.last)
         row, part = 4 * index, place - np.floor(min(place, self.last - _ONE))
@@ -163,13 +166,16 @@ class PathTerms(NamedTuple):
         self, memory: float, step: int, x_old: float, y_old: float, x: float, y: float,
         cos_yaw: float, sin_yaw: float, forward: float, found: Found,
     ) -> tuple[float, float]:  # fmt: skip
-        """Distance to the path and missing speed as one length, and facing."""
+        """Return the cost of a step (m) and the unchanged memory.
+
+        The cost is the distance to the path and the missing speed as one length, and what facing backwards adds.
+        """
         off_x, off_y, along_x, along_y = _offset(self.last, memory, x, y, found[1:])
         against = max(-(cos_yaw * along_x + sin_yaw * along_y), _ZERO)
         return norm_of_three(off_x, off_y, found[0]) + _AGAINST * against, memory
 
     def terminal(self, memory: float, x: float, y: float, cos_yaw: float, sin_yaw: float, found: Found) -> float:
-        """Return the last distance and the error of the last heading."""
+        """Return the weighted cost of the last distance and the last heading's error, as one length (m)."""
         off_x, off_y, along_x, along_y = _offset(self.last, memory, x, y, found[1:])
         piece = np.floor(min(memory, self.last - _ONE))
         row = np.int32(piece - self.first) * 2
