@@ -27,8 +27,8 @@ def _on_the_circle(speed_m_s: float) -> PlannerState:
     """Return a robot that goes round the circle at this speed, turned inwards as it has to be."""
     turned = math.asin(X_ICR_M / RADIUS_M)
     forward, turn = speed_m_s * math.cos(turned), speed_m_s / RADIUS_M
-    wheels = [(forward + side * 0.2 * turn) / 0.06 for side in (-1.0, 1.0)]
-    return PlannerState(0, RADIUS_M, 0.0, 0.5 * math.pi + turned, *wheels)
+    left, right = ((forward + side * 0.2 * turn) / 0.06 for side in (-1.0, 1.0))
+    return PlannerState(0, RADIUS_M, 0.0, 0.5 * math.pi + turned, left, right)
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,8 @@ def _cost(commands: np.ndarray, state: PlannerState, speed_m_s: float, step_s: f
     turned_m = X_ICR_M * math.remainder(turned, 2.0 * math.pi)
     changes = np.diff(np.vstack([wheels, commands]), axis=0)
     distance = float(weights @ ((states[:, :2] - reference) ** 2).sum(axis=1))
-    return distance + weights[-1] * turned_m**2 + (CHANGE_S * MODEL.wheel_radius_m) ** 2 * float((changes**2).sum())
+    last = float(weights[-1]) * turned_m**2
+    return distance + last + (CHANGE_S * MODEL.wheel_radius_m) ** 2 * float((changes**2).sum())
 
 
 @pytest.mark.thorough
