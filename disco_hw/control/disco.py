@@ -32,8 +32,7 @@ from disco_hw.control.plan import (
     Rollouts,
     WheelPlan,
 )
-from disco_hw.control.refinement import STEP_S as REFINED_STEP_S
-from disco_hw.control.refinement import Refinement, RefinementStart
+from disco_hw.control.refinement import Refinement
 from disco_hw.control.rollout_points import RolloutPoints
 from disco_hw.control.sampling import Sampling
 from disco_hw.control.state_prediction import PlanStart, StatePrediction
@@ -70,8 +69,8 @@ class Disco:
         )
         self._guidance = Guidance(self._optimiser, settings)
         self._sampling = Sampling(self._optimiser, points.weights, settings, surroundings)
-        self._refinement = Refinement(limits) if settings.refine else None
-        self._refine_points()
+        self._refinement = Refinement(limits, settings.step_s, points.history) if settings.refine else None
+        self._set_refined_model()
         self._stopping = Stopping(settings, limits)
         # Buffers of the compiled rollout: where it begins, and how the wheels turn in it.
         self._start = np.zeros(START_SIZE, np.float32)
@@ -122,7 +121,7 @@ class Disco:
         delays or faster turns than at first are refused.
         """
         self._points.set_belief(belief)
-        self._refine_points()
+        self._set_refined_model()
 
     def set_task(self, task: PlannedTask) -> None:
         """Plan for another task of the same type from the next `plan` on; nothing is compiled. Raises TypeError."""
@@ -200,13 +199,13 @@ class Disco:
         trajectory = begin.mean_path(self._points.mean_run, nominal)
 
         # Beside the line the plan is refined; where it stands, the guide takes its place.
-        refined = self._refined(state, begin, system, nominal) if outcome in REFINED else None
+        refined = self._refined(begin, system, nominal) if outcome in REFINED else None
         if guided and self._is_guided(now_ns, system, trajectory):
             optimiser.use_guide()
             nominal = optimiser.nominal()
             trajectory = begin.mean_path(self._points.mean_run, nominal)
         elif refined is not None:
-            return WheelPlan(t0_ns, REFINED_STEP_S, *refined, diagnostics)
+            return WheelPlan(t0_ns, settings.step_s, *refined, diagnostics)
         return WheelPlan(t0_ns, settings.step_s, self._compensation.commanded(nominal), trajectory, diagnostics)
 
     def _system(self, state: PlannerState, begin: PlanStart, task_s: float) -> SkidSteer:
@@ -252,32 +251,19 @@ class Disco:
             return False
         return self._guidance.has_robot(now_ns, system, trajectory)
 
-    def _refine_points(self) -> None:
-        """Refine under the belief in force: under its sigma points, or in its mean."""
-        if self._refinement is None:
-            return
-        points, shared = self._points, self._settings.uncertainty == "ut"
-        theta = points.theta if shared else points.mean_theta
-        weights = points.weights.astype(np.float64) if shared else np.ones(1)
-        self._refinement.set_points(points.model, theta, weights, points.chassis)
+    def _set_refined_model(self) -> None:
+        """Refine in the mean of the belief in force."""
+        if self._refinement is not None:
+            self._refinement.set_model(self._points.model, self._points.chassis)
 
-    def _refined(
-        self, state: PlannerState, begin: PlanStart, system: SkidSteer, nominal: Array
-    ) -> tuple[Array, Array] | None:
+    def _refined(self, begin: PlanStart, system: SkidSteer, nominal: Array) -> tuple[Array, Array] | None:
         """Return the refined commands (N, 2), as the robot is to get them, and where they lead; None without such."""
-        refinement = self._refinement
-        if refinement is None:
+        if self._refinement is None:
             return None
-        past = self._prediction.commands_before(state, begin.t0_ns, REFINED_STEP_S, refinement.history)
-        shared, mean_means = self._settings.uncertainty == "ut", begin.mean_means
-        means = begin.point_means if shared or mean_means is None else mean_means[None]
-        initial = RefinementStart(
-            system.task, system.start, begin.state, begin.elapsed_s, begin.slide, means, past, begin.before
-        )
-        commands = refinement.improve(initial, begin.t0_ns, nominal, self._settings.step_s)
+        commands = self._refinement.improve(system.task, system.start, begin, nominal)
         if commands is None:
             return None
-        path = begin._replace(earlier=past).mean_path(refinement.mean, commands)
+        path = begin.mean_path(self._points.mean_run, commands)
         # The refinement knows the line and nothing else: near an obstacle or a fence the sampled plan stands.
         if self._surroundings is not None and not self._surroundings.allows(path):
             return None

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState
-from disco_hw.model import Model
+from disco_hw.control.parameter_points import mean_point
+from disco_hw.control.refinement import CHANGE_S, END_X_ICR, LEAST_END_WEIGHT, STEPS
+from disco_hw.model import Gaussian, Model
 from disco_hw.model.model import EffectSetting
+from disco_hw.model.step import FreeRun
 from disco_hw.tasks.circle import CircleCost
 
 RADIUS_M, X_ICR_M = 0.75, 0.2
@@ -22,8 +27,8 @@ def _on_the_circle(speed_m_s: float) -> PlannerState:
     """Return a robot that goes round the circle at this speed, turned inwards as it has to be."""
     turned = math.asin(X_ICR_M / RADIUS_M)
     forward, turn = speed_m_s * math.cos(turned), speed_m_s / RADIUS_M
-    wheels = [(forward + side * 0.2 * turn) / 0.06 for side in (-1.0, 1.0)]
-    return PlannerState(0, RADIUS_M, 0.0, 0.5 * math.pi + turned, *wheels)
+    left, right = ((forward + side * 0.2 * turn) / 0.06 for side in (-1.0, 1.0))
+    return PlannerState(0, RADIUS_M, 0.0, 0.5 * math.pi + turned, left, right)
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +49,51 @@ def drive_on() -> dict[float, tuple[np.ndarray, np.ndarray]]:
 def test_a_refined_plan_stays_on_the_line(drive_on: dict[float, tuple[np.ndarray, np.ndarray]]) -> None:
     """A robot on the circle is planned to stay within a millimetre of it; sampling alone is not as near."""
     assert np.abs(drive_on[0.2][1]).max() < 1e-3
+
+
+@pytest.mark.thorough
+def test_a_wide_belief_does_not_lead_a_refined_plan_off_the_line() -> None:
+    """The refinement plans in the mean: under points 15 % apart it would stay where their spread costs least."""
+    geometry = np.array([MODEL.wheel_radius_m, MODEL.axial_distance_m, MODEL.x_icr_m])
+    names = ("wheel_radius_m", "axial_distance_m", "x_icr_m")
+    believed = replace(MODEL, belief=Gaussian(names, geometry, np.diag((0.15 * geometry) ** 2)))
+    planner = Disco(believed, CircleCost(radius_m=RADIUS_M, speed_m_s=0.2), replace(SETTINGS, uncertainty="ut"), LIMITS)
+    plan = planner.plan(0, _on_the_circle(0.2))
+    assert np.abs(np.hypot(*plan.trajectory[:, :2].T) - RADIUS_M).max() < 1e-3
+
+
+def _cost(commands: np.ndarray, state: PlannerState, speed_m_s: float, step_s: float) -> float:
+    """Cost of commands (STEPS, 2) beside the circle, written anew in numpy."""
+    wheels = np.array([state.left_speed_rad_s, state.right_speed_rad_s])
+    start = np.array([state.x_m, state.y_m, state.yaw_rad, *wheels])
+    states = FreeRun(MODEL, mean_point(MODEL), step_s).states(start, commands, 0)[1:]
+    angles = math.atan2(state.y_m, state.x_m) + speed_m_s * step_s / RADIUS_M * np.arange(1, STEPS + 1)
+    reference = RADIUS_M * np.column_stack([np.cos(angles), np.sin(angles)])
+    way_m = float(np.hypot(*np.diff(reference, axis=0).T).sum())
+    weights = np.ones(STEPS)
+    weights[-1] = max(END_X_ICR * X_ICR_M * STEPS / way_m, LEAST_END_WEIGHT)
+    turned = states[-1, 2] - (angles[-1] + 0.5 * math.pi + math.asin(X_ICR_M / RADIUS_M))
+    turned_m = X_ICR_M * math.remainder(turned, 2.0 * math.pi)
+    changes = np.diff(np.vstack([wheels, commands]), axis=0)
+    distance = float(weights @ ((states[:, :2] - reference) ** 2).sum(axis=1))
+    last = float(weights[-1]) * turned_m**2
+    return distance + last + (CHANGE_S * MODEL.wheel_radius_m) ** 2 * float((changes**2).sum())
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("speed_m_s", [0.1, 0.2, 0.3])
+def test_a_refined_plan_costs_no_more_than_the_sampled_one(speed_m_s: float) -> None:
+    """In the mean of what is believed, on the line and beside it."""
+    settings = replace(DiscoSettings.for_speed(speed_m_s, 50.0), uncertainty="point", refine=True)
+    on_it = _on_the_circle(speed_m_s)
+    planner = Disco(MODEL, CircleCost(radius_m=RADIUS_M, speed_m_s=speed_m_s), settings, LIMITS)
+    for off_m, turned_rad in ((0.0, 0.0), (0.02, 0.0), (-0.02, 0.1), (0.0, -0.1)):
+        state = structs.replace(on_it, x_m=on_it.x_m + off_m, yaw_rad=on_it.yaw_rad + turned_rad)
+        planner.reset()
+        refined = planner.plan(0, state).wheel_speeds
+        sampled = planner.optimiser.nominal()[:STEPS]
+        costs = [_cost(commands, state, speed_m_s, settings.step_s) for commands in (refined, sampled)]
+        assert costs[0] <= costs[1]
 
 
 @pytest.mark.thorough

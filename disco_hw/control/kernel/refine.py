@@ -1,8 +1,8 @@
 """Gauss-Newton refinement of a plan: the bottom of the valley that sampling has found.
 
-Minimises the mean over the parameter points of the squared distances to a timed reference and of the squared error of
-the last heading, plus the squared changes of the commands. Derivatives are finite differences of rollouts: one for each
-command and point, from the step on in which the command acts. Limits of commands and of their changes are kept by
+Minimises the squared distances to a timed reference, the squared error of the last heading and the squared changes of
+the commands, in the mean of the belief. Derivatives are finite differences of rollouts: one for each command, from the
+step on in which the command acts. Limits of commands and of their changes are kept by
 Hildreth's dual method (a quadratic program with few active constraints). Double precision, no allocation.
 """
 
@@ -38,8 +38,8 @@ class Problem(NamedTuple):
     """Least-squares problem of a refinement: initial state, model coefficients, command bounds and reference.
 
     `start` (5,): x, y (m, relative to the task's origin), yaw (rad), wheel speeds (rad/s); `time_s` of it; `slide` (3,)
-    as of `Disturbance.slides`; `means` (L, n) of what the model's terms remember at the start, or None; `base`,
-    `effects`, `series`: coefficients of L points; `weights` (L,). `history`: rows of commands from before the plan.
+    as of `Disturbance.slides`; `means` (n,) of what the model's terms remember at the start, or None; `base`,
+    `effects` (tables of one point), `series`: coefficients. `history`: rows of commands from before the plan.
     `reference` (T, 2) in m. `largest`, `change`: bounds of a command and of its change in a step (rad/s); `before`
     (2,): the command before the plan; `change_m`: distance (m) that costs as much as a change of 1 rad/s.
     `heading` (2,): the direction in which a robot that stays on the line faces at the end; `end_weight`: of the last
@@ -53,7 +53,6 @@ class Problem(NamedTuple):
     base: Base
     effects: Coefficients
     series: Array
-    weights: Array
     history: int
     reference: Array
     largest: float
@@ -123,12 +122,12 @@ def _roll(
 
 
 @block_function
-def _store_memory(remembered: Array | None, means: Array | None, point: int) -> None:
+def _store_memory(remembered: Array | None, means: Array | None) -> None:
     """Set what the model's terms remember to what they do at the start."""
     if remembered is None or means is None:
         return
     for n in range(remembered.shape[0]):
-        remembered[n] = means[point, n]
+        remembered[n] = means[n]
 
 
 @scalar_function
@@ -152,24 +151,18 @@ def _last_residual(problem: Problem, states: Array) -> float:
 
 @block_function
 def _cost(problem: Problem, buffers: Buffers, commands: Array) -> float:
-    """Cost of commands (H + T, 2) under all points."""
+    """Cost of commands (H + T, 2)."""
     integration = integration_from(problem.series, True, None)
     states, history = buffers.states, problem.history
-    cost = 0.0
-    for i in range(problem.weights.shape[0]):
-        base, effects = base_point(problem.base, i), effect_point(problem.effects, i)
-        _store_memory(buffers.remembered, problem.means, i)
-        _begin(states, problem.start, base)
-        _roll(
-            states, 0, commands, history, problem.time_s, problem.slide, buffers.remembered, base, effects, integration
-        )
-        squares = 0.0
-        for t in range(problem.reference.shape[0]):
-            off_x, off_y = _residual(problem, states, t)
-            squares += off_x * off_x + off_y * off_y
-        turned = _last_residual(problem, states)
-        squares += turned * turned
-        cost += problem.weights[i] * squares
+    base, effects = base_point(problem.base, 0), effect_point(problem.effects, 0)
+    _store_memory(buffers.remembered, problem.means)
+    _begin(states, problem.start, base)
+    _roll(states, 0, commands, history, problem.time_s, problem.slide, buffers.remembered, base, effects, integration)
+    turned = _last_residual(problem, states)
+    cost = turned * turned
+    for t in range(problem.reference.shape[0]):
+        off_x, off_y = _residual(problem, states, t)
+        cost += off_x * off_x + off_y * off_y
     changes = 0.0
     for t in range(problem.reference.shape[0]):
         for c in range(CHANNELS):
@@ -187,50 +180,44 @@ def _linearise(problem: Problem, buffers: Buffers) -> None:
     steps = problem.reference.shape[0]
     size = CHANNELS * steps
     normal, gradient, slopes, residuals = buffers.normal, buffers.gradient, buffers.slopes, buffers.residuals
-    normal[:, :] = 0.0
-    gradient[:] = 0.0
-    for i in range(problem.weights.shape[0]):
-        base, effects = base_point(problem.base, i), effect_point(problem.effects, i)
-        _store_memory(buffers.remembered, problem.means, i)
-        _begin(states, problem.start, base)
+    base, effects = base_point(problem.base, 0), effect_point(problem.effects, 0)
+    _store_memory(buffers.remembered, problem.means)
+    _begin(states, problem.start, base)
+    _roll(states, 0, commands, history, problem.time_s, problem.slide, buffers.remembered, base, effects, integration)
+    for t in range(steps):
+        residuals[RESIDUALS * t], residuals[RESIDUALS * t + 1] = _residual(problem, states, t)
+    residuals[size] = _last_residual(problem, states)
+    for j in range(size):
+        k, c = j // CHANNELS, j % CHANNELS
+        # What terms remember is not kept along a rollout: with such it is rolled out from its start.
+        first = 0 if buffers.remembered is not None else k
+        _store_memory(buffers.remembered, problem.means)
+        for column in range(STATE_COLUMNS):
+            moved[first, column] = states[first, column]
+        moved[0, AXLE_X], moved[0, AXLE_Y] = states[0, AXLE_X], states[0, AXLE_Y]
+        kept = commands[history + k, c]
+        commands[history + k, c] = kept + DIFFERENCE_RAD_S
         _roll(
-            states, 0, commands, history, problem.time_s, problem.slide, buffers.remembered, base, effects, integration
-        )
-        for t in range(steps):
-            residuals[RESIDUALS * t], residuals[RESIDUALS * t + 1] = _residual(problem, states, t)
-        residuals[size] = _last_residual(problem, states)
-        for j in range(size):
-            k, c = j // CHANNELS, j % CHANNELS
-            # What terms remember is not kept along a rollout: with such it is rolled out from its start.
-            first = 0 if buffers.remembered is not None else k
-            _store_memory(buffers.remembered, problem.means, i)
-            for column in range(STATE_COLUMNS):
-                moved[first, column] = states[first, column]
-            moved[0, AXLE_X], moved[0, AXLE_Y] = states[0, AXLE_X], states[0, AXLE_Y]
-            kept = commands[history + k, c]
-            commands[history + k, c] = kept + DIFFERENCE_RAD_S
-            _roll(
-                moved, first, commands, history, problem.time_s, problem.slide, buffers.remembered, base, effects,
-                integration,
-            )  # fmt: skip
-            commands[history + k, c] = kept
-            for t in range(k, steps):
-                off_x, off_y = _residual(problem, moved, t)
-                slopes[j, RESIDUALS * t] = (off_x - residuals[RESIDUALS * t]) / DIFFERENCE_RAD_S
-                slopes[j, RESIDUALS * t + 1] = (off_y - residuals[RESIDUALS * t + 1]) / DIFFERENCE_RAD_S
-            slopes[j, size] = (_last_residual(problem, moved) - residuals[size]) / DIFFERENCE_RAD_S
-        weight = problem.weights[i]
-        for a in range(size):
-            begin = RESIDUALS * (a // CHANNELS)
-            pulled = 0.0
+            moved, first, commands, history, problem.time_s, problem.slide, buffers.remembered, base, effects,
+            integration,
+        )  # fmt: skip
+        commands[history + k, c] = kept
+        for t in range(k, steps):
+            off_x, off_y = _residual(problem, moved, t)
+            slopes[j, RESIDUALS * t] = (off_x - residuals[RESIDUALS * t]) / DIFFERENCE_RAD_S
+            slopes[j, RESIDUALS * t + 1] = (off_y - residuals[RESIDUALS * t + 1]) / DIFFERENCE_RAD_S
+        slopes[j, size] = (_last_residual(problem, moved) - residuals[size]) / DIFFERENCE_RAD_S
+    for a in range(size):
+        begin = RESIDUALS * (a // CHANNELS)
+        pulled = 0.0
+        for r in range(begin, size + 1):
+            pulled += slopes[a, r] * residuals[r]
+        gradient[a] = pulled
+        for b in range(a + 1):
+            product = 0.0
             for r in range(begin, size + 1):
-                pulled += slopes[a, r] * residuals[r]
-            gradient[a] += weight * pulled
-            for b in range(a + 1):
-                product = 0.0
-                for r in range(begin, size + 1):
-                    product += slopes[a, r] * slopes[b, r]
-                normal[a, b] += weight * product
+                product += slopes[a, r] * slopes[b, r]
+            normal[a, b] = product
     _add_changes(problem, buffers)
     for a in range(size):
         normal[a, a] += DAMPING * normal[a, a] + 1e-12
