@@ -57,7 +57,7 @@ class PathCost:
         self, time_s: float, x_m: float, y_m: float, yaw_rad: float, memory: float | None, step_s: float, horizon: int,
         x_icr_m: float = 0.0,
     ) -> Prepared:  # fmt: skip
-        """Return kernel terms, the rollouts' origin, their initial memory 0, and the path's place for the next plan.
+        """Return kernel terms, the rollouts' origin and first memory (0), and the place on the path for the next plan.
 
         Places count in entries of the table. Rollouts count them from where they begin, and are
         relative to a point of the path nearby, so that a long path is as precise as a short one.
