@@ -332,7 +332,10 @@ class VendorDriver:
         self._end(self._permit.lost(why))
 
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
-        """Return frames that stop the wheels in any state; requests are dropped, and no motion follows until a reset."""
+        """Return frames that stop the wheels in any state; no motion is commanded afterwards until a reset.
+
+        Earlier requests are dropped.
+        """
         self._end(self._permit.stopped())
         return parts.estop_frames(now_ns, self._port.stop_frames())
 

@@ -57,10 +57,10 @@ class PathCost:
         self, time_s: float, x_m: float, y_m: float, yaw_rad: float, memory: float | None, step_s: float, horizon: int,
         x_icr_m: float = 0.0,
     ) -> Prepared:  # fmt: skip
-        """Return the kernel's terms, the rollouts' origin and initial memory, and the place on the path for the next plan.
+        """Return kernel terms, the rollouts' origin and first memory (0), and the place on the path for the next plan.
 
-        Places count in entries of the table. Rollouts count them from where they begin, hence 0 as their memory, and
-        are relative to a point of the path nearby, so that a long path is as precise as a short one.
+        Places count in entries of the table. Rollouts count them from where they begin, and are
+        relative to a point of the path nearby, so that a long path is as precise as a short one.
         """
         path = self.path
         place, first, last = path.piece(path.place(x_m, y_m, yaw_rad, memory))
