@@ -116,7 +116,7 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         return f"circle of {self.radius_m:g} m about {centre} at {self.speed_m_s:g} m/s"
 
     def course(self) -> CircleCourse:
-        """Return the circle as a course."""
+        """Return the circle as a `CircleCourse`."""
         return CircleCourse(self.center_x_m, self.center_y_m, self.radius_m)
 
     def progress(self) -> LapCounter:
@@ -124,7 +124,7 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         return LapCounter(self.center_x_m, self.center_y_m)
 
     def planned(self, mode: str) -> CircleCost:
-        """Return the circle with the cost of the control mode."""
+        """Return the cost of following the circle, for the planner, in this control mode."""
         cost = CircleCost(self.center_x_m, self.center_y_m, self.radius_m, self.speed_m_s)
         return cost.paper() if mode == "paper" else cost
 
@@ -252,7 +252,7 @@ class CircleCost:
         self, time_s: float, x_m: float, y_m: float, yaw_rad: float, memory: float | None, step_s: float, horizon: int,
         x_icr_m: float = 0.0,
     ) -> Prepared:  # fmt: skip
-        """Terms for the kernel; nothing depends on time or place. The memory is the angle swept (rad)."""
+        """Return kernel terms, the same at every time and place; the rollouts' memory is the angle swept (rad)."""
         return _prepared(self, step_s, horizon, x_icr_m)
 
     def line_m(self) -> Array:
@@ -294,7 +294,7 @@ class CircleTerms(NamedTuple):
         return math.atan2(y, x)
 
     def line_at(self, place: float, ahead_m: float) -> tuple[float, float, float, float, float, float]:
-        """Return the point `ahead_m` further round, the robot's heading on the circle there, and its speed."""
+        """Return x, y, heading (cosine, sine), cosine of heading against circle, and speed, `ahead_m` further on."""
         angle = place + ahead_m / self.radius_m
         cosine, sine = math.cos(angle), math.sin(angle)
         head_x = -sine * self.turned_cos - cosine * self.turned_sin
@@ -318,7 +318,7 @@ class CircleTerms(NamedTuple):
         return math.sqrt(off_edge * off_edge + off_speed * off_speed) + against, swept
 
     def terminal(self, memory: float, x: float, y: float, cos_yaw: float, sin_yaw: float, found: Found) -> float:
-        """Return the progress missing at the end, and the distance to the edge and the heading that are left."""
+        """Return the weighted cost (m) of missing progress, of the last distance to the edge and of the heading."""
         shortfall = self.progress_weight * max(self.desired - memory * self.per_rad, _ZERO)
         rho, inverse = norm_and_inverse(x, y)
         along, inwards = (x * sin_yaw - y * cos_yaw) * inverse, -(x * cos_yaw + y * sin_yaw) * inverse

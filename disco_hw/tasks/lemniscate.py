@@ -94,7 +94,7 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         }
 
     def editing_note(self, robot: Chassis) -> str:
-        """Return a sentence with the largest speed on the present size."""
+        """Return a sentence with the largest speed for the present size."""
         return f"At a size of {self.size_m:g} m at most {self.fastest_m_s(robot):.3f} m/s."
 
     def describe(self) -> str:
@@ -107,7 +107,7 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         return _points(self.center_x_m, self.center_y_m, self.size_m)
 
     def course(self) -> LineCourse:
-        """Return the line through the figure's points."""
+        """Return the `LineCourse` through the points of the figure."""
         return line_course(self.points(), "lemniscate")
 
     def progress(self) -> PathProgress:
@@ -115,7 +115,7 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         return PathProgress(PathTable(np.array(self.points())))
 
     def planned(self, _mode: str) -> PathCost:
-        """Return the figure with the cost of a path, the same in every mode."""
+        """Return the cost of following the figure, for the planner; the same in every mode."""
         return PathCost(PathTable(np.array(self.points())), self.speed_m_s)
 
 

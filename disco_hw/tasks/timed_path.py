@@ -118,7 +118,7 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         return f"path {self.path} of {length_m:.2f} m in {self.times_s[-1]:g} s, at most {self.speed_m_s:.3g} m/s"
 
     def course(self) -> LineCourse:
-        """Return the line through the way-points."""
+        """Return the `LineCourse` through the way-points."""
         return line_course(self.points, "timed path")
 
     def progress(self) -> TimedProgress:
@@ -126,7 +126,7 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         return TimedProgress(self.points, self.times_s)
 
     def planned(self, _mode: str) -> TimedPathCost:
-        """Return the way-points with their cost, the same in every mode."""
+        """Return the cost of following the way-points in time, for the planner; the same in every mode."""
         return TimedPathCost(Waypoints(np.array(self.points), np.array(self.times_s)))
 
 
@@ -194,7 +194,7 @@ class TimedPathCost:
         self, time_s: float, x_m: float, y_m: float, yaw_rad: float, memory: float | None, step_s: float, horizon: int,
         x_icr_m: float = 0.0,
     ) -> Prepared:  # fmt: skip
-        """Terms for the kernel, relative to where the robot should be now; there is no memory."""
+        """Return kernel terms and their origin, where the robot should be now; rollouts have no memory."""
         x, y = self._where(time_s + step_s * np.arange(horizon + 1))
         along_x, along_y = np.diff(x), np.diff(y)
         length = np.hypot(along_x, along_y)
@@ -223,7 +223,7 @@ class TimedPathTerms(NamedTuple):
         self, memory: float, step: int, x_old: float, y_old: float, x: float, y: float,
         cos_yaw: float, sin_yaw: float, forward: float, found: Found,
     ) -> tuple[float, float]:  # fmt: skip
-        """Distance to where the robot should be, and facing."""
+        """Return the cost of a step, distance to the place due now and facing backwards, and the unchanged memory."""
         against = max(-(cos_yaw * self.along_x[step] + sin_yaw * self.along_y[step]), _ZERO)
         return norm(x - self.x[step], y - self.y[step]) + _AGAINST * against, memory
 
