@@ -48,9 +48,9 @@ class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class Prior(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Uniform ranges of the model's base parameters; the defaults are the paper's (appendix, skid-steer table).
+    """Uniform ranges of the model's base parameters; the class's defaults are the paper's (appendix, skid-steer table).
 
-    What a robot.toml leaves out is made from its own robot, see `prior_around`.
+    Loading a robot.toml replaces what it leaves out by ranges around its own robot, see `prior_around`.
     """
 
     x_icr_m: Range = (0.0, 0.5)
@@ -82,7 +82,7 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     key_file: str | None = None
 
     def medium_fields(self) -> dict[str, Any]:
-        """Return the fields for `drivers.transport.create_transport`: kind, address, and a serial line's exchange."""
+        """Return keyword arguments for `create_transport`: the medium, its settings, and a serial line's exchange."""
         fields = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in _OF_THE_PROTOCOL}
         exchange = find_driver(self.driver).exchange
         return fields if exchange is None else {**fields, "exchange": exchange(self.settings())}

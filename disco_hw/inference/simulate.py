@@ -54,7 +54,7 @@ def simulate_kernel(
     means: Any,
     out: Any,
 ) -> None:
-    """Measured poses (n, P, 3) of n simulations, one for each row of `base` and `effects` and each of `seeds`.
+    """Write measured poses (n, P, 3) of n simulations to `out`, one for each row of `base` and `effects`, and seed.
 
     Every run starts at its pose of `starts` (runs, 3). Slip is added after every step of a moving robot: forward, to
     the left, and in yaw about the lever's end; its variance is that of the noise times `intensity` (M,), and it keeps
@@ -267,7 +267,7 @@ def _swapped(item: T, work: Callable[[S, T], R], shared: S) -> R:
 
 @contextmanager
 def dask_workers(address: str) -> Iterator[DaskWorkers]:
-    """Connect to the scheduler at `address`, e.g. tcp://host:8786; the cluster is left as it was.
+    """Yield workers of the Dask cluster whose scheduler is at `address`, e.g. tcp://host:8786, as a context manager.
 
     Raises InputError if dask is not installed, nothing answers, or the cluster has no workers; WorkError if the cluster
     is lost on the way or its workers cannot do the work.

@@ -74,7 +74,10 @@ def _checked_vector(vector: Array, size: int, what: str) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Gaussian:
-    """Belief that is a joint Gaussian; raises ValueError for wrong shapes, non-finite values or a wrong covariance."""
+    """Joint Gaussian belief: one vector of means (P,) and one covariance matrix (P, P).
+
+    Raises ValueError for wrong shapes, non-finite values or a wrong covariance.
+    """
 
     names: tuple[str, ...]
     means: Array
@@ -191,7 +194,7 @@ BASE_PARAMETERS = (WHEEL_RADIUS, AXIAL_DISTANCE, X_ICR)
 
 @dataclass(frozen=True)
 class EffectSetting:
-    """An effect that a model has, with the values of its parameters; of a term without a name `reach` may be left out.
+    """An effect of a model with its parameter values; `reach` is optional for terms given by a formula.
 
     Raises ValueError for an unknown effect, missing or unknown parameters, or values outside their physical range.
     """
@@ -306,7 +309,7 @@ class Model:
 
     @property
     def parameters(self) -> dict[str, Parameter]:
-        """Parameters by their full names: the base ones, then `effect.parameter`."""
+        """Dict from full names to parameters: base ones first, then `effect.parameter`."""
         found = {parameter.name: parameter for parameter in BASE_PARAMETERS}
         for setting in self.effects:
             found |= {f"{setting.name}.{parameter.name}": parameter for parameter in setting.effect.parameters}
@@ -349,9 +352,9 @@ class Model:
 def coefficient_tables(
     model: Model, theta: Array, step_s: float, dtype: type = np.float64
 ) -> tuple[Base, Coefficients]:
-    """Work out what the compiled step needs, for L parameter points.
+    """Return Base and Effects, with arrays (L,), for the compiled step at L parameter points.
 
-    `theta` (L, P) in the order of `model.parameter_names`. Gives Base and Effects of arrays (L,); None if absent.
+    `theta` (L, P) in the order of `model.parameter_names`. What is absent is None.
     """
 
     def table(values: Array) -> NDArray[np.floating]:

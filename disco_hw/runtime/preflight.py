@@ -100,7 +100,7 @@ def check_link_load(link: Link, control: Control) -> Check:
 
 
 def check_firmware_limits(robot: Robot, limits: Limits) -> list[Check]:
-    """Compare robot.toml's limits and encoder with what the controller keeps to; a check for each difference."""
+    """Compare robot.toml's limits and encoder with the controller's; FAIL for each difference, else one OK."""
     errors = check_limits(limits, robot.max_wheel_speed_rad_s, robot.max_wheel_acceleration_rad_s2, robot.ticks_per_rev)
     if errors:
         return [Check("firmware limits", Level.FAIL, error) for error in errors]
@@ -127,7 +127,7 @@ def check_task(robot: Robot, task: RobotTask) -> Check:
 
 
 def check_fence(robot: Robot, fence: Fence) -> list[Check]:
-    """Say what the fence holds, and where the footprint is only guessed; nothing without a fence."""
+    """Report the footprint's size where a fence is set, and warn if it is estimated; an empty list without a fence."""
     if not fence.is_set:
         return []
     size = robot.footprint
@@ -161,7 +161,7 @@ def check_command_timing(control: Control, limits: Limits) -> Check:
 
 
 def check_watchdog(limits: Limits) -> Check:
-    """Whether how long the controller waits for a command is known of itself, or declared alone."""
+    """Warn if the command timeout is declared in robot.toml and not read from the controller."""
     timeout = limits.command_timeout_s
     described = f"{timeout.value:g} s, {SOURCE_TEXTS[timeout.said_by]}"
     if timeout.said_by == "robot.toml":

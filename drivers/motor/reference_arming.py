@@ -24,8 +24,7 @@ DELAY_NS = 150_000_000
 class ArmedWatch:
     """Monitor of commands and state while armed; pure.
 
-    `late` counts late commands, `silent` times without the state. `late` counts the times that commands were late,
-    `silent` those without the state.
+    `late` counts the times that commands were late, `silent` those that no state was received.
     """
 
     def __init__(self) -> None:
@@ -108,6 +107,7 @@ class CommandEcho:
         return received_ns - waiting[0][1] if waiting else 0
 
     def _find_accepted(self, counter: int) -> int:
+        """Return the number of the last accepted command, inferred from its counter."""
         last, before = self._last, self._accepted
         if before is not None and last - self._last_when_reported < COUNTER_MODULUS:
             accepted = before + (counter - before) % COUNTER_MODULUS
@@ -177,7 +177,7 @@ class Arming:
 
     @property
     def ready(self) -> bool:
-        """Whether our session is open and nothing else is asked of it."""
+        """Whether the robot is READY in our session, and the session is not spent."""
         return self._robot_state == "READY" and self._ours and not self._spent
 
     @property
@@ -352,6 +352,7 @@ class Handshake:
         return None
 
     def _gather(self) -> None:
+        """Set `identity` and `limits`; None while messages are missing or limits are invalid."""
         hello, build = self._hello, self._build
         if hello is None or build is None or self.missing or not self._limits_are_valid():
             self.identity = self.limits = None
@@ -379,6 +380,6 @@ class Handshake:
 
 
 def _board(board_id: int) -> str:
-    """Return a board's number in words: its top bit says that a plant's line takes the place of wheels."""
+    """Describe a board by its number, whose top bit marks simulated wheels."""
     number = board_id & ~_VIRTUAL_BOARD
     return f"board {number}" if number == board_id else f"board {number} with VIRTUAL wheels"

@@ -40,7 +40,7 @@ class Remains:
     def of(
         cls, timed: PredictionErrors, offered: PredictionErrors, floor: PredictionErrors, body: PredictionErrors | None
     ) -> Remains | None:
-        """Evaluate held-out errors; `body`: those with measured wheels. Return None if nothing was predicted."""
+        """Evaluate held-out errors; `body`: those by measured wheel motion. None if nothing was predicted."""
         if not math.isfinite(offered.position_m):
             return None
         before, after, noise = ((one.position_m, one.yaw_rad) for one in (timed, offered, floor))
@@ -57,7 +57,7 @@ class Remains:
 
     @property
     def closed(self) -> tuple[float | None, float | None]:
-        """Share of the gap between `timed` and the noise that is closed, in position and heading; None without one."""
+        """Share of the gap between `timed` and noise that is closed: position, heading; None for one without a gap."""
         ends = zip(self.before, self.after, self.floor, strict=True)
         position, heading = ((b - a) / (b - f) if b > f else None for b, a, f in ends)
         return position, heading

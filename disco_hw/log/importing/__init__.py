@@ -224,6 +224,7 @@ def _existing_path(path: Path) -> Path:
 
 
 def _with_topics(settings: Ros2, topics: Sequence[str]) -> Ros2:
+    """Return the settings of [ros2] with its topics replaced by those given as ROLE=NAME."""
     fields = {"commands": "command_topic", "wheels": "wheel_topic", "poses": "pose_topic"}
     given: dict[str, str] = {}
     for one in topics:

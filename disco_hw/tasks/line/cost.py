@@ -35,7 +35,7 @@ _ZERO, _ONE, _TWO, _AGAINST = single(0.0), single(1.0), single(2.0), single(AGAI
 
 @dataclass(frozen=True, eq=False)
 class PathCost:
-    """Follow way-points by arc length: c = sqrt(e^2 + (progress - wanted)^2) + facing, e the distance to the path.
+    """Follow way-points; the cost is the distance e, the error of the speed along the path, and facing backwards.
 
     The place on the path is carried along every rollout: each step moves it by the step's projection on the path's
     direction; so a path may cross itself. The speed of that is the progress, but no more than the forward speed and the
@@ -158,7 +158,7 @@ class PathTerms(NamedTuple):
         return float(min(self.speed_m_s * time_s, max(self.end, 0.0) / self.per_m))
 
     def row_of(self, memory: float) -> int:
-        """Return the row of the table for a place."""
+        """Return the index of the table's row for a place."""
         row: int = np.int32(np.floor(min(memory, self.last - _ONE)) - self.first)  # type: ignore[assignment]
         return row
 
@@ -189,7 +189,7 @@ class PathTerms(NamedTuple):
 
 @helper
 def _row(place: float, first: float, last: float) -> int:
-    """Return the row of the table for a place."""
+    """Return the index of the table's row for a place."""
     return int(np.floor(min(place, last - _ONE)) - first)
 
 
