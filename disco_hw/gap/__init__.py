@@ -173,7 +173,7 @@ def _of_wheels(wheels: Mapping[str, Mapping[float, PredictionErrors]]) -> dict[s
 
 
 def offered_stage(gap: Mapping[str, Mapping[float, PredictionErrors]], adds: bool, settings: GapSettings) -> str:
-    """The stage whose model is handed out: the first that is as good as the best, by the rule of `decision`.
+    """Return the stage whose model is offered: the first that is as good as the best, by the rule of `decision`.
 
     First comes `timed`, as every robot is late; but where the amended model `adds` nothing to a delay and a lag, that
     does. The amended one counts as it is `written`, where it lacks what no model can carry, and is handed out where
@@ -192,7 +192,7 @@ def offered_stage(gap: Mapping[str, Mapping[float, PredictionErrors]], adds: boo
 def model_of(
     stage: str, model: Model, analysis: GapAnalysis, final: FinalFit, predictions: StagePredictions | None
 ) -> tuple[Model, tuple[str, ...]]:
-    """The model of a stage with the joint Gaussian of its parameters, and notes."""
+    """Return the model of a stage, and notes on it; a fitted model has the joint Gaussian of its parameters."""
     if predictions is not None and stage != "amended":
         return simple_model(model, *predictions.joint[stage])
     if analysis.body is None and analysis.wheels is not None and stage != "amended":
@@ -282,7 +282,7 @@ def search_log(
 
 
 def _vector(layout: Layout, model: Model) -> Array:
-    """The model's parameters as a channel's vector."""
+    """Return a channel's parameter vector with the model's values; entries that the model lacks are neutral."""
     vector = layout.neutral.copy()
     for name, value in zip(model.parameter_names, model.point(), strict=True):
         if name in layout.place:
@@ -306,7 +306,7 @@ class GapResult:
     directory: Path
 
     def as_dict(self) -> dict[str, Any]:
-        """The content of report.json."""
+        """Return the content of report.json as a JSON-serialisable dict."""
         return self.report.as_dict()
 
     def as_text(self) -> str:
@@ -345,7 +345,7 @@ class _Task:
 
 
 def _searched(task: _Task, drive: DriveLog) -> GapReport | str:
-    """The report of one log of a fleet, or in one line why there is none."""
+    """Return the report of one log of a fleet, or the error message if the log cannot be used."""
     try:
         return task.report(drive)
     except LogError as error:

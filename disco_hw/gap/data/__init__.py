@@ -142,8 +142,9 @@ _SENSED = np.array(
 
 
 class PoseSensor(NamedTuple):
-    """Pose sensor by a vector of the body channel: delay of the poses (s), position ahead and left of the tracked point
-    (m), error of the yaw (rad).
+    """Pose sensor that a parameter vector of the body channel describes.
+
+    Delay of the poses (s), position ahead and left of the tracked point (m), error of the yaw (rad).
     """
 
     delay_s: float
@@ -153,7 +154,7 @@ class PoseSensor(NamedTuple):
 
 
 def pose_sensor(p: Array) -> PoseSensor:
-    """The sensor of a vector in the order of `BODY.columns`."""
+    """Return the pose sensor of a parameter vector whose entries are in the order of `BODY.columns`."""
     return _sensor(tuple(p[_SENSED].tolist()))
 
 

@@ -87,7 +87,7 @@ class WheelResponse:
         return cls(commands, lag_s, commanded, speed, angle, unknown_s)
 
     def best(self, turned: Turned, about_s: float, step_s: float, fewest: int) -> tuple[float, float]:
-        """The delay within a step of one at which the misfit is least, and that."""
+        """Return the delay (s) of the least mismatch, within `step_s` of `about_s`, and that mismatch (nats)."""
         return lowest(lambda some: self.mismatches(turned, some, fewest), about_s, step_s)
 
     def mismatches(self, turned: Turned, delays: Array, fewest: int) -> Array:
@@ -122,8 +122,9 @@ class WheelResponse:
         return float(sum(mismatch_of(right - left, right + left, measured) for measured in sides))
 
     def _at(self, t_s: Array, segment: Index) -> tuple[Array, Array, Mask]:
-        """Way (n, 2) and time without a known command (n,) up to some times, and whether commands of a segment are in
-        force there.
+        """Return the ideal wheels' angles at some times, the time without a known command, and a validity mask.
+
+        Angles (n, 2) in rad; accumulated time (n,) in s; mask (n,): whether commands of the segment are in force there.
         """
         commands, lag_s = self.commands, self.lag_s
         k = np.maximum(np.searchsorted(commands.t_s, t_s, side="right") - 1, 0)
@@ -167,7 +168,7 @@ class Response:
 
 
 def response(turned: Turned, commands: Commands, settings: GridSettings) -> Response:
-    """The delay and the lag with which what wheels turn is fitted best by what both commands ask for.
+    """Estimate the delay and the lag with which both commands explain the turning of the wheels best.
 
     Scanned over delays of +-`most_pose_delay_s` behind a few lags; about the best, wherever that lies between the steps
     of the scan, over delays that are as long in all behind each of `lags_s`. Delays at which commands are known for

@@ -293,7 +293,10 @@ def starts_of(first: NDArray[np.bool_], usable: NDArray[np.bool_], ahead_s: floa
 def starts_as_far_as(
     first: NDArray[np.bool_], usable: NDArray[np.bool_], ahead_s: float, settings: GridSettings
 ) -> tuple[Index, float]:
-    """Starts of predictions `ahead_s` ahead, or of half or a quarter of it where runs are too short; and how far."""
+    """Return nodes (K,) where predictions start, and their length (s): `ahead_s`, or a half or a quarter of it.
+
+    The length is the longest of the three for which there is a start, and a quarter if there is none.
+    """
     for share in (1.0, 0.5, 0.25):
         start = starts_of(first, usable, share * ahead_s, settings)
         if start.size:

@@ -245,7 +245,7 @@ def _timed(log: DriveLog, wheels: Wheels, settings: GridSettings) -> _Timed:
 
 
 def _to_borders(commands: Commands, begin_s: float, later_s: float) -> float:
-    """The move nearest to `later_s` that lets commands change at the borders of cells, in the mean over their changes.
+    """Return the shift (s) nearest to `later_s` that puts changes of commands on cell borders, on average.
 
     A delay of a part of a cell is made by a mean of neighbouring cells: a change within a cell would be smeared twice.
     """
@@ -258,12 +258,15 @@ def _to_borders(commands: Commands, begin_s: float, later_s: float) -> float:
 
 
 def _moved(t_s: Array, by_s: float) -> Array:
-    """Times, moved, to the nanosecond: the last digits would decide on which side of a cell's border a sample lies."""
+    """Return times (s) shifted by `by_s` and rounded to the nanosecond.
+
+    The last digits would decide on which side of a cell's border a sample lies.
+    """
     return np.asarray(np.round(t_s + by_s, 9))
 
 
 def even_times(t_s: Array, neighbours: int) -> Array:
-    """Times (N,) without the jitter of their stamps: means over as many `neighbours` before as after.
+    """Return times (N,) without the jitter of their stamps: means over up to `neighbours` samples on either side.
 
     Where samples are lost the stamp itself stays. Angles read by jittering stamps would make every response look
     weaker than it is; moved to even times by the measured speed they do not.
@@ -395,7 +398,7 @@ def _speeds(grid: Array, t: Array, angle: Array, span_s: float) -> Array:
 
 
 def _quantum(angle: Array) -> float:
-    """The smallest step of the angle, rad; 0 if it has none."""
+    """Estimate the smallest step of the wheel angles, rad; 0 if they change 100 times or less."""
     steps = np.abs(np.diff(angle, axis=0)).ravel()
     steps = steps[steps > 1e-9]
     return float(np.quantile(steps, 0.001)) if steps.size > 100 else 0.0
@@ -423,9 +426,10 @@ def _empty(settings: GapSettings) -> GriddedDrive:
 
 
 def undo_sample_hold(wheels: Wheels, settings: GridSettings) -> Wheels:
-    """The wheels' samples without repeated ones, angles integrated backwards; unchanged where nothing is held.
+    """Remove repeated samples of held wheel speeds, and integrate the angles again by the backward rectangle rule.
 
-    Held are speeds from which the angles were derived, if the log repeats more than a third of those of turning wheels.
+    Speeds from which the angles were derived are held if the log repeats more than `repeated_share` of those of turning
+    wheels. Other wheels stay unchanged.
     """
     if wheels.angle_measured or wheels.t_s.size < 3:
         return wheels

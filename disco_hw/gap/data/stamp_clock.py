@@ -66,7 +66,10 @@ class StampClock:
         return np.asarray(drift + self.jump_s * ((t_s >= self.jump_at_s) - 0.5))
 
     def corrected(self, samples: Samples) -> Samples:
-        """Samples with stamps of an even clock; those that a jump makes come before an earlier one are left out."""
+        """Return the samples with the time stamps that an even clock would give.
+
+        Samples that a jump of the clock puts before an earlier one are left out.
+        """
         t_s = samples.t_s - self.off_s(samples.t_s)
         keep = t_s > np.concatenate([[-np.inf], np.maximum.accumulate(t_s)[:-1]])
         return replace(picked(samples, keep), t_s=t_s[keep])
@@ -88,7 +91,7 @@ class StampClock:
 
 
 def picked(samples: Samples, chosen: NDArray[np.bool_]) -> Samples:
-    """Some samples (n,) of all."""
+    """Return the samples that a mask (n,) selects."""
     columns = {each.name: getattr(samples, each.name)[chosen] for each in fields(samples)}
     return replace(samples, **columns)
 
@@ -137,8 +140,10 @@ def clock_of(align: Alignment, settings: GridSettings, least_error_s: float, lea
 
 
 def _level(delays: Array, far_s: float) -> tuple[float, float]:
-    """Sum of squares of delays (n,) about the level that most agree on, those further off than `far_s` counting as
-    that; and the median of those that agree.
+    """Return a robust sum of squares of delays (n,), and the median of those that agree.
+
+    Delays agree if they are closer than `far_s` to the level that most agree on. The squares are taken about the mean
+    of these; a delay further off than `far_s` counts as `far_s`.
     """
     off = delays - delays[:, None]
     level = float(delays[int(np.argmin(np.minimum(off**2, far_s**2).sum(axis=1)))])
@@ -209,7 +214,7 @@ class Aligned(Generic[Samples]):
 def aligned(
     wheels: Wheels, samples: Samples, begins_s: Sequence[float], clock_of: ClockOf[Samples], least_s: float, whose: str
 ) -> Aligned[Samples]:
-    """Samples of one log, or of several that begin at `begins_s`, laid by the clock of each.
+    """Align the samples of one log, or of several that begin at `begins_s`, by the clock of each log.
 
     Delays of logs that lie within `least_s` about their median are taken as one. Of a log that does not show its own
     nobody knows a better one than that of the others; where no log does, they are looked at together. `whose`: "poses'"

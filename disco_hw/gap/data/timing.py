@@ -79,7 +79,7 @@ def pose_clock(wheels: Wheels, poses: Poses, settings: GridSettings) -> StampClo
 
 
 def pose_delay_s(wheels: Wheels, poses: Poses, settings: GridSettings) -> float:
-    """The delay at which poses and wheels agree best, s: positive where a pose is older than its time stamp.
+    """Estimate the delay (s) at which poses and wheels agree best: positive where poses are older than their stamps.
 
     Scanned over +-`most_pose_delay_s`: for each delay the turns and ways between poses `delay_span_s` apart are fitted
     by those of the wheels (two regressions, robust by Huber's weights; their likelihoods, with unknown variances, are

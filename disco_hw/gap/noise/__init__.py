@@ -103,7 +103,10 @@ def fit_wheel_noise(channel: WheelChannel, raw: Array) -> WheelNoise:
 
 
 def _pull(logs: Array, start: Array, prior_sd: float) -> float:
-    """A weak prior that keeps parameters the log says nothing about where they are."""
+    """Return the cost (nats) of a weak Gaussian prior on logarithms of parameters, centred at `start`.
+
+    The prior keeps parameters that the log says nothing about where they are.
+    """
     return 0.5 * float((((logs - start) / prior_sd) ** 2).sum())
 
 
@@ -126,7 +129,10 @@ def fit_body_noise(channel: BodyChannel, p: Array, extra: Array | None = None, i
 
 
 def without_outliers(channel: BodyChannel, p: Array, extra: Array | None = None) -> BodyChannel:
-    """The channel without poses that no noise of this size explains; found again until none is left."""
+    """Return the channel without poses whose whitened residual exceeds the limit for outliers.
+
+    The search is repeated, three times at most, until none is left or more than a tenth of the poses would go.
+    """
     for _ in range(3):
         white = channel.whitened(p, extra)
         wild = channel.use & (np.abs(white).max(axis=1) > channel.settings.noise.outlier)
@@ -155,7 +161,7 @@ def local_weight(white: Array, use: NDArray[np.bool_], settings: NoiseSettings) 
 
 
 def learn_wheel_noise(channel: WheelChannel, raw: Array) -> WheelChannel:
-    """The channel with the noise of residuals `raw` (E, 2), and weights for what is noisier still."""
+    """Return the channel with noise estimated from residuals `raw` (E, 2), and weights for noisier stretches."""
     channel = channel.with_noise(fit_wheel_noise(channel, raw))
     white = whiten_wheels(raw, channel.gains)
     wild = channel.gains.use & (np.abs(white).max(axis=1) > 2.0 * channel.settings.noise.outlier)
@@ -166,7 +172,7 @@ def learn_wheel_noise(channel: WheelChannel, raw: Array) -> WheelChannel:
 
 
 def learn_body_noise(channel: BodyChannel, p: Array, extra: Array | None = None, iterations: int = 15) -> BodyChannel:
-    """The channel with the noise that is left at `p`, without outliers, and weights for what is noisier still."""
+    """Return the channel with noise estimated at `p`, without outliers, and with weights for noisier stretches."""
     geometry = p.copy()
     channel = without_outliers(replace(channel, geometry=geometry).with_noise(channel.noise), p, extra)
     channel = channel.with_noise(fit_body_noise(channel, p, extra, iterations))
@@ -226,12 +232,12 @@ def _third(t_s: Array, values: Array, window: NDArray[np.int64], use: Mask) -> A
 
 
 def _least(*differences: Array) -> float:
-    """The smallest of some bounds that enough samples give; 0 where none does."""
+    """Return the smallest standard deviation of those arrays that have enough samples; 0 where none has."""
     return min((_sigma(each) for each in differences if each.shape[0] >= _FEWEST), default=0.0)
 
 
 def _scatter(values: Array, rest: NDArray[np.int64], inside: Mask) -> float:
-    """Standard deviation of values (P, C) about the middles of their rests; 0 where the robot hardly rests."""
+    """Return the standard deviation of values (P, C) about the median of each rest; 0 if the robot hardly rests."""
     off = []
     for number in np.unique(rest[inside]):
         chosen = values[inside & (rest == number)]
@@ -242,7 +248,7 @@ def _scatter(values: Array, rest: NDArray[np.int64], inside: Mask) -> float:
 
 
 def _sigma(values: Array) -> float:
-    """Standard deviation of values about 0, single jumps clipped."""
+    """Return the standard deviation of values about 0, with single jumps clipped."""
     if not values.size:
         return 0.0
     rough = _OF_MEDIAN * float(np.median(np.abs(values)))

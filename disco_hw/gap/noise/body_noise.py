@@ -62,7 +62,7 @@ class BodyNoise:
 
     @classmethod
     def from_vector(cls, logs: Array) -> BodyNoise:
-        """The inverse of `vector`."""
+        """Return the noise whose logarithms, in the order of `vector`, are `logs` (9,)."""
         return cls(*np.exp(logs).tolist())
 
 
@@ -189,7 +189,7 @@ def _learn(c: Any, m: Any, w: Any, gain: Any) -> None:
 
 @scalar_function
 def _drift(e: Any, t: Any) -> None:
-    """Expected errors (9,) of the next sample."""
+    """Propagate the expected errors `e` (9,) to the next sample, in place."""
     e[0] += t[0] * e[2] + t[1] * e[3] + t[2] * e[4]
     e[1] += t[3] * e[2] + t[4] * e[3] + t[5] * e[4]
     e[2] += t[6] * e[5]
@@ -277,7 +277,7 @@ def _whiten(
 
 
 def _along(motion: BodyMotion) -> tuple[Array | Mask, ...]:
-    """A motion as the kernels take it."""
+    """Return the motion as the tuple of arrays that the kernels take."""
     return (
         motion.dt_s, motion.dx_m, motion.dy_m, np.cos(motion.yaw_rad), np.sin(motion.yaw_rad), motion.moving,
         motion.speed_m_s, motion.yaw_rate_rad_s, motion.restart, motion.use,

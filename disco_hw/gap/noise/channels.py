@@ -90,7 +90,7 @@ class WheelChannel:
 
     @classmethod
     def build(cls, drive: GriddedDrive, noise: WheelNoise, geometry: Array, use: Mask | None = None) -> WheelChannel:
-        """The channel with a noise model; samples where no command is known are left out.
+        """Build the channel with a noise model; samples without a known command are not used.
 
         `geometry` (3,): wheel radius, axial distance, x_icr, for effects that speak of the robot's motion.
         """
@@ -134,8 +134,9 @@ class WheelChannel:
         return replace(self, weight=weight)
 
     def evenly(self, p: Array, extra: Array | None = None) -> WheelChannel:
-        """Return the channel whose wheels err equally at every speed; errors far above a vector's residuals count less
-        (Huber, 1964).
+        """Return the channel with wheel errors of equal size at every speed, and with Huber weights.
+
+        Errors far above the root mean square of the residuals at `p` count less (Huber, 1964).
         """
         settings, samples = self.settings.noise, self.drive.encoder
         raw = self.raw_residual(p, extra)
@@ -246,7 +247,7 @@ class BodyChannel:
 
     @classmethod
     def build(cls, drive: GriddedDrive, noise: BodyNoise, geometry: Array, use: Mask | None = None) -> BodyChannel:
-        """The channel with a noise model; `geometry` is the parameter vector that describes the motion roughly.
+        """Build the channel with a noise model; the parameter vector `geometry` describes the motion roughly.
 
         `use` (P,) leaves single poses of the drive out.
         """

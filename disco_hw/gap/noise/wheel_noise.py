@@ -26,7 +26,9 @@ _START_VARIANCE = 0.04
 
 @dataclass(frozen=True, slots=True)
 class WheelNoise:
-    """Relative speed error (1) and its correlation time (s); reading error (rad); jitter of the encoder's and of the
+    """Noise of the wheels' speeds and angles, and of the time stamps of encoders and commands.
+
+    Relative speed error (1) and its correlation time (s); reading error (rad); jitter of the encoder's and of the
     command's time stamps (s); drift of the angle (rad per square root of s); slow relative speed error (1), which
     drifts with `DRIFT_S`.
     """
@@ -54,7 +56,7 @@ class WheelNoise:
 
     @classmethod
     def from_vector(cls, logs: Array) -> WheelNoise:
-        """The inverse of `vector`."""
+        """Return the noise whose logarithms, in the order of `vector`, are `logs` (7,)."""
         return cls(*np.exp(logs).tolist())
 
 
@@ -220,7 +222,7 @@ def calm_speeds(dt_s: Array, speed_rad_s: Array, settings: NoiseSettings) -> Arr
 
 
 def steady_speeds(dt_s: Array, speed_rad_s: Array, settings: NoiseSettings) -> Array:
-    """Expected measured speeds (E, 2) as long as there is no model: their mean over `steady_s` either side."""
+    """Estimate speeds (E, 2) without a model, as means of measured ones over `steady_s` on either side."""
     return _mean(dt_s, speed_rad_s, settings.steady_s, settings.fewest_steady)
 
 
@@ -259,7 +261,7 @@ def wheel_likelihood(
 
 
 def _along(motion: WheelMotion) -> tuple[Array | NDArray[np.bool_], ...]:
-    """A motion of the wheels as the kernels take it."""
+    """Return the motion of the wheels as the tuple of arrays that the kernels take."""
     return motion.dt_s, motion.speed_rad_s, motion.expected_rad_s, motion.jumps, motion.restart, motion.use
 
 

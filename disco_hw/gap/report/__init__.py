@@ -163,7 +163,7 @@ class GapReport:
         return "unexplained" if self.unnamed or self.residue or self.doubtful else "nothing_missing"
 
     def as_dict(self) -> dict[str, Any]:
-        """The content of report.json."""
+        """Return the content of report.json as a JSON-serialisable dict."""
         return {
             "verdict": self.verdict,
             "warnings": list(self.warnings),
@@ -281,7 +281,7 @@ class FleetRow:
     why_not: str = ""
 
     def as_dict(self) -> dict[str, Any]:
-        """The row in fleet.json."""
+        """Return the log's row of fleet.json as a JSON-serialisable dict."""
         report = self.report
         if report is None:
             return {"log": str(self.log), "verdict": "not_judged", "why_not": self.why_not}
@@ -303,7 +303,7 @@ class FleetRow:
         }  # fmt: skip
 
     def cells(self) -> tuple[str, ...]:
-        """The row in words, by column."""
+        """Return the row as text, one cell per column of the table."""
         report = self.report
         if report is None:
             return (str(self.log), f"not judged: {self.why_not}", *[""] * (len(_COLUMNS) - 2))
@@ -341,7 +341,7 @@ class FleetResult:
     directory: Path
 
     def as_dict(self) -> dict[str, Any]:
-        """The content of fleet.json."""
+        """Return the content of fleet.json as a JSON-serialisable dict."""
         return {"logs": [row.as_dict() for row in self.rows]}
 
     def table(self) -> str:

@@ -57,7 +57,7 @@ def at_joint_fit(part: ChannelEstimates, own_part: Part, of: Freed, joint: Joint
 
 
 def simple_model(model: Model, of: Freed, joint: JointFit) -> tuple[Model, tuple[str, ...]]:
-    """The model with what a joint fit freed of it, geometry and effects with all their parameters, and its belief."""
+    """Return the model with the geometry and effects of a joint fit and their joint Gaussian, and notes."""
     deviations = dict(zip(joint.names, np.sqrt(np.diag(joint.covariance)), strict=True))
     by_name = {}
     for name, deviation in deviations.items():
@@ -109,7 +109,7 @@ def _rescaled(term: Term, geometry: tuple[float, float]) -> float:
 def with_terms_named(
     part: ChannelEstimates, unnamed: Sequence[UnnamedTerm], geometry: tuple[float, float]
 ) -> ChannelEstimates:
-    """A channel's estimates with the numbers of its unnamed terms under their names in a model.
+    """Return a channel's estimates with the coefficients of its unnamed terms under their names in a model.
 
     They are put in units of the speeds that wheels of the final `geometry` (radius, axial distance, m) make.
     """
@@ -133,7 +133,7 @@ def amended_model(
     terms: Mapping[str, float],
     parts: tuple[ChannelEstimates, ...],
 ) -> tuple[Model, tuple[str, ...]]:
-    """The model with base parameters of `parts`, `effects` and `terms` added, and their joint Gaussian; and notes.
+    """Return the model with base parameters of `parts`, `effects`, `terms` and their joint Gaussian, and notes.
 
     `terms` has by name how far each reaches. Terms that the model has already stay, with what was believed of them, and
     reach no less far. Values outside an effect's physical range are put at its end, with a note. A time below a
@@ -185,7 +185,7 @@ def _takes_no_time(name: str, values: Mapping[str, ParameterEstimate]) -> bool:
 
 
 def _known_terms(model: Model, base: Mapping[str, float]) -> tuple[dict[str, ParameterEstimate], dict[str, float]]:
-    """The terms that a model has, with their intervals, and how far they reach, in units of the refitted `base`."""
+    """Return the terms of a model with their intervals, and their reach, in units of the refitted `base`."""
     ratios = [
         base.get(name, getattr(model, name)) / getattr(model, name) for name in ("wheel_radius_m", "axial_distance_m")
     ]

@@ -88,12 +88,15 @@ def is_blind(name: str, size: float | None) -> bool:
 
 
 def _realistic(parameter: Parameter) -> float:
-    """A size that real robots show; an effect whose smallest visible size is above it is one this log is blind to."""
+    """Return the size of a parameter that real robots show; infinity if none is known.
+
+    A log is blind to an effect that is visible above that size only, or to a limit that is visible below it only.
+    """
     return math.inf if parameter.realistic is None else parameter.realistic
 
 
 def experiment_of(name: str) -> str:
-    """The drive that shows an effect, as it is typed, and what it is."""
+    """Return the command line of the drive that shows an effect, and a description of that drive."""
     effect = REGISTRY[name]
     return f"disco-hw drive ROBOT.toml --script {effect.script}: {effect.excitation}"
 
@@ -118,7 +121,7 @@ def _limit(found: ChannelResult, name: str, top_rad_s: float | None) -> BlindSpo
 def _largest(
     wheels: WheelChannel, limited: Callable[[Array, tuple[float, float]], Array], geometry: tuple[float, float]
 ) -> float | None:
-    """The largest limit that cuts at least half a second of the commands."""
+    """Return the largest limit that cuts half a second of the commands; None if these are too few or too small."""
     command = wheels.drive.command_rad_s
     size = limited(command[np.isfinite(command[:, 0])], geometry)
     if size.size < 200 or size.max() < 1e-3:
@@ -127,7 +130,10 @@ def _largest(
 
 
 def _largest_tried(found: ChannelResult, effect: Effect) -> float | None:
-    """The largest of a limit's trials that would have shown, with what makes wheels late, as that may hide it."""
+    """Return the largest of a limit's trial values that this log would have shown, or None.
+
+    Parameters of the fit and the delays of the wheels may adapt, as they may hide the limit.
+    """
     channel, best = found.selector.channel, found.fit
     layout, limits = channel.layout, found.selector.thresholds
     places = tuple(
@@ -208,7 +214,10 @@ _BOLDEST = 10.0
 
 
 def boldest_claims(spots: Iterable[BlindSpot], most: int) -> tuple[BlindSpot, ...]:
-    """The claims that are furthest below what real robots show, and are no other effect's by algebra."""
+    """Return the claims, `most` at most, whose visible sizes are furthest below those that real robots show.
+
+    Effects that equal another one algebraically are left out.
+    """
     claims = [spot for spot in spots if spot.smallest_visible is not None and not spot.blind and _boldness(spot)]
     claims = [spot for spot in claims if REGISTRY[spot.name].mimics is None]
     return tuple(sorted(claims, key=_boldness, reverse=True)[:most])
@@ -317,7 +326,7 @@ def _boldness(spot: BlindSpot) -> float:
 
 
 def finder(analysis: GapAnalysis) -> Finds:
-    """The search of the channel in which an effect acts, on the log with the effect put in."""
+    """Return a function that puts an effect into the log and reports whether the search of its channel finds it."""
 
     def finds(spot: BlindSpot, size: float) -> bool:
         of_body = f"{spot.name}.{spot.parameter}" in BODY.place
@@ -337,7 +346,7 @@ def finder(analysis: GapAnalysis) -> Finds:
 
 
 def with_size(found: ChannelResult, name: str, size: float) -> Array:
-    """The parameter vector of what a channel's search found, with an effect of this size on top."""
+    """Return the parameter vector that a channel's search found, with the effect `name` set to `size`."""
     channel, candidate, vector = found.selector.channel, CANDIDATES[name], found.fit.vector.copy()
     if candidate.profile is not None:
         values = candidate.profile.values(channel)
@@ -347,7 +356,7 @@ def with_size(found: ChannelResult, name: str, size: float) -> Array:
 
 
 def with_effect(drive: GriddedDrive, found: ChannelResult, vector: Array) -> GriddedDrive:
-    """A drive as it would have been measured, noise and all, had the robot been that of another parameter vector.
+    """Return the drive as it would have been measured, noise included, from a robot with the parameters `vector`.
 
     The difference of two free runs, at `vector` and at what was found, is put on what was measured: on the wheels'
     angles or, motion by motion, on the poses. What one free run drifts from the measured path does not enter.

@@ -60,7 +60,7 @@ def _worst_stretch(wheels: ChannelResult) -> bytes:
 
 
 def _legend_beside(axes: Axes) -> None:
-    """A legend to the right of the axes, that covers nothing."""
+    """Place a legend to the right of the axes, where it covers nothing."""
     axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0, fontsize=9)
 
 
@@ -139,7 +139,7 @@ def disagreement(title: str, regimes: list[Regime]) -> bytes:
 
 
 def stretch(t_s: Array, measured: Array, before: Array, after: Array, label: str) -> bytes:
-    """The stretch of the log in which model and measurement differ most."""
+    """Plot the stretch of the log in which model and measurement differ most, as a PNG image."""
     figure = Figure(figsize=(9.0, 2.8))
     axes = figure.add_subplot()
     axes.plot(t_s, measured, color="black", linewidth=1.4, label="measured")

@@ -47,7 +47,7 @@ _PLACES = {2: ("first half of the log", "second"), 3: ("first third of the log",
 
 
 def effect_findings(analysis: GapAnalysis, final: FinalFit, given: bool = False) -> tuple[EffectFinding, ...]:
-    """The effects that are missing, in order of evidence; with those `given` in the model, if asked."""
+    """Return the missing effects, most evident first; if `given`, also those that the model already has."""
     only = final.encoder_is_cause
     out: list[EffectFinding] = []
     for found, estimated in ((analysis.body, final.body_estimates), (analysis.wheels, final.wheel_estimates)):
@@ -239,8 +239,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Measured:
-    """Measured facts against which findings are checked: the drive, its geometry (radius and axial distance, m), and
-    names that the residuals dispute, with the reason.
+    """Measured facts against which findings are checked.
+
+    The drive, its geometry (radius and axial distance, m), and names that the residuals dispute, with the reason.
     """
 
     drive: GriddedDrive
@@ -317,8 +318,9 @@ def _at_end(parameter: Parameter, value: float, settings: ReportSettings) -> boo
 
 
 def is_weakly_known(parameter: Parameter, estimate: ParameterEstimate, settings: ReportSettings) -> bool:
-    """Whether an interval is so wide that the value says little: wider than how far it is from neutral, nearly so of a
-    limit.
+    """Whether an interval is so wide that the estimated value says little.
+
+    Its half width is compared with the distance of the value from neutral; of a limit, with `limit_share` of the value.
     """
     half = 0.5 * (estimate.high - estimate.low)
     limits = math.isinf(parameter.neutral)

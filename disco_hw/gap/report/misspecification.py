@@ -86,8 +86,9 @@ def _perturbation_of(split: Split, name: str, channel: BodyChannel) -> Array:
 
 
 def _velocity(channel: BodyChannel, vector: Array, extra: Array | None) -> Array:
-    """Velocity of the point of the axle that rolls, in the body's frame, at the nodes of a free run, (M, 3); zero where
-    a run ends.
+    """Return the velocity of the axle's rolling point in the body's frame, (M, 3) in m/s, m/s and rad/s.
+
+    It is that of a free run at the nodes, and zero where a run ends.
     """
     track = channel.track(vector, extra)
     step = np.diff(track, axis=0, append=track[-1:])
@@ -100,7 +101,7 @@ def _velocity(channel: BodyChannel, vector: Array, extra: Array | None) -> Array
 
 
 def _middle(perturbation: Array, lever_m: float) -> tuple[float, int]:
-    """The size below which half of what an effect does is done, and the axis it acts on most."""
+    """Return the power-weighted median size of a perturbation (M, 3) on its strongest axis, and that axis."""
     power = (perturbation * (1.0, 1.0, lever_m)) ** 2
     axis = int(np.argmax(power.sum(axis=0)))
     size = np.sort(np.abs(perturbation[:, axis]))
@@ -120,7 +121,7 @@ _OPPOSITES = (
 
 
 def disputed_names(found: ChannelResult) -> dict[str, str]:
-    """Accepted effects that act like what is missing and cannot be it, each with the reason."""
+    """Return accepted effects that act like what is missing and cannot be it, each with the reason."""
     out = {}
     for name in found.names:
         if name in found.selector.given:
@@ -179,8 +180,9 @@ def _has_equal_alternative(found: ChannelResult, name: str) -> str | None:
 
 
 def _alike(found: ChannelResult, name: str, places: Iterable[int]) -> float:
-    """Share of what a term does to the residuals, to first order, that a name can do too; `places`: its coefficients
-    among those of all terms.
+    """Return the share of a term's effect on the residuals that a named effect can reproduce, to first order.
+
+    `places`: the term's coefficients among those of all terms.
     """
     best, layout = found.fit, found.selector.channel.layout
     first = len(found.channel.layout.columns)
@@ -314,7 +316,7 @@ def regimes(
 
 
 def describe(found: list[Regime], excess: float) -> str:
-    """The regimes that disagree most, with more than `excess` times the mean square of noise, for a person."""
+    """Describe the regimes that disagree most, with more than `excess` times the mean square of noise."""
     loud = [regime for regime in found if regime.before > excess]
     if not loud:
         return "nowhere more than noise"

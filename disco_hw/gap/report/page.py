@@ -15,7 +15,7 @@ from disco_hw.gap.settings import DEFAULT_SETTINGS, ReportSettings
 
 
 def other_known_symptoms(effect: EffectFinding, settings: ReportSettings = DEFAULT_SETTINGS.report) -> tuple[str, ...]:
-    """The parameters of a missing effect that say something by themselves, and are known."""
+    """Return the parameters of a missing effect that have symptoms of their own and are known well enough."""
     described = {parameter.name: parameter for parameter in REGISTRY[effect.name].parameters}
     by_themselves = dict(REGISTRY[effect.name].other_symptoms)
     return tuple(
@@ -37,7 +37,7 @@ _MOST_NAMES = 3
 
 
 def summary_lines(report: GapReport) -> list[str]:
-    """The answer in at most ten lines, for somebody who drives the robot.
+    """Summarise the report in at most ten lines, for the operator of the robot.
 
     What is missing and how sure that is, how much it matters, what is left, which model to drive with, what to do next.
     """
@@ -104,7 +104,7 @@ def _gap_line(report: GapReport) -> str:
 
 
 def as_text(report: GapReport) -> str:
-    """The report for a terminal."""
+    """Format the report as text for a terminal."""
     lines = [*(f"warning: {warning}" for warning in report.warnings), *summary_lines(report), ""]
     for effect in report.effects:
         values = ", ".join(f"{n} {e.value:.4g} [{e.low:.4g}, {e.high:.4g}]" for n, e in effect.parameters.items())
@@ -142,7 +142,7 @@ def _in_cell(errors: PredictionErrors) -> str:
 
 
 def _describe(term: UnnamedFinding) -> str:
-    """The equation of a term, and what it means where that is known."""
+    """Format the equation of a term, followed by its meaning where that is known."""
     return term.form if term.meaning is None else f"{term.form} ({term.meaning})"
 
 
@@ -208,7 +208,7 @@ def page(report: GapReport) -> str:
 
 
 def _with_code(line: str) -> str:
-    """A line as HTML, what stands between backticks as code."""
+    """Convert a line to HTML, with text between backticks as code."""
     pieces = escape(line).split("`")
     return "".join(f"<code>{piece}</code>" if k % 2 else piece for k, piece in enumerate(pieces))
 

@@ -83,7 +83,7 @@ class Remains:
         return f"{said} Most of the rest is {where}.".strip()
 
     def as_dict(self) -> Mapping[str, object]:
-        """The content of `remains` in report.json."""
+        """Return the content of `remains` in report.json."""
         position, heading = self.closed
         return {
             "closed_position": position,

@@ -251,7 +251,7 @@ class _Evaluated:
         return self.errors.position_m * self.errors.yaw_rad
 
     def fit(self, ahead: Ahead) -> JointFit:
-        """The fit of all data that predicts them best, of those from where the candidate begins and from each fold's.
+        """Return the best fit of all data, of those begun at the candidate's values and at each fold's fit.
 
         From a start far off the whole log may end where no fold does.
         """
@@ -261,10 +261,10 @@ class _Evaluated:
 
 
 def of_every_log(analysis: GapAnalysis, final: FinalFit) -> GapAnalysis:
-    """The analysis without what the pose source does in this log only.
+    """Return the analysis without effects of the pose source that may hold for this log only.
 
-    Poses of a clock that runs unevenly are late by what the next log need not show, and so is any effect of the sensor
-    that is as well none there: the interval of each parameter holds it.
+    These are delays of poses whose clock runs unevenly, and effects with the neutral value of each parameter inside its
+    interval.
     """
     estimated = {} if final.body_estimates is None else final.body_estimates.by_name
     for which, name in least_evident_first(analysis):
@@ -279,11 +279,11 @@ def of_every_log(analysis: GapAnalysis, final: FinalFit) -> GapAnalysis:
 
 
 def _needed(analysis: GapAnalysis, timed: _Fitted, ahead: Ahead, apart: StagePredictions) -> _Evaluated:
-    """The candidate that has what predictions need of all that was found.
+    """Return the candidate reduced to what predictions need of all that was found.
 
-    What goes, the least evident first, is what held-out data are predicted as well without as by the best, within one
-    standard error (Breiman et al., Classification and Regression Trees, 1984, ch. 3): what a log does not need is as
-    likely of this log alone.
+    Effects and terms are dropped, the least evident first, where held-out errors stay within one standard error of the
+    best candidate's (Breiman et al., Classification and Regression Trees, 1984, ch. 3). What predictions do not need
+    may hold for this log only.
     """
     of_channels = _Candidate.of_channels(analysis, apart)
     kept = of_channels.evaluate(ahead, apart)
@@ -390,7 +390,7 @@ def _chains(analysis: GapAnalysis, final: FinalFit, by_fold: Mapping[int, Sequen
 
 
 def _chain(analysis: GapAnalysis, final: FinalFit, vectors: Sequence[Array]) -> Chain:
-    """A chain of the channels' vectors; where it is the encoders that count wrong, the wheels turn as commanded."""
+    """Return the chain of the channels' vectors, without gains of the wheels where the encoders count wrong."""
     assert analysis.body is not None
     core, perturbation = _split(analysis.body, vectors[0])
     wheels = analysis.wheels
@@ -412,7 +412,7 @@ def _split(found: ChannelResult, vector: Array) -> tuple[Array, Array | None]:
 
 
 def prune(analysis: GapAnalysis) -> GapAnalysis:
-    """The analysis without what makes its held-out predictions worse."""
+    """Return the analysis with what makes its held-out predictions worse removed or replaced."""
     if analysis.body is None:
         return analysis
     settings = analysis.drive.settings.prediction

@@ -228,7 +228,7 @@ def lacking_one(analysis: GapAnalysis) -> Iterator[GapAnalysis]:
 
 
 def lacking(analysis: GapAnalysis, which: str, name: str | None) -> GapAnalysis:
-    """An analysis without a name in one of its channels, or without the terms there."""
+    """Return the analysis without one effect of a channel, or without its unnamed terms if `name` is None."""
     found: ChannelResult = getattr(analysis, which)
     if name is not None:
         rest = tuple(other for other in found.names if other != name)

@@ -73,7 +73,7 @@ class ChannelResult:
 
 
 def _evenly(found: ChannelResult) -> Fit | None:
-    """The accepted set, fitted to errors that are alike at every speed; None but of wheels."""
+    """Fit the accepted set with wheel errors alike at every speed; None for the body or without free parameters."""
     best, channel = found.fit, found.channel
     if not isinstance(channel, WheelChannel) or not best.active:
         return None
@@ -87,7 +87,9 @@ def _evenly(found: ChannelResult) -> Fit | None:
 
 
 def _reported_fit(found: ChannelResult) -> Fit:
-    """The accepted set as it was fitted, or to errors that are alike at every speed, if blocks agree better on that.
+    """Return the fit whose values are reported: the accepted one or the one with errors alike at every speed.
+
+    The second is taken if blocks of time agree clearly better on it.
 
     The noise of wheels is taken to grow with their speed, and weighs slow ones most. What the accepted set cannot
     describe does not: then values are as good as least squares of speeds make them, by the scatter between blocks
@@ -102,7 +104,7 @@ def _reported_fit(found: ChannelResult) -> Fit:
 
 
 def deviations_of(best: Fit, channel: ResidualChannel) -> Array:
-    """Standard deviations of what was fitted, (A,), by how blocks of time scatter."""
+    """Return standard deviations (A,) of the fitted parameters, from the scatter between blocks of time."""
     factors = [inflation(best, channel, (index,)) for index in best.active]
     return np.asarray(np.sqrt(np.maximum(np.diag(best.covariance()) * factors, 1e-300)))
 

@@ -87,7 +87,7 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
 
 
 def _on_own_clock(drive: GriddedDrive) -> GriddedDrive:
-    """A drive as if commands and poses were stamped where they lie.
+    """Return the drive as if its commands and poses were stamped at the times to which they were moved.
 
     So a search is the same wherever their stamps are, to the last bit.
     """
@@ -115,7 +115,7 @@ def stamped(found: ChannelResult, drive: GriddedDrive) -> ChannelResult:
 
 
 def _later(vector: Array, drive: GriddedDrive, layout: Layout, times: float) -> Array:
-    """A vector with a delay longer by so many times what commands or poses were moved by."""
+    """Return the vector with a delay longer by `times` the time by which commands or poses were moved."""
     moved, by_s = vector.copy(), drive.commands_moved_s if layout.of_wheels else drive.poses_moved_s
     moved[[layout.place[column] for column in delay_columns(layout)]] += times * by_s
     return moved
@@ -355,9 +355,10 @@ def _extended(plain: Selector, channel: WithTerms) -> Array:
 
 
 def best_terms(small: Fit, channel: ResidualChannel, options: Iterator[Term]) -> tuple[list[Term], int]:
-    """The terms that promise most to first order on top of a fit, if they may be worth it, and how many were tried.
+    """Find the terms that gain most to first order on top of a fit; return them and how many were tried.
 
-    Of the discs of the floor, which are variations of one another, only the best.
+    Terms that are not worth a fit are left out. Of the discs of the floor, which are variations of one another, only
+    the best is kept.
     """
     settings = channel.settings.terms
     promising: list[tuple[float, Term]] = []

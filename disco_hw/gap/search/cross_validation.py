@@ -120,8 +120,10 @@ class Chain:
 
 
 def smoothed_poses(channel: BodyChannel, p: Array) -> tuple[Array, Array]:
-    """Poses at all nodes (M, 3): averaged over `pose_reach_s` along the wheels' path, and from the nearest
-    sample alone.
+    """Return the poses at all nodes, smoothed along the wheels' path, and those from the nearest sample alone.
+
+    Both are (M, 3) in m, m and rad, and NaN where no sample is near. Smoothing averages over `pose_reach_s` on
+    either side.
     """
     drive, samples = channel.drive, channel.samples
     reach_s = channel.settings.prediction.pose_reach_s
@@ -163,7 +165,7 @@ def smoothed_poses(channel: BodyChannel, p: Array) -> tuple[Array, Array]:
 
 
 def find_starts(channel: BodyChannel, poses: tuple[Array, Array], ahead_s: float) -> Starts:
-    """Starts of predictions every 0.2 s where poses and commands are known."""
+    """Return the starts of predictions, `start_every_s` apart, where poses and commands are known."""
     drive = channel.drive
     known = np.isfinite(drive.command_rad_s[:, 0]) if drive.has_commands else np.ones(drive.t_s.size, dtype=bool)
     smooth, alone = poses
@@ -248,7 +250,7 @@ def prediction_error(body: BodyChannel, starts: Starts, p: Array, track: Array, 
 
 
 def fold_of(channel: BodyChannel | WheelChannel) -> Index:
-    """The fold (n,) of each residual of a channel."""
+    """Return the fold (n,) of each residual of a channel."""
     folds = channel.drive.folds
     fold: Index = channel.block // round(folds.stretch_s / channel.settings.grid.block_s) % folds.count
     return fold
@@ -363,7 +365,10 @@ Angles = dict[int, Array]
 
 
 def only_timed(found: ChannelResult) -> ChannelResult:
-    """The wheels with a delay and a lag in place of what was found: what a careful engineer fits by hand."""
+    """Return the result of the wheels with only a delay and a lag in place of what was found.
+
+    A careful engineer fits the same by hand.
+    """
     plain = found.plain or found.selector
     names = tuple(dict.fromkeys((*plain.given, *DELAY_NAMES)))
     selector = replace(plain, fits=dict(plain.fits), proofs={})

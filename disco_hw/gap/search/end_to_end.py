@@ -58,11 +58,11 @@ class Freed:
     chain: Callable[[Sequence[Array]], Chain]
 
     def joined(self, of: Callable[[Part], Array]) -> Array:
-        """The freed entries of a vector of each channel, one after the other, (A,)."""
+        """Concatenate the freed entries of the vectors that `of` returns for the channels, (A,)."""
         return np.concatenate([of(part)[list(part.active)] for part in self.parts])
 
     def vectors(self, values: Array) -> list[Array]:
-        """The channels' vectors with freed values (A,)."""
+        """Return the channels' vectors with their freed entries set to `values` (A,)."""
         counts = np.cumsum([len(part.active) for part in self.parts])
         out = [part.vector.copy() for part in self.parts]
         for vector, part, values_of_part in zip(out, self.parts, np.split(values, counts[:-1]), strict=True):
@@ -112,7 +112,10 @@ class Ahead:
 
     @classmethod
     def of(cls, body: BodyChannel, wheels: WheelChannel | None, poses: tuple[Array, Array]) -> Ahead:
-        """The predictions of a drive from smoothed `poses`, as far ahead as the settings say, or runs are long."""
+        """Build the predictions of a drive from smoothed `poses`, over half and all of the reported horizon.
+
+        Horizons are shorter where runs are.
+        """
         longest_s = scored_horizon_s(body, poses)
         usual_s = body.settings.prediction.reported_horizon_s
         horizons = sorted({min(ahead_s, longest_s) for ahead_s in (0.5 * usual_s, usual_s)})
@@ -134,8 +137,9 @@ class Ahead:
         return sum(float(np.log(_usual(error)[1:]).sum()) for error in self.errors(chain))
 
     def fit(self, of: Freed, left_out: int | None = None, begin: Sequence[Array] | None = None) -> JointFit:
-        """The freed values that predict best, one of the folds `left_out` or none; they `begin` at other vectors or at
-        those that they are trusted about.
+        """Fit the freed entries so that they predict best, without the fold `left_out` if there is one.
+
+        The fit begins at the vectors `begin`, or else at those on which the prior is centred.
 
         Errors of position and of heading are each measured in what they usually are at the start of a round; large ones
         count linearly (Huber, 1964). Neighbouring predictions overlap, so that each counts for the time it adds.

@@ -52,7 +52,7 @@ class Fit:
         return np.asarray(self.jacobian.T @ self.residual)
 
     def information(self) -> Array:
-        """Normal matrix, (A, A), with what was expected."""
+        """Return the normal matrix (A, A) of the residuals, plus the precision of the prior."""
         return self.normal if self.precision is None else self.normal + np.diag(self.precision)
 
     def covariance(self) -> Array:
@@ -71,8 +71,9 @@ def inverse(matrix: Array) -> Array:
 
 
 def within(covariance: Array, low: Array, high: Array) -> Array:
-    """A covariance (A, A) of entries of which no more is unknown than where in their ranges, `low` to `high` (A,), they
-    lie: the standard deviation is that of an even distribution there at most.
+    """Limit the covariance (A, A) of entries that lie in the ranges from `low` to `high` (A,).
+
+    A standard deviation is at most that of a uniform distribution over the range; correlations stay.
     """
     deviations = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     share = np.minimum(1.0, (high - low) / 12.0**0.5 / deviations)
@@ -95,7 +96,7 @@ def jacobian(
     base: Array,
     known: Mapping[int, Array] | None = None,
 ) -> Array:
-    """Derivative of the residual by differences within bounds, (n, A); `base` is the residual at `vector`.
+    """Return the derivative (n, A) of the residual by differences within bounds; `base` is the residual at `vector`.
 
     `known`: columns (n,) of entries for which they were taken before, at the same vector.
     """
@@ -113,7 +114,7 @@ def jacobian(
 
 
 def sensitivity(channel: ResidualChannel, vector: Array, places: tuple[int, ...], residual: Array) -> Array:
-    """Derivative of a channel's residual with respect to some entries, (n, len(places))."""
+    """Return the derivative of a channel's residual with respect to some entries, (n, len(places))."""
     return jacobian(channel.residual, vector, places, channel.layout, residual)
 
 
@@ -201,13 +202,19 @@ def _as_promised(gained: float, gradient: Array, normal: Array, step: Array, set
 
 
 def _carried(slope: Array, step: Array, change: Array, scale: Array) -> Array:
-    """Derivatives (n, A) that give the `change` (n,) of residuals over a step (A,), and are else as they were."""
+    """Update derivatives (n, A) by a rank-one term, so that a step (A,) gives the `change` (n,) of residuals.
+
+    Along directions orthogonal to the scaled step they stay as they were (Broyden, 1965).
+    """
     along = scale * step
     return np.asarray(slope + np.outer(change - slope @ step, along / float(along @ step)))
 
 
 def by_block(found: Fit, block: Index, blocks_each: int = 1) -> tuple[Array, Array]:
-    """Normal matrices (B, A, A) and gradients (B, A) by block of time, `blocks_each` neighbouring blocks as one."""
+    """Return normal matrices (B, A, A) and gradients (B, A) by block of time.
+
+    `blocks_each` neighbouring blocks count as one.
+    """
     label = np.unique(block // blocks_each, return_inverse=True)[1]
     sizes, width = np.bincount(label), len(found.active)
     normal, gradient = np.zeros((sizes.size, width, width)), np.zeros((sizes.size, width))

@@ -30,7 +30,9 @@ Array = NDArray[np.float64]
 
 
 def learn_saturated_wheels(channel: WheelChannel, vector: Array) -> tuple[WheelChannel, Array, int]:
-    """The channel with the noise its richest model leaves, the residual (E, 2) of that, how many parameters it had.
+    """Estimate the noise of the wheels that the channel's richest model leaves.
+
+    Return the channel with that noise, the residual (E, 2) of the model, and the number of its parameters.
 
     `vector`: the fit of the smooth effects; on top come any static response of a wheel, quick and slow ones, limited
     changes of speed and the other wheel's influence, each as speed of the wheel itself.
@@ -66,7 +68,10 @@ def learn_saturated_wheels(channel: WheelChannel, vector: Array) -> tuple[WheelC
 def learn_saturated_body(
     channel: BodyChannel, names: tuple[str, ...], vector: Array, perturbations: Iterable[Array]
 ) -> tuple[BodyChannel, Array, Array, int]:
-    """The channel with the noise its richest model leaves, that model's vector, what it adds, its parameters' number.
+    """Estimate the noise of the body that the channel's richest model leaves.
+
+    Return the channel with that noise, the model's vector, the perturbation (M, 3) that it adds, and the number of its
+    parameters.
 
     `names`: effects whose entries are free; `vector` where they were fitted; `perturbations` (M, 3) each.
     """
@@ -194,7 +199,7 @@ class Candidate:
 
 
 def driven(channel: ResidualChannel) -> CommandedDrive:
-    """The drive of a channel as effects see it."""
+    """Return the commanded drive of a channel as effects see it."""
     inner = channel.inner
     commands, geometry = inner.drive.command_rad_s, inner.geometry
     t_s = inner.samples.t_s if isinstance(inner, BodyChannel) else inner.drive.t_s
@@ -212,12 +217,12 @@ def delay_columns(layout: Layout) -> tuple[str, ...]:
 
 
 def delays_of(layout: Layout) -> tuple[str, ...]:
-    """The effects that do."""
+    """Return the effects that delay one side of a channel against the other."""
     return tuple(column.partition(".")[0] for column in delay_columns(layout))
 
 
 def with_delay(channel: ResidualChannel, vector: Array) -> Array:
-    """A parameter vector with the delay of commands or poses as it is at first sight."""
+    """Return a parameter vector with the first estimate of the delay of commands or poses."""
     delayed, layout, drive = vector.copy(), channel.layout, channel.inner.drive
     places = [layout.place[column] for column in delay_columns(layout)]
     seen_s = drive.commands_moved_s if layout.of_wheels else drive.pose_delay_s
@@ -278,7 +283,7 @@ def smooth_of(layout: Layout) -> tuple[str, ...]:
 
 
 def parameters_of(names: tuple[str, ...]) -> int:
-    """Number of parameters of a set of effects."""
+    """Return the number of parameters of a set of effects."""
     return sum(CANDIDATES[name].parameters for name in names)
 
 

@@ -242,14 +242,14 @@ class Selector:
         return self.channel.settings.selection
 
     def exact(self, names: Names) -> Fit:
-        """The best fit of a set, as close as fits are made: what is told and proved rests on it."""
+        """Return the best fit of a set to full accuracy, as results that are reported and proved need."""
         found = self.fit(names)
         if found.loose:
             found = self.fits[frozenset(names)] = fit(self.channel, found, found.active)
         return found
 
     def fit(self, names: Names) -> Fit:
-        """The best fit of a set, started from the best smaller ones known; as close as it takes to compete."""
+        """Return the best fit of a set, begun at the best known subsets, as accurate as a comparison needs."""
         key = frozenset(names)
         if key not in self.fits:
             if key <= frozenset(self.given):
@@ -453,8 +453,9 @@ class Selector:
         return float(self.fit(names).cost + 0.5 * parameters_of(names) * np.log(self.channel.count))
 
     def swapped(self, accepted: Names, among: Names | None = None) -> Names:
-        """Replace single effects, or only those `among` some by others of these, as long as that fits better by more
-        than the parameters' price.
+        """Replace single effects by others as long as that gains more than the price of the parameters.
+
+        `among` limits which effects are replaced, and by which.
         """
         for _ in range(len(accepted)):
             best, score = accepted, self.settings.swap_nats
@@ -487,8 +488,9 @@ class Selector:
         return float(self.fit(rest).cost - self.fit(accepted).cost - price)
 
     def needed(self, accepted: Names, among: Names | None = None) -> Names:
-        """Drop effects, or only those `among` some, that the others have made unnecessary, of several first the one
-        that is missed least.
+        """Drop effects that the others have made unnecessary, the one that is missed least first.
+
+        `among` limits which effects may be dropped.
         """
         idle = []
         for name in accepted:

@@ -61,7 +61,10 @@ class Term:
         return (self.perturbation, *self.further_waves)
 
     def written(self, coefficients: Array) -> str:
-        """The form with its number, from one coefficient a feature: of waves the root of their mean square."""
+        """Format the equation with its coefficient, or for waves with the root mean square of their sum.
+
+        `coefficients`: one per feature.
+        """
         size = float(coefficients[0]) if not self.further_waves else float(np.sqrt(0.5 * (coefficients**2).sum()))
         return self.form.format(size)
 
@@ -141,7 +144,7 @@ def _waves(drive: GriddedDrive, v: Array, w: Array) -> Iterator[Term]:
 
 
 def with_known_terms(drive: GriddedDrive, effects: Iterable[EffectSetting], p: Array, delay_s: float) -> GriddedDrive:
-    """The drive with what the terms among a given model's effects add; `p` is its vector of the body."""
+    """Return the drive with what the terms among `effects` add; `p` is the parameter vector of the body."""
     u, (v, w, a) = drive.delayed_commands(delay_s), motion(drive, p)
     command = motion_perturbation = None
     for setting in effects:
@@ -165,21 +168,21 @@ def _times(setting: EffectSetting, feature: Array) -> Array:
 
 
 def _of_commands(term: GenericTerm, u: Array, t_s: Array) -> Array:
-    """The feature of a term of commands (M, 2) at the nodes."""
+    """Evaluate the feature of a term of the commands at the nodes, (M, 2)."""
     if term.memory is not None:
         return term.memory.at_nodes(GRID_STEP_S, u, u[:, ::-1])
     return np.asarray(COMMAND_FEATURES[term.feature](u, u[:, ::-1], t_s[:, None]))
 
 
 def _of_body(term: GenericTerm, v: Array, w: Array, a: Array, t_s: Array) -> Array:
-    """The feature of a term of the body (M,) at the nodes."""
+    """Evaluate the feature of a term of the body at the nodes, (M,)."""
     if term.memory is not None:
         return term.memory.at_nodes(GRID_STEP_S, v, w)
     return np.asarray(BODY_FEATURES[term.feature](v, w, a, t_s))
 
 
 def _with_place(name: str) -> str:
-    """A term's equation with a place for the number in place of the k."""
+    """Replace the k in a term's equation by a format field for its value."""
     return name.replace("+= k ", "+= {:.4g} ")
 
 
@@ -317,7 +320,10 @@ class WithTerms:
         return self.inner.trusted_blocks
 
     def split(self, p: Array) -> tuple[Array, Array | None]:
-        """The inner channel's vector, and what the terms add at the nodes, not to be written to."""
+        """Split a vector into that of the inner channel and what the terms add at the nodes.
+
+        The second array is shared by later calls: do not write to it.
+        """
         width = len(self.inner.layout.columns)
         coefficients = p[width:]
         key = coefficients.tobytes()
