@@ -19,10 +19,10 @@ REAL_TIME = ("tests/hil/", "tests/firmware_protocol/emulated/")
 STANDING = tuple(f"tests/hil/test_{name}.py" for name in ("check", "held_up", "path", "waiting"))
 TESTS = Path(__file__).parent
 # With `--dist each` a worker reads and runs only its own folders, as reading all tests takes as long as a tenth of them
-# does to run. The first has the stacks in real time, one the folders that compute most, and the last all others.
+# does to run. The first has the stacks in real time; the others are what takes about equally long.
 PARTS = (
     ("hil", "firmware_protocol/emulated"),
-    ("adaptation", "control", "estimation", "gap", "inference", "model", "tasks"),
+    ("adaptation", "control", "estimation", "gap", "inference", "log", "model", "tasks", "tools", "viewer"),
 )
 
 
