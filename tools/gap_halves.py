@@ -34,7 +34,7 @@ from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search import joint_predictions
 from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, final_fit
-from disco_hw.gap.search.channel_result import estimate_parameters, sampling_covariance
+from disco_hw.gap.search.channel_result import estimate_parameters
 from disco_hw.gap.search.cross_validation import (
     Chain,
     PredictionErrors,
@@ -68,7 +68,7 @@ GROUPS: dict[str, Callable[[str], bool]] = {
 class Half:
     """What a half of a log, or a log, taught: the stage offered, and by stage the errors 2 s ahead on another one.
 
-    `away`: by parameter how far that one's value lies from its own, in standard deviations of the difference.
+    `away`: by parameter how far that one's value lies from its own, in standard deviations of its interval.
     """
 
     learnt_from: str
@@ -128,11 +128,11 @@ def unseen_errors(drive: GriddedDrive, models: dict[str, Model], ahead_s: float 
 
 
 def values_away(analysis: GapAnalysis, final: FinalFit, other: GapAnalysis) -> dict[str, float]:
-    """How far another half's value of a parameter lies from its own, in standard deviations of the difference.
+    """How far another half's value of a parameter lies from its own, in standard deviations of the interval.
 
-    An interval says where the value of another half is expected. What that half says of it errs, too: its variance
-    is added. Of the parameters that the other half knows at least half as well; not of how late poses of a clock
-    are that is said to run unevenly, which is each log's own.
+    An interval says where the value is expected that another half gives, errors and all. Of the parameters that the
+    other half knows at least half as well; not of how late poses of a clock are that is said to run unevenly, which is
+    each log's own.
     """
     away = {}
     uneven = not (analysis.drive.pose_clock_even and other.drive.pose_clock_even)
@@ -146,13 +146,12 @@ def values_away(analysis: GapAnalysis, final: FinalFit, other: GapAnalysis) -> d
         selector = there.plain or there.selector
         alike = replace(there, selector=selector, names=found.names, plain=None, unnamed=())
         same = estimate_parameters(alike)
-        sampled = dict(zip(same.fitted, np.diag(sampling_covariance(alike)) ** 0.5, strict=True))
         for name, estimate in own.by_name.items():
             value = same.by_name.get(name)
             if name not in of_this_log and value is not None and value.deviation <= 2.0 * estimate.deviation:
                 apart = value.value - estimate.value
                 reach = estimate.high - estimate.value if apart > 0.0 else estimate.value - estimate.low
-                away[name] = apart / max(np.hypot(reach / Z95, sampled.get(name, value.deviation)), 1e-12)
+                away[name] = apart / max(reach / Z95, 1e-12)
     return away
 
 

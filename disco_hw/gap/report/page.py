@@ -167,7 +167,7 @@ _DEFINITIONS = {
     "floor": "what the noise of the sensors makes of a perfect model",
     "held out": "predicted by what was fitted on other stretches of the log",
     "evidence": "twice the gain in log likelihood, less the price of the parameters",
-    "95 %": "an interval that holds the value in 95 of 100 such drives",
+    "95 %": "an interval that holds the value of another drive as long, under the same conditions, in 95 of 100",
 }
 
 

@@ -137,18 +137,15 @@ class ChannelEstimates:
     covariance: Array
 
 
-def sampling_covariance(found: ChannelResult) -> Array:
-    """Covariance (A, A) of what a channel's accepted set frees, as an estimate of the values of this log."""
-    best, channel = found.reported, found.selector.channel
-    factors = np.array([interval_inflation(best, channel, (index,)) for index in best.active])
-    return np.asarray(best.covariance() * np.sqrt(np.outer(factors, factors)))
-
-
 def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
-    """Intervals of all parameters that a channel's accepted set frees: where the next drive's values are expected."""
+    """Return intervals of all parameters that a channel frees: where the values of another drive are expected.
+
+    What another drive gives errs as much as what this one gives; of several logs together, as much as each of them.
+    """
     best, channel = found.reported, found.selector.channel
-    columns = channel.layout.columns
-    covariance = sampling_covariance(found)
+    columns, drives = channel.layout.columns, _drives(channel)
+    factors = np.array([drives * interval_inflation(best, channel, (index,)) for index in best.active])
+    covariance = best.covariance() * np.sqrt(np.outer(factors, factors))
     variances = np.maximum(np.diag(covariance), 1e-300)
     wandering, apart, stamped = drifted(found), _weightings_apart(found), _stamped(found)
     more = np.array(
@@ -169,6 +166,14 @@ def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
         if profile is not None:
             by_name[profile.column] = _profiled(found, profile.column, profile.refine)
     return ChannelEstimates(by_name, tuple(columns[index] for index in best.active), covariance)
+
+
+def _drives(channel: ResidualChannel) -> int:
+    """Return the number of drives whose errors lie between a value and that of another drive, in units of its variance.
+
+    The other one is 1; and L logs that are searched together know their mean L times as well as each does.
+    """
+    return 1 + len(channel.inner.drive.log_begins_s)
 
 
 def _weightings_apart(found: ChannelResult) -> Array:
@@ -220,7 +225,8 @@ def _profiled(found: ChannelResult, column: str, step: float) -> ParameterEstima
     slope = np.column_stack([best.jacobian, (ends[1].residual - ends[0].residual) / (high - low)])
     precision = None if best.precision is None else np.append(best.precision, 0.0)
     free = replace(best, active=(*best.active, place), slope=slope, precision=precision)
-    deviation = float(free.covariance()[-1, -1] * interval_inflation(free, channel, (place,))) ** 0.5
+    variance = float(free.covariance()[-1, -1] * interval_inflation(free, channel, (place,)))
+    deviation = (_drives(channel) * variance) ** 0.5
     normal = ParameterEstimate.around(value, deviation)
     return ParameterEstimate(value, min(low, normal.low), max(high, normal.high))
 

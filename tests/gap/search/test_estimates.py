@@ -20,22 +20,25 @@ from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.settings import DEFAULT_SETTINGS, FitSettings, GapSettings
 
 
-def test_an_interval_is_widened_by_how_blocks_scatter_and_by_how_a_value_wanders(monkeypatch):
+@pytest.mark.parametrize(("begins_s", "drives"), [((0.0,), 2.0), ((0.0, 30.0, 60.0), 4.0)])
+def test_an_interval_is_of_another_drive_and_widened_by_how_a_value_wanders(monkeypatch, begins_s, drives):
     covariance = np.array([[4.0, 1.0], [1.0, 9.0]])
-    told = SimpleNamespace(vector=np.array([7.0, 5.0, 3.0]), active=(2, 0), covariance=lambda: covariance)
+    reported = SimpleNamespace(vector=np.array([7.0, 5.0, 3.0]), active=(2, 0), covariance=lambda: covariance)
     low, high = np.array([-60.0, 0.0, -np.inf]), np.array([60.0, 1.0, np.inf])
     layout = SimpleNamespace(columns=("a", "b", "c"), low=low, high=high)
-    channel = SimpleNamespace(layout=layout)
-    found = SimpleNamespace(reported=told, selector=SimpleNamespace(channel=channel), names=())
+    channel = SimpleNamespace(layout=layout, inner=SimpleNamespace(drive=SimpleNamespace(log_begins_s=begins_s)))
+    found = SimpleNamespace(reported=reported, selector=SimpleNamespace(channel=channel), names=())
     monkeypatch.setattr(channel_result, "interval_inflation", lambda best, of, active: {2: 4.0, 0: 1.44}[active[0]])
     monkeypatch.setattr(channel_result, "drifted", lambda of: {"c": 6.0})
     monkeypatch.setattr(channel_result, "_weightings_apart", lambda of: np.array([3.0, 0.0]))
     monkeypatch.setattr(channel_result, "_stamped", lambda of: {"a": 2.0})
     estimates = estimate_parameters(found)
-    # Of `c` 4 x 4 and 9 beside, of `a` 9 x 1.44 and 2 beside.
-    deviations = np.sqrt([16.0 + 9.0, 12.96 + 2.0])
-    together = 1.0 * 2.0 * 1.2 * np.sqrt(25.0 / 16.0 * 14.96 / 12.96)
-    np.testing.assert_allclose(estimates.covariance, [[25.0, together], [together, 14.96]])
+    # Of `c` 4 x 4 for each drive and 9 beside, of `a` 9 x 1.44 and 2 beside.
+    variances = np.array([16.0 * drives + 9.0, 12.96 * drives + 2.0])
+    deviations = np.sqrt(variances)
+    # The correlation is that of the fit, 1 / 6.
+    together = deviations.prod() / 6.0
+    np.testing.assert_allclose(estimates.covariance, [[variances[0], together], [together, variances[1]]])
     assert estimates.fitted == ("c", "a")
     for name, value, deviation in (("c", 3.0, deviations[0]), ("a", 7.0, deviations[1])):
         one = estimates.by_name[name]
@@ -56,14 +59,14 @@ def correlation(covariance):
 
 
 def test_two_weightings_lie_apart_by_what_is_beyond_the_difference_of_their_variances(monkeypatch):
-    told = SimpleNamespace(active=(2, 0, 1), vector=np.array([1.0, 2.0, 3.0]))
+    reported = SimpleNamespace(active=(2, 0, 1), vector=np.array([1.0, 2.0, 3.0]))
     evenly = SimpleNamespace(active=(2, 0, 1), vector=np.array([2.0, 0.0, 7.0]))
-    deviations = {id(evenly): np.array([3.0, 1.0, 1.0]), id(told): np.array([2.0, 2.0, 1.0])}
+    deviations = {id(evenly): np.array([3.0, 1.0, 1.0]), id(reported): np.array([2.0, 2.0, 1.0])}
     monkeypatch.setattr(channel_result, "deviations_of", lambda best, channel: deviations[id(best)])
-    found = SimpleNamespace(reported=told, fit=told, evenly=evenly, channel=None)
+    found = SimpleNamespace(reported=reported, fit=reported, evenly=evenly, channel=None)
     # Half of 16 beyond 9 - 4, of 1 within 4 - 1, and of 4 beyond none.
     assert channel_result._weightings_apart(found).tolist() == [5.5, 0.0, 2.0]
-    assert channel_result._weightings_apart(SimpleNamespace(reported=told, evenly=None)).tolist() == [0.0] * 3
+    assert channel_result._weightings_apart(SimpleNamespace(reported=reported, evenly=None)).tolist() == [0.0] * 3
 
 
 def test_a_delay_is_known_as_well_as_the_stamps_are():
@@ -75,7 +78,9 @@ def test_a_delay_is_known_as_well_as_the_stamps_are():
 
 
 @pytest.mark.parametrize("step", [0.5, 2.0])
-@pytest.mark.parametrize(("slope", "ends"), [(1e3, (-4.0, 128.0)), (0.392, (-10.0, 128.0)), (0.01, (-392.0, 392.0))])
+@pytest.mark.parametrize(
+    ("slope", "ends"), [(1e3, (-4.0, 128.0)), (0.392, (-(200.0**0.5), 128.0)), (0.01, (-554.372, 554.372))]
+)
 @pytest.mark.parametrize("precision", [None, np.array([3.0])])
 def test_a_profile_reaches_to_where_the_cost_has_risen_or_blocks_scatter(monkeypatch, step, slope, ends, precision):
     # Below, the cost rises by 1.91 nats within two steps and by 1.93 within four; above it never does.
@@ -93,17 +98,19 @@ def test_a_profile_reaches_to_where_the_cost_has_risen_or_blocks_scatter(monkeyp
     monkeypatch.setattr(
         channel_result, "interval_inflation", lambda free, channel, of: {((0, 1), (1,)): 4.0}[free.active, of]
     )
-    channel = SimpleNamespace(layout=SimpleNamespace(place={"x.at": 1}))
+    inner = SimpleNamespace(drive=SimpleNamespace(log_begins_s=(0.0,)))
+    channel = SimpleNamespace(layout=SimpleNamespace(place={"x.at": 1}), inner=inner)
     found = SimpleNamespace(selector=SimpleNamespace(channel=channel), fit=at(0.0), names=())
     one = channel_result._profiled(found, "x.at", step)
-    # Twice as far each time, beyond 64 steps no more; or 1.96 deviations, which are twice those of the noise model.
+    # Twice as far each time, beyond 64 steps no more; or 1.96 deviations of the difference to
+    # another drive; those of either are twice those of the noise model.
     assert (one.low, one.value, one.high) == pytest.approx((10.0 + ends[0] * step, 10.0, 10.0 + ends[1] * step))
 
 
-def of_blocks(block, told=None, settings=DEFAULT_SETTINGS):
+def of_blocks(block, reported=None, settings=DEFAULT_SETTINGS):
     layout = SimpleNamespace(columns=("x",), low=np.array([-np.inf]), high=np.array([np.inf]))
     channel = SimpleNamespace(block=np.asarray(block), settings=settings, layout=layout)
-    return SimpleNamespace(reported=told, channel=channel, selector=SimpleNamespace(channel=channel))
+    return SimpleNamespace(reported=reported, channel=channel, selector=SimpleNamespace(channel=channel))
 
 
 def test_a_value_wanders_by_what_halves_surely_differ_or_by_the_most_that_shorter_parts_do(monkeypatch):
@@ -179,9 +186,9 @@ def test_of_several_logs_those_that_say_enough_speak_where_there_are_two():
     np.testing.assert_allclose((two.values, two.deviations), (alone.values, alone.deviations))
 
 
-def later(told):
+def later(fitted):
     """The second half of a fit."""
-    return replace(told, residual=told.residual[6:], slope=told.slope[6:])
+    return replace(fitted, residual=fitted.residual[6:], slope=fitted.slope[6:])
 
 
 def test_of_one_part_nothing_is_said_apart():

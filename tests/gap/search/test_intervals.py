@@ -1,6 +1,7 @@
 """95 % intervals hold what is true about as often as they say, and are wider where the noise is more than thought."""
 
 from dataclasses import replace
+from itertools import permutations
 from types import SimpleNamespace
 
 import numpy as np
@@ -40,6 +41,15 @@ def test_intervals_hold_the_truth_nine_times_of_ten():
         for name, truth in (("turn_slip.k_s", 0.08), ("wheel_radius_m", 0.06), ("axial_distance_m", 0.4)):
             held.append(found[name].low <= truth <= found[name].high)
     assert np.mean(held) >= 0.85
+
+
+def test_intervals_hold_what_another_drive_gives():
+    """The promise of the report, which no error of the other drive is added to."""
+    held, names = [], ("turn_slip.k_s", "wheel_radius_m", "axial_distance_m")
+    found = [estimated(body_channel(seed, turn_slip=0.08)[0]).by_name for seed in range(12)]
+    for here, there in permutations(found, 2):
+        held += [here[name].low <= there[name].value <= here[name].high for name in names]
+    assert 0.95 <= np.mean(held) <= 0.995
 
 
 def test_an_estimate_tells_its_standard_deviation_and_the_joint_one():
