@@ -49,7 +49,7 @@ from disco_hw.runtime.assembly import (
     make_adaptation,
 )
 from disco_hw.runtime.core import FindsWiring, Pilot, TaskPilot
-from disco_hw.runtime.pipeline import FollowTask, NoPlanner, Off, Pipeline, Planner, StandstillTracker
+from disco_hw.runtime.pipeline import FollowTask, NoPlanner, Off, Pipeline, Planner, Standstill
 from disco_hw.runtime.robot_setup import Setup, kept_files, link_key, load_setup, refuse_missing_effects, scene_of
 from drivers.kernel_cache import are_kernels_kept
 from drivers.types import PoseSample, Readings, Transport, WheelSample
@@ -425,7 +425,7 @@ def warm_up(pipeline: Pipeline) -> None:
     pipeline.step(0, Readings(), Off())
     for tick in range(1, _TICKS):
         now_ns = tick * _PERIOD_NS
-        pipeline.step(now_ns, _readings(now_ns, tick), FollowTask() if tick > _ON_THE_WAY else StandstillTracker())
+        pipeline.step(now_ns, _readings(now_ns, tick), FollowTask() if tick > _ON_THE_WAY else Standstill())
         pipeline.rollouts(1)
 
 

@@ -13,7 +13,7 @@ from disco_hw.drive.coverage import Coverage
 from disco_hw.runtime import State
 from disco_hw.runtime.core import CoreTick, Pilot, PilotTick, TaskPilot
 from disco_hw.runtime.fence_guard import STOPS_MOTION
-from disco_hw.runtime.pipeline import Manual, Source, StandstillTracker
+from disco_hw.runtime.pipeline import Manual, Source, Standstill
 from disco_hw.runtime.supervisor import Reply, UserRequest
 
 
@@ -22,7 +22,7 @@ class DeadmanVerdict:
     """One tick's requests, the motion while motion is allowed, and a sentence where something changed."""
 
     requests: tuple[UserRequest, ...]
-    motion: Manual | StandstillTracker
+    motion: Manual | Standstill
     event: str | None = None
 
 
@@ -59,7 +59,7 @@ class Deadman:
         self._was_armed = state is State.ARMED
         if self._engaged and newest is not None:
             return DeadmanVerdict(requests, Manual(newest.left_rad_s, newest.right_rad_s), event)
-        return DeadmanVerdict(requests, StandstillTracker(), event)
+        return DeadmanVerdict(requests, Standstill(), event)
 
     def refused(self, why: str) -> str:
         """Take in that the daemon refused to arm or start; returns the sentence for the person."""

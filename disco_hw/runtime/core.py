@@ -20,7 +20,7 @@ from disco_hw.log import records
 from disco_hw.log.recorder import Recorder
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.obstacles import ObstacleRefused, ObstacleReport
-from disco_hw.runtime.pipeline import FollowTask, Motion, Off, Pipeline, Source, StandstillTracker, Tick, untimed
+from disco_hw.runtime.pipeline import FollowTask, Motion, Off, Pipeline, Source, Standstill, Tick, untimed
 from disco_hw.runtime.plausibility import Directions, Headway, Plausibility, PlausibilityStats
 from disco_hw.runtime.pose_jumps import PoseJumps
 from disco_hw.runtime.robot_setup import record_of
@@ -420,7 +420,7 @@ class DaemonCore:
 def _motion(output: Output, steering: Motion) -> Motion:
     if output.motion_allowed:
         return steering
-    return StandstillTracker() if output.zero_only else Off()
+    return Standstill() if output.zero_only else Off()
 
 
 @dataclass(frozen=True, slots=True)

@@ -219,7 +219,7 @@ class Off:
 
 
 @dataclass(frozen=True, slots=True)
-class StandstillTracker:
+class Standstill:
     """Come to zero wheel speed within the limits and hold it."""
 
 
@@ -262,7 +262,7 @@ class Source(enum.Enum):
     """No frame is sent at all."""
 
 
-Motion = Off | StandstillTracker | FollowTask | Manual | Silent
+Motion = Off | Standstill | FollowTask | Manual | Silent
 
 
 class Tick(msgspec.Struct, frozen=True, gc=False):
@@ -472,7 +472,7 @@ class Pipeline:
         match motion:
             case Off():
                 return Source.OFF, (0.0, 0.0)
-            case StandstillTracker():
+            case Standstill():
                 return Source.HOLD, (0.0, 0.0)
             case Silent():
                 return Source.SILENT, (0.0, 0.0)

@@ -34,7 +34,7 @@ from disco_hw.log.records import (
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.assembly import apply_geometry, create_pipeline, create_planner
 from disco_hw.runtime.obstacles import Obstacles
-from disco_hw.runtime.pipeline import FollowTask, Manual, Motion, Off, Pipeline, Silent, Source, StandstillTracker
+from disco_hw.runtime.pipeline import FollowTask, Manual, Motion, Off, Pipeline, Silent, Source, Standstill
 from disco_hw.runtime.robot_setup import setup_of_log, task_of
 from disco_hw.runtime.safe_area import fence_of_record, report_of_record
 from drivers.types import PoseSample, Readings, WheelSample
@@ -201,7 +201,7 @@ def _motion(command: Command) -> Motion:
         case Source.OFF:
             return Off()
         case Source.HOLD:
-            return StandstillTracker()
+            return Standstill()
         case Source.SILENT:
             return Silent()
         case Source.MANUAL:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from disco_hw.drive import ManualInput
 from disco_hw.drive.hand_pilot import Deadman
 from disco_hw.runtime import State
-from disco_hw.runtime.pipeline import Manual, StandstillTracker
+from disco_hw.runtime.pipeline import Manual, Standstill
 from disco_hw.runtime.supervisor import UserRequest
 
 MS = 1_000_000
@@ -54,7 +54,7 @@ def test_a_press_while_ready_arms_and_starts_once():
 def test_a_deadman_held_from_the_start_counts_for_nothing_until_released():
     bench = Bench()
     assert [bench.tick(True).requests for _ in range(100)] == [()] * 100
-    assert bench.verdict.motion == StandstillTracker()
+    assert bench.verdict.motion == Standstill()
     bench.tick(False)
     assert bench.tick(True).requests == ARM_START
 
@@ -89,7 +89,7 @@ def test_release_loss_and_silence_stop_in_the_same_tick(loss, words):
     bench = Bench().driving()
     verdict = bench.tick(**loss)
     assert verdict.requests == DISARM
-    assert verdict.motion == StandstillTracker()
+    assert verdict.motion == Standstill()
     assert words in verdict.event
 
 
@@ -126,7 +126,7 @@ def test_a_press_counts_while_ready_only_and_is_used_up(state):
 def test_once_disarmed_by_others_a_new_press_is_needed(state):
     bench = Bench().driving()
     bench.state = state
-    assert bench.tick(True).motion == StandstillTracker()
+    assert bench.tick(True).motion == Standstill()
     bench.state = State.READY
     assert [bench.tick(True).requests for _ in range(20)] == [()] * 20
 
@@ -142,7 +142,7 @@ def test_whoever_else_arms_the_robot_finds_it_disarmed():
     bench.state = State.ARMED
     verdict = bench.tick(True)
     assert verdict.requests == DISARM
-    assert verdict.motion == StandstillTracker()
+    assert verdict.motion == Standstill()
 
 
 def test_a_release_while_arming_takes_the_request_back():
@@ -181,7 +181,7 @@ def test_motion_only_between_a_press_and_the_first_loss(story):
         before = bench.state
         verdict = bench.tick(held, age_ns, gone)
         good = held and not gone and age_ns <= 200 * MS
-        if verdict.motion != StandstillTracker():
+        if verdict.motion != Standstill():
             assert good
         if UserRequest.ARM in verdict.requests:
             assert good

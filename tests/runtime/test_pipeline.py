@@ -21,7 +21,7 @@ from disco_hw.runtime.pipeline import (
     Off,
     Pipeline,
     Source,
-    StandstillTracker,
+    Standstill,
     WheelLimits,
 )
 from drivers.types import PoseSample, Readings, WheelSample
@@ -69,7 +69,7 @@ def run(pipeline: Pipeline, motions, start: int = 0):
 
 
 def test_standing_and_off_ask_for_zero():
-    ticks = run(make(Scripted()), [Off(), StandstillTracker()])
+    ticks = run(make(Scripted()), [Off(), Standstill()])
     assert [tick.source for tick in ticks] == [Source.OFF, Source.HOLD]
     assert all(tick.requested == (0.0, 0.0) for tick in ticks)
     assert all(tick.plan is None for tick in ticks)
@@ -101,13 +101,13 @@ def test_a_planner_that_never_found_anything_moves_nothing():
 
 def test_the_planner_starts_anew_after_every_pause():
     planner = Scripted(*[1.0] * 10)
-    run(make(planner), [Off(), FollowTask(), FollowTask(), StandstillTracker(), FollowTask()])
+    run(make(planner), [Off(), FollowTask(), FollowTask(), Standstill(), FollowTask()])
     assert planner.resets == 2
 
 
 def test_an_old_plan_does_not_outlive_a_pause():
     planner = Scripted(1.0)
-    ticks = run(make(planner), [Off(), FollowTask(), StandstillTracker(), FollowTask()])
+    ticks = run(make(planner), [Off(), FollowTask(), Standstill(), FollowTask()])
     assert ticks[3].source is Source.RAMP
 
 
@@ -134,7 +134,7 @@ def test_the_planner_sees_the_estimate_and_the_commands_sent():
         now_ns = k * PERIOD_NS
         wheels = WheelSample(now_ns, now_ns, 0.1 * k, 0.2 * k, 5.0, 10.0)
         pose = PoseSample(now_ns, now_ns, 1.0, 2.0, 0.5, 0.005, 0.01)
-        pipeline.step(now_ns, Readings(wheels=(wheels,), poses=(pose,)), FollowTask() if k > 2 else StandstillTracker())
+        pipeline.step(now_ns, Readings(wheels=(wheels,), poses=(pose,)), FollowTask() if k > 2 else Standstill())
     state = planner.states[-1]
     assert (state.x_m, state.y_m) == pytest.approx((1.0, 2.0), abs=0.05)
     assert (state.left_speed_rad_s, state.right_speed_rad_s) == (5.0, 10.0)
