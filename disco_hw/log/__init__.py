@@ -109,7 +109,7 @@ class WriterStatus(msgspec.Struct, frozen=True):
     """State of the log writer: what is in its file, and the error that ended it, if any.
 
     All ticks up to number `sequence` that were sent are in the file, apart from `refused` records. `deleted`: the file
-    was removed, and all that was in it with it.
+    was removed, and all that was in it with it. `sync_s`: how long the disk has been at work on what is in the file.
     """
 
     state: Literal["recording", "finished", "failed"]
@@ -121,6 +121,7 @@ class WriterStatus(msgspec.Struct, frozen=True):
     bytes: int = 0
     error: str = ""
     deleted: bool = False
+    sync_s: float = 0.0
 
 
 class Batch(msgspec.Struct, frozen=True, array_like=True):

@@ -42,6 +42,8 @@ _UNREAD_TICKS = 50
 _SILENCE_S = 0.7
 # Chosen: a writer that is silent for longer is ended and replaced.
 _PATIENCE_S = 2.0
+# Chosen: as long as a silent writer is waited for; a healthy disk takes milliseconds.
+_SLOW_DISK_S = 2.0
 # Chosen: longer, as the first writer loads its code from a cold disk.
 _START_PATIENCE_S = 15.0
 # Chosen: the exit code comes after the socket has closed; it says why.
@@ -192,6 +194,7 @@ class ProcessRecorder:
         self._next_part = 1
         self._continues = ""
         self._frozen = False
+        self._slow_disk_reported = False
         self._end: bytes | None = None
         self._final: RecorderStats | None = None
         _check_place(recording.path)
@@ -358,6 +361,7 @@ class ProcessRecorder:
                 self._kept_status = status
             if status.state != "failed" and status.error and status.error != refusal:
                 self._note(f"a record was refused by the log writer: {status.error}")
+            self._report_slow_disk(status)
 
     def _look_after(self, now_s: float) -> None:
         line = self._line
@@ -435,6 +439,15 @@ class ProcessRecorder:
         if self._fault and self._status.sequence:
             self._fault, self._frozen = "", False
             self._messages.append(f"recording goes on in {self._status.path}")
+
+    def _report_slow_disk(self, status: WriterStatus) -> None:
+        """Report, once, that the disk lags behind the file."""
+        if status.sync_s >= _SLOW_DISK_S and not self._slow_disk_reported:
+            self._slow_disk_reported = True
+            self._messages.append(
+                f"the disk has been storing the log for {status.sync_s:.1f} s; all is recorded, but a power cut now "
+                "would lose what came since; use a faster disk, or stop other programs that write to it"
+            )
 
     def _report_losses(self) -> None:
         """Report at the end how many ticks are in no file, and why."""

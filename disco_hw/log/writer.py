@@ -17,6 +17,7 @@ import signal
 import socket
 import sys
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal
 
@@ -86,6 +87,40 @@ class LogFile:
         os.close(self._fd)
 
 
+class BackgroundSync:
+    """Brings a file to the disk on a thread of its own, because a slow disk can take seconds for it."""
+
+    def __init__(self, file: LogFile) -> None:
+        self._file = file
+        self._thread = ThreadPoolExecutor(1)
+        self._running: Future[None] | None = None
+        self._begun_s = 0.0
+
+    def start(self) -> None:
+        """Begin to bring to the disk what is written; raises OSError if the last attempt failed.
+
+        While the last one still runs, nothing is begun.
+        """
+        if self._running is not None:
+            if not self._running.done():
+                return
+            self._running.result()
+        self._begun_s = time.monotonic()
+        self._running = self._thread.submit(self._file.sync)
+
+    def finish(self) -> None:
+        """Return when all is on the disk; raises OSError if that failed, now or in the last attempt."""
+        if self._running is not None:
+            # The kernel reports a failure to the first caller only.
+            self._running.result()
+        self._file.sync()
+
+    @property
+    def pending_s(self) -> float:
+        """How long the disk has been at work on the running attempt, in seconds; 0 if none runs."""
+        return 0.0 if self._running is None or self._running.done() else time.monotonic() - self._begun_s
+
+
 class StatusLine:
     """Status to the recorder; a recorder that is gone or does not read costs nothing."""
 
@@ -108,6 +143,7 @@ class Session:
         self._start = start
         self._connection = connection
         self._file = file
+        self._sync = BackgroundSync(file)
         self._line = line
         self._frames = Frames()
         self._grace_ends_s: float | None = None
@@ -134,15 +170,14 @@ class Session:
             ended = self._receive(max(0.0, min(next_flush_s, next_beat_s) - time.monotonic()))
             now_s = time.monotonic()
             if now_s >= next_flush_s:
-                self._flush("recording")
+                self._flush()
                 now_s = time.monotonic()
                 next_flush_s = now_s + self._start.flush_s
             if now_s >= next_beat_s:
                 self._report("recording")
                 next_beat_s = now_s + self._start.beat_s
             ended = ended or (self._grace_ends_s is not None and now_s > self._grace_ends_s)
-        self._log.finish()
-        self._flush("finished")
+        self._finish()
 
     def _receive(self, timeout_s: float) -> bool:
         """Wait for ticks and write them; True if no more will come."""
@@ -163,22 +198,31 @@ class Session:
             self._report("recording")
         return not data
 
-    def _flush(self, state: Literal["recording", "finished"]) -> None:
-        if state == "recording":
-            self._log.flush()
-            # What is in the file outlives this process; the disk may take its time to make it outlive a power cut.
-            self._report(state)
-        self._file.sync()
+    def _flush(self) -> None:
+        """Hand all to the file, and let the disk take its time to make it outlive a power cut."""
+        self._log.flush()
+        self._report("recording")
+        self._sync.start()
+        self._check_exists()
+
+    def _finish(self) -> None:
+        """Write the index and return when all is on the disk."""
+        self._log.finish()
+        self._report("recording")
+        self._sync.finish()
+        self._check_exists()
+        self._report("finished")
+
+    def _check_exists(self) -> None:
         if self._file.deleted:
             raise FileNotFoundError("it was deleted while it was being written, and its content is lost")
-        self._report(state)
 
     def _report(self, state: Literal["recording", "finished"]) -> None:
         log, start = self._log, self._start
         self._line.send(
             WriterStatus(
                 state, start.path, start.part, self.sequence, log.records, log.flushed_refused, self._file.tell(),
-                log.last_refusal,
+                log.last_refusal, sync_s=self._sync.pending_s,
             )
         )  # fmt: skip
 

@@ -277,3 +277,33 @@ def test_the_errors_of_a_log_are_those_of_bad_input():
     from disco_hw.errors import InputError
 
     assert issubclass(LogError, InputError)
+
+
+@pytest.fixture
+def slow_disk(tmp_path, monkeypatch):
+    """Let each fsync of the processes that are started now take 2.5 s, as a worn SD card does."""
+    source, library = tmp_path / "slow.c", tmp_path / "slow.so"
+    source.write_text(
+        "#include <sys/syscall.h>\n#include <unistd.h>\n"
+        "int fsync(int fd) { usleep(2500000); return (int)syscall(SYS_fsync, fd); }\n",
+        encoding="utf-8",
+    )
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", str(library), str(source)], check=True)
+    monkeypatch.setenv("LD_PRELOAD", str(library))
+
+
+@pytest.mark.usefixtures("slow_disk")
+def test_a_disk_that_takes_seconds_holds_up_no_writer_and_is_reported_once(path):
+    recorder = ProcessRecorder(recording(path))
+    begin_s, first = time.monotonic(), 1
+    while time.monotonic() - begin_s < 7.0:
+        drive(recorder, first, 1, period_s=0.01)
+        stats = recorder.poll()
+        assert (stats.writer_deaths, stats.fault) == (0, "")
+        first += 1
+    final = recorder.close(10.0)
+    assert (final.delivered_ticks, final.waiting_ticks) == (first - 1, 0)
+    assert ticks_of(path) == list(range(1, first))
+    messages = recorder.new_messages()
+    assert [line for line in messages if "the disk has been storing the log for 2." not in line] == []
+    assert len(messages) == 1
