@@ -240,8 +240,13 @@ class CircleReport:
 def load_circle_report(
     log_file: FilePath, truth_file: FilePath, task: CircleTask, laps_requested: float, stopped: bool
 ) -> CircleReport:
-    """Read log and truth of one run; raises WorkError when the task never ran or a file does not fit."""
+    """Read log and truth of one run; raises WorkError if the task never ran, or a file is not whole or does not fit."""
     log = open_log(log_file)
+    if log.ending is None:
+        raise WorkError(
+            f"{log_file}: ends before the drive did, because its writer was replaced; the rest is in the other .mcap "
+            "files beside it; stop other programs that write to the disk, and drive again"
+        )
     command = log.columns("/command")
     driven = command["in_force"].astype(bool) & (command["source"] == "plan")
     if not driven.any():

@@ -229,7 +229,8 @@ def start_pose(setup: Setup) -> tuple[float, float, float]:
 
 def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
     """Drive and stop the robot; return whether daemon and robot both reported it standing and disarmed."""
-    for old in (files.log, files.truth):
+    parts = files.log.parent.glob(f"{files.log.stem}.part*{files.log.suffix}")
+    for old in (files.log, files.truth, *parts):
         old.unlink(missing_ok=True)
     setup = load_setup(files.robot)
     task = circle_task(setup.config.task, "the demonstration")
