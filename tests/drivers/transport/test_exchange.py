@@ -100,7 +100,7 @@ def transport(line, exchange, monkeypatch):
 
 
 def ask(*frames, rank=2):
-    return [OutgoingFrame(frame, time.monotonic_ns() + 5_000_000_000, rank) for frame in frames]
+    return [OutgoingFrame(frame, time.monotonic_ns() + 60_000_000_000, rank) for frame in frames]
 
 
 def test_replies_come_in_the_order_of_the_questions_and_each_is_read_as_its_own(line, transport):
