@@ -85,7 +85,7 @@ def decode(frame: Frame) -> Decoded | None:
     if len(frame.data) != found.length and not (found.length == 1 and len(frame.data) == 8):
         return None
     # The messages of a motor, counted from 0.
-    motor = (frame.can_id & 0xF) - 1 if frame.can_id >> 4 in (0x25, 0x26) else None
+    motor = (frame.can_id & 0xF) - 1 if frame.can_id >> 4 in (0x25, 0x26) else -1
     return Decoded(found.name, found.unpack(frame.data), motor)
 
 

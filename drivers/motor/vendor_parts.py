@@ -161,11 +161,11 @@ def by_number(named: Mapping[str, Layout]) -> Mapping[int, Layout]:
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """A message by its name, with its fields, and which controller or motor sent it (None where it does not say)."""
+    """A message by its name, with its fields, and which controller or motor sent it (-1 where it does not say)."""
 
     name: str
     values: Mapping[str, Any]
-    node: int | None = None
+    node: int = -1
 
 
 def limits(fastest: Limit, timeout: Limit, stop_deceleration_rad_s2: float) -> Limits:

@@ -86,7 +86,7 @@ def _check_meaning(found: Comparison, frame: Frame, then: Mapping[str, Any]) -> 
 
 def _in_their_words(decoded: protocol.Decoded) -> dict[str, Any]:
     ours: dict[str, Any] = dict(decoded.values)
-    if decoded.node is not None:
+    if decoded.node >= 0:
         ours["motor"] = decoded.node
     if "switches" in ours:
         bits = ours.pop("switches")
