@@ -29,8 +29,9 @@ def run_seed(seed: int, duration_s: float, cycle_us: int, planner: str) -> dict[
     """Run one seed; return its figures as plain data."""
     from disco_hw.runtime.assembly import create_planner  # noqa: PLC0415 - in the worker, after its niceness is set
     from disco_hw.runtime.robot_setup import load_setup  # noqa: PLC0415
-    from sim.fault_schedule import KINDS, random_schedule  # noqa: PLC0415
+    from sim.fault_schedule import KINDS  # noqa: PLC0415
     from tools.fault_run import ROBOT_FILE, FaultRun  # noqa: PLC0415
+    from tools.random_faults import random_schedule  # noqa: PLC0415
 
     kinds = tuple(name for name in KINDS if name not in KINDS_LEFT_OUT)
     schedule = random_schedule(seed, duration_s - QUIET_AT_END_S, kinds=kinds)

@@ -37,10 +37,10 @@ from firmware_protocol.firmware_core import FirmwareConfig
 from sim.body_dynamics import BodyPose
 from sim.fault_player import FaultPlayer
 from sim.fault_schedule import FaultSchedule, ScheduledFault
-from sim.in_process import SimulatedCan
 from sim.plant import Plant, TrueState
 from sim.plant_parameters import PlantParameters
 from sim.virtual_robot import VirtualRobot
+from tools.in_process import SimulatedCan
 from tools.wheel_monitor import WheelMonitor
 
 ROBOT_FILE = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"

@@ -20,7 +20,7 @@ from disco_hw.config import PoseInput
 from disco_hw.log.drive import Edge, Motion, chain
 from disco_hw.log.drive import poses as along
 from drivers.motor.ros2_base_wire import REFUSALS, Ros2BaseSettings, Wheels
-from drivers.pose.headings import is_heading_measured
+from drivers.pose import is_heading_measured
 from drivers.pose.senders import SILENCE_S, SenderGate
 
 TYPES = (msg.PoseStamped, msg.PoseWithCovarianceStamped, msg.Odometry)

@@ -40,7 +40,7 @@ def load_robot_config(path: Path | str) -> RobotConfig:
 
 def refuse_outside_task(path: Path, config: RobotConfig) -> None:
     """Raise InputError, naming the place, for a task on whose line or start the footprint is not within the fence."""
-    from disco_hw.fence.task_line import task_breach  # noqa: PLC0415
+    from disco_hw.fence.clearance import task_breach  # noqa: PLC0415
 
     fault = task_breach(config.fence, config.robot.footprint, config.task.course())
     if fault is not None:

@@ -12,7 +12,7 @@ from disco_hw.daemon.control_socket import ControlMessage, ControlServer, counte
 from disco_hw.daemon.loop import Clock, Loop
 from disco_hw.daemon.page_feed import WatchedRecorder
 from disco_hw.daemon.process import Notifier, StopSignals, Waiting
-from disco_hw.fence.task_line import task_breach
+from disco_hw.fence.clearance import task_breach
 from disco_hw.log import records
 from disco_hw.runtime import AdviceStyle, State, advice, headline, records_of_tick
 from disco_hw.runtime.core import CoreTick, DaemonCore, Pilot

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import msgspec
 
-from drivers.pose.headings import is_variance_known
+from drivers.pose import is_variance_known
 from drivers.types import PoseSample
 
 SAME_RAD = 1e-6

@@ -17,15 +17,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-import disco_hw
-from disco_hw.adaptation.guard import NAMES, Geometry, believed_geometry, with_geometry
+from disco_hw.adaptation.guard import Geometry, believed_geometry, with_geometry
 from disco_hw.effects import surface_change
-from disco_hw.experiments import running_stack
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.log import records
-from disco_hw.log.reader import open_log
 from disco_hw.log.recorder import MemoryRecorder
-from disco_hw.model import load_model, model_text
 from disco_hw.reports import write_pictures
 from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.robot_setup import Setup
@@ -309,86 +305,3 @@ def _beliefs(recorder: MemoryRecorder, model: Geometry) -> tuple[tuple[tuple[flo
                 covariance = np.array(change.covariance).reshape(3, 3)
                 found.append((t_s, np.array(change.mean), np.sqrt(np.diag(covariance))))
     return tuple(found), reverted
-
-
-# Chosen for the live drive: the size of the change, when it comes, and what is left out and compared after it.
-GROWTH = 0.15
-CHANGE_S = 75.0
-SETTLED_S = 20.0
-COMPARED_S = 20.0
-TASK = 'kind = "circle"\nradius_m = 0.75\nspeed_m_s = 0.2\n'
-# On the circle of TASK, facing along it: x, y (m) and a quarter turn.
-START = (0.75, 0.0, 1.5707963)
-
-
-@dataclass(frozen=True, slots=True)
-class LiveDrive:
-    """Result of one drive in real time, with a change of the plant.
-
-    Mean tracking costs on the plant's truth, over 20 s before the change and from 20 s after it on; what changed, by
-    its size before, as the robot believed it at last, how long after the change (s) it was first reported, and what the
-    loop missed.
-    """
-
-    cost_before: float
-    cost_after: float
-    believed: float
-    published_s: float
-    overruns: int
-
-
-def drive_through_change(directory: Path, changes: str, *, adapt: bool) -> LiveDrive:
-    """Drive the paper's circle through a sudden change of the plant.
-
-    The belief is right, and as narrow as after `infer`, until the wheel radius or axial distance (`changes`) grows by
-    15 %.
-    """
-    model = load_model(Path(disco_hw.__file__).parent / "robots" / "wombot_model.toml")
-    mean = believed_geometry(model).mean
-    std = BELIEVED_STD * np.array([1.0, mean[1], mean[2]])
-    narrow = directory / "narrow.toml"
-    narrow.write_text(model_text(with_geometry(model, Geometry(mean, np.diag(std**2)))), encoding="utf-8")
-    axle, wheels = CHANGES[changes]
-    hidden = ("--hide", f"surface_change={axle * GROWTH},{CHANGE_S},{wheels * GROWTH}")
-    arguments = ("--adapt",) if adapt else ()
-    with running_stack(directory, "can", TASK, START, hidden, arguments, str(narrow)) as stack:
-        stack.operator.wait_for("READY", 60.0)
-        stack.start()
-        stack.operator.wait_until("driving", lambda s: s["source"] == "plan", 10.0)
-        first_s = first_truth_s(directory / "truth.csv")
-        end_s = first_s + CHANGE_S + SETTLED_S + COMPARED_S
-        status = stack.operator.wait_until("the end", lambda s: newest_truth_s(directory / "truth.csv") > end_s, 200.0)
-        stack.operator.request("quit")
-        assert stack.daemon.process.wait(10.0) == 0
-    table = np.genfromtxt(directory / "truth.csv", delimiter=",", skip_header=1, usecols=(0, 1, 2, 8))
-    t_s = table[:, 0] * 1e-9 - first_s - CHANGE_S
-    cost = np.hypot(np.hypot(table[:, 1], table[:, 2]) - 0.75, table[:, 3] - 0.2)
-    with open_log(directory / "run.mcap") as log:
-        times_ns = log.columns("/belief")["t_ns"].tolist() if adapt else []
-        published = [t_ns * 1e-9 - first_s - CHANGE_S for t_ns in times_ns]
-        published_s = min((at for at in published if at > 0.0), default=math.inf)
-    index = NAMES.index("wheel_radius_m" if wheels else "axial_distance_m")
-    believed = status["adaptation"]["mean"][NAMES[index]] / float(mean[index]) if adapt else 1.0
-    return LiveDrive(
-        float(cost[(t_s > -COMPARED_S) & (t_s < 0.0)].mean()),
-        float(cost[(t_s > SETTLED_S) & (t_s < SETTLED_S + COMPARED_S)].mean()),
-        believed,
-        published_s,
-        int(status["loop"]["overruns"]),
-    )
-
-
-def first_truth_s(path: Path) -> float:
-    """Return when the truth begins, s of the monotonic clock."""
-    with path.open(encoding="utf-8") as file:
-        file.readline()
-        return int(file.readline().partition(",")[0]) * 1e-9
-
-
-def newest_truth_s(path: Path) -> float:
-    """Return when the newest row on disk was true."""
-    with path.open("rb") as file:
-        file.seek(0, 2)
-        file.seek(max(0, file.tell() - 1000))
-        rows = [row for row in file.read().split(b"\n")[1:-1] if row.count(b",") > 10]
-    return int(rows[-1].partition(b",")[0]) * 1e-9

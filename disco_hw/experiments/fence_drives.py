@@ -21,8 +21,7 @@ from disco_hw.control import CommandLimits
 from disco_hw.control.baselines import LAWS, Follower, NominalRobot, Reference
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.fence import Circle, Fence, Footprint
-from disco_hw.fence.clearance import Boundaries
-from disco_hw.fence.task_line import task_breach
+from disco_hw.fence.clearance import Boundaries, task_breach
 from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.core import CoreTick, PilotTick
 from disco_hw.runtime.fence_guard import FenceVerdict

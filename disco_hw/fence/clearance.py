@@ -1,4 +1,4 @@
-"""Signed distance from a rectangle at many poses to a fence and to obstacles.
+"""Signed distance from a rectangle at many poses to a fence and to obstacles, and whether a task stays within them.
 
 Positive: the whole footprint is inside of `keep_in` and outside of everything else, and so far from the nearest of
 them. Negative: how deep it is where it must not be. The clearance changes by at most as much as a corner moves, as long
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -223,3 +224,33 @@ def first_breach(boundaries: Boundaries, poses: Array) -> tuple[Point, float] | 
     if clearance[worst] >= 0.0:
         return None
     return (float(poses[worst, 0]), float(poses[worst, 1])), -float(clearance[worst])
+
+
+class TaskLine(Protocol):
+    """The line of a task; those of `disco_hw.tasks` have it."""
+
+    @property
+    def start(self) -> tuple[float, float, float]:
+        """Start of the line and the heading there: x, y (m), yaw (rad)."""
+
+    def outline_m(self) -> NDArray[np.float64]:
+        """Return the line as points (N, 2)."""
+
+
+def task_breach(fence: Fence, footprint: Footprint, course: TaskLine) -> str | None:
+    """Say where a robot on this task would leave the fence, and how far; None if it stays inside.
+
+    The robot is taken to face along the line. Where it turns at corners the guard sees to the rest.
+    """
+    if not fence.is_set:
+        return None
+    boundaries = Boundaries(footprint, fence)
+    start = first_breach(boundaries, np.array([course.start], dtype=np.float64))
+    if start is not None:
+        (x, y), far = start
+        return f"the task starts at ({x:.2f}, {y:.2f}), where the footprint is {far:.2f} m outside"
+    crossing = first_breach(boundaries, along_line(np.asarray(course.outline_m(), dtype=np.float64)))
+    if crossing is not None:
+        (x, y), far = crossing
+        return f"the task's line crosses it near ({x:.2f}, {y:.2f}): the footprint is {far:.2f} m outside there"
+    return None

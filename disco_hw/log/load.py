@@ -14,7 +14,7 @@ from disco_hw.log import ROBOT_TOML
 from disco_hw.log.container import MAGIC
 from disco_hw.log.drive import LONGEST_SILENCE_NS, Array, Commands, DriveLog, Gyro, Index, Poses, Wheels, concatenate
 from disco_hw.log.importing.csv_drive import read_csv
-from disco_hw.log.importing.headings import with_headings_only, without_standing_headings
+from disco_hw.log.importing.losses import with_headings_only, without_standing_headings
 from disco_hw.log.importing.rosbag_file import is_bag
 from disco_hw.log.reader import Log, open_log
 

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 from websockets.asyncio.server import ServerConnection
 
-from disco_hw.files.descriptors import free_descriptors
+from disco_hw.processes import free_descriptors
 
 REQUEST_TIMEOUT_S = 3.0
 """How long a connection may take for its request and the opening of a WebSocket."""

@@ -22,7 +22,7 @@ from disco_hw.daemon import connect, send_request
 from disco_hw.daemon.emergency import read_robot_toml, stop_robot
 from disco_hw.daemon.kept_connection import KeptConnection
 from disco_hw.errors import InputError, WorkError
-from disco_hw.files.descriptors import DescriptorReserve
+from disco_hw.processes import DescriptorReserve
 from disco_hw.runtime import advice, is_estop, next_step, status_headline
 
 REQUESTS = ("arm", "start", "stop", "disarm", "reset", "task")

@@ -10,13 +10,12 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated, Any
 
 from msgspec import Meta
 
-from drivers.motor.vendor_parts import BodySettings
+from drivers.motor.vendor_parts import BodySettings, Decoded, Layout, layout
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 # Identifiers of protocol v2 (ugv_sdk).
@@ -29,57 +28,33 @@ NORMAL, EMERGENCY_STOP, EXCEPTION = range(3)
 _I16 = (-32768, 32767)
 
 
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """Layout of a message: its name, the bytes by `struct`, and each field with what one step of it is worth."""
-
-    name: str
-    body: str
-    fields: tuple[tuple[str, float], ...]
-
-
-def _fields(text: str) -> tuple[tuple[str, float], ...]:
-    pairs = (item.partition(":") for item in text.split())
-    return tuple((name, float(scale) if scale else 1.0) for name, _, scale in pairs)
-
-
-_MOTION = _fields("linear_m_s:0.001 angular_rad_s:0.001 lateral_m_s:0.001 steering_rad:0.001")
-_LIGHT = _fields("enable front_mode front_value rear_mode rear_value")
-_LAYOUTS: dict[int, Layout] = {
-    MOTION_COMMAND: Layout("motion_command", "hhhh", _MOTION),
-    LIGHT_COMMAND: Layout("light_command", "BBBBBxxx", _LIGHT),
-    CONTROL_MODE: Layout("control_mode_config", "B", _fields("mode")),
-    STATE_RESET: Layout("state_reset", "B", _fields("error_clear_byte")),
-    SYSTEM_STATE: Layout("system_state", "BBhHxx", _fields("vehicle_state control_mode battery_v:0.1 error_code")),
-    MOTION_STATE: Layout("motion_state", "hhhh", _MOTION),
-    LIGHT_STATE: Layout("light_state", "BBBBBxxx", _LIGHT),
-    RC_STATE: Layout(
-        "rc_state", "Bbbbbbxx", _fields("switches stick_right_h stick_right_v stick_left_v stick_left_h var_a")
-    ),
-    ODOMETRY: Layout("odometry", "ii", _fields("left_mm right_mm")),
-    0x361: Layout("bms_basic", "BBHhh", _fields("soc_percent soh_percent bms_v:0.1 bms_a:0.1 bms_deg_c:0.1")),
-    0x362: Layout("bms_extended", "BBBB4x", _fields("alarm_1 alarm_2 warn_1 warn_2")),
-    MOTOR_SPEED: Layout("motor_speed", "hhhh", _fields("m1_m_s:0.001 m2_m_s:0.001 m3_m_s:0.001 m4_m_s:0.001")),
-    VERSION: Layout("version_response", "8s", _fields("bytes")),
-}
-_LAYOUTS |= {
-    first + motor: Layout(name, body, _fields(names))
-    for motor in range(8)
-    for first, name, body, names in (
-        (0x251, "actuator_high_speed", "hhi", "rpm current_a:0.1 pulses"),
-        (0x261, "actuator_low_speed", "HhbBxx", "driver_v:0.1 driver_deg_c motor_deg_c driver_state"),
-    )
-}
-LAYOUTS: Mapping[int, Layout] = MappingProxyType(_LAYOUTS)
-
-
-@dataclass(frozen=True, slots=True)
-class Decoded:
-    """A message by its name; `motor` counts from 0 for those that each motor sends."""
-
-    name: str
-    values: Mapping[str, float | int | bytes]
-    motor: int | None = None
+_MOTION = "linear_m_s:1000 angular_rad_s:1000 lateral_m_s:1000 steering_rad:1000"
+_LIGHT = "enable front_mode front_value rear_mode rear_value"
+LAYOUTS: Mapping[int, Layout] = MappingProxyType(
+    {
+        row[1]: layout(">", *row)
+        for row in (
+            ("motion_command", MOTION_COMMAND, "hhhh", _MOTION),
+            ("light_command", LIGHT_COMMAND, "BBBBBxxx", _LIGHT),
+            ("control_mode_config", CONTROL_MODE, "B", "mode"),
+            ("state_reset", STATE_RESET, "B", "error_clear_byte"),
+            ("system_state", SYSTEM_STATE, "BBhHxx", "vehicle_state control_mode battery_v:10 error_code"),
+            ("motion_state", MOTION_STATE, "hhhh", _MOTION),
+            ("light_state", LIGHT_STATE, "BBBBBxxx", _LIGHT),
+            ("rc_state", RC_STATE, "Bbbbbbxx", "switches stick_right_h stick_right_v stick_left_v stick_left_h var_a"),
+            ("odometry", ODOMETRY, "ii", "left_mm right_mm"),
+            ("bms_basic", 0x361, "BBHhh", "soc_percent soh_percent bms_v:10 bms_a:10 bms_deg_c:10"),
+            ("bms_extended", 0x362, "BBBB4x", "alarm_1 alarm_2 warn_1 warn_2"),
+            ("motor_speed", MOTOR_SPEED, "hhhh", "m1_m_s:1000 m2_m_s:1000 m3_m_s:1000 m4_m_s:1000"),
+            ("version_response", VERSION, "8s", "bytes"),
+            *(("actuator_high_speed", 0x251 + motor, "hhi", "rpm current_a:10 pulses") for motor in range(8)),
+            *(
+                ("actuator_low_speed", 0x261 + motor, "HhbBxx", "driver_v:10 driver_deg_c motor_deg_c driver_state")
+                for motor in range(8)
+            ),
+        )
+    }
+)
 
 
 def motion(linear_m_s: float, angular_rad_s: float) -> Frame:
@@ -104,18 +79,14 @@ def decode(frame: Frame) -> Decoded | None:
 
     CONTROL_MODE and STATE_RESET may have 1 or 8 bytes: the manual and the SDK disagree.
     """
-    layout = LAYOUTS.get(frame.can_id)
-    if frame.extended or layout is None:
+    found = LAYOUTS.get(frame.can_id)
+    if frame.extended or found is None:
         return None
-    length = struct.calcsize(">" + layout.body)
-    if len(frame.data) != length and not (length == 1 and len(frame.data) == 8):
+    if len(frame.data) != found.length and not (found.length == 1 and len(frame.data) == 8):
         return None
-    raw = struct.unpack_from(">" + layout.body, frame.data)
-    values = {
-        name: value * scale if scale != 1.0 else value for (name, scale), value in zip(layout.fields, raw, strict=True)
-    }
-    motor = (frame.can_id & 0xF) - 1 if frame.can_id >> 4 in (0x25, 0x26) else None
-    return Decoded(layout.name, MappingProxyType(values), motor)
+    # The messages of a motor, counted from 0.
+    motor = (frame.can_id & 0xF) - 1 if frame.can_id >> 4 in (0x25, 0x26) else -1
+    return Decoded(found.name, found.unpack(frame.data), motor)
 
 
 # By the manual; the base offers no way to change or read it.

@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from drivers.motor.vendor_parts import Layout, Nodes, Sign, all_of, in_sides, layouts, sides_of
+from drivers.motor.vendor_parts import Decoded, Layout, Nodes, Sign, all_of, by_number, in_sides, layouts, sides_of
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 # CAN Simple: six bits of node, of which 0x3F is no axis, and five of command.
@@ -103,12 +103,7 @@ TELEMETRY: Mapping[Generation, Mapping[str, Layout]] = MappingProxyType(
         Generation.V06: layouts(
             "<",
             *_COMMON_TELEMETRY,
-            (
-                "Get_Version",
-                0x00,
-                "8B",
-                _VERSION_FIELDS,
-            ),
+            ("Get_Version", 0x00, "8B", _VERSION_FIELDS),
             ("Heartbeat", 0x01, "IBBBx", "axis_error axis_state procedure_result trajectory_done"),
             ("Get_Error", 0x03, "II", "active_errors disarm_reason"),
             ("Get_Temperature", 0x15, "ff", "fet_deg_c motor_deg_c"),
@@ -119,23 +114,11 @@ TELEMETRY: Mapping[Generation, Mapping[str, Layout]] = MappingProxyType(
 )
 # Get_Version of CAN Simple in firmware 0.6; 0.5 has no such command.
 GET_VERSION = 0x00
-_BY_NUMBER = {
-    generation: {layout.command: (name, layout) for name, layout in table.items()}
-    for generation, table in TELEMETRY.items()
-}
+_BY_NUMBER = {generation: by_number(table) for generation, table in TELEMETRY.items()}
 _SDO_VALUES = MappingProxyType({"f32": "f", "u32": "I", "i32": "i", "u16": "H", "u8": "B", "bool": "?"})
 _SDO_HEAD = struct.Struct("<BHB")
 # RxSdo and TxSdo of CAN Simple in firmware 0.6, as the node names them.
 SDO_REQUEST, SDO_REPLY = 0x04, 0x05
-
-
-@dataclass(frozen=True, slots=True)
-class Decoded:
-    """A telemetry message of one node, its fields by the names of `TELEMETRY`."""
-
-    node: int
-    name: str
-    values: Mapping[str, Value]
 
 
 def identifier(node: int, command: int) -> int:
@@ -166,15 +149,12 @@ def decode(generation: Generation, frame: Frame) -> Decoded | None:
     """Return what a node says; None for what is no telemetry, or not of its full length."""
     node, command = split(frame.can_id)
     known = _BY_NUMBER[generation].get(command)
-    if frame.extended or known is None or node > LARGEST_NODE:
+    if frame.extended or known is None or node > LARGEST_NODE or len(frame.data) != known.length:
         return None
-    name, layout = known
-    if len(frame.data) != layout.length:
-        return None
-    values: dict[str, Value] = layout.unpack(frame.data)
-    if generation is Generation.V06 and name == "Heartbeat":
+    values = known.unpack(frame.data)
+    if generation is Generation.V06 and known.name == "Heartbeat":
         values["trajectory_done"] = int(values["trajectory_done"]) & 1
-    return Decoded(node, name, values)
+    return Decoded(known.name, values, node)
 
 
 def read_parameter(node: int, endpoint: int) -> Frame:

@@ -21,7 +21,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from drivers.motor.vendor_parts import Sign, in_sides, layouts
+from drivers.motor.vendor_parts import Sign, by_number, in_sides, layouts
 from drivers.types import CyclicFrame, Frame, LineQuestions, SafetyCard, SettingsFault
 
 # User manual, packet serial: eight addresses; the version is at most 48 bytes; CRC-16 ends every reply.
@@ -74,7 +74,7 @@ GETTERS = layouts(
 GAIN_STEPS = 65536
 """Of a velocity gain in one unit; the order of the gains differs between setting and asking."""
 _OLDER_STATUS = struct.Struct(">H")
-_GETTER_BY_NUMBER = {layout.command: (name, layout) for name, layout in GETTERS.items()}
+_GETTER_BY_NUMBER = by_number(GETTERS)
 Value = float | int | str
 
 
@@ -121,7 +121,7 @@ def reply(address: int, name: str, received: bytes) -> tuple[Mapping[str, Value]
 
 def getter_name(command: int) -> str | None:
     """Name of the command that asks with this number."""
-    return _GETTER_BY_NUMBER[command][0] if command in _GETTER_BY_NUMBER else None
+    return _GETTER_BY_NUMBER[command].name if command in _GETTER_BY_NUMBER else None
 
 
 def _head(address: int, command: int) -> bytes:

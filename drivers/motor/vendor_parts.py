@@ -114,12 +114,17 @@ def wheel_sample(
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Layout of a message: its number, its bytes by `struct` without the byte order, and the names of the fields."""
+    """Layout of a message: its name and number, its bytes by `struct` without the byte order, and its fields.
 
+    `steps`: of each field, how many steps on the wire make a unit; a value with one step a unit stays a whole number.
+    """
+
+    name: str
     command: int
     order: str
     body: str
     fields: tuple[str, ...] = ()
+    steps: tuple[float, ...] = ()
 
     @property
     def length(self) -> int:
@@ -127,19 +132,40 @@ class Layout:
         return struct.calcsize(self.order + self.body)
 
     def pack(self, *values: float) -> bytes:
-        """Return the bytes of the fields."""
+        """Return the bytes of the fields, from values in steps."""
         return struct.pack(self.order + self.body, *values)
 
-    def unpack(self, data: bytes) -> dict[str, Any]:
-        """Return the fields by name, of bytes that begin with them."""
-        return dict(zip(self.fields, struct.unpack_from(self.order + self.body, data), strict=True))
+    def unpack(self, data: bytes, offset: int = 0) -> dict[str, Any]:
+        """Return the fields by name, of bytes that have them from `offset` on."""
+        raw = struct.unpack_from(self.order + self.body, data, offset)
+        named = zip(self.fields, self.steps, raw, strict=True)
+        return {name: value if steps == 1.0 else value / steps for name, steps, value in named}
+
+
+def layout(order: str, name: str, command: int, body: str, fields: str) -> Layout:
+    """Return a layout; `fields` has their names, each with `:STEPS` where a unit is not one step."""
+    pairs = [item.partition(":") for item in fields.split()]
+    steps = tuple(float(steps) if steps else 1.0 for _, _, steps in pairs)
+    return Layout(name, command, order, body, tuple(name for name, _, _ in pairs), steps)
 
 
 def layouts(order: str, *rows: tuple[str, int, str, str]) -> Mapping[str, Layout]:
-    """Return layouts by name, from rows of name, number, body and the fields' names."""
-    return MappingProxyType(
-        {name: Layout(command, order, body, tuple(names.split())) for name, command, body, names in rows}
-    )
+    """Return layouts by name, from rows of name, number, body and fields as `layout` takes them."""
+    return MappingProxyType({row[0]: layout(order, *row) for row in rows})
+
+
+def by_number(named: Mapping[str, Layout]) -> Mapping[int, Layout]:
+    """Return the same layouts by their numbers."""
+    return MappingProxyType({each.command: each for each in named.values()})
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """A message by its name, with its fields, and which controller or motor sent it (-1 where it does not say)."""
+
+    name: str
+    values: Mapping[str, Any]
+    node: int = -1
 
 
 def limits(fastest: Limit, timeout: Limit, stop_deceleration_rad_s2: float) -> Limits:

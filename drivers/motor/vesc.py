@@ -155,9 +155,9 @@ class VescPort(Port):
                 return report
             return FrameReport(counts=report.counts, lost=report.lost, is_status=True, wheels=self._sample(t_ns))
         decoded = codec.decode(frame)
-        if decoded is None or decoded.controller not in self._motors:
+        if decoded is None or decoded.node not in self._motors:
             return self._unused(frame)
-        motor = self._motors[decoded.controller]
+        motor = self._motors[decoded.node]
         match decoded.name:
             case "pong":
                 motor.answered = True

@@ -10,9 +10,9 @@ from __future__ import annotations
 import binascii
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 
+from drivers.motor.vendor_parts import Decoded, by_number, layout, layouts
 from drivers.types import Frame
 
 # comm_can of the firmware: identifier 255 is all controllers; packets have at most PACKET_MAX_PL_LEN bytes.
@@ -55,24 +55,20 @@ FILL, FILL_LONG, PROCESS, PROCESS_SHORT = 5, 6, 7, 8
 _FILL_BYTES, _FILL_REACH, _LONG_BYTES, _SHORT_BYTES = 7, 255, 6, 6
 
 
-def _fields(text: str) -> tuple[tuple[str, float], ...]:
-    pairs = (item.partition(":") for item in text.split())
-    return tuple((name, float(steps) if steps else 1.0) for name, _, steps in pairs)
-
-
-_STATUS: Mapping[int, tuple[str, str, tuple[tuple[str, float], ...]]] = MappingProxyType(
-    {
-        9: ("status", ">ihh", _fields("erpm current_a:10 duty:1000")),
-        14: ("status2", ">ii", _fields("ah:1e4 ah_charged:1e4")),
-        15: ("status3", ">ii", _fields("wh:1e4 wh_charged:1e4")),
-        16: ("status4", ">hhhh", _fields("t_fet_c:10 t_motor_c:10 current_in_a:10 pid_pos_deg:50")),
-        27: ("status5", ">ihxx", _fields("tachometer v_in:10")),
-        58: ("status6", ">hhhh", _fields("adc1_v:1000 adc2_v:1000 adc3_v:1000 ppm:1000")),
-    }
+_STATUS = by_number(
+    layouts(
+        ">",
+        ("status", 9, "ihh", "erpm current_a:10 duty:1000"),
+        ("status2", 14, "ii", "ah:1e4 ah_charged:1e4"),
+        ("status3", 15, "ii", "wh:1e4 wh_charged:1e4"),
+        ("status4", 16, "hhhh", "t_fet_c:10 t_motor_c:10 current_in_a:10 pid_pos_deg:50"),
+        ("status5", 27, "ihxx", "tachometer v_in:10"),
+        ("status6", 58, "hhhh", "adc1_v:1000 adc2_v:1000 adc3_v:1000 ppm:1000"),
+    )
 )
-_VALUES: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = tuple(
-    (body, _fields(names))
-    for body, names in (
+VALUES = tuple(
+    layout(">", "values", GET_VALUES, body, fields)
+    for body, fields in (
         ("h", "t_fet_c:10"),
         ("h", "t_motor_c:10"),
         ("i", "current_motor_a:100"),
@@ -104,15 +100,6 @@ ALL_OF_A_MOTOR = 1 << 7 | 1 << 13 | 1 << 17 | FAULT_AND_STATUS
 TIMED_OUT, KILL_SWITCH = 1, 2
 
 
-@dataclass(frozen=True, slots=True)
-class Decoded:
-    """A status message of one controller, or its answer to a ping ("pong", without values)."""
-
-    controller: int
-    name: str
-    values: Mapping[str, float]
-
-
 def can_frame(command: int, controller: int, data: bytes) -> Frame:
     """Return the frame of a command. Raises ValueError for a controller above 255."""
     if not 0 <= controller <= EVERYBODY:
@@ -137,13 +124,11 @@ def decode(frame: Frame) -> Decoded | None:
         return None
     number, controller = frame.can_id >> 8, frame.can_id & 0xFF
     if number == PONG and len(frame.data) >= 1:
-        return Decoded(frame.data[0], "pong", MappingProxyType({}))
-    if number not in _STATUS:
+        return Decoded("pong", MappingProxyType({}), frame.data[0])
+    status = _STATUS.get(number)
+    if status is None or len(frame.data) != status.length:
         return None
-    name, body, fields = _STATUS[number]
-    if len(frame.data) != struct.calcsize(body):
-        return None
-    return Decoded(controller, name, _scaled(fields, struct.unpack(body, frame.data)))
+    return Decoded(status.name, status.unpack(frame.data), controller)
 
 
 def packet_command(name: str, value: float) -> bytes:
@@ -165,19 +150,18 @@ def forward(controller: int, payload: bytes) -> bytes:
 def values(payload: bytes) -> Mapping[str, float] | None:
     """Return the values in an answer to GET_VALUES or its selective form; None for what is no whole answer."""
     if payload[:1] == bytes([GET_VALUES]):
-        mask, offset = (1 << len(_VALUES)) - 1, 1
+        mask, offset = (1 << len(VALUES)) - 1, 1
     elif payload[:1] == bytes([GET_VALUES_SELECTIVE]) and len(payload) >= 5:
         mask, offset = int.from_bytes(payload[1:5]), 5
     else:
         return None
     found: dict[str, float] = {}
-    for bit, (body, fields) in enumerate(_VALUES):
+    for bit, part in enumerate(VALUES):
         if mask >> bit & 1:
-            try:
-                found |= _scaled(fields, struct.unpack_from(">" + body, payload, offset))
-            except struct.error:
+            if len(payload) < offset + part.length:
                 return None
-            offset += struct.calcsize(">" + body)
+            found |= part.unpack(payload, offset)
+            offset += part.length
     return MappingProxyType(found)
 
 
@@ -304,7 +288,3 @@ class PacketDecoder:
 def _steps(value: float, steps: float) -> int:
     low, high = _I32
     return min(max(round(value * steps), low), high)
-
-
-def _scaled(fields: tuple[tuple[str, float], ...], raw: tuple[int, ...]) -> dict[str, float]:
-    return {name: value / steps if steps != 1.0 else value for (name, steps), value in zip(fields, raw, strict=True)}

@@ -194,7 +194,7 @@ def cyclic_frames(settings: VescSettings, command_rate_hz: float, _authenticated
 def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
     """Return the controllers whose status was heard, split into left and right as they are numbered; None for none."""
     decoded = [codec.decode(frame) for frame in frames]
-    nodes = sorted({one.controller for one in decoded if one is not None and one.name == "status"})
+    nodes = sorted({one.node for one in decoded if one is not None and one.name == "status"})
     return {"nodes": in_sides(nodes)} if len(nodes) > 1 else None
 
 

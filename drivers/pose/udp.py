@@ -17,8 +17,7 @@ from typing import Any
 
 import msgspec
 
-from drivers.pose import PoseSourceError
-from drivers.pose.headings import is_heading_filled_in
+from drivers.pose import PoseSourceError, is_heading_filled_in
 from drivers.pose.senders import SILENCE_S, PoseProof, SenderGate, parse_allowed
 from drivers.types import PoseSample
 

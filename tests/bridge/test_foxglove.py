@@ -22,10 +22,10 @@ from disco_hw.config import load_robot_config
 from disco_hw.daemon import run, socket_path
 from disco_hw.daemon.page_feed import ViewerFeed, feed_path
 from disco_hw.errors import InputError
-from disco_hw.experiments import write_robot_file
 from disco_hw.log.mcap_log import SCENE, VIEWS
 from disco_hw.log.records import TOPIC_BY_NAME, DaemonState, Estimate, Event
 from disco_hw.runtime.robot_setup import load_setup, scene_of
+from tools.stack import write_robot_file
 
 ESTIMATE = Estimate(7, 1.0, 2.0, 0.5, (0.0,) * 9, 0.25, 0.0, 0.0, 0.0)
 WANTED = {"/estimate", "/view/transform", SCENE}

@@ -8,7 +8,7 @@ import pytest
 from disco_hw.daemon.emergency import read_robot_toml, stop_robot
 from disco_hw.daemon.kept_connection import KeptConnection
 from disco_hw.errors import InputError, WorkError
-from disco_hw.files.descriptors import DescriptorReserve, free_descriptors
+from disco_hw.processes import DescriptorReserve, free_descriptors
 from tests.viewer.test_operator_controls import Daemon
 
 

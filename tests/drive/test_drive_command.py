@@ -11,7 +11,7 @@ import pytest
 
 from disco_hw.drive.drive_command import DriveOptions, DriveResult, run_drive
 from disco_hw.errors import InputError
-from disco_hw.experiments import write_robot_file
+from tools.stack import write_robot_file
 from tools.viewer_run import write_log
 
 

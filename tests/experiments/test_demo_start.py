@@ -13,13 +13,14 @@ import pytest
 
 from disco_hw import experiments
 from disco_hw.errors import WorkError
-from disco_hw.experiments import Operator, Stack
+from disco_hw.experiments import Operator
 from disco_hw.experiments.demo import start_pose
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
 from sim.body_dynamics import BodyPose
 from tests.daemon.simulated_clock import SimulatedClock
 from tests.runtime.simulated import ROBOT_FILE, simulated_stack
+from tools.stack import Stack
 
 QUARTER_S = 0.5 * math.pi * 0.75 / 0.2
 

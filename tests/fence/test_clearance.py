@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from disco_hw.fence import Circle, Fence, Footprint
-from disco_hw.fence.clearance import FREE_M, Boundaries, MovingCircle, along_line, first_breach
-from disco_hw.fence.task_line import task_breach
+from disco_hw.fence.clearance import FREE_M, Boundaries, MovingCircle, along_line, first_breach, task_breach
 
 FOOTPRINT = Footprint(0.5, 0.4, 0.05)
 ROOM = ((-2.0, -1.5), (2.0, -1.5), (2.0, 1.5), (-2.0, 1.5))

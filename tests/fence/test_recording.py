@@ -9,7 +9,7 @@ import pytest
 
 from disco_hw.fence import Fence, Footprint
 from disco_hw.fence.clearance import Boundaries, along_line
-from disco_hw.fence.recording import NoFence, fence_along
+from disco_hw.first_use.fence_drive import NoFence, fence_along
 
 FOOTPRINT = Footprint(0.5, 0.4, 0.05)
 SQUARE = np.array([[1.5, -1.5], [1.5, 1.5], [-1.5, 1.5], [-1.5, -1.5], [1.5, -1.5]])

@@ -17,7 +17,7 @@ import pytest
 from disco_hw.adaptation.guard import choose_adaptation
 from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError
-from disco_hw.experiments import disco_hw_process, write_robot_file
+from disco_hw.experiments import disco_hw_process
 from disco_hw.first_use import InitOptions, recognised, run_init
 from disco_hw.runtime.robot_setup import load_setup
 from drivers.motor import motor_drivers
@@ -26,6 +26,7 @@ from drivers.types import Frame
 from sim.devices.roboclaw import Roboclaw
 from sim.plant_parameters import PlantParameters
 from tests.first_use.miswired import MiswiredRobot, Miswiring, robot_file
+from tools.stack import write_robot_file
 
 SIMULATED = {"reference": {}, "odrive": {"nodes": [3, 5]}, "vesc": {"nodes": [23, 51]}, "agilex": {}}
 

@@ -11,7 +11,7 @@ from typing import Any
 from unittest import mock
 
 from disco_hw.cli import main
-from disco_hw.experiments import TruthRow
+from tools.stack import TruthRow
 
 STILL_RAD_S = 0.05
 COMMAND_TIMEOUT_S = 0.1

@@ -9,11 +9,11 @@ import pytest
 
 import disco_hw
 from disco_hw.adaptation.guard import Geometry, believed_geometry, with_geometry
-from disco_hw.experiments import running_stack
-from disco_hw.experiments.adapt import GROWTH, drive_through_change, newest_truth_s
 from disco_hw.log.reader import open_log
 from disco_hw.model import load_model, model_text
 from tests.hil.stack import disco
+from tools.bench.adapt import GROWTH, drive_through_change
+from tools.stack import newest_truth_s, running_stack
 
 pytestmark = [pytest.mark.hil, pytest.mark.long]
 

@@ -6,8 +6,9 @@ import re
 
 import pytest
 
-from disco_hw.experiments import disco_hw_process, write_robot_file
+from disco_hw.experiments import disco_hw_process
 from tests.hil.stack import disco, disco_json
+from tools.stack import write_robot_file
 
 pytestmark = pytest.mark.hil
 

@@ -11,7 +11,8 @@ import time
 
 import pytest
 
-from disco_hw.experiments import disco_hw_process, write_robot_file
+from disco_hw.experiments import disco_hw_process
+from tools.stack import write_robot_file
 
 pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.timeout(400)]
 _REPEAT_S = 0.03

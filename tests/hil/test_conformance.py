@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.experiments import DEVICES, READY_TIMEOUT_S, disco_hw_process, write_robot_file
+from disco_hw.experiments import DEVICES, READY_TIMEOUT_S, disco_hw_process
 from tests.drivers.waiting import wait_until
+from tools.stack import write_robot_file
 
 pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.timeout(300)]
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,9 +10,10 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from disco_hw.experiments import Child, running_stack
+from disco_hw.experiments import Child
 from disco_hw.log.reader import open_log
 from tests.hil.stack import STILL_RAD_S
+from tools.stack import running_stack
 
 pytestmark = pytest.mark.hil
 

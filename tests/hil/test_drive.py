@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 
 from disco_hw.drive import INPUT_LIMIT_NS
-from disco_hw.experiments import Operator, disco_hw_process, write_robot_file
+from disco_hw.experiments import Operator, disco_hw_process
 from disco_hw.log.load import load_drive
 from disco_hw.log.reader import open_log
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.replay import replay
 from tests.hil.stack import DECELERATION_RAD_S2, MOTOR_SETTLING_S, STILL_RAD_S
+from tools.stack import write_robot_file
 
 pytestmark = pytest.mark.hil
 

@@ -9,8 +9,8 @@ import time
 import pytest
 
 from disco_hw.errors import WorkError
-from disco_hw.experiments import running_stack
 from tests.hil.stack import STILL_RAD_S, disco, disco_json
+from tools.stack import running_stack
 
 pytestmark = pytest.mark.hil
 
@@ -62,7 +62,7 @@ def test_estop_stops_and_latches(tmp_path, link, daemon):
 
 
 def test_estop_without_a_robot_says_so_and_fails(tmp_path):
-    from disco_hw.experiments import write_robot_file
+    from tools.stack import write_robot_file
 
     code, output = disco("estop", str(write_robot_file(tmp_path)))
     assert code == 1

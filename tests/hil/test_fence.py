@@ -8,8 +8,9 @@ import socket
 import pytest
 
 from disco_hw.errors import WorkError
-from disco_hw.experiments import READY_TIMEOUT_S, running_stack
+from disco_hw.experiments import READY_TIMEOUT_S
 from tests.hil.stack import disco
+from tools.stack import running_stack
 
 TASK = 'kind = "circle"\nradius_m = 0.75\nspeed_m_s = 0.2\n'
 ROOM = [[-1.8, -1.8], [1.8, -1.8], [1.8, 1.8], [-1.8, 1.8]]

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.experiments import running_stack, write_robot_file
 from disco_hw.processes import can_lock_memory
+from tools.stack import running_stack, write_robot_file
 
 pytestmark = pytest.mark.hil
 MOST_LOCKED_BYTES = 400_000_000

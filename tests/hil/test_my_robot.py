@@ -22,8 +22,9 @@ import pytest
 from disco_hw.config import load_robot_config
 from disco_hw.daemon import send_request, socket_path
 from disco_hw.errors import WorkError
-from disco_hw.experiments import disco_hw_process, link_of_device, write_robot_file
+from disco_hw.experiments import disco_hw_process, link_of_device
 from tests.hil.test_commission import Terminal
+from tools.stack import write_robot_file
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "my-robot.md").read_text("utf-8")
 DRIVERS = ("reference", "odrive", "vesc", "agilex", "roboclaw")

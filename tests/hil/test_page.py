@@ -12,7 +12,7 @@ import pytest
 
 from disco_hw.daemon import send_request
 from disco_hw.drive import INPUT_LIMIT_NS
-from disco_hw.experiments import disco_hw_process, is_stationary, running_stack
+from disco_hw.experiments import disco_hw_process, is_stationary
 from disco_hw.log.reader import open_log
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.viewer import scene
@@ -22,6 +22,7 @@ from tests.hil.test_drive import Bench
 from tests.viewer.camera import project, screenshot, shows
 from tests.viewer.test_page import scene_canvas, wait_for
 from tools.browser import chromium, keep, opened
+from tools.stack import running_stack
 
 pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.browser]
 # Ticks, the link, and a machine that has other things to do.

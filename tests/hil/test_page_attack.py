@@ -4,10 +4,10 @@ import time
 
 import pytest
 
-from disco_hw.experiments import running_stack
 from tests.hil.stack import STILL_RAD_S
 from tests.viewer.test_attack import attack, limited_page
 from tests.viewer.test_operator_controls import ask, line_to
+from tools.stack import running_stack
 
 pytestmark = pytest.mark.hil
 ATTACKED_S = 5.0

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from disco_hw.experiments import READY_TIMEOUT_S, running_stack, write_robot_file
+from disco_hw.experiments import READY_TIMEOUT_S
 from tests.hil.stack import disco, disco_json
 from tests.runtime.path_robot import ROBOTS
+from tools.stack import running_stack, write_robot_file
 
 PATH = "x_m,y_m\n0,0\n0.5,0\n0.8,0.2\n"
 TASK = 'path = "path.csv"\nspeed_m_s = 0.25\n'

@@ -2,11 +2,11 @@
 
 import pytest
 
-from disco_hw.experiments import running_stack
 from tests.hil.test_page import assert_drawn, page_of
 from tests.runtime.path_robot import ROBOTS
 from tests.viewer.test_page import wait_for
 from tools.browser import chromium, keep, opened
+from tools.stack import running_stack
 
 pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.browser]
 TASK = 'path = "path.csv"\nspeed_m_s = 0.2\n'

@@ -12,12 +12,13 @@ from pathlib import Path
 import pytest
 
 from disco_hw.errors import WorkError
-from disco_hw.experiments import READY_TIMEOUT_S, Stack, running_stack
+from disco_hw.experiments import READY_TIMEOUT_S
 from disco_hw.log.log_command import info
 from disco_hw.log.reader import open_log
 from tests.drivers.waiting import free_port, wait_until
 from tests.hil.stack import STILL_RAD_S, disco_here
 from tests.log.processes import SmallDisk
+from tools.stack import Stack, running_stack
 
 pytestmark = pytest.mark.hil
 

@@ -18,18 +18,12 @@ import can
 import pytest
 
 from disco_hw.errors import WorkError
-from disco_hw.experiments import (
-    READY_TIMEOUT_S,
-    Operator,
-    disco_hw_process,
-    read_truth,
-    running_stack,
-    write_robot_file,
-)
+from disco_hw.experiments import READY_TIMEOUT_S, Operator, disco_hw_process
 from firmware_protocol.codec import Codec
 from tests.drivers.waiting import wait_until
 from tests.hil.stack import STILL_RAD_S, disco, disco_here
 from tests.runtime.path_robot import path_robot
+from tools.stack import read_truth, running_stack, write_robot_file
 
 pytestmark = pytest.mark.hil
 

@@ -13,9 +13,10 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
 
-from disco_hw import experiments
-from disco_hw.experiments import FAST_START, disco_hw_process, is_stationary
+from disco_hw.experiments import READY_TIMEOUT_S, disco_hw_process, is_stationary
 from tests.hil.test_drive import Bench
+from tools import stack as rig
+from tools.stack import FAST_START
 
 pytestmark = [pytest.mark.hil, pytest.mark.timeout(400)]
 
@@ -51,9 +52,9 @@ def node(kind, output, start=FAST_START):
 
 @contextmanager
 def stack_with_bridge(directory, monkeypatch):
-    written = experiments.write_robot_file
-    monkeypatch.setattr(experiments, "write_robot_file", lambda *given: with_poses_of_ros(written(*given)))
-    with experiments.running_stack(directory) as stack:
+    written = rig.write_robot_file
+    monkeypatch.setattr(rig, "write_robot_file", lambda *given: with_poses_of_ros(written(*given)))
+    with rig.running_stack(directory) as stack:
         bridge = ["bridge", "ros2", str(stack.robot_file)]
         with disco_hw_process("bridge", bridge, directory / "bridge.txt") as child:
             yield stack, child.process
@@ -131,7 +132,7 @@ def test_real_ros_arms_and_drives_by_its_speeds(tmp_path):
 
 
 def drive(stack):
-    stack.operator.wait_until("a pose", lambda status: status["pose_ok"], experiments.READY_TIMEOUT_S)
+    stack.operator.wait_until("a pose", lambda status: status["pose_ok"], READY_TIMEOUT_S)
     stack.drive()
 
 
@@ -144,7 +145,7 @@ def assert_stops(stack):
 def test_it_drives_by_the_poses_of_a_node_that_hears_its_odometry_and_stops_when_the_node_dies(tmp_path, monkeypatch):
     said = tmp_path / "node.txt"
     with stack_with_bridge(tmp_path, monkeypatch) as (stack, _), node("echo", said) as process:
-        stack.operator.wait_until("a pose", lambda status: status["pose_ok"], experiments.READY_TIMEOUT_S)
+        stack.operator.wait_until("a pose", lambda status: status["pose_ok"], READY_TIMEOUT_S)
         status = stack.drive_until("a metre further", lambda _: far(said) > 1.0, 30.0)
         assert status["pose_ok"]
         assert status["task"]["distance_m"] < 0.2
@@ -163,7 +164,7 @@ def test_it_drives_by_the_transforms_of_a_localisation_and_stops_when_that_dies(
 
     monkeypatch.setitem(globals(), "with_poses_of_ros", by_transforms)
     with stack_with_bridge(tmp_path, monkeypatch) as (stack, _), node("tf", said) as process:
-        stack.operator.wait_until("a pose", lambda status: status["pose_ok"], experiments.READY_TIMEOUT_S)
+        stack.operator.wait_until("a pose", lambda status: status["pose_ok"], READY_TIMEOUT_S)
         status = stack.drive_until("a metre further", lambda _: far(said) > 1.0, 30.0)
         assert status["task"]["distance_m"] < 0.2
         process.kill()

@@ -12,9 +12,10 @@ import pytest
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
 
 from disco_hw.config import load_robot_config
-from disco_hw.experiments import FAST_START, FAST_TASK, READY_TIMEOUT_S, Operator, is_stationary, write_robot_file
+from disco_hw.experiments import READY_TIMEOUT_S, Operator, is_stationary
 from disco_hw.experiments import disco_hw_process as process_of
 from tests.hil.test_ros2 import real_node, real_ros
+from tools.stack import FAST_START, FAST_TASK, write_robot_file
 
 pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.timeout(400)]
 JOINTS = 'left_joints = ["fl", "rl"]\nright_joints = ["fr", "rr"]\n'

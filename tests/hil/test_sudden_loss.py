@@ -8,10 +8,10 @@ import time
 
 import pytest
 
-from disco_hw.experiments import running_stack
 from disco_hw.log.log_command import info
 from disco_hw.log.reader import open_log
 from tests.hil.stack import assert_stopped_in_time
+from tools.stack import running_stack
 
 pytestmark = pytest.mark.hil
 

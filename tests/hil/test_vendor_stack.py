@@ -8,8 +8,9 @@ import time
 
 import pytest
 
-from disco_hw.experiments import DEVICES, running_stack
+from disco_hw.experiments import DEVICES
 from tests.hil.stack import STILL_RAD_S, disco_json
+from tools.stack import running_stack
 
 pytestmark = pytest.mark.hil
 

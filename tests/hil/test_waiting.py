@@ -5,8 +5,9 @@ import time
 
 import pytest
 
-from disco_hw.experiments import disco_hw_process, write_robot_file
+from disco_hw.experiments import disco_hw_process
 from tests.hil.stack import disco_here
+from tools.stack import write_robot_file
 
 pytestmark = pytest.mark.hil
 

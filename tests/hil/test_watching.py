@@ -12,9 +12,10 @@ import time
 
 import pytest
 
-from disco_hw.experiments import disco_hw_process, write_robot_file
+from disco_hw.experiments import disco_hw_process
 from tests.drivers.waiting import wait_until
 from tests.hil.test_check import wait_for_line
+from tools.stack import write_robot_file
 
 pytestmark = pytest.mark.hil
 

@@ -11,7 +11,6 @@ import tty
 
 import pytest
 
-from disco_hw.experiments import write_robot_file
 from drivers.transport import serial
 from drivers.types import Frame
 from firmware_protocol.serial_framing import encode_frame
@@ -23,6 +22,7 @@ from sim.plant_parameters import PlantParameters
 from tests.firmware_protocol.other_end import LinkEnd
 from tests.firmware_protocol.ports.posix_board import build_board, prefer, running_board
 from tests.firmware_protocol.protocol_host import ProtocolHost
+from tools.stack import write_robot_file
 
 
 @pytest.fixture(scope="module")

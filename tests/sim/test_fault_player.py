@@ -12,11 +12,11 @@ from sim.can_protocol import ErrorState
 from sim.fault_player import COMMANDS, CpuHogs, FaultPlayer, Injection
 from sim.fault_schedule import KINDS, parse_schedule
 from sim.hub import HubLink
-from sim.in_process import SimulatedCan
 from sim.plant import Plant
 from sim.serial_line import SerialLine
 from sim.unixcan import UnixCanBus
 from sim.virtual_robot import TRUTH_COLUMNS, VirtualRobot
+from tools.in_process import SimulatedCan
 
 MS = 1_000_000
 

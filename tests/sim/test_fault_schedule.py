@@ -11,8 +11,8 @@ from sim.fault_schedule import (
     FaultFileError,
     kinds_table,
     parse_schedule,
-    random_schedule,
 )
+from tools.random_faults import random_schedule
 
 
 @contextmanager

@@ -5,9 +5,9 @@ from firmware_protocol.firmware_core import FirmwareConfig
 from sim import LinkFaultError
 from sim.body_dynamics import BodyPose
 from sim.effects import HiddenEffectError
-from sim.in_process import REOPEN_NS, SimulatedCan
 from sim.plant_parameters import PlantParameters
 from sim.virtual_robot import RobotInProcess
+from tools.in_process import REOPEN_NS, SimulatedCan
 
 FIRMWARE = FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0)
 

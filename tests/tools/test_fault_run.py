@@ -6,9 +6,10 @@ A short part of what `make fault-campaign` does for hours.
 import pytest
 
 from disco_hw.runtime.plausibility import PlausibilityStats
-from sim.fault_schedule import KINDS, FaultSchedule, parse_schedule, random_schedule
+from sim.fault_schedule import KINDS, FaultSchedule, parse_schedule
 from tools.fault_campaign import KINDS_LEFT_OUT, markdown, summary
 from tools.fault_run import FaultRun
+from tools.random_faults import random_schedule
 
 FAST = {"cycle_us": 5000}
 

@@ -20,9 +20,10 @@ from pathlib import Path
 import numpy as np
 
 from disco_hw.daemon import send_request
-from disco_hw.experiments import FAST_START, FAST_TASK, READY_TIMEOUT_S, Operator, disco_hw_process, write_robot_file
+from disco_hw.experiments import READY_TIMEOUT_S, Operator, disco_hw_process
 from disco_hw.log.reader import open_log
 from tools.bench.latency import WHEEL_COMMAND
+from tools.stack import FAST_START, FAST_TASK, write_robot_file
 
 DOMAIN = 90
 SETTLED_S = 2.0

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from disco_hw.experiments import Operator, disco_hw_process, write_robot_file
+from disco_hw.experiments import Operator, disco_hw_process
 from disco_hw.log.reader import open_log
+from tools.stack import write_robot_file
 
 WHEEL_COMMAND, WHEEL_TICKS = 0x100, 0x111
 SETTLED_S = 2.0

@@ -25,7 +25,7 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
 from disco_hw.daemon.page_feed import FeedSubscriber, ViewerFeed, feed_path
-from disco_hw.experiments import disco_hw_process, running_stack
+from disco_hw.experiments import disco_hw_process
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Plan
 from disco_hw.processes import stolen_ms
@@ -36,6 +36,7 @@ from disco_hw.viewer.recording import Recording, Snapshot, stage_of_robot
 from disco_hw.viewer.server import serving
 from drivers.types import WheelSample
 from tools.browser import chromium, opened
+from tools.stack import running_stack
 from tools.viewer_run import PERIOD_NS, ROBOT_FILE, pose_at, tick_records, write_log
 
 _HAS_STAMP = "[...document.querySelectorAll('input')].some(input => /^[0-9]{6,}$/.test(input.value))"

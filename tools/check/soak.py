@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from disco_hw.errors import WorkError
-from disco_hw.experiments import Operator, disco_hw_process, write_robot_file
+from disco_hw.experiments import Operator, disco_hw_process
 from disco_hw.processes import stolen_ms
+from tools.stack import write_robot_file
 
 WANTED_P999_US = 1000.0
 PERIOD_US = 20_000

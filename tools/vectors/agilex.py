@@ -86,8 +86,8 @@ def _check_meaning(found: Comparison, frame: Frame, then: Mapping[str, Any]) -> 
 
 def _in_their_words(decoded: protocol.Decoded) -> dict[str, Any]:
     ours: dict[str, Any] = dict(decoded.values)
-    if decoded.motor is not None:
-        ours["motor"] = decoded.motor
+    if decoded.node >= 0:
+        ours["motor"] = decoded.node
     if "switches" in ours:
         bits = ours.pop("switches")
         ours |= {f"sw{name}": _SWITCH.get(bits >> 2 * k & 3, "unknown") for k, name in enumerate("abcd")}

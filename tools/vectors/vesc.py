@@ -159,7 +159,7 @@ def _check_values(found: Comparison, payload: bytes, given: Mapping[str, Any]) -
     if read is None:
         found.differences.append(f"no values in {payload.hex()}")
         return
-    steps = {name: 1.0 / each for _, fields in codec._VALUES for name, each in fields}
+    steps = {name: 1.0 / each for part in codec.VALUES for name, each in zip(part.fields, part.steps, strict=True)}
     measured = dict(given.get("device_values", {}))
     measured |= {f"t_mos{k + 1}_c": value for k, value in enumerate(measured.pop("t_mos_c", ()))}
     for name, value in read.items():

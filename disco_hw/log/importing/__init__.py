@@ -25,8 +25,7 @@ from disco_hw.files import ROBOT_TOML as ROBOT_FILE
 from disco_hw.log import ROBOT_TOML, Attachment, End, Start, attachment, batch_encoder, version
 from disco_hw.log.container import MAGIC
 from disco_hw.log.drive import LONGEST_COMMAND_S, DriveLog
-from disco_hw.log.importing.headings import without_standing_headings
-from disco_hw.log.importing.losses import WARNING, warnings_first
+from disco_hw.log.importing.losses import WARNING, warnings_first, without_standing_headings
 from disco_hw.log.importing.rosbag_file import METADATA, SUFFIXES, is_bag
 from disco_hw.log.mcap_log import McapLog
 from disco_hw.log.records import Command, Record

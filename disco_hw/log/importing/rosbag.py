@@ -50,7 +50,7 @@ from disco_hw.log.importing.rosbag_topics import (
     choose,
 )
 from disco_hw.log.importing.rosbag_wheels import measured_columns, unwrapped, wheels_of
-from drivers.pose.headings import is_heading_measured
+from drivers.pose import is_heading_measured
 
 _LONGEST_COMMAND_NS = round(LONGEST_COMMAND_S * 1e9)
 # Chosen: where no wheels show a pause, nothing at all for this long is one.

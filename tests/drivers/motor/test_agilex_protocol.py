@@ -37,7 +37,7 @@ def test_the_state_and_the_odometry_are_read():
 def test_each_motor_has_its_own_identifier():
     motor = protocol.decode(Frame(0x254, bytes.fromhex("ff9c000a00000064")))
     assert motor is not None
-    assert (motor.motor, motor.values["rpm"], motor.values["pulses"]) == (3, -100, 100)
+    assert (motor.node, motor.values["rpm"], motor.values["pulses"]) == (3, -100, 100)
 
 
 @pytest.mark.parametrize("can_id", [0x211, 0x221, 0x251, 0x311])

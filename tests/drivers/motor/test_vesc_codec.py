@@ -21,7 +21,7 @@ def test_a_command_is_held_to_what_the_wire_can_say():
 def test_status_is_read_in_its_units():
     status = codec.decode(Frame(9 << 8 | 23, bytes.fromhex("00000BB8FFDF0064"), extended=True))
     assert status is not None
-    assert (status.controller, status.name) == (23, "status")
+    assert (status.node, status.name) == (23, "status")
     assert dict(status.values) == {"erpm": 3000, "current_a": -3.3, "duty": 0.1}
     other = codec.decode(Frame(27 << 8 | 23, bytes.fromhex("FFFFFFFA00F00000"), extended=True))
     assert other is not None
@@ -37,7 +37,7 @@ def test_a_pong_names_who_is_there():
     assert codec.ping(23, 200) == Frame(17 << 8 | 23, b"\xc8", extended=True)
     answer = codec.decode(Frame(18 << 8 | 200, bytes((23, 0)), extended=True))
     assert answer is not None
-    assert (answer.controller, answer.name) == (23, "pong")
+    assert (answer.node, answer.name) == (23, "pong")
 
 
 def test_a_fault_is_read_from_an_answer_in_fragments():

@@ -8,11 +8,12 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
-from disco_hw.experiments import Operator, disco_hw_process, write_robot_file
+from disco_hw.experiments import Operator, disco_hw_process
 from disco_hw.log.reader import open_log
 from disco_hw.processes import can_use_fifo
 from tests.watched_processors import build_watcher, watched_processors
 from tools.check.emulated_board import build_board, missing, running_board
+from tools.stack import write_robot_file
 
 pytestmark = [
     pytest.mark.long,

@@ -10,7 +10,7 @@ import pytest
 
 from disco_hw.log.drive import DriveLog
 from disco_hw.log.importing.csv_drive import read_csv
-from disco_hw.log.importing.headings import without_standing_headings
+from disco_hw.log.importing.losses import without_standing_headings
 from disco_hw.log.load import load_drive
 from tests.inference.test_infer_command import ROBOT
 from tests.log.importing.test_csv_faults import as_text, table
