@@ -27,8 +27,6 @@ class GridSettings:
     """Of a longer drive so much is judged, stretches with commands first. Chosen: it bounds how long a search takes."""
     stretch_s: float = 20.0
     """Length of the stretches that are picked of a long drive. Chosen: several manoeuvres each."""
-    shortest_run_s: float = 1.0
-    """Shorter runs are left out. Chosen: `lead_s` of each run is spent before it can be judged."""
     longest_silence_s: float = 1.5
     """Where wheel samples fail to come for longer, a run ends. Chosen."""
     speed_span_s: float = 0.03
@@ -52,7 +50,8 @@ class GridSettings:
     repeated_periods: float = 4.0
     """A value that is repeated for longer than so many periods was measured again. Chosen."""
     lead_s: float = 1.0
-    """After a run's start so long nothing is predicted: what was commanded before is not known. Chosen."""
+    """After a run's start so long nothing is predicted, as what was commanded before is not known. Shorter runs are left
+    out. Chosen."""
     lead_share: float = 0.25
     """And of a short run so much of it at most. Chosen: windows of 2 s are predicted 1 s ahead."""
     start_every_s: float = 0.2
@@ -86,10 +85,9 @@ class GridSettings:
     least_link_error_s: float = 0.15
     """Of commands a smaller one is none. Measured: lags that differ from turn to turn make 0.05 of an even link, and a
     drive that ramps by 9 rad/s^2 makes 0.105."""
-    least_link_nats: float = 0.05
-    """And the whole log fits by so much per pair better with it. Measured: even links 0.046 at most."""
     least_delay_nats: float = 0.05
-    """A delay stands out by so much per pose. Measured: steady circles 0.4, a robot that turns about 3."""
+    """A delay, and a drift or jump of the commands' clock, stands out by so much per pose or pair. Measured: delays on
+    steady circles 0.4, of a robot that turns about 3; even links 0.046 at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,8 +202,8 @@ class SelectionSettings:
     """Rounds of the closer search of a profiled entry. Chosen."""
     better_nats: float = 0.5
     """A fit from another start replaces the one known if it is better by this. Chosen."""
-    poor_share: float = 0.5
-    """A fit lacks much if its cost is above the expected one by this share. Chosen."""
+    poor_fit: float = 1.5
+    """Mean square of whitened residuals from which on a fit or a regime disagrees. Chosen: noise alone has one."""
     large_share: float = 0.25
     """An effect that makes up this share of what such a fit lacks is taken whatever its score. Chosen."""
     swap_nats: float = 2.0
@@ -215,6 +213,9 @@ class SelectionSettings:
     evidence (Kass and Raftery, 1995)."""
     block_lengths: tuple[int, ...] = (1, 3, 9)
     """Neighbouring blocks taken as one for the sandwich variance. Chosen: 3, 9 and 27 s."""
+    sure_sigmas: float = 3.0
+    """What differs by so many standard deviations is no chance: parts of a log, logs, regimes and their noise, the two
+    channels' opinions of an encoder. Chosen: one in 370."""
     even_rounds: int = 3
     """How often a fit to errors that are alike at every speed weighs them anew. Chosen: it is settled by then."""
     clearly_closer: float = 0.7
@@ -222,12 +223,8 @@ class SelectionSettings:
     less may be chance."""
     fewest_blocks: int = 5
     """Fewer blocks say nothing about their scatter. Chosen."""
-    far_off: float = 1.5
-    """Where the accepted set costs so many times what is expected, plainer noise is assumed. Chosen."""
     place_nats: float = 6.0
     """A patch of the floor and a change of all of it differ by less: either does. Chosen."""
-    encoder_sigmas: float = 3.0
-    """An encoder may be the cause if the body agrees within so many standard deviations. Chosen: one in 370."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -347,13 +344,8 @@ class ReportSettings:
     """It is taken over so many nodes either side. Chosen."""
     fewest_samples: int = 40
     """Regimes with fewer samples are left out. Chosen."""
-    excess: float = 1.5
-    """Mean square of whitened residuals from which on a regime disagrees. Chosen: noise alone has one."""
     louder: float = 1.1
     """Something is left in a regime with so much more than the richest model leaves. Chosen."""
-    sure_sigmas: float = 3.0
-    """What differs by so many standard deviations is no chance: regimes and their noise, parts of a log, logs. Chosen:
-    one in 370."""
     nats_each: float = 1.0
     """And nats for each parameter of the richest model. Chosen: the price of Akaike's criterion."""
     least_nats: float = 20.0
@@ -369,8 +361,8 @@ class ReportSettings:
     end_share: float = 0.01
     """A value this close to where its fit had to end, in its range, is not believed. Chosen."""
     wide_share: float = 0.5
-    """A half interval over so much of a value's distance from none says too little of it. Chosen: no interval is wider
-    than its value."""
+    """A value whose half interval, or whose change from one regime to its opposite, is over so much of its distance from
+    none says too little. Chosen: nobody who is told the value expects it."""
     limit_share: float = 0.8
     """Of a limit, the same of this share of it. Chosen."""
     beyond_limit: float = 1.05
@@ -384,15 +376,10 @@ class ReportSettings:
     magnitude."""
     alike_share: float = 0.05
     """Where a name can do less than this of what the term does, the term has to be worth more than it. Chosen."""
-    form_share: float = 0.5
-    """And one whose value differs from one regime to its opposite by this share of itself. Chosen: nobody who is told
-    the value expects it."""
     form_apart_sigmas: float = 3.5
     """By so many standard deviations. Chosen: of some twenty comparisons in a log one in a hundred logs by chance."""
     regime_known_share: float = 0.05
     """A regime that holds less of what is known of a value says nothing of it. Chosen."""
-    regime_blocks: int = 3
-    """Neighbouring blocks taken as one for the scatter of regimes. Chosen: 9 s."""
     short_parts: int = 4
     """Beside halves a log is divided into so many parts to see how parameters change along it. Chosen."""
     worth_share: float = 0.1

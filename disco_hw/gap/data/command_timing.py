@@ -269,4 +269,4 @@ def command_clock(wheels: Wheels, commands: Commands, settings: GridSettings) ->
     if not first.known or not first.delay_s:
         return StampClock(-first.delay_s), first.known
     align = CommandAlignment(turned, first, WheelResponse.of(commands, first.lag_s), settings)
-    return clock_of(align, settings, settings.least_link_error_s, settings.least_link_nats), True
+    return clock_of(align, settings, settings.least_link_error_s, settings.least_delay_nats), True

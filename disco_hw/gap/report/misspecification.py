@@ -29,7 +29,7 @@ from disco_hw.gap.search.least_squares import Fit, fit, inverse
 from disco_hw.gap.search.richest_model import CANDIDATES, DELAY_NAMES, indices
 from disco_hw.gap.search.selection import Z95, Split, inflation
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms
-from disco_hw.gap.settings import GRID_STEP_S, ReportSettings
+from disco_hw.gap.settings import GRID_STEP_S, GapSettings
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -207,18 +207,18 @@ def _changes_with_regime(found: ChannelResult, name: str) -> str | None:
     clearest: tuple[float, str] = (settings.form_apart_sigmas, "")
     for column, (one, other) in product(columns, _OPPOSITES):
         place, value = best.active.index(layout.place[column]), float(best.vector[layout.place[column]])
-        apart = _apart(best, channel.block, place, (inside[one], inside[other]), settings)
+        apart = _apart(best, channel.block, place, (inside[one], inside[other]), channel.settings)
         if apart is None:
             continue
         moved, moved_too, sigmas = apart
-        if abs(moved - moved_too) > settings.form_share * (abs(value) if math.isinf(size) else size):
+        if abs(moved - moved_too) > settings.wide_share * (abs(value) if math.isinf(size) else size):
             text = f"{column} is {value + moved:.3g} {one} and {value + moved_too:.3g} {other}"
             clearest = max(clearest, (abs(sigmas), text))
     return clearest[1] or None
 
 
 def _apart(
-    best: Fit, block: Index, place: int, inside: tuple[Mask, Mask], settings: ReportSettings
+    best: Fit, block: Index, place: int, inside: tuple[Mask, Mask], settings: GapSettings
 ) -> tuple[float, float, float] | None:
     """Return the change of an active entry in each of two regimes, and their difference in standard deviations.
 
@@ -227,13 +227,13 @@ def _apart(
     slope = best.jacobian[:, place]
     column = float(slope @ slope)
     parts = np.column_stack([np.where(mask, slope, 0.0) for mask in inside])
-    if min((parts**2).sum(axis=0)) < settings.regime_known_share * column:
+    if min((parts**2).sum(axis=0)) < settings.report.regime_known_share * column:
         return None
     wide = np.column_stack([best.jacobian, parts])
     covariance = inverse(wide.T @ wide)
     step = -covariance @ (wide.T @ best.residual)
     # Neighbouring blocks err together: a few are taken as one, and the larger of two variances counts.
-    group = np.unique(block // settings.regime_blocks, return_inverse=True)[1]
+    group = np.unique(block // settings.selection.block_lengths[1], return_inverse=True)[1]
     pulls = np.zeros((group.max() + 1, wide.shape[1]))
     np.add.at(pulls, group, wide * (best.residual + wide @ step)[:, None])
     contrast = covariance[-2] - covariance[-1]
@@ -359,7 +359,7 @@ def loud_regimes(found: ChannelResult) -> list[tuple[float, str]]:
             continue
         gain, spread = gain_by_block(0.5 * (now - best)[inside], samples.block[inside], settings.fewest_blocks)
         ratio = float(now[inside].sum() / max(best[inside].sum(), 1e-9))
-        if gain > price and gain > settings.sure_sigmas * spread and ratio > settings.louder:
+        if gain > price and gain > channel.settings.selection.sure_sigmas * spread and ratio > settings.louder:
             loud.append((math.sqrt(ratio), name))
     return sorted(loud, reverse=True)[: settings.most_regimes]
 

@@ -111,7 +111,7 @@ def test_the_misfit_of_a_stretch_at_an_age_is_that_of_all_its_pairs(shown):
 def test_a_clock_is_sought_where_a_delay_is_known(monkeypatch, first, told):
     def clock_of(align, settings, least_error_s, least_nats):
         assert (align.first, align.response_model.lag_s) == (first, 0.1)
-        assert (least_error_s, least_nats) == (settings.least_link_error_s, settings.least_link_nats)
+        assert (least_error_s, least_nats) == (settings.least_link_error_s, settings.least_delay_nats)
         return "sought"
 
     monkeypatch.setattr(Turned, "of", lambda wheels, settings: pairs([1.0, 2.0]))

@@ -152,7 +152,7 @@ def test_a_name_that_takes_little_of_what_its_channel_lacks_is_disputed(offset_m
 
 
 def test_a_value_in_two_regimes_is_what_each_says_and_as_far_apart_as_its_blocks_scatter():
-    generator, settings = np.random.default_rng(3), DEFAULT_SETTINGS.report
+    generator, settings = np.random.default_rng(3), DEFAULT_SETTINGS
     slope, block = generator.standard_normal((4000, 2)), np.repeat(np.arange(200), 20)
     one = np.repeat(generator.random(200) < 0.4, 20)
     noise = generator.standard_normal(4000)
@@ -181,7 +181,7 @@ def test_values_that_scatter_as_noise_does_are_not_called_different(monkeypatch)
 
     def apart(best, block, place, inside, settings):
         asked.append(place)
-        return 0.02, -0.02, times * settings.form_apart_sigmas
+        return 0.02, -0.02, times * settings.report.form_apart_sigmas
 
     monkeypatch.setattr("disco_hw.gap.report.misspecification._apart", apart)
     times = 0.95
