@@ -89,12 +89,12 @@ class GriddedDrive:
     def has_commands(self) -> bool:
         """Whether enough commands are known to judge the wheels."""
         known = np.count_nonzero(np.isfinite(self.command_rad_s[:, 0]))
-        return bool(known > 0.02 * self.t_s.size and self.encoder.t_s.size > self.settings.grid.fewest_readings)
+        return bool(known > 0.02 * self.t_s.size and self.encoder.t_s.size > self.settings.grid.fewest_samples)
 
     @property
     def has_poses(self) -> bool:
         """Whether enough poses were measured to judge the body."""
-        return self.pose.t_s.size > self.settings.grid.fewest_poses
+        return self.pose.t_s.size > self.settings.grid.fewest_samples
 
     @property
     def duration_s(self) -> float:

@@ -339,7 +339,7 @@ def _exceeded(effect: Effect, limit: ParameterEstimate, measured: Measured) -> s
         return None
     drive, settings = measured.drive, measured.drive.settings.report
     reached = effect.limited(_calm(drive), measured.geometry)
-    beyond = reached > limit.value * settings.beyond_limit
+    beyond = reached > limit.value * (1.0 + settings.worth_share)
     seconds = float(beyond.sum()) * GRID_STEP_S
     if seconds < max(settings.beyond_s, settings.beyond_share * drive.duration_s):
         return None

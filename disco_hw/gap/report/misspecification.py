@@ -156,7 +156,7 @@ def _takes_little(found: ChannelResult, name: str) -> str | None:
     if found.richest is None or not loud_regimes(found):
         return None
     best = 0.5 * float(found.richest @ found.richest)
-    left = found.fit.cost - best - settings.nats_each * found.richest_parameters
+    left = found.fit.cost - best - found.richest_parameters
     explained = max(_gain(found, name), 0.0)
     if explained > settings.worth_share * (explained + left):
         return None
@@ -260,13 +260,13 @@ def masks(drive: GriddedDrive, samples: GridSamples) -> Mapping[str, Mask]:
 def masks_at_nodes(drive: GriddedDrive) -> Mapping[str, Mask]:
     """Which nodes (M,) lie in which regime; regimes overlap."""
     speed, settings = drive.speed_rad_s, drive.settings.report
-    span = settings.span_nodes
+    span = drive.settings.terms.smooth_nodes
     mean, half = speed.mean(axis=1), 0.5 * (speed[:, 1] - speed[:, 0])
     ahead = np.minimum(np.arange(speed.shape[0]) + span, speed.shape[0] - 1)
     behind = np.maximum(np.arange(speed.shape[0]) - span, 0)
     growth = (np.abs(speed[ahead]).max(axis=1) - np.abs(speed[behind]).max(axis=1)) / (2 * span * GRID_STEP_S)
     size = np.abs(speed).max(axis=1)
-    moving = size > settings.rest_rad_s
+    moving = size > drive.settings.grid.rest_rad_s
     steady = moving & (np.abs(growth) < settings.speeding_rad_s2)
     turning = np.abs(half) > 0.3
     slow, fast = _halves(size, moving, settings.worth_share)
@@ -310,7 +310,7 @@ def regimes(
     found = []
     for name, mask in masks(channel.drive, samples).items():
         inside = mask & use
-        if inside.sum() >= channel.settings.report.fewest_samples:
+        if inside.sum() >= channel.settings.grid.fewest_samples:
             found.append(Regime(name, float(first[inside].mean()), float(last[inside].mean()), int(inside.sum())))
     return sorted(found, key=lambda regime: -(regime.before - regime.after) * regime.samples**0.5)
 
@@ -332,7 +332,7 @@ def remaining_disagreements(found: ChannelResult) -> list[str]:
     out = [f"{name}: {regime} still disagrees: {times:.1f} times the noise" for times, regime in loud_regimes(found)]
     if isinstance(channel, WheelChannel):
         drive = channel.drive
-        if channel.noise.command_stamp_s > channel.settings.report.at_bound * largest_command_jitter_s(drive):
+        if channel.noise.command_stamp_s > (1.0 - channel.settings.report.end_share) * largest_command_jitter_s(drive):
             out.append(
                 f"{name}: speeding up and braking still disagree: as if commands came "
                 f"{1e3 * channel.noise.command_stamp_s:.0f} ms early or late at random, the encoder's time stamps "
@@ -351,15 +351,16 @@ def loud_regimes(found: ChannelResult) -> list[tuple[float, str]]:
     width = found.richest.size // use.size
     now = (found.fit.residual.reshape(-1, width) ** 2).sum(axis=1)
     best = (found.richest.reshape(-1, width) ** 2).sum(axis=1)
-    price = settings.least_nats + settings.nats_each * found.richest_parameters
+    # One nat for each parameter is the price of Akaike's criterion.
+    price = channel.settings.selection.unnamed_score + found.richest_parameters
     loud = []
     for name, mask in masks(channel.drive, samples).items():
         inside = mask & use
-        if name == "standstill" or inside.sum() < settings.fewest_samples:
+        if name == "standstill" or inside.sum() < channel.settings.grid.fewest_samples:
             continue
-        gain, spread = gain_by_block(0.5 * (now - best)[inside], samples.block[inside], settings.fewest_blocks)
+        gain, spread = gain_by_block(0.5 * (now - best)[inside], samples.block[inside], channel.settings.selection.fewest_blocks)
         ratio = float(now[inside].sum() / max(best[inside].sum(), 1e-9))
-        if gain > price and gain > channel.settings.selection.sure_sigmas * spread and ratio > settings.louder:
+        if gain > price and gain > channel.settings.selection.sure_sigmas * spread and ratio > 1.0 + settings.worth_share:
             loud.append((math.sqrt(ratio), name))
     return sorted(loud, reverse=True)[: settings.most_regimes]
 
