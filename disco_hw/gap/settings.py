@@ -327,11 +327,6 @@ class ReportSettings:
     """For so long in all at least. Chosen."""
     beyond_share: float = 0.005
     """And for so much of the log. Chosen."""
-    times_unnamed: float = 3.0
-    """So is one that is worth less than so many times what a term without a name beside it is. Chosen: half an order of
-    magnitude."""
-    alike_share: float = 0.05
-    """Where a name can do less than this of what the term does, the term has to be worth more than it. Chosen."""
     form_apart_sigmas: float = 3.5
     """By so many standard deviations. Chosen: of some twenty comparisons in a log one in a hundred logs by chance."""
     regime_known_share: float = 0.05

@@ -5,14 +5,14 @@ of its channel, from which the noise was estimated. If that gains far more than 
 blocks of time, something is left. A named effect of the body must be as strong where little of it acts as where much
 acts: otherwise a slip that saturates would pass for one that grows without limit.
 
-A name is disputed if it explains little of what is missing, if a form without a name beside it explains as much, or if
-its value changes with the regime (parameter constancy; Hansen, 1992).
+A name is disputed if it explains little of what is missing, or if its value changes with the regime (parameter
+constancy; Hansen, 1992).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 
@@ -129,7 +129,6 @@ def disputed_names(found: ChannelResult) -> dict[str, str]:
         why = (
             _answers_otherwise(found, name)
             or _takes_little(found, name)
-            or _has_equal_alternative(found, name)
             or _changes_with_regime(found, name)
         )
         if why is not None:
@@ -161,37 +160,6 @@ def _takes_little(found: ChannelResult, name: str) -> str | None:
     if explained > settings.worth_share * (explained + left):
         return None
     return f"it takes {100.0 * explained / (explained + left):.2g} % of what its channel lacks"
-
-
-def _has_equal_alternative(found: ChannelResult, name: str) -> str | None:
-    """Describe an unnamed term of the channel that explains about as much as a name; None if there is none.
-
-    A term whose traces are of another kind must explain more: it stands for something else, beside which the name may
-    be true.
-    """
-    settings, taken = found.channel.settings.report, _gain(found, name)
-    end = 0
-    for one in found.unnamed:
-        begin, end = end, end + len(one.term.features)
-        times = settings.times_unnamed if _alike(found, name, range(begin, end)) > settings.alike_share else 1.0
-        if taken < times * one.evidence.gain:
-            return f"{one.form} beside it explains {one.evidence.gain / max(taken, 1e-9):.2g} times as much"
-    return None
-
-
-def _alike(found: ChannelResult, name: str, places: Iterable[int]) -> float:
-    """Return the share of a term's effect on the residuals that a named effect can reproduce, to first order.
-
-    `places`: the term's coefficients among those of all terms.
-    """
-    best, layout = found.fit, found.selector.channel.layout
-    first = len(found.channel.layout.columns)
-    indices = [first + place for place in places]
-    term = best.jacobian[:, [best.active.index(index) for index in indices]] @ best.vector[indices]
-    columns = [best.active.index(layout.place[c]) for c in CANDIDATES[name].columns if layout.place[c] in best.active]
-    column = best.jacobian[:, columns]
-    pull = column.T @ term
-    return float(pull @ inverse(column.T @ column) @ pull) / max(float(term @ term), 1e-300)
 
 
 def _changes_with_regime(found: ChannelResult, name: str) -> str | None:
