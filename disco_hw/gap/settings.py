@@ -42,14 +42,15 @@ class GridSettings:
     loud_rad_s: float = 2.0
     """Wheels that rest under such a command do not listen to it. Chosen."""
     fewest_samples: int = 60
-    """Fewer samples judge nothing: encoder readings the wheels, poses the body and their clock, either a regime. Chosen."""
+    """Fewer samples judge nothing: encoder readings the wheels, poses the body and their clock, either a regime.
+    Chosen."""
     repeated_share: float = 0.3
     """Wheel speeds of which more than this share repeat the last one are held. Chosen: a Husky's do in most samples."""
     repeated_periods: float = 4.0
     """A value that is repeated for longer than so many periods was measured again. Chosen."""
     lead_s: float = 1.0
-    """After a run's start so long nothing is predicted, as what was commanded before is not known. Shorter runs are left
-    out. Chosen."""
+    """After a run's start so long nothing is predicted, as what was commanded before is not known. Shorter runs are
+    left out. Chosen."""
     lead_share: float = 0.25
     """And of a short run so much of it at most. Chosen: windows of 2 s are predicted 1 s ahead."""
     start_every_s: float = 0.2
@@ -111,8 +112,8 @@ class NoiseSettings:
     huber: float = 3.0
     """Whitened residuals beyond grow linearly. Literature: Huber's loss (1964); the size is chosen."""
     steady_s: float = 0.3
-    """Half the span over which speeds are averaged where there is no model to say what to expect, and over which errors that
-    are alike at every speed are measured. Chosen: several readings."""
+    """Half the span over which speeds are averaged where there is no model to say what to expect, and over which errors
+    that are alike at every speed are measured. Chosen: several readings."""
     even_huber: float = 1.345
     """Of them those beyond so many times their size grow linearly. Literature: 95 % efficient (Huber, 1964)."""
     prior_sd: float = 2.0
@@ -123,16 +124,15 @@ class NoiseSettings:
     """Steps of the search for the wheels' noise at most. Chosen: it is flat by then."""
     outlier: float = 5.0
     """Poses beyond so many standard deviations are left out. Chosen: one in two million by chance."""
+    poor_fit: float = 1.5
+    """Mean square of whitened residuals from which on a fit or a regime disagrees, and a stretch is weighed down.
+    Chosen: noise alone has one."""
     smooth_samples: int = 25
     """The local size of residuals is a mean over so many samples either side. Chosen."""
-    local_excess: float = 1.4
-    """Stretches with more than this mean square are weighed down. Chosen: white noise stays below."""
-    least_command_jitter_s: float = 1e-3
-    """Commands scatter by as much at least, s. Chosen."""
     command_jitter_ratio: float = 2.0
-    """And by so many times what the encoder's stamps scatter. Chosen."""
-    command_jitter_share: float = 0.05
-    """And by this share of the encoder's period. Chosen. More than all that is a response, and no jitter."""
+    """Commands scatter by so many times what the encoder's stamps scatter. Chosen."""
+    command_jitter_share: float = 0.1
+    """And by this share of the encoder's period. Chosen. More than both is a response, and no jitter."""
     largest_wheel_noise: tuple[float, ...] = (0.05, 1.0, 0.1, 0.05, 0.1, 0.1, 0.02)
     """Upper bounds in the order of `WheelNoise`. Chosen: beyond, wheels that do not turn would pass for noise."""
 
@@ -153,11 +153,13 @@ class FitSettings:
     least_known_share: float = 1e-3
     """A part of a log with less of the information about a parameter says nothing of it. Chosen."""
     part_known_share: float = 0.2
-    """Parts of a log are compared in parameters of which each has so much of its share of the information. Chosen."""
+    """A part of a log, or a regime, says nothing of a parameter of which it has less of its share of the information.
+    Chosen."""
     ridge: float = 1e-2
     """Ridge of the richest model, on columns of unit length. Chosen: columns that look alike stay small."""
     rounds: int = 2
-    """How often the noise, or the weight of errors, is learnt anew from what a fit leaves. Chosen: it is settled by then."""
+    """How often the noise, or the weight of errors, is learnt anew from what a fit leaves. Chosen: it is settled by
+    then."""
     richest_halvings: int = 4
     """How often its step is halved until it fits better. Chosen."""
     bend_shares: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.35, 0.55, 0.75, 0.9)
@@ -193,9 +195,6 @@ class SelectionSettings:
     """More effects are not named. Chosen."""
     profile_searches: int = 4
     """Rounds of the closer search of a profiled entry. Chosen."""
-    poor_fit: float = 1.5
-    """Mean square of whitened residuals from which on a fit or a regime disagrees: up to this it may be noise. Chosen: noise
-    alone has one."""
     large_share: float = 0.25
     """An effect that makes up this share of what such a fit lacks is taken whatever its score. Chosen."""
     telling_nats: float = 3.0
@@ -270,8 +269,6 @@ class PredictionSettings:
     """
     pose_reach_s: float = 0.3
     """A start pose is averaged over so long either side. Chosen."""
-    fixed_sigmas: float = 5.0
-    """A value that the other folds fix to so many standard deviations is used, however few its data. Chosen."""
     resamples: int = 400
     """Bootstrap draws of an interval. Chosen."""
     rough_geometry: float = 0.1
@@ -308,8 +305,6 @@ class ReportSettings:
 
     proved_claims: int = 3
     """So many claims of what a log shows are proved by putting the effect in. Chosen: each takes a search or two."""
-    commanded_share: float = 0.75
-    """A limit shows only where this share of what the robot can do is asked. Chosen."""
     speeding_rad_s2: float = 2.0
     """Growth of the wheels' speed from which on they speed up or brake. Chosen."""
     most_regimes: int = 3
@@ -319,18 +314,15 @@ class ReportSettings:
     end_share: float = 0.01
     """A value this close to where its fit had to end, in its range, is not believed. Chosen."""
     wide_share: float = 0.5
-    """A value whose half interval, or whose change from one regime to its opposite, is over so much of its distance from
-    none says too little. Chosen: nobody who is told the value expects it."""
+    """A value whose half interval, or whose change from one regime to its opposite, is over so much of its distance
+    from none says too little. Chosen: nobody who is told the value expects it."""
     limit_share: float = 0.8
-    """Of a limit, the same of this share of it. Chosen."""
+    """So near a limit it shows: where this share of what the robot can do is asked, and where an interval is no wider
+    than from it to there. Chosen."""
     beyond_s: float = 0.5
     """For so long in all at least. Chosen."""
-    beyond_share: float = 0.005
-    """And for so much of the log. Chosen."""
     form_apart_sigmas: float = 3.5
     """By so many standard deviations. Chosen: of some twenty comparisons in a log one in a hundred logs by chance."""
-    regime_known_share: float = 0.05
-    """A regime that holds less of what is known of a value says nothing of it. Chosen."""
     worth_share: float = 0.1
     """A value that changes by less of itself is the same to whoever drives; a name that takes less of what its channel
     lacks, where it still disagrees, is disputed. Chosen."""

@@ -106,7 +106,7 @@ def channel_findings(
 ) -> tuple[ChannelFinding, ...]:
     """Which channels disagree, and where."""
     guilty = {effect.channel for effect in effects} | {term.channel for term in unnamed}
-    excess = analysis.drive.settings.selection.poor_fit
+    excess = analysis.drive.settings.noise.poor_fit
     out = []
     for place, found in ((Channel.COMMAND_TO_WHEEL, analysis.wheels), (Channel.WHEEL_TO_BODY, analysis.body)):
         where = "not measured in this log" if found is None else describe(regimes_of(found), excess)
@@ -341,7 +341,7 @@ def _exceeded(effect: Effect, limit: ParameterEstimate, measured: Measured) -> s
     reached = effect.limited(_calm(drive), measured.geometry)
     beyond = reached > limit.value * (1.0 + settings.worth_share)
     seconds = float(beyond.sum()) * GRID_STEP_S
-    if seconds < max(settings.beyond_s, settings.beyond_share * drive.duration_s):
+    if seconds < settings.beyond_s:
         return None
     unit = effect.parameters[0].unit
     return (

@@ -126,11 +126,7 @@ def disputed_names(found: ChannelResult) -> dict[str, str]:
     for name in found.names:
         if name in found.selector.given:
             continue
-        why = (
-            _answers_otherwise(found, name)
-            or _takes_little(found, name)
-            or _changes_with_regime(found, name)
-        )
+        why = _answers_otherwise(found, name) or _takes_little(found, name) or _changes_with_regime(found, name)
         if why is not None:
             out[name] = f"something acts like it and has another form: {why}"
     return out
@@ -195,7 +191,7 @@ def _apart(
     slope = best.jacobian[:, place]
     column = float(slope @ slope)
     parts = np.column_stack([np.where(mask, slope, 0.0) for mask in inside])
-    if min((parts**2).sum(axis=0)) < settings.report.regime_known_share * column:
+    if min((parts**2).sum(axis=0)) < settings.fit.part_known_share / len(inside) * column:
         return None
     wide = np.column_stack([best.jacobian, parts])
     covariance = inverse(wide.T @ wide)
@@ -300,7 +296,8 @@ def remaining_disagreements(found: ChannelResult) -> list[str]:
     out = [f"{name}: {regime} still disagrees: {times:.1f} times the noise" for times, regime in loud_regimes(found)]
     if isinstance(channel, WheelChannel):
         drive = channel.drive
-        if channel.noise.command_stamp_s > (1.0 - channel.settings.report.end_share) * largest_command_jitter_s(drive):
+        largest_s = largest_command_jitter_s(drive)
+        if channel.noise.command_stamp_s > (1.0 - channel.settings.report.end_share) * largest_s:
             out.append(
                 f"{name}: speeding up and braking still disagree: as if commands came "
                 f"{1e3 * channel.noise.command_stamp_s:.0f} ms early or late at random, the encoder's time stamps "
@@ -321,14 +318,14 @@ def loud_regimes(found: ChannelResult) -> list[tuple[float, str]]:
     best = (found.richest.reshape(-1, width) ** 2).sum(axis=1)
     # One nat for each parameter is the price of Akaike's criterion.
     price = channel.settings.selection.unnamed_score + found.richest_parameters
-    loud = []
+    loud, chosen = [], channel.settings.selection
     for name, mask in masks(channel.drive, samples).items():
         inside = mask & use
         if name == "standstill" or inside.sum() < channel.settings.grid.fewest_samples:
             continue
-        gain, spread = gain_by_block(0.5 * (now - best)[inside], samples.block[inside], channel.settings.selection.fewest_blocks)
+        gain, spread = gain_by_block(0.5 * (now - best)[inside], samples.block[inside], chosen.fewest_blocks)
         ratio = float(now[inside].sum() / max(best[inside].sum(), 1e-9))
-        if gain > price and gain > channel.settings.selection.sure_sigmas * spread and ratio > 1.0 + settings.worth_share:
+        if gain > price and gain > chosen.sure_sigmas * spread and ratio > 1.0 + settings.worth_share:
             loud.append((math.sqrt(ratio), name))
     return sorted(loud, reverse=True)[: settings.most_regimes]
 

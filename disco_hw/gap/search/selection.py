@@ -397,7 +397,7 @@ class Selector:
         Such a fit scatters from block to block more than any noise, and the score alone would never take it.
         """
         lacking = self.fit(smaller).cost - 0.5 * self.channel.count
-        poor = self.fit(smaller).cost > self.settings.poor_fit * 0.5 * self.channel.count
+        poor = self.fit(smaller).cost > self.channel.settings.noise.poor_fit * 0.5 * self.channel.count
         return poor and gain > self.settings.large_share * lacking
 
     def promise(self, accepted: Names, name: str) -> float:
