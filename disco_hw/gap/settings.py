@@ -27,10 +27,8 @@ class GridSettings:
     """Of a longer drive so much is judged, stretches with commands first. Chosen: it bounds how long a search takes."""
     stretch_s: float = 20.0
     """Length of the stretches that are picked of a long drive. Chosen: several manoeuvres each."""
-    shortest_run_s: float = 1.0
-    """Shorter runs are left out. Chosen: `lead_s` of each run is spent before it can be judged."""
     longest_silence_s: float = 1.5
-    """Where wheel samples fail to come for longer, a run ends. Chosen."""
+    """Where wheel samples fail to come for longer a run ends, where poses do a window. Chosen."""
     speed_span_s: float = 0.03
     """Speeds are differences of the angle over so long either side, s. Chosen: a few encoder periods."""
     even_samples: int = 10
@@ -43,16 +41,16 @@ class GridSettings:
     """Wheels that turn so fast without a command are driven by another master. Chosen."""
     loud_rad_s: float = 2.0
     """Wheels that rest under such a command do not listen to it. Chosen."""
-    fewest_readings: int = 100
-    """Fewer encoder readings do not judge the wheels. Chosen: 80 s of readings that are held leave as many."""
-    fewest_poses: int = 60
-    """Fewer poses do not judge the body. Chosen."""
+    fewest_samples: int = 60
+    """Fewer samples judge nothing: encoder readings the wheels, poses the body and their clock, either a regime.
+    Chosen."""
     repeated_share: float = 0.3
     """Wheel speeds of which more than this share repeat the last one are held. Chosen: a Husky's do in most samples."""
     repeated_periods: float = 4.0
     """A value that is repeated for longer than so many periods was measured again. Chosen."""
     lead_s: float = 1.0
-    """After a run's start so long nothing is predicted: what was commanded before is not known. Chosen."""
+    """After a run's start so long nothing is predicted, as what was commanded before is not known. Shorter runs are
+    left out. Chosen."""
     lead_share: float = 0.25
     """And of a short run so much of it at most. Chosen: windows of 2 s are predicted 1 s ahead."""
     start_every_s: float = 0.2
@@ -86,10 +84,9 @@ class GridSettings:
     least_link_error_s: float = 0.15
     """Of commands a smaller one is none. Measured: lags that differ from turn to turn make 0.05 of an even link, and a
     drive that ramps by 9 rad/s^2 makes 0.105."""
-    least_link_nats: float = 0.05
-    """And the whole log fits by so much per pair better with it. Measured: even links 0.046 at most."""
     least_delay_nats: float = 0.05
-    """A delay stands out by so much per pose. Measured: steady circles 0.4, a robot that turns about 3."""
+    """A delay, and a drift or jump of the commands' clock, stands out by so much per pose or pair. Measured: delays on
+    steady circles 0.4, of a robot that turns about 3; even links 0.046 at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,8 +98,6 @@ class NoiseSettings:
     a share of the misfit. Chosen: what is late by little fits alike, and first sight that errs by 0.3 s far worse."""
     shortest_window: int = 12
     """Windows with fewer poses are left out, unless most are so thin. Chosen."""
-    longest_pose_gap_s: float = 2.0
-    """Where poses fail to come for longer, a window ends. Chosen."""
     slip_onset_m_s: float = 0.05
     """From this rim speed on the body slips as much as it ever does. Chosen."""
     trusted_wheel_blocks: float = 1.0
@@ -112,14 +107,13 @@ class NoiseSettings:
     """The same for the body, whose noise wanders less. Measured: 1.4 over six dirty logs."""
     calm_s: float = 0.05
     """Half the span over which measured speeds are averaged for the quick error. Chosen."""
-    steady_s: float = 0.25
-    """Half the span over which they are averaged where there is no model to say what to expect. Chosen."""
     fewest_steady: int = 3
     """At least so many samples either side then. Chosen."""
     huber: float = 3.0
     """Whitened residuals beyond grow linearly. Literature: Huber's loss (1964); the size is chosen."""
-    even_span_s: float = 0.3
-    """How large errors are that are alike at every speed is measured over this. Chosen: several readings."""
+    steady_s: float = 0.3
+    """Half the span over which speeds are averaged where there is no model to say what to expect, and over which errors
+    that are alike at every speed are measured. Chosen: several readings."""
     even_huber: float = 1.345
     """Of them those beyond so many times their size grow linearly. Literature: 95 % efficient (Huber, 1964)."""
     prior_sd: float = 2.0
@@ -130,16 +124,15 @@ class NoiseSettings:
     """Steps of the search for the wheels' noise at most. Chosen: it is flat by then."""
     outlier: float = 5.0
     """Poses beyond so many standard deviations are left out. Chosen: one in two million by chance."""
+    poor_fit: float = 1.5
+    """Mean square of whitened residuals from which on a fit or a regime disagrees, and a stretch is weighed down.
+    Chosen: noise alone has one."""
     smooth_samples: int = 25
     """The local size of residuals is a mean over so many samples either side. Chosen."""
-    local_excess: float = 1.4
-    """Stretches with more than this mean square are weighed down. Chosen: white noise stays below."""
-    least_command_jitter_s: float = 1e-3
-    """Commands scatter by as much at least, s. Chosen."""
     command_jitter_ratio: float = 2.0
-    """And by so many times what the encoder's stamps scatter. Chosen."""
-    command_jitter_share: float = 0.05
-    """And by this share of the encoder's period. Chosen. More than all that is a response, and no jitter."""
+    """Commands scatter by so many times what the encoder's stamps scatter. Chosen."""
+    command_jitter_share: float = 0.1
+    """And by this share of the encoder's period. Chosen. More than both is a response, and no jitter."""
     largest_wheel_noise: tuple[float, ...] = (0.05, 1.0, 0.1, 0.05, 0.1, 0.1, 0.02)
     """Upper bounds in the order of `WheelNoise`. Chosen: beyond, wheels that do not turn would pass for noise."""
 
@@ -149,7 +142,7 @@ class FitSettings:
     """Least squares, and the richest model of a channel, whose residual is noise."""
 
     iterations: int = 12
-    """Steps of Levenberg-Marquardt at most. Chosen: nearly all fits end before."""
+    """Steps of a fit at most. Chosen: nearly all end before."""
     enough_nats: float = 0.02
     """A step that gains less is the last one. Chosen."""
     promised_share: float = 0.25
@@ -160,11 +153,13 @@ class FitSettings:
     least_known_share: float = 1e-3
     """A part of a log with less of the information about a parameter says nothing of it. Chosen."""
     part_known_share: float = 0.2
-    """Parts of a log are compared in parameters of which each has so much of its share of the information. Chosen."""
+    """A part of a log, or a regime, says nothing of a parameter of which it has less of its share of the information.
+    Chosen."""
     ridge: float = 1e-2
     """Ridge of the richest model, on columns of unit length. Chosen: columns that look alike stay small."""
-    richest_rounds: int = 2
-    """How often its noise is learnt from what it leaves. Chosen."""
+    rounds: int = 2
+    """How often the noise, or the weight of errors, is learnt anew from what a fit leaves. Chosen: it is settled by
+    then."""
     richest_halvings: int = 4
     """How often its step is halved until it fits better. Chosen."""
     bend_shares: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.35, 0.55, 0.75, 0.9)
@@ -198,36 +193,23 @@ class SelectionSettings:
     """Whitened residuals below come of samples that say nothing. Chosen."""
     most_effects: int = 8
     """More effects are not named. Chosen."""
-    worth_fitting_nats: float = 8.0
-    """Gain to first order from which on an effect is fitted. Chosen: well below what acceptance takes."""
     profile_searches: int = 4
     """Rounds of the closer search of a profiled entry. Chosen."""
-    better_nats: float = 0.5
-    """A fit from another start replaces the one known if it is better by this. Chosen."""
-    poor_share: float = 0.5
-    """A fit lacks much if its cost is above the expected one by this share. Chosen."""
     large_share: float = 0.25
     """An effect that makes up this share of what such a fit lacks is taken whatever its score. Chosen."""
-    swap_nats: float = 2.0
-    """One effect replaces another if it fits better by this. Chosen."""
     telling_nats: float = 3.0
-    """One of two explanations is told if it is better by this. Literature: half a difference of BIC of 6, positive
-    evidence (Kass and Raftery, 1995)."""
+    """One of two explanations is told, or takes the place of the other, if it is better by this. Literature: half a
+    difference of BIC of 6, positive evidence (Kass and Raftery, 1995)."""
     block_lengths: tuple[int, ...] = (1, 3, 9)
     """Neighbouring blocks taken as one for the sandwich variance. Chosen: 3, 9 and 27 s."""
-    even_rounds: int = 3
-    """How often a fit to errors that are alike at every speed weighs them anew. Chosen: it is settled by then."""
+    sure_sigmas: float = 3.0
+    """What differs by so many standard deviations is no chance: parts of a log, logs, regimes and their noise, the two
+    channels' opinions of an encoder. Chosen: one in 370."""
     clearly_closer: float = 0.7
     """Such a fit is told where its deviations, in the geometric mean, are so many times those of the other. Chosen:
     less may be chance."""
     fewest_blocks: int = 5
     """Fewer blocks say nothing about their scatter. Chosen."""
-    far_off: float = 1.5
-    """Where the accepted set costs so many times what is expected, plainer noise is assumed. Chosen."""
-    place_nats: float = 6.0
-    """A patch of the floor and a change of all of it differ by less: either does. Chosen."""
-    encoder_sigmas: float = 3.0
-    """An encoder may be the cause if the body agrees within so many standard deviations. Chosen: one in 370."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,19 +220,15 @@ class TermSettings:
     """More terms are not added. Chosen."""
     least_independent_share: float = 0.1
     """A term of which what is fitted already does the rest is left out: it would only pull against it. Chosen."""
-    worth_trying_nats: float = 18.0
-    """Gain to first order from which on a term is fitted. Chosen: below what acceptance takes."""
     most_tried: int = 4
     """So many of the most promising terms are fitted until one is accepted. Chosen: what promises most to first order
     may gain nothing, and the next all of it."""
-    about_many: int = 110
-    """Number of terms that the price of a choice among all assumes. Chosen: about as many as a usual log offers."""
     waves: int = 8
     """How many cosines of the time ground may vary by, the slowest. Chosen: of 150 s, down to a period of 37 s."""
     usual_wave: float = 0.1
     """Standard deviation that is expected of each, as a share of the speed. Chosen."""
     smooth_nodes: int = 8
-    """Accelerations are taken of speeds averaged over so many nodes either side. Chosen: a tenth of a second."""
+    """Accelerations are taken of speeds over so many nodes either side. Chosen: a tenth of a second."""
     disc_radii_m: tuple[float, ...] = (0.5, 0.75, 1.0, 1.3)
     """Sizes of patches. Chosen."""
     disc_spacing_m: float = 0.4
@@ -291,12 +269,8 @@ class PredictionSettings:
     """
     pose_reach_s: float = 0.3
     """A start pose is averaged over so long either side. Chosen."""
-    fixed_sigmas: float = 5.0
-    """A value that the other folds fix to so many standard deviations is used, however few its data. Chosen."""
     resamples: int = 400
     """Bootstrap draws of an interval. Chosen."""
-    floor_draws: int = 20
-    """Draws of the sensors' noise at each start. Chosen: the error is averaged over hundreds of starts."""
     rough_geometry: float = 0.1
     """Without effects the geometry of the whole chain is that of the body within this share. Chosen."""
     joint_trust: float = 3.0
@@ -311,10 +285,6 @@ class PredictionSettings:
     """A larger ratio is worse whatever the scatter. Chosen."""
     worse_sigmas: float = 2.0
     """Standard deviations of the growth over blocks from which on it is worse. Chosen: one in twenty."""
-    fit_rounds: int = 2
-    """How often the usual error is taken anew in such a fit. Chosen."""
-    fit_steps: int = 8
-    """Steps of a round at most. Chosen: it is flat by then."""
     most_changes: int = 4
     """At most so many names are dropped or replaced as predictions are better without. Chosen."""
     standing_m_s: float = 0.02
@@ -333,68 +303,26 @@ class PredictionSettings:
 class ReportSettings:
     """Settings of the report on remaining disagreements and on effects that a log could not show."""
 
-    usual_inflation: float = 1.5
-    """Inflation of the variance that is expected of an effect that is not there. Chosen."""
     proved_claims: int = 3
     """So many claims of what a log shows are proved by putting the effect in. Chosen: each takes a search or two."""
-    commanded_share: float = 0.75
-    """A limit shows only where this share of what the robot can do is asked. Chosen."""
-    rest_rad_s: float = 0.1
-    """Regimes: wheels below rest. Chosen."""
     speeding_rad_s2: float = 2.0
     """Growth of the wheels' speed from which on they speed up or brake. Chosen."""
-    span_nodes: int = 10
-    """It is taken over so many nodes either side. Chosen."""
-    fewest_samples: int = 40
-    """Regimes with fewer samples are left out. Chosen."""
-    excess: float = 1.5
-    """Mean square of whitened residuals from which on a regime disagrees. Chosen: noise alone has one."""
-    louder: float = 1.1
-    """Something is left in a regime with so much more than the richest model leaves. Chosen."""
-    sure_sigmas: float = 3.0
-    """What differs by so many standard deviations is no chance: regimes and their noise, parts of a log, logs. Chosen:
-    one in 370."""
-    nats_each: float = 1.0
-    """And nats for each parameter of the richest model. Chosen: the price of Akaike's criterion."""
-    least_nats: float = 20.0
-    """And nats beside. Chosen."""
-    fewest_blocks: int = 4
-    """With fewer blocks their scatter is not known. Chosen."""
     most_regimes: int = 3
     """At most so many are listed, the loudest. Chosen."""
-    at_bound: float = 0.9
-    """A jitter of the commands above this share of its bound is no jitter. Chosen."""
     largest_ratio: float = 9.9
     """Ratios of strength beyond are not distinguished. Chosen."""
     end_share: float = 0.01
     """A value this close to where its fit had to end, in its range, is not believed. Chosen."""
     wide_share: float = 0.5
-    """A half interval over so much of a value's distance from none says too little of it. Chosen: no interval is wider
-    than its value."""
+    """A value whose half interval, or whose change from one regime to its opposite, is over so much of its distance
+    from none says too little. Chosen: nobody who is told the value expects it."""
     limit_share: float = 0.8
-    """Of a limit, the same of this share of it. Chosen."""
-    beyond_limit: float = 1.05
-    """Wheels that are faster than a limit by this are beyond it. Chosen: above what a reading errs by."""
+    """So near a limit it shows: where this share of what the robot can do is asked, and where an interval is no wider
+    than from it to there. Chosen."""
     beyond_s: float = 0.5
     """For so long in all at least. Chosen."""
-    beyond_share: float = 0.005
-    """And for so much of the log. Chosen."""
-    times_unnamed: float = 3.0
-    """So is one that is worth less than so many times what a term without a name beside it is. Chosen: half an order of
-    magnitude."""
-    alike_share: float = 0.05
-    """Where a name can do less than this of what the term does, the term has to be worth more than it. Chosen."""
-    form_share: float = 0.5
-    """And one whose value differs from one regime to its opposite by this share of itself. Chosen: nobody who is told
-    the value expects it."""
     form_apart_sigmas: float = 3.5
     """By so many standard deviations. Chosen: of some twenty comparisons in a log one in a hundred logs by chance."""
-    regime_known_share: float = 0.05
-    """A regime that holds less of what is known of a value says nothing of it. Chosen."""
-    regime_blocks: int = 3
-    """Neighbouring blocks taken as one for the scatter of regimes. Chosen: 9 s."""
-    short_parts: int = 4
-    """Beside halves a log is divided into so many parts to see how parameters change along it. Chosen."""
     worth_share: float = 0.1
     """A value that changes by less of itself is the same to whoever drives; a name that takes less of what its channel
     lacks, where it still disagrees, is disputed. Chosen."""

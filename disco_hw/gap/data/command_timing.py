@@ -180,7 +180,7 @@ def response(turned: Turned, commands: Commands, settings: GridSettings) -> Resp
     step_s, coarse_s = settings.delay_step_s, 2.0 * settings.delay_step_s
     delays = _delays(settings.most_pose_delay_s, coarse_s)
     most = max(int(responses[0.0].known(turned, delay_s).sum()) for delay_s in delays.tolist())
-    fewest = max(settings.fewest_poses, 3 * most // 4)
+    fewest = max(settings.fewest_samples, 3 * most // 4)
     scanned = {lag_s: responses[lag_s].mismatches(turned, delays, fewest) for lag_s in (0.0, *settings.lags_s[1::3])}
     ordinary = scanned[0.0][np.isfinite(scanned[0.0])]
     if not ordinary.size:
@@ -234,7 +234,7 @@ class CommandAlignment:
         """Length of the stretches that are looked at one by one: longer where speeds come less often."""
         begin_s, settings = self.turned.begin_s, self.settings
         spacing_s = float(np.median(np.diff(begin_s))) if begin_s.size > 1 else math.inf
-        return max(settings.clock_stretch_s, 1.5 * settings.fewest_poses * spacing_s)
+        return max(settings.clock_stretch_s, 1.5 * settings.fewest_samples * spacing_s)
 
     def fitted(self, clock: StampClock) -> tuple[float, float]:
         """Age of all commands, their stamps corrected by a clock, and the misfit of a pair and wheel."""
@@ -259,7 +259,7 @@ class CommandAlignment:
         return count * mismatch if np.isfinite(mismatch) else 0.0
 
     def _mismatches(self, low_s: float, high_s: float, delays: Array) -> Array:
-        return self.response_model.mismatches(self.turned.between(low_s, high_s), delays, self.settings.fewest_poses)
+        return self.response_model.mismatches(self.turned.between(low_s, high_s), delays, self.settings.fewest_samples)
 
 
 def command_clock(wheels: Wheels, commands: Commands, settings: GridSettings) -> tuple[StampClock, bool]:
@@ -269,4 +269,4 @@ def command_clock(wheels: Wheels, commands: Commands, settings: GridSettings) ->
     if not first.known or not first.delay_s:
         return StampClock(-first.delay_s), first.known
     align = CommandAlignment(turned, first, WheelResponse.of(commands, first.lag_s), settings)
-    return clock_of(align, settings, settings.least_link_error_s, settings.least_link_nats), True
+    return clock_of(align, settings, settings.least_link_error_s, settings.least_delay_nats), True

@@ -89,12 +89,12 @@ class GriddedDrive:
     def has_commands(self) -> bool:
         """Whether enough commands are known to judge the wheels."""
         known = np.count_nonzero(np.isfinite(self.command_rad_s[:, 0]))
-        return bool(known > 0.02 * self.t_s.size and self.encoder.t_s.size > self.settings.grid.fewest_readings)
+        return bool(known > 0.02 * self.t_s.size and self.encoder.t_s.size > self.settings.grid.fewest_samples)
 
     @property
     def has_poses(self) -> bool:
         """Whether enough poses were measured to judge the body."""
-        return self.pose.t_s.size > self.settings.grid.fewest_poses
+        return self.pose.t_s.size > self.settings.grid.fewest_samples
 
     @property
     def duration_s(self) -> float:
@@ -293,7 +293,7 @@ def _runs(t_s: Array, segment: Index, settings: GridSettings) -> list[tuple[int,
     breaks = np.flatnonzero((np.diff(segment) != 0) | (np.diff(t_s) > settings.longest_silence_s)) + 1
     edges = [0, *breaks.tolist(), t_s.size]
     pairs = pairwise(edges)
-    return [(lo, hi) for lo, hi in pairs if hi - lo > 2 and t_s[hi - 1] - t_s[lo] >= settings.shortest_run_s]
+    return [(lo, hi) for lo, hi in pairs if hi - lo > 2 and t_s[hi - 1] - t_s[lo] >= settings.lead_s]
 
 
 def _commanded(commands: Commands, wheels: Wheels) -> Mask:
@@ -332,7 +332,7 @@ def _spread(
             pieces[-1] = (pieces[-1][0], hi)
         else:
             pieces.append((lo, hi))
-    return [(lo, hi) for lo, hi in pieces if t_s[hi - 1] - t_s[lo] >= settings.shortest_run_s]
+    return [(lo, hi) for lo, hi in pieces if t_s[hi - 1] - t_s[lo] >= settings.lead_s]
 
 
 def _locate(t_s: Array, grid: Array, offset: int, block_s: float) -> GridSamples:

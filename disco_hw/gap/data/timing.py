@@ -126,7 +126,7 @@ def _mismatches(wheels: Wheels, poses: Poses, delays: Array, settings: GridSetti
     for place, delay in enumerate(delays):
         t_s = poses.t_s - delay
         known = (t_s[before] >= begin) & (t_s[after] <= end)
-        if np.count_nonzero(known) < settings.fewest_poses:
+        if np.count_nonzero(known) < settings.fewest_samples:
             continue
         first, last = before[known], after[known]
         left, right = (

@@ -64,7 +64,7 @@ def largest_command_jitter_s(drive: GriddedDrive) -> float:
     """
     settings = drive.settings.noise
     scattered_s = settings.command_jitter_ratio * drive.stamp_scatter_s
-    return settings.least_command_jitter_s + scattered_s + settings.command_jitter_share * drive.encoder_period_s
+    return scattered_s + settings.command_jitter_share * drive.encoder_period_s
 
 
 def wheel_mismatch(channel: WheelChannel, raw: Array) -> Callable[[Array], float]:
@@ -155,7 +155,7 @@ def local_weight(white: Array, use: NDArray[np.bool_], settings: NoiseSettings) 
     weights = np.empty_like(white)
     for side in range(white.shape[1]):
         local = np.convolve(clipped[:, side], window, "same") / np.maximum(amount, 1.0)
-        weights[:, side] = 1.0 / np.sqrt(np.maximum(local / settings.local_excess, 1.0))
+        weights[:, side] = 1.0 / np.sqrt(np.maximum(local / settings.poor_fit, 1.0))
     tamed = np.abs(white) * weights
     return np.asarray(weights * np.minimum(1.0, settings.huber / np.maximum(tamed, 1e-9)))
 

@@ -140,7 +140,7 @@ class WheelChannel:
         """
         settings, samples = self.settings.noise, self.drive.encoder
         raw = self.raw_residual(p, extra)
-        apart = max(round(settings.even_span_s / max(float(np.median(np.diff(samples.t_s))), 1e-3)), 1)
+        apart = max(round(settings.steady_s / max(float(np.median(np.diff(samples.t_s))), 1e-3)), 1)
         moving = np.abs(self.drive.speed_rad_s[samples.node]).max(axis=1) > self.settings.grid.rest_rad_s
         counted = self.gains.use & moving
         grown = (raw[apart:] - raw[:-apart])[counted[apart:] & counted[:-apart]]
@@ -150,7 +150,7 @@ class WheelChannel:
             self.noise,
             relative=_NEGLIGIBLE,
             drift_std=_NEGLIGIBLE,
-            drift_rad_sqrt_s=max(off_rad, _NEGLIGIBLE) / settings.even_span_s**0.5,
+            drift_rad_sqrt_s=max(off_rad, _NEGLIGIBLE) / settings.steady_s**0.5,
         )
         even = self.with_noise(noise)
         white = even.whitened(p, extra)
@@ -401,7 +401,7 @@ def _windows(drive: GriddedDrive) -> tuple[Index, Mask]:
     number = np.zeros(t.size, dtype=np.int64)
     current, begin = 0, 0
     for k in range(1, t.size):
-        if run[k] != run[k - 1] or t[k] - t[begin] > block_s or t[k] - t[k - 1] > settings.longest_pose_gap_s:
+        if run[k] != run[k - 1] or t[k] - t[begin] > block_s or t[k] - t[k - 1] > drive.settings.grid.longest_silence_s:
             current, begin = current + 1, k
         number[k] = current
     sizes = np.bincount(number, minlength=current + 1)

@@ -110,7 +110,7 @@ def _limit(found: ChannelResult, name: str, top_rad_s: float | None) -> BlindSpo
         geometry = (float(channel.geometry[0]), float(channel.geometry[1]))
         largest = _largest(channel, effect.limited, geometry)
         if top_rad_s is not None:
-            possible = channel.settings.report.commanded_share * float(
+            possible = channel.settings.report.limit_share * float(
                 effect.limited(np.array([[-top_rad_s, top_rad_s]]), geometry)[0]
             )
     enough = min(possible, _realistic(parameter))
@@ -145,7 +145,7 @@ def _largest_tried(found: ChannelResult, effect: Effect) -> float | None:
         vector[layout.place[effect.columns[0]]] = limit
         moved = channel.residual(vector) - best.residual
         residual = moved - slope @ solve(slope, slope.T @ moved)
-        enough = (limits.score + math.log(max(channel.count, 2))) * channel.settings.report.usual_inflation
+        enough = (limits.score + math.log(max(channel.count, 2))) * channel.settings.noise.poor_fit
         ahead_m = found.selector.moves(channel.split(best.vector), channel.split(vector))
         if float(residual @ residual) > enough and ahead_m > limits.moves_m:
             return limit
@@ -176,7 +176,7 @@ def _size(found: ChannelResult, name: str, column: str) -> float | None:
     if information[first, first] <= 1e-9:
         return None
     covariance = inverse(information)
-    size = math.sqrt(threshold * channel.settings.report.usual_inflation * float(covariance[first, first]))
+    size = math.sqrt(threshold * channel.settings.noise.poor_fit * float(covariance[first, first]))
     limit = max(abs(layout.low[places[0]]), abs(layout.high[places[0]]))
     if size >= limit:
         return None
@@ -199,7 +199,7 @@ def _by_trial(found: ChannelResult, column: str, trials: tuple[float, ...], thre
         difference = channel.residual(vector) - best.residual
         enough = found.selector.moves(channel.split(best.vector), channel.split(vector))
         if (
-            float(difference @ difference) > threshold * channel.settings.report.usual_inflation
+            float(difference @ difference) > threshold * channel.settings.noise.poor_fit
             and enough > found.selector.thresholds.moves_m
         ):
             return size

@@ -106,7 +106,7 @@ def channel_findings(
 ) -> tuple[ChannelFinding, ...]:
     """Which channels disagree, and where."""
     guilty = {effect.channel for effect in effects} | {term.channel for term in unnamed}
-    excess = analysis.drive.settings.report.excess
+    excess = analysis.drive.settings.noise.poor_fit
     out = []
     for place, found in ((Channel.COMMAND_TO_WHEEL, analysis.wheels), (Channel.WHEEL_TO_BODY, analysis.body)):
         where = "not measured in this log" if found is None else describe(regimes_of(found), excess)
@@ -178,15 +178,15 @@ def drifting_parameters(analysis: GapAnalysis, final: FinalFit) -> tuple[str, ..
 
     Over its thirds, or over its halves where a third of it says too little.
     """
-    settings, out = analysis.drive.settings.report, []
+    settings, out = analysis.drive.settings, []
     for found, estimated in ((analysis.body, final.body_estimates), (analysis.wheels, final.wheel_estimates)):
         if found is None or estimated is None:
             continue
         for name, parts in (in_equal_parts(found, 2) | in_equal_parts(found, 3)).items():
             values = [float(value) for value in parts.values]
             size = max(abs(values[0]), abs(values[-1]))
-            far = abs(values[-1] - values[0]) > settings.worth_share * size
-            sure = abs(parts.apart(0, len(values) - 1)) > settings.sure_sigmas
+            far = abs(values[-1] - values[0]) > settings.report.worth_share * size
+            sure = abs(parts.apart(0, len(values) - 1)) > settings.selection.sure_sigmas
             if "." in name and far and sure and sorted(values) in (values, values[::-1]):
                 texts = [
                     f"{value:.3g} in the {place}" for value, place in zip(values, _PLACES[len(values)], strict=True)
@@ -197,7 +197,7 @@ def drifting_parameters(analysis: GapAnalysis, final: FinalFit) -> tuple[str, ..
 
 def across_logs(analysis: GapAnalysis) -> tuple[AcrossLogs, ...]:
     """Every parameter that each of several logs determines, and whether they differ in it by more than their noise."""
-    settings, out = analysis.drive.settings.report, []
+    settings, out = analysis.drive.settings, []
     for found in (analysis.body, analysis.wheels):
         if found is None:
             continue
@@ -207,12 +207,12 @@ def across_logs(analysis: GapAnalysis) -> tuple[AcrossLogs, ...]:
             low, high = int(np.argmin(logs.values)), int(np.argmax(logs.values))
             # A point of turning near the axle is compared with the robot's size.
             size = found.fit.vector[1] if name == "x_icr_m" else np.abs(logs.values).max()
-            share = settings.worth_share if "." in name else settings.differ_share
+            share = settings.report.worth_share if "." in name else settings.report.differ_share
             far = logs.values[high] - logs.values[low] > share * size
             reach = Z95 * logs.deviations
             ends = np.column_stack([logs.values, logs.values - reach, logs.values + reach]).tolist()
             values = tuple((value, least, most) for value, least, most in ends)
-            out.append(AcrossLogs(name, values, bool(far and logs.apart(low, high) > settings.sure_sigmas)))
+            out.append(AcrossLogs(name, values, bool(far and logs.apart(low, high) > settings.selection.sure_sigmas)))
     return tuple(out)
 
 
@@ -339,9 +339,9 @@ def _exceeded(effect: Effect, limit: ParameterEstimate, measured: Measured) -> s
         return None
     drive, settings = measured.drive, measured.drive.settings.report
     reached = effect.limited(_calm(drive), measured.geometry)
-    beyond = reached > limit.value * settings.beyond_limit
+    beyond = reached > limit.value * (1.0 + settings.worth_share)
     seconds = float(beyond.sum()) * GRID_STEP_S
-    if seconds < max(settings.beyond_s, settings.beyond_share * drive.duration_s):
+    if seconds < settings.beyond_s:
         return None
     unit = effect.parameters[0].unit
     return (

@@ -5,14 +5,14 @@ of its channel, from which the noise was estimated. If that gains far more than 
 blocks of time, something is left. A named effect of the body must be as strong where little of it acts as where much
 acts: otherwise a slip that saturates would pass for one that grows without limit.
 
-A name is disputed if it explains little of what is missing, if a form without a name beside it explains as much, or if
-its value changes with the regime (parameter constancy; Hansen, 1992).
+A name is disputed if it explains little of what is missing, or if its value changes with the regime (parameter
+constancy; Hansen, 1992).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 
@@ -29,7 +29,7 @@ from disco_hw.gap.search.least_squares import Fit, fit, inverse
 from disco_hw.gap.search.richest_model import CANDIDATES, DELAY_NAMES, indices
 from disco_hw.gap.search.selection import Z95, Split, inflation
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms
-from disco_hw.gap.settings import GRID_STEP_S, ReportSettings
+from disco_hw.gap.settings import GRID_STEP_S, GapSettings
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -126,12 +126,7 @@ def disputed_names(found: ChannelResult) -> dict[str, str]:
     for name in found.names:
         if name in found.selector.given:
             continue
-        why = (
-            _answers_otherwise(found, name)
-            or _takes_little(found, name)
-            or _has_equal_alternative(found, name)
-            or _changes_with_regime(found, name)
-        )
+        why = _answers_otherwise(found, name) or _takes_little(found, name) or _changes_with_regime(found, name)
         if why is not None:
             out[name] = f"something acts like it and has another form: {why}"
     return out
@@ -156,42 +151,11 @@ def _takes_little(found: ChannelResult, name: str) -> str | None:
     if found.richest is None or not loud_regimes(found):
         return None
     best = 0.5 * float(found.richest @ found.richest)
-    left = found.fit.cost - best - settings.nats_each * found.richest_parameters
+    left = found.fit.cost - best - found.richest_parameters
     explained = max(_gain(found, name), 0.0)
     if explained > settings.worth_share * (explained + left):
         return None
     return f"it takes {100.0 * explained / (explained + left):.2g} % of what its channel lacks"
-
-
-def _has_equal_alternative(found: ChannelResult, name: str) -> str | None:
-    """Describe an unnamed term of the channel that explains about as much as a name; None if there is none.
-
-    A term whose traces are of another kind must explain more: it stands for something else, beside which the name may
-    be true.
-    """
-    settings, taken = found.channel.settings.report, _gain(found, name)
-    end = 0
-    for one in found.unnamed:
-        begin, end = end, end + len(one.term.features)
-        times = settings.times_unnamed if _alike(found, name, range(begin, end)) > settings.alike_share else 1.0
-        if taken < times * one.evidence.gain:
-            return f"{one.form} beside it explains {one.evidence.gain / max(taken, 1e-9):.2g} times as much"
-    return None
-
-
-def _alike(found: ChannelResult, name: str, places: Iterable[int]) -> float:
-    """Return the share of a term's effect on the residuals that a named effect can reproduce, to first order.
-
-    `places`: the term's coefficients among those of all terms.
-    """
-    best, layout = found.fit, found.selector.channel.layout
-    first = len(found.channel.layout.columns)
-    indices = [first + place for place in places]
-    term = best.jacobian[:, [best.active.index(index) for index in indices]] @ best.vector[indices]
-    columns = [best.active.index(layout.place[c]) for c in CANDIDATES[name].columns if layout.place[c] in best.active]
-    column = best.jacobian[:, columns]
-    pull = column.T @ term
-    return float(pull @ inverse(column.T @ column) @ pull) / max(float(term @ term), 1e-300)
 
 
 def _changes_with_regime(found: ChannelResult, name: str) -> str | None:
@@ -207,18 +171,18 @@ def _changes_with_regime(found: ChannelResult, name: str) -> str | None:
     clearest: tuple[float, str] = (settings.form_apart_sigmas, "")
     for column, (one, other) in product(columns, _OPPOSITES):
         place, value = best.active.index(layout.place[column]), float(best.vector[layout.place[column]])
-        apart = _apart(best, channel.block, place, (inside[one], inside[other]), settings)
+        apart = _apart(best, channel.block, place, (inside[one], inside[other]), channel.settings)
         if apart is None:
             continue
         moved, moved_too, sigmas = apart
-        if abs(moved - moved_too) > settings.form_share * (abs(value) if math.isinf(size) else size):
+        if abs(moved - moved_too) > settings.wide_share * (abs(value) if math.isinf(size) else size):
             text = f"{column} is {value + moved:.3g} {one} and {value + moved_too:.3g} {other}"
             clearest = max(clearest, (abs(sigmas), text))
     return clearest[1] or None
 
 
 def _apart(
-    best: Fit, block: Index, place: int, inside: tuple[Mask, Mask], settings: ReportSettings
+    best: Fit, block: Index, place: int, inside: tuple[Mask, Mask], settings: GapSettings
 ) -> tuple[float, float, float] | None:
     """Return the change of an active entry in each of two regimes, and their difference in standard deviations.
 
@@ -227,13 +191,13 @@ def _apart(
     slope = best.jacobian[:, place]
     column = float(slope @ slope)
     parts = np.column_stack([np.where(mask, slope, 0.0) for mask in inside])
-    if min((parts**2).sum(axis=0)) < settings.regime_known_share * column:
+    if min((parts**2).sum(axis=0)) < settings.fit.part_known_share / len(inside) * column:
         return None
     wide = np.column_stack([best.jacobian, parts])
     covariance = inverse(wide.T @ wide)
     step = -covariance @ (wide.T @ best.residual)
     # Neighbouring blocks err together: a few are taken as one, and the larger of two variances counts.
-    group = np.unique(block // settings.regime_blocks, return_inverse=True)[1]
+    group = np.unique(block // settings.selection.block_lengths[1], return_inverse=True)[1]
     pulls = np.zeros((group.max() + 1, wide.shape[1]))
     np.add.at(pulls, group, wide * (best.residual + wide @ step)[:, None])
     contrast = covariance[-2] - covariance[-1]
@@ -260,13 +224,13 @@ def masks(drive: GriddedDrive, samples: GridSamples) -> Mapping[str, Mask]:
 def masks_at_nodes(drive: GriddedDrive) -> Mapping[str, Mask]:
     """Which nodes (M,) lie in which regime; regimes overlap."""
     speed, settings = drive.speed_rad_s, drive.settings.report
-    span = settings.span_nodes
+    span = drive.settings.terms.smooth_nodes
     mean, half = speed.mean(axis=1), 0.5 * (speed[:, 1] - speed[:, 0])
     ahead = np.minimum(np.arange(speed.shape[0]) + span, speed.shape[0] - 1)
     behind = np.maximum(np.arange(speed.shape[0]) - span, 0)
     growth = (np.abs(speed[ahead]).max(axis=1) - np.abs(speed[behind]).max(axis=1)) / (2 * span * GRID_STEP_S)
     size = np.abs(speed).max(axis=1)
-    moving = size > settings.rest_rad_s
+    moving = size > drive.settings.grid.rest_rad_s
     steady = moving & (np.abs(growth) < settings.speeding_rad_s2)
     turning = np.abs(half) > 0.3
     slow, fast = _halves(size, moving, settings.worth_share)
@@ -310,7 +274,7 @@ def regimes(
     found = []
     for name, mask in masks(channel.drive, samples).items():
         inside = mask & use
-        if inside.sum() >= channel.settings.report.fewest_samples:
+        if inside.sum() >= channel.settings.grid.fewest_samples:
             found.append(Regime(name, float(first[inside].mean()), float(last[inside].mean()), int(inside.sum())))
     return sorted(found, key=lambda regime: -(regime.before - regime.after) * regime.samples**0.5)
 
@@ -332,7 +296,8 @@ def remaining_disagreements(found: ChannelResult) -> list[str]:
     out = [f"{name}: {regime} still disagrees: {times:.1f} times the noise" for times, regime in loud_regimes(found)]
     if isinstance(channel, WheelChannel):
         drive = channel.drive
-        if channel.noise.command_stamp_s > channel.settings.report.at_bound * largest_command_jitter_s(drive):
+        largest_s = largest_command_jitter_s(drive)
+        if channel.noise.command_stamp_s > (1.0 - channel.settings.report.end_share) * largest_s:
             out.append(
                 f"{name}: speeding up and braking still disagree: as if commands came "
                 f"{1e3 * channel.noise.command_stamp_s:.0f} ms early or late at random, the encoder's time stamps "
@@ -351,15 +316,16 @@ def loud_regimes(found: ChannelResult) -> list[tuple[float, str]]:
     width = found.richest.size // use.size
     now = (found.fit.residual.reshape(-1, width) ** 2).sum(axis=1)
     best = (found.richest.reshape(-1, width) ** 2).sum(axis=1)
-    price = settings.least_nats + settings.nats_each * found.richest_parameters
-    loud = []
+    # One nat for each parameter is the price of Akaike's criterion.
+    price = channel.settings.selection.unnamed_score + found.richest_parameters
+    loud, chosen = [], channel.settings.selection
     for name, mask in masks(channel.drive, samples).items():
         inside = mask & use
-        if name == "standstill" or inside.sum() < settings.fewest_samples:
+        if name == "standstill" or inside.sum() < channel.settings.grid.fewest_samples:
             continue
-        gain, spread = gain_by_block(0.5 * (now - best)[inside], samples.block[inside], settings.fewest_blocks)
+        gain, spread = gain_by_block(0.5 * (now - best)[inside], samples.block[inside], chosen.fewest_blocks)
         ratio = float(now[inside].sum() / max(best[inside].sum(), 1e-9))
-        if gain > price and gain > settings.sure_sigmas * spread and ratio > settings.louder:
+        if gain > price and gain > chosen.sure_sigmas * spread and ratio > 1.0 + settings.worth_share:
             loud.append((math.sqrt(ratio), name))
     return sorted(loud, reverse=True)[: settings.most_regimes]
 

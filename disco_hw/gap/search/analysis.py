@@ -85,7 +85,7 @@ def one_encoder(
     spread = 0.5 * (gains[0].deviation + gains[1].deviation)
     value, deviation = asymmetry
     variance = deviation**2 + spread**2
-    possible = abs(value - expected) < settings.encoder_sigmas * variance**0.5
+    possible = abs(value - expected) < settings.sure_sigmas * variance**0.5
     nats = 0.5 * (value**2 - (value - expected) ** 2) / variance
     return possible, possible and nats > settings.telling_nats
 

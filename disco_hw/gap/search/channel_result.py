@@ -78,7 +78,7 @@ def _evenly(found: ChannelResult) -> Fit | None:
     if not isinstance(channel, WheelChannel) or not best.active:
         return None
     terms, vector = tuple(one.term for one in found.unnamed), best.vector
-    for _ in range(channel.settings.selection.even_rounds):
+    for _ in range(channel.settings.fit.rounds):
         plainly = channel.evenly(*found.selector.channel.split(vector))
         even: ResidualChannel = WithTerms.of(plainly, terms) if terms else plainly
         other = fit(even, vector, best.active)
@@ -269,11 +269,11 @@ def drifted(found: ChannelResult) -> dict[str, float]:
     drive shows the mean: what shorter parts differ by counts once, as what may be chance does. What logs that are
     searched together differ by is what the next one may differ by.
     """
-    settings = found.channel.settings.report
+    settings = found.channel.settings
     variance: dict[str, float] = {}
-    for count in (2, settings.short_parts):
+    for count in (2, 4):
         for name, one in in_equal_parts(found, count).items():
-            goes_on = count == 2 and abs(one.apart(0, 1)) > settings.sure_sigmas
+            goes_on = count == 2 and abs(one.apart(0, 1)) > settings.selection.sure_sigmas
             apart = one.variance_to_next if goes_on else one.variance_between
             variance[name] = max(apart, variance.get(name, 0.0))
     for name, one in in_logs(found).items():

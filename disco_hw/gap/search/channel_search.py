@@ -83,7 +83,7 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
     found = searched(sound)
     # Where nothing known comes near, the noise is too little to compare what is all wrong: the family shows in the
     # noise that the best of it leaves, and what is left against the richest model.
-    return searched(plain) if found.fit.cost > settings.far_off * 0.5 * sound.count else found
+    return searched(plain) if found.fit.cost > drive.settings.noise.poor_fit * 0.5 * sound.count else found
 
 
 def _on_own_clock(drive: GriddedDrive) -> GriddedDrive:
@@ -214,18 +214,14 @@ def _time_or_place(found: ChannelResult) -> ChannelResult:
     if set(alike) & set(placed.names) or not any(one.term.disc for one in placed.unnamed):
         return named
     better = _priced(named) - _priced(placed)
-    clearly = found.channel.settings.selection.place_nats
+    clearly = found.channel.settings.selection.telling_nats
     return replace(placed, either=alike if better < clearly else ()) if better > -clearly else named
 
 
 def _priced(found: ChannelResult) -> float:
-    """Misfit in nats with the price of all that was fitted, and of the choice among all terms."""
-    many = float(parameters_of(found.names))
-    chosen = 0.0
-    for one in found.unnamed:
-        many += 4.0 if one.term.disc else len(one.term.features)
-        chosen += 0.0 if one.term.disc else math.log(found.channel.settings.terms.about_many)
-    return found.fit.cost + 0.5 * many * math.log(max(found.channel.count, 2)) + chosen
+    """Misfit in nats with the price of all that was fitted, where and how large a patch is among it."""
+    many = parameters_of(found.names) + sum(4 if one.term.disc else len(one.term.features) for one in found.unnamed)
+    return found.fit.cost + 0.5 * many * math.log(max(found.channel.count, 2))
 
 
 def _body_perturbations(channel: BodyChannel, names: Names, vector: Array) -> Iterator[Array]:
@@ -387,7 +383,7 @@ def best_terms(small: Fit, channel: ResidualChannel, options: Iterator[Term]) ->
             continue
         coefficients = -inverse(information) @ pull
         gain = -0.5 * float(pull @ coefficients) - 0.5 * (len(columns) - 1) * math.log(channel.count)
-        if gain > settings.worth_trying_nats and coefficients.max() <= term.highest:
+        if 2.0 * gain > channel.settings.selection.unnamed_score and coefficients.max() <= term.highest:
             promising.append((gain, term))
     best: list[Term] = []
     for _, term in sorted(promising, key=lambda one: -one[0]):

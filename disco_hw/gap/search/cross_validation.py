@@ -275,7 +275,7 @@ def fold_vectors(found: Fit, fold: Index, count: int, neutral: Array, settings: 
         vector, others = found.vector.copy(), np.delete(normal, place, axis=0).sum(axis=0)
         pulled = np.delete(gradient, place, axis=0).sum(axis=0) + pull
         determined = known(others, normal.sum(axis=0), settings.fit)
-        determined |= np.diag(others) * vector[active] ** 2 > settings.prediction.fixed_sigmas**2
+        determined |= np.diag(others) * vector[active] ** 2 > settings.selection.sure_sigmas**2
         here = (others + np.diag(precision))[np.ix_(determined, determined)]
         vector[active[determined]] -= inverse(here) @ pulled[determined]
         vector[active[~determined]] = neutral[active[~determined]]
@@ -344,20 +344,14 @@ def floor_errors(body: BodyChannel, noise: SensorNoise, ahead_s: float, poses: t
     settings = body.settings.prediction
     period_s = max(float(np.median(np.diff(body.samples.t_s))), 1e-3)
     # The start is a mean over all poses within reach, the end a single one.
-    averaged = max(2.0 * settings.pose_reach_s / period_s, 1.0) ** 0.5
+    averaged = max(2.0 * settings.pose_reach_s / period_s, 1.0)
     size = np.array([noise.position_m, noise.position_m, noise.yaw_rad])
     cosine, sine = np.cos(starts.pose[:, 2]), np.sin(starts.pose[:, 2])
     dx, dy = starts.end[:, 0] - starts.pose[:, 0], starts.end[:, 1] - starts.pose[:, 1]
     ahead, left = cosine * dx + sine * dy, cosine * dy - sine * dx
-    generator = np.random.default_rng(1)
-    squares = np.zeros((starts.node.size, 3))
-    for _ in range(settings.floor_draws):
-        first, last = generator.standard_normal((2, starts.node.size, 3)) * size
-        first /= averaged
-        error = last - first
-        error[:, 0] += left * first[:, 2]
-        error[:, 1] -= ahead * first[:, 2]
-        squares += error**2 / settings.floor_draws
+    squares = np.tile(size**2 * (1.0 + 1.0 / averaged), (starts.node.size, 1))
+    # What the heading errs by at the start moves the end aside.
+    squares[:, :2] += np.column_stack([left, ahead]) ** 2 * noise.yaw_rad**2 / averaged
     return summarise(np.sqrt(squares), np.full(starts.node.size, noise.wheel_rad_s), starts, settings)
 
 

@@ -144,9 +144,9 @@ class Ahead:
         Errors of position and of heading are each measured in what they usually are at the start of a round; large ones
         count linearly (Huber, 1964). Neighbouring predictions overlap, so that each counts for the time it adds.
         """
-        settings = self.body.settings.prediction
+        settings = self.body.settings
         chosen = [starts.block % self.folds != left_out for _, starts in self.starts]
-        every_s = self.body.settings.grid.start_every_s
+        every_s = settings.grid.start_every_s
         shares = [min(every_s / ahead_s, 1.0) ** 0.5 for ahead_s, _ in self.starts]
         start, step = of.joined(lambda part: part.vector), of.joined(lambda part: part.layout.step)
         low, high = of.joined(lambda part: part.layout.low), of.joined(lambda part: part.layout.high)
@@ -157,7 +157,7 @@ class Ahead:
         root = np.linalg.cholesky(precision + np.diag((_NEGLIGIBLE / step) ** 2)).T
         first_at = start if begin is None else of.at(begin).joined(lambda part: part.vector)
         values, cost, normal = np.clip(first_at, low + _INSIDE * step, high - _INSIDE * step), math.inf, root.T @ root
-        for _ in range(settings.fit_rounds if any(mask.any() for mask in chosen) else 0):
+        for _ in range(settings.fit.rounds if any(mask.any() for mask in chosen) else 0):
             units = [
                 _usual(error[mask]) / share
                 for error, mask, share in zip(self.errors(of.chain(of.vectors(values))), chosen, shares, strict=True)
@@ -180,7 +180,7 @@ class Ahead:
 
             found = least_squares(
                 residual, values, slope, bounds=(low, high), x_scale=10.0 * step, loss="huber",
-                f_scale=self.body.settings.noise.huber * max(shares), max_nfev=settings.fit_steps, ftol=1e-5, xtol=1e-8,
+                f_scale=settings.noise.huber * max(shares), max_nfev=settings.fit.iterations, ftol=1e-5, xtol=1e-8,
             )  # fmt: skip
             values, cost, normal = found.x, float(found.cost), np.asarray(found.jac.T @ found.jac)
         return JointFit(tuple(of.vectors(values)), cost, of.names, within(inverse(normal), low, high))

@@ -52,7 +52,7 @@ def learn_saturated_wheels(channel: WheelChannel, vector: Array) -> tuple[WheelC
     best, least = channel, raw
     for begin in (channel, channel.with_noise(WheelNoise(reading_rad=channel.noise.reading_rad))):
         estimated = begin
-        for _ in range(channel.settings.fit.richest_rounds):
+        for _ in range(channel.settings.fit.rounds):
             slope = np.column_stack([(whiten_wheels(c, estimated.gains) * estimated.weight).ravel() for c in columns])
             found = _ridge(
                 slope, (whiten_wheels(raw, estimated.gains) * estimated.weight).ravel(), channel.settings.fit

@@ -305,7 +305,7 @@ class Selector:
         closer(lambda value: self._linear_gain(parent, new, value), spacing)
         best = max(gains, key=gains.__getitem__)
         found = self._at(parent, active, new, best)
-        if parent.cost - found.cost < self.settings.worth_fitting_nats:
+        if 2.0 * (parent.cost - found.cost) < self.thresholds.score:
             return found
         refined = {best: found}
         step = new.profile.refine
@@ -397,7 +397,7 @@ class Selector:
         Such a fit scatters from block to block more than any noise, and the score alone would never take it.
         """
         lacking = self.fit(smaller).cost - 0.5 * self.channel.count
-        poor = lacking > self.settings.poor_share * 0.5 * self.channel.count
+        poor = self.fit(smaller).cost > self.channel.settings.noise.poor_fit * 0.5 * self.channel.count
         return poor and gain > self.settings.large_share * lacking
 
     def promise(self, accepted: Names, name: str) -> float:
@@ -406,9 +406,9 @@ class Selector:
         price = 0.5 * candidate.parameters * np.log(self.channel.count)
         smooth = candidate.starts is None and candidate.profile is None
         if smooth and frozenset((*accepted, name)) not in self.fits:
-            gain = self._linear_gain(self.fit(accepted), candidate)
-            if gain < self.settings.worth_fitting_nats:
-                return float(gain - price)
+            worth = float(self._linear_gain(self.fit(accepted), candidate) - price)
+            if 2.0 * worth < self.thresholds.score:
+                return worth
         return float(self.fit(accepted).cost - self.fit((*accepted, name)).cost - price)
 
     def ranked(self, accepted: Names) -> list[str]:
@@ -458,7 +458,7 @@ class Selector:
         `among` limits which effects are replaced, and by which.
         """
         for _ in range(len(accepted)):
-            best, score = accepted, self.settings.swap_nats
+            best, score = accepted, self.settings.telling_nats
             for place, old in enumerate(accepted):
                 if old in self.given or (among is not None and old not in among):
                     continue
@@ -512,6 +512,6 @@ class Selector:
         places = [layout.place[column] for column in columns]
         vector[places] = layout.neutral[places]
         option, key = fit(self.channel, vector, indices(self.channel, rest), loose=not self.closely), frozenset(rest)
-        if option.cost < self.fit(rest).cost - self.settings.better_nats:
+        if option.cost < self.fit(rest).cost - self.channel.settings.fit.enough_nats:
             self.fits[key] = option
             self.proofs = {pair: proof for pair, proof in self.proofs.items() if key not in pair}

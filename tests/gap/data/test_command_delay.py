@@ -311,8 +311,8 @@ def test_too_few_samples_or_commands_have_no_delay_and_nothing_is_asked_of_it(sc
     none = picked(ONE, np.array([True, False]))
     assert scanned(found, commands=none) == Response(delay_s=0.0, lag_s=0.0, mismatch=0.0, known=True)
     # Two samples make one pair.
-    assert scanned(found, sampled(2, 0.4), fewest_poses=1).delay_s == pytest.approx(0.24, abs=1e-3)
-    assert scanned(found, sampled(1, 0.4), fewest_poses=1) == Response()
+    assert scanned(found, sampled(2, 0.4), fewest_samples=1).delay_s == pytest.approx(0.24, abs=1e-3)
+    assert scanned(found, sampled(1, 0.4), fewest_samples=1) == Response()
     for fewest, told in ((392, True), (393, False)):
-        assert (scanned(found, fewest_poses=fewest).delay_s > 0.2) == told
+        assert (scanned(found, fewest_samples=fewest).delay_s > 0.2) == told
     assert command_clock(sampled(), none, SETTINGS) == (StampClock(0.0), True)

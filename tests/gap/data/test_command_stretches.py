@@ -11,7 +11,7 @@ from disco_hw.gap.data.stamp_clock import StampClock
 from disco_hw.gap.settings import GridSettings
 from disco_hw.log.drive import Commands
 
-SETTINGS = GridSettings(delay_step_s=0.02, most_pose_delay_s=1.0, least_delay_nats=0.05, fewest_poses=60)
+SETTINGS = GridSettings(delay_step_s=0.02, most_pose_delay_s=1.0, least_delay_nats=0.05, fewest_samples=60)
 COMMANDS = Commands(np.array([0.0, 10.0, 30.0]), np.ones(3), np.ones(3), np.zeros(3))
 
 
@@ -68,7 +68,7 @@ def shown(monkeypatch):
 
         def misfits(answer, turned, delays, fewest):
             asked.append((turned.begin_s.tolist(), delays))
-            assert fewest == SETTINGS.fewest_poses
+            assert fewest == SETTINGS.fewest_samples
             there = -np.maximum(depth - 100.0 * (delays - at_s) ** 2, 0.0)
             return np.where(np.abs(delays) <= known_s, there, np.inf)
 
@@ -111,7 +111,7 @@ def test_the_misfit_of_a_stretch_at_an_age_is_that_of_all_its_pairs(shown):
 def test_a_clock_is_sought_where_a_delay_is_known(monkeypatch, first, told):
     def clock_of(align, settings, least_error_s, least_nats):
         assert (align.first, align.response_model.lag_s) == (first, 0.1)
-        assert (least_error_s, least_nats) == (settings.least_link_error_s, settings.least_link_nats)
+        assert (least_error_s, least_nats) == (settings.least_link_error_s, settings.least_delay_nats)
         return "sought"
 
     monkeypatch.setattr(Turned, "of", lambda wheels, settings: pairs([1.0, 2.0]))

@@ -369,11 +369,11 @@ def test_turns_and_ways_of_poses_are_fitted_by_those_of_the_wheels_at_a_delay(de
 def test_too_few_pairs_are_not_fitted(fewest, known):
     wheels, poses = winding()
     count, _ = by_hand(wheels, poses, 0.12)
-    settings = replace(SETTINGS, fewest_poses=count + fewest)
+    settings = replace(SETTINGS, fewest_samples=count + fewest)
     assert np.isfinite(timing._mismatches(wheels, poses, np.array([0.12]), settings))[0] == known
     pairs = timing._pairs(poses, 0.4)[0].size
     for more, wanted in ((0, True), (1, False)):
-        settings = replace(SETTINGS, fewest_poses=pairs + more)
+        settings = replace(SETTINGS, fewest_samples=pairs + more)
         unlimited = replace(wheels, t_s=wheels.t_s.copy(), segment=wheels.segment)
         assert np.isfinite(timing._mismatches(unlimited, poses, np.array([0.0]), settings))[0] == wanted
     for few in (0, 1):

@@ -19,10 +19,10 @@ from disco_hw.gap.report.misspecification import (
     disputed_names,
     misspecified_effects,
 )
-from disco_hw.gap.search.channel_result import ChannelResult, UnnamedTerm
+from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.least_squares import Fit
-from disco_hw.gap.search.selection import EffectEvidence, Selector, body_moves
-from disco_hw.gap.search.unnamed_terms import Term, WithTerms, motion
+from disco_hw.gap.search.selection import Selector, body_moves
+from disco_hw.gap.search.unnamed_terms import motion
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from tests.gap.synthetic import GEOMETRY, LIMITS, NOISE, body_channel, line_of
 
@@ -108,38 +108,6 @@ def test_what_the_model_has_is_not_disputed():
     assert disputed_names(replace(found, selector=replace(found.selector, given=("lateral_icr",)))) == {}
 
 
-def beside(form, times):
-    """A turn slip, and beside it a term that is worth so many times as much: of the yaw rate, or of the speed."""
-    found = slipping(0.1)
-    line, vector = driven()
-    speed, rate, _ = motion(line, vector)
-    turning, forward = rate * np.abs(rate), speed**3
-    column = {"omega += k omega |omega|": (0, 0, 1), "v_x += k v^3": (1, 0, 0)}[form]
-    term = Term(form, np.where(column[2], turning, forward)[:, None] * np.array(column, dtype=float))
-    channel = WithTerms.of(found.channel, (term,))
-    selector = Selector(channel, found.selector.moves, LIMITS)
-    gain = selector.exact(()).cost - selector.exact(found.names).cost
-    evidence = EffectEvidence(times * gain, 1.0, 1.0, 1.0, 1.0, 1.0)
-    return replace(found, selector=selector, unnamed=(UnnamedTerm(form, evidence, term),))
-
-
-@pytest.mark.parametrize(
-    ("form", "times", "disputed"),
-    [
-        ("omega += k omega |omega|", 0.3, False),
-        ("omega += k omega |omega|", 0.4, True),
-        ("omega += k omega |omega|", 5.0, True),
-        # What leaves other traces explains something else, unless it is worth more.
-        ("v_x += k v^3", 0.9, False),
-        ("v_x += k v^3", 1.1, True),
-    ],
-)
-def test_a_name_beside_a_form_without_one_that_is_worth_a_third_of_it_is_disputed(form, times, disputed):
-    why = disputed_names(beside(form, times))
-    assert (why != {}) == disputed
-    assert not disputed or f"{form} beside it explains {times:.2g} times" in why["turn_slip"]
-
-
 @pytest.mark.parametrize(("offset_m", "disputed"), [(0.0, False), (0.1, True)])
 def test_a_name_that_takes_little_of_what_its_channel_lacks_is_disputed(offset_m, disputed):
     channel, _ = body_channel(turn_slip=0.02, lateral_icr=offset_m)
@@ -152,7 +120,7 @@ def test_a_name_that_takes_little_of_what_its_channel_lacks_is_disputed(offset_m
 
 
 def test_a_value_in_two_regimes_is_what_each_says_and_as_far_apart_as_its_blocks_scatter():
-    generator, settings = np.random.default_rng(3), DEFAULT_SETTINGS.report
+    generator, settings = np.random.default_rng(3), DEFAULT_SETTINGS
     slope, block = generator.standard_normal((4000, 2)), np.repeat(np.arange(200), 20)
     one = np.repeat(generator.random(200) < 0.4, 20)
     noise = generator.standard_normal(4000)
@@ -181,7 +149,7 @@ def test_values_that_scatter_as_noise_does_are_not_called_different(monkeypatch)
 
     def apart(best, block, place, inside, settings):
         asked.append(place)
-        return 0.02, -0.02, times * settings.form_apart_sigmas
+        return 0.02, -0.02, times * settings.report.form_apart_sigmas
 
     monkeypatch.setattr("disco_hw.gap.report.misspecification._apart", apart)
     times = 0.95

@@ -85,7 +85,7 @@ def test_what_predicts_best_is_found_by_errors_in_their_usual_size_and_what_was_
 
 def test_a_fit_begins_where_it_is_told_and_trusts_what_it_is_about(linear):
     ahead, _ = linear
-    steps = replace(DEFAULT_SETTINGS, prediction=replace(DEFAULT_SETTINGS.prediction, fit_rounds=0))
+    steps = replace(DEFAULT_SETTINGS, fit=replace(DEFAULT_SETTINGS.fit, rounds=0))
     still = replace(ahead, body=SimpleNamespace(settings=steps, drive=IN_TWO))
     information, off = 3e6 * np.eye(3), start() + np.where(np.arange(start().size) < 3, 0.01, 0.0)
     of = Freed((Part(BODY, start(), (0, 1, 2), information),), lambda vectors: Chain(vectors[0], None))
@@ -117,8 +117,8 @@ def test_wheels_are_run_anew_for_what_moves_them_and_not_for_effects_of_the_body
 
     monkeypatch.setattr(Ahead, "errors", errors)
     monkeypatch.setattr(end_to_end, "chain_wheels", lambda *_: turned_once)
-    prediction = replace(DEFAULT_SETTINGS.prediction, fit_rounds=1, fit_steps=1)
-    body = SimpleNamespace(settings=replace(DEFAULT_SETTINGS, prediction=prediction), drive=IN_TWO)
+    once = replace(DEFAULT_SETTINGS.fit, rounds=1, iterations=1)
+    body = SimpleNamespace(settings=replace(DEFAULT_SETTINGS, fit=once), drive=IN_TWO)
     vector = start()
     vector[2] = BODY.high[2]
     parts = (

@@ -54,7 +54,7 @@ def test_no_more_effects_are_taken_than_may_be(most):
 
 def test_an_effect_is_swapped_for_the_one_that_is_worth_most_more_than_it():
     both = {(A, B): 9.0, (A,): 2.0, (B,): 3.0}
-    least = SETTINGS.swap_nats
+    least = SETTINGS.telling_nats
     # By no more than it takes nothing is swapped.
     assert Told({**both, (C, B): 9.0 + least}).swapped((A, B)) == (A, B)
     assert Told({**both, (C, B): 9.1 + least}).swapped((A, B)) == (C, B)
@@ -63,7 +63,7 @@ def test_an_effect_is_swapped_for_the_one_that_is_worth_most_more_than_it():
     # Both, one after the other.
     assert Told({**both, (C, B): 15.0, (C, D): 19.0}).swapped((A, B)) == (C, D)
     # What is given stays, and what comes behind it does not.
-    given = Told({**both, (C, B): 15.0, (A, D): 12.0}, given=(A,))
+    given = Told({**both, (C, B): 15.0, (A, D): 13.0}, given=(A,))
     assert given.swapped((A, B)) == (A, D)
 
 
@@ -109,8 +109,9 @@ def test_evidence_pays_for_the_parameters_that_are_new(monkeypatch):
     assert prices == [3]
 
 
-@pytest.mark.parametrize(("gain", "is_fitted"), [(SETTINGS.worth_fitting_nats, True), (7.9, False)])
-def test_what_is_worth_a_fit_is_fitted_before_it_is_ranked(gain, is_fitted):
+@pytest.mark.parametrize(("more", "is_fitted"), [(1e-9, True), (-0.1, False)])
+def test_what_may_reach_the_score_is_fitted_before_it_is_ranked(more, is_fitted):
+    gain = 0.5 * (LIMITS.score + np.log(1000)) + more
     chosen = Selector(SimpleNamespace(settings=DEFAULT_SETTINGS, count=1000), lambda small, big: 1.0, LIMITS)
     chosen.fits[frozenset()] = Fit(np.zeros(1), (), 50.0, np.empty(0), np.empty((0, 0)))
     chosen._linear_gain = lambda parent, new: gain

@@ -14,7 +14,8 @@ from disco_hw.gap.search.selection import Selector
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from tests.gap.synthetic import LIMITS
 
-WORTH = DEFAULT_SETTINGS.selection.worth_fitting_nats
+# Half a score is a gain in nats.
+WORTH = 0.5 * LIMITS.score
 
 
 def fitted(cost, vector=(0.0,), active=()):
@@ -129,11 +130,11 @@ def test_an_effect_does_nothing_where_all_it_has_beside_the_scanned_entry_is_neu
 @pytest.mark.parametrize("closely", [False, True])
 def test_a_set_is_fitted_anew_from_a_larger_one_only_where_that_is_clearly_better(monkeypatch, closely):
     some = searching(closely)
-    better = DEFAULT_SETTINGS.selection.better_nats
+    better = DEFAULT_SETTINGS.fit.enough_nats
     some.fits = {frozenset(names): fitted(9.0) for names in (("turn_slip", "side_slip"), ("turn_slip",))}
     some.channel.layout = BODY
     some.fits[frozenset({"turn_slip", "side_slip"})] = fitted(5.0, BODY.neutral)
-    for cost, kept in ((9.0 - better, 9.0), (8.9 - better, 8.9 - better)):
+    for cost, kept in ((9.0 - better, 9.0), (8.99 - better, 8.99 - better)):
         found = replace(fitted(cost), loose=not closely)
         monkeypatch.setattr(selection, "fit", lambda *_, loose, found=found: found if loose == found.loose else None)
         some._refit_without(("turn_slip", "side_slip"), "side_slip", ("turn_slip",))
