@@ -19,7 +19,7 @@ from tests.firmware_protocol.emulated.board_end import BoardEnd
 from tests.firmware_protocol.other_end import LinkEnd
 from tests.firmware_protocol.protocol_host import CODEC, ProtocolHost
 from tests.sim.test_board import SimProcess
-from tests.sim.test_python_can_link import HubProcess, drive_beside_another_node
+from tests.sim.test_python_can_link import HubProcess, drive_with_another_node
 from tools.check.emulated_board import build_board, missing, run_fast, running_bare_board, running_board
 
 ROOT = Path(__file__).parents[3]
@@ -226,7 +226,7 @@ def test_behind_slcan_it_sits_on_the_mock_bus_beside_other_nodes(tmp_path, proce
         running_board(image, processor, terminal=True) as board,
         HubProcess(tmp_path / "bus", board.port, "sleep_after_open=0"),
     ):
-        drive_beside_another_node(tmp_path / "bus")
+        drive_with_another_node(tmp_path / "bus")
 
 
 @pytest.mark.parametrize("processor", ["m3", "m4f"])
