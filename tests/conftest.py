@@ -116,10 +116,10 @@ def pytest_collection_modifyitems(config, items):
     items.sort(key=lambda item: not item.nodeid.startswith(REAL_TIME))
     if not config.getoption("--robot"):
         return
-    still = pytest.mark.skip(reason="turns the wheels; lift them off the ground and give --allow-motion")
-    left_on = pytest.mark.skip(reason="restarts the controller; give --allow-restart or --allow-restart=COMMAND")
+    skip_motion = pytest.mark.skip(reason="turns the wheels; lift them off the ground and give --allow-motion")
+    skip_restart = pytest.mark.skip(reason="restarts the controller; give --allow-restart or --allow-restart=COMMAND")
     for item in items:
         if item.get_closest_marker("motion") and not config.getoption("--allow-motion"):
-            item.add_marker(still)
+            item.add_marker(skip_motion)
         if item.get_closest_marker("restart") and config.getoption("--allow-restart") is None:
-            item.add_marker(left_on)
+            item.add_marker(skip_restart)

@@ -48,15 +48,15 @@ def product() -> list[Path]:
 def test_rooms_import_only_rooms_below_them():
     wrong = []
     for file in product():
-        own = file.relative_to(ROOT / "disco_hw").parts[0].removesuffix(".py")
-        for module in imports(file) if own not in {"__main__", "__init__"} else ():
+        room = file.relative_to(ROOT / "disco_hw").parts[0].removesuffix(".py")
+        for module in imports(file) if room not in {"__main__", "__init__"} else ():
             if module.split(".")[0] not in OURS or module == "disco_hw":
                 continue
             other = room_of(module)
             if module.split(".")[0] == "disco_hw":
-                allowed = other == own or (other in ROOMS and own in ROOMS and ROOMS.index(other) > ROOMS.index(own))
+                allowed = other == room or (other in ROOMS and room in ROOMS and ROOMS.index(other) > ROOMS.index(room))
             else:
-                allowed = other in {"drivers", "firmware_protocol"} or (other == "sim" and own in MAY_IMPORT_SIM)
+                allowed = other in {"drivers", "firmware_protocol"} or (other == "sim" and room in MAY_IMPORT_SIM)
             if not allowed:
                 wrong.append(f"{file.relative_to(ROOT)} imports {module}")
     assert not wrong, "\n".join(wrong)

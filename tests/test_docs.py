@@ -68,23 +68,23 @@ def commands_of(page: Path) -> list[str]:
 
 
 @cache
-def whole_command() -> click.Command:
+def root_command() -> click.Command:
     return typer.main.get_command(app())
 
 
 def wrong_in(line: str) -> str | None:
     """What of a call is not there: its verb, or an option."""
-    words = shlex.split(line, comments=True)
-    command = whole_command()
+    parts = shlex.split(line, comments=True)
+    command = root_command()
     while isinstance(command, click.Group):
-        if not words or words[0].startswith("-"):
+        if not parts or parts[0].startswith("-"):
             break
-        verb, *words = words
+        verb, *parts = parts
         if verb not in command.commands:
             return f"there is no {verb}"
         command = command.commands[verb]
     known = {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
-    options = {word.split("=")[0] for word in words if re.match(r"--?[a-z]", word)} - {"--help", "--install-completion"}
+    options = {part.split("=")[0] for part in parts if re.match(r"--?[a-z]", part)} - {"--help", "--install-completion"}
     return f"{line}: no option {', '.join(sorted(options - known))}" if options - known else None
 
 
@@ -111,8 +111,8 @@ def test_every_file_tool_and_test_that_a_page_names_is_there(page):
 def test_make_offers_what_the_pages_say():
     targets = set(re.findall(r"^([a-z][\w\-]*):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     for page in PAGES:
-        said = set(re.findall(r"(?:^|`)make ([a-z][\w\-]*)", page.read_text(encoding="utf-8"), re.MULTILINE))
-        assert said <= targets, page
+        mentioned = set(re.findall(r"(?:^|`)make ([a-z][\w\-]*)", page.read_text(encoding="utf-8"), re.MULTILINE))
+        assert mentioned <= targets, page
 
 
 def sentences(page: Path) -> list[str]:

@@ -29,16 +29,16 @@ def watched_processors(program: Path, folder: Path, period_us: int, least_us: in
     them. The computer's own host has done that, or its kernel; no program of ours can.
     """
     with ExitStack() as stack:
-        said: list[Path] = []
+        paths: list[Path] = []
         for processor in sorted(os.sched_getaffinity(0)):
-            said.append(folder / f"paused-{processor}")
-            sink = stack.enter_context(said[-1].open("wb"))
+            paths.append(folder / f"paused-{processor}")
+            sink = stack.enter_context(paths[-1].open("wb"))
             command = [str(program), str(period_us), "99" if can_use_fifo() else "0", str(processor), str(least_us)]
             watch = stack.enter_context(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=sink))
             stack.callback(watch.kill)
 
         def paused() -> Pauses:
-            lines = [line.split() for path in said for line in path.read_text().splitlines()]
+            lines = [line.split() for path in paths for line in path.read_text().splitlines()]
             return sorted((int(since), int(to)) for since, to in lines)
 
         yield paused

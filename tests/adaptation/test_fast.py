@@ -99,13 +99,13 @@ def test_a_belief_that_the_planner_refuses_is_counted_and_not_in_force():
 
 
 def test_an_estimate_of_absurd_variance_never_reaches_the_planner():
-    put = []
+    applied = []
 
     def spoil(adaptation):
         adaptation._filter._bank.covariance[0, 3:6, 3:6] = np.diag([1e300] * 3)
 
-    adaptation, written = learning(put.append, spoil)
-    assert put == []
+    adaptation, written = learning(applied.append, spoil)
+    assert applied == []
     assert adaptation.status()["belief"] == "model"
     assert adaptation.counts()["refused"] == len(written) > 0
     assert all("no covariance" in one.text for one in written)

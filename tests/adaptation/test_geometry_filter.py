@@ -16,7 +16,7 @@ from tools.tracking import classical, tracks
 from tools.tracking import drive as track
 
 MEAN = np.array(NOMINAL)
-TURN, STRAIGHT, STAND = (2.6, 4.6), (3.6, 3.6), (0.0, 0.0)
+TURN, STRAIGHT, STANDSTILL = (2.6, 4.6), (3.6, 3.6), (0.0, 0.0)
 
 
 def learner():
@@ -192,9 +192,9 @@ def test_a_pose_stamped_in_the_future_does_not_hold_up_those_after_it():
 def test_a_robot_that_stands_teaches_nothing():
     found, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL), (0.0, 0.0, 0.3), 1)
     drive(found, plant, TURN, 10.0)
-    drive(found, plant, STAND, 2.0)
+    drive(found, plant, STANDSTILL, 2.0)
     before, covariance = found.mean, found.covariance
-    drive(found, plant, STAND, 20.0)
+    drive(found, plant, STANDSTILL, 20.0)
     np.testing.assert_array_equal(found.mean, before)
     np.testing.assert_array_equal(found.covariance, covariance)
 
@@ -206,14 +206,14 @@ def test_minutes_of_straight_lines_and_standing_leave_axle_and_x_icr_alone(minut
     before = found.mean
     for _ in range(minutes):
         drive(found, plant, STRAIGHT, 40.0)
-        drive(found, plant, STAND, 20.0)
+        drive(found, plant, STANDSTILL, 20.0)
     assert np.abs(found.mean / before - 1.0).max() < 0.015
 
 
 def test_a_robot_that_was_carried_is_found_again():
     found, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL), (0.0, 0.0, 0.3), 1)
     drive(found, plant, TURN, 10.0)
-    drive(found, plant, STAND, 2.0)
+    drive(found, plant, STANDSTILL, 2.0)
     known = found.covariance
     plant.state[:3] = 2.0, -1.0, -2.0
     drive(found, plant, TURN, 1.2)

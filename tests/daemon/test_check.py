@@ -129,7 +129,7 @@ def test_the_conformance_suite_keeps_out_of_a_daemons_way_too(tmp_path):
     daemon = Daemon(tmp_path / "control.sock", {})
     try:
         with pytest.raises(pytest.exit.Exception, match="a daemon is connected to this robot") as caught:
-            test_robot.TestRobot.make_end(SimpleNamespace(getoption=lambda _: str(robot)))
+            test_robot.TestRobot.create_end(SimpleNamespace(getoption=lambda _: str(robot)))
     finally:
         daemon.close()
     assert caught.value.returncode == 1

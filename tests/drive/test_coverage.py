@@ -92,8 +92,8 @@ def test_starts_and_stops_are_counted_where_they_are_hard():
 
 
 def test_steering_counts_where_it_is_quick():
-    quick = covered(lambda t: (3.0 - 2.0 * math.sin(math.pi * t), 3.0 + 2.0 * math.sin(math.pi * t)), 8.2)
-    assert found(quick)["quick steering"] == 8
+    fast = covered(lambda t: (3.0 - 2.0 * math.sin(math.pi * t), 3.0 + 2.0 * math.sin(math.pi * t)), 8.2)
+    assert found(fast)["quick steering"] == 8
     slow = covered(lambda t: (3.0 - 2.0 * math.sin(0.8 * t), 3.0 + 2.0 * math.sin(0.8 * t)), 20.0)
     assert "quick steering" not in found(slow)
 

@@ -64,10 +64,10 @@ def test_who_holds_in_vain_is_asked_once_to_let_go_when_the_robot_is_ready():
     bench.state = State.HANDSHAKE
     assert [bench.tick(True).event for _ in range(50)] == [None] * 50
     bench.state = State.READY
-    said = [bench.tick(True).event for _ in range(50)]
-    assert said[0] is not None
-    assert "release it and press it again" in said[0]
-    assert said[1:] == [None] * 49
+    events = [bench.tick(True).event for _ in range(50)]
+    assert events[0] is not None
+    assert "release it and press it again" in events[0]
+    assert events[1:] == [None] * 49
     bench.tick(False)
     assert bench.tick(True).requests == ARM_START
     # What says already that the deadman is to be let go is not said again.
@@ -77,7 +77,7 @@ def test_who_holds_in_vain_is_asked_once_to_let_go_when_the_robot_is_ready():
 
 
 @pytest.mark.parametrize(
-    ("loss", "words"),
+    ("loss", "expected_event"),
     [
         ({"held": False}, "released"),
         ({"held": True, "gone": True}, "disconnected"),
@@ -85,12 +85,12 @@ def test_who_holds_in_vain_is_asked_once_to_let_go_when_the_robot_is_ready():
         ({"held": True, "age_ns": -1}, "200 ms"),
     ],
 )
-def test_release_loss_and_silence_stop_in_the_same_tick(loss, words):
+def test_release_loss_and_silence_stop_in_the_same_tick(loss, expected_event):
     bench = Bench().driving()
     verdict = bench.tick(**loss)
     assert verdict.requests == DISARM
     assert verdict.motion == Standstill()
-    assert words in verdict.event
+    assert expected_event in verdict.event
 
 
 def test_input_of_exactly_200_ms_still_counts():

@@ -35,16 +35,16 @@ STATUS = {
 }
 
 
-def printed(thing):
+def printed(renderable):
     console = Console(file=io.StringIO(), width=160)
-    console.print(thing)
+    console.print(renderable)
     return console.file.getvalue()
 
 
 def test_the_table_shows_all_there_is():
     text = printed(table(STATUS))
-    for word in ("ARMED", "command +1.5 -2.5", "wheels +1.0 -2.0", "hold [this] key", "deadman pressed", "radius"):
-        assert word in text
+    for fragment in ("ARMED", "command +1.5 -2.5", "wheels +1.0 -2.0", "hold [this] key", "deadman pressed", "radius"):
+        assert fragment in text
     assert "done     straight slow" in text
     assert "missing  reverse fast" in text
 

@@ -16,7 +16,7 @@ from tools.viewer_run import write_log
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "expected_error"),
     [
         ({"script": "dance"}, "--script dance: no such script; write one of circle, steps, excite"),
         ({"unattended": True}, "--unattended and --seconds belong to a script"),
@@ -26,17 +26,17 @@ from tools.viewer_run import write_log
         ({"link": "wifi"}, "--link wifi"),
     ],
 )
-def test_wrong_options_get_one_line(tmp_path, options, words):
-    with pytest.raises(InputError, match=re.escape(words)) as caught:
+def test_wrong_options_get_one_line(tmp_path, options, expected_error):
+    with pytest.raises(InputError, match=re.escape(expected_error)) as caught:
         run_drive(DriveOptions(write_robot_file(tmp_path), **options))
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "control.sock").exists()
 
 
 @pytest.mark.parametrize(
-    ("interface", "words"), [("socketcan", "link.interface socketcan"), ("serial", "link.port /dev/ttyUSB0")]
+    ("interface", "expected_error"), [("socketcan", "link.interface socketcan"), ("serial", "link.port /dev/ttyUSB0")]
 )
-def test_nobody_drives_a_robot_that_may_be_real_unattended(tmp_path, interface, words):
+def test_nobody_drives_a_robot_that_may_be_real_unattended(tmp_path, interface, expected_error):
     robot = write_robot_file(tmp_path)
     text = robot.read_text()
     if interface == "serial":
@@ -45,7 +45,7 @@ def test_nobody_drives_a_robot_that_may_be_real_unattended(tmp_path, interface, 
         text = re.sub(r"(?m)^interface = .*$", 'interface = "socketcan"', text)
     robot.write_text(text)
     link = "serial" if interface == "serial" else None
-    with pytest.raises(InputError, match=f"^--unattended: {words}.* may lead to a real robot; hold a deadman"):
+    with pytest.raises(InputError, match=f"^--unattended: {expected_error}.* may lead to a real robot; hold a deadman"):
         run_drive(DriveOptions(robot, link=link, script="steps", unattended=True))
 
 
@@ -84,14 +84,16 @@ def test_the_result_is_for_people_and_machines():
     assert json.loads(json.dumps(result.as_dict()))["log"] == "a.mcap"
 
 
-@pytest.mark.parametrize("said", [("event", "armed"), ("recording", "the log writer died (signal 9)")])
-def test_a_drive_whose_log_is_not_whole_is_not_completed(tmp_path, monkeypatch, said):
-    monkeypatch.setattr("disco_hw.drive.drive_command.serve", lambda _setup, _log, say, _pilot, **_: say(*said))
+@pytest.mark.parametrize("notification", [("event", "armed"), ("recording", "the log writer died (signal 9)")])
+def test_a_drive_whose_log_is_not_whole_is_not_completed(tmp_path, monkeypatch, notification):
+    monkeypatch.setattr(
+        "disco_hw.drive.drive_command.serve", lambda _setup, _log, notify, _pilot, **_: notify(*notification)
+    )
     result = run_drive(DriveOptions(write_robot_file(tmp_path), page=True, as_json=True))
-    whole = said[0] != "recording"
-    assert result.completed is whole
-    assert ("LOG NOT COMPLETE: the log writer died" in result.as_text()) is not whole
-    assert result.as_dict()["recording_errors"] == (() if whole else (said[1],))
+    is_complete = notification[0] != "recording"
+    assert result.completed is is_complete
+    assert ("LOG NOT COMPLETE: the log writer died" in result.as_text()) is not is_complete
+    assert result.as_dict()["recording_errors"] == (() if is_complete else (notification[1],))
 
 
 @pytest.mark.parametrize("cut_off", [0, 40])
@@ -99,10 +101,10 @@ def test_a_writer_that_was_slow_has_lost_nothing_where_the_log_proves_it(tmp_pat
     log = tmp_path / "drive.mcap"
     pauses = "the log writer has not answered for 0.8 s; new ticks are kept until it does"
 
-    def served(_setup, path, say, _pilot, **_options):
+    def served(_setup, path, notify, _pilot, **_options):
         write_log(path, ticks=60)
         os.truncate(path, path.stat().st_size - cut_off)
-        say("recording", pauses)
+        notify("recording", pauses)
 
     monkeypatch.setattr("disco_hw.drive.drive_command.serve", served)
     result = run_drive(DriveOptions(write_robot_file(tmp_path), page=True, as_json=True, log_file=log))

@@ -117,7 +117,7 @@ def test_a_script_that_fits_nowhere_says_how_much_room_it_needs():
         fitted(Script("long", (straight(seconds=20.0),)), Fence(keep_in=Circle((0, 0), 0.8)))
 
 
-class Held:
+class AlwaysPressed:
     """A deadman that is always held."""
 
     ended = None
@@ -134,11 +134,11 @@ class Held:
 
 def drive(source: FittedScriptSource, robot: ScriptGeometry, bounds: Boundaries) -> float:
     """Let a robot with another geometry obey until the source ends; returns its least clearance (m)."""
-    pose, held, least = CENTER, False, math.inf
+    pose, deadman, least = CENTER, False, math.inf
     for tick in range(20_000):
-        given = source.poll(tick * 20_000_000, RobotView(State.ARMED, held, pose=pose))
-        held = given.deadman
-        wheels = (given.left_rad_s, given.right_rad_s) if held else (0.0, 0.0)
+        given = source.poll(tick * 20_000_000, RobotView(State.ARMED, deadman, pose=pose))
+        deadman = given.deadman
+        wheels = (given.left_rad_s, given.right_rad_s) if deadman else (0.0, 0.0)
         path = driven_path(Manoeuvre("tick", "", 0.02, lambda t_s, wheels=wheels: wheels), pose, robot)
         pose = tuple(path[-1].tolist())
         if tick % 10 == 0:
@@ -156,7 +156,7 @@ def test_a_robot_that_is_otherwise_than_its_model_is_fitted_anew_before_it_leave
     for manoeuvre in fitted(script, fence).manoeuvres:
         path = driven_path(manoeuvre, pose, other)
         pose, planned = tuple(path[-1].tolist()), min(planned, float(bounds.clearance_m(path).min()))
-    playing = FittedScriptSource(script, Held(), ROBOT, bounds, ROOM_NEEDED)
+    playing = FittedScriptSource(script, AlwaysPressed(), ROBOT, bounds, ROOM_NEEDED)
     assert planned < 0.0
     assert drive(playing, other, bounds) > 0.0
     assert playing.completed
@@ -166,16 +166,16 @@ def test_a_robot_that_is_otherwise_than_its_model_is_fitted_anew_before_it_leave
 def test_while_it_is_fitted_anew_the_robot_stands_and_the_deadman_counts():
     far = Manoeuvre("far", "", 4.0, lambda t_s: (5.0, 5.0))
     playing = source(Fence(keep_in=Circle((0, 0), 2.4)), straight(seconds=1.0), far)
-    pose, held, given = CENTER, False, None
+    pose, deadman, given = CENTER, False, None
     for tick in range(30):
-        given = playing.poll(tick * 20_000_000, RobotView(State.ARMED, held, pose=pose))
-        held = given.deadman
+        given = playing.poll(tick * 20_000_000, RobotView(State.ARMED, deadman, pose=pose))
+        deadman = given.deadman
     while playing.task.startswith("straight"):
         tick += 1
         given = playing.poll(tick * 20_000_000, RobotView(State.ARMED, True, pose=pose))
     # It is where it must not go on ahead.
-    stands = playing.poll((tick + 1) * 20_000_000, RobotView(State.ARMED, True, pose=(1.5, 0.0, 0.0)))
-    assert (stands.left_rad_s, stands.right_rad_s, stands.deadman) == (0.0, 0.0, True)
+    standstill = playing.poll((tick + 1) * 20_000_000, RobotView(State.ARMED, True, pose=(1.5, 0.0, 0.0)))
+    assert (standstill.left_rad_s, standstill.right_rad_s, standstill.deadman) == (0.0, 0.0, True)
     for more in range(2, 6):
         given = playing.poll((tick + more) * 20_000_000, RobotView(State.ARMED, True, pose=(1.5, 0.0, 0.0)))
     assert given.left_rad_s < 0.0
@@ -184,17 +184,19 @@ def test_while_it_is_fitted_anew_the_robot_stands_and_the_deadman_counts():
 
 def test_a_robot_that_came_to_where_nothing_fits_ends_the_script():
     playing = source(Fence(keep_in=Circle((0, 0), 2.4)), straight(seconds=1.0), straight("far", 4.0))
-    held = False
+    deadman = False
     for tick in range(200):
         pose = (2.2, 0.0, 1.57) if playing.task.startswith("far") else CENTER
-        held = playing.poll(tick * 20_000_000, RobotView(State.ARMED, held, pose=pose)).deadman
-    assert not held
+        deadman = playing.poll(tick * 20_000_000, RobotView(State.ARMED, deadman, pose=pose)).deadman
+    assert not deadman
     assert playing.ended.startswith("script s does not fit into the fence")
     assert not playing.completed
 
 
 def source(fence: Fence, *manoeuvres: Manoeuvre) -> FittedScriptSource:
-    return FittedScriptSource(Script("s", manoeuvres), Held(), ROBOT, Boundaries(FOOTPRINT, fence), ROOM_NEEDED)
+    return FittedScriptSource(
+        Script("s", manoeuvres), AlwaysPressed(), ROBOT, Boundaries(FOOTPRINT, fence), ROOM_NEEDED
+    )
 
 
 def test_the_deadman_is_open_until_the_script_fits():
@@ -202,9 +204,9 @@ def test_the_deadman_is_open_until_the_script_fits():
     assert not fits.poll(0, RobotView(State.READY, False)).deadman
     assert fits.status_text.startswith("waiting for a pose")
     inputs = [fits.poll(k, RobotView(State.READY, False, pose=CENTER)) for k in range(5)]
-    held = [one.deadman for one in inputs]
-    assert [False, True] in [list(pair) for pair in pairwise(held)]
-    assert held[-1]
+    deadman_states = [one.deadman for one in inputs]
+    assert [False, True] in [list(pair) for pair in pairwise(deadman_states)]
+    assert deadman_states[-1]
     assert fits.ended is None
 
 
@@ -217,7 +219,7 @@ def test_a_script_that_does_not_fit_ends_before_anything_moves():
 
 
 def test_a_script_that_the_fence_stops_ends_and_is_not_complete():
-    playing = ScriptSource(Script("s", (straight("far"),)), Held())
+    playing = ScriptSource(Script("s", (straight("far"),)), AlwaysPressed())
     assert playing.poll(0, RobotView(State.ARMED, True)).deadman
     stopped = playing.poll(20_000_000, RobotView(State.ARMED, True, fence_stopped=True))
     assert not stopped.deadman

@@ -54,7 +54,7 @@ class Bench:
         assert self.stack.robot.truth.right_speed_rad_s == pytest.approx(5.0, abs=0.3)
         return self
 
-    def asked(self):
+    def largest_setpoint_rad_s(self):
         outputs = self.stack.robot.board.outputs
         return max(abs(outputs.left_setpoint_rad_s), abs(outputs.right_setpoint_rad_s))
 
@@ -78,7 +78,7 @@ def test_release_and_loss_stop_and_disarm(loss):
     assert ticks[0].output.state is State.STOPPING
     assert ticks[0].pipeline.source is Source.HOLD
     bench.run(0.4)
-    assert bench.asked() == 0.0
+    assert bench.largest_setpoint_rad_s() == 0.0
     bench.run(1.0)
     assert bench.stack.core.last.output.state is State.READY
     assert max(abs(bench.stack.robot.truth.left_speed_rad_s), abs(bench.stack.robot.truth.right_speed_rad_s)) < 0.05
@@ -102,7 +102,7 @@ def test_silence_stops_200_ms_after_the_last_input_and_nothing_arms_again():
 def test_no_number_is_a_stop():
     bench = Bench().driving()
     bench.run(0.6, wheels=(float("nan"), 5.0))
-    assert bench.asked() == 0.0
+    assert bench.largest_setpoint_rad_s() == 0.0
 
 
 def test_the_status_says_what_is_going_on():

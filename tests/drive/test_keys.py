@@ -42,20 +42,20 @@ class Typist:
         return seen
 
 
-def held(seen):
+def deadman_states(seen):
     return [moment.deadman for moment in seen]
 
 
 def test_a_held_key_drives_until_200_ms_after_its_last_repeat():
     typist = Typist()
     seen = typist.hold(UP, 1000)
-    assert not any(held(seen[:17]))
-    assert all(held(seen[20:]))
+    assert not any(deadman_states(seen[:17]))
+    assert all(deadman_states(seen[20:]))
     assert seen[-1].left_rad_s == seen[-1].right_rad_s == pytest.approx(4.0)
     after = typist.wait(400)
     # The newest input carries its own time, so that whoever judges its age can.
     assert all(moment.t_ns <= typist.now_ns - 400 * MS for moment in after if moment.deadman)
-    assert sum(held(after)) * 10 <= 200
+    assert sum(deadman_states(after)) * 10 <= 200
     assert after[-1].left_rad_s == 0.0
 
 
@@ -63,27 +63,27 @@ def test_a_key_held_from_the_start_holds_nothing_and_is_reported():
     typist = Typist()
     typist.keys = KeyHold(8.0)
     typist.keys.at(typist.now_ns)
-    assert not any(held(typist.hold(UP, 300)))
+    assert not any(deadman_states(typist.hold(UP, 300)))
     assert not typist.keys.is_ignored
-    assert not any(held(typist.hold(UP, 700, delay_ms=30)))
+    assert not any(deadman_states(typist.hold(UP, 700, delay_ms=30)))
     assert typist.keys.is_ignored
     typist.wait(500)
     assert not typist.keys.is_ignored
-    assert any(held(typist.hold(UP, 1000)))
+    assert any(deadman_states(typist.hold(UP, 1000)))
     assert not typist.keys.is_ignored
 
 
 def test_a_tap_holds_nothing():
     typist = Typist()
     typist.press(UP)
-    assert not any(held(typist.wait(2000)))
+    assert not any(deadman_states(typist.wait(2000)))
 
 
 def test_slow_taps_hold_nothing():
     typist = Typist()
     for _ in range(10):
         typist.press(UP)
-        assert not any(held(typist.wait(300)))
+        assert not any(deadman_states(typist.wait(300)))
 
 
 def test_what_comes_faster_than_any_repeat_holds_nothing():
@@ -95,14 +95,14 @@ def test_what_comes_faster_than_any_repeat_holds_nothing():
 
 
 def test_a_late_first_repeat_is_waited_for():
-    assert any(held(Typist().hold(UP, 1000, delay_ms=660)))
+    assert any(deadman_states(Typist().hold(UP, 1000, delay_ms=660)))
 
 
 def test_another_key_takes_over_without_a_break_where_repeats_begin_early():
     typist = Typist()
     typist.hold(UP, 600)
     seen = typist.hold(LEFT, 600, delay_ms=180)
-    assert all(held(seen))
+    assert all(deadman_states(seen))
     assert seen[-1].left_rad_s < 0.0 < seen[-1].right_rad_s
 
 
@@ -110,32 +110,32 @@ def test_another_key_ends_the_hold_where_repeats_begin_late():
     typist = Typist()
     typist.hold(UP, 600)
     seen = typist.hold(LEFT, 1500, delay_ms=400)
-    assert not any(held(seen[30:]))
+    assert not any(deadman_states(seen[30:]))
 
 
 def test_a_stutter_of_the_connection_does_not_hold_again():
     typist = Typist()
     typist.hold(UP, 600)
     typist.wait(300)
-    assert not any(held(typist.hold(UP, 2000, delay_ms=30)))
+    assert not any(deadman_states(typist.hold(UP, 2000, delay_ms=30)))
     assert "release all keys" in typist.keys.status_text
     typist.wait(600)
     assert "release" not in typist.keys.status_text
-    assert any(held(typist.hold(UP, 1000)))
+    assert any(deadman_states(typist.hold(UP, 1000)))
 
 
 def test_any_other_key_stops():
     typist = Typist()
     typist.hold(UP, 600)
     typist.press(b"\x1b")
-    assert not any(held(typist.hold(UP, 1000, delay_ms=30)))
+    assert not any(deadman_states(typist.hold(UP, 1000, delay_ms=30)))
 
 
 def test_digits_choose_the_speed_and_stop():
     typist = Typist()
     typist.hold(UP, 600)
     typist.press(b"9")
-    assert not any(held(typist.wait(600)))
+    assert not any(deadman_states(typist.wait(600)))
     assert typist.hold(UP, 600)[-1].left_rad_s == pytest.approx(8.0)
     assert "100% speed" in typist.keys.status_text
 

@@ -12,10 +12,10 @@ PIECES = Pieces(5.0)
     [(1.0, 0.0, (5.0, 5.0)), (0.0, 0.4, (-2.0, 2.0)), (-0.5, 0.2, (-3.5, -1.5)), (0.5, -0.5, (5.0, 0.0))],
 )
 def test_shares_are_of_the_largest_speed_and_left_turns_have_the_right_wheel_ahead(forward, turn, wheels):
-    held = PIECES.hold("name", "purpose", 2.0, forward, turn)
-    assert held.wheels(0.0) == pytest.approx(wheels)
-    assert held.wheels(1.9) == pytest.approx(wheels)
-    assert (held.name, held.purpose, held.duration_s) == ("name", "purpose", 2.0)
+    manoeuvre = PIECES.hold("name", "purpose", 2.0, forward, turn)
+    assert manoeuvre.wheels(0.0) == pytest.approx(wheels)
+    assert manoeuvre.wheels(1.9) == pytest.approx(wheels)
+    assert (manoeuvre.name, manoeuvre.purpose, manoeuvre.duration_s) == ("name", "purpose", 2.0)
 
 
 def test_a_played_piece_follows_its_profile():

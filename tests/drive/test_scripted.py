@@ -119,42 +119,42 @@ def test_limits_that_nobody_measured_are_those_asked_for():
     assert "not found: no wheel speeds were measured" in bench.source.task
 
 
-def held(source, robot, ticks, start_ns=0):
+def deadman_states(source, robot, ticks, start_ns=0):
     return [source.poll(start_ns + k * TICK, robot).deadman for k in range(1, ticks + 1)]
 
 
 def test_unattended_presses_once_the_robot_is_ready_and_was_seen_open():
     source = Unattended()
-    assert held(source, RobotView(State.HANDSHAKE, driving=False), 3) == [False] * 3
-    assert held(source, READY, 3, 3 * TICK) == [False, True, True]
-    assert held(source, DRIVING, 3, 6 * TICK) == [True] * 3
+    assert deadman_states(source, RobotView(State.HANDSHAKE, driving=False), 3) == [False] * 3
+    assert deadman_states(source, READY, 3, 3 * TICK) == [False, True, True]
+    assert deadman_states(source, DRIVING, 3, 6 * TICK) == [True] * 3
 
 
 def test_unattended_never_presses_again():
     source = Unattended()
-    held(source, READY, 2)
-    held(source, DRIVING, 2, 2 * TICK)
-    assert held(source, HOLDING, 1, 4 * TICK) == [True]
+    deadman_states(source, READY, 2)
+    deadman_states(source, DRIVING, 2, 2 * TICK)
+    assert deadman_states(source, HOLDING, 1, 4 * TICK) == [True]
     source.poll(5 * TICK, RobotView(State.STOPPING, driving=False))
     assert "disarmed before" in source.ended
-    assert held(source, READY, 100, 6 * TICK) == [False] * 100
+    assert deadman_states(source, READY, 100, 6 * TICK) == [False] * 100
 
 
 def test_unattended_goes_on_after_a_short_hold_however_late():
     source = Unattended(driving_within_s=1.0)
-    held(source, READY, 2)
-    held(source, DRIVING, 100, 2 * TICK)
-    assert held(source, HOLDING, 50, 102 * TICK) == [True] * 50
-    assert held(source, DRIVING, 1, 152 * TICK) == [True]
-    assert held(source, HOLDING, 60, 153 * TICK)[-1] is False
+    deadman_states(source, READY, 2)
+    deadman_states(source, DRIVING, 100, 2 * TICK)
+    assert deadman_states(source, HOLDING, 50, 102 * TICK) == [True] * 50
+    assert deadman_states(source, DRIVING, 1, 152 * TICK) == [True]
+    assert deadman_states(source, HOLDING, 60, 153 * TICK)[-1] is False
     assert "stood still for 1 s" in source.ended
 
 
 def test_unattended_gives_up():
     source = Unattended(ready_within_s=1.0)
-    held(source, RobotView(State.HANDSHAKE, driving=False), 52)
+    deadman_states(source, RobotView(State.HANDSHAKE, driving=False), 52)
     assert "not ready within 1 s" in source.ended
     source = Unattended(driving_within_s=1.0)
-    held(source, READY, 60)
+    deadman_states(source, READY, 60)
     assert "did not start" in source.ended
     assert not source.completed

@@ -65,8 +65,8 @@ def steps_of(seed):
 def test_steps_are_drawn_from_the_seed_and_spread_over_the_square():
     first, again, other = ([step.wheels(0.0) for step in steps_of(seed)[1]] for seed in (1, 1, 2))
     assert first == again != other
-    script, held = steps_of(1)
-    assert [step.duration_s for step in held] == [STEP_S] * STEPS
+    script, steps = steps_of(1)
+    assert [step.duration_s for step in steps] == [STEP_S] * STEPS
     begins_s = script.duration_s - 0.6 - STEPS * STEP_S
     assert script.at(begins_s) == script.at(begins_s + 5.99) == first[0] != script.at(begins_s + 6.01)
     assert len({(left > 0.0, right > 0.0) for left, right in first}) == 4

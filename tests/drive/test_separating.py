@@ -17,8 +17,8 @@ def driven(name):
 
 def speeds(values):
     """The speeds that are held both ways."""
-    held = set(np.round(values[np.abs(values) > 0.1], 6))
-    return {value for value in held if value > 0.0 and -value in held}
+    constant_speeds = set(np.round(values[np.abs(values) > 0.1], 6))
+    return {value for value in constant_speeds if value > 0.0 and -value in constant_speeds}
 
 
 def test_straights_go_both_ways_at_two_speeds_and_never_turn():
@@ -66,9 +66,9 @@ def test_all_together_turn_fast_and_go_straight_both_ways_at_either_end():
     forward, turn = driven("separate").T
     straight = np.where(turn == 0.0, forward, 0.0)
     for values, least in ((turn, 0.8 * TOP_RAD_S), (straight, 0.35 * TOP_RAD_S)):
-        held = np.flatnonzero(np.abs(values) > least)
-        early, late = held[held < 0.2 * turn.size], held[held > 0.8 * turn.size]
-        assert {np.sign(values[k]) for k in early} == {np.sign(values[k]) for k in late} == {1.0, -1.0}
+        reached = np.flatnonzero(np.abs(values) > least)
+        at_start, at_end = reached[reached < 0.2 * turn.size], reached[reached > 0.8 * turn.size]
+        assert {np.sign(values[k]) for k in at_start} == {np.sign(values[k]) for k in at_end} == {1.0, -1.0}
 
 
 def test_starts_reach_two_speeds_both_ways():

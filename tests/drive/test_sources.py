@@ -14,14 +14,14 @@ def test_input_counts_for_200_ms():
 
 @pytest.mark.parametrize("source", [GamepadSource, Keyboard, PageSource, ScriptSource])
 def test_every_source_has_all_that_the_pilot_asks_for(source):
-    asked = [name for name in vars(ManualSource) if not name.startswith("_")]
-    assert sorted(asked) == ["close", "completed", "ended", "poll", "status_text", "task"]
-    assert all(hasattr(source, name) for name in asked)
+    required = [name for name in vars(ManualSource) if not name.startswith("_")]
+    assert sorted(required) == ["close", "completed", "ended", "poll", "status_text", "task"]
+    assert all(hasattr(source, name) for name in required)
 
 
 def test_what_was_said_cannot_be_changed():
-    said, seen = ManualInput(1, 0.0, 0.0, deadman=False), RobotView(State.READY, driving=False)
+    manual, seen = ManualInput(1, 0.0, 0.0, deadman=False), RobotView(State.READY, driving=False)
     with pytest.raises(AttributeError):
-        said.deadman = True
+        manual.deadman = True
     with pytest.raises(AttributeError):
         seen.driving = True

@@ -58,10 +58,10 @@ def test_by_hand_a_metre_and_then_the_task_is_armed_anew(bench):
     assert "heading not known" in last.output.detail
     assert "drive" in bench.pilot.status()
     # Nobody holds the pad: whoever arms finds it disarmed again, and the task is refused.
-    asked = bench.run(2.0, ARM, START)
+    ticks = bench.run(2.0, ARM, START)
     assert bench.robot.truth.left_speed_rad_s == pytest.approx(0.0, abs=0.01)
     assert not any(
-        tick.output.motion_allowed and isinstance(bench.pilot.step(0, tick).motion, FollowTask) for tick in asked
+        tick.output.motion_allowed and isinstance(bench.pilot.step(0, tick).motion, FollowTask) for tick in ticks
     )
     bench.hand.held = True
     driven = bench.run(6.0)

@@ -6,11 +6,11 @@ from disco_hw.drive.script import ReachedLimits
 
 
 def limits(**observed):
-    """Manoeuvres with their samples (asked, measured) of the left wheel; the right one does as asked."""
+    """Manoeuvres with their samples (commanded, measured) of the left wheel; the right one does as commanded."""
     found = ReachedLimits()
     for manoeuvre, samples in observed.items():
-        for asked, measured in samples:
-            found.observe(manoeuvre, (asked, asked), (measured, asked))
+        for commanded, measured in samples:
+            found.observe(manoeuvre, (commanded, commanded), (measured, commanded))
     return found
 
 
@@ -30,9 +30,9 @@ def test_single_bad_samples_do_not_count():
     assert limits(ahead=[(6.0, 4.5)] * 4 + [(6.0, 0.0)]).within((6.0, 0.0))[0] == 4.5
 
 
-@pytest.mark.parametrize(("measured", "held"), [(5.8, 6.0), (7.0, 6.0), (-1.0, 0.0)])
-def test_close_is_reached_and_the_wrong_way_is_nothing(measured, held):
-    assert limits(ahead=[(6.0, measured)]).within((6.0, 0.0))[0] == held
+@pytest.mark.parametrize(("measured", "limit"), [(5.8, 6.0), (7.0, 6.0), (-1.0, 0.0)])
+def test_close_is_reached_and_the_wrong_way_is_nothing(measured, limit):
+    assert limits(ahead=[(6.0, measured)]).within((6.0, 0.0))[0] == limit
 
 
 def test_a_measurement_that_is_no_number_limits_nothing():

@@ -75,11 +75,11 @@ def run(script, cache, home):
     process = FORKED.Process(target=run_script, args=(script, out), kwargs=environment)
     process.start()
     process.join(120.0)
-    said, reported = ((out / name).read_text(encoding="utf-8") for name in ("stdout", "stderr"))
-    assert process.exitcode == 0, reported
-    value, loaded = said.split()
+    stdout, stderr = ((out / name).read_text(encoding="utf-8") for name in ("stdout", "stderr"))
+    assert process.exitcode == 0, stderr
+    value, loaded = stdout.split()
     assert value == "42.0"
-    return loaded == "True", reported
+    return loaded == "True", stderr
 
 
 def plant(cache, marker):
@@ -160,10 +160,10 @@ def test_a_pickle_beside_the_source_is_not_run_either_and_where_none_is_private_
     marker, home = tmp_path / "ran", tmp_path / "home"
     home.mkdir()
     run(script, None, home)
-    beside = script.parent / "__pycache__"
-    plant(beside, marker)
-    beside.chmod(0o777)
-    assert str(beside) in run(script, None, home)[1]
+    cache_folder = script.parent / "__pycache__"
+    plant(cache_folder, marker)
+    cache_folder.chmod(0o777)
+    assert str(cache_folder) in run(script, None, home)[1]
     (module,) = (home / ".cache" / "numba").iterdir()
     module.chmod(0o777)
     loaded, reported = run(script, None, home)

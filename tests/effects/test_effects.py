@@ -74,21 +74,21 @@ def test_effects_describe_themselves(effect):
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "said"),
+    ("name", "value", "description"),
     [
         ("pose_latency", 0.065, "poses are stamped 65 ms late"),
         ("pose_latency", -0.065, "poses are stamped 65 ms early"),
         ("command_delay", -0.02, "the wheels act on commands 20 ms before they come: a clock stamps too late"),
     ],
 )
-def test_a_time_is_told_in_words_and_none_is_negative(name, value, said):
-    assert REGISTRY[name].describe({REGISTRY[name].parameters[0].name: value}) == said
+def test_a_time_is_told_in_words_and_none_is_negative(name, value, description):
+    assert REGISTRY[name].describe({REGISTRY[name].parameters[0].name: value}) == description
 
 
-@pytest.mark.parametrize("besides", [(("no", "no"),), (("unequal", "wheels are {no}"),)])
-def test_what_follows_a_sentence_is_of_a_parameter_and_names_parameters(besides):
+@pytest.mark.parametrize("other_symptoms", [(("no", "no"),), (("unequal", "wheels are {no}"),)])
+def test_what_follows_a_sentence_is_of_a_parameter_and_names_parameters(other_symptoms):
     with pytest.raises(ValueError, match=r"turning_load: .*'no'"):
-        replace(REGISTRY["turning_load"], other_symptoms=besides)
+        replace(REGISTRY["turning_load"], other_symptoms=other_symptoms)
 
 
 @pytest.mark.parametrize(
@@ -228,9 +228,9 @@ def test_yaw_acceleration_limit_comes_after_the_motors_lag():
 
 def test_stiction_holds_a_wheel_at_rest_but_not_a_turning_one():
     weak = np.full((10, 2), 0.5)
-    held = free_run({"stiction": {"threshold_rad_s": 0.7}}, weak)
+    stuck = free_run({"stiction": {"threshold_rad_s": 0.7}}, weak)
     turning = free_run({"stiction": {"threshold_rad_s": 0.7}}, weak, start=(0.0, 0.0, 0.0, 2.0, 2.0))
-    assert held[-1, 3] == 0.0
+    assert stuck[-1, 3] == 0.0
     assert turning[-1, 3] == pytest.approx(0.5)
 
 

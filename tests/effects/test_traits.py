@@ -11,7 +11,7 @@ GEOMETRY = (0.06, 0.4, 0.1)
 TOP_RAD_S = 6.0
 
 
-def drawn(effect, rng):
+def sampled(effect, rng):
     """Values within what is physically possible, and not far out."""
     return tuple(rng.uniform(max(p.low, -0.5), min(p.high, 5.0)) for p in effect.parameters)
 
@@ -24,7 +24,7 @@ def called(effect, values, **motion):
 def turns_more(effect, rng):
     """Whether it makes the robot turn faster than its wheels can, which go up to `TOP_RAD_S` either way."""
     left, right, was_left, was_right = rng.uniform(-TOP_RAD_S, TOP_RAD_S, 4)
-    values, time_s = drawn(effect, rng), rng.uniform(0.0, 100.0)
+    values, time_s = sampled(effect, rng), rng.uniform(0.0, 100.0)
     at_start = {"wheel_left": was_left, "wheel_right": was_right, "time_s": time_s}
     most = 2.0 * TOP_RAD_S + 1e-9
     if effect.stage is Stage.COMMAND:
@@ -67,9 +67,9 @@ def test_an_effect_says_whether_it_uses_the_geometry(effect):
 
 
 def test_what_makes_wheels_late_is_a_time():
-    late = [effect for effect in REGISTRY.values() if effect.delayed_by is not None]
-    assert len(late) == 2
-    for effect in late:
+    delaying = [effect for effect in REGISTRY.values() if effect.delayed_by is not None]
+    assert len(delaying) == 2
+    for effect in delaying:
         (unit,) = [parameter.unit for parameter in effect.parameters if parameter.name == effect.delayed_by]
         assert unit == "s"
         assert effect.delay_starts

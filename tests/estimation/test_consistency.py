@@ -84,10 +84,10 @@ def test_late_lossy_unordered_poses_leave_the_filter_consistent(slipping, seeds)
     nees = []
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
-        late = [
+        delayed = [
             (t + int(rng.integers(120, 280)) * 10**6, i) for t, i in arrivals_in_order(slipping) if rng.random() > 0.2
         ]
-        estimates, _ = follow(slipping, seed, late)
+        estimates, _ = follow(slipping, seed, delayed)
         nees.append([squared_error(estimate, slipping.truth[seed, k]) for k, estimate in estimates if k > 40])
     assert_consistent(np.array(nees))
 
@@ -99,9 +99,9 @@ def test_uncertain_geometry_stays_consistent_only_if_the_filter_is_told(seeds):
     covariance = np.diag([0.2 * 0.061, 0.1 * 0.415, 0.05]) ** 2
     geometry = np.clip(rng.multivariate_normal([0.061, 0.415, 0.238], covariance, seeds), 0.01, None)
     drive = drives(seeds, 6.0, Geometry(*geometry.T))
-    told = OdometryParameters(0.061, 0.415, 0.238, tuple(map(tuple, covariance.tolist())))
+    informed = OdometryParameters(0.061, 0.415, 0.238, tuple(map(tuple, covariance.tolist())))
     nees = {}
-    for name, parameters in (("told", told), ("untold", NOMINAL)):
+    for name, parameters in (("informed", informed), ("uninformed", NOMINAL)):
         # Poses at 5 Hz without a gate: what is tested is the covariance.
         runs = [
             follow(
@@ -112,8 +112,8 @@ def test_uncertain_geometry_stays_consistent_only_if_the_filter_is_told(seeds):
         nees[name] = np.array(
             [[squared_error(e, drive.truth[seed, k]) for k, e in estimates] for seed, (estimates, _) in enumerate(runs)]
         )
-    assert nees["told"].mean() == pytest.approx(3.0, rel=0.15)
-    assert nees["untold"].mean() > 3 * nees["told"].mean()
+    assert nees["informed"].mean() == pytest.approx(3.0, rel=0.15)
+    assert nees["uninformed"].mean() > 3 * nees["informed"].mean()
 
 
 def rmse(drive, runs):
@@ -127,7 +127,7 @@ def rmse(drive, runs):
 def test_late_lossy_unordered_poses_cost_less_than_three_percent_of_accuracy():
     # Wheels that do not slip: slip of the last 200 ms cannot be known to anyone, and would be added to the error.
     drive = drives(15, 8.0, slip=Slip(0.0, 0.0, 0.0))
-    ordered, late, stamped_on_arrival = [], [], []
+    ordered, unordered, stamped_on_arrival = [], [], []
     for seed in range(15):
         rng = np.random.default_rng(seed)
         survivors = [(t, i) for t, i in arrivals_in_order(drive) if rng.random() > 0.2]
@@ -141,12 +141,12 @@ def test_late_lossy_unordered_poses_cost_less_than_three_percent_of_accuracy():
             return PoseSample(on, on, pose.x_m, pose.y_m, pose.yaw_rad, pose.position_std_m, pose.yaw_std_rad)
 
         ordered.append(follow(drive, seed, survivors)[0])
-        late.append(follow(drive, seed, delayed)[0])
+        unordered.append(follow(drive, seed, delayed)[0])
         stamped_on_arrival.append(follow(drive, seed, delayed, sample=restamped)[0])
     position, yaw = rmse(drive, ordered)
-    late_position, late_yaw = rmse(drive, late)
-    assert late_position < 1.03 * position
-    assert late_yaw < 1.03 * yaw
+    unordered_position, unordered_yaw = rmse(drive, unordered)
+    assert unordered_position < 1.03 * position
+    assert unordered_yaw < 1.03 * yaw
     # What the time stamps are worth: the same poses taken as of their arrival.
     assert rmse(drive, stamped_on_arrival)[0] > 3 * position
 
@@ -154,8 +154,8 @@ def test_late_lossy_unordered_poses_cost_less_than_three_percent_of_accuracy():
 def test_once_all_poses_are_in_the_late_run_equals_the_ordered_run_to_the_bit(slipping):
     rng = np.random.default_rng(0)
     survivors = [(t, i) for t, i in arrivals_in_order(slipping) if rng.random() > 0.2 and i < 170]
-    late = [(t + int(rng.integers(120, 280)) * 10**6, i) for t, i in survivors]
-    assert follow(slipping, 0, survivors)[0][-1] == follow(slipping, 0, late)[0][-1]
+    delayed = [(t + int(rng.integers(120, 280)) * 10**6, i) for t, i in survivors]
+    assert follow(slipping, 0, survivors)[0][-1] == follow(slipping, 0, delayed)[0][-1]
 
 
 @thinned("delay_ns", [200_000_000, 0], quick=1)

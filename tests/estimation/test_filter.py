@@ -159,7 +159,7 @@ def test_extrapolation_keeps_the_speed_for_a_bounded_time_and_doubts_it_for_long
 def test_extrapolating_in_two_steps_adds_no_doubt():
     pose_filter, state = initialised()
     wheels = WheelReading(0, 0.0, 0.0, 5.0, 5.0)
-    once = pose_filter.extrapolate(state, wheels, 10**9)
-    twice = pose_filter.extrapolate(pose_filter.extrapolate(state, wheels, 150_000_000), wheels, 10**9)
-    assert (twice.left_rad, twice.t_ns) == (once.left_rad, once.t_ns)
-    np.testing.assert_allclose(np.array(twice.belief.covariance)[0, 0], once.belief.xx, rtol=1e-9)
+    in_one_step = pose_filter.extrapolate(state, wheels, 10**9)
+    in_two_steps = pose_filter.extrapolate(pose_filter.extrapolate(state, wheels, 150_000_000), wheels, 10**9)
+    assert (in_two_steps.left_rad, in_two_steps.t_ns) == (in_one_step.left_rad, in_one_step.t_ns)
+    np.testing.assert_allclose(np.array(in_two_steps.belief.covariance)[0, 0], in_one_step.belief.xx, rtol=1e-9)

@@ -83,12 +83,12 @@ def test_estimate_is_predicted_to_the_time_asked_for():
 
 
 def test_asking_does_not_change_the_filter():
-    asked, silent = running(), running()
+    queried, silent = running(), running()
     for t_ms in (20, 500, 30):
-        asked.estimate(t_ms * MS)
-    for fusion in (asked, silent):
+        queried.estimate(t_ms * MS)
+    for fusion in (queried, silent):
         fusion.add_wheels(wheels(40, 0.1, 0.1))
-    assert asked.estimate(50 * MS) == silent.estimate(50 * MS)
+    assert queried.estimate(50 * MS) == silent.estimate(50 * MS)
 
 
 def test_a_time_before_the_newest_sample_gets_the_newest_pose():
@@ -124,10 +124,10 @@ def test_rejected_poses_do_not_keep_the_pose_alive():
 def test_silent_wheels_are_flagged_with_their_age():
     fusion = running()
     assert fusion.estimate(160 * MS).wheels_ok
-    late = fusion.estimate(161 * MS)
-    assert not late.wheels_ok
-    assert not late.ok
-    assert late.wheel_age_s == pytest.approx(0.151)
+    stale = fusion.estimate(161 * MS)
+    assert not stale.wheels_ok
+    assert not stale.ok
+    assert stale.wheel_age_s == pytest.approx(0.151)
 
 
 def test_pose_update_carries_innovation_variances_ratio_and_age():
@@ -227,11 +227,11 @@ wheel_events = st.tuples(st.just("wheels"), st.integers(-200, 900), number, numb
 pose_events = st.tuples(
     st.just("pose"), st.integers(-1500, 200), number, number, number, st.one_of(number, st.just(0.01))
 )
-asks = st.tuples(st.just("ask"), st.integers(-500, 5000))
+queries = st.tuples(st.just("ask"), st.integers(-500, 5000))
 
 
 @settings(max_examples=150, deadline=None)
-@given(st.lists(st.one_of(wheel_events, wheel_events, pose_events, asks), max_size=60), st.booleans(), st.booleans())
+@given(st.lists(st.one_of(wheel_events, wheel_events, pose_events, queries), max_size=60), st.booleans(), st.booleans())
 def test_no_stream_of_samples_harms_the_estimate(events, known, pose_required):
     fusions = [
         fusion_with(PARAMETERS if known else UNCERTAIN, pose_required=pose_required, gate_lockout_count=2)

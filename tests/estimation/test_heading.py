@@ -46,9 +46,9 @@ def position_only(drive, lever=(0.0, 0.0)):
     return sample
 
 
-def arrivals(drive, late_ns=150_000_000):
+def arrivals(drive, delay_ns=150_000_000):
     step = EVERY_NS // 40_000_000
-    return [(drive.wheels[i * POSE_EVERY].t_ns + late_ns, i) for i in range(0, drive.measured.shape[1], step)]
+    return [(drive.wheels[i * POSE_EVERY].t_ns + delay_ns, i) for i in range(0, drive.measured.shape[1], step)]
 
 
 @thinned("lever", [LEVER, (0.0, 0.0)], quick=1)

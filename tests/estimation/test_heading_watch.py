@@ -39,8 +39,8 @@ def test_one_that_repeats_itself_while_the_wheels_turn_is_left_out_until_it_has_
     assert found == [True] * found.index(False) + [False] * (50 - found.index(False))
     assert 5 <= found.index(False) <= 9
     assert watch.current == (Heading.FROZEN,)
-    (said,) = watch.new_messages()
-    assert said.startswith("udp: the heading stays at 1.00 rad while the wheels turn the robot by 0.1")
+    (message,) = watch.new_messages()
+    assert message.startswith("udp: the heading stays at 1.00 rad while the wheels turn the robot by 0.1")
     again = kept(watch, [1.0 + 0.02 * k for k in range(1, 40)])
     assert again[:9] == [False] * 9
     assert all(again[9:])
@@ -62,8 +62,8 @@ def test_a_deviation_that_says_nothing_leaves_the_heading_out(std_rad):
     watch = HeadingWatch(["udp"])
     found, never_measured = watch.screen(pose(0.5, std_rad), 0.0, PER_RAD)
     assert (found.x_m, found.y_m, found.has_heading, never_measured) == (1.0, 2.0, False, False)
-    (said,) = watch.new_messages()
-    assert said.endswith("only the positions are used")
+    (message,) = watch.new_messages()
+    assert message.endswith("only the positions are used")
 
 
 def test_the_position_is_then_that_of_the_sensor():

@@ -95,16 +95,16 @@ def test_a_pose_between_wheel_readings_sees_interpolated_angles():
 
 
 def test_a_pose_beyond_the_newest_reading_is_run_again_on_measured_wheels():
-    early = buffer_with([0, 10])
-    early.add_pose(near(0.0))
-    early.add_pose(near(18.0))
-    extrapolated = early.head()
-    early.add_wheels(reading(20))
-    late = buffer_with([0, 10, 20])
-    late.add_pose(near(0.0))
-    late.add_pose(near(18.0))
-    assert early.head() == late.head()
-    assert extrapolated.right_rad != late._states[-2].right_rad
+    poses_first = buffer_with([0, 10])
+    poses_first.add_pose(near(0.0))
+    poses_first.add_pose(near(18.0))
+    extrapolated = poses_first.head()
+    poses_first.add_wheels(reading(20))
+    wheels_first = buffer_with([0, 10, 20])
+    wheels_first.add_pose(near(0.0))
+    wheels_first.add_pose(near(18.0))
+    assert poses_first.head() == wheels_first.head()
+    assert extrapolated.right_rad != wheels_first._states[-2].right_rad
 
 
 def test_a_pose_at_the_stamp_of_a_reading_comes_after_it_whichever_arrives_first():
@@ -129,8 +129,8 @@ def test_a_pose_older_than_the_buffer_is_refused():
 def test_a_pose_at_the_far_end_of_the_buffer_gives_the_same_bits():
     wheels = [10 * k for k in range(1, 230)]
     on_time = run([*wheels[:130], near(1300.0), near(1310.0), *wheels[130:]])
-    late = run([*wheels[:130], near(1310.0), *wheels[130:], near(1300.0)])
-    assert on_time == late
+    delayed = run([*wheels[:130], near(1310.0), *wheels[130:], near(1300.0)])
+    assert on_time == delayed
 
 
 def test_a_repeated_stamp_is_refused():

@@ -77,11 +77,11 @@ def test_straight_and_spin_read_off_by_hand():
 @settings(deadline=None)
 @given(st.floats(-30, 30), st.floats(-30, 30), st.floats(0.01, 0.99))
 def test_an_arc_may_be_cut_anywhere(left, right, part):
-    whole = moved(START, arc(PARAMETERS, left, right))
+    uncut = moved(START, arc(PARAMETERS, left, right))
     first = moved(START, arc(PARAMETERS, part * left, part * right))
     both = moved(first, arc(PARAMETERS, left - part * left, right - part * right))
-    assert (both.x_m, both.y_m) == pytest.approx((whole.x_m, whole.y_m), abs=1e-12)
-    assert math.remainder(both.yaw_rad - whole.yaw_rad, math.tau) == pytest.approx(0.0, abs=1e-12)
+    assert (both.x_m, both.y_m) == pytest.approx((uncut.x_m, uncut.y_m), abs=1e-12)
+    assert math.remainder(both.yaw_rad - uncut.yaw_rad, math.tau) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_advance_follows_the_segments_in_order():

@@ -43,8 +43,8 @@ class Run:
             if number % 4 == 0 and off_fast(t_s) is not None:
                 arrivals.append((wheels.t_ns, 1, sample_of_fast(number // 4, off_fast(t_s))))
             if number % 20 == 0 and off_slow(t_s) is not None:
-                late = sample_of_slow(wheels.t_ns, DRIVE.truth[0, number], rng, off_slow(t_s))
-                arrivals.append((late.received_ns, 2, late))
+                slow_sample = sample_of_slow(wheels.t_ns, DRIVE.truth[0, number], rng, off_slow(t_s))
+                arrivals.append((slow_sample.received_ns, 2, slow_sample))
         self.start_ns = DRIVE.wheels[0].t_ns
         for now_ns, kind, sample in sorted(arrivals, key=lambda each: each[:2]):
             if kind:
@@ -53,7 +53,7 @@ class Run:
             self.fusion.add_wheels(sample)
             self.fusion.sources.step(now_ns)
             self.output_lines += [
-                ((now_ns - self.start_ns) * 1e-9, words) for words in self.fusion.sources.new_messages()
+                ((now_ns - self.start_ns) * 1e-9, message) for message in self.fusion.sources.new_messages()
             ]
             self.ok.append(self.fusion.estimate(now_ns).pose_ok)
         self.end_ns = DRIVE.wheels[-1].t_ns
@@ -65,7 +65,7 @@ class Run:
         return [one.standing.value for one in self.fusion.sources.all]
 
     def status_text(self):
-        return " | ".join(words for _, words in self.output_lines)
+        return " | ".join(message for _, message in self.output_lines)
 
 
 def test_two_that_agree_are_fused_each_late_pose_at_its_own_time():
@@ -103,9 +103,11 @@ def test_a_lost_one_is_said_and_the_other_goes_on(silent):
 
     run = Run(off_fast=off) if silent == FAST else Run(off_slow=off)
     label = ("natnet", "nmea")[silent]
-    lost = [at_s for at_s, words in run.output_lines if words.startswith(f"{label}: no pose for 1 s; continuing with ")]
-    assert len(lost) == 1
-    assert 3.8 < lost[0] < 4.3
+    loss_times_s = [
+        at_s for at_s, message in run.output_lines if message.startswith(f"{label}: no pose for 1 s; continuing with ")
+    ]
+    assert len(loss_times_s) == 1
+    assert 3.8 < loss_times_s[0] < 4.3
     assert run.standings()[silent] == "lost"
     assert all(run.ok[40:])
     assert run.off_m() < 0.1
@@ -139,7 +141,7 @@ def test_one_that_jumps_is_left_out_even_if_it_speaks_more_often(liar):
 def test_one_that_jumped_and_came_back_is_used_again():
     run = Run(off_slow=lambda t: (0.5, 0.0) if 2.0 < t < 4.5 else (0.0, 0.0))
     assert run.standings() == ["good", "good"]
-    assert [words for _, words in run.output_lines if words.startswith("nmea: ")][-1] == "nmea: its poses are used"
+    assert [text for _, text in run.output_lines if text.startswith("nmea: ")][-1] == "nmea: its poses are used"
 
 
 def test_a_single_outlier_of_one_is_counted_and_changes_nothing():

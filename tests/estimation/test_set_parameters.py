@@ -70,19 +70,21 @@ def test_a_pose_from_before_the_change_is_still_taken_in():
 def test_adopting_late_is_adopting_at_once_bit_for_bit():
     """States are adopted when they are gone on from; the same poses, late ones and after trimming, give the same."""
 
-    def found(at_once):
+    def found(immediately):
         fusion, estimates = driven(), []
         for tick in range(100, 240):
             if tick in {100, 110, 180}:
                 fusion.set_parameters(OLD if tick == 110 else NEW)
-                if at_once:
+                if immediately:
                     buffer = fusion._buffer
                     buffer._states, buffer._before = [buffer._filter.adopt(state) for state in buffer._states], 0
             fusion.add_wheels(wheels(tick))
             if tick % 3 == 0:
-                late = (tick - 15) * TICK_NS
-                fusion.add_pose(PoseSample(late, tick * TICK_NS, 0.004 * tick, 0.01, 0.0, 0.005, 0.01), tick * TICK_NS)
+                sample_ns = (tick - 15) * TICK_NS
+                fusion.add_pose(
+                    PoseSample(sample_ns, tick * TICK_NS, 0.004 * tick, 0.01, 0.0, 0.005, 0.01), tick * TICK_NS
+                )
             estimates.append(fusion.estimate(tick * TICK_NS))
         return estimates
 
-    assert found(at_once=False) == found(at_once=True)
+    assert found(immediately=False) == found(immediately=True)

@@ -48,14 +48,14 @@ def test_an_adapted_run_replays_bit_for_bit_and_not_without_its_beliefs(tmp_path
     assert not replay(write_log(tmp_path / "without.mcap", without)).ok
 
 
-def made_up(lost: float, adapted: float) -> AdaptRun:
+def made_up(loss: float, adapted: float) -> AdaptRun:
     """A run whose laps of 10 s cost 0.01 in their first half and 0.03 in their second.
 
     After 60 s so much is lost, and after 67 s so much of it remains.
     """
     t_s = np.arange(0.02, 120.0, 0.02)
     cost = np.where(t_s % 10.0 < 5.0, 0.01, 0.03)
-    cost = cost + np.where(t_s < 60.0, 0.0, np.where(t_s < 67.0, lost, adapted))
+    cost = cost + np.where(t_s < 60.0, 0.0, np.where(t_s < 67.0, loss, adapted))
     return AdaptRun(
         t_s, cost, np.zeros((t_s.size, 2)), ((0.0, np.ones(3), np.ones(3)), (64.0, np.ones(3), np.ones(3))), 0
     )

@@ -49,9 +49,9 @@ def test_only_the_last_half_is_steady():
 
 
 def test_plants_are_drawn_from_the_posterior():
-    drawn = np.array([[plant[name] for name in MODEL.belief.names] for plant in plants(MODEL, 4000)])
-    np.testing.assert_allclose(drawn.mean(axis=0), MODEL.belief.mean(), atol=1e-3)
-    np.testing.assert_allclose(np.cov(drawn.T), MODEL.belief.covariance(), atol=1.5e-5)
+    samples = np.array([[plant[name] for name in MODEL.belief.names] for plant in plants(MODEL, 4000)])
+    np.testing.assert_allclose(samples.mean(axis=0), MODEL.belief.mean(), atol=1e-3)
+    np.testing.assert_allclose(np.cov(samples.T), MODEL.belief.covariance(), atol=1.5e-5)
     assert plants(MODEL, 3) == plants(MODEL, 5)[:3]
     assert plants(MODEL, 2, first=3) == plants(MODEL, 5)[3:]
 
@@ -77,16 +77,16 @@ def test_a_wider_belief_is_that_of_plants_and_controllers_alike(monkeypatch):
 
 
 def test_a_robot_without_commands_stands_at_the_cost_of_standing():
-    asked = []
+    calls = []
 
     def command(now_ns, state):
-        asked.append((now_ns, state.t_ns, len(state.sent)))
+        calls.append((now_ns, state.t_ns, len(state.sent)))
         return 0.0, 0.0
 
     run = drive(command, MEAN, CircleOptions(duration_s=3.0), 1)
     np.testing.assert_array_equal(run.poses, np.tile([0.75, 0.0, math.pi / 2], (30, 1)))
-    assert [now_ns for now_ns, _, _ in asked] == [t_ns for _, t_ns, _ in asked] == list(range(0, 3 * 10**9, 10**8))
-    assert [count for _, _, count in asked] == [min(step, 20) for step in range(30)]
+    assert [now_ns for now_ns, _, _ in calls] == [t_ns for _, t_ns, _ in calls] == list(range(0, 3 * 10**9, 10**8))
+    assert [count for _, _, count in calls] == [min(step, 20) for step in range(30)]
     assert CircleCost().instant_cost(0.0, *run.poses[-1, :2], run.forward_m_s[-1]) == pytest.approx(0.2)
 
 
@@ -115,8 +115,8 @@ def test_every_curve_is_driven_and_reported(short):
 def test_table_csv_and_picture(short, tmp_path):
     result, _ = short
     table = result.table()
-    for said in (*CURVES, "lag_s = 0.1", "wheel_noise = 0.05", "largest_rot_s = 1", "rate_hz = 10", "mode default"):
-        assert said in table
+    for fragment in (*CURVES, "lag_s = 0.1", "wheel_noise = 0.05", "largest_rot_s = 1", "rate_hz = 10", "mode default"):
+        assert fragment in table
     result.write_csv(tmp_path / "circle.csv")
     rows = list(csv.DictReader((tmp_path / "circle.csv").open()))
     assert list(rows[0]) == ["t_s", *CURVES]

@@ -51,51 +51,52 @@ class Scripted:
     """A daemon's control socket; each request to arm ends in the next of `ends` after a second."""
 
     def __init__(self, monkeypatch, tmp_path, *ends):
-        monkeypatch.setattr(experiments, "send_request", self.answer)
-        self.clock, self.ends, self.asked_s = simulated_time(monkeypatch), ends, []
+        monkeypatch.setattr(experiments, "send_request", self.respond)
+        self.clock, self.ends, self.arming_times_s = simulated_time(monkeypatch), ends, []
         self.path = tmp_path / "control.sock"
         self.path.touch()
 
-    def answer(self, path, request, timeout_s):
+    def respond(self, path, request, timeout_s):
         assert path == self.path
         now_s = self.clock.now_ns() * 1e-9
         if request["do"] == "arm":
-            self.asked_s.append(now_s)
+            self.arming_times_s.append(now_s)
             return {"ok": True}
-        over = self.asked_s and now_s > self.asked_s[-1] + 1.0
-        return {"ok": True, "state": self.ends[len(self.asked_s) - 1] if over else "READY", "detail": "so"}
+        over = self.arming_times_s and now_s > self.arming_times_s[-1] + 1.0
+        return {"ok": True, "state": self.ends[len(self.arming_times_s) - 1] if over else "READY", "detail": "so"}
 
 
 def test_an_arming_that_a_busy_machine_ended_is_asked_for_again(monkeypatch, tmp_path):
     daemon = Scripted(monkeypatch, tmp_path, "READY", "READY", "ARMED")
     Operator(daemon.path).arm()
-    assert len(daemon.asked_s) == 3
+    assert len(daemon.arming_times_s) == 3
 
 
-@pytest.mark.parametrize(("ends", "asked"), [(["READY"] * 3, 3), (["READY", "FAULT"], 2)])
-def test_an_arming_is_not_asked_for_without_end_and_not_in_a_fault(monkeypatch, tmp_path, ends, asked):
+@pytest.mark.parametrize(("ends", "attempts"), [(["READY"] * 3, 3), (["READY", "FAULT"], 2)])
+def test_an_arming_is_not_asked_for_without_end_and_not_in_a_fault(monkeypatch, tmp_path, ends, attempts):
     daemon = Scripted(monkeypatch, tmp_path, *ends)
     with pytest.raises(WorkError, match=rf"not ARMED within 5 s \({ends[-1]}: so\)"):
         Operator(daemon.path).arm()
-    assert len(daemon.asked_s) == asked
+    assert len(daemon.arming_times_s) == attempts
 
 
 class Driven:
-    """An operator whose first `lost` drives end for this reason, and all others at speed."""
+    """An operator whose first `failing_drives` drives end for this reason, and all others at speed."""
 
-    def __init__(self, daemon, lost, cause, said):
-        self.output, self.lost, self.cause, self.output_lines, self.started = daemon, lost, cause, said, 0
+    def __init__(self, daemon, failing_drives, cause, output_lines):
+        self.output, self.failing_drives, self.cause = daemon, failing_drives, cause
+        self.output_lines, self.started = output_lines, 0
 
     def arm(self):
         pass
 
     def request(self, what):
         self.started += 1
-        if self.started <= self.lost:
+        if self.started <= self.failing_drives:
             self.output.write_bytes(self.output.read_bytes() + self.output_lines)
 
     def wait_until(self, what, accept, timeout_s):
-        fails = self.started <= self.lost
+        fails = self.started <= self.failing_drives
         status = {"state": "READY", "stop_cause": self.cause} if fails else {"state": "ARMED", "stop_cause": "NONE"}
         if not accept(status):
             raise WorkError(f"not {what}")
@@ -103,7 +104,7 @@ class Driven:
 
 
 @pytest.mark.parametrize(
-    ("lost", "cause", "said", "drives"),
+    ("failing_drives", "cause", "output_lines", "drives"),
     [
         (2, "COMMAND_TIMEOUT", b"", 3),
         (
@@ -116,12 +117,12 @@ class Driven:
         (3, "COMMAND_TIMEOUT", b"", None),
     ],
 )
-def test_a_drive_that_a_busy_machine_held_up_is_begun_anew(tmp_path, lost, cause, said, drives):
+def test_a_drive_that_a_busy_machine_held_up_is_begun_anew(tmp_path, failing_drives, cause, output_lines, drives):
     output = tmp_path / "daemon.txt"
     output.write_bytes(
         b"event: armed -> stopping: no wheel data from the robot; check the cable and the robot's power\n"
     )
-    operator = Driven(output, lost, cause, said)
+    operator = Driven(output, failing_drives, cause, output_lines)
     stack = Stack(tmp_path, tmp_path, None, SimpleNamespace(output_lines=output.read_text), operator, None)
     at_speed = lambda status: status["state"] == "ARMED"  # noqa: E731
     if drives is None:

@@ -29,21 +29,21 @@ class Driver:
 
 
 def campaign(out, **changes) -> Campaign:
-    return Campaign(out, FenceOptions(**changes), lambda words: None)
+    return Campaign(out, FenceOptions(**changes), lambda message: None)
 
 
 def test_a_campaign_that_was_broken_off_goes_on_and_ends_as_if_it_had_not_been(tmp_path):
-    whole, first, second = Driver(), Driver(), Driver()
-    at_once = campaign(tmp_path / "once")
-    at_once.gather("by hand", 5, whole, 0)
+    uninterrupted, first, second = Driver(), Driver(), Driver()
+    reference = campaign(tmp_path / "once")
+    reference.gather("by hand", 5, uninterrupted, 0)
     campaign(tmp_path / "twice").gather("by hand", 2, first, 0)
     with (tmp_path / "twice" / DRIVES).open("ab") as file:
         file.write(b'{"kind": "by hand", "numb')
         file.write(b"\n")
-    going_on = campaign(tmp_path / "twice")
-    going_on.gather("by hand", 5, second, 0)
-    assert (whole.driven, first.driven, second.driven) == (5, 2, 3)
-    assert going_on.result.rows() == at_once.result.rows()
+    resumed = campaign(tmp_path / "twice")
+    resumed.gather("by hand", 5, second, 0)
+    assert (uninterrupted.driven, first.driven, second.driven) == (5, 2, 3)
+    assert resumed.result.rows() == reference.result.rows()
 
 
 @pytest.mark.parametrize("changes", [{"seed": 2}, {"off": 0.1}, {"seconds": 5.0}])

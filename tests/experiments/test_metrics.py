@@ -71,6 +71,6 @@ def test_estimation_error_survives_the_wrap_of_yaw_and_other_sample_times():
 
 def test_no_common_time_is_refused():
     path = circle()
-    late = Path(path.t_s + 1e6, path.x_m, path.y_m, path.yaw_rad, path.speed_m_s)
+    shifted = Path(path.t_s + 1e6, path.x_m, path.y_m, path.yaw_rad, path.speed_m_s)
     with pytest.raises(ValueError, match="in common"):
-        estimation_figures(late, path)
+        estimation_figures(shifted, path)

@@ -54,10 +54,10 @@ def figures(text):
     return [(float(laps), float(mm)) for laps, mm in re.findall(r"([\d.]+) laps, (\d+) mm", text)]
 
 
-def agree(said, ran):
+def agree(documented, measured):
     """Rounding differs from one processor to the next, so the last digit may."""
-    assert len(said) == len(ran) > 0
-    np.testing.assert_allclose(ran, said, rtol=0.1, atol=2.0)
+    assert len(documented) == len(measured) > 0
+    np.testing.assert_allclose(measured, documented, rtol=0.1, atol=2.0)
 
 
 def test_the_pages_law_drives_the_circle_as_the_page_says(tmp_path):
@@ -98,11 +98,11 @@ def test_a_law_that_has_no_answer_for_a_while_stops_the_robot_until_it_has_one(t
 
 
 @pytest.mark.parametrize(
-    ("pose", "control", "learnt"),
+    ("pose", "control", "adapts"),
     [("", "", True), (GOOD_POSES, "", True), ("[pose]\nrate_hz = 4.0\n", "", False), ("", 'adaptation = "off"', False)],
     ids=["measured", "good poses", "slow poses", "off"],
 )
-def test_the_geometry_is_learnt_where_the_real_robot_would_learn_it(tmp_path, pose, control, learnt):
+def test_the_geometry_is_learnt_where_the_real_robot_would_learn_it(tmp_path, pose, control, adapts):
     robot, log = tmp_path / "robot.toml", tmp_path / "log.mcap"
     text = ROBOT.read_text("utf-8").replace("wombot_model.toml", str(ROBOT.with_name("wombot_model.toml")))
     text = text.replace("[control]\n", f"[control]\n{control}\n")
@@ -110,7 +110,7 @@ def test_the_geometry_is_learnt_where_the_real_robot_would_learn_it(tmp_path, po
     drive_virtual(robot, lambda *_: (2.0, 4.0), 4.0, log=log)
     with open_log(log) as opened:
         sources = {record.source for *_, record in opened.records() if isinstance(record, BeliefChange)}
-    assert ("adapted" in sources) == learnt
+    assert ("adapted" in sources) == adapts
 
 
 def test_a_robot_with_another_controller_and_other_poses_is_played_too(tmp_path):

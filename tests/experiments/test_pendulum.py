@@ -93,18 +93,18 @@ def made_up():
 
 
 def test_the_band_of_costs_is_never_below_zero(made_up, tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr("disco_hw.experiments.pendulum.write_pictures", lambda figure, path: drawn.append(figure))
+    figures = []
+    monkeypatch.setattr("disco_hw.experiments.pendulum.write_pictures", lambda figure, path: figures.append(figure))
     made_up.write_pictures(tmp_path / "pendulum.png")
-    axes = drawn[0].axes[0]
+    axes = figures[0].axes[0]
     assert "rad²/s²" in axes.get_ylabel()
     assert all(band.get_paths()[0].vertices[:, 1].min() >= 0.0 for band in axes.collections)
 
 
 def test_table_csv_and_picture(made_up, tmp_path):
     result = made_up
-    for said in (*CURVES, "3 seeds from 0 on, 200 steps of 0.05 s"):
-        assert said in result.table()
+    for fragment in (*CURVES, "3 seeds from 0 on, 200 steps of 0.05 s"):
+        assert fragment in result.table()
     result.write_csv(tmp_path / "pendulum.csv")
     rows = list(csv.DictReader((tmp_path / "pendulum.csv").open()))
     assert len(rows) == 200

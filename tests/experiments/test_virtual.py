@@ -26,9 +26,9 @@ def test_without_a_seed_the_plant_is_the_mean():
 def test_draws_have_the_posteriors_spread_parameter_by_parameter():
     setup = load_setup(ROBOT)
     plants = [true_parameters(setup, seed) for seed in range(400)]
-    drawn = np.array([(p.wheel_radius_m, p.axial_distance_m, p.x_icr_m) for p in plants])
-    assert drawn.mean(0) == pytest.approx((0.061, 0.415, 0.238), abs=0.003)
-    assert drawn.std(0) == pytest.approx((0.01225, 0.00949, 0.0114), rel=0.15)
+    samples = np.array([(p.wheel_radius_m, p.axial_distance_m, p.x_icr_m) for p in plants])
+    assert samples.mean(0) == pytest.approx((0.061, 0.415, 0.238), abs=0.003)
+    assert samples.std(0) == pytest.approx((0.01225, 0.00949, 0.0114), rel=0.15)
 
 
 def test_the_plain_robot_is_the_one_that_its_model_describes(monkeypatch):
@@ -44,11 +44,11 @@ def test_the_plain_robot_is_the_one_that_its_model_describes(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("hide", "words"),
+    ("hide", "expected_error"),
     [("turn_slp=0.1", "turn_slp"), ("turn_slip", "no value"), ("turn_slip=much", "not a number")],
 )
-def test_a_mistake_in_what_to_hide_is_named(hide, words):
-    with pytest.raises(InputError, match=words):
+def test_a_mistake_in_what_to_hide_is_named(hide, expected_error):
+    with pytest.raises(InputError, match=expected_error):
         run_sim(SimOptions(ROBOT, hide=(hide,)))
 
 

@@ -65,12 +65,12 @@ def test_the_nearest_of_all_shapes_counts():
 
 
 def test_an_obstacle_is_where_its_velocity_takes_it():
-    person = MovingCircle(2.0, 0.0, 0.3, -0.5, 0.0)
-    assert clearance(Fence(), 0, 0, 0, obstacles=[person]) == pytest.approx(1.4)
-    assert clearance(Fence(), 0, 0, 0, obstacles=[person], time_s=2.0) == pytest.approx(0.4)
+    pedestrian = MovingCircle(2.0, 0.0, 0.3, -0.5, 0.0)
+    assert clearance(Fence(), 0, 0, 0, obstacles=[pedestrian]) == pytest.approx(1.4)
+    assert clearance(Fence(), 0, 0, 0, obstacles=[pedestrian], time_s=2.0) == pytest.approx(0.4)
     aside = MovingCircle(0.0, 2.0, 0.3, 0.0, -0.5)
     assert clearance(Fence(), 0, 0, 0, obstacles=[aside], time_s=2.0) == pytest.approx(0.5)
-    bounds = Boundaries(FOOTPRINT, Fence(keep_out=(Circle((0, -1), 0.1),)), [person])
+    bounds = Boundaries(FOOTPRINT, Fence(keep_out=(Circle((0, -1), 0.1),)), [pedestrian])
     bounds.set_obstacles([])
     assert bounds.clearance_m(np.zeros((1, 3)))[0] == pytest.approx(0.7)
 
@@ -188,13 +188,13 @@ class Straight:
 
 
 @pytest.mark.parametrize(
-    ("start", "length", "words"),
+    ("start", "length", "expected_breach"),
     [
         ((-1.0, 0.0, 0.0), 2.5, None),
         ((-1.0, 0.0, 0.0), 3.0, "the task's line crosses it near (2.00, 0.00): the footprint is 0.30 m outside there"),
         ((-1.9, 0.5, 0.0), 1.0, "the task starts at (-1.90, 0.50), where the footprint is 0.10 m outside"),
     ],
 )
-def test_a_task_that_leaves_the_fence_is_named_with_the_place(start, length, words):
-    assert task_breach(Fence(keep_in=ROOM), FOOTPRINT, Straight(start, length)) == words
+def test_a_task_that_leaves_the_fence_is_named_with_the_place(start, length, expected_breach):
+    assert task_breach(Fence(keep_in=ROOM), FOOTPRINT, Straight(start, length)) == expected_breach
     assert task_breach(Fence(), FOOTPRINT, Straight(start, length)) is None

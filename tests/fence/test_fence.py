@@ -21,7 +21,7 @@ CROSSED = (ROOM[0], ROOM[2], ROOM[1], ROOM[3])
 
 
 @pytest.mark.parametrize(
-    ("fence", "field", "words"),
+    ("fence", "field", "expected_fault"),
     [
         (Fence(keep_in=ROOM[:2]), "keep_in", "2 points make no polygon"),
         (Fence(keep_in=(*ROOM, ROOM[0])), "keep_in", "points 4 and 0 are the same, (-2, -1.5)"),
@@ -41,10 +41,10 @@ CROSSED = (ROOM[0], ROOM[2], ROOM[1], ROOM[3])
         (Fence(keep_in=((0, 0), (math.inf, 0), (1, 1))), "keep_in", "point 1 is not a finite number"),
     ],
 )  # fmt: skip
-def test_a_fence_that_cannot_be_meant_is_named(fence, field, words):
+def test_a_fence_that_cannot_be_meant_is_named(fence, field, expected_fault):
     fault = fence_fault(fence, FOOTPRINT)
     assert fault is not None
-    assert (fault.field, words in fault.fault) == (field, True), fault
+    assert (fault.field, expected_fault in fault.fault) == (field, True), fault
     assert fault.hint
 
 
@@ -103,7 +103,7 @@ def test_the_usual_footprint_is_made_from_the_wheels(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("fence", "words"),
+    ("fence", "expected_error"),
     [
         ("keep_in = [[-2, -1], [2, -1], [2, 1]]\nkeep_inn = 3", "keep_inn: no such field; did you mean keep_in?"),
         ("keep_in = [[-2, -1], [2]]", "fence.keep_in"),
@@ -119,12 +119,12 @@ def test_the_usual_footprint_is_made_from_the_wheels(tmp_path):
         ("keep_out = [[[-0.80, -0.05], [-0.7, -0.05], [-0.7, 0.05]]]", "the task's line crosses it near (-0.7"),
     ],
 )  # fmt: skip
-def test_robot_toml_says_what_is_wrong_with_a_fence(tmp_path, fence, words):
+def test_robot_toml_says_what_is_wrong_with_a_fence(tmp_path, fence, expected_error):
     path = robot_toml(tmp_path, fence)
     with pytest.raises(InputError) as refusal:
         load_robot_config(path)
     assert str(refusal.value).startswith(f"{path}: ")
-    assert words in str(refusal.value)
+    assert expected_error in str(refusal.value)
     assert "\n" not in str(refusal.value)
     # Whoever asks the running daemon to stop does not have to mend it first.
     assert load_daemon_address(path)[0] == "wombot"

@@ -34,7 +34,7 @@ def test_a_round_way_has_no_more_corners_than_a_fence_may_have():
 
 
 @pytest.mark.parametrize(
-    ("poses", "words"),
+    ("poses", "expected_error"),
     [
         (np.empty((0, 3)), "the log holds no poses"),
         (along_line(SQUARE[:-1]), "the path ends 3.0 m from its start"),
@@ -42,6 +42,6 @@ def test_a_round_way_has_no_more_corners_than_a_fence_may_have():
         (along_line(np.array([[0, 0], [0.1, 0], [0.1, 0.1], [0, 0]], float)), "the path makes no fence"),
     ],
 )
-def test_a_way_that_makes_no_fence_is_refused(poses, words):
-    with pytest.raises(NoFence, match=words):
+def test_a_way_that_makes_no_fence_is_refused(poses, expected_error):
+    with pytest.raises(NoFence, match=expected_error):
         fence_along(poses, FOOTPRINT)

@@ -103,17 +103,17 @@ class Bench:
                 return self.out
         raise AssertionError(f"still {self.out.state}, not {states}; rejections {self.core.rejections}")
 
-    def ask(self, request: str, session: int = 7, **changes: object) -> None:
+    def set_request(self, request: str, session: int = 7, **changes: object) -> None:
         self.request = {"request": request, "session": session} | changes
 
     def to_ready(self, session: int = 7):
         self.hello()
-        self.ask("READY", session)
+        self.set_request("READY", session)
         return self.run_until("READY")
 
     def to_armed(self, session: int = 7):
         self.to_ready(session)
-        self.ask("ARM", session)
+        self.set_request("ARM", session)
         self.command = {}
         return self.run_until("ARMED")
 

@@ -19,7 +19,7 @@ PERIODS_S = {
     for message in PROTOCOL.messages
     if message.sender == "ROBOT" and message.period_s and message.name not in NEVER_CYCLIC
 }
-STILL_RAD_S = 0.05
+STANDSTILL_RAD_S = 0.05
 CLOCK_S = 5.0
 
 
@@ -29,14 +29,14 @@ class FirmwareConformance:
     key: bytes | None = None
 
     @classmethod
-    def make_end(cls, config):
+    def create_end(cls, config):
         """Return who answers; `config` is pytest's."""
         raise AssertionError("say who answers")
 
     @pytest.fixture(scope="class")
     @classmethod
     def talk(cls, request):
-        end = cls.make_end(request.config)
+        end = cls.create_end(request.config)
         yield ProtocolHost(end, cls.key, first_session=end.now_ns // 1000 % 255)
         end.close()
 
@@ -159,7 +159,7 @@ class FirmwareConformance:
     def test_a_host_of_another_protocol_is_refused_until_one_of_its_own_comes(self, host, changes, fault):
         host.hello(**changes)
         host.wait_for(fault, lambda: host.fault == fault and not host.accepted)
-        host.ask("READY", host.new_session())
+        host.set_request("READY", host.new_session())
         host.run(0.5)
         assert host.state == "STANDBY"
         assert {"FAULT", "HANDSHAKE"} <= host.blockers
@@ -167,20 +167,20 @@ class FirmwareConformance:
         host.wait_for("READY with the right protocol", lambda: host.state == "READY" and host.fault == "NONE")
 
     def test_parameters_can_be_read_and_nonsense_is_refused(self, host):
-        def ask(**request):
+        def request_parameter(**request):
             host.latest.pop("PARAM_RESPONSE", None)
             host.send("PARAM_REQUEST", **request)
             host.wait_for("PARAM_RESPONSE", lambda: "PARAM_RESPONSE" in host.latest)
-            answer = host.latest["PARAM_RESPONSE"]
-            return CODEC.choice_name("PARAM_RESPONSE", "status", answer["status"]), answer["value"]
+            response = host.latest["PARAM_RESPONSE"]
+            return CODEC.choice_name("PARAM_RESPONSE", "status", response["status"]), response["value"]
 
-        status, speed = ask(operation="READ", key=5, value=0.0)
+        status, speed = request_parameter(operation="READ", key=5, value=0.0)
         assert (status, speed) == ("OK", pytest.approx(host.limits["max_wheel_speed"], abs=0.002))
-        assert ask(operation="READ", key=999, value=0.0)[0] == "UNKNOWN_KEY"
-        assert ask(operation="WRITE", key=5, value=1e6)[0] == "READ_ONLY"
-        assert ask(operation="WRITE", key=4, value=1e6)[0] == "OUT_OF_RANGE"
-        assert ask(operation=7, key=5, value=0.0)[0] == "UNKNOWN_OPERATION"
-        assert ask(operation="READ", key=5, value=0.0) == ("OK", speed)
+        assert request_parameter(operation="READ", key=999, value=0.0)[0] == "UNKNOWN_KEY"
+        assert request_parameter(operation="WRITE", key=5, value=1e6)[0] == "READ_ONLY"
+        assert request_parameter(operation="WRITE", key=4, value=1e6)[0] == "OUT_OF_RANGE"
+        assert request_parameter(operation=7, key=5, value=0.0)[0] == "UNKNOWN_OPERATION"
+        assert request_parameter(operation="READ", key=5, value=0.0) == ("OK", speed)
 
     # Sessions.
 
@@ -188,15 +188,15 @@ class FirmwareConformance:
         before = host.challenge
         session = host.to_ready()
         host.wait_for("the session", lambda: host.session == session and host.challenge not in (0, before))
-        host.ask("STANDBY")
+        host.set_request("STANDBY")
         host.wait_for("STANDBY", lambda: (host.state, host.session) == ("STANDBY", 0))
 
     @pytest.mark.parametrize("which", ["none", "the last one"])
     def test_a_session_needs_a_number_that_is_new(self, host, which):
         used = host.to_ready()
-        host.ask("STANDBY")
+        host.set_request("STANDBY")
         host.wait_for_state("STANDBY")
-        host.ask("READY", 0 if which == "none" else used)
+        host.set_request("READY", 0 if which == "none" else used)
         host.run(0.5)
         assert host.state == "STANDBY"
         assert "SESSION" in host.blockers
@@ -214,23 +214,23 @@ class FirmwareConformance:
         host.run(0.15)
         assert host.reject_reason == "NONZERO_BEFORE_ARMED"
         assert host.state == "READY"
-        assert host.fastest < STILL_RAD_S
+        assert host.fastest < STANDSTILL_RAD_S
 
     def test_it_tells_the_counter_of_the_last_command_that_it_took(self, host):
         """By which the host sees how late the robot is with them."""
         session = host.to_ready()
-        for wheel_speed, taken in ((0.0, True), (1.0, False)):
+        for wheel_speed, is_accepted in ((0.0, True), (1.0, False)):
             for _ in range(10):
                 host.wheel_command(wheel_speed, wheel_speed, session=session)
                 host.run(0.02)
-                if taken:
+                if is_accepted:
                     last = host.last_counter("WHEEL_COMMAND")
             host.run(0.15)
             assert host.latest["SYSTEM_STATE"]["last_command_counter"] == last
 
     def test_no_arming_without_zero_commands(self, host):
         session = host.to_ready()
-        host.ask("ARM", session)
+        host.set_request("ARM", session)
         host.run(1.0)
         assert host.state == "READY"
         assert "ZERO_COMMANDS" in host.blockers
@@ -239,7 +239,7 @@ class FirmwareConformance:
         session = host.to_ready()
         host.command = {}
         host.run(0.3)
-        host.ask("ARM", session, answer=0)
+        host.set_request("ARM", session, response=0)
         host.run(0.7)
         assert host.state == "READY"
         assert host.reject_reason == "CHALLENGE"
@@ -265,19 +265,19 @@ class FirmwareConformance:
         host.end.send(0x080, b"\xa5" * length)
         assert host.wait_for_state("ESTOP", within_s=1.0) <= 0.1 + slack_s
         assert CODEC.choice_name("SYSTEM_STATE", "estop_source", host.latest["SYSTEM_STATE"]["estop_source"]) == "FRAME"
-        host.ask("READY", host.new_session())
+        host.set_request("READY", host.new_session())
         host.run(0.3)
         assert host.state == "ESTOP"
 
     def test_a_reset_that_was_already_asked_for_undoes_no_later_stop(self, host):
-        host.ask("RESET")
+        host.set_request("RESET")
         host.run(0.3)
         host.end.send(0x080, b"")
         host.run(1.2)
         assert host.state == "ESTOP"
-        host.ask("STANDBY")
+        host.set_request("STANDBY")
         host.run(0.2)
-        host.ask("RESET")
+        host.set_request("RESET")
         host.wait_for_state("STANDBY")
 
     # Restarts.
@@ -332,7 +332,7 @@ class FirmwareConformance:
             pytest.skip("no key")
         before = host.rejected
         host.proves = False
-        host.ask("READY", host.new_session())
+        host.set_request("READY", host.new_session())
         host.run(0.8)
         assert host.state == "STANDBY"
         assert host.rejected != before
@@ -344,7 +344,7 @@ class FirmwareConformance:
         right = host.prover
         host.prover = Prover(bytes(byte ^ 1 for byte in self.key), CODEC)
         host.prover.challenge(int(host.latest["MAC_CHALLENGE"]["nonce"]))
-        host.ask("READY", host.new_session())
+        host.set_request("READY", host.new_session())
         host.run(0.8)
         host.prover = right
         assert (host.state, host.reject_reason) == ("STANDBY", "AUTHENTICATION")
@@ -370,9 +370,9 @@ class FirmwareConformance:
     def test_armed_it_stands_until_told_and_then_follows(self, host):
         host.to_armed()
         host.run(0.5)
-        assert host.fastest < STILL_RAD_S
+        assert host.fastest < STANDSTILL_RAD_S
         ticks = dict(host.latest["WHEEL_TICKS"])
-        host.heard.clear()
+        host.received.clear()
         host.command = {"left": host.fast, "right": -host.fast / 1.5}
         host.run(1.5 + host.speed_up_s)
         assert host.speeds == pytest.approx((host.fast, -host.fast / 1.5), rel=0.1, abs=0.05)
@@ -389,10 +389,10 @@ class FirmwareConformance:
     def stops(self, host, cause, within_s):
         took_s = host.wait_for("stop", lambda: host.state not in ("ARMED", "READY"), within_s)
         assert host.stop_cause == cause
-        host.wait_for("standing wheels", lambda: host.fastest < STILL_RAD_S, 2.0)
+        host.wait_for("standing wheels", lambda: host.fastest < STANDSTILL_RAD_S, 2.0)
         host.wait_for_state("STANDBY", "ESTOP", "FAULT")
         host.run(0.5)
-        assert host.fastest < STILL_RAD_S
+        assert host.fastest < STANDSTILL_RAD_S
         assert host.state != "ARMED", "nothing arms again by itself"
         return took_s
 
@@ -431,7 +431,7 @@ class FirmwareConformance:
     )
     def test_the_host_can_end_it(self, host, slack_s, changes, cause):
         session = host.to_driving()
-        host.ask(**{"request": "ARM", "session": session} | changes)
+        host.set_request(**{"request": "ARM", "session": session} | changes)
         assert self.stops(host, cause, 1.0) <= 0.05 + slack_s
 
     @pytest.mark.motion
@@ -465,7 +465,7 @@ class FirmwareConformance:
             host.to_driving()
         finally:
             host.end.send = send
-        host.ask("STANDBY")
+        host.set_request("STANDBY")
         host.command = None
         host.wait_for_state("STANDBY")
         host.request = None
@@ -476,4 +476,4 @@ class FirmwareConformance:
             host.run(0.01)
             fastest = max(fastest, host.fastest)
             assert host.state in ("STANDBY", "READY")
-        assert fastest < STILL_RAD_S
+        assert fastest < STANDSTILL_RAD_S

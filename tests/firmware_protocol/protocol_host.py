@@ -14,7 +14,7 @@ _BLOCKERS = CODEC.choices("SESSION_STATE", "blockers")
 class ProtocolHost:
     """Sends `request` (a HOST_STATE's signals) every 50 ms and `command` (a WHEEL_COMMAND's) every 20 ms, if not None.
 
-    `heard` keeps what came since it was cleared last: (time in ns, decoded frame). `proves`: whether commands are
+    `received` keeps what came since it was cleared last: (time in ns, decoded frame). `proves`: whether commands are
     proved where there is a key, and `valid_for_s` how long they hold unless a test says otherwise. `damaged` counts
     what came and could not be decoded.
     """
@@ -26,7 +26,7 @@ class ProtocolHost:
         self.valid_for_s = valid_for_s
         self.request = None
         self.command = None
-        self.heard = []
+        self.received = []
         self.damaged = 0
         self.latest = {}
         self.limits = {}
@@ -116,17 +116,17 @@ class ProtocolHost:
         ours = {"protocol_major": PROTOCOL_MAJOR, "protocol_minor": PROTOCOL_MINOR, "dbc_hash": CODEC.dbc_hash}
         self.send("HELLO_REQUEST", **ours | changes)
 
-    def host_state(self, request, session=0, answer=None, host_fault=0):
-        if answer is None:
-            answer = challenge_answer(self.challenge, session, CODEC.dbc_hash) if request == "ARM" else 0
-        self.send("HOST_STATE", request=request, session=session, challenge_answer=answer, host_fault=host_fault)
+    def host_state(self, request, session=0, response=None, host_fault=0):
+        if response is None:
+            response = challenge_answer(self.challenge, session, CODEC.dbc_hash) if request == "ARM" else 0
+        self.send("HOST_STATE", request=request, session=session, challenge_answer=response, host_fault=host_fault)
 
     def wheel_command(self, left=0.0, right=0.0, mode="SPEED", valid_for=None, session=None):
         valid_for = self.valid_for_s if valid_for is None else valid_for
         session = session if session is not None else (self.request or {}).get("session", 0)
         self.send("WHEEL_COMMAND", mode=mode, left_speed=left, right_speed=right, valid_for=valid_for, session=session)
 
-    def ask(self, request, session=0, **changes):
+    def set_request(self, request, session=0, **changes):
         """Go on sending this request, beginning now."""
         self.request = {"request": request, "session": session} | changes
         self._due["request"] = 0
@@ -145,7 +145,7 @@ class ProtocolHost:
             if not isinstance(decoded, Decoded):
                 self.damaged += 1
                 continue
-            self.heard.append((t_ns, decoded))
+            self.received.append((t_ns, decoded))
             self.latest[decoded.name] = decoded.values
             if decoded.name == "LIMITS":
                 self.limits.update(decoded.values)
@@ -162,8 +162,8 @@ class ProtocolHost:
         start_ns = self.end.now_ns
         while not holds():
             passed_s = (self.end.now_ns - start_ns) * 1e-9
-            said = {name: self.latest.get(name) for name in ("SYSTEM_STATE", "SESSION_STATE")}
-            assert passed_s < within_s, f"no {what} within {within_s} s; the robot said {said}"
+            last_states = {name: self.latest.get(name) for name in ("SYSTEM_STATE", "SESSION_STATE")}
+            assert passed_s < within_s, f"no {what} within {within_s} s; the robot said {last_states}"
             self.step()
         return (self.end.now_ns - start_ns) * 1e-9
 
@@ -171,8 +171,8 @@ class ProtocolHost:
         return self.wait_for(" or ".join(states), lambda: self.state in states, within_s)
 
     def messages(self, name):
-        """Return what was received of one message since `heard` was cleared: (time in ns, decoded)."""
-        return [(t_ns, decoded) for t_ns, decoded in self.heard if decoded.name == name]
+        """Return what was received of one message since `received` was cleared: (time in ns, decoded)."""
+        return [(t_ns, decoded) for t_ns, decoded in self.received if decoded.name == name]
 
     def restart(self):
         """Have the controller restarted; return the time (ns) at which it was seen to be there again."""
@@ -181,10 +181,12 @@ class ProtocolHost:
         self.end.restart()
         self.end.wait_until_up()
         self.end.step()
-        for kept in (self.latest, self.limits, self.heard):
+        for kept in (self.latest, self.limits, self.received):
             kept.clear()
-        told = {"HELLO", "SYSTEM_STATE", "SESSION_STATE"} | ({"MAC_CHALLENGE"} if self.prover is not None else set())
-        self.wait_for("word from the restarted controller", lambda: told <= self.latest.keys(), 10.0)
+        expected = {"HELLO", "SYSTEM_STATE", "SESSION_STATE"} | (
+            {"MAC_CHALLENGE"} if self.prover is not None else set()
+        )
+        self.wait_for("word from the restarted controller", lambda: expected <= self.latest.keys(), 10.0)
         apart_us = (self._device_ahead_us() - before_us + 2**39) % 2**40 - 2**39
         assert abs(apart_us) > 100_000, "its clock went on as if nothing had happened: was it restarted?"
         assert (self.accepted, self.session) == (False, 0), "it knows a host or a session before any has come"
@@ -201,16 +203,16 @@ class ProtocolHost:
     def settle(self):
         """Bring the robot to STANDBY, accepted, still, without fault or emergency stop, whatever was before."""
         self.proves, self.command = True, None
-        self.ask("STANDBY")
+        self.set_request("STANDBY")
         self.wait_for("SYSTEM_STATE and SESSION_STATE", lambda: {"SYSTEM_STATE", "SESSION_STATE"} <= self.latest.keys())
         if not self.accepted or len(self.limits) < 6 or (self.prover is not None and not self.prover.ready):
             self.hello()
         for _ in range(4):
             if self.state in ("ESTOP", "FAULT"):
                 self.run(0.6)
-                self.ask("RESET")
+                self.set_request("RESET")
                 self.run(0.4)
-                self.ask("STANDBY")
+                self.set_request("STANDBY")
             self.run(0.1)
             if self.state == "STANDBY" and self.accepted and len(self.limits) >= 6:
                 break
@@ -219,12 +221,12 @@ class ProtocolHost:
         assert self.accepted
         # SYSTEM_STATE comes at 10 Hz: let it tell of all that went before.
         self.run(0.12)
-        self.heard.clear()
+        self.received.clear()
 
     def to_ready(self):
         """Open a new session; return its number."""
         session = self.new_session()
-        self.ask("READY", session)
+        self.set_request("READY", session)
         self.wait_for_state("READY")
         return session
 
@@ -232,7 +234,7 @@ class ProtocolHost:
         session = self.to_ready()
         self.command = {}
         self.run(0.2)
-        self.ask("ARM", session)
+        self.set_request("ARM", session)
         self.wait_for_state("ARMED")
         return session
 

@@ -57,9 +57,9 @@ def test_published_subkeys():
 
 def test_the_key_schedule_is_fips_197s():
     """FIPS 197, appendix A.1: the first and the last word made of the key."""
-    words = bytes(c_key(RFC_KEY).round_keys)
-    assert words[16:20].hex() == "a0fafe17"
-    assert words[-4:].hex() == "b6630ca6"
+    schedule = bytes(c_key(RFC_KEY).round_keys)
+    assert schedule[16:20].hex() == "a0fafe17"
+    assert schedule[-4:].hex() == "b6630ca6"
 
 
 @given(st.binary(min_size=16, max_size=16), st.binary(max_size=80))
@@ -133,7 +133,7 @@ def test_every_bit_of_frame_and_proof_matters(name):
     c = c_authentication()
     prover = prover_for(c)
 
-    def taken_with(bit):
+    def accepted_with(bit):
         """What of these is taken: the frame, its proof and its identifier with this bit turned."""
         flip = (1 << bit).to_bytes(8, "little")
 
@@ -146,11 +146,11 @@ def test_every_bit_of_frame_and_proof_matters(name):
             "proof": (EncodedFrame(proof.can_id, flipped(proof.data)), frame),
             "identifier": (proof, EncodedFrame(frame.can_id ^ 1 << bit % 11, frame.data)),
         }
-        taken = [what for what, pair in turned.items() if c_holds(c, index, *pair)]
+        accepted = [what for what, pair in turned.items() if c_holds(c, index, *pair)]
         assert c_holds(c, index, proof, frame), f"bit {bit}: what failed used nothing up"
-        return taken
+        return accepted
 
-    assert {bit: taken for bit in range(64) if (taken := taken_with(bit))} == {}
+    assert {bit: accepted for bit in range(64) if (accepted := accepted_with(bit))} == {}
 
 
 def test_a_proof_of_another_key_nonce_or_kind_is_none():
@@ -163,11 +163,11 @@ def test_a_proof_of_another_key_nonce_or_kind_is_none():
     assert not c_holds(c, 0, proof, frame)
 
 
-@pytest.mark.parametrize("lost", [0, 1, 2, 0x7FFF, 0xFFFF - 1])
-def test_lost_frames_do_no_harm_up_to_what_the_low_bits_can_tell(lost):
+@pytest.mark.parametrize("dropped", [0, 1, 2, 0x7FFF, 0xFFFF - 1])
+def test_lost_frames_do_no_harm_up_to_what_the_low_bits_can_tell(dropped):
     c = c_authentication()
     nonce = bytes(c.nonce)
-    for freshness in (1, 2 + lost, 3 + 2 * lost, 4 + 3 * lost):
+    for freshness in (1, 2 + dropped, 3 + 2 * dropped, 4 + 3 * dropped):
         mac = truncated_mac(RFC_KEY, nonce, freshness, COMMAND)
         proof = EncodedFrame(0x0F0, (freshness & 0xFFFF).to_bytes(2, "little") + mac)
         assert c_holds(c, lib.DISCO_PROOF_WHEEL_COMMAND, proof, COMMAND)

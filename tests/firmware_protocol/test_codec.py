@@ -92,8 +92,8 @@ def check_everything(message, page, raw):
     can_id, data = CODEC.encode(message.name, counter, **scaled)
     assert can_id == message.can_id
     assert data == pack_in_c(message, raw)
-    whole = dict(scaled, crc=data[0], counter=counter) if protected(message) else scaled
-    assert data == ORACLE.encode_message(message.name, whole, strict=False)
+    complete = dict(scaled, crc=data[0], counter=counter) if protected(message) else scaled
+    assert data == ORACLE.encode_message(message.name, complete, strict=False)
     decoded = CODEC.decode(can_id, data)
     assert isinstance(decoded, Decoded)
     assert decoded.name == message.name

@@ -25,13 +25,13 @@ def restarted(config, entropy=None):
 
 def test_a_controller_whose_entropy_repeats_does_not_conform():
     suite = FirmwareConformance()
-    for test, told in (
+    for test, expected_message in (
         (suite.test_a_restarted_controller_has_no_session_and_other_challenges, "asked for the same"),
         (suite.test_a_session_recorded_after_one_restart_does_not_arm_after_the_next, "has armed it"),
     ):
         host = ProtocolHost(SimulatedEnd(ReferenceRobot(), restarted(CONFIG, entropy=7)))
         host.settle()
-        with pytest.raises(AssertionError, match=f"{told}.*: its entropy repeats"):
+        with pytest.raises(AssertionError, match=f"{expected_message}.*: its entropy repeats"):
             test(host)
 
 
@@ -47,7 +47,7 @@ def test_a_restart_that_was_none_is_told():
 
 class TestCore(FirmwareConformance):
     @classmethod
-    def make_end(cls, config):
+    def create_end(cls, config):
         return SimulatedEnd(ReferenceRobot(), restarted(CONFIG))
 
 
@@ -55,7 +55,7 @@ class TestAuthenticatedCore(FirmwareConformance):
     key = bytes(range(16))
 
     @classmethod
-    def make_end(cls, config):
+    def create_end(cls, config):
         config_with_key = replace(CONFIG, key=cls.key)
         return SimulatedEnd(ReferenceRobot(config_with_key), restarted(config_with_key))
 
@@ -66,6 +66,6 @@ class TestSlowCore(FirmwareConformance):
     key = bytes(range(16))
 
     @classmethod
-    def make_end(cls, config):
+    def create_end(cls, config):
         slow = replace(CONFIG, key=cls.key, max_wheel_speed_rad_s=1.0, max_wheel_acceleration_rad_s2=0.5)
         return SimulatedEnd(ReferenceRobot(slow), restarted(slow))

@@ -52,17 +52,17 @@ def test_crc_agrees_with_the_autosar_helper_of_cantools(payload, one_byte_id):
 def test_all_errors_of_up_to_three_bits_in_sampled_frames_are_found():
     body, identifier = bytes.fromhex("306902B4FB2C01"), 0x910
     good = crc8(body, identifier)
-    whole = int.from_bytes(body, "big")
+    body_bits = int.from_bytes(body, "big")
     patterns = {1 << a | 1 << b | 1 << c for a in range(0, 56, 3) for b in range(56) for c in range(56)}
     for pattern in patterns - {0}:
-        assert crc8((whole ^ pattern).to_bytes(7, "big"), identifier) != good
+        assert crc8((body_bits ^ pattern).to_bytes(7, "big"), identifier) != good
 
 
 @given(st.integers(0, 0xFFFF), st.integers(0, 255), st.integers(0, 0xFFFF_FFFF))
 def test_challenge_answers_agree(challenge, session, dbc_hash):
     proof = challenge.to_bytes(2, "little") + bytes((session,)) + dbc_hash.to_bytes(4, "little")
-    answer = challenge_answer(challenge, session, dbc_hash)
-    assert answer == lib.disco_challenge_answer(challenge, session, dbc_hash) == oracle.Crc16CcittFalse.calc(proof)
+    response = challenge_answer(challenge, session, dbc_hash)
+    assert response == lib.disco_challenge_answer(challenge, session, dbc_hash) == oracle.Crc16CcittFalse.calc(proof)
 
 
 class Twins:

@@ -127,10 +127,10 @@ def test_the_core_ends_each_fault_as_the_table_says(fault):
     assert bench.run(5).state == ("FAULT" if fault.latches else bench.out.state)
     bench.command = None
     end(bench)
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.run(3000)
     assert (bench.out.fault != 0, bench.out.state) == (fault.latches, "FAULT" if fault.latches else "STANDBY")
-    bench.ask("RESET")
+    bench.set_request("RESET")
     bench.run(500)
     assert (bench.out.fault != 0, bench.out.state) == (fault.permanent, "FAULT" if fault.permanent else "STANDBY")
 
@@ -139,6 +139,6 @@ def test_what_ends_a_fault_is_said_with_the_remedy():
     assert FAULTS["STALL_LEFT"].advice.endswith("; then reset")
     assert FAULTS["OVER_TEMPERATURE_LEFT"].advice.endswith("; it clears by itself")
     assert FAULTS["SELF_TEST_FAILED"].advice.endswith("; then restart the controller")
-    assert not any(word in fault.hint for fault in FAULTS.values() for word in ("reset", "clear"))
+    assert not any(term in fault.hint for fault in FAULTS.values() for term in ("reset", "clear"))
     assert advice("NONE") == advice("NO_SUCH_FAULT") == ""
     assert status_codes.fault("BUS_OFF") == f"BUS_OFF: {FAULTS['BUS_OFF'].advice}"

@@ -9,11 +9,11 @@ from firmware_protocol import _firmware
 from firmware_protocol.firmware_core import FirmwareConfig, FirmwareCore, FirmwareInputs, FirmwareOutputs, ResetCause
 from tests.firmware_protocol.bench import CODEC, CONFIG, FAULTS, Bench
 
-STILL = FirmwareInputs(left_ticks=0, right_ticks=0, left_speed_rad_s=0.0, right_speed_rad_s=0.0)
+STATIONARY = FirmwareInputs(left_ticks=0, right_ticks=0, left_speed_rad_s=0.0, right_speed_rad_s=0.0)
 
 
 def test_first_cycle():
-    assert FirmwareCore(CONFIG).step(1000, STILL) == FirmwareOutputs(
+    assert FirmwareCore(CONFIG).step(1000, STATIONARY) == FirmwareOutputs(
         left_setpoint_rad_s=0.0,
         right_setpoint_rad_s=0.0,
         driver_enabled=False,
@@ -35,9 +35,9 @@ def test_first_cycle():
 def test_two_cores_share_nothing():
     first, second = FirmwareCore(CONFIG), FirmwareCore(CONFIG)
     first.receive(0, 0x080, b"")
-    first.step(1000, STILL)
-    assert first.step(2000, STILL).state == "ESTOP"
-    assert second.step(2000, STILL).state == "STANDBY"
+    first.step(1000, STATIONARY)
+    assert first.step(2000, STATIONARY).state == "ESTOP"
+    assert second.step(2000, STATIONARY).state == "STANDBY"
 
 
 def test_the_configuration_is_copied_and_every_value_arrives():
@@ -87,7 +87,7 @@ def test_every_input_arrives():
 
 def test_drain_gives_what_was_queued_once():
     core = FirmwareCore(CONFIG)
-    core.step(1000, STILL)
+    core.step(1000, STATIONARY)
     frames = core.drain()
     assert [CODEC.decode(*frame).name for frame in frames[:3]] == ["HELLO", "SYSTEM_STATE", "SESSION_STATE"]
     assert core.drain() == []
@@ -136,8 +136,8 @@ def test_more_than_a_can_frame_and_odd_identifiers_are_taken_in():
 
 def test_outputs_and_inputs_are_values():
     with pytest.raises(AttributeError):
-        STILL.left_ticks = 1
-    assert msgspec.structs.replace(STILL, left_ticks=5).left_ticks == 5
+        STATIONARY.left_ticks = 1
+    assert msgspec.structs.replace(STATIONARY, left_ticks=5).left_ticks == 5
 
 
 def test_names_are_the_dbcs():

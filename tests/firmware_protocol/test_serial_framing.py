@@ -48,8 +48,8 @@ def test_check_value_and_vector(encode_frame):
 def test_a_frame_with_every_checksum_is_taken(decode, encode_frame):
     """Bytes of 0 among them, which the stuffing leaves out."""
     frames = [(0x100, number.to_bytes(2, "little")) for number in range(1 << 16)]
-    taken, stats = decode(*(encode_frame(*frame) for frame in frames))
-    assert taken == frames
+    decoded, stats = decode(*(encode_frame(*frame) for frame in frames))
+    assert decoded == frames
     assert stats.malformed == 0
 
 

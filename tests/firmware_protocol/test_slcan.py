@@ -108,14 +108,14 @@ def test_commands_are_answered(text, reply):
 
 
 @pytest.mark.parametrize(
-    ("opens", "hears", "speaks"),
+    ("opens", "receives", "speaks"),
     [(b"C\r", False, False), (b"L\r", True, False), (b"O\r", True, True)],
 )
-def test_a_channel_that_is_closed_passes_nothing_and_one_that_listens_does_not_speak(opens, hears, speaks):
+def test_a_channel_that_is_closed_passes_nothing_and_one_that_listens_does_not_speak(opens, receives, speaks):
     line = Slcan()
     line.feed(b"O\r")
     line.feed(opens)
-    assert (line.encode(0x100, b"") != b"") == hears
+    assert (line.encode(0x100, b"") != b"") == receives
     frame = [(0x100, b"")] if speaks else []
     assert line.feed(b"t1000\r") == (frame, b"\r" if speaks else b"\a")
     for other in (b"T000001230\r", b"r1000\r", b"R000001230\r"):

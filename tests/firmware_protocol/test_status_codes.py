@@ -11,7 +11,7 @@ def table(message, signal):
 
 
 @pytest.mark.parametrize(
-    ("message", "signal", "say"),
+    ("message", "signal", "describe"),
     [
         ("SYSTEM_STATE", "fault", status_codes.fault),
         ("SYSTEM_STATE", "stop_cause", status_codes.stop_cause),
@@ -20,13 +20,13 @@ def table(message, signal):
         ("SESSION_STATE", "blockers", status_codes.blocker),
     ],
 )
-def test_every_code_of_the_dbc_has_a_sentence(message, signal, say):
+def test_every_code_of_the_dbc_has_a_sentence(message, signal, describe):
     names = table(message, signal)
     assert names
-    sentences = {say(name) for name in names}
+    sentences = {describe(name) for name in names}
     assert len(sentences) >= len(names) - 2
     for name in names:
-        assert say(name) not in (name, say("NO_SUCH_CODE")), name
+        assert describe(name) not in (name, describe("NO_SUCH_CODE")), name
 
 
 def test_a_code_of_a_newer_firmware_is_shown_as_it_is():

@@ -77,22 +77,22 @@ class MiswiredPlant:
             self._sink(msgspec.structs.replace(pose, x_m=x, y_m=y, yaw_rad=yaw), until_us)
         return []
 
-    def _told(self, of_sides):
+    def _reported(self, of_sides):
         wrong = self._wrong
-        told = [
+        reported = [
             0 if side in wrong.dead_encoders else way * value / wrong.ratio
             for side, (way, value) in enumerate(zip(wrong.encoders, of_sides, strict=True))
         ]
-        return told[::-1] if wrong.swapped != wrong.crossed else told
+        return reported[::-1] if wrong.swapped != wrong.crossed else reported
 
     @property
     def encoder_ticks(self):
-        left, right = self._told(self._plant.encoder_ticks)
+        left, right = self._reported(self._plant.encoder_ticks)
         return round(left), round(right)
 
     @property
     def measured_wheel_speeds_rad_s(self):
-        return tuple(self._told(self._plant.measured_wheel_speeds_rad_s))
+        return tuple(self._reported(self._plant.measured_wheel_speeds_rad_s))
 
     @property
     def truth(self):
@@ -139,18 +139,18 @@ class MiswiredRobot:
         while self._now_us < until_us:
             self._now_us += STEP_US
             for received in self.link.receive():
-                self._take(received.frame)
+                self._handle(received.frame)
             for frame in self.board.step(self._now_us):
                 self._send(frame)
 
-    def _take(self, frame):
+    def _handle(self, frame):
         """One frame from the host; on a half-duplex line its reply is there before the next one is said."""
         if self._exchange is None:
             self.board.receive(self._now_us, frame)
             return
         request = CanFrame(0, self._exchange.request(frame))
-        said = b"".join(each.data for each in self.board.controller.receive(self._now_us, request))
-        reply = self._exchange.reply(frame, said)
+        output = b"".join(each.data for each in self.board.controller.receive(self._now_us, request))
+        reply = self._exchange.reply(frame, output)
         if reply is not None:
             self._send(reply)
 
@@ -161,7 +161,7 @@ class MiswiredRobot:
         self.sender.close()
 
 
-class Person:
+class SimulatedOperator:
     """Holds the deadman while something is to be driven, looks at the wheels, answers; satisfies ManualSource."""
 
     completed, status_text, task, ended = True, "a person", "", None
@@ -170,7 +170,7 @@ class Person:
         self.plant, self.pilot = plant, None
         self.angles, self.last_us = [0.0, 0.0], None
         self._open_ns = self._requested_ns = None
-        self._from, self._held_ns, self._let_go = (0.0, 0.0), None, False
+        self._from, self._pressed_ns, self._let_go = (0.0, 0.0), None, False
         self.strokes = 0
 
     @property
@@ -191,28 +191,28 @@ class Person:
 
     def poll(self, now_ns, robot):
         self.look()
-        wanted = self.action is not None and not isinstance(self.action, Prompt)
+        needs_driving = self.action is not None and not isinstance(self.action, Prompt)
         counting = isinstance(self.action, DriveWheels) and "exactly one turn" in self.action.todo
         if counting and max(map(abs, self.turned())) >= 2.0 * math.pi:
             self._let_go = True
         if not counting:
             self._let_go = False
-        held = wanted and not self._let_go and robot.state in (State.READY, State.ARMED)
-        if held and self._held_ns is None:
+        pressed = needs_driving and not self._let_go and robot.state in (State.READY, State.ARMED)
+        if pressed and self._pressed_ns is None:
             # Open once, then pressed.
-            self._held_ns, self._from = now_ns, tuple(self.angles)
+            self._pressed_ns, self._from = now_ns, tuple(self.angles)
             self.strokes += 1
             return ManualInput(now_ns, 0.0, 0.0, deadman=False)
         if (
-            held
+            pressed
             and not robot.driving
             and isinstance(self.action, DriveWheels)
-            and now_ns - self._held_ns > 3_000_000_000
+            and now_ns - self._pressed_ns > 3_000_000_000
         ):
-            held = False
-        if not held:
-            self._held_ns = None
-        return ManualInput(now_ns, 0.0, 0.0, deadman=held)
+            pressed = False
+        if not pressed:
+            self._pressed_ns = None
+        return ManualInput(now_ns, 0.0, 0.0, deadman=pressed)
 
     def keys(self):
         if not isinstance(self.action, Prompt):
@@ -259,9 +259,9 @@ def stage(path, steps, wrong, plant=None, effects=None, seed=1, raw_poses=False,
     if raw_poses:
         setup = as_sent(setup)
     robot = MiswiredRobot(setup, plant or PlantParameters(), wrong, effects, seed)
-    person = Person(robot.plant)
-    pilot = CommissionPilot(Procedure(steps(setup.config.robot, slowest_rad_s(setup))), person, person.keys)
-    person.pilot = pilot
+    operator = SimulatedOperator(robot.plant)
+    pilot = CommissionPilot(Procedure(steps(setup.config.robot, slowest_rad_s(setup))), operator, operator.keys)
+    operator.pilot = pilot
     run = SimulatedRun(setup, robot, NoPlanner(), pilot)
     run.where, run.slow_rad_s = [], speed_of(setup.config.robot, slowest_rad_s(setup))
     try:
@@ -275,4 +275,4 @@ def stage(path, steps, wrong, plant=None, effects=None, seed=1, raw_poses=False,
     assert pilot.done, f"stuck at {pilot.procedure.action}: {run.core.last.output}"
     if pilot.fault_text is not None:
         raise WorkError(pilot.fault_text)
-    return pilot.procedure.result, run, person
+    return pilot.procedure.result, run, operator

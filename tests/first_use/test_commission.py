@@ -16,7 +16,7 @@ from sim.plant_parameters import PlantParameters
 from tests.first_use.miswired import Miswiring, robot_file, stage
 
 DRIVERS = ("reference", "odrive", "vesc", "agilex", "roboclaw")
-TOLD_WITHIN_M = 0.3
+FARTHEST_M = 0.3
 
 
 def in_millimetres(x, y, yaw):
@@ -43,7 +43,7 @@ def turned_aside(x, y, yaw):
     return x, y, yaw + math.pi / 2
 
 
-def all_at_once(x, y, yaw):
+def wrong_in_every_way(x, y, yaw):
     return 1e3 * x, -1e3 * y, math.degrees(-yaw) + 90.0
 
 
@@ -68,10 +68,10 @@ FAST = (
 )
 
 
-def judged(path, name, wrong, **options):
+def evaluated(path, name, wrong, **options):
     """Drive one stage and judge it; the judgement, the run."""
     one = next(stage for stage in STAGES if stage.name == name)
-    seen, run, _person = stage(path, one.steps, wrong, raw_poses=one.raw_poses, **options)
+    seen, run, _operator = stage(path, one.steps, wrong, raw_poses=one.raw_poses, **options)
     return one.evaluate(seen, load_setup(path)), run
 
 
@@ -80,14 +80,14 @@ def commissioned(path, wrong, names=("sides", "turns", "floor"), **options):
     found = []
     for name in names:
         for _ in range(2):
-            judgement, run = judged(path, name, wrong, **options)
+            evaluation, run = evaluated(path, name, wrong, **options)
             check_near(run, name)
-            found += [fault.name for fault in judgement.faults]
-            if not judgement.faults:
+            found += [fault.name for fault in evaluation.faults]
+            if not evaluation.faults:
                 break
-            if not write_fields(CommissionOptions(path, write=True), judgement.edits):
+            if not write_fields(CommissionOptions(path, write=True), evaluation.edits):
                 return found
-        assert not judgement.faults, f"not mended: {judgement.faults}"
+        assert not evaluation.faults, f"not mended: {evaluation.faults}"
     return found
 
 
@@ -113,7 +113,7 @@ def check_near(run, name):
         y += 0.02 * (v * math.sin(yaw) - slip * math.cos(yaw))
         yaw += 0.02 * w
         farthest = max(farthest, math.hypot(true.x_m - x, true.y_m - y))
-    assert farthest < TOLD_WITHIN_M
+    assert farthest < FARTHEST_M
 
 
 @pytest.mark.parametrize(("name", "driver", "wrong"), FAST)
@@ -123,10 +123,10 @@ def test_a_fault_is_found_named_and_mended(tmp_path, name, driver, wrong):
 
 def test_a_pose_wrong_in_every_way_is_mended_at_once(tmp_path):
     path = robot_file(tmp_path)
-    judgement, run = judged(path, "floor", Miswiring(pose=all_at_once))
+    evaluation, run = evaluated(path, "floor", Miswiring(pose=wrong_in_every_way))
     check_near(run, "floor")
-    assert write_fields(CommissionOptions(path, write=True), judgement.edits)
-    assert {fault.name for fault in judgement.faults} == {
+    assert write_fields(CommissionOptions(path, write=True), evaluation.edits)
+    assert {fault.name for fault in evaluation.faults} == {
         "pose in other units",
         "yaw in other units",
         "yaw the other way round",
@@ -141,18 +141,18 @@ def test_a_pose_wrong_in_every_way_is_mended_at_once(tmp_path):
 def test_an_encoder_that_does_not_count_is_named_and_nothing_is_written(tmp_path):
     # The reference firmware notices by itself; an ODrive's simulator does not look.
     with pytest.raises(WorkError, match="ENCODER_MISSING_RIGHT"):
-        judged(robot_file(tmp_path), "sides", Miswiring(dead_encoders=(1,)))
-    judgement, _ = judged(robot_file(tmp_path, "odrive"), "sides", Miswiring(dead_encoders=(1,)))
-    assert [fault.name for fault in judgement.faults] == ["encoder dead"]
-    assert "right" in judgement.faults[0].text
-    assert not judgement.edits
+        evaluated(robot_file(tmp_path), "sides", Miswiring(dead_encoders=(1,)))
+    evaluation, _ = evaluated(robot_file(tmp_path, "odrive"), "sides", Miswiring(dead_encoders=(1,)))
+    assert [fault.name for fault in evaluation.faults] == ["encoder dead"]
+    assert "right" in evaluation.faults[0].text
+    assert not evaluation.edits
 
 
 def test_a_watchdog_that_is_off_is_named(tmp_path, monkeypatch):
     path = robot_file(tmp_path, "odrive")
     monkeypatch.setattr(odrive.Axis, "check_watchdog", lambda *_args: None)
-    judgement, _ = judged(path, "turns", Miswiring())
-    assert [fault.name for fault in judgement.faults] == ["watchdog off"]
+    evaluation, _ = evaluated(path, "turns", Miswiring())
+    assert [fault.name for fault in evaluation.faults] == ["watchdog off"]
 
 
 def sound(number):
@@ -206,12 +206,14 @@ def test_who_holds_a_key_that_does_not_count_is_told_once(tmp_path):
         def poll(self, _now_ns, _robot):
             return None
 
-    vain = [False, True, True, False, True]
-    asked = iter(vain)
+    ineffective = [False, True, True, False, True]
+    readings = iter(ineffective)
     procedure = Procedure(STAGES[0].steps(load_setup(robot_file(tmp_path)).config.robot, 0.0))
-    pilot = CommissionPilot(procedure, Idle(), str, lambda: next(asked))
-    said = [[text for text in pilot.step(k, None).events if "release all keys" in text] for k in range(len(vain))]
-    assert list(map(len, said)) == [0, 1, 0, 0, 1]
+    pilot = CommissionPilot(procedure, Idle(), str, lambda: next(readings))
+    messages = [
+        [text for text in pilot.step(k, None).events if "release all keys" in text] for k in range(len(ineffective))
+    ]
+    assert list(map(len, messages)) == [0, 1, 0, 0, 1]
 
 
 def test_what_would_be_refused_is_not_written(tmp_path):
@@ -255,7 +257,7 @@ def test_of_several_pose_sources_the_first_alone_is_looked_at_which_is_said(tmp_
     assert (len(setup.config.pose.also), as_sent(setup).config.pose.also) == (1, ())
     monkeypatch.setattr("os.isatty", lambda _descriptor: True)
 
-    def goes_away(_question):
+    def goes_away(_prompt):
         raise EOFError
 
     with pytest.raises(EOFError):
@@ -266,5 +268,5 @@ def test_of_several_pose_sources_the_first_alone_is_looked_at_which_is_said(tmp_
 def test_without_a_yes_nothing_is_written(tmp_path):
     path = robot_file(tmp_path)
     before = path.read_text(encoding="utf-8")
-    assert not write_fields(CommissionOptions(path), {("wheels", "sides_swapped"): True}, ask=lambda _question: "")
+    assert not write_fields(CommissionOptions(path), {("wheels", "sides_swapped"): True}, ask=lambda _prompt: "")
     assert path.read_text(encoding="utf-8") == before

@@ -15,10 +15,10 @@ class Operator:
     """Answers questions one after the other, and remembers them."""
 
     def __init__(self, *answers: str) -> None:
-        self.answers, self.asked = list(answers), list[str]()
+        self.answers, self.prompts = list(answers), list[str]()
 
-    def __call__(self, question: str) -> str:
-        self.asked.append(question)
+    def __call__(self, prompt: str) -> str:
+        self.prompts.append(prompt)
         return self.answers.pop(0)
 
 
@@ -50,8 +50,8 @@ def test_a_way_round_is_written_as_the_fence_once_that_is_agreed_to(tmp_path, mo
     assert record_fence(robot, operator, "push it", "simulated", drive=drive)
     assert load_robot_config(robot).fence.keep_in == EDGE
     assert drive.drives[-1] == DriveOptions(robot, link="simulated")
-    assert "once round along the edge" in operator.asked[0]
-    assert "write this into" in operator.asked[1]
+    assert "once round along the edge" in operator.prompts[0]
+    assert "write this into" in operator.prompts[1]
     assert "push it; Ctrl-D ends the recording" in capsys.readouterr().err
 
 
@@ -69,6 +69,6 @@ def test_a_way_that_makes_no_fence_says_so_and_can_be_driven_again(tmp_path, mon
     operator = Operator("y", "y", "y")
     assert record_fence(robot, operator, "push it", drive=drive)
     assert len(drive.drives) == 2
-    assert operator.asked[1].startswith("once more?")
+    assert operator.prompts[1].startswith("once more?")
     assert "edge.mcap: the path ends 1.2 m from its start" in capsys.readouterr().err
     assert load_robot_config(robot).fence.keep_in == EDGE

@@ -70,7 +70,7 @@ def test_the_robot_learns_once_its_poses_are_said_to_be_as_good_as_is_written(tm
 
 def test_what_a_person_answers_stands_in_the_file(tmp_path):
     answers = iter(["0.1", "", "nonsense", "4096", ""])
-    out = run_init(InitOptions(tmp_path / "robot.toml", driver="reference"), lambda _question: next(answers), quiet)
+    out = run_init(InitOptions(tmp_path / "robot.toml", driver="reference"), lambda _prompt: next(answers), quiet)
     robot = load_robot_config(out).robot
     assert (robot.wheel_radius_m, robot.axial_distance_m, robot.ticks_per_rev) == (0.1, 0.31, 4096)
 
@@ -93,11 +93,11 @@ UNFIT = {
 }
 
 
-@pytest.mark.parametrize(("place", "words"), UNFIT.values(), ids=UNFIT)
+@pytest.mark.parametrize(("place", "expected_error"), UNFIT.values(), ids=UNFIT)
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_what_cannot_be_written_is_refused_in_one_line_and_nothing_is_left(tmp_path, place, words, overwrite):
+def test_what_cannot_be_written_is_refused_in_one_line_and_nothing_is_left(tmp_path, place, expected_error, overwrite):
     out = place(tmp_path)
-    with pytest.raises(InputError, match=words) as refused:
+    with pytest.raises(InputError, match=expected_error) as refused:
         run_init(InitOptions(out, driver="reference", overwrite=overwrite), None, quiet)
     assert str(refused.value).startswith(f"{out}: ")
     assert "\n" not in str(refused.value)
@@ -118,27 +118,27 @@ def test_what_no_robot_is_like_is_refused_and_nothing_is_left(tmp_path):
 
 
 @contextmanager
-def line_with(*boards, says=b""):
+def line_with(*boards, chatter=b""):
     """A serial port with these boards at its other end; its name, and all that they have heard."""
     robot, host = os.openpty()
     tty.setraw(host)
-    heard, ended = bytearray(), threading.Event()
+    received_bytes, ended = bytearray(), threading.Event()
 
     def serve():
         while not ended.is_set():
-            if says:
-                os.write(robot, says)
+            if chatter:
+                os.write(robot, chatter)
             if not select.select([robot], [], [], 0.01)[0]:
                 continue
             received = os.read(robot, 4096)
-            heard.extend(received)
+            received_bytes.extend(received)
             for board in boards:
                 os.write(robot, board.receive(0, received))
 
     served = threading.Thread(target=serve)
     served.start()
     try:
-        yield os.ttyname(host), heard
+        yield os.ttyname(host), received_bytes
     finally:
         ended.set()
         served.join()
@@ -146,8 +146,8 @@ def line_with(*boards, says=b""):
         os.close(robot)
 
 
-def from_line(tmp_path, port, ask=None, **options):
-    return run_init(InitOptions(tmp_path / "robot.toml", f"serial:{port}", listen_s=0.1, **options), ask, quiet)
+def from_line(tmp_path, port, prompt_user=None, **options):
+    return run_init(InitOptions(tmp_path / "robot.toml", f"serial:{port}", listen_s=0.1, **options), prompt_user, quiet)
 
 
 ONE, TWO = ["128/1", "128/2"], [["128/1", "128/2"], ["129/1", "129/2"]]
@@ -156,7 +156,7 @@ ONE, TWO = ["128/1", "128/2"], [["128/1", "128/2"], ["129/1", "129/2"]]
 @pytest.mark.parametrize(("addresses", "motors"), [((0x80,), ONE), ((0x80, 0x81), TWO)])
 def test_a_roboclaw_is_found_by_its_version_and_by_nothing_that_moves_or_writes(tmp_path, addresses, motors):
     boards = [Roboclaw(address) for address in addresses]
-    with line_with(*boards) as (port, heard):
+    with line_with(*boards) as (port, received_bytes):
         out = from_line(tmp_path, port, is_interactive=True)
     link = load_robot_config(out).link
     found = [list(side) if isinstance(side, tuple) else side for side in link.settings().motors]
@@ -164,25 +164,25 @@ def test_a_roboclaw_is_found_by_its_version_and_by_nothing_that_moves_or_writes(
     version = GETTERS["version"].command
     everyone = range(FIRST_ADDRESS, LAST_ADDRESS + 1)
     # All once; then again those who have not replied, and any whose reply came while this computer was held up.
-    asked = [heard[at] for at in range(0, len(heard), 2)]
-    assert asked[: len(everyone)] == list(everyone)
-    assert {address for address in everyone if address not in addresses} <= set(asked[len(everyone) :])
-    assert bytes(heard) == b"".join(bytes((address, version)) for address in asked)
+    queried = [received_bytes[at] for at in range(0, len(received_bytes), 2)]
+    assert queried[: len(everyone)] == list(everyone)
+    assert {address for address in everyone if address not in addresses} <= set(queried[len(everyone) :])
+    assert bytes(received_bytes) == b"".join(bytes((address, version)) for address in queried)
     assert not any(board.obeyed for board in boards)
 
 
 def test_a_silent_line_is_asked_only_with_somebodys_leave(tmp_path):
-    with line_with(Roboclaw()) as (port, heard):
-        for answers in (None, lambda _question: "n"):
+    with line_with(Roboclaw()) as (port, received_bytes):
+        for answers in (None, lambda _prompt: "n"):
             with pytest.raises(InputError, match=r"no controller was recognised; .* or give --ask"):
                 from_line(tmp_path, port, answers)
-        assert not heard
-        assert load_robot_config(from_line(tmp_path, port, lambda _question: "y" if "[y/n]" in _question else "")).link
-        assert heard
+        assert not received_bytes
+        assert load_robot_config(from_line(tmp_path, port, lambda _prompt: "y" if "[y/n]" in _prompt else "")).link
+        assert received_bytes
 
 
 def test_who_names_the_controller_has_given_leave(tmp_path):
-    with line_with(Roboclaw(0x83)) as (port, _heard):
+    with line_with(Roboclaw(0x83)) as (port, _received):
         assert load_robot_config(from_line(tmp_path, port, driver="roboclaw")).link.settings().motors == (
             "131/1",
             "131/2",
@@ -190,10 +190,10 @@ def test_who_names_the_controller_has_given_leave(tmp_path):
 
 
 def test_a_line_on_which_something_speaks_is_not_asked(tmp_path):
-    with line_with(Roboclaw(), says=b"$GPGGA,1*00\r\n") as (port, heard):
+    with line_with(Roboclaw(), chatter=b"$GPGGA,1*00\r\n") as (port, received_bytes):
         with pytest.raises(InputError, match="no controller was recognised"):
             from_line(tmp_path, port, is_interactive=True)
-        assert not heard
+        assert not received_bytes
 
 
 @pytest.mark.hil

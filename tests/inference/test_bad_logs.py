@@ -43,13 +43,13 @@ def everywhere(**values):
     return lambda rows: [row | values for row in rows]
 
 
-def held(prefixes, value):
+def constant_columns(prefixes, value):
     """Every sample of these columns has the same value."""
     return lambda rows: [row | {name: value for name in row if name.startswith(prefixes) and row[name]} for row in rows]
 
 
-at_rest = held(("pose", "enc", "cmd"), "0")
-lifted = held(("pose",), "0.1")
+at_rest = constant_columns(("pose", "enc", "cmd"), "0")
+lifted = constant_columns(("pose",), "0.1")
 
 
 POSE = ("pose_x_m", "pose_y_m", "pose_yaw_rad")

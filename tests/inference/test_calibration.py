@@ -65,8 +65,8 @@ def test_a_widened_posterior_keeps_its_mean_and_only_grows_along_what_is_widened
     np.testing.assert_allclose(same, mean, atol=1e-12)
     was, found = factor @ covariance[0] @ factor.T, factor @ wider[0] @ factor.T
     np.testing.assert_allclose(found, was * np.outer(by, by), atol=1e-9 * found.max())
-    drawn = after.draw(50_000, np.random.default_rng(1))[0]
-    np.testing.assert_allclose(np.cov(drawn.T), wider[0], atol=0.03 * wider[0].max())
+    samples = after.draw(50_000, np.random.default_rng(1))[0]
+    np.testing.assert_allclose(np.cov(samples.T), wider[0], atol=0.03 * wider[0].max())
     # What maps to a standard normal vector stays lower triangular, as the density takes its diagonal.
     assert (np.diagonal(after.factor, axis1=2, axis2=3) > 0.0).all()
     np.testing.assert_array_equal(np.triu(after.factor, 1), 0.0)

@@ -10,8 +10,8 @@ from tests.tables import thinned
 
 
 def scores(hidden=(), drive="rich"):
-    laid = excitation(logged(drive, 5, hidden))
-    values = Scores(laid, estimates(laid, noise_of(laid)))(laid.pose)
+    excited_drive = excitation(logged(drive, 5, hidden))
+    values = Scores(excited_drive, estimates(excited_drive, noise_of(excited_drive)))(excited_drive.pose)
     return dict(zip((check.name for check in CHECKS), values, strict=True))
 
 

@@ -51,9 +51,9 @@ def test_wheels_that_count_double_are_warned_of_in_the_first_line(run):
     first, *_ = result.as_text().splitlines()
     assert first.startswith("warning: simulated: the wheels count 2.00 times the expected ticks")
     assert "check ticks_per_rev and gear" in first
-    told = json.loads(json.dumps(result.as_dict()))
-    assert [each["cause"] for each in told["contradictions"]] == ["encoder_count"]
-    assert told["posterior"]["wheel_radius_m"]["mean"] == pytest.approx(0.5 * RADIUS_M, rel=0.1)
+    report = json.loads(json.dumps(result.as_dict()))
+    assert [each["cause"] for each in report["contradictions"]] == ["encoder_count"]
+    assert report["posterior"]["wheel_radius_m"]["mean"] == pytest.approx(0.5 * RADIUS_M, rel=0.1)
 
 
 @thinned("error", [EmptyRegionError("empty"), np.linalg.LinAlgError("singular")], quick=1)
@@ -69,6 +69,6 @@ def test_a_region_without_parameters_is_one_line(monkeypatch, error):
 
 def test_a_region_that_is_all_but_empty_says_so():
     apart = Region.box(np.zeros(1), np.ones(1))
-    nowhere = Region(apart.low, apart.high, np.array([9.0]), np.eye(1), apart)
+    empty_region = Region(apart.low, apart.high, np.array([9.0]), np.eye(1), apart)
     with pytest.raises(EmptyRegionError):
-        nowhere.draw(10, np.random.default_rng(1))
+        empty_region.draw(10, np.random.default_rng(1))

@@ -50,5 +50,5 @@ def test_statistics_stay_finite_where_nothing_moves():
     statistics = estimates(drive, USUAL)(simulator.poses(corners, draw_seeds(4, np.random.default_rng(0))))
     assert statistics.shape == (4, len(STATISTICS))
     assert np.isfinite(statistics).all()
-    still = np.zeros((1, drive.t_s.size, 3))
-    assert np.isfinite(estimates(drive, USUAL)(still)).all()
+    stationary = np.zeros((1, drive.t_s.size, 3))
+    assert np.isfinite(estimates(drive, USUAL)(stationary)).all()

@@ -107,6 +107,6 @@ def test_values_that_are_not_finite_are_refused():
 
 def test_logs_without_a_common_stretch_are_refused():
     log = straight()
-    late = replace(log.poses, t_s=log.poses.t_s + 100.0)
+    shifted = replace(log.poses, t_s=log.poses.t_s + 100.0)
     with pytest.raises(UnusableDriveError, match="record them together"):
-        excitation(replace(log, poses=late))
+        excitation(replace(log, poses=shifted))

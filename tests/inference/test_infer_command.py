@@ -47,7 +47,7 @@ def robot(tmp_path_factory):
 def inferred(robot):
     folder = robot.parent
     log = write_log(folder / "circle.csv")
-    said = []
+    progress = []
     result = infer_command(
         [log],
         robot,
@@ -55,9 +55,9 @@ def inferred(robot):
         folder / "report.html",
         InferOptions(simulations=600, seed=3),
         search=finds(),
-        report_progress=lambda stage, share: said.append((stage, share)),
+        report_progress=lambda stage, share: progress.append((stage, share)),
     )
-    return folder, result, said
+    return folder, result, progress
 
 
 @pytest.fixture(scope="module")
@@ -105,8 +105,8 @@ def test_what_contradicts_itself_stands_first_in_text_and_json(inferred):
     warned = replace(result, contradictions=(wrong,))
     assert warned.as_text().splitlines()[0] == f"warning: {wrong.message}"
     assert warned.all_warnings() == [f"warning: {wrong.message}", *result.warnings()]
-    first, told = next(iter(warned.as_dict().items()))
-    assert (first, told) == ("contradictions", [{"cause": wrong.cause, "message": wrong.message}])
+    first, value = next(iter(warned.as_dict().items()))
+    assert (first, value) == ("contradictions", [{"cause": wrong.cause, "message": wrong.message}])
     assert result.as_dict()["contradictions"] == []
 
 
@@ -131,17 +131,17 @@ def test_the_report_is_whole_in_one_file(inferred):
 
 def test_the_report_has_every_figure_of_the_diagnostics(inferred):
     folder, result, _ = inferred
-    page, told = (folder / "report.html").read_text(), result.as_dict()
-    numbers = told["diagnostics"]
+    page, report = (folder / "report.html").read_text(), result.as_dict()
+    numbers = report["diagnostics"]
     assert f"rests on {numbers['effective_simulations']:.0f}; seed 3" in page
     assert f"{numbers['simulations']} simulations" in page
     for name, p in numbers["sbc_p"].items():
         assert f"{name} p = {p:.2g}" in page
     for level, share in numbers["coverage"].items():
         assert f"<td class=n>{float(level):.0%}</td><td class=n>{share:.0%}</td>" in page
-    for one in told["posterior"].values():
+    for one in report["posterior"].values():
         assert f"{one['mean']:.5f}</td><td class=n>{one['sd']:.5f}" in page
-    assert all(f"<p>{html.escape(sentence)}</p>" in page for sentence in told["undetermined"])
+    assert all(f"<p>{html.escape(sentence)}</p>" in page for sentence in report["undetermined"])
     assert "steady circle cannot tell the wheel radius" in page
 
 
@@ -167,13 +167,13 @@ def test_a_log_of_ours_gives_what_its_table_gives(robot, tmp_path, inferred):
 
 
 def test_the_text_names_every_parameter_and_progress_is_told(inferred):
-    _, result, said = inferred
+    _, result, progress = inferred
     text = result.as_text()
     assert all(name in text for name in TRUTH)
     assert "written in" in text
     assert "next: disco-hw gap" not in text
-    assert said[0] == ("round 1 of 5: 64 simulations", 0.0)
-    shares = [share for _, share in said]
+    assert progress[0] == ("round 1 of 5: 64 simulations", 0.0)
+    shares = [share for _, share in progress]
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
 

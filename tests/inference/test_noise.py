@@ -119,10 +119,10 @@ def test_one_minute_of_a_circle_tells_the_slip_without_bias():
 
 
 def test_the_poses_of_another_drive_are_not_taken_for_slip():
-    own, other = excitation(logged("rich")), excitation(logged("rich", seed=2))
-    poses = min(own.pose.shape[0], other.pose.shape[0])
-    assert poses > 0.9 * own.pose.shape[0]
-    swapped = own.pose.copy()
+    original, other = excitation(logged("rich")), excitation(logged("rich", seed=2))
+    poses = min(original.pose.shape[0], other.pose.shape[0])
+    assert poses > 0.9 * original.pose.shape[0]
+    swapped = original.pose.copy()
     swapped[:poses] = other.pose[:poses]
-    assert unexplained_share(own, THETA) < 0.15
-    assert unexplained_share(with_poses(own, swapped), THETA) > 0.8
+    assert unexplained_share(original, THETA) < 0.15
+    assert unexplained_share(with_poses(original, swapped), THETA) > 0.8

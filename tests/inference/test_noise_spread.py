@@ -32,10 +32,10 @@ def test_it_is_the_scatter_of_what_is_measured_on_other_drives_like_it(circle):
         for pose, fit in zip(poses, fits, strict=True)
     ]
     known = noise_spread(circle, THETA, 1, repeats=60)
-    told = np.sqrt(np.diag(known.factor @ known.factor.T))
-    assert told[:5] == pytest.approx(np.std(logs, axis=0), rel=0.4)
+    predicted_std = np.sqrt(np.diag(known.factor @ known.factor.T))
+    assert predicted_std[:5] == pytest.approx(np.std(logs, axis=0), rel=0.4)
     # The slip of one minute is told several times worse than the sensor's noise.
-    assert told[2:5].min() > 2.0 * told[:2].max()
+    assert predicted_std[2:5].min() > 2.0 * predicted_std[:2].max()
     assert np.log(known.noise.vector() / TRUE.vector()) == pytest.approx(-np.mean(logs, axis=0), abs=0.06)
 
 

@@ -38,18 +38,18 @@ def double(values):
         values[i] *= 2.0
 
 
-def twice(values):
+def calls_double_twice(values):
     double(values)
     double(values)
 
 
-def once(values):
+def calls_double(values):
     double(values)
 
 
 def test_no_other_copy_of_what_a_kernel_calls_is_ever_linked(tmp_path, monkeypatch):
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
-    kernel = kernel_function(twice)
+    kernel = kernel_function(calls_double_twice)
     values = np.ones(3)
     kernel(values)
     np.testing.assert_array_equal(values, 4.0)
@@ -63,8 +63,8 @@ def test_no_other_copy_of_what_a_kernel_calls_is_ever_linked(tmp_path, monkeypat
 def test_what_a_kernel_calls_can_be_called_from_elsewhere_too(tmp_path, monkeypatch):
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
     values = np.ones(3)
-    kernel_function(twice)(values)
-    njit(once)(values)
+    kernel_function(calls_double_twice)(values)
+    njit(calls_double)(values)
     double(values)
     np.testing.assert_array_equal(values, 16.0)
 
@@ -72,7 +72,7 @@ def test_what_a_kernel_calls_can_be_called_from_elsewhere_too(tmp_path, monkeypa
 def test_what_a_kernel_calls_is_lowered_and_no_more(tmp_path, monkeypatch):
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
     collecting, jit_of_overloads = gc.isenabled(), jit_registry[CPU]
-    kernel_function(twice)(np.ones(3))
+    kernel_function(calls_double_twice)(np.ones(3))
     (called,) = double.overloads.values()
     code = str(called.library._get_module_for_linking())
     assert called.fndesc.llvm_func_name in code

@@ -55,16 +55,16 @@ def test_numba_has_all_that_kernels_are_compiled_with():
 
 
 @pytest.mark.parametrize(
-    ("version", "members", "parameters", "said"),
+    ("version", "members", "parameters", "expected_message"),
     [
         ("0.99.0", {}, {}, "numba 0.99.0 is newer than any that was tried. disco_hw/jit/numba_internals.py"),
         ("0.61.0", {BaseContext: ("gone",)}, {}, "numba 0.61.0: BaseContext has no gone. disco_hw/jit"),
         ("0.61.0", {}, {changed: ["version"]}, "changed takes ['version', 'members', 'parameters'], not ['version']"),
     ],
 )
-def test_what_a_new_numba_changes_is_named_with_what_to_do(version, members, parameters, said):
+def test_what_a_new_numba_changes_is_named_with_what_to_do(version, members, parameters, expected_message):
     (found,) = changed(version, members, parameters)
-    assert said in found
+    assert expected_message in found
     assert "pyproject.toml" in found
 
 

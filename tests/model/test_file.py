@@ -138,9 +138,9 @@ def test_unreadable_files_are_reported(tmp_path):
 
 
 def test_the_mark_of_missing_effects_is_kept(tmp_path):
-    whole = read(tmp_path, GOOD)
-    assert whole.missing_effects == ()
-    save_model(replace(whole, missing_effects=("turn_slip", "slope")), tmp_path / "marked.toml")
+    complete = read(tmp_path, GOOD)
+    assert complete.missing_effects == ()
+    save_model(replace(complete, missing_effects=("turn_slip", "slope")), tmp_path / "marked.toml")
     assert load_model(tmp_path / "marked.toml").missing_effects == ("turn_slip", "slope")
 
 

@@ -101,13 +101,13 @@ def test_longer_steps_lead_to_the_same_place():
 
 def test_a_run_goes_on_from_what_another_remembered():
     model, means = a_few(), np.zeros(5)
-    whole = run(model, DRIVE)
+    single_run = run(model, DRIVE)
     first = run(model, DRIVE[:13], means=means)
-    forgotten = run(model, DRIVE[13:], start=first[-1])
+    without_memory = run(model, DRIVE[13:], start=first[-1])
     second = run(model, DRIVE[13:], means=means, start=first[-1])
-    np.testing.assert_allclose(np.vstack([first, second[1:]]), whole, atol=1e-12)
-    assert np.abs(forgotten[1:] - whole[14:]).max() > 0.05
-    np.testing.assert_array_equal(simulate(model, DRIVE, STEP_S), whole)
+    np.testing.assert_allclose(np.vstack([first, second[1:]]), single_run, atol=1e-12)
+    assert np.abs(without_memory[1:] - single_run[14:]).max() > 0.05
+    np.testing.assert_array_equal(simulate(model, DRIVE, STEP_S), single_run)
 
 
 def test_a_robot_that_has_done_the_same_for_ever_goes_on_so():

@@ -7,11 +7,11 @@ import pytest
 from disco_hw.errors import LogError
 from disco_hw.processes import spawn_at_normal_priority
 
-TELL = "import os; print(os.sched_getscheduler(0), os.getpriority(os.PRIO_PROCESS, 0))"
+PRINT_SCHEDULING = "import os; print(os.sched_getscheduler(0), os.getpriority(os.PRIO_PROCESS, 0))"
 
 
-def told_by_child():
-    process = spawn_at_normal_priority([sys.executable, "-c", TELL])
+def child_scheduling():
+    process = spawn_at_normal_priority([sys.executable, "-c", PRINT_SCHEDULING])
     process.wait(20)
     policy, nice = process.stdout.read().split()
     process.stdout.close()
@@ -32,15 +32,15 @@ def test_the_child_of_a_real_time_thread_runs_at_normal_priority():
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
         except PermissionError:
             return None
-        told = told_by_child()
-        return told, os.sched_getscheduler(0)
+        child = child_scheduling()
+        return child, os.sched_getscheduler(0)
 
     found = in_thread(work)
     if found is None:
         pytest.skip("no right to use SCHED_FIFO here")
-    (policy, _), own = found
+    (policy, _), thread_policy = found
     assert policy == os.SCHED_OTHER
-    assert own == os.SCHED_FIFO
+    assert thread_policy == os.SCHED_FIFO
 
 
 def test_the_child_of_a_favoured_thread_is_not_favoured():
@@ -49,7 +49,7 @@ def test_the_child_of_a_favoured_thread_is_not_favoured():
             os.setpriority(os.PRIO_PROCESS, 0, -5)
         except PermissionError:
             return None
-        return told_by_child()
+        return child_scheduling()
 
     found = in_thread(work)
     if found is None:

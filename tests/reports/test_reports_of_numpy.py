@@ -85,11 +85,11 @@ def inferred(scalar):
 
 def experiments(scalar):
     """What the verbs of the paper's experiments print."""
-    once = np.ones((2, 4))
+    ones = np.ones((2, 4))
     runs = {"posterior": [Run(np.ones((9, 3)), np.ones(9), np.ones((9, 2)))] * 2}
     disc = SimpleNamespace(center_x_m=scalar(1), center_y_m=scalar(1), radius_m=scalar(1), speed_m_s=scalar(1))
     circle = CircleResult(replace(CircleOptions(), lag_s=scalar(1)), disc, "default", runs)
-    pendulum = PendulumResult(made(PendulumOptions, scalar), {"true parameters": once})
+    pendulum = PendulumResult(made(PendulumOptions, scalar), {"true parameters": ones})
     t_s = np.arange(0.0, 120.0, 0.1)
     belief = (scalar(1), np.ones(3), np.ones(3))
     plain = AdaptRun(t_s, np.ones(t_s.size), np.ones((t_s.size, 2)), (belief,), scalar(1))

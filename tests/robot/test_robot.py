@@ -17,7 +17,7 @@ from tests.firmware_protocol.other_end import LinkEnd
 
 class TestRobot(FirmwareConformance):
     @classmethod
-    def make_end(cls, config):
+    def create_end(cls, config):
         try:
             setup = load_setup(Path(config.getoption("--robot")))
             if setup.config.link.driver not in (None, DEFAULT):

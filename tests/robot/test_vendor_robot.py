@@ -15,9 +15,9 @@ from disco_hw.runtime.robot_setup import load_setup
 from drivers.motor import DEFAULT, find_driver
 from drivers.types import DriverState, LinkState, Request, WheelCommand
 
-STILL = (DriverState.STANDBY, DriverState.READY)
+IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 PATIENT_S = 10.0
-STANDS_RAD_S = 0.15
+STANDSTILL_RAD_S = 0.15
 
 
 class Robot:
@@ -76,15 +76,15 @@ class Robot:
         self.driver.request(Request.STANDBY)
         self.wait(lambda: self.driver.state not in (DriverState.DISCONNECTED, DriverState.HANDSHAKE), "found")
         if self.driver.state in (DriverState.FAULT, DriverState.ESTOP):
-            self.wait(self.stands, "standing")
+            self.wait(self.is_stationary, "standing")
             self.driver.request(Request.RESET)
-        self.wait(lambda: self.driver.state in STILL and self.stands(), "standing by")
+        self.wait(lambda: self.driver.state in IDLE_STATES and self.is_stationary(), "standing by")
         self.samples, self.fastest = self.samples[-1:], 0.0
 
-    def stands(self):
+    def is_stationary(self):
         """Whether the newest sample says so."""
         last = self.samples[-1:]
-        return bool(last) and max(abs(last[0].left_speed_rad_s), abs(last[0].right_speed_rad_s)) < STANDS_RAD_S
+        return bool(last) and max(abs(last[0].left_speed_rad_s), abs(last[0].right_speed_rad_s)) < STANDSTILL_RAD_S
 
     def arm(self):
         """Arm, with zeros."""
@@ -134,15 +134,15 @@ def test_it_is_found_and_says_what_it_is(robot):
 
 def test_nothing_turns_before_it_is_armed(robot):
     robot.run(1.0, robot.speed_rad_s, robot.speed_rad_s)
-    assert robot.driver.state in STILL
-    assert robot.fastest < STANDS_RAD_S
+    assert robot.driver.state in IDLE_STATES
+    assert robot.fastest < STANDSTILL_RAD_S
 
 
 def test_a_new_link_finds_it_again_and_arms_nothing(robot):
     robot.connect()
-    robot.wait(lambda: robot.driver.state in STILL, "found again")
+    robot.wait(lambda: robot.driver.state in IDLE_STATES, "found again")
     robot.run(0.5, robot.speed_rad_s, robot.speed_rad_s)
-    assert robot.fastest < STANDS_RAD_S
+    assert robot.fastest < STANDSTILL_RAD_S
 
 
 @pytest.mark.motion
@@ -150,7 +150,7 @@ def test_armed_with_zeros_it_stands(robot):
     robot.arm()
     robot.run(1.0)
     assert robot.driver.state is DriverState.ARMED, robot.driver.detail
-    assert robot.fastest < STANDS_RAD_S
+    assert robot.fastest < STANDSTILL_RAD_S
 
 
 @pytest.mark.motion
@@ -160,19 +160,19 @@ def test_the_wheels_follow_and_count_the_way_they_turn(robot, left, right):
     robot.run(2.0, left * robot.speed_rad_s, right * robot.speed_rad_s)
     assert robot.driver.state is DriverState.ARMED, robot.driver.detail
     last = robot.samples[-1]
-    asked = (left * robot.speed_rad_s, right * robot.speed_rad_s)
-    assert (last.left_speed_rad_s, last.right_speed_rad_s) == pytest.approx(asked, rel=0.3)
-    assert robot.turned() == pytest.approx([2.0 * each for each in asked], rel=0.5)
+    commanded = (left * robot.speed_rad_s, right * robot.speed_rad_s)
+    assert (last.left_speed_rad_s, last.right_speed_rad_s) == pytest.approx(commanded, rel=0.3)
+    assert robot.turned() == pytest.approx([2.0 * each for each in commanded], rel=0.5)
 
 
 @pytest.mark.motion
 def test_disarmed_it_comes_to_stand_and_stays(robot):
     robot.drive()
     robot.driver.request(Request.STANDBY)
-    robot.wait(lambda: robot.driver.state in STILL and robot.stands(), "standing")
+    robot.wait(lambda: robot.driver.state in IDLE_STATES and robot.is_stationary(), "standing")
     robot.fastest = 0.0
     robot.run(1.0, robot.speed_rad_s, robot.speed_rad_s)
-    assert robot.fastest < STANDS_RAD_S
+    assert robot.fastest < STANDSTILL_RAD_S
 
 
 @pytest.mark.motion
@@ -181,10 +181,10 @@ def test_a_silent_host_is_stopped_by_the_controller_and_nothing_arms_again(robot
     time.sleep(robot.driver.limits.command_timeout_s.value + 2.0)
     robot.run(0.2, robot.speed_rad_s, robot.speed_rad_s)
     assert robot.driver.state is not DriverState.ARMED
-    robot.wait(robot.stands, "standing")
+    robot.wait(robot.is_stationary, "standing")
     robot.fastest = 0.0
     robot.run(1.0, robot.speed_rad_s, robot.speed_rad_s)
-    assert robot.fastest < STANDS_RAD_S
+    assert robot.fastest < STANDSTILL_RAD_S
 
 
 @pytest.mark.motion
@@ -193,22 +193,22 @@ def test_an_emergency_stop_holds_until_it_is_reset(robot):
     now_ns = time.monotonic_ns()
     for outgoing in robot.driver.estop(now_ns):
         robot.transport.send(outgoing, now_ns)
-    robot.wait(lambda: robot.driver.state is DriverState.ESTOP and robot.stands(), "in e-stop, standing")
+    robot.wait(lambda: robot.driver.state is DriverState.ESTOP and robot.is_stationary(), "in e-stop, standing")
     robot.driver.request(Request.ARM)
     robot.fastest = 0.0
     robot.run(1.0, robot.speed_rad_s, robot.speed_rad_s)
     assert robot.driver.state is DriverState.ESTOP
-    assert robot.fastest < STANDS_RAD_S
+    assert robot.fastest < STANDSTILL_RAD_S
     robot.driver.request(Request.RESET)
-    robot.wait(lambda: robot.driver.state in STILL, "reset")
+    robot.wait(lambda: robot.driver.state in IDLE_STATES, "reset")
 
 
 @pytest.mark.motion
 def test_a_link_that_is_renewed_while_it_drives_stops_it_and_never_arms(robot):
     robot.drive()
     robot.connect()
-    robot.wait(lambda: robot.driver.state in (*STILL, DriverState.FAULT) and robot.stands(), "standing")
+    robot.wait(lambda: robot.driver.state in (*IDLE_STATES, DriverState.FAULT) and robot.is_stationary(), "standing")
     robot.fastest = 0.0
     robot.run(1.0, robot.speed_rad_s, robot.speed_rad_s)
     assert robot.driver.state is not DriverState.ARMED
-    assert robot.fastest < STANDS_RAD_S
+    assert robot.fastest < STANDSTILL_RAD_S

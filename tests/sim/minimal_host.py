@@ -8,7 +8,7 @@ from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decod
 
 
 class MinimalHost:
-    """Goes for `wanted` ("STANDBY", "READY", "ARM") and then commands `speeds`; `latest` holds what the robot sent.
+    """Goes for `request` ("STANDBY", "READY", "ARM") and then commands `speeds`; `latest` holds what the robot sent.
 
     `patience`: how many times as long its commands hold, and are apart, as those of a daemon.
     """
@@ -17,7 +17,7 @@ class MinimalHost:
         self.codec = Codec()
         self.session = session
         self._patience = patience
-        self.wanted = "STANDBY"
+        self.request = "STANDBY"
         self.speeds = (0.0, 0.0)
         self.mode = "SPEED"
         self.silent = False
@@ -56,13 +56,13 @@ class MinimalHost:
             frames.append(self._encode("TIME_REQUEST", sequence=now_ms // 1000 % 256))
         if now_ms % (50 * self._patience) == 3:
             challenge = int(self.latest.get("SESSION_STATE", {}).get("challenge", 0))
-            answer = binascii.crc_hqx(struct.pack("<HBI", challenge, self.session, self.codec.dbc_hash), 0xFFFF)
+            response = binascii.crc_hqx(struct.pack("<HBI", challenge, self.session, self.codec.dbc_hash), 0xFFFF)
             frames.append(
                 self._encode(
-                    "HOST_STATE", request=self.wanted, session=self.session, challenge_answer=answer, host_fault=0
+                    "HOST_STATE", request=self.request, session=self.session, challenge_answer=response, host_fault=0
                 )
             )
-        if now_ms % (20 * self._patience) == 5 and self.wanted == "ARM":
+        if now_ms % (20 * self._patience) == 5 and self.request == "ARM":
             left, right = self.speeds if self.robot_state == "ARMED" else (0.0, 0.0)
             frames.append(
                 self._encode(

@@ -69,8 +69,8 @@ class Robot:
         return max(abs(state["left_speed_rad_s"]), abs(state["right_speed_rad_s"]))
 
     def truth(self):
-        whole_lines = (self.directory / "truth.csv").read_text().rpartition("\n")[0]
-        rows = csv.DictReader(io.StringIO(whole_lines))
+        complete_lines = (self.directory / "truth.csv").read_text().rpartition("\n")[0]
+        rows = csv.DictReader(io.StringIO(complete_lines))
         return [{name: value if name == "state" else float(value) for name, value in row.items()} for row in rows]
 
     def stop(self, number=signal.SIGTERM):
@@ -147,9 +147,9 @@ def drive(port, host, seconds, until=lambda: False):
 
 
 def arm(port, host):
-    host.wanted = "READY"
+    host.request = "READY"
     assert drive(port, host, 30, lambda: host.robot_state == "READY"), host.latest
-    host.wanted = "ARM"
+    host.request = "ARM"
     assert drive(port, host, 30, lambda: host.robot_state == "ARMED"), host.latest
 
 
@@ -199,9 +199,9 @@ def vanish_and_see_it_stop(robot, port):
     """The host goes without a word: its descriptors are closed, as when it is killed."""
     port.close()
     # Judged by the robot's own record, whenever this test gets to look at it.
-    stands_by_ns = time.monotonic_ns() + round(1e9 * (COMMAND_TIMEOUT_S + 3.0 / 20.0 + 0.5))
-    wait_until(lambda: robot.truth()[-1]["t_ns"] > stands_by_ns + 200_000_000, 30.0)
-    after = [row for row in robot.truth() if row["t_ns"] > stands_by_ns]
+    stop_deadline_ns = time.monotonic_ns() + round(1e9 * (COMMAND_TIMEOUT_S + 3.0 / 20.0 + 0.5))
+    wait_until(lambda: robot.truth()[-1]["t_ns"] > stop_deadline_ns + 200_000_000, 30.0)
+    after = [row for row in robot.truth() if row["t_ns"] > stop_deadline_ns]
     assert max(abs(row[side]) for row in after for side in ("left_speed_rad_s", "right_speed_rad_s")) < 0.05
     assert "ARMED" not in {row["state"] for row in after}
     assert robot.wheel_speed() < 0.05

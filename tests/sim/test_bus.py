@@ -10,19 +10,19 @@ LONG_NS = 10**10
 FRAME = CanFrame(0x110, bytes.fromhex("8d306902b4fb2c01"))
 
 
-def fates(*given_fates):
-    """A fault that deals out one fate after the other, then leaves frames alone."""
+def scripted_outcomes(*outcomes):
+    """A fault that deals out one outcome after the other, then leaves frames alone."""
 
-    class Fates:
+    class ScriptedOutcomes:
         def __init__(self):
-            self.left = list(given_fates)
-            self.asked = []
+            self.left = list(outcomes)
+            self.calls = []
 
         def outcome(self, now_ns, sender, frame):
-            self.asked.append((now_ns, sender, frame))
+            self.calls.append((now_ns, sender, frame))
             return self.left.pop(0) if self.left else FrameOutcome()
 
-    return Fates()
+    return ScriptedOutcomes()
 
 
 def data_of(deliveries):
@@ -129,7 +129,7 @@ def test_a_full_queue_refuses():
 
 
 def test_a_destroyed_frame_is_sent_again_after_an_error_frame():
-    bus = CanBus(fault=fates(FrameOutcome(wire_error_bit=30)))
+    bus = CanBus(fault=scripted_outcomes(FrameOutcome(wire_error_bit=30)))
     a, b = bus.attach("a"), bus.attach("b")
     bus.send(a, FRAME)
     (delivery,) = bus.advance(LONG_NS)
@@ -139,7 +139,7 @@ def test_a_destroyed_frame_is_sent_again_after_an_error_frame():
 
 
 def test_a_frame_destroyed_for_ever_ends_in_bus_off_and_the_bus_is_free_again():
-    bus = CanBus(fault=fates(*[FrameOutcome(wire_error_bit=20)] * 32))
+    bus = CanBus(fault=scripted_outcomes(*[FrameOutcome(wire_error_bit=20)] * 32))
     a, b = bus.attach("a"), bus.attach("b")
     bus.send(a, FRAME)
     bus.send(a, FRAME)
@@ -155,7 +155,7 @@ def test_a_frame_destroyed_for_ever_ends_in_bus_off_and_the_bus_is_free_again():
 
 
 def test_an_error_passive_sender_waits_eight_bits_before_it_sends_again():
-    bus = CanBus(fault=fates(*[FrameOutcome(wire_error_bit=20)] * 16))
+    bus = CanBus(fault=scripted_outcomes(*[FrameOutcome(wire_error_bit=20)] * 16))
     a, b = bus.attach("a"), bus.attach("b")
     bus.send(a, CanFrame(0x100))
     bus.advance(16 * (20 + 1 + 6 + 6 + 8 + 3) * BIT_NS)
@@ -259,7 +259,7 @@ def test_recovery_needs_bus_off():
 
 
 def test_lost_frame_is_acknowledged_and_reaches_nobody():
-    bus = CanBus(fault=fates(FrameOutcome(lost=True)))
+    bus = CanBus(fault=scripted_outcomes(FrameOutcome(lost=True)))
     a, b = bus.attach("a"), bus.attach("b")
     bus.send(a, FRAME)
     assert bus.advance(LONG_NS) == []
@@ -267,7 +267,7 @@ def test_lost_frame_is_acknowledged_and_reaches_nobody():
 
 
 def test_one_way_loss():
-    bus = CanBus(fault=fates(FrameOutcome(lost_at=("b",)), FrameOutcome(lost_at=("b",))))
+    bus = CanBus(fault=scripted_outcomes(FrameOutcome(lost_at=("b",)), FrameOutcome(lost_at=("b",))))
     a, b, c = (bus.attach(name) for name in "abc")
     bus.send(a, FRAME)
     bus.send(b, CanFrame(0x700))
@@ -275,7 +275,7 @@ def test_one_way_loss():
 
 
 def test_duplicate():
-    bus = CanBus(fault=fates(FrameOutcome(copies=2)))
+    bus = CanBus(fault=scripted_outcomes(FrameOutcome(copies=2)))
     a, b = bus.attach("a"), bus.attach("b")
     bus.send(a, FRAME)
     assert [d.frame for d in bus.advance(LONG_NS)] == [FRAME, FRAME]
@@ -283,18 +283,18 @@ def test_duplicate():
 
 
 def test_delay_reorders():
-    bus = CanBus(fault=fates(FrameOutcome(delay_ns=1_000_000)))
+    bus = CanBus(fault=scripted_outcomes(FrameOutcome(delay_ns=1_000_000)))
     a, _ = bus.attach("a", order=TransmitOrder.FIFO), bus.attach("b")
     bus.send(a, CanFrame(1))
     bus.send(a, CanFrame(2))
-    late_ns = (frame_bits(CanFrame(1)) - 3) * BIT_NS + 1_000_000
-    assert [d.frame.can_id for d in bus.advance(late_ns - 1)] == [2]
-    assert bus.next_event_ns() == late_ns
-    assert [(d.t_ns, d.frame.can_id) for d in bus.advance(late_ns)] == [(late_ns, 1)]
+    arrival_ns = (frame_bits(CanFrame(1)) - 3) * BIT_NS + 1_000_000
+    assert [d.frame.can_id for d in bus.advance(arrival_ns - 1)] == [2]
+    assert bus.next_event_ns() == arrival_ns
+    assert [(d.t_ns, d.frame.can_id) for d in bus.advance(arrival_ns)] == [(arrival_ns, 1)]
 
 
 def test_deliveries_are_in_order_of_time_even_over_a_long_stride():
-    bus = CanBus(fault=fates(FrameOutcome(delay_ns=1_000_000)))
+    bus = CanBus(fault=scripted_outcomes(FrameOutcome(delay_ns=1_000_000)))
     a, _ = bus.attach("a"), bus.attach("b")
     bus.send(a, CanFrame(1))
     bus.advance(0)
@@ -307,7 +307,7 @@ def test_deliveries_are_in_order_of_time_even_over_a_long_stride():
 
 @pytest.mark.parametrize("data", [b"", b"\x01", bytes(7), bytes.fromhex("8d306902b4fb2c02")])
 def test_payload_corrupted_behind_the_crc(data):
-    bus = CanBus(fault=fates(FrameOutcome(data=data)))
+    bus = CanBus(fault=scripted_outcomes(FrameOutcome(data=data)))
     a, _ = bus.attach("a"), bus.attach("b")
     bus.send(a, FRAME)
     (delivery,) = bus.advance(LONG_NS)
@@ -316,13 +316,13 @@ def test_payload_corrupted_behind_the_crc(data):
 
 
 def test_faults_are_asked_with_time_sender_and_frame():
-    fault = fates()
+    fault = scripted_outcomes()
     bus = CanBus(fault=fault)
     a, _ = bus.attach("a"), bus.attach("b")
     bus.advance(700)
     bus.send(a, FRAME)
     bus.advance(LONG_NS)
-    assert fault.asked == [(700, "a", FRAME)]
+    assert fault.calls == [(700, "a", FRAME)]
 
 
 def test_equal_frames_at_the_same_time_merge():
@@ -366,7 +366,7 @@ def test_a_babbling_node_starves_higher_identifiers_only():
 
 def test_log_is_candump():
     lines = []
-    bus = CanBus(fault=fates(FrameOutcome(wire_error_bit=0)), log=lines.append)
+    bus = CanBus(fault=scripted_outcomes(FrameOutcome(wire_error_bit=0)), log=lines.append)
     a, _ = bus.attach("a"), bus.attach("b")
     bus.send(a, FRAME)
     bus.advance(LONG_NS)

@@ -43,9 +43,11 @@ def test_bytes_are_those_of_socketcan(frame):
     assert unpack_frame(packed) == frame
 
 
-@pytest.mark.parametrize("make", [bus_off_frame, receive_overflow_frame, lambda: controller_error_frame(130, 7, 0x20)])
-def test_error_frames_survive_the_bytes(make):
-    frame = make()
+@pytest.mark.parametrize(
+    "create_frame", [bus_off_frame, receive_overflow_frame, lambda: controller_error_frame(130, 7, 0x20)]
+)
+def test_error_frames_survive_the_bytes(create_frame):
+    frame = create_frame()
     can_id, length, _, data = dissect_can_frame(pack_frame(frame))
     assert can_id == 0x20000000 | frame.can_id
     assert length == 8

@@ -13,7 +13,7 @@ def commands(tmp_path):
     served.close()
 
 
-def serve_once(commands, execute):
+def serve_in_thread(commands, execute):
     import select
 
     def run():
@@ -27,7 +27,7 @@ def serve_once(commands, execute):
 
 def test_a_command_is_executed_and_answered(tmp_path, commands):
     seen = []
-    thread = serve_once(commands, lambda text: (seen.append(text), f"done {text}")[1])
+    thread = serve_in_thread(commands, lambda text: (seen.append(text), f"done {text}")[1])
     assert send_command(tmp_path / "commands", "  estop_button on\n") == "done estop_button on"
     thread.join()
     assert seen == ["estop_button on"]
@@ -70,11 +70,11 @@ def test_close_removes_the_socket_and_may_be_repeated(tmp_path, commands):
 
 def test_the_command_line_sends_one_command(tmp_path, commands, capsys):
     path = str(tmp_path / "commands")
-    for answer, code in (("ok", 0), ("error: no", 1)):
-        thread = serve_once(commands, lambda text: f"{answer} {text}")  # noqa: B023
+    for reply, code in (("ok", 0), ("error: no", 1)):
+        thread = serve_in_thread(commands, lambda text: f"{reply} {text}")  # noqa: B023
         assert main([path, "reboot", "watchdog"]) == code
         thread.join()
-        assert capsys.readouterr().out == f"{answer} reboot watchdog\n"
+        assert capsys.readouterr().out == f"{reply} reboot watchdog\n"
     assert main([str(tmp_path / "none"), "reboot"]) == 1
     assert "is the virtual robot running" in capsys.readouterr().err
     assert main([path]) == 2

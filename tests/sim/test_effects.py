@@ -68,7 +68,7 @@ def test_an_unknown_name_is_refused_with_all_names():
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "expected_error"),
     [
         ("turn_slip", "turn_slip=NUMBER"),
         ("turn_slip=", "not a number"),
@@ -82,8 +82,8 @@ def test_an_unknown_name_is_refused_with_all_names():
         ("surface_change=0.1,40,0,1", "4 values"),
     ],
 )
-def test_impossible_values_are_refused_in_one_line(text, says):
-    with pytest.raises(HiddenEffectError, match=says) as caught:
+def test_impossible_values_are_refused_in_one_line(text, expected_error):
+    with pytest.raises(HiddenEffectError, match=expected_error) as caught:
         parse_hidden_effects([text])
     assert "\n" not in str(caught.value)
 

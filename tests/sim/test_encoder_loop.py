@@ -12,13 +12,13 @@ def speeds(left, right=1.0):
     return FirmwareInputs(left_ticks=0, right_ticks=0, left_speed_rad_s=left, right_speed_rad_s=right)
 
 
-def driven(use, reports, seconds, wanted=0.5, regulates=True):
+def driven(use, reports, seconds, target_rad_s=0.5, regulates=True):
     """What the left motor is driven at, after a motor that follows at once was reported so."""
-    loop, true = EncoderLoop(use, FULL_RAD_S), wanted
+    loop, true = EncoderLoop(use, FULL_RAD_S), target_rad_s
     for _ in range(round(seconds * 1000)):
-        loop.see((wanted, 1.0), speeds(true), speeds(reports(true)), 1e-3, regulates)
-        true = loop.drive((wanted, 1.0))[0]
-    return loop.drive((wanted, 1.0))
+        loop.see((target_rad_s, 1.0), speeds(true), speeds(reports(true)), 1e-3, regulates)
+        true = loop.drive((target_rad_s, 1.0))[0]
+    return loop.drive((target_rad_s, 1.0))
 
 
 @pytest.mark.parametrize("use", EncoderUse)

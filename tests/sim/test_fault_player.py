@@ -30,13 +30,13 @@ class Rig:
         self.reported = []
         self.player = FaultPlayer(self.schedule, self.robot, self.can, 0, self.reported.append, processes)
         self.ms = 0
-        self.heard = []
+        self.received_ids = []
 
     def run(self, until_ms):
         while self.ms < until_ms:
             self.ms += 1
             self.can.advance(self.ms * MS)
-            self.heard += [received.frame.can_id for received in self.can.host.receive()]
+            self.received_ids += [received.frame.can_id for received in self.can.host.receive()]
             self.can.send(self.robot.step(self.ms * 1000, self.can.error_counters))
             self.player.step(self.ms * MS)
 
@@ -44,12 +44,12 @@ class Rig:
 def test_one_way_loss_silences_one_side_and_ends():
     rig = Rig('kind="one_way"\nat_s=0.1\nfor_s=0.1\nto="host"')
     rig.run(100)
-    assert rig.heard
-    rig.heard.clear()
+    assert rig.received_ids
+    rig.received_ids.clear()
     rig.run(199)
-    assert len(rig.heard) <= 1
+    assert len(rig.received_ids) <= 1
     rig.run(300)
-    assert len(rig.heard) > 20
+    assert len(rig.received_ids) > 20
     assert rig.reported == ["fault 1 begins: one_way to=host", "fault 1 ends: one_way"]
     assert rig.player.frames.struck[1] > 20
 
@@ -87,12 +87,12 @@ def test_button_and_babble_are_taken_back():
     rig = Rig('kind="estop_button"\nat_s=0.1\nfor_s=0.1', 'kind="babble"\nat_s=0.1\nfor_s=0.1\nid=0x7ff\nrate_hz=500')
     rig.run(150)
     assert rig.robot.estop_button
-    assert 0x7FF in rig.heard
+    assert 0x7FF in rig.received_ids
     rig.run(205)
-    rig.heard.clear()
+    rig.received_ids.clear()
     rig.run(300)
     assert not rig.robot.estop_button
-    assert 0x7FF not in rig.heard
+    assert 0x7FF not in rig.received_ids
 
 
 def test_of_two_faults_of_a_kind_at_once_the_end_of_one_leaves_the_other():
@@ -104,16 +104,16 @@ def test_of_two_faults_of_a_kind_at_once_the_end_of_one_leaves_the_other():
     )
     rig.run(200)
     assert rig.robot.estop_button
-    rig.heard.clear()
+    rig.received_ids.clear()
     rig.run(300)
     assert rig.robot.estop_button
-    assert 0x7FE in rig.heard
-    assert 0x7FF not in rig.heard
+    assert 0x7FE in rig.received_ids
+    assert 0x7FF not in rig.received_ids
     rig.run(400)
-    rig.heard.clear()
+    rig.received_ids.clear()
     rig.run(450)
     assert not rig.robot.estop_button
-    assert 0x7FE not in rig.heard
+    assert 0x7FE not in rig.received_ids
 
 
 @pytest.mark.parametrize("second", ["unplug", "unplug_mid_frame"])
@@ -151,7 +151,7 @@ def test_faults_of_processes_go_to_whoever_has_them_in_hand():
 
 
 @pytest.mark.parametrize(
-    ("kind", "link", "interface", "words"),
+    ("kind", "link", "interface", "expected_error"),
     [
         ("sigkill", "can", "unixcan", "tests/hil"),
         ("babble", "serial", "", "CAN bus"),
@@ -159,10 +159,10 @@ def test_faults_of_processes_go_to_whoever_has_them_in_hand():
         ("drop", "can", "socketcan", "unixcan"),
     ],
 )
-def test_what_the_simulator_cannot_do_is_refused(kind, link, interface, words):
+def test_what_the_simulator_cannot_do_is_refused(kind, link, interface, expected_error):
     lasts = "for_s=1" if KINDS[kind].lasts else ""
     schedule = parse_schedule(f'[[fault]]\nkind="{kind}"\nat_s=0\n{lasts}')
-    with pytest.raises(OptionError, match=words):
+    with pytest.raises(OptionError, match=expected_error):
         _check_faults(schedule, link, interface)
 
 
@@ -289,10 +289,10 @@ def test_state_answers_with_a_row_of_the_truth(injection):
 )
 def test_a_bad_command_is_refused_with_one_line_and_changes_nothing(robot, link, injection, text, why):
     before = robot.truth
-    answer = injection.execute(text, 0)
-    assert answer.startswith("error: ")
-    assert why in answer
-    assert "\n" not in answer
+    response = injection.execute(text, 0)
+    assert response.startswith("error: ")
+    assert why in response
+    assert "\n" not in response
     assert injection.refused == 1
     assert robot.truth == before
     assert link.hub.path.exists()
@@ -309,8 +309,8 @@ def test_what_a_link_cannot_do_is_refused(robot):
 
 
 def test_every_command_is_described(injection):
-    answer = injection.execute("help", 0)
-    named = answer.partition("write one of ")[2].split(", ")
+    response = injection.execute("help", 0)
+    named = response.partition("write one of ")[2].split(", ")
     assert named == [line.split()[0] for line in COMMANDS.splitlines()]
 
 

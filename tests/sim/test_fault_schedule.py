@@ -43,9 +43,11 @@ def test_a_schedule_is_in_order_with_defaults_and_numbers():
 
 @given(st.integers(0, 2**40), st.floats(10, 300))
 def test_a_seed_draws_the_same_faults_one_after_the_other(seed, duration_s):
-    drawn = random_schedule(seed, duration_s)
-    assert random_schedule(seed, duration_s) == drawn
-    assert all(before.end_ns < after.begin_ns for before, after in zip(drawn.faults, drawn.faults[1:], strict=False))
+    schedule = random_schedule(seed, duration_s)
+    assert random_schedule(seed, duration_s) == schedule
+    assert all(
+        before.end_ns < after.begin_ns for before, after in zip(schedule.faults, schedule.faults[1:], strict=False)
+    )
 
 
 def test_all_kinds_are_drawn_in_time():
@@ -53,7 +55,7 @@ def test_all_kinds_are_drawn_in_time():
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "fragments"),
     [
         ("fault = [", ["not TOML"]),
         ("seed = " + "1" * 5000, ["not TOML", "5000 digits"]),
@@ -78,13 +80,13 @@ def test_all_kinds_are_drawn_in_time():
         ('[[fault]]\nkind = "brown_out"\nat_s = 1\nfor_s = 1', ["brown_out", "for_s", "unknown"]),
     ],
 )
-def test_a_wrong_schedule_gets_one_line(text, words):
+def test_a_wrong_schedule_gets_one_line(text, fragments):
     with pytest.raises(FaultFileError) as caught:
         parse_schedule(text, "faults.toml")
     message = str(caught.value)
     assert message.startswith("faults.toml: ")
     assert "\n" not in message
-    assert all(word in message for word in words), message
+    assert all(fragment in message for fragment in fragments), message
 
 
 @given(st.text(max_size=200) | st.binary(max_size=200).map(lambda b: b.decode("latin-1")))

@@ -50,22 +50,22 @@ class Client:
 
 
 @pytest.fixture
-def make_hub(tmp_path):
+def create_hub(tmp_path):
     hubs = []
 
-    def make(**options):
+    def create(**options):
         hub = Hub(tmp_path / f"hub{len(hubs)}", T0, **options)
         hubs.append(hub)
         return hub
 
-    yield make
+    yield create
     for hub in hubs:
         hub.close()
 
 
 @pytest.fixture
-def hub(make_hub):
-    return make_hub()
+def hub(create_hub):
+    return create_hub()
 
 
 def test_a_frame_reaches_the_others_when_it_has_been_on_the_wire(hub):
@@ -80,8 +80,8 @@ def test_a_frame_reaches_the_others_when_it_has_been_on_the_wire(hub):
     assert hub.next_event_ns() is None
 
 
-def test_without_pacing_it_reaches_them_at_once(make_hub):
-    hub = make_hub(pacing=False)
+def test_without_pacing_it_reaches_them_at_once(create_hub):
+    hub = create_hub(pacing=False)
     a, b = Client(hub), Client(hub)
     a.send(FRAME)
     hub.pump(T0)
@@ -123,13 +123,13 @@ def test_a_lone_node_is_acknowledged(hub):
     assert (robot.pending, robot.tec) == (0, 0)
 
 
-def test_faults_and_log_reach_the_bus(make_hub):
+def test_faults_and_log_reach_the_bus(create_hub):
     class LoseAll:
         def outcome(self, now_ns, sender, frame):
             return FrameOutcome(lost=True)
 
     lines = []
-    hub = make_hub(fault=LoseAll(), log=lines.append)
+    hub = create_hub(fault=LoseAll(), log=lines.append)
     a, b = Client(hub), Client(hub)
     a.send(FRAME)
     hub.pump(T0)
@@ -167,21 +167,21 @@ def test_a_reader_that_never_reads_is_bounded_counted_and_reported(hub):
         hub.pump(now_ns)
         got += len(reader.received())
     assert got == 2 * READER_QUEUE
-    lost = hub.stats.reader_overflow
-    assert 0 < lost < READER_QUEUE
+    dropped = hub.stats.reader_overflow
+    assert 0 < dropped < READER_QUEUE
     frames = []
     for _ in range(100):
         frames += sleeper.received()
         hub.pump(now_ns)
     numbers = [int.from_bytes(frame.data) for frame in frames]
-    assert numbers == list(range(2 * READER_QUEUE - lost))
+    assert numbers == list(range(2 * READER_QUEUE - dropped))
     hub.bus.send(robot, FRAME)
     hub.pump(now_ns + LONG_NS)
     assert sleeper.received() == [CanFrame(0x004, b"\x00\x01\x00\x00\x00\x00\x00\x00", error=True), FRAME]
 
 
-def test_without_pacing_senders_wait_for_a_slow_reader_and_nothing_is_lost(make_hub):
-    hub = make_hub(pacing=False)
+def test_without_pacing_senders_wait_for_a_slow_reader_and_nothing_is_lost(create_hub):
+    hub = create_hub(pacing=False)
     a, slow = Client(hub), Client(hub)
     sent, got, now_ns, waited = 0, [], T0, 0
     while len(got) < 3000:
@@ -205,8 +205,8 @@ def test_without_pacing_senders_wait_for_a_slow_reader_and_nothing_is_lost(make_
     assert hub.stats.reader_overflow == 0
 
 
-def test_without_pacing_a_stalled_reader_holds_up_nobody(make_hub):
-    hub = make_hub(pacing=False)
+def test_without_pacing_a_stalled_reader_holds_up_nobody(create_hub):
+    hub = create_hub(pacing=False)
     a, _sleeper, reader = Client(hub), Client(hub), Client(hub)
     got, now_ns = [], T0
     for number in range(3000):
@@ -228,9 +228,9 @@ def test_without_pacing_a_stalled_reader_holds_up_nobody(make_hub):
     assert hub.stats.reader_overflow > 0
 
 
-def test_while_senders_wait_the_owner_can_sleep(make_hub):
+def test_while_senders_wait_the_owner_can_sleep(create_hub):
     """The descriptor must not stay readable for what will not be read, and the end of the wait must be a due event."""
-    hub = make_hub(pacing=False)
+    hub = create_hub(pacing=False)
     a, _sleeper = Client(hub), Client(hub)
 
     def flood():
@@ -325,8 +325,8 @@ def test_unplugging_loses_what_was_not_yet_on_the_bus(hub):
     assert [d for d in hub.pump(T0 + LONG_NS) if robot in d.receivers] == []
 
 
-def test_when_the_bus_has_room_again_waiting_senders_wake_the_owner(make_hub):
-    hub = make_hub(pacing=False)
+def test_when_the_bus_has_room_again_waiting_senders_wake_the_owner(create_hub):
+    hub = create_hub(pacing=False)
     a, b = Client(hub), Client(hub)
     a.send(*[FRAME] * 40)
     hub.pump(T0)

@@ -48,9 +48,9 @@ def test_frames_take_their_time_both_ways(can):
     (received,) = can.advance(1 * MS)
     assert received.frame == FRAME
     assert 200_000 < received.t_ns < 400_000
-    (heard,) = can.host.receive()
-    assert heard.frame == Frame(0x110, b"\x01")
-    assert heard.t_ns > received.t_ns
+    (telemetry,) = can.host.receive()
+    assert telemetry.frame == Frame(0x110, b"\x01")
+    assert telemetry.t_ns > received.t_ns
     assert can.host.receive() == ()
     assert can.host.stats.frames_sent == can.host.stats.frames_received == 1
 

@@ -175,7 +175,7 @@ def test_the_timeline_reports_each_beginning_and_end_once():
     assert timeline.done
 
 
-def fates(text, count=400, sender="host", frame=FRAME, seed=1):
+def outcomes_of(text, count=400, sender="host", frame=FRAME, seed=1):
     faults = FrameFaults(seed)
     faults.set_active(schedule(text).faults)
     return faults, [faults.outcome(k, sender, frame) for k in range(count)]
@@ -184,24 +184,24 @@ def fates(text, count=400, sender="host", frame=FRAME, seed=1):
 @pytest.mark.parametrize(
     ("kind", "touched"),
     [
-        ("drop", lambda fate: fate.lost_at == ("robot",)),
-        ("duplicate", lambda fate: fate.copies == 2),
-        ("delay", lambda fate: fate.delay_ns == 50 * MS),
-        ("reorder", lambda fate: 0 < fate.delay_ns <= 30 * MS),
-        ("flip_before_crc", lambda fate: fate.wire_error_bit is not None),
-        ("flip_after_crc", lambda fate: fate.data is not None and one_bit_differs(fate.data)),
+        ("drop", lambda outcome: outcome.lost_at == ("robot",)),
+        ("duplicate", lambda outcome: outcome.copies == 2),
+        ("delay", lambda outcome: outcome.delay_ns == 50 * MS),
+        ("reorder", lambda outcome: 0 < outcome.delay_ns <= 30 * MS),
+        ("flip_before_crc", lambda outcome: outcome.wire_error_bit is not None),
+        ("flip_after_crc", lambda outcome: outcome.data is not None and one_bit_differs(outcome.data)),
         (
             "wrong_length",
-            lambda fate: fate.data is not None and len(fate.data) != 8 and FRAME.data.startswith(fate.data),
+            lambda outcome: outcome.data is not None and len(outcome.data) != 8 and FRAME.data.startswith(outcome.data),
         ),
     ],
 )
 def test_each_kind_touches_its_share_of_the_frames(kind, touched):
-    faults, found = fates(f'kind="{kind}"\nat_s=0\nfor_s=1\nprobability=0.3')
+    faults, found = outcomes_of(f'kind="{kind}"\nat_s=0\nfor_s=1\nprobability=0.3')
     count = sum(map(touched, found))
     assert 80 < count < 160
     assert faults.struck == {1: count}
-    others = [fate for fate in found if not touched(fate)]
+    others = [outcome for outcome in found if not touched(outcome)]
     assert set(others) == {type(found[0])()}
 
 
@@ -211,8 +211,8 @@ def one_bit_differs(data):
 
 def test_the_same_seed_strikes_the_same_frames_and_another_others():
     text = 'kind="drop"\nat_s=0\nfor_s=1'
-    assert fates(text, seed=1)[1] == fates(text, seed=1)[1]
-    assert fates(text, seed=1)[1] != fates(text, seed=2)[1]
+    assert outcomes_of(text, seed=1)[1] == outcomes_of(text, seed=1)[1]
+    assert outcomes_of(text, seed=1)[1] != outcomes_of(text, seed=2)[1]
 
 
 @pytest.mark.parametrize(
@@ -229,25 +229,27 @@ def test_the_same_seed_strikes_the_same_frames_and_another_others():
     ],
 )
 def test_direction_and_identifier_choose(text, sender, struck):
-    faults, _ = fates(f'kind="drop"\nat_s=0\nfor_s=1\nprobability=1.0\n{text}', count=1, sender=sender)
+    faults, _ = outcomes_of(f'kind="drop"\nat_s=0\nfor_s=1\nprobability=1.0\n{text}', count=1, sender=sender)
     assert bool(faults.struck) == struck
 
 
 def test_one_way_takes_all_of_one_direction():
-    _, found = fates('kind="one_way"\nat_s=0\nfor_s=1\nto="host"', sender="robot", count=20)
-    assert all(fate.lost for fate in found)
-    _, found = fates('kind="one_way"\nat_s=0\nfor_s=1\nto="host"', sender="host", count=20)
-    assert not any(fate.lost or fate.lost_at for fate in found)
+    _, found = outcomes_of('kind="one_way"\nat_s=0\nfor_s=1\nto="host"', sender="robot", count=20)
+    assert all(outcome.lost for outcome in found)
+    _, found = outcomes_of('kind="one_way"\nat_s=0\nfor_s=1\nto="host"', sender="host", count=20)
+    assert not any(outcome.lost or outcome.lost_at for outcome in found)
 
 
 def test_a_longer_frame_than_its_data_is_padded_to_a_wrong_length():
-    _, found = fates('kind="wrong_length"\nat_s=0\nfor_s=1\nprobability=1.0', frame=CanFrame(0x80, b"\x01"))
-    assert {len(fate.data) for fate in found} == {0, 2, 3, 4, 5, 6, 7, 8}
+    _, found = outcomes_of('kind="wrong_length"\nat_s=0\nfor_s=1\nprobability=1.0', frame=CanFrame(0x80, b"\x01"))
+    assert {len(outcome.data) for outcome in found} == {0, 2, 3, 4, 5, 6, 7, 8}
 
 
 def test_an_empty_frame_has_no_bit_to_flip():
-    _, found = fates('kind="flip_after_crc"\nat_s=0\nfor_s=1\nprobability=1.0', frame=CanFrame(0x80, b""), count=5)
-    assert all(fate.data is None for fate in found)
+    _, found = outcomes_of(
+        'kind="flip_after_crc"\nat_s=0\nfor_s=1\nprobability=1.0', frame=CanFrame(0x80, b""), count=5
+    )
+    assert all(outcome.data is None for outcome in found)
 
 
 def test_the_line_breaks_within_the_next_frame_and_only_there():

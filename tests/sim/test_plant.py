@@ -17,8 +17,8 @@ from sim.plant import CELLS, Disturbances, Plant
 from sim.plant_parameters import PlantParameters
 
 NOISY = PlantParameters()
-STILL = NOISY.noiseless()
-IDEAL = STILL.with_ideal_motors()
+NOISELESS = NOISY.noiseless()
+IDEAL = NOISELESS.with_ideal_motors()
 
 # Straight, both turns, a slow reverse, a rest, a fast spin: two seconds in which every effect can show.
 DRIVE = ((5.0, 5.0), (6.5, 2.0), (2.0, 6.5), (-0.4, -1.0), (0.0, 0.0), (-7.0, 7.0), (3.0, 4.0))
@@ -82,28 +82,28 @@ def test_effects_of_size_nothing_leave_the_trajectory_bit_identical(baseline):
 
 
 def test_pose_latency_shifts_the_measured_path_by_itself():
-    quick, late = recorded(STILL)[3], recorded(STILL, pose_latency=0.12)[3]
-    for now, then in zip(late[3:], quick, strict=False):
+    prompt, delayed = recorded(NOISELESS)[3], recorded(NOISELESS, pose_latency=0.12)[3]
+    for now, then in zip(delayed[3:], prompt, strict=False):
         assert now.sample_us - then.sample_us == 120_000
         assert (now.x_m, now.y_m, now.yaw_rad) == (then.x_m, then.y_m, then.yaw_rad)
 
 
 def test_pose_latency_keeps_stamps_and_noise():
-    quick, late = recorded(NOISY)[3], recorded(NOISY, pose_latency=0.04)[3]
-    assert [(m.sample_us, m.available_us) for m in quick] == [(m.sample_us, m.available_us) for m in late]
+    prompt, delayed = recorded(NOISY)[3], recorded(NOISY, pose_latency=0.04)[3]
+    assert [(m.sample_us, m.available_us) for m in prompt] == [(m.sample_us, m.available_us) for m in delayed]
 
 
 @pytest.mark.parametrize("delay_s", [0.04, 0.0403])
 def test_a_delayed_command_takes_effect_exactly_then(delay_s):
-    prompt, late = Plant(IDEAL), Plant(IDEAL, hidden_effects({"command_delay": delay_s}))
+    prompt, delayed = Plant(IDEAL), Plant(IDEAL, hidden_effects({"command_delay": delay_s}))
     prompt.step(100_000, 0.0, 0.0)
     prompt.step(400_000, 4.0, 2.0)
-    late.step(100_000, 0.0, 0.0)
-    late.step(100_000 + round(delay_s * 1e6), 4.0, 2.0)
-    assert late.truth.left_speed_rad_s == late.truth.x_m == 0.0
-    late.step(400_000 + round(delay_s * 1e6), 4.0, 2.0)
+    delayed.step(100_000, 0.0, 0.0)
+    delayed.step(100_000 + round(delay_s * 1e6), 4.0, 2.0)
+    assert delayed.truth.left_speed_rad_s == delayed.truth.x_m == 0.0
+    delayed.step(400_000 + round(delay_s * 1e6), 4.0, 2.0)
     for name in ("x_m", "y_m", "yaw_rad", "left_speed_rad_s"):
-        assert getattr(late.truth, name) == pytest.approx(getattr(prompt.truth, name), abs=1e-12)
+        assert getattr(delayed.truth, name) == pytest.approx(getattr(prompt.truth, name), abs=1e-12)
 
 
 def test_every_delayed_command_comes_through_in_order():
@@ -128,7 +128,7 @@ def test_the_circle_has_the_radius_of_the_kinematics():
 
 
 def test_a_straight_line_is_straight_with_real_motors_and_ends_where_the_ticks_say():
-    plant = Plant(STILL)
+    plant = Plant(NOISELESS)
     plant.step(5_000_000, 5.0, 5.0)
     plant.step(6_000_000, 0.0, 0.0)
     state = plant.truth
@@ -138,7 +138,7 @@ def test_a_straight_line_is_straight_with_real_motors_and_ends_where_the_ticks_s
 
 
 def test_a_measured_pose_is_the_true_one_at_its_stamp():
-    plant = Plant(STILL)
+    plant = Plant(NOISELESS)
     truth, poses = {}, []
     for _ in range(2000):
         poses += plant.step(plant.now_us + 1000, 3.0, 5.0)
@@ -175,13 +175,13 @@ def test_poses_come_out_when_they_are_available_and_not_before():
 @settings(max_examples=15, deadline=None)
 @given(cuts=st.lists(st.integers(1, 80), min_size=1, max_size=40))
 def test_how_a_run_is_cut_into_steps_changes_nothing(cuts):
-    whole, cut = Plant(seed=5), Plant(seed=5)
+    uncut, cut = Plant(seed=5), Plant(seed=5)
     until_us = 1000 * sum(cuts)
-    poses = whole.step(until_us, 3.0, 5.0)
+    poses = uncut.step(until_us, 3.0, 5.0)
     pieces = [pose for milliseconds in cuts for pose in cut.step(cut.now_us + 1000 * milliseconds, 3.0, 5.0)]
-    assert cut.truth == whole.truth
-    assert cut.encoder_ticks == whole.encoder_ticks
-    assert cut.battery == whole.battery
+    assert cut.truth == uncut.truth
+    assert cut.encoder_ticks == uncut.encoder_ticks
+    assert cut.battery == uncut.battery
     assert pieces == poses
 
 
@@ -213,13 +213,13 @@ def test_the_integrator_is_of_second_order(effects):
 
 
 def test_limits_and_dry_friction_leave_the_integrator_convergent():
-    coarse, _, fine = errors_by_step(STILL)
+    coarse, _, fine = errors_by_step(NOISELESS)
     assert fine < 0.5 * coarse
     assert fine < 5e-6
 
 
 def test_kidnapping_moves_the_body_and_not_the_wheels():
-    plant = Plant(STILL, start=BodyPose(1.0, 1.0, 0.5))
+    plant = Plant(NOISELESS, start=BodyPose(1.0, 1.0, 0.5))
     plant.step(500_000, 3.0, 3.0)
     before, ticks = plant.truth, plant.encoder_ticks
     plant.kidnap(0.5, -0.2, 4.0)
@@ -233,7 +233,7 @@ def test_kidnapping_moves_the_body_and_not_the_wheels():
 
 
 def test_disabled_and_braked_wheels_come_to_rest():
-    plant = Plant(STILL)
+    plant = Plant(NOISELESS)
     plant.step(1_000_000, 5.0, 5.0)
     plant.step(4_000_000, 5.0, 5.0, enabled=False)
     assert plant.truth.left_speed_rad_s == plant.truth.speed_m_s == 0.0
@@ -243,7 +243,7 @@ def test_disabled_and_braked_wheels_come_to_rest():
 
 
 def test_readings_follow_what_the_motors_do():
-    plant = Plant(STILL)
+    plant = Plant(NOISELESS)
     resting_v = plant.battery.voltage_v
     plant.step(3_000_000, -6.0, 6.0)
     left_a, right_a = plant.motor_currents_a
@@ -261,7 +261,7 @@ def test_time_cannot_go_back():
 
 
 def test_wheel_disturbance_shows_in_ticks_and_in_the_pose():
-    plant = Plant(replace(STILL, wheel_disturbance_std=0.015).with_ideal_motors(), seed=4)
+    plant = Plant(replace(NOISELESS, wheel_disturbance_std=0.015).with_ideal_motors(), seed=4)
     speeds = []
     for _ in range(4000):
         plant.step(plant.now_us + 10_000, 5.0, 5.0)
@@ -314,11 +314,11 @@ def test_sides_and_axes_are_independent():
 
 
 def test_wander_adds_slow_variance():
-    quick, _ = _blocks(PARAMETERS, 4, 200)
-    slow, _ = _blocks(replace(PARAMETERS, wheel_wander_std=0.02, wheel_wander_correlation_s=2.0), 4, 200)
-    wander = slow[:, 0] - quick[:, 0]
-    assert wander.std() == pytest.approx(0.02, rel=0.1)
-    assert np.corrcoef(wander[:-200], wander[200:])[0, 1] == pytest.approx(np.exp(-1.0), abs=0.12)
+    without_drift, _ = _blocks(PARAMETERS, 4, 200)
+    with_drift, _ = _blocks(replace(PARAMETERS, wheel_wander_std=0.02, wheel_wander_correlation_s=2.0), 4, 200)
+    drift = with_drift[:, 0] - without_drift[:, 0]
+    assert drift.std() == pytest.approx(0.02, rel=0.1)
+    assert np.corrcoef(drift[:-200], drift[200:])[0, 1] == pytest.approx(np.exp(-1.0), abs=0.12)
 
 
 def test_volatility_keeps_the_variance_and_fattens_the_tails():

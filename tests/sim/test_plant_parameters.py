@@ -46,8 +46,8 @@ def test_noiseless_silences_every_random_source_and_touches_no_geometry():
 
 
 def test_draws_have_the_posteriors_mean_and_covariance():
-    drawn = [draw_plant_parameters(MEAN, COVARIANCE, seed) for seed in range(3000)]
-    values = np.array([(p.x_icr_m, p.wheel_radius_m, p.axial_distance_m) for p in drawn])
+    samples = [draw_plant_parameters(MEAN, COVARIANCE, seed) for seed in range(3000)]
+    values = np.array([(p.x_icr_m, p.wheel_radius_m, p.axial_distance_m) for p in samples])
     np.testing.assert_allclose(values.mean(axis=0), MEAN, atol=4 * np.sqrt(np.diag(COVARIANCE) / 3000).max())
     np.testing.assert_allclose(np.cov(values.T), COVARIANCE, atol=0.1 * COVARIANCE.max())
 
@@ -63,10 +63,10 @@ def test_a_draw_is_decided_by_its_seed_and_keeps_the_rest_of_the_base():
 def test_draws_stay_in_the_physical_range():
     wide = np.diag([0.5, 0.1, 0.5])
     for seed in range(200):
-        drawn = draw_plant_parameters(MEAN, wide, seed)
-        assert drawn.wheel_radius_m >= 0.01
-        assert 0.05 <= drawn.axial_distance_m <= 2.0
-        assert abs(drawn.x_icr_m) <= 1.0
+        sample = draw_plant_parameters(MEAN, wide, seed)
+        assert sample.wheel_radius_m >= 0.01
+        assert 0.05 <= sample.axial_distance_m <= 2.0
+        assert abs(sample.x_icr_m) <= 1.0
 
 
 def test_a_posterior_without_physical_plants_is_an_error():

@@ -140,7 +140,7 @@ class HubProcess:
         self.process.communicate(timeout=60)
 
 
-def drive_beside_another_node(path):
+def drive_with_another_node(path):
     """Drive a board that is a node of the bus at `path`; then a third node stops it."""
     transport = can_transport.create_transport(interface="unixcan", channel=str(path))
     transport.open()
@@ -151,11 +151,11 @@ def drive_beside_another_node(path):
             host.to_driving()
             assert (host.state, host.fault) == ("ARMED", "NONE")
             host.wait_for("turning wheels", lambda: host.fastest > 1.0)
-            heard = set()
+            received_ids = set()
             while (message := other.recv(0)) is not None:
-                heard.add(message.arbitration_id)
+                received_ids.add(message.arbitration_id)
             # What the robot says and what its host says: each node hears both.
-            assert {0x100, 0x101, 0x110, 0x111, 0x130, 0x133} <= heard
+            assert {0x100, 0x101, 0x110, 0x111, 0x130, 0x133} <= received_ids
             other.send(can.Message(arbitration_id=0x080, data=b"\1", is_extended_id=False))
             host.wait_for_state("ESTOP", within_s=2.0)
             host.wait_for("standing wheels", lambda: host.fastest == 0.0, 2.0)
@@ -170,11 +170,11 @@ def test_a_board_behind_slcan_sits_on_the_mock_bus_beside_other_nodes(tmp_path):
         running_board(build_board(tmp_path, "-DDISCO_LINK_SLCAN")) as board,
         HubProcess(tmp_path / "bus", board.link, "sleep_after_open=0"),
     ):
-        drive_beside_another_node(tmp_path / "bus")
+        drive_with_another_node(tmp_path / "bus")
 
 
 @pytest.mark.parametrize(
-    ("words", "reported"),
+    ("arguments", "reported"),
     [
         (["slcan", "{folder}/none"], "cannot be opened"),
         (["virtual", "bus", "sleep_after_open"], "write KEY=JSON"),
@@ -182,8 +182,8 @@ def test_a_board_behind_slcan_sits_on_the_mock_bus_beside_other_nodes(tmp_path):
         (["slcan"], "cannot be opened"),
     ],
 )
-def test_what_cannot_be_joined_is_said_in_one_line(words, reported, tmp_path):
-    words = [word.format(folder=tmp_path) for word in words]
+def test_what_cannot_be_joined_is_said_in_one_line(arguments, reported, tmp_path):
+    arguments = [argument.format(folder=tmp_path) for argument in arguments]
     with pytest.raises(JoinError, match=reported) as error:
-        joined(words, 0, 500_000)
+        joined(arguments, 0, 500_000)
     assert "\n" not in str(error.value)

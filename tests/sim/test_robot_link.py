@@ -13,8 +13,8 @@ def test_it_hears_data_frames_only_and_which_identifiers_are_long():
     robot, other = RobotNode(bus), bus.attach("other")
     for frame in (CanFrame(0x100, b"a"), CanFrame(0x100, b"b", extended=True), CanFrame(0x101, remote=True)):
         bus.send(other, frame)
-    heard = robot.take(5 * MS, bus.advance(5 * MS))
-    assert [received.frame for received in heard] == [Frame(0x100, b"b", extended=True), Frame(0x100, b"a")]
+    received_frames = robot.take(5 * MS, bus.advance(5 * MS))
+    assert [received.frame for received in received_frames] == [Frame(0x100, b"b", extended=True), Frame(0x100, b"a")]
 
 
 def test_after_bus_off_it_is_back_after_the_delay_and_not_before():

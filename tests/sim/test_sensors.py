@@ -13,7 +13,7 @@ from sim.sensors import Electrics, Encoders, SampledPoseSensor, wrapped
 from sim.wheel_dynamics import WheelPieces
 
 NOISY = PlantParameters()
-STILL = NOISY.noiseless()
+NOISELESS = NOISY.noiseless()
 
 
 def measure(parameters, count, pose=None, seed=1, **effects):
@@ -30,7 +30,7 @@ def errors(measurements, pose=None):
 
 
 def test_samples_come_at_the_rate_and_can_be_read_after_the_delay():
-    measured = measure(STILL, 5)
+    measured = measure(NOISELESS, 5)
     assert [m.sample_us for m in measured] == [40_000, 80_000, 120_000, 160_000, 200_000]
     assert [m.available_us - m.sample_us for m in measured] == [30_000] * 5
     assert errors(measured).max() == 0.0
@@ -60,41 +60,41 @@ def test_volatile_noise_keeps_its_size_and_has_heavy_tails():
 
 
 def test_sample_times_jitter_and_stay_in_order():
-    measured = measure(replace(STILL, pose_sample_jitter_s=0.004), 2000)
+    measured = measure(replace(NOISELESS, pose_sample_jitter_s=0.004), 2000)
     stamps = np.array([m.sample_us for m in measured])
     off = stamps - 40_000 * np.arange(1, 2001)
     assert off.std() == pytest.approx(4000, rel=0.06)
-    wild = measure(replace(STILL, pose_sample_jitter_s=0.5), 2000)
+    wild = measure(replace(NOISELESS, pose_sample_jitter_s=0.5), 2000)
     assert np.all(np.diff([m.sample_us for m in wild]) > 0)
 
 
 def test_the_delay_jitters_and_is_never_negative():
-    measured = measure(replace(STILL, pose_delay_jitter_s=0.02), 2000)
+    measured = measure(replace(NOISELESS, pose_delay_jitter_s=0.02), 2000)
     delays = np.array([m.available_us - m.sample_us for m in measured])
     assert delays.min() == 0
     assert np.median(delays) == pytest.approx(30_000, rel=0.06)
 
 
 def test_latency_asks_for_the_pose_of_earlier_and_stamps_it_as_of_now():
-    sensor = SampledPoseSensor(STILL, hidden_effects({"pose_latency": 0.1}), np.random.SeedSequence(1))
-    asked, stamped = [], []
+    sensor = SampledPoseSensor(NOISELESS, hidden_effects({"pose_latency": 0.1}), np.random.SeedSequence(1))
+    true_times_us, stamped = [], []
     for _ in range(4):
-        asked.append(sensor.next_true_us)
+        true_times_us.append(sensor.next_true_us)
         stamped.append(sensor.sample(BodyPose()).sample_us)
-    assert asked == [0, 0, 20_000, 60_000]
+    assert true_times_us == [0, 0, 20_000, 60_000]
     assert stamped == [40_000, 80_000, 120_000, 160_000]
 
 
 def test_offset_turns_with_the_body_and_bias_turns_the_yaw_only():
     pose = BodyPose(1.0, 2.0, math.pi / 2)
-    (m,) = measure(STILL, 1, pose, pose_offset=(0.1, 0.03))
+    (m,) = measure(NOISELESS, 1, pose, pose_offset=(0.1, 0.03))
     assert (m.x_m, m.y_m, m.yaw_rad) == pytest.approx((0.97, 2.1, math.pi / 2))
-    (m,) = measure(STILL, 1, pose, heading_bias=0.05)
+    (m,) = measure(NOISELESS, 1, pose, heading_bias=0.05)
     assert (m.x_m, m.y_m, m.yaw_rad) == pytest.approx((1.0, 2.0, math.pi / 2 + 0.05))
 
 
 def test_yaw_is_wrapped_to_the_half_open_range():
-    assert measure(STILL, 1, BodyPose(0, 0, 3.5))[0].yaw_rad == pytest.approx(3.5 - 2 * math.pi)
+    assert measure(NOISELESS, 1, BodyPose(0, 0, 3.5))[0].yaw_rad == pytest.approx(3.5 - 2 * math.pi)
     assert wrapped(math.pi) == wrapped(-math.pi) == math.pi
     assert wrapped(7 * math.pi) == pytest.approx(math.pi)
 
@@ -106,8 +106,8 @@ def test_dropouts_lose_their_share():
 
 def test_gaps_silence_the_sensor_for_their_length():
     measured = measure(replace(NOISY, pose_gap_interval_s=20.0, pose_gap_length_s=1.2), 10_000)
-    lost = np.array([m is None for m in measured], dtype=int)
-    starts, ends = np.flatnonzero(np.diff(lost) == 1), np.flatnonzero(np.diff(lost) == -1)
+    missing = np.array([m is None for m in measured], dtype=int)
+    starts, ends = np.flatnonzero(np.diff(missing) == 1), np.flatnonzero(np.diff(missing) == -1)
     lengths = ends[1 : len(starts)] - starts[: len(ends) - 1] if ends[0] < starts[0] else ends - starts[: len(ends)]
     assert len(starts) == pytest.approx(10_000 / 25 / 20, rel=0.5)
     assert lengths.min() == 30
@@ -157,8 +157,8 @@ def test_the_count_starts_where_it_is_set():
     assert encoders.ticks == (2**24 - 3, -7)
     ticks, speeds = _turn(encoders, lambda t: (10.5 * TICK_RAD, -9.5 * TICK_RAD), 1)
     assert ticks[-1].tolist() == [2**24 + 7, -17]
-    still = Encoders(parameters, hidden_effects({}))
-    _, speeds = _turn(still, lambda t: (0.0, 0.0), 200)
+    stationary = Encoders(parameters, hidden_effects({}))
+    _, speeds = _turn(stationary, lambda t: (0.0, 0.0), 200)
     assert np.all(speeds == 0.0)
 
 

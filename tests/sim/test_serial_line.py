@@ -253,18 +253,18 @@ def test_faults_of_a_bus_are_refused(line):
         line.babble(FRAME)
 
 
-class Fate:
+class FixedOutcome:
     """Does the same to every frame from one side."""
 
-    def __init__(self, sender, **fate):
-        self.sender, self.what = sender, FrameOutcome(**fate)
+    def __init__(self, sender, **outcome):
+        self.sender, self.what = sender, FrameOutcome(**outcome)
 
     def outcome(self, now_ns, sender, frame):
         return self.what if sender == self.sender else FrameOutcome()
 
 
 @pytest.mark.parametrize(
-    ("fate", "frames"),
+    ("outcome", "frames"),
     [
         ({}, 1),
         ({"lost": True}, 0),
@@ -274,20 +274,20 @@ class Fate:
         ({"data": b"other"}, 1),
     ],
 )
-def test_faults_on_the_way_to_the_host_are_what_the_host_reads(fate, frames):
+def test_faults_on_the_way_to_the_host_are_what_the_host_reads(outcome, frames):
     line = SerialLine(None, 0, pacing=False)
-    line.set_bus_fault(Fate("robot", **fate))
+    line.set_bus_fault(FixedOutcome("robot", **outcome))
     with serial.Serial(line.port, 921_600, timeout=0.2) as host:
         line.collect(1)
         line.send([Frame(0x110, b"12345678")])
         line.advance(2)
         found = FrameDecoder().feed(host.read(200))
-        assert found == [(0x110, fate.get("data", b"12345678"))] * frames
+        assert found == [(0x110, outcome.get("data", b"12345678"))] * frames
     line.close()
 
 
 @pytest.mark.parametrize(
-    ("fate", "expected"),
+    ("outcome", "expected"),
     [
         ({"lost_at": ("robot",)}, []),
         ({"wire_error_bit": 3}, []),
@@ -295,9 +295,9 @@ def test_faults_on_the_way_to_the_host_are_what_the_host_reads(fate, frames):
         ({"data": b"x"}, [b"x"]),
     ],
 )
-def test_faults_on_the_way_to_the_robot_are_what_the_robot_reads(fate, expected):
+def test_faults_on_the_way_to_the_robot_are_what_the_robot_reads(outcome, expected):
     line = SerialLine(None, 0, pacing=False)
-    line.set_bus_fault(Fate("host", **fate))
+    line.set_bus_fault(FixedOutcome("host", **outcome))
     with serial.Serial(line.port, 921_600) as host:
         line.collect(1)
         host.write(encode_frame(0x100, b"abc"))

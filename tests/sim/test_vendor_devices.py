@@ -96,19 +96,19 @@ def status_byte(vesc):
 
 def run_vesc(vesc, until_ms, events=()):
     """Milliseconds up to `until_ms`: what arrives in one comes before its check."""
-    answers = {}
+    responses = {}
     for ms in range(until_ms + 1):
         vesc.at(ms)
         for at, received in events:
-            if at == ms and (answer := vesc.receive_bytes(received)[0]):
-                answers[ms] = answer[7]
+            if at == ms and (response := vesc.receive_bytes(received)[0]):
+                responses[ms] = response[7]
         vesc.step(ms)
-    return answers
+    return responses
 
 
 def test_a_request_in_the_millisecond_of_a_check_reads_the_result_of_the_check_before():
-    asked = [(ms, STATUS_REQUEST) for ms in (600, 609, 610, 611)]
-    assert run_vesc(Vesc(1, 400), 620, [(200, SET_RPM), *asked]) == {600: 0, 609: 0, 610: 0, 611: 1}
+    requests = [(ms, STATUS_REQUEST) for ms in (600, 609, 610, 611)]
+    assert run_vesc(Vesc(1, 400), 620, [(200, SET_RPM), *requests]) == {600: 0, 609: 0, 610: 0, 611: 1}
 
 
 def test_the_status_stays_timed_out_until_the_check_after_a_command():

@@ -90,9 +90,9 @@ class Setup:
         assert until is None, "it did not come to it"
 
     def arm(self):
-        self.host.wanted = "READY"
+        self.host.request = "READY"
         self.run(2000, until=lambda: self.host.robot_state == "READY")
-        self.host.wanted = "ARM"
+        self.host.request = "ARM"
         self.run(2000, until=lambda: self.host.robot_state == "ARMED")
 
     def wheel_speed(self):
@@ -124,7 +124,7 @@ def test_handshake_arm_drive_stop(setup):
     assert truth.yaw_rad > 0.0
     ticks = setup.host.latest["WHEEL_TICKS"]
     assert ticks["left_ticks"] / ticks["right_ticks"] == pytest.approx(2 / 3, abs=0.02)
-    setup.host.wanted = "STANDBY"
+    setup.host.request = "STANDBY"
     setup.run(1000, until=lambda: setup.host.robot_state == "STANDBY")
     setup.run(300)
     assert setup.wheel_speed() < 0.01

@@ -10,8 +10,8 @@ from sim.effects import hidden_effects
 from sim.plant_parameters import PlantParameters
 from sim.wheel_dynamics import WheelMotors
 
-STILL = PlantParameters().noiseless()
-IDEAL = STILL.with_ideal_motors()
+NOISELESS = PlantParameters().noiseless()
+IDEAL = NOISELESS.with_ideal_motors()
 NO_DISTURBANCE = np.zeros((100_000, 2))
 
 
@@ -41,14 +41,14 @@ def test_ideal_wheels_turn_exactly_as_commanded():
 
 
 def test_the_unloaded_response_is_a_first_order_lag_with_the_stated_time_constant():
-    bench = Bench(replace(STILL, turning_load_nm=0.0, max_motor_acceleration_rad_s2=math.inf))
+    bench = Bench(replace(NOISELESS, turning_load_nm=0.0, max_motor_acceleration_rad_s2=math.inf))
     speeds = bench.run(0.3, 3.0, 3.0)[:, 0]
     t = np.arange(1, 301) * 1e-3
     np.testing.assert_allclose(speeds, 3.0 * (1.0 - np.exp(-t / 0.06)), atol=1e-9)
 
 
 def test_motor_lag_takes_the_place_of_the_loops_own_time_constant():
-    for parameters in (IDEAL, replace(STILL, turning_load_nm=0.0, max_motor_acceleration_rad_s2=math.inf)):
+    for parameters in (IDEAL, replace(NOISELESS, turning_load_nm=0.0, max_motor_acceleration_rad_s2=math.inf)):
         bench = Bench(parameters, motor_lag=0.12)
         assert bench.run(0.12, 3.0, 3.0)[-1, 0] == pytest.approx(3.0 * (1.0 - math.exp(-1.0)), abs=1e-9)
 
@@ -60,13 +60,13 @@ def test_the_lagged_angle_is_the_integral_of_the_lagged_speed():
 
 
 def test_acceleration_is_limited():
-    bench = Bench(STILL)
+    bench = Bench(NOISELESS)
     speeds = bench.run(0.05, 8.0, 8.0)[:, 0]
     assert np.diff(speeds).max() == pytest.approx(0.06, abs=1e-9)
 
 
 def test_too_little_torque_means_slower_acceleration():
-    weak = replace(STILL, max_motor_torque_nm=0.75, turning_load_nm=0.0)
+    weak = replace(NOISELESS, max_motor_torque_nm=0.75, turning_load_nm=0.0)
     bench = Bench(weak)
     speeds = bench.run(0.1, 8.0, 8.0)[:, 0]
     assert speeds[50] == pytest.approx(0.051 * (0.75 - 0.15) / 0.03, rel=0.05)
@@ -75,15 +75,15 @@ def test_too_little_torque_means_slower_acceleration():
 
 
 def test_steady_torque_is_friction_times_direction():
-    bench = Bench(replace(STILL, turning_load_nm=0.0))
+    bench = Bench(replace(NOISELESS, turning_load_nm=0.0))
     bench.run(1.0, 3.0, -3.0)
     assert bench.wheels.torques_nm == pytest.approx((0.15 + 3 * 0.02, -0.15 - 3 * 0.02), abs=1e-6)
 
 
 def test_the_loop_works_off_the_load_of_turning():
-    bench = Bench(STILL)
+    bench = Bench(NOISELESS)
     speeds = bench.run(1.0, -3.0, 3.0)
-    unloaded = Bench(replace(STILL, turning_load_nm=0.0)).run(1.0, -3.0, 3.0)
+    unloaded = Bench(replace(NOISELESS, turning_load_nm=0.0)).run(1.0, -3.0, 3.0)
     dip = unloaded[:, 1] - speeds[:, 1]
     assert 0.02 < dip.max() < 0.3
     assert speeds[-1] == pytest.approx((-3.0, 3.0), abs=0.005)
@@ -91,13 +91,13 @@ def test_the_loop_works_off_the_load_of_turning():
 
 
 def test_a_wheel_that_is_commanded_to_stop_stands_still():
-    bench = Bench(STILL)
+    bench = Bench(NOISELESS)
     bench.run(0.5, -3.0, 5.0)
     assert np.all(bench.run(1.0, 0.0, 0.0)[-1] == 0.0)
 
 
 def test_a_wheel_without_drive_coasts_to_rest_on_friction():
-    bench = Bench(replace(STILL, viscous_friction_nm_s=0.0, turning_load_nm=0.0))
+    bench = Bench(replace(NOISELESS, viscous_friction_nm_s=0.0, turning_load_nm=0.0))
     bench.run(1.0, 5.0, -5.0)
     speeds = bench.run(2.0, 5.0, -5.0, enabled=False)
     seconds_to_rest = 5.0 * 0.03 / 0.15
@@ -107,13 +107,13 @@ def test_a_wheel_without_drive_coasts_to_rest_on_friction():
 
 
 def test_a_disabled_wheel_at_rest_ignores_its_command():
-    bench = Bench(STILL)
+    bench = Bench(NOISELESS)
     assert np.all(bench.run(0.5, 5.0, 5.0, enabled=False) == 0.0)
 
 
 @pytest.mark.parametrize("enabled", [True, False])
 def test_the_brake_stops_within_its_time_constant_and_wins_over_the_command(enabled):
-    bench = Bench(STILL)
+    bench = Bench(NOISELESS)
     bench.run(1.0, 5.0, 5.0)
     speeds = bench.run(0.3, 5.0, 5.0, enabled=enabled, brake=True)
     assert speeds[40, 0] < 5.0 * math.exp(-1.0)
@@ -121,7 +121,7 @@ def test_the_brake_stops_within_its_time_constant_and_wins_over_the_command(enab
 
 
 def test_drive_taken_up_again_starts_from_the_coasting_speed():
-    bench = Bench(STILL)
+    bench = Bench(NOISELESS)
     bench.run(1.0, 5.0, 5.0)
     coasting = bench.run(0.2, 0.0, 0.0, enabled=False)[-1, 0]
     assert bench.run(0.001, 5.0, 5.0)[-1, 0] == pytest.approx(coasting, abs=0.1)

@@ -31,8 +31,8 @@ PATIENCE_S = 60.0
 pytestmark = pytest.mark.skipif(not Path("/sys/class/net", VCAN).exists(), reason=f"no {VCAN}: make socketcan-test")
 
 
-def ip(*words):
-    subprocess.run(["ip", "link", *words], check=True, capture_output=True)
+def ip(*arguments):
+    subprocess.run(["ip", "link", *arguments], check=True, capture_output=True)
 
 
 class RawSocket:
@@ -154,12 +154,12 @@ class SlcanAdapter:
         fcntl.ioctl(self._line, termios.TIOCSETD, struct.pack("i", N_SLCAN))
         (self.channel,) = set(os.listdir("/sys/class/net")) - before
         self._running = True
-        self._thread = threading.Thread(target=self._answer, daemon=True)
+        self._thread = threading.Thread(target=self._drain_adapter, daemon=True)
         self._thread.start()
         ip("set", self.channel, "type", "can", "bitrate", "500000")
         ip("set", self.channel, "up")
 
-    def says(self, line):
+    def send_line(self, line):
         os.write(self.adapter, line)
 
     def state(self):
@@ -173,7 +173,7 @@ class SlcanAdapter:
             with contextlib.suppress(OSError):
                 os.close(descriptor)
 
-    def _answer(self):
+    def _drain_adapter(self):
         while self._running:
             if select.select([self.adapter], [], [], 0.1)[0]:
                 os.read(self.adapter, 4096)
@@ -190,11 +190,11 @@ def test_a_real_bus_off_keeps_the_link_down_until_the_controller_is_restarted(sl
     opened = open_transport("can", interface="socketcan", channel=slcan.channel)
     try:
         wait_until(lambda: opened.state is LinkState.UP, PATIENCE_S)
-        slcan.says(b"t1102AABB\r")
+        slcan.send_line(b"t1102AABB\r")
         assert collect(opened, 1, PATIENCE_S)[0].frame.data == b"\xaa\xbb"
-        slcan.says(b"e1a\r")
+        slcan.send_line(b"e1a\r")
         wait_until(lambda: opened.stats.bus_errors == 1, PATIENCE_S)
-        slcan.says(b"sb256000\r")
+        slcan.send_line(b"sb256000\r")
         wait_until(lambda: slcan.state() == "BUS-OFF", PATIENCE_S)
         wait_until(lambda: opened.stats.bus_off == 1 and opened.state is LinkState.CONNECTING, PATIENCE_S)
         with pytest.raises(LinkLostError, match="bus-off"):
@@ -204,7 +204,7 @@ def test_a_real_bus_off_keeps_the_link_down_until_the_controller_is_restarted(sl
         ip("set", slcan.channel, "down")
         ip("set", slcan.channel, "up")
         wait_until(lambda: opened.state is LinkState.UP, PATIENCE_S)
-        slcan.says(b"t1101CC\r")
+        slcan.send_line(b"t1101CC\r")
         assert collect(opened, 1, PATIENCE_S)[-1].frame.data == b"\xcc"
     finally:
         opened.close()

@@ -100,13 +100,13 @@ def path_cost(
         for x_now, y_now, yaw_now, forward_now in zip(x[1:], y[1:], yaw[1:], forward, strict=True):
             off_x, off_y, along_x, along_y = off(at, x_now, y_now)
             along = np.clip(off_x * along_x + off_y * along_y, -farthest_m, farthest_m)
-            wanted = np.full(at.shape, task.speed_m_s)
+            target_m_s = np.full(at.shape, task.speed_m_s)
             if not endless:
-                wanted = np.minimum(wanted, (last - at) * path.spacing_m / SLOW_DOWN_S)
+                target_m_s = np.minimum(target_m_s, (last - at) * path.spacing_m / SLOW_DOWN_S)
             at = at + along / path.spacing_m
             at = np.mod(at, last) if endless else np.clip(at, first, last)
             off_x, off_y, along_x, along_y = off(at, x_now, y_now)
-            missing = weight * (wanted - np.minimum(along / step_s, forward_now + wanted))
+            missing = weight * (target_m_s - np.minimum(along / step_s, forward_now + target_m_s))
             total += np.hypot(np.hypot(off_x, off_y), missing) + facing_cost(yaw_now, along_x, along_y)
         swung = TURN_WEIGHT * abs(rounded_m) * turned_away(yaw[-1] - turned(at))
         return np.asarray(total + TERMINAL_M / (task.speed_m_s * step_s) * np.hypot(np.hypot(off_x, off_y), swung))

@@ -55,8 +55,8 @@ def test_driving_round_costs_nothing_and_pays_for_no_progress():
 
 
 def test_progress_takes_the_reward_from_standing_and_from_spinning():
-    stand = (physics.RobotState(0.75, 0.0, math.pi / 2, 0.0, 0.0), 0.0, 0.0)
-    for trap in (stand, spinning()):
+    standstill = (physics.RobotState(0.75, 0.0, math.pi / 2, 0.0, 0.0), 0.0, 0.0)
+    for trap in (standstill, spinning()):
         assert sequence_cost(CircleCost(), *trap) > sequence_cost(CircleCost().paper(), *trap) + 0.05 * T
     assert sequence_cost(CircleCost(), *spinning()) > 0.3 * T
 

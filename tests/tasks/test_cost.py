@@ -50,7 +50,7 @@ def looked_up(task):
 
 
 @pytest.mark.parametrize(
-    ("compiled", "plain", "count", "said"),
+    ("compiled", "plain", "count", "expected_error"),
     [
         (staged, stage_cost, 10, "has no stage cost"),
         (ended, terminal_cost, 6, "has no terminal cost"),
@@ -58,8 +58,8 @@ def looked_up(task):
         (looked_up, row_of, 1, "has no table"),
     ],
 )
-def test_terms_without_a_cost_are_refused(compiled, plain, count, said):
-    with pytest.raises(TypeError, match=f"Nonsense {said}"):
+def test_terms_without_a_cost_are_refused(compiled, plain, count, expected_error):
+    with pytest.raises(TypeError, match=f"Nonsense {expected_error}"):
         plain(Nonsense(1.0), *[0.0] * count)
     with pytest.raises(TypingError, match="No implementation of function"):
         compiled(Nonsense(1.0))
@@ -78,8 +78,8 @@ def test_a_circle_has_costs():
     assert (prepared.begin, prepared.memory) == (0.0, 0.0)
     # At 1 m from the centre, at rest, after a whole turn: nothing of the progress is missing.
     assert staged(terms)[0] == pytest.approx((0.25**2 + 0.2**2) ** 0.5, rel=1e-5)
-    lost = 0.8 * 0.2 * 50
-    assert ended(terms) == pytest.approx(20.0 * 0.25 + lost, rel=1e-5)
+    missing_progress = 0.8 * 0.2 * 50
+    assert ended(terms) == pytest.approx(20.0 * 0.25 + missing_progress, rel=1e-5)
     paper = CircleCost().paper().prepare(0.0, 0.0, 0.0, 0.0, None, 0.1, 50).terms
     assert ended(paper) == 0.0
     assert looks(terms) is None

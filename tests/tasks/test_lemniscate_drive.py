@@ -69,6 +69,6 @@ def test_a_lemniscate_is_driven_changed_recorded_and_replayed_bit_for_bit(tmp_pa
         task = stage.task_at(timeline.tasks.last(timeline.last_ns))
         assert task == changed
         away = curves.distance(task, timeline, timeline.first_ns, timeline.last_ns)
-        asked = curves.speed(task, timeline, timeline.first_ns, timeline.last_ns)
+        speed = curves.speed(task, timeline, timeline.first_ns, timeline.last_ns)
     assert np.nanmax(np.abs(away.values["distance (m)"])) < 0.2
-    assert set(asked.values["reference"]) == {0.3}
+    assert set(speed.values["reference"]) == {0.3}

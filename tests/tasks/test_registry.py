@@ -82,12 +82,12 @@ def is_named_in(names: frozenset[str], kind: str, classes: set[str]) -> bool:
 
 @pytest.mark.parametrize("kind", kinds())
 def test_a_kind_is_named_in_its_own_file_alone(kind):
-    own = PACKAGE / "tasks" / f"{kind}.py"
-    classes = {node.name for node in ast.parse(own.read_text("utf-8")).body if isinstance(node, ast.ClassDef)}
+    task_file = PACKAGE / "tasks" / f"{kind}.py"
+    classes = {node.name for node in ast.parse(task_file.read_text("utf-8")).body if isinstance(node, ast.ClassDef)}
     found = set()
     for path in PACKAGE.rglob("*.py"):
         name = path.relative_to(PACKAGE).as_posix()
-        if path != own and not name.startswith(ELSEWHERE.get(kind, ())):
+        if path != task_file and not name.startswith(ELSEWHERE.get(kind, ())):
             found |= {name} if is_named_in(names_in_file(path), kind, classes) else set()
     for path in PACKAGE.rglob("*.html"):
         found |= {path.name} if f'"{kind}"' in path.read_text("utf-8") else set()

@@ -18,9 +18,9 @@ MODEL = load_model(ROBOTS / "wombot_model.toml")
 
 
 def test_the_torch_path_is_timed_on_the_processor():
-    taken = torch_times_ms(MODEL, "cpu", 32, 4)
-    assert taken.shape == (4,)
-    assert (taken > 0.0).all()
+    durations_ms = torch_times_ms(MODEL, "cpu", 32, 4)
+    assert durations_ms.shape == (4,)
+    assert (durations_ms > 0.0).all()
 
 
 def test_the_ratio_is_of_times_in_the_same_run():
@@ -34,10 +34,10 @@ def test_the_ratio_is_of_times_in_the_same_run():
 def test_calls_are_given_their_number_and_summed_up():
     numbers = []
     with undisturbed():
-        taken = times_ms(numbers.append, 5, left_out=2)
+        durations_ms = times_ms(numbers.append, 5, left_out=2)
     assert numbers == list(range(7))
     assert summary("k", np.array([1.0, 2.0, 3.0]))["k.p50"] == 2.0
-    assert taken.size == 5
+    assert durations_ms.size == 5
 
 
 def test_the_peer_rolls_the_same_model_and_cost():

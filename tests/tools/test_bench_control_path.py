@@ -12,8 +12,8 @@ THERE_AND_BACK = PathTask(path="back.csv", speed_m_s=0.25, points=paths()["there
 
 def test_figures_of_a_drive_that_is_known():
     step = np.arange(100)
-    beside = np.where(step < 20, 5.0, np.where(step < 60, 0.1, -0.2))
-    rows = np.column_stack([0.02 * step, beside, np.where(step < 80, 0.2, -0.1), 1.0 * step])
+    cross_track_m = np.where(step < 20, 5.0, np.where(step < 60, 0.1, -0.2))
+    rows = np.column_stack([0.02 * step, cross_track_m, np.where(step < 80, 0.2, -0.1), 1.0 * step])
     figures = followed(LINE, [rows, rows], "along")
     # The first two seconds do not count.
     assert figures["rms_mm"] == pytest.approx(np.sqrt((40 * 100.0**2 + 40 * 200.0**2) / 80.0))

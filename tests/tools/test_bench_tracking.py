@@ -23,9 +23,9 @@ def test_a_robot_in_mujoco_turns_about_the_point_that_it_is_said_to():
         poses.append(plant.pose)
         forward.append(plant.forward_m_s)
         angles += [(one.left_angle_rad, one.right_angle_rad) for one in plant.readings().wheels]
-    late = np.array(poses[150:])
-    moved, yaw = np.diff(late[:, :2], axis=0), late[1:, 2]
-    turned = np.diff(late[:, 2])
+    settled = np.array(poses[150:])
+    moved, yaw = np.diff(settled[:, :2], axis=0), settled[1:, 2]
+    turned = np.diff(settled[:, 2])
     aside = moved[:, 1] * np.cos(yaw) - moved[:, 0] * np.sin(yaw)
     assert aside.sum() / turned.sum() == pytest.approx(-BEHIND_M, rel=0.1)
     left, right = np.array(angles[-1]) - np.array(angles[150])
@@ -79,8 +79,8 @@ def test_a_drive_arrives_that_stays_on_the_line_and_one_in_reverse_is_seen(
     monkeypatch.setattr(bench_tracking, "ForeignPlant", OnTheLine)
     track = tracks()["square"]
     robot = ForeignRobot(*NOMINAL, dead_rad_s=0.0, grip_std=0.0)
-    late_s, went_back = bench_tracking._arrival_s(Straight(wheels_rad_s), robot, track, 1)
-    assert (late_s < bench_tracking.SPARE_S) == arrives
+    delay_s, went_back = bench_tracking._arrival_s(Straight(wheels_rad_s), robot, track, 1)
+    assert (delay_s < bench_tracking.SPARE_S) == arrives
     assert went_back == backwards
 
 

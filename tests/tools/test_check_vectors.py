@@ -40,14 +40,14 @@ def test_cases_that_agree(tmp_path, capsys):
     write(tmp_path, "vesc_can", ERPM)
     write(tmp_path, "unheard_of", {"case": "x:1"})
     assert main([str(tmp_path)]) == 0
-    said = capsys.readouterr().out
-    assert "odrive056.jsonl: 1 of 1 agree, 0 of them within rounding" in said
-    assert "vesc_can.jsonl: 1 of 1 agree, 1 of them within rounding" in said
-    assert "unheard_of.jsonl: no driver here speaks this protocol" in said
+    output = capsys.readouterr().out
+    assert "odrive056.jsonl: 1 of 1 agree, 0 of them within rounding" in output
+    assert "vesc_can.jsonl: 1 of 1 agree, 1 of them within rounding" in output
+    assert "unheard_of.jsonl: no driver here speaks this protocol" in output
 
 
 @pytest.mark.parametrize(
-    ("field", "value", "said"),
+    ("field", "value", "expected_text"),
     [
         ("frames", [{"id": 0x6D, "extended": False, "data": "0000c03f00000001"}], "frame"),
         ("then", {**VELOCITY["then"], "watchdog_fed_nodes": [5]}, "fed"),
@@ -55,12 +55,12 @@ def test_cases_that_agree(tmp_path, capsys):
         ("given", {}, "cannot be run"),
     ],
 )
-def test_a_case_that_disagrees_is_named(tmp_path, capsys, field, value, said):
+def test_a_case_that_disagrees_is_named(tmp_path, capsys, field, value, expected_text):
     write(tmp_path, "odrive056", VELOCITY, {**VELOCITY, field: value, "case": "odd:02"})
     assert main([str(tmp_path)]) == 1
     out = capsys.readouterr().out
     assert "1 of 2 agree" in out
-    assert any(line.startswith("  odd:02: ") and said in line for line in out.splitlines())
+    assert any(line.startswith("  odd:02: ") and expected_text in line for line in out.splitlines())
 
 
 def test_a_folder_without_vectors_is_refused(tmp_path, capsys):
@@ -72,5 +72,5 @@ def test_a_folder_without_vectors_is_refused(tmp_path, capsys):
 @pytest.mark.skipif(FOLDER is None, reason="DISCO_HW_VENDOR_VECTORS does not name a folder of vectors")
 def test_every_case_of_the_vendors_agrees(capsys):
     assert main([str(FOLDER)]) == 0, capsys.readouterr().out
-    said = capsys.readouterr().out
-    assert all(f"{name}.jsonl" in said for name in CHECKS)
+    output = capsys.readouterr().out
+    assert all(f"{name}.jsonl" in output for name in CHECKS)

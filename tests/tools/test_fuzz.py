@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(autouse=True)
-def _in_a_place_of_its_own(tmp_path, monkeypatch):
+def _in_temporary_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
@@ -23,16 +23,16 @@ def test_hostile_files_are_read_or_refused_in_one_line(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("error", "words"),
+    ("error", "expected_text"),
     [(IndexError("out of range"), "IndexError"), (fuzz.InputError("first\nsecond"), "more than one line")],
 )
-def test_what_gets_through_is_reported_and_the_file_kept(tmp_path, monkeypatch, error, words):
+def test_what_gets_through_is_reported_and_the_file_kept(tmp_path, monkeypatch, error, expected_text):
     def fail(path):
         raise error
 
     monkeypatch.setitem(fuzz.READERS, "faults.toml", fail)
     wrong = fuzz.attack(0.01, 1, tmp_path, only="faults.toml")
-    assert words in wrong[0]
+    assert expected_text in wrong[0]
     assert (tmp_path / wrong[0].partition(":")[0]).exists()
 
 
@@ -48,7 +48,7 @@ def test_every_verb_reads_or_refuses_hostile_files(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("fails", "words"),
+    ("fails", "expected_text"),
     [
         (lambda argv: 1 / 0, "ZeroDivisionError"),
         (lambda argv: fuzz.time.sleep(30), "TooSlowError"),
@@ -57,13 +57,13 @@ def test_every_verb_reads_or_refuses_hostile_files(tmp_path):
         (lambda argv: os._exit(3), "no answer"),
     ],
 )
-def test_what_a_verb_lets_through_is_reported_and_the_file_kept(tmp_path, monkeypatch, fails, words):
-    monkeypatch.setattr(fuzz, "CALL_S", 1 if words == "TooSlowError" else 60)
+def test_what_a_verb_lets_through_is_reported_and_the_file_kept(tmp_path, monkeypatch, fails, expected_text):
+    monkeypatch.setattr(fuzz, "CALL_S", 1 if expected_text == "TooSlowError" else 60)
     monkeypatch.setattr(fuzz.verb_calls, "CALLS", fuzz.verb_calls.CALLS[:1])
     parent, call = os.getpid(), fuzz.verb_calls.call
     monkeypatch.setattr(fuzz.verb_calls, "call", lambda argv: call(argv) if os.getpid() == parent else fails(argv))
     (wrong,) = fuzz.attack_verbs(1, 1, tmp_path / "verbs")
-    assert words in wrong
+    assert expected_text in wrong
     assert (tmp_path / wrong.partition(":")[0]).exists()
 
 

@@ -56,23 +56,23 @@ def test_the_table_compares_with_the_usual_settings_on_the_same_logs():
 
 
 def test_what_was_searched_already_is_not_searched_again(monkeypatch, tmp_path, capsys):
-    asked = []
+    searched = []
 
     def search(task):
         variant, job = task
-        asked.append((variant.key, job.key))
+        searched.append((variant.key, job.key))
         return variant.key, job.key, result()
 
     monkeypatch.setattr(gap_ablation, "search", search)
     assert main(["grid.block_s", "--logs", "1", "-o", str(tmp_path)]) == 0
-    assert [key for key, _ in asked] == ["usual", "grid.block_s x0.5", "grid.block_s x2"]
+    assert [key for key, _ in searched] == ["usual", "grid.block_s x0.5", "grid.block_s x2"]
     assert main(["grid.block_s", "grid.longest_silence_s", "--logs", "1", "-o", str(tmp_path)]) == 0
-    assert [key for key, _ in asked[3:]] == ["grid.longest_silence_s x0.5", "grid.longest_silence_s x2"]
+    assert [key for key, _ in searched[3:]] == ["grid.longest_silence_s x0.5", "grid.longest_silence_s x2"]
     assert "| grid.longest_silence_s x2 | 1 |" in capsys.readouterr().out
     assert len([*tmp_path.glob("*/gap_ablation.md")]) == 1
     # The validation set is searched with the usual settings alone.
     assert main(["--validate", "--logs", "2", "-o", str(tmp_path)]) == 0
-    assert [key for key, _ in asked[5:]] == ["usual", "usual"]
+    assert [key for key, _ in searched[5:]] == ["usual", "usual"]
     with pytest.raises(SystemExit):
         main(["no.such", "-o", str(tmp_path)])
 

@@ -81,9 +81,9 @@ def test_how_late_poses_are_is_counted_from_the_true_wheels():
     t_s = np.arange(14_400) / 480.0
     command = np.repeat(joystick(5, 30.0), 12, axis=0)
     turned = np.cumsum(command, axis=0)[:, [0, 1, 0, 1]] / 480.0
-    late = np.vstack([np.zeros((12, 2)), command[:-12]])
-    yaw = np.cumsum(0.4 * 0.13 / 0.49 * (late[:, 1] - late[:, 0])) / 480.0
-    forward = 0.13 / 2 * late.sum(axis=1)
+    delayed = np.vstack([np.zeros((12, 2)), command[:-12]])
+    yaw = np.cumsum(0.4 * 0.13 / 0.49 * (delayed[:, 1] - delayed[:, 0])) / 480.0
+    forward = 0.13 / 2 * delayed.sum(axis=1)
     truth = np.column_stack([np.cumsum(forward * np.cos(yaw)) / 480.0, np.cumsum(forward * np.sin(yaw)) / 480.0, yaw])
     nothing, none = np.zeros((0, 3)), np.zeros((0, 2))
     recording = Recording(t_s[:0], none, t_s[:0], none, t_s[:0], nothing, t_s, truth, turned, nothing)
@@ -111,10 +111,10 @@ def test_what_tyres_slip_is_no_lateness_where_it_is_told():
 def test_the_response_of_true_wheels_is_told_whatever_turning_loses():
     command = joystick(5, 30.0)
     t_s = np.arange(command.shape[0] * 12) / 480.0
-    asked = np.repeat(command, 12, axis=0)
-    late = np.vstack([np.zeros((48, 2)), asked[:-48]])
+    commanded = np.repeat(command, 12, axis=0)
+    delayed = np.vstack([np.zeros((48, 2)), commanded[:-48]])
     speed, wheels = np.zeros(2), np.zeros((t_s.size, 2))
-    for k, wish in enumerate(late):
+    for k, wish in enumerate(delayed):
         speed = speed + (wish - speed) * -math.expm1(-1.0 / (480.0 * 0.17))
         wheels[k] = speed
     wheels += 0.2 * np.sign(wheels[:, 1:] - wheels[:, :1]) * [1.0, -1.0]
@@ -214,8 +214,8 @@ def test_a_robot_that_is_drawn_drives_and_turns_as_skid_steer_robots_do(number):
     straight, turning = 0.5 * robot.top_rad_s, 0.6 * robot.top_rad_s
     commands = np.tile([straight, straight], (80, 1)), np.tile([-turning, turning], (80, 1))
     driven = [record({}, 1, command, robot) for command in commands]
-    late = driven[0].truth_s > 1.0
-    slopes = [np.polyfit(one.truth_s[late], np.c_[one.turned, one.truth[:, 2]][late], 1)[0] for one in driven]
+    settled = driven[0].truth_s > 1.0
+    slopes = [np.polyfit(one.truth_s[settled], np.c_[one.turned, one.truth[:, 2]][settled], 1)[0] for one in driven]
     assert slopes[0][:4] == pytest.approx([straight] * 4, rel=0.01)
     assert abs(slopes[0][4]) < 0.01
     rolled = robot.wheel_radius_m * (slopes[1][1] - slopes[1][0])

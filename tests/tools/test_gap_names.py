@@ -10,12 +10,12 @@ from rich.console import Console
 from tools import gap_names
 from tools.gap_names import compare, differences, fixed_jobs
 
-ANSWER = {"log": "abc", "names": ["motor_lag"], "report": {"effects": [{"value": 0.1, "ci": [math.nan, 1.0]}]}}
+RESULT = {"log": "abc", "names": ["motor_lag"], "report": {"effects": [{"value": 0.1, "ci": [math.nan, 1.0]}]}}
 
 
 def compared(after):
     console = Console(record=True, file=io.StringIO(), width=300)
-    return compare({"one": ANSWER}, {"one": after}, console), console.export_text()
+    return compare({"one": RESULT}, {"one": after}, console), console.export_text()
 
 
 def test_the_logs_are_sixty_of_every_kind():
@@ -26,22 +26,22 @@ def test_the_logs_are_sixty_of_every_kind():
 
 
 def test_equal_answers_are_equal_and_the_last_bit_is_not():
-    equal, said = compared(json.loads(json.dumps(ANSWER)))
+    equal, output = compared(json.loads(json.dumps(RESULT)))
     assert equal
-    assert "other names in 0, equal to the last bit in 1" in said
-    other = copy.deepcopy(ANSWER)
+    assert "other names in 0, equal to the last bit in 1" in output
+    other = copy.deepcopy(RESULT)
     other["report"]["effects"][0]["value"] = math.nextafter(0.1, 1.0)
-    equal, said = compared(other)
+    equal, output = compared(other)
     assert not equal
-    assert "report.effects[0].value: 0.1 -> 0.10000000000000002" in said
-    assert "largest difference of two numbers: 1.4e-16" in said
+    assert "report.effects[0].value: 0.1 -> 0.10000000000000002" in output
+    assert "largest difference of two numbers: 1.4e-16" in output
 
 
 def test_other_names_and_other_logs_are_said():
-    equal, said = compared({**ANSWER, "names": [], "log": "other"})
+    equal, output = compared({**RESULT, "names": [], "log": "other"})
     assert not equal
-    assert "other names in 1" in said
-    assert "the logs themselves differ, so nothing follows for: one" in said
+    assert "other names in 1" in output
+    assert "the logs themselves differ, so nothing follows for: one" in output
 
 
 def test_what_is_missing_on_one_side_differs():
@@ -49,7 +49,7 @@ def test_what_is_missing_on_one_side_differs():
 
 
 def test_nothing_to_compare_is_not_equal():
-    assert not compare({}, {"one": ANSWER}, Console(quiet=True))
+    assert not compare({}, {"one": RESULT}, Console(quiet=True))
 
 
 def test_a_log_that_was_searched_is_not_searched_again(tmp_path, monkeypatch):
@@ -57,5 +57,5 @@ def test_a_log_that_was_searched_is_not_searched_again(tmp_path, monkeypatch):
     jobs = fixed_jobs()[:3]
     before, after = tmp_path / "before.json", tmp_path / "after.json"
     for path in (before, after):
-        path.write_text(json.dumps({job.key: ANSWER for job in jobs}))
+        path.write_text(json.dumps({job.key: RESULT for job in jobs}))
     assert gap_names.main([str(after), "--first", "3", "--compare", str(before)]) == 0

@@ -40,17 +40,19 @@ def test_what_this_pip_is_set_to_is_found(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("failing", ["uv", "pip --disable-pip-version-check install --quiet --no-compile uv"])
 def test_pip_installs_where_uv_cannot(failing, monkeypatch, capsys):
-    asked = []
+    command_lines = []
 
     def run(command, **_settings):
-        words = " ".join(command).removeprefix(f"{sys.executable} -m ")
-        asked.append(words)
-        return subprocess.CompletedProcess(command, int(words.startswith(failing) or words == failing), stdout="")
+        command_line = " ".join(command).removeprefix(f"{sys.executable} -m ")
+        command_lines.append(command_line)
+        return subprocess.CompletedProcess(
+            command, int(command_line.startswith(failing) or command_line == failing), stdout=""
+        )
 
     monkeypatch.setattr(subprocess, "run", run)
     monkeypatch.setattr(install, "find_spec", lambda _name: None)
     assert install.main(".[dev]") == 0
-    assert asked[-1] == "pip --disable-pip-version-check install --quiet --no-compile --editable .[dev]"
+    assert command_lines[-1] == "pip --disable-pip-version-check install --quiet --no-compile --editable .[dev]"
     assert "pip does" in capsys.readouterr().err
 
 

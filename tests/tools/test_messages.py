@@ -58,4 +58,4 @@ def test_every_reason_of_a_transition_and_every_remedy_of_a_fault_is_on_the_list
 
 def test_no_refusal_speaks_of_what_only_its_programmers_know(listed):
     private = ("NoneType", "AssertionError", "object at", "TODO")
-    assert not [message for message in listed if any(word in message.text for word in private)]
+    assert not [message for message in listed if any(term in message.text for term in private)]

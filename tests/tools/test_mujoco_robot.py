@@ -36,14 +36,14 @@ def numbers(source: str) -> set[float]:
     return found - NEUTRAL
 
 
-def held(left_rad_s: float, right_rad_s: float, seconds: float = 4.0) -> np.ndarray:
+def constant_commands(left_rad_s: float, right_rad_s: float, seconds: float = 4.0) -> np.ndarray:
     return np.tile([left_rad_s, right_rad_s], (round(seconds * PER_S), 1))
 
 
 def steady(recording: mujoco_robot.Recording) -> tuple[np.ndarray, float]:
     """Speeds of the wheels (4,) and yaw rate over the last two seconds, rad/s."""
-    late = recording.truth_s > recording.truth_s[-1] - 2.0
-    slope = np.polyfit(recording.truth_s[late], np.c_[recording.turned, recording.truth[:, 2]][late], 1)[0]
+    settled = recording.truth_s > recording.truth_s[-1] - 2.0
+    slope = np.polyfit(recording.truth_s[settled], np.c_[recording.turned, recording.truth[:, 2]][settled], 1)[0]
     return slope[:4], float(slope[4])
 
 
@@ -51,8 +51,8 @@ def test_it_shares_no_constant_and_no_code_with_our_simulator_and_model():
     source = "\n".join(file.read_text().replace("from __future__ import annotations", "") for file in SOURCES)
     ours = [file for room in ("sim", "disco_hw/model", "disco_hw/effects") for file in (ROOT / room).rglob("*.py")]
     assert len(ours) > 40
-    own = numbers(source)
-    both = {file.name: own & numbers(file.read_text()) for file in ours}
+    constants = numbers(source)
+    both = {file.name: constants & numbers(file.read_text()) for file in ours}
     assert not {name: shared for name, shared in both.items() if shared}
     imported = re.findall(r"^ *(?:from|import) ([\w.]+)", source, re.MULTILINE)
     strange = ("sim", "disco_hw.model", "disco_hw.effects", "tools")
@@ -66,7 +66,7 @@ def test_constants_that_are_shared_would_be_seen():
 @pytest.mark.parametrize("wheels", [(-2.0, 2.0), (-4.0, 4.0), (1.0, 3.0), (4.5, 2.5)])
 def test_it_turns_as_skid_steer_robots_do(wheels):
     """Effective over geometric track of published robots: 1.3 to 2.6."""
-    speeds, yaw_rate = steady(record({}, 1, held(*wheels)))
+    speeds, yaw_rate = steady(record({}, 1, constant_commands(*wheels)))
     rolled = WHEEL_RADIUS_M * (speeds[[1, 3]].mean() - speeds[[0, 2]].mean())
     assert 1.3 < rolled / yaw_rate / TRACK_M < 2.6
     # The contact holds the turn up, and the servos droop equally, however fast they are asked to turn.
@@ -78,22 +78,22 @@ def test_it_turns_as_skid_steer_robots_do(wheels):
 def test_robots_of_other_sizes_turn_so_too(name):
     robot = ROBOTS[name]
     for wheels in [(-4.0, 4.0), (1.0, 3.0)]:
-        speeds, yaw_rate = steady(record({}, 1, held(*wheels), robot))
+        speeds, yaw_rate = steady(record({}, 1, constant_commands(*wheels), robot))
         rolled = robot.wheel_radius_m * (speeds[[1, 3]].mean() - speeds[[0, 2]].mean())
         assert 1.3 < rolled / yaw_rate / robot.track_m < 2.6
-    speeds, _ = steady(record({"unequal_wheels": robot.size("unequal_wheels")}, 1, held(3.0, 3.0), robot))
+    speeds, _ = steady(record({"unequal_wheels": robot.size("unequal_wheels")}, 1, constant_commands(3.0, 3.0), robot))
     assert speeds[0] / speeds[1] == pytest.approx(1.0 + robot.size("unequal_wheels"), rel=0.005)
 
 
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
 def test_it_stands_where_it_stands(robot):
-    recording = record({}, 1, held(0.0, 0.0), robot)
+    recording = record({}, 1, constant_commands(0.0, 0.0), robot)
     assert np.abs(recording.truth - recording.truth[0]).max() < 1e-4
     assert np.abs(recording.turned).max() < 1e-3
 
 
 def test_wheels_settle_at_their_command_on_a_straight():
-    speeds, yaw_rate = steady(record({}, 1, held(3.0, 3.0)))
+    speeds, yaw_rate = steady(record({}, 1, constant_commands(3.0, 3.0)))
     assert speeds == pytest.approx([3.0] * 4, rel=0.005)
     assert abs(yaw_rate) < 1e-3
 
@@ -119,9 +119,9 @@ def test_a_robot_is_driven_and_logged_as_its_habits_say():
     assert rare.turned == pytest.approx(all_there.turned)
     assert (rare.command == command[::2]).all()
     # Stamps are late, never early, by half a normal distribution, and in order.
-    late_s = rare.command_s - np.arange(rare.command_s.size) * 2 / PER_S
-    assert (late_s >= 0.0).all()
-    assert np.sqrt((late_s**2).mean()) == pytest.approx(0.004, rel=0.15)
+    delay_s = rare.command_s - np.arange(rare.command_s.size) * 2 / PER_S
+    assert (delay_s >= 0.0).all()
+    assert np.sqrt((delay_s**2).mean()) == pytest.approx(0.004, rel=0.15)
     for times_s, period_s in ((rare.wheel_s, 24 / STEPS_PER_S), (rare.pose_s, 32 / STEPS_PER_S)):
         assert (np.diff(times_s) >= 0.0).all()
         assert 0.84 < times_s.size * period_s / 9.0 < 0.96
@@ -147,8 +147,8 @@ def test_a_delay_and_a_latency_are_there_to_the_step():
     command = joystick(2, 6.0)
     plain = record({}, 2, command)
     steps = round(0.145 * STEPS_PER_S)
-    late = record({"command_delay": 0.145}, 2, command)
-    assert late.turned[steps:] == pytest.approx(plain.turned[:-steps], abs=1e-6)
+    delayed = record({"command_delay": 0.145}, 2, command)
+    assert delayed.turned[steps:] == pytest.approx(plain.turned[:-steps], abs=1e-6)
     assert np.abs(plain.turned).max() > 1.0
     stamped = record({"pose_latency": 0.21}, 2, command)
     assert stamped.pose_s == pytest.approx(plain.pose_s[: stamped.pose_s.size] + 0.21)
@@ -156,14 +156,14 @@ def test_a_delay_and_a_latency_are_there_to_the_step():
 
 
 def test_each_other_effect_does_what_it_says():
-    straight, spin = held(3.0, 3.0, 3.0), held(-4.0, 4.0, 3.0)
+    straight, spin = constant_commands(3.0, 3.0, 3.0), constant_commands(-4.0, 4.0, 3.0)
     plain, turning = record({}, 1, straight), record({}, 1, spin)
     for name in ("dead_band", "dry_friction"):
         speeds, _ = steady(record({name: 0.57}, 1, straight))
         assert speeds == pytest.approx([3.0 - 0.57] * 4, rel=0.005)
-        assert np.abs(record({name: 0.57}, 1, held(0.3, -0.5)).turned).max() < 0.2
+        assert np.abs(record({name: 0.57}, 1, constant_commands(0.3, -0.5)).turned).max() < 0.2
     # Friction goes on while a command ends, what a drive ignores is a matter of commands alone.
-    ends = np.concatenate([held(3.0, 3.0, 2.0), held(0.0, 0.0, 1.0)])
+    ends = np.concatenate([constant_commands(3.0, 3.0, 2.0), constant_commands(0.0, 0.0, 1.0)])
     ignoring, rubbing = (record({name: 0.57}, 1, ends).turned[-1, 0] for name in ("dead_band", "dry_friction"))
     assert rubbing < ignoring - 0.01
     lagging = record({"motor_lag": 0.23}, 1, straight)
@@ -171,7 +171,7 @@ def test_each_other_effect_does_what_it_says():
     assert plain.turned[-1] - lagging.turned[-1] == pytest.approx(3.0 * (0.23 - 0.037), rel=0.03)
     speeds, _ = steady(record({"unequal_wheels": 0.042}, 1, straight))
     assert speeds[0] / speeds[1] == pytest.approx(1.042, rel=0.005)
-    assert record({"slope": 5.7}, 1, held(0.0, 0.0)).truth[-1, 0] > 0.01
+    assert record({"slope": 5.7}, 1, constant_commands(0.0, 0.0)).truth[-1, 0] > 0.01
     assert abs(steady(record({"torque_limit": 5.7}, 1, spin))[1]) < 0.95 * abs(steady(turning)[1])
     # Gently: at a blow the tyres slip.
     reversals = 2.0 * np.tile(np.sin(np.arange(6.0 * PER_S) / PER_S * 2.0), (2, 1)).T

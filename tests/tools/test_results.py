@@ -93,12 +93,12 @@ def test_every_figure_in_words_has_its_day_and_a_command_that_is_there(row):
     assert commands or gone, what
     targets = set(re.findall(r"^([a-z][\w\-]*):", (results.ROOT / "Makefile").read_text("utf-8"), re.MULTILINE))
     for command in commands:
-        words = command.removeprefix("sudo ").split()
-        if words[0] == "make":
-            assert {word for word in words[1:] if "=" not in word} <= targets, command
-        elif words[:2] == ["python", "-m"]:
-            assert (results.ROOT / (words[2].replace(".", "/") + ".py")).exists(), command
-        elif words[0] == "pytest":
-            assert all((results.ROOT / word).exists() for word in words[1:] if word.startswith("tests/")), command
+        parts = command.removeprefix("sudo ").split()
+        if parts[0] == "make":
+            assert {part for part in parts[1:] if "=" not in part} <= targets, command
+        elif parts[:2] == ["python", "-m"]:
+            assert (results.ROOT / (parts[2].replace(".", "/") + ".py")).exists(), command
+        elif parts[0] == "pytest":
+            assert all((results.ROOT / part).exists() for part in parts[1:] if part.startswith("tests/")), command
         else:
-            assert words[0] == "disco-hw", command
+            assert parts[0] == "disco-hw", command

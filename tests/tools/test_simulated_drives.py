@@ -100,8 +100,8 @@ def test_the_poor_drive_is_short_and_slow():
 
 def test_random_steps_hold_each_pair():
     drive = make_drive("random_steps", 1)
-    held = np.count_nonzero(np.diff(drive.left_rad_s) == 0.0) / len(drive.t_s)
-    assert held > 0.85
+    constant_share = np.count_nonzero(np.diff(drive.left_rad_s) == 0.0) / len(drive.t_s)
+    assert constant_share > 0.85
     assert drive.left_rad_s.min() < -4.0 < 4.0 < drive.left_rad_s.max()
 
 

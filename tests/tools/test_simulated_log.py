@@ -104,9 +104,9 @@ def test_time_stamps_jitter_as_asked():
 
 def test_lateness_is_in_commands_and_readings_and_not_in_poses():
     log = columns(simulated_log(CIRCLE, IDEAL, seed=1, options=LogOptions(lateness_s=0.001, stamp_jitter_s=0.0)))
-    late_s = log["t_s"][~np.isnan(log["cmd_left_rad_s"])] - CIRCLE.t_s
-    assert late_s.min() >= 0.0
-    assert late_s.mean() == pytest.approx(0.001, rel=0.1)
+    lateness_s = log["t_s"][~np.isnan(log["cmd_left_rad_s"])] - CIRCLE.t_s
+    assert lateness_s.min() >= 0.0
+    assert lateness_s.mean() == pytest.approx(0.001, rel=0.1)
     np.testing.assert_allclose(np.diff(log["t_s"][~np.isnan(log["pose_x_m"])]), 0.04, atol=1e-6)
 
 
@@ -155,7 +155,7 @@ def test_the_command_writes_log_and_truth(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "expected_error"),
     [
         (["--hide", "turnslip=0.1"], "turn_slip"),
         (["--hide", "motor_lag=-1"], "motor_lag"),
@@ -165,10 +165,10 @@ def test_the_command_writes_log_and_truth(tmp_path, capsys):
         (["--drive", "poor", "--truth", "no/such/folder/truth.json"], "truth.json"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_2(tmp_path, capsys, arguments, says):
+def test_bad_input_is_one_line_and_exit_code_2(tmp_path, capsys, arguments, expected_error):
     assert main([str(tmp_path / "log.csv"), *arguments]) == 2
     error = capsys.readouterr().err
-    assert says in error
+    assert expected_error in error
     assert error.count("\n") == 1
 
 

@@ -16,12 +16,12 @@ def split(decorator):
 
 
 @pytest.mark.parametrize(
-    ("keep", "quick"), [(1, [0]), (2, [0, 4]), (3, [0, 2, 4]), (5, [0, 1, 2, 3, 4]), (9, [0, 1, 2, 3, 4])]
+    ("keep", "expected"), [(1, [0]), (2, [0, 4]), (3, [0, 2, 4]), (5, [0, 1, 2, 3, 4]), (9, [0, 1, 2, 3, 4])]
 )
-def test_the_quick_cases_are_spread_from_the_first_to_the_last_and_none_is_lost(keep, quick):
+def test_the_quick_cases_are_spread_from_the_first_to_the_last_and_none_is_lost(keep, expected):
     kept, thorough = split(thinned("number", range(5), quick=keep))
-    assert kept == quick
-    assert [values for (values,) in thorough] == [number for number in range(5) if number not in quick]
+    assert kept == expected
+    assert [values for (values,) in thorough] == [number for number in range(5) if number not in expected]
 
 
 def test_a_tuple_is_one_value_of_one_argument_and_the_values_of_several():

@@ -70,7 +70,7 @@ def test_a_robot_that_obeys_is_left_alone():
 
 
 @pytest.mark.parametrize(
-    ("commit", "words"),
+    ("commit", "expected_text"),
     [
         (lambda s: s.accept(Frame(0x100, bytes(8))), "have a proof"),
         (lambda s: s.step(accepted_commands=99), "have a proof"),
@@ -90,10 +90,10 @@ def test_a_robot_that_obeys_is_left_alone():
         ),
     ],
 )
-def test_each_violation_is_reported(commit, words):
+def test_each_violation_is_reported(commit, expected_text):
     scene = Scene()
     commit(scene)
-    assert any(words in text for text in scene.monitor.violations), scene.monitor.violations
+    assert any(expected_text in text for text in scene.monitor.violations), scene.monitor.violations
 
 
 @pytest.mark.parametrize(("cycles_armed", "reported"), [(21, False), (24, True)])

@@ -15,7 +15,7 @@ from tests.drivers.motor.bench import Bench
 from tests.tables import thinned
 
 FORWARD = (3.0, 2.0)
-STILL = (DriverState.STANDBY, DriverState.READY)
+IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 class DriverConformance:
@@ -28,7 +28,7 @@ class DriverConformance:
     def create_driver(self):
         raise AssertionError("say how to make the driver")
 
-    def make_robot(self, first_ticks=(0, 0)):
+    def create_robot(self, first_ticks=(0, 0)):
         raise AssertionError("say how to make its robot")
 
     def near_the_wrap(self):
@@ -37,7 +37,7 @@ class DriverConformance:
 
     @pytest.fixture
     def bench(self):
-        return Bench(self.create_driver(), self.make_robot())
+        return Bench(self.create_driver(), self.create_robot())
 
     def stop_time_s(self, speed_rad_s):
         return self.watchdog_s + speed_rad_s / self.deceleration_rad_s2 + 0.05
@@ -49,7 +49,7 @@ class DriverConformance:
         assert driver.detail
 
     def test_introduces_itself_and_stays_still(self, bench):
-        bench.run_until(*STILL)
+        bench.run_until(*IDLE_STATES)
         assert bench.driver.identity.controller
         assert bench.driver.limits.ticks_per_rev.value > 0
         assert bench.driver.limits.max_wheel_speed_rad_s.value > 0
@@ -72,7 +72,7 @@ class DriverConformance:
             assert moved == pytest.approx(bench.robot.angle[wheel] - behind, abs=2 * resolution + 0.02)
 
     def test_ready_opens_a_session_and_moves_nothing(self, bench):
-        bench.run_until(*STILL)
+        bench.run_until(*IDLE_STATES)
         bench.driver.request(Request.READY)
         bench.run_until(DriverState.READY)
         bench.run(1.0, FORWARD)
@@ -90,7 +90,7 @@ class DriverConformance:
         bench.largest_speed = 0.0
         bench.run(3.0)
         assert bench.largest_speed == 0.0
-        assert bench.driver.state in STILL
+        assert bench.driver.state in IDLE_STATES
 
     def test_a_host_without_commands_stops_the_robot_and_arm_is_consumed(self, bench):
         """Alive and talking, but no command: the house-keeping must not feed the watchdog."""
@@ -99,7 +99,7 @@ class DriverConformance:
         bench.command = None
         bench.run(self.stop_time_s(max(FORWARD)))
         assert bench.robot.speed_rad_s < 0.05
-        bench.run_until(*STILL)
+        bench.run_until(*IDLE_STATES)
         bench.run(3.0, FORWARD)
         assert not bench.robot.armed
         assert bench.driver.detail not in ("", "armed", "arming"), "it says why"
@@ -111,7 +111,7 @@ class DriverConformance:
         assert bench.driver.state is DriverState.STOPPING
         bench.run(self.stop_time_s(max(FORWARD)))
         assert bench.robot.speed_rad_s < 0.05
-        bench.run_until(*STILL)
+        bench.run_until(*IDLE_STATES)
         assert not bench.robot.armed
 
     def test_arms_again_only_on_request(self, bench):
@@ -144,7 +144,7 @@ class DriverConformance:
         bench.robot.break_down(False)
         bench.run(0.5)
         bench.driver.request(Request.RESET)
-        bench.run_until(*STILL)
+        bench.run_until(*IDLE_STATES)
         bench.largest_speed = 0.0
         bench.run(2.0)
         assert bench.largest_speed == 0.0
@@ -152,7 +152,7 @@ class DriverConformance:
 
     @pytest.mark.parametrize("armed", [False, True])
     def test_the_hosts_emergency_stop_latches_in_any_state(self, bench, armed):
-        bench.run_until(*STILL)
+        bench.run_until(*IDLE_STATES)
         if armed:
             bench.arm()
             bench.run(0.5, FORWARD)
@@ -164,7 +164,7 @@ class DriverConformance:
         bench.run(2.0, FORWARD)
         assert bench.driver.state is DriverState.ESTOP
         bench.driver.request(Request.RESET)
-        bench.run_until(*STILL)
+        bench.run_until(*IDLE_STATES)
         bench.largest_speed = 0.0
         bench.run(2.0)
         assert bench.largest_speed == 0.0
@@ -185,13 +185,13 @@ class DriverConformance:
         bench.run(1.0)
         assert bench.driver.state is DriverState.ESTOP, "releasing the button alone is not enough"
         bench.driver.request(Request.RESET)
-        bench.run_until(*STILL)
+        bench.run_until(*IDLE_STATES)
         bench.largest_speed = 0.0
         bench.run(2.0)
         assert bench.largest_speed == 0.0
 
     def test_encoders_wrap_in_both_directions(self):
-        bench = Bench(self.create_driver(), self.make_robot(first_ticks=self.near_the_wrap()))
+        bench = Bench(self.create_driver(), self.create_robot(first_ticks=self.near_the_wrap()))
         bench.arm()
         for command in ((4.0, -4.0), (-4.0, 4.0), (4.0, -4.0)):
             bench.run(2.0, command)
@@ -215,7 +215,7 @@ class DriverConformance:
         bench.host_end.plug(True)
         bench.largest_speed = 0.0
         bench.run(3.0, FORWARD)
-        assert bench.driver.state in STILL
+        assert bench.driver.state in IDLE_STATES
         assert bench.largest_speed == 0.0
         angle = bench.wheels[-1].left_angle_rad
         assert angle > 1.0, "the angles go on from where they were"
@@ -231,7 +231,7 @@ class DriverConformance:
         bench.run(0.1)
         bench.host_end.plug(True)
         bench.run(1.0)
-        assert bench.driver.state in STILL
+        assert bench.driver.state in IDLE_STATES
         for before, after in itertools.pairwise(bench.wheels):
             assert abs(after.left_angle_rad - before.left_angle_rad) < 0.5
 
@@ -289,5 +289,5 @@ class DriverConformance:
         bench.driver.request(Request.RESET)
         bench.run(0.5)
         bench.driver.request(Request.STANDBY)
-        bench.run_until(*STILL)
+        bench.run_until(*IDLE_STATES)
         bench.arm()

@@ -56,8 +56,8 @@ class ToyController:
             return
         request, session, valid_ms, left, right = struct.unpack("<BBBhh", data[1:])
         # One reset for each time that it is asked for: a request held since before the cause was gone counts no more.
-        asked, self._request = request != self._request, request
-        if request == 3 and asked and self.state in (toy.FAULT, toy.ESTOP) and not (self.broken or self.pressed):
+        is_new, self._request = request != self._request, request
+        if request == 3 and is_new and self.state in (toy.FAULT, toy.ESTOP) and not (self.broken or self.pressed):
             self.state = toy.IDLE
         if request == 2 and self.state == toy.IDLE and session != self.session and (left, right) == (0, 0):
             self.state, self.session = toy.ARMED, session
@@ -105,7 +105,7 @@ class TestToyDriver(DriverConformance):
     def create_driver(self):
         return toy.DRIVER.make(None, None)
 
-    def make_robot(self, first_ticks=(0, 0)):
+    def create_robot(self, first_ticks=(0, 0)):
         return ToyController(first_ticks)
 
     def near_the_wrap(self):

@@ -10,7 +10,7 @@ from tests.drivers.motor.vendors import VENDORS
 
 (AGILEX,) = [vendor for vendor in VENDORS if vendor.name == "agilex"]
 FORWARD = (3.0, 2.0)
-STILL = (DriverState.STANDBY, DriverState.READY)
+IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 @pytest.fixture
@@ -23,12 +23,12 @@ def test_a_person_who_takes_the_remote_control_drives_and_that_is_no_fault(bench
     bench.run(0.5, FORWARD)
     bench.robot.controller.base.use_remote_control(0.3, 0.0)
     bench.run(0.3, FORWARD)
-    assert bench.driver.state in STILL
+    assert bench.driver.state in IDLE_STATES
     assert "remote control" in bench.driver.detail
     assert bench.robot.speed == pytest.approx((5.0, 5.0))
     bench.driver.request(Request.ARM)
     bench.run(1.0)
-    assert bench.driver.state in STILL
+    assert bench.driver.state in IDLE_STATES
     assert bench.robot.speed == pytest.approx((5.0, 5.0)), "the person still drives"
 
 
@@ -55,7 +55,7 @@ def test_the_buttons_stop_it_and_need_a_reset(bench):
     assert bench.driver.state is DriverState.FAULT, "releasing the button alone is not enough"
     assert bench.robot.speed_rad_s == 0.0
     bench.driver.request(Request.RESET)
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
 
 
 @pytest.mark.parametrize("warning", [0x0002, 0x0004, 0x0200, 0x0400])
@@ -106,12 +106,12 @@ def test_a_host_that_paused_for_longer_than_the_time_out_is_disarmed(bench, paus
 
 
 def test_it_does_not_arm_while_the_base_moves(bench):
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     bench.robot.stuck, bench.robot.speed = {0, 1}, [4.0, 4.0]
     bench.run(0.1)
     bench.driver.request(Request.ARM)
     bench.run(0.3, FORWARD)
-    assert bench.driver.state in STILL
+    assert bench.driver.state in IDLE_STATES
     assert "moving" in bench.driver.detail
     assert not [frame for frame in bench.robot.received if AGILEX.is_motion(frame)]
 
@@ -141,7 +141,7 @@ def test_a_person_who_takes_the_remote_control_while_it_slows_down_ends_that(ben
     bench.robot.controller.base.control_mode = CAN_MODE
     bench.run(0.5)
     assert not [frame for frame in bench.robot.received if AGILEX.is_motion(frame)]
-    assert bench.driver.state in STILL
+    assert bench.driver.state in IDLE_STATES
 
 
 def test_it_waits_for_the_wheels_to_stand_from_the_end_of_a_ramp_however_long_that_was():

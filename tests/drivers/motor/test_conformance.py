@@ -15,7 +15,7 @@ class TestReferenceDriver(DriverConformance):
     def create_driver(self):
         return ReferenceDriver(Codec(), itertools.count(41).__next__)
 
-    def make_robot(self, first_ticks=(0, 0)):
+    def create_robot(self, first_ticks=(0, 0)):
         return ReferenceRobot(first_ticks=first_ticks)
 
     def near_the_wrap(self):
@@ -30,5 +30,5 @@ class TestAuthenticatedReferenceDriver(TestReferenceDriver):
     def create_driver(self):
         return ReferenceDriver(Codec(), itertools.count(41).__next__, self.key)
 
-    def make_robot(self, first_ticks=(0, 0)):
+    def create_robot(self, first_ticks=(0, 0)):
         return ReferenceRobot(replace(CONFIG, key=self.key), first_ticks=first_ticks)

@@ -15,7 +15,7 @@ from disco_hw.errors import InputError
 from drivers.motor import DEFAULT, UnknownDriverError, create_driver, find_driver, motor_drivers
 from drivers.types import DriverState
 
-OWN = {name: driver.example for name, driver in motor_drivers().items()}
+EXAMPLES = {name: driver.example for name, driver in motor_drivers().items()}
 """The fields that a driver has in [link] of a robot of its kind."""
 ROOT = Path(__file__).parents[3]
 WOMBOT = ROOT / "disco_hw/robots/wombot.toml"
@@ -34,7 +34,7 @@ def robot_toml(folder, link):
 def test_every_driver_is_made_by_its_name_and_begins_without_a_link():
     for name, driver in motor_drivers().items():
         assert driver.name == name
-        settings = msgspec.convert(tomllib.loads(OWN[name]), driver.settings)
+        settings = msgspec.convert(tomllib.loads(EXAMPLES[name]), driver.settings)
         assert create_driver(name, settings).state is DriverState.DISCONNECTED
 
 
@@ -74,12 +74,12 @@ def test_robot_toml_with_an_unknown_driver_is_refused_in_one_line(tmp_path):
 
 def test_robot_toml_may_name_each_driver(tmp_path):
     for name in motor_drivers():
-        link = f'driver = "{name}"\nkind = "{motor_drivers()[name].kinds[0]}"\n{OWN[name]}'
+        link = f'driver = "{name}"\nkind = "{motor_drivers()[name].kinds[0]}"\n{EXAMPLES[name]}'
         assert load_robot_config(robot_toml(tmp_path, link)).link.driver == name
 
 
 @pytest.mark.parametrize(
-    ("link", "said"),
+    ("link", "expected_error"),
     [
         ("nodes = [3, 5]", r"link\.nodes: belongs to the driver odrive, but link.driver is reference; remove it"),
         ('driver = "odrive"\nnodes = [3, 5]\nvel_limit_turns_s = 10.0', r"watchdog_s: missing; add it"),
@@ -94,15 +94,24 @@ def test_robot_toml_may_name_each_driver(tmp_path):
             r"watchdog_s: 0\.25 is not a multiple of 0\.1",
         ),
         (f'{ROBOCLAW.replace("serial", "can")}motors = ["128/1", "128/2"]', r'roboclaw does not .*; write "serial"'),
-        (f'driver = "vesc"\nkind = "serial"\n{OWN["vesc"]}', r"link\.uart_node: belongs to a serial line, .*add it"),
-        (f'driver = "vesc"\n{OWN["vesc"]}uart_node = 23', r"link\.uart_node: belongs to a serial line, .*remove it"),
-        (f'driver = "vesc"\nkind = "serial"\n{OWN["vesc"]}uart_node = 9', r"link\.uart_node: 9 is not in link\.nodes"),
+        (
+            f'driver = "vesc"\nkind = "serial"\n{EXAMPLES["vesc"]}',
+            r"link\.uart_node: belongs to a serial line, .*add it",
+        ),
+        (
+            f'driver = "vesc"\n{EXAMPLES["vesc"]}uart_node = 23',
+            r"link\.uart_node: belongs to a serial line, .*remove it",
+        ),
+        (
+            f'driver = "vesc"\nkind = "serial"\n{EXAMPLES["vesc"]}uart_node = 9',
+            r"link\.uart_node: 9 is not in link\.nodes",
+        ),
         ("of_driver = 3", r"link\.of_driver: no such field"),
         ("gears = 3", r"gears: no such field"),
     ],
 )
-def test_a_field_that_is_not_the_drivers_or_is_wrong_is_refused_by_name(tmp_path, link, said):
-    with pytest.raises(InputError, match=said) as refused:
+def test_a_field_that_is_not_the_drivers_or_is_wrong_is_refused_by_name(tmp_path, link, expected_error):
+    with pytest.raises(InputError, match=expected_error) as refused:
         load_robot_config(robot_toml(tmp_path, link))
     assert "\n" not in str(refused.value)
 

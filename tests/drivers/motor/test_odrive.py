@@ -11,7 +11,7 @@ from tests.drivers.motor.vendors import VENDORS
 
 NEW, OLD = VENDORS[:2]
 FORWARD = (3.0, 2.0)
-STILL = (DriverState.STANDBY, DriverState.READY)
+IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 @pytest.fixture(params=[NEW, OLD], ids=str)
@@ -24,7 +24,7 @@ def axes(bench):
 
 
 def test_arming_sets_mode_and_zero_before_the_closed_loop_of_each_axis(bench):
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     bench.run(1.0)
     bench.robot.received.clear()
     bench.arm()
@@ -39,7 +39,7 @@ def test_arming_sets_mode_and_zero_before_the_closed_loop_of_each_axis(bench):
 
 
 def test_a_velocity_left_by_somebody_else_does_not_move_it(bench):
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     for axis in axes(bench):
         axis.input_vel_turns_s = 5.0
     bench.arm()
@@ -49,7 +49,7 @@ def test_a_velocity_left_by_somebody_else_does_not_move_it(bench):
 def test_a_watchdog_that_ran_out_while_nobody_drove_is_cleared_by_arming_alone(bench):
     assert bench.robot.controller.boards[0].axes[0].watchdog_enabled
     bench.run(0.5)
-    assert bench.driver.state in STILL
+    assert bench.driver.state in IDLE_STATES
     bench.arm()
     assert [axis.axis_error for axis in axes(bench)] == [0, 0]
 
@@ -68,12 +68,12 @@ def test_an_axis_that_idles_without_an_error_is_a_fault_that_stays(bench):
 def test_one_axis_whose_heartbeat_fails_to_come_stops_the_others(bench):
     bench.arm()
     bench.run(0.5, FORWARD)
-    lost = axes(bench)[1].node_id
+    silent_node = axes(bench)[1].node_id
     drain = bench.robot.drain
-    bench.robot.drain = lambda: [frame for frame in drain() if frame.can_id != lost << 5 | 1]
+    bench.robot.drain = lambda: [frame for frame in drain() if frame.can_id != silent_node << 5 | 1]
     bench.run(0.2, FORWARD)
     assert bench.driver.state is DriverState.FAULT
-    assert f"node {lost} stopped reporting" in bench.driver.detail
+    assert f"node {silent_node} stopped reporting" in bench.driver.detail
     assert CLOSED_LOOP not in [axis.axis_state for axis in axes(bench)]
 
 
@@ -86,9 +86,9 @@ def test_a_missing_node_is_named():
     assert "node 5" in bench.driver.detail
 
 
-@pytest.mark.parametrize(("said", "plays"), [(NEW, OLD), (OLD, NEW)], ids=["old for new", "new for old"])
-def test_another_generation_than_declared_is_refused(said, plays):
-    bench = said.bench()
+@pytest.mark.parametrize(("declared", "plays"), [(NEW, OLD), (OLD, NEW)], ids=["old for new", "new for old"])
+def test_another_generation_than_declared_is_refused(declared, plays):
+    bench = declared.bench()
     bench.robot.controller = plays.bench().robot.controller
     bench.run(2.0)
     assert bench.driver.state is DriverState.REFUSED
@@ -97,14 +97,14 @@ def test_another_generation_than_declared_is_refused(said, plays):
 
 
 def test_an_axis_that_calibrates_is_refused_until_it_has_done(bench):
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     calibrating = axes(bench)[0]
     calibrating.axis_error, calibrating.axis_state = 0, 3
     calibrating.feed()
     bench.run(0.3)
     assert bench.driver.state is DriverState.REFUSED
     axes(bench)[0].axis_state = IDLE
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
 
 
 def test_axes_that_somebody_else_has_armed_are_brought_to_idle(bench):
@@ -116,7 +116,7 @@ def test_axes_that_somebody_else_has_armed_are_brought_to_idle(bench):
 
 
 def test_an_axis_that_is_not_calibrated_is_said_not_to_arm(bench):
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     axes(bench)[1].calibrated = False
     bench.driver.request(Request.ARM)
     bench.run(2.0)
@@ -137,13 +137,13 @@ def test_a_position_that_jumps_does_not_move_the_angle(bench):
 
 def test_it_does_not_arm_while_an_axis_turns(bench):
     """The closed loop holds zero from its first moment: it would brake as hard as it can."""
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     bench.robot.speed = [4.0, 4.0]
     bench.run(0.1)
     bench.robot.received.clear()
     bench.driver.request(Request.ARM)
     bench.run(0.3, FORWARD)
-    assert bench.driver.state in STILL
+    assert bench.driver.state in IDLE_STATES
     assert "a motor is turning" in bench.driver.detail
     assert not [frame for frame in bench.robot.received if frame.can_id & 0x1F == 0x07 and frame.data[0] == CLOSED_LOOP]
 
@@ -151,8 +151,8 @@ def test_it_does_not_arm_while_an_axis_turns(bench):
 def test_it_does_not_arm_without_encoder_estimates(bench):
     drain = bench.robot.drain
     bench.robot.drain = lambda: [frame for frame in drain() if frame.can_id & 0x1F != 0x09]
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     bench.driver.request(Request.ARM)
     bench.run(0.3)
-    assert bench.driver.state in STILL
+    assert bench.driver.state in IDLE_STATES
     assert "no encoder estimates" in bench.driver.detail

@@ -55,10 +55,10 @@ def test_a_node_that_does_not_exist_is_refused():
 
 def test_a_parameter_is_read_only_from_the_answer_to_its_own_endpoint():
     assert protocol.read_parameter(3, 0x102) == Frame(0x064, bytes.fromhex("0002010000000000"))
-    answer = Frame(0x065, bytes.fromhex("00020100") + struct.pack("<f", 0.1))
-    assert protocol.parameter(answer, 3, 0x102, "f32") == pytest.approx(0.1)
-    assert protocol.parameter(answer, 3, 0x103, "f32") is None
-    assert protocol.parameter(answer, 4, 0x102, "f32") is None
+    response = Frame(0x065, bytes.fromhex("00020100") + struct.pack("<f", 0.1))
+    assert protocol.parameter(response, 3, 0x102, "f32") == pytest.approx(0.1)
+    assert protocol.parameter(response, 3, 0x103, "f32") is None
+    assert protocol.parameter(response, 4, 0x102, "f32") is None
 
 
 @given(st.integers(0, 0x7FF), st.binary(max_size=8), st.sampled_from(Generation), st.booleans())

@@ -56,15 +56,16 @@ EVENTS = {
 }
 
 GONE = {"stage": REST, "target": STANDBY, "since_ns": None}
-LOST_LINK = {**GONE, "note": "disarmed: the link was lost"}
+DISARMED_BY_LINK = {**GONE, "note": "disarmed: the link was lost"}
 MET = {**GONE, "events": ("met anew",)}
-LOST = {**GONE, "note": "disarmed: why", "fault": "why", "events": ("disarmed: why",)}
+DISARMED_WITH_FAULT = {**GONE, "note": "disarmed: why", "fault": "why", "events": ("disarmed: why",)}
 STOPPED = {**GONE, "note": "emergency stop sent", "estopped": True}
 RECEIVED = {**GONE, "estopped": True, "events": (STOPPED_FROM_OUTSIDE,)}
 SHARED = "another host is on the link: it commands wheel 3; disconnect it"
-TAKEN = "another host commands wheel 3; disconnect it"
+OTHER_HOST = "another host commands wheel 3; disconnect it"
 FOREIGN = {
-    **GONE, "shared": True, "note": f"disarmed: {TAKEN}", "fault": TAKEN, "events": (SHARED, f"disarmed: {TAKEN}"),
+    **GONE, "shared": True, "note": f"disarmed: {OTHER_HOST}", "fault": OTHER_HOST,
+    "events": (SHARED, f"disarmed: {OTHER_HOST}"),
 }  # fmt: skip
 ARMS = {"target": ARM, "stage": ARMING, "note": "arming", "since_ns": None, "zeros": 0, "speeds": (0.0, 0.0)}
 SLOWS = {"stage": STOPPING, "note": "stopping as requested", "since_ns": None}
@@ -80,7 +81,7 @@ SAME = {
     "do reset": {"target": RESET},
     "begun": {"since_ns": NOW},
     "given up": GIVEN_UP,
-    "lost": LOST,
+    "lost": DISARMED_WITH_FAULT,
     "e-stop": STOPPED,
     "e-stop heard": RECEIVED,
     "command heard": FOREIGN,
@@ -107,8 +108,8 @@ OTHERWISE = {
         "e-stop heard": {**GONE, "estopped": True},
     },
     "arming": {
-        "link up": LOST_LINK,
-        "link down": {**LOST_LINK, "link_is_up": False},
+        "link up": DISARMED_BY_LINK,
+        "link down": {**DISARMED_BY_LINK, "link_is_up": False},
         "restarted": {**MET, "note": "disarmed: it restarted"},
         "arm": {},
         "arm, unfit": {},
@@ -120,8 +121,8 @@ OTHERWISE = {
         "proof": {"stage": ARMED, "note": "armed", "fed_ns": NOW, "speeds": (0.0, 0.0)},
     },
     "armed": {
-        "link up": LOST_LINK,
-        "link down": {**LOST_LINK, "link_is_up": False},
+        "link up": DISARMED_BY_LINK,
+        "link down": {**DISARMED_BY_LINK, "link_is_up": False},
         "restarted": {**MET, "note": "disarmed: it restarted"},
         "arm": {},
         "arm, unfit": {},
@@ -144,17 +145,17 @@ OTHERWISE = {
 def test_each_stage_takes_each_event_so(stage):
     before, otherwise = AT[stage], OTHERWISE[stage]
     expected = {event: replace(before, **otherwise.get(event, SAME.get(event, {}))) for event in EVENTS}
-    assert {event: take(before) for event, take in EVENTS.items()} == expected
+    assert {event: apply_event(before) for event, apply_event in EVENTS.items()} == expected
 
 
-ESTOP_WORDS = "emergency stop; remove its cause, then reset"
+ESTOP_TEXT = "emergency stop; remove its cause, then reset"
 STATES = [
     ({"link_is_up": False, "estopped": True}, WELL, DriverState.DISCONNECTED, "the link is down"),
     (
         {"estopped": True, "fault": "old"},
         ILL["refused"],
         DriverState.ESTOP,
-        ESTOP_WORDS,
+        ESTOP_TEXT,
     ),
     ({}, ILL["stopped"], DriverState.ESTOP, "why"),
     ({"fault": "old"}, ILL["refused"], DriverState.REFUSED, "why"),
@@ -214,9 +215,9 @@ def test_a_loss_and_an_emergency_stop_end_where_the_driver_says(event):
 
 
 def test_whoever_else_is_on_the_link_is_said_once_and_again_after_a_restart():
-    once = AT["rest"].command_received("wheel 3")
-    assert once.command_received("wheel 4").events == (SHARED,)
-    assert once.restarted("it restarted").command_received("wheel 3").events == (SHARED, SHARED)
+    reported = AT["rest"].command_received("wheel 3")
+    assert reported.command_received("wheel 4").events == (SHARED,)
+    assert reported.restarted("it restarted").command_received("wheel 3").events == (SHARED, SHARED)
     stopped = AT["armed"].stop_received()
     assert stopped.stop_received().events == (STOPPED_FROM_OUTSIDE,)
 

@@ -14,14 +14,14 @@ from tests.drivers.motor.bench import MS, START_NS, Bench
 from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot
 
 CODEC = Codec()
-STILL = (DriverState.STANDBY, DriverState.READY)
+IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 def create_driver():
     return ReferenceDriver(CODEC, itertools.count(3).__next__)
 
 
-def make_bench(robot=None, **options):
+def create_bench(robot=None, **options):
     return Bench(create_driver(), robot or ReferenceRobot(), **options)
 
 
@@ -34,16 +34,16 @@ def test_says_what_it_waits_for():
     assert "no answer from the robot" in driver.detail
     driver.request(Request.ARM)
     assert driver.detail == "no answer from the robot; check that it is switched on and uses the same bit rate"
-    bench = make_bench()
+    bench = create_bench()
     bench.driver = driver
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     assert "not arming: no answer from the robot" in driver.detail
     bench.run(1.0)
     assert not bench.robot.armed, "a request made too early is not remembered"
 
 
 def test_another_major_version_is_refused():
-    bench = make_bench(ReferenceRobot(replace(CONFIG, protocol_major=2)))
+    bench = create_bench(ReferenceRobot(replace(CONFIG, protocol_major=2)))
     bench.run_until(DriverState.REFUSED)
     assert "the robot speaks protocol 2.0, this host 1.0" in bench.driver.detail
     bench.driver.request(Request.ARM)
@@ -53,7 +53,7 @@ def test_another_major_version_is_refused():
 
 
 def test_another_dbc_is_refused_but_telemetry_is_shown():
-    bench = make_bench(ReferenceRobot(replace(CONFIG, dbc_hash=0x0BADCAFE)))
+    bench = create_bench(ReferenceRobot(replace(CONFIG, dbc_hash=0x0BADCAFE)))
     bench.run_until(DriverState.REFUSED)
     assert "0badcafe" in bench.driver.detail
     assert f"{CODEC.dbc_hash:08x}" in bench.driver.detail
@@ -68,15 +68,15 @@ def test_another_dbc_is_refused_but_telemetry_is_shown():
 
 
 def test_a_robot_flashed_meanwhile_is_taken():
-    bench = make_bench(ReferenceRobot(replace(CONFIG, dbc_hash=0x0BADCAFE)))
+    bench = create_bench(ReferenceRobot(replace(CONFIG, dbc_hash=0x0BADCAFE)))
     bench.run_until(DriverState.REFUSED)
     bench.robot = ReferenceRobot(boot_ns=bench.now_ns)
-    bench.run_until(*STILL, timeout_s=6.0)
+    bench.run_until(*IDLE_STATES, timeout_s=6.0)
 
 
 @pytest.mark.parametrize("rate_hz", [20, 50, 100])
 def test_arms_at_every_control_rate(rate_hz):
-    bench = make_bench(rate_hz=rate_hz)
+    bench = create_bench(rate_hz=rate_hz)
     bench.arm()
     bench.run(2.0, (3.0, 2.0))
     assert bench.driver.state is DriverState.ARMED
@@ -84,7 +84,7 @@ def test_arms_at_every_control_rate(rate_hz):
 
 
 def test_each_arming_has_a_session_of_its_own():
-    bench = make_bench()
+    bench = create_bench()
     sessions = []
     for _ in range(4):
         bench.arm()
@@ -96,7 +96,7 @@ def test_each_arming_has_a_session_of_its_own():
 
 
 def test_a_robot_that_falls_silent_starts_a_new_handshake():
-    bench = make_bench()
+    bench = create_bench()
     bench.arm()
     bench.run(1.0, (3.0, 3.0))
     bench.loses = lambda _: True
@@ -104,7 +104,7 @@ def test_a_robot_that_falls_silent_starts_a_new_handshake():
     assert bench.driver.identity is bench.driver.limits is None
     bench.loses = None
     bench.largest_speed = 0.0
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     assert bench.driver.detail == "disarmed: the robot stopped sending"
     bench.run(2.0)
     assert bench.largest_speed == 0.0
@@ -112,7 +112,7 @@ def test_a_robot_that_falls_silent_starts_a_new_handshake():
 
 def test_a_lossy_link_does_not_disarm():
     """Three frames in a row may not be lost at 50 Hz: the fourth is out of sequence and the fifth comes too late."""
-    bench = make_bench(loses=lambda generator: generator.random() < 0.03)
+    bench = create_bench(loses=lambda generator: generator.random() < 0.03)
     bench.arm()
     bench.run(10.0, (3.0, 2.0))
     assert bench.driver.state is DriverState.ARMED
@@ -122,12 +122,12 @@ def test_a_lossy_link_does_not_disarm():
 
 
 def test_arming_is_given_up_with_the_robots_own_reason():
-    bench = make_bench()
-    bench.run_until(*STILL)
+    bench = create_bench()
+    bench.run_until(*IDLE_STATES)
     bench.robot.pushed = 1.0
     bench.driver.request(Request.ARM)
     assert bench.driver.state is DriverState.ARMING
-    bench.run_until(*STILL, timeout_s=1.6)
+    bench.run_until(*IDLE_STATES, timeout_s=1.6)
     assert "the robot did not arm within 1.5 s" in bench.driver.detail
     assert "the wheels are turning" in bench.driver.detail
     bench.robot.pushed = 0.0
@@ -136,8 +136,8 @@ def test_arming_is_given_up_with_the_robots_own_reason():
 
 
 def test_a_second_host_is_pointed_out_once_a_link():
-    bench = make_bench()
-    bench.run_until(*STILL)
+    bench = create_bench()
+    bench.run_until(*IDLE_STATES)
     other = CODEC.encode("TIME_REQUEST", 0, sequence=1)
     reported = "another host is on the link: it sends TIME_REQUEST; disconnect it"
     for _ in range(3):
@@ -155,7 +155,7 @@ def test_a_second_host_is_pointed_out_once_a_link():
 
 
 def test_a_second_host_that_commands_motion_stops_the_robot_but_never_drives_it():
-    bench = make_bench()
+    bench = create_bench()
     bench.arm()
     bench.run(0.5, (1.0, 1.0))
     for counter in range(400):
@@ -172,7 +172,7 @@ def test_a_second_host_that_commands_motion_stops_the_robot_but_never_drives_it(
 
 def test_an_estop_from_outside_is_no_second_host_and_is_said_once_a_stop():
     """As `disco-hw estop` sends it beside the daemon: three frames, which the robot and the driver both receive."""
-    bench = make_bench()
+    bench = create_bench()
     bench.arm()
     reported = "e-stop received on the link, sent by `disco-hw estop` or another host"
     for stops in (1, 2):
@@ -188,8 +188,8 @@ def test_an_estop_from_outside_is_no_second_host_and_is_said_once_a_stop():
 
 
 def test_a_second_host_is_pointed_out_even_if_it_sends_an_estop_first():
-    bench = make_bench()
-    bench.run_until(*STILL)
+    bench = create_bench()
+    bench.run_until(*IDLE_STATES)
     bench.inject_to_host(*CODEC.encode("ESTOP", reason="UNSPECIFIED"))
     bench.inject_to_host(*CODEC.encode("TIME_REQUEST", 0, sequence=1))
     bench.run(0.1)
@@ -197,7 +197,7 @@ def test_a_second_host_is_pointed_out_even_if_it_sends_an_estop_first():
 
 
 def test_a_new_link_voids_everything_even_if_its_loss_went_unseen():
-    bench = make_bench()
+    bench = create_bench()
     bench.arm()
     bench.run(2.0, (1.0, 1.0))
     driver = bench.driver
@@ -216,18 +216,18 @@ def test_a_new_link_voids_everything_even_if_its_loss_went_unseen():
     }
 
 
-def answer(name, counter=0, **signals):
+def received_frame(name, counter=0, **signals):
     return ReceivedFrame(START_NS, Frame(*CODEC.encode(name, counter, **signals)))
 
 
 def limits(page):
     if page == 0:
-        return answer("LIMITS", page=0, max_wheel_speed=8, max_wheel_acceleration=20, ticks_per_rev=2048)
-    return answer("LIMITS", page=1, command_timeout=0.1, drive_off_timeout=0.5, stop_deceleration=20)
+        return received_frame("LIMITS", page=0, max_wheel_speed=8, max_wheel_acceleration=20, ticks_per_rev=2048)
+    return received_frame("LIMITS", page=1, command_timeout=0.1, drive_off_timeout=0.5, stop_deceleration=20)
 
 
 def hello():
-    return answer(
+    return received_frame(
         "HELLO",
         protocol_major=1,
         protocol_minor=0,
@@ -243,7 +243,7 @@ def test_says_which_part_of_the_handshake_is_missing():
     driver.link_up(START_NS)
     driver.receive(START_NS, [hello(), limits(0)])
     assert driver.detail == "waiting for the robot's BUILD, LIMITS"
-    driver.receive(START_NS, [answer("BUILD", dbc_hash=CODEC.dbc_hash, board_id=1), limits(1)])
+    driver.receive(START_NS, [received_frame("BUILD", dbc_hash=CODEC.dbc_hash, board_id=1), limits(1)])
     assert driver.identity is not None
     assert driver.detail == "waiting for the robot's SYSTEM_STATE"
     later_ns = START_NS + 400 * MS
@@ -255,17 +255,17 @@ def test_a_response_to_a_request_of_the_last_link_teaches_nothing():
     driver.link_up(START_NS)
     driver.transmit(START_NS, None)
     driver.link_up(START_NS)
-    driver.receive(START_NS, [answer("TIME_RESPONSE", sequence=1, receive_time=5)])
+    driver.receive(START_NS, [received_frame("TIME_RESPONSE", sequence=1, receive_time=5)])
     assert driver.clock_offset_ns is None
     driver.transmit(START_NS, None)
-    driver.receive(START_NS, [answer("TIME_RESPONSE", sequence=2, receive_time=5)])
+    driver.receive(START_NS, [received_frame("TIME_RESPONSE", sequence=2, receive_time=5)])
     assert driver.clock_offset_ns == START_NS - 5_000
 
 
 @pytest.mark.parametrize("call", ["receive", "transmit"])
 def test_silence_is_noticed_by_each_half_of_a_tick(call):
-    bench = make_bench()
-    bench.run_until(*STILL)
+    bench = create_bench()
+    bench.run_until(*IDLE_STATES)
     driver, later_ns = bench.driver, bench.now_ns + 501 * MS
     if call == "receive":
         assert (
@@ -278,7 +278,7 @@ def test_silence_is_noticed_by_each_half_of_a_tick(call):
 
 
 def test_nothing_is_silent_that_was_never_heard():
-    bench = make_bench()
+    bench = create_bench()
     bench.loses = lambda _: True
     bench.run(4.0)
     assert bench.events == []
@@ -289,7 +289,7 @@ def test_nothing_is_silent_that_was_never_heard():
 )
 def test_a_silence_counts_only_beyond_its_limit_which_is_longer_for_a_robot_that_was_refused(protocol, silence_ms):
     """One that is refused says less, and should stay refused in words until it is gone."""
-    bench = make_bench(ReferenceRobot(replace(CONFIG, **protocol)))
+    bench = create_bench(ReferenceRobot(replace(CONFIG, **protocol)))
     bench.run_until(DriverState.REFUSED if protocol else DriverState.STANDBY)
     received_ns = bench.driver._last_received_ns
     assert bench.driver.receive(received_ns + silence_ms * MS, ()).events == ()
@@ -318,7 +318,7 @@ def test_a_robot_that_has_shown_only_its_state_can_fall_silent_too():
 def test_a_robot_that_has_shown_all_but_its_state_can_fall_silent_too():
     driver = create_driver()
     driver.link_up(START_NS)
-    build = answer("BUILD", dbc_hash=CODEC.dbc_hash, board_id=1)
+    build = received_frame("BUILD", dbc_hash=CODEC.dbc_hash, board_id=1)
     driver.receive(START_NS, [hello(), limits(0), limits(1), build])
     assert driver.identity is not None
     assert (
@@ -328,7 +328,7 @@ def test_a_robot_that_has_shown_all_but_its_state_can_fall_silent_too():
 
 
 def test_a_robot_that_turns_out_to_be_another_is_commanded_no_more():
-    bench = make_bench()
+    bench = create_bench()
     bench.arm()
     bench.run(0.5, (1.0, 1.0))
     bench.inject_to_host(*CODEC.encode("BUILD", 0, dbc_hash=0x0BADCAFE, board_id=1))
@@ -339,7 +339,7 @@ def test_a_robot_that_turns_out_to_be_another_is_commanded_no_more():
 
 
 def test_an_emergency_stop_of_ours_ends_the_wish_to_be_armed():
-    bench = make_bench()
+    bench = create_bench()
     bench.arm()
     bench.driver.estop(bench.now_ns)
     assert bench.driver.state is DriverState.STOPPING
@@ -349,13 +349,13 @@ def test_an_emergency_stop_of_ours_ends_the_wish_to_be_armed():
 
 
 def test_faults_and_emergency_stops_are_reported_in_words():
-    bench = make_bench()
+    bench = create_bench()
     bench.arm()
     bench.robot.press_estop(True)
     bench.run_until(DriverState.ESTOP)
     assert bench.driver.detail == "emergency stop button pressed; release it, then reset"
-    bench = make_bench()
-    bench.run_until(*STILL)
+    bench = create_bench()
+    bench.run_until(*IDLE_STATES)
     bench.robot.break_down(True)
     bench.run_until(DriverState.FAULT)
     assert bench.driver.detail == f"the robot reports OVER_CURRENT_LEFT: {FAULTS['OVER_CURRENT_LEFT'].advice}"
@@ -363,13 +363,13 @@ def test_faults_and_emergency_stops_are_reported_in_words():
 
 
 def test_a_board_whose_wheels_are_virtual_is_distinguished_from_a_robots():
-    bench = make_bench(ReferenceRobot(replace(CONFIG, board_id=0x8003)))
-    bench.run_until(*STILL)
+    bench = create_bench(ReferenceRobot(replace(CONFIG, board_id=0x8003)))
+    bench.run_until(*IDLE_STATES)
     assert any("board 3 with VIRTUAL wheels" in event for event in bench.events)
 
 
 def test_each_event_is_reported_once():
-    bench = make_bench()
+    bench = create_bench()
     bench.arm()
     bench.run(2.0)
     reported = [event for event in bench.events if not event.startswith("handshake complete: firmware 0.1.0, board 1")]
@@ -378,7 +378,7 @@ def test_each_event_is_reported_once():
 
 
 def test_slow_telemetry_is_handed_on():
-    bench = make_bench()
+    bench = create_bench()
     bench.run(6.0)
     kinds = {
         kind for readings in bench.readings for kind in ("motors", "power", "link_health") if getattr(readings, kind)
@@ -389,7 +389,7 @@ def test_slow_telemetry_is_handed_on():
 
 
 def test_commands_are_counted():
-    bench = make_bench()
+    bench = create_bench()
     bench.arm()
     before = bench.driver.stats.commands_sent
     bench.run(1.0, (1.0, 1.0))
@@ -429,7 +429,7 @@ def test_emergency_stop_frames():
 
 
 def test_a_command_leaves_in_time_or_not_at_all():
-    bench = make_bench()
+    bench = create_bench()
     bench.arm()
     (command,) = (
         outgoing
@@ -445,7 +445,7 @@ def test_a_command_leaves_in_time_or_not_at_all():
 
 
 def test_released_its_motors_are_off_for_a_moment_then_braked_and_nothing_that_is_wanted_meanwhile_ramps():
-    bench = make_bench()
+    bench = create_bench()
     bench.arm()
     bench.run(0.6, (3.0, 2.0))
     bench.driver.release("the left wheel does not count")

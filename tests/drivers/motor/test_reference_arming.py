@@ -192,8 +192,13 @@ def test_arming_that_takes_too_long_is_given_up_with_the_robots_reason():
     assert one.target is Request.ARM
     one.step(start_ns + ARMING_TIMEOUT_NS + 1)
     assert one.target is Request.STANDBY
-    for words in ("the robot did not arm within 1.5 s", "challenge is not answered", "wheels are turning", "was wrong"):
-        assert words in one.note
+    for fragment in (
+        "the robot did not arm within 1.5 s",
+        "challenge is not answered",
+        "wheels are turning",
+        "was wrong",
+    ):
+        assert fragment in one.note
     report(one, "ARMED")
     assert not one.armed, "an arming that comes too late is not taken"
     assert one.host_state().request == "STANDBY"
@@ -303,7 +308,7 @@ PAGE1 = {"page": 1, "command_timeout": 0.1, "drive_off_timeout": 0.5, "stop_dece
 FRAMES = (("HELLO", HELLO), ("BUILD", BUILD), ("LIMITS", PAGE0), ("LIMITS", PAGE1))
 
 
-def take(handshake, *frames):
+def handle_frames(handshake, *frames):
     for name, values in frames:
         handshake.handle(Decoded(name, 0, 0, values))
     return handshake
@@ -315,7 +320,7 @@ def test_complete_with_the_last_frame_in_any_order(frames):
     for frame in frames:
         assert handshake.identity is handshake.limits is None
         assert handshake.missing
-        take(handshake, frame)
+        handle_frames(handshake, frame)
     assert handshake.missing == ()
     assert handshake.refusal is None
     identity, limits = handshake.identity, handshake.limits
@@ -328,29 +333,29 @@ def test_complete_with_the_last_frame_in_any_order(frames):
 
 
 def test_another_major_version_is_refused_at_the_first_frame():
-    handshake = take(Handshake(2, 5, 0xCAFE1234), ("HELLO", HELLO))
+    handshake = handle_frames(Handshake(2, 5, 0xCAFE1234), ("HELLO", HELLO))
     assert "the robot speaks protocol 1.3, this host 2.5" in handshake.refusal
     assert "flash" in handshake.refusal
 
 
 def test_another_hash_may_be_read_but_is_refused():
-    handshake = take(Handshake(1, 0, 0x0000BEEF), *FRAMES)
+    handshake = handle_frames(Handshake(1, 0, 0x0000BEEF), *FRAMES)
     assert handshake.limits is not None
-    for words in ("cafe1234", "0000beef", "can be read but not driven", "flash"):
-        assert words in handshake.refusal
+    for fragment in ("cafe1234", "0000beef", "can be read but not driven", "flash"):
+        assert fragment in handshake.refusal
 
 
 def test_a_robot_flashed_meanwhile_is_accepted():
-    handshake = take(Handshake(1, 0, 0xBEEF), *FRAMES)
+    handshake = handle_frames(Handshake(1, 0, 0xBEEF), *FRAMES)
     assert handshake.refusal
-    take(handshake, ("BUILD", {**BUILD, "dbc_hash": 0xBEEF}))
+    handle_frames(handshake, ("BUILD", {**BUILD, "dbc_hash": 0xBEEF}))
     assert handshake.refusal is None
 
 
 @pytest.mark.parametrize(("page", "name"), [(0, "ticks_per_rev"), (0, "max_wheel_speed"), (1, "command_timeout")])
 def test_limits_that_make_no_sense_are_refused(page, name):
     broken = [(kind, {**values, name: 0} if values.get("page") == page else values) for kind, values in FRAMES]
-    handshake = take(Handshake(1, 0, 0xCAFE1234), *broken)
+    handshake = handle_frames(Handshake(1, 0, 0xCAFE1234), *broken)
     assert handshake.identity is handshake.limits is None
     assert "that are not above zero" in handshake.refusal
 
@@ -361,7 +366,7 @@ def test_limits_that_make_no_sense_are_refused(page, name):
 )
 def test_a_key_on_one_end_alone_is_refused_in_words(has_key, bits, refusal):
     frames = [(name, {**values, "capabilities": bits} if name == "HELLO" else values) for name, values in FRAMES]
-    handshake = take(Handshake(1, 0, 0xCAFE1234, has_key=has_key), *frames)
+    handshake = handle_frames(Handshake(1, 0, 0xCAFE1234, has_key=has_key), *frames)
     assert refusal in handshake.refusal
     assert "link.key_file" in handshake.refusal
-    assert take(Handshake(1, 0, 0xCAFE1234, has_key=not has_key), *frames).refusal is None
+    assert handle_frames(Handshake(1, 0, 0xCAFE1234, has_key=not has_key), *frames).refusal is None

@@ -34,7 +34,7 @@ def synced_clock(now_ns):
     return clock
 
 
-def make(now_ns=None):
+def create_telemetry(now_ns=None):
     made = Telemetry(synced_clock(now_ns) if now_ns is not None else DeviceClock())
     made.configure(TICKS_PER_REV, MAX_SPEED_RAD_S)
     return made
@@ -67,26 +67,26 @@ def pose(to, t_ns, received_ns, *, valid=1, yaw=0.5):
 @given(now_ms=st.integers(10_000, 10**9), age_ms=st.integers(0, 250))
 def test_a_sample_is_stamped_with_its_measurement_whatever_its_delay(now_ms, age_ms):
     now_ns = now_ms * MS
-    sample = wheels(make(now_ns), 0, now_ns - age_ms * MS, now_ns)
+    sample = wheels(create_telemetry(now_ns), 0, now_ns - age_ms * MS, now_ns)
     assert sample.t_ns == pytest.approx(now_ns - age_ms * MS, abs=25_000)
     assert sample.received_ns == now_ns
-    measured = pose(make(now_ns), now_ns - age_ms * MS, now_ns)
+    measured = pose(create_telemetry(now_ns), now_ns - age_ms * MS, now_ns)
     assert measured.t_ns == pytest.approx(now_ns - age_ms * MS, abs=105_000)
 
 
 def test_before_the_clock_is_known_the_reception_counts():
-    assert wheels(make(), 0, 9_000 * MS, 9_100 * MS).t_ns == 9_100 * MS
-    assert pose(make(), 9_000 * MS, 9_100 * MS).t_ns == 9_100 * MS
+    assert wheels(create_telemetry(), 0, 9_000 * MS, 9_100 * MS).t_ns == 9_100 * MS
+    assert pose(create_telemetry(), 9_000 * MS, 9_100 * MS).t_ns == 9_100 * MS
 
 
 def test_no_sample_is_of_the_future():
     now_ns = 9_000 * MS
-    assert wheels(make(now_ns), 0, now_ns + 5 * MS, now_ns).t_ns == now_ns
+    assert wheels(create_telemetry(now_ns), 0, now_ns + 5 * MS, now_ns).t_ns == now_ns
 
 
 def test_stamps_that_contradict_the_clock_are_counted_and_end_the_trust_in_it():
     now_ns = 9_000 * MS
-    made = make(now_ns)
+    made = create_telemetry(now_ns)
     for counter in range(DISTRUST_CLOCK_AFTER):
         assert not made.distrusts_clock
         t_ns = now_ns + counter * 10 * MS
@@ -98,7 +98,7 @@ def test_stamps_that_contradict_the_clock_are_counted_and_end_the_trust_in_it():
 
 
 def test_angles_and_speeds():
-    made = make()
+    made = create_telemetry()
     wheels(made, 0, 9_000 * MS, 9_000 * MS, ticks=(2**24 - 3, 5))
     sample = wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(2**24 + 7, -5))
     per_tick = 2 * math.pi / 2048
@@ -108,7 +108,7 @@ def test_angles_and_speeds():
 
 def test_a_gap_longer_than_the_sample_times_wrap_allows_the_motion_of_its_length():
     """2.9 s at 8 rad/s; by the sample times alone it could have been 0.28 s."""
-    made = make()
+    made = create_telemetry()
     wheels(made, 0, 9_000 * MS, 9_000 * MS)
     moved = int(8.0 * 2.9 / (2 * math.pi) * 2048)
     assert wheels(made, 1, 11_900 * MS, 11_900 * MS, ticks=(moved, moved)) is not None
@@ -117,7 +117,7 @@ def test_a_gap_longer_than_the_sample_times_wrap_allows_the_motion_of_its_length
 
 def test_receptions_in_a_batch_do_not_make_motion_implausible():
     """A loop that was held up reads five samples at once; their own times say how far apart they are."""
-    made = make()
+    made = create_telemetry()
     for counter in range(5):
         step = int(8.0 * 0.01 / (2 * math.pi) * 2048)
         sample = wheels(made, counter, (9_000 + 10 * counter) * MS, 9_050 * MS, ticks=(counter * step, 0))
@@ -127,7 +127,7 @@ def test_receptions_in_a_batch_do_not_make_motion_implausible():
 @pytest.mark.parametrize("restarted_after_ms", range(30, 1300, 90))
 def test_the_ticks_of_a_device_that_has_restarted_are_no_motion(restarted_after_ms):
     """Its sample times jump as well; they must not make room for the jump of the ticks."""
-    made = make()
+    made = create_telemetry()
     wheels(made, 0, 9_000 * MS, 9_000 * MS, ticks=(2000, 2000))
     for number in range(1, 7):
         received_ns = (9_000 + 10 * number) * MS
@@ -137,7 +137,7 @@ def test_the_ticks_of_a_device_that_has_restarted_are_no_motion(restarted_after_
 
 
 def test_implausible_ticks_and_invalid_halves_are_counted_and_dropped():
-    made = make()
+    made = create_telemetry()
     wheels(made, 0, 9_000 * MS, 9_000 * MS)
     assert wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(5000, 0)) is None
     assert made.implausible_ticks == 1
@@ -163,12 +163,12 @@ def ticks_of(speed_rad_s, elapsed_ms):
 )
 def test_motion_at_full_speed_is_plausible_over_any_gap_and_twice_that_is_not(start_ms, steps):
     """Samples 10 ms to 4 s apart, each received up to 40 ms late; their times on the wire wrap every 1.3 s."""
-    made = make()
+    made = create_telemetry()
     t_ms, ticks = start_ms, 0
     wheels(made, 0, t_ms * MS, t_ms * MS)
-    for counter, (gap_ms, late_ms) in enumerate(steps, 1):
+    for counter, (gap_ms, delay_ms) in enumerate(steps, 1):
         t_ms += gap_ms
-        received_ns = (t_ms + late_ms) * MS
+        received_ns = (t_ms + delay_ms) * MS
         too_far = ticks + ticks_of(2.0 * 8.0, gap_ms + 90) + 10
         assert wheels(made, counter % 16, t_ms * MS, received_ns, ticks=(too_far, ticks)) is None
         ticks += ticks_of(8.0, gap_ms)
@@ -177,7 +177,7 @@ def test_motion_at_full_speed_is_plausible_over_any_gap_and_twice_that_is_not(st
 
 def test_a_stamp_that_fits_again_restores_the_trust_in_the_clock():
     now_ns = 9_000 * MS
-    made = make(now_ns)
+    made = create_telemetry(now_ns)
     for number in range(3 * DISTRUST_CLOCK_AFTER):
         t_ns = now_ns + number * 10 * MS
         wheels(made, number % 16, t_ns - (700 * MS if number % 5 else 0), t_ns)
@@ -185,7 +185,7 @@ def test_a_stamp_that_fits_again_restores_the_trust_in_the_clock():
 
 
 def test_angles_go_on_through_an_interruption():
-    made = make()
+    made = create_telemetry()
     wheels(made, 0, 9_000 * MS, 9_000 * MS)
     before = wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(20, 20))
     made.restart()
@@ -195,7 +195,7 @@ def test_angles_go_on_through_an_interruption():
 
 
 def test_angles_go_on_when_other_limits_are_reported():
-    made = make()
+    made = create_telemetry()
     wheels(made, 0, 9_000 * MS, 9_000 * MS)
     before = wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(20, 20))
     made.configure(1024, 4.0)
@@ -204,7 +204,7 @@ def test_angles_go_on_when_other_limits_are_reported():
 
 
 def test_the_same_limits_reported_again_lose_no_motion():
-    made = make()
+    made = create_telemetry()
     wheels(made, 0, 9_000 * MS, 9_000 * MS)
     made.configure(TICKS_PER_REV, MAX_SPEED_RAD_S)
     assert wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(20, 20)).left_angle_rad > 0
@@ -215,7 +215,7 @@ def test_the_same_limits_reported_again_lose_no_motion():
     [(0.5, 0.5), (-3.1415, -3.1415), (3.2, 3.2 - 2 * math.pi), (-3.2, 2 * math.pi - 3.2), (math.pi, math.pi)],
 )
 def test_yaw_is_wrapped(wire, wrapped):
-    assert pose(make(), 0, 0, yaw=wire).yaw_rad == pytest.approx(wrapped)
+    assert pose(create_telemetry(), 0, 0, yaw=wire).yaw_rad == pytest.approx(wrapped)
 
 
 def test_slow_telemetry():

@@ -11,10 +11,10 @@ from tests.drivers.motor.bench import MS, START_NS, Bench
 from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot
 from tests.tables import thinned
 
-STILL = (DriverState.STANDBY, DriverState.READY)
+IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
-def make_bench(robot=None, **options):
+def create_bench(robot=None, **options):
     driver = ReferenceDriver(Codec(), itertools.count(3).__next__)
     return Bench(driver, robot or ReferenceRobot(), **options)
 
@@ -28,7 +28,7 @@ def test_samples_carry_the_time_of_their_measurement(jitter_ms, skew):
         return 2 * MS + generator.expovariate(1.0) * jitter_ms * MS
 
     robot = ReferenceRobot(boot_ns=START_NS - 123_456_789, skew=skew)
-    bench = make_bench(robot, delay_ns=delay_ns)
+    bench = create_bench(robot, delay_ns=delay_ns)
     bench.arm()
     bench.command = WheelCommand(4.0, -4.0, 0.1)
     bench.run(4.0)
@@ -61,14 +61,14 @@ def test_samples_carry_the_time_of_their_measurement(jitter_ms, skew):
 
 
 def test_a_restarted_robot_is_noticed_and_moves_nothing():
-    bench = make_bench(ReferenceRobot(boot_ns=START_NS - 10**9))
+    bench = create_bench(ReferenceRobot(boot_ns=START_NS - 10**9))
     bench.arm()
     bench.run(3.0, (3.0, 3.0))
     angle = bench.wheels[-1].left_angle_rad
     bench.robot = ReferenceRobot(boot_ns=bench.now_ns)
     bench.largest_speed = 0.0
     bench.run(3.0)
-    assert bench.driver.state in STILL
+    assert bench.driver.state in IDLE_STATES
     assert bench.largest_speed == 0.0
     assert bench.events.count("sample times disagree with the robot's clock: synchronising the clocks again") == 1
     assert bench.wheels[-1].left_angle_rad == pytest.approx(angle, abs=0.05), "the encoder's new zero is no motion"
@@ -78,30 +78,30 @@ def test_a_restarted_robot_is_noticed_and_moves_nothing():
 
 def test_a_restart_that_only_the_clock_shows_is_noticed():
     """Three laps of the sample times later to the microsecond, so that these go on as if nothing had happened."""
-    bench = make_bench(ReferenceRobot(boot_ns=START_NS - 10**10))
+    bench = create_bench(ReferenceRobot(boot_ns=START_NS - 10**10))
     bench.run(4.0)
     bench.robot = ReferenceRobot(boot_ns=START_NS - 10**10 + 3 * 1_310_720_000)
     bench.run(3.0)
     assert bench.events.count("the robot has restarted: its clock was set back") == 1
     assert not any("contradict" in event for event in bench.events)
     assert bench.driver.synced
-    assert bench.driver.state in STILL
+    assert bench.driver.state in IDLE_STATES
 
 
 def test_a_clock_that_leaps_ahead_is_distinguished_from_a_restart():
     """By three laps of the sample times, so that only the clock shows it."""
-    bench = make_bench(ReferenceRobot(boot_ns=START_NS - 10**10))
+    bench = create_bench(ReferenceRobot(boot_ns=START_NS - 10**10))
     bench.run(4.0)
     bench.robot.boot_ns -= 3 * 1_310_720_000
     bench.run(3.0)
     reported = "the robot's clock jumped: this computer was suspended, or the controller's clock is over 200 ppm off"
     assert bench.events.count(reported) == 1
     assert not any("restarted" in event for event in bench.events)
-    assert bench.driver.state in STILL
+    assert bench.driver.state in IDLE_STATES
 
 
 def test_a_controller_whose_clock_goes_back_is_counted_and_goes_on():
-    bench = make_bench(ReferenceRobot(boot_ns=START_NS - 10**10))
+    bench = create_bench(ReferenceRobot(boot_ns=START_NS - 10**10))
     bench.arm()
     bench.run(1.0, (3.0, 3.0))
     reported = "the robot's controller saw its clock go backwards and counted a nominal period instead"
@@ -113,7 +113,7 @@ def test_a_controller_whose_clock_goes_back_is_counted_and_goes_on():
     assert bench.driver.state is DriverState.ARMED
     bench.robot.boot_ns += 2 * 10**9
     bench.run(0.4)
-    assert bench.driver.state in STILL, "a clock that goes back so far stops the robot"
+    assert bench.driver.state in IDLE_STATES, "a clock that goes back so far stops the robot"
     assert any("fault CLOCK_MISMATCH" in event for event in bench.events)
     assert bench.driver.stats.robot_clock_errors == 3
     bench.robot = ReferenceRobot(boot_ns=bench.now_ns)
@@ -122,7 +122,7 @@ def test_a_controller_whose_clock_goes_back_is_counted_and_goes_on():
 
 
 def test_the_ticks_of_another_robot_on_a_new_link_are_no_motion():
-    bench = make_bench()
+    bench = create_bench()
     bench.arm()
     bench.run(1.0, (3.0, 3.0))
     angle = bench.wheels[-1].left_angle_rad

@@ -15,7 +15,7 @@ from tests.tables import thinned
 CODEC = Codec()
 
 
-def make_bench(**options):
+def create_bench(**options):
     return Bench(ReferenceDriver(CODEC, itertools.count(3).__next__), ReferenceRobot(), **options)
 
 
@@ -38,16 +38,16 @@ def test_it_objects_to_late_commands_and_to_silence_and_forgets_at_rest():
 @thinned("rate_hz", [50, 20, 100], quick=1)
 @pytest.mark.parametrize("growth", [0.05, 0.2, 1.0, 3.0])
 def test_commands_that_come_later_and_later_disarm(growth, rate_hz):
-    bench = make_bench(rate_hz=rate_hz)
+    bench = create_bench(rate_hz=rate_hz)
     bench.arm()
     bench.run(1.0, (3.0, 3.0))
     begin_ns = bench.now_ns
     bench.lag_ns = lambda now_ns: growth * (now_ns - begin_ns)
     # What arrives a time E after the beginning was sent growth / (1 + growth) * E ago; telemetry reports it at 10 Hz.
-    told_ns = (150 * MS + bench.period_ns) * (1 + growth) / growth + 100 * MS + 2 * bench.period_ns
+    deadline_ns = (150 * MS + bench.period_ns) * (1 + growth) / growth + 100 * MS + 2 * bench.period_ns
     while bench.driver.state is DriverState.ARMED:
         bench.step()
-        assert bench.now_ns - begin_ns < told_ns
+        assert bench.now_ns - begin_ns < deadline_ns
     under_way_ns = bench.lag_ns(bench.now_ns)
     gave_up_ns = bench.now_ns
     while bench.robot.armed:
@@ -59,7 +59,7 @@ def test_commands_that_come_later_and_later_disarm(growth, rate_hz):
 
 
 def test_it_says_so_and_counts():
-    bench = make_bench()
+    bench = create_bench()
     bench.arm()
     bench.run(1.0, (3.0, 3.0))
     begin_ns = bench.now_ns
@@ -71,7 +71,7 @@ def test_it_says_so_and_counts():
 
 
 def test_a_link_that_is_slow_but_not_slower_and_slower_does_not_disarm():
-    bench = make_bench(lag_ns=lambda now_ns: 60 * MS, delay_ns=lambda generator: generator.uniform(2, 25) * MS)
+    bench = create_bench(lag_ns=lambda now_ns: 60 * MS, delay_ns=lambda generator: generator.uniform(2, 25) * MS)
     bench.arm()
     bench.run(20.0, (3.0, 3.0))
     assert bench.driver.state is DriverState.ARMED
@@ -80,17 +80,17 @@ def test_a_link_that_is_slow_but_not_slower_and_slower_does_not_disarm():
 
 @thinned("rate_hz", [50, 20, 100], quick=1)
 def test_lost_frames_are_no_lateness(rate_hz):
-    bench = make_bench(rate_hz=rate_hz, loses=lambda generator: generator.random() < (0.02 if rate_hz == 20 else 0.2))
+    bench = create_bench(rate_hz=rate_hz, loses=lambda generator: generator.random() < (0.02 if rate_hz == 20 else 0.2))
     bench.arm()
     bench.run(20.0, (3.0, 3.0))
     assert bench.driver.stats.late_commands == 0
 
 
-@pytest.mark.parametrize("lost", [("SYSTEM_STATE",), ("SYSTEM_STATE", "SESSION_STATE")])
-def test_armed_it_goes_on_hearing_the_robots_state_or_stops(lost):
+@pytest.mark.parametrize("missing", [("SYSTEM_STATE",), ("SYSTEM_STATE", "SESSION_STATE")])
+def test_armed_it_goes_on_hearing_the_robots_state_or_stops(missing):
     """Armed is what the robot says it is: without its word for half a second nobody knows."""
-    bench = make_bench()
-    ids = [CODEC.can_id(name) for name in lost]
+    bench = create_bench()
+    ids = [CODEC.can_id(name) for name in missing]
     bench.arm()
     bench.run(1.0, (3.0, 3.0))
     drain = bench.robot.drain
@@ -105,10 +105,10 @@ def test_armed_it_goes_on_hearing_the_robots_state_or_stops(lost):
         == "disarmed: the robot has not sent its state for 0.5 s; check the cable and the load of the link"
     )
     assert sum("has not sent its state" in event for event in bench.events) == 1
-    lost_before = bench.driver.stats.lost_frames
+    missing_before = bench.driver.stats.lost_frames
     bench.robot.drain = drain
     bench.run(2.0)
-    assert bench.driver.stats.lost_frames > lost_before
+    assert bench.driver.stats.lost_frames > missing_before
     assert not bench.robot.armed
 
 

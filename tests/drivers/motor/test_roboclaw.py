@@ -10,7 +10,7 @@ from tests.drivers.motor.vendors import VENDORS
 
 ONE, TWO = (vendor for vendor in VENDORS if vendor.name == "roboclaw")
 FORWARD = (3.0, 2.0)
-STILL = (DriverState.STANDBY, DriverState.READY)
+IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 STOP = SETTERS["duty_m1m2"].command
 
 
@@ -39,12 +39,12 @@ def test_the_serial_timeout_is_set_and_read_back_before_the_first_speed(bench):
 
 
 def test_a_board_that_does_not_keep_its_timeout_is_not_armed(bench):
-    bench.run_until(*STILL)
-    take = bench.robot.receive
-    bench.robot.receive = lambda now_ns, frame: None if frame.can_id & 0xFF == 14 else take(now_ns, frame)
+    bench.run_until(*IDLE_STATES)
+    receive = bench.robot.receive
+    bench.robot.receive = lambda now_ns, frame: None if frame.can_id & 0xFF == 14 else receive(now_ns, frame)
     bench.driver.request(Request.ARM)
     bench.run(2.5, FORWARD)
-    assert bench.driver.state in STILL
+    assert bench.driver.state in IDLE_STATES
     assert "serial timeout" in bench.driver.detail
     assert bench.largest_speed == 0.0
 
@@ -81,8 +81,8 @@ def test_a_board_that_restarted_standing_is_known_by_its_timeout(bench):
 
 def test_a_board_that_takes_no_commands_is_lost_though_it_answers(bench):
     drive(bench)
-    take = bench.robot.receive
-    bench.robot.receive = lambda now_ns, frame: None if frame.can_id & 0xFF == 40 else take(now_ns, frame)
+    receive = bench.robot.receive
+    bench.robot.receive = lambda now_ns, frame: None if frame.can_id & 0xFF == 40 else receive(now_ns, frame)
     bench.run(0.3, FORWARD)
     assert bench.driver.state is DriverState.FAULT
     assert "does not accept its commands" in bench.driver.detail
@@ -100,7 +100,7 @@ def test_its_e_stop_input_stops_it_and_needs_a_reset(bench):
     assert bench.driver.state is DriverState.FAULT
     assert bench.robot.speed_rad_s < 0.05
     bench.driver.request(Request.RESET)
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
 
 
 def test_an_e_stop_that_the_board_latches_by_itself_is_reset_only_when_asked_to(bench):
@@ -114,7 +114,7 @@ def test_an_e_stop_that_the_board_latches_by_itself_is_reset_only_when_asked_to(
     assert bench.driver.state is DriverState.ESTOP
     assert not [frame for frame in bench.robot.received if frame.can_id & 0xFF == 200]
     bench.driver.request(Request.RESET)
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
 
 
 def test_the_two_byte_status_of_older_firmware_is_taken(bench):

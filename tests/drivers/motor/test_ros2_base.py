@@ -36,18 +36,20 @@ def test_what_the_base_cannot_do_is_slowed_down_on_the_same_curve(bench):
 
 
 @pytest.mark.parametrize(
-    ("fault", "words", "state"),
+    ("fault", "expected_detail", "state"),
     [
         ("others_speak", "another node publishes on /cmd_vel", DriverState.STANDBY),
         ("has_listener", "no node subscribes to /cmd_vel", DriverState.HANDSHAKE),
     ],
 )
-def test_a_base_that_others_drive_or_that_hears_nobody_is_not_armed_and_disarmed(bench, end, fault, words, state):
+def test_a_base_that_others_drive_or_that_hears_nobody_is_not_armed_and_disarmed(
+    bench, end, fault, expected_detail, state
+):
     setattr(end, fault, fault == "others_speak")
     bench.run(0.2)
     bench.driver.request(Request.ARM)
     assert bench.driver.state is state
-    assert words in bench.driver.detail
+    assert expected_detail in bench.driver.detail
     setattr(end, fault, fault != "others_speak")
     bench.run(0.2)
     bench.arm()
@@ -55,7 +57,7 @@ def test_a_base_that_others_drive_or_that_hears_nobody_is_not_armed_and_disarmed
     setattr(end, fault, fault == "others_speak")
     bench.run(0.2)
     assert bench.driver.state is DriverState.FAULT
-    assert words in bench.driver.detail
+    assert expected_detail in bench.driver.detail
     assert not end.driving
 
 
@@ -71,11 +73,11 @@ def test_a_bridge_that_was_started_with_other_settings_is_refused(bench, end):
 
 def test_why_there_is_no_odometry_is_said(bench, end):
     bench.robot.controller.joints = False
-    for refusal, words in enumerate(wire.REFUSALS):
+    for refusal, reason in enumerate(wire.REFUSALS):
         end.refusal = refusal
         bench.run(0.2)
         assert bench.driver.state is DriverState.HANDSHAKE
-        assert bench.driver.detail == f"no odometry from /odom: {words}"
+        assert bench.driver.detail == f"no odometry from /odom: {reason}"
 
 
 def test_a_fault_stays_until_it_is_reset_although_its_cause_has_gone(bench, end):
@@ -112,8 +114,8 @@ def test_the_safety_card_says_who_stops_the_base_and_that_its_time_out_is_only_d
     card = driver.safety_card(VENDOR.settings)
     assert card.reaction_s == pytest.approx(wire.DEADMAN_S + 0.5)
     assert "only the base's own time-out of 0.5 s" in card.host_silent
-    assert any("declared" in words for words in card.unverified)
-    assert any("Odometry" in words for words in card.unverified), "without joints"
+    assert any("declared" in text for text in card.unverified)
+    assert any("Odometry" in text for text in card.unverified), "without joints"
 
 
 def test_odometry_that_stops_while_it_slows_down_is_a_fault_that_stays(bench, end):

@@ -15,7 +15,7 @@ from tests.drivers.motor.vendors import VENDORS
 from tests.tables import thinned
 
 FORWARD = (3.0, 2.0)
-STILL = (DriverState.STANDBY, DriverState.READY)
+IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 COASTING_S = 2.5
 
 
@@ -54,7 +54,7 @@ def drive(bench, seconds=1.0):
 def test_nothing_that_moves_is_sent_before_arming(vendor, bench):
     bench.command = command(*FORWARD)
     bench.run(2.0)
-    assert bench.driver.state in STILL
+    assert bench.driver.state in IDLE_STATES
     assert bench.largest_speed == 0.0
     bench.driver.request(Request.READY)
     bench.run(1.0)
@@ -82,7 +82,7 @@ def test_armed_the_wheels_follow_and_the_samples_say_so(bench):
         assert moved == pytest.approx(bench.robot.angle[wheel] - behind, abs=0.05)
 
 
-TELLS = {
+IDENTITIES = {
     "odrive-0.5": ("ODrive, firmware 0.5 (declared", {}),
     "odrive": ("ODrive, firmware 0.6.11 (reported", {}),
     "vesc": ("VESC (declared", {"command_timeout_s": "device"}),
@@ -94,9 +94,9 @@ TELLS = {
 
 
 def test_it_says_who_it_is_and_of_each_limit_whether_it_was_reported_or_declared(vendor, bench):
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     identity, limits = bench.driver.identity, bench.driver.limits
-    begin, others = TELLS.get(str(vendor)) or TELLS[vendor.name]
+    begin, others = IDENTITIES.get(str(vendor)) or IDENTITIES[vendor.name]
     assert identity.describe().startswith(begin)
     declared = dict.fromkeys(("max_wheel_speed_rad_s", "command_timeout_s", "stop_deceleration_rad_s2"), "robot.toml")
     assert {name: limit.said_by for name, limit in limits.known().items()} == declared | others
@@ -112,7 +112,7 @@ def test_a_silent_host_is_stopped_by_the_controller_and_nothing_moves_when_it_is
     bench.largest_speed = 0.0
     bench.run(3.0)
     assert bench.largest_speed < 0.05
-    assert bench.driver.state in (*STILL, DriverState.FAULT)
+    assert bench.driver.state in (*IDLE_STATES, DriverState.FAULT)
 
 
 def test_the_wheels_are_driven_no_longer_than_the_safety_card_says(vendor, bench):
@@ -136,11 +136,11 @@ def test_a_host_that_was_frozen_blames_itself_and_not_a_controller_whose_replies
     bench.host_runs = False
     bench.run(vendor.watchdog_s + COASTING_S)
     bench.host_runs = True
-    late, bench.host_end.receive = bench.host_end.receive, lambda: ()
+    receive, bench.host_end.receive = bench.host_end.receive, lambda: ()
     bench.run(0.05)
     assert "stopped reporting" not in bench.driver.detail
     assert "does not accept" not in bench.driver.detail
-    bench.host_end.receive = late
+    bench.host_end.receive = receive
     bench.largest_speed = 0.0
     bench.run(1.0)
     assert "stopped reporting" not in f"{bench.driver.detail} {bench.events}"
@@ -158,9 +158,9 @@ def test_a_host_that_pauses_for_less_than_any_watchdog_drives_on(vendor, bench, 
         bench.host_runs = False
         bench.run(pause_s)
         bench.host_runs = True
-        late, bench.host_end.receive = bench.host_end.receive, lambda: ()
+        receive, bench.host_end.receive = bench.host_end.receive, lambda: ()
         bench.run(0.012)
-        bench.host_end.receive = late
+        bench.host_end.receive = receive
         bench.run(0.313)
         assert bench.driver.state is DriverState.ARMED, f"{bench.driver.detail} {bench.events}"
 
@@ -213,19 +213,19 @@ def test_disarming_ramps_down_and_says_so_until_it_stands(bench):
     assert bench.driver.state is DriverState.STOPPING
     bench.run(0.1)
     assert 0.5 < bench.robot.speed_rad_s < max(FORWARD), "it is slowed down, not let go"
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     bench.run(0.2)
     assert bench.robot.speed_rad_s < 0.05
     assert no_wheel_is_driven(bench)
 
 
 def test_an_arming_that_is_taken_back_moves_nothing(bench):
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     bench.driver.request(Request.ARM)
     bench.run(0.05, FORWARD)
     bench.driver.request(Request.STANDBY)
     bench.run(2.0, FORWARD)
-    assert bench.driver.state in STILL
+    assert bench.driver.state in IDLE_STATES
     assert bench.largest_speed == 0.0
 
 
@@ -249,7 +249,7 @@ def test_an_error_cleared_does_not_energise_again(vendor, bench):
     bench.run(COASTING_S)
     vendor.mend(bench.robot)
     bench.driver.request(Request.RESET)
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     bench.largest_speed = 0.0
     bench.run(2.0, FORWARD)
     assert bench.largest_speed < 0.05
@@ -261,7 +261,7 @@ def test_an_error_cleared_does_not_energise_again(vendor, bench):
 @thinned("when", ["armed", "before", "standby", "arming", "stopping", "fault"], quick=2)
 def test_the_emergency_stop_stops_in_every_state(vendor, bench, when):
     if when != "before":
-        bench.run_until(*STILL)
+        bench.run_until(*IDLE_STATES)
     if when in ("armed", "stopping", "fault"):
         drive(bench)
     if when == "arming":
@@ -286,7 +286,7 @@ def test_the_emergency_stop_stops_in_every_state(vendor, bench, when):
     assert bench.largest_speed < 0.05
     vendor.mend(bench.robot)
     bench.driver.request(Request.RESET)
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     bench.run(2.0)
     assert bench.largest_speed < 0.05
 
@@ -294,7 +294,7 @@ def test_the_emergency_stop_stops_in_every_state(vendor, bench, when):
 def test_an_emergency_stop_from_beside_the_daemon_stops_it_and_is_confirmed(vendor, bench):
     drive(bench)
     found = find_driver(vendor.name)
-    heard = found.stop_confirmation(vendor.settings)
+    confirms_stop = found.stop_confirmation(vendor.settings)
     # A line that is one host's alone is taken only beside a daemon that is frozen.
     bench.host_runs = not vendor.is_serial
     bench.run(0.002)
@@ -313,7 +313,7 @@ def test_an_emergency_stop_from_beside_the_daemon_stops_it_and_is_confirmed(vend
             for frame in found.stop_frames(vendor.settings):
                 bench.robot.receive(bench.now_ns, frame)
         frames = bench.robot.drain()
-        confirmed = confirmed or True in [heard(frame) for frame in frames]
+        confirmed = confirmed or True in [confirms_stop(frame) for frame in frames]
         for frame in frames:
             bench._send(bench.robot_end, frame)
     assert confirmed
@@ -333,7 +333,7 @@ def test_a_line_unplugged_stops_the_robot_and_reconnection_never_arms(vendor, be
     bench.host_end.plug(True)
     bench.largest_speed = 0.0
     bench.run(3.0, FORWARD)
-    assert bench.driver.state in (*STILL, DriverState.FAULT)
+    assert bench.driver.state in (*IDLE_STATES, DriverState.FAULT)
     assert bench.largest_speed < 0.05
     assert bench.wheels[-1].left_angle_rad > 1.0, "the angles go on from where they were"
 
@@ -353,7 +353,7 @@ def test_an_emergency_stop_is_latched_although_the_line_was_out_when_it_was_aske
     assert bench.driver.state is DriverState.ESTOP
     assert bench.largest_speed < 0.05
     bench.driver.request(Request.RESET)
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
 
 
 def test_a_fault_is_latched_although_the_line_was_out_since(vendor, bench):
@@ -374,7 +374,7 @@ def test_a_fault_is_latched_although_the_line_was_out_since(vendor, bench):
     assert bench.driver.state is DriverState.FAULT
     assert bench.largest_speed < 0.05
     bench.driver.request(Request.RESET)
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
 
 
 @thinned("out_for_s", [0.03, 0.09, 0.15], quick=1)
@@ -463,7 +463,7 @@ def test_a_controller_that_fell_silent_while_it_drove_is_a_fault_until_a_reset_t
     assert bench.driver.state is DriverState.FAULT
     assert "stopped reporting" in bench.driver.detail
     bench.driver.request(Request.RESET)
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
 
 
 def test_an_emergency_stop_is_not_reset_while_nothing_is_heard_of_the_controllers(bench):
@@ -477,13 +477,13 @@ def test_an_emergency_stop_is_not_reset_while_nothing_is_heard_of_the_controller
     bench.run(1.0)
     assert bench.driver.state is DriverState.ESTOP
     bench.robot.drain = drain
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
 
 
 def test_what_is_wanted_after_a_stop_is_not_forgotten_on_the_way(bench):
     drive(bench)
     bench.driver.request(Request.READY)
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     bench.run(0.5)
     assert bench.driver.state is DriverState.READY
 
@@ -529,4 +529,4 @@ def test_released_no_speed_but_zero_is_commanded_any_more_and_the_reason_is_a_fa
     assert bench.driver.state is DriverState.FAULT
     bench.driver.request(Request.RESET)
     bench.run(1.0)
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)

@@ -13,7 +13,7 @@ from sim.can_protocol import CanFrame
 from tests.drivers.motor.vendors import VENDORS
 
 FORWARD = (3.0, 2.0)
-STILL = (DriverState.STANDBY, DriverState.READY)
+IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 COASTING_S = 2.5
 PHASES = ("start", "arm", "run", "stop", "again", "fault", "reset", "reconnect", "estop", "after")
 SUMS = {
@@ -56,7 +56,7 @@ class Recorded:
 
 # Of the boards with one driver and one kind of line `make test` tries the first.
 FURTHER = ("odrive-0.5", "odrive-four-axes", "vesc-four-braking", "roboclaw-a-board-a-side")
-QUICK_AND_FURTHER = [pytest.param(one, marks=pytest.mark.thorough) if str(one) in FURTHER else one for one in VENDORS]
+MARKED_VENDORS = [pytest.param(one, marks=pytest.mark.thorough) if str(one) in FURTHER else one for one in VENDORS]
 
 
 @functools.cache
@@ -65,7 +65,7 @@ def scripted_day(vendor):
     recorded = Recorded(vendor)
     bench, begin = recorded.bench, recorded.begin
     begin()  # start
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     bench.run(0.5)
     begin()  # arm
     bench.arm()
@@ -74,7 +74,7 @@ def scripted_day(vendor):
     bench.run(0.5, (-1.0, 2.5))
     begin()  # stop
     bench.driver.request(Request.STANDBY)
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     bench.run(COASTING_S)
     begin()  # again
     bench.arm()
@@ -86,7 +86,7 @@ def scripted_day(vendor):
     begin()  # reset
     vendor.mend(bench.robot)
     bench.driver.request(Request.RESET)
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     bench.run(COASTING_S)
     begin()  # reconnect
     bench.arm()
@@ -102,7 +102,7 @@ def scripted_day(vendor):
     bench.run(COASTING_S)
     begin()  # after
     bench.driver.request(Request.RESET)
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     bench.run(0.5)
     return recorded.phases
 
@@ -111,7 +111,7 @@ def sums(vendor):
     return [hashlib.sha256("\n".join(lines).encode()).hexdigest()[:6] for lines in scripted_day(vendor)]
 
 
-NEVER_ASKED = (20, 22, 28, 29, 61, 62, 94, 98, 148, 201)
+UNUSED_COMMANDS = (20, 22, 28, 29, 61, 62, 94, 98, 148, 201)
 """Of a RoboClaw: to count anew, other PIDs, the non-volatile memory, modes of its pins and of its e-stop."""
 
 
@@ -119,7 +119,7 @@ def as_frame(frame):
     return CanFrame(int(frame[3][:-1], 16), bytes.fromhex(frame[4] if len(frame) > 4 else ""), frame[3][-1] == "x")
 
 
-@pytest.mark.parametrize("vendor", QUICK_AND_FURTHER, ids=str)
+@pytest.mark.parametrize("vendor", MARKED_VENDORS, ids=str)
 def test_no_frame_of_a_scripted_day_moves_by_itself_calibrates_or_writes_what_stays(vendor):
     sent = [as_frame(line.split(" ")) for lines in scripted_day(vendor) for line in lines]
     assert len(sent) > 100
@@ -136,7 +136,7 @@ def test_no_frame_of_a_scripted_day_moves_by_itself_calibrates_or_writes_what_st
         ("vesc", ["17 00000000x", "117 00000001x", "417 00000000x", "1f17 x", "3f17 00x", "817 fe000dx", "317 0bb8x"]),
         # The serial mode, lights, brakes, a mode of 1 byte.
         ("agilex", ["421 0200000000000000", "121 0000000000000000", "131 00", "421 01"]),
-        ("roboclaw", [f"{0x8000 | command:x} 0000000000000000" for command in NEVER_ASKED]
+        ("roboclaw", [f"{0x8000 | command:x} 0000000000000000" for command in UNUSED_COMMANDS]
          + ["8022 8022000100010000"]),
     ],
 )  # fmt: skip
@@ -148,7 +148,7 @@ def test_what_no_driver_may_send_would_be_noticed(label, frames):
         assert vendor.is_forbidden(frame), text
 
 
-@pytest.mark.parametrize("vendor", QUICK_AND_FURTHER, ids=str)
+@pytest.mark.parametrize("vendor", MARKED_VENDORS, ids=str)
 def test_every_frame_of_a_scripted_day_is_the_one_that_was_recorded(vendor):
     found = dict(zip(PHASES, sums(vendor), strict=True))
     assert found == dict(zip(PHASES, SUMS[str(vendor)].split(), strict=True))

@@ -6,16 +6,16 @@ from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError
 from drivers.motor import find_driver
 from drivers.types import DriverState, Request
-from tests.drivers.motor.test_motor_drivers import OWN, robot_toml
+from tests.drivers.motor.test_motor_drivers import EXAMPLES, robot_toml
 from tests.drivers.motor.vendors import VENDORS
 
 (VESC,) = [vendor for vendor in VENDORS if vendor.label == "vesc"]
 FORWARD = (3.0, 2.0)
-STILL = (DriverState.STANDBY, DriverState.READY)
+IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 def test_a_task_that_needs_less_than_the_speed_loop_holds_is_refused_with_what_it_holds(tmp_path):
-    slow = OWN["vesc"].replace("gear = 20.0", "gear = 1.0")
+    slow = EXAMPLES["vesc"].replace("gear = 20.0", "gear = 1.0")
     with pytest.raises(InputError, match=r"task\.speed_m_s: 0\.2 m/s is slower .*; write at least 0\.81"):
         load_robot_config(robot_toml(tmp_path, f'driver = "vesc"\n{slow}'))
 
@@ -55,12 +55,12 @@ def test_status_messages_that_are_off_are_asked_for_by_name():
 
 def test_it_does_not_arm_while_a_motor_turns():
     bench = VESC.bench()
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     bench.robot.speed = [2.0, 2.0]
     bench.run(0.05)
     bench.driver.request(Request.ARM)
     bench.run(0.05, FORWARD)
-    assert bench.driver.state in STILL
+    assert bench.driver.state in IDLE_STATES
     assert "is turning" in bench.driver.detail
     assert not [frame for frame in bench.robot.received if VESC.is_motion(frame)]
 
@@ -88,7 +88,7 @@ def test_it_brakes_for_as_long_as_a_motor_says_that_it_turns_and_lets_go_of_one_
 
 def test_it_is_armed_only_after_zeros_for_a_while():
     bench = VESC.bench()
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     bench.robot.received.clear()
     bench.arm()
     bench.run(0.02)
@@ -99,7 +99,7 @@ def test_it_is_armed_only_after_zeros_for_a_while():
 
 def test_a_fault_is_named_within_half_a_second():
     bench = VESC.bench()
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     bench.robot.controller.sides[1][0].values.fault = 6
     bench.run(0.5)
     assert bench.driver.state is DriverState.FAULT
@@ -108,7 +108,7 @@ def test_a_fault_is_named_within_half_a_second():
 
 def test_the_questions_for_faults_do_not_feed_the_timeout():
     bench = VESC.bench()
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     bench.run(2.0)
     assert [vesc.fed for side in bench.robot.controller.sides for vesc in side] == [0, 0]
 

@@ -35,9 +35,9 @@ def test_a_status_of_11_bits_or_too_short_is_none():
 
 def test_a_pong_names_who_is_there():
     assert codec.ping(23, 200) == Frame(17 << 8 | 23, b"\xc8", extended=True)
-    answer = codec.decode(Frame(18 << 8 | 200, bytes((23, 0)), extended=True))
-    assert answer is not None
-    assert (answer.node, answer.name) == (23, "pong")
+    response = codec.decode(Frame(18 << 8 | 200, bytes((23, 0)), extended=True))
+    assert response is not None
+    assert (response.node, response.name) == (23, "pong")
 
 
 def test_a_fault_is_read_from_an_answer_in_fragments():

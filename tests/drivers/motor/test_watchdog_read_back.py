@@ -10,7 +10,7 @@ from drivers.types import DriverState
 from tests.drivers.motor.vendors import VENDORS, Vendor
 
 BY_LABEL = {vendor.label: vendor for vendor in VENDORS}
-STILL = (DriverState.STANDBY, DriverState.READY)
+IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 def readable_odrive():
@@ -23,18 +23,18 @@ def vescs(bench):
 
 
 @pytest.mark.parametrize(
-    ("field", "value", "said"),
+    ("field", "value", "expected_detail"),
     [
         ("timeout_ms", 0, "controller 51: its timeout is off"),
         ("timeout_ms", 1000, "controller 51: its timeout is 1 s; set 0.1 s there"),
         ("timeout_brake_current_a", 30.0, "brakes with 30 A"),
     ],
 )
-def test_a_vesc_whose_timeout_is_another_is_refused(field, value, said):
+def test_a_vesc_whose_timeout_is_another_is_refused(field, value, expected_detail):
     bench = BY_LABEL["vesc"].bench()
     setattr(vescs(bench)[1], field, value)
     bench.run_until(DriverState.REFUSED)
-    assert said in bench.driver.detail
+    assert expected_detail in bench.driver.detail
     assert bench.driver.identity is bench.driver.limits is None
     assert not [frame for frame in bench.robot.received if BY_LABEL["vesc"].is_motion(frame)]
 
@@ -54,17 +54,17 @@ def test_settings_of_another_layout_or_controller_are_not_used(payload):
 
 
 @pytest.mark.parametrize(
-    ("number", "value", "said"),
+    ("number", "value", "expected_detail"),
     [
         (220, bytes(4), "node 5: its watchdog is off"),
         (221, struct.pack("<f", 2.0), "node 5: its watchdog is set to 2 s; set it to 0.1 s"),
     ],
 )
-def test_an_odrive_whose_watchdog_is_another_is_refused(number, value, said):
+def test_an_odrive_whose_watchdog_is_another_is_refused(number, value, expected_detail):
     bench = readable_odrive().bench()
     bench.robot.controller.boards[1].parameters[number] = value
     bench.run_until(DriverState.REFUSED)
-    assert said in bench.driver.detail
+    assert expected_detail in bench.driver.detail
 
 
 def test_an_odrive_that_does_not_answer_for_the_endpoints_given_is_refused():
@@ -75,7 +75,7 @@ def test_an_odrive_that_does_not_answer_for_the_endpoints_given_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("vendor", "level", "words"),
+    ("vendor", "level", "expected_text"),
     [
         (BY_LABEL["odrive-0.5"], Level.WARNING, "could not be read back"),
         (readable_odrive(), Level.OK, "reported by the controller"),
@@ -84,9 +84,9 @@ def test_an_odrive_that_does_not_answer_for_the_endpoints_given_is_refused():
         (BY_LABEL["roboclaw"], Level.OK, "reported by the controller"),
     ],
 )
-def test_the_check_says_whether_it_was_read_back(vendor, level, words):
+def test_the_check_says_whether_it_was_read_back(vendor, level, expected_text):
     bench = vendor.bench()
-    bench.run_until(*STILL)
+    bench.run_until(*IDLE_STATES)
     found = check_watchdog(bench.driver.limits)
-    assert (found.level, words in found.text) == (level, True)
+    assert (found.level, expected_text in found.text) == (level, True)
     bench.arm()

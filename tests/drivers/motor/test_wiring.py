@@ -19,8 +19,8 @@ class Miswired:
         self.wiring, self.true = wiring, (0.0, 0.0)
 
     def transmit(self, now_ns, command):
-        own = (command.left_rad_s, command.right_rad_s)
-        sides = own[::-1] if self.wiring.sides_swapped else own
+        wheel_speeds = (command.left_rad_s, command.right_rad_s)
+        sides = wheel_speeds[::-1] if self.wiring.sides_swapped else wheel_speeds
         self.true = tuple(
             direction * speed * self.wiring.turn_ratio
             for direction, speed in zip(self.wiring.motor_direction, sides, strict=True)

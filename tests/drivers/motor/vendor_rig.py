@@ -36,14 +36,14 @@ class VendorRig:
             sent = CanFrame(frame.can_id, frame.data, frame.extended)
             self._outgoing += self.controller.receive(self._us(now_ns), sent)
             return
-        said = self.controller.receive(self._us(now_ns), CanFrame(0, self.exchange.request(frame)))
-        reply = self.exchange.reply(frame, b"".join(each.data for each in said))
+        output = self.controller.receive(self._us(now_ns), CanFrame(0, self.exchange.request(frame)))
+        reply = self.exchange.reply(frame, b"".join(each.data for each in output))
         self._outgoing += [] if reply is None else [reply]
 
     def step(self, now_ns):
-        for side, wanted in enumerate(self.controller.wheels_rad_s):
-            if wanted is not None and side not in self.stuck:
-                self.speed[side] = wanted
+        for side, target_rad_s in enumerate(self.controller.wheels_rad_s):
+            if target_rad_s is not None and side not in self.stuck:
+                self.speed[side] = target_rad_s
             else:
                 self.speed[side] *= math.exp(-1e-3 / COASTING_S)
             self.angle[side] += 1e-3 * self.speed[side]

@@ -130,9 +130,9 @@ def test_axes_that_are_z_up_already_stay():
 @settings(max_examples=200)
 def test_no_bytes_break_it(datagram, version, at, change):
     assert parse_frame(datagram, version) is None or datagram[:2] == b"\x07\x00"
-    whole = frame(version, [rigid_body(version, 3, (1.5, 0.1, -2.0), TURNED)])
-    parse_frame(whole[:at] + change + whole[at + len(change) :], version)
-    assert parse_frame(whole[: min(at, 60)], version) is None
+    valid_frame = frame(version, [rigid_body(version, 3, (1.5, 0.1, -2.0), TURNED)])
+    parse_frame(valid_frame[:at] + change + valid_frame[at + len(change) :], version)
+    assert parse_frame(valid_frame[: min(at, 60)], version) is None
 
 
 class Motive:
@@ -159,22 +159,22 @@ def test_by_multicast_with_the_exposures_age_and_a_lost_body(port):
     # The clock's frequency shows in half a second of the server's own time.
     motive.send(port, frame(version, [body], timestamp_s=1.0, exposed=TEN_MHZ))
     motive.send(port, frame(version, [body], timestamp_s=2.0, exposed=2 * TEN_MHZ))
-    found, said = until(source, lambda found, _: len(found) == 2)
-    assert said == ["rigid body 3 is tracked"]
+    found, messages = until(source, lambda found, _: len(found) == 2)
+    assert messages == ["rigid body 3 is tracked"]
     # The first one's age is not known; the second was exposed 5 ms before it was sent.
     assert {pose.received_ns - pose.t_ns for pose in found} == {0, 5_000_000}
     assert (found[1].x_m, found[1].y_m, found[1].yaw_rad) == pytest.approx((1.5, 2.0, 0.7), abs=1e-6)
     assert (found[1].position_std_m, found[1].yaw_std_rad) == (0.002, 0.004)
-    lost = rigid_body(version, 3, (1.5, 0.1, -2.0), TURNED, tracked=False)
+    unseen = rigid_body(version, 3, (1.5, 0.1, -2.0), TURNED, tracked=False)
     nan = rigid_body(version, 3, (math.nan, 0.1, -2.0), TURNED)
     motive.send(
-        port, frame(version, [lost]), frame(version, [nan]), frame(version, [lost]), b"hello", frame(version, [])
+        port, frame(version, [unseen]), frame(version, [nan]), frame(version, [unseen]), b"hello", frame(version, [])
     )
-    found, said = until(source, lambda _, said: len(said) == 3)
+    found, messages = until(source, lambda _, messages: len(messages) == 3)
     assert found == []
-    assert said[0] == "the cameras do not see rigid body 3; check its markers"
-    assert said[1] == "datagrams received that are not frames of NatNet 3.0; correct pose.natnet_version"
-    assert said[2] == "rigid body 3 is not in Motive's frames, which have none; correct pose.body"
+    assert messages[0] == "the cameras do not see rigid body 3; check its markers"
+    assert messages[1] == "datagrams received that are not frames of NatNet 3.0; correct pose.natnet_version"
+    assert messages[2] == "rigid body 3 is not in Motive's frames, which have none; correct pose.body"
     assert (source.lost, source.malformed) == (3, 1)
     source.close()
     source.close()
@@ -216,20 +216,20 @@ def test_frames_of_a_second_server_are_refused_and_named(port):
         for sender, x_m in ((one, 1.0), (two, 5.0), (one, 1.1)):
             sender.sendto(frame(version, [rigid_body(version, 3, (x_m, 0.1, -2.0), TURNED)]), ("127.0.0.1", port))
         names = [f"127.0.0.1:{sender.getsockname()[1]}" for sender in (one, two)]
-        found, said = until(source, lambda found, _: len(found) == 2)
+        found, messages = until(source, lambda found, _: len(found) == 2)
     assert [pose.x_m for pose in found] == pytest.approx([1.0, 1.1])
-    assert any(f"{names[1]} sends poses while {names[0]} does: not used" in words for words in said)
+    assert any(f"{names[1]} sends poses while {names[0]} does: not used" in message for message in messages)
     source.close()
 
 
 def test_a_frame_with_more_than_motive_can_send_is_none():
     version = (3, 0)
     one = [rigid_body(version, 3, (1.5, 0.1, -2.0), TURNED)]
-    whole = frame(version, one, empty=True)
+    valid_frame = frame(version, one, empty=True)
     # After size, number of the frame and its head: so many marker sets, none of which has a name or a marker.
     sets = b"\0" + struct.pack("<i", 0)
     for many, is_read in ((1000, True), (12_000, False)):
-        body = whole[4:8] + struct.pack("<i", many) + many * sets + whole[12:]
+        body = valid_frame[4:8] + struct.pack("<i", many) + many * sets + valid_frame[12:]
         found = parse_frame(struct.pack("<HH", 7, len(body)) + body, version)
         assert (found is not None) == is_read
 

@@ -91,17 +91,17 @@ def test_what_is_no_fix_gives_none_and_breaks_nothing(broken):
 
 def test_a_datum_of_another_town_is_said():
     fixes = Fixes(datum=(47.0, 8.5))
-    said = [each["said"] for each in fixes.add_line(GGA_ALONE, NOW_NS) if "said" in each]
-    assert "the position is 32097 m from the datum, and 838 m is the farthest allowed; correct pose.datum" in said
+    messages = [each["said"] for each in fixes.add_line(GGA_ALONE, NOW_NS) if "said" in each]
+    assert "the position is 32097 m from the datum, and 838 m is the farthest allowed; correct pose.datum" in messages
     assert len(fixes.add_line(GGA_ALONE, NOW_NS)) == 1
 
 
 @pytest.mark.parametrize("quality", [0, 6, 7, 8])
 def test_what_is_not_measured_is_not_used_and_said_so(quality):
     fixes = Fixes()
-    (said,) = fixes.add_line(gga(1.0, 47.0, 8.0, quality=quality), NOW_NS)
-    assert f"fix quality {quality}" in said["said"]
-    assert "not used" in said["said"]
+    (message,) = fixes.add_line(gga(1.0, 47.0, 8.0, quality=quality), NOW_NS)
+    assert f"fix quality {quality}" in message["said"]
+    assert "not used" in message["said"]
     assert fixes.add_line(gga(1.2, 47.0, 8.0, quality=quality), NOW_NS) == []
 
 
@@ -132,7 +132,9 @@ def test_a_heading_goes_with_the_position_of_the_same_burst(order):
 def test_a_fix_has_the_receivers_time_and_not_the_moods_of_the_line():
     clock = ReceiverClock()
     delays_s = [0.15, 0.05, 0.30, 0.05, 0.80, 0.06]
-    found = [clock.host_ns(100.0 + 0.2 * k, round(1e9 * (7.0 + 0.2 * k + late))) for k, late in enumerate(delays_s)]
+    found = [
+        clock.host_ns(100.0 + 0.2 * k, round(1e9 * (7.0 + 0.2 * k + delay_s))) for k, delay_s in enumerate(delays_s)
+    ]
     # All as late as the least late one, once that was seen.
     assert found[1:] == [pytest.approx(1e9 * (7.05 + 0.2 * k), abs=10) for k in range(1, 6)]
     # Over midnight, and over a receiver that has found its time anew.
@@ -151,20 +153,20 @@ def ended():
 
 
 def until(source, enough):
-    """Poses and news of the source until `enough(poses, news)`, within a generous time."""
-    found, said = [], []
+    """Poses and messages of the source until `enough(poses, messages)`, within a generous time."""
+    found, messages = [], []
     end_s = time.monotonic() + 60.0
-    while not enough(found, said):
-        assert time.monotonic() < end_s, (found, said)
+    while not enough(found, messages):
+        assert time.monotonic() < end_s, (found, messages)
         found += source.receive(time.monotonic_ns(), ())
-        said += source.new_messages()
+        messages += source.new_messages()
         time.sleep(0.01)
-    return found, said
+    return found, messages
 
 
 def opened(source):
     """Wait until it listens: what came before the port was open is thrown away."""
-    until(source, lambda _, said: any(words.endswith(": open") for words in said))
+    until(source, lambda _, messages: any(message.endswith(": open") for message in messages))
 
 
 def test_over_a_serial_port_that_goes_away(ended):
@@ -172,17 +174,17 @@ def test_over_a_serial_port_that_goes_away(ended):
     tty.setraw(slave)
     source = create_pose_source("nmea", device=os.ttyname(slave), baud=115_200)
     ended(source)
-    _, said = until(source, lambda _, said: said)
-    assert said[0].endswith(": open")
+    _, messages = until(source, lambda _, messages: messages)
+    assert messages[0].endswith(": open")
     os.write(master, b"half a line*00\r\n" + GGA_ALONE)
-    (pose,), said = until(source, lambda found, _: found)
+    (pose,), messages = until(source, lambda found, _: found)
     assert (pose.x_m, pose.y_m, pose.has_heading) == (0.0, 0.0, False)
     assert 0 <= time.monotonic_ns() - pose.t_ns < 60 * 10**9
-    assert any("fix quality 1" in words for words in said)
+    assert any("fix quality 1" in message for message in messages)
     os.close(slave)
     os.close(master)
-    _, said = until(source, lambda _, said: said)
-    assert "trying again until it is there" in said[-1]
+    _, messages = until(source, lambda _, messages: messages)
+    assert "trying again until it is there" in messages[-1]
 
 
 def test_over_tcp_with_a_server_that_comes_late_and_sends_garbage(ended):
@@ -196,7 +198,7 @@ def test_over_tcp_with_a_server_that_comes_late_and_sends_garbage(ended):
             receiver.sendall(bytes(range(256)) * 20 + b"\n" + GGA_ALONE)
             (pose,), _ = until(source, lambda found, _: found)
         assert (pose.x_m, pose.y_m) != (0.0, 0.0)
-        until(source, lambda _, said: any("trying again" in words for words in said))
+        until(source, lambda _, messages: any("trying again" in message for message in messages))
         again, _ = server.accept()
         opened(source)
         with again:
@@ -243,11 +245,11 @@ def fix(quality, altitude="499.6", talker="GN", time="092725.00", place="4717.11
     return sentence(f"{talker}GGA,{time},{place},{quality},08,1.01,{altitude},M,48.0,M,,")
 
 
-def said_by(found):
+def messages_of(found):
     return [each["said"] for each in found if "said" in each]
 
 
-def taken(*lines):
+def parsed(*lines):
     """Return what is made of sentences that come 10 ms apart."""
     fixes = Fixes()
     return [each for k, line in enumerate(lines) for each in fixes.add_line(line, NOW_NS + 10_000_000 * k)]
@@ -255,9 +257,9 @@ def taken(*lines):
 
 @pytest.mark.parametrize("quality", QUALITY_STD_M)
 def test_a_fix_without_an_altitude_is_a_position_and_said_once(quality):
-    found = taken(fix(quality, ""), fix(quality, ""), fix(quality), fix(quality, ""), fix(quality, ""))
+    found = parsed(fix(quality, ""), fix(quality, ""), fix(quality), fix(quality, ""), fix(quality, ""))
     assert [(pose["x_m"], pose["y_m"]) for pose in poses(found)] == [pytest.approx((0.0, 0.0), abs=1e-6)] * 5
-    assert [words for words in said_by(found) if "altitude" in words] == [
+    assert [message for message in messages_of(found) if "altitude" in message] == [
         "GGA sentences lack an altitude; used instead: 0 m",
         "GGA sentences lack an altitude; used instead: the last height, 547.6 m",
     ]
@@ -265,15 +267,15 @@ def test_a_fix_without_an_altitude_is_a_position_and_said_once(quality):
 
 @pytest.mark.parametrize("broken", [{"time": ""}, {"place": ",,,"}])
 def test_a_fix_without_time_or_place_is_no_position_and_said_once(broken):
-    found = taken(fix(4, **broken), fix(4, **broken))
+    found = parsed(fix(4, **broken), fix(4, **broken))
     assert poses(found) == []
-    assert said_by(found)[1:] == ["GGA sentences lack time, latitude or longitude and give no position"]
+    assert messages_of(found)[1:] == ["GGA sentences lack time, latitude or longitude and give no position"]
 
 
 @pytest.mark.parametrize("talker", ["GP", "GN", "GL", "GA", "GB", "BD", "GQ"])
 @pytest.mark.parametrize("heading", ["HDT,123.456,T", "THS,123.456,A"])
 def test_a_heading_of_any_talker_is_read(talker, heading):
-    (pose,) = poses(taken(sentence(talker + heading), fix(4, talker=talker)))
+    (pose,) = poses(parsed(sentence(talker + heading), fix(4, talker=talker)))
     assert pose["yaw_rad"] == pytest.approx(math.radians(90.0 - 123.456))
     assert pose["yaw_std_rad"] == 0.02
 
@@ -284,43 +286,43 @@ def test_a_heading_of_any_talker_is_read(talker, heading):
      ("THS,123.4,S", "simulated"), ("THS,,V", "not valid"), ("THS,123.4,", "unknown mode")],
 )  # fmt: skip
 def test_a_heading_that_the_receiver_does_not_measure_is_refused_and_said_once(ths, why):
-    found = taken(sentence("GN" + ths), fix(4), sentence("GN" + ths), fix(4))
+    found = parsed(sentence("GN" + ths), fix(4), sentence("GN" + ths), fix(4))
     assert ["yaw_rad" in pose for pose in poses(found)] == [False, False]
-    (said,) = [words for words in said_by(found) if words.startswith("THS")]
-    assert why in said
-    assert "not used" in said
-    again = taken(sentence("GN" + ths), sentence("GNTHS,123.4,A"), fix(4))
-    assert "THS: the heading is measured again" in said_by(again)
+    (refusal,) = [message for message in messages_of(found) if message.startswith("THS")]
+    assert why in refusal
+    assert "not used" in refusal
+    again = parsed(sentence("GN" + ths), sentence("GNTHS,123.4,A"), fix(4))
+    assert "THS: the heading is measured again" in messages_of(again)
     assert "yaw_rad" in poses(again)[0]
 
 
 @pytest.mark.parametrize("ths", ["GNTHS,400.0,A", "GNTHS,-3.0,A", "GNTHS,,A", "GNHDT,,T", "GNHDT,361.0,T"])
 def test_what_is_no_heading_is_none(ths):
-    assert ["yaw_rad" in pose for pose in poses(taken(sentence(ths), fix(4)))] == [False]
-    assert poses(taken(sentence("GNTHS,123.4,A").replace(b"123", b"124"), fix(4)))[0].keys().isdisjoint({"yaw_rad"})
+    assert ["yaw_rad" in pose for pose in poses(parsed(sentence(ths), fix(4)))] == [False]
+    assert poses(parsed(sentence("GNTHS,123.4,A").replace(b"123", b"124"), fix(4)))[0].keys().isdisjoint({"yaw_rad"})
 
 
 @pytest.mark.parametrize("heading", [sentence("GPHDT,123.4,T"), sentence("GNTHS,123.4,A")], ids=["HDT", "THS"])
 @pytest.mark.parametrize(("quality", "std_rad"), [(1, 0.02), (2, 0.02), (4, 0.02), (5, 0.4)])
 def test_the_heading_of_a_float_fix_is_wide_before_or_after_its_position(heading, quality, std_rad):
-    (first,) = poses(taken(heading, fix(quality)))
+    (first,) = poses(parsed(heading, fix(quality)))
     # The first position without a heading is not kept waiting; from then on it is known that there are some.
-    after = poses(taken(heading, fix(4), *[sentence("GNZDA,,,,,,")] * 9, fix(quality), heading))[-1]
+    after = poses(parsed(heading, fix(4), *[sentence("GNZDA,,,,,,")] * 9, fix(quality), heading))[-1]
     assert first["yaw_std_rad"] == after["yaw_std_rad"] == std_rad
 
 
 def test_the_heading_that_came_without_a_fix_is_wide():
-    (pose,) = poses(taken(fix(0), sentence("GPHDT,123.4,T"), fix(4)))
+    (pose,) = poses(parsed(fix(0), sentence("GPHDT,123.4,T"), fix(4)))
     assert pose["yaw_std_rad"] == 0.4
 
 
 def test_where_no_heading_comes_the_sentences_that_bring_one_are_named_once():
-    def said_over(seconds, *first):
+    def messages_over(seconds, *first):
         fixes = Fixes()
         found = [each for line in first for each in fixes.add_line(line, NOW_NS)]
         found += [each for k in range(5 * seconds) for each in fixes.add_line(fix(4), NOW_NS + 200_000_000 * (k + 1))]
-        return [words for words in said_by(found) if "HDT or THS" in words]
+        return [message for message in messages_of(found) if "HDT or THS" in message]
 
-    assert len(said_over(30)) == 1
-    assert said_over(9) == []
-    assert said_over(30, HDT) == []
+    assert len(messages_over(30)) == 1
+    assert messages_over(9) == []
+    assert messages_over(30, HDT) == []

@@ -28,14 +28,14 @@ def source():
     made.close()
 
 
-def say(*datagrams):
+def send_datagrams(*datagrams):
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
         for datagram in datagrams:
             sender.sendto(datagram, bridge_address(PORT))
 
 
 def test_poses_come_in_the_order_of_their_times_and_the_rest_is_counted(source):
-    say(*(msgspec.msgpack.encode({**POSE, "t_ns": NOW_NS - age}) for age in (10, 50)), b"hello", b"")
+    send_datagrams(*(msgspec.msgpack.encode({**POSE, "t_ns": NOW_NS - age}) for age in (10, 50)), b"hello", b"")
     assert [NOW_NS - pose.t_ns for pose in source.receive(NOW_NS, ())] == [50, 10]
     assert (source.malformed, source.foreign_users) == (2, 0)
 
@@ -56,13 +56,13 @@ socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM).sendto(sys.stdin.buffer.read(),
 
 
 def test_a_second_bridge_is_refused_and_named(source):
-    say(msgspec.msgpack.encode({**POSE, "t_ns": NOW_NS}), msgspec.json.encode({"said": "hello"}))
+    send_datagrams(msgspec.msgpack.encode({**POSE, "t_ns": NOW_NS}), msgspec.json.encode({"said": "hello"}))
     datagram = msgspec.msgpack.encode({**POSE, "x_m": 9.0, "t_ns": NOW_NS})
     address = bridge_address(PORT).hex()
     subprocess.run([sys.executable, "-c", ANOTHER_BRIDGE, address], input=datagram, check=True, timeout=60)
     assert [pose.x_m for pose in source.receive(NOW_NS, ())] == [1.0]
-    words, refused = source.new_messages()
-    assert words == "hello"
+    greeting, refused = source.new_messages()
+    assert greeting == "hello"
     assert f"sends poses while bridge process {os.getpid()} does: not used" in refused
 
 

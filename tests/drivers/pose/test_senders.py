@@ -24,8 +24,8 @@ FIRST, SECOND = ("127.0.0.1", 4001), ("127.0.0.1", 4002)
 
 
 def proven(body, sent_ns=WALL_NS, key=KEY):
-    told = sent_ns.to_bytes(8, "big") + body
-    return told + hmac.new(key, told, hashlib.sha256).digest()
+    stamped = sent_ns.to_bytes(8, "big") + body
+    return stamped + hmac.new(key, stamped, hashlib.sha256).digest()
 
 
 def test_the_first_sender_is_kept_until_it_has_been_silent():
@@ -51,10 +51,12 @@ def test_a_flood_of_refused_datagrams_is_reported_once_in_ten_seconds_with_their
     for t_ns in range(0, 21 * SECOND_NS, SECOND_NS // 100):
         gate.note_pose(FIRST, t_ns)
         gate.may_send(SECOND, t_ns)
-    said = gate.new_messages()
-    assert len(said) == 3
-    assert "127.0.0.1:4002 sends poses while 127.0.0.1:4001 does: not used (1 datagrams); stop one of them" in said[0]
-    assert "(1000 datagrams)" in said[1]
+    messages = gate.new_messages()
+    assert len(messages) == 3
+    assert (
+        "127.0.0.1:4002 sends poses while 127.0.0.1:4001 does: not used (1 datagrams); stop one of them" in messages[0]
+    )
+    assert "(1000 datagrams)" in messages[1]
     assert gate.new_messages() == []
 
 
@@ -67,7 +69,7 @@ def test_made_up_addresses_do_not_fill_the_memory():
 
 
 @pytest.mark.parametrize(
-    ("addresses", "words"),
+    ("addresses", "expected_error"),
     [
         ((), "empty"),
         (("localhost",), '"localhost" is not an IPv4'),
@@ -75,15 +77,15 @@ def test_made_up_addresses_do_not_fill_the_memory():
         (("::1",), "not an IPv4"),
     ],
 )
-def test_what_is_no_address_is_refused(addresses, words):
-    with pytest.raises(ValueError, match=words):
+def test_what_is_no_address_is_refused(addresses, expected_error):
+    with pytest.raises(ValueError, match=expected_error):
         parse_allowed(addresses)
-    with pytest.raises(PoseSourceError, match=rf"pose\.allow: .*{words}"):
+    with pytest.raises(PoseSourceError, match=rf"pose\.allow: .*{expected_error}"):
         create_pose_source("udp", port=free_port(socket.SOCK_DGRAM), allow=addresses)
 
 
 @pytest.mark.parametrize(
-    ("datagram", "words"),
+    ("datagram", "expected_refusal"),
     [
         (b"", "without the authentication code"),
         (b"x" * 39, "without the authentication code"),
@@ -96,8 +98,8 @@ def test_what_is_no_address_is_refused(addresses, words):
         (proven(b"{}", 2**64 - 1), "by their sender's clock"),
     ],
 )
-def test_what_is_not_proven_or_not_of_now_is_refused(datagram, words):
-    assert words in PoseProof(KEY, WALL_NS - 500_000_000).unwrap(datagram, WALL_NS)
+def test_what_is_not_proven_or_not_of_now_is_refused(datagram, expected_refusal):
+    assert expected_refusal in PoseProof(KEY, WALL_NS - 500_000_000).unwrap(datagram, WALL_NS)
 
 
 def test_each_proven_datagram_counts_once_and_none_from_before_the_port_was_opened():
@@ -126,8 +128,8 @@ def test_over_a_real_socket_only_the_holder_of_the_key_is_heard():
         poses = source.receive(NOW_NS, ())
     assert [(pose.x_m, pose.y_m) for pose in poses] == [(1.0, -2.0)]
     assert source.refused == 2
-    (said,) = source.new_messages()
-    assert "sends poses without the authentication code of pose.key_file: not used" in said
+    (message,) = source.new_messages()
+    assert "sends poses without the authentication code of pose.key_file: not used" in message
     source.close()
 
 

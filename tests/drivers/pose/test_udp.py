@@ -77,9 +77,9 @@ def test_a_heading_that_nobody_has_filled_in_is_left_out_and_the_position_is_kep
     assert (pose.x_m, pose.y_m, pose.has_heading) == (1.0, -2.0, has_heading)
 
 
-@pytest.mark.parametrize("word", [b"NaN", b"1e999", b"-Infinity"])
-def test_a_number_that_is_not_finite_is_none(word):
-    text = json.dumps({**POSE, "age_s": 0.0}).encode().replace(b"-2.0", word)
+@pytest.mark.parametrize("literal", [b"NaN", b"1e999", b"-Infinity"])
+def test_a_number_that_is_not_finite_is_none(literal):
+    text = json.dumps({**POSE, "age_s": 0.0}).encode().replace(b"-2.0", literal)
     assert pose_of(text, NOW_NS) is None
 
 

@@ -41,7 +41,7 @@ from tests.drivers.waiting import collect, free_port, median_send_s, outgoing, s
 
 
 @pytest.mark.parametrize(
-    ("error_class", "data", "words"),
+    ("error_class", "data", "expected_text"),
     [
         (0x0A8, "0000001900000000", "no acknowledgement"),
         (0x08C, "0002090800000000", "protocol violation"),
@@ -51,9 +51,9 @@ from tests.drivers.waiting import collect, free_port, median_send_s, outgoing, s
         (0x001, "", "transmit timeout"),
     ],
 )
-def test_frames_as_the_kernel_makes_them(error_class, data, words):
+def test_frames_as_the_kernel_makes_them(error_class, data, expected_text):
     error = decode_error_frame(error_class, bytes.fromhex(data))
-    assert words in error.text
+    assert expected_text in error.text
     assert error.harmful
     assert error.bus_off == (error_class == 0x040)
 
@@ -86,48 +86,48 @@ A, B = Frame(0x100, b"\1"), Frame(0x100, b"\2")
 
 
 @pytest.fixture
-def own():
+def sent_frames():
     return SentFrames()
 
 
-def test_each_frame_sent_excuses_one_that_is_equal(own):
-    own.sent(0, A)
-    own.sent(0, A)
-    assert [own.is_echo(1, A) for _ in range(3)] == [True, True, False]
+def test_each_frame_sent_excuses_one_that_is_equal(sent_frames):
+    sent_frames.sent(0, A)
+    sent_frames.sent(0, A)
+    assert [sent_frames.is_echo(1, A) for _ in range(3)] == [True, True, False]
 
 
-def test_another_frame_is_no_echo_and_takes_no_excuse(own):
-    own.sent(0, A)
-    assert not own.is_echo(1, B)
-    assert not own.is_echo(1, Frame(0x101, A.data))
-    assert own.is_echo(1, A)
+def test_another_frame_is_no_echo_and_takes_no_excuse(sent_frames):
+    sent_frames.sent(0, A)
+    assert not sent_frames.is_echo(1, B)
+    assert not sent_frames.is_echo(1, Frame(0x101, A.data))
+    assert sent_frames.is_echo(1, A)
 
 
-def test_an_excuse_ends_after_a_second(own):
-    own.sent(0, A)
-    own.sent(ECHO_NS, B)
-    assert not own.is_echo(ECHO_NS + 1, A)
-    assert own.is_echo(2 * ECHO_NS, B)
+def test_an_excuse_ends_after_a_second(sent_frames):
+    sent_frames.sent(0, A)
+    sent_frames.sent(ECHO_NS, B)
+    assert not sent_frames.is_echo(ECHO_NS + 1, A)
+    assert sent_frames.is_echo(2 * ECHO_NS, B)
 
 
-def test_a_frame_that_was_not_sent_excuses_nothing(own):
+def test_a_frame_that_was_not_sent_excuses_nothing(sent_frames):
     for frame in (A, B, A):
-        own.sent(0, frame)
-    own.not_sent(A)
-    assert [own.is_echo(1, frame) for frame in (A, A, B)] == [True, False, True]
-    own.not_sent(B)
+        sent_frames.sent(0, frame)
+    sent_frames.not_sent(A)
+    assert [sent_frames.is_echo(1, frame) for frame in (A, A, B)] == [True, False, True]
+    sent_frames.not_sent(B)
 
 
 @given(st.lists(st.tuples(st.sampled_from([A, B]), st.booleans()), max_size=40))
 def test_whoever_else_sends_is_heard_as_often_as_he_sends(events):
     """Echoes and another host's frames of the same contents, in any order: what is not excused is as many as his."""
-    own = SentFrames()
+    sent_frames = SentFrames()
     for frame, is_ours in events:
         if is_ours:
-            own.sent(0, frame)
-    heard = [frame for frame, _ in events if not own.is_echo(1, frame)]
+            sent_frames.sent(0, frame)
+    not_echoes = [frame for frame, _ in events if not sent_frames.is_echo(1, frame)]
     strangers = [frame for frame, is_ours in events if not is_ours]
-    assert sorted(heard, key=lambda frame: frame.data) == sorted(strangers, key=lambda frame: frame.data)
+    assert sorted(not_echoes, key=lambda frame: frame.data) == sorted(strangers, key=lambda frame: frame.data)
 
 
 FAST = BackoffPolicy(first_s=0.01, longest_s=0.05, steady_s=0.1)
@@ -182,8 +182,8 @@ def test_frames_with_long_identifiers_pass_both_ways(virtual):
     assert received.frame == Frame(0x110, b"\x01", extended=True)
     for can_id in (0x317, 0x1FFFFFFF):
         send(transport, OutgoingFrame(Frame(can_id, b"\x02", extended=True), time.monotonic_ns() + 10**10))
-        heard = other.recv(5.0)
-        assert (heard.arbitration_id, heard.is_extended_id) == (can_id, True)
+        on_bus = other.recv(5.0)
+        assert (on_bus.arbitration_id, on_bus.is_extended_id) == (can_id, True)
 
 
 def test_what_is_no_classic_data_frame_is_counted_and_dropped(virtual):
@@ -235,10 +235,10 @@ def test_a_file_in_the_users_home_changes_nothing(tmp_path, monkeypatch):
 
 
 def test_the_bus_is_opened_as_asked_and_options_go_through_as_they_are(monkeypatch):
-    asked = []
+    requested = []
 
     def refuse(**settings):
-        asked.append(settings)
+        requested.append(settings)
         raise OSError("not here")
 
     monkeypatch.setattr(can, "Bus", refuse)
@@ -250,7 +250,7 @@ def test_the_bus_is_opened_as_asked_and_options_go_through_as_they_are(monkeypat
         with pytest.raises(OSError, match="not here"):
             medium.connect(TransportCounters())
     plain = {"interface": "slcan", "channel": "/dev/x", "ignore_config": True, "bitrate": 125_000, "timeout": 0.1}
-    assert asked == [
+    assert requested == [
         {"interface": "virtual", "channel": "one", "ignore_config": True, "bitrate": 250_000, "rx_queue_size": 7},
         {**plain, "sleep_after_open": 0.0},
         {**plain, "sleep_after_open": 2.0, "tty_baudrate": 9600},
@@ -345,11 +345,13 @@ class SocketcandServer:
                 return
             *commands, text = (text + data.decode()).split(">")
             for command in commands:
-                words = command.strip("< ").split()
-                if words[0] == "send":
-                    self.frames.append((int(words[1], 16), bytes.fromhex("".join(f"{byte:0>2}" for byte in words[3:]))))
+                arguments = command.strip("< ").split()
+                if arguments[0] == "send":
+                    self.frames.append(
+                        (int(arguments[1], 16), bytes.fromhex("".join(f"{byte:0>2}" for byte in arguments[3:])))
+                    )
                 else:
-                    self.opened.append(words)
+                    self.opened.append(arguments)
                     self._client = client
                     client.sendall(b"< ok >")
 
@@ -381,11 +383,11 @@ def test_socketcand_by_host_and_port_from_the_options():
         wait_until(lambda: server.frames == [(0x100, b"\xab\x01")])
         server.stop()
 
-        def lost():
+        def is_connecting():
             transport.send(outgoing(), time.monotonic_ns())
             return transport.state is LinkState.CONNECTING
 
-        wait_until(lost)
+        wait_until(is_connecting)
         wait_until(lambda: "start the other end first" in (transport.last_error or ""))
     finally:
         transport.close()
@@ -405,17 +407,17 @@ def test_a_bus_over_a_port_that_stays_mute_is_opened_again():
 
 
 @pytest.mark.parametrize(
-    ("error", "words"),
+    ("error", "expected_text"),
     [
         (TypeError("no argument 'hots'"), "link.options do not fit this interface"),
         (can.CanInterfaceNotImplementedError("only on Windows"), "install its maker's driver"),
         (NameError("canGetNumberOfChannels"), "install its maker's driver"),
     ],
 )
-def test_why_an_interface_does_not_open_is_one_line_with_a_remedy(error, words):
-    said = CanMedium("kvaser", "0", 500_000).explain(error)
-    assert words in said
-    assert "kvaser 0" in said
+def test_why_an_interface_does_not_open_is_one_line_with_a_remedy(error, expected_text):
+    explanation = CanMedium("kvaser", "0", 500_000).explain(error)
+    assert expected_text in explanation
+    assert "kvaser 0" in explanation
 
 
 @pytest.fixture
@@ -582,7 +584,7 @@ def test_want_of_room_is_distinguished_from_a_dead_line():
 
 
 @pytest.mark.parametrize(
-    ("flags", "carrier", "error", "words"),
+    ("flags", "carrier", "error", "expected_error"),
     [
         ("0x80", "0", OSError, "interface is down"),
         ("0x81", "0", LinkLostError, "bus-off"),
@@ -590,7 +592,7 @@ def test_want_of_room_is_distinguished_from_a_dead_line():
         ("gibberish", "1", None, ""),
     ],
 )
-def test_an_interface_on_which_sending_would_be_swallowed_is_not_used(tmp_path, flags, carrier, error, words):
+def test_an_interface_on_which_sending_would_be_swallowed_is_not_used(tmp_path, flags, carrier, error, expected_error):
     """What the kernel shows in sysfs; "lo" lends its name, since every machine has it."""
     (tmp_path / "lo").mkdir()
     (tmp_path / "lo" / "flags").write_text(flags + "\n")
@@ -598,7 +600,7 @@ def test_an_interface_on_which_sending_would_be_swallowed_is_not_used(tmp_path, 
     if error is None:
         require_working_interface("lo", tmp_path)
         return
-    with pytest.raises(error, match=words):
+    with pytest.raises(error, match=expected_error):
         require_working_interface("lo", tmp_path)
 
 

@@ -99,12 +99,12 @@ def transport(line, exchange, monkeypatch):
     transport.close()
 
 
-def ask(*frames, rank=2):
+def outgoing(*frames, rank=2):
     return [OutgoingFrame(frame, time.monotonic_ns() + 60_000_000_000, rank) for frame in frames]
 
 
 def test_replies_come_in_the_order_of_the_questions_and_each_is_read_as_its_own(line, transport):
-    send(transport, *ask(ENCODERS, SPEEDS, STATUS, STOP))
+    send(transport, *outgoing(ENCODERS, SPEEDS, STATUS, STOP))
     replies = [received.frame for received in collect(transport, 4)]
     assert [reply.can_id for reply in replies] == [frame.can_id for frame in (ENCODERS, SPEEDS, STATUS, STOP)]
     assert protocol.reply(0x80, "encoders", replies[0].data)[0]["encoder_m1"] == 11
@@ -115,7 +115,7 @@ def test_replies_come_in_the_order_of_the_questions_and_each_is_read_as_its_own(
 def test_no_request_leaves_before_the_reply_to_the_one_before_is_whole(line, transport):
     """In pieces, with less than the quiet time between them."""
     line.spoil = lambda _request, reply: [(0.004, reply[:3]), (0.004, reply[3:7]), (0.004, reply[7:])]
-    send(transport, *ask(ENCODERS, SPEEDS, ENCODERS))
+    send(transport, *outgoing(ENCODERS, SPEEDS, ENCODERS))
     assert len(collect(transport, 3)) == 3
     assert line.requests == [ENCODERS.data, SPEEDS.data, ENCODERS.data]
 
@@ -124,7 +124,7 @@ def test_no_request_leaves_before_the_reply_to_the_one_before_is_whole(line, tra
 def test_a_late_reply_is_nobodys(line, transport, exchange):
     pauses = iter((exchange.timeout_s + exchange.quiet_s / 2, 0.0, 0.0))
     line.spoil = lambda _request, reply: [(next(pauses), reply)]
-    send(transport, *ask(ENCODERS, SPEEDS, STATUS))
+    send(transport, *outgoing(ENCODERS, SPEEDS, STATUS))
     assert [received.frame.can_id for received in collect(transport, 2)] == [SPEEDS.can_id, STATUS.can_id]
     assert transport.stats.receive_errors == 1
 
@@ -143,7 +143,7 @@ def test_a_late_reply_is_nobodys(line, transport, exchange):
 def test_a_reply_that_does_not_fit_the_question_is_counted_and_the_next_is_whole(line, transport, spoilt):
     changes = iter((spoilt, lambda reply: reply))
     line.spoil = lambda _request, reply: [(0.0, next(changes)(reply))]
-    send(transport, *ask(ENCODERS, SPEEDS))
+    send(transport, *outgoing(ENCODERS, SPEEDS))
     assert [received.frame.can_id for received in collect(transport, 1)] == [SPEEDS.can_id]
     assert transport.stats.malformed == 1
 
@@ -151,7 +151,7 @@ def test_a_reply_that_does_not_fit_the_question_is_counted_and_the_next_is_whole
 @hasty
 def test_a_board_that_is_silent_holds_up_the_others_for_a_moment_only(line, transport):
     silent = [query(0x81, "status")] * 3
-    send(transport, *ask(*silent, STATUS))
+    send(transport, *outgoing(*silent, STATUS))
     assert [received.frame.can_id for received in collect(transport, 1)] == [STATUS.can_id]
     assert transport.stats.receive_errors == 3
 
@@ -159,27 +159,27 @@ def test_a_board_that_is_silent_holds_up_the_others_for_a_moment_only(line, tran
 def test_a_stop_goes_before_what_waits(line, transport):
     all_wait = threading.Event()
     line.spoil = lambda _request, reply: [(0.0, reply)] * all_wait.wait(10.0)
-    send(transport, *ask(*[ENCODERS] * 8), *ask(STOP, rank=0))
+    send(transport, *outgoing(*[ENCODERS] * 8), *outgoing(STOP, rank=0))
     all_wait.set()
     replies = [received.frame.can_id for received in collect(transport, 9)]
     assert replies.index(STOP.can_id) <= 1
 
 
 def test_unplugged_and_plugged_in_it_goes_on(line, transport):
-    send(transport, *ask(ENCODERS))
+    send(transport, *outgoing(ENCODERS))
     collect(transport, 1)
     line.replug()
 
     def came_back():
-        transport.send(*ask(SPEEDS), time.monotonic_ns())
+        transport.send(*outgoing(SPEEDS), time.monotonic_ns())
         return transport.generation > 1 and transport.state is LinkState.UP
 
     wait_until(came_back)
     transport.receive()
-    send(transport, *ask(ENCODERS))
+    send(transport, *outgoing(ENCODERS))
     wait_until(lambda: any(received.frame.can_id == ENCODERS.can_id for received in transport.receive()))
 
 
 def test_a_packet_that_is_longer_than_any_is_refused(line, transport):
     with pytest.raises(ValueError, match="not a classic CAN frame"):
-        transport.send(*ask(Frame(1, bytes(513))), time.monotonic_ns())
+        transport.send(*outgoing(Frame(1, bytes(513))), time.monotonic_ns())

@@ -14,7 +14,7 @@ def caused(error, cause):
 
 
 @pytest.mark.parametrize(
-    ("error", "words"),
+    ("error", "expected_text"),
     [
         (serial.SerialException(errno.ENOENT, "could not open"), "no such device"),
         (serial.SerialException(errno.EACCES, "could not open"), "usermod -aG dialout"),
@@ -23,12 +23,12 @@ def caused(error, cause):
         (ValueError("odd"), "/dev/ttyUSB0: odd"),
     ],
 )
-def test_serial_port(error, words):
-    assert words in explain_port("/dev/ttyUSB0", error)
+def test_serial_port(error, expected_text):
+    assert expected_text in explain_port("/dev/ttyUSB0", error)
 
 
 @pytest.mark.parametrize(
-    ("interface", "error", "words"),
+    ("interface", "error", "expected_text"),
     [
         ("socketcan", OSError(errno.ENODEV, "No such device"), "sudo ip link set can0 up type can bitrate 250000"),
         ("socketcan", can.CanOperationError("down", errno.ENETDOWN), "the interface is down"),
@@ -41,9 +41,9 @@ def test_serial_port(error, words):
         ("virtual", KeyError(), "virtual can0: KeyError"),
     ],
 )
-def test_can_bus(interface, error, words):
+def test_can_bus(interface, error, expected_text):
     text = explain_can(interface, "can0", 250_000, error)
-    assert words in text
+    assert expected_text in text
     assert "\n" not in text
 
 

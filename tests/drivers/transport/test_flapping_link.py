@@ -13,7 +13,7 @@ from drivers.transport.serial import SerialMedium
 from tests.drivers.transport.pseudo_terminal import PseudoTerminal
 from tests.drivers.waiting import wait_until
 
-AT_ONCE = BackoffPolicy(first_s=0.0002, longest_s=0.0002, steady_s=10.0)
+IMMEDIATELY = BackoffPolicy(first_s=0.0002, longest_s=0.0002, steady_s=10.0)
 SETTLED, RECONNECTS = 20, 1000
 MINUTES_S = 100.0
 
@@ -29,14 +29,14 @@ class Flapping:
     def connect(self, counters):
         connection, seen = self._medium.connect(counters), self.seen
 
-        class Lost:
+        class BrokenConnection:
             write, close = connection.write, connection.close
 
             def read(self):
                 seen.append(resources())
                 raise LinkLostError("flapped")
 
-        return Lost()
+        return BrokenConnection()
 
 
 @pytest.fixture
@@ -77,15 +77,15 @@ def resources():
 def test_descriptors_and_threads_stay_as_many(kind, request):
     medium = request.getfixturevalue(kind)
     before = resources()
-    transport = ReconnectingTransport(medium, backoff=AT_ONCE)
+    transport = ReconnectingTransport(medium, backoff=IMMEDIATELY)
     transport.open()
     wait_until(lambda: len(medium.seen) > RECONNECTS, MINUTES_S)
     transport.close()
     # The hub may just be hanging up, and what an earlier test left behind may end meanwhile.
     wait_until(lambda: all(now <= then for now, then in zip(resources(), before, strict=True)))
-    early, late = medium.seen[SETTLED : 2 * SETTLED], medium.seen[-SETTLED:]
-    (early_files, early_threads), (late_files, late_threads) = (
-        tuple(map(max, zip(*looks, strict=True))) for looks in (early, late)
+    first, last = medium.seen[SETTLED : 2 * SETTLED], medium.seen[-SETTLED:]
+    (first_files, first_threads), (last_files, last_threads) = (
+        tuple(map(max, zip(*looks, strict=True))) for looks in (first, last)
     )
-    assert late_files <= early_files + 1
-    assert late_threads <= early_threads
+    assert last_files <= first_files + 1
+    assert last_threads <= first_threads

@@ -5,7 +5,7 @@ from drivers.types import LinkState
 
 
 @pytest.mark.parametrize(
-    ("settings", "words"),
+    ("settings", "expected_error"),
     [
         ({"kind": "can", "interface": "sockercan"}, 'link.interface: python-can has no interface "sockercan"'),
         ({"kind": "usb"}, 'link.kind: "usb"'),
@@ -14,10 +14,10 @@ from drivers.types import LinkState
         ({"kind": "can", "interface": "virtual", "options": {"channel": "a"}}, "write it as link.channel"),
     ],
 )
-def test_settings_that_no_device_can_satisfy_are_one_clear_line(settings, words):
+def test_settings_that_no_device_can_satisfy_are_one_clear_line(settings, expected_error):
     with pytest.raises(TransportSettingsError) as caught:
         open_transport(**settings)
-    assert words in str(caught.value)
+    assert expected_error in str(caught.value)
     assert "; write " in str(caught.value)
     assert "\n" not in str(caught.value)
 

@@ -100,11 +100,11 @@ def test_a_frame_never_outlives_its_deadline():
 @given(st.lists(st.tuples(st.integers(0, 20), st.booleans()), max_size=40))
 def test_what_has_not_expired_keeps_its_order(frames):
     queue = TransmitQueue(64)
-    for number, (can_id, late) in enumerate(frames):
-        queue.push(frame(can_id, number, deadline_ns=10 if late else 100))
-    assert queue.expire(50) == sum(late for _, late in frames)
+    for number, (can_id, is_expired) in enumerate(frames):
+        queue.push(frame(can_id, number, deadline_ns=10 if is_expired else 100))
+    assert queue.expire(50) == sum(is_expired for _, is_expired in frames)
     sent = [(outgoing.frame.can_id, outgoing.frame.data[0]) for outgoing in drain(queue)]
-    assert sent == sorted((can_id, number) for number, (can_id, late) in enumerate(frames) if not late)
+    assert sent == sorted((can_id, number) for number, (can_id, is_expired) in enumerate(frames) if not is_expired)
 
 
 def test_full_queue_refuses_the_least_urgent_frame():
@@ -131,8 +131,8 @@ def test_a_frame_put_back_stays_before_its_equals():
     assert drain(queue) == [urgent, first, second]
     queue.push(first)
     queue.push(second)
-    taken = [queue.pop(), queue.pop()]
-    for one in reversed(taken):
+    popped = [queue.pop(), queue.pop()]
+    for one in reversed(popped):
         queue.requeue(one)
     assert drain(queue) == [first, second]
     queue.push(first)
@@ -370,10 +370,10 @@ def test_a_stalled_medium_never_blocks_the_caller_and_an_emergency_stop_still_fi
     medium.may_write.clear()
     send(transport, outgoing(0x300))
     wait_until(transport._writing.locked)
-    taken = sum(transport.send(outgoing(0x200), time.monotonic_ns()) for _ in range(200))
+    accepted = sum(transport.send(outgoing(0x200), time.monotonic_ns()) for _ in range(200))
     assert not medium.sent, "the caller waited for the medium"
-    assert taken == reconnecting.TRANSMIT_CAPACITY
-    assert transport.stats.transmit_queue_full == 200 - taken
+    assert accepted == reconnecting.TRANSMIT_CAPACITY
+    assert transport.stats.transmit_queue_full == 200 - accepted
     send(transport, outgoing(0x080))
     medium.may_write.set()
     wait_until(lambda: len(medium.sent) >= 2)

@@ -133,20 +133,20 @@ def test_an_adapter_that_comes_back_under_another_number_is_found_by_its_lasting
     transport = ReconnectingTransport(SerialMedium(str(by_id), 115_200), backoff=FAST, mute_after_s=0.3)
     transport.open()
 
-    def answer_of(terminal):
+    def frames_from(terminal):
         # Again and again: a host that pauses makes the line mute, and what was on it is gone.
         return wait_until(lambda: terminal.write(LINE) or transport.receive())
 
     try:
         wait_until(lambda: transport.state is LinkState.UP)
-        assert answer_of(before)[-1].frame == FRAME
+        assert frames_from(before)[-1].frame == FRAME
         generation = transport.generation
         by_id.unlink()
         by_id.symlink_to(after.path)
         wait_until(lambda: transport.generation > generation)
         assert re.search(r"no frame received for 0\.[36] s", transport.last_error)
         assert "/dev/serial/by-id" in transport.last_error
-        assert answer_of(after)[-1].frame == FRAME
+        assert frames_from(after)[-1].frame == FRAME
         wait_until(lambda: transport.last_error is None)
     finally:
         transport.close()
@@ -184,20 +184,20 @@ def test_the_lines_are_set_before_the_port_is_opened(terminal, monkeypatch, dtr,
 
 def test_both_lines_are_low_unless_robot_toml_says_otherwise(terminal):
     """At the seam to the kernel, as pseudo-terminals have no such lines: which are set, and which are cleared."""
-    asked = []
+    line_states = []
 
     class Port(serial.Serial):
         def _update_dtr_state(self):
-            asked.append(("dtr", self._dtr_state))
+            line_states.append(("dtr", self._dtr_state))
 
         def _update_rts_state(self):
-            asked.append(("rts", self._rts_state))
+            line_states.append(("rts", self._rts_state))
 
     port = SerialMedium(str(terminal.path), 115_200)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(serial, "Serial", Port)
         port.connect(TransportCounters()).close()
-    assert set(asked) == {("dtr", False), ("rts", False)}
+    assert set(line_states) == {("dtr", False), ("rts", False)}
 
 
 class FtdiPort:
@@ -207,10 +207,10 @@ class FtdiPort:
         self.low_latency = False
         self.error = error
 
-    def set_low_latency_mode(self, wanted):
+    def set_low_latency_mode(self, enabled):
         if self.error is not None:
             raise self.error
-        self.low_latency = wanted
+        self.low_latency = enabled
 
 
 def test_an_adapter_that_holds_bytes_back_is_set_not_to():

@@ -19,7 +19,7 @@ from tests.firmware_protocol.emulated.board_end import BoardEnd
 from tests.firmware_protocol.other_end import LinkEnd
 from tests.firmware_protocol.protocol_host import CODEC, ProtocolHost
 from tests.sim.test_board import SimProcess
-from tests.sim.test_python_can_link import HubProcess, drive_beside_another_node
+from tests.sim.test_python_can_link import HubProcess, drive_with_another_node
 from tools.check.emulated_board import build_board, missing, run_fast, running_bare_board, running_board
 
 ROOT = Path(__file__).parents[3]
@@ -95,27 +95,27 @@ def test_the_emergency_stop_button_stops_the_wheels(host):
     host.end.bench.do("p")
     assert host.wait_for_state("ESTOP", within_s=1.0) <= 0.1 + host.end.slack_s
     host.wait_for("standing wheels", lambda: host.fastest == 0.0, 1.0)
-    host.ask("RESET")
+    host.set_request("RESET")
     host.run(1.0)
     assert host.state == "ESTOP"
     host.end.bench.do("p")
-    host.ask("STANDBY")
+    host.set_request("STANDBY")
     host.run(0.2)
     host.settle()
 
 
 def test_parameters_that_were_written_outlive_a_restart(host):
-    def ask(**request):
+    def request_parameter(**request):
         host.latest.pop("PARAM_RESPONSE", None)
         host.send("PARAM_REQUEST", **request)
         host.wait_for("PARAM_RESPONSE", lambda: "PARAM_RESPONSE" in host.latest)
         return host.latest["PARAM_RESPONSE"]["value"]
 
-    assert ask(operation="READ", key=4, value=0.0) == 20.0
-    assert ask(operation="WRITE", key=4, value=5.0) == 5.0
+    assert request_parameter(operation="READ", key=4, value=0.0) == 20.0
+    assert request_parameter(operation="WRITE", key=4, value=5.0) == 5.0
     host.run(0.1)
     host.restart()
-    assert ask(operation="READ", key=4, value=0.0) == 5.0
+    assert request_parameter(operation="READ", key=4, value=0.0) == 5.0
 
 
 def test_a_thousand_frames_of_garbage_move_nothing_and_leave_it_sound(host_at_a_terminal):
@@ -188,10 +188,10 @@ def test_a_host_that_freezes_stops_the_wheels_within_the_watchdogs_time(tmp_path
             host.wait()
             host.stdout.close()
     last = max(row.accepted for row in rows)
-    heard_ms = next(row.ms for row in rows if row.accepted == last)
-    first_zero_ms = next(row.ms for row in rows if row.ms > heard_ms and row.setpoints == (0.0, 0.0))
+    last_command_ms = next(row.ms for row in rows if row.accepted == last)
+    first_zero_ms = next(row.ms for row in rows if row.ms > last_command_ms and row.setpoints == (0.0, 0.0))
     # 100 ms of the watchdog, 1.5 rad/s at 20 rad/s2, two lines of the bench and two cycles.
-    assert first_zero_ms - heard_ms <= 100 + 75 + 22
+    assert first_zero_ms - last_command_ms <= 100 + 75 + 22
     after = [row for row in rows if row.ms >= first_zero_ms]
     assert {row.setpoints for row in after} == {(0.0, 0.0)}
     assert after[-1].speeds == (0.0, 0.0)
@@ -226,7 +226,7 @@ def test_behind_slcan_it_sits_on_the_mock_bus_beside_other_nodes(tmp_path, proce
         running_board(image, processor, terminal=True) as board,
         HubProcess(tmp_path / "bus", board.port, "sleep_after_open=0"),
     ):
-        drive_beside_another_node(tmp_path / "bus")
+        drive_with_another_node(tmp_path / "bus")
 
 
 @pytest.mark.parametrize("processor", ["m3", "m4f"])

@@ -29,30 +29,30 @@ PERIOD_NS = 20_000_000
 LEAST_PAUSE_US = 500
 
 
-def own_overruns(deadlines_ns, ends_ns, pauses):
+def overruns_without_pauses(deadlines_ns, ends_ns, pauses):
     """How many ticks would have ended after the next deadline without these pauses, too.
 
     What several processors were paused at once counts once.
     """
-    own = 0
+    count = 0
     for deadline, end in zip(deadlines_ns, ends_ns, strict=True):
-        lost, until = 0, deadline
+        paused_ns, until = 0, deadline
         for paused, resumed in pauses:
             since, to = max(paused, until), min(resumed, end)
             if to > since:
-                lost, until = lost + to - since, to
-        own += end - lost > deadline + PERIOD_NS
-    return own
+                paused_ns, until = paused_ns + to - since, to
+        count += end - paused_ns > deadline + PERIOD_NS
+    return count
 
 
 def overran(loop):
     """Deadlines and ends, ns, of the ticks that the daemon counted as overruns: ended after the next deadline."""
-    (late,) = np.nonzero(np.diff(loop["overruns"]))
+    (indices,) = np.nonzero(np.diff(loop["overruns"]))
     stages = sum(values for name, values in loop.items() if name.startswith("stages_ns."))
-    ends = loop["woke_ns"][late] + stages[late + 1]
+    ends = loop["woke_ns"][indices] + stages[indices + 1]
     # What comes after the last stage is not timed; the next tick is the latest that it can have ended.
-    ends = np.where(ends > loop["t_ns"][late] + PERIOD_NS, ends, loop["woke_ns"][late + 1])
-    return loop["t_ns"][late].tolist(), ends.tolist()
+    ends = np.where(ends > loop["t_ns"][indices] + PERIOD_NS, ends, loop["woke_ns"][indices + 1])
+    return loop["t_ns"][indices].tolist(), ends.tolist()
 
 
 def drive(directory, robot_file, others=()):
@@ -66,10 +66,10 @@ def drive(directory, robot_file, others=()):
     loop = joined([part.columns("/loop") for part in parts])
     assert np.all(np.diff(loop["tick"]) == 1), "the log lacks ticks"
     stolen_ms = parts[-1].columns("/counters")["loop.stolen_ms"][-1]
-    own = own_overruns(*overran(loop), pauses)
+    unexplained = overruns_without_pauses(*overran(loop), pauses)
     within = [to - since for since, to in pauses if to > loop["t_ns"][0] and since < loop["t_ns"][-1]]
-    return own, (
-        f"{loop['overruns'][-1]} overruns, {own} of them without a pause of the computer, "
+    return unexplained, (
+        f"{loop['overruns'][-1]} overruns, {unexplained} of them without a pause of the computer, "
         f"{loop['skipped'][-1]} skipped in {len(loop['tick'])} ticks, latest {loop['lateness_ns'].max() * 1e-6:.1f} ms "
         f"late; the computer ran nobody on a processor {len(within)} times, {max(within, default=0) * 1e-6:.1f} ms at "
         f"most; its host took {stolen_ms} ms"
@@ -137,11 +137,11 @@ def virtual_m2(tmp_path_factory):
 def test_only_what_a_pause_took_is_the_computers():
     ms = 1_000_000
     pauses = [(5 * ms, 15 * ms), (6 * ms, 16 * ms), (100 * ms, 103 * ms)]
-    assert own_overruns([0], [25 * ms], pauses) == 0
-    assert own_overruns([0], [32 * ms], pauses) == 1, "two processors at once"
-    assert own_overruns([90 * ms], [112 * ms], pauses) == 0
-    assert own_overruns([90 * ms], [114 * ms], pauses) == 1
-    assert own_overruns([200 * ms], [221 * ms], pauses) == 1
+    assert overruns_without_pauses([0], [25 * ms], pauses) == 0
+    assert overruns_without_pauses([0], [32 * ms], pauses) == 1, "two processors at once"
+    assert overruns_without_pauses([90 * ms], [112 * ms], pauses) == 0
+    assert overruns_without_pauses([90 * ms], [114 * ms], pauses) == 1
+    assert overruns_without_pauses([200 * ms], [221 * ms], pauses) == 1
 
 
 @pytest.mark.parametrize("processor", ["m3", "m4f"])
@@ -152,7 +152,7 @@ def test_the_daemon_drives_the_circle_through_the_board_as_through_the_virtual_r
         robot_file = write_robot_file(tmp_path, "serial")
         text = robot_file.read_text("utf-8")
         robot_file.write_text(text.replace(str(tmp_path / "tty"), running.port), "utf-8")
-        own, loop = drive(tmp_path, robot_file)
+        unexplained, loop = drive(tmp_path, robot_file)
         rows = list(running.bench.rows)
     assert {row.start for row in rows} == {1}
     board, board_error = mean_square_m2([row.pose[:2] for row in rows])
@@ -161,6 +161,6 @@ def test_the_daemon_drives_the_circle_through_the_board_as_through_the_virtual_r
         of = f"{1e3 * math.sqrt(board):.1f} mm rms, virtual robot {1e3 * math.sqrt(virtual):.1f} mm"
         print(f"\ncircle: {processor} {of}; {loop}")
     if can_use_fifo():
-        assert own == 0, loop
+        assert unexplained == 0, loop
     # Within 20 %, and twice what chance adds to the difference.
     assert board <= 1.2**2 * virtual + 2 * math.hypot(board_error, 1.2**2 * virtual_error)

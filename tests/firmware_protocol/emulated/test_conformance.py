@@ -16,13 +16,13 @@ pytestmark = [
 
 class TestM3(FirmwareConformance):
     @classmethod
-    def make_end(cls, config):
+    def create_end(cls, config):
         return BoardEnd("m3")
 
 
 class TestM4F(FirmwareConformance):
     @classmethod
-    def make_end(cls, config):
+    def create_end(cls, config):
         return BoardEnd("m4f")
 
 
@@ -30,7 +30,7 @@ class TestAuthenticatedM3(FirmwareConformance):
     key = bytes(range(16))
 
     @classmethod
-    def make_end(cls, config):
+    def create_end(cls, config):
         return BoardEnd("m3", key=cls.key)
 
 
@@ -38,11 +38,11 @@ class TestAuthenticatedM4F(FirmwareConformance):
     key = bytes(range(16))
 
     @classmethod
-    def make_end(cls, config):
+    def create_end(cls, config):
         return BoardEnd("m4f", key=cls.key)
 
 
 class TestSlcanM4F(FirmwareConformance):
     @classmethod
-    def make_end(cls, config):
+    def create_end(cls, config):
         return BoardEnd("m4f", slcan=True)

@@ -30,7 +30,7 @@ def driving():
 
 def test_who_holds_the_key_arms_and_drives():
     bench = driving()
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.command = None
     bench.run_until("STANDBY")
     assert refused(bench) == 0
@@ -61,7 +61,7 @@ def test_without_the_key_not_even_ready(key):
     bench = Bench(LOCKED)
     bench.prover = Prover(key, CODEC) if key else None
     bench.hello()
-    bench.ask("READY")
+    bench.set_request("READY")
     bench.command = {}
     bench.run(2000)
     assert bench.out.state == "STANDBY"
@@ -80,10 +80,10 @@ def test_to_leave_the_emergency_stop_takes_the_key():
     bench = driving()
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.command = None
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.run(1500)
     proves, bench.prover = bench.prover, None
-    bench.ask("RESET")
+    bench.set_request("RESET")
     bench.run(500)
     assert bench.out.state == "ESTOP"
     bench.prover = proves
@@ -95,7 +95,7 @@ def test_an_unproved_standby_neither_stops_nor_takes_a_request_back():
     bench = driving()
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.command = None
-    bench.ask("RESET")
+    bench.set_request("RESET")
     bench.run(1500)
     assert bench.out.state == "STANDBY"
     bench.core.receive(bench.now_us, 0x080, b"")
@@ -168,7 +168,7 @@ def test_a_recorded_run_played_to_another_start_does_nothing():
 
 def test_a_recorded_run_played_again_later_in_the_same_start_does_nothing():
     bench, frames = recorded_run()
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.command = None
     bench.run_until("STANDBY")
     bench.request = None
@@ -199,7 +199,7 @@ def test_the_nonce_is_new_in_every_session_and_for_every_host():
     bench.run(100)
     assert bench.prover._nonce == armed, "none but the host's own end changes it within a session"
     assert bench.out.state == "ARMED"
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.command = None
     bench.run_until("STANDBY")
     bench.step()
@@ -214,13 +214,13 @@ def test_the_nonce_is_new_in_every_session_and_for_every_host():
 def test_a_host_that_starts_anew_is_heard():
     bench = Bench(LOCKED)
     bench.to_ready()
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.run_until("STANDBY")
     bench.run(500)
     bench.prover = Prover(KEY, CODEC)
     bench.run(600)
     bench.hello()
-    bench.ask("READY", 9)
+    bench.set_request("READY", 9)
     bench.run_until("READY")
 
 
@@ -280,7 +280,7 @@ def test_the_next_nonce_is_drawn_in_a_cycle_with_nothing_to_send():
     a = bench.core._core.authentication
     bench.to_ready()
     draws = a.draws
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.run_until("STANDBY")
     sending = bench.messages("MAC_CHALLENGE", bench.now_us)
     assert sending

@@ -147,7 +147,7 @@ def test_standby_rejects_even_zero():
 def test_stopped_states_reject_everything(state):
     bench = driving()
     if state == "STOPPING":
-        bench.ask("STANDBY")
+        bench.set_request("STANDBY")
         bench.run_until("STOPPING")
     elif state == "FAULT":
         bench.command = {"left": 4.0, "right": 2.0}
@@ -212,9 +212,9 @@ def test_zeros_of_an_arming_before_do_not_count():
     bench = Bench()
     bench.to_armed()
     bench.command = None
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.run_until("STANDBY")
-    bench.ask("READY", session=9)
+    bench.set_request("READY", session=9)
     bench.run_until("READY", within_ms=60)
     five_zeros_more(bench)
 
@@ -239,7 +239,7 @@ def test_zero_commands_that_stopped_do_not_arm():
     bench.run(300)
     bench.command = None
     bench.run(101)
-    bench.ask("ARM")
+    bench.set_request("ARM")
     bench.run(100)
     assert bench.out.state == "READY"
     assert "ZERO_COMMANDS" in bench.blockers()
@@ -256,7 +256,7 @@ def test_the_watchdog_runs_from_the_instant_of_arming():
     bench = Bench()
     bench.to_ready()
     bench.command = {}
-    bench.ask("ARM")
+    bench.set_request("ARM")
     while bench.step().state != "ARMED":
         pass
     bench.command = None
@@ -273,7 +273,7 @@ def test_no_command_from_before_arming_outlives_it():
         bench.wheel_command(mode="COAST", valid_for=0.002)
         bench.step()
     bench.run(40)
-    bench.ask("ARM")
+    bench.set_request("ARM")
     bench.run_until("ARMED", within_ms=50)
     assert bench.out.driver_enabled
     assert stop_time_us(bench) == 100 * MS
@@ -324,7 +324,7 @@ def test_a_command_holds_no_longer_than_it_says_nor_than_the_firmware_allows(val
 
 def test_a_stop_for_another_reason_is_no_watchdog_event():
     bench = driving()
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.command = {"left": 4.0, "right": 2.0}
     bench.run_until("STOPPING")
     assert bench.out.watchdog_events == 0

@@ -132,7 +132,7 @@ def test_taking_over_a_wheel_that_runs_away_starts_within_the_limit():
     assert setpoints(bench) == pytest.approx((7.98, 3.99))
 
 
-def ask_to_disarm(bench):
+def request_disarm(bench):
     bench.request["request"] = "STANDBY"
 
 
@@ -142,7 +142,7 @@ def fall_silent(bench):
 
 @pytest.mark.parametrize(
     "act",
-    [lambda bench: bench.core.receive(bench.now_us, 0x080, b""), ask_to_disarm, fall_silent],
+    [lambda bench: bench.core.receive(bench.now_us, 0x080, b""), request_disarm, fall_silent],
     ids=["estop", "disarmed", "silence"],
 )
 def test_released_wheels_are_braked_by_any_stop_without_a_ramp(act):
@@ -194,7 +194,7 @@ def test_estop_decelerates_from_the_very_next_cycle_then_brakes(how):
 def test_stopping_keeps_curvature_and_ends_in_standby():
     bench = Bench(dataclasses.replace(CONFIG, stop_deceleration_rad_s2=10.0))
     bench.to_driving(4.0, -1.0)
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.run_until("STOPPING")
     start = bench.now_us
     assert bench.out.limited
@@ -233,7 +233,7 @@ def test_a_stop_that_does_not_end_is_ended():
     bench = Bench(dataclasses.replace(CONFIG, drive_off_timeout_s=2.0, stop_timeout_s=0.3))
     bench.to_driving()
     bench.wheels_follow = False
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.run_until("STOPPING")
     start = bench.now_us
     bench.run_until("STANDBY")
@@ -312,7 +312,7 @@ def test_estop_at_any_instant_stops_for_good(at_ms):
     bench.hello()
     for ms in range(1, 700):
         session_request = "READY" if bench.out.state == "STANDBY" else "ARM"
-        bench.ask(session_request)
+        bench.set_request(session_request)
         bench.command = {"left": 6.0, "right": -3.0} if bench.out.state == "ARMED" else {}
         bench.step()
         if ms == at_ms:

@@ -197,10 +197,10 @@ def test_turning_against_the_setpoint_is_wrong_direction(side, sign):
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-@pytest.mark.parametrize(("asked", "speed"), [(1.0, -3.0), (4.0, -1.0), (4.0, 0.5), (4.0, -0.5), (4.0, 0.0)])
-def test_up_to_the_check_speed_a_wheel_does_not_turn_against_its_setpoint(asked, speed, sign):
+@pytest.mark.parametrize(("setpoint_rad_s", "speed"), [(1.0, -3.0), (4.0, -1.0), (4.0, 0.5), (4.0, -0.5), (4.0, 0.0)])
+def test_up_to_the_check_speed_a_wheel_does_not_turn_against_its_setpoint(setpoint_rad_s, speed, sign):
     bench = Bench()
-    bench.to_driving(asked * sign, asked * sign)
+    bench.to_driving(setpoint_rad_s * sign, setpoint_rad_s * sign)
     bench.wheels_follow = False
     bench.speeds[0] = speed * sign
     assert wait_for_fault(bench, within_ms=1000) == (None, None)
@@ -237,15 +237,17 @@ def setpoint(bench):
 
 
 # The last is nine tenths of 3 rad/s in the core's arithmetic, to the bit.
-@pytest.mark.parametrize(("speed", "late"), [(2.685, True), (2.715, False), (np.float32(0.9) * np.float32(3.0), False)])
-def test_a_wheel_is_late_if_it_lost_more_than_a_tenth_of_its_speed(speed, late):
+@pytest.mark.parametrize(
+    ("speed", "is_delayed"), [(2.685, True), (2.715, False), (np.float32(0.9) * np.float32(3.0), False)]
+)
+def test_a_wheel_is_late_if_it_lost_more_than_a_tenth_of_its_speed(speed, is_delayed):
     bench = Bench()
     bench.to_driving(4.0, 4.0)
     bench.wheels_follow = False
     bench.speeds[0] = -3.0
     bench.run(290)
     bench.speeds[0] = -float(speed)
-    assert (bench.run(20).fault == 0) == late
+    assert (bench.run(20).fault == 0) == is_delayed
 
 
 def test_a_slow_wheel_that_slows_down_is_only_late_too():
@@ -279,9 +281,9 @@ def test_reset_causes_latch_once_and_clear(cause, fault):
 
 
 def reset(bench):
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.run(250)
-    bench.ask("RESET")
+    bench.set_request("RESET")
     bench.run(60)
 
 
@@ -328,9 +330,9 @@ def test_a_reset_of_one_fault_hides_no_other_for_a_single_cycle():
     bench.inputs.update(voltage_v=12.0, left_current_a=50.0)
     bench.run(300)
     bench.inputs.pop("left_current_a")
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.run(250)
-    bench.ask("RESET")
+    bench.set_request("RESET")
     shown = {name_of(bench.step().fault) for _ in range(60)}
     assert shown == {"OVER_CURRENT_LEFT", "UNDER_VOLTAGE"}
     assert (bench.out.state, name_of(bench.out.fault)) == ("STANDBY", "UNDER_VOLTAGE")
@@ -341,7 +343,7 @@ def test_a_passing_fault_blocks_ready_while_it_is_held():
     bench.hello()
     bench.inputs["voltage_v"] = 12.0
     bench.run(300)
-    bench.ask("READY")
+    bench.set_request("READY")
     bench.run(1000)
     assert bench.out.state == "STANDBY"
     bench.inputs.clear()
@@ -412,8 +414,8 @@ def test_a_fault_is_held_from_the_last_cycle_that_had_its_cause_though_its_debou
     bench.inputs["voltage_v"] = config.under_voltage_v - 1.0
     assert name_of(bench.run(bad_steps).fault) == "UNDER_VOLTAGE"
     bench.inputs["voltage_v"] = config.under_voltage_v + 1.0
-    held = 0
+    fault_cycles = 0
     while bench.step().fault:
-        held += 1
-        assert held < 10_000
-    assert held == round(config.fault_hold_s * 1e3) - 1
+        fault_cycles += 1
+        assert fault_cycles < 10_000
+    assert fault_cycles == round(config.fault_hold_s * 1e3) - 1

@@ -12,7 +12,7 @@ from tests.firmware_protocol.bench import CODEC, CONFIG, FAULTS, MS, Bench, seal
 
 def test_without_a_handshake_nothing_gets_ready():
     bench = Bench()
-    bench.ask("READY")
+    bench.set_request("READY")
     bench.run(500)
     assert bench.out.state == "STANDBY"
     assert bench.blockers() == {"HANDSHAKE", "CHALLENGE", "ZERO_COMMANDS"}
@@ -21,7 +21,7 @@ def test_without_a_handshake_nothing_gets_ready():
 def test_another_dbc_is_refused_and_named_and_the_right_one_accepted_afterwards():
     bench = Bench()
     bench.hello(dbc_hash=CODEC.dbc_hash ^ 1)
-    bench.ask("READY")
+    bench.set_request("READY")
     bench.run(300)
     assert bench.out.state == "STANDBY"
     assert bench.out.fault == FAULTS["DBC_HASH_MISMATCH"]
@@ -47,7 +47,7 @@ def test_a_host_of_another_major_is_heard_refused_and_answered(major):
     bench.run(100)
     before = len(bench.messages("HELLO"))
     bench.hello(protocol_major=major)
-    bench.ask("READY")
+    bench.set_request("READY")
     bench.run(300)
     assert bench.out.state == "STANDBY"
     assert bench.out.fault == FAULTS["PROTOCOL_MAJOR_MISMATCH"]
@@ -142,13 +142,13 @@ def test_a_host_that_babbles_is_disqualified_and_motion_stops():
 def test_session_zero_and_the_last_session_are_refused(session):
     bench = Bench()
     bench.to_ready(session=7)
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.run_until("STANDBY")
-    bench.ask("READY", session=session)
+    bench.set_request("READY", session=session)
     bench.run(300)
     assert bench.out.state == "STANDBY"
     assert "SESSION" in bench.blockers()
-    bench.ask("READY", session=8)
+    bench.set_request("READY", session=8)
     bench.run_until("READY")
     assert bench.out.session == 8
 
@@ -169,7 +169,7 @@ def test_it_never_arms_again_by_itself():
     bench.run_until("STANDBY")
     bench.command = command
     for request in ("ARM", "READY", "ARM"):
-        bench.ask(request)
+        bench.set_request(request)
         bench.run(1000)
         assert bench.out.state == "STANDBY"
     bench.command = {}
@@ -181,7 +181,7 @@ def test_a_new_session_in_ready_goes_through_standby_with_a_new_challenge():
     bench = Bench()
     bench.to_ready(session=7)
     challenge = bench.core.challenge
-    bench.ask("READY", session=8)
+    bench.set_request("READY", session=8)
     bench.run(60)
     assert (bench.out.state, bench.out.session) == ("READY", 8)
     assert bench.core.challenge != challenge
@@ -192,10 +192,10 @@ def test_every_entry_of_standby_and_ready_has_a_new_challenge_never_zero():
     seen = []
     bench.hello()
     for session in range(1, 60):
-        bench.ask("READY", session=session)
+        bench.set_request("READY", session=session)
         bench.run_until("READY")
         seen.append(bench.core.challenge)
-        bench.ask("STANDBY", session=session)
+        bench.set_request("STANDBY", session=session)
         bench.run_until("STANDBY")
         seen.append(bench.core.challenge)
     assert all(a != b for a, b in itertools.pairwise(seen))
@@ -211,10 +211,10 @@ def test_a_counted_start_gives_none_of_the_challenges_of_the_starts_before():
         bench.to_ready()
         for session in range(8, 18):
             seen.append(bench.core.challenge)
-            bench.ask("STANDBY")
+            bench.set_request("STANDBY")
             bench.run_until("STANDBY")
             seen.append(bench.core.challenge)
-            bench.ask("READY", session)
+            bench.set_request("READY", session)
             bench.run_until("READY")
     assert len(seen) - len(set(seen)) < 70, "of 2000 out of 65535 thirty are expected"
 
@@ -223,10 +223,10 @@ def test_a_counted_start_gives_none_of_the_challenges_of_the_starts_before():
 def test_a_start_without_entropy_or_with_that_of_the_last_one_is_refused_for_good(entropy, last_entropy):
     bench = Bench(entropy=entropy, last_entropy=last_entropy)
     bench.hello()
-    bench.ask("READY")
+    bench.set_request("READY")
     assert bench.run(200).state == "FAULT"
     assert bench.out.fault == FAULTS["ENTROPY_INVALID"]
-    bench.ask("RESET")
+    bench.set_request("RESET")
     bench.run(800)
     assert (bench.out.state, bench.out.driver_enabled) == ("FAULT", False)
 
@@ -249,10 +249,10 @@ def test_challenges_are_the_upper_sixteen_bits_of_splitmix64(entropy, outputs):
     seen = [bench.core.challenge]
     for session in (7, 8):
         bench.hello()
-        bench.ask("READY", session)
+        bench.set_request("READY", session)
         bench.run_until("READY")
         seen.append(bench.core.challenge)
-        bench.ask("STANDBY")
+        bench.set_request("STANDBY")
         bench.run_until("STANDBY")
         seen.append(bench.core.challenge)
     assert seen[:4] == [output >> 48 for output in outputs]
@@ -281,19 +281,19 @@ def test_a_hash_of_zero_is_passed_over(entry):
 def test_arming_another_session_than_the_one_that_is_ready_starts_over():
     bench = Bench()
     bench.to_ready(session=7)
-    bench.ask("ARM", session=8)
+    bench.set_request("ARM", session=8)
     bench.command = {}
     bench.run(400)
     assert (bench.out.state, bench.out.session) == ("STANDBY", 0)
     assert bench.core.rejections["CHALLENGE"] == 0
 
 
-def arm_with(answer):
+def arm_with(respond):
     bench = Bench()
     bench.to_ready()
     bench.command = {}
     bench.answers = False
-    bench.ask("ARM", challenge_answer=answer(bench))
+    bench.set_request("ARM", challenge_answer=respond(bench))
     bench.run(400)
     return bench
 
@@ -303,7 +303,7 @@ def test_right_answer_arms():
 
 
 @pytest.mark.parametrize(
-    "answer",
+    "respond",
     [
         lambda b: 0,
         lambda b: b.core.challenge,
@@ -312,8 +312,8 @@ def test_right_answer_arms():
         lambda b: challenge_answer(b.core.challenge ^ 1, 7, CODEC.dbc_hash),
     ],
 )
-def test_wrong_answer_does_not(answer):
-    bench = arm_with(answer)
+def test_wrong_answer_does_not(respond):
+    bench = arm_with(respond)
     assert bench.out.state == "READY"
     assert bench.core.rejections["CHALLENGE"] > 0
     assert bench.blockers() == {"CHALLENGE"}
@@ -323,11 +323,11 @@ def test_the_answer_to_an_old_challenge_does_not_arm():
     bench = Bench()
     bench.to_ready(session=7)
     old = challenge_answer(bench.core.challenge, 9, CODEC.dbc_hash)
-    bench.ask("READY", session=9)
+    bench.set_request("READY", session=9)
     bench.run(60)
     assert bench.out.session == 9
     bench.command, bench.answers = {}, False
-    bench.ask("ARM", session=9, challenge_answer=old)
+    bench.set_request("ARM", session=9, challenge_answer=old)
     bench.run(400)
     assert bench.out.state == "READY"
 
@@ -336,13 +336,13 @@ def test_answer_given_in_standby_is_no_answer():
     bench = Bench()
     bench.hello()
     bench.command = {}
-    bench.ask("ARM")
+    bench.set_request("ARM")
     bench.run(400)
     assert bench.out.state == "STANDBY"
     bench.answers = False
-    bench.ask("READY")
+    bench.set_request("READY")
     bench.run_until("READY")
-    bench.ask("ARM")
+    bench.set_request("ARM")
     bench.run(300)
     assert bench.out.state == "READY"
 
@@ -353,7 +353,7 @@ def test_arming_waits_for_wheels_that_stand():
     bench.wheels_follow = False
     bench.speeds = [0.0, -0.06]
     bench.command = {}
-    bench.ask("ARM")
+    bench.set_request("ARM")
     bench.run(400)
     assert bench.out.state == "READY"
     assert bench.blockers() == {"WHEELS_MOVING"}
@@ -379,7 +379,7 @@ def estopped():
     bench.to_driving()
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.command = None
-    bench.ask("ARM")
+    bench.set_request("ARM")
     bench.run(800)
     assert bench.out.state == "ESTOP"
     return bench
@@ -387,10 +387,10 @@ def estopped():
 
 def test_reset_clears_an_estop_but_starts_nothing():
     bench = estopped()
-    bench.ask("RESET")
+    bench.set_request("RESET")
     bench.run_until("STANDBY")
     bench.command = {"left": 1.0, "right": 1.0}
-    bench.ask("ARM")
+    bench.set_request("ARM")
     for _ in range(1000):
         assert bench.step().state == "STANDBY"
         assert not bench.out.driver_enabled
@@ -398,27 +398,27 @@ def test_reset_clears_an_estop_but_starts_nothing():
 
 def test_a_reset_asked_for_before_the_stop_does_not_clear_it():
     bench = Bench()
-    bench.ask("RESET")
+    bench.set_request("RESET")
     bench.run(300)
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.run(1500)
     assert bench.out.state == "ESTOP"
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.run(100)
-    bench.ask("RESET")
+    bench.set_request("RESET")
     bench.run(60)
     assert bench.out.state == "STANDBY"
 
 
 def test_a_reset_that_was_asked_for_before_a_silence_does_not_clear_what_came_in_it():
     bench = Bench()
-    bench.ask("RESET")
+    bench.set_request("RESET")
     bench.run(300)
     bench.request = None
     bench.run(300)
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.run(700)
-    bench.ask("RESET")
+    bench.set_request("RESET")
     bench.run(1000)
     assert bench.out.state == "ESTOP"
 
@@ -427,7 +427,7 @@ def test_a_reset_waits_for_stillness_and_is_void_when_the_stop_comes_again():
     bench = estopped()
     bench.wheels_follow = False
     bench.speeds = [1.0, 1.0]
-    bench.ask("RESET")
+    bench.set_request("RESET")
     bench.run(300)
     assert bench.out.state == "ESTOP"
     bench.core.receive(bench.now_us, 0x080, b"")
@@ -441,11 +441,11 @@ def test_a_reset_no_longer_asked_for_is_void(end):
     bench = estopped()
     bench.wheels_follow = False
     bench.speeds = [1.0, 1.0]
-    bench.ask("RESET")
+    bench.set_request("RESET")
     bench.run(100)
     bench.request = None
     if end == "another request":
-        bench.ask("STANDBY")
+        bench.set_request("STANDBY")
     bench.run(700)
     bench.speeds = [0.0, 0.0]
     bench.run(300)
@@ -457,7 +457,7 @@ def test_a_reset_is_asked_for_until_the_host_is_silent_and_no_longer():
         bench = estopped()
         bench.wheels_follow = False
         bench.speeds = [1.0, 1.0]
-        bench.ask("RESET")
+        bench.set_request("RESET")
         bench.run(50 - bench.now_us // MS % 50)
         bench.request = None
         bench.run(silent_ms - 1)
@@ -477,7 +477,7 @@ def test_a_pressed_button_cannot_be_reset_nor_does_its_release_reset(source):
     bench.command = None
     bench.run(600)
     challenge = bench.core.challenge
-    bench.ask("RESET")
+    bench.set_request("RESET")
     bench.run(700)
     assert bench.out.state == "ESTOP"
     # A challenge is renewed on the way through STANDBY, be it between two cycles.
@@ -485,9 +485,9 @@ def test_a_pressed_button_cannot_be_reset_nor_does_its_release_reset(source):
     bench.inputs.clear()
     bench.run(1000)
     assert bench.out.state == "ESTOP"
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.run(100)
-    bench.ask("RESET")
+    bench.set_request("RESET")
     bench.run_until("STANDBY", within_ms=60)
     assert bench.out.estop_source == "NONE"
 
@@ -495,7 +495,7 @@ def test_a_pressed_button_cannot_be_reset_nor_does_its_release_reset(source):
 def test_motion_asked_for_delays_a_reset():
     bench = estopped()
     bench.command = {"left": 0.002, "right": 0.0, "session": 7}
-    bench.ask("RESET")
+    bench.set_request("RESET")
     bench.run(1000)
     assert bench.out.state == "ESTOP"
     start = bench.now_us
@@ -515,7 +515,7 @@ def test_the_first_source_of_an_estop_is_kept():
 def test_host_fault_blocks_ready():
     bench = Bench()
     bench.hello()
-    bench.ask("READY", host_fault=5)
+    bench.set_request("READY", host_fault=5)
     bench.run(300)
     assert bench.out.state == "STANDBY"
     assert "HOST_STATE" in bench.blockers()

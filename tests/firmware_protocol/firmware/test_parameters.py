@@ -24,7 +24,7 @@ BOUNDS = {
 }
 
 
-def ask(bench, operation, key, value=0.0):
+def request_parameter(bench, operation, key, value=0.0):
     bench.send("PARAM_REQUEST", operation=operation, key=key, value=value)
     bench.step()
     values = bench.messages("PARAM_RESPONSE")[-1].values
@@ -34,7 +34,7 @@ def ask(bench, operation, key, value=0.0):
 def test_every_key_of_the_table_can_be_read():
     assert set(KEYS.values()) == set(DEFAULTS)
     for key, name in KEYS.items():
-        assert ask(Bench(), "READ", key) == ("OK", key, pytest.approx(DEFAULTS[name]))
+        assert request_parameter(Bench(), "READ", key) == ("OK", key, pytest.approx(DEFAULTS[name]))
 
 
 @pytest.mark.parametrize("name", BOUNDS)
@@ -42,11 +42,11 @@ def test_write_within_bounds_is_read_back(name):
     key = CODEC.choice_value("PARAM_REQUEST", "key", name)
     bench = Bench()
     for value in BOUNDS[name]:
-        assert ask(bench, "WRITE", key, value) == ("OK", key, value)
-        assert ask(bench, "READ", key) == ("OK", key, value)
+        assert request_parameter(bench, "WRITE", key, value) == ("OK", key, value)
+        assert request_parameter(bench, "READ", key) == ("OK", key, value)
     low, high = BOUNDS[name]
     for value in (low * 0.999, high * 1.001, -1.0):
-        assert ask(bench, "WRITE", key, value) == ("OUT_OF_RANGE", key, high)
+        assert request_parameter(bench, "WRITE", key, value) == ("OUT_OF_RANGE", key, high)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
@@ -63,13 +63,13 @@ def test_what_is_not_a_number_is_refused(value):
 @pytest.mark.parametrize("name", ["MAX_WHEEL_SPEED", "MAX_WHEEL_ACCELERATION"])
 def test_hard_limits_are_read_only(name):
     key = CODEC.choice_value("PARAM_REQUEST", "key", name)
-    assert ask(Bench(), "WRITE", key, 1.0) == ("READ_ONLY", key, DEFAULTS[name])
+    assert request_parameter(Bench(), "WRITE", key, 1.0) == ("READ_ONLY", key, DEFAULTS[name])
 
 
 def test_unknown_key_and_operation():
-    assert ask(Bench(), "READ", 99) == ("UNKNOWN_KEY", 99, 0.0)
-    assert ask(Bench(), "WRITE", 0, 1.0) == ("UNKNOWN_KEY", 0, 0.0)
-    assert ask(Bench(), 2, 1, 1.0) == ("UNKNOWN_OPERATION", 1, CONFIG.over_current_a)
+    assert request_parameter(Bench(), "READ", 99) == ("UNKNOWN_KEY", 99, 0.0)
+    assert request_parameter(Bench(), "WRITE", 0, 1.0) == ("UNKNOWN_KEY", 0, 0.0)
+    assert request_parameter(Bench(), 2, 1, 1.0) == ("UNKNOWN_OPERATION", 1, CONFIG.over_current_a)
 
 
 @pytest.mark.parametrize("state", ["READY", "ARMED", "STOPPING", "moving ESTOP"])
@@ -80,13 +80,13 @@ def test_writing_is_refused_unless_disarmed(state):
     else:
         bench.to_driving()
     if state == "STOPPING":
-        bench.ask("STANDBY")
+        bench.set_request("STANDBY")
         bench.run_until("STOPPING")
     elif state == "moving ESTOP":
         bench.core.receive(bench.now_us, 0x080, b"")
         bench.step()
-    assert ask(bench, "WRITE", 4, 50.0)[0] == "REFUSED_ARMED"
-    assert ask(bench, "READ", 4)[2] == CONFIG.stop_deceleration_rad_s2
+    assert request_parameter(bench, "WRITE", 4, 50.0)[0] == "REFUSED_ARMED"
+    assert request_parameter(bench, "READ", 4)[2] == CONFIG.stop_deceleration_rad_s2
 
 
 @pytest.mark.parametrize("state", ["FAULT", "ESTOP"])
@@ -98,14 +98,14 @@ def test_writing_is_allowed_in_a_state_that_does_not_move(state):
     else:
         bench.core.receive(bench.now_us, 0x080, b"")
         bench.step()
-    assert ask(bench, "WRITE", 1, 60.0) == ("OK", 1, 60.0)
+    assert request_parameter(bench, "WRITE", 1, 60.0) == ("OK", 1, 60.0)
 
 
 def test_a_written_value_is_in_force_and_told_in_limits():
     bench = Bench()
     bench.run(100)
     before = bench.now_us
-    assert ask(bench, "WRITE", 4, 40.0)[0] == "OK"
+    assert request_parameter(bench, "WRITE", 4, 40.0)[0] == "OK"
     bench.run(100)
     pages = [message.values for message in bench.messages("LIMITS", since_us=before)]
     assert [page["page"] for page in pages] == [0, 1]
@@ -143,8 +143,8 @@ def packed(**changes):
 def unpacked(record):
     """The configuration that is left, and whether the record was taken."""
     config = ffi.new("disco_config_t *", lib.disco_config_default(2048, 8.0))
-    taken = lib.disco_record_unpack(bytes(record), config)
-    return config, taken
+    is_accepted = lib.disco_record_unpack(bytes(record), config)
+    return config, is_accepted
 
 
 def sealed_record(record):
@@ -157,8 +157,8 @@ OTHER = {"over_current": 12.5, "over_temperature": 60.0, "under_voltage": 18.0, 
 
 def test_what_was_written_is_kept_over_a_restart_and_nothing_else():
     record = packed(**OTHER, max_wheel_speed=3.0)
-    config, taken = unpacked(record)
-    assert taken
+    config, is_accepted = unpacked(record)
+    assert is_accepted
     assert {name: getattr(config, name) for name in OTHER} == OTHER
     assert config.max_wheel_speed == 8.0
     assert record[0] == 1
@@ -171,8 +171,8 @@ def test_a_record_with_any_bit_turned_is_not_taken():
     def became_of(bit):
         record = packed(**OTHER)
         record[bit // 8] ^= 1 << bit % 8
-        config, taken = unpacked(record)
-        return taken, config.over_current
+        config, is_accepted = unpacked(record)
+        return is_accepted, config.over_current
 
     found = {bit: became_of(bit) for bit in range(8 * RECORD)}
     assert {bit: became for bit, became in found.items() if became != (False, 30.0)} == {}
@@ -200,24 +200,24 @@ def test_what_was_never_written_is_not_taken(record):
 def test_a_well_sealed_record_of_nonsense_changes_nothing(at, value):
     record = packed(**OTHER)
     record[at : at + len(value)] = value
-    config, taken = unpacked(sealed_record(record))
-    assert not taken
+    config, is_accepted = unpacked(sealed_record(record))
+    assert not is_accepted
     assert config.over_current == 30.0
 
 
 def test_a_record_of_fewer_parameters_is_taken():
     record = packed(**OTHER)
     record[7:30] = bytes(23)
-    config, taken = unpacked(sealed_record(record))
-    assert taken
+    config, is_accepted = unpacked(sealed_record(record))
+    assert is_accepted
     assert (config.over_current, config.over_temperature) == (12.5, 80.0)
 
 
 def test_only_a_write_that_was_accepted_is_to_be_kept():
     bench = Bench()
-    ask(bench, "READ", 4)
-    ask(bench, "WRITE", 4, 1e6)
-    ask(bench, "WRITE", 5, 1.0)
+    request_parameter(bench, "READ", 4)
+    request_parameter(bench, "WRITE", 4, 1e6)
+    request_parameter(bench, "WRITE", 5, 1.0)
     assert bench.core._core.parameter_writes == 0
-    ask(bench, "WRITE", 4, 5.0)
+    request_parameter(bench, "WRITE", 4, 5.0)
     assert bench.core._core.parameter_writes == 1

@@ -81,7 +81,7 @@ frames = st.one_of(
 def test_random_frames_never_move_an_idle_robot(sequence):
     bench = Bench()
     bench.hello()
-    bench.ask("READY")
+    bench.set_request("READY")
     for (can_id, body, kind), milliseconds in sequence:
         data = sealed(can_id, body, major=0 if can_id == 0x102 else 1) if kind == "sealed" else body
         bench.core.receive(bench.now_us, can_id, data)
@@ -101,12 +101,12 @@ class Host:
     def act(self):
         bench, state = self.bench, self.bench.out.state
         if state in {"READY", "ARMED"} and bench.out.session == self.session:
-            bench.ask("ARM", self.session)
+            bench.set_request("ARM", self.session)
         elif state in {"ESTOP", "FAULT"}:
             # A reset counts from the moment it is first asked for, so it must be taken back to be asked for again.
-            bench.ask("RESET" if bench.now_us % 1_000_000 > 200_000 else "STANDBY", self.session)
+            bench.set_request("RESET" if bench.now_us % 1_000_000 > 200_000 else "STANDBY", self.session)
         else:
-            bench.ask("READY", self.session)
+            bench.set_request("READY", self.session)
             self.session = self.session % 255 + (bench.now_us % 300_000 == 0) or 1
         if state == "ARMED":
             bench.command = {"left": self.generator.uniform(-65, 65), "right": self.generator.uniform(-65, 65)}

@@ -34,7 +34,7 @@ def bring_to(state: str) -> Bench:
         bench.to_driving()
     elif state == "STOPPING":
         bench.to_driving()
-        bench.ask("STANDBY")
+        bench.set_request("STANDBY")
         bench.run_until("STOPPING")
     elif state == "FAULT":
         bench.inputs["left_current_a"] = 100.0
@@ -68,27 +68,27 @@ def latched_fault(state):
 def reset_fault(_state):
     bench = bring_to("FAULT")
     bench.inputs.clear()
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.run(300)
     assert bench.out.state == "FAULT"
-    bench.ask("RESET")
+    bench.set_request("RESET")
     bench.run(60)
     return bench, "FAULT"
 
 
 def reset_estop(_state):
     bench, _ = estop_frame("STANDBY")
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.run(700)
     assert bench.out.state == "ESTOP"
-    bench.ask("RESET")
+    bench.set_request("RESET")
     bench.run(60)
     return bench, "ESTOP"
 
 
 def ready_given_up(_state):
     bench = bring_to("READY")
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.run(60)
     return bench, "READY"
 
@@ -101,7 +101,7 @@ def ready(_state):
 
 def armed(_state):
     bench = bring_to("READY")
-    bench.ask("ARM")
+    bench.set_request("ARM")
     bench.command = {}
     bench.run_until("ARMED")
     return bench, "READY"
@@ -139,7 +139,7 @@ def silent_commands(_state):
 
 def host_fault(_state):
     bench = bring_to("ARMED")
-    bench.ask("ARM", host_fault=3)
+    bench.set_request("ARM", host_fault=3)
     bench.run_until("STOPPING", within_ms=60)
     return bench, "ARMED"
 
@@ -154,7 +154,7 @@ def silent_host(_state):
 
 def changed_session(_state):
     bench = bring_to("ARMED")
-    bench.ask("ARM", session=8)
+    bench.set_request("ARM", session=8)
     bench.command = {"left": 4.0, "right": 2.0, "session": 7}
     bench.run_until("STOPPING", within_ms=60)
     return bench, "ARMED"
@@ -162,7 +162,7 @@ def changed_session(_state):
 
 def requested(_state):
     bench = bring_to("ARMED")
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.run_until("STOPPING", within_ms=60)
     return bench, "ARMED"
 

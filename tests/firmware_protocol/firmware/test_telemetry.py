@@ -189,7 +189,7 @@ def test_last_command_counter_is_that_of_the_last_accepted_command():
     accepted = bench.counters["WHEEL_COMMAND"]
     bench.command = None
     bench.wheel_command(4.0, 2.0, session=9)
-    bench.ask("STANDBY")
+    bench.set_request("STANDBY")
     bench.run_until("STOPPING")
     assert last(bench, "SYSTEM_STATE")["last_command_counter"] == accepted
 
@@ -391,10 +391,10 @@ def test_sample_times_are_those_of_the_40_bit_clock(now_us, before_us):
     # The core's own time has not come so far yet when it is told of a pose.
     bench.step()
     bench.core.pose(0.0, 0.0, 0.0, now_us, 0.0, 0.0)
-    own_us = now_us
+    pose_us = now_us
     bench.step(elapsed_us=10 * MS)
     assert last(bench, "WHEEL_SPEED")["sample_time"] == bench.now_us % (1 << 40) // 20 % 65536 * 20
-    assert last(bench, "POSE_HEADING")["sample_time"] == own_us % (1 << 40) // 100 % 65536 * 100
+    assert last(bench, "POSE_HEADING")["sample_time"] == pose_us % (1 << 40) // 100 % 65536 * 100
 
 
 def test_a_hello_is_answered_from_20_ms_after_the_answer_before():

@@ -83,7 +83,7 @@ def is_stopped(out):
     return out.state != "ARMED"
 
 
-def stands(out):
+def has_zero_setpoints(out):
     return out.left_setpoint_rad_s == 0.0 and out.right_setpoint_rad_s == 0.0
 
 
@@ -92,9 +92,9 @@ def stays_stopped(bench, cycles=900):
     for k in range(cycles):
         bench.step()
         assert bench.out.state != "ARMED"
-        assert stands(bench.out)
+        assert has_zero_setpoints(bench.out)
         if k % 200 == 0:
-            bench.ask("READY" if k % 400 else "ARM", session=8 + k // 200)
+            bench.set_request("READY" if k % 400 else "ARM", session=8 + k // 200)
 
 
 @pytest.mark.parametrize("rate", RATES)
@@ -103,22 +103,22 @@ def test_a_clock_that_begins_to_run_at_another_rate_stops_a_robot_whose_host_goe
     bench.core.clock = running_at(rate, bench.now_us)
     apart_a_cycle = abs(rate - 1.0) - 0.1
     cycles_until(bench, is_stopped, math.ceil(TOLERANCE_MS / apart_a_cycle) + 1)
-    cycles_until(bench, stands, RAMP_CYCLES + 1)
+    cycles_until(bench, has_zero_setpoints, RAMP_CYCLES + 1)
     stays_stopped(bench)
 
 
 @pytest.mark.parametrize("rate", [*RATES, 0.9, 0.95, 0.99, 1.0, 1.01, 1.05, 1.1])
-@thinned("late_us", [0, 1, 300, 999], quick=2)
-def test_with_a_silent_host_the_wheels_stand_in_the_watchdogs_time_by_either_clock(rate, late_us):
+@thinned("delay_us", [0, 1, 300, 999], quick=2)
+def test_with_a_silent_host_the_wheels_stand_in_the_watchdogs_time_by_either_clock(rate, delay_us):
     bench = driving()
     bench.command = None
-    bench.now_us += late_us
+    bench.now_us += delay_us
     bench.wheel_command(SPEED, SPEED / 2)
-    bench.now_us -= late_us
+    bench.now_us -= delay_us
     bench.core.clock = running_at(rate, bench.now_us)
-    by_clock = math.ceil((TIMEOUT_MS + late_us * 1e-3) / rate) if rate else math.inf
+    by_clock = math.ceil((TIMEOUT_MS + delay_us * 1e-3) / rate) if rate else math.inf
     stopped = cycles_until(bench, is_stopped, min(TIMEOUT_MS, by_clock) + 1)
-    cycles_until(bench, stands, RAMP_CYCLES + 1)
+    cycles_until(bench, has_zero_setpoints, RAMP_CYCLES + 1)
     assert stopped + RAMP_CYCLES <= TIMEOUT_MS + 1 + RAMP_CYCLES
     stays_stopped(bench)
 
@@ -143,7 +143,7 @@ def test_one_leap_of_the_clock_stops_the_robot_at_once(leap_us, sign):
     assert bench.step().state == "STOPPING"
     assert bench.out.stop_cause == "FAULT"
     assert bench.out.fault == FAULTS["CLOCK_MISMATCH"]
-    cycles_until(bench, stands, RAMP_CYCLES + 1)
+    cycles_until(bench, has_zero_setpoints, RAMP_CYCLES + 1)
     stays_stopped(bench)
 
 
@@ -184,18 +184,18 @@ def test_once_apart_the_cores_own_time_goes_by_the_faster_of_the_two_clocks(rate
     assert wheel_samples(bench, 1000) == pytest.approx(samples, abs=1)
 
 
-def own_time_us(bench):
+def device_time_us(bench):
     bench.send("TIME_REQUEST", sequence=1)
     bench.step()
     return bench.messages("TIME_RESPONSE")[-1].values["receive_time"]
 
 
 def test_the_cores_own_time_is_that_of_a_clock_whose_cycles_jitter():
-    bench, drawn = Bench(), random.Random(1)
+    bench, generator = Bench(), random.Random(1)
     for _ in range(1000):
-        bench.step(drawn.randrange(500, 1500))
+        bench.step(generator.randrange(500, 1500))
     now_us = bench.now_us
-    assert own_time_us(bench) == now_us
+    assert device_time_us(bench) == now_us
 
 
 def test_after_a_leap_frames_within_the_cycles_make_time_no_faster():
@@ -208,7 +208,7 @@ def test_after_a_leap_frames_within_the_cycles_make_time_no_faster():
         bench.now_us -= 400
         bench.step()
     now_us = bench.now_us
-    assert own_time_us(bench) == now_us
+    assert device_time_us(bench) == now_us
 
 
 @pytest.mark.parametrize(("ahead_us", "errors"), [(10_000, 0), (10_001, 1)])
@@ -238,7 +238,7 @@ def test_with_a_silent_host_no_row_of_small_leaps_keeps_the_robot_armed(leap_us)
     begin_us = bench.now_us
     bench.core.clock = lambda true_us: true_us + leap_us * ((true_us - begin_us) // MS % 2)
     cycles_until(bench, is_stopped, TIMEOUT_MS + 1)
-    cycles_until(bench, stands, RAMP_CYCLES + 1)
+    cycles_until(bench, has_zero_setpoints, RAMP_CYCLES + 1)
 
 
 @pytest.mark.parametrize("config", [CONFIG, dataclasses.replace(CONFIG, cycle_s=0.005)], ids=["1 kHz", "200 Hz"])
@@ -247,11 +247,11 @@ def test_with_a_silent_host_no_row_of_small_leaps_keeps_the_robot_armed(leap_us)
 def test_no_sound_clock_stops_the_robot_whose_cycles_jitter(config, rate, jitter):
     """Cycles a tenth too long or too short, each up to a whole period late or early, and now and then one lost."""
     bench = driving(config)
-    cycle_us, drawn = config.cycle_s * 1e6, random.Random(3)
+    cycle_us, generator = config.cycle_s * 1e6, random.Random(3)
     begin_us = bench.now_us
     for k in itertools.count(1):
-        lost = 0.5 * cycle_us * (k % 50 == 0)
-        due_us = begin_us + k * cycle_us * rate + drawn.uniform(-jitter, jitter) * 0.5 * cycle_us + lost
+        gap_us = 0.5 * cycle_us * (k % 50 == 0)
+        due_us = begin_us + k * cycle_us * rate + generator.uniform(-jitter, jitter) * 0.5 * cycle_us + gap_us
         step_to(bench, math.floor(due_us))
         assert bench.out.state == "ARMED", (k, bench.out)
         if bench.now_us - begin_us > 5_000_000:

@@ -40,10 +40,10 @@ moderate = st.floats(-100.0, 100.0, width=32)
 def test_approach_keeps_to_the_step_and_to_the_straight_line(left, right, to_left, to_right, step):
     result = lib.disco_approach(wheels(left, right), wheels(to_left, to_right), step)
     moved = (result.left - left, result.right - right)
-    wanted = (to_left - left, to_right - right)
+    to_target = (to_left - left, to_right - right)
     assert max(map(abs, moved)) <= step * (1 + 1e-5) + 1e-5
-    assert moved[0] * wanted[1] == pytest.approx(moved[1] * wanted[0], rel=1e-3, abs=0.01)
-    if max(map(abs, wanted)) <= step:
+    assert moved[0] * to_target[1] == pytest.approx(moved[1] * to_target[0], rel=1e-3, abs=0.01)
+    if max(map(abs, to_target)) <= step:
         assert (result.left, result.right) == (to_left, to_right)
 
 

@@ -60,37 +60,37 @@ def replay(core, tmp_path):
     """Compile the board for a kind of link and let it hear these bytes; what it said, its cycles and its stores."""
     flags, objects = core
 
-    def replayed(link, heard, byte_us=LINE_US, plant=b""):
+    def replayed(link, received_bytes, byte_us=LINE_US, plant=b""):
         options, _ = LINKS[link]
         sources = [PORTS / "controller.c", PORT, *([PORTS / "plant_line.c"] if link == "plant" else [])]
         program, line, plant_line = tmp_path / "board", tmp_path / "line", tmp_path / "plant"
         subprocess.run(["cc", *flags, *options, *map(str, sources), *objects, "-lm", "-o", str(program)], check=True)
-        line.write_bytes(heard)
+        line.write_bytes(received_bytes)
         plant_line.write_bytes(plant)
         environment = {"LINK": str(line), "PLANT": str(plant_line), "BYTE_US": str(byte_us)}
         ran = subprocess.run(
             [str(program)], capture_output=True, env=environment | {"ASAN_OPTIONS": "detect_leaks=0"}, check=False
         )
-        said = ran.stderr.decode()
-        assert ran.returncode == 0, said
-        cycles, stores = map(int, re.fullmatch(r"(\d+) cycles (\d+) stores\n", said).groups())
+        stderr = ran.stderr.decode()
+        assert ran.returncode == 0, stderr
+        cycles, stores = map(int, re.fullmatch(r"(\d+) cycles (\d+) stores\n", stderr).groups())
         return ran.stdout, cycles, stores
 
     return replayed
 
 
-def frames_of(link, said):
+def frames_of(link, output):
     if link == "slcan":
-        lines = re.findall(rb"t([0-9A-F]{3})(\d)([0-9A-F]*)\r", said)
+        lines = re.findall(rb"t([0-9A-F]{3})(\d)([0-9A-F]*)\r", output)
         return [(int(can_id, 16), bytes.fromhex(data.decode())) for can_id, _, data in lines]
     if link == "can":
-        return [(can_id, data[:length]) for can_id, length, data in struct.iter_unpack("<HB8s", said)]
-    return FrameDecoder().feed(said)
+        return [(can_id, data[:length]) for can_id, length, data in struct.iter_unpack("<HB8s", output)]
+    return FrameDecoder().feed(output)
 
 
-def answers(link, said, name):
+def answers(link, output, name):
     can_id = CODEC.can_id(name)
-    return [CODEC.decode(can_id, data).values for seen, data in frames_of(link, said) if seen == can_id]
+    return [CODEC.decode(can_id, data).values for seen, data in frames_of(link, output) if seen == can_id]
 
 
 def garbage(draw, link, ids):
@@ -117,28 +117,28 @@ def test_garbage_on_its_lines_does_no_harm_and_it_answers_afterwards(replay, lin
     noise = b"".join(itertools.islice(garbage(draw, link, HOST_IDS), 4000))
     end = {"slcan": b"\rC\rO\r", "can": b""}.get(link, b"\0")
     opening = b"O\r" if link == "slcan" else b""
-    asked = CODEC.encode("TIME_REQUEST", 3, sequence=77)
+    request = CODEC.encode("TIME_REQUEST", 3, sequence=77)
     plant = b"".join(itertools.islice(garbage(draw, "plant", PLANT_IDS), 4000))
-    said, cycles, _ = replay(link, opening + noise + end + LINKS[link][1](asked.can_id, asked.data), plant=plant)
+    output, cycles, _ = replay(link, opening + noise + end + LINKS[link][1](request.can_id, request.data), plant=plant)
     assert cycles > 2000
-    assert answers(link, said, "TIME_RESPONSE")[-1]["sequence"] == 77
+    assert answers(link, output, "TIME_RESPONSE")[-1]["sequence"] == 77
 
 
 @pytest.mark.parametrize("link", ["serial", "slcan", "can"])
 def test_a_line_that_never_falls_silent_does_not_hold_up_the_cycle(replay, link):
     """As USB's can be: twice as fast as the core takes it in, for half a second without a gap."""
     frame = LINKS[link][1](0x7FF, bytes(8))
-    heard = frame * (500_000 // len(frame))
-    _, cycles, _ = replay(link, heard, byte_us=USB_US)
+    received_bytes = frame * (500_000 // len(frame))
+    _, cycles, _ = replay(link, received_bytes, byte_us=USB_US)
     assert cycles >= 2400
 
 
 def test_parameters_are_stored_when_they_change_and_not_each_time_they_are_written(replay):
     """Flash wears out."""
     values = [5.0] * 10 + [6.0] * 10 + [5.0]
-    asked = [CODEC.encode("PARAM_REQUEST", i, operation="WRITE", key=4, value=v) for i, v in enumerate(values)]
+    requests = [CODEC.encode("PARAM_REQUEST", i, operation="WRITE", key=4, value=v) for i, v in enumerate(values)]
     # 20 ms of silence between them.
-    heard = b"".join(bytes(2000) + encode_frame(frame.can_id, frame.data) for frame in asked)
-    said, _, stores = replay("serial", bytes(20_000) + heard)
-    assert [answer["value"] for answer in answers("serial", said, "PARAM_RESPONSE")] == values
+    received_bytes = b"".join(bytes(2000) + encode_frame(frame.can_id, frame.data) for frame in requests)
+    output, _, stores = replay("serial", bytes(20_000) + received_bytes)
+    assert [response["value"] for response in answers("serial", output, "PARAM_RESPONSE")] == values
     assert stores == 3

@@ -51,8 +51,8 @@ def test_the_contract_has_at_most_a_dozen_functions_and_each_is_explained():
 def test_a_port_is_the_contract_in_at_most_300_lines(port):
     text = (PORTS / port / "port.c").read_text("utf-8")
     assert REQUIRED <= functions(text) <= functions(CONTRACT)
-    own = [file for file in (PORTS / port).iterdir() if file.name not in AROUND_THE_BOARD]
-    assert sum(len(file.read_text("utf-8").splitlines()) for file in own) <= 300 + START_CODE.get(port, 0)
+    port_files = [file for file in (PORTS / port).iterdir() if file.name not in AROUND_THE_BOARD]
+    assert sum(len(file.read_text("utf-8").splitlines()) for file in port_files) <= 300 + START_CODE.get(port, 0)
 
 
 @pytest.mark.parametrize("port", SKELETONS)

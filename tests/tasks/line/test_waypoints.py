@@ -88,14 +88,14 @@ def test_what_a_robot_cannot_follow_is_refused(tmp_path, text, fault):
     assert str(path) in str(error.value)
 
 
-def meet(tmp_path, text):
+def load_timed_path(tmp_path, text):
     path = tmp_path / "path.csv"
     path.write_text(text)
     return TimedPathTask(path="path.csv").with_file(path, ROBOT, True)
 
 
 def test_way_points_to_meet_may_rest_and_pass_one_place_twice(tmp_path):
-    found = meet(tmp_path, "t_s,x_m,y_m\n0.5,0,0\n2,0.75,0\n3,0.75,0\n4.5,0,0\n")
+    found = load_timed_path(tmp_path, "t_s,x_m,y_m\n0.5,0,0\n2,0.75,0\n3,0.75,0\n4.5,0,0\n")
     assert found.times_s == (0.5, 2.0, 3.0, 4.5)
 
 
@@ -114,7 +114,7 @@ def test_way_points_to_meet_may_rest_and_pass_one_place_twice(tmp_path):
 )
 def test_what_a_robot_cannot_meet_is_refused(tmp_path, text, fault):
     with pytest.raises(InputError, match=fault) as error:
-        meet(tmp_path, text)
+        load_timed_path(tmp_path, text)
     assert str(tmp_path / "path.csv") in str(error.value)
     assert "\n" not in str(error.value)
 
