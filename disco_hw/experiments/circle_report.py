@@ -229,8 +229,8 @@ class CircleReport:
         axes.plot(self.truth.x_m[:1], self.truth.y_m[:1], "o", color="tab:green", label="start")
         axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
         axes.set_title(
-            f"{self.circle.laps:.2f} laps, RMS distance {self.circle.settled_rms_distance_m * 1e3:.0f} mm, "
-            f"mean cost {self.circle.mean_cost:.3f}"
+            f"{self.circle.laps:.2f} laps, mean cost {self.circle.mean_cost:.3f}; "
+            f"after a quarter lap: RMS distance {self.circle.settled_rms_distance_m * 1e3:.0f} mm"
         )
         axes.grid(alpha=0.3)
         axes.legend(loc="center")

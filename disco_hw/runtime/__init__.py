@@ -141,6 +141,8 @@ def next_transition(state: State, conditions: int) -> Transition | None:
 AdviceStyle = Callable[[str], str]
 """How a person asks for an action, as "arm": in words that begin with a verb."""
 
+ARMING = "arming"
+"""Detail of a status while the robot has been asked to arm and has not yet."""
 ESTOP_HINT = "The stop is latched. Make the place safe, release the robot's own button, then {reset}."
 _NEXT = {
     "DISCONNECTED": "Check the robot's power and the cable to it.",
@@ -205,6 +207,8 @@ def advice(status: Mapping[str, Any], advice_style: AdviceStyle = by_button) -> 
     if state == "ARMED":
         sentence = "{stop} to hold still, or {disarm} to end." if status["running"] else "{start} to drive the task."
         return (_asking(sentence, advice_style),)
+    if state == "READY" and status.get("detail") == ARMING:
+        return ("Wait: the robot is arming.",)
     return (_asking(_NEXT[state], advice_style),) if state in _NEXT else ()
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import msgspec
 
-from disco_hw.runtime import PROBLEM, Condition, State, Transition, connection, next_transition
+from disco_hw.runtime import ARMING, PROBLEM, Condition, State, Transition, connection, next_transition
 from drivers.types import DriverState, LinkState, Request
 from firmware_protocol.status_codes import BY_ITSELF, THEN_RESET, THEN_RESTART
 
@@ -394,7 +394,7 @@ class Supervisor:
             case State.READY:
                 if self._arming is None and self._settings.heading_required and inputs.heading_missing:
                     return f"heading not known; {FIND_HEADING}"
-                return "arming" if self._arming is not None else "ready to be armed"
+                return ARMING if self._arming is not None else "ready to be armed"
             case State.ARMED if not seen & _TELEMETRY_FRESH:
                 return "no recent wheel data from the robot: commanding zero speed"
             case State.ARMED:

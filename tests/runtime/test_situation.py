@@ -104,3 +104,8 @@ def test_driving_by_hand_has_its_own_words():
 
 def test_codes_in_words():
     assert describe("OVER_CURRENT_RIGHT") == "Over current right"
+
+
+def test_who_has_just_armed_is_not_sent_to_arm_again():
+    sentences = advice({**STATUS, "detail": "arming"}, by_command(Path("robots/mine.toml")))
+    assert sentences == ("Wait: the robot is arming.",)

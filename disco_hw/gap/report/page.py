@@ -77,7 +77,10 @@ def _range(effect: EffectFinding) -> str:
     if described.sentence_below is not None and estimate.value < 0.0:
         ends = -estimate.high, -estimate.low
     unit = "" if parameter.unit == "1" else f" {parameter.unit}"
-    return f"{effect.name} is between {ends[0]:.2g} and {ends[1]:.2g}{unit}"
+    # As many decimals as tell the ends apart.
+    width = ends[1] - ends[0]
+    decimals = max(0, -math.floor(math.log10(width))) if math.isfinite(width) and width > 0.0 else 2
+    return f"{effect.name} is between {ends[0]:.{decimals}f} and {ends[1]:.{decimals}f}{unit}"
 
 
 def _gap_line(report: GapReport) -> str:

@@ -84,7 +84,7 @@ def test_the_answer_says_how_sure_how_much_is_explained_and_in_at_most_ten_lines
     found = replace(report_of("motor_lag", 0.05, 0.02), remains=Remains.of(TIMED, errors(0.02, 0.10), FLOOR, None))
     lines = summary_lines(found)
     assert lines[0] == "The wheels follow their command slowly, with a time constant of 123 ms."
-    assert lines[1] == "How sure: with 95 % probability motor_lag is between 0.1 and 0.15 s."
+    assert lines[1] == "How sure: with 95 % probability motor_lag is between 0.10 and 0.15 s."
     assert lines[3].startswith(
         "Of what is more than the sensors' noise this explains 75% in position and 0% in heading."
     )
@@ -95,3 +95,9 @@ def test_the_answer_says_how_sure_how_much_is_explained_and_in_at_most_ten_lines
         "Poses are stamped 65 ms early.",
         "How sure: with 95 % probability pose_latency is between 0.06 and 0.07 s.",
     ]
+
+
+def test_the_ends_of_a_narrow_interval_are_told_apart():
+    dead_band = EffectFinding("deadband", "actuator", {"width_rad_s": ParameterEstimate(0.8005, 0.799, 0.8019)}, 9.0)
+    found = replace(report_of("motor_lag", 0.05, 0.02), effects=(dead_band,))
+    assert summary_lines(found)[1] == "How sure: with 95 % probability deadband is between 0.799 and 0.802 rad/s."
