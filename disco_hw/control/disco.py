@@ -195,11 +195,11 @@ class Disco:
             sampling.leave_touching_plan()
         self._begin = begin
         nominal = optimiser.nominal()
-        trajectory = begin.mean_path(self._points.mean_run, nominal)
 
         # Beside the line the plan is refined; where it stands, the guide takes its place.
         refined = self._refined(begin, system, nominal) if outcome in REFINED else None
         diagnostics = sampling.diagnostics(outcome, retries, self._speed_part(outcome))
+        trajectory = begin.mean_path(self._points.mean_run, nominal) if refined is None else refined[1]
         if guided and self._is_guided(now_ns, system, trajectory):
             optimiser.use_guide()
             nominal = optimiser.nominal()
