@@ -195,11 +195,11 @@ class Disco:
             sampling.leave_touching_plan()
         self._begin = begin
         nominal = optimiser.nominal()
-        diagnostics = sampling.diagnostics(outcome, retries)
-        trajectory = begin.mean_path(self._points.mean_run, nominal)
 
         # Beside the line the plan is refined; where it stands, the guide takes its place.
         refined = self._refined(begin, system, nominal) if outcome in REFINED else None
+        diagnostics = sampling.diagnostics(outcome, retries, self._speed_part(outcome))
+        trajectory = begin.mean_path(self._points.mean_run, nominal) if refined is None else refined[1]
         if guided and self._is_guided(now_ns, system, trajectory):
             optimiser.use_guide()
             nominal = optimiser.nominal()
@@ -255,6 +255,10 @@ class Disco:
         """Refine in the mean of the belief in force."""
         if self._refinement is not None:
             self._refinement.set_model(self._points.model, self._points.chassis)
+
+    def _speed_part(self, outcome: PlanOutcome) -> float:
+        """Return the part of the task's speed that the wheels can do ahead; 1 where no refinement was tried."""
+        return 1.0 if self._refinement is None or outcome not in REFINED else self._refinement.speed_part
 
     def _refined(self, begin: PlanStart, system: SkidSteer, nominal: Array) -> tuple[Array, Array] | None:
         """Return the refined commands (N, 2), as the robot is to get them, and where they lead; None without such."""

@@ -54,7 +54,7 @@ class Guidance:
         """
         settings = self._settings
         horizon_s = settings.sampler.horizon * settings.step_s
-        half = settings.sampler.horizon // 2
+        half = min(settings.sampler.horizon // 2, len(trajectory) - 1)
         way_m = system.task.way_ahead_m(half * settings.step_s)
         # From the last place on: that of a plan which does not stand is far enough.
         begin, *places = trajectory[: half + 1, :2].tolist()

@@ -261,7 +261,8 @@ class Diagnostics(msgspec.Struct, frozen=True):
 
     `ess` effective sample size, `collapsed` whether it is below the alarm; `temperature`; `cost_min`, `cost_mean` of
     the samples and `cost_nominal` of sample 0, which is the plan that they vary; `valid_samples` with a finite cost;
-    `retries` made and the `outcome`.
+    `retries` made and the `outcome`; `speed_part`: the part of the task's speed that the wheels can do ahead, 1 where
+    that is not known.
     """
 
     ess: float
@@ -273,6 +274,7 @@ class Diagnostics(msgspec.Struct, frozen=True):
     retries: int = 0
     collapsed: bool = False
     outcome: PlanOutcome = PlanOutcome.PLANNED
+    speed_part: float = 1.0
 
 
 class WheelPlan(msgspec.Struct, frozen=True, eq=False):

@@ -31,6 +31,7 @@ Array = NDArray[np.float64]
 
 # Chosen: more look further ahead, and each takes its share of the time.
 STEPS = 20
+ROWS = np.arange(STEPS)
 # Chosen: each takes its time of the tick; the next tick begins from what this one found.
 ITERATIONS = 2
 # A change of a wheel's rim speed costs as much as the distance that it covers in this time.
@@ -52,7 +53,7 @@ class Refinement:
         self._limits, self._step_s, self._history = limits, step_s, history
         self._series = integration_series(step_s, wide=True)
         self._reference = np.zeros((STEPS, CHANNELS), np.float32)
-        self._found = np.ones(5, np.float32)
+        self._found = np.ones(6, np.float32)
         self._start, self._before = np.zeros(5), np.zeros(CHANNELS)
         self._compiled: dict[str, Callable[..., float]] = {}
         self._last: Array | None = None
@@ -93,38 +94,24 @@ class Refinement:
             "timed reference", timed_reference, self._reference, terms, start, self._chassis,
             self._limits.speed_rad_s, self._step_s, self._found,
         )  # fmt: skip
-        distance_m, facing, *_ = self._found.tolist()
-        way_m = float(np.hypot(*np.diff(self._reference, axis=0).T).sum())
+        distance_m, facing, _, _, _, way_m = self._found.tolist()
         problem, buffers = self._posed(begin, start, way_m), self._buffers
         assert buffers is not None
         if not self.is_compiled:
             # Off the line too, so that no compilation waits for the robot to reach it.
-            self._call("refine", refine, problem, buffers, 0)
+            self._call("refine", refine, problem, buffers, 0, 0)
+        last, self._last = self._last, None
         if not (distance_m < max(LATERAL_PART * way_m, 0.02) and facing > FACING):
-            self._last = None
             return None
         buffers.commands[: self._history] = begin.earlier
-        plan = buffers.commands[self._history :]
-        starts = [_shifted(nominal, 0.0)]
-        if self._last is not None:
-            starts.append(_shifted(self._last, (begin.t0_ns - self._last_ns) * 1e-9 / self._step_s))
-        best, best_cost = None, math.inf
-        for one in starts:
-            plan[:] = one
-            cost = self._call("refine", refine, problem, buffers, 0)
-            if cost < best_cost:
-                best, best_cost = plan.copy(), cost
-        if best is None:
-            self._last = None
+        buffers.starts[0] = nominal.take(ROWS, axis=0, mode="clip")
+        if last is not None:
+            buffers.starts[1] = _shifted(last, (begin.t0_ns - self._last_ns) * 1e-9 / self._step_s)
+        cost = self._call("refine", refine, problem, buffers, 1 if last is None else 2, ITERATIONS)
+        if not math.isfinite(cost):
             return None
-        plan[:] = best
-        cost = self._call("refine", refine, problem, buffers, ITERATIONS)
-        found = plan.copy()
-        if not (math.isfinite(cost) and np.isfinite(found).all()):
-            self._last = None
-            return None
-        self._last, self._last_ns = found, begin.t0_ns
-        return found
+        self._last, self._last_ns = buffers.commands[self._history :].copy(), begin.t0_ns
+        return self._last
 
     def _posed(self, begin: PlanStart, start: NDArray[np.float32], way_m: float) -> Problem:
         self._start[:] = begin.state
@@ -133,12 +120,13 @@ class Refinement:
         self._before[:] = begin.before
         x_icr_m = abs(self._chassis.x_icr_m)
         end_weight = max(END_X_ICR * x_icr_m * STEPS / max(way_m, 1e-3), LEAST_END_WEIGHT)
+        change_m = CHANGE_S * self._chassis.wheel_radius_m
         change = min(self._limits.acceleration_rad_s2 * self._step_s, 4.0 * self._limits.speed_rad_s)
         return Problem(
             self._start, float(begin.elapsed_s), np.array(begin.slide, np.float64), begin.mean_means, self._base,
             self._effects, self._series, self._history, self._reference,
-            float(self._limits.speed_rad_s), float(change), self._before, CHANGE_S * self._chassis.wheel_radius_m,
-            self._found[3:], end_weight, x_icr_m,
+            float(self._limits.speed_rad_s), float(change), self._before, change_m,
+            self._found[3:5], end_weight, x_icr_m,
         )  # fmt: skip
 
     def _call(self, name: str, kernel: Callable[..., object], *arguments: object) -> float:
@@ -153,6 +141,7 @@ def _buffers(history: int, means: Array | None) -> Buffers:
     return Buffers(
         commands=np.zeros((history + STEPS, CHANNELS)),
         tried=np.zeros((history + STEPS, CHANNELS)),
+        starts=np.zeros((2, STEPS, CHANNELS)),
         states=np.zeros((STEPS + 1, STATE_COLUMNS)),
         moved=np.zeros((STEPS + 1, STATE_COLUMNS)),
         remembered=means,
@@ -167,6 +156,5 @@ def _buffers(history: int, means: Array | None) -> Buffers:
 
 
 def _shifted(plan: Array, steps: float) -> Array:
-    """Return the part (STEPS, 2) of a plan that begins so many steps, or parts of one, behind its begin."""
-    at, rows = steps + np.arange(STEPS), np.arange(len(plan))
-    return np.column_stack([np.interp(at, rows, column) for column in plan.T])
+    """Return a plan (STEPS, 2) moved on by so many steps, or parts of one."""
+    return np.column_stack([np.interp(steps + ROWS, ROWS, column) for column in plan.T])

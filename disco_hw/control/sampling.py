@@ -73,8 +73,8 @@ class Sampling:
             if len(commands):
                 optimiser.set_nominal(commands[0])
 
-    def diagnostics(self, outcome: PlanOutcome, retries: int) -> Diagnostics:
-        """Return how the last step went."""
+    def diagnostics(self, outcome: PlanOutcome, retries: int, speed_part: float) -> Diagnostics:
+        """Return how the last step went, with the part of the task's speed that the wheels can do."""
         ess, temperature, least, mean, nominal, valid = self._optimiser.work.report.tolist()
         collapsed = ess < self._settings.min_ess
-        return Diagnostics(ess, temperature, least, mean, nominal, int(valid), retries, collapsed, outcome)
+        return Diagnostics(ess, temperature, least, mean, nominal, int(valid), retries, collapsed, outcome, speed_part)

@@ -21,6 +21,7 @@ from disco_hw.log.recorder import Recorder
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.obstacles import ObstacleRefused, ObstacleReport
 from disco_hw.runtime.pipeline import FollowTask, Motion, Off, Pipeline, Source, Standstill, Tick, untimed
+from disco_hw.runtime.planner_events import FOLLOWS, PlannerEvents
 from disco_hw.runtime.plausibility import Directions, Headway, Plausibility, PlausibilityStats
 from disco_hw.runtime.pose_jumps import PoseJumps
 from disco_hw.runtime.robot_setup import record_of
@@ -150,7 +151,7 @@ class DaemonCore:
         self._controller_changed = False
         self._generation = 0
         self._link_up = False
-        self._planner_failing = self._planner_collapsed = self._fell_back = False
+        self._planner_events = PlannerEvents(config.control.fallback)
         self._state = supervisor.state
         self._last_reported: tuple[str, bool, bool] | None = None
         self.entered: dict[str, int] = {}
@@ -212,7 +213,7 @@ class DaemonCore:
             *self._pose_events(),
             *output.events,
             *estimated.events,
-            *self._planner_events(result),
+            *self._planner_events.step(result.source, result.plan, result.planner_failure),
             *doubts,
         )
         events = (*events, *fence_events, *self._stays(now_ns, output, result))
@@ -362,34 +363,10 @@ class DaemonCore:
         messages += [*pipeline.fusion.sources.new_messages(), *self._jumps.new_messages()]
         return [f"poses: {text}" for text in messages]
 
-    def _planner_events(self, result: Tick) -> tuple[str, ...]:
-        """Say when the planner begins and ceases to fail, or to plan from too few samples, not in every tick."""
-        events: list[str] = []
-        failing = result.planner_failure is not None
-        if failing != self._planner_failing:
-            events.append(f"planner: {result.planner_failure}" if failing else "planner: recovered")
-        self._planner_failing = failing
-        if result.plan is not None:
-            found = result.plan.diagnostics
-            fell_back = result.source is Source.FALLBACK
-            if fell_back is not self._fell_back:
-                law = self.config.control.fallback
-                events.append(
-                    f"planner: no valid plan; the fallback controller {law} follows the line instead"
-                    if fell_back
-                    else "planner: valid plan again; the planner drives"
-                )
-            self._fell_back = fell_back
-            if found.collapsed != self._planner_collapsed:
-                few = f"planner: plans rest on {found.ess:.1f} effective samples, too few to trust the plan"
-                events.append(few if found.collapsed else "planner: enough effective samples again")
-            self._planner_collapsed = found.collapsed
-        return tuple(events)
-
     def _stays(self, now_ns: int, output: Output, result: Tick) -> tuple[str, ...]:
         """Say when the task that runs does not get on."""
         place, command = (result.estimate.x_m, result.estimate.y_m), result.command
-        follows = output.running and result.source in (Source.PLAN, Source.TAIL, Source.FALLBACK, Source.RAMP)
+        follows = output.running and result.source in FOLLOWS
         return self._headway.step(
             now_ns, follows, place, (command.left_rad_s, command.right_rad_s), self.newest_wheels,
             result.planner_failure,

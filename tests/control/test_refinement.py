@@ -41,6 +41,7 @@ def drive_on() -> dict[float, tuple[np.ndarray, np.ndarray]]:
         assert planner.refinement is not None
         # The outer wheel would need more than its limit at 0.8 m/s on this circle.
         assert (planner.refinement.speed_part < 1.0) is (speed > 0.5)
+        assert plan.diagnostics.speed_part == planner.refinement.speed_part
         found[speed] = plan.wheel_speeds, np.hypot(*plan.trajectory[:, :2].T) - RADIUS_M
     return found
 

@@ -36,9 +36,9 @@ def timed_reference(
 ) -> None:  # fmt: skip
     """Fill `reference` (T, 2) with points (m), relative to the task's origin.
 
-    `start` (11,) is the state of `SkidSteer`. Sets `found` (5,): distance to the line (m), cosine of the angle between
+    `start` (11,) is the state of `SkidSteer`. Sets `found` (6,): distance to the line (m), cosine of the angle between
     the robot and the heading in which it would stay on the line, the part of the task's speed that the wheels can do,
-    at most 1, and that heading at the end (cosine, sine).
+    at most 1, that heading at the end (cosine, sine), and the length of the way from the first point to the last (m).
     """
     x, y, cos_yaw, sin_yaw = start[START_X], start[START_Y], start[START_COS], start[START_SIN]
     place = place_of(terms, start[START_MEMORY], x, y)
@@ -47,7 +47,7 @@ def timed_reference(
     found[1] = cos_yaw * head_x + sin_yaw * head_y
     fastest = USED_SPEED * max(largest_rad_s - chassis.dead_rad_s, 0.0) * chassis.wheel_radius_m
     half_axle, part_s = 0.5 * chassis.axial_distance_m, step_s / PARTS
-    ahead, requested = 0.0, 0.0
+    ahead, requested, way_m = 0.0, 0.0, 0.0
     for t in range(reference.shape[0]):
         for _ in range(PARTS):
             _, _, from_x, from_y, along, speed = line_at(terms, place, ahead)
@@ -60,5 +60,7 @@ def timed_reference(
             requested += way
         at_x, at_y, head_x, head_y, _, _ = line_at(terms, place, ahead)
         reference[t, 0], reference[t, 1] = at_x, at_y
+        if t > 0:
+            way_m += math.hypot(at_x - reference[t - 1, 0], at_y - reference[t - 1, 1])
     found[2] = ahead / requested if requested > 0.0 else 1.0
-    found[3], found[4] = head_x, head_y
+    found[3], found[4], found[5] = head_x, head_y, way_m

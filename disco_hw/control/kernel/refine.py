@@ -67,13 +67,15 @@ class Problem(NamedTuple):
 class Buffers(NamedTuple):
     """Scratch of the refinement: T steps, N = 2 T commands, H rows of history.
 
-    `commands` (H + T, 2): the past and the plan, which is improved in place; `tried` the same for what is tried.
+    `commands` (H + T, 2): the past and the plan that is improved; `tried` the same for what is tried.
+    `starts` (2, T, 2): plans to begin from.
     `states`, `moved` (T + 1, 9); `remembered` (n,) or None; `residuals` (2 T + 1,), `slopes` (N, 2 T + 1);
     `normal`, `inverse` (N, N); `gradient`, `step` (N,); `multipliers` (2, 2 N).
     """
 
     commands: Array
     tried: Array
+    starts: Array
     states: Array
     moved: Array
     remembered: Array | None
@@ -336,13 +338,29 @@ def _apply_step(problem: Problem, buffers: Buffers, share: float) -> None:
             buffers.tried[history + t, c] = last
 
 
-@kernel_function
-def refine(problem: Problem, buffers: Buffers, iterations: int) -> float:
-    """Bring `buffers.commands` within the limits and improve them; returns the cost that is left."""
+@block_function
+def _choose_start(problem: Problem, buffers: Buffers, count: int) -> float:
+    """Set the plan to the cheapest of the first `count` starts, brought within the limits; returns its cost."""
+    plan, starts = buffers.commands[problem.history :], buffers.starts
+    best, least = 0, math.inf
     buffers.step[:] = 0.0
-    _apply_step(problem, buffers, 0.0)
-    buffers.commands[:, :] = buffers.tried
-    cost = _cost(problem, buffers, buffers.commands)
+    for n in range(count):
+        plan[:, :] = starts[n]
+        _apply_step(problem, buffers, 0.0)
+        starts[n] = buffers.tried[problem.history :]
+        cost = _cost(problem, buffers, buffers.tried)
+        if cost < least:
+            best, least = n, cost
+    plan[:, :] = starts[best]
+    return least
+
+
+@kernel_function
+def refine(problem: Problem, buffers: Buffers, count: int, iterations: int) -> float:
+    """Improve the cheapest of the first `count` of `buffers.starts`, in `buffers.commands`; returns its cost."""
+    cost = _choose_start(problem, buffers, count)
+    if cost == math.inf:
+        return cost
     for _ in range(iterations):
         _linearise(problem, buffers)
         for a in range(buffers.step.shape[0]):
