@@ -78,19 +78,21 @@ _GETTER_BY_NUMBER = by_number(GETTERS)
 Value = float | int | str
 
 
-def set_bytes(address: int, name: str, **values: int) -> bytes:
-    """Return the bytes that set something; `values` by the names of `SETTERS`, held to what the wire can say.
+def setting(address: int, name: str, **values: int) -> Frame:
+    """Return the packet that sets something; `values` by the names of `SETTERS`, held to what the wire can say.
 
     Raises ValueError for an address outside 0x80 to 0x87.
     """
     layout = SETTERS[name]
     arguments = [_in_range(values[field], code) for field, code in zip(layout.fields, layout.body, strict=True)]
-    return with_crc(_head(address, layout.command) + layout.pack(*arguments))
+    packet = with_crc(_head(address, layout.command) + layout.pack(*arguments))
+    return Frame(address << 8 | layout.command, packet)
 
 
-def request_bytes(address: int, name: str) -> bytes:
-    """Return the bytes that ask for something. Raises ValueError for an address outside 0x80 to 0x87."""
-    return _head(address, GETTERS[name].command)
+def query(address: int, name: str) -> Frame:
+    """Return the packet that asks for something. Raises ValueError for an address outside 0x80 to 0x87."""
+    command = GETTERS[name].command
+    return Frame(address << 8 | command, _head(address, command))
 
 
 def with_crc(packet: bytes) -> bytes:
@@ -232,16 +234,6 @@ class RoboclawExchange:
             return Frame(frame.can_id, ACKNOWLEDGE) if received[:1] == ACKNOWLEDGE else None
         found = reply(address, name, received)
         return None if found is None else Frame(frame.can_id, received[: found[1]])
-
-
-def setting(address: int, name: str, **values: int) -> Frame:
-    """Return the packet that sets something."""
-    return Frame(address << 8 | SETTERS[name].command, set_bytes(address, name, **values))
-
-
-def query(address: int, name: str) -> Frame:
-    """Return the packet that asks for something."""
-    return Frame(address << 8 | GETTERS[name].command, request_bytes(address, name))
 
 
 QUESTIONS = LineQuestions(

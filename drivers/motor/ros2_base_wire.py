@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -235,11 +234,6 @@ def cyclic_frames(_settings: Ros2BaseSettings, command_rate_hz: float, _authenti
         CyclicFrame("speeds", "HOST", 8, command_rate_hz),
         *(CyclicFrame(name, "ROBOT", 8, rate) for name, rate in (("state", 20.0), ("angles", 50.0), ("wheels", 50.0))),
     )
-
-
-def recognise(frames: Sequence[Frame]) -> dict[str, object] | None:
-    """Return None, because the bridge is started with the robot.toml that would be made."""
-    return None
 
 
 def safety_card(settings: Ros2BaseSettings) -> SafetyCard:

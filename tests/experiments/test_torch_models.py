@@ -4,9 +4,9 @@ import numpy as np
 import torch
 
 from disco_hw.control import pendulum
-from disco_hw.experiments.pendulum import circle_cost, pendulum_cost, pendulum_transition, skid_steer_transition
 from disco_hw.model import plain as physics
 from disco_hw.tasks.circle import CircleCost
+from tools.torch_models import circle_cost, pendulum_cost, pendulum_transition, skid_steer_transition
 
 RNG = np.random.default_rng(4)
 

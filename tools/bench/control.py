@@ -25,13 +25,14 @@ from disco_hw.control.parameter_points import sigma_points, unscented_points
 from disco_hw.control.pendulum import PendulumPlanner, PendulumPoints
 from disco_hw.control.plan import ROTATION
 from disco_hw.experiments.circle import CircleOptions, CircleResult, Command, drive, planner_command, plants
-from disco_hw.experiments.pendulum import POSTERIOR, circle_cost, skid_steer_transition
+from disco_hw.experiments.pendulum import POSTERIOR
 from disco_hw.jit import block_function, float32, tune_loops
 from disco_hw.model import Model, load_model
 from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.tasks.circle import CircleCost
 from tools.bench.step_times import summary, times_ms, undisturbed
+from tools.torch_models import circle_cost, skid_steer_transition
 
 ROBOTS = Path(disco_hw.__file__).parent / "robots"
 PERIOD_NS = 20_000_000

@@ -37,7 +37,7 @@ def _check_setter(found: Comparison, case: Case) -> None:
     given = case["given"]
     name = _SETTER_BY_NUMBER[given["command"]]
     values = {field: _raw(field, given) for field in protocol.SETTERS[name].fields}
-    packet = protocol.set_bytes(given["address"], name, **values)
+    packet = protocol.setting(given["address"], name, **values).data
     found.same("bytes", packet.hex(), case["bytes"])
     board = Roboclaw(given["address"])
     answer = board.receive(0, bytes.fromhex(case["bytes"]))
@@ -66,7 +66,7 @@ def _check_getter(found: Comparison, case: Case) -> None:
         found.differences.append(f"command {given['command']} is not known")
         return
     address, received = given["address"], bytes.fromhex(case["bytes"])
-    found.same("request", protocol.request_bytes(address, name).hex(), given["request"])
+    found.same("request", protocol.query(address, name).data.hex(), given["request"])
     verdict = case["then"].get("both") or case["then"]["python"]
     read = protocol.reply(address, name, received)
     found.same("accepted", read is not None, verdict["accepted"])
@@ -148,14 +148,14 @@ def _check_late(found: Comparison, case: Case) -> None:
             continue
         if "host_sends_speeds" in step:
             speeds = dict(zip(protocol.SETTERS["speed_m1m2"].fields, step["host_sends_speeds"], strict=True))
-            sent = protocol.set_bytes(address, "speed_m1m2", **speeds).hex()
+            sent = protocol.setting(address, "speed_m1m2", **speeds).data.hex()
             found.same("speeds", [sent] * len(step["requests"]), step["requests"])
             found.same("late bytes acknowledge", late[:1] == protocol.ACKNOWLEDGE, step["then"]["accepted"])
             late = b""
             continue
         name = protocol.getter_name(step["host_asks"]) or ""
         for request in step["requests"]:
-            found.same("request", protocol.request_bytes(address, name).hex(), request)
+            found.same("request", protocol.query(address, name).data.hex(), request)
         for answer in step["replies"]:
             if late:
                 found.same("late bytes first", protocol.reply(address, name, late + bytes.fromhex(answer)), None)

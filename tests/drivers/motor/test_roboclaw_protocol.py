@@ -8,17 +8,17 @@ from drivers.motor import roboclaw_protocol as protocol
 
 
 def test_a_command_of_both_speeds():
-    sent = protocol.set_bytes(0x80, "speed_m1m2", speed_m1_counts_s=1000, speed_m2_counts_s=-1000)
+    sent = protocol.setting(0x80, "speed_m1m2", speed_m1_counts_s=1000, speed_m2_counts_s=-1000).data
     assert sent.hex() == "8025000003e8fffffc188290"
 
 
 def test_a_value_is_held_to_what_the_wire_can_say():
-    assert protocol.set_bytes(0x80, "duty_m1m2", duty_m1=40000, duty_m2=-40000)[2:6].hex() == "7fff8000"
+    assert protocol.setting(0x80, "duty_m1m2", duty_m1=40000, duty_m2=-40000).data[2:6].hex() == "7fff8000"
 
 
 def test_an_answer_is_read_with_its_sign():
     received = bytes.fromhex("00000001fffffffffb04")
-    assert protocol.request_bytes(0x80, "encoders") == b"\x80\x4e"
+    assert protocol.query(0x80, "encoders").data == b"\x80\x4e"
     assert protocol.reply(0x80, "encoders", received) == ({"encoder_m1": 1, "encoder_m2": -1}, 10)
 
 
@@ -42,7 +42,7 @@ def test_the_status_may_have_two_bytes():
 
 def test_an_address_that_no_board_has_is_refused():
     with pytest.raises(ValueError, match="0x7f"):
-        protocol.request_bytes(0x7F, "status")
+        protocol.query(0x7F, "status")
 
 
 @given(st.binary(max_size=60), st.sampled_from(sorted(protocol.GETTERS)))
