@@ -23,9 +23,9 @@ from std_msgs.msg import String
 
 
 def echo(node, x, y, yaw):
-    say = node.create_publisher(PoseStamped, "/pose", 10)
+    publisher = node.create_publisher(PoseStamped, "/pose", 10)
 
-    def heard(message):
+    def publish_pose(message):
         place, turned = message.pose.pose.position, message.pose.pose.orientation
         pose = PoseStamped()
         pose.header.stamp, pose.header.frame_id = message.header.stamp, "map"
@@ -33,29 +33,37 @@ def echo(node, x, y, yaw):
         pose.pose.position.y = y + math.sin(yaw) * place.x + math.cos(yaw) * place.y
         half = 0.5 * (yaw + 2.0 * math.atan2(turned.z, turned.w))
         pose.pose.orientation.z, pose.pose.orientation.w = math.sin(half), math.cos(half)
-        say.publish(pose)
+        publisher.publish(pose)
 
-    node.create_subscription(Odometry, "/odom", heard, qos_profile_sensor_data)
+    node.create_subscription(Odometry, "/odom", publish_pose, qos_profile_sensor_data)
 
 
 def listen(node):
-    def take(topic, frame):
+    def print_topic(topic, frame):
         return lambda message: print(topic, frame(message), flush=True)
 
     def stamped(message):
         return message.header.frame_id
 
     reliable = QoSProfile(depth=10)
-    node.create_subscription(Odometry, "/odom", take("odom", stamped), reliable)
-    node.create_subscription(JointState, "/joint_states", take("joint_states", lambda m: ",".join(m.name)), reliable)
-    node.create_subscription(Path, "/plan", take("plan", stamped), reliable)
+    node.create_subscription(Odometry, "/odom", print_topic("odom", stamped), reliable)
     node.create_subscription(
-        DiagnosticArray, "/diagnostics", take("diagnostics", lambda m: m.status[0].name.replace(" ", "")), reliable
+        JointState, "/joint_states", print_topic("joint_states", lambda m: ",".join(m.name)), reliable
+    )
+    node.create_subscription(Path, "/plan", print_topic("plan", stamped), reliable)
+    node.create_subscription(
+        DiagnosticArray,
+        "/diagnostics",
+        print_topic("diagnostics", lambda m: m.status[0].name.replace(" ", "")),
+        reliable,
     )
 
 
 def speed(node, forward, turn):
-    say, ask = node.create_publisher(Twist, "/cmd_vel", 10), node.create_publisher(String, "/disco_hw/ctl", 10)
+    speed_publisher, request_publisher = (
+        node.create_publisher(Twist, "/cmd_vel", 10),
+        node.create_publisher(String, "/disco_hw/ctl", 10),
+    )
     granted = []
 
     def reply(message):
@@ -65,11 +73,11 @@ def speed(node, forward, turn):
     def drive():
         twist = Twist()
         twist.linear.x, twist.angular.z = forward, turn
-        say.publish(twist)
+        speed_publisher.publish(twist)
 
     node.create_subscription(String, "/disco_hw/reply", reply, 10)
     node.create_timer(0.05, drive)
-    node.create_timer(1.0, lambda: granted or ask.publish(String(data="arm")))
+    node.create_timer(1.0, lambda: granted or request_publisher.publish(String(data="arm")))
 
 
 def base(node, port, radius, track, x, y, yaw):
@@ -93,10 +101,10 @@ def base(node, port, radius, track, x, y, yaw):
         now["left"] += period * left
         now["right"] += period * right
         now["tick"] += 1
-        said = JointState(name=["fl", "rl", "fr", "rr"])
-        said.header.stamp = node.get_clock().now().to_msg()
-        said.position, said.velocity = [now["left"]] * 2 + [now["right"]] * 2, [left] * 2 + [right] * 2
-        joints.publish(said)
+        joint_state = JointState(name=["fl", "rl", "fr", "rr"])
+        joint_state.header.stamp = node.get_clock().now().to_msg()
+        joint_state.position, joint_state.velocity = [now["left"]] * 2 + [now["right"]] * 2, [left] * 2 + [right] * 2
+        joints.publish(joint_state)
         if now["tick"] % 2 == 0:
             pose = {"x_m": now["x"], "y_m": now["y"], "yaw_rad": now["yaw"], "position_std_m": 0.005}
             sender.sendto(json.dumps({**pose, "yaw_std_rad": 0.01, "age_s": 0.0}).encode(), ("127.0.0.1", int(port)))

@@ -28,7 +28,7 @@ from disco_hw.runtime.robot_setup import load_setup, scene_of
 from tools.stack import write_robot_file
 
 ESTIMATE = Estimate(7, 1.0, 2.0, 0.5, (0.0,) * 9, 0.25, 0.0, 0.0, 0.0)
-WANTED = {"/estimate", "/view/transform", SCENE}
+REQUIRED_TOPICS = {"/estimate", "/view/transform", SCENE}
 
 
 @pytest.fixture
@@ -54,32 +54,32 @@ def live(tmp_path):
     feed.close()
 
 
-async def hear(url):
+async def receive(url):
     """The advertised channels by topic, and the first message of each wanted one."""
     async with connect(url, subprotocols=["foxglove.sdk.v1"], max_size=None) as client:
         channels, messages = {}, {}
-        while WANTED - set(messages):
-            said = await asyncio.wait_for(client.recv(), 30.0)
-            if isinstance(said, str):
-                for channel in json.loads(said).get("channels", []):
+        while REQUIRED_TOPICS - set(messages):
+            message = await asyncio.wait_for(client.recv(), 30.0)
+            if isinstance(message, str):
+                for channel in json.loads(message).get("channels", []):
                     channels[channel["topic"]] = channel
-                wanted = [one["id"] for one in channels.values() if one["topic"] in WANTED]
-                asked = [{"id": number, "channelId": number} for number in wanted]
-                await client.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
-            elif said[0] == 1:
-                number, _ = struct.unpack("<IQ", said[1:13])
+                channel_ids = [one["id"] for one in channels.values() if one["topic"] in REQUIRED_TOPICS]
+                subscriptions = [{"id": number, "channelId": number} for number in channel_ids]
+                await client.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
+            elif message[0] == 1:
+                number, _ = struct.unpack("<IQ", message[1:13])
                 topic = next(one["topic"] for one in channels.values() if one["id"] == number)
-                messages.setdefault(topic, said[13:])
+                messages.setdefault(topic, message[13:])
         return channels, messages
 
 
 def test_a_client_gets_all_topics_and_what_the_daemon_records(live):
-    channels, messages = asyncio.run(hear(live.url))
+    channels, messages = asyncio.run(receive(live.url))
     assert {name for name, _ in VIEWS} | (set(TOPIC_BY_NAME) - {"/can/rx", "/can/tx"}) | {SCENE} == set(channels)
     assert channels["/estimate"]["encoding"] == "json"
     assert channels["/view/transform"]["schemaName"] == "foxglove.FrameTransform"
-    said = json.loads(messages["/estimate"])
-    assert (said["x_m"], said["y_m"], said["speed_m_s"]) == (1.0, 2.0, 0.25)
+    estimate = json.loads(messages["/estimate"])
+    assert (estimate["x_m"], estimate["y_m"], estimate["speed_m_s"]) == (1.0, 2.0, 0.25)
     scene = SceneUpdate()
     scene.ParseFromString(messages[SCENE])
     task, robot = scene.entities
@@ -99,10 +99,10 @@ def test_a_port_that_is_taken_is_refused_in_one_line(live, tmp_path):
         Live(config, "127.0.0.1", int(live.url.rpartition(":")[2]))
 
 
-@pytest.mark.parametrize("words", [["run.mcap"], ["--live"], ["--live", "--robot", "r.toml", "--host", "0.0.0.0"]])
-def test_what_it_is_not_for_is_refused(words):
+@pytest.mark.parametrize("arguments", [["run.mcap"], ["--live"], ["--live", "--robot", "r.toml", "--host", "0.0.0.0"]])
+def test_what_it_is_not_for_is_refused(arguments):
     with pytest.raises(InputError):
-        CliRunner().invoke(app(), ["view", "--foxglove", *words], catch_exceptions=False)
+        CliRunner().invoke(app(), ["view", "--foxglove", *arguments], catch_exceptions=False)
 
 
 def test_the_layout_names_topics_and_fields_that_there_are():

@@ -57,19 +57,19 @@ def odometry(at_ms, x, y, yaw, speed=0.0, turn=0.0):
     return msg.Odometry(msg.Header(msg.stamp_of(WALL_NS + at_ms * MS), "odom"), "base_link", pose, twist)
 
 
-def taken(inlet, message, now_ms):
+def pass_wheels(inlet, message, now_ms):
     return inlet.wheels(message, WALL_NS + now_ms * MS, MONO_NS + now_ms * MS, WALL_NS + now_ms * MS)
 
 
 def test_joints_of_a_side_are_averaged_and_their_age_is_that_of_the_stamp():
-    wheels = taken(WheelInlet(settings(**JOINTS)), joints(-20), 0)
+    wheels = pass_wheels(WheelInlet(settings(**JOINTS)), joints(-20), 0)
     assert wheels.angles_rad == pytest.approx((1.0, 2.0))
     assert wheels.speeds_rad_s == pytest.approx((0.5, 1.5))
     assert wheels.age_s == pytest.approx(0.020)
 
 
 def test_a_stamp_a_little_ahead_is_now():
-    assert taken(WheelInlet(settings(**JOINTS)), joints(30), 0).age_s == 0.0
+    assert pass_wheels(WheelInlet(settings(**JOINTS)), joints(30), 0).age_s == 0.0
 
 
 def test_a_message_without_a_stamp_counts_from_when_it_was_sent():
@@ -80,13 +80,13 @@ def test_a_message_without_a_stamp_counts_from_when_it_was_sent():
 
 def test_without_velocities_the_speeds_are_those_of_the_angles():
     inlet = WheelInlet(settings(**JOINTS))
-    assert taken(inlet, joints(0, speeds=None), 0).speeds_rad_s == (0.0, 0.0)
-    assert taken(inlet, joints(20, (1.1, 1.9), None), 20).speeds_rad_s == pytest.approx((5.0, -5.0))
+    assert pass_wheels(inlet, joints(0, speeds=None), 0).speeds_rad_s == (0.0, 0.0)
+    assert pass_wheels(inlet, joints(20, (1.1, 1.9), None), 20).speeds_rad_s == pytest.approx((5.0, -5.0))
 
 
 def test_joints_of_an_arm_alone_are_nothing_and_not_refused():
     inlet = WheelInlet(settings(**JOINTS))
-    assert taken(inlet, joints(0, names=("arm",)), 0) is None
+    assert pass_wheels(inlet, joints(0, names=("arm",)), 0) is None
     assert not inlet.refused
 
 
@@ -104,40 +104,40 @@ def test_joints_of_an_arm_alone_are_nothing_and_not_refused():
 )
 def test_wheels_that_cannot_be_are_refused_by_reason(message, reason):
     inlet = WheelInlet(settings(**JOINTS))
-    assert taken(inlet, message, 0) is None
-    assert [reason in words for words in inlet.refused] == [True]
+    assert pass_wheels(inlet, message, 0) is None
+    assert [reason in text for text in inlet.refused] == [True]
     assert reason in wire.REFUSALS[inlet.why(MONO_NS)]
     assert inlet.why(MONO_NS + 2000 * MS) == 0
-    assert taken(inlet, joints(40), 40) is not None, "what comes after is taken"
+    assert pass_wheels(inlet, joints(40), 40) is not None, "what comes after is taken"
 
 
 def test_what_comes_out_of_order_is_refused():
     inlet = WheelInlet(settings(**JOINTS))
-    assert taken(inlet, joints(0), 0)
-    assert taken(inlet, joints(-10), 10) is None
-    assert taken(inlet, joints(0), 10) is None
+    assert pass_wheels(inlet, joints(0), 0)
+    assert pass_wheels(inlet, joints(-10), 10) is None
+    assert pass_wheels(inlet, joints(0), 10) is None
     assert list(inlet.refused) == ["its messages come out of order"]
 
 
 def test_odometry_is_turned_back_into_wheels_whatever_was_lost_between():
     """An arc of 1.5 m to the left by 3 rad: the wheels of an ideal base with a track of 0.5 m."""
     inlet, radius = WheelInlet(settings()), 0.5
-    taken(inlet, odometry(0, 3.0, -1.0, 3.0), 0)
+    pass_wheels(inlet, odometry(0, 3.0, -1.0, 3.0), 0)
     for step in range(1, 31):
         yaw = 3.0 + 0.1 * step
         x = 3.0 + radius * (math.sin(yaw) - math.sin(3.0))
         y = -1.0 - radius * (math.cos(yaw) - math.cos(3.0))
         if step % 3 == 0:
-            wheels = taken(inlet, odometry(20 * step, x, y, yaw, 0.5, 1.0), 20 * step)
+            wheels = pass_wheels(inlet, odometry(20 * step, x, y, yaw, 0.5, 1.0), 20 * step)
     assert wheels.angles_rad == pytest.approx(((1.5 - 0.75) / 0.1, (1.5 + 0.75) / 0.1), rel=0.01)
     assert wheels.speeds_rad_s == pytest.approx((2.5, 7.5))
 
 
 def test_odometry_with_a_pose_that_is_none_is_refused_and_forgotten():
     inlet = WheelInlet(settings())
-    before = taken(inlet, odometry(0, 0.0, 0.0, 0.0), 0)
+    before = pass_wheels(inlet, odometry(0, 0.0, 0.0, 0.0), 0)
     for x, yaw in ((math.nan, 0.0), (math.inf, 0.0), (0.0, math.nan), (1e308, 1.0)):
-        wheels = taken(inlet, odometry(20, x, 0.0, yaw), 20)
+        wheels = pass_wheels(inlet, odometry(20, x, 0.0, yaw), 20)
         assert wheels is None or x == 1e308
     assert before.angles_rad == (0.0, 0.0)
 
@@ -176,8 +176,8 @@ class TestBaseEnd:
         end.receive(0, wire.speeds(0.5, 0.0))
         for now_ms in range(20, 240, 20):
             end.receive(now_ms * MS, wire.enable(True))
-            said = end.step(now_ms * MS)
-            assert said == (None if now_ms <= 200 else (0.0, 0.0))
+            published = end.step(now_ms * MS)
+            assert published == (None if now_ms <= 200 else (0.0, 0.0))
         assert not end.driving
         assert wire.unpack_state(end.state().data)[0] & wire.FELL_SILENT
         assert end.receive(300 * MS, wire.speeds(0.5, 0.0)) is None
@@ -327,14 +327,14 @@ class OverDds:
 
     def until(self, condition, also=lambda: None):
         """Say joints, and whatever `also` does, until the flags fulfil a condition; the speeds heard on the way."""
-        heard, deadline = [], time.monotonic() + 100.0
+        received, deadline = [], time.monotonic() + 100.0
         while not condition(self.flags()):
             assert time.monotonic() < deadline
             now = msg.Header(msg.stamp_of(time.time_ns()))
             self.joints.write(msg.JointState(now, ["fl", "rl", "fr", "rr"], [0.0] * 4, [0.0] * 4))
             also()
-            heard += [(each.linear.x, each.angular.z) for each in self.speeds.take(100)]
-        return heard
+            received += [(each.linear.x, each.angular.z) for each in self.speeds.take(100)]
+        return received
 
 
 @pytest.fixture(params=[""])
@@ -348,11 +348,11 @@ def test_over_dds_a_base_is_found_and_driven_until_another_node_speaks(over_dds)
     over_dds.until(lambda flags: flags & wire.RECEIVED and flags & wire.ODOMETRY and not flags & wire.OTHERS)
     over_dds.send(wire.enable(True))
     over_dds.until(lambda flags: flags & wire.DRIVING)
-    heard = over_dds.until(
+    received = over_dds.until(
         lambda flags: (0.25, -0.5) in [(one.linear.x, one.angular.z) for one in over_dds.speeds.take(10)],
         lambda: over_dds.send(wire.speeds(0.25, -0.5)),
     )
-    assert set(heard) <= {(0.25, -0.5), (0.0, 0.0)}
+    assert set(received) <= {(0.25, -0.5), (0.0, 0.0)}
     other = DataWriter(over_dds.participant, Topic(over_dds.participant, "rt/cmd_vel", msg.Twist))
     over_dds.until(lambda flags: flags & wire.OTHERS, lambda: other.write(msg.Twist()))
 
@@ -375,19 +375,19 @@ def test_over_dds_the_button_and_the_daemons_end_stop_the_base(over_dds):
     over_dds.until(lambda flags: not flags & (wire.DRIVING | wire.FELL_SILENT))
 
 
-def refused(tmp_path, old, new, words):
+def refused(tmp_path, old, new, message):
     file = robot_file(tmp_path, find_driver("ros2_base").name)
     text = file.read_text(encoding="utf-8")
     assert old in text
     file.write_text(text.replace(old, new), encoding="utf-8")
-    with pytest.raises(InputError, match=words) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         run_base_bridge(file)
     assert str(caught.value).startswith(str(file))
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("old", "new", "message"),
     [
         ("watchdog_s = 0.5\n", "", "watchdog_s: missing; add it"),
         ("watchdog_s = 0.5", "watchdog_s = 0.0", r"link\.watchdog_s"),
@@ -403,8 +403,8 @@ def refused(tmp_path, old, new, words):
         ("ros2_base", "agilex", "watchdog_s"),
     ],
 )
-def test_what_robot_toml_lacks_is_one_line(tmp_path, old, new, words):
-    refused(tmp_path, old, new, words)
+def test_what_robot_toml_lacks_is_one_line(tmp_path, old, new, message):
+    refused(tmp_path, old, new, message)
 
 
 def test_a_socket_that_others_could_have_placed_is_refused(tmp_path):

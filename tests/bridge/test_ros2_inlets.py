@@ -64,7 +64,7 @@ def test_a_covariance_becomes_standard_deviations_the_larger_of_the_position():
 
 
 @pytest.mark.parametrize(
-    ("message", "word"),
+    ("message", "expected"),
     [
         (pose_message(frame="odom"), "frame"),
         (pose_message(frame=""), "frame"),
@@ -82,11 +82,11 @@ def test_a_covariance_becomes_standard_deviations_the_larger_of_the_position():
         ),
     ],
 )
-def test_what_is_no_pose_is_refused_by_its_reason(message, word):
+def test_what_is_no_pose_is_refused_by_its_reason(message, expected):
     inlet = PoseInlet(PoseInput())
     assert inlet.datagram(message, WALL_NS, MONO_NS, WALL_NS) is None
-    assert [word in reason for reason in inlet.refused] == [True]
-    assert word in inlet.why
+    assert [expected in reason for reason in inlet.refused] == [True]
+    assert expected in inlet.why
     # One that is well is still taken after it.
     assert inlet.datagram(pose_message(age_ns=10 * MS), 0, MONO_NS, WALL_NS) is not None
     assert inlet.why == ""
@@ -135,17 +135,17 @@ def inlet_that_may_drive():
 
 @pytest.mark.parametrize(("speed", "turn"), [(0.2, 0.0), (0.1, 0.3), (-0.2, -0.2), (0.0, 0.4)])
 def test_a_speed_becomes_the_wheel_speeds_that_make_it(speed, turn):
-    wanted = inlet_that_may_drive().request(twist(speed, turn), WALL_NS, MONO_NS, WALL_NS)
-    del wanted["do"]
-    steering = steering_from(wanted)
+    request = inlet_that_may_drive().request(twist(speed, turn), WALL_NS, MONO_NS, WALL_NS)
+    del request["do"]
+    steering = steering_from(request)
     left, right = wheel_speeds(steering.forward, steering.left * 0.6, 5.0)
     assert 0.1 * (left + right) / 2 == pytest.approx(speed)
     assert 0.1 * (right - left) / 0.8 == pytest.approx(turn)
 
 
 def test_what_is_too_fast_is_slowed_down_on_the_same_curve():
-    wanted = inlet_that_may_drive().request(twist(3.0, 3.0), WALL_NS, MONO_NS, WALL_NS)
-    left, right = wheel_speeds(wanted["forward"], wanted["left"] * 0.6, 5.0)
+    request = inlet_that_may_drive().request(twist(3.0, 3.0), WALL_NS, MONO_NS, WALL_NS)
+    left, right = wheel_speeds(request["forward"], request["left"] * 0.6, 5.0)
     assert max(abs(left), abs(right)) <= 5.0 + 1e-9
     assert 0.1 * (right - left) / 0.8 == pytest.approx(0.1 * (left + right) / 2)
 
@@ -185,8 +185,8 @@ def test_the_daemons_deadman_counts_from_when_the_speed_was_sent():
     view = RobotView(State.READY, False)
 
     def steer(now_ns, held, stamp_ns):
-        wanted = {"forward": 0.1, "left": 0.0, "held": held, "stamp": str(stamp_ns)}
-        return page.steer(now_ns, 1, steering_from(wanted))
+        command = {"forward": 0.1, "left": 0.0, "held": held, "stamp": str(stamp_ns)}
+        return page.steer(now_ns, 1, steering_from(command))
 
     steer(MONO_NS, False, MONO_NS)
     request = inlet.request(twist(0.1, 0.0), WALL_NS - 150 * MS, MONO_NS, WALL_NS)
@@ -195,7 +195,7 @@ def test_the_daemons_deadman_counts_from_when_the_speed_was_sent():
     assert MONO_NS - page.poll(MONO_NS, view).t_ns == 150 * MS
 
 
-def said_by(kind, draw, struck_ns):
+def sent_speeds(kind, draw, struck_ns):
     """(when it was sent, when it is heard, speed) of a node's speeds at 20 Hz, wrong in some way from a time on."""
     for step in range(80):
         sent = step * 50 * MS + draw.randrange(20 * MS)
@@ -215,12 +215,12 @@ def said_by(kind, draw, struck_ns):
 def test_at_random_times_a_fault_disarms_within_the_deadmans_time_and_nothing_else_does(kind, seed):
     draw = random.Random(f"{kind}{seed}")
     struck_ns = draw.randrange(1000 * MS, 2500 * MS)
-    heard = sorted(said_by(kind, draw, struck_ns), key=lambda one: one[1])
+    received = sorted(sent_speeds(kind, draw, struck_ns), key=lambda one: one[1])
     inlet, page, deadman = SpeedInlet(ROBOT, DRIVE, PARAMETERS), PageSource(5.0, 0.6), Deadman()
     state, armed_ns, disarmed_ns, last_good_ns = State.READY, [], [], 0
     for now in range(0, 4000 * MS, 20 * MS):
-        while heard and heard[0][1] <= now:
-            sent, at, speed = heard.pop(0)
+        while received and received[0][1] <= now:
+            sent, at, speed = received.pop(0)
             if sent <= struck_ns or kind in ("none", "flood"):
                 last_good_ns = sent
             if 300 * MS < at < 350 * MS:
@@ -249,10 +249,10 @@ def test_at_random_times_a_fault_disarms_within_the_deadmans_time_and_nothing_el
 def test_of_a_flood_of_requests_a_few_are_taken_in_their_order():
     errands, go, done, finished = Errands(most=3), threading.Event(), [], threading.Event()
 
-    def work(words):
+    def work(text):
         assert go.wait(60.0)
-        done.append(words)
-        if words == "2":
+        done.append(text)
+        if text == "2":
             finished.set()
 
     for number in range(50):
@@ -265,15 +265,15 @@ def test_of_a_flood_of_requests_a_few_are_taken_in_their_order():
     errands.close()
 
 
-@pytest.mark.parametrize("words", ["estop", "stop", "disarm", "status"])
-def test_stopping_is_taken_from_whoever_asks(words):
-    assert refusal(words, False) is None
+@pytest.mark.parametrize("action", ["estop", "stop", "disarm", "status"])
+def test_stopping_is_taken_from_whoever_asks(action):
+    assert refusal(action, False) is None
 
 
-@pytest.mark.parametrize("words", ["arm", "arm --unrecorded", "start", "reset", "task radius_m=1", "stopping", ""])
-def test_what_lets_the_robot_move_is_taken_only_where_robot_toml_says_so(words):
-    assert "ros2.may_move = true" in str(refusal(words, Ros2().may_move))
-    assert refusal(words, True) is None
+@pytest.mark.parametrize("action", ["arm", "arm --unrecorded", "start", "reset", "task radius_m=1", "stopping", ""])
+def test_what_lets_the_robot_move_is_taken_only_where_robot_toml_says_so(action):
+    assert "ros2.may_move = true" in str(refusal(action, Ros2().may_move))
+    assert refusal(action, True) is None
 
 
 class TestTransforms:
@@ -282,10 +282,10 @@ class TestTransforms:
     @pytest.fixture
     def inlet(self):
         inlet = TransformInlet(PoseInput(position_std_m=0.03, yaw_std_rad=0.04), "base_link")
-        assert not self.heard(inlet, 0, "base_footprint", "base_link", (0.1, 0.0, 0.0), static=True)
+        assert not self.poses_of(inlet, 0, "base_footprint", "base_link", (0.1, 0.0, 0.0), static=True)
         return inlet
 
-    def heard(self, inlet, at_ms, parent, child, place, static=False, now_ms=None):
+    def poses_of(self, inlet, at_ms, parent, child, place, static=False, now_ms=None):
         """The poses that a transform at a time brings."""
         turned = msg.Quaternion(0.0, 0.0, math.sin(place[2] / 2), math.cos(place[2] / 2))
         header = msg.Header(msg.stamp_of(WALL_NS + at_ms * MS), parent)
@@ -300,9 +300,9 @@ class TestTransforms:
         return at.x, at.y, 2.0 * math.atan2(turned.z, turned.w)
 
     def test_the_chain_is_followed_at_the_corrections_own_time(self, inlet):
-        self.heard(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
-        self.heard(inlet, 100, "odom", "/base_footprint", (2.0, 0.0, 0.2))
-        (pose,) = self.heard(inlet, 50, "map", "odom", (10.0, 5.0, math.pi / 2), now_ms=100)
+        self.poses_of(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
+        self.poses_of(inlet, 100, "odom", "/base_footprint", (2.0, 0.0, 0.2))
+        (pose,) = self.poses_of(inlet, 50, "map", "odom", (10.0, 5.0, math.pi / 2), now_ms=100)
         assert msg.time_of(pose.header.stamp) == WALL_NS + 50 * MS
         assert pose.header.frame_id == "map"
         # Half way: 1.5 m and 0.1 rad in odom, and 0.1 m further to base_link.
@@ -312,73 +312,73 @@ class TestTransforms:
         assert pose.pose.covariance[35] == pytest.approx(0.04**2)
 
     def test_a_correction_dated_ahead_counts_from_the_newest_odometry_and_reaches_the_daemon(self, inlet):
-        self.heard(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
-        (pose,) = self.heard(inlet, 1000, "map", "odom", (1.0, 0.0, 0.0), now_ms=10)
+        self.poses_of(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
+        (pose,) = self.poses_of(inlet, 1000, "map", "odom", (1.0, 0.0, 0.0), now_ms=10)
         assert msg.time_of(pose.header.stamp) == WALL_NS
         datagram = PoseInlet(PoseInput()).datagram(pose, 0, MONO_NS, WALL_NS + 10 * MS)
         passed = pose_of(datagram, MONO_NS)
         assert (passed.t_ns, passed.x_m) == (MONO_NS - 10 * MS, pytest.approx(2.1))
 
     def test_the_wheels_alone_bring_none(self, inlet):
-        self.heard(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
-        self.heard(inlet, 10, "map", "odom", (1.0, 0.0, 0.0))
-        assert not self.heard(inlet, 20, "odom", "base_footprint", (1.1, 0.0, 0.0))
+        self.poses_of(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
+        self.poses_of(inlet, 10, "map", "odom", (1.0, 0.0, 0.0))
+        assert not self.poses_of(inlet, 20, "odom", "base_footprint", (1.1, 0.0, 0.0))
 
     def test_a_correction_that_repeats_itself_brings_two_a_second_and_weaker_ones(self, inlet):
         poses = []
         for at_ms in range(0, 3000, 20):
-            self.heard(inlet, at_ms, "odom", "base_footprint", (1.0, 0.0, 0.0))
-            poses += self.heard(inlet, at_ms + 5, "map", "odom", (1.0 if at_ms < 2000 else 2.0, 0.0, 0.0))
+            self.poses_of(inlet, at_ms, "odom", "base_footprint", (1.0, 0.0, 0.0))
+            poses += self.poses_of(inlet, at_ms + 5, "map", "odom", (1.0 if at_ms < 2000 else 2.0, 0.0, 0.0))
         assert [round(math.sqrt(pose.pose.covariance[0]) / 0.03) for pose in poses] == [1, 3, 3, 3, 1, 3]
 
     def test_a_single_edge_that_moves_brings_each(self):
         inlet = TransformInlet(PoseInput(), "base_link")
-        poses = [self.heard(inlet, 20 * k, "map", "base_link", (1.0, 0.0, 0.0)) for k in range(5)]
+        poses = [self.poses_of(inlet, 20 * k, "map", "base_link", (1.0, 0.0, 0.0)) for k in range(5)]
         assert [len(each) for each in poses] == [1] * 5
 
     def test_static_transforms_alone_are_no_pose(self):
         inlet = TransformInlet(PoseInput(), "base_link")
-        assert not self.heard(inlet, 0, "map", "base_link", (1.0, 0.0, 0.0), static=True)
+        assert not self.poses_of(inlet, 0, "map", "base_link", (1.0, 0.0, 0.0), static=True)
 
     @pytest.mark.parametrize(
         ("at_ms", "place", "reason"),
         [(100, (math.nan, 0.0, 0.0), "not finite"), (-500, (0.0, 0.0, 0.0), "do not reach")],
     )
     def test_transforms_that_make_no_pose_are_counted_by_reason(self, inlet, at_ms, place, reason):
-        self.heard(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
+        self.poses_of(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
         before = sum(inlet.refused.values())
-        assert not self.heard(inlet, at_ms, "map", "odom", place)
+        assert not self.poses_of(inlet, at_ms, "map", "odom", place)
         assert sum(inlet.refused.values()) == before + 1
         assert reason in list(inlet.refused)[-1]
 
     def test_a_missing_chain_and_a_circle_are_named_and_a_flood_of_frames_is_bounded(self, inlet):
-        assert not self.heard(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
-        assert not self.heard(inlet, 0, "base_link", "odom", (1.0, 0.0, 0.0))
+        assert not self.poses_of(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
+        assert not self.poses_of(inlet, 0, "base_link", "odom", (1.0, 0.0, 0.0))
         assert any('without a chain from "map" to "base_link"' in why for why in inlet.refused)
         for number in range(1000):
-            self.heard(inlet, 0, "map", f"frame{number}", (0.0, 0.0, 0.0))
+            self.poses_of(inlet, 0, "map", f"frame{number}", (0.0, 0.0, 0.0))
         assert inlet.refused["transforms of too many frames"] > 400
 
     def test_of_two_publishers_of_one_edge_the_first_counts_and_the_other_is_named(self, inlet):
-        def heard(at_ms, x, publisher):
+        def poses_by(at_ms, x, publisher):
             header = msg.Header(msg.stamp_of(WALL_NS + at_ms * MS), "map")
             place = msg.Transform(msg.Vector3(x, 0.0, 0.0), msg.Quaternion(0.0, 0.0, 0.0, 1.0))
             message = msg.TFMessage([msg.TransformStamped(header, "odom", place)])
             return list(inlet.poses(message, 0, WALL_NS + at_ms * MS, static=False, publisher=publisher))
 
         for at_ms in range(0, 500, 50):
-            self.heard(inlet, at_ms, "odom", "base_link", (1.0, 0.0, 0.0))
-            heard(at_ms, 3.0, "slam")
-            assert not heard(at_ms + 10, 9.0, "amcl")
+            self.poses_of(inlet, at_ms, "odom", "base_link", (1.0, 0.0, 0.0))
+            poses_by(at_ms, 3.0, "slam")
+            assert not poses_by(at_ms + 10, 9.0, "amcl")
         assert inlet.refused["transforms of a second publisher of the same edge"] == 10
-        (said,) = inlet.new_messages()
-        assert said.startswith("amcl sends poses while slam does: not used")
+        (warning,) = inlet.new_messages()
+        assert warning.startswith("amcl sends poses while slam does: not used")
 
     def test_a_clock_that_was_set_back_begins_anew(self, inlet):
-        self.heard(inlet, 60_000, "odom", "base_footprint", (1.0, 0.0, 0.0))
-        self.heard(inlet, 60_000, "map", "odom", (1.0, 0.0, 0.0))
-        self.heard(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
-        assert self.heard(inlet, 0, "map", "odom", (3.0, 0.0, 0.0))
+        self.poses_of(inlet, 60_000, "odom", "base_footprint", (1.0, 0.0, 0.0))
+        self.poses_of(inlet, 60_000, "map", "odom", (1.0, 0.0, 0.0))
+        self.poses_of(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
+        assert self.poses_of(inlet, 0, "map", "odom", (3.0, 0.0, 0.0))
 
 
 def test_over_dds_the_bridges_own_odometry_and_a_localisation_make_poses_for_the_daemon(tmp_path):
@@ -390,8 +390,8 @@ def test_over_dds_the_bridges_own_odometry_and_a_localisation_make_poses_for_the
     daemon, bridge, ended = create_pose_source(port=port), Bridge(load_setup(file)), []
     thread = threading.Thread(target=bridge.run, args=(lambda: bool(ended),))
     thread.start()
-    heard, deadline = [], time.monotonic() + 100.0
-    while not heard and time.monotonic() < deadline:
+    received, deadline = [], time.monotonic() + 100.0
+    while not received and time.monotonic() < deadline:
         now_ns = time.time_ns()
         for parent, child, x, ahead_ns in (("odom", "base_link", 2.0, 0), ("map", "odom", 3.0, 200 * MS)):
             place = msg.Transform(
@@ -399,13 +399,13 @@ def test_over_dds_the_bridges_own_odometry_and_a_localisation_make_poses_for_the
             )
             header = msg.Header(msg.stamp_of(now_ns + ahead_ns), parent)
             bridge._publish("/tf", msg.TFMessage([msg.TransformStamped(header, child, place)]))
-        heard = daemon.receive(time.monotonic_ns(), ())
+        received = daemon.receive(time.monotonic_ns(), ())
         time.sleep(0.01)
     ended.append(True)
     thread.join()
     bridge.close()
     daemon.close()
-    assert heard[0].x_m == pytest.approx(5.0)
+    assert received[0].x_m == pytest.approx(5.0)
 
 
 @pytest.mark.parametrize(
@@ -434,9 +434,9 @@ def test_of_two_publishers_on_the_topic_the_first_counts_until_it_is_silent_and_
     assert [passes(40 * k, "publisher a") for k in range(3)] == [True] * 3
     assert [passes(90 + k, "publisher b") for k in range(5)] == [False] * 5
     assert inlet.refused["of a second publisher on the topic"] == 5
-    (said,) = inlet.new_messages()
-    assert said.startswith("publisher b sends poses while publisher a does: not used")
-    assert "is used until it has sent nothing for 2 s" in said
+    (warning,) = inlet.new_messages()
+    assert warning.startswith("publisher b sends poses while publisher a does: not used")
+    assert "is used until it has sent nothing for 2 s" in warning
     assert passes(120, "publisher a")
     assert passes(2200, "publisher b")
     assert inlet.new_messages() == ["poses now come from publisher b; publisher a has sent nothing for 2.1 s"]

@@ -54,8 +54,14 @@ def filled(kind, seed=1):
         elif isinstance(value, list) and value:
             value = [number + 0.5 * i for i in range(len(value))]
         elif isinstance(value, list):
-            held = ELEMENTS.get((kind.__name__, field.name))
-            value = [filled(held, i) for i in (1, 2)] if held else ["a", "bcd"] if field.name == "name" else [1.5, 2.5]
+            element = ELEMENTS.get((kind.__name__, field.name))
+            value = (
+                [filled(element, i) for i in (1, 2)]
+                if element
+                else ["a", "bcd"]
+                if field.name == "name"
+                else [1.5, 2.5]
+            )
         else:
             value = filled(type(value), number)
         setattr(message, field.name, value)

@@ -72,7 +72,7 @@ def test_a_polygon_becomes_a_circle_that_holds_all_of_it():
 
 
 @pytest.mark.parametrize(
-    ("message", "word"),
+    ("message", "expected"),
     [
         (array(obstacle(), frame="odom"), 'in frame "odom", not "map"'),
         (array(obstacle(), frame=""), "in frame"),
@@ -89,17 +89,17 @@ def test_a_polygon_becomes_a_circle_that_holds_all_of_it():
         (msg.String('{"name": "a b", "x_m": 0, "y_m": 0, "radius_m": 1}'), "JSON"),
     ],
 )
-def test_what_is_no_obstacle_is_refused_by_its_reason_and_others_are_still_taken(message, word):
+def test_what_is_no_obstacle_is_refused_by_its_reason_and_others_are_still_taken(message, expected):
     inlet = ObstacleInlet("map")
     assert received(message, inlet) == []
-    assert [word in reason for reason in inlet.refused] == [True]
+    assert [expected in reason for reason in inlet.refused] == [True]
     assert list(inlet.refused.values()) == [1]
     assert len(received(array(obstacle()), inlet)) == 1
 
 
 def test_an_obstacle_without_points_is_none():
-    nowhere = array(msg.ObstacleMsg(radius=1.0), obstacle(number=8))
-    assert [one.name for one in received(nowhere)] == ["ros2.8"]
+    without_points = array(msg.ObstacleMsg(radius=1.0), obstacle(number=8))
+    assert [one.name for one in received(without_points)] == ["ros2.8"]
 
 
 def test_of_too_many_the_first_are_passed_on_and_the_others_counted():
@@ -155,13 +155,13 @@ def test_over_dds_both_types_come_to_the_daemons_source(tmp_path):
     bridge.close()
     daemon.close()
     assert (found["ros2.7"].x_m, found["ros2.7"].vx_m_s, found["cart"].x_m) == (1.25, 0.5, 1.5)
-    said = {one.key: one.value for one in bridge._diagnosis(0, 0)[1].status[1].values if "obstacles" in one.key}
-    assert int(said["obstacles passed on"]) >= 2
-    assert said["obstacles not sent"] == "0"
+    diagnosis = {one.key: one.value for one in bridge._diagnosis(0, 0)[1].status[1].values if "obstacles" in one.key}
+    assert int(diagnosis["obstacles passed on"]) >= 2
+    assert diagnosis["obstacles not sent"] == "0"
 
 
 def test_without_a_port_for_obstacles_none_are_read(tmp_path):
     bridge = Bridge(load_setup(robot_file(tmp_path)))
     assert "obstacles" not in bridge.where
-    assert not any(take == bridge._handle_obstacles for _, take in bridge._readers)
+    assert not any(handler == bridge._handle_obstacles for _, handler in bridge._readers)
     bridge.close()

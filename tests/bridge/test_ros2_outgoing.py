@@ -41,11 +41,11 @@ def estimate(t_s, x, y, yaw, healthy=True):
     return round(t_s * 1e9), records.Estimate(round(t_s * 1e9), x, y, yaw, spread, 0.0, 0.0, 0.0, 0.0, True, healthy)
 
 
-def driven(said):
+def driven(converter):
     """Two wheels that turn differently for five seconds from angles that are not zero."""
     for step in range(251):
         t = 0.02 * step
-        newest = dict(said.messages([wheels(t, 7.0 + 2.0 * t, -3.0 + 3.0 * t, 2.0, 3.0)], OFFSET_NS))
+        newest = dict(converter.messages([wheels(t, 7.0 + 2.0 * t, -3.0 + 3.0 * t, 2.0, 3.0)], OFFSET_NS))
     return newest
 
 
@@ -75,8 +75,8 @@ def test_odometry_follows_the_wheels_from_zero_on_in_base_and_odom_frame():
 
 
 def test_its_covariance_is_one_and_grows_with_the_way():
-    said = outgoing()
-    first = dict(said.messages([wheels(0.0, 7.0, -3.0)], OFFSET_NS))["odom"]
+    converter = outgoing()
+    first = dict(converter.messages([wheels(0.0, 7.0, -3.0)], OFFSET_NS))["odom"]
     last = driven(outgoing())["odom"]
     for matrix in (first.pose.covariance, last.pose.covariance, last.twist.covariance):
         full = np.array(matrix).reshape(6, 6)
@@ -87,24 +87,24 @@ def test_its_covariance_is_one_and_grows_with_the_way():
 
 
 def test_wheels_that_cannot_be_are_not_said():
-    said = outgoing()
-    driven(said)
-    assert list(said.messages([wheels(6.0, math.nan, 0.0)], OFFSET_NS)) == []
-    assert list(said.messages([wheels(4.0, 17.0, 12.0)], OFFSET_NS)) == []
+    converter = outgoing()
+    driven(converter)
+    assert list(converter.messages([wheels(6.0, math.nan, 0.0)], OFFSET_NS)) == []
+    assert list(converter.messages([wheels(4.0, 17.0, 12.0)], OFFSET_NS)) == []
 
 
 def test_wheels_announced_before_their_tick_is_recorded_are_said_once():
-    said = outgoing()
-    first = list(said.messages([wheels(0.0, 7.0, -3.0)], OFFSET_NS))
-    later = list(said.messages([wheels(0.0, 7.0, -3.0), estimate(0.0, 1.0, 0.0, 0.0)], OFFSET_NS))
+    converter = outgoing()
+    first = list(converter.messages([wheels(0.0, 7.0, -3.0)], OFFSET_NS))
+    later = list(converter.messages([wheels(0.0, 7.0, -3.0), estimate(0.0, 1.0, 0.0, 0.0)], OFFSET_NS))
     assert [topic for topic, _ in first] == ["odom", "joint_states", "/tf"]
     assert [topic for topic, _ in later] == ["disco_hw/pose", "/tf"]
 
 
 def test_the_map_is_where_the_estimate_and_the_odometry_agree():
-    said = outgoing()
-    driven(said)
-    newest = list(said.messages([estimate(5.0, 4.0, -1.0, 2.0)], OFFSET_NS))
+    converter = outgoing()
+    driven(converter)
+    newest = list(converter.messages([estimate(5.0, 4.0, -1.0, 2.0)], OFFSET_NS))
     (pose,) = [one for topic, one in newest if topic == "disco_hw/pose"]
     assert (pose.header.frame_id, pose.pose.covariance[1], pose.pose.covariance[35]) == ("map", 0.001, 0.003)
     (transform,) = [one for topic, message in newest if topic == "/tf" for one in message.transforms]
@@ -117,10 +117,10 @@ def test_the_map_is_where_the_estimate_and_the_odometry_agree():
 
 
 def test_who_gives_poses_over_ros_says_where_the_map_is():
-    said = outgoing("ros2")
-    driven(said)
-    assert [topic for topic, _ in said.messages([estimate(5.0, 4.0, -1.0, 2.0)], OFFSET_NS)] == ["disco_hw/pose"]
-    assert list(said.messages([estimate(5.0, 4.0, -1.0, 2.0, healthy=False)], OFFSET_NS)) == []
+    converter = outgoing("ros2")
+    driven(converter)
+    assert [topic for topic, _ in converter.messages([estimate(5.0, 4.0, -1.0, 2.0)], OFFSET_NS)] == ["disco_hw/pose"]
+    assert list(converter.messages([estimate(5.0, 4.0, -1.0, 2.0, healthy=False)], OFFSET_NS)) == []
 
 
 def test_a_plan_is_a_path_in_the_map():
@@ -131,19 +131,19 @@ def test_a_plan_is_a_path_in_the_map():
 
 
 def test_diagnostics_say_how_the_daemon_is_and_when_it_is_silent():
-    said = outgoing()
+    converter = outgoing()
 
-    def levels(heard=True, wrong=""):
-        _, message = said.diagnostics(OFFSET_NS, heard, {"poses": "3"}, wrong)
+    def levels(is_connected=True, wrong=""):
+        _, message = converter.diagnostics(OFFSET_NS, is_connected, {"poses": "3"}, wrong)
         return [one.level for one in message.status], [one.message for one in message.status]
 
-    assert levels(heard=False)[0] == [3, 0]
-    ((topic, text),) = said.messages([(1, records.DaemonState(1, "ARMED", "READY", "armed", True))], OFFSET_NS)
+    assert levels(is_connected=False)[0] == [3, 0]
+    ((topic, text),) = converter.messages([(1, records.DaemonState(1, "ARMED", "READY", "armed", True))], OFFSET_NS)
     assert (topic, text.data) == ("disco_hw/state", "ARMED running: armed")
     assert levels(wrong="poses refused: not finite") == ([0, 1], ["ARMED: armed", "poses refused: not finite"])
-    said.messages([(1, records.DaemonState(1, "FAULT", "ARMED", "e-stop", False, True))], OFFSET_NS)
+    converter.messages([(1, records.DaemonState(1, "FAULT", "ARMED", "e-stop", False, True))], OFFSET_NS)
     assert levels()[0] == [2, 0]
-    assert levels(heard=False)[0] == [3, 0]
+    assert levels(is_connected=False)[0] == [3, 0]
 
 
 @pytest.mark.parametrize(

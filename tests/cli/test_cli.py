@@ -102,11 +102,15 @@ def test_verbs_and_options_are_completed_and_nothing_heavy_is_loaded_for_it():
         "print('heavy', sorted(heavy & set(sys.modules)))"
     )
 
-    def completed(*words: str) -> list[str]:
-        told = {"_DISCO_HW_COMPLETE": "complete_bash", "COMP_WORDS": " ".join(words), "COMP_CWORD": str(len(words) - 1)}
+    def completed(*arguments: str) -> list[str]:
+        completion = {
+            "_DISCO_HW_COMPLETE": "complete_bash",
+            "COMP_WORDS": " ".join(arguments),
+            "COMP_CWORD": str(len(arguments) - 1),
+        }
         command = [sys.executable, "-c", script.replace("cli.main()", "sys.argv = ['disco-hw']; cli.main()")]
         result = subprocess.run(
-            command, capture_output=True, text=True, timeout=60, check=True, env={**os.environ, **told}
+            command, capture_output=True, text=True, timeout=60, check=True, env={**os.environ, **completion}
         )
         return result.stdout.split("\n")
 
@@ -117,19 +121,19 @@ def test_verbs_and_options_are_completed_and_nothing_heavy_is_loaded_for_it():
 
 
 @pytest.mark.parametrize(
-    "words",
+    "arguments",
     ["R", "R --json", "--json R", "R --link can", "--link serial:/dev/ttyUSB0 R --json", "R --link=can:socketcan:can0",
      "--link= R", "R --link --json", "R --link a --link b", "", "R --link", "R more", "R --jso", "R --json=1", "--help",
      "R -x", "R -- --json", "-- R"],
 )  # fmt: skip
-def test_a_stop_that_goes_past_the_library_is_read_as_the_library_reads_it(monkeypatch, words):
-    asked = []
-    monkeypatch.setattr(emergency, "stop_and_report", lambda *given: asked.append(given) or 0)
-    result = CliRunner().invoke(app(), ["estop", *words.split()])
-    plain = plain_stop(["estop", *words.split()])
-    assert plain is None or asked == [plain]
+def test_a_stop_that_goes_past_the_library_is_read_as_the_library_reads_it(monkeypatch, arguments):
+    calls = []
+    monkeypatch.setattr(emergency, "stop_and_report", lambda *given: calls.append(given) or 0)
+    result = CliRunner().invoke(app(), ["estop", *arguments.split()])
+    plain = plain_stop(["estop", *arguments.split()])
+    assert plain is None or calls == [plain]
     # What the library refuses, explains or reads in a way of its own is left to it.
-    assert (plain is None) == (result.exit_code != 0 or not asked or "--" in words.split())
+    assert (plain is None) == (result.exit_code != 0 or not calls or "--" in arguments.split())
 
 
 def test_no_other_verb_is_taken_for_a_stop():

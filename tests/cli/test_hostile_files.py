@@ -79,13 +79,13 @@ def calling():
 def test_the_table_has_every_file_argument_of_every_verb():
     found = set()
 
-    def walk(group_app, words):
+    def walk(group_app, prefix):
         for one in group_app.registered_commands:
-            verb = " ".join([*words, one.name or one.callback.__name__])
+            verb = " ".join([*prefix, one.name or one.callback.__name__])
             hints = typing.get_type_hints(one.callback)
             found.update((verb, name) for name, hint in hints.items() if "Path" in str(hint))
         for group in group_app.registered_groups:
-            walk(group.typer_instance, [*words, group.name])
+            walk(group.typer_instance, [*prefix, group.name])
 
     walk(app(), [])
     assert found == READ | WRITTEN
@@ -96,17 +96,17 @@ def test_the_table_has_every_file_argument_of_every_verb():
 @pytest.mark.parametrize("one", CALLS, ids=lambda one: f"{one.verb} {one.arguments}")
 def test_good_files_get_as_far_as_the_work(tmp_path, calling, one):
     write_good(tmp_path)
-    said = calling(one.argv(tmp_path))
+    outcome = calling(one.argv(tmp_path))
     if one.verb == "experiment gap":
-        assert "needs a circle" in said.errors
+        assert "needs a circle" in outcome.errors
     elif one.verb == "log fence":
         # A log of a drive that does not go round.
-        assert said.code == 2
-        assert "run.mcap" in said.errors
+        assert outcome.code == 2
+        assert "run.mcap" in outcome.errors
     elif one.verb == "replay":
-        assert said.code == 1
+        assert outcome.code == 1
     else:
-        assert said.code in (None, 0), said.errors
+        assert outcome.code in (None, 0), outcome.errors
 
 
 @thinned(
@@ -121,10 +121,10 @@ def test_what_is_no_file_is_refused_in_one_line_that_names_it(tmp_path, calling,
     bad.unlink()
     (KINDS | TOML_KINDS)[kind](bad)
     signal.alarm(STUCK_S)
-    said = calling(one.argv(tmp_path))
-    assert said.code == 2, said
-    assert len(said.errors.strip().splitlines()) == 1, said.errors
-    assert name in said.errors
+    outcome = calling(one.argv(tmp_path))
+    assert outcome.code == 2, outcome
+    assert len(outcome.errors.strip().splitlines()) == 1, outcome.errors
+    assert name in outcome.errors
 
 
 def test_the_good_files_are_of_every_kind_that_a_verb_reads():

@@ -33,9 +33,9 @@ def loaded_by(*arguments):
     """Exit code, the top packages loaded, and what was said, of a command in a process of its own."""
     command = [sys.executable, "-c", COUNT, *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-    said, _, counted = done.stderr.rpartition("CODE ")
+    output, _, counted = done.stderr.rpartition("CODE ")
     code, _, names = counted.partition(" LOADED ")
-    return int(code), set(names.split()), done.stdout + said
+    return int(code), set(names.split()), done.stdout + output
 
 
 @pytest.fixture
@@ -53,8 +53,8 @@ def robot(tmp_path):
 
 @pytest.mark.parametrize("verb", [["ctl", "{robot}", "status"], ["estop", "{robot}"], ["estop", "{robot}", "--json"]])
 def test_a_question_and_a_stop_load_no_large_library(robot, verb):
-    code, loaded, said = loaded_by(*(word.format(robot=robot) for word in verb))
-    assert code == 1, said
+    code, loaded, output = loaded_by(*(argument.format(robot=robot) for argument in verb))
+    assert code == 1, output
     assert not loaded & {*HEAVY, "numpy"}
     # A stop does without the command-line library too.
     assert (verb[0] == "estop") == (not loaded & {"typer", "click"})
@@ -63,11 +63,11 @@ def test_a_question_and_a_stop_load_no_large_library(robot, verb):
 def test_a_daemon_is_asked_whatever_has_become_of_the_task_in_the_file_but_not_with_another_section_wrong(robot):
     text = robot.read_text(encoding="utf-8")
     robot.write_text(text.replace('kind = "circle"', 'kind = "none such"'))
-    code, loaded, said = loaded_by("ctl", robot, "stop")
-    assert (code, "no daemon listens there" in said, "numpy" in loaded) == (1, True, False)
+    code, loaded, output = loaded_by("ctl", robot, "stop")
+    assert (code, "no daemon listens there" in output, "numpy" in loaded) == (1, True, False)
     robot.write_text(text + "rate_hz = 50\n")  # in [daemon]
-    code, _, said = loaded_by("ctl", robot, "stop")
-    assert (code, "rate_hz" in said) == (2, True)
+    code, _, output = loaded_by("ctl", robot, "stop")
+    assert (code, "rate_hz" in output) == (2, True)
 
 
 @thinned(
@@ -89,17 +89,17 @@ def test_a_missing_file_is_refused_before_anything_heavy_is_loaded(robot, tmp_pa
     others = rest.partition("\n[")
     pathless.write_text(f'{text}[task]\nkind = "path"\npath = "none.csv"\nspeed_m_s = 0.2\n[{others[2]}')
     none = tmp_path / "none.mcap"
-    code, loaded, said = loaded_by(*(word.format(robot=robot, none=none, pathless=pathless) for word in verb))
-    assert code == 2, said
-    assert "none" in said
+    code, loaded, output = loaded_by(*(argument.format(robot=robot, none=none, pathless=pathless) for argument in verb))
+    assert code == 2, output
+    assert "none" in output
     assert not loaded & set(HEAVY)
 
 
 def test_a_model_that_is_no_toml_is_refused_before_anything_heavy_is_loaded(robot):
     robot.with_name("wombot_model.toml").write_text("[[[")
-    code, loaded, said = loaded_by("run", robot)
-    assert code == 2, said
-    assert "wombot_model.toml" in said
+    code, loaded, output = loaded_by("run", robot)
+    assert code == 2, output
+    assert "wombot_model.toml" in output
     assert not loaded & set(HEAVY)
 
 

@@ -62,7 +62,7 @@ def test_shipped_robot_file_is_valid():
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "fragments"),
     [
         (("wheel_radius_m = 0.06\n", ""), ["wheel_radius_m", "missing", "add"]),
         (("wheel_radius_m", "weel_radius_m"), ["weel_radius_m", "no such field", "did you mean wheel_radius_m?"]),
@@ -83,14 +83,14 @@ def test_shipped_robot_file_is_valid():
         (("max_wheel_speed_rad_s = 8.0", "max_wheel_speed_rad_s = 2.0"), ["task.speed_m_s", "wheels"]),
     ],
 )
-def test_a_mistake_gets_one_line_with_file_and_field(tmp_path, change, words):
+def test_a_mistake_gets_one_line_with_file_and_field(tmp_path, change, fragments):
     with pytest.raises(InputError) as caught:
         load(tmp_path, GOOD.replace(*change))
     message = str(caught.value)
     assert "\n" not in message
     assert message.startswith(str(tmp_path / "robot.toml"))
-    for word in words:
-        assert word in message
+    for fragment in fragments:
+        assert fragment in message
 
 
 @pytest.mark.parametrize(
@@ -117,17 +117,17 @@ def test_ranges_and_relations_are_checked(tmp_path, extra, field):
 
 
 @pytest.mark.parametrize(
-    ("escape", "words"), [(r"\u0000", "a NUL"), (r"\n", r"control character '\n'"), (r"\u001b", "control")]
+    ("escape", "expected"), [(r"\u0000", "a NUL"), (r"\n", r"control character '\n'"), (r"\u001b", "control")]
 )
 @pytest.mark.parametrize("place", ["log.directory", "daemon.control_socket", "robot.name"])
-def test_no_name_holds_a_control_character(tmp_path, place, escape, words):
+def test_no_name_holds_a_control_character(tmp_path, place, escape, expected):
     section, field = place.split(".")
     text = f'{field} = "/tmp/a{escape}b"'
     text = GOOD.replace('name = "wombot"', text) if section == "robot" else f"{GOOD}[{section}]\n{text}\n"
     with pytest.raises(InputError) as error:
         load(tmp_path, text)
     assert f"robot.toml: {place}: holds " in str(error.value)
-    assert words in str(error.value)
+    assert expected in str(error.value)
     assert "\n" not in str(error.value)
 
 
@@ -191,7 +191,7 @@ def test_a_path_is_named_in_the_task_with_or_without_its_kind(tmp_path, kind):
 
 
 @pytest.mark.parametrize(
-    ("task", "words"),
+    ("task", "message"),
     [
         ('path = "p.csv"\nradius_m = 1.0\n', "radius_m: no such field"),
         ('kind = "circle"\npath = "p.csv"\n', "path: no such field"),
@@ -204,8 +204,8 @@ def test_a_path_is_named_in_the_task_with_or_without_its_kind(tmp_path, kind):
         ('kind = "timed_path"\npath = "p.csv"\ntimes_s = [0.0]\n', "times_s: no such field; write way-points in a CSV"),
     ],
 )
-def test_a_mistake_in_a_path_task_gets_one_line(tmp_path, task, words):
-    with pytest.raises(InputError, match=words) as caught:
+def test_a_mistake_in_a_path_task_gets_one_line(tmp_path, task, message):
+    with pytest.raises(InputError, match=message) as caught:
         load(tmp_path, GOOD + "[task]\n" + task)
     assert "\n" not in str(caught.value)
 

@@ -29,13 +29,13 @@ def pipe():
             continue
 
 
-def held(descriptor):
+def printed_unread(descriptor):
     """A teller, and whether telling it ten sentences ended although nobody reads."""
     teller = AsyncPrinter(descriptor, line_of, most=4)
-    telling = threading.Thread(target=lambda: [teller("event", str(k)) for k in range(10)], daemon=True)
-    telling.start()
-    telling.join(10.0)
-    return teller, not telling.is_alive()
+    printing = threading.Thread(target=lambda: [teller("event", str(k)) for k in range(10)], daemon=True)
+    printing.start()
+    printing.join(10.0)
+    return teller, not printing.is_alive()
 
 
 def test_everything_is_written_in_order_by_the_end(pipe):
@@ -50,16 +50,16 @@ def test_everything_is_written_in_order_by_the_end(pipe):
 def test_a_terminal_that_is_held_by_ctrl_s_holds_nobody_up():
     master, slave = pty.openpty()
     termios.tcflow(slave, termios.TCOOFF)
-    teller, reported = held(slave)
+    teller, reported = printed_unread(slave)
     assert reported
     teller.close(0.1)
     termios.tcflow(slave, termios.TCOON)
     teller.close(10.0)
-    said = b""
+    output = b""
     # A terminal hands on what was written to it piece by piece.
-    while b"messages are missing here" not in said and select.select([master], [], [], 10.0)[0]:
-        said += os.read(master, 65536)
-    lines = said.decode().splitlines()
+    while b"messages are missing here" not in output and select.select([master], [], [], 10.0)[0]:
+        output += os.read(master, 65536)
+    lines = output.decode().splitlines()
     assert lines[0] == "event: 0"
     assert "messages are missing here" in lines[-1]
     os.close(master)
@@ -68,14 +68,14 @@ def test_a_terminal_that_is_held_by_ctrl_s_holds_nobody_up():
 
 def test_a_pipe_that_nobody_reads_holds_nobody_up(pipe):
     os.write(pipe[1], b"x" * fcntl.fcntl(pipe[1], fcntl.F_GETPIPE_SZ))
-    teller, reported = held(pipe[1])
+    teller, reported = printed_unread(pipe[1])
     assert reported
     assert teller.dropped >= 5
 
 
 def test_a_reader_that_has_gone_is_no_error(pipe):
     os.close(pipe[0])
-    teller, reported = held(pipe[1])
+    teller, reported = printed_unread(pipe[1])
     assert reported
     teller.close()
     assert not teller._thread.is_alive()

@@ -66,9 +66,9 @@ def test_a_robot_that_takes_what_it_is_sent(key):
 
 def test_a_key_that_is_not_the_robots_fails():
     found = check._query_robot(RobotInTime(KEY), create_driver(None, None, KEY[::-1]), RobotPoses())
-    heard = check._hearing_check(found)
-    assert heard.level is Level.FAIL
-    assert "link.key_file" in heard.text
+    result = check._hearing_check(found)
+    assert result.level is Level.FAIL
+    assert "link.key_file" in result.text
 
 
 def test_a_fault_that_does_not_latch_fails_with_what_to_do():
@@ -84,23 +84,23 @@ def test_a_fault_that_does_not_latch_fails_with_what_to_do():
 def test_what_else_the_robot_rejects_is_a_warning():
     robot = RobotInTime(b"")
     robot.disturb = Frame(0x101, bytes(8))
-    heard = check._hearing_check(check._query_robot(robot, create_driver(None), RobotPoses()))
-    assert heard.level is Level.WARNING
-    assert "checksum" in heard.text
+    result = check._hearing_check(check._query_robot(robot, create_driver(None), RobotPoses()))
+    assert result.level is Level.WARNING
+    assert "checksum" in result.text
 
 
 class Antenna:
     """Positions without heading from a source that says of itself what it does; none while it is `silent`."""
 
     def __init__(self, silent):
-        self.silent, self._said = silent, ["/dev/ttyACM0: open", "fix quality 0: no fix"]
+        self.silent, self._messages = silent, ["/dev/ttyACM0: open", "fix quality 0: no fix"]
 
     def receive(self, now_ns, from_robot):
         return [] if self.silent else [PoseSample(now_ns, now_ns, 1.0, 2.0, math.nan, 0.02, math.nan)]
 
     def new_messages(self):
-        said, self._said = self._said, []
-        return said
+        messages, self._messages = self._messages, []
+        return messages
 
     def close(self):
         pass

@@ -12,7 +12,7 @@ ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 
 
 @pytest.mark.parametrize(
-    ("action", "changes", "words"),
+    ("action", "changes", "message"),
     [
         ("jump", (), "jump: no such request"),
         ("drive", ("forward=1",), "drive: no such request"),
@@ -24,8 +24,8 @@ ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
         ("task", ("do=1",), "do=1: not a change"),
     ],
 )
-def test_what_is_no_request_is_not_sent(action, changes, words):
-    with pytest.raises(InputError, match=words):
+def test_what_is_no_request_is_not_sent(action, changes, message):
+    with pytest.raises(InputError, match=message):
         ask(ROBOT, action, changes)
 
 

@@ -46,25 +46,25 @@ def test_a_compilation_says_what_it_is_for_how_far_it_is_and_how_long_it_took():
     def outer(x):
         return inner(x) * inner(2.0 * x)
 
-    said = []
-    with compile_progress("the planner for a test", said.append, every_s=0.005):
+    messages = []
+    with compile_progress("the planner for a test", messages.append, every_s=0.005):
         outer(1.0)
-    assert said[0].startswith("compiling the planner for a test: ")
-    assert len(said) > 2
-    assert all(line.startswith("compiling: ") and " functions, " in line for line in said[1:-1])
-    assert said[-1].startswith("compiled 2 functions, ")
+    assert messages[0].startswith("compiling the planner for a test: ")
+    assert len(messages) > 2
+    assert all(line.startswith("compiling: ") and " functions, " in line for line in messages[1:-1])
+    assert messages[-1].startswith("compiled 2 functions, ")
     assert not [thread for thread in threading.enumerate() if thread.name == "compile progress"]
-    before = list(said)
-    with compile_progress("the planner for a test", said.append):
+    before = list(messages)
+    with compile_progress("the planner for a test", messages.append):
         outer(2.0)
-    assert said == before, "what is compiled already needs no words"
+    assert messages == before, "what is compiled already needs no words"
 
 
 def ended(process, by):
     """End a program while another process compiles for it; what came until all who could write had ended."""
     with process:
-        own = process.stdout.readline().split()[0]
-        while process.stdout.readline().split()[0] == own:
+        pid = process.stdout.readline().split()[0]
+        while process.stdout.readline().split()[0] == pid:
             pass
         process.send_signal(by)
         return process.communicate(timeout=60)[0]
@@ -85,17 +85,17 @@ def start(tmp_path):
             return ended(subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True), ended_by)
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=100, check=False)
         assert done.returncode == 0, done.stderr
-        own, *said, result = done.stdout.splitlines()
-        return own, {line.split()[0] for line in said if "compiled 1 functions" in line}, result
+        pid, *lines, result = done.stdout.splitlines()
+        return pid, {line.split()[0] for line in lines if "compiled 1 functions" in line}, result
 
     return run
 
 
 @pytest.mark.thorough
 def test_a_first_start_compiles_in_another_process_and_the_next_one_not_at_all(start):
-    own, compiled_by, result = start(START)
+    pid, compiled_by, result = start(START)
     assert len(compiled_by) == 1
-    assert own not in compiled_by
+    assert pid not in compiled_by
     assert result == "3.0"
     assert start(START)[1:] == (set(), "3.0")
 
@@ -103,8 +103,8 @@ def test_a_first_start_compiles_in_another_process_and_the_next_one_not_at_all(s
 @pytest.mark.thorough
 def test_what_cannot_be_kept_is_compiled_by_the_process_itself(start):
     # A function that is in no file has no place beside it for its kernel.
-    own, compiled_by, result = start(START.replace("from kernel import double", KERNEL))
-    assert (compiled_by, result) == ({own}, "3.0")
+    pid, compiled_by, result = start(START.replace("from kernel import double", KERNEL))
+    assert (compiled_by, result) == ({pid}, "3.0")
 
 
 @thinned("number", [signal.SIGTERM, signal.SIGKILL], quick=1)
@@ -119,25 +119,25 @@ ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 def test_what_a_start_will_need_is_compiled_beforehand_with_words_and_nothing_for_files_that_it_refuses(
     tmp_path, monkeypatch
 ):
-    made, said = [], []
+    made, messages = [], []
 
-    def make(config, model):
+    def create(config, model):
         made.append([effect.name for effect in model.effects])
         njit(lambda x: x + 1.0)(2.0)
 
-    monkeypatch.setattr(run, "create_planner", make)
+    monkeypatch.setattr(run, "create_planner", create)
     monkeypatch.setattr(run, "create_pipeline", lambda *_: None)
     monkeypatch.setattr(run, "warm_up", lambda _: None)
     shipped = load_model(ROBOT.parent / "wombot_model.toml")
     with_deadband = replace(shipped, effects=(EffectSetting("deadband", {"width_rad_s": 0.5}),))
     save_model(with_deadband, tmp_path / "model.toml")
-    compile_beforehand(ROBOT, tmp_path / "model.toml", said.append)
+    compile_beforehand(ROBOT, tmp_path / "model.toml", messages.append)
     # One planner to drive with, and one that is used up in the rehearsal.
     assert made == [["deadband"]] * 2
-    assert said[0].startswith("compiling the planner for this task and a model with deadband")
+    assert messages[0].startswith("compiling the planner for this task and a model with deadband")
     save_model(replace(shipped, missing_effects=("motor_lag",)), tmp_path / "marked.toml")
     for refused in (tmp_path / "marked.toml", tmp_path / "none.toml"):
-        compile_beforehand(ROBOT, refused, said.append)
+        compile_beforehand(ROBOT, refused, messages.append)
     assert len(made) == 2
 
 
@@ -161,9 +161,9 @@ class Result:
     ids=["check", "gap", "infer"],
 )
 def test_check_gap_and_infer_compile_for_the_model_that_they_read_or_wrote(tmp_path, monkeypatch, verb, model):
-    asked = []
+    models = []
     for module, name in ((check, "run_check"), (gap, "gap"), (infer_command, "infer_command")):
         monkeypatch.setattr(module, name, lambda *_: Result())
-    monkeypatch.setattr(run, "compile_beforehand", lambda robot_file, model, say: asked.append(model))
+    monkeypatch.setattr(run, "compile_beforehand", lambda robot_file, model, report: models.append(model))
     verb(tmp_path)
-    assert asked == [model(tmp_path)]
+    assert models == [model(tmp_path)]

@@ -36,7 +36,7 @@ def daemon(tmp_path):
     daemon.close()
 
 
-def raw_server(path, answer):
+def raw_server(path, reply):
     """Whatever else may listen there: takes one request, sends `answer`, hangs up."""
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     listener.bind(str(path))
@@ -46,7 +46,7 @@ def raw_server(path, answer):
         connection, _ = listener.accept()
         with connection, listener:
             connection.recv(4096)
-            connection.sendall(answer)
+            connection.sendall(reply)
 
     thread = threading.Thread(target=serve)
     thread.start()
@@ -116,7 +116,7 @@ def test_a_stranger_that_drips_without_end_is_given_up(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("answer", "words"),
+    ("reply", "message"),
     [
         (b"", "closed the connection"),
         (b"half", "closed the connection"),
@@ -124,10 +124,10 @@ def test_a_stranger_that_drips_without_end_is_given_up(tmp_path):
         (b"5\n", "is not"),
     ],
 )
-def test_a_stranger_on_the_socket_is_reported(tmp_path, answer, words):
+def test_a_stranger_on_the_socket_is_reported(tmp_path, reply, message):
     path = tmp_path / "robot.sock"
-    thread = raw_server(path, answer)
-    with pytest.raises(WorkError, match=words):
+    thread = raw_server(path, reply)
+    with pytest.raises(WorkError, match=message):
         send_request(path, {"do": "status"})
     thread.join()
 

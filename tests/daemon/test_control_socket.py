@@ -159,7 +159,7 @@ def test_estop_passes_a_flood_of_another_client(server):
 
 
 @pytest.mark.parametrize(
-    ("line", "words"),
+    ("line", "message"),
     [
         (b"arm", "not a JSON object"),
         (b"[1, 2]", "not a JSON object"),
@@ -173,14 +173,14 @@ def test_estop_passes_a_flood_of_another_client(server):
         (b'{"do": ["estop"]}', '"do" must be one of'),
     ],
 )
-def test_garbage_gets_one_clear_line_and_is_hung_up_on(server, line, words):
+def test_garbage_gets_one_clear_line_and_is_hung_up_on(server, line, message):
     with connect(server) as client:
         client.sendall(line + b"\n")
         for _ in range(5):
             assert server.poll() == []
         (reply,) = lines_from(client)
         assert reply["ok"] is False
-        assert words in reply["error"]
+        assert message in reply["error"]
         assert hung_up(client)
     assert server.stats.refused == 1
 

@@ -68,7 +68,7 @@ def daemon(tmp_path):
     """Serves a control socket that takes an e-stop; its status, and what it was asked, are attributes."""
 
     class Daemon:
-        status, asked, ending = {"ok": True, "robot_state": "READY", "link": "up"}, [], False
+        status, actions, ending = {"ok": True, "robot_state": "READY", "link": "up"}, [], False
 
     directory = tmp_path / "run"
     directory.mkdir(mode=0o700)
@@ -78,7 +78,7 @@ def daemon(tmp_path):
     def serve():
         while not Daemon.ending:
             for message in server.poll():
-                Daemon.asked.append(message.action)
+                Daemon.actions.append(message.action)
                 server.reply(message, Daemon.status if message.action == "status" else {"ok": True})
             time.sleep(0.002)
 
@@ -100,7 +100,7 @@ def test_a_socket_that_cannot_be_looked_at_does_not_hide_what_became_of_the_link
 def test_a_link_section_that_says_nothing_leaves_the_daemon(tmp_path, daemon):
     daemon.status = {**daemon.status, "robot_state": "ESTOP", "robot_state_ns": time.monotonic_ns() + 10**10}
     outcome = stop_robot(robot_file(tmp_path, daemon.socket, link="interface = 7"))
-    assert daemon.asked[0] == "estop"
+    assert daemon.actions[0] == "estop"
     assert outcome.sent
     assert outcome.confirmed
     assert "interface" in outcome.link_error
@@ -118,8 +118,8 @@ def test_a_misspelt_field_of_the_link_does_not_keep_the_stop_from_it(tmp_path):
 
 def test_a_daemon_that_holds_the_stop_until_its_link_is_up_has_not_sent_it(tmp_path, daemon):
     daemon.status = {**daemon.status, "link": "connecting", "robot_state": "UNKNOWN"}
-    nowhere = {"/tmp/disco-hw-wombot.can": "/nowhere/bus"}
-    outcome = stop_robot(robot_file(tmp_path, daemon.socket, link='interface = "unixcan"', **nowhere))
+    without_bus = {"/tmp/disco-hw-wombot.can": "/nowhere/bus"}
+    outcome = stop_robot(robot_file(tmp_path, daemon.socket, link='interface = "unixcan"', **without_bus))
     assert not outcome.sent
     assert "NOT SENT" in outcome.as_text()
     assert "connecting" in outcome.as_text()
@@ -161,11 +161,11 @@ def test_a_state_on_the_serial_line_from_before_the_request_confirms_nothing(tmp
         frames_on(robot_end)
         monkeypatch.setattr(emergency, "_CONFIRM_S", 30.0)
 
-        def answer():
+        def reply():
             frames_on(robot_end, settle_s=0.0)
             os.write(robot_end, encode_frame(frame_id, data))
 
-        answering = threading.Thread(target=answer)
+        answering = threading.Thread(target=reply)
         answering.start()
         assert stop_robot(robot, "serial").confirmed
         answering.join()
@@ -194,11 +194,11 @@ def test_without_a_file_that_can_be_read_the_option_says_where_the_link_is(tmp_p
     other = can.Bus(interface="virtual", channel=str(tmp_path))
     try:
         outcome = stop_robot(path, f"can:virtual:{tmp_path}")
-        heard = other.recv(30.0)
+        received = other.recv(30.0)
     finally:
         other.shutdown()
-    assert heard is not None
-    assert Codec().decode(heard.arbitration_id, bytes(heard.data)).name == "ESTOP"
+    assert received is not None
+    assert Codec().decode(received.arbitration_id, bytes(received.data)).name == "ESTOP"
     assert (outcome.link, outcome.link_error) == (f"virtual {tmp_path}", None)
     assert str(path) in outcome.file_error
     assert f"{path}: " in outcome.as_text()
@@ -225,12 +225,12 @@ def test_a_line_of_one_request_at_a_time_is_left_to_a_daemon_that_lives_and_take
     ours, theirs = pty.openpty()
     tty.setraw(theirs)
     driver = find_driver(name)
-    own = driver.example + (f"uart_node = {UART_NODE}\n" if driver.serial_field else "")
-    link = f'interface = "virtual"\ndriver = "{name}"\n{own}'
+    settings = driver.example + (f"uart_node = {UART_NODE}\n" if driver.serial_field else "")
+    link = f'interface = "virtual"\ndriver = "{name}"\n{settings}'
     serial = {'kind = "can"': 'kind = "serial"', "/tmp/disco-hw-wombot.tty": os.ttyname(theirs)}
     try:
         outcome = stop_robot(robot_file(tmp_path, daemon.socket, link=link, **serial))
-        assert (daemon.asked[0], outcome.sent) == ("estop", True)
+        assert (daemon.actions[0], outcome.sent) == ("estop", True)
         assert "left to the daemon" in outcome.link_error
         assert not select.select([ours], [], [], 0.0)[0], "nobody else speaks on the line"
         outcome = stop_robot(robot_file(tmp_path, tmp_path / "none", link=link, **serial))
@@ -247,10 +247,10 @@ def test_a_link_option_that_says_nothing_is_refused_with_what_to_write(tmp_path,
         stop_robot(robot_file(tmp_path, tmp_path / "none"), option)
 
 
-@pytest.mark.parametrize(("latches", "word"), [(True, "stays latched"), (False, "does not latch the stop")])
-def test_what_is_said_of_a_confirmed_stop_is_what_the_controller_does(latches, word):
+@pytest.mark.parametrize(("latches", "expected"), [(True, "stays latched"), (False, "does not latch the stop")])
+def test_what_is_said_of_a_confirmed_stop_is_what_the_controller_does(latches, expected):
     outcome = emergency.EstopOutcome("can0", None, "not running", confirmed=True, latches=latches)
-    assert word in outcome.as_text()
+    assert expected in outcome.as_text()
 
 
 @pytest.mark.parametrize("confirmed", [True, False])

@@ -21,7 +21,7 @@ max_wheel_speed_rad_s = 8.0
 
 
 @pytest.mark.parametrize(
-    ("section", "words"),
+    ("section", "message"),
     [
         ('interface = "sockercan"', 'link.interface: python-can has no interface "sockercan"; write one of '),
         ('interface = "socketcand"', "link.options: socketcand needs host and port; write options = { host = "),
@@ -33,20 +33,20 @@ max_wheel_speed_rad_s = 8.0
     ],
 )
 @pytest.mark.parametrize("verb", [run_check, lambda robot: run_daemon(DaemonOptions(robot))], ids=["check", "run"])
-def test_what_no_device_could_satisfy_is_refused_before_anything_is_opened(tmp_path, section, words, verb):
+def test_what_no_device_could_satisfy_is_refused_before_anything_is_opened(tmp_path, section, message, verb):
     robot = tmp_path / "robot.toml"
     robot.write_text(ROBOT + section)
     with pytest.raises(InputError) as caught:
         verb(robot)
-    assert str(caught.value).startswith(f"{robot}: {words}")
+    assert str(caught.value).startswith(f"{robot}: {message}")
     assert "\n" not in str(caught.value)
 
 
 def test_what_robot_toml_says_of_the_link_reaches_it(tmp_path, monkeypatch):
-    asked = {}
-    monkeypatch.setattr(assembly, "create_transport", lambda kind, **settings: asked.update(settings))
+    requested = {}
+    monkeypatch.setattr(assembly, "create_transport", lambda kind, **settings: requested.update(settings))
     robot = tmp_path / "robot.toml"
     robot.write_text(ROBOT + 'options = { host = "10.0.0.1", port = 29536 }\ndtr = true\nrts = true\n')
     assembly.create_link(load_setup(robot))
-    assert asked["options"] == {"host": "10.0.0.1", "port": 29536}
-    assert (asked["dtr"], asked["rts"]) == (True, True)
+    assert requested["options"] == {"host": "10.0.0.1", "port": 29536}
+    assert (requested["dtr"], requested["rts"]) == (True, True)

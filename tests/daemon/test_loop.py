@@ -12,8 +12,8 @@ MS_NS = 1_000_000
 class Run:
     """A loop at 50 Hz on a simulated clock whose ticks last as long as given, then nothing."""
 
-    def __init__(self, durations_ns, wake_late_ns=()):
-        self.clock = LateClock(wake_late_ns)
+    def __init__(self, durations_ns, wake_delays_ns=()):
+        self.clock = DelayedClock(wake_delays_ns)
         self.loop = Loop(self.clock, 50.0)
         self.durations_ns = list(durations_ns)
         self.starts_ns = []
@@ -26,17 +26,17 @@ class Run:
         self.clock.advance_ns(self.durations_ns.pop(0))
 
 
-class LateClock(SimulatedClock):
+class DelayedClock(SimulatedClock):
     """Wakes up late by the given times, then on time."""
 
-    def __init__(self, wake_late_ns):
+    def __init__(self, wake_delays_ns):
         super().__init__()
-        self.wake_late_ns = list(wake_late_ns)
+        self.wake_delays_ns = list(wake_delays_ns)
 
     def sleep_until_ns(self, deadline_ns):
         super().sleep_until_ns(deadline_ns)
-        if self.wake_late_ns:
-            self.advance_ns(self.wake_late_ns.pop(0))
+        if self.wake_delays_ns:
+            self.advance_ns(self.wake_delays_ns.pop(0))
 
 
 def test_ticks_lie_on_the_grid_whatever_they_take():
@@ -80,8 +80,8 @@ def test_a_stopped_process_skips_and_counts():
     st.lists(st.integers(0, 5 * PERIOD_NS) | st.integers(0, PERIOD_NS // 10), min_size=1, max_size=60),
     st.lists(st.integers(0, 3 * PERIOD_NS) | st.just(0), max_size=60),
 )
-def test_whatever_is_late_there_is_no_burst_and_every_period_is_accounted_for(durations_ns, wake_late_ns):
-    run = Run(durations_ns, wake_late_ns)
+def test_whatever_is_late_there_is_no_burst_and_every_period_is_accounted_for(durations_ns, wake_delays_ns):
+    run = Run(durations_ns, wake_delays_ns)
     gaps_ns = [after - before for before, after in zip(run.starts_ns, run.starts_ns[1:], strict=False)]
     assert all(gap_ns >= PERIOD_NS // 2 for gap_ns in gaps_ns)
     # The last tick that started served the deadline number ticks - 1 + skipped, less what was skipped after it.

@@ -25,7 +25,7 @@ NOBODY = 65534
 SHIPPED = (Path(disco_hw.__file__).parent / "robots" / "wombot.toml").read_text(encoding="utf-8")
 needs_root = pytest.mark.skipif(ME != 0, reason="needs root to act as a second user")
 
-ANSWER = b'{"ok": true, "text": "the stranger says", "robot_state": "ESTOP", "robot_state_ns": 9e18, "link": "up"}\n'
+REPLY = b'{"ok": true, "text": "the stranger says", "robot_state": "ESTOP", "robot_state_ns": 9e18, "link": "up"}\n'
 
 # The interpreter may lie where other users cannot read, so the command runs once before for what it imports.
 AS_USER = """
@@ -89,7 +89,7 @@ def serve_as_a_daemon(path):
         while True:
             connection, _ = listener.accept()
             connection.recv(4096)
-            connection.sendall(ANSWER)
+            connection.sendall(REPLY)
             connection.close()
 
     return act
@@ -124,18 +124,18 @@ def test_the_place_is_the_runtime_directory_of_this_user(tmp_path, monkeypatch, 
 
 
 def test_a_place_that_is_not_believed_is_passed_over_by_both_sides_and_its_going_changes_nothing(temporary):
-    taken = temporary / f"disco-hw-{ME}"
-    taken.mkdir()
-    taken.chmod(0o777)
+    occupied = temporary / f"disco-hw-{ME}"
+    occupied.mkdir()
+    occupied.chmod(0o777)
     path = default_socket_path("wombot")
     assert path.parent == temporary / f"disco-hw-{ME}-2"
     server = ControlServer(path, ["status"])
     try:
         (line,) = passed_over(default_socket_path("wombot"))
-        assert line.startswith(f"{taken}: others can write to it")
-        taken.rmdir()
+        assert line.startswith(f"{occupied}: others can write to it")
+        occupied.rmdir()
         assert default_socket_path("wombot") == path
-        taken.touch()
+        occupied.touch()
         assert default_socket_path("wombot") == path
     finally:
         server.close()
@@ -170,8 +170,8 @@ def test_a_listener_of_another_user_is_not_believed(tmp_path, monkeypatch):
 
 @needs_root
 def test_what_another_user_made_first_is_passed_over_and_named(temporary, tmp_path, capsys):
-    taken = temporary / f"disco-hw-{ME}"
-    with as_nobody(serve_as_a_daemon(taken / "wombot.sock")):
+    occupied = temporary / f"disco-hw-{ME}"
+    with as_nobody(serve_as_a_daemon(occupied / "wombot.sock")):
         robot = robot_file(tmp_path)
         server = ControlServer(default_socket_path("wombot"), ["disarm"])
         ending = threading.Event()
@@ -189,7 +189,7 @@ def test_what_another_user_made_first_is_passed_over_and_named(temporary, tmp_pa
             ending.set()
             thread.join()
             server.close()
-        assert capsys.readouterr().err == f"disco-hw: {taken}: belongs to nobody (65534); not used\n"
+        assert capsys.readouterr().err == f"disco-hw: {occupied}: belongs to nobody (65534); not used\n"
 
 
 @needs_root
@@ -200,12 +200,12 @@ def test_what_another_user_made_first_is_passed_over_and_named(temporary, tmp_pa
 def test_a_false_daemon_confirms_no_estop(tmp_path):
     # The real command against the real /tmp, under the name of a user whom this machine lacks, another in each run.
     uid = 200_000_000 + os.getpid()
-    taken = Path(f"/tmp/disco-hw-{uid}")
+    occupied = Path(f"/tmp/disco-hw-{uid}")
     home = Path(tempfile.mkdtemp(prefix="estop", dir="/tmp"))
     home.chmod(0o755)
     try:
         robot = robot_file(home)
-        with as_nobody(serve_as_a_daemon(taken / "wombot.sock")):
+        with as_nobody(serve_as_a_daemon(occupied / "wombot.sock")):
             for verb in (["estop", robot], ["ctl", robot, "disarm"], ["ctl", robot, "status"]):
                 script = AS_USER.format(uid=uid)
                 environment = {**os.environ, "HOME": str(home), "PYTHONDONTWRITEBYTECODE": "1"}
@@ -216,13 +216,13 @@ def test_a_false_daemon_confirms_no_estop(tmp_path):
                 )  # fmt: skip
                 output = done.stdout + done.stderr
                 assert done.returncode == 1, output
-                assert f"{taken}: belongs to nobody (65534)" in output
+                assert f"{occupied}: belongs to nobody (65534)" in output
                 assert "reports ESTOP" not in output
                 assert "the stranger says" not in output
                 assert "Traceback" not in output
     finally:
         shutil.rmtree(home)
-        shutil.rmtree(taken)
+        shutil.rmtree(occupied)
 
 
 @needs_root

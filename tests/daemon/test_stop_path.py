@@ -38,13 +38,13 @@ def test_every_step_runs_once_whatever_the_others_raise(errors):
 
 
 @pytest.mark.parametrize(
-    ("error", "words"), [(OSError(5, "unplugged"), "OSError: [Errno 5] unplugged"), (SystemExit(3), "SystemExit: 3")]
+    ("error", "expected"), [(OSError(5, "unplugged"), "OSError: [Errno 5] unplugged"), (SystemExit(3), "SystemExit: 3")]
 )
-def test_a_failure_is_reported_in_words(error, words):
+def test_a_failure_is_reported_in_words(error, expected):
     path = StopPath()
     path.add("wheels", lambda: sys.exit(3) if isinstance(error, SystemExit) else (_ for _ in ()).throw(error))
     (outcome,) = path.run()
-    assert outcome == StepOutcome("wheels", words)
+    assert outcome == StepOutcome("wheels", expected)
     assert not outcome.ok
 
 

@@ -130,7 +130,7 @@ def test_the_unit_restarts_watches_stops_and_does_not_arm():
     ):
         assert expected in unit
     commands = [value for key, value in unit if key.startswith("Exec")]
-    assert not any(word in command for command in commands for word in (" arm", " ctl ", " start"))
+    assert not any(verb in command for command in commands for verb in (" arm", " ctl ", " start"))
 
 
 def test_the_unit_leaves_a_stranger_little_to_take_over(tmp_path):

@@ -74,11 +74,11 @@ def leaves_as_open(refused):
 
 
 @pytest.mark.parametrize("read", [open_file, read_bytes, lambda path, kind: list(read_lines(path, kind)), read_toml])
-@pytest.mark.parametrize(("make", "words"), NO_FILES.values(), ids=NO_FILES)
-def test_what_is_no_plain_file_of_its_size_is_refused(tmp_path, make, words, read):
+@pytest.mark.parametrize(("create", "message"), NO_FILES.values(), ids=NO_FILES)
+def test_what_is_no_plain_file_of_its_size_is_refused(tmp_path, create, message, read):
     path = tmp_path / "robot.toml"
-    make(path)
-    with pytest.raises(InputError, match=words) as refused:
+    create(path)
+    with pytest.raises(InputError, match=message) as refused:
         read(path, ROBOT_TOML)
     assert "\n" not in str(refused.value)
     assert str(refused.value).startswith(f"{path}: ")
@@ -134,9 +134,9 @@ HOSTILE = {
 }
 
 
-@pytest.mark.parametrize(("text", "words"), HOSTILE.values(), ids=HOSTILE)
-def test_what_would_keep_a_parser_busy_is_refused_with_its_line(text, words):
-    with pytest.raises(InputError, match=words) as refused:
+@pytest.mark.parametrize(("text", "message"), HOSTILE.values(), ids=HOSTILE)
+def test_what_would_keep_a_parser_busy_is_refused_with_its_line(text, message):
+    with pytest.raises(InputError, match=message) as refused:
         parse_toml(text.encode(), "robot.toml")
     assert "\n" not in str(refused.value)
 
@@ -179,24 +179,24 @@ def _written(value: object) -> str:
 def test_any_file_of_a_sensible_shape_is_read_as_the_parser_reads_it(table):
     text = "".join(f"{key} = {_written(value)}\n" for key, value in table.items())
     try:
-        wanted = tomllib.loads(text)
+        expected = tomllib.loads(text)
     except ValueError:
         return
-    assert parse_toml(text.encode(), "x") == wanted
+    assert parse_toml(text.encode(), "x") == expected
 
 
 @given(st.text(alphabet="\"'\\#[]{}=.,a1_- \n", max_size=200))
 def test_any_text_is_read_or_refused_in_one_line(text):
-    words = ""
+    message = ""
     try:
         parse_toml(text.encode(), "x")
     except InputError as error:
-        words = str(error)
-    assert "\n" not in words
+        message = str(error)
+    assert "\n" not in message
 
 
 # Files that no user names: of the package, of the kernel, of this program's own processes, or written and not read.
-OWN = {
+ALLOWED_CALLS = {
     "disco_hw/files/__init__.py": {"os.open", "tomllib.loads"},
     "disco_hw/daemon/control_socket.py": {"os.open"},
     "disco_hw/processes/__init__.py": {"read_text"},
@@ -260,7 +260,11 @@ def test_nothing_else_reads_the_files_of_users():
         for package in ("disco_hw", "drivers", "sim")
         for path in sorted((ROOT / package).rglob("*.py"))
     }
-    assert {name: calls - OWN.get(name, set()) for name, calls in found.items() if calls - OWN.get(name, set())} == {}
+    assert {
+        name: calls - ALLOWED_CALLS.get(name, set())
+        for name, calls in found.items()
+        if calls - ALLOWED_CALLS.get(name, set())
+    } == {}
 
 
 @pytest.mark.parametrize(

@@ -46,25 +46,25 @@ def test_there_are_such_fields():
 @pytest.mark.parametrize("wrong", ['"usb"', "7", "[]"])
 @pytest.mark.parametrize(("section", "field", "values"), [*fields_with_choices(RobotConfig), DRIVERS])
 def test_every_choice_of_robot_toml_is_listed(tmp_path, section, field, values, wrong):
-    said = refusal(load_robot_config, tmp_path / "robot.toml", GOOD + f"[{section}]\n{field} = {wrong}\n")
-    assert f"{section}.{field}: " in said
-    assert all(str(value) in said.partition("; ")[2] for value in values)
+    message = refusal(load_robot_config, tmp_path / "robot.toml", GOOD + f"[{section}]\n{field} = {wrong}\n")
+    assert f"{section}.{field}: " in message
+    assert all(str(value) in message.partition("; ")[2] for value in values)
 
 
 def test_the_kinds_of_task_and_belief_are_listed(tmp_path):
-    said = refusal(load_robot_config, tmp_path / "robot.toml", GOOD + '[task]\nkind = "square"\n')
-    assert "task.kind: 'square' is not a kind of task; write one of circle, " in said
-    said = refusal(load_model, tmp_path / "model.toml", MODEL + '[belief]\nkind = "cauchy"\nnames = []\n')
-    assert "belief.kind: invalid value 'cauchy'; write one of gaussian, mixture, uniform" in said
-    said = refusal(load_model, tmp_path / "model.toml", MODEL + "[belief]\nnames = []\n")
-    assert "[belief] kind: missing; add it: one of gaussian, mixture, uniform" in said
+    message = refusal(load_robot_config, tmp_path / "robot.toml", GOOD + '[task]\nkind = "square"\n')
+    assert "task.kind: 'square' is not a kind of task; write one of circle, " in message
+    message = refusal(load_model, tmp_path / "model.toml", MODEL + '[belief]\nkind = "cauchy"\nnames = []\n')
+    assert "belief.kind: invalid value 'cauchy'; write one of gaussian, mixture, uniform" in message
+    message = refusal(load_model, tmp_path / "model.toml", MODEL + "[belief]\nnames = []\n")
+    assert "[belief] kind: missing; add it: one of gaussian, mixture, uniform" in message
     assert "format: invalid enum value 2; write 1" in refusal(
         load_model, tmp_path / "model.toml", MODEL.replace("1", "2")
     )
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "expected"),
     [
         (
             GOOD.replace("wheel_radius_m", "weel_radius"),
@@ -76,18 +76,18 @@ def test_the_kinds_of_task_and_belief_are_listed(tmp_path):
         (GOOD + "[control]\nzzz = 1.0\n", "[control] zzz: no such field; check the spelling or remove it"),
     ],
 )
-def test_a_misspelt_name_gets_the_nearest(tmp_path, text, words):
-    assert words in refusal(load_robot_config, tmp_path / "robot.toml", text)
+def test_a_misspelt_name_gets_the_nearest(tmp_path, text, expected):
+    assert expected in refusal(load_robot_config, tmp_path / "robot.toml", text)
 
 
 def test_a_misspelt_name_of_a_model_gets_the_nearest(tmp_path):
-    said = refusal(load_model, tmp_path / "model.toml", MODEL.replace("axial_distance_m", "axle_distance_m"))
-    assert "did you mean axial_distance_m?" in said
-    said = refusal(load_model, tmp_path / "model.toml", MODEL + '[[effects]]\nname = "motor_lagg"\ntau_s = 0.1\n')
-    assert "did you mean motor_lag?" in said
+    message = refusal(load_model, tmp_path / "model.toml", MODEL.replace("axial_distance_m", "axle_distance_m"))
+    assert "did you mean axial_distance_m?" in message
+    message = refusal(load_model, tmp_path / "model.toml", MODEL + '[[effects]]\nname = "motor_lagg"\ntau_s = 0.1\n')
+    assert "did you mean motor_lag?" in message
     assert nearest("zzz", ["abc"]) is None
 
 
 def test_values_in_lists_have_their_place(tmp_path):
-    said = refusal(load_model, tmp_path / "model.toml", MODEL + '[belief]\nkind = "gaussian"\nnames = [1]\n')
-    assert "belief.names[0]: expected `str`, got `int`; correct the value" in said
+    message = refusal(load_model, tmp_path / "model.toml", MODEL + '[belief]\nkind = "gaussian"\nnames = [1]\n')
+    assert "belief.names[0]: expected `str`, got `int`; correct the value" in message
