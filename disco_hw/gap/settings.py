@@ -309,8 +309,6 @@ class ReportSettings:
     """Growth of the wheels' speed from which on they speed up or brake. Chosen."""
     most_regimes: int = 3
     """At most so many are listed, the loudest. Chosen."""
-    largest_ratio: float = 9.9
-    """Ratios of strength beyond are not distinguished. Chosen."""
     end_share: float = 0.01
     """A value this close to where its fit had to end, in its range, is not believed. Chosen."""
     wide_share: float = 0.5
@@ -328,8 +326,6 @@ class ReportSettings:
     lacks, where it still disagrees, is disputed. Chosen."""
     differ_share: float = 0.03
     """Logs of one robot differ in its geometry by so much of it at least. Chosen: another floor changes more."""
-    lever_m: float = 0.2
-    """Lever by which yaw rates are compared with speeds. Chosen."""
 
 
 @dataclass(frozen=True, slots=True)
