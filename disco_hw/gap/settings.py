@@ -314,7 +314,7 @@ class ReportSettings:
     wide_share: float = 0.5
     """A value whose half interval, or whose change from one regime to its opposite, is over so much of its distance
     from none says too little. Chosen: nobody who is told the value expects it."""
-    limit_share: float = 0.8
+    limit_share: float = 0.75
     """So near a limit it shows: where this share of what the robot can do is asked, and where an interval is no wider
     than from it to there. Chosen."""
     beyond_s: float = 0.5
