@@ -269,6 +269,8 @@ class PredictionSettings:
     """
     pose_reach_s: float = 0.3
     """A start pose is averaged over so long either side. Chosen."""
+    fixed_sigmas: float = 5.0
+    """A value that the other folds fix to so many standard deviations is used, however few its data. Chosen."""
     resamples: int = 400
     """Bootstrap draws of an interval. Chosen."""
     rough_geometry: float = 0.1
