@@ -1,12 +1,15 @@
-"""What each threshold of the search for missing effects is good for: halved and doubled, one at a time.
+"""What each threshold and rule of the search for missing effects is good for, one at a time.
 
-    python -m tools.gap_ablation [GROUP.NAME ...] [--logs N] [--jobs N] -o out/gap_ablation
+    python -m tools.gap_ablation [GROUP.NAME ...] [--rules] [--logs N] [--jobs N] -o out/gap_ablation
 
 Each log of a small tuning set is searched with the usual settings, and with each threshold at half and at double.
 Seeds of the tuning set are 31 on; of the validation set, which no choice looks at, 131 on (`--validate`, usual
 settings). A run of the same code that was broken off goes on from `gap_ablation.json`. The table `gap_ablation.md` has
 names right, error of the amended model over that of `timed`, intervals that hold the truth, CPU, and how many logs are
 answered otherwise in any way. A threshold whose half and double change nothing is none.
+
+With `--rules` each log is searched once while it is counted how often each rule of `tools.gap_rules` answers otherwise
+than nothing would, and once more without each rule that did. Where none does, the answer is the same without it.
 """
 
 from __future__ import annotations
@@ -26,6 +29,7 @@ from tools.gap_jobs import Job, Result, jobs, work  # first: it sets the threads
 import numpy as np
 
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
+from tools.gap_rules import RULES, counting, without
 from tools.gap_study import revision
 
 TUNING, VALIDATION = 31, 131
@@ -106,6 +110,33 @@ def searched(todo: Sequence[tuple[Variant, Job]], processes: int) -> Iterator[tu
         yield from pool.imap_unordered(search, todo)
 
 
+def search_rules(job: Job) -> tuple[str, dict[str, dict[str, Any]], dict[str, list[int]]]:
+    """What is found in a log, usually and without each rule that decides anything there, and how often each does."""
+    with counting() as counts:
+        found = {USUAL: asdict(work(job))}
+    for name in (name for name, (_, otherwise) in counts.items() if otherwise):
+        with without(name):
+            found[name] = asdict(work(job))
+    return job.key, found, counts
+
+
+def rule_table(by_log: Mapping[str, tuple[Mapping[str, dict[str, Any]], Mapping[str, Sequence[int]]]]) -> Iterator[str]:
+    """One line for each rule: in how many logs it decides anything, and what is found in these without it."""
+    yield "| rule | decides in | names right without it | as usual | amended over timed | as usual | differ |"
+    yield "|---|---|---|---|---|---|---|"
+    for rule in RULES:
+        logs = [log for log, (_, counts) in by_log.items() if counts[rule.name][1]]
+        if not logs:
+            yield f"| {rule.name} | 0 of {len(by_log)} | | | | | |"
+            continue
+        usual, own = ({log: by_log[log][0][name] for log in logs} for name in (USUAL, rule.name))
+        differ = sum(_answer(own[log]) != _answer(usual[log]) for log in logs)
+        yield (
+            f"| {rule.name} | {len(logs)} of {len(by_log)} | {_right(own)} | {_right(usual)} | {_ratio(own):.3f} | "
+            f"{_ratio(usual):.3f} | {differ} |"
+        )
+
+
 def table(found: Mapping[str, Mapping[str, dict[str, Any]]]) -> Iterator[str]:
     """One line for each variant, over the logs that it was searched with, and the usual settings on the same logs."""
     columns = ("threshold", "logs", "names right", "as usual", "amended over timed", "as usual", "intervals hold")
@@ -146,6 +177,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--validate", action="store_true", help="the usual settings on the validation set, nothing else"
     )
+    parser.add_argument("--rules", action="store_true", help="rules switched off, in place of thresholds")
     parser.add_argument("-o", "--out", type=Path, default=Path("out/gap_ablation"), help="directory to write to")
     options = parser.parse_args(arguments)
     chosen = [name for name in thresholds() if not options.names or name.startswith(tuple(options.names))]
@@ -158,6 +190,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         variants += [Variant(name, times) for name in chosen for times in (0.5, 2.0)]
     folder = options.out / revision()
     folder.mkdir(parents=True, exist_ok=True)
+    if options.rules:
+        return _rules(folder, logs(VALIDATION if options.validate else TUNING)[: options.logs])
     results = folder / ("gap_validation.json" if options.validate else "gap_ablation.json")
     found: dict[str, dict[str, Any]] = json.loads(results.read_text(encoding="utf-8")) if results.exists() else {}
     todo = [
@@ -173,6 +207,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         unfinished.replace(results)
         print(f"{count} of {len(todo)}: {key}: {log}", file=sys.stderr, flush=True)
     lines = [*table(found)] if USUAL in found else []
+    results.with_suffix(".md").write_text("\n".join([*lines, ""]), encoding="utf-8")
+    print("\n".join(lines))
+    return 0
+
+
+def _rules(folder: Path, chosen: Sequence[Job]) -> int:
+    """Search with and without rules, log by log; write and print the table."""
+    results = folder / "gap_rules.json"
+    by_log = json.loads(results.read_text(encoding="utf-8")) if results.exists() else {}
+    for count, job in enumerate(chosen, 1):
+        if job.key not in by_log:
+            key, found, counts = search_rules(job)
+            by_log[key] = found, counts
+            results.write_text(json.dumps(by_log), encoding="utf-8")
+        print(f"{count} of {len(chosen)}: {job.key}", file=sys.stderr, flush=True)
+    lines = [*rule_table(by_log)]
     results.with_suffix(".md").write_text("\n".join([*lines, ""]), encoding="utf-8")
     print("\n".join(lines))
     return 0

@@ -269,6 +269,8 @@ class PredictionSettings:
     """
     pose_reach_s: float = 0.3
     """A start pose is averaged over so long either side. Chosen."""
+    fixed_sigmas: float = 5.0
+    """A value that the other folds fix to so many standard deviations is used, however few its data. Chosen."""
     resamples: int = 400
     """Bootstrap draws of an interval. Chosen."""
     rough_geometry: float = 0.1
@@ -309,14 +311,12 @@ class ReportSettings:
     """Growth of the wheels' speed from which on they speed up or brake. Chosen."""
     most_regimes: int = 3
     """At most so many are listed, the loudest. Chosen."""
-    largest_ratio: float = 9.9
-    """Ratios of strength beyond are not distinguished. Chosen."""
     end_share: float = 0.01
     """A value this close to where its fit had to end, in its range, is not believed. Chosen."""
     wide_share: float = 0.5
     """A value whose half interval, or whose change from one regime to its opposite, is over so much of its distance
     from none says too little. Chosen: nobody who is told the value expects it."""
-    limit_share: float = 0.8
+    limit_share: float = 0.75
     """So near a limit it shows: where this share of what the robot can do is asked, and where an interval is no wider
     than from it to there. Chosen."""
     beyond_s: float = 0.5
@@ -328,8 +328,6 @@ class ReportSettings:
     lacks, where it still disagrees, is disputed. Chosen."""
     differ_share: float = 0.03
     """Logs of one robot differ in its geometry by so much of it at least. Chosen: another floor changes more."""
-    lever_m: float = 0.2
-    """Lever by which yaw rates are compared with speeds. Chosen."""
 
 
 @dataclass(frozen=True, slots=True)

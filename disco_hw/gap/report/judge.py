@@ -25,7 +25,6 @@ from disco_hw.gap.report.misspecification import (
     Regime,
     describe,
     disputed_names,
-    misspecified_effects,
     regimes,
     remaining_disagreements,
 )
@@ -153,7 +152,7 @@ def residue_sentences(analysis: GapAnalysis) -> tuple[str, ...]:
     ]
     for found in (analysis.wheels, analysis.body):
         if found is not None:
-            out += [*remaining_disagreements(found), *misspecified_effects(found)]
+            out += remaining_disagreements(found)
     return tuple(out)
 
 

@@ -2,8 +2,7 @@
 
 An effect of the right family and the wrong form leaves a residue. The accepted set is compared with the richest model
 of its channel, from which the noise was estimated. If that gains far more than its many parameters explain, in several
-blocks of time, something is left. A named effect of the body must be as strong where little of it acts as where much
-acts: otherwise a slip that saturates would pass for one that grows without limit.
+blocks of time, something is left.
 
 A name is disputed if it explains little of what is missing, or if its value changes with the regime (parameter
 constancy; Hansen, 1992).
@@ -19,97 +18,17 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.effects.registry import REGISTRY
-from disco_hw.gap.data import BODY
 from disco_hw.gap.data.gridded_drive import GriddedDrive, GridSamples
 from disco_hw.gap.noise import largest_command_jitter_s
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.search.channel_result import ChannelResult
-from disco_hw.gap.search.least_squares import Fit, fit, inverse
-from disco_hw.gap.search.richest_model import CANDIDATES, DELAY_NAMES, indices
-from disco_hw.gap.search.selection import Z95, Split, inflation
-from disco_hw.gap.search.unnamed_terms import Term, WithTerms
+from disco_hw.gap.search.least_squares import Fit, inverse
+from disco_hw.gap.search.richest_model import CANDIDATES, DELAY_NAMES
 from disco_hw.gap.settings import GRID_STEP_S, GapSettings
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Index = NDArray[np.int64]
-
-_UNITS = ("m/s ahead", "m/s to the side", "rad/s")
-
-
-def misspecified_effects(found: ChannelResult) -> list[str]:
-    """Sentences on accepted effects of the body that are not as strong where they are small as where they are large."""
-    channel = found.channel
-    if not isinstance(channel, BodyChannel):
-        return []
-    out, settings = [], channel.settings.report
-    for name in found.names:
-        perturbation = _perturbation_of(found.selector.split(found.names), name, channel)
-        level, axis = _middle(perturbation, settings.lever_m)
-        if level <= 0.0:
-            continue
-        # What saturates grows with less than its first power, what sets in late with more.
-        more = perturbation * np.sqrt(np.abs(perturbation[:, axis]) / level)[:, None]
-        wide = WithTerms.of(channel, (*(one.term for one in found.unnamed), Term("", more)))
-        now = found.fit
-        free = fit(wide, np.append(now.vector, 0.0), indices(wide, found.names))
-        if 2.0 * (now.cost - free.cost) < Z95**2 * inflation(free, wide, (free.vector.size - 1,)):
-            continue
-        again = _perturbation_of(wide.split(free.vector), name, channel)
-        share = float((again * perturbation).sum() / (perturbation**2).sum())
-        times = _ratio(share + 0.5 * float(free.vector[-1]), share + float(free.vector[-1]), settings.largest_ratio)
-        out.append(
-            f"wheel_to_body: {name} is {times:.1f} times as strong where it makes up {0.25 * level:.2g} "
-            f"{_UNITS[axis]} as where it makes up {level:.2g}: 95 % sure that its form is another"
-        )
-    return out
-
-
-def _ratio(small: float, large: float, most: float) -> float:
-    """Return the ratio of the strengths where small and where large, limited to `most` and its inverse."""
-    if large <= small / most:
-        return most
-    return max(small / large, 1.0 / most)
-
-
-def _perturbation_of(split: Split, name: str, channel: BodyChannel) -> Array:
-    """Return an effect's contribution to the body's velocity at the nodes of a fit, (M, 3) in m/s, m/s, rad/s."""
-    place = channel.layout.place
-    vector, extra = split
-    without = vector.copy()
-    columns = [place[column] for column in CANDIDATES[name].columns]
-    without[columns] = channel.layout.neutral[columns]
-    if not REGISTRY[name].moves:
-        return np.zeros((channel.drive.t_s.size, 3))
-    return _velocity(channel, vector, extra) - _velocity(channel, without, extra)
-
-
-def _velocity(channel: BodyChannel, vector: Array, extra: Array | None) -> Array:
-    """Return the velocity of the axle's rolling point in the body's frame, (M, 3) in m/s, m/s and rad/s.
-
-    It is that of a free run at the nodes, and zero where a run ends.
-    """
-    track = channel.track(vector, extra)
-    step = np.diff(track, axis=0, append=track[-1:])
-    step[np.append(channel.drive.first[1:], True)] = 0.0
-    yaw = track[:, 2] + 0.5 * step[:, 2]
-    ahead = np.cos(yaw) * step[:, 0] + np.sin(yaw) * step[:, 1]
-    # Of the point that rolls, as a perturbation of the yaw rate moves the tracked one to the side by itself.
-    left = np.cos(yaw) * step[:, 1] - np.sin(yaw) * step[:, 0] + BODY.at(vector, "x_icr_m") * step[:, 2]
-    return np.column_stack([ahead, left, step[:, 2]]) / GRID_STEP_S
-
-
-def _middle(perturbation: Array, lever_m: float) -> tuple[float, int]:
-    """Return the power-weighted median size of a perturbation (M, 3) on its strongest axis, and that axis."""
-    power = (perturbation * (1.0, 1.0, lever_m)) ** 2
-    axis = int(np.argmax(power.sum(axis=0)))
-    size = np.sort(np.abs(perturbation[:, axis]))
-    share = np.cumsum(size**2)
-    if share[-1] <= 0.0:
-        return 0.0, axis
-    return float(size[np.searchsorted(share, 0.5 * share[-1])]), axis
-
 
 _OPPOSITES = (
     ("slow", "fast"),

@@ -275,7 +275,7 @@ def fold_vectors(found: Fit, fold: Index, count: int, neutral: Array, settings: 
         vector, others = found.vector.copy(), np.delete(normal, place, axis=0).sum(axis=0)
         pulled = np.delete(gradient, place, axis=0).sum(axis=0) + pull
         determined = known(others, normal.sum(axis=0), settings.fit)
-        determined |= np.diag(others) * vector[active] ** 2 > settings.selection.sure_sigmas**2
+        determined |= np.diag(others) * vector[active] ** 2 > settings.prediction.fixed_sigmas**2
         here = (others + np.diag(precision))[np.ix_(determined, determined)]
         vector[active[determined]] -= inverse(here) @ pulled[determined]
         vector[active[~determined]] = neutral[active[~determined]]

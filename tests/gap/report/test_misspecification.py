@@ -1,7 +1,4 @@
-"""A slip that saturates is called by its family's name, and said to be of another form; one that does not is not.
-
-A name that only acts like what is missing is disputed, with the reason.
-"""
+"""A name that only acts like what is missing is disputed, with the reason."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -15,9 +12,7 @@ from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.report.misspecification import (
     _answers_otherwise,
     _apart,
-    _perturbation_of,
     disputed_names,
-    misspecified_effects,
 )
 from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.least_squares import Fit
@@ -28,18 +23,6 @@ from tests.gap.synthetic import GEOMETRY, LIMITS, NOISE, body_channel, line_of
 
 # Turns at four rates: at two of them a wrong axial distance makes up for any form.
 DRIVE = ((4, 4), (0, 0), (-1, 1), (1, -1), (-2, 2), (2, -2), (-3.5, 3.5), (3.5, -3.5), (-6, 6), (6, -6), (3, 6), (6, 3))
-
-
-def slipping(k_s, saturates_at_rad_s=None):
-    """What is found in a drive whose turns slip by k |omega|, or k |omega| / (1 + |omega| / saturates_at)."""
-    line, truth = driven()
-    rate = motion(line, truth)[1]
-    perturbation = np.zeros((rate.size, 3))
-    if saturates_at_rad_s is None:
-        truth[BODY.place["turn_slip.k_s"]] = k_s
-    else:
-        perturbation[:, 2] = -k_s * rate * np.abs(rate) / (1.0 + np.abs(rate) / saturates_at_rad_s)
-    return found_of("turn_slip", truth, perturbation)
 
 
 def driven():
@@ -59,30 +42,6 @@ def found_of(name, truth, perturbation):
     channel = BodyChannel.build(replace(line, pose_values=clean + noise), NOISE, plain)
     selector = Selector(channel, body_moves(channel), LIMITS)
     return ChannelResult(selector, (name,), channel)
-
-
-def test_slip_that_saturates_is_stronger_where_it_is_small():
-    (told,) = misspecified_effects(slipping(0.4, 0.5))
-    assert "turn_slip" in told
-    assert float(told.split(" is ")[1].split(" times")[0]) > 1.2
-
-
-def test_what_turns_less_is_not_pushed_sideways():
-    found = slipping(0.1)
-    perturbation = _perturbation_of(found.selector.split(found.names), "turn_slip", found.channel)
-    assert np.abs(perturbation[:, 2]).max() > 0.1
-    # The tracked point, GEOMETRY[2] behind the one that rolls, moves to the side because the yaw rate is another.
-    assert np.abs(perturbation[:, :2]).max() < 1e-9
-
-
-@pytest.mark.parametrize("k_s", [0.05, 0.1])
-def test_slip_that_does_not_is_of_its_form(k_s):
-    assert misspecified_effects(slipping(k_s)) == []
-
-
-def test_what_acts_nowhere_says_nothing():
-    found = slipping(0.05)
-    assert misspecified_effects(replace(found, names=("pose_latency",))) == []
 
 
 def aside(of_left_m, of_right_m):
