@@ -220,6 +220,8 @@ class TermSettings:
     """More terms are not added. Chosen."""
     least_independent_share: float = 0.1
     """A term of which what is fitted already does the rest is left out: it would only pull against it. Chosen."""
+    worth_trying_nats: float = 18.0
+    """Gain to first order from which on a term is fitted. Chosen: below what acceptance takes."""
     most_tried: int = 4
     """So many of the most promising terms are fitted until one is accepted. Chosen: what promises most to first order
     may gain nothing, and the next all of it."""

@@ -383,7 +383,7 @@ def best_terms(small: Fit, channel: ResidualChannel, options: Iterator[Term]) ->
             continue
         coefficients = -inverse(information) @ pull
         gain = -0.5 * float(pull @ coefficients) - 0.5 * (len(columns) - 1) * math.log(channel.count)
-        if 2.0 * gain > channel.settings.selection.unnamed_score and coefficients.max() <= term.highest:
+        if gain > settings.worth_trying_nats and coefficients.max() <= term.highest:
             promising.append((gain, term))
     best: list[Term] = []
     for _, term in sorted(promising, key=lambda one: -one[0]):
