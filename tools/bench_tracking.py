@@ -85,13 +85,13 @@ def _peer(robot: ForeignRobot, track: Track) -> Planner:
     else:
         mppi = line_mppi(believed, distance_map(track.points_m), SPEED_M_S, settings, LIMITS.speed_rad_s)
     command = circle_command(mppi, 1)
-    held, due_ns = (0.0, 0.0), 0
+    current_command, due_ns = (0.0, 0.0), 0
 
     def law(state: PlannerState, _task: object, _model: object) -> tuple[float, float]:
-        nonlocal held, due_ns
+        nonlocal current_command, due_ns
         if state.t_ns >= due_ns:
-            held, due_ns = command(state.t_ns, state), state.t_ns + round(settings.step_s * 1e9)
-        return held
+            current_command, due_ns = command(state.t_ns, state), state.t_ns + round(settings.step_s * 1e9)
+        return current_command
 
     return LawController(law, believed, track.task)
 
@@ -163,11 +163,11 @@ def starts(count: int = 200, ways: tuple[str, ...] = STARTED_WAYS) -> dict[str, 
                 model(robot, True), track.task, DiscoSettings.for_speed(SPEED_M_S, STARTS_RATE_HZ), LIMITS, 1
             )
             found = [_arrival_s(planner, robot, track, seed) for seed in range(count)]
-            late_s = np.array([late_s for late_s, _ in found])
+            delay_s = np.array([delay_s for delay_s, _ in found])
             figures |= {
-                f"starts.{way}.dead_{dead_rad_s:g}.late_median_s": float(np.median(late_s)),
-                f"starts.{way}.dead_{dead_rad_s:g}.late_worst_s": float(late_s.max()),
-                f"starts.{way}.dead_{dead_rad_s:g}.lost": float((late_s > SPARE_S).sum()),
+                f"starts.{way}.dead_{dead_rad_s:g}.late_median_s": float(np.median(delay_s)),
+                f"starts.{way}.dead_{dead_rad_s:g}.late_worst_s": float(delay_s.max()),
+                f"starts.{way}.dead_{dead_rad_s:g}.lost": float((delay_s > SPARE_S).sum()),
                 f"starts.{way}.dead_{dead_rad_s:g}.backwards": float(sum(backwards for _, backwards in found)),
             }
     return figures

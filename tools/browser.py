@@ -69,14 +69,14 @@ def unnamed(page):
     session = page.context.new_cdp_session(page)
     found = []
     for node in session.send("Accessibility.getFullAXTree")["nodes"]:
-        role, said = node.get("role", {}).get("value"), node.get("name", {}).get("value", "").strip()
+        role, accessible_name = node.get("role", {}).get("value"), node.get("name", {}).get("value", "").strip()
         if node.get("ignored") or role not in _OPERATED:
             continue
-        held = {each["name"]: each["value"].get("value") for each in node.get("properties", [])}
-        if not said:
+        properties = {each["name"]: each["value"].get("value") for each in node.get("properties", [])}
+        if not accessible_name:
             found.append(f"{role} without a name")
-        if not held.get("focusable") and not held.get("disabled"):
-            found.append(f"{role} {said!r} that no key reaches")
+        if not properties.get("focusable") and not properties.get("disabled"):
+            found.append(f"{role} {accessible_name!r} that no key reaches")
     session.detach()
     return found
 

@@ -141,11 +141,11 @@ def main() -> int:
             fresh = files[result["seed"]].with_suffix(".part")
             fresh.write_text(json.dumps(result), encoding="utf-8")
             fresh.replace(files[result["seed"]])
-            trouble = len(result["violations"]) + bool(result["raised"])
+            violations = len(result["violations"]) + bool(result["raised"])
             factor = result["simulated_s"] / result["cpu_s"]
             console.print(
                 f"seed {result['seed']}: {result['simulated_s']:.0f} s at {factor:.0f} times real time on a core, "
-                f"{len(result['faults'])} faults, {trouble} violations"
+                f"{len(result['faults'])} faults, {violations} violations"
             )
     results = [json.loads(file.read_text(encoding="utf-8")) for file in files.values() if file.exists()]
     return _report(console, results)

@@ -47,9 +47,9 @@ ROBOT_FILE = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 SETTLED_S = 2.5
 """A fault's consequences are looked for until so long after its end."""
 WRAP_SOON_TICKS = (1 << 24) - 20_000
-LOST_M = 0.5
-LOST_RAD = 0.5
-LOST_FOR_S = 1.5
+WRONG_POSITION_M = 0.5
+WRONG_HEADING_RAD = 0.5
+WRONG_FOR_S = 1.5
 """Longest that the robot may move with an estimate that is wrong by more than the two above.
 
 While its one pose sensor lies, the robot cannot know: poses that agree with each other and not with the wheels are what
@@ -80,7 +80,7 @@ class CirclingPlanner:
     def __init__(self, config: RobotConfig, model_geometry: tuple[float, float, float]) -> None:
         self._task = circle_task(config.task, "the campaign")
         self._radius_m, self._axial_m, _ = model_geometry
-        self._nowhere = np.zeros((self.STEPS + 1, 3))
+        self._zero_path = np.zeros((self.STEPS + 1, 3))
         self._found = Diagnostics(1.0, 1.0, 0.0, 0.0, 0.0, 1)
 
     def plan(self, now_ns: int, state: PlannerState) -> WheelPlan:
@@ -98,7 +98,7 @@ class CirclingPlanner:
         right = (speed + 0.5 * self._axial_m * turn) / self._radius_m
         speeds = np.empty((self.STEPS, 2))
         speeds[:] = (left, right)
-        return WheelPlan(now_ns, 0.05, speeds, self._nowhere, self._found)
+        return WheelPlan(now_ns, 0.05, speeds, self._zero_path, self._found)
 
     def reset(self) -> None:
         """Nothing is kept from plan to plan."""
@@ -126,15 +126,15 @@ class Attendant:
             return ()
         match last.output.state:
             case State.FAULT:
-                wanted = UserRequest.RESET
+                request = UserRequest.RESET
             case State.READY:
-                wanted = UserRequest.ARM
+                request = UserRequest.ARM
             case State.ARMED if not last.output.running:
-                wanted = UserRequest.START
+                request = UserRequest.START
             case _:
                 return ()
         self._last_ns = now_ns
-        return (wanted,)
+        return (request,)
 
 
 class LogReader:
@@ -159,11 +159,11 @@ class LogReader:
                     for name, value in getattr(record, group).items():
                         self.counts[f"{group}.{name}"] = value
             elif isinstance(record, RobotLinkHealth):
-                self._take_robot({name: getattr(record, name) for name in record.__struct_fields__})
+                self._count_changes({name: getattr(record, name) for name in record.__struct_fields__})
             elif isinstance(record, RobotStatus):
-                self._take_robot({"rejected_count": record.rejected_count})
+                self._count_changes({"rejected_count": record.rejected_count})
 
-    def _take_robot(self, values: dict[str, int]) -> None:
+    def _count_changes(self, values: dict[str, int]) -> None:
         for name, value in values.items():
             before = self._robot.get(name, value)
             self._robot[name] = value
@@ -266,7 +266,7 @@ class FaultRun:
         self._hogged = False
         self._open: list[_Open] = []
         self._closing: list[tuple[int, _Open]] = []
-        self._lost_since_us: int | None = None
+        self._wrong_since_us: int | None = None
         self._thawed_us = 0
         self.outcome = FaultRunResult(violations=self.monitor.violations)
         self._start_daemon()
@@ -370,21 +370,21 @@ class FaultRun:
         moving = max(abs(truth.left_speed_rad_s), abs(truth.right_speed_rad_s)) > 0.05
         self.outcome.moving_s += moving * self._period_us * 1e-6
         last = None if self.core is None else self.core.last
-        lost = False
+        is_wrong = False
         if moving and not lied_to and last is not None and last.output.motion_allowed and not self._frozen:
             found = last.pipeline.estimate
-            lost = (
-                math.hypot(found.x_m - truth.x_m, found.y_m - truth.y_m) > LOST_M
-                or abs(math.remainder(found.yaw_rad - truth.yaw_rad, 2.0 * math.pi)) > LOST_RAD
+            is_wrong = (
+                math.hypot(found.x_m - truth.x_m, found.y_m - truth.y_m) > WRONG_POSITION_M
+                or abs(math.remainder(found.yaw_rad - truth.yaw_rad, 2.0 * math.pi)) > WRONG_HEADING_RAD
             )
-        if not lost:
-            self._lost_since_us = None
-        elif self._lost_since_us is None:
-            self._lost_since_us = self.now_us
-        elif self.now_us - self._lost_since_us > LOST_FOR_S * 1e6:
+        if not is_wrong:
+            self._wrong_since_us = None
+        elif self._wrong_since_us is None:
+            self._wrong_since_us = self.now_us
+        elif self.now_us - self._wrong_since_us > WRONG_FOR_S * 1e6:
             struck = ", ".join(str(o.outcome.fault) for o in self._open) or "no fault"
             self.monitor.violations.append(f"{self.now_us * 1e-6:.2f} s: moving on a wrong estimate under {struck}")
-            self._lost_since_us = self.now_us + 10_000_000
+            self._wrong_since_us = self.now_us + 10_000_000
 
     def _check_telemetry(self, now_us: int) -> None:
         """A daemon that no longer hears of the wheels takes the motion away."""

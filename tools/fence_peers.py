@@ -147,7 +147,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
     options = FenceOptions(seed=given.seed)
-    campaign = Campaign(given.out, options, lambda words: print(words, file=sys.stderr, flush=True))
+    campaign = Campaign(given.out, options, lambda message: print(message, file=sys.stderr, flush=True))
     campaign.gather(MUJOCO, given.mujoco, lambda rng: mujoco_hand_drive(rng, options.seconds), 4)
     campaign.gather(MUJOCO_TASK, given.tasks, lambda rng: mujoco_task_drive(rng, options.seconds), 5)
     campaign.gather(

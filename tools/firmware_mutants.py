@@ -24,7 +24,7 @@ from pathlib import Path
 
 from firmware_protocol.build_firmware import PACKAGE, SOURCES, create_ffi
 from tools.check.firmware_check import build_harness, run_harness
-from tools.check.mutation import QUICK, Mutant, mutants
+from tools.check.mutation import FAST_TESTS, Mutant, mutants
 
 ROOT = Path(__file__).resolve().parent.parent
 FIRMWARE = PACKAGE / "firmware"
@@ -136,7 +136,7 @@ def child(folder: Path, files: Sequence[str]) -> int:
     os.chdir(ROOT)
     for one in files:
         # File by file, so that the others need not even be collected.
-        status = pytest.main(["-x", "-m", QUICK, "-p", "no:cacheprovider", "-n", "0", "-p", "no:timeout",
+        status = pytest.main(["-x", "-m", FAST_TESTS, "-p", "no:cacheprovider", "-n", "0", "-p", "no:timeout",
                               "--hypothesis-profile=mutants", f"--basetemp={folder}/t", one])  # fmt: skip
         if status not in (0, pytest.ExitCode.NO_TESTS_COLLECTED):
             return int(status)

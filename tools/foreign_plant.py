@@ -51,7 +51,7 @@ class ForeignRobot:
     ticks: int = 1860
     pose_std_m: float = 0.003
     yaw_std_rad: float = 0.004
-    pose_late_s: float = 0.02
+    pose_delay_s: float = 0.02
     slope_m_s: float = 0.0
     left_gain: float = 1.0
     believed: tuple[float, float, float] = NOMINAL
@@ -73,8 +73,8 @@ def _advance(state: Any, left: float, right: float, numbers: Any, noise: Any) ->
     )
     for one in noise:
         for wheel, command in ((0, left * gain), (1, right)):
-            wanted = math.copysign(max(abs(command) - dead, 0.0), command)
-            state[_LEFT + wheel] += (wanted - state[_LEFT + wheel]) * STEP_S / lag
+            target = math.copysign(max(abs(command) - dead, 0.0), command)
+            state[_LEFT + wheel] += (target - state[_LEFT + wheel]) * STEP_S / lag
             state[_ANGLE_L + wheel] += state[_LEFT + wheel] * STEP_S
             keep = STEP_S / grip_s
             state[_GRIP_L + wheel] += -state[_GRIP_L + wheel] * keep + grip_std * math.sqrt(2.0 * keep) * one[wheel]
@@ -105,7 +105,7 @@ class ForeignPlant:
         self.state[:3] = start
         self.now_ms = 0
         self._rng = np.random.default_rng([seed, 5])
-        self._late: list[tuple[int, PoseSample]] = []
+        self._delayed: list[tuple[int, PoseSample]] = []
         self._past = [(0, 0)] * 3
         r = robot
         self._numbers = (
@@ -150,15 +150,15 @@ class ForeignPlant:
             wheels.append(WheelSample(self.now_ns, self.now_ns, left * tick, right * tick, *speeds))
         if self.now_ms % _POSES_EVERY == 0:
             x, y, yaw = self.state[:3] + self._rng.standard_normal(3) * self._pose_std()
-            due = self.now_ms + round(self.robot.pose_late_s / STEP_S)
+            due = self.now_ms + round(self.robot.pose_delay_s / STEP_S)
             stamp = self.now_ns
             sample = PoseSample(
                 stamp, due * 1_000_000, float(x), float(y), math.remainder(float(yaw), 2.0 * math.pi),
                 self.robot.pose_std_m, self.robot.yaw_std_rad,
             )  # fmt: skip
-            self._late.append((due, sample))
-        while self._late and self._late[0][0] <= self.now_ms:
-            poses.append(self._late.pop(0)[1])
+            self._delayed.append((due, sample))
+        while self._delayed and self._delayed[0][0] <= self.now_ms:
+            poses.append(self._delayed.pop(0)[1])
         return Readings(wheels=tuple(wheels), poses=tuple(poses))
 
     def advance(self, left_rad_s: float, right_rad_s: float, count: int, /) -> None:

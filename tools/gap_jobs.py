@@ -148,7 +148,7 @@ def jobs(kind: str, seeds: Iterable[int]) -> Iterator[Job]:
             yield Job(kind, realistic(str(first), seed) | realistic(str(second), seed + 1000), seed)
         elif kind == "strange":
             for form in strange_robot.FORMS:
-                yield Job(kind, {form: tuple(strange_robot.drawn(form, seed).values())}, seed)
+                yield Job(kind, {form: tuple(strange_robot.sampled_parameters(form, seed).values())}, seed)
         else:
             for name in {"outside": OUTSIDE, "forms": tuple(FORMS)}.get(kind, NAMED):
                 yield Job(kind, realistic(name, seed, 0.25 if kind == "weak" else 1.0), seed)

@@ -11,7 +11,7 @@ from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, differen
 from disco_hw.runtime.pipeline import Governor, WheelLimits
 from sim.effects import EFFECTS, HiddenEffects, hidden_effects
 from sim.plant_parameters import PlantParameters
-from tools.simulated_drives import ScriptedDrive, make_drive
+from tools.simulated_drives import ScriptedDrive, create_drive
 from tools.simulated_log import LogOptions, dirty_log_options, dirty_parameters, simulated_log, varied_parameters
 
 # What a robot.toml sets if it says nothing else.
@@ -43,7 +43,7 @@ def simulated_drive(
     if dirty:
         parameters, options = dirty_parameters(parameters), dirty_log_options()
     effects: HiddenEffects = hidden_effects(hide or {})
-    driven = make_drive(drive, seed)
+    driven = create_drive(drive, seed)
     if script is not None:
         driven = then_scripted(driven, script)
     rows = simulated_log(driven, parameters, effects, seed, options)

@@ -18,7 +18,7 @@ from pathlib import Path
 CONSTRAINTS = str(Path(__file__).parents[1] / "constraints.txt")
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check")
 # pip's name of a setting, uv's variable for it, and what stands between values where there are several.
-AS_UV_SAYS_IT = (
+UV_SETTINGS = (
     ("index-url", "UV_DEFAULT_INDEX", " "),
     ("extra-index-url", "UV_INDEX", " "),
     ("find-links", "UV_FIND_LINKS", ","),
@@ -43,9 +43,9 @@ def uv_variables(pip_settings: str) -> dict[str, str]:
             rank = order.index(place)
             if name not in found or rank < found[name][0]:
                 found[name] = rank, str(ast.literal_eval(value))
-    said = {uv: between.join(found[pip][1].split()) for pip, uv, between in AS_UV_SAYS_IT if pip in found}
+    variables = {uv: between.join(found[pip][1].split()) for pip, uv, between in UV_SETTINGS if pip in found}
     # As pip does: the best version of all indexes, not of the first that has any.
-    return {"UV_INDEX_STRATEGY": "unsafe-best-match", **said}
+    return {"UV_INDEX_STRATEGY": "unsafe-best-match", **variables}
 
 
 def install_with_uv(project: str, environment: Mapping[str, str]) -> bool:
@@ -57,8 +57,8 @@ def install_with_uv(project: str, environment: Mapping[str, str]) -> bool:
             return False
     settings = subprocess.run([*PIP, "config", "list"], capture_output=True, text=True, check=True).stdout
     # The project itself is built anew whenever it is asked for: its C sources may have changed.
-    asked = ["--python", sys.executable, "--constraint", CONSTRAINTS, "--reinstall-package", "disco-hw"]
-    command = [sys.executable, "-m", "uv", "--quiet", "pip", "install", *asked, "--editable", project]
+    options = ["--python", sys.executable, "--constraint", CONSTRAINTS, "--reinstall-package", "disco-hw"]
+    command = [sys.executable, "-m", "uv", "--quiet", "pip", "install", *options, "--editable", project]
     return subprocess.run(command, env={**uv_variables(settings), **environment}, check=False).returncode == 0
 
 

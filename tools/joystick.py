@@ -46,8 +46,10 @@ def keyboard(seed: int, duration_s: float, top_rad_s: float) -> Array:
     rows = np.zeros((0, 2))
     while rows.shape[0] < duration_s * COMMANDS_PER_S:
         key = keys[rng.integers(len(keys))]
-        held = np.tile([forward * key[0], turn * key[1]], (round(rng.uniform(0.71, 4.1) * COMMANDS_PER_S), 1))
-        rows = np.concatenate([rows, held])
+        constant_commands = np.tile(
+            [forward * key[0], turn * key[1]], (round(rng.uniform(0.71, 4.1) * COMMANDS_PER_S), 1)
+        )
+        rows = np.concatenate([rows, constant_commands])
         if rng.random() < 0.17:
             # Faster or slower, by other keys.
             forward = float(np.clip(forward * rng.choice([0.91, 1.11, 1.21]), 0.19, 0.83))

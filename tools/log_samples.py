@@ -82,11 +82,11 @@ def log_bytes(ticks, finish=True, flush_every=None, numbers=False, end=None, **c
     return sink.getvalue()
 
 
-def with_damaged_chunk(whole):
+def with_damaged_chunk(content):
     """The log with one bit of the data of its middle chunk turned over."""
-    chunks = make_reader(io.BytesIO(whole)).get_summary().chunk_indexes
+    chunks = make_reader(io.BytesIO(content)).get_summary().chunk_indexes
     chunk = chunks[len(chunks) // 2]
-    damaged = bytearray(whole)
+    damaged = bytearray(content)
     damaged[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
     return bytes(damaged)
 

@@ -23,7 +23,7 @@ KINDS = {
     "help": "what --help says",
     "said": "events, progress, reports, and all other words",
 }
-_WORDS = re.compile(r"[A-Za-z]{2,}[,:;.)]* +\(?[a-zA-Z{]")
+_PROSE = re.compile(r"[A-Za-z]{2,}[,:;.)]* +\(?[a-zA-Z{]")
 _SHOWN = ("alt", "aria-label", "placeholder", "title")
 _SCRIPT_TEXT = re.compile(r"`((?:[^`\\]|\\.)*)`|\"((?:[^\"\\\n]|\\.)*)\"")
 
@@ -76,7 +76,7 @@ def _texts(node: ast.AST, name: str, kind: str, skipped: set[int]) -> Iterator[M
         kind = "refusal"
     text = as_text(node)
     if text is not None:
-        if _WORDS.search(text):
+        if _PROSE.search(text):
             yield Message(_kind_in(name, kind), text, name, getattr(node, "lineno", 0))
         return
     for child in ast.iter_child_nodes(node):
@@ -129,9 +129,9 @@ class _Shown(HTMLParser):
         line = self.getpos()[0]
         if self._inside == "script":
             for text in _SCRIPT_TEXT.finditer(data):
-                said = text[1] or text[2] or ""
-                if _WORDS.search(said) and "=>" not in said:
-                    self.found.append((line + data[: text.start()].count("\n"), said))
+                literal = text[1] or text[2] or ""
+                if _PROSE.search(literal) and "=>" not in literal:
+                    self.found.append((line + data[: text.start()].count("\n"), literal))
         elif self._inside != "style" and data.strip():
             self.found.append((line, data.strip()))
 

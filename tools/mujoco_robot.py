@@ -308,7 +308,7 @@ def record(hidden: Hidden, seed: int, command: Array | None = None, robot: Robot
     if unknown:
         raise ValueError(f"no such effect: {', '.join(sorted(unknown))}; give some of {', '.join(EFFECTS)}")
     command, habits = driven(robot, seed) if command is None else command, robot.habits
-    heard = np.sign(command) * np.maximum(np.abs(command) - hidden.get("dead_band", 0.0), 0.0)
+    effective_command = np.sign(command) * np.maximum(np.abs(command) - hidden.get("dead_band", 0.0), 0.0)
     model = mujoco.MjModel.from_xml_string(mjcf(hidden, robot))
     data = mujoco.MjData(model)
     motors = [model.joint(name).qposadr[0] for name, *_ in _WHEELS]
@@ -322,7 +322,7 @@ def record(hidden: Hidden, seed: int, command: Array | None = None, robot: Robot
         w, x, y, z = data.qpos[3:7]
         where[k] = data.qpos[0], data.qpos[1], math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         turned[k] = data.qpos[motors] - turned_before
-        left, right = heard[k // STEPS_PER_COMMAND]
+        left, right = effective_command[k // STEPS_PER_COMMAND]
         waiting.append(np.array([left, right, left, right]))
         data.ctrl[:] = waiting.popleft()
         mujoco.mj_step(model, data)
@@ -367,7 +367,7 @@ def record(hidden: Hidden, seed: int, command: Array | None = None, robot: Robot
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tools.mujoco_robot", description=(__doc__ or "").split(":")[0])
-    about = "; ".join(f"{name}={usual} {meaning}" for name, (usual, meaning) in EFFECTS.items())
+    about = "; ".join(f"{name}={usual} {description}" for name, (usual, description) in EFFECTS.items())
     parser.add_argument("--hide", action="append", default=[], metavar="EFFECT[=SIZE]", help=about)
     parser.add_argument("--robot", choices=tuple(ROBOTS), default="middle", help="which robot (middle)")
     parser.add_argument("--seed", type=int, default=1, help="of drive and noise (1)")

@@ -149,12 +149,15 @@ def _solver(lag_s: float, only_forward: bool) -> Any:
     settled = (1.0 - keep) * lag_s / STEP_S
     cost, changes, sums = 0.0, [], []
     for t in range(HORIZON):
-        ask_left, ask_right = commands[2 * t], commands[2 * t + 1]
-        changes += [ask_left - last_left, ask_right - last_right]
-        sums += [ask_left + ask_right] if only_forward else []
-        last_left, last_right = ask_left, ask_right
-        mean_left, mean_right = ask_left + settled * (left - ask_left), ask_right + settled * (right - ask_right)
-        left, right = ask_left + keep * (left - ask_left), ask_right + keep * (right - ask_right)
+        command_left, command_right = commands[2 * t], commands[2 * t + 1]
+        changes += [command_left - last_left, command_right - last_right]
+        sums += [command_left + command_right] if only_forward else []
+        last_left, last_right = command_left, command_right
+        mean_left, mean_right = (
+            command_left + settled * (left - command_left),
+            command_right + settled * (right - command_right),
+        )
+        left, right = command_left + keep * (left - command_left), command_right + keep * (right - command_right)
         forward = 0.5 * radius * (mean_left + mean_right)
         turn = radius * (mean_right - mean_left) / axle
         middle = yaw + 0.5 * STEP_S * turn

@@ -28,7 +28,7 @@ from typing import Any
 
 import pytest
 
-from tools.check.mutation import QUICK, Mutant, marked
+from tools.check.mutation import FAST_TESTS, Mutant, marked
 
 ROOT = Path(__file__).resolve().parent.parent
 EQUIVALENTS = Path(__file__).with_name("python_equivalents.toml")
@@ -244,9 +244,9 @@ class Mutated(importlib.abc.MetaPathFinder):
 def quiet() -> Iterator[None]:
     """Without what tests print."""
     sys.stdout.flush()
-    kept, nowhere = [os.dup(1), os.dup(2)], os.open(os.devnull, os.O_WRONLY)
+    kept, devnull = [os.dup(1), os.dup(2)], os.open(os.devnull, os.O_WRONLY)
     for place in (1, 2):
-        os.dup2(nowhere, place)
+        os.dup2(devnull, place)
     try:
         yield
     finally:
@@ -256,7 +256,7 @@ def quiet() -> Iterator[None]:
 
 def run_tests(arguments: Sequence[str], plugins: Sequence[Any] = ()) -> int:
     """Run those of some tests that `make test` runs until one fails."""
-    options = ["-x", "-n", "0", "-m", QUICK, "-p", "no:cacheprovider", "-p", "no:timeout", "-p", "no:playwright"]
+    options = ["-x", "-n", "0", "-m", FAST_TESTS, "-p", "no:cacheprovider", "-p", "no:timeout", "-p", "no:playwright"]
     with quiet():
         return int(pytest.main([*options, *arguments], plugins=list(plugins)))
 

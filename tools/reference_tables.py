@@ -51,7 +51,7 @@ def settings() -> dict[str, tuple[type, set[str]]]:
 
 def settings_table(name: str, present: str) -> str:
     """Markdown of the keys of one struct, with the meanings that the present table has."""
-    meanings = dict(re.findall(r"^\| `(\w+)` \|.*\| ([^|]*) \|$", present, re.MULTILINE))
+    descriptions = dict(re.findall(r"^\| `(\w+)` \|.*\| ([^|]*) \|$", present, re.MULTILINE))
     struct, left_out = settings()[name]
     information = inspect.type_info(struct)
     assert isinstance(information, inspect.StructType)
@@ -59,8 +59,8 @@ def settings_table(name: str, present: str) -> str:
     for field in information.fields:
         if field.name not in left_out:
             default = _COMPUTED.get(name.strip("[]")) or default_of(field)
-            meaning = meanings.get(field.name, "")
-            lines.append(f"| `{field.name}` | {allowed(field.type)} | {default} | {meaning} |")
+            description = descriptions.get(field.name, "")
+            lines.append(f"| `{field.name}` | {allowed(field.type)} | {default} | {description} |")
     return "\n".join(lines)
 
 
@@ -82,8 +82,8 @@ def allowed(kind: inspect.Type) -> str:
         case inspect.StrType():
             return "text"
         case inspect.TupleType():
-            words = dict.fromkeys(map(allowed, kind.item_types))
-            return f"{len(kind.item_types)} x {' / '.join(words)}"
+            types = dict.fromkeys(map(allowed, kind.item_types))
+            return f"{len(kind.item_types)} x {' / '.join(types)}"
         case inspect.ListType() | inspect.VarTupleType():
             return f"list of {allowed(kind.item_type)}"
         case _:
@@ -96,14 +96,13 @@ def interval(kind: inspect.FloatType | inspect.IntType) -> str:
         next((one for one in pair if one is not None), None) for pair in ((kind.gt, kind.ge), (kind.lt, kind.le))
     )
     high = None if high is not None and high > 1e9 else high
-    word = "integer" if isinstance(kind, inspect.IntType) else ""
+    number_type = "integer" if isinstance(kind, inspect.IntType) else ""
     if low is None:
-        return word or "number"
+        return number_type or "number"
     if high is None:
-        return f"{word} {'>' if kind.gt is not None else '>='}{low:g}".strip()
-    return (
-        f"{word} {'(' if kind.gt is not None else '['}{low:g}, {high:.8g}{')' if kind.lt is not None else ']'}".strip()
-    )
+        return f"{number_type} {'>' if kind.gt is not None else '>='}{low:g}".strip()
+    left, right = "(" if kind.gt is not None else "[", ")" if kind.lt is not None else "]"
+    return f"{number_type} {left}{low:g}, {high:.8g}{right}".strip()
 
 
 def literal(value: Any) -> str:
@@ -128,8 +127,8 @@ def default_of(field: inspect.Field) -> str:
 def commands(command: click.Command, name: str) -> Iterator[tuple[str, str]]:
     """Each command below this one that does something, with its arguments and the first sentence of its help."""
     if isinstance(command, click.Group):
-        for word, inner in command.commands.items():
-            yield from commands(inner, f"{name} {word}")
+        for subcommand, inner in command.commands.items():
+            yield from commands(inner, f"{name} {subcommand}")
         return
     arguments = " ".join(
         parameter.make_metavar(click.Context(command))
@@ -147,8 +146,8 @@ def first_sentence(text: str) -> str:
 def commands_table(_name: str, _present: str) -> str:
     """Markdown of every command of the command line."""
     rows = [
-        f"| `{call.replace('|', ' ')}` | {words} |"
-        for call, words in commands(typer.main.get_command(app()), "disco-hw")
+        f"| `{call.replace('|', ' ')}` | {summary} |"
+        for call, summary in commands(typer.main.get_command(app()), "disco-hw")
     ]
     return "\n".join(["| command | what it does |", "|---|---|", *rows])
 
@@ -159,8 +158,8 @@ def states_table(_name: str, _present: str) -> str:
     for row in TRANSITIONS:
         sources = [state.name for state in State if state in row.sources]
         others = [state.name for state in State if state not in row.sources]
-        said = ", ".join(sources) if len(sources) <= len(others) + 1 else f"any but {', '.join(others)}"
-        lines.append(f"| {said} | {row.target.name} | {row.reason} |")
+        source_text = ", ".join(sources) if len(sources) <= len(others) + 1 else f"any but {', '.join(others)}"
+        lines.append(f"| {source_text} | {row.target.name} | {row.reason} |")
     return "\n".join(lines)
 
 

@@ -136,9 +136,9 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def _git(*words: str) -> str:
-    result = subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True, check=False)
-    return result.stdout.strip() or ("" if words[0] == "status" else "unknown")
+def _git(*arguments: str) -> str:
+    result = subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=False)
+    return result.stdout.strip() or ("" if arguments[0] == "status" else "unknown")
 
 
 def _cpu() -> str:

@@ -33,7 +33,7 @@ from sim.body_dynamics import BodyPose
 from sim.plant import Plant
 from sim.process import PoseSender
 
-STEP_S, SAY_S, LINE_S = 0.005, 0.02, 0.05
+STEP_S, PUBLISH_S, LINE_S = 0.005, 0.02, 0.05
 RELIABLE = Qos(Policy.Reliability.Reliable(0), Policy.History.KeepLast(10))
 
 
@@ -44,8 +44,8 @@ class BaseNode:
         self.settings, self.plant = settings, plant
         self.silent = False
         self.zero_ticks = (0, 0)
-        self._said = (0.0, 0.0)
-        self._said_s = -math.inf
+        self._commanded = (0.0, 0.0)
+        self._commanded_s = -math.inf
         self._pose = [0.0, 0.0, 0.0]
         self._angles = (0.0, 0.0)
         self._domain, participant = join_domain(config)
@@ -55,7 +55,7 @@ class BaseNode:
         self._speeds = DataReader(
             participant, Topic(participant, wire_name(settings.speed_topic, namespace), speed), RELIABLE
         )
-        self._say = DataWriter(
+        self._wheel_writer = DataWriter(
             participant, Topic(participant, wire_name(settings.wheels_from, namespace), wheels), RELIABLE
         )
 
@@ -64,15 +64,15 @@ class BaseNode:
         for sample in self._speeds.take(20):
             if sample.sample_info.valid_data:
                 twist = sample.twist if self.settings.speed_stamped else sample
-                self._said, self._said_s = (twist.linear.x, twist.angular.z), now_s
-        return self._said if now_s - self._said_s <= self.settings.watchdog_s else (0.0, 0.0)
+                self._commanded, self._commanded_s = (twist.linear.x, twist.angular.z), now_s
+        return self._commanded if now_s - self._commanded_s <= self.settings.watchdog_s else (0.0, 0.0)
 
     def wheels_of(self, speeds: tuple[float, float]) -> tuple[float, float]:
         """Return the wheel speeds of speeds of the body, by the nominal geometry."""
         half = 0.5 * self.settings.track_m * speeds[1]
         return (speeds[0] - half) / self.settings.wheel_radius_m, (speeds[0] + half) / self.settings.wheel_radius_m
 
-    def say(self) -> None:
+    def publish(self) -> None:
         """Publish the wheels' state now."""
         if self.silent:
             return
@@ -86,7 +86,7 @@ class BaseNode:
             names = [name for side in sides for name in side]
             angles = [angle for side, angle in zip(sides, (left, right), strict=True) for _ in side]
             turning = [speed for side, speed in zip(sides, speeds, strict=True) for _ in side]
-            self._say.write(msg.JointState(header, names, angles, turning))
+            self._wheel_writer.write(msg.JointState(header, names, angles, turning))
             return
         radius, track = settings.wheel_radius_m, settings.track_m
         moved = (radius * (left - self._angles[0]), radius * (right - self._angles[1]))
@@ -102,7 +102,9 @@ class BaseNode:
         )
         linear, angular = 0.5 * radius * (speeds[0] + speeds[1]), radius * (speeds[1] - speeds[0]) / track
         twist = msg.Twist(msg.Vector3(linear, 0.0, 0.0), msg.Vector3(0.0, 0.0, angular))
-        self._say.write(msg.Odometry(header, "base_link", msg.PoseWithCovariance(pose), msg.TwistWithCovariance(twist)))
+        self._wheel_writer.write(
+            msg.Odometry(header, "base_link", msg.PoseWithCovariance(pose), msg.TwistWithCovariance(twist))
+        )
 
 
 def main(robot: str, *start: str) -> None:
@@ -126,7 +128,7 @@ def main(robot: str, *start: str) -> None:
     signal.signal(signal.SIGUSR1, restart)
     signal.signal(signal.SIGUSR2, fall_silent)
     begun_s = time.monotonic()
-    next_say_s = next_line_s = begun_s
+    next_publish_s = next_line_s = begun_s
     while True:
         now_s = time.monotonic()
         speeds = node.obey(now_s)
@@ -134,14 +136,14 @@ def main(robot: str, *start: str) -> None:
         for pose in plant.step(now_us, *node.wheels_of(speeds)):
             if poses is not None:
                 poses.send(pose, now_us)
-        if now_s >= next_say_s:
-            next_say_s = max(next_say_s + SAY_S, now_s - SAY_S)
-            node.say()
+        if now_s >= next_publish_s:
+            next_publish_s = max(next_publish_s + PUBLISH_S, now_s - PUBLISH_S)
+            node.publish()
         if now_s >= next_line_s:
             next_line_s = now_s + LINE_S
             truth = plant.truth
-            words = (truth.left_speed_rad_s, truth.right_speed_rad_s, *speeds)
-            print(time.monotonic_ns(), *(f"{word:.4f}" for word in words), flush=True)
+            values = (truth.left_speed_rad_s, truth.right_speed_rad_s, *speeds)
+            print(time.monotonic_ns(), *(f"{value:.4f}" for value in values), flush=True)
         time.sleep(STEP_S)
 
 

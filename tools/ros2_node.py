@@ -44,30 +44,30 @@ def main(domain: str, kind: str, east: str, north: str, heading: str) -> None:
     if kind == "speed":
         drive(participant, msg.Twist(msg.Vector3(x, 0.0, 0.0), msg.Vector3(0.0, 0.0, yaw)))
         return
-    say = DataWriter(participant, Topic(participant, "rt/pose", msg.PoseStamped))
+    pose_writer = DataWriter(participant, Topic(participant, "rt/pose", msg.PoseStamped))
     transforms = DataWriter(participant, Topic(participant, "rt/tf", msg.TFMessage)) if kind == "tf" else None
     # The name of a pose and the bytes of something else, once it is time.
     other = None
     wrong: list[int] = []
     signal.signal(signal.SIGUSR1, lambda *_: wrong.append(1))
     while True:
-        for heard in odometry.take(10):
-            if not heard.sample_info.valid_data:
+        for received in odometry.take(10):
+            if not received.sample_info.valid_data:
                 continue
-            heard_ns = time.monotonic_ns()
-            place, turned = heard.pose.pose.position, heard.pose.pose.orientation
+            received_ns = time.monotonic_ns()
+            place, turned = received.pose.pose.position, received.pose.pose.orientation
             at_x = x + math.cos(yaw) * place.x - math.sin(yaw) * place.y
             at_y = y + math.sin(yaw) * place.x + math.cos(yaw) * place.y
             half = 0.5 * (yaw + 2.0 * math.atan2(turned.z, turned.w))
             pose = msg.RosPose(msg.Point(at_x, at_y, 0.0), msg.Quaternion(0.0, 0.0, math.sin(half), math.cos(half)))
-            message = msg.PoseStamped(msg.Header(heard.header.stamp, "map"), pose)
+            message = msg.PoseStamped(msg.Header(received.header.stamp, "map"), pose)
             times = 1
             if transforms is not None:
                 times = 0
                 turned = msg.Quaternion(0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw))
                 # A correction that is new each time.
-                shift = msg.Vector3(x + 1e-6 * (heard_ns % 1000), y, 0.0)
-                ahead = msg.stamp_of(msg.time_of(heard.header.stamp) + 200_000_000)
+                shift = msg.Vector3(x + 1e-6 * (received_ns % 1000), y, 0.0)
+                ahead = msg.stamp_of(msg.time_of(received.header.stamp) + 200_000_000)
                 one = msg.TransformStamped(msg.Header(ahead, "map"), "odom", msg.Transform(shift, turned))
                 transforms.write(msg.TFMessage([one]))
             if wrong:
@@ -82,27 +82,27 @@ def main(domain: str, kind: str, east: str, north: str, heading: str) -> None:
                 elif kind == "garbage" and other is None:
                     other = DataWriter(participant, Topic(participant, "rt/pose", Garbage))
             for _ in range(times):
-                (other or say).write(Garbage("x" * 300) if other else message)
-            stamp_ns, said_ns = msg.time_of(heard.header.stamp), time.monotonic_ns()
-            print(f"{stamp_ns} {heard_ns} {said_ns} {place.x:.6f} {place.y:.6f}", flush=True)
+                (other or pose_writer).write(Garbage("x" * 300) if other else message)
+            stamp_ns, sent_ns = msg.time_of(received.header.stamp), time.monotonic_ns()
+            print(f"{stamp_ns} {received_ns} {sent_ns} {place.x:.6f} {place.y:.6f}", flush=True)
         time.sleep(0.001)
 
 
 def drive(participant, twist):
-    say = DataWriter(participant, Topic(participant, "rt/cmd_vel", msg.Twist))
+    speed_writer = DataWriter(participant, Topic(participant, "rt/cmd_vel", msg.Twist))
     reliable = Qos(Policy.Reliability.Reliable(0), Policy.History.KeepLast(10))
-    ask = DataWriter(participant, Topic(participant, "rt/disco_hw/ctl", msg.String), reliable)
+    request_writer = DataWriter(participant, Topic(participant, "rt/disco_hw/ctl", msg.String), reliable)
     button = DataWriter(participant, Topic(participant, "rt/disco_hw/estop", msg.Bool), reliable)
     replies = DataReader(participant, Topic(participant, "rt/disco_hw/reply", msg.String), reliable)
     os.set_blocking(sys.stdin.fileno(), False)
     while True:
-        say.write(twist)
+        speed_writer.write(twist)
         with contextlib.suppress(BlockingIOError, TypeError):
             for line in os.read(sys.stdin.fileno(), 1000).decode().splitlines():
                 if line == "button":
                     button.write(msg.Bool(True))
                 else:
-                    ask.write(msg.String(line))
+                    request_writer.write(msg.String(line))
         for reply in replies.take(10):
             if reply.sample_info.valid_data:
                 print(reply.data, flush=True)

@@ -70,7 +70,7 @@ class _Tape:
     def __init__(self, generator: np.random.Generator, vehicle: Vehicle) -> None:
         self.generator = generator
         self._vehicle = vehicle
-        self._wanted: list[Floats] = []
+        self._desired: list[Floats] = []
         self._slew: list[Floats] = []
         self._phase: list[str] = []
 
@@ -82,7 +82,7 @@ class _Tape:
         """Append a manoeuvre given as functions of the time since its start (s)."""
         count = max(round(seconds * self._vehicle.rate_hz), 1)
         t = np.arange(count) / self._vehicle.rate_hz
-        self._wanted.append(np.stack([speed(t), turn(t)], axis=1))
+        self._desired.append(np.stack([speed(t), turn(t)], axis=1))
         slew = SHARP_RAD_S2 if sharp else float(self.generator.uniform(*HAND_RAD_S2))
         self._slew.append(np.full(count, slew))
         self._phase += [phase] * count
@@ -97,11 +97,11 @@ class _Tape:
 
     def drive(self, name: str, steady: bool = False) -> ScriptedDrive:
         """Put wanted speeds through the hand: tremor (unless `steady`), limits, and the slew of each manoeuvre."""
-        wanted = np.concatenate(self._wanted)
+        desired = np.concatenate(self._desired)
         if not steady:
-            wanted = wanted * (1.0 + self._tremor(wanted.shape))
+            desired = desired * (1.0 + self._tremor(desired.shape))
         largest = self._vehicle.max_wheel_speed_rad_s
-        wheels = largest * np.stack([wanted[:, 0] - wanted[:, 1], wanted[:, 0] + wanted[:, 1]], axis=1)
+        wheels = largest * np.stack([desired[:, 0] - desired[:, 1], desired[:, 0] + desired[:, 1]], axis=1)
         wheels *= np.minimum(1.0, largest / np.maximum(np.abs(wheels).max(axis=1, keepdims=True), 1e-9))
         steps = np.concatenate(self._slew) / self._vehicle.rate_hz
         commands = np.zeros(wheels.shape)
@@ -175,11 +175,11 @@ def _weave(tape: _Tape) -> None:
 
 
 def _ramps(tape: _Tape) -> None:
-    still = _constant(0.0)
+    zero = _constant(0.0)
     for phase in ("ramp straight", "ramp spin"):
         seconds = tape.about(8.0)
         ramp = _there_and_back(tape.about(0.3), seconds)
-        speed, turn = (ramp, still) if phase == "ramp straight" else (still, ramp)
+        speed, turn = (ramp, zero) if phase == "ramp straight" else (zero, ramp)
         tape.play(phase, seconds, speed, turn)
         tape.rest()
 
@@ -260,7 +260,7 @@ DRIVES: Mapping[str, Callable[[_Tape], ScriptedDrive]] = MappingProxyType(
 )
 
 
-def make_drive(name: str, seed: int, vehicle: Vehicle | None = None) -> ScriptedDrive:
+def create_drive(name: str, seed: int, vehicle: Vehicle | None = None) -> ScriptedDrive:
     """Make one of `DRIVES`.
 
     `rich`: about 150 s of everything that identification asks for, in random order; `free`: 140 s of a person with a

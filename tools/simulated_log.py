@@ -21,7 +21,7 @@ from sim.effects import HiddenEffects, effects_table, parse_hidden_effects
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
 from sim.sensors import PoseMeasurement
-from tools.simulated_drives import DRIVES, ScriptedDrive, Vehicle, make_drive
+from tools.simulated_drives import DRIVES, ScriptedDrive, Vehicle, create_drive
 
 COLUMNS = (
     "t_s",
@@ -102,9 +102,9 @@ def simulated_log(
         parameters or PlantParameters(), encoder_start_left_ticks=left_start, encoder_start_right_ticks=right_start
     )
     plant = Plant(parameters, effects, plant_seed)
-    command_s = _late(drive.t_s, drive.period_s, options, generator)
+    command_s = _delayed(drive.t_s, drive.period_s, options, generator)
     reading_period_s = 1.0 / options.encoder_rate_hz
-    reading_s = _late(np.arange(0.0, drive.duration_s, reading_period_s), reading_period_s, options, generator)
+    reading_s = _delayed(np.arange(0.0, drive.duration_s, reading_period_s), reading_period_s, options, generator)
     rows = [
         _row(stamp, command=(left, right))
         for stamp, left, right in zip(
@@ -161,12 +161,12 @@ def _run(
     return ticks, [pose for pose in poses if pose.sample_us <= last_us]
 
 
-def _late(
+def _delayed(
     t_s: npt.NDArray[np.float64], period_s: float, options: LogOptions, generator: np.random.Generator
 ) -> npt.NDArray[np.float64]:
     """When things due at t_s really happen."""
-    late_s = generator.exponential(options.lateness_s, size=len(t_s)) if options.lateness_s > 0.0 else 0.0
-    return t_s + np.minimum(late_s, LARGEST_JITTER_PERIODS * period_s)
+    delay_s = generator.exponential(options.lateness_s, size=len(t_s)) if options.lateness_s > 0.0 else 0.0
+    return t_s + np.minimum(delay_s, LARGEST_JITTER_PERIODS * period_s)
 
 
 def _stamped(
@@ -196,7 +196,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         effects = parse_hidden_effects(options.hide)
-        drive = make_drive(options.drive, options.seed, Vehicle(options.max_wheel_speed))
+        drive = create_drive(options.drive, options.seed, Vehicle(options.max_wheel_speed))
         parameters = _parameters(options)
     except ValueError as error:
         print(f"simulated_log: {error}", file=sys.stderr)

@@ -65,7 +65,7 @@ MOTORS = ("motor_lag", "command_delay")
 class _Wheel:
     """State of one side: what is requested of the motor, its speed, heat and angle, and the angle beyond the gear."""
 
-    asked: float = 0.0
+    hysteresis_rad_s: float = 0.0
     speed: float = 0.0
     heat: float = 0.0
     angle: float = 0.0
@@ -121,7 +121,7 @@ class Recording:
     values: Mapping[str, float] = field(default_factory=dict)
 
 
-def drawn(form: str, seed: int) -> dict[str, float]:
+def sampled_parameters(form: str, seed: int) -> dict[str, float]:
     """A form's parameters for a seed; raises KeyError for a form that does not exist."""
     rng = np.random.default_rng([seed, 8311, list(FORMS).index(form)])
     return {name: float(rng.uniform(*ends)) for name, ends in FORMS[form].items()}
@@ -132,16 +132,16 @@ def record(form: str | None, seed: int, command: Array | None = None, share: flo
 
     `share` scales the first parameter of the form.
     """
-    values = {} if form is None else drawn(form, seed)
+    values = {} if form is None else sampled_parameters(form, seed)
     if values:
         values[next(iter(values))] *= share
     rng = np.random.default_rng([seed, 9173])
     radius, axial, ahead = (each * (1.0 + rng.uniform(-0.047, 0.047)) for each in NOMINAL)
     lag_s, delay_s = rng.uniform(0.033, 0.062), rng.uniform(0.021, 0.039)
-    asked = joystick(seed, DURATION_S) if command is None else command
+    commands = joystick(seed, DURATION_S) if command is None else command
     steps_per_s = COMMANDS_PER_S * STEPS_A_COMMAND
-    dt, steps = 1.0 / steps_per_s, asked.shape[0] * STEPS_A_COMMAND
-    arrival = _arrivals(asked, delay_s, values if form == "rate_dependent_latency" else None)
+    dt, steps = 1.0 / steps_per_s, commands.shape[0] * STEPS_A_COMMAND
+    arrival = _arrivals(commands, delay_s, values if form == "rate_dependent_latency" else None)
     wheels, in_force, following = (_Wheel(), _Wheel()), (0.0, 0.0), 0
     body = _Body(axial, ahead, float(rng.uniform(-math.pi, math.pi)))
     phases, drained = rng.uniform(-math.pi, math.pi, 2), 0.0
@@ -150,13 +150,13 @@ def record(form: str | None, seed: int, command: Array | None = None, share: flo
     angles, path = np.empty((steps, 2)), np.empty((steps, 3))
     for k in range(steps):
         while following < len(arrival) and arrival[following] <= k * dt:
-            in_force, following = tuple(asked[following]), following + 1
+            in_force, following = tuple(commands[following]), following + 1
         if form == "cross_coupled_supply":
-            taken = values["share_s_rad"] * (abs(wheels[0].speed) + abs(wheels[1].speed))
-            drained += (taken - drained) * dt / values["memory_s"]
+            drain = values["share_s_rad"] * (abs(wheels[0].speed) + abs(wheels[1].speed))
+            drained += (drain - drained) * dt / values["memory_s"]
         rim = np.empty(2)
         for side, wheel in enumerate(wheels):
-            target = _asked(form, values, wheel, in_force[side]) * (1.0 - drained)
+            target = _target_speed(form, values, wheel, in_force[side]) * (1.0 - drained)
             wheel.speed += (target - wheel.speed) * -math.expm1(-dt / lag_s)
             wheel.angle += wheel.speed * dt
             if form == "thermal_fade":
@@ -167,25 +167,25 @@ def record(form: str | None, seed: int, command: Array | None = None, share: flo
         noise = keep * noise + shocks[k]
         body.move(form, values, rim * (1.0 + noise), dt)
         angles[k], path[k] = (wheels[0].angle, wheels[1].angle), (body.x, body.y, body.yaw)
-    return _measured(asked, angles, path, rng, values)
+    return _measured(commands, angles, path, rng, values)
 
 
-def _arrivals(asked: Array, delay_s: float, values: Mapping[str, float] | None) -> Array:
+def _arrivals(commands: Array, delay_s: float, values: Mapping[str, float] | None) -> Array:
     """When each command takes effect, s: later the more it differs from the one before, and never out of order."""
-    sent = np.arange(asked.shape[0]) / COMMANDS_PER_S
-    late = np.full(sent.size, delay_s)
+    sent = np.arange(commands.shape[0]) / COMMANDS_PER_S
+    delays_s = np.full(sent.size, delay_s)
     if values is not None:
-        change = np.abs(np.diff(asked, axis=0, prepend=asked[:1])).max(axis=1)
-        late += values["most_s"] * change / (change + values["half_rad_s"])
-    return np.maximum.accumulate(sent + late)
+        change = np.abs(np.diff(commands, axis=0, prepend=commands[:1])).max(axis=1)
+        delays_s += values["most_s"] * change / (change + values["half_rad_s"])
+    return np.maximum.accumulate(sent + delays_s)
 
 
-def _asked(form: str | None, values: Mapping[str, float], wheel: _Wheel, command: float) -> float:
+def _target_speed(form: str | None, values: Mapping[str, float], wheel: _Wheel, command: float) -> float:
     """The speed that a motor is after under a command."""
     if form == "hysteresis":
         half = values["half_width_rad_s"]
-        wheel.asked = min(max(wheel.asked, command - half), command + half)
-        return wheel.asked
+        wheel.hysteresis_rad_s = min(max(wheel.hysteresis_rad_s, command - half), command + half)
+        return wheel.hysteresis_rad_s
     if form == "stribeck_friction":
         sliding, breakaway = values["sliding_rad_s"], values["breakaway_rad_s"]
         fading = math.exp(-((wheel.speed / values["fading_rad_s"]) ** 2))
@@ -208,21 +208,21 @@ def _beyond_gear(form: str | None, values: Mapping[str, float], wheel: _Wheel, p
 
 
 def _measured(
-    asked: Array, angles: Array, path: Array, rng: np.random.Generator, values: Mapping[str, float]
+    commands: Array, angles: Array, path: Array, rng: np.random.Generator, values: Mapping[str, float]
 ) -> Recording:
     """Return the recording of a drive: commands as sent, counted angles, noisy poses."""
     steps_per_s = COMMANDS_PER_S * STEPS_A_COMMAND
     reading, posed = (np.arange(every - 1, angles.shape[0], every) for every in (STEPS_A_READING, STEPS_A_POSE))
     count = 2.0 * math.pi / COUNTS_PER_TURN
     seen = np.round(angles[reading] / count) * count
-    reading_s, posed_s, sent_s = (reading + 1) / steps_per_s, (posed + 1) / steps_per_s, np.arange(len(asked))
+    reading_s, posed_s, sent_s = (reading + 1) / steps_per_s, (posed + 1) / steps_per_s, np.arange(len(commands))
     segments = [np.zeros(each.size, dtype=np.int64) for each in (sent_s, reading_s, posed_s)]
     poses = path[posed] + rng.standard_normal((posed.size, 3)) * (POSITION_STD_M, POSITION_STD_M, YAW_STD_RAD)
     speeds = [differentiate_angle(reading_s, seen[:, side], segments[1]) for side in (0, 1)]
     nothing = np.empty(0)
     log = DriveLog(
         ("strange",),
-        Commands(sent_s / COMMANDS_PER_S, asked[:, 0], asked[:, 1], segments[0]),
+        Commands(sent_s / COMMANDS_PER_S, commands[:, 0], commands[:, 1], segments[0]),
         Wheels(reading_s, seen[:, 0], seen[:, 1], speeds[0], speeds[1], segments[1], True, False),
         Poses(posed_s, poses[:, 0], poses[:, 1], poses[:, 2], segments[2]),
         Gyro(nothing, nothing, np.empty(0, dtype=np.int64)),

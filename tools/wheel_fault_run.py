@@ -34,7 +34,7 @@ from sim.virtual_robot import STEP_US, VendorRobot
 
 ROBOTS = Path(disco_hw.__file__).parent / "robots"
 RADIUS_M = 0.75
-STANDS_RAD_S = 0.1
+STATIONARY_RAD_S = 0.1
 FAULTS: Mapping[str, tuple[str, dict[str, Any]]] = {
     "frozen": ("encoder_stuck", {}),
     "disconnected": ("encoder_disconnected", {}),
@@ -74,9 +74,9 @@ class VendorInProcess:
 
     def __init__(self, setup: Setup, plant: Plant, pose_sink: Any) -> None:
         link = setup.config.link
-        make = find_controller(str(link.driver))
-        assert make is not None
-        controller: Any = make(link.settings(), plant.parameters.ticks_per_rev)
+        create_controller = find_controller(str(link.driver))
+        assert create_controller is not None
+        controller: Any = create_controller(link.settings(), plant.parameters.ticks_per_rev)
         self.board = VendorRobot(plant, controller, pose_sink)
         exchange = find_driver(link.driver).exchange if link.kind == "serial" else None
         self._exchange = None if exchange is None else exchange(link.settings())
@@ -96,16 +96,16 @@ class VendorInProcess:
         while self._now_us < until_us:
             self._now_us += STEP_US
             for received in self._link.receive():
-                self._take(received.frame)
+                self._receive(received.frame)
             for frame in self.board.step(self._now_us):
                 self._send(frame)
 
-    def _take(self, frame: Any) -> None:
+    def _receive(self, frame: Any) -> None:
         if self._exchange is None:
             self.board.receive(self._now_us, frame)
             return
-        said = self.board.controller.receive(self._now_us, CanFrame(0, self._exchange.request(frame)))
-        reply = self._exchange.reply(frame, b"".join(each.data for each in said))
+        frames = self.board.controller.receive(self._now_us, CanFrame(0, self._exchange.request(frame)))
+        reply = self._exchange.reply(frame, b"".join(each.data for each in frames))
         if reply is not None:
             self._send(reply)
 
@@ -249,8 +249,8 @@ class WheelFaultRun:
             truth = self.board.truth
             true = (truth.left_speed_rad_s, truth.right_speed_rad_s)
             if shows_us is None:
-                asked = (0.0, 0.0) if tick.command is None else (tick.command.left_rad_s, tick.command.right_rad_s)
-                shows_us = begun_us if max(map(abs, asked)) > 0.0 else None
+                commanded = (0.0, 0.0) if tick.command is None else (tick.command.left_rad_s, tick.command.right_rad_s)
+                shows_us = begun_us if max(map(abs, commanded)) > 0.0 else None
             if shows_us is not None:
                 travel += max(map(abs, true)) * 1e-6 * (now_us - last_us)
             last_us = now_us
@@ -258,7 +258,7 @@ class WheelFaultRun:
             if math.isnan(run.noticed_s) and tick.output.state is not State.ARMED and shows_us is not None:
                 run.noticed_s = 1e-6 * (now_us - shows_us)
                 run.status_text = tick.output.detail
-            is_stationary = max(map(abs, true)) < STANDS_RAD_S and not tick.output.motion_allowed
+            is_stationary = max(map(abs, true)) < STATIONARY_RAD_S and not tick.output.motion_allowed
             stood_us = (stood_us or now_us) if is_stationary and not math.isnan(run.noticed_s) else None
             if stood_us == now_us:
                 run.stopped_s, run.travel_rad = 1e-6 * (now_us - (shows_us or begun_us)), travel

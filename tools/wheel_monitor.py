@@ -63,7 +63,7 @@ class MonitoredLimits:
     drive_off_s: float = 0.5
     # From 8 rad/s the plant's wheels, with a lag of 0.06 s, need this long to stand once zero is asked for.
     settling_s: float = 0.6
-    still_rad_s: float = 0.05
+    stationary_rad_s: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -218,7 +218,7 @@ class WheelMonitor:
             self._zero_since_us = now_us
         zero_s = 0.0 if self._zero_since_us is None else (now_us - self._zero_since_us) * 1e-6
         fastest = max(map(abs, wheel_speeds))
-        if zero_s > self.limits.settling_s and fastest > self.limits.still_rad_s:
+        if zero_s > self.limits.settling_s and fastest > self.limits.stationary_rad_s:
             self._report(now_us, f"the wheels turn at {fastest:.3f} rad/s {zero_s:.2f} s after zero was asked for")
 
     def _report(self, now_us: int, text: str) -> None:

@@ -35,7 +35,7 @@ def watcher() -> Path | None:
 
 
 @contextmanager
-def held_up_ms() -> Iterator[list[int]]:
+def longest_pause_ms() -> Iterator[list[int]]:
     """Yield a list for how long (ms) this machine held up what ran, with one entry after the block.
 
     The longest time for which a processor ran nobody, or the most that the host took within LOOKS periods.
@@ -46,10 +46,10 @@ def held_up_ms() -> Iterator[list[int]]:
 
     def watch() -> None:
         nonlocal worst
-        said = deque([processes.stolen_ms()], LOOKS + 1)
+        stolen_ms = deque([processes.stolen_ms()], LOOKS + 1)
         while not ended.wait(PERIOD_S):
-            said.append(processes.stolen_ms())
-            worst = max(worst, said[-1] - said[0])
+            stolen_ms.append(processes.stolen_ms())
+            worst = max(worst, stolen_ms[-1] - stolen_ms[0])
 
     program, thread = watcher(), threading.Thread(target=watch)
     watching = nullcontext(list) if program is None else watched_processors(program, program.parent, WATCH_US, LEAST_US)
@@ -66,7 +66,7 @@ def held_up_ms() -> Iterator[list[int]]:
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool:
     item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
-    with held_up_ms() as most:
+    with longest_pause_ms() as most:
         reports = runtestprotocol(item, log=False, nextitem=nextitem)
     if most[0] >= STALL_MS and any(report.failed and report.when == "call" for report in reports):
         item.warn(pytest.PytestWarning(f"tried once more: this machine ran nothing for {most[0]} ms"))

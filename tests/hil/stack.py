@@ -13,7 +13,7 @@ from unittest import mock
 from disco_hw.cli import main
 from tools.stack import TruthRow
 
-STILL_RAD_S = 0.05
+STATIONARY_RAD_S = 0.05
 COMMAND_TIMEOUT_S = 0.1
 DECELERATION_RAD_S2 = 20.0
 # The motors follow their setpoint with a lag of 0.06 s: from 8 rad/s that takes 0.21 s after the ramp has ended.
@@ -63,12 +63,16 @@ def assert_stopped_in_time(rows: list[TruthRow], cut_s: float) -> None:
     final = rows[-1].accepted
     last_accepted = next(row for row in rows if row.accepted == final)
     # The firmware still slews towards the last command while it waits for the next one.
-    held = [row.requested for row in rows if last_accepted.t_s <= row.t_s <= last_accepted.t_s + COMMAND_TIMEOUT_S]
-    ramp_s = max(held) / DECELERATION_RAD_S2
-    asked_zero_by = last_accepted.t_s + COMMAND_TIMEOUT_S + ramp_s + 0.02
-    stands_by = asked_zero_by + MOTOR_SETTLING_S
-    late_asks = [row for row in rows if row.t_s > asked_zero_by and row.requested > 1e-6]
-    assert not late_asks, f"asked for {late_asks[0].requested} rad/s {late_asks[0].t_s - last_accepted.t_s:.3f} s later"
-    turning = [row for row in rows if row.t_s > stands_by and row.fastest >= STILL_RAD_S]
+    requested_rad_s = [
+        row.requested for row in rows if last_accepted.t_s <= row.t_s <= last_accepted.t_s + COMMAND_TIMEOUT_S
+    ]
+    ramp_s = max(requested_rad_s) / DECELERATION_RAD_S2
+    zero_requested_s = last_accepted.t_s + COMMAND_TIMEOUT_S + ramp_s + 0.02
+    stationary_s = zero_requested_s + MOTOR_SETTLING_S
+    later_requests = [row for row in rows if row.t_s > zero_requested_s and row.requested > 1e-6]
+    assert not later_requests, (
+        f"asked for {later_requests[0].requested} rad/s {later_requests[0].t_s - last_accepted.t_s:.3f} s later"
+    )
+    turning = [row for row in rows if row.t_s > stationary_s and row.fastest >= STATIONARY_RAD_S]
     assert not turning, f"{turning[0].fastest} rad/s {turning[0].t_s - last_accepted.t_s:.3f} s later"
-    assert rows[-1].t_s > stands_by + 0.5, "the truth ends too early to judge"
+    assert rows[-1].t_s > stationary_s + 0.5, "the truth ends too early to judge"

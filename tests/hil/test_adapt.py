@@ -17,13 +17,13 @@ from tools.stack import newest_truth_s, running_stack
 
 pytestmark = [pytest.mark.hil, pytest.mark.long]
 
-LEARNT_S = 30.0
+ADAPTED_S = 30.0
 
 
 CIRCLE, CIRCLE_START = 'kind = "circle"\nradius_m = 0.75\nspeed_m_s = 0.2\n', (0.75, 0.0, 1.5707963)
 # By x_icr, wheel radius and axial distance of the model file.
 OTHER_ROBOT = np.array([1.0, 1.13, 0.87])
-SETTLED_S, JUDGED_S = 10.0, 25.0
+SETTLED_S, EVALUATED_S = 10.0, 25.0
 COST = 0.022
 """Mean tracking cost on the truth: 0.013 learning, 0.033 not learning."""
 RELEARNT_COST = 0.0145
@@ -41,7 +41,7 @@ def driven_otherwise(directory, adaptation):
         stack.start()
         stack.operator.wait_until("driving", lambda s: s["source"] == "plan", 10.0)
         begun_s = newest_truth_s(directory / "truth.csv")
-        end_s = begun_s + SETTLED_S + JUDGED_S
+        end_s = begun_s + SETTLED_S + EVALUATED_S
         stack.operator.wait_until("the end", lambda s: newest_truth_s(directory / "truth.csv") > end_s, 120.0)
         stack.operator.request("quit")
         assert stack.daemon.process.wait(10.0) == 0
@@ -75,7 +75,7 @@ def test_an_operator_takes_the_learnt_belief_back_while_driving(tmp_path):
     with running_stack(tmp_path, "can", CIRCLE, CIRCLE_START, run_arguments=("--adapt",)) as stack:
         operator = stack.operator
         stack.start()
-        operator.wait_until("adapting", lambda s: s["adaptation"]["belief"] == "adapted", LEARNT_S)
+        operator.wait_until("adapting", lambda s: s["adaptation"]["belief"] == "adapted", ADAPTED_S)
         operator.request("revert")
         reverted = operator.wait_until("the model's belief", lambda s: s["adaptation"]["belief"] == "model", 2.0)
         assert (reverted["state"], reverted["running"]) == ("ARMED", True)

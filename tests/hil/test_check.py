@@ -43,12 +43,12 @@ def test_check_fails_without_a_robot_and_says_what_to_do(tmp_path):
     assert "adaptation: measured, as pose.rate_hz is not given" in output
 
 
-def wait_for_line(path, word: str, timeout_s: float = 30.0) -> None:
+def wait_for_line(path, text: str, timeout_s: float = 30.0) -> None:
     import time
 
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
-        if word in path.read_text():
+        if text in path.read_text():
             return
         time.sleep(0.05)
-    raise AssertionError(f"no {word!r} in {path.read_text()!r}")
+    raise AssertionError(f"no {text!r} in {path.read_text()!r}")

@@ -51,7 +51,7 @@ def test_demo_follows_the_circle(tmp_path, link, plant_seed, laps):
     assert (tmp_path / "demo.mcap").stat().st_size > 100_000
     assert (tmp_path / "circle.png").read_bytes().startswith(b"\x89PNG")
     # The demonstration has no fence to show.
-    assert shown_in_vain(tmp_path / "demo.mcap") == {"/view/fence"}
+    assert shown_but_not_logged(tmp_path / "demo.mcap") == {"/view/fence"}
     replayed = subprocess.run(
         [sys.executable, "-m", "disco_hw", "replay", "--json", str(tmp_path / "demo.mcap")],
         capture_output=True,
@@ -62,7 +62,7 @@ def test_demo_follows_the_circle(tmp_path, link, plant_seed, laps):
     assert replayed.returncode == 0, replayed.stdout + replayed.stderr
 
 
-def shown_in_vain(log):
+def shown_but_not_logged(log):
     """What a panel of the shipped Foxglove layout shows and the log does not hold: topics, and fields of messages."""
     layout = LAYOUT.read_text(encoding="utf-8")
     panels = json.loads(layout)["configById"]

@@ -17,7 +17,7 @@ from tools.stack import write_robot_file
 pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.timeout(400)]
 _REPEAT_S = 0.03
 _RELEASE_S = 0.8
-_IN_VAIN = ("release all keys", "release the deadman", "release it and press")
+_RELEASE_PROMPTS = ("release all keys", "release the deadman", "release it and press")
 """What is said to whose key came too late: they let go and hold again."""
 
 
@@ -43,7 +43,7 @@ class Terminal:
                 except OSError:
                     break
                 self.output_lines += fresh
-                if any(words in fresh for words in _IN_VAIN):
+                if any(prompt in fresh for prompt in _RELEASE_PROMPTS):
                     self._next_s = time.monotonic() + _RELEASE_S
             if self.holding and time.monotonic() >= self._next_s:
                 self.type(" ")
@@ -53,12 +53,12 @@ class Terminal:
     def type(self, keys):
         os.write(self.master, keys.encode())
 
-    def wait(self, words, timeout_s=120.0):
-        return self.pump(lambda said: words in said, timeout_s)
+    def wait(self, text, timeout_s=120.0):
+        return self.pump(lambda output: text in output, timeout_s)
 
     def pause(self, seconds):
         end_s = time.monotonic() + seconds
-        self.pump(lambda _said: time.monotonic() > end_s)
+        self.pump(lambda _output: time.monotonic() > end_s)
 
 
 def test_the_first_stage_goes_through_at_a_terminal(tmp_path):
@@ -71,12 +71,12 @@ def test_the_first_stage_goes_through_at_a_terminal(tmp_path):
             terminal.type("\n")
             terminal.wait("the left side speeds up slowly")
             terminal.pause(3.0)
-            for side, answer in (("left", "1"), ("right", "3")):
+            for side, key in (("left", "1"), ("right", "3")):
                 terminal.holding = True
                 terminal.wait(f"the {side} side was commanded forward")
                 terminal.holding = False
                 terminal.pause(0.5)
-                terminal.type(answer)
+                terminal.type(key)
                 terminal.pause(1.0)
             terminal.wait("commissioned")
             assert terminal.process.wait(20.0) == 0

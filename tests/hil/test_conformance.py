@@ -21,7 +21,9 @@ def conform(robot_file, *arguments, at_terminal=""):
     result = subprocess.run(
         command, cwd=ROOT, input=at_terminal, capture_output=True, text=True, timeout=250, check=False
     )
-    found = {word: int(count) for count, word in re.findall(r"(\d+) (passed|failed|skipped|error)", result.stdout)}
+    found = {
+        outcome: int(count) for count, outcome in re.findall(r"(\d+) (passed|failed|skipped|error)", result.stdout)
+    }
     return result.returncode, found, result.stdout + result.stderr
 
 

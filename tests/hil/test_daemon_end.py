@@ -12,7 +12,7 @@ import pytest
 
 from disco_hw.experiments import Child
 from disco_hw.log.reader import open_log
-from tests.hil.stack import STILL_RAD_S
+from tests.hil.stack import STATIONARY_RAD_S
 from tools.stack import running_stack
 
 pytestmark = pytest.mark.hil
@@ -31,7 +31,7 @@ def test_a_signal_stops_the_wheels_before_the_process_ends(tmp_path, number):
     assert code == 0
     before = [row for row in rows if row.t_s < ended_s]
     assert max(row.fastest for row in before) > 5.0
-    assert before[-1].fastest < STILL_RAD_S
+    assert before[-1].fastest < STATIONARY_RAD_S
     assert before[-1].state in {"STANDBY", "READY"}
     with open_log(tmp_path / "run.mcap") as log:
         assert log.summary().complete
@@ -46,7 +46,7 @@ def test_quit_stops_the_wheels_too(tmp_path):
         assert stack.daemon.process.wait(60.0) == 0
         ended_s = time.monotonic()
         rows = stack.truth()
-    assert next(row for row in reversed(rows) if row.t_s < ended_s).fastest < STILL_RAD_S
+    assert next(row for row in reversed(rows) if row.t_s < ended_s).fastest < STATIONARY_RAD_S
 
 
 FAILING = """
@@ -99,7 +99,7 @@ def test_an_exception_in_the_loop_stops_the_wheels_and_is_reported(tmp_path, mon
     # 60 plans are 1.2 s; how fast it has become by then is not this test's matter.
     assert max(row.fastest for row in rows) > 2.0
     last_command = next(row for row in rows if row.accepted == rows[-1].accepted)
-    assert all(row.fastest < STILL_RAD_S for row in rows if row.t_s > last_command.t_s + 0.75)
+    assert all(row.fastest < STATIONARY_RAD_S for row in rows if row.t_s > last_command.t_s + 0.75)
 
 
 def test_a_planner_without_a_valid_control_follows_the_tail_then_ramps_down(tmp_path, monkeypatch):

@@ -41,27 +41,27 @@ def disarm(pid, line):
 class Stolen:
     """Stands for `stolen_ms`; asked first, it lets `act` happen to the first daemon after 1.5 s.
 
-    It says 0, `early_ms` from 0.2 s on, and `taken_ms` more from just before `act` on.
+    It says 0, `early_ms` from 0.2 s on, and `stolen_ms` more from just before `act` on.
     """
 
-    def __init__(self, taken_ms, act, early_ms=0):
-        self._taken_ms = taken_ms
+    def __init__(self, stolen_ms, act, early_ms=0):
+        self._stolen_ms = stolen_ms
         self._early_ms = early_ms
         self._act = act
-        self._said_ms = None
+        self._reported_ms = None
 
     def __call__(self):
-        if self._said_ms is None:
-            self._said_ms = 0
+        if self._reported_ms is None:
+            self._reported_ms = 0
             Timer(0.2, self._rise, (self._early_ms,)).start()
             Timer(1.5, self._strike, daemon()).start()
-        return self._said_ms
+        return self._reported_ms
 
     def _rise(self, by_ms):
-        self._said_ms += by_ms
+        self._reported_ms += by_ms
 
     def _strike(self, pid, line):
-        self._rise(self._taken_ms)
+        self._rise(self._stolen_ms)
         self._act(pid, line)
 
 
@@ -69,20 +69,20 @@ class Stolen:
 def test_it_drives_anew_where_the_machines_host_held_the_daemon_up(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(demo, "stolen_ms", Stolen(120, hold_up))
     report = demo.run_demo(demo.DemoOptions(out=tmp_path, laps=0.2))
-    said = " ".join(capsys.readouterr().out.split())
+    output = " ".join(capsys.readouterr().out.split())
     assert report.success
-    assert said.count("virtual robot pid") == 2
+    assert output.count("virtual robot pid") == 2
     # Held up for 0.3 s, the daemon comes back just as the wheels come to a stand.
-    assert re.search(LEFT_ARMED, said)
-    assert "the host of this virtual machine took 120 ms" in said
+    assert re.search(LEFT_ARMED, output)
+    assert "the host of this virtual machine took 120 ms" in output
 
 
 @pytest.mark.parametrize(
     ("stolen", "act"),
     [
-        pytest.param({"taken_ms": 120}, disarm, marks=pytest.mark.long),
-        pytest.param({"taken_ms": 0, "early_ms": 5000}, hold_up, marks=pytest.mark.thorough),
-        pytest.param({"taken_ms": 90}, hold_up, marks=pytest.mark.long),
+        pytest.param({"stolen_ms": 120}, disarm, marks=pytest.mark.long),
+        pytest.param({"stolen_ms": 0, "early_ms": 5000}, hold_up, marks=pytest.mark.thorough),
+        pytest.param({"stolen_ms": 90}, hold_up, marks=pytest.mark.long),
     ],
 )
 def test_whatever_else_stops_it_ends_it(tmp_path, monkeypatch, capsys, stolen, act):
@@ -93,7 +93,7 @@ def test_whatever_else_stops_it_ends_it(tmp_path, monkeypatch, capsys, stolen, a
 
 
 @pytest.mark.parametrize(
-    ("state", "cause", "anew"),
+    ("state", "cause", "is_stall"),
     [
         ("STOPPING", "COMMAND_TIMEOUT", True),
         ("READY", "COMMAND_TIMEOUT", True),
@@ -101,13 +101,13 @@ def test_whatever_else_stops_it_ends_it(tmp_path, monkeypatch, capsys, stolen, a
         ("FAULT", "COMMAND_TIMEOUT", False),
     ],
 )
-def test_a_stall_is_known_though_the_wheels_stand_at_the_first_status(state, cause, anew):
+def test_a_stall_is_known_though_the_wheels_stand_at_the_first_status(state, cause, is_stall):
     class Stopped:
         def wait_until(self, what, accept, timeout_s):
             return {"state": "READY", "stop_cause": cause}
 
     status = {"state": state, "detail": "", "stop_cause": cause}
-    assert isinstance(demo._why_stopped(Stopped(), status, 120), demo._HostStallError) is anew
+    assert isinstance(demo._why_stopped(Stopped(), status, 120), demo._HostStallError) is is_stall
 
 
 @pytest.mark.long

@@ -20,7 +20,7 @@ from disco_hw.log.load import load_drive
 from disco_hw.log.reader import open_log
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.replay import replay
-from tests.hil.stack import DECELERATION_RAD_S2, MOTOR_SETTLING_S, STILL_RAD_S
+from tests.hil.stack import DECELERATION_RAD_S2, MOTOR_SETTLING_S, STATIONARY_RAD_S
 from tools.stack import write_robot_file
 
 pytestmark = pytest.mark.hil
@@ -100,7 +100,7 @@ def typing(master, key):
         process.wait()
 
 
-def assert_stands_in_time(t_s, wheels, before_s, silent_s):
+def assert_stops_in_time(t_s, wheels, before_s, silent_s):
     """The wheels stand 200 ms plus the deceleration after the last input, and for the rest of the run.
 
     The input fell silent at some time between `before_s` and `silent_s`.
@@ -110,8 +110,8 @@ def assert_stands_in_time(t_s, wheels, before_s, silent_s):
     assert fastest > 1.5, "the robot was not driving when the input fell silent"
     by_s = silent_s + INPUT_LIMIT_NS * 1e-9 + fastest / DECELERATION_RAD_S2 + MOTOR_SETTLING_S + MARGIN_S
     assert t_s[-1] > by_s + 0.3, "the truth ends too early to judge"
-    late = size[t_s > by_s]
-    assert late.max() < STILL_RAD_S, f"{late.max()} rad/s"
+    after = size[t_s > by_s]
+    assert after.max() < STATIONARY_RAD_S, f"{after.max()} rad/s"
 
 
 @pytest.mark.thorough
@@ -135,7 +135,7 @@ def test_a_script_is_driven_unattended_and_recorded_as_executed(tmp_path, monkey
     commands = np.column_stack([drive.commands.left_rad_s, drive.commands.right_rad_s])
     given = commands[np.isfinite(commands).all(axis=1)]
     assert np.abs(np.diff(given, axis=0)).max() <= 20.0 * 0.03 + 1e-9
-    assert np.abs(wheels[-1]).max() < STILL_RAD_S
+    assert np.abs(wheels[-1]).max() < STATIONARY_RAD_S
     # No plan was made, so the replay needs no planner either, which takes long to compile.
     monkeypatch.setattr("disco_hw.runtime.replay.create_planner", lambda *_: NoPlanner())
     assert replay(made.log).ok
@@ -171,8 +171,8 @@ def test_a_key_held_drives_and_a_frozen_typist_stops_the_robot(tmp_path):
         t_s, wheels = made.truth()
     os.close(master)
     again_s = t_s[np.flatnonzero((t_s > frozen_s + 0.2) & (wheels.max(axis=1) < -0.2))[0]]
-    assert_stands_in_time(t_s[t_s < again_s - 0.1], wheels[t_s < again_s - 0.1], before_s, frozen_s)
-    assert np.abs(wheels[-1]).max() < STILL_RAD_S
+    assert_stops_in_time(t_s[t_s < again_s - 0.1], wheels[t_s < again_s - 0.1], before_s, frozen_s)
+    assert np.abs(wheels[-1]).max() < STATIONARY_RAD_S
 
 
 @pytest.mark.thorough
@@ -190,7 +190,7 @@ def test_a_terminal_that_closes_stops_the_robot_and_ends(tmp_path):
         assert process.wait(60.0) == 1
         time.sleep(1.0)
         t_s, wheels = made.truth()
-    assert_stands_in_time(t_s, wheels, before_s, closed_s)
+    assert_stops_in_time(t_s, wheels, before_s, closed_s)
     with open_log(made.log) as log:
         last = log.columns("/daemon/state")["state"][-1]
     assert last == "READY"

@@ -9,7 +9,7 @@ import time
 import pytest
 
 from disco_hw.errors import WorkError
-from tests.hil.stack import STILL_RAD_S, disco, disco_json
+from tests.hil.stack import STATIONARY_RAD_S, disco, disco_json
 from tools.stack import running_stack
 
 pytestmark = pytest.mark.hil
@@ -38,7 +38,7 @@ def test_estop_stops_and_latches(tmp_path, link, daemon):
             robot_file.write_text(text)
             assert "round" in text
         code, outcome = disco_json("estop", str(robot_file))
-        told_s = time.monotonic()
+        replied_s = time.monotonic()
         if daemon == "frozen":
             os.kill(stack.daemon.process.pid, signal.SIGCONT)
         assert code == 0, outcome
@@ -51,14 +51,14 @@ def test_estop_stops_and_latches(tmp_path, link, daemon):
         stack.operator.request("reset")
         stack.operator.wait_for("READY", 5.0)
         rows = stack.truth()
-        said = (tmp_path / "daemon.txt").read_text()
+        output = (tmp_path / "daemon.txt").read_text()
     # The daemon hears the frames of `disco-hw estop` on a bus that all share.
-    assert "another host is on the link" not in said
+    assert "another host is on the link" not in output
     if (link, daemon) == ("can", "healthy"):
-        assert said.count("e-stop received on the link") == 1
-    stopped = [row for row in rows if row.t_s > told_s + 0.5]
+        assert output.count("e-stop received on the link") == 1
+    stopped = [row for row in rows if row.t_s > replied_s + 0.5]
     assert any(row.state == "ESTOP" for row in rows)
-    assert max(row.fastest for row in stopped) < STILL_RAD_S
+    assert max(row.fastest for row in stopped) < STATIONARY_RAD_S
 
 
 def test_estop_without_a_robot_says_so_and_fails(tmp_path):

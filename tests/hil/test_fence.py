@@ -46,8 +46,8 @@ def test_a_daemon_keeps_its_task_inside_and_stops_for_an_obstacle_that_is_report
         both = operator.wait_until("aware of both", lambda s: len(s["area"]["obstacles"]) == 2, AGE_LIMIT_S)
         assert both["running"]
         assert both["area"]["verdict"] in {"free", "scaled"}
-        lost = operator.wait_until("stopped for the person", lambda s: not s["running"], 2.0 * AGE_LIMIT_S)
-        assert lost["area"]["verdict"] == "obstacle lost"
+        stopped = operator.wait_until("stopped for the person", lambda s: not s["running"], 2.0 * AGE_LIMIT_S)
+        assert stopped["area"]["verdict"] == "obstacle lost"
         operator.wait_for_standstill(2.0)
         code, output = disco("ctl", robot, "status")
         assert code == 0, output

@@ -15,11 +15,11 @@ from disco_hw import processes
 from tests.hil import conftest
 
 def stolen_ms():
-    processes.looks.append({taken_ms} if len(processes.looks) > 2 else 0)
+    processes.looks.append({stolen_ms} if len(processes.looks) > 2 else 0)
     return processes.looks[-1]
 
 processes.looks, processes.stolen_ms = [], stolen_ms
-if {taken_ms}:
+if {stolen_ms}:
     conftest.watcher = lambda: None
 pytest_runtest_protocol = conftest.pytest_runtest_protocol
 """
@@ -63,14 +63,14 @@ def run(folder):
 
 
 @pytest.mark.parametrize(
-    ("taken_ms", "passes_at", "tries", "code"),
+    ("stolen_ms", "passes_at", "tries", "code"),
     [
         (120, 2, 2, 0),
         *(pytest.param(*case, marks=pytest.mark.thorough) for case in ((120, 3, 2, 1), (90, 2, 1, 1), (120, 1, 1, 0))),
     ],
 )
-def test_a_failure_is_tried_once_more_where_the_host_took_the_processors(tmp_path, taken_ms, passes_at, tries, code):
-    (tmp_path / "conftest.py").write_text(CONFTEST.format(taken_ms=taken_ms))
+def test_a_failure_is_tried_once_more_where_the_host_took_the_processors(tmp_path, stolen_ms, passes_at, tries, code):
+    (tmp_path / "conftest.py").write_text(CONFTEST.format(stolen_ms=stolen_ms))
     (tmp_path / "test_it.py").write_text(TEST.format(passes_at=passes_at, happens="wait_for_looks"))
     result = run(tmp_path)
     assert result.returncode == code, result.stdout + result.stderr
@@ -80,7 +80,7 @@ def test_a_failure_is_tried_once_more_where_the_host_took_the_processors(tmp_pat
 
 @pytest.mark.skipif(watcher() is None, reason="needs cc and the right to SCHED_FIFO")
 def test_so_is_one_during_which_a_processor_ran_nobody(tmp_path):
-    (tmp_path / "conftest.py").write_text(CONFTEST.format(taken_ms=0))
+    (tmp_path / "conftest.py").write_text(CONFTEST.format(stolen_ms=0))
     (tmp_path / "test_it.py").write_text(TEST.format(passes_at=2, happens="hold_up") + PAUSE)
     result = run(tmp_path)
     assert result.returncode == 0, result.stdout + result.stderr

@@ -34,9 +34,9 @@ def test_a_daemon_that_drives_has_locked_no_more_than_it_says(tmp_path, monkeypa
     with running_stack(directory) as stack:
         stack.drive()
         locked = locked_bytes(stack.daemon.process.pid)
-        said = stack.daemon.output.read_text(encoding="utf-8")
-    assert "memory: locked" in said
-    assert "compiled" in said or not compiles
+        output = stack.daemon.output.read_text(encoding="utf-8")
+    assert "memory: locked" in output
+    assert "compiled" in output or not compiles
     assert 50_000_000 < locked <= MOST_LOCKED_BYTES
 
 

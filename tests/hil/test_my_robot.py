@@ -89,11 +89,11 @@ class Reader:
         """The page's next command in a terminal, or that of before `again`; it has to end well unless it `may_fail`."""
         assert again or self.left.pop(0) == line
         self.commands += 1
-        words = line.replace("ROBOT.toml", "robot.toml").replace("can:socketcan:can0", self.link).split()
-        terminal = Terminal([sys.executable, "-m", "disco_hw", *words[1:]], self.directory)
+        arguments = line.replace("ROBOT.toml", "robot.toml").replace("can:socketcan:can0", self.link).split()
+        terminal = Terminal([sys.executable, "-m", "disco_hw", *arguments[1:]], self.directory)
         try:
             yield terminal
-            terminal.pump(lambda _said: terminal.process.poll() is not None, PATIENCE_S)
+            terminal.pump(lambda _output: terminal.process.poll() is not None, PATIENCE_S)
             code = terminal.process.wait(10.0)
             assert code == 0 or may_fail, f"{line}: {terminal.output_lines[-3000:]}"
         finally:
@@ -139,20 +139,20 @@ class Reader:
                 mine.unlink()
         return float(row[4]), float(row[5])
 
-    def answer(self, terminal, question, answer):
+    def reply(self, terminal, prompt, keys):
         """Rest the hands a moment, as whoever lets go of a key to press another does."""
-        terminal.wait(question, PATIENCE_S)
+        terminal.wait(prompt, PATIENCE_S)
         terminal.holding = False
         terminal.pause(0.7)
-        self.press(terminal, answer)
+        self.press(terminal, keys)
 
     def settings(self):
         """The robot.toml that `init` asks for and writes."""
         with self.type(TYPED[0]) as terminal:
             if self.driver == "roboclaw":
-                self.answer(terminal, "[y/n]", "y\n")
-            for asked, value in MEASURES.items():
-                self.answer(terminal, asked, value + "\n")
+                self.reply(terminal, "[y/n]", "y\n")
+            for prompt, value in MEASURES.items():
+                self.reply(terminal, prompt, value + "\n")
         assert tomllib.loads(self.robot_file.read_text("utf-8"))["link"]["driver"] == self.driver, terminal.output_lines
         if self.driver != "reference":
             self.write_poses()
@@ -172,24 +172,24 @@ class Reader:
 
     def first_drive(self):
         with self.type(TYPED[2]) as terminal:
-            self.answer(terminal, "press Enter", "\n")
+            self.reply(terminal, "press Enter", "\n")
             for side, key in (("left", "1"), ("right", "3")):
                 terminal.wait(f"the {side} side speeds up", PATIENCE_S)
                 terminal.pause(0.7)
                 with self.holding(terminal):
                     terminal.wait(f"the {side} side was commanded forward", PATIENCE_S)
-                self.answer(terminal, "", key)
-            self.answer(terminal, "press Enter", "\n")
+                self.reply(terminal, "", key)
+            self.reply(terminal, "press Enter", "\n")
             for side in (0, 1):
                 terminal.wait(f"the {('left', 'right')[side]} wheel; hold", PATIENCE_S)
                 terminal.pause(0.7)
                 with self.holding(terminal):
                     self.until_one_turn(terminal, side)
-                self.answer(terminal, "was that one turn", "y")
+                self.reply(terminal, "was that one turn", "y")
             terminal.wait("both sides turn", PATIENCE_S)
             terminal.pause(0.7)
             with self.holding(terminal):
-                terminal.pump(lambda said: "let go:" in said or "press Enter" in said, PATIENCE_S)
+                terminal.pump(lambda output: "let go:" in output or "press Enter" in output, PATIENCE_S)
             if "press Enter" not in terminal.output_lines.rsplit("both sides turn", 1)[1]:
                 terminal.wait("press Enter", PATIENCE_S)
             terminal.pause(0.7)
@@ -197,7 +197,7 @@ class Reader:
             terminal.wait("half a metre straight on", PATIENCE_S)
             terminal.pause(0.7)
             with self.holding(terminal):
-                terminal.pump(lambda said: "commissioned" in said, PATIENCE_S)
+                terminal.pump(lambda output: "commissioned" in output, PATIENCE_S)
         assert "\nnot commissioned" not in terminal.output_lines
 
     def until_one_turn(self, terminal, side):
@@ -215,7 +215,8 @@ class Reader:
                 terminal.pause(0.7)
                 with self.holding(terminal):
                     terminal.pump(
-                        lambda said: "release all keys" in said[200:] or terminal.process.poll() is not None, PATIENCE_S
+                        lambda output: "release all keys" in output[200:] or terminal.process.poll() is not None,
+                        PATIENCE_S,
                     )
 
     def circle(self):

@@ -17,7 +17,7 @@ from disco_hw.log.reader import open_log
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.viewer import scene
 from tests.drivers.waiting import free_port
-from tests.hil.stack import DECELERATION_RAD_S2, STILL_RAD_S
+from tests.hil.stack import DECELERATION_RAD_S2, STATIONARY_RAD_S
 from tests.hil.test_drive import Bench
 from tests.viewer.camera import project, screenshot, shows
 from tests.viewer.test_page import scene_canvas, wait_for
@@ -53,11 +53,11 @@ def test_the_page_draws_the_robot_survives_being_stopped_and_its_estop_stops_the
         with page_of(stack.robot_file, tmp_path / "page.txt") as (page, url), opened(browser, url, 760, 560) as tab:
             stack.operator.wait_for("READY", 60.0)
             tab.frame_locator("#scene").get_by_text("READY, no fault").wait_for(state="attached")
-            assert_drawn(tab, stack)
+            assert_visible(tab, stack)
             stack.drive()
             tab.get_by_text("ARMED · running").wait_for()
-            drawn = tab.frame_locator("#scene")
-            wait_for(tab, lambda: "rad/s (plan)" in (drawn.locator("body").text_content() or ""))
+            frame = tab.frame_locator("#scene")
+            wait_for(tab, lambda: "rad/s (plan)" in (frame.locator("body").text_content() or ""))
             keep(tab, "live")
             stop_the_page_for_a_while(stack, page.pid)
             tab.get_by_role("button", name="E-STOP").click()
@@ -65,7 +65,7 @@ def test_the_page_draws_the_robot_survives_being_stopped_and_its_estop_stops_the
             stopped_s = time.monotonic()
             tab.get_by_text("The stop is latched.").wait_for()
             keep(tab, "estop")
-            assert_drawn(tab, stack, line=False)
+            assert_visible(tab, stack, line=False)
             tab.get_by_role("button", name="Reset").click()
             stack.operator.wait_for("READY", 10.0)
             set_the_task(tab, stack)
@@ -79,7 +79,7 @@ def test_the_page_draws_the_robot_survives_being_stopped_and_its_estop_stops_the
     assert any(row.fastest > 5.0 for row in rows)
     later = [row.fastest for row in rows if row.t_s > stopped_s + 0.5]
     assert later
-    assert max(later) < STILL_RAD_S
+    assert max(later) < STATIONARY_RAD_S
 
 
 @pytest.mark.timeout(300)
@@ -116,7 +116,7 @@ def stop_the_page_for_a_while(stack, pid):
     assert after["recorder"]["dropped_ticks"] == 0
 
 
-def assert_drawn(tab, stack, line=True, beside=(0.0, 0.0)):
+def assert_visible(tab, stack, line=True, empty_place=(0.0, 0.0)):
     """Robot and task have their colours where they are in the world, seen from the page's first camera.
 
     `beside` is a place where neither of them is.
@@ -140,8 +140,8 @@ def assert_drawn(tab, stack, line=True, beside=(0.0, 0.0)):
         return (
             all(shows(picture, column, row, scene.TASK_COLOUR, 3) for column, row in on_line)
             and shows(picture, *place(x_m, y_m, 0.1), scene.BODY_COLOUR, 4)
-            and not shows(picture, *place(*beside, 0.0), scene.TASK_COLOUR, 3)
-            and not shows(picture, *place(*beside, 0.0), scene.BODY_COLOUR, 3)
+            and not shows(picture, *place(*empty_place, 0.0), scene.TASK_COLOUR, 3)
+            and not shows(picture, *place(*empty_place, 0.0), scene.BODY_COLOUR, 3)
         )
 
     wait_for(tab, everything_is_there, 120.0)
@@ -210,9 +210,9 @@ def test_the_pad_drives_while_it_is_held_and_seen(tmp_path):
     for name, ended_s, limit_s in ends:
         before = fastest[(t_s > ended_s - 0.3) & (t_s < ended_s)]
         assert before.max() > 1.0, f"{name}: nothing moved"
-        still_s = ended_s + limit_s + before.max() / DECELERATION_RAD_S2 + 0.15 + MARGIN_S
-        after = fastest[(t_s > still_s) & (t_s < still_s + 0.3)]
-        assert after.max() < STILL_RAD_S, f"{name}: {after.max()} rad/s {limit_s} s later"
+        stationary_s = ended_s + limit_s + before.max() / DECELERATION_RAD_S2 + 0.15 + MARGIN_S
+        after = fastest[(t_s > stationary_s) & (t_s < stationary_s + 0.3)]
+        assert after.max() < STATIONARY_RAD_S, f"{name}: {after.max()} rad/s {limit_s} s later"
 
 
 def hold(tab, pad, bench):
@@ -265,7 +265,7 @@ def lose(tab, pad, bench, drive):
     """The page's process falls silent: nothing says that the pad was let go."""
     pad.wait_for()
     hold(tab, pad, bench)
-    page = page_beside(drive.pid)
+    page = page_process_of(drive.pid)
     os.kill(page, signal.SIGSTOP)
     ended_s = time.monotonic()
     time.sleep(1.5)
@@ -276,7 +276,7 @@ def lose(tab, pad, bench, drive):
     return "lost", ended_s, INPUT_LIMIT_NS * 1e-9
 
 
-def page_beside(pid):
+def page_process_of(pid):
     """The process of the page that this one has started."""
     for each in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):

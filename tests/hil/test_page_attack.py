@@ -4,9 +4,9 @@ import time
 
 import pytest
 
-from tests.hil.stack import STILL_RAD_S
+from tests.hil.stack import STATIONARY_RAD_S
 from tests.viewer.test_attack import attack, limited_page
-from tests.viewer.test_operator_controls import ask, line_to
+from tests.viewer.test_operator_controls import line_to, request_reply
 from tools.stack import running_stack
 
 pytestmark = pytest.mark.hil
@@ -17,14 +17,14 @@ ATTACKED_S = 5.0
     "descriptors", [pytest.param(256, marks=pytest.mark.thorough), pytest.param(1024, marks=pytest.mark.long)]
 )
 def test_a_press_during_an_attack_latches_the_stop_and_the_wheels_stand(tmp_path, descriptors):
-    page_said = tmp_path / "page.txt"
-    with running_stack(tmp_path) as stack, limited_page(stack.robot_file, page_said, descriptors) as port:
+    output_file = tmp_path / "page.txt"
+    with running_stack(tmp_path) as stack, limited_page(stack.robot_file, output_file, descriptors) as port:
         with line_to(port) as line:
             stack.drive()
             with attack(port):
                 time.sleep(ATTACKED_S)
                 pressed_s = time.monotonic()
-                reply = ask(line, do="estop")
+                reply = request_reply(line, do="estop")
                 replied_s = time.monotonic()
                 status = stack.operator.wait_until("ESTOP", lambda status: status["robot_state"] == "ESTOP", 10.0)
                 latched_s = time.monotonic()
@@ -41,4 +41,4 @@ def test_a_press_during_an_attack_latches_the_stop_and_the_wheels_stand(tmp_path
     print(f"press to ESTOP in the robot {latch_s - pressed_s:.3f} s")
     assert latch_s > pressed_s
     assert rows[-1].state == "ESTOP"
-    assert rows[-1].fastest < STILL_RAD_S
+    assert rows[-1].fastest < STATIONARY_RAD_S

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.hil.test_page import assert_drawn, page_of
+from tests.hil.test_page import assert_visible, page_of
 from tests.runtime.path_robot import ROBOTS
 from tests.viewer.test_page import wait_for
 from tools.browser import chromium, keep, opened
@@ -19,9 +19,9 @@ def test_a_path_is_drawn_its_speed_changed_and_a_reload_changes_nothing(tmp_path
         output = tmp_path / "page.txt"
         with page_of(stack.robot_file, output) as (_, url), opened(browser, url, 900, 640) as tab:
             stack.operator.wait_for("READY", 60.0)
-            drawn = tab.frame_locator("#scene")
-            drawn.get_by_text("READY, no fault").wait_for(state="attached")
-            assert_drawn(tab, stack, beside=(0.75, 0.0))
+            frame = tab.frame_locator("#scene")
+            frame.get_by_text("READY, no fault").wait_for(state="attached")
+            assert_visible(tab, stack, empty_place=(0.75, 0.0))
             tab.get_by_role("button", name="Task…").click()
             tab.get_by_text("Follows path.csv").wait_for()
             for label, shown in (("Speed (m/s)", True), ("Radius (m)", False), ("Centre x (m)", False)):
@@ -31,7 +31,7 @@ def test_a_path_is_drawn_its_speed_changed_and_a_reload_changes_nothing(tmp_path
             tab.get_by_text("path path.csv of").wait_for()
             assert stack.operator.status()["task"]["asked"]["speed_m_s"] == 0.3
             stack.drive(until_rad_s=4.0)
-            wait_for(tab, lambda: "of 9.14 m" in (drawn.locator("body").text_content() or ""))
+            wait_for(tab, lambda: "of 9.14 m" in (frame.locator("body").text_content() or ""))
             keep(tab, "path")
             before = stack.operator.status()
             for _ in range(3):

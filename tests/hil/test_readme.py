@@ -51,13 +51,13 @@ class Reader:
         (robots / "wombot.toml").write_text(shipped.replace("/tmp/disco-hw-wombot", str(directory / "wombot")))
         # The folder of the robots is named as the package, and must not be taken for it.
         self._environment = {**os.environ, "XDG_RUNTIME_DIR": str(directory), "PYTHONPATH": str(ROOT)}
-        self._beside: list[subprocess.Popen] = []
+        self._background: list[subprocess.Popen] = []
 
     def _command(self, line: str, **placeholders: str) -> list[str]:
-        program, *words = line.split()
-        self.left.remove([program, *words])
+        program, *arguments = line.split()
+        self.left.remove([program, *arguments])
         begin = [sys.executable] if program == "python" else [sys.executable, "-m", "disco_hw"]
-        return [*begin, *(placeholders.get(word.replace(".", "_"), word) for word in words)]
+        return [*begin, *(placeholders.get(argument.replace(".", "_"), argument) for argument in arguments)]
 
     def type(self, line: str, **placeholders: str) -> str:
         """Run a command to its end, which must be good."""
@@ -84,11 +84,11 @@ class Reader:
             process = subprocess.Popen(
                 self._command(line), cwd=self._directory, env=self._environment, stdout=sink, stderr=sink
             )
-        self._beside.append(process)
+        self._background.append(process)
         try:
             yield process
         finally:
-            self._beside.remove(process)
+            self._background.remove(process)
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
             try:
@@ -97,12 +97,12 @@ class Reader:
                 process.kill()
         assert code == 0, output.read_text("utf-8", errors="replace")
 
-    def ctl(self, *words: str) -> str:
-        return self.untold([sys.executable, "-m", "disco_hw", "ctl", ROBOT, *words])
+    def ctl(self, *arguments: str) -> str:
+        return self.untold([sys.executable, "-m", "disco_hw", "ctl", ROBOT, *arguments])
 
     def wait(self, what: str, condition, timeout_s: float = 1800.0) -> None:
         deadline_s, status = time.monotonic() + timeout_s, None
-        while time.monotonic() < deadline_s and all(process.poll() is None for process in self._beside):
+        while time.monotonic() < deadline_s and all(process.poll() is None for process in self._background):
             result = subprocess.run(
                 [sys.executable, "-m", "disco_hw", "ctl", ROBOT, "status", "--json"],
                 cwd=self._directory, env=self._environment, capture_output=True, text=True, timeout=60, check=False,
@@ -111,7 +111,7 @@ class Reader:
             if status is not None and condition(status):
                 return
             time.sleep(0.2)
-        ended = [process.args for process in self._beside if process.poll() is not None]
+        ended = [process.args for process in self._background if process.poll() is not None]
         raise AssertionError(f"not {what}: {status}; ended: {ended}")
 
     def wait_for(self, state: str) -> None:
@@ -188,8 +188,8 @@ def test_what_the_model_misses_is_found_and_driven_with(tmp_path):
             reader.wait("on its way", lambda status: laps(status) > 0.1, 600.0)
             reader.type(f"disco-hw ctl {ROBOT} quit")
         reader.type(f"disco-hw drive {ROBOT} --script excite --unattended --log drive.mcap")
-        said = reader.type(f"disco-hw gap drive.mcap --robot {ROBOT} -o out/gap")
-        assert "deadband" in said
+        output = reader.type(f"disco-hw gap drive.mcap --robot {ROBOT} -o out/gap")
+        assert "deadband" in output
         with reader.another_terminal(f"disco-hw run {ROBOT} --model out/gap/model.toml"):
             reader.wait_for("READY")
             reader.ctl("arm")

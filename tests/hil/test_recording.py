@@ -16,7 +16,7 @@ from disco_hw.experiments import READY_TIMEOUT_S
 from disco_hw.log.log_command import info
 from disco_hw.log.reader import open_log
 from tests.drivers.waiting import free_port, wait_until
-from tests.hil.stack import STILL_RAD_S, disco_here
+from tests.hil.stack import STATIONARY_RAD_S, disco_here
 from tests.log.processes import SmallDisk
 from tools.stack import Stack, running_stack
 
@@ -91,15 +91,15 @@ def test_a_recorder_frozen_killed_and_deleted_on_the_way_is_reported_counted_and
         ended_s = time.monotonic()
         rows = stack.truth()
         output = (tmp_path / "daemon.txt").read_text()
-    assert next(row for row in reversed(rows) if row.t_s < ended_s).fastest < STILL_RAD_S
-    for words in (
+    assert next(row for row in reversed(rows) if row.t_s < ended_s).fastest < STATIONARY_RAD_S
+    for fragment in (
         "has not answered for",
         "was stopped",
         "signal 9",
         "deleted while it was being written",
         "goes on in",
     ):
-        assert any(line.startswith("recording: ") and words in line for line in output.splitlines()), words
+        assert any(line.startswith("recording: ") and fragment in line for line in output.splitlines()), fragment
     assert not third.exists()
     # A killed writer may have written more than it had confirmed: those ticks are in the next file, too.
     kept = sorted({*ticks_in(first), *ticks_in(second)})

@@ -21,7 +21,7 @@ from disco_hw.errors import WorkError
 from disco_hw.experiments import READY_TIMEOUT_S, Operator, disco_hw_process
 from firmware_protocol.codec import Codec
 from tests.drivers.waiting import wait_until
-from tests.hil.stack import STILL_RAD_S, disco, disco_here
+from tests.hil.stack import STATIONARY_RAD_S, disco, disco_here
 from tests.runtime.path_robot import path_robot
 from tools.stack import read_truth, running_stack, write_robot_file
 
@@ -60,7 +60,7 @@ sys.exit(run_virtual_robot(VirtualRobotOptions(
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "fragments"),
     [
         pytest.param("protocol_major=2", ["protocol", "2"], marks=pytest.mark.long),
         ("dbc_hash=0x12345678", ["12345678"]),
@@ -69,7 +69,7 @@ sys.exit(run_virtual_robot(VirtualRobotOptions(
         pytest.param("ticks_per_rev=1024", ["ticks_per_rev", "1024"], marks=pytest.mark.long),
     ],
 )
-def test_a_firmware_that_does_not_fit_is_refused_in_words(tmp_path, change, words):
+def test_a_firmware_that_does_not_fit_is_refused_in_words(tmp_path, change, fragments):
     robot_file = write_robot_file(tmp_path)
     script = OTHER_FIRMWARE.format(change=change)
     arguments = [sys.executable, "-c", script, str(tmp_path / "bus"), str(tmp_path / "truth.csv"), str(tmp_path / "i")]
@@ -78,14 +78,14 @@ def test_a_firmware_that_does_not_fit_is_refused_in_words(tmp_path, change, word
             with disco_hw_process("daemon", ["run", str(robot_file)], tmp_path / "daemon.txt") as daemon:
                 operator = Operator(tmp_path / "control.sock", (daemon,))
                 status = operator.wait_for("FAULT", READY_TIMEOUT_S)
-                for word in words:
-                    assert word in status["detail"]
+                for fragment in fragments:
+                    assert fragment in status["detail"]
                 with pytest.raises(WorkError, match="refused to arm"):
                     operator.request("arm")
             code, output = disco_here("check", str(robot_file))
             assert code == 1
-            for word in words:
-                assert word in output
+            for fragment in fragments:
+                assert fragment in output
         finally:
             robot.terminate()
 
@@ -171,7 +171,7 @@ def test_neither_forgeries_on_the_bus_nor_a_second_daemon_ever_turn_a_wheel(tmp_
         time.sleep(0.5)
         rows = stack.truth()
     assert max(row.requested for row in rows) == 0.0
-    assert max(row.fastest for row in rows) < STILL_RAD_S
+    assert max(row.fastest for row in rows) < STATIONARY_RAD_S
 
 
 def test_a_replayed_session_never_turns_a_wheel(tmp_path):
@@ -210,7 +210,7 @@ def test_a_replayed_session_never_turns_a_wheel(tmp_path):
     assert max(row.fastest for row in rows) > 5.0
     after = [row for row in rows if row.t_s > stopped_s]
     assert max(row.requested for row in after) == 0.0
-    assert max(row.fastest for row in after) < STILL_RAD_S
+    assert max(row.fastest for row in after) < STATIONARY_RAD_S
 
 
 SEEDED_ROBOT = """
@@ -273,7 +273,7 @@ def test_a_session_recorded_before_a_restart_does_not_arm_after_it(tmp_path, see
         time.sleep(0.3)
     rows = read_truth(truth)
     assert ({row.state for row in rows} >= {"ARMED"}) == seeded
-    assert (max(row.fastest for row in rows) > STILL_RAD_S) == seeded
+    assert (max(row.fastest for row in rows) > STATIONARY_RAD_S) == seeded
     assert (max(row.requested for row in rows) > 0.0) == seeded
     assert "READY" in {row.state for row in rows}, "the recording does not even begin a session"
 
@@ -311,7 +311,7 @@ def test_garbage_on_a_serial_line_leaves_the_daemon_waiting(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("verb", "csv", "words"),
+    ("verb", "csv", "message"),
     [
         ("run", "x_m,y_m\n0,0\n1,one\n", "line 3: y_m: 'one' is not a finite number; write one"),
         ("sim", "x_m,y_m\n0,0\n", "1 way-points; write at least two"),
@@ -325,7 +325,7 @@ def test_garbage_on_a_serial_line_leaves_the_daemon_waiting(tmp_path):
         ("run", None, "cannot be read"),
     ],
 )
-def test_a_bad_path_gets_one_line_and_exit_code_2(tmp_path, verb, csv, words):
+def test_a_bad_path_gets_one_line_and_exit_code_2(tmp_path, verb, csv, message):
     path = path_robot(tmp_path, csv or "")
     if csv is None:
         (tmp_path / "path.csv").unlink()
@@ -333,7 +333,7 @@ def test_a_bad_path_gets_one_line_and_exit_code_2(tmp_path, verb, csv, words):
     assert code == 2, output
     assert len(output.strip().splitlines()) == 1
     assert str(tmp_path / "path.csv") in output
-    assert words in output
+    assert message in output
 
 
 def test_a_daemon_can_be_asked_to_stop_when_the_path_is_gone(tmp_path):

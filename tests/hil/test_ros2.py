@@ -60,7 +60,7 @@ def stack_with_bridge(directory, monkeypatch):
             yield stack, child.process
 
 
-def heard(output):
+def received_positions(output):
     """(x, y) of each odometry that the node heard, m."""
     rows = [line.split() for line in output.read_text(encoding="utf-8").splitlines()]
     return [(float(row[3]), float(row[4])) for row in rows if len(row) == 5]
@@ -90,25 +90,25 @@ def real_node(output, *arguments):
 @real_ros
 @pytest.mark.long
 def test_real_ros_gives_the_poses_hears_the_odometry_in_another_node_and_stops_it_by_dying(tmp_path, monkeypatch):
-    heard_by = tmp_path / "listener.txt"
+    listener_file = tmp_path / "listener.txt"
     with (
         stack_with_bridge(tmp_path, monkeypatch) as (stack, _),
         real_node(tmp_path / "node.txt", "echo", *FAST_START) as process,
-        real_node(heard_by, "listen"),
+        real_node(listener_file, "listen"),
     ):
         drive(stack)
         stack.operator.wait_until("on the circle", lambda status: status["pose"][1] > 1.0, 60.0)
         assert stack.operator.status()["task"]["distance_m"] < 0.2
         process.kill()
         assert_stops(stack)
-    lines = [line.split() for line in heard_by.read_text(encoding="utf-8").splitlines()]
-    wanted = {
+    lines = [line.split() for line in listener_file.read_text(encoding="utf-8").splitlines()]
+    expected = {
         ("odom", "odom"),
         ("joint_states", "left_wheel_joint,right_wheel_joint"),
         ("plan", "map"),
         ("diagnostics", "disco-hw:daemon"),
     }
-    assert wanted <= {tuple(line) for line in lines}
+    assert expected <= {tuple(line) for line in lines}
     assert sum(line[0] == "odom" for line in lines) > 200
 
 
@@ -143,10 +143,10 @@ def assert_stops(stack):
 
 
 def test_it_drives_by_the_poses_of_a_node_that_hears_its_odometry_and_stops_when_the_node_dies(tmp_path, monkeypatch):
-    said = tmp_path / "node.txt"
-    with stack_with_bridge(tmp_path, monkeypatch) as (stack, _), node("echo", said) as process:
+    node_file = tmp_path / "node.txt"
+    with stack_with_bridge(tmp_path, monkeypatch) as (stack, _), node("echo", node_file) as process:
         stack.operator.wait_until("a pose", lambda status: status["pose_ok"], READY_TIMEOUT_S)
-        status = stack.drive_until("a metre further", lambda _: far(said) > 1.0, 30.0)
+        status = stack.drive_until("a metre further", lambda _: far(node_file) > 1.0, 30.0)
         assert status["pose_ok"]
         assert status["task"]["distance_m"] < 0.2
         process.kill()
@@ -155,7 +155,7 @@ def test_it_drives_by_the_poses_of_a_node_that_hears_its_odometry_and_stops_when
 
 @pytest.mark.long
 def test_it_drives_by_the_transforms_of_a_localisation_and_stops_when_that_dies(tmp_path, monkeypatch):
-    said, plain = tmp_path / "node.txt", with_poses_of_ros
+    node_file, plain = tmp_path / "node.txt", with_poses_of_ros
 
     def by_transforms(robot_file):
         text = plain(robot_file).read_text(encoding="utf-8")
@@ -163,9 +163,9 @@ def test_it_drives_by_the_transforms_of_a_localisation_and_stops_when_that_dies(
         return robot_file
 
     monkeypatch.setitem(globals(), "with_poses_of_ros", by_transforms)
-    with stack_with_bridge(tmp_path, monkeypatch) as (stack, _), node("tf", said) as process:
+    with stack_with_bridge(tmp_path, monkeypatch) as (stack, _), node("tf", node_file) as process:
         stack.operator.wait_until("a pose", lambda status: status["pose_ok"], READY_TIMEOUT_S)
-        status = stack.drive_until("a metre further", lambda _: far(said) > 1.0, 30.0)
+        status = stack.drive_until("a metre further", lambda _: far(node_file) > 1.0, 30.0)
         assert status["task"]["distance_m"] < 0.2
         process.kill()
         assert_stops(stack)
@@ -175,7 +175,7 @@ def test_it_drives_by_the_transforms_of_a_localisation_and_stops_when_that_dies(
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 @pytest.mark.parametrize("whom", ["node", "bridge"])
 def test_speeds_drive_once_asked_to_arm_and_their_silence_disarms_for_good(whom, how, tmp_path):
-    said = tmp_path / "node.txt"
+    node_file = tmp_path / "node.txt"
     with ExitStack() as stack:
         bench = Bench(tmp_path, stack)
         with_poses_of_ros(bench.robot_file)
@@ -184,9 +184,9 @@ def test_speeds_drive_once_asked_to_arm_and_their_silence_disarms_for_good(whom,
         bridge = stack.enter_context(
             disco_hw_process("bridge", ["bridge", "ros2", str(bench.robot_file)], tmp_path / "bridge.txt")
         )
-        speaker = stack.enter_context(node("speed", said, (0.15, 0.0, 0.3)))
+        speaker = stack.enter_context(node("speed", node_file, (0.15, 0.0, 0.3)))
         operator = bench.operator
-        ask_until(speaker, said, "arm", '"ok": true')
+        request_until(speaker, node_file, "arm", '"ok": true')
         operator.wait_until("driving", lambda status: status["drive"]["driving"] and not is_stationary(status), 20.0)
         {"node": speaker, "bridge": bridge.process}[whom].send_signal(how)
         operator.wait_for("READY", 20.0)
@@ -197,9 +197,9 @@ def test_speeds_drive_once_asked_to_arm_and_their_silence_disarms_for_good(whom,
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("words", ["button", "estop"])
-def test_an_estop_from_ros_is_latched_until_it_is_reset(words, tmp_path):
-    said = tmp_path / "node.txt"
+@pytest.mark.parametrize("action", ["button", "estop"])
+def test_an_estop_from_ros_is_latched_until_it_is_reset(action, tmp_path):
+    node_file = tmp_path / "node.txt"
     with ExitStack() as stack:
         bench = Bench(tmp_path, stack)
         with_poses_of_ros(bench.robot_file)
@@ -207,32 +207,32 @@ def test_an_estop_from_ros_is_latched_until_it_is_reset(words, tmp_path):
         bench.ready()
         bridge = ["bridge", "ros2", str(bench.robot_file)]
         stack.enter_context(disco_hw_process("bridge", bridge, tmp_path / "bridge.txt"))
-        speaker, operator = stack.enter_context(node("speed", said, (0.15, 0.0, 0.3))), bench.operator
-        ask_until(speaker, said, "arm", '"ok": true')
+        speaker, operator = stack.enter_context(node("speed", node_file, (0.15, 0.0, 0.3))), bench.operator
+        request_until(speaker, node_file, "arm", '"ok": true')
         operator.wait_until("driving", lambda status: status["drive"]["driving"] and not is_stationary(status), 20.0)
-        speaker.stdin.write(f"{words}\n".encode())
+        speaker.stdin.write(f"{action}\n".encode())
         operator.wait_until("stopped", lambda status: status["estop"], 10.0)
         operator.wait_for_standstill(10.0)
         speaker.stdin.write(b"arm\n")
         time.sleep(1.0)
         assert operator.status()["estop"]
-        ask_until(speaker, said, "reset", '"do": "reset", "ok": true')
+        request_until(speaker, node_file, "reset", '"do": "reset", "ok": true')
         operator.wait_for("READY", 10.0)
 
 
-def ask_until(speaker, said, words, answer, timeout_s=30.0):
+def request_until(speaker, node_file, request, reply, timeout_s=30.0):
     """Ask once a second, as who asks before the bridge is there is not heard."""
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
-        speaker.stdin.write(f"{words}\n".encode())
+        speaker.stdin.write(f"{request}\n".encode())
         time.sleep(1.0)
-        if answer in said.read_text(encoding="utf-8"):
+        if reply in node_file.read_text(encoding="utf-8"):
             return
-    raise AssertionError(said.read_text(encoding="utf-8"))
+    raise AssertionError(node_file.read_text(encoding="utf-8"))
 
 
 def far(output):
-    rows = heard(output)
+    rows = received_positions(output)
     return max((abs(x) + abs(y) for x, y in rows), default=0.0)
 
 
@@ -247,11 +247,11 @@ def test_it_stops_when_the_nodes_poses_become_wrong(kind, tmp_path, monkeypatch)
 
 @pytest.mark.long
 def test_a_flood_of_poses_stops_nothing_and_the_node_frozen_does(tmp_path, monkeypatch):
-    said = tmp_path / "node.txt"
-    with stack_with_bridge(tmp_path, monkeypatch) as (stack, _), node("flood", said) as process:
+    node_file = tmp_path / "node.txt"
+    with stack_with_bridge(tmp_path, monkeypatch) as (stack, _), node("flood", node_file) as process:
         drive(stack)
         process.send_signal(signal.SIGUSR1)
-        stack.operator.wait_until("flooded for a while", lambda _: len(heard(said)) > 400, 60.0)
+        stack.operator.wait_until("flooded for a while", lambda _: len(received_positions(node_file)) > 400, 60.0)
         assert stack.operator.status()["running"]
         process.send_signal(signal.SIGSTOP)
         assert_stops(stack)
@@ -322,9 +322,9 @@ def _can_have_networks():
 
 @pytest.mark.long
 @pytest.mark.skipif(not _can_have_networks(), reason="networks of one's own take root and iproute2")
-@pytest.mark.parametrize(("localhost_only", "heard"), [(True, "near"), (False, "far near")])
-def test_nodes_on_another_computer_are_heard_only_where_robot_toml_lets_them(localhost_only, heard):
-    words = ["unshare", "-n", "bash", "-c", _TWO_COMPUTERS, "two computers", str(domain()), str(localhost_only)]
+@pytest.mark.parametrize(("localhost_only", "expected"), [(True, "near"), (False, "far near")])
+def test_nodes_on_another_computer_are_heard_only_where_robot_toml_lets_them(localhost_only, expected):
+    command = ["unshare", "-n", "bash", "-c", _TWO_COMPUTERS, "two computers", str(domain()), str(localhost_only)]
     environment = {**os.environ, "PYTHON": sys.executable, "NODE": _NODE}
-    done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=200.0, check=False)
-    assert (done.stdout.strip(), done.returncode) == (heard, 0), done.stderr
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=200.0, check=False)
+    assert (done.stdout.strip(), done.returncode) == (expected, 0), done.stderr

@@ -54,8 +54,8 @@ class Base:
         return self.stack.enter_context(real_node(self.output_lines, "base", *numbers))
 
     def begin_bridge(self):
-        words = ["bridge", "ros2-base", str(self.robot_file)]
-        return self.stack.enter_context(process_of("bridge", words, self.directory / "bridge.txt")).process
+        arguments = ["bridge", "ros2-base", str(self.robot_file)]
+        return self.stack.enter_context(process_of("bridge", arguments, self.directory / "bridge.txt")).process
 
     def begin_other_speaker(self):
         domain = str(100 + os.getpid() % 100)
@@ -158,10 +158,10 @@ def test_it_keeps_to_the_circle_by_joint_states_and_by_odometry(tmp_path, lines)
 
 
 @pytest.mark.parametrize(
-    ("fault", "words"),
+    ("fault", "message"),
     [(signal.SIGUSR1, "the angles of its wheels jumped"), (signal.SIGUSR2, "no odometry"), (None, "another node")],
 )
-def test_a_base_that_restarts_falls_silent_or_hears_another_stops(tmp_path, fault, words):
+def test_a_base_that_restarts_falls_silent_or_hears_another_stops(tmp_path, fault, message):
     with ExitStack() as stack:
         base = Base(tmp_path, stack)
         base.drive()
@@ -172,4 +172,4 @@ def test_a_base_that_restarts_falls_silent_or_hears_another_stops(tmp_path, faul
             base.begin_other_speaker()
         base.operator.wait_until("disarmed", lambda status: status["state"] != "ARMED", 60.0)
         base.wait_for_true_standstill()
-        assert words in (tmp_path / "daemon.txt").read_text(encoding="utf-8")
+        assert message in (tmp_path / "daemon.txt").read_text(encoding="utf-8")

@@ -66,9 +66,9 @@ def test_the_robot_stops_and_stays(tmp_path, link, faults):
     for begin_s, cut_s, end_s in spans_s:
         assert_stopped_in_time([row for row in rows if begin_s < row.t_s < end_s], cut_s)
     if faults[-1] == "SIGKILL":
-        said = info(tmp_path / "run.mcap", as_json=False)
-        assert "ended properly" not in said
-        assert "the daemon or its recorder had ended" in said
+        text = info(tmp_path / "run.mcap", as_json=False)
+        assert "ended properly" not in text
+        assert "the daemon or its recorder had ended" in text
     with open_log(tmp_path / "run.mcap") as log:
         # At 50 Hz the drive takes dozens of ticks; whatever became of the daemon, they can be read back.
         driven = log.columns("/command")["source"] == "plan"

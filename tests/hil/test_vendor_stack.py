@@ -9,7 +9,7 @@ import time
 import pytest
 
 from disco_hw.experiments import DEVICES
-from tests.hil.stack import STILL_RAD_S, disco_json
+from tests.hil.stack import STATIONARY_RAD_S, disco_json
 from tools.stack import running_stack
 
 pytestmark = pytest.mark.hil
@@ -52,7 +52,7 @@ def test_the_robot_stops_and_nothing_arms_again(tmp_path, device, fault):
     assert not driven, f"asked for {driven[0].requested} rad/s {driven[0].t_s - cut_s:.2f} s later"
     stopped = [row for row in rows if row.t_s > cut_s + ROLLS_S - 0.5]
     assert stopped
-    assert max(row.fastest for row in stopped) < STILL_RAD_S
+    assert max(row.fastest for row in stopped) < STATIONARY_RAD_S
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_an_estop_from_beside_stops_it_and_is_confirmed(tmp_path, device, daemon
         if daemon == "frozen":
             os.kill(stack.daemon.process.pid, signal.SIGSTOP)
         code, outcome = disco_json("estop", str(stack.robot_file))
-        told_s = time.monotonic()
+        replied_s = time.monotonic()
         if daemon == "frozen":
             os.kill(stack.daemon.process.pid, signal.SIGCONT)
         assert code == 0, outcome
@@ -73,5 +73,5 @@ def test_an_estop_from_beside_stops_it_and_is_confirmed(tmp_path, device, daemon
         status = stack.operator.status()
         assert status["state"] != "ARMED"
         rows = stack.truth()
-    stopped = [row for row in rows if row.t_s > told_s + ROLLS_S - 0.5]
-    assert max(row.fastest for row in stopped) < STILL_RAD_S
+    stopped = [row for row in rows if row.t_s > replied_s + ROLLS_S - 0.5]
+    assert max(row.fastest for row in stopped) < STATIONARY_RAD_S

@@ -11,7 +11,7 @@ from disco_hw.log.drive import DriveLog
 from disco_hw.log.load import load_drive
 from sim.effects import hidden_effects
 from sim.plant_parameters import PlantParameters
-from tools.simulated_drives import make_drive
+from tools.simulated_drives import create_drive
 from tools.simulated_log import simulated_log, write_csv
 
 TRUTH = {"x_icr_m": 0.12, "wheel_radius_m": 0.06, "axial_distance_m": 0.45}
@@ -31,7 +31,7 @@ def robot_config(**prior):
 
 def write_log(path: Path, drive: str = "circle", seed: int = 1, hide: dict | None = None, **parameters: float) -> Path:
     plant = PlantParameters(**(TRUTH | parameters)).with_ideal_motors()
-    write_csv(path, simulated_log(make_drive(drive, seed), plant, hidden_effects(hide or {}), seed))
+    write_csv(path, simulated_log(create_drive(drive, seed), plant, hidden_effects(hide or {}), seed))
     return path
 
 
@@ -41,5 +41,5 @@ def logged(drive: str = "circle", seed: int = 1, hidden: tuple = (), noiseless: 
     plant = plant.noiseless() if noiseless else plant
     with TemporaryDirectory() as folder:
         path = Path(folder) / "log.csv"
-        write_csv(path, simulated_log(make_drive(drive, seed), plant, hidden_effects(dict(hidden)), seed))
+        write_csv(path, simulated_log(create_drive(drive, seed), plant, hidden_effects(dict(hidden)), seed))
         return load_drive(path, TICKS_PER_REV)

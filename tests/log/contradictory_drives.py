@@ -26,7 +26,9 @@ def wrapped(yaw_rad):
 
 def with_poses(**changes) -> Change:
     """Poses whose columns are made by these functions of the old poses."""
-    return lambda log: replace(log, poses=replace(log.poses, **{k: make(log.poses) for k, make in changes.items()}))
+    return lambda log: replace(
+        log, poses=replace(log.poses, **{k: function(log.poses) for k, function in changes.items()})
+    )
 
 
 def rotated(angle_rad: float, with_heading: bool = True) -> Change:

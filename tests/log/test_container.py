@@ -15,7 +15,7 @@ from disco_hw.log import Attachment, container
 from disco_hw.log.container import MAGIC, DamagedError, messages, read_attachment, read_chunk, read_contents
 from tools.log_samples import ATTACHMENTS, drive_ticks, log_bytes
 
-WHOLE = log_bytes(drive_ticks(120), flush_every=10)
+COMPLETE_LOG = log_bytes(drive_ticks(120), flush_every=10)
 KILLED = log_bytes(drive_ticks(120), flush_every=10, finish=False)
 
 
@@ -44,11 +44,11 @@ def sequences(data):
 
 
 def test_a_complete_file_is_read_by_its_index():
-    contents = contents_of(WHOLE)
+    contents = contents_of(COMPLETE_LOG)
     assert contents.complete
     assert contents.damage == []
     assert len(contents.chunks) == 12
-    assert sequences(WHOLE) == list(range(1, 121))
+    assert sequences(COMPLETE_LOG) == list(range(1, 121))
 
 
 def test_a_file_without_its_end_is_walked_and_says_so():
@@ -60,7 +60,7 @@ def test_a_file_without_its_end_is_walked_and_says_so():
 
 
 def test_index_and_walk_agree():
-    indexed, walked = contents_of(WHOLE), contents_of(KILLED)
+    indexed, walked = contents_of(COMPLETE_LOG), contents_of(KILLED)
     assert indexed.chunks == walked.chunks
     assert indexed.counts == walked.counts
     assert indexed.attachments == walked.attachments
@@ -71,10 +71,10 @@ def test_index_and_walk_agree():
 
 @pytest.mark.parametrize("tenth", range(1, 10))
 def test_whatever_tenth_is_left_all_its_whole_chunks_are(tenth):
-    cut = len(WHOLE) * tenth // 10
-    whole_chunks = sum(chunk.offset + chunk.length <= cut for chunk in contents_of(WHOLE).chunks)
-    assert sequences(WHOLE[:cut]) == list(range(1, 10 * whole_chunks + 1))
-    assert not contents_of(WHOLE[:cut]).complete
+    cut = len(COMPLETE_LOG) * tenth // 10
+    complete_chunks = sum(chunk.offset + chunk.length <= cut for chunk in contents_of(COMPLETE_LOG).chunks)
+    assert sequences(COMPLETE_LOG[:cut]) == list(range(1, 10 * complete_chunks + 1))
+    assert not contents_of(COMPLETE_LOG[:cut]).complete
 
 
 def test_cut_anywhere_it_reads_or_is_refused():
@@ -89,9 +89,9 @@ def test_cut_anywhere_it_reads_or_is_refused():
             assert contents.damage
 
 
-@pytest.mark.parametrize("data", [WHOLE, KILLED], ids=["indexed", "walked"])
+@pytest.mark.parametrize("data", [COMPLETE_LOG, KILLED], ids=["indexed", "walked"])
 def test_a_damaged_chunk_costs_itself_only(data):
-    chunk = contents_of(WHOLE).chunks[4]
+    chunk = contents_of(COMPLETE_LOG).chunks[4]
     at = chunk.offset + chunk.length // 2
     damaged = bytearray(data)
     damaged[at] ^= 0x40
@@ -109,13 +109,13 @@ def test_a_damaged_chunk_costs_itself_only(data):
 
 
 def test_an_unfinished_record_is_called_so():
-    last = contents_of(WHOLE).chunks[-1]
+    last = contents_of(COMPLETE_LOG).chunks[-1]
     cut = KILLED[: last.offset + 100]
     assert contents_of(cut).damage[0] == f"at byte {last.offset - 9}: an unfinished record; 109 bytes are lost"
 
 
 def test_a_wrong_checksum_is_noticed_where_everything_else_fits():
-    chunk = contents_of(WHOLE).chunks[4]
+    chunk = contents_of(COMPLETE_LOG).chunks[4]
     damaged = bytearray(KILLED)
     damaged[chunk.offset + 24] ^= 1
     assert sequences(damaged) == [*range(1, 41), *range(51, 121)]
@@ -148,14 +148,14 @@ def test_nonsense_inside_a_chunk_costs_the_chunk(inner):
 
 @pytest.mark.parametrize("length", [0, 5, 2**40, 2**64 - 1])
 def test_a_chunk_whose_length_is_wrong_costs_itself_only(length):
-    chunk = contents_of(WHOLE).chunks[4]
+    chunk = contents_of(COMPLETE_LOG).chunks[4]
     damaged = bytearray(KILLED)
     damaged[chunk.offset - 8 : chunk.offset] = struct.pack("<Q", length)
     assert sequences(damaged) == [*range(1, 41), *range(51, 121)]
 
 
 def test_a_hole_of_zeros_costs_what_it_covers_only():
-    chunks = contents_of(WHOLE).chunks
+    chunks = contents_of(COMPLETE_LOG).chunks
     damaged = bytearray(KILLED)
     start, end = chunks[3].offset + 20, chunks[6].offset - 30
     damaged[start:end] = bytes(end - start)
@@ -163,7 +163,7 @@ def test_a_hole_of_zeros_costs_what_it_covers_only():
 
 
 def test_an_unusable_index_is_walked_around():
-    damaged = bytearray(WHOLE)
+    damaged = bytearray(COMPLETE_LOG)
     damaged[-200] ^= 1
     contents = contents_of(damaged)
     assert "index at the end is unusable" in contents.damage[-1]
@@ -178,7 +178,7 @@ def test_a_damaged_attachment_is_left_out():
     assert [kept.name for kept in contents.attachments] == [ATTACHMENTS[1].name]
     assert "wrong checksum" in contents.damage[0]
     assert sequences(damaged) == list(range(1, 121))
-    indexed = bytearray(WHOLE)
+    indexed = bytearray(COMPLETE_LOG)
     indexed[at] ^= 1
     with Opened(indexed) as fd, pytest.raises(DamagedError, match="wrong checksum"):
         read_attachment(fd, read_contents(fd, "x").attachments[0])

@@ -64,12 +64,12 @@ def test_a_log_given_twice_is_refused_by_whatever_name(tmp_path, mcap, table):
 @pytest.mark.parametrize("share", [1.0, 0.6])
 def test_a_log_and_its_copy_are_one_drive(tmp_path, share):
     data = log_bytes(drive_ticks(200), flush_every=5)
-    whole, cut, mended = (tmp_path / name for name in ("whole.mcap", "cut.mcap", "mended.mcap"))
-    whole.write_bytes(data)
+    complete, cut, mended = (tmp_path / name for name in ("whole.mcap", "cut.mcap", "mended.mcap"))
+    complete.write_bytes(data)
     cut.write_bytes(data[: int(len(data) * share)])
     recover_log(cut, mended)
     with pytest.raises(LogError, match=r"mended\.mcap: holds the same data as .*whole\.mcap, which would count twice"):
-        load_drive([whole, mended])
+        load_drive([complete, mended])
 
 
 def test_two_drives_are_two(tmp_path):

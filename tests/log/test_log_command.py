@@ -123,7 +123,7 @@ def test_what_is_no_log_is_refused(tmp_path, command):
         command(path)
 
 
-WHOLE = log_bytes(drive_ticks(300), flush_every=10)
+COMPLETE_LOG = log_bytes(drive_ticks(300), flush_every=10)
 
 
 def entries(path):
@@ -134,7 +134,7 @@ def entries(path):
 @thinned("tenth", range(1, 11), quick=3)
 def test_every_whole_chunk_comes_over_and_the_loss_is_named(tmp_path, tenth):
     source, target = tmp_path / "cut.mcap", tmp_path / "mended.mcap"
-    source.write_bytes(WHOLE[: len(WHOLE) * tenth // 10])
+    source.write_bytes(COMPLETE_LOG[: len(COMPLETE_LOG) * tenth // 10])
     recovered = recover_log(source, target)
     assert entries(target) == entries(source)
     assert recovered.chunks * 10 == len({tick for _, _, tick, _ in entries(target)})
@@ -149,7 +149,7 @@ def test_every_whole_chunk_comes_over_and_the_loss_is_named(tmp_path, tenth):
 
 def test_a_recovered_log_is_whole_for_other_readers_too(tmp_path):
     source, target = tmp_path / "cut.mcap", tmp_path / "mended.mcap"
-    source.write_bytes(WHOLE[: len(WHOLE) // 2])
+    source.write_bytes(COMPLETE_LOG[: len(COMPLETE_LOG) // 2])
     recovered = recover_log(source, target)
     reader = make_reader(io.BytesIO(target.read_bytes()), validate_crcs=True)
     messages = list(reader.iter_messages())
@@ -159,7 +159,7 @@ def test_a_recovered_log_is_whole_for_other_readers_too(tmp_path):
 
 def test_damage_inside_a_complete_log_costs_the_chunk(tmp_path):
     source, target = tmp_path / "bad.mcap", tmp_path / "mended.mcap"
-    source.write_bytes(with_damaged_chunk(WHOLE))
+    source.write_bytes(with_damaged_chunk(COMPLETE_LOG))
     recovered = recover_log(source, target)
     assert len(recovered.lost) == 1
     assert len({tick for _, _, tick, _ in entries(target)}) == 290
@@ -169,9 +169,9 @@ def test_damage_inside_a_complete_log_costs_the_chunk(tmp_path):
 
 def test_damage_between_the_chunks_costs_nothing(tmp_path):
     source, target, sound = tmp_path / "bad.mcap", tmp_path / "mended.mcap", tmp_path / "sound.mcap"
-    sound.write_bytes(WHOLE)
-    damaged = bytearray(WHOLE)
-    index = make_reader(io.BytesIO(WHOLE)).get_summary().chunk_indexes[9]
+    sound.write_bytes(COMPLETE_LOG)
+    damaged = bytearray(COMPLETE_LOG)
+    index = make_reader(io.BytesIO(COMPLETE_LOG)).get_summary().chunk_indexes[9]
     damaged[index.chunk_start_offset + index.chunk_length + index.message_index_length // 2] ^= 1
     source.write_bytes(damaged)
     assert not recover_log(source, target).lost
@@ -180,27 +180,27 @@ def test_damage_between_the_chunks_costs_nothing(tmp_path):
 
 def test_the_source_is_not_touched_and_nothing_is_overwritten(tmp_path):
     source = tmp_path / "cut.mcap"
-    source.write_bytes(WHOLE[:20_000])
+    source.write_bytes(COMPLETE_LOG[:20_000])
     with pytest.raises(LogError, match="already exists"):
         recover_log(source, source)
-    assert source.read_bytes() == WHOLE[:20_000]
+    assert source.read_bytes() == COMPLETE_LOG[:20_000]
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("content", "message"),
     [
         (b"", "empty file"),
         (b"no log", "not an MCAP file"),
         (MAGIC, "no message in it can be read; there is nothing to recover"),
         (log_bytes([]), "no message in it can be read"),
-        (WHOLE[:2000], "no message in it can be read"),
+        (COMPLETE_LOG[:2000], "no message in it can be read"),
     ],
     ids=["empty", "other", "magic alone", "no records", "cut before its first chunk"],
 )
-def test_of_nothing_nothing_is_recovered_and_no_target_left_behind(tmp_path, content, words):
+def test_of_nothing_nothing_is_recovered_and_no_target_left_behind(tmp_path, content, message):
     source, target = tmp_path / "x", tmp_path / "y"
     source.write_bytes(content)
-    with pytest.raises(LogError, match=words) as refused:
+    with pytest.raises(LogError, match=message) as refused:
         recover_log(source, target)
     assert "\n" not in str(refused.value)
     assert not target.exists()
@@ -208,7 +208,7 @@ def test_of_nothing_nothing_is_recovered_and_no_target_left_behind(tmp_path, con
 
 def test_a_disk_full_on_the_way_leaves_no_target_behind(tmp_path):
     source, target = tmp_path / "cut.mcap", tmp_path / "mended.mcap"
-    source.write_bytes(WHOLE[:-1000])
+    source.write_bytes(COMPLETE_LOG[:-1000])
     resource.prlimit(0, resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
     try:
         with pytest.raises(LogError, match="File too large"):
@@ -222,6 +222,6 @@ def test_places_that_cannot_be_read_or_written_are_named(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         recover_log(tmp_path / "none", tmp_path / "y")
     source = tmp_path / "cut.mcap"
-    source.write_bytes(WHOLE)
+    source.write_bytes(COMPLETE_LOG)
     with pytest.raises(InputError, match="No such file"):
         recover_log(source, tmp_path / "no directory" / "y")

@@ -86,8 +86,8 @@ def test_positions_without_heading_are_left_out_and_said_to_be(tmp_path):
 @pytest.mark.parametrize("flush_every", [None, 5])
 def test_a_clock_that_goes_backwards_is_refused(tmp_path, flush_every):
     ticks = [(k * PERIOD_NS, tick(k)) for k in (*range(1, 61), *range(31, 70))]
-    words = r"run\.mcap: the clock goes backwards by 0\.58 s after 1\.18 s of /command; give each run as a log"
-    with pytest.raises(LogError, match=words):
+    message = r"run\.mcap: the clock goes backwards by 0\.58 s after 1\.18 s of /command; give each run as a log"
+    with pytest.raises(LogError, match=message):
         drive_of(tmp_path, ticks, flush_every=flush_every)
 
 

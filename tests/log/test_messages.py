@@ -65,10 +65,10 @@ def test_a_topic_that_does_not_exist_is_refused(index):
 @given(st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=40))), st.integers(1, 30))
 def test_a_stream_cut_anywhere_gives_the_same_frames(frames, length):
     stream = b"".join(frame(kind, payload) for kind, payload in frames)
-    taken, got = Frames(), []
+    decoder, got = Frames(), []
     for start in range(0, len(stream), length):
-        taken.add(stream[start : start + length])
-        got += list(taken)
+        decoder.add(stream[start : start + length])
+        got += list(decoder)
     assert got == frames
 
 

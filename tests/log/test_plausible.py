@@ -67,8 +67,8 @@ def test_wrapped_degrees_are_degrees():
 def test_wrapped_radians_are_believed_whatever_the_wheels_say():
     poses, _, _ = circle()
     wrapped = np.angle(np.exp(1j * poses.yaw_rad))
-    _, still, none = circle(0.0, 0.0)
-    assert yaw_fault(poses.t_s, wrapped, poses.segment, still, none) is None
+    _, stationary, none = circle(0.0, 0.0)
+    assert yaw_fault(poses.t_s, wrapped, poses.segment, stationary, none) is None
 
 
 @pytest.mark.parametrize("speeds", [(2.0, 3.0), (3.0, 3.0), (-3.0, -3.0), (1.0, 4.0)])

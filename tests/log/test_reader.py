@@ -101,16 +101,16 @@ def test_the_summary_counts_what_was_dropped_on_the_way(tmp_path):
 
 @thinned("tenth", range(1, 10), quick=3)
 def test_cut_at_every_tenth_the_log_reads_and_says_what_is_lost(tmp_path, tenth):
-    whole = log_bytes(drive_ticks(300), flush_every=10)
+    content = log_bytes(drive_ticks(300), flush_every=10)
     path = tmp_path / "cut.mcap"
-    path.write_bytes(whole[: len(whole) * tenth // 10])
+    path.write_bytes(content[: len(content) * tenth // 10])
     with open_log(path) as log:
         ticks = [entry.tick for entry in log.records(("/wheels",))]
         summary = log.summary()
     assert ticks == list(range(1, len(ticks) + 1))
     assert len(ticks) >= 300 * tenth // 10 - 60
     assert not summary.complete
-    assert any(words in summary.damage[-1] for words in ("the end is missing", "the index at the end is unusable"))
+    assert any(text in summary.damage[-1] for text in ("the end is missing", "the index at the end is unusable"))
 
 
 def test_a_damaged_chunk_of_a_complete_log_is_an_error_with_the_remedy(tmp_path):
@@ -122,17 +122,17 @@ def test_a_damaged_chunk_of_a_complete_log_is_an_error_with_the_remedy(tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("content", "message"),
     [
         (b"", "empty file"),
         (b"t_s,cmd_left_rad_s\n", "not an MCAP file"),
         (b"\x89MCAP0\r\n", "nothing of the log is left"),
     ],
 )
-def test_what_is_no_log_is_refused_in_one_line(tmp_path, content, words):
+def test_what_is_no_log_is_refused_in_one_line(tmp_path, content, message):
     path = tmp_path / "x.mcap"
     path.write_bytes(content)
-    with pytest.raises(LogError, match=words):
+    with pytest.raises(LogError, match=message):
         open_log(path)
 
 
@@ -186,10 +186,10 @@ def test_a_log_still_being_written_reads_as_far_as_it_goes(tmp_path):
 def test_a_brief_look_gives_the_same_records_but_of_plans_the_figures_alone(log_file):
     topics = ("/plan", "/estimate", "/command")
     with open_log(log_file) as log:
-        whole = [(entry.now_ns, entry.record) for entry in log.records(topics)]
+        complete = [(entry.now_ns, entry.record) for entry in log.records(topics)]
         brief = list(log.brief_records(topics))
-    assert len(brief) == len(whole) > 0
-    for (now_ns, record), (brief_ns, short) in zip(whole, brief, strict=True):
+    assert len(brief) == len(complete) > 0
+    for (now_ns, record), (brief_ns, short) in zip(complete, brief, strict=True):
         assert brief_ns == now_ns
         if isinstance(record, Plan):
             figures = ("t_ns", "effective_samples", "temperature", "min_cost", "mean_cost")

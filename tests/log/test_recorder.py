@@ -86,9 +86,9 @@ def test_a_stopped_writer_is_reported_within_a_second_replaced_and_nothing_is_lo
     following = kept_going(recorder, following, lambda stats: stats.writer_deaths == 1)
     following = kept_going(recorder, following, lambda stats: not stats.fault)
     wait_until(lambda: not alive(stopped))
-    news = recorder.new_messages()
-    assert "was stopped" in news[0]
-    assert news[1] == f"recording goes on in {path.with_name('run.part2.mcap')}"
+    messages = recorder.new_messages()
+    assert "was stopped" in messages[0]
+    assert messages[1] == f"recording goes on in {path.with_name('run.part2.mcap')}"
     final = recorder.close()
     assert all_accounted(final, following - 1)
     assert (final.dropped_ticks, final.lost_ticks, final.waiting_ticks) == (0, 0, 0)

@@ -67,10 +67,10 @@ def test_what_was_still_on_its_way_when_the_recording_process_was_killed_is_not_
         # Shorter by far than a silent writer is put up with, and many times what may be lost.
         time.sleep(0.3)
         recording_process.process.kill()
-        last_put = int(recording_process.process.stdout.readlines()[-1])
+        last_recorded = int(recording_process.process.stdout.readlines()[-1])
         os.kill(recording_process.writer_pid, signal.SIGCONT)
         wait_until(lambda: not alive(recording_process.writer_pid))
-    assert ticks_of(path)[-1] > last_put - 20
+    assert ticks_of(path)[-1] > last_recorded - 20
 
 
 def test_nothing_is_left_in_the_runtime_directory_of_a_killed_process(path, runtime_root):
@@ -133,9 +133,9 @@ def fill(recorder):
     return stats, first - 1
 
 
-def check_after_full_disk(path, stats, words):
+def check_after_full_disk(path, stats, message):
     assert stats.writer_deaths >= 1
-    assert words in stats.last_error
+    assert message in stats.last_error
     assert "nothing is being recorded" in stats.fault
     with open_log(path) as log:
         assert log.damage == ("the end is missing: the writer was killed or is still at work, or the file was cut",)
@@ -179,11 +179,11 @@ def test_the_last_words_with_a_full_disk_count_the_ticks_that_are_lost_and_name_
         recorder.new_messages()
         final = recorder.close(1.0)
         assert final.waiting_ticks == given - final.delivered_ticks > 0
-        words = recorder.new_messages()
-        assert f"{final.waiting_ticks} of {given} ticks are not in the log: " in words[-1]
-        assert "No space left on device" in words[-1]
-        assert not [line for line in words if "goes on" in line]
-        assert final.fault == words[-1]
+        messages = recorder.new_messages()
+        assert f"{final.waiting_ticks} of {given} ticks are not in the log: " in messages[-1]
+        assert "No space left on device" in messages[-1]
+        assert not [line for line in messages if "goes on" in line]
+        assert final.fault == messages[-1]
         assert Path(final.path).exists()
 
 

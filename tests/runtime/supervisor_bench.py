@@ -35,8 +35,8 @@ class Bench:
     def tick(self, *requests, count=1, **changes):
         self.inputs = replace(self.inputs, **changes)
         for index in range(count):
-            asked = requests if index == 0 else ()
-            self.out = self.supervisor.step(self.now_ns, replace(self.inputs, requests=asked))
+            tick_requests = requests if index == 0 else ()
+            self.out = self.supervisor.step(self.now_ns, replace(self.inputs, requests=tick_requests))
             self.now_ns += TICK_NS
             self.events += self.out.events
             if self.out.driver_request is not None:

@@ -166,13 +166,13 @@ def test_limits_are_recorded_under_who_says_them():
     assert found.declared == {"max_wheel_speed_rad_s": 15.0, "stop_deceleration_rad_s2": 10.0}
 
 
-@pytest.mark.parametrize("lost", ["link", "robot"])
-def test_what_a_robot_said_that_is_not_heard_any_more_is_not_its_state(lost):
+@pytest.mark.parametrize("disconnected", ["link", "robot"])
+def test_what_a_robot_said_that_is_not_heard_any_more_is_not_its_state(disconnected):
     stack = simulated_stack(NoPlanner(), needs_pose=False)
     stack.run(1.5)
     stack.run(0.5, UserRequest.ESTOP)
     assert stack.core.robot_status.state == "ESTOP"
-    if lost == "link":
+    if disconnected == "link":
         stack.robot.link.plug(False)
     else:
         stack.robot.board.step = lambda _now_us: ()

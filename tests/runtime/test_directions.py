@@ -62,7 +62,7 @@ class Floor:
         return PoseSample(t_ns, t_ns, x, y, yaw, self._noise_m, 0.005)
 
 
-def first_doubt(vendor, reported, true, speeds, seconds=3.0):
+def first_finding(vendor, reported, true, speeds, seconds=3.0):
     """Seconds of motion until something is found, and what; None where nothing is."""
     bench = vendor.bench()
     # What robot.toml says stands before a robot that is wired as the driver believes: the other way round is as true.
@@ -87,24 +87,24 @@ def first_doubt(vendor, reported, true, speeds, seconds=3.0):
     return None
 
 
-@thinned(("wiring", "speeds", "said"), WRONG, quick=12)
+@thinned(("wiring", "speeds", "expected"), WRONG, quick=12)
 @pytest.mark.parametrize("vendor", ONE_OF_EACH, ids=str)
-def test_a_wrong_wiring_is_noticed_in_the_first_half_second_of_motion(vendor, wiring, speeds, said):
-    after_s, found = first_doubt(vendor, AS_CONFIGURED, wiring, speeds)
+def test_a_wrong_wiring_is_noticed_in_the_first_half_second_of_motion(vendor, wiring, speeds, expected):
+    after_s, found = first_finding(vendor, AS_CONFIGURED, wiring, speeds)
     assert after_s <= 0.5
-    assert all(part in found for part in said.split(".*"))
+    assert all(part in found for part in expected.split(".*"))
 
 
 @thinned("speeds", [(3.0, 2.0), (-2.0, 2.0), (6.0, 6.0), (-1.0, -3.0), (1.0, 3.0)], quick=2)
 @thinned("vendor", ONE_OF_EACH, ids=str, quick=3)
 def test_a_right_wiring_is_let_alone(vendor, speeds):
-    assert first_doubt(vendor, AS_CONFIGURED, AS_CONFIGURED, speeds) is None
+    assert first_finding(vendor, AS_CONFIGURED, AS_CONFIGURED, speeds) is None
 
 
-def drive(watch, asked, turned, poses=()):
+def drive(watch, commands, turned, poses=()):
     """Ticks with speeds asked and angles counted; what was found, and in which tick."""
     last = (0.0, 0.0)
-    for tick, (speeds, angles) in enumerate(zip(asked, turned, strict=True)):
+    for tick, (speeds, angles) in enumerate(zip(commands, turned, strict=True)):
         now_ns = tick * TICK_NS
         rates = [(now - was) / 0.02 for now, was in zip(angles, last, strict=True)]
         sample, last = WheelSample(now_ns, now_ns, *angles, *rates), angles
@@ -115,13 +115,13 @@ def drive(watch, asked, turned, poses=()):
 
 
 def test_wheels_that_lag_while_the_command_swings_are_let_alone():
-    asked = [(4.0 * math.cos(tick / 9), 3.0 * math.cos(tick / 7)) for tick in range(200)]
+    commands = [(4.0 * math.cos(tick / 9), 3.0 * math.cos(tick / 7)) for tick in range(200)]
     turned, angle = [], (0.0, 0.0)
     for tick in range(200):
-        speeds = asked[tick - 12] if tick >= 12 else (0.0, 0.0)
+        speeds = commands[tick - 12] if tick >= 12 else (0.0, 0.0)
         angle = (angle[0] + 0.02 * speeds[0], angle[1] + 0.02 * speeds[1])
         turned.append(angle)
-    assert drive(Directions(RADIUS_M, TRACK_M, AS_CONFIGURED), asked, turned) is None
+    assert drive(Directions(RADIUS_M, TRACK_M, AS_CONFIGURED), commands, turned) is None
 
 
 def test_what_was_already_written_is_what_changes():
@@ -205,16 +205,16 @@ def test_a_wheel_that_does_not_count_gets_no_wiring_advice_however_it_turns(runs
 
 
 def test_a_wheel_that_counts_backward_after_it_has_followed_gets_no_wiring_advice():
-    asked = [(0.0, 0.0)] + [(2.0, 2.0)] * 60
+    commands = [(0.0, 0.0)] + [(2.0, 2.0)] * 60
     turned = [(0.0, 0.0)] + [(0.04 * (tick if tick < 10 else 20 - tick), 0.04 * tick) for tick in range(60)]
     last, found = (0.0, 0.0), {}
     for followed in (False, True):
         watch = Directions(RADIUS_M, TRACK_M, AS_CONFIGURED)
-        for tick, (speeds, angles) in enumerate(zip(asked, turned, strict=True)):
+        for tick, (speeds, angles) in enumerate(zip(commands, turned, strict=True)):
             now_ns = tick * TICK_NS
             rates = [(now - was) / 0.02 for now, was in zip(angles, last, strict=True)]
             sample, last = WheelSample(now_ns, now_ns, *angles, *rates), angles
-            said = watch.step(now_ns, (sample,), (), WheelCommand(*speeds, 0.1), (followed, followed))
-            found[followed] = found.get(followed) or said
+            finding = watch.step(now_ns, (sample,), (), WheelCommand(*speeds, 0.1), (followed, followed))
+            found[followed] = found.get(followed) or finding
     assert "wheels.encoder_direction" in found[False]
     assert found[True] is None

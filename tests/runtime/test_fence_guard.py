@@ -53,7 +53,7 @@ def guard_of(fence: Fence, stops: StoppingSettings = STOPS, margin_m: float = 0.
     return FenceGuard(Boundaries(FOOTPRINT, fence), stops, margin_m)
 
 
-def judge(fence: Fence, seen: PoseEstimate, requested, last=None, geometry=EXACT, stops=STOPS, margin_m=0.05):
+def evaluate(fence: Fence, seen: PoseEstimate, requested, last=None, geometry=EXACT, stops=STOPS, margin_m=0.05):
     sent = (seen.left_speed_rad_s, seen.right_speed_rad_s) if last is None else last
     return guard_of(fence, stops, margin_m).step(seen, geometry, sent, requested)
 
@@ -67,7 +67,7 @@ def test_without_a_fence_and_obstacles_nothing_is_judged():
 
 
 def integrated(
-    seen: PoseEstimate, geometry: OdometryParameters, before, command, stops: StoppingSettings, held_s, longer
+    seen: PoseEstimate, geometry: OdometryParameters, before, command, stops: StoppingSettings, response_s, longer
 ):
     """The end of the stopping path by small steps of what the module's docstring says, and the poses on the way."""
     x, y, yaw = seen.x_m, seen.y_m, seen.yaw_rad
@@ -87,7 +87,7 @@ def integrated(
             yaw += dt * w
             poses.append((x, y, yaw))
 
-    drive(before, held_s, slowing=False)
+    drive(before, response_s, slowing=False)
     drive(excess, abs(excess).max() / stops.deceleration_rad_s2, slowing=True)
     drive(command, 1.5 * stops.period_s + stops.reaction_s, slowing=False)
     drive(command, abs(command).max() / stops.deceleration_rad_s2, slowing=True)
@@ -98,7 +98,7 @@ def integrated(
 @pytest.mark.parametrize("command", [(5.0, 5.0), (2.0, 6.0), (-3.0, 5.0), (-6.0, -2.0)])
 def test_the_stopping_path_is_what_the_wheels_would_do(before, command):
     seen = estimate(0.3, -0.2, 0.7, before)
-    found = judge(Fence(keep_in=CELL), seen, command)
+    found = evaluate(Fence(keep_in=CELL), seen, command)
     assert (found.verdict, found.scale) == (FenceVerdict.FREE, 1.0)
     path = np.array(found.path)
     expected = integrated(seen, EXACT, before, command, STOPS, STOPS.response_s, 1.0)
@@ -116,41 +116,41 @@ def test_the_believed_spread_makes_the_path_longer_and_wider():
     spread = OdometryParameters(RADIUS, AXLE, X_ICR, ((deviation**2 * RADIUS**2, 0, 0), (0, 0, 0), (0, 0, 0)))
     fence, stops = Fence(keep_in=ROOM), STOPS
     seen = estimate(0.5, 0, 0, (5, 5), age_s=0.5)
-    exact, longer = (judge(fence, seen, (5, 5), geometry=one) for one in (EXACT, spread))
-    held_s = stops.response_s + 3 * deviation * 0.5
-    expected = integrated(seen, spread, (5, 5), (5, 5), stops, held_s, 1 + 3 * deviation)
+    exact, longer = (evaluate(fence, seen, (5, 5), geometry=one) for one in (EXACT, spread))
+    response_s = stops.response_s + 3 * deviation * 0.5
+    expected = integrated(seen, spread, (5, 5), (5, 5), stops, response_s, 1 + 3 * deviation)
     np.testing.assert_allclose(longer.path[-1], expected[-1], atol=2e-4)
     assert exact.path[-1][0] < longer.path[-1][0]
     # A pose of unknown age has none.
     np.testing.assert_allclose(
-        judge(fence, estimate(0.5, 0, 0, (5, 5), age_s=None), (5, 5), geometry=EXACT).path, exact.path
+        evaluate(fence, estimate(0.5, 0, 0, (5, 5), age_s=None), (5, 5), geometry=EXACT).path, exact.path
     )
     # Straight ahead neither a turn's spread nor that of the turning centre matters; on the spot both do.
     turn = OdometryParameters(RADIUS, AXLE, X_ICR, ((0, 0, 0), (0, (0.02 * AXLE) ** 2, 0), (0, 0, 0)))
     centre = OdometryParameters(RADIUS, AXLE, X_ICR, ((0, 0, 0), (0, 0, 0), (0, 0, 0.01**2)))
     for one in (turn, centre):
-        assert judge(fence, seen, (5, 5), geometry=one).clearance_m == pytest.approx(exact.clearance_m)
+        assert evaluate(fence, seen, (5, 5), geometry=one).clearance_m == pytest.approx(exact.clearance_m)
     # By the wall, while the robot turns through `turned`, the corner that comes nearest is at the end of it.
     spinning = estimate(0.0, -1.1, 0.0, (-1, 1))
-    plain = judge(fence, spinning, (-1, 1))
+    plain = evaluate(fence, spinning, (-1, 1))
     path = np.array(plain.path)
     turned = path[-1, 2]
     assert turned == pytest.approx(2 * RADIUS / AXLE * (0.08 + 0.13 + 0.5 / 20))
     moved = np.hypot(0.0, X_ICR * np.abs(np.diff(path[:, 2]))).sum()
-    wide = judge(fence, spinning, (-1, 1), geometry=turn)
+    wide = evaluate(fence, spinning, (-1, 1), geometry=turn)
     assert plain.clearance_m - wide.clearance_m == pytest.approx(
         3 * 0.02 * turned * (FOOTPRINT.reach_m + 0.5 * moved), rel=0.05
     )
-    aside = judge(fence, spinning, (-1, 1), geometry=centre)
+    aside = evaluate(fence, spinning, (-1, 1), geometry=centre)
     assert plain.clearance_m - aside.clearance_m == pytest.approx(3 * 0.01 * turned, rel=0.05)
     # What radius and axle have in common does not change how the robot turns.
     common = 0.01**2 * RADIUS * AXLE
-    own = (0.01**2 * RADIUS**2, 0.01**2 * AXLE**2)
-    both = OdometryParameters(RADIUS, AXLE, X_ICR, ((own[0], common, 0), (common, own[1], 0), (0, 0, 0)))
-    alone = OdometryParameters(RADIUS, AXLE, X_ICR, ((own[0], 0, 0), (0, own[1], 0), (0, 0, 0)))
+    variances = (0.01**2 * RADIUS**2, 0.01**2 * AXLE**2)
+    both = OdometryParameters(RADIUS, AXLE, X_ICR, ((variances[0], common, 0), (common, variances[1], 0), (0, 0, 0)))
+    alone = OdometryParameters(RADIUS, AXLE, X_ICR, ((variances[0], 0, 0), (0, variances[1], 0), (0, 0, 0)))
     assert (
-        judge(fence, spinning, (-1, 1), geometry=both).clearance_m
-        > judge(fence, spinning, (-1, 1), geometry=alone).clearance_m + 1e-3
+        evaluate(fence, spinning, (-1, 1), geometry=both).clearance_m
+        > evaluate(fence, spinning, (-1, 1), geometry=alone).clearance_m + 1e-3
     )
 
 
@@ -167,7 +167,7 @@ def test_the_believed_spread_makes_the_path_longer_and_wider():
 )  # fmt: skip
 def test_three_deviations_of_the_corner_known_least_are_kept(spread, deviation_m):
     fence = Fence(keep_in=ROOM)
-    known, unknown = (judge(fence, estimate(spread=one), (0, 0)) for one in (NO_SPREAD, spread))
+    known, unknown = (evaluate(fence, estimate(spread=one), (0, 0)) for one in (NO_SPREAD, spread))
     assert known.clearance_m - unknown.clearance_m == pytest.approx(3 * deviation_m)
 
 
@@ -175,7 +175,7 @@ def test_the_deviation_is_that_of_the_corner_in_the_world():
     spread = ((0, 0, 0), (0, 1e-4, 2e-4), (0, 2e-4, 4e-4))
     fence = Fence(keep_in=Circle((0.0, 0.0), 2.0))
     for yaw in (0.3, 1.3, -2.0):
-        known, unknown = (judge(fence, estimate(yaw=yaw, spread=one), (0, 0)) for one in (NO_SPREAD, spread))
+        known, unknown = (evaluate(fence, estimate(yaw=yaw, spread=one), (0, 0)) for one in (NO_SPREAD, spread))
         offsets = []
         for x, y in FOOTPRINT.corners_m():
             ahead, aside = x * math.cos(yaw) - y * math.sin(yaw), x * math.sin(yaw) + y * math.cos(yaw)
@@ -203,17 +203,17 @@ def test_a_command_is_free_scaled_and_stopped_as_the_wall_comes_nearer(speed):
         (needed_m + 0.049, FenceVerdict.SCALED),
         (needed_m + 0.001, FenceVerdict.SCALED),
     ):
-        found = judge(fence, ahead_of_wall(gap_m, wheels), wheels)
+        found = evaluate(fence, ahead_of_wall(gap_m, wheels), wheels)
         assert (found.verdict, found.reason) == (verdict, "")
         assert (found.scale == 1.0) == (verdict is FenceVerdict.FREE)
     assert found.scale in SCALES
     assert found.clearance_m >= 0.05 * found.scale
     # Already the stop itself would end outside.
-    at_once_m = RADIUS * (speed * 0.08 + speed**2 / 40.0)
-    found = judge(fence, ahead_of_wall(at_once_m - 0.001, wheels), wheels)
+    immediate_stop_m = RADIUS * (speed * 0.08 + speed**2 / 40.0)
+    found = evaluate(fence, ahead_of_wall(immediate_stop_m - 0.001, wheels), wheels)
     assert (found.verdict, found.scale) == (FenceVerdict.STOPPED, 0.0)
     assert found.clearance_m == pytest.approx(-0.001)
-    end_m = 1.7 - at_once_m + 0.001 + needed_m
+    end_m = 1.7 - immediate_stop_m + 0.001 + needed_m
     assert (
         found.reason
         == f"the stopping path would leave the fence at ({end_m:.2f}, 0.00); drive the robot away from there"
@@ -224,9 +224,9 @@ def test_the_margin_is_kept_in_part_by_scaled_commands():
     fence = Fence(keep_in=ROOM)
     for margin_m in (0.0, 0.05, 0.2):
         for gap_m in np.linspace(0.01, 0.4, 40):
-            found = judge(fence, ahead_of_wall(gap_m), (5, 5), margin_m=margin_m)
-            wanted = [s for s in SCALES if gap_m - (stopping_m(5 * s) - RADIUS * 5 * s * 0.08) >= s * margin_m]
-            assert found.scale == pytest.approx(max(wanted))
+            found = evaluate(fence, ahead_of_wall(gap_m), (5, 5), margin_m=margin_m)
+            allowed = [s for s in SCALES if gap_m - (stopping_m(5 * s) - RADIUS * 5 * s * 0.08) >= s * margin_m]
+            assert found.scale == pytest.approx(max(allowed))
             assert found.verdict in (GOES if found.scale else {FenceVerdict.STOPPED})
 
 
@@ -240,20 +240,22 @@ def test_scales_go_from_nothing_to_all():
 def test_what_leads_away_from_the_fence_is_free(gap_m):
     fence = Fence(keep_in=ROOM)
     seen = ahead_of_wall(gap_m)
-    away = judge(fence, seen, (-8, -8))
+    away = evaluate(fence, seen, (-8, -8))
     assert (away.verdict, away.scale) == (FenceVerdict.FREE, 1.0)
     for towards in ((3, 3), (-2, 2), (2, 5)):
-        assert judge(fence, seen, towards).scale == 0.0 or (gap_m > 0 and judge(fence, seen, towards).scale <= 0.25)
+        assert evaluate(fence, seen, towards).scale == 0.0 or (
+            gap_m > 0 and evaluate(fence, seen, towards).scale <= 0.25
+        )
     # Still moving outwards, not even the way back is let through: it would begin with going farther out.
-    assert judge(fence, ahead_of_wall(-0.03, (3, 3)), (-8, -8)).scale == 0.0
+    assert evaluate(fence, ahead_of_wall(-0.03, (3, 3)), (-8, -8)).scale == 0.0
 
 
 def test_going_back_into_the_fence_must_not_lead_into_an_obstacle():
     pillar = Circle((0.9, 0.0), 0.15)
     seen = ahead_of_wall(-0.35)
-    assert judge(Fence(keep_in=ROOM), seen, (-8, -8)).scale == 1.0
-    assert judge(Fence(keep_in=ROOM, keep_out=(Circle((1.6, 0.0), 0.15),)), seen, (-8, -8)).scale == 0.5
-    assert judge(Fence(keep_in=ROOM, keep_out=(pillar,)), seen, (-8, -8)).scale == 1.0
+    assert evaluate(Fence(keep_in=ROOM), seen, (-8, -8)).scale == 1.0
+    assert evaluate(Fence(keep_in=ROOM, keep_out=(Circle((1.6, 0.0), 0.15),)), seen, (-8, -8)).scale == 0.5
+    assert evaluate(Fence(keep_in=ROOM, keep_out=(pillar,)), seen, (-8, -8)).scale == 1.0
 
 
 def test_along_the_fence_outside_of_the_margin_is_free():
@@ -262,7 +264,7 @@ def test_along_the_fence_outside_of_the_margin_is_free():
     spread = OdometryParameters(RADIUS, AXLE, X_ICR, ((1e-6, 0, 0), (0, 1e-4, 0), (0, 0, 1e-4)))
     # 0.3 m/s, the side of the footprint 0.15 m from the wall.
     seen = estimate(0.0, 1.5 - 0.2 - 0.15, 0.0, (5, 5), spread=deviation)
-    assert judge(fence, seen, (5, 5), geometry=spread).verdict is FenceVerdict.FREE
+    assert evaluate(fence, seen, (5, 5), geometry=spread).verdict is FenceVerdict.FREE
 
 
 def test_a_stopped_command_does_not_flutter():
@@ -287,8 +289,8 @@ def test_a_stopped_command_does_not_flutter():
 def test_an_obstacle_that_moves_is_met_where_it_will_be(at_s):
     guard = guard_of(Fence())
     seen = estimate(0, 0, 0, (5, 5))
-    beside = MovingCircle(0.45, 0.8, 0.1, 0.0, 0.0 if at_s == "now" else -3.0)
-    guard.set_obstacles([beside])
+    obstacle = MovingCircle(0.45, 0.8, 0.1, 0.0, 0.0 if at_s == "now" else -3.0)
+    guard.set_obstacles([obstacle])
     assert guard.is_active
     found = guard.step(seen, EXACT, (5, 5), (5, 5))
     assert (found.verdict is FenceVerdict.FREE) == (at_s == "now")
@@ -302,18 +304,18 @@ def test_the_time_at_each_point_of_the_path_is_when_the_robot_is_there():
     times = {"held": 0.08, "tail": 0.13, "brake": speed / 20.0}
     end_s = sum(times.values())
     end_m = 0.3 + stopping_m(speed)
-    for late in (False, True):
+    for passes_after in (False, True):
         guard = guard_of(Fence())
         # It comes along the robot's line towards it, to be where the robot stops at the end of its way.
         radius, velocity = 0.1, -1.0
         touches_at_end_m = end_m + radius
-        start_m = touches_at_end_m - velocity * end_s + (0.01 if late else -0.01)
+        start_m = touches_at_end_m - velocity * end_s + (0.01 if passes_after else -0.01)
         guard.set_obstacles([MovingCircle(start_m, 0.0, radius, velocity, 0.0)])
         found = guard.step(estimate(0, 0, 0, (speed, speed)), EXACT, (speed, speed), (speed, speed))
         full = guard._stopping_paths(
             guard.boundaries, estimate(0, 0, 0, (speed, speed)), EXACT, (speed, speed), (speed, speed)
         )[1][-1]
-        assert full[-1].min() == pytest.approx(0.01 if late else -0.01, abs=1e-6)
+        assert full[-1].min() == pytest.approx(0.01 if passes_after else -0.01, abs=1e-6)
         assert found.scale < 1.0
 
 
@@ -370,17 +372,17 @@ def test_without_a_pose_that_is_a_pose_nothing_moves(seen):
 
 
 def test_a_pose_so_large_that_the_path_has_no_numbers_moves_nothing():
-    found = judge(Fence(keep_in=ROOM), estimate(x=1e308), (1e308, 1e308), last=(1e308, 1e308))
+    found = evaluate(Fence(keep_in=ROOM), estimate(x=1e308), (1e308, 1e308), last=(1e308, 1e308))
     assert found.scale == 0.0
     assert found.verdict in STOPS_MOTION
 
 
 @pytest.mark.parametrize("requested", [(math.nan, 0.0), (math.inf, 1.0), (0.0, 0.0), (1e-4, -1e-4)])
 def test_what_asks_for_no_motion_is_judged_as_a_stop(requested):
-    found = judge(Fence(keep_in=ROOM), estimate(wheels=(5, 5)), requested)
+    found = evaluate(Fence(keep_in=ROOM), estimate(wheels=(5, 5)), requested)
     assert (found.verdict, found.scale) == (FenceVerdict.FREE, 1.0)
     assert found.path[-1][0] == pytest.approx(RADIUS * (5 * 0.08 + 25 / 40))
-    assert judge(Fence(keep_in=ROOM), estimate(last_nan := 0.0), (1, 1), last=(math.nan, last_nan)).scale == 0.0
+    assert evaluate(Fence(keep_in=ROOM), estimate(last_nan := 0.0), (1, 1), last=(math.nan, last_nan)).scale == 0.0
 
 
 def test_an_obstacle_that_is_reported_no_longer_stops_the_robot():
@@ -507,16 +509,16 @@ def test_no_motion_ever_leaves_the_fence_even_if_the_host_dies(room, pillar, com
 
 def test_the_path_is_sampled_as_finely_as_its_phases_say():
     assert SCALES.tolist() == [0.0, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875, 1.0]
-    assert len(judge(Fence(keep_in=ROOM), estimate(), (1, 1)).path) == 1 + 3 + 2 + 3 + 3
+    assert len(evaluate(Fence(keep_in=ROOM), estimate(), (1, 1)).path) == 1 + 3 + 2 + 3 + 3
 
 
-@pytest.mark.parametrize(("speed", "asks"), [(1e-3, False), (1.01e-3, True), (9.9e-4, False)])
-def test_a_command_below_a_thousandth_of_a_radian_asks_for_nothing(speed, asks):
+@pytest.mark.parametrize(("speed", "moves"), [(1e-3, False), (1.01e-3, True), (9.9e-4, False)])
+def test_a_command_below_a_thousandth_of_a_radian_asks_for_nothing(speed, moves):
     for requested in ((speed, 0.0), (0.0, -speed)):
-        path = judge(Fence(keep_in=ROOM), estimate(), requested).path
-        assert (path[-1] != path[0]) == asks
-    assert judge(Fence(keep_in=ROOM), estimate(wheels=(5, 5)), (0.0, 0.0)).path[-1] == pytest.approx(
-        judge(Fence(keep_in=ROOM), estimate(wheels=(5, 5)), (math.nan, 0.0)).path[-1]
+        path = evaluate(Fence(keep_in=ROOM), estimate(), requested).path
+        assert (path[-1] != path[0]) == moves
+    assert evaluate(Fence(keep_in=ROOM), estimate(wheels=(5, 5)), (0.0, 0.0)).path[-1] == pytest.approx(
+        evaluate(Fence(keep_in=ROOM), estimate(wheels=(5, 5)), (math.nan, 0.0)).path[-1]
     )
 
 
@@ -531,54 +533,54 @@ def paths(stop, *others):
     return [stop, *others, *([[-9.0] * len(stop)] * (len(SCALES) - 1 - len(others)))]
 
 
-STILL = [[0.0] * 3] * len(SCALES)
+STATIONARY = [[0.0] * 3] * len(SCALES)
 
 
 def test_between_two_points_the_clearance_is_less_by_half_the_way_that_is_not_seen():
     far = [1.0, 1.0, 1.0]
     for step, chosen in ((1.74, 0.25), (1.76, 0.0)):
         # 1 - step / 2 against a quarter of the margin.
-        driven = [[0.0] * 3, [0.0, step, 0.0], *STILL[2:]]
+        driven = [[0.0] * 3, [0.0, step, 0.0], *STATIONARY[2:]]
         assert largest(paths(far, [1.0, 1.0, 1.0]), driven) == chosen
-    driven = [[0.0] * 3, [0.0, 0.0, 1.76], *STILL[2:]]
+    driven = [[0.0] * 3, [0.0, 0.0, 1.76], *STATIONARY[2:]]
     assert largest(paths(far, [1.0, 1.0, 1.0]), driven) == 0.0
     # The first point has nothing before it.
-    assert largest(paths(far, [1.0, 1.0, 1.0]), [[0.0] * 3, [1.76, 0.0, 0.0], *STILL[2:]]) == 0.25
-    assert largest(paths(far, [1.0, 0.5, 0.1]), STILL) == 0.0
+    assert largest(paths(far, [1.0, 1.0, 1.0]), [[0.0] * 3, [1.76, 0.0, 0.0], *STATIONARY[2:]]) == 0.25
+    assert largest(paths(far, [1.0, 0.5, 0.1]), STATIONARY) == 0.0
 
 
 def test_a_path_may_come_exactly_as_near_as_it_may():
-    assert largest(paths([1.0] * 3, [1.0, 0.5, 0.125]), STILL) == 0.25
-    assert largest(paths([1.0] * 3, [1.0, 0.5, 0.124]), STILL) == 0.0
+    assert largest(paths([1.0] * 3, [1.0, 0.5, 0.125]), STATIONARY) == 0.25
+    assert largest(paths([1.0] * 3, [1.0, 0.5, 0.124]), STATIONARY) == 0.0
     # As near as the stop itself, too.
-    assert largest(paths([1.0, 0.5, 0.03], [1.0, 0.5, 0.03]), STILL) == 0.25
-    assert largest(paths([1.0, 0.5, 0.0], [1.0, 0.5, 0.0]), STILL) == 0.25
-    assert largest(paths([1.0, 0.5, -0.01], [1.0, 0.5, -0.01]), STILL) == 0.0
+    assert largest(paths([1.0, 0.5, 0.03], [1.0, 0.5, 0.03]), STATIONARY) == 0.25
+    assert largest(paths([1.0, 0.5, 0.0], [1.0, 0.5, 0.0]), STATIONARY) == 0.25
+    assert largest(paths([1.0, 0.5, -0.01], [1.0, 0.5, -0.01]), STATIONARY) == 0.0
 
 
 def test_leading_away_is_never_nearer_and_at_last_farther_than_at_first():
     stop = [-1.0, -1.0, -1.0]
-    assert largest(paths(stop, [-1.0, -1.0, -0.9]), STILL) == 0.25
-    assert largest(paths(stop, [-1.0, -0.8, -1.0]), STILL) == 0.0
-    assert largest(paths(stop, [-1.0, -1.1, -0.9]), STILL) == 0.0
-    assert largest(paths(stop, [-1.0, -1.0, -1.0]), STILL) == 0.0
-    assert largest(paths(stop, [-1.0, -0.9, -0.95]), STILL) == 0.25
+    assert largest(paths(stop, [-1.0, -1.0, -0.9]), STATIONARY) == 0.25
+    assert largest(paths(stop, [-1.0, -0.8, -1.0]), STATIONARY) == 0.0
+    assert largest(paths(stop, [-1.0, -1.1, -0.9]), STATIONARY) == 0.0
+    assert largest(paths(stop, [-1.0, -1.0, -1.0]), STATIONARY) == 0.0
+    assert largest(paths(stop, [-1.0, -0.9, -0.95]), STATIONARY) == 0.25
 
 
 def test_of_two_shapes_both_must_hold():
     guard = guard_of(Fence(), margin_m=0.5)
     far, near = np.array(paths([1.0] * 3, [1.0] * 3)), np.array(paths([1.0] * 3, [1.0, 0.5, 0.1]))
-    assert guard._largest_scale(np.stack([far, far], axis=2), np.array(STILL)) == 1
-    assert guard._largest_scale(np.stack([far, near], axis=2), np.array(STILL)) == 0
+    assert guard._largest_scale(np.stack([far, far], axis=2), np.array(STATIONARY)) == 1
+    assert guard._largest_scale(np.stack([far, near], axis=2), np.array(STATIONARY)) == 0
 
 
 @pytest.mark.parametrize(("sent", "measured"), [((5.0, 5.0), (0.0, 0.0)), ((0.0, 0.0), (5.0, 5.0))])
 def test_the_nearer_of_the_paths_by_command_and_by_measurement_counts(sent, measured):
     fence = Fence(keep_in=CELL)
     seen = estimate(0.5, 0.0, 0.0, measured)
-    both = judge(fence, seen, (2.0, 2.0), last=sent).clearance_m
-    alone = judge(fence, estimate(0.5, 0.0, 0.0, (5.0, 5.0)), (2.0, 2.0)).clearance_m
-    slow = judge(fence, estimate(0.5, 0.0, 0.0, (0.0, 0.0)), (2.0, 2.0)).clearance_m
+    both = evaluate(fence, seen, (2.0, 2.0), last=sent).clearance_m
+    alone = evaluate(fence, estimate(0.5, 0.0, 0.0, (5.0, 5.0)), (2.0, 2.0)).clearance_m
+    slow = evaluate(fence, estimate(0.5, 0.0, 0.0, (0.0, 0.0)), (2.0, 2.0)).clearance_m
     assert both == pytest.approx(alone)
     assert both < slow - 0.01
     steps = guard_of(fence)._stopping_paths(Boundaries(FOOTPRINT, fence), seen, EXACT, sent, (2.0, 2.0))[2]
@@ -598,7 +600,7 @@ def test_long_arcs_end_where_they_do():
     slow = StoppingSettings(response_s=1.2, reaction_s=0.9, deceleration_rad_s2=2.0, period_s=0.02)
     wide = Fence(keep_in=Circle((0.0, 0.0), 20.0))
     for before, command in (((2.0, 7.0), (2.0, 7.0)), ((-3.0, 4.0), (-3.0, 4.0)), ((0.5, 0.6), (0.6, 0.7))):
-        found = judge(wide, estimate(0.0, 0.0, 0.4, before), command, stops=slow)
+        found = evaluate(wide, estimate(0.0, 0.0, 0.4, before), command, stops=slow)
         expected = integrated(estimate(0.0, 0.0, 0.4, before), EXACT, before, command, slow, 1.2, 1.0)
         np.testing.assert_allclose(found.path[-1], expected[-1], atol=2e-4)
 
@@ -606,10 +608,10 @@ def test_long_arcs_end_where_they_do():
 def test_a_believed_spread_makes_turns_longer_too():
     spread = OdometryParameters(RADIUS, AXLE, X_ICR, ((0.02**2 * RADIUS**2, 0, 0), (0, 0, 0), (0, 0, 0)))
     seen = estimate(wheels=(-2.0, 2.0))
-    exact, longer = (judge(Fence(keep_in=ROOM), seen, (-2.0, 2.0), geometry=one) for one in (EXACT, spread))
+    exact, longer = (evaluate(Fence(keep_in=ROOM), seen, (-2.0, 2.0), geometry=one) for one in (EXACT, spread))
     assert longer.path[-1][2] == pytest.approx(1.06 * exact.path[-1][2])
     unknown_age, no_age = (
-        judge(Fence(keep_in=ROOM), estimate(wheels=(-2.0, 2.0), age_s=age), (-2.0, 2.0), geometry=spread)
+        evaluate(Fence(keep_in=ROOM), estimate(wheels=(-2.0, 2.0), age_s=age), (-2.0, 2.0), geometry=spread)
         for age in (None, 0.0)
     )
     assert unknown_age.path == no_age.path
@@ -626,8 +628,10 @@ def test_the_clearance_is_less_by_the_turn_that_is_not_known_along_the_path():
     turned = np.abs(path[:, 2] - path[0, 2])
     moved = np.concatenate([[0.0], np.cumsum(np.hypot(RADIUS / AXLE * 0.0 + np.diff(turned) * X_ICR,
                                                       np.diff(turned) * AXLE))])  # fmt: skip
-    lost = (exact[1] - wide[1])[-1, :, 1]
-    np.testing.assert_allclose(lost, 3 * 0.01 * turned * (FOOTPRINT.reach_m + 0.5 * moved), rtol=1e-6, atol=1e-12)
+    reduction_m = (exact[1] - wide[1])[-1, :, 1]
+    np.testing.assert_allclose(
+        reduction_m, 3 * 0.01 * turned * (FOOTPRINT.reach_m + 0.5 * moved), rtol=1e-6, atol=1e-12
+    )
 
 
 def test_an_obstacle_is_met_at_the_time_of_coming_to_a_slower_command():
@@ -654,16 +658,16 @@ def test_in_a_turn_the_faster_wheel_says_how_long_the_braking_lasts(before, comm
 
 
 def test_a_clearance_that_matters_to_nothing_is_given_as_the_largest_that_does():
-    found = judge(Fence(keep_in=Circle((0.0, 0.0), 20.0)), estimate(), (0, 0), margin_m=0.25)
+    found = evaluate(Fence(keep_in=Circle((0.0, 0.0), 20.0)), estimate(), (0, 0), margin_m=0.25)
     assert found.clearance_m == pytest.approx(0.25 + 2.0 * FOOTPRINT.reach_m)
-    assert judge(Fence(keep_in=((-9, -9), (9, -9), (9, 9), (-9, 9))), estimate(), (0, 0)).clearance_m == pytest.approx(
-        0.05 + 2.0 * FOOTPRINT.reach_m
-    )
+    assert evaluate(
+        Fence(keep_in=((-9, -9), (9, -9), (9, 9), (-9, 9))), estimate(), (0, 0)
+    ).clearance_m == pytest.approx(0.05 + 2.0 * FOOTPRINT.reach_m)
 
 
 def test_a_path_of_which_only_the_end_has_no_numbers_moves_nothing():
     with np.errstate(all="ignore"):
-        found = judge(Fence(keep_in=ROOM), estimate(), (1e200, 1e200))
+        found = evaluate(Fence(keep_in=ROOM), estimate(), (1e200, 1e200))
     assert (found.verdict, found.scale) == (FenceVerdict.NO_POSE, 0.0)
     assert found.reason == "the predicted stopping path is not finite"
 
@@ -672,7 +676,7 @@ def test_the_place_that_is_said_is_where_the_full_command_would_be_deepest():
     # It would go over the pillar and stop far behind it; a part of the command would stop on it.
     slow = StoppingSettings(response_s=0.08, reaction_s=0.1, deceleration_rad_s2=2.0, period_s=0.02)
     fence = Fence(keep_out=(Circle((0.55, 0.0), 0.14),))
-    found = judge(fence, estimate(), (8, 8), stops=slow, margin_m=0.25)
+    found = evaluate(fence, estimate(), (8, 8), stops=slow, margin_m=0.25)
     bounds = Boundaries(FOOTPRINT, fence)
     expected = integrated(estimate(), EXACT, (0, 0), (8, 8), slow, slow.response_s, 1.0)
     deepest = expected[bounds.clearance_m(expected).argmin()]
@@ -684,11 +688,11 @@ def test_the_place_that_is_said_is_where_the_full_command_would_be_deepest():
 
 def test_between_two_points_both_of_them_count():
     far = [1.0, 1.0, 1.0, 1.0]
-    still = [[0.0] * 4] * len(SCALES)
-    driven = [[0.0] * 4, [0.0, 0.0, 0.0, 0.2], *still[2:]]
+    stationary = [[0.0] * 4] * len(SCALES)
+    driven = [[0.0] * 4, [0.0, 0.0, 0.0, 0.2], *stationary[2:]]
     # Between the last two the clearance may be 0.2 - 0.1, and a quarter of the margin is 0.125.
     assert largest(paths(far, [1.0, 0.2, 0.2, 0.2]), driven) == 0.0
-    assert largest(paths(far, [1.0, 0.2, 0.2, 0.2]), still) == 0.25
+    assert largest(paths(far, [1.0, 0.2, 0.2, 0.2]), stationary) == 0.25
 
 
 def test_the_spread_of_a_turn_counts_what_radius_and_axle_have_in_common_twice():
@@ -698,6 +702,7 @@ def test_the_spread_of_a_turn_counts_what_radius_and_axle_have_in_common_twice()
     both = OdometryParameters(RADIUS, AXLE, X_ICR, ((radius, half, 0), (half, axle, 0), (0, 0, 0)))
     alone = OdometryParameters(RADIUS, AXLE, X_ICR, ((radius, 0, 0), (0, 0, 0), (0, 0, 0)))
     found = [
-        judge(Fence(keep_in=CELL), estimate(wheels=(1, 3)), (1, 3), geometry=one).clearance_m for one in (both, alone)
+        evaluate(Fence(keep_in=CELL), estimate(wheels=(1, 3)), (1, 3), geometry=one).clearance_m
+        for one in (both, alone)
     ]
     assert found[0] == pytest.approx(found[1], abs=1e-12)

@@ -56,9 +56,9 @@ def test_the_change_keeps_its_direction_and_at_least_one_wheel_uses_its_limit(le
     governor = governor_at(left0, right0)
     governed = governor.step(left, right, PERIOD_S)
     moved = (governed.left_rad_s - left0, governed.right_rad_s - right0)
-    wanted = (left - left0, right - right0)
-    assert moved[0] * wanted[1] - moved[1] * wanted[0] == pytest.approx(0.0, abs=1e-9)
-    assert moved[0] * wanted[0] + moved[1] * wanted[1] >= 0.0
+    requested = (left - left0, right - right0)
+    assert moved[0] * requested[1] - moved[1] * requested[0] == pytest.approx(0.0, abs=1e-9)
+    assert moved[0] * requested[0] + moved[1] * requested[1] >= 0.0
     if Limited.ACCELERATION in governed.limited:
         assert not (
             speed_change_allowed(left0, left0 + 1.01 * moved[0], PERIOD_S)
@@ -113,9 +113,9 @@ def test_reversing_brakes_to_standstill_first_and_accelerates_with_what_is_left(
     assert governor.step(-8.0, -8.0, PERIOD_S).left_rad_s == pytest.approx(-0.2)
 
 
-@pytest.mark.parametrize("late_s", [0.031, 0.2, 1e9, math.inf])
-def test_a_late_tick_allows_one_and_a_half_periods_and_says_so(late_s):
-    governed = Governor(LIMITS, PERIOD_S).step(8.0, 8.0, late_s)
+@pytest.mark.parametrize("elapsed_s", [0.031, 0.2, 1e9, math.inf])
+def test_a_late_tick_allows_one_and_a_half_periods_and_says_so(elapsed_s):
+    governed = Governor(LIMITS, PERIOD_S).step(8.0, 8.0, elapsed_s)
     assert governed.left_rad_s == pytest.approx(20.0 * 0.03)
     assert Limited.PERIOD in governed.limited
 

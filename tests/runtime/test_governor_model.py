@@ -61,7 +61,7 @@ class GovernorModel(RuleBasedStateMachine):
         self.check(left, right, dt_s, math.inf if dt_s > 0.0 else 0.0)
 
     @rule(bad=NOT_FINITE, good=SPEEDS, bad_is_left=st.booleans(), dt_s=PERIODS)
-    def ask_for_no_number(self, bad, good, bad_is_left, dt_s):
+    def request_not_finite(self, bad, good, bad_is_left, dt_s):
         self.not_finite += 1
         pair = (bad, good) if bad_is_left else (good, bad)
         self.check(*pair, dt_s, dt_s, counts_as=(0.0, 0.0))
@@ -90,8 +90,14 @@ class GovernorModel(RuleBasedStateMachine):
         part = furthest(self.last, desired, min(elapsed_s, 1.5 * self.period_s), self.limits)
         expected = [s + part * (e - s) for s, e in zip(self.last, desired, strict=True)]
         got = (command.left_rad_s, command.right_rad_s)
-        for want, have in zip(expected, got, strict=True):
-            assert math.isclose(want, have, rel_tol=1e-9, abs_tol=1e-9), (self.last, desired, elapsed_s, expected, got)
+        for expected_speed, have in zip(expected, got, strict=True):
+            assert math.isclose(expected_speed, have, rel_tol=1e-9, abs_tol=1e-9), (
+                self.last,
+                desired,
+                elapsed_s,
+                expected,
+                got,
+            )
         assert (Limited.SPEED in command.limited) == (fastest > top)
         self.last = got
 

@@ -16,7 +16,9 @@ TICK_NS = 20_000_000
 COMMAND = (0.4, -0.5)
 
 
-def said(seconds, speed_m_s=0.2, robot_m_s=0.0, wheels_rad_s=0.0, command=COMMAND, failure=None, running=True):
+def headway_events(
+    seconds, speed_m_s=0.2, robot_m_s=0.0, wheels_rad_s=0.0, command=COMMAND, failure=None, running=True
+):
     """What a headway says while the robot moves, its wheels turn and it is commanded like this; with the times."""
     headway, found = Headway(speed_m_s), []
     for tick in range(round(seconds * 50)):
@@ -29,7 +31,7 @@ def said(seconds, speed_m_s=0.2, robot_m_s=0.0, wheels_rad_s=0.0, command=COMMAN
 
 
 @pytest.mark.parametrize(
-    ("what", "words"),
+    ("what", "expected"),
     [
         ({}, "the wheels do not turn although commanded up to 0.50 rad/s"),
         ({"command": (0.0, 0.0)}, "the planner commands no motion"),
@@ -37,21 +39,21 @@ def said(seconds, speed_m_s=0.2, robot_m_s=0.0, wheels_rad_s=0.0, command=COMMAN
         ({"wheels_rad_s": 2.0}, "the wheels have turned by 10.0 rad, but the pose has not changed"),
     ],
 )
-def test_a_robot_that_stays_is_reported_once_with_what_stands_in_the_way(what, words):
-    ((at_s, text),) = said(30.0, **what)
+def test_a_robot_that_stays_is_reported_once_with_what_stands_in_the_way(what, expected):
+    ((at_s, text),) = headway_events(30.0, **what)
     assert at_s == pytest.approx(5.0, abs=0.05)
     assert text.startswith("task: no progress for 5 s: ")
-    assert words in text
+    assert expected in text
 
 
 @pytest.mark.parametrize("speed_m_s", [0.2, 0.02])
 def test_a_robot_that_drives_is_not_reported(speed_m_s):
-    assert said(60.0, speed_m_s=speed_m_s, robot_m_s=0.9 * speed_m_s) == []
+    assert headway_events(60.0, speed_m_s=speed_m_s, robot_m_s=0.9 * speed_m_s) == []
 
 
 @pytest.mark.parametrize("what", [{"running": False}, {"speed_m_s": math.nan}])
 def test_what_does_not_run_or_may_rest_is_not_watched(what):
-    assert said(20.0, **what) == []
+    assert headway_events(20.0, **what) == []
 
 
 def test_it_is_reported_when_the_robot_gets_on_again():

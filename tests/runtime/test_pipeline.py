@@ -59,7 +59,7 @@ class Scripted:
         self.resets += 1
 
 
-def make(planner, plan_tail_s: float = 0.06, means: DriveMeans | None = None) -> Pipeline:
+def create_pipeline(planner, plan_tail_s: float = 0.06, means: DriveMeans | None = None) -> Pipeline:
     fusion = PoseFusion(Estimation(), OdometryParameters(0.06, 0.4, 0.0), 0.05)
     return Pipeline(fusion, planner, Governor(WheelLimits(8.0, 20.0, 20.0), 0.02), plan_tail_s, means=means)
 
@@ -69,14 +69,14 @@ def run(pipeline: Pipeline, motions, start: int = 0):
 
 
 def test_standing_and_off_ask_for_zero():
-    ticks = run(make(Scripted()), [Off(), Standstill()])
+    ticks = run(create_pipeline(Scripted()), [Off(), Standstill()])
     assert [tick.source for tick in ticks] == [Source.OFF, Source.HOLD]
     assert all(tick.requested == (0.0, 0.0) for tick in ticks)
     assert all(tick.plan is None for tick in ticks)
 
 
 def test_a_plan_is_followed_within_the_acceleration_limit():
-    ticks = run(make(Scripted(2.0, 2.0, 2.0)), [Off(), FollowTask(), FollowTask()])
+    ticks = run(create_pipeline(Scripted(2.0, 2.0, 2.0)), [Off(), FollowTask(), FollowTask()])
     assert ticks[1].source is Source.PLAN
     assert ticks[1].requested == (2.0, 2.0)
     assert ticks[1].command.left_rad_s == pytest.approx(0.4)
@@ -85,7 +85,7 @@ def test_a_plan_is_followed_within_the_acceleration_limit():
 
 
 def test_a_missing_plan_is_followed_on_its_tail_then_the_wheels_ramp_to_zero():
-    ticks = run(make(Scripted(0.4), plan_tail_s=0.06), [Off(), *[FollowTask()] * 6])
+    ticks = run(create_pipeline(Scripted(0.4), plan_tail_s=0.06), [Off(), *[FollowTask()] * 6])
     assert [tick.source for tick in ticks[1:]] == [Source.PLAN, *[Source.TAIL] * 3, *[Source.RAMP] * 2]
     assert ticks[4].requested == (0.4, 0.4)
     assert ticks[5].requested == (0.0, 0.0)
@@ -94,25 +94,25 @@ def test_a_missing_plan_is_followed_on_its_tail_then_the_wheels_ramp_to_zero():
 
 
 def test_a_planner_that_never_found_anything_moves_nothing():
-    ticks = run(make(Scripted()), [Off(), *[FollowTask()] * 3])
+    ticks = run(create_pipeline(Scripted()), [Off(), *[FollowTask()] * 3])
     assert {tick.source for tick in ticks[1:]} == {Source.RAMP}
     assert all(tick.command.left_rad_s == 0.0 for tick in ticks)
 
 
 def test_the_planner_starts_anew_after_every_pause():
     planner = Scripted(*[1.0] * 10)
-    run(make(planner), [Off(), FollowTask(), FollowTask(), Standstill(), FollowTask()])
+    run(create_pipeline(planner), [Off(), FollowTask(), FollowTask(), Standstill(), FollowTask()])
     assert planner.resets == 2
 
 
 def test_an_old_plan_does_not_outlive_a_pause():
     planner = Scripted(1.0)
-    ticks = run(make(planner), [Off(), FollowTask(), Standstill(), FollowTask()])
+    ticks = run(create_pipeline(planner), [Off(), FollowTask(), Standstill(), FollowTask()])
     assert ticks[3].source is Source.RAMP
 
 
 def test_manual_speeds_pass_the_governor_too():
-    ticks = run(make(Scripted()), [Off(), Manual(100.0, -50.0), Manual(float("nan"), 0.0)])
+    ticks = run(create_pipeline(Scripted()), [Off(), Manual(100.0, -50.0), Manual(float("nan"), 0.0)])
     assert ticks[1].source is Source.MANUAL
     assert Limited.SPEED in ticks[1].command.limited
     assert abs(ticks[1].command.left_rad_s) <= 0.4 + 1e-12
@@ -120,7 +120,7 @@ def test_manual_speeds_pass_the_governor_too():
 
 
 def test_off_forgets_the_last_command():
-    pipeline = make(Scripted(*[3.0] * 10))
+    pipeline = create_pipeline(Scripted(*[3.0] * 10))
     ticks = run(pipeline, [Off(), *[FollowTask()] * 5, Off(), FollowTask()])
     assert ticks[5].command.left_rad_s == pytest.approx(2.0)
     assert ticks[6].command.left_rad_s == 0.0
@@ -129,7 +129,7 @@ def test_off_forgets_the_last_command():
 
 def test_the_planner_sees_the_estimate_and_the_commands_sent():
     planner = Scripted(*[1.0] * 3)
-    pipeline = make(planner)
+    pipeline = create_pipeline(planner)
     for k in range(6):
         now_ns = k * PERIOD_NS
         wheels = WheelSample(now_ns, now_ns, 0.1 * k, 0.2 * k, 5.0, 10.0)
@@ -144,7 +144,7 @@ def test_the_planner_sees_the_estimate_and_the_commands_sent():
 
 def test_the_history_of_commands_is_bounded_to_two_seconds():
     planner = Scripted(*[0.0] * 300)
-    run(make(planner), [Off(), *[FollowTask()] * 250])
+    run(create_pipeline(planner), [Off(), *[FollowTask()] * 250])
     sent = planner.states[-1].sent
     assert sent[0].t_ns >= planner.states[-1].t_ns - 2_000_000_000 - PERIOD_NS
     assert np.all(np.diff([command.t_ns for command in sent]) == PERIOD_NS)
@@ -152,7 +152,7 @@ def test_the_history_of_commands_is_bounded_to_two_seconds():
 
 def test_stages_are_marked_in_order():
     marked = []
-    make(Scripted()).step(0, Readings(), Off(), marked.append)
+    create_pipeline(Scripted()).step(0, Readings(), Off(), marked.append)
     assert marked == ["estimate", "plan"]
 
 
@@ -164,7 +164,7 @@ def test_what_terms_remember_is_kept_up_while_something_else_drives():
         ),
     )  # fmt: skip
     planner = Scripted(1.0)
-    pipeline = make(planner, means=DriveMeans.of(model))
+    pipeline = create_pipeline(planner, means=DriveMeans.of(model))
     ticks, turned = [], 0.0
     for k in range(200):
         speed = ticks[-1].command.left_rad_s if ticks else 0.0
@@ -191,5 +191,5 @@ def test_what_terms_remember_is_kept_up_while_something_else_drives():
 
 def test_a_model_without_memory_gives_the_planner_none():
     planner = Scripted(1.0)
-    run(make(planner), [Off(), FollowTask()])
+    run(create_pipeline(planner), [Off(), FollowTask()])
     assert (planner.states[0].command_means, planner.states[0].body_means) == ((), ())

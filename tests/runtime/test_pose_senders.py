@@ -27,18 +27,18 @@ from tools.fault_run import CirclingPlanner
 class Sender:
     """Tells by datagrams where the robot truly is, off by `off(t_s)` (m, east), at a rate; `said` changes a pose."""
 
-    def __init__(self, port, rate_hz, off=lambda t_s: 0.0, said=lambda pose: pose):
+    def __init__(self, port, rate_hz, off=lambda t_s: 0.0, transform=lambda pose: pose):
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect(("127.0.0.1", port))
         self.name = "{}:{}".format(*self._socket.getsockname())
-        self._period_us, self._off, self._said = round(1e6 / rate_hz), off, said
+        self._period_us, self._off, self._transform = round(1e6 / rate_hz), off, transform
         self.is_silent = False
 
     def step(self, now_us, truth):
         if now_us % self._period_us == 0 and not self.is_silent:
             pose = {"x_m": truth.x_m + self._off(now_us * 1e-6), "y_m": truth.y_m, "yaw_rad": truth.yaw_rad}
             pose |= {"position_std_m": 0.005, "yaw_std_rad": 0.01, "age_s": 0.0}
-            self._socket.send(json.dumps(self._said(pose)).encode())
+            self._socket.send(json.dumps(self._transform(pose)).encode())
 
     def close(self):
         self._socket.close()
@@ -89,19 +89,19 @@ class Bench:
 def bench(tmp_path):
     made = []
 
-    def make(lines=""):
+    def create_bench(lines=""):
         made.append(Bench(tmp_path, lines))
         return made[-1]
 
-    yield make
+    yield create_bench
     for one in made:
         one.stack.core.pose_source.close()
         for sender in one.senders:
             sender.close()
 
 
-def containing(said, words):
-    return [text for text in said if words in text]
+def containing(lines, fragment):
+    return [text for text in lines if fragment in text]
 
 
 @thinned("off_m", [1.0, -0.3], quick=1)
@@ -116,17 +116,17 @@ def test_a_robot_that_is_carried_stops_its_task_and_says_so_and_its_operator_sta
     last = made.stack.run(2.0)[-1]
     assert not last.output.running
     assert last.command.left_rad_s == last.command.right_rad_s == 0.0
-    said = made.output_lines()
-    (jump,) = containing(said, "poses: the pose jumped by")
+    lines = made.output_lines()
+    (jump,) = containing(lines, "poses: the pose jumped by")
     assert f"by {abs(off_m):.2f} m" in jump
     assert (
         "which the motion of the wheels does not explain: the robot was carried or has slipped, or the measured poses"
         in jump
     )
-    (stop,) = containing(said, "task stopped: the pose jumped by")
+    (stop,) = containing(lines, "task stopped: the pose jumped by")
     assert stop.endswith("check that the robot is where the page shows it, then start again")
-    (misfit,) = containing(said, "poses: 3 poses in a row disagree with the wheels")
-    assert f"{abs(off_m):.2f} m, and are not used" in misfit
+    (mismatch,) = containing(lines, "poses: 3 poses in a row disagree with the wheels")
+    assert f"{abs(off_m):.2f} m, and are not used" in mismatch
     # It never goes on by itself.
     assert not made.stack.run(3.0)[-1].output.running
     (reply,) = [reply for tick in made.stack.run(0.1, UserRequest.START) for reply in tick.replies]
@@ -175,10 +175,12 @@ def test_another_sender_takes_over_only_after_the_task_has_stopped_for_want_of_p
     first.is_silent = True
     seen = made.stack.run(4.0)
     assert not seen[-1].output.running
-    said = made.output_lines()
-    stopped = said.index("task stopped: no valid pose; check the pose sensor, or set estimation.pose_required = false")
-    (taken,) = containing(said, f"poses: poses now come from {second.name}; {first.name} has sent nothing for 2.0 s")
-    assert stopped < said.index(taken)
+    lines = made.output_lines()
+    stopped = lines.index("task stopped: no valid pose; check the pose sensor, or set estimation.pose_required = false")
+    (takeover,) = containing(
+        lines, f"poses: poses now come from {second.name}; {first.name} has sent nothing for 2.0 s"
+    )
+    assert stopped < lines.index(takeover)
     assert seen[-1].pipeline.estimate.pose_ok
 
 
@@ -186,8 +188,8 @@ def test_only_allowed_addresses_may_send(bench):
     made = bench('allow = ["10.0.0.0/8"]\n')
     sender = made.send(25.0)
     assert not made.start()
-    (said,) = containing(made.output_lines(), "is not in pose.allow")
-    assert said.startswith(f"poses: {sender.name} sends poses but is not in pose.allow: not used (1 datagrams)")
+    (line,) = containing(made.output_lines(), "is not in pose.allow")
+    assert line.startswith(f"poses: {sender.name} sends poses but is not in pose.allow: not used (1 datagrams)")
 
 
 def constant(yaw_rad):
@@ -195,7 +197,7 @@ def constant(yaw_rad):
 
 
 @thinned(
-    "said",
+    "transform",
     [
         lambda pose: {**pose, "yaw_rad": 0.0, "yaw_std_rad": 0.0},
         lambda pose: {**pose, "yaw_rad": 0.3, "yaw_std_rad": -1.0},
@@ -204,29 +206,29 @@ def constant(yaw_rad):
     ids=["identity", "minus one", "large"],
     quick=1,
 )
-def test_a_heading_that_is_said_to_be_unknown_is_not_used_and_the_operator_is_told(bench, said):
+def test_a_heading_that_is_said_to_be_unknown_is_not_used_and_the_operator_is_told(bench, transform):
     made = bench()
-    made.send(25.0, said=said)
+    made.send(25.0, transform=transform)
     assert not made.start()
     last = made.stack.core.last
     assert (last.pipeline.estimate.initialised, last.pipeline.estimate.heading_known) == (True, False)
     assert last.output.detail == "armed, commanding zero speed"
     assert made.error_m() < 0.05
-    (told,) = containing(made.output_lines(), "only the positions are used")
-    assert told.startswith("poses: udp: its poses have no heading, or a covariance that marks it as unknown")
+    (line,) = containing(made.output_lines(), "only the positions are used")
+    assert line.startswith("poses: udp: its poses have no heading, or a covariance that marks it as unknown")
     assert status(made.stack.core, {}, RecorderStats())["poses"][0]["heading"] == "none"
 
 
 def test_a_heading_that_never_moves_is_found_out_by_the_first_turn_and_the_estimate_forgets_it(bench):
     """At first it fits: the circle begins with it."""
     made = bench()
-    made.send(25.0, said=constant(0.5 * math.pi))
+    made.send(25.0, transform=constant(0.5 * math.pi))
     assert made.start()
     last = made.stack.run(3.0)[-1]
     assert not last.output.running
     assert not last.pipeline.estimate.heading_known
-    (told,) = containing(made.output_lines(), "the heading stays at 1.57 rad while the wheels turn the robot by")
-    assert told.endswith("only the positions are used; check the pose sensor")
+    (line,) = containing(made.output_lines(), "the heading stays at 1.57 rad while the wheels turn the robot by")
+    assert line.endswith("only the positions are used; check the pose sensor")
     assert status(made.stack.core, {}, RecorderStats())["poses"][0]["heading"] == "stands still"
 
 
@@ -235,14 +237,14 @@ def test_a_heading_sensor_that_dies_is_left_out_and_the_drive_goes_on_by_positio
     made = bench("offset = [0.1, 0.0]\n")
     dead = []
 
-    def said(pose):
+    def with_dead_heading(pose):
         if made.stack.now_us > 6_000_000 and not dead:
             dead.append(pose["yaw_rad"])
         yaw = pose["yaw_rad"]
         x, y = pose["x_m"] + 0.1 * math.cos(yaw), pose["y_m"] + 0.1 * math.sin(yaw)
         return {**pose, "x_m": x, "y_m": y, "yaw_rad": dead[0] if dead and made.stack.now_us < 14_000_000 else yaw}
 
-    made.send(25.0, said=said)
+    made.send(25.0, transform=with_dead_heading)
     assert made.start()
     last = made.stack.run(10.0)[-1]
     assert containing(made.output_lines(), "udp: the heading stays at")
@@ -285,12 +287,12 @@ def test_a_first_pose_that_is_not_where_the_wheels_led_to_from_the_origin_stops_
     )
     file.write_text(f"{text}\n[estimation]\npose_required = false\n", encoding="utf-8")
     stack = simulated_stack(CirclingPlanner(load_setup(file).config, (0.061, 0.415, 0.238)), robot_file=file)
-    received, heard = stack.core.pose_source.receive, []
-    stack.core.pose_source.receive = lambda now_ns, poses: received(now_ns, poses) if heard else []
+    received, enabled = stack.core.pose_source.receive, []
+    stack.core.pose_source.receive = lambda now_ns, poses: received(now_ns, poses) if enabled else []
     stack.run(1.5)
     stack.run(0.5, UserRequest.ARM)
     assert stack.run(2.0, UserRequest.START)[-1].output.running
-    heard.append(True)
+    enabled.append(True)
     seen = stack.run(0.5)
     assert not seen[-1].output.running
     assert containing([event for tick in seen for event in tick.events], "task stopped: the pose jumped by")

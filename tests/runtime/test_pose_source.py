@@ -58,8 +58,8 @@ def test_without_wheels_poses_are_recorded_and_nothing_is_armed(monkeypatch):
     """Whoever pushes the robot, or drives it by its own remote control, has its poses; no blind motion."""
     stack = simulated_stack(NoPlanner())
     driver = stack.core.driver
-    heard = driver.receive
-    monkeypatch.setattr(driver, "receive", lambda *of: msgspec.structs.replace(heard(*of), wheels=()))
+    receive = driver.receive
+    monkeypatch.setattr(driver, "receive", lambda *of: msgspec.structs.replace(receive(*of), wheels=()))
     stack.core.pose_source = Elsewhere()
     stack.pilot = HandPilot(Hand(), Coverage(8.0))
     stack.run(1.5)

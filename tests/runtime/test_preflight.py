@@ -27,7 +27,7 @@ def robot(**changes):
     return Robot(**{**values, "max_wheel_speed_rad_s": 8.0, **changes})
 
 
-def limits(said_by="device", **changes):
+def limits(source="device", **changes):
     values = {
         "max_wheel_speed_rad_s": 8.0,
         "max_wheel_acceleration_rad_s2": 20.0,
@@ -35,8 +35,8 @@ def limits(said_by="device", **changes):
         "command_timeout_s": 0.1,
         "stop_deceleration_rad_s2": 20.0,
     }
-    said = {name: Limit(value, said_by) for name, value in {**values, **changes}.items() if value is not None}
-    return Limits(**said)
+    reported = {name: Limit(value, source) for name, value in {**values, **changes}.items() if value is not None}
+    return Limits(**reported)
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_each_difference_is_a_check_of_its_own():
 
 
 @pytest.mark.parametrize(
-    ("rate_hz", "valid_for_s", "timeout_s", "level", "words"),
+    ("rate_hz", "valid_for_s", "timeout_s", "level", "expected"),
     [
         (50.0, 0.1, 0.1, Level.OK, "3 commands in a row"),
         (100.0, 0.1, 0.1, Level.OK, "8 commands in a row"),
@@ -110,11 +110,11 @@ def test_each_difference_is_a_check_of_its_own():
         (20.0, 0.1, 0.02, Level.FAIL, "between two commands"),
     ],
 )
-def test_command_timing_counts_what_may_be_lost(rate_hz, valid_for_s, timeout_s, level, words):
+def test_command_timing_counts_what_may_be_lost(rate_hz, valid_for_s, timeout_s, level, expected):
     control = Control(rate_hz=rate_hz, command_valid_for_s=valid_for_s)
     check = check_command_timing(control, limits(command_timeout_s=timeout_s))
     assert check.level is level
-    assert words in check.text
+    assert expected in check.text
 
 
 @pytest.mark.parametrize("rate_hz", [20.0, 30.0, 50.0, 100.0])
@@ -159,8 +159,8 @@ def test_round_trip_gives_median_and_worst():
     text = check_round_trip([0.001, 0.002, 0.006], 0.02).text
     assert "median 2.00 ms" in text
     assert "worst 6.00 ms of 3" in text
-    held_up = check_round_trip(10 * [0.001] + [0.080], 0.02).text
-    assert "worst 80.00 ms of 11; 1 longer than a control period of 20 ms" in held_up
+    delayed = check_round_trip(10 * [0.001] + [0.080], 0.02).text
+    assert "worst 80.00 ms of 11; 1 longer than a control period of 20 ms" in delayed
 
 
 def test_only_failures_keep_the_robot_from_being_armed():
@@ -212,15 +212,15 @@ def test_every_error_is_reported_at_once():
 
 
 @pytest.mark.parametrize(
-    ("brakes", "level", "said"),
+    ("brakes", "level", "expected"),
     [
         (True, Level.OK, "its watchdog; about 0.14 m and 0.50 s at 0.48 m/s"),
         (False, Level.WARNING, "its watchdog; 0.05 m, 0.10 s, at 0.48 m/s, and then as far as the robot rolls"),
     ],
 )
-def test_the_safety_card_says_how_far_and_how_long_at_full_speed(brakes, level, said):
+def test_the_safety_card_says_how_far_and_how_long_at_full_speed(brakes, level, expected):
     card = SafetyCard("the controller", "its watchdog", 0.1, brakes, "a frame")
     (found,) = [
         check for check in check_safety(robot(max_wheel_acceleration_rad_s2=20.0), card) if check.name == "stops by"
     ]
-    assert (found.level, found.text) == (level, said)
+    assert (found.level, found.text) == (level, expected)

@@ -22,8 +22,8 @@ def test_a_fan_keeps_first_and_last_point_of_each_path_and_eleven_in_all():
     assert paths.shape == (3, 11, 2)
     assert record.t_ns == 7
     assert record.weights == tuple(made.weights)
-    for path, whole in zip(paths, made.trajectories, strict=True):
-        assert path[[0, -1]] == pytest.approx(whole[[0, -1], :2], abs=6e-4)
+    for path, trajectory in zip(paths, made.trajectories, strict=True):
+        assert path[[0, -1]] == pytest.approx(trajectory[[0, -1], :2], abs=6e-4)
     assert all(value == round(value, 3) for value in record.x_m)
 
 

@@ -102,9 +102,9 @@ def test_a_drive_whose_model_remembers_replays_bit_for_bit(tmp_path, monkeypatch
     log = write_log(tmp_path / "run.mcap", ticks, text, (tmp_path / "model.toml").read_text())
     report = replay(log)
     assert report.ok, report.as_text()
-    for forgotten in ("add_command", "add_wheels"):
+    for method in ("add_command", "add_wheels"):
         with monkeypatch.context() as patch:
-            patch.setattr(DriveMeans, forgotten, lambda *_: None)
+            patch.setattr(DriveMeans, method, lambda *_: None)
             assert not replay(log).ok
 
 
@@ -130,8 +130,8 @@ def test_a_follower_takes_over_from_a_planner_that_finds_nothing_and_replays_bit
     assert last - first > 40
     assert sources[last:] == [Source.PLAN] * (len(sources) - last) != []
     assert all(tick.command.left_rad_s > 0.5 for tick in driven[first:last])
-    said = [text for tick in driven for text in tick.events if text.startswith("planner")]
-    assert said == [
+    events = [text for tick in driven for text in tick.events if text.startswith("planner")]
+    assert events == [
         "planner: no valid plan; the fallback controller lqr follows the line instead",
         "planner: valid plan again; the planner drives",
     ]

@@ -57,8 +57,8 @@ def test_a_model_marked_as_lacking_an_effect_is_run_only_when_asked_to(tmp_path,
     marked = tmp_path / "model.toml"
     save_model(replace(load_model(ROBOT.parent / "wombot_model.toml"), missing_effects=("turn_slip",)), marked)
     monkeypatch.setattr(run, "serve", lambda *_: 0)
-    words = r"model\.toml: missing_effects: the model lacks turn_slip.*--accept-missing-effects"
-    with pytest.raises(InputError, match=words):
+    message = r"model\.toml: missing_effects: the model lacks turn_slip.*--accept-missing-effects"
+    with pytest.raises(InputError, match=message):
         run_daemon(DaemonOptions(robot=ROBOT, model=marked))
     assert run_daemon(DaemonOptions(robot=ROBOT, model=marked, accept_missing_effects=True)) == 0
     assert run_daemon(DaemonOptions(robot=ROBOT)) == 0

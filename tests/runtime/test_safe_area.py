@@ -119,8 +119,8 @@ def test_a_task_is_left_where_its_stopping_path_would_leave_the_fence(robot_file
     run.pilot.step = lambda now_ns, last: PilotTick(motion=Manual(5.0, 5.0))
     ticks = run.run(1.0)
     assert not ticks[-1].output.running
-    said = [event for tick in ticks for event in tick.events if event.startswith("task stopped")]
-    (event,) = said
+    stop_events = [event for tick in ticks for event in tick.events if event.startswith("task stopped")]
+    (event,) = stop_events
     assert event.startswith("task stopped: fence: the stopping path would leave the fence at (0.")
     assert ticks[-1].output.state is State.ARMED
 
@@ -230,11 +230,11 @@ def test_thirty_two_obstacles_are_kept_and_no_more():
     ],
 )  # fmt: skip
 def test_what_is_no_obstacle_is_refused_in_one_line(fields):
-    whole = {"name": "box", "x_m": 0.0, "y_m": 0.0, "radius_m": 0.1}
-    assert report_from(whole).age_limit_s == 1.0
+    valid = {"name": "box", "x_m": 0.0, "y_m": 0.0, "radius_m": 0.1}
+    assert report_from(valid).age_limit_s == 1.0
     with pytest.raises(ObstacleRefused, match=r"obstacle: .*; write"):
-        report_from({**whole, **fields})
-    assert reports_in(msgspec.json.encode({**whole, **fields})) == []
+        report_from({**valid, **fields})
+    assert reports_in(msgspec.json.encode({**valid, **fields})) == []
 
 
 def test_datagrams_of_one_and_of_several_are_taken():

@@ -54,8 +54,8 @@ class Bench:
         self._advance(now_us)
         if now_us % 100_000 == 0 and self.off_m is not None:
             truth = self.stack.robot.truth
-            said = {"x_m": truth.x_m + self.off_m - 1.0, "y_m": truth.y_m, "position_std_m": 0.02, "age_s": 0.0}
-            self._sender.send(json.dumps(said).encode())
+            datagram = {"x_m": truth.x_m + self.off_m - 1.0, "y_m": truth.y_m, "position_std_m": 0.02, "age_s": 0.0}
+            self._sender.send(json.dumps(datagram).encode())
 
     def start(self):
         self.stack.run(1.5)
@@ -141,7 +141,7 @@ class LoopFigures:
 
 
 @pytest.mark.parametrize(
-    ("lines", "words"),
+    ("lines", "message"),
     [
         ('[[pose.also]]\nsource = "sonar"\n', r'pose\.also\[0\]\.source: there is no source "sonar"; write one of'),
         ('[[pose.also]]\nport = 7\n', r"pose\.also\[0\]: does not say which source; add source, one of"),
@@ -158,8 +158,8 @@ class LoopFigures:
         ('[[pose.also]]\nsource = "udp"\n[[pose.also.also]]\nsource = "robot"\n', r"also\[0\]\.also: sources are not"),
     ],
 )  # fmt: skip
-def test_a_further_source_that_is_wrong_is_one_line(tmp_path, lines, words):
-    with pytest.raises(InputError, match=words):
+def test_a_further_source_that_is_wrong_is_one_line(tmp_path, lines, message):
+    with pytest.raises(InputError, match=message):
         load_robot_config(robot_toml(tmp_path, lines))
 
 
@@ -209,5 +209,5 @@ def test_a_key_beside_robot_toml_is_read_and_one_that_others_can_read_or_is_none
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         stranger.sendto(b'{"x_m":1,"y_m":2,"position_std_m":0.1,"age_s":0}', ("127.0.0.1", port))
         assert list(source.receive(10**12, ())) == []
-    assert any("without the authentication code of pose.key_file" in words for words in source.new_messages())
+    assert any("without the authentication code of pose.key_file" in message for message in source.new_messages())
     source.close()

@@ -21,36 +21,38 @@ STATUS = {"estop": False, "robot_state": "READY", "fault": "NONE", "state": "REA
 
 @pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
 def test_every_fault_of_the_protocol_has_its_sentence(fault):
-    (said,) = advice({**STATUS, "fault": fault.name})
-    assert said.startswith(f"{describe(fault.name)}. ")
-    assert said.lower().endswith(f"{fault.advice.lower()}.")
+    (sentence,) = advice({**STATUS, "fault": fault.name})
+    assert sentence.startswith(f"{describe(fault.name)}. ")
+    assert sentence.lower().endswith(f"{fault.advice.lower()}.")
 
 
 def test_nobody_is_sent_to_reset_what_does_not_latch():
-    said = advice({**STATUS, "fault": "OVER_TEMPERATURE_LEFT"})
-    assert said == ("Over temperature left. Let the left motor cool down and drive more gently; it clears by itself.",)
+    sentences = advice({**STATUS, "fault": "OVER_TEMPERATURE_LEFT"})
+    assert sentences == (
+        "Over temperature left. Let the left motor cool down and drive more gently; it clears by itself.",
+    )
 
 
 @pytest.mark.parametrize("state", State)
 def test_every_state_says_what_to_do(state):
-    said = advice({**STATUS, "state": state.name})
-    assert len(said) == 1
-    assert said[0].endswith(".")
+    sentences = advice({**STATUS, "state": state.name})
+    assert len(sentences) == 1
+    assert sentences[0].endswith(".")
 
 
 @pytest.mark.parametrize("state", ["READY", "ARMED", "FAULT"])
 def test_in_a_terminal_it_names_commands_in_place_of_buttons(state):
-    ask = by_command(Path("robots/mine.toml"))
+    advice_style = by_command(Path("robots/mine.toml"))
     for running in (False, True):
-        said = " ".join(advice({**STATUS, "state": state, "running": running}, ask))
-        assert "disco-hw ctl robots/mine.toml " in said
-        assert "press" not in said.lower()
-    latched = advice({**STATUS, "state": "FAULT", "estop": True, "fault": "STALL_LEFT"}, ask)
+        text = " ".join(advice({**STATUS, "state": state, "running": running}, advice_style))
+        assert "disco-hw ctl robots/mine.toml " in text
+        assert "press" not in text.lower()
+    latched = advice({**STATUS, "state": "FAULT", "estop": True, "fault": "STALL_LEFT"}, advice_style)
     assert latched[0].endswith("then run `disco-hw ctl robots/mine.toml reset`.")
 
 
 @pytest.mark.parametrize(
-    ("link", "link_error", "driver", "words"),
+    ("link", "link_error", "driver", "expected"),
     [
         (LinkState.CONNECTING, None, DriverState.DISCONNECTED, "the link is connecting"),
         (LinkState.CONNECTING, "plug it in", DriverState.DISCONNECTED, "plug it in"),
@@ -59,8 +61,8 @@ def test_in_a_terminal_it_names_commands_in_place_of_buttons(state):
         (LinkState.UP, "transmit queue full", DriverState.READY, "no answer"),
     ],
 )
-def test_what_stands_between_the_host_and_the_robot(link, link_error, driver, words):
-    assert connection(link, link_error, driver, "no answer") == words
+def test_what_stands_between_the_host_and_the_robot(link, link_error, driver, expected):
+    assert connection(link, link_error, driver, "no answer") == expected
 
 
 @pytest.mark.parametrize(
@@ -82,8 +84,8 @@ def test_the_button_that_leads_on(state, running, button):
 
 
 def test_a_fault_and_a_latched_stop_come_before_everything_else():
-    said = advice({**STATUS, "state": "FAULT", "fault": "STALL_LEFT"})
-    assert said == ("Stall left. Free the left wheels, check their motor's cable; then reset.",)
+    sentences = advice({**STATUS, "state": "FAULT", "fault": "STALL_LEFT"})
+    assert sentences == ("Stall left. Free the left wheels, check their motor's cable; then reset.",)
     both = advice({**STATUS, "state": "FAULT", "fault": "STALL_LEFT", "estop": True})
     assert len(both) == 2
     assert "latched" in both[0]

@@ -39,8 +39,8 @@ def test_each_row_fires_when_its_conditions_hold_and_not_when_one_is_missing_or_
 @pytest.mark.parametrize("problem", PROBLEM, ids=lambda problem: problem.name)
 @pytest.mark.parametrize("source", [State.HANDSHAKE, State.READY, State.ARMED, State.STOPPING])
 def test_every_problem_leads_to_fault_whatever_else_is_asked(source, problem):
-    everything_asked = C.ARM_PENDING | C.RESET_PENDING | C.DISARM_REQUESTED
-    row = next_transition(source, (QUIET[source] | everything_asked | problem).value)
+    all_requests = C.ARM_PENDING | C.RESET_PENDING | C.DISARM_REQUESTED
+    row = next_transition(source, (QUIET[source] | all_requests | problem).value)
     assert row is not None
     assert row.target is State.FAULT
 

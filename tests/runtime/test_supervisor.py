@@ -56,7 +56,7 @@ def test_a_link_interrupted_between_two_ticks_voids_the_session(start):
 
 @pytest.mark.parametrize("start", ["ready", "armed", "running", "stopping"])
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("changes", "expected"),
     [
         ({"daemon_error": "the pipeline raised ValueError"}, "the pipeline raised ValueError"),
         ({"driver_state": DriverState.ESTOP}, "detail of the driver"),
@@ -65,15 +65,15 @@ def test_a_link_interrupted_between_two_ticks_voids_the_session(start):
         ({"preflight_errors": ("speed limit above the firmware's",)}, "speed limit above the firmware's"),
     ],
 )
-def test_a_problem_means_fault_in_words_without_motion(start, changes, words):
+def test_a_problem_means_fault_in_words_without_motion(start, changes, expected):
     bench = Bench()
     getattr(bench, start)()
     out = bench.tick(**changes)
     assert out.state is State.FAULT
     assert out.driver_request is Request.STANDBY
     assert (out.motion_allowed, out.running) == (False, False)
-    assert words in out.detail
-    assert words in out.events[-1]
+    assert expected in out.detail
+    assert expected in out.events[-1]
     assert out.estop == (changes.get("driver_state") is DriverState.ESTOP)
 
 
@@ -544,14 +544,14 @@ def test_to_arm_unrecorded_needs_all_else_that_arming_needs(state):
 
 def test_a_pose_that_jumps_stops_the_task_and_refuses_a_start_while_it_does():
     jump = "the pose jumped by 1.00 m and 0.10 rad, which the motion of the wheels does not explain"
-    words = f"{jump}; check that the robot is where the page shows it, then start again"
+    reason = f"{jump}; check that the robot is where the page shows it, then start again"
     bench = Bench().running()
     out = bench.tick(pose_jump=jump)
     assert (out.state, out.motion_allowed, out.zero_only) == (State.ARMED, False, True)
-    assert out.events[-1] == f"task stopped: {words}"
+    assert out.events[-1] == f"task stopped: {reason}"
     # The jump is over, and nobody has asked for motion again.
     assert not bench.tick(pose_jump="", count=10).motion_allowed
-    assert refusal(bench.tick(START, pose_jump=jump)) == words
+    assert refusal(bench.tick(START, pose_jump=jump)) == reason
     assert bench.tick(START, pose_jump="").motion_allowed
 
 

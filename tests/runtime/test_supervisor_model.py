@@ -13,7 +13,7 @@ from disco_hw.runtime import State
 from disco_hw.runtime.supervisor import Inputs, Supervisor, SupervisorSettings, UserRequest
 from drivers.types import DriverState, LinkState, Request
 
-ZERO_S, DISARM_S, STILL = 0.05, 0.15, 0.05
+ZERO_S, DISARM_S, STATIONARY_RAD_S = 0.05, 0.15, 0.05
 SETTINGS = SupervisorSettings(ZERO_S, DISARM_S, pose_required=True)
 TALKS = {
     DriverState.STANDBY, DriverState.READY, DriverState.ARMING, DriverState.ARMED, DriverState.STOPPING,
@@ -44,7 +44,7 @@ def fresh(inputs):
     return inputs.telemetry_age_s is not None and inputs.telemetry_age_s <= ZERO_S
 
 
-def lost(inputs):
+def is_telemetry_lost(inputs):
     return inputs.telemetry_age_s is None or not inputs.telemetry_age_s <= DISARM_S
 
 
@@ -61,7 +61,7 @@ class SupervisorModel(RuleBasedStateMachine):
         self.history = []
 
     @rule(change=ONE_CHANGE, requests=REQUESTS, wait_s=st.sampled_from([0.02, 0.02, 1.0, 4.0]))
-    def one_thing(self, change, requests, wait_s):
+    def change_inputs(self, change, requests, wait_s):
         self.inputs = msgspec.structs.replace(self.inputs, **change)
         self.step(requests, wait_s)
 
@@ -72,7 +72,7 @@ class SupervisorModel(RuleBasedStateMachine):
         self.step(requests, 0.02)
 
     @rule(change=ONE_CHANGE, requests=REQUESTS)
-    def one_thing_while_driving(self, change, requests):
+    def change_inputs_while_driving(self, change, requests):
         self.a_good_arming(True)
         self.inputs = msgspec.structs.replace(self.inputs, **change)
         self.step(requests, 0.02)
@@ -128,7 +128,7 @@ class SupervisorModel(RuleBasedStateMachine):
         if before is State.DISCONNECTED:
             assert after is (State.HANDSHAKE if up else State.DISCONNECTED)
             return
-        if before is not State.FAULT and (troubled(inputs) or self.estop_held()):
+        if before is not State.FAULT and (troubled(inputs) or self.is_estop_latched()):
             assert after is State.FAULT
             return
         match before:
@@ -136,32 +136,34 @@ class SupervisorModel(RuleBasedStateMachine):
                 assert after in (State.FAULT, State.HANDSHAKE)
                 if after is State.HANDSHAKE:
                     assert not troubled(inputs)
-                    assert self.asked_since(UserRequest.RESET, State.FAULT)
+                    assert self.requested_since(UserRequest.RESET, State.FAULT)
             case State.ARMED:
-                gone = lost(inputs) or robot is not DriverState.ARMED or UserRequest.DISARM in inputs.requests
+                gone = (
+                    is_telemetry_lost(inputs) or robot is not DriverState.ARMED or UserRequest.DISARM in inputs.requests
+                )
                 assert after is (State.STOPPING if gone else State.ARMED)
             case State.READY:
                 assert after in (State.READY, State.ARMED, State.STOPPING, State.HANDSHAKE)
                 if after is State.ARMED:
                     assert robot is DriverState.ARMED
                     assert fresh(inputs)
-                    assert self.asked_to_arm()
-                if robot not in TALKS or lost(inputs):
+                    assert self.arming_requested()
+                if robot not in TALKS or is_telemetry_lost(inputs):
                     assert after is not State.READY
-                if robot in MAY_MOVE and not self.asked_to_arm():
+                if robot in MAY_MOVE and not self.arming_requested():
                     assert after is State.STOPPING
             case State.STOPPING:
                 assert after in (State.STOPPING, State.READY, State.HANDSHAKE)
                 if after is State.READY:
                     assert robot in IDLE
                     assert fresh(inputs)
-                    assert inputs.wheel_speed_rad_s < STILL
+                    assert inputs.wheel_speed_rad_s < STATIONARY_RAD_S
             case State.HANDSHAKE:
                 assert after in (State.HANDSHAKE, State.READY, State.STOPPING)
                 assert (after is State.READY) == (robot in IDLE and fresh(inputs))
                 assert (after is State.STOPPING) == (robot in MAY_MOVE)
 
-    def asked_since(self, request, state):
+    def requested_since(self, request, state):
         """Whether it was asked for in this step, or since the state was entered."""
         for inputs, output in reversed(self.history):
             if request in inputs.requests and any(r.request is request and r.accepted for r in output.replies):
@@ -170,19 +172,19 @@ class SupervisorModel(RuleBasedStateMachine):
                 return False
         return False
 
-    def asked_to_arm(self):
-        return any(self.asked_since(r, State.READY) for r in ARMINGS)
+    def arming_requested(self):
+        return any(self.requested_since(r, State.READY) for r in ARMINGS)
 
-    def estop_held(self):
+    def is_estop_latched(self):
         """Whether an e-stop was asked for and no reset accepted after it, in the order of the requests."""
-        held = False
+        latched = False
         for _, output in self.history:
             for reply in output.replies:
                 if reply.request is UserRequest.ESTOP:
-                    held = True
+                    latched = True
                 elif reply.request is UserRequest.RESET and reply.accepted:
-                    held = False
-        return held
+                    latched = False
+        return latched
 
     def check_motion(self, inputs, output):
         if output.motion_allowed:
@@ -192,19 +194,19 @@ class SupervisorModel(RuleBasedStateMachine):
             assert inputs.pose_ok
             assert not inputs.heading_missing
             assert not troubled(inputs)
-            assert not self.estop_held()
+            assert not self.is_estop_latched()
             # Between the last time that it was not armed and now, somebody asked for it: arming, then starting.
-            assert self.asked_before_motion()
+            assert self.requested_before_motion()
             assert not output.zero_only
         if output.state not in (State.ARMED, State.STOPPING, State.FAULT):
             assert not output.zero_only
-        if self.estop_held() and inputs.link_state is LinkState.UP:
+        if self.is_estop_latched() and inputs.link_state is LinkState.UP:
             assert output.send_estop == (inputs.driver_state is not DriverState.ESTOP)
-        if lost(inputs) and output.state is not State.ARMED:
+        if is_telemetry_lost(inputs) and output.state is not State.ARMED:
             assert not output.zero_only
             assert not output.motion_allowed
 
-    def asked_before_motion(self):
+    def requested_before_motion(self):
         started = False
         for inputs, output in reversed(self.history):
             accepted = {r.request for r in output.replies if r.accepted}
@@ -222,15 +224,15 @@ class SupervisorModel(RuleBasedStateMachine):
     def check_requests(self, output):
         """The robot is asked to arm only after a person asked for it, once for each asking; ARMED asks for nothing."""
         armings = sum(past.driver_request is Request.ARM for _, past in self.history)
-        asked = sum(r.request in ARMINGS and r.accepted for _, past in self.history for r in past.replies)
-        assert armings <= asked
+        accepted = sum(r.request in ARMINGS and r.accepted for _, past in self.history for r in past.replies)
+        assert armings <= accepted
         inputs, before = self.history[-1][0], self.history[-2][1].state if len(self.history) > 1 else None
         for reply in output.replies:
             if reply.request is UserRequest.ARM and inputs.recording_fault and before is not State.ARMED:
                 assert not reply.accepted
         resets = sum(past.driver_request is Request.RESET for _, past in self.history)
-        asked = sum(r.request is UserRequest.RESET and r.accepted for _, past in self.history for r in past.replies)
-        assert resets <= asked
+        accepted = sum(r.request is UserRequest.RESET and r.accepted for _, past in self.history for r in past.replies)
+        assert resets <= accepted
         if output.state is State.ARMED:
             assert output.driver_request is None
 

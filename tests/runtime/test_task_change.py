@@ -47,7 +47,7 @@ def test_an_armed_robot_keeps_its_task(state):
 
 
 @pytest.mark.parametrize(
-    ("asked", "words"),
+    ("changes", "message"),
     [
         ({}, "give one or more of radius_m"),
         ({"radius": 0.5}, "not radius"),
@@ -65,9 +65,9 @@ def test_an_armed_robot_keeps_its_task(state):
         ({"radius_m": 0.1, "speed_m_s": 0.2}, "needs more than 8 rad/s of the outer wheel"),
     ],
 )
-def test_what_the_robot_cannot_do_is_refused_in_words(asked, words):
-    with pytest.raises(TaskRefused, match=words):
-        changed_task(CircleTask(), asked, ROBOT, State.READY)
+def test_what_the_robot_cannot_do_is_refused_in_words(changes, message):
+    with pytest.raises(TaskRefused, match=message):
+        changed_task(CircleTask(), changes, ROBOT, State.READY)
 
 
 def test_the_limits_are_those_that_are_enforced():
@@ -128,11 +128,11 @@ def test_of_a_path_only_the_speed_can_be_changed():
 
 def test_a_status_and_a_record_hold_a_path_without_its_way_points():
     other = msgspec.structs.replace(LINE, speed_m_s=0.1)
-    asked = requested_task(other)
-    assert "points" not in asked
-    assert task_in_status(asked, LINE) == other
-    assert task_in_status(asked, msgspec.structs.replace(LINE, points=((0.0, 0.0), (2.0, 0.1)))) is None
-    assert task_in_status(asked, CircleTask()) is None
+    requested = requested_task(other)
+    assert "points" not in requested
+    assert task_in_status(requested, LINE) == other
+    assert task_in_status(requested, msgspec.structs.replace(LINE, points=((0.0, 0.0), (2.0, 0.1)))) is None
+    assert task_in_status(requested, CircleTask()) is None
     assert task_in_status(requested_task(CircleTask(radius_m=2.0)), LINE) == CircleTask(radius_m=2.0)
     assert task_of(record_of(7, other), LINE) == other
     assert other.describe() == "path line.csv of 2.00 m at 0.1 m/s"

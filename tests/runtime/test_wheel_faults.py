@@ -43,27 +43,27 @@ class Robot:
     def drive(self, seconds, command, turns=None, counts=None):
         """Seconds until a wheel is found not to obey and what, None for nothing.
 
-        `turns(wanted)`: what the left wheel truly does; `counts(true)`: what its encoder says.
+        `turns(target)`: what the left wheel truly does; `counts(true)`: what its encoder says.
         """
         for number in range(round(seconds / TICK_S)):
-            asked = command(number * TICK_S) if callable(command) else command
-            self._move(asked, turns, counts)
+            commanded = command(number * TICK_S) if callable(command) else command
+            self._move(commanded, turns, counts)
             now_ns = self.tick * TICK_NS
             wheels = WheelSample(now_ns, now_ns, *self.counts, *self.reported)
             poses = [self._pose(now_ns)] if self.has_poses and self.tick % 2 == 0 else []
             found = self.faults.step(now_ns, [wheels], poses, GEOMETRY)
             if found is not None:
                 return (number + 1) * TICK_S, found
-            self.faults.commanded(now_ns, WheelCommand(*asked, 0.1))
+            self.faults.commanded(now_ns, WheelCommand(*commanded, 0.1))
         return None
 
-    def _move(self, asked, turns, counts):
+    def _move(self, commanded, turns, counts):
         self.tick += 1
         for side in (0, 1):
-            wanted = math.copysign(max(abs(asked[side]) - self.dead_rad_s, 0.0), asked[side])
-            self.sticks[side] = self.sticks[side] and abs(wanted) <= self.stiction_rad_s
-            wanted = 0.0 if self.sticks[side] else wanted
-            self.speeds[side] += (wanted - self.speeds[side]) * (1.0 - math.exp(-TICK_S / self.lag_s))
+            target = math.copysign(max(abs(commanded[side]) - self.dead_rad_s, 0.0), commanded[side])
+            self.sticks[side] = self.sticks[side] and abs(target) <= self.stiction_rad_s
+            target = 0.0 if self.sticks[side] else target
+            self.speeds[side] += (target - self.speeds[side]) * (1.0 - math.exp(-TICK_S / self.lag_s))
             true = self.speeds[side] if side or turns is None else turns(self.speeds[side])
             self.angles[side] += true * TICK_S
             self.reported[side] = true if side or counts is None else counts(true)
@@ -87,10 +87,10 @@ def around(speed):
 FAULTS = [
     pytest.param(None, lambda true: 0.0, Cause.ENCODER_SILENT, id="frozen"),
     pytest.param(None, lambda true: -true, Cause.ENCODER_REVERSED, id="reversed"),
-    pytest.param(lambda wanted: 0.0, None, Cause.STANDS, id="blocked"),
-    pytest.param(lambda wanted: -wanted, None, Cause.TURNS_BACKWARD, id="turns-backward"),
-    pytest.param(lambda wanted: 12.0, None, Cause.RUNS_AWAY, id="runs-away"),
-    pytest.param(lambda wanted: 12.0, lambda true: -true, Cause.RUNS_AWAY, id="runs-away-reversed"),
+    pytest.param(lambda target: 0.0, None, Cause.STANDS, id="blocked"),
+    pytest.param(lambda target: -target, None, Cause.TURNS_BACKWARD, id="turns-backward"),
+    pytest.param(lambda target: 12.0, None, Cause.RUNS_AWAY, id="runs-away"),
+    pytest.param(lambda target: 12.0, lambda true: -true, Cause.RUNS_AWAY, id="runs-away-reversed"),
 ]
 UNDECIDED = {
     Cause.ENCODER_SILENT: Cause.SILENT, Cause.STANDS: Cause.SILENT, Cause.ENCODER_REVERSED: Cause.OPPOSED,
@@ -160,7 +160,7 @@ def test_a_dead_band_is_known_as_well_after_a_stop_as_before(dead_rad_s, lag_s):
     assert robot.drive(12.0, turns_stops_and_curves) is None
     assert robot.faults.not_following == 0
     # And a wheel that ceases to turn then is found.
-    found = robot.drive(3.0, (1.6, 2.82), turns=lambda wanted: 0.0)
+    found = robot.drive(3.0, (1.6, 2.82), turns=lambda target: 0.0)
     assert found is not None
 
 
@@ -178,7 +178,7 @@ def test_wheels_that_lag_behind_swinging_commands_follow_them(lag_s):
 def test_a_wheel_that_stands_for_a_moment_is_counted_once_and_stops_nothing():
     robot = Robot()
     robot.drive(3.0, (3.0, 3.0))
-    assert robot.drive(0.16, (3.0, 3.0), lambda wanted: 0.0) is None
+    assert robot.drive(0.16, (3.0, 3.0), lambda target: 0.0) is None
     assert robot.drive(3.0, (3.0, 3.0)) is None
     assert robot.faults.not_following == 1
 
@@ -186,7 +186,7 @@ def test_a_wheel_that_stands_for_a_moment_is_counted_once_and_stops_nothing():
 def test_a_wheel_that_stands_against_a_stone_for_a_quarter_second_is_no_fault():
     robot = Robot()
     robot.drive(3.0, (3.0, 3.0))
-    assert robot.drive(0.26, (3.0, 3.0), lambda wanted: 0.0) is None
+    assert robot.drive(0.26, (3.0, 3.0), lambda target: 0.0) is None
     assert robot.drive(3.0, (3.0, 3.0)) is None
 
 
@@ -210,7 +210,7 @@ def test_a_wheel_that_never_followed_and_counts_backward_is_left_to_whoever_know
 def test_disarmed_nothing_is_expected():
     robot = Robot()
     robot.drive(3.0, around(FAST))
-    robot.drive(0.2, around(FAST), lambda wanted: 0.0)
+    robot.drive(0.2, around(FAST), lambda target: 0.0)
     robot.faults.commanded(robot.tick * TICK_NS, None)
     for _ in range(100):
         robot.tick += 1
@@ -219,21 +219,23 @@ def test_disarmed_nothing_is_expected():
 
 
 def test_a_base_that_makes_wheel_speeds_of_its_own_may_turn_by_more():
-    def turned(asked):
-        mean = sum(asked) / 2
-        return tuple(mean + 1.5 * (each - mean) for each in asked)
+    def turned(commanded):
+        mean = sum(commanded) / 2
+        return tuple(mean + 1.5 * (each - mean) for each in commanded)
 
     for takes_body_speeds, is_left_alone in ((True, True), (False, False)):
         robot = Robot(faults=WheelFaults(takes_body_speeds))
         robot.drive(4.0, (3.0, 3.0))
-        asked = (0.6, 3.5)
+        commanded = (0.6, 3.5)
         move = robot._move
-        robot._move = lambda _asked, turns, counts, move=move, asked=asked: move(turned(asked), turns, counts)
-        assert (robot.drive(2.0, asked) is None) is is_left_alone
+        robot._move = lambda _commanded, turns, counts, move=move, commanded=commanded: move(
+            turned(commanded), turns, counts
+        )
+        assert (robot.drive(2.0, commanded) is None) is is_left_alone
 
 
 @pytest.mark.parametrize("speed", [SLOW, FAST])
-@pytest.mark.parametrize(("turns", "counts"), [(lambda wanted: 0.0, None), (None, lambda true: 0.0)])
+@pytest.mark.parametrize(("turns", "counts"), [(lambda target: 0.0, None), (None, lambda true: 0.0)])
 def test_a_base_that_has_shown_to_turn_as_it_is_asked_to_is_judged_as_soon_as_single_wheels(turns, counts, speed):
     found = {}
     for is_base in (True, False):

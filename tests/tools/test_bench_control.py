@@ -11,7 +11,7 @@ from disco_hw.model import plain as physics
 from disco_hw.tasks.circle import CircleCost
 from tests.control import oracle
 from tests.tasks import costs
-from tools.bench.control import ROBOTS, beside_peer, torch_times_ms
+from tools.bench.control import ROBOTS, compare_with_peer, torch_times_ms
 from tools.bench.step_times import summary, times_ms, undisturbed
 
 MODEL = load_model(ROBOTS / "wombot_model.toml")
@@ -24,7 +24,7 @@ def test_the_torch_path_is_timed_on_the_processor():
 
 
 def test_the_ratio_is_of_times_in_the_same_run():
-    figures = beside_peer("x", lambda _: None, lambda _: sum(range(20_000)), 40, 40)
+    figures = compare_with_peer("x", lambda _: None, lambda _: sum(range(20_000)), 40, 40)
     assert figures["control.x_ratio_to_pytorch_mppi"] > 10.0
     assert figures["control.x_step_ms.min"] <= figures["control.x_step_ms.p50"] <= figures["control.x_step_ms.max"]
     # Eight million multiplications cannot be that fast, unless a compiler has seen through them.

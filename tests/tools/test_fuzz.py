@@ -52,8 +52,8 @@ def test_every_verb_reads_or_refuses_hostile_files(tmp_path):
     [
         (lambda argv: 1 / 0, "ZeroDivisionError"),
         (lambda argv: fuzz.time.sleep(30), "TooSlowError"),
-        (lambda argv: fuzz.verb_calls.Said(2, "first\nsecond"), "not one line"),
-        (lambda argv: bytearray(1_200_000_000) and fuzz.verb_calls.Said(0, ""), "MB"),
+        (lambda argv: fuzz.verb_calls.CallOutcome(2, "first\nsecond"), "not one line"),
+        (lambda argv: bytearray(1_200_000_000) and fuzz.verb_calls.CallOutcome(0, ""), "MB"),
         (lambda argv: os._exit(3), "no answer"),
     ],
 )

@@ -8,7 +8,7 @@ import pytest
 import disco_hw
 from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.robot_setup import load_setup
-from tools.study.pose_figures import OWN, RTK, UDP, drive_circle, with_circle
+from tools.study.pose_figures import ROBOT, RTK, UDP, drive_circle, with_circle
 
 
 @pytest.fixture(scope="module")
@@ -35,4 +35,4 @@ def test_a_circle_by_positions_without_heading(driven):
 @pytest.mark.long
 @pytest.mark.timeout(1200)
 def test_datagrams_that_are_late_lost_and_wrong_cost_less_than_a_fifth(driven):
-    assert rms_mm(driven(UDP, range(1, 9))) <= 1.2 * rms_mm(driven(OWN, range(1, 9)))
+    assert rms_mm(driven(UDP, range(1, 9))) <= 1.2 * rms_mm(driven(ROBOT, range(1, 9)))

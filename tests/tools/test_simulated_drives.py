@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from tools.simulated_drives import DRIVES, UnknownDriveError, Vehicle, make_drive
+from tools.simulated_drives import DRIVES, UnknownDriveError, Vehicle, create_drive
 
 SEEDS = range(4)
 
@@ -20,7 +20,7 @@ def speeds(drive, phase):
 @pytest.mark.parametrize("name", DRIVES)
 def test_commands_are_evenly_timed_finite_and_within_speed_and_slew(name):
     for seed in SEEDS:
-        drive = make_drive(name, seed)
+        drive = create_drive(name, seed)
         assert drive.name == name
         assert len(drive.t_s) == len(drive.left_rad_s) == len(drive.right_rad_s) == len(drive.phase)
         np.testing.assert_allclose(np.diff(drive.t_s), drive.period_s)
@@ -31,7 +31,7 @@ def test_commands_are_evenly_timed_finite_and_within_speed_and_slew(name):
 
 @pytest.mark.parametrize("name", DRIVES)
 def test_a_drive_starts_and_ends_at_rest(name):
-    drive = make_drive(name, 1)
+    drive = create_drive(name, 1)
     for wheel in (drive.left_rad_s, drive.right_rad_s):
         assert np.all(wheel[:10] == 0.0)
         assert wheel[-1] == 0.0
@@ -39,14 +39,14 @@ def test_a_drive_starts_and_ends_at_rest(name):
 
 @pytest.mark.parametrize("name", DRIVES)
 def test_the_seed_decides_the_drive(name):
-    assert np.array_equal(make_drive(name, 1).left_rad_s, make_drive(name, 1).left_rad_s)
+    assert np.array_equal(create_drive(name, 1).left_rad_s, create_drive(name, 1).left_rad_s)
     if name != "circle":
-        assert not np.array_equal(make_drive(name, 1).left_rad_s, make_drive(name, 2).left_rad_s)
+        assert not np.array_equal(create_drive(name, 1).left_rad_s, create_drive(name, 2).left_rad_s)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_rich_drive_contains_what_distinguishes_effects(seed):
-    drive = make_drive("rich", seed)
+    drive = create_drive("rich", seed)
     assert 140.0 <= drive.duration_s <= 160.0
     for phase, share in (("straight slow", 0.35), ("straight fast", 0.95), ("reverse slow", -0.35)):
         wheels = speeds(drive, phase)
@@ -74,12 +74,12 @@ def test_the_rich_drive_contains_what_distinguishes_effects(seed):
 
 
 def test_drives_of_different_seeds_order_their_manoeuvres_differently():
-    orders = {tuple(dict.fromkeys(make_drive("rich", seed).phase)) for seed in range(6)}
+    orders = {tuple(dict.fromkeys(create_drive("rich", seed).phase)) for seed in range(6)}
     assert len(orders) >= 4
 
 
 def test_the_circle_is_steady_and_is_the_papers_on_the_papers_robot():
-    wheels = speeds(make_drive("circle", 0), "circle")
+    wheels = speeds(create_drive("circle", 0), "circle")
     assert np.all(np.ptp(wheels, axis=0) == 0.0)
     left, right = wheels[0]
     v, omega = 0.061 * 0.5 * (left + right), 0.061 * (right - left) / 0.415
@@ -88,32 +88,32 @@ def test_the_circle_is_steady_and_is_the_papers_on_the_papers_robot():
 
 
 def test_the_straight_drive_never_turns():
-    drive = make_drive("straight", 1)
+    drive = create_drive("straight", 1)
     assert np.array_equal(drive.left_rad_s, drive.right_rad_s)
 
 
 def test_the_poor_drive_is_short_and_slow():
-    drive = make_drive("poor", 1)
+    drive = create_drive("poor", 1)
     assert drive.duration_s < 16.0
     assert np.abs(drive.left_rad_s).max() < 2.0
 
 
 def test_random_steps_hold_each_pair():
-    drive = make_drive("random_steps", 1)
+    drive = create_drive("random_steps", 1)
     constant_share = np.count_nonzero(np.diff(drive.left_rad_s) == 0.0) / len(drive.t_s)
     assert constant_share > 0.85
     assert drive.left_rad_s.min() < -4.0 < 4.0 < drive.left_rad_s.max()
 
 
 def test_a_drive_scales_with_the_vehicle():
-    small, large = (make_drive("straight", 1, Vehicle(max_wheel_speed_rad_s=top)) for top in (4.0, 8.0))
+    small, large = (create_drive("straight", 1, Vehicle(max_wheel_speed_rad_s=top)) for top in (4.0, 8.0))
     assert np.abs(small.left_rad_s).max() == pytest.approx(0.5 * np.abs(large.left_rad_s).max())
-    assert make_drive("circle", 1, Vehicle(rate_hz=20.0)).period_s == 0.05
+    assert create_drive("circle", 1, Vehicle(rate_hz=20.0)).period_s == 0.05
 
 
 def test_unknown_drives_and_impossible_vehicles_are_refused():
     with pytest.raises(UnknownDriveError, match="rich, free, circle") as caught:
-        make_drive("rich_", 1)
+        create_drive("rich_", 1)
     assert "\n" not in str(caught.value)
     with pytest.raises(ValueError, match="max_wheel_speed_rad_s"):
         Vehicle(max_wheel_speed_rad_s=0.0)

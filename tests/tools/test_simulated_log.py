@@ -12,7 +12,7 @@ import pytest
 
 from sim.effects import EFFECTS, hidden_effects
 from sim.plant_parameters import PlantParameters
-from tools.simulated_drives import make_drive
+from tools.simulated_drives import create_drive
 from tools.simulated_log import (
     COLUMNS,
     LogOptions,
@@ -26,8 +26,8 @@ from tools.simulated_log import (
 
 IDEAL = PlantParameters().with_ideal_motors()
 EXACT = LogOptions(lateness_s=0.0, stamp_jitter_s=0.0)
-POOR = make_drive("poor", 1)
-CIRCLE = make_drive("circle", 1)
+POOR = create_drive("poor", 1)
+CIRCLE = create_drive("circle", 1)
 
 
 def columns(rows):
@@ -180,7 +180,7 @@ def test_help_runs_as_a_module_and_lists_every_effect():
 
 
 def test_noise_of_a_resting_robot_is_the_sensors():
-    rest = make_drive("poor", 1)
+    rest = create_drive("poor", 1)
     rest = replace(rest, left_rad_s=np.zeros_like(rest.t_s), right_rad_s=np.zeros_like(rest.t_s))
     log = columns(simulated_log(rest, IDEAL, seed=5))
     x = log["pose_x_m"][~np.isnan(log["pose_x_m"])]

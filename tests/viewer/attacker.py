@@ -36,11 +36,11 @@ def main(port, count):
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     count = min(count, hard - 50)
     poll = select.poll()
-    held, unsent = {}, {}
+    connections, unsent = {}, {}
 
     def attack(number):
         connection, part = open_one(port, number)
-        held[connection.fileno()], unsent[connection.fileno()] = connection, part
+        connections[connection.fileno()], unsent[connection.fileno()] = connection, part
         poll.register(connection, select.POLLOUT | select.POLLIN)
 
     for number in range(count):
@@ -49,10 +49,10 @@ def main(port, count):
     number = count
     while True:
         for descriptor, events in poll.poll(1000):
-            connection = held[descriptor]
+            connection = connections[descriptor]
             if events & (select.POLLIN | select.POLLHUP | select.POLLERR):
                 poll.unregister(descriptor)
-                del held[descriptor], unsent[descriptor]
+                del connections[descriptor], unsent[descriptor]
                 connection.close()
                 attack(number)
                 number += 1

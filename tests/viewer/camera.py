@@ -30,16 +30,18 @@ def screenshot(page):
     return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
 
 
-def like(colour, wanted, least=4):
+def like(colour, expected, least=4):
     """Whether the order of the channels is that of the wanted colour: what is drawn fades in, but grey stays grey."""
-    return np.argmax(colour) == np.argmax(wanted) and np.argmin(colour) == np.argmin(wanted) and np.ptp(colour) > least
+    return (
+        np.argmax(colour) == np.argmax(expected) and np.argmin(colour) == np.argmin(expected) and np.ptp(colour) > least
+    )
 
 
-def shows(picture, column, row, wanted, reach=5):
+def shows(picture, column, row, expected, reach=5):
     """Whether a pixel near a place is like the wanted colour."""
     row, column = round(row), round(column)
     part = picture[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1].reshape(-1, 3)
-    return any(like(pixel, wanted) for pixel in part)
+    return any(like(pixel, expected) for pixel in part)
 
 
 def off_golden(picture, name):

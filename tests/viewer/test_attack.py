@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.drivers.waiting import free_port, wait_until
-from tests.viewer.test_operator_controls import COOKIES, Daemon, ask, line_to
+from tests.viewer.test_operator_controls import COOKIES, Daemon, line_to, request_reply
 from tests.viewer.test_server import get
 from tools.viewer_run import ROBOT_FILE
 
@@ -47,10 +47,10 @@ def page_process(directory, descriptors):
     text = ROBOT_FILE.read_text()
     assert "[daemon]" not in text
     robot.write_text(f'{text}\n[daemon]\ncontrol_socket = "{daemon.server.path}"\n')
-    said = directory / "said.txt"
+    output_file = directory / "said.txt"
     try:
-        with limited_page(robot, said, descriptors) as port:
-            yield daemon, port, said
+        with limited_page(robot, output_file, descriptors) as port:
+            yield daemon, port, output_file
     finally:
         daemon.close()
 
@@ -71,14 +71,14 @@ def attack(port):
 @pytest.mark.long
 @pytest.mark.parametrize("descriptors", [1024, 256])
 def test_every_press_reaches_the_daemon_and_new_pages_get_in_during_an_attack(tmp_path, descriptors):
-    with page_process(tmp_path, descriptors) as (daemon, port, said), line_to(port) as line:
-        ask(line, do="stop")
+    with page_process(tmp_path, descriptors) as (daemon, port, output_file), line_to(port) as line:
+        request_reply(line, do="stop")
         with attack(port):
             for press in range(PRESSES):
                 # A machine that is busy with other things may confirm late; it is sent all the same.
-                assert "NOT SENT" not in str(ask(line, do="estop"))
+                assert "NOT SENT" not in str(request_reply(line, do="estop"))
                 assert daemon.actions("status", "drive").count("estop") > press
             assert get(port, "/", Cookie=COOKIES[port])[0].status == 200
             with line_to(port) as another:
-                assert "NOT SENT" not in str(ask(another, do="estop"))
-        assert len(said.read_bytes()) < 20_000
+                assert "NOT SENT" not in str(request_reply(another, do="estop"))
+        assert len(output_file.read_bytes()) < 20_000

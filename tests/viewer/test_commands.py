@@ -57,7 +57,7 @@ def test_an_exported_page_is_whole(log_file, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("write", "name", "words"),
+    ("write", "name", "message"),
     [
         (snapshot_log, "a.txt", "no such kind of picture"),
         (snapshot_log, "none/a.png", "no such directory"),
@@ -66,8 +66,8 @@ def test_an_exported_page_is_whole(log_file, tmp_path):
         (export_log, "none/a.html", "no such directory"),
     ],
 )
-def test_a_name_that_cannot_be_written_is_told(log_file, tmp_path, write, name, words):
-    with pytest.raises(InputError, match=words):
+def test_a_name_that_cannot_be_written_is_told(log_file, tmp_path, write, name, message):
+    with pytest.raises(InputError, match=message):
         write(log_file, tmp_path / name)
 
 
@@ -120,12 +120,12 @@ def test_a_page_is_served_until_it_is_told_to_end(log_file):
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     try:
         line = process.stdout.readline()
-        told = json.loads(line)
-        assert told["ticks"] == 200
+        report = json.loads(line)
+        assert report["ticks"] == 200
         # As a browser does: the address carries the token, a cookie keeps it.
         browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
-        with browser.open(told["page"], timeout=60) as answer:
-            assert answer.status == 200
+        with browser.open(report["page"], timeout=60) as response:
+            assert response.status == 200
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == 0
         assert process.stdout.read() == ""

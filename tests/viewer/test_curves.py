@@ -58,9 +58,9 @@ def test_a_long_window_is_thinned(timeline, monkeypatch):
 )
 def test_a_marginal_is_a_density_with_the_beliefs_mean(belief):
     model = Model(0.06, 0.3, belief=belief)
-    drawn = curves.marginals(model, model, "wheel_radius_m", 4000)
-    density, x = drawn.values["in force"], drawn.t_s
-    assert (density == drawn.values["model file"]).all()
+    curve = curves.marginals(model, model, "wheel_radius_m", 4000)
+    density, x = curve.values["in force"], curve.t_s
+    assert (density == curve.values["model file"]).all()
     step = x[1] - x[0]
     assert density.sum() * step == pytest.approx(1.0, abs=0.01)
     assert (x * density).sum() * step == pytest.approx(belief.mean()[0], rel=0.01)
@@ -71,11 +71,11 @@ def test_what_is_known_exactly_has_no_marginal():
 
 
 def test_an_adapted_belief_is_drawn_beside_the_model_files():
-    file, learnt = (
+    file, adapted = (
         Model(0.06, 0.3, belief=Gaussian(("wheel_radius_m",), np.array((mean,)), np.array(((1e-6,),))))
         for mean in (0.06, 0.07)
     )
-    drawn = curves.marginals(file, learnt, "wheel_radius_m", 4000)
-    peaks = {name: drawn.t_s[np.argmax(density)] for name, density in drawn.values.items()}
+    curve = curves.marginals(file, adapted, "wheel_radius_m", 4000)
+    peaks = {name: curve.t_s[np.argmax(density)] for name, density in curve.values.items()}
     assert peaks["model file"] == pytest.approx(0.06, abs=1e-4)
     assert peaks["in force"] == pytest.approx(0.07, abs=1e-4)

@@ -95,8 +95,8 @@ def test_a_page_that_stays_open_does_not_grow(page):
 
 
 def status_with(**task):
-    asked = {"kind": "circle", "center_x_m": 0.0, "center_y_m": 0.0, "radius_m": 0.75, "speed_m_s": 0.2} | task
-    return {"ok": False} if task == {"none": True} else {"ok": True, "task": {"asked": asked}}
+    requested = {"kind": "circle", "center_x_m": 0.0, "center_y_m": 0.0, "radius_m": 0.75, "speed_m_s": 0.2} | task
+    return {"ok": False} if task == {"none": True} else {"ok": True, "task": {"asked": requested}}
 
 
 def test_a_task_that_was_changed_before_the_page_was_opened_is_taken_over(page):
@@ -115,19 +115,23 @@ def adapted(now_ns, radius_m=0.061):
 
 
 def status_of(change):
-    told = {"belief": "adapted", "mean": dict(zip(NAMES, change.mean, strict=True)), "covariance": change.covariance}
-    return json.loads(json.dumps({"ok": True, "adaptation": told}))
+    adaptation = {
+        "belief": "adapted",
+        "mean": dict(zip(NAMES, change.mean, strict=True)),
+        "covariance": change.covariance,
+    }
+    return json.loads(json.dumps({"ok": True, "adaptation": adaptation}))
 
 
 def test_a_belief_from_before_the_page_was_opened_is_taken_over(page):
     live, _ = page
     live.ingest(ticks(0, 51))
-    learnt = adapted(START_NS)
-    live._learn_belief(status_of(learnt))
+    change = adapted(START_NS)
+    live._learn_belief(status_of(change))
     in_force = live._snapshot().belief
-    assert (in_force.names, in_force.mean, in_force.covariance) == (learnt.names, learnt.mean, learnt.covariance)
+    assert (in_force.names, in_force.mean, in_force.covariance) == (change.names, change.mean, change.covariance)
     live.ingest(ticks(51, 200))
-    live._learn_belief(status_of(learnt))
+    live._learn_belief(status_of(change))
     assert len(live.timeline.beliefs) == 1
     live._learn_belief(status_of(adapted(START_NS, 0.062)))
     assert live._snapshot().belief.mean[1] == 0.062
@@ -185,12 +189,12 @@ def test_what_is_due_is_due_once_a_period():
 
 def test_a_path_that_is_not_the_daemons_is_not_drawn_and_told(tmp_path):
     stage = stage_of_robot(path_robot(tmp_path))
-    told = {"ok": True, "task": {"asked": requested_task(replace(stage.task, speed_m_s=0.1))}}
+    status = {"ok": True, "task": {"asked": requested_task(replace(stage.task, speed_m_s=0.1))}}
     other = replace(stage.task, points=stage.task.points[:-1])
     with serving("test", port=0) as served, closing(Desk(tmp_path / "control.sock", ROBOT_FILE)) as desk:
         live = LivePage(served.server, stage, tmp_path / "control.sock", desk)
         live.ingest(ticks(0, 51))
-        live._learn_task(told)
+        live._learn_task(status)
         assert live._stage.task_at(live._snapshot().task).speed_m_s == 0.1
         assert live.scene.knows_task
         live._learn_task({"ok": True, "task": {"asked": requested_task(other)}})

@@ -17,10 +17,10 @@ def test_every_kind_is_found_at_its_tick(timeline):
 def test_marks_are_in_order_and_say_what_happened(timeline):
     marks = marks_of(timeline)
     assert [mark.t_ns for mark in marks] == sorted(mark.t_ns for mark in marks)
-    words = {mark.kind: mark.text for mark in marks}
-    assert "OVERCURRENT" in words[FAULT]
-    assert "3.0 times the gate" in words[GATED]
-    assert words[REJECTED_FRAMES].startswith("3 frames")
+    texts = {mark.kind: mark.text for mark in marks}
+    assert "OVERCURRENT" in texts[FAULT]
+    assert "3.0 times the gate" in texts[GATED]
+    assert texts[REJECTED_FRAMES].startswith("3 frames")
 
 
 def test_what_goes_on_and_on_is_marked_once_in_half_a_second():
@@ -36,8 +36,8 @@ def test_what_adaptation_did_is_marked():
     line.add(10, records.BeliefChange(10, "adapted", reason="the wheels are worn"))
     for t_ns, outcome in ((20, "confirming"), (30, "refused"), (40, "agrees"), (900_000_000, "reverted")):
         line.add(t_ns, records.Adaptation(t_ns, outcome, f"it {outcome}"))
-    told = [(mark.t_ns, mark.kind, mark.text) for mark in marks_of(line)]
-    assert told == [
+    reported = [(mark.t_ns, mark.kind, mark.text) for mark in marks_of(line)]
+    assert reported == [
         (10, ADAPTED, "belief adapted: the wheels are worn"),
         (30, ADAPTED, "it refused"),
         (900_000_000, ADAPTED, "it reverted"),

@@ -38,7 +38,7 @@ class Daemon:
     def __init__(self, directory):
         directory.mkdir(mode=0o700)
         self.server = ControlServer(directory / "control.sock", SERVED)
-        self.asked, self.hangs, self._ending = [], False, threading.Event()
+        self.received, self.hangs, self._ending = [], False, threading.Event()
         self.status = STATUS
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
@@ -46,19 +46,19 @@ class Daemon:
     def _serve(self):
         while not self._ending.is_set():
             for message in [] if self.hangs else self.server.poll():
-                self.asked.append((message.action, message.arguments))
-                self.server.reply(message, self._answer(message))
+                self.received.append((message.action, message.arguments))
+                self.server.reply(message, self._reply(message))
             time.sleep(0.002)
 
-    def _answer(self, message):
+    def _reply(self, message):
         if message.action == "status":
             return self.status
         if message.action == "drive":
-            return {"ok": True, "stamp": str(1_000 + len(self.asked))}
+            return {"ok": True, "stamp": str(1_000 + len(self.received))}
         return {"ok": message.action != "arm", "text": "done it", "error": "not now"}
 
     def actions(self, *but):
-        return [action for action, _ in self.asked if action not in but]
+        return [action for action, _ in self.received if action not in but]
 
     def close(self):
         self._ending.set()
@@ -89,14 +89,14 @@ def desk_of(socket, robot=ROBOT_FILE):
 
 @contextmanager
 def line_to(port, origin=None):
-    own, cookie = f"http://127.0.0.1:{port}", {"Cookie": COOKIES[port]}
+    address, cookie = f"http://127.0.0.1:{port}", {"Cookie": COOKIES[port]}
     with connect(
-        f"ws://127.0.0.1:{port}/desk", origin=origin or own, additional_headers=cookie, open_timeout=60
+        f"ws://127.0.0.1:{port}/desk", origin=origin or address, additional_headers=cookie, open_timeout=60
     ) as line:
         yield line
 
 
-def told(line, kind, timeout_s=60.0):
+def next_message(line, kind, timeout_s=60.0):
     """The next message of that kind."""
     deadline = time.monotonic() + timeout_s
     while True:
@@ -108,20 +108,20 @@ def told(line, kind, timeout_s=60.0):
 def hung_up(line):
     """Whether the other end closes the line before it replies."""
     try:
-        return told(line, "reply") is None
+        return next_message(line, "reply") is None
     except ConnectionClosed:
         return True
 
 
-def ask(line, **request):
+def request_reply(line, **request):
     line.send(json.dumps(request))
-    return told(line, "drive" if request["do"] == "drive" else "reply")
+    return next_message(line, "drive" if request["do"] == "drive" else "reply")
 
 
 def test_every_button_asks_the_daemon_and_tells_its_answer(daemon):
     with desk_of(daemon.server.path) as (_, port), line_to(port) as line:
         for action in desk_module.REQUESTS:
-            reply = ask(line, do=action)
+            reply = request_reply(line, do=action)
             assert reply["do"] == action
             assert reply["ok"] is (action != "arm")
             assert "not now" in reply["error"]
@@ -130,14 +130,14 @@ def test_every_button_asks_the_daemon_and_tells_its_answer(daemon):
 
 def test_the_task_goes_through_with_its_numbers(daemon):
     with desk_of(daemon.server.path) as (_, port), line_to(port) as line:
-        ask(line, do="task", radius_m=0.5, speed_m_s=0.1)
-    assert ("task", {"radius_m": 0.5, "speed_m_s": 0.1}) in daemon.asked
+        request_reply(line, do="task", radius_m=0.5, speed_m_s=0.1)
+    assert ("task", {"radius_m": 0.5, "speed_m_s": 0.1}) in daemon.received
 
 
 def test_what_is_no_request_of_the_page_does_not_reach_the_daemon(daemon):
     with desk_of(daemon.server.path) as (_, port):
         with line_to(port) as line:
-            assert "no such request" in ask(line, do="quit")["error"]
+            assert "no such request" in request_reply(line, do="quit")["error"]
         for garbage in ("", "[1]", '{"do": 1}', "{" * 100_000, b"\xff"):
             with line_to(port) as line:
                 line.send(garbage)
@@ -147,7 +147,7 @@ def test_what_is_no_request_of_the_page_does_not_reach_the_daemon(daemon):
 
 def test_the_estop_asks_the_daemon_first(daemon, tmp_path):
     with desk_of(daemon.server.path, tmp_path / "none.toml") as (_, port), line_to(port) as line:
-        assert ask(line, do="estop")["text"] == "done it"
+        assert request_reply(line, do="estop")["text"] == "done it"
     assert daemon.actions("status", "drive") == ["estop"]
 
 
@@ -161,12 +161,12 @@ def robot_elsewhere(directory):
 
 def test_without_a_daemon_the_estop_takes_the_link_and_says_if_that_failed(tmp_path):
     with desk_of(tmp_path / "none.sock", robot_elsewhere(tmp_path)) as (_, port), line_to(port) as line:
-        reply = ask(line, do="estop")
+        reply = request_reply(line, do="estop")
         assert not reply["ok"]
         assert "NOT SENT: use the robot's own e-stop button" in reply["error"]
-        assert "disco-hw run" in ask(line, do="arm")["error"]
+        assert "disco-hw run" in request_reply(line, do="arm")["error"]
     with desk_of(tmp_path / "none.sock", tmp_path / "none.toml") as (_, port), line_to(port) as line:
-        assert "NOT SENT" in ask(line, do="estop")["error"]
+        assert "NOT SENT" in request_reply(line, do="estop")["error"]
 
 
 def test_the_estop_takes_the_link_that_the_daemon_was_given(tmp_path):
@@ -202,10 +202,10 @@ def test_the_pad_has_a_line_of_its_own_and_is_opened_when_the_page_goes(daemon):
     hold = {"do": "drive", "forward": 0.5, "left": 0.0, "held": True}
     with desk_of(daemon.server.path) as (_, port):
         with line_to(port) as line:
-            first = ask(line, stamp="0", **hold)
-            assert ask(line, stamp=first["stamp"], **hold)["ok"]
-        wait_until(lambda: [of.get("held") for what, of in daemon.asked if what == "drive"][-1:] == [False], 30.0)
-    drives = [arguments for action, arguments in daemon.asked if action == "drive"]
+            first = request_reply(line, stamp="0", **hold)
+            assert request_reply(line, stamp=first["stamp"], **hold)["ok"]
+        wait_until(lambda: [of.get("held") for what, of in daemon.received if what == "drive"][-1:] == [False], 30.0)
+    drives = [arguments for action, arguments in daemon.received if action == "drive"]
     assert [drive["held"] for drive in drives] == [True, True, False]
     assert drives[1]["stamp"] == first["stamp"]
 
@@ -213,9 +213,9 @@ def test_the_pad_has_a_line_of_its_own_and_is_opened_when_the_page_goes(daemon):
 def test_a_pad_without_a_daemon_is_told_so_and_tries_again(tmp_path):
     with desk_of(tmp_path / "run" / "control.sock") as (_, port), line_to(port) as line:
         request = {"do": "drive", "forward": 0, "left": 0, "held": False, "stamp": "0"}
-        assert "no daemon" in ask(line, **request)["error"]
+        assert "no daemon" in request_reply(line, **request)["error"]
         made = Daemon(tmp_path / "run")
-        assert ask(line, **request)["ok"]
+        assert request_reply(line, **request)["ok"]
         made.close()
 
 
@@ -223,7 +223,7 @@ def test_two_pages_see_the_same_robot(daemon):
     with desk_of(daemon.server.path) as (desk, port), line_to(port) as one, line_to(port) as other:
         for line in (one, other):
             deadline = time.monotonic() + 30.0
-            while (status := told(line, "status"))["state"] != "READY":
+            while (status := next_message(line, "status"))["state"] != "READY":
                 assert time.monotonic() < deadline
         assert status["next"] == "arm"
         assert status["task"]["limits"]["radius_m"] == [0.1, 50.0]
@@ -233,22 +233,22 @@ def test_two_pages_see_the_same_robot(daemon):
 def test_nobody_there_asks_nothing_of_the_daemon(daemon):
     with desk_of(daemon.server.path) as (_, port):
         with line_to(port) as line:
-            told(line, "status")
+            next_message(line, "status")
 
-        def asks_no_more():
-            asked = len(daemon.asked)
+        def is_quiet():
+            count = len(daemon.received)
             time.sleep(0.6)
-            return len(daemon.asked) == asked
+            return len(daemon.received) == count
 
         # The page may take its time to notice that its browser has gone.
-        wait_until(asks_no_more, 30.0)
+        wait_until(is_quiet, 30.0)
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null"])
 def test_a_foreign_page_gets_no_line(daemon, origin):
     with desk_of(daemon.server.path) as (_, port), pytest.raises(InvalidStatus), line_to(port, origin):
         pass
-    assert daemon.asked == []
+    assert daemon.received == []
 
 
 def test_with_another_address_there_is_no_control_without_its_token(daemon):
@@ -257,16 +257,16 @@ def test_with_another_address_there_is_no_control_without_its_token(daemon):
         serving("test", host="0.0.0.0", port=0, desk=desk) as page,
     ):
         address = urlsplit(page.url)
-        own, token = f"http://127.0.0.1:{address.port}", address.query.removeprefix("token=")
+        page_origin, token = f"http://127.0.0.1:{address.port}", address.query.removeprefix("token=")
         for cookie in ({}, {"Cookie": f"disco-hw-token-{address.port}=wrong"}):
             with pytest.raises(InvalidStatus) as refused:
-                connect(f"ws://127.0.0.1:{address.port}/desk", origin=own, additional_headers=cookie)
+                connect(f"ws://127.0.0.1:{address.port}/desk", origin=page_origin, additional_headers=cookie)
             assert refused.value.response.status_code == 403
-        assert daemon.asked == []
+        assert daemon.received == []
         welcome, _ = get(address.port, f"/?token={token}")
         cookie = {"Cookie": welcome.getheader("Set-Cookie").split(";")[0]}
-        with connect(f"ws://127.0.0.1:{address.port}/desk", origin=own, additional_headers=cookie) as line:
-            assert ask(line, do="stop")["ok"]
+        with connect(f"ws://127.0.0.1:{address.port}/desk", origin=page_origin, additional_headers=cookie) as line:
+            assert request_reply(line, do="stop")["ok"]
 
 
 def test_the_desk_is_what_opens_and_nobody_else_may_frame_it(daemon):
@@ -279,46 +279,46 @@ def test_the_desk_is_what_opens_and_nobody_else_may_frame_it(daemon):
         response, scene = get(port, "/index.html", **cookie)
         assert b"E-STOP" not in scene
         assert f"http://127.0.0.1:{port}" in response.getheader("Content-Security-Policy")
-        own, instance = get(port, "/instance", Origin=f"http://localhost:{port}")
+        local, instance = get(port, "/instance", Origin=f"http://localhost:{port}")
         assert instance.strip() in body
-        assert own.getheader("Access-Control-Allow-Origin") == f"http://localhost:{port}"
+        assert local.getheader("Access-Control-Allow-Origin") == f"http://localhost:{port}"
         foreign, _ = get(port, "/instance", Origin="http://evil.example")
         assert foreign.getheader("Access-Control-Allow-Origin") is None
 
 
 @pytest.mark.parametrize(
-    ("status", "error", "words"),
+    ("status", "error", "expected"),
     [(None, "no daemon listens", "no daemon listens"), ({"ok": False, "error": "not started"}, "", "not started"),
      ({"ok": False}, "", "its loop does not run yet")],
 )  # fmt: skip
-def test_without_a_status_it_says_why(status, error, words):
-    said = shown(status, error)
-    assert not said["ok"]
-    assert words in said["detail"]
+def test_without_a_status_it_says_why(status, error, expected):
+    display = shown(status, error)
+    assert not display["ok"]
+    assert expected in display["detail"]
 
 
 def test_what_is_not_recorded_is_shown_whatever_the_state():
-    said = shown({**STATUS, "recorder": {"fault": "nothing is being recorded: no room"}}, "")
-    assert said["advice"][-1] == "RECORDING: nothing is being recorded: no room."
+    display = shown({**STATUS, "recorder": {"fault": "nothing is being recorded: no room"}}, "")
+    assert display["advice"][-1] == "RECORDING: nothing is being recorded: no room."
     assert not any("RECORDING" in sentence for sentence in shown(STATUS, "")["advice"])
 
 
 def test_a_latched_stop_and_a_drive_by_page_are_shown():
-    said = shown({**STATUS, "robot_state": "ESTOP", "drive": {"by_page": True, "driving": False, "words": "w"}}, "")
-    assert said["estop"]
-    assert "latched" in said["advice"][0]
-    assert said["drive"] == {"by_page": True, "driving": False}
+    display = shown({**STATUS, "robot_state": "ESTOP", "drive": {"by_page": True, "driving": False, "words": "w"}}, "")
+    assert display["estop"]
+    assert "latched" in display["advice"][0]
+    assert display["drive"] == {"by_page": True, "driving": False}
 
 
 def test_a_request_still_unanswered_when_the_browser_goes_goes_on_and_leaves_no_task(daemon, monkeypatch):
-    tasks, answer, asked, answered = [], Desk._forward_request, threading.Event(), threading.Event()
+    tasks, forward, requested, answered = [], Desk._forward_request, threading.Event(), threading.Event()
 
     async def watched(self, *arguments):
         tasks.append(asyncio.current_task())
-        await answer(self, *arguments)
+        await forward(self, *arguments)
 
     def unanswered(_, request):
-        asked.set()
+        requested.set()
         return {"ok": answered.wait(60.0)}
 
     monkeypatch.setattr(Desk, "_forward_request", watched)
@@ -326,7 +326,7 @@ def test_a_request_still_unanswered_when_the_browser_goes_goes_on_and_leaves_no_
     with desk_of(daemon.server.path) as (_, port):
         with line_to(port) as line:
             line.send(json.dumps({"do": "disarm"}))
-            assert asked.wait(60.0)
+            assert requested.wait(60.0)
         wait_until(tasks[0].done, 30.0)
         answered.set()
 

@@ -26,8 +26,12 @@ LIMITS = {"asked": {"kind": "circle", "radius_m": 0.75, "speed_m_s": 0.2, "cente
           "labels": {"radius_m": "Radius (m)", "speed_m_s": "Speed (m/s)", "center_x_m": "Centre x (m)",
                      "center_y_m": "Centre y (m)"},
           "note": "Radius 0.1 to 50 m; at 0.75 m at most 0.318 m/s."}  # fmt: skip
-WHOLE = {**STATUS, "task": LIMITS}
-HELD = {"by_page": True, "driving": False, "words": "hold the pad to drive; the robot is armed by holding, not by Arm"}
+COMPLETE_STATUS = {**STATUS, "task": LIMITS}
+DRIVE_BY_PAGE = {
+    "by_page": True,
+    "driving": False,
+    "words": "hold the pad to drive; the robot is armed by holding, not by Arm",
+}
 STATES = {
     "disconnected": {"state": "DISCONNECTED", "detail": LINK_ERROR, "robot_state": "UNKNOWN"},
     "handshake": {
@@ -53,7 +57,7 @@ STATES = {
         "robot_state": "ESTOP",
         "detail": "e-stop requested by the operator; mend it, then reset",
     },
-    "by hand": {"state": "READY", "drive": HELD},
+    "by hand": {"state": "READY", "drive": DRIVE_BY_PAGE},
 }
 
 # Every element that holds text of its own: is all of it inside of the element and of the window?
@@ -139,7 +143,7 @@ def test_a_dark_room_darkens_the_desk(browser, daemon):
 
 @pytest.mark.parametrize("name", ["ready", "running", "estop", "by hand"])
 def test_the_desk_looks_as_it_did(browser, daemon, name):
-    daemon.status = {**WHOLE, **STATES[name]}
+    daemon.status = {**COMPLETE_STATUS, **STATES[name]}
     with desk_at(daemon.server.path) as url, opened(browser, url, scene=False) as tab:
         tab.locator("#detail", has_text=daemon.status["detail"][:60]).wait_for()
         # A frame that was not loaded shows now a sign for that, and now none; nor does a caret or a mouse belong here.
@@ -154,7 +158,7 @@ def test_the_desk_looks_as_it_did(browser, daemon, name):
 
 @pytest.mark.parametrize(("width", "height"), [(390, 844), (360, 640), (640, 900), (844, 390), (640, 360), (1400, 620)])
 def test_the_pad_lies_over_neither_the_e_stop_nor_on_a_small_screen_the_scene(browser, daemon, width, height):
-    daemon.status = {**WHOLE, **STATES["by hand"]}
+    daemon.status = {**COMPLETE_STATUS, **STATES["by hand"]}
     with desk_at(daemon.server.path) as url, opened(browser, url, width, height, scene=False) as tab:
         tab.locator("#drive").wait_for()
         pad, card, scene, bar = (tab.locator(f"#{each}").bounding_box() for each in ("pad", "drive", "scene", "top"))
@@ -167,11 +171,11 @@ def test_the_pad_lies_over_neither_the_e_stop_nor_on_a_small_screen_the_scene(br
         tab.mouse.down()
         tab.mouse.move(pad["x"] + 0.5 * pad["width"], pad["y"] + 2.0)
         tab.wait_for_timeout(300)
-        pulled = [arguments for action, arguments in daemon.asked if action == "drive" and arguments["held"]]
+        pulled = [arguments for action, arguments in daemon.received if action == "drive" and arguments["held"]]
         assert pulled[-1]["forward"] == pytest.approx(0.5)
         tab.mouse.up()
-        said = "() => { at('padsays').textContent = 'no daemon hears the pad'; return (%s)(); }"
-        assert tab.evaluate(said % CUT_OFF) == []
+        script = "() => { at('padsays').textContent = 'no daemon hears the pad'; return (%s)(); }"
+        assert tab.evaluate(script % CUT_OFF) == []
         keep(tab, f"pad-{width}-{height}")
 
 
@@ -185,7 +189,7 @@ def apart(one, other):
 
 
 def test_what_is_dragged_in_the_scene_stands_in_the_form_and_escape_closes_it(browser, daemon):
-    daemon.status = WHOLE
+    daemon.status = COMPLETE_STATUS
     desk = Desk(daemon.server.path, ROBOT_FILE)
     with serving("test", port=0, desk=desk) as page, opened(browser, page.url, scene=False) as tab:
         tab.locator("#state", has_text="READY").wait_for()
@@ -206,10 +210,10 @@ def test_what_is_dragged_in_the_scene_stands_in_the_form_and_escape_closes_it(br
 
 @pytest.mark.parametrize("name", STATES)
 def test_every_text_is_whole(browser, daemon, name):
-    daemon.status = {**WHOLE, **STATES[name]}
+    daemon.status = {**COMPLETE_STATUS, **STATES[name]}
     with desk_at(daemon.server.path) as url, opened(browser, url, scene=False) as tab:
-        said = daemon.status["detail"]
-        tab.locator("#detail", has_text=said[:60]).wait_for()
+        detail = daemon.status["detail"]
+        tab.locator("#detail", has_text=detail[:60]).wait_for()
         assert cut_off(tab, name) == []
         # The longest answers of the daemon are refusals.
         tab.evaluate("text => answer(text, true)", f"arm refused: not connected to the robot: {LINK_ERROR}")
@@ -226,7 +230,7 @@ def test_the_stop_button_stays_where_it_is_whatever_is_said(browser, daemon):
     with desk_at(daemon.server.path) as url, opened(browser, url, scene=False) as tab:
         places = {}
         for name in ("ready", "disconnected", "stopping"):
-            daemon.status = {**WHOLE, **STATES[name]}
+            daemon.status = {**COMPLETE_STATUS, **STATES[name]}
             tab.locator("#detail", has_text=daemon.status["detail"][:60]).wait_for()
             for width in WIDTHS:
                 tab.set_viewport_size({"width": width, "height": HEIGHT})

@@ -59,12 +59,12 @@ def from_above(page, server, attempts=3):
         wait_for(page, lambda: len(server.get_clients()) == 1)
         client = next(iter(server.get_clients().values()))
         with ThreadPoolExecutor(1) as pool:
-            drawn = pool.submit(client.get_render, SIZE, SIZE, wxyz=down, position=position, fov=FIELD_OF_VIEW)
-            wait_for(page, drawn.done)
+            rendering = pool.submit(client.get_render, SIZE, SIZE, wxyz=down, position=position, fov=FIELD_OF_VIEW)
+            wait_for(page, rendering.done)
         # A browser that is starved of its processor loses the connection and makes a new one.
-        if drawn.exception() is None:
-            return drawn.result()[:, :, :3].astype(int)
-    raise drawn.exception()
+        if rendering.exception() is None:
+            return rendering.result()[:, :, :3].astype(int)
+    raise rendering.exception()
 
 
 def pixel(x_m, y_m, z_m=0.0):
@@ -79,9 +79,9 @@ def hue_near(picture, row, column, reach=5):
     return part[np.argmax(np.ptp(part, axis=1))]
 
 
-def like(colour, wanted):
+def like(colour, expected):
     """Whether the order of the channels is that of the wanted colour, clearly."""
-    return np.argmax(colour) == np.argmax(wanted) and np.argmin(colour) == np.argmin(wanted) and np.ptp(colour) > 60
+    return np.argmax(colour) == np.argmax(expected) and np.argmin(colour) == np.argmin(expected) and np.ptp(colour) > 60
 
 
 def test_a_browser_without_a_graphics_card_draws_few_pixels_and_its_notice_goes(browser, replay):
@@ -144,7 +144,7 @@ def test_circle_and_robot_are_drawn_at_their_places_and_replay_is_sought(browser
 
 
 # Where things are: the picture, the boxes of panel and bar of time, and heads of folds that only a mouse would reach.
-LAID_OUT = """() => {
+LAYOUT = """() => {
   const place = element => (({x, y, width, height}) => ({x, y, width, height}))(element.getBoundingClientRect());
   const boxes = [...document.querySelectorAll(".mantine-Paper-root")];
   const panel = boxes.find(box => box.textContent.includes("Play"));
@@ -163,16 +163,16 @@ def test_every_control_has_a_name_and_keys_and_a_phone_sees_the_scene_and_the_pa
     with opened(browser, served.url, width, 844) as tab:
         tab.get_by_role("button", name="Play").wait_for()
         wait_for(tab, lambda: unnamed(tab) == [])
-        wait_for(tab, lambda: tab.evaluate(LAID_OUT)["mouse"] == [])
+        wait_for(tab, lambda: tab.evaluate(LAYOUT)["mouse"] == [])
         if width == 390:
-            wait_for(tab, lambda: not_covered(tab.evaluate(LAID_OUT)))
+            wait_for(tab, lambda: not_covered(tab.evaluate(LAYOUT)))
             head = tab.get_by_role("button", name="Show or hide the panel")
-            before = tab.evaluate(LAID_OUT)["panel"]["height"]
+            before = tab.evaluate(LAYOUT)["panel"]["height"]
             head.focus(timeout=30_000)
             head.press("Enter")
-            wait_for(tab, lambda: tab.evaluate(LAID_OUT)["canvas"]["height"] > 844 - 0.6 * before)
+            wait_for(tab, lambda: tab.evaluate(LAYOUT)["canvas"]["height"] > 844 - 0.6 * before)
         else:
-            wait_for(tab, lambda: as_wide_as_the_picture(tab.evaluate(LAID_OUT)))
+            wait_for(tab, lambda: as_wide_as_the_picture(tab.evaluate(LAYOUT)))
         keep(tab, f"replay-{width}")
 
 
@@ -197,12 +197,12 @@ def test_an_exported_page_plays_from_the_file_alone(browser, log_file, tmp_path)
         tab.locator("canvas").first.wait_for()
         wait_for(tab, lambda: any("Embedded data loaded" in text for text in tab.output_lines))
         keep(tab, "export")
-        asked = [text for text in tab.output_lines if text.startswith("request") and "http" in text]
-        assert asked == []
+        requests = [text for text in tab.output_lines if text.startswith("request") and "http" in text]
+        assert requests == []
 
 
 _CIRCLE = {"radius_m": 0.75, "speed_m_s": 0.2, "center_x_m": 0.0, "center_y_m": 0.0}
-WHOLE_STATUS = {
+COMPLETE_STATUS = {
     **STATUS, "stop_cause": "NONE", "link": "up", "link_error": "", "adaptation": None,
     "task": {"asked": {"kind": "circle", **_CIRCLE}, "limits": {name: [-50.0, 50.0] for name in _CIRCLE},
              "labels": {**{name: name for name in _CIRCLE}, "center_x_m": "Centre x (m)"}, "note": "",
@@ -215,7 +215,7 @@ WHOLE_STATUS = {
 
 def test_the_circle_is_dragged_with_the_mouse_and_set(browser, tmp_path):
     daemon = Daemon(tmp_path / "run")
-    daemon.status = WHOLE_STATUS
+    daemon.status = COMPLETE_STATUS
     desk, ending = Desk(daemon.server.path, ROBOT_FILE), threading.Event()
     with serving("test", port=0, desk=desk) as page:
         live = LivePage(page.server, stage_of_robot(ROBOT_FILE), daemon.server.path, desk)
@@ -236,9 +236,9 @@ def test_the_circle_is_dragged_with_the_mouse_and_set(browser, tmp_path):
                 tab.evaluate("() => { document.getElementById('task').style.visibility = ''; }")
                 wait_for(tab, lambda: float(tab.get_by_label("Centre x (m)").input_value()) == desk.draft["center_x_m"])
                 tab.get_by_role("button", name="Set the task").click()
-                wait_for(tab, lambda: any(action == "task" for action, _ in daemon.asked))
-                asked = next(arguments for action, arguments in daemon.asked if action == "task")
-                assert asked["center_x_m"] == desk.draft["center_x_m"]
+                wait_for(tab, lambda: any(action == "task" for action, _ in daemon.received))
+                requested = next(arguments for action, arguments in daemon.received if action == "task")
+                assert requested["center_x_m"] == desk.draft["center_x_m"]
         finally:
             ending.set()
             thread.join()
@@ -248,7 +248,7 @@ def test_the_circle_is_dragged_with_the_mouse_and_set(browser, tmp_path):
 
 def test_the_fence_is_typed_and_cornered_by_the_robots_nose_and_put_in_force(browser, tmp_path):
     daemon = Daemon(tmp_path / "run")
-    daemon.status = WHOLE_STATUS
+    daemon.status = COMPLETE_STATUS
     desk, ending = Desk(daemon.server.path, ROBOT_FILE), threading.Event()
     with serving("test", port=0, desk=desk) as page:
         live = LivePage(page.server, stage_of_robot(ROBOT_FILE), daemon.server.path, desk)
@@ -270,11 +270,11 @@ def test_the_fence_is_typed_and_cornered_by_the_robots_nose_and_put_in_force(bro
                 panel.get_by_label("Keep out of").fill('[{"center": [0.9, 0], "radius_m": 0.15}]')
                 wait_for(tab, lambda: "radius_m" in live.fence_editor._keep_out.value)
                 panel.get_by_role("button", name="Use this fence").click()
-                wait_for(tab, lambda: any(action == "fence" for action, _ in daemon.asked))
-                asked = next(arguments for action, arguments in daemon.asked if action == "fence")
-                assert asked["keep_in"] == [[-2, -1.5], [2, -1.5], [2, 1.5], [-2, 1.5]]
-                assert asked["keep_out"] == [{"center": [0.9, 0], "radius_m": 0.15}]
-                assert asked["margin_m"] == 0.05
+                wait_for(tab, lambda: any(action == "fence" for action, _ in daemon.received))
+                requested = next(arguments for action, arguments in daemon.received if action == "fence")
+                assert requested["keep_in"] == [[-2, -1.5], [2, -1.5], [2, 1.5], [-2, 1.5]]
+                assert requested["keep_out"] == [{"center": [0.9, 0], "radius_m": 0.15}]
+                assert requested["margin_m"] == 0.05
                 panel.get_by_text("done it").wait_for()
                 keep(tab, "fence-editor")
         finally:

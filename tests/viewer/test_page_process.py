@@ -34,15 +34,17 @@ def gone(pid):
 
 def test_the_page_lives_as_long_as_the_block_and_prints_on_standard_error_alone(capfd):
     port = free_port()
-    said = []
+    captured = []
     with page_in_background(ROBOT_FILE, None, "127.0.0.1", port) as page:
-        wait_until(lambda: said.append(capfd.readouterr()) or f":{port}/" in "".join(it.err for it in said), 60.0)
+        wait_until(
+            lambda: captured.append(capfd.readouterr()) or f":{port}/" in "".join(it.err for it in captured), 60.0
+        )
         wait_until(lambda: listens(port), 60.0)
         assert os.getsid(page.pid) == page.pid
     assert page.returncode == 0
     assert not listens(port)
-    said.append(capfd.readouterr())
-    assert not any(it.out for it in said)
+    captured.append(capfd.readouterr())
+    assert not any(it.out for it in captured)
 
 
 def test_the_page_ends_when_its_parent_is_killed():

@@ -72,8 +72,8 @@ def test_what_matters_comes_first_in_metres_and_the_counters_after_it(timeline):
     assert "| distance | 0.012 m |" in text
     assert "| battery | 24.5 V, 1.0 A, 30 °C |" in text
     assert "| loop | 100 us late (99 %), 7 overruns |" in text
-    once = {**STATUS, "loop": {**STATUS["loop"], "overruns": 1}}
-    assert "| loop | 100 us late (99 %), 1 overrun |" in live_summary(once, None)
+    single_overrun = {**STATUS, "loop": {**STATUS["loop"], "overruns": 1}}
+    assert "| loop | 100 us late (99 %), 1 overrun |" in live_summary(single_overrun, None)
 
 
 def test_a_replay_shows_the_same_motion_and_the_distance(timeline):

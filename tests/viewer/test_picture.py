@@ -9,7 +9,7 @@ from disco_hw.viewer import picture, scene
 from tools.viewer_run import FAN_TICK
 
 
-def drawn(recording, t_s, path):
+def pixels_of(recording, t_s, path):
     picture.draw_picture(recording, t_s, path)
     return np.asarray(Image.open(path).convert("RGB")).astype(int)
 
@@ -27,7 +27,7 @@ def count_shades(pixels, colour, palest):
 
 
 def test_every_layer_is_in_the_picture(recording, tmp_path):
-    pixels = drawn(recording, FAN_TICK * 0.02 + 0.1, tmp_path / "a.png")
+    pixels = pixels_of(recording, FAN_TICK * 0.02 + 0.1, tmp_path / "a.png")
     assert count(pixels, scene.TASK_COLOUR) > 500
     assert count(pixels, scene.PLAN_COLOUR) > 50
     assert count_shades(pixels, scene.FAN_COLOUR, 0.2) > 60
@@ -35,8 +35,8 @@ def test_every_layer_is_in_the_picture(recording, tmp_path):
 
 
 def test_an_instant_before_the_log_and_one_after_it_are_its_ends(recording, tmp_path):
-    before, start = (drawn(recording, t_s, tmp_path / "a.png") for t_s in (-5.0, 0.0))
-    after, end = (drawn(recording, t_s, tmp_path / "a.png") for t_s in (1e6, recording.duration_s))
+    before, start = (pixels_of(recording, t_s, tmp_path / "a.png") for t_s in (-5.0, 0.0))
+    after, end = (pixels_of(recording, t_s, tmp_path / "a.png") for t_s in (1e6, recording.duration_s))
     assert (before == start).all()
     assert (after == end).all()
     assert np.abs(start - end).max() > 100

@@ -34,9 +34,9 @@ def drive(tmp_path_factory):
 
     def let_pass(duration_s, *requests):
         for tick in stack.ticks(duration_s, *requests):
-            said = shown(status(stack.core, loop, RecorderStats()), "")
-            assert read_of_the_task() <= said["task"].keys()
-            live[tick.pipeline.t_ns] = (said["head"], said["detail"])
+            display = shown(status(stack.core, loop, RecorderStats()), "")
+            assert read_of_the_task() <= display["task"].keys()
+            live[tick.pipeline.t_ns] = (display["head"], display["detail"])
 
     let_pass(1.5)
     let_pass(0.5, UserRequest.ARM)

@@ -165,9 +165,9 @@ def test_nothing_is_drawn_that_costs_a_browser_without_a_graphics_card_ten_times
     assert len(lines) == 13
     assert set(lines) == {"screen"}
     assert not any(type(message).__name__ == "GridMessage" for message in sent)
-    said = {type(message).__name__: message for message in sent}
-    assert not said["EnableLightsMessage"].cast_shadow
-    assert said["EnvironmentMapMessage"].hdri_data is None
+    by_type = {type(message).__name__: message for message in sent}
+    assert not by_type["EnableLightsMessage"].cast_shadow
+    assert by_type["EnvironmentMapMessage"].hdri_data is None
 
 
 def test_the_grid_has_a_line_every_metre_and_is_seen_in_the_dark_as_the_turning_centre_is(scene, shot):

@@ -164,8 +164,8 @@ def test_a_client_that_asks_for_a_public_tunnel_gets_none(page, monkeypatch):
 
 
 def test_a_taken_port_is_an_error_and_not_the_next_one():
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as occupied:
+        port = occupied.getsockname()[1]
         with pytest.raises(InputError, match=f"--port {port}"), serving("test", port=port):
             pass
 
@@ -194,12 +194,12 @@ def test_another_address_needs_its_token():
         assert "SameSite=Strict" in cookie
         pair = cookie.split(";")[0]
         assert get(port, Cookie=pair)[0].status == 200
-        own = f"http://127.0.0.1:{port}"
-        with pytest.raises(InvalidStatus), upgrade(port, own):
+        page_origin = f"http://127.0.0.1:{port}"
+        with pytest.raises(InvalidStatus), upgrade(port, page_origin):
             pass
         with pytest.raises(InvalidStatus), upgrade(port, "http://evil.example", headers={"Cookie": pair}):
             pass
-        with upgrade(port, own, headers={"Cookie": pair}) as client:
+        with upgrade(port, page_origin, headers={"Cookie": pair}) as client:
             assert client.recv(timeout=60)
 
 

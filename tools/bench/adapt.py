@@ -47,7 +47,7 @@ class Scenario:
     """A drive of a foreign robot: what it is, how it changes at `change_s`, and how good its poses are.
 
     `changed` gives the robot after `seconds` of driving. `narrow`: the belief at first is 1 % wide, else 15 %.
-    `poses`: every how many-th pose arrives, and the noise added to it (m, rad). Judged over the last `judged_s`.
+    `poses`: every how many-th pose arrives, and the noise added to it (m, rad). Evaluated over the last `evaluated_s`.
     `step` of the length number `index` by a factor: how soon 80 % of it is known.
     """
 
@@ -56,7 +56,7 @@ class Scenario:
     narrow: bool = False
     poses: tuple[int, float, float] = (1, 0.0, 0.0)
     duration_s: float = 45.0
-    judged_s: float = 15.0
+    evaluated_s: float = 15.0
     step: tuple[int, float] | None = None
 
 
@@ -89,14 +89,14 @@ SCENARIOS: dict[str, Scenario] = {
     "radius drifts 5 % in 60 s": Scenario(
         changed=lambda robot, seconds: replace(robot, radius_m=NOMINAL[0] * (1.0 - 0.05 * min(seconds / 60.0, 1.0))),
         duration_s=70.0,
-        judged_s=40.0,
+        evaluated_s=40.0,
     ),
     "no change, rough ground": Scenario(
-        robot=lambda seed: ForeignRobot(*NOMINAL, grip_std=0.08), duration_s=60.0, judged_s=40.0
+        robot=lambda seed: ForeignRobot(*NOMINAL, grip_std=0.08), duration_s=60.0, evaluated_s=40.0
     ),
-    "no change, belief of 1 %": Scenario(narrow=True, duration_s=60.0, judged_s=50.0),
+    "no change, belief of 1 %": Scenario(narrow=True, duration_s=60.0, evaluated_s=50.0),
     "poses 5 Hz, 10 mm": Scenario(robot=_unlike, poses=(5, 0.01, 0.015), duration_s=60.0),
-    "poses 2 Hz, 25 mm": Scenario(robot=_unlike, poses=(12, 0.025, 0.03), duration_s=90.0, judged_s=30.0),
+    "poses 2 Hz, 25 mm": Scenario(robot=_unlike, poses=(12, 0.025, 0.03), duration_s=90.0, evaluated_s=30.0),
 }
 
 
@@ -109,7 +109,7 @@ class Estimated:
     """
 
     error: Array
-    held: Array
+    coverage: Array
     known_s: float
     changes: int
 
@@ -120,10 +120,10 @@ def scenarios(seeds: int = 8) -> dict[str, float]:
     for name, scenario in SCENARIOS.items():
         found = [estimate(scenario, seed) for seed in range(seeds)]
         key = f"adapt.{name}"
-        errors, held = (np.array([getattr(one, field) for one in found]) for field in ("error", "held"))
+        errors, coverage = (np.array([getattr(one, field) for one in found]) for field in ("error", "coverage"))
         for index, length in enumerate(LENGTHS):
             figures[f"{key}.{length}_error_percent"] = float(100.0 * np.median(errors[:, index]))
-            figures[f"{key}.{length}_held_percent"] = float(100.0 * np.mean(held[:, index]))
+            figures[f"{key}.{length}_held_percent"] = float(100.0 * np.mean(coverage[:, index]))
         if scenario.step is not None:
             figures[f"{key}.known_median_s"] = float(np.median([one.known_s for one in found]))
             figures[f"{key}.known_worst_s"] = max(one.known_s for one in found)
@@ -140,7 +140,7 @@ def estimate(scenario: Scenario, seed: int) -> Estimated:
     adaptation = FastAdaptation(model, 0.5 * mean, 1.6 * mean, lambda one: in_force.append(one or model))
     first = scenario.robot(seed)
     plant, noise = ForeignPlant(first, (0.0, 0.0, 0.3), seed), np.random.default_rng(seed + 1000)
-    errors, held, known_s = [], [], math.inf
+    errors, covered, known_s = [], [], math.inf
     for tick in range(round(scenario.duration_s / 0.02)):
         seconds = 0.02 * tick
         if tick % 25 == 0:
@@ -151,15 +151,15 @@ def estimate(scenario: Scenario, seed: int) -> Estimated:
         plant.advance(*_commands(seconds), 20)
         truth = np.array([getattr(plant.robot, length) for length in LENGTHS])
         believed, deviation = (array[_FROM_ADAPTATION] for array in (in_force[-1].mean, in_force[-1].std))
-        if seconds > scenario.duration_s - scenario.judged_s:
+        if seconds > scenario.duration_s - scenario.evaluated_s:
             errors.append(believed / truth - 1.0)
-            held.append(np.abs(believed - truth) < 1.645 * deviation)
+            covered.append(np.abs(believed - truth) < 1.645 * deviation)
         if scenario.step is not None and seconds >= CHANGE_S and math.isinf(known_s):
             index, factor = scenario.step
             if (believed[index] / NOMINAL[index] - 1.0) / (factor - 1.0) > 0.8:
                 known_s = seconds - CHANGE_S
     error = np.sqrt(np.mean(np.square(errors), axis=0))
-    return Estimated(error, np.mean(held, axis=0), known_s, adaptation.counts()["changes"])
+    return Estimated(error, np.mean(covered, axis=0), known_s, adaptation.counts()["changes"])
 
 
 def _commands(seconds: float) -> tuple[float, float]:
@@ -212,12 +212,12 @@ def _calls(setup: Setup) -> dict[str, float]:
 
 
 def _timed(name: str, count: int, call: Callable[[int], object]) -> dict[str, float]:
-    taken = np.empty(count)
+    durations_us = np.empty(count)
     for k in range(count):
         begun = time.perf_counter()
         call(k)
-        taken[k] = 1e6 * (time.perf_counter() - begun)
-    p50, p99, p999 = np.percentile(taken, (50.0, 99.0, 99.9))
+        durations_us[k] = 1e6 * (time.perf_counter() - begun)
+    p50, p99, p999 = np.percentile(durations_us, (50.0, 99.0, 99.9))
     return {f"{name}_p50_us": float(p50), f"{name}_p99_us": float(p99), f"{name}_p999_us": float(p999)}
 
 
@@ -329,6 +329,6 @@ def _won_back(setup: Setup) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    asked = sys.argv[1:]
-    for key, value in (scenarios(*map(int, asked[1:])) if asked[:1] == ["scenarios"] else run()).items():
+    argv = sys.argv[1:]
+    for key, value in (scenarios(*map(int, argv[1:])) if argv[:1] == ["scenarios"] else run()).items():
         print(f"{key:45} {value:12.4g}")

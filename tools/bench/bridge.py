@@ -100,7 +100,7 @@ def _cpu_s(process: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def _heard(directory: Path) -> np.ndarray:
+def _node_odometry(directory: Path) -> np.ndarray:
     """Return (N, 3): stamp (wall clock), reception and reply (monotonic, ns) of each odometry."""
     rows = [line.split() for line in (directory / "node.txt").read_text(encoding="utf-8").splitlines()]
     return np.array([list(map(int, row[:3])) for row in rows if len(row) == 5])
@@ -112,17 +112,17 @@ def _odometry_ms(directory: Path, start_ns: int, end_ns: int) -> np.ndarray:
     with open_log(directory / "run.mcap") as log:
         ticks = np.array([(entry.record.t_ns, entry.now_ns) for entry in log.records({"/wheels"})])
     found = []
-    for stamp_ns, heard_ns, _ in _heard(directory):
-        if start_ns <= heard_ns <= end_ns:
+    for stamp_ns, received_ns, _ in _node_odometry(directory):
+        if start_ns <= received_ns <= end_ns:
             nearest = int(np.abs(ticks[:, 0] + offset_ns - stamp_ns).argmin())
-            found.append((heard_ns - ticks[nearest, 1]) * 1e-6)
+            found.append((received_ns - ticks[nearest, 1]) * 1e-6)
     return np.array(found)
 
 
 def _pose_to_command_ms(directory: Path, start_ns: int, end_ns: int) -> np.ndarray:
     """From a node's saying a pose to the next wheel command on the wire after the tick that took it."""
     offset_ns = time.time_ns() - time.monotonic_ns()
-    said = _heard(directory)
+    node_rows = _node_odometry(directory)
     on_wire = []
     for line in (directory / "bus.log").read_text(encoding="utf-8").splitlines():
         stamp, _, frame = line.split()
@@ -133,9 +133,9 @@ def _pose_to_command_ms(directory: Path, start_ns: int, end_ns: int) -> np.ndarr
     with open_log(directory / "run.mcap") as log:
         for entry in log.records({"/pose"}):
             if start_ns <= entry.now_ns <= end_ns:
-                nearest = int(np.abs(said[:, 0] - offset_ns - entry.record.t_ns).argmin())
+                nearest = int(np.abs(node_rows[:, 0] - offset_ns - entry.record.t_ns).argmin())
                 sent_ns = commands[np.searchsorted(commands, entry.now_ns)]
-                found.append((sent_ns - said[nearest, 2]) * 1e-6)
+                found.append((sent_ns - node_rows[nearest, 2]) * 1e-6)
     return np.array(found)
 
 

@@ -57,12 +57,12 @@ def run(steps: int = 3000, peer_steps: int = 100, seeds: int = 8, duration_s: fl
     with undisturbed() as allowed:
         figures["control.realtime"] = float(allowed)
         figures |= on_the_robot(steps)
-        figures |= beside_peer("skid_steer", *skid_steer_pair(model), steps, peer_steps)
-        figures |= beside_peer("pendulum", *pendulum_pair(), steps, peer_steps)
+        figures |= compare_with_peer("skid_steer", *skid_steer_pair(model), steps, peer_steps)
+        figures |= compare_with_peer("pendulum", *pendulum_pair(), steps, peer_steps)
         figures |= scaling(model, max(steps // 100, 3))
     if torch.cuda.is_available():
-        taken = torch_times_ms(model, "cuda", GPU_SAMPLES, 50)
-        figures |= summary("control.torch_cuda_k65536_ms", taken)
+        cuda_ms = torch_times_ms(model, "cuda", GPU_SAMPLES, 50)
+        figures |= summary("control.torch_cuda_k65536_ms", cuda_ms)
     figures |= circle_quality(model, seeds, duration_s)
     return figures
 
@@ -131,7 +131,7 @@ def pendulum_pair() -> tuple[Step, Step]:
     return lambda _: planner.plan(math.pi, 0.0), lambda _: mppi.command(start)
 
 
-def beside_peer(name: str, ours: Step, theirs: Step, steps: int, peer_steps: int) -> dict[str, float]:
+def compare_with_peer(name: str, ours: Step, theirs: Step, steps: int, peer_steps: int) -> dict[str, float]:
     """Time of a step of both and of a bare loop, in turns so that all see the same machine.
 
     Ratio of the medians, and of the minima.
@@ -173,8 +173,8 @@ def scaling(model: Model, steps: int) -> dict[str, float]:
     for _ in range(ROUNDS):
         for size, planner in planners.items():
             count = max(2, steps * SIZES[0] // size)
-            taken = times_ms(lambda n, planner=planner: planner.plan(*calls[n % CALLS]), count, left_out=2)
-            least[size] = min(least[size], float(taken.min()))
+            step_ms = times_ms(lambda n, planner=planner: planner.plan(*calls[n % CALLS]), count, left_out=2)
+            least[size] = min(least[size], float(step_ms.min()))
     shares = {size: least[size] / size for size in SIZES}
     return {
         **{f"control.scaling.k{size}_ms": least[size] for size in SIZES},
@@ -212,10 +212,10 @@ def allocations(model: Model, steps: int = 200) -> dict[str, float]:
     tracemalloc.start()
     try:
         planner.plan(*moving(20))
-        held = tracemalloc.get_traced_memory()[0]
+        traced_bytes = tracemalloc.get_traced_memory()[0]
         for number in range(21, 21 + steps):
             planner.plan(*moving(number))
-        grown = tracemalloc.get_traced_memory()[0] - held
+        grown = tracemalloc.get_traced_memory()[0] - traced_bytes
     finally:
         tracemalloc.stop()
     return {"in_the_step": float(counted["step"] - counted["empty"]), "bytes_grown_per_step": grown / steps}

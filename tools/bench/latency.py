@@ -27,12 +27,12 @@ def run(seconds: float = 20.0) -> dict[str, float]:
     for link in ("can", "serial"):
         with tempfile.TemporaryDirectory() as name:
             _drive(Path(name), link, seconds)
-            whole_ms, waited_ms = _latencies_ms(Path(name))
-        for key, values in (("", whole_ms), ("waiting_", waited_ms)):
+            total_ms, waited_ms = _latencies_ms(Path(name))
+        for key, values in (("", total_ms), ("waiting_", waited_ms)):
             figures[f"latency.{link}.{key}p50_ms"] = float(np.percentile(values, 50))
             figures[f"latency.{link}.{key}p99_ms"] = float(np.percentile(values, 99))
-        figures[f"latency.{link}.max_ms"] = float(whole_ms.max())
-        figures[f"latency.{link}.commands"] = float(len(whole_ms))
+        figures[f"latency.{link}.max_ms"] = float(total_ms.max())
+        figures[f"latency.{link}.commands"] = float(len(total_ms))
     return figures
 
 
@@ -58,7 +58,7 @@ def _latencies_ms(directory: Path) -> tuple[np.ndarray, np.ndarray]:
         can_id, _, data = frame.partition("#")
         if int(can_id, 16) in (WHEEL_COMMAND, WHEEL_TICKS):
             passed.setdefault((int(can_id, 16), bytes.fromhex(data)), []).append(float(stamp[1:-1]))
-    whole, waited = [], []
+    total_ms, waited_ms = [], []
     newest: float | None = None
     with open_log(directory / "run.mcap") as log:
         for entry in log.records({"/can/rx", "/can/tx"}):
@@ -68,9 +68,9 @@ def _latencies_ms(directory: Path) -> tuple[np.ndarray, np.ndarray]:
             elif record.can_id == WHEEL_COMMAND and newest is not None:
                 sent = _nearest(passed.get((WHEEL_COMMAND, record.data)), record.t_ns * 1e-9)
                 if sent is not None:
-                    whole.append(1e3 * (sent - newest))
-                    waited.append(1e3 * (record.t_ns * 1e-9 - newest))
-    return np.array(whole), np.array(waited)
+                    total_ms.append(1e3 * (sent - newest))
+                    waited_ms.append(1e3 * (record.t_ns * 1e-9 - newest))
+    return np.array(total_ms), np.array(waited_ms)
 
 
 def _nearest(times_s: list[float] | None, t_s: float) -> float | None:

@@ -47,11 +47,11 @@ def _between_marks(calls: tuple[Callable[[], object], ...]) -> None:
     try:
         gc.disable()
         _ptrace(TRACE_ME)
-        own = os.getpid()
+        pid = os.getpid()
         for call in calls:
-            os.kill(own, MARK)
+            os.kill(pid, MARK)
             call()
-            os.kill(own, MARK)
+            os.kill(pid, MARK)
         status = 0
     finally:
         os._exit(status)
@@ -98,10 +98,10 @@ def figures_of(planner: Disco, calls: int = 2000) -> dict[str, float]:
     assert step is not None
     samples = planner.settings.sampler.samples
     again = partial(step, *optimiser.arguments)
-    held = sum(getattr(work, name).nbytes for name in PER_SAMPLE)
+    buffer_bytes = sum(getattr(work, name).nbytes for name in PER_SAMPLE)
     figures = {
         "instructions_per_sample": instructions_of(again) / samples,
-        "bytes_per_sample": held / samples,
+        "bytes_per_sample": buffer_bytes / samples,
     }
     with undisturbed():
         figures["compiled_ms"] = float(times_ms(lambda _: again(), calls).min())

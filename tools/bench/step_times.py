@@ -36,17 +36,17 @@ def undisturbed() -> Iterator[bool]:
 
 def times_ms(call: Callable[[int], object], count: int, left_out: int = 20) -> np.ndarray:
     """Milliseconds that each of `count` calls takes, after `left_out` more; a call is given its number."""
-    taken_ns = np.empty(count + left_out)
+    durations_ns = np.empty(count + left_out)
     for number in range(count + left_out):
         if number % IN_A_ROW == IN_A_ROW - 1:
             time.sleep(REST_S)
         began_ns = time.perf_counter_ns()
         call(number)
-        taken_ns[number] = time.perf_counter_ns() - began_ns
-    return np.asarray(taken_ns[left_out:] * 1e-6)
+        durations_ns[number] = time.perf_counter_ns() - began_ns
+    return np.asarray(durations_ns[left_out:] * 1e-6)
 
 
-def summary(key: str, taken_ms: np.ndarray) -> dict[str, float]:
+def summary(key: str, durations_ms: np.ndarray) -> dict[str, float]:
     """Least, p50, p99, p99.9 and largest under `key`."""
     quantiles = {"min": 0.0, "p50": 50.0, "p99": 99.0, "p99_9": 99.9, "max": 100.0}
-    return {f"{key}.{name}": float(np.percentile(taken_ms, at)) for name, at in quantiles.items()}
+    return {f"{key}.{name}": float(np.percentile(durations_ms, at)) for name, at in quantiles.items()}

@@ -77,7 +77,7 @@ SPAN_S = 10.0
 TURNS = 5
 OPENINGS = 5
 SEEKS = 300
-DRAWN_S = 20.0
+BROWSER_SPAN_S = 20.0
 PORT = 8139
 _CAMERA = {
     "type": "ViewerCameraMessage", "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, 0.0, 3.0), "fov": 1.3, "near": 0.01,
@@ -185,19 +185,19 @@ def _feed(directory: Path) -> dict[str, float]:
 
 
 def _put_all(feed: ViewerFeed, first: int, subscriber: FeedSubscriber | None = None) -> list[float]:
-    taken_us = []
+    durations_us = []
     for now_ns, got in map(tick_records, range(first, first + 3000)):
         begin = time.thread_time()
         feed.put(now_ns, got)
-        taken_us.append((time.thread_time() - begin) * 1e6)
+        durations_us.append((time.thread_time() - begin) * 1e6)
         if subscriber is not None:
             subscriber.receive(0.0)
-    return taken_us
+    return durations_us
 
 
 def _replay(directory: Path) -> dict[str, float]:
     """Opening a log of ten minutes, and going to places in it until they have been handed to the browser's link."""
-    log = write_log(directory / "long.mcap", round(LONG_S * 1e9 / PERIOD_NS), _whole_tick)
+    log = write_log(directory / "long.mcap", round(LONG_S * 1e9 / PERIOD_NS), _full_plan_tick)
     stolen_before_ms = stolen_ms()
     opens_s, opens_cpu_s = [], []
     for _ in range(OPENINGS):
@@ -229,7 +229,7 @@ def _replay(directory: Path) -> dict[str, float]:
     }
 
 
-def _whole_tick(tick: int) -> tuple[int, list[Any]]:
+def _full_plan_tick(tick: int) -> tuple[int, list[Any]]:
     """A tick with a plan as long as the shipped robot's: 50 steps, with all digits."""
     now_ns, got = tick_records(tick)
     path = [pose_at(tick + 5 * step) for step in range(51)]
@@ -248,7 +248,7 @@ def _live(directory: Path) -> dict[str, float]:
     ages_ms: list[float] = []
     figures: dict[str, float] = {}
 
-    def taken(name: str, begin_ns: int, stolen_before_ms: int) -> None:
+    def record_span(name: str, begin_ns: int, stolen_before_ms: int) -> None:
         spans[name].append((begin_ns, time.monotonic_ns()))
         stolen[name].append(stolen_ms() - stolen_before_ms)
 
@@ -259,28 +259,28 @@ def _live(directory: Path) -> dict[str, float]:
             time.sleep(2.0)
             before_ms, begin_ns = stolen_ms(), time.monotonic_ns()
             time.sleep(SPAN_S)
-            taken("without_page", begin_ns, before_ms)
+            record_span("without_page", begin_ns, before_ms)
             with disco_hw_process("page", [*view, str(stack.robot_file)], directory / "page.txt") as page, _reader():
                 time.sleep(3.0)
                 cpu_s, before_ms, begin_ns = _cpu_s(page.process.pid), stolen_ms(), time.monotonic_ns()
                 ages_ms += _ages_ms(feed_path(directory / "control.sock"))
-                taken("with_page", begin_ns, before_ms)
+                record_span("with_page", begin_ns, before_ms)
                 cpu_percent.append(100.0 * (_cpu_s(page.process.pid) - cpu_s) / SPAN_S)
                 os.kill(page.process.pid, signal.SIGSTOP)
                 time.sleep(0.5)
                 before_ms, begin_ns = stolen_ms(), time.monotonic_ns()
                 time.sleep(SPAN_S)
-                taken("stopped_page", begin_ns, before_ms)
+                record_span("stopped_page", begin_ns, before_ms)
                 os.kill(page.process.pid, signal.SIGCONT)
         try:
             with chromium() as browser:
-                drawn_ms = _drawn_ms(browser, stack.robot_file, directory / "control.sock")
+                frame_ages_ms = _frame_ages_ms(browser, stack.robot_file, directory / "control.sock")
         except pytest.skip.Exception as reason:
             print(f"the browser's figures are left out: {reason}", file=sys.stderr)
         else:
-            figures["viewer.bus_to_browser_ms_p50"] = float(np.quantile(drawn_ms, 0.5))
-            figures["viewer.bus_to_browser_ms_p99"] = float(np.quantile(drawn_ms, 0.99))
-            figures["viewer.bus_to_browser_frames"] = len(drawn_ms)
+            figures["viewer.bus_to_browser_ms_p50"] = float(np.quantile(frame_ages_ms, 0.5))
+            figures["viewer.bus_to_browser_ms_p99"] = float(np.quantile(frame_ages_ms, 0.99))
+            figures["viewer.bus_to_browser_frames"] = len(frame_ages_ms)
         stack.operator.request("quit")
         stack.daemon.process.wait(10.0)
     figures["viewer.page_cpu_percent"] = float(np.median(cpu_percent))
@@ -307,7 +307,7 @@ def _lateness(name: str, loops: list[dict[str, Any]], stolen: list[int]) -> dict
     }
 
 
-def _drawn_ms(browser: Any, robot_file: Path, socket: Path) -> list[float]:
+def _frame_ages_ms(browser: Any, robot_file: Path, socket: Path) -> list[float]:
     """Age of the newest wheel sample when a real browser has it on the page, from its time stamp on.
 
     The live page runs in this process and shows, beside everything else, the stamp of what it has just drawn; the
@@ -333,7 +333,7 @@ def _drawn_ms(browser: Any, robot_file: Path, socket: Path) -> list[float]:
                 tab.wait_for_function(_HAS_STAMP)
                 tab.wait_for_timeout(10_000)
                 tab.evaluate(_WATCH_STAMP)
-                tab.wait_for_timeout(DRAWN_S * 1e3)
+                tab.wait_for_timeout(BROWSER_SPAN_S * 1e3)
                 seen = tab.evaluate("window.seen")
         finally:
             ending.set()

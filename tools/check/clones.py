@@ -42,20 +42,20 @@ class Outcome:
     def describe(self) -> str:
         lines = self.output.splitlines()
         counts = ", ".join(COUNT.findall(" ".join(lines[-3:]))) or "no counts"
-        told = [line for line in lines if line.startswith(("FAILED", "ERROR"))]
+        failures = [line for line in lines if line.startswith(("FAILED", "ERROR"))]
         first = (
             f"rc {self.code}, {self.wall_s:.0f} s wall, {self.cpu_s:.0f} s CPU, {counts}, load {self.load[0]:.1f} "
             f"before and {self.load[1]:.1f} after, the host stole {self.stolen_s:.1f} s"
         )
-        return "\n  ".join([first, *(told or (lines[-10:] if self.code else []))])
+        return "\n  ".join([first, *(failures or (lines[-10:] if self.code else []))])
 
 
 def run(command: list[str], folder: Path) -> Outcome:
     """Run a command to its end; its processes count where they were waited for."""
-    own = {name: value for name, value in os.environ.items() if name not in OF_THIS_CHECKOUT}
+    environment = {name: value for name, value in os.environ.items() if name not in OF_THIS_CHECKOUT}
     load, stolen, begin_s, used_s = os.getloadavg()[0], stolen_ms(), time.monotonic(), _children_cpu_s()
     done = subprocess.run(
-        command, cwd=folder, env=own, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
+        command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
     )
     wall_s, cpu_s, stolen_s = time.monotonic() - begin_s, _children_cpu_s() - used_s, (stolen_ms() - stolen) * 1e-3
     return Outcome(done.returncode, wall_s, cpu_s, (load, os.getloadavg()[0]), stolen_s, done.stdout)
@@ -85,22 +85,22 @@ def main() -> int:
     parser.add_argument("--most", type=float, default=math.inf, metavar="S", help="seconds that one may take")
     parser.add_argument("--more", type=float, default=0.0, metavar="S", help="seconds more beside busy processes")
     parser.add_argument("--dry", action="store_true", help="clone, but only say what make would do")
-    asked = parser.parse_args()
-    command = ["make", "test", *(["-n"] if asked.dry else [])]
+    options = parser.parse_args()
+    command = ["make", "test", *(["-n"] if options.dry else [])]
     codes: list[int] = []
-    for number in range(1, asked.clones + 1):
-        beside = asked.processes if number > asked.clones - asked.busy else 0
-        with tempfile.TemporaryDirectory(prefix="clone") as folder, busy(beside):
+    for number in range(1, options.clones + 1):
+        busy_processes = options.processes if number > options.clones - options.busy else 0
+        with tempfile.TemporaryDirectory(prefix="clone") as folder, busy(busy_processes):
             subprocess.run(["git", "clone", "-q", ".", folder], check=True)
             outcome = run(command, Path(folder))
-        late = outcome.wall_s > asked.most + bool(beside) * asked.more
-        codes.append(outcome.code or int(late))
+        is_too_slow = outcome.wall_s > options.most + bool(busy_processes) * options.more
+        codes.append(outcome.code or int(is_too_slow))
         print(
-            f"{number} of {asked.clones}{f', beside {beside} busy processes' * bool(beside)}: "
-            f"{outcome.describe()}{', too long' * late}",
+            f"{number} of {options.clones}{f', beside {busy_processes} busy processes' * bool(busy_processes)}: "
+            f"{outcome.describe()}{', too long' * is_too_slow}",
             flush=True,
         )
-    print(f"{codes.count(0)} of {asked.clones} passed")
+    print(f"{codes.count(0)} of {options.clones} passed")
     return int(any(codes))
 
 

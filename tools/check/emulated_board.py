@@ -157,10 +157,10 @@ class Bench:
 
 
 def _truth(line: bytes) -> Truth | None:
-    words = line.split()
-    if len(words) != 11:
+    fields = line.split()
+    if len(fields) != 11:
         return None
-    start, ms, *scaled, state, accepted = map(int, words)
+    start, ms, *scaled, state, accepted = map(int, fields)
     left_set, right_set, left, right = (value * 1e-3 for value in scaled[:4])
     x, y, yaw = (value * 1e-4 for value in scaled[4:])
     return Truth(start, ms, (left_set, right_set), (left, right), (x, y, yaw), state, accepted)
@@ -207,13 +207,13 @@ def running_board(
 
     `first_us`: where the board's counter begins. `terminal`: its serial line is a terminal, and no socket.
     """
-    drawn = secrets.randbits(63) if entropy is None else entropy
+    board_entropy = secrets.randbits(63) if entropy is None else entropy
     with tempfile.TemporaryDirectory(prefix="disco-hw-board-") as folder:
         link, bench = Path(folder) / "link", Path(folder) / "bench"
         lines = [f"unix:{path},server=on,wait=off" for path in (link, bench)]
         if terminal:
             lines[0] = "pty"
-        command = _command(image, processor, _settings(drawn, first_us, key), *lines)
+        command = _command(image, processor, _settings(board_entropy, first_us, key), *lines)
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         try:
             port = _ports_of(process, 1)[0] if terminal else f"unix://{link}"
@@ -276,13 +276,13 @@ def _prefer(process: int) -> None:
 
 def _ports_of(process: subprocess.Popen[str], count: int) -> list[str]:
     assert process.stdout is not None
-    said, ports = "", []
+    output, ports = "", []
     for line in process.stdout:
-        said += line
+        output += line
         ports += re.findall(r"redirected to (/dev/\S+)", line)
         if len(ports) == count:
             return ports
-    raise RuntimeError(f"the emulator did not start: {said.strip()}")
+    raise RuntimeError(f"the emulator did not start: {output.strip()}")
 
 
 def main() -> int:

@@ -78,8 +78,8 @@ def run_instrumented(tree: Path, flags: str) -> bool:
 def coverage_of(tree: Path, name: str) -> Coverage:
     notes = next(tree.rglob(f"{Path(name).stem}.gcno"))
     command = ["gcov", "--json-format", "--stdout", "--branch-probabilities", str(notes)]
-    answer = subprocess.run(command, cwd=tree, capture_output=True, text=True, check=True).stdout
-    file = next(file for file in json.loads(answer)["files"] if file["file"].endswith(f"firmware/{name}"))
+    output = subprocess.run(command, cwd=tree, capture_output=True, text=True, check=True).stdout
+    file = next(file for file in json.loads(output)["files"] if file["file"].endswith(f"firmware/{name}"))
     lines = {line["line_number"]: line for line in file["lines"]}
     branches = [
         (number, branch) for number, line in lines.items() for branch in line["branches"] if not branch["throw"]

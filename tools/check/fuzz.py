@@ -46,7 +46,7 @@ SLOWEST_S = 5.0
 CALL_S = 10
 CALL_MB = 1000.0
 BATCH = 50
-LOST_S = 60.0
+REPLY_TIMEOUT_S = 60.0
 TOKENS = (b"nan", b"inf", b"-1", b"1e999", b"0x", b"[[", b"]]", b"\x00", b"\xff", b'"', b"\n", b",", b"=", b"9" * 400)
 
 
@@ -139,15 +139,15 @@ def attack_verbs(count: int, seed: int, directory: Path) -> list[str]:
         number = 0
         while number < count:
             batch = range(number, min(number + BATCH, count))
-            answers = _in_a_process(lambda at, seed=seed: _attacked(at, seed, directory), batch)
-            for at, answer in zip(batch, answers, strict=False):
-                ends[answer["end"]] += 1
-                if answer["trouble"]:
-                    kept = Path(f"fuzz-{seed}-{at}-{answer['name']}")
+            results = _in_a_process(lambda at, seed=seed: _attacked(at, seed, directory), batch)
+            for at, result in zip(batch, results, strict=False):
+                ends[result["end"]] += 1
+                if result["error"]:
+                    kept = Path(f"fuzz-{seed}-{at}-{result['name']}")
                     kept.write_bytes(_input(at, seed)[2])
-                    wrong.append(f"{kept}: {answer['call']}: {answer['trouble']}")
-            number = batch.start + len(answers)
-    print(f"verbs: {number} files, " + ", ".join(f"{share} {words}" for words, share in sorted(ends.items())))
+                    wrong.append(f"{kept}: {result['call']}: {result['error']}")
+            number = batch.start + len(results)
+    print(f"verbs: {number} files, " + ", ".join(f"{share} {end}" for end, share in sorted(ends.items())))
     return wrong
 
 
@@ -166,24 +166,24 @@ def _attacked(number: int, seed: int, directory: Path) -> dict[str, str]:
     directory.mkdir()
     verb_calls.write_good(directory)
     (directory / name).write_bytes(content)
-    end, trouble = "", ""
+    end, error = "", ""
     # The peak of this call alone.
     Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     signal.alarm(CALL_S)
     try:
-        said = verb_calls.call(one.argv(directory))
-        end = "got to their work" if said.code in (None, 0, 1) else "refused in one line"
-        if said.code == 2 and len(said.errors.strip().splitlines()) != 1:
-            trouble = f"not one line: {said.errors!r}"
+        outcome = verb_calls.call(one.argv(directory))
+        end = "got to their work" if outcome.code in (None, 0, 1) else "refused in one line"
+        if outcome.code == 2 and len(outcome.errors.strip().splitlines()) != 1:
+            error = f"not one line: {outcome.errors!r}"
     except BaseException:
         # Anything but a refusal in words is what the fuzzer is looking for, an alarm in a loop that catches all too.
-        end, trouble = "failed", traceback.format_exc(limit=-3).replace("\n", " | ")
+        end, error = "failed", traceback.format_exc(limit=-3).replace("\n", " | ")
     finally:
         signal.alarm(0)
     peak_mb = _peak_mb()
     if peak_mb > CALL_MB:
-        trouble = trouble or f"took {peak_mb:.0f} MB"
-    return {"end": end, "name": name, "call": f"{one.verb} {one.arguments}", "trouble": trouble}
+        error = error or f"took {peak_mb:.0f} MB"
+    return {"end": end, "name": name, "call": f"{one.verb} {one.arguments}", "error": error}
 
 
 class TooSlowError(BaseException):
@@ -197,21 +197,25 @@ def _in_a_process(job: Callable[[int], dict[str, str]], numbers: Sequence[int]) 
     if child == 0:
         os.close(read_end)
         signal.signal(signal.SIGALRM, _too_slow)
-        with os.fdopen(write_end, "w", encoding="utf-8") as answers:
+        with os.fdopen(write_end, "w", encoding="utf-8") as results:
             for number in numbers:
-                print(json.dumps(job(number)), file=answers, flush=True)
+                print(json.dumps(job(number)), file=results, flush=True)
         os._exit(0)
     os.close(write_end)
     found: list[dict[str, str]] = []
     with os.fdopen(read_end, encoding="utf-8") as lines:
-        while len(found) < len(numbers) and select.select([lines], [], [], LOST_S)[0] and (line := lines.readline()):
+        while (
+            len(found) < len(numbers)
+            and select.select([lines], [], [], REPLY_TIMEOUT_S)[0]
+            and (line := lines.readline())
+        ):
             found.append(json.loads(line))
     with contextlib.suppress(ProcessLookupError):
         os.kill(child, signal.SIGKILL)
     _, status = os.waitpid(child, 0)
     if len(found) < len(numbers):
-        trouble = f"no answer in {LOST_S:g} s, or killed (wait status {status})"
-        found.append({"end": "failed", "name": "input", "call": "", "trouble": trouble})
+        error = f"no answer in {REPLY_TIMEOUT_S:g} s, or killed (wait status {status})"
+        found.append({"end": "failed", "name": "input", "call": "", "error": error})
     return found
 
 
@@ -240,15 +244,15 @@ def attack(seconds: float, seed: int, directory: Path, only: str | None = None) 
             path = directory / name
             path.write_bytes(hostile(name, good, chance))
             began_s = time.monotonic()
-            trouble = _trouble(name, path, refused)
+            error = _read_error(name, path, refused)
             took_s = time.monotonic() - began_s
             if took_s > SLOWEST_S:
-                trouble = trouble or f"took {took_s:.1f} s"
+                error = error or f"took {took_s:.1f} s"
             counts[name] += 1
-            if trouble:
+            if error:
                 kept = Path(f"fuzz-{seed}-{number}-{name}")
                 kept.write_bytes(path.read_bytes())
-                wrong.append(f"{kept}: {trouble}")
+                wrong.append(f"{kept}: {error}")
         if before_mb is None and number > WARM_UP:
             before_mb = _resident_mb()
     if before_mb is not None:
@@ -261,7 +265,7 @@ def attack(seconds: float, seed: int, directory: Path, only: str | None = None) 
     return wrong
 
 
-def _trouble(name: str, path: Path, refused: dict[str, int]) -> str:
+def _read_error(name: str, path: Path, refused: dict[str, int]) -> str:
     try:
         READERS[name](path)
     except (InputError, WorkError, FaultFileError) as error:

@@ -27,7 +27,7 @@ WARM_UP = 0.2
 SLOWEST_S = 5.0
 KEY = bytes(range(16))
 CONFIG = FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0)
-STILL = FirmwareInputs(left_ticks=0, right_ticks=0, left_speed_rad_s=0.0, right_speed_rad_s=0.0)
+STATIONARY = FirmwareInputs(left_ticks=0, right_ticks=0, left_speed_rad_s=0.0, right_speed_rad_s=0.0)
 _LAYOUTS = {message.can_id: message for message in PROTOCOL.messages}
 _IDS = tuple(_LAYOUTS)
 
@@ -86,7 +86,7 @@ def _core(key: bytes) -> Callable[[random.Random], None]:
     def receive(generator: random.Random) -> None:
         now_us = next(times)
         core.receive(now_us, *hostile_frame(generator))
-        outputs = core.step(now_us, STILL)
+        outputs = core.step(now_us, STATIONARY)
         core.drain()
         assert not outputs.driver_enabled, "armed by noise"
 
@@ -105,7 +105,7 @@ TARGETS: dict[str, Callable[[], Callable[[random.Random], None]]] = {
 
 def campaign(name: str, count: int, seed: int) -> list[str]:
     """Feed hostile frames to one target; return what went wrong."""
-    take = TARGETS[name]()
+    feed_one = TARGETS[name]()
     generator = random.Random(seed)
     settled, slowest_s = 0, 0.0
     tracemalloc.start()
@@ -113,7 +113,7 @@ def campaign(name: str, count: int, seed: int) -> list[str]:
         for number in range(count):
             started = time.monotonic()
             try:
-                take(generator)
+                feed_one(generator)
             except Exception as error:
                 return [f"{name}: frame {number} of seed {seed}: {type(error).__name__}: {error}"]
             slowest_s = max(slowest_s, time.monotonic() - started)

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 # The tests that must notice a mutant: those that `make test` runs.
-QUICK = "not long and not thorough"
+FAST_TESTS = "not long and not thorough"
 
 # Comments, character and string constants are passed over; numbers, words and the longest operators are tokens.
 _TOKEN = re.compile(

@@ -21,7 +21,7 @@ from disco_hw.experiments import Operator, disco_hw_process
 from disco_hw.processes import stolen_ms
 from tools.stack import write_robot_file
 
-WANTED_P999_US = 1000.0
+TARGET_P999_US = 1000.0
 PERIOD_US = 20_000
 BARE_LOOP = Path(__file__).with_name("bare_loop.c")
 BARE_PRIORITY = 90
@@ -58,12 +58,12 @@ def soak(minutes: float, realtime: bool, hog_nice: int) -> dict[str, Any]:
                 hogs = [subprocess.Popen(command) for _ in range(os.cpu_count() or 1)]
                 stolen_before_ms = stolen_ms()
                 bare = [str(bare_loop), str(PERIOD_US), str(BARE_PRIORITY if realtime else 0)]
-                with subprocess.Popen(bare, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as beside:
+                with subprocess.Popen(bare, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as bare_process:
                     stops = _drive(operator, minutes * 60.0)
-                    bare_us = json.loads(beside.communicate()[0])
+                    bare_us = json.loads(bare_process.communicate()[0])
                 status = operator.status()
                 log_bytes = (directory / "run.mcap").stat().st_size
-                said = [
+                realtime_lines = [
                     line
                     for line in daemon.output.read_text(encoding="utf-8").splitlines()
                     if line.startswith("real time:")
@@ -85,7 +85,7 @@ def soak(minutes: float, realtime: bool, hog_nice: int) -> dict[str, Any]:
         "laps": status["task"]["laps"],
         "stops": stops,
         "log_mb": log_bytes / 1e6,
-        "said": said,
+        "said": realtime_lines,
     }
 
 
@@ -130,9 +130,11 @@ def main() -> int:
     print(text)
     if given.out is not None:
         given.out.write_text(text + "\n", encoding="utf-8")
-    late_us = found["loop"]["lateness_us"]["p999"]
-    good = late_us < WANTED_P999_US and found["loop"]["overruns"] == 0
-    print(f"lateness p99.9 {late_us:.0f} us, {found['loop']['overruns']} overruns: {'held' if good else 'not held'}")
+    lateness_us = found["loop"]["lateness_us"]["p999"]
+    good = lateness_us < TARGET_P999_US and found["loop"]["overruns"] == 0
+    print(
+        f"lateness p99.9 {lateness_us:.0f} us, {found['loop']['overruns']} overruns: {'held' if good else 'not held'}"
+    )
     bare_us = found["bare_loop_lateness_us"]["p999"]
     print(f"a bare loop beside it: p99.9 {bare_us:.0f} us; taken by the machine's host: {found['stolen_s']:.1f} s")
     return 0 if good or given.no_fifo else 1

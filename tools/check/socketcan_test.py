@@ -72,8 +72,8 @@ def run(*command: str, **options: object) -> subprocess.CompletedProcess[str]:
     """Run a command and keep its output. Raises CannotError with the last line of it where it fails."""
     done = subprocess.run(command, capture_output=True, text=True, check=False, **options)  # type: ignore[call-overload]
     if done.returncode:
-        said = (done.stderr or done.stdout).strip().splitlines() or ["it said nothing"]
-        raise CannotError(f"{' '.join(command)}: {said[-1]}")
+        output_lines = (done.stderr or done.stdout).strip().splitlines() or ["it said nothing"]
+        raise CannotError(f"{' '.join(command)}: {output_lines[-1]}")
     return done  # type: ignore[no-any-return]
 
 
@@ -106,8 +106,8 @@ def fetch(emulator: Emulator) -> tuple[Path, str]:
     if missing:
         run("apt-get", "update", "-qq")
         run("apt-get", "install", "-y", "-qq", "--no-install-recommends", *missing)
-    said = run("apt-cache", "depends", emulator.kernel).stdout
-    found = re.search(r"Depends: linux-image-(\S+)", said)
+    dependencies = run("apt-cache", "depends", emulator.kernel).stdout
+    found = re.search(r"Depends: linux-image-(\S+)", dependencies)
     if found is None:
         raise CannotError(f"apt-cache knows no {emulator.kernel}; run apt-get update")
     release = found.group(1)
@@ -126,8 +126,8 @@ def module_files(unpacked: Path, release: str, names: tuple[str, ...]) -> list[s
     """The files of modules and of what they need, in the order in which they must be loaded."""
     files: list[str] = []
     for name in names:
-        said = run("modprobe", "-d", str(unpacked), "-S", release, "--show-depends", name).stdout
-        files += [line.split()[1] for line in said.splitlines() if line.startswith("insmod")]
+        output = run("modprobe", "-d", str(unpacked), "-S", release, "--show-depends", name).stdout
+        files += [line.split()[1] for line in output.splitlines() if line.startswith("insmod")]
     return list(dict.fromkeys(files))
 
 

@@ -73,8 +73,8 @@ def run(*command: str, **options: object) -> str:
     both = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, **options}
     done = subprocess.run(command, check=False, **both)  # type: ignore[call-overload]
     if done.returncode:
-        said = done.stdout.strip().splitlines() or ["it said nothing"]
-        raise CannotError(f"{' '.join(command)[:100]}: {said[-1]}")
+        output_lines = done.stdout.strip().splitlines() or ["it said nothing"]
+        raise CannotError(f"{' '.join(command)[:100]}: {output_lines[-1]}")
     return str(done.stdout)
 
 
@@ -84,17 +84,19 @@ def mirrors(targets: str) -> list[str]:
     return list(dict.fromkeys(f"deb {row[0]} {row[1]} {row[2]}" for row in rows if row[3] == "Debian"))
 
 
-def fetched_mb(said: str) -> float:
+def fetched_mb(apt_output: str) -> float:
     """Sum of what apt says that it has fetched."""
     scale = {"": 1e-6, "k": 1e-3, "M": 1.0, "G": 1e3}
-    return sum(float(size) * scale[unit] for size, unit in re.findall(r"^Fetched ([\d.]+) ([kMG]?)B in", said, re.M))
+    return sum(
+        float(size) * scale[unit] for size, unit in re.findall(r"^Fetched ([\d.]+) ([kMG]?)B in", apt_output, re.M)
+    )
 
 
 def requirements(project: str) -> list[str]:
     """Return the packages that these tests need as wheels, by the text of a pyproject.toml."""
-    asked = tomllib.loads(project)["project"]["dependencies"]
+    dependencies = tomllib.loads(project)["project"]["dependencies"]
     others = (*LEFT_OUT, COMPILED_THERE)
-    return [one for one in asked if re.split(r"[<>=\[ ]", one)[0] not in others] + list(FOR_TESTS)
+    return [one for one in dependencies if re.split(r"[<>=\[ ]", one)[0] not in others] + list(FOR_TESTS)
 
 
 def get_tools() -> None:
@@ -135,11 +137,11 @@ def unpack_debian() -> None:
     half = BUILD / "root.half"
     shutil.rmtree(half, ignore_errors=True)
     BUILD.mkdir(parents=True, exist_ok=True)
-    asked = ("--verbose", "--arch=arm64", "--variant=extract", "--skip=check/qemu", f"--include={UNPACKED}")
+    options = ("--verbose", "--arch=arm64", "--variant=extract", "--skip=check/qemu", f"--include={UNPACKED}")
     alone = ("unshare", "--mount", "--propagation=private")
-    said = run(*alone, "mmdebstrap", *asked, release, str(half), *lines, env={**os.environ, "LC_ALL": "C"})
+    output = run(*alone, "mmdebstrap", *options, release, str(half), *lines, env={**os.environ, "LC_ALL": "C"})
     half.rename(ROOT)
-    print(f"  {fetched_mb(said):.0f} MB downloaded, {size_mb(ROOT):.0f} MB on disk", flush=True)
+    print(f"  {fetched_mb(output):.0f} MB downloaded, {size_mb(ROOT):.0f} MB on disk", flush=True)
 
 
 def size_mb(folder: Path) -> float:
@@ -159,14 +161,14 @@ def let_kernel_run_arm64() -> None:
         run(*try_it)
     except (OSError, CannotError) as error:
         where = "in a container, run on its host, as root"
-        said = f"no program of aarch64 runs here ({error}); {where}: apt-get install qemu-user-static"
-        raise CannotError(said) from error
+        message = f"no program of aarch64 runs here ({error}); {where}: apt-get install qemu-user-static"
+        raise CannotError(message) from error
 
 
 def install_wheels() -> None:
     """Have what the project and its tests import in the root, but what cannot be had as wheels."""
-    wanted, constraints = requirements((PROJECT / "pyproject.toml").read_text("utf-8")), PROJECT / "constraints.txt"
-    key = hashlib.sha256("\n".join([*wanted, constraints.read_text("utf-8")]).encode()).hexdigest()
+    required, constraints = requirements((PROJECT / "pyproject.toml").read_text("utf-8")), PROJECT / "constraints.txt"
+    key = hashlib.sha256("\n".join([*required, constraints.read_text("utf-8")]).encode()).hexdigest()
     packages = ROOT / PACKAGES
     done = packages / ".installed"
     if done.exists() and done.read_text("utf-8") == key:
@@ -177,10 +179,10 @@ def install_wheels() -> None:
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check")
     of_root = (*WHEELS_FOR, f"--python-version={version}", "--implementation=cp", "--only-binary=:all:")
     limits = {**os.environ, "PIP_CONSTRAINT": str(constraints)}
-    run(*pip, "download", "--dest", str(WHEELS), *of_root, *wanted, env=limits)
+    run(*pip, "download", "--dest", str(WHEELS), *of_root, *required, env=limits)
     run(*pip, "download", "--dest", str(WHEELS), "--no-deps", "--no-binary=:all:", COMPILED_THERE, env=limits)
     local = ("--no-index", "--find-links", str(WHEELS), "--no-compile", "--target", str(packages))
-    run(*pip, "install", *local, *of_root, *wanted, env=limits)
+    run(*pip, "install", *local, *of_root, *required, env=limits)
     print(f"  {size_mb(WHEELS):.0f} MB downloaded, {size_mb(packages):.0f} MB on disk", flush=True)
     (source,) = WHEELS.glob(f"{COMPILED_THERE}-*.tar.gz")
     with tarfile.open(source) as archive:

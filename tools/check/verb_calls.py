@@ -50,7 +50,10 @@ class Call:
     def argv(self, directory: Path) -> list[str]:
         """The arguments with the files where they are."""
         known = {*good_files(), OUT}
-        return [str(directory / word) if word in known else word for word in (self.verb + " " + self.arguments).split()]
+        return [
+            str(directory / argument) if argument in known else argument
+            for argument in (self.verb + " " + self.arguments).split()
+        ]
 
 
 _SETUP = ("robot.toml", "model.toml", "path.csv")
@@ -86,7 +89,7 @@ CALLS = (
 
 def good_files() -> dict[str, bytes]:
     """One sound file of each kind; robot.toml names the model, the path and the key beside it."""
-    return dict(_GOOD or _make_good())
+    return dict(_GOOD or _build_good_files())
 
 
 _GOOD: dict[str, bytes] = {}
@@ -105,7 +108,7 @@ def _as_the_wheels_turn(ticks: list[tuple[int, list[Any]]]) -> list[tuple[int, l
     return found
 
 
-def _make_good() -> dict[str, bytes]:
+def _build_good_files() -> dict[str, bytes]:
     shipped, model = (ROBOTS / "wombot.toml").read_bytes(), (ROBOTS / "wombot_model.toml").read_bytes()
     robot = shipped.decode()
     for old, new in (
@@ -213,14 +216,14 @@ def without_work() -> Iterator[None]:
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class CallOutcome:
     """Outcome of a call: `code` is the exit code, None where its work would have begun."""
 
     code: int | None
     errors: str
 
 
-def call(argv: list[str]) -> Said:
+def call(argv: list[str]) -> CallOutcome:
     """Run `disco-hw` with these arguments, inside `without_work`; an exception that it lets through comes out."""
     sys.argv = ["disco-hw", *argv]
     errors = io.StringIO()
@@ -228,7 +231,7 @@ def call(argv: list[str]) -> Said:
         try:
             cli.main()
         except WorkBeginsError:
-            return Said(None, errors.getvalue())
+            return CallOutcome(None, errors.getvalue())
         except SystemExit as end:
-            return Said(int(end.code or 0), errors.getvalue())
-    return Said(0, errors.getvalue())
+            return CallOutcome(int(end.code or 0), errors.getvalue())
+    return CallOutcome(0, errors.getvalue())

@@ -53,15 +53,17 @@ ROWS = {
 def sizes(processor: str, folder: Path, roots: tuple[str, ...]) -> tuple[int, int]:
     """Return bytes of code and of constants that these functions need of the core."""
     linked = folder / f"core-{processor}.o"
-    wanted = [f"-Wl,-u,{root}" for root in roots]
+    root_options = [f"-Wl,-u,{root}" for root in roots]
     subprocess.run(
         [COMPILER, "-std=c11", *PROCESSORS[processor].flags, *FLAGS[:-1], "-nostdlib", "-r", "-Wl,--gc-sections",
-         f"-Wl,-e,{roots[0]}", *wanted, *(str(FIRMWARE / name) for name in SOURCES), "-o", str(linked)],
+         f"-Wl,-e,{roots[0]}", *root_options, *(str(FIRMWARE / name) for name in SOURCES), "-o", str(linked)],
         check=True,
     )  # fmt: skip
     tools = COMPILER.removesuffix("gcc")
-    wants = subprocess.run([f"{tools}objdump", "-r", str(linked)], capture_output=True, text=True, check=True).stdout
-    assert not SLOW.findall(wants), f"the core has doubles or divides 64 bits: {SLOW.findall(wants)}"
+    relocations = subprocess.run(
+        [f"{tools}objdump", "-r", str(linked)], capture_output=True, text=True, check=True
+    ).stdout
+    assert not SLOW.findall(relocations), f"the core has doubles or divides 64 bits: {SLOW.findall(relocations)}"
     listed = subprocess.run([f"{tools}size", "-A", str(linked)], capture_output=True, text=True, check=True).stdout
     found = [(name, int(count)) for name, count in re.findall(r"^\.(\w+)\S*\s+(\d+)", listed, re.MULTILINE)]
     assert not sum(count for name, count in found if name in ("bss", "data")), "the core has no variables of its own"
@@ -104,7 +106,7 @@ def measure(processor: str) -> dict[str, int]:
 def table(figures: Mapping[str, Mapping[str, int]]) -> str:
     """Return the figures as the document has them."""
     lines = [f"| | {' | '.join(figures)} |", f"|---|{'---:|' * len(figures)}"]
-    lines += [f"| {words} | {' | '.join(str(of[name]) for of in figures.values())} |" for name, words in ROWS.items()]
+    lines += [f"| {label} | {' | '.join(str(of[name]) for of in figures.values())} |" for name, label in ROWS.items()]
     return "\n".join(lines) + "\n"
 
 
@@ -119,12 +121,12 @@ def documented(text: str) -> dict[str, dict[str, int]]:
     """Return the figures that the document has, by processor."""
     block = found(text)
     processors = [name.strip() for name in block[1].split("|")]
-    names = {words: name for name, words in ROWS.items()}
+    names = {label: name for name, label in ROWS.items()}
     figures: dict[str, dict[str, int]] = {processor: {} for processor in processors}
     for line in block[2].splitlines():
-        words, *values = (cell.strip() for cell in line.strip("|").split("|"))
+        label, *values = (cell.strip() for cell in line.strip("|").split("|"))
         for processor, value in zip(processors, values, strict=True):
-            figures[processor][names[words]] = int(value)
+            figures[processor][names[label]] = int(value)
     return figures
 
 

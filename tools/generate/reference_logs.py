@@ -39,7 +39,7 @@ SHORT_SIGHTED = ("rate_hz = 50.0", "rate_hz = 50.0\nhorizon = 10\nstep_s = 0.3")
 """Ten steps instead of fifty: plans are most of a log."""
 
 
-class LearntOnce(NoAdaptation):
+class SingleAdaptation(NoAdaptation):
     """A belief that changes once, at `at_ns`, to a wheel 2 % larger."""
 
     def __init__(self, stack: SimulatedRun, at_ns: int) -> None:
@@ -53,9 +53,11 @@ class LearntOnce(NoAdaptation):
         believed = believed_geometry(self._model)
         mean = believed.mean.copy()
         mean[NAMES.index("wheel_radius_m")] *= 1.02
-        learnt = replace(believed, mean=mean)
-        apply_geometry(self._stack.core.pipeline, self._model, learnt)
-        change = BeliefChange(now_ns, "adapted", NAMES, tuple(mean.tolist()), tuple(learnt.covariance.ravel().tolist()))
+        adapted = replace(believed, mean=mean)
+        apply_geometry(self._stack.core.pipeline, self._model, adapted)
+        change = BeliefChange(
+            now_ns, "adapted", NAMES, tuple(mean.tolist()), tuple(adapted.covariance.ravel().tolist())
+        )
         return AdaptationUpdate((change,))
 
 
@@ -113,7 +115,7 @@ def circle() -> SimulatedRun:
 def adapted() -> SimulatedRun:
     """Another belief comes into force on the way, and another circle after it."""
     stack = simulated(planner())
-    stack.core.adaptation = LearntOnce(stack, 2_500_000_000)
+    stack.core.adaptation = SingleAdaptation(stack, 2_500_000_000)
     _started(stack)
     stack.run(1.5)
     stack.run(0.3, UserRequest.STOP)

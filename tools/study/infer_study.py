@@ -41,7 +41,7 @@ from sim.plant_parameters import PlantParameters
 from tools.foreign_plant import ForeignPlant, ForeignRobot
 from tools.joystick import TOP_RAD_S
 from tools.mujoco_robot import COUNTS_PER_TURN, TRACK_M, WHEEL_RADIUS_M, record
-from tools.simulated_drives import make_drive
+from tools.simulated_drives import create_drive
 from tools.simulated_log import simulated_log, write_csv
 
 PLAUSIBLE = {"x_icr_m": (0.0, 0.3), "wheel_radius_m": (0.04, 0.10), "axial_distance_m": (0.2, 0.5)}
@@ -73,7 +73,7 @@ def logged(parameters: PlantParameters, drive: str, seed: int) -> DriveLog:
     """One drive of a robot, by way of a CSV file."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "log.csv"
-        write_csv(path, simulated_log(make_drive(drive, seed), parameters, None, seed))
+        write_csv(path, simulated_log(create_drive(drive, seed), parameters, None, seed))
         return load_drive(path, parameters.ticks_per_rev)
 
 
@@ -85,13 +85,13 @@ def foreign_robot(seed: int, kind: str) -> ForeignRobot:
     robot = ForeignRobot(radius_m, axle_m, x_icr_m, grip_s=grip_s)
     if kind == "foreign":
         return robot
-    quick = replace(robot, mass_kg=20.0, inertia_kg_m2=2.5 * axle_m**2, relaxation_m=0.0015, side_s=0.003)
-    return replace(quick, slope_m_s=SLIDING_M_S) if kind == "sliding" else quick
+    fast = replace(robot, mass_kg=20.0, inertia_kg_m2=2.5 * axle_m**2, relaxation_m=0.0015, side_s=0.003)
+    return replace(fast, slope_m_s=SLIDING_M_S) if kind == "sliding" else fast
 
 
 def foreign_log(robot: ForeignRobot, drive: str, seed: int) -> DriveLog:
     """One drive of a foreign robot, from what its sensors said."""
-    script = make_drive(drive, seed)
+    script = create_drive(drive, seed)
     plant = ForeignPlant(robot, (0.0, 0.0, 0.0), seed)
     wheels: list[tuple[float, ...]] = []
     poses: list[tuple[float, ...]] = []
@@ -201,17 +201,17 @@ def closed_form(seed: int, kind: str, drive: str) -> dict[str, object]:
     }
 
 
-def study(kind: str, drive: str, seeds: range, out: Path, quick: bool) -> list[dict[str, object]]:
+def study(kind: str, drive: str, seeds: range, out: Path, is_closed_form: bool) -> list[dict[str, object]]:
     """Recover robots, those not done before with this code; a line of JSON each is kept in `out`."""
     digest = hashlib.sha256()
     for file in (*sorted(Path("disco_hw/inference").glob("*.py")), Path("tools/foreign_plant.py"), Path(__file__)):
         digest.update(file.read_bytes())
-    path = out / f"{kind}_{drive}_{'closed_form_' if quick else ''}{digest.hexdigest()[:12]}.jsonl"
+    path = out / f"{kind}_{drive}_{'closed_form_' if is_closed_form else ''}{digest.hexdigest()[:12]}.jsonl"
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     done = {one["seed"]: one for one in map(json.loads, lines)}
     for seed in seeds:
         if seed not in done:
-            done[seed] = (closed_form if quick else recover)(seed, kind, drive)
+            done[seed] = (closed_form if is_closed_form else recover)(seed, kind, drive)
             with path.open("a", encoding="utf-8") as kept:
                 kept.write(json.dumps(done[seed]) + "\n")
             print(json.dumps(done[seed]), flush=True)
@@ -261,16 +261,16 @@ def main() -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     seeds = range(options.first, options.first + options.plants)
     results = study(options.kind, options.drive, seeds, options.out, options.closed_form)
-    judged = [one for one in results if "refused" not in one]
-    flagged = sum(bool(one["outside_simulated"]) for one in judged)
-    refused = len(results) - len(judged)
+    evaluated = [one for one in results if "refused" not in one]
+    flagged = sum(bool(one["outside_simulated"]) for one in evaluated)
+    refused = len(results) - len(evaluated)
     print(f"{len(results)} logs: {refused} refused, {flagged} said to lie outside what was simulated")
-    if judged:
-        picture(judged, options.out / f"recovery_{options.kind}_{options.drive}.png")
-        inside = np.array([one["inside"] for one in judged]).sum(axis=0).tolist()
-        held = ", ".join(f"{name} {count} of {len(judged)}" for name, count in zip(NAMES, inside, strict=True))
-        print(f"90 % intervals hold {held}")
-        found = figures(judged)
+    if evaluated:
+        picture(evaluated, options.out / f"recovery_{options.kind}_{options.drive}.png")
+        inside = np.array([one["inside"] for one in evaluated]).sum(axis=0).tolist()
+        coverage = ", ".join(f"{name} {count} of {len(evaluated)}" for name, count in zip(NAMES, inside, strict=True))
+        print(f"90 % intervals hold {coverage}")
+        found = figures(evaluated)
         (options.out / f"recovery_{options.kind}_{options.drive}.json").write_text(
             json.dumps({"figures": found, "robots": results}, indent=1), encoding="utf-8"
         )

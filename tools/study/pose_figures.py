@@ -49,7 +49,7 @@ class PoseKind:
     by_datagram: bool = True
 
 
-OWN = PoseKind("robot", {}, by_datagram=False)
+ROBOT = PoseKind("robot", {}, by_datagram=False)
 RTK = PoseKind(
     "rtk, 5 Hz, 2 cm, 150 ms late, no heading",
     {"pose_rate_hz": 5.0, "pose_position_std_m": 0.02, "pose_delay_s": 0.15},
@@ -86,12 +86,12 @@ class Datagrams:
     """The robot's poses, sent to a port of this computer and taken from it; satisfies `drivers.types.PoseSource`."""
 
     def __init__(self, has_heading: bool) -> None:
-        taken = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        taken.setblocking(False)
-        taken.bind(("127.0.0.1", 0))
-        self._source = UdpPoses(taken, SenderGate())
+        receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        receiver.setblocking(False)
+        receiver.bind(("127.0.0.1", 0))
+        self._source = UdpPoses(receiver, SenderGate())
         self._sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._sender.connect(taken.getsockname())
+        self._sender.connect(receiver.getsockname())
         self._has_heading = has_heading
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
@@ -218,7 +218,7 @@ def main() -> None:
     """Print the figures of docs/poses.md: eight robots each."""
     setup = with_circle(load_setup(Path(disco_hw.__file__).parent / "robots" / "wombot.toml"), 3.0, 0.5)
     planner = create_planner(setup.config, setup.model)
-    for kind in (RTK, OWN, UDP):
+    for kind in (RTK, ROBOT, UDP):
         for seed in range(1, 9):
             found = drive_circle(setup, planner, kind, seed)
             print(

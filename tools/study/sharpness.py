@@ -90,8 +90,8 @@ def _peer(
 
     def draw(piece: slice) -> Array:
         with torch.no_grad():
-            drawn = estimator.sample((_DRAWS,), condition=given[piece])
-        return np.asarray(drawn.transpose(0, 1).double().numpy())
+            samples = estimator.sample((_DRAWS,), condition=given[piece])
+        return np.asarray(samples.transpose(0, 1).double().numpy())
 
     with torch.no_grad():
         found = estimator.log_prob(torch.as_tensor(unit, dtype=torch.float32)[None], given)

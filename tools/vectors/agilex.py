@@ -29,7 +29,7 @@ def check(case: Case) -> Comparison:
         case "malformed", "short":
             frame = of_driver(case["frames"][0])
             found.same("a short frame", protocol.decode(frame), None)
-            _check_meaning(found, Frame(frame.can_id, frame.data.ljust(8, b"\0")), then)
+            _check_decoded(found, Frame(frame.can_id, frame.data.ljust(8, b"\0")), then)
         case "malformed", "unknown_state":
             _check_telemetry(found, case["frames"][0], then)
         case "malformed", _:
@@ -65,17 +65,17 @@ def _check_command(found: Comparison, case: Case) -> None:
     elif can_id == protocol.LIGHT_COMMAND:
         arguments = tuple(data[:5])
     found.same("obeyed", base.obeyed, [(can_id, arguments)])
-    _check_meaning(found, of_driver(frame), then)
+    _check_decoded(found, of_driver(frame), then)
 
 
-def _check_meaning(found: Comparison, frame: Frame, then: Mapping[str, Any]) -> None:
+def _check_decoded(found: Comparison, frame: Frame, then: Mapping[str, Any]) -> None:
     decoded = protocol.decode(frame)
     if decoded is None:
         # Nothing of ours reads the brake of bases that have one, as the SDK does not.
         found.same("decoded", then.get("body"), "not decoded by the SDK")
         return
     found.same("message", decoded.name, then["message"])
-    ours = _in_their_words(decoded)
+    ours = _in_vendor_terms(decoded)
     for name, value in ours.items():
         if isinstance(value, float) and isinstance(then[name], float):
             # The SDK multiplies 32-bit floats.
@@ -84,7 +84,7 @@ def _check_meaning(found: Comparison, frame: Frame, then: Mapping[str, Any]) -> 
             found.same(name, value, then[name])
 
 
-def _in_their_words(decoded: protocol.Decoded) -> dict[str, Any]:
+def _in_vendor_terms(decoded: protocol.Decoded) -> dict[str, Any]:
     ours: dict[str, Any] = dict(decoded.values)
     if decoded.node >= 0:
         ours["motor"] = decoded.node
@@ -101,7 +101,7 @@ def _in_their_words(decoded: protocol.Decoded) -> dict[str, Any]:
 
 
 def _check_telemetry(found: Comparison, frame: Mapping[str, Any], then: Mapping[str, Any]) -> None:
-    _check_meaning(found, of_driver(frame), then)
+    _check_decoded(found, of_driver(frame), then)
     base = AgilexBase()
     can_id, data = frame["id"], bytes.fromhex(frame["data"])
     _load(base, can_id, data)

@@ -39,8 +39,8 @@ class Comparison:
 
 def number(value: object) -> Any:
     """A value of a case: the words for what JSON has no number for become floats."""
-    words = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
-    return words[value] if isinstance(value, str) and value in words else value
+    constants = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
+    return constants[value] if isinstance(value, str) and value in constants else value
 
 
 def f32(value: float) -> float:

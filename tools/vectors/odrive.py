@@ -60,8 +60,8 @@ def check_06(case: Case) -> Comparison:
         case "malformed", "short_telemetry":
             frame = of_driver(case["frames"][0])
             found.same("a short frame", protocol.decode(Generation.V06, frame), None)
-            whole = protocol.decode(Generation.V06, type(frame)(frame.can_id, frame.data.ljust(8, b"\0")))
-            values = {} if whole is None else whole.values
+            padded = protocol.decode(Generation.V06, type(frame)(frame.can_id, frame.data.ljust(8, b"\0")))
+            values = {} if padded is None else padded.values
             found.same("its bytes", values, {name: then[name] for name in values})
         case "malformed", "unknown_or_unasked":
             # The library hears only what it has asked for; ours knows every telemetry message.
@@ -69,8 +69,8 @@ def check_06(case: Case) -> Comparison:
             known = {layout.command for layout in protocol.TELEMETRY[Generation.V06].values()}
             found.same("known", decoded is not None, given["command_id"] in known)
         case "malformed", _:
-            heard = [protocol.decode(Generation.V06, of_driver(frame)) for frame in case["frames"]]
-            found.same("from the node", [d for d in heard if d is not None and d.node == given["node"]], [])
+            received = [protocol.decode(Generation.V06, of_driver(frame)) for frame in case["frames"]]
+            found.same("from the node", [d for d in received if d is not None and d.node == given["node"]], [])
         case _:
             _check_steps(found, case)
     return found
@@ -169,7 +169,7 @@ def _check_telemetry(found: Comparison, case: Case, generation: Generation) -> N
         found.differences.append("not decoded")
         return
     found.same("node", decoded.node, node)
-    ours = _in_their_words(decoded.values, generation)
+    ours = _in_vendor_terms(decoded.values, generation)
     found.same("meaning", ours, {name: then[name] for name in ours})
     board = OdriveBoard(generation.value, given.get("nodes", [node]))
     axis = next(axis for axis in board.axes if axis.node_id == node)
@@ -186,7 +186,7 @@ def _check_telemetry(found: Comparison, case: Case, generation: Generation) -> N
         found.same("frame", as_case(board.message(axis, frame["id"] & _SILENT)), frame)
 
 
-def _in_their_words(values: Mapping[str, Any], generation: Generation) -> dict[str, Any]:
+def _in_vendor_terms(values: Mapping[str, Any], generation: Generation) -> dict[str, Any]:
     ours = dict(values)
     if generation is Generation.V05 and "motor_flags" in ours:
         flags = ours.pop("controller_flags")

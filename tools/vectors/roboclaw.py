@@ -24,12 +24,14 @@ def check(case: Case) -> Comparison:
         case "malformed", "acknowledge":
             _check_setter(found, case)
             # Only the vendor's stricter host: a byte that is not 0xFF acknowledges nothing.
-            taken = bytes.fromhex(given["acknowledge"])[:1] == protocol.ACKNOWLEDGE
-            found.same("acknowledged", taken, then["arduino"]["accepted"] and then["arduino"]["requests_sent"] == 1)
+            is_acknowledged = bytes.fromhex(given["acknowledge"])[:1] == protocol.ACKNOWLEDGE
+            found.same(
+                "acknowledged", is_acknowledged, then["arduino"]["accepted"] and then["arduino"]["requests_sent"] == 1
+            )
         case "malformed", _:
             _check_replies(found, case)
         case _:
-            _check_late(found, case)
+            _check_delayed_reply(found, case)
     return found
 
 
@@ -40,8 +42,8 @@ def _check_setter(found: Comparison, case: Case) -> None:
     packet = protocol.setting(given["address"], name, **values).data
     found.same("bytes", packet.hex(), case["bytes"])
     board = Roboclaw(given["address"])
-    answer = board.receive(0, bytes.fromhex(case["bytes"]))
-    found.same("acknowledge", answer.hex(), case["then"].get("acknowledge_expected", "ff"))
+    acknowledge = board.receive(0, bytes.fromhex(case["bytes"]))
+    found.same("acknowledge", acknowledge.hex(), case["then"].get("acknowledge_expected", "ff"))
     found.same("obeyed", board.obeyed, [(given["command"], tuple(values.values()))])
     other = Roboclaw(protocol.FIRST_ADDRESS + (given["address"] - protocol.FIRST_ADDRESS + 1) % 8)
     found.same("another board", (other.receive(0, packet), other.obeyed), (b"", []))
@@ -74,14 +76,14 @@ def _check_getter(found: Comparison, case: Case) -> None:
         return
     values, length = read
     found.same("unread bytes", len(received) - length, verdict["unread_bytes"])
-    ours = _in_their_words(values, verdict["values"])
+    ours = _in_vendor_terms(values, verdict["values"])
     found.same("values", ours, verdict["values"])
     board = Roboclaw(address)
     _load(board, name, values)
     found.same("reply", board.receive(0, bytes.fromhex(given["request"])).hex(), case["bytes"])
 
 
-def _in_their_words(values: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, Any]:
+def _in_vendor_terms(values: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, Any]:
     """Counts unsigned, gains and times in their units, as the vendor's hosts return them."""
     ours: dict[str, Any] = {}
     for name, value in values.items():
@@ -135,29 +137,29 @@ def _check_replies(found: Comparison, case: Case) -> None:
         return
     found.same("accepted", bool(good), verdict["accepted"])
     if good and verdict["accepted"]:
-        found.same("values", _in_their_words(good[0], verdict["values"]), verdict["values"])
+        found.same("values", _in_vendor_terms(good[0], verdict["values"]), verdict["values"])
 
 
-def _check_late(found: Comparison, case: Case) -> None:
+def _check_delayed_reply(found: Comparison, case: Case) -> None:
     """A late reply does not pass for the answer to the next question; after a flush the next one does."""
     address = case["given"]["address"]
-    late = b""
+    delayed = b""
     for step in case["steps"]:
         if "late_bytes" in step:
-            late = bytes.fromhex(step["late_bytes"])
+            delayed = bytes.fromhex(step["late_bytes"])
             continue
         if "host_sends_speeds" in step:
             speeds = dict(zip(protocol.SETTERS["speed_m1m2"].fields, step["host_sends_speeds"], strict=True))
             sent = protocol.setting(address, "speed_m1m2", **speeds).data.hex()
             found.same("speeds", [sent] * len(step["requests"]), step["requests"])
-            found.same("late bytes acknowledge", late[:1] == protocol.ACKNOWLEDGE, step["then"]["accepted"])
-            late = b""
+            found.same("late bytes acknowledge", delayed[:1] == protocol.ACKNOWLEDGE, step["then"]["accepted"])
+            delayed = b""
             continue
         name = protocol.getter_name(step["host_asks"]) or ""
         for request in step["requests"]:
             found.same("request", protocol.query(address, name).data.hex(), request)
-        for answer in step["replies"]:
-            if late:
-                found.same("late bytes first", protocol.reply(address, name, late + bytes.fromhex(answer)), None)
-            found.same("flushed", protocol.reply(address, name, bytes.fromhex(answer)) is not None, True)
-        late = b""
+        for reply in step["replies"]:
+            if delayed:
+                found.same("late bytes first", protocol.reply(address, name, delayed + bytes.fromhex(reply)), None)
+            found.same("flushed", protocol.reply(address, name, bytes.fromhex(reply)) is not None, True)
+        delayed = b""

@@ -26,14 +26,14 @@ def check_can(case: Case) -> Comparison:
         case "sequence":
             _check_timeout(found, device, given, then)
         case "device_to_host" if "request" in given:
-            _check_answer(found, device, case)
+            _check_reply(found, device, case)
         case "device_to_host":
             _check_status(found, device, case)
         case _ if topic == "short_status":
             frame = of_driver(case["frames"][0])
             found.same("a short status", codec.decode(frame), None)
-            whole = codec.decode(Frame(frame.can_id, frame.data.ljust(8, b"\0"), extended=True))
-            found.same("its bytes", dict(whole.values) if whole else {}, then)
+            padded = codec.decode(Frame(frame.can_id, frame.data.ljust(8, b"\0"), extended=True))
+            found.same("its bytes", dict(padded.values) if padded else {}, then)
         case kind:
             if kind == "host_to_device":
                 _check_host(found, case)
@@ -50,7 +50,7 @@ def check_uart(case: Case) -> Comparison:
         case "sequence":
             _check_serial_timeout(found, device, given, then)
         case "device_to_host":
-            _check_serial_answer(found, device, case)
+            _check_serial_reply(found, device, case)
         case _ if "packets" in then:
             received = bytes.fromhex(case["bytes"])
             found.same("packets", [each.hex() for each in codec.PacketDecoder().feed(received)], then["packets"])
@@ -69,9 +69,9 @@ def check_uart(case: Case) -> Comparison:
         case kind:
             if kind == "host_to_device":
                 _check_serial_host(found, case)
-            answer, frames = device.receive_bytes(bytes.fromhex(case["bytes"]))
+            reply, frames = device.receive_bytes(bytes.fromhex(case["bytes"]))
             _check_motor(found, device, then)
-            found.same("reply", answer.hex(), then["reply"])
+            found.same("reply", reply.hex(), then["reply"])
             if "can_frames" in then:
                 found.same("frames on CAN", as_cases(frames), then["can_frames"])
     return found
@@ -139,18 +139,20 @@ def _check_status(found: Comparison, device: Vesc, case: Case) -> None:
         found.within(name, ours, value, _F32_STEP * abs(value))
 
 
-def _check_answer(found: Comparison, device: Vesc, case: Case) -> None:
+def _check_reply(found: Comparison, device: Vesc, case: Case) -> None:
     given, then = case["given"], case["then"]
     mask = given.get("mask")
     payload = bytes([codec.GET_VALUES]) if mask is None else codec.request_values(mask)
-    asked = codec.fragments(given["controller_id"], given["host_id"], payload)
-    found.same("request", as_cases(asked), [given["request"]])
+    request_frames = codec.fragments(given["controller_id"], given["host_id"], payload)
+    found.same("request", as_cases(request_frames), [given["request"]])
     found.same("answer", as_cases(device.receive(on_bus(given["request"]))), case["frames"])
     found.same("fed", device.fed > 0, then["timeout_fed"])
     reassembly = codec.Reassembly(given["host_id"])
-    whole = [packet for frame in case["frames"] if (packet := reassembly.feed(of_driver(frame)))]
-    found.same("whole", [(packet[0], packet[2].hex()) for packet in whole], [(given["controller_id"], then["payload"])])
-    for packet in whole:
+    packets = [packet for frame in case["frames"] if (packet := reassembly.feed(of_driver(frame)))]
+    found.same(
+        "whole", [(packet[0], packet[2].hex()) for packet in packets], [(given["controller_id"], then["payload"])]
+    )
+    for packet in packets:
         _check_values(found, packet[2], given)
 
 
@@ -182,7 +184,7 @@ def _check_serial_host(found: Comparison, case: Case) -> None:
         found.same("bytes", codec.packet(bytes.fromhex(given["payload"])).hex(), case["bytes"])
 
 
-def _check_serial_answer(found: Comparison, device: Vesc, case: Case) -> None:
+def _check_serial_reply(found: Comparison, device: Vesc, case: Case) -> None:
     given, then = case["given"], case["then"]
     payload = bytes.fromhex(then["payload"])
     request = bytes.fromhex(given["request"])
@@ -193,18 +195,18 @@ def _check_serial_answer(found: Comparison, device: Vesc, case: Case) -> None:
         far = Vesc(given["far_id"])
         far.values = device.values
         _, frames = device.receive_bytes(request)
-        answers = [answer for frame in frames for answer in far.receive(frame)]
-        found.same("on CAN", as_cases(answers), given["can_frames_of_far_vesc"])
-        answer = b"".join(device.handle_packet_reply(frame) for frame in answers)
+        replies = [reply for frame in frames for reply in far.receive(frame)]
+        found.same("on CAN", as_cases(replies), given["can_frames_of_far_vesc"])
+        reply = b"".join(device.handle_packet_reply(frame) for frame in replies)
     else:
         if "mask" in given:
             found.same("request", codec.packet(codec.request_values(given["mask"])), request)
         device.firmware = payload[1:] if payload[:1] == b"\0" else device.firmware
         device.timed_out = bool(then.get("status_byte", 0) & codec.TIMED_OUT)
         device.kill_switch_active = bool(then.get("status_byte", 0) & codec.KILL_SWITCH)
-        answer, _ = device.receive_bytes(request)
-    found.same("answer", answer.hex(), case["bytes"])
-    found.same("packets", [each.hex() for each in codec.PacketDecoder().feed(answer)], [then["payload"]])
+        reply, _ = device.receive_bytes(request)
+    found.same("answer", reply.hex(), case["bytes"])
+    found.same("packets", [each.hex() for each in codec.PacketDecoder().feed(reply)], [then["payload"]])
     if payload[:1] != b"\0":
         _check_values(found, payload, given)
         for name in ("fault", "controller_id", "status_byte"):
@@ -263,9 +265,9 @@ def _check_serial_timeout(found: Comparison, device: Vesc, given: Mapping[str, A
         device.at(ms)
         for at, sent in given["sent_ms_bytes"]:
             if at == ms:
-                answer, _ = device.receive_bytes(bytes.fromhex(sent))
+                reply, _ = device.receive_bytes(bytes.fromhex(sent))
                 events += [[ms, *call] for call in device.pop_calls()]
-                events += [[ms, "reply", answer.hex()]] if answer else []
+                events += [[ms, "reply", reply.hex()]] if reply else []
         clocked.check(ms)
     _check_clocked(found, clocked, then)
     found.same("events", events, then["events_ms"])

@@ -35,7 +35,7 @@ class Maker:
         before = (self.sequence,) if self.ros1 else ()
         return self.types["std_msgs/msg/Header"](*before, self.stamp(t_ns), frame)
 
-    def make(self, name, *values):
+    def create(self, name, *values):
         return self.types[name](*values)
 
     def write(self, topic, message, log_ns):
@@ -46,22 +46,22 @@ class Maker:
         self.writer.write(self.connections[topic], int(log_ns), raw)
 
     def vector(self, x=0.0, y=0.0, z=0.0):
-        return self.make("geometry_msgs/msg/Vector3", x, y, z)
+        return self.create("geometry_msgs/msg/Vector3", x, y, z)
 
     def turn(self, yaw):
-        return self.make("geometry_msgs/msg/Quaternion", 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
+        return self.create("geometry_msgs/msg/Quaternion", 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
 
     def pose(self, x, y, yaw):
-        return self.make("geometry_msgs/msg/Pose", self.make("geometry_msgs/msg/Point", x, y, 0.0), self.turn(yaw))
+        return self.create("geometry_msgs/msg/Pose", self.create("geometry_msgs/msg/Point", x, y, 0.0), self.turn(yaw))
 
     def twist(self, v, w):
-        return self.make("geometry_msgs/msg/Twist", self.vector(v), self.vector(z=w))
+        return self.create("geometry_msgs/msg/Twist", self.vector(v), self.vector(z=w))
 
     def twist_stamped(self, t_ns, v, w):
-        return self.make("geometry_msgs/msg/TwistStamped", self.header(t_ns, "base_link"), self.twist(v, w))
+        return self.create("geometry_msgs/msg/TwistStamped", self.header(t_ns, "base_link"), self.twist(v, w))
 
     def joints(self, t_ns, names, positions, speeds):
-        return self.make(
+        return self.create(
             "sensor_msgs/msg/JointState",
             self.header(t_ns, ""),
             list(names),
@@ -71,32 +71,32 @@ class Maker:
         )
 
     def pose_stamped(self, t_ns, frame, x, y, yaw):
-        return self.make("geometry_msgs/msg/PoseStamped", self.header(t_ns, frame), self.pose(x, y, yaw))
+        return self.create("geometry_msgs/msg/PoseStamped", self.header(t_ns, frame), self.pose(x, y, yaw))
 
     def pose_covariance(self, t_ns, frame, x, y, yaw):
-        inner = self.make("geometry_msgs/msg/PoseWithCovariance", self.pose(x, y, yaw), np.zeros(36))
-        return self.make("geometry_msgs/msg/PoseWithCovarianceStamped", self.header(t_ns, frame), inner)
+        inner = self.create("geometry_msgs/msg/PoseWithCovariance", self.pose(x, y, yaw), np.zeros(36))
+        return self.create("geometry_msgs/msg/PoseWithCovarianceStamped", self.header(t_ns, frame), inner)
 
     def odometry(self, t_ns, frame, x, y, yaw, v=0.0, w=0.0):
-        inner = self.make("geometry_msgs/msg/PoseWithCovariance", self.pose(x, y, yaw), np.zeros(36))
-        twist = self.make("geometry_msgs/msg/TwistWithCovariance", self.twist(v, w), np.zeros(36))
-        return self.make("nav_msgs/msg/Odometry", self.header(t_ns, frame), "base_link", inner, twist)
+        inner = self.create("geometry_msgs/msg/PoseWithCovariance", self.pose(x, y, yaw), np.zeros(36))
+        twist = self.create("geometry_msgs/msg/TwistWithCovariance", self.twist(v, w), np.zeros(36))
+        return self.create("nav_msgs/msg/Odometry", self.header(t_ns, frame), "base_link", inner, twist)
 
     def transforms(self, t_ns, *edges):
         one = [
-            self.make(
+            self.create(
                 "geometry_msgs/msg/TransformStamped",
                 self.header(t_ns, parent),
                 child,
-                self.make("geometry_msgs/msg/Transform", self.vector(x, y, z), self.turn(yaw)),
+                self.create("geometry_msgs/msg/Transform", self.vector(x, y, z), self.turn(yaw)),
             )
             for parent, child, x, y, z, yaw in edges
         ]
-        return self.make("tf2_msgs/msg/TFMessage", one)
+        return self.create("tf2_msgs/msg/TFMessage", one)
 
     def image(self, t_ns, pixels):
         fields = (self.header(t_ns, "camera"), 100, pixels.size // 100, "mono8", 0, 100, pixels)
-        return self.make("sensor_msgs/msg/Image", *fields)
+        return self.create("sensor_msgs/msg/Image", *fields)
 
 
 @contextmanager

@@ -64,29 +64,29 @@ def read(tmp_path, lines, end="\n", **settings):
 
 
 @pytest.fixture(scope="module")
-def whole(frames, tmp_path_factory):
+def reference(frames, tmp_path_factory):
     return read(tmp_path_factory.mktemp("whole"), lines_of(frames))
 
 
-def assert_same(drive, whole, atol_s=2e-6):
-    np.testing.assert_allclose(drive.wheels.t_s, whole.wheels.t_s, atol=atol_s)
-    np.testing.assert_array_equal(drive.wheels.left_angle_rad, whole.wheels.left_angle_rad)
-    np.testing.assert_array_equal(drive.poses.x_m, whole.poses.x_m)
-    np.testing.assert_array_equal(drive.commands.left_rad_s, whole.commands.left_rad_s)
+def assert_same(drive, reference, atol_s=2e-6):
+    np.testing.assert_allclose(drive.wheels.t_s, reference.wheels.t_s, atol=atol_s)
+    np.testing.assert_array_equal(drive.wheels.left_angle_rad, reference.wheels.left_angle_rad)
+    np.testing.assert_array_equal(drive.poses.x_m, reference.poses.x_m)
+    np.testing.assert_array_equal(drive.commands.left_rad_s, reference.commands.left_rad_s)
 
 
 @pytest.mark.parametrize("write", [packed, screen])
 @pytest.mark.parametrize("stamp", [absolute, from_zero, dated])
-def test_each_format_with_time_stamps_gives_the_same_drive(tmp_path, frames, whole, stamp, write):
+def test_each_format_with_time_stamps_gives_the_same_drive(tmp_path, frames, reference, stamp, write):
     drive = read(tmp_path, lines_of(frames, stamp, write))
-    assert_same(drive, whole)
+    assert_same(drive, reference)
     assert drive.notes == ()
 
 
 @pytest.mark.parametrize("write", [packed, screen])
-def test_differences_between_frames_are_summed_up(tmp_path, frames, whole, write):
+def test_differences_between_frames_are_summed_up(tmp_path, frames, reference, write):
     drive = read(tmp_path, differences(frames, write))
-    assert_same(drive, whole, atol_s=2e-3)
+    assert_same(drive, reference, atol_s=2e-3)
     (note,) = drive.notes
     assert "are differences between frames (candump -td) and were summed up" in note
 
@@ -114,26 +114,26 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("others", OTHERS.values(), ids=OTHERS)
-def test_frames_of_other_kinds_change_nothing(tmp_path, frames, whole, others):
+def test_frames_of_other_kinds_change_nothing(tmp_path, frames, reference, others):
     lines = lines_of(frames)
     drive = read(tmp_path, lines[:100] + others + lines[100:])
-    assert_same(drive, whole)
+    assert_same(drive, reference)
     assert drive.notes == ()
 
 
 @pytest.mark.parametrize("left", [1, 5, 25, 31, 36])
-def test_a_last_line_that_is_cut_is_left_out_and_said(tmp_path, frames, whole, left):
+def test_a_last_line_that_is_cut_is_left_out_and_said(tmp_path, frames, reference, left):
     lines = lines_of(frames)
     drive = read(tmp_path, [*lines, lines[-1][:left]], end="")
-    assert_same(drive, whole)
+    assert_same(drive, reference)
     assert "the last line is cut off" in drive.notes[0] or left > 30
 
 
 @pytest.mark.parametrize(("count", "warns"), [(1, False), (30, False), (60, True)])
-def test_lines_that_are_no_frame_are_counted(tmp_path, frames, whole, count, warns):
+def test_lines_that_are_no_frame_are_counted(tmp_path, frames, reference, count, warns):
     lines = lines_of(frames)
     drive = read(tmp_path, lines[:300] + ["read: Network is down"] * count + lines[300:])
-    assert_same(drive, whole)
+    assert_same(drive, reference)
     assert f"lines: {count} of {900 + count} are no frame and were left out, the first is line 301" in drive.notes[0]
     assert drive.notes[0].startswith("warning: ") == warns
 
@@ -147,10 +147,10 @@ def interleaved(one, other):
     return [line for pair in zip(one, other, strict=True) for line in pair]
 
 
-def test_of_two_channels_the_one_that_speaks_the_protocol_is_read(tmp_path, frames, whole):
+def test_of_two_channels_the_one_that_speaks_the_protocol_is_read(tmp_path, frames, reference):
     chatter = [packed(absolute(t_s, 0.0), "7A1", "0011", "can1") for t_s, _, _ in frames]
     drive = read(tmp_path, interleaved(lines_of(frames), chatter))
-    assert_same(drive, whole)
+    assert_same(drive, reference)
     assert "channel can0 was read, and can1 left out; --channel takes another" in drive.notes[0]
 
 
@@ -159,13 +159,13 @@ def two_robots(frames):
     return [*lines_of(frames[:450]), *interleaved(lines_of(frames[450:]), lines_of(later, channel="can1"))]
 
 
-def test_of_two_robots_one_must_be_named(tmp_path, frames, whole):
+def test_of_two_robots_one_must_be_named(tmp_path, frames, reference):
     with pytest.raises(LogError, match=r"several channels hold a robot \(can0 with .*, can1 with .*--channel") as error:
         read(tmp_path, two_robots(frames))
     assert "\n" not in str(error.value)
-    assert_same(read(tmp_path, two_robots(frames), channel="can0"), whole)
-    assert_same(read(tmp_path, two_robots(frames), usual_channel="can0"), whole)
-    assert read(tmp_path, two_robots(frames), channel="can1").wheels.t_s.size < 0.6 * whole.wheels.t_s.size
+    assert_same(read(tmp_path, two_robots(frames), channel="can0"), reference)
+    assert_same(read(tmp_path, two_robots(frames), usual_channel="can0"), reference)
+    assert read(tmp_path, two_robots(frames), channel="can1").wheels.t_s.size < 0.6 * reference.wheels.t_s.size
     with pytest.raises(LogError, match="no channel can7; it has can0, can1"):
         read(tmp_path, two_robots(frames), channel="can7")
 
@@ -184,17 +184,17 @@ def test_the_channel_comes_from_the_command_line_or_robot_toml(tmp_path, frames)
         import_log(tmp_path / "a.csv", robot, tmp_path / "c.mcap", channel="can0")
 
 
-def test_a_clock_that_was_set_back_is_taken_out(tmp_path, frames, whole):
+def test_a_clock_that_was_set_back_is_taken_out(tmp_path, frames, reference):
     back = [(t_s - (3600.0 if k >= 450 else 0.0), can_id, data) for k, (t_s, can_id, data) in enumerate(frames)]
     drive = read(tmp_path, lines_of(back))
-    np.testing.assert_allclose(drive.wheels.t_s, whole.wheels.t_s, atol=0.06)
+    np.testing.assert_allclose(drive.wheels.t_s, reference.wheels.t_s, atol=0.06)
     assert "the clock was set back 1 times, which was taken out" in drive.notes[0]
 
 
-def test_frames_in_slight_disorder_are_read(tmp_path, frames, whole):
+def test_frames_in_slight_disorder_are_read(tmp_path, frames, reference):
     mixed = list(frames)
     mixed[500], mixed[501] = mixed[501], mixed[500]
     drive = read(tmp_path, lines_of(mixed))
-    assert drive.wheels.t_s.size >= whole.wheels.t_s.size - 1
+    assert drive.wheels.t_s.size >= reference.wheels.t_s.size - 1
     assert (np.diff(drive.wheels.t_s) > 0.0).all()
     assert drive.notes == ()

@@ -52,8 +52,8 @@ def test_a_pause_in_which_a_counter_may_wrap_unseen_begins_a_segment(tmp_path):
 
 def test_a_wheel_that_wraps_too_rarely_takes_the_span_of_the_other():
     counts = np.column_stack([np.floor(90.0 * np.arange(400)), np.floor(25.0 * np.arange(400))])
-    nowhere, unknown = np.zeros(T_S.size, dtype=bool), np.full((T_S.size, 2), np.nan)
-    left, right = unwrap_wheels(T_S, counts % 6000.0, (), nowhere, unknown)
+    no_restarts, unknown = np.zeros(T_S.size, dtype=bool), np.full((T_S.size, 2), np.nan)
+    left, right = unwrap_wheels(T_S, counts % 6000.0, (), no_restarts, unknown)
     assert (left.span, right.span, right.wraps) == (6000.0, 6000.0, 1)
     np.testing.assert_array_equal(right.values, counts[:, 1])
 
@@ -77,11 +77,11 @@ def test_an_encoder_that_returns_to_zero_is_seen_at_any_rate(period_s, turned_ra
     angles = speed_rad_s * period_s * np.arange(1 + round(2.0 * turned_rad / abs(speed_rad_s) / period_s))
     other, at = angles.copy(), angles.size // 2
     angles[at:] -= angles[at]
-    anew = restarts(period_s * np.arange(angles.size), np.column_stack([angles, other]))
-    assert np.flatnonzero(anew).tolist() == [at]
+    restarted = restarts(period_s * np.arange(angles.size), np.column_stack([angles, other]))
+    assert np.flatnonzero(restarted).tolist() == [at]
 
 
 def test_samples_that_were_held_and_come_in_bursts_are_no_reset():
     t_s = 0.02 * np.arange(1000)
-    held = 6.0 * 0.1 * np.floor(t_s / 0.1 + 1e-9)
-    assert not restarts(t_s, np.column_stack([held, held])).any()
+    angles = 6.0 * 0.1 * np.floor(t_s / 0.1 + 1e-9)
+    assert not restarts(t_s, np.column_stack([angles, angles])).any()

@@ -162,7 +162,7 @@ def test_yaw_within_pi_keeps_its_bits(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("content", "message"),
     [
         ("", "empty file"),
         (HEADER + "\n", "has a header but no rows"),
@@ -177,8 +177,8 @@ def test_yaw_within_pi_keeps_its_bits(tmp_path):
         ("\x00\x01\x02", "no column"),
     ],
 )
-def test_a_bad_file_is_refused_in_one_line(tmp_path, content, words):
-    assert words in refused(tmp_path, content)
+def test_a_bad_file_is_refused_in_one_line(tmp_path, content, message):
+    assert message in refused(tmp_path, content)
 
 
 def test_degrees_and_millimetres_are_refused(tmp_path):

@@ -61,11 +61,11 @@ def sizes(drive):
     return drive.commands.t_s.size, drive.wheels.t_s.size, drive.poses.t_s.size
 
 
-@pytest.mark.parametrize("word", ["nan", "NaN", "NAN", " nan ", "N/A", "null", "None", "-", ""])
-def test_a_word_for_no_sample_is_an_empty_cell(tmp_path, word):
+@pytest.mark.parametrize("cell", ["nan", "NaN", "NAN", " nan ", "N/A", "null", "None", "-", ""])
+def test_a_word_for_no_sample_is_an_empty_cell(tmp_path, cell):
     rows = table()
     for row in rows[::2]:
-        row["enc_left_rad_s"] = row["pose_yaw_rad"] = word
+        row["enc_left_rad_s"] = row["pose_yaw_rad"] = cell
     drive = read(tmp_path, as_text(rows))
     assert sizes(drive) == (100, 50, 100)
     assert np.isnan(drive.poses.yaw_rad[::2]).all()
@@ -174,14 +174,14 @@ MERGES = {
 
 @pytest.mark.parametrize("parts", MERGES.values(), ids=MERGES)
 def test_rows_of_one_time_with_other_columns_are_one_row(tmp_path, parts):
-    drive, whole = read(tmp_path, as_text(split(table(), *parts))), read(tmp_path, as_text(table()))
+    drive, reference = read(tmp_path, as_text(split(table(), *parts))), read(tmp_path, as_text(table()))
     for part, name in (
         ("commands", "left_rad_s"),
         ("wheels", "left_angle_rad"),
         ("poses", "yaw_rad"),
         ("poses", "t_s"),
     ):
-        np.testing.assert_array_equal(getattr(getattr(drive, part), name), getattr(getattr(whole, part), name))
+        np.testing.assert_array_equal(getattr(getattr(drive, part), name), getattr(getattr(reference, part), name))
     assert f"{(len(parts) - 1) * ROWS} rows have the time of another and were joined with it" in only_note(drive)
 
 
@@ -233,11 +233,11 @@ def read_ticks(tmp_path, rows):
 @pytest.mark.parametrize("span", [256, 1024, 2048, 3000, 4096])
 @pytest.mark.parametrize("both", [True, False])
 def test_ticks_that_wrap_are_made_continuous_wheel_by_wheel(tmp_path, span, both):
-    whole = read_ticks(tmp_path, with_ticks())
+    reference = read_ticks(tmp_path, with_ticks())
     wrapped = with_ticks(lambda ticks: ticks % span, (lambda ticks: ticks % span) if both else (lambda ticks: ticks))
     drive = read_ticks(tmp_path, wrapped)
-    np.testing.assert_allclose(drive.wheels.left_angle_rad, whole.wheels.left_angle_rad, atol=1e-9)
-    np.testing.assert_allclose(drive.wheels.right_angle_rad, whole.wheels.right_angle_rad, atol=1e-9)
+    np.testing.assert_allclose(drive.wheels.left_angle_rad, reference.wheels.left_angle_rad, atol=1e-9)
+    np.testing.assert_allclose(drive.wheels.right_angle_rad, reference.wheels.right_angle_rad, atol=1e-9)
     assert drive.segments == 1
     assert len(drive.notes) == 1 + both
     assert f"enc_left_ticks wraps at {span}: made continuous at" in drive.notes[0]

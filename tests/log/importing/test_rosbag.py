@@ -39,8 +39,8 @@ def place(tmp_path, storage="mcap"):
     return tmp_path / ("run.bag" if storage == "ros1" else "run")
 
 
-def said(drive, words):
-    return any(words in note for note in drive.notes)
+def has_note(drive, text):
+    return any(text in note for note in drive.notes)
 
 
 def chosen(drive):
@@ -98,7 +98,7 @@ def test_a_topic_that_is_asked_for_is_taken_instead(tmp_path):
     np.testing.assert_allclose(drive.poses.t_s - drive.wheels.t_s[0], truth.poses.t_s - truth.wheels.t_s[0], atol=1e-6)
     np.testing.assert_allclose(drive.wheels.left_speed_rad_s, truth.wheels.left_speed_rad_s, atol=1e-9)
     assert not drive.wheels.angle_measured
-    assert said(drive, "has been through the robot's own kinematics")
+    assert has_note(drive, "has been through the robot's own kinematics")
 
 
 def test_without_joint_states_the_odometry_serves_and_that_is_said(tmp_path):
@@ -106,14 +106,14 @@ def test_without_joint_states_the_odometry_serves_and_that_is_said(tmp_path):
     drive = read_rosbag(place(tmp_path), robot_config())
     assert ("wheels", "/odom") in chosen(drive)
     np.testing.assert_allclose(drive.wheels.right_speed_rad_s, truth.wheels.right_speed_rad_s, atol=1e-9)
-    assert said(drive, "record /joint_states")
+    assert has_note(drive, "record /joint_states")
 
 
 def test_odometry_of_the_wheels_is_never_taken_for_a_measured_pose(tmp_path):
     recorded(place(tmp_path), leave=("/rtabmap/odom", "/amcl_pose", "/tf"))
     drive = read_rosbag(place(tmp_path), robot_config())
     assert not drive.poses.t_s.size
-    assert said(drive, "no topic holds poses that were not made from the wheels")
+    assert has_note(drive, "no topic holds poses that were not made from the wheels")
 
 
 def test_names_of_joints_and_frames_that_nobody_guesses_can_be_set(tmp_path):
@@ -143,7 +143,7 @@ def test_a_gap_in_the_recording_starts_a_new_segment(tmp_path):
 def test_a_clock_that_is_set_is_said_and_taken_out(tmp_path, by_s):
     truth = recorded(place(tmp_path), clock=lambda t_s: by_s if t_s > 5.0 else 0.0)
     drive = read_rosbag(place(tmp_path), robot_config())
-    assert said(drive, f"the clock of the stamps was set {'back' if by_s < 0 else 'ahead'} by 30 s")
+    assert has_note(drive, f"the clock of the stamps was set {'back' if by_s < 0 else 'ahead'} by 30 s")
     assert_same_wheels(drive, truth)
     assert drive.segments == 2
     assert drive.poses.t_s[-1] == pytest.approx(drive.wheels.t_s[-1], abs=0.2)
@@ -154,11 +154,11 @@ def test_a_simulated_clock_is_said_and_unstamped_commands_are_carried_over(tmp_p
     start_s = 100.0 - BEGAN_NS * 1e-9
     truth = recorded(place(tmp_path), clock=lambda t_s: start_s - 0.5 * t_s)
     drive = read_rosbag(place(tmp_path), robot_config())
-    assert said(drive, "a simulated clock, or one that was not set")
+    assert has_note(drive, "a simulated clock, or one that was not set")
     np.testing.assert_allclose(np.diff(drive.wheels.t_s), 0.5 * np.diff(truth.wheels.t_s), atol=1e-6)
     given = drive.commands.t_s[np.isfinite(drive.commands.left_rad_s)]
-    wanted = 0.5 * (truth.commands.t_s[np.isfinite(truth.commands.left_rad_s)])
-    np.testing.assert_allclose(given - given[0], wanted - wanted[0], atol=2e-3)
+    expected = 0.5 * (truth.commands.t_s[np.isfinite(truth.commands.left_rad_s)])
+    np.testing.assert_allclose(given - given[0], expected - expected[0], atol=2e-3)
 
 
 def test_messages_without_a_stamp_have_the_time_of_recording_and_that_is_said(tmp_path):
@@ -168,7 +168,7 @@ def test_messages_without_a_stamp_have_the_time_of_recording_and_that_is_said(tm
             stamp = 0 if k % 10 == 0 else t_ns
             maker.write("/joint_states", maker.joints(stamp, LEFT + RIGHT, [0.1 * k] * 4, [5.0] * 4), t_ns)
     drive = read_rosbag(place(tmp_path), robot_config())
-    assert said(drive, "20 of 200 messages have no stamp")
+    assert has_note(drive, "20 of 200 messages have no stamp")
     np.testing.assert_allclose(np.diff(drive.wheels.t_s), 0.02, atol=1e-6)
 
 
@@ -177,8 +177,8 @@ def test_the_stamp_counts_not_the_recording(tmp_path):
     with bag(place(tmp_path)) as maker:
         for k in range(200):
             t_ns = BEGAN_NS + k * 20_000_000
-            held = BEGAN_NS + 120 * 20_000_000 if 80 <= k < 120 else t_ns
-            maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [0.1 * k] * 4, [5.0] * 4), held + k)
+            received_ns = BEGAN_NS + 120 * 20_000_000 if 80 <= k < 120 else t_ns
+            maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [0.1 * k] * 4, [5.0] * 4), received_ns + k)
     drive = read_rosbag(place(tmp_path), robot_config())
     np.testing.assert_allclose(np.diff(drive.wheels.t_s), 0.02, atol=1e-6)
     assert drive.segments == 1
@@ -194,25 +194,25 @@ def test_what_is_not_finite_is_left_out_and_counted(tmp_path):
             maker.write("/slam/pose", maker.pose_stamped(t_ns, "map", x, 0.0, 0.0), t_ns)
     drive = read_rosbag(place(tmp_path), robot_config())
     assert (drive.wheels.t_s.size, drive.poses.t_s.size) == (49, 48)
-    assert said(drive, "poses, /slam/pose: 2 of 50 messages hold no finite value")
-    assert said(drive, "wheels: 1 of 50 messages lack a position or velocity")
+    assert has_note(drive, "poses, /slam/pose: 2 of 50 messages hold no finite value")
+    assert has_note(drive, "wheels: 1 of 50 messages lack a position or velocity")
 
 
 @pytest.mark.parametrize(
-    ("lost_rad", "burst", "segments"), [(80.0, False, 2), (4.0, False, 2), (0.0, False, 1), (0.0, True, 1)]
+    ("reset_rad", "burst", "segments"), [(80.0, False, 2), (4.0, False, 2), (0.0, False, 1), (0.0, True, 1)]
 )
-def test_where_a_driver_counts_anew_nothing_is_predicted_across(tmp_path, lost_rad, burst, segments):
+def test_where_a_driver_counts_anew_nothing_is_predicted_across(tmp_path, reset_rad, burst, segments):
     with bag(place(tmp_path)) as maker:
         for k in range(300):
             t_ns = BEGAN_NS + k * 20_000_000
             if burst and k == 200:
                 # This one comes right after the one before.
                 t_ns -= 19_900_000
-            angle = 0.4 * k - (lost_rad if k >= 200 else 0.0)
+            angle = 0.4 * k - (reset_rad if k >= 200 else 0.0)
             maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [angle] * 4, []), t_ns)
     drive = read_rosbag(place(tmp_path), robot_config())
     assert drive.segments == segments
-    assert said(drive, "1 times the wheels paused, or a clock or encoder was set") is (segments == 2)
+    assert has_note(drive, "1 times the wheels paused, or a clock or encoder was set") is (segments == 2)
     fast = np.abs(drive.wheels.left_speed_rad_s) > 30.0
     assert fast.any() == burst
 
@@ -227,24 +227,24 @@ def test_positions_within_one_turn_are_made_continuous(tmp_path):
     assert drive.wheels.left_angle_rad[-1] == pytest.approx(19.9)
     np.testing.assert_allclose(drive.wheels.left_speed_rad_s[1:], 5.0, atol=1e-3)
     assert not drive.wheels.speed_measured
-    assert said(drive, "left wheel: the position wraps at 6.283185307 rad: made continuous at 3 places")
+    assert has_note(drive, "left wheel: the position wraps at 6.283185307 rad: made continuous at 3 places")
 
 
 @pytest.mark.parametrize(
-    ("topic", "make"),
+    ("topic", "build_message"),
     [
         ("/wheel_cmds", lambda m, t: m.joints(t, LEFT + RIGHT, [], [1.0, 3.0, 4.0, 6.0])),
         ("/base_controller/cmd_vel_out", lambda m, t: m.twist_stamped(t, 0.055 * 3.5, 0.055 * 3.0 / 0.4)),
         ("/velocity_controller/commands", lambda m, t: array(m, [2.0, 5.0])),
     ],
 )
-def test_the_controllers_own_commands_come_before_cmd_vel(tmp_path, topic, make):
+def test_the_controllers_own_commands_come_before_cmd_vel(tmp_path, topic, build_message):
     with bag(place(tmp_path)) as maker:
         for k in range(50):
             t_ns = BEGAN_NS + k * 20_000_000
             maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [0.1 * k] * 4, [5.0] * 4), t_ns)
             maker.write("/cmd_vel", maker.twist(0.0, 9.0), t_ns)
-            maker.write(topic, make(maker, t_ns), t_ns)
+            maker.write(topic, build_message(maker, t_ns), t_ns)
     drive = read_rosbag(place(tmp_path), robot_config())
     assert chosen(drive)[0] == ("commands", topic)
     np.testing.assert_allclose(drive.commands.left_rad_s[:-1], 2.0)
@@ -252,8 +252,8 @@ def test_the_controllers_own_commands_come_before_cmd_vel(tmp_path, topic, make)
 
 
 def array(maker, values):
-    layout = maker.make("std_msgs/msg/MultiArrayLayout", [], 0)
-    return maker.make("std_msgs/msg/Float64MultiArray", layout, np.array(values))
+    layout = maker.create("std_msgs/msg/MultiArrayLayout", [], 0)
+    return maker.create("std_msgs/msg/Float64MultiArray", layout, np.array(values))
 
 
 def test_the_command_imports_a_folder_that_reads_as_any_log(robot, tmp_path):

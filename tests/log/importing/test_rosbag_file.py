@@ -71,7 +71,7 @@ def test_what_infer_is_given_as_a_bag_is_to_be_imported_first(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def whole_bags(tmp_path_factory):
+def complete_bags(tmp_path_factory):
     """The content of one drive's bag by storage, and its number of wheel samples."""
     folder, contents = tmp_path_factory.mktemp("bags"), {}
     for storage in ("mcap", "sqlite3", "ros1"):
@@ -86,8 +86,8 @@ ENDINGS = {"mcap": "mcap", "sqlite3": "db3", "ros1": "bag"}
 
 @thinned("storage", ENDINGS, quick=2)
 @thinned("share", [0.55, 0.7, 0.9, 0.99], quick=2)
-def test_a_truncated_bag_is_read_as_far_as_it_is_whole(tmp_path, whole_bags, storage, share):
-    contents, samples = whole_bags
+def test_a_truncated_bag_is_read_as_far_as_it_is_whole(tmp_path, complete_bags, storage, share):
+    contents, samples = complete_bags
     path = tmp_path / f"b.{ENDINGS[storage]}"
     path.write_bytes(contents[storage][: int(share * len(contents[storage]))])
     drive = read_rosbag(path, robot_config())
@@ -99,31 +99,31 @@ def test_a_truncated_bag_is_read_as_far_as_it_is_whole(tmp_path, whole_bags, sto
 
 @pytest.mark.parametrize("storage", ENDINGS)
 @pytest.mark.parametrize("size", [20, 100])
-def test_a_bag_that_was_cut_before_its_first_message_is_one_line(tmp_path, whole_bags, storage, size):
+def test_a_bag_that_was_cut_before_its_first_message_is_one_line(tmp_path, complete_bags, storage, size):
     path = tmp_path / f"b.{ENDINGS[storage]}"
-    path.write_bytes(whole_bags[0][storage][:size])
+    path.write_bytes(complete_bags[0][storage][:size])
     with pytest.raises(LogError, match=r"b\.\w+: the bag cannot be read .*; record it again, or convert") as error:
         read_rosbag(path, robot_config())
     assert one_line(error)
 
 
 @pytest.mark.thorough
-def test_wherever_an_mcap_is_cut_it_is_a_drive_with_a_warning_or_one_line(tmp_path, whole_bags):
-    content, rng, path = whole_bags[0]["mcap"], random.Random(7), tmp_path / "b.mcap"
+def test_wherever_an_mcap_is_cut_it_is_a_drive_with_a_warning_or_one_line(tmp_path, complete_bags):
+    content, rng, path = complete_bags[0]["mcap"], random.Random(7), tmp_path / "b.mcap"
     for _ in range(10):
         path.write_bytes(content[: rng.randrange(len(content))])
         try:
-            said = read_rosbag(path, robot_config()).notes[0]
-            assert said.startswith("warning: ")
+            message = read_rosbag(path, robot_config()).notes[0]
+            assert message.startswith("warning: ")
         except LogError as error:
-            said = str(error)
-        assert "\n" not in said
-        assert str(path) in said
+            message = str(error)
+        assert "\n" not in message
+        assert str(path) in message
 
 
-@pytest.mark.parametrize("make", ["mcap", "bz2", "lz4"])
-def test_a_damaged_chunk_costs_its_messages_only(tmp_path, make):
-    path, chunks = in_chunks(tmp_path, make)
+@pytest.mark.parametrize("kind", ["mcap", "bz2", "lz4"])
+def test_a_damaged_chunk_costs_its_messages_only(tmp_path, kind):
+    path, chunks = in_chunks(tmp_path, kind)
     assert len(chunks) > 5
     spoilt = bytearray(path.read_bytes())
     for at in range(chunks[3] + 20, chunks[3] + 80):
@@ -135,9 +135,9 @@ def test_a_damaged_chunk_costs_its_messages_only(tmp_path, make):
     assert "1 damaged chunks were left out" in drive.notes[0]
 
 
-def in_chunks(folder, make):
+def in_chunks(folder, kind):
     """A bag of 400 wheel samples in small packed chunks, and where the bytes of each chunk begin."""
-    if make == "mcap":
+    if kind == "mcap":
         small(folder / "b", count=400)
         path = folder / "chunks.mcap"
         with file_of(folder / "b").open("rb") as source, path.open("wb") as sink:
@@ -155,7 +155,7 @@ def in_chunks(folder, make):
         return path, [one.chunk_start_offset + one.chunk_length - one.compressed_size for one in found]
     path = folder / "chunks.bag"
     writer = Writer1(path)
-    writer.set_compression(Writer1.CompressionFormat[make.upper()])
+    writer.set_compression(Writer1.CompressionFormat[kind.upper()])
     vars(writer).update(chunk_threshold=10_000)
     with writer:
         fill(Maker(writer, get_typestore(Stores.ROS1_NOETIC), True), 400)
@@ -166,19 +166,19 @@ def in_chunks(folder, make):
 def test_a_mutated_bag_is_a_drive_or_one_line(tmp_path, storage):
     source = small(tmp_path / "b.bag", storage)
     source = source if storage == "ros1" else file_of(source)
-    whole, rng = source.read_bytes(), random.Random(3)
+    content, rng = source.read_bytes(), random.Random(3)
     for _ in range(60):
-        spoilt = bytearray(whole)
+        spoilt = bytearray(content)
         for _ in range(rng.choice((1, 3, 20))):
             spoilt[rng.randrange(len(spoilt))] = rng.choice((0, 1, 0x7F, 0xFF, rng.randrange(256)))
         source.write_bytes(spoilt)
-        said = str(source)
+        message = str(source)
         try:
             read_rosbag(source, robot_config())
         except InputError as error:
-            said = str(error)
-        assert "\n" not in said
-        assert str(source) in said
+            message = str(error)
+        assert "\n" not in message
+        assert str(source) in message
 
 
 @pytest.mark.parametrize("size", [2**31, 2**40, 2**62, 2**64 - 1])

@@ -42,19 +42,19 @@ def logs(tmp_path_factory):
     return folder / "own.mcap", folder / "imported.mcap"
 
 
-def call(*words):
-    done = CliRunner().invoke(app(), [*map(str, words)], catch_exceptions=False)
+def call(*arguments):
+    done = CliRunner().invoke(app(), [*map(str, arguments)], catch_exceptions=False)
     assert done.exit_code == 0, done.output
     return done.stdout
 
 
 def test_the_posteriors_lie_within_one_anothers_intervals(logs, tmp_path):
-    own, imported = (
+    original, imported = (
         json.loads(call("infer", log, "--robot", ROBOT, "-o", tmp_path / f"{i}.toml", "--json"))["posterior"]
         for i, log in enumerate(logs)
     )
-    assert set(own) == set(imported)
-    for name, found in own.items():
+    assert set(original) == set(imported)
+    for name, found in original.items():
         for one, other in ((found, imported[name]), (imported[name], found)):
             low, high = other["ci90"]
             assert low <= one["mean"] <= high, name
@@ -65,10 +65,10 @@ def test_the_same_effect_is_named_with_the_same_value(logs, tmp_path):
     for i, log in enumerate(logs):
         call("gap", log, "--robot", ROBOT, "-o", tmp_path / str(i))
         reports.append(json.loads((tmp_path / str(i) / "report.json").read_text(encoding="utf-8")))
-    own, imported = ({effect["name"]: effect["parameters"] for effect in one["effects"]} for one in reports)
-    assert set(own) == set(imported)
-    assert "deadband" in own
-    for name, parameters in own.items():
+    original, imported = ({effect["name"]: effect["parameters"] for effect in one["effects"]} for one in reports)
+    assert set(original) == set(imported)
+    assert "deadband" in original
+    for name, parameters in original.items():
         for parameter, found in parameters.items():
             other = imported[name][parameter]
             assert other["ci95"][0] <= found["value"] <= other["ci95"][1], f"{name} {parameter}"

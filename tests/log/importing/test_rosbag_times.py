@@ -31,7 +31,7 @@ def assert_true(times, names, within_ns=0):
         assert np.abs(times.t_ns[name] - true_ns).max() <= within_ns, name
 
 
-def stands_still(t_ns):
+def with_frozen_clock(t_ns):
     return t_ns // 3_000_000_000 * 3_000_000_000
 
 
@@ -52,7 +52,7 @@ def jumps(t_ns):
 
 
 FAULTS = {
-    "stands still": (stands_still, "stand still while the recording goes on"),
+    "stands still": (with_frozen_clock, "stand still while the recording goes on"),
     "never changes": (never_changes, "stand still while the recording goes on"),
     "another epoch": (of_another_epoch, "are of another clock than those of other topics"),
     "from power on": (from_power_on, "are of another clock than those of other topics"),
@@ -60,15 +60,15 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize(("change", "words"), FAULTS.values(), ids=FAULTS)
+@pytest.mark.parametrize(("change", "description"), FAULTS.values(), ids=FAULTS)
 @pytest.mark.parametrize("topic", PERIODS_NS)
-def test_a_topic_whose_stamps_are_wrong_is_dated_by_the_recording_and_no_other(topic, change, words):
+def test_a_topic_whose_stamps_are_wrong_is_dated_by_the_recording_and_no_other(topic, change, description):
     times = timeline(stamped(**{topic: change}))
     assert_true(times, set(PERIODS_NS) - {topic})
     assert_true(times, [topic], within_ns=LATENCY_NS)
     assert not times.breaks_ns.size
     (note,) = times.notes
-    assert note.startswith(f"warning: {topic}: its stamps {words}")
+    assert note.startswith(f"warning: {topic}: its stamps {description}")
 
 
 @pytest.mark.parametrize("by_ns", [-30_000_000_000, 30_000_000_000, -3_600_000_000_000])
@@ -113,7 +113,7 @@ def test_commands_whose_stamp_stands_still_cost_neither_wheels_nor_poses(tmp_pat
             t_ns = BEGAN_NS + k * 20_000_000
             maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [0.1 * k] * 4, [5.0] * 4), t_ns)
             if k % 2 == 0:
-                stamp_ns = BEGAN_NS + int(stands_still(k * 20_000_000))
+                stamp_ns = BEGAN_NS + int(with_frozen_clock(k * 20_000_000))
                 maker.write("/cmd_vel", maker.twist_stamped(stamp_ns, 0.27, 0.0), t_ns)
             if k % 4 == 0:
                 maker.write("/slam/pose", maker.pose_stamped(t_ns, "map", 0.0055 * k, 0.0, 0.0), t_ns)

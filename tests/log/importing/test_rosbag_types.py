@@ -20,7 +20,7 @@ MANY_LINES = "float32[2] drivers\n" * 100_000
 HOSTILE = {"nested brackets": IDL_HEAD + NESTED, "many lines": MANY_LINES}
 
 
-def drive_beside(path, kinds, definition):
+def record_with_topics(path, kinds, definition):
     """A bag of wheels beside topics of types with this definition."""
     with bag(path) as maker:
         for k in range(50):
@@ -46,14 +46,14 @@ def parsed(monkeypatch):
 
 @pytest.mark.parametrize("definition", HOSTILE.values(), ids=HOSTILE)
 def test_a_definition_that_nobody_needs_is_not_parsed(tmp_path, parsed, definition):
-    path = drive_beside(tmp_path / "b", ["a_msgs/msg/Image", "b_msgs/msg/Cloud"], definition)
+    path = record_with_topics(tmp_path / "b", ["a_msgs/msg/Image", "b_msgs/msg/Cloud"], definition)
     assert read_rosbag(path, robot_config()).wheels.t_s.size == 50
     assert parsed == []
 
 
 @thinned("definition", HOSTILE.values(), ids=HOSTILE, quick=1)
 def test_needed_definitions_of_a_bag_are_given_up_after_half_a_second_together(tmp_path, parsed, definition):
-    path = drive_beside(tmp_path / "b", [f"a{k}_msgs/msg/Drive" for k in range(20)], definition)
+    path = record_with_topics(tmp_path / "b", [f"a{k}_msgs/msg/Drive" for k in range(20)], definition)
     drive = read_rosbag(path, robot_config())
     assert drive.wheels.t_s.size == 50
     assert "takes over 0.5 s to parse" in drive.notes[0]
@@ -64,7 +64,7 @@ def test_needed_definitions_of_a_bag_are_given_up_after_half_a_second_together(t
 
 
 def test_a_topic_that_was_asked_for_and_takes_too_long_is_one_line(tmp_path):
-    path = drive_beside(tmp_path / "b", ["a_msgs/msg/Drive"], HOSTILE["nested brackets"])
-    asked = msgspec.structs.replace(robot_config(), ros2=Ros2(command_topic="/cmd_drive0"))
+    path = record_with_topics(tmp_path / "b", ["a_msgs/msg/Drive"], HOSTILE["nested brackets"])
+    config = msgspec.structs.replace(robot_config(), ros2=Ros2(command_topic="/cmd_drive0"))
     with pytest.raises(LogError, match=r"/cmd_drive0: the bag's definition of a_msgs/msg/Drive takes over 0\.5 s"):
-        read_rosbag(path, asked)
+        read_rosbag(path, config)

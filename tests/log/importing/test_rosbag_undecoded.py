@@ -9,7 +9,7 @@ from tests.inference.drives import robot_config
 from tests.log.importing.bags import Maker, recorded
 from tests.tables import thinned
 
-WHOLE = 646
+MESSAGES = 646
 """Wheel samples of the drive."""
 
 
@@ -31,14 +31,14 @@ def record_damaged(path, monkeypatch, topic, every, storage="mcap"):
         recorded(path, storage)
 
 
-@thinned(("every", "lost", "is_warned"), [(10, 64, True), (200, 3, False), (3, 215, True)], quick=1)
-def test_a_message_that_cannot_be_decoded_is_left_out_and_counted(tmp_path, monkeypatch, every, lost, is_warned):
+@thinned(("every", "undecoded", "is_warned"), [(10, 64, True), (200, 3, False), (3, 215, True)], quick=1)
+def test_a_message_that_cannot_be_decoded_is_left_out_and_counted(tmp_path, monkeypatch, every, undecoded, is_warned):
     record_damaged(tmp_path / "b", monkeypatch, "/joint_states", every)
     drive = read_rosbag(tmp_path / "b", robot_config())
-    assert drive.wheels.t_s.size == WHOLE - lost
+    assert drive.wheels.t_s.size == MESSAGES - undecoded
     assert drive.poses.t_s.size == 309
     (note,) = (note for note in drive.notes if "cannot be decoded" in note)
-    assert f"/joint_states: {lost} of {WHOLE} messages" in note
+    assert f"/joint_states: {undecoded} of {MESSAGES} messages" in note
     assert note.startswith(WARNING) is is_warned
 
 
@@ -55,7 +55,7 @@ def test_a_topic_of_which_most_cannot_be_decoded_is_refused(tmp_path, monkeypatc
 def test_a_topic_of_which_no_message_can_be_decoded_is_not_chosen_and_named(tmp_path, monkeypatch):
     record_damaged(tmp_path / "b", monkeypatch, "/joint_states", 1)
     drive = read_rosbag(tmp_path / "b", robot_config())
-    assert drive.wheels.t_s.size == WHOLE
+    assert drive.wheels.t_s.size == MESSAGES
     assert "none of its messages can be decoded" in drive.notes[0]
     assert any("hides what that leaves out; record /joint_states" in note for note in drive.notes)
 
@@ -63,7 +63,7 @@ def test_a_topic_of_which_no_message_can_be_decoded_is_not_chosen_and_named(tmp_
 @thinned("topic", ["/rtabmap/odom", "/cmd_vel", "/tf", "/camera/image_raw"], quick=1)
 def test_damage_in_one_topic_costs_no_wheel_sample(tmp_path, monkeypatch, topic):
     record_damaged(tmp_path / "b", monkeypatch, topic, 5)
-    assert read_rosbag(tmp_path / "b", robot_config()).wheels.t_s.size == WHOLE
+    assert read_rosbag(tmp_path / "b", robot_config()).wheels.t_s.size == MESSAGES
 
 
 @thinned("share", [0.3, 0.6, 0.97], quick=1)
@@ -72,4 +72,4 @@ def test_a_sqlite3_file_is_read_to_its_damage(tmp_path, share):
     (path,) = (tmp_path / "b").glob("*.db3")
     size = path.stat().st_size
     path.write_bytes(path.read_bytes()[: int(share * size)])
-    assert read_rosbag(path, robot_config()).wheels.t_s.size > 0.9 * share * WHOLE
+    assert read_rosbag(path, robot_config()).wheels.t_s.size > 0.9 * share * MESSAGES
