@@ -8,7 +8,7 @@ import pytest
 
 from tests.tools.test_mujoco_robot import numbers
 from tools import strange_robot
-from tools.strange_robot import COMMANDS_PER_S, FORMS, NOMINAL, drawn, record
+from tools.strange_robot import COMMANDS_PER_S, FORMS, NOMINAL, record, sampled_parameters
 
 ROOT = Path(__file__).parents[2]
 
@@ -60,7 +60,7 @@ def test_every_form_is_drawn_within_its_ranges_and_moves_the_robot():
     plain = record(None, 5, command)
     for form, ranges in FORMS.items():
         recording = record(form, 5, command)
-        assert recording.values == drawn(form, 5)
+        assert recording.values == sampled_parameters(form, 5)
         assert all(low <= recording.values[name] <= high for name, (low, high) in ranges.items())
         assert np.abs(recording.truth - plain.truth).max() > 0.01, form
 
