@@ -210,6 +210,8 @@ class SelectionSettings:
     less may be chance."""
     fewest_blocks: int = 5
     """Fewer blocks say nothing about their scatter. Chosen."""
+    far_off: float = 1.5
+    """Where the accepted set costs so many times what is expected, plainer noise is assumed. Chosen."""
 
 
 @dataclass(frozen=True, slots=True)

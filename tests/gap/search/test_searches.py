@@ -263,8 +263,8 @@ def test_where_nothing_that_is_known_comes_near_the_noise_is_what_that_leaves(no
     drive = ((4, 4), (-3, 3), (0, 0), (2, 5)) * 5
 
     def searched(far_off):
-        choice = replace(DEFAULT_SETTINGS.noise, poor_fit=far_off)
-        line = wheels_of(drive=drive, settings=replace(DEFAULT_SETTINGS, noise=choice), motor_lag=0.15)
+        choice = replace(DEFAULT_SETTINGS.selection, far_off=far_off)
+        line = wheels_of(drive=drive, settings=replace(DEFAULT_SETTINGS, selection=choice), motor_lag=0.15)
         noted.selectors.clear()
         return search_wheels(line, np.array(GEOMETRY), WHEEL.neutral), len(noted.selectors)
 
