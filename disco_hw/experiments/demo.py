@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 import signal
+import socket
 import tempfile
 import threading
 import time
@@ -30,6 +31,7 @@ from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments import (
     DEVICES,
+    READY_TIMEOUT_S,
     Operator,
     disco_hw_process,
     is_stationary,
@@ -53,6 +55,8 @@ from disco_hw.viewer import DEFAULT_PORT, LOOPBACK, TOKEN_VARIABLE, page_address
 # Chosen: how often the picture in the terminal is drawn.
 _POLL_S = 0.1
 _STOP_TIMEOUT_S = 10.0
+# Chosen: a page starts in a few seconds, on a busy computer in ten.
+_PAGE_TIMEOUT_S = 20.0
 _STALL_MS = 100
 _PICTURE_ROWS = 14
 _STALL_LOOK_BACK_S = 0.5
@@ -241,9 +245,6 @@ def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
     ]  # fmt: skip
     # The daemon hands the variable on to its page.
     os.environ[TOKEN_VARIABLE] = token = page_token()
-    address = page_address(LOOPBACK, options.port, token)
-    if options.view:
-        console.print(f"page {address} (until the drive is over)", soft_wrap=True)
     daemon_arguments = ["run", str(files.robot), "--log", str(files.log), *_page(options), *_adapt(options)]
     with (
         disco_hw_process("virtual robot", simulator, files.simulator_output) as robot,
@@ -252,6 +253,11 @@ def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
         operator = Operator(files.socket, (robot, daemon))
         link = options.link if options.device is None else link_of_device(options.device)
         console.print(f"virtual robot pid {robot.process.pid}, daemon pid {daemon.process.pid}, link {link}")
+        if options.view:
+            operator.wait_for("READY", READY_TIMEOUT_S)
+            _wait_for_page(options.port)
+            address = page_address(LOOPBACK, options.port, token)
+            console.print(f"page {address} (until the drive is over)", soft_wrap=True)
         operator.arm()
         if options.obstacle:
             (x_m, y_m), radius_m = PILLAR.center, PILLAR.radius_m
@@ -267,6 +273,18 @@ def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
         if code != 0:
             raise WorkError(f"the daemon ended with exit code {code}: {daemon.last_line()}")
     return stopped
+
+
+def _wait_for_page(port: int) -> None:
+    """Return once the page answers, so that nobody opens it in vain, or after some seconds: the drive needs no page."""
+    deadline_s = time.monotonic() + _PAGE_TIMEOUT_S
+    while time.monotonic() < deadline_s:
+        try:
+            socket.create_connection((LOOPBACK, port), _POLL_S).close()
+        except OSError:
+            time.sleep(_POLL_S)
+        else:
+            return
 
 
 def _page(options: DemoOptions) -> list[str]:

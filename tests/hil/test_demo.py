@@ -5,7 +5,10 @@ from __future__ import annotations
 import os
 import re
 import signal
+import subprocess
+import sys
 import time
+import urllib.request
 from pathlib import Path
 from threading import Timer
 
@@ -14,6 +17,7 @@ import pytest
 from disco_hw.daemon import send_request
 from disco_hw.errors import WorkError
 from disco_hw.experiments import demo
+from tests.drivers.waiting import free_port
 
 pytestmark = pytest.mark.hil
 LEFT_ARMED = "the daemon left ARMED for (STOPPING|READY)"
@@ -115,3 +119,18 @@ def test_a_pillar_on_the_circle_is_driven_around_in_real_time(tmp_path):
     report = demo.run_demo(demo.DemoOptions(out=tmp_path, laps=0.6, obstacle=True))
     assert report.success
     assert report.left_at_pillar_m > 0.02
+
+
+@pytest.mark.thorough
+def test_the_page_answers_as_soon_as_its_address_is_printed(tmp_path):
+    command = [sys.executable, "-m", "disco_hw", "demo", "--view", "--laps", "0.5", "--port", str(free_port())]
+    with subprocess.Popen([*command, "--out", str(tmp_path)], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            address = next(line.split()[1] for line in process.stdout if line.startswith("page http"))
+            browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+            with browser.open(address, timeout=10.0) as response:
+                assert response.status == 200
+            process.communicate(timeout=120.0)
+        finally:
+            process.kill()
+    assert process.returncode == 0
