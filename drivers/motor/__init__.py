@@ -11,18 +11,23 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import import_module
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
 
 from drivers.types import (
     Driver,
+    DriverState,
+    DriverStats,
+    Identity,
+    Limits,
     MotorDriver,
     MotorSample,
     OutgoingFrame,
     Readings,
     ReceivedFrame,
+    Request,
     WheelCommand,
     WheelSample,
 )
@@ -114,15 +119,61 @@ AS_CONFIGURED = Wiring()
 
 
 class RewiredDriver:
-    """A driver behind a wiring; with `__getattr__` it satisfies `drivers.types.Driver`."""
+    """A driver behind a wiring; satisfies `drivers.types.Driver`."""
 
     def __init__(self, driver: Driver, wiring: Wiring) -> None:
         self._driver = driver
         self._wiring = wiring
 
-    def __getattr__(self, name: str) -> Any:
-        """Return what the wrapped driver has of this name: only wheels and motors differ with the wiring."""
-        return getattr(self._driver, name)
+    @property
+    def state(self) -> DriverState:
+        """State of the wrapped driver with its robot."""
+        return self._driver.state
+
+    @property
+    def detail(self) -> str:
+        """Text of the wrapped driver on why the state is what it is."""
+        return self._driver.detail
+
+    @property
+    def identity(self) -> Identity | None:
+        """Identity of the controller, from the wrapped driver."""
+        return self._driver.identity
+
+    @property
+    def limits(self) -> Limits | None:
+        """Limits of the controller, from the wrapped driver."""
+        return self._driver.limits
+
+    @property
+    def stats(self) -> DriverStats:
+        """Counters of the wrapped driver."""
+        return self._driver.stats
+
+    @property
+    def clock_offset_ns(self) -> int | None:
+        """Offset from the controller's clock to the host's monotonic clock, in ns, from the wrapped driver."""
+        return self._driver.clock_offset_ns
+
+    def link_up(self, now_ns: int) -> None:
+        """Tell the wrapped driver that the link is up."""
+        self._driver.link_up(now_ns)
+
+    def link_down(self, now_ns: int) -> None:
+        """Tell the wrapped driver that the link is down."""
+        self._driver.link_down(now_ns)
+
+    def request(self, request: Request) -> None:
+        """Pass a request to the wrapped driver."""
+        self._driver.request(request)
+
+    def release(self, why: str) -> None:
+        """Pass a release to the wrapped driver."""
+        self._driver.release(why)
+
+    def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
+        """Return the wrapped driver's e-stop frames, which are the same for any wiring."""
+        return self._driver.estop(now_ns)
 
     def receive(self, now_ns: int, frames: Sequence[ReceivedFrame]) -> Readings:
         """Return the readings of the wrapped driver, with the wheels as they are wired."""
@@ -154,8 +205,14 @@ class RewiredDriver:
         if wiring.sides_swapped != wiring.encoders_swapped:
             left, right = right, left
         on_left, on_right = (wiring.turn_ratio * direction for direction in wiring.encoder_direction)
-        angles, speeds = (on_left * left[0], on_right * right[0]), (on_left * left[1], on_right * right[1])
-        return WheelSample(sample.t_ns, sample.received_ns, *angles, *speeds)
+        return WheelSample(
+            sample.t_ns,
+            sample.received_ns,
+            on_left * left[0],
+            on_right * right[0],
+            on_left * left[1],
+            on_right * right[1],
+        )
 
     def _motors(self, sample: MotorSample) -> MotorSample:
         if not self._wiring.sides_swapped:
@@ -171,4 +228,4 @@ class RewiredDriver:
 
 def rewired(driver: Driver, wiring: Wiring) -> Driver:
     """Return the driver for wheels that are wired so; the driver itself where nothing is to be changed."""
-    return driver if wiring == AS_CONFIGURED else cast(Driver, RewiredDriver(driver, wiring))
+    return driver if wiring == AS_CONFIGURED else RewiredDriver(driver, wiring)

@@ -17,7 +17,6 @@ import msgspec
 
 from drivers.pose import PoseSourceError
 from drivers.pose.senders import SILENCE_S, SenderGate, parse_allowed
-from drivers.pose.udp import SocketPoses
 from drivers.types import PoseSample
 
 SOURCE = "natnet"
@@ -214,7 +213,7 @@ def create_pose_source(
     return NatNetPoses(opened, senders, server, VERSIONS[natnet_version], *settings)
 
 
-class NatNetPoses(SocketPoses):
+class NatNetPoses:
     """Satisfies `drivers.types.PoseSource` and `drivers.types.MessageSource`.
 
     With a server's address it asks that one once a second, which keeps a server that sends unicast going, and whose
@@ -232,14 +231,15 @@ class NatNetPoses(SocketPoses):
         position_std_m: float,
         yaw_std_rad: float,
     ) -> None:
-        super().__init__(opened, senders)
-        self._server, self._version, self._body, self._up_axis = server, version, body, up_axis
+        self._socket, self._senders, self._server = opened, senders, server
+        self._version, self._body, self._up_axis = version, body, up_axis
         self._stds = position_std_m, yaw_std_rad
         self._requested_ns: int | None = None
         self._ticks_per_s: float | None = None
         self._first: MotiveFrame | None = None
         self._state = ""
-        self.lost = 0
+        self._messages: list[str] = []
+        self.malformed = self.lost = 0
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
         """Return the poses received since the last call, oldest first; never waits and never raises."""
@@ -257,6 +257,15 @@ class NatNetPoses(SocketPoses):
                     self._senders.note_pose(sender, now_ns)
                     poses.append(pose)
         return sorted(poses, key=lambda pose: pose.t_ns)
+
+    def new_messages(self) -> Sequence[str]:
+        """Return messages for the operator since the last call."""
+        messages, self._messages = self._messages, []
+        return [*messages, *self._senders.new_messages()]
+
+    def close(self) -> None:
+        """Close the NatNet socket; safe to call twice."""
+        self._socket.close()
 
     def _request_info(self, now_ns: int) -> None:
         if not self._server or (self._requested_ns is not None and now_ns - self._requested_ns < _REQUEST_NS):

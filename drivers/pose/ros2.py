@@ -15,7 +15,7 @@ from typing import Any
 
 from drivers.pose import PoseSourceError
 from drivers.pose.senders import SILENCE_S, SenderGate
-from drivers.pose.udp import LONGEST_DATAGRAM, MOST_A_TICK, SocketPoses, message_of, pose_of
+from drivers.pose.udp import LONGEST_DATAGRAM, MOST_A_TICK, message_of, pose_of
 from drivers.types import PoseSample
 
 SOURCE = "ros2"
@@ -56,12 +56,15 @@ def create_pose_source(
     return BridgePoses(opened, SenderGate(sender_silence_s))
 
 
-class BridgePoses(SocketPoses):
+class BridgePoses:
     """Satisfies `drivers.types.PoseSource` and `drivers.types.MessageSource`."""
 
     def __init__(self, opened: socket.socket, senders: SenderGate) -> None:
-        super().__init__(opened, senders)
+        self._socket = opened
         self._users = {os.geteuid(), _ROOT}
+        self._senders = senders
+        self._messages: list[str] = []
+        self.malformed = 0
         self.foreign_users = 0
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
@@ -76,6 +79,15 @@ class BridgePoses(SocketPoses):
                 elif (pose := self._handle(datagram, f"bridge process {process}", now_ns)) is not None:
                     poses.append(pose)
         return sorted(poses, key=lambda pose: pose.t_ns)
+
+    def new_messages(self) -> Sequence[str]:
+        """Return messages for the operator since the last call."""
+        messages, self._messages = self._messages, []
+        return [*messages, *self._senders.new_messages()]
+
+    def close(self) -> None:
+        """Close the bridge's socket; safe to call twice."""
+        self._socket.close()
 
     def _handle(self, datagram: bytes, sender: str, now_ns: int) -> PoseSample | None:
         if not self._senders.may_send(sender, now_ns):

@@ -85,31 +85,14 @@ def create_pose_source(
     return UdpPoses(opened, SenderGate(sender_silence_s, allowed), proof)
 
 
-class SocketPoses:
-    """Base of the pose sources that read datagrams from a socket; `malformed` counts those that hold no pose."""
-
-    def __init__(self, opened: socket.socket, senders: SenderGate) -> None:
-        self._socket = opened
-        self._senders = senders
-        self._messages: list[str] = []
-        self.malformed = 0
-
-    def new_messages(self) -> Sequence[str]:
-        """Return messages for the operator since the last call."""
-        messages, self._messages = self._messages, []
-        return [*messages, *self._senders.new_messages()]
-
-    def close(self) -> None:
-        """Close the socket; safe to call twice."""
-        self._socket.close()
-
-
-class UdpPoses(SocketPoses):
+class UdpPoses:
     """Satisfies `drivers.types.PoseSource` and `drivers.types.MessageSource`."""
 
     def __init__(self, opened: socket.socket, senders: SenderGate, proof: PoseProof | None = None) -> None:
-        super().__init__(opened, senders)
+        self._socket = opened
+        self._senders = senders
         self._proof = proof
+        self.malformed = 0
 
     @property
     def refused(self) -> int:
@@ -125,6 +108,14 @@ class UdpPoses(SocketPoses):
                 if pose is not None:
                     poses.append(pose)
         return sorted(poses, key=lambda pose: pose.t_ns)
+
+    def new_messages(self) -> Sequence[str]:
+        """Return messages for the operator since the last call."""
+        return self._senders.new_messages()
+
+    def close(self) -> None:
+        """Close the UDP socket; safe to call twice."""
+        self._socket.close()
 
     def _handle(self, datagram: bytes, sender: tuple[str, int], now_ns: int) -> PoseSample | None:
         """Return the pose in a datagram, if its sender counts; the cheap checks first, as anybody can send many."""

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 
-from drivers.transport.reconnecting import RECEIVE_CAPACITY, TransportStatus
-from drivers.types import LinkState, OutgoingFrame, ReceivedFrame
+from drivers.transport.reconnecting import RECEIVE_CAPACITY, TransportCounters
+from drivers.types import LinkState, OutgoingFrame, ReceivedFrame, TransportStats
 
 # As of a real link, so that an overflow shows in tests as it would there.
 QUEUE_CAPACITY = RECEIVE_CAPACITY
 
 
-class InProcessTransport(TransportStatus):
+class InProcessTransport:
     """One end of a pair; what one end sends the other receives at once, stamped with the sender's `now_ns`.
 
     Satisfies `drivers.types.Transport`. `connect_pair` makes the two ends; the link is up while both are open and it is
@@ -19,16 +20,40 @@ class InProcessTransport(TransportStatus):
     """
 
     def __init__(self, name: str) -> None:
-        super().__init__()
         self._name = name
+        self._counters = TransportCounters()
         self._peer: InProcessTransport | None = None
         self._open = False
         self._plugged = True
+        self._state = LinkState.CLOSED
+        self._generation = 0
+        self._last_error: str | None = None
+        self._incoming: deque[ReceivedFrame] = deque()
 
     @property
     def name(self) -> str:
         """Name given to this end."""
         return self._name
+
+    @property
+    def state(self) -> LinkState:
+        """Whether frames can be carried now."""
+        return self._state
+
+    @property
+    def generation(self) -> int:
+        """Number of times the link has come up."""
+        return self._generation
+
+    @property
+    def stats(self) -> TransportStats:
+        """A snapshot of the counters."""
+        return self._counters.snapshot()
+
+    @property
+    def last_error(self) -> str | None:
+        """The newest error in words, or None if there was none since the link last came up."""
+        return self._last_error
 
     def open(self) -> None:
         """Connect as soon as the other end is open too."""

@@ -187,15 +187,57 @@ class Medium(Protocol):
         """Say in one line what the error means and what to do."""
 
 
-class TransportStatus:
-    """What a transport reports of itself (see `drivers.types.Transport`): base of the transports, which fill it in."""
+class ReconnectingTransport:
+    """A `drivers.types.Transport` over any medium, which it connects again with back-off whenever it is lost.
 
-    def __init__(self) -> None:
+    Whatever waits to be sent when the link is lost is dropped: nothing old is ever sent on a new link. A frame leaves
+    in the order of `TransmitQueue`, and is dropped when its deadline has passed or when it does not fit the queue.
+    """
+
+    def __init__(
+        self,
+        medium: Medium,
+        *,
+        backoff: BackoffPolicy = DEFAULT_BACKOFF,
+        mute_after_s: float | None = None,
+        carries_extended: bool = False,
+        carries_packets: bool = False,
+    ) -> None:
+        """Create a transport that is closed.
+
+        `mute_after_s`: a link on which no frame comes for so long is closed and connected again; None: never.
+
+        `carries_extended`: whether the medium has frames with 29-bit identifiers; `carries_packets`: whether it has
+        none, but packets of up to 512 bytes.
+        """
+        self._medium = medium
+        self._largest = (
+            MAX_EXTENDED_ID if carries_packets else MAX_CAN_ID,
+            MAX_EXTENDED_ID if carries_extended or carries_packets else -1,
+        )
+        self._most_data = _MOST_PACKET if carries_packets else MAX_DATA
+        self._backoff = backoff
+        self._mute_after_s = mute_after_s
+        self._patience_s = mute_after_s
+        self._mute_reason: str | None = None
         self._counters = TransportCounters()
+        self._changed = threading.Condition()
+        self._writing = threading.Lock()
         self._state = LinkState.CLOSED
         self._generation = 0
         self._last_error: str | None = None
+        self._connection: Connection | None = None
+        self._outgoing = TransmitQueue(TRANSMIT_CAPACITY)
+        self._sending = False
         self._incoming: deque[ReceivedFrame] = deque()
+        self._stop = threading.Event()
+        self._lost = threading.Event()
+        self._threads: tuple[threading.Thread, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Medium and address, for messages to the operator."""
+        return self._medium.name
 
     @property
     def state(self) -> LinkState:
@@ -219,55 +261,6 @@ class TransportStatus:
         That it was mute, and so was connected again, is said until a frame comes.
         """
         return self._last_error
-
-
-class ReconnectingTransport(TransportStatus):
-    """A `drivers.types.Transport` over any medium, which it connects again with back-off whenever it is lost.
-
-    Whatever waits to be sent when the link is lost is dropped: nothing old is ever sent on a new link. A frame leaves
-    in the order of `TransmitQueue`, and is dropped when its deadline has passed or when it does not fit the queue.
-    """
-
-    def __init__(
-        self,
-        medium: Medium,
-        *,
-        backoff: BackoffPolicy = DEFAULT_BACKOFF,
-        mute_after_s: float | None = None,
-        carries_extended: bool = False,
-        carries_packets: bool = False,
-    ) -> None:
-        """Create a transport that is closed.
-
-        `mute_after_s`: a link on which no frame comes for so long is closed and connected again; None: never.
-
-        `carries_extended`: whether the medium has frames with 29-bit identifiers; `carries_packets`: whether it has
-        none, but packets of up to 512 bytes.
-        """
-        super().__init__()
-        self._medium = medium
-        self._largest = (
-            MAX_EXTENDED_ID if carries_packets else MAX_CAN_ID,
-            MAX_EXTENDED_ID if carries_extended or carries_packets else -1,
-        )
-        self._most_data = _MOST_PACKET if carries_packets else MAX_DATA
-        self._backoff = backoff
-        self._mute_after_s = mute_after_s
-        self._patience_s = mute_after_s
-        self._mute_reason: str | None = None
-        self._changed = threading.Condition()
-        self._writing = threading.Lock()
-        self._connection: Connection | None = None
-        self._outgoing = TransmitQueue(TRANSMIT_CAPACITY)
-        self._sending = False
-        self._stop = threading.Event()
-        self._lost = threading.Event()
-        self._threads: tuple[threading.Thread, ...] = ()
-
-    @property
-    def name(self) -> str:
-        """Medium and address, for messages to the operator."""
-        return self._medium.name
 
     def open(self) -> None:
         """Start both threads and the first connection attempt; return at once.
