@@ -42,7 +42,7 @@ from disco_hw.gap.search.cross_validation import (
     scored_horizon_s,
     smoothed_poses,
 )
-from disco_hw.gap.search.selection import Z95
+from disco_hw.gap.search.evidence import Z95
 from disco_hw.gap.search.unnamed_terms import with_known_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.log.drive import DriveLog, concatenate

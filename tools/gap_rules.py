@@ -23,7 +23,8 @@ from disco_hw.gap.search import (
     channel_search,
     selection,
 )
-from disco_hw.gap.search.selection import EffectEvidence, Selector
+from disco_hw.gap.search.evidence import EffectEvidence
+from disco_hw.gap.search.selection import Selector
 
 Answer = Callable[..., Any]
 

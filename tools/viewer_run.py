@@ -7,7 +7,7 @@ import disco_hw
 from disco_hw.files import MODEL_TOML as MODEL_KIND
 from disco_hw.files import ROBOT_TOML as ROBOT_KIND
 from disco_hw.log import MODEL_TOML, ROBOT_TOML, attachment, records
-from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
+from disco_hw.log.process_recorder import ProcessRecorder, RecordingSettings
 from drivers.types import PoseSample, PowerSample, RobotLinkHealth, RobotStatus, WheelSample
 
 ROBOT_FILE = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"

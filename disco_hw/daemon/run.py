@@ -37,7 +37,8 @@ from disco_hw.daemon.process import STANDARD_OUTPUT, AsyncPrinter, StopPath, Sto
 from disco_hw.errors import InputError, LogError
 from disco_hw.files import check_log_file, file_name_of
 from disco_hw.log import DBC, Attachment, version
-from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, RecordingSettings
+from disco_hw.log.process_recorder import ProcessRecorder, RecordingSettings
+from disco_hw.log.recorder import NullRecorder, Recorder
 from disco_hw.processes import end_with_parent
 from disco_hw.runtime import AdviceStyle, by_command
 from disco_hw.runtime.assembly import (

@@ -22,7 +22,8 @@ from disco_hw.control.plan import Law, LawController
 from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments.virtual import true_parameters
 from disco_hw.log import MODEL_TOML, Attachment
-from disco_hw.log.recorder import MemoryRecorder, ProcessRecorder, RecordingSettings
+from disco_hw.log.process_recorder import ProcessRecorder, RecordingSettings
+from disco_hw.log.recorder import MemoryRecorder
 from disco_hw.model import model_text
 from disco_hw.reports import refuse_file
 from disco_hw.runtime.assembly import (

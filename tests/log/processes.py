@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.log.recorder import RecordingSettings
+from disco_hw.log.process_recorder import RecordingSettings
 from tools.log_samples import ATTACHMENTS, tick
 
 _RECORD = """
 import sys, time
 from pathlib import Path
-from disco_hw.log.recorder import ProcessRecorder
+from disco_hw.log.process_recorder import ProcessRecorder
 from tests.log.processes import recording
 from tools.log_samples import tick
 recorder = ProcessRecorder(recording(Path(sys.argv[1])))

@@ -13,7 +13,7 @@ PROGRAM = """
 import sys
 from pathlib import Path
 from disco_hw.log.reader import open_log
-from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
+from disco_hw.log.process_recorder import ProcessRecorder, RecordingSettings
 from disco_hw.log.records import Temperature
 
 log = Path(sys.argv[1])

@@ -10,15 +10,9 @@ import pytest
 
 from disco_hw.errors import LogError
 from disco_hw.log.log_command import info
+from disco_hw.log.process_recorder import ProcessRecorder, wall_offset_ns
 from disco_hw.log.reader import open_log
-from disco_hw.log.recorder import (
-    MemoryRecorder,
-    NullRecorder,
-    ProcessRecorder,
-    Recorder,
-    RecorderStats,
-    wall_offset_ns,
-)
+from disco_hw.log.recorder import MemoryRecorder, NullRecorder, Recorder, RecorderStats
 from disco_hw.log.records import Event
 from tests.log.processes import alive, drive, recording, size, wait_until
 from tools.log_samples import ATTACHMENTS, bits, tick

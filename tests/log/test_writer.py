@@ -15,8 +15,8 @@ import pytest
 from disco_hw.errors import LogError
 from disco_hw.log import writer
 from disco_hw.log.log_command import info
+from disco_hw.log.process_recorder import ProcessRecorder
 from disco_hw.log.reader import open_log
-from disco_hw.log.recorder import ProcessRecorder
 from tests.log.processes import RecordingProcess, SmallDisk, alive, drive, recording, size, wait_until
 
 

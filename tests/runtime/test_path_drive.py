@@ -8,7 +8,8 @@ import pytest
 from disco_hw.daemon.control_socket import loop_figures, status
 from disco_hw.daemon.loop import LoopStats
 from disco_hw.log import Attachment
-from disco_hw.log.recorder import ProcessRecorder, RecorderStats, RecordingSettings
+from disco_hw.log.process_recorder import ProcessRecorder, RecordingSettings
+from disco_hw.log.recorder import RecorderStats
 from disco_hw.runtime import State
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay

@@ -13,7 +13,7 @@ from disco_hw.control.optimiser import Optimiser
 from disco_hw.control.past_motion import DriveMeans
 from disco_hw.errors import InputError
 from disco_hw.log import MODEL_TOML, ROBOT_TOML, Attachment
-from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
+from disco_hw.log.process_recorder import ProcessRecorder, RecordingSettings
 from disco_hw.log.records import UnexplainedMotion
 from disco_hw.model import EffectSetting, load_model, save_model
 from disco_hw.runtime.pipeline import Source

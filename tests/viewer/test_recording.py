@@ -1,7 +1,7 @@
 import pytest
 
 from disco_hw.errors import InputError
-from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
+from disco_hw.log.process_recorder import ProcessRecorder, RecordingSettings
 from disco_hw.viewer.recording import Recording
 from tools.viewer_run import ROBOT_FILE, plan_at, pose_at, tick_records
 

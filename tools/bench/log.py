@@ -14,8 +14,8 @@ import numpy as np
 from disco_hw.log import batch_encoder
 from disco_hw.log.log_command import recover_log
 from disco_hw.log.mcap_log import McapLog
+from disco_hw.log.process_recorder import ProcessRecorder, RecordingSettings
 from disco_hw.log.reader import open_log
-from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
 from disco_hw.log.records import Command, Estimate, FrameIn, FrameOut, Innovation, LoopTiming, Plan, Record
 from disco_hw.log.writer import LogFile, Start
 from drivers.types import PoseSample, WheelSample

@@ -24,7 +24,7 @@ from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.log import MODEL_TOML, ROBOT_TOML, Attachment, version
-from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
+from disco_hw.log.process_recorder import ProcessRecorder, RecordingSettings
 from disco_hw.log.records import BeliefChange, FrameIn, FrameOut
 from disco_hw.runtime.assembly import apply_geometry, create_planner
 from disco_hw.runtime.pipeline import NoPlanner, Planner

@@ -13,7 +13,7 @@ from disco_hw.effects import Stage
 from disco_hw.gap.search.analysis import FinalFit, GapAnalysis
 from disco_hw.gap.search.channel_result import ChannelEstimates, ParameterEstimate, UnnamedTerm
 from disco_hw.gap.search.end_to_end import Freed, JointFit, Part
-from disco_hw.gap.search.selection import Z95
+from disco_hw.gap.search.evidence import Z95
 from disco_hw.gap.search.unnamed_terms import Term
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model.model import BASE_PARAMETERS, within_ranges

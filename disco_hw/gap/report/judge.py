@@ -37,8 +37,8 @@ from disco_hw.gap.search.channel_result import (
     in_equal_parts,
     in_logs,
 )
+from disco_hw.gap.search.evidence import Z95
 from disco_hw.gap.search.richest_model import candidates_of, parameters_of
-from disco_hw.gap.search.selection import Z95
 from disco_hw.gap.settings import GRID_STEP_S, ReportSettings
 from disco_hw.model.terms import TERMS
 

@@ -17,9 +17,9 @@ from disco_hw.effects import Channel
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.search.channel_result import ChannelEstimates, ChannelResult, ParameterEstimate, estimate_parameters
+from disco_hw.gap.search.evidence import inflation
 from disco_hw.gap.search.least_squares import Fit, fit
 from disco_hw.gap.search.richest_model import DELAY_NAMES, indices
-from disco_hw.gap.search.selection import inflation
 from disco_hw.gap.settings import SelectionSettings
 
 Array = NDArray[np.float64]

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
+from disco_hw.gap.search.evidence import Z95, EffectEvidence, inflation, interval_inflation
 from disco_hw.gap.search.least_squares import Fit, by_block, fit, inverse, within
 from disco_hw.gap.search.richest_model import CANDIDATES, delay_columns, indices
-from disco_hw.gap.search.selection import Z95, EffectEvidence, Names, Selector, inflation, interval_inflation
+from disco_hw.gap.search.selection import Names, Selector
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms
 
 Array = NDArray[np.float64]

@@ -18,6 +18,7 @@ from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise, whiten_wheels
 from disco_hw.gap.search.channel_result import ChannelResult, UnnamedTerm
+from disco_hw.gap.search.evidence import compare
 from disco_hw.gap.search.least_squares import Fit, fit, inverse
 from disco_hw.gap.search.richest_model import (
     DELAY_COLUMNS,
@@ -32,14 +33,7 @@ from disco_hw.gap.search.richest_model import (
     smooth_of,
     with_delay,
 )
-from disco_hw.gap.search.selection import (
-    Names,
-    Selector,
-    Thresholds,
-    body_moves,
-    compare,
-    wheel_moves,
-)
+from disco_hw.gap.search.selection import Names, Selector, Thresholds, body_moves, wheel_moves
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms, body_terms, places, places_near, wheel_terms
 from disco_hw.gap.settings import SelectionSettings
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from disco_hw.gap.search.evidence import EffectEvidence, compare, held_out_by_block, inflation, interval_inflation
 from disco_hw.gap.search.least_squares import Fit
-from disco_hw.gap.search.selection import EffectEvidence, compare, held_out_by_block, inflation, interval_inflation
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from tests.tables import thinned
 

@@ -12,9 +12,10 @@ from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search import selection
+from disco_hw.gap.search.evidence import EffectEvidence
 from disco_hw.gap.search.least_squares import Fit, fit
 from disco_hw.gap.search.richest_model import CANDIDATES, DELAY_NAMES, candidates_of, indices
-from disco_hw.gap.search.selection import EffectEvidence, Selector, Thresholds, body_moves, wheel_moves
+from disco_hw.gap.search.selection import Selector, Thresholds, body_moves, wheel_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from tests.gap.synthetic import GEOMETRY, LIMITS, body_channel, line_of
 

@@ -8,9 +8,10 @@ import pytest
 
 from disco_hw.gap.data import BODY
 from disco_hw.gap.search import selection
+from disco_hw.gap.search.evidence import EffectEvidence
 from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.richest_model import candidates_of
-from disco_hw.gap.search.selection import EffectEvidence, Selector
+from disco_hw.gap.search.selection import Selector
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from tests.gap.synthetic import LIMITS
 

@@ -10,8 +10,9 @@ from disco_hw.gap import find_gap
 from disco_hw.gap.search import channel_search
 from disco_hw.gap.search.channel_result import ChannelResult, UnnamedTerm
 from disco_hw.gap.search.channel_search import best_terms, that_models_hold, with_unnamed
+from disco_hw.gap.search.evidence import EffectEvidence
 from disco_hw.gap.search.least_squares import fit
-from disco_hw.gap.search.selection import EffectEvidence, Selector, body_moves
+from disco_hw.gap.search.selection import Selector, body_moves
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms, motion
 from disco_hw.model import Model, load_model, save_model
 from tests.gap.search.another_drive import another_drive, errors_ahead, without_terms

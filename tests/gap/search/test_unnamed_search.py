@@ -20,8 +20,9 @@ from disco_hw.gap.search.channel_search import (
     that_models_hold,
     with_unnamed,
 )
+from disco_hw.gap.search.evidence import EffectEvidence
 from disco_hw.gap.search.least_squares import Fit
-from disco_hw.gap.search.selection import EffectEvidence, Selector, Thresholds, body_moves
+from disco_hw.gap.search.selection import Selector, Thresholds, body_moves
 from disco_hw.gap.search.unnamed_terms import Term
 from disco_hw.gap.settings import DEFAULT_SETTINGS, SelectionSettings
 from tests.gap.synthetic import LIMITS, NOISE, body_channel
