@@ -1,27 +1,23 @@
-"""Run a plant under a drive in simulated time and write what a host would have logged, as CSV.
+"""Logs that a host would have of a plant under a drive, in simulated time, and the same as CSV.
 
 One row per event, sorted by time stamp; empty cells mean "no sample at that time". The truth stays out of the log.
 """
 
 from __future__ import annotations
 
-import argparse
 import csv
-import json
-import math
-import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from sim.effects import HiddenEffects, effects_table, parse_hidden_effects
+from sim.effects import HiddenEffects
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
 from sim.sensors import PoseMeasurement
-from tools.simulated_drives import DRIVES, ScriptedDrive, Vehicle, create_drive
+from tools.simulated_drives import ScriptedDrive
 
 COLUMNS = (
     "t_s",
@@ -189,80 +185,3 @@ def _row(
     tick_cells = ("", "") if ticks is None else (str(ticks[0]), str(ticks[1]))
     pose_cells = ("", "", "") if pose is None else (f"{pose.x_m:.5f}", f"{pose.y_m:.5f}", f"{pose.yaw_rad:.6f}")
     return t_s, (f"{t_s:.6f}", *command_cells, *tick_cells, *pose_cells)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line of this module; returns the exit code (2 on bad input)."""
-    options = _parser().parse_args(arguments)
-    try:
-        effects = parse_hidden_effects(options.hide)
-        drive = create_drive(options.drive, options.seed, Vehicle(options.max_wheel_speed))
-        parameters = _parameters(options)
-    except ValueError as error:
-        print(f"simulated_log: {error}", file=sys.stderr)
-        return 2
-    log_options = dirty_log_options() if options.dirty else LogOptions()
-    rows = simulated_log(drive, parameters, effects, options.seed, log_options)
-    try:
-        write_csv(options.output, rows)
-        if options.truth is not None:
-            options.truth.write_text(_truth(parameters, effects), encoding="utf-8")
-    except OSError as error:
-        print(
-            f"simulated_log: {error.filename}: cannot be written ({error.strerror}); give another path", file=sys.stderr
-        )
-        return 2
-    print(f"{options.output}: {len(rows)} rows, {drive.duration_s:.0f} s of {drive.name}")
-    return 0
-
-
-def _truth(parameters: PlantParameters, effects: HiddenEffects) -> str:
-    """Return the true parameters and effects as JSON; a limit that does not exist is null."""
-    finite = {name: value if math.isfinite(value) else None for name, value in asdict(parameters).items()}
-    return json.dumps({"effects": dict(effects.items), "parameters": finite}, indent=1)
-
-
-def _parameters(options: argparse.Namespace) -> PlantParameters:
-    parameters = PlantParameters(
-        wheel_radius_m=options.wheel_radius, axial_distance_m=options.axial_distance, x_icr_m=options.x_icr
-    )
-    if options.vary:
-        parameters = varied_parameters(parameters, options.seed)
-    if options.motors == "ideal":
-        parameters = parameters.with_ideal_motors()
-    return dirty_parameters(parameters) if options.dirty else parameters
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m tools.simulated_log",
-        description=(__doc__ or "").split("\n\n", maxsplit=1)[0],
-        epilog=f"effects for --hide (NAME=VALUE or NAME=VALUE,VALUE):\n\n{effects_table()}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    nominal = PlantParameters()
-    parser.add_argument("output", type=Path, help="CSV file to write")
-    parser.add_argument("--drive", default="rich", metavar="NAME", help=f"one of {', '.join(DRIVES)} (rich)")
-    parser.add_argument("--seed", type=int, default=0, help="decides drive, disturbances, noise and time stamps (0)")
-    parser.add_argument("--hide", action="append", default=[], metavar="EFFECT=VALUE", help="hidden effect; repeatable")
-    parser.add_argument(
-        "--motors",
-        choices=("ideal", "real"),
-        default="ideal",
-        help="ideal: wheels turn as commanded, so that nothing is hidden but what --hide says; real: with the lag, "
-        "limits and load of the simulated motors (ideal)",
-    )
-    parser.add_argument("--dirty", action="store_true", help="outliers, lost poses, bursts, wander, bad time stamps")
-    parser.add_argument("--vary", action="store_true", help="a robot off its drawing: geometry drawn around the given")
-    parser.add_argument("--wheel-radius", type=float, default=nominal.wheel_radius_m, help="m (%(default)s)")
-    parser.add_argument("--axial-distance", type=float, default=nominal.axial_distance_m, help="m (%(default)s)")
-    parser.add_argument("--x-icr", type=float, default=nominal.x_icr_m, help="m (%(default)s)")
-    parser.add_argument(
-        "--max-wheel-speed", type=float, default=8.0, help="what the drive may ask, rad/s (%(default)s)"
-    )
-    parser.add_argument("--truth", type=Path, metavar="FILE", help="write what is true to this JSON file, for scoring")
-    return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

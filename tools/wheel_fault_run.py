@@ -238,12 +238,8 @@ class WheelFaultRun:
         kind, values = FAULTS[run.fault]
         fault = ScheduledFault(0, KINDS[kind], 0, _FOREVER_NS, {"wheel": run.side, **values})
         self.board.faults.set_active([fault])
-        side = ("left", "right").index(run.side)
         begun_us, shows_us, travel, last_us = self.stack.now_us, None, 0.0, self.stack.now_us
         stood_us: int | None = None
-        step_us = 2000
-        core = self.stack.core
-        self.board.faults.set_active([fault])
         for tick in self.stack.ticks(seconds):
             now_us = self.stack.now_us
             truth = self.board.truth
@@ -266,5 +262,4 @@ class WheelFaultRun:
                 return run
         if stood_us is None:
             run.stopped_s, run.travel_rad = math.nan, travel
-        del side, step_us, core
         return run

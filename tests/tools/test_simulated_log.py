@@ -1,16 +1,13 @@
-"""Logs as a host would write them: form, consistency with the physics, dirt, and the command line."""
+"""Logs as a host would write them: form, consistency with the physics, and dirt."""
 
 import csv
-import json
 import math
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from sim.effects import EFFECTS, hidden_effects
+from sim.effects import hidden_effects
 from sim.plant_parameters import PlantParameters
 from tools.simulated_drives import create_drive
 from tools.simulated_log import (
@@ -18,7 +15,6 @@ from tools.simulated_log import (
     LogOptions,
     dirty_log_options,
     dirty_parameters,
-    main,
     simulated_log,
     varied_parameters,
     write_csv,
@@ -136,47 +132,6 @@ def test_the_file_has_the_columns_and_nothing_of_the_truth(tmp_path):
     assert tuple(header) == COLUMNS
     assert all(len(row) == len(COLUMNS) for row in rows)
     assert "slip" not in (tmp_path / "log.csv").read_text()
-
-
-def test_the_command_writes_log_and_truth(tmp_path, capsys):
-    log, truth = tmp_path / "log.csv", tmp_path / "truth.json"
-    arguments = [str(log), "--drive", "poor", "--seed", "4", "--hide", "turn_slip=0.1", "--hide", "wheel_gain=0.02,0"]
-    assert main([*arguments, "--vary", "--truth", str(truth)]) == 0
-    assert "rows" in capsys.readouterr().out
-    reported = json.loads(truth.read_text(), parse_constant=pytest.fail)
-    assert reported["effects"] == {"turn_slip": [0.1], "wheel_gain": [0.02, 0.0]}
-    assert reported["parameters"]["wheel_radius_m"] == varied_parameters(PlantParameters(), 4).wheel_radius_m
-    assert reported["parameters"]["max_motor_torque_nm"] is None
-    before = log.read_bytes()
-    assert main([*arguments, "--vary"]) == 0
-    assert log.read_bytes() == before
-    assert main([*arguments, "--vary", "--motors", "real"]) == 0
-    assert log.read_bytes() != before
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected_error"),
-    [
-        (["--hide", "turnslip=0.1"], "turn_slip"),
-        (["--hide", "motor_lag=-1"], "motor_lag"),
-        (["--drive", "round"], "circle"),
-        (["--wheel-radius", "0"], "wheel_radius_m"),
-        (["--max-wheel-speed", "nan"], "max_wheel_speed"),
-        (["--drive", "poor", "--truth", "no/such/folder/truth.json"], "truth.json"),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_code_2(tmp_path, capsys, arguments, expected_error):
-    assert main([str(tmp_path / "log.csv"), *arguments]) == 2
-    error = capsys.readouterr().err
-    assert expected_error in error
-    assert error.count("\n") == 1
-
-
-def test_help_runs_as_a_module_and_lists_every_effect():
-    done = subprocess.run(
-        [sys.executable, "-m", "tools.simulated_log", "--help"], capture_output=True, text=True, timeout=60, check=True
-    )
-    assert all(f"{name}=" in done.stdout for name in EFFECTS)
 
 
 def test_noise_of_a_resting_robot_is_the_sensors():

@@ -72,8 +72,3 @@ def _percentiles(name: str, times_us: np.ndarray) -> dict[str, float]:
         f"{name}.{label}": float(np.percentile(times_us, percent))
         for label, percent in (("p50", 50.0), ("p99", 99.0), ("p99.9", 99.9))
     }
-
-
-if __name__ == "__main__":
-    for key, value in run().items():
-        print(f"{key} {value:.1f}")

@@ -13,8 +13,8 @@ from disco_hw.inference.infer import Inference, infer, noise_of
 from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds
 from disco_hw.log.drive import DriveLog
 from disco_hw.model import Model
+from tools.bench.sbi_scores import PEERS, paired, scores
 from tools.study.infer_study import config, logged, plant
-from tools.study.sharpness import PEERS, paired, scores
 
 SEED = 5
 SIMULATIONS = 300
@@ -46,7 +46,7 @@ def run() -> dict[str, float]:
 
 
 def log_scores(result: Inference) -> dict[str, float]:
-    """Mean log scores of the posteriors on fresh simulations (`tools.study.sharpness`): ours, and how far it is ahead.
+    """Mean log scores of the posteriors on fresh simulations (`tools.bench.sbi_scores`): ours, and how far it is ahead.
 
     Ahead of sbi's, with the standard error, also before the posteriors are cut to their region. Without sbi only ours.
     """
@@ -81,8 +81,3 @@ def reference_sd(log: DriveLog, truth: np.ndarray) -> np.ndarray:
     jacobian = np.array(slopes).T
     precision = jacobian.T @ np.linalg.inv(np.cov(here.T)) @ jacobian
     return np.sqrt(np.diag(np.linalg.inv(precision)))
-
-
-if __name__ == "__main__":
-    for name, value in run().items():
-        print(f"{name} {value:.4g}")

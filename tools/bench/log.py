@@ -124,8 +124,3 @@ def _milliseconds(work: Callable[[], object]) -> float:
 
 def _quantile(values: Sequence[float], share: float) -> float:
     return float(np.quantile(values, share))
-
-
-if __name__ == "__main__":
-    for key, value in run().items():
-        print(f"{key:<32} {value:10.3f}")

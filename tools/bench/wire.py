@@ -57,8 +57,3 @@ def run(count: int = 20_000) -> dict[str, float]:
         figures["wire.core_cmac_us.p50"] / figures["wire.cryptography_cmac_us.p50"]
     )
     return figures
-
-
-if __name__ == "__main__":
-    for name, value in run().items():
-        print(f"{name} {value:.2f}")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from disco_hw.inference.density_network import Mixtures, Region
-from tools.study.sharpness import _least_squares, _log_inside, compared, paired, summary
+from tools.bench.sbi_scores import _log_inside, paired
 
 BOX = Region.box(np.full(3, -1.0), np.ones(3))
 
@@ -33,23 +33,3 @@ def test_a_paired_difference_has_the_error_of_its_differences():
     mean, error = paired(common + off, common)
     assert mean == pytest.approx(0.2)
     assert error == pytest.approx(0.1 / np.sqrt(1000), rel=0.01)
-
-
-def test_what_statistics_point_to_is_found_whatever_their_scale():
-    rng = np.random.default_rng(0)
-    unit = rng.uniform(-1.0, 1.0, (300, 3))
-    statistics = unit @ rng.standard_normal((3, 3)) * (1.0, 1e-3, 1e3) + 7.0
-    assert _least_squares(unit[:200], statistics[:200], statistics[200:]) == pytest.approx(unit[200:], abs=1e-9)
-
-
-def test_each_way_of_looking_compares_its_own_scores():
-    zero, ends = np.zeros(4), np.array([1.0, 0.0, 0.0, 1.0])
-    found = {"central": ends, "ours": zero + 3.0, "nsf": zero, "ours_raw": 1.0 + ends, "nsf_raw": zero}
-    given = {name: mean for name, (mean, _) in compared(found, "nsf").items()}
-    assert given == {"as posteriors, nsf": 3.0, "as they come out, nsf": 1.5, "the same, near the log, nsf": 2.0}
-
-
-def test_the_summary_has_the_error_over_the_robots():
-    one, two = summary({"a": [0.1], "b": [0.1, 0.3]})
-    assert "+0.1000 +- nan over 1 robots" in one
-    assert "+0.2000 +- 0.1000 over 2 robots, +0.1000 to +0.3000" in two
