@@ -109,13 +109,13 @@ bench: $(PEERS)/.installed
 	$(PEERS)/bin/python -m tools.bench $(PARTS)
 
 gap-study: $(STAMP)
-	$(BIN)/python -m $(if $(filter mujoco,$(KIND)),tools.gap_mujoco,tools.gap_study $(KIND))
+	$(BIN)/python -m $(if $(filter mujoco,$(KIND)),tools.gap.mujoco,tools.gap.study $(KIND))
 
 soak: $(STAMP)
 	$(BIN)/python -m tools.check.soak --minutes 30
 
 fault-campaign: $(STAMP)
-	$(BIN)/python -m tools.fault_campaign --seeds 100 --hours 1
+	$(BIN)/python -m tools.faults.campaign --seeds 100 --hours 1
 
 # The tests of properties, too, with new examples.
 PROPERTY_TESTS = $$(grep -rl hypothesis tests --include=test_*.py)

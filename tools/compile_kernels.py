@@ -30,7 +30,7 @@ from disco_hw.tasks import task_from
 from disco_hw.tasks.circle import CircleCost
 from disco_hw.tasks.line import Waypoints
 from disco_hw.tasks.timed_path import TimedPathCost
-from tools.gap_logs import simulated_drive
+from tools.gap.logs import simulated_drive
 
 ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 PROCESSORS = 2

@@ -148,7 +148,7 @@ from disco_hw.gap.report.page import sentence
 from disco_hw.log.drive import Commands
 from disco_hw.model import Model, load_model, save_model
 from disco_hw.model.step import FreeRun
-from tools.gap_logs import simulated_drive
+from tools.gap.logs import simulated_drive
 
 log = simulated_drive({"x_speed_squared_drag": 0.5}, seed=905)
 none, no_segment = np.empty(0), np.empty(0, dtype=np.int64)
@@ -194,7 +194,7 @@ from disco_hw.gap import find_gap
 from disco_hw.gap.report.page import as_text
 from disco_hw.log.drive import Poses
 from disco_hw.model import Model
-from tools.gap_logs import simulated_drive
+from tools.gap.logs import simulated_drive
 
 RADIUS_M, AXIAL_M, K_S = 0.06, 0.4, 0.3
 log = simulated_drive({}, seed=905)

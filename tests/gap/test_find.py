@@ -15,7 +15,7 @@ from disco_hw.gap.search.analysis import final_fit
 from disco_hw.gap.search.selection import Selector
 from disco_hw.log.drive import DriveLog
 from disco_hw.model import Model, load_model, save_model
-from tools.gap_logs import simulated_drive
+from tools.gap.logs import simulated_drive
 
 MODEL = Model(0.061, 0.415, 0.238)
 

@@ -14,7 +14,7 @@ from disco_hw.gap import WRITTEN
 from disco_hw.gap.search import joint_predictions
 from disco_hw.gap.search.analysis import final_fit
 from disco_hw.model import Model, load_model
-from tools.gap_logs import simulated_drive
+from tools.gap.logs import simulated_drive
 
 MODEL = Model(0.061, 0.415, 0.238)
 

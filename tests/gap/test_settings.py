@@ -13,7 +13,7 @@ from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.search.selection import Selector, body_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
 from tests.gap.synthetic import LIMITS, body_channel
-from tools.gap_logs import simulated_drive
+from tools.gap.logs import simulated_drive
 
 GROUPS = [type(getattr(DEFAULT_SETTINGS, field.name)) for field in fields(GapSettings)]
 

@@ -19,8 +19,8 @@ from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.log.importing import write_log
 from disco_hw.model import Model
+from tools.gap.strange_robot import record
 from tools.joystick import joystick
-from tools.strange_robot import record
 
 ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 

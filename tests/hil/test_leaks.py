@@ -17,7 +17,7 @@ from drivers.types import LinkState
 from sim.fault_schedule import FaultSchedule
 from sim.hub import Hub
 from sim.serial_line import SerialLine
-from tools.fault_run import FaultRun
+from tools.faults.run import FaultRun
 
 pytestmark = pytest.mark.long
 

@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 
 from disco_hw.log.drive import Commands, DriveLog
-from tools.gap_logs import simulated_drive
+from tools.gap.logs import simulated_drive
 
 Change = Callable[[DriveLog], DriveLog]
 RADIUS_M, AXIAL_M = 0.06, 0.4

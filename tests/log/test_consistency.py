@@ -14,7 +14,7 @@ from disco_hw.log.load import load_drive
 from sim.effects import EFFECTS
 from tests.log.contradictory_drives import AXIAL_M, FAULTS, RADIUS_M, rotated, sound, without_commands
 from tests.tables import thinned
-from tools.gap_logs import realistic, simulated_drive
+from tools.gap.logs import realistic, simulated_drive
 
 REAL = os.environ.get("DISCO_HW_DATA")
 # Nominal wheel radius and axial distance (m) by the beginning of a file's name.

@@ -21,7 +21,7 @@ from tests.drive.test_hand_pilot import Hand
 from tests.drivers.waiting import free_port
 from tests.runtime.simulated import ROBOT_FILE, simulated_stack
 from tests.tables import thinned
-from tools.fault_run import CirclingPlanner
+from tools.faults.run import CirclingPlanner
 
 
 class Sender:

@@ -16,7 +16,7 @@ from sim.plant import Plant
 from sim.serial_line import SerialLine
 from sim.unixcan import UnixCanBus
 from sim.virtual_robot import TRUTH_COLUMNS, VirtualRobot
-from tools.in_process import SimulatedCan
+from tools.faults.in_process import SimulatedCan
 
 MS = 1_000_000
 

@@ -12,7 +12,7 @@ from sim.fault_schedule import (
     kinds_table,
     parse_schedule,
 )
-from tools.random_faults import random_schedule
+from tools.faults.random_faults import random_schedule
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from sim.body_dynamics import BodyPose
 from sim.effects import HiddenEffectError
 from sim.plant_parameters import PlantParameters
 from sim.virtual_robot import RobotInProcess
-from tools.in_process import REOPEN_NS, SimulatedCan
+from tools.faults.in_process import REOPEN_NS, SimulatedCan
 
 FIRMWARE = FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0)
 

@@ -7,9 +7,9 @@ import pytest
 
 from disco_hw.runtime.plausibility import PlausibilityStats
 from sim.fault_schedule import KINDS, FaultSchedule, parse_schedule
-from tools.fault_campaign import KINDS_LEFT_OUT, markdown, summary
-from tools.fault_run import FaultRun
-from tools.random_faults import random_schedule
+from tools.faults.campaign import KINDS_LEFT_OUT, markdown, summary
+from tools.faults.random_faults import random_schedule
+from tools.faults.run import FaultRun
 
 FAST = {"cycle_us": 5000}
 

@@ -5,9 +5,9 @@ from dataclasses import asdict, fields
 import pytest
 
 from disco_hw.gap.settings import DEFAULT_SETTINGS
-from tools import gap_ablation
-from tools.gap_ablation import Variant, logs, main, scaled, table, thresholds
-from tools.gap_jobs import Result
+from tools.gap import ablation as gap_ablation
+from tools.gap.ablation import Variant, logs, main, scaled, table, thresholds
+from tools.gap.jobs import Result
 
 
 def result(named=("motor_lag",), amended_mm=5.0, covered=(True, False), cpu_s=3.0):

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tools import gap_mujoco
-from tools.gap_mujoco import Result, body_lag_s, drawn, injected_floor, response_of, robot_of, table, truth_of
+from tools.gap import mujoco as gap_mujoco
+from tools.gap.mujoco import Result, body_lag_s, drawn, injected_floor, response_of, robot_of, table, truth_of
 from tools.joystick import joystick, keyboard
 from tools.mujoco_robot import EFFECTS, ROBOTS, Habits, Recording, Robot, record
 

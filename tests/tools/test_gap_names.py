@@ -7,8 +7,8 @@ import math
 
 from rich.console import Console
 
-from tools import gap_names
-from tools.gap_names import compare, differences, fixed_jobs
+from tools.gap import names as gap_names
+from tools.gap.names import compare, differences, fixed_jobs
 
 RESULT = {"log": "abc", "names": ["motor_lag"], "report": {"effects": [{"value": 0.1, "ci": [math.nan, 1.0]}]}}
 

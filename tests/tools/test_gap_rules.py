@@ -7,8 +7,8 @@ from disco_hw.gap.search import channel_result
 from disco_hw.gap.search.selection import Selector, body_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from tests.gap.synthetic import LIMITS, body_channel
-from tools.gap_ablation import rule_table
-from tools.gap_rules import RULES, counting, without
+from tools.gap.ablation import rule_table
+from tools.gap.rules import RULES, counting, without
 
 
 def test_each_rule_is_there_and_is_put_back():

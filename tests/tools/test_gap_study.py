@@ -10,10 +10,12 @@ from rich.console import Console
 
 from disco_hw.gap.report.blind_spots import BlindSpot
 from disco_hw.gap.search.channel_result import ParameterEstimate
-from tools import gap_jobs, gap_study, gap_tables
-from tools.gap_jobs import Job, Result, jobs
-from tools.gap_logs import NAMED
-from tools.strange_robot import FORMS
+from tools.gap import jobs as gap_jobs
+from tools.gap import study as gap_study
+from tools.gap import tables as gap_tables
+from tools.gap.jobs import Job, Result, jobs
+from tools.gap.logs import NAMED
+from tools.gap.strange_robot import FORMS
 
 pytestmark = pytest.mark.long
 

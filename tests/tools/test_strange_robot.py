@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tests.tools.test_mujoco_robot import numbers
-from tools import strange_robot
-from tools.strange_robot import COMMANDS_PER_S, FORMS, NOMINAL, record, sampled_parameters
+from tools.gap import strange_robot
+from tools.gap.strange_robot import COMMANDS_PER_S, FORMS, NOMINAL, record, sampled_parameters
 
 ROOT = Path(__file__).parents[2]
 

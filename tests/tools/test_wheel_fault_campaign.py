@@ -6,9 +6,9 @@ import pytest
 
 from disco_hw.runtime import State
 from disco_hw.runtime.supervisor import UserRequest
-from tools import wheel_fault_campaign
-from tools.wheel_fault_campaign import drive_healthy, strike
-from tools.wheel_fault_run import WheelFaultRun, WheelRun
+from tools.faults import wheel_campaign as wheel_fault_campaign
+from tools.faults.wheel_campaign import drive_healthy, strike
+from tools.faults.wheel_run import WheelFaultRun, WheelRun
 
 SUBSET = [
     ("reference", "frozen", 0.03, "circle", "left", 11),

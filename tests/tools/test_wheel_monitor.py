@@ -7,7 +7,7 @@ import pytest
 from drivers.types import Frame
 from firmware_protocol.codec import Codec
 from firmware_protocol.firmware_core import FirmwareOutputs
-from tools.wheel_monitor import WheelMonitor, crc8h2f, read_command
+from tools.faults.wheel_monitor import WheelMonitor, crc8h2f, read_command
 
 BASE = FirmwareOutputs(0.0, 0.0, True, False, False, "ARMED", 0, 7, "NONE", "NONE", 0, 10, 0, 0, 0)
 CODEC = Codec()

@@ -13,7 +13,7 @@ from disco_hw.gap.data.timing import pose_clock, pose_delay_s
 from disco_hw.gap.settings import GridSettings
 from disco_hw.log.drive import Commands, Poses, Wheels
 from tests.tables import thinned
-from tools.gap_logs import realistic, simulated_drive
+from tools.gap.logs import realistic, simulated_drive
 
 RADIUS_M, TRACK_M = 0.11, 0.6
 

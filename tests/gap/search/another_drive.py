@@ -1,4 +1,4 @@
-"""What a model that was written predicts of another drive of the same robot of `tools/strange_robot.py`.
+"""What a model that was written predicts of another drive of the same robot of `tools/gap/strange_robot.py`.
 
 Errors of free runs of the model's own step, 2 s ahead from single poses and readings of the wheels, with what the
 runtime keeps of the past, or with nothing remembered, or without the model's terms.
@@ -18,7 +18,7 @@ from disco_hw.log.drive import DriveLog
 from disco_hw.model import Model
 from disco_hw.model.step import FreeRun
 from disco_hw.model.terms import TERMS
-from tools import strange_robot
+from tools.gap import strange_robot
 from tools.joystick import joystick
 
 Array = NDArray[np.float64]

@@ -19,7 +19,7 @@ from disco_hw.gap.search.channel_search import responding, search_body, search_w
 from disco_hw.gap.search.selection import Selector, wheel_moves
 from disco_hw.model import Model
 from tests.gap.synthetic import LIMITS
-from tools.gap_logs import simulated_drive
+from tools.gap.logs import simulated_drive
 
 pytestmark = pytest.mark.long
 

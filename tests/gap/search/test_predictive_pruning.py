@@ -12,7 +12,7 @@ from disco_hw.gap.search import prune
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.model import Model
-from tools.gap_logs import simulated_drive
+from tools.gap.logs import simulated_drive
 
 
 @dataclass(frozen=True)

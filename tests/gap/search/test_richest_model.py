@@ -11,7 +11,7 @@ from disco_hw.gap.noise import largest_command_jitter_s, learn_wheel_noise
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search.richest_model import learn_saturated_wheels
-from tools.gap_logs import simulated_drive
+from tools.gap.logs import simulated_drive
 
 pytestmark = pytest.mark.long
 

@@ -17,7 +17,7 @@ from disco_hw.gap.search.unnamed_terms import Term, WithTerms, motion
 from disco_hw.model import Model, load_model, save_model
 from tests.gap.search.another_drive import another_drive, errors_ahead, without_terms
 from tests.gap.synthetic import LIMITS, body_channel
-from tools import strange_robot
+from tools.gap import strange_robot
 
 PROOF = EffectEvidence(100.0, 90.0, 80.0, 80.0, 1.0, 190.0)
 

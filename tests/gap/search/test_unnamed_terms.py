@@ -11,7 +11,7 @@ from disco_hw.gap import find_gap
 from disco_hw.model import Model, load_model, save_model
 from disco_hw.model.step import FreeRun
 from disco_hw.tasks.circle import CircleCost
-from tools.gap_logs import simulated_drive
+from tools.gap.logs import simulated_drive
 
 pytestmark = pytest.mark.long
 

@@ -1,4 +1,4 @@
-"""`python -m tools.wheel_fault_campaign`: wheels that cease to obey, with every driver's simulated controller.
+"""`python -m tools.faults.wheel_campaign`: wheels that cease to obey, with every driver's simulated controller.
 
 Every fault at every speed with every driver on a circle and straight on, the sides in turn; then healthy drives on
 rough ground. Prints the table of docs/results.md, and exits with 1 if a fault was missed, a cause was wrong, or a
@@ -20,7 +20,7 @@ from pathlib import Path
 
 from drivers.motor import motor_drivers
 from sim.plant_parameters import PlantParameters
-from tools.wheel_fault_run import FAULTS, WheelFaultRun, WheelRun
+from tools.faults.wheel_run import FAULTS, WheelFaultRun, WheelRun
 
 SPEEDS_M_S = (0.03, 0.05, 0.08, 0.2)
 TRACKS = ("circle", "straight")
@@ -132,7 +132,7 @@ def markdown(runs: Sequence[WheelRun]) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m tools.wheel_fault_campaign", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tools.faults.wheel_campaign", description=__doc__)
     add = parser.add_argument
     add("--drivers", nargs="*", default=sorted(motor_drivers()), help="which")
     add("--seed", type=int, default=0, help="of plants and noise")

@@ -21,8 +21,8 @@ from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
 from disco_hw.log.drive import DriveLog
 from disco_hw.model import Model
-from tools import strange_robot
-from tools.gap_logs import LARGEST_RAD_S, NAMED, realistic, simulated_drive
+from tools.gap import strange_robot
+from tools.gap.logs import LARGEST_RAD_S, NAMED, realistic, simulated_drive
 
 MODEL = Model(0.0625, 0.405, 0.25)
 # What scripts ask of the robot.

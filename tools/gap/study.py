@@ -20,24 +20,32 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from tools import gap_jobs
-from tools.gap_jobs import KINDS, Job, Result, jobs
-from tools.gap_tables import summary, table, write
+from tools.gap import jobs as gap_jobs
+from tools.gap.jobs import KINDS, Job, Result, jobs
+from tools.gap.tables import summary, table, write
 
 _JUDGED = ("disco_hw/gap", "disco_hw/effects", "disco_hw/model", "disco_hw/log", "disco_hw/drive", "sim")
 _JUDGED_TOO = (
-    "tools/gap_logs.py", "tools/gap_jobs.py", "tools/gap_mujoco.py", "tools/mujoco_robot.py", "tools/strange_robot.py",
+    "tools/gap/logs.py", "tools/gap/jobs.py", "tools/gap/mujoco.py", "tools/mujoco_robot.py",
+    "tools/gap/strange_robot.py",
 )  # fmt: skip
 
 
 def revision() -> str:
     """A short hash of all sources that a result depends on."""
-    root, digest = Path(__file__).parents[1], hashlib.sha256()
+    root, digest = Path(__file__).parents[2], hashlib.sha256()
     for name in (*_JUDGED, *_JUDGED_TOO):
         path = root / name
         for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
             digest.update(file.read_bytes())
     return digest.hexdigest()[:12]
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file whole or not at all: a study may be broken off."""
+    unfinished = path.with_suffix(".part")
+    unfinished.write_text(text, encoding="utf-8")
+    unfinished.replace(path)
 
 
 class Kept:
@@ -58,11 +66,9 @@ class Kept:
         return [Result(**json.loads(path.read_text(encoding="utf-8"))) for path in paths]
 
     def put(self, result: Result) -> None:
-        """Keep a result; whole or not at all."""
+        """Keep a result."""
         path = self._folder / f"{'-'.join([result.kind, *result.hidden, str(result.seed)])}.json"
-        unfinished = path.with_suffix(".part")
-        unfinished.write_text(json.dumps(asdict(result)), encoding="utf-8")
-        unfinished.replace(path)
+        write_whole(path, json.dumps(asdict(result)))
 
 
 def run(todo: Sequence[Job], processes: int, dask: str | None) -> Iterator[Result]:
@@ -108,7 +114,7 @@ def study(todo: Sequence[Job], out: Path, processes: int, dask: str | None, cons
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m tools.gap_study", description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m tools.gap.study", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"of {', '.join(KINDS)} (all)")
     parser.add_argument("--seeds", type=int, default=10, help="logs of each hidden effect (10)")
     parser.add_argument("--first", type=int, default=1, help="first seed (1)")

@@ -36,8 +36,8 @@ from disco_hw.gap.search.analysis import final_fit
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.model import Model
 from disco_hw.model.terms import BODY_FEATURES, BODY_MEMORIES
-from tools.gap_halves import STAGES, unseen_errors
-from tools.gap_study import revision
+from tools.gap.halves import STAGES, unseen_errors
+from tools.gap.study import revision, write_whole
 from tools.joystick import STEPS_PER_COMMAND, STEPS_PER_S
 from tools.mujoco_robot import (
     DOWNHILL_RAD,
@@ -411,9 +411,7 @@ def study(hidden: Iterable[str], seeds: Iterable[int], out: Path, robot: str = "
                 result = msgspec.json.decode(path.read_bytes(), type=Result)
             else:
                 result = work(name, seed, robot_of(robot))
-                unfinished = path.with_suffix(".part")
-                unfinished.write_bytes(msgspec.json.encode(result))
-                unfinished.replace(path)
+                write_whole(path, msgspec.json.encode(result).decode())
             results.append(result)
             print(row(result), file=sys.stderr, flush=True)
     name = "gap_mujoco.md" if robot == "middle" else f"gap_mujoco_{robot}.md"
@@ -422,7 +420,7 @@ def study(hidden: Iterable[str], seeds: Iterable[int], out: Path, robot: str = "
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m tools.gap_mujoco", description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m tools.gap.mujoco", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("hidden", nargs="*", metavar="EFFECT", help=f"of nothing, {', '.join(EFFECTS)} (all)")
     which = f"{', '.join(ROBOTS)}, or a number, which draws one (middle)"
     parser.add_argument("--robot", default="middle", help=which)

@@ -1,6 +1,6 @@
 """What each threshold and rule of the search for missing effects is good for, one at a time.
 
-    python -m tools.gap_ablation [GROUP.NAME ...] [--rules] [--logs N] [--jobs N] -o out/gap_ablation
+    python -m tools.gap.ablation [GROUP.NAME ...] [--rules] [--logs N] [--jobs N] -o out/gap_ablation
 
 Each log of a small tuning set is searched with the usual settings, and with each threshold at half and at double.
 Seeds of the tuning set are 31 on; of the validation set, which no choice looks at, 131 on (`--validate`, usual
@@ -8,7 +8,7 @@ settings). A run of the same code that was broken off goes on from `gap_ablation
 names right, error of the amended model over that of `timed`, intervals that hold the truth, CPU, and how many logs are
 answered otherwise in any way. A threshold whose half and double change nothing is none.
 
-With `--rules` each log is searched once while it is counted how often each rule of `tools.gap_rules` answers otherwise
+With `--rules` each log is searched once while it is counted how often each rule of `tools.gap.rules` answers otherwise
 than nothing would, and once more without each rule that did. Where none does, the answer is the same without it.
 """
 
@@ -23,14 +23,14 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from tools.gap_jobs import Job, Result, jobs, work  # first: it sets the threads of the linear algebra
+from tools.gap.jobs import Job, Result, jobs, work  # first: it sets the threads of the linear algebra
 
 # isort: split
 import numpy as np
 
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
-from tools.gap_rules import RULES, counting, without
-from tools.gap_study import revision
+from tools.gap.rules import RULES, counting, without
+from tools.gap.study import revision, write_whole
 
 TUNING, VALIDATION = 31, 131
 USUAL = "usual"
@@ -170,7 +170,7 @@ def _answer(one: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m tools.gap_ablation", description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m tools.gap.ablation", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("names", nargs="*", metavar="GROUP.NAME", help="thresholds, or beginnings of their names (all)")
     parser.add_argument("--logs", type=int, default=3, help="the first so many of the set (3)")
     parser.add_argument("--jobs", type=int, default=1, help="processes (1)")
@@ -202,9 +202,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ]
     for count, (key, log, result) in enumerate(searched(todo, options.jobs), 1):
         found.setdefault(key, {})[log] = result
-        unfinished = results.with_suffix(".part")
-        unfinished.write_text(json.dumps(found), encoding="utf-8")
-        unfinished.replace(results)
+        write_whole(results, json.dumps(found))
         print(f"{count} of {len(todo)}: {key}: {log}", file=sys.stderr, flush=True)
     lines = [*table(found)] if USUAL in found else []
     results.with_suffix(".md").write_text("\n".join([*lines, ""]), encoding="utf-8")
@@ -220,7 +218,7 @@ def _rules(folder: Path, chosen: Sequence[Job]) -> int:
         if job.key not in by_log:
             key, found, counts = search_rules(job)
             by_log[key] = found, counts
-            results.write_text(json.dumps(by_log), encoding="utf-8")
+            write_whole(results, json.dumps(by_log))
         print(f"{count} of {len(chosen)}: {job.key}", file=sys.stderr, flush=True)
     lines = [*rule_table(by_log)]
     results.with_suffix(".md").write_text("\n".join([*lines, ""]), encoding="utf-8")

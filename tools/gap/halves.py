@@ -1,6 +1,6 @@
 """What models learnt from one half of a measured log predict of the other, end to end: tables of `docs/results.md`.
 
-`DISCO_HW_DATA=FOLDER python -m tools.gap_halves [--parts N | --days | --others] [NAME...]`: logs whose path holds a
+`DISCO_HW_DATA=FOLDER python -m tools.gap.halves [--parts N | --days | --others] [NAME...]`: logs whose path holds a
 NAME, all without one. For either half: the stage that is offered, the errors 2 s ahead on the half that was not seen,
 of every stage, and how many of its 95 % intervals hold the other half's value of the same parameters, as well as that
 is known, where it is known half as well. With `--parts` the same of N parts of each log, and of every other one of
@@ -246,7 +246,7 @@ def measured_logs(names: Sequence[str]) -> list[Path]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m tools.gap_halves", description=(__doc__ or "").split(":")[0])
+    parser = argparse.ArgumentParser(prog="python -m tools.gap.halves", description=(__doc__ or "").split(":")[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help="logs whose path holds it (all)")
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--parts", type=int, default=2, metavar="N", help="of each log (2)")

@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import binomtest
 
-from tools import strange_robot
-from tools.gap_jobs import FORMS, KINDS, MOTORS, NAMED, OUTSIDE, Result
+from tools.gap import strange_robot
+from tools.gap.jobs import FORMS, KINDS, MOTORS, NAMED, OUTSIDE, Result
 
 
 def wilson(right: int, count: int) -> tuple[float, float]:

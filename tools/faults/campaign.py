@@ -30,8 +30,8 @@ def run_seed(seed: int, duration_s: float, cycle_us: int, planner: str) -> dict[
     from disco_hw.runtime.assembly import create_planner  # noqa: PLC0415 - in the worker, after its niceness is set
     from disco_hw.runtime.robot_setup import load_setup  # noqa: PLC0415
     from sim.fault_schedule import KINDS  # noqa: PLC0415
-    from tools.fault_run import ROBOT_FILE, FaultRun  # noqa: PLC0415
-    from tools.random_faults import random_schedule  # noqa: PLC0415
+    from tools.faults.random_faults import random_schedule  # noqa: PLC0415
+    from tools.faults.run import ROBOT_FILE, FaultRun  # noqa: PLC0415
 
     kinds = tuple(name for name in KINDS if name not in KINDS_LEFT_OUT)
     schedule = random_schedule(seed, duration_s - QUIET_AT_END_S, kinds=kinds)
@@ -115,7 +115,7 @@ def markdown(rows: dict[str, dict[str, Any]]) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m tools.fault_campaign", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tools.faults.campaign", description=__doc__)
     add = parser.add_argument
     add("--seeds", type=int, default=100, help="how many")
     add("--first", type=int, default=0, help="the first of them")

@@ -40,8 +40,8 @@ from sim.fault_schedule import FaultSchedule, ScheduledFault
 from sim.plant import Plant, TrueState
 from sim.plant_parameters import PlantParameters
 from sim.virtual_robot import VirtualRobot
-from tools.in_process import SimulatedCan
-from tools.wheel_monitor import WheelMonitor
+from tools.faults.in_process import SimulatedCan
+from tools.faults.wheel_monitor import WheelMonitor
 
 ROBOT_FILE = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 SETTLED_S = 2.5

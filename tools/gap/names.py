@@ -1,7 +1,7 @@
 """Whether a change of the code changes what the search for missing effects answers, to the last bit.
 
-    python -m tools.gap_names BEFORE.json                      # with the code as it was
-    python -m tools.gap_names AFTER.json --compare BEFORE.json  # with the code as it is
+    python -m tools.gap.names BEFORE.json                      # with the code as it was
+    python -m tools.gap.names AFTER.json --compare BEFORE.json  # with the code as it is
 
 Sixty simulated logs: every named effect twice, ten with nothing hidden, five with two effects, five with one that is on
 no list. Whole reports are kept, and the amended model; a log that was searched already is not searched again.
@@ -20,7 +20,7 @@ from typing import Any
 
 from rich.console import Console
 
-from tools.gap_jobs import MODEL, Job, jobs  # first: it sets the threads of the linear algebra
+from tools.gap.jobs import MODEL, Job, jobs  # first: it sets the threads of the linear algebra
 
 # isort: split
 import numpy as np
@@ -28,7 +28,7 @@ import numpy as np
 from disco_hw.gap import GapReport, find_gap
 from disco_hw.gap.report.page import as_text
 from disco_hw.log.drive import DriveLog
-from tools.gap_logs import LARGEST_RAD_S, simulated_drive
+from tools.gap.logs import LARGEST_RAD_S, simulated_drive
 
 
 def fixed_jobs() -> list[Job]:
@@ -117,7 +117,7 @@ def _plain(value: Any) -> Any:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m tools.gap_names", description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m tools.gap.names", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("out", type=Path, metavar="OUT.json", help="file to write, or to go on with")
     parser.add_argument("--compare", type=Path, metavar="BEFORE.json", help="answers to compare with")
     parser.add_argument("--first", type=int, help="only so many of the logs")
