@@ -180,8 +180,8 @@ class PlantLine:
     Raises OSError or `serial.SerialException` if it cannot be opened at first.
     """
 
-    def __init__(self, port: str, baud: int = 921_600) -> None:
-        self._medium = SerialMedium(port, baud, dtr=False, rts=False)
+    def __init__(self, port: str) -> None:
+        self._medium = SerialMedium(port, 921_600, dtr=False, rts=False)
         self._decoder = FrameDecoder()
         self._waiting: deque[Frame] = deque()
         self._unsent = b""

@@ -178,7 +178,7 @@ class CommandSocket:
         self._path.unlink(missing_ok=True)
 
 
-def send_command(path: Path, text: str, timeout_s: float = 5.0) -> str:
+def send_command(path: Path, text: str) -> str:
     """Send one command to a `CommandSocket` and return its answer.
 
     Raises OSError if nobody listens at `path`, TimeoutError if no answer comes in time.
@@ -186,7 +186,7 @@ def send_command(path: Path, text: str, timeout_s: float = 5.0) -> str:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
         # An empty name lets Linux choose an address, to which the answer can go.
         client.bind("")
-        client.settimeout(timeout_s)
+        client.settimeout(5.0)
         client.sendto(text.encode(), str(path))
         return client.recv(MAX_COMMAND_BYTES).decode()
 

@@ -13,7 +13,7 @@ import queue
 import signal
 import socket
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import FrameType, TracebackType
 from typing import Any
@@ -33,8 +33,7 @@ class StopSignals:
     whoever presses Ctrl-C wants the robot to stop.
     """
 
-    def __init__(self, signals: Sequence[signal.Signals] = _STOP_SIGNALS) -> None:
-        self._signals = tuple(signals)
+    def __init__(self) -> None:
         self._former: dict[signal.Signals, Any] = {}
         self._received: signal.Signals | None = None
 
@@ -44,7 +43,7 @@ class StopSignals:
         return self._received
 
     def __enter__(self) -> StopSignals:
-        for number in self._signals:
+        for number in _STOP_SIGNALS:
             if number is not _MAY_STAY_IGNORED or signal.getsignal(number) is not signal.SIG_IGN:
                 self._former[number] = signal.signal(number, self._note)
         return self

@@ -190,13 +190,10 @@ class PageSource:
     ended: str | None = None
     completed, task = True, ""
 
-    def __init__(
-        self, top_rad_s: float, turn_share: float, status_text: str = PAD_STATUS_TEXT, limit_ns: int = INPUT_LIMIT_NS
-    ) -> None:
+    def __init__(self, top_rad_s: float, turn_share: float, status_text: str = PAD_STATUS_TEXT) -> None:
         self._status_text = status_text
         self._top_rad_s = top_rad_s
         self._turn_share = turn_share
-        self._limit_ns = limit_ns
         self._open_ns: dict[int, int] = {}
         self._holder: int | None = None
         self._newest: ManualInput | None = None
@@ -214,7 +211,7 @@ class PageSource:
         if steering.stamp_ns > now_ns:
             return "the stamp is from another daemon; release the pad and hold it again"
         if self._holder is None:
-            if now_ns - self._open_ns.get(page, -self._limit_ns - 1) > self._limit_ns:
+            if now_ns - self._open_ns.get(page, -INPUT_LIMIT_NS - 1) > INPUT_LIMIT_NS:
                 return "release the pad and hold it again"
             self._holder = page
         if self._holder != page:
@@ -226,7 +223,7 @@ class PageSource:
     def poll(self, now_ns: int, _robot: RobotView) -> ManualInput | None:
         """Return the newest input of the page that holds its pad; zero speeds with the deadman released without one."""
         newest = self._newest
-        if newest is not None and now_ns - newest.t_ns <= self._limit_ns:
+        if newest is not None and now_ns - newest.t_ns <= INPUT_LIMIT_NS:
             return newest
         if self._holder is not None:
             # Reported once with its age, so that the stop has its reason; the next hold begins with an open pad.
@@ -240,7 +237,7 @@ class PageSource:
 
     def _handle_open(self, now_ns: int, page: int) -> None:
         """Note that a page has reported its pad released, and end its hold if it had one."""
-        self._open_ns = {one: at for one, at in self._open_ns.items() if now_ns - at <= self._limit_ns}
+        self._open_ns = {one: at for one, at in self._open_ns.items() if now_ns - at <= INPUT_LIMIT_NS}
         self._open_ns[page] = now_ns
         if self._holder == page:
             self._holder, self._newest = None, None

@@ -34,8 +34,7 @@ class Deadman:
     arms by itself. Whoever else arms the robot finds it disarmed again. Who holds on is asked once to let go.
     """
 
-    def __init__(self, limit_ns: int = INPUT_LIMIT_NS) -> None:
-        self._limit_ns = limit_ns
+    def __init__(self) -> None:
         self._seen_open = False
         self._engaged = False
         self._was_armed = False
@@ -48,7 +47,7 @@ class Deadman:
 
     def step(self, now_ns: int, newest: ManualInput | None, state: State) -> DeadmanVerdict:
         """Judge the newest input (None: the device is gone) in the daemon's present state."""
-        fresh = newest is not None and 0 <= now_ns - newest.t_ns <= self._limit_ns
+        fresh = newest is not None and 0 <= now_ns - newest.t_ns <= INPUT_LIMIT_NS
         is_held = newest is not None and fresh and newest.deadman
         requests, event = self._hold(newest, fresh, is_held, state) if self._engaged else self._press(is_held, state)
         if state is State.ARMED and not self._engaged and not requests:
@@ -91,7 +90,7 @@ class Deadman:
             if newest is None:
                 return (UserRequest.DISARM,), "the input device is disconnected: stopping"
             if not fresh:
-                limit_ms = self._limit_ns // 1_000_000
+                limit_ms = INPUT_LIMIT_NS // 1_000_000
                 return (UserRequest.DISARM,), f"no input for more than {limit_ms} ms: stopping"
             return (UserRequest.DISARM,), "deadman released: stopping"
         if state not in {State.READY, State.ARMED} or (self._was_armed and state is State.READY):

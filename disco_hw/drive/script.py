@@ -99,8 +99,9 @@ class Room:
         )
 
 
-def room_needed(wheels: Callable[[float], Wheels], duration_s: float, robot: Robot, step_s: float = 0.02) -> Room:
+def room_needed(wheels: Callable[[float], Wheels], duration_s: float, robot: Robot) -> Room:
     """Return the room that a drive takes on a robot with exactly the nominal geometry; a real one needs more."""
+    step_s = 0.02
     x_m = y_m = yaw_rad = 0.0
     xs, ys = [0.0], [0.0]
     for k in range(math.ceil(duration_s / step_s)):

@@ -173,7 +173,7 @@ def circle(robot: Robot, task: CircleTask, top_rad_s: float) -> Script:
     )
 
 
-def steps(top_rad_s: float, seed: int, settling_s: float = 0.0, count: int = STEPS) -> Script:
+def steps(top_rad_s: float, seed: int, settling_s: float = 0.0) -> Script:
     """Wheel speeds drawn evenly within the limits that the wheels show first, 6 s each; at most `top_rad_s`.
 
     `settling_s`: from rest to `top_rad_s`.
@@ -191,7 +191,7 @@ def steps(top_rad_s: float, seed: int, settling_s: float = 0.0, count: int = STE
         found += [replace(pieces.hold(name, search, hold_s, forward, turn), finds_limits=True), rest()]
     draw = random.Random(seed)
     purpose = "steady motion anywhere within the limits, and the step to it"
-    for number in range(1, count + 1):
+    for number in range(1, STEPS + 1):
         left, right = draw.uniform(-1.0, 1.0), draw.uniform(-1.0, 1.0)
         wheels = _constant(left * top_rad_s, right * top_rad_s)
         name = f"step {number}: {left:+.0%} {right:+.0%} of the limits"

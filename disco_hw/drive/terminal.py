@@ -96,9 +96,8 @@ class KeyHold:
     waits longer than 200 ms before it repeats that one, the hold ends.
     """
 
-    def __init__(self, top_rad_s: float, limit_ns: int = INPUT_LIMIT_NS) -> None:
+    def __init__(self, top_rad_s: float) -> None:
         self._top_rad_s = top_rad_s
-        self._limit_ns = limit_ns
         self._share = 0.5
         self._state = _Hold.LAPSED
         self._direction = (0.0, 0.0)
@@ -132,7 +131,7 @@ class KeyHold:
         """Return the wheel speeds and the deadman at a time."""
         if self._last_ns is None:
             self._last_ns = now_ns
-        if self._state is _Hold.HELD and now_ns - self._last_ns > self._limit_ns:
+        if self._state is _Hold.HELD and now_ns - self._last_ns > INPUT_LIMIT_NS:
             self._state = _Hold.LAPSED
         if self._state is _Hold.LAPSED and now_ns - self._last_ns >= _RELEASE_NS:
             self._state, self._ignored = _Hold.OPEN, 0
@@ -148,7 +147,7 @@ class KeyHold:
         match self._state:
             case _Hold.PRESSED if gap_ns < _SHORTEST_REPEAT_NS:
                 return _Hold.PRESSED
-            case _Hold.HELD | _Hold.PRESSED if gap_ns <= self._limit_ns:
+            case _Hold.HELD | _Hold.PRESSED if gap_ns <= INPUT_LIMIT_NS:
                 return _Hold.HELD
             case _Hold.PRESSED:
                 return _Hold.PRESSED

@@ -199,13 +199,10 @@ class DensityNetwork:
         return Mixtures(log_weight - math.log(members), mean, factor)
 
 
-def train(
-    statistics: Array, targets: Array, settings: NetworkSettings, seed: int, scaling: Scaling | None = None
-) -> DensityNetwork:
+def train(statistics: Array, targets: Array, settings: NetworkSettings, seed: int) -> DensityNetwork:
     """Fit an ensemble to pairs of statistics (n, S) and targets (n, P), the targets of order one."""
-    if scaling is None:
-        spread = statistics.std(axis=0)
-        scaling = Scaling(statistics.mean(axis=0), np.where(spread > 1e-12, spread, 1.0))
+    spread = statistics.std(axis=0)
+    scaling = Scaling(statistics.mean(axis=0), np.where(spread > 1e-12, spread, 1.0))
     features = scaling(statistics)
     skip, residual = _least_squares(features, targets)
     # Matrices this small are slower on several threads than on one.

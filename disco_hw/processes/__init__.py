@@ -15,7 +15,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Collection, Iterator, MutableMapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,16 +54,16 @@ class Step:
         return f"{self.name}: {self.text}"
 
 
-def limit_thread_pools(environment: MutableMapping[str, str] = os.environ) -> Step:
+def limit_thread_pools() -> Step:
     """Hold the numeric libraries to one thread each; must come before they are imported to bind all of them.
 
     Torch and numba are also held if they are imported already; a BLAS that is loaded keeps the threads it has.
     """
-    numpy_is_loaded = "numpy" in sys.modules and environment.get("OPENBLAS_NUM_THREADS") != "1"
+    numpy_is_loaded = "numpy" in sys.modules and os.environ.get("OPENBLAS_NUM_THREADS") != "1"
     for name in _COUNTED_BY:
         # Numba reads its variable again at each compilation and raises if it then differs from the threads it has.
         if not (name.startswith("NUMBA") and "numba" in sys.modules):
-            environment[f"{name}_THREADS"] = "1"
+            os.environ[f"{name}_THREADS"] = "1"
     for name in ("torch", "numba"):
         if (module := sys.modules.get(name)) is not None:
             module.set_num_threads(1)

@@ -159,8 +159,8 @@ def thinned(rows: Array, count: int) -> Array:
 class ParameterPoints:
     """The sigma points of a model's belief, ready to roll plans out; the mean alone if nothing is believed."""
 
-    def __init__(self, model: Model, alpha: float = 1.0) -> None:
-        points, _ = unscented_points(model, alpha)
+    def __init__(self, model: Model) -> None:
+        points, _ = unscented_points(model, 1.0)
         self._names = model.parameter_names
         self._points = points
 

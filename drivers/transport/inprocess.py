@@ -115,8 +115,8 @@ class InProcessTransport:
         self._state = LinkState.UP if up else LinkState.CONNECTING if self._open else LinkState.CLOSED
 
 
-def connect_pair(first: str = "host", second: str = "robot") -> tuple[InProcessTransport, InProcessTransport]:
+def connect_pair() -> tuple[InProcessTransport, InProcessTransport]:
     """Return the two ends of one link, both closed."""
-    a, b = InProcessTransport(first), InProcessTransport(second)
+    a, b = InProcessTransport("host"), InProcessTransport("robot")
     a._peer, b._peer = b, a
     return a, b

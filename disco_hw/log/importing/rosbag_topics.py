@@ -230,9 +230,9 @@ def _by_tf(bag: Bag, route: tuple[Edge, ...] | None) -> Iterable[TopicCandidate]
     )
 
 
-def _first(bag: Bag, topic: str, count: int = _PEEKED) -> Iterator[BagMessage]:
+def _first(bag: Bag, topic: str) -> Iterator[BagMessage]:
     for at, message in enumerate(bag.messages([topic])):
-        if at >= count:
+        if at >= _PEEKED:
             return
         yield message
 
