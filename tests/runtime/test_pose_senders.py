@@ -21,7 +21,7 @@ from tests.drive.test_hand_pilot import Hand
 from tests.drivers.waiting import free_port
 from tests.runtime.simulated import ROBOT_FILE, simulated_stack
 from tests.tables import thinned
-from tools.faults.run import CirclingPlanner
+from tools.faults.run import circling_planner
 
 
 class Sender:
@@ -54,9 +54,7 @@ class Bench:
             'file = "wombot_model.toml"', f'file = "{ROBOT_FILE.parent / "wombot_model.toml"}"'
         )
         file.write_text(f'{text}\n[pose]\nsource = "udp"\nport = {self.port}\n{lines}', encoding="utf-8")
-        self.stack = simulated_stack(
-            CirclingPlanner(load_setup(file).config, (0.061, 0.415, 0.238)), robot_file=file, needs_pose=True
-        )
+        self.stack = simulated_stack(circling_planner(load_setup(file)), robot_file=file, needs_pose=True)
         self.senders = []
         self._advance = self.stack.robot.advance
         self.stack.robot.advance = self.advance
@@ -286,7 +284,7 @@ def test_a_first_pose_that_is_not_where_the_wheels_led_to_from_the_origin_stops_
         'file = "wombot_model.toml"', f'file = "{ROBOT_FILE.parent / "wombot_model.toml"}"'
     )
     file.write_text(f"{text}\n[estimation]\npose_required = false\n", encoding="utf-8")
-    stack = simulated_stack(CirclingPlanner(load_setup(file).config, (0.061, 0.415, 0.238)), robot_file=file)
+    stack = simulated_stack(circling_planner(load_setup(file)), robot_file=file)
     received, enabled = stack.core.pose_source.receive, []
     stack.core.pose_source.receive = lambda now_ns, poses: received(now_ns, poses) if enabled else []
     stack.run(1.5)

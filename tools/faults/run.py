@@ -10,25 +10,21 @@ import random
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 import disco_hw
-from disco_hw.config import RobotConfig
-from disco_hw.control import NoValidControl, PlannerState, Rollouts, WheelPlan
-from disco_hw.control.plan import Diagnostics
+from disco_hw.control import PlannerState
+from disco_hw.control.plan import LawController
 from disco_hw.daemon.control_socket import counters
 from disco_hw.daemon.loop import LoopStats
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
-from disco_hw.model import Belief
 from disco_hw.runtime import State
 from disco_hw.runtime.assembly import assemble_core, create_pipeline
 from disco_hw.runtime.core import CoreTick, DaemonCore
 from disco_hw.runtime.pipeline import Planner
-from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.runtime.robot_setup import Setup, load_setup
 from disco_hw.runtime.supervisor import UserRequest
-from disco_hw.tasks import PlannedTask
 from disco_hw.tasks.circle import circle_task
 from drivers.motor.reference import ReferenceDriver
 from drivers.types import RobotLinkHealth, RobotStatus
@@ -43,6 +39,9 @@ from sim.virtual_robot import VirtualRobot
 from tools.faults.in_process import SimulatedCan
 from tools.faults.wheel_monitor import WheelMonitor
 
+GEOMETRY = (0.061, 0.415, 0.238)
+"""Wheel radius, axial distance and x_icr of the robot, m."""
+LOOK_AHEAD_RAD = 0.35
 ROBOT_FILE = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 SETTLED_S = 2.5
 """A fault's consequences are looked for until so long after its end."""
@@ -71,47 +70,22 @@ _USUAL = frozenset(
 _BY_CHANCE = {"fusion.poses_gated": 1}
 
 
-class CirclingPlanner:
+def circling_planner(setup: Setup) -> LawController:
     """Planner that goes round the task's circle in microseconds, where DISCO is not what is tried."""
+    task = circle_task(setup.config.task, "the campaign")
+    radius_m, axial_m, _ = GEOMETRY
 
-    STEPS = 10
-    LOOK_AHEAD_RAD = 0.35
-
-    def __init__(self, config: RobotConfig, model_geometry: tuple[float, float, float]) -> None:
-        self._task = circle_task(config.task, "the campaign")
-        self._radius_m, self._axial_m, _ = model_geometry
-        self._zero_path = np.zeros((self.STEPS + 1, 3))
-        self._found = Diagnostics(1.0, 1.0, 0.0, 0.0, 0.0, 1)
-
-    def plan(self, now_ns: int, state: PlannerState) -> WheelPlan:
+    def law(state: PlannerState, _task: Any, _model: Any) -> tuple[float, float]:
         """Turn towards a point ahead on the circle."""
-        task = self._task
-        bearing = math.atan2(state.y_m - task.center_y_m, state.x_m - task.center_x_m) + self.LOOK_AHEAD_RAD
-        x_m, y_m = (
-            task.center_x_m + task.radius_m * math.cos(bearing),
-            task.center_y_m + task.radius_m * math.sin(bearing),
-        )
+        bearing = math.atan2(state.y_m - task.center_y_m, state.x_m - task.center_x_m) + LOOK_AHEAD_RAD
+        x_m = task.center_x_m + task.radius_m * math.cos(bearing)
+        y_m = task.center_y_m + task.radius_m * math.sin(bearing)
         error = math.remainder(math.atan2(y_m - state.y_m, x_m - state.x_m) - state.yaw_rad, 2.0 * math.pi)
         turn = max(-1.5, min(1.5, 2.0 * error))
         speed = task.speed_m_s * max(0.2, math.cos(error))
-        left = (speed - 0.5 * self._axial_m * turn) / self._radius_m
-        right = (speed + 0.5 * self._axial_m * turn) / self._radius_m
-        speeds = np.empty((self.STEPS, 2))
-        speeds[:] = (left, right)
-        return WheelPlan(now_ns, 0.05, speeds, self._zero_path, self._found)
+        return (speed - 0.5 * axial_m * turn) / radius_m, (speed + 0.5 * axial_m * turn) / radius_m
 
-    def reset(self) -> None:
-        """Nothing is kept from plan to plan."""
-
-    def set_task(self, task: PlannedTask) -> None:
-        """The circle stays as it is."""
-
-    def set_belief(self, belief: Belief) -> None:
-        """Do nothing, because it steers by what it sees."""
-
-    def sampled_rollouts(self, count: int) -> Rollouts:
-        """Raise NoValidControl, because nothing is sampled."""
-        raise NoValidControl("this planner samples nothing")
+    return LawController(law, setup.model, task)
 
 
 class Attendant:
@@ -222,7 +196,7 @@ class FaultRun:
     """One robot and one daemon. `run` moves time on; `outcome` is what the monitors saw so far.
 
     `cycle_us`: period of the robot's controller (1 ms on a board; 5 ms is what campaigns use, which makes its times
-    coarser by as much). `planner`: DISCO, or `CirclingPlanner` if None. Seeds decide plant, sessions and faults.
+    coarser by as much). `planner`: DISCO, or `circling_planner` if None. Seeds decide plant, sessions and faults.
     """
 
     def __init__(
@@ -247,7 +221,8 @@ class FaultRun:
         )
         task = circle_task(self.config.task, "the campaign")
         start = BodyPose(task.center_x_m + task.radius_m, task.center_y_m, 0.5 * math.pi)
-        parameters = replace(parameters, wheel_radius_m=0.061, axial_distance_m=0.415, x_icr_m=0.238)
+        radius_m, axial_m, x_icr_m = GEOMETRY
+        parameters = replace(parameters, wheel_radius_m=radius_m, axial_distance_m=axial_m, x_icr_m=x_icr_m)
         self.robot = VirtualRobot(
             Plant(parameters, None, seed, start),
             FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0, cycle_s=cycle_us * 1e-6),
@@ -330,7 +305,7 @@ class FaultRun:
 
     def _start_daemon(self) -> None:
         setup, config = self._setup, self.config
-        planner: Planner = self._planner or CirclingPlanner(config, (0.061, 0.415, 0.238))
+        planner: Planner = self._planner or circling_planner(setup)
         driver = ReferenceDriver(Codec(), draw_session=lambda: self._chance.getrandbits(16))
         self.core = assemble_core(
             config, self.can.host, driver, create_pipeline(config, setup.model, planner), self.log
