@@ -1,4 +1,4 @@
-"""Study of a circle that is driven by poses of other sources than the robot's own, in simulated time.
+"""A circle that is driven by poses of other sources than the robot's own, in simulated time.
 
 The poses go as datagrams through a real socket and `drivers.pose.udp`, with the rate, noise, delay, losses and outliers
 of the source; those without heading are driven by hand first, as a person would.
@@ -11,23 +11,20 @@ import math
 import socket
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
-import disco_hw
 from disco_hw.drive import ManualInput, RobotView
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot, UntilHeading
 from disco_hw.errors import WorkError
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.experiments.virtual import true_parameters
-from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.core import CoreTick, TaskPilot
 from disco_hw.runtime.pipeline import Planner
-from disco_hw.runtime.robot_setup import Setup, load_setup
+from disco_hw.runtime.robot_setup import Setup
 from disco_hw.runtime.supervisor import UserRequest
 from drivers.pose.senders import SenderGate
 from drivers.pose.udp import UdpPoses
@@ -43,20 +40,17 @@ _NEES_EVERY = 25
 class PoseKind:
     """Kind of a pose sensor: fields of PlantParameters, and whether it measures the heading."""
 
-    name: str
     sensor: dict[str, float]
     has_heading: bool = True
     by_datagram: bool = True
 
 
-ROBOT = PoseKind("robot", {}, by_datagram=False)
+ROBOT = PoseKind({}, by_datagram=False)
 RTK = PoseKind(
-    "rtk, 5 Hz, 2 cm, 150 ms late, no heading",
     {"pose_rate_hz": 5.0, "pose_position_std_m": 0.02, "pose_delay_s": 0.15},
     has_heading=False,
 )
 UDP = PoseKind(
-    "udp, 100 Hz, 40 ms late, 5 % lost, 1 % outliers",
     {
         "pose_rate_hz": 100.0,
         "pose_delay_s": 0.04,
@@ -71,14 +65,11 @@ class PoseFigures:
     """Figures of one drive with a pose source.
 
     `rms_m` of the true distance to the circle after a quarter of a lap, `nees` the mean normalised error squared of the
-    estimate (3 where its covariance is right), `looks` that it is the mean of, `straight_m` driven by hand before.
+    estimate (3 where its covariance is right), `straight_m` driven by hand before.
     """
 
-    kind: str
     rms_m: float
-    max_m: float
     nees: float
-    looks: int
     straight_m: float
 
 
@@ -158,7 +149,7 @@ def drive_circle(setup: Setup, planner: Planner, kind: PoseKind, seed: int, laps
         refused = [reply.text for tick in started for reply in tick.replies if not reply.accepted]
         if refused or not started[-1].output.running:
             raise WorkError(f"the virtual robot was not started: {refused}")
-        return _driven(run, kind, laps, straight_m)
+        return _driven(run, laps, straight_m)
     finally:
         run.core.pose_source.close()
 
@@ -186,7 +177,7 @@ def _estimate(run: SimulatedRun) -> Any:
     return last.pipeline.estimate
 
 
-def _driven(run: SimulatedRun, kind: PoseKind, laps: float, straight_m: float) -> PoseFigures:
+def _driven(run: SimulatedRun, laps: float, straight_m: float) -> PoseFigures:
     task: Any = run.core.task
     lap_s = math.tau * task.radius_m / task.speed_m_s
     run.run(0.25 * lap_s)
@@ -200,8 +191,7 @@ def _driven(run: SimulatedRun, kind: PoseKind, laps: float, straight_m: float) -
             yaw = math.remainder(estimate.yaw_rad - truth.yaw_rad, math.tau)
             error = np.array([estimate.x_m - truth.x_m, estimate.y_m - truth.y_m, yaw])
             nees.append(float(error @ np.linalg.solve(np.array(estimate.covariance), error)))
-    rms_m = float(np.sqrt(np.mean(np.square(off))))
-    return PoseFigures(kind.name, rms_m, float(np.max(np.abs(off))), float(np.mean(nees)), len(nees), straight_m)
+    return PoseFigures(float(np.sqrt(np.mean(np.square(off)))), float(np.mean(nees)), straight_m)
 
 
 def with_circle(setup: Setup, radius_m: float, speed_m_s: float) -> Setup:
@@ -212,21 +202,3 @@ def with_circle(setup: Setup, radius_m: float, speed_m_s: float) -> Setup:
     circle: Any = config.task
     task = msgspec.structs.replace(circle, radius_m=radius_m, speed_m_s=speed_m_s)
     return replace(setup, config=msgspec.structs.replace(config, robot=robot, task=task))
-
-
-def main() -> None:
-    """Print the figures of docs/poses.md: eight robots each."""
-    setup = with_circle(load_setup(Path(disco_hw.__file__).parent / "robots" / "wombot.toml"), 3.0, 0.5)
-    planner = create_planner(setup.config, setup.model)
-    for kind in (RTK, ROBOT, UDP):
-        for seed in range(1, 9):
-            found = drive_circle(setup, planner, kind, seed)
-            print(
-                f"{found.kind}: robot {seed}: {1e3 * found.rms_m:.0f} mm RMS, {1e3 * found.max_m:.0f} mm at most, "
-                f"NEES {found.nees:.2f} over {found.looks} looks, {found.straight_m:.2f} m by hand",
-                flush=True,
-            )
-
-
-if __name__ == "__main__":
-    main()

@@ -8,7 +8,7 @@ import pytest
 import disco_hw
 from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.robot_setup import load_setup
-from tools.study.pose_figures import ROBOT, RTK, UDP, drive_circle, with_circle
+from tests.runtime.pose_drives import ROBOT, RTK, UDP, drive_circle, with_circle
 
 
 @pytest.fixture(scope="module")
