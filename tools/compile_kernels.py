@@ -10,11 +10,10 @@ import sys
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.control import CommandLimits, Disco, DiscoSettings
 from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
 from disco_hw.gap import missing_effects
@@ -32,7 +31,6 @@ from disco_hw.tasks.line import Waypoints
 from disco_hw.tasks.timed_path import TimedPathCost
 from tools.gap.logs import simulated_drive
 
-ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 PROCESSORS = 2
 CORNER = Waypoints(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]), np.array([0.0, 5.0, 10.0]))
 
@@ -47,7 +45,7 @@ def model_with_every_effect(values: Mapping[str, Mapping[str, float]], base: tup
 
 
 def plan_the_shipped_tasks() -> None:
-    setup = load_setup(ROBOT)
+    setup = load_setup(SHIPPED_ROBOT)
     create_planner(setup.config, setup.model)
     limits = CommandLimits.of_robot(setup.config.robot)
     for task in (task_from({"kind": "lemniscate"}).planned("default"), TimedPathCost(CORNER)):
@@ -56,7 +54,7 @@ def plan_the_shipped_tasks() -> None:
 
 def plan_in_other_forms() -> None:
     """On the circle, with those forms that several quick tests plan with."""
-    setup = load_setup(ROBOT)
+    setup = load_setup(SHIPPED_ROBOT)
     limits = CommandLimits.of_robot(setup.config.robot)
     lagging = replace(setup.model, effects=(EffectSetting("motor_lag", {"tau_s": 0.1}),))
     Disco(lagging, CircleCost(), DiscoSettings(), CommandLimits(25.0, 40.0)).warm_up()

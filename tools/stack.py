@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.experiments import Child, Operator, disco_hw_process, with_device
 
 # Chosen: a busy machine is tried again.
@@ -142,7 +142,7 @@ def write_robot_file(
 
     `device`: another motor controller, of `DEVICES`. `control`: a line for that section.
     """
-    shipped = Path(disco_hw.__file__).parent / "robots"
+    shipped = SHIPPED_ROBOT.parent
     text = (shipped / "wombot.toml").read_text(encoding="utf-8")
     for old, new in {
         'kind = "can"': f'kind = "{link}"',

@@ -1,16 +1,15 @@
 """A run that is known by heart: the shipped robot on its circle at 50 Hz, as records and as a log."""
 
 import math
-from pathlib import Path
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.files import MODEL_TOML as MODEL_KIND
 from disco_hw.files import ROBOT_TOML as ROBOT_KIND
 from disco_hw.log import MODEL_TOML, ROBOT_TOML, attachment, records
 from disco_hw.log.process_recorder import ProcessRecorder, RecordingSettings
 from drivers.types import PoseSample, PowerSample, RobotLinkHealth, RobotStatus, WheelSample
 
-ROBOT_FILE = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
+ROBOT_FILE = SHIPPED_ROBOT
 MODEL_FILE = ROBOT_FILE.with_name("wombot_model.toml")
 PERIOD_NS = 20_000_000
 START_NS = 5_000_000_000_000

@@ -250,7 +250,7 @@ def check(
 ) -> None:
     """Check link, firmware match, latency, bus load, real-time settings and limits before a drive.
 
-    Nothing moves. Nothing moves.
+    Nothing moves.
     """
     check_named_files(robot)
     from disco_hw.daemon.check import run_check

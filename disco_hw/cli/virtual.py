@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from disco_hw.cli.options import AsJson, LinkOption, ModelOption, View, print_result, progress_line
-from disco_hw.config import check_named_files
+from disco_hw.config import SHIPPED_ROBOT, check_named_files
 from disco_hw.errors import InputError
 from disco_hw.reports import as_json as json_of
 from disco_hw.reports import refuse_directory
@@ -175,7 +175,6 @@ def circle(
     as_json: AsJson = False,
 ) -> None:
     """Drive the circle knowing the prior, the posterior, its mean alone, a point estimate, or the truth."""
-    import disco_hw
     from disco_hw.experiments.circle import CircleOptions, run_circle
     from disco_hw.runtime.robot_setup import load_setup
 
@@ -185,7 +184,7 @@ def circle(
         if not math.isfinite(value):
             raise InputError(f"--{option} {value}: not a finite number; write one")
     refuse_directory(out)
-    setup = load_setup(robot or Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
+    setup = load_setup(robot or SHIPPED_ROBOT)
     options = CircleOptions(
         seeds, duration_s, rate_hz, largest_rot_s, largest_rot_s2, lag_s, wheel_noise, seed_offset, belief_scale
     )
@@ -208,12 +207,11 @@ def adapt(
     as_json: AsJson = False,
 ) -> None:
     """Let wheel radius or axial distance change on the way, and see what adaptation wins back."""
-    import disco_hw
     from disco_hw.experiments.adapt import AdaptOptions, run_adapt
     from disco_hw.runtime.robot_setup import load_setup
 
     refuse_directory(out)
-    setup = load_setup(robot or Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
+    setup = load_setup(robot or SHIPPED_ROBOT)
     result = run_adapt(setup, AdaptOptions(change=change, seeds=seeds, seed_offset=seed_offset), progress_line)
     out.mkdir(parents=True, exist_ok=True)
     result.write_csv(out / "adapt.csv")
@@ -240,12 +238,10 @@ def gap(
     as_json: AsJson = False,
 ) -> None:
     """Hide an effect in the virtual robot, find it in a log, and drive the circle without and with it in the model."""
-    import disco_hw
     from disco_hw.experiments.gap import GapExperimentOptions, run_gap_experiment
 
-    shipped = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
     hidden = tuple(hide or ("deadband=0.8",))
-    options = GapExperimentOptions(robot or shipped, hidden, out, laps, script, plant_seed, seed)
+    options = GapExperimentOptions(robot or SHIPPED_ROBOT, hidden, out, laps, script, plant_seed, seed)
     result = run_gap_experiment(options, progress_line)
     print_result(
         result.as_dict(), as_json, f"{result.as_text()}\n\nwritten: {out}/experiment.png, report.html, drive.mcap"

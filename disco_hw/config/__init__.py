@@ -27,6 +27,7 @@ from disco_hw.files import LOG, MODEL_TOML, WAY_POINTS, open_file, read_toml
 
 __all__ = [
     "LINK_FORMS",
+    "SHIPPED_ROBOT",
     "Control",
     "DaemonSettings",
     "Drive",
@@ -47,6 +48,9 @@ __all__ = [
     "names_address",
     "refuse_outside_task",
 ]
+
+SHIPPED_ROBOT = Path(__file__).parents[1] / "robots" / "wombot.toml"
+"""The robot.toml that comes with the package; its model and a path lie beside it."""
 
 
 def check_named_files(robot: Path | None = None, model: Path | None = None, logs: Iterable[Path] = ()) -> None:

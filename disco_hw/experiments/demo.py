@@ -26,8 +26,7 @@ from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
-import disco_hw
-from disco_hw.config import load_robot_config
+from disco_hw.config import SHIPPED_ROBOT, load_robot_config
 from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments import (
     DEVICES,
@@ -118,7 +117,7 @@ def run_demo(options: DemoOptions) -> CircleReport:
             daemon_output=options.out / "daemon.txt",
         )
         stopped = _drive_undisturbed(options, files, console)
-    task = circle_task(load_robot_config(_shipped_robot()).task, "the demonstration")
+    task = circle_task(load_robot_config(SHIPPED_ROBOT).task, "the demonstration")
     report = load_circle_report(files.log, files.truth, task, options.laps, stopped)
     if options.obstacle:
         report = replace(report, pillar=PILLAR, footprint=FOOTPRINT)
@@ -159,15 +158,10 @@ class _Files:
     daemon_output: Path
 
 
-def _shipped_robot() -> Path:
-    return Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
-
-
 def _write_robot_file(scratch: Path, options: DemoOptions) -> Path:
     """Copy the shipped robot with addresses of its own, so that two demonstrations never meet."""
-    shipped = _shipped_robot()
-    model = shipped.with_name("wombot_model.toml")
-    text = shipped.read_text(encoding="utf-8")
+    model = SHIPPED_ROBOT.with_name("wombot_model.toml")
+    text = SHIPPED_ROBOT.read_text(encoding="utf-8")
     replaced = {
         'kind = "can"': f'kind = "{options.link}"',
         'channel = "/tmp/disco-hw-wombot.can"': f'channel = "{scratch / "bus"}"',
@@ -177,7 +171,7 @@ def _write_robot_file(scratch: Path, options: DemoOptions) -> Path:
     }
     for old, new in replaced.items():
         if text.count(old) != 1:
-            raise WorkError(f"{shipped}: expected exactly one line '{old.strip()}'")
+            raise WorkError(f"{SHIPPED_ROBOT}: expected exactly one line '{old.strip()}'")
         text = text.replace(old, new)
     if options.device is not None:
         text = with_device(text, options.device)
@@ -308,7 +302,7 @@ def _watch_laps(operator: Operator, options: DemoOptions, limit_s: float, consol
     task = progress.add_task("circle", total=options.laps, figures="")
     deadline = time.monotonic() + limit_s
     next_line = 0.0
-    floor = _Floor(circle_task(load_robot_config(_shipped_robot()).task, "the demonstration"))
+    floor = _Floor(circle_task(load_robot_config(SHIPPED_ROBOT).task, "the demonstration"))
     shown = Group(progress, floor) if console.width >= NARROWEST else progress
     with Live(shown, console=console, refresh_per_second=4) if console.is_terminal else _nothing():
         while True:

@@ -9,14 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.control import CommandLimits
 from disco_hw.control.baselines import LAWS, Follower, NominalRobot, Reference
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
@@ -36,7 +35,6 @@ from sim.plant_parameters import PlantParameters
 
 Array = NDArray[np.float64]
 FOOTPRINT = Footprint(0.50, 0.40, 0.05)
-_SHIPPED = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 # Chosen: room, speed and distance of the trials; less room, or more speed, makes them harder.
 _ALONG_M = 0.15
 _WALL_M_S = 0.3
@@ -105,7 +103,7 @@ class _Overridden(SafeArea):
 
 def fenced_setup(fence: Fence, task: RobotTask | None = None, base: Setup | None = None) -> Setup:
     """Return the shipped robot, or `base`, with this fence and task and a footprint."""
-    setup = base or load_setup(_SHIPPED)
+    setup = base or load_setup(SHIPPED_ROBOT)
     robot = msgspec.structs.replace(setup.config.robot, footprint_m=FOOTPRINT)
     changes = {"fence": fence, "robot": robot} | ({} if task is None else {"task": task})
     return replace(setup, config=msgspec.structs.replace(setup.config, **changes))
@@ -295,7 +293,7 @@ def along_drive(rng: np.random.Generator, off: float, seconds: float) -> FencedD
     """
     radius_m = float(rng.uniform(0.6, 1.2))
     task = CircleTask(center_x_m=0.0, center_y_m=0.0, radius_m=radius_m, speed_m_s=_WALL_M_S)
-    plant, shipped = untold_plant(rng, off), load_setup(_SHIPPED)
+    plant, shipped = untold_plant(rng, off), load_setup(SHIPPED_ROBOT)
     model = shipped.model
     facing = math.asin(model.x_icr_m / radius_m)
     turned = [(x * math.cos(facing) - y * math.sin(facing), x * math.sin(facing) + y * math.cos(facing)) for x, y in

@@ -1,12 +1,10 @@
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 
-import disco_hw
 from disco_hw.adaptation.guard import (
     Geometry,
     believed_geometry,
@@ -16,11 +14,11 @@ from disco_hw.adaptation.guard import (
     possible_range,
     with_geometry,
 )
-from disco_hw.config import Control, PoseInput, Prior
+from disco_hw.config import SHIPPED_ROBOT, Control, PoseInput, Prior
 from disco_hw.errors import InputError
 from disco_hw.model import EffectSetting, Gaussian, load_model
 
-MODEL = load_model(Path(disco_hw.__file__).parent / "robots" / "wombot_model.toml")
+MODEL = load_model(SHIPPED_ROBOT.with_name("wombot_model.toml"))
 NEW = Geometry(np.array([0.2, 0.07, 0.4]), np.diag([1e-6, 2e-8, 3e-6]))
 
 

@@ -5,14 +5,13 @@ Seconds are for a benchmark (tools/bench/start.py); what makes them is counted h
 
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 from tests.tables import thinned
 
-SHIPPED = Path(disco_hw.__file__).parent / "robots"
+SHIPPED = SHIPPED_ROBOT.parent
 HEAVY = ("scipy", "torch", "matplotlib", "numba", "cantools", "filterpy", "viser", "zmq", "mcap", "cryptography",
          "pydantic", "rich")  # fmt: skip
 COUNT = """

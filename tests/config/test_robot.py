@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.config import Prior, load_robot_config
+from disco_hw.config import SHIPPED_ROBOT, Prior, load_robot_config
 from disco_hw.errors import InputError
 from disco_hw.tasks import kinds, task_class
 from disco_hw.tasks.circle import circle_task
@@ -48,16 +48,14 @@ def test_the_prior_is_around_the_robot_where_the_file_leaves_it_out(tmp_path):
 
 
 def test_the_papers_robot_has_the_papers_prior():
-    import disco_hw
 
-    config = load_robot_config(Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
+    config = load_robot_config(SHIPPED_ROBOT)
     assert config.prior == Prior()
 
 
 def test_shipped_robot_file_is_valid():
-    import disco_hw
 
-    config = load_robot_config(Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
+    config = load_robot_config(SHIPPED_ROBOT)
     assert config.link.interface == "unixcan"
 
 

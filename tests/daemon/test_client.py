@@ -1,14 +1,10 @@
 """What `ctl` asks a daemon for, and what it does not even send."""
 
-from pathlib import Path
-
 import pytest
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.daemon import ask, describe_controller
 from disco_hw.errors import InputError, WorkError
-
-ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 
 
 @pytest.mark.parametrize(
@@ -26,14 +22,14 @@ ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 )
 def test_what_is_no_request_is_not_sent(action, changes, message):
     with pytest.raises(InputError, match=message):
-        ask(ROBOT, action, changes)
+        ask(SHIPPED_ROBOT, action, changes)
 
 
 @pytest.mark.parametrize("robot", ["no daemon", "no robot.toml"])
 def test_an_estop_that_reaches_nobody_says_what_does(tmp_path, robot):
     path = tmp_path / "robot.toml"
     if robot == "no daemon":
-        path.write_text(ROBOT.read_text() + f'[daemon]\ncontrol_socket = "{tmp_path / "none"}"\n')
+        path.write_text(SHIPPED_ROBOT.read_text() + f'[daemon]\ncontrol_socket = "{tmp_path / "none"}"\n')
     error = WorkError if robot == "no daemon" else InputError
     with pytest.raises(error, match=r"NOT SENT: use `disco-hw estop .*button, now"):
         ask(path, "estop")
@@ -44,7 +40,7 @@ def test_an_estop_that_reaches_nobody_says_what_does(tmp_path, robot):
 
 def test_only_arming_is_done_unrecorded():
     with pytest.raises(InputError, match="--unrecorded: belongs to arm, not to start"):
-        ask(ROBOT, "start", unrecorded=True)
+        ask(SHIPPED_ROBOT, "start", unrecorded=True)
 
 
 def test_a_status_says_of_each_limit_who_says_it():

@@ -6,14 +6,13 @@ import subprocess
 import sys
 import threading
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from numba import njit
 
-import disco_hw
 from disco_hw import gap
 from disco_hw.cli import logs, robot
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.daemon import check, run
 from disco_hw.daemon.run import compile_beforehand, compile_progress
 from disco_hw.inference import infer_command
@@ -113,9 +112,6 @@ def test_who_compiles_ends_with_the_process_that_it_compiles_for(start, number):
     start("import time\n" + START.replace("double(1.5)", for_ever), ended_by=number)
 
 
-ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
-
-
 def test_what_a_start_will_need_is_compiled_beforehand_with_words_and_nothing_for_files_that_it_refuses(
     tmp_path, monkeypatch
 ):
@@ -128,16 +124,16 @@ def test_what_a_start_will_need_is_compiled_beforehand_with_words_and_nothing_fo
     monkeypatch.setattr(run, "create_planner", create)
     monkeypatch.setattr(run, "create_pipeline", lambda *_: None)
     monkeypatch.setattr(run, "warm_up", lambda _: None)
-    shipped = load_model(ROBOT.parent / "wombot_model.toml")
+    shipped = load_model(SHIPPED_ROBOT.parent / "wombot_model.toml")
     with_deadband = replace(shipped, effects=(EffectSetting("deadband", {"width_rad_s": 0.5}),))
     save_model(with_deadband, tmp_path / "model.toml")
-    compile_beforehand(ROBOT, tmp_path / "model.toml", messages.append)
+    compile_beforehand(SHIPPED_ROBOT, tmp_path / "model.toml", messages.append)
     # One planner to drive with, and one that is used up in the rehearsal.
     assert made == [["deadband"]] * 2
     assert messages[0].startswith("compiling the planner for this task and a model with deadband")
     save_model(replace(shipped, missing_effects=("motor_lag",)), tmp_path / "marked.toml")
     for refused in (tmp_path / "marked.toml", tmp_path / "none.toml"):
-        compile_beforehand(ROBOT, refused, messages.append)
+        compile_beforehand(SHIPPED_ROBOT, refused, messages.append)
     assert len(made) == 2
 
 
@@ -154,9 +150,9 @@ class Result:
 @pytest.mark.parametrize(
     ("verb", "model"),
     [
-        (lambda out: robot.check(ROBOT), lambda _: None),
-        (lambda out: logs.gap([ROBOT], ROBOT, out), lambda out: out / "model.toml"),
-        (lambda out: logs.infer([ROBOT], ROBOT, out), lambda out: out),
+        (lambda out: robot.check(SHIPPED_ROBOT), lambda _: None),
+        (lambda out: logs.gap([SHIPPED_ROBOT], SHIPPED_ROBOT, out), lambda out: out / "model.toml"),
+        (lambda out: logs.infer([SHIPPED_ROBOT], SHIPPED_ROBOT, out), lambda out: out),
     ],
     ids=["check", "gap", "infer"],
 )

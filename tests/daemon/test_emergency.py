@@ -8,12 +8,11 @@ import select
 import threading
 import time
 import tty
-from pathlib import Path
 
 import can
 import pytest
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.daemon import SERVED, emergency
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.daemon.emergency import stop_and_report, stop_robot
@@ -23,7 +22,7 @@ from drivers.types import Frame, LinkState, ReceivedFrame
 from firmware_protocol.codec import Codec
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 
-SHIPPED = (Path(disco_hw.__file__).parent / "robots" / "wombot.toml").read_text(encoding="utf-8")
+SHIPPED = (SHIPPED_ROBOT).read_text(encoding="utf-8")
 
 UART_NODE = 51
 

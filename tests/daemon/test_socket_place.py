@@ -13,16 +13,15 @@ from pathlib import Path
 
 import pytest
 
-import disco_hw
 from disco_hw import daemon as client
-from disco_hw.config import load_robot_config
+from disco_hw.config import SHIPPED_ROBOT, load_robot_config
 from disco_hw.daemon import ask, believed_users, default_socket_path, passed_over, send_request, socket_path
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.errors import WorkError
 
 ME = os.geteuid()
 NOBODY = 65534
-SHIPPED = (Path(disco_hw.__file__).parent / "robots" / "wombot.toml").read_text(encoding="utf-8")
+SHIPPED = (SHIPPED_ROBOT).read_text(encoding="utf-8")
 needs_root = pytest.mark.skipif(ME != 0, reason="needs root to act as a second user")
 
 REPLY = b'{"ok": true, "text": "the stranger says", "robot_state": "ESTOP", "robot_state_ns": 9e18, "link": "up"}\n'

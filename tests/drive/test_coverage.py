@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import disco_hw
-from disco_hw.config import load_robot_config
+from disco_hw.config import SHIPPED_ROBOT, load_robot_config
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.scripts import create_script
 from disco_hw.runtime.pipeline import Governor, WheelLimits
 
-CONFIG = load_robot_config(Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
+CONFIG = load_robot_config(SHIPPED_ROBOT)
 TOP = 6.4
 PERIOD_NS = 20_000_000
 

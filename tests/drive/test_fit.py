@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.drive import ManualInput, RobotView
 from disco_hw.drive.fit import FittedScriptSource, ScriptDoesNotFit, ScriptGeometry, driven_path, fit_script
 from disco_hw.drive.script import Manoeuvre, Room, Script, ScriptSource
@@ -19,7 +18,6 @@ from disco_hw.fence.clearance import Boundaries
 from disco_hw.runtime import State
 from disco_hw.runtime.robot_setup import load_setup
 
-ROBOT_FILE = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 ROBOT = ScriptGeometry(0.06, 0.4, 0.1)
 FOOTPRINT = Footprint(0.5, 0.4, 0.05)
 ROOM_NEEDED = Room((-0.5, 2.5), (-1.0, 1.0))
@@ -35,7 +33,7 @@ def bend() -> Manoeuvre:
 
 
 def shipped(name: str) -> Script:
-    setup = load_setup(ROBOT_FILE)
+    setup = load_setup(SHIPPED_ROBOT)
     return create_script(name, setup.config.robot, setup.config.task, 0.6)
 
 

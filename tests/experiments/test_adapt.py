@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.experiments.adapt import AdaptOptions, AdaptResult, AdaptRun, drive
 from disco_hw.log import records
 from disco_hw.log.recorder import MemoryRecorder
@@ -25,7 +23,7 @@ OPTIONS = AdaptOptions(change_s=CHANGE_S, settled_s=10.0, compared_s=0.5, seeds=
 @pytest.fixture(scope="module")
 def adapted():
     """A drive on which the wheels grow by 15 % after 4 s: what it did and what was recorded."""
-    setup = load_setup(Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
+    setup = load_setup(SHIPPED_ROBOT)
     recorder = MemoryRecorder()
     effects = {"surface_change": (0.0, CHANGE_S + 2.0, 0.15)}
     return drive(setup, effects, OPTIONS, adapted=True, seed=1, recorder=recorder), recorder.ticks

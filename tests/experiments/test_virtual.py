@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-import disco_hw
 from disco_hw.cli import app
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.errors import InputError
 from disco_hw.experiments import virtual, with_device
 from disco_hw.experiments.virtual import SimOptions, run_sim, true_parameters
 from disco_hw.runtime.robot_setup import load_setup
 
-ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
-
 
 def test_without_a_seed_the_plant_is_the_mean():
-    plant = true_parameters(load_setup(ROBOT), None)
+    plant = true_parameters(load_setup(SHIPPED_ROBOT), None)
     assert (plant.wheel_radius_m, plant.axial_distance_m, plant.x_icr_m) == (0.061, 0.415, 0.238)
 
 
 def test_draws_have_the_posteriors_spread_parameter_by_parameter():
-    setup = load_setup(ROBOT)
+    setup = load_setup(SHIPPED_ROBOT)
     plants = [true_parameters(setup, seed) for seed in range(400)]
     samples = np.array([(p.wheel_radius_m, p.axial_distance_m, p.x_icr_m) for p in plants])
     assert samples.mean(0) == pytest.approx((0.061, 0.415, 0.238), abs=0.003)
@@ -34,11 +30,11 @@ def test_draws_have_the_posteriors_spread_parameter_by_parameter():
 def test_the_plain_robot_is_the_one_that_its_model_describes(monkeypatch):
     played = []
     monkeypatch.setattr(virtual, "run_virtual_robot", played.append)
-    run_sim(SimOptions(ROBOT))
+    run_sim(SimOptions(SHIPPED_ROBOT))
     (options,) = played
     assert options.plant == options.plant.with_ideal_motors()
     assert options.effects == {}
-    run_sim(SimOptions(ROBOT, hide=("motor_lag=0.06",)))
+    run_sim(SimOptions(SHIPPED_ROBOT, hide=("motor_lag=0.06",)))
     assert played[1].plant == options.plant
     assert set(played[1].effects) == {"motor_lag"}
 
@@ -49,13 +45,13 @@ def test_the_plain_robot_is_the_one_that_its_model_describes(monkeypatch):
 )
 def test_a_mistake_in_what_to_hide_is_named(hide, expected_error):
     with pytest.raises(InputError, match=expected_error):
-        run_sim(SimOptions(ROBOT, hide=(hide,)))
+        run_sim(SimOptions(SHIPPED_ROBOT, hide=(hide,)))
 
 
 def test_a_fractional_encoder_is_refused(tmp_path):
     path = tmp_path / "robot.toml"
-    text = ROBOT.read_text().replace("ticks_per_rev = 2048", "ticks_per_rev = 2796.8")
-    path.write_text(text.replace("wombot_model.toml", str(ROBOT.parent / "wombot_model.toml")))
+    text = SHIPPED_ROBOT.read_text().replace("ticks_per_rev = 2048", "ticks_per_rev = 2796.8")
+    path.write_text(text.replace("wombot_model.toml", str(SHIPPED_ROBOT.parent / "wombot_model.toml")))
     with pytest.raises(InputError, match="whole number"):
         run_sim(SimOptions(path))
     # Checked before the encoder, so that this ends even where the start is not looked at.
@@ -77,9 +73,11 @@ def test_a_robot_is_needed_to_run():
 
 def test_a_board_that_has_a_link_of_its_own_is_refused_what_the_simulators_link_does(tmp_path):
     with pytest.raises(InputError, match="--bus-log: cannot be used with --board"):
-        run_sim(SimOptions(ROBOT, board="/dev/ttyUSB1", bus_log=tmp_path / "bus.log"))
+        run_sim(SimOptions(SHIPPED_ROBOT, board="/dev/ttyUSB1", bus_log=tmp_path / "bus.log"))
     vendors = tmp_path / "robot.toml"
-    text = ROBOT.read_text("utf-8").replace("wombot_model.toml", str(ROBOT.with_name("wombot_model.toml")))
+    text = SHIPPED_ROBOT.read_text("utf-8").replace(
+        "wombot_model.toml", str(SHIPPED_ROBOT.with_name("wombot_model.toml"))
+    )
     vendors.write_text(with_device(text, "odrive"), "utf-8")
     with pytest.raises(InputError, match=r"--board: .*robot\.toml has link\.driver odrive"):
         run_sim(SimOptions(vendors, board="/dev/ttyUSB1"))

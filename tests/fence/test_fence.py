@@ -7,14 +7,13 @@ from pathlib import Path
 
 import pytest
 
-import disco_hw
-from disco_hw.config import load_daemon_address, load_robot_config
+from disco_hw.config import SHIPPED_ROBOT, load_daemon_address, load_robot_config
 from disco_hw.errors import InputError
 from disco_hw.fence import Circle, Fence, Footprint, area_m2, fence_fault
 
 FOOTPRINT = Footprint(0.5, 0.4, 0.05)
 ROOM = ((-2.0, -1.5), (2.0, -1.5), (2.0, 1.5), (-2.0, 1.5))
-ROBOT_TEXT = (Path(disco_hw.__file__).parent / "robots" / "wombot.toml").read_text()
+ROBOT_TEXT = (SHIPPED_ROBOT).read_text()
 
 
 CROSSED = (ROOM[0], ROOM[2], ROOM[1], ROOM[3])

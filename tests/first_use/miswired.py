@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 import socket
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import msgspec
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.drive import ManualInput
 from disco_hw.errors import WorkError
 from disco_hw.experiments import with_device
@@ -32,8 +31,6 @@ from sim.plant_parameters import PlantParameters
 from sim.process import PoseSender
 from sim.virtual_robot import STEP_US, VendorRobot, VirtualRobot
 from tests.drivers.waiting import free_port
-
-SHIPPED = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 
 
 @dataclass(frozen=True)
@@ -234,8 +231,8 @@ class SimulatedOperator:
 
 def robot_file(directory, driver=None):
     """The shipped robot with poses by datagrams and another controller."""
-    text = SHIPPED.read_text(encoding="utf-8").replace(
-        '"wombot_model.toml"', f'"{SHIPPED.parent / "wombot_model.toml"}"'
+    text = SHIPPED_ROBOT.read_text(encoding="utf-8").replace(
+        '"wombot_model.toml"', f'"{SHIPPED_ROBOT.parent / "wombot_model.toml"}"'
     )
     if driver not in (None, "reference"):
         text = with_device(text, driver)

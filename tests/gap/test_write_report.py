@@ -8,10 +8,9 @@ from types import SimpleNamespace
 import pytest
 from typer.testing import CliRunner
 
-import disco_hw
 from disco_hw import gap
 from disco_hw.cli import app
-from disco_hw.config import load_robot_config
+from disco_hw.config import SHIPPED_ROBOT, load_robot_config
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.errors import InputError, LogError
 from disco_hw.gap.report import STAGES, EffectFinding, FleetRow, GapReport, LowConfidence, UnnamedFinding
@@ -21,8 +20,6 @@ from disco_hw.log.importing import write_log
 from disco_hw.model import Model
 from tools.gap.strange_robot import record
 from tools.joystick import joystick
-
-ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 
 
 class EnoughError(Exception):
@@ -38,7 +35,7 @@ def test_the_search_knows_what_the_robot_can_do(monkeypatch, tmp_path):
 
     monkeypatch.setattr(gap, "load_drive", lambda *_: None)
     monkeypatch.setattr(gap, "find_gap", search)
-    robot = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
+    robot = SHIPPED_ROBOT
     with pytest.raises(EnoughError):
         gap.gap([], robot, tmp_path)
     assert handed.top_rad_s == load_robot_config(robot).robot.max_wheel_speed_rad_s
@@ -49,7 +46,7 @@ def test_a_directory_that_cannot_be_used_is_refused_before_the_search(monkeypatc
         raise EnoughError
 
     monkeypatch.setattr(gap, "load_drive", search)
-    robot = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
+    robot = SHIPPED_ROBOT
     given = tmp_path / "model.toml"
     given.write_bytes((robot.parent / "wombot_model.toml").read_bytes())
     with pytest.raises(InputError, match="exists and is not a directory"):
@@ -100,7 +97,7 @@ def fleet(monkeypatch, tmp_path):
 def test_a_fleet_ends_in_one_table_with_a_row_for_each_log(fleet, tmp_path):
     out = tmp_path / "out"
     said = []
-    result = gap.gap_fleet(fleet, ROBOT, out, progress=said.append)
+    result = gap.gap_fleet(fleet, SHIPPED_ROBOT, out, progress=said.append)
     head, monday, tuesday, short = (out / "fleet.txt").read_text().splitlines()
     assert head.split() == ["log", "found", "doubtful", "ahead", "timed", "offered", "floor", "model"]
     assert monday.split("  ")[0] == str(fleet[0])
@@ -131,7 +128,7 @@ def test_a_fleet_ends_in_one_table_with_a_row_for_each_log(fleet, tmp_path):
 def test_a_fleet_s_json_has_the_numbers_and_every_log_its_report(fleet, tmp_path):
     out = tmp_path / "out"
     answer = CliRunner().invoke(
-        app(), ["gap", *map(str, fleet), "--robot", str(ROBOT), "-o", str(out), "--fleet", "--json"]
+        app(), ["gap", *map(str, fleet), "--robot", str(SHIPPED_ROBOT), "-o", str(out), "--fleet", "--json"]
     )
     assert answer.exit_code == 0, answer.output
     content = json.loads((out / "fleet.json").read_text())
@@ -155,7 +152,7 @@ def test_reports_of_a_fleet_are_written_over_no_log(fleet, tmp_path):
     inside.parent.mkdir(parents=True)
     inside.write_bytes(b"a log too")
     with pytest.raises(InputError, match="is read here and would be overwritten"):
-        gap.gap_fleet([fleet[0], inside], ROBOT, tmp_path / "out")
+        gap.gap_fleet([fleet[0], inside], SHIPPED_ROBOT, tmp_path / "out")
 
 
 def test_a_log_of_a_fleet_without_poses_is_told_by_its_wheels():
@@ -184,10 +181,10 @@ def test_a_cluster_makes_the_same_table(tmp_path):
         cluster.wait_for_workers(2)
         address = ["--dask", cluster.scheduler_address]
         answer = CliRunner().invoke(
-            app(), ["gap", *map(str, logs), "--robot", str(ROBOT), "-o", str(tmp_path / "far"), *address]
+            app(), ["gap", *map(str, logs), "--robot", str(SHIPPED_ROBOT), "-o", str(tmp_path / "far"), *address]
         )
     assert answer.exit_code == 0, answer.output
-    here = gap.gap_fleet(logs, ROBOT, tmp_path / "here")
+    here = gap.gap_fleet(logs, SHIPPED_ROBOT, tmp_path / "here")
     assert (tmp_path / "far" / "fleet.txt").read_text() == (tmp_path / "here" / "fleet.txt").read_text()
     assert here.table() in answer.output
     assert (tmp_path / "far" / "drive2" / "report.html").stat().st_size > 10_000

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-import disco_hw
 from disco_hw.adaptation.guard import Geometry, believed_geometry, with_geometry
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.log.reader import open_log
 from disco_hw.model import load_model, model_text
 from tests.hil.stack import disco
@@ -32,7 +30,7 @@ RELEARNT_COST = 0.0145
 
 def driven_otherwise(directory, adaptation):
     """Drive a robot that is not what its model file says; returns its geometry and the mean tracking cost."""
-    model = load_model(Path(disco_hw.__file__).parent / "robots" / "wombot_model.toml")
+    model = load_model(SHIPPED_ROBOT.with_name("wombot_model.toml"))
     believed = believed_geometry(model)
     truth = Geometry(OTHER_ROBOT * believed.mean, believed.covariance)
     (directory / "truth.toml").write_text(model_text(with_geometry(model, truth)), encoding="utf-8")

@@ -1,12 +1,10 @@
 import math
 import typing
-from pathlib import Path
 
 import msgspec
 import pytest
 
-import disco_hw
-from disco_hw.config import load_robot_config
+from disco_hw.config import SHIPPED_ROBOT, load_robot_config
 from disco_hw.fence import Circle, Fence, Footprint
 from disco_hw.log.mcap_log import VIEWS, scene_message, views
 from disco_hw.log.records import Command, Estimate, Event, Fan, GuardVerdict, Level, Plan
@@ -15,7 +13,6 @@ from drivers.types import PoseSample
 
 WALL_NS = 1_700_000_000_123_456_789
 CLASSES = dict(VIEWS)
-ROBOT_FILE = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 FOOTPRINT = Footprint(0.5, 0.4, 0.05)
 
 
@@ -93,7 +90,7 @@ def points_of(line):
 
 
 def test_the_scene_shows_the_fence_in_the_world_and_the_footprint_on_the_robot():
-    config = load_robot_config(ROBOT_FILE)
+    config = load_robot_config(SHIPPED_ROBOT)
     corners = ((-2.0, -1.5), (2.0, -1.5), (2.0, 1.5))
     fence = Fence(keep_in=corners, keep_out=(Circle((0.0, 0.0), 0.3),))
     robot = msgspec.structs.replace(config.robot, footprint_m=FOOTPRINT)

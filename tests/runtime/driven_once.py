@@ -6,13 +6,12 @@ import gc
 import json
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import msgspec
 from numba.core.dispatcher import Dispatcher
 
-import disco_hw
 from disco_hw.adaptation.guard import believed_geometry
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.daemon.run import warm_up
 from disco_hw.runtime import State
 from disco_hw.runtime.assembly import apply_geometry, create_pipeline, create_planner
@@ -29,7 +28,7 @@ def compiled_forms() -> dict[str, int]:
 
 
 def main(uncertainty: str) -> None:
-    setup = load_setup(Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
+    setup = load_setup(SHIPPED_ROBOT)
     control = msgspec.structs.replace(setup.config.control, uncertainty=uncertainty)
     setup = replace(setup, config=msgspec.structs.replace(setup.config, control=control))
     warm_up(create_pipeline(setup.config, setup.model, create_planner(setup.config, setup.model)))

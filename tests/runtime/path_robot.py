@@ -5,9 +5,9 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 
-ROBOTS = Path(disco_hw.__file__).parent / "robots"
+ROBOTS = SHIPPED_ROBOT.parent
 _CIRCLE = 'kind = "circle"\nradius_m = 0.75\nspeed_m_s = 0.2\n'
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.pipeline import Planner
@@ -13,7 +13,7 @@ from disco_hw.runtime.robot_setup import load_setup
 from sim.body_dynamics import BodyPose
 from sim.plant_parameters import PlantParameters
 
-ROBOT_FILE = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
+ROBOT_FILE = SHIPPED_ROBOT
 START = BodyPose(0.75, 0.0, 1.5707963)
 
 

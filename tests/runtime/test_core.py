@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path as FilePath
-
 import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.control import NoValidControl
 from disco_hw.daemon import describe
 from disco_hw.daemon.control_socket import loop_figures, status
@@ -31,8 +29,6 @@ from sim.plant_parameters import PlantParameters
 from sim.virtual_robot import VirtualRobot
 from tests.runtime.simulated import START, simulated_stack
 from tests.tables import thinned
-
-ROBOT = FilePath(disco_hw.__file__).parent / "robots" / "wombot.toml"
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +149,7 @@ def test_the_log_says_which_controller_answers_and_who_says_its_limits():
     assert first.fixed == first.declared == {}
     shown = status(stack.core, loop_figures(LoopStats()), RecorderStats())
     assert shown["controller"]["limits"]["max_wheel_speed_rad_s"] == {"value": 8.0, "said_by": "device"}
-    assert "controller: reference controller, firmware" in describe({**shown, "do": "status"}, ROBOT)
+    assert "controller: reference controller, firmware" in describe({**shown, "do": "status"}, SHIPPED_ROBOT)
     exchanged(stack, max_wheel_speed_rad_s=4.0)
     stack.run(3.0)
     assert recorded()[-1].told["max_wheel_speed_rad_s"] == 4.0
@@ -217,7 +213,7 @@ class Moody:
 
 
 def test_a_planner_that_gives_up_is_followed_on_its_tail_then_the_wheels_ramp_down():
-    setup = load_setup(ROBOT)
+    setup = load_setup(SHIPPED_ROBOT)
     stack = simulated_stack(Moody(create_planner(setup.config, setup.model), 4_000_000_000))
     stack.run(1.5)
     stack.run(0.5, UserRequest.ARM)
@@ -282,7 +278,7 @@ class Collapsing:
 
 
 def test_plans_that_hang_on_too_few_samples_are_reported_once():
-    setup = load_setup(ROBOT)
+    setup = load_setup(SHIPPED_ROBOT)
     stack = simulated_stack(Collapsing(create_planner(setup.config, setup.model), 2_500_000_000, 3_000_000_000))
     stack.run(1.5)
     stack.run(0.5, UserRequest.ARM)

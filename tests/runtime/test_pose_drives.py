@@ -1,11 +1,9 @@
 """A circle by RTK positions without heading, and by datagrams that get lost: whole drives in simulated time."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.robot_setup import load_setup
 from tests.runtime.pose_drives import ROBOT, RTK, UDP, drive_circle, with_circle
@@ -13,7 +11,7 @@ from tests.runtime.pose_drives import ROBOT, RTK, UDP, drive_circle, with_circle
 
 @pytest.fixture(scope="module")
 def driven():
-    setup = with_circle(load_setup(Path(disco_hw.__file__).parent / "robots" / "wombot.toml"), 3.0, 0.5)
+    setup = with_circle(load_setup(SHIPPED_ROBOT), 3.0, 0.5)
     planner = create_planner(setup.config, setup.model)
     return lambda kind, seeds: [drive_circle(setup, planner, kind, seed) for seed in seeds]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from msgspec import structs
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.control.optimiser import Optimiser
 from disco_hw.control.past_motion import DriveMeans
 from disco_hw.errors import InputError
@@ -22,7 +22,7 @@ from disco_hw.runtime.supervisor import UserRequest
 from tests.runtime.simulated import simulated_stack
 from tests.tables import thinned
 
-ROBOTS = Path(disco_hw.__file__).parent / "robots"
+ROBOTS = SHIPPED_ROBOT.parent
 
 
 @pytest.fixture(scope="module")

@@ -8,18 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.daemon import run
 from disco_hw.daemon.run import DaemonOptions, run_daemon
 from disco_hw.errors import InputError
 from disco_hw.model import EffectSetting, Gaussian, Model, load_model, save_model
 from disco_hw.runtime.robot_setup import geometry, link_key, load_setup
 
-ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
-
 
 def test_the_shipped_robot_carries_the_papers_posterior():
-    setup = load_setup(ROBOT)
+    setup = load_setup(SHIPPED_ROBOT)
     mean, covariance = geometry(setup.model)
     assert mean == (0.061, 0.415, 0.238)
     assert np.array(covariance) == pytest.approx(
@@ -28,16 +26,16 @@ def test_the_shipped_robot_carries_the_papers_posterior():
 
 
 def test_overrides_and_their_mistakes():
-    assert load_setup(ROBOT, link="serial").config.link.kind == "serial"
+    assert load_setup(SHIPPED_ROBOT, link="serial").config.link.kind == "serial"
     with pytest.raises(InputError, match="--link radio: not a link"):
-        load_setup(ROBOT, link="radio")
+        load_setup(SHIPPED_ROBOT, link="radio")
     with pytest.raises(InputError, match="cannot be read"):
-        load_setup(ROBOT, model=Path("/nowhere/model.toml"))
+        load_setup(SHIPPED_ROBOT, model=Path("/nowhere/model.toml"))
 
 
 def test_without_a_model_the_prior_is_the_belief(tmp_path):
     path = tmp_path / "robot.toml"
-    path.write_text(ROBOT.read_text().replace('file = "wombot_model.toml"', ""))
+    path.write_text(SHIPPED_ROBOT.read_text().replace('file = "wombot_model.toml"', ""))
     setup = load_setup(path)
     assert setup.model_file is None
     mean, covariance = geometry(setup.model)
@@ -55,17 +53,17 @@ def test_what_the_belief_does_not_name_is_exact():
 
 def test_a_model_marked_as_lacking_an_effect_is_run_only_when_asked_to(tmp_path, monkeypatch):
     marked = tmp_path / "model.toml"
-    save_model(replace(load_model(ROBOT.parent / "wombot_model.toml"), missing_effects=("turn_slip",)), marked)
+    save_model(replace(load_model(SHIPPED_ROBOT.parent / "wombot_model.toml"), missing_effects=("turn_slip",)), marked)
     monkeypatch.setattr(run, "serve", lambda *_: 0)
     message = r"model\.toml: missing_effects: the model lacks turn_slip.*--accept-missing-effects"
     with pytest.raises(InputError, match=message):
-        run_daemon(DaemonOptions(robot=ROBOT, model=marked))
-    assert run_daemon(DaemonOptions(robot=ROBOT, model=marked, accept_missing_effects=True)) == 0
-    assert run_daemon(DaemonOptions(robot=ROBOT)) == 0
+        run_daemon(DaemonOptions(robot=SHIPPED_ROBOT, model=marked))
+    assert run_daemon(DaemonOptions(robot=SHIPPED_ROBOT, model=marked, accept_missing_effects=True)) == 0
+    assert run_daemon(DaemonOptions(robot=SHIPPED_ROBOT)) == 0
 
 
 def test_the_key_is_read_from_beside_robot_toml_and_a_bad_one_named_in_a_line(tmp_path):
-    text = ROBOT.read_text(encoding="utf-8").replace('file = "wombot_model.toml"', "")
+    text = SHIPPED_ROBOT.read_text(encoding="utf-8").replace('file = "wombot_model.toml"', "")
     robot_file = tmp_path / "robot.toml"
     robot_file.write_text(text)
     assert link_key(load_setup(robot_file)) is None

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.fence import Circle, Fence, Footprint
 from disco_hw.fence.clearance import Boundaries
@@ -29,7 +29,7 @@ from disco_hw.runtime.supervisor import UserRequest
 from sim.body_dynamics import BodyPose
 from sim.plant_parameters import PlantParameters
 
-ROBOTS = Path(disco_hw.__file__).parent / "robots"
+ROBOTS = SHIPPED_ROBOT.parent
 ROOM = ((-2.0, -1.5), (2.0, -1.5), (2.0, 1.5), (-2.0, 1.5))
 FENCE = "\n[fence]\nkeep_in = [[-2, -1.5], [2, -1.5], [2, 1.5], [-2, 1.5]]\n"
 SECOND_NS = 1_000_000_000

@@ -14,9 +14,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-import disco_hw
 from disco_hw.adaptation.fast import FastAdaptation
 from disco_hw.adaptation.guard import NAMES, Geometry, believed_geometry, with_geometry
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.daemon.run import warm_up
 from disco_hw.experiments.adapt import BELIEVED_STD, CHANGES, AdaptOptions, run_adapt
 from disco_hw.log.reader import open_log
@@ -30,7 +30,6 @@ from tools.stack import FAST_START, FAST_TASK, first_truth_s, newest_truth_s, ru
 Array = NDArray[np.float64]
 
 LIVE_S = 30.0
-ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 LENGTHS = ("radius_m", "axle_m", "x_icr_m")
 # The order of the adaptation's arrays is x_icr, wheel radius, axial distance.
 _TO_ADAPTATION, _FROM_ADAPTATION = [2, 0, 1], [1, 2, 0]
@@ -38,7 +37,7 @@ _TO_ADAPTATION, _FROM_ADAPTATION = [2, 0, 1], [1, 2, 0]
 
 def run() -> dict[str, float]:
     """Microseconds of the daemon's calls, figures of the loop in real time, and of the experiment."""
-    setup = load_setup(ROBOT)
+    setup = load_setup(SHIPPED_ROBOT)
     return _calls(setup) | _live() | _changed_live() | _won_back(setup)
 
 
@@ -272,7 +271,7 @@ def drive_through_change(directory: Path, changes: str, *, adapt: bool) -> LiveD
     The belief is right, and as narrow as after `infer`, until the wheel radius or axial distance (`changes`) grows by
     15 %.
     """
-    model = load_model(Path(disco_hw.__file__).parent / "robots" / "wombot_model.toml")
+    model = load_model(SHIPPED_ROBOT.with_name("wombot_model.toml"))
     mean = believed_geometry(model).mean
     std = BELIEVED_STD * np.array([1.0, mean[1], mean[2]])
     narrow = directory / "narrow.toml"

@@ -9,7 +9,6 @@ import math
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ import torch
 from numba import njit
 from numba.core.runtime import _nrt_python, rtsys
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand
 from disco_hw.control.black_box import BlackBoxDisco
 from disco_hw.control.kernel.step import disco_step
@@ -34,7 +33,7 @@ from disco_hw.tasks.circle import CircleCost
 from tools.bench.step_times import summary, times_ms, undisturbed
 from tools.torch_models import circle_cost, skid_steer_transition
 
-ROBOTS = Path(disco_hw.__file__).parent / "robots"
+ROBOTS = SHIPPED_ROBOT.parent
 PERIOD_NS = 20_000_000
 STEP_NS = 100_000_000
 PAPERS_SIZE = Sampler(samples=400, horizon=50)

@@ -8,13 +8,12 @@ for one that faces the way.
 from __future__ import annotations
 
 import math
-from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, SentCommand
 from disco_hw.experiments.circle import KinematicPlant, plants
 from disco_hw.model import Model, load_model
@@ -22,7 +21,7 @@ from disco_hw.tasks.line import load_waypoints
 from disco_hw.tasks.path import PathTask
 from tools.bench.step_times import summary, times_ms, undisturbed
 
-ROBOTS = FilePath(disco_hw.__file__).parent / "robots"
+ROBOTS = SHIPPED_ROBOT.parent
 LIMITS = CommandLimits(8.0, 20.0)
 RATE_HZ = 10.0
 LAG_S, WHEEL_NOISE = 0.1, 0.05

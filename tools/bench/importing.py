@@ -14,9 +14,8 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 
-ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 DURATION_S = 600.0
 IMAGE_HZ, IMAGE_BYTES = 10.0, 155_000
 WHEELS_HZ, POSES_HZ, COMMANDS_HZ = 50.0, 30.0, 20.0
@@ -31,7 +30,7 @@ def run() -> dict[str, float]:
             bag, key = Path(name) / "bag", f"import.{storage.name.lower()}"
             write_bag(bag, storage)
             figures[f"{key}.bag_mb"] = sum(file.stat().st_size for file in bag.iterdir()) * 1e-6
-            command = [sys.executable, "-m", "disco_hw", "import", str(bag), "--robot", str(ROBOT)]
+            command = [sys.executable, "-m", "disco_hw", "import", str(bag), "--robot", str(SHIPPED_ROBOT)]
             began_s = time.monotonic()
             process = subprocess.Popen([*command, "-o", f"{name}/log.mcap"], stdout=subprocess.DEVNULL)
             _, status, used = os.wait4(process.pid, 0)

@@ -9,12 +9,11 @@ import os
 import subprocess
 import sys
 import tempfile
-from pathlib import Path
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 
 RUNS = 5
-ROBOT = str(Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
+ROBOT = str(SHIPPED_ROBOT)
 COMMAND = ("-m", "disco_hw")
 NUMPY = ("-c", "import numpy")
 CASES: dict[str, tuple[str, ...]] = {

@@ -20,8 +20,8 @@ from unittest.mock import patch
 import msgspec
 import typer.main
 
-import disco_hw
 from disco_hw import cli
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.log import Attachment
 from disco_hw.runtime.pipeline import NoPlanner
 from drivers.motor import find_driver
@@ -29,7 +29,7 @@ from drivers.types import PoseSample
 from firmware_protocol.codec import Codec
 from tools.log_samples import drive_ticks, log_bytes
 
-ROBOTS = Path(disco_hw.__file__).parent / "robots"
+ROBOTS = SHIPPED_ROBOT.parent
 CSV = "t_s,cmd_left_rad_s,cmd_right_rad_s,enc_left_rad_s,enc_right_rad_s,pose_x_m,pose_y_m,pose_yaw_rad,segment\n"
 FAULTS = 'seed = 3\n[[fault]]\nkind = "drop"\nat_s = 1\nfor_s = 2.5\nto = "host"\nid = 0x100\nprobability = 0.5\n'
 OUT = "out"

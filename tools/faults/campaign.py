@@ -27,17 +27,18 @@ QUIET_AT_END_S = 5.0
 
 def run_seed(seed: int, duration_s: float, cycle_us: int, planner: str) -> dict[str, Any]:
     """Run one seed; return its figures as plain data."""
+    from disco_hw.config import SHIPPED_ROBOT  # noqa: PLC0415
     from disco_hw.runtime.assembly import create_planner  # noqa: PLC0415 - in the worker, after its niceness is set
     from disco_hw.runtime.robot_setup import load_setup  # noqa: PLC0415
     from sim.fault_schedule import KINDS  # noqa: PLC0415
     from tools.faults.random_faults import random_schedule  # noqa: PLC0415
-    from tools.faults.run import ROBOT_FILE, FaultRun  # noqa: PLC0415
+    from tools.faults.run import FaultRun  # noqa: PLC0415
 
     kinds = tuple(name for name in KINDS if name not in KINDS_LEFT_OUT)
     schedule = random_schedule(seed, duration_s - QUIET_AT_END_S, kinds=kinds)
     disco = None
     if planner == "disco":
-        setup = load_setup(ROBOT_FILE)
+        setup = load_setup(SHIPPED_ROBOT)
         disco = create_planner(setup.config, setup.model)
     run = FaultRun(schedule, seed=seed, cycle_us=cycle_us, planner=disco)
     run.run(0.1)

@@ -9,10 +9,9 @@ import math
 import random
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.control import PlannerState
 from disco_hw.control.plan import LawController
 from disco_hw.daemon.control_socket import counters
@@ -42,7 +41,6 @@ from tools.faults.wheel_monitor import WheelMonitor
 GEOMETRY = (0.061, 0.415, 0.238)
 """Wheel radius, axial distance and x_icr of the robot, m."""
 LOOK_AHEAD_RAD = 0.35
-ROBOT_FILE = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 SETTLED_S = 2.5
 """A fault's consequences are looked for until so long after its end."""
 WRAP_SOON_TICKS = (1 << 24) - 20_000
@@ -208,7 +206,7 @@ class FaultRun:
         planner: Planner | None = None,
         plant: PlantParameters | None = None,
     ) -> None:
-        setup = load_setup(ROBOT_FILE)
+        setup = load_setup(SHIPPED_ROBOT)
         self.config = setup.config
         self._setup = setup
         self._planner = planner

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import disco_hw
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.control.plan import LawController
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.runtime import State
@@ -32,7 +32,7 @@ from sim.plant_parameters import PlantParameters
 from sim.sensors import PoseMeasurement
 from sim.virtual_robot import STEP_US, VendorRobot
 
-ROBOTS = Path(disco_hw.__file__).parent / "robots"
+ROBOTS = SHIPPED_ROBOT.parent
 RADIUS_M = 0.75
 STATIONARY_RAD_S = 0.1
 FAULTS: Mapping[str, tuple[str, dict[str, Any]]] = {

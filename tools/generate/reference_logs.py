@@ -16,9 +16,9 @@ from pathlib import Path
 
 import msgspec
 
-import disco_hw
 from disco_hw.adaptation import AdaptationUpdate, NoAdaptation
 from disco_hw.adaptation.guard import NAMES, believed_geometry
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.drive import ManualInput
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
@@ -34,7 +34,7 @@ from sim.body_dynamics import BodyPose
 from sim.plant_parameters import PlantParameters
 
 DIRECTORY = Path(__file__).parents[2] / "tests" / "runtime" / "reference_logs"
-ROBOTS = Path(disco_hw.__file__).parent / "robots"
+ROBOTS = SHIPPED_ROBOT.parent
 SHORT_SIGHTED = ("rate_hz = 50.0", "rate_hz = 50.0\nhorizon = 10\nstep_s = 0.3")
 """Ten steps instead of fifty: plans are most of a log."""
 

@@ -1,13 +1,12 @@
 """A simulated drive as a bag of ROS 2 and back: `infer` and `gap` find in it what they find in our own log of it."""
 
 import json
-from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
-import disco_hw
 from disco_hw.cli import app
+from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.script import ScriptSource, Unattended
@@ -20,14 +19,12 @@ from sim.body_dynamics import BodyPose
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(1500)]
 
-ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
-
 
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory):
     """Our own log of a minute's drive of a robot with a deadband, and the one that came through a bag."""
     folder = tmp_path_factory.mktemp("drive")
-    setup = load_setup(ROBOT)
+    setup = load_setup(SHIPPED_ROBOT)
     config = setup.config
     script = create_script("separate", config.robot, config.task, config.drive.speed_share)
     pilot = HandPilot(ScriptSource(script, Unattended()), Coverage(1.0))
@@ -38,7 +35,7 @@ def logs(tmp_path_factory):
     run.drive(script.duration_s + 10.0)
     run.write_log(folder / "own.mcap")
     call("log", "export", folder / "own.mcap", "-o", folder / "bag", "--rosbag2")
-    call("import", folder / "bag", "--robot", ROBOT, "-o", folder / "imported.mcap")
+    call("import", folder / "bag", "--robot", SHIPPED_ROBOT, "-o", folder / "imported.mcap")
     return folder / "own.mcap", folder / "imported.mcap"
 
 
@@ -50,7 +47,7 @@ def call(*arguments):
 
 def test_the_posteriors_lie_within_one_anothers_intervals(logs, tmp_path):
     original, imported = (
-        json.loads(call("infer", log, "--robot", ROBOT, "-o", tmp_path / f"{i}.toml", "--json"))["posterior"]
+        json.loads(call("infer", log, "--robot", SHIPPED_ROBOT, "-o", tmp_path / f"{i}.toml", "--json"))["posterior"]
         for i, log in enumerate(logs)
     )
     assert set(original) == set(imported)
@@ -63,7 +60,7 @@ def test_the_posteriors_lie_within_one_anothers_intervals(logs, tmp_path):
 def test_the_same_effect_is_named_with_the_same_value(logs, tmp_path):
     reports = []
     for i, log in enumerate(logs):
-        call("gap", log, "--robot", ROBOT, "-o", tmp_path / str(i))
+        call("gap", log, "--robot", SHIPPED_ROBOT, "-o", tmp_path / str(i))
         reports.append(json.loads((tmp_path / str(i) / "report.json").read_text(encoding="utf-8")))
     original, imported = ({effect["name"]: effect["parameters"] for effect in one["effects"]} for one in reports)
     assert set(original) == set(imported)
