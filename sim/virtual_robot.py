@@ -8,12 +8,12 @@ sends none. A side whose motor is released rolls on: it is given its own speed, 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 from drivers.transport import connect_pair
-from drivers.types import Frame, OutgoingFrame, Transport
+from drivers.types import Exchange, Frame, OutgoingFrame, Transport
 from firmware_protocol.firmware_core import (
     FirmwareConfig,
     FirmwareCore,
@@ -22,13 +22,10 @@ from firmware_protocol.firmware_core import (
     ResetCause,
     random_entropy,
 )
-from sim.body_dynamics import BodyPose
 from sim.can_protocol import CanFrame
-from sim.effects import hidden_effects
 from sim.encoder_loop import EncoderLoop
 from sim.injected_faults import RobotFaults
 from sim.plant import Plant, TrueState
-from sim.plant_parameters import PlantParameters
 from sim.process import TextRecord
 from sim.sensors import PoseMeasurement
 
@@ -139,8 +136,7 @@ class Controller(Protocol):
 class VendorRobot:
     """Virtual robot with a vendor's controllers.
 
-    `pose_sink` gets each measured pose and the robot time (us) at which it is there. `pose_sink` gets each measured
-    pose and the robot time (us) at which it is there.
+    `pose_sink` gets each measured pose and the robot time (us) at which it is there.
     """
 
     def __init__(
@@ -418,21 +414,15 @@ _FOREVER_NS = 1 << 62
 class RobotInProcess:
     """A virtual robot on an in-process link; `host` is the host's end of it, open, and `link` the robot's.
 
-    Time begins at 0 and moves on by `advance` alone. `effects` as in `sim.effects`; raises HiddenEffectError.
-    `board` may be exchanged for another one between two steps.
+    Time begins at 0 and moves on by `advance` alone. `board` may be exchanged for another one between two steps.
+    `exchange`: how a vendor's controllers are asked on a half-duplex line; a reply is there before the next request.
     """
 
-    def __init__(
-        self,
-        plant: PlantParameters,
-        effects: Mapping[str, float | Sequence[float]],
-        firmware: FirmwareConfig,
-        start: BodyPose,
-        seed: int,
-    ) -> None:
+    def __init__(self, board: VirtualRobot | VendorRobot, exchange: Exchange | None = None) -> None:
         host, self.link = connect_pair()
         self.host: Transport = host
-        self.board = VirtualRobot(Plant(plant, hidden_effects(effects), seed, start), firmware)
+        self.board = board
+        self._exchange = exchange
         host.open()
         self.link.open()
         self._now_us = 0
@@ -447,6 +437,19 @@ class RobotInProcess:
         while self._now_us < until_us:
             self._now_us += STEP_US
             for received in self.link.receive():
-                self.board.receive(self._now_us, received.frame)
+                self._receive(received.frame)
             for frame in self.board.step(self._now_us):
-                self.link.send(OutgoingFrame(frame, _FOREVER_NS), self._now_us * 1000)
+                self._send(frame)
+
+    def _receive(self, frame: Frame) -> None:
+        if self._exchange is None:
+            self.board.receive(self._now_us, frame)
+            return
+        assert isinstance(self.board, VendorRobot)
+        frames = self.board.controller.receive(self._now_us, CanFrame(0, self._exchange.request(frame)))
+        reply = self._exchange.reply(frame, b"".join(each.data for each in frames))
+        if reply is not None:
+            self._send(reply)
+
+    def _send(self, frame: Frame) -> None:
+        self.link.send(OutgoingFrame(frame, _FOREVER_NS), self._now_us * 1000)

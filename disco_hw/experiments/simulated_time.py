@@ -39,9 +39,10 @@ from disco_hw.runtime.robot_setup import Setup, kept_files, load_setup
 from disco_hw.runtime.supervisor import UserRequest
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.body_dynamics import BodyPose
-from sim.effects import HiddenEffectError
+from sim.effects import HiddenEffectError, hidden_effects
+from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
-from sim.virtual_robot import STEP_US, RobotInProcess
+from sim.virtual_robot import STEP_US, RobotInProcess, VirtualRobot
 
 # Chosen: handshake and first poses, and arming, take less.
 _READY_S, _ARMED_S = 1.5, 0.5
@@ -67,7 +68,7 @@ def virtual_robot(
         max_wheel_speed_rad_s=robot.max_wheel_speed_rad_s,
         max_wheel_acceleration_rad_s2=robot.max_wheel_acceleration_rad_s2,
     )
-    return RobotInProcess(plant, effects or {}, firmware, start, seed)
+    return RobotInProcess(VirtualRobot(Plant(plant, hidden_effects(effects or {}), seed, start), firmware))
 
 
 class SimulatedRun:

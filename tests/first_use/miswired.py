@@ -19,17 +19,14 @@ from disco_hw.runtime import State
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.robot_setup import load_setup
 from drivers.motor import find_driver
-from drivers.transport import connect_pair
-from drivers.types import OutgoingFrame
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.body_dynamics import BodyPose
-from sim.can_protocol import CanFrame
 from sim.devices import find_controller
 from sim.effects import hidden_effects
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
 from sim.process import PoseSender
-from sim.virtual_robot import STEP_US, VendorRobot, VirtualRobot
+from sim.virtual_robot import RobotInProcess, VendorRobot, VirtualRobot
 from tests.drivers.waiting import free_port
 
 
@@ -126,33 +123,11 @@ class MiswiredRobot:
             self.board = VendorRobot(self.plant, find_controller(name)(config.link.settings(), plant.ticks_per_rev))
         # VESC speaks on CAN and on a serial line, and asks for answers on the latter only.
         exchange = find_driver(name).exchange if config.link.kind == "serial" else None
-        self._exchange = None if exchange is None else exchange(config.link.settings())
-        self.host, self.link = connect_pair()
-        self.host.open()
-        self.link.open()
-        self._now_us = 0
+        self._process = RobotInProcess(self.board, None if exchange is None else exchange(config.link.settings()))
+        self.host = self._process.host
 
     def advance(self, until_us):
-        while self._now_us < until_us:
-            self._now_us += STEP_US
-            for received in self.link.receive():
-                self._handle(received.frame)
-            for frame in self.board.step(self._now_us):
-                self._send(frame)
-
-    def _handle(self, frame):
-        """One frame from the host; on a half-duplex line its reply is there before the next one is said."""
-        if self._exchange is None:
-            self.board.receive(self._now_us, frame)
-            return
-        request = CanFrame(0, self._exchange.request(frame))
-        output = b"".join(each.data for each in self.board.controller.receive(self._now_us, request))
-        reply = self._exchange.reply(frame, output)
-        if reply is not None:
-            self._send(reply)
-
-    def _send(self, frame):
-        self.link.send(OutgoingFrame(frame, 1 << 62), self._now_us * 1000)
+        self._process.advance(until_us)
 
     def close(self):
         self.sender.close()

@@ -1,19 +1,23 @@
 import pytest
 
+from disco_hw.config import SHIPPED_ROBOT
+from disco_hw.experiments.simulated_time import virtual_robot
+from disco_hw.runtime.robot_setup import load_setup
 from drivers.types import Frame, LinkState, OutgoingFrame
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim import LinkFaultError
 from sim.body_dynamics import BodyPose
 from sim.effects import HiddenEffectError
+from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
-from sim.virtual_robot import RobotInProcess
+from sim.virtual_robot import RobotInProcess, VirtualRobot
 from tools.faults.in_process import REOPEN_NS, SimulatedCan
 
 FIRMWARE = FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0)
 
 
 def test_frames_come_while_time_passes_and_only_then():
-    robot = RobotInProcess(PlantParameters(), {}, FIRMWARE, BodyPose(1.0, 2.0, 0.5), seed=1)
+    robot = RobotInProcess(VirtualRobot(Plant(PlantParameters(), None, 1, BodyPose(1.0, 2.0, 0.5)), FIRMWARE))
     robot.advance(500_000)
     assert robot.truth.t_us == 500_000
     assert robot.host.receive()
@@ -23,7 +27,7 @@ def test_frames_come_while_time_passes_and_only_then():
 
 def test_an_unknown_effect_is_refused():
     with pytest.raises(HiddenEffectError):
-        RobotInProcess(PlantParameters(), {"levitation": 1.0}, FIRMWARE, BodyPose(), seed=1)
+        virtual_robot(load_setup(SHIPPED_ROBOT), PlantParameters(), BodyPose(), effects={"levitation": 1.0})
 
 
 MS = 1_000_000

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,18 +19,16 @@ from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.runtime import State
 from disco_hw.runtime.robot_setup import Setup, load_setup
 from drivers.motor import find_driver
-from drivers.transport import connect_pair
-from drivers.types import OutgoingFrame, PoseSample, Transport
+from drivers.types import PoseSample
 from sim.body_dynamics import BodyPose
-from sim.can_protocol import CanFrame
 from sim.devices import find_controller
 from sim.effects import hidden_effects
 from sim.fault_schedule import KINDS, ScheduledFault
 from sim.injected_faults import RobotFaults
-from sim.plant import Plant, TrueState
+from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
 from sim.sensors import PoseMeasurement
-from sim.virtual_robot import STEP_US, VendorRobot
+from sim.virtual_robot import RobotInProcess, VendorRobot
 
 ROBOTS = SHIPPED_ROBOT.parent
 RADIUS_M = 0.75
@@ -69,48 +67,15 @@ class _Poses:
         """Do nothing, because the source holds no resources."""
 
 
-class VendorInProcess:
-    """A vendor's simulated controllers on an in-process link; `host` is the host's end of it."""
-
-    def __init__(self, setup: Setup, plant: Plant, pose_sink: Any) -> None:
-        link = setup.config.link
-        create_controller = find_controller(str(link.driver))
-        assert create_controller is not None
-        controller: Any = create_controller(link.settings(), plant.parameters.ticks_per_rev)
-        self.board = VendorRobot(plant, controller, pose_sink)
-        exchange = find_driver(link.driver).exchange if link.kind == "serial" else None
-        self._exchange = None if exchange is None else exchange(link.settings())
-        host, self._link = connect_pair()
-        self.host: Transport = host
-        self.host.open()
-        self._link.open()
-        self._now_us = 0
-
-    @property
-    def truth(self) -> TrueState:
-        """The true state of the plant now."""
-        return self.board.truth
-
-    def advance(self, until_us: int) -> None:
-        """Let time pass until then."""
-        while self._now_us < until_us:
-            self._now_us += STEP_US
-            for received in self._link.receive():
-                self._receive(received.frame)
-            for frame in self.board.step(self._now_us):
-                self._send(frame)
-
-    def _receive(self, frame: Any) -> None:
-        if self._exchange is None:
-            self.board.receive(self._now_us, frame)
-            return
-        frames = self.board.controller.receive(self._now_us, CanFrame(0, self._exchange.request(frame)))
-        reply = self._exchange.reply(frame, b"".join(each.data for each in frames))
-        if reply is not None:
-            self._send(reply)
-
-    def _send(self, frame: Any) -> None:
-        self._link.send(OutgoingFrame(frame, _FOREVER_NS), 1000 * self._now_us)
+def vendor_robot(setup: Setup, plant: Plant, pose_sink: Callable[[PoseMeasurement, int], None]) -> RobotInProcess:
+    """Return a vendor's simulated controllers on an in-process link."""
+    link = setup.config.link
+    create_controller = find_controller(str(link.driver))
+    assert create_controller is not None
+    controller: Any = create_controller(link.settings(), plant.parameters.ticks_per_rev)
+    exchange = find_driver(link.driver).exchange if link.kind == "serial" else None
+    board = VendorRobot(plant, controller, pose_sink)
+    return RobotInProcess(board, None if exchange is None else exchange(link.settings()))
 
 
 def setup_of(driver: str, speed_m_s: float) -> Setup:
@@ -211,11 +176,10 @@ class WheelFaultRun:
         plant = plant or PlantParameters()
         start = BodyPose(RADIUS_M, 0.0, 0.5 * math.pi) if track == "circle" else BodyPose()
         poses = _Poses()
-        robot: Any
         if driver == "reference":
             robot = virtual_robot(setup, plant, start, effects=hide, seed=seed)
         else:
-            robot = VendorInProcess(setup, Plant(plant, hidden_effects(hide or {}), seed, start), poses.take)
+            robot = vendor_robot(setup, Plant(plant, hidden_effects(hide or {}), seed, start), poses.take)
         law = Law(track, speed_m_s, (0.061, 0.415))
         planner = LawController(law, setup.model, setup.config.task.planned(setup.config.control.mode))
         self.stack = SimulatedRun(setup, robot, planner)
