@@ -76,8 +76,6 @@ class _Client:
 class ControlServer:
     """Server of the control socket: `poll()` for requests in each tick, e-stop first; `reply()` to each.
 
-    `poll()` for requests in each tick, e-stop first; `reply()` to each.
-
     Raises InputError if another daemon serves this socket, or the path cannot be used. What a dead daemon left behind
     is replaced: a record lock shows whether one lives, which the kernel drops with the process, however it ends.
     """

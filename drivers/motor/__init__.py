@@ -83,10 +83,7 @@ def create_driver(name: str | None, settings: Any = None, key: bytes | None = No
 
 
 def fields_of(name: str | None, fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of [link] that are the driver's own; raise DriverFieldError for one of another driver's.
-
-    Raises DriverFieldError for one of another driver's.
-    """
+    """Return the fields of [link] that are the driver's own; raise DriverFieldError for one of another driver's."""
     found = find_driver(name)
     accepted = {field: value for field, value in fields.items() if field in found.settings.__struct_fields__}
     others = motor_drivers().values() if len(accepted) < len(fields) else ()

@@ -26,10 +26,7 @@ _PERIODS_MS = {0x211: 100, 0x221: 20, 0x311: 20, 0x251: 20, 0x261: 100, 0x241: 2
 
 @dataclass(slots=True)
 class AgilexBase:
-    """State of one base, of which `commanded` is what it follows now: speed (m/s) and turn rate (rad/s).
-
-    `commanded` is what it follows now: speed (m/s) and turn rate (rad/s).
-    """
+    """State of one base, of which `commanded` is what it follows now: speed (m/s) and turn rate (rad/s)."""
 
     vehicle_state: int = 0
     control_mode: int = STANDBY
@@ -157,10 +154,7 @@ class AgilexBase:
 
 
 class AgilexController:
-    """Controller of one AgileX base (a `virtual_robot.Controller`), which makes wheel speeds by its own track width.
-
-    It makes wheel speeds of its own, by the track that it has.
-    """
+    """Controller of one AgileX base (a `virtual_robot.Controller`), which makes wheel speeds by its own track width."""
 
     brakes = False
 

@@ -168,8 +168,7 @@ class OdriveBoard:
     def __init__(self, generation: str, nodes: Sequence[int], periods_ms: dict[str, int] | None = None) -> None:
         """Create a board of firmware `generation` "0.5" or "0.6".
 
-        `periods_ms`: by the names of `PERIODS`, 0 for never; default: the firmware's. `periods_ms`: by the names of
-        `PERIODS`, 0 for never; what is left out is as the firmware has it.
+        `periods_ms`: by the names of `PERIODS`, 0 for never; what is left out is as the firmware has it.
         """
         self.generation = generation
         self.axes = [Axis(node) for node in nodes]

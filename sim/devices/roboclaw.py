@@ -24,7 +24,7 @@ QUIET_US = 10_000
 
 @dataclass(slots=True)
 class RoboclawRegisters:
-    """Registers that a host can set and read; motor 1 and 2. Counts wrap at 2^32. Counts wrap at 2^32."""
+    """Registers that a host can set and read; motor 1 and 2. Counts wrap at 2^32."""
 
     timeout_ds: int = 0
     encoder_m1: int = 0

@@ -60,7 +60,7 @@ class TopicCandidate:
 class Choice:
     """Choice of the topics to read; an empty topic is a role that nothing serves.
 
-    `edges` lead from the map to the robot, if by tf. `edges` lead from the map to the robot, if by tf.
+    `edges` lead from the map to the robot, if by tf.
     """
 
     table: tuple[TopicCandidate, ...]
