@@ -16,6 +16,7 @@ from disco_hw.bridge.ros2_obstacles import TOPIC, ObstacleInlet
 from disco_hw.runtime.obstacle_source import obstacle_source_of, reports_in
 from disco_hw.runtime.obstacles import MOST_OBSTACLES
 from disco_hw.runtime.robot_setup import load_setup
+from tests.drivers.waiting import free_port
 from tests.first_use.miswired import robot_file
 
 WALL_NS = 1_800_000_000_000_000_000
@@ -118,12 +119,6 @@ def test_text_holds_what_udp_takes():
     assert not inlet.refused
 
 
-def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-        one.bind(("127.0.0.1", 0))
-        return one.getsockname()[1]
-
-
 def test_over_dds_both_types_come_to_the_daemons_source(tmp_path):
     from cyclonedds.pub import DataWriter
     from cyclonedds.topic import Topic
@@ -131,7 +126,7 @@ def test_over_dds_both_types_come_to_the_daemons_source(tmp_path):
     from disco_hw.bridge.ros2 import RELIABLE, wire_name
 
     file = robot_file(tmp_path)
-    text = file.read_text(encoding="utf-8") + f"[fence]\nobstacles_port = {free_port()}\n"
+    text = file.read_text(encoding="utf-8") + f"[fence]\nobstacles_port = {free_port(socket.SOCK_DGRAM)}\n"
     text += f'[ros2]\ndomain = {13 + os.getpid() % 20 * 3}\n[daemon]\ncontrol_socket = "{tmp_path / "control"}"\n'
     file.write_text(text, encoding="utf-8")
     setup, ended = load_setup(file), []

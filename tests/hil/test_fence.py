@@ -9,6 +9,7 @@ import pytest
 
 from disco_hw.errors import WorkError
 from disco_hw.experiments import READY_TIMEOUT_S
+from tests.drivers.waiting import free_port
 from tests.hil.stack import disco
 from tools.stack import running_stack
 
@@ -17,16 +18,10 @@ ROOM = [[-1.8, -1.8], [1.8, -1.8], [1.8, 1.8], [-1.8, 1.8]]
 AGE_LIMIT_S = 3.0
 
 
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 @pytest.mark.hil
 @pytest.mark.long
 def test_a_daemon_keeps_its_task_inside_and_stops_for_an_obstacle_that_is_reported_no_longer(tmp_path):
-    port = free_port()
+    port = free_port(socket.SOCK_DGRAM)
     task = f"{TASK}\n[fence]\nkeep_in = {ROOM}\nobstacles_port = {port}\n"
     with running_stack(tmp_path, task=task, start=(0.75, 0.0, 1.5707963)) as stack:
         operator, robot = stack.operator, str(stack.robot_file)

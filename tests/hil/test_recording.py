@@ -17,7 +17,7 @@ from disco_hw.log.log_command import info
 from disco_hw.log.reader import open_log
 from tests.drivers.waiting import free_port, wait_until
 from tests.hil.stack import STATIONARY_RAD_S, disco_here
-from tests.log.processes import SmallDisk
+from tests.log.processes import SmallDisk, recorded_ticks
 from tools.stack import Stack, running_stack
 
 pytestmark = pytest.mark.hil
@@ -59,11 +59,6 @@ def events_in(path: Path) -> list[str]:
         return [entry.record.text for entry in log.records(("/event",)) if entry.record.code == "recording"]
 
 
-def ticks_in(path: Path) -> list[int]:
-    with open_log(path) as log:
-        return [entry.tick for entry in log.records(("/loop",))]
-
-
 @pytest.mark.thorough
 def test_a_recorder_frozen_killed_and_deleted_on_the_way_is_reported_counted_and_replaced(tmp_path):
     first, second, third, fourth = (tmp_path / f"run{part}.mcap" for part in ("", ".part2", ".part3", ".part4"))
@@ -102,17 +97,17 @@ def test_a_recorder_frozen_killed_and_deleted_on_the_way_is_reported_counted_and
         assert any(line.startswith("recording: ") and fragment in line for line in output.splitlines()), fragment
     assert not third.exists()
     # A killed writer may have written more than it had confirmed: those ticks are in the next file, too.
-    kept = sorted({*ticks_in(first), *ticks_in(second)})
+    kept = sorted({*recorded_ticks(first), *recorded_ticks(second)})
     assert kept == list(range(1, kept[-1] + 1)), "a tick is missing"
     with deleted:
         unlinked = Path(f"/proc/self/fd/{deleted.fileno()}")
-        gone, events_gone = ticks_in(unlinked), events_in(unlinked)
+        gone, events_gone = recorded_ticks(unlinked), events_in(unlinked)
     with open_log(fourth) as log:
         assert log.metadata.continues_sequence == gone[-1]
         assert log.metadata.continues == str(third)
         summary = log.summary()
     assert (summary.ended, summary.missing_ticks) == (True, 0)
-    assert ticks_in(fourth)[0] == gone[-1] + 1
+    assert recorded_ticks(fourth)[0] == gone[-1] + 1
     assert gone[0] <= kept[-1] + 1
     assert f"{len(gone)} lost with a deleted file" in output
     # What the killed writer had not confirmed was given to the third.
@@ -180,7 +175,7 @@ def test_a_drive_that_ends_with_a_full_disk_says_which_ticks_are_lost_and_exits_
         named_files = re.findall(r"\S+\.mcap", "".join(line for line in last.splitlines() if line.startswith("log: ")))
         assert named_files
         assert all(Path(name).exists() for name in named_files), last
-        assert ticks_in(disk / "run.mcap")
+        assert recorded_ticks(disk / "run.mcap")
 
 
 @pytest.mark.long

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from disco_hw.log.process_recorder import RecordingSettings
+from disco_hw.log.reader import open_log
 from tools.log_samples import ATTACHMENTS, tick
 
 _RECORD = """
@@ -32,6 +33,12 @@ for k in range(1, 100_000):
 def recording(path, **changes):
     given = {"path": path, "robot": "wombot", "attachments": ATTACHMENTS, "flush_s": 0.05}
     return RecordingSettings(**(given | changes))
+
+
+def recorded_ticks(path):
+    """Ticks of the control loop that a log holds."""
+    with open_log(path) as log:
+        return [entry.tick for entry in log.records(("/loop",))]
 
 
 def wait_until(condition, timeout_s=60.0):

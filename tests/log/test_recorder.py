@@ -14,18 +14,13 @@ from disco_hw.log.process_recorder import ProcessRecorder, wall_offset_ns
 from disco_hw.log.reader import open_log
 from disco_hw.log.recorder import MemoryRecorder, NullRecorder, Recorder, RecorderStats
 from disco_hw.log.records import Event
-from tests.log.processes import alive, drive, recording, size, wait_until
+from tests.log.processes import alive, drive, recorded_ticks, recording, size, wait_until
 from tools.log_samples import ATTACHMENTS, bits, tick
 
 
 @pytest.fixture
 def path(tmp_path):
     return tmp_path / "logs" / "run.mcap"
-
-
-def recorded_ticks(path):
-    with open_log(path) as log:
-        return [entry.tick for entry in log.records(("/loop",))]
 
 
 def test_what_is_put_is_in_the_log(path):

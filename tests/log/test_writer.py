@@ -17,17 +17,12 @@ from disco_hw.log import writer
 from disco_hw.log.log_command import info
 from disco_hw.log.process_recorder import ProcessRecorder
 from disco_hw.log.reader import open_log
-from tests.log.processes import RecordingProcess, SmallDisk, alive, drive, recording, size, wait_until
+from tests.log.processes import RecordingProcess, SmallDisk, alive, drive, recorded_ticks, recording, size, wait_until
 
 
 @pytest.fixture
 def path(tmp_path):
     return tmp_path / "run.mcap"
-
-
-def ticks_of(path):
-    with open_log(path) as log:
-        return [entry.tick for entry in log.records(("/loop",))]
 
 
 def test_a_killed_writer_loses_no_more_than_what_came_since_the_last_flush(path):
@@ -42,7 +37,7 @@ def test_a_killed_writer_loses_no_more_than_what_came_since_the_last_flush(path)
         assert not log.complete
         assert "the end is missing" in log.damage[-1]
         assert sum(log.counts.values()) >= written
-    assert ticks_of(path) + ticks_of(recorder.path) == list(range(1, 201))
+    assert recorded_ticks(path) + recorded_ticks(recorder.path) == list(range(1, 201))
 
 
 def test_when_the_recording_process_is_killed_the_file_is_finished(path):
@@ -57,7 +52,7 @@ def test_when_the_recording_process_is_killed_the_file_is_finished(path):
         assert log.ending is None
         assert (log.summary().missing_ticks, log.summary().ended) == (0, False)
     assert "nothing recorded after" in info(path, as_json=False)
-    assert len(ticks_of(path)) > 20
+    assert len(recorded_ticks(path)) > 20
 
 
 def test_what_was_still_on_its_way_when_the_recording_process_was_killed_is_not_lost(path):
@@ -70,7 +65,7 @@ def test_what_was_still_on_its_way_when_the_recording_process_was_killed_is_not_
         last_recorded = int(recording_process.process.stdout.readlines()[-1])
         os.kill(recording_process.writer_pid, signal.SIGCONT)
         wait_until(lambda: not alive(recording_process.writer_pid))
-    assert ticks_of(path)[-1] > last_recorded - 20
+    assert recorded_ticks(path)[-1] > last_recorded - 20
 
 
 def test_nothing_is_left_in_the_runtime_directory_of_a_killed_process(path, runtime_root):
@@ -87,7 +82,7 @@ def test_when_both_are_killed_the_file_still_reads(path):
         os.kill(recording_process.writer_pid, signal.SIGKILL)
         recording_process.process.kill()
         wait_until(lambda: not alive(recording_process.writer_pid))
-    assert len(ticks_of(path)) > 20
+    assert len(recorded_ticks(path)) > 20
 
 
 def test_an_interrupt_is_not_for_the_writer(path):
@@ -97,7 +92,7 @@ def test_an_interrupt_is_not_for_the_writer(path):
     os.kill(recorder.writer_pid, signal.SIGINT)
     drive(recorder, 6, 5, period_s=0.01)
     assert recorder.close().writer_deaths == 0
-    assert ticks_of(path) == list(range(1, 11))
+    assert recorded_ticks(path) == list(range(1, 11))
 
 
 def test_what_comes_after_a_termination_is_still_recorded(path):
@@ -107,7 +102,7 @@ def test_what_comes_after_a_termination_is_still_recorded(path):
     os.kill(recorder.writer_pid, signal.SIGTERM)
     drive(recorder, 6, 50, period_s=0.01)
     assert recorder.close().writer_deaths == 0
-    assert ticks_of(path) == list(range(1, 56))
+    assert recorded_ticks(path) == list(range(1, 56))
 
 
 def test_the_writer_has_a_session_of_its_own(path):
@@ -139,7 +134,7 @@ def check_after_full_disk(path, stats, message):
     assert "nothing is being recorded" in stats.fault
     with open_log(path) as log:
         assert log.damage == ("the end is missing: the writer was killed or is still at work, or the file was cut",)
-    assert len(ticks_of(path)) > 20
+    assert len(recorded_ticks(path)) > 20
 
 
 def test_a_full_disk_ends_the_log_and_with_room_again_another_begins(tmp_path):
@@ -161,7 +156,7 @@ def test_a_full_disk_ends_the_log_and_with_room_again_another_begins(tmp_path):
         assert final.ticks + final.dropped_ticks == given
         assert final.delivered_ticks == final.ticks
         assert recorder.path == disk / "run.part2.mcap"
-        assert ticks_of(path) + ticks_of(recorder.path) == list(range(1, final.ticks + 1))
+        assert recorded_ticks(path) + recorded_ticks(recorder.path) == list(range(1, final.ticks + 1))
 
 
 def full_recorder(disk):
@@ -206,7 +201,7 @@ def test_a_disk_with_room_again_at_the_end_loses_nothing_and_the_part_begins_bef
         final = recorder.close()
         assert (final.delivered_ticks, final.waiting_ticks, final.fault) == (given, 0, "")
         assert recorder.new_messages() == (f"recording goes on in {final.path}",)
-        assert ticks_of(disk / "run.mcap") + ticks_of(Path(final.path)) == list(range(1, given + 1))
+        assert recorded_ticks(disk / "run.mcap") + recorded_ticks(Path(final.path)) == list(range(1, given + 1))
         with open_log(Path(final.path)) as log:
             assert log.summary().start < log.summary().end
 
@@ -218,7 +213,7 @@ def test_a_file_that_may_not_grow_is_continued_by_another(path):
     check_after_full_disk(path, stats, "File too large")
     final = recorder.close()
     assert (final.writer_deaths, final.delivered_ticks) == (1, given)
-    assert ticks_of(path) + ticks_of(recorder.path) == list(range(1, given + 1))
+    assert recorded_ticks(path) + recorded_ticks(recorder.path) == list(range(1, given + 1))
 
 
 def test_a_disk_full_from_the_start_is_one_line(tmp_path):
@@ -303,7 +298,7 @@ def test_a_disk_that_takes_seconds_holds_up_no_writer_and_is_reported_once(path)
         first += 1
     final = recorder.close(10.0)
     assert (final.delivered_ticks, final.waiting_ticks) == (first - 1, 0)
-    assert ticks_of(path) == list(range(1, first))
+    assert recorded_ticks(path) == list(range(1, first))
     messages = recorder.new_messages()
     assert [line for line in messages if "the disk has been storing the log for 2." not in line] == []
     assert len(messages) == 1

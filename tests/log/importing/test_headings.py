@@ -12,7 +12,6 @@ from disco_hw.log.drive import DriveLog
 from disco_hw.log.importing.csv_drive import read_csv
 from disco_hw.log.importing.losses import without_standing_headings
 from disco_hw.log.load import load_drive
-from tests.inference.test_infer_command import ROBOT
 from tests.log.importing.test_csv_faults import as_text, table
 from tests.tables import thinned
 
@@ -73,13 +72,6 @@ def test_whoever_compares_headings_is_given_none_that_stands_still(tmp_path):
     drive = load_drive(tmp_path / "log.csv")
     assert not drive.poses.t_s.size
     assert any("800 of 800 positions have no heading and were left out" in note for note in drive.notes)
-
-
-@pytest.fixture
-def robot(tmp_path):
-    path = tmp_path / "robot.toml"
-    path.write_text(ROBOT)
-    return path
 
 
 def import_command(path, robot, *options):

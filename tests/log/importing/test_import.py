@@ -18,13 +18,6 @@ from tests.inference.test_infer_command import ROBOT
 from tests.log.importing.test_candump import dumped
 
 
-@pytest.fixture
-def robot(tmp_path):
-    path = tmp_path / "robot.toml"
-    path.write_text(ROBOT)
-    return path
-
-
 def test_a_csv_file_becomes_a_log_with_the_robots_file_in_it(robot, tmp_path):
     source, out = write_log(tmp_path / "log.csv", "poor"), tmp_path / "log.mcap"
     command = [sys.executable, "-m", "disco_hw", "import", str(source), "--robot", str(robot), "-o", str(out), "--json"]

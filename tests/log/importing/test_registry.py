@@ -9,7 +9,6 @@ import disco_hw.log.importing
 from disco_hw.errors import LogError
 from disco_hw.log.importing import format_of, import_log, log_formats
 from disco_hw.log.load import load_drive
-from tests.inference.test_infer_command import ROBOT
 
 EXAMPLE = Path(__file__).parents[3] / "docs/examples/wheel_text.py"
 
@@ -24,13 +23,6 @@ def page_format(tmp_path, monkeypatch):
     log_formats.cache_clear()
     yield
     log_formats.cache_clear()
-
-
-@pytest.fixture
-def robot(tmp_path):
-    path = tmp_path / "robot.toml"
-    path.write_text(ROBOT)
-    return path
 
 
 def test_formats_are_distinguished_by_their_first_bytes():

@@ -19,16 +19,8 @@ from disco_hw.log.importing import import_log
 from disco_hw.log.importing.rosbag import read_rosbag
 from disco_hw.log.load import load_drive
 from tests.inference.drives import robot_config
-from tests.inference.test_infer_command import ROBOT
 from tests.log.importing.bags import BEGAN_NS, LATENCY_NS, LEFT, RIGHT, bag, recorded
 from tests.tables import thinned
-
-
-@pytest.fixture
-def robot(tmp_path):
-    path = tmp_path / "robot.toml"
-    path.write_text(ROBOT)
-    return path
 
 
 def config(**settings):
