@@ -5,8 +5,8 @@ Poses may come as chains of transforms: what /tf and /tf_static say between fram
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -29,14 +29,22 @@ _WHEEL_COLUMNS = {
 }
 
 
+def _no_values() -> Array:
+    return np.empty(0)
+
+
+def _no_segments() -> Index:
+    return np.empty(0, dtype=np.int64)
+
+
 @dataclass(frozen=True, slots=True)
 class Commands:
     """Wheel-speed commands, each in force from its time on until the next, all (N,); NaN: no command known or given."""
 
-    t_s: Array
-    left_rad_s: Array
-    right_rad_s: Array
-    segment: Index
+    t_s: Array = field(default_factory=_no_values)
+    left_rad_s: Array = field(default_factory=_no_values)
+    right_rad_s: Array = field(default_factory=_no_values)
+    segment: Index = field(default_factory=_no_segments)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,34 +55,49 @@ class Wheels:
     differences.
     """
 
-    t_s: Array
-    left_angle_rad: Array
-    right_angle_rad: Array
-    left_speed_rad_s: Array
-    right_speed_rad_s: Array
-    segment: Index
-    angle_measured: bool
-    speed_measured: bool
+    t_s: Array = field(default_factory=_no_values)
+    left_angle_rad: Array = field(default_factory=_no_values)
+    right_angle_rad: Array = field(default_factory=_no_values)
+    left_speed_rad_s: Array = field(default_factory=_no_values)
+    right_speed_rad_s: Array = field(default_factory=_no_values)
+    segment: Index = field(default_factory=_no_segments)
+    angle_measured: bool = False
+    speed_measured: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Poses:
     """Measured poses in the world frame, all (N,); yaw in (-pi, pi]."""
 
-    t_s: Array
-    x_m: Array
-    y_m: Array
-    yaw_rad: Array
-    segment: Index
+    t_s: Array = field(default_factory=_no_values)
+    x_m: Array = field(default_factory=_no_values)
+    y_m: Array = field(default_factory=_no_values)
+    yaw_rad: Array = field(default_factory=_no_values)
+    segment: Index = field(default_factory=_no_segments)
 
 
 @dataclass(frozen=True, slots=True)
 class Gyro:
     """Yaw rate, counter-clockwise positive, all (N,)."""
 
-    t_s: Array
-    yaw_rate_rad_s: Array
-    segment: Index
+    t_s: Array = field(default_factory=_no_values)
+    yaw_rate_rad_s: Array = field(default_factory=_no_values)
+    segment: Index = field(default_factory=_no_segments)
+
+
+def after_silences(wheel_ns: NDArray[Any]) -> NDArray[Any]:
+    """Return the times (ns) of wheel samples after a silence: what was driven meanwhile is not known."""
+    return wheel_ns[1:][np.diff(wheel_ns) > LONGEST_SILENCE_NS]
+
+
+def in_segments(begin_ns: float, breaks_ns: NDArray[Any]) -> Callable[[NDArray[Any]], tuple[Array, Index]]:
+    """Return a function that gives for times (ns) the seconds since `begin_ns` and the segments between breaks."""
+
+    def when(t_ns: NDArray[Any]) -> tuple[Array, Index]:
+        seconds = (t_ns - begin_ns).astype(np.float64) * 1e-9
+        return seconds, np.searchsorted(breaks_ns, t_ns, side="right").astype(np.int64)
+
+    return when
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +113,7 @@ class DriveLog:
     commands: Commands
     wheels: Wheels
     poses: Poses
-    gyro: Gyro
+    gyro: Gyro = field(default_factory=Gyro)
     notes: tuple[str, ...] = ()
     begins_s: tuple[float, ...] = (0.0,)
 

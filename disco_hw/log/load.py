@@ -12,7 +12,7 @@ from disco_hw.errors import InputError, LogError
 from disco_hw.files import LOG, begin_of, parse_toml
 from disco_hw.log import ROBOT_TOML
 from disco_hw.log.container import MAGIC
-from disco_hw.log.drive import LONGEST_SILENCE_NS, Array, Commands, DriveLog, Gyro, Index, Poses, Wheels, concatenate
+from disco_hw.log.drive import Array, Commands, DriveLog, Index, Poses, Wheels, after_silences, concatenate, in_segments
 from disco_hw.log.importing.csv_drive import read_csv
 from disco_hw.log.importing.losses import with_headings_only, without_standing_headings
 from disco_hw.log.importing.rosbag_file import is_bag
@@ -43,12 +43,7 @@ def drive_from_log(log: Log) -> DriveLog:
     starts = [int(t_ns[0]) for t_ns in (command_ns, wheel_ns, pose_ns) if t_ns.size]
     if not starts:
         raise LogError(f"{log.path}: holds no command, wheel sample or pose; nothing was driven in it")
-    breaks_ns = _breaks(log, wheel_ns, notes)
-
-    def when(t_ns: Index) -> tuple[Array, Index]:
-        seconds = (t_ns - min(starts)).astype(np.float64) * 1e-9
-        return seconds, np.searchsorted(breaks_ns, t_ns, side="right").astype(np.int64)
-
+    when = in_segments(min(starts), _breaks(log, wheel_ns, notes))
     command_s, command_segment = when(command_ns)
     wheel_s, wheel_segment = when(wheel_ns)
     pose_s, pose_segment = when(pose_ns)
@@ -60,7 +55,6 @@ def drive_from_log(log: Log) -> DriveLog:
         commands=Commands(command_s, speeds[:, 0], speeds[:, 1], command_segment),
         wheels=Wheels(wheel_s, left_angle, right_angle, left_speed, right_speed, wheel_segment, measured, measured),
         poses=Poses(pose_s, x_m, y_m, yaw_rad, pose_segment),
-        gyro=Gyro(np.empty(0), np.empty(0), np.empty(0, dtype=np.int64)),
         notes=tuple(notes),
     )
 
@@ -155,9 +149,8 @@ def _breaks(log: Log, wheel_ns: Index, notes: list[str]) -> Index:
     gaps = log.gaps()
     if gaps:
         notes.append(f"{log.path}: {sum(gap.ticks for gap in gaps)} ticks are missing; each gap starts a new segment")
-    silent = wheel_ns[1:][np.diff(wheel_ns) > LONGEST_SILENCE_NS]
     missing = np.asarray([gap.before_ns for gap in gaps], dtype=np.int64)
-    return np.unique(np.concatenate([silent, missing]))
+    return np.unique(np.concatenate([after_silences(wheel_ns), missing]))
 
 
 def _floats(column: NDArray[np.generic]) -> Array:

@@ -7,7 +7,7 @@ import numpy as np
 from disco_hw.config import RobotConfig
 from disco_hw.errors import LogError
 from disco_hw.files import DRIVE_CSV, read_lines
-from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, integrate_angle
+from disco_hw.log.drive import Commands, DriveLog, Poses, Wheels, integrate_angle
 from disco_hw.log.importing import LogFormat
 
 
@@ -23,14 +23,12 @@ def read(path: Path, config: RobotConfig) -> DriveLog:
             raise LogError(f"{path}: line {number}: not three numbers; write time, left and right") from None
         rows.append((t_s, left, right))
     t_s, left, right = np.array(rows, dtype=np.float64).reshape(-1, 3).T
-    one, no_segment, none = np.zeros(t_s.size, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0)
+    one = np.zeros(t_s.size, dtype=np.int64)
     return DriveLog(
         (str(path),),
-        Commands(none, none, none, no_segment),
+        Commands(),
         Wheels(t_s, integrate_angle(t_s, left, one), integrate_angle(t_s, right, one), left, right, one, False, True),
-        Poses(none, none, none, none, no_segment),
-        Gyro(none, none, no_segment),
-        (),
+        Poses(),
     )
 
 

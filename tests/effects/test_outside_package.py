@@ -151,9 +151,8 @@ from disco_hw.model.step import FreeRun
 from tools.gap.logs import simulated_drive
 
 log = simulated_drive({"x_speed_squared_drag": 0.5}, seed=905)
-none, no_segment = np.empty(0), np.empty(0, dtype=np.int64)
 # Without commands only the body is searched, which is enough and takes half the time.
-log = replace(log, commands=Commands(none, none, none, no_segment))
+log = replace(log, commands=Commands())
 report = find_gap(log, Model(0.061, 0.415, 0.238))
 save_model(report.model, Path(sys.argv[1]))
 model = load_model(Path(sys.argv[1]))
@@ -202,11 +201,10 @@ log = simulated_drive({}, seed=905)
 mean = 0.5 * (log.commands.left_rad_s + log.commands.right_rad_s)
 half = 0.5 * (log.commands.right_rad_s - log.commands.left_rad_s)
 half = half / (1.0 - 2.0 * K_S * RADIUS_M / AXIAL_M * np.abs(half))
-none, no_segment = np.empty(0), np.empty(0, dtype=np.int64)
 log = replace(
     log,
     commands=replace(log.commands, left_rad_s=mean - half, right_rad_s=mean + half),
-    poses=Poses(none, none, none, none, no_segment),
+    poses=Poses(),
 )
 report = find_gap(log, Model(RADIUS_M, AXIAL_M, 0.1), top_rad_s=8.0)
 print(json.dumps({

@@ -4,11 +4,8 @@ import numpy as np
 import pytest
 
 from disco_hw.inference.excitation import UnusableDriveError, excitation
-from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, concatenate
+from disco_hw.log.drive import Commands, DriveLog, Poses, Wheels, concatenate
 from tests.inference.drives import logged
-
-NOTHING = np.empty(0)
-NO_SEGMENT = np.empty(0, dtype=np.int64)
 
 
 def straight(rate_hz=25.0, seconds=20.0, wheel_rad_s=2.0, radius_m=0.05, gap=None):
@@ -24,7 +21,6 @@ def straight(rate_hz=25.0, seconds=20.0, wheel_rad_s=2.0, radius_m=0.05, gap=Non
         Commands(wheel_t, speed, speed, wheel_segment),
         Wheels(wheel_t, angle, angle, speed, speed, wheel_segment, True, True),
         Poses(t, radius_m * wheel_rad_s * t, zero, zero, segment),
-        Gyro(NOTHING, NOTHING, NO_SEGMENT),
     )
 
 
@@ -54,7 +50,7 @@ def test_poses_lie_at_their_place_on_the_grid():
 
 def test_without_encoders_commands_drive_the_simulations():
     log = straight()
-    blind = replace(log, wheels=Wheels(NOTHING, NOTHING, NOTHING, NOTHING, NOTHING, NO_SEGMENT, False, False))
+    blind = replace(log, wheels=Wheels())
     drive = excitation(blind)
     assert drive.source == "commands"
     assert drive.roll_rad[:, 0].sum() == pytest.approx(2.0 * (drive.t_s[-1] - drive.t_s[0]), rel=1e-6)
@@ -62,7 +58,7 @@ def test_without_encoders_commands_drive_the_simulations():
 
 def test_a_log_without_encoders_beside_one_with_them_is_said_to_count_for_nothing():
     log = straight()
-    nothing = Wheels(NOTHING, NOTHING, NOTHING, NOTHING, NOTHING, NO_SEGMENT, False, False)
+    nothing = Wheels()
     drive = excitation(concatenate([log, replace(log, wheels=nothing)]))
     assert drive.t_s.size == excitation(log).t_s.size
     assert drive.notes == (

@@ -28,8 +28,7 @@ def test_the_same_seed_gives_the_same_posterior():
 @pytest.mark.thorough
 def test_a_log_without_encoders_is_driven_by_its_commands():
     log = logged("circle")
-    nothing, none = np.empty(0), np.empty(0, dtype=np.int64)
-    blind = replace(log, wheels=Wheels(nothing, nothing, nothing, nothing, nothing, none, False, False))
+    blind = replace(log, wheels=Wheels())
     found = infer(blind, robot_config(), FEW)
     assert found.drive.source == "commands"
     assert found.draws.mean(axis=0) == pytest.approx(THETA, rel=0.05)

@@ -66,8 +66,7 @@ def with_commands(factor: float) -> Change:
 
 
 def without_commands(log: DriveLog) -> DriveLog:
-    nothing = np.empty(0)
-    return replace(log, commands=Commands(nothing, nothing, nothing, np.empty(0, dtype=np.int64)))
+    return replace(log, commands=Commands())
 
 
 def of_another_drive(log: DriveLog) -> DriveLog:

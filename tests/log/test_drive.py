@@ -4,7 +4,6 @@ import pytest
 from disco_hw.log.drive import (
     Commands,
     DriveLog,
-    Gyro,
     Poses,
     Wheels,
     concatenate,
@@ -26,7 +25,6 @@ def drive(name, end_s, segments=1, wheels=True):
         commands=Commands(t_s, t_s + 1.0, t_s + 2.0, segment),
         wheels=Wheels(*(t_s[:count] for _ in range(5)), segment[:count], wheels, wheels),
         poses=Poses(t_s, t_s, t_s, t_s, segment),
-        gyro=Gyro(np.empty(0), np.empty(0), zeros(0)),
         notes=(f"note of {name}",),
     )
 
@@ -61,11 +59,7 @@ def test_a_drive_without_wheels_does_not_change_how_they_were_measured():
 
 
 def test_an_empty_drive():
-    none = np.empty(0)
-    empty = DriveLog(
-        (), Commands(none, none, none, zeros(0)), Wheels(none, none, none, none, none, zeros(0), False, False),
-        Poses(none, none, none, none, zeros(0)), Gyro(none, none, zeros(0)),
-    )  # fmt: skip
+    empty = DriveLog((), Commands(), Wheels(), Poses())
     assert (empty.end_s, empty.segments) == (0.0, 0)
 
 

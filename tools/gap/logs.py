@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from disco_hw.drive.script import Script
-from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, differentiate_angle
+from disco_hw.log.drive import Commands, DriveLog, Poses, Wheels, differentiate_angle
 from disco_hw.runtime.pipeline import Governor, WheelLimits
 from sim.effects import EFFECTS, HiddenEffects, hidden_effects
 from sim.plant_parameters import PlantParameters
@@ -81,13 +81,11 @@ def as_drive(t_s: np.ndarray, cells: np.ndarray, ticks_per_rev: int) -> DriveLog
     pose_s, pose, pose_segment = group(4, 7)
     angle = ticks * (2.0 * math.pi / ticks_per_rev)
     speeds = [differentiate_angle(wheel_s, angle[:, side], wheel_segment) for side in (0, 1)]
-    nothing = np.empty(0)
     return DriveLog(
         ("simulated",),
         Commands(command_s, command[:, 0], command[:, 1], command_segment),
         Wheels(wheel_s, angle[:, 0], angle[:, 1], speeds[0], speeds[1], wheel_segment, True, False),
         Poses(pose_s, pose[:, 0], pose[:, 1], pose[:, 2], pose_segment),
-        Gyro(nothing, nothing, np.empty(0, dtype=np.int64)),
     )
 
 

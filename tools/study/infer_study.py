@@ -34,7 +34,7 @@ from disco_hw.inference.excitation import excitation
 from disco_hw.inference.infer import InferOptions, infer, noise_of, noise_spread
 from disco_hw.inference.noise import unexplained_share
 from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds
-from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels
+from disco_hw.log.drive import Commands, DriveLog, Poses, Wheels
 from disco_hw.log.load import load_drive
 from disco_hw.model import Model
 from sim.plant_parameters import PlantParameters
@@ -111,7 +111,6 @@ def foreign_log(robot: ForeignRobot, drive: str, seed: int) -> DriveLog:
         commands=Commands(script.t_s, script.left_rad_s, script.right_rad_s, one[0]),
         wheels=Wheels(*wheel_columns, one[1], True, True),
         poses=Poses(*pose_columns, one[2]),
-        gyro=Gyro(np.empty(0), np.empty(0), np.empty(0, dtype=np.int64)),
     )
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from disco_hw.config import Robot
 from disco_hw.errors import LogError
 from disco_hw.files import CANDUMP, read_lines
-from disco_hw.log.drive import LONGEST_SILENCE_NS, Array, Commands, DriveLog, Gyro, Index, Poses, Wheels
+from disco_hw.log.drive import Array, Commands, DriveLog, Index, Poses, Wheels, after_silences, in_segments
 from disco_hw.log.importing import LogFormat
 from disco_hw.log.importing.losses import loss_note, warnings_first
 from drivers.device_clock import DeviceClock
@@ -265,23 +265,16 @@ def _drive(path: Path, commands: list[Row], wheels: list[Row], poses: list[Row],
     began_ns = min(rows[0][0] for rows in (commands, wheels, poses) if rows)
     command, wheel, pose = _table(commands, 3), _table(wheels, 5), _table(poses, 4)
     wheel_ns = wheel[:, 0]
-    # What was driven while no wheel was heard is not known.
-    breaks_ns = wheel_ns[1:][np.diff(wheel_ns) > LONGEST_SILENCE_NS]
-
-    def when(t_ns: Array) -> tuple[Array, np.ndarray]:
-        return (t_ns - began_ns) * 1e-9, np.searchsorted(breaks_ns, t_ns, side="right").astype(np.int64)
-
+    when = in_segments(began_ns, after_silences(wheel_ns))
     (command_s, command_segment), (wheel_s, wheel_segment) = when(command[:, 0]), when(wheel_ns)
     pose_s, pose_segment = when(pose[:, 0])
     measured = bool(wheel_s.size)
-    none = np.empty(0)
     return DriveLog(
         (str(path),),
         Commands(command_s, command[:, 1], command[:, 2], command_segment),
         Wheels(wheel_s, wheel[:, 1], wheel[:, 2], wheel[:, 3], wheel[:, 4], wheel_segment, measured, measured),
         Poses(pose_s, pose[:, 1], pose[:, 2], pose[:, 3], pose_segment),
-        Gyro(none, none, np.empty(0, dtype=np.int64)),
-        notes,
+        notes=notes,
     )
 
 

@@ -16,15 +16,15 @@ from disco_hw.config import Robot, RobotConfig
 from disco_hw.errors import LogError
 from disco_hw.log.drive import (
     LONGEST_COMMAND_S,
-    LONGEST_SILENCE_NS,
     Array,
     Commands,
     DriveLog,
     Edge,
-    Gyro,
     Index,
     Motion,
     Poses,
+    after_silences,
+    in_segments,
     poses,
     rotations,
 )
@@ -204,12 +204,7 @@ def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: R
         notes.append(
             f"{breaks_ns.size} times the wheels paused, or a clock or encoder was set; new segments begin there"
         )
-
-    def when(t_ns: Index) -> tuple[Array, Index]:
-        return (t_ns - began_ns).astype(np.float64) * 1e-9, np.searchsorted(breaks_ns, t_ns, side="right").astype(
-            np.int64
-        )
-
+    when = in_segments(began_ns, breaks_ns)
     (command_s, command_segment), (pose_s, pose_segment) = when(command_ns), when(pose_ns)
     commands = Commands(command_s, command[:, 0], command[:, 1], command_segment)
     wheels = wheels_of(*when(wheel_ns), wheel, measured)
@@ -218,9 +213,7 @@ def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: R
     if fault is not None:
         notes.append(f"poses and wheels do not fit together: {fault.rpartition(';')[0]}; see which topics were read")
     notes += _of_the_choice(choice)
-    none = np.empty(0)
-    gyro = Gyro(none, none, np.empty(0, dtype=np.int64))
-    return DriveLog((str(path),), commands, wheels, drive_poses, gyro, tuple(notes))
+    return DriveLog((str(path),), commands, wheels, drive_poses, notes=tuple(notes))
 
 
 def _of_the_choice(choice: Choice) -> list[str]:
@@ -313,7 +306,7 @@ def _expired(t_ns: Index, speeds: Array) -> tuple[Index, Array]:
 def _pauses(wheel_ns: Index, others: Sequence[Index]) -> Index:
     """Return the times (ns) after gaps: half a second without wheel data; without any, two seconds without anything."""
     if wheel_ns.size:
-        return wheel_ns[1:][np.diff(wheel_ns) > LONGEST_SILENCE_NS]
+        return after_silences(wheel_ns)
     all_ns = np.sort(np.concatenate(others))
     return np.asarray(all_ns[1:][np.diff(all_ns) > _LONGEST_PAUSE_NS])
 

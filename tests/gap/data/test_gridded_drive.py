@@ -11,7 +11,7 @@ from disco_hw.gap.data.gridded_drive import even_times, grid_drive
 from disco_hw.gap.data.stamp_clock import StampClock
 from disco_hw.gap.data.timing import tick_s
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
-from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels
+from disco_hw.log.drive import Commands, DriveLog, Poses, Wheels
 from tests.tables import thinned
 
 
@@ -22,13 +22,11 @@ def drive(t_command, command, t_wheel, speed, ticks=2048, segment=None, pose_s=N
     poses = np.arange(0.0, t_wheel[-1], 0.04) if pose_s is None else pose_s
     none = np.zeros(poses.size)
     zeros = np.zeros(t_command.size, np.int64)
-    empty = np.empty(0)
     return DriveLog(
         ("made",),
         Commands(t_command, command, command, zeros),
         Wheels(t_wheel, angle, angle, speed, speed, where, True, False),
         Poses(poses, none, none, np.mod(poses + np.pi, 2 * np.pi) - np.pi, np.zeros(poses.size, np.int64)),
-        Gyro(empty, empty, np.empty(0, np.int64)),
     )
 
 

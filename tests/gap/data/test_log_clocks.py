@@ -10,7 +10,7 @@ from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.data.stamp_clock import StampClock, aligned
 from disco_hw.gap.search.channel_result import estimate_parameters
 from disco_hw.gap.search.channel_search import search_body
-from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, concatenate
+from disco_hw.log.drive import Commands, DriveLog, Poses, Wheels, concatenate
 
 BEGINS_S = (0.0, 22.0, 42.0)
 
@@ -110,13 +110,12 @@ def log_of(seed, late_s, heard_s):
     own = t_s[::2] + 0.0037
     seen = [np.interp(own - late_s, t_s, each) + 1e-3 * rng.standard_normal(own.size) for each in (x, y, yaw)]
     seen[2] = np.mod(seen[2] + np.pi, 2.0 * np.pi) - np.pi
-    none, empty = np.zeros(t_s.size, dtype=np.int64), np.empty(0)
+    none = np.zeros(t_s.size, dtype=np.int64)
     return DriveLog(
         (f"made {seed}",),
         Commands(t_s + 0.0011, *asked.T, none),
         Wheels(t_s, *angle.T, *turned.T, none, True, False),
         Poses(own, *seen, none[::2]),
-        Gyro(empty, empty, np.empty(0, np.int64)),
     )
 
 
@@ -156,10 +155,9 @@ def test_a_search_of_logs_whose_clocks_differ_finds_the_robot_and_holds_how_late
 
 @pytest.mark.thorough
 def test_a_log_without_commands_or_poses_speaks_for_no_delay():
-    empty, none = np.empty(0), np.empty(0, np.int64)
     whole = log_of(1, 0.1, 0.06)
-    bare = replace(log_of(2, 0.4, 0.2), commands=Commands(empty, empty, empty, none))
-    still = replace(log_of(3, 0.4, 0.06), poses=Poses(empty, empty, empty, empty, none))
+    bare = replace(log_of(2, 0.4, 0.2), commands=Commands())
+    still = replace(log_of(3, 0.4, 0.06), poses=Poses())
     alone = grid_drive(whole)
     for logs in ([whole, bare, bare], [bare, whole]):
         assert grid_drive(concatenate(logs)).commands_moved_s == pytest.approx(alone.commands_moved_s, abs=0.001)
