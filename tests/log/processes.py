@@ -1,9 +1,11 @@
 """Recording processes to kill: a process that records like the daemon does, and waiting for what it brings about."""
 
 import os
+import resource
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -46,6 +48,16 @@ def wait_until(condition, timeout_s=60.0):
     while not condition():
         assert time.monotonic() < deadline, "waited in vain"
         time.sleep(0.01)
+
+
+@contextmanager
+def files_of_at_most(size):
+    """Let this process write no file beyond `size` bytes, as on a full disk."""
+    resource.prlimit(0, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+    try:
+        yield
+    finally:
+        resource.prlimit(0, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
 
 
 def alive(pid):

@@ -1,6 +1,5 @@
 import csv
 import math
-import resource
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ from disco_hw.log.load import drive_from_log
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Command
 from drivers.types import PoseSample, WheelSample
+from tests.log.processes import files_of_at_most
 from tools.log_samples import PERIOD_NS, write_log
 
 TICKS = 2048
@@ -87,10 +87,6 @@ def test_nothing_is_overwritten_and_a_bad_place_is_named(drive, tmp_path):
 
 
 def test_a_full_disk_leaves_no_half_table_behind(drive, tmp_path):
-    resource.prlimit(0, resource.RLIMIT_FSIZE, (2_000, resource.RLIM_INFINITY))
-    try:
-        with pytest.raises(LogError, match="File too large"):
-            write_csv(drive, tmp_path / "run.csv", None)
-    finally:
-        resource.prlimit(0, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    with files_of_at_most(2_000), pytest.raises(LogError, match="File too large"):
+        write_csv(drive, tmp_path / "run.csv", None)
     assert not (tmp_path / "run.csv").exists()

@@ -1,6 +1,5 @@
 import io
 import json
-import resource
 
 import pytest
 from mcap.reader import make_reader
@@ -12,6 +11,7 @@ from disco_hw.log.container import MAGIC
 from disco_hw.log.log_command import export, info, recover, recover_log
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Controller
+from tests.log.processes import files_of_at_most
 from tests.tables import thinned
 from tools.log_samples import ATTACHMENTS, PERIOD_NS, bits, drive_ticks, log_bytes, tick, with_damaged_chunk, write_log
 
@@ -209,12 +209,8 @@ def test_of_nothing_nothing_is_recovered_and_no_target_left_behind(tmp_path, con
 def test_a_disk_full_on_the_way_leaves_no_target_behind(tmp_path):
     source, target = tmp_path / "cut.mcap", tmp_path / "mended.mcap"
     source.write_bytes(COMPLETE_LOG[:-1000])
-    resource.prlimit(0, resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
-    try:
-        with pytest.raises(LogError, match="File too large"):
-            recover_log(source, target)
-    finally:
-        resource.prlimit(0, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    with files_of_at_most(20_000), pytest.raises(LogError, match="File too large"):
+        recover_log(source, target)
     assert not target.exists()
 
 

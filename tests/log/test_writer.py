@@ -17,7 +17,17 @@ from disco_hw.log import writer
 from disco_hw.log.log_command import info
 from disco_hw.log.process_recorder import ProcessRecorder
 from disco_hw.log.reader import open_log
-from tests.log.processes import RecordingProcess, SmallDisk, alive, drive, recorded_ticks, recording, size, wait_until
+from tests.log.processes import (
+    RecordingProcess,
+    SmallDisk,
+    alive,
+    drive,
+    files_of_at_most,
+    recorded_ticks,
+    recording,
+    size,
+    wait_until,
+)
 
 
 @pytest.fixture
@@ -253,12 +263,8 @@ def test_a_half_written_end_is_cut_off(path):
     file.write(b"ole")
     file.flush()
     file.write(b"h")
-    resource.prlimit(0, resource.RLIMIT_FSIZE, (8, resource.RLIM_INFINITY))
-    try:
-        with pytest.raises(OSError, match="File too large"):
-            file.write(b"alf-written")
-    finally:
-        resource.prlimit(0, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    with files_of_at_most(8), pytest.raises(OSError, match="File too large"):
+        file.write(b"alf-written")
     assert path.read_bytes() == b"wholehal"
     file.truncate_to_complete()
     assert path.read_bytes() == b"whole"

@@ -1,4 +1,3 @@
-import resource
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +7,7 @@ from disco_hw.errors import LogError
 from disco_hw.log.importing import write_log
 from disco_hw.log.load import load_drive
 from tests.inference.drives import logged
+from tests.log.processes import files_of_at_most
 
 
 def parts(drive):
@@ -69,10 +69,6 @@ def test_times_that_do_not_fit_into_a_log_are_refused_and_leave_nothing_behind(t
 
 def test_a_full_disk_leaves_no_half_log_behind(tmp_path):
     drive = logged("poor")
-    resource.prlimit(0, resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
-    try:
-        with pytest.raises(LogError, match="File too large"):
-            write_log(drive, tmp_path / "log.mcap", "test")
-    finally:
-        resource.prlimit(0, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    with files_of_at_most(20_000), pytest.raises(LogError, match="File too large"):
+        write_log(drive, tmp_path / "log.mcap", "test")
     assert not (tmp_path / "log.mcap").exists()
