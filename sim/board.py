@@ -27,6 +27,7 @@ from sim.injected_faults import RobotFaults
 from sim.plant import Plant, TrueState
 from sim.python_can_link import RETRY_NS
 from sim.sensors import PoseMeasurement
+from sim.virtual_robot import sensor_inputs
 
 # Frames of the plant's line, as firmware_protocol/ports/plant_line.c has them, which also brakes after SILENT_US.
 WHEELS, POWER, POSITION, HEADING = 0x7E0, 0x7E1, 0x7E2, 0x7E3
@@ -108,7 +109,7 @@ class BoardRobot:
         setpoints = (outputs.left_setpoint_rad_s, outputs.right_setpoint_rad_s)
         turned = setpoints if faults is None else faults.setpoints(*setpoints, is_driven=outputs.driver_enabled)
         poses: Sequence[PoseMeasurement] = plant.step(now_us, *turned, outputs.driver_enabled, outputs.brake)
-        inputs = self._inputs()
+        inputs = sensor_inputs(plant, self.estop_button, error_counters, ResetCause.POWER_ON)
         if faults is not None:
             poses = faults.poses(now_us, poses)
             inputs = faults.inputs(inputs, setpoints, outputs.driver_enabled)
@@ -131,22 +132,6 @@ class BoardRobot:
         """Raise LinkFaultError, because only an operator or the board itself can restart it."""
         raise LinkFaultError("reboot: not over this line; press the board's reset button")
 
-    def _inputs(self) -> FirmwareInputs:
-        plant = self.plant
-        (left_ticks, right_ticks), (left_speed, right_speed) = plant.encoder_ticks, plant.measured_wheel_speeds_rad_s
-        left_current, right_current = plant.motor_currents_a
-        return FirmwareInputs(
-            left_ticks=left_ticks,
-            right_ticks=right_ticks,
-            left_speed_rad_s=left_speed,
-            right_speed_rad_s=right_speed,
-            left_current_a=left_current,
-            right_current_a=right_current,
-            left_temperature_c=max(plant.motor_temperatures_c),
-            voltage_v=plant.battery.voltage_v,
-            estop_button=self.estop_button,
-        )
-
 
 def _i16(value: float) -> int:
     return max(-_LARGEST_I16, min(round(value), _LARGEST_I16))
@@ -160,7 +145,8 @@ def _wheels(inputs: FirmwareInputs) -> Frame:
 
 def _power(inputs: FirmwareInputs) -> Frame:
     currents = (_i16(100 * inputs.left_current_a), _i16(100 * inputs.right_current_a))
-    voltage, temperature = round(100 * inputs.voltage_v), max(-127, min(round(inputs.left_temperature_c), 127))
+    voltage, hottest_c = round(100 * inputs.voltage_v), max(inputs.left_temperature_c, inputs.right_temperature_c)
+    temperature = max(-127, min(round(hottest_c), 127))
     return Frame(POWER, struct.pack("<hhHbB", *currents, min(voltage, 0xFFFF), temperature, inputs.estop_button))
 
 
