@@ -148,5 +148,4 @@ def test_a_long_sentence_would_be_seen(tmp_path):
 def test_each_tool_has_its_line_and_each_line_its_tool():
     named = set(re.findall(r"`(\w+\.(?:py|c))`", (ROOT / "tools" / "README.md").read_text(encoding="utf-8")))
     there = {path.name for path in (ROOT / "tools").rglob("*.[pc]*") if path.suffix in {".py", ".c"}}
-    vectors = {path.name for path in (ROOT / "tools" / "vectors").glob("*.py")}
-    assert named == there - vectors - {"__init__.py"}
+    assert named == there - {"__init__.py"}

@@ -67,15 +67,13 @@ class AdaptOptions:
 class AdaptRun:
     """Record of one drive.
 
-    `t_s` (N,), instant `cost` (N,), `path` (N, 2) m of the plant; beliefs in force as (t_s, mean (3,), std (3,)), and
-    how often the adapted belief was taken back.
+    `t_s` (N,), instant `cost` (N,), `path` (N, 2) m of the plant; beliefs in force as (t_s, mean (3,), std (3,)).
     """
 
     t_s: Array
     cost: Array
     path: Array
     beliefs: tuple[tuple[float, Array, Array], ...]
-    reverted: int
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -286,22 +284,20 @@ def drive(
     drive_for(options.change_s + options.settled_s + options.compared_s + period_s, UserRequest.START)
     table = np.array(rows)
     table = table[table[:, 0] > 0.0]
-    return AdaptRun(table[:, 0], table[:, 1], table[:, 2:], *_beliefs(run.recorder, believed_geometry(setup.model)))
+    return AdaptRun(table[:, 0], table[:, 1], table[:, 2:], _beliefs(run.recorder, believed_geometry(setup.model)))
 
 
-def _beliefs(recorder: MemoryRecorder, model: Geometry) -> tuple[tuple[tuple[float, Array, Array], ...], int]:
-    """Return the beliefs in force over time, and how often that of the model came back."""
+def _beliefs(recorder: MemoryRecorder, model: Geometry) -> tuple[tuple[float, Array, Array], ...]:
+    """Return the beliefs in force over time."""
     found = [(0.0, model.mean, model.std)]
-    reverted = 0
     for _, tick in recorder.ticks:
         for change in tick:
             if not isinstance(change, records.BeliefChange):
                 continue
             t_s = change.t_ns * 1e-9 - _START_S
             if change.source == "model":
-                reverted += 1
                 found.append((t_s, model.mean, model.std))
             else:
                 covariance = np.array(change.covariance).reshape(3, 3)
                 found.append((t_s, np.array(change.mean), np.sqrt(np.diag(covariance))))
-    return tuple(found), reverted
+    return tuple(found)

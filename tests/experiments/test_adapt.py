@@ -54,9 +54,7 @@ def made_up(loss: float, adapted: float) -> AdaptRun:
     t_s = np.arange(0.02, 120.0, 0.02)
     cost = np.where(t_s % 10.0 < 5.0, 0.01, 0.03)
     cost = cost + np.where(t_s < 60.0, 0.0, np.where(t_s < 67.0, loss, adapted))
-    return AdaptRun(
-        t_s, cost, np.zeros((t_s.size, 2)), ((0.0, np.ones(3), np.ones(3)), (64.0, np.ones(3), np.ones(3))), 0
-    )
+    return AdaptRun(t_s, cost, np.zeros((t_s.size, 2)), ((0.0, np.ones(3), np.ones(3)), (64.0, np.ones(3), np.ones(3))))
 
 
 def test_the_figures_are_what_they_say(tmp_path):

@@ -92,7 +92,7 @@ def experiments(scalar):
     pendulum = PendulumResult(made(PendulumOptions, scalar), {"true parameters": ones})
     t_s = np.arange(0.0, 120.0, 0.1)
     belief = (scalar(1), np.ones(3), np.ones(3))
-    plain = AdaptRun(t_s, np.ones(t_s.size), np.ones((t_s.size, 2)), (belief,), scalar(1))
+    plain = AdaptRun(t_s, np.ones(t_s.size), np.ones((t_s.size, 2)), (belief,))
     changed = [(name, adapted) for name in CHANGES for adapted in (False, True)]
     drives = {key: [replace(plain, cost=plain.cost * (1 + place))] for place, key in enumerate(changed)}
     adapt = AdaptResult(AdaptOptions(), None, drives)

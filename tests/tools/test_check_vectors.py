@@ -8,7 +8,7 @@ import os
 
 import pytest
 
-from tools.check_vectors import CHECKS, main
+from tools.vectors.check import CHECKS, main
 
 FOLDER = os.environ.get("DISCO_HW_VENDOR_VECTORS")
 VELOCITY = {

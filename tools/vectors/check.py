@@ -1,6 +1,6 @@
 """Run test vectors of vendors' protocols through the drivers' codecs and the simulators.
 
-`python -m tools.check_vectors DIR`
+`python -m tools.vectors.check DIR`
 
 A vector file is called as its protocol and holds one case a line; the format is said in the README beside the files.
 Prints how many cases of each file agree, how many of those within rounding, and every disagreement. Exits 1 if there
@@ -41,7 +41,7 @@ def check_case(check: Callable[[Case], Comparison], line: str) -> tuple[str, Com
 def main(arguments: list[str]) -> int:
     """Check every file of the folder named; return the exit status."""
     if len(arguments) != 1 or not Path(arguments[0]).is_dir():
-        print("usage: python -m tools.check_vectors DIR, the folder with the *.jsonl files", file=sys.stderr)
+        print("usage: python -m tools.vectors.check DIR, the folder with the *.jsonl files", file=sys.stderr)
         return 2
     files = sorted(Path(arguments[0]).glob("*.jsonl"))
     known = [path for path in files if path.stem in CHECKS]
