@@ -23,6 +23,7 @@ from disco_hw.daemon import send_request
 from disco_hw.experiments import READY_TIMEOUT_S, Operator, disco_hw_process
 from disco_hw.log.reader import open_log
 from tools.bench.latency import WHEEL_COMMAND
+from tools.bench.step_times import process_cpu_s
 from tools.stack import FAST_START, FAST_TASK, write_robot_file
 
 DOMAIN = 90
@@ -85,19 +86,13 @@ def circling(directory: Path, bridged: bool = True) -> Iterator[tuple[int, int]]
 
 def _loop_for(seconds: float, daemon: int, bridge: str) -> dict[str, float]:
     """Let it run, and return the daemon's CPU time for a second of it (ms), and the machine's load and CPUs."""
-    before_s = _cpu_s(daemon)
+    before_s = process_cpu_s(daemon)
     time.sleep(seconds)
     return {
-        f"bridge.daemon_cpu_ms_per_s_{bridge}": 1e3 * (_cpu_s(daemon) - before_s) / seconds,
+        f"bridge.daemon_cpu_ms_per_s_{bridge}": 1e3 * (process_cpu_s(daemon) - before_s) / seconds,
         f"bridge.load_{bridge}": os.getloadavg()[0],
         "bridge.cpus": float(len(os.sched_getaffinity(0))),
     }
-
-
-def _cpu_s(process: int) -> float:
-    """CPU time that a process has taken, in user space and in the kernel."""
-    fields = Path(f"/proc/{process}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _node_odometry(directory: Path) -> np.ndarray:

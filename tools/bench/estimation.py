@@ -11,6 +11,7 @@ from disco_hw.config import Estimation
 from disco_hw.estimation import PoseFusion
 from disco_hw.estimation.odometry import OdometryParameters, Pose, advance
 from drivers.types import PoseSample, WheelSample
+from tools.bench.step_times import percentiles
 
 PERIOD_NS = 10_000_000
 POSE_EVERY = 4
@@ -27,8 +28,8 @@ def run(ticks: int = 20_000) -> dict[str, float]:
     """
     plain, with_pose = _drive(ticks, lambda index: 10)
     _, mixed = _drive(ticks // 4, lambda index: 95 if index % 25 == 0 else 0)
-    figures = _percentiles("estimation.tick_us", np.concatenate([plain, with_pose]))
-    figures |= _percentiles("estimation.tick_with_pose_us", with_pose)
+    figures = percentiles("estimation.tick_us", np.concatenate([plain, with_pose]))
+    figures |= percentiles("estimation.tick_with_pose_us", with_pose)
     rewinds = np.sort(mixed)[-len(mixed) // 25 :]
     figures |= {
         "estimation.rewind_950ms_us.p50": float(np.median(rewinds)),
@@ -65,10 +66,3 @@ def _drive(ticks: int, delay_ticks: Callable[[int], int]) -> tuple[np.ndarray, n
     if stats.poses_accepted < 0.95 * (ticks // POSE_EVERY) - 25 or stats.poses_too_old:
         raise RuntimeError(f"the benchmark does not fuse its poses: {stats}")
     return np.array(plain), np.array(with_pose)
-
-
-def _percentiles(name: str, times_us: np.ndarray) -> dict[str, float]:
-    return {
-        f"{name}.{label}": float(np.percentile(times_us, percent))
-        for label, percent in (("p50", 50.0), ("p99", 99.0), ("p99.9", 99.9))
-    }

@@ -35,6 +35,7 @@ from disco_hw.viewer.pages import LivePage, ReplayPage, run_live
 from disco_hw.viewer.recording import Recording, Snapshot, stage_of_robot
 from disco_hw.viewer.server import serving
 from drivers.types import WheelSample
+from tools.bench.step_times import process_cpu_s
 from tools.browser import chromium, opened
 from tools.stack import running_stack
 from tools.viewer_run import PERIOD_NS, ROBOT_FILE, pose_at, tick_records, write_log
@@ -161,7 +162,7 @@ def _children_cpu_s() -> float:
     cpu_s = 0.0
     for pid in found:
         with suppress(OSError):
-            cpu_s += _cpu_s(pid)
+            cpu_s += process_cpu_s(pid)
     return cpu_s
 
 
@@ -262,10 +263,10 @@ def _live(directory: Path) -> dict[str, float]:
             record_span("without_page", begin_ns, before_ms)
             with disco_hw_process("page", [*view, str(stack.robot_file)], directory / "page.txt") as page, _reader():
                 time.sleep(3.0)
-                cpu_s, before_ms, begin_ns = _cpu_s(page.process.pid), stolen_ms(), time.monotonic_ns()
+                cpu_s, before_ms, begin_ns = process_cpu_s(page.process.pid), stolen_ms(), time.monotonic_ns()
                 ages_ms += _ages_ms(feed_path(directory / "control.sock"))
                 record_span("with_page", begin_ns, before_ms)
-                cpu_percent.append(100.0 * (_cpu_s(page.process.pid) - cpu_s) / SPAN_S)
+                cpu_percent.append(100.0 * (process_cpu_s(page.process.pid) - cpu_s) / SPAN_S)
                 os.kill(page.process.pid, signal.SIGSTOP)
                 time.sleep(0.5)
                 before_ms, begin_ns = stolen_ms(), time.monotonic_ns()
@@ -387,11 +388,6 @@ def _reader() -> Iterator[None]:
 def _read_all(client: ClientConnection) -> None:
     for _ in client:
         pass
-
-
-def _cpu_s(pid: int) -> float:
-    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from drivers.motor.reference_frames import FrameTransmission
 from firmware_protocol import _firmware
 from firmware_protocol.codec import Codec
 from firmware_protocol.protection import aes_cmac
+from tools.bench.step_times import percentiles
 
 COMMAND = {"mode": "SPEED", "left_speed": 1.5, "right_speed": -0.75, "valid_for": 0.1, "session": 7}
 SAMPLE = {"left_valid": 1, "right_valid": 1, "driver_enabled": 1, "limited": 0, "left_speed": 1.0, "right_speed": 2.0}
@@ -51,8 +52,7 @@ def run(count: int = 20_000) -> dict[str, float]:
             start = perf_counter_ns()
             what()
             times[i] = (perf_counter_ns() - start) * 1e-3
-        for label, percent in (("p50", 50.0), ("p99", 99.0), ("p99.9", 99.9)):
-            figures[f"{name}.{label}"] = float(np.percentile(times, percent))
+        figures |= percentiles(name, times)
     figures["wire.core_cmac_over_cryptography"] = (
         figures["wire.core_cmac_us.p50"] / figures["wire.cryptography_cmac_us.p50"]
     )
