@@ -9,10 +9,13 @@ import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import numpy.typing as npt
 
+from disco_hw.log.drive import DriveLog
+from disco_hw.log.load import load_drive
 from sim.effects import HiddenEffects
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
@@ -133,6 +136,14 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
         writer.writerows(cells for _, cells in rows)
+
+
+def read_back(rows: Sequence[Row], ticks_per_rev: int) -> DriveLog:
+    """Rows as they are read from their CSV file."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "log.csv"
+        write_csv(path, rows)
+        return load_drive(path, ticks_per_rev)
 
 
 def _run(

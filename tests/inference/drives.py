@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from disco_hw.config import Prior, Robot, RobotConfig
 from disco_hw.log.drive import DriveLog
-from disco_hw.log.load import load_drive
 from sim.effects import hidden_effects
 from sim.plant_parameters import PlantParameters
 from tools.simulated_drives import create_drive
-from tools.simulated_log import simulated_log, write_csv
+from tools.simulated_log import read_back, simulated_log, write_csv
 
 TRUTH = {"x_icr_m": 0.12, "wheel_radius_m": 0.06, "axial_distance_m": 0.45}
 TICKS_PER_REV = 2048
@@ -39,7 +37,5 @@ def write_log(path: Path, drive: str = "circle", seed: int = 1, hide: dict | Non
 def logged(drive: str = "circle", seed: int = 1, hidden: tuple = (), noiseless: bool = False) -> DriveLog:
     plant = PlantParameters(**TRUTH).with_ideal_motors()
     plant = plant.noiseless() if noiseless else plant
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "log.csv"
-        write_csv(path, simulated_log(create_drive(drive, seed), plant, hidden_effects(dict(hidden)), seed))
-        return load_drive(path, TICKS_PER_REV)
+    rows = simulated_log(create_drive(drive, seed), plant, hidden_effects(dict(hidden)), seed)
+    return read_back(rows, TICKS_PER_REV)

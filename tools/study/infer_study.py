@@ -1,4 +1,4 @@
-"""Recovery study of `infer`: robots drawn from the prior's plausible part, errors and coverage; pictures on request.
+"""Recovery study of `infer`: robots drawn from the prior's plausible part, errors and coverage.
 
 python -m tools.study.infer_study --plants 20 --drive rich --out out/infer
 python -m tools.study.infer_study --kind foreign --first 200 --plants 40
@@ -18,13 +18,11 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from disco_hw.config import Prior, Robot, RobotConfig
 from disco_hw.errors import InputError
@@ -35,14 +33,13 @@ from disco_hw.inference.infer import InferOptions, infer, noise_of, noise_spread
 from disco_hw.inference.noise import unexplained_share
 from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds
 from disco_hw.log.drive import Commands, DriveLog, Poses, Wheels
-from disco_hw.log.load import load_drive
 from disco_hw.model import Model
 from sim.plant_parameters import PlantParameters
 from tools.foreign_plant import ForeignPlant, ForeignRobot
 from tools.joystick import TOP_RAD_S
 from tools.mujoco_robot import COUNTS_PER_TURN, TRACK_M, WHEEL_RADIUS_M, record
 from tools.simulated_drives import create_drive
-from tools.simulated_log import simulated_log, write_csv
+from tools.simulated_log import read_back, simulated_log
 
 PLAUSIBLE = {"x_icr_m": (0.0, 0.3), "wheel_radius_m": (0.04, 0.10), "axial_distance_m": (0.2, 0.5)}
 LEVEL = 0.9
@@ -71,10 +68,7 @@ def plant(seed: int) -> PlantParameters:
 
 def logged(parameters: PlantParameters, drive: str, seed: int) -> DriveLog:
     """One drive of a robot, by way of a CSV file."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "log.csv"
-        write_csv(path, simulated_log(create_drive(drive, seed), parameters, None, seed))
-        return load_drive(path, parameters.ticks_per_rev)
+    return read_back(simulated_log(create_drive(drive, seed), parameters, None, seed), parameters.ticks_per_rev)
 
 
 def foreign_robot(seed: int, kind: str) -> ForeignRobot:
@@ -235,19 +229,6 @@ def figures(results: list[dict[str, object]]) -> dict[str, float]:
     return found
 
 
-def picture(results: list[dict[str, object]], path: Path) -> None:
-    """Errors with 90 % bars over the truth."""
-    figure = Figure(figsize=(9.0, 3.0), layout="constrained")
-    truth, mean, sd = (np.array([one[key] for one in results]) for key in ("truth", "mean", "sd"))
-    for index, (axis, name) in enumerate(zip(figure.subplots(1, 3), NAMES, strict=True)):
-        error_mm = 1e3 * (mean - truth)[:, index]
-        axis.errorbar(truth[:, index], error_mm, yerr=1.645e3 * sd[:, index], fmt="o", ms=3, color="#1f6f8b")
-        axis.axhline(0.0, color="#888", lw=0.8)
-        axis.set_xlabel(f"true {name}")
-        axis.set_ylabel("error (mm)")
-    figure.savefig(path, dpi=110)
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
     parser.add_argument("--kind", choices=KINDS, default="own")
@@ -265,7 +246,6 @@ def main() -> int:
     refused = len(results) - len(evaluated)
     print(f"{len(results)} logs: {refused} refused, {flagged} said to lie outside what was simulated")
     if evaluated:
-        picture(evaluated, options.out / f"recovery_{options.kind}_{options.drive}.png")
         inside = np.array([one["inside"] for one in evaluated]).sum(axis=0).tolist()
         coverage = ", ".join(f"{name} {count} of {len(evaluated)}" for name, count in zip(NAMES, inside, strict=True))
         print(f"90 % intervals hold {coverage}")
