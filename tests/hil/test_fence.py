@@ -31,10 +31,13 @@ def test_a_daemon_keeps_its_task_inside_and_stops_for_an_obstacle_that_is_report
         operator.request("fence", margin_m=0.06)
         assert operator.status()["area"]["fence"]["margin_m"] == 0.06
         stack.start()
-        with pytest.raises(WorkError, match="the fence can be changed while the robot is disarmed"):
+        with pytest.raises(WorkError, match="the fence can be changed only while the robot is disarmed"):
             operator.request("fence", margin_m=0.05)
         code, output = disco("ctl", robot, "obstacle", "add", "name=box", "x_m=-1.5", "y_m=1.5", "radius_m=0.1")
-        assert (code, output.strip()) == (0, "obstacle box: kept for 600 s, then the robot stops")
+        assert (code, output.strip()) == (
+            0,
+            "obstacle box: valid for 600 s; without a newer report the robot then stops",
+        )
         person = {"name": "person", "x_m": -1.5, "y_m": -1.5, "radius_m": 0.2, "age_limit_s": AGE_LIMIT_S}
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             sender.sendto(json.dumps(person).encode(), ("127.0.0.1", port))
@@ -46,7 +49,7 @@ def test_a_daemon_keeps_its_task_inside_and_stops_for_an_obstacle_that_is_report
         operator.wait_for_standstill(2.0)
         code, output = disco("ctl", robot, "status")
         assert code == 0, output
-        assert "fence: obstacle lost, obstacle person is reported no longer; report it again or remove it" in output
+        assert "fence: obstacle lost, obstacle person is no longer reported; report it again or remove it" in output
         code, output = disco("ctl", robot, "obstacle", "remove", "name=person")
         assert (code, output.strip()) == (0, "obstacle person: removed")
         operator.wait_until("free again", lambda s: s["area"]["verdict"] == "free", 2.0)
