@@ -179,8 +179,8 @@ def circle(
     from disco_hw.experiments.circle import CircleOptions, run_circle
     from disco_hw.runtime.robot_setup import load_setup
 
-    if mode not in {"default", "paper"}:
-        raise InputError(f"--mode {mode}: no such mode; write default or paper")
+    if mode not in {"default", "sampled", "paper"}:
+        raise InputError(f"--mode {mode}: no such mode; write default, sampled or paper")
     for option, value in (("duration-s", duration_s), ("lag-s", lag_s), ("wheel-noise", wheel_noise)):
         if not math.isfinite(value):
             raise InputError(f"--{option} {value}: not a finite number; write one")

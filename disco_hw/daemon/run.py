@@ -27,7 +27,7 @@ from numba.core import event
 from disco_hw import processes
 from disco_hw.adaptation.guard import AdaptationChoice, AdaptationKind, check_adaptable, choose_adaptation
 from disco_hw.config import RobotConfig
-from disco_hw.control.plan import Law, LawController
+from disco_hw.control.plan import PLANNER_VERSION, Law, LawController
 from disco_hw.daemon import SERVED, describe_recording, passed_over, socket_path
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.daemon.daemon import Daemon, Report
@@ -251,7 +251,9 @@ def _create_recorder(setup: Setup, log: Path | None) -> Recorder:
     attachments = [*kept_files(setup), Attachment(DBC, "text/plain", packaged_dbc().encode())]
     name = setup.config.robot.name
     scene = scene_of(setup.config)
-    return ProcessRecorder(RecordingSettings(log, name, version=version(), attachments=tuple(attachments), scene=scene))
+    return ProcessRecorder(
+        RecordingSettings(log, name, version(), PLANNER_VERSION, attachments=tuple(attachments), scene=scene)
+    )
 
 
 def _close_recorder(recorder: Recorder, report: Report) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from disco_hw.adaptation import GeometryAdaptation
 from disco_hw.adaptation.guard import choose_adaptation
 from disco_hw.config import RobotConfig
-from disco_hw.control.plan import Law, LawController
+from disco_hw.control.plan import PLANNER_VERSION, Law, LawController
 from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments.virtual import true_parameters
 from disco_hw.log import MODEL_TOML, Attachment
@@ -156,7 +156,13 @@ class SimulatedRun:
         attachments = (*kept_files(setup), model)
         ticks = self.recorder.ticks
         recorder = ProcessRecorder(
-            RecordingSettings(path, self._setup.config.robot.name, attachments=attachments, queue_ticks=len(ticks) + 1)
+            RecordingSettings(
+                path,
+                self._setup.config.robot.name,
+                planner=PLANNER_VERSION,
+                attachments=attachments,
+                queue_ticks=len(ticks) + 1,
+            )
         )
         for now_ns, records in ticks:
             recorder.put(now_ns, records)
