@@ -40,7 +40,10 @@ class Remains:
     def of(
         cls, timed: PredictionErrors, offered: PredictionErrors, floor: PredictionErrors, body: PredictionErrors | None
     ) -> Remains | None:
-        """Evaluate held-out errors; `body`: those by measured wheel motion. None if nothing was predicted."""
+        """Return what remains of the held-out errors, or None if nothing was predicted.
+
+        `body`: the errors of predictions from measured wheel motion.
+        """
         if not math.isfinite(offered.position_m):
             return None
         before, after, noise = ((one.position_m, one.yaw_rad) for one in (timed, offered, floor))
