@@ -207,7 +207,7 @@ def adapt(
     out: Annotated[Path, typer.Option("-o", "--out", help="Directory for CSV and picture.")] = Path("out/adapt"),
     as_json: AsJson = False,
 ) -> None:
-    """Let wheel radius or axial distance change on the way, and see what adaptation wins back."""
+    """Change wheel radius or axial distance on the way, and compare the drive with and without adaptation."""
     import disco_hw
     from disco_hw.experiments.adapt import AdaptOptions, run_adapt
     from disco_hw.runtime.robot_setup import load_setup
@@ -266,7 +266,7 @@ def fence(
     ] = Path("out/fence"),
     as_json: AsJson = False,
 ) -> None:
-    """Drive in random rooms on robots that nobody told, and count how often one leaves its fence."""
+    """Drive unknown robots in random rooms, and count how often one leaves its fence."""
     from disco_hw.experiments.fence import FenceOptions, run_fence
 
     refuse_directory(out)

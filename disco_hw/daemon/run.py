@@ -42,11 +42,11 @@ from disco_hw.processes import end_with_parent
 from disco_hw.runtime import AdviceStyle, by_command
 from disco_hw.runtime.assembly import (
     assemble_core,
+    create_adaptation,
     create_link,
     create_pipeline,
     create_planner,
     driver_of,
-    make_adaptation,
 )
 from disco_hw.runtime.core import FindsWiring, Pilot, TaskPilot
 from disco_hw.runtime.pipeline import FollowTask, NoPlanner, Off, Pipeline, Planner, Standstill
@@ -206,7 +206,7 @@ def _start(
     if advice_style is not None and log is not None:
         stop.add("log", lambda: report("log", f"look at it: disco-hw view {log}, or disco-hw log info {log}"))
     stop.add(_RECORDER, lambda: _close_recorder(recorder, report))
-    adaptation = make_adaptation(setup, pipeline, adapt)
+    adaptation = create_adaptation(setup, pipeline, adapt)
     for step in processes.enter_real_time(config.daemon.realtime_priority):
         report("real time", str(step))
     for line in passed_over(server.path):

@@ -27,10 +27,10 @@ from disco_hw.model import model_text
 from disco_hw.reports import refuse_file
 from disco_hw.runtime.assembly import (
     assemble_core,
+    create_adaptation,
     create_pipeline,
     create_planner,
     driver_of,
-    make_adaptation,
 )
 from disco_hw.runtime.core import CoreTick, DaemonCore, FindsWiring, Pilot, TaskPilot
 from disco_hw.runtime.pipeline import Pipeline, Planner
@@ -107,7 +107,7 @@ class SimulatedRun:
     @staticmethod
     def _adaptation(setup: Setup, pipeline: Pipeline) -> GeometryAdaptation | None:
         chosen = choose_adaptation(setup.config.control, setup.config.pose, setup.model)
-        return make_adaptation(setup, pipeline, chosen.kind)
+        return create_adaptation(setup, pipeline, chosen.kind)
 
     def ticks(self, duration_s: float, *requests: UserRequest) -> Iterator[CoreTick]:
         """Let time pass and give every tick as it comes; the requests come with the first one."""
