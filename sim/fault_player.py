@@ -63,9 +63,9 @@ class FaultTimeline:
         begun: list[ScheduledFault] = []
         while self._coming and self._coming[-1].begin_ns <= now_ns:
             begun.append(self._coming.pop())
-        held = (*self.active, *begun)
-        ended = tuple(fault for fault in held if fault.end_ns <= now_ns)
-        self.active = tuple(fault for fault in held if fault.end_ns > now_ns)
+        running = (*self.active, *begun)
+        ended = tuple(fault for fault in running if fault.end_ns <= now_ns)
+        self.active = tuple(fault for fault in running if fault.end_ns > now_ns)
         self._next_ns = self._find_next_ns()
         return FaultStep(tuple(begun), ended)
 
@@ -164,9 +164,9 @@ class FaultPlayer:
                 self.frames.break_next = False
 
     def _do(self, command: str, now_ns: int) -> None:
-        answer = self._injection.execute(command, now_ns)
-        if answer != "ok":
-            self._report(answer)
+        reply = self._injection.execute(command, now_ns)
+        if reply != "ok":
+            self._report(reply)
 
 
 class Injection:

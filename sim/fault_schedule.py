@@ -29,14 +29,14 @@ class Site(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class FaultParameter:
-    """One parameter of a kind: a number within bounds, a whole one if `whole`, or one of `choices`."""
+    """One parameter of a kind: a number within bounds, an integer if `is_integer`, or one of `choices`."""
 
     name: str
     default: float | str
     least: float = 0.0
     most: float = 0.0
     choices: tuple[str, ...] = ()
-    whole: bool = False
+    is_integer: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,16 +50,16 @@ class Kind:
     lasts: bool = True
 
 
-def _number(name: str, default: float, least: float, most: float, *, whole: bool = False) -> FaultParameter:
-    return FaultParameter(name, default, least, most, whole=whole)
+def _number(name: str, default: float, least: float, most: float, *, is_integer: bool = False) -> FaultParameter:
+    return FaultParameter(name, default, least, most, is_integer=is_integer)
 
 
 _TO = FaultParameter("to", "both", choices=("robot", "host", "both"))
 _ONE_SIDE = FaultParameter("to", "robot", choices=("robot", "host"))
-_ID = _number("id", -1, -1, 0x7FF, whole=True)
+_ID = _number("id", -1, -1, 0x7FF, is_integer=True)
 _SOME = _number("probability", 0.3, 1e-6, 1.0)
-_LATE = _number("delay_s", 0.3, 1e-3, 10.0)
-_CORES = _number("cores", 2, 1, 1024, whole=True)
+_DELAY = _number("delay_s", 0.3, 1e-3, 10.0)
+_CORES = _number("cores", 2, 1, 1024, is_integer=True)
 _DROP = _number("drop_v", 6.0, 0.1, 100.0)
 _WHEEL = FaultParameter("wheel", "left", choices=("left", "right"))
 _PROCESS = FaultParameter("process", "daemon", choices=("daemon", "robot", "recorder", "viewer"))
@@ -81,7 +81,7 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
             Kind("wrong_length", Site.FRAMES, "frames are cut short or padded behind the link's check", _FRAMES),
             Kind(
                 "babble", Site.LINK, "another node sends zeros under an identifier",
-                (_number("id", 0x100, 0, 0x7FF, whole=True), _number("rate_hz", 400.0, 0.1, 100_000.0)),
+                (_number("id", 0x100, 0, 0x7FF, is_integer=True), _number("rate_hz", 400.0, 0.1, 100_000.0)),
             ),
             Kind(
                 "bus_off", Site.LINK, "a controller leaves the bus",
@@ -94,11 +94,11 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
             Kind("encoder_disconnected", Site.SENSORS, "an encoder's lines hang in the air", (_WHEEL,)),
             Kind(
                 "encoder_jump", Site.SENSORS, "an encoder's count jumps",
-                (_WHEEL, _number("ticks", 5000, -(1 << 31), 1 << 31, whole=True)), lasts=False,
+                (_WHEEL, _number("ticks", 5000, -(1 << 31), 1 << 31, is_integer=True)), lasts=False,
             ),
             Kind(
                 "encoder_wrap", Site.SENSORS, "an encoder's count has so many bits only",
-                (_WHEEL, _number("bits", 10, 4, 31, whole=True)),
+                (_WHEEL, _number("bits", 10, 4, 31, is_integer=True)),
             ),
             Kind("encoder_reversed", Site.SENSORS, "an encoder counts backwards", (_WHEEL,)),
             Kind("pose_frozen", Site.SENSORS, "the pose sensor repeats its last pose under new stamps"),
@@ -106,7 +106,7 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
                 "pose_jump", Site.SENSORS, "measured poses are elsewhere",
                 (_number("dx_m", 2.0, -1e3, 1e3), _number("dy_m", 0.0, -1e3, 1e3), _number("dyaw_rad", 0.0, -3.2, 3.2)),
             ),
-            Kind("pose_late", Site.SENSORS, "poses come later, with their true stamps", (_LATE,)),
+            Kind("pose_late", Site.SENSORS, "poses come later, with their true stamps", (_DELAY,)),
             Kind("pose_swapped", Site.SENSORS, "x and y of measured poses are exchanged"),
             Kind("pose_nan", Site.SENSORS, "measured poses are not numbers"),
             Kind("pose_silent", Site.SENSORS, "no poses are measured"),
@@ -229,9 +229,9 @@ def _value(value: Any, parameter: FaultParameter, where: str) -> float | str:
             )
         return str(value)
     number = _bounded(value, where, parameter.least, parameter.most)
-    if parameter.whole and number != int(number):
+    if parameter.is_integer and number != int(number):
         raise FaultFileError(f"{where}: {value!r} is not a whole number; round it")
-    return int(number) if parameter.whole else number
+    return int(number) if parameter.is_integer else number
 
 
 def _bounded(value: Any, where: str, least: float, most: float) -> float:

@@ -104,7 +104,7 @@ class Hub:
     def next_event_ns(self) -> int | None:
         """Return when `pump` is due even if no client does anything; None if never."""
         times = [t for t in (self.bus.next_event_ns(), self._plug_in_ns) if t is not None]
-        times.extend(client.last_read_ns + READER_STALL_NS for client in self._held_up_by())
+        times.extend(client.last_read_ns + READER_STALL_NS for client in self._slow_readers())
         return min(times) if times else None
 
     def pump(self, now_ns: int) -> list[DeliveredFrame]:
@@ -256,8 +256,8 @@ class Hub:
             client.last_read_ns = self._now_ns
             self.stats.frames_out += 1
 
-    def _held_up_by(self) -> list[_Client]:
-        """Return the readers for whom senders wait."""
+    def _slow_readers(self) -> list[_Client]:
+        """Return the clients whose full queues make the senders wait."""
         if self._pacing:
             return []
         return [
@@ -268,10 +268,10 @@ class Hub:
 
     def _set_events(self) -> None:
         """Listen only to what can be served now, or a level-triggered poll would spin."""
-        held_up = bool(self._held_up_by())
+        must_wait = bool(self._slow_readers())
         for descriptor, client in self._clients.items():
             room = client.unsent + client.node.pending < CLIENT_TRANSMIT_QUEUE
-            events = select.EPOLLIN if room and not held_up else 0
+            events = select.EPOLLIN if room and not must_wait else 0
             if client.unread:
                 events |= select.EPOLLOUT
             if events != client.events:

@@ -127,7 +127,7 @@ class RobotFaults:
         self._touched = False
         self._changed = False
         self._jumps: list[ScheduledFault] = []
-        self._late: deque[tuple[int, PoseMeasurement]] = deque()
+        self._delayed: deque[tuple[int, PoseMeasurement]] = deque()
         self._last_pose: PoseMeasurement | None = None
         self._classify()
 
@@ -151,17 +151,17 @@ class RobotFaults:
 
     def poses(self, now_us: int, measured: Sequence[PoseMeasurement]) -> Sequence[PoseMeasurement]:
         """Return the poses that the faults let through by `now_us` of robot time, changed or delayed."""
-        if not self.active and not self._late:
+        if not self.active and not self._delayed:
             if measured:
                 self._last_pose = measured[-1]
             return measured
         for pose in measured:
             changed = self._changed_pose(pose)
             if changed is not None:
-                self._late.append((now_us + self._delay_us, changed))
+                self._delayed.append((now_us + self._delay_us, changed))
         due: list[PoseMeasurement] = []
-        while self._late and self._late[0][0] <= now_us:
-            due.append(self._late.popleft()[1])
+        while self._delayed and self._delayed[0][0] <= now_us:
+            due.append(self._delayed.popleft()[1])
         return due
 
     def inputs(self, inputs: FirmwareInputs, setpoints: tuple[float, float], driver_enabled: bool) -> FirmwareInputs:

@@ -201,13 +201,13 @@ class Disturbances:
         p = parameters
         dt = p.integration_step_us * 1e-6
         fast = math.exp(-dt / p.wheel_disturbance_correlation_s)
-        slow = math.exp(-dt / p.wheel_wander_correlation_s)
+        slow = math.exp(-dt / p.wheel_drift_correlation_s)
         slip = math.exp(-dt / p.slip_correlation_s)
         burst = math.exp(-dt / p.volatility_correlation_s)
         self._wheel_decay = np.array([fast, fast, slow, slow, burst])
         self._slip_decay = np.array([slip, slip, slip, burst])
         self._wheel_std = p.wheel_disturbance_std
-        self._wander_std = p.wheel_wander_std
+        self._drift_std = p.wheel_drift_std
         self._slip_std = np.array([p.slip_std_x_m_s, p.slip_std_y_m_s, p.slip_std_yaw_rad_s])
         self._volatility = p.volatility
         self._wheel_last = self._wheel_generator.standard_normal(len(self._wheel_decay))
@@ -226,7 +226,7 @@ class Disturbances:
     def _wheel_block(self) -> Array:
         unit = _correlated(self._wheel_generator, self._wheel_decay, self._wheel_last)
         fast = self._wheel_std * unit[:, :2] * self._bursts(unit[:, 4:])
-        return np.ascontiguousarray(fast + self._wander_std * unit[:, 2:4])
+        return np.ascontiguousarray(fast + self._drift_std * unit[:, 2:4])
 
     def _slip_block(self) -> Array:
         unit = _correlated(self._slip_generator, self._slip_decay, self._slip_last)

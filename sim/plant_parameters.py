@@ -8,10 +8,10 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import numpy.typing as npt
 
-DRAWN_FIELDS = ("x_icr_m", "wheel_radius_m", "axial_distance_m")
+SAMPLED_FIELDS = ("x_icr_m", "wheel_radius_m", "axial_distance_m")
 # Chosen: wider than any robot this project drives; beyond, the Gaussian is not of a robot.
-SMALLEST_DRAWN = (-1.0, 0.01, 0.05)
-LARGEST_DRAWN = (1.0, 1.0, 2.0)
+SMALLEST_SAMPLE = (-1.0, 0.01, 0.05)
+LARGEST_SAMPLE = (1.0, 1.0, 2.0)
 # Chosen: a Gaussian with less than about one draw in so many inside lies outside.
 MAX_DRAWS = 10_000
 
@@ -29,7 +29,7 @@ _MUST_BE_POSITIVE = frozenset(
         "brake_time_constant_s",
         "speed_observer_bandwidth_rad_s",
         "wheel_disturbance_correlation_s",
-        "wheel_wander_correlation_s",
+        "wheel_drift_correlation_s",
         "slip_correlation_s",
         "volatility_correlation_s",
         "pose_rate_hz",
@@ -85,8 +85,8 @@ class PlantParameters:
     # Disturbances: of wheel speed relative to itself (fast and slow), of the body's velocity while it moves.
     wheel_disturbance_std: float = 0.015
     wheel_disturbance_correlation_s: float = 0.15
-    wheel_wander_std: float = 0.0
-    wheel_wander_correlation_s: float = 20.0
+    wheel_drift_std: float = 0.0
+    wheel_drift_correlation_s: float = 20.0
     slip_std_x_m_s: float = 0.005
     slip_std_y_m_s: float = 0.004
     slip_std_yaw_rad_s: float = 0.018
@@ -129,7 +129,7 @@ class PlantParameters:
         return replace(
             self,
             wheel_disturbance_std=0.0,
-            wheel_wander_std=0.0,
+            wheel_drift_std=0.0,
             slip_std_x_m_s=0.0,
             slip_std_y_m_s=0.0,
             slip_std_yaw_rad_s=0.0,
@@ -170,15 +170,15 @@ def draw_plant_parameters(
 ) -> PlantParameters:
     """Draw a robot from a Gaussian over (x_icr, wheel radius, axial distance), in metres and this order.
 
-    mean: shape (3,); covariance: shape (3, 3). Draws outside `SMALLEST_DRAWN`..`LARGEST_DRAWN` are drawn again, so the
-    distribution is the truncated Gaussian; everything else is taken from `base`. Raises DrawError if the covariance is
-    not symmetric positive semi-definite, or if `MAX_DRAWS` draws give nothing physical.
+    mean: shape (3,); covariance: shape (3, 3). Draws outside `SMALLEST_SAMPLE`..`LARGEST_SAMPLE` are drawn again, so
+    the distribution is the truncated Gaussian; everything else is taken from `base`. Raises DrawError if the covariance
+    is not symmetric positive semi-definite, or if `MAX_DRAWS` draws give nothing physical.
     """
     centre = np.asarray(mean, dtype=np.float64)
     spread = np.asarray(covariance, dtype=np.float64)
-    size = len(DRAWN_FIELDS)
+    size = len(SAMPLED_FIELDS)
     if centre.shape != (size,) or spread.shape != (size, size):
-        raise DrawError(f"{', '.join(DRAWN_FIELDS)}: the mean needs shape ({size},), the covariance ({size}, {size})")
+        raise DrawError(f"{', '.join(SAMPLED_FIELDS)}: the mean needs shape ({size},), the covariance ({size}, {size})")
     if not (np.all(np.isfinite(centre)) and np.all(np.isfinite(spread)) and np.allclose(spread, spread.T)):
         raise DrawError("mean and covariance must be finite and the covariance symmetric")
     variances, axes = np.linalg.eigh(spread)
@@ -187,9 +187,9 @@ def draw_plant_parameters(
     root = axes * np.sqrt(np.maximum(variances, 0.0))
     generator = np.random.default_rng(seed)
     for _ in range(MAX_DRAWS):
-        drawn = centre + root @ generator.standard_normal(size)
-        if np.all(drawn >= SMALLEST_DRAWN) and np.all(drawn <= LARGEST_DRAWN):
-            x_icr_m, wheel_radius_m, axial_distance_m = (float(number) for number in drawn)
+        sample = centre + root @ generator.standard_normal(size)
+        if np.all(sample >= SMALLEST_SAMPLE) and np.all(sample <= LARGEST_SAMPLE):
+            x_icr_m, wheel_radius_m, axial_distance_m = (float(number) for number in sample)
             return replace(
                 base or PlantParameters(),
                 x_icr_m=x_icr_m,

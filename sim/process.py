@@ -198,12 +198,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("usage: python -m sim.process SOCKET COMMAND...", file=sys.stderr)
         return 2
     try:
-        answer = send_command(Path(given[0]), " ".join(given[1:]))
+        reply = send_command(Path(given[0]), " ".join(given[1:]))
     except OSError as error:
         print(f"{given[0]}: no answer ({error}); is the virtual robot running, with --inject?", file=sys.stderr)
         return 1
-    print(answer)
-    return int(answer.startswith("error"))
+    print(reply)
+    return int(reply.startswith("error"))
 
 
 if __name__ == "__main__":

@@ -3,7 +3,8 @@
 Wheel radius, axle and x_icr of every robot are off by up to 15 %, and nobody is told; the motors' lag and dead band are
 known to all. From rest on the line; figures are of 5 to 30 s, at 50 plans a second. The gains of the classical ones
 were found on robots 0 to 4 (`docs/results.md`); these are robots 1000 on, or others with `--first`.
-Names that begin with `mujoco` drive the robot of `tools/mujoco_plant.py`.
+Names that begin with `mujoco` drive the robot of `tools/mujoco_plant.py`, those with `ahead` track a point ahead of the
+centre of rotation.
 
 `python -m tools.bench_tracking disco_adapting circle,square 20` drives some of it; `... starts 20` begins anywhere.
 `... --first 5000 --count 20` drives robots that nothing was chosen on; `--speeds 0.1,0.2,0.3` at these speeds (m/s),
@@ -36,7 +37,7 @@ from tools.tracking import LIMITS, Contender, Drive, Track, classical, disco, dr
 
 FIRST = 1000
 SPEED_M_S, RATE_HZ = 0.2, 50.0
-MUJOCO = "mujoco_"
+MUJOCO, AHEAD = "mujoco_", "ahead_"
 
 
 def contenders(speed_m_s: float = SPEED_M_S) -> dict[str, Contender]:
@@ -44,7 +45,9 @@ def contenders(speed_m_s: float = SPEED_M_S) -> dict[str, Contender]:
     settings = DiscoSettings.for_speed(speed_m_s, RATE_HZ)
     nmpc = Contender(partial(_nmpc, speed_m_s, False), learns=True)
     integral = classical(PurePursuit(look_ahead_m=0.081, integral=3.04, preview_s=0.142), speed_m_s)
+    nmpc_forward = Contender(partial(_nmpc, speed_m_s, True), learns=True)
     adapting = disco(settings, learns=True)
+    sampled = disco(replace(settings, refine=False), learns=True)
     offset_free = disco(replace(settings, offset_free=True), learns=True)
     return {
         "pure_pursuit": classical(PurePursuit(), speed_m_s),
@@ -53,19 +56,24 @@ def contenders(speed_m_s: float = SPEED_M_S) -> dict[str, Contender]:
         "lqr": classical(LinearQuadratic(), speed_m_s),
         "pytorch_mppi": Contender(_peer),
         "nmpc": nmpc,
-        "nmpc_forward": Contender(partial(_nmpc, speed_m_s, True), learns=True),
+        "nmpc_forward": nmpc_forward,
         "disco_point": disco(replace(settings, uncertainty="point")),
         "disco_ut": disco(settings),
         "disco_ut_offset_free": disco(replace(settings, offset_free=True)),
         "disco_adapting": adapting,
-        "disco_refined": disco(replace(settings, refine=True), learns=True),
+        "disco_sampled": sampled,
         "disco_offset_free": offset_free,
         "disco_truth": disco(settings, knows=True),
         "kanayama_truth": classical(Kanayama(), speed_m_s, knows=True),
+        AHEAD + "nmpc": nmpc,
+        AHEAD + "disco_sampled": sampled,
+        AHEAD + "disco_adapting": adapting,
         MUJOCO + "pure_pursuit_integral": integral,
         MUJOCO + "kanayama": classical(Kanayama(), speed_m_s),
         MUJOCO + "nmpc": nmpc,
+        MUJOCO + "nmpc_forward": nmpc_forward,
         MUJOCO + "disco_adapting": adapting,
+        MUJOCO + "disco_sampled": sampled,
         MUJOCO + "disco_offset_free": offset_free,
     }
 
@@ -105,6 +113,8 @@ def rows(
         plant_of: Callable[..., ForeignPlant | MujocoPlant] = ForeignPlant
         if name.startswith(MUJOCO):
             made, plant_of = mujoco_robots, MujocoPlant
+        elif name.startswith(AHEAD):
+            made = point_ahead
         for way in ways:
             yield (
                 f"tracking.{name}.{way}",
@@ -120,6 +130,17 @@ def rows(
                     for seed, robot in enumerate(made(first, count))
                 ],
             )
+
+
+def point_ahead(first: int, count: int) -> list[ForeignRobot]:
+    """The same robots with the tracked point as far ahead of the centre of rotation as it is behind it otherwise.
+
+    There forwards is the stable direction, and every controller drives it.
+    """
+    radius_m, axle_m, x_icr_m = NOMINAL
+    return [
+        replace(robot, x_icr_m=-robot.x_icr_m, believed=(radius_m, axle_m, -x_icr_m)) for robot in robots(first, count)
+    ]
 
 
 def figures_of(drives: list[Drive]) -> dict[str, float]:

@@ -61,7 +61,7 @@ def dirty_parameters(parameters: PlantParameters) -> PlantParameters:
     return replace(
         parameters,
         volatility=0.5,
-        wheel_wander_std=0.01,
+        wheel_drift_std=0.01,
         pose_noise_correlation_s=0.1,
         pose_noise_volatility=0.4,
         pose_sample_jitter_s=0.005,

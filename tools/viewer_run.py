@@ -3,6 +3,7 @@
 import math
 
 from disco_hw.config import SHIPPED_ROBOT
+from disco_hw.control.plan import PLANNER_VERSION
 from disco_hw.files import MODEL_TOML as MODEL_KIND
 from disco_hw.files import ROBOT_TOML as ROBOT_KIND
 from disco_hw.log import MODEL_TOML, ROBOT_TOML, attachment, records
@@ -86,7 +87,9 @@ def tick_records(tick):
 def write_log(path, ticks=200, records_of=tick_records):
     """A log of the run, written by the real writer; `records_of(tick)` is what each tick holds."""
     attachments = (attachment(ROBOT_FILE, ROBOT_TOML, ROBOT_KIND), attachment(MODEL_FILE, MODEL_TOML, MODEL_KIND))
-    recorder = ProcessRecorder(RecordingSettings(path, "wombot", attachments=attachments, queue_ticks=100_000))
+    recorder = ProcessRecorder(
+        RecordingSettings(path, "wombot", planner=PLANNER_VERSION, attachments=attachments, queue_ticks=100_000)
+    )
     for tick in range(ticks):
         recorder.put(*records_of(tick))
     stats = recorder.close(300.0)

@@ -72,7 +72,7 @@ def gap(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Find where simulation and logs disagree, name the missing effect, write the amended model, show the shrink."""
+    """Find where model and logs disagree, name the missing effect, and write the amended model."""
     from disco_hw.processes import limit_thread_pools
 
     limit_thread_pools()
@@ -126,7 +126,7 @@ def fence_of(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="A log of a drive once round along the edge.")],
     as_json: AsJson = False,
 ) -> None:
-    """Write the [fence] that a robot went round, by hand or pushed, for its robot.toml (docs/fence.md)."""
+    """Write the [fence] along which a robot was driven or pushed, for its robot.toml (docs/fence.md)."""
     check_named_files(logs=[log])
     from disco_hw.first_use.fence_drive import fence_of_log, fence_toml
 
@@ -149,7 +149,7 @@ def recover(
     out: Annotated[Path, typer.Option("-o", "--out", help="Where to write the repaired log.")],
     as_json: AsJson = False,
 ) -> None:
-    """Copy everything whole from a damaged log into a new one."""
+    """Copy what is readable of a damaged log into a new one."""
     check_named_files(logs=[log])
     from disco_hw.log.log_command import recover as log_recover
 

@@ -155,7 +155,7 @@ def init(
         bool, typer.Option("--yes", help="Ask nothing: take the usual value for what is not given.")
     ] = False,
 ) -> None:
-    """Write a robot.toml from what is heard on the robot's link, and from what you say; nothing moves."""
+    """Write a robot.toml from the frames on the robot's link and your answers; nothing moves."""
     import sys
 
     from disco_hw.first_use import InitOptions, run_init
@@ -279,12 +279,12 @@ bridge_app = typer.Typer(no_args_is_help=True, help="Carry poses, commands and s
 
 @bridge_app.callback()
 def _bridge() -> None:
-    """Each verb below has a robot of its own."""
+    """Group the bridge's commands, each of which takes a robot.toml."""
 
 
 @bridge_app.command()
 def ros2(robot: RobotFile, model: ModelOption = None, link: LinkOption = None) -> None:
-    """Poses and commands in, odometry and state out, beside a daemon that may come and go (docs/ros2.md)."""
+    """Take poses and commands from ROS 2, and publish odometry and state (docs/ros2.md)."""
     check_named_files(robot, model)
     with _ros2_extra("ros2"):
         from disco_hw.bridge.ros2 import run_ros2_bridge

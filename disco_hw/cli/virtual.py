@@ -178,8 +178,8 @@ def circle(
     from disco_hw.experiments.circle import CircleOptions, run_circle
     from disco_hw.runtime.robot_setup import load_setup
 
-    if mode not in {"default", "paper"}:
-        raise InputError(f"--mode {mode}: no such mode; write default or paper")
+    if mode not in {"default", "sampled", "paper"}:
+        raise InputError(f"--mode {mode}: no such mode; write default, sampled or paper")
     for option, value in (("duration-s", duration_s), ("lag-s", lag_s), ("wheel-noise", wheel_noise)):
         if not math.isfinite(value):
             raise InputError(f"--{option} {value}: not a finite number; write one")
@@ -206,7 +206,7 @@ def adapt(
     out: Annotated[Path, typer.Option("-o", "--out", help="Directory for CSV and picture.")] = Path("out/adapt"),
     as_json: AsJson = False,
 ) -> None:
-    """Let wheel radius or axial distance change on the way, and see what adaptation wins back."""
+    """Change wheel radius or axial distance on the way, and compare the drive with and without adaptation."""
     from disco_hw.experiments.adapt import AdaptOptions, run_adapt
     from disco_hw.runtime.robot_setup import load_setup
 
@@ -262,7 +262,7 @@ def fence(
     ] = Path("out/fence"),
     as_json: AsJson = False,
 ) -> None:
-    """Drive in random rooms on robots that nobody told, and count how often one leaves its fence."""
+    """Drive unknown robots in random rooms, and count how often one leaves its fence."""
     from disco_hw.experiments.fence import FenceOptions, run_fence
 
     refuse_directory(out)

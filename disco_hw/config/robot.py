@@ -168,7 +168,7 @@ class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """The loop and the planner."""
 
     rate_hz: Annotated[float, Meta(ge=20.0, le=100.0)] = 50.0
-    mode: Literal["default", "paper"] = "default"
+    mode: Literal["default", "sampled", "paper"] = "default"
     uncertainty: Literal["ut", "mc", "joint", "point"] = "ut"
     adaptation: Literal["auto", "off", "fast", "audited"] = "auto"
     disturbance: bool = False

@@ -36,7 +36,7 @@ from disco_hw.control.refinement import Refinement
 from disco_hw.control.rollout_points import RolloutPoints
 from disco_hw.control.sampling import Sampling
 from disco_hw.control.state_prediction import PlanStart, StatePrediction
-from disco_hw.control.stopping import Stopping
+from disco_hw.control.stopping import Stopping, ramp_to_zero
 from disco_hw.control.surroundings import Surroundings
 from disco_hw.fence.clearance import Boundaries
 from disco_hw.model import Belief, Model
@@ -61,6 +61,7 @@ class Disco:
     ) -> None:  # fmt: skip
         self._task, self._settings, self._surroundings = task, settings, surroundings
         self._points = points = RolloutPoints(model, settings, limits, seed)
+        self._limits = limits
         self._compensation = DisturbanceCompensation(points, settings.offset_free)
         self._prediction = StatePrediction(points, self._compensation, settings, limits)
         sampler, change = settings.sampler, limits.acceleration_rad_s2 * settings.step_s
@@ -69,7 +70,7 @@ class Disco:
         )
         self._guidance = Guidance(self._optimiser, settings)
         self._sampling = Sampling(self._optimiser, points.weights, settings, surroundings)
-        self._refinement = Refinement(limits, settings.step_s, points.history) if settings.refine else None
+        self._refinement = Refinement(limits, settings, points.history) if settings.refine else None
         self._set_refined_model()
         self._stopping = Stopping(settings, limits)
         # Buffers of the compiled rollout: where it begins, and how the wheels turn in it.
@@ -267,11 +268,22 @@ class Disco:
         commands = self._refinement.improve(system.task, system.start, begin, nominal)
         if commands is None:
             return None
-        path = begin.mean_path(self._points.mean_run, commands)
         # The refinement knows the line and nothing else: near an obstacle or a fence the sampled plan stands.
-        if self._surroundings is not None and not self._surroundings.allows(path):
+        if not self._is_clear(begin, commands, system):
             return None
+        path = begin.mean_path(self._points.mean_run, commands)
         return self._compensation.commanded(commands), path
+
+    def _is_clear(self, begin: PlanStart, commands: Array, system: SkidSteer) -> bool:
+        """Whether a robot that does this and then stops keeps clear of the fence and obstacles under every point."""
+        if self._surroundings is None:
+            return True
+        limits, step_s, points = self._limits, self._settings.step_s, self._points
+        stop_steps = math.ceil(np.abs(commands[-1]).max() / (limits.acceleration_rad_s2 * step_s)) + 1
+        stopped = np.concatenate([commands, ramp_to_zero(commands[-1], limits, step_s, stop_steps)])
+        runs = [begin.point_path(points.run, stopped, point) for point in range(points.weights.size)]
+        x_m, y_m = (begin.state[:2] - system.start[:2]).tolist()
+        return self._surroundings.allows(np.array(runs), (x_m, y_m))
 
     def sampled_rollouts(self, count: int = 50) -> Rollouts:
         """Return the last plan's `count` sequences of the largest weight, rolled out under the mean parameters.

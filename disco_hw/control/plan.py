@@ -22,6 +22,11 @@ from disco_hw.model.coefficients import NO_DISTURBANCE, Disturbance
 Array = NDArray[np.float64]
 # Radians in a turn.
 ROTATION = 2.0 * math.pi
+PLANNER_VERSION = 2
+"""Version of the plans that the default mode makes from the same input; a log names it, and a replay follows it.
+
+1: the sampled plan, as `mode = "sampled"` has it now. 2: the plan is refined beside the line.
+"""
 USUAL_SPEED_M_S, USUAL_STEP_S, USUAL_NOISE = 0.2, 0.1, 0.1 * ROTATION
 # Chosen: longer steps of a slow robot would answer too late to what happens on the way.
 LONGEST_STEP_S = 0.25
@@ -134,7 +139,7 @@ class DiscoSettings:
     guide_below: float = 0.85
     euler: bool = False
     offset_free: bool = False
-    refine: bool = False
+    refine: bool = True
     iterations_at_start: int = 5
     min_ess: float = 3.0
     retries: int = 2
@@ -200,6 +205,7 @@ class DiscoSettings:
     def from_config(cls, control: config.Control, speed_m_s: float) -> DiscoSettings:
         """Return the settings that robot.toml asks for, for its task's speed."""
         settings = cls.paper() if control.mode == "paper" else cls.for_speed(speed_m_s, control.rate_hz)
+        settings = replace(settings, refine=control.mode == "default")
         horizon = settings.sampler.horizon if control.horizon is None else control.horizon
         step_s = settings.step_s if control.step_s is None else control.step_s
         sampler = replace(settings.sampler, samples=control.samples, horizon=horizon)

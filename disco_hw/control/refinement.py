@@ -19,7 +19,7 @@ from disco_hw.control.kernel.guide import SteeredChassis
 from disco_hw.control.kernel.reference import timed_reference
 from disco_hw.control.kernel.refine import CHANNELS, STATE_COLUMNS, Buffers, Problem, refine
 from disco_hw.control.parameter_points import mean_point
-from disco_hw.control.plan import CommandLimits
+from disco_hw.control.plan import CommandLimits, DiscoSettings
 from disco_hw.control.state_prediction import PlanStart
 from disco_hw.jit import compiled_for
 from disco_hw.model import Model
@@ -29,13 +29,12 @@ from disco_hw.model.step import integration_series
 
 Array = NDArray[np.float64]
 
-# Chosen: more look further ahead, and each takes its share of the time.
+# Chosen: more look further ahead, and each takes its share of the time. No more than the sampled plan has.
 STEPS = 20
-ROWS = np.arange(STEPS)
 # Chosen: each takes its time of the tick; the next tick begins from what this one found.
 ITERATIONS = 2
 # A change of a wheel's rim speed costs as much as the distance that it covers in this time.
-CHANGE_S = 0.2
+CHANGE_S = 0.15
 # What lies beyond the horizon: who follows the line exactly with the tracked point behind the centre of rotation turns
 # away from the heading that stays on it, e-fold over each x_icr of the way. So the end, distance and x_icr times the
 # error of the heading, counts as much as over so many times x_icr more of the way.
@@ -43,22 +42,32 @@ END_X_ICR = 5.0
 LEAST_END_WEIGHT = 10.0
 # The robot is beside the line within this part of the way that the horizon covers, and facing within this cosine.
 LATERAL_PART, FACING = 0.3, 0.5
+# A robot that, in the mean over the last horizon, covers less than this part of its way is left to the sampled plan: a
+# reference that starts anew beside the robot lets a plan put off its way from tick to tick. And one that starts from
+# rest would be turned on the spot to where the line begins, as fast as its wheels can.
+LEAST_PROGRESS = 0.25
 
 
 class Refinement:
     """Improves plans for robots beside their line; keeps its last plan as the start of the next."""
 
-    def __init__(self, limits: CommandLimits, step_s: float, history: int) -> None:
-        """Refine within the limits, in steps of `step_s`, after `history` commands from before the plan."""
-        self._limits, self._step_s, self._history = limits, step_s, history
-        self._series = integration_series(step_s, wide=True)
-        self._reference = np.zeros((STEPS, CHANNELS), np.float32)
+    def __init__(self, limits: CommandLimits, settings: DiscoSettings, history: int) -> None:
+        """Refine within the limits, in the steps of `settings`, after `history` commands from before the plan."""
+        self._limits, self._step_s, self._history = limits, settings.step_s, history
+        self._rows = np.arange(min(STEPS, settings.sampler.horizon))
+        self._series = integration_series(settings.step_s, wide=True)
+        self._reference = np.zeros((self._rows.size, CHANNELS), np.float32)
         self._found = np.ones(6, np.float32)
         self._start, self._before = np.zeros(5), np.zeros(CHANNELS)
         self._compiled: dict[str, Callable[..., float]] = {}
         self._last: Array | None = None
         self._last_ns = 0
+        self._progress = Progress(self._horizon_s)
         self._buffers: Buffers | None = None
+
+    @property
+    def _horizon_s(self) -> float:
+        return self._rows.size * self._step_s
 
     @property
     def speed_part(self) -> float:
@@ -74,16 +83,17 @@ class Refinement:
         """Forget the last plan."""
         self._last = None
         self._found[:] = 1.0
+        self._progress.reset()
 
     def set_model(self, model: Model, chassis: SteeredChassis) -> None:
         """Refine in the mean of this model's belief from now on."""
         self._chassis = chassis
         self._base, self._effects = coefficient_tables(model, mean_point(model), self._step_s)
         if self._buffers is None:
-            self._buffers = _buffers(self._history, new_means(self._effects))
+            self._buffers = _buffers(self._rows.size, self._history, new_means(self._effects))
 
     def improve(self, terms: Terms, start: NDArray[np.float32], begin: PlanStart, nominal: Array) -> Array | None:
-        """Return commands (STEPS, 2) that cost no more than the plan `nominal` (T, 2); None off the line.
+        """Return commands (N, 2) that cost no more than the plan `nominal` (T, 2); None off the line.
 
         `terms` of the task and `start` (11,) are those of `SkidSteer`.
         What is returned is kept as the start of the next refinement.
@@ -101,12 +111,15 @@ class Refinement:
             # Off the line too, so that no compilation waits for the robot to reach it.
             self._call("refine", refine, problem, buffers, 0, 0)
         last, self._last = self._last, None
-        if not (distance_m < max(LATERAL_PART * way_m, 0.02) and facing > FACING):
+        covered_m = 0.5 * float(begin.state[3] + begin.state[4]) * self._chassis.wheel_radius_m * self._horizon_s
+        progress = self._progress.after(begin.t0_ns, covered_m / max(way_m, 1e-3))
+        if progress < LEAST_PROGRESS or not (distance_m < max(LATERAL_PART * way_m, 0.02) and facing > FACING):
             return None
         buffers.commands[: self._history] = begin.earlier
-        buffers.starts[0] = nominal.take(ROWS, axis=0, mode="clip")
+        buffers.starts[0] = nominal[: self._rows.size]
         if last is not None:
-            buffers.starts[1] = _shifted(last, (begin.t0_ns - self._last_ns) * 1e-9 / self._step_s)
+            shifted = self._rows + (begin.t0_ns - self._last_ns) * 1e-9 / self._step_s
+            buffers.starts[1] = np.column_stack([np.interp(shifted, self._rows, column) for column in last.T])
         cost = self._call("refine", refine, problem, buffers, 1 if last is None else 2, ITERATIONS)
         if not math.isfinite(cost):
             return None
@@ -119,7 +132,7 @@ class Refinement:
         self._start[:2] = start[:2]
         self._before[:] = begin.before
         x_icr_m = abs(self._chassis.x_icr_m)
-        end_weight = max(END_X_ICR * x_icr_m * STEPS / max(way_m, 1e-3), LEAST_END_WEIGHT)
+        end_weight = max(END_X_ICR * x_icr_m * self._rows.size / max(way_m, 1e-3), LEAST_END_WEIGHT)
         change_m = CHANGE_S * self._chassis.wheel_radius_m
         change = min(self._limits.acceleration_rad_s2 * self._step_s, 4.0 * self._limits.speed_rad_s)
         return Problem(
@@ -136,14 +149,34 @@ class Refinement:
         return entry(*arguments)
 
 
-def _buffers(history: int, means: Array | None) -> Buffers:
-    size = CHANNELS * STEPS
+class Progress:
+    """The part of the way along the line that the robot covers, as a mean over about `horizon_s`."""
+
+    def __init__(self, horizon_s: float) -> None:
+        self._horizon_s = horizon_s
+        self._part: float | None = None
+        self._ns = 0
+
+    def reset(self) -> None:
+        """Begin with what the robot covers at the next call."""
+        self._part = None
+
+    def after(self, now_ns: int, part: float) -> float:
+        """Return the mean at `now_ns`, of a robot that now covers this part."""
+        covered = min(max(part, 0.0), 1.0)
+        weight = 1.0 if self._part is None else min((now_ns - self._ns) * 1e-9 / self._horizon_s, 1.0)
+        self._part, self._ns = (self._part or 0.0) + weight * (covered - (self._part or 0.0)), now_ns
+        return self._part
+
+
+def _buffers(steps: int, history: int, means: Array | None) -> Buffers:
+    size = CHANNELS * steps
     return Buffers(
-        commands=np.zeros((history + STEPS, CHANNELS)),
-        tried=np.zeros((history + STEPS, CHANNELS)),
-        starts=np.zeros((2, STEPS, CHANNELS)),
-        states=np.zeros((STEPS + 1, STATE_COLUMNS)),
-        moved=np.zeros((STEPS + 1, STATE_COLUMNS)),
+        commands=np.zeros((history + steps, CHANNELS)),
+        tried=np.zeros((history + steps, CHANNELS)),
+        starts=np.zeros((2, steps, CHANNELS)),
+        states=np.zeros((steps + 1, STATE_COLUMNS)),
+        moved=np.zeros((steps + 1, STATE_COLUMNS)),
         remembered=means,
         residuals=np.zeros(size + 1),
         slopes=np.zeros((size, size + 1)),
@@ -153,8 +186,3 @@ def _buffers(history: int, means: Array | None) -> Buffers:
         step=np.zeros(size),
         multipliers=np.zeros((2, 2 * size)),
     )
-
-
-def _shifted(plan: Array, steps: float) -> Array:
-    """Return a plan (STEPS, 2) moved on by so many steps, or parts of one."""
-    return np.column_stack([np.interp(steps + ROWS, ROWS, column) for column in plan.T])

@@ -12,6 +12,14 @@ TRAPPED = (
 )
 
 
+def ramp_to_zero(start: Array, limits: CommandLimits, step_s: float, steps: int) -> Array:
+    """Return commands (steps, 2) from `start` (2,) to zero (rad/s), as fast as the acceleration limit allows."""
+    change = limits.acceleration_rad_s2 * step_s
+    size = np.maximum(np.abs(start) - np.minimum(change, np.abs(start)) * np.arange(1, steps + 1)[:, None], 0.0)
+    ramp: Array = np.sign(start) * size
+    return ramp
+
+
 class Stopping:
     """Ramps commands to zero within the limits, for at most `decay_s` on end."""
 
@@ -38,9 +46,5 @@ class Stopping:
                 f"no command sequence had a finite cost for {decay_s} s, in spite of retries and a "
                 "restart; check the pose, the wheel speeds and the model"
             )
-        steps = np.arange(1, self._settings.sampler.horizon + 1)[:, None]
-        change = self._limits.acceleration_rad_s2 * self._settings.step_s
         start = np.nan_to_num(np.clip(np.array(before), -self._limits.speed_rad_s, self._limits.speed_rad_s))
-        size = np.maximum(np.abs(start) - np.minimum(change, np.abs(start)) * steps, 0.0)
-        ramp: Array = np.sign(start) * size
-        return ramp
+        return ramp_to_zero(start, self._limits, self._settings.step_s, self._settings.sampler.horizon)

@@ -22,6 +22,7 @@ from disco_hw.control.kernel.avoid import (
     TOUCH_COST,
     Area,
     place_shapes,
+    touches,
 )
 from disco_hw.fence import Footprint
 from disco_hw.fence.clearance import Boundaries
@@ -60,6 +61,7 @@ class Surroundings:
         self._bounds: Boundaries | None = None
         self._circles: bytes | None = None
         self._place: Callable[..., None] | None = None
+        self._touches: Callable[..., bool] | None = None
         self.area = Area(
             aligned_zeros(MOST_SHAPES * COLUMNS),
             np.zeros(1, np.int64),
@@ -99,12 +101,25 @@ class Surroundings:
         """Drive around what stands on this line, points (N, 2)."""
         self._detours.set_line(line_m)
 
-    def allows(self, path: Array) -> bool:
-        """Whether a path (N, 3) of x, y, yaw needs no detour and keeps the footprint far enough from everything."""
-        if self._bounds is None or self._detours.is_near(path):
-            return self._bounds is None
-        keep_m = float(self.area.body[KEEP])
-        return bool((self._bounds.clearance_m(path, within_m=2.0 * keep_m + 0.1) >= keep_m).all())
+    def allows(self, paths: Array, origin_m: tuple[float, float]) -> bool:
+        """Whether paths (L, N, 3) of x, y, yaw need no detour and keep the footprint far enough from everything.
+
+        They begin where `place` was last asked for, with that origin; the first pose is that of the plan's begin, the
+        others follow a step apart.
+        """
+        if self._bounds is None:
+            return True
+        if any(self._detours.is_near(path) for path in paths):
+            return False
+        body = self.area.body
+        looked_m = float(body[FASTEST] * body[STEP_LENGTH]) * self._horizon
+        if np.hypot(*(paths[..., :2] - paths[:, :1, :2]).T).max() > looked_m:
+            # Beyond what was looked for.
+            return False
+        if not self.area.number[0]:
+            return True
+        assert self._touches is not None, "`place` comes first"
+        return not self._touches(self.area, (paths - (*origin_m, 0.0)).astype(np.float32))
 
     def place(self, x_m: float, y_m: float, origin_m: tuple[float, float], speed_m_s: float) -> Area:
         """Put the shapes that a plan from here can reach into the kernel's buffers, relative to the origin.
@@ -118,6 +133,7 @@ class Surroundings:
         arguments = self.area, self._table, x_m, y_m, *origin_m, reach_m, time_s
         if self._place is None:
             self._place = compiled_for(place_shapes, *arguments)
+            self._touches = compiled_for(touches, self.area, np.zeros((1, 1, 3), np.float32))
         self._place(*arguments)
         self._detours.place(self.area.detours, x_m, y_m, origin_m)
         return self.area

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from disco_hw import processes
@@ -19,7 +19,8 @@ from disco_hw.runtime.core import CoreTick, DaemonCore, Pilot
 from disco_hw.runtime.obstacles import ObstacleRefused
 from disco_hw.runtime.robot_setup import TaskRefused, changed_task
 from disco_hw.runtime.safe_area import FenceRefused
-from disco_hw.runtime.supervisor import Reply, UserRequest
+from disco_hw.runtime.supervisor import Output, Reply, UserRequest
+from drivers.samples import RobotStatus
 from drivers.types import Request
 
 # Chosen: periods of what the loop does beside its ticks; shorter ones would take more of their time.
@@ -34,6 +35,21 @@ _WATCHED_FAN_NS = _SECOND_NS // 2
 _FAN_PATHS = 16
 
 Report = Callable[[str, str], None]
+
+
+def state_line(output: Output, robot: RobotStatus | None, pilot: Mapping[str, Any], advice_style: AdviceStyle) -> str:
+    """Return the daemon's state and what the operator can do next, as one line; `pilot` is the pilot's status."""
+    head, detail = headline(output.state.name, output.detail, output.running, output.estop)
+    status = {
+        **pilot,
+        "state": output.state.name,
+        "detail": output.detail,
+        "running": output.running,
+        "estop": output.estop,
+        "robot_state": "UNKNOWN" if robot is None else robot.state,
+        "fault": "UNKNOWN" if robot is None else robot.fault,
+    }
+    return " ".join((f"{head}: {detail}.", *advice(status, advice_style)))
 
 
 class Daemon:
@@ -224,20 +240,12 @@ class Daemon:
 
     def _report_state(self, last: CoreTick) -> None:
         """Say how things are and what to do, to the service manager and to whoever reads the output."""
-        output, robot = last.output, self._core.robot_status
+        output = last.output
         head, detail = headline(output.state.name, output.detail, output.running, output.estop)
         self._notifier.status(f"{head}: {detail}")
         if self._advice_style is None:
             return
-        known = {
-            **self._pilot.status(),
-            "state": output.state.name,
-            "running": output.running,
-            "estop": output.estop,
-            "robot_state": "UNKNOWN" if robot is None else robot.state,
-            "fault": "UNKNOWN" if robot is None else robot.fault,
-        }
-        text = " ".join((f"{head}: {detail}.", *advice(known, self._advice_style)))
+        text = state_line(output, self._core.robot_status, self._pilot.status(), self._advice_style)
         if self._waiting.should_report(output.state, text):
             self._report("state", text)
 

@@ -27,7 +27,7 @@ from numba.core import event
 from disco_hw import processes
 from disco_hw.adaptation.guard import AdaptationChoice, AdaptationKind, check_adaptable, choose_adaptation
 from disco_hw.config import RobotConfig
-from disco_hw.control.plan import Law, LawController
+from disco_hw.control.plan import PLANNER_VERSION, Law, LawController
 from disco_hw.daemon import SERVED, describe_recording, passed_over, socket_path
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.daemon.daemon import Daemon, Report
@@ -43,11 +43,11 @@ from disco_hw.processes import end_with_parent
 from disco_hw.runtime import AdviceStyle, by_command
 from disco_hw.runtime.assembly import (
     assemble_core,
+    create_adaptation,
     create_link,
     create_pipeline,
     create_planner,
     driver_of,
-    make_adaptation,
 )
 from disco_hw.runtime.core import FindsWiring, Pilot, TaskPilot
 from disco_hw.runtime.pipeline import FollowTask, NoPlanner, Off, Pipeline, Planner, Standstill
@@ -207,7 +207,7 @@ def _start(
     if advice_style is not None and log is not None:
         stop.add("log", lambda: report("log", f"look at it: disco-hw view {log}, or disco-hw log info {log}"))
     stop.add(_RECORDER, lambda: _close_recorder(recorder, report))
-    adaptation = make_adaptation(setup, pipeline, adapt)
+    adaptation = create_adaptation(setup, pipeline, adapt)
     for step in processes.enter_real_time(config.daemon.realtime_priority):
         report("real time", str(step))
     for line in passed_over(server.path):
@@ -252,7 +252,9 @@ def _create_recorder(setup: Setup, log: Path | None) -> Recorder:
     attachments = [*kept_files(setup), Attachment(DBC, "text/plain", packaged_dbc().encode())]
     name = setup.config.robot.name
     scene = scene_of(setup.config)
-    return ProcessRecorder(RecordingSettings(log, name, version=version(), attachments=tuple(attachments), scene=scene))
+    return ProcessRecorder(
+        RecordingSettings(log, name, version(), PLANNER_VERSION, attachments=tuple(attachments), scene=scene)
+    )
 
 
 def _close_recorder(recorder: Recorder, report: Report) -> None:

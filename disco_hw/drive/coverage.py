@@ -128,7 +128,7 @@ class Coverage:
     def describe(self) -> str:
         """One line for the operator: how much is done, and the first things that are missing."""
         items, missing = self.items(), self.missing()
-        done = f"{self.driven_s:.0f} s driven, {len(items) - len(missing)} of {len(items)} excited"
+        done = f"{self.driven_s:.0f} s driven, {len(items) - len(missing)} of {len(items)} motions"
         if not missing:
             return f"{done}; nothing is missing"
         more = f" and {len(missing) - 4} more" if len(missing) > 4 else ""

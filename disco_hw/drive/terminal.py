@@ -303,7 +303,7 @@ def table(status: Mapping[str, Any]) -> Group:
     from rich.text import Text  # noqa: PLC0415
 
     drive = status["drive"]
-    items = Table("", "excited", "of", "for", box=None, pad_edge=False)
+    items = Table("", "motion so far", "needed", "shows", box=None, pad_edge=False)
     for item in drive["coverage"]["items"]:
         mark = Text("done", "green") if item["covered"] else Text("missing", "yellow" if item["found"] else "red")
         unit = " s" if item["unit"] == "s" else ""

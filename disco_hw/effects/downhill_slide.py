@@ -1,4 +1,4 @@
-"""Downhill slide: tyres that turning drags sideways give way to the pull of a slope, those that roll straight hold."""
+"""Downhill slide: tyres that slip sideways in a turn give way to the pull of a slope; rolling straight they hold."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Turning load: the scrub of the tyres takes a constant from the wheels' difference, however fast the robot turns."""
+"""Turning load: scrubbing tyres lower the wheels' speed difference by a constant, however fast the robot turns."""
 
 from __future__ import annotations
 

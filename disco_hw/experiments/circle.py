@@ -218,7 +218,7 @@ def run_circle(
         model = replace(model, belief=Gaussian(model.belief.names, model.belief.mean(), covariance))
     circle = CircleCost()
     task = circle.paper() if mode == "paper" else circle
-    settings = DiscoSettings.paper() if mode == "paper" else DiscoSettings()
+    settings = DiscoSettings.paper() if mode == "paper" else DiscoSettings(refine=mode == "default")
     runs: dict[str, list[Run]] = {}
     for name in CURVES:
         runs[name] = [

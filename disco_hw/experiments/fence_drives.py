@@ -38,7 +38,7 @@ FOOTPRINT = Footprint(0.50, 0.40, 0.05)
 # Chosen: room, speed and distance of the trials; less room, or more speed, makes them harder.
 _ALONG_M = 0.15
 _WALL_M_S = 0.3
-_BESIDE_M = (0.05, 0.15)
+_SPARE_M = (0.05, 0.15)
 _RUN_UP_M, _BEYOND_M = (1.5, 2.5), 3.0
 # Chosen: fast, and soft on the wheels, so that the stop takes its way.
 _CORRIDOR_M_S, _SOFT_RAD_S2 = 0.4, 2.0
@@ -257,7 +257,7 @@ def tight_room(rng: np.random.Generator, clearance_m: float) -> tuple[Fence, Cir
 
 def tight_setup(rng: np.random.Generator) -> Setup:
     """Return the shipped robot on a circle in a tight room, whose walls come within 0.05 to 0.15 m of its way."""
-    return fenced_setup(*tight_room(rng, float(rng.uniform(*_BESIDE_M))))
+    return fenced_setup(*tight_room(rng, float(rng.uniform(*_SPARE_M))))
 
 
 def corridor_setup(rng: np.random.Generator) -> Setup:

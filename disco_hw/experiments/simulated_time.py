@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from disco_hw.adaptation import GeometryAdaptation
 from disco_hw.adaptation.guard import choose_adaptation
 from disco_hw.config import RobotConfig
-from disco_hw.control.plan import Law, LawController
+from disco_hw.control.plan import PLANNER_VERSION, Law, LawController
 from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments.virtual import true_parameters
 from disco_hw.log import MODEL_TOML, Attachment
@@ -28,10 +28,10 @@ from disco_hw.model import model_text
 from disco_hw.reports import refuse_file
 from disco_hw.runtime.assembly import (
     assemble_core,
+    create_adaptation,
     create_pipeline,
     create_planner,
     driver_of,
-    make_adaptation,
 )
 from disco_hw.runtime.core import CoreTick, DaemonCore, FindsWiring, Pilot, TaskPilot
 from disco_hw.runtime.pipeline import Pipeline, Planner
@@ -109,7 +109,7 @@ class SimulatedRun:
     @staticmethod
     def _adaptation(setup: Setup, pipeline: Pipeline) -> GeometryAdaptation | None:
         chosen = choose_adaptation(setup.config.control, setup.config.pose, setup.model)
-        return make_adaptation(setup, pipeline, chosen.kind)
+        return create_adaptation(setup, pipeline, chosen.kind)
 
     def ticks(self, duration_s: float, *requests: UserRequest) -> Iterator[CoreTick]:
         """Let time pass and give every tick as it comes; the requests come with the first one."""
@@ -158,7 +158,13 @@ class SimulatedRun:
         attachments = (*kept_files(setup), model)
         ticks = self.recorder.ticks
         recorder = ProcessRecorder(
-            RecordingSettings(path, self._setup.config.robot.name, attachments=attachments, queue_ticks=len(ticks) + 1)
+            RecordingSettings(
+                path,
+                self._setup.config.robot.name,
+                planner=PLANNER_VERSION,
+                attachments=attachments,
+                queue_ticks=len(ticks) + 1,
+            )
         )
         for now_ns, records in ticks:
             recorder.put(now_ns, records)

@@ -33,9 +33,9 @@ _NEIGHBOURS = 5
 _JUMP = 12.0
 _SMALLEST = np.array([2e-4, 2e-4, 2e-4, 2e-4, 5e-4])
 _LARGEST = np.array([0.3, 0.5, 0.5, 0.5, 1.0])
-# Of a standard normal variable: the median of its square, and the mean of its square held at 9.
+# Of a standard normal variable: the median of its square, and the mean of its square clipped at 9.
 _MEDIAN_OF_SQUARE = 0.4549
-_MEAN_OF_HELD_SQUARE = 0.995
+_MEAN_OF_CLIPPED_SQUARE = 0.995
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,10 +168,10 @@ def _chosen(windows: _Windows, chosen: NDArray[np.bool_], independent: float) ->
 
 
 def _variance(squares: Array) -> Array:
-    """Variances (axes,) from squared errors (W, axes), those beyond three standard deviations held there."""
+    """Variances (axes,) from squared errors (W, axes), clipped at three standard deviations."""
     rough = np.median(squares, axis=0) / _MEDIAN_OF_SQUARE
-    held: Array = np.minimum(squares, 9.0 * rough).mean(axis=0) / _MEAN_OF_HELD_SQUARE
-    return held
+    variance: Array = np.minimum(squares, 9.0 * rough).mean(axis=0) / _MEAN_OF_CLIPPED_SQUARE
+    return variance
 
 
 def _grown(time_s: Array, correlation_s: float) -> Array:

@@ -72,6 +72,7 @@ class Start(msgspec.Struct, frozen=True):
     flush_s: float = 0.5
     beat_s: float = 0.2
     grace_s: float = 3.0
+    planner: int = 0
 
 
 class Launch(msgspec.Struct, frozen=True):

@@ -123,10 +123,10 @@ def _wheels_standing(rolled_rad: np.ndarray, way_m: np.ndarray, radius_m: float)
 def dead_encoders(windows: MotionWindows) -> tuple[Contradiction, ...]:
     """Return the encoders that count nothing while their wheel is told to turn and the other one does."""
     known = np.isfinite(windows.rolled_rad).all(axis=1) & np.isfinite(windows.commanded_rad).all(axis=1)
-    rolled, told = np.abs(windows.rolled_rad[known]), np.abs(windows.commanded_rad[known])
+    rolled, commanded = np.abs(windows.rolled_rad[known]), np.abs(windows.commanded_rad[known])
     found = []
     for side, name in enumerate(SIDES):
-        could = (told[:, side] > MOVING_RAD) & (rolled[:, 1 - side] > MOVING_RAD)
+        could = (commanded[:, side] > MOVING_RAD) & (rolled[:, 1 - side] > MOVING_RAD)
         share = float(np.mean(rolled[could, side] < _STILL)) if np.count_nonzero(could) >= FEWEST_WINDOWS else 0.0
         if share > _DEAD_SHARE:
             message = (

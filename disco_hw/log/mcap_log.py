@@ -221,6 +221,7 @@ class ByteSink(Protocol):
 class Metadata:
     """Metadata of a log: wall-clock time is monotonic time plus `wall_offset_ns`.
 
+    `planner`: version of the planner (`control.plan.PLANNER_VERSION`); 0 where none is named, as in logs of version 1.
     A later part `continues` the file of that path, which holds ticks up to number `continues_sequence`; None if that
     was not recorded.
     """
@@ -233,21 +234,23 @@ class Metadata:
     format: str = FORMAT
     continues: str = ""
     continues_sequence: int | None = None
+    planner: int = 0
 
     def as_text(self) -> dict[str, str]:
         """Return the metadata in the form kept in the file."""
-        return {
+        text = {
             "format": self.format,
             "robot": self.robot,
             "version": self.version,
             "part": str(self.part),
             "start_ns": str(self.start_ns),
             "wall_offset_ns": str(self.wall_offset_ns),
-        } | (
-            {}
-            if self.continues_sequence is None
-            else {"continues": self.continues, "continues_sequence": str(self.continues_sequence)}
-        )
+        }
+        if self.continues_sequence is not None:
+            text |= {"continues": self.continues, "continues_sequence": str(self.continues_sequence)}
+        if self.planner:
+            text["planner"] = str(self.planner)
+        return text
 
     @staticmethod
     def from_text(text: dict[str, str]) -> Metadata:
@@ -265,6 +268,7 @@ class Metadata:
             text.get("format", ""),
             text.get("continues", ""),
             None if former is None else int(former),
+            int(text.get("planner", "0")),
         )
 
 
@@ -316,6 +320,7 @@ class McapLog:
             start.wall_offset_ns,
             continues=start.continues,
             continues_sequence=start.continues_sequence if start.part > 1 else None,
+            planner=start.planner,
         )
         self._writer.add_metadata(METADATA, metadata.as_text())
         for attachment in start.attachments:

@@ -57,7 +57,7 @@ def motion_windows(log: DriveLog, poses_rate: float = 1.0) -> MotionWindows:
 
 def _of_segment(log: DriveLog, segment: int, poses_rate: float) -> MotionWindows:
     commands, wheels, poses = log.commands, log.wheels, log.poses
-    told: Mask = np.asarray(commands.segment == segment)
+    in_segment: Mask = np.asarray(commands.segment == segment)
     rolling, seen = wheels.segment == segment, poses.segment == segment
     pose_s = poses_rate * poses.t_s[seen]
     rolled_s = wheels.t_s[rolling]
@@ -68,7 +68,7 @@ def _of_segment(log: DriveLog, segment: int, poses_rate: float) -> MotionWindows
     moved = _increments(pose_s, place, _gaps(pose_s), begin)
     return MotionWindows(
         begin,
-        _increments(*_integrated(commands, told), begin),
+        _increments(*_integrated(commands, in_segment), begin),
         _increments(rolled_s, angle, _gaps(rolled_s), begin),
         moved[:, 0] + 1j * moved[:, 1],
         np.interp(begin + 0.5 * WINDOW_S, pose_s, yaw) if yaw.size else np.full(begin.size, np.nan),

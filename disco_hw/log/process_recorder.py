@@ -69,6 +69,7 @@ class RecordingSettings:
     path: Path
     robot: str
     version: str = ""
+    planner: int = 0
     attachments: tuple[Attachment, ...] = ()
     scene: TaskScene | None = None
     queue_ticks: int = 1000
@@ -108,6 +109,7 @@ class ProcessRecorder:
             path=str(recording.path.absolute()),
             robot=recording.robot,
             version=recording.version,
+            planner=recording.planner,
             start_ns=0,
             wall_offset_ns=recording.offset_ns,
             attachments=recording.attachments,

@@ -117,7 +117,7 @@ class BackgroundSync:
 
     @property
     def pending_s(self) -> float:
-        """How long the disk has been at work on the running attempt, in seconds; 0 if none runs."""
+        """Time for which the disk has been busy with the running attempt, in s; 0 if none runs."""
         return 0.0 if self._running is None or self._running.done() else time.monotonic() - self._begun_s
 
 

@@ -142,7 +142,7 @@ def create_fast_adaptation(setup: Setup, pipeline: Pipeline, watch: PoseWatch | 
     )
 
 
-def make_adaptation(setup: Setup, pipeline: Pipeline, kind: AdaptationKind) -> GeometryAdaptation | None:
+def create_adaptation(setup: Setup, pipeline: Pipeline, kind: AdaptationKind) -> GeometryAdaptation | None:
     """Return what learns the geometry, as `choose_adaptation` says; None for "off"."""
     if kind == "off":
         return None

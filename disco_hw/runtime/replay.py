@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,10 @@ import msgspec
 
 from disco_hw.adaptation.guard import geometry_of
 from disco_hw.config import RobotConfig
+from disco_hw.control.plan import PLANNER_VERSION
 from disco_hw.errors import InputError
 from disco_hw.fence.clearance import Boundaries
+from disco_hw.log.mcap_log import Metadata
 from disco_hw.log.reader import Entry, open_log
 from disco_hw.log.records import (
     BeliefChange,
@@ -35,7 +37,7 @@ from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.assembly import apply_geometry, create_pipeline, create_planner
 from disco_hw.runtime.obstacles import Obstacles
 from disco_hw.runtime.pipeline import FollowTask, Manual, Motion, Off, Pipeline, Silent, Source, Standstill
-from disco_hw.runtime.robot_setup import setup_of_log, task_of
+from disco_hw.runtime.robot_setup import Setup, setup_of_log, task_of
 from disco_hw.runtime.safe_area import fence_of_record, report_of_record
 from drivers.types import PoseSample, Readings, WheelSample
 
@@ -112,8 +114,10 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
     """Replay a log with the robot.toml and the model that it carries.
 
     `tolerance`: what numbers may differ by, in their own units or as a share of the larger, whichever allows more; 0
-    for bit for bit, which only the machine that recorded promises: another processor rounds sums differently.
-    Raises LogError for a log that cannot be read and InputError for one that holds no ticks or no robot.toml.
+    for bit for bit, which only the machine that recorded promises: another processor rounds sums differently. The plans
+    are made as those of the log's planner version.
+    Raises LogError for a log that cannot be read and InputError for one that holds no ticks or no robot.toml, or plans
+    of a planner version that is not known here.
     """
     with open_log(path) as log:
         first = next((entry.record for entry in log.records(("/command",))), None)
@@ -121,7 +125,7 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
             raise InputError(
                 f"{path}: its commands are from {first.source!r}, not from a planner or a hand; {_REPLAYED}"
             )
-        setup = setup_of_log(log, _REPLAYED)
+        setup = _planned_as_recorded(setup_of_log(log, _REPLAYED), path, log.metadata)
         pipeline = create_pipeline(setup.config, setup.model, create_planner(setup.config, setup.model))
         area = _ReplayedArea(pipeline, setup.config)
         ticks = values = 0
@@ -144,6 +148,21 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
         if not ticks:
             raise InputError(f"{path}: holds no ticks; give the log of a `disco-hw run`")
         return ReplayReport(ticks, values, log.summary().missing_ticks, log.metadata.version, difference, tolerance)
+
+
+def _planned_as_recorded(setup: Setup, path: Path, recorded: Metadata) -> Setup:
+    """Return the setup with the mode that plans as the log's planner version did; raises InputError if none does."""
+    planner = recorded.planner or 1
+    if planner > PLANNER_VERSION:
+        raise InputError(
+            f"{path}: its plans are of planner version {planner}, and this disco-hw replays versions up to "
+            f"{PLANNER_VERSION}; replay it with disco-hw {recorded.version or 'of the version that recorded it'}"
+        )
+    control = setup.config.control
+    if planner == PLANNER_VERSION or control.mode != "default":
+        return setup
+    sampled = msgspec.structs.replace(control, mode="sampled")
+    return replace(setup, config=msgspec.structs.replace(setup.config, control=sampled))
 
 
 class _ReplayedArea:

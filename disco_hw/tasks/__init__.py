@@ -222,7 +222,7 @@ class RobotTask(Protocol):
         """Return the progress of the task as it begins."""
 
     def planned(self, mode: str) -> PlannedTask:
-        """Return the task with the cost of the control mode, "default" or "paper"."""
+        """Return the task with the cost of the control mode, "default", "sampled" or "paper"."""
 
 
 Found = tuple[float, float, float, float, float]

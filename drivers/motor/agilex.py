@@ -179,7 +179,7 @@ class AgilexPort(BodyPort):
     def _motion(self, linear_m_s: float, angular_rad_s: float) -> Frame:
         return protocol.motion(linear_m_s, angular_rad_s)
 
-    def _stand_by(self) -> tuple[Frame, ...]:
+    def _standby_frames(self) -> tuple[Frame, ...]:
         return self.stop_frames()
 
     def _handle_odometry(self, counts_mm: tuple[int, int], t_ns: int, looked_ns: int) -> FrameReport:

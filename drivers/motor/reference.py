@@ -172,7 +172,7 @@ class ReferenceDriver:
             commands_sent=self._commands_sent,
             sessions=self._arming.sessions,
             robot_clock_errors=self._clock_errors,
-            late_commands=self._watch.late,
+            late_commands=self._watch.late_commands,
             silent_states=self._watch.silent,
         )
 

@@ -24,11 +24,11 @@ DELAY_NS = 150_000_000
 class ArmedWatch:
     """Monitor of commands and state while armed; pure.
 
-    `late` counts the times that commands were late, `silent` those that no state was received.
+    `late_commands` counts the times that commands were late, `silent` those that no state was received.
     """
 
     def __init__(self) -> None:
-        self.late = 0
+        self.late_commands = 0
         self.silent = 0
         self._echo = CommandEcho()
         self._reported_ns: int | None = None
@@ -52,7 +52,7 @@ class ArmedWatch:
     def objection(self, now_ns: int) -> str | None:
         """Return why a robot that is armed must not stay so, None while all is well; counts each call that objects."""
         if self._delay_ns > DELAY_NS:
-            self.late += 1
+            self.late_commands += 1
             return (
                 f"commands reach the robot over {self._delay_ns * 1e-9:.2f} s late; check the load of the link and "
                 "of this computer"

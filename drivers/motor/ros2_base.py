@@ -158,7 +158,7 @@ class Ros2BasePort(BodyPort):
         if permit.target is Request.RESET and is_latched:
             frames = (Frame(wire.RESET, b""),)
         elif permit.target is Request.RESET or not permit.estopped or is_latched:
-            frames = self._stand_by() if self._flags & wire.DRIVING else ()
+            frames = self._standby_frames() if self._flags & wire.DRIVING else ()
         return frames if frames and self._is_due(now_ns) else ()
 
     def stop_frames(self) -> tuple[Frame, ...]:
@@ -168,7 +168,7 @@ class Ros2BasePort(BodyPort):
     def _motion(self, linear_m_s: float, angular_rad_s: float) -> Frame:
         return wire.speeds(linear_m_s, angular_rad_s)
 
-    def _stand_by(self) -> tuple[Frame, ...]:
+    def _standby_frames(self) -> tuple[Frame, ...]:
         return (wire.enable(False),)
 
     @property

@@ -211,10 +211,10 @@ class BodyPort(Port):
         return (self._motion(scale * (left_m_s + right_m_s) / 2.0, scale * (right_m_s - left_m_s) / it.track_m),)
 
     def brake(self, now_ns: int, lasts_ns: int) -> tuple[Sequence[Frame], bool]:
-        """Zero speed until the base stands, then what makes it stand by."""
+        """Zero speed until the base stands, then the frames of standby."""
         if self._is_stationary or lasts_ns > BRAKING_NS:
             self._repeat_ns = now_ns
-            return self._stand_by(), True
+            return self._standby_frames(), True
         return (self._motion(0.0, 0.0),), False
 
     @property
@@ -227,7 +227,7 @@ class BodyPort(Port):
         """Return the command of these speeds of the body."""
 
     @abstractmethod
-    def _stand_by(self) -> tuple[Frame, ...]:
+    def _standby_frames(self) -> tuple[Frame, ...]:
         """Return the frames after which a base that stands takes no speeds."""
 
 

@@ -143,7 +143,7 @@ class Layout:
 
 
 def layout(order: str, name: str, command: int, body: str, fields: str) -> Layout:
-    """Return a layout; `fields` has their names, each with `:STEPS` where a unit is not one step."""
+    """Return the layout of a message; `fields` names its fields, each with `:STEPS` where a unit is not one step."""
     pairs = [item.partition(":") for item in fields.split()]
     steps = tuple(float(steps) if steps else 1.0 for _, _, steps in pairs)
     return Layout(name, command, order, body, tuple(name for name, _, _ in pairs), steps)

@@ -132,8 +132,8 @@ class Vesc:
             self._set_from_can(command, data)
         elif command == 17:
             # A ping to all is answered with 255 as the sender.
-            answer = bytes((to, 0))
-            return [CanFrame(18 << 8 | (data[0] if data else 0), answer, extended=True)]
+            reply = bytes((to, 0))
+            return [CanFrame(18 << 8 | (data[0] if data else 0), reply, extended=True)]
         elif command == 5 and len(data) >= 1:
             self._fragments[data[0] : data[0] + len(data) - 1] = data[1:]
         elif command == 6 and len(data) >= 2:
@@ -154,10 +154,10 @@ class Vesc:
         frames: list[CanFrame] = []
         self._serial_out.clear()
         for payload, behind in self._serial.feed(received):
-            answer, forwarded = self._obey(payload, behind)
+            reply, forwarded = self._obey(payload, behind)
             frames += forwarded
-            if answer is not None:
-                self._serial_out += serial_packet(answer)
+            if reply is not None:
+                self._serial_out += serial_packet(reply)
         return bytes(self._serial_out), frames
 
     def handle_packet_reply(self, frame: CanFrame) -> bytes:
@@ -280,13 +280,13 @@ class Vesc:
     def _packet_from_can(self, sender: int, mode: int, payload: bytes) -> list[CanFrame]:
         if mode not in (0, 2):
             return []
-        answer, frames = self._obey(payload, b"")
-        if answer is None or mode != 0:
+        reply, frames = self._obey(payload, b"")
+        if reply is None or mode != 0:
             return frames
-        return [*frames, *can_packet(sender, self.controller_id, answer, send_mode=1)]
+        return [*frames, *can_packet(sender, self.controller_id, reply, send_mode=1)]
 
     def _obey(self, payload: bytes, behind: bytes) -> tuple[bytes | None, list[CanFrame]]:
-        """Carry out a packet; `behind` is what lies in memory behind it. Returns answer and frames for CAN."""
+        """Carry out a packet; `behind` is what lies in memory behind it. Returns reply and frames for CAN."""
         command, brake_a = payload[0] if payload else None, self.timeout_brake_current_a
         if command in _PACKET_SET:
             name, scale = _PACKET_SET[command]

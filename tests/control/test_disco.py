@@ -35,6 +35,11 @@ def planner(model=MODEL, task=None, seed=3, limits=LIMITS, **changes):
     return Disco(model, task or CircleCost(), replace(DiscoSettings(), **changes), limits, seed)
 
 
+def sampling_planner(**changes):
+    """Return a planner whose plans are those of the sampling update, without a refinement."""
+    return planner(refine=False, **changes)
+
+
 def drive(disco, seconds, start=(0.75, 0.0, math.pi / 2), period_s=0.1, wheel_noise=0.0, lag_s=0.1):
     """Drive a plant with the posterior's mean; returns instant costs and commands."""
     plant = KinematicPlant(MEAN, start, lag_s, wheel_noise, 1)
@@ -56,9 +61,9 @@ def test_drives_the_circle_smoothly_from_rest():
     assert np.abs(np.diff(commands, axis=0)).mean() / (2.0 * math.pi) < 0.03
 
 
-def test_replanning_faster_does_not_make_the_command_restless():
-    _, slow = drive(planner(), 15.0, period_s=0.1, wheel_noise=0.05)
-    _, fast = drive(planner(), 15.0, period_s=0.02, wheel_noise=0.05)
+def test_sampling_more_often_does_not_make_the_command_restless():
+    _, slow = drive(sampling_planner(), 15.0, period_s=0.1, wheel_noise=0.05)
+    _, fast = drive(sampling_planner(), 15.0, period_s=0.02, wheel_noise=0.05)
     steady_slow, steady_fast = slow[50:], fast[250:]
     in_a_tenth = [np.abs(steady_slow[1:] - steady_slow[:-1]).mean(), np.abs(steady_fast[5:] - steady_fast[:-5]).mean()]
     assert in_a_tenth[1] < in_a_tenth[0]
@@ -104,7 +109,7 @@ def test_the_first_command_is_tied_to_what_was_sent_and_to_the_measured_wheels()
 
 
 def test_shifting_by_fractions_continues_the_plan():
-    disco = planner(gain_by_time=True)
+    disco = sampling_planner(gain_by_time=True)
     first = disco.plan(0, TANGENT)
     second = disco.plan(20_000_000, msgspec.structs.replace(TANGENT, t_ns=20_000_000))
     at = np.array([second.at(t) for t in range(100_000_000, 4_000_000_000, 100_000_000)])
@@ -114,9 +119,10 @@ def test_shifting_by_fractions_continues_the_plan():
     np.testing.assert_allclose(again.wheel_speeds, second.wheel_speeds, atol=1e-6)
 
 
-def test_the_predicted_path_starts_at_the_state_and_follows_the_mean_model():
-    plan = planner().plan(0, TANGENT)
-    assert plan.trajectory.shape == (41, 3)
+@pytest.mark.parametrize(("refine", "steps"), [(True, 20), (False, 40)])
+def test_the_predicted_path_starts_at_the_state_and_follows_the_mean_model(refine, steps):
+    plan = planner(refine=refine).plan(0, msgspec.structs.replace(TANGENT, left_speed_rad_s=3.0, right_speed_rad_s=3.0))
+    assert plan.trajectory.shape == (steps + 1, 3)
     np.testing.assert_allclose(plan.trajectory[0], [0.75, 0.0, math.pi / 2])
     left, right = plan.wheel_speeds[0]
     turned = plan.trajectory[1, 2] - plan.trajectory[0, 2]
@@ -192,7 +198,7 @@ def test_paper_mode_stands_still_and_chatters_as_the_published_code_does():
 
 
 def test_what_was_sampled_can_be_looked_at():
-    disco = planner()
+    disco = sampling_planner()
     plan = disco.plan(0, TANGENT)
     rollouts = disco.sampled_rollouts(30)
     assert rollouts.wheel_speeds.shape == (30, 40, 2)
@@ -306,7 +312,7 @@ def test_a_belief_set_is_as_good_as_a_belief_begun_with(uncertainty):
 def test_a_belief_set_between_plans_keeps_the_plan_compiles_nothing_and_repeats():
     runs = []
     for _ in range(2):
-        disco = planner()
+        disco = sampling_planner()
         plans = [disco.plan(0, TANGENT)]
         compiled = len(disco_step.signatures)
         disco.set_belief(LEARNT)

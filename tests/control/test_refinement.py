@@ -12,13 +12,19 @@ from msgspec import structs
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState
 from disco_hw.control.parameter_points import mean_point
 from disco_hw.control.refinement import CHANGE_S, END_X_ICR, LEAST_END_WEIGHT, STEPS
+from disco_hw.control.surroundings import Surroundings
+from disco_hw.fence import Fence, Footprint
+from disco_hw.fence.clearance import Boundaries
 from disco_hw.model import Gaussian, Model
 from disco_hw.model.model import EffectSetting
 from disco_hw.model.step import FreeRun
 from disco_hw.tasks.circle import CircleCost
+from disco_hw.tasks.line import PathTable
+from disco_hw.tasks.line.cost import PathCost
 
 RADIUS_M, X_ICR_M = 0.75, 0.2
 LIMITS = CommandLimits(8.0, 20.0)
+FOOTPRINT = Footprint(0.5, 0.4, 0.05)
 MODEL = Model(0.06, 0.4, X_ICR_M, (EffectSetting("motor_lag", {"tau_s": 0.15}),))
 SETTINGS = DiscoSettings(uncertainty="point", refine=True)
 
@@ -46,13 +52,11 @@ def drive_on() -> dict[float, tuple[np.ndarray, np.ndarray]]:
     return found
 
 
-@pytest.mark.thorough
 def test_a_refined_plan_stays_on_the_line(drive_on: dict[float, tuple[np.ndarray, np.ndarray]]) -> None:
     """A robot on the circle is planned to stay within a millimetre of it; sampling alone is not as near."""
     assert np.abs(drive_on[0.2][1]).max() < 1e-3
 
 
-@pytest.mark.thorough
 def test_a_wide_belief_does_not_lead_a_refined_plan_off_the_line() -> None:
     """The refinement plans in the mean: under points 15 % apart it would stay where their spread costs least."""
     geometry = np.array([MODEL.wheel_radius_m, MODEL.axial_distance_m, MODEL.x_icr_m])
@@ -81,7 +85,6 @@ def _cost(commands: np.ndarray, state: PlannerState, speed_m_s: float, step_s: f
     return distance + last + (CHANGE_S * MODEL.wheel_radius_m) ** 2 * float((changes**2).sum())
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("speed_m_s", [0.1, 0.2, 0.3])
 def test_a_refined_plan_costs_no_more_than_the_sampled_one(speed_m_s: float) -> None:
     """In the mean of what is believed, on the line and beside it."""
@@ -97,7 +100,6 @@ def test_a_refined_plan_costs_no_more_than_the_sampled_one(speed_m_s: float) -> 
         assert costs[0] <= costs[1]
 
 
-@pytest.mark.thorough
 def test_a_line_too_fast_for_the_wheels_is_followed_slower(
     drive_on: dict[float, tuple[np.ndarray, np.ndarray]],
 ) -> None:
@@ -108,7 +110,6 @@ def test_a_line_too_fast_for_the_wheels_is_followed_slower(
     assert np.abs(off_m).max() < 5e-3
 
 
-@pytest.mark.thorough
 def test_warming_up_compiles_the_refinement() -> None:
     """The refinement is compiled before the robot reaches its line, though warming up plans far from it."""
     planner = Disco(MODEL, CircleCost(radius_m=RADIUS_M), SETTINGS, LIMITS)
@@ -117,8 +118,38 @@ def test_warming_up_compiles_the_refinement() -> None:
     assert planner.refinement.is_compiled
 
 
-def test_plans_are_refined_only_where_the_settings_say_so() -> None:
-    """Neither the paper's mode nor the default refines, so that their plans and logs stay as they were."""
-    for settings in (DiscoSettings.paper(), DiscoSettings(uncertainty="point")):
-        assert not settings.refine
+def test_plans_are_refined_but_in_the_mode_of_the_paper() -> None:
+    """The paper's mode is to stay as it is."""
+    assert Disco(MODEL, CircleCost(radius_m=RADIUS_M), DiscoSettings(), LIMITS).refinement is not None
+    for settings in (DiscoSettings.paper(), DiscoSettings(refine=False)):
         assert Disco(MODEL, CircleCost(radius_m=RADIUS_M), settings, LIMITS).refinement is None
+
+
+def test_a_robot_that_gets_nowhere_is_left_to_the_sampled_plan() -> None:
+    """A plan that starts anew from the robot's place can put off its way for ever; who moves is refined again."""
+    planner = Disco(MODEL, CircleCost(radius_m=RADIUS_M, speed_m_s=0.2), DiscoSettings(), LIMITS)
+    moving = _on_the_circle(0.2)
+    standing = structs.replace(moving, left_speed_rad_s=0.0, right_speed_rad_s=0.0)
+    steps = [
+        len(planner.plan(t * 100_000_000, structs.replace(state, t_ns=t * 100_000_000)).wheel_speeds)
+        for t, state in enumerate([moving] + 40 * [standing] + 20 * [moving])
+    ]
+    assert steps[0] == steps[10] == STEPS
+    assert steps[40] == DiscoSettings().sampler.horizon
+    assert steps[60] == STEPS
+
+
+@pytest.mark.parametrize(("room_to_stop_m", "is_refined"), [(0.2, False), (0.6, True)])
+def test_a_plan_is_refined_only_if_the_robot_can_stop_after_it(room_to_stop_m: float, is_refined: bool) -> None:
+    """At 0.4 m/s a robot that brakes with 0.18 m/s^2 needs 0.44 m: more than the planned way alone would tell."""
+    speed_m_s, limits, settings = 0.4, CommandLimits(8.0, 3.0), DiscoSettings()
+    way_m, keep_m = STEPS * settings.step_s * speed_m_s, 0.05
+    wall_m = FOOTPRINT.ahead + 0.5 * FOOTPRINT.length + keep_m + way_m + room_to_stop_m
+    room = Fence(keep_in=((-5.0, -5.0), (wall_m, -5.0), (wall_m, 5.0), (-5.0, 5.0)))
+    around = Surroundings(FOOTPRINT, keep_m, 1e-3, settings.step_s, settings.sampler.horizon, speed_m_s)
+    line = PathCost(PathTable(np.array([[-4.0, 0.0], [8.0, 0.0]])), speed_m_s)
+    planner = Disco(MODEL, line, settings, limits, surroundings=around)
+    around.look_around(Boundaries(FOOTPRINT, room, ()), 0.0)
+    turning = speed_m_s / MODEL.wheel_radius_m
+    plan = planner.plan(0, PlannerState(0, 0.0, 0.0, 0.0, turning, turning))
+    assert (len(plan.wheel_speeds) == STEPS) is is_refined

@@ -126,7 +126,7 @@ def test_words_and_json_agree():
     reported = coverage.as_dict()
     assert "straight slow" not in reported["missing"]
     assert len(reported["missing"]) == len(reported["items"]) - 1
-    assert "1 of 17 excited" in coverage.describe()
+    assert "1 of 17 motions" in coverage.describe()
     assert "straight fast 0/2 s" in coverage.describe()
 
 

@@ -56,7 +56,7 @@ def test_the_table_does_without_wheels():
 def test_the_line_is_one_line():
     text = line(STATUS)
     assert "\n" not in text
-    assert text.startswith("ARMED: hold [this] key | 5 s driven, 1 of 17 excited; missing: straight fast 0/2 s")
+    assert text.startswith("ARMED: hold [this] key | 5 s driven, 1 of 17 motions; missing: straight fast 0/2 s")
 
 
 @pytest.mark.parametrize("terminal", [False, True])

@@ -53,15 +53,15 @@ class Reader:
         self._environment = {**os.environ, "XDG_RUNTIME_DIR": str(directory), "PYTHONPATH": str(ROOT)}
         self._background: list[subprocess.Popen] = []
 
-    def _command(self, line: str, **placeholders: str) -> list[str]:
+    def _command(self, line: str) -> list[str]:
         program, *arguments = line.split()
         self.left.remove([program, *arguments])
         begin = [sys.executable] if program == "python" else [sys.executable, "-m", "disco_hw"]
-        return [*begin, *(placeholders.get(argument.replace(".", "_"), argument) for argument in arguments)]
+        return [*begin, *arguments]
 
-    def type(self, line: str, **placeholders: str) -> str:
+    def type(self, line: str) -> str:
         """Run a command to its end, which must be good."""
-        return self.untold(self._command(line, **placeholders))
+        return self.untold(self._command(line))
 
     def untold(self, command: list[str]) -> str:
         result = subprocess.run(
@@ -146,9 +146,8 @@ def test_the_tutorials_commands_go_through(tmp_path):
             reader.wait("driving", lambda status: status["wheels"] and max(map(abs, status["wheels"])) > 1.0)
             reader.ctl("stop")
             reader.ctl("quit")
-    reader.untold([sys.executable, "-m", "disco_hw", "log", "export", "tour.mcap", "-o", "drive.csv"])
-    named = {"FILE": "drive.csv", "ROBOT_toml": ROBOT, "LOG_mcap": "imported.mcap"}
-    reader.type("disco-hw import FILE --robot ROBOT.toml -o LOG.mcap", **named)
+    reader.type("disco-hw log export tour.mcap -o tour.csv")
+    reader.type(f"disco-hw import tour.csv --robot {ROBOT} -o imported.mcap")
     assert "ended properly" in reader.type("disco-hw log info tour.mcap")
     assert not reader.left
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from disco_hw.control.plan import PLANNER_VERSION
 from disco_hw.daemon.control_socket import loop_figures, status
 from disco_hw.daemon.loop import LoopStats
 from disco_hw.log import Attachment
@@ -26,7 +27,9 @@ CORNER = "x_m,y_m\n0,0\n1.2,0\n1.2,0.8\n"
 
 
 def write_log(path, setup, ticks):
-    begin = RecordingSettings(path, "wombot", attachments=tuple(kept_files(setup)), queue_ticks=100_000)
+    begin = RecordingSettings(
+        path, "wombot", planner=PLANNER_VERSION, attachments=tuple(kept_files(setup)), queue_ticks=100_000
+    )
     recorder = ProcessRecorder(begin)
     for now_ns, got in ticks:
         recorder.put(now_ns, got)
@@ -124,7 +127,9 @@ def test_other_way_points_give_other_plans(tmp_path):
         for a in kept_files(setup)
     ]
     recorder = ProcessRecorder(
-        RecordingSettings(tmp_path / "run.mcap", "w", attachments=tuple(files), queue_ticks=10_000)
+        RecordingSettings(
+            tmp_path / "run.mcap", "w", planner=PLANNER_VERSION, attachments=tuple(files), queue_ticks=10_000
+        )
     )
     for now_ns, got in stack.recorder.ticks:
         recorder.put(now_ns, got)

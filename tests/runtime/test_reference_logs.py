@@ -14,8 +14,10 @@ import pytest
 from jsonschema import Draft202012Validator
 from mcap.reader import make_reader
 
+from disco_hw.control.plan import PLANNER_VERSION
 from disco_hw.estimation import filter  # noqa: A004 - the module's name
 from disco_hw.estimation.odometry import arc
+from disco_hw.log.reader import open_log
 from disco_hw.runtime.replay import replay
 
 LOGS = Path(__file__).parent / "reference_logs"
@@ -24,7 +26,8 @@ TOLERANCE = 1e-4
 
 
 @pytest.mark.parametrize(
-    ("name", "ticks", "values"), [("circle", 255, 7380), ("adapted", 240, 7050), ("drive", 225, 4900)]
+    ("name", "ticks", "values"),
+    [("circle", 255, 7380), ("adapted", 240, 7050), ("drive", 225, 4900), ("refined", 175, 5000)],
 )
 def test_a_reference_log_gives_what_it_gave(name, ticks, values):
     report = replay(LOGS / f"{name}.mcap", TOLERANCE)
@@ -33,7 +36,7 @@ def test_a_reference_log_gives_what_it_gave(name, ticks, values):
     assert report.values > values
 
 
-@pytest.mark.parametrize("name", ["circle", "adapted", "drive"])
+@pytest.mark.parametrize("name", ["circle", "adapted", "drive", "refined"])
 def test_every_message_obeys_the_schema_in_its_log(name):
     """As another reader sees the file, which knows the schemas from it alone."""
     checked = Counter()
@@ -50,6 +53,11 @@ def test_every_message_obeys_the_schema_in_its_log(name):
 @functools.cache
 def _parsed(schema):
     return json.loads(schema)
+
+
+def test_logs_from_before_planner_versions_are_still_among_them():
+    with open_log(LOGS / "refined.mcap") as refined, open_log(LOGS / "circle.mcap") as sampled:
+        assert (refined.metadata.planner, sampled.metadata.planner) == (PLANNER_VERSION, 0)
 
 
 def test_a_changed_build_is_reported_by_tick_and_field(monkeypatch):

@@ -11,6 +11,7 @@ from msgspec import structs
 from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.control.optimiser import Optimiser
 from disco_hw.control.past_motion import DriveMeans
+from disco_hw.control.plan import PLANNER_VERSION
 from disco_hw.errors import InputError
 from disco_hw.log import MODEL_TOML, ROBOT_TOML, Attachment
 from disco_hw.log.process_recorder import ProcessRecorder, RecordingSettings
@@ -36,14 +37,18 @@ def ticks():
     return stack.recorder.ticks
 
 
-def write_log(path: Path, ticks, robot: str | None = None, model: str | None = None) -> Path:
+def write_log(
+    path: Path, ticks, robot: str | None = None, model: str | None = None, planner: int = PLANNER_VERSION
+) -> Path:
     robot = robot or (ROBOTS / "wombot.toml").read_text()
     model = model or (ROBOTS / "wombot_model.toml").read_text()
     attachments = (
         Attachment(ROBOT_TOML, "application/toml", robot.encode()),
         Attachment(MODEL_TOML, "application/toml", model.encode()),
     )
-    recorder = ProcessRecorder(RecordingSettings(path, "wombot", attachments=attachments, queue_ticks=100_000))
+    recorder = ProcessRecorder(
+        RecordingSettings(path, "wombot", planner=planner, attachments=attachments, queue_ticks=100_000)
+    )
     for now_ns, records in ticks:
         recorder.put(now_ns, records)
     stats = recorder.close(30.0)
@@ -183,6 +188,13 @@ def test_one_changed_bit_in_the_log_is_found(tmp_path, ticks):
     assert not report.ok
     assert report.difference.field == "Command.left_rad_s"
     assert report.difference.t_ns == ticks[150][0]
+
+
+def test_plans_of_a_later_planner_are_refused_with_the_version_that_has_it(tmp_path, ticks):
+    log = write_log(tmp_path / "later.mcap", ticks[:1], planner=PLANNER_VERSION + 1)
+    text = f"{log}: its plans are of planner version {PLANNER_VERSION + 1}, .* up to {PLANNER_VERSION}; replay it with"
+    with pytest.raises(InputError, match=text):
+        replay(log)
 
 
 def test_a_log_without_ticks_or_robot_is_refused(tmp_path, ticks):

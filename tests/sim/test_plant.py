@@ -315,7 +315,7 @@ def test_sides_and_axes_are_independent():
 
 def test_wander_adds_slow_variance():
     without_drift, _ = _blocks(PARAMETERS, 4, 200)
-    with_drift, _ = _blocks(replace(PARAMETERS, wheel_wander_std=0.02, wheel_wander_correlation_s=2.0), 4, 200)
+    with_drift, _ = _blocks(replace(PARAMETERS, wheel_drift_std=0.02, wheel_drift_correlation_s=2.0), 4, 200)
     drift = with_drift[:, 0] - without_drift[:, 0]
     assert drift.std() == pytest.approx(0.02, rel=0.1)
     assert np.corrcoef(drift[:-200], drift[200:])[0, 1] == pytest.approx(np.exp(-1.0), abs=0.12)

@@ -37,7 +37,7 @@ def test_signed_and_unlimited_parameters_are_accepted():
 
 
 def test_noiseless_silences_every_random_source_and_touches_no_geometry():
-    quiet = PlantParameters(pose_outlier_probability=0.1, wheel_wander_std=0.1, pose_gap_interval_s=3.0).noiseless()
+    quiet = PlantParameters(pose_outlier_probability=0.1, wheel_drift_std=0.1, pose_gap_interval_s=3.0).noiseless()
     random_fields = [f.name for f in dataclasses.fields(quiet) if "_std" in f.name or "probability" in f.name]
     assert len(random_fields) >= 9
     assert all(getattr(quiet, name) == 0.0 for name in random_fields)

@@ -32,7 +32,7 @@ def test_a_new_default_or_key_changes_the_table_and_keeps_what_was_written_by_ha
     table = settings_table("[control]", stale)
     assert "| `rate_hz` | [20, 100] | 50.0 | how often |" in table
     assert "gone" not in table
-    assert '| `mode` | "default", "paper" | "default" |  |' in table
+    assert '| `mode` | "default", "paper", "sampled" | "default" |  |' in table
 
 
 def test_a_table_that_nothing_makes_is_refused():

@@ -69,4 +69,4 @@ def _drawn(kind: str, parameter: FaultParameter, chance: random.Random) -> float
     if parameter.name == "probability":
         return chance.choice((0.02, 0.2, 0.5, 1.0))
     least, most = _DRAWN[kind, parameter.name]
-    return chance.randint(int(least), int(most)) if parameter.whole else round(chance.uniform(least, most), 6)
+    return chance.randint(int(least), int(most)) if parameter.is_integer else round(chance.uniform(least, most), 6)

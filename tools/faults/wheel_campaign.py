@@ -64,7 +64,7 @@ def rough_plant(chance: random.Random) -> PlantParameters:
         usual,
         wheel_radius_m=0.9 * usual.wheel_radius_m,
         wheel_disturbance_std=chance.uniform(0.05, 0.12),
-        wheel_wander_std=chance.uniform(0.0, 0.05),
+        wheel_drift_std=chance.uniform(0.0, 0.05),
         slip_std_x_m_s=chance.uniform(0.005, 0.02),
         slip_std_y_m_s=chance.uniform(0.005, 0.02),
         slip_std_yaw_rad_s=chance.uniform(0.02, 0.08),

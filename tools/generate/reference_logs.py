@@ -1,6 +1,6 @@
 """Writes the reference logs that tests/runtime/test_reference_logs.py replays.
 
-    python -m tools.generate.reference_logs [DIRECTORY]
+    python -m tools.generate.reference_logs [DIRECTORY [NAME ...]]
 
 Only after a change that is meant to alter estimates, plans or commands: the test says at which tick and in which field
 a build first differs from the one that recorded them.
@@ -19,6 +19,7 @@ import msgspec
 from disco_hw.adaptation import AdaptationUpdate, NoAdaptation
 from disco_hw.adaptation.guard import NAMES, believed_geometry
 from disco_hw.config import SHIPPED_ROBOT
+from disco_hw.control.plan import PLANNER_VERSION
 from disco_hw.drive import ManualInput
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
@@ -74,24 +75,24 @@ class Hand:
         pass
 
 
-def robot_toml() -> str:
-    """The shipped robot, planning in few steps."""
+def robot_toml(mode: str = "sampled") -> str:
+    """The shipped robot, planning in few steps in a mode."""
     text = (ROBOTS / "wombot.toml").read_text(encoding="utf-8")
     assert SHORT_SIGHTED[0] in text
-    return text.replace(*SHORT_SIGHTED)
+    return text.replace(SHORT_SIGHTED[0], f'{SHORT_SIGHTED[1]}\nmode = "{mode}"')
 
 
-def setup() -> Setup:
+def setup(mode: str = "sampled") -> Setup:
     """The robot of these logs, and its model."""
     with tempfile.TemporaryDirectory() as directory:
         robot = Path(directory) / "robot.toml"
-        robot.write_text(robot_toml(), encoding="utf-8")
+        robot.write_text(robot_toml(mode), encoding="utf-8")
         return load_setup(robot, ROBOTS / "wombot_model.toml")
 
 
-def planner() -> Planner:
+def planner(mode: str = "sampled") -> Planner:
     """Create the planner DISCO for the robot of these logs."""
-    found = setup()
+    found = setup(mode)
     return create_planner(found.config, found.model)
 
 
@@ -109,6 +110,13 @@ def circle() -> SimulatedRun:
     stack.robot.board.kidnap(0.2, 0.1, 0.3)
     stack.run(1.5)
     stack.run(0.6, UserRequest.DISARM)
+    return stack
+
+
+def refined() -> SimulatedRun:
+    """DISCO drives in its default mode, which refines the plan once the robot is under way."""
+    stack = _started(simulated(planner("default")))
+    stack.run(1.5)
     return stack
 
 
@@ -132,18 +140,24 @@ def drive() -> SimulatedRun:
     return stack
 
 
-KINDS: dict[str, Callable[[], SimulatedRun]] = {"circle": circle, "adapted": adapted, "drive": drive}
+KINDS: dict[str, Callable[[], SimulatedRun]] = {
+    "circle": circle,
+    "adapted": adapted,
+    "drive": drive,
+    "refined": refined,
+}
 
 
 def write(name: str, directory: Path) -> Path:
     """Record the run of that name, without its raw frames, which a replay does not need."""
     stack = KINDS[name]()
-    files = {ROBOT_TOML: robot_toml().encode(), MODEL_TOML: (ROBOTS / "wombot_model.toml").read_bytes()}
+    robot = robot_toml("default" if name == "refined" else "sampled")
+    files = {ROBOT_TOML: robot.encode(), MODEL_TOML: (ROBOTS / "wombot_model.toml").read_bytes()}
     attachments = tuple(Attachment(attached, "application/toml", content) for attached, content in files.items())
     path = directory / f"{name}.mcap"
     path.unlink(missing_ok=True)
     recorder = ProcessRecorder(
-        RecordingSettings(path, "wombot", version=version(), attachments=attachments, queue_ticks=100_000)
+        RecordingSettings(path, "wombot", version(), PLANNER_VERSION, attachments, queue_ticks=100_000)
     )
     for now_ns, recorded in stack.recorder.ticks:
         recorder.put(now_ns, [record for record in recorded if not isinstance(record, FrameIn | FrameOut)])
@@ -163,7 +177,7 @@ def _started(stack: SimulatedRun) -> SimulatedRun:
 def main() -> int:
     directory = Path(sys.argv[1]) if len(sys.argv) > 1 else DIRECTORY
     directory.mkdir(parents=True, exist_ok=True)
-    for name in KINDS:
+    for name in sys.argv[2:] or KINDS:
         path = write(name, directory)
         print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
     return 0

@@ -204,3 +204,20 @@ def touch_cost(
     overlap = body[KEEP] + abs(forward) * body[STEP_LENGTH] + radius + towards - off
     touches = constant(TOUCH_COST, forward) if overlap > zero else zero
     return touches + constant(TOUCH_COST_PER_M, forward) * max(overlap, zero)
+
+
+@kernel_function
+def touches(area: Area, paths: Floats) -> bool:
+    """Whether the footprint touches a near shape on any of the paths (L, N, 3): x, y (m) from the origin, yaw (rad).
+
+    The first pose of a path is where the plan begins, the others follow a step apart; each is looked at.
+    """
+    step_s = area.body[STEP_LENGTH]
+    for n in range(paths.shape[0]):
+        for t in range(1, paths.shape[1]):
+            x, y, yaw = paths[n, t, 0], paths[n, t, 1], paths[n, t, 2]
+            forward = math.hypot(x - paths[n, t - 1, 0], y - paths[n, t - 1, 1]) / step_s
+            for shape in range(area.number[0]):
+                if touch_cost(area, shape, t * step_s, (x, y, forward), math.cos(yaw), math.sin(yaw)) > 0.0:
+                    return True
+    return False

@@ -59,7 +59,7 @@ def _worst_stretch(wheels: ChannelResult) -> bytes:
     return stretch(drive.t_s[part], drive.speed_rad_s[part, 0], before[part, 0], after[part, 0], "left wheel, rad/s")
 
 
-def _legend_beside(axes: Axes) -> None:
+def _legend_outside(axes: Axes) -> None:
     """Place a legend to the right of the axes, where it covers nothing."""
     axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0, fontsize=9)
 
@@ -94,7 +94,7 @@ def gap_by_horizon(gap: dict[str, dict[float, PredictionErrors]]) -> bytes:
         axes.set_xlabel("predicted ahead, s")
         axes.set_ylabel(label)
         _plain_log(axes, upward=True)
-    _legend_beside(axes)
+    _legend_outside(axes)
     figure.set_layout_engine("constrained")
     return png(figure)
 
@@ -110,7 +110,7 @@ def gap_by_regime(gap: dict[str, dict[float, PredictionErrors]], ahead_s: float)
         axes.barh(rows, values, height=0.25, color=_COLOURS[stage], label=stage)
     axes.set_yticks(range(len(names)), names)
     axes.set_xlabel(f"position error {ahead_s:g} s ahead, mm")
-    _legend_beside(axes)
+    _legend_outside(axes)
     return png(figure)
 
 
@@ -134,7 +134,7 @@ def disagreement(title: str, regimes: list[Regime]) -> bytes:
     else:
         # Where there is nothing but noise the bars stay short, so that it looks like nothing.
         axes.set_xlim(0.0, max(1.05 * largest, _LEAST_SHOWN))
-    _legend_beside(axes)
+    _legend_outside(axes)
     return png(figure)
 
 
@@ -147,5 +147,5 @@ def stretch(t_s: Array, measured: Array, before: Array, after: Array, label: str
     axes.plot(t_s, after, color=_COLOURS["amended"], linewidth=1.1, label="amended")
     axes.set_xlabel("time, s")
     axes.set_ylabel(label)
-    _legend_beside(axes)
+    _legend_outside(axes)
     return png(figure)

@@ -293,11 +293,11 @@ def low_confidence_of(effect: EffectFinding, measured: Measured) -> str | None:
         if _at_end(parameter, estimate.value, settings):
             return f"{_written(parameter, estimate)} lies at the end of its range"
     if all(is_weakly_known(parameter, estimate, settings) for parameter, estimate in pairs):
-        said = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
-        return f"{said} is hardly known: its interval is wider than the value"
+        values = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
+        return f"{values} is hardly known: its interval is wider than the value"
     if holds_no_effect(effect):
-        said = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
-        return f"{said}: its interval holds no effect"
+        values = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
+        return f"{values}: its interval holds no effect"
     return _exceeded(described, pairs[0][1], measured) or measured.disputed.get(effect.name)
 
 

@@ -42,7 +42,7 @@ def summary_lines(report: GapReport) -> list[str]:
     What is missing and how sure that is, how much it matters, what is left, which model to drive with, what to do next.
     """
     effects = report.effects[:_MOST_NAMES]
-    lines = [f"{said[0].upper()}{said[1:]}." for said in (sentence(each, report.settings.report) for each in effects)]
+    lines = [f"{text[0].upper()}{text[1:]}." for text in (sentence(each, report.settings.report) for each in effects)]
     more = len(report.effects) - len(effects)
     if more:
         lines[-1] += f" And {more} more, listed below."

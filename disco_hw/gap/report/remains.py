@@ -40,7 +40,10 @@ class Remains:
     def of(
         cls, timed: PredictionErrors, offered: PredictionErrors, floor: PredictionErrors, body: PredictionErrors | None
     ) -> Remains | None:
-        """Evaluate held-out errors; `body`: those by measured wheel motion. None if nothing was predicted."""
+        """Return what remains of the held-out errors, or None if nothing was predicted.
+
+        `body`: the errors of predictions from measured wheel motion.
+        """
         if not math.isfinite(offered.position_m):
             return None
         before, after, noise = ((one.position_m, one.yaw_rad) for one in (timed, offered, floor))
@@ -51,8 +54,8 @@ class Remains:
         }
         channel = None
         if body is not None:
-            own = (body.position_m, body.yaw_rad)[larger]
-            channel = Channel.WHEEL_TO_BODY if own**2 > 0.5 * after[larger] ** 2 else Channel.COMMAND_TO_WHEEL
+            of_body = (body.position_m, body.yaw_rad)[larger]
+            channel = Channel.WHEEL_TO_BODY if of_body**2 > 0.5 * after[larger] ** 2 else Channel.COMMAND_TO_WHEEL
         return cls(before, after, noise, max(above, key=above.__getitem__, default=None), channel)
 
     @property
@@ -73,14 +76,14 @@ class Remains:
             f"{share:.0%} in {name}" for share, name in zip(self.closed, ("position", "heading"), strict=True)
             if share is not None
         ]  # fmt: skip
-        said = f"Of what is more than the sensors' noise this explains {' and '.join(shares)}." if shares else ""
+        closed = f"Of what is more than the sensors' noise this explains {' and '.join(shares)}." if shares else ""
         if self.is_explained:
-            return said or "What is left is the sensors' noise."
+            return closed or "What is left is the sensors' noise."
         if self.regime is None:
-            return said
+            return closed
         part = {Channel.WHEEL_TO_BODY: ", between wheels and body", Channel.COMMAND_TO_WHEEL: ", from command to wheel"}
         where = f"while {_WHILE.get(self.regime, self.regime)}{part[self.channel] if self.channel else ''}"
-        return f"{said} Most of the rest is {where}.".strip()
+        return f"{closed} Most of the rest is {where}.".strip()
 
     def as_dict(self) -> Mapping[str, object]:
         """Return the content of `remains` in report.json."""

@@ -82,7 +82,7 @@ class StagePredictions:
         """Errors of one stage with the wheels as they were measured; None where they are measured in any case."""
         if self.wheels is None:
             return None
-        measured = {held: replace(chain, wheels=None) for held, chain in self.chains[stage].items()}
+        measured = {block: replace(chain, wheels=None) for block, chain in self.chains[stage].items()}
         return errors_of(self.body, None, measured, self.scored_horizon_s, self.poses)
 
     def table(self) -> dict[str, dict[float, PredictionErrors]]:

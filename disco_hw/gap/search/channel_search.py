@@ -194,7 +194,7 @@ def search_body(drive: GriddedDrive, start: Array, given: Names = ()) -> Channel
 
 
 def _time_or_place(found: ChannelResult) -> ChannelResult:
-    """Add unnamed terms; replace a change of the floor by a patch of it, if that does as well.
+    """Add unnamed terms to the body's effects; replace a change of the floor by a patch of it, if that does as well.
 
     A patch that was left and not entered again looks like a change. No floor changes while one drives on it, so the
     patch is reported then, and the change is kept as an alternative.

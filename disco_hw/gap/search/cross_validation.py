@@ -97,7 +97,7 @@ def within_one_standard_error(best: PredictionErrors, other: PredictionErrors) -
 
 @dataclass(frozen=True)
 class Starts:
-    """Starts of predictions: nodes (K,), smoothed poses there (K, 3), poses measured at the end (K, 3)."""
+    """Start of each of K predictions: node (K,), smoothed pose there (K, 3), pose measured at its end (K, 3)."""
 
     node: Index
     pose: Array

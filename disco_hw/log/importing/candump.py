@@ -80,11 +80,11 @@ def read_dump(path: Path) -> Dump:
     """
     t_ns, channels = array("q"), Counter[str]()
     filled = bad = first_bad = 0
-    last_is_bad = is_whole = False
+    last_is_bad = is_complete = False
     for number, line in enumerate(read_lines(path, CANDUMP), start=1):
         if not line.strip():
             continue
-        filled, is_whole = filled + 1, line.endswith(("\n", "\r"))
+        filled, is_complete = filled + 1, line.endswith(("\n", "\r"))
         parsed = _parsed(line)
         last_is_bad = parsed is None
         if parsed is None:
@@ -97,7 +97,7 @@ def read_dump(path: Path) -> Dump:
         t_ns.append(parsed[0])
         channels[parsed[1]] += 1
     notes = []
-    if last_is_bad and not is_whole and channels:
+    if last_is_bad and not is_complete and channels:
         notes.append(f"{path}: the last line is cut off and was left out; the recording did not end regularly")
         bad, filled = bad - 1, filled - 1
     if bad:

@@ -35,16 +35,16 @@ _ZERO, _ONE, _TWO, _AGAINST = single(0.0), single(1.0), single(2.0), single(AGAI
 
 @dataclass(frozen=True, eq=False)
 class PathCost:
-    """Follow way-points; the cost is the distance e, the error of the speed along the path, and facing backwards.
+    """Cost of following way-points: the distance e, the error of the speed along the path, and facing backwards.
 
     The place on the path is carried along every rollout: each step moves it by the step's projection on the path's
     direction; so a path may cross itself. The speed of that is the progress, but no more than the forward speed and the
     wanted one together: a robot that slides round a corner makes progress sideways, one that stands or drives backwards
-    makes none. Facing is AGAINST_M
-    times the part of the heading that is against the path's direction: backwards would else be the easier way, for it
-    puts the tracked point before the axle. Wanted is `speed_m_s`, and less in the last second of an open path. The end
-    costs the distance that is left, over TERMINAL_M more of the way, together with the error of the heading from that
-    of a robot that stays on the path; else the tracked point would be swung to the path at the end.
+    makes none. Facing is AGAINST_M times the part of the heading that is against the path's direction: backwards would
+    else be the easier way, for it puts the tracked point before the axle. Wanted is `speed_m_s`, and less in the last
+    second of an open path. The end costs the distance that is left, over TERMINAL_M more of the way, together with the
+    error of the heading from that of a robot that stays on the path; else the tracked point would be swung to the path
+    at the end.
 
     Where the way turns sharply, rollouts end at the end of the table's piece, the robot stops there, and then turns to
     the next, which it could not find by sampling as nothing is gained before the turn is half done.

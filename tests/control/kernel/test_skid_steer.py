@@ -29,7 +29,7 @@ SAMPLES, HORIZON, STEP_S = 160, 50, 0.1
 # Single precision holds no more than this of a cost of hundreds.
 RELATIVE = 1e-5
 SAMPLER = Sampler(samples=SAMPLES, horizon=HORIZON)
-PLAN_SETTINGS = DiscoSettings(sampler=SAMPLER, iterations_at_start=1, retries=0, gain_by_time=False)
+PLAN_SETTINGS = DiscoSettings(sampler=SAMPLER, iterations_at_start=1, retries=0, gain_by_time=False, refine=False)
 LIMITS = CommandLimits(8.0, 20.0)
 
 BASE = st.tuples(st.floats(0.02, 0.12), st.floats(0.2, 0.8), st.floats(-0.3, 0.4))

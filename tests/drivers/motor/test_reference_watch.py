@@ -30,7 +30,7 @@ def test_it_objects_to_late_commands_and_to_silence_and_forgets_at_rest():
     watch.reported(0, DELAY_NS + 1)
     assert watch.objection(DELAY_NS + 1 + STATE_TIMEOUT_NS) is None
     assert "not sent its state for 0.5 s" in watch.objection(DELAY_NS + 2 + STATE_TIMEOUT_NS)
-    assert (watch.late, watch.silent) == (1, 1)
+    assert (watch.late_commands, watch.silent) == (1, 1)
     watch.rest()
     assert watch.objection(10**12) is None
 
