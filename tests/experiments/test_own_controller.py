@@ -18,6 +18,7 @@ from disco_hw.errors import InputError
 from disco_hw.experiments import with_device
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import BeliefChange
+from tests.runtime.simulated import ROBOT_TEXT
 from tests.tables import thinned
 
 ROOT = Path(disco_hw.__file__).parents[1]
@@ -74,8 +75,7 @@ def test_the_pages_comparison_with_disco_is_as_it_says(tmp_path):
 @thinned("rate_hz", [20, 33, 60, 100], quick=2)
 def test_the_robot_starts_at_every_control_rate(tmp_path, rate_hz):
     robot = tmp_path / "robot.toml"
-    text = ROBOT.read_text("utf-8").replace("rate_hz = 50.0", f"rate_hz = {rate_hz}.0")
-    robot.write_text(text.replace("wombot_model.toml", str(ROBOT.with_name("wombot_model.toml"))), encoding="utf-8")
+    robot.write_text(ROBOT_TEXT.replace("rate_hz = 50.0", f"rate_hz = {rate_hz}.0"), encoding="utf-8")
     drive = drive_virtual(robot, lambda _state, _task, _model: (2.0, 2.0), 1.0)
     assert abs(drive.commands.shape[0] - rate_hz) <= 1
     assert drive.speeds[-1] == pytest.approx(2.0 * 0.061, rel=0.1)
@@ -104,8 +104,7 @@ def test_a_law_that_has_no_answer_for_a_while_stops_the_robot_until_it_has_one(t
 )
 def test_the_geometry_is_learnt_where_the_real_robot_would_learn_it(tmp_path, pose, control, adapts):
     robot, log = tmp_path / "robot.toml", tmp_path / "log.mcap"
-    text = ROBOT.read_text("utf-8").replace("wombot_model.toml", str(ROBOT.with_name("wombot_model.toml")))
-    text = text.replace("[control]\n", f"[control]\n{control}\n")
+    text = ROBOT_TEXT.replace("[control]\n", f"[control]\n{control}\n")
     robot.write_text(f"{text}\n{pose}", encoding="utf-8")
     drive_virtual(robot, lambda *_: (2.0, 4.0), 4.0, log=log)
     with open_log(log) as opened:
@@ -114,9 +113,8 @@ def test_the_geometry_is_learnt_where_the_real_robot_would_learn_it(tmp_path, po
 
 
 def test_a_robot_with_another_controller_and_other_poses_is_played_too(tmp_path):
-    text = ROBOT.read_text("utf-8").replace('"wombot_model.toml"', f'"{ROBOT.parent / "wombot_model.toml"}"')
     mine = tmp_path / "mine.toml"
-    mine.write_text(with_device(text, "odrive"), encoding="utf-8")
+    mine.write_text(with_device(ROBOT_TEXT, "odrive"), encoding="utf-8")
     drive = drive_virtual(mine, lambda *_: (2.0, 2.0), 1.0)
     assert drive.speeds[-1] > 0.05
 

@@ -12,6 +12,7 @@ from disco_hw.errors import InputError
 from disco_hw.experiments import virtual, with_device
 from disco_hw.experiments.virtual import SimOptions, run_sim, true_parameters
 from disco_hw.runtime.robot_setup import load_setup
+from tests.runtime.simulated import ROBOT_TEXT
 
 
 def test_without_a_seed_the_plant_is_the_mean():
@@ -50,8 +51,7 @@ def test_a_mistake_in_what_to_hide_is_named(hide, expected_error):
 
 def test_a_fractional_encoder_is_refused(tmp_path):
     path = tmp_path / "robot.toml"
-    text = SHIPPED_ROBOT.read_text().replace("ticks_per_rev = 2048", "ticks_per_rev = 2796.8")
-    path.write_text(text.replace("wombot_model.toml", str(SHIPPED_ROBOT.parent / "wombot_model.toml")))
+    path.write_text(ROBOT_TEXT.replace("ticks_per_rev = 2048", "ticks_per_rev = 2796.8"))
     with pytest.raises(InputError, match="whole number"):
         run_sim(SimOptions(path))
     # Checked before the encoder, so that this ends even where the start is not looked at.
@@ -75,9 +75,6 @@ def test_a_board_that_has_a_link_of_its_own_is_refused_what_the_simulators_link_
     with pytest.raises(InputError, match="--bus-log: cannot be used with --board"):
         run_sim(SimOptions(SHIPPED_ROBOT, board="/dev/ttyUSB1", bus_log=tmp_path / "bus.log"))
     vendors = tmp_path / "robot.toml"
-    text = SHIPPED_ROBOT.read_text("utf-8").replace(
-        "wombot_model.toml", str(SHIPPED_ROBOT.with_name("wombot_model.toml"))
-    )
-    vendors.write_text(with_device(text, "odrive"), "utf-8")
+    vendors.write_text(with_device(ROBOT_TEXT, "odrive"), "utf-8")
     with pytest.raises(InputError, match=r"--board: .*robot\.toml has link\.driver odrive"):
         run_sim(SimOptions(vendors, board="/dev/ttyUSB1"))

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import msgspec
 
-from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.drive import ManualInput
 from disco_hw.errors import WorkError
 from disco_hw.experiments import with_device
@@ -28,6 +27,7 @@ from sim.plant_parameters import PlantParameters
 from sim.process import PoseSender
 from sim.virtual_robot import RobotInProcess, VendorRobot, VirtualRobot
 from tests.drivers.waiting import free_port
+from tests.runtime.simulated import ROBOT_TEXT
 
 
 @dataclass(frozen=True)
@@ -206,13 +206,10 @@ class SimulatedOperator:
 
 def robot_file(directory, driver=None):
     """The shipped robot with poses by datagrams and another controller."""
-    text = SHIPPED_ROBOT.read_text(encoding="utf-8").replace(
-        '"wombot_model.toml"', f'"{SHIPPED_ROBOT.parent / "wombot_model.toml"}"'
-    )
     if driver not in (None, "reference"):
-        text = with_device(text, driver)
+        text = with_device(ROBOT_TEXT, driver)
     else:
-        text += f'\n[pose]\nsource = "udp"\nport = {free_port(socket.SOCK_DGRAM)}\n'
+        text = ROBOT_TEXT + f'\n[pose]\nsource = "udp"\nport = {free_port(socket.SOCK_DGRAM)}\n'
     path = directory / "robot.toml"
     path.write_text(text, encoding="utf-8")
     return path

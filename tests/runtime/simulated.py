@@ -14,6 +14,10 @@ from sim.body_dynamics import BodyPose
 from sim.plant_parameters import PlantParameters
 
 ROBOT_FILE = SHIPPED_ROBOT
+ROBOT_TEXT = SHIPPED_ROBOT.read_text(encoding="utf-8").replace(
+    '"wombot_model.toml"', f'"{SHIPPED_ROBOT.with_name("wombot_model.toml")}"'
+)
+"""The shipped robot.toml, which finds its model from any folder."""
 START = BodyPose(0.75, 0.0, 1.5707963)
 
 

@@ -9,7 +9,7 @@ from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
-from tests.runtime.simulated import ROBOT_FILE, simulated_stack
+from tests.runtime.simulated import ROBOT_TEXT, simulated_stack
 from tests.runtime.test_path_drive import write_log
 
 # A kernel to compile; tests/control/test_disco.py drives with joint sampling in every `make test`.
@@ -18,8 +18,7 @@ pytestmark = pytest.mark.long
 
 def test_robot_toml_asks_for_joint_sampling_and_it_drives_and_replays(tmp_path):
     robot_file = tmp_path / "robot.toml"
-    text = ROBOT_FILE.read_text().replace("[control]\n", '[control]\nuncertainty = "joint"\n')
-    robot_file.write_text(text.replace('"wombot_model.toml"', f'"{ROBOT_FILE.parent / "wombot_model.toml"}"'))
+    robot_file.write_text(ROBOT_TEXT.replace("[control]\n", '[control]\nuncertainty = "joint"\n'))
     setup = load_setup(robot_file)
     planner = create_planner(setup.config, setup.model)
     assert planner.settings.uncertainty == "joint"

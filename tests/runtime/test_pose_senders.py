@@ -19,7 +19,7 @@ from disco_hw.runtime.supervisor import UserRequest
 from drivers.types import PoseSample
 from tests.drive.test_hand_pilot import Hand
 from tests.drivers.waiting import free_port
-from tests.runtime.simulated import ROBOT_FILE, simulated_stack
+from tests.runtime.simulated import ROBOT_TEXT, simulated_stack
 from tests.tables import thinned
 from tools.faults.run import circling_planner
 
@@ -50,10 +50,7 @@ class Bench:
     def __init__(self, directory, lines=""):
         self.port = free_port(socket.SOCK_DGRAM)
         file = directory / "robot.toml"
-        text = ROBOT_FILE.read_text(encoding="utf-8").replace(
-            'file = "wombot_model.toml"', f'file = "{ROBOT_FILE.parent / "wombot_model.toml"}"'
-        )
-        file.write_text(f'{text}\n[pose]\nsource = "udp"\nport = {self.port}\n{lines}', encoding="utf-8")
+        file.write_text(f'{ROBOT_TEXT}\n[pose]\nsource = "udp"\nport = {self.port}\n{lines}', encoding="utf-8")
         self.stack = simulated_stack(circling_planner(load_setup(file)), robot_file=file, needs_pose=True)
         self.senders = []
         self._advance = self.stack.robot.advance
@@ -280,10 +277,7 @@ def test_a_drive_whose_heading_is_left_out_on_the_way_is_replayed_bit_for_bit(tm
 
 def test_a_first_pose_that_is_not_where_the_wheels_led_to_from_the_origin_stops_the_task(tmp_path):
     file = tmp_path / "robot.toml"
-    text = ROBOT_FILE.read_text(encoding="utf-8").replace(
-        'file = "wombot_model.toml"', f'file = "{ROBOT_FILE.parent / "wombot_model.toml"}"'
-    )
-    file.write_text(f"{text}\n[estimation]\npose_required = false\n", encoding="utf-8")
+    file.write_text(f"{ROBOT_TEXT}\n[estimation]\npose_required = false\n", encoding="utf-8")
     stack = simulated_stack(circling_planner(load_setup(file)), robot_file=file)
     received, enabled = stack.core.pose_source.receive, []
     stack.core.pose_source.receive = lambda now_ns, poses: received(now_ns, poses) if enabled else []

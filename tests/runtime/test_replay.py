@@ -20,7 +20,7 @@ from disco_hw.model import EffectSetting, load_model, save_model
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.supervisor import UserRequest
-from tests.runtime.simulated import simulated_stack
+from tests.runtime.simulated import ROBOT_TEXT, simulated_stack
 from tests.tables import thinned
 
 ROBOTS = SHIPPED_ROBOT.parent
@@ -66,8 +66,7 @@ def test_the_same_robot_gives_the_same_bits(tmp_path, ticks):
 
 @pytest.mark.thorough
 def test_what_no_parameter_explains_is_recorded_and_replays_bit_for_bit(tmp_path):
-    text = (ROBOTS / "wombot.toml").read_text().replace("rate_hz = 50.0", "rate_hz = 50.0\ndisturbance = true")
-    text = text.replace("wombot_model.toml", str(ROBOTS / "wombot_model.toml"))
+    text = ROBOT_TEXT.replace("rate_hz = 50.0", "rate_hz = 50.0\ndisturbance = true")
     (tmp_path / "robot.toml").write_text(text)
     stack = simulated_stack(robot_file=tmp_path / "robot.toml")
     stack.run(1.5)
@@ -122,8 +121,7 @@ def test_a_follower_takes_over_from_a_planner_that_finds_nothing_and_replays_bit
         return valid and not 60 <= self.step_number < 260
 
     monkeypatch.setattr(Optimiser, "step", failing)
-    text = (ROBOTS / "wombot.toml").read_text().replace("rate_hz = 50.0", 'rate_hz = 50.0\nfallback = "lqr"')
-    text = text.replace("wombot_model.toml", str(ROBOTS / "wombot_model.toml"))
+    text = ROBOT_TEXT.replace("rate_hz = 50.0", 'rate_hz = 50.0\nfallback = "lqr"')
     (tmp_path / "robot.toml").write_text(text)
     stack = simulated_stack(robot_file=tmp_path / "robot.toml")
     stack.run(1.5)

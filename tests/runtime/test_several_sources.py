@@ -17,7 +17,7 @@ from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
 from drivers.types import PoseSample
-from tests.runtime.simulated import ROBOT_FILE, simulated_stack
+from tests.runtime.simulated import ROBOT_FILE, ROBOT_TEXT, simulated_stack
 
 
 @pytest.fixture
@@ -29,10 +29,7 @@ def port():
 
 def robot_toml(directory, lines):
     path = directory / "robot.toml"
-    text = ROBOT_FILE.read_text(encoding="utf-8").replace(
-        'file = "wombot_model.toml"', f'file = "{ROBOT_FILE.parent / "wombot_model.toml"}"'
-    )
-    path.write_text(f"{text}\n{lines}", encoding="utf-8")
+    path.write_text(f"{ROBOT_TEXT}\n{lines}", encoding="utf-8")
     return path
 
 
