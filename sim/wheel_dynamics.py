@@ -337,8 +337,8 @@ def _advance(
                         wheel["stuck"] = 0
                 profile_before = wheel["profile"]
                 start = _profile(p, wheel, reference, dt)
-                at_once = start != profile_before
-                acceleration = 0.0 if at_once else (wheel["profile"] - profile_before) / dt
+                is_immediate = start != profile_before
+                acceleration = 0.0 if is_immediate else (wheel["profile"] - profile_before) / dt
                 _track(p, wheel, acceleration, load, dt)
                 crossed = profile_before * wheel["profile"] <= 0.0 and profile_before != 0.0
                 resting = crossed or abs(wheel["profile"]) < REST_RAD_S

@@ -316,9 +316,10 @@ def table(status: Mapping[str, Any]) -> Group:
         Text(f"command {command[0]:+.1f} {command[1]:+.1f}  wheels {measured} rad/s"),
         Text(drive["words"]),
         Text(drive["task"]),
-        items,
-        Text(drive["coverage_words"]),
+        # The table is longer than a small terminal, which cuts off the end.
         *(Text(message, "dim") for message in drive["messages"]),
+        Text(drive["coverage_words"]),
+        items,
     )
 
 

@@ -56,7 +56,7 @@ def export(path: Path, out: Path, as_json: bool) -> str:
         rows = write_csv(drive, out, ticks_per_rev(log))
     if as_json:
         return json.dumps({"out": str(out), "rows": rows, "segments": drive.segments, "notes": drive.notes})
-    return "\n".join([f"{out}: {rows} rows, {drive.segments} segments", *drive.notes])
+    return "\n".join([f"{out}: {rows} rows, {drive.segments} segment{'s' * (drive.segments != 1)}", *drive.notes])
 
 
 def export_rosbag(path: Path, out: Path, as_json: bool) -> str:
@@ -68,7 +68,9 @@ def export_rosbag(path: Path, out: Path, as_json: bool) -> str:
         messages = write_rosbag(drive, out, first_ns + log.metadata.wall_offset_ns, nominal_geometry(log))
     if as_json:
         return json.dumps({"out": str(out), "messages": messages, "segments": drive.segments, "notes": drive.notes})
-    return "\n".join([f"{out}: {messages} messages, {drive.segments} segments", *drive.notes])
+    return "\n".join(
+        [f"{out}: {messages} messages, {drive.segments} segment{'s' * (drive.segments != 1)}", *drive.notes]
+    )
 
 
 def _controller(record: Controller) -> str:

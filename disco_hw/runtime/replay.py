@@ -138,7 +138,7 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
                 pipeline.set_task(changed.planned(setup.config.control.mode), line_m)
             for change in (entry.record for entry in recorded if isinstance(entry.record, BeliefChange)):
                 apply_geometry(pipeline, setup.model, geometry_of(change))
-            area.take(recorded)
+            area.apply(recorded)
             outcome = _replay_tick(pipeline, recorded, area.begin(recorded[0].now_ns))
             ticks += 1
             compared, difference = _compare(tick, recorded[0].now_ns, recorded, outcome, tolerance)
@@ -175,8 +175,8 @@ class _ReplayedArea:
         self._obstacles = Obstacles()
         self._overridden = False
 
-    def take(self, recorded: Sequence[Entry]) -> None:
-        """Take in what a tick's records say of them."""
+    def apply(self, recorded: Sequence[Entry]) -> None:
+        """Apply what a tick's records say of them."""
         self._overridden = False
         for entry in recorded:
             match entry.record:

@@ -109,7 +109,7 @@ def test_recover_says_what_came_over_and_what_not(cut, log, tmp_path):
 def test_export_writes_the_csv(log, tmp_path):
     text = export(log, tmp_path / "a.csv", as_json=False)
     header = (tmp_path / "a.csv").read_text(encoding="utf-8").splitlines()[0]
-    assert "rows, 1 segments" in text
+    assert "rows, 1 segment\n" in text + "\n"
     assert header.startswith("t_s,cmd_left_rad_s,cmd_right_rad_s,enc_left_ticks,enc_right_ticks,enc_left_rad_s")
     plain = json.loads(export(log, tmp_path / "b.csv", as_json=True))
     assert plain["rows"] == len((tmp_path / "b.csv").read_text(encoding="utf-8").splitlines()) - 1

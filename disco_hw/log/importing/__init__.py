@@ -171,7 +171,8 @@ class Imported:
 
     def as_text(self) -> str:
         """Return the result as lines: warnings first, then what was written, then notes."""
-        written = f"{self.out}: {self.records} records, {self.duration_s:.1f} s, {self.segments} segments"
+        segments = f"{self.segments} segment{'s' * (self.segments != 1)}"
+        written = f"{self.out}: {self.records} records, {self.duration_s:.1f} s, {segments}"
         notes = (f"note: {note}" for note in self.notes if note not in self._warnings)
         return "\n".join([*self._warnings, written, *notes])
 
