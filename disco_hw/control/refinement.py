@@ -62,7 +62,7 @@ class Refinement:
         self._compiled: dict[str, Callable[..., float]] = {}
         self._last: Array | None = None
         self._last_ns = 0
-        self._progress = Progress(self._horizon_s)
+        self._progress = CoveredWay(self._horizon_s)
         self._buffers: Buffers | None = None
 
     @property
@@ -149,7 +149,7 @@ class Refinement:
         return entry(*arguments)
 
 
-class Progress:
+class CoveredWay:
     """The part of the way along the line that the robot covers, as a mean over about `horizon_s`."""
 
     def __init__(self, horizon_s: float) -> None:
