@@ -54,7 +54,11 @@ class UserRequest(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class SupervisorSettings:
-    """Ages, times and bounds of the supervisor; what motion requires, unless it is by hand."""
+    """Ages, times and bounds of the supervisor; what motion requires, unless it is by hand.
+
+    `heading_required`: the drive goes by poses. Then it stops where the heading is not known, the pose has jumped or
+    sources contradict one another. With the wheels off the ground poses disagree with them, and are not needed.
+    """
 
     telemetry_zero_s: float
     telemetry_disarm_s: float
@@ -275,9 +279,9 @@ class Supervisor:
         """Return why the pose does not allow the task to be followed; None if it does, or while driven by hand."""
         if inputs.by_hand:
             return None
-        if inputs.pose_jump:
+        if inputs.pose_jump and self._settings.heading_required:
             return f"{inputs.pose_jump}; {AFTER_A_JUMP}"
-        if inputs.poses_contradict:
+        if inputs.poses_contradict and self._settings.heading_required:
             return f"{inputs.poses_contradict}; find the source that is wrong and remove it from [pose] in robot.toml"
         if self._settings.heading_required and inputs.heading_missing:
             return f"heading not known; {FIND_HEADING}"

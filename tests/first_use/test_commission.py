@@ -10,6 +10,7 @@ import pytest
 from disco_hw.errors import InputError, WorkError
 from disco_hw.first_use.commission import STAGES, CommissionOptions, as_sent, run_commission, write_fields
 from disco_hw.first_use.procedure import MOST_SHARE, CommissionPilot, Procedure
+from disco_hw.log.records import Event
 from disco_hw.runtime.robot_setup import load_setup
 from sim.devices import odrive
 from sim.plant_parameters import PlantParameters
@@ -146,6 +147,19 @@ def test_an_encoder_that_does_not_count_is_named_and_nothing_is_written(tmp_path
     assert [fault.name for fault in evaluation.faults] == ["encoder dead"]
     assert "right" in evaluation.faults[0].text
     assert not evaluation.edits
+
+
+def lifted(_x, _y, _yaw):
+    """Poses of a robot whose wheels are off the ground."""
+    return 0.3, -0.2, 0.5
+
+
+@pytest.mark.parametrize("name", ["sides", "turns"])
+def test_a_robot_on_blocks_is_driven_to_the_end_though_its_poses_stand_still(tmp_path, name):
+    evaluation, run = evaluated(robot_file(tmp_path), name, Miswiring(pose=lifted))
+    assert not evaluation.faults
+    events = [record.text for _, records in run.recorder.ticks for record in records if isinstance(record, Event)]
+    assert not [text for text in events if "task stopped" in text]
 
 
 def test_a_watchdog_that_is_off_is_named(tmp_path, monkeypatch):
