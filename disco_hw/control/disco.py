@@ -70,7 +70,9 @@ class Disco:
         )
         self._guidance = Guidance(self._optimiser, settings)
         self._sampling = Sampling(self._optimiser, points.weights, settings, surroundings)
-        self._refinement = Refinement(limits, settings, points.history) if settings.refine else None
+        # With an estimated disturbance, which changes in every tick, refined commands would be restless.
+        is_refined = settings.refine and not settings.offset_free
+        self._refinement = Refinement(limits, settings, points.history) if is_refined else None
         self._set_refined_model()
         self._stopping = Stopping(settings, limits)
         # Buffers of the compiled rollout: where it begins, and how the wheels turn in it.

@@ -122,7 +122,7 @@ class DiscoSettings:
     command what its wheels were found to lose (wheel_loss.py).
     iterations_at_start: optimisation steps for the first plan after a reset.
     refine: whether a Gauss-Newton refinement in the mean of the belief improves the plan beside the task's line
-    (refinement.py).
+    (refinement.py); not together with `offset_free`.
     min_ess: effective sample size below which a step counts as collapsed: it is tried again, and reported.
     retries: further attempts after a step without a valid result; then the plan is dropped and planned anew.
     decay_s: how long the planner answers with a ramp to zero when nothing helps, before it raises NoValidControl.

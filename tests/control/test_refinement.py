@@ -118,10 +118,10 @@ def test_warming_up_compiles_the_refinement() -> None:
     assert planner.refinement.is_compiled
 
 
-def test_plans_are_refined_but_in_the_mode_of_the_paper() -> None:
-    """The paper's mode is to stay as it is."""
+def test_plans_are_refined_except_in_two_modes() -> None:
+    """The paper's mode is to stay as it is, and an estimated disturbance would make refined commands restless."""
     assert Disco(MODEL, CircleCost(radius_m=RADIUS_M), DiscoSettings(), LIMITS).refinement is not None
-    for settings in (DiscoSettings.paper(), DiscoSettings(refine=False)):
+    for settings in (DiscoSettings.paper(), DiscoSettings(refine=False), DiscoSettings(offset_free=True)):
         assert Disco(MODEL, CircleCost(radius_m=RADIUS_M), settings, LIMITS).refinement is None
 
 
