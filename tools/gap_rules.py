@@ -146,7 +146,6 @@ RULES: tuple[Rule, ...] = (
         lambda original, found: channel_search.with_unnamed(found, channel_search._body_options),
         _named,
     ),
-    Rule("names that harm predictions are pruned", search, "prune", _first, _is),
     Rule("effects of the pose source that no other log shares are left out", search, "of_every_log", _first, _is),
     Rule("a second start of the whole chain", search._Candidate, "_begins_far", _says(False)),
     Rule(

@@ -287,12 +287,6 @@ class PredictionSettings:
     Chosen: a ramp of seconds makes a lag of a second, and a fit that begins there ends there."""
     worse: float = 1.05
     """A larger ratio of errors is worse. Measured: equally good models scatter by some percent."""
-    far_worse: float = 1.25
-    """A larger ratio is worse whatever the scatter. Chosen."""
-    worse_sigmas: float = 2.0
-    """Standard deviations of the growth over blocks from which on it is worse. Chosen: one in twenty."""
-    most_changes: int = 4
-    """At most so many names are dropped or replaced as predictions are better without. Chosen."""
     standing_m_s: float = 0.02
     """Mean speed below which the robot stands; three times this, turns on the spot. Chosen."""
     standing_rad_s: float = 0.05

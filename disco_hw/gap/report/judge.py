@@ -138,30 +138,21 @@ def candidate_evidence(analysis: GapAnalysis) -> tuple[CandidateEvidence, ...]:
                 gain, score = promise + price, 2.0 * promise
                 enough = score > selector.thresholds.score
                 verdict = "moves a 2 s prediction too little, or in one stretch only" if enough else "not needed"
-                verdict = "makes held-out predictions worse" if name in analysis.pruned else verdict
             out.append(CandidateEvidence(REGISTRY[name].channel.value, name, gain, score, verdict))
     return tuple(sorted(out, key=lambda candidate: -candidate.score))
 
 
 def residue_sentences(analysis: GapAnalysis) -> tuple[str, ...]:
-    """Describe effects that fit and were left out, and disagreements that naming has left, by regime."""
-    out = [
-        f"{REGISTRY[name].channel.value if name in REGISTRY else 'unnamed'}: {name} fits, and yet makes held-out "
-        "predictions worse: it only stands for what is missing"
-        for name in analysis.pruned
-    ]
-    for found in (analysis.wheels, analysis.body):
-        if found is not None:
-            out += remaining_disagreements(found)
-    return tuple(out)
+    """Describe disagreements that naming has left, by regime."""
+    channels = [found for found in (analysis.wheels, analysis.body) if found is not None]
+    return tuple(sentence for found in channels for sentence in remaining_disagreements(found))
 
 
 def left_out_notes(analysis: GapAnalysis, final: FinalFit, kept: GapAnalysis) -> tuple[str, ...]:
     """Sentences on what was found, with its `final` fit, and the amended model does not have."""
-    gone = kept.pruned[len(analysis.pruned) :]
-    of_this_log = of_every_log(analysis, final).pruned[len(analysis.pruned) :]
-    of_poses = [name for name in gone if name in of_this_log]
-    others = [name for name in gone if name not in of_poses]
+    of_this_log = of_every_log(analysis, final).left_out
+    of_poses = [name for name in kept.left_out if name in of_this_log]
+    others = [name for name in kept.left_out if name not in of_poses]
     out = []
     if of_poses:
         out.append(
