@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from disco_hw.effects import Channel, Effect, Parameter
+from disco_hw.effects import Channel, Parameter
 from disco_hw.effects.registry import REGISTRY
-from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.report import (
     AcrossLogs,
     CandidateEvidence,
@@ -39,7 +36,7 @@ from disco_hw.gap.search.channel_result import (
 )
 from disco_hw.gap.search.richest_model import candidates_of, parameters_of
 from disco_hw.gap.search.selection import Z95
-from disco_hw.gap.settings import GRID_STEP_S, ReportSettings
+from disco_hw.gap.settings import ReportSettings
 from disco_hw.model.terms import TERMS
 
 _PLACES = {2: ("first half of the log", "second"), 3: ("first third of the log", "second", "last")}
@@ -224,51 +221,22 @@ def blind_spot_findings(
     return tuple(sorted(spots, key=lambda spot: not spot.blind))
 
 
-Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Measured:
-    """Measured facts against which findings are checked.
-
-    The drive, its geometry (radius and axial distance, m), and names that the residuals dispute, with the reason.
-    """
-
-    drive: GriddedDrive
-    geometry: tuple[float, float]
-    disputed: Mapping[str, str] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, analysis: GapAnalysis, final: FinalFit) -> Measured:
-        """Collect the facts of a searched drive."""
-        vector = analysis.nominal_body if final.final_body is None else final.final_body.vector
-        disputed: dict[str, str] = {}
-        for found in (analysis.body, analysis.wheels):
-            disputed |= {} if found is None else disputed_names(found)
-        estimated: dict[str, ParameterEstimate] = {}
-        for channel in (final.body_estimates, final.wheel_estimates):
-            estimated |= {} if channel is None else channel.by_name
-        doubted = {name: why for name, why in disputed.items() if not _confirmed(REGISTRY[name], estimated)}
-        return cls(analysis.drive, (float(vector[0]), float(vector[1])), doubted)
-
-
-def _confirmed(effect: Effect, estimated: Mapping[str, ParameterEstimate]) -> bool:
-    """Whether the other channel, from other measurements, says the same of an effect, and clearly not nothing."""
-    estimate, other = estimated.get(effect.columns[0]), estimated.get(effect.witness or "")
-    if estimate is None or other is None:
-        return False
-    nothing = effect.parameters[0].neutral
-    overlap = estimate.low <= other.high and other.low <= estimate.high
-    return overlap and not (estimate.low <= nothing <= estimate.high or other.low <= nothing <= other.high)
+def doubts(analysis: GapAnalysis) -> dict[str, str]:
+    """Return the names that the residuals of their channel dispute, each with the reason."""
+    channels = [found for found in (analysis.body, analysis.wheels) if found is not None]
+    return {name: why for found in channels for name, why in disputed_names(found).items()}
 
 
 def classify_findings(
-    effects: Iterable[EffectFinding], measured: Measured
+    effects: Iterable[EffectFinding], disputed: Mapping[str, str], settings: ReportSettings
 ) -> tuple[tuple[EffectFinding, ...], tuple[LowConfidence, ...]]:
-    """Effects that may be reported as found, and those that may not, each with the reason."""
+    """Effects that may be reported as found, and those that may not, each with the reason.
+
+    `disputed`: names that the residuals speak against, with the reason.
+    """
     sure, doubtful = [], []
     for effect in effects:
-        why = low_confidence_of(effect, measured)
+        why = low_confidence_of(effect, settings) or disputed.get(effect.name)
         if why is None:
             sure.append(effect)
         else:
@@ -276,28 +244,16 @@ def classify_findings(
     return tuple(sure), tuple(doubtful)
 
 
-def low_confidence_of(effect: EffectFinding, measured: Measured) -> str | None:
-    """Why an effect is not reported as found; None if nothing speaks against it."""
-    described, settings = REGISTRY[effect.name], measured.drive.settings.report
-    pairs = [(parameter, effect.parameters[parameter.name]) for parameter in described.parameters]
+def low_confidence_of(effect: EffectFinding, settings: ReportSettings) -> str | None:
+    """Why the values of an effect are not to be believed; None if nothing speaks against them."""
+    pairs = [(parameter, effect.parameters[parameter.name]) for parameter in REGISTRY[effect.name].parameters]
     for parameter, estimate in pairs:
         if _at_end(parameter, estimate.value, settings):
             return f"{_written(parameter, estimate)} lies at the end of its range"
     if all(is_weakly_known(parameter, estimate, settings) for parameter, estimate in pairs):
         values = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
         return f"{values} is hardly known: its interval is wider than the value"
-    if holds_no_effect(effect):
-        values = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
-        return f"{values}: its interval holds no effect"
-    return _exceeded(described, pairs[0][1], measured) or measured.disputed.get(effect.name)
-
-
-def holds_no_effect(effect: EffectFinding) -> bool:
-    """Whether the intervals of all that make an effect's size hold the value at which it does nothing."""
-    sizes = [each for each in REGISTRY[effect.name].parameters if math.isfinite(each.neutral)]
-    intervals = [(effect.parameters[each.name], each.neutral) for each in sizes]
-    # A limit does nothing only where it is infinite, which no interval holds.
-    return not REGISTRY[effect.name].is_limit and all(each.low <= none <= each.high for each, none in intervals)
+    return None
 
 
 def _at_end(parameter: Parameter, value: float, settings: ReportSettings) -> bool:
@@ -321,27 +277,3 @@ def is_weakly_known(parameter: Parameter, estimate: ParameterEstimate, settings:
 def _written(parameter: Parameter, estimate: ParameterEstimate) -> str:
     unit = "" if parameter.unit == "1" else f" {parameter.unit}"
     return f"{parameter.name} {estimate.value:.3g} [{estimate.low:.3g}, {estimate.high:.3g}]{unit}"
-
-
-def _exceeded(effect: Effect, limit: ParameterEstimate, measured: Measured) -> str | None:
-    """Describe for how long and how far the wheels exceeded a limit; None if they did not."""
-    if not effect.is_limit or effect.limited is None:
-        return None
-    drive, settings = measured.drive, measured.drive.settings.report
-    reached = effect.limited(_calm(drive), measured.geometry)
-    beyond = reached > limit.value * (1.0 + settings.worth_share)
-    seconds = float(beyond.sum()) * GRID_STEP_S
-    if seconds < settings.beyond_s:
-        return None
-    unit = effect.parameters[0].unit
-    return (
-        f"a limit of {limit.value:.3g} {unit} is exceeded for {seconds:.1f} s of this log, up to "
-        f"{float(np.quantile(reached, 0.999)):.3g} {unit}"
-    )
-
-
-def _calm(drive: GriddedDrive) -> Array:
-    """Measured wheel speeds (M, 2), means over a quarter of a second, which single readings do not move."""
-    width = round(0.25 / GRID_STEP_S)
-    kernel = np.ones(width) / width
-    return np.column_stack([np.convolve(drive.speed_rad_s[:, side], kernel, "same") for side in (0, 1)])
