@@ -15,6 +15,9 @@ GRID_STEP_S = 0.01
 """Grid of the free runs, s. Chosen: half the period of commands at 50 Hz."""
 DRIFT_S = 20.0
 """Correlation time of the slow error of a wheel's speed, s. Chosen: longer than any manoeuvre of a log."""
+# No choice at all.
+OF_MEDIAN = 1.4826
+"""Standard deviation of a normal distribution over the median of its absolute values."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,8 +194,6 @@ class SelectionSettings:
     """Whitened residuals beyond do not raise it further. Chosen."""
     silent: float = 1e-3
     """Whitened residuals below come of samples that say nothing. Chosen."""
-    most_effects: int = 8
-    """More effects are not named. Chosen."""
     profile_searches: int = 4
     """Rounds of the closer search of a profiled entry. Chosen."""
     large_share: float = 0.25
@@ -289,10 +290,8 @@ class PredictionSettings:
     """A larger ratio of errors is worse. Measured: equally good models scatter by some percent."""
     standing_m_s: float = 0.02
     """Mean speed below which the robot stands; three times this, turns on the spot. Chosen."""
-    standing_rad_s: float = 0.05
-    """Mean yaw rate below which it stands. Chosen."""
     spinning_rad_s: float = 0.1
-    """Mean yaw rate above which it turns on the spot. Chosen."""
+    """Mean yaw rate above which it turns on the spot, and below which it stands. Chosen."""
     turning_rad_s: float = 0.3
     """Mean yaw rate above which it drives a curve. Chosen."""
     speeding_m_s2: float = 0.25
@@ -307,8 +306,8 @@ class ReportSettings:
     """So many claims of what a log shows are proved by putting the effect in. Chosen: each takes a search or two."""
     speeding_rad_s2: float = 2.0
     """Growth of the wheels' speed from which on they speed up or brake. Chosen."""
-    most_regimes: int = 3
-    """At most so many are listed, the loudest. Chosen."""
+    most_listed: int = 3
+    """So many regimes, the loudest, and names are listed at most. Chosen."""
     end_share: float = 0.01
     """A value this close to where its fit had to end, in its range, is not believed. Chosen."""
     wide_share: float = 0.5

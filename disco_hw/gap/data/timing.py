@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from disco_hw.gap.data.stamp_clock import StampClock, clock_of, picked
-from disco_hw.gap.settings import GridSettings
+from disco_hw.gap.settings import OF_MEDIAN, GridSettings
 from disco_hw.jit import kernel_function, scalar_function
 from disco_hw.log.drive import Poses, Wheels
 
@@ -207,7 +207,7 @@ def mismatch_of(difference: Array, total: Array, measured: Array) -> float:
             of_b, of_a = projected(bb, ab, aa, by, ay)
         for k in range(count):
             left[k] = abs(measured[k] - of_a * difference[k] - of_b * total[k])
-        limit = 2.0 * 1.4826 * np.median(left) + 1e-9
+        limit = 2.0 * OF_MEDIAN * np.median(left) + 1e-9
     loss = 0.0
     for k in range(count):
         loss += left[k] * left[k] if left[k] < limit else limit * (2.0 * left[k] - limit)

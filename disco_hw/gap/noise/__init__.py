@@ -19,13 +19,11 @@ from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.noise.body_noise import BodyNoise, body_likelihood
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise, wheel_likelihood, whiten_wheels
-from disco_hw.gap.settings import NoiseSettings
+from disco_hw.gap.settings import OF_MEDIAN, NoiseSettings
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# A Gaussian's standard deviation over the median of its absolute values.
-_OF_MEDIAN = 1.4826
 # Values further out than so many standard deviations are single jumps, and count as that much.
 _CLIPPED_SIGMAS = 5.0
 # Samples next to each other are comparable where their distances in time differ by no more than this ratio.
@@ -251,6 +249,6 @@ def _sigma(values: Array) -> float:
     """Return the standard deviation of values about 0, with single jumps clipped."""
     if not values.size:
         return 0.0
-    rough = _OF_MEDIAN * float(np.median(np.abs(values)))
+    rough = OF_MEDIAN * float(np.median(np.abs(values)))
     largest = _CLIPPED_SIGMAS * rough if rough > 0.0 else float(np.abs(values).max())
     return float(np.sqrt((np.clip(values, -largest, largest) ** 2).mean()))

@@ -246,7 +246,7 @@ def loud_regimes(found: ChannelResult) -> list[tuple[float, str]]:
         ratio = float(now[inside].sum() / max(best[inside].sum(), 1e-9))
         if gain > price and gain > chosen.sure_sigmas * spread and ratio > 1.0 + settings.worth_share:
             loud.append((math.sqrt(ratio), name))
-    return sorted(loud, reverse=True)[: settings.most_regimes]
+    return sorted(loud, reverse=True)[: settings.most_listed]
 
 
 def gain_by_block(gains: Array, block: Index, fewest: int) -> tuple[float, float]:

@@ -174,7 +174,7 @@ def regimes_driven(channel: BodyChannel | WheelChannel, node: Index, ahead: int)
     mean, mean_turn = (size[node + ahead] - size[node]) / ahead, (turn[node + ahead] - turn[node]) / ahead
     changed = np.ptp(sliding_window_view(v, ahead)[node], axis=1)
     regimes = {
-        "standstill": (mean < settings.standing_m_s) & (mean_turn < settings.standing_rad_s),
+        "standstill": (mean < settings.standing_m_s) & (mean_turn < settings.spinning_rad_s),
         "turning on the spot": (mean < settings.standing_m_s * 3) & (mean_turn > settings.spinning_rad_s),
         "speeding up and braking": changed > settings.speeding_m_s2 * ahead * GRID_STEP_S * 0.5,
         "curves": mean_turn > settings.turning_rad_s,

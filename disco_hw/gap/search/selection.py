@@ -420,15 +420,14 @@ class Selector:
     def greedy(self, begin: Names = (), settle: Callable[[Selector, Names], None] | None = None) -> Names:
         """Forward steps only, from a set that is kept; `settle` may better the fit of a set before the next step."""
         accepted = begin or self.given
-        while len(accepted) < self.settings.most_effects:
+        while True:
             ranked = self.ranked(accepted)
             new = next((name for name in ranked if self.acceptable(accepted, (*accepted, name))), None)
             if new is None:
-                break
+                return accepted
             accepted = (*accepted, new)
             if settle is not None:
                 settle(self, accepted)
-        return accepted
 
     def select(self, begin: Names = ()) -> Names:
         """Forward, swap, backward, until nothing changes; from what is needed of a set to begin with.
@@ -437,16 +436,15 @@ class Selector:
         """
         accepted = self.needed(begin) if begin else self.given
         visited = {frozenset(accepted): accepted}
-        while len(accepted) < self.settings.most_effects:
+        while True:
             ranked = self.ranked(accepted)
             new = next((name for name in ranked if self.acceptable(accepted, (*accepted, name))), None)
             if new is None:
-                break
+                return accepted
             larger = self.needed(self.swapped((*accepted, new)))
             if frozenset(larger) in visited:
                 return min(visited.values(), key=self.priced)
             visited[frozenset(larger)] = accepted = larger
-        return accepted
 
     def priced(self, names: Names) -> float:
         """Misfit of a set in nats with half the price of its parameters."""
