@@ -120,9 +120,7 @@ def regimes_of(found: ChannelResult) -> list[Regime]:
 def candidate_evidence(analysis: GapAnalysis) -> tuple[CandidateEvidence, ...]:
     """Evidence of every named effect: of the accepted ones against their absence, of the others on top."""
     out = []
-    for found in (analysis.body, analysis.wheels):
-        if found is None:
-            continue
+    for found in analysis.channels:
         selector = found.selector
         for name in candidates_of(found.channel.layout):
             if name in found.names:
@@ -141,8 +139,7 @@ def candidate_evidence(analysis: GapAnalysis) -> tuple[CandidateEvidence, ...]:
 
 def residue_sentences(analysis: GapAnalysis) -> tuple[str, ...]:
     """Describe disagreements that naming has left, by regime."""
-    channels = [found for found in (analysis.wheels, analysis.body) if found is not None]
-    return tuple(sentence for found in channels for sentence in remaining_disagreements(found))
+    return tuple(sentence for found in analysis.channels[::-1] for sentence in remaining_disagreements(found))
 
 
 def left_out_notes(analysis: GapAnalysis, final: FinalFit, kept: GapAnalysis) -> tuple[str, ...]:
@@ -185,9 +182,7 @@ def drifting_parameters(analysis: GapAnalysis, final: FinalFit) -> tuple[str, ..
 def across_logs(analysis: GapAnalysis) -> tuple[AcrossLogs, ...]:
     """Every parameter that each of several logs determines, and whether they differ in it by more than their noise."""
     settings, out = analysis.drive.settings, []
-    for found in (analysis.body, analysis.wheels):
-        if found is None:
-            continue
+    for found in analysis.channels:
         for name, logs in in_logs(found).items():
             if logs.values.size != len(analysis.drive.log_begins_s):
                 continue
@@ -209,9 +204,8 @@ def blind_spot_findings(
     """Every effect that was not found, with the smallest size that would have been; blind ones first."""
     named = {effect.name for effect in effects}
     spots: list[BlindSpot] = []
-    for found in (analysis.wheels, analysis.body):
-        if found is not None:
-            spots += [spot for spot in blind_spots(found, top_rad_s) if spot.name not in named]
+    for found in analysis.channels[::-1]:
+        spots += [spot for spot in blind_spots(found, top_rad_s) if spot.name not in named]
     seen = {spot.name for spot in spots} | named
     for name, effect in REGISTRY.items():
         searched = analysis.wheels if effect.channel is Channel.COMMAND_TO_WHEEL else analysis.body
@@ -223,8 +217,7 @@ def blind_spot_findings(
 
 def doubts(analysis: GapAnalysis) -> dict[str, str]:
     """Return the names that the residuals of their channel dispute, each with the reason."""
-    channels = [found for found in (analysis.body, analysis.wheels) if found is not None]
-    return {name: why for found in channels for name, why in disputed_names(found).items()}
+    return {name: why for found in analysis.channels for name, why in disputed_names(found).items()}
 
 
 def classify_findings(

@@ -357,7 +357,7 @@ def _timed(ahead: Ahead, refitted: Freed) -> Freed:
 
 def _base(analysis: GapAnalysis) -> list[Fit]:
     """Fits of both channels, or of the body, without anything that is missing."""
-    return [found.base for found in (analysis.body, analysis.wheels) if found is not None]
+    return [found.base for found in analysis.channels]
 
 
 def _all_fits(analysis: GapAnalysis, final: FinalFit) -> list[Fit]:
@@ -368,11 +368,10 @@ def _all_fits(analysis: GapAnalysis, final: FinalFit) -> list[Fit]:
 
 def _by_fold(analysis: GapAnalysis, fits: Sequence[Fit]) -> dict[int, list[Array]]:
     """For each fold the vectors of the channels, fitted on the data of the others."""
-    channels = [found for found in (analysis.body, analysis.wheels) if found is not None]
     count, settings = analysis.drive.folds.count, analysis.drive.settings
     by_channel = [
         fold_vectors(one, fold_of(found.channel), count, found.selector.channel.neutral, settings)
-        for found, one in zip(channels, fits, strict=True)
+        for found, one in zip(analysis.channels, fits, strict=True)
     ]
     return {fold: [vectors[fold] for vectors in by_channel] for fold in range(count)}
 

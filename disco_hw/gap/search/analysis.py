@@ -119,16 +119,19 @@ class GapAnalysis:
     left_out: tuple[str, ...] = ()
 
     @property
+    def channels(self) -> tuple[ChannelResult, ...]:
+        """Results of the channels that could be judged, the body first."""
+        return tuple(found for found in (self.body, self.wheels) if found is not None)
+
+    @property
     def found_any(self) -> bool:
         """Whether anything is missing in the model, by name or without."""
-        channels = [found for found in (self.body, self.wheels) if found is not None]
-        return any(found.unnamed or set(found.names) - set(found.selector.given) for found in channels)
+        return any(found.unnamed or set(found.names) - set(found.selector.given) for found in self.channels)
 
     @property
     def adds_to_timed(self) -> bool:
         """Whether anything is missing beyond a delay and a lag."""
-        channels = [found for found in (self.body, self.wheels) if found is not None]
-        return any(found.unnamed or set(found.names) - {*found.selector.given, *DELAY_NAMES} for found in channels)
+        return any(found.unnamed or set(found.names) - {*found.selector.given, *DELAY_NAMES} for found in self.channels)
 
 
 @dataclass(frozen=True)
