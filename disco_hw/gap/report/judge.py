@@ -240,20 +240,10 @@ def classify_findings(
 def low_confidence_of(effect: EffectFinding, settings: ReportSettings) -> str | None:
     """Why the values of an effect are not to be believed; None if nothing speaks against them."""
     pairs = [(parameter, effect.parameters[parameter.name]) for parameter in REGISTRY[effect.name].parameters]
-    for parameter, estimate in pairs:
-        if _at_end(parameter, estimate.value, settings):
-            return f"{_written(parameter, estimate)} lies at the end of its range"
     if all(is_weakly_known(parameter, estimate, settings) for parameter, estimate in pairs):
         values = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
         return f"{values} is hardly known: its interval is wider than the value"
     return None
-
-
-def _at_end(parameter: Parameter, value: float, settings: ReportSettings) -> bool:
-    """Whether a value lies where the fit was not allowed to go further; neutral is no such end."""
-    low = parameter.low if parameter.least_fitted is None else parameter.least_fitted
-    ends = [end for end in (low, parameter.high) if math.isfinite(end) and end != parameter.neutral]
-    return any(abs(value - end) <= settings.end_share * abs(end) for end in ends)
 
 
 def is_weakly_known(parameter: Parameter, estimate: ParameterEstimate, settings: ReportSettings) -> bool:
