@@ -126,10 +126,11 @@ class NoiseSettings:
     wheel_iterations: int = 25
     """Steps of the search for the wheels' noise at most. Chosen: it is flat by then."""
     outlier: float = 5.0
-    """Poses beyond so many standard deviations are left out. Chosen: one in two million by chance."""
+    """Poses beyond so many standard deviations are left out, differences of samples count as that much. Chosen: one in
+    two million by chance."""
     poor_fit: float = 1.5
-    """Mean square of whitened residuals from which on a fit or a regime disagrees, and a stretch is weighed down.
-    Chosen: noise alone has one."""
+    """Mean square of whitened residuals from which on a fit or a regime disagrees, plainer noise is assumed, and a
+    stretch is weighed down. Chosen: noise alone has one."""
     smooth_samples: int = 25
     """The local size of residuals is a mean over so many samples either side. Chosen."""
     command_jitter_ratio: float = 2.0
@@ -211,8 +212,6 @@ class SelectionSettings:
     less may be chance."""
     fewest_blocks: int = 5
     """Fewer blocks say nothing about their scatter. Chosen."""
-    far_off: float = 1.5
-    """Where the accepted set costs so many times what is expected, plainer noise is assumed. Chosen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,7 +308,7 @@ class ReportSettings:
     most_listed: int = 3
     """So many regimes, the loudest, and names are listed at most. Chosen."""
     end_share: float = 0.01
-    """A value this close to where its fit had to end, in its range, is not believed. Chosen."""
+    """Commands that come early or late by this close to the most that is plausible do so by more. Chosen."""
     wide_share: float = 0.5
     """A value whose half interval, or whose change from one regime to its opposite, is over so much of its distance
     from none says too little. Chosen: nobody who is told the value expects it."""
