@@ -85,16 +85,8 @@ def pose_delay_s(wheels: Wheels, poses: Poses, settings: GridSettings) -> float:
     by those of the wheels (two regressions, robust by Huber's weights; their likelihoods, with unknown variances, are
     added). 0 where the poses are too few or where no delay stands out.
     """
-    steps = round(settings.most_pose_delay_s / settings.delay_step_s)
-    delays: Array = settings.delay_step_s * np.arange(-steps, steps + 1, dtype=np.float64)
-    mismatch = _mismatches(wheels, poses, delays, settings)
-    best = int(np.argmin(mismatch))
-    ordinary = mismatch[np.isfinite(mismatch)]
-    if not ordinary.size or float(np.median(ordinary)) - mismatch[best] < settings.least_delay_nats:
-        return 0.0
-    return lowest(lambda some: _mismatches(wheels, poses, some, settings), float(delays[best]), settings.delay_step_s)[
-        0
-    ]
+    found_s = standing_out(lambda some: _mismatches(wheels, poses, some, settings), settings.delay_step_s, settings)
+    return found_s or 0.0
 
 
 def tick_s(t_s: Array, rows_s: Array) -> float:
@@ -162,6 +154,22 @@ def apart(t_s: Array, segment: Index, span_s: float) -> tuple[Index, Index]:
     second = later[first]
     near = (segment[first] == segment[second]) & (t_s[second] - t_s[first] < 1.6 * span_s)
     return first[near], second[near]
+
+
+def scanned_delays(most_s: float, step_s: float) -> Array:
+    """Delays from minus the most to the most, (D,)."""
+    steps = round(most_s / step_s)
+    return np.asarray(step_s * np.arange(-steps, steps + 1, dtype=np.float64))
+
+
+def standing_out(misfits: Callable[[Array], Array], step_s: float, settings: GridSettings) -> float | None:
+    """Return the delay (s) of the least mismatch, of all that are scanned in such steps; None if none stands out."""
+    delays = scanned_delays(settings.most_pose_delay_s, step_s)
+    mismatch = misfits(delays)
+    best, ordinary = int(np.argmin(mismatch)), mismatch[np.isfinite(mismatch)]
+    if not ordinary.size or float(np.median(ordinary)) - mismatch[best] < settings.least_delay_nats:
+        return None
+    return lowest(misfits, float(delays[best]), step_s)[0]
 
 
 def lowest(misfits: Callable[[Array], Array], about_s: float, step_s: float) -> tuple[float, float]:
