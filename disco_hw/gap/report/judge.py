@@ -22,6 +22,7 @@ from disco_hw.gap.report.misspecification import (
     Regime,
     describe,
     disputed_names,
+    gain_of,
     regimes,
     remaining_disagreements,
 )
@@ -74,9 +75,9 @@ def _finding(name: str, found: ChannelResult, estimated: ChannelEstimates, same:
 
 def _score(found: ChannelResult, name: str) -> float:
     """Evidence score of one accepted effect, the others kept."""
-    rest = tuple(other for other in found.names if other != name)
     if name in found.selector.given:
         return 0.0
+    rest = tuple(other for other in found.names if other != name)
     return found.selector.evidence(rest, found.names).score
 
 
@@ -124,9 +125,7 @@ def candidate_evidence(analysis: GapAnalysis) -> tuple[CandidateEvidence, ...]:
         selector = found.selector
         for name in candidates_of(found.channel.layout):
             if name in found.names:
-                rest = tuple(other for other in found.names if other != name)
-                gain, verdict = selector.exact(rest).cost - found.fit.cost, "accepted"
-                score = 0.0 if name in selector.given else selector.evidence(rest, found.names).score
+                gain, score, verdict = gain_of(found, name), _score(found, name), "accepted"
             else:
                 price = 0.5 * parameters_of((name,)) * math.log(max(found.channel.count, 2))
                 promise = selector.promise(found.names, name)

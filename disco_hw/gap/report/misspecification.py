@@ -51,7 +51,7 @@ def disputed_names(found: ChannelResult) -> dict[str, str]:
     return out
 
 
-def _gain(found: ChannelResult, name: str) -> float:
+def gain_of(found: ChannelResult, name: str) -> float:
     """Return the gain of a name in nats, with the others kept."""
     rest = tuple(other for other in found.names if other != name)
     return found.selector.exact(rest).cost - found.fit.cost
@@ -71,7 +71,7 @@ def _takes_little(found: ChannelResult, name: str) -> str | None:
         return None
     best = 0.5 * float(found.richest @ found.richest)
     left = found.fit.cost - best - found.richest_parameters
-    explained = max(_gain(found, name), 0.0)
+    explained = max(gain_of(found, name), 0.0)
     if explained > settings.worth_share * (explained + left):
         return None
     return f"it takes {100.0 * explained / (explained + left):.2g} % of what its channel lacks"

@@ -86,12 +86,8 @@ class StagePredictions:
         return table
 
 
-def stage_predictions(analysis: GapAnalysis, final: FinalFit | None = None) -> StagePredictions:
-    """Predictions of `refitted` and `amended`, the channels fitted apart: quick, for names that compete.
-
-    Of an analysis in which the body was judged; `final` is its final fit, if it is made already.
-    """
-    final = final_fit(analysis) if final is None else final
+def stage_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePredictions:
+    """Predictions of `refitted` and `amended`, the channels fitted apart, where the body was judged."""
     body, wheels = analysis.body, analysis.wheels
     assert body is not None
     assert final.final_body is not None

@@ -6,7 +6,7 @@ without one of the names.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -210,8 +210,9 @@ def least_evident_first(analysis: GapAnalysis) -> list[tuple[str, str | None]]:
         found: ChannelResult | None = getattr(analysis, which)
         if found is None:
             continue
-        for name, rest in each_name(found):
-            if name not in DELAY_NAMES:
+        for name in found.names:
+            if name not in found.selector.given and name not in DELAY_NAMES:
+                rest = tuple(other for other in found.names if other != name)
                 out.append((found.selector.evidence(rest, found.names).score, which, name))
         if found.unnamed:
             out.append((max(term.evidence.score for term in found.unnamed), which, None))
@@ -226,13 +227,6 @@ def lacking(analysis: GapAnalysis, which: str, name: str | None) -> GapAnalysis:
         return _changed(analysis, found, replace(found, names=rest), (name,))
     bare = replace(found, selector=found.plain or found.selector, unnamed=(), plain=None)
     return _changed(analysis, found, bare, tuple(term.form for term in found.unnamed))
-
-
-def each_name(found: ChannelResult) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Every name that was found, and the others."""
-    for name in found.names:
-        if name not in found.selector.given:
-            yield name, tuple(other for other in found.names if other != name)
 
 
 def _changed(analysis: GapAnalysis, old: ChannelResult, new: ChannelResult, left_out: tuple[str, ...]) -> GapAnalysis:

@@ -417,12 +417,16 @@ class Selector:
         promises = {name: self.promise(accepted, name) for name in rest}
         return sorted((name for name in rest if promises[name] > 0.0), key=lambda name: -promises[name])
 
+    def _next(self, accepted: Names) -> str | None:
+        """Return the most promising candidate that is accepted on top of a set, or None."""
+        acceptable = (name for name in self.ranked(accepted) if self.acceptable(accepted, (*accepted, name)))
+        return next(acceptable, None)
+
     def greedy(self, begin: Names = (), settle: Callable[[Selector, Names], None] | None = None) -> Names:
         """Forward steps only, from a set that is kept; `settle` may better the fit of a set before the next step."""
         accepted = begin or self.given
         while True:
-            ranked = self.ranked(accepted)
-            new = next((name for name in ranked if self.acceptable(accepted, (*accepted, name))), None)
+            new = self._next(accepted)
             if new is None:
                 return accepted
             accepted = (*accepted, new)
@@ -437,8 +441,7 @@ class Selector:
         accepted = self.needed(begin) if begin else self.given
         visited = {frozenset(accepted): accepted}
         while True:
-            ranked = self.ranked(accepted)
-            new = next((name for name in ranked if self.acceptable(accepted, (*accepted, name))), None)
+            new = self._next(accepted)
             if new is None:
                 return accepted
             larger = self.needed(self.swapped((*accepted, new)))
