@@ -29,7 +29,7 @@ from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap import model_of, offered_stage, search_log, written_of
 from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.report import EffectFinding
-from disco_hw.gap.report.judge import classify_findings, doubts, effect_findings, unnamed_findings
+from disco_hw.gap.report.judge import Measured, classify_findings, effect_findings, unnamed_findings
 from disco_hw.gap.report.page import other_known_symptoms
 from disco_hw.gap.search import joint_predictions
 from disco_hw.gap.search.analysis import final_fit
@@ -325,7 +325,7 @@ def work(hidden: str, seed: int, robot: Robot = ROBOTS["middle"]) -> Result:
     analysis, _ = search_log(seen.as_drive(), nominal)
     final = final_fit(analysis)
     fits, unnamed = effect_findings(analysis, final), unnamed_findings(analysis)
-    named, doubtful = classify_findings(fits, doubts(analysis), DEFAULT_SETTINGS.report)
+    named, doubtful = classify_findings(fits, Measured.of(analysis, final))
     written = written_of(analysis, final, joint_predictions(analysis, final))
     assert written[2] is not None
     kept = written[0] if written[2].kept is None else written[2].kept[0]

@@ -30,12 +30,12 @@ from disco_hw.gap.report import (
 from disco_hw.gap.report.amend import amended_model, at_joint_fit, carried_terms, channel_estimates, simple_model
 from disco_hw.gap.report.blind_spots import being_proved, boldest_claims, finder
 from disco_hw.gap.report.judge import (
+    Measured,
     across_logs,
     blind_spot_findings,
     candidate_evidence,
     channel_findings,
     classify_findings,
-    doubts,
     drifting_parameters,
     effect_findings,
     left_out_notes,
@@ -92,7 +92,7 @@ def find_gap(
     report_progress("intervals, blind spots and the gap on held-out data")
     final = final_fit(analysis)
     named, unnamed = effect_findings(analysis, final), unnamed_findings(analysis)
-    effects, doubtful = classify_findings(named, doubts(analysis), settings.report)
+    effects, doubtful = classify_findings(named, Measured.of(analysis, final))
     spots = blind_spot_findings(analysis, named, top_rad_s)
     claims = boldest_claims(spots, settings.report.proved_claims) if prove else ()
     if claims:
@@ -239,7 +239,7 @@ def missing_effects(log: DriveLog, model: Model) -> tuple[str, ...]:
     check_consistency(log, model)
     analysis, _ = search_log(log, model)
     final = final_fit(analysis)
-    sure, doubtful = classify_findings(effect_findings(analysis, final), doubts(analysis), DEFAULT_SETTINGS.report)
+    sure, doubtful = classify_findings(effect_findings(analysis, final), Measured.of(analysis, final))
     names = tuple(effect.name for effect in sure or doubtful)
     if analysis.body is None or not names:
         return names

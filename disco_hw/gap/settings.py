@@ -315,6 +315,8 @@ class ReportSettings:
     limit_share: float = 0.75
     """So near a limit it shows: where this share of what the robot can do is asked, and where an interval is no wider
     than from it to there. Chosen."""
+    beyond_s: float = 0.5
+    """For so long in all at least. Chosen."""
     form_apart_sigmas: float = 3.5
     """By so many standard deviations. Chosen: of some twenty comparisons in a log one in a hundred logs by chance."""
     worth_share: float = 0.1

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
-from disco_hw.effects import Channel, Parameter
+from disco_hw.effects import Channel, Effect, Parameter
 from disco_hw.effects.registry import REGISTRY
+from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.report import (
     AcrossLogs,
     CandidateEvidence,
@@ -37,7 +40,7 @@ from disco_hw.gap.search.channel_result import (
 )
 from disco_hw.gap.search.richest_model import candidates_of, parameters_of
 from disco_hw.gap.search.selection import Z95
-from disco_hw.gap.settings import ReportSettings
+from disco_hw.gap.settings import GRID_STEP_S, ReportSettings
 from disco_hw.model.terms import TERMS
 
 _PLACES = {2: ("first half of the log", "second"), 3: ("first third of the log", "second", "last")}
@@ -214,21 +217,35 @@ def blind_spot_findings(
     return tuple(sorted(spots, key=lambda spot: not spot.blind))
 
 
-def doubts(analysis: GapAnalysis) -> dict[str, str]:
-    """Return the names that the residuals of their channel dispute, each with the reason."""
-    return {name: why for found in analysis.channels for name, why in disputed_names(found).items()}
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Measured facts against which findings are checked.
+
+    The drive, its geometry (radius and axial distance, m), and names that the residuals dispute, with the reason.
+    """
+
+    drive: GriddedDrive
+    geometry: tuple[float, float]
+    disputed: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, analysis: GapAnalysis, final: FinalFit) -> Measured:
+        """Collect the facts of a searched drive."""
+        vector = analysis.nominal_body if final.final_body is None else final.final_body.vector
+        disputed = {name: why for found in analysis.channels for name, why in disputed_names(found).items()}
+        return cls(analysis.drive, (float(vector[0]), float(vector[1])), disputed)
 
 
 def classify_findings(
-    effects: Iterable[EffectFinding], disputed: Mapping[str, str], settings: ReportSettings
+    effects: Iterable[EffectFinding], measured: Measured
 ) -> tuple[tuple[EffectFinding, ...], tuple[LowConfidence, ...]]:
-    """Effects that may be reported as found, and those that may not, each with the reason.
-
-    `disputed`: names that the residuals speak against, with the reason.
-    """
+    """Effects that may be reported as found, and those that may not, each with the reason."""
     sure, doubtful = [], []
     for effect in effects:
-        why = low_confidence_of(effect, settings) or disputed.get(effect.name)
+        why = low_confidence_of(effect, measured)
         if why is None:
             sure.append(effect)
         else:
@@ -236,13 +253,14 @@ def classify_findings(
     return tuple(sure), tuple(doubtful)
 
 
-def low_confidence_of(effect: EffectFinding, settings: ReportSettings) -> str | None:
-    """Why the values of an effect are not to be believed; None if nothing speaks against them."""
-    pairs = [(parameter, effect.parameters[parameter.name]) for parameter in REGISTRY[effect.name].parameters]
+def low_confidence_of(effect: EffectFinding, measured: Measured) -> str | None:
+    """Why an effect is not reported as found; None if nothing speaks against it."""
+    described, settings = REGISTRY[effect.name], measured.drive.settings.report
+    pairs = [(parameter, effect.parameters[parameter.name]) for parameter in described.parameters]
     if all(is_weakly_known(parameter, estimate, settings) for parameter, estimate in pairs):
         values = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
         return f"{values} is hardly known: its interval is wider than the value"
-    return None
+    return _exceeded(described, pairs[0][1], measured) or measured.disputed.get(effect.name)
 
 
 def is_weakly_known(parameter: Parameter, estimate: ParameterEstimate, settings: ReportSettings) -> bool:
@@ -259,3 +277,27 @@ def is_weakly_known(parameter: Parameter, estimate: ParameterEstimate, settings:
 def _written(parameter: Parameter, estimate: ParameterEstimate) -> str:
     unit = "" if parameter.unit == "1" else f" {parameter.unit}"
     return f"{parameter.name} {estimate.value:.3g} [{estimate.low:.3g}, {estimate.high:.3g}]{unit}"
+
+
+def _exceeded(effect: Effect, limit: ParameterEstimate, measured: Measured) -> str | None:
+    """Describe for how long and how far the wheels exceeded a limit; None if they did not."""
+    if not effect.is_limit or effect.limited is None:
+        return None
+    drive, settings = measured.drive, measured.drive.settings.report
+    reached = effect.limited(_calm(drive), measured.geometry)
+    beyond = reached > limit.value * (1.0 + settings.worth_share)
+    seconds = float(beyond.sum()) * GRID_STEP_S
+    if seconds < settings.beyond_s:
+        return None
+    unit = effect.parameters[0].unit
+    return (
+        f"a limit of {limit.value:.3g} {unit} is exceeded for {seconds:.1f} s of this log, up to "
+        f"{float(np.quantile(reached, 0.999)):.3g} {unit}"
+    )
+
+
+def _calm(drive: GriddedDrive) -> Array:
+    """Measured wheel speeds (M, 2), means over a quarter of a second, which single readings do not move."""
+    width = round(0.25 / GRID_STEP_S)
+    kernel = np.ones(width) / width
+    return np.column_stack([np.convolve(drive.speed_rad_s[:, side], kernel, "same") for side in (0, 1)])

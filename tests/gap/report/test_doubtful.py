@@ -1,13 +1,21 @@
 """What is not known, or contradicted by its own log, is listed with the reason and not told as found."""
 
+import numpy as np
 import pytest
 
 from disco_hw.gap.report import EffectFinding
-from disco_hw.gap.report.judge import classify_findings, low_confidence_of
+from disco_hw.gap.report.judge import Measured, classify_findings, low_confidence_of
 from disco_hw.gap.search.channel_result import ParameterEstimate
-from disco_hw.gap.settings import DEFAULT_SETTINGS
+from tests.gap.synthetic import line_of
 
-SETTINGS = DEFAULT_SETTINGS.report
+GEOMETRY = (0.06, 0.4)
+
+
+def drive(fastest=4.0, seconds=40.0):
+    """Wheels that turn at 3 rad/s, and for two seconds at the fastest, on the spot."""
+    speed = np.full((round(seconds * 100), 2), 3.0)
+    speed[500:700] = -fastest, fastest
+    return Measured(line_of(speed), GEOMETRY)
 
 
 def effect(name, **values):
@@ -24,6 +32,11 @@ def effect(name, **values):
         ("battery_sag", {"loss": (0.9, -2e11, 2e11)}, "wider than the value"),
         ("speed_limit", {"limit_rad_s": (4.2, 4.1, 4.3)}, None),
         ("speed_limit", {"limit_rad_s": (4.2, 2.4, 6.0)}, "wider than the value"),
+        ("speed_limit", {"limit_rad_s": (3.5, 3.4, 3.6)}, "s of this log, up to 4 rad/s"),
+        # However wide its interval.
+        ("speed_limit", {"limit_rad_s": (3.5, 2.9, 4.1)}, "s of this log, up to 4 rad/s"),
+        ("yaw_rate_limit", {"limit_rad_s": (0.15, 0.14, 0.16)}, "is exceeded"),
+        ("yaw_rate_limit", {"limit_rad_s": (1.2, 1.15, 1.25)}, None),
         ("wheel_gain", {"left": (0.0, -0.1, 0.1), "right": (0.05, 0.04, 0.06)}, None),
         ("wheel_gain", {"left": (0.01, -0.1, 0.1), "right": (0.05, -0.04, 0.15)}, "wider than the value"),
         (
@@ -33,20 +46,23 @@ def effect(name, **values):
         ),
     ],
 )
-def test_only_what_is_known_is_told(name, values, why):
-    found = low_confidence_of(effect(name, **values), SETTINGS)
+def test_only_what_is_known_and_not_contradicted_is_told(name, values, why):
+    found = low_confidence_of(effect(name, **values), drive())
     assert (found is None) == (why is None)
     assert why is None or why in found
 
 
+def test_a_moment_beyond_a_limit_contradicts_nothing():
+    speed = np.full((4000, 2), 3.0)
+    speed[1000:1004] = 6.0
+    assert (
+        low_confidence_of(effect("speed_limit", limit_rad_s=(3.2, 3.1, 3.3)), Measured(line_of(speed), GEOMETRY))
+        is None
+    )
+
+
 def test_effects_are_parted_and_keep_their_order():
-    effects = [
-        effect("motor_lag", tau_s=(0.2, 0.19, 0.21)),
-        effect("speed_limit", limit_rad_s=(3.5, 3.4, 3.6)),
-        effect("deadband", width_rad_s=(0.3, 0.01, 0.59)),
-    ]
-    sure, doubtful = classify_findings(effects, {"speed_limit": "it is exceeded"}, SETTINGS)
+    effects = [effect("motor_lag", tau_s=(0.2, 0.19, 0.21)), effect("speed_limit", limit_rad_s=(3.5, 3.4, 3.6))]
+    sure, doubtful = classify_findings(effects, drive())
     assert [one.name for one in sure] == ["motor_lag"]
-    assert [one.name for one in doubtful] == ["speed_limit", "deadband"]
-    assert doubtful[0].why == "it is exceeded"
-    assert "hardly known" in doubtful[1].why
+    assert [(one.name, "exceeded" in one.why) for one in doubtful] == [("speed_limit", True)]
