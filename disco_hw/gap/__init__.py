@@ -44,7 +44,7 @@ from disco_hw.gap.report.judge import (
 )
 from disco_hw.gap.report.page import as_text, page
 from disco_hw.gap.report.remains import Remains
-from disco_hw.gap.search import StagePredictions, joint_predictions, prune, stage_predictions
+from disco_hw.gap.search import StagePredictions, joint_predictions, stage_predictions
 from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, final_fit
 from disco_hw.gap.search.channel_result import ChannelEstimates
 from disco_hw.gap.search.channel_search import search_body, search_wheels, that_models_hold
@@ -163,7 +163,6 @@ def written_of(
         written = replace(written, wheels=refitted)
     if written is analysis:
         return analysis, final, predictions
-    written = prune(written)
     final = final_fit(written)
     return written, final, joint_predictions(written, final) if written.body is not None else None
 
@@ -255,7 +254,7 @@ def search_log(
     report_progress: Progress = lambda text: None,
     settings: GapSettings = DEFAULT_SETTINGS,
 ) -> tuple[GapAnalysis, list[str]]:
-    """Search both channels, and leave out what makes predictions worse; return notes on what could not be evaluated."""
+    """Search both channels; return notes on what could not be evaluated."""
     drive = grid_drive(log, settings)
     if not (drive.has_poses or drive.has_commands):
         raise LogError(
@@ -278,7 +277,7 @@ def search_log(
         wheels = search_wheels(drive, geometry, nominal_wheels, _given(model, WHEEL))
     else:
         notes.append("no commands: the way from command to wheel is not judged")
-    return prune(GapAnalysis(drive, nominal_body, nominal_wheels, body, wheels)), notes
+    return GapAnalysis(drive, nominal_body, nominal_wheels, body, wheels), notes
 
 
 def _vector(layout: Layout, model: Model) -> Array:

@@ -15,6 +15,9 @@ GRID_STEP_S = 0.01
 """Grid of the free runs, s. Chosen: half the period of commands at 50 Hz."""
 DRIFT_S = 20.0
 """Correlation time of the slow error of a wheel's speed, s. Chosen: longer than any manoeuvre of a log."""
+# No choice at all.
+OF_MEDIAN = 1.4826
+"""Standard deviation of a normal distribution over the median of its absolute values."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,10 +126,11 @@ class NoiseSettings:
     wheel_iterations: int = 25
     """Steps of the search for the wheels' noise at most. Chosen: it is flat by then."""
     outlier: float = 5.0
-    """Poses beyond so many standard deviations are left out. Chosen: one in two million by chance."""
+    """Poses beyond so many standard deviations are left out, differences of samples count as that much. Chosen: one in
+    two million by chance."""
     poor_fit: float = 1.5
-    """Mean square of whitened residuals from which on a fit or a regime disagrees, and a stretch is weighed down.
-    Chosen: noise alone has one."""
+    """Mean square of whitened residuals from which on a fit or a regime disagrees, plainer noise is assumed, and a
+    stretch is weighed down. Chosen: noise alone has one."""
     smooth_samples: int = 25
     """The local size of residuals is a mean over so many samples either side. Chosen."""
     command_jitter_ratio: float = 2.0
@@ -191,8 +195,6 @@ class SelectionSettings:
     """Whitened residuals beyond do not raise it further. Chosen."""
     silent: float = 1e-3
     """Whitened residuals below come of samples that say nothing. Chosen."""
-    most_effects: int = 8
-    """More effects are not named. Chosen."""
     profile_searches: int = 4
     """Rounds of the closer search of a profiled entry. Chosen."""
     large_share: float = 0.25
@@ -210,8 +212,6 @@ class SelectionSettings:
     less may be chance."""
     fewest_blocks: int = 5
     """Fewer blocks say nothing about their scatter. Chosen."""
-    far_off: float = 1.5
-    """Where the accepted set costs so many times what is expected, plainer noise is assumed. Chosen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,18 +287,10 @@ class PredictionSettings:
     Chosen: a ramp of seconds makes a lag of a second, and a fit that begins there ends there."""
     worse: float = 1.05
     """A larger ratio of errors is worse. Measured: equally good models scatter by some percent."""
-    far_worse: float = 1.25
-    """A larger ratio is worse whatever the scatter. Chosen."""
-    worse_sigmas: float = 2.0
-    """Standard deviations of the growth over blocks from which on it is worse. Chosen: one in twenty."""
-    most_changes: int = 4
-    """At most so many names are dropped or replaced as predictions are better without. Chosen."""
     standing_m_s: float = 0.02
     """Mean speed below which the robot stands; three times this, turns on the spot. Chosen."""
-    standing_rad_s: float = 0.05
-    """Mean yaw rate below which it stands. Chosen."""
     spinning_rad_s: float = 0.1
-    """Mean yaw rate above which it turns on the spot. Chosen."""
+    """Mean yaw rate above which it turns on the spot, and below which it stands. Chosen."""
     turning_rad_s: float = 0.3
     """Mean yaw rate above which it drives a curve. Chosen."""
     speeding_m_s2: float = 0.25
@@ -313,10 +305,10 @@ class ReportSettings:
     """So many claims of what a log shows are proved by putting the effect in. Chosen: each takes a search or two."""
     speeding_rad_s2: float = 2.0
     """Growth of the wheels' speed from which on they speed up or brake. Chosen."""
-    most_regimes: int = 3
-    """At most so many are listed, the loudest. Chosen."""
+    most_listed: int = 3
+    """So many regimes, the loudest, and names are listed at most. Chosen."""
     end_share: float = 0.01
-    """A value this close to where its fit had to end, in its range, is not believed. Chosen."""
+    """Commands that come early or late by this close to the most that is plausible do so by more. Chosen."""
     wide_share: float = 0.5
     """A value whose half interval, or whose change from one regime to its opposite, is over so much of its distance
     from none says too little. Chosen: nobody who is told the value expects it."""

@@ -69,6 +69,12 @@ def test_a_steady_circle_shows_what_stands_beside_the_lag_of_real_motors():
 
 
 @pytest.mark.long
+def test_a_motor_with_a_slew_limit_is_not_given_a_gain_that_misleads():
+    report = find_gap(simulated_drive({"acceleration_limit": 10.0}, seed=7002), Model(0.061, 0.415, 0.238))
+    assert report.why_not_amended is None
+
+
+@pytest.mark.long
 def test_two_effects_of_different_channels_are_both_named():
     report = report_of(("yaw_rate_limit", 1.0), ("pose_latency", 0.1))
     assert {effect.name for effect in report.effects} == {"yaw_rate_limit", "pose_latency"}

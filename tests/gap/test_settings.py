@@ -49,10 +49,10 @@ def test_a_setting_of_the_grid_is_felt_in_the_drive():
 
 def test_a_setting_of_the_selection_is_felt_by_who_selects():
     channel, drive = body_channel(turn_slip=0.08)
-    none = replace(DEFAULT_SETTINGS, selection=replace(DEFAULT_SETTINGS.selection, most_effects=0))
-    strict = type(channel).build(replace(drive, settings=none), channel.noise, channel.neutral)
-    assert Selector(channel, body_moves(channel), LIMITS).select() == ("turn_slip",)
-    assert Selector(strict, body_moves(strict), LIMITS).select() == ()
+    never = replace(DEFAULT_SETTINGS, selection=replace(DEFAULT_SETTINGS.selection, telling_nats=1e9))
+    lenient = type(channel).build(replace(drive, settings=never), channel.noise, channel.neutral)
+    assert Selector(channel, body_moves(channel), LIMITS).rivals(("turn_slip",), "turn_slip") == ()
+    assert "side_slip" in Selector(lenient, body_moves(lenient), LIMITS).rivals(("turn_slip",), "turn_slip")
 
 
 def test_a_setting_of_the_noise_is_felt_by_the_channel():

@@ -1,9 +1,12 @@
 """Rules of the search for missing effects, switched off one at a time and counted."""
 
+from dataclasses import replace
+
 import pytest
 
 from disco_hw.gap.report import judge
 from disco_hw.gap.search import channel_result
+from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.gap.search.selection import Selector, body_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from tests.gap.synthetic import LIMITS, body_channel
@@ -22,16 +25,16 @@ def test_each_rule_is_there_and_is_put_back():
 
 def test_a_rule_counts_where_its_answer_is_another_and_is_silent_without():
     channel, _ = body_channel(turn_slip=0.08)
-    parameter = judge.REGISTRY["motor_lag"].parameters[0]
+    parameter, wide = judge.REGISTRY["motor_lag"].parameters[0], ParameterEstimate(0.2, 0.0, 0.4)
     with counting() as counts:
-        assert judge._at_end(parameter, parameter.high, DEFAULT_SETTINGS.report)
-        assert not judge._at_end(parameter, 0.2, DEFAULT_SETTINGS.report)
+        assert judge.is_weakly_known(parameter, wide, DEFAULT_SETTINGS.report)
+        assert not judge.is_weakly_known(parameter, replace(wide, low=0.19, high=0.21), DEFAULT_SETTINGS.report)
         assert Selector(channel, body_moves(channel), LIMITS).select() == ("turn_slip",)
-    assert counts["a value at the end of its range"] == [2, 1]
+    assert counts["a value that is hardly known"] == [2, 1]
     assert counts["an effect moves predictions"][0] > 0
     assert counts["an effect moves predictions"][1] == 0
-    with without("a value at the end of its range"):
-        assert not judge._at_end(parameter, parameter.high, DEFAULT_SETTINGS.report)
+    with without("a value that is hardly known"):
+        assert not judge.is_weakly_known(parameter, wide, DEFAULT_SETTINGS.report)
     with pytest.raises(KeyError), without("no such rule"):
         pass
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.data.stamp_clock import StampClock, clock_of
-from disco_hw.gap.data.timing import apart, lowest, mismatch_of
+from disco_hw.gap.data.timing import apart, lowest, mismatch_of, scanned_delays, standing_out
 from disco_hw.gap.settings import GridSettings
 from disco_hw.jit import kernel_function
 from disco_hw.log.drive import Commands, Wheels
@@ -178,7 +178,7 @@ def response(turned: Turned, commands: Commands, settings: GridSettings) -> Resp
         return Response()
     responses = {lag_s: WheelResponse.of(commands, lag_s) for lag_s in (0.0, *settings.lags_s)}
     step_s, coarse_s = settings.delay_step_s, 2.0 * settings.delay_step_s
-    delays = _delays(settings.most_pose_delay_s, coarse_s)
+    delays = scanned_delays(settings.most_pose_delay_s, coarse_s)
     most = max(int(responses[0.0].known(turned, delay_s).sum()) for delay_s in delays.tolist())
     fewest = max(settings.fewest_samples, 3 * most // 4)
     scanned = {lag_s: responses[lag_s].mismatches(turned, delays, fewest) for lag_s in (0.0, *settings.lags_s[1::3])}
@@ -192,7 +192,7 @@ def response(turned: Turned, commands: Commands, settings: GridSettings) -> Resp
     centre_s, _ = responses[lag_s].best(turned, float(delays[least]), coarse_s, fewest)
     near = {}
     for other_s, response_model in responses.items():
-        about = centre_s + lag_s - other_s + _delays(settings.lag_reach_s, step_s)
+        about = centre_s + lag_s - other_s + scanned_delays(settings.lag_reach_s, step_s)
         mismatch = response_model.mismatches(turned, about, fewest)
         near[other_s] = float(mismatch.min()), float(about[int(np.argmin(mismatch))])
     # Between steps some fit better than where the scan met them.
@@ -206,12 +206,6 @@ def response(turned: Turned, commands: Commands, settings: GridSettings) -> Resp
     deep = float(np.median(ordinary)) - found.mismatch >= settings.least_delay_nats
     shown = deep and responses[found.lag_s].is_distinct(turned, found.delay_s, settings.lag_reach_s)
     return found if shown else Response(known=False)
-
-
-def _delays(most_s: float, step_s: float) -> Array:
-    """Delays from minus the most to the most, (D,)."""
-    steps = round(most_s / step_s)
-    return np.asarray(step_s * np.arange(-steps, steps + 1, dtype=np.float64))
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,12 +239,8 @@ class CommandAlignment:
     def part_delay_s(self, low_s: float, high_s: float) -> float | None:
         """Age of the commands in force in a stretch; None where it does not show."""
         step_s = 2.0 * self.settings.delay_step_s
-        delays = _delays(self.settings.most_pose_delay_s, step_s)
-        mismatch = self._mismatches(low_s, high_s, delays)
-        ordinary, least = mismatch[np.isfinite(mismatch)], int(np.argmin(mismatch))
-        if not ordinary.size or float(np.median(ordinary)) - mismatch[least] < self.settings.least_delay_nats:
-            return None
-        return -lowest(lambda some: self._mismatches(low_s, high_s, some), float(delays[least]), step_s)[0]
+        found_s = standing_out(lambda some: self._mismatches(low_s, high_s, some), step_s, self.settings)
+        return None if found_s is None else -found_s
 
     def part_mismatch(self, low_s: float, high_s: float, delay_s: float) -> float:
         """Misfit of all pairs of a stretch at an age."""

@@ -20,7 +20,7 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from disco_hw.gap.data.command_timing import command_clock
 from disco_hw.gap.data.stamp_clock import Aligned, StampClock, aligned
 from disco_hw.gap.data.timing import pose_clock, tick_s
-from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, Folds, GapSettings, GridSettings
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, OF_MEDIAN, Folds, GapSettings, GridSettings
 from disco_hw.log.drive import Commands, DriveLog, Poses, Wheels
 
 Array = NDArray[np.float64]
@@ -283,7 +283,7 @@ def even_times(t_s: Array, neighbours: int) -> Array:
 def _scatter(t_s: Array) -> float:
     """Scatter of time stamps, s: robust standard deviation of their differences over the root of two."""
     steps = np.diff(t_s)
-    return float(1.4826 * np.median(np.abs(steps - np.median(steps))) / 2.0**0.5)
+    return float(OF_MEDIAN * np.median(np.abs(steps - np.median(steps))) / 2.0**0.5)
 
 
 def _runs(t_s: Array, segment: Index, settings: GridSettings) -> list[tuple[int, int]]:

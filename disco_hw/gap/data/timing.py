@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from disco_hw.gap.data.stamp_clock import StampClock, clock_of, picked
-from disco_hw.gap.settings import GridSettings
+from disco_hw.gap.settings import OF_MEDIAN, GridSettings
 from disco_hw.jit import kernel_function, scalar_function
 from disco_hw.log.drive import Poses, Wheels
 
@@ -85,16 +85,8 @@ def pose_delay_s(wheels: Wheels, poses: Poses, settings: GridSettings) -> float:
     by those of the wheels (two regressions, robust by Huber's weights; their likelihoods, with unknown variances, are
     added). 0 where the poses are too few or where no delay stands out.
     """
-    steps = round(settings.most_pose_delay_s / settings.delay_step_s)
-    delays: Array = settings.delay_step_s * np.arange(-steps, steps + 1, dtype=np.float64)
-    mismatch = _mismatches(wheels, poses, delays, settings)
-    best = int(np.argmin(mismatch))
-    ordinary = mismatch[np.isfinite(mismatch)]
-    if not ordinary.size or float(np.median(ordinary)) - mismatch[best] < settings.least_delay_nats:
-        return 0.0
-    return lowest(lambda some: _mismatches(wheels, poses, some, settings), float(delays[best]), settings.delay_step_s)[
-        0
-    ]
+    found_s = standing_out(lambda some: _mismatches(wheels, poses, some, settings), settings.delay_step_s, settings)
+    return found_s or 0.0
 
 
 def tick_s(t_s: Array, rows_s: Array) -> float:
@@ -164,6 +156,22 @@ def apart(t_s: Array, segment: Index, span_s: float) -> tuple[Index, Index]:
     return first[near], second[near]
 
 
+def scanned_delays(most_s: float, step_s: float) -> Array:
+    """Delays from minus the most to the most, (D,)."""
+    steps = round(most_s / step_s)
+    return np.asarray(step_s * np.arange(-steps, steps + 1, dtype=np.float64))
+
+
+def standing_out(misfits: Callable[[Array], Array], step_s: float, settings: GridSettings) -> float | None:
+    """Return the delay (s) of the least mismatch, of all that are scanned in such steps; None if none stands out."""
+    delays = scanned_delays(settings.most_pose_delay_s, step_s)
+    mismatch = misfits(delays)
+    best, ordinary = int(np.argmin(mismatch)), mismatch[np.isfinite(mismatch)]
+    if not ordinary.size or float(np.median(ordinary)) - mismatch[best] < settings.least_delay_nats:
+        return None
+    return lowest(misfits, float(delays[best]), step_s)[0]
+
+
 def lowest(misfits: Callable[[Array], Array], about_s: float, step_s: float) -> tuple[float, float]:
     """Return the delay (s) of the least mismatch, within a step of a scan's best one, and the mismatch there."""
 
@@ -207,7 +215,7 @@ def mismatch_of(difference: Array, total: Array, measured: Array) -> float:
             of_b, of_a = projected(bb, ab, aa, by, ay)
         for k in range(count):
             left[k] = abs(measured[k] - of_a * difference[k] - of_b * total[k])
-        limit = 2.0 * 1.4826 * np.median(left) + 1e-9
+        limit = 2.0 * OF_MEDIAN * np.median(left) + 1e-9
     loss = 0.0
     for k in range(count):
         loss += left[k] * left[k] if left[k] < limit else limit * (2.0 * left[k] - limit)

@@ -19,15 +19,11 @@ from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.noise.body_noise import BodyNoise, body_likelihood
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise, wheel_likelihood, whiten_wheels
-from disco_hw.gap.settings import NoiseSettings
+from disco_hw.gap.settings import OF_MEDIAN, NoiseSettings
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# A Gaussian's standard deviation over the median of its absolute values.
-_OF_MEDIAN = 1.4826
-# Values further out than so many standard deviations are single jumps, and count as that much.
-_CLIPPED_SIGMAS = 5.0
 # Samples next to each other are comparable where their distances in time differ by no more than this ratio.
 _UNEVEN = 2.0
 _FEWEST = 20
@@ -198,18 +194,21 @@ def sensor_noise(channel: BodyChannel, p: Array) -> SensorNoise:
     """
     raw, measured = channel.raw_residual(p), channel.measured
     t_s, window, use = channel.samples.t_s, channel.window, channel.use
+    outlier = channel.settings.noise.outlier
     moving = [
-        _least(_second(t_s, raw[:, columns], window, use), _third(t_s, measured[:, columns], window, use))
+        _least(outlier, _second(t_s, raw[:, columns], window, use), _third(t_s, measured[:, columns], window, use))
         for columns in (slice(0, 2), slice(2, 3))
     ]
     resting = (np.abs(channel.drive.speed_rad_s).max(axis=1) < channel.settings.grid.rest_rad_s)[channel.samples.node]
     at_rest = [
-        _scatter(measured[:, columns], np.cumsum(np.diff(window + 1e6 * ~resting, prepend=-1.0) != 0), resting & use)
+        _scatter(
+            outlier, measured[:, columns], np.cumsum(np.diff(window + 1e6 * ~resting, prepend=-1.0) != 0), resting & use
+        )
         for columns in (slice(0, 2), slice(2, 3))
     ]
     speed = channel.drive.speed_rad_s.mean(axis=1)[channel.samples.node]
     of_speed = _second(t_s, speed[:, None], window, use & ~resting)
-    return SensorNoise(max(moving[0], at_rest[0]), max(moving[1], at_rest[1]), _sigma(of_speed))
+    return SensorNoise(max(moving[0], at_rest[0]), max(moving[1], at_rest[1]), _sigma(outlier, of_speed))
 
 
 def _second(t_s: Array, values: Array, window: NDArray[np.int64], use: Mask) -> Array:
@@ -231,12 +230,12 @@ def _third(t_s: Array, values: Array, window: NDArray[np.int64], use: Mask) -> A
     return np.asarray(np.diff(values, 3, axis=0)[good] / 20.0**0.5)
 
 
-def _least(*differences: Array) -> float:
+def _least(outlier: float, *differences: Array) -> float:
     """Return the smallest standard deviation of those arrays that have enough samples; 0 where none has."""
-    return min((_sigma(each) for each in differences if each.shape[0] >= _FEWEST), default=0.0)
+    return min((_sigma(outlier, each) for each in differences if each.shape[0] >= _FEWEST), default=0.0)
 
 
-def _scatter(values: Array, rest: NDArray[np.int64], inside: Mask) -> float:
+def _scatter(outlier: float, values: Array, rest: NDArray[np.int64], inside: Mask) -> float:
     """Return the standard deviation of values (P, C) about the median of each rest; 0 if the robot hardly rests."""
     off = []
     for number in np.unique(rest[inside]):
@@ -244,13 +243,13 @@ def _scatter(values: Array, rest: NDArray[np.int64], inside: Mask) -> float:
         if chosen.shape[0] >= 5:
             off.append((chosen - np.median(chosen, axis=0)) * (chosen.shape[0] / (chosen.shape[0] - 1.0)) ** 0.5)
     stacked = np.concatenate(off) if off else np.empty((0, values.shape[1]))
-    return _sigma(stacked) if stacked.shape[0] >= _FEWEST else 0.0
+    return _sigma(outlier, stacked) if stacked.shape[0] >= _FEWEST else 0.0
 
 
-def _sigma(values: Array) -> float:
-    """Return the standard deviation of values about 0, with single jumps clipped."""
+def _sigma(outlier: float, values: Array) -> float:
+    """Return the standard deviation of values about 0, with single jumps clipped at `outlier` of them."""
     if not values.size:
         return 0.0
-    rough = _OF_MEDIAN * float(np.median(np.abs(values)))
-    largest = _CLIPPED_SIGMAS * rough if rough > 0.0 else float(np.abs(values).max())
+    rough = OF_MEDIAN * float(np.median(np.abs(values)))
+    largest = outlier * rough if rough > 0.0 else float(np.abs(values).max())
     return float(np.sqrt((np.clip(values, -largest, largest) ** 2).mean()))

@@ -7,7 +7,7 @@ data.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,8 +77,28 @@ class ResidualChannel(Protocol):
         """Entries of effects and base alone, and what unnamed terms add at the nodes, if any."""
 
 
+class _WithoutTerms:
+    """What both channels share: settings of their drive, and no unnamed terms."""
+
+    drive: GriddedDrive
+
+    @property
+    def settings(self) -> GapSettings:
+        """The settings of the analysis."""
+        return self.drive.settings
+
+    @property
+    def inner(self) -> Self:
+        """Channel without unnamed terms: this one."""
+        return self
+
+    def split(self, p: Array) -> tuple[Array, Array | None]:
+        """Return the vector and None: this channel has no unnamed terms."""
+        return p, None
+
+
 @dataclass(frozen=True)
-class WheelChannel:
+class WheelChannel(_WithoutTerms):
     """Commands in, wheel angles out; `weight` (E, 2) tames stretches that are noisier than the rest."""
 
     drive: GriddedDrive
@@ -158,11 +178,6 @@ class WheelChannel:
         return even.weighted(np.minimum(1.0, settings.even_huber * size / np.maximum(np.abs(white), 1e-9)) / size)
 
     @property
-    def settings(self) -> GapSettings:
-        """The settings of the analysis."""
-        return self.drive.settings
-
-    @property
     def layout(self) -> Layout:
         """Layout of the parameter vector: names, ranges and neutral values."""
         return WHEEL
@@ -173,23 +188,24 @@ class WheelChannel:
         return WHEEL.neutral
 
     @property
-    def inner(self) -> WheelChannel:
-        """Channel without unnamed terms: this one."""
-        return self
-
-    @property
     def free(self) -> tuple[int, ...]:
         """Entries of the vector that are fitted whatever the effects."""
         return ()
 
-    def split(self, p: Array) -> tuple[Array, Array | None]:
-        """Return the vector and None: this channel has no unnamed terms."""
-        return p, None
+    @property
+    def samples(self) -> GridSamples:
+        """Samples of the encoders."""
+        return self.drive.encoder
+
+    @property
+    def use(self) -> Mask:
+        """Which samples are used, (E,)."""
+        return self.gains.use
 
     @property
     def block(self) -> Index:
         """Block of time of each residual, (2 E,)."""
-        return np.repeat(self.drive.encoder.block, 2)
+        return np.repeat(self.samples.block, 2)
 
     @property
     def count(self) -> int:
@@ -230,7 +246,7 @@ class WheelChannel:
 
 
 @dataclass(frozen=True)
-class BodyChannel:
+class BodyChannel(_WithoutTerms):
     """Channel from measured wheel angles to poses, in windows of time whose start pose is unknown."""
 
     drive: GriddedDrive
@@ -307,11 +323,6 @@ class BodyChannel:
         return replace(self, weight=weight)
 
     @property
-    def settings(self) -> GapSettings:
-        """The settings of the analysis."""
-        return self.drive.settings
-
-    @property
     def layout(self) -> Layout:
         """Layout of the parameter vector: names, ranges and neutral values."""
         return BODY
@@ -322,18 +333,9 @@ class BodyChannel:
         return np.concatenate([self.geometry[:BASE_COUNT], BODY.neutral[BASE_COUNT:]])
 
     @property
-    def inner(self) -> BodyChannel:
-        """Channel without unnamed terms: this one."""
-        return self
-
-    @property
     def free(self) -> tuple[int, ...]:
         """Entries of the vector that are fitted whatever the effects."""
         return tuple(range(BASE_COUNT))
-
-    def split(self, p: Array) -> tuple[Array, Array | None]:
-        """Return the vector and None: this channel has no unnamed terms."""
-        return p, None
 
     @property
     def block(self) -> Index:

@@ -185,31 +185,11 @@ class GapReport:
                 for effect in self.effects
             ],
             "unnamed": [
-                {
-                    "channel": term.channel,
-                    "form": term.form,
-                    "evidence": term.evidence,
-                    "in_model": term.in_model,
-                    "indistinguishable_from": list(term.indistinguishable_from),
-                    "experiment": term.experiment,
-                    "meaning": term.meaning,
-                }
-                for term in self.unnamed
+                asdict(term) | {"indistinguishable_from": list(term.indistinguishable_from)} for term in self.unnamed
             ],
-            "doubtful": [{"name": one.name, "why": one.why} for one in self.doubtful],
+            "doubtful": [asdict(one) for one in self.doubtful],
             "residue": list(self.residue),
-            "blind_spots": [
-                {
-                    "name": spot.name,
-                    "parameter": spot.parameter,
-                    "unit": spot.unit,
-                    "smallest_visible": spot.smallest_visible,
-                    "blind": spot.blind,
-                    "experiment": spot.experiment,
-                    "proved": spot.proved,
-                }
-                for spot in self.blind_spots
-            ],
+            "blind_spots": [asdict(spot) for spot in self.blind_spots],
             "drive": self.drive,
             "gap": self._gap_dict(),
             "wheels": [

@@ -90,8 +90,7 @@ def _geometry(final: FinalFit) -> tuple[float, float]:
 
 def carried_terms(analysis: GapAnalysis, final: FinalFit) -> dict[str, float]:
     """By name the accepted unnamed terms that a model can carry, and the largest size that their features had."""
-    found = [found for found in (analysis.body, analysis.wheels) if found is not None]
-    terms = [one.term for each in found for one in each.unnamed]
+    terms = [one.term for each in analysis.channels for one in each.unnamed]
     return {
         term.model_name: float(np.abs(term.perturbation).max()) / _rescaled(term, _geometry(final))
         for term in terms

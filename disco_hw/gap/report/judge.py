@@ -25,6 +25,7 @@ from disco_hw.gap.report.misspecification import (
     Regime,
     describe,
     disputed_names,
+    gain_of,
     regimes,
     remaining_disagreements,
 )
@@ -77,9 +78,9 @@ def _finding(name: str, found: ChannelResult, estimated: ChannelEstimates, same:
 
 def _score(found: ChannelResult, name: str) -> float:
     """Evidence score of one accepted effect, the others kept."""
-    rest = tuple(other for other in found.names if other != name)
     if name in found.selector.given:
         return 0.0
+    rest = tuple(other for other in found.names if other != name)
     return found.selector.evidence(rest, found.names).score
 
 
@@ -123,45 +124,31 @@ def regimes_of(found: ChannelResult) -> list[Regime]:
 def candidate_evidence(analysis: GapAnalysis) -> tuple[CandidateEvidence, ...]:
     """Evidence of every named effect: of the accepted ones against their absence, of the others on top."""
     out = []
-    for found in (analysis.body, analysis.wheels):
-        if found is None:
-            continue
+    for found in analysis.channels:
         selector = found.selector
         for name in candidates_of(found.channel.layout):
             if name in found.names:
-                rest = tuple(other for other in found.names if other != name)
-                gain, verdict = selector.exact(rest).cost - found.fit.cost, "accepted"
-                score = 0.0 if name in selector.given else selector.evidence(rest, found.names).score
+                gain, score, verdict = gain_of(found, name), _score(found, name), "accepted"
             else:
                 price = 0.5 * parameters_of((name,)) * math.log(max(found.channel.count, 2))
                 promise = selector.promise(found.names, name)
                 gain, score = promise + price, 2.0 * promise
                 enough = score > selector.thresholds.score
                 verdict = "moves a 2 s prediction too little, or in one stretch only" if enough else "not needed"
-                verdict = "makes held-out predictions worse" if name in analysis.pruned else verdict
             out.append(CandidateEvidence(REGISTRY[name].channel.value, name, gain, score, verdict))
     return tuple(sorted(out, key=lambda candidate: -candidate.score))
 
 
 def residue_sentences(analysis: GapAnalysis) -> tuple[str, ...]:
-    """Describe effects that fit and were left out, and disagreements that naming has left, by regime."""
-    out = [
-        f"{REGISTRY[name].channel.value if name in REGISTRY else 'unnamed'}: {name} fits, and yet makes held-out "
-        "predictions worse: it only stands for what is missing"
-        for name in analysis.pruned
-    ]
-    for found in (analysis.wheels, analysis.body):
-        if found is not None:
-            out += remaining_disagreements(found)
-    return tuple(out)
+    """Describe disagreements that naming has left, by regime."""
+    return tuple(sentence for found in analysis.channels[::-1] for sentence in remaining_disagreements(found))
 
 
 def left_out_notes(analysis: GapAnalysis, final: FinalFit, kept: GapAnalysis) -> tuple[str, ...]:
     """Sentences on what was found, with its `final` fit, and the amended model does not have."""
-    gone = kept.pruned[len(analysis.pruned) :]
-    of_this_log = of_every_log(analysis, final).pruned[len(analysis.pruned) :]
-    of_poses = [name for name in gone if name in of_this_log]
-    others = [name for name in gone if name not in of_poses]
+    of_this_log = of_every_log(analysis, final).left_out
+    of_poses = [name for name in kept.left_out if name in of_this_log]
+    others = [name for name in kept.left_out if name not in of_poses]
     out = []
     if of_poses:
         out.append(
@@ -197,9 +184,7 @@ def drifting_parameters(analysis: GapAnalysis, final: FinalFit) -> tuple[str, ..
 def across_logs(analysis: GapAnalysis) -> tuple[AcrossLogs, ...]:
     """Every parameter that each of several logs determines, and whether they differ in it by more than their noise."""
     settings, out = analysis.drive.settings, []
-    for found in (analysis.body, analysis.wheels):
-        if found is None:
-            continue
+    for found in analysis.channels:
         for name, logs in in_logs(found).items():
             if logs.values.size != len(analysis.drive.log_begins_s):
                 continue
@@ -221,9 +206,8 @@ def blind_spot_findings(
     """Every effect that was not found, with the smallest size that would have been; blind ones first."""
     named = {effect.name for effect in effects}
     spots: list[BlindSpot] = []
-    for found in (analysis.wheels, analysis.body):
-        if found is not None:
-            spots += [spot for spot in blind_spots(found, top_rad_s) if spot.name not in named]
+    for found in analysis.channels[::-1]:
+        spots += [spot for spot in blind_spots(found, top_rad_s) if spot.name not in named]
     seen = {spot.name for spot in spots} | named
     for name, effect in REGISTRY.items():
         searched = analysis.wheels if effect.channel is Channel.COMMAND_TO_WHEEL else analysis.body
@@ -251,24 +235,8 @@ class Measured:
     def of(cls, analysis: GapAnalysis, final: FinalFit) -> Measured:
         """Collect the facts of a searched drive."""
         vector = analysis.nominal_body if final.final_body is None else final.final_body.vector
-        disputed: dict[str, str] = {}
-        for found in (analysis.body, analysis.wheels):
-            disputed |= {} if found is None else disputed_names(found)
-        estimated: dict[str, ParameterEstimate] = {}
-        for channel in (final.body_estimates, final.wheel_estimates):
-            estimated |= {} if channel is None else channel.by_name
-        doubted = {name: why for name, why in disputed.items() if not _confirmed(REGISTRY[name], estimated)}
-        return cls(analysis.drive, (float(vector[0]), float(vector[1])), doubted)
-
-
-def _confirmed(effect: Effect, estimated: Mapping[str, ParameterEstimate]) -> bool:
-    """Whether the other channel, from other measurements, says the same of an effect, and clearly not nothing."""
-    estimate, other = estimated.get(effect.columns[0]), estimated.get(effect.witness or "")
-    if estimate is None or other is None:
-        return False
-    nothing = effect.parameters[0].neutral
-    overlap = estimate.low <= other.high and other.low <= estimate.high
-    return overlap and not (estimate.low <= nothing <= estimate.high or other.low <= nothing <= other.high)
+        disputed = {name: why for found in analysis.channels for name, why in disputed_names(found).items()}
+        return cls(analysis.drive, (float(vector[0]), float(vector[1])), disputed)
 
 
 def classify_findings(
@@ -289,31 +257,10 @@ def low_confidence_of(effect: EffectFinding, measured: Measured) -> str | None:
     """Why an effect is not reported as found; None if nothing speaks against it."""
     described, settings = REGISTRY[effect.name], measured.drive.settings.report
     pairs = [(parameter, effect.parameters[parameter.name]) for parameter in described.parameters]
-    for parameter, estimate in pairs:
-        if _at_end(parameter, estimate.value, settings):
-            return f"{_written(parameter, estimate)} lies at the end of its range"
     if all(is_weakly_known(parameter, estimate, settings) for parameter, estimate in pairs):
         values = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
         return f"{values} is hardly known: its interval is wider than the value"
-    if holds_no_effect(effect):
-        values = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
-        return f"{values}: its interval holds no effect"
     return _exceeded(described, pairs[0][1], measured) or measured.disputed.get(effect.name)
-
-
-def holds_no_effect(effect: EffectFinding) -> bool:
-    """Whether the intervals of all that make an effect's size hold the value at which it does nothing."""
-    sizes = [each for each in REGISTRY[effect.name].parameters if math.isfinite(each.neutral)]
-    intervals = [(effect.parameters[each.name], each.neutral) for each in sizes]
-    # A limit does nothing only where it is infinite, which no interval holds.
-    return not REGISTRY[effect.name].is_limit and all(each.low <= none <= each.high for each, none in intervals)
-
-
-def _at_end(parameter: Parameter, value: float, settings: ReportSettings) -> bool:
-    """Whether a value lies where the fit was not allowed to go further; neutral is no such end."""
-    low = parameter.low if parameter.least_fitted is None else parameter.least_fitted
-    ends = [end for end in (low, parameter.high) if math.isfinite(end) and end != parameter.neutral]
-    return any(abs(value - end) <= settings.end_share * abs(end) for end in ends)
 
 
 def is_weakly_known(parameter: Parameter, estimate: ParameterEstimate, settings: ReportSettings) -> bool:

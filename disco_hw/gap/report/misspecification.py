@@ -51,7 +51,7 @@ def disputed_names(found: ChannelResult) -> dict[str, str]:
     return out
 
 
-def _gain(found: ChannelResult, name: str) -> float:
+def gain_of(found: ChannelResult, name: str) -> float:
     """Return the gain of a name in nats, with the others kept."""
     rest = tuple(other for other in found.names if other != name)
     return found.selector.exact(rest).cost - found.fit.cost
@@ -71,7 +71,7 @@ def _takes_little(found: ChannelResult, name: str) -> str | None:
         return None
     best = 0.5 * float(found.richest @ found.richest)
     left = found.fit.cost - best - found.richest_parameters
-    explained = max(_gain(found, name), 0.0)
+    explained = max(gain_of(found, name), 0.0)
     if explained > settings.worth_share * (explained + left):
         return None
     return f"it takes {100.0 * explained / (explained + left):.2g} % of what its channel lacks"
@@ -84,7 +84,7 @@ def _changes_with_regime(found: ChannelResult, name: str) -> str | None:
     columns = [column for column in CANDIDATES[name].columns if layout.place[column] in best.active]
     sizes = [abs(best.vector[layout.place[column]] - layout.neutral[layout.place[column]]) for column in columns]
     size = max((each for each in sizes if math.isfinite(each)), default=math.inf)
-    samples = drive.encoder if isinstance(found.channel, WheelChannel) else found.channel.samples
+    samples = found.channel.samples
     width = best.residual.size // samples.node.size
     inside = {regime: np.repeat(mask, width) for regime, mask in masks(drive, samples).items()}
     clearest: tuple[float, str] = (settings.form_apart_sigmas, "")
@@ -186,8 +186,7 @@ def regimes(
     channel: WheelChannel | BodyChannel, before: Array, after: Array, extra: Array | None = None
 ) -> list[Regime]:
     """Every regime with enough samples, from the vectors before and after, the one that improves most first."""
-    samples = channel.drive.encoder if isinstance(channel, WheelChannel) else channel.samples
-    use = channel.gains.use if isinstance(channel, WheelChannel) else channel.use
+    samples, use = channel.samples, channel.use
     first = (channel.whitened(before) ** 2).mean(axis=1)
     last = (channel.whitened(after, extra) ** 2).mean(axis=1)
     found = []
@@ -230,8 +229,7 @@ def loud_regimes(found: ChannelResult) -> list[tuple[float, str]]:
     channel, settings = found.channel, found.channel.settings.report
     if found.richest is None:
         return []
-    samples = channel.drive.encoder if isinstance(channel, WheelChannel) else channel.samples
-    use = channel.gains.use if isinstance(channel, WheelChannel) else channel.use
+    samples, use = channel.samples, channel.use
     width = found.richest.size // use.size
     now = (found.fit.residual.reshape(-1, width) ** 2).sum(axis=1)
     best = (found.richest.reshape(-1, width) ** 2).sum(axis=1)
@@ -246,7 +244,7 @@ def loud_regimes(found: ChannelResult) -> list[tuple[float, str]]:
         ratio = float(now[inside].sum() / max(best[inside].sum(), 1e-9))
         if gain > price and gain > chosen.sure_sigmas * spread and ratio > 1.0 + settings.worth_share:
             loud.append((math.sqrt(ratio), name))
-    return sorted(loud, reverse=True)[: settings.most_regimes]
+    return sorted(loud, reverse=True)[: settings.most_listed]
 
 
 def gain_by_block(gains: Array, block: Index, fewest: int) -> tuple[float, float]:

@@ -32,16 +32,13 @@ def sentence(effect: EffectFinding, settings: ReportSettings = DEFAULT_SETTINGS.
     return "; ".join((described.describe(values), *also))
 
 
-# Chosen: more is a table, not a sentence.
-_MOST_NAMES = 3
-
-
 def summary_lines(report: GapReport) -> list[str]:
     """Summarise the report in at most ten lines, for the operator of the robot.
 
     What is missing and how sure that is, how much it matters, what is left, which model to drive with, what to do next.
     """
-    effects = report.effects[:_MOST_NAMES]
+    most = report.settings.report.most_listed
+    effects = report.effects[:most]
     lines = [f"{text[0].upper()}{text[1:]}." for text in (sentence(each, report.settings.report) for each in effects)]
     more = len(report.effects) - len(effects)
     if more:
@@ -60,7 +57,7 @@ def summary_lines(report: GapReport) -> list[str]:
         lines.append(report.remains.describe())
     blind = [spot.name for spot in report.blind_spots if spot.blind]
     if blind:
-        names = ", ".join(blind) if len(blind) <= _MOST_NAMES else f"{len(blind)} effects, listed below,"
+        names = ", ".join(blind) if len(blind) <= most else f"{len(blind)} effects, listed below,"
         advice = f"Drive next: `{report.drive}`; this" if report.drive else "This"
         lines.append(f"{advice} log could not have shown {names} of realistic size.")
     if report.provenance is not None:

@@ -1,18 +1,14 @@
 """Which effects are missing: fits, evidence, selection, held-out predictions.
 
-Here the gap by stage: what the model as given, refitted and amended predicts of data that it was not fitted to.
-
-The same predictions prune the names that make the whole worse, however well they fit their own channel: where the true
-form is none that is known, the best stand-in of one channel may lead the chain from command to pose astray. A name
-without which held-out predictions are clearly better goes; where they are worse than with the refitted geometry alone,
-one that harms them goes or another that would do as well takes its place.
+Here the gap by stage: what the model as given, refitted and amended predicts of data that it was not fitted to. The
+amended model keeps of all that was found what these predictions need: where the true form is none that is known, the
+best stand-in of one channel may lead the chain from command to pose astray.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,15 +24,12 @@ from disco_hw.gap.search.analysis import (
     GapAnalysis,
     final_fit,
     lacking,
-    lacking_one,
     least_evident_first,
-    swapped_one,
 )
 from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.cross_validation import (
     Chain,
     PredictionErrors,
-    clearly_worse,
     errors_of,
     floor_errors,
     fold_of,
@@ -44,7 +37,6 @@ from disco_hw.gap.search.cross_validation import (
     scored_horizon_s,
     smoothed_poses,
     within_one_standard_error,
-    worse_by,
 )
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
 from disco_hw.gap.search.least_squares import Fit, inverse
@@ -94,12 +86,8 @@ class StagePredictions:
         return table
 
 
-def stage_predictions(analysis: GapAnalysis, final: FinalFit | None = None) -> StagePredictions:
-    """Predictions of `refitted` and `amended`, the channels fitted apart: quick, for names that compete.
-
-    Of an analysis in which the body was judged; `final` is its final fit, if it is made already.
-    """
-    final = final_fit(analysis) if final is None else final
+def stage_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePredictions:
+    """Predictions of `refitted` and `amended`, the channels fitted apart, where the body was judged."""
     body, wheels = analysis.body, analysis.wheels
     assert body is not None
     assert final.final_body is not None
@@ -365,7 +353,7 @@ def _timed(ahead: Ahead, refitted: Freed) -> Freed:
 
 def _base(analysis: GapAnalysis) -> list[Fit]:
     """Fits of both channels, or of the body, without anything that is missing."""
-    return [found.base for found in (analysis.body, analysis.wheels) if found is not None]
+    return [found.base for found in analysis.channels]
 
 
 def _all_fits(analysis: GapAnalysis, final: FinalFit) -> list[Fit]:
@@ -376,11 +364,10 @@ def _all_fits(analysis: GapAnalysis, final: FinalFit) -> list[Fit]:
 
 def _by_fold(analysis: GapAnalysis, fits: Sequence[Fit]) -> dict[int, list[Array]]:
     """For each fold the vectors of the channels, fitted on the data of the others."""
-    channels = [found for found in (analysis.body, analysis.wheels) if found is not None]
     count, settings = analysis.drive.folds.count, analysis.drive.settings
     by_channel = [
         fold_vectors(one, fold_of(found.channel), count, found.selector.channel.neutral, settings)
-        for found, one in zip(channels, fits, strict=True)
+        for found, one in zip(analysis.channels, fits, strict=True)
     ]
     return {fold: [vectors[fold] for vectors in by_channel] for fold in range(count)}
 
@@ -409,38 +396,3 @@ def _split(found: ChannelResult, vector: Array) -> tuple[Array, Array | None]:
     if vector.size == len(found.channel.layout.columns):
         return vector, None
     return found.selector.channel.split(vector)
-
-
-def prune(analysis: GapAnalysis) -> GapAnalysis:
-    """Return the analysis with what makes its held-out predictions worse removed or replaced."""
-    if analysis.body is None:
-        return analysis
-    settings = analysis.drive.settings.prediction
-    predictions = stage_predictions(analysis)
-    refitted = predictions.errors("refitted")
-    now = predictions.errors("amended")
-    for _ in range(settings.most_changes):
-        if clearly_worse(refitted, now, settings):
-            options = chain(lacking_one(analysis), swapped_one(analysis))
-            better = _best(refitted, worse_by(refitted, now), options)
-        else:
-            better = _best(now, 1.0 / settings.worse, lacking_one(analysis))
-            if better is not None and not clearly_worse(better[1], now, settings):
-                better = None
-        if better is None:
-            break
-        analysis, now = better
-    return analysis
-
-
-def _best(
-    than: PredictionErrors, below: float, options: Iterable[GapAnalysis]
-) -> tuple[GapAnalysis, PredictionErrors] | None:
-    """Return the analysis that predicts best, if its errors are below `below` times those of `than`; else None."""
-    best, least = None, below
-    for option in options:
-        errors = stage_predictions(option).errors("amended")
-        ratio = worse_by(than, errors)
-        if ratio < least:
-            best, least = (option, errors), ratio
-    return best

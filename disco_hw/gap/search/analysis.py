@@ -1,12 +1,12 @@
 """Result of the searches of both channels, and the one fit to it on which every finding rests.
 
 It also has what algebra confounds, effects with the same equations and one cause seen in two channels, and analyses
-without one of the names or with another in its place.
+without one of the names.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -107,8 +107,8 @@ def confounded_with(names: tuple[str, ...], encoder_possible: bool) -> dict[str,
 class GapAnalysis:
     """Findings in the channels of one drive; a channel that could not be evaluated is None.
 
-    `nominal_body`, `nominal_wheels` are the vectors of the model as given; `pruned` names what fits but was left out,
-    as predictions are worse with it.
+    `nominal_body`, `nominal_wheels` are the vectors of the model as given; `left_out` names what was found and the
+    amended model lacks, as predictions do not need it.
     """
 
     drive: GriddedDrive
@@ -116,19 +116,22 @@ class GapAnalysis:
     nominal_wheels: Array
     body: ChannelResult | None
     wheels: ChannelResult | None
-    pruned: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def channels(self) -> tuple[ChannelResult, ...]:
+        """Results of the channels that could be judged, the body first."""
+        return tuple(found for found in (self.body, self.wheels) if found is not None)
 
     @property
     def found_any(self) -> bool:
         """Whether anything is missing in the model, by name or without."""
-        channels = [found for found in (self.body, self.wheels) if found is not None]
-        return any(found.unnamed or set(found.names) - set(found.selector.given) for found in channels)
+        return any(found.unnamed or set(found.names) - set(found.selector.given) for found in self.channels)
 
     @property
     def adds_to_timed(self) -> bool:
         """Whether anything is missing beyond a delay and a lag."""
-        channels = [found for found in (self.body, self.wheels) if found is not None]
-        return any(found.unnamed or set(found.names) - {*found.selector.given, *DELAY_NAMES} for found in channels)
+        return any(found.unnamed or set(found.names) - {*found.selector.given, *DELAY_NAMES} for found in self.channels)
 
 
 @dataclass(frozen=True)
@@ -207,24 +210,13 @@ def least_evident_first(analysis: GapAnalysis) -> list[tuple[str, str | None]]:
         found: ChannelResult | None = getattr(analysis, which)
         if found is None:
             continue
-        for name, rest in each_name(found):
-            if name not in DELAY_NAMES:
+        for name in found.names:
+            if name not in found.selector.given and name not in DELAY_NAMES:
+                rest = tuple(other for other in found.names if other != name)
                 out.append((found.selector.evidence(rest, found.names).score, which, name))
         if found.unnamed:
             out.append((max(term.evidence.score for term in found.unnamed), which, None))
     return [(which, name) for _, which, name in sorted(out, key=lambda one: one[0])]
-
-
-def lacking_one(analysis: GapAnalysis) -> Iterator[GapAnalysis]:
-    """Analyses that lack one of the names, or the terms of a channel."""
-    for which in ("wheels", "body"):
-        found: ChannelResult | None = getattr(analysis, which)
-        if found is None:
-            continue
-        for name, _ in each_name(found):
-            yield lacking(analysis, which, name)
-        if found.unnamed:
-            yield lacking(analysis, which, None)
 
 
 def lacking(analysis: GapAnalysis, which: str, name: str | None) -> GapAnalysis:
@@ -237,25 +229,8 @@ def lacking(analysis: GapAnalysis, which: str, name: str | None) -> GapAnalysis:
     return _changed(analysis, found, bare, tuple(term.form for term in found.unnamed))
 
 
-def swapped_one(analysis: GapAnalysis) -> Iterator[GapAnalysis]:
-    """Analyses that have, in place of one of the names, another that would do as well."""
-    for found in (analysis.wheels, analysis.body):
-        if found is None:
-            continue
-        for name, rest in each_name(found):
-            for rival in found.selector.rivals(found.names, name):
-                yield _changed(analysis, found, replace(found, names=(*rest, rival)), (name,))
-
-
-def each_name(found: ChannelResult) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Every name that was found, and the others."""
-    for name in found.names:
-        if name not in found.selector.given:
-            yield name, tuple(other for other in found.names if other != name)
-
-
-def _changed(analysis: GapAnalysis, old: ChannelResult, new: ChannelResult, pruned: tuple[str, ...]) -> GapAnalysis:
-    pruned = (*analysis.pruned, *pruned)
+def _changed(analysis: GapAnalysis, old: ChannelResult, new: ChannelResult, left_out: tuple[str, ...]) -> GapAnalysis:
+    left_out = (*analysis.left_out, *left_out)
     if old is analysis.wheels:
-        return replace(analysis, wheels=new, pruned=pruned)
-    return replace(analysis, body=new, pruned=pruned)
+        return replace(analysis, wheels=new, left_out=left_out)
+    return replace(analysis, body=new, left_out=left_out)

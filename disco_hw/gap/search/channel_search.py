@@ -77,7 +77,7 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
     found = searched(sound)
     # Where nothing known comes near, the noise is too little to compare what is all wrong: the family shows in the
     # noise that the best of it leaves, and what is left against the richest model.
-    return searched(plain) if found.fit.cost > drive.settings.selection.far_off * 0.5 * sound.count else found
+    return searched(plain) if found.fit.cost > drive.settings.noise.poor_fit * 0.5 * sound.count else found
 
 
 def _on_own_clock(drive: GriddedDrive) -> GriddedDrive:

@@ -57,30 +57,7 @@ class PredictionErrors:
 
 def worse_by(before: PredictionErrors, after: PredictionErrors) -> float:
     """Ratio of errors after to before, the larger one of position and heading."""
-    return max(_ratios(before, after))
-
-
-def _ratios(before: PredictionErrors, after: PredictionErrors) -> tuple[float, float]:
-    """Errors after over those before, of position and of heading."""
-    return after.position_m / before.position_m, after.yaw_rad / before.yaw_rad
-
-
-def clearly_worse(before: PredictionErrors, after: PredictionErrors, settings: PredictionSettings) -> bool:
-    """Whether errors after are larger by 5 % and by two standard deviations of what blocks scatter, or by a quarter."""
-    for quantity, ratio in enumerate(_ratios(before, after)):
-        sure = ratio > settings.worse and _sigmas(before, after, quantity) > settings.worse_sigmas
-        if sure or ratio > settings.far_worse:
-            return True
-    return False
-
-
-def _sigmas(before: PredictionErrors, after: PredictionErrors, quantity: int) -> float:
-    """Growth of a sum of squares over its standard deviation, which is how much the growth of the blocks scatters."""
-    if before.squares is None or after.squares is None:
-        return math.inf
-    growth = after.squares[:, quantity] - before.squares[:, quantity]
-    scatter = math.sqrt(growth.size) * float(growth.std(ddof=1)) if growth.size > 1 else math.inf
-    return float(growth.sum()) / max(scatter, 1e-30)
+    return max(after.position_m / before.position_m, after.yaw_rad / before.yaw_rad)
 
 
 def within_one_standard_error(best: PredictionErrors, other: PredictionErrors) -> bool:
@@ -197,7 +174,7 @@ def regimes_driven(channel: BodyChannel | WheelChannel, node: Index, ahead: int)
     mean, mean_turn = (size[node + ahead] - size[node]) / ahead, (turn[node + ahead] - turn[node]) / ahead
     changed = np.ptp(sliding_window_view(v, ahead)[node], axis=1)
     regimes = {
-        "standstill": (mean < settings.standing_m_s) & (mean_turn < settings.standing_rad_s),
+        "standstill": (mean < settings.standing_m_s) & (mean_turn < settings.spinning_rad_s),
         "turning on the spot": (mean < settings.standing_m_s * 3) & (mean_turn > settings.spinning_rad_s),
         "speeding up and braking": changed > settings.speeding_m_s2 * ahead * GRID_STEP_S * 0.5,
         "curves": mean_turn > settings.turning_rad_s,

@@ -27,12 +27,11 @@ from disco_hw.gap.search.cross_validation import (
     scored_horizon_s,
 )
 from disco_hw.gap.search.least_squares import inverse, within
+from disco_hw.gap.settings import OF_MEDIAN
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# A Gaussian's standard deviation over the median of its absolute values.
-_OF_MEDIAN = 1.4826
 _LEAST_SCALE = 1e-5
 # How surely entries of which nothing is known stay where they are: enough where predictions say nothing of them.
 _NEGLIGIBLE = 1e-4
@@ -190,6 +189,6 @@ def _usual(error: Array) -> Array:
     """Usual size of errors (K, 3): of position, twice, and of heading; (3,), 1 of no errors."""
     if not error.size:
         return np.ones(3)
-    position = _OF_MEDIAN * float(np.median(np.abs(error[:, :2])))
-    heading = _OF_MEDIAN * float(np.median(np.abs(error[:, 2])))
+    position = OF_MEDIAN * float(np.median(np.abs(error[:, :2])))
+    heading = OF_MEDIAN * float(np.median(np.abs(error[:, 2])))
     return np.asarray(np.maximum(np.array([position, position, heading]), _LEAST_SCALE))

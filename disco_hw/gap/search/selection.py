@@ -291,18 +291,21 @@ class Selector:
         promises = {name: self.promise(accepted, name) for name in rest}
         return sorted((name for name in rest if promises[name] > 0.0), key=lambda name: -promises[name])
 
+    def _next(self, accepted: Names) -> str | None:
+        """Return the most promising candidate that is accepted on top of a set, or None."""
+        acceptable = (name for name in self.ranked(accepted) if self.acceptable(accepted, (*accepted, name)))
+        return next(acceptable, None)
+
     def greedy(self, begin: Names = (), settle: Callable[[Selector, Names], None] | None = None) -> Names:
         """Forward steps only, from a set that is kept; `settle` may better the fit of a set before the next step."""
         accepted = begin or self.given
-        while len(accepted) < self.settings.most_effects:
-            ranked = self.ranked(accepted)
-            new = next((name for name in ranked if self.acceptable(accepted, (*accepted, name))), None)
+        while True:
+            new = self._next(accepted)
             if new is None:
-                break
+                return accepted
             accepted = (*accepted, new)
             if settle is not None:
                 settle(self, accepted)
-        return accepted
 
     def select(self, begin: Names = ()) -> Names:
         """Forward, swap, backward, until nothing changes; from what is needed of a set to begin with.
@@ -311,16 +314,14 @@ class Selector:
         """
         accepted = self.needed(begin) if begin else self.given
         visited = {frozenset(accepted): accepted}
-        while len(accepted) < self.settings.most_effects:
-            ranked = self.ranked(accepted)
-            new = next((name for name in ranked if self.acceptable(accepted, (*accepted, name))), None)
+        while True:
+            new = self._next(accepted)
             if new is None:
-                break
+                return accepted
             larger = self.needed(self.swapped((*accepted, new)))
             if frozenset(larger) in visited:
                 return min(visited.values(), key=self.priced)
             visited[frozenset(larger)] = accepted = larger
-        return accepted
 
     def priced(self, names: Names) -> float:
         """Misfit of a set in nats with half the price of its parameters."""

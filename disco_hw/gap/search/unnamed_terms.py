@@ -106,7 +106,7 @@ def body_terms(channel: BodyChannel, p: Array) -> Iterator[Term]:
     drive = channel.drive
     v, w, a = motion(drive, p)
     dw = np.gradient(smoothed(w, drive.settings.terms), GRID_STEP_S)
-    moving = np.minimum(np.abs(drive.speed_rad_s).max(axis=1) * p[0] / 0.05, 1.0)
+    moving = np.minimum(np.abs(drive.speed_rad_s).max(axis=1) * p[0] / drive.settings.noise.slip_onset_m_s, 1.0)
     beyond = {"moving": moving, "domega/dt": dw, "v domega/dt": v * dw}
     geometry = float(p[0]), float(p[1])
     for axis, target in enumerate(BODY_TARGETS):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.report.amend import amended_model, carried_terms, with_terms_named
+from disco_hw.gap.search.analysis import GapAnalysis
 from disco_hw.gap.search.channel_result import ChannelEstimates, ParameterEstimate, UnnamedTerm
 from disco_hw.gap.search.unnamed_terms import Term
 from disco_hw.model import EffectSetting, Gaussian, Model
@@ -55,16 +56,17 @@ def test_how_far_a_term_reaches_is_its_largest_feature_in_speeds_of_the_last_fit
     drag = Term("v_x += {:.4g} v^3", feature, DRAG, geometry=(0.06, 0.4))
     shared = Term("command += {:.4g} u_other", np.array([[4.0, -5.0]]), SHARED)
     written = [UnnamedTerm(term.form, None, term) for term in (drag, replace(drag, model_name=None), shared)]
-    analysis = SimpleNamespace(body=SimpleNamespace(unnamed=written[:2]), wheels=SimpleNamespace(unnamed=written[2:]))
+    body, wheels = SimpleNamespace(unnamed=written[:2]), SimpleNamespace(unnamed=written[2:])
+    analysis = GapAnalysis(None, None, None, body, wheels)
     final = SimpleNamespace(final_body=SimpleNamespace(vector=np.array([0.066, 0.5, 0.0])))
     assert carried_terms(analysis, final) == {DRAG: pytest.approx(0.3 * 1.1**3), SHARED: 5.0}
     turning = UnnamedTerm("", None, replace(drag, model_name=TURN))
-    analysis = SimpleNamespace(body=SimpleNamespace(unnamed=[turning]), wheels=analysis.wheels)
+    analysis = replace(analysis, body=SimpleNamespace(unnamed=[turning]))
     # The larger wheels and the longer axle turn more slowly.
     assert carried_terms(analysis, final)[TURN] == pytest.approx(0.3 * 1.1**3 / (0.5 / 0.4))
     unfitted = carried_terms(analysis, SimpleNamespace(final_body=None))
     assert unfitted[TURN] == pytest.approx(0.3 / 0.06**3 * 0.4)
-    alone = carried_terms(SimpleNamespace(body=None, wheels=analysis.wheels), SimpleNamespace(final_body=None))
+    alone = carried_terms(replace(analysis, body=None), SimpleNamespace(final_body=None))
     assert alone == {SHARED: 5.0}
 
 

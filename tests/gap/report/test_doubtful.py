@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report import EffectFinding
-from disco_hw.gap.report.judge import Measured, _confirmed, classify_findings, low_confidence_of
+from disco_hw.gap.report.judge import Measured, classify_findings, low_confidence_of
 from disco_hw.gap.search.channel_result import ParameterEstimate
 from tests.gap.synthetic import line_of
 
@@ -27,11 +26,10 @@ def effect(name, **values):
     ("name", "values", "why"),
     [
         ("motor_lag", {"tau_s": (0.2, 0.18, 0.22)}, None),
-        ("motor_lag", {"tau_s": (2.0, 1.05, 2.95)}, "end of its range"),
         ("motor_lag", {"tau_s": (0.2, 0.01, 0.39)}, "wider than the value"),
         ("motor_lag", {"tau_s": (0.030, 0.010, 0.051)}, "wider than the value"),
         ("motor_lag", {"tau_s": (0.030, 0.017, 0.043)}, None),
-        ("battery_sag", {"loss": (0.9, -2e11, 2e11)}, "end of its range"),
+        ("battery_sag", {"loss": (0.9, -2e11, 2e11)}, "wider than the value"),
         ("speed_limit", {"limit_rad_s": (4.2, 4.1, 4.3)}, None),
         ("speed_limit", {"limit_rad_s": (4.2, 2.4, 6.0)}, "wider than the value"),
         ("speed_limit", {"limit_rad_s": (3.5, 3.4, 3.6)}, "s of this log, up to 4 rad/s"),
@@ -41,12 +39,6 @@ def effect(name, **values):
         ("yaw_rate_limit", {"limit_rad_s": (1.2, 1.15, 1.25)}, None),
         ("wheel_gain", {"left": (0.0, -0.1, 0.1), "right": (0.05, 0.04, 0.06)}, None),
         ("wheel_gain", {"left": (0.01, -0.1, 0.1), "right": (0.05, -0.04, 0.15)}, "wider than the value"),
-        # When it changed is known, and that it did is not.
-        (
-            "surface_change",
-            {"track": (0.03, -0.01, 0.07), "time_s": (50.0, 45.0, 55.0), "radius": (0.01, -0.01, 0.03)},
-            "its interval holds no effect",
-        ),
         (
             "surface_change",
             {"track": (0.03, 0.01, 0.05), "time_s": (50.0, 45.0, 55.0), "radius": (0.01, -0.01, 0.03)},
@@ -74,26 +66,3 @@ def test_effects_are_parted_and_keep_their_order():
     sure, doubtful = classify_findings(effects, drive())
     assert [one.name for one in sure] == ["motor_lag"]
     assert [(one.name, "exceeded" in one.why) for one in doubtful] == [("speed_limit", True)]
-
-
-@pytest.mark.parametrize(
-    ("of_body", "of_wheels", "confirmed"),
-    [
-        ((0.02, 0.015, 0.025), (0.021, 0.020, 0.022), True),
-        ((0.02, 0.015, 0.025), (0.026, 0.025, 0.027), True),
-        ((0.02, 0.015, 0.025), (0.027, 0.026, 0.028), False),
-        ((0.02, 0.015, 0.025), (0.013, 0.012, 0.014), False),
-        # Nothing is no witness, and needs none.
-        ((0.02, 0.015, 0.025), (0.010, -0.010, 0.030), False),
-        ((0.02, -0.001, 0.041), (0.021, 0.020, 0.022), False),
-        ((-0.02, -0.025, -0.015), (-0.021, -0.022, -0.020), True),
-    ],
-)
-def test_what_both_channels_say_alike_is_not_disputed(of_body, of_wheels, confirmed):
-    """Unequal wheels lead the robot aside, and share the load of a turn unequally."""
-    said = {"wheel_radius_asymmetry.ratio": of_body, "turning_load.unequal": of_wheels}
-    estimated = {name: ParameterEstimate(*values) for name, values in said.items()}
-    assert _confirmed(REGISTRY["wheel_radius_asymmetry"], estimated) == confirmed
-    assert not _confirmed(REGISTRY["turn_slip"], {**estimated, "turn_slip.k_s": ParameterEstimate(0.1, 0.09, 0.11)})
-    del estimated["turning_load.unequal"]
-    assert not _confirmed(REGISTRY["wheel_radius_asymmetry"], estimated)

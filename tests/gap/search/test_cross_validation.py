@@ -13,8 +13,6 @@ from disco_hw.gap.search.channel_search import indices
 from disco_hw.gap.search.cross_validation import (
     Chain,
     PredictionErrors,
-    _sigmas,
-    clearly_worse,
     errors_of,
     floor_errors,
     fold_of,
@@ -56,22 +54,6 @@ def test_the_right_model_errs_by_the_noise_alone_and_a_wrong_one_by_more():
     assert wrong.yaw_rad > 5.0 * sound.yaw_rad
     assert wrong.position_ci[0] < wrong.position_m < wrong.position_ci[1]
     assert wrong.by_regime_m["turning on the spot"] > 2.0 * sound.by_regime_m["turning on the spot"]
-
-
-def test_only_what_repeats_in_most_stretches_or_is_far_worse_is_clearly_worse():
-    def errors(*squares):
-        both = np.column_stack([squares, np.ones(len(squares))])
-        return PredictionErrors(float(np.sqrt(np.mean(squares))), (0.0, 1.0), 1.0, (0.0, 1.0), 0.0, {}, both)
-
-    def clearly(before, after):
-        return clearly_worse(before, after, DEFAULT_SETTINGS.prediction)
-
-    before = errors(1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
-    assert clearly(before, errors(1.2, 1.2, 1.1, 1.3, 1.2, 1.2))
-    assert not clearly(before, errors(2.2, 0.9, 1.1, 0.9, 1.1, 1.0))
-    assert clearly(before, errors(5.0, 0.9, 1.1, 0.9, 1.1, 1.0))
-    assert not clearly(before, errors(1.05, 1.05, 1.05, 1.05, 1.05, 1.05))
-    assert not clearly(errors(1.2, 1.2, 1.1, 1.3, 1.2, 1.2), before)
 
 
 def test_smoothed_poses_are_closer_to_the_truth_than_measured_ones():
@@ -155,41 +137,6 @@ def test_the_larger_growth_of_position_and_heading_counts():
     before = in_stretches([1.0] * 6, [4.0] * 6)
     assert worse_by(before, in_stretches([4.0] * 6, [9.0] * 6)) == pytest.approx(2.0)
     assert worse_by(before, in_stretches([1.0] * 6, [9.0] * 6)) == pytest.approx(1.5)
-
-
-def test_at_its_bounds_nothing_is_clearly_worse_and_without_stretches_the_size_alone_decides():
-    before, twice = in_stretches([1.0] * 6, [1.0] * 6), in_stretches([4.0] * 6, [1.0] * 6)
-    settings = replace(DEFAULT_SETTINGS.prediction, worse=2.0, far_worse=2.0)
-    assert not clearly_worse(before, twice, settings)
-    assert clearly_worse(before, twice, replace(settings, far_worse=1.9))
-    settings = replace(settings, worse=1.9)
-    assert clearly_worse(before, twice, settings)
-    uneven = in_stretches([19.0, 1.0, 1.0, 1.0, 1.0, 1.0], [1.0] * 6)
-    assert not clearly_worse(before, uneven, settings)
-    assert clearly_worse(replace(before, squares=None), uneven, settings)
-    assert clearly_worse(before, replace(uneven, squares=None), settings)
-
-
-@pytest.mark.parametrize(("sigmas", "worse"), [(2.1, True), (1.95, False)])
-def test_growth_is_clear_by_how_stretches_scatter_about_their_own_mean(sigmas, worse):
-    # Squares that grow by 1.3 of 10 on the mean, three stretches by more and three by less.
-    scatter = 1.3 * np.sqrt(6.0) / sigmas
-    growth = 1.3 + scatter * np.sqrt(5.0 / 6.0) * np.array([1, -1, 1, -1, 1, -1])
-    before = in_stretches([10.0] * 6, [1.0] * 6)
-    assert clearly_worse(before, in_stretches(10.0 + growth, [1.0] * 6), DEFAULT_SETTINGS.prediction) is worse
-    # Two stretches that grow alike are sure too, one is not.
-    for count in (1, 2):
-        before, after = in_stretches([10.0] * count, [1.0] * count), in_stretches([11.3, 11.4][:count], [1.0] * count)
-        assert clearly_worse(before, after, DEFAULT_SETTINGS.prediction) is (count == 2)
-
-
-def test_growth_that_is_just_as_sure_as_it_must_be_is_not_clear_and_of_one_stretch_nothing_is_sure():
-    before, after = in_stretches([10.0] * 4, [1.0] * 4), in_stretches([11.5, 11.0, 11.5, 11.0], [1.0] * 4)
-    sure = _sigmas(before, after, 0)
-    assert sure == pytest.approx(5.0 / (2.0 * np.sqrt(0.25 / 3.0)))
-    assert not clearly_worse(before, after, replace(DEFAULT_SETTINGS.prediction, worse_sigmas=sure))
-    assert clearly_worse(before, after, replace(DEFAULT_SETTINGS.prediction, worse_sigmas=0.99 * sure))
-    assert _sigmas(in_stretches([10.0], [1.0]), in_stretches([11.0], [1.0]), 0) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from disco_hw.gap.search.analysis import GapAnalysis, lacking, lacking_one, least_evident_first, swapped_one
+from disco_hw.gap.search.analysis import GapAnalysis, lacking, least_evident_first
 from disco_hw.gap.search.channel_result import ChannelResult, UnnamedTerm
 
 SCORES = {
@@ -32,8 +32,8 @@ def found(names, terms=(), given=(), plain=None, **rivals):
     return ChannelResult(chosen(given, **rivals), names, None, unnamed, plain)
 
 
-def analysis_of(wheels=None, body=None, pruned=()):
-    return GapAnalysis(None, None, None, body, wheels, pruned)
+def analysis_of(wheels=None, body=None, left_out=()):
+    return GapAnalysis(None, None, None, body, wheels, left_out)
 
 
 def told(analysis):
@@ -41,7 +41,7 @@ def told(analysis):
     of = [analysis.wheels, analysis.body]
     return (
         *(None if one is None else (*one.names, *(term.form for term in one.unnamed)) for one in of),
-        analysis.pruned,
+        analysis.left_out,
     )
 
 
@@ -59,25 +59,18 @@ def test_the_least_evident_comes_first_whatever_its_channel_and_lateness_and_wha
     assert least_evident_first(analysis_of()) == []
 
 
-def test_each_name_and_all_terms_of_a_channel_go_in_turn():
+def test_without_its_terms_a_channel_is_the_one_that_was_searched_before():
     plain = chosen()
-    wheels = found(("motor_lag", "deadband"), given=("motor_lag",))
     body = found(("slope", "turn_slip"), [("v v", 45.0), ("v w", 25.0)], plain=plain)
-    both = analysis_of(wheels, body, ("stiction",))
-    without = [*lacking_one(both)]
-    kept, terms = ("motor_lag", "deadband"), ("slope", "turn_slip", "v v", "v w")
-    assert [told(one) for one in without] == [
-        (("motor_lag",), terms, ("stiction", "deadband")),
-        (kept, terms[1:], ("stiction", "slope")),
-        (kept, ("slope", "v v", "v w"), ("stiction", "turn_slip")),
-        (kept, ("slope", "turn_slip"), ("stiction", "v v", "v w")),
-    ]
+    both = analysis_of(found(("motor_lag", "deadband")), body, ("stiction",))
+    bare, fewer = lacking(both, "body", None), lacking(both, "body", "turn_slip")
+    kept = ("motor_lag", "deadband")
+    assert told(bare) == (kept, ("slope", "turn_slip"), ("stiction", "v v", "v w"))
+    assert told(fewer) == (kept, ("slope", "v v", "v w"), ("stiction", "turn_slip"))
     # What is fitted without them has none.
-    assert without[-1].body.selector is plain
-    assert without[-1].body.plain is None
-    assert without[-2].body.plain is plain
-    assert [told(one)[1] for one in lacking_one(analysis_of(None, body))] == [told(one)[1] for one in without[1:]]
-    assert [told(one) for one in lacking_one(analysis_of(wheels))] == [(("motor_lag",), None, ("deadband",))]
+    assert bare.body.selector is plain
+    assert bare.body.plain is None
+    assert fewer.body.plain is plain
 
 
 @pytest.mark.parametrize("which", ["wheels", "body"])
@@ -87,19 +80,6 @@ def test_what_lacks_something_is_the_channel_that_had_it(which):
     assert getattr(less, which).names == ("deadband",)
     other = "body" if which == "wheels" else "wheels"
     assert getattr(less, other) is getattr(analysis, other)
-    assert less.pruned == ("slope",)
+    assert less.left_out == ("slope",)
     # Without terms there is nothing to go back to.
     assert getattr(lacking(analysis, which, None), which).selector is getattr(analysis, which).selector
-
-
-def test_what_would_do_as_well_takes_the_place_of_a_name():
-    wheels = found(("motor_lag", "deadband"), deadband=("stiction",))
-    body = found(("slope", "turn_slip"), given=("slope",), turn_slip=("side_slip", "lateral_icr"), slope=("no",))
-    options = [told(one) for one in swapped_one(analysis_of(wheels, body))]
-    assert options == [
-        (("motor_lag", "stiction"), ("slope", "turn_slip"), ("deadband",)),
-        (("motor_lag", "deadband"), ("slope", "side_slip"), ("turn_slip",)),
-        (("motor_lag", "deadband"), ("slope", "lateral_icr"), ("turn_slip",)),
-    ]
-    assert len([*swapped_one(analysis_of(None, body))]) == 2
-    assert len([*swapped_one(analysis_of(wheels))]) == 1

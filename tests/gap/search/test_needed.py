@@ -86,8 +86,8 @@ def needed(monkeypatch, squares, wheels=None, body=None):
     monkeypatch.setattr(stages, "_Candidate", Candidate)
     analysis = analysis_of(wheels, body)
     kept = stages._needed(analysis, "timed", "ahead", "apart").candidate
-    wheels, body, pruned = told(kept.analysis)
-    return " ".join((*(wheels or ()), *(body or ()))), kept.is_on_top, pruned, Candidate.judged_so_far
+    wheels, body, left_out = told(kept.analysis)
+    return " ".join((*(wheels or ()), *(body or ()))), kept.is_on_top, left_out, Candidate.judged_so_far
 
 
 def test_the_least_evident_goes_first_where_nothing_is_worse_without_and_the_rest_stays(monkeypatch):
@@ -96,8 +96,8 @@ def test_the_least_evident_goes_first_where_nothing_is_worse_without_and_the_res
         ("turn_slip slope", True): 1.0, ("turn_slip", True): 1.01, ("slope", True): 1.0,
     }  # fmt: skip
     body = found(("turn_slip", "slope", "side_slip"))
-    names, on_top, pruned, _ = needed(monkeypatch, squares, body=body)
-    assert (names, on_top, pruned) == ("slope", True, ("side_slip", "turn_slip"))
+    names, on_top, left_out, _ = needed(monkeypatch, squares, body=body)
+    assert (names, on_top, left_out) == ("slope", True, ("side_slip", "turn_slip"))
     # Where it does better without, all else is held against that.
     better = {**squares, ("turn_slip slope", True): 0.8, ("slope", True): 0.9}
     assert needed(monkeypatch, better, body=body)[0] == "turn_slip slope"
@@ -144,8 +144,8 @@ def of_every_log(names, even=True, **estimates):
     by_name |= {column: ParameterEstimate(0.1, *ends) for column, ends in estimates.items()}
     analysis = replace(analysis_of(None, found(names, [("drag", 45.0)])), drive=SimpleNamespace(pose_clock_even=even))
     final = SimpleNamespace(body_estimates=SimpleNamespace(by_name=by_name))
-    _, body, pruned = told(stages.of_every_log(analysis, final))
-    return body, pruned
+    _, body, left_out = told(stages.of_every_log(analysis, final))
+    return body, left_out
 
 
 @pytest.mark.parametrize("even", [True, False])

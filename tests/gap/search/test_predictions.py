@@ -376,10 +376,10 @@ def test_what_the_other_fold_says_little_of_is_used_if_it_fixes_the_value_itself
 @pytest.mark.parametrize(
     ("v_m_s", "omega_rad_s", "told"),
     [
-        (0.019, 0.049, "standstill"),
-        (-0.019, -0.049, "standstill"),
+        (0.019, 0.099, "standstill"),
+        (-0.019, -0.099, "standstill"),
         (0.021, 0.0, "straight ahead"),
-        (0.0, 0.051, "straight ahead"),
+        (0.0, 0.101, "turning on the spot"),
         (0.059, -0.101, "turning on the spot"),
         (0.061, 0.101, "straight ahead"),
         (0.059, 0.099, "straight ahead"),
@@ -400,7 +400,6 @@ def test_a_regime_is_told_by_mean_speed_and_mean_yaw_rate(v_m_s, omega_rad_s, to
     ("bound", "v_m_s", "omega_rad_s"),
     [
         ("standing_m_s", 0.0, 0.0),
-        ("standing_rad_s", 0.0, 0.0),
         ("standing_m_s", 0.0, 0.2),
         ("spinning_rad_s", 0.03, 0.0),
         ("speeding_m_s2", 0.3, 0.0),

@@ -46,13 +46,6 @@ def test_what_promises_more_than_its_price_is_ranked():
     assert some.ranked(()) == [C, B]
 
 
-@pytest.mark.parametrize("most", [1, 2])
-def test_no_more_effects_are_taken_than_may_be(most):
-    worths = {(): 0.0, (A,): 3.0, (A, B): 5.0, (A, B, C): 6.0}
-    assert Told(worths, most_effects=most).greedy() == (A, B)[:most]
-    assert Told(worths, most_effects=most).select() == (A, B)[:most]
-
-
 def test_an_effect_is_swapped_for_the_one_that_is_worth_most_more_than_it():
     both = {(A, B): 9.0, (A,): 2.0, (B,): 3.0}
     least = SETTINGS.telling_nats

@@ -107,7 +107,7 @@ def test_what_was_freed_is_told_with_the_fit_of_all_data():
 
 def test_channels_fitted_apart_are_told_at_once():
     analysis = analysed()
-    apart = stage_predictions(analysis)
+    apart = stage_predictions(analysis, final_fit(analysis))
     assert set(apart.chains) == {"refitted", "amended"}
     assert not apart.joint
     for fold in (0, 1):
