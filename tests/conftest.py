@@ -21,8 +21,9 @@ TESTS = Path(__file__).parent
 # With `--dist each` a worker reads and runs only its own folders, as reading all tests takes as long as a tenth of them
 # does to run. The first has the stacks in real time; the others are what takes about equally long.
 PARTS = (
-    ("hil", "firmware_protocol/emulated"),
-    ("adaptation", "control", "estimation", "gap", "inference", "log", "model", "tasks", "tools", "viewer"),
+    ("hil", "first_use", "firmware_protocol/emulated"),
+    ("adaptation", "estimation", "gap", "inference", "log", "model"),
+    ("control", "drivers", "experiments", "runtime", "sim", "tasks"),
 )
 
 
@@ -33,7 +34,7 @@ def pytest_configure(config):
             raise pytest.UsageError(f"--dist each: the tests have {len(PARTS) + 1} parts; give -n {len(PARTS) + 1}")
         config.pluginmanager.register(PartsOfTests())
     if settings().derandomize:
-        # Examples take constants from what a process has imported so far, which is chance on three workers.
+        # Examples take constants from what a process has imported so far, which is chance on several workers.
         assert callable(providers._get_local_constants)
         providers._get_local_constants = lambda: providers._local_constants
 

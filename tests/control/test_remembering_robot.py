@@ -28,8 +28,9 @@ MODEL = Model(
         ),
     ),
 )  # fmt: skip
+# What is sampled remembers; a refined plan is made anew in each tick.
 SETTINGS = DiscoSettings(
-    sampler=Sampler(samples=160, horizon=30), uncertainty="point", iterations_at_start=1, retries=0
+    sampler=Sampler(samples=160, horizon=30), uncertainty="point", iterations_at_start=1, retries=0, refine=False
 )
 TURNING_S, AHEAD_STEPS = 1.0, 8
 
