@@ -298,7 +298,7 @@ def test_there_is_nothing_to_look_at_without_a_plan():
 LEARNT = Gaussian(MODEL.belief.names, MODEL.belief.mean() * [1.05, 0.97, 1.02], 0.25 * MODEL.belief.covariance())
 
 
-@pytest.mark.parametrize("uncertainty", ["ut", "mc", "joint"])
+@thinned("uncertainty", ["ut", "mc", "joint"], quick=1)
 def test_a_belief_set_is_as_good_as_a_belief_begun_with(uncertainty):
     begun = planner(replace(MODEL, belief=LEARNT), uncertainty=uncertainty)
     swapped = planner(uncertainty=uncertainty)

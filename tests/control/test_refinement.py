@@ -52,11 +52,13 @@ def drive_on() -> dict[float, tuple[np.ndarray, np.ndarray]]:
     return found
 
 
+@pytest.mark.thorough
 def test_a_refined_plan_stays_on_the_line(drive_on: dict[float, tuple[np.ndarray, np.ndarray]]) -> None:
     """A robot on the circle is planned to stay within a millimetre of it; sampling alone is not as near."""
     assert np.abs(drive_on[0.2][1]).max() < 1e-3
 
 
+@pytest.mark.thorough
 def test_a_wide_belief_does_not_lead_a_refined_plan_off_the_line() -> None:
     """The refinement plans in the mean: under points 15 % apart it would stay where their spread costs least."""
     geometry = np.array([MODEL.wheel_radius_m, MODEL.axial_distance_m, MODEL.x_icr_m])
@@ -85,6 +87,7 @@ def _cost(commands: np.ndarray, state: PlannerState, speed_m_s: float, step_s: f
     return distance + last + (CHANGE_S * MODEL.wheel_radius_m) ** 2 * float((changes**2).sum())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("speed_m_s", [0.1, 0.2, 0.3])
 def test_a_refined_plan_costs_no_more_than_the_sampled_one(speed_m_s: float) -> None:
     """In the mean of what is believed, on the line and beside it."""
@@ -100,6 +103,7 @@ def test_a_refined_plan_costs_no_more_than_the_sampled_one(speed_m_s: float) -> 
         assert costs[0] <= costs[1]
 
 
+@pytest.mark.thorough
 def test_a_line_too_fast_for_the_wheels_is_followed_slower(
     drive_on: dict[float, tuple[np.ndarray, np.ndarray]],
 ) -> None:
