@@ -114,6 +114,7 @@ def test_a_line_too_fast_for_the_wheels_is_followed_slower(
     assert np.abs(off_m).max() < 5e-3
 
 
+@pytest.mark.thorough
 def test_warming_up_compiles_the_refinement() -> None:
     """The refinement is compiled before the robot reaches its line, though warming up plans far from it."""
     planner = Disco(MODEL, CircleCost(radius_m=RADIUS_M), SETTINGS, LIMITS)
