@@ -64,7 +64,10 @@ def wall_offset_ns() -> int:
 
 @dataclass(frozen=True, slots=True)
 class RecordingSettings:
-    """Header of a log, and how many control cycles may wait for the writer (`queue_ticks`) before more are dropped."""
+    """Header of a log, and how many control cycles may wait for the writer (`queue_ticks`) before more are dropped.
+
+    `planner`: version of the planner that the log's plans are of, 0 to name none.
+    """
 
     path: Path
     robot: str

@@ -144,16 +144,22 @@ def test_a_robot_that_gets_nowhere_is_left_to_the_sampled_plan() -> None:
     assert steps[60] == STEPS
 
 
-@pytest.mark.parametrize(("room_to_stop_m", "is_refined"), [(0.2, False), (0.6, True)])
-def test_a_plan_is_refined_only_if_the_robot_can_stop_after_it(room_to_stop_m: float, is_refined: bool) -> None:
-    """At 0.4 m/s a robot that brakes with 0.18 m/s^2 needs 0.44 m: more than the planned way alone would tell."""
+@pytest.mark.parametrize(
+    ("room_to_stop_m", "radius_part", "is_refined"), [(0.2, 0.01, False), (0.6, 0.01, True), (0.6, 0.2, False)]
+)
+def test_a_plan_is_refined_only_if_the_robot_can_stop_after_it(
+    room_to_stop_m: float, radius_part: float, is_refined: bool
+) -> None:
+    """At 0.4 m/s a robot that brakes with 0.18 m/s^2 needs 0.44 m, and more where its wheels may be larger."""
     speed_m_s, limits, settings = 0.4, CommandLimits(8.0, 3.0), DiscoSettings()
     way_m, keep_m = STEPS * settings.step_s * speed_m_s, 0.05
     wall_m = FOOTPRINT.ahead + 0.5 * FOOTPRINT.length + keep_m + way_m + room_to_stop_m
     room = Fence(keep_in=((-5.0, -5.0), (wall_m, -5.0), (wall_m, 5.0), (-5.0, 5.0)))
     around = Surroundings(FOOTPRINT, keep_m, 1e-3, settings.step_s, settings.sampler.horizon, speed_m_s)
     line = PathCost(PathTable(np.array([[-4.0, 0.0], [8.0, 0.0]])), speed_m_s)
-    planner = Disco(MODEL, line, settings, limits, surroundings=around)
+    radius_m = MODEL.wheel_radius_m
+    radius = Gaussian(("wheel_radius_m",), np.array([radius_m]), np.array([[(radius_part * radius_m) ** 2]]))
+    planner = Disco(replace(MODEL, belief=radius), line, settings, limits, surroundings=around)
     around.look_around(Boundaries(FOOTPRINT, room, ()), 0.0)
     turning = speed_m_s / MODEL.wheel_radius_m
     plan = planner.plan(0, PlannerState(0, 0.0, 0.0, 0.0, turning, turning))

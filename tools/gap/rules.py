@@ -155,6 +155,7 @@ RULES: tuple[Rule, ...] = (
     Rule("an encoder is the cause of both", analysis, "one_encoder", _says((False, False))),
     Rule("rivals of a name", Selector, "rivals", _says(())),
     Rule("a value that is hardly known", judge, "is_weakly_known", _says(False)),
+    Rule("an interval that includes no effect", judge, "includes_no_effect", _says(False)),
     Rule("a limit that was exceeded", judge, "_exceeded", _says(None)),
     Rule("wheels answer otherwise than by delay and lag", misspecification, "_answers_otherwise", _says(None)),
     Rule("a name takes little of what is missing", misspecification, "_takes_little", _says(None)),

@@ -217,7 +217,8 @@ def touches(area: Area, paths: Floats) -> bool:
         for t in range(1, paths.shape[1]):
             x, y, yaw = paths[n, t, 0], paths[n, t, 1], paths[n, t, 2]
             forward = math.hypot(x - paths[n, t - 1, 0], y - paths[n, t - 1, 1]) / step_s
+            cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
             for shape in range(area.number[0]):
-                if touch_cost(area, shape, t * step_s, (x, y, forward), math.cos(yaw), math.sin(yaw)) > 0.0:
+                if touch_cost(area, shape, t * step_s, (x, y, forward), cos_yaw, sin_yaw) > 0.0:
                     return True
     return False

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.data.stamp_clock import StampClock, clock_of
-from disco_hw.gap.data.timing import apart, lowest, mismatch_of, scanned_delays, standing_out
+from disco_hw.gap.data.timing import apart, lowest, mismatch_of, most_distinct_delay, scanned_delays
 from disco_hw.gap.settings import GridSettings
 from disco_hw.jit import kernel_function
 from disco_hw.log.drive import Commands, Wheels
@@ -239,7 +239,7 @@ class CommandAlignment:
     def part_delay_s(self, low_s: float, high_s: float) -> float | None:
         """Age of the commands in force in a stretch; None where it does not show."""
         step_s = 2.0 * self.settings.delay_step_s
-        found_s = standing_out(lambda some: self._mismatches(low_s, high_s, some), step_s, self.settings)
+        found_s = most_distinct_delay(lambda some: self._mismatches(low_s, high_s, some), step_s, self.settings)
         return None if found_s is None else -found_s
 
     def part_mismatch(self, low_s: float, high_s: float, delay_s: float) -> float:

@@ -85,7 +85,9 @@ def pose_delay_s(wheels: Wheels, poses: Poses, settings: GridSettings) -> float:
     by those of the wheels (two regressions, robust by Huber's weights; their likelihoods, with unknown variances, are
     added). 0 where the poses are too few or where no delay stands out.
     """
-    found_s = standing_out(lambda some: _mismatches(wheels, poses, some, settings), settings.delay_step_s, settings)
+    found_s = most_distinct_delay(
+        lambda some: _mismatches(wheels, poses, some, settings), settings.delay_step_s, settings
+    )
     return found_s or 0.0
 
 
@@ -162,21 +164,21 @@ def scanned_delays(most_s: float, step_s: float) -> Array:
     return np.asarray(step_s * np.arange(-steps, steps + 1, dtype=np.float64))
 
 
-def standing_out(misfits: Callable[[Array], Array], step_s: float, settings: GridSettings) -> float | None:
+def most_distinct_delay(mismatches: Callable[[Array], Array], step_s: float, settings: GridSettings) -> float | None:
     """Return the delay (s) of the least mismatch, of all that are scanned in such steps; None if none stands out."""
     delays = scanned_delays(settings.most_pose_delay_s, step_s)
-    mismatch = misfits(delays)
+    mismatch = mismatches(delays)
     best, ordinary = int(np.argmin(mismatch)), mismatch[np.isfinite(mismatch)]
     if not ordinary.size or float(np.median(ordinary)) - mismatch[best] < settings.least_delay_nats:
         return None
-    return lowest(misfits, float(delays[best]), step_s)[0]
+    return lowest(mismatches, float(delays[best]), step_s)[0]
 
 
-def lowest(misfits: Callable[[Array], Array], about_s: float, step_s: float) -> tuple[float, float]:
+def lowest(mismatches: Callable[[Array], Array], about_s: float, step_s: float) -> tuple[float, float]:
     """Return the delay (s) of the least mismatch, within a step of a scan's best one, and the mismatch there."""
 
     def at(delay_s: float) -> float:
-        return min(float(misfits(np.full(1, delay_s))[0]), 1e3)
+        return min(float(mismatches(np.full(1, delay_s))[0]), 1e3)
 
     bounds = (about_s - step_s, about_s + step_s)
     found = minimize_scalar(at, bounds=bounds, method="bounded", options={"xatol": _CLOSE_S})

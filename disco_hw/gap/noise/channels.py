@@ -7,7 +7,7 @@ data.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol, Self
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,28 +77,8 @@ class ResidualChannel(Protocol):
         """Entries of effects and base alone, and what unnamed terms add at the nodes, if any."""
 
 
-class _WithoutTerms:
-    """What both channels share: settings of their drive, and no unnamed terms."""
-
-    drive: GriddedDrive
-
-    @property
-    def settings(self) -> GapSettings:
-        """The settings of the analysis."""
-        return self.drive.settings
-
-    @property
-    def inner(self) -> Self:
-        """Channel without unnamed terms: this one."""
-        return self
-
-    def split(self, p: Array) -> tuple[Array, Array | None]:
-        """Return the vector and None: this channel has no unnamed terms."""
-        return p, None
-
-
 @dataclass(frozen=True)
-class WheelChannel(_WithoutTerms):
+class WheelChannel:
     """Commands in, wheel angles out; `weight` (E, 2) tames stretches that are noisier than the rest."""
 
     drive: GriddedDrive
@@ -107,6 +87,20 @@ class WheelChannel(_WithoutTerms):
     weight: Array
     noise: WheelNoise
     geometry: Array
+
+    @property
+    def settings(self) -> GapSettings:
+        """The settings of the analysis."""
+        return self.drive.settings
+
+    @property
+    def inner(self) -> WheelChannel:
+        """Channel without unnamed terms: this one."""
+        return self
+
+    def split(self, p: Array) -> tuple[Array, Array | None]:
+        """Return the vector and None: this channel has no unnamed terms."""
+        return p, None
 
     @classmethod
     def build(cls, drive: GriddedDrive, noise: WheelNoise, geometry: Array, use: Mask | None = None) -> WheelChannel:
@@ -246,7 +240,7 @@ class WheelChannel(_WithoutTerms):
 
 
 @dataclass(frozen=True)
-class BodyChannel(_WithoutTerms):
+class BodyChannel:
     """Channel from measured wheel angles to poses, in windows of time whose start pose is unknown."""
 
     drive: GriddedDrive
@@ -260,6 +254,20 @@ class BodyChannel(_WithoutTerms):
     weight: Array
     noise: BodyNoise
     geometry: Array
+
+    @property
+    def settings(self) -> GapSettings:
+        """The settings of the analysis."""
+        return self.drive.settings
+
+    @property
+    def inner(self) -> BodyChannel:
+        """Channel without unnamed terms: this one."""
+        return self
+
+    def split(self, p: Array) -> tuple[Array, Array | None]:
+        """Return the vector and None: this channel has no unnamed terms."""
+        return p, None
 
     @classmethod
     def build(cls, drive: GriddedDrive, noise: BodyNoise, geometry: Array, use: Mask | None = None) -> BodyChannel:

@@ -260,7 +260,18 @@ def low_confidence_of(effect: EffectFinding, measured: Measured) -> str | None:
     if all(is_weakly_known(parameter, estimate, settings) for parameter, estimate in pairs):
         values = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
         return f"{values} is hardly known: its interval is wider than the value"
+    if includes_no_effect(effect):
+        values = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
+        return f"{values}: its interval includes no effect"
     return _exceeded(described, pairs[0][1], measured) or measured.disputed.get(effect.name)
+
+
+def includes_no_effect(effect: EffectFinding) -> bool:
+    """Whether the intervals of all that make an effect's size include the value at which it does nothing."""
+    sizes = [each for each in REGISTRY[effect.name].parameters if math.isfinite(each.neutral)]
+    intervals = [(effect.parameters[each.name], each.neutral) for each in sizes]
+    # A limit does nothing only where it is infinite, which no interval includes.
+    return not REGISTRY[effect.name].is_limit and all(each.low <= none <= each.high for each, none in intervals)
 
 
 def is_weakly_known(parameter: Parameter, estimate: ParameterEstimate, settings: ReportSettings) -> bool:

@@ -39,6 +39,12 @@ def effect(name, **values):
         ("yaw_rate_limit", {"limit_rad_s": (1.2, 1.15, 1.25)}, None),
         ("wheel_gain", {"left": (0.0, -0.1, 0.1), "right": (0.05, 0.04, 0.06)}, None),
         ("wheel_gain", {"left": (0.01, -0.1, 0.1), "right": (0.05, -0.04, 0.15)}, "wider than the value"),
+        # When it changed is known, and that it did is not.
+        (
+            "surface_change",
+            {"track": (0.03, -0.01, 0.07), "time_s": (50.0, 45.0, 55.0), "radius": (0.01, -0.01, 0.03)},
+            "includes no effect",
+        ),
         (
             "surface_change",
             {"track": (0.03, 0.01, 0.05), "time_s": (50.0, 45.0, 55.0), "radius": (0.01, -0.01, 0.03)},
