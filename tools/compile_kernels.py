@@ -9,7 +9,6 @@ import math
 import sys
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 
 import numpy as np
 
@@ -26,7 +25,6 @@ from disco_hw.model.step import FreeRun
 from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.tasks import task_from
-from disco_hw.tasks.circle import CircleCost
 from disco_hw.tasks.line import Waypoints
 from disco_hw.tasks.timed_path import TimedPathCost
 from tools.gap.logs import simulated_drive
@@ -52,16 +50,6 @@ def plan_the_shipped_tasks() -> None:
         Disco(setup.model, task, DiscoSettings(), limits).warm_up()
 
 
-def plan_in_other_forms() -> None:
-    """On the circle, with those forms that several quick tests plan with."""
-    setup = load_setup(SHIPPED_ROBOT)
-    limits = CommandLimits.of_robot(setup.config.robot)
-    lagging = replace(setup.model, effects=(EffectSetting("motor_lag", {"tau_s": 0.1}),))
-    Disco(lagging, CircleCost(), DiscoSettings(), CommandLimits(25.0, 40.0)).warm_up()
-    for settings in (DiscoSettings(uncertainty="joint"), DiscoSettings(offset_free=True)):
-        Disco(setup.model, CircleCost(), settings, limits).warm_up()
-
-
 def search_a_log() -> None:
     log, nominal = simulated_drive({}, seed=1, drive="circle"), Model(0.061, 0.415, 0.238)
     missing_effects(log, nominal)
@@ -73,8 +61,7 @@ def search_a_log() -> None:
 
 
 def main() -> int:
-    # The last begins on the processor that is free first.
-    work: tuple[Callable[[], None], ...] = (plan_the_shipped_tasks, search_a_log, plan_in_other_forms)
+    work: tuple[Callable[[], None], ...] = (plan_the_shipped_tasks, search_a_log)
     with ProcessPoolExecutor(PROCESSORS) as pool:
         for done in [pool.submit(one) for one in work]:
             done.result()

@@ -167,7 +167,7 @@ def test_delay_and_lag_in_the_model_help_a_plant_that_has_them():
     assert costs[0] < costs[1]
 
 
-@thinned("uncertainty", ["joint", "point", "mc"], quick=1)
+@thinned("uncertainty", ["joint", "point", "mc"], quick=0)
 def test_every_form_of_uncertainty_drives(uncertainty):
     costs, _ = drive(planner(uncertainty=uncertainty), 15.0)
     assert costs[75:].mean() < 0.06

@@ -19,14 +19,19 @@ from disco_hw.model import Gaussian, Model
 from disco_hw.model.model import EffectSetting
 from disco_hw.model.step import FreeRun
 from disco_hw.tasks.circle import CircleCost
-from disco_hw.tasks.line import PathTable
-from disco_hw.tasks.line.cost import PathCost
 
 RADIUS_M, X_ICR_M = 0.75, 0.2
 LIMITS = CommandLimits(8.0, 20.0)
 FOOTPRINT = Footprint(0.5, 0.4, 0.05)
 MODEL = Model(0.06, 0.4, X_ICR_M, (EffectSetting("motor_lag", {"tau_s": 0.15}),))
 SETTINGS = DiscoSettings(uncertainty="point", refine=True)
+
+
+def _believed(radius_part: float, others_part: float, effects: tuple[EffectSetting, ...] = ()) -> Model:
+    """Return a robot whose geometry is known to these parts of its values: the wheels' radius, and the others."""
+    names, values = ("wheel_radius_m", "axial_distance_m", "x_icr_m"), np.array([0.06, 0.4, X_ICR_M])
+    deviations = values * np.array([radius_part, others_part, others_part])
+    return Model(*values.tolist(), effects, belief=Gaussian(names, values, np.diag(deviations**2)))
 
 
 def _on_the_circle(speed_m_s: float) -> PlannerState:
@@ -61,10 +66,12 @@ def test_a_refined_plan_stays_on_the_line(drive_on: dict[float, tuple[np.ndarray
 @pytest.mark.thorough
 def test_a_wide_belief_does_not_lead_a_refined_plan_off_the_line() -> None:
     """The refinement plans in the mean: under points 15 % apart it would stay where their spread costs least."""
-    geometry = np.array([MODEL.wheel_radius_m, MODEL.axial_distance_m, MODEL.x_icr_m])
-    names = ("wheel_radius_m", "axial_distance_m", "x_icr_m")
-    believed = replace(MODEL, belief=Gaussian(names, geometry, np.diag((0.15 * geometry) ** 2)))
-    planner = Disco(believed, CircleCost(radius_m=RADIUS_M, speed_m_s=0.2), replace(SETTINGS, uncertainty="ut"), LIMITS)
+    planner = Disco(
+        _believed(0.15, 0.15, MODEL.effects),
+        CircleCost(radius_m=RADIUS_M, speed_m_s=0.2),
+        replace(SETTINGS, uncertainty="ut"),
+        LIMITS,
+    )
     plan = planner.plan(0, _on_the_circle(0.2))
     assert np.abs(np.hypot(*plan.trajectory[:, :2].T) - RADIUS_M).max() < 1e-3
 
@@ -132,7 +139,7 @@ def test_plans_are_refined_except_in_two_modes() -> None:
 
 def test_a_robot_that_gets_nowhere_is_left_to_the_sampled_plan() -> None:
     """A plan that starts anew from the robot's place can put off its way for ever; who moves is refined again."""
-    planner = Disco(MODEL, CircleCost(radius_m=RADIUS_M, speed_m_s=0.2), DiscoSettings(), LIMITS)
+    planner = Disco(_believed(0.01, 0.01), CircleCost(radius_m=RADIUS_M, speed_m_s=0.2), DiscoSettings(), LIMITS)
     moving = _on_the_circle(0.2)
     standing = structs.replace(moving, left_speed_rad_s=0.0, right_speed_rad_s=0.0)
     steps = [
@@ -156,10 +163,8 @@ def test_a_plan_is_refined_only_if_the_robot_can_stop_after_it(
     wall_m = FOOTPRINT.ahead + 0.5 * FOOTPRINT.length + keep_m + way_m + room_to_stop_m
     room = Fence(keep_in=((-5.0, -5.0), (wall_m, -5.0), (wall_m, 5.0), (-5.0, 5.0)))
     around = Surroundings(FOOTPRINT, keep_m, 1e-3, settings.step_s, settings.sampler.horizon, speed_m_s)
-    line = PathCost(PathTable(np.array([[-4.0, 0.0], [8.0, 0.0]])), speed_m_s)
-    radius_m = MODEL.wheel_radius_m
-    radius = Gaussian(("wheel_radius_m",), np.array([radius_m]), np.array([[(radius_part * radius_m) ** 2]]))
-    planner = Disco(replace(MODEL, belief=radius), line, settings, limits, surroundings=around)
+    nearly_straight = CircleCost(0.0, 100.0, 100.0, speed_m_s)
+    planner = Disco(_believed(radius_part, 0.001), nearly_straight, settings, limits, surroundings=around)
     around.look_around(Boundaries(FOOTPRINT, room, ()), 0.0)
     turning = speed_m_s / MODEL.wheel_radius_m
     plan = planner.plan(0, PlannerState(0, 0.0, 0.0, 0.0, turning, turning))

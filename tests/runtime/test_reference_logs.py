@@ -27,7 +27,12 @@ TOLERANCE = 1e-4
 
 @pytest.mark.parametrize(
     ("name", "ticks", "values"),
-    [("circle", 255, 7380), ("adapted", 240, 7050), ("drive", 225, 4900), ("refined", 175, 5000)],
+    [
+        pytest.param("circle", 255, 7380, marks=pytest.mark.thorough),
+        ("adapted", 240, 7050),
+        ("drive", 225, 4900),
+        ("refined", 175, 5000),
+    ],
 )
 def test_a_reference_log_gives_what_it_gave(name, ticks, values):
     report = replay(LOGS / f"{name}.mcap", TOLERANCE)

@@ -1,6 +1,9 @@
+import pytest
+
 from tools.bench.loop import run
 
 
+@pytest.mark.thorough
 def test_every_figure_is_there_for_both_ways_of_running():
     figures = run(seconds=0.3)
     for mode in ("plain", "realtime"):

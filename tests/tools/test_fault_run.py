@@ -24,7 +24,7 @@ def test_without_faults_it_drives_and_nothing_is_reported():
     assert run.core.plausibility == PlausibilityStats()
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.thorough), pytest.param(1, marks=pytest.mark.long)])
 def test_random_faults_end_in_a_stop_or_are_tolerated(seed):
     kinds = tuple(kind for kind in KINDS if kind not in KINDS_LEFT_OUT)
     run = FaultRun(random_schedule(seed, 23.0, kinds=kinds, quiet_s=(3.0, 4.0)), seed=seed, **FAST)
@@ -83,6 +83,7 @@ def test_a_fault_too_short_to_stop_for_is_counted_and_reported(fault, counter):
     assert seen.events
 
 
+@pytest.mark.thorough
 def test_the_same_seeds_give_the_same_run():
     schedule = random_schedule(5, 7.0, quiet_s=(3.0, 4.0))
     runs = [FaultRun(schedule, seed=5, **FAST) for _ in range(2)]
@@ -104,7 +105,7 @@ def test_the_table_counts_what_struck_an_armed_robot():
     ("to", "growth"),
     [
         ("robot", 0.1),
-        ("both", 1.0),
+        pytest.param("both", 1.0, marks=pytest.mark.thorough),
         *(pytest.param(*case, marks=pytest.mark.long) for case in [("robot", 0.2), ("robot", 1.0), ("both", 0.1)]),
         pytest.param("both", 0.2, marks=pytest.mark.long),
     ],

@@ -47,6 +47,7 @@ def test_every_verb_reads_or_refuses_hostile_files(tmp_path):
     assert done.stdout.splitlines()[-1] == "[]"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("fails", "expected_text"),
     [

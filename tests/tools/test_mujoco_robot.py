@@ -16,6 +16,8 @@ from tools import mujoco_robot
 from tools.joystick import COMMANDS_PER_S, STEPS_PER_S, joystick, keyboard
 from tools.mujoco_robot import EFFECTS, ROBOTS, TRACK_M, WHEEL_RADIUS_M, Habits, driven, record
 
+pytestmark = pytest.mark.thorough
+
 pytest.importorskip("mujoco", reason="pip install 'disco-hw[mujoco]'")
 
 ROOT = Path(__file__).parents[2]

@@ -7,6 +7,8 @@ import pytest
 
 from tools.simulated_drives import DRIVES, UnknownDriveError, Vehicle, create_drive
 
+pytestmark = pytest.mark.thorough
+
 SEEDS = range(4)
 
 

@@ -20,6 +20,8 @@ from tools.simulated_log import (
     write_csv,
 )
 
+pytestmark = pytest.mark.thorough
+
 IDEAL = PlantParameters().with_ideal_motors()
 EXACT = LogOptions(lateness_s=0.0, stamp_jitter_s=0.0)
 POOR = create_drive("poor", 1)

@@ -4,6 +4,8 @@ import pytest
 
 from tools.bench.step_instructions import instructions_of
 
+pytestmark = pytest.mark.thorough
+
 try:
     instructions_of(lambda: None)
 except OSError:

@@ -10,6 +10,8 @@ from tests.tools.test_mujoco_robot import numbers
 from tools.gap import strange_robot
 from tools.gap.strange_robot import COMMANDS_PER_S, FORMS, NOMINAL, record, sampled_parameters
 
+pytestmark = pytest.mark.thorough
+
 ROOT = Path(__file__).parents[2]
 
 

@@ -28,7 +28,7 @@ def test_a_wheel_that_ceases_to_obey_stops_the_robot_in_time_and_for_the_right_c
     assert not run.is_wrong, run.status_text
 
 
-@pytest.mark.parametrize("driver", ["reference", "roboclaw"])
+@pytest.mark.parametrize("driver", ["reference", pytest.param("roboclaw", marks=pytest.mark.thorough)])
 def test_mended_and_reset_it_can_be_armed_again_and_drives(driver):
     run = WheelFaultRun(driver, 0.2, "straight", seed=5)
     assert run.drive(3.0) == []

@@ -56,6 +56,7 @@ def allocations(arguments) -> tuple[int, int]:
     return counted[0], counted[1]
 
 
+@pytest.mark.thorough
 def test_the_step_allocates_nothing():
     planner = PendulumPlanner(PendulumPoints(np.ones((5, 2)), np.full(5, 0.2)), PAPER_SAMPLER)
     planner.plan(math.pi, 0.0)
