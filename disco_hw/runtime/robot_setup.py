@@ -53,13 +53,6 @@ def load_setup(robot: Path, model: Path | None = None, link: str | None = None, 
     InputError.
     """
     config = load_robot_config(robot)
-    if config.task.file is None:
-        path_file = None
-    else:
-        is_checked, path_file = path_file is None, path_file or robot.parent / config.task.file
-        config = msgspec.structs.replace(config, task=config.task.with_file(path_file, config.robot, is_checked))
-        if is_checked:
-            refuse_outside_task(robot, config)
     if link is not None:
         config = msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, **link_fields(link)))
     model_file = model
@@ -67,6 +60,14 @@ def load_setup(robot: Path, model: Path | None = None, link: str | None = None, 
         model_file = robot.parent / config.model.file
     config = msgspec.structs.replace(config, pose=_with_key_from_file(robot, config.pose))
     loaded = Model.nominal(config.robot, config.prior) if model_file is None else load_model(model_file)
+    if config.task.file is None:
+        path_file = None
+    else:
+        is_checked, path_file = path_file is None, path_file or robot.parent / config.task.file
+        x_icr_m = geometry(loaded)[0][2] if is_checked else None
+        config = msgspec.structs.replace(config, task=config.task.with_file(path_file, config.robot, x_icr_m))
+        if is_checked:
+            refuse_outside_task(robot, config)
     return Setup(robot, model_file, path_file, config, loaded)
 
 

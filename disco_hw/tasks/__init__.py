@@ -191,8 +191,10 @@ class RobotTask(Protocol):
     def file(self) -> str | None:
         """The file that [task] names, relative to robot.toml."""
 
-    def with_file(self, file: Path, robot: Chassis, is_checked: bool) -> Self:
-        """Return the task with its file's contents; unless it was driven before, impossible ones are refused.
+    def with_file(self, file: Path, robot: Chassis, x_icr_m: float | None) -> Self:
+        """Return the task with its file's contents; what a robot with this x_icr cannot drive is refused.
+
+        `x_icr_m` None is for what was driven before, which is not judged.
 
         Raises InputError naming file, line and remedy.
         """

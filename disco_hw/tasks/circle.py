@@ -63,7 +63,7 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         """Always None, because a circle is described by its fields alone."""
         return None
 
-    def with_file(self, _file: Path, _robot: Chassis, _is_checked: bool) -> Self:
+    def with_file(self, _file: Path, _robot: Chassis, _x_icr_m: float | None) -> Self:
         """Return the task unchanged, because it has no file."""
         return self
 

@@ -51,7 +51,7 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         """Always None, because a lemniscate is described by its fields alone."""
         return None
 
-    def with_file(self, _file: Path, _robot: Chassis, _is_checked: bool) -> Self:
+    def with_file(self, _file: Path, _robot: Chassis, _x_icr_m: float | None) -> Self:
         """Return the task unchanged, because it has no file."""
         return self
 

@@ -48,11 +48,11 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         """Path of the CSV file with the way-points."""
         return self.path
 
-    def with_file(self, file: Path, _robot: Chassis, is_checked: bool) -> Self:
+    def with_file(self, file: Path, _robot: Chassis, x_icr_m: float | None) -> Self:
         """Return the task with the way-points of a CSV.
 
         Raises InputError as `load_waypoints`, and for times, for too many way-points, for a path that is too short or
-        too long, for a way-point further from the origin than poses go, and, if it `is_checked`, for hairpins.
+        too long, for a way-point further from the origin than poses go, and for hairpins unless `x_icr_m` is None.
         """
         found = load_waypoints(file)
         if found.times_s is not None:
@@ -61,11 +61,11 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
                 'by time with kind = "timed_path" in [task]'
             )
         check_size(file, found)
-        if is_checked:
+        if x_icr_m is not None:
             # Loaded where it is needed alone: half of the daemon's commands need no path.
             from disco_hw.tasks.line.course import refuse_hairpins  # noqa: PLC0415
 
-            refuse_hairpins(file, found)
+            refuse_hairpins(file, found, x_icr_m)
         return msgspec.structs.replace(self, points=points_of(found))
 
     def fault(self) -> TaskFault | None:

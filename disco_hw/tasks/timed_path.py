@@ -61,7 +61,7 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         """Path of the CSV file with the timed way-points."""
         return self.path
 
-    def with_file(self, file: Path, robot: Chassis, _is_checked: bool) -> Self:
+    def with_file(self, file: Path, robot: Chassis, _x_icr_m: float | None) -> Self:
         """Return the task with the way-points and times of a CSV.
 
         Raises InputError as `load_waypoints`, and for missing times, for a first time before the start, for too many

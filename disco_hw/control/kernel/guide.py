@@ -40,6 +40,10 @@ LIFTED_RAD_S = 0.05
 # A robot that faces elsewhere goes on at this part of its speed: turning on the spot by the middle of a bend, it could
 # turn for ever with the place that it is to go to.
 SLOWEST = 0.2
+# Between two corners nearer to one another than the centre of rotation is to the tracked point, the line asks the point
+# to go aside faster than the robot turns. It goes on at this part of its speed, and cuts the line: the law would else
+# hold it still there for ever.
+LEAST_FORWARD = 0.3
 
 
 class SteeredChassis(NamedTuple):
@@ -80,6 +84,8 @@ def guide(
         _, _, to_x, to_y, _, _ = line_at(terms, place, speed * lead_s + TURN_M)
         bend = math.atan2(from_x * to_y - from_y * to_x, from_x * to_x + from_y * to_y) / TURN_M
         turn = speed * (bend - YAW_PER_M * math.atan2(math.sin(off_rad), math.cos(off_rad)))
+        # On a line that can be followed, along^2 + (x_icr * bend)^2 = 1.
+        along = max(along, LEAST_FORWARD * (1.0 - min(abs(x_icr_m * bend), 1.0)))
         forward = speed * (along + (1.0 - along) * returning) * max(math.cos(off_rad), SLOWEST)
         left, right = _within(
             (forward - half_axle * turn) / chassis.wheel_radius_m,

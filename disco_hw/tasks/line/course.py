@@ -181,43 +181,45 @@ def speed_range(robot: Chassis) -> Mapping[str, Editable]:
 
 SHARP_APART_M = 1.0
 """What two turns need between them of which each is sharp."""
-BACK_RAD, BACK_APART_M = math.radians(160.0), 0.28
-"""What turns need between them that together turn back."""
-ROUND_RAD, ROUND_APART_M = math.radians(200.0), 0.5
-"""What turns need between them that together turn further round than back."""
+BACK_RAD, BACK_APART_M, BACK_APART_X_ICR = math.radians(160.0), 0.28, 1.17
+"""What turns need between them that together turn back: m, and so many times x_icr."""
+ROUND_RAD, ROUND_APART_M, ROUND_APART_X_ICR = math.radians(200.0), 0.5, 2.1
+"""What turns need between them that together turn further round than back: m, and so many times x_icr."""
 # Of what turns back all but this is in one place, where the robot stops and turns.
 _ELSEWHERE_RAD = math.radians(45.0)
 # Pieces of the table that are one place.
 _PLACE = 2
 
 
-def refuse_hairpins(file: Path, waypoints: Waypoints) -> None:
-    """Raise InputError naming the lines of turns that are too near to one another for the robot to get past."""
-    found = hairpin(PathTable(waypoints.places_m))
+def refuse_hairpins(file: Path, waypoints: Waypoints, x_icr_m: float) -> None:
+    """Raise InputError naming the lines of turns that are too near to one another for a robot with this x_icr."""
+    found = hairpin(PathTable(waypoints.places_m), x_icr_m)
     if found is None:
         return
     begin_m, end_m, least_m = found
     at_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(waypoints.places_m, axis=0).T))])
     first, last = (waypoints.lines[int(np.argmin(np.abs(at_m - there_m)))] for there_m in (begin_m, end_m))
     raise InputError(
-        f"{file}: lines {first} to {last}: the path turns twice within {least_m:g} m, where the robot may stop and "
-        f"not continue; leave {math.ceil(10.0 * least_m) / 10.0:g} m between the turns, or turn at one way-point"
+        f"{file}: lines {first} to {last}: the path turns twice within {least_m:.2f} m, where the robot would leave "
+        f"it far; leave {math.ceil(10.0 * least_m) / 10.0:g} m between the turns, or turn at one way-point"
     )
 
 
-def hairpin(path: PathTable) -> tuple[float, float, float] | None:
+def hairpin(path: PathTable, x_icr_m: float) -> tuple[float, float, float] | None:
     """Return the first turns that are too near to one another, and what they need between them, m along the path.
 
-    Or None.
+    Or None. Turning swings the tracked point aside, the further the larger `x_icr_m` is.
     """
+    back_m = max(BACK_APART_M, BACK_APART_X_ICR * abs(x_icr_m))
+    round_m = max(ROUND_APART_M, ROUND_APART_X_ICR * abs(x_icr_m))
     heading = _headings(path)
     length_m = path.spacing_m * (len(path.table) - 1)
     found = [
         pair
         for pair in (
             _sharp_pair(path, heading),
-            _turn_back(path, heading, BACK_RAD, BACK_APART_M),
-            _turn_back(path, heading, ROUND_RAD, ROUND_APART_M),
+            _turn_back(path, heading, BACK_RAD, back_m),
+            _turn_back(path, heading, ROUND_RAD, round_m),
         )
         if pair is not None
     ]

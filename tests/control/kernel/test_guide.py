@@ -59,6 +59,14 @@ def test_the_guide_reaches_a_line_from_beside_it_whichever_way_it_faces(y_m, yaw
     assert np.all(np.diff(states[-30:, 0]) > 0.0)
 
 
+@pytest.mark.parametrize("apart_m", [0.19, 0.25])
+def test_the_guide_goes_on_between_turns_nearer_than_the_centre_of_rotation_is(apart_m):
+    """The line asks for more than turning does there; standing across it the robot would stay for ever."""
+    u_turn = PathCost(PathTable(np.array([[0.0, 0.0], [1.5, 0.0], [1.5, apart_m], [0.0, apart_m]])), SPEED_M_S)
+    _, states = guide_of(u_turn, (0.9, 0.0, 0.0), horizon=120)
+    assert states[-1, 1] > 0.7 * apart_m
+
+
 def test_the_guide_keeps_to_the_limits():
     commands, _ = guide_of(CORNER, (0.5, 0.3, 3.0))
     assert np.abs(commands).max() <= LIMITS.speed_rad_s + 1e-5

@@ -11,6 +11,8 @@ from disco_hw.tasks.line import PathTable, load_waypoints
 from disco_hw.tasks.line.course import hairpin
 from tests.runtime.path_robot import ROBOTS, path_robot
 
+X_ICR_M = 0.238
+
 
 def way(*legs):
     """Places along legs of a length (m), each with the turn after it (degrees)."""
@@ -23,7 +25,7 @@ def way(*legs):
 
 
 def found(places):
-    return hairpin(PathTable(places))
+    return hairpin(PathTable(places), X_ICR_M)
 
 
 # Where the planner stopped for good in simulated drives (docs/paths.md).
@@ -112,13 +114,21 @@ def test_the_shipped_path_and_round_ones_have_none():
         assert found(radius_m * np.column_stack([np.sin(angle), np.cos(angle)])) is None
 
 
+def test_a_robot_whose_centre_of_rotation_is_further_away_needs_more_room():
+    places = way((1.0, 90), (0.4, 90), (1.0, 0))
+    assert hairpin(PathTable(places), 0.3) is None
+    for x_icr_m in (0.45, -0.45):
+        _, _, least_m = hairpin(PathTable(places), x_icr_m)
+        assert least_m == pytest.approx(1.17 * 0.45)
+
+
 def test_it_is_refused_with_its_lines_and_the_remedy(tmp_path):
     csv = "x_m,y_m\n0,0\n\n1,0\n1,0.2\n0,0.2\n"
     with pytest.raises(InputError) as caught:
         load_setup(path_robot(tmp_path, csv))
     assert str(caught.value) == (
-        f"{tmp_path}/path.csv: lines 4 to 5: the path turns twice within 0.28 m, where the robot may stop and not "
-        "continue; leave 0.3 m between the turns, or turn at one way-point"
+        f"{tmp_path}/path.csv: lines 4 to 5: the path turns twice within 0.28 m, where the robot would leave "
+        "it far; leave 0.3 m between the turns, or turn at one way-point"
     )
     assert load_setup(path_robot(tmp_path, csv.replace("0.2", "0.4"))).config.task.points[2] == (1.0, 0.4)
 

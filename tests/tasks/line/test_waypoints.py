@@ -84,14 +84,14 @@ def test_what_a_robot_cannot_follow_is_refused(tmp_path, text, fault):
     path = tmp_path / "path.csv"
     path.write_text(text)
     with pytest.raises(InputError, match=fault) as error:
-        PathTask(path="path.csv").with_file(path, ROBOT, True)
+        PathTask(path="path.csv").with_file(path, ROBOT, 0.2)
     assert str(path) in str(error.value)
 
 
 def load_timed_path(tmp_path, text):
     path = tmp_path / "path.csv"
     path.write_text(text)
-    return TimedPathTask(path="path.csv").with_file(path, ROBOT, True)
+    return TimedPathTask(path="path.csv").with_file(path, ROBOT, 0.2)
 
 
 def test_way_points_to_meet_may_rest_and_pass_one_place_twice(tmp_path):
