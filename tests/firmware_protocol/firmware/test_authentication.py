@@ -22,8 +22,7 @@ def refused(bench):
 
 
 def driving():
-    bench = Bench(LOCKED)
-    bench.to_driving()
+    bench = Bench(LOCKED).to_driving()
     assert refused(bench) == 0
     return bench
 
@@ -46,8 +45,7 @@ def test_it_says_that_it_wants_proof_and_gives_a_nonce():
 
 
 def test_without_a_key_nothing_of_it_is_seen():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     assert int(bench.messages("HELLO")[0].values["capabilities"]) == CONFIG.capabilities
     assert not bench.messages("MAC_CHALLENGE")
     for can_id in (0x0F0, 0x0F1, 0x0F2):
@@ -212,8 +210,7 @@ def test_the_nonce_is_new_in_every_session_and_for_every_host():
 
 
 def test_a_host_that_starts_anew_is_heard():
-    bench = Bench(LOCKED)
-    bench.to_ready()
+    bench = Bench(LOCKED).to_ready()
     bench.set_request("STANDBY")
     bench.run_until("STANDBY")
     bench.run(500)
@@ -292,7 +289,6 @@ def test_the_next_nonce_is_drawn_in_a_cycle_with_nothing_to_send():
 
 
 def test_without_a_key_no_nonce_is_ever_drawn():
-    bench = Bench()
-    bench.hello()
+    bench = Bench().hello()
     bench.run(100)
     assert bench.core._core.authentication.draws == 0

@@ -19,8 +19,7 @@ def test_without_a_handshake_nothing_gets_ready():
 
 
 def test_another_dbc_is_refused_and_named_and_the_right_one_accepted_afterwards():
-    bench = Bench()
-    bench.hello(dbc_hash=CODEC.dbc_hash ^ 1)
+    bench = Bench().hello(dbc_hash=CODEC.dbc_hash ^ 1)
     bench.set_request("READY")
     bench.run(300)
     assert bench.out.state == "STANDBY"
@@ -34,8 +33,7 @@ def test_another_dbc_is_refused_and_named_and_the_right_one_accepted_afterwards(
 
 
 def test_another_dbc_stops_motion():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     bench.hello(dbc_hash=1)
     bench.run(2)
     assert (bench.out.state, bench.out.stop_cause) == ("STOPPING", "FAULT")
@@ -63,15 +61,13 @@ def test_firmware_of_another_major_is_understood_as_such_and_nothing_else_of_it_
 
 
 def test_another_minor_is_accepted():
-    bench = Bench()
-    bench.hello(protocol_minor=9)
+    bench = Bench().hello(protocol_minor=9)
     bench.step()
     assert "HANDSHAKE" not in bench.blockers()
 
 
 def test_a_host_silent_for_long_must_introduce_itself_again():
-    bench = Bench()
-    bench.hello()
+    bench = Bench().hello()
     bench.run(5000)
     assert "HANDSHAKE" not in bench.blockers()
     bench.step()
@@ -80,8 +76,7 @@ def test_a_host_silent_for_long_must_introduce_itself_again():
 
 @pytest.mark.parametrize("wrong", [{"protocol_major": 2}, {"dbc_hash": 1}])
 def test_a_refused_host_is_forgotten_too(wrong):
-    bench = Bench()
-    bench.hello(**wrong)
+    bench = Bench().hello(**wrong)
     bench.run(5000)
     assert bench.out.fault != 0
     bench.run(502)
@@ -89,8 +84,7 @@ def test_a_refused_host_is_forgotten_too(wrong):
 
 
 def test_any_sound_frame_keeps_the_acquaintance():
-    bench = Bench()
-    bench.hello()
+    bench = Bench().hello()
     bench.run(4000)
     bench.send("TIME_REQUEST", sequence=1)
     bench.run(4000)
@@ -98,8 +92,7 @@ def test_any_sound_frame_keeps_the_acquaintance():
 
 
 def test_host_state_counts_only_once_qualified():
-    bench = Bench()
-    bench.hello()
+    bench = Bench().hello()
     for _ in range(3):
         bench.host_state(request="READY", session=7)
         assert bench.step().state == "STANDBY"
@@ -108,8 +101,7 @@ def test_host_state_counts_only_once_qualified():
 
 
 def test_unknown_request_changes_nothing():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     bench.host_state(request=4, session=7)
     bench.run(2)
     assert bench.out.state == "ARMED"
@@ -117,8 +109,7 @@ def test_unknown_request_changes_nothing():
 
 
 def test_wrong_crc_and_repeated_host_states_are_not_used():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     body = CODEC.encode(
         "HOST_STATE", bench.counters["HOST_STATE"] + 1, request="STANDBY", session=7, challenge_answer=0, host_fault=0
     ).data
@@ -130,8 +121,7 @@ def test_wrong_crc_and_repeated_host_states_are_not_used():
 
 
 def test_a_host_that_babbles_is_disqualified_and_motion_stops():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     for _ in range(5):
         bench.core.receive(bench.now_us, 0x101, sealed(0x101, bytes(7), major=3))
     bench.run(2)
@@ -140,8 +130,7 @@ def test_a_host_that_babbles_is_disqualified_and_motion_stops():
 
 @pytest.mark.parametrize("session", [0, 7])
 def test_session_zero_and_the_last_session_are_refused(session):
-    bench = Bench()
-    bench.to_ready(session=7)
+    bench = Bench().to_ready(session=7)
     bench.set_request("STANDBY")
     bench.run_until("STANDBY")
     bench.set_request("READY", session=session)
@@ -154,8 +143,7 @@ def test_session_zero_and_the_last_session_are_refused(session):
 
 
 def test_session_dies_with_ready_and_armed():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     assert bench.out.session == 7
     bench.command = None
     bench.run_until("STOPPING")
@@ -163,8 +151,7 @@ def test_session_dies_with_ready_and_armed():
 
 
 def test_it_never_arms_again_by_itself():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     command, bench.command = bench.command, None
     bench.run_until("STANDBY")
     bench.command = command
@@ -178,8 +165,7 @@ def test_it_never_arms_again_by_itself():
 
 
 def test_a_new_session_in_ready_goes_through_standby_with_a_new_challenge():
-    bench = Bench()
-    bench.to_ready(session=7)
+    bench = Bench().to_ready(session=7)
     challenge = bench.core.challenge
     bench.set_request("READY", session=8)
     bench.run(60)
@@ -207,8 +193,7 @@ def test_a_counted_start_gives_none_of_the_challenges_of_the_starts_before():
     """The first twenty of each of a hundred starts: as few are alike as of numbers drawn at random."""
     seen = []
     for start in range(1, 101):
-        bench = Bench(entropy=start, last_entropy=start - 1)
-        bench.to_ready()
+        bench = Bench(entropy=start, last_entropy=start - 1).to_ready()
         for session in range(8, 18):
             seen.append(bench.core.challenge)
             bench.set_request("STANDBY")
@@ -221,8 +206,7 @@ def test_a_counted_start_gives_none_of_the_challenges_of_the_starts_before():
 
 @pytest.mark.parametrize(("entropy", "last_entropy"), [(0, 0), (0, 5), (5, 5), (2**64 - 1, 2**64 - 1)])
 def test_a_start_without_entropy_or_with_that_of_the_last_one_is_refused_for_good(entropy, last_entropy):
-    bench = Bench(entropy=entropy, last_entropy=last_entropy)
-    bench.hello()
+    bench = Bench(entropy=entropy, last_entropy=last_entropy).hello()
     bench.set_request("READY")
     assert bench.run(200).state == "FAULT"
     assert bench.out.fault == FAULTS["ENTROPY_INVALID"]
@@ -233,7 +217,7 @@ def test_a_start_without_entropy_or_with_that_of_the_last_one_is_refused_for_goo
 
 @pytest.mark.parametrize(("entropy", "last_entropy"), [(1, 0), (5, 6), (2**32, 0), (2**32, 2**33)])
 def test_a_start_with_entropy_of_its_own_is_taken(entropy, last_entropy):
-    assert Bench(entropy=entropy, last_entropy=last_entropy).to_armed().state == "ARMED"
+    assert Bench(entropy=entropy, last_entropy=last_entropy).to_armed().out.state == "ARMED"
 
 
 @pytest.mark.parametrize(
@@ -279,8 +263,7 @@ def test_a_hash_of_zero_is_passed_over(entry):
 
 
 def test_arming_another_session_than_the_one_that_is_ready_starts_over():
-    bench = Bench()
-    bench.to_ready(session=7)
+    bench = Bench().to_ready(session=7)
     bench.set_request("ARM", session=8)
     bench.command = {}
     bench.run(400)
@@ -289,8 +272,7 @@ def test_arming_another_session_than_the_one_that_is_ready_starts_over():
 
 
 def arm_with(respond):
-    bench = Bench()
-    bench.to_ready()
+    bench = Bench().to_ready()
     bench.command = {}
     bench.answers = False
     bench.set_request("ARM", challenge_answer=respond(bench))
@@ -320,8 +302,7 @@ def test_wrong_answer_does_not(respond):
 
 
 def test_the_answer_to_an_old_challenge_does_not_arm():
-    bench = Bench()
-    bench.to_ready(session=7)
+    bench = Bench().to_ready(session=7)
     old = challenge_answer(bench.core.challenge, 9, CODEC.dbc_hash)
     bench.set_request("READY", session=9)
     bench.run(60)
@@ -333,8 +314,7 @@ def test_the_answer_to_an_old_challenge_does_not_arm():
 
 
 def test_answer_given_in_standby_is_no_answer():
-    bench = Bench()
-    bench.hello()
+    bench = Bench().hello()
     bench.command = {}
     bench.set_request("ARM")
     bench.run(400)
@@ -348,8 +328,7 @@ def test_answer_given_in_standby_is_no_answer():
 
 
 def test_arming_waits_for_wheels_that_stand():
-    bench = Bench()
-    bench.to_ready()
+    bench = Bench().to_ready()
     bench.wheels_follow = False
     bench.speeds = [0.0, -0.06]
     bench.command = {}
@@ -375,8 +354,7 @@ def test_wheels_stand_below_the_speed_of_stillness_and_not_at_it():
 
 
 def estopped():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.command = None
     bench.set_request("ARM")
@@ -468,8 +446,7 @@ def test_a_reset_is_asked_for_until_the_host_is_silent_and_no_longer():
 
 @pytest.mark.parametrize("source", ["estop_button", "estop_line"])
 def test_a_pressed_button_cannot_be_reset_nor_does_its_release_reset(source):
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     bench.inputs[source] = True
     bench.run(700)
     assert (bench.out.state, bench.out.estop_source) == ("ESTOP", source.removeprefix("estop_").upper())
@@ -513,8 +490,7 @@ def test_the_first_source_of_an_estop_is_kept():
 
 
 def test_host_fault_blocks_ready():
-    bench = Bench()
-    bench.hello()
+    bench = Bench().hello()
     bench.set_request("READY", host_fault=5)
     bench.run(300)
     assert bench.out.state == "STANDBY"
@@ -522,8 +498,7 @@ def test_host_fault_blocks_ready():
 
 
 def test_silent_host_loses_ready():
-    bench = Bench()
-    bench.to_ready()
+    bench = Bench().to_ready()
     last = bench.now_us
     bench.request = None
     bench.run_until("STANDBY")

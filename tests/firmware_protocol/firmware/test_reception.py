@@ -79,8 +79,7 @@ frames = st.one_of(
 @settings(max_examples=60)
 @given(st.lists(st.tuples(frames, st.integers(1, 5)), max_size=80))
 def test_random_frames_never_move_an_idle_robot(sequence):
-    bench = Bench()
-    bench.hello()
+    bench = Bench().hello()
     bench.set_request("READY")
     for (can_id, body, kind), milliseconds in sequence:
         data = sealed(can_id, body, major=0 if can_id == 0x102 else 1) if kind == "sealed" else body

@@ -50,8 +50,7 @@ def test_counters_go_up_by_one_for_each_frame(name):
 
 
 def test_wheel_frames_of_one_sample_have_one_counter_and_one_instant():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     speeds = [(t, m.counter, m.values) for t, m in bench.sent if m.name == "WHEEL_SPEED"]
     ticks = [(t, m.counter, m.values) for t, m in bench.sent if m.name == "WHEEL_TICKS"]
     assert [sample[:2] for sample in speeds] == [sample[:2] for sample in ticks]
@@ -96,8 +95,7 @@ def test_a_speed_that_is_not_known_is_not_valid(side, bad):
 
 
 def test_driver_and_limited_bits():
-    bench = Bench()
-    bench.to_armed()
+    bench = Bench().to_armed()
     bench.command = {"left": 40.0, "right": 40.0}
     bench.run(100)
     values = last(bench, "WHEEL_SPEED")
@@ -147,8 +145,7 @@ def test_system_state_tells_every_change_at_once():
 
 
 def test_system_state_follows_session_fault_and_stop_cause():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     assert last(bench, "SYSTEM_STATE")["session"] == 7
     bench.command = None
     bench.run_until("STANDBY")
@@ -161,8 +158,7 @@ def test_system_state_follows_session_fault_and_stop_cause():
 
 
 def test_a_session_that_changes_within_one_cycle_is_told():
-    bench = Bench()
-    bench.to_ready(session=7)
+    bench = Bench().to_ready(session=7)
     bench.run(5)
     bench.host_state(request="READY", session=8)
     before = len(bench.messages("SYSTEM_STATE"))
@@ -184,8 +180,7 @@ def test_rejections_are_counted_modulo_256_with_the_newest_reason():
 
 
 def test_last_command_counter_is_that_of_the_last_accepted_command():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     accepted = bench.counters["WHEEL_COMMAND"]
     bench.command = None
     bench.wheel_command(4.0, 2.0, session=9)
@@ -219,8 +214,7 @@ def test_cycles_whose_clock_goes_back_are_counted_and_others_are_not():
 
 
 def test_a_session_that_ends_is_told_at_once():
-    bench = Bench()
-    bench.to_ready()
+    bench = Bench().to_ready()
     bench.run(5)
     before = len(bench.messages("SESSION_STATE"))
     bench.core.receive(bench.now_us, 0x080, b"")
@@ -335,8 +329,7 @@ def test_limits_that_change_during_the_introduction_are_told_once_more_if_at_all
 
 
 def test_what_is_due_together_goes_out_two_a_cycle_the_wheels_first():
-    bench = Bench()
-    bench.hello()
+    bench = Bench().hello()
     bench.run(100)
     start = bench.now_us + 5_000 * MS
     bench.step(elapsed_us=5_000 * MS)
@@ -350,8 +343,7 @@ def test_what_is_due_together_goes_out_two_a_cycle_the_wheels_first():
 
 
 def test_no_cycle_sends_more_than_six_frames():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     bench.command = None
     bench.run(2500)
     most = max(len(names) for names in names_by_cycle(bench, 0).values())
@@ -398,8 +390,7 @@ def test_sample_times_are_those_of_the_40_bit_clock(now_us, before_us):
 
 
 def test_a_hello_is_answered_from_20_ms_after_the_answer_before():
-    bench = Bench()
-    bench.hello()
+    bench = Bench().hello()
     bench.run(100)
     bench.hello()
     bench.step()
