@@ -73,6 +73,12 @@ class Bench:
         assert self.driver.state is DriverState.ARMING
         self.run_until(DriverState.ARMED)
 
+    def drive(self, seconds, command=None):
+        """Arm, and run for a time with a command (None: the one set before); returns the bench itself."""
+        self.arm()
+        self.run(seconds, command)
+        return self
+
     def inject_to_host(self, can_id, data):
         """A frame that somebody else sends; the driver sees it with its next batch."""
         self.robot_end.send(OutgoingFrame(Frame(can_id, data), self.now_ns), self.now_ns)

@@ -80,8 +80,7 @@ class DriverConformance:
         assert bench.largest_speed == 0.0
 
     def test_a_silent_host_stops_the_robot_and_is_not_armed_when_it_comes_back(self, bench):
-        bench.arm()
-        bench.run(1.0, FORWARD)
+        bench.drive(1.0, FORWARD)
         bench.host_runs = False
         bench.run(self.stop_time_s(max(FORWARD)))
         assert bench.robot.speed_rad_s < 0.05
@@ -94,8 +93,7 @@ class DriverConformance:
 
     def test_a_host_without_commands_stops_the_robot_and_arm_is_consumed(self, bench):
         """Alive and talking, but no command: the house-keeping must not feed the watchdog."""
-        bench.arm()
-        bench.run(1.0, FORWARD)
+        bench.drive(1.0, FORWARD)
         bench.command = None
         bench.run(self.stop_time_s(max(FORWARD)))
         assert bench.robot.speed_rad_s < 0.05
@@ -105,8 +103,7 @@ class DriverConformance:
         assert bench.driver.detail not in ("", "armed", "arming"), "it says why"
 
     def test_disarms_on_request_while_moving(self, bench):
-        bench.arm()
-        bench.run(1.0, FORWARD)
+        bench.drive(1.0, FORWARD)
         bench.driver.request(Request.STANDBY)
         assert bench.driver.state is DriverState.STOPPING
         bench.run(self.stop_time_s(max(FORWARD)))
@@ -127,8 +124,7 @@ class DriverConformance:
         assert bench.robot.speed_rad_s > 1.0
 
     def test_a_fault_disarms_and_needs_reset_and_a_new_arming(self, bench):
-        bench.arm()
-        bench.run(0.5, FORWARD)
+        bench.drive(0.5, FORWARD)
         bench.robot.break_down(True)
         bench.run_until(DriverState.FAULT)
         bench.run(self.stop_time_s(max(FORWARD)))
@@ -154,8 +150,7 @@ class DriverConformance:
     def test_the_hosts_emergency_stop_latches_in_any_state(self, bench, armed):
         bench.run_until(*IDLE_STATES)
         if armed:
-            bench.arm()
-            bench.run(0.5, FORWARD)
+            bench.drive(0.5, FORWARD)
         bench.send_estop()
         bench.run(self.stop_time_s(max(FORWARD)))
         assert bench.robot.speed_rad_s < 0.05
@@ -171,8 +166,7 @@ class DriverConformance:
         bench.arm()
 
     def test_the_emergency_stop_button_holds_until_released_and_reset(self, bench):
-        bench.arm()
-        bench.run(0.5, FORWARD)
+        bench.drive(0.5, FORWARD)
         bench.robot.press_estop(True)
         bench.run_until(DriverState.ESTOP)
         bench.run(self.stop_time_s(max(FORWARD)))
@@ -204,8 +198,7 @@ class DriverConformance:
         assert bench.driver.stats.implausible_ticks == 0
 
     def test_an_unplugged_line_stops_the_robot_and_nothing_moves_when_it_is_back(self, bench):
-        bench.arm()
-        bench.run(1.0, FORWARD)
+        bench.drive(1.0, FORWARD)
         bench.step()
         bench.host_end.plug(False)
         bench.run(self.stop_time_s(max(FORWARD)))
@@ -219,14 +212,12 @@ class DriverConformance:
         assert bench.largest_speed == 0.0
         angle = bench.wheels[-1].left_angle_rad
         assert angle > 1.0, "the angles go on from where they were"
-        bench.arm()
-        bench.run(1.0)
+        bench.drive(1.0)
         assert bench.wheels[-1].left_angle_rad > angle
 
     @thinned("unplugged_after_ms", range(20), quick=4)
     def test_unplugged_at_any_instant(self, bench, unplugged_after_ms):
-        bench.arm()
-        bench.run(0.3 + unplugged_after_ms * 1e-3, FORWARD)
+        bench.drive(0.3 + unplugged_after_ms * 1e-3, FORWARD)
         bench.host_end.plug(False)
         bench.run(0.1)
         bench.host_end.plug(True)
@@ -274,8 +265,7 @@ class DriverConformance:
         assert bench.driver.stats.commands_sent == sent
 
     def test_released_the_wheels_roll_out_without_a_ramp_and_the_reason_is_a_fault_until_a_reset(self, bench):
-        bench.arm()
-        bench.run(0.6, FORWARD)
+        bench.drive(0.6, FORWARD)
         bench.driver.release("the left wheel does not count")
         bench.run(0.02)
         assert bench.driver.state is DriverState.FAULT

@@ -55,8 +55,7 @@ def test_a_watchdog_that_ran_out_while_nobody_drove_is_cleared_by_arming_alone(b
 
 
 def test_an_axis_that_idles_without_an_error_is_a_fault_that_stays(bench):
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     axes(bench)[0].axis_state = IDLE
     bench.run_until(DriverState.FAULT, timeout_s=0.2)
     assert "closed loop" in bench.driver.detail
@@ -66,8 +65,7 @@ def test_an_axis_that_idles_without_an_error_is_a_fault_that_stays(bench):
 
 
 def test_one_axis_whose_heartbeat_fails_to_come_stops_the_others(bench):
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     silent_node = axes(bench)[1].node_id
     drain = bench.robot.drain
     bench.robot.drain = lambda: [frame for frame in drain() if frame.can_id != silent_node << 5 | 1]
@@ -126,8 +124,7 @@ def test_an_axis_that_is_not_calibrated_is_said_not_to_arm(bench):
 
 
 def test_a_position_that_jumps_does_not_move_the_angle(bench):
-    bench.arm()
-    bench.run(1.0, FORWARD)
+    bench.drive(1.0, FORWARD)
     angle = bench.wheels[-1].left_angle_rad
     bench.robot.angle[0] += 1000.0
     bench.run(0.2, (0.0, 0.0))

@@ -76,9 +76,7 @@ def test_a_robot_flashed_meanwhile_is_taken():
 
 @pytest.mark.parametrize("rate_hz", [20, 50, 100])
 def test_arms_at_every_control_rate(rate_hz):
-    bench = create_bench(rate_hz=rate_hz)
-    bench.arm()
-    bench.run(2.0, (3.0, 2.0))
+    bench = create_bench(rate_hz=rate_hz).drive(2.0, (3.0, 2.0))
     assert bench.driver.state is DriverState.ARMED
     assert bench.robot.core.rejections["STATE"] <= 2
 
@@ -96,9 +94,7 @@ def test_each_arming_has_a_session_of_its_own():
 
 
 def test_a_robot_that_falls_silent_starts_a_new_handshake():
-    bench = create_bench()
-    bench.arm()
-    bench.run(1.0, (3.0, 3.0))
+    bench = create_bench().drive(1.0, (3.0, 3.0))
     bench.loses = lambda _: True
     bench.run_until(DriverState.HANDSHAKE, timeout_s=0.6)
     assert bench.driver.identity is bench.driver.limits is None
@@ -112,9 +108,7 @@ def test_a_robot_that_falls_silent_starts_a_new_handshake():
 
 def test_a_lossy_link_does_not_disarm():
     """Three frames in a row may not be lost at 50 Hz: the fourth is out of sequence and the fifth comes too late."""
-    bench = create_bench(loses=lambda generator: generator.random() < 0.03)
-    bench.arm()
-    bench.run(10.0, (3.0, 2.0))
+    bench = create_bench(loses=lambda generator: generator.random() < 0.03).drive(10.0, (3.0, 2.0))
     assert bench.driver.state is DriverState.ARMED
     assert bench.driver.stats.lost_frames > 30
     assert bench.driver.stats.implausible_ticks == 0
@@ -155,9 +149,7 @@ def test_a_second_host_is_pointed_out_once_a_link():
 
 
 def test_a_second_host_that_commands_motion_stops_the_robot_but_never_drives_it():
-    bench = create_bench()
-    bench.arm()
-    bench.run(0.5, (1.0, 1.0))
+    bench = create_bench().drive(0.5, (1.0, 1.0))
     for counter in range(400):
         foreign = CODEC.encode(
             "WHEEL_COMMAND", counter, mode="SPEED", left_speed=8, right_speed=8, valid_for=0.1, session=200
@@ -197,9 +189,7 @@ def test_a_second_host_is_pointed_out_even_if_it_sends_an_estop_first():
 
 
 def test_a_new_link_voids_everything_even_if_its_loss_went_unseen():
-    bench = create_bench()
-    bench.arm()
-    bench.run(2.0, (1.0, 1.0))
+    bench = create_bench().drive(2.0, (1.0, 1.0))
     driver = bench.driver
     bench.host_end.receive()
     for renew in (driver.link_up, driver.link_down):
@@ -328,9 +318,7 @@ def test_a_robot_that_has_shown_all_but_its_state_can_fall_silent_too():
 
 
 def test_a_robot_that_turns_out_to_be_another_is_commanded_no_more():
-    bench = create_bench()
-    bench.arm()
-    bench.run(0.5, (1.0, 1.0))
+    bench = create_bench().drive(0.5, (1.0, 1.0))
     bench.inject_to_host(*CODEC.encode("BUILD", 0, dbc_hash=0x0BADCAFE, board_id=1))
     bench.run_until(DriverState.REFUSED)
     assert "WHEEL_COMMAND" not in names(bench.driver.transmit(bench.now_ns, WheelCommand(1.0, 1.0, 0.1)))
@@ -369,9 +357,7 @@ def test_a_board_whose_wheels_are_virtual_is_distinguished_from_a_robots():
 
 
 def test_each_event_is_reported_once():
-    bench = create_bench()
-    bench.arm()
-    bench.run(2.0)
+    bench = create_bench().drive(2.0)
     reported = [event for event in bench.events if not event.startswith("handshake complete: firmware 0.1.0, board 1")]
     assert reported == ["robot unknown -> STANDBY", "robot STANDBY -> READY", "robot READY -> ARMED"]
     assert len(bench.events) == 4
@@ -445,9 +431,7 @@ def test_a_command_leaves_in_time_or_not_at_all():
 
 
 def test_released_its_motors_are_off_for_a_moment_then_braked_and_nothing_that_is_wanted_meanwhile_ramps():
-    bench = create_bench()
-    bench.arm()
-    bench.run(0.6, (3.0, 2.0))
+    bench = create_bench().drive(0.6, (3.0, 2.0))
     bench.driver.release("the left wheel does not count")
     bench.run(0.05)
     bench.driver.request(Request.STANDBY)

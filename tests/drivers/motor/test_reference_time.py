@@ -61,9 +61,7 @@ def test_samples_carry_the_time_of_their_measurement(jitter_ms, skew):
 
 
 def test_a_restarted_robot_is_noticed_and_moves_nothing():
-    bench = create_bench(ReferenceRobot(boot_ns=START_NS - 10**9))
-    bench.arm()
-    bench.run(3.0, (3.0, 3.0))
+    bench = create_bench(ReferenceRobot(boot_ns=START_NS - 10**9)).drive(3.0, (3.0, 3.0))
     angle = bench.wheels[-1].left_angle_rad
     bench.robot = ReferenceRobot(boot_ns=bench.now_ns)
     bench.largest_speed = 0.0
@@ -101,9 +99,7 @@ def test_a_clock_that_leaps_ahead_is_distinguished_from_a_restart():
 
 
 def test_a_controller_whose_clock_goes_back_is_counted_and_goes_on():
-    bench = create_bench(ReferenceRobot(boot_ns=START_NS - 10**10))
-    bench.arm()
-    bench.run(1.0, (3.0, 3.0))
+    bench = create_bench(ReferenceRobot(boot_ns=START_NS - 10**10)).drive(1.0, (3.0, 3.0))
     reported = "the robot's controller saw its clock go backwards and counted a nominal period instead"
     for times in (1, 2):
         bench.robot.boot_ns += 15 * 10**6
@@ -122,9 +118,7 @@ def test_a_controller_whose_clock_goes_back_is_counted_and_goes_on():
 
 
 def test_the_ticks_of_another_robot_on_a_new_link_are_no_motion():
-    bench = create_bench()
-    bench.arm()
-    bench.run(1.0, (3.0, 3.0))
+    bench = create_bench().drive(1.0, (3.0, 3.0))
     angle = bench.wheels[-1].left_angle_rad
     bench.host_end.plug(False)
     bench.run(0.1)

@@ -24,8 +24,7 @@ def boards(bench):
 
 
 def drive(bench):
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     assert bench.robot.speed == pytest.approx(FORWARD, abs=0.02)
 
 
@@ -71,8 +70,7 @@ def test_a_speed_that_was_still_waiting_behind_the_stop_is_stopped_too(bench):
 
 
 def test_a_board_that_restarted_standing_is_known_by_its_timeout(bench):
-    bench.arm()
-    bench.run(0.3)
+    bench.drive(0.3)
     bench.robot.controller.restart()
     bench.run(0.7)
     assert bench.driver.state is DriverState.FAULT
@@ -129,8 +127,7 @@ def test_the_two_byte_status_of_older_firmware_is_taken(bench):
 def test_a_speed_beyond_what_the_board_can_do_is_held_to_it(bench):
     for board in boards(bench):
         board.registers.pid_m1 = board.registers.pid_m2 = (65536, 32768, 0, 6000)
-    bench.arm()
-    bench.run(1.0, (50.0, 2.0))
+    bench.drive(1.0, (50.0, 2.0))
     assert bench.robot.speed[0] == pytest.approx(6000 / ONE.settings.counts_per_rad, rel=1e-3)
     assert bench.driver.limits.max_wheel_speed_rad_s.value == pytest.approx(6000 / ONE.settings.counts_per_rad)
 

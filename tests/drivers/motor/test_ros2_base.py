@@ -52,8 +52,7 @@ def test_a_base_that_others_drive_or_that_hears_nobody_is_not_armed_and_disarmed
     assert expected_detail in bench.driver.detail
     setattr(end, fault, fault != "others_speak")
     bench.run(0.2)
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     setattr(end, fault, fault == "others_speak")
     bench.run(0.2)
     assert bench.driver.state is DriverState.FAULT
@@ -92,16 +91,14 @@ def test_a_fault_stays_until_it_is_reset_although_its_cause_has_gone(bench, end)
 
 
 def test_after_a_pause_longer_than_the_bridge_waits_nothing_is_sent_that_moves(bench):
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     sent = bench.driver.transmit(bench.now_ns + 220_000_000, WheelCommand(*FORWARD, 0.1))
     assert bench.driver.state is DriverState.FAULT
     assert not [one for one in sent if one.frame.can_id == wire.SPEEDS]
 
 
 def test_a_restart_of_the_base_alone_is_seen_by_its_angles(bench, end):
-    bench.arm()
-    bench.run(1.0, FORWARD)
+    bench.drive(1.0, FORWARD)
     bench.robot.controller._zero_ticks = (-50_000, 50_000)
     bench.run(0.1, FORWARD)
     assert bench.driver.state is DriverState.FAULT
@@ -119,8 +116,7 @@ def test_the_safety_card_says_who_stops_the_base_and_that_its_time_out_is_only_d
 
 
 def test_odometry_that_stops_while_it_slows_down_is_a_fault_that_stays(bench, end):
-    bench.arm()
-    bench.run(0.5, (20.0, 20.0))
+    bench.drive(0.5, (20.0, 20.0))
     bench.driver.request(Request.STANDBY)
     bench.run(0.1)
     VENDOR.lose_left(bench.robot)

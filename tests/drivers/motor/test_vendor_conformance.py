@@ -46,8 +46,7 @@ def no_wheel_is_driven(bench):
 
 
 def drive(bench, seconds=1.0):
-    bench.arm()
-    bench.run(seconds, FORWARD)
+    bench.drive(seconds, FORWARD)
     assert bench.robot.speed == pytest.approx(FORWARD, abs=0.02)
 
 
@@ -253,8 +252,7 @@ def test_an_error_cleared_does_not_energise_again(vendor, bench):
     bench.largest_speed = 0.0
     bench.run(2.0, FORWARD)
     assert bench.largest_speed < 0.05
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     assert bench.robot.speed == pytest.approx(FORWARD, abs=0.02)
 
 

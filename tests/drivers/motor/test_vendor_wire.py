@@ -77,8 +77,7 @@ def scripted_day(vendor):
     bench.run_until(*IDLE_STATES)
     bench.run(COASTING_S)
     begin()  # again
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     begin()  # fault
     vendor.lose_left(bench.robot)
     bench.run_until(DriverState.FAULT, timeout_s=0.5)
@@ -89,15 +88,13 @@ def scripted_day(vendor):
     bench.run_until(*IDLE_STATES)
     bench.run(COASTING_S)
     begin()  # reconnect
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     bench.host_end.plug(False)
     bench.run(COASTING_S)
     bench.host_end.plug(True)
     bench.run(COASTING_S)
     begin()  # estop
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     bench.send_estop()
     bench.run(COASTING_S)
     begin()  # after

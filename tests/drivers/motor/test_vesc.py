@@ -22,9 +22,7 @@ def test_a_task_that_needs_less_than_the_speed_loop_holds_is_refused_with_what_i
 
 @pytest.mark.parametrize("pause_s", [0.13, 0.5])
 def test_a_host_that_paused_for_longer_than_the_timeout_is_disarmed(pause_s):
-    bench = VESC.bench()
-    bench.arm()
-    bench.run(1.0, FORWARD)
+    bench = VESC.bench().drive(1.0, FORWARD)
     bench.host_runs = False
     bench.run(pause_s)
     bench.host_runs = True
@@ -35,9 +33,7 @@ def test_a_host_that_paused_for_longer_than_the_timeout_is_disarmed(pause_s):
 
 
 def test_a_controller_that_restarts_while_armed_is_lost():
-    bench = VESC.bench()
-    bench.arm()
-    bench.run(2.0, FORWARD)
+    bench = VESC.bench().drive(2.0, FORWARD)
     bench.robot.controller.restart()
     bench.run(0.1, FORWARD)
     assert bench.driver.state is DriverState.FAULT
@@ -67,9 +63,7 @@ def test_it_does_not_arm_while_a_motor_turns():
 
 def test_it_brakes_for_as_long_as_a_motor_says_that_it_turns_and_lets_go_of_one_that_says_nothing():
     """On a slope, a brake that is let go after a while would let the robot roll away."""
-    bench = VESC.bench()
-    bench.arm()
-    bench.run(1.0, FORWARD)
+    bench = VESC.bench().drive(1.0, FORWARD)
     step = bench.robot.step
 
     def pushed(now_ns):
@@ -90,8 +84,7 @@ def test_it_is_armed_only_after_zeros_for_a_while():
     bench = VESC.bench()
     bench.run_until(*IDLE_STATES)
     bench.robot.received.clear()
-    bench.arm()
-    bench.run(0.02)
+    bench.drive(0.02)
     zeros = [frame for frame in bench.robot.received if frame.can_id == 3 << 8 | 23]
     assert len(zeros) >= 10
     assert {frame.data for frame in zeros} == {bytes(4)}
