@@ -19,7 +19,7 @@ from disco_hw.runtime.supervisor import UserRequest
 from drivers.types import PoseSample
 from tests.drive.test_hand_pilot import Hand
 from tests.drivers.waiting import free_port
-from tests.runtime.simulated import ROBOT_TEXT, simulated_stack
+from tests.runtime.simulated import ROBOT_TEXT, arm, simulated_stack
 from tests.tables import thinned
 from tools.faults.run import circling_planner
 
@@ -66,8 +66,7 @@ class Bench:
         return self.senders[-1]
 
     def start(self):
-        self.stack.run(1.5)
-        self.stack.run(0.5, UserRequest.ARM)
+        arm(self.stack)
         return self.stack.run(0.5, UserRequest.START)[-1].output.running
 
     def output_lines(self):
@@ -281,8 +280,7 @@ def test_a_first_pose_that_is_not_where_the_wheels_led_to_from_the_origin_stops_
     stack = simulated_stack(circling_planner(load_setup(file)), robot_file=file)
     received, enabled = stack.core.pose_source.receive, []
     stack.core.pose_source.receive = lambda now_ns, poses: received(now_ns, poses) if enabled else []
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
+    arm(stack)
     assert stack.run(2.0, UserRequest.START)[-1].output.running
     enabled.append(True)
     seen = stack.run(0.5)

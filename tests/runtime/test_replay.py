@@ -20,7 +20,7 @@ from disco_hw.model import EffectSetting, load_model, save_model
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.supervisor import UserRequest
-from tests.runtime.simulated import ROBOT_TEXT, simulated_stack
+from tests.runtime.simulated import ROBOT_TEXT, arm, simulated_stack
 from tests.tables import thinned
 
 ROBOTS = SHIPPED_ROBOT.parent
@@ -30,8 +30,7 @@ ROBOTS = SHIPPED_ROBOT.parent
 def ticks():
     """The records of the daemon for a start, two seconds of driving and a stop."""
     stack = simulated_stack()
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
+    arm(stack)
     stack.run(2.0, UserRequest.START)
     stack.run(1.0, UserRequest.DISARM)
     return stack.recorder.ticks
@@ -69,8 +68,7 @@ def test_what_no_parameter_explains_is_recorded_and_replays_bit_for_bit(tmp_path
     text = ROBOT_TEXT.replace("rate_hz = 50.0", "rate_hz = 50.0\ndisturbance = true")
     (tmp_path / "robot.toml").write_text(text)
     stack = simulated_stack(robot_file=tmp_path / "robot.toml")
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
+    arm(stack)
     stack.run(2.5, UserRequest.START)
     ticks = stack.recorder.ticks
     found = [one for _, records in ticks for one in records if isinstance(one, UnexplainedMotion)]
@@ -98,8 +96,7 @@ def test_a_drive_whose_model_remembers_replays_bit_for_bit(tmp_path, monkeypatch
     text = (ROBOTS / "wombot.toml").read_text().replace("wombot_model.toml", "model.toml")
     (tmp_path / "robot.toml").write_text(text)
     stack = simulated_stack(robot_file=tmp_path / "robot.toml")
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
+    arm(stack)
     # Longer than commands are kept one by one.
     stack.run(3.0, UserRequest.START)
     ticks = stack.recorder.ticks
@@ -124,8 +121,7 @@ def test_a_follower_takes_over_from_a_planner_that_finds_nothing_and_replays_bit
     text = ROBOT_TEXT.replace("rate_hz = 50.0", 'rate_hz = 50.0\nfallback = "lqr"')
     (tmp_path / "robot.toml").write_text(text)
     stack = simulated_stack(robot_file=tmp_path / "robot.toml")
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
+    arm(stack)
     driven = stack.run(3.0, UserRequest.START)
     sources = [tick.pipeline.source for tick in driven]
     first, last = sources.index(Source.FALLBACK), len(sources) - sources[::-1].index(Source.FALLBACK)

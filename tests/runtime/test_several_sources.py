@@ -17,7 +17,7 @@ from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
 from drivers.types import PoseSample
-from tests.runtime.simulated import ROBOT_FILE, ROBOT_TEXT, simulated_stack
+from tests.runtime.simulated import ROBOT_FILE, ROBOT_TEXT, arm, simulated_stack
 
 
 @pytest.fixture
@@ -55,8 +55,7 @@ class Bench:
             self._sender.send(json.dumps(datagram).encode())
 
     def start(self):
-        self.stack.run(1.5)
-        self.stack.run(0.5, UserRequest.ARM)
+        arm(self.stack)
         return self.stack.run(1.5, UserRequest.START)[-1].output.running
 
     def close(self):

@@ -23,8 +23,7 @@ def refusal(out):
 
 @pytest.mark.parametrize("start", ["ready", "armed", "running", "stopping", "faulted"])
 def test_a_link_that_is_down_means_disconnected_and_no_command(start):
-    bench = Bench()
-    getattr(bench, start)()
+    bench = getattr(Bench(), start)()
     out = bench.tick(link_state=LinkState.CONNECTING)
     assert out.state is State.DISCONNECTED
     assert (out.motion_allowed, out.zero_only, out.running) == (False, False, False)
@@ -46,8 +45,7 @@ def test_without_a_link_it_says_why_and_what_to_do():
 
 @pytest.mark.parametrize("start", ["ready", "armed", "running", "stopping", "faulted"])
 def test_a_link_interrupted_between_two_ticks_voids_the_session(start):
-    bench = Bench()
-    getattr(bench, start)()
+    bench = getattr(Bench(), start)()
     out = bench.tick(link_generation=2)
     assert out.state is State.DISCONNECTED
     assert (out.motion_allowed, out.zero_only, out.running) == (False, False, False)
@@ -66,8 +64,7 @@ def test_a_link_interrupted_between_two_ticks_voids_the_session(start):
     ],
 )
 def test_a_problem_means_fault_in_words_without_motion(start, changes, expected):
-    bench = Bench()
-    getattr(bench, start)()
+    bench = getattr(Bench(), start)()
     out = bench.tick(**changes)
     assert out.state is State.FAULT
     assert out.driver_request is Request.STANDBY
@@ -103,8 +100,7 @@ def test_a_fault_of_the_robot_is_followed_by_this_hosts_reset_without_another_re
 
 @pytest.mark.parametrize("start", ["ready", "armed", "running", "stopping"])
 def test_estop_means_fault_in_the_same_tick_and_its_frames_until_the_robot_shows_it(start):
-    bench = Bench()
-    getattr(bench, start)()
+    bench = getattr(Bench(), start)()
     bench.robot_obeys = False
     out = bench.tick(ESTOP)
     assert out.state is State.FAULT
@@ -173,8 +169,7 @@ def test_a_robot_found_armed_is_stopped():
 
 @pytest.mark.parametrize("start", ["ready", "stopping"])
 def test_a_robot_that_restarts_begins_with_a_handshake(start):
-    bench = Bench()
-    getattr(bench, start)()
+    bench = getattr(Bench(), start)()
     assert bench.tick(driver_state=DriverState.HANDSHAKE).state is State.HANDSHAKE
 
 

@@ -8,6 +8,8 @@ from drivers.types import DriverState, Frame, LinkState, OutgoingFrame, Readings
 
 MS = 1_000_000
 START_NS = 50_000 * MS
+FORWARD = (3.0, 2.0)
+IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 class Bench:

@@ -11,11 +11,8 @@ import random
 import pytest
 
 from drivers.types import Driver, DriverState, Request, WheelCommand
-from tests.drivers.motor.bench import Bench
+from tests.drivers.motor.bench import FORWARD, IDLE_STATES, Bench
 from tests.tables import thinned
-
-FORWARD = (3.0, 2.0)
-IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 class DriverConformance:

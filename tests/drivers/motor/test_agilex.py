@@ -6,11 +6,10 @@ import pytest
 
 from drivers.types import DriverState, Request
 from sim.devices.agilex import CAN_MODE, STANDBY
+from tests.drivers.motor.bench import FORWARD, IDLE_STATES
 from tests.drivers.motor.vendors import VENDORS
 
 (AGILEX,) = [vendor for vendor in VENDORS if vendor.name == "agilex"]
-FORWARD = (3.0, 2.0)
-IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 @pytest.fixture

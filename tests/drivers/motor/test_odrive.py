@@ -7,11 +7,10 @@ import pytest
 
 from drivers.types import DriverState, Request
 from sim.devices.odrive import CLOSED_LOOP, IDLE
+from tests.drivers.motor.bench import FORWARD, IDLE_STATES
 from tests.drivers.motor.vendors import VENDORS
 
 NEW, OLD = VENDORS[:2]
-FORWARD = (3.0, 2.0)
-IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 @pytest.fixture(params=[NEW, OLD], ids=str)

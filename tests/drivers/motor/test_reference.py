@@ -10,11 +10,10 @@ from drivers.motor.reference import ESTOP_REPEATS, ReferenceDriver
 from drivers.types import DriverState, Frame, ReceivedFrame, Request, WheelCommand
 from firmware_protocol.codec import Codec
 from firmware_protocol.status_codes import FAULTS
-from tests.drivers.motor.bench import MS, START_NS, Bench
+from tests.drivers.motor.bench import IDLE_STATES, MS, START_NS, Bench
 from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot
 
 CODEC = Codec()
-IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 def create_driver():

@@ -7,11 +7,9 @@ import pytest
 from drivers.motor.reference import ReferenceDriver
 from drivers.types import DriverState, WheelCommand
 from firmware_protocol.codec import Codec
-from tests.drivers.motor.bench import MS, START_NS, Bench
+from tests.drivers.motor.bench import IDLE_STATES, MS, START_NS, Bench
 from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot
 from tests.tables import thinned
-
-IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 def create_bench(robot=None, **options):

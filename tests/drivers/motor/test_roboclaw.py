@@ -6,11 +6,10 @@ from disco_hw.config import Control, Link
 from disco_hw.runtime.preflight import Level, check_link_load
 from drivers.motor.roboclaw_protocol import SETTERS
 from drivers.types import DriverState, Request, WheelCommand
+from tests.drivers.motor.bench import FORWARD, IDLE_STATES
 from tests.drivers.motor.vendors import VENDORS
 
 ONE, TWO = (vendor for vendor in VENDORS if vendor.name == "roboclaw")
-FORWARD = (3.0, 2.0)
-IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 STOP = SETTERS["duty_m1m2"].command
 
 

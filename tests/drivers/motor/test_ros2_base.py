@@ -5,10 +5,10 @@ import pytest
 from drivers.motor import find_driver
 from drivers.motor import ros2_base_wire as wire
 from drivers.types import DriverState, Request, WheelCommand
+from tests.drivers.motor.bench import FORWARD
 from tests.drivers.motor.vendors import VENDORS
 
 (VENDOR,) = [vendor for vendor in VENDORS if vendor.name == "ros2_base"]
-FORWARD = (3.0, 2.0)
 
 
 @pytest.fixture

@@ -10,12 +10,10 @@ import pytest
 
 from drivers.motor import find_driver
 from drivers.types import DriverState, Frame, OutgoingFrame, Request, WheelCommand
-from tests.drivers.motor.bench import START_NS
+from tests.drivers.motor.bench import FORWARD, IDLE_STATES, START_NS
 from tests.drivers.motor.vendors import VENDORS
 from tests.tables import thinned
 
-FORWARD = (3.0, 2.0)
-IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 COASTING_S = 2.5
 
 

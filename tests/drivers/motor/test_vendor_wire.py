@@ -10,10 +10,9 @@ import pytest
 
 from drivers.types import DriverState, Request
 from sim.can_protocol import CanFrame
+from tests.drivers.motor.bench import FORWARD, IDLE_STATES
 from tests.drivers.motor.vendors import VENDORS
 
-FORWARD = (3.0, 2.0)
-IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 COASTING_S = 2.5
 PHASES = ("start", "arm", "run", "stop", "again", "fault", "reset", "reconnect", "estop", "after")
 SUMS = {

@@ -6,12 +6,11 @@ from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError
 from drivers.motor import find_driver
 from drivers.types import DriverState, Request
+from tests.drivers.motor.bench import FORWARD, IDLE_STATES
 from tests.drivers.motor.test_motor_drivers import EXAMPLES, robot_toml
 from tests.drivers.motor.vendors import VENDORS
 
 (VESC,) = [vendor for vendor in VENDORS if vendor.label == "vesc"]
-FORWARD = (3.0, 2.0)
-IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 def test_a_task_that_needs_less_than_the_speed_loop_holds_is_refused_with_what_it_holds(tmp_path):

@@ -7,10 +7,10 @@ import pytest
 from disco_hw.runtime.preflight import Level, check_watchdog
 from drivers.motor.vesc_codec import timeout
 from drivers.types import DriverState
+from tests.drivers.motor.bench import IDLE_STATES
 from tests.drivers.motor.vendors import VENDORS, Vendor
 
 BY_LABEL = {vendor.label: vendor for vendor in VENDORS}
-IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 def readable_odrive():
