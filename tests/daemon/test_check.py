@@ -106,16 +106,17 @@ class Antenna:
         pass
 
 
-def test_positions_without_heading_are_a_warning_with_what_to_do():
-    reported = check._telemetry_check(check._query_robot(RobotInTime(b""), create_driver(None), Antenna(silent=False)))
+@pytest.mark.parametrize(
+    ("silent", "expected_text"),
+    [
+        (False, "heading not known; the pose sensor measures none: drive one metre"),
+        (True, "0 pose samples a second; fix quality 0: no fix; without a pose"),
+    ],
+)
+def test_poses_without_heading_or_none_at_all_are_a_warning_with_the_reason(silent, expected_text):
+    reported = check._telemetry_check(check._query_robot(RobotInTime(b""), create_driver(None), Antenna(silent)))
     assert reported.level is Level.WARNING
-    assert "heading not known; the pose sensor measures none: drive one metre" in reported.text
-
-
-def test_a_pose_source_that_is_silent_says_why():
-    reported = check._telemetry_check(check._query_robot(RobotInTime(b""), create_driver(None), Antenna(silent=True)))
-    assert reported.level is Level.WARNING
-    assert "0 pose samples a second; fix quality 0: no fix; without a pose" in reported.text
+    assert expected_text in reported.text
 
 
 def test_the_conformance_suite_keeps_out_of_a_daemons_way_too(tmp_path):

@@ -184,21 +184,14 @@ def test_a_stamp_that_fits_again_restores_the_trust_in_the_clock():
     assert not made.distrusts_clock
 
 
-def test_angles_go_on_through_an_interruption():
+@pytest.mark.parametrize(("restarts", "limits"), [(True, (TICKS_PER_REV, MAX_SPEED_RAD_S)), (False, (1024, 4.0))])
+def test_angles_go_on_through_an_interruption_and_when_other_limits_are_reported(restarts, limits):
     made = create_telemetry()
     wheels(made, 0, 9_000 * MS, 9_000 * MS)
     before = wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(20, 20))
-    made.restart()
-    made.configure(TICKS_PER_REV, MAX_SPEED_RAD_S)
-    after = wheels(made, 2, 9_020 * MS, 9_020 * MS, ticks=(900_000, 3))
-    assert (after.left_angle_rad, after.right_angle_rad) == (before.left_angle_rad, before.right_angle_rad)
-
-
-def test_angles_go_on_when_other_limits_are_reported():
-    made = create_telemetry()
-    wheels(made, 0, 9_000 * MS, 9_000 * MS)
-    before = wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(20, 20))
-    made.configure(1024, 4.0)
+    if restarts:
+        made.restart()
+    made.configure(*limits)
     after = wheels(made, 2, 9_020 * MS, 9_020 * MS, ticks=(900_000, 3))
     assert (after.left_angle_rad, after.right_angle_rad) == (before.left_angle_rad, before.right_angle_rad)
 
