@@ -104,8 +104,9 @@ class Bench:
                 return self.out
         raise AssertionError(f"still {self.out.state}, not {states}; rejections {self.core.rejections}")
 
-    def set_request(self, request: str, session: int = 7, **changes: object) -> None:
+    def set_request(self, request: str, session: int = 7, **changes: object) -> "Bench":
         self.request = {"request": request, "session": session} | changes
+        return self
 
     def to_ready(self, session: int = 7) -> "Bench":
         self.hello()

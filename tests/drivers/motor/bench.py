@@ -75,6 +75,11 @@ class Bench:
         assert self.driver.state is DriverState.ARMING
         self.run_until(DriverState.ARMED)
 
+    def request(self, request):
+        """Ask the driver for a state; returns the bench itself."""
+        self.driver.request(request)
+        return self
+
     def drive(self, seconds, command=None):
         """Arm, and run for a time with a command (None: the one set before); returns the bench itself."""
         self.arm()

@@ -70,8 +70,7 @@ class DriverConformance:
 
     def test_ready_opens_a_session_and_moves_nothing(self, bench):
         bench.run_until(*IDLE_STATES)
-        bench.driver.request(Request.READY)
-        bench.run_until(DriverState.READY)
+        bench.request(Request.READY).run_until(DriverState.READY)
         bench.run(1.0, FORWARD)
         assert bench.driver.state is DriverState.READY
         assert bench.largest_speed == 0.0
@@ -111,8 +110,7 @@ class DriverConformance:
     def test_arms_again_only_on_request(self, bench):
         bench.arm()
         sessions = bench.driver.stats.sessions
-        bench.driver.request(Request.READY)
-        bench.run_until(DriverState.READY)
+        bench.request(Request.READY).run_until(DriverState.READY)
         bench.run(2.0, FORWARD)
         assert bench.largest_speed == 0.0
         bench.arm()
@@ -127,17 +125,14 @@ class DriverConformance:
         bench.run(self.stop_time_s(max(FORWARD)))
         assert bench.robot.speed_rad_s < 0.05
         assert len(bench.driver.detail) > 10
-        bench.driver.request(Request.ARM)
-        bench.run(2.0)
+        bench.request(Request.ARM).run(2.0)
         assert bench.driver.state is DriverState.FAULT
-        bench.driver.request(Request.RESET)
-        bench.run(1.0)
+        bench.request(Request.RESET).run(1.0)
         assert bench.driver.state is DriverState.FAULT, "the cause is still there"
         bench.driver.request(Request.STANDBY)
         bench.robot.break_down(False)
         bench.run(0.5)
-        bench.driver.request(Request.RESET)
-        bench.run_until(*IDLE_STATES)
+        bench.request(Request.RESET).run_until(*IDLE_STATES)
         bench.largest_speed = 0.0
         bench.run(2.0)
         assert bench.largest_speed == 0.0
@@ -152,11 +147,9 @@ class DriverConformance:
         bench.run(self.stop_time_s(max(FORWARD)))
         assert bench.robot.speed_rad_s < 0.05
         assert bench.driver.state is DriverState.ESTOP
-        bench.driver.request(Request.ARM)
-        bench.run(2.0, FORWARD)
+        bench.request(Request.ARM).run(2.0, FORWARD)
         assert bench.driver.state is DriverState.ESTOP
-        bench.driver.request(Request.RESET)
-        bench.run_until(*IDLE_STATES)
+        bench.request(Request.RESET).run_until(*IDLE_STATES)
         bench.largest_speed = 0.0
         bench.run(2.0)
         assert bench.largest_speed == 0.0
@@ -168,15 +161,13 @@ class DriverConformance:
         bench.run_until(DriverState.ESTOP)
         bench.run(self.stop_time_s(max(FORWARD)))
         assert bench.robot.speed_rad_s < 0.05
-        bench.driver.request(Request.RESET)
-        bench.run(1.0)
+        bench.request(Request.RESET).run(1.0)
         assert bench.driver.state is DriverState.ESTOP
         bench.driver.request(Request.STANDBY)
         bench.robot.press_estop(False)
         bench.run(1.0)
         assert bench.driver.state is DriverState.ESTOP, "releasing the button alone is not enough"
-        bench.driver.request(Request.RESET)
-        bench.run_until(*IDLE_STATES)
+        bench.request(Request.RESET).run_until(*IDLE_STATES)
         bench.largest_speed = 0.0
         bench.run(2.0)
         assert bench.largest_speed == 0.0
@@ -270,11 +261,8 @@ class DriverConformance:
         bench.run(2.0)
         assert bench.robot.speed_rad_s == pytest.approx(0.0, abs=0.05)
         assert not bench.robot.armed
-        bench.driver.request(Request.ARM)
-        bench.run(0.5)
+        bench.request(Request.ARM).run(0.5)
         assert bench.driver.state is DriverState.FAULT
-        bench.driver.request(Request.RESET)
-        bench.run(0.5)
-        bench.driver.request(Request.STANDBY)
-        bench.run_until(*IDLE_STATES)
+        bench.request(Request.RESET).run(0.5)
+        bench.request(Request.STANDBY).run_until(*IDLE_STATES)
         bench.arm()

@@ -24,8 +24,7 @@ def test_a_person_who_takes_the_remote_control_drives_and_that_is_no_fault(bench
     assert bench.driver.state in IDLE_STATES
     assert "remote control" in bench.driver.detail
     assert bench.robot.speed == pytest.approx((5.0, 5.0))
-    bench.driver.request(Request.ARM)
-    bench.run(1.0)
+    bench.request(Request.ARM).run(1.0)
     assert bench.driver.state in IDLE_STATES
     assert bench.robot.speed == pytest.approx((5.0, 5.0)), "the person still drives"
 
@@ -50,8 +49,7 @@ def test_the_buttons_stop_it_and_need_a_reset(bench):
     bench.run(1.0, FORWARD)
     assert bench.driver.state is DriverState.FAULT, "releasing the button alone is not enough"
     assert bench.robot.speed_rad_s == 0.0
-    bench.driver.request(Request.RESET)
-    bench.run_until(*IDLE_STATES)
+    bench.request(Request.RESET).run_until(*IDLE_STATES)
 
 
 @pytest.mark.parametrize("warning", [0x0002, 0x0004, 0x0200, 0x0400])
@@ -101,8 +99,7 @@ def test_it_does_not_arm_while_the_base_moves(bench):
     bench.run_until(*IDLE_STATES)
     bench.robot.stuck, bench.robot.speed = {0, 1}, [4.0, 4.0]
     bench.run(0.1)
-    bench.driver.request(Request.ARM)
-    bench.run(0.3, FORWARD)
+    bench.request(Request.ARM).run(0.3, FORWARD)
     assert bench.driver.state in IDLE_STATES
     assert "moving" in bench.driver.detail
     assert not [frame for frame in bench.robot.received if AGILEX.is_motion(frame)]
@@ -110,8 +107,7 @@ def test_it_does_not_arm_while_the_base_moves(bench):
 
 def test_a_button_pressed_while_it_slows_down_ends_that_and_its_release_moves_nothing(bench):
     bench.drive(0.5, (20.0, 20.0))
-    bench.driver.request(Request.STANDBY)
-    bench.run(0.1)
+    bench.request(Request.STANDBY).run(0.1)
     bench.robot.press_estop(True)
     bench.run(0.3)
     bench.robot.press_estop(False)
@@ -123,8 +119,7 @@ def test_a_button_pressed_while_it_slows_down_ends_that_and_its_release_moves_no
 
 def test_a_person_who_takes_the_remote_control_while_it_slows_down_ends_that(bench):
     bench.drive(0.5, (20.0, 20.0))
-    bench.driver.request(Request.STANDBY)
-    bench.run(0.1)
+    bench.request(Request.STANDBY).run(0.1)
     bench.robot.controller.base.use_remote_control(0.0, 0.0)
     bench.run(0.2)
     bench.robot.received.clear()
@@ -136,8 +131,7 @@ def test_a_person_who_takes_the_remote_control_while_it_slows_down_ends_that(ben
 
 def test_it_waits_for_the_wheels_to_stand_from_the_end_of_a_ramp_however_long_that_was():
     bench = dataclasses.replace(AGILEX, changes="stop_deceleration_rad_s2 = 1.0").bench().drive(0.5, (4.0, 4.0))
-    bench.driver.request(Request.STANDBY)
-    bench.run(3.8)
+    bench.request(Request.STANDBY).run(3.8)
     bench.robot.stuck, bench.robot.speed = {0, 1}, [4.0, 4.0]
     bench.run(1.0)
     assert bench.robot.controller.base.control_mode == CAN_MODE, "standing by, it would brake no longer"

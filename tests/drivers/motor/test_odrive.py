@@ -115,8 +115,7 @@ def test_axes_that_somebody_else_has_armed_are_brought_to_idle(bench):
 def test_an_axis_that_is_not_calibrated_is_said_not_to_arm(bench):
     bench.run_until(*IDLE_STATES)
     axes(bench)[1].calibrated = False
-    bench.driver.request(Request.ARM)
-    bench.run(2.0)
+    bench.request(Request.ARM).run(2.0)
     assert bench.driver.state is DriverState.FAULT
     assert "node 5" in bench.driver.detail
     assert [axis.axis_state for axis in axes(bench)] == [IDLE, IDLE]
@@ -137,8 +136,7 @@ def test_it_does_not_arm_while_an_axis_turns(bench):
     bench.robot.speed = [4.0, 4.0]
     bench.run(0.1)
     bench.robot.received.clear()
-    bench.driver.request(Request.ARM)
-    bench.run(0.3, FORWARD)
+    bench.request(Request.ARM).run(0.3, FORWARD)
     assert bench.driver.state in IDLE_STATES
     assert "a motor is turning" in bench.driver.detail
     assert not [frame for frame in bench.robot.received if frame.can_id & 0x1F == 0x07 and frame.data[0] == CLOSED_LOOP]
@@ -148,7 +146,6 @@ def test_it_does_not_arm_without_encoder_estimates(bench):
     drain = bench.robot.drain
     bench.robot.drain = lambda: [frame for frame in drain() if frame.can_id & 0x1F != 0x09]
     bench.run_until(*IDLE_STATES)
-    bench.driver.request(Request.ARM)
-    bench.run(0.3)
+    bench.request(Request.ARM).run(0.3)
     assert bench.driver.state in IDLE_STATES
     assert "no encoder estimates" in bench.driver.detail

@@ -45,8 +45,7 @@ def test_another_major_version_is_refused():
     bench = create_bench(ReferenceRobot(replace(CONFIG, protocol_major=2)))
     bench.run_until(DriverState.REFUSED)
     assert "the robot speaks protocol 2.0, this host 1.0" in bench.driver.detail
-    bench.driver.request(Request.ARM)
-    bench.run(3.0, (1.0, 1.0))
+    bench.request(Request.ARM).run(3.0, (1.0, 1.0))
     assert bench.driver.state is DriverState.REFUSED
     assert bench.largest_speed == 0.0
 
@@ -57,8 +56,7 @@ def test_another_dbc_is_refused_but_telemetry_is_shown():
     assert "0badcafe" in bench.driver.detail
     assert f"{CODEC.dbc_hash:08x}" in bench.driver.detail
     for request in (Request.READY, Request.ARM):
-        bench.driver.request(request)
-        bench.run(2.0, (1.0, 1.0))
+        bench.request(request).run(2.0, (1.0, 1.0))
     assert bench.driver.state is DriverState.REFUSED
     assert bench.driver.stats.sessions == 0
     assert bench.largest_speed == 0.0
@@ -86,8 +84,7 @@ def test_each_arming_has_a_session_of_its_own():
     for _ in range(4):
         bench.arm()
         sessions.append(bench.robot.session)
-        bench.driver.request(Request.STANDBY)
-        bench.run(0.3)
+        bench.request(Request.STANDBY).run(0.3)
     assert 0 not in sessions
     assert len(set(sessions)) == 4
 

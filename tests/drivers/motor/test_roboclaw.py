@@ -40,8 +40,7 @@ def test_a_board_that_does_not_keep_its_timeout_is_not_armed(bench):
     bench.run_until(*IDLE_STATES)
     receive = bench.robot.receive
     bench.robot.receive = lambda now_ns, frame: None if frame.can_id & 0xFF == 14 else receive(now_ns, frame)
-    bench.driver.request(Request.ARM)
-    bench.run(2.5, FORWARD)
+    bench.request(Request.ARM).run(2.5, FORWARD)
     assert bench.driver.state in IDLE_STATES
     assert "serial timeout" in bench.driver.detail
     assert bench.largest_speed == 0.0
@@ -96,8 +95,7 @@ def test_its_e_stop_input_stops_it_and_needs_a_reset(bench):
     bench.run(2.0, FORWARD)
     assert bench.driver.state is DriverState.FAULT
     assert bench.robot.speed_rad_s < 0.05
-    bench.driver.request(Request.RESET)
-    bench.run_until(*IDLE_STATES)
+    bench.request(Request.RESET).run_until(*IDLE_STATES)
 
 
 def test_an_e_stop_that_the_board_latches_by_itself_is_reset_only_when_asked_to(bench):
@@ -110,8 +108,7 @@ def test_an_e_stop_that_the_board_latches_by_itself_is_reset_only_when_asked_to(
     bench.run(1.0)
     assert bench.driver.state is DriverState.ESTOP
     assert not [frame for frame in bench.robot.received if frame.can_id & 0xFF == 200]
-    bench.driver.request(Request.RESET)
-    bench.run_until(*IDLE_STATES)
+    bench.request(Request.RESET).run_until(*IDLE_STATES)
 
 
 def test_the_two_byte_status_of_older_firmware_is_taken(bench):

@@ -65,8 +65,7 @@ def test_a_bridge_that_was_started_with_other_settings_is_refused(bench, end):
     bench.run(0.2)
     assert bench.driver.state is DriverState.HANDSHAKE
     assert "another [link] of robot.toml" in bench.driver.detail
-    bench.driver.request(Request.ARM)
-    bench.run(0.5, FORWARD)
+    bench.request(Request.ARM).run(0.5, FORWARD)
     assert bench.largest_speed == 0.0
 
 
@@ -86,8 +85,7 @@ def test_a_fault_stays_until_it_is_reset_although_its_cause_has_gone(bench, end)
     bench.robot.controller.joints = True
     bench.run(1.0, FORWARD)
     assert bench.driver.state is DriverState.FAULT
-    bench.driver.request(Request.RESET)
-    bench.run_until(DriverState.STANDBY)
+    bench.request(Request.RESET).run_until(DriverState.STANDBY)
 
 
 def test_after_a_pause_longer_than_the_bridge_waits_nothing_is_sent_that_moves(bench):
@@ -117,8 +115,7 @@ def test_the_safety_card_says_who_stops_the_base_and_that_its_time_out_is_only_d
 
 def test_odometry_that_stops_while_it_slows_down_is_a_fault_that_stays(bench, end):
     bench.drive(0.5, (20.0, 20.0))
-    bench.driver.request(Request.STANDBY)
-    bench.run(0.1)
+    bench.request(Request.STANDBY).run(0.1)
     VENDOR.lose_left(bench.robot)
     bench.run(0.4)
     assert not end.driving

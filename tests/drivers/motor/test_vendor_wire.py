@@ -72,8 +72,7 @@ def scripted_day(vendor):
     bench.run(1.0, FORWARD)
     bench.run(0.5, (-1.0, 2.5))
     begin()  # stop
-    bench.driver.request(Request.STANDBY)
-    bench.run_until(*IDLE_STATES)
+    bench.request(Request.STANDBY).run_until(*IDLE_STATES)
     bench.run(COASTING_S)
     begin()  # again
     bench.drive(0.5, FORWARD)
@@ -83,8 +82,7 @@ def scripted_day(vendor):
     bench.run(COASTING_S)
     begin()  # reset
     vendor.mend(bench.robot)
-    bench.driver.request(Request.RESET)
-    bench.run_until(*IDLE_STATES)
+    bench.request(Request.RESET).run_until(*IDLE_STATES)
     bench.run(COASTING_S)
     begin()  # reconnect
     bench.drive(0.5, FORWARD)
@@ -97,8 +95,7 @@ def scripted_day(vendor):
     bench.send_estop()
     bench.run(COASTING_S)
     begin()  # after
-    bench.driver.request(Request.RESET)
-    bench.run_until(*IDLE_STATES)
+    bench.request(Request.RESET).run_until(*IDLE_STATES)
     bench.run(0.5)
     return recorded.phases
 

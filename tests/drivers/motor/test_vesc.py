@@ -53,8 +53,7 @@ def test_it_does_not_arm_while_a_motor_turns():
     bench.run_until(*IDLE_STATES)
     bench.robot.speed = [2.0, 2.0]
     bench.run(0.05)
-    bench.driver.request(Request.ARM)
-    bench.run(0.05, FORWARD)
+    bench.request(Request.ARM).run(0.05, FORWARD)
     assert bench.driver.state in IDLE_STATES
     assert "is turning" in bench.driver.detail
     assert not [frame for frame in bench.robot.received if VESC.is_motion(frame)]
@@ -70,8 +69,7 @@ def test_it_brakes_for_as_long_as_a_motor_says_that_it_turns_and_lets_go_of_one_
         step(now_ns)
 
     bench.robot.stuck, bench.robot.step = {0, 1}, pushed
-    bench.driver.request(Request.STANDBY)
-    bench.run(10.0)
+    bench.request(Request.STANDBY).run(10.0)
     assert bench.driver.state is DriverState.STOPPING
     assert bench.robot.received[-1].can_id >> 8 == 2, "a brake current"
     bench.robot.drain = list

@@ -78,11 +78,9 @@ def test_to_leave_the_emergency_stop_takes_the_key():
     bench = driving()
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.command = None
-    bench.set_request("STANDBY")
-    bench.run(1500)
+    bench.set_request("STANDBY").run(1500)
     proves, bench.prover = bench.prover, None
-    bench.set_request("RESET")
-    bench.run(500)
+    bench.set_request("RESET").run(500)
     assert bench.out.state == "ESTOP"
     bench.prover = proves
     bench.run_until("STANDBY")
@@ -93,8 +91,7 @@ def test_an_unproved_standby_neither_stops_nor_takes_a_request_back():
     bench = driving()
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.command = None
-    bench.set_request("RESET")
-    bench.run(1500)
+    bench.set_request("RESET").run(1500)
     assert bench.out.state == "STANDBY"
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.step()
@@ -193,8 +190,7 @@ def test_a_frame_played_again_in_its_session_is_refused():
 def test_the_nonce_is_new_in_every_session_and_for_every_host():
     bench = driving()
     armed = bench.prover._nonce
-    bench.hello()
-    bench.run(100)
+    bench.hello().run(100)
     assert bench.prover._nonce == armed, "none but the host's own end changes it within a session"
     assert bench.out.state == "ARMED"
     bench.set_request("STANDBY")
@@ -204,21 +200,18 @@ def test_the_nonce_is_new_in_every_session_and_for_every_host():
     standby = bench.prover._nonce
     assert standby != armed
     bench.run(30)
-    bench.hello()
-    bench.run(2)
+    bench.hello().run(2)
     assert bench.prover._nonce != standby
 
 
 def test_a_host_that_starts_anew_is_heard():
     bench = Bench(LOCKED).to_ready()
-    bench.set_request("STANDBY")
-    bench.run_until("STANDBY")
+    bench.set_request("STANDBY").run_until("STANDBY")
     bench.run(500)
     bench.prover = Prover(KEY, CODEC)
     bench.run(600)
     bench.hello()
-    bench.set_request("READY", 9)
-    bench.run_until("READY")
+    bench.set_request("READY", 9).run_until("READY")
 
 
 def test_parameters_are_read_and_written_with_the_key_alone():
@@ -277,8 +270,7 @@ def test_the_next_nonce_is_drawn_in_a_cycle_with_nothing_to_send():
     a = bench.core._core.authentication
     bench.to_ready()
     draws = a.draws
-    bench.set_request("STANDBY")
-    bench.run_until("STANDBY")
+    bench.set_request("STANDBY").run_until("STANDBY")
     sending = bench.messages("MAC_CHALLENGE", bench.now_us)
     assert sending
     assert (a.prepared, a.draws) == (False, draws)

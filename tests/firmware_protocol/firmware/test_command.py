@@ -144,8 +144,7 @@ def test_standby_rejects_even_zero():
 def test_stopped_states_reject_everything(state):
     bench = driving()
     if state == "STOPPING":
-        bench.set_request("STANDBY")
-        bench.run_until("STOPPING")
+        bench.set_request("STANDBY").run_until("STOPPING")
     elif state == "FAULT":
         bench.command = {"left": 4.0, "right": 2.0}
         bench.inputs["left_current_a"] = 100.0
@@ -207,10 +206,8 @@ def five_zeros_more(bench):
 def test_zeros_of_an_arming_before_do_not_count():
     bench = Bench().to_armed()
     bench.command = None
-    bench.set_request("STANDBY")
-    bench.run_until("STANDBY")
-    bench.set_request("READY", session=9)
-    bench.run_until("READY", within_ms=60)
+    bench.set_request("STANDBY").run_until("STANDBY")
+    bench.set_request("READY", session=9).run_until("READY", within_ms=60)
     five_zeros_more(bench)
 
 
@@ -232,8 +229,7 @@ def test_zero_commands_that_stopped_do_not_arm():
     bench.run(300)
     bench.command = None
     bench.run(101)
-    bench.set_request("ARM")
-    bench.run(100)
+    bench.set_request("ARM").run(100)
     assert bench.out.state == "READY"
     assert "ZERO_COMMANDS" in bench.blockers()
 
@@ -264,8 +260,7 @@ def test_no_command_from_before_arming_outlives_it():
         bench.wheel_command(mode="COAST", valid_for=0.002)
         bench.step()
     bench.run(40)
-    bench.set_request("ARM")
-    bench.run_until("ARMED", within_ms=50)
+    bench.set_request("ARM").run_until("ARMED", within_ms=50)
     assert bench.out.driver_enabled
     assert stop_time_us(bench) == 100 * MS
     assert bench.out.stop_cause == "COMMAND_TIMEOUT"

@@ -183,8 +183,7 @@ def test_estop_decelerates_from_the_very_next_cycle_then_brakes(how):
 
 def test_stopping_keeps_curvature_and_ends_in_standby():
     bench = Bench(dataclasses.replace(CONFIG, stop_deceleration_rad_s2=10.0)).to_driving(4.0, -1.0)
-    bench.set_request("STANDBY")
-    bench.run_until("STOPPING")
+    bench.set_request("STANDBY").run_until("STOPPING")
     start = bench.now_us
     assert bench.out.limited
     while bench.step().state == "STOPPING":
@@ -219,8 +218,7 @@ def test_after_a_stop_that_was_cut_off_the_next_motion_begins_at_zero():
 def test_a_stop_that_does_not_end_is_ended():
     bench = Bench(dataclasses.replace(CONFIG, drive_off_timeout_s=2.0, stop_timeout_s=0.3)).to_driving()
     bench.wheels_follow = False
-    bench.set_request("STANDBY")
-    bench.run_until("STOPPING")
+    bench.set_request("STANDBY").run_until("STOPPING")
     start = bench.now_us
     bench.run_until("STANDBY")
     assert bench.now_us - start == 300 * MS

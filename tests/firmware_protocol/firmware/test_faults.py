@@ -272,10 +272,8 @@ def test_reset_causes_latch_once_and_clear(cause, fault):
 
 
 def reset(bench):
-    bench.set_request("STANDBY")
-    bench.run(250)
-    bench.set_request("RESET")
-    bench.run(60)
+    bench.set_request("STANDBY").run(250)
+    bench.set_request("RESET").run(60)
 
 
 @pytest.mark.parametrize("fault", ["SELF_TEST_FAILED", "CONFIG_INVALID"])
@@ -321,8 +319,7 @@ def test_a_reset_of_one_fault_hides_no_other_for_a_single_cycle():
     bench.inputs.update(voltage_v=12.0, left_current_a=50.0)
     bench.run(300)
     bench.inputs.pop("left_current_a")
-    bench.set_request("STANDBY")
-    bench.run(250)
+    bench.set_request("STANDBY").run(250)
     bench.set_request("RESET")
     shown = {name_of(bench.step().fault) for _ in range(60)}
     assert shown == {"OVER_CURRENT_LEFT", "UNDER_VOLTAGE"}
@@ -333,8 +330,7 @@ def test_a_passing_fault_blocks_ready_while_it_is_held():
     bench = Bench().hello()
     bench.inputs["voltage_v"] = 12.0
     bench.run(300)
-    bench.set_request("READY")
-    bench.run(1000)
+    bench.set_request("READY").run(1000)
     assert bench.out.state == "STANDBY"
     bench.inputs.clear()
     bench.run(400)

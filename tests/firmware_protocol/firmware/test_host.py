@@ -12,30 +12,26 @@ from tests.firmware_protocol.bench import CODEC, CONFIG, FAULTS, MS, Bench, seal
 
 def test_without_a_handshake_nothing_gets_ready():
     bench = Bench()
-    bench.set_request("READY")
-    bench.run(500)
+    bench.set_request("READY").run(500)
     assert bench.out.state == "STANDBY"
     assert bench.blockers() == {"HANDSHAKE", "CHALLENGE", "ZERO_COMMANDS"}
 
 
 def test_another_dbc_is_refused_and_named_and_the_right_one_accepted_afterwards():
     bench = Bench().hello(dbc_hash=CODEC.dbc_hash ^ 1)
-    bench.set_request("READY")
-    bench.run(300)
+    bench.set_request("READY").run(300)
     assert bench.out.state == "STANDBY"
     assert bench.out.fault == FAULTS["DBC_HASH_MISMATCH"]
     assert {"HANDSHAKE", "FAULT"} <= bench.blockers()
     assert bench.core.rejections["HANDSHAKE"] == 1
     assert bench.messages("BUILD")[-1].values["dbc_hash"] == CODEC.dbc_hash
-    bench.hello()
-    bench.run_until("READY")
+    bench.hello().run_until("READY")
     assert bench.out.fault == FAULTS["NONE"]
 
 
 def test_another_dbc_stops_motion():
     bench = Bench().to_driving()
-    bench.hello(dbc_hash=1)
-    bench.run(2)
+    bench.hello(dbc_hash=1).run(2)
     assert (bench.out.state, bench.out.stop_cause) == ("STOPPING", "FAULT")
 
 
@@ -45,8 +41,7 @@ def test_a_host_of_another_major_is_heard_refused_and_answered(major):
     bench.run(100)
     before = len(bench.messages("HELLO"))
     bench.hello(protocol_major=major)
-    bench.set_request("READY")
-    bench.run(300)
+    bench.set_request("READY").run(300)
     assert bench.out.state == "STANDBY"
     assert bench.out.fault == FAULTS["PROTOCOL_MAJOR_MISMATCH"]
     assert len(bench.messages("HELLO")) == before + 1
@@ -131,14 +126,11 @@ def test_a_host_that_babbles_is_disqualified_and_motion_stops():
 @pytest.mark.parametrize("session", [0, 7])
 def test_session_zero_and_the_last_session_are_refused(session):
     bench = Bench().to_ready(session=7)
-    bench.set_request("STANDBY")
-    bench.run_until("STANDBY")
-    bench.set_request("READY", session=session)
-    bench.run(300)
+    bench.set_request("STANDBY").run_until("STANDBY")
+    bench.set_request("READY", session=session).run(300)
     assert bench.out.state == "STANDBY"
     assert "SESSION" in bench.blockers()
-    bench.set_request("READY", session=8)
-    bench.run_until("READY")
+    bench.set_request("READY", session=8).run_until("READY")
     assert bench.out.session == 8
 
 
@@ -156,8 +148,7 @@ def test_it_never_arms_again_by_itself():
     bench.run_until("STANDBY")
     bench.command = command
     for request in ("ARM", "READY", "ARM"):
-        bench.set_request(request)
-        bench.run(1000)
+        bench.set_request(request).run(1000)
         assert bench.out.state == "STANDBY"
     bench.command = {}
     bench.run(1000)
@@ -167,8 +158,7 @@ def test_it_never_arms_again_by_itself():
 def test_a_new_session_in_ready_goes_through_standby_with_a_new_challenge():
     bench = Bench().to_ready(session=7)
     challenge = bench.core.challenge
-    bench.set_request("READY", session=8)
-    bench.run(60)
+    bench.set_request("READY", session=8).run(60)
     assert (bench.out.state, bench.out.session) == ("READY", 8)
     assert bench.core.challenge != challenge
 
@@ -178,11 +168,9 @@ def test_every_entry_of_standby_and_ready_has_a_new_challenge_never_zero():
     seen = []
     bench.hello()
     for session in range(1, 60):
-        bench.set_request("READY", session=session)
-        bench.run_until("READY")
+        bench.set_request("READY", session=session).run_until("READY")
         seen.append(bench.core.challenge)
-        bench.set_request("STANDBY", session=session)
-        bench.run_until("STANDBY")
+        bench.set_request("STANDBY", session=session).run_until("STANDBY")
         seen.append(bench.core.challenge)
     assert all(a != b for a, b in itertools.pairwise(seen))
     assert len(set(seen)) > 110
@@ -196,22 +184,18 @@ def test_a_counted_start_gives_none_of_the_challenges_of_the_starts_before():
         bench = Bench(entropy=start, last_entropy=start - 1).to_ready()
         for session in range(8, 18):
             seen.append(bench.core.challenge)
-            bench.set_request("STANDBY")
-            bench.run_until("STANDBY")
+            bench.set_request("STANDBY").run_until("STANDBY")
             seen.append(bench.core.challenge)
-            bench.set_request("READY", session)
-            bench.run_until("READY")
+            bench.set_request("READY", session).run_until("READY")
     assert len(seen) - len(set(seen)) < 70, "of 2000 out of 65535 thirty are expected"
 
 
 @pytest.mark.parametrize(("entropy", "last_entropy"), [(0, 0), (0, 5), (5, 5), (2**64 - 1, 2**64 - 1)])
 def test_a_start_without_entropy_or_with_that_of_the_last_one_is_refused_for_good(entropy, last_entropy):
     bench = Bench(entropy=entropy, last_entropy=last_entropy).hello()
-    bench.set_request("READY")
-    assert bench.run(200).state == "FAULT"
+    assert bench.set_request("READY").run(200).state == "FAULT"
     assert bench.out.fault == FAULTS["ENTROPY_INVALID"]
-    bench.set_request("RESET")
-    bench.run(800)
+    bench.set_request("RESET").run(800)
     assert (bench.out.state, bench.out.driver_enabled) == ("FAULT", False)
 
 
@@ -233,11 +217,9 @@ def test_challenges_are_the_upper_sixteen_bits_of_splitmix64(entropy, outputs):
     seen = [bench.core.challenge]
     for session in (7, 8):
         bench.hello()
-        bench.set_request("READY", session)
-        bench.run_until("READY")
+        bench.set_request("READY", session).run_until("READY")
         seen.append(bench.core.challenge)
-        bench.set_request("STANDBY")
-        bench.run_until("STANDBY")
+        bench.set_request("STANDBY").run_until("STANDBY")
         seen.append(bench.core.challenge)
     assert seen[:4] == [output >> 48 for output in outputs]
 
@@ -275,8 +257,7 @@ def arm_with(respond):
     bench = Bench().to_ready()
     bench.command = {}
     bench.answers = False
-    bench.set_request("ARM", challenge_answer=respond(bench))
-    bench.run(400)
+    bench.set_request("ARM", challenge_answer=respond(bench)).run(400)
     return bench
 
 
@@ -304,26 +285,21 @@ def test_wrong_answer_does_not(respond):
 def test_the_answer_to_an_old_challenge_does_not_arm():
     bench = Bench().to_ready(session=7)
     old = challenge_answer(bench.core.challenge, 9, CODEC.dbc_hash)
-    bench.set_request("READY", session=9)
-    bench.run(60)
+    bench.set_request("READY", session=9).run(60)
     assert bench.out.session == 9
     bench.command, bench.answers = {}, False
-    bench.set_request("ARM", session=9, challenge_answer=old)
-    bench.run(400)
+    bench.set_request("ARM", session=9, challenge_answer=old).run(400)
     assert bench.out.state == "READY"
 
 
 def test_answer_given_in_standby_is_no_answer():
     bench = Bench().hello()
     bench.command = {}
-    bench.set_request("ARM")
-    bench.run(400)
+    bench.set_request("ARM").run(400)
     assert bench.out.state == "STANDBY"
     bench.answers = False
-    bench.set_request("READY")
-    bench.run_until("READY")
-    bench.set_request("ARM")
-    bench.run(300)
+    bench.set_request("READY").run_until("READY")
+    bench.set_request("ARM").run(300)
     assert bench.out.state == "READY"
 
 
@@ -332,8 +308,7 @@ def test_arming_waits_for_wheels_that_stand():
     bench.wheels_follow = False
     bench.speeds = [0.0, -0.06]
     bench.command = {}
-    bench.set_request("ARM")
-    bench.run(400)
+    bench.set_request("ARM").run(400)
     assert bench.out.state == "READY"
     assert bench.blockers() == {"WHEELS_MOVING"}
     bench.speeds = [0.0, -0.04]
@@ -357,16 +332,14 @@ def estopped():
     bench = Bench().to_driving()
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.command = None
-    bench.set_request("ARM")
-    bench.run(800)
+    bench.set_request("ARM").run(800)
     assert bench.out.state == "ESTOP"
     return bench
 
 
 def test_reset_clears_an_estop_but_starts_nothing():
     bench = estopped()
-    bench.set_request("RESET")
-    bench.run_until("STANDBY")
+    bench.set_request("RESET").run_until("STANDBY")
     bench.command = {"left": 1.0, "right": 1.0}
     bench.set_request("ARM")
     for _ in range(1000):
@@ -376,28 +349,23 @@ def test_reset_clears_an_estop_but_starts_nothing():
 
 def test_a_reset_asked_for_before_the_stop_does_not_clear_it():
     bench = Bench()
-    bench.set_request("RESET")
-    bench.run(300)
+    bench.set_request("RESET").run(300)
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.run(1500)
     assert bench.out.state == "ESTOP"
-    bench.set_request("STANDBY")
-    bench.run(100)
-    bench.set_request("RESET")
-    bench.run(60)
+    bench.set_request("STANDBY").run(100)
+    bench.set_request("RESET").run(60)
     assert bench.out.state == "STANDBY"
 
 
 def test_a_reset_that_was_asked_for_before_a_silence_does_not_clear_what_came_in_it():
     bench = Bench()
-    bench.set_request("RESET")
-    bench.run(300)
+    bench.set_request("RESET").run(300)
     bench.request = None
     bench.run(300)
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.run(700)
-    bench.set_request("RESET")
-    bench.run(1000)
+    bench.set_request("RESET").run(1000)
     assert bench.out.state == "ESTOP"
 
 
@@ -405,8 +373,7 @@ def test_a_reset_waits_for_stillness_and_is_void_when_the_stop_comes_again():
     bench = estopped()
     bench.wheels_follow = False
     bench.speeds = [1.0, 1.0]
-    bench.set_request("RESET")
-    bench.run(300)
+    bench.set_request("RESET").run(300)
     assert bench.out.state == "ESTOP"
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.speeds = [0.0, 0.0]
@@ -419,8 +386,7 @@ def test_a_reset_no_longer_asked_for_is_void(end):
     bench = estopped()
     bench.wheels_follow = False
     bench.speeds = [1.0, 1.0]
-    bench.set_request("RESET")
-    bench.run(100)
+    bench.set_request("RESET").run(100)
     bench.request = None
     if end == "another request":
         bench.set_request("STANDBY")
@@ -435,8 +401,7 @@ def test_a_reset_is_asked_for_until_the_host_is_silent_and_no_longer():
         bench = estopped()
         bench.wheels_follow = False
         bench.speeds = [1.0, 1.0]
-        bench.set_request("RESET")
-        bench.run(50 - bench.now_us // MS % 50)
+        bench.set_request("RESET").run(50 - bench.now_us // MS % 50)
         bench.request = None
         bench.run(silent_ms - 1)
         assert bench.out.state == "ESTOP"
@@ -454,26 +419,22 @@ def test_a_pressed_button_cannot_be_reset_nor_does_its_release_reset(source):
     bench.command = None
     bench.run(600)
     challenge = bench.core.challenge
-    bench.set_request("RESET")
-    bench.run(700)
+    bench.set_request("RESET").run(700)
     assert bench.out.state == "ESTOP"
     # A challenge is renewed on the way through STANDBY, be it between two cycles.
     assert bench.core.challenge == challenge
     bench.inputs.clear()
     bench.run(1000)
     assert bench.out.state == "ESTOP"
-    bench.set_request("STANDBY")
-    bench.run(100)
-    bench.set_request("RESET")
-    bench.run_until("STANDBY", within_ms=60)
+    bench.set_request("STANDBY").run(100)
+    bench.set_request("RESET").run_until("STANDBY", within_ms=60)
     assert bench.out.estop_source == "NONE"
 
 
 def test_motion_asked_for_delays_a_reset():
     bench = estopped()
     bench.command = {"left": 0.002, "right": 0.0, "session": 7}
-    bench.set_request("RESET")
-    bench.run(1000)
+    bench.set_request("RESET").run(1000)
     assert bench.out.state == "ESTOP"
     start = bench.now_us
     bench.command = None
@@ -491,8 +452,7 @@ def test_the_first_source_of_an_estop_is_kept():
 
 def test_host_fault_blocks_ready():
     bench = Bench().hello()
-    bench.set_request("READY", host_fault=5)
-    bench.run(300)
+    bench.set_request("READY", host_fault=5).run(300)
     assert bench.out.state == "STANDBY"
     assert "HOST_STATE" in bench.blockers()
 

@@ -80,8 +80,7 @@ def test_writing_is_refused_unless_disarmed(state):
     else:
         bench.to_driving()
     if state == "STOPPING":
-        bench.set_request("STANDBY")
-        bench.run_until("STOPPING")
+        bench.set_request("STANDBY").run_until("STOPPING")
     elif state == "moving ESTOP":
         bench.core.receive(bench.now_us, 0x080, b"")
         bench.step()

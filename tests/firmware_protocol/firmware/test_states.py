@@ -34,8 +34,7 @@ def bring_to(state: str) -> Bench:
         bench.to_driving()
     elif state == "STOPPING":
         bench.to_driving()
-        bench.set_request("STANDBY")
-        bench.run_until("STOPPING")
+        bench.set_request("STANDBY").run_until("STOPPING")
     elif state == "FAULT":
         bench.inputs["left_current_a"] = 100.0
         bench.run_until("FAULT")
@@ -68,28 +67,23 @@ def latched_fault(state):
 def reset_fault(_state):
     bench = bring_to("FAULT")
     bench.inputs.clear()
-    bench.set_request("STANDBY")
-    bench.run(300)
+    bench.set_request("STANDBY").run(300)
     assert bench.out.state == "FAULT"
-    bench.set_request("RESET")
-    bench.run(60)
+    bench.set_request("RESET").run(60)
     return bench, "FAULT"
 
 
 def reset_estop(_state):
     bench, _ = estop_frame("STANDBY")
-    bench.set_request("STANDBY")
-    bench.run(700)
+    bench.set_request("STANDBY").run(700)
     assert bench.out.state == "ESTOP"
-    bench.set_request("RESET")
-    bench.run(60)
+    bench.set_request("RESET").run(60)
     return bench, "ESTOP"
 
 
 def ready_given_up(_state):
     bench = bring_to("READY")
-    bench.set_request("STANDBY")
-    bench.run(60)
+    bench.set_request("STANDBY").run(60)
     return bench, "READY"
 
 
@@ -139,8 +133,7 @@ def silent_commands(_state):
 
 def host_fault(_state):
     bench = bring_to("ARMED")
-    bench.set_request("ARM", host_fault=3)
-    bench.run_until("STOPPING", within_ms=60)
+    bench.set_request("ARM", host_fault=3).run_until("STOPPING", within_ms=60)
     return bench, "ARMED"
 
 
@@ -162,8 +155,7 @@ def changed_session(_state):
 
 def requested(_state):
     bench = bring_to("ARMED")
-    bench.set_request("STANDBY")
-    bench.run_until("STOPPING", within_ms=60)
+    bench.set_request("STANDBY").run_until("STOPPING", within_ms=60)
     return bench, "ARMED"
 
 

@@ -184,8 +184,7 @@ def test_last_command_counter_is_that_of_the_last_accepted_command():
     accepted = bench.counters["WHEEL_COMMAND"]
     bench.command = None
     bench.wheel_command(4.0, 2.0, session=9)
-    bench.set_request("STANDBY")
-    bench.run_until("STOPPING")
+    bench.set_request("STANDBY").run_until("STOPPING")
     assert last(bench, "SYSTEM_STATE")["last_command_counter"] == accepted
 
 
@@ -253,8 +252,7 @@ def test_handshake_is_offered_until_accepted_and_answered_ever_after():
     assert len(bench.messages("HELLO")) == 1
     bench.run(2500)
     assert len(bench.messages("HELLO")) == 3
-    bench.hello()
-    bench.run(1)
+    bench.hello().run(1)
     assert len(bench.messages("HELLO")) == 4
     # Two pages with each, and no more.
     bench.run(100)
@@ -395,8 +393,7 @@ def test_a_hello_is_answered_from_20_ms_after_the_answer_before():
     bench.hello()
     bench.step()
     before = len(bench.messages("HELLO"))
-    bench.hello()
-    bench.run(19)
+    bench.hello().run(19)
     bench.step(elapsed_us=999)
     assert len(bench.messages("HELLO")) == before
     bench.step(elapsed_us=1)
