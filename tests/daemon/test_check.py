@@ -2,6 +2,7 @@
 
 import math
 import time
+from contextlib import closing
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -127,12 +128,11 @@ def test_the_conformance_suite_keeps_out_of_a_daemons_way_too(tmp_path):
         f'max_wheel_speed_rad_s = 8.0\n[link]\ninterface = "unixcan"\nchannel = "{tmp_path}/bus"\n'
         f'[daemon]\ncontrol_socket = "{tmp_path}/control.sock"\n'
     )
-    daemon = Daemon(tmp_path / "control.sock", {})
-    try:
-        with pytest.raises(pytest.exit.Exception, match="a daemon is connected to this robot") as caught:
-            test_robot.TestRobot.create_end(SimpleNamespace(getoption=lambda _: str(robot)))
-    finally:
-        daemon.close()
+    with (
+        closing(Daemon(tmp_path / "control.sock", {})),
+        pytest.raises(pytest.exit.Exception, match="a daemon is connected to this robot") as caught,
+    ):
+        test_robot.TestRobot.create_end(SimpleNamespace(getoption=lambda _: str(robot)))
     assert caught.value.returncode == 1
 
 
