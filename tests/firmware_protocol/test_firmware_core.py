@@ -143,8 +143,7 @@ def test_outputs_and_inputs_are_values():
 def test_names_are_the_dbcs():
     bench = Bench()
     bench.inputs["left_current_a"] = 100.0
-    bench.run_until("FAULT")
-    assert bench.out.fault == FAULTS["OVER_CURRENT_LEFT"]
+    assert bench.run_until("FAULT").fault == FAULTS["OVER_CURRENT_LEFT"]
 
 
 @pytest.mark.parametrize("step_back_s", [0.0, 0.001, 5.0, 100.0])

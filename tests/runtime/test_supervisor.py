@@ -147,8 +147,7 @@ def test_a_robot_that_stops_by_itself_ends_the_run(robot):
     assert out.state is State.STOPPING
     assert "no longer armed: no wheel command arrived in time; waiting" in out.detail
     assert any("no longer armed: no wheel command arrived in time" in event for event in out.events)
-    bench.tick(count=50)
-    assert bench.out.state is State.READY
+    assert bench.tick(count=50).state is State.READY
     assert Request.ARM not in bench.requests_sent[-50:]
 
 
@@ -328,10 +327,8 @@ def test_arming_that_the_robot_never_finishes_is_given_up():
     bench = Bench().ready()
     bench.robot_obeys = False
     bench.tick(ARM)
-    bench.tick(count=99, driver_state=DriverState.ARMING)
-    assert bench.out.detail == "arming"
-    bench.tick(count=3)
-    assert bench.out.state is State.STOPPING
+    assert bench.tick(count=99, driver_state=DriverState.ARMING).detail == "arming"
+    assert bench.tick(count=3).state is State.STOPPING
     assert any("the robot did not arm within 2 s: detail of the driver" in event for event in bench.events)
 
 
@@ -340,8 +337,7 @@ def test_arming_that_the_robot_refuses_is_given_up_at_once():
     bench.robot_obeys = False
     bench.tick(ARM)
     bench.tick(driver_state=DriverState.ARMING)
-    bench.tick(driver_state=DriverState.READY)
-    assert bench.out.driver_request is Request.READY
+    assert bench.tick(driver_state=DriverState.READY).driver_request is Request.READY
     assert any("did not arm: detail of the driver" in event for event in bench.events)
 
 
@@ -357,10 +353,8 @@ def test_a_reset_without_effect_is_given_up_and_said():
     bench = Bench().faulted()
     bench.robot_obeys = False
     bench.tick(RESET)
-    bench.tick(count=149)
-    assert bench.out.driver_request is None
-    bench.tick(count=2)
-    assert bench.out.driver_request is Request.STANDBY
+    assert bench.tick(count=149).driver_request is None
+    assert bench.tick(count=2).driver_request is Request.STANDBY
     assert any("did not reset within 3 s: detail of the driver" in event for event in bench.events)
 
 

@@ -75,6 +75,12 @@ class Bench:
         assert self.driver.state is DriverState.ARMING
         self.run_until(DriverState.ARMED)
 
+    def largest_speed_in(self, seconds, command=None):
+        """Run as `run` does, and return the largest speed of a wheel meanwhile (rad/s)."""
+        self.largest_speed = 0.0
+        self.run(seconds, command)
+        return self.largest_speed
+
     def request(self, request):
         """Ask the driver for a state; returns the bench itself."""
         self.driver.request(request)

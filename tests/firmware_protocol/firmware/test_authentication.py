@@ -61,8 +61,7 @@ def test_without_the_key_not_even_ready(key):
     bench.hello()
     bench.set_request("READY")
     bench.command = {}
-    bench.run(2000)
-    assert bench.out.state == "STANDBY"
+    assert bench.run(2000).state == "STANDBY"
     assert refused(bench) > 100
     assert bench.messages("SYSTEM_STATE")[-1].values["reject_reason"] == 13
     assert {"HOST_STATE", "ZERO_COMMANDS"} <= bench.blockers()
@@ -80,8 +79,7 @@ def test_to_leave_the_emergency_stop_takes_the_key():
     bench.command = None
     bench.set_request("STANDBY").run(1500)
     proves, bench.prover = bench.prover, None
-    bench.set_request("RESET").run(500)
-    assert bench.out.state == "ESTOP"
+    assert bench.set_request("RESET").run(500).state == "ESTOP"
     bench.prover = proves
     bench.run_until("STANDBY")
 
@@ -91,8 +89,7 @@ def test_an_unproved_standby_neither_stops_nor_takes_a_request_back():
     bench = driving()
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.command = None
-    bench.set_request("RESET").run(1500)
-    assert bench.out.state == "STANDBY"
+    assert bench.set_request("RESET").run(1500).state == "STANDBY"
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.step()
     counter = bench.next_counter("HOST_STATE")
@@ -104,8 +101,7 @@ def test_an_unproved_standby_neither_stops_nor_takes_a_request_back():
 def test_commands_without_proof_do_not_feed_the_watchdog():
     bench = driving()
     bench.prover = None
-    bench.run(101)
-    assert bench.out.state == "STOPPING"
+    assert bench.run(101).state == "STOPPING"
     assert bench.out.stop_cause == "COMMAND_TIMEOUT"
 
 
@@ -154,8 +150,7 @@ def test_a_recorded_run_played_to_another_start_does_nothing():
     bench = Bench(LOCKED, entropy=2)
     for can_id, data in frames:
         bench.core.receive(bench.now_us, can_id, data)
-        bench.run(5)
-        assert bench.out.state == "STANDBY"
+        assert bench.run(5).state == "STANDBY"
         assert not bench.out.driver_enabled
     assert refused(bench) > 20
     assert bench.out.accepted_commands == 0

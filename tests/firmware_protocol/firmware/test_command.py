@@ -13,8 +13,7 @@ def rejected(bench, act):
     before, accepted = bench.core.rejections, bench.out.accepted_commands
     act()
     after = bench.core.rejections
-    bench.step()
-    assert bench.out.accepted_commands == accepted
+    assert bench.step().accepted_commands == accepted
     return {name: after[name] - before[name] for name in after if after[name] != before[name]}
 
 
@@ -46,8 +45,7 @@ def test_armed_accepts_and_follows():
     bench = driving()
     before = bench.out.accepted_commands
     bench.wheel_command(4.1, 2.1)
-    bench.run(30)
-    assert bench.out.accepted_commands == before + 1
+    assert bench.run(30).accepted_commands == before + 1
     assert (bench.out.left_setpoint_rad_s, bench.out.right_setpoint_rad_s) == pytest.approx((4.1, 2.1))
     assert bench.out.last_command_counter == bench.counters["WHEEL_COMMAND"]
 
@@ -86,8 +84,7 @@ def test_a_replayed_run_of_old_frames_is_rejected_at_its_first_frame_and_by_its_
     accepted = bench.out.accepted_commands
     for frame in recorded:
         bench.core.receive(bench.now_us, *frame)
-        bench.step()
-        assert bench.out.left_setpoint_rad_s == 0.0
+        assert bench.step().left_setpoint_rad_s == 0.0
     assert bench.out.accepted_commands == accepted
 
 
@@ -229,8 +226,7 @@ def test_zero_commands_that_stopped_do_not_arm():
     bench.run(300)
     bench.command = None
     bench.run(101)
-    bench.set_request("ARM").run(100)
-    assert bench.out.state == "READY"
+    assert bench.set_request("ARM").run(100).state == "READY"
     assert "ZERO_COMMANDS" in bench.blockers()
 
 
@@ -260,8 +256,7 @@ def test_no_command_from_before_arming_outlives_it():
         bench.wheel_command(mode="COAST", valid_for=0.002)
         bench.step()
     bench.run(40)
-    bench.set_request("ARM").run_until("ARMED", within_ms=50)
-    assert bench.out.driver_enabled
+    assert bench.set_request("ARM").run_until("ARMED", within_ms=50).driver_enabled
     assert stop_time_us(bench) == 100 * MS
     assert bench.out.stop_cause == "COMMAND_TIMEOUT"
 
@@ -312,8 +307,7 @@ def test_a_stop_for_another_reason_is_no_watchdog_event():
     bench = driving()
     bench.set_request("STANDBY")
     bench.command = {"left": 4.0, "right": 2.0}
-    bench.run_until("STOPPING")
-    assert bench.out.watchdog_events == 0
+    assert bench.run_until("STOPPING").watchdog_events == 0
 
 
 def test_a_late_command_finds_the_watchdog_expired_even_if_no_cycle_ran_in_between():
@@ -322,8 +316,7 @@ def test_a_late_command_finds_the_watchdog_expired_even_if_no_cycle_ran_in_betwe
     accepted = bench.step().accepted_commands
     bench.now_us += 150 * MS
     bench.wheel_command(4.0, 2.0)
-    bench.step()
-    assert bench.out.state == "STOPPING"
+    assert bench.step().state == "STOPPING"
     assert bench.out.accepted_commands == accepted
 
 

@@ -25,8 +25,7 @@ def test_driver_is_off_and_brake_on_wherever_the_robot_is_not_armed(state):
         bench.run_until("FAULT")
     elif state == "ESTOP":
         bench.core.receive(bench.now_us, 0x080, b"")
-    bench.step()
-    assert bench.out.state == state
+    assert bench.step().state == state
     assert (bench.out.driver_enabled, bench.out.brake, setpoints(bench)) == (False, True, (0.0, 0.0))
 
 
@@ -39,8 +38,7 @@ def test_armed_holds_zero_with_driver_on():
 def test_acceleration_is_limited_and_both_wheels_move_by_one_factor():
     bench = Bench().to_armed()
     bench.command = {"left": 4.0, "right": -2.0}
-    bench.run(25)
-    assert bench.out.limited
+    assert bench.run(25).limited
     left, right = setpoints(bench)
     assert left > 0
     assert right == pytest.approx(-left / 2, abs=1e-4)
@@ -267,8 +265,7 @@ def test_a_pause_or_a_leap_of_the_clock_is_no_bigger_step_than_any_other(cycle_u
     bench.run(20)
     bench.wheel_command(8.0, 8.0)
     before = setpoints(bench)[0]
-    bench.step(elapsed_us=leap_ms * MS)
-    assert bench.out.state == "ARMED"
+    assert bench.step(elapsed_us=leap_ms * MS).state == "ARMED"
     assert setpoints(bench)[0] - before == pytest.approx(20.0 * cycle_us * 1e-6, abs=EPS)
 
 
@@ -278,8 +275,7 @@ def test_a_stop_that_begins_with_a_leap_of_the_clock_begins_no_steeper(leap_ms):
     bench.command = {"left": 4.0, "right": 4.0}
     bench.run(300)
     before = setpoints(bench)[0]
-    bench.step(elapsed_us=leap_ms * MS)
-    assert bench.out.state == "STOPPING"
+    assert bench.step(elapsed_us=leap_ms * MS).state == "STOPPING"
     assert before - setpoints(bench)[0] == pytest.approx(20.0 * 0.001, abs=EPS)
 
 

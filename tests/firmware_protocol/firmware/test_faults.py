@@ -330,8 +330,7 @@ def test_a_passing_fault_blocks_ready_while_it_is_held():
     bench = Bench().hello()
     bench.inputs["voltage_v"] = 12.0
     bench.run(300)
-    bench.set_request("READY").run(1000)
-    assert bench.out.state == "STANDBY"
+    assert bench.set_request("READY").run(1000).state == "STANDBY"
     bench.inputs.clear()
     bench.run(400)
     assert (bench.out.state, name_of(bench.out.fault)) == ("STANDBY", "UNDER_VOLTAGE")

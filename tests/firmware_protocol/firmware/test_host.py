@@ -12,21 +12,18 @@ from tests.firmware_protocol.bench import CODEC, CONFIG, FAULTS, MS, Bench, seal
 
 def test_without_a_handshake_nothing_gets_ready():
     bench = Bench()
-    bench.set_request("READY").run(500)
-    assert bench.out.state == "STANDBY"
+    assert bench.set_request("READY").run(500).state == "STANDBY"
     assert bench.blockers() == {"HANDSHAKE", "CHALLENGE", "ZERO_COMMANDS"}
 
 
 def test_another_dbc_is_refused_and_named_and_the_right_one_accepted_afterwards():
     bench = Bench().hello(dbc_hash=CODEC.dbc_hash ^ 1)
-    bench.set_request("READY").run(300)
-    assert bench.out.state == "STANDBY"
+    assert bench.set_request("READY").run(300).state == "STANDBY"
     assert bench.out.fault == FAULTS["DBC_HASH_MISMATCH"]
     assert {"HANDSHAKE", "FAULT"} <= bench.blockers()
     assert bench.core.rejections["HANDSHAKE"] == 1
     assert bench.messages("BUILD")[-1].values["dbc_hash"] == CODEC.dbc_hash
-    bench.hello().run_until("READY")
-    assert bench.out.fault == FAULTS["NONE"]
+    assert bench.hello().run_until("READY").fault == FAULTS["NONE"]
 
 
 def test_another_dbc_stops_motion():
@@ -41,8 +38,7 @@ def test_a_host_of_another_major_is_heard_refused_and_answered(major):
     bench.run(100)
     before = len(bench.messages("HELLO"))
     bench.hello(protocol_major=major)
-    bench.set_request("READY").run(300)
-    assert bench.out.state == "STANDBY"
+    assert bench.set_request("READY").run(300).state == "STANDBY"
     assert bench.out.fault == FAULTS["PROTOCOL_MAJOR_MISMATCH"]
     assert len(bench.messages("HELLO")) == before + 1
 
@@ -72,10 +68,8 @@ def test_a_host_silent_for_long_must_introduce_itself_again():
 @pytest.mark.parametrize("wrong", [{"protocol_major": 2}, {"dbc_hash": 1}])
 def test_a_refused_host_is_forgotten_too(wrong):
     bench = Bench().hello(**wrong)
-    bench.run(5000)
-    assert bench.out.fault != 0
-    bench.run(502)
-    assert bench.out.fault == 0
+    assert bench.run(5000).fault != 0
+    assert bench.run(502).fault == 0
 
 
 def test_any_sound_frame_keeps_the_acquaintance():
@@ -98,8 +92,7 @@ def test_host_state_counts_only_once_qualified():
 def test_unknown_request_changes_nothing():
     bench = Bench().to_driving()
     bench.host_state(request=4, session=7)
-    bench.run(2)
-    assert bench.out.state == "ARMED"
+    assert bench.run(2).state == "ARMED"
     assert bench.core.rejections["MODE"] == 1
 
 
@@ -111,8 +104,7 @@ def test_wrong_crc_and_repeated_host_states_are_not_used():
     bench.core.receive(bench.now_us, 0x101, bytes((body[0] ^ 1,)) + body[1:])
     bench.counters["HOST_STATE"] -= 1
     bench.host_state(request="STANDBY", session=7)
-    bench.run(2)
-    assert bench.out.state == "ARMED"
+    assert bench.run(2).state == "ARMED"
 
 
 def test_a_host_that_babbles_is_disqualified_and_motion_stops():
@@ -127,19 +119,16 @@ def test_a_host_that_babbles_is_disqualified_and_motion_stops():
 def test_session_zero_and_the_last_session_are_refused(session):
     bench = Bench().to_ready(session=7)
     bench.set_request("STANDBY").run_until("STANDBY")
-    bench.set_request("READY", session=session).run(300)
-    assert bench.out.state == "STANDBY"
+    assert bench.set_request("READY", session=session).run(300).state == "STANDBY"
     assert "SESSION" in bench.blockers()
-    bench.set_request("READY", session=8).run_until("READY")
-    assert bench.out.session == 8
+    assert bench.set_request("READY", session=8).run_until("READY").session == 8
 
 
 def test_session_dies_with_ready_and_armed():
     bench = Bench().to_driving()
     assert bench.out.session == 7
     bench.command = None
-    bench.run_until("STOPPING")
-    assert bench.out.session == 0
+    assert bench.run_until("STOPPING").session == 0
 
 
 def test_it_never_arms_again_by_itself():
@@ -148,11 +137,9 @@ def test_it_never_arms_again_by_itself():
     bench.run_until("STANDBY")
     bench.command = command
     for request in ("ARM", "READY", "ARM"):
-        bench.set_request(request).run(1000)
-        assert bench.out.state == "STANDBY"
+        assert bench.set_request(request).run(1000).state == "STANDBY"
     bench.command = {}
-    bench.run(1000)
-    assert bench.out.state == "STANDBY"
+    assert bench.run(1000).state == "STANDBY"
 
 
 def test_a_new_session_in_ready_goes_through_standby_with_a_new_challenge():
@@ -285,22 +272,18 @@ def test_wrong_answer_does_not(respond):
 def test_the_answer_to_an_old_challenge_does_not_arm():
     bench = Bench().to_ready(session=7)
     old = challenge_answer(bench.core.challenge, 9, CODEC.dbc_hash)
-    bench.set_request("READY", session=9).run(60)
-    assert bench.out.session == 9
+    assert bench.set_request("READY", session=9).run(60).session == 9
     bench.command, bench.answers = {}, False
-    bench.set_request("ARM", session=9, challenge_answer=old).run(400)
-    assert bench.out.state == "READY"
+    assert bench.set_request("ARM", session=9, challenge_answer=old).run(400).state == "READY"
 
 
 def test_answer_given_in_standby_is_no_answer():
     bench = Bench().hello()
     bench.command = {}
-    bench.set_request("ARM").run(400)
-    assert bench.out.state == "STANDBY"
+    assert bench.set_request("ARM").run(400).state == "STANDBY"
     bench.answers = False
     bench.set_request("READY").run_until("READY")
-    bench.set_request("ARM").run(300)
-    assert bench.out.state == "READY"
+    assert bench.set_request("ARM").run(300).state == "READY"
 
 
 def test_arming_waits_for_wheels_that_stand():
@@ -308,12 +291,10 @@ def test_arming_waits_for_wheels_that_stand():
     bench.wheels_follow = False
     bench.speeds = [0.0, -0.06]
     bench.command = {}
-    bench.set_request("ARM").run(400)
-    assert bench.out.state == "READY"
+    assert bench.set_request("ARM").run(400).state == "READY"
     assert bench.blockers() == {"WHEELS_MOVING"}
     bench.speeds = [0.0, -0.04]
-    bench.run(2)
-    assert bench.out.state == "ARMED"
+    assert bench.run(2).state == "ARMED"
     assert bench.out.blockers == 0
 
 
@@ -332,8 +313,7 @@ def estopped():
     bench = Bench().to_driving()
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.command = None
-    bench.set_request("ARM").run(800)
-    assert bench.out.state == "ESTOP"
+    assert bench.set_request("ARM").run(800).state == "ESTOP"
     return bench
 
 
@@ -351,11 +331,9 @@ def test_a_reset_asked_for_before_the_stop_does_not_clear_it():
     bench = Bench()
     bench.set_request("RESET").run(300)
     bench.core.receive(bench.now_us, 0x080, b"")
-    bench.run(1500)
-    assert bench.out.state == "ESTOP"
+    assert bench.run(1500).state == "ESTOP"
     bench.set_request("STANDBY").run(100)
-    bench.set_request("RESET").run(60)
-    assert bench.out.state == "STANDBY"
+    assert bench.set_request("RESET").run(60).state == "STANDBY"
 
 
 def test_a_reset_that_was_asked_for_before_a_silence_does_not_clear_what_came_in_it():
@@ -365,20 +343,17 @@ def test_a_reset_that_was_asked_for_before_a_silence_does_not_clear_what_came_in
     bench.run(300)
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.run(700)
-    bench.set_request("RESET").run(1000)
-    assert bench.out.state == "ESTOP"
+    assert bench.set_request("RESET").run(1000).state == "ESTOP"
 
 
 def test_a_reset_waits_for_stillness_and_is_void_when_the_stop_comes_again():
     bench = estopped()
     bench.wheels_follow = False
     bench.speeds = [1.0, 1.0]
-    bench.set_request("RESET").run(300)
-    assert bench.out.state == "ESTOP"
+    assert bench.set_request("RESET").run(300).state == "ESTOP"
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.speeds = [0.0, 0.0]
-    bench.run(1000)
-    assert bench.out.state == "ESTOP"
+    assert bench.run(1000).state == "ESTOP"
 
 
 @pytest.mark.parametrize("end", ["another request", "silence"])
@@ -392,8 +367,7 @@ def test_a_reset_no_longer_asked_for_is_void(end):
         bench.set_request("STANDBY")
     bench.run(700)
     bench.speeds = [0.0, 0.0]
-    bench.run(300)
-    assert bench.out.state == "ESTOP"
+    assert bench.run(300).state == "ESTOP"
 
 
 def test_a_reset_is_asked_for_until_the_host_is_silent_and_no_longer():
@@ -403,8 +377,7 @@ def test_a_reset_is_asked_for_until_the_host_is_silent_and_no_longer():
         bench.speeds = [1.0, 1.0]
         bench.set_request("RESET").run(50 - bench.now_us // MS % 50)
         bench.request = None
-        bench.run(silent_ms - 1)
-        assert bench.out.state == "ESTOP"
+        assert bench.run(silent_ms - 1).state == "ESTOP"
         bench.speeds = [0.0, 0.0]
         assert bench.step().state == state
 
@@ -419,23 +392,19 @@ def test_a_pressed_button_cannot_be_reset_nor_does_its_release_reset(source):
     bench.command = None
     bench.run(600)
     challenge = bench.core.challenge
-    bench.set_request("RESET").run(700)
-    assert bench.out.state == "ESTOP"
+    assert bench.set_request("RESET").run(700).state == "ESTOP"
     # A challenge is renewed on the way through STANDBY, be it between two cycles.
     assert bench.core.challenge == challenge
     bench.inputs.clear()
-    bench.run(1000)
-    assert bench.out.state == "ESTOP"
+    assert bench.run(1000).state == "ESTOP"
     bench.set_request("STANDBY").run(100)
-    bench.set_request("RESET").run_until("STANDBY", within_ms=60)
-    assert bench.out.estop_source == "NONE"
+    assert bench.set_request("RESET").run_until("STANDBY", within_ms=60).estop_source == "NONE"
 
 
 def test_motion_asked_for_delays_a_reset():
     bench = estopped()
     bench.command = {"left": 0.002, "right": 0.0, "session": 7}
-    bench.set_request("RESET").run(1000)
-    assert bench.out.state == "ESTOP"
+    assert bench.set_request("RESET").run(1000).state == "ESTOP"
     start = bench.now_us
     bench.command = None
     bench.wheel_command(0.002, 0.0, session=7)
@@ -446,14 +415,12 @@ def test_motion_asked_for_delays_a_reset():
 def test_the_first_source_of_an_estop_is_kept():
     bench = estopped()
     bench.inputs["estop_button"] = True
-    bench.step()
-    assert bench.out.estop_source == "FRAME"
+    assert bench.step().estop_source == "FRAME"
 
 
 def test_host_fault_blocks_ready():
     bench = Bench().hello()
-    bench.set_request("READY", host_fault=5).run(300)
-    assert bench.out.state == "STANDBY"
+    assert bench.set_request("READY", host_fault=5).run(300).state == "STANDBY"
     assert "HOST_STATE" in bench.blockers()
 
 

@@ -53,8 +53,7 @@ def test_estop_before_the_first_cycle_is_kept():
     bench = Bench()
     core.receive(0, 0x080, b"")
     bench.core = core
-    bench.run(2)
-    assert bench.out.state == "ESTOP"
+    assert bench.run(2).state == "ESTOP"
 
 
 def test_nothing_is_accepted_before_the_wheels_are_known_to_stand():

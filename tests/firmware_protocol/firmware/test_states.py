@@ -67,16 +67,14 @@ def latched_fault(state):
 def reset_fault(_state):
     bench = bring_to("FAULT")
     bench.inputs.clear()
-    bench.set_request("STANDBY").run(300)
-    assert bench.out.state == "FAULT"
+    assert bench.set_request("STANDBY").run(300).state == "FAULT"
     bench.set_request("RESET").run(60)
     return bench, "FAULT"
 
 
 def reset_estop(_state):
     bench, _ = estop_frame("STANDBY")
-    bench.set_request("STANDBY").run(700)
-    assert bench.out.state == "ESTOP"
+    assert bench.set_request("STANDBY").run(700).state == "ESTOP"
     bench.set_request("RESET").run(60)
     return bench, "ESTOP"
 
@@ -318,8 +316,6 @@ def test_a_stop_that_takes_too_long_ends_in_standby_all_the_same():
 def test_passing_fault_returns_to_standby_by_itself():
     bench, _ = passing_fault("ARMED")
     assert bench.out.fault == FAULTS["UNDER_VOLTAGE"]
-    bench.run_until("STANDBY")
-    assert bench.out.fault == FAULTS["UNDER_VOLTAGE"]
+    assert bench.run_until("STANDBY").fault == FAULTS["UNDER_VOLTAGE"]
     bench.inputs.clear()
-    bench.run(510)
-    assert bench.out.fault == FAULTS["NONE"]
+    assert bench.run(510).fault == FAULTS["NONE"]
