@@ -9,6 +9,7 @@ from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.pipeline import Planner
+from disco_hw.runtime.replay import ReplayReport, replay
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
 from sim.body_dynamics import BodyPose
@@ -41,3 +42,10 @@ def arm(stack: SimulatedRun) -> None:
     """Wait until the robot is ready, and arm it."""
     stack.run(1.5)
     stack.run(0.5, UserRequest.ARM)
+
+
+def replayed(log: Path, *arguments: float) -> ReplayReport:
+    """Return the report of a replay that must have found no difference."""
+    report = replay(log, *arguments)
+    assert report.ok, report.as_text()
+    return report

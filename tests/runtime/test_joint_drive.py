@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from disco_hw.runtime.assembly import create_planner
-from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
-from tests.runtime.simulated import ROBOT_TEXT, arm, simulated_stack
+from tests.runtime.simulated import ROBOT_TEXT, arm, replayed, simulated_stack
 from tests.runtime.test_path_drive import write_log
 
 # A kernel to compile; tests/control/test_disco.py drives with joint sampling in every `make test`.
@@ -32,5 +31,4 @@ def test_robot_toml_asks_for_joint_sampling_and_it_drives_and_replays(tmp_path):
         off_m.append(np.hypot(truth.x_m, truth.y_m) - 0.75)
     assert np.abs(off_m[50:]).max() < 0.06
     assert stack.core.progress.laps > 0.4
-    report = replay(write_log(tmp_path / "run.mcap", setup, stack.recorder.ticks))
-    assert report.ok, report.as_text()
+    replayed(write_log(tmp_path / "run.mcap", setup, stack.recorder.ticks))

@@ -21,7 +21,7 @@ from disco_hw.viewer.commands import snapshot_log
 from disco_hw.viewer.recording import Recording
 from sim.body_dynamics import BodyPose
 from tests.runtime.path_robot import path_robot
-from tests.runtime.simulated import arm, simulated_stack
+from tests.runtime.simulated import arm, replayed, simulated_stack
 
 CORNER = "x_m,y_m\n0,0\n1.2,0\n1.2,0.8\n"
 
@@ -88,8 +88,7 @@ def test_an_open_path_ends_with_the_robot_standing_and_is_replayed_and_shown_wit
     log = write_log(tmp_path / "run.mcap", setup, stack.recorder.ticks)
     (tmp_path / "path.csv").unlink()
     robot_file.unlink()
-    report = replay(log)
-    assert report.ok, report.as_text()
+    replayed(log)
     with Recording(log) as recording:
         task = recording.stage.task_at(recording.at(3.0).task)
         assert isinstance(task, PathTask)
@@ -109,8 +108,7 @@ def test_another_speed_is_recorded_and_replayed(tmp_path):
     stack.run(3.0, UserRequest.START)
     assert stack.robot.truth.speed_m_s == pytest.approx(0.15, abs=0.04)
     log = write_log(tmp_path / "run.mcap", setup, stack.recorder.ticks)
-    report = replay(log)
-    assert report.ok, report.as_text()
+    replayed(log)
     with Recording(log) as recording:
         assert recording.stage.task.speed_m_s == 0.3
         assert recording.stage.task_at(recording.at(3.0).task).speed_m_s == 0.15

@@ -20,7 +20,7 @@ from disco_hw.model import EffectSetting, load_model, save_model
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.supervisor import UserRequest
-from tests.runtime.simulated import ROBOT_TEXT, arm, simulated_stack
+from tests.runtime.simulated import ROBOT_TEXT, arm, replayed, simulated_stack
 from tests.tables import thinned
 
 ROBOTS = SHIPPED_ROBOT.parent
@@ -57,8 +57,7 @@ def write_log(
 
 
 def test_the_same_robot_gives_the_same_bits(tmp_path, ticks):
-    report = replay(write_log(tmp_path / "run.mcap", ticks))
-    assert report.ok, report.as_text()
+    report = replayed(write_log(tmp_path / "run.mcap", ticks))
     assert report.ticks == len(ticks)
     assert report.values > 5000
 
@@ -76,8 +75,7 @@ def test_what_no_parameter_explains_is_recorded_and_replays_bit_for_bit(tmp_path
     assert found[0].forward == 0.0 != found[-1].forward
     assert abs(found[-1].drift_x_m_s) + abs(found[-1].drift_y_m_s) > 0.0
     assert stack.core.last.pipeline.disturbance.forward == found[-1].forward
-    report = replay(write_log(tmp_path / "run.mcap", ticks, text))
-    assert report.ok, report.as_text()
+    replayed(write_log(tmp_path / "run.mcap", ticks, text))
     wrong = [
         (now, [structs.replace(one, left=0.1) if isinstance(one, UnexplainedMotion) else one for one in records])
         for now, records in ticks
@@ -101,8 +99,7 @@ def test_a_drive_whose_model_remembers_replays_bit_for_bit(tmp_path, monkeypatch
     stack.run(3.0, UserRequest.START)
     ticks = stack.recorder.ticks
     log = write_log(tmp_path / "run.mcap", ticks, text, (tmp_path / "model.toml").read_text())
-    report = replay(log)
-    assert report.ok, report.as_text()
+    replayed(log)
     for method in ("add_command", "add_wheels"):
         with monkeypatch.context() as patch:
             patch.setattr(DriveMeans, method, lambda *_: None)
@@ -135,8 +132,7 @@ def test_a_follower_takes_over_from_a_planner_that_finds_nothing_and_replays_bit
         "planner: valid plan again; the planner drives",
     ]
     log = write_log(tmp_path / "run.mcap", stack.recorder.ticks, text)
-    report = replay(log)
-    assert report.ok, report.as_text()
+    replayed(log)
     other = write_log(tmp_path / "other.mcap", stack.recorder.ticks, text.replace('"lqr"', '"kanayama"'))
     assert not replay(other).ok
 

@@ -77,24 +77,14 @@ def driving_with(side, **inputs):
 
 
 @pytest.mark.parametrize("side", SIDES)
-def test_current_without_ticks_is_a_missing_encoder(side):
-    bench = driving_with(side, current_a=2.0)
+@pytest.mark.parametrize(
+    ("current_a", "fault"), [(2.0, "ENCODER_MISSING"), (CONFIG.stall_current_a, "ENCODER_MISSING"), (-16.0, "STALL")]
+)
+def test_current_without_ticks_is_a_missing_encoder_and_more_than_the_stall_current_a_stall(side, current_a, fault):
+    bench = driving_with(side, current_a=current_a)
     bench.inputs[f"{side}_ticks"] = int(bench.ticks[SIDES.index(side)])
-    assert wait_for_fault(bench) == (f"ENCODER_MISSING_{side.upper()}", 300)
+    assert wait_for_fault(bench) == (f"{fault}_{side.upper()}", 300)
     assert (bench.out.state, bench.out.driver_enabled) == ("FAULT", False)
-
-
-@pytest.mark.parametrize("side", SIDES)
-def test_much_current_without_ticks_is_a_stall(side):
-    bench = driving_with(side, current_a=-16.0)
-    bench.inputs[f"{side}_ticks"] = int(bench.ticks[SIDES.index(side)])
-    assert wait_for_fault(bench) == (f"STALL_{side.upper()}", 300)
-
-
-def test_the_stall_current_itself_is_none():
-    bench = driving_with("left", current_a=CONFIG.stall_current_a)
-    bench.inputs["left_ticks"] = int(bench.ticks[0])
-    assert wait_for_fault(bench) == ("ENCODER_MISSING_LEFT", 300)
 
 
 @pytest.mark.parametrize(
