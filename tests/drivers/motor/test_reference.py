@@ -24,6 +24,11 @@ def create_bench(robot=None, **options):
     return Bench(create_driver(), robot or ReferenceRobot(), **options)
 
 
+@pytest.fixture
+def bench():
+    return create_bench()
+
+
 def test_says_what_it_waits_for():
     driver = create_driver()
     assert driver.detail == "the link is down"
@@ -78,8 +83,7 @@ def test_arms_at_every_control_rate(rate_hz):
     assert bench.robot.core.rejections["STATE"] <= 2
 
 
-def test_each_arming_has_a_session_of_its_own():
-    bench = create_bench()
+def test_each_arming_has_a_session_of_its_own(bench):
     sessions = []
     for _ in range(4):
         bench.arm()
@@ -111,8 +115,7 @@ def test_a_lossy_link_does_not_disarm():
     assert bench.wheels[-1].left_angle_rad == pytest.approx(bench.robot.angle[0], abs=0.2)
 
 
-def test_arming_is_given_up_with_the_robots_own_reason():
-    bench = create_bench()
+def test_arming_is_given_up_with_the_robots_own_reason(bench):
     bench.run_until(*IDLE_STATES)
     bench.robot.pushed = 1.0
     bench.driver.request(Request.ARM)
@@ -125,8 +128,7 @@ def test_arming_is_given_up_with_the_robots_own_reason():
     assert not bench.robot.armed
 
 
-def test_a_second_host_is_pointed_out_once_a_link():
-    bench = create_bench()
+def test_a_second_host_is_pointed_out_once_a_link(bench):
     bench.run_until(*IDLE_STATES)
     other = CODEC.encode("TIME_REQUEST", 0, sequence=1)
     reported = "another host is on the link: it sends TIME_REQUEST; disconnect it"
@@ -158,9 +160,8 @@ def test_a_second_host_that_commands_motion_stops_the_robot_but_never_drives_it(
     assert "another host is on the link: it sends WHEEL_COMMAND; disconnect it" in bench.events
 
 
-def test_an_estop_from_outside_is_no_second_host_and_is_said_once_a_stop():
+def test_an_estop_from_outside_is_no_second_host_and_is_said_once_a_stop(bench):
     """As `disco-hw estop` sends it beside the daemon: three frames, which the robot and the driver both receive."""
-    bench = create_bench()
     bench.arm()
     reported = "e-stop received on the link, sent by `disco-hw estop` or another host"
     for stops in (1, 2):
@@ -175,8 +176,7 @@ def test_an_estop_from_outside_is_no_second_host_and_is_said_once_a_stop():
     assert bench.driver.stats.unknown_id == 0
 
 
-def test_a_second_host_is_pointed_out_even_if_it_sends_an_estop_first():
-    bench = create_bench()
+def test_a_second_host_is_pointed_out_even_if_it_sends_an_estop_first(bench):
     bench.run_until(*IDLE_STATES)
     bench.inject_to_host(*CODEC.encode("ESTOP", reason="UNSPECIFIED"))
     bench.inject_to_host(*CODEC.encode("TIME_REQUEST", 0, sequence=1))
@@ -249,8 +249,7 @@ def test_a_response_to_a_request_of_the_last_link_teaches_nothing():
 
 
 @pytest.mark.parametrize("call", ["receive", "transmit"])
-def test_silence_is_noticed_by_each_half_of_a_tick(call):
-    bench = create_bench()
+def test_silence_is_noticed_by_each_half_of_a_tick(call, bench):
     bench.run_until(*IDLE_STATES)
     driver, later_ns = bench.driver, bench.now_ns + 501 * MS
     if call == "receive":
@@ -263,8 +262,7 @@ def test_silence_is_noticed_by_each_half_of_a_tick(call):
     assert driver.state is DriverState.HANDSHAKE
 
 
-def test_nothing_is_silent_that_was_never_heard():
-    bench = create_bench()
+def test_nothing_is_silent_that_was_never_heard(bench):
     bench.loses = lambda _: True
     bench.run(4.0)
     assert bench.events == []
@@ -322,8 +320,7 @@ def test_a_robot_that_turns_out_to_be_another_is_commanded_no_more():
     assert bench.robot.speed_rad_s == 0.0
 
 
-def test_an_emergency_stop_of_ours_ends_the_wish_to_be_armed():
-    bench = create_bench()
+def test_an_emergency_stop_of_ours_ends_the_wish_to_be_armed(bench):
     bench.arm()
     bench.driver.estop(bench.now_ns)
     assert bench.driver.state is DriverState.STOPPING
@@ -359,8 +356,7 @@ def test_each_event_is_reported_once():
     assert len(bench.events) == 4
 
 
-def test_slow_telemetry_is_handed_on():
-    bench = create_bench()
+def test_slow_telemetry_is_handed_on(bench):
     bench.run(6.0)
     kinds = {
         kind for readings in bench.readings for kind in ("motors", "power", "link_health") if getattr(readings, kind)
@@ -370,8 +366,7 @@ def test_slow_telemetry_is_handed_on():
     assert (status.state, status.fault, status.fault_code) == ("STANDBY", "NONE", 0)
 
 
-def test_commands_are_counted():
-    bench = create_bench()
+def test_commands_are_counted(bench):
     bench.arm()
     before = bench.driver.stats.commands_sent
     bench.run(1.0, (1.0, 1.0))
@@ -410,8 +405,7 @@ def test_emergency_stop_frames():
     assert all(outgoing.deadline_ns > 1_000 + 100 * MS for outgoing in frames)
 
 
-def test_a_command_leaves_in_time_or_not_at_all():
-    bench = create_bench()
+def test_a_command_leaves_in_time_or_not_at_all(bench):
     bench.arm()
     (command,) = (
         outgoing

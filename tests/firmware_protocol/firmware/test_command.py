@@ -119,8 +119,7 @@ def test_before_qualification_nothing_is_accepted():
 
 
 @pytest.mark.parametrize("state", ["STANDBY", "READY"])
-def test_nonzero_command_before_armed_is_rejected(state):
-    bench = Bench()
+def test_nonzero_command_before_armed_is_rejected(state, bench):
     if state == "READY":
         bench.to_ready()
     bench.command = {}
@@ -129,8 +128,7 @@ def test_nonzero_command_before_armed_is_rejected(state):
     assert rejected(bench, lambda: bench.wheel_command(0.0, 0.002)) == {"NONZERO_BEFORE_ARMED": 1}
 
 
-def test_standby_rejects_even_zero():
-    bench = Bench()
+def test_standby_rejects_even_zero(bench):
     bench.command = {}
     bench.run(200)
     bench.command = None

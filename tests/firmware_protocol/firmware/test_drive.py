@@ -16,8 +16,7 @@ def setpoints(bench):
 
 
 @pytest.mark.parametrize("state", ["STANDBY", "READY", "FAULT", "ESTOP"])
-def test_driver_is_off_and_brake_on_wherever_the_robot_is_not_armed(state):
-    bench = Bench()
+def test_driver_is_off_and_brake_on_wherever_the_robot_is_not_armed(state, bench):
     if state == "READY":
         bench.to_ready()
     elif state == "FAULT":

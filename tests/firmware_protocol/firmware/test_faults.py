@@ -44,8 +44,7 @@ THRESHOLDS = [
 
 
 @pytest.mark.parametrize(("field", "bad", "good", "fault", "debounce_ms"), THRESHOLDS)
-def test_threshold_and_debounce(field, bad, good, fault, debounce_ms):
-    bench = Bench()
+def test_threshold_and_debounce(field, bad, good, fault, debounce_ms, bench):
     bench.inputs[field] = good
     assert bench.run(1500).fault == 0
     bench.inputs[field] = bad
@@ -53,8 +52,7 @@ def test_threshold_and_debounce(field, bad, good, fault, debounce_ms):
 
 
 @pytest.mark.parametrize(("field", "bad", "good", "fault", "debounce_ms"), [row for row in THRESHOLDS if row[-1]])
-def test_a_shorter_disturbance_is_no_fault(field, bad, good, fault, debounce_ms):
-    bench = Bench()
+def test_a_shorter_disturbance_is_no_fault(field, bad, good, fault, debounce_ms, bench):
     for _ in range(3):
         bench.inputs[field] = bad
         bench.run(debounce_ms - 1)
@@ -144,15 +142,13 @@ def test_as_many_ticks_as_may_be_are_no_jump_and_one_more_is(ticks):
 
 
 @pytest.mark.parametrize("ticks", [16, 17])
-def test_sixteen_ticks_in_a_microsecond_are_no_jump(ticks):
-    bench = Bench()
+def test_sixteen_ticks_in_a_microsecond_are_no_jump(ticks, bench):
     bench.inputs["right_ticks"] = ticks
     bench.step(elapsed_us=1)
     assert (bench.out.fault == FAULTS["ENCODER_JUMP_RIGHT"]) == (ticks > 16)
 
 
-def test_ticks_may_wrap():
-    bench = Bench()
+def test_ticks_may_wrap(bench):
     bench.ticks = [2.0**32 - 500, -(2.0**31)]
     bench.core = Bench().core.__class__(CONFIG)
     bench.to_driving(4.0, -4.0)
@@ -160,8 +156,7 @@ def test_ticks_may_wrap():
     assert bench.ticks[0] > 2**32
 
 
-def test_the_fastest_turn_by_hand_is_no_jump():
-    bench = Bench()
+def test_the_fastest_turn_by_hand_is_no_jump(bench):
     bench.wheels_follow = False
     bench.speeds = [20.0, -20.0]
     assert bench.run(200).fault == 0
@@ -249,8 +244,7 @@ def test_wrong_direction_asks_for_an_enabled_driver():
 
 
 @pytest.mark.parametrize(("cause", "fault"), [("WATCHDOG", "WATCHDOG_RESET"), ("BROWN_OUT", "BROWN_OUT_RESET")])
-def test_reset_causes_latch_once_and_clear(cause, fault):
-    bench = Bench()
+def test_reset_causes_latch_once_and_clear(cause, fault, bench):
     core = bench.core.__class__(CONFIG)
     inputs = FirmwareInputs(
         left_ticks=0, right_ticks=0, left_speed_rad_s=0.0, right_speed_rad_s=0.0, reset_cause=ResetCause[cause]
@@ -276,8 +270,7 @@ def test_permanent_faults_are_not_reset(fault):
     assert (bench.out.state, name_of(bench.out.fault)) == ("FAULT", fault)
 
 
-def test_a_later_fault_does_not_make_an_earlier_one_forgotten():
-    bench = Bench()
+def test_a_later_fault_does_not_make_an_earlier_one_forgotten(bench):
     bench.inputs["self_test_failed"] = True
     bench.run(2)
     bench.inputs.clear()
@@ -288,8 +281,7 @@ def test_a_later_fault_does_not_make_an_earlier_one_forgotten():
     assert (bench.out.state, name_of(bench.out.fault)) == ("FAULT", "SELF_TEST_FAILED")
 
 
-def test_a_latched_fault_outlives_its_cause_and_a_reset_waits_for_the_cause_to_go():
-    bench = Bench()
+def test_a_latched_fault_outlives_its_cause_and_a_reset_waits_for_the_cause_to_go(bench):
     bench.inputs["left_current_a"] = 50.0
     bench.run_until("FAULT")
     reset(bench)
@@ -304,8 +296,7 @@ def test_a_latched_fault_outlives_its_cause_and_a_reset_waits_for_the_cause_to_g
     assert (bench.out.state, name_of(bench.out.fault)) == ("FAULT", "OVER_CURRENT_LEFT")
 
 
-def test_a_reset_of_one_fault_hides_no_other_for_a_single_cycle():
-    bench = Bench()
+def test_a_reset_of_one_fault_hides_no_other_for_a_single_cycle(bench):
     bench.inputs.update(voltage_v=12.0, left_current_a=50.0)
     bench.run(300)
     bench.inputs.pop("left_current_a")
@@ -328,8 +319,7 @@ def test_a_passing_fault_blocks_ready_while_it_is_held():
     assert (bench.out.state, bench.out.fault) == ("READY", 0)
 
 
-def test_a_passing_fault_is_held_to_the_millisecond():
-    bench = Bench()
+def test_a_passing_fault_is_held_to_the_millisecond(bench):
     bench.inputs["voltage_v"] = 12.0
     bench.run(300)
     bench.inputs.clear()
@@ -337,8 +327,7 @@ def test_a_passing_fault_is_held_to_the_millisecond():
     assert name_of(bench.step().fault) == "NONE"
 
 
-def test_the_graver_fault_is_shown():
-    bench = Bench()
+def test_the_graver_fault_is_shown(bench):
     bench.inputs.update(voltage_v=10.0, left_temperature_c=100.0, tx_error_count=300)
     bench.run(1100)
     assert name_of(bench.out.fault) == "UNDER_VOLTAGE"

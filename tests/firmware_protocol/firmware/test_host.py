@@ -10,8 +10,7 @@ from firmware_protocol.protection import challenge_answer
 from tests.firmware_protocol.bench import CODEC, CONFIG, FAULTS, MS, Bench, sealed
 
 
-def test_without_a_handshake_nothing_gets_ready():
-    bench = Bench()
+def test_without_a_handshake_nothing_gets_ready(bench):
     assert bench.set_request("READY").run(500).state == "STANDBY"
     assert bench.blockers() == {"HANDSHAKE", "CHALLENGE", "ZERO_COMMANDS"}
 
@@ -33,8 +32,7 @@ def test_another_dbc_stops_motion():
 
 
 @pytest.mark.parametrize("major", [0, 2, 255])
-def test_a_host_of_another_major_is_heard_refused_and_answered(major):
-    bench = Bench()
+def test_a_host_of_another_major_is_heard_refused_and_answered(major, bench):
     bench.run(100)
     before = len(bench.messages("HELLO"))
     bench.hello(protocol_major=major)
@@ -150,8 +148,7 @@ def test_a_new_session_in_ready_goes_through_standby_with_a_new_challenge():
     assert bench.core.challenge != challenge
 
 
-def test_every_entry_of_standby_and_ready_has_a_new_challenge_never_zero():
-    bench = Bench()
+def test_every_entry_of_standby_and_ready_has_a_new_challenge_never_zero(bench):
     seen = []
     bench.hello()
     for session in range(1, 60):
@@ -327,8 +324,7 @@ def test_reset_clears_an_estop_but_starts_nothing():
         assert not bench.out.driver_enabled
 
 
-def test_a_reset_asked_for_before_the_stop_does_not_clear_it():
-    bench = Bench()
+def test_a_reset_asked_for_before_the_stop_does_not_clear_it(bench):
     bench.set_request("RESET").run(300)
     bench.core.receive(bench.now_us, 0x080, b"")
     assert bench.run(1500).state == "ESTOP"
@@ -336,8 +332,7 @@ def test_a_reset_asked_for_before_the_stop_does_not_clear_it():
     assert bench.set_request("RESET").run(60).state == "STANDBY"
 
 
-def test_a_reset_that_was_asked_for_before_a_silence_does_not_clear_what_came_in_it():
-    bench = Bench()
+def test_a_reset_that_was_asked_for_before_a_silence_does_not_clear_what_came_in_it(bench):
     bench.set_request("RESET").run(300)
     bench.request = None
     bench.run(300)

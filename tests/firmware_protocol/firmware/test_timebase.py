@@ -197,8 +197,7 @@ def test_the_cores_own_time_is_that_of_a_clock_whose_cycles_jitter():
     assert device_time_us(bench) == now_us
 
 
-def test_after_a_leap_frames_within_the_cycles_make_time_no_faster():
-    bench = Bench()
+def test_after_a_leap_frames_within_the_cycles_make_time_no_faster(bench):
     assert bench.step(100 * MS).fault == FAULTS["CLOCK_MISMATCH"]
     for _ in range(100):
         bench.now_us += 400
@@ -210,8 +209,7 @@ def test_after_a_leap_frames_within_the_cycles_make_time_no_faster():
 
 
 @pytest.mark.parametrize(("ahead_us", "errors"), [(10_000, 0), (10_001, 1)])
-def test_a_frame_may_be_stamped_ten_milliseconds_after_the_cycle_that_follows_it(ahead_us, errors):
-    bench = Bench()
+def test_a_frame_may_be_stamped_ten_milliseconds_after_the_cycle_that_follows_it(ahead_us, errors, bench):
     bench.core.receive(bench.now_us + MS + ahead_us, 0x7FF, b"")
     bench.step()
     assert bench.core._core.clock_errors == errors
