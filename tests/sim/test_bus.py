@@ -25,6 +25,11 @@ def scripted_outcomes(*outcomes):
     return ScriptedOutcomes()
 
 
+@pytest.fixture
+def bus():
+    return CanBus()
+
+
 def bus_with(names, *arguments, **options):
     """Return a bus and its nodes, each called by a letter."""
     bus = CanBus(*arguments, **options)
@@ -112,16 +117,14 @@ def test_nothing_is_lost_or_reordered_and_the_wire_is_never_used_twice(sends, or
         assert after - before >= frame_bits(delivery.frame) * BIT_NS
 
 
-def test_own_frames_come_back_only_if_asked():
-    bus = CanBus()
+def test_own_frames_come_back_only_if_asked(bus):
     a, b = bus.attach("a", echo=True), bus.attach("b")
     bus.send(a, FRAME)
     bus.send(b, CanFrame(0x700))
     assert [d.receivers for d in bus.advance(LONG_NS)] == [(b, a), (a,)]
 
 
-def test_a_full_queue_refuses():
-    bus = CanBus()
+def test_a_full_queue_refuses(bus):
     a, _ = bus.attach("a", capacity=2), bus.attach("b")
     assert [bus.send(a, FRAME) for _ in range(3)] == [True, True, False]
     assert a.refused_full == 1
@@ -162,8 +165,7 @@ def test_an_error_passive_sender_waits_eight_bits_before_it_sends_again():
     assert [d.frame.can_id for d in data_of(bus.advance(LONG_NS))] == [0x700, 0x100]
 
 
-def test_a_lone_node_repeats_for_ever_and_stays_error_passive():
-    bus = CanBus()
+def test_a_lone_node_repeats_for_ever_and_stays_error_passive(bus):
     a = bus.attach("a", capacity=3)
     for _ in range(4):
         bus.send(a, FRAME)
@@ -173,8 +175,7 @@ def test_a_lone_node_repeats_for_ever_and_stays_error_passive():
     assert len(data_of(bus.advance(2 * 10**8))) == 3
 
 
-def test_a_missing_acknowledgement_takes_the_frame_up_to_its_slot_and_an_error_flag():
-    bus = CanBus()
+def test_a_missing_acknowledgement_takes_the_frame_up_to_its_slot_and_an_error_flag(bus):
     a = bus.attach("a")
     bus.send(a, FRAME)
     bus.advance(0)
@@ -212,8 +213,7 @@ def test_recovery_from_bus_off_takes_128_times_11_recessive_bits_after_the_reque
     assert bus.send(a, FRAME)
 
 
-def test_on_a_busy_bus_each_frame_counts_once_towards_recovery():
-    bus = CanBus()
+def test_on_a_busy_bus_each_frame_counts_once_towards_recovery(bus):
     a, b, _ = (bus.attach(name, capacity=1000) for name in "abc")
     bus.force_bus_off(a)
     bus.request_recovery(a)
@@ -244,8 +244,7 @@ def test_recovery_completes_at_any_bit_rate(bitrate):
     assert a.state is ErrorState.ACTIVE
 
 
-def test_recovery_needs_bus_off():
-    bus = CanBus()
+def test_recovery_needs_bus_off(bus):
     a = bus.attach("a")
     bus.request_recovery(a)
     assert bus.next_event_ns() is None
@@ -335,8 +334,7 @@ def test_two_nodes_with_one_identifier_destroy_each_other():
     assert (a.state, b.state) == (ErrorState.BUS_OFF, ErrorState.BUS_OFF)
 
 
-def test_a_babbling_node_starves_higher_identifiers_only():
-    bus = CanBus()
+def test_a_babbling_node_starves_higher_identifiers_only(bus):
     babbler, low, high, _ = (bus.attach(name, capacity=4) for name in "abcd")
     got = []
     bus.send(high, CanFrame(0x700))
@@ -386,15 +384,13 @@ def test_without_a_bit_rate_a_frame_takes_no_time():
     assert [(d.t_ns, d.frame.can_id) for d in bus.advance(77)] == [(77, 1), (77, 2), (77, 3)]
 
 
-def test_time_does_not_go_back():
-    bus = CanBus()
+def test_time_does_not_go_back(bus):
     bus.advance(10)
     with pytest.raises(ValueError, match="cannot go back"):
         bus.advance(9)
 
 
-def test_error_frames_cannot_be_sent():
-    bus = CanBus()
+def test_error_frames_cannot_be_sent(bus):
     a = bus.attach("a")
     with pytest.raises(ValueError, match="error frame"):
         bus.send(a, CanFrame(0x40, bytes(8), error=True))
