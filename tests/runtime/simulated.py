@@ -8,6 +8,7 @@ from pathlib import Path
 from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.runtime.assembly import create_planner
+from disco_hw.runtime.core import CoreTick
 from disco_hw.runtime.pipeline import Planner
 from disco_hw.runtime.replay import ReplayReport, replay
 from disco_hw.runtime.robot_setup import load_setup
@@ -42,6 +43,12 @@ def arm(stack: SimulatedRun) -> None:
     """Wait until the robot is ready, and arm it."""
     stack.run(1.5)
     stack.run(0.5, UserRequest.ARM)
+
+
+def start(stack: SimulatedRun, seconds: float) -> list[CoreTick]:
+    """Arm the robot, start the task, and return the ticks of so long a drive."""
+    arm(stack)
+    return stack.run(seconds, UserRequest.START)
 
 
 def replayed(log: Path, *arguments: float) -> ReplayReport:

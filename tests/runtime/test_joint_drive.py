@@ -7,8 +7,7 @@ import pytest
 
 from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.robot_setup import load_setup
-from disco_hw.runtime.supervisor import UserRequest
-from tests.runtime.simulated import ROBOT_TEXT, arm, replayed, simulated_stack
+from tests.runtime.simulated import ROBOT_TEXT, replayed, simulated_stack, start
 from tests.runtime.test_path_drive import write_log
 
 # A kernel to compile; tests/control/test_disco.py drives with joint sampling in every `make test`.
@@ -22,8 +21,7 @@ def test_robot_toml_asks_for_joint_sampling_and_it_drives_and_replays(tmp_path):
     planner = create_planner(setup.config, setup.model)
     assert planner.settings.uncertainty == "joint"
     stack = simulated_stack(planner, robot_file=robot_file)
-    arm(stack)
-    stack.run(0.02, UserRequest.START)
+    start(stack, 0.02)
     off_m = []
     for _ in range(150):
         stack.run(0.1)

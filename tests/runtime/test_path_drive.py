@@ -21,7 +21,7 @@ from disco_hw.viewer.commands import snapshot_log
 from disco_hw.viewer.recording import Recording
 from sim.body_dynamics import BodyPose
 from tests.runtime.path_robot import path_robot
-from tests.runtime.simulated import arm, replayed, simulated_stack
+from tests.runtime.simulated import replayed, simulated_stack, start
 
 CORNER = "x_m,y_m\n0,0\n1.2,0\n1.2,0.8\n"
 
@@ -41,8 +41,7 @@ def write_log(path, setup, ticks):
 def started(robot_file):
     setup = load_setup(robot_file)
     stack = simulated_stack(robot_file=robot_file, start=BodyPose(*setup.config.task.course().start))
-    arm(stack)
-    stack.run(0.02, UserRequest.START)
+    start(stack, 0.02)
     return setup, stack
 
 

@@ -18,7 +18,7 @@ from disco_hw.runtime.supervisor import UserRequest
 from drivers.types import PoseSample
 from tests.drive.test_hand_pilot import Hand
 from tests.drivers.waiting import free_port
-from tests.runtime.simulated import ROBOT_TEXT, arm, replayed, simulated_stack
+from tests.runtime.simulated import ROBOT_TEXT, arm, replayed, simulated_stack, start
 from tests.tables import thinned
 from tools.faults.run import circling_planner
 
@@ -65,8 +65,7 @@ class Bench:
         return self.senders[-1]
 
     def start(self):
-        arm(self.stack)
-        return self.stack.run(0.5, UserRequest.START)[-1].output.running
+        return start(self.stack, 0.5)[-1].output.running
 
     def output_lines(self):
         return [

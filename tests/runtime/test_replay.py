@@ -20,7 +20,7 @@ from disco_hw.model import EffectSetting, load_model, save_model
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.supervisor import UserRequest
-from tests.runtime.simulated import ROBOT_TEXT, arm, replayed, simulated_stack
+from tests.runtime.simulated import ROBOT_TEXT, arm, replayed, simulated_stack, start
 from tests.tables import thinned
 
 ROBOTS = SHIPPED_ROBOT.parent
@@ -30,8 +30,7 @@ ROBOTS = SHIPPED_ROBOT.parent
 def ticks():
     """The records of the daemon for a start, two seconds of driving and a stop."""
     stack = simulated_stack()
-    arm(stack)
-    stack.run(2.0, UserRequest.START)
+    start(stack, 2.0)
     stack.run(1.0, UserRequest.DISARM)
     return stack.recorder.ticks
 
@@ -67,8 +66,7 @@ def test_what_no_parameter_explains_is_recorded_and_replays_bit_for_bit(tmp_path
     text = ROBOT_TEXT.replace("rate_hz = 50.0", "rate_hz = 50.0\ndisturbance = true")
     (tmp_path / "robot.toml").write_text(text)
     stack = simulated_stack(robot_file=tmp_path / "robot.toml")
-    arm(stack)
-    stack.run(2.5, UserRequest.START)
+    start(stack, 2.5)
     ticks = stack.recorder.ticks
     found = [one for _, records in ticks for one in records if isinstance(one, UnexplainedMotion)]
     assert len(found) == len(ticks)
@@ -118,8 +116,7 @@ def test_a_follower_takes_over_from_a_planner_that_finds_nothing_and_replays_bit
     text = ROBOT_TEXT.replace("rate_hz = 50.0", 'rate_hz = 50.0\nfallback = "lqr"')
     (tmp_path / "robot.toml").write_text(text)
     stack = simulated_stack(robot_file=tmp_path / "robot.toml")
-    arm(stack)
-    driven = stack.run(3.0, UserRequest.START)
+    driven = start(stack, 3.0)
     sources = [tick.pipeline.source for tick in driven]
     first, last = sources.index(Source.FALLBACK), len(sources) - sources[::-1].index(Source.FALLBACK)
     assert set(sources[first:last]) == {Source.FALLBACK}

@@ -14,9 +14,8 @@ from disco_hw.log.load import load_drive
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.runtime.assembly import create_planner, pose_source_of
 from disco_hw.runtime.robot_setup import load_setup
-from disco_hw.runtime.supervisor import UserRequest
 from drivers.types import PoseSample
-from tests.runtime.simulated import ROBOT_FILE, ROBOT_TEXT, arm, replayed, simulated_stack
+from tests.runtime.simulated import ROBOT_FILE, ROBOT_TEXT, replayed, simulated_stack, start
 
 
 @pytest.fixture
@@ -54,8 +53,7 @@ class Bench:
             self._sender.send(json.dumps(datagram).encode())
 
     def start(self):
-        arm(self.stack)
-        return self.stack.run(1.5, UserRequest.START)[-1].output.running
+        return start(self.stack, 1.5)[-1].output.running
 
     def close(self):
         self._sender.close()
