@@ -30,8 +30,6 @@ NOMINAL = (0.061, 0.415, 0.238)
 class ForeignRobot:
     """Parameters of the plant in SI units: `grip_std` is slip as a part of the speed, correlated over `grip_s`.
 
-    `grip_std` is slip as a part of the speed, correlated over `grip_s`.
-
     `believed`: the wheel radius, axle and x_icr that controllers are given of it.
     """
 

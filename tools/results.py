@@ -1,7 +1,6 @@
 """`python -m tools.results bench.json`: keeps measured figures, and writes the last part of docs/results.md.
 
     make bench PARTS=bench_wire && python -m tools.results bench.json
-    python -m tools.results out/infer/recovery_rich.json --shown-by "python -m tools.study.infer_study"
     disco-hw demo --json > demo.json && python -m tools.results demo.json --shown-by "disco-hw demo --json"
     python -m tools.results            # only writes the page again, from the figures that are kept
 

@@ -144,7 +144,7 @@ def _scores(whitened: tuple[Array, int]) -> Array:
     return np.asarray(np.where(seen, left.T @ error / np.where(seen, length, 1.0) / spread, 0.0))
 
 
-# On logs of robots without any difference the largest of all values stays below this (tools/study/infer_study.py).
+# On logs of robots without any difference the largest of all values stays below this (study: docs/results.md).
 LARGEST_DEVIATION = 5.0
 # More than this of the motion within a second, and no geometry and no slip of a usable robot is behind it.
 LARGEST_UNEXPLAINED = 0.5

@@ -2,6 +2,7 @@
 
 import math
 import time
+from contextlib import closing
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -106,16 +107,17 @@ class Antenna:
         pass
 
 
-def test_positions_without_heading_are_a_warning_with_what_to_do():
-    reported = check._telemetry_check(check._query_robot(RobotInTime(b""), create_driver(None), Antenna(silent=False)))
+@pytest.mark.parametrize(
+    ("silent", "expected_text"),
+    [
+        (False, "heading not known; the pose sensor measures none: drive one metre"),
+        (True, "0 pose samples a second; fix quality 0: no fix; without a pose"),
+    ],
+)
+def test_poses_without_heading_or_none_at_all_are_a_warning_with_the_reason(silent, expected_text):
+    reported = check._telemetry_check(check._query_robot(RobotInTime(b""), create_driver(None), Antenna(silent)))
     assert reported.level is Level.WARNING
-    assert "heading not known; the pose sensor measures none: drive one metre" in reported.text
-
-
-def test_a_pose_source_that_is_silent_says_why():
-    reported = check._telemetry_check(check._query_robot(RobotInTime(b""), create_driver(None), Antenna(silent=True)))
-    assert reported.level is Level.WARNING
-    assert "0 pose samples a second; fix quality 0: no fix; without a pose" in reported.text
+    assert expected_text in reported.text
 
 
 def test_the_conformance_suite_keeps_out_of_a_daemons_way_too(tmp_path):
@@ -126,12 +128,11 @@ def test_the_conformance_suite_keeps_out_of_a_daemons_way_too(tmp_path):
         f'max_wheel_speed_rad_s = 8.0\n[link]\ninterface = "unixcan"\nchannel = "{tmp_path}/bus"\n'
         f'[daemon]\ncontrol_socket = "{tmp_path}/control.sock"\n'
     )
-    daemon = Daemon(tmp_path / "control.sock", {})
-    try:
-        with pytest.raises(pytest.exit.Exception, match="a daemon is connected to this robot") as caught:
-            test_robot.TestRobot.create_end(SimpleNamespace(getoption=lambda _: str(robot)))
-    finally:
-        daemon.close()
+    with (
+        closing(Daemon(tmp_path / "control.sock", {})),
+        pytest.raises(pytest.exit.Exception, match="a daemon is connected to this robot") as caught,
+    ):
+        test_robot.TestRobot.create_end(SimpleNamespace(getoption=lambda _: str(robot)))
     assert caught.value.returncode == 1
 
 

@@ -1,5 +1,6 @@
 import socket
 import threading
+from contextlib import closing
 
 import pytest
 
@@ -62,11 +63,8 @@ def test_a_request_gets_its_reply(daemon):
 
 
 def test_a_long_reply_arrives_whole(tmp_path):
-    daemon = Daemon(tmp_path / "robot.sock", {"text": "x" * 60_000})
-    try:
+    with closing(Daemon(tmp_path / "robot.sock", {"text": "x" * 60_000})) as daemon:
         assert len(send_request(daemon.server.path, {"do": "status"})["text"]) == 60_000
-    finally:
-        daemon.close()
 
 
 def test_a_refused_request_comes_back_as_a_reply(daemon):

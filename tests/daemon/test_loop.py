@@ -56,24 +56,22 @@ def test_late_wake_ups_do_not_accumulate():
     assert run.stats.last_lateness_ns == 5 * MS_NS
 
 
-def test_a_short_overrun_is_served_late_and_the_grid_is_kept():
-    run = Run([25 * MS_NS, MS_NS, MS_NS])
-    assert run.starts_ns == [0, 25 * MS_NS, 40 * MS_NS]
-    assert (run.stats.overruns, run.stats.skipped_periods) == (1, 0)
-
-
-def test_a_long_overrun_skips_whole_periods_without_a_burst():
-    run = Run([95 * MS_NS, MS_NS, MS_NS])
-    # 20 to 80 ms are missed by more than half a period; 100 ms is next.
-    assert run.starts_ns == [0, 100 * MS_NS, 120 * MS_NS]
-    assert (run.stats.overruns, run.stats.skipped_periods) == (1, 4)
-
-
-def test_a_stopped_process_skips_and_counts():
-    run = Run([MS_NS, MS_NS, MS_NS], [0, 10_000 * MS_NS])
-    assert run.starts_ns == [0, 10_020 * MS_NS, 10_040 * MS_NS]
-    assert run.stats.skipped_periods == 500
-    assert run.stats.overruns == 1
+@pytest.mark.parametrize(
+    ("first_ms", "wake_delays_ms", "starts_ms", "skipped_periods"),
+    [
+        (25, [], [0, 25, 40], 0),
+        # 20 to 80 ms are missed by more than half a period; 100 ms is next.
+        (95, [], [0, 100, 120], 4),
+        (1, [0, 10_000], [0, 10_020, 10_040], 500),
+    ],
+    ids=["short overrun", "long overrun", "stopped process"],
+)
+def test_an_overrun_is_counted_and_skips_whole_periods_without_a_burst(
+    first_ms, wake_delays_ms, starts_ms, skipped_periods
+):
+    run = Run([first_ms * MS_NS, MS_NS, MS_NS], [delay_ms * MS_NS for delay_ms in wake_delays_ms])
+    assert run.starts_ns == [start_ms * MS_NS for start_ms in starts_ms]
+    assert (run.stats.overruns, run.stats.skipped_periods) == (1, skipped_periods)
 
 
 @given(

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
@@ -128,16 +128,13 @@ def test_a_place_that_is_not_believed_is_passed_over_by_both_sides_and_its_going
     occupied.chmod(0o777)
     path = default_socket_path("wombot")
     assert path.parent == temporary / f"disco-hw-{ME}-2"
-    server = ControlServer(path, ["status"])
-    try:
+    with closing(ControlServer(path, ["status"])):
         (line,) = passed_over(default_socket_path("wombot"))
         assert line.startswith(f"{occupied}: others can write to it")
         occupied.rmdir()
         assert default_socket_path("wombot") == path
         occupied.touch()
         assert default_socket_path("wombot") == path
-    finally:
-        server.close()
 
 
 def test_the_places_of_other_users_and_other_names_are_not_looked_at(temporary):

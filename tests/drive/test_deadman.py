@@ -43,24 +43,26 @@ class Bench:
         return self
 
 
-def test_a_press_while_ready_arms_and_starts_once():
-    bench = Bench()
+@pytest.fixture
+def bench():
+    return Bench()
+
+
+def test_a_press_while_ready_arms_and_starts_once(bench):
     assert bench.tick(False).requests == ()
     assert bench.tick(True).requests == ARM_START
     assert [bench.tick(True).requests for _ in range(50)] == [()] * 50
     assert bench.verdict.motion == Manual(1.0, 2.0)
 
 
-def test_a_deadman_held_from_the_start_counts_for_nothing_until_released():
-    bench = Bench()
+def test_a_deadman_held_from_the_start_counts_for_nothing_until_released(bench):
     assert [bench.tick(True).requests for _ in range(100)] == [()] * 100
     assert bench.verdict.motion == Standstill()
     bench.tick(False)
     assert bench.tick(True).requests == ARM_START
 
 
-def test_who_holds_in_vain_is_asked_once_to_let_go_when_the_robot_is_ready():
-    bench = Bench()
+def test_who_holds_in_vain_is_asked_once_to_let_go_when_the_robot_is_ready(bench):
     bench.state = State.HANDSHAKE
     assert [bench.tick(True).event for _ in range(50)] == [None] * 50
     bench.state = State.READY
@@ -111,8 +113,7 @@ def test_nothing_arms_again_until_the_deadman_was_seen_open(loss):
 
 
 @pytest.mark.parametrize("state", [state for state in State if state is not State.READY])
-def test_a_press_counts_while_ready_only_and_is_used_up(state):
-    bench = Bench()
+def test_a_press_counts_while_ready_only_and_is_used_up(state, bench):
     bench.tick(False)
     bench.state = state
     verdict = bench.tick(True)
@@ -131,8 +132,7 @@ def test_once_disarmed_by_others_a_new_press_is_needed(state):
     assert [bench.tick(True).requests for _ in range(20)] == [()] * 20
 
 
-def test_whoever_else_arms_the_robot_finds_it_disarmed():
-    bench = Bench()
+def test_whoever_else_arms_the_robot_finds_it_disarmed(bench):
     bench.tick(False)
     bench.state = State.ARMED
     assert bench.tick(False).requests == DISARM
@@ -145,16 +145,14 @@ def test_whoever_else_arms_the_robot_finds_it_disarmed():
     assert verdict.motion == Standstill()
 
 
-def test_a_release_while_arming_takes_the_request_back():
-    bench = Bench()
+def test_a_release_while_arming_takes_the_request_back(bench):
     bench.tick(False)
     bench.tick(True)
     bench.state = State.READY
     assert bench.tick(False).requests == DISARM
 
 
-def test_a_refusal_needs_a_new_press():
-    bench = Bench()
+def test_a_refusal_needs_a_new_press(bench):
     bench.tick(False)
     bench.tick(True)
     bench.state = State.READY

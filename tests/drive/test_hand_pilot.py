@@ -59,8 +59,12 @@ class Bench:
         return max(abs(outputs.left_setpoint_rad_s), abs(outputs.right_setpoint_rad_s))
 
 
-def test_what_is_held_is_driven_and_recorded_as_executed():
-    bench = Bench().driving()
+@pytest.fixture
+def bench():
+    return Bench().driving()
+
+
+def test_what_is_held_is_driven_and_recorded_as_executed(bench):
     commands = [r for _, tick in bench.stack.recorder.ticks for r in tick if isinstance(r, records.Command)]
     driven = [command for command in commands if command.in_force and command.source == "manual"]
     assert driven
@@ -72,8 +76,7 @@ def test_what_is_held_is_driven_and_recorded_as_executed():
 
 
 @pytest.mark.parametrize("loss", [{"held": False}, {"gone": True}])
-def test_release_and_loss_stop_and_disarm(loss):
-    bench = Bench().driving()
+def test_release_and_loss_stop_and_disarm(loss, bench):
     ticks = bench.run(0.02, **loss)
     assert ticks[0].output.state is State.STOPPING
     assert ticks[0].pipeline.source is Source.HOLD
@@ -84,8 +87,7 @@ def test_release_and_loss_stop_and_disarm(loss):
     assert max(abs(bench.stack.robot.truth.left_speed_rad_s), abs(bench.stack.robot.truth.right_speed_rad_s)) < 0.05
 
 
-def test_silence_stops_200_ms_after_the_last_input_and_nothing_arms_again():
-    bench = Bench().driving()
+def test_silence_stops_200_ms_after_the_last_input_and_nothing_arms_again(bench):
     bench.hand.silent_since_ns = bench.stack.now_us * 1000
     ticks = bench.run(0.3)
     moving = [tick for tick in ticks if tick.pipeline.source is Source.MANUAL]
@@ -99,14 +101,12 @@ def test_silence_stops_200_ms_after_the_last_input_and_nothing_arms_again():
     assert bench.stack.core.last.output.state is State.ARMED
 
 
-def test_no_number_is_a_stop():
-    bench = Bench().driving()
+def test_no_number_is_a_stop(bench):
     bench.run(0.6, wheels=(float("nan"), 5.0))
     assert bench.largest_setpoint_rad_s() == 0.0
 
 
-def test_the_status_says_what_is_going_on():
-    bench = Bench().driving()
+def test_the_status_says_what_is_going_on(bench):
     reported = bench.stack.pilot.status()["drive"]
     assert reported["driving"]
     assert reported["words"] == "words"
@@ -126,8 +126,7 @@ def test_a_press_while_not_ready_is_reported_and_sends_nothing():
     assert any("not ready" in text for text in reported(bench))
 
 
-def test_a_refusal_is_reported_and_needs_a_new_press():
-    bench = Bench().driving()
+def test_a_refusal_is_reported_and_needs_a_new_press(bench):
     bench.stack.pilot.learn(0, bench.stack.core.last, [Reply(UserRequest.ARM, False, "no recent wheel data")])
     assert bench.run(0.02)[0].output.state is State.STOPPING
     assert any("no recent wheel data" in text for text in reported(bench))
@@ -148,8 +147,7 @@ def reported(bench):
     return bench.stack.pilot.status()["drive"]["messages"]
 
 
-def test_the_end_of_the_source_is_the_pilots():
-    bench = Bench().driving()
+def test_the_end_of_the_source_is_the_pilots(bench):
     assert not bench.stack.pilot.done
     bench.run(0.02, ended="the end", held=False)
     assert bench.stack.pilot.done

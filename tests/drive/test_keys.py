@@ -42,12 +42,16 @@ class Typist:
         return seen
 
 
+@pytest.fixture
+def typist():
+    return Typist()
+
+
 def deadman_states(seen):
     return [moment.deadman for moment in seen]
 
 
-def test_a_held_key_drives_until_200_ms_after_its_last_repeat():
-    typist = Typist()
+def test_a_held_key_drives_until_200_ms_after_its_last_repeat(typist):
     seen = typist.hold(UP, 1000)
     assert not any(deadman_states(seen[:17]))
     assert all(deadman_states(seen[20:]))
@@ -59,8 +63,7 @@ def test_a_held_key_drives_until_200_ms_after_its_last_repeat():
     assert after[-1].left_rad_s == 0.0
 
 
-def test_a_key_held_from_the_start_holds_nothing_and_is_reported():
-    typist = Typist()
+def test_a_key_held_from_the_start_holds_nothing_and_is_reported(typist):
     typist.keys = KeyHold(8.0)
     typist.keys.at(typist.now_ns)
     assert not any(deadman_states(typist.hold(UP, 300)))
@@ -73,21 +76,18 @@ def test_a_key_held_from_the_start_holds_nothing_and_is_reported():
     assert not typist.keys.is_ignored
 
 
-def test_a_tap_holds_nothing():
-    typist = Typist()
+def test_a_tap_holds_nothing(typist):
     typist.press(UP)
     assert not any(deadman_states(typist.wait(2000)))
 
 
-def test_slow_taps_hold_nothing():
-    typist = Typist()
+def test_slow_taps_hold_nothing(typist):
     for _ in range(10):
         typist.press(UP)
         assert not any(deadman_states(typist.wait(300)))
 
 
-def test_what_comes_faster_than_any_repeat_holds_nothing():
-    typist = Typist()
+def test_what_comes_faster_than_any_repeat_holds_nothing(typist):
     for _ in range(100):
         typist.now_ns += 9 * MS
         typist.press(UP)
@@ -98,23 +98,20 @@ def test_a_late_first_repeat_is_waited_for():
     assert any(deadman_states(Typist().hold(UP, 1000, delay_ms=660)))
 
 
-def test_another_key_takes_over_without_a_break_where_repeats_begin_early():
-    typist = Typist()
+def test_another_key_takes_over_without_a_break_where_repeats_begin_early(typist):
     typist.hold(UP, 600)
     seen = typist.hold(LEFT, 600, delay_ms=180)
     assert all(deadman_states(seen))
     assert seen[-1].left_rad_s < 0.0 < seen[-1].right_rad_s
 
 
-def test_another_key_ends_the_hold_where_repeats_begin_late():
-    typist = Typist()
+def test_another_key_ends_the_hold_where_repeats_begin_late(typist):
     typist.hold(UP, 600)
     seen = typist.hold(LEFT, 1500, delay_ms=400)
     assert not any(deadman_states(seen[30:]))
 
 
-def test_a_stutter_of_the_connection_does_not_hold_again():
-    typist = Typist()
+def test_a_stutter_of_the_connection_does_not_hold_again(typist):
     typist.hold(UP, 600)
     typist.wait(300)
     assert not any(deadman_states(typist.hold(UP, 2000, delay_ms=30)))
@@ -124,15 +121,13 @@ def test_a_stutter_of_the_connection_does_not_hold_again():
     assert any(deadman_states(typist.hold(UP, 1000)))
 
 
-def test_any_other_key_stops():
-    typist = Typist()
+def test_any_other_key_stops(typist):
     typist.hold(UP, 600)
     typist.press(b"\x1b")
     assert not any(deadman_states(typist.hold(UP, 1000, delay_ms=30)))
 
 
-def test_digits_choose_the_speed_and_stop():
-    typist = Typist()
+def test_digits_choose_the_speed_and_stop(typist):
     typist.hold(UP, 600)
     typist.press(b"9")
     assert not any(deadman_states(typist.wait(600)))

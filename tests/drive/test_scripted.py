@@ -42,8 +42,12 @@ class Bench:
         return self.last
 
 
-def test_time_runs_while_driving_only():
-    bench = Bench()
+@pytest.fixture
+def bench():
+    return Bench()
+
+
+def test_time_runs_while_driving_only(bench):
     assert bench.run(READY, 100).left_rad_s == 1.0
     bench.run(DRIVING, 25)
     assert bench.last.right_rad_s == 0.5
@@ -52,8 +56,7 @@ def test_time_runs_while_driving_only():
     assert "m1" in bench.source.task
 
 
-def test_deadman_and_time_are_the_other_sources():
-    bench = Bench()
+def test_deadman_and_time_are_the_other_sources(bench):
     assert bench.run(DRIVING, 1).t_ns == bench.now_ns - 7
     bench.finger.held = False
     assert bench.run(DRIVING, 1).deadman is False
@@ -61,8 +64,7 @@ def test_deadman_and_time_are_the_other_sources():
     assert bench.run(DRIVING, 1) is None
 
 
-def test_what_was_broken_off_begins_anew():
-    bench = Bench()
+def test_what_was_broken_off_begins_anew(bench):
     bench.run(DRIVING, 75)
     assert bench.last.left_rad_s == 2.0
     bench.run(READY, 5)
@@ -70,8 +72,7 @@ def test_what_was_broken_off_begins_anew():
     assert (bench.last.left_rad_s, bench.last.right_rad_s) == (2.0, pytest.approx(0.02))
 
 
-def test_the_end_opens_the_deadman():
-    bench = Bench()
+def test_the_end_opens_the_deadman(bench):
     bench.run(DRIVING, 101)
     assert bench.source.ended == "script s completed"
     assert bench.source.completed
@@ -79,8 +80,7 @@ def test_the_end_opens_the_deadman():
     assert bench.run(READY, 1).deadman is False
 
 
-def test_the_end_of_the_deadman_is_the_end():
-    bench = Bench()
+def test_the_end_of_the_deadman_is_the_end(bench):
     bench.finger.ended = "the terminal was closed"
     assert bench.source.ended == "the terminal was closed"
     assert not bench.source.completed
@@ -88,8 +88,7 @@ def test_the_end_of_the_deadman_is_the_end():
     assert bench.finger.closed
 
 
-def test_a_stalled_loop_skips_nothing():
-    bench = Bench()
+def test_a_stalled_loop_skips_nothing(bench):
     bench.run(DRIVING, 1)
     bench.now_ns += 5_000_000_000
     assert bench.run(DRIVING, 1).left_rad_s == 1.0

@@ -46,8 +46,9 @@ class Bench:
             self.core.receive(self.now_us, *self.prover.prove(frame))
         self.core.receive(self.now_us, *frame)
 
-    def hello(self, **changes: object) -> None:
+    def hello(self, **changes: object) -> "Bench":
         self.send("HELLO_REQUEST", **{"protocol_major": 1, "protocol_minor": 0, "dbc_hash": CODEC.dbc_hash} | changes)
+        return self
 
     def host_state(self, **changes: object) -> None:
         signals = {"request": "STANDBY", "session": 0, "challenge_answer": 0, "host_fault": 0} | changes
@@ -103,26 +104,29 @@ class Bench:
                 return self.out
         raise AssertionError(f"still {self.out.state}, not {states}; rejections {self.core.rejections}")
 
-    def set_request(self, request: str, session: int = 7, **changes: object) -> None:
+    def set_request(self, request: str, session: int = 7, **changes: object) -> "Bench":
         self.request = {"request": request, "session": session} | changes
+        return self
 
-    def to_ready(self, session: int = 7):
+    def to_ready(self, session: int = 7) -> "Bench":
         self.hello()
         self.set_request("READY", session)
-        return self.run_until("READY")
+        self.run_until("READY")
+        return self
 
-    def to_armed(self, session: int = 7):
+    def to_armed(self, session: int = 7) -> "Bench":
         self.to_ready(session)
         self.set_request("ARM", session)
         self.command = {}
-        return self.run_until("ARMED")
+        self.run_until("ARMED")
+        return self
 
-    def to_driving(self, left: float = 4.0, right: float = 2.0):
+    def to_driving(self, left: float = 4.0, right: float = 2.0) -> "Bench":
         self.to_armed()
         self.command = {"left": left, "right": right}
         self.run(400)
         assert abs(self.out.left_setpoint_rad_s - left) + abs(self.out.right_setpoint_rad_s - right) < 1e-6
-        return self.out
+        return self
 
     def messages(self, name: str, since_us: int = 0) -> list[Decoded]:
         return [decoded for t_us, decoded in self.sent if decoded.name == name and t_us >= since_us]

@@ -25,8 +25,7 @@ def bad_input(field, value):
     """A cause that lies in one measurement, and its end."""
 
     def begin():
-        bench = Bench()
-        bench.to_driving()
+        bench = Bench().to_driving()
         bench.inputs[field] = value
         return bench
 
@@ -37,8 +36,7 @@ def dead_wheel(side, current_a):
     """A driven wheel without ticks."""
 
     def begin():
-        bench = Bench()
-        bench.to_driving(4.0, 4.0)
+        bench = Bench().to_driving(4.0, 4.0)
         bench.inputs.update({f"{side}_current_a": current_a, f"{side}_ticks": int(bench.ticks[side == "right"])})
         return bench
 
@@ -47,8 +45,7 @@ def dead_wheel(side, current_a):
 
 def jump(side):
     def begin():
-        bench = Bench()
-        bench.to_driving()
+        bench = Bench().to_driving()
         bench.ticks[side] += 5000
         return bench
 
@@ -57,8 +54,7 @@ def jump(side):
 
 def turned_round(side):
     def begin():
-        bench = Bench()
-        bench.to_driving(4.0, 4.0)
+        bench = Bench().to_driving(4.0, 4.0)
         bench.wheels_follow = False
         bench.speeds[side] = -3.0
         return bench
@@ -71,9 +67,7 @@ def turned_round(side):
 
 def stranger(**changes):
     def begin():
-        bench = Bench()
-        bench.hello(**changes)
-        return bench
+        return Bench().hello(**changes)
 
     return begin, lambda bench: bench.hello()
 
@@ -88,8 +82,7 @@ def started_by(cause):
 
 
 def leapt_clock():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     bench.step(50 * MS)
     return bench
 
@@ -127,11 +120,9 @@ def test_the_core_ends_each_fault_as_the_table_says(fault):
     assert bench.run(5).state == ("FAULT" if fault.latches else bench.out.state)
     bench.command = None
     end(bench)
-    bench.set_request("STANDBY")
-    bench.run(3000)
+    bench.set_request("STANDBY").run(3000)
     assert (bench.out.fault != 0, bench.out.state) == (fault.latches, "FAULT" if fault.latches else "STANDBY")
-    bench.set_request("RESET")
-    bench.run(500)
+    bench.set_request("RESET").run(500)
     assert (bench.out.fault != 0, bench.out.state) == (fault.permanent, "FAULT" if fault.permanent else "STANDBY")
 
 

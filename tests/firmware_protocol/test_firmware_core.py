@@ -140,17 +140,14 @@ def test_outputs_and_inputs_are_values():
     assert msgspec.structs.replace(STATIONARY, left_ticks=5).left_ticks == 5
 
 
-def test_names_are_the_dbcs():
-    bench = Bench()
+def test_names_are_the_dbcs(bench):
     bench.inputs["left_current_a"] = 100.0
-    bench.run_until("FAULT")
-    assert bench.out.fault == FAULTS["OVER_CURRENT_LEFT"]
+    assert bench.run_until("FAULT").fault == FAULTS["OVER_CURRENT_LEFT"]
 
 
 @pytest.mark.parametrize("step_back_s", [0.0, 0.001, 5.0, 100.0])
-def test_a_clock_that_stands_or_goes_back_stops_no_watchdog(step_back_s):
+def test_a_clock_that_stands_or_goes_back_stops_no_watchdog(step_back_s, bench):
     """The wheels stand as soon as with a sound clock, which counts a cycle as a millisecond."""
-    bench = Bench()
     bench.now_us = 200_000_000
     bench.to_driving()
     bench.request = bench.command = None
@@ -161,8 +158,7 @@ def test_a_clock_that_stands_or_goes_back_stops_no_watchdog(step_back_s):
     assert (bench.out.left_setpoint_rad_s, bench.out.driver_enabled) == (0.0, False)
 
 
-def test_after_the_clock_went_back_time_goes_on_at_its_rate():
-    bench = Bench()
+def test_after_the_clock_went_back_time_goes_on_at_its_rate(bench):
     bench.run(1000)
     before = bench.core._core.now_us
     bench.now_us -= 600_000
@@ -179,9 +175,8 @@ def test_after_the_clock_went_back_time_goes_on_at_its_rate():
 
 
 @pytest.mark.parametrize("ahead_us", [10_001, 70_000, 1 << 32])
-def test_a_frame_stamped_far_ahead_does_not_hold_time_up(ahead_us):
+def test_a_frame_stamped_far_ahead_does_not_hold_time_up(ahead_us, bench):
     """As by a clock of two words that is read while its low word wraps: 71 minutes ahead, once."""
-    bench = Bench()
     bench.run(1000)
     before, since_us = bench.core._core.now_us, bench.now_us
     bench.core.receive(bench.now_us + 1000 + ahead_us, 0x7FF, b"")
@@ -192,9 +187,8 @@ def test_a_frame_stamped_far_ahead_does_not_hold_time_up(ahead_us):
     assert bench.messages("SESSION_STATE")[-1].values["clock_error_count"] == 1
 
 
-def test_a_frame_may_be_stamped_after_the_cycle_that_follows():
+def test_a_frame_may_be_stamped_after_the_cycle_that_follows(bench):
     """A board may read its clock for a cycle, take in frames, and then run the cycle."""
-    bench = Bench()
     bench.run(1000)
     before = bench.core._core.now_us
     bench.core.receive(bench.now_us + 1000 + 10_000, 0x7FF, b"")
@@ -207,8 +201,7 @@ def test_a_frame_may_be_stamped_after_the_cycle_that_follows():
 
 @pytest.mark.parametrize("skipped", [7, 15])
 def test_repeated_commands_and_leaps_of_the_counter_are_counted(skipped):
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     errors = bench.core._core.sequence_errors
     for _ in range(skipped):
         bench.next_counter("WHEEL_COMMAND")
@@ -217,8 +210,7 @@ def test_repeated_commands_and_leaps_of_the_counter_are_counted(skipped):
 
 
 def test_lost_commands_are_counted():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     errors = bench.core._core.sequence_errors
     bench.next_counter("WHEEL_COMMAND")
     bench.run(100)

@@ -83,14 +83,13 @@ def test_missing_poses_are_refused():
         excitation(few)
 
 
-def test_a_robot_at_rest_is_refused():
-    with pytest.raises(UnusableDriveError, match="record a drive"):
-        excitation(straight(wheel_rad_s=0.0))
-
-
-def test_lifted_wheels_are_refused():
-    with pytest.raises(UnusableDriveError, match="off the ground or the pose sensor is dead"):
-        excitation(straight(radius_m=0.0))
+@pytest.mark.parametrize(
+    ("changes", "expected_error"),
+    [({"wheel_rad_s": 0.0}, "record a drive"), ({"radius_m": 0.0}, "off the ground or the pose sensor is dead")],
+)
+def test_a_robot_at_rest_and_lifted_wheels_are_refused(changes, expected_error):
+    with pytest.raises(UnusableDriveError, match=expected_error):
+        excitation(straight(**changes))
 
 
 def test_values_that_are_not_finite_are_refused():

@@ -95,24 +95,15 @@ def test_when_both_are_killed_the_file_still_reads(path):
     assert len(recorded_ticks(path)) > 20
 
 
-def test_an_interrupt_is_not_for_the_writer(path):
+@pytest.mark.parametrize(("sent", "ticks"), [(signal.SIGINT, 5), (signal.SIGTERM, 50)])
+def test_what_comes_after_an_interrupt_or_a_termination_is_still_recorded(path, sent, ticks):
     recorder = ProcessRecorder(recording(path))
     drive(recorder, 1, 5)
     wait_until(lambda: recorder.poll().written > 0)
-    os.kill(recorder.writer_pid, signal.SIGINT)
-    drive(recorder, 6, 5, period_s=0.01)
+    os.kill(recorder.writer_pid, sent)
+    drive(recorder, 6, ticks, period_s=0.01)
     assert recorder.close().writer_deaths == 0
-    assert recorded_ticks(path) == list(range(1, 11))
-
-
-def test_what_comes_after_a_termination_is_still_recorded(path):
-    recorder = ProcessRecorder(recording(path))
-    drive(recorder, 1, 5)
-    wait_until(lambda: recorder.poll().written > 0)
-    os.kill(recorder.writer_pid, signal.SIGTERM)
-    drive(recorder, 6, 50, period_s=0.01)
-    assert recorder.close().writer_deaths == 0
-    assert recorded_ticks(path) == list(range(1, 56))
+    assert recorded_ticks(path) == list(range(1, 6 + ticks))
 
 
 def test_the_writer_has_a_session_of_its_own(path):

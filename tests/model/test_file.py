@@ -87,6 +87,11 @@ GOOD = model_text(
         ("mean = [0.06, 0.1]", "mean = [0.06]", "belief: mean has 1 entries, not 2"),
         ("mean = [0.06, 0.1]", "mean = [60.0, 0.1]", r"belief: mean of wheel_radius_m: 60.0 is outside .* m; write"),
         ("mean = [0.06, 0.1]", "mean = [-0.06, 0.1]", "belief: mean of wheel_radius_m: -0.06 is outside"),
+        (
+            "[belief]",
+            '[[effects]]\nname = "motor_lag"\ntau_s = 0.2\n\n[belief]',
+            "'motor_lag' is listed twice; keep one",
+        ),
         ("tau_s = 0.1", "tau_s = " + "1" * 60, "motor_lag.tau_s: 1+ is outside"),
         ("tau_s = 0.1", "tau_s = " + "1" * 5000, "not valid TOML .*64 characters"),
         ("tau_s = 0.1", "tau_s = " + "[" * 3000 + "]" * 3000, "not valid TOML .*16 deep"),
@@ -109,12 +114,6 @@ def test_faults_are_reported_in_one_line_with_the_file(tmp_path, old, new, fault
         read(tmp_path, GOOD.replace(old, new, 1))
     assert str(error.value).startswith(str(tmp_path / "model.toml"))
     assert "\n" not in str(error.value)
-
-
-def test_an_effect_listed_twice_is_refused(tmp_path):
-    twice = '\n[[effects]]\nname = "motor_lag"\ntau_s = 0.2\n'
-    with pytest.raises(InputError, match="effect 'motor_lag' is listed twice; keep one"):
-        read(tmp_path, GOOD.replace("[belief]", f"{twice}\n[belief]"))
 
 
 def test_a_covariance_that_was_rounded_on_its_way_is_symmetric_to_the_last_bit(tmp_path):

@@ -8,8 +8,11 @@ from pathlib import Path
 from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.runtime.assembly import create_planner
+from disco_hw.runtime.core import CoreTick
 from disco_hw.runtime.pipeline import Planner
+from disco_hw.runtime.replay import ReplayReport, replay
 from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.runtime.supervisor import UserRequest
 from sim.body_dynamics import BodyPose
 from sim.plant_parameters import PlantParameters
 
@@ -34,3 +37,22 @@ def simulated_stack(
     setup = load_setup(robot_file)
     robot = virtual_robot(setup, replace(PlantParameters(), **changes), start, effects=hide, seed=seed)
     return SimulatedRun(setup, robot, planner or create_planner(setup.config, setup.model), needs_pose=needs_pose)
+
+
+def arm(stack: SimulatedRun) -> None:
+    """Wait until the robot is ready, and arm it."""
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ARM)
+
+
+def start(stack: SimulatedRun, seconds: float) -> list[CoreTick]:
+    """Arm the robot, start the task, and return the ticks of so long a drive."""
+    arm(stack)
+    return stack.run(seconds, UserRequest.START)
+
+
+def replayed(log: Path, *arguments: float) -> ReplayReport:
+    """Return the report of a replay that must have found no difference."""
+    report = replay(log, *arguments)
+    assert report.ok, report.as_text()
+    return report

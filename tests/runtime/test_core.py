@@ -27,7 +27,7 @@ from sim.effects import hidden_effects
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
 from sim.virtual_robot import VirtualRobot
-from tests.runtime.simulated import START, simulated_stack
+from tests.runtime.simulated import START, arm, simulated_stack, start
 from tests.tables import thinned
 
 
@@ -35,8 +35,7 @@ from tests.tables import thinned
 def lap():
     """One lap of the circle, and the stop after it."""
     stack = simulated_stack()
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
+    arm(stack)
     rows = []
     stack.run(0.02, UserRequest.START)
     while stack.core.progress.laps < 1.0 and stack.now_us < 60_000_000:
@@ -86,9 +85,7 @@ def test_no_command_frame_leaves_before_arming():
 
 def test_a_lost_link_voids_the_session_and_nothing_rearms():
     stack = simulated_stack()
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
-    stack.run(2.0, UserRequest.START)
+    start(stack, 2.0)
     session = stack.robot.board.outputs.session
     assert abs(stack.robot.truth.right_speed_rad_s) > 1.0
     stack.robot.link.plug(False)
@@ -215,9 +212,7 @@ class Moody:
 def test_a_planner_that_gives_up_is_followed_on_its_tail_then_the_wheels_ramp_down():
     setup = load_setup(SHIPPED_ROBOT)
     stack = simulated_stack(Moody(create_planner(setup.config, setup.model), 4_000_000_000))
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
-    ticks = stack.run(4.0, UserRequest.START)
+    ticks = start(stack, 4.0)
     sources = [tick.pipeline.source for tick in ticks]
     tail = [k for k, source in enumerate(sources) if source is Source.TAIL]
     assert len(tail) == 10
@@ -245,9 +240,7 @@ def test_the_wheels_of_a_tick_are_announced_before_it_is_planned_and_recorded():
 
     stack = simulated_stack(Planner())
     stack.core.announce = lambda now_ns, wheels: happened.append(("wheels", now_ns, *wheels))
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
-    stack.run(0.1, UserRequest.START)
+    start(stack, 0.1)
     planned = [k for k, (what, *_) in enumerate(happened) if what == "plan"]
     assert planned
     assert all(happened[k - 1][:2] == ("wheels", happened[k][1]) for k in planned)
@@ -280,9 +273,7 @@ class Collapsing:
 def test_plans_that_hang_on_too_few_samples_are_reported_once():
     setup = load_setup(SHIPPED_ROBOT)
     stack = simulated_stack(Collapsing(create_planner(setup.config, setup.model), 2_500_000_000, 3_000_000_000))
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
-    ticks = stack.run(2.0, UserRequest.START)
+    ticks = start(stack, 2.0)
     reported = [text for tick in ticks for text in tick.events if text.startswith("planner")]
     assert reported == [
         "planner: plans rest on 1.2 effective samples, too few to trust the plan",
@@ -293,9 +284,7 @@ def test_plans_that_hang_on_too_few_samples_are_reported_once():
 def test_runs_with_one_seed_are_equal_bit_for_bit():
     def commands():
         stack = simulated_stack(seed=3)
-        stack.run(1.5)
-        stack.run(0.5, UserRequest.ARM)
-        ticks = stack.run(1.0, UserRequest.START)
+        ticks = start(stack, 1.0)
         return [(tick.pipeline.command.left_rad_s, tick.pipeline.command.right_rad_s) for tick in ticks]
 
     first = commands()

@@ -8,9 +8,8 @@ from disco_hw.control.plan import LawController
 from disco_hw.runtime import State
 from disco_hw.runtime.plausibility import Headway
 from disco_hw.runtime.robot_setup import load_setup
-from disco_hw.runtime.supervisor import UserRequest
 from drivers.types import WheelSample
-from tests.runtime.simulated import ROBOT_FILE, simulated_stack
+from tests.runtime.simulated import ROBOT_FILE, simulated_stack, start
 
 TICK_NS = 20_000_000
 COMMAND = (0.4, -0.5)
@@ -66,9 +65,7 @@ def test_it_is_reported_when_the_robot_gets_on_again():
 
 def started(**changes):
     stack = simulated_stack(**changes)
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
-    stack.run(0.02, UserRequest.START)
+    start(stack, 0.02)
     return stack
 
 

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from disco_hw.runtime.assembly import create_planner
-from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import load_setup
-from disco_hw.runtime.supervisor import UserRequest
-from tests.runtime.simulated import ROBOT_TEXT, simulated_stack
+from tests.runtime.simulated import ROBOT_TEXT, replayed, simulated_stack, start
 from tests.runtime.test_path_drive import write_log
 
 # A kernel to compile; tests/control/test_disco.py drives with joint sampling in every `make test`.
@@ -23,9 +21,7 @@ def test_robot_toml_asks_for_joint_sampling_and_it_drives_and_replays(tmp_path):
     planner = create_planner(setup.config, setup.model)
     assert planner.settings.uncertainty == "joint"
     stack = simulated_stack(planner, robot_file=robot_file)
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
-    stack.run(0.02, UserRequest.START)
+    start(stack, 0.02)
     off_m = []
     for _ in range(150):
         stack.run(0.1)
@@ -33,5 +29,4 @@ def test_robot_toml_asks_for_joint_sampling_and_it_drives_and_replays(tmp_path):
         off_m.append(np.hypot(truth.x_m, truth.y_m) - 0.75)
     assert np.abs(off_m[50:]).max() < 0.06
     assert stack.core.progress.laps > 0.4
-    report = replay(write_log(tmp_path / "run.mcap", setup, stack.recorder.ticks))
-    assert report.ok, report.as_text()
+    replayed(write_log(tmp_path / "run.mcap", setup, stack.recorder.ticks))

@@ -21,7 +21,7 @@ from disco_hw.viewer.commands import snapshot_log
 from disco_hw.viewer.recording import Recording
 from sim.body_dynamics import BodyPose
 from tests.runtime.path_robot import path_robot
-from tests.runtime.simulated import simulated_stack
+from tests.runtime.simulated import replayed, simulated_stack, start
 
 CORNER = "x_m,y_m\n0,0\n1.2,0\n1.2,0.8\n"
 
@@ -41,9 +41,7 @@ def write_log(path, setup, ticks):
 def started(robot_file):
     setup = load_setup(robot_file)
     stack = simulated_stack(robot_file=robot_file, start=BodyPose(*setup.config.task.course().start))
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
-    stack.run(0.02, UserRequest.START)
+    start(stack, 0.02)
     return setup, stack
 
 
@@ -89,8 +87,7 @@ def test_an_open_path_ends_with_the_robot_standing_and_is_replayed_and_shown_wit
     log = write_log(tmp_path / "run.mcap", setup, stack.recorder.ticks)
     (tmp_path / "path.csv").unlink()
     robot_file.unlink()
-    report = replay(log)
-    assert report.ok, report.as_text()
+    replayed(log)
     with Recording(log) as recording:
         task = recording.stage.task_at(recording.at(3.0).task)
         assert isinstance(task, PathTask)
@@ -110,8 +107,7 @@ def test_another_speed_is_recorded_and_replayed(tmp_path):
     stack.run(3.0, UserRequest.START)
     assert stack.robot.truth.speed_m_s == pytest.approx(0.15, abs=0.04)
     log = write_log(tmp_path / "run.mcap", setup, stack.recorder.ticks)
-    report = replay(log)
-    assert report.ok, report.as_text()
+    replayed(log)
     with Recording(log) as recording:
         assert recording.stage.task.speed_m_s == 0.3
         assert recording.stage.task_at(recording.at(3.0).task).speed_m_s == 0.15

@@ -13,7 +13,7 @@ from disco_hw.runtime.pipeline import FollowTask, Manual, NoPlanner, Source
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
 from tests.runtime import simulated
-from tests.runtime.simulated import simulated_stack
+from tests.runtime.simulated import arm, simulated_stack
 
 
 def test_a_task_is_followed_and_nothing_is_added():
@@ -61,8 +61,7 @@ def test_only_who_needs_a_pose_waits_for_one(monkeypatch, needs_pose):
     monkeypatch.setattr(simulated, "load_setup", without_pose)
     stack = simulated_stack(NoPlanner(), needs_pose=needs_pose)
     stack.pilot = Eager()
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
+    arm(stack)
     assert stack.core.last.output.state is State.ARMED
     last = stack.run(0.5, UserRequest.START)[-1]
     assert not last.pipeline.estimate.pose_ok

@@ -13,13 +13,12 @@ from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.runtime.pipeline import NoPlanner
-from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
 from drivers.types import PoseSample
 from tests.drive.test_hand_pilot import Hand
 from tests.drivers.waiting import free_port
-from tests.runtime.simulated import ROBOT_TEXT, simulated_stack
+from tests.runtime.simulated import ROBOT_TEXT, arm, replayed, simulated_stack, start
 from tests.tables import thinned
 from tools.faults.run import circling_planner
 
@@ -66,9 +65,7 @@ class Bench:
         return self.senders[-1]
 
     def start(self):
-        self.stack.run(1.5)
-        self.stack.run(0.5, UserRequest.ARM)
-        return self.stack.run(0.5, UserRequest.START)[-1].output.running
+        return start(self.stack, 0.5)[-1].output.running
 
     def output_lines(self):
         return [
@@ -269,8 +266,7 @@ def test_a_drive_whose_heading_is_left_out_on_the_way_is_replayed_bit_for_bit(tm
     assert abs(math.remainder(found.yaw_rad - truth.yaw_rad, math.tau)) < 0.2
     log = tmp_path / "run.mcap"
     stack.write_log(log)
-    report = replay(log)
-    assert report.ok, report.as_text()
+    replayed(log)
     recorded = [one for _, tick in stack.recorder.ticks for one in tick if isinstance(one, PoseSample)]
     assert {pose.yaw_rad for pose in recorded} == {1.5}
 
@@ -281,8 +277,7 @@ def test_a_first_pose_that_is_not_where_the_wheels_led_to_from_the_origin_stops_
     stack = simulated_stack(circling_planner(load_setup(file)), robot_file=file)
     received, enabled = stack.core.pose_source.receive, []
     stack.core.pose_source.receive = lambda now_ns, poses: received(now_ns, poses) if enabled else []
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
+    arm(stack)
     assert stack.run(2.0, UserRequest.START)[-1].output.running
     enabled.append(True)
     seen = stack.run(0.5)

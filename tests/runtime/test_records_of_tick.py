@@ -7,7 +7,7 @@ from disco_hw.control import Rollouts
 from disco_hw.runtime.records_of_tick import fan
 from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.viewer.scene import fan_paths
-from tests.runtime.simulated import simulated_stack
+from tests.runtime.simulated import simulated_stack, start
 
 
 def rollouts(count, steps):
@@ -35,9 +35,7 @@ def test_a_short_plan_is_kept_whole(steps):
 
 def drive(look):
     stack = simulated_stack(seed=2)
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
-    stack.run(0.02, UserRequest.START)
+    start(stack, 0.02)
     seen, commands = [], []
     for _ in range(60):
         command = stack.run(0.02)[0].pipeline.command

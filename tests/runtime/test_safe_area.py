@@ -28,6 +28,7 @@ from disco_hw.runtime.safe_area import OVERRIDE_NS, FenceRefused, SafeArea, fenc
 from disco_hw.runtime.supervisor import UserRequest
 from sim.body_dynamics import BodyPose
 from sim.plant_parameters import PlantParameters
+from tests.runtime.simulated import arm, replayed
 
 ROBOTS = SHIPPED_ROBOT.parent
 ROOM = ((-2.0, -1.5), (2.0, -1.5), (2.0, 1.5), (-2.0, 1.5))
@@ -65,8 +66,7 @@ def by_hand(robot_file: Path, start: BodyPose = MIDDLE, **plant) -> tuple[Simula
     setup, hand = load_setup(robot_file), Hand()
     robot = virtual_robot(setup, PlantParameters(**plant), start)
     run = SimulatedRun(setup, robot, NoPlanner(), hand)
-    run.run(1.5)
-    run.run(0.5, UserRequest.ARM)
+    arm(run)
     run.run(0.02, UserRequest.START)
     return run, hand
 
@@ -101,8 +101,7 @@ def test_a_hand_is_stopped_before_the_wall_and_may_leave_it(robot_file, tmp_path
     assert sum(bool(one.path_x_m) for one in guards) > len(guards) / 6
     log = tmp_path / "run.mcap"
     run.write_log(log)
-    report = replay(log)
-    assert report.ok, report.as_text()
+    replayed(log)
 
 
 def test_a_task_is_left_where_its_stopping_path_would_leave_the_fence(robot_file):
@@ -110,8 +109,7 @@ def test_a_task_is_left_where_its_stopping_path_would_leave_the_fence(robot_file
     run = SimulatedRun(
         setup, virtual_robot(setup, PlantParameters(), BodyPose(0.75, 0.0, 1.57)), NoPlanner(), needs_pose=True
     )
-    run.run(1.5)
-    run.run(0.5, UserRequest.ARM)
+    arm(run)
     area = run.core.area
     area.report(run.now_us * 1000, ObstacleReport(name="box", x_m=0.75, y_m=0.5, radius_m=0.3, age_limit_s=60.0))
     assert run.run(0.1, UserRequest.START)[-1].output.running
@@ -304,8 +302,7 @@ def test_the_log_of_a_drive_round_the_edge_makes_its_fence(tmp_path):
     setup = load_setup(ROBOTS / "wombot.toml")
     hand = Hand()
     run = SimulatedRun(setup, virtual_robot(setup, PlantParameters(), MIDDLE), NoPlanner(), hand)
-    run.run(1.5)
-    run.run(0.5, UserRequest.ARM)
+    arm(run)
     run.run(0.02, UserRequest.START)
     hand.wheels = (4.0, 6.5)
     log = tmp_path / "edge.mcap"

@@ -13,11 +13,9 @@ from disco_hw.log import records
 from disco_hw.log.load import load_drive
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.runtime.assembly import create_planner, pose_source_of
-from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import load_setup
-from disco_hw.runtime.supervisor import UserRequest
 from drivers.types import PoseSample
-from tests.runtime.simulated import ROBOT_FILE, ROBOT_TEXT, simulated_stack
+from tests.runtime.simulated import ROBOT_FILE, ROBOT_TEXT, replayed, simulated_stack, start
 
 
 @pytest.fixture
@@ -55,9 +53,7 @@ class Bench:
             self._sender.send(json.dumps(datagram).encode())
 
     def start(self):
-        self.stack.run(1.5)
-        self.stack.run(0.5, UserRequest.ARM)
-        return self.stack.run(1.5, UserRequest.START)[-1].output.running
+        return start(self.stack, 1.5)[-1].output.running
 
     def close(self):
         self._sender.close()
@@ -100,8 +96,7 @@ def test_both_are_fused_shown_recorded_and_replayed_bit_for_bit(bench, tmp_path)
     assert {pose.source for pose in bench.poses()} == {0, 1}
     log = tmp_path / "run.mcap"
     bench.stack.write_log(log)
-    report = replay(log)
-    assert report.ok, report.as_text()
+    replayed(log)
     # What compares poses takes one source: from one to the other is no motion.
     assert load_drive(log).poses.x_m.size == sum(pose.source == 0 for pose in bench.poses())
 

@@ -12,6 +12,11 @@ from firmware_protocol import status_codes
 from tests.runtime.supervisor_bench import ARM, DISARM, ESTOP, RESET, SETTINGS, START, STOP, TICK_NS, Bench
 
 
+@pytest.fixture
+def bench():
+    return Bench()
+
+
 def refusal(out):
     assert len(out.replies) == 1
     assert not out.replies[0].accepted
@@ -23,16 +28,14 @@ def refusal(out):
 
 @pytest.mark.parametrize("start", ["ready", "armed", "running", "stopping", "faulted"])
 def test_a_link_that_is_down_means_disconnected_and_no_command(start):
-    bench = Bench()
-    getattr(bench, start)()
+    bench = getattr(Bench(), start)()
     out = bench.tick(link_state=LinkState.CONNECTING)
     assert out.state is State.DISCONNECTED
     assert (out.motion_allowed, out.zero_only, out.running) == (False, False, False)
     assert "link is down" in out.events[-1]
 
 
-def test_without_a_link_it_says_why_and_what_to_do():
-    bench = Bench()
+def test_without_a_link_it_says_why_and_what_to_do(bench):
     assert bench.tick(link_state=LinkState.CONNECTING).detail == "the link is connecting"
     hint = "serial /dev/ttyUSB0: no such device; plug the adapter in"
     out = bench.tick(ARM, link_state=LinkState.CONNECTING, link_error=hint)
@@ -46,8 +49,7 @@ def test_without_a_link_it_says_why_and_what_to_do():
 
 @pytest.mark.parametrize("start", ["ready", "armed", "running", "stopping", "faulted"])
 def test_a_link_interrupted_between_two_ticks_voids_the_session(start):
-    bench = Bench()
-    getattr(bench, start)()
+    bench = getattr(Bench(), start)()
     out = bench.tick(link_generation=2)
     assert out.state is State.DISCONNECTED
     assert (out.motion_allowed, out.zero_only, out.running) == (False, False, False)
@@ -66,8 +68,7 @@ def test_a_link_interrupted_between_two_ticks_voids_the_session(start):
     ],
 )
 def test_a_problem_means_fault_in_words_without_motion(start, changes, expected):
-    bench = Bench()
-    getattr(bench, start)()
+    bench = getattr(Bench(), start)()
     out = bench.tick(**changes)
     assert out.state is State.FAULT
     assert out.driver_request is Request.STANDBY
@@ -77,8 +78,7 @@ def test_a_problem_means_fault_in_words_without_motion(start, changes, expected)
     assert out.estop == (changes.get("driver_state") is DriverState.ESTOP)
 
 
-def test_a_fault_whose_words_end_with_the_remedy_has_it_once():
-    bench = Bench()
+def test_a_fault_whose_words_end_with_the_remedy_has_it_once(bench):
     bench.running()
     out = bench.tick(driver_state=DriverState.FAULT, driver_detail="node 3 fell silent; remove the cause, then reset")
     assert out.detail == "node 3 fell silent; remove the cause, then reset"
@@ -92,8 +92,7 @@ def test_a_fault_whose_words_end_with_the_remedy_has_it_once():
      ("SELF_TEST_FAILED", "; then restart the controller, then reset"),
      ("STALL_LEFT", "motor's cable; then reset")],
 )  # fmt: skip
-def test_a_fault_of_the_robot_is_followed_by_this_hosts_reset_without_another_remedy(fault, ending):
-    bench = Bench()
+def test_a_fault_of_the_robot_is_followed_by_this_hosts_reset_without_another_remedy(fault, ending, bench):
     bench.running()
     out = bench.tick(driver_state=DriverState.FAULT, driver_detail=status_codes.fault(fault))
     assert out.detail.endswith(ending)
@@ -103,8 +102,7 @@ def test_a_fault_of_the_robot_is_followed_by_this_hosts_reset_without_another_re
 
 @pytest.mark.parametrize("start", ["ready", "armed", "running", "stopping"])
 def test_estop_means_fault_in_the_same_tick_and_its_frames_until_the_robot_shows_it(start):
-    bench = Bench()
-    getattr(bench, start)()
+    bench = getattr(Bench(), start)()
     bench.robot_obeys = False
     out = bench.tick(ESTOP)
     assert out.state is State.FAULT
@@ -151,8 +149,7 @@ def test_a_robot_that_stops_by_itself_ends_the_run(robot):
     assert out.state is State.STOPPING
     assert "no longer armed: no wheel command arrived in time; waiting" in out.detail
     assert any("no longer armed: no wheel command arrived in time" in event for event in out.events)
-    bench.tick(count=50)
-    assert bench.out.state is State.READY
+    assert bench.tick(count=50).state is State.READY
     assert Request.ARM not in bench.requests_sent[-50:]
 
 
@@ -163,8 +160,7 @@ def test_a_robot_armed_unasked_is_stopped(robot):
     assert out.driver_request is Request.STANDBY
 
 
-def test_a_robot_found_armed_is_stopped():
-    bench = Bench()
+def test_a_robot_found_armed_is_stopped(bench):
     bench.tick(driver_state=DriverState.ARMED)
     out = bench.tick(driver_state=DriverState.ARMED)
     assert out.state is State.STOPPING
@@ -173,8 +169,7 @@ def test_a_robot_found_armed_is_stopped():
 
 @pytest.mark.parametrize("start", ["ready", "stopping"])
 def test_a_robot_that_restarts_begins_with_a_handshake(start):
-    bench = Bench()
-    getattr(bench, start)()
+    bench = getattr(Bench(), start)()
     assert bench.tick(driver_state=DriverState.HANDSHAKE).state is State.HANDSHAKE
 
 
@@ -184,8 +179,7 @@ def test_lost_telemetry_while_ready_means_handshake():
     assert bench.tick(telemetry_age_s=0.01).state is State.READY
 
 
-def test_the_way_up_to_ready():
-    bench = Bench()
+def test_the_way_up_to_ready(bench):
     bench.robot_obeys = False
     assert bench.tick(link_state=LinkState.CONNECTING).state is State.DISCONNECTED
     assert bench.tick(link_state=LinkState.UP).state is State.HANDSHAKE
@@ -333,10 +327,8 @@ def test_arming_that_the_robot_never_finishes_is_given_up():
     bench = Bench().ready()
     bench.robot_obeys = False
     bench.tick(ARM)
-    bench.tick(count=99, driver_state=DriverState.ARMING)
-    assert bench.out.detail == "arming"
-    bench.tick(count=3)
-    assert bench.out.state is State.STOPPING
+    assert bench.tick(count=99, driver_state=DriverState.ARMING).detail == "arming"
+    assert bench.tick(count=3).state is State.STOPPING
     assert any("the robot did not arm within 2 s: detail of the driver" in event for event in bench.events)
 
 
@@ -345,8 +337,7 @@ def test_arming_that_the_robot_refuses_is_given_up_at_once():
     bench.robot_obeys = False
     bench.tick(ARM)
     bench.tick(driver_state=DriverState.ARMING)
-    bench.tick(driver_state=DriverState.READY)
-    assert bench.out.driver_request is Request.READY
+    assert bench.tick(driver_state=DriverState.READY).driver_request is Request.READY
     assert any("did not arm: detail of the driver" in event for event in bench.events)
 
 
@@ -362,10 +353,8 @@ def test_a_reset_without_effect_is_given_up_and_said():
     bench = Bench().faulted()
     bench.robot_obeys = False
     bench.tick(RESET)
-    bench.tick(count=149)
-    assert bench.out.driver_request is None
-    bench.tick(count=2)
-    assert bench.out.driver_request is Request.STANDBY
+    assert bench.tick(count=149).driver_request is None
+    assert bench.tick(count=2).driver_request is Request.STANDBY
     assert any("did not reset within 3 s: detail of the driver" in event for event in bench.events)
 
 
@@ -386,8 +375,7 @@ def test_after_a_disarm_the_robot_can_be_armed_again():
     assert bench.tick(count=5).motion_allowed
 
 
-def test_estop_asked_while_disconnected_is_sent_when_the_link_is_up():
-    bench = Bench()
+def test_estop_asked_while_disconnected_is_sent_when_the_link_is_up(bench):
     bench.tick(link_state=LinkState.CONNECTING)
     out = bench.tick(ESTOP)
     assert not out.send_estop
@@ -440,8 +428,7 @@ def test_estop_beats_arm_in_the_same_tick_in_either_order(order):
     assert Request.ARM not in bench.requests_sent
 
 
-def test_what_it_says_of_each_state():
-    bench = Bench()
+def test_what_it_says_of_each_state(bench):
     assert bench.ready().out.detail == "ready to be armed"
     assert bench.tick(ARM).detail == "arming"
     bench.tick(count=3)
@@ -514,8 +501,7 @@ def test_whatever_happens_motion_needs_everything(history):
 # --- recording -------------------------------------------------------------------------------------------------------
 
 
-def test_what_would_not_be_recorded_is_armed_only_if_that_is_asked_for():
-    bench = Bench()
+def test_what_would_not_be_recorded_is_armed_only_if_that_is_asked_for(bench):
     bench.ready()
     out = bench.tick(ARM, recording_fault="nothing is being recorded: no room")
     assert refusal(out) == "nothing is being recorded: no room"
@@ -524,8 +510,7 @@ def test_what_would_not_be_recorded_is_armed_only_if_that_is_asked_for():
     assert bench.tick(count=5).state is State.ARMED
 
 
-def test_a_recorder_that_fails_on_the_way_does_not_stop_the_robot():
-    bench = Bench()
+def test_a_recorder_that_fails_on_the_way_does_not_stop_the_robot(bench):
     bench.running()
     out = bench.tick(recording_fault="nothing is being recorded: no room", count=5)
     assert (out.state, out.running) == (State.ARMED, True)
@@ -533,8 +518,7 @@ def test_a_recorder_that_fails_on_the_way_does_not_stop_the_robot():
 
 
 @pytest.mark.parametrize("state", ["faulted", "stopping"])
-def test_to_arm_unrecorded_needs_all_else_that_arming_needs(state):
-    bench = Bench()
+def test_to_arm_unrecorded_needs_all_else_that_arming_needs(state, bench):
     getattr(bench, state)()
     assert not bench.tick(UserRequest.ARM_UNRECORDED).replies[0].accepted
     ready = Bench()
@@ -555,8 +539,7 @@ def test_a_pose_that_jumps_stops_the_task_and_refuses_a_start_while_it_does():
     assert bench.tick(START, pose_jump="").motion_allowed
 
 
-def test_who_drives_by_hand_sees_a_jump_and_drives_on():
-    bench = Bench()
+def test_who_drives_by_hand_sees_a_jump_and_drives_on(bench):
     bench.ready().tick(ARM)
     bench.tick(count=3)
     assert bench.tick(START, by_hand=True).motion_allowed

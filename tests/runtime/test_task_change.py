@@ -25,7 +25,7 @@ from disco_hw.tasks import CENTER_M, SLOWEST_M_S
 from disco_hw.tasks.circle import RADIUS_M, CircleTask
 from disco_hw.tasks.path import PathTask
 from disco_hw.tasks.timed_path import TimedPathTask
-from tests.runtime.simulated import simulated_stack
+from tests.runtime.simulated import replayed, simulated_stack
 from tests.runtime.test_replay import write_log
 
 ROBOT = Robot(
@@ -163,8 +163,7 @@ def test_another_circle_is_driven_recorded_and_replayed_bit_for_bit(tmp_path):
     off_new, off_old = (math.hypot(estimate.x_m - x, estimate.y_m) - r for x, r in ((0.25, 0.5), (0.0, 0.75)))
     assert abs(off_new) < 0.07 < abs(off_old)
     log = write_log(tmp_path / "run.mcap", stack.recorder.ticks)
-    report = replay(log)
-    assert report.ok, report.as_text()
+    replayed(log)
     # Without the record the planner would have followed the circle of robot.toml.
     untold = [(t, [r for r in tick if not isinstance(r, records.Task)]) for t, tick in stack.recorder.ticks]
     assert not replay(write_log(tmp_path / "untold.mcap", untold)).ok

@@ -10,11 +10,11 @@ from disco_hw.daemon.loop import LoopStats
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.runtime import State
 from disco_hw.runtime.pipeline import Source
-from disco_hw.runtime.replay import replay
 from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.tasks.timed_path import TimedPathTask
 from disco_hw.viewer.recording import Recording
 from tests.runtime.path_robot import timed_path_robot
+from tests.runtime.simulated import replayed
 from tests.runtime.test_path_drive import drive, started, write_log
 
 # Half a minute of compiling; tests/control/tasks/test_timed_path.py drives such a path in every `make test`.
@@ -48,8 +48,7 @@ def test_way_points_are_met_at_their_times_to_the_end_and_replayed_and_shown_wit
     log = write_log(tmp_path / "run.mcap", setup, stack.recorder.ticks)
     (tmp_path / "path.csv").unlink()
     robot_file.unlink()
-    report = replay(log)
-    assert report.ok, report.as_text()
+    replayed(log)
     with Recording(log) as recording:
         shown_task = recording.stage.task_at(recording.at(3.0).task)
     assert shown_task == setup.config.task

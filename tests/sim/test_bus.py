@@ -25,13 +25,23 @@ def scripted_outcomes(*outcomes):
     return ScriptedOutcomes()
 
 
+@pytest.fixture
+def bus():
+    return CanBus()
+
+
+def bus_with(names, *arguments, **options):
+    """Return a bus and its nodes, each called by a letter."""
+    bus = CanBus(*arguments, **options)
+    return bus, *(bus.attach(name) for name in names)
+
+
 def data_of(deliveries):
     return [d for d in deliveries if not d.frame.error]
 
 
 def test_a_frame_arrives_at_its_end_at_all_others():
-    bus = CanBus()
-    a, b, c = (bus.attach(name) for name in "abc")
+    bus, a, b, c = bus_with("abc")
     bus.advance(5_000)
     assert bus.send(a, FRAME)
     end_ns = 5_000 + (frame_bits(FRAME) - 3) * BIT_NS
@@ -42,8 +52,7 @@ def test_a_frame_arrives_at_its_end_at_all_others():
 
 
 def test_frames_follow_after_the_intermission():
-    bus = CanBus()
-    a, _ = bus.attach("a"), bus.attach("b")
+    bus, a, _ = bus_with("ab")
     for _ in range(3):
         bus.send(a, FRAME)
     times = [d.t_ns for d in bus.advance(LONG_NS)]
@@ -54,16 +63,14 @@ def test_frames_follow_after_the_intermission():
 
 @pytest.mark.parametrize("bitrate", [125_000, 83_333, 1_000_000])
 def test_bit_rate(bitrate):
-    bus = CanBus(bitrate)
-    a, _ = bus.attach("a"), bus.attach("b")
+    bus, a, _ = bus_with("ab", bitrate)
     bus.send(a, FRAME)
     (delivery,) = bus.advance(LONG_NS)
     assert delivery.t_ns == pytest.approx((frame_bits(FRAME) - 3) * 1e9 / bitrate, abs=1.0)
 
 
 def test_the_lowest_identifier_wins_and_the_loser_follows():
-    bus = CanBus()
-    a, b, _ = (bus.attach(name) for name in "abc")
+    bus, a, b, _ = bus_with("abc")
     bus.send(a, CanFrame(0x200))
     bus.send(b, CanFrame(0x100))
     assert [(d.sender, d.frame.can_id) for d in bus.advance(LONG_NS)] == [(b, 0x100), (a, 0x200)]
@@ -71,8 +78,7 @@ def test_the_lowest_identifier_wins_and_the_loser_follows():
 
 
 def test_a_frame_on_the_wire_is_not_interrupted():
-    bus = CanBus()
-    a, b = bus.attach("a"), bus.attach("b")
+    bus, a, b = bus_with("ab")
     bus.send(a, CanFrame(0x700))
     bus.advance(10 * BIT_NS)
     bus.send(b, CanFrame(0x001))
@@ -111,16 +117,14 @@ def test_nothing_is_lost_or_reordered_and_the_wire_is_never_used_twice(sends, or
         assert after - before >= frame_bits(delivery.frame) * BIT_NS
 
 
-def test_own_frames_come_back_only_if_asked():
-    bus = CanBus()
+def test_own_frames_come_back_only_if_asked(bus):
     a, b = bus.attach("a", echo=True), bus.attach("b")
     bus.send(a, FRAME)
     bus.send(b, CanFrame(0x700))
     assert [d.receivers for d in bus.advance(LONG_NS)] == [(b, a), (a,)]
 
 
-def test_a_full_queue_refuses():
-    bus = CanBus()
+def test_a_full_queue_refuses(bus):
     a, _ = bus.attach("a", capacity=2), bus.attach("b")
     assert [bus.send(a, FRAME) for _ in range(3)] == [True, True, False]
     assert a.refused_full == 1
@@ -129,8 +133,7 @@ def test_a_full_queue_refuses():
 
 
 def test_a_destroyed_frame_is_sent_again_after_an_error_frame():
-    bus = CanBus(fault=scripted_outcomes(FrameOutcome(wire_error_bit=30)))
-    a, b = bus.attach("a"), bus.attach("b")
+    bus, a, b = bus_with("ab", fault=scripted_outcomes(FrameOutcome(wire_error_bit=30)))
     bus.send(a, FRAME)
     (delivery,) = bus.advance(LONG_NS)
     error_ns = (30 + 1 + 6 + 6 + 8 + 3) * BIT_NS
@@ -139,8 +142,7 @@ def test_a_destroyed_frame_is_sent_again_after_an_error_frame():
 
 
 def test_a_frame_destroyed_for_ever_ends_in_bus_off_and_the_bus_is_free_again():
-    bus = CanBus(fault=scripted_outcomes(*[FrameOutcome(wire_error_bit=20)] * 32))
-    a, b = bus.attach("a"), bus.attach("b")
+    bus, a, b = bus_with("ab", fault=scripted_outcomes(*[FrameOutcome(wire_error_bit=20)] * 32))
     bus.send(a, FRAME)
     bus.send(a, FRAME)
     out = bus.advance(LONG_NS)
@@ -155,8 +157,7 @@ def test_a_frame_destroyed_for_ever_ends_in_bus_off_and_the_bus_is_free_again():
 
 
 def test_an_error_passive_sender_waits_eight_bits_before_it_sends_again():
-    bus = CanBus(fault=scripted_outcomes(*[FrameOutcome(wire_error_bit=20)] * 16))
-    a, b = bus.attach("a"), bus.attach("b")
+    bus, a, b = bus_with("ab", fault=scripted_outcomes(*[FrameOutcome(wire_error_bit=20)] * 16))
     bus.send(a, CanFrame(0x100))
     bus.advance(16 * (20 + 1 + 6 + 6 + 8 + 3) * BIT_NS)
     assert a.state is ErrorState.PASSIVE
@@ -164,8 +165,7 @@ def test_an_error_passive_sender_waits_eight_bits_before_it_sends_again():
     assert [d.frame.can_id for d in data_of(bus.advance(LONG_NS))] == [0x700, 0x100]
 
 
-def test_a_lone_node_repeats_for_ever_and_stays_error_passive():
-    bus = CanBus()
+def test_a_lone_node_repeats_for_ever_and_stays_error_passive(bus):
     a = bus.attach("a", capacity=3)
     for _ in range(4):
         bus.send(a, FRAME)
@@ -175,8 +175,7 @@ def test_a_lone_node_repeats_for_ever_and_stays_error_passive():
     assert len(data_of(bus.advance(2 * 10**8))) == 3
 
 
-def test_a_missing_acknowledgement_takes_the_frame_up_to_its_slot_and_an_error_flag():
-    bus = CanBus()
+def test_a_missing_acknowledgement_takes_the_frame_up_to_its_slot_and_an_error_flag(bus):
     a = bus.attach("a")
     bus.send(a, FRAME)
     bus.advance(0)
@@ -184,8 +183,7 @@ def test_a_missing_acknowledgement_takes_the_frame_up_to_its_slot_and_an_error_f
 
 
 def test_a_bus_off_node_acknowledges_nothing():
-    bus = CanBus()
-    a, b = bus.attach("a"), bus.attach("b")
+    bus, a, b = bus_with("ab")
     bus.force_bus_off(b)
     bus.send(a, FRAME)
     assert data_of(bus.advance(10**8)) == []
@@ -193,8 +191,7 @@ def test_a_bus_off_node_acknowledges_nothing():
 
 
 def test_forced_bus_off_is_reported_at_once():
-    bus = CanBus()
-    a, _ = bus.attach("a"), bus.attach("b")
+    bus, a, _ = bus_with("ab")
     bus.advance(9_000)
     bus.force_bus_off(a)
     assert bus.next_event_ns() == 9_000
@@ -202,8 +199,7 @@ def test_forced_bus_off_is_reported_at_once():
 
 
 def test_recovery_from_bus_off_takes_128_times_11_recessive_bits_after_the_request():
-    bus = CanBus()
-    a, _ = bus.attach("a"), bus.attach("b")
+    bus, a, _ = bus_with("ab")
     bus.force_bus_off(a)
     bus.advance(LONG_NS)
     assert a.state is ErrorState.BUS_OFF
@@ -217,8 +213,7 @@ def test_recovery_from_bus_off_takes_128_times_11_recessive_bits_after_the_reque
     assert bus.send(a, FRAME)
 
 
-def test_on_a_busy_bus_each_frame_counts_once_towards_recovery():
-    bus = CanBus()
+def test_on_a_busy_bus_each_frame_counts_once_towards_recovery(bus):
     a, b, _ = (bus.attach(name, capacity=1000) for name in "abc")
     bus.force_bus_off(a)
     bus.request_recovery(a)
@@ -230,8 +225,7 @@ def test_on_a_busy_bus_each_frame_counts_once_towards_recovery():
 
 
 def test_idle_bits_before_a_frame_count_towards_recovery():
-    bus = CanBus()
-    a, b, _ = (bus.attach(name) for name in "abc")
+    bus, a, b, _ = bus_with("abc")
     bus.force_bus_off(a)
     bus.request_recovery(a)
     bus.advance(100 * 11 * BIT_NS)
@@ -242,8 +236,7 @@ def test_idle_bits_before_a_frame_count_towards_recovery():
 
 @pytest.mark.parametrize("bitrate", [83_333, 125_000, None])
 def test_recovery_completes_at_any_bit_rate(bitrate):
-    bus = CanBus(bitrate)
-    a, _ = bus.attach("a"), bus.attach("b")
+    bus, a, _ = bus_with("ab", bitrate)
     bus.advance(12_345)
     bus.force_bus_off(a)
     bus.request_recovery(a)
@@ -251,16 +244,14 @@ def test_recovery_completes_at_any_bit_rate(bitrate):
     assert a.state is ErrorState.ACTIVE
 
 
-def test_recovery_needs_bus_off():
-    bus = CanBus()
+def test_recovery_needs_bus_off(bus):
     a = bus.attach("a")
     bus.request_recovery(a)
     assert bus.next_event_ns() is None
 
 
 def test_lost_frame_is_acknowledged_and_reaches_nobody():
-    bus = CanBus(fault=scripted_outcomes(FrameOutcome(lost=True)))
-    a, b = bus.attach("a"), bus.attach("b")
+    bus, a, b = bus_with("ab", fault=scripted_outcomes(FrameOutcome(lost=True)))
     bus.send(a, FRAME)
     assert bus.advance(LONG_NS) == []
     assert (a.sent, a.tec, b.received) == (1, 0, 0)
@@ -275,8 +266,7 @@ def test_one_way_loss():
 
 
 def test_duplicate():
-    bus = CanBus(fault=scripted_outcomes(FrameOutcome(copies=2)))
-    a, b = bus.attach("a"), bus.attach("b")
+    bus, a, b = bus_with("ab", fault=scripted_outcomes(FrameOutcome(copies=2)))
     bus.send(a, FRAME)
     assert [d.frame for d in bus.advance(LONG_NS)] == [FRAME, FRAME]
     assert (a.sent, b.received) == (1, 2)
@@ -294,8 +284,7 @@ def test_delay_reorders():
 
 
 def test_deliveries_are_in_order_of_time_even_over_a_long_stride():
-    bus = CanBus(fault=scripted_outcomes(FrameOutcome(delay_ns=1_000_000)))
-    a, _ = bus.attach("a"), bus.attach("b")
+    bus, a, _ = bus_with("ab", fault=scripted_outcomes(FrameOutcome(delay_ns=1_000_000)))
     bus.send(a, CanFrame(1))
     bus.advance(0)
     for can_id in range(2, 30):
@@ -307,8 +296,7 @@ def test_deliveries_are_in_order_of_time_even_over_a_long_stride():
 
 @pytest.mark.parametrize("data", [b"", b"\x01", bytes(7), bytes.fromhex("8d306902b4fb2c02")])
 def test_payload_corrupted_behind_the_crc(data):
-    bus = CanBus(fault=scripted_outcomes(FrameOutcome(data=data)))
-    a, _ = bus.attach("a"), bus.attach("b")
+    bus, a, _ = bus_with("ab", fault=scripted_outcomes(FrameOutcome(data=data)))
     bus.send(a, FRAME)
     (delivery,) = bus.advance(LONG_NS)
     assert (delivery.frame.can_id, delivery.frame.data) == (0x110, data)
@@ -317,8 +305,7 @@ def test_payload_corrupted_behind_the_crc(data):
 
 def test_faults_are_asked_with_time_sender_and_frame():
     fault = scripted_outcomes()
-    bus = CanBus(fault=fault)
-    a, _ = bus.attach("a"), bus.attach("b")
+    bus, a, _ = bus_with("ab", fault=fault)
     bus.advance(700)
     bus.send(a, FRAME)
     bus.advance(LONG_NS)
@@ -326,8 +313,7 @@ def test_faults_are_asked_with_time_sender_and_frame():
 
 
 def test_equal_frames_at_the_same_time_merge():
-    bus = CanBus()
-    a, b, c = (bus.attach(name) for name in "abc")
+    bus, a, b, c = bus_with("abc")
     bus.send(a, FRAME)
     bus.send(b, FRAME)
     assert [d.receivers for d in bus.advance(LONG_NS)] == [(c,)]
@@ -336,8 +322,7 @@ def test_equal_frames_at_the_same_time_merge():
 
 def test_two_nodes_with_one_identifier_destroy_each_other():
     """The classic mistake: both win arbitration, differ in the data, and drive each other to bus-off."""
-    bus = CanBus()
-    a, b, _ = (bus.attach(name) for name in "abc")
+    bus, a, b, _ = bus_with("abc")
     one, other = CanFrame(0x100, b"\x00\xff"), CanFrame(0x100, b"\x00\xfe")
     bus.send(a, one)
     bus.send(b, other)
@@ -349,8 +334,7 @@ def test_two_nodes_with_one_identifier_destroy_each_other():
     assert (a.state, b.state) == (ErrorState.BUS_OFF, ErrorState.BUS_OFF)
 
 
-def test_a_babbling_node_starves_higher_identifiers_only():
-    bus = CanBus()
+def test_a_babbling_node_starves_higher_identifiers_only(bus):
     babbler, low, high, _ = (bus.attach(name, capacity=4) for name in "abcd")
     got = []
     bus.send(high, CanFrame(0x700))
@@ -366,8 +350,7 @@ def test_a_babbling_node_starves_higher_identifiers_only():
 
 def test_log_is_candump():
     lines = []
-    bus = CanBus(fault=scripted_outcomes(FrameOutcome(wire_error_bit=0)), log=lines.append)
-    a, _ = bus.attach("a"), bus.attach("b")
+    bus, a, _ = bus_with("ab", fault=scripted_outcomes(FrameOutcome(wire_error_bit=0)), log=lines.append)
     bus.send(a, FRAME)
     bus.advance(LONG_NS)
     assert lines == [
@@ -377,8 +360,7 @@ def test_log_is_candump():
 
 
 def test_a_detached_node_is_gone():
-    bus = CanBus()
-    a, b = bus.attach("a"), bus.attach("b")
+    bus, a, b = bus_with("ab")
     bus.send(b, FRAME)
     bus.detach(b)
     assert bus.advance(LONG_NS) == []
@@ -386,8 +368,7 @@ def test_a_detached_node_is_gone():
 
 
 def test_a_node_detached_in_recovery_is_forgotten():
-    bus = CanBus()
-    a, _ = bus.attach("a"), bus.attach("b")
+    bus, a, _ = bus_with("ab")
     bus.force_bus_off(a)
     bus.request_recovery(a)
     bus.detach(a)
@@ -396,23 +377,20 @@ def test_a_node_detached_in_recovery_is_forgotten():
 
 
 def test_without_a_bit_rate_a_frame_takes_no_time():
-    bus = CanBus(None)
-    a, _ = bus.attach("a"), bus.attach("b")
+    bus, a, _ = bus_with("ab", None)
     bus.advance(77)
     for can_id in (3, 1, 2):
         bus.send(a, CanFrame(can_id))
     assert [(d.t_ns, d.frame.can_id) for d in bus.advance(77)] == [(77, 1), (77, 2), (77, 3)]
 
 
-def test_time_does_not_go_back():
-    bus = CanBus()
+def test_time_does_not_go_back(bus):
     bus.advance(10)
     with pytest.raises(ValueError, match="cannot go back"):
         bus.advance(9)
 
 
-def test_error_frames_cannot_be_sent():
-    bus = CanBus()
+def test_error_frames_cannot_be_sent(bus):
     a = bus.attach("a")
     with pytest.raises(ValueError, match="error frame"):
         bus.send(a, CanFrame(0x40, bytes(8), error=True))

@@ -32,6 +32,13 @@ def pose(us, x=1.0):
     return PoseMeasurement(us, us, x, 2.0, 0.5, 0.01, 0.01)
 
 
+def under(kind, **values):
+    """Return the faults of a robot under one fault."""
+    faults = RobotFaults()
+    faults.set_active([fault(kind, **values)])
+    return faults
+
+
 def test_without_faults_nothing_is_touched():
     faults, given = RobotFaults(), inputs(500)
     assert faults.inputs(given, (3.0, 3.0), True) is given
@@ -41,8 +48,7 @@ def test_without_faults_nothing_is_touched():
 
 
 def test_a_stuck_encoder_loses_what_it_did_not_count():
-    faults = RobotFaults()
-    faults.set_active([fault("encoder_stuck", wheel="left")])
+    faults = under("encoder_stuck", wheel="left")
     assert [seen(faults, ticks).left_ticks for ticks in (100, 200, 300)] == [100, 100, 100]
     assert seen(faults, 300).left_speed_rad_s == 0.0
     assert seen(faults, 300).right_speed_rad_s == 3.0
@@ -52,8 +58,7 @@ def test_a_stuck_encoder_loses_what_it_did_not_count():
 
 
 def test_a_reversed_encoder_counts_down_without_a_jump_and_up_again():
-    faults = RobotFaults()
-    faults.set_active([fault("encoder_reversed", wheel="left")])
+    faults = under("encoder_reversed", wheel="left")
     assert [seen(faults, ticks).left_ticks for ticks in (100, 110, 130)] == [100, 90, 70]
     assert seen(faults, 130).left_speed_rad_s == -3.0
     faults.set_active([])
@@ -69,14 +74,12 @@ def test_a_jump_stays():
 
 
 def test_a_short_counter_wraps():
-    faults = RobotFaults()
-    faults.set_active([fault("encoder_wrap", wheel="left", bits=8)])
+    faults = under("encoder_wrap", wheel="left", bits=8)
     assert [seen(faults, ticks).left_ticks for ticks in (250, 255, 256, 600)] == [250, 255, 0, 88]
 
 
 def test_a_stalled_motor_does_not_turn_and_draws_current_while_it_is_asked_to():
-    faults = RobotFaults()
-    faults.set_active([fault("motor_stall", wheel="left")])
+    faults = under("motor_stall", wheel="left")
     assert faults.setpoints(3.0, 3.0, is_driven=True) == (0.0, 3.0)
     assert seen(faults, 0, (-3.0, 3.0)).left_current_a == -18.0
     assert seen(faults, 0, (0.0, 3.0)).left_current_a == 1.0
@@ -84,15 +87,13 @@ def test_a_stalled_motor_does_not_turn_and_draws_current_while_it_is_asked_to():
 
 
 def test_a_motor_that_runs_away_stops_when_its_controller_drives_it_no_longer():
-    faults = RobotFaults()
-    faults.set_active([fault("motor_runaway", wheel="right", speed_rad_s=12.0)])
+    faults = under("motor_runaway", wheel="right", speed_rad_s=12.0)
     assert faults.setpoints(3.0, 3.0, is_driven=True) == (3.0, 12.0)
     assert faults.setpoints(0.0, 0.0, is_driven=False) == (0.0, 0.0)
 
 
 def test_a_disconnected_encoder_trembles_where_it_stood():
-    faults = RobotFaults()
-    faults.set_active([fault("encoder_disconnected", wheel="left")])
+    faults = under("encoder_disconnected", wheel="left")
     counts = [seen(faults, ticks).left_ticks for ticks in range(100, 200)]
     assert max(counts) - min(counts) <= 6 < len(counts)
     assert len(set(counts)) > 1
@@ -100,8 +101,7 @@ def test_a_disconnected_encoder_trembles_where_it_stood():
 
 
 def test_a_sagging_battery_stops_at_nothing():
-    faults = RobotFaults()
-    faults.set_active([fault("battery_sag", drop_v=6.0)])
+    faults = under("battery_sag", drop_v=6.0)
     assert seen(faults, 0).voltage_v == 18.0
     faults.set_active([fault("battery_sag", drop_v=60.0)])
     assert seen(faults, 0).voltage_v == 0.0
@@ -116,8 +116,7 @@ def test_a_sagging_battery_stops_at_nothing():
     ],
 )
 def test_poses_that_are_wrong(kind, values, expected):
-    faults = RobotFaults()
-    faults.set_active([fault(kind, **values)])
+    faults = under(kind, **values)
     (found,) = faults.poses(0, [pose(0)])
     assert (found.x_m, found.y_m, found.yaw_rad) == pytest.approx(expected, nan_ok=True)
     assert found.sample_us == 0
@@ -132,8 +131,7 @@ def test_a_frozen_sensor_repeats_the_last_pose_under_new_stamps():
 
 
 def test_late_poses_keep_their_stamps_and_their_order_and_none_is_lost():
-    faults = RobotFaults()
-    faults.set_active([fault("pose_late", delay_s=0.1)])
+    faults = under("pose_late", delay_s=0.1)
     assert faults.poses(0, [pose(0)]) == []
     assert faults.poses(99_999, [pose(40_000)]) == []
     assert [p.sample_us for p in faults.poses(100_000, [])] == [0]
@@ -142,8 +140,7 @@ def test_late_poses_keep_their_stamps_and_their_order_and_none_is_lost():
 
 
 def test_a_silent_sensor_says_nothing():
-    faults = RobotFaults()
-    faults.set_active([fault("pose_silent")])
+    faults = under("pose_silent")
     assert faults.poses(0, [pose(0)]) == []
 
 

@@ -95,6 +95,11 @@ class Setup:
         self.host.request = "ARM"
         self.run(2000, until=lambda: self.host.robot_state == "ARMED")
 
+    def drive(self, left_rad_s, right_rad_s, milliseconds):
+        self.arm()
+        self.host.speeds = (left_rad_s, right_rad_s)
+        self.run(milliseconds)
+
     def wheel_speed(self):
         truth = self.robot.truth
         return max(abs(truth.left_speed_rad_s), abs(truth.right_speed_rad_s))
@@ -131,9 +136,7 @@ def test_handshake_arm_drive_stop(setup):
 
 
 def test_silence_stops_the_wheels_in_time(setup):
-    setup.arm()
-    setup.host.speeds = (4.0, 4.0)
-    setup.run(1000)
+    setup.drive(4.0, 4.0, 1000)
     assert setup.wheel_speed() == pytest.approx(4.0, abs=0.05)
     setup.host.silent = True
     decelerating_s = 4.0 / CONFIG.stop_deceleration_rad_s2
@@ -147,9 +150,7 @@ def test_silence_stops_the_wheels_in_time(setup):
 
 
 def test_coasting_wheels_roll_on_and_braked_ones_stop(setup):
-    setup.arm()
-    setup.host.speeds = (4.0, 4.0)
-    setup.run(1000)
+    setup.drive(4.0, 4.0, 1000)
     setup.host.mode, setup.host.speeds = "COAST", (0.0, 0.0)
     setup.run(200)
     assert not setup.robot.outputs.driver_enabled
@@ -163,9 +164,7 @@ def test_coasting_wheels_roll_on_and_braked_ones_stop(setup):
 
 
 def test_the_estop_button_stops_and_latches(setup):
-    setup.arm()
-    setup.host.speeds = (4.0, 4.0)
-    setup.run(500)
+    setup.drive(4.0, 4.0, 500)
     setup.robot.estop_button = True
     setup.run(700)
     assert setup.wheel_speed() < 0.01
@@ -177,9 +176,7 @@ def test_the_estop_button_stops_and_latches(setup):
 
 
 def test_ticks_and_pose_show_what_the_plant_does(setup):
-    setup.arm()
-    setup.host.speeds = (3.0, 3.0)
-    setup.run(2000)
+    setup.drive(3.0, 3.0, 2000)
     setup.host.speeds = (0.0, 0.0)
     setup.run(1000)
     truth, ticks = setup.robot.truth, setup.host.latest["WHEEL_TICKS"]
@@ -235,9 +232,7 @@ def test_kidnapping_moves_the_pose_and_not_the_ticks(setup):
 
 
 def test_a_restart_forgets_the_session_and_stands_still(setup):
-    setup.arm()
-    setup.host.speeds = (4.0, 4.0)
-    setup.run(500)
+    setup.drive(4.0, 4.0, 500)
     position = setup.robot.truth.x_m
     setup.robot.reboot()
     assert setup.robot.outputs.left_setpoint_rad_s == 0.0
@@ -281,9 +276,7 @@ def test_two_runs_with_one_seed_are_equal():
     runs = []
     for _ in range(2):
         setup = Setup(parameters=PlantParameters(), challenge_seed=5)
-        setup.arm()
-        setup.host.speeds = (3.0, 2.0)
-        setup.run(500)
+        setup.drive(3.0, 2.0, 500)
         runs.append((setup.frames, setup.robot.truth))
     assert runs[0] == runs[1]
 

@@ -12,6 +12,7 @@ import termios
 import threading
 import time
 import tty
+from contextlib import closing
 from pathlib import Path
 
 import can
@@ -87,8 +88,7 @@ def test_frames_that_this_protocol_has_not_are_counted_as_malformed(transport, o
 
 
 def test_the_stamp_is_the_kernels_not_that_of_reading(other):
-    connection = CanMedium("socketcan", VCAN, 500_000).connect(TransportCounters())
-    try:
+    with closing(CanMedium("socketcan", VCAN, 500_000).connect(TransportCounters())) as connection:
         connection.read()
         before_ns = time.monotonic_ns()
         other.send(0x110, b"stamped")
@@ -98,8 +98,6 @@ def test_the_stamp_is_the_kernels_not_that_of_reading(other):
         slack_ns = 2_000_000
         assert before_ns - slack_ns <= received.t_ns <= after_ns + slack_ns
         assert time.monotonic_ns() - received.t_ns > 250_000_000
-    finally:
-        connection.close()
 
 
 def test_the_kernels_filter_lets_through_what_it_is_set_to(other):
@@ -135,12 +133,9 @@ def test_an_interface_that_goes_down_is_waited_for(transport):
 
 
 def test_an_absent_interface_is_named():
-    opened = open_transport("can", interface="socketcan", channel="can77")
-    try:
+    with closing(open_transport("can", interface="socketcan", channel="can77")) as opened:
         wait_until(lambda: opened.last_error and "can77" in opened.last_error, PATIENCE_S)
         assert opened.state is LinkState.CONNECTING
-    finally:
-        opened.close()
 
 
 class SlcanAdapter:
@@ -187,8 +182,7 @@ def slcan():
 
 
 def test_a_real_bus_off_keeps_the_link_down_until_the_controller_is_restarted(slcan):
-    opened = open_transport("can", interface="socketcan", channel=slcan.channel)
-    try:
+    with closing(open_transport("can", interface="socketcan", channel=slcan.channel)) as opened:
         wait_until(lambda: opened.state is LinkState.UP, PATIENCE_S)
         slcan.send_line(b"t1102AABB\r")
         assert collect(opened, 1, PATIENCE_S)[0].frame.data == b"\xaa\xbb"
@@ -206,16 +200,11 @@ def test_a_real_bus_off_keeps_the_link_down_until_the_controller_is_restarted(sl
         wait_until(lambda: opened.state is LinkState.UP, PATIENCE_S)
         slcan.send_line(b"t1101CC\r")
         assert collect(opened, 1, PATIENCE_S)[-1].frame.data == b"\xcc"
-    finally:
-        opened.close()
 
 
 def test_an_adapter_that_is_pulled_out_is_a_lost_link(slcan):
-    opened = open_transport("can", interface="socketcan", channel=slcan.channel)
-    try:
+    with closing(open_transport("can", interface="socketcan", channel=slcan.channel)) as opened:
         wait_until(lambda: opened.state is LinkState.UP, PATIENCE_S)
         slcan.close()
         wait_until(lambda: opened.state is LinkState.CONNECTING, PATIENCE_S)
         assert slcan.channel in opened.last_error
-    finally:
-        opened.close()

@@ -1,20 +1,16 @@
 """A path by arc length: followed forwards, at its speed, through crossings and sharp turns, to its end."""
 
 import math
-from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 
-from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, PlanOutcome
-from disco_hw.experiments.circle import KinematicPlant
-from disco_hw.model import load_model
+from disco_hw.control import PlannerState, PlanOutcome
 from disco_hw.tasks.line import SPACING_M, PathTable, Waypoints, sharp_turns
 from tests.tasks.costs import path_along
+from tests.tasks.drives import SPIN, begin_with, drive, planner_for, plant_at
 
-MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
-MEAN = {"wheel_radius_m": 0.061, "axial_distance_m": 0.415, "x_icr_m": 0.238}
 ANGLE = np.linspace(0.0, 2.0 * np.pi, 200)
 EIGHT = Waypoints(np.column_stack([1.5 * np.sin(ANGLE), 0.75 * np.sin(2.0 * ANGLE)]))
 CORNER = Waypoints(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]))
@@ -22,15 +18,13 @@ CORNER = Waypoints(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]))
 
 def follow(task, seconds, start):
     """Drive along; returns poses (N, 3), speeds (N,) and places (N,) on the path."""
-    plant = KinematicPlant(MEAN, start, 0.1, 0.0, 1)
-    disco = Disco(MODEL, task, DiscoSettings(), CommandLimits(8.0, 20.0), 2)
-    found = []
-    for step in range(round(seconds * 10)):
-        now_ns = step * 100_000_000
-        state = PlannerState(now_ns, plant.x_m, plant.y_m, plant.yaw_rad, *plant.wheels)
-        plant.advance(*disco.plan(now_ns, state).at(now_ns), 0.1)
-        found.append((plant.x_m, plant.y_m, plant.yaw_rad, plant.forward_m_s, disco._memory))
-    found = np.array(found)
+    plant, disco = plant_at(*start), planner_for(task)
+    found = np.array(
+        [
+            (plant.x_m, plant.y_m, plant.yaw_rad, plant.forward_m_s, disco._memory)
+            for _ in drive(disco, plant, range(round(seconds * 10)))
+        ]
+    )
     return found[:, :3], found[:, 3], found[:, 4]
 
 
@@ -65,30 +59,17 @@ def test_a_start_beside_the_path_joins_it():
 
 
 ROUND = Waypoints(np.column_stack([np.sin(ANGLE), 1.0 - np.cos(ANGLE)]))
-# Wheel speeds (rad/s) of spinning at 1.6 rad/s about the point of rotation.
-SPIN = 1.6 * MEAN["axial_distance_m"] / MEAN["wheel_radius_m"] / 2.0
 
 
 @pytest.mark.parametrize("trap", ["standing", "spinning"])
 def test_the_planner_leaves_the_traps(trap):
     task = path_along(ROUND, speed_m_s=0.2)
-    plant = KinematicPlant(MEAN, (0.0, 0.0, 0.0), 0.1, 0.0, 1)
-    disco = Disco(MODEL, task, DiscoSettings(), CommandLimits(8.0, 20.0), 2)
-    if trap == "spinning":
-        plant.wheels = (-SPIN, SPIN)
-    # The trap is the plan that it starts from.
-    disco.plan(0, PlannerState(0, 0.0, 0.0, 0.0, *plant.wheels))
-    disco.optimiser.set_nominal(np.broadcast_to(plant.wheels, (disco.settings.sampler.horizon, 2)))
-    poses, places = [], []
-    for step in range(1, 151):
-        now_ns = step * 100_000_000
-        state = PlannerState(now_ns, plant.x_m, plant.y_m, plant.yaw_rad, *plant.wheels)
-        plant.advance(*disco.plan(now_ns, state).at(now_ns), 0.1)
-        poses.append((plant.x_m, plant.y_m, plant.yaw_rad))
-        places.append(disco._memory)
+    plant, disco = plant_at(0.0, 0.0, 0.0), planner_for(task)
+    begin_with(disco, plant, (-SPIN, SPIN) if trap == "spinning" else (0.0, 0.0))
+    poses = [(plant.x_m, plant.y_m, plant.yaw_rad) for _ in drive(disco, plant, range(1, 151))]
     assert distance_to(ROUND, np.array(poses))[80:].mean() < 0.05
     # 15 s at 0.2 m/s, less the way out of the trap.
-    assert places[-1] * task.path.spacing_m > 2.2
+    assert disco._memory * task.path.spacing_m > 2.2
 
 
 def test_a_round_path_is_driven_forwards():
@@ -187,7 +168,7 @@ def test_a_path_without_length_is_refused():
 @pytest.mark.parametrize("broken", [{"x_m": math.nan}, {"y_m": -math.inf}, {"yaw_rad": math.nan}])
 @pytest.mark.parametrize("waypoints", [EIGHT, BACK, CORNER])
 def test_a_state_that_is_none_is_reported_and_forgotten(waypoints, broken):
-    disco = Disco(MODEL, path_along(waypoints), DiscoSettings(), CommandLimits(8.0, 20.0), 2)
+    disco = planner_for(path_along(waypoints))
     good = PlannerState(0, 0.1, 0.0, 0.0, 0.0, 0.0)
     disco.plan(0, good)
     stopping = disco.plan(100_000_000, msgspec.structs.replace(good, t_ns=100_000_000, **broken))

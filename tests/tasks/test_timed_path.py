@@ -1,70 +1,47 @@
 """A path by time: being at each place when its time has come."""
 
 import math
-from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
 
-from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState
-from disco_hw.experiments.circle import KinematicPlant
-from disco_hw.model import load_model
 from disco_hw.tasks.line import Waypoints
 from disco_hw.tasks.timed_path import TimedPathCost
+from tests.tasks.drives import SPIN, begin_with, drive, planner_for, plant_at
 
-MODEL = load_model(FilePath(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
-MEAN = {"wheel_radius_m": 0.061, "axial_distance_m": 0.415, "x_icr_m": 0.238}
 ANGLE = np.linspace(0.0, 2.0 * np.pi, 100)
 ROUND = Waypoints(np.column_stack([np.sin(ANGLE), 1.0 - np.cos(ANGLE)]), 5.0 + 4.0 * ANGLE)
 
 
 def test_places_are_reached_at_their_times_after_waiting_for_the_first():
     task = TimedPathCost(ROUND)
-    plant = KinematicPlant(MEAN, (0.0, 0.0, 0.3), 0.1, 0.0, 1)
-    disco = Disco(MODEL, task, DiscoSettings(), CommandLimits(8.0, 20.0), 2)
-    off = []
-    for step in range(350):
-        now_ns = 10**12 + step * 100_000_000
-        state = PlannerState(now_ns, plant.x_m, plant.y_m, plant.yaw_rad, *plant.wheels)
-        plant.advance(*disco.plan(now_ns, state).at(now_ns), 0.1)
-        off.append(task.instant_cost((step + 1) * 0.1, plant.x_m, plant.y_m, plant.forward_m_s))
+    plant = plant_at(0.0, 0.0, 0.3)
+    off = [
+        task.instant_cost((step - 9_999) * 0.1, plant.x_m, plant.y_m, plant.forward_m_s)
+        for step in drive(planner_for(task), plant, range(10_000, 10_350))
+    ]
     assert np.mean(off[60:]) < 0.05
     assert np.max(off[100:]) < 0.12
-
-
-# Wheel speeds (rad/s) of spinning at 1.6 rad/s about the point of rotation.
-SPIN = 1.6 * MEAN["axial_distance_m"] / MEAN["wheel_radius_m"] / 2.0
 
 
 @pytest.mark.parametrize("trap", ["standing", "spinning"])
 def test_the_planner_leaves_the_traps(trap):
     task = TimedPathCost(Waypoints(ROUND.places_m, 4.0 * ANGLE))
-    plant = KinematicPlant(MEAN, (0.0, 0.0, 0.0), 0.1, 0.0, 1)
-    disco = Disco(MODEL, task, DiscoSettings(), CommandLimits(8.0, 20.0), 2)
-    if trap == "spinning":
-        plant.wheels = (-SPIN, SPIN)
-    # The trap is the plan that it starts from.
-    disco.plan(0, PlannerState(0, 0.0, 0.0, 0.0, *plant.wheels))
-    disco.optimiser.set_nominal(np.broadcast_to(plant.wheels, (disco.settings.sampler.horizon, 2)))
-    off = []
-    for step in range(1, 151):
-        now_ns = step * 100_000_000
-        state = PlannerState(now_ns, plant.x_m, plant.y_m, plant.yaw_rad, *plant.wheels)
-        plant.advance(*disco.plan(now_ns, state).at(now_ns), 0.1)
-        off.append(task.instant_cost((step + 1) * 0.1, plant.x_m, plant.y_m, plant.forward_m_s))
+    plant, disco = plant_at(0.0, 0.0, 0.0), planner_for(task)
+    begin_with(disco, plant, (-SPIN, SPIN) if trap == "spinning" else (0.0, 0.0))
+    off = [
+        task.instant_cost((step + 1) * 0.1, plant.x_m, plant.y_m, plant.forward_m_s)
+        for step in drive(disco, plant, range(1, 151))
+    ]
     assert np.mean(off[-50:]) < 0.08
 
 
 @pytest.mark.parametrize("yaw_rad", [0.0, math.pi])
 def test_it_is_followed_forwards(yaw_rad):
     task = TimedPathCost(Waypoints(ROUND.places_m, 4.0 * ANGLE))
-    plant = KinematicPlant(MEAN, (0.0, 0.0, yaw_rad), 0.1, 0.0, 1)
-    disco = Disco(MODEL, task, DiscoSettings(), CommandLimits(8.0, 20.0), 2)
+    plant = plant_at(0.0, 0.0, yaw_rad)
     speeds, off = [], []
-    for step in range(200):
-        now_ns = step * 100_000_000
-        state = PlannerState(now_ns, plant.x_m, plant.y_m, plant.yaw_rad, *plant.wheels)
-        plant.advance(*disco.plan(now_ns, state).at(now_ns), 0.1)
+    for step in drive(planner_for(task), plant, range(200)):
         speeds.append(plant.forward_m_s)
         off.append(task.instant_cost((step + 1) * 0.1, plant.x_m, plant.y_m, plant.forward_m_s))
     assert min(speeds[60:]) > -0.02

@@ -213,7 +213,9 @@ COMPLETE_STATUS = {
 }  # fmt: skip
 
 
-def test_the_circle_is_dragged_with_the_mouse_and_set(browser, tmp_path):
+@pytest.fixture
+def operated(tmp_path):
+    """A page beside a daemon that does what it is asked to: address, page, daemon and the operator's desk."""
     daemon = Daemon(tmp_path / "run")
     daemon.status = COMPLETE_STATUS
     desk, ending = Desk(daemon.server.path, ROBOT_FILE), threading.Event()
@@ -223,22 +225,7 @@ def test_the_circle_is_dragged_with_the_mouse_and_set(browser, tmp_path):
         thread = threading.Thread(target=run_live, args=(live, ending.is_set))
         thread.start()
         try:
-            with opened(browser, page.url, 760, 600) as tab:
-                tab.get_by_role("button", name="Task…").click()
-                tab.get_by_text("drag the balls").wait_for()
-                wait_for(tab, lambda: live.editor.balls["middle"].visible)
-                tab.evaluate("() => { document.getElementById('task').style.visibility = 'hidden'; }")
-                tab.wait_for_timeout(3000)
-                drag(tab, (0.0, 0.0), (0.3, -0.2))
-                wait_for(tab, lambda: desk.draft["center_x_m"] == pytest.approx(0.3, abs=0.08))
-                assert desk.draft["center_y_m"] == pytest.approx(-0.2, abs=0.08)
-                keep(tab, "task-dragged")
-                tab.evaluate("() => { document.getElementById('task').style.visibility = ''; }")
-                wait_for(tab, lambda: float(tab.get_by_label("Centre x (m)").input_value()) == desk.draft["center_x_m"])
-                tab.get_by_role("button", name="Set the task").click()
-                wait_for(tab, lambda: any(action == "task" for action, _ in daemon.received))
-                requested = next(arguments for action, arguments in daemon.received if action == "task")
-                assert requested["center_x_m"] == desk.draft["center_x_m"]
+            yield page.url, live, daemon, desk
         finally:
             ending.set()
             thread.join()
@@ -246,42 +233,49 @@ def test_the_circle_is_dragged_with_the_mouse_and_set(browser, tmp_path):
             daemon.close()
 
 
-def test_the_fence_is_typed_and_cornered_by_the_robots_nose_and_put_in_force(browser, tmp_path):
-    daemon = Daemon(tmp_path / "run")
-    daemon.status = COMPLETE_STATUS
-    desk, ending = Desk(daemon.server.path, ROBOT_FILE), threading.Event()
-    with serving("test", port=0, desk=desk) as page:
-        live = LivePage(page.server, stage_of_robot(ROBOT_FILE), daemon.server.path, desk)
-        live.ingest([(now_ns, record) for now_ns, got in map(tick_records, range(20)) for record in got])
-        thread = threading.Thread(target=run_live, args=(live, ending.is_set))
-        thread.start()
-        try:
-            with opened(browser, page.url, 1200, 900) as tab:
-                tab.set_default_timeout(40_000)
-                panel = tab.frame_locator("#scene")
-                panel.get_by_text("Fence", exact=True).locator("visible=true").click()
-                stay_in = panel.get_by_label("Stay in")
-                panel.get_by_role("button", name="Corner at the robot's nose").click()
-                x, y, yaw = live.fence_editor._pose
-                ahead = live.fence_editor._footprint.ahead + 0.5 * live.fence_editor._footprint.length
-                nose = [[round(x + ahead * math.cos(yaw), 3), round(y + ahead * math.sin(yaw), 3)]]
-                wait_for(tab, lambda: stay_in.input_value() == json.dumps(nose))
-                stay_in.fill("[[-2, -1.5], [2, -1.5], [2, 1.5], [-2, 1.5]]")
-                panel.get_by_label("Keep out of").fill('[{"center": [0.9, 0], "radius_m": 0.15}]')
-                wait_for(tab, lambda: "radius_m" in live.fence_editor._keep_out.value)
-                panel.get_by_role("button", name="Use this fence").click()
-                wait_for(tab, lambda: any(action == "fence" for action, _ in daemon.received))
-                requested = next(arguments for action, arguments in daemon.received if action == "fence")
-                assert requested["keep_in"] == [[-2, -1.5], [2, -1.5], [2, 1.5], [-2, 1.5]]
-                assert requested["keep_out"] == [{"center": [0.9, 0], "radius_m": 0.15}]
-                assert requested["margin_m"] == 0.05
-                panel.get_by_text("done it").wait_for()
-                keep(tab, "fence-editor")
-        finally:
-            ending.set()
-            thread.join()
-            desk.close()
-            daemon.close()
+def test_the_circle_is_dragged_with_the_mouse_and_set(browser, operated):
+    url, live, daemon, desk = operated
+    with opened(browser, url, 760, 600) as tab:
+        tab.get_by_role("button", name="Task…").click()
+        tab.get_by_text("drag the balls").wait_for()
+        wait_for(tab, lambda: live.editor.balls["middle"].visible)
+        tab.evaluate("() => { document.getElementById('task').style.visibility = 'hidden'; }")
+        tab.wait_for_timeout(3000)
+        drag(tab, (0.0, 0.0), (0.3, -0.2))
+        wait_for(tab, lambda: desk.draft["center_x_m"] == pytest.approx(0.3, abs=0.08))
+        assert desk.draft["center_y_m"] == pytest.approx(-0.2, abs=0.08)
+        keep(tab, "task-dragged")
+        tab.evaluate("() => { document.getElementById('task').style.visibility = ''; }")
+        wait_for(tab, lambda: float(tab.get_by_label("Centre x (m)").input_value()) == desk.draft["center_x_m"])
+        tab.get_by_role("button", name="Set the task").click()
+        wait_for(tab, lambda: any(action == "task" for action, _ in daemon.received))
+        requested = next(arguments for action, arguments in daemon.received if action == "task")
+        assert requested["center_x_m"] == desk.draft["center_x_m"]
+
+
+def test_the_fence_is_typed_and_cornered_by_the_robots_nose_and_put_in_force(browser, operated):
+    url, live, daemon, _ = operated
+    with opened(browser, url, 1200, 900) as tab:
+        tab.set_default_timeout(40_000)
+        panel = tab.frame_locator("#scene")
+        panel.get_by_text("Fence", exact=True).locator("visible=true").click()
+        stay_in = panel.get_by_label("Stay in")
+        panel.get_by_role("button", name="Corner at the robot's nose").click()
+        x, y, yaw = live.fence_editor._pose
+        ahead = live.fence_editor._footprint.ahead + 0.5 * live.fence_editor._footprint.length
+        nose = [[round(x + ahead * math.cos(yaw), 3), round(y + ahead * math.sin(yaw), 3)]]
+        wait_for(tab, lambda: stay_in.input_value() == json.dumps(nose))
+        stay_in.fill("[[-2, -1.5], [2, -1.5], [2, 1.5], [-2, 1.5]]")
+        panel.get_by_label("Keep out of").fill('[{"center": [0.9, 0], "radius_m": 0.15}]')
+        wait_for(tab, lambda: "radius_m" in live.fence_editor._keep_out.value)
+        panel.get_by_role("button", name="Use this fence").click()
+        wait_for(tab, lambda: any(action == "fence" for action, _ in daemon.received))
+        requested = next(arguments for action, arguments in daemon.received if action == "fence")
+        assert requested["keep_in"] == [[-2, -1.5], [2, -1.5], [2, 1.5], [-2, 1.5]]
+        assert requested["keep_out"] == [{"center": [0.9, 0], "radius_m": 0.15}]
+        assert requested["margin_m"] == 0.05
+        panel.get_by_text("done it").wait_for()
+        keep(tab, "fence-editor")
 
 
 def drag(tab, start, end):

@@ -7,17 +7,31 @@ from time import perf_counter
 
 import numpy as np
 
+from disco_hw.config import Robot, RobotConfig
 from disco_hw.inference.estimates import estimates
 from disco_hw.inference.excitation import excitation
 from disco_hw.inference.infer import Inference, infer, noise_of
 from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds
 from disco_hw.log.drive import DriveLog
 from disco_hw.model import Model
+from sim.plant_parameters import PlantParameters
 from tools.bench.sbi_scores import PEERS, paired, scores
-from tools.study.infer_study import config, logged, plant
+from tools.simulated_drives import create_drive
+from tools.simulated_log import read_back, simulated_log
 
 SEED = 5
 SIMULATIONS = 300
+PLAUSIBLE = {"x_icr_m": (0.0, 0.3), "wheel_radius_m": (0.04, 0.10), "axial_distance_m": (0.2, 0.5)}
+CONFIG = RobotConfig(
+    robot=Robot(name="bench", wheel_radius_m=0.06, axial_distance_m=0.4, ticks_per_rev=2048, max_wheel_speed_rad_s=8.0)
+)
+
+
+def plausible_plant(seed: int) -> PlantParameters:
+    """Draw a robot with sensor noise, disturbances and quantised encoders."""
+    rng = np.random.default_rng([seed, 77])
+    geometry = {name: float(rng.uniform(*span)) for name, span in PLAUSIBLE.items()}
+    return PlantParameters(**geometry).with_ideal_motors()
 
 
 def run() -> dict[str, float]:
@@ -27,11 +41,12 @@ def run() -> dict[str, float]:
     """
     found: dict[str, float] = {}
     for drive in ("rich", "circle"):
-        parameters = plant(SEED)
-        log = logged(parameters, drive, SEED)
+        parameters = plausible_plant(SEED)
+        written = simulated_log(create_drive(drive, SEED), parameters, None, SEED)
+        log = read_back(written, parameters.ticks_per_rev)
         truth = np.array([getattr(parameters, name) for name in NAMES])
         began = perf_counter()
-        result = infer(log, config())
+        result = infer(log, CONFIG)
         key = f"inference.{drive}"
         found[f"{key}.seconds"] = perf_counter() - began
         found[f"{key}.effective_simulations"] = result.effective_simulations

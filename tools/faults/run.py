@@ -17,7 +17,7 @@ from disco_hw.control.plan import LawController
 from disco_hw.daemon.control_socket import counters
 from disco_hw.daemon.loop import LoopStats
 from disco_hw.log import records
-from disco_hw.log.recorder import RecorderStats
+from disco_hw.log.recorder import MemoryRecorder, RecorderStats
 from disco_hw.runtime import State
 from disco_hw.runtime.assembly import assemble_core, create_pipeline
 from disco_hw.runtime.core import CoreTick, DaemonCore
@@ -110,17 +110,21 @@ class Attendant:
 
 
 class LogReader:
-    """Takes the place of the recorder and keeps, of what is recorded, what shows trouble."""
+    """Keeps, of what is recorded, what shows trouble."""
 
     def __init__(self) -> None:
         self.counts: dict[str, int] = {}
         self.events: list[tuple[int, str]] = []
-        self.ticks = 0
+        self.recorder = MemoryRecorder()
         self._robot: dict[str, int] = {}
 
-    def put(self, now_ns: int, recorded: Sequence[records.Record]) -> None:
-        """Keep what shows trouble."""
-        self.ticks += 1
+    def read(self) -> None:
+        """Keep what shows trouble of the ticks recorded since the last call; the recorder forgets them."""
+        for now_ns, recorded in self.recorder.ticks:
+            self._read_tick(now_ns, recorded)
+        self.recorder.ticks.clear()
+
+    def _read_tick(self, now_ns: int, recorded: Sequence[records.Record]) -> None:
         for record in recorded:
             if isinstance(record, records.Event):
                 self.events.append((now_ns, record.text))
@@ -142,21 +146,6 @@ class LogReader:
             key = f"robot.{name}"
             # They wrap at 256 and begin anew when the robot restarts: any change is one.
             self.counts[key] = self.counts.get(key, 0) + (value != before)
-
-    def poll(self) -> RecorderStats:
-        """Nothing is lost in memory."""
-        return RecorderStats()
-
-    def new_messages(self) -> tuple[str, ...]:
-        """Nothing happens to it."""
-        return ()
-
-    def repair(self) -> None:
-        """Nothing of it can break."""
-
-    def close(self, timeout_s: float = 5.0) -> RecorderStats:
-        """There is nothing to close."""
-        return RecorderStats()
 
 
 @dataclass
@@ -306,7 +295,7 @@ class FaultRun:
         planner: Planner = self._planner or circling_planner(setup)
         driver = ReferenceDriver(Codec(), draw_session=lambda: self._chance.getrandbits(16))
         self.core = assemble_core(
-            config, self.can.host, driver, create_pipeline(config, setup.model, planner), self.log
+            config, self.can.host, driver, create_pipeline(config, setup.model, planner), self.log.recorder
         )
         self.can.host.open()
         if self.now_us:
@@ -329,6 +318,7 @@ class FaultRun:
             self._next_second_ns = now_ns + 1_000_000_000
             extra = (counters(core, self._loop, RecorderStats(), now_ns),)
         core.tick(now_ns, self._attendant.requests(now_ns, core.last), extra)
+        self.log.read()
 
     def _note_faults(self, begun: Sequence[ScheduledFault], ended: Sequence[ScheduledFault], armed: bool) -> None:
         for fault in begun:

@@ -48,7 +48,7 @@ def check_uart(case: Case) -> Comparison:
     device = _device(given)
     match case["kind"]:
         case "sequence":
-            _check_serial_timeout(found, device, given, then)
+            _check_timeout(found, device, given, then)
         case "device_to_host":
             _check_serial_reply(found, device, case)
         case _ if "packets" in then:
@@ -245,34 +245,23 @@ class _Clocked:
 
 
 def _check_timeout(found: Comparison, device: Vesc, given: Mapping[str, Any], then: Mapping[str, Any]) -> None:
-    clocked = _Clocked(device, given)
-    obeyed = []
-    for ms in range(given["until_ms"]):
-        device.at(ms)
-        for at, can_id, data in given["sent_ms_id_data"]:
-            if at == ms:
-                device.receive(CanFrame(can_id, bytes.fromhex(data), extended=True))
-                obeyed += [[ms, *call] for call in device.pop_calls()]
-        clocked.check(ms)
-    _check_clocked(found, clocked, then)
-    found.same("obeyed", obeyed, then["obeyed_ms_call_value"])
-
-
-def _check_serial_timeout(found: Comparison, device: Vesc, given: Mapping[str, Any], then: Mapping[str, Any]) -> None:
+    """What is sent, on CAN or on the serial line, is obeyed and answered in its millisecond; the timeout stops it."""
     clocked = _Clocked(device, given)
     events: list[list[object]] = []
+    is_serial = "sent_ms_bytes" in given
     for ms in range(given["until_ms"]):
         device.at(ms)
-        for at, sent in given["sent_ms_bytes"]:
-            if at == ms:
-                reply, _ = device.receive_bytes(bytes.fromhex(sent))
-                events += [[ms, *call] for call in device.pop_calls()]
-                events += [[ms, "reply", reply.hex()]] if reply else []
+        for at, *sent in given["sent_ms_bytes" if is_serial else "sent_ms_id_data"]:
+            if at != ms:
+                continue
+            data, reply = bytes.fromhex(sent[-1]), b""
+            if is_serial:
+                reply, _ = device.receive_bytes(data)
+            else:
+                device.receive(CanFrame(sent[0], data, extended=True))
+            events += [[ms, *call] for call in device.pop_calls()]
+            events += [[ms, "reply", reply.hex()]] if reply else []
         clocked.check(ms)
-    _check_clocked(found, clocked, then)
-    found.same("events", events, then["events_ms"])
-
-
-def _check_clocked(found: Comparison, clocked: _Clocked, then: Mapping[str, Any]) -> None:
     found.same("timed out", clocked.changes, then["has_timeout_changes_ms"])
     found.same("brake", clocked.brakes, then["brake_calls_from_to_ms_value"])
+    found.same("events", events, then["events_ms" if is_serial else "obeyed_ms_call_value"])

@@ -8,6 +8,8 @@ from drivers.types import DriverState, Frame, LinkState, OutgoingFrame, Readings
 
 MS = 1_000_000
 START_NS = 50_000 * MS
+FORWARD = (3.0, 2.0)
+IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 class Bench:
@@ -72,6 +74,23 @@ class Bench:
         self.driver.request(Request.ARM)
         assert self.driver.state is DriverState.ARMING
         self.run_until(DriverState.ARMED)
+
+    def largest_speed_in(self, seconds, command=None):
+        """Run as `run` does, and return the largest speed of a wheel meanwhile (rad/s)."""
+        self.largest_speed = 0.0
+        self.run(seconds, command)
+        return self.largest_speed
+
+    def request(self, request):
+        """Ask the driver for a state; returns the bench itself."""
+        self.driver.request(request)
+        return self
+
+    def drive(self, seconds, command=None):
+        """Arm, and run for a time with a command (None: the one set before); returns the bench itself."""
+        self.arm()
+        self.run(seconds, command)
+        return self
 
     def inject_to_host(self, can_id, data):
         """A frame that somebody else sends; the driver sees it with its next batch."""

@@ -11,11 +11,8 @@ import random
 import pytest
 
 from drivers.types import Driver, DriverState, Request, WheelCommand
-from tests.drivers.motor.bench import Bench
+from tests.drivers.motor.bench import FORWARD, IDLE_STATES, Bench
 from tests.tables import thinned
-
-FORWARD = (3.0, 2.0)
-IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 class DriverConformance:
@@ -73,29 +70,24 @@ class DriverConformance:
 
     def test_ready_opens_a_session_and_moves_nothing(self, bench):
         bench.run_until(*IDLE_STATES)
-        bench.driver.request(Request.READY)
-        bench.run_until(DriverState.READY)
+        bench.request(Request.READY).run_until(DriverState.READY)
         bench.run(1.0, FORWARD)
         assert bench.driver.state is DriverState.READY
         assert bench.largest_speed == 0.0
 
     def test_a_silent_host_stops_the_robot_and_is_not_armed_when_it_comes_back(self, bench):
-        bench.arm()
-        bench.run(1.0, FORWARD)
+        bench.drive(1.0, FORWARD)
         bench.host_runs = False
         bench.run(self.stop_time_s(max(FORWARD)))
         assert bench.robot.speed_rad_s < 0.05
         assert not bench.robot.armed
         bench.host_runs = True
-        bench.largest_speed = 0.0
-        bench.run(3.0)
-        assert bench.largest_speed == 0.0
+        assert bench.largest_speed_in(3.0) == 0.0
         assert bench.driver.state in IDLE_STATES
 
     def test_a_host_without_commands_stops_the_robot_and_arm_is_consumed(self, bench):
         """Alive and talking, but no command: the house-keeping must not feed the watchdog."""
-        bench.arm()
-        bench.run(1.0, FORWARD)
+        bench.drive(1.0, FORWARD)
         bench.command = None
         bench.run(self.stop_time_s(max(FORWARD)))
         assert bench.robot.speed_rad_s < 0.05
@@ -105,8 +97,7 @@ class DriverConformance:
         assert bench.driver.detail not in ("", "armed", "arming"), "it says why"
 
     def test_disarms_on_request_while_moving(self, bench):
-        bench.arm()
-        bench.run(1.0, FORWARD)
+        bench.drive(1.0, FORWARD)
         bench.driver.request(Request.STANDBY)
         assert bench.driver.state is DriverState.STOPPING
         bench.run(self.stop_time_s(max(FORWARD)))
@@ -117,8 +108,7 @@ class DriverConformance:
     def test_arms_again_only_on_request(self, bench):
         bench.arm()
         sessions = bench.driver.stats.sessions
-        bench.driver.request(Request.READY)
-        bench.run_until(DriverState.READY)
+        bench.request(Request.READY).run_until(DriverState.READY)
         bench.run(2.0, FORWARD)
         assert bench.largest_speed == 0.0
         bench.arm()
@@ -127,68 +117,52 @@ class DriverConformance:
         assert bench.robot.speed_rad_s > 1.0
 
     def test_a_fault_disarms_and_needs_reset_and_a_new_arming(self, bench):
-        bench.arm()
-        bench.run(0.5, FORWARD)
+        bench.drive(0.5, FORWARD)
         bench.robot.break_down(True)
         bench.run_until(DriverState.FAULT)
         bench.run(self.stop_time_s(max(FORWARD)))
         assert bench.robot.speed_rad_s < 0.05
         assert len(bench.driver.detail) > 10
-        bench.driver.request(Request.ARM)
-        bench.run(2.0)
+        bench.request(Request.ARM).run(2.0)
         assert bench.driver.state is DriverState.FAULT
-        bench.driver.request(Request.RESET)
-        bench.run(1.0)
+        bench.request(Request.RESET).run(1.0)
         assert bench.driver.state is DriverState.FAULT, "the cause is still there"
         bench.driver.request(Request.STANDBY)
         bench.robot.break_down(False)
         bench.run(0.5)
-        bench.driver.request(Request.RESET)
-        bench.run_until(*IDLE_STATES)
-        bench.largest_speed = 0.0
-        bench.run(2.0)
-        assert bench.largest_speed == 0.0
+        bench.request(Request.RESET).run_until(*IDLE_STATES)
+        assert bench.largest_speed_in(2.0) == 0.0
         bench.arm()
 
     @pytest.mark.parametrize("armed", [False, True])
     def test_the_hosts_emergency_stop_latches_in_any_state(self, bench, armed):
         bench.run_until(*IDLE_STATES)
         if armed:
-            bench.arm()
-            bench.run(0.5, FORWARD)
+            bench.drive(0.5, FORWARD)
         bench.send_estop()
         bench.run(self.stop_time_s(max(FORWARD)))
         assert bench.robot.speed_rad_s < 0.05
         assert bench.driver.state is DriverState.ESTOP
-        bench.driver.request(Request.ARM)
-        bench.run(2.0, FORWARD)
+        bench.request(Request.ARM).run(2.0, FORWARD)
         assert bench.driver.state is DriverState.ESTOP
-        bench.driver.request(Request.RESET)
-        bench.run_until(*IDLE_STATES)
-        bench.largest_speed = 0.0
-        bench.run(2.0)
-        assert bench.largest_speed == 0.0
+        bench.request(Request.RESET).run_until(*IDLE_STATES)
+        assert bench.largest_speed_in(2.0) == 0.0
         bench.arm()
 
     def test_the_emergency_stop_button_holds_until_released_and_reset(self, bench):
-        bench.arm()
-        bench.run(0.5, FORWARD)
+        bench.drive(0.5, FORWARD)
         bench.robot.press_estop(True)
         bench.run_until(DriverState.ESTOP)
         bench.run(self.stop_time_s(max(FORWARD)))
         assert bench.robot.speed_rad_s < 0.05
-        bench.driver.request(Request.RESET)
-        bench.run(1.0)
+        bench.request(Request.RESET).run(1.0)
         assert bench.driver.state is DriverState.ESTOP
         bench.driver.request(Request.STANDBY)
         bench.robot.press_estop(False)
         bench.run(1.0)
         assert bench.driver.state is DriverState.ESTOP, "releasing the button alone is not enough"
-        bench.driver.request(Request.RESET)
-        bench.run_until(*IDLE_STATES)
-        bench.largest_speed = 0.0
-        bench.run(2.0)
-        assert bench.largest_speed == 0.0
+        bench.request(Request.RESET).run_until(*IDLE_STATES)
+        assert bench.largest_speed_in(2.0) == 0.0
 
     def test_encoders_wrap_in_both_directions(self):
         bench = Bench(self.create_driver(), self.create_robot(first_ticks=self.near_the_wrap()))
@@ -204,8 +178,7 @@ class DriverConformance:
         assert bench.driver.stats.implausible_ticks == 0
 
     def test_an_unplugged_line_stops_the_robot_and_nothing_moves_when_it_is_back(self, bench):
-        bench.arm()
-        bench.run(1.0, FORWARD)
+        bench.drive(1.0, FORWARD)
         bench.step()
         bench.host_end.plug(False)
         bench.run(self.stop_time_s(max(FORWARD)))
@@ -213,20 +186,16 @@ class DriverConformance:
         assert bench.robot.speed_rad_s < 0.05
         bench.driver.request(Request.ARM)
         bench.host_end.plug(True)
-        bench.largest_speed = 0.0
-        bench.run(3.0, FORWARD)
+        assert bench.largest_speed_in(3.0, FORWARD) == 0.0
         assert bench.driver.state in IDLE_STATES
-        assert bench.largest_speed == 0.0
         angle = bench.wheels[-1].left_angle_rad
         assert angle > 1.0, "the angles go on from where they were"
-        bench.arm()
-        bench.run(1.0)
+        bench.drive(1.0)
         assert bench.wheels[-1].left_angle_rad > angle
 
     @thinned("unplugged_after_ms", range(20), quick=4)
     def test_unplugged_at_any_instant(self, bench, unplugged_after_ms):
-        bench.arm()
-        bench.run(0.3 + unplugged_after_ms * 1e-3, FORWARD)
+        bench.drive(0.3 + unplugged_after_ms * 1e-3, FORWARD)
         bench.host_end.plug(False)
         bench.run(0.1)
         bench.host_end.plug(True)
@@ -274,8 +243,7 @@ class DriverConformance:
         assert bench.driver.stats.commands_sent == sent
 
     def test_released_the_wheels_roll_out_without_a_ramp_and_the_reason_is_a_fault_until_a_reset(self, bench):
-        bench.arm()
-        bench.run(0.6, FORWARD)
+        bench.drive(0.6, FORWARD)
         bench.driver.release("the left wheel does not count")
         bench.run(0.02)
         assert bench.driver.state is DriverState.FAULT
@@ -283,11 +251,8 @@ class DriverConformance:
         bench.run(2.0)
         assert bench.robot.speed_rad_s == pytest.approx(0.0, abs=0.05)
         assert not bench.robot.armed
-        bench.driver.request(Request.ARM)
-        bench.run(0.5)
+        bench.request(Request.ARM).run(0.5)
         assert bench.driver.state is DriverState.FAULT
-        bench.driver.request(Request.RESET)
-        bench.run(0.5)
-        bench.driver.request(Request.STANDBY)
-        bench.run_until(*IDLE_STATES)
+        bench.request(Request.RESET).run(0.5)
+        bench.request(Request.STANDBY).run_until(*IDLE_STATES)
         bench.arm()

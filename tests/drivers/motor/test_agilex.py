@@ -6,11 +6,10 @@ import pytest
 
 from drivers.types import DriverState, Request
 from sim.devices.agilex import CAN_MODE, STANDBY
+from tests.drivers.motor.bench import FORWARD, IDLE_STATES
 from tests.drivers.motor.vendors import VENDORS
 
 (AGILEX,) = [vendor for vendor in VENDORS if vendor.name == "agilex"]
-FORWARD = (3.0, 2.0)
-IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 @pytest.fixture
@@ -19,22 +18,19 @@ def bench():
 
 
 def test_a_person_who_takes_the_remote_control_drives_and_that_is_no_fault(bench):
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     bench.robot.controller.base.use_remote_control(0.3, 0.0)
     bench.run(0.3, FORWARD)
     assert bench.driver.state in IDLE_STATES
     assert "remote control" in bench.driver.detail
     assert bench.robot.speed == pytest.approx((5.0, 5.0))
-    bench.driver.request(Request.ARM)
-    bench.run(1.0)
+    bench.request(Request.ARM).run(1.0)
     assert bench.driver.state in IDLE_STATES
     assert bench.robot.speed == pytest.approx((5.0, 5.0)), "the person still drives"
 
 
 def test_after_the_person_has_let_go_it_does_not_drive_on(bench):
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     bench.robot.controller.base.use_remote_control(0.3, 0.0)
     bench.run(0.3, FORWARD)
     bench.robot.controller.base.control_mode = CAN_MODE
@@ -44,8 +40,7 @@ def test_after_the_person_has_let_go_it_does_not_drive_on(bench):
 
 
 def test_the_buttons_stop_it_and_need_a_reset(bench):
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     bench.robot.press_estop(True)
     bench.run(0.3, FORWARD)
     assert bench.driver.state is DriverState.ESTOP
@@ -54,8 +49,7 @@ def test_the_buttons_stop_it_and_need_a_reset(bench):
     bench.run(1.0, FORWARD)
     assert bench.driver.state is DriverState.FAULT, "releasing the button alone is not enough"
     assert bench.robot.speed_rad_s == 0.0
-    bench.driver.request(Request.RESET)
-    bench.run_until(*IDLE_STATES)
+    bench.request(Request.RESET).run_until(*IDLE_STATES)
 
 
 @pytest.mark.parametrize("warning", [0x0002, 0x0004, 0x0200, 0x0400])
@@ -68,8 +62,7 @@ def test_a_warning_of_the_battery_or_the_remote_control_stops_nothing(bench, war
 
 @pytest.mark.parametrize("error", [0x0001, 0x0008, 0x0100])
 def test_an_error_in_either_byte_stops_it(bench, error):
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     bench.robot.controller.base.error_code = error
     bench.run(0.3, FORWARD)
     assert bench.driver.state is DriverState.FAULT
@@ -78,16 +71,14 @@ def test_an_error_in_either_byte_stops_it(bench, error):
 
 
 def test_turning_on_the_spot_is_a_turn_rate_by_the_nominal_track(bench):
-    bench.arm()
-    bench.run(0.5, (-2.0, 2.0))
+    bench.drive(0.5, (-2.0, 2.0))
     linear, angular = bench.robot.controller.base.commanded_motion
     assert (linear, angular) == (0, round(1e3 * 0.06 * 4.0 / 0.31))
     assert bench.robot.speed == pytest.approx((-2.0, 2.0), abs=0.02)
 
 
 def test_more_than_the_base_can_do_is_scaled_and_keeps_its_curve(bench):
-    bench.arm()
-    bench.run(0.3, (50.0, 25.0))
+    bench.drive(0.3, (50.0, 25.0))
     left, right = bench.robot.speed
     assert 0.06 * left == pytest.approx(1.5, abs=0.01)
     assert left / right == pytest.approx(2.0, abs=0.01)
@@ -95,8 +86,7 @@ def test_more_than_the_base_can_do_is_scaled_and_keeps_its_curve(bench):
 
 @pytest.mark.parametrize("pause_s", [0.55, 2.0])
 def test_a_host_that_paused_for_longer_than_the_time_out_is_disarmed(bench, pause_s):
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     bench.host_runs = False
     bench.run(pause_s)
     bench.host_runs = True
@@ -109,32 +99,25 @@ def test_it_does_not_arm_while_the_base_moves(bench):
     bench.run_until(*IDLE_STATES)
     bench.robot.stuck, bench.robot.speed = {0, 1}, [4.0, 4.0]
     bench.run(0.1)
-    bench.driver.request(Request.ARM)
-    bench.run(0.3, FORWARD)
+    bench.request(Request.ARM).run(0.3, FORWARD)
     assert bench.driver.state in IDLE_STATES
     assert "moving" in bench.driver.detail
     assert not [frame for frame in bench.robot.received if AGILEX.is_motion(frame)]
 
 
 def test_a_button_pressed_while_it_slows_down_ends_that_and_its_release_moves_nothing(bench):
-    bench.arm()
-    bench.run(0.5, (20.0, 20.0))
-    bench.driver.request(Request.STANDBY)
-    bench.run(0.1)
+    bench.drive(0.5, (20.0, 20.0))
+    bench.request(Request.STANDBY).run(0.1)
     bench.robot.press_estop(True)
     bench.run(0.3)
     bench.robot.press_estop(False)
-    bench.largest_speed = 0.0
-    bench.run(2.0)
-    assert bench.largest_speed < 0.05
+    assert bench.largest_speed_in(2.0) < 0.05
     assert bench.driver.state is DriverState.FAULT
 
 
 def test_a_person_who_takes_the_remote_control_while_it_slows_down_ends_that(bench):
-    bench.arm()
-    bench.run(0.5, (20.0, 20.0))
-    bench.driver.request(Request.STANDBY)
-    bench.run(0.1)
+    bench.drive(0.5, (20.0, 20.0))
+    bench.request(Request.STANDBY).run(0.1)
     bench.robot.controller.base.use_remote_control(0.0, 0.0)
     bench.run(0.2)
     bench.robot.received.clear()
@@ -145,11 +128,8 @@ def test_a_person_who_takes_the_remote_control_while_it_slows_down_ends_that(ben
 
 
 def test_it_waits_for_the_wheels_to_stand_from_the_end_of_a_ramp_however_long_that_was():
-    bench = dataclasses.replace(AGILEX, changes="stop_deceleration_rad_s2 = 1.0").bench()
-    bench.arm()
-    bench.run(0.5, (4.0, 4.0))
-    bench.driver.request(Request.STANDBY)
-    bench.run(3.8)
+    bench = dataclasses.replace(AGILEX, changes="stop_deceleration_rad_s2 = 1.0").bench().drive(0.5, (4.0, 4.0))
+    bench.request(Request.STANDBY).run(3.8)
     bench.robot.stuck, bench.robot.speed = {0, 1}, [4.0, 4.0]
     bench.run(1.0)
     assert bench.robot.controller.base.control_mode == CAN_MODE, "standing by, it would brake no longer"

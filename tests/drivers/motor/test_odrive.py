@@ -7,11 +7,10 @@ import pytest
 
 from drivers.types import DriverState, Request
 from sim.devices.odrive import CLOSED_LOOP, IDLE
+from tests.drivers.motor.bench import FORWARD, IDLE_STATES
 from tests.drivers.motor.vendors import VENDORS
 
 NEW, OLD = VENDORS[:2]
-FORWARD = (3.0, 2.0)
-IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 @pytest.fixture(params=[NEW, OLD], ids=str)
@@ -55,8 +54,7 @@ def test_a_watchdog_that_ran_out_while_nobody_drove_is_cleared_by_arming_alone(b
 
 
 def test_an_axis_that_idles_without_an_error_is_a_fault_that_stays(bench):
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     axes(bench)[0].axis_state = IDLE
     bench.run_until(DriverState.FAULT, timeout_s=0.2)
     assert "closed loop" in bench.driver.detail
@@ -66,8 +64,7 @@ def test_an_axis_that_idles_without_an_error_is_a_fault_that_stays(bench):
 
 
 def test_one_axis_whose_heartbeat_fails_to_come_stops_the_others(bench):
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     silent_node = axes(bench)[1].node_id
     drain = bench.robot.drain
     bench.robot.drain = lambda: [frame for frame in drain() if frame.can_id != silent_node << 5 | 1]
@@ -118,16 +115,14 @@ def test_axes_that_somebody_else_has_armed_are_brought_to_idle(bench):
 def test_an_axis_that_is_not_calibrated_is_said_not_to_arm(bench):
     bench.run_until(*IDLE_STATES)
     axes(bench)[1].calibrated = False
-    bench.driver.request(Request.ARM)
-    bench.run(2.0)
+    bench.request(Request.ARM).run(2.0)
     assert bench.driver.state is DriverState.FAULT
     assert "node 5" in bench.driver.detail
     assert [axis.axis_state for axis in axes(bench)] == [IDLE, IDLE]
 
 
 def test_a_position_that_jumps_does_not_move_the_angle(bench):
-    bench.arm()
-    bench.run(1.0, FORWARD)
+    bench.drive(1.0, FORWARD)
     angle = bench.wheels[-1].left_angle_rad
     bench.robot.angle[0] += 1000.0
     bench.run(0.2, (0.0, 0.0))
@@ -141,8 +136,7 @@ def test_it_does_not_arm_while_an_axis_turns(bench):
     bench.robot.speed = [4.0, 4.0]
     bench.run(0.1)
     bench.robot.received.clear()
-    bench.driver.request(Request.ARM)
-    bench.run(0.3, FORWARD)
+    bench.request(Request.ARM).run(0.3, FORWARD)
     assert bench.driver.state in IDLE_STATES
     assert "a motor is turning" in bench.driver.detail
     assert not [frame for frame in bench.robot.received if frame.can_id & 0x1F == 0x07 and frame.data[0] == CLOSED_LOOP]
@@ -152,7 +146,6 @@ def test_it_does_not_arm_without_encoder_estimates(bench):
     drain = bench.robot.drain
     bench.robot.drain = lambda: [frame for frame in drain() if frame.can_id & 0x1F != 0x09]
     bench.run_until(*IDLE_STATES)
-    bench.driver.request(Request.ARM)
-    bench.run(0.3)
+    bench.request(Request.ARM).run(0.3)
     assert bench.driver.state in IDLE_STATES
     assert "no encoder estimates" in bench.driver.detail

@@ -92,6 +92,17 @@ SAME = {
 AT_REST = {"command heard": {"shared": True, "events": (SHARED,)}}
 LATCHED_FAULT = {"note": "not arming: old; remove the cause, then reset"}
 LATCHED_STOP = {"note": "not arming: emergency stop; remove its cause, then reset"}
+ON_THE_WAY = {
+    "link up": DISARMED_BY_LINK,
+    "link down": {**DISARMED_BY_LINK, "link_is_up": False},
+    "restarted": {**MET, "note": "disarmed: it restarted"},
+    "arm": {},
+    "arm, unfit": {},
+    "stand by": {**SLOWS, "target": STANDBY},
+    "be ready": {**SLOWS, "target": READY},
+    "do reset": {**SLOWS, "target": RESET},
+    "begun": {},
+}
 OTHERWISE = {
     "rest": {**AT_REST, "arm": ARMS, "arm, unfit": {"note": "not arming: why"}},
     "ready": {**AT_REST, "begun": {}, "arm": ARMS, "arm, unfit": {"note": "not arming: why"}},
@@ -108,28 +119,12 @@ OTHERWISE = {
         "e-stop heard": {**GONE, "estopped": True},
     },
     "arming": {
-        "link up": DISARMED_BY_LINK,
-        "link down": {**DISARMED_BY_LINK, "link_is_up": False},
-        "restarted": {**MET, "note": "disarmed: it restarted"},
-        "arm": {},
-        "arm, unfit": {},
-        "stand by": {**SLOWS, "target": STANDBY},
-        "be ready": {**SLOWS, "target": READY},
-        "do reset": {**SLOWS, "target": RESET},
-        "begun": {},
+        **ON_THE_WAY,
         "zero": {"zeros": 4, "fed_ns": NOW},
         "proof": {"stage": ARMED, "note": "armed", "fed_ns": NOW, "speeds": (0.0, 0.0)},
     },
     "armed": {
-        "link up": DISARMED_BY_LINK,
-        "link down": {**DISARMED_BY_LINK, "link_is_up": False},
-        "restarted": {**MET, "note": "disarmed: it restarted"},
-        "arm": {},
-        "arm, unfit": {},
-        "stand by": {**SLOWS, "target": STANDBY},
-        "be ready": {**SLOWS, "target": READY},
-        "do reset": {**SLOWS, "target": RESET},
-        "begun": {},
+        **ON_THE_WAY,
         "command": {"fed_ns": NOW, "speeds": (3.0, -2.0)},
     },
     "stopping": {

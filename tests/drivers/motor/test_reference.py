@@ -10,11 +10,10 @@ from drivers.motor.reference import ESTOP_REPEATS, ReferenceDriver
 from drivers.types import DriverState, Frame, ReceivedFrame, Request, WheelCommand
 from firmware_protocol.codec import Codec
 from firmware_protocol.status_codes import FAULTS
-from tests.drivers.motor.bench import MS, START_NS, Bench
+from tests.drivers.motor.bench import IDLE_STATES, MS, START_NS, Bench
 from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot
 
 CODEC = Codec()
-IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 def create_driver():
@@ -23,6 +22,11 @@ def create_driver():
 
 def create_bench(robot=None, **options):
     return Bench(create_driver(), robot or ReferenceRobot(), **options)
+
+
+@pytest.fixture
+def bench():
+    return create_bench()
 
 
 def test_says_what_it_waits_for():
@@ -46,8 +50,7 @@ def test_another_major_version_is_refused():
     bench = create_bench(ReferenceRobot(replace(CONFIG, protocol_major=2)))
     bench.run_until(DriverState.REFUSED)
     assert "the robot speaks protocol 2.0, this host 1.0" in bench.driver.detail
-    bench.driver.request(Request.ARM)
-    bench.run(3.0, (1.0, 1.0))
+    bench.request(Request.ARM).run(3.0, (1.0, 1.0))
     assert bench.driver.state is DriverState.REFUSED
     assert bench.largest_speed == 0.0
 
@@ -58,8 +61,7 @@ def test_another_dbc_is_refused_but_telemetry_is_shown():
     assert "0badcafe" in bench.driver.detail
     assert f"{CODEC.dbc_hash:08x}" in bench.driver.detail
     for request in (Request.READY, Request.ARM):
-        bench.driver.request(request)
-        bench.run(2.0, (1.0, 1.0))
+        bench.request(request).run(2.0, (1.0, 1.0))
     assert bench.driver.state is DriverState.REFUSED
     assert bench.driver.stats.sessions == 0
     assert bench.largest_speed == 0.0
@@ -76,29 +78,23 @@ def test_a_robot_flashed_meanwhile_is_taken():
 
 @pytest.mark.parametrize("rate_hz", [20, 50, 100])
 def test_arms_at_every_control_rate(rate_hz):
-    bench = create_bench(rate_hz=rate_hz)
-    bench.arm()
-    bench.run(2.0, (3.0, 2.0))
+    bench = create_bench(rate_hz=rate_hz).drive(2.0, (3.0, 2.0))
     assert bench.driver.state is DriverState.ARMED
     assert bench.robot.core.rejections["STATE"] <= 2
 
 
-def test_each_arming_has_a_session_of_its_own():
-    bench = create_bench()
+def test_each_arming_has_a_session_of_its_own(bench):
     sessions = []
     for _ in range(4):
         bench.arm()
         sessions.append(bench.robot.session)
-        bench.driver.request(Request.STANDBY)
-        bench.run(0.3)
+        bench.request(Request.STANDBY).run(0.3)
     assert 0 not in sessions
     assert len(set(sessions)) == 4
 
 
 def test_a_robot_that_falls_silent_starts_a_new_handshake():
-    bench = create_bench()
-    bench.arm()
-    bench.run(1.0, (3.0, 3.0))
+    bench = create_bench().drive(1.0, (3.0, 3.0))
     bench.loses = lambda _: True
     bench.run_until(DriverState.HANDSHAKE, timeout_s=0.6)
     assert bench.driver.identity is bench.driver.limits is None
@@ -112,17 +108,14 @@ def test_a_robot_that_falls_silent_starts_a_new_handshake():
 
 def test_a_lossy_link_does_not_disarm():
     """Three frames in a row may not be lost at 50 Hz: the fourth is out of sequence and the fifth comes too late."""
-    bench = create_bench(loses=lambda generator: generator.random() < 0.03)
-    bench.arm()
-    bench.run(10.0, (3.0, 2.0))
+    bench = create_bench(loses=lambda generator: generator.random() < 0.03).drive(10.0, (3.0, 2.0))
     assert bench.driver.state is DriverState.ARMED
     assert bench.driver.stats.lost_frames > 30
     assert bench.driver.stats.implausible_ticks == 0
     assert bench.wheels[-1].left_angle_rad == pytest.approx(bench.robot.angle[0], abs=0.2)
 
 
-def test_arming_is_given_up_with_the_robots_own_reason():
-    bench = create_bench()
+def test_arming_is_given_up_with_the_robots_own_reason(bench):
     bench.run_until(*IDLE_STATES)
     bench.robot.pushed = 1.0
     bench.driver.request(Request.ARM)
@@ -135,8 +128,7 @@ def test_arming_is_given_up_with_the_robots_own_reason():
     assert not bench.robot.armed
 
 
-def test_a_second_host_is_pointed_out_once_a_link():
-    bench = create_bench()
+def test_a_second_host_is_pointed_out_once_a_link(bench):
     bench.run_until(*IDLE_STATES)
     other = CODEC.encode("TIME_REQUEST", 0, sequence=1)
     reported = "another host is on the link: it sends TIME_REQUEST; disconnect it"
@@ -155,9 +147,7 @@ def test_a_second_host_is_pointed_out_once_a_link():
 
 
 def test_a_second_host_that_commands_motion_stops_the_robot_but_never_drives_it():
-    bench = create_bench()
-    bench.arm()
-    bench.run(0.5, (1.0, 1.0))
+    bench = create_bench().drive(0.5, (1.0, 1.0))
     for counter in range(400):
         foreign = CODEC.encode(
             "WHEEL_COMMAND", counter, mode="SPEED", left_speed=8, right_speed=8, valid_for=0.1, session=200
@@ -170,9 +160,8 @@ def test_a_second_host_that_commands_motion_stops_the_robot_but_never_drives_it(
     assert "another host is on the link: it sends WHEEL_COMMAND; disconnect it" in bench.events
 
 
-def test_an_estop_from_outside_is_no_second_host_and_is_said_once_a_stop():
+def test_an_estop_from_outside_is_no_second_host_and_is_said_once_a_stop(bench):
     """As `disco-hw estop` sends it beside the daemon: three frames, which the robot and the driver both receive."""
-    bench = create_bench()
     bench.arm()
     reported = "e-stop received on the link, sent by `disco-hw estop` or another host"
     for stops in (1, 2):
@@ -187,8 +176,7 @@ def test_an_estop_from_outside_is_no_second_host_and_is_said_once_a_stop():
     assert bench.driver.stats.unknown_id == 0
 
 
-def test_a_second_host_is_pointed_out_even_if_it_sends_an_estop_first():
-    bench = create_bench()
+def test_a_second_host_is_pointed_out_even_if_it_sends_an_estop_first(bench):
     bench.run_until(*IDLE_STATES)
     bench.inject_to_host(*CODEC.encode("ESTOP", reason="UNSPECIFIED"))
     bench.inject_to_host(*CODEC.encode("TIME_REQUEST", 0, sequence=1))
@@ -197,9 +185,7 @@ def test_a_second_host_is_pointed_out_even_if_it_sends_an_estop_first():
 
 
 def test_a_new_link_voids_everything_even_if_its_loss_went_unseen():
-    bench = create_bench()
-    bench.arm()
-    bench.run(2.0, (1.0, 1.0))
+    bench = create_bench().drive(2.0, (1.0, 1.0))
     driver = bench.driver
     bench.host_end.receive()
     for renew in (driver.link_up, driver.link_down):
@@ -263,8 +249,7 @@ def test_a_response_to_a_request_of_the_last_link_teaches_nothing():
 
 
 @pytest.mark.parametrize("call", ["receive", "transmit"])
-def test_silence_is_noticed_by_each_half_of_a_tick(call):
-    bench = create_bench()
+def test_silence_is_noticed_by_each_half_of_a_tick(call, bench):
     bench.run_until(*IDLE_STATES)
     driver, later_ns = bench.driver, bench.now_ns + 501 * MS
     if call == "receive":
@@ -277,8 +262,7 @@ def test_silence_is_noticed_by_each_half_of_a_tick(call):
     assert driver.state is DriverState.HANDSHAKE
 
 
-def test_nothing_is_silent_that_was_never_heard():
-    bench = create_bench()
+def test_nothing_is_silent_that_was_never_heard(bench):
     bench.loses = lambda _: True
     bench.run(4.0)
     assert bench.events == []
@@ -328,9 +312,7 @@ def test_a_robot_that_has_shown_all_but_its_state_can_fall_silent_too():
 
 
 def test_a_robot_that_turns_out_to_be_another_is_commanded_no_more():
-    bench = create_bench()
-    bench.arm()
-    bench.run(0.5, (1.0, 1.0))
+    bench = create_bench().drive(0.5, (1.0, 1.0))
     bench.inject_to_host(*CODEC.encode("BUILD", 0, dbc_hash=0x0BADCAFE, board_id=1))
     bench.run_until(DriverState.REFUSED)
     assert "WHEEL_COMMAND" not in names(bench.driver.transmit(bench.now_ns, WheelCommand(1.0, 1.0, 0.1)))
@@ -338,8 +320,7 @@ def test_a_robot_that_turns_out_to_be_another_is_commanded_no_more():
     assert bench.robot.speed_rad_s == 0.0
 
 
-def test_an_emergency_stop_of_ours_ends_the_wish_to_be_armed():
-    bench = create_bench()
+def test_an_emergency_stop_of_ours_ends_the_wish_to_be_armed(bench):
     bench.arm()
     bench.driver.estop(bench.now_ns)
     assert bench.driver.state is DriverState.STOPPING
@@ -369,16 +350,13 @@ def test_a_board_whose_wheels_are_virtual_is_distinguished_from_a_robots():
 
 
 def test_each_event_is_reported_once():
-    bench = create_bench()
-    bench.arm()
-    bench.run(2.0)
+    bench = create_bench().drive(2.0)
     reported = [event for event in bench.events if not event.startswith("handshake complete: firmware 0.1.0, board 1")]
     assert reported == ["robot unknown -> STANDBY", "robot STANDBY -> READY", "robot READY -> ARMED"]
     assert len(bench.events) == 4
 
 
-def test_slow_telemetry_is_handed_on():
-    bench = create_bench()
+def test_slow_telemetry_is_handed_on(bench):
     bench.run(6.0)
     kinds = {
         kind for readings in bench.readings for kind in ("motors", "power", "link_health") if getattr(readings, kind)
@@ -388,8 +366,7 @@ def test_slow_telemetry_is_handed_on():
     assert (status.state, status.fault, status.fault_code) == ("STANDBY", "NONE", 0)
 
 
-def test_commands_are_counted():
-    bench = create_bench()
+def test_commands_are_counted(bench):
     bench.arm()
     before = bench.driver.stats.commands_sent
     bench.run(1.0, (1.0, 1.0))
@@ -428,8 +405,7 @@ def test_emergency_stop_frames():
     assert all(outgoing.deadline_ns > 1_000 + 100 * MS for outgoing in frames)
 
 
-def test_a_command_leaves_in_time_or_not_at_all():
-    bench = create_bench()
+def test_a_command_leaves_in_time_or_not_at_all(bench):
     bench.arm()
     (command,) = (
         outgoing
@@ -445,9 +421,7 @@ def test_a_command_leaves_in_time_or_not_at_all():
 
 
 def test_released_its_motors_are_off_for_a_moment_then_braked_and_nothing_that_is_wanted_meanwhile_ramps():
-    bench = create_bench()
-    bench.arm()
-    bench.run(0.6, (3.0, 2.0))
+    bench = create_bench().drive(0.6, (3.0, 2.0))
     bench.driver.release("the left wheel does not count")
     bench.run(0.05)
     bench.driver.request(Request.STANDBY)

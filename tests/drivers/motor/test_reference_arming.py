@@ -20,10 +20,15 @@ def report(arming, state, session=None, stop_cause="NONE", reject_reason="NONE")
     arming.handle_status(state, arming.session if session is None else session, stop_cause, reject_reason)
 
 
-def armed():
-    """An arming that has gone all the way."""
+def at_standby():
     one = arming()
     report(one, "STANDBY", 0)
+    return one
+
+
+def armed():
+    """An arming that has gone all the way."""
+    one = at_standby()
     one.request(Request.ARM)
     one.step(0)
     report(one, "READY")
@@ -34,8 +39,7 @@ def armed():
 
 
 def test_the_way_up_step_by_step():
-    one = arming()
-    report(one, "STANDBY", 0)
+    one = at_standby()
     assert one.host_state().request == "STANDBY"
     assert one.session == 0, "no session before one is wanted"
     one.request(Request.ARM)
@@ -56,8 +60,7 @@ def test_the_way_up_step_by_step():
 
 
 def test_ready_alone_opens_a_session_and_asks_for_no_more():
-    one = arming()
-    report(one, "STANDBY", 0)
+    one = at_standby()
     one.request(Request.READY)
     one.step(0)
     assert one.host_state().request == "READY"
@@ -99,8 +102,7 @@ def test_a_stopping_robot_that_still_shows_our_session_has_closed_it():
 
 
 def test_a_challenge_of_another_session_is_not_answered():
-    one = arming()
-    report(one, "STANDBY", 0)
+    one = at_standby()
     one.request(Request.ARM)
     one.step(0)
     one.handle_session(0x1234, one.session + 1, (), 0)
@@ -154,8 +156,7 @@ def test_arm_is_consumed_when_the_link_or_robot_is_another_one():
 
 
 def test_no_session_before_the_robot_has_been_heard_again():
-    one = arming()
-    report(one, "STANDBY", 0)
+    one = at_standby()
     one.request(Request.READY)
     one.step(0)
     report(one, "READY")
@@ -179,8 +180,7 @@ def test_a_robot_armed_in_another_session_is_not_ours():
 
 
 def test_arming_that_takes_too_long_is_given_up_with_the_robots_reason():
-    one = arming()
-    report(one, "STANDBY", 0)
+    one = at_standby()
     one.note = "of an earlier attempt"
     one.request(Request.ARM)
     assert one.note == ""
@@ -208,8 +208,7 @@ def test_arming_that_takes_too_long_is_given_up_with_the_robots_reason():
 
 
 def test_a_new_request_to_arm_has_all_the_time_again():
-    one = arming()
-    report(one, "STANDBY", 0)
+    one = at_standby()
     one.request(Request.ARM)
     one.step(0)
     one.request(Request.READY)
@@ -238,8 +237,7 @@ def test_reset_is_held_until_the_robot_has_left_its_latch(state):
 
 @pytest.mark.parametrize("state", ["FAULT", "ESTOP"])
 def test_arm_is_consumed_by_a_latch(state):
-    one = arming()
-    report(one, "STANDBY", 0)
+    one = at_standby()
     one.request(Request.ARM)
     report(one, state, 0)
     assert one.target is Request.STANDBY
@@ -260,8 +258,7 @@ def test_a_session_is_never_zero_nor_the_last_nor_the_robots(draws, foreign):
 
 
 def test_a_session_that_the_robot_has_had_before_is_replaced():
-    one = arming()
-    report(one, "STANDBY", 0)
+    one = at_standby()
     one.request(Request.READY)
     start_ns = 10**15
     one.step(start_ns)
@@ -280,8 +277,7 @@ def test_a_session_that_the_robot_has_had_before_is_replaced():
 
 
 def test_a_ready_session_serves_the_arming_that_follows():
-    one = arming()
-    report(one, "STANDBY", 0)
+    one = at_standby()
     one.request(Request.READY)
     one.step(0)
     report(one, "READY")

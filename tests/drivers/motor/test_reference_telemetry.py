@@ -40,6 +40,11 @@ def create_telemetry(now_ns=None):
     return made
 
 
+@pytest.fixture
+def made():
+    return create_telemetry()
+
+
 def wheels(to, counter, t_ns, received_ns, ticks=(0, 0), valid=(1, 1)):
     """Feed one wheel sample measured at host time `t_ns`."""
     device_us = (t_ns - BOOT_NS) // 1000
@@ -97,8 +102,7 @@ def test_stamps_that_contradict_the_clock_are_counted_and_end_the_trust_in_it():
     assert not made.distrusts_clock
 
 
-def test_angles_and_speeds():
-    made = create_telemetry()
+def test_angles_and_speeds(made):
     wheels(made, 0, 9_000 * MS, 9_000 * MS, ticks=(2**24 - 3, 5))
     sample = wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(2**24 + 7, -5))
     per_tick = 2 * math.pi / 2048
@@ -106,18 +110,16 @@ def test_angles_and_speeds():
     assert (sample.left_speed_rad_s, sample.right_speed_rad_s) == (1.0, -2.0)
 
 
-def test_a_gap_longer_than_the_sample_times_wrap_allows_the_motion_of_its_length():
+def test_a_gap_longer_than_the_sample_times_wrap_allows_the_motion_of_its_length(made):
     """2.9 s at 8 rad/s; by the sample times alone it could have been 0.28 s."""
-    made = create_telemetry()
     wheels(made, 0, 9_000 * MS, 9_000 * MS)
     moved = int(8.0 * 2.9 / (2 * math.pi) * 2048)
     assert wheels(made, 1, 11_900 * MS, 11_900 * MS, ticks=(moved, moved)) is not None
     assert made.implausible_ticks == 0
 
 
-def test_receptions_in_a_batch_do_not_make_motion_implausible():
+def test_receptions_in_a_batch_do_not_make_motion_implausible(made):
     """A loop that was held up reads five samples at once; their own times say how far apart they are."""
-    made = create_telemetry()
     for counter in range(5):
         step = int(8.0 * 0.01 / (2 * math.pi) * 2048)
         sample = wheels(made, counter, (9_000 + 10 * counter) * MS, 9_050 * MS, ticks=(counter * step, 0))
@@ -125,9 +127,8 @@ def test_receptions_in_a_batch_do_not_make_motion_implausible():
 
 
 @pytest.mark.parametrize("restarted_after_ms", range(30, 1300, 90))
-def test_the_ticks_of_a_device_that_has_restarted_are_no_motion(restarted_after_ms):
+def test_the_ticks_of_a_device_that_has_restarted_are_no_motion(restarted_after_ms, made):
     """Its sample times jump as well; they must not make room for the jump of the ticks."""
-    made = create_telemetry()
     wheels(made, 0, 9_000 * MS, 9_000 * MS, ticks=(2000, 2000))
     for number in range(1, 7):
         received_ns = (9_000 + 10 * number) * MS
@@ -136,8 +137,7 @@ def test_the_ticks_of_a_device_that_has_restarted_are_no_motion(restarted_after_
     assert sample is not None
 
 
-def test_implausible_ticks_and_invalid_halves_are_counted_and_dropped():
-    made = create_telemetry()
+def test_implausible_ticks_and_invalid_halves_are_counted_and_dropped(made):
     wheels(made, 0, 9_000 * MS, 9_000 * MS)
     assert wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(5000, 0)) is None
     assert made.implausible_ticks == 1
@@ -184,27 +184,18 @@ def test_a_stamp_that_fits_again_restores_the_trust_in_the_clock():
     assert not made.distrusts_clock
 
 
-def test_angles_go_on_through_an_interruption():
-    made = create_telemetry()
+@pytest.mark.parametrize(("restarts", "limits"), [(True, (TICKS_PER_REV, MAX_SPEED_RAD_S)), (False, (1024, 4.0))])
+def test_angles_go_on_through_an_interruption_and_when_other_limits_are_reported(restarts, limits, made):
     wheels(made, 0, 9_000 * MS, 9_000 * MS)
     before = wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(20, 20))
-    made.restart()
-    made.configure(TICKS_PER_REV, MAX_SPEED_RAD_S)
+    if restarts:
+        made.restart()
+    made.configure(*limits)
     after = wheels(made, 2, 9_020 * MS, 9_020 * MS, ticks=(900_000, 3))
     assert (after.left_angle_rad, after.right_angle_rad) == (before.left_angle_rad, before.right_angle_rad)
 
 
-def test_angles_go_on_when_other_limits_are_reported():
-    made = create_telemetry()
-    wheels(made, 0, 9_000 * MS, 9_000 * MS)
-    before = wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(20, 20))
-    made.configure(1024, 4.0)
-    after = wheels(made, 2, 9_020 * MS, 9_020 * MS, ticks=(900_000, 3))
-    assert (after.left_angle_rad, after.right_angle_rad) == (before.left_angle_rad, before.right_angle_rad)
-
-
-def test_the_same_limits_reported_again_lose_no_motion():
-    made = create_telemetry()
+def test_the_same_limits_reported_again_lose_no_motion(made):
     wheels(made, 0, 9_000 * MS, 9_000 * MS)
     made.configure(TICKS_PER_REV, MAX_SPEED_RAD_S)
     assert wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(20, 20)).left_angle_rad > 0

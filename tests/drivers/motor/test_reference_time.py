@@ -7,11 +7,9 @@ import pytest
 from drivers.motor.reference import ReferenceDriver
 from drivers.types import DriverState, WheelCommand
 from firmware_protocol.codec import Codec
-from tests.drivers.motor.bench import MS, START_NS, Bench
+from tests.drivers.motor.bench import IDLE_STATES, MS, START_NS, Bench
 from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot
 from tests.tables import thinned
-
-IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 def create_bench(robot=None, **options):
@@ -61,15 +59,11 @@ def test_samples_carry_the_time_of_their_measurement(jitter_ms, skew):
 
 
 def test_a_restarted_robot_is_noticed_and_moves_nothing():
-    bench = create_bench(ReferenceRobot(boot_ns=START_NS - 10**9))
-    bench.arm()
-    bench.run(3.0, (3.0, 3.0))
+    bench = create_bench(ReferenceRobot(boot_ns=START_NS - 10**9)).drive(3.0, (3.0, 3.0))
     angle = bench.wheels[-1].left_angle_rad
     bench.robot = ReferenceRobot(boot_ns=bench.now_ns)
-    bench.largest_speed = 0.0
-    bench.run(3.0)
+    assert bench.largest_speed_in(3.0) == 0.0
     assert bench.driver.state in IDLE_STATES
-    assert bench.largest_speed == 0.0
     assert bench.events.count("sample times disagree with the robot's clock: synchronising the clocks again") == 1
     assert bench.wheels[-1].left_angle_rad == pytest.approx(angle, abs=0.05), "the encoder's new zero is no motion"
     assert bench.driver.synced
@@ -101,9 +95,7 @@ def test_a_clock_that_leaps_ahead_is_distinguished_from_a_restart():
 
 
 def test_a_controller_whose_clock_goes_back_is_counted_and_goes_on():
-    bench = create_bench(ReferenceRobot(boot_ns=START_NS - 10**10))
-    bench.arm()
-    bench.run(1.0, (3.0, 3.0))
+    bench = create_bench(ReferenceRobot(boot_ns=START_NS - 10**10)).drive(1.0, (3.0, 3.0))
     reported = "the robot's controller saw its clock go backwards and counted a nominal period instead"
     for times in (1, 2):
         bench.robot.boot_ns += 15 * 10**6
@@ -122,9 +114,7 @@ def test_a_controller_whose_clock_goes_back_is_counted_and_goes_on():
 
 
 def test_the_ticks_of_another_robot_on_a_new_link_are_no_motion():
-    bench = create_bench()
-    bench.arm()
-    bench.run(1.0, (3.0, 3.0))
+    bench = create_bench().drive(1.0, (3.0, 3.0))
     angle = bench.wheels[-1].left_angle_rad
     bench.host_end.plug(False)
     bench.run(0.1)

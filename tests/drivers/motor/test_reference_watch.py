@@ -38,9 +38,7 @@ def test_it_objects_to_late_commands_and_to_silence_and_forgets_at_rest():
 @thinned("rate_hz", [50, 20, 100], quick=1)
 @pytest.mark.parametrize("growth", [0.05, 0.2, 1.0, 3.0])
 def test_commands_that_come_later_and_later_disarm(growth, rate_hz):
-    bench = create_bench(rate_hz=rate_hz)
-    bench.arm()
-    bench.run(1.0, (3.0, 3.0))
+    bench = create_bench(rate_hz=rate_hz).drive(1.0, (3.0, 3.0))
     begin_ns = bench.now_ns
     bench.lag_ns = lambda now_ns: growth * (now_ns - begin_ns)
     # What arrives a time E after the beginning was sent growth / (1 + growth) * E ago; telemetry reports it at 10 Hz.
@@ -59,9 +57,7 @@ def test_commands_that_come_later_and_later_disarm(growth, rate_hz):
 
 
 def test_it_says_so_and_counts():
-    bench = create_bench()
-    bench.arm()
-    bench.run(1.0, (3.0, 3.0))
+    bench = create_bench().drive(1.0, (3.0, 3.0))
     begin_ns = bench.now_ns
     bench.lag_ns = lambda now_ns: 0.2 * (now_ns - begin_ns)
     bench.run(3.0)
@@ -72,8 +68,7 @@ def test_it_says_so_and_counts():
 
 def test_a_link_that_is_slow_but_not_slower_and_slower_does_not_disarm():
     bench = create_bench(lag_ns=lambda now_ns: 60 * MS, delay_ns=lambda generator: generator.uniform(2, 25) * MS)
-    bench.arm()
-    bench.run(20.0, (3.0, 3.0))
+    bench.drive(20.0, (3.0, 3.0))
     assert bench.driver.state is DriverState.ARMED
     assert bench.driver.stats.late_commands == 0
 
@@ -81,8 +76,7 @@ def test_a_link_that_is_slow_but_not_slower_and_slower_does_not_disarm():
 @thinned("rate_hz", [50, 20, 100], quick=1)
 def test_lost_frames_are_no_lateness(rate_hz):
     bench = create_bench(rate_hz=rate_hz, loses=lambda generator: generator.random() < (0.02 if rate_hz == 20 else 0.2))
-    bench.arm()
-    bench.run(20.0, (3.0, 3.0))
+    bench.drive(20.0, (3.0, 3.0))
     assert bench.driver.stats.late_commands == 0
 
 
@@ -91,8 +85,7 @@ def test_armed_it_goes_on_hearing_the_robots_state_or_stops(missing):
     """Armed is what the robot says it is: without its word for half a second nobody knows."""
     bench = create_bench()
     ids = [CODEC.can_id(name) for name in missing]
-    bench.arm()
-    bench.run(1.0, (3.0, 3.0))
+    bench.drive(1.0, (3.0, 3.0))
     drain = bench.robot.drain
     bench.robot.drain = lambda: [frame for frame in drain() if frame.can_id not in ids]
     bench.run(0.35)

@@ -6,11 +6,10 @@ from disco_hw.config import Control, Link
 from disco_hw.runtime.preflight import Level, check_link_load
 from drivers.motor.roboclaw_protocol import SETTERS
 from drivers.types import DriverState, Request, WheelCommand
+from tests.drivers.motor.bench import FORWARD, IDLE_STATES
 from tests.drivers.motor.vendors import VENDORS
 
 ONE, TWO = (vendor for vendor in VENDORS if vendor.name == "roboclaw")
-FORWARD = (3.0, 2.0)
-IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 STOP = SETTERS["duty_m1m2"].command
 
 
@@ -24,8 +23,7 @@ def boards(bench):
 
 
 def drive(bench):
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     assert bench.robot.speed == pytest.approx(FORWARD, abs=0.02)
 
 
@@ -42,8 +40,7 @@ def test_a_board_that_does_not_keep_its_timeout_is_not_armed(bench):
     bench.run_until(*IDLE_STATES)
     receive = bench.robot.receive
     bench.robot.receive = lambda now_ns, frame: None if frame.can_id & 0xFF == 14 else receive(now_ns, frame)
-    bench.driver.request(Request.ARM)
-    bench.run(2.5, FORWARD)
+    bench.request(Request.ARM).run(2.5, FORWARD)
     assert bench.driver.state in IDLE_STATES
     assert "serial timeout" in bench.driver.detail
     assert bench.largest_speed == 0.0
@@ -71,8 +68,7 @@ def test_a_speed_that_was_still_waiting_behind_the_stop_is_stopped_too(bench):
 
 
 def test_a_board_that_restarted_standing_is_known_by_its_timeout(bench):
-    bench.arm()
-    bench.run(0.3)
+    bench.drive(0.3)
     bench.robot.controller.restart()
     bench.run(0.7)
     assert bench.driver.state is DriverState.FAULT
@@ -99,8 +95,7 @@ def test_its_e_stop_input_stops_it_and_needs_a_reset(bench):
     bench.run(2.0, FORWARD)
     assert bench.driver.state is DriverState.FAULT
     assert bench.robot.speed_rad_s < 0.05
-    bench.driver.request(Request.RESET)
-    bench.run_until(*IDLE_STATES)
+    bench.request(Request.RESET).run_until(*IDLE_STATES)
 
 
 def test_an_e_stop_that_the_board_latches_by_itself_is_reset_only_when_asked_to(bench):
@@ -113,8 +108,7 @@ def test_an_e_stop_that_the_board_latches_by_itself_is_reset_only_when_asked_to(
     bench.run(1.0)
     assert bench.driver.state is DriverState.ESTOP
     assert not [frame for frame in bench.robot.received if frame.can_id & 0xFF == 200]
-    bench.driver.request(Request.RESET)
-    bench.run_until(*IDLE_STATES)
+    bench.request(Request.RESET).run_until(*IDLE_STATES)
 
 
 def test_the_two_byte_status_of_older_firmware_is_taken(bench):
@@ -129,8 +123,7 @@ def test_the_two_byte_status_of_older_firmware_is_taken(bench):
 def test_a_speed_beyond_what_the_board_can_do_is_held_to_it(bench):
     for board in boards(bench):
         board.registers.pid_m1 = board.registers.pid_m2 = (65536, 32768, 0, 6000)
-    bench.arm()
-    bench.run(1.0, (50.0, 2.0))
+    bench.drive(1.0, (50.0, 2.0))
     assert bench.robot.speed[0] == pytest.approx(6000 / ONE.settings.counts_per_rad, rel=1e-3)
     assert bench.driver.limits.max_wheel_speed_rad_s.value == pytest.approx(6000 / ONE.settings.counts_per_rad)
 

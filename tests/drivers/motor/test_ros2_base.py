@@ -5,10 +5,10 @@ import pytest
 from drivers.motor import find_driver
 from drivers.motor import ros2_base_wire as wire
 from drivers.types import DriverState, Request, WheelCommand
+from tests.drivers.motor.bench import FORWARD
 from tests.drivers.motor.vendors import VENDORS
 
 (VENDOR,) = [vendor for vendor in VENDORS if vendor.name == "ros2_base"]
-FORWARD = (3.0, 2.0)
 
 
 @pytest.fixture
@@ -52,8 +52,7 @@ def test_a_base_that_others_drive_or_that_hears_nobody_is_not_armed_and_disarmed
     assert expected_detail in bench.driver.detail
     setattr(end, fault, fault != "others_speak")
     bench.run(0.2)
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     setattr(end, fault, fault == "others_speak")
     bench.run(0.2)
     assert bench.driver.state is DriverState.FAULT
@@ -66,8 +65,7 @@ def test_a_bridge_that_was_started_with_other_settings_is_refused(bench, end):
     bench.run(0.2)
     assert bench.driver.state is DriverState.HANDSHAKE
     assert "another [link] of robot.toml" in bench.driver.detail
-    bench.driver.request(Request.ARM)
-    bench.run(0.5, FORWARD)
+    bench.request(Request.ARM).run(0.5, FORWARD)
     assert bench.largest_speed == 0.0
 
 
@@ -87,21 +85,18 @@ def test_a_fault_stays_until_it_is_reset_although_its_cause_has_gone(bench, end)
     bench.robot.controller.joints = True
     bench.run(1.0, FORWARD)
     assert bench.driver.state is DriverState.FAULT
-    bench.driver.request(Request.RESET)
-    bench.run_until(DriverState.STANDBY)
+    bench.request(Request.RESET).run_until(DriverState.STANDBY)
 
 
 def test_after_a_pause_longer_than_the_bridge_waits_nothing_is_sent_that_moves(bench):
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     sent = bench.driver.transmit(bench.now_ns + 220_000_000, WheelCommand(*FORWARD, 0.1))
     assert bench.driver.state is DriverState.FAULT
     assert not [one for one in sent if one.frame.can_id == wire.SPEEDS]
 
 
 def test_a_restart_of_the_base_alone_is_seen_by_its_angles(bench, end):
-    bench.arm()
-    bench.run(1.0, FORWARD)
+    bench.drive(1.0, FORWARD)
     bench.robot.controller._zero_ticks = (-50_000, 50_000)
     bench.run(0.1, FORWARD)
     assert bench.driver.state is DriverState.FAULT
@@ -119,10 +114,8 @@ def test_the_safety_card_says_who_stops_the_base_and_that_its_time_out_is_only_d
 
 
 def test_odometry_that_stops_while_it_slows_down_is_a_fault_that_stays(bench, end):
-    bench.arm()
-    bench.run(0.5, (20.0, 20.0))
-    bench.driver.request(Request.STANDBY)
-    bench.run(0.1)
+    bench.drive(0.5, (20.0, 20.0))
+    bench.request(Request.STANDBY).run(0.1)
     VENDOR.lose_left(bench.robot)
     bench.run(0.4)
     assert not end.driving

@@ -10,12 +10,10 @@ import pytest
 
 from drivers.motor import find_driver
 from drivers.types import DriverState, Frame, OutgoingFrame, Request, WheelCommand
-from tests.drivers.motor.bench import START_NS
+from tests.drivers.motor.bench import FORWARD, IDLE_STATES, START_NS
 from tests.drivers.motor.vendors import VENDORS
 from tests.tables import thinned
 
-FORWARD = (3.0, 2.0)
-IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 COASTING_S = 2.5
 
 
@@ -46,8 +44,7 @@ def no_wheel_is_driven(bench):
 
 
 def drive(bench, seconds=1.0):
-    bench.arm()
-    bench.run(seconds, FORWARD)
+    bench.drive(seconds, FORWARD)
     assert bench.robot.speed == pytest.approx(FORWARD, abs=0.02)
 
 
@@ -56,8 +53,7 @@ def test_nothing_that_moves_is_sent_before_arming(vendor, bench):
     bench.run(2.0)
     assert bench.driver.state in IDLE_STATES
     assert bench.largest_speed == 0.0
-    bench.driver.request(Request.READY)
-    bench.run(1.0)
+    bench.request(Request.READY).run(1.0)
     assert bench.driver.state is DriverState.READY
     assert not [frame for frame in bench.robot.received if vendor.is_motion(frame)]
 
@@ -109,9 +105,7 @@ def test_a_silent_host_is_stopped_by_the_controller_and_nothing_moves_when_it_is
     bench.run(vendor.watchdog_s + COASTING_S)
     assert bench.robot.speed_rad_s < 0.05
     bench.host_runs = True
-    bench.largest_speed = 0.0
-    bench.run(3.0)
-    assert bench.largest_speed < 0.05
+    assert bench.largest_speed_in(3.0) < 0.05
     assert bench.driver.state in (*IDLE_STATES, DriverState.FAULT)
 
 
@@ -191,9 +185,7 @@ def test_asked_to_stand_by_after_a_pause_it_does_not_ramp_down_from_where_it_was
     bench.run(vendor.watchdog_s + COASTING_S)
     bench.driver.request(Request.STANDBY)
     bench.host_runs = True
-    bench.largest_speed = 0.0
-    bench.run(2.0)
-    assert bench.largest_speed < 0.05
+    assert bench.largest_speed_in(2.0) < 0.05
 
 
 def test_without_commands_the_controllers_watchdog_is_not_fed(vendor, bench):
@@ -221,10 +213,8 @@ def test_disarming_ramps_down_and_says_so_until_it_stands(bench):
 
 def test_an_arming_that_is_taken_back_moves_nothing(bench):
     bench.run_until(*IDLE_STATES)
-    bench.driver.request(Request.ARM)
-    bench.run(0.05, FORWARD)
-    bench.driver.request(Request.STANDBY)
-    bench.run(2.0, FORWARD)
+    bench.request(Request.ARM).run(0.05, FORWARD)
+    bench.request(Request.STANDBY).run(2.0, FORWARD)
     assert bench.driver.state in IDLE_STATES
     assert bench.largest_speed == 0.0
 
@@ -236,8 +226,7 @@ def test_one_side_lost_stops_the_other_and_stays_a_fault(vendor, bench):
     bench.run(0.05)
     assert bench.robot.controller.wheels_rad_s[1] in (None, 0.0)
     assert len(bench.driver.detail) > 10
-    bench.driver.request(Request.ARM)
-    bench.run(COASTING_S, FORWARD)
+    bench.request(Request.ARM).run(COASTING_S, FORWARD)
     assert bench.driver.state is DriverState.FAULT
     assert bench.robot.speed_rad_s < 0.05
 
@@ -248,13 +237,9 @@ def test_an_error_cleared_does_not_energise_again(vendor, bench):
     bench.run_until(DriverState.FAULT, timeout_s=0.5)
     bench.run(COASTING_S)
     vendor.mend(bench.robot)
-    bench.driver.request(Request.RESET)
-    bench.run_until(*IDLE_STATES)
-    bench.largest_speed = 0.0
-    bench.run(2.0, FORWARD)
-    assert bench.largest_speed < 0.05
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.request(Request.RESET).run_until(*IDLE_STATES)
+    assert bench.largest_speed_in(2.0, FORWARD) < 0.05
+    bench.drive(0.5, FORWARD)
     assert bench.robot.speed == pytest.approx(FORWARD, abs=0.02)
 
 
@@ -265,8 +250,7 @@ def test_the_emergency_stop_stops_in_every_state(vendor, bench, when):
     if when in ("armed", "stopping", "fault"):
         drive(bench)
     if when == "arming":
-        bench.driver.request(Request.ARM)
-        bench.run(0.045)
+        bench.request(Request.ARM).run(0.045)
     if when == "stopping":
         bench.driver.request(Request.STANDBY)
     if when == "fault":
@@ -280,13 +264,10 @@ def test_the_emergency_stop_stops_in_every_state(vendor, bench, when):
     assert bench.robot.speed_rad_s < 0.05
     assert bench.driver.state is DriverState.ESTOP
     bench.driver.request(Request.ARM)
-    bench.largest_speed = 0.0
-    bench.run(2.0)
+    assert bench.largest_speed_in(2.0) < 0.05
     assert bench.driver.state is DriverState.ESTOP
-    assert bench.largest_speed < 0.05
     vendor.mend(bench.robot)
-    bench.driver.request(Request.RESET)
-    bench.run_until(*IDLE_STATES)
+    bench.request(Request.RESET).run_until(*IDLE_STATES)
     bench.run(2.0)
     assert bench.largest_speed < 0.05
 
@@ -331,10 +312,8 @@ def test_a_line_unplugged_stops_the_robot_and_reconnection_never_arms(vendor, be
     assert bench.robot.speed_rad_s < 0.05
     bench.driver.request(Request.ARM)
     bench.host_end.plug(True)
-    bench.largest_speed = 0.0
-    bench.run(3.0, FORWARD)
+    assert bench.largest_speed_in(3.0, FORWARD) < 0.05
     assert bench.driver.state in (*IDLE_STATES, DriverState.FAULT)
-    assert bench.largest_speed < 0.05
     assert bench.wheels[-1].left_angle_rad > 1.0, "the angles go on from where they were"
 
 
@@ -348,12 +327,9 @@ def test_an_emergency_stop_is_latched_although_the_line_was_out_when_it_was_aske
     bench.run(3.0)
     assert bench.driver.state is DriverState.ESTOP
     bench.driver.request(Request.ARM)
-    bench.largest_speed = 0.0
-    bench.run(1.0, FORWARD)
+    assert bench.largest_speed_in(1.0, FORWARD) < 0.05
     assert bench.driver.state is DriverState.ESTOP
-    assert bench.largest_speed < 0.05
-    bench.driver.request(Request.RESET)
-    bench.run_until(*IDLE_STATES)
+    bench.request(Request.RESET).run_until(*IDLE_STATES)
 
 
 def test_a_fault_is_latched_although_the_line_was_out_since(vendor, bench):
@@ -369,12 +345,9 @@ def test_a_fault_is_latched_although_the_line_was_out_since(vendor, bench):
     bench.run(2.2)
     assert (bench.driver.state, bench.driver.detail) == (DriverState.FAULT, why)
     bench.driver.request(Request.ARM)
-    bench.largest_speed = 0.0
-    bench.run(0.2, FORWARD)
+    assert bench.largest_speed_in(0.2, FORWARD) < 0.05
     assert bench.driver.state is DriverState.FAULT
-    assert bench.largest_speed < 0.05
-    bench.driver.request(Request.RESET)
-    bench.run_until(*IDLE_STATES)
+    bench.request(Request.RESET).run_until(*IDLE_STATES)
 
 
 @thinned("out_for_s", [0.03, 0.09, 0.15], quick=1)
@@ -394,9 +367,7 @@ def test_a_brown_out_disarms_and_nothing_moves_after_it(bench):
     bench.robot.controller.restart()
     bench.run(COASTING_S)
     assert bench.driver.state is not DriverState.ARMED
-    bench.largest_speed = 0.0
-    bench.run(2.0, FORWARD)
-    assert bench.largest_speed < 0.05
+    assert bench.largest_speed_in(2.0, FORWARD) < 0.05
 
 
 def test_telemetry_that_stops_while_armed_is_a_lost_controller(vendor, bench):
@@ -444,8 +415,7 @@ def test_a_command_that_is_none_is_the_callers_error(bench, bad):
 def test_it_arms_again_only_on_request(bench):
     drive(bench)
     sessions = bench.driver.stats.sessions
-    bench.driver.request(Request.READY)
-    bench.run(3.0, FORWARD)
+    bench.request(Request.READY).run(3.0, FORWARD)
     assert bench.robot.speed_rad_s < 0.05
     bench.arm()
     assert bench.driver.stats.sessions == sessions + 1
@@ -462,8 +432,7 @@ def test_a_controller_that_fell_silent_while_it_drove_is_a_fault_until_a_reset_t
     bench.run(1.0)
     assert bench.driver.state is DriverState.FAULT
     assert "stopped reporting" in bench.driver.detail
-    bench.driver.request(Request.RESET)
-    bench.run_until(*IDLE_STATES)
+    bench.request(Request.RESET).run_until(*IDLE_STATES)
 
 
 def test_an_emergency_stop_is_not_reset_while_nothing_is_heard_of_the_controllers(bench):
@@ -473,8 +442,7 @@ def test_an_emergency_stop_is_not_reset_while_nothing_is_heard_of_the_controller
     drain = bench.robot.drain
     bench.robot.drain = lambda: drain() and []
     bench.run(COASTING_S)
-    bench.driver.request(Request.RESET)
-    bench.run(1.0)
+    bench.request(Request.RESET).run(1.0)
     assert bench.driver.state is DriverState.ESTOP
     bench.robot.drain = drain
     bench.run_until(*IDLE_STATES)
@@ -482,8 +450,7 @@ def test_an_emergency_stop_is_not_reset_while_nothing_is_heard_of_the_controller
 
 def test_what_is_wanted_after_a_stop_is_not_forgotten_on_the_way(bench):
     drive(bench)
-    bench.driver.request(Request.READY)
-    bench.run_until(*IDLE_STATES)
+    bench.request(Request.READY).run_until(*IDLE_STATES)
     bench.run(0.5)
     assert bench.driver.state is DriverState.READY
 
@@ -492,8 +459,7 @@ def test_another_host_that_commands_while_it_stops_is_a_fault(vendor, bench):
     if vendor.is_serial:
         return
     drive(bench)
-    bench.driver.request(Request.STANDBY)
-    bench.run(0.05)
+    bench.request(Request.STANDBY).run(0.05)
     frame = Frame(vendor.foreign.can_id, vendor.foreign.data, vendor.foreign.extended)
     bench.robot_end.send(OutgoingFrame(frame, bench.now_ns), bench.now_ns)
     bench.run(0.05)
@@ -524,9 +490,7 @@ def test_released_no_speed_but_zero_is_commanded_any_more_and_the_reason_is_a_fa
     bench.run(COASTING_S, FORWARD)
     assert not [frame for frame in bench.robot.received[sent:] if vendor.is_motion(frame)], "a ramp would be motion"
     assert no_wheel_is_driven(bench)
-    bench.driver.request(Request.ARM)
-    bench.run(0.5)
+    bench.request(Request.ARM).run(0.5)
     assert bench.driver.state is DriverState.FAULT
-    bench.driver.request(Request.RESET)
-    bench.run(1.0)
+    bench.request(Request.RESET).run(1.0)
     bench.run_until(*IDLE_STATES)

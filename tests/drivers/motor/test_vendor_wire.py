@@ -10,10 +10,9 @@ import pytest
 
 from drivers.types import DriverState, Request
 from sim.can_protocol import CanFrame
+from tests.drivers.motor.bench import FORWARD, IDLE_STATES
 from tests.drivers.motor.vendors import VENDORS
 
-FORWARD = (3.0, 2.0)
-IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 COASTING_S = 2.5
 PHASES = ("start", "arm", "run", "stop", "again", "fault", "reset", "reconnect", "estop", "after")
 SUMS = {
@@ -73,36 +72,30 @@ def scripted_day(vendor):
     bench.run(1.0, FORWARD)
     bench.run(0.5, (-1.0, 2.5))
     begin()  # stop
-    bench.driver.request(Request.STANDBY)
-    bench.run_until(*IDLE_STATES)
+    bench.request(Request.STANDBY).run_until(*IDLE_STATES)
     bench.run(COASTING_S)
     begin()  # again
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     begin()  # fault
     vendor.lose_left(bench.robot)
     bench.run_until(DriverState.FAULT, timeout_s=0.5)
     bench.run(COASTING_S)
     begin()  # reset
     vendor.mend(bench.robot)
-    bench.driver.request(Request.RESET)
-    bench.run_until(*IDLE_STATES)
+    bench.request(Request.RESET).run_until(*IDLE_STATES)
     bench.run(COASTING_S)
     begin()  # reconnect
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     bench.host_end.plug(False)
     bench.run(COASTING_S)
     bench.host_end.plug(True)
     bench.run(COASTING_S)
     begin()  # estop
-    bench.arm()
-    bench.run(0.5, FORWARD)
+    bench.drive(0.5, FORWARD)
     bench.send_estop()
     bench.run(COASTING_S)
     begin()  # after
-    bench.driver.request(Request.RESET)
-    bench.run_until(*IDLE_STATES)
+    bench.request(Request.RESET).run_until(*IDLE_STATES)
     bench.run(0.5)
     return recorded.phases
 

@@ -6,12 +6,11 @@ from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError
 from drivers.motor import find_driver
 from drivers.types import DriverState, Request
+from tests.drivers.motor.bench import FORWARD, IDLE_STATES
 from tests.drivers.motor.test_motor_drivers import EXAMPLES, robot_toml
 from tests.drivers.motor.vendors import VENDORS
 
 (VESC,) = [vendor for vendor in VENDORS if vendor.label == "vesc"]
-FORWARD = (3.0, 2.0)
-IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 def test_a_task_that_needs_less_than_the_speed_loop_holds_is_refused_with_what_it_holds(tmp_path):
@@ -22,9 +21,7 @@ def test_a_task_that_needs_less_than_the_speed_loop_holds_is_refused_with_what_i
 
 @pytest.mark.parametrize("pause_s", [0.13, 0.5])
 def test_a_host_that_paused_for_longer_than_the_timeout_is_disarmed(pause_s):
-    bench = VESC.bench()
-    bench.arm()
-    bench.run(1.0, FORWARD)
+    bench = VESC.bench().drive(1.0, FORWARD)
     bench.host_runs = False
     bench.run(pause_s)
     bench.host_runs = True
@@ -35,9 +32,7 @@ def test_a_host_that_paused_for_longer_than_the_timeout_is_disarmed(pause_s):
 
 
 def test_a_controller_that_restarts_while_armed_is_lost():
-    bench = VESC.bench()
-    bench.arm()
-    bench.run(2.0, FORWARD)
+    bench = VESC.bench().drive(2.0, FORWARD)
     bench.robot.controller.restart()
     bench.run(0.1, FORWARD)
     assert bench.driver.state is DriverState.FAULT
@@ -58,8 +53,7 @@ def test_it_does_not_arm_while_a_motor_turns():
     bench.run_until(*IDLE_STATES)
     bench.robot.speed = [2.0, 2.0]
     bench.run(0.05)
-    bench.driver.request(Request.ARM)
-    bench.run(0.05, FORWARD)
+    bench.request(Request.ARM).run(0.05, FORWARD)
     assert bench.driver.state in IDLE_STATES
     assert "is turning" in bench.driver.detail
     assert not [frame for frame in bench.robot.received if VESC.is_motion(frame)]
@@ -67,9 +61,7 @@ def test_it_does_not_arm_while_a_motor_turns():
 
 def test_it_brakes_for_as_long_as_a_motor_says_that_it_turns_and_lets_go_of_one_that_says_nothing():
     """On a slope, a brake that is let go after a while would let the robot roll away."""
-    bench = VESC.bench()
-    bench.arm()
-    bench.run(1.0, FORWARD)
+    bench = VESC.bench().drive(1.0, FORWARD)
     step = bench.robot.step
 
     def pushed(now_ns):
@@ -77,8 +69,7 @@ def test_it_brakes_for_as_long_as_a_motor_says_that_it_turns_and_lets_go_of_one_
         step(now_ns)
 
     bench.robot.stuck, bench.robot.step = {0, 1}, pushed
-    bench.driver.request(Request.STANDBY)
-    bench.run(10.0)
+    bench.request(Request.STANDBY).run(10.0)
     assert bench.driver.state is DriverState.STOPPING
     assert bench.robot.received[-1].can_id >> 8 == 2, "a brake current"
     bench.robot.drain = list
@@ -90,8 +81,7 @@ def test_it_is_armed_only_after_zeros_for_a_while():
     bench = VESC.bench()
     bench.run_until(*IDLE_STATES)
     bench.robot.received.clear()
-    bench.arm()
-    bench.run(0.02)
+    bench.drive(0.02)
     zeros = [frame for frame in bench.robot.received if frame.can_id == 3 << 8 | 23]
     assert len(zeros) >= 10
     assert {frame.data for frame in zeros} == {bytes(4)}

@@ -1,21 +1,21 @@
 """A controller whose watchdog is off, or other than robot.toml declares, is refused in words where it can be asked."""
 
 import struct
+from dataclasses import replace
 
 import pytest
 
 from disco_hw.runtime.preflight import Level, check_watchdog
 from drivers.motor.vesc_codec import timeout
 from drivers.types import DriverState
-from tests.drivers.motor.vendors import VENDORS, Vendor
+from tests.drivers.motor.bench import IDLE_STATES
+from tests.drivers.motor.vendors import VENDORS
 
 BY_LABEL = {vendor.label: vendor for vendor in VENDORS}
-IDLE_STATES = (DriverState.STANDBY, DriverState.READY)
 
 
 def readable_odrive():
-    vendor = BY_LABEL["odrive-0.6"]
-    return Vendor(vendor.name, vendor.label, "watchdog_endpoints = [220, 221]\n", *list(vars(vendor).values())[3:])
+    return replace(BY_LABEL["odrive-0.6"], changes="watchdog_endpoints = [220, 221]\n")
 
 
 def vescs(bench):

@@ -3,7 +3,8 @@
 import struct
 import tomllib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
+from functools import partial
 
 import msgspec
 
@@ -25,7 +26,8 @@ class Vendor:
 
     name: str
     label: str
-    changes: str
+    changes: str = ""
+    _: KW_ONLY
     watchdog_s: float
     lose_left: Callable[[VendorRig], None]
     is_motion: Callable[[CanFrame], bool]
@@ -157,111 +159,41 @@ def is_ros2_base_forbidden(frame):
     return len(frame.data) != {0x010: 0, 0x011: 1, 0x012: 8, 0x013: 0}.get(frame.can_id)
 
 
+ODRIVE = partial(
+    Vendor, "odrive", watchdog_s=0.1,
+    lose_left=fail_left_odrive, is_motion=is_odrive_motion, is_forbidden=is_odrive_forbidden,
+)  # fmt: skip
+VESC = partial(
+    Vendor, "vesc", watchdog_s=0.11, mend=mend_vesc,
+    lose_left=fail_left_vesc, is_motion=is_vesc_motion, is_forbidden=is_vesc_forbidden,
+)  # fmt: skip
+ROBOCLAW = partial(
+    Vendor, "roboclaw", watchdog_s=0.2, foreign=None, is_motion=is_roboclaw_motion, is_forbidden=is_roboclaw_forbidden
+)
 VENDORS = (
-    Vendor(
-        "odrive",
-        "odrive-0.6",
-        "",
-        0.1,
-        fail_left_odrive,
-        is_odrive_motion,
-        is_odrive_forbidden,
-        CanFrame(3 << 5 | 0x0D, bytes(8)),
-    ),
-    Vendor(
-        "odrive",
-        "odrive-0.5",
-        'firmware = "0.5"\n',
-        0.1,
-        fail_left_odrive,
-        is_odrive_motion,
-        is_odrive_forbidden,
-        CanFrame(5 << 5 | 0x0D, bytes(8)),
-    ),
-    Vendor(
-        "odrive",
-        "odrive-four-axes",
-        "nodes = [[3, 5], [6, 7]]\n",
-        0.1,
-        fail_left_odrive,
-        is_odrive_motion,
-        is_odrive_forbidden,
-        CanFrame(6 << 5 | 0x0D, bytes(8)),
-    ),
-    Vendor(
-        "vesc",
-        "vesc",
-        "",
-        0.11,
-        fail_left_vesc,
-        is_vesc_motion,
-        is_vesc_forbidden,
-        CanFrame(3 << 8 | 23, bytes(4), extended=True),
-        mend_vesc,
-    ),
-    Vendor(
-        "vesc",
+    ODRIVE("odrive-0.6", foreign=CanFrame(3 << 5 | 0x0D, bytes(8))),
+    ODRIVE("odrive-0.5", 'firmware = "0.5"\n', foreign=CanFrame(5 << 5 | 0x0D, bytes(8))),
+    ODRIVE("odrive-four-axes", "nodes = [[3, 5], [6, 7]]\n", foreign=CanFrame(6 << 5 | 0x0D, bytes(8))),
+    VESC("vesc", foreign=CanFrame(3 << 8 | 23, bytes(4), extended=True)),
+    VESC(
         "vesc-four-braking",
         "nodes = [[23, 24], [51, 52]]\ntimeout_brake_current_a = 10.0\n",
-        0.11,
-        fail_left_vesc,
-        is_vesc_motion,
-        is_vesc_forbidden,
-        CanFrame(3 << 8 | 52, bytes(4), extended=True),
-        mend_vesc,
+        foreign=CanFrame(3 << 8 | 52, bytes(4), extended=True),
     ),
+    VESC("vesc-uart", "uart_node = 51\n", foreign=None),
     Vendor(
-        "vesc",
-        "vesc-uart",
-        "uart_node = 51\n",
-        0.11,
-        fail_left_vesc,
-        is_vesc_motion,
-        is_vesc_forbidden,
-        None,
-        mend_vesc,
+        "agilex", "agilex", watchdog_s=0.5, foreign=CanFrame(0x111, b"\0\x10" + bytes(6)),
+        lose_left=fail_left_agilex, is_motion=is_agilex_motion, is_forbidden=is_agilex_forbidden,
     ),
-    Vendor(
-        "agilex",
-        "agilex",
-        "",
-        0.5,
-        fail_left_agilex,
-        is_agilex_motion,
-        is_agilex_forbidden,
-        CanFrame(0x111, b"\0\x10" + bytes(6)),
-    ),
-    Vendor(
-        "roboclaw",
-        "roboclaw",
-        "",
-        0.2,
-        fail_left_roboclaw,
-        is_roboclaw_motion,
-        is_roboclaw_forbidden,
-        None,
-        mend_roboclaw,
-    ),
-    Vendor(
-        "roboclaw",
+    ROBOCLAW("roboclaw", lose_left=fail_left_roboclaw, mend=mend_roboclaw),
+    ROBOCLAW(
         "roboclaw-a-board-a-side",
         'motors = [["128/1", "128/2"], ["129/1", "129/2"]]\n',
-        0.2,
-        lambda rig: rig.controller.dead.add(128),
-        is_roboclaw_motion,
-        is_roboclaw_forbidden,
-        None,
-        lambda rig: rig.controller.dead.clear(),
+        lose_left=lambda rig: rig.controller.dead.add(128),
+        mend=lambda rig: rig.controller.dead.clear(),
     ),
     Vendor(
-        "ros2_base",
-        "ros2-base",
-        "",
-        0.2,
-        lose_left_ros2_base,
-        is_ros2_base_motion,
-        is_ros2_base_forbidden,
-        CanFrame(0x012, bytes(8)),
-        mend_ros2_base,
+        "ros2_base", "ros2-base", watchdog_s=0.2, foreign=CanFrame(0x012, bytes(8)), mend=mend_ros2_base,
+        lose_left=lose_left_ros2_base, is_motion=is_ros2_base_motion, is_forbidden=is_ros2_base_forbidden,
     ),
-)
+)  # fmt: skip

@@ -14,7 +14,6 @@ from disco_hw.errors import InputError
 from drivers.pose import DEFAULT, PoseSourceError, create_pose_source, pose_sources
 from drivers.types import PoseSample
 from tests.config.test_robot import GOOD
-from tests.drivers.waiting import free_port
 
 ROOT = Path(__file__).parents[3]
 EXAMPLE = ROOT / "docs/examples/beacon.py"
@@ -30,11 +29,6 @@ def _in_the_folder(tmp_path, monkeypatch):
     pose_sources.cache_clear()
     yield
     pose_sources.cache_clear()
-
-
-@pytest.fixture
-def port():
-    return free_port(socket.SOCK_DGRAM)
 
 
 def robot_toml(folder, section):

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from drivers.pose import PoseSourceError, create_pose_source
 from drivers.pose.natnet import VERSIONS, parse_frame, plane_pose
 from tests.drivers.pose.test_nmea import until
-from tests.drivers.waiting import free_port
 
 # Turned by 0.7 rad about Motive's upward axis y, at 1.5 m along x and 2 m towards the viewer (z).
 TURNED = (0.0, math.sin(0.35), 0.0, math.cos(0.35))
@@ -145,11 +144,6 @@ class Motive:
     def send(self, port, *datagrams, group="239.255.42.99"):
         for datagram in datagrams:
             self.socket.sendto(datagram, (group, port))
-
-
-@pytest.fixture
-def port():
-    return free_port(socket.SOCK_DGRAM)
 
 
 def test_by_multicast_with_the_exposures_age_and_a_lost_body(port):

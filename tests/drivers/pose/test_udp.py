@@ -16,15 +16,9 @@ from hypothesis import strategies as st
 
 from drivers.pose import PoseSourceError, create_pose_source
 from drivers.pose.udp import pose_of
-from tests.drivers.waiting import free_port
 
 NOW_NS = 100_000_000_000
 POSE = {"x_m": 1.0, "y_m": -2.0, "yaw_rad": 0.5, "position_std_m": 0.01, "yaw_std_rad": 0.02}
-
-
-@pytest.fixture
-def port():
-    return free_port(socket.SOCK_DGRAM)
 
 
 @pytest.mark.parametrize("encode", [msgspec.json.encode, msgspec.msgpack.encode], ids=["json", "msgpack"])

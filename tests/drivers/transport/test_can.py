@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import closing
 
 import can
 import can.interfaces.virtual as virtual_bus
@@ -221,17 +222,13 @@ def test_a_file_in_the_users_home_changes_nothing(tmp_path, monkeypatch):
     (tmp_path / "can.ini").write_text("[default]\nreceive_own_messages = True\n")
     monkeypatch.setenv("CAN_CONFIG", '{"receive_own_messages": true}')
     channel = next(CHANNELS)
-    transport = opened("virtual", channel)
     other = can.Bus(interface="virtual", channel=channel, ignore_config=True)
-    try:
+    with other, closing(opened("virtual", channel)) as transport:
         up(transport)
         send(transport, outgoing(0x100, b"ours"))
         other.recv(5.0)
         other.send(message(0x111))
         assert [received.frame.can_id for received in collect(transport, 1)] == [0x111]
-    finally:
-        transport.close()
-        other.shutdown()
 
 
 def test_the_bus_is_opened_as_asked_and_options_go_through_as_they_are(monkeypatch):
@@ -257,24 +254,27 @@ def test_the_bus_is_opened_as_asked_and_options_go_through_as_they_are(monkeypat
     ]
 
 
-def test_a_bus_that_hands_back_own_frames_brings_those_of_another_host_only():
-    channel = next(CHANNELS)
-    transport = opened("virtual", channel, receive_own_messages=True)
-    other = can.Bus(interface="virtual", channel=channel, ignore_config=True)
-    try:
+# Of interface-local scope: nothing of it leaves this machine.
+MULTICAST_GROUP = "ff11::6469:7363"
+
+
+@pytest.mark.parametrize("interface", ["virtual", "udp_multicast"])
+def test_a_bus_that_hands_back_own_frames_brings_those_of_another_host_only(interface):
+    if interface == "virtual":
+        channel, options, own = next(CHANNELS), {}, {"receive_own_messages": True}
+    else:
+        # A free port, so that runs side by side do not hear each other.
+        channel, options, own = MULTICAST_GROUP, {"port": free_port(socket.SOCK_DGRAM), "hop_limit": 0}, {}
+    other = can.Bus(interface=interface, channel=channel, ignore_config=True, **options)
+    with other, closing(opened(interface, channel, **options, **own)) as transport:
         up(transport)
-        for number in range(3):
+        for number in range(5):
             send(transport, outgoing(0x100, bytes((number,))))
             assert bytes(other.recv(5.0).data) == bytes((number,))
-        send(transport, outgoing(0x100, b"same"))
-        other.recv(5.0)
-        other.send(message(0x100, b"same"))
+        other.send(message(0x100, b"\4"))
         other.send(message(0x111))
         got = [(received.frame.can_id, received.frame.data) for received in collect(transport, 2)]
-        assert got == [(0x100, b"same"), (0x111, b"\x01\x02")]
-    finally:
-        transport.close()
-        other.shutdown()
+        assert got == [(0x100, b"\4"), (0x111, b"\x01\x02")]
 
 
 def test_a_frame_that_found_no_room_excuses_no_other_hosts():
@@ -289,29 +289,6 @@ def test_a_frame_that_found_no_room_excuses_no_other_hosts():
     with pytest.raises(TransmitBusyError):
         connection.write(Frame(0x100, b"\1"))
     assert [received.frame for received in connection.read()] == [Frame(0x100, b"\1")]
-
-
-# Of interface-local scope: nothing of it leaves this machine.
-MULTICAST_GROUP = "ff11::6469:7363"
-
-
-def test_over_udp_multicast_own_frames_do_not_come_back_and_another_hosts_do():
-    # A free port, so that runs side by side do not hear each other.
-    port = free_port(socket.SOCK_DGRAM)
-    transport = opened("udp_multicast", MULTICAST_GROUP, port=port, hop_limit=0)
-    other = can.Bus(interface="udp_multicast", channel=MULTICAST_GROUP, port=port, hop_limit=0, ignore_config=True)
-    try:
-        up(transport)
-        for number in range(5):
-            send(transport, outgoing(0x100, bytes((number,))))
-            assert bytes(other.recv(5.0).data) == bytes((number,))
-        other.send(message(0x100, b"\4"))
-        other.send(message(0x111))
-        got = [(received.frame.can_id, received.frame.data) for received in collect(transport, 2)]
-        assert got == [(0x100, b"\4"), (0x111, b"\x01\x02")]
-    finally:
-        transport.close()
-        other.shutdown()
 
 
 class SocketcandServer:
@@ -371,8 +348,7 @@ class SocketcandServer:
 
 def test_socketcand_by_host_and_port_from_the_options():
     server = SocketcandServer()
-    transport = opened("socketcand", "can7", host="127.0.0.1", port=server.port)
-    try:
+    with closing(opened("socketcand", "can7", host="127.0.0.1", port=server.port)) as transport:
         up(transport)
         assert server.opened == [["open", "can7"], ["rawmode"]]
         server.send(0x110, b"\x11\x22")
@@ -389,8 +365,6 @@ def test_socketcand_by_host_and_port_from_the_options():
 
         wait_until(is_connecting)
         wait_until(lambda: "start the other end first" in (transport.last_error or ""))
-    finally:
-        transport.close()
 
 
 def test_a_bus_over_a_port_that_stays_mute_is_opened_again():
@@ -441,8 +415,7 @@ def hub(tmp_path):
 
 def test_between_processes_through_the_hub_that_dies_and_comes_back(hub):
     path, start = hub
-    transport = opened("unixcan", str(path))
-    try:
+    with closing(opened("unixcan", str(path))) as transport:
         wait_until(lambda: transport.last_error)
         assert "start the other end first" in transport.last_error
         process = start()
@@ -462,8 +435,6 @@ def test_between_processes_through_the_hub_that_dies_and_comes_back(hub):
                 wait_until(lambda: transport.state is LinkState.CONNECTING)
                 assert not transport.send(outgoing(), time.monotonic_ns())
                 start()
-    finally:
-        transport.close()
 
 
 @pytest.fixture
@@ -605,9 +576,6 @@ def test_an_interface_on_which_sending_would_be_swallowed_is_not_used(tmp_path, 
 
 
 def test_socketcan_says_what_is_missing():
-    transport = opened("socketcan", "can_absent")
-    try:
+    with closing(opened("socketcan", "can_absent")) as transport:
         wait_until(lambda: transport.last_error)
         assert "sudo ip link set can_absent up type can bitrate 500000" in transport.last_error
-    finally:
-        transport.close()

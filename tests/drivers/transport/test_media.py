@@ -1,3 +1,5 @@
+from contextlib import closing
+
 import pytest
 
 from drivers.transport import TransportSettingsError, can, create_transport, open_transport
@@ -52,11 +54,8 @@ def test_an_interface_name_is_known_to_include_ours():
     ],
 )
 def test_an_absent_device_is_waited_for(settings):
-    transport = open_transport(**settings)
-    try:
+    with closing(open_transport(**settings)) as transport:
         assert transport.state is LinkState.CONNECTING
-    finally:
-        transport.close()
     assert transport.state is LinkState.CLOSED
     assert transport.generation == 0
     assert transport.last_error

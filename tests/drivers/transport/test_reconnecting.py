@@ -3,6 +3,7 @@
 import queue
 import threading
 import time
+from contextlib import closing
 from types import SimpleNamespace
 
 import pytest
@@ -272,8 +273,7 @@ def test_an_error_while_sending_makes_the_link_anew(transport, medium):
 
 @pytest.mark.parametrize("way", ["read", "write"])
 def test_the_loss_is_reported_in_the_mediums_words(medium, way):
-    transport = ReconnectingTransport(medium, backoff=BackoffPolicy(first_s=5.0))
-    try:
+    with closing(ReconnectingTransport(medium, backoff=BackoffPolicy(first_s=5.0))) as transport:
         up(transport)
         if way == "read":
             medium.incoming.put(OSError("unplugged"))
@@ -282,8 +282,6 @@ def test_the_loss_is_reported_in_the_mediums_words(medium, way):
             send(transport, outgoing())
         wait_until(lambda: transport.state is LinkState.CONNECTING and medium.connections[0].closed)
         assert transport.last_error == "scripted: unplugged"
-    finally:
-        transport.close()
 
 
 @pytest.mark.parametrize("flaps", [False, True])

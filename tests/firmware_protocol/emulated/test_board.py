@@ -8,6 +8,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 
@@ -232,8 +233,7 @@ def test_behind_slcan_it_sits_on_the_mock_bus_beside_other_nodes(tmp_path, proce
 @pytest.mark.parametrize("processor", ["m3", "m4f"])
 def test_it_drives_on_while_the_counter_wraps(processor):
     wraps_s = 8.0
-    end = BoardEnd(processor, first_us=2**32 - round(wraps_s * 1e6))
-    try:
+    with closing(BoardEnd(processor, first_us=2**32 - round(wraps_s * 1e6))) as end:
         host = ProtocolHost(end, first_session=1)
         host.settle()
         host.to_driving()
@@ -246,8 +246,6 @@ def test_it_drives_on_while_the_counter_wraps(processor):
         assert {row.state for row in turning} == {ARMED}
         assert min(row.fastest for row in turning) > 1.0
         assert (host.state, host.fault, host.latest["SESSION_STATE"]["clock_error_count"]) == ("ARMED", "NONE", 0)
-    finally:
-        end.close()
 
 
 @pytest.mark.timeout(1800)

@@ -22,8 +22,7 @@ def refused(bench):
 
 
 def driving():
-    bench = Bench(LOCKED)
-    bench.to_driving()
+    bench = Bench(LOCKED).to_driving()
     assert refused(bench) == 0
     return bench
 
@@ -46,8 +45,7 @@ def test_it_says_that_it_wants_proof_and_gives_a_nonce():
 
 
 def test_without_a_key_nothing_of_it_is_seen():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     assert int(bench.messages("HELLO")[0].values["capabilities"]) == CONFIG.capabilities
     assert not bench.messages("MAC_CHALLENGE")
     for can_id in (0x0F0, 0x0F1, 0x0F2):
@@ -63,8 +61,7 @@ def test_without_the_key_not_even_ready(key):
     bench.hello()
     bench.set_request("READY")
     bench.command = {}
-    bench.run(2000)
-    assert bench.out.state == "STANDBY"
+    assert bench.run(2000).state == "STANDBY"
     assert refused(bench) > 100
     assert bench.messages("SYSTEM_STATE")[-1].values["reject_reason"] == 13
     assert {"HOST_STATE", "ZERO_COMMANDS"} <= bench.blockers()
@@ -80,12 +77,9 @@ def test_to_leave_the_emergency_stop_takes_the_key():
     bench = driving()
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.command = None
-    bench.set_request("STANDBY")
-    bench.run(1500)
+    bench.set_request("STANDBY").run(1500)
     proves, bench.prover = bench.prover, None
-    bench.set_request("RESET")
-    bench.run(500)
-    assert bench.out.state == "ESTOP"
+    assert bench.set_request("RESET").run(500).state == "ESTOP"
     bench.prover = proves
     bench.run_until("STANDBY")
 
@@ -95,9 +89,7 @@ def test_an_unproved_standby_neither_stops_nor_takes_a_request_back():
     bench = driving()
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.command = None
-    bench.set_request("RESET")
-    bench.run(1500)
-    assert bench.out.state == "STANDBY"
+    assert bench.set_request("RESET").run(1500).state == "STANDBY"
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.step()
     counter = bench.next_counter("HOST_STATE")
@@ -109,8 +101,7 @@ def test_an_unproved_standby_neither_stops_nor_takes_a_request_back():
 def test_commands_without_proof_do_not_feed_the_watchdog():
     bench = driving()
     bench.prover = None
-    bench.run(101)
-    assert bench.out.state == "STOPPING"
+    assert bench.run(101).state == "STOPPING"
     assert bench.out.stop_cause == "COMMAND_TIMEOUT"
 
 
@@ -159,8 +150,7 @@ def test_a_recorded_run_played_to_another_start_does_nothing():
     bench = Bench(LOCKED, entropy=2)
     for can_id, data in frames:
         bench.core.receive(bench.now_us, can_id, data)
-        bench.run(5)
-        assert bench.out.state == "STANDBY"
+        assert bench.run(5).state == "STANDBY"
         assert not bench.out.driver_enabled
     assert refused(bench) > 20
     assert bench.out.accepted_commands == 0
@@ -195,8 +185,7 @@ def test_a_frame_played_again_in_its_session_is_refused():
 def test_the_nonce_is_new_in_every_session_and_for_every_host():
     bench = driving()
     armed = bench.prover._nonce
-    bench.hello()
-    bench.run(100)
+    bench.hello().run(100)
     assert bench.prover._nonce == armed, "none but the host's own end changes it within a session"
     assert bench.out.state == "ARMED"
     bench.set_request("STANDBY")
@@ -206,22 +195,18 @@ def test_the_nonce_is_new_in_every_session_and_for_every_host():
     standby = bench.prover._nonce
     assert standby != armed
     bench.run(30)
-    bench.hello()
-    bench.run(2)
+    bench.hello().run(2)
     assert bench.prover._nonce != standby
 
 
 def test_a_host_that_starts_anew_is_heard():
-    bench = Bench(LOCKED)
-    bench.to_ready()
-    bench.set_request("STANDBY")
-    bench.run_until("STANDBY")
+    bench = Bench(LOCKED).to_ready()
+    bench.set_request("STANDBY").run_until("STANDBY")
     bench.run(500)
     bench.prover = Prover(KEY, CODEC)
     bench.run(600)
     bench.hello()
-    bench.set_request("READY", 9)
-    bench.run_until("READY")
+    bench.set_request("READY", 9).run_until("READY")
 
 
 def test_parameters_are_read_and_written_with_the_key_alone():
@@ -280,8 +265,7 @@ def test_the_next_nonce_is_drawn_in_a_cycle_with_nothing_to_send():
     a = bench.core._core.authentication
     bench.to_ready()
     draws = a.draws
-    bench.set_request("STANDBY")
-    bench.run_until("STANDBY")
+    bench.set_request("STANDBY").run_until("STANDBY")
     sending = bench.messages("MAC_CHALLENGE", bench.now_us)
     assert sending
     assert (a.prepared, a.draws) == (False, draws)
@@ -292,7 +276,6 @@ def test_the_next_nonce_is_drawn_in_a_cycle_with_nothing_to_send():
 
 
 def test_without_a_key_no_nonce_is_ever_drawn():
-    bench = Bench()
-    bench.hello()
+    bench = Bench().hello()
     bench.run(100)
     assert bench.core._core.authentication.draws == 0

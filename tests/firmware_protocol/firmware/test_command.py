@@ -13,14 +13,12 @@ def rejected(bench, act):
     before, accepted = bench.core.rejections, bench.out.accepted_commands
     act()
     after = bench.core.rejections
-    bench.step()
-    assert bench.out.accepted_commands == accepted
+    assert bench.step().accepted_commands == accepted
     return {name: after[name] - before[name] for name in after if after[name] != before[name]}
 
 
 def driving():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     bench.command = None
     return bench
 
@@ -47,8 +45,7 @@ def test_armed_accepts_and_follows():
     bench = driving()
     before = bench.out.accepted_commands
     bench.wheel_command(4.1, 2.1)
-    bench.run(30)
-    assert bench.out.accepted_commands == before + 1
+    assert bench.run(30).accepted_commands == before + 1
     assert (bench.out.left_setpoint_rad_s, bench.out.right_setpoint_rad_s) == pytest.approx((4.1, 2.1))
     assert bench.out.last_command_counter == bench.counters["WHEEL_COMMAND"]
 
@@ -75,8 +72,7 @@ def test_replayed_counter_is_rejected():
 
 
 def test_a_replayed_run_of_old_frames_is_rejected_at_its_first_frame_and_by_its_session_for_ever():
-    bench = Bench()
-    bench.to_armed()
+    bench = Bench().to_armed()
     recorded = []
     for _ in range(20):
         values = {"mode": "SPEED", "left_speed": 6.0, "right_speed": 6.0, "valid_for": 0.5, "session": 7}
@@ -88,8 +84,7 @@ def test_a_replayed_run_of_old_frames_is_rejected_at_its_first_frame_and_by_its_
     accepted = bench.out.accepted_commands
     for frame in recorded:
         bench.core.receive(bench.now_us, *frame)
-        bench.step()
-        assert bench.out.left_setpoint_rad_s == 0.0
+        assert bench.step().left_setpoint_rad_s == 0.0
     assert bench.out.accepted_commands == accepted
 
 
@@ -116,8 +111,7 @@ def test_another_majors_command_is_a_wrong_crc():
 
 
 def test_before_qualification_nothing_is_accepted():
-    bench = Bench()
-    bench.to_ready()
+    bench = Bench().to_ready()
     for expected in ({"NOT_QUALIFIED": 1},) * 3:
         assert rejected(bench, bench.wheel_command) == expected
     bench.wheel_command()
@@ -125,8 +119,7 @@ def test_before_qualification_nothing_is_accepted():
 
 
 @pytest.mark.parametrize("state", ["STANDBY", "READY"])
-def test_nonzero_command_before_armed_is_rejected(state):
-    bench = Bench()
+def test_nonzero_command_before_armed_is_rejected(state, bench):
     if state == "READY":
         bench.to_ready()
     bench.command = {}
@@ -135,8 +128,7 @@ def test_nonzero_command_before_armed_is_rejected(state):
     assert rejected(bench, lambda: bench.wheel_command(0.0, 0.002)) == {"NONZERO_BEFORE_ARMED": 1}
 
 
-def test_standby_rejects_even_zero():
-    bench = Bench()
+def test_standby_rejects_even_zero(bench):
     bench.command = {}
     bench.run(200)
     bench.command = None
@@ -147,8 +139,7 @@ def test_standby_rejects_even_zero():
 def test_stopped_states_reject_everything(state):
     bench = driving()
     if state == "STOPPING":
-        bench.set_request("STANDBY")
-        bench.run_until("STOPPING")
+        bench.set_request("STANDBY").run_until("STOPPING")
     elif state == "FAULT":
         bench.command = {"left": 4.0, "right": 2.0}
         bench.inputs["left_current_a"] = 100.0
@@ -184,8 +175,7 @@ def test_arming_takes_five_zero_commands_in_a_row():
 
 @pytest.mark.parametrize("broken", ["crc", "repeated"])
 def test_an_unusable_frame_breaks_the_row_of_zeros(broken):
-    bench = Bench()
-    bench.to_ready()
+    bench = Bench().to_ready()
     for _ in range(3 + 4):
         bench.wheel_command()
         bench.step()
@@ -209,19 +199,15 @@ def five_zeros_more(bench):
 
 
 def test_zeros_of_an_arming_before_do_not_count():
-    bench = Bench()
-    bench.to_armed()
+    bench = Bench().to_armed()
     bench.command = None
-    bench.set_request("STANDBY")
-    bench.run_until("STANDBY")
-    bench.set_request("READY", session=9)
-    bench.run_until("READY", within_ms=60)
+    bench.set_request("STANDBY").run_until("STANDBY")
+    bench.set_request("READY", session=9).run_until("READY", within_ms=60)
     five_zeros_more(bench)
 
 
 def test_zeros_count_until_the_command_timeout_is_over():
-    bench = Bench()
-    bench.to_ready()
+    bench = Bench().to_ready()
     for _ in range(3 + 5):
         bench.wheel_command()
         bench.step()
@@ -233,15 +219,12 @@ def test_zeros_count_until_the_command_timeout_is_over():
 
 
 def test_zero_commands_that_stopped_do_not_arm():
-    bench = Bench()
-    bench.to_ready()
+    bench = Bench().to_ready()
     bench.command = {}
     bench.run(300)
     bench.command = None
     bench.run(101)
-    bench.set_request("ARM")
-    bench.run(100)
-    assert bench.out.state == "READY"
+    assert bench.set_request("ARM").run(100).state == "READY"
     assert "ZERO_COMMANDS" in bench.blockers()
 
 
@@ -253,8 +236,7 @@ def stop_time_us(bench):
 
 
 def test_the_watchdog_runs_from_the_instant_of_arming():
-    bench = Bench()
-    bench.to_ready()
+    bench = Bench().to_ready()
     bench.command = {}
     bench.set_request("ARM")
     while bench.step().state != "ARMED":
@@ -267,15 +249,12 @@ def test_the_watchdog_runs_from_the_instant_of_arming():
 
 def test_no_command_from_before_arming_outlives_it():
     """Neither its mode, nor its time of validity, nor its age."""
-    bench = Bench()
-    bench.to_ready()
+    bench = Bench().to_ready()
     for _ in range(3 + 5):
         bench.wheel_command(mode="COAST", valid_for=0.002)
         bench.step()
     bench.run(40)
-    bench.set_request("ARM")
-    bench.run_until("ARMED", within_ms=50)
-    assert bench.out.driver_enabled
+    assert bench.set_request("ARM").run_until("ARMED", within_ms=50).driver_enabled
     assert stop_time_us(bench) == 100 * MS
     assert bench.out.stop_cause == "COMMAND_TIMEOUT"
 
@@ -326,8 +305,7 @@ def test_a_stop_for_another_reason_is_no_watchdog_event():
     bench = driving()
     bench.set_request("STANDBY")
     bench.command = {"left": 4.0, "right": 2.0}
-    bench.run_until("STOPPING")
-    assert bench.out.watchdog_events == 0
+    assert bench.run_until("STOPPING").watchdog_events == 0
 
 
 def test_a_late_command_finds_the_watchdog_expired_even_if_no_cycle_ran_in_between():
@@ -336,8 +314,7 @@ def test_a_late_command_finds_the_watchdog_expired_even_if_no_cycle_ran_in_betwe
     accepted = bench.step().accepted_commands
     bench.now_us += 150 * MS
     bench.wheel_command(4.0, 2.0)
-    bench.step()
-    assert bench.out.state == "STOPPING"
+    assert bench.step().state == "STOPPING"
     assert bench.out.accepted_commands == accepted
 
 
@@ -354,8 +331,7 @@ def test_a_clock_that_steps_back_neither_trips_nor_extends_the_watchdog():
 
 
 def test_timeouts_are_those_of_the_configuration():
-    bench = Bench(dataclasses.replace(CONFIG, command_timeout_s=0.06))
-    bench.to_driving()
+    bench = Bench(dataclasses.replace(CONFIG, command_timeout_s=0.06)).to_driving()
     bench.command = None
     bench.wheel_command(4.0, 2.0)
     assert stop_time_us(bench) == 60 * MS

@@ -16,8 +16,7 @@ def setpoints(bench):
 
 
 @pytest.mark.parametrize("state", ["STANDBY", "READY", "FAULT", "ESTOP"])
-def test_driver_is_off_and_brake_on_wherever_the_robot_is_not_armed(state):
-    bench = Bench()
+def test_driver_is_off_and_brake_on_wherever_the_robot_is_not_armed(state, bench):
     if state == "READY":
         bench.to_ready()
     elif state == "FAULT":
@@ -25,24 +24,20 @@ def test_driver_is_off_and_brake_on_wherever_the_robot_is_not_armed(state):
         bench.run_until("FAULT")
     elif state == "ESTOP":
         bench.core.receive(bench.now_us, 0x080, b"")
-    bench.step()
-    assert bench.out.state == state
+    assert bench.step().state == state
     assert (bench.out.driver_enabled, bench.out.brake, setpoints(bench)) == (False, True, (0.0, 0.0))
 
 
 def test_armed_holds_zero_with_driver_on():
-    bench = Bench()
-    bench.to_armed()
+    bench = Bench().to_armed()
     assert (bench.out.driver_enabled, bench.out.brake, bench.out.limited) == (True, False, False)
     assert setpoints(bench) == (0.0, 0.0)
 
 
 def test_acceleration_is_limited_and_both_wheels_move_by_one_factor():
-    bench = Bench()
-    bench.to_armed()
+    bench = Bench().to_armed()
     bench.command = {"left": 4.0, "right": -2.0}
-    bench.run(25)
-    assert bench.out.limited
+    assert bench.run(25).limited
     left, right = setpoints(bench)
     assert left > 0
     assert right == pytest.approx(-left / 2, abs=1e-4)
@@ -55,8 +50,7 @@ def test_acceleration_is_limited_and_both_wheels_move_by_one_factor():
 
 
 def test_speed_is_limited_with_curvature_kept_and_said_so():
-    bench = Bench()
-    bench.to_armed()
+    bench = Bench().to_armed()
     bench.command = {"left": 65.0, "right": -32.5}
     bench.run(600)
     assert setpoints(bench) == pytest.approx((8.0, -4.0))
@@ -64,8 +58,7 @@ def test_speed_is_limited_with_curvature_kept_and_said_so():
 
 
 def test_hold_zero_goes_back_to_zero_within_the_limit():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     bench.command = {"mode": "HOLD_ZERO"}
     before = setpoints(bench)
     while setpoints(bench) == before:
@@ -76,8 +69,7 @@ def test_hold_zero_goes_back_to_zero_within_the_limit():
 
 
 def test_brake_stops_then_brakes_and_stays_so_when_pushed():
-    bench = Bench(dataclasses.replace(CONFIG, stop_deceleration_rad_s2=40.0))
-    bench.to_driving()
+    bench = Bench(dataclasses.replace(CONFIG, stop_deceleration_rad_s2=40.0)).to_driving()
     bench.command = {"mode": "BRAKE"}
     before = setpoints(bench)
     while setpoints(bench) == before:
@@ -93,8 +85,7 @@ def test_brake_stops_then_brakes_and_stays_so_when_pushed():
 
 
 def test_brake_waits_for_wheels_that_still_roll():
-    bench = Bench()
-    bench.to_driving(0.2, 0.2)
+    bench = Bench().to_driving(0.2, 0.2)
     bench.wheels_follow = False
     bench.command = {"mode": "BRAKE"}
     bench.run(100)
@@ -105,8 +96,7 @@ def test_brake_waits_for_wheels_that_still_roll():
 
 
 def test_coast_lets_go_and_the_driver_takes_over_where_the_wheels_are():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     bench.wheels_follow = False
     bench.command = {"mode": "COAST"}
     bench.run(40)
@@ -120,8 +110,7 @@ def test_coast_lets_go_and_the_driver_takes_over_where_the_wheels_are():
 
 
 def test_taking_over_a_wheel_that_runs_away_starts_within_the_limit():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     bench.wheels_follow = False
     bench.command = {"mode": "COAST"}
     bench.run(40)
@@ -146,8 +135,7 @@ def fall_silent(bench):
     ids=["estop", "disarmed", "silence"],
 )
 def test_released_wheels_are_braked_by_any_stop_without_a_ramp(act):
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     bench.wheels_follow = False
     bench.command = {"mode": "COAST"}
     bench.run(40)
@@ -180,8 +168,7 @@ STOPS = {
 
 @pytest.mark.parametrize("how", STOPS)
 def test_estop_decelerates_from_the_very_next_cycle_then_brakes(how):
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     start = bench.now_us
     trace = stop(bench, STOPS[how])
     assert trace[0] == pytest.approx((3.98, 1.99))
@@ -192,10 +179,8 @@ def test_estop_decelerates_from_the_very_next_cycle_then_brakes(how):
 
 
 def test_stopping_keeps_curvature_and_ends_in_standby():
-    bench = Bench(dataclasses.replace(CONFIG, stop_deceleration_rad_s2=10.0))
-    bench.to_driving(4.0, -1.0)
-    bench.set_request("STANDBY")
-    bench.run_until("STOPPING")
+    bench = Bench(dataclasses.replace(CONFIG, stop_deceleration_rad_s2=10.0)).to_driving(4.0, -1.0)
+    bench.set_request("STANDBY").run_until("STOPPING")
     start = bench.now_us
     assert bench.out.limited
     while bench.step().state == "STOPPING":
@@ -206,8 +191,7 @@ def test_stopping_keeps_curvature_and_ends_in_standby():
 
 
 def test_silence_drives_no_longer_than_the_drive_off_timeout():
-    bench = Bench(dataclasses.replace(CONFIG, stop_deceleration_rad_s2=2.0))
-    bench.to_driving()
+    bench = Bench(dataclasses.replace(CONFIG, stop_deceleration_rad_s2=2.0)).to_driving()
     bench.command = None
     bench.wheel_command(4.0, 2.0)
     start = bench.now_us
@@ -218,8 +202,7 @@ def test_silence_drives_no_longer_than_the_drive_off_timeout():
 
 
 def test_after_a_stop_that_was_cut_off_the_next_motion_begins_at_zero():
-    bench = Bench(dataclasses.replace(CONFIG, stop_deceleration_rad_s2=2.0))
-    bench.to_driving()
+    bench = Bench(dataclasses.replace(CONFIG, stop_deceleration_rad_s2=2.0)).to_driving()
     bench.command = None
     while bench.step().driver_enabled:
         pass
@@ -230,11 +213,9 @@ def test_after_a_stop_that_was_cut_off_the_next_motion_begins_at_zero():
 
 
 def test_a_stop_that_does_not_end_is_ended():
-    bench = Bench(dataclasses.replace(CONFIG, drive_off_timeout_s=2.0, stop_timeout_s=0.3))
-    bench.to_driving()
+    bench = Bench(dataclasses.replace(CONFIG, drive_off_timeout_s=2.0, stop_timeout_s=0.3)).to_driving()
     bench.wheels_follow = False
-    bench.set_request("STANDBY")
-    bench.run_until("STOPPING")
+    bench.set_request("STANDBY").run_until("STOPPING")
     start = bench.now_us
     bench.run_until("STANDBY")
     assert bench.now_us - start == 300 * MS
@@ -242,15 +223,13 @@ def test_a_stop_that_does_not_end_is_ended():
 
 
 def test_an_estop_that_does_not_end_lets_the_driver_go():
-    bench = Bench(dataclasses.replace(CONFIG, drive_off_timeout_s=2.0, stop_timeout_s=0.3))
-    bench.to_driving()
+    bench = Bench(dataclasses.replace(CONFIG, drive_off_timeout_s=2.0, stop_timeout_s=0.3)).to_driving()
     bench.wheels_follow = False
     assert len(stop(bench, STOPS["estop"])) == 299
 
 
 def test_latched_fault_lets_the_driver_go_at_once_even_in_a_stop():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     bench.core.receive(bench.now_us, 0x080, b"")
     assert bench.step().driver_enabled
     bench.inputs["left_ticks"] = 1 << 20
@@ -259,8 +238,7 @@ def test_latched_fault_lets_the_driver_go_at_once_even_in_a_stop():
 
 
 def test_a_braked_robot_stays_braked_when_it_is_stopped():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     bench.command = {"mode": "BRAKE"}
     bench.run(400)
     bench.wheels_follow = False
@@ -270,8 +248,7 @@ def test_a_braked_robot_stays_braked_when_it_is_stopped():
 
 
 def test_a_stop_does_not_begin_again():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     stop(bench, STOPS["estop"])
     bench.wheels_follow = False
     bench.speeds = [2.0, 2.0]
@@ -282,34 +259,29 @@ def test_a_stop_does_not_begin_again():
 @pytest.mark.parametrize("cycle_us", [1 * MS, 5 * MS])
 @pytest.mark.parametrize("leap_ms", [0, 2, 15])
 def test_a_pause_or_a_leap_of_the_clock_is_no_bigger_step_than_any_other(cycle_us, leap_ms):
-    bench = Bench(dataclasses.replace(CONFIG, cycle_s=cycle_us * 1e-6))
-    bench.to_armed()
+    bench = Bench(dataclasses.replace(CONFIG, cycle_s=cycle_us * 1e-6)).to_armed()
     bench.command = {"left": 8.0, "right": 8.0}
     bench.run(20)
     bench.wheel_command(8.0, 8.0)
     before = setpoints(bench)[0]
-    bench.step(elapsed_us=leap_ms * MS)
-    assert bench.out.state == "ARMED"
+    assert bench.step(elapsed_us=leap_ms * MS).state == "ARMED"
     assert setpoints(bench)[0] - before == pytest.approx(20.0 * cycle_us * 1e-6, abs=EPS)
 
 
 @pytest.mark.parametrize("leap_ms", [110, 256, 480])
 def test_a_stop_that_begins_with_a_leap_of_the_clock_begins_no_steeper(leap_ms):
-    bench = Bench()
-    bench.to_armed()
+    bench = Bench().to_armed()
     bench.command = {"left": 4.0, "right": 4.0}
     bench.run(300)
     before = setpoints(bench)[0]
-    bench.step(elapsed_us=leap_ms * MS)
-    assert bench.out.state == "STOPPING"
+    assert bench.step(elapsed_us=leap_ms * MS).state == "STOPPING"
     assert before - setpoints(bench)[0] == pytest.approx(20.0 * 0.001, abs=EPS)
 
 
 @pytest.mark.parametrize("at_ms", range(1, 700, 23))
 def test_estop_at_any_instant_stops_for_good(at_ms):
     """From the first cycle over the handshake, arming, acceleration and a turn: after it, only deceleration to zero."""
-    bench = Bench()
-    bench.hello()
+    bench = Bench().hello()
     for ms in range(1, 700):
         session_request = "READY" if bench.out.state == "STANDBY" else "ARM"
         bench.set_request(session_request)

@@ -44,8 +44,7 @@ THRESHOLDS = [
 
 
 @pytest.mark.parametrize(("field", "bad", "good", "fault", "debounce_ms"), THRESHOLDS)
-def test_threshold_and_debounce(field, bad, good, fault, debounce_ms):
-    bench = Bench()
+def test_threshold_and_debounce(field, bad, good, fault, debounce_ms, bench):
     bench.inputs[field] = good
     assert bench.run(1500).fault == 0
     bench.inputs[field] = bad
@@ -53,8 +52,7 @@ def test_threshold_and_debounce(field, bad, good, fault, debounce_ms):
 
 
 @pytest.mark.parametrize(("field", "bad", "good", "fault", "debounce_ms"), [row for row in THRESHOLDS if row[-1]])
-def test_a_shorter_disturbance_is_no_fault(field, bad, good, fault, debounce_ms):
-    bench = Bench()
+def test_a_shorter_disturbance_is_no_fault(field, bad, good, fault, debounce_ms, bench):
     for _ in range(3):
         bench.inputs[field] = bad
         bench.run(debounce_ms - 1)
@@ -70,32 +68,21 @@ def test_time_counts_from_the_first_cycle_whatever_the_clock_shows_then():
 
 
 def driving_with(side, **inputs):
-    bench = Bench()
-    bench.to_driving(4.0, 4.0)
+    bench = Bench().to_driving(4.0, 4.0)
     bench.wheels_follow = False
     bench.inputs.update({f"{side}_{name}": value for name, value in inputs.items()})
     return bench
 
 
 @pytest.mark.parametrize("side", SIDES)
-def test_current_without_ticks_is_a_missing_encoder(side):
-    bench = driving_with(side, current_a=2.0)
+@pytest.mark.parametrize(
+    ("current_a", "fault"), [(2.0, "ENCODER_MISSING"), (CONFIG.stall_current_a, "ENCODER_MISSING"), (-16.0, "STALL")]
+)
+def test_current_without_ticks_is_a_missing_encoder_and_more_than_the_stall_current_a_stall(side, current_a, fault):
+    bench = driving_with(side, current_a=current_a)
     bench.inputs[f"{side}_ticks"] = int(bench.ticks[SIDES.index(side)])
-    assert wait_for_fault(bench) == (f"ENCODER_MISSING_{side.upper()}", 300)
+    assert wait_for_fault(bench) == (f"{fault}_{side.upper()}", 300)
     assert (bench.out.state, bench.out.driver_enabled) == ("FAULT", False)
-
-
-@pytest.mark.parametrize("side", SIDES)
-def test_much_current_without_ticks_is_a_stall(side):
-    bench = driving_with(side, current_a=-16.0)
-    bench.inputs[f"{side}_ticks"] = int(bench.ticks[SIDES.index(side)])
-    assert wait_for_fault(bench) == (f"STALL_{side.upper()}", 300)
-
-
-def test_the_stall_current_itself_is_none():
-    bench = driving_with("left", current_a=CONFIG.stall_current_a)
-    bench.inputs["left_ticks"] = int(bench.ticks[0])
-    assert wait_for_fault(bench) == ("ENCODER_MISSING_LEFT", 300)
 
 
 @pytest.mark.parametrize(
@@ -117,8 +104,7 @@ def test_what_is_no_missing_encoder(spoil):
 @pytest.mark.parametrize("check_speed", [0.8, 1.6])
 def test_few_ticks_a_turn_are_given_their_time(check_speed):
     coarse = dataclasses.replace(CONFIG, ticks_per_rev=20, encoder_check_speed_rad_s=check_speed)
-    bench = Bench(coarse)
-    bench.to_driving(2.0, 2.0)
+    bench = Bench(coarse).to_driving(2.0, 2.0)
     bench.inputs["left_current_a"] = 2.0
     assert bench.run(2000).fault == 0
     # One last tick in the next cycle, from which the time counts.
@@ -156,15 +142,13 @@ def test_as_many_ticks_as_may_be_are_no_jump_and_one_more_is(ticks):
 
 
 @pytest.mark.parametrize("ticks", [16, 17])
-def test_sixteen_ticks_in_a_microsecond_are_no_jump(ticks):
-    bench = Bench()
+def test_sixteen_ticks_in_a_microsecond_are_no_jump(ticks, bench):
     bench.inputs["right_ticks"] = ticks
     bench.step(elapsed_us=1)
     assert (bench.out.fault == FAULTS["ENCODER_JUMP_RIGHT"]) == (ticks > 16)
 
 
-def test_ticks_may_wrap():
-    bench = Bench()
+def test_ticks_may_wrap(bench):
     bench.ticks = [2.0**32 - 500, -(2.0**31)]
     bench.core = Bench().core.__class__(CONFIG)
     bench.to_driving(4.0, -4.0)
@@ -172,16 +156,14 @@ def test_ticks_may_wrap():
     assert bench.ticks[0] > 2**32
 
 
-def test_the_fastest_turn_by_hand_is_no_jump():
-    bench = Bench()
+def test_the_fastest_turn_by_hand_is_no_jump(bench):
     bench.wheels_follow = False
     bench.speeds = [20.0, -20.0]
     assert bench.run(200).fault == 0
 
 
 def test_ticks_made_up_for_a_pause_are_no_jump():
-    bench = Bench()
-    bench.to_driving(6.0, 6.0)
+    bench = Bench().to_driving(6.0, 6.0)
     bench.step(elapsed_us=20 * MS)
     assert name_of(bench.step().fault) == "NONE"
 
@@ -189,8 +171,7 @@ def test_ticks_made_up_for_a_pause_are_no_jump():
 @pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize("sign", [1, -1])
 def test_turning_against_the_setpoint_is_wrong_direction(side, sign):
-    bench = Bench()
-    bench.to_driving(4.0 * sign, 4.0 * sign)
+    bench = Bench().to_driving(4.0 * sign, 4.0 * sign)
     bench.wheels_follow = False
     bench.speeds[SIDES.index(side)] = -3.0 * sign
     assert wait_for_fault(bench) == (f"WRONG_DIRECTION_{side.upper()}", 300)
@@ -199,16 +180,14 @@ def test_turning_against_the_setpoint_is_wrong_direction(side, sign):
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize(("setpoint_rad_s", "speed"), [(1.0, -3.0), (4.0, -1.0), (4.0, 0.5), (4.0, -0.5), (4.0, 0.0)])
 def test_up_to_the_check_speed_a_wheel_does_not_turn_against_its_setpoint(setpoint_rad_s, speed, sign):
-    bench = Bench()
-    bench.to_driving(setpoint_rad_s * sign, setpoint_rad_s * sign)
+    bench = Bench().to_driving(setpoint_rad_s * sign, setpoint_rad_s * sign)
     bench.wheels_follow = False
     bench.speeds[0] = speed * sign
     assert wait_for_fault(bench, within_ms=1000) == (None, None)
 
 
 def test_each_time_the_wheel_turns_against_its_setpoint_is_judged_by_itself():
-    bench = Bench()
-    bench.to_driving(4.0, 4.0)
+    bench = Bench().to_driving(4.0, 4.0)
     bench.wheels_follow = False
     bench.speeds[0] = -7.0
     bench.run(100)
@@ -219,8 +198,7 @@ def test_each_time_the_wheel_turns_against_its_setpoint_is_judged_by_itself():
 
 
 def test_a_wheel_that_is_only_late_in_turning_round_is_not():
-    bench = Bench()
-    bench.to_driving(4.0, 4.0)
+    bench = Bench().to_driving(4.0, 4.0)
     bench.wheels_follow = False
     bench.command = {"left": -4.0, "right": -4.0}
     opposed_ms = 0
@@ -241,8 +219,7 @@ def setpoint(bench):
     ("speed", "is_delayed"), [(2.685, True), (2.715, False), (np.float32(0.9) * np.float32(3.0), False)]
 )
 def test_a_wheel_is_late_if_it_lost_more_than_a_tenth_of_its_speed(speed, is_delayed):
-    bench = Bench()
-    bench.to_driving(4.0, 4.0)
+    bench = Bench().to_driving(4.0, 4.0)
     bench.wheels_follow = False
     bench.speeds[0] = -3.0
     bench.run(290)
@@ -251,8 +228,7 @@ def test_a_wheel_is_late_if_it_lost_more_than_a_tenth_of_its_speed(speed, is_del
 
 
 def test_a_slow_wheel_that_slows_down_is_only_late_too():
-    bench = Bench(dataclasses.replace(CONFIG, encoder_check_speed_rad_s=0.1))
-    bench.to_driving(4.0, 4.0)
+    bench = Bench(dataclasses.replace(CONFIG, encoder_check_speed_rad_s=0.1)).to_driving(4.0, 4.0)
     bench.wheels_follow = False
     bench.speeds[0] = -0.3
     bench.run(290)
@@ -268,8 +244,7 @@ def test_wrong_direction_asks_for_an_enabled_driver():
 
 
 @pytest.mark.parametrize(("cause", "fault"), [("WATCHDOG", "WATCHDOG_RESET"), ("BROWN_OUT", "BROWN_OUT_RESET")])
-def test_reset_causes_latch_once_and_clear(cause, fault):
-    bench = Bench()
+def test_reset_causes_latch_once_and_clear(cause, fault, bench):
     core = bench.core.__class__(CONFIG)
     inputs = FirmwareInputs(
         left_ticks=0, right_ticks=0, left_speed_rad_s=0.0, right_speed_rad_s=0.0, reset_cause=ResetCause[cause]
@@ -281,10 +256,8 @@ def test_reset_causes_latch_once_and_clear(cause, fault):
 
 
 def reset(bench):
-    bench.set_request("STANDBY")
-    bench.run(250)
-    bench.set_request("RESET")
-    bench.run(60)
+    bench.set_request("STANDBY").run(250)
+    bench.set_request("RESET").run(60)
 
 
 @pytest.mark.parametrize("fault", ["SELF_TEST_FAILED", "CONFIG_INVALID"])
@@ -297,8 +270,7 @@ def test_permanent_faults_are_not_reset(fault):
     assert (bench.out.state, name_of(bench.out.fault)) == ("FAULT", fault)
 
 
-def test_a_later_fault_does_not_make_an_earlier_one_forgotten():
-    bench = Bench()
+def test_a_later_fault_does_not_make_an_earlier_one_forgotten(bench):
     bench.inputs["self_test_failed"] = True
     bench.run(2)
     bench.inputs.clear()
@@ -309,8 +281,7 @@ def test_a_later_fault_does_not_make_an_earlier_one_forgotten():
     assert (bench.out.state, name_of(bench.out.fault)) == ("FAULT", "SELF_TEST_FAILED")
 
 
-def test_a_latched_fault_outlives_its_cause_and_a_reset_waits_for_the_cause_to_go():
-    bench = Bench()
+def test_a_latched_fault_outlives_its_cause_and_a_reset_waits_for_the_cause_to_go(bench):
     bench.inputs["left_current_a"] = 50.0
     bench.run_until("FAULT")
     reset(bench)
@@ -325,13 +296,11 @@ def test_a_latched_fault_outlives_its_cause_and_a_reset_waits_for_the_cause_to_g
     assert (bench.out.state, name_of(bench.out.fault)) == ("FAULT", "OVER_CURRENT_LEFT")
 
 
-def test_a_reset_of_one_fault_hides_no_other_for_a_single_cycle():
-    bench = Bench()
+def test_a_reset_of_one_fault_hides_no_other_for_a_single_cycle(bench):
     bench.inputs.update(voltage_v=12.0, left_current_a=50.0)
     bench.run(300)
     bench.inputs.pop("left_current_a")
-    bench.set_request("STANDBY")
-    bench.run(250)
+    bench.set_request("STANDBY").run(250)
     bench.set_request("RESET")
     shown = {name_of(bench.step().fault) for _ in range(60)}
     assert shown == {"OVER_CURRENT_LEFT", "UNDER_VOLTAGE"}
@@ -339,13 +308,10 @@ def test_a_reset_of_one_fault_hides_no_other_for_a_single_cycle():
 
 
 def test_a_passing_fault_blocks_ready_while_it_is_held():
-    bench = Bench()
-    bench.hello()
+    bench = Bench().hello()
     bench.inputs["voltage_v"] = 12.0
     bench.run(300)
-    bench.set_request("READY")
-    bench.run(1000)
-    assert bench.out.state == "STANDBY"
+    assert bench.set_request("READY").run(1000).state == "STANDBY"
     bench.inputs.clear()
     bench.run(400)
     assert (bench.out.state, name_of(bench.out.fault)) == ("STANDBY", "UNDER_VOLTAGE")
@@ -353,8 +319,7 @@ def test_a_passing_fault_blocks_ready_while_it_is_held():
     assert (bench.out.state, bench.out.fault) == ("READY", 0)
 
 
-def test_a_passing_fault_is_held_to_the_millisecond():
-    bench = Bench()
+def test_a_passing_fault_is_held_to_the_millisecond(bench):
     bench.inputs["voltage_v"] = 12.0
     bench.run(300)
     bench.inputs.clear()
@@ -362,8 +327,7 @@ def test_a_passing_fault_is_held_to_the_millisecond():
     assert name_of(bench.step().fault) == "NONE"
 
 
-def test_the_graver_fault_is_shown():
-    bench = Bench()
+def test_the_graver_fault_is_shown(bench):
     bench.inputs.update(voltage_v=10.0, left_temperature_c=100.0, tx_error_count=300)
     bench.run(1100)
     assert name_of(bench.out.fault) == "UNDER_VOLTAGE"

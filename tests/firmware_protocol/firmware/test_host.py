@@ -10,46 +10,33 @@ from firmware_protocol.protection import challenge_answer
 from tests.firmware_protocol.bench import CODEC, CONFIG, FAULTS, MS, Bench, sealed
 
 
-def test_without_a_handshake_nothing_gets_ready():
-    bench = Bench()
-    bench.set_request("READY")
-    bench.run(500)
-    assert bench.out.state == "STANDBY"
+def test_without_a_handshake_nothing_gets_ready(bench):
+    assert bench.set_request("READY").run(500).state == "STANDBY"
     assert bench.blockers() == {"HANDSHAKE", "CHALLENGE", "ZERO_COMMANDS"}
 
 
 def test_another_dbc_is_refused_and_named_and_the_right_one_accepted_afterwards():
-    bench = Bench()
-    bench.hello(dbc_hash=CODEC.dbc_hash ^ 1)
-    bench.set_request("READY")
-    bench.run(300)
-    assert bench.out.state == "STANDBY"
+    bench = Bench().hello(dbc_hash=CODEC.dbc_hash ^ 1)
+    assert bench.set_request("READY").run(300).state == "STANDBY"
     assert bench.out.fault == FAULTS["DBC_HASH_MISMATCH"]
     assert {"HANDSHAKE", "FAULT"} <= bench.blockers()
     assert bench.core.rejections["HANDSHAKE"] == 1
     assert bench.messages("BUILD")[-1].values["dbc_hash"] == CODEC.dbc_hash
-    bench.hello()
-    bench.run_until("READY")
-    assert bench.out.fault == FAULTS["NONE"]
+    assert bench.hello().run_until("READY").fault == FAULTS["NONE"]
 
 
 def test_another_dbc_stops_motion():
-    bench = Bench()
-    bench.to_driving()
-    bench.hello(dbc_hash=1)
-    bench.run(2)
+    bench = Bench().to_driving()
+    bench.hello(dbc_hash=1).run(2)
     assert (bench.out.state, bench.out.stop_cause) == ("STOPPING", "FAULT")
 
 
 @pytest.mark.parametrize("major", [0, 2, 255])
-def test_a_host_of_another_major_is_heard_refused_and_answered(major):
-    bench = Bench()
+def test_a_host_of_another_major_is_heard_refused_and_answered(major, bench):
     bench.run(100)
     before = len(bench.messages("HELLO"))
     bench.hello(protocol_major=major)
-    bench.set_request("READY")
-    bench.run(300)
-    assert bench.out.state == "STANDBY"
+    assert bench.set_request("READY").run(300).state == "STANDBY"
     assert bench.out.fault == FAULTS["PROTOCOL_MAJOR_MISMATCH"]
     assert len(bench.messages("HELLO")) == before + 1
 
@@ -63,15 +50,13 @@ def test_firmware_of_another_major_is_understood_as_such_and_nothing_else_of_it_
 
 
 def test_another_minor_is_accepted():
-    bench = Bench()
-    bench.hello(protocol_minor=9)
+    bench = Bench().hello(protocol_minor=9)
     bench.step()
     assert "HANDSHAKE" not in bench.blockers()
 
 
 def test_a_host_silent_for_long_must_introduce_itself_again():
-    bench = Bench()
-    bench.hello()
+    bench = Bench().hello()
     bench.run(5000)
     assert "HANDSHAKE" not in bench.blockers()
     bench.step()
@@ -80,17 +65,13 @@ def test_a_host_silent_for_long_must_introduce_itself_again():
 
 @pytest.mark.parametrize("wrong", [{"protocol_major": 2}, {"dbc_hash": 1}])
 def test_a_refused_host_is_forgotten_too(wrong):
-    bench = Bench()
-    bench.hello(**wrong)
-    bench.run(5000)
-    assert bench.out.fault != 0
-    bench.run(502)
-    assert bench.out.fault == 0
+    bench = Bench().hello(**wrong)
+    assert bench.run(5000).fault != 0
+    assert bench.run(502).fault == 0
 
 
 def test_any_sound_frame_keeps_the_acquaintance():
-    bench = Bench()
-    bench.hello()
+    bench = Bench().hello()
     bench.run(4000)
     bench.send("TIME_REQUEST", sequence=1)
     bench.run(4000)
@@ -98,8 +79,7 @@ def test_any_sound_frame_keeps_the_acquaintance():
 
 
 def test_host_state_counts_only_once_qualified():
-    bench = Bench()
-    bench.hello()
+    bench = Bench().hello()
     for _ in range(3):
         bench.host_state(request="READY", session=7)
         assert bench.step().state == "STANDBY"
@@ -108,30 +88,25 @@ def test_host_state_counts_only_once_qualified():
 
 
 def test_unknown_request_changes_nothing():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     bench.host_state(request=4, session=7)
-    bench.run(2)
-    assert bench.out.state == "ARMED"
+    assert bench.run(2).state == "ARMED"
     assert bench.core.rejections["MODE"] == 1
 
 
 def test_wrong_crc_and_repeated_host_states_are_not_used():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     body = CODEC.encode(
         "HOST_STATE", bench.counters["HOST_STATE"] + 1, request="STANDBY", session=7, challenge_answer=0, host_fault=0
     ).data
     bench.core.receive(bench.now_us, 0x101, bytes((body[0] ^ 1,)) + body[1:])
     bench.counters["HOST_STATE"] -= 1
     bench.host_state(request="STANDBY", session=7)
-    bench.run(2)
-    assert bench.out.state == "ARMED"
+    assert bench.run(2).state == "ARMED"
 
 
 def test_a_host_that_babbles_is_disqualified_and_motion_stops():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     for _ in range(5):
         bench.core.receive(bench.now_us, 0x101, sealed(0x101, bytes(7), major=3))
     bench.run(2)
@@ -140,63 +115,46 @@ def test_a_host_that_babbles_is_disqualified_and_motion_stops():
 
 @pytest.mark.parametrize("session", [0, 7])
 def test_session_zero_and_the_last_session_are_refused(session):
-    bench = Bench()
-    bench.to_ready(session=7)
-    bench.set_request("STANDBY")
-    bench.run_until("STANDBY")
-    bench.set_request("READY", session=session)
-    bench.run(300)
-    assert bench.out.state == "STANDBY"
+    bench = Bench().to_ready(session=7)
+    bench.set_request("STANDBY").run_until("STANDBY")
+    assert bench.set_request("READY", session=session).run(300).state == "STANDBY"
     assert "SESSION" in bench.blockers()
-    bench.set_request("READY", session=8)
-    bench.run_until("READY")
-    assert bench.out.session == 8
+    assert bench.set_request("READY", session=8).run_until("READY").session == 8
 
 
 def test_session_dies_with_ready_and_armed():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     assert bench.out.session == 7
     bench.command = None
-    bench.run_until("STOPPING")
-    assert bench.out.session == 0
+    assert bench.run_until("STOPPING").session == 0
 
 
 def test_it_never_arms_again_by_itself():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     command, bench.command = bench.command, None
     bench.run_until("STANDBY")
     bench.command = command
     for request in ("ARM", "READY", "ARM"):
-        bench.set_request(request)
-        bench.run(1000)
-        assert bench.out.state == "STANDBY"
+        assert bench.set_request(request).run(1000).state == "STANDBY"
     bench.command = {}
-    bench.run(1000)
-    assert bench.out.state == "STANDBY"
+    assert bench.run(1000).state == "STANDBY"
 
 
 def test_a_new_session_in_ready_goes_through_standby_with_a_new_challenge():
-    bench = Bench()
-    bench.to_ready(session=7)
+    bench = Bench().to_ready(session=7)
     challenge = bench.core.challenge
-    bench.set_request("READY", session=8)
-    bench.run(60)
+    bench.set_request("READY", session=8).run(60)
     assert (bench.out.state, bench.out.session) == ("READY", 8)
     assert bench.core.challenge != challenge
 
 
-def test_every_entry_of_standby_and_ready_has_a_new_challenge_never_zero():
-    bench = Bench()
+def test_every_entry_of_standby_and_ready_has_a_new_challenge_never_zero(bench):
     seen = []
     bench.hello()
     for session in range(1, 60):
-        bench.set_request("READY", session=session)
-        bench.run_until("READY")
+        bench.set_request("READY", session=session).run_until("READY")
         seen.append(bench.core.challenge)
-        bench.set_request("STANDBY", session=session)
-        bench.run_until("STANDBY")
+        bench.set_request("STANDBY", session=session).run_until("STANDBY")
         seen.append(bench.core.challenge)
     assert all(a != b for a, b in itertools.pairwise(seen))
     assert len(set(seen)) > 110
@@ -207,33 +165,27 @@ def test_a_counted_start_gives_none_of_the_challenges_of_the_starts_before():
     """The first twenty of each of a hundred starts: as few are alike as of numbers drawn at random."""
     seen = []
     for start in range(1, 101):
-        bench = Bench(entropy=start, last_entropy=start - 1)
-        bench.to_ready()
+        bench = Bench(entropy=start, last_entropy=start - 1).to_ready()
         for session in range(8, 18):
             seen.append(bench.core.challenge)
-            bench.set_request("STANDBY")
-            bench.run_until("STANDBY")
+            bench.set_request("STANDBY").run_until("STANDBY")
             seen.append(bench.core.challenge)
-            bench.set_request("READY", session)
-            bench.run_until("READY")
+            bench.set_request("READY", session).run_until("READY")
     assert len(seen) - len(set(seen)) < 70, "of 2000 out of 65535 thirty are expected"
 
 
 @pytest.mark.parametrize(("entropy", "last_entropy"), [(0, 0), (0, 5), (5, 5), (2**64 - 1, 2**64 - 1)])
 def test_a_start_without_entropy_or_with_that_of_the_last_one_is_refused_for_good(entropy, last_entropy):
-    bench = Bench(entropy=entropy, last_entropy=last_entropy)
-    bench.hello()
-    bench.set_request("READY")
-    assert bench.run(200).state == "FAULT"
+    bench = Bench(entropy=entropy, last_entropy=last_entropy).hello()
+    assert bench.set_request("READY").run(200).state == "FAULT"
     assert bench.out.fault == FAULTS["ENTROPY_INVALID"]
-    bench.set_request("RESET")
-    bench.run(800)
+    bench.set_request("RESET").run(800)
     assert (bench.out.state, bench.out.driver_enabled) == ("FAULT", False)
 
 
 @pytest.mark.parametrize(("entropy", "last_entropy"), [(1, 0), (5, 6), (2**32, 0), (2**32, 2**33)])
 def test_a_start_with_entropy_of_its_own_is_taken(entropy, last_entropy):
-    assert Bench(entropy=entropy, last_entropy=last_entropy).to_armed().state == "ARMED"
+    assert Bench(entropy=entropy, last_entropy=last_entropy).to_armed().out.state == "ARMED"
 
 
 @pytest.mark.parametrize(
@@ -249,11 +201,9 @@ def test_challenges_are_the_upper_sixteen_bits_of_splitmix64(entropy, outputs):
     seen = [bench.core.challenge]
     for session in (7, 8):
         bench.hello()
-        bench.set_request("READY", session)
-        bench.run_until("READY")
+        bench.set_request("READY", session).run_until("READY")
         seen.append(bench.core.challenge)
-        bench.set_request("STANDBY")
-        bench.run_until("STANDBY")
+        bench.set_request("STANDBY").run_until("STANDBY")
         seen.append(bench.core.challenge)
     assert seen[:4] == [output >> 48 for output in outputs]
 
@@ -279,8 +229,7 @@ def test_a_hash_of_zero_is_passed_over(entry):
 
 
 def test_arming_another_session_than_the_one_that_is_ready_starts_over():
-    bench = Bench()
-    bench.to_ready(session=7)
+    bench = Bench().to_ready(session=7)
     bench.set_request("ARM", session=8)
     bench.command = {}
     bench.run(400)
@@ -289,12 +238,10 @@ def test_arming_another_session_than_the_one_that_is_ready_starts_over():
 
 
 def arm_with(respond):
-    bench = Bench()
-    bench.to_ready()
+    bench = Bench().to_ready()
     bench.command = {}
     bench.answers = False
-    bench.set_request("ARM", challenge_answer=respond(bench))
-    bench.run(400)
+    bench.set_request("ARM", challenge_answer=respond(bench)).run(400)
     return bench
 
 
@@ -320,46 +267,31 @@ def test_wrong_answer_does_not(respond):
 
 
 def test_the_answer_to_an_old_challenge_does_not_arm():
-    bench = Bench()
-    bench.to_ready(session=7)
+    bench = Bench().to_ready(session=7)
     old = challenge_answer(bench.core.challenge, 9, CODEC.dbc_hash)
-    bench.set_request("READY", session=9)
-    bench.run(60)
-    assert bench.out.session == 9
+    assert bench.set_request("READY", session=9).run(60).session == 9
     bench.command, bench.answers = {}, False
-    bench.set_request("ARM", session=9, challenge_answer=old)
-    bench.run(400)
-    assert bench.out.state == "READY"
+    assert bench.set_request("ARM", session=9, challenge_answer=old).run(400).state == "READY"
 
 
 def test_answer_given_in_standby_is_no_answer():
-    bench = Bench()
-    bench.hello()
+    bench = Bench().hello()
     bench.command = {}
-    bench.set_request("ARM")
-    bench.run(400)
-    assert bench.out.state == "STANDBY"
+    assert bench.set_request("ARM").run(400).state == "STANDBY"
     bench.answers = False
-    bench.set_request("READY")
-    bench.run_until("READY")
-    bench.set_request("ARM")
-    bench.run(300)
-    assert bench.out.state == "READY"
+    bench.set_request("READY").run_until("READY")
+    assert bench.set_request("ARM").run(300).state == "READY"
 
 
 def test_arming_waits_for_wheels_that_stand():
-    bench = Bench()
-    bench.to_ready()
+    bench = Bench().to_ready()
     bench.wheels_follow = False
     bench.speeds = [0.0, -0.06]
     bench.command = {}
-    bench.set_request("ARM")
-    bench.run(400)
-    assert bench.out.state == "READY"
+    assert bench.set_request("ARM").run(400).state == "READY"
     assert bench.blockers() == {"WHEELS_MOVING"}
     bench.speeds = [0.0, -0.04]
-    bench.run(2)
-    assert bench.out.state == "ARMED"
+    assert bench.run(2).state == "ARMED"
     assert bench.out.blockers == 0
 
 
@@ -375,20 +307,16 @@ def test_wheels_stand_below_the_speed_of_stillness_and_not_at_it():
 
 
 def estopped():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.command = None
-    bench.set_request("ARM")
-    bench.run(800)
-    assert bench.out.state == "ESTOP"
+    assert bench.set_request("ARM").run(800).state == "ESTOP"
     return bench
 
 
 def test_reset_clears_an_estop_but_starts_nothing():
     bench = estopped()
-    bench.set_request("RESET")
-    bench.run_until("STANDBY")
+    bench.set_request("RESET").run_until("STANDBY")
     bench.command = {"left": 1.0, "right": 1.0}
     bench.set_request("ARM")
     for _ in range(1000):
@@ -396,44 +324,31 @@ def test_reset_clears_an_estop_but_starts_nothing():
         assert not bench.out.driver_enabled
 
 
-def test_a_reset_asked_for_before_the_stop_does_not_clear_it():
-    bench = Bench()
-    bench.set_request("RESET")
-    bench.run(300)
+def test_a_reset_asked_for_before_the_stop_does_not_clear_it(bench):
+    bench.set_request("RESET").run(300)
     bench.core.receive(bench.now_us, 0x080, b"")
-    bench.run(1500)
-    assert bench.out.state == "ESTOP"
-    bench.set_request("STANDBY")
-    bench.run(100)
-    bench.set_request("RESET")
-    bench.run(60)
-    assert bench.out.state == "STANDBY"
+    assert bench.run(1500).state == "ESTOP"
+    bench.set_request("STANDBY").run(100)
+    assert bench.set_request("RESET").run(60).state == "STANDBY"
 
 
-def test_a_reset_that_was_asked_for_before_a_silence_does_not_clear_what_came_in_it():
-    bench = Bench()
-    bench.set_request("RESET")
-    bench.run(300)
+def test_a_reset_that_was_asked_for_before_a_silence_does_not_clear_what_came_in_it(bench):
+    bench.set_request("RESET").run(300)
     bench.request = None
     bench.run(300)
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.run(700)
-    bench.set_request("RESET")
-    bench.run(1000)
-    assert bench.out.state == "ESTOP"
+    assert bench.set_request("RESET").run(1000).state == "ESTOP"
 
 
 def test_a_reset_waits_for_stillness_and_is_void_when_the_stop_comes_again():
     bench = estopped()
     bench.wheels_follow = False
     bench.speeds = [1.0, 1.0]
-    bench.set_request("RESET")
-    bench.run(300)
-    assert bench.out.state == "ESTOP"
+    assert bench.set_request("RESET").run(300).state == "ESTOP"
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.speeds = [0.0, 0.0]
-    bench.run(1000)
-    assert bench.out.state == "ESTOP"
+    assert bench.run(1000).state == "ESTOP"
 
 
 @pytest.mark.parametrize("end", ["another request", "silence"])
@@ -441,15 +356,13 @@ def test_a_reset_no_longer_asked_for_is_void(end):
     bench = estopped()
     bench.wheels_follow = False
     bench.speeds = [1.0, 1.0]
-    bench.set_request("RESET")
-    bench.run(100)
+    bench.set_request("RESET").run(100)
     bench.request = None
     if end == "another request":
         bench.set_request("STANDBY")
     bench.run(700)
     bench.speeds = [0.0, 0.0]
-    bench.run(300)
-    assert bench.out.state == "ESTOP"
+    assert bench.run(300).state == "ESTOP"
 
 
 def test_a_reset_is_asked_for_until_the_host_is_silent_and_no_longer():
@@ -457,19 +370,16 @@ def test_a_reset_is_asked_for_until_the_host_is_silent_and_no_longer():
         bench = estopped()
         bench.wheels_follow = False
         bench.speeds = [1.0, 1.0]
-        bench.set_request("RESET")
-        bench.run(50 - bench.now_us // MS % 50)
+        bench.set_request("RESET").run(50 - bench.now_us // MS % 50)
         bench.request = None
-        bench.run(silent_ms - 1)
-        assert bench.out.state == "ESTOP"
+        assert bench.run(silent_ms - 1).state == "ESTOP"
         bench.speeds = [0.0, 0.0]
         assert bench.step().state == state
 
 
 @pytest.mark.parametrize("source", ["estop_button", "estop_line"])
 def test_a_pressed_button_cannot_be_reset_nor_does_its_release_reset(source):
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     bench.inputs[source] = True
     bench.run(700)
     assert (bench.out.state, bench.out.estop_source) == ("ESTOP", source.removeprefix("estop_").upper())
@@ -477,27 +387,19 @@ def test_a_pressed_button_cannot_be_reset_nor_does_its_release_reset(source):
     bench.command = None
     bench.run(600)
     challenge = bench.core.challenge
-    bench.set_request("RESET")
-    bench.run(700)
-    assert bench.out.state == "ESTOP"
+    assert bench.set_request("RESET").run(700).state == "ESTOP"
     # A challenge is renewed on the way through STANDBY, be it between two cycles.
     assert bench.core.challenge == challenge
     bench.inputs.clear()
-    bench.run(1000)
-    assert bench.out.state == "ESTOP"
-    bench.set_request("STANDBY")
-    bench.run(100)
-    bench.set_request("RESET")
-    bench.run_until("STANDBY", within_ms=60)
-    assert bench.out.estop_source == "NONE"
+    assert bench.run(1000).state == "ESTOP"
+    bench.set_request("STANDBY").run(100)
+    assert bench.set_request("RESET").run_until("STANDBY", within_ms=60).estop_source == "NONE"
 
 
 def test_motion_asked_for_delays_a_reset():
     bench = estopped()
     bench.command = {"left": 0.002, "right": 0.0, "session": 7}
-    bench.set_request("RESET")
-    bench.run(1000)
-    assert bench.out.state == "ESTOP"
+    assert bench.set_request("RESET").run(1000).state == "ESTOP"
     start = bench.now_us
     bench.command = None
     bench.wheel_command(0.002, 0.0, session=7)
@@ -508,22 +410,17 @@ def test_motion_asked_for_delays_a_reset():
 def test_the_first_source_of_an_estop_is_kept():
     bench = estopped()
     bench.inputs["estop_button"] = True
-    bench.step()
-    assert bench.out.estop_source == "FRAME"
+    assert bench.step().estop_source == "FRAME"
 
 
 def test_host_fault_blocks_ready():
-    bench = Bench()
-    bench.hello()
-    bench.set_request("READY", host_fault=5)
-    bench.run(300)
-    assert bench.out.state == "STANDBY"
+    bench = Bench().hello()
+    assert bench.set_request("READY", host_fault=5).run(300).state == "STANDBY"
     assert "HOST_STATE" in bench.blockers()
 
 
 def test_silent_host_loses_ready():
-    bench = Bench()
-    bench.to_ready()
+    bench = Bench().to_ready()
     last = bench.now_us
     bench.request = None
     bench.run_until("STANDBY")

@@ -50,8 +50,7 @@ def test_write_within_bounds_is_read_back(name):
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_what_is_not_a_number_is_refused(value):
-    bench = Bench()
+def test_what_is_not_a_number_is_refused(value, bench):
     body = bytes((0x10, 1, 0)) + struct.pack("<f", value)
     bench.core.receive(bench.now_us, 0x160, sealed(0x160, body))
     bench.step()
@@ -73,15 +72,13 @@ def test_unknown_key_and_operation():
 
 
 @pytest.mark.parametrize("state", ["READY", "ARMED", "STOPPING", "moving ESTOP"])
-def test_writing_is_refused_unless_disarmed(state):
-    bench = Bench()
+def test_writing_is_refused_unless_disarmed(state, bench):
     if state == "READY":
         bench.to_ready()
     else:
         bench.to_driving()
     if state == "STOPPING":
-        bench.set_request("STANDBY")
-        bench.run_until("STOPPING")
+        bench.set_request("STANDBY").run_until("STOPPING")
     elif state == "moving ESTOP":
         bench.core.receive(bench.now_us, 0x080, b"")
         bench.step()
@@ -90,8 +87,7 @@ def test_writing_is_refused_unless_disarmed(state):
 
 
 @pytest.mark.parametrize("state", ["FAULT", "ESTOP"])
-def test_writing_is_allowed_in_a_state_that_does_not_move(state):
-    bench = Bench()
+def test_writing_is_allowed_in_a_state_that_does_not_move(state, bench):
     if state == "FAULT":
         bench.inputs["left_current_a"] = 40.0
         bench.run_until("FAULT")
@@ -101,8 +97,7 @@ def test_writing_is_allowed_in_a_state_that_does_not_move(state):
     assert request_parameter(bench, "WRITE", 1, 60.0) == ("OK", 1, 60.0)
 
 
-def test_a_written_value_is_in_force_and_told_in_limits():
-    bench = Bench()
+def test_a_written_value_is_in_force_and_told_in_limits(bench):
     bench.run(100)
     before = bench.now_us
     assert request_parameter(bench, "WRITE", 4, 40.0)[0] == "OK"
@@ -119,8 +114,7 @@ def test_a_written_value_is_in_force_and_told_in_limits():
     assert bench.now_us - start == pytest.approx(100 * MS, abs=3 * MS)
 
 
-def test_a_damaged_request_is_not_answered():
-    bench = Bench()
+def test_a_damaged_request_is_not_answered(bench):
     bench.core.receive(bench.now_us, 0x160, bytes(8))
     bench.step()
     assert bench.messages("PARAM_RESPONSE") == []
@@ -213,8 +207,7 @@ def test_a_record_of_fewer_parameters_is_taken():
     assert (config.over_current, config.over_temperature) == (12.5, 80.0)
 
 
-def test_only_a_write_that_was_accepted_is_to_be_kept():
-    bench = Bench()
+def test_only_a_write_that_was_accepted_is_to_be_kept(bench):
     request_parameter(bench, "READ", 4)
     request_parameter(bench, "WRITE", 4, 1e6)
     request_parameter(bench, "WRITE", 5, 1.0)

@@ -15,16 +15,14 @@ ROBOT_IDS = [message.can_id for message in PROTOCOL.messages if message.sender =
 
 
 @pytest.mark.parametrize("can_id", [*ROBOT_IDS, 0, 0x7FF, 0x1FFFFFFF])
-def test_frames_for_others_are_counted_and_otherwise_nothing(can_id):
-    bench = Bench()
+def test_frames_for_others_are_counted_and_otherwise_nothing(can_id, bench):
     bench.core.receive(bench.now_us, can_id, bytes(8))
     assert bench.core.unknown_frames == 1
     assert bench.step().rejected_frames == 0
 
 
 @pytest.mark.parametrize("can_id", SEALED_IDS)
-def test_every_wrong_length_and_every_damaged_byte_is_rejected(can_id):
-    bench = Bench()
+def test_every_wrong_length_and_every_damaged_byte_is_rejected(can_id, bench):
     good = sealed(can_id, bytes(7), major=0 if can_id == 0x102 else 1)
     for length in range(8):
         bench.core.receive(bench.now_us, can_id, good[:length])
@@ -39,8 +37,7 @@ def test_every_wrong_length_and_every_damaged_byte_is_rejected(can_id):
 
 @pytest.mark.parametrize("length", range(9))
 @pytest.mark.parametrize("state", ["STANDBY", "READY", "ARMED"])
-def test_estop_needs_no_proof(state, length):
-    bench = Bench()
+def test_estop_needs_no_proof(state, length, bench):
     if state != "STANDBY":
         getattr(bench, f"to_{state.lower()}")()
     bench.core.receive(bench.now_us, 0x080, b"\xa5" * length)
@@ -53,13 +50,11 @@ def test_estop_before_the_first_cycle_is_kept():
     bench = Bench()
     core.receive(0, 0x080, b"")
     bench.core = core
-    bench.run(2)
-    assert bench.out.state == "ESTOP"
+    assert bench.run(2).state == "ESTOP"
 
 
-def test_nothing_is_accepted_before_the_wheels_are_known_to_stand():
+def test_nothing_is_accepted_before_the_wheels_are_known_to_stand(bench):
     """Frames may come before the first cycle; the measurements are not known yet."""
-    bench = Bench()
     bench.core = bench.core.__class__(CONFIG)
     bench.now_us = 0
     bench.hello()
@@ -79,8 +74,7 @@ frames = st.one_of(
 @settings(max_examples=60)
 @given(st.lists(st.tuples(frames, st.integers(1, 5)), max_size=80))
 def test_random_frames_never_move_an_idle_robot(sequence):
-    bench = Bench()
-    bench.hello()
+    bench = Bench().hello()
     bench.set_request("READY")
     for (can_id, body, kind), milliseconds in sequence:
         data = sealed(can_id, body, major=0 if can_id == 0x102 else 1) if kind == "sealed" else body

@@ -81,8 +81,7 @@ def test_the_two_voltages_share_one_range():
 
 
 def test_an_invalid_configuration_never_leaves_fault():
-    bench = Bench(dataclasses.replace(CONFIG, max_wheel_speed_rad_s=math.nan))
-    bench.hello()
+    bench = Bench(dataclasses.replace(CONFIG, max_wheel_speed_rad_s=math.nan)).hello()
     bench.set_request("READY")
     bench.command = {}
     assert bench.run(1000).state == "FAULT"

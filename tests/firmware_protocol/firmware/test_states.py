@@ -34,8 +34,7 @@ def bring_to(state: str) -> Bench:
         bench.to_driving()
     elif state == "STOPPING":
         bench.to_driving()
-        bench.set_request("STANDBY")
-        bench.run_until("STOPPING")
+        bench.set_request("STANDBY").run_until("STOPPING")
     elif state == "FAULT":
         bench.inputs["left_current_a"] = 100.0
         bench.run_until("FAULT")
@@ -68,28 +67,21 @@ def latched_fault(state):
 def reset_fault(_state):
     bench = bring_to("FAULT")
     bench.inputs.clear()
-    bench.set_request("STANDBY")
-    bench.run(300)
-    assert bench.out.state == "FAULT"
-    bench.set_request("RESET")
-    bench.run(60)
+    assert bench.set_request("STANDBY").run(300).state == "FAULT"
+    bench.set_request("RESET").run(60)
     return bench, "FAULT"
 
 
 def reset_estop(_state):
     bench, _ = estop_frame("STANDBY")
-    bench.set_request("STANDBY")
-    bench.run(700)
-    assert bench.out.state == "ESTOP"
-    bench.set_request("RESET")
-    bench.run(60)
+    assert bench.set_request("STANDBY").run(700).state == "ESTOP"
+    bench.set_request("RESET").run(60)
     return bench, "ESTOP"
 
 
 def ready_given_up(_state):
     bench = bring_to("READY")
-    bench.set_request("STANDBY")
-    bench.run(60)
+    bench.set_request("STANDBY").run(60)
     return bench, "READY"
 
 
@@ -139,8 +131,7 @@ def silent_commands(_state):
 
 def host_fault(_state):
     bench = bring_to("ARMED")
-    bench.set_request("ARM", host_fault=3)
-    bench.run_until("STOPPING", within_ms=60)
+    bench.set_request("ARM", host_fault=3).run_until("STOPPING", within_ms=60)
     return bench, "ARMED"
 
 
@@ -162,8 +153,7 @@ def changed_session(_state):
 
 def requested(_state):
     bench = bring_to("ARMED")
-    bench.set_request("STANDBY")
-    bench.run_until("STOPPING", within_ms=60)
+    bench.set_request("STANDBY").run_until("STOPPING", within_ms=60)
     return bench, "ARMED"
 
 
@@ -296,8 +286,7 @@ def test_fault_is_left_only_with_every_proof(missing):
 
 
 def test_the_cause_of_a_stop_is_shown_until_the_next_arming():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     bench.command = None
     bench.run_until("STANDBY")
     bench.to_ready(session=8)
@@ -327,8 +316,6 @@ def test_a_stop_that_takes_too_long_ends_in_standby_all_the_same():
 def test_passing_fault_returns_to_standby_by_itself():
     bench, _ = passing_fault("ARMED")
     assert bench.out.fault == FAULTS["UNDER_VOLTAGE"]
-    bench.run_until("STANDBY")
-    assert bench.out.fault == FAULTS["UNDER_VOLTAGE"]
+    assert bench.run_until("STANDBY").fault == FAULTS["UNDER_VOLTAGE"]
     bench.inputs.clear()
-    bench.run(510)
-    assert bench.out.fault == FAULTS["NONE"]
+    assert bench.run(510).fault == FAULTS["NONE"]

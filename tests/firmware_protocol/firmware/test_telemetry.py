@@ -32,8 +32,7 @@ def last(bench, name):
 
 
 @pytest.mark.parametrize("name", PERIODS_MS)
-def test_period(name):
-    bench = Bench()
+def test_period(name, bench):
     bench.run(4000)
     times = [t_us for t_us, message in bench.sent if message.name == name and t_us > 100 * MS]
     gaps = {b - a for a, b in itertools.pairwise(times)}
@@ -41,8 +40,7 @@ def test_period(name):
 
 
 @pytest.mark.parametrize("name", [*PERIODS_MS, "LIMITS"])
-def test_counters_go_up_by_one_for_each_frame(name):
-    bench = Bench()
+def test_counters_go_up_by_one_for_each_frame(name, bench):
     bench.run(20 * PERIODS_MS.get(name, 500))
     counters = [message.counter for message in bench.messages(name)]
     assert len(counters) > 16
@@ -50,8 +48,7 @@ def test_counters_go_up_by_one_for_each_frame(name):
 
 
 def test_wheel_frames_of_one_sample_have_one_counter_and_one_instant():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     speeds = [(t, m.counter, m.values) for t, m in bench.sent if m.name == "WHEEL_SPEED"]
     ticks = [(t, m.counter, m.values) for t, m in bench.sent if m.name == "WHEEL_TICKS"]
     assert [sample[:2] for sample in speeds] == [sample[:2] for sample in ticks]
@@ -59,8 +56,7 @@ def test_wheel_frames_of_one_sample_have_one_counter_and_one_instant():
         assert values["sample_time"] == t_us // 20 % 65536 * 20
 
 
-def test_wheel_values():
-    bench = Bench()
+def test_wheel_values(bench):
     bench.wheels_follow = False
     bench.inputs = {
         "left_ticks": (1 << 24) + 5,
@@ -82,8 +78,7 @@ def test_wheel_values():
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_a_speed_that_is_not_known_is_not_valid(side, bad):
-    bench = Bench()
+def test_a_speed_that_is_not_known_is_not_valid(side, bad, bench):
     bench.inputs[f"{side}_speed_rad_s"] = bad
     bench.run(20)
     values = last(bench, "WHEEL_SPEED")
@@ -96,16 +91,14 @@ def test_a_speed_that_is_not_known_is_not_valid(side, bad):
 
 
 def test_driver_and_limited_bits():
-    bench = Bench()
-    bench.to_armed()
+    bench = Bench().to_armed()
     bench.command = {"left": 40.0, "right": 40.0}
     bench.run(100)
     values = last(bench, "WHEEL_SPEED")
     assert (values["driver_enabled"], values["limited"]) == (1, 1)
 
 
-def test_motor_and_power_values():
-    bench = Bench()
+def test_motor_and_power_values(bench):
     bench.inputs.update(
         left_current_a=-1.239,
         right_current_a=400.0,
@@ -123,8 +116,7 @@ def test_motor_and_power_values():
     assert last(bench, "POWER") == pytest.approx({"voltage": 24.57, "current": -2.5, "temperature": 127})
 
 
-def test_values_are_rounded_to_the_nearest_step_and_end_at_zero_where_there_is_no_less():
-    bench = Bench()
+def test_values_are_rounded_to_the_nearest_step_and_end_at_zero_where_there_is_no_less(bench):
     bench.inputs.update(
         left_temperature_c=20.496, right_temperature_c=20.504, voltage_v=0.0, battery_temperature_c=100.0
     )
@@ -134,8 +126,7 @@ def test_values_are_rounded_to_the_nearest_step_and_end_at_zero_where_there_is_n
     assert (power["voltage"], power["temperature"]) == (0.0, 100)
 
 
-def test_system_state_tells_every_change_at_once():
-    bench = Bench()
+def test_system_state_tells_every_change_at_once(bench):
     bench.run(105)
     before = len(bench.messages("SYSTEM_STATE"))
     bench.core.receive(bench.now_us, 0x080, b"")
@@ -147,8 +138,7 @@ def test_system_state_tells_every_change_at_once():
 
 
 def test_system_state_follows_session_fault_and_stop_cause():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     assert last(bench, "SYSTEM_STATE")["session"] == 7
     bench.command = None
     bench.run_until("STANDBY")
@@ -161,8 +151,7 @@ def test_system_state_follows_session_fault_and_stop_cause():
 
 
 def test_a_session_that_changes_within_one_cycle_is_told():
-    bench = Bench()
-    bench.to_ready(session=7)
+    bench = Bench().to_ready(session=7)
     bench.run(5)
     bench.host_state(request="READY", session=8)
     before = len(bench.messages("SYSTEM_STATE"))
@@ -171,8 +160,7 @@ def test_a_session_that_changes_within_one_cycle_is_told():
     assert len(bench.messages("SYSTEM_STATE")) == before + 1
 
 
-def test_rejections_are_counted_modulo_256_with_the_newest_reason():
-    bench = Bench()
+def test_rejections_are_counted_modulo_256_with_the_newest_reason(bench):
     bench.run(50)
     for _ in range(300):
         bench.core.receive(bench.now_us, 0x100, b"\0")
@@ -184,18 +172,15 @@ def test_rejections_are_counted_modulo_256_with_the_newest_reason():
 
 
 def test_last_command_counter_is_that_of_the_last_accepted_command():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     accepted = bench.counters["WHEEL_COMMAND"]
     bench.command = None
     bench.wheel_command(4.0, 2.0, session=9)
-    bench.set_request("STANDBY")
-    bench.run_until("STOPPING")
+    bench.set_request("STANDBY").run_until("STOPPING")
     assert last(bench, "SYSTEM_STATE")["last_command_counter"] == accepted
 
 
-def test_session_state_tells_challenge_session_acceptance_and_blockers():
-    bench = Bench()
+def test_session_state_tells_challenge_session_acceptance_and_blockers(bench):
     bench.run(105)
     before = len(bench.messages("SESSION_STATE"))
     bench.hello()
@@ -208,8 +193,7 @@ def test_session_state_tells_challenge_session_acceptance_and_blockers():
     assert values["blockers"] == bench.out.blockers
 
 
-def test_cycles_whose_clock_goes_back_are_counted_and_others_are_not():
-    bench = Bench()
+def test_cycles_whose_clock_goes_back_are_counted_and_others_are_not(bench):
     bench.run(150)
     assert last(bench, "SESSION_STATE")["clock_error_count"] == 0
     for elapsed_us in (-1, -50_000, 0):
@@ -219,8 +203,7 @@ def test_cycles_whose_clock_goes_back_are_counted_and_others_are_not():
 
 
 def test_a_session_that_ends_is_told_at_once():
-    bench = Bench()
-    bench.to_ready()
+    bench = Bench().to_ready()
     bench.run(5)
     before = len(bench.messages("SESSION_STATE"))
     bench.core.receive(bench.now_us, 0x080, b"")
@@ -229,8 +212,7 @@ def test_a_session_that_ends_is_told_at_once():
     assert last(bench, "SESSION_STATE")["session"] == 0
 
 
-def test_link_health():
-    bench = Bench()
+def test_link_health(bench):
     bench.run(1000)
     assert set(last(bench, "LINK_HEALTH").values()) == {0}
     bench.inputs.update(tx_error_count=300, rx_error_count=130)
@@ -254,13 +236,11 @@ def test_link_health():
     }
 
 
-def test_handshake_is_offered_until_accepted_and_answered_ever_after():
-    bench = Bench()
+def test_handshake_is_offered_until_accepted_and_answered_ever_after(bench):
     assert len(bench.messages("HELLO")) == 1
     bench.run(2500)
     assert len(bench.messages("HELLO")) == 3
-    bench.hello()
-    bench.run(1)
+    bench.hello().run(1)
     assert len(bench.messages("HELLO")) == 4
     # Two pages with each, and no more.
     bench.run(100)
@@ -304,9 +284,8 @@ def names_by_cycle(bench, since_us):
 HANDSHAKE = ["HELLO", "BUILD", "LIMITS", "LIMITS"]
 
 
-def test_the_introduction_comes_a_frame_a_cycle():
+def test_the_introduction_comes_a_frame_a_cycle(bench):
     """So that no cycle takes much longer than the others."""
-    bench = Bench()
     bench.run(42)
     bench.hello()
     start = bench.now_us + MS
@@ -321,8 +300,7 @@ def test_the_introduction_comes_a_frame_a_cycle():
 @pytest.mark.parametrize(
     ("after_cycles", "pages"), [(0, [0, 1]), (1, [0, 1]), (2, [0, 1]), (3, [0, 0, 1]), (4, [0, 1, 0, 1])]
 )
-def test_limits_that_change_during_the_introduction_are_told_once_more_if_at_all(after_cycles, pages):
-    bench = Bench()
+def test_limits_that_change_during_the_introduction_are_told_once_more_if_at_all(after_cycles, pages, bench):
     bench.run(42)
     bench.hello()
     start = bench.now_us + MS
@@ -335,8 +313,7 @@ def test_limits_that_change_during_the_introduction_are_told_once_more_if_at_all
 
 
 def test_what_is_due_together_goes_out_two_a_cycle_the_wheels_first():
-    bench = Bench()
-    bench.hello()
+    bench = Bench().hello()
     bench.run(100)
     start = bench.now_us + 5_000 * MS
     bench.step(elapsed_us=5_000 * MS)
@@ -350,8 +327,7 @@ def test_what_is_due_together_goes_out_two_a_cycle_the_wheels_first():
 
 
 def test_no_cycle_sends_more_than_six_frames():
-    bench = Bench()
-    bench.to_driving()
+    bench = Bench().to_driving()
     bench.command = None
     bench.run(2500)
     most = max(len(names) for names in names_by_cycle(bench, 0).values())
@@ -385,8 +361,7 @@ def test_values_are_rounded_exactly_halves_up(value):
     "now_us", [*(n << 32 for n in (1, 2, 255, 256)), (1 << 40) - 1, (1 << 40) + 19, 0xFFFFFFFF, 123_456_789_012]
 )
 @pytest.mark.parametrize("before_us", [0, 1, 3, 19, 20, 21])
-def test_sample_times_are_those_of_the_40_bit_clock(now_us, before_us):
-    bench = Bench()
+def test_sample_times_are_those_of_the_40_bit_clock(now_us, before_us, bench):
     bench.now_us = now_us - before_us - MS
     # The core's own time has not come so far yet when it is told of a pose.
     bench.step()
@@ -398,22 +373,19 @@ def test_sample_times_are_those_of_the_40_bit_clock(now_us, before_us):
 
 
 def test_a_hello_is_answered_from_20_ms_after_the_answer_before():
-    bench = Bench()
-    bench.hello()
+    bench = Bench().hello()
     bench.run(100)
     bench.hello()
     bench.step()
     before = len(bench.messages("HELLO"))
-    bench.hello()
-    bench.run(19)
+    bench.hello().run(19)
     bench.step(elapsed_us=999)
     assert len(bench.messages("HELLO")) == before
     bench.step(elapsed_us=1)
     assert len(bench.messages("HELLO")) == before + 1
 
 
-def test_a_flood_of_hellos_gets_an_answer_every_20_ms():
-    bench = Bench()
+def test_a_flood_of_hellos_gets_an_answer_every_20_ms(bench):
     bench.run(100)
     before = len(bench.messages("HELLO"))
     for _ in range(200):
@@ -422,8 +394,7 @@ def test_a_flood_of_hellos_gets_an_answer_every_20_ms():
     assert len(bench.messages("HELLO")) - before == pytest.approx(10, abs=1)
 
 
-def test_time_is_that_of_reception():
-    bench = Bench()
+def test_time_is_that_of_reception(bench):
     bench.run(10)
     bench.now_us += 321
     bench.send("TIME_REQUEST", sequence=200)
@@ -432,8 +403,7 @@ def test_time_is_that_of_reception():
     assert last(bench, "TIME_RESPONSE") == {"sequence": 200, "receive_time": 10 * MS + MS + 321}
 
 
-def test_time_wraps_at_40_bits():
-    bench = Bench()
+def test_time_wraps_at_40_bits(bench):
     bench.now_us = (1 << 40) + 1234
     bench.send("TIME_REQUEST", sequence=0)
     bench.step()
@@ -598,16 +568,14 @@ def test_timeouts_beyond_their_frame_end_at_its_edge():
     assert last(bench, "LIMITS")["command_timeout"] == pytest.approx(0.020)
 
 
-def test_pose_counters():
-    bench = Bench()
+def test_pose_counters(bench):
     for _ in range(20):
         bench.core.pose(0.0, 0.0, 0.0, 0, 0.0, 0.0)
         bench.step()
     assert [message.counter for message in bench.messages("POSE_HEADING")] == [n % 16 for n in range(20)]
 
 
-def test_after_a_pause_nothing_is_caught_up_in_a_burst():
-    bench = Bench()
+def test_after_a_pause_nothing_is_caught_up_in_a_burst(bench):
     bench.run(10)
     bench.now_us += 5_000 * MS
     bench.step()
@@ -617,8 +585,7 @@ def test_after_a_pause_nothing_is_caught_up_in_a_burst():
     assert len(bench.messages("WHEEL_SPEED", since_us=start)) == 3
 
 
-def test_a_cycle_that_is_late_by_one_period_sends_once():
-    bench = Bench()
+def test_a_cycle_that_is_late_by_one_period_sends_once(bench):
     while not bench.messages("WHEEL_SPEED", since_us=max(bench.now_us, 50 * MS)):
         bench.step()
     bench.step(elapsed_us=20 * MS)

@@ -90,8 +90,7 @@ def has_zero_setpoints(out):
 def stays_stopped(bench, cycles=900):
     """Whatever the host goes on asking for."""
     for k in range(cycles):
-        bench.step()
-        assert bench.out.state != "ARMED"
+        assert bench.step().state != "ARMED"
         assert has_zero_setpoints(bench.out)
         if k % 200 == 0:
             bench.set_request("READY" if k % 400 else "ARM", session=8 + k // 200)
@@ -198,10 +197,8 @@ def test_the_cores_own_time_is_that_of_a_clock_whose_cycles_jitter():
     assert device_time_us(bench) == now_us
 
 
-def test_after_a_leap_frames_within_the_cycles_make_time_no_faster():
-    bench = Bench()
-    bench.step(100 * MS)
-    assert bench.out.fault == FAULTS["CLOCK_MISMATCH"]
+def test_after_a_leap_frames_within_the_cycles_make_time_no_faster(bench):
+    assert bench.step(100 * MS).fault == FAULTS["CLOCK_MISMATCH"]
     for _ in range(100):
         bench.now_us += 400
         bench.send("TIME_REQUEST", sequence=2)
@@ -212,8 +209,7 @@ def test_after_a_leap_frames_within_the_cycles_make_time_no_faster():
 
 
 @pytest.mark.parametrize(("ahead_us", "errors"), [(10_000, 0), (10_001, 1)])
-def test_a_frame_may_be_stamped_ten_milliseconds_after_the_cycle_that_follows_it(ahead_us, errors):
-    bench = Bench()
+def test_a_frame_may_be_stamped_ten_milliseconds_after_the_cycle_that_follows_it(ahead_us, errors, bench):
     bench.core.receive(bench.now_us + MS + ahead_us, 0x7FF, b"")
     bench.step()
     assert bench.core._core.clock_errors == errors
