@@ -25,6 +25,7 @@ from drivers.motor.roboclaw_protocol import FIRST_ADDRESS, GETTERS, LAST_ADDRESS
 from drivers.types import Frame
 from sim.devices.roboclaw import Roboclaw
 from sim.plant_parameters import PlantParameters
+from tests.drivers.waiting import wait_until
 from tests.first_use.miswired import MiswiredRobot, Miswiring, robot_file
 from tools.stack import write_robot_file
 
@@ -208,23 +209,10 @@ def test_from_the_link_of_a_virtual_robot_to_a_file_that_check_accepts(tmp_path,
     robot = write_robot_file(tmp_path, device=device)
     out = tmp_path / "mine.toml"
     with disco_hw_process("virtual robot", ["sim", str(robot)], tmp_path / "sim.txt"):
+        wait_until((tmp_path / link.partition("/")[2]).exists, 60.0)
         command = [sys.executable, "-m", "disco_hw"]
-        for _ in range(100):
-            options = [
-                "init",
-                "-o",
-                str(out),
-                "--link",
-                link.format(tmp_path),
-                "--yes",
-                "--ask",
-                "--overwrite",
-                "--listen-s",
-                "1",
-            ]
-            done = subprocess.run([*command, *options], capture_output=True, text=True, timeout=300, check=False)
-            if done.returncode == 0:
-                break
+        options = ["-o", str(out), "--link", link.format(tmp_path), "--yes", "--ask", "--listen-s", "1"]
+        done = subprocess.run([*command, "init", *options], capture_output=True, text=True, timeout=300, check=False)
         assert done.returncode == 0, done.stderr
         config = load_robot_config(out)
         assert config.link.driver == device
