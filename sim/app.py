@@ -16,6 +16,7 @@ from typing import Literal
 import can
 import serial
 
+from drivers.private_socket import SocketPathError
 from drivers.types import ReceivedFrame
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim import RobotLink
@@ -27,7 +28,7 @@ from sim.fault_schedule import FaultSchedule, Site
 from sim.hub import HubLink
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
-from sim.process import CommandSocket, PoseSender, SocketPathError, StopSignal, TextRecord
+from sim.process import CommandSocket, PoseSender, StopSignal, TextRecord
 from sim.python_can_link import PythonCanLink
 from sim.serial_line import SerialLine, SerialPathError
 from sim.virtual_robot import STEP_US, Controller, ControllerClock, Robot, TruthRecorder, VendorRobot, VirtualRobot

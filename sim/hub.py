@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from drivers.private_socket import bind_private
 from drivers.types import Frame, ReceivedFrame
 from sim import LinkFaultError, RobotNode
 from sim.bus import BusFault, CanBus, DeliveredFrame
@@ -26,7 +27,6 @@ from sim.can_protocol import (
     receive_overflow_frame,
     unpack_frame,
 )
-from sim.process import bind_private
 
 # Chosen: shallow, as of a CAN interface; the rest waits in the sender's socket.
 CLIENT_TRANSMIT_QUEUE = 32

@@ -6,12 +6,12 @@ import socket
 import can
 import pytest
 
+from drivers.private_socket import SocketPathError
 from drivers.types import Frame
 from sim import RESTART_DELAY_NS, LinkFaultError
 from sim.bus import FrameOutcome
 from sim.can_protocol import ECHO_OWN_FRAMES, FRAME_BYTES, CanFrame, ErrorState, frame_bits, pack_frame, unpack_frame
 from sim.hub import READER_QUEUE, READER_STALL_NS, Hub, HubLink
-from sim.process import SocketPathError
 from sim.unixcan import UnixCanBus
 
 T0 = 10**12
