@@ -218,7 +218,8 @@ def _start(
     core = assemble_core(config, transport, driver, pipeline, recorder, pilot.needs_pose, adaptation)
     core.announce = recorder.announce
     stop.add("pose source", core.pose_source.close)
-    stop.add("obstacle source", core.obstacle_source.close)
+    if core.obstacle_source is not None:
+        stop.add("obstacle source", core.obstacle_source.close)
     if isinstance(pilot, FindsWiring):
         core.directions = None
     daemon = Daemon(core, server, recorder, MonotonicClock(), signals, report, pilot, advice_style, page_messages)

@@ -36,7 +36,7 @@ from disco_hw.log.recorder import Recorder
 from disco_hw.model import Model
 from disco_hw.runtime.core import DaemonCore
 from disco_hw.runtime.fence_guard import FenceGuard, StoppingSettings
-from disco_hw.runtime.obstacle_source import obstacle_source_of
+from disco_hw.runtime.obstacles import obstacle_source_of
 from disco_hw.runtime.pipeline import Governor, Pipeline, Planner, WheelLimits
 from disco_hw.runtime.preflight import check_firmware_limits, check_task, failures
 from disco_hw.runtime.robot_setup import Setup, geometry
