@@ -148,7 +148,6 @@ TRICKS: dict[str, Callable[[], None]] = {
     "functions lowered only": numbas_own_libraries,
     "private copies in a kernel": undo("_KernelLibrary", JITCodeLibrary),
     "overloads lowered only": undo("_overloads_recorded"),
-    "registries loaded once": undo("_registries_loaded"),
     "no garbage collection": undo("_nothing_collected"),
     "no timers": numbas_own_compile,
     "forced inlining": inlining,
