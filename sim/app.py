@@ -16,6 +16,7 @@ from typing import Literal
 import can
 import serial
 
+from drivers.private_socket import SocketPathError
 from drivers.types import ReceivedFrame
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim import RobotLink
@@ -27,7 +28,7 @@ from sim.fault_schedule import FaultSchedule, Site
 from sim.hub import HubLink
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
-from sim.process import CommandSocket, PoseSender, SocketPathError, StopSignal, TextRecord
+from sim.process import CommandSocket, PoseSender, StopSignal, TextRecord
 from sim.python_can_link import PythonCanLink
 from sim.serial_line import SerialLine, SerialPathError
 from sim.virtual_robot import STEP_US, Controller, ControllerClock, Robot, TruthRecorder, VendorRobot, VirtualRobot
@@ -53,7 +54,7 @@ class VirtualRobotOptions:
     """Options of the virtual robot.
 
     With kind "can" and interface "unixcan" the process serves a bus of its own at the socket `channel`, with frames
-    taking their time on the wire if `pacing`; any other `interface` is joined through python-can. With kind "serial" it
+    taking their time on the wire; any other `interface` is joined through python-can. With kind "serial" it
     makes a pseudo-terminal, and a symbolic link to it at `port` unless that is None.
 
     `board`: serial port of the plant's line of a board whose firmware has one (docs/port.md); the board has a link of
@@ -65,8 +66,8 @@ class VirtualRobotOptions:
     hidden effects by name (see `sim.effects`). `seed`: all disturbances and noise. `challenge_seed`: arming
     challenges that are the same in every run, for tests alone; None draws them from the system. `truth_file`: CSV of
     `sim.virtual_robot.TRUTH_COLUMNS` at 100 Hz. `bus_log`: every frame on the own bus or line, as candump does.
-    `inject`: socket for the commands of `sim.fault_player`. `ready_fd`: descriptor that gets the ready line too, and is
-    then closed. `faults`: what goes wrong, from the ready line on; of the faults of processes only `cpu_hog`.
+    `inject`: socket for the commands of `sim.fault_player`.
+    `faults`: what goes wrong, from the ready line on; of the faults of processes only `cpu_hog`.
     `realtime_priority`: SCHED_FIFO priority where the system allows it; 0 for none.
     """
 
@@ -74,7 +75,6 @@ class VirtualRobotOptions:
     interface: str = "unixcan"
     channel: str = "disco-robot.sock"
     bitrate: int = 500_000
-    pacing: bool = True
     port: str | None = None
     baud: int = 921_600
     board: str | None = None
@@ -90,7 +90,6 @@ class VirtualRobotOptions:
     truth_file: Path | None = None
     bus_log: Path | None = None
     inject: Path | None = None
-    ready_fd: int | None = None
     faults: FaultSchedule | None = None
     realtime_priority: int = 40
 
@@ -117,7 +116,7 @@ def run_virtual_robot(options: VirtualRobotOptions) -> int:
             print(error, file=sys.stderr)
             return 2
         scheduling = _schedule(options.realtime_priority)
-        _announce(f"ready {process.link.address} ({scheduling})", options.ready_fd)
+        print(f"ready {process.link.address} ({scheduling})", flush=True)
         process.start(options.faults, resources)
         while not stop.requested:
             select.select((*process.filenos(), stop.fileno()), (), (), process.timeout_s())
@@ -325,11 +324,11 @@ def _open_link(options: VirtualRobotOptions, log: Callable[[str], object] | None
             raise OptionError(f"baud {options.baud}: not positive; give the line's rate in bit/s")
         path = None if options.port is None else Path(options.port)
         framed = options.controller is None
-        return SerialLine(path, now_ns, baud=options.baud, pacing=options.pacing, log=log, framed=framed)
+        return SerialLine(path, now_ns, baud=options.baud, log=log, framed=framed)
     if options.bitrate <= 0:
         raise OptionError(f"bitrate {options.bitrate}: not positive; give the bus's rate in bit/s")
     if options.interface == "unixcan":
-        return HubLink(Path(options.channel), now_ns, bitrate=options.bitrate, pacing=options.pacing, log=log)
+        return HubLink(Path(options.channel), now_ns, bitrate=options.bitrate, log=log)
     try:
         return PythonCanLink(options.interface, options.channel, now_ns, bitrate=options.bitrate)
     except (can.CanError, OSError, ValueError, NotImplementedError) as error:
@@ -349,13 +348,6 @@ def _schedule(priority: int) -> str:
     except OSError:
         return "no real-time priority allowed"
     return f"SCHED_FIFO {priority}"
-
-
-def _announce(line: str, ready_fd: int | None) -> None:
-    print(line, flush=True)
-    if ready_fd is not None:
-        os.write(ready_fd, line.encode() + b"\n")
-        os.close(ready_fd)
 
 
 def _report(line: str) -> None:

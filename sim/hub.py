@@ -6,16 +6,14 @@ Each packet on the socket is one Linux `struct can_frame`. Without threads: the 
 
 from __future__ import annotations
 
-import argparse
 import select
 import socket
-import sys
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from drivers.private_socket import bind_private
 from drivers.types import Frame, ReceivedFrame
 from sim import LinkFaultError, RobotNode
 from sim.bus import BusFault, CanBus, DeliveredFrame
@@ -29,8 +27,6 @@ from sim.can_protocol import (
     receive_overflow_frame,
     unpack_frame,
 )
-from sim.process import SocketPathError, StopSignal, bind_private
-from sim.python_can_link import Guest, JoinError, joined
 
 # Chosen: shallow, as of a CAN interface; the rest waits in the sender's socket.
 CLIENT_TRANSMIT_QUEUE = 32
@@ -368,44 +364,3 @@ class HubLink:
     def close(self) -> None:
         """Close the hub and remove its socket."""
         self.hub.close()
-
-
-def main() -> int:
-    """Serve a hub alone until SIGTERM or SIGINT: `python -m sim.hub PATH`."""
-    parser = argparse.ArgumentParser(prog="python -m sim.hub", description="A CAN bus on a Unix socket.")
-    parser.add_argument("path", type=Path, help="socket to listen on")
-    parser.add_argument("--bitrate", type=int, default=500_000, help="bit/s")
-    parser.add_argument("--no-pacing", action="store_true", help="frames take no time")
-    join = "let what is on this python-can interface be a node, as a board behind SLCAN"
-    parser.add_argument("--join", nargs="+", metavar=("INTERFACE CHANNEL", "KEY=JSON"), help=join)
-    given, now_ns = parser.parse_args(), time.monotonic_ns()
-    stop = StopSignal()
-    try:
-        guest_link = joined(given.join, now_ns, given.bitrate) if given.join else None
-        hub = Hub(given.path, now_ns, bitrate=given.bitrate, pacing=not given.no_pacing)
-    except (SocketPathError, JoinError) as error:
-        print(error, file=sys.stderr)
-        return 2
-    guest = None if guest_link is None else Guest(hub.bus, guest_link)
-    print(f"ready {given.path}", flush=True)
-    while not stop.requested:
-        times = [hub.next_event_ns(), None if guest is None else guest.link.next_event_ns()]
-        due_ns = min((t for t in times if t is not None), default=None)
-        timeout_s = None if due_ns is None else max(0.0, (due_ns - time.monotonic_ns()) * 1e-9)
-        others = [] if guest is None else guest.link.filenos()
-        select.select((hub.fileno(), stop.fileno(), *others), (), (), timeout_s)
-        now_ns = time.monotonic_ns()
-        if guest is not None:
-            guest.take(now_ns)
-        deliveries = hub.pump(now_ns)
-        if guest is not None:
-            guest.give(deliveries)
-    hub.close()
-    print(hub.stats, *([] if guest is None else [guest.link.summary()]), file=sys.stderr)
-    if guest is not None:
-        guest.link.close()
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import sys
 from collections import deque
 from collections.abc import Sequence
@@ -13,8 +12,7 @@ import can
 
 from drivers.types import Frame, ReceivedFrame
 from sim import LinkFaultError
-from sim.bus import BusFault, CanBus, DeliveredFrame
-from sim.can_protocol import CanFrame
+from sim.bus import BusFault
 
 # Chosen: soon enough for an adapter that is plugged in again, and no load while it is away.
 RETRY_NS = 500_000_000
@@ -169,49 +167,3 @@ class PythonCanLink:
                 bus.shutdown()
             except (can.CanError, OSError):
                 self.errors += 1
-
-
-class JoinError(Exception):
-    """Exception for a bus that cannot be joined; the message is one line for the user."""
-
-
-def joined(given: Sequence[str], now_ns: int, bitrate: int) -> PythonCanLink:
-    """Open the bus of `[interface, channel, "key=JSON", ...]`. Raises JoinError."""
-    interface, *rest = given
-    channel, options = rest[0] if rest else "", {}
-    for option in rest[1:]:
-        key, _, value = option.partition("=")
-        try:
-            options[key] = json.loads(value)
-        except json.JSONDecodeError:
-            raise JoinError(f'--join: {option}: write KEY=JSON, such as sleep_after_open=0 or name="text"') from None
-    try:
-        return PythonCanLink(interface, channel, now_ns, bitrate=bitrate, **options)
-    except (can.CanError, OSError, ValueError, NotImplementedError, TypeError) as error:
-        raise JoinError(f"--join {' '.join(given)}: cannot be opened ({error}); check interface and channel") from None
-
-
-class Guest:
-    """A node of `bus` for whatever is on `link`: what one has, the other gets."""
-
-    def __init__(self, bus: CanBus, link: PythonCanLink) -> None:
-        self.link = link
-        self._bus = bus
-        self._node = bus.attach("guest", capacity=GUEST_QUEUE)
-
-    def take(self, now_ns: int) -> None:
-        """Put on the bus what has come over the link; what does not fit the node's queue is counted there."""
-        self.link.collect(now_ns)
-        for received in self.link.advance(now_ns):
-            frame = received.frame
-            self._bus.send(self._node, CanFrame(frame.can_id, frame.data, frame.extended))
-
-    def give(self, deliveries: Sequence[DeliveredFrame]) -> None:
-        """Send over the link what the node has received."""
-        self.link.send(
-            [
-                Frame(delivery.frame.can_id, delivery.frame.data, delivery.frame.extended)
-                for delivery in deliveries
-                if self._node in delivery.receivers and not (delivery.frame.error or delivery.frame.remote)
-            ]
-        )

@@ -14,7 +14,6 @@ import numpy as np
 from disco_hw.adaptation import AdaptationUpdate
 from disco_hw.adaptation.geometry_filter import GeometryFilter
 from disco_hw.adaptation.guard import NAMES, Geometry, geometry_fault
-from disco_hw.adaptation.pose_quality import PoseWatch
 from disco_hw.log import records
 from drivers.types import Readings
 
@@ -32,15 +31,13 @@ class FastAdaptation:
     """Learns from `model`, within `low` and `high` (order of NAMES).
 
     `apply_geometry` makes planner and estimator use a geometry, None for the model file's; it raises ValueError for one
-    that they cannot take. With a `watch` estimation begins once the poses are good enough.
+    that they cannot take.
     """
 
     def __init__(
         self, model: Geometry, low: np.ndarray, high: np.ndarray, apply_geometry: Callable[[Geometry | None], None],
-        drifts: bool = False, watch: PoseWatch | None = None,
+        drifts: bool = False,
     ) -> None:  # fmt: skip
-        self._watch = PoseWatch(is_good=True) if watch is None else watch
-        self._messages: list[str] = []
         self._model, self._in_force, self._apply_geometry = model, model, apply_geometry
         self._low, self._high = low, high
         order = np.ix_(_FROM_NAMES, _FROM_NAMES)
@@ -91,18 +88,11 @@ class FastAdaptation:
 
     def feed(self, now_ns: int, readings: Readings) -> None:
         """Take in the wheel and pose samples that the tick received."""
-        if self._watch.is_good:
-            self._filter.add(readings.wheels, readings.poses)
-            return
-        messages = self._watch.step(now_ns, readings.poses)
-        self._messages += [messages] if messages else []
-        self._text = self._watch.text
+        self._filter.add(readings.wheels, readings.poses)
 
     def handle_request(self, action: str) -> tuple[bool, str]:
         """Handle "revert" or "adapt" at the next step."""
         self._requested = action
-        if action == "adapt" and not self._watch.is_good:
-            return True, f"not learning yet: {self._watch.text}"
         if action == "revert":
             return True, "back to the model file's belief; `ctl adapt` learns again"
         return True, "learning" if self._paused else "already learning"
@@ -132,8 +122,8 @@ class FastAdaptation:
         return bool(moved.any() or (width < SIGNIFICANT_WIDTH).any() or (width > 1.0 / SIGNIFICANT_WIDTH).any())
 
     def _new_messages(self) -> tuple[str, ...]:
-        """Sentences on the poses and on what the filter noticed since the last time."""
-        found, self._messages = self._messages, []
+        """Sentences on what the filter noticed since the last time."""
+        found: list[str] = []
         if self._filter.changes > self._changes:
             found.append("adapt: the robot moves differently from what was learnt; learning again")
         if self._filter.carried > self._carried:

@@ -29,8 +29,8 @@ Array = NDArray[np.float64]
 
 SLIP_STD, SLIP_S = 0.035, 0.2
 """Slip of a wheel as a part of its way, and how long it lasts."""
-LAG_S, LAG_STD_S, LAG_DRIFT_S = 0.03, 0.03, 0.003
-"""Of the pose behind the wheels: what is believed at first, and the random walk over a radian turned."""
+LAG_S, LAG_STD_S = 0.03, 0.03
+"""Of the pose behind the wheels: what is believed at first, and its standard deviation."""
 DRIFT_PER_SQRT_M, DRIFT_PER_SQRT_RAD = 0.001, 0.002
 """Random walk, by size: of the radius over a metre driven, of axle and x_icr over a radian turned."""
 LEAST_STD = 0.002
@@ -121,7 +121,7 @@ class _Bank:
         step[:, _X, _DRIFT_X] = step[:, _Y, _DRIFT_Y] = dt_s
         step[:, _LEFT, _LEFT] = step[:, _RIGHT, _RIGHT] = keep
 
-        noise = np.empty((len(state), _SIZE))
+        noise = np.zeros((len(state), _SIZE))
         distance = np.abs(way)
         slid_m = x_icr * _SLIDING_STD_S * (turn / dt_s - self._velocity[:, 2])
         self._velocity = np.stack([move_x, move_y, turn], axis=1) / dt_s
@@ -132,7 +132,6 @@ class _Bank:
         noise[:, _AXLE] = (DRIFT_PER_SQRT_RAD * axle) ** 2 * np.abs(turn)
         noise[:, _X_ICR] = (DRIFT_PER_SQRT_RAD * x_icr) ** 2 * np.abs(turn)
         noise[:, _SLIPS] = SLIP_STD**2 * (1.0 - keep * keep)
-        noise[:, _LAG] = LAG_DRIFT_S**2 * np.abs(turn)
         noise[:, _DRIFTS] = self._drifts * DRIFT_WALK_M_S**2 * dt_s
         covariance = step @ self.covariance @ step.transpose(0, 2, 1)
         covariance[:, _EVERY, _EVERY] += noise

@@ -80,62 +80,40 @@ def check_adaptable(model: Model, uncertainty: str, requested_by: str = "--adapt
         )
 
 
-LEAST_RATE_HZ, MOST_POSITION_STD_M, MOST_YAW_STD_RAD, MOST_LATENCY_S = 10.0, 0.01, 0.01, 0.3
-"""Limits of poses from which the filter learns without being asked to."""
-
-
-AdaptationKind = Literal["off", "fast", "measured"]
-REPORT_ON, REPORT_OFF = "the geometry is estimated while driving", "the geometry is not estimated"
-
-
 @dataclass(frozen=True, slots=True)
 class AdaptationChoice:
-    """Choice of the adaptation that runs, with the reason; "measured" waits for poses that are good enough."""
+    """Choice of the adaptation that runs, "off" or "fast", with the reason."""
 
-    kind: AdaptationKind
+    kind: Literal["off", "fast"]
     why: str
 
     @property
     def report(self) -> str:
-        """Return what runs and why, for the operator; empty for "measured", where `PoseWatch` reports it later."""
-        if self.kind == "measured":
-            return ""
-        return f"{REPORT_ON if self.kind == 'fast' else REPORT_OFF}: {self.why}"
+        """Return what runs and why, for the operator."""
+        what = "estimated while driving" if self.kind == "fast" else "not estimated"
+        return f"the geometry is {what}: {self.why}"
 
 
 def choose_adaptation(control: Control, pose: PoseInput, model: Model) -> AdaptationChoice:
-    """Return the adaptation for `control.adaptation`; "auto" is the filter where [pose] says poses are good enough.
+    """Return the adaptation for `control.adaptation`; "auto" is the filter where the model allows it.
 
     Raises InputError for one that is asked for and that the model does not allow.
     """
     requested = control.adaptation
+    why = f'{REQUESTED_BY_FILE} = "{requested}"'
+    if pose.rate_hz is not None:
+        why += "; remove pose.rate_hz, which decides nothing any more and will be refused later"
     if requested == "off":
-        return AdaptationChoice("off", f'{REQUESTED_BY_FILE} = "off"')
-    if requested != "auto":
-        check_adaptable(model, control.uncertainty, REQUESTED_BY_FILE)
-        deprecated = '; write "fast": its second estimator was no better and is gone' if requested == "audited" else ""
-        return AdaptationChoice("fast", f'{REQUESTED_BY_FILE} = "{requested}"{deprecated}')
+        return AdaptationChoice("off", why)
+    if requested == "audited":
+        why += '; write "fast": its second estimator was no better and is gone'
     try:
         check_adaptable(model, control.uncertainty, REQUESTED_BY_FILE)
     except InputError as error:
+        if requested != "auto":
+            raise
         return AdaptationChoice("off", str(error))
-    if pose.rate_hz is None:
-        text = (
-            f"pose.rate_hz is not given: the geometry is estimated once poses come at {LEAST_RATE_HZ:g} Hz or more, "
-            f"with {1e3 * MOST_POSITION_STD_M:g} mm, {MOST_YAW_STD_RAD:g} rad and {MOST_LATENCY_S:g} s or less"
-        )
-        return AdaptationChoice("measured", text)
-    if pose.rate_hz < LEAST_RATE_HZ:
-        return AdaptationChoice("off", f"pose.rate_hz is {pose.rate_hz:g}, less than {LEAST_RATE_HZ:g}")
-    for name, most in (
-        ("position_std_m", MOST_POSITION_STD_M), ("yaw_std_rad", MOST_YAW_STD_RAD), ("latency_s", MOST_LATENCY_S),
-    ):  # fmt: skip
-        given = getattr(pose, name)
-        if given > most:
-            return AdaptationChoice("off", f"pose.{name} is {given:g}, more than {most:g}")
-    return AdaptationChoice(
-        "fast", f"poses at {pose.rate_hz:g} Hz with {pose.position_std_m:g} m and {pose.yaw_std_rad:g} rad"
-    )
+    return AdaptationChoice("fast", why)
 
 
 def believed_geometry(model: Model) -> Geometry:

@@ -7,11 +7,9 @@ what stops the base waits for nothing.
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import select
 import socket
-import stat
 import struct
 import time
 from collections.abc import Callable, Iterator
@@ -34,6 +32,7 @@ from disco_hw.daemon.process import StopSignals
 from disco_hw.errors import InputError
 from drivers.motor import ros2_base_wire as wire
 from drivers.private_files import why_not_private
+from drivers.private_socket import SocketPathError, bind_private
 from drivers.types import Frame
 
 INTERFACE = "unixcan"
@@ -315,27 +314,8 @@ def _listen(path: Path) -> socket.socket:
         why = why_not_private(path.parent, (os.geteuid(), _ROOT))
         if why is not None:
             raise InputError(f"{path.parent}: {why}; {hint}")
-        if path.exists() and not stat.S_ISSOCK(path.lstat().st_mode):
-            raise InputError(f"{path}: exists and is not a socket; {hint}")
-        if path.exists():
-            _remove_stale(path)
-        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        listener.setblocking(False)
-        listener.bind(str(path))
-        path.chmod(0o600)
-        listener.listen(_MOST_CLIENTS)
+        return bind_private(path, socket.SOCK_SEQPACKET)
     except OSError as error:
         raise InputError(f"{path}: cannot listen there ({error.strerror or error}); {hint}") from None
-    return listener
-
-
-def _remove_stale(path: Path) -> None:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
-        try:
-            probe.connect(str(path))
-        except OSError as error:
-            if error.errno != errno.ECONNREFUSED:
-                raise
-            path.unlink()
-            return
-    raise InputError(f"{path}: another bridge or a virtual robot listens there; stop it first")
+    except SocketPathError as error:
+        raise InputError(str(error)) from None

@@ -14,8 +14,7 @@ import msgspec
 
 from disco_hw.bridge import ros2_messages as msg
 from disco_hw.bridge.ros2_inlets import AHEAD_NS
-from disco_hw.runtime.obstacle_source import reports_in
-from disco_hw.runtime.obstacles import MOST_OBSTACLES, ObstacleReport
+from disco_hw.runtime.obstacles import MOST_OBSTACLES, ObstacleReport, reports_in
 
 TOPIC = "disco_hw/obstacles"
 TYPES = (msg.ObstacleArrayMsg, msg.String)

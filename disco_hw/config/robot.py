@@ -98,10 +98,9 @@ class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     """Section [pose] of robot.toml: `source` is of `drivers.pose`; None leaves what that source takes by itself.
 
     `datum`: latitude and longitude (degrees) of the world frame's origin. For `disco-hw bridge ros2`: the topic, the
-    frame that its poses must be in, and the standard deviations of poses that come without. By these, `rate_hz` (how
-    often poses come at least) and `latency_s` it is decided whether the geometry is learnt while driving. `also`:
-    further sources, whose poses are fused with these. `allow`: addresses and networks that may send to the port;
-    `key_file`: the key that each datagram must be proven with.
+    frame that its poses must be in, and the standard deviations of poses that come without. `rate_hz` is read from old
+    files and decides nothing. `also`: further sources, whose poses are fused with these. `allow`: addresses and
+    networks that may send to the port; `key_file`: the key that each datagram must be proven with.
     """
 
     source: str = DEFAULT

@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 from numba.core import event
 
 from disco_hw import processes
-from disco_hw.adaptation.guard import AdaptationChoice, AdaptationKind, check_adaptable, choose_adaptation
+from disco_hw.adaptation.guard import AdaptationChoice, check_adaptable, choose_adaptation
 from disco_hw.config import RobotConfig
 from disco_hw.control.plan import PLANNER_VERSION, Law, LawController
 from disco_hw.daemon import SERVED, describe_recording, passed_over, socket_path
@@ -43,7 +43,7 @@ from disco_hw.processes import end_with_parent
 from disco_hw.runtime import AdviceStyle, by_command
 from disco_hw.runtime.assembly import (
     assemble_core,
-    create_adaptation,
+    create_fast_adaptation,
     create_link,
     create_pipeline,
     create_planner,
@@ -114,15 +114,14 @@ def run_daemon(
     else:
         chosen = choose_adaptation(setup.config.control, setup.config.pose, setup.model)
     with closing(AsyncPrinter(STANDARD_OUTPUT, in_json if options.as_json else in_text)) as report:
-        if chosen.report:
-            report("adapt", chosen.report)
+        report("adapt", chosen.report)
         return serve(
             setup,
             options.log_file,
             report,
             create_pilot(setup.config),
             lambda: create_planner(setup.config, setup.model) if law is None else _controller(law, setup),
-            chosen.kind,
+            chosen.kind == "fast",
             by_command(options.robot),
             page_messages,
         )
@@ -138,14 +137,14 @@ def serve(
     report: Report,
     pilot: Pilot,
     new_planner: Callable[[], Planner] = NoPlanner,
-    adapt: AdaptationKind = "off",
+    adapts: bool = False,
     advice_style: AdviceStyle | None = None,
     page_messages: Callable[[], tuple[str, ...]] = lambda: (),
 ) -> int:
     """Run until SIGTERM, SIGINT, a quit request or the pilot's end, as `run_daemon`; returns the exit code.
 
     `report` is called in the loop, and so must not wait. `pilot` decides what the robot does while motion is allowed;
-    `new_planner` is called twice, as one planner is used up in the warm-up. `adapt`: whether the geometry is learnt
+    `new_planner` is called twice, as one planner is used up in the warm-up. `adapts`: whether the geometry is learnt
     while driving; not where an operator drives. `advice_style`: how the operator requests the next step; with it
     the daemon reports what it waits for, what to do, and where the log is. Raises InputError.
     """
@@ -166,7 +165,7 @@ def serve(
                 stop,
                 report,
                 pilot,
-                adapt,
+                adapts,
                 advice_style,
                 page_messages,
             ).run()
@@ -189,7 +188,7 @@ def _start(
     stop: StopPath,
     report: Report,
     pilot: Pilot,
-    adapt: AdaptationKind,
+    adapts: bool,
     advice_style: AdviceStyle | None,
     page_messages: Callable[[], tuple[str, ...]],
 ) -> Daemon:
@@ -207,7 +206,7 @@ def _start(
     if advice_style is not None and log is not None:
         stop.add("log", lambda: report("log", f"look at it: disco-hw view {log}, or disco-hw log info {log}"))
     stop.add(_RECORDER, lambda: _close_recorder(recorder, report))
-    adaptation = create_adaptation(setup, pipeline, adapt)
+    adaptation = create_fast_adaptation(setup, pipeline) if adapts else None
     for step in processes.enter_real_time(config.daemon.realtime_priority):
         report("real time", str(step))
     for line in passed_over(server.path):
@@ -218,7 +217,8 @@ def _start(
     core = assemble_core(config, transport, driver, pipeline, recorder, pilot.needs_pose, adaptation)
     core.announce = recorder.announce
     stop.add("pose source", core.pose_source.close)
-    stop.add("obstacle source", core.obstacle_source.close)
+    if core.obstacle_source is not None:
+        stop.add("obstacle source", core.obstacle_source.close)
     if isinstance(pilot, FindsWiring):
         core.directions = None
     daemon = Daemon(core, server, recorder, MonotonicClock(), signals, report, pilot, advice_style, page_messages)

@@ -28,7 +28,7 @@ from disco_hw.model import model_text
 from disco_hw.reports import refuse_file
 from disco_hw.runtime.assembly import (
     assemble_core,
-    create_adaptation,
+    create_fast_adaptation,
     create_pipeline,
     create_planner,
     driver_of,
@@ -109,7 +109,7 @@ class SimulatedRun:
     @staticmethod
     def _adaptation(setup: Setup, pipeline: Pipeline) -> GeometryAdaptation | None:
         chosen = choose_adaptation(setup.config.control, setup.config.pose, setup.model)
-        return create_adaptation(setup, pipeline, chosen.kind)
+        return create_fast_adaptation(setup, pipeline) if chosen.kind == "fast" else None
 
     def ticks(self, duration_s: float, *requests: UserRequest) -> Iterator[CoreTick]:
         """Let time pass and give every tick as it comes; the requests come with the first one."""
@@ -236,14 +236,7 @@ def drive_virtual(
 
 def _at_the_reference_controller(setup: Setup) -> Setup:
     usual = {field.name: field.default for field in msgspec.structs.fields(RobotConfig)}
-    requested = choose_adaptation(setup.config.control, setup.config.pose, setup.model)
-    kind = "auto" if requested.kind == "measured" else requested.kind
-    changed = {
-        "link": usual["link"],
-        "wheels": usual["wheels"],
-        "pose": usual["pose"],
-        "control": msgspec.structs.replace(setup.config.control, adaptation=kind),
-    }
+    changed = {name: usual[name] for name in ("link", "wheels", "pose")}
     return replace(setup, config=msgspec.structs.replace(setup.config, **changed))
 
 

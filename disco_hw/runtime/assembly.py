@@ -11,14 +11,12 @@ from disco_hw.adaptation import GeometryAdaptation
 from disco_hw.adaptation.fast import FastAdaptation
 from disco_hw.adaptation.guard import (
     REQUESTED_BY_FILE,
-    AdaptationKind,
     Geometry,
     believed_geometry,
     check_adaptable,
     possible_range,
     with_geometry,
 )
-from disco_hw.adaptation.pose_quality import PoseWatch
 from disco_hw.config import PoseInput, RobotConfig
 from disco_hw.control.baselines import LAWS, WithFallback
 from disco_hw.control.past_motion import DriveMeans
@@ -36,7 +34,7 @@ from disco_hw.log.recorder import Recorder
 from disco_hw.model import Model
 from disco_hw.runtime.core import DaemonCore
 from disco_hw.runtime.fence_guard import FenceGuard, StoppingSettings
-from disco_hw.runtime.obstacle_source import obstacle_source_of
+from disco_hw.runtime.obstacles import obstacle_source_of
 from disco_hw.runtime.pipeline import Governor, Pipeline, Planner, WheelLimits
 from disco_hw.runtime.preflight import check_firmware_limits, check_task, failures
 from disco_hw.runtime.robot_setup import Setup, geometry
@@ -127,8 +125,8 @@ def create_guard(config: RobotConfig, model: Model) -> FenceGuard:
     return FenceGuard(Boundaries(config.robot.footprint, config.fence), settings, config.fence.margin_m)
 
 
-def create_fast_adaptation(setup: Setup, pipeline: Pipeline, watch: PoseWatch | None = None) -> FastAdaptation:
-    """Return the filter that learns the geometry, from the first pose on or once `watch` finds the poses good enough.
+def create_fast_adaptation(setup: Setup, pipeline: Pipeline) -> FastAdaptation:
+    """Return the filter that learns the geometry.
 
     `pipeline` has taken no step yet. Raises InputError where the model does not allow it.
     """
@@ -138,15 +136,7 @@ def create_fast_adaptation(setup: Setup, pipeline: Pipeline, watch: PoseWatch | 
         *possible_range(setup.config.prior),
         lambda geometry: apply_geometry(pipeline, setup.model, geometry),
         setup.config.control.disturbance,
-        watch,
     )
-
-
-def create_adaptation(setup: Setup, pipeline: Pipeline, kind: AdaptationKind) -> GeometryAdaptation | None:
-    """Return what learns the geometry, as `choose_adaptation` says; None for "off"."""
-    if kind == "off":
-        return None
-    return create_fast_adaptation(setup, pipeline, PoseWatch() if kind == "measured" else None)
 
 
 def _rehearsed(setup: Setup, pipeline: Pipeline) -> Geometry:

@@ -19,7 +19,7 @@ from disco_hw.config import RobotConfig
 from disco_hw.log import records
 from disco_hw.log.recorder import Recorder
 from disco_hw.runtime import records_of_tick
-from disco_hw.runtime.obstacles import ObstacleRefused, ObstacleReport
+from disco_hw.runtime.obstacles import ObstacleRefused, UdpObstacles
 from disco_hw.runtime.pipeline import FollowTask, Motion, Off, Pipeline, Source, Standstill, Tick, untimed
 from disco_hw.runtime.planner_events import FOLLOWS, PlannerEvents
 from disco_hw.runtime.plausibility import Directions, Headway, Plausibility, PlausibilityStats
@@ -49,27 +49,6 @@ from drivers.types import (
 STATUS_HOLDS_NS = 500_000_000
 """What the robot said of its state is not known any more after so long: five of its reports have failed to come."""
 _FOLLOW_TASK = FollowTask()
-
-
-class ObstacleSource(Protocol):
-    """Protocol of a source of obstacle reports, read in each tick; `disco_hw.runtime.obstacles` has the reports."""
-
-    def receive(self, now_ns: int) -> Sequence[ObstacleReport]:
-        """Return the obstacles reported since the last call, oldest first; never waits and never raises."""
-
-    def close(self) -> None:
-        """Close the source of obstacles; safe to call twice."""
-
-
-class NoObstacles:
-    """Source of obstacles that reports none, for a robot without one."""
-
-    def receive(self, now_ns: int) -> Sequence[ObstacleReport]:
-        """Return no reports: there is no source."""
-        return ()
-
-    def close(self) -> None:
-        """Do nothing: this implementation holds no resources."""
 
 
 def unannounced(_now_ns: int, _wheels: Sequence[WheelSample]) -> None:
@@ -111,13 +90,13 @@ class DaemonCore:
         preflight: Callable[[Driver], tuple[str, ...]],
         adaptation: GeometryAdaptation | None = None,
         pose_source: PoseSource | None = None,
-        obstacle_source: ObstacleSource | None = None,
+        obstacle_source: UdpObstacles | None = None,
     ) -> None:
         self.config = config
         self.transport = transport
         self.driver = driver
         self.pose_source = pose_source or RobotPoses()
-        self.obstacle_source = obstacle_source or NoObstacles()
+        self.obstacle_source = obstacle_source
         self.pipeline = pipeline
         guard = pipeline.guard
         self.area = None if guard is None else SafeArea(guard, config.fence, config.robot.footprint)
@@ -268,7 +247,7 @@ class DaemonCore:
         if self.area.guard.boundaries is not None and self.driver.limits is not None:
             stops = self.driver.limits.stop_deceleration_rad_s2.value
             self.area.guard.set_deceleration(min(stops, self.config.robot.max_wheel_acceleration_rad_s2))
-        for report in self.obstacle_source.receive(now_ns):
+        for report in () if self.obstacle_source is None else self.obstacle_source.receive(now_ns):
             with suppress(ObstacleRefused):
                 self.area.report(now_ns, report)
         return self.area.begin(now_ns, by_hand)

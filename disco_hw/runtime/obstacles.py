@@ -1,4 +1,7 @@
-"""Obstacles that somebody reports: circles with a velocity, each kept until its age limit; pure.
+"""Obstacles that somebody reports: circles with a velocity, each kept until its age limit.
+
+Reports come from the control socket or in UDP datagrams, from any program that can send one: a tracker, another robot,
+the bridge to ROS 2. A datagram is JSON or MessagePack, one obstacle or a list, with the fields of `ObstacleReport`.
 
 An obstacle that is reported no longer is kept where its last velocity takes it. At its age limit it becomes lost: the
 robot must then stand still until it is reported again or removed, because nobody knows where it is.
@@ -6,14 +9,18 @@ robot must then stand still until it is reported again or removed, because nobod
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Mapping
+import socket
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
 
+from disco_hw.config import RobotConfig
+from disco_hw.errors import InputError
 from disco_hw.fence.clearance import MovingCircle
 from drivers.samples import FARTHEST_M
 
@@ -25,6 +32,12 @@ ENTERED_AGE_LIMIT_S = 600.0
 """Age limit of an obstacle that a person enters and says none."""
 # Chosen: above what moves near such a robot; a report of more is taken for an error of units and refused.
 _FASTEST_M_S = 20.0
+# Chosen: one for each obstacle that there may be; the rest waits for the next tick, so that no sender holds up the
+# loop.
+_DATAGRAMS_A_TICK = 32
+# Chosen: room for MOST_OBSTACLES reports with short numbers as JSON; a longer datagram is cut off and counts as
+# malformed.
+_LONGEST_DATAGRAM = 8192
 _Coordinate = Annotated[float, Meta(ge=-FARTHEST_M, le=FARTHEST_M)]
 _Speed = Annotated[float, Meta(ge=-_FASTEST_M_S, le=_FASTEST_M_S)]
 
@@ -136,3 +149,60 @@ class Obstacles:
                 }
             )
         return found
+
+
+_Content = ObstacleReport | list[ObstacleReport]
+_JSON = msgspec.json.Decoder(_Content)
+_MESSAGE_PACK = msgspec.msgpack.Decoder(_Content)
+
+
+def obstacle_source_of(config: RobotConfig) -> UdpObstacles | None:
+    """Open the port that robot.toml names for reports; None without one. Raises InputError if it cannot be had."""
+    port = config.fence.obstacles_port
+    if port is None:
+        return None
+    address = config.fence.obstacles_address
+    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    opened.setblocking(False)
+    try:
+        opened.bind((address, port))
+    except OSError as error:
+        opened.close()
+        why = error.strerror or str(error)
+        raise InputError(f"robot.toml: fence.obstacles_port: {address}:{port}: {why}; choose another port") from None
+    return UdpObstacles(opened)
+
+
+class UdpObstacles:
+    """Source of obstacle reports in UDP datagrams, for the control loop: no call waits, and its work is bounded."""
+
+    def __init__(self, opened: socket.socket) -> None:
+        self._socket = opened
+        self.malformed = 0
+        """Number of datagrams that held no report."""
+
+    def receive(self, now_ns: int) -> Sequence[ObstacleReport]:
+        """Return the obstacles reported since the last call, oldest first; never waits and never raises."""
+        reports: list[ObstacleReport] = []
+        with contextlib.suppress(OSError):
+            for _ in range(_DATAGRAMS_A_TICK):
+                found = reports_in(self._socket.recv(_LONGEST_DATAGRAM))
+                self.malformed += not found
+                reports += found
+        return reports
+
+    def close(self) -> None:
+        """Close the UDP socket; safe to call twice."""
+        self._socket.close()
+
+
+def reports_in(datagram: bytes) -> list[ObstacleReport]:
+    """Return the reports in a datagram, at most 32; empty for what holds none or one that is not right."""
+    decoder = _JSON if datagram[:1] in (b"{", b"[") else _MESSAGE_PACK
+    try:
+        read = decoder.decode(datagram)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        return []
+    reports = read if isinstance(read, list) else [read]
+    numbers = (value for one in reports for value in msgspec.structs.astuple(one) if isinstance(value, float))
+    return reports[:MOST_OBSTACLES] if all(map(math.isfinite, numbers)) else []

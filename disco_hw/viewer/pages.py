@@ -27,7 +27,7 @@ from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.panel import coverage_text, events_text, live_details, live_summary, replay_details, replay_text
 from disco_hw.viewer.recording import Recording, ShownRobot, Snapshot, snapshot_at
 from disco_hw.viewer.scene import DARK, Scene
-from disco_hw.viewer.timeline import KINDS, Excited, Items, Mark, Timeline, marks_of
+from disco_hw.viewer.timeline import KINDS, Excited, Mark, Timeline, marks_of
 from disco_hw.viewer.views import ScrubBar, TaskEditor, Views, add_layers
 
 # Chosen: how late an end is noticed.
@@ -171,7 +171,7 @@ class LivePage:
             return
         adaptation = status.get("adaptation")
         if adaptation is None:
-            self.timeline.adaptations = Items()
+            self.timeline.adaptations.clear()
         in_force = _belief_in_force(newest, adaptation)
         if _geometry(record) != _geometry(in_force):
             self.timeline.add(newest, in_force)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,7 @@ from drivers.types import MotorSample, RobotLinkHealth, RobotStatus
 
 Array = NDArray[np.float64]
 
+_Timed = TypeVar("_Timed", records.Plan, records.Fan, records.GuardVerdict)
 # Chosen: an older plan, rollout or pose says nothing of now; rollouts come once a second, with some delay.
 PLAN_AGE_NS = 500_000_000
 FAN_AGE_NS = 1_100_000_000
@@ -92,7 +94,6 @@ def snapshot_at(timeline: Timeline, t_ns: int, plan: records.Plan | None) -> Sna
     loop, power = timeline.loop.last(t_ns), timeline.power.last(t_ns)
     values = None if estimate is None else dict(zip(ESTIMATE, estimate[1].tolist(), strict=False))
     covariance = np.full((3, 3), np.nan) if estimate is None else estimate[1][-len(COVARIANCE) :].reshape(3, 3)
-    fresh = plan is not None and 0 <= t_ns - plan.t_ns <= PLAN_AGE_NS
     return Snapshot(
         t_ns=t_ns,
         pose=None if values is None else (values["x_m"], values["y_m"], values["yaw_rad"]),
@@ -106,7 +107,7 @@ def snapshot_at(timeline: Timeline, t_ns: int, plan: records.Plan | None) -> Sna
         command=None if command is None else (float(command[1][2]), float(command[1][3])),
         in_force=command is not None and bool(command[1][4]),
         source=timeline.source.last(t_ns) or "",
-        plan=plan if fresh else None,
+        plan=_fresh(plan, t_ns, PLAN_AGE_NS),
         poses=timeline.pose.rows(t_ns - POSES_NS, t_ns)[1][-_POSES:],
         trail=thinned(_positions(timeline, t_ns), TRAIL_POINTS),
         state=timeline.state.last(t_ns),
@@ -120,23 +121,18 @@ def snapshot_at(timeline: Timeline, t_ns: int, plan: records.Plan | None) -> Sna
         current_a=np.nan if power is None else float(power[1][1]),
         battery_c=np.nan if power is None else float(power[1][2]),
         events=tuple(timeline.events.latest(t_ns, _EVENTS)),
-        fan=_fresh_fan(timeline, t_ns),
+        fan=_fresh(timeline.fans.last(t_ns), t_ns, FAN_AGE_NS),
         task=timeline.tasks.last(t_ns),
         belief=timeline.beliefs.last(t_ns),
         adaptation=timeline.adaptations.last(t_ns),
-        guard=_fresh_guard(timeline, t_ns),
+        guard=_fresh(timeline.guards.last(t_ns), t_ns, PLAN_AGE_NS),
         fence=timeline.fences.last(t_ns),
     )
 
 
-def _fresh_guard(timeline: Timeline, t_ns: int) -> records.GuardVerdict | None:
-    guard = timeline.guards.last(t_ns)
-    return guard if guard is not None and t_ns - guard.t_ns <= PLAN_AGE_NS else None
-
-
-def _fresh_fan(timeline: Timeline, t_ns: int) -> records.Fan | None:
-    fan = timeline.fans.last(t_ns)
-    return fan if fan is not None and t_ns - fan.t_ns <= FAN_AGE_NS else None
+def _fresh(record: _Timed | None, t_ns: int, age_ns: int) -> _Timed | None:
+    """Return the record if it is not older than `age_ns` at `t_ns`, and not newer."""
+    return record if record is not None and 0 <= t_ns - record.t_ns <= age_ns else None
 
 
 def _positions(timeline: Timeline, t_ns: int) -> Array:

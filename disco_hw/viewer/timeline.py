@@ -111,6 +111,11 @@ class Items(Generic[Item]):
         first = min(bisect_right(self._times, oldest_ns), max(len(self._times) - 1, 0))
         del self._times[:first], self._items[:first]
 
+    def clear(self) -> None:
+        """Forget all records."""
+        self._times.clear()
+        self._items.clear()
+
 
 ESTIMATE = ("x_m", "y_m", "yaw_rad", "speed_m_s", "yaw_rate_rad_s", "wheels_healthy", "pose_healthy")
 COVARIANCE = tuple(f"cov{row}{column}" for row in range(3) for column in range(3))
@@ -150,8 +155,14 @@ class Timeline:
         self.adaptations: Items[records.Adaptation] = Items()
         self.guards: Items[records.GuardVerdict] = Items()
         self.fences: Items[records.FenceChange] = Items()
+        self._as_they_are: dict[type, Items[Any]] = {
+            RobotStatus: self.status, RobotLinkHealth: self.link, records.DaemonState: self.state,
+            records.Event: self.events, records.Counters: self.counters, records.Fan: self.fans,
+            records.Task: self.tasks, records.BeliefChange: self.beliefs, records.Adaptation: self.adaptations,
+            records.FenceChange: self.fences,
+        }  # fmt: skip
 
-    def add(self, now_ns: int, record: records.Record | records.PlanFigures) -> None:  # noqa: PLR0912, PLR0915
+    def add(self, now_ns: int, record: records.Record | records.PlanFigures) -> None:  # noqa: PLR0912
         """Take in one record of the tick at `now_ns`; ticks come in order. Frames are not kept."""
         self.first_ns = now_ns if self.first_ns is None else self.first_ns
         self.last_ns = now_ns
@@ -181,32 +192,12 @@ class Timeline:
                 self.innovation.append(now_ns, row)
             case PowerSample() as it:
                 self.power.append(now_ns, (it.voltage_v, it.current_a, it.temperature_c))
-            case RobotStatus() as it:
-                self.status.append(now_ns, it)
-            case RobotLinkHealth() as it:
-                self.link.append(now_ns, it)
-            case records.DaemonState() as it:
-                self.state.append(now_ns, it)
-            case records.Event() as it:
-                self.events.append(now_ns, it)
-            case records.Counters() as it:
-                self.counters.append(now_ns, it)
-            case records.Fan() as it:
-                self.fans.append(now_ns, it)
-            case records.Task() as it:
-                self.tasks.append(now_ns, it)
-            case records.BeliefChange() as it:
-                self.beliefs.append(now_ns, it)
-            case records.Adaptation() as it:
-                self.adaptations.append(now_ns, it)
             case records.GuardVerdict() as it:
                 # Those between two that hold a path would hide it.
                 if it.path_x_m or it.obstacles or it.reason:
                     self.guards.append(now_ns, it)
-            case records.FenceChange() as it:
-                self.fences.append(now_ns, it)
-            case _:
-                pass
+            case _ if type(record) in self._as_they_are:
+                self._as_they_are[type(record)].append(now_ns, record)
 
     def drop_before(self, oldest_ns: int) -> None:
         """Drop what is older, so that a page that stays open does not grow."""
@@ -214,10 +205,8 @@ class Timeline:
             self.estimate, self.wheels, self.command, self.pose, self.innovation, self.planner, self.loop, self.power
         ):  # fmt: skip
             series.drop_before(oldest_ns)
-        for items in (
-            self.plans, self.status, self.link, self.state, self.source, self.events, self.counters, self.fans,
-            self.tasks, self.beliefs, self.adaptations, self.guards, self.fences,
-        ):  # fmt: skip
+        others: tuple[Items[Any], ...] = (self.plans, self.source, self.guards)
+        for items in (*others, *self._as_they_are.values()):
             items.drop_before(oldest_ns)
 
 

@@ -1,7 +1,6 @@
 import re
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -46,48 +45,38 @@ def test_what_cannot_be_adapted_is_refused():
         check_adaptable(replace(MODEL, effects=(EffectSetting("side_slip", {"k_s": 0.1}),)), "ut")
 
 
-GOOD = PoseInput(rate_hz=25.0, position_std_m=0.005, yaw_std_rad=0.005, latency_s=0.05)
-
-
-def test_the_geometry_is_learnt_where_robot_toml_says_good_poses():
-    assert choose_adaptation(Control(), GOOD, MODEL).kind == "fast"
-    chosen = choose_adaptation(Control(), PoseInput(), MODEL)
-    assert chosen.kind == "measured"
-    assert "pose.rate_hz" in chosen.why
+def test_the_geometry_is_learnt_where_the_model_allows_it():
+    assert choose_adaptation(Control(), PoseInput(), MODEL).kind == "fast"
+    chosen = choose_adaptation(Control(uncertainty="point"), PoseInput(), MODEL)
+    assert chosen.kind == "off"
+    assert "uncertainty" in chosen.why
 
 
 def test_one_line_reports_what_runs_and_why():
-    assert choose_adaptation(Control(), GOOD, MODEL).report.startswith("the geometry is estimated while driving: poses")
-    assert choose_adaptation(Control(adaptation="off"), GOOD, MODEL).report == (
+    assert choose_adaptation(Control(), PoseInput(), MODEL).report == (
+        'the geometry is estimated while driving: control.adaptation = "auto"'
+    )
+    assert choose_adaptation(Control(adaptation="off"), PoseInput(), MODEL).report == (
         'the geometry is not estimated: control.adaptation = "off"'
     )
-    # Where the poses are measured first, that line comes once they are.
-    assert choose_adaptation(Control(), PoseInput(), MODEL).report == ""
 
 
-@pytest.mark.parametrize(
-    ("field", "value"), [("rate_hz", 9.0), ("position_std_m", 0.02), ("yaw_std_rad", 0.02), ("latency_s", 0.4)]
-)
-def test_poses_that_are_not_good_enough_are_named(field, value):
-    chosen = choose_adaptation(Control(), msgspec.structs.replace(GOOD, **{field: value}), MODEL)
-    assert chosen.kind == "off"
-    assert f"pose.{field} is {value:g}" in chosen.why
-
-
-def test_what_the_file_asks_for_counts_whatever_the_poses():
-    assert choose_adaptation(Control(adaptation="off"), GOOD, MODEL).kind == "off"
+def test_what_the_file_asks_for_counts():
+    assert choose_adaptation(Control(adaptation="off"), PoseInput(), MODEL).kind == "off"
     assert choose_adaptation(Control(adaptation="fast"), PoseInput(), MODEL).kind == "fast"
+    with pytest.raises(InputError, match=r"^control.adaptation: .*uncertainty"):
+        choose_adaptation(Control(adaptation="fast", uncertainty="point"), PoseInput(), MODEL)
+
+
+def test_old_entries_are_read_and_named():
     deprecated = choose_adaptation(Control(adaptation="audited"), PoseInput(), MODEL)
     assert deprecated.kind == "fast"
     assert 'write "fast"' in deprecated.why
-    with pytest.raises(InputError, match=r"^control.adaptation: .*uncertainty"):
-        choose_adaptation(Control(adaptation="fast", uncertainty="point"), GOOD, MODEL)
-
-
-def test_a_model_that_cannot_be_adapted_is_left_alone_with_the_reason():
-    chosen = choose_adaptation(Control(uncertainty="point"), GOOD, MODEL)
-    assert chosen.kind == "off"
-    assert "uncertainty" in chosen.why
+    # The rate of the poses once decided whether the geometry is learnt.
+    for adaptation in ("auto", "off"):
+        slow = choose_adaptation(Control(adaptation=adaptation), PoseInput(rate_hz=2.0), MODEL)
+        assert slow.kind == ("fast" if adaptation == "auto" else "off")
+        assert "remove pose.rate_hz" in slow.report
 
 
 def test_the_range_is_the_prior_as_far_as_it_is_possible():

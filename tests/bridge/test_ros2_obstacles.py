@@ -13,8 +13,7 @@ pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv
 from disco_hw.bridge import ros2_messages as msg
 from disco_hw.bridge.ros2 import Bridge
 from disco_hw.bridge.ros2_obstacles import TOPIC, ObstacleInlet
-from disco_hw.runtime.obstacle_source import obstacle_source_of, reports_in
-from disco_hw.runtime.obstacles import MOST_OBSTACLES
+from disco_hw.runtime.obstacles import MOST_OBSTACLES, obstacle_source_of, reports_in
 from disco_hw.runtime.robot_setup import load_setup
 from tests.drivers.waiting import free_port
 from tests.first_use.miswired import robot_file

@@ -24,7 +24,6 @@ from tests.tables import thinned
 ROOT = Path(disco_hw.__file__).parents[1]
 PAGE = ROOT / "docs" / "my-controller.md"
 ROBOT = ROOT / "disco_hw" / "robots" / "wombot.toml"
-GOOD_POSES = "[pose]\nrate_hz = 25.0\nposition_std_m = 0.005\nyaw_std_rad = 0.01\n"
 
 
 def program(number):
@@ -97,15 +96,10 @@ def test_a_law_that_has_no_answer_for_a_while_stops_the_robot_until_it_has_one(t
         assert log.summary().missing_ticks == 0
 
 
-@pytest.mark.parametrize(
-    ("pose", "control", "adapts"),
-    [("", "", True), (GOOD_POSES, "", True), ("[pose]\nrate_hz = 4.0\n", "", False), ("", 'adaptation = "off"', False)],
-    ids=["measured", "good poses", "slow poses", "off"],
-)
-def test_the_geometry_is_learnt_where_the_real_robot_would_learn_it(tmp_path, pose, control, adapts):
+@pytest.mark.parametrize(("control", "adapts"), [("", True), ('adaptation = "off"', False)], ids=["auto", "off"])
+def test_the_geometry_is_learnt_where_the_real_robot_would_learn_it(tmp_path, control, adapts):
     robot, log = tmp_path / "robot.toml", tmp_path / "log.mcap"
-    text = ROBOT_TEXT.replace("[control]\n", f"[control]\n{control}\n")
-    robot.write_text(f"{text}\n{pose}", encoding="utf-8")
+    robot.write_text(ROBOT_TEXT.replace("[control]\n", f"[control]\n{control}\n"), encoding="utf-8")
     drive_virtual(robot, lambda *_: (2.0, 4.0), 4.0, log=log)
     with open_log(log) as opened:
         sources = {record.source for *_, record in opened.records() if isinstance(record, BeliefChange)}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import select
 import subprocess
 import sys
@@ -56,17 +55,10 @@ def test_what_is_written_for_any_driver_is_accepted(tmp_path, driver):
     assert "disco-hw commission" in out.read_text(encoding="utf-8")
 
 
-def test_the_robot_learns_once_its_poses_are_said_to_be_as_good_as_is_written(tmp_path):
+def test_the_robot_learns_its_geometry_while_it_drives(tmp_path):
     out = run_init(InitOptions(tmp_path / "robot.toml", driver="reference"), None, quiet)
-    text = out.read_text(encoding="utf-8")
-
-    def chosen():
-        setup = load_setup(out)
-        return choose_adaptation(setup.config.control, setup.config.pose, setup.model).kind
-
-    assert chosen() == "measured"
-    out.write_text(re.sub(r"^# (\w+ = )", r"\1", text, flags=re.MULTILINE), encoding="utf-8")
-    assert chosen() == "fast"
+    setup = load_setup(out)
+    assert choose_adaptation(setup.config.control, setup.config.pose, setup.model).kind == "fast"
 
 
 def test_what_a_person_answers_stands_in_the_file(tmp_path):

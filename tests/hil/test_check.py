@@ -40,7 +40,7 @@ def test_check_fails_without_a_robot_and_says_what_to_do(tmp_path):
     code, output = disco("check", str(write_robot_file(tmp_path)))
     assert code == 1
     assert "fail  link" in output
-    assert "adaptation: measured, as pose.rate_hz is not given" in output
+    assert 'adaptation: fast, as control.adaptation = "auto"' in output
 
 
 def wait_for_line(path, text: str, timeout_s: float = 30.0) -> None:

@@ -21,7 +21,7 @@ MEMBERS = {
     codegen.CodeLibrary: ("_raise_if_finalized", "_ensure_finalized"),
     codegen.JITCodeLibrary: ("finalize", "enable_object_caching", "_get_module_for_linking"),
     BaseContext: ("insert_user_function", "get_dummy_value"),
-    type(cpu_target.target_context): ("load_additional_registries", "codegen"),
+    type(cpu_target.target_context): ("codegen",),
     CPUDispatcher: ("add_overload", "compile"),
     compiler.CompileResult: ("_replace", "entry_point", "fndesc", "library"),
 }

@@ -3,13 +3,14 @@
 import csv
 import io
 import itertools
+import math
 import os
-import select
 import signal
 import stat
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import can
 import pytest
@@ -17,8 +18,11 @@ import serial
 
 from drivers.types import Frame
 from firmware_protocol.codec import Codec
+from firmware_protocol.firmware_core import FirmwareConfig
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
-from sim.__main__ import main
+from sim.app import VirtualRobotOptions, run_virtual_robot
+from sim.body_dynamics import BodyPose
+from sim.plant_parameters import PlantParameters
 from sim.process import send_command
 from sim.unixcan import UnixCanBus
 from sim.virtual_robot import TRUTH_COLUMNS
@@ -28,29 +32,37 @@ from tests.tables import thinned
 
 COMMAND_TIMEOUT_S = 0.5
 # The firmware gives its host as long as it can be set to: a test that is held up for 0.1 s has not let go.
-PATIENT = f"""
+PATIENT = FirmwareConfig(
+    ticks_per_rev=2048,
+    max_wheel_speed_rad_s=8.0,
+    command_timeout_s=COMMAND_TIMEOUT_S,
+    drive_off_timeout_s=2.0,
+    host_state_timeout_s=2.0,
+)
+RUN = """
 import sys
+from pathlib import PosixPath
 from firmware_protocol.firmware_core import FirmwareConfig
-from sim.__main__ import main
-from sim.app import VirtualRobotOptions
-VirtualRobotOptions.firmware_config = FirmwareConfig(
-    ticks_per_rev=2048, max_wheel_speed_rad_s=8.0, command_timeout_s={COMMAND_TIMEOUT_S}, drive_off_timeout_s=2.0,
-    host_state_timeout_s=2.0)
-sys.exit(main(sys.argv[1:]))
+from sim.app import VirtualRobotOptions, run_virtual_robot
+from sim.body_dynamics import BodyPose
+sys.exit(run_virtual_robot(VirtualRobotOptions({options})))
 """
 
 
 class Robot:
-    def __init__(self, directory, *options, patient=False):
+    def __init__(self, directory, **options):
         self.directory = directory
         self.channel = directory / "bus"
         self.port = directory / "tty"
+        options = {
+            "channel": str(self.channel),
+            "inject": directory / "inject",
+            "truth_file": directory / "truth.csv",
+            **options,
+        }
+        given = ", ".join(f"{name}={value!r}" for name, value in options.items())
         self.process = subprocess.Popen(
-            [
-                *(sys.executable, *(("-c", PATIENT) if patient else ("-m", "sim"))),
-                *("--channel", str(self.channel), "--inject", str(directory / "inject")),
-                *("--truth", str(directory / "truth.csv"), *options),
-            ],
+            [sys.executable, "-c", RUN.format(options=given)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -83,10 +95,10 @@ class Robot:
 def start(tmp_path):
     robots = []
 
-    def start(*options, **patience):
+    def start(**options):
         directory = tmp_path / str(len(robots))
         directory.mkdir()
-        robots.append(Robot(directory, *options, **patience))
+        robots.append(Robot(directory, **options))
         assert robots[-1].ready.startswith("ready "), robots[-1].process.communicate()
         return robots[-1]
 
@@ -161,7 +173,7 @@ def host():
 
 
 def test_drive_it_over_can_and_let_go(start, host):
-    robot = start(patient=True)
+    robot = start(firmware=PATIENT)
     port = CanPort(robot)
     arm(port, host)
     host.speeds = (2.0, 3.0)
@@ -178,7 +190,7 @@ def test_drive_it_over_can_and_let_go(start, host):
 
 @pytest.mark.thorough
 def test_drive_it_over_a_serial_line_and_let_go(start, host, tmp_path):
-    robot = start("--kind", "serial", "--port", str(tmp_path / "0" / "tty"), patient=True)
+    robot = start(kind="serial", port=str(tmp_path / "0" / "tty"), firmware=PATIENT)
     assert robot.ready.startswith(f"ready serial {robot.port} at 921600 Bd")
     port = SerialPort(robot)
     arm(port, host)
@@ -235,7 +247,7 @@ def read_to_the_end(bus):
 @pytest.mark.thorough
 def test_the_record_has_no_gap_whatever_happens_to_the_process(start, tmp_path):
     before_ns = time.monotonic_ns()
-    robot = start("--start", "1", "-2", "0.5", "--bus-log", str(tmp_path / "bus.log"))
+    robot = start(start=BodyPose(1.0, -2.0, 0.5), bus_log=tmp_path / "bus.log")
     wait_until(lambda: len(robot.truth()) >= 90, 30.0)
     robot.process.send_signal(signal.SIGSTOP)
     time.sleep(0.5)
@@ -277,22 +289,6 @@ def test_faults_at_run_time(start):
         assert [bus.recv(30).arbitration_id for _ in range(20)] == [0x100] * 20
 
 
-def test_ready_descriptor(tmp_path):
-    read_end, write_end = os.pipe()
-    with subprocess.Popen(
-        [sys.executable, "-m", "sim", "--channel", str(tmp_path / "bus"), "--ready-fd", str(write_end)],
-        pass_fds=[write_end],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    ) as process:
-        os.close(write_end)
-        assert select.select([read_end], [], [], 60)[0]
-        with os.fdopen(read_end) as ready:
-            assert ready.read().startswith(f"ready unixcan {tmp_path / 'bus'}")
-        process.terminate()
-        assert process.wait(60) == 0
-
-
 @pytest.fixture
 def signals():
     """The process takes over the signals; here that is the test's own."""
@@ -307,24 +303,22 @@ def signals():
 @pytest.mark.parametrize(
     ("options", "line"),
     [
-        (("--hide", "moonlight=1"), "moonlight"),
-        (("--hide", "turn_slip=x"), "turn_slip: 'x' is not a number"),
-        (("--wheel-radius-m", "-1"), "wheel_radius_m = -1 is impossible"),
-        (("--channel", "/nonexistent/bus"), "/nonexistent/bus: cannot listen here"),
-        (("--kind", "serial", "--port", "/nonexistent/tty"), "/nonexistent/tty: cannot be made"),
-        (("--interface", "socketcan", "--channel", "nocan0"), "socketcan nocan0: cannot be opened"),
-        (("--interface", "moon"), "cannot be opened (CAN interface 'moon' not supported)"),
-        (("--truth", "/nonexistent/truth.csv"), "/nonexistent/truth.csv: No such file or directory"),
-        (("--bus-log", "/nonexistent/bus.log"), "/nonexistent/bus.log: No such file or directory"),
-        (("--inject", "/nonexistent/inject"), "/nonexistent/inject: cannot listen here"),
-        (("--bitrate", "0"), "bitrate 0: not positive"),
-        (("--baud", "0", "--kind", "serial"), "baud 0: not positive"),
-        (("--max-wheel-speed-rad-s", "nan"), "max_wheel_speed_rad_s=nan: out of the firmware's range"),
-        (("--ticks-per-rev", "100000"), "ticks_per_rev=100000"),
+        ({"effects": {"moonlight": 1.0}}, "moonlight"),
+        ({"channel": "/nonexistent/bus"}, "/nonexistent/bus: cannot listen here"),
+        ({"kind": "serial", "port": "/nonexistent/tty"}, "/nonexistent/tty: cannot be made"),
+        ({"interface": "socketcan", "channel": "nocan0"}, "socketcan nocan0: cannot be opened"),
+        ({"interface": "moon"}, "cannot be opened (CAN interface 'moon' not supported)"),
+        ({"truth_file": Path("/nonexistent/truth.csv")}, "/nonexistent/truth.csv: No such file or directory"),
+        ({"bus_log": Path("/nonexistent/bus.log")}, "/nonexistent/bus.log: No such file or directory"),
+        ({"inject": Path("/nonexistent/inject")}, "/nonexistent/inject: cannot listen here"),
+        ({"bitrate": 0}, "bitrate 0: not positive"),
+        ({"baud": 0, "kind": "serial"}, "baud 0: not positive"),
+        ({"firmware": FirmwareConfig(2048, math.nan)}, "max_wheel_speed_rad_s=nan: out of the firmware's range"),
+        ({"plant": PlantParameters(ticks_per_rev=100000)}, "ticks_per_rev=100000"),
     ],
 )
 def test_a_bad_option_is_one_clear_line_and_exit_code_2(tmp_path, capsys, options, line):
-    code = main(["--channel", str(tmp_path / "bus"), *options])
+    code = run_virtual_robot(VirtualRobotOptions(**{"channel": str(tmp_path / "bus"), **options}))
     output, errors = capsys.readouterr()
     assert code == 2
     assert line in errors
@@ -335,7 +329,7 @@ def test_a_bad_option_is_one_clear_line_and_exit_code_2(tmp_path, capsys, option
 
 @pytest.mark.thorough
 def test_a_full_disk_ends_the_records_not_the_robot(start):
-    robot = start("--truth", "/dev/full", "--bus-log", "/dev/full")
+    robot = start(truth_file=Path("/dev/full"), bus_log=Path("/dev/full"))
     time.sleep(1.3)
     assert robot.state()["state"] == "STANDBY"
     code, errors = robot.stop()

@@ -3,7 +3,8 @@ import threading
 
 import pytest
 
-from sim.process import CommandSocket, SocketPathError, main, send_command
+from drivers.private_socket import SocketPathError
+from sim.process import CommandSocket, main, send_command
 
 
 @pytest.fixture

@@ -1,22 +1,18 @@
 """Real sockets, time given by the test."""
 
 import select
-import signal
 import socket
-import subprocess
-import sys
 
 import can
 import pytest
 
+from drivers.private_socket import SocketPathError
 from drivers.types import Frame
 from sim import RESTART_DELAY_NS, LinkFaultError
 from sim.bus import FrameOutcome
 from sim.can_protocol import ECHO_OWN_FRAMES, FRAME_BYTES, CanFrame, ErrorState, frame_bits, pack_frame, unpack_frame
 from sim.hub import READER_QUEUE, READER_STALL_NS, Hub, HubLink
-from sim.process import SocketPathError
 from sim.unixcan import UnixCanBus
-from tests.tables import thinned
 
 T0 = 10**12
 LONG_NS = 10**10
@@ -360,27 +356,6 @@ def test_close_removes_the_socket_and_may_be_repeated(hub):
     hub.close()
     assert not hub.path.exists()
     assert a.received() == ["closed"]
-
-
-@thinned("number", [signal.SIGTERM, signal.SIGINT], quick=1)
-def test_process_ends_cleanly_on_a_signal(tmp_path, number):
-    path = tmp_path / "hub"
-    with subprocess.Popen(
-        [sys.executable, "-m", "sim.hub", str(path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout.readline() == f"ready {path}\n"
-        process.send_signal(number)
-        assert process.wait(60) == 0
-        assert "Traceback" not in process.stderr.read()
-    assert not path.exists()
-
-
-def test_process_says_why_it_cannot_start(tmp_path):
-    result = subprocess.run(
-        [sys.executable, "-m", "sim.hub", str(tmp_path)], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert result.returncode == 2
-    assert result.stderr == f"{tmp_path}: exists and is not a socket; remove it or choose another path\n"
 
 
 MS = 1_000_000

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from sim.process import SocketPathError, TextRecord, bind_private
+from drivers.private_socket import SocketPathError, bind_private
+from sim.process import TextRecord
 from tests.tables import thinned
 
 SCRIPT = """
@@ -82,7 +83,7 @@ def test_what_a_dead_process_left_is_replaced(tmp_path, kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_live_socket_is_left_alone(tmp_path, kind):
-    with bind_private(tmp_path / "s", kind), pytest.raises(SocketPathError, match="another process listens here"):
+    with bind_private(tmp_path / "s", kind), pytest.raises(SocketPathError, match="another process listens there"):
         bind_private(tmp_path / "s", kind)
 
 

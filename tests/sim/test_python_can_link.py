@@ -11,10 +11,11 @@ from drivers.transport import can as can_transport
 from drivers.types import Frame
 from sim import LinkFaultError
 from sim.hub import Hub
-from sim.python_can_link import RETRY_NS, JoinError, PythonCanLink, joined
+from sim.python_can_link import RETRY_NS, PythonCanLink
 from tests.firmware_protocol.other_end import LinkEnd
 from tests.firmware_protocol.ports.posix_board import build_board, prefer, running_board
 from tests.firmware_protocol.protocol_host import ProtocolHost
+from tests.sim.hub_process import HUB_PROCESS
 
 FRAME = Frame(0x100, bytes(range(8)))
 
@@ -124,10 +125,10 @@ def test_what_cannot_be_opened_raises():
 
 
 class HubProcess:
-    """`python -m sim.hub --join slcan TERMINAL`, from its ready line on."""
+    """A hub with what is on slcan TERMINAL as a node, from its ready line on."""
 
     def __init__(self, path, terminal, *options):
-        command = [sys.executable, "-m", "sim.hub", str(path), "--join", "slcan", terminal, *options]
+        command = [sys.executable, HUB_PROCESS, str(path), "slcan", terminal, *options]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         prefer(self.process)
 
@@ -171,19 +172,3 @@ def test_a_board_behind_slcan_sits_on_the_mock_bus_beside_other_nodes(tmp_path):
         HubProcess(tmp_path / "bus", board.link, "sleep_after_open=0"),
     ):
         drive_with_another_node(tmp_path / "bus")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "reported"),
-    [
-        (["slcan", "{folder}/none"], "cannot be opened"),
-        (["virtual", "bus", "sleep_after_open"], "write KEY=JSON"),
-        (["nonsense", "bus"], "cannot be opened"),
-        (["slcan"], "cannot be opened"),
-    ],
-)
-def test_what_cannot_be_joined_is_said_in_one_line(arguments, reported, tmp_path):
-    arguments = [argument.format(folder=tmp_path) for argument in arguments]
-    with pytest.raises(JoinError, match=reported) as error:
-        joined(arguments, 0, 500_000)
-    assert "\n" not in str(error.value)

@@ -17,6 +17,7 @@ import pytest
 
 from sim.can_protocol import CanFrame, pack_frame
 from sim.unixcan import UnixCanBus
+from tests.sim.hub_process import HUB_PROCESS
 from tests.tables import thinned
 
 FLOOD = 20_000
@@ -30,7 +31,7 @@ def hubs(folder):
     def start(*options):
         path = folder / f"hub{len(processes)}"
         process = subprocess.Popen(
-            [sys.executable, "-m", "sim.hub", str(path), *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+            [sys.executable, HUB_PROCESS, str(path), *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE
         )
         processes.append(process)
         assert process.stdout.readline() == f"ready {path}\n".encode()

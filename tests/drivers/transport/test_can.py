@@ -39,6 +39,7 @@ from drivers.transport.reconnecting import (
 from drivers.types import Frame, LinkState, OutgoingFrame
 from tests.drivers.transport.pseudo_terminal import PseudoTerminal
 from tests.drivers.waiting import collect, free_port, median_send_s, outgoing, send, wait_until
+from tests.sim.hub_process import HUB_PROCESS
 
 
 @pytest.mark.parametrize(
@@ -401,7 +402,7 @@ def hub(tmp_path):
     processes = []
 
     def start():
-        process = subprocess.Popen([sys.executable, "-m", "sim.hub", str(path)], stdout=subprocess.PIPE, text=True)
+        process = subprocess.Popen([sys.executable, HUB_PROCESS, str(path)], stdout=subprocess.PIPE, text=True)
         processes.append(process)
         assert "ready" in process.stdout.readline()
         return process
