@@ -1,4 +1,4 @@
-"""Correction of a belief by a measured pose: screening, the Mahalanobis gate, and the extended Kalman filter's update.
+"""Correction of a belief by a measured pose: screening, the Mahalanobis gate, and filterpy's extended Kalman filter.
 
 And what poses that go on correcting show: motion that the geometry does not explain. The fused pose follows wheels,
 geometry and the present estimate of that motion; what poses go on correcting is what that estimate still lacks. Each
@@ -10,7 +10,13 @@ principle, Francis and Wonham 1976). As the corrections are those of the Kalman 
 from __future__ import annotations
 
 import enum
+import importlib
 import math
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -27,6 +33,49 @@ from disco_hw.estimation.odometry import (
 )
 from disco_hw.model.coefficients import NO_DISTURBANCE, Disturbance
 from drivers.types import PoseSample
+
+
+@contextmanager
+def deferred(*names: str) -> Iterator[None]:
+    """Put off the import of these modules by what the block imports, until something of them is called.
+
+    What the block takes from them by `from NAME import THING` is a stand-in for that function or object. Whoever
+    imports the modules afterwards gets them as ever. Nothing happens to one that is imported already.
+    """
+    deferred_modules = {name: _DeferredModule(name) for name in names if name not in sys.modules}
+    sys.modules.update(deferred_modules)
+    try:
+        yield
+    finally:
+        for name in deferred_modules:
+            del sys.modules[name]
+
+
+class _DeferredModule(ModuleType):
+    """A module as it is seen by an import statement: everything is in it."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return _DeferredImport(self.__name__, name)
+
+
+class _DeferredImport:
+    """Placeholder for something of a module, whose use imports the module."""
+
+    def __init__(self, module: str, name: str) -> None:
+        self._source = module, name
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._loaded(), name)
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        return self._loaded()(*arguments, **named)
+
+    def _loaded(self) -> Any:
+        module, name = self._source
+        return getattr(importlib.import_module(module), name)
+
 
 # Above FARTHEST_M, which a place may lie away; a pose beyond these numbers is an error of the sensor.
 MAX_POSITION_M = 1000.0
@@ -136,6 +185,10 @@ def _exceeded(distance2: float) -> float:
     return math.erfc(math.sqrt(half)) + 2.0 * math.sqrt(half / math.pi) * math.exp(-half)
 
 
+# What is not used here of filterpy brings most of scipy with it, into a process that locks its memory.
+with deferred("filterpy.stats", "scipy.ndimage"):
+    from filterpy.kalman import ExtendedKalmanFilter
+
 Vector = NDArray[np.float64]
 Triple = tuple[float, float, float]
 
@@ -161,48 +214,77 @@ class Correction(msgspec.Struct, frozen=True, gc=False):
     log_density: float
 
 
-def correct(belief: PoseBelief, measurement: Measurement) -> Correction:
-    """Fuse one pose into a belief; the caller decides by `distance2` whether to take the result.
+class PoseCorrector:
+    """Applies measured poses to beliefs; holds filterpy's filters as work space, and nothing from call to call.
 
-    Its covariance P becomes (I - KH) P (I - KH)' + K R K' (Joseph), which rounding leaves positive definite.
+    filterpy does the gain, the Joseph form and the Mahalanobis distance. Its prediction is linear and it knows neither
+    gates nor time, so that those are ours; its arrays broadcast silently when a shape is wrong, so that all are made
+    (3,) and (3, 3) and checked.
     """
-    pose, position, yaw = measurement.pose, measurement.position_variance, measurement.yaw_variance
-    ahead_x, ahead_y, by_yaw_x, by_yaw_y = measurement.lever(belief.yaw_rad)
-    rows = 2 if yaw is None else 3
-    jacobian = np.array(((1.0, 0.0, by_yaw_x), (0.0, 1.0, by_yaw_y), (0.0, 0.0, 1.0)))[:rows]
-    noise = np.diag((position, position, yaw or 0.0)[:rows])
-    off_x, off_y = pose.x_m - (belief.x_m + ahead_x), pose.y_m - (belief.y_m + ahead_y)
-    residual = np.array((off_x, off_y, wrap(pose.yaw_rad - belief.yaw_rad))[:rows])
-    prior = np.array(belief.covariance)
-    crossed = prior @ jacobian.T
-    spread = jacobian @ crossed + noise
-    information = np.linalg.inv(spread)
-    gain = crossed @ information
-    x, y, yaw_rad = (np.array((belief.x_m, belief.y_m, belief.yaw_rad)) + gain @ residual).tolist()
-    kept = _IDENTITY - gain @ jacobian
-    covariance, sensitivity = kept @ prior @ kept.T + gain @ noise @ gain.T, None
-    if belief.sensitivity is not None:
-        # The parameters are not estimated: their part of the error shrinks like any other error of the pose.
-        part = kept @ np.array(belief.sensitivity).reshape(3, 3)
-        covariance = covariance - part @ part.T
-        sensitivity = _flat(part)
-    (xx, xy, xt), (_, yy, yt), (_, _, tt) = covariance.tolist()
-    floor = FLOOR_VARIANCE
-    innovation, variance = residual.tolist(), spread.diagonal().tolist()
-    # A root and its square, as in logs of before: a replay compares every bit.
-    distance2 = math.sqrt(residual @ information @ residual) ** 2
-    return Correction(
-        PoseBelief(x, y, wrap(yaw_rad), xx + floor, xy, xt, yy + floor, yt, tt + floor, sensitivity),
-        (innovation[0], innovation[1], math.nan if yaw is None else innovation[2]),
-        (variance[0], variance[1], math.nan if yaw is None else variance[2]),
-        distance2,
-        -0.5 * (distance2 + math.log(float(np.linalg.det(spread)))),
-    )
+
+    def __init__(self) -> None:
+        self._of_poses = ExtendedKalmanFilter(dim_x=3, dim_z=3)
+        self._of_positions = ExtendedKalmanFilter(dim_x=3, dim_z=2)
+
+    def correct(self, belief: PoseBelief, measurement: Measurement) -> Correction:
+        """Fuse one pose into a belief; the caller decides by `distance2` whether to take the result."""
+        pose, position, yaw = measurement.pose, measurement.position_variance, measurement.yaw_variance
+        ahead_x, ahead_y, by_yaw_x, by_yaw_y = measurement.lever(belief.yaw_rad)
+        jacobian, predicted = _IDENTITY, np.array((belief.x_m + ahead_x, belief.y_m + ahead_y, belief.yaw_rad))
+        if by_yaw_x or by_yaw_y:
+            jacobian = np.array(((1.0, 0.0, by_yaw_x), (0.0, 1.0, by_yaw_y), (0.0, 0.0, 1.0)))
+        ekf = self._of_positions if yaw is None else self._of_poses
+        ekf.x = np.array((belief.x_m, belief.y_m, belief.yaw_rad))
+        ekf.P = np.array(belief.covariance)
+        if yaw is None:
+            ekf.R = np.array(((position, 0.0), (0.0, position)))
+            measured = np.array((pose.x_m, pose.y_m))
+            ekf.update(measured, lambda _state: jacobian[:2], lambda _state: predicted[:2])
+        else:
+            ekf.R = np.array(((position, 0.0, 0.0), (0.0, position, 0.0), (0.0, 0.0, yaw)))
+            measured = np.array((pose.x_m, pose.y_m, pose.yaw_rad))
+            ekf.update(measured, lambda _state: jacobian, lambda _state: predicted, residual=_residual)
+        if ekf.x.shape != (3,) or ekf.P.shape != (3, 3) or ekf.S.shape != measured.shape * 2:
+            raise AssertionError(f"filterpy returned shapes {ekf.x.shape}, {ekf.P.shape}, {ekf.S.shape}")
+        distance2 = float(ekf.mahalanobis) ** 2
+        x, y, yaw_rad = ekf.x.tolist()
+        covariance, sensitivity = ekf.P, None
+        if belief.sensitivity is not None:
+            # The parameters are not estimated: their part of the error shrinks like any other error of the pose.
+            part = (_IDENTITY - ekf.K @ jacobian[: measured.size]) @ np.array(belief.sensitivity).reshape(3, 3)
+            covariance = covariance - part @ part.T
+            sensitivity = _flat(part)
+        (xx, xy, xt), (_, yy, yt), (_, _, tt) = covariance.tolist()
+        innovation, variance = ekf.y.tolist(), ekf.S.diagonal().tolist()
+        return Correction(
+            PoseBelief(
+                x,
+                y,
+                wrap(yaw_rad),
+                xx + FLOOR_VARIANCE,
+                xy,
+                xt,
+                yy + FLOOR_VARIANCE,
+                yt,
+                tt + FLOOR_VARIANCE,
+                sensitivity,
+            ),
+            (innovation[0], innovation[1], math.nan if yaw is None else innovation[2]),
+            (variance[0], variance[1], math.nan if yaw is None else variance[2]),
+            distance2,
+            -0.5 * (distance2 + math.log(float(np.linalg.det(ekf.S)))),
+        )
 
 
 def _flat(matrix: Vector) -> Flat9:
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
     return a, b, c, d, e, f, g, h, i
+
+
+def _residual(measured: Vector, predicted: Vector) -> Vector:
+    difference: Vector = measured - predicted
+    difference[2] = wrap(float(difference[2]))
+    return difference
 
 
 BODY_PER_S, TURN_PER_S, WORLD_PER_S = 0.2, 0.25, 0.4

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import msgspec
 
 from disco_hw.config import Estimation
-from disco_hw.estimation.correction import Correction, Measurement, PoseReason, Triple, correct, gate_limit
+from disco_hw.estimation.correction import Correction, Measurement, PoseCorrector, PoseReason, Triple, gate_limit
 from disco_hw.estimation.odometry import (
     MotionModel,
     OdometryParameters,
@@ -107,9 +107,11 @@ def any_heading(measurement: Measurement, model: MotionModel) -> HeadingSearch:
     return HeadingSearch(tuple(beliefs), (1.0 / COMPONENTS,) * COMPONENTS)
 
 
-def correct_search(search: HeadingSearch, measurement: Measurement) -> tuple[HeadingSearch, Correction]:
+def correct_search(
+    search: HeadingSearch, measurement: Measurement, corrector: PoseCorrector
+) -> tuple[HeadingSearch, Correction]:
     """Update the search with a measurement; return it with the correction of the component that fits it best."""
-    corrections = [correct(belief, measurement) for belief in search.beliefs]
+    corrections = [corrector.correct(belief, measurement) for belief in search.beliefs]
     logs = [math.log(w) + c.log_density for w, c in zip(search.weights, corrections, strict=True)]
     most = max(logs)
     kept = [(math.exp(log - most), c) for log, c in zip(logs, corrections, strict=True)]
@@ -176,6 +178,7 @@ class PoseFilter:
         self._lockout_count = settings.gate_lockout_count
         self._take_over_ns = round(TAKE_OVER_TIMEOUTS * settings.pose_timeout_s * 1e9)
         self._pose_required = settings.pose_required
+        self._corrector = PoseCorrector()
 
     def begin(self, wheels: WheelReading) -> FilterState:
         """Return the state at the first wheel sample: no belief, or the origin where no pose is required."""
@@ -262,13 +265,13 @@ class PoseFilter:
         search = any_heading(measurement, self._model)
         if measurement.yaw_variance is None:
             return search
-        return self._settled(correct_search(search, measurement)[0])
+        return self._settled(correct_search(search, measurement, self._corrector)[0])
 
     def _corrected(self, belief: Belief, measurement: Measurement) -> tuple[Belief, Correction]:
         if isinstance(belief, PoseBelief):
-            correction = correct(belief, measurement)
+            correction = self._corrector.correct(belief, measurement)
             return correction.belief, correction
-        search, best = correct_search(belief, measurement)
+        search, best = correct_search(belief, measurement, self._corrector)
         return self._settled(search), best
 
     def _settled(self, search: HeadingSearch) -> Belief:

@@ -12,7 +12,7 @@ from disco_hw.config import SHIPPED_ROBOT
 from tests.tables import thinned
 
 SHIPPED = SHIPPED_ROBOT.parent
-HEAVY = ("scipy", "torch", "matplotlib", "numba", "cantools", "viser", "zmq", "mcap", "cryptography",
+HEAVY = ("scipy", "torch", "matplotlib", "numba", "cantools", "filterpy", "viser", "zmq", "mcap", "cryptography",
          "pydantic", "rich")  # fmt: skip
 COUNT = """
 import contextlib, sys
@@ -111,3 +111,11 @@ def test_what_drives_loads_nothing_that_it_does_not_use(module):
               "scipy.special", "scipy.optimize", "scipy.sparse", "scipy.ndimage", "scipy.signal",
               "scipy.spatial"}  # fmt: skip
     assert not loaded & unused
+    assert "filterpy.kalman" in loaded or module != "disco_hw.daemon.run"
+
+
+@pytest.mark.thorough
+def test_filterpys_statistics_are_there_for_who_asks_for_them():
+    text = "import disco_hw.estimation, filterpy.stats\nprint(filterpy.stats.logpdf([1.0], [0.0], [[1.0]]))"
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=120, check=True)
+    assert float(done.stdout) == pytest.approx(-1.4189385332)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from disco_hw.estimation.correction import FLOOR_VARIANCE, Measurement, correct
+from disco_hw.estimation.correction import FLOOR_VARIANCE, Measurement, PoseCorrector
 from disco_hw.estimation.odometry import Pose, PoseBelief
 
 
@@ -32,7 +32,7 @@ def test_update_equals_the_information_form(seed):
     prior, mean = random_covariance(rng, 0.1), rng.normal(size=3)
     z = mean + rng.normal(size=3) * 0.1
     noise = np.diag([1e-4, 1e-4, 4e-4])
-    correction = correct(belief_of(mean.tolist(), prior), measured(*z.tolist()))
+    correction = PoseCorrector().correct(belief_of(mean.tolist(), prior), measured(*z.tolist()))
     information = np.linalg.inv(prior) + np.linalg.inv(noise)
     posterior = np.linalg.inv(information)
     expected = posterior @ (np.linalg.solve(prior, mean) + np.linalg.solve(noise, z))
@@ -51,7 +51,7 @@ def test_uncertain_parameters_are_considered_and_not_estimated(seed):
     rest, sensitivity = random_covariance(rng, 0.05), rng.normal(size=(3, 3)) * 0.1
     mean = rng.normal(size=3)
     z = mean + rng.normal(size=3) * 0.05
-    correction = correct(belief_of(mean.tolist(), rest, sensitivity), measured(*z.tolist()))
+    correction = PoseCorrector().correct(belief_of(mean.tolist(), rest, sensitivity), measured(*z.tolist()))
     # Schmidt's filter in the joint state (pose, normalised parameters), any gain form, with no gain on the parameters.
     joint = np.block([[rest + sensitivity @ sensitivity.T, sensitivity], [sensitivity.T, np.eye(3)]])
     observe = np.hstack([np.eye(3), np.zeros((3, 3))])
@@ -69,7 +69,7 @@ def test_uncertain_parameters_are_considered_and_not_estimated(seed):
 @pytest.mark.parametrize(("predicted", "seen"), [(3.13, -3.13), (-3.13, 3.13), (3.13, -3.13 + 20 * math.tau)])
 def test_yaw_innovation_takes_the_short_way_round(predicted, seen):
     covariance = np.diag([1e-4, 1e-4, 4e-4])
-    correction = correct(belief_of((0.0, 0.0, predicted), covariance), measured(0.0, 0.0, seen))
+    correction = PoseCorrector().correct(belief_of((0.0, 0.0, predicted), covariance), measured(0.0, 0.0, seen))
     short = math.copysign(math.tau - 6.26, predicted)
     assert correction.innovation[2] == pytest.approx(short, abs=1e-12)
     # Equal variances: the result is half way, at pi, not at zero.
@@ -78,13 +78,23 @@ def test_yaw_innovation_takes_the_short_way_round(predicted, seen):
 
 
 def test_a_thousand_poses_at_standstill_leave_the_covariance_above_its_floor():
+    corrector = PoseCorrector()
     belief = belief_of((0.0, 0.0, 0.0), np.diag([1.0, 1.0, 1.0]))
     for _ in range(1000):
-        belief = correct(belief, measured(0.0, 0.0, 0.0)).belief
+        belief = corrector.correct(belief, measured(0.0, 0.0, 0.0)).belief
     standard_deviations = np.sqrt(np.diag(belief.covariance))
     # Balance of floor q and information 1/r: P^2 = q (P + r).
     np.testing.assert_allclose(standard_deviations[:2], math.sqrt(math.sqrt(FLOOR_VARIANCE * 1e-4)), rtol=0.01)
     assert np.linalg.eigvalsh(np.array(belief.covariance))[0] >= FLOOR_VARIANCE
+
+
+def test_one_corrector_serves_many_beliefs_without_memory():
+    rng = np.random.default_rng(0)
+    used, cases = PoseCorrector(), []
+    for _ in range(10):
+        belief = belief_of(rng.normal(size=3).tolist(), random_covariance(rng))
+        cases.append((belief, measured(*rng.normal(size=3).tolist())))
+    assert [used.correct(*case) for case in cases] == [PoseCorrector().correct(*case) for case in cases]
 
 
 @settings(deadline=None)
@@ -99,7 +109,7 @@ def test_any_sizes_leave_the_covariance_symmetric_and_positive_definite(exponent
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     covariance = turn @ np.diag(10.0 ** np.array(exponents)) @ turn.T
     sensitivity = rng.normal(size=(3, 3)) if seed % 2 else None
-    corrected = correct(
+    corrected = PoseCorrector().correct(
         belief_of((0.0, 0.0, 0.0), covariance, sensitivity), measured(*z, 10.0**noise_exponent, 10.0**noise_exponent)
     )
     posterior = np.array(corrected.belief.covariance)
