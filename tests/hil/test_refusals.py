@@ -320,7 +320,7 @@ def test_garbage_on_a_serial_line_leaves_the_daemon_waiting(tmp_path):
         (
             "check",
             "x_m,y_m\n0,0\n1,0\n1,0.2\n0,0.2\n",
-            "lines 3 to 4: the path turns twice within 0.28 m, where the robot may stop",
+            "lines 3 to 4: the path turns twice within 0.28 m, where the robot would leave",
         ),
         ("run", None, "cannot be read"),
     ],
