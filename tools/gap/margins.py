@@ -54,7 +54,7 @@ class WatchedFloat(float, _Watched):
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **named: Any) -> Any:
         return _evaluate(lambda *values: getattr(ufunc, method)(*values, **named), inputs, _is_comparison(ufunc))
 
-    def __round__(self, digits: int | None = None) -> Any:
+    def __round__(self, digits: int | None = None) -> Any:  # type: ignore[override]
         return _evaluate(lambda value: round(value) if digits is None else round(value, digits), (self,), False)
 
     def __int__(self) -> int:
@@ -88,9 +88,9 @@ def _evaluate(function: Callable[..., Any], inputs: tuple[Any, ...], is_comparis
     """Evaluate a function of numbers, some of them watched, as usual and with each threshold at half and double."""
     usual = function(*map(_plain, inputs))
     watched = [value for value in inputs if isinstance(value, _Watched)]
-    margins, others = watched[0].margins, {}
+    margins, others = watched[0].margins, dict[str, tuple[Any, Any]]()
     for name in sorted({name for value in watched for name in value.others}):
-        pair = []
+        pair: list[Any] = []
         for place in (0, 1):
             values = [
                 value.others[name][place] if isinstance(value, _Watched) and name in value.others else _plain(value)
