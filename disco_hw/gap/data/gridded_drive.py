@@ -9,7 +9,7 @@ at 4 to 10 Hz, and laid on the interval that it ends a speed is neither late nor
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -39,7 +39,7 @@ class GridSamples:
 
     def pick(self, chosen: Mask | Index) -> GridSamples:
         """Return the chosen samples."""
-        return GridSamples(self.node[chosen], self.fraction[chosen], self.t_s[chosen], self.block[chosen])
+        return GridSamples(*(getattr(self, each.name)[chosen] for each in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +138,7 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
     runs = _runs(wheels.t_s, wheels.segment, grid_settings)
     driven_s = sum(float(wheels.t_s[hi - 1] - wheels.t_s[lo]) for lo, hi in runs)
     if driven_s > grid_settings.longest_s:
-        runs = _spread(wheels.t_s, runs, driven_s, _commanded(command_samples, wheels), grid_settings)
+        runs = _spread(wheels.t_s, runs, driven_s, _commanded(command_samples, wheels), settings)
         notes.append(
             f"{driven_s:.0f} s of driving: {grid_settings.longest_s:.0f} s of it, evenly spread and those with "
             "commands first, are judged"
@@ -162,7 +162,7 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
         changes.append(change)
         angles.append(at)
         speeds.append(speed)
-        even = np.clip(even_times(t, grid_settings.even_samples), grid[0], grid[-1])
+        even = np.clip(even_times(t, grid_settings.neighbours), grid[0], grid[-1])
         moved = np.column_stack([np.interp(t, grid, speed[:, side]) for side in (0, 1)]) * (even - t)[:, None]
         encoder_at.append(_locate(even, grid, offset, grid_settings.block_s))
         encoder_angle.append(angle + moved)
@@ -306,19 +306,19 @@ def _commanded(commands: Commands, wheels: Wheels) -> Mask:
 
 
 def _spread(
-    t_s: Array, runs: list[tuple[int, int]], driven_s: float, commanded: Mask, settings: GridSettings
+    t_s: Array, runs: list[tuple[int, int]], driven_s: float, commanded: Mask, settings: GapSettings
 ) -> list[tuple[int, int]]:
-    """Stretches of `stretch_s` of the runs that add up to about `longest_s`, neighbours joined.
+    """Stretches of the length of a fold of the runs that add up to about `longest_s`, neighbours joined.
 
     Evenly spread over those in which commands are known; the others, which show nothing of the way from command to
     wheel, only as far as these do not suffice.
     """
     stretches = []
     for lo, hi in runs:
-        edges = np.arange(t_s[lo], t_s[hi - 1], settings.stretch_s)
+        edges = np.arange(t_s[lo], t_s[hi - 1], settings.prediction.folds.stretch_s)
         cuts = [*np.searchsorted(t_s[lo:hi], edges).tolist(), hi - lo]
         stretches += [(lo + a, lo + b) for a, b in pairwise(cuts) if b - a > 2]
-    most = max(int(len(stretches) * settings.longest_s / driven_s), 1)
+    most = max(int(len(stretches) * settings.grid.longest_s / driven_s), 1)
     known = np.array([bool(commanded[lo:hi].any()) for lo, hi in stretches])
     kept: list[int] = []
     for group in (np.flatnonzero(known), np.flatnonzero(~known)):
@@ -332,7 +332,7 @@ def _spread(
             pieces[-1] = (pieces[-1][0], hi)
         else:
             pieces.append((lo, hi))
-    return [(lo, hi) for lo, hi in pieces if t_s[hi - 1] - t_s[lo] >= settings.most_delay_s]
+    return [(lo, hi) for lo, hi in pieces if t_s[hi - 1] - t_s[lo] >= settings.grid.most_delay_s]
 
 
 def _locate(t_s: Array, grid: Array, offset: int, block_s: float) -> GridSamples:
@@ -343,12 +343,7 @@ def _locate(t_s: Array, grid: Array, offset: int, block_s: float) -> GridSamples
 
 
 def _joined(parts: list[GridSamples]) -> GridSamples:
-    return GridSamples(
-        np.concatenate([part.node for part in parts]),
-        np.concatenate([part.fraction for part in parts]),
-        np.concatenate([part.t_s for part in parts]),
-        np.concatenate([part.block for part in parts]),
-    )
+    return GridSamples(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(GridSamples)))
 
 
 def _command_cells(commands: Commands, segment: int, grid: Array) -> tuple[Array, Array]:
@@ -407,22 +402,8 @@ def _quantum(angle: Array) -> float:
 def _empty(settings: GapSettings) -> GriddedDrive:
     nothing, pairs = np.empty(0), np.empty((0, 2))
     samples = GridSamples(np.empty(0, np.int64), nothing, nothing, np.empty(0, np.int64))
-    return GriddedDrive(
-        nothing,
-        np.empty(0, bool),
-        pairs,
-        nothing,
-        pairs,
-        pairs,
-        samples,
-        pairs,
-        0.0,
-        0.0,
-        0.0,
-        samples,
-        np.empty((0, 3)),
-        settings=settings,
-    )
+    wheels = nothing, np.empty(0, bool), pairs, nothing, pairs, pairs, samples, pairs
+    return GriddedDrive(*wheels, 0.0, 0.0, 0.0, samples, np.empty((0, 3)), settings=settings)
 
 
 def undo_sample_hold(wheels: Wheels, settings: GridSettings) -> Wheels:

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.gap.settings import START_STD
 from disco_hw.jit import kernel_function, scalar_function
 
 Array = NDArray[np.float64]
@@ -22,9 +23,6 @@ Mask = NDArray[np.bool_]
 
 # Position and heading, slip, and the correlated noise of the poses: three of each.
 STATES = 9
-# Chosen: far above the noise of a pose, so that the first one decides.
-_START_M = 0.3
-_START_RAD = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,18 +45,7 @@ class BodyNoise:
 
     def vector(self) -> Array:
         """Return the logarithms of all nine values, (9,)."""
-        values = (
-            self.position_m,
-            self.yaw_rad,
-            self.stamp_s,
-            self.slip_forward_m_s,
-            self.slip_left_m_s,
-            self.slip_yaw_rad_s,
-            self.slip_correlation_s,
-            self.relative,
-            self.noise_correlation_s,
-        )
-        return np.asarray(np.log(np.array(values)))
+        return np.asarray(np.log(np.array(astuple(self))))
 
     @classmethod
     def from_vector(cls, logs: Array) -> BodyNoise:
@@ -116,7 +103,7 @@ def _begin(c: Any, noise: Any) -> None:
     c[:, :] = 0.0
     for i in range(3):
         pose = noise[1] if i == 2 else noise[0]
-        c[i, i] = _START_M**2 if i < 2 else _START_RAD**2
+        c[i, i] = START_STD**2
         c[3 + i, 3 + i] = 1.0
         c[6 + i, 6 + i] = pose * pose
 
