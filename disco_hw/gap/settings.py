@@ -128,9 +128,6 @@ class NoiseSettings:
     stretch is weighed down; and the most by which heavy tails raise scores. Chosen: noise alone has one."""
     smooth_samples: int = 25
     """The local size of residuals is a mean over so many samples either side. Chosen."""
-    command_jitter_share: float = 0.1
-    """Commands jitter by this share of the encoder's period at most, and by what the encoder's stamps scatter. Chosen:
-    more is a response."""
     largest_wheel_noise: tuple[float, ...] = (0.05, 1.0, 0.1, 0.05, 0.1, 0.1, 0.02)
     """Upper bounds in the order of `WheelNoise`. Chosen: beyond, wheels that do not turn would pass for noise."""
 
@@ -154,7 +151,9 @@ class FitSettings:
     ridge: float = 1e-2
     """Ridge of the richest model, on columns of unit length. Chosen: columns that look alike stay small."""
     expected_share: float = 0.1
-    """Geometry of the whole chain and slow waves of the ground are expected within this share. Chosen."""
+    """Geometry of the whole chain and slow waves of the ground are expected within this share, and the jitter of
+    commands, beside what the encoder's stamps scatter, within this share of the encoder's period. Chosen: more is a
+    response."""
     rounds: int = 2
     """How often the noise, or the weight of errors, is learnt anew from what a fit leaves, and how often a scanned
     entry is searched more closely. Chosen: it is settled by then."""
@@ -220,7 +219,7 @@ class PredictionSettings:
     """Free-running predictions on data that was not fitted."""
 
     horizons_s: tuple[float, ...] = (0.5, 1.0, 2.0, 5.0)
-    """How far ahead. Chosen."""
+    """How far ahead. A limit that is exceeded for less than the shortest is none that was exceeded. Chosen."""
     reported_horizon_s: float = 2.0
     """The one that the answer is about, or the longest below that runs are long enough for. Chosen: about as far as a
     planner looks."""
@@ -260,8 +259,6 @@ class ReportSettings:
     limit_share: float = 0.75
     """So near a limit it shows: where this share of what the robot can do is asked, and where an interval is no wider
     than from it to there. Chosen."""
-    beyond_s: float = 0.5
-    """For so long in all at least. Chosen."""
     worth_share: float = 0.1
     """A value that changes by less of itself is the same to whoever drives. A name that takes less of what its channel
     lacks, where it still disagrees, is disputed; a term that is so little of its own is not tried. An effect is judged

@@ -60,7 +60,7 @@ def largest_command_jitter_s(drive: GriddedDrive) -> float:
 
     More than that is a response that the model lacks, and must not count as noise.
     """
-    return drive.stamp_scatter_s + drive.settings.noise.command_jitter_share * drive.encoder_period_s
+    return drive.stamp_scatter_s + drive.settings.fit.expected_share * drive.encoder_period_s
 
 
 def wheel_mismatch(channel: WheelChannel, raw: Array) -> Callable[[Array], float]:

@@ -37,8 +37,6 @@ from disco_hw.gap.search.selection import Names, Selector, Thresholds, body_move
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms, body_terms, places, places_near, wheel_terms
 from disco_hw.gap.settings import NEGLIGIBLE, GapSettings
 
-# Fourth moment of normal noise over its variance squared.
-_GAUSSIAN_KURTOSIS = 3.0
 Array = NDArray[np.float64]
 
 
@@ -236,7 +234,8 @@ def _thresholds(white: Array, use: NDArray[np.bool_], all_settings: GapSettings)
     if not sound.size:
         return Thresholds(settings.named_score, settings.least_moved_m, settings.unnamed_score)
     sound = np.clip(sound / np.sqrt((sound**2).mean()), -all_settings.noise.outlier, all_settings.noise.outlier)
-    heavy = float((sound**4).mean()) / _GAUSSIAN_KURTOSIS
+    # Of normal noise the fourth moment is three times the variance squared.
+    heavy = float((sound**4).mean()) / 3.0
     times = min(max(heavy, 1.0), all_settings.noise.poor_fit)
     return Thresholds(times * settings.named_score, settings.least_moved_m, times * settings.unnamed_score)
 
