@@ -33,6 +33,8 @@ class GridSettings:
     """Blocks of time that are left out together, and windows of poses, the start of which is unknown. Chosen."""
     longest_s: float = 320.0
     """Of a longer drive so much is judged, stretches with commands first. Chosen: it bounds how long a search takes."""
+    stretch_s: float = 20.0
+    """Length of the stretches that are picked of a long drive. Chosen: several manoeuvres each."""
     speed_span_s: float = 0.03
     """Speeds are differences of the angle, or means for the quick error, over so long either side. Chosen: a few
     encoder periods."""
@@ -224,8 +226,7 @@ class PredictionSettings:
     """The one that the answer is about, or the longest below that runs are long enough for. Chosen: about as far as a
     planner looks."""
     folds: Folds = Folds(21.0, 2)
-    """Stretches that are left out in turn, and of which a longer drive is made. Chosen: of seven blocks, longer than
-    `DRIFT_S`."""
+    """Stretches that are left out in turn. Chosen: of seven blocks, longer than `DRIFT_S`."""
     short_folds: Folds = Folds(9.0, 4)
     """Those of logs shorter than six of these stretches, as half of a minute's log is too little to learn from. Chosen
     on halves of twelve logs of a small robot; learnt from thirds of 15 logs of three robots, so divided 7 of 90 offered

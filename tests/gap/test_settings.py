@@ -11,7 +11,7 @@ import pytest
 from disco_hw import gap
 from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.search.selection import Selector, body_moves
-from disco_hw.gap.settings import DEFAULT_SETTINGS, Folds, GapSettings
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
 from tests.gap.synthetic import LIMITS, body_channel
 from tools.gap.logs import simulated_drive
 
@@ -41,9 +41,7 @@ def test_settings_are_frozen():
 
 def test_a_setting_of_the_grid_is_felt_in_the_drive():
     log = simulated_drive({}, 1, "circle")
-    grid, prediction = DEFAULT_SETTINGS.grid, DEFAULT_SETTINGS.prediction
-    prediction = replace(prediction, folds=Folds(5.0, 2))
-    short = replace(DEFAULT_SETTINGS, grid=replace(grid, longest_s=20.0), prediction=prediction)
+    short = replace(DEFAULT_SETTINGS, grid=replace(DEFAULT_SETTINGS.grid, longest_s=20.0, stretch_s=5.0))
     drive = grid_drive(log, short)
     assert drive.settings is short
     assert drive.duration_s < 30.0 < grid_drive(log).duration_s

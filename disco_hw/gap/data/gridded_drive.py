@@ -138,7 +138,7 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
     runs = _runs(wheels.t_s, wheels.segment, grid_settings)
     driven_s = sum(float(wheels.t_s[hi - 1] - wheels.t_s[lo]) for lo, hi in runs)
     if driven_s > grid_settings.longest_s:
-        runs = _spread(wheels.t_s, runs, driven_s, _commanded(command_samples, wheels), settings)
+        runs = _spread(wheels.t_s, runs, driven_s, _commanded(command_samples, wheels), grid_settings)
         notes.append(
             f"{driven_s:.0f} s of driving: {grid_settings.longest_s:.0f} s of it, evenly spread and those with "
             "commands first, are judged"
@@ -306,19 +306,19 @@ def _commanded(commands: Commands, wheels: Wheels) -> Mask:
 
 
 def _spread(
-    t_s: Array, runs: list[tuple[int, int]], driven_s: float, commanded: Mask, settings: GapSettings
+    t_s: Array, runs: list[tuple[int, int]], driven_s: float, commanded: Mask, settings: GridSettings
 ) -> list[tuple[int, int]]:
-    """Stretches of the length of a fold of the runs that add up to about `longest_s`, neighbours joined.
+    """Stretches of `stretch_s` of the runs that add up to about `longest_s`, neighbours joined.
 
     Evenly spread over those in which commands are known; the others, which show nothing of the way from command to
     wheel, only as far as these do not suffice.
     """
     stretches = []
     for lo, hi in runs:
-        edges = np.arange(t_s[lo], t_s[hi - 1], settings.prediction.folds.stretch_s)
+        edges = np.arange(t_s[lo], t_s[hi - 1], settings.stretch_s)
         cuts = [*np.searchsorted(t_s[lo:hi], edges).tolist(), hi - lo]
         stretches += [(lo + a, lo + b) for a, b in pairwise(cuts) if b - a > 2]
-    most = max(int(len(stretches) * settings.grid.longest_s / driven_s), 1)
+    most = max(int(len(stretches) * settings.longest_s / driven_s), 1)
     known = np.array([bool(commanded[lo:hi].any()) for lo, hi in stretches])
     kept: list[int] = []
     for group in (np.flatnonzero(known), np.flatnonzero(~known)):
@@ -332,7 +332,7 @@ def _spread(
             pieces[-1] = (pieces[-1][0], hi)
         else:
             pieces.append((lo, hi))
-    return [(lo, hi) for lo, hi in pieces if t_s[hi - 1] - t_s[lo] >= settings.grid.most_delay_s]
+    return [(lo, hi) for lo, hi in pieces if t_s[hi - 1] - t_s[lo] >= settings.most_delay_s]
 
 
 def _locate(t_s: Array, grid: Array, offset: int, block_s: float) -> GridSamples:

@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from disco_hw.gap.data.gridded_drive import even_times, grid_drive
 from disco_hw.gap.data.stamp_clock import StampClock
 from disco_hw.gap.data.timing import tick_s
-from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, Folds
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from disco_hw.log.drive import Commands, DriveLog, Poses, Wheels
 from tests.tables import thinned
 
@@ -210,9 +210,7 @@ def test_of_a_long_drive_the_stretches_with_commands_are_judged_first(commanded_
     begin_s, end_s = commanded_s
     speed = np.where((t >= begin_s) & (t < end_s), 2.0, 0.0)
     command = np.where((t >= begin_s) & (t < end_s), 2.0, np.nan)
-    grid, prediction = DEFAULT_SETTINGS.grid, DEFAULT_SETTINGS.prediction
-    prediction = replace(prediction, folds=Folds(10.0, 2))
-    short = replace(DEFAULT_SETTINGS, grid=replace(grid, longest_s=60.0), prediction=prediction)
+    short = replace(DEFAULT_SETTINGS, grid=replace(DEFAULT_SETTINGS.grid, longest_s=60.0, stretch_s=10.0))
     line = grid_drive(drive(t, command, t, speed), short)
     known_s = GRID_STEP_S * np.isfinite(line.command_rad_s[:, 0]).sum()
     assert known_s == pytest.approx(min(end_s - begin_s, 60.0), abs=2.0)
