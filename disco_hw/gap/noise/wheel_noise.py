@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -40,7 +40,16 @@ class WheelNoise:
 
     def vector(self) -> Array:
         """Return the logarithms of all seven values, (7,)."""
-        return np.asarray(np.log(np.array(astuple(self))))
+        values = (
+            self.relative,
+            self.correlation_s,
+            self.reading_rad,
+            self.stamp_s,
+            self.command_stamp_s,
+            self.drift_rad_sqrt_s,
+            self.drift_std,
+        )
+        return np.asarray(np.log(np.array(values)))
 
     @classmethod
     def from_vector(cls, logs: Array) -> WheelNoise:
