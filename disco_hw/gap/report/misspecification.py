@@ -87,7 +87,7 @@ def _changes_with_regime(found: ChannelResult, name: str) -> str | None:
     samples = found.channel.samples
     width = best.residual.size // samples.node.size
     inside = {regime: np.repeat(mask, width) for regime, mask in masks(drive, samples).items()}
-    clearest: tuple[float, str] = (channel.settings.selection.sure_sigmas, "")
+    clearest: tuple[float, str] = (settings.form_apart_sigmas, "")
     for column, (one, other) in product(columns, _OPPOSITES):
         place, value = best.active.index(layout.place[column]), float(best.vector[layout.place[column]])
         apart = _apart(best, channel.block, place, (inside[one], inside[other]), channel.settings)

@@ -108,7 +108,7 @@ def test_values_that_scatter_as_noise_does_are_not_called_different(monkeypatch)
 
     def apart(best, block, place, inside, settings):
         asked.append(place)
-        return 0.02, -0.02, times * settings.selection.sure_sigmas
+        return 0.02, -0.02, times * settings.report.form_apart_sigmas
 
     monkeypatch.setattr("disco_hw.gap.report.misspecification._apart", apart)
     times = 0.95
