@@ -173,9 +173,8 @@ class SelectionSettings:
     """Score that a named effect takes at least. Measured: of one parameter it takes twice the gain 13, by chance in one
     log of 3700, of about 18 names in one of 200."""
     unnamed_score: float = 20.0
-    """Score that a term without a name takes at least, and a name before the noise is learnt; gain to first order, in
-    nats, from which on a term is fitted. Measured: with both scores, nothing was named in 446 of 450 logs with nothing
-    hidden."""
+    """Score that a term without a name takes at least, and a name before the noise is learnt. Measured: with both
+    scores, nothing was named in 446 of 450 logs with nothing hidden."""
     large_share: float = 0.25
     """An effect that makes up this share of what such a fit lacks is taken whatever its score. Chosen."""
     telling_nats: float = 3.0
@@ -197,10 +196,19 @@ class SelectionSettings:
 class TermSettings:
     """Unnamed terms, and patches of the floor."""
 
+    worth_trying_nats: float = 18.0
+    """Gain to first order from which on a term is fitted. Chosen: below what acceptance takes."""
+    most_tried: int = 4
+    """So many of the most promising terms are fitted until one is accepted. Chosen: what promises most to first order
+    may gain nothing, and the next all of it."""
     waves: int = 8
     """How many cosines of the time ground may vary by, the slowest. Chosen: of 150 s, down to a period of 37 s."""
     disc_radii_m: tuple[float, ...] = (0.5, 0.75, 1.0, 1.3)
-    """Sizes of patches, whose centres lie as far apart as the smallest. Chosen."""
+    """Sizes of patches. Chosen."""
+    disc_spacing_m: float = 0.4
+    """Distance of the centres that are tried. Chosen: half a patch."""
+    disc_size_steps_m: tuple[float, ...] = (-0.15, -0.05, 0.0, 0.05, 0.15)
+    """And of the radius. Chosen."""
     least_inside: float = 0.03
     """Share of all turning that must lie inside a patch, at least. Chosen."""
     largest_floor_m2: float = 60.0
@@ -251,8 +259,8 @@ class ReportSettings:
     speeding_rad_s2: float = 2.0
     """Growth of the wheels' speed from which on they speed up or brake. Chosen."""
     most_listed: int = 3
-    """So many regimes, the loudest, names and unnamed terms are told at most, terms tried, and claims of what a log
-    shows proved. Chosen."""
+    """So many regimes, the loudest, names and unnamed terms are told at most, and claims of what a log shows proved.
+    Chosen."""
     wide_share: float = 0.5
     """A value whose half interval, or whose change from one regime to its opposite, is over so much of its distance
     from none says too little. Chosen: nobody who is told the value expects it."""

@@ -375,10 +375,10 @@ def best_terms(small: Fit, channel: ResidualChannel, options: Iterator[Term]) ->
             continue
         coefficients = -inverse(information) @ pull
         gain = -0.5 * float(pull @ coefficients) - 0.5 * (len(columns) - 1) * math.log(channel.count)
-        if gain > channel.settings.selection.unnamed_score and coefficients.max() <= term.highest:
+        if gain > channel.settings.terms.worth_trying_nats and coefficients.max() <= term.highest:
             promising.append((gain, term))
     best: list[Term] = []
     for _, term in sorted(promising, key=lambda one: -one[0]):
         if term.disc is None or all(other.disc is None for other in best):
             best.append(term)
-    return best[: channel.settings.report.most_listed], max(tried, 2)
+    return best[: channel.settings.terms.most_tried], max(tried, 2)

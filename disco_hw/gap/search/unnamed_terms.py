@@ -197,7 +197,7 @@ def places(channel: BodyChannel, p: Array) -> Iterator[Term]:
     if (high_x - low_x) * (high_y - low_y) > settings.largest_floor_m2:
         return
     across, along = (
-        np.arange(low, high + 1e-9, min(settings.disc_radii_m)) for low, high in ((low_x, high_x), (low_y, high_y))
+        np.arange(low, high + 1e-9, settings.disc_spacing_m) for low, high in ((low_x, high_x), (low_y, high_y))
     )
     yield from _discs(
         channel, p, ((cx, cy, radius) for cx in across for cy in along for radius in settings.disc_radii_m)
@@ -207,8 +207,9 @@ def places(channel: BodyChannel, p: Array) -> Iterator[Term]:
 def places_near(channel: BodyChannel, p: Array, disc: tuple[float, float, float]) -> Iterator[Term]:
     """Discs of the floor closer around one than `places` lie to each other."""
     x, y, radius = disc
-    steps = [min(channel.settings.terms.disc_radii_m) * share for share in (-0.5, -0.25, 0.0, 0.25, 0.5)]
-    sizes = [radius + step for step in steps]
+    settings = channel.settings.terms
+    sizes = [size for size in (radius + step for step in settings.disc_size_steps_m) if size > 0.0]
+    steps = [settings.disc_spacing_m * share for share in (-0.5, -0.25, 0.0, 0.25, 0.5)]
     yield from _discs(channel, p, ((x + dx, y + dy, size) for dx in steps for dy in steps for size in sizes))
 
 

@@ -234,7 +234,7 @@ def of_rough_and_smooth(found, noted, layout):
     assert all(len(set(active)) == len(active) for active in noted.freed)
     assert set(indices(found.channel, smooth_of(layout))) in [set(active) for active in noted.freed]
     # What comes after tries terms one by one, of which none is worth it.
-    assert len(trials) <= DEFAULT_SETTINGS.report.most_listed
+    assert len(trials) <= DEFAULT_SETTINGS.terms.most_tried
     assert all(isinstance(trial.channel, WithTerms) and len(trial.channel.terms) == 1 for trial in trials)
     assert not found.unnamed
     return chosen

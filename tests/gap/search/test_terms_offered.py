@@ -208,8 +208,8 @@ def sought_on(channel):
 def test_patches_cover_the_floor_where_a_good_part_of_the_turning_was_done_inside_and_outside():
     channel, x, y = lawn()
     found = {term.disc: term for term in places(channel, np.array(GEOMETRY))}
-    # From 2 to 98 % of either way, every 0.5 m.
-    across, along = np.arange(0.08, 3.92, 0.5), np.arange(0.04, 1.96, 0.5)
+    # From 2 to 98 % of either way, every 0.4 m.
+    across, along = np.arange(0.08, 3.92, 0.4), np.arange(0.04, 1.96, 0.4)
     centres = {(round(cx, 2), round(cy, 2)) for cx, cy, _ in found}
     assert centres <= {(round(a, 2), round(b, 2)) for a in across for b in along}
     for radius in (0.5, 0.75, 1.0, 1.3):
@@ -288,27 +288,27 @@ def test_turning_counts_and_neither_time_nor_too_little_nor_nearly_all_of_it():
 
 def test_closer_around_a_patch_are_its_neighbours_and_other_sizes():
     channel, _, _ = lawn()
-    near = {tuple(np.round(term.disc, 3)) for term in places_near(channel, np.array(GEOMETRY), (2.0, 1.0, 0.75))}
-    # Half of the smallest patch either way.
-    steps = (-0.25, -0.125, 0.0, 0.125, 0.25)
-    assert near == {(2.0 + dx, 1.0 + dy, 0.75 + dr) for dx in steps for dy in steps for dr in steps}
-    small = {round(term.disc[2], 3) for term in places_near(channel, np.array(GEOMETRY), (2.0, 1.0, 0.5))}
-    # The smallest one holds too little of the turning.
-    assert small == {0.375, 0.5, 0.625, 0.75}
-    channel, _, _ = lawn(disc_radii_m=(1.2, 0.8))
-    beside = {tuple(np.round(term.disc, 3)) for term in places_near(channel, np.array(GEOMETRY), (2.0, 1.0, 0.8))}
+    near = {tuple(np.round(term.disc, 2)) for term in places_near(channel, np.array(GEOMETRY), (2.0, 1.0, 0.75))}
+    steps = (-0.2, -0.1, 0.0, 0.1, 0.2)
+    assert near == {
+        (round(2.0 + dx, 2), round(1.0 + dy, 2), round(0.75 + dr, 2))
+        for dx in steps for dy in steps for dr in (-0.15, -0.05, 0.0, 0.05, 0.15)
+    }  # fmt: skip
+    small = {round(term.disc[2], 2) for term in places_near(channel, np.array(GEOMETRY), (2.0, 1.0, 0.5))}
+    assert small == {0.35, 0.45, 0.5, 0.55, 0.65}
+    # Larger ones alone, around a centre of which the next ones lie further away.
+    channel, _, _ = lawn(disc_spacing_m=0.8, disc_size_steps_m=(-1.0, 0.1))
+    beside = {tuple(np.round(term.disc, 2)) for term in places_near(channel, np.array(GEOMETRY), (2.0, 1.0, 0.75))}
     steps = (-0.4, -0.2, 0.0, 0.2, 0.4)
-    assert beside == {
-        tuple(np.round((2.0 + dx, 1.0 + dy, 0.8 + dr), 3)) for dx in steps for dy in steps for dr in steps
-    }
+    assert beside == {(round(2.0 + dx, 2), round(1.0 + dy, 2), 0.85) for dx in steps for dy in steps}
 
 
 def test_patches_are_sought_up_to_both_ends_of_the_floor():
-    channel, _, _ = lawn(disc_radii_m=(0.5,))
+    channel, _, _ = lawn(disc_spacing_m=0.5, disc_radii_m=(0.4,))
     x = np.where(np.arange(channel.samples.t_s.size) % 4 < 2, 1.0, 3.0)
     channel.measured = np.column_stack([x, np.full(x.size, 2.0), x])
     discs = {term.disc for term in places(channel, np.array(GEOMETRY))}
-    assert discs == {(x, 2.0, 0.5) for x in (1.0, 1.5, 2.0, 2.5, 3.0)}
+    assert discs == {(x, 2.0, 0.4) for x in (1.0, 1.5, 2.0, 2.5, 3.0)}
 
 
 def extended():
