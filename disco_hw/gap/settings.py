@@ -116,6 +116,8 @@ class NoiseSettings:
     steady_s: float = 0.3
     """Half the span over which speeds are averaged where there is no model to say what to expect, over which errors
     that are alike at every speed are measured, and over which a start pose is averaged. Chosen: several readings."""
+    even_huber: float = 1.345
+    """Of them those beyond so many times their size grow linearly. Literature: 95 % efficient (Huber, 1964)."""
     prior_sd: float = 2.0
     """Standard deviation of the logarithm of every noise parameter about its start. Chosen: a factor of seven."""
     wheel_iterations: int = 25
@@ -145,6 +147,8 @@ class FitSettings:
     promised_share: float = 0.25
     """Of fits that only compete, a step that gains what was promised within this share takes the derivatives along.
     Chosen: the next step then errs by about its square."""
+    enough_carried_nats: float = 0.002
+    """A step with such derivatives that gains less is the last one. Chosen: they make the last steps shorter."""
     least_known_share: float = 1e-3
     """A part of a log with less of the information about a parameter says nothing of it. Chosen."""
     part_known_share: float = 0.2
@@ -157,8 +161,8 @@ class FitSettings:
     commands, beside what the encoder's stamps scatter, within this share of the encoder's period. Chosen: more is a
     response."""
     rounds: int = 2
-    """How often the noise, or the weight of errors, is learnt anew from what a fit leaves, and how often a scanned
-    entry is searched more closely. Chosen: it is settled by then."""
+    """How often the noise, or the weight of errors, is learnt anew from what a fit leaves. Chosen: it is settled by
+    then."""
     bend_shares: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.35, 0.55, 0.75, 0.9)
     """Where the static response of a wheel may bend, shares of the largest command. Chosen: denser below."""
 
@@ -175,6 +179,8 @@ class SelectionSettings:
     unnamed_score: float = 20.0
     """Score that a term without a name takes at least, and a name before the noise is learnt. Measured: with both
     scores, nothing was named in 446 of 450 logs with nothing hidden."""
+    profile_searches: int = 4
+    """Rounds of the closer search of a profiled entry. Chosen."""
     large_share: float = 0.25
     """An effect that makes up this share of what such a fit lacks is taken whatever its score. Chosen."""
     telling_nats: float = 3.0

@@ -165,7 +165,7 @@ class WheelChannel:
         even = self.with_noise(noise)
         white = even.whitened(p, extra)
         size = float(np.sqrt((white[counted] ** 2).mean())) if counted.any() else 1.0
-        return even.weighted(np.minimum(1.0, settings.huber * size / np.maximum(np.abs(white), 1e-9)) / size)
+        return even.weighted(np.minimum(1.0, settings.even_huber * size / np.maximum(np.abs(white), 1e-9)) / size)
 
     @property
     def layout(self) -> Layout:

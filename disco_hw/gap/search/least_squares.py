@@ -160,6 +160,7 @@ def fit(
     settings = channel.settings.fit
     for _ in range((settings.iterations if iterations is None else iterations) if active else 0):
         slope = slope() if callable(slope) else slope
+        enough_nats = settings.enough_carried_nats if carried else settings.enough_nats
         normal, gradient = slope.T @ slope, slope.T @ now
         if has_prior:
             normal, gradient = normal + np.diag(precision), gradient + precision * (vector[chosen] - expected)
@@ -187,7 +188,7 @@ def fit(
             break
         partial_jacobian = partial(jacobian, residual, vector, active, layout, now)
         slope = _carried(slope, moved, now - was, scale) if carried else partial_jacobian
-        if 0.0 < gained < settings.enough_nats:
+        if 0.0 < gained < enough_nats:
             break
     if carried:
         slope = partial(jacobian, residual, vector, active, layout, now)

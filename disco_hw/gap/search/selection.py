@@ -183,7 +183,7 @@ class Selector:
             return found
         refined = {best: found}
         step = new.profile.refine
-        for _ in range(self.channel.settings.fit.rounds):
+        for _ in range(self.settings.profile_searches):
             centre = min(refined, key=lambda value: refined[value].cost)
             for value in (centre - step, centre + step):
                 if value not in refined:

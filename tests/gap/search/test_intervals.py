@@ -323,7 +323,7 @@ def test_errors_that_are_alike_at_every_speed_are_of_the_size_that_is_left():
     # Those of usual size count whole, in units of their root mean square; an outlier grows linearly.
     assert (white**2).mean() ** 0.5 * even.weight[used].max() == pytest.approx(1.0, abs=1e-6)
     counted = np.abs(white * even.weight[used])
-    assert counted.max() == pytest.approx(even.settings.noise.huber, rel=1e-6)
+    assert counted.max() == pytest.approx(even.settings.noise.even_huber, rel=1e-6)
     assert np.mean(counted < counted.max() - 1e-6) > 0.7
     speed = np.abs(found.channel.motion.speed_rad_s[:, 0])
     slow, fast = speed < 1.0, speed > 3.0

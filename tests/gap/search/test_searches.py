@@ -254,7 +254,7 @@ def test_the_noise_of_wheels_is_learnt_of_a_rough_selection_and_all_that_is_smoo
     np.testing.assert_array_equal(use, found.channel.gains.use & turning.any(axis=1))
     assert turning.any(axis=1).mean() > turning.all(axis=1).mean() + 0.2
     np.testing.assert_array_equal((white * found.channel.weight).ravel(), found.richest)
-    assert of is settings
+    assert of is DEFAULT_SETTINGS
     assert limits is chosen.thresholds
 
 
@@ -293,7 +293,7 @@ def test_the_noise_of_a_body_is_learnt_of_a_rough_selection_and_all_that_is_smoo
     ((white, use, of, limits),) = noted.tails
     assert use is found.channel.use
     np.testing.assert_array_equal((white * found.channel.weight).ravel(), found.richest)
-    assert of is settings
+    assert of is DEFAULT_SETTINGS
     assert limits is chosen.thresholds
 
 
