@@ -67,8 +67,7 @@ class GridSettings:
     delay_step_s: float = 0.02
     """The delay of poses is scanned in steps of this. Chosen: between them a parabola is exact enough to begin with."""
     lags_s: tuple[float, ...] = (0.02, 0.04, 0.06, 0.09, 0.13, 0.18, 0.25, 0.35, 0.5, 0.7, 1.0)
-    """Lags behind which the delay of commands is scanned, and time constants and slews of the richest model of the
-    wheels. Chosen: as close as the delay can tell them apart."""
+    """Lags behind which the delay of commands is scanned. Chosen: as close as the delay can tell them apart."""
     most_command_pairs: int = 3000
     """About so many pairs of samples are compared in it at most. Chosen: more say no more, and take longer."""
     delay_span_s: float = 0.4
@@ -86,9 +85,8 @@ class GridSettings:
     least_clock_nats: float = 0.02
     """And the whole log fits by so much per pose better with it. Measured: drifting clocks 0.04 to 0.8."""
     least_link_error_s: float = 0.15
-    """Of commands a smaller error of the clock is none, so far about a delay behind one lag is that behind another, and
-    the last fit begins from either of two delays that are further apart. Measured: lags that differ from turn to turn
-    make 0.05 of an even link, a drive that ramps by 9 rad/s^2 0.105."""
+    """Of commands a smaller error of the clock is none, so far about a delay behind one lag is that behind another.
+    Measured: lags that differ from turn to turn make 0.05 of an even link, a drive that ramps by 9 rad/s^2 0.105."""
     least_delay_nats: float = 0.05
     """A delay, and a drift or jump of the commands' clock, stands out by so much per pose or pair. Measured: delays on
     steady circles 0.4, of a robot that turns about 3; even links 0.046 at most."""
@@ -163,8 +161,14 @@ class FitSettings:
     rounds: int = 2
     """How often the noise, or the weight of errors, is learnt anew from what a fit leaves. Chosen: it is settled by
     then."""
+    richest_halvings: int = 4
+    """How often its step is halved until it fits better. Chosen."""
     bend_shares: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.35, 0.55, 0.75, 0.9)
     """Where the static response of a wheel may bend, shares of the largest command. Chosen: denser below."""
+    responses_s: tuple[float, ...] = (0.02, 0.05, 0.12, 0.3)
+    """Time constants of further responses. Chosen: factors of two and a half."""
+    slews_s: tuple[float, ...] = (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
+    """How long wheels may take to the largest command where their change is limited. Chosen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,6 +250,9 @@ class PredictionSettings:
     models were worse than `timed`, and 10 as longer logs are; better by a fifth 15 either way."""
     resamples: int = 400
     """Bootstrap draws of an interval. Chosen."""
+    delay_far_s: float = 0.2
+    """Where `timed` has a delay or a lag so far from that of the wheels' channel, the last fit begins from either.
+    Chosen: a ramp of seconds makes a lag of a second, and a fit that begins there ends there."""
     worse: float = 1.05
     """A larger ratio of errors is worse. Measured: equally good models scatter by some percent."""
     standing_m_s: float = 0.02

@@ -214,7 +214,7 @@ class _Candidate:
             return False
         amended, plain = self.of.parts[1], timed.parts[1].vector
         delay_places = [amended.layout.place[name] for name in DELAY_COLUMNS]
-        far_s: float = self.analysis.drive.settings.grid.least_link_error_s
+        far_s: float = self.analysis.drive.settings.prediction.delay_far_s
         return bool(np.abs(amended.vector[delay_places] - plain[delay_places]).max() > far_s)
 
     def evaluate(self, ahead: Ahead, apart: StagePredictions) -> _Evaluated:

@@ -90,10 +90,12 @@ def learn_saturated_body(
     perturbation = (
         np.tensordot(found[len(chosen) :], np.stack(steps), axes=1) if steps else np.zeros((channel.drive.t_s.size, 3))
     )
-    moved = vector.copy()
-    moved[chosen] = np.clip(vector[chosen] + found[: len(chosen)], layout.low[chosen], layout.high[chosen])
-    if np.sum(channel.residual(moved, perturbation) ** 2) < np.sum(base**2):
-        return learn_body_noise(channel, moved, perturbation), moved, perturbation, found.size
+    for halving in range(channel.settings.fit.richest_halvings):
+        share = 0.5**halving
+        moved, extra = vector.copy(), share * perturbation
+        moved[chosen] = np.clip(vector[chosen] + share * found[: len(chosen)], layout.low[chosen], layout.high[chosen])
+        if np.sum(channel.residual(moved, extra) ** 2) < np.sum(base**2):
+            return learn_body_noise(channel, moved, extra), moved, extra, found.size
     return channel, vector, np.zeros_like(perturbation), found.size
 
 
@@ -114,25 +116,25 @@ def _integrated(speed: Array, first: NDArray[np.bool_]) -> Array:
 
 def _wheel_shapes(channel: WheelChannel, vector: Array) -> Iterator[Array]:
     """Speeds (M, 2) of the wheels that a command may make in ways the named effects do not have."""
-    drive, lags_s = channel.drive, channel.settings.grid.lags_s
+    drive, settings = channel.drive, channel.settings.fit
     commanded = drive.delayed_commands(WHEEL.at(vector, DELAYED_BY))
     response_s = sum(WHEEL.at(vector, column) for column in DELAY_COLUMNS if column != DELAYED_BY)
     u = _slow(commanded, max(response_s, 1e-3))
     largest = float(np.abs(u).max(initial=0.0))
     if largest <= 0.0:
         return
-    for share in channel.settings.fit.bend_shares:
+    for share in settings.bend_shares:
         yield np.sign(u) * np.maximum(np.abs(u) - share * largest, 0.0)
     other = u[:, ::-1]
     yield from (np.tanh(u / 0.05), u, np.abs(u), u * u, other, np.abs(other) * np.tanh(u / 0.05), np.abs(other) * u)
     # Not time: what wanders slowly would be taken for a trend, and the noise then for less than it is.
     yield from (u * np.sin(drive.angle_rad), u * np.cos(drive.angle_rad))
-    for response_s in lags_s[1::3]:
+    for response_s in settings.responses_s:
         behind = _slow(u, response_s) - u
         yield behind
         yield behind[:, ::-1]
         yield _slow(behind, response_s)
-    for full_s in lags_s[3:]:
+    for full_s in settings.slews_s:
         yield _slewed(commanded, largest / full_s) - commanded
 
 
