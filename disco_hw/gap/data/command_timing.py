@@ -6,23 +6,20 @@ A search that begins without a delay of 0.3 s does not find it: it takes the tra
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.data.stamp_clock import StampClock, clock_of
 from disco_hw.gap.data.timing import apart, lowest, mismatch_of, most_distinct_delay, scanned_delays
-from disco_hw.gap.settings import GridSettings
+from disco_hw.gap.settings import NEGLIGIBLE, GridSettings
 from disco_hw.jit import kernel_function
 from disco_hw.log.drive import Commands, Wheels
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-
-# Pairs whose commands do not change fit as well at every delay, but for rounding.
-_SAME_NATS = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,13 +52,7 @@ class Turned:
 
     def pick(self, chosen: Mask) -> Turned:
         """Return the chosen pairs."""
-        return Turned(
-            self.begin_s[chosen],
-            self.end_s[chosen],
-            self.segment[chosen],
-            self.left_rad[chosen],
-            self.right_rad[chosen],
-        )
+        return Turned(*(getattr(self, each.name)[chosen] for each in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +97,8 @@ class WheelResponse:
         if not shared.begin_s.size:
             return False
         shorter, there, longer = (self._mismatch(shared, each) for each in delays)
-        return min(shorter, longer) > there + _SAME_NATS
+        # Pairs whose commands do not change fit as well at every delay, but for rounding.
+        return min(shorter, longer) > there + NEGLIGIBLE
 
     def known(self, turned: Turned, delay_s: float) -> Mask:
         """Between which pairs (n,) commands are known at a delay."""
@@ -170,7 +162,7 @@ class Response:
 def response(turned: Turned, commands: Commands, settings: GridSettings) -> Response:
     """Estimate the delay and the lag with which both commands explain the turning of the wheels best.
 
-    Scanned over delays of +-`most_pose_delay_s` behind a few lags; about the best, wherever that lies between the steps
+    Scanned over delays of +-`most_delay_s` behind a few lags; about the best, wherever that lies between the steps
     of the scan, over delays that are as long in all behind each of `lags_s`. Delays at which commands are known for
     less than three quarters of the pairs are left out: they would be judged by another part of the log.
     """
@@ -178,7 +170,7 @@ def response(turned: Turned, commands: Commands, settings: GridSettings) -> Resp
         return Response()
     responses = {lag_s: WheelResponse.of(commands, lag_s) for lag_s in (0.0, *settings.lags_s)}
     step_s, coarse_s = settings.delay_step_s, 2.0 * settings.delay_step_s
-    delays = scanned_delays(settings.most_pose_delay_s, coarse_s)
+    delays = scanned_delays(settings.most_delay_s, coarse_s)
     most = max(int(responses[0.0].known(turned, delay_s).sum()) for delay_s in delays.tolist())
     fewest = max(settings.fewest_samples, 3 * most // 4)
     scanned = {lag_s: responses[lag_s].mismatches(turned, delays, fewest) for lag_s in (0.0, *settings.lags_s[1::3])}
@@ -192,7 +184,7 @@ def response(turned: Turned, commands: Commands, settings: GridSettings) -> Resp
     centre_s, _ = responses[lag_s].best(turned, float(delays[least]), coarse_s, fewest)
     near = {}
     for other_s, response_model in responses.items():
-        about = centre_s + lag_s - other_s + scanned_delays(settings.lag_reach_s, step_s)
+        about = centre_s + lag_s - other_s + scanned_delays(settings.least_link_error_s, step_s)
         mismatch = response_model.mismatches(turned, about, fewest)
         near[other_s] = float(mismatch.min()), float(about[int(np.argmin(mismatch))])
     # Between steps some fit better than where the scan met them.
@@ -204,7 +196,7 @@ def response(turned: Turned, commands: Commands, settings: GridSettings) -> Resp
             if best < found.mismatch:
                 found = Response(delay_s, other_s, best, other_s < max(settings.lags_s))
     deep = float(np.median(ordinary)) - found.mismatch >= settings.least_delay_nats
-    shown = deep and responses[found.lag_s].is_distinct(turned, found.delay_s, settings.lag_reach_s)
+    shown = deep and responses[found.lag_s].is_distinct(turned, found.delay_s, settings.least_link_error_s)
     return found if shown else Response(known=False)
 
 
@@ -228,7 +220,7 @@ class CommandAlignment:
         """Length of the stretches that are looked at one by one: longer where speeds come less often."""
         begin_s, settings = self.turned.begin_s, self.settings
         spacing_s = float(np.median(np.diff(begin_s))) if begin_s.size > 1 else math.inf
-        return max(settings.clock_stretch_s, 1.5 * settings.fewest_samples * spacing_s)
+        return max(4.0 * settings.block_s, 1.5 * settings.fewest_samples * spacing_s)
 
     def fitted(self, clock: StampClock) -> tuple[float, float]:
         """Age of all commands, their stamps corrected by a clock, and the misfit of a pair and wheel."""

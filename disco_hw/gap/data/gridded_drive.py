@@ -9,7 +9,7 @@ at 4 to 10 Hz, and laid on the interval that it ends a speed is neither late nor
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -39,7 +39,7 @@ class GridSamples:
 
     def pick(self, chosen: Mask | Index) -> GridSamples:
         """Return the chosen samples."""
-        return GridSamples(self.node[chosen], self.fraction[chosen], self.t_s[chosen], self.block[chosen])
+        return GridSamples(*(getattr(self, each.name)[chosen] for each in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +162,7 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
         changes.append(change)
         angles.append(at)
         speeds.append(speed)
-        even = np.clip(even_times(t, grid_settings.even_samples), grid[0], grid[-1])
+        even = np.clip(even_times(t, grid_settings.neighbours), grid[0], grid[-1])
         moved = np.column_stack([np.interp(t, grid, speed[:, side]) for side in (0, 1)]) * (even - t)[:, None]
         encoder_at.append(_locate(even, grid, offset, grid_settings.block_s))
         encoder_angle.append(angle + moved)
@@ -230,7 +230,7 @@ def _timed(log: DriveLog, wheels: Wheels, settings: GridSettings) -> _Timed:
     if not aligned_commands.known:
         text = (
             f"wheels answer commands more slowly than behind a lag of {max(settings.lags_s):g} s, or more than "
-            f"{settings.most_pose_delay_s:g} s late or early, or commands hardly change: how late commands are stamped "
+            f"{settings.most_delay_s:g} s late or early, or commands hardly change: how late commands are stamped "
             "is not known from this log"
         )
         notes = (*notes, text)
@@ -290,10 +290,10 @@ def _runs(t_s: Array, segment: Index, settings: GridSettings) -> list[tuple[int,
     """Stretches of one segment without silence, as half-open index ranges."""
     if t_s.size < 2:
         return []
-    breaks = np.flatnonzero((np.diff(segment) != 0) | (np.diff(t_s) > settings.longest_silence_s)) + 1
+    breaks = np.flatnonzero((np.diff(segment) != 0) | (np.diff(t_s) > settings.longest_response_s)) + 1
     edges = [0, *breaks.tolist(), t_s.size]
     pairs = pairwise(edges)
-    return [(lo, hi) for lo, hi in pairs if hi - lo > 2 and t_s[hi - 1] - t_s[lo] >= settings.lead_s]
+    return [(lo, hi) for lo, hi in pairs if hi - lo > 2 and t_s[hi - 1] - t_s[lo] >= settings.most_delay_s]
 
 
 def _commanded(commands: Commands, wheels: Wheels) -> Mask:
@@ -332,7 +332,7 @@ def _spread(
             pieces[-1] = (pieces[-1][0], hi)
         else:
             pieces.append((lo, hi))
-    return [(lo, hi) for lo, hi in pieces if t_s[hi - 1] - t_s[lo] >= settings.lead_s]
+    return [(lo, hi) for lo, hi in pieces if t_s[hi - 1] - t_s[lo] >= settings.most_delay_s]
 
 
 def _locate(t_s: Array, grid: Array, offset: int, block_s: float) -> GridSamples:
@@ -343,12 +343,7 @@ def _locate(t_s: Array, grid: Array, offset: int, block_s: float) -> GridSamples
 
 
 def _joined(parts: list[GridSamples]) -> GridSamples:
-    return GridSamples(
-        np.concatenate([part.node for part in parts]),
-        np.concatenate([part.fraction for part in parts]),
-        np.concatenate([part.t_s for part in parts]),
-        np.concatenate([part.block for part in parts]),
-    )
+    return GridSamples(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(GridSamples)))
 
 
 def _command_cells(commands: Commands, segment: int, grid: Array) -> tuple[Array, Array]:
@@ -407,22 +402,8 @@ def _quantum(angle: Array) -> float:
 def _empty(settings: GapSettings) -> GriddedDrive:
     nothing, pairs = np.empty(0), np.empty((0, 2))
     samples = GridSamples(np.empty(0, np.int64), nothing, nothing, np.empty(0, np.int64))
-    return GriddedDrive(
-        nothing,
-        np.empty(0, bool),
-        pairs,
-        nothing,
-        pairs,
-        pairs,
-        samples,
-        pairs,
-        0.0,
-        0.0,
-        0.0,
-        samples,
-        np.empty((0, 3)),
-        settings=settings,
-    )
+    wheels = nothing, np.empty(0, bool), pairs, nothing, pairs, pairs, samples, pairs
+    return GriddedDrive(*wheels, 0.0, 0.0, 0.0, samples, np.empty((0, 3)), settings=settings)
 
 
 def undo_sample_hold(wheels: Wheels, settings: GridSettings) -> Wheels:

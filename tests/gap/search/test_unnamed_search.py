@@ -504,7 +504,8 @@ def test_the_price_of_a_patch_is_that_of_four_numbers_and_of_a_term_one():
 
 def heavy(white, use=None):
     white = np.asarray(white, dtype=float)
-    settings = SelectionSettings(named_score=4.0, unnamed_score=20.0, least_moved_m=0.002)
+    selection = SelectionSettings(named_score=4.0, unnamed_score=20.0, least_moved_m=0.002)
+    settings = replace(DEFAULT_SETTINGS, selection=selection)
     return _thresholds(white, np.ones(white.shape[0], dtype=bool) if use is None else np.asarray(use), settings)
 
 
@@ -524,7 +525,7 @@ def test_only_samples_that_are_used_and_say_something_tell_of_tails():
     some = np.array([[3.0, 3.0]] * 9 + [[0.5, 0.5]] * 32)
     plain = heavy(some)
     silent = np.zeros((500, 2))
-    silent[:, 1] = 0.0009
+    silent[:, 1] = 0.9e-5
     assert heavy(np.vstack([some, silent])) == plain
     # One of the two is enough.
     assert heavy(np.vstack([some, [[0.0, 0.5]] * 10])) != plain
