@@ -39,7 +39,7 @@ def mean_distance_m(settings, rate_hz, speed_m_s, radius_m):
 
 
 @thinned("rate_hz", [50.0, 25.0, 10.0], quick=1)
-@thinned("speed_m_s", [0.6, 0.4, 0.2, 0.1], quick=1)
+@thinned("speed_m_s", [0.6, 0.4, 0.2, 0.1], quick=0)
 def test_the_circle_is_driven_without_an_offset(rate_hz, speed_m_s):
     settings = DiscoSettings.for_speed(speed_m_s, rate_hz)
     for radius_m in (0.3, 0.75, 3.0):
