@@ -15,11 +15,6 @@ GRID_STEP_S = 0.01
 """Grid of the free runs, s. Chosen: half the period of commands at 50 Hz."""
 DRIFT_S = 20.0
 """Correlation time of the slow error of a wheel's speed, s. Chosen: longer than any manoeuvre of a log."""
-START_STD = 0.3
-"""Standard deviation of an angle (rad) or place (m) where a run begins. Chosen: so far above any noise that the first
-sample decides."""
-NEGLIGIBLE = 1e-5
-"""What is smaller (m, rad, s, nats, a share) is rounding, far below what any sensor of a robot resolves. Chosen."""
 # No choice at all.
 OF_MEDIAN = 1.4826
 """Standard deviation of a normal distribution over the median of its absolute values."""
@@ -36,11 +31,9 @@ class GridSettings:
     stretch_s: float = 20.0
     """Length of the stretches that are picked of a long drive. Chosen: several manoeuvres each."""
     speed_span_s: float = 0.03
-    """Speeds are differences of the angle, or means for the quick error, over so long either side. Chosen: a few
-    encoder periods."""
-    neighbours: int = 8
-    """Time stamps are made even, and accelerations taken of speeds on the grid, over so many neighbours either side.
-    Chosen."""
+    """Speeds are differences of the angle over so long either side, s. Chosen: a few encoder periods."""
+    even_samples: int = 10
+    """Time stamps are made even over so many neighbours either side. Chosen."""
     longest_response_s: float = 1.5
     """Wheels answer a command within this time. Where wheel samples fail to come for longer a run ends, where poses do
     a window. Chosen."""
@@ -72,6 +65,8 @@ class GridSettings:
     """About so many pairs of samples are compared in it at most. Chosen: more say no more, and take longer."""
     delay_span_s: float = 0.4
     """Turns and ways between poses so far apart are compared with the wheels'. Chosen: several poses of a lidar."""
+    clock_stretch_s: float = 12.0
+    """A drift or jump of the poses' clock is looked for in stretches of this. Chosen: each with starts and turns."""
     fewest_clock_stretches: int = 4
     """In fewer of them it is not looked for. Chosen."""
     least_clock_share: float = 0.5
@@ -85,7 +80,7 @@ class GridSettings:
     least_clock_nats: float = 0.02
     """And the whole log fits by so much per pose better with it. Measured: drifting clocks 0.04 to 0.8."""
     least_link_error_s: float = 0.15
-    """Of commands a smaller error of the clock is none, so far about a delay behind one lag is that behind another.
+    """Of commands a smaller error of the clock is none, and so far about a delay behind one lag is that behind another.
     Measured: lags that differ from turn to turn make 0.05 of an even link, a drive that ramps by 9 rad/s^2 0.105."""
     least_delay_nats: float = 0.05
     """A delay, and a drift or jump of the commands' clock, stands out by so much per pose or pair. Measured: delays on
@@ -100,8 +95,7 @@ class NoiseSettings:
     """Poses as they are stamped begin the search in place of those as late as at first sight, where they leave so small
     a share of the misfit. Chosen: what is late by little fits alike, and first sight that errs by 0.3 s far worse."""
     shortest_window: int = 12
-    """Windows with fewer poses are left out, unless most are so thin. Measured: with 5, predictions of half of a log of
-    a Warthog on grass err by a quarter more in heading."""
+    """Windows with fewer poses are left out, unless most are so thin. Chosen."""
     slip_onset_m_s: float = 0.05
     """From this rim speed on the body slips as much as it ever does. Chosen."""
     trusted_wheel_blocks: float = 1.0
@@ -109,6 +103,10 @@ class NoiseSettings:
     scores of what is not there is 3.4 over six dirty logs."""
     trusted_body_blocks: float = 6.0
     """The same for the body, whose noise wanders less. Measured: 1.4 over six dirty logs."""
+    calm_s: float = 0.05
+    """Half the span over which measured speeds are averaged for the quick error. Chosen."""
+    fewest_steady: int = 3
+    """At least so many samples either side then. Chosen."""
     huber: float = 3.0
     """Whitened residuals beyond grow linearly. Literature: Huber's loss (1964); the size is chosen."""
     steady_s: float = 0.3
@@ -118,18 +116,22 @@ class NoiseSettings:
     """Of them those beyond so many times their size grow linearly. Literature: 95 % efficient (Huber, 1964)."""
     prior_sd: float = 2.0
     """Standard deviation of the logarithm of every noise parameter about its start. Chosen: a factor of seven."""
+    difference_step: float = 2e-2
+    """Step of the logarithms in central differences. Chosen."""
     wheel_iterations: int = 25
-    """Steps of the search for the wheels' noise at most. Measured: with 12 the model of half of a log of a Warthog on
-    grass is worse than `timed`."""
+    """Steps of the search for the wheels' noise at most. Chosen: it is flat by then."""
     outlier: float = 5.0
-    """Poses beyond so many standard deviations are left out, differences of samples count as that much, as does the
-    noise whose tails raise scores, and a value that other folds fix so surely is used, however few its data. Chosen:
-    one in two million by chance."""
+    """Poses beyond so many standard deviations are left out, differences of samples count as that much, and a value
+    that other folds fix so surely is used, however few its data. Chosen: one in two million by chance."""
     poor_fit: float = 1.5
     """Mean square of whitened residuals from which on a fit or a regime disagrees, plainer noise is assumed, and a
     stretch is weighed down; and the most by which heavy tails raise scores. Chosen: noise alone has one."""
     smooth_samples: int = 25
     """The local size of residuals is a mean over so many samples either side. Chosen."""
+    command_jitter_ratio: float = 2.0
+    """Commands scatter by so many times what the encoder's stamps scatter. Chosen."""
+    command_jitter_share: float = 0.1
+    """And by this share of the encoder's period. Chosen. More than both is a response, and no jitter."""
     largest_wheel_noise: tuple[float, ...] = (0.05, 1.0, 0.1, 0.05, 0.1, 0.1, 0.02)
     """Upper bounds in the order of `WheelNoise`. Chosen: beyond, wheels that do not turn would pass for noise."""
 
@@ -155,9 +157,7 @@ class FitSettings:
     ridge: float = 1e-2
     """Ridge of the richest model, on columns of unit length. Chosen: columns that look alike stay small."""
     expected_share: float = 0.1
-    """Geometry of the whole chain and slow waves of the ground are expected within this share, and the jitter of
-    commands, beside what the encoder's stamps scatter, within this share of the encoder's period. Chosen: more is a
-    response."""
+    """Geometry of the whole chain and slow waves of the ground are expected within this share. Chosen."""
     rounds: int = 2
     """How often the noise, or the weight of errors, is learnt anew from what a fit leaves. Chosen: it is settled by
     then."""
@@ -175,6 +175,8 @@ class FitSettings:
 class SelectionSettings:
     """Which effects are accepted."""
 
+    most_moved_share: float = 0.1
+    """It is judged where it moves most, on this share of the predictions. Chosen: some are felt in few places only."""
     least_moved_m: float = 1e-3
     """What moves predictions less is not worth a name. Chosen: below what poses are measured to."""
     named_score: float = 4.0
@@ -183,6 +185,10 @@ class SelectionSettings:
     unnamed_score: float = 20.0
     """Score that a term without a name takes at least, and a name before the noise is learnt. Measured: with both
     scores, nothing was named in 446 of 450 logs with nothing hidden."""
+    clipped_at: float = 6.0
+    """Whitened residuals beyond do not raise it further. Chosen."""
+    silent: float = 1e-3
+    """Whitened residuals below come of samples that say nothing. Chosen."""
     profile_searches: int = 4
     """Rounds of the closer search of a profiled entry. Chosen."""
     large_share: float = 0.25
@@ -213,6 +219,8 @@ class TermSettings:
     may gain nothing, and the next all of it."""
     waves: int = 8
     """How many cosines of the time ground may vary by, the slowest. Chosen: of 150 s, down to a period of 37 s."""
+    smooth_nodes: int = 8
+    """Accelerations are taken of speeds over so many nodes either side. Chosen: a tenth of a second."""
     disc_radii_m: tuple[float, ...] = (0.5, 0.75, 1.0, 1.3)
     """Sizes of patches. Chosen."""
     disc_spacing_m: float = 0.4
@@ -238,7 +246,7 @@ class PredictionSettings:
     """Free-running predictions on data that was not fitted."""
 
     horizons_s: tuple[float, ...] = (0.5, 1.0, 2.0, 5.0)
-    """How far ahead. A limit that is exceeded for less than the shortest is none that was exceeded. Chosen."""
+    """How far ahead. Chosen."""
     reported_horizon_s: float = 2.0
     """The one that the answer is about, or the longest below that runs are long enough for. Chosen: about as far as a
     planner looks."""
@@ -272,21 +280,23 @@ class ReportSettings:
     speeding_rad_s2: float = 2.0
     """Growth of the wheels' speed from which on they speed up or brake. Chosen."""
     most_listed: int = 3
-    """So many regimes, the loudest, names and unnamed terms are told at most, and claims of what a log shows proved.
-    Chosen."""
+    """So many regimes, the loudest, names and unnamed terms are told at most, and claims of what a log shows are
+    proved. Chosen."""
+    end_share: float = 0.01
+    """Commands that come early or late by this close to the most that is plausible do so by more. Chosen."""
     wide_share: float = 0.5
     """A value whose half interval, or whose change from one regime to its opposite, is over so much of its distance
     from none says too little. Chosen: nobody who is told the value expects it."""
     limit_share: float = 0.75
     """So near a limit it shows: where this share of what the robot can do is asked, and where an interval is no wider
     than from it to there. Chosen."""
+    beyond_s: float = 0.5
+    """For so long in all at least. Chosen."""
     form_apart_sigmas: float = 3.5
-    """By so many standard deviations a value changes with the regime. Chosen: of some twenty comparisons in a log one
-    in a hundred logs by chance. Measured: with 3 a wheel gain of 3 % is doubted in one of 21 simulated logs."""
+    """By so many standard deviations. Chosen: of some twenty comparisons in a log one in a hundred logs by chance."""
     worth_share: float = 0.1
-    """A value that changes by less of itself is the same to whoever drives. A name that takes less of what its channel
-    lacks, where it still disagrees, is disputed; a term that is so little of its own is not tried. An effect is judged
-    on so many of the predictions, those that it moves most. Chosen."""
+    """A value that changes by less of itself is the same to whoever drives; a name that takes less of what its channel
+    lacks, where it still disagrees, is disputed, and a term that is so much its own is not tried. Chosen."""
     differ_share: float = 0.03
     """Logs of one robot differ in its geometry by so much of it at least. Chosen: another floor changes more."""
 

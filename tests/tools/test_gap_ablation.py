@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import pytest
 
-from disco_hw.gap.report import remains
+from disco_hw.gap.search import end_to_end
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from tools.gap import ablation as gap_ablation
 from tools.gap.ablation import Ablation, alike, changed, main, module_numbers, scaled, settings_fields, table
@@ -55,20 +55,20 @@ def test_thresholds_are_fields_of_the_settings_and_numbers_of_modules():
     assert len(settings_fields()) == sum(
         len(fields(getattr(DEFAULT_SETTINGS, one.name))) for one in fields(DEFAULT_SETTINGS)
     )
-    assert "disco_hw.gap.report.remains:_EXPLAINED" in module_numbers()
+    assert "disco_hw.gap.search.end_to_end:_NEGLIGIBLE" in module_numbers()
     # The size of a vector is no threshold.
     assert not [name for name in module_numbers() if "BASE_COUNT" in name or "settings" in name]
 
 
 def test_only_what_is_named_changes_and_modules_are_put_back():
-    number = "disco_hw.gap.report.remains:_EXPLAINED"
-    usual = remains._EXPLAINED
+    number = "disco_hw.gap.search.end_to_end:_NEGLIGIBLE"
+    usual = end_to_end._NEGLIGIBLE
     with changed(["grid.block_s", number, "prediction.folds"], 2.0) as settings:
         assert settings.grid.block_s == 2.0 * DEFAULT_SETTINGS.grid.block_s
-        assert 2.0 * usual == remains._EXPLAINED
+        assert 2.0 * usual == end_to_end._NEGLIGIBLE
     others = [one.name for one in fields(DEFAULT_SETTINGS) if one.name != "grid"]
     assert [getattr(settings, name) for name in others] == [getattr(DEFAULT_SETTINGS, name) for name in others]
-    assert usual == remains._EXPLAINED
+    assert usual == end_to_end._NEGLIGIBLE
 
 
 def test_answers_are_alike_where_names_errors_and_intervals_are():

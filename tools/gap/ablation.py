@@ -44,7 +44,7 @@ LEAST_CHANGE = 0.02
 AT_ONCE = 8
 SAID = ("named", "unnamed", "doubtful", "offered")
 # No thresholds: sizes of vectors, and numbers of the normal distribution.
-DEFINITIONS = ("BASE_COUNT", "STATES", "Z95")
+DEFINITIONS = ("BASE_COUNT", "STATES", "Z95", "_RISE", "_ONE_SIGMA", "_GAUSSIAN_KURTOSIS")
 
 
 def scaled(value: Any, times: float) -> Any:

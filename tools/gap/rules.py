@@ -105,8 +105,7 @@ def _is(one: Any, other: Any) -> bool:
 
 
 def _plain(white: Any, use: Any, settings: Any) -> Any:
-    limits = settings.selection
-    return selection.Thresholds(limits.named_score, limits.least_moved_m, limits.unnamed_score)
+    return selection.Thresholds(settings.named_score, settings.least_moved_m, settings.unnamed_score)
 
 
 RULES: tuple[Rule, ...] = (

@@ -32,9 +32,11 @@ _STEPS: Mapping[str, float] = {
     "rad/s^2": 1e-2,
     "m": 1e-4,
     "m/s": 1e-4,
+    "m/rad": 1e-3,
     "rad": 1e-3,
     "1": 2e-4,
 }
+_OTHER_STEP = 1e-3
 _UNLIMITED = 1e6
 
 
@@ -68,7 +70,7 @@ def _layout(parameters: Mapping[str, Parameter], base: int) -> Layout:
         columns=columns,
         neutral=neutral,
         step=np.array(
-            [1e-4 if k < base else _STEPS.get(p.unit, _STEPS["rad"]) for k, p in enumerate(parameters.values())]
+            [1e-4 if k < base else _STEPS.get(p.unit, _OTHER_STEP) for k, p in enumerate(parameters.values())]
         ),
         low=low,
         high=np.array([max(p.high, p.neutral if p.neutral < np.inf else _UNLIMITED) for p in parameters.values()]),

@@ -6,20 +6,23 @@ A search that begins without a delay of 0.3 s does not find it: it takes the tra
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.data.stamp_clock import StampClock, clock_of
 from disco_hw.gap.data.timing import apart, lowest, mismatch_of, most_distinct_delay, scanned_delays
-from disco_hw.gap.settings import NEGLIGIBLE, GridSettings
+from disco_hw.gap.settings import GridSettings
 from disco_hw.jit import kernel_function
 from disco_hw.log.drive import Commands, Wheels
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+
+# Pairs whose commands do not change fit as well at every delay, but for rounding.
+_SAME_NATS = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +55,13 @@ class Turned:
 
     def pick(self, chosen: Mask) -> Turned:
         """Return the chosen pairs."""
-        return Turned(*(getattr(self, each.name)[chosen] for each in fields(self)))
+        return Turned(
+            self.begin_s[chosen],
+            self.end_s[chosen],
+            self.segment[chosen],
+            self.left_rad[chosen],
+            self.right_rad[chosen],
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,8 +106,7 @@ class WheelResponse:
         if not shared.begin_s.size:
             return False
         shorter, there, longer = (self._mismatch(shared, each) for each in delays)
-        # Pairs whose commands do not change fit as well at every delay, but for rounding.
-        return min(shorter, longer) > there + NEGLIGIBLE
+        return min(shorter, longer) > there + _SAME_NATS
 
     def known(self, turned: Turned, delay_s: float) -> Mask:
         """Between which pairs (n,) commands are known at a delay."""
@@ -220,7 +228,7 @@ class CommandAlignment:
         """Length of the stretches that are looked at one by one: longer where speeds come less often."""
         begin_s, settings = self.turned.begin_s, self.settings
         spacing_s = float(np.median(np.diff(begin_s))) if begin_s.size > 1 else math.inf
-        return max(4.0 * settings.block_s, 1.5 * settings.fewest_samples * spacing_s)
+        return max(settings.clock_stretch_s, 1.5 * settings.fewest_samples * spacing_s)
 
     def fitted(self, clock: StampClock) -> tuple[float, float]:
         """Age of all commands, their stamps corrected by a clock, and the misfit of a pair and wheel."""

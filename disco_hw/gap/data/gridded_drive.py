@@ -9,7 +9,7 @@ at 4 to 10 Hz, and laid on the interval that it ends a speed is neither late nor
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -39,7 +39,7 @@ class GridSamples:
 
     def pick(self, chosen: Mask | Index) -> GridSamples:
         """Return the chosen samples."""
-        return GridSamples(*(getattr(self, each.name)[chosen] for each in fields(self)))
+        return GridSamples(self.node[chosen], self.fraction[chosen], self.t_s[chosen], self.block[chosen])
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +162,7 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
         changes.append(change)
         angles.append(at)
         speeds.append(speed)
-        even = np.clip(even_times(t, grid_settings.neighbours), grid[0], grid[-1])
+        even = np.clip(even_times(t, grid_settings.even_samples), grid[0], grid[-1])
         moved = np.column_stack([np.interp(t, grid, speed[:, side]) for side in (0, 1)]) * (even - t)[:, None]
         encoder_at.append(_locate(even, grid, offset, grid_settings.block_s))
         encoder_angle.append(angle + moved)
@@ -343,7 +343,12 @@ def _locate(t_s: Array, grid: Array, offset: int, block_s: float) -> GridSamples
 
 
 def _joined(parts: list[GridSamples]) -> GridSamples:
-    return GridSamples(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(GridSamples)))
+    return GridSamples(
+        np.concatenate([part.node for part in parts]),
+        np.concatenate([part.fraction for part in parts]),
+        np.concatenate([part.t_s for part in parts]),
+        np.concatenate([part.block for part in parts]),
+    )
 
 
 def _command_cells(commands: Commands, segment: int, grid: Array) -> tuple[Array, Array]:
@@ -402,8 +407,22 @@ def _quantum(angle: Array) -> float:
 def _empty(settings: GapSettings) -> GriddedDrive:
     nothing, pairs = np.empty(0), np.empty((0, 2))
     samples = GridSamples(np.empty(0, np.int64), nothing, nothing, np.empty(0, np.int64))
-    wheels = nothing, np.empty(0, bool), pairs, nothing, pairs, pairs, samples, pairs
-    return GriddedDrive(*wheels, 0.0, 0.0, 0.0, samples, np.empty((0, 3)), settings=settings)
+    return GriddedDrive(
+        nothing,
+        np.empty(0, bool),
+        pairs,
+        nothing,
+        pairs,
+        pairs,
+        samples,
+        pairs,
+        0.0,
+        0.0,
+        0.0,
+        samples,
+        np.empty((0, 3)),
+        settings=settings,
+    )
 
 
 def undo_sample_hold(wheels: Wheels, settings: GridSettings) -> Wheels:

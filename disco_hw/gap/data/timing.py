@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from disco_hw.gap.data.stamp_clock import StampClock, clock_of, picked
-from disco_hw.gap.settings import NEGLIGIBLE, OF_MEDIAN, GridSettings
+from disco_hw.gap.settings import OF_MEDIAN, GridSettings
 from disco_hw.jit import kernel_function, scalar_function
 from disco_hw.log.drive import Poses, Wheels
 
@@ -24,6 +24,14 @@ Index = NDArray[np.int64]
 
 # Chosen: each round reweights the outliers anew, and takes as long.
 _ROUNDS = 4
+# Finer than any pose is measured; keeps a log without any noise finite.
+_LEAST_SQUARE = 1e-10
+# A column of which the other one leaves less than this share of its square says nothing of its own.
+_LEAST_INDEPENDENT = 1e-12
+# Stamps are alike to the microsecond.
+_STAMP_DIGITS = 6
+# So closely the least of a misfit is searched: a hundredth of what a cell of the grid holds.
+_CLOSE_S = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +51,7 @@ class PoseAlignment:
     @property
     def stretch_s(self) -> float:
         """Length of the stretches that are looked at one by one."""
-        return 4.0 * self.settings.block_s
+        return self.settings.clock_stretch_s
 
     def fitted(self, clock: StampClock) -> tuple[float, float]:
         """Age of all poses, their stamps corrected by a clock, and the misfit of a pose."""
@@ -90,7 +98,7 @@ def tick_s(t_s: Array, rows_s: Array) -> float:
     """
     if not t_s.size or rows_s.size < 2:
         return 0.0
-    shared = np.isin(np.rint(t_s / NEGLIGIBLE), np.rint(rows_s / NEGLIGIBLE))
+    shared = np.isin(np.round(t_s, _STAMP_DIGITS), np.round(rows_s, _STAMP_DIGITS))
     return float(np.median(np.diff(rows_s))) if shared.all() else 0.0
 
 
@@ -173,7 +181,7 @@ def lowest(mismatches: Callable[[Array], Array], about_s: float, step_s: float) 
         return min(float(mismatches(np.full(1, delay_s))[0]), 1e3)
 
     bounds = (about_s - step_s, about_s + step_s)
-    found = minimize_scalar(at, bounds=bounds, method="bounded", options={"xatol": NEGLIGIBLE})
+    found = minimize_scalar(at, bounds=bounds, method="bounded", options={"xatol": _CLOSE_S})
     return float(found.x), float(found.fun)
 
 
@@ -183,7 +191,7 @@ def projected(aa: float, ab: float, bb: float, ay: float, by: float) -> tuple[fl
     if aa == 0.0:
         return 0.0, 0.0
     independent = bb - ab * ab / aa
-    second = (by - ab * ay / aa) / independent if independent > NEGLIGIBLE**2 * bb else 0.0
+    second = (by - ab * ay / aa) / independent if independent > _LEAST_INDEPENDENT * bb else 0.0
     return (ay - ab * second) / aa, second
 
 
@@ -213,4 +221,4 @@ def mismatch_of(difference: Array, total: Array, measured: Array) -> float:
     loss = 0.0
     for k in range(count):
         loss += left[k] * left[k] if left[k] < limit else limit * (2.0 * left[k] - limit)
-    return 0.5 * math.log(loss / count + NEGLIGIBLE**2)
+    return 0.5 * math.log(loss / count + _LEAST_SQUARE)

@@ -38,11 +38,9 @@ def _huber(white: Array, limit: float) -> float:
     return float(flat @ flat - beyond @ beyond)
 
 
-def _minimise(objective, start: Array, low: Array, high: Array, most: int) -> Array:  # type: ignore[no-untyped-def]
-    # Of logarithms. Central: a one-sided difference this wide would end the search some way off.
-    step = 2e-2
-
+def _minimise(objective, start: Array, low: Array, high: Array, most: int, step: float) -> Array:  # type: ignore[no-untyped-def]
     def slope(logs: Array) -> Array:
+        # Central: a one-sided difference this wide would end the search some way off.
         out = np.empty(logs.size)
         for k in range(logs.size):
             ahead, behind = logs.copy(), logs.copy()
@@ -60,7 +58,9 @@ def largest_command_jitter_s(drive: GriddedDrive) -> float:
 
     More than that is a response that the model lacks, and must not count as noise.
     """
-    return drive.stamp_scatter_s + drive.settings.fit.expected_share * drive.encoder_period_s
+    settings = drive.settings.noise
+    scattered_s = settings.command_jitter_ratio * drive.stamp_scatter_s
+    return scattered_s + settings.command_jitter_share * drive.encoder_period_s
 
 
 def wheel_mismatch(channel: WheelChannel, raw: Array) -> Callable[[Array], float]:
@@ -93,8 +93,9 @@ def fit_wheel_noise(channel: WheelChannel, raw: Array) -> WheelNoise:
     least = begin - 5.0
     if drive.quantum_rad > 0.0:
         least[_READING] = max(least[_READING], math.log(drive.quantum_rad / math.sqrt(12.0)))
-    begin = np.maximum(begin, least)
-    return WheelNoise.from_vector(_minimise(objective, begin, least, most, settings.wheel_iterations))
+    return WheelNoise.from_vector(
+        _minimise(objective, np.maximum(begin, least), least, most, settings.wheel_iterations, settings.difference_step)
+    )
 
 
 def _pull(logs: Array, start: Array, prior_sd: float) -> float:
@@ -118,7 +119,9 @@ def fit_body_noise(channel: BodyChannel, p: Array, extra: Array | None = None, i
         white, weight = likelihood(logs)
         return 0.5 * _huber(white, settings.huber) - weight + _pull(logs, start, settings.prior_sd)
 
-    return BodyNoise.from_vector(_minimise(objective, start, start - 5.0, start + 5.0, iterations))
+    return BodyNoise.from_vector(
+        _minimise(objective, start, start - 5.0, start + 5.0, iterations, settings.difference_step)
+    )
 
 
 def without_outliers(channel: BodyChannel, p: Array, extra: Array | None = None) -> BodyChannel:

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap.settings import START_STD
 from disco_hw.jit import kernel_function, scalar_function
 
 Array = NDArray[np.float64]
@@ -23,6 +22,9 @@ Mask = NDArray[np.bool_]
 
 # Position and heading, slip, and the correlated noise of the poses: three of each.
 STATES = 9
+# Chosen: far above the noise of a pose, so that the first one decides.
+_START_M = 0.3
+_START_RAD = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +116,7 @@ def _begin(c: Any, noise: Any) -> None:
     c[:, :] = 0.0
     for i in range(3):
         pose = noise[1] if i == 2 else noise[0]
-        c[i, i] = START_STD**2
+        c[i, i] = _START_M**2 if i < 2 else _START_RAD**2
         c[3 + i, 3 + i] = 1.0
         c[6 + i, 6 + i] = pose * pose
 

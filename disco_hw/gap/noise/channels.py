@@ -25,11 +25,14 @@ from disco_hw.gap.noise.wheel_noise import (
     wheel_gains,
     whiten_wheels,
 )
-from disco_hw.gap.settings import NEGLIGIBLE, GapSettings
+from disco_hw.gap.settings import GapSettings
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+
+# A noise parameter that is as good as zero; the logarithm of it is taken.
+_NEGLIGIBLE = 1e-5
 
 
 class ResidualChannel(Protocol):
@@ -119,9 +122,10 @@ class WheelChannel:
         between = np.diff(jumps[place.node + 1], prepend=0.0)
         speed = drive.speed_rad_s[place.node]
         dt = np.maximum(dt, 0.0)
-        steady = steady_speeds(dt, speed, drive.settings)
+        noise_settings = drive.settings.noise
+        steady = steady_speeds(dt, speed, noise_settings)
         motion = WheelMotion(
-            dt, calm_speeds(dt, speed, drive.settings), steady, np.maximum(between, 0.0), first_of_run | resumed, good
+            dt, calm_speeds(dt, speed, noise_settings), steady, np.maximum(between, 0.0), first_of_run | resumed, good
         )
         return cls(drive, motion, wheel_gains(noise, motion), np.ones((place.t_s.size, 2)), noise, geometry)
 
@@ -158,9 +162,9 @@ class WheelChannel:
         # Readings and time stamps err as they do.
         noise = replace(
             self.noise,
-            relative=NEGLIGIBLE,
-            drift_std=NEGLIGIBLE,
-            drift_rad_sqrt_s=max(off_rad, NEGLIGIBLE) / settings.steady_s**0.5,
+            relative=_NEGLIGIBLE,
+            drift_std=_NEGLIGIBLE,
+            drift_rad_sqrt_s=max(off_rad, _NEGLIGIBLE) / settings.steady_s**0.5,
         )
         even = self.with_noise(noise)
         white = even.whitened(p, extra)
@@ -402,7 +406,7 @@ def _windows(drive: GriddedDrive) -> tuple[Index, Mask]:
 
     A window ends after a block of time, with its run, and where poses fail to come for long.
     """
-    t, node, block_s = drive.pose.t_s, drive.pose.node, drive.settings.grid.block_s
+    t, node, settings, block_s = drive.pose.t_s, drive.pose.node, drive.settings.noise, drive.settings.grid.block_s
     run = np.searchsorted(np.flatnonzero(drive.first), node, side="right")
     number = np.zeros(t.size, dtype=np.int64)
     current, begin = 0, 0
@@ -415,7 +419,7 @@ def _windows(drive: GriddedDrive) -> tuple[Index, Mask]:
             current, begin = current + 1, k
         number[k] = current
     sizes = np.bincount(number, minlength=current + 1)
-    keep = sizes[number] >= min(drive.settings.noise.shortest_window, int(np.median(sizes)))
+    keep = sizes[number] >= min(settings.shortest_window, int(np.median(sizes)))
     _, renumbered = np.unique(number[keep], return_inverse=True)
     return renumbered.astype(np.int64), keep
 

@@ -15,10 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from disco_hw.gap.settings import DRIFT_S, START_STD, GapSettings
+from disco_hw.gap.settings import DRIFT_S, NoiseSettings
 from disco_hw.jit import kernel_function, scalar_function
 
 Array = NDArray[np.float64]
+
+# Chosen: 0.2 rad, far above the noise of an encoder, so that the first count decides.
+_START_VARIANCE = 0.04
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +103,7 @@ def _spread(c: Any, noise: Any, go: float, far: float, keep: float, hold: float,
 @scalar_function
 def _begin(noise: Any) -> Any:
     """Covariance of a run's first sample."""
-    return START_STD**2, 0.0, 0.0, noise[0] * noise[0], 0.0, noise[6] * noise[6]
+    return _START_VARIANCE, 0.0, 0.0, noise[0] * noise[0], 0.0, noise[6] * noise[6]
 
 
 @scalar_function
@@ -210,17 +213,17 @@ def _whiten(
         other_slow += gain[k, 1, 2] * other
 
 
-def calm_speeds(dt_s: Array, speed_rad_s: Array, settings: GapSettings) -> Array:
-    """Measured speeds (E, 2) with less of their own noise: their mean over `speed_span_s` either side.
+def calm_speeds(dt_s: Array, speed_rad_s: Array, settings: NoiseSettings) -> Array:
+    """Measured speeds (E, 2) with less of their own noise: their mean over `calm_s` either side.
 
     An error that acted on the measured speed itself would scale the very noise it is measured by, and look like a gain.
     """
-    return _mean(dt_s, speed_rad_s, settings.grid.speed_span_s, 0)
+    return _mean(dt_s, speed_rad_s, settings.calm_s, 0)
 
 
-def steady_speeds(dt_s: Array, speed_rad_s: Array, settings: GapSettings) -> Array:
+def steady_speeds(dt_s: Array, speed_rad_s: Array, settings: NoiseSettings) -> Array:
     """Estimate speeds (E, 2) without a model, as means of measured ones over `steady_s` on either side."""
-    return _mean(dt_s, speed_rad_s, settings.noise.steady_s, 1)
+    return _mean(dt_s, speed_rad_s, settings.steady_s, settings.fewest_steady)
 
 
 def _mean(dt_s: Array, speed_rad_s: Array, span_s: float, fewest: int) -> Array:

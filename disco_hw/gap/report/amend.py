@@ -15,7 +15,6 @@ from disco_hw.gap.search.channel_result import ChannelEstimates, ParameterEstima
 from disco_hw.gap.search.end_to_end import Freed, JointFit, Part
 from disco_hw.gap.search.evidence import Z95
 from disco_hw.gap.search.unnamed_terms import Term
-from disco_hw.gap.settings import GRID_STEP_S
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model.model import BASE_PARAMETERS, within_ranges
 from disco_hw.model.terms import REACH, TERMS, effect_of
@@ -173,12 +172,15 @@ def amended_model(
     return replace(bare, belief=belief), tuple(notes)
 
 
+# Chosen: a shorter delay or lag is none that a controller could feel.
+_LEAST_TIME_S = 1e-3
+
+
 def _takes_no_time(name: str, values: Mapping[str, ParameterEstimate]) -> bool:
     """Whether an effect that is a time alone is shorter than anything that a robot's loop resolves."""
     effect = effect_of(name)
     is_time = effect.delayed_by is not None or effect.stage is Stage.POSE_TIME
-    # A tenth of a cell of the grid is none that a controller could feel.
-    return is_time and all(abs(values[p.name].value) < 0.1 * GRID_STEP_S for p in effect.parameters if p.name in values)
+    return is_time and all(abs(values[p.name].value) < _LEAST_TIME_S for p in effect.parameters if p.name in values)
 
 
 def _known_terms(model: Model, base: Mapping[str, float]) -> tuple[dict[str, ParameterEstimate], dict[str, float]]:

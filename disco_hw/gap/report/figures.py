@@ -23,6 +23,9 @@ from disco_hw.reports import BASELINE, FLOOR, MAIN, REFERENCE, png
 Array = NDArray[np.float64]
 
 _COLOURS = {"nominal": REFERENCE, "refitted": "#9467bd", "timed": BASELINE, "amended": MAIN, "floor": FLOOR}
+# Upper end of the axis of residuals, in units of the noise, at least.
+_LEAST_SHOWN = 4.0
+_STRETCH_S = 6.0
 
 
 def pictures(analysis: GapAnalysis, gap: dict[str, dict[float, PredictionErrors]]) -> dict[str, bytes]:
@@ -50,7 +53,7 @@ def _worst_stretch(wheels: ChannelResult) -> bytes:
     angles = (channel.angles(wheels.base.vector), channel.angles(*wheels.selector.split(wheels.names)))
     before, after = (np.gradient(angle, GRID_STEP_S, axis=0) for angle in angles)
     size = np.where(np.isfinite(drive.command_rad_s[:, 0]), np.abs(before - drive.speed_rad_s).mean(axis=1), 0.0)
-    width = min(round(2.0 * channel.settings.grid.block_s / GRID_STEP_S), size.size)
+    width = min(round(_STRETCH_S / GRID_STEP_S), size.size)
     begin = int(np.argmax(np.convolve(size, np.ones(width), "valid")))
     part = slice(begin, begin + width)
     return stretch(drive.t_s[part], drive.speed_rad_s[part, 0], before[part, 0], after[part, 0], "left wheel, rad/s")
@@ -130,7 +133,7 @@ def disagreement(title: str, regimes: list[Regime]) -> bytes:
         _plain_log(axes, upward=False)
     else:
         # Where there is nothing but noise the bars stay short, so that it looks like nothing.
-        axes.set_xlim(0.0, max(1.05 * largest, 4.0))
+        axes.set_xlim(0.0, max(1.05 * largest, _LEAST_SHOWN))
     _legend_outside(axes)
     return png(figure)
 

@@ -298,7 +298,7 @@ def _exceeded(effect: Effect, limit: ParameterEstimate, measured: Measured) -> s
     reached = effect.limited(_calm(drive), measured.geometry)
     beyond = reached > limit.value * (1.0 + settings.worth_share)
     seconds = float(beyond.sum()) * GRID_STEP_S
-    if seconds < drive.settings.prediction.horizons_s[0]:
+    if seconds < settings.beyond_s:
         return None
     unit = effect.parameters[0].unit
     return (

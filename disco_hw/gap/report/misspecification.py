@@ -143,7 +143,7 @@ def masks(drive: GriddedDrive, samples: GridSamples) -> Mapping[str, Mask]:
 def masks_at_nodes(drive: GriddedDrive) -> Mapping[str, Mask]:
     """Which nodes (M,) lie in which regime; regimes overlap."""
     speed, settings = drive.speed_rad_s, drive.settings.report
-    span = drive.settings.grid.neighbours
+    span = drive.settings.terms.smooth_nodes
     mean, half = speed.mean(axis=1), 0.5 * (speed[:, 1] - speed[:, 0])
     ahead = np.minimum(np.arange(speed.shape[0]) + span, speed.shape[0] - 1)
     behind = np.maximum(np.arange(speed.shape[0]) - span, 0)
@@ -151,7 +151,7 @@ def masks_at_nodes(drive: GriddedDrive) -> Mapping[str, Mask]:
     size = np.abs(speed).max(axis=1)
     moving = size > drive.settings.grid.rest_rad_s
     steady = moving & (np.abs(growth) < settings.speeding_rad_s2)
-    turning = np.abs(half) > drive.settings.grid.turning_rad_s
+    turning = np.abs(half) > 0.3
     slow, fast = _halves(size, moving, settings.worth_share)
     turning_slowly, turning_fast = _halves(np.abs(half), turning, settings.worth_share)
     times = np.linspace(drive.t_s[0], drive.t_s[-1], 4)
@@ -215,7 +215,7 @@ def remaining_disagreements(found: ChannelResult) -> list[str]:
     if isinstance(channel, WheelChannel):
         drive = channel.drive
         largest_s = largest_command_jitter_s(drive)
-        if channel.noise.command_stamp_s > 0.99 * largest_s:
+        if channel.noise.command_stamp_s > (1.0 - channel.settings.report.end_share) * largest_s:
             out.append(
                 f"{name}: speeding up and braking still disagree: as if commands came "
                 f"{1e3 * channel.noise.command_stamp_s:.0f} ms early or late at random, the encoder's time stamps "

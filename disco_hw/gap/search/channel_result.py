@@ -22,6 +22,8 @@ from disco_hw.gap.search.unnamed_terms import Term, WithTerms
 
 Array = NDArray[np.float64]
 
+_RISE = 0.5 * Z95**2
+
 
 @dataclass(frozen=True)
 class UnnamedTerm:
@@ -215,7 +217,7 @@ def _profiled(found: ChannelResult, column: str, step: float) -> ParameterEstima
             vector = best.vector.copy()
             vector[place] += sign * reach
             there = fit(channel, vector, active, 1)
-            if there.cost > best.cost + 0.5 * Z95**2 or reach > 64.0 * step:
+            if there.cost > best.cost + _RISE or reach > 64.0 * step:
                 break
             reach *= 2.0
         ends.append(there)

@@ -35,8 +35,10 @@ from disco_hw.gap.search.richest_model import (
 )
 from disco_hw.gap.search.selection import Names, Selector, Thresholds, body_moves, wheel_moves
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms, body_terms, places, places_near, wheel_terms
-from disco_hw.gap.settings import NEGLIGIBLE, GapSettings
+from disco_hw.gap.settings import GapSettings
 
+# Fourth moment of normal noise over its variance squared.
+_GAUSSIAN_KURTOSIS = 3.0
 Array = NDArray[np.float64]
 
 
@@ -231,12 +233,11 @@ def _thresholds(white: Array, use: NDArray[np.bool_], all_settings: GapSettings)
     Noise that comes in bursts wanders too, more slowly than any block that could show it.
     """
     settings, sound = all_settings.selection, white[use]
-    sound = sound[np.abs(sound).max(axis=1) > NEGLIGIBLE]
+    sound = sound[np.abs(sound).max(axis=1) > settings.silent]
     if not sound.size:
         return Thresholds(settings.named_score, settings.least_moved_m, settings.unnamed_score)
-    sound = np.clip(sound / np.sqrt((sound**2).mean()), -all_settings.noise.outlier, all_settings.noise.outlier)
-    # Of normal noise the fourth moment is three times the variance squared.
-    heavy = float((sound**4).mean()) / 3.0
+    sound = np.clip(sound / np.sqrt((sound**2).mean()), -settings.clipped_at, settings.clipped_at)
+    heavy = float((sound**4).mean()) / _GAUSSIAN_KURTOSIS
     times = min(max(heavy, 1.0), all_settings.noise.poor_fit)
     return Thresholds(times * settings.named_score, settings.least_moved_m, times * settings.unnamed_score)
 
@@ -350,6 +351,7 @@ def best_terms(small: Fit, channel: ResidualChannel, options: Iterator[Term]) ->
     Terms that are not worth a fit are left out. Of the discs of the floor, which are variations of one another, only
     the best is kept.
     """
+    settings = channel.settings.terms
     promising: list[tuple[float, Term]] = []
     tried = 0
     core, fixed = channel.split(small.vector)
@@ -376,10 +378,10 @@ def best_terms(small: Fit, channel: ResidualChannel, options: Iterator[Term]) ->
             continue
         coefficients = -inverse(information) @ pull
         gain = -0.5 * float(pull @ coefficients) - 0.5 * (len(columns) - 1) * math.log(channel.count)
-        if gain > channel.settings.terms.worth_trying_nats and coefficients.max() <= term.highest:
+        if gain > settings.worth_trying_nats and coefficients.max() <= term.highest:
             promising.append((gain, term))
     best: list[Term] = []
     for _, term in sorted(promising, key=lambda one: -one[0]):
         if term.disc is None or all(other.disc is None for other in best):
             best.append(term)
-    return best[: channel.settings.terms.most_tried], max(tried, 2)
+    return best[: settings.most_tried], max(tried, 2)

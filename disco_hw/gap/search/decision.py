@@ -22,13 +22,15 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr, stdtrit
+from scipy.special import stdtrit
 
 from disco_hw.gap.search.cross_validation import PredictionErrors
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
+# Of a normal distribution the share below one standard deviation.
+_ONE_SIGMA = 0.8413447460685429
 # Keeps the log of an error of none finite, far below what any sensor resolves (1e-9 m or rad).
 _NO_ERROR = 1e-18
 
@@ -50,7 +52,7 @@ def excess(best: PredictionErrors, other: PredictionErrors, floor: PredictionErr
     # Stretches of a single fold were predicted by one model: it is taken for one of two.
     share = 2.0 / growth.size + 1.0 / max(best.folds - 1, 1)
     error = float(growth.std(ddof=1)) * math.sqrt(share)
-    return float(growth.mean()), float(stdtrit(growth.size - 1, ndtr(1.0))) * error
+    return float(growth.mean()), float(stdtrit(growth.size - 1, _ONE_SIGMA)) * error
 
 
 def is_as_good(best: PredictionErrors, other: PredictionErrors, floor: PredictionErrors | None) -> bool:

@@ -27,10 +27,16 @@ from disco_hw.gap.search.cross_validation import (
     scored_horizon_s,
 )
 from disco_hw.gap.search.least_squares import inverse, within
-from disco_hw.gap.settings import NEGLIGIBLE, OF_MEDIAN
+from disco_hw.gap.settings import OF_MEDIAN
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+_LEAST_SCALE = 1e-5
+# How surely entries of which nothing is known stay where they are: enough where predictions say nothing of them.
+_NEGLIGIBLE = 1e-4
+# A fit begins inside its bounds, by this many difference steps.
+_INSIDE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -147,15 +153,9 @@ class Ahead:
         # Effects of the body leave the wheels alone; its geometry may not.
         first = np.array(of.parts[0].active)
         of_body = np.concatenate([first >= BASE_COUNT, np.zeros(step.size - first.size, dtype=bool)])
-        # Entries of which nothing is known stay where they are.
-        root = np.linalg.cholesky(precision + np.diag((NEGLIGIBLE / step) ** 2)).T
+        root = np.linalg.cholesky(precision + np.diag((_NEGLIGIBLE / step) ** 2)).T
         first_at = start if begin is None else of.at(begin).joined(lambda part: part.vector)
-        # A fit begins inside its bounds.
-        values, cost, normal = (
-            np.clip(first_at, low + NEGLIGIBLE * step, high - NEGLIGIBLE * step),
-            math.inf,
-            root.T @ root,
-        )
+        values, cost, normal = np.clip(first_at, low + _INSIDE * step, high - _INSIDE * step), math.inf, root.T @ root
         for _ in range(settings.fit.rounds if any(mask.any() for mask in chosen) else 0):
             units = [
                 _usual(error[mask]) / share
@@ -191,4 +191,4 @@ def _usual(error: Array) -> Array:
         return np.ones(3)
     position = OF_MEDIAN * float(np.median(np.abs(error[:, :2])))
     heading = OF_MEDIAN * float(np.median(np.abs(error[:, 2])))
-    return np.asarray(np.maximum(np.array([position, position, heading]), NEGLIGIBLE))
+    return np.asarray(np.maximum(np.array([position, position, heading]), _LEAST_SCALE))

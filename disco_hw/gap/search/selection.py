@@ -31,6 +31,7 @@ Split = tuple[Array, Array | None]
 def wheel_moves(channel: WheelChannel, geometry: Array) -> Callable[[Split, Split], float]:
     """Return a function for the distance (m) of two fits' wheel predictions, with half the way as lever arm."""
     drive = channel.drive
+    settings = channel.settings.selection
     usable = np.isfinite(drive.command_rad_s[:, 0])
     usual_s = channel.settings.prediction.reported_horizon_s
     start, ahead_s = starts_as_far_as(drive.first, usable, usual_s, channel.settings.grid)
@@ -45,7 +46,7 @@ def wheel_moves(channel: WheelChannel, geometry: Array) -> Callable[[Split, Spli
         forward = 0.5 * geometry[0] * step.sum(axis=1)
         yaw = geometry[0] / geometry[1] * (step[:, 1] - step[:, 0])
         lever = np.abs(0.25 * geometry[0] * way.sum(axis=1)) + abs(geometry[2])
-        return _where_most(forward**2 + (lever * yaw) ** 2, channel.settings.report.worth_share)
+        return _where_most(forward**2 + (lever * yaw) ** 2, settings.most_moved_share)
 
     return moves
 
@@ -53,6 +54,7 @@ def wheel_moves(channel: WheelChannel, geometry: Array) -> Callable[[Split, Spli
 def body_moves(channel: BodyChannel) -> Callable[[Split, Split], float]:
     """Return a function for the distance (m) of two fits' body predictions at the usual horizon."""
     drive = channel.drive
+    settings = channel.settings.selection
     everywhere = np.ones(drive.t_s.size, dtype=bool)
     usual_s = channel.settings.prediction.reported_horizon_s
     start, ahead_s = starts_as_far_as(drive.first, everywhere, usual_s, channel.settings.grid)
@@ -71,9 +73,7 @@ def body_moves(channel: BodyChannel) -> Callable[[Split, Split], float]:
             )  # fmt: skip
         apart = ends[1] - ends[0]
         lever = 0.5 * np.hypot(ends[1][:, 0], ends[1][:, 1])
-        return _where_most(
-            apart[:, 0] ** 2 + apart[:, 1] ** 2 + (lever * apart[:, 2]) ** 2, channel.settings.report.worth_share
-        )
+        return _where_most(apart[:, 0] ** 2 + apart[:, 1] ** 2 + (lever * apart[:, 2]) ** 2, settings.most_moved_share)
 
     return moves
 

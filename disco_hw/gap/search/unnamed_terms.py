@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from disco_hw.gap.data import Layout
 from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
-from disco_hw.gap.settings import GRID_STEP_S, GapSettings, GridSettings
+from disco_hw.gap.settings import GRID_STEP_S, GapSettings, TermSettings
 from disco_hw.model import EffectSetting
 from disco_hw.model.terms import (
     BODY_FEATURES,
@@ -98,14 +98,14 @@ def motion(drive: GriddedDrive, p: Array) -> tuple[Array, Array, Array]:
     """Forward speed (m/s), yaw rate (rad/s) and acceleration (m/s^2) from the wheels, (M,) each."""
     speed = drive.speed_rad_s
     v = 0.5 * p[0] * speed.sum(axis=1)
-    return v, p[0] / p[1] * (speed[:, 1] - speed[:, 0]), np.gradient(smoothed(v, drive.settings.grid), GRID_STEP_S)
+    return v, p[0] / p[1] * (speed[:, 1] - speed[:, 0]), np.gradient(smoothed(v, drive.settings.terms), GRID_STEP_S)
 
 
 def body_terms(channel: BodyChannel, p: Array) -> Iterator[Term]:
     """Yield the terms that may be added to the body's velocity; `p` is the vector of the channel."""
     drive = channel.drive
     v, w, a = motion(drive, p)
-    dw = np.gradient(smoothed(w, drive.settings.grid), GRID_STEP_S)
+    dw = np.gradient(smoothed(w, drive.settings.terms), GRID_STEP_S)
     moving = np.minimum(np.abs(drive.speed_rad_s).max(axis=1) * p[0] / drive.settings.noise.slip_onset_m_s, 1.0)
     beyond = {"moving": moving, "domega/dt": dw, "v domega/dt": v * dw}
     geometry = float(p[0]), float(p[1])
@@ -245,9 +245,9 @@ def _on(axis: int, feature: Array) -> Array:
     return perturbation
 
 
-def smoothed(values: Array, settings: GridSettings) -> Array:
+def smoothed(values: Array, settings: TermSettings) -> Array:
     """Values at the nodes without what changes from one to the next."""
-    window = np.hanning(2 * settings.neighbours + 1)
+    window = np.hanning(2 * settings.smooth_nodes + 1)
     return np.convolve(values, window / window.sum(), "same")
 
 

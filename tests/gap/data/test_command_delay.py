@@ -165,7 +165,7 @@ def scanned(monkeypatch):
         monkeypatch.setattr(WheelResponse, "mismatches", misfits)
         monkeypatch.setattr(WheelResponse, "known", known)
         monkeypatch.setattr(WheelResponse, "is_distinct", lambda *_: shared)
-        chosen = replace(SETTINGS, **({"lags_s": (0.1, 0.3), "least_link_error_s": 0.12} | settings))
+        chosen = replace(SETTINGS, **({"lags_s": (0.1, 0.3), "lag_reach_s": 0.12} | settings))
         return response(Turned.of(sampled() if wheels is None else wheels, chosen), commands, chosen)
 
     told.asked = asked
@@ -264,7 +264,7 @@ def test_the_same_pairs_fit_worse_at_a_shorter_and_at_a_longer_delay(by_s, told)
 
 @pytest.mark.parametrize(
     ("shorter", "longer", "told"),
-    [(0.2, 0.2, True), (0.2, 0.0, False), (0.0, 0.2, False), (0.2, 1e-5, False), (1.1e-5, 0.2, True)],
+    [(0.2, 0.2, True), (0.2, 0.0, False), (0.0, 0.2, False), (0.2, 1e-4, False), (1.1e-4, 0.2, True)],
 )
 def test_both_fit_worse_for_the_pairs_that_are_known_at_all_three(monkeypatch, shorter, longer, told):
     known = {0.1: [1, 1, 0, 1], 0.3: [1, 0, 1, 1], 0.5: [1, 1, 1, 0]}

@@ -11,7 +11,7 @@ from disco_hw.gap.data.stamp_clock import StampClock
 from disco_hw.gap.settings import GridSettings
 from disco_hw.log.drive import Commands
 
-SETTINGS = GridSettings(delay_step_s=0.02, most_delay_s=1.0, least_delay_nats=0.05, fewest_samples=60)
+SETTINGS = GridSettings(delay_step_s=0.02, most_pose_delay_s=1.0, least_delay_nats=0.05, fewest_samples=60)
 COMMANDS = Commands(np.array([0.0, 10.0, 30.0]), np.ones(3), np.ones(3), np.zeros(3))
 
 

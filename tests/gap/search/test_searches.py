@@ -245,6 +245,7 @@ def test_the_noise_of_wheels_is_learnt_of_a_rough_selection_and_all_that_is_smoo
         wheels_of(motor_lag=0.15, drive=((0, 4), (3, 3), (0, 0)) * 6), np.array(GEOMETRY), WHEEL.neutral
     )
     chosen = of_rough_and_smooth(found, noted, WHEEL)
+    settings = DEFAULT_SETTINGS.selection
     # Heavy tails are those of wheels of which one turns at least.
     ((white, use, of, limits),) = noted.tails
     turning = (
@@ -253,7 +254,7 @@ def test_the_noise_of_wheels_is_learnt_of_a_rough_selection_and_all_that_is_smoo
     np.testing.assert_array_equal(use, found.channel.gains.use & turning.any(axis=1))
     assert turning.any(axis=1).mean() > turning.all(axis=1).mean() + 0.2
     np.testing.assert_array_equal((white * found.channel.weight).ravel(), found.richest)
-    assert of is DEFAULT_SETTINGS
+    assert of is settings
     assert limits is chosen.thresholds
 
 
@@ -288,10 +289,11 @@ def test_the_noise_of_a_body_is_learnt_of_a_rough_selection_and_all_that_is_smoo
     channel, line = body_channel(turn_slip=0.08)
     found = search_body(line, channel.neutral)
     chosen = of_rough_and_smooth(found, noted, BODY)
+    settings = DEFAULT_SETTINGS.selection
     ((white, use, of, limits),) = noted.tails
     assert use is found.channel.use
     np.testing.assert_array_equal((white * found.channel.weight).ravel(), found.richest)
-    assert of is DEFAULT_SETTINGS
+    assert of is settings
     assert limits is chosen.thresholds
 
 

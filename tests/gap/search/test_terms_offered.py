@@ -19,7 +19,7 @@ from disco_hw.gap.search.unnamed_terms import (
     wheel_terms,
     with_known_terms,
 )
-from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, FitSettings, GridSettings, TermSettings
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, FitSettings, TermSettings
 from disco_hw.model import EffectSetting
 from tests.gap.synthetic import GEOMETRY, body_channel, line_of
 
@@ -81,9 +81,9 @@ def test_motion_is_that_of_the_wheels():
 
 def test_what_changes_from_one_node_to_the_next_is_smoothed_away():
     values = np.where(np.arange(400) % 2 == 0, 1.0, -1.0)
-    assert np.abs(smoothed(values, GridSettings())[20:-20]).max() < 0.02
-    assert smoothed(np.ones(400), GridSettings())[20:-20] == pytest.approx(1.0)
-    single = smoothed(np.eye(1, 101, 50)[0], GridSettings(neighbours=8))
+    assert np.abs(smoothed(values, TermSettings())[20:-20]).max() < 0.02
+    assert smoothed(np.ones(400), TermSettings())[20:-20] == pytest.approx(1.0)
+    single = smoothed(np.eye(1, 101, 50)[0], TermSettings(smooth_nodes=8))
     # Half a wave of a cosine over eight nodes either side.
     share = 0.5 * (1.0 + np.cos(np.pi * np.arange(-8, 9) / 8.0))
     np.testing.assert_allclose(single[42:59], share / share.sum(), atol=1e-12)

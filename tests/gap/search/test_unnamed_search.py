@@ -525,7 +525,7 @@ def test_only_samples_that_are_used_and_say_something_tell_of_tails():
     some = np.array([[3.0, 3.0]] * 9 + [[0.5, 0.5]] * 32)
     plain = heavy(some)
     silent = np.zeros((500, 2))
-    silent[:, 1] = 0.9e-5
+    silent[:, 1] = 0.0009
     assert heavy(np.vstack([some, silent])) == plain
     # One of the two is enough.
     assert heavy(np.vstack([some, [[0.0, 0.5]] * 10])) != plain
