@@ -94,7 +94,7 @@ def find_gap(
     named, unnamed = effect_findings(analysis, final), unnamed_findings(analysis)
     effects, doubtful = classify_findings(named, Measured.of(analysis, final))
     spots = blind_spot_findings(analysis, named, top_rad_s)
-    claims = boldest_claims(spots, settings.report.most_listed) if prove else ()
+    claims = boldest_claims(spots, settings.report.proved_claims) if prove else ()
     if claims:
         report_progress(
             f"proof of what this log shows: {', '.join(claim.name for claim in claims)} put in and searched for"

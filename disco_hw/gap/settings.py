@@ -30,13 +30,14 @@ class GridSettings:
     """Of a longer drive so much is judged, stretches with commands first. Chosen: it bounds how long a search takes."""
     stretch_s: float = 20.0
     """Length of the stretches that are picked of a long drive. Chosen: several manoeuvres each."""
+    longest_silence_s: float = 1.5
+    """Where wheel samples fail to come for longer a run ends, where poses do a window. Chosen."""
     speed_span_s: float = 0.03
     """Speeds are differences of the angle over so long either side, s. Chosen: a few encoder periods."""
     even_samples: int = 10
     """Time stamps are made even over so many neighbours either side. Chosen."""
     longest_response_s: float = 1.5
-    """Wheels answer a command within this time. Where wheel samples fail to come for longer a run ends, where poses do
-    a window. Chosen."""
+    """Wheels answer a command within this time. Chosen."""
     rest_rad_s: float = 0.05
     """Wheels that turn more slowly rest, and commands below ask for nothing. Chosen."""
     turning_rad_s: float = 0.3
@@ -50,17 +51,21 @@ class GridSettings:
     """Wheel speeds of which more than this share repeat the last one are held. Chosen: a Husky's do in most samples."""
     repeated_periods: float = 4.0
     """A value that is repeated for longer than so many periods was measured again. Chosen."""
+    lead_s: float = 1.0
+    """After a run's start so long nothing is predicted, as what was commanded before is not known. Shorter runs are
+    left out. Chosen."""
     lead_share: float = 0.25
     """And of a short run so much of it at most. Chosen: windows of 2 s are predicted 1 s ahead."""
     start_every_s: float = 0.2
     """Predictions start so far apart. Chosen: neighbours then differ, and a minute has 300."""
-    most_delay_s: float = 1.0
-    """Poses are stamped, and commands answered, at most so much too early or too late, and after a run's start nothing
-    is predicted for so long, as what was commanded before is not known. Shorter runs are left out. Chosen."""
+    most_pose_delay_s: float = 1.0
+    """Poses are stamped at most so much too early or too late. Chosen: a pose that is later than that is of no use."""
     delay_step_s: float = 0.02
     """The delay of poses is scanned in steps of this. Chosen: between them a parabola is exact enough to begin with."""
     lags_s: tuple[float, ...] = (0.02, 0.04, 0.06, 0.09, 0.13, 0.18, 0.25, 0.35, 0.5, 0.7, 1.0)
     """Lags behind which the delay of commands is scanned. Chosen: as close as the delay can tell them apart."""
+    lag_reach_s: float = 0.15
+    """So far about the delay that is as long in all. Chosen: a lag is not quite as late as a delay of its length."""
     most_command_pairs: int = 3000
     """About so many pairs of samples are compared in it at most. Chosen: more say no more, and take longer."""
     delay_span_s: float = 0.4
@@ -80,8 +85,8 @@ class GridSettings:
     least_clock_nats: float = 0.02
     """And the whole log fits by so much per pose better with it. Measured: drifting clocks 0.04 to 0.8."""
     least_link_error_s: float = 0.15
-    """Of commands a smaller error of the clock is none, and so far about a delay behind one lag is that behind another.
-    Measured: lags that differ from turn to turn make 0.05 of an even link, a drive that ramps by 9 rad/s^2 0.105."""
+    """Of commands a smaller one is none. Measured: lags that differ from turn to turn make 0.05 of an even link, and a
+    drive that ramps by 9 rad/s^2 makes 0.105."""
     least_delay_nats: float = 0.05
     """A delay, and a drift or jump of the commands' clock, stands out by so much per pose or pair. Measured: delays on
     steady circles 0.4, of a robot that turns about 3; even links 0.046 at most."""
@@ -110,8 +115,8 @@ class NoiseSettings:
     huber: float = 3.0
     """Whitened residuals beyond grow linearly. Literature: Huber's loss (1964); the size is chosen."""
     steady_s: float = 0.3
-    """Half the span over which speeds are averaged where there is no model to say what to expect, over which errors
-    that are alike at every speed are measured, and over which a start pose is averaged. Chosen: several readings."""
+    """Half the span over which speeds are averaged where there is no model to say what to expect, and over which errors
+    that are alike at every speed are measured. Chosen: several readings."""
     even_huber: float = 1.345
     """Of them those beyond so many times their size grow linearly. Literature: 95 % efficient (Huber, 1964)."""
     prior_sd: float = 2.0
@@ -121,11 +126,11 @@ class NoiseSettings:
     wheel_iterations: int = 25
     """Steps of the search for the wheels' noise at most. Chosen: it is flat by then."""
     outlier: float = 5.0
-    """Poses beyond so many standard deviations are left out, differences of samples count as that much, and a value
-    that other folds fix so surely is used, however few its data. Chosen: one in two million by chance."""
+    """Poses beyond so many standard deviations are left out, differences of samples count as that much. Chosen: one in
+    two million by chance."""
     poor_fit: float = 1.5
     """Mean square of whitened residuals from which on a fit or a regime disagrees, plainer noise is assumed, and a
-    stretch is weighed down; and the most by which heavy tails raise scores. Chosen: noise alone has one."""
+    stretch is weighed down. Chosen: noise alone has one."""
     smooth_samples: int = 25
     """The local size of residuals is a mean over so many samples either side. Chosen."""
     command_jitter_ratio: float = 2.0
@@ -152,12 +157,10 @@ class FitSettings:
     least_known_share: float = 1e-3
     """A part of a log with less of the information about a parameter says nothing of it. Chosen."""
     part_known_share: float = 0.2
-    """A part of a log, or a regime, says nothing of a parameter of which it has less of its share of the information,
-    nor does a log of a patch outside of which less of all turning was done. Chosen."""
+    """A part of a log, or a regime, says nothing of a parameter of which it has less of its share of the information.
+    Chosen."""
     ridge: float = 1e-2
     """Ridge of the richest model, on columns of unit length. Chosen: columns that look alike stay small."""
-    expected_share: float = 0.1
-    """Geometry of the whole chain and slow waves of the ground are expected within this share. Chosen."""
     rounds: int = 2
     """How often the noise, or the weight of errors, is learnt anew from what a fit leaves. Chosen: it is settled by
     then."""
@@ -185,6 +188,9 @@ class SelectionSettings:
     unnamed_score: float = 20.0
     """Score that a term without a name takes at least, and a name before the noise is learnt. Measured: with both
     scores, nothing was named in 446 of 450 logs with nothing hidden."""
+    heaviest: float = 1.5
+    """Scores are raised by up to this factor where the noise has heavy tails. Chosen: noise in bursts wanders too, more
+    slowly than any block could show."""
     clipped_at: float = 6.0
     """Whitened residuals beyond do not raise it further. Chosen."""
     silent: float = 1e-3
@@ -200,7 +206,7 @@ class SelectionSettings:
     """Neighbouring blocks taken as one for the sandwich variance. Chosen: 3, 9 and 27 s."""
     sure_sigmas: float = 3.0
     """What differs by so many standard deviations is no chance: parts of a log, logs, regimes and their noise, the two
-    channels' opinions of an encoder. So far channels are trusted when the whole chain is fitted. Chosen: one in 370."""
+    channels' opinions of an encoder. Chosen: one in 370."""
     clearly_closer: float = 0.7
     """Such a fit is told where its deviations, in the geometric mean, are so many times those of the other. Chosen:
     less may be chance."""
@@ -212,6 +218,10 @@ class SelectionSettings:
 class TermSettings:
     """Unnamed terms, and patches of the floor."""
 
+    most_terms: int = 3
+    """More terms are not added. Chosen."""
+    least_independent_share: float = 0.1
+    """A term of which what is fitted already does the rest is left out: it would only pull against it. Chosen."""
     worth_trying_nats: float = 18.0
     """Gain to first order from which on a term is fitted. Chosen: below what acceptance takes."""
     most_tried: int = 4
@@ -219,6 +229,8 @@ class TermSettings:
     may gain nothing, and the next all of it."""
     waves: int = 8
     """How many cosines of the time ground may vary by, the slowest. Chosen: of 150 s, down to a period of 37 s."""
+    usual_wave: float = 0.1
+    """Standard deviation that is expected of each, as a share of the speed. Chosen."""
     smooth_nodes: int = 8
     """Accelerations are taken of speeds over so many nodes either side. Chosen: a tenth of a second."""
     disc_radii_m: tuple[float, ...] = (0.5, 0.75, 1.0, 1.3)
@@ -228,7 +240,9 @@ class TermSettings:
     disc_size_steps_m: tuple[float, ...] = (-0.15, -0.05, 0.0, 0.05, 0.15)
     """And of the radius. Chosen."""
     least_inside: float = 0.03
-    """Share of all turning that must lie inside a patch, at least. Chosen."""
+    """Share of all turning that must lie inside a patch. Chosen."""
+    most_inside: float = 0.8
+    """And at most. Chosen: outside of it the floor must be known too."""
     largest_floor_m2: float = 60.0
     """On larger floors no patch is sought. Chosen: there would be too many."""
 
@@ -254,10 +268,20 @@ class PredictionSettings:
     """Stretches that are left out in turn. Chosen: of seven blocks, longer than `DRIFT_S`."""
     short_folds: Folds = Folds(9.0, 4)
     """Those of logs shorter than six of these stretches, as half of a minute's log is too little to learn from. Chosen
-    on halves of twelve logs of a small robot; learnt from thirds of 15 logs of three robots, so divided 7 of 90 offered
-    models were worse than `timed`, and 10 as longer logs are; better by a fifth 15 either way."""
+    on halves of twelve logs of a small robot; learnt from thirds of 15 logs of three robots, so
+    divided 7 of 90 offered models were worse than `timed`, and 10 as longer logs are; better by a fifth 15 either way.
+    """
+    pose_reach_s: float = 0.3
+    """A start pose is averaged over so long either side. Chosen."""
+    fixed_sigmas: float = 5.0
+    """A value that the other folds fix to so many standard deviations is used, however few its data. Chosen."""
     resamples: int = 400
     """Bootstrap draws of an interval. Chosen."""
+    rough_geometry: float = 0.1
+    """Without effects the geometry of the whole chain is that of the body within this share. Chosen."""
+    joint_trust: float = 3.0
+    """Before the whole chain is fitted, channels are trusted to so many of their standard deviations. Measured: halves
+    of real logs predict each other best with 3 to 10."""
     delay_far_s: float = 0.2
     """Where `timed` has a delay or a lag so far from that of the wheels' channel, the last fit begins from either.
     Chosen: a ramp of seconds makes a lag of a second, and a fit that begins there ends there."""
@@ -277,11 +301,12 @@ class PredictionSettings:
 class ReportSettings:
     """Settings of the report on remaining disagreements and on effects that a log could not show."""
 
+    proved_claims: int = 3
+    """So many claims of what a log shows are proved by putting the effect in. Chosen: each takes a search or two."""
     speeding_rad_s2: float = 2.0
     """Growth of the wheels' speed from which on they speed up or brake. Chosen."""
     most_listed: int = 3
-    """So many regimes, the loudest, names and unnamed terms are told at most, and claims of what a log shows are
-    proved. Chosen."""
+    """So many regimes, the loudest, and names are listed at most. Chosen."""
     end_share: float = 0.01
     """Commands that come early or late by this close to the most that is plausible do so by more. Chosen."""
     wide_share: float = 0.5
@@ -296,7 +321,7 @@ class ReportSettings:
     """By so many standard deviations. Chosen: of some twenty comparisons in a log one in a hundred logs by chance."""
     worth_share: float = 0.1
     """A value that changes by less of itself is the same to whoever drives; a name that takes less of what its channel
-    lacks, where it still disagrees, is disputed, and a term that is so much its own is not tried. Chosen."""
+    lacks, where it still disagrees, is disputed. Chosen."""
     differ_share: float = 0.03
     """Logs of one robot differ in its geometry by so much of it at least. Chosen: another floor changes more."""
 

@@ -10,6 +10,7 @@ from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.gap.search.selection import Selector, body_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from tests.gap.synthetic import LIMITS, body_channel
+from tools.gap.ablation import rule_table
 from tools.gap.rules import RULES, counting, without
 
 
@@ -36,3 +37,18 @@ def test_a_rule_counts_where_its_answer_is_another_and_is_silent_without():
         assert not judge.is_weakly_known(parameter, wide, DEFAULT_SETTINGS.report)
     with pytest.raises(KeyError), without("no such rule"):
         pass
+
+
+def test_the_table_has_each_rule_and_compares_where_it_decides():
+    name = RULES[0].name
+    usual = {
+        "kind": "single", "hidden": ["motor_lag"], "seed": 31, "named": ["motor_lag"], "unnamed": [], "residue": 0,
+        "blind": [], "refitted_mm": 20.0, "amended_mm": 5.0, "floor_mm": 4.0, "errors": [], "covered": [], "cpu_s": 1.0,
+        "timed_mm": 10.0,
+    }  # fmt: skip
+    never, once = ({rule.name: [3, int(decides and rule.name == name)] for rule in RULES} for decides in (False, True))
+    other = {**usual, "named": [], "amended_mm": 10.0}
+    lines = [*rule_table({"a": ({"usual": usual}, never), "b": ({"usual": usual, name: other}, once)})]
+    assert len(lines) == 2 + len(RULES)
+    assert lines[2] == f"| {name} | 1 of 2 | 0 | 1 | 1.000 | 0.500 | 1 |"
+    assert lines[3] == f"| {RULES[1].name} | 0 of 2 | | | | | |"

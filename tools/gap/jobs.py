@@ -156,7 +156,7 @@ def jobs(kind: str, seeds: Iterable[int]) -> Iterator[Job]:
 
 def work(job: Job, settings: GapSettings = DEFAULT_SETTINGS) -> Result:
     """Make one log and search it."""
-    log, model = log_of(job), Model(*strange_robot.NOMINAL) if job.kind == "strange" else MODEL
+    log, model = _log(job), Model(*strange_robot.NOMINAL) if job.kind == "strange" else MODEL
     began = time.process_time()
     report = find_gap(log, model, top_rad_s=LARGEST_RAD_S, settings=settings)
     cpu_s = time.process_time() - began
@@ -181,8 +181,7 @@ def work(job: Job, settings: GapSettings = DEFAULT_SETTINGS) -> Result:
     )  # fmt: skip
 
 
-def log_of(job: Job) -> DriveLog:
-    """Make the log of a job."""
+def _log(job: Job) -> DriveLog:
     if job.kind == "strange":
         return strange_robot.record(next(iter(job.hidden)), job.seed).log
     circle = job.kind in ("circle", "asked")

@@ -301,7 +301,7 @@ def injected_floor(recording: Recording) -> tuple[float, float]:
     The start is a mean of the poses within reach of it, the end a single pose.
     """
     period_s = float(np.median(np.diff(recording.pose_s)))
-    reach, ahead = round(DEFAULT_SETTINGS.noise.steady_s / period_s), round(AHEAD_S / period_s)
+    reach, ahead = round(DEFAULT_SETTINGS.prediction.pose_reach_s / period_s), round(AHEAD_S / period_s)
     window = np.ones(2 * reach + 1) / (2 * reach + 1)
     start = np.column_stack([np.convolve(each, window, "valid") for each in recording.noise.T])[: -ahead - reach]
     end = recording.noise[reach + ahead :][: len(start)]

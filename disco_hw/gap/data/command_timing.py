@@ -170,7 +170,7 @@ class Response:
 def response(turned: Turned, commands: Commands, settings: GridSettings) -> Response:
     """Estimate the delay and the lag with which both commands explain the turning of the wheels best.
 
-    Scanned over delays of +-`most_delay_s` behind a few lags; about the best, wherever that lies between the steps
+    Scanned over delays of +-`most_pose_delay_s` behind a few lags; about the best, wherever that lies between the steps
     of the scan, over delays that are as long in all behind each of `lags_s`. Delays at which commands are known for
     less than three quarters of the pairs are left out: they would be judged by another part of the log.
     """
@@ -178,7 +178,7 @@ def response(turned: Turned, commands: Commands, settings: GridSettings) -> Resp
         return Response()
     responses = {lag_s: WheelResponse.of(commands, lag_s) for lag_s in (0.0, *settings.lags_s)}
     step_s, coarse_s = settings.delay_step_s, 2.0 * settings.delay_step_s
-    delays = scanned_delays(settings.most_delay_s, coarse_s)
+    delays = scanned_delays(settings.most_pose_delay_s, coarse_s)
     most = max(int(responses[0.0].known(turned, delay_s).sum()) for delay_s in delays.tolist())
     fewest = max(settings.fewest_samples, 3 * most // 4)
     scanned = {lag_s: responses[lag_s].mismatches(turned, delays, fewest) for lag_s in (0.0, *settings.lags_s[1::3])}
@@ -192,7 +192,7 @@ def response(turned: Turned, commands: Commands, settings: GridSettings) -> Resp
     centre_s, _ = responses[lag_s].best(turned, float(delays[least]), coarse_s, fewest)
     near = {}
     for other_s, response_model in responses.items():
-        about = centre_s + lag_s - other_s + scanned_delays(settings.least_link_error_s, step_s)
+        about = centre_s + lag_s - other_s + scanned_delays(settings.lag_reach_s, step_s)
         mismatch = response_model.mismatches(turned, about, fewest)
         near[other_s] = float(mismatch.min()), float(about[int(np.argmin(mismatch))])
     # Between steps some fit better than where the scan met them.
@@ -204,7 +204,7 @@ def response(turned: Turned, commands: Commands, settings: GridSettings) -> Resp
             if best < found.mismatch:
                 found = Response(delay_s, other_s, best, other_s < max(settings.lags_s))
     deep = float(np.median(ordinary)) - found.mismatch >= settings.least_delay_nats
-    shown = deep and responses[found.lag_s].is_distinct(turned, found.delay_s, settings.least_link_error_s)
+    shown = deep and responses[found.lag_s].is_distinct(turned, found.delay_s, settings.lag_reach_s)
     return found if shown else Response(known=False)
 
 

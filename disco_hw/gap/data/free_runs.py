@@ -283,9 +283,7 @@ def starts_of(first: NDArray[np.bool_], usable: NDArray[np.bool_], ahead_s: floa
     begins = np.flatnonzero(first)
     ends = np.append(begins[1:], first.size)
     # What was commanded before a run is not known, and late wheels still follow it.
-    lead = np.minimum(
-        round(settings.most_delay_s / GRID_STEP_S), (settings.lead_share * (ends - begins)).astype(np.int64)
-    )
+    lead = np.minimum(round(settings.lead_s / GRID_STEP_S), (settings.lead_share * (ends - begins)).astype(np.int64))
     bad = np.concatenate([[0], np.cumsum(~usable)])
     found = [np.arange(lo + at, hi - ahead - 1, stride) for lo, at, hi in zip(begins, lead, ends, strict=True)]
     start = np.concatenate(found) if found else np.empty(0, dtype=np.int64)

@@ -230,7 +230,7 @@ def _timed(log: DriveLog, wheels: Wheels, settings: GridSettings) -> _Timed:
     if not aligned_commands.known:
         text = (
             f"wheels answer commands more slowly than behind a lag of {max(settings.lags_s):g} s, or more than "
-            f"{settings.most_delay_s:g} s late or early, or commands hardly change: how late commands are stamped "
+            f"{settings.most_pose_delay_s:g} s late or early, or commands hardly change: how late commands are stamped "
             "is not known from this log"
         )
         notes = (*notes, text)
@@ -290,10 +290,10 @@ def _runs(t_s: Array, segment: Index, settings: GridSettings) -> list[tuple[int,
     """Stretches of one segment without silence, as half-open index ranges."""
     if t_s.size < 2:
         return []
-    breaks = np.flatnonzero((np.diff(segment) != 0) | (np.diff(t_s) > settings.longest_response_s)) + 1
+    breaks = np.flatnonzero((np.diff(segment) != 0) | (np.diff(t_s) > settings.longest_silence_s)) + 1
     edges = [0, *breaks.tolist(), t_s.size]
     pairs = pairwise(edges)
-    return [(lo, hi) for lo, hi in pairs if hi - lo > 2 and t_s[hi - 1] - t_s[lo] >= settings.most_delay_s]
+    return [(lo, hi) for lo, hi in pairs if hi - lo > 2 and t_s[hi - 1] - t_s[lo] >= settings.lead_s]
 
 
 def _commanded(commands: Commands, wheels: Wheels) -> Mask:
@@ -332,7 +332,7 @@ def _spread(
             pieces[-1] = (pieces[-1][0], hi)
         else:
             pieces.append((lo, hi))
-    return [(lo, hi) for lo, hi in pieces if t_s[hi - 1] - t_s[lo] >= settings.most_delay_s]
+    return [(lo, hi) for lo, hi in pieces if t_s[hi - 1] - t_s[lo] >= settings.lead_s]
 
 
 def _locate(t_s: Array, grid: Array, offset: int, block_s: float) -> GridSamples:

@@ -81,7 +81,7 @@ def pose_clock(wheels: Wheels, poses: Poses, settings: GridSettings) -> StampClo
 def pose_delay_s(wheels: Wheels, poses: Poses, settings: GridSettings) -> float:
     """Estimate the delay (s) at which poses and wheels agree best: positive where poses are older than their stamps.
 
-    Scanned over +-`most_delay_s`: for each delay the turns and ways between poses `delay_span_s` apart are fitted
+    Scanned over +-`most_pose_delay_s`: for each delay the turns and ways between poses `delay_span_s` apart are fitted
     by those of the wheels (two regressions, robust by Huber's weights; their likelihoods, with unknown variances, are
     added). 0 where the poses are too few or where no delay stands out.
     """
@@ -166,7 +166,7 @@ def scanned_delays(most_s: float, step_s: float) -> Array:
 
 def most_distinct_delay(mismatches: Callable[[Array], Array], step_s: float, settings: GridSettings) -> float | None:
     """Return the delay (s) of the least mismatch, of all that are scanned in such steps; None if none stands out."""
-    delays = scanned_delays(settings.most_delay_s, step_s)
+    delays = scanned_delays(settings.most_pose_delay_s, step_s)
     mismatch = mismatches(delays)
     best, ordinary = int(np.argmin(mismatch)), mismatch[np.isfinite(mismatch)]
     if not ordinary.size or float(np.median(ordinary)) - mismatch[best] < settings.least_delay_nats:

@@ -411,11 +411,7 @@ def _windows(drive: GriddedDrive) -> tuple[Index, Mask]:
     number = np.zeros(t.size, dtype=np.int64)
     current, begin = 0, 0
     for k in range(1, t.size):
-        if (
-            run[k] != run[k - 1]
-            or t[k] - t[begin] > block_s
-            or t[k] - t[k - 1] > drive.settings.grid.longest_response_s
-        ):
+        if run[k] != run[k - 1] or t[k] - t[begin] > block_s or t[k] - t[k - 1] > drive.settings.grid.longest_silence_s:
             current, begin = current + 1, k
         number[k] = current
     sizes = np.bincount(number, minlength=current + 1)

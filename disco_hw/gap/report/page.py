@@ -311,7 +311,7 @@ def _by_regime(report: GapReport) -> str:
 def _candidates(report: GapReport) -> str:
     rows = [(c.channel, c.name, f"{c.gain:.1f}", f"{c.score:.1f}", c.verdict) for c in report.candidates]
     selection = report.settings.selection
-    most = selection.named_score * report.settings.noise.poor_fit
+    most = selection.named_score * selection.heaviest
     score = f"score ({selection.named_score:g} accepts, up to {most:g} where the noise has heavy tails)"
     return _table(("channel", "effect", "gain, nats", score, "verdict"), rows)
 

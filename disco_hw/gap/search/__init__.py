@@ -171,7 +171,7 @@ class _Candidate:
     @classmethod
     def of_channels(cls, analysis: GapAnalysis, apart: StagePredictions) -> _Candidate:
         """All that was found, from where the channels apart have it."""
-        trust, final = apart.body.settings.selection.sure_sigmas**-2.0, final_fit(analysis)
+        trust, final = apart.body.settings.prediction.joint_trust**-2.0, final_fit(analysis)
         fits = _all_fits(analysis, final)
 
         def chain(vectors: Sequence[Array]) -> Chain:
@@ -324,7 +324,7 @@ def _information(found: Fit, channel: BodyChannel | WheelChannel, left_out: int)
 def _roughly(channel: BodyChannel | WheelChannel, found: Fit) -> Array:
     """Return a weak prior that keeps the geometry near the body's, for logs with few commands; zero for the rest."""
     known = np.zeros(len(found.active))
-    share = channel.settings.fit.expected_share
+    share = channel.settings.prediction.rough_geometry
     known[: len(channel.free)] = (share * found.vector[[0, 1, 1]][: len(channel.free)]) ** -2.0
     return np.diag(known)
 

@@ -35,7 +35,7 @@ from disco_hw.gap.search.richest_model import (
 )
 from disco_hw.gap.search.selection import Names, Selector, Thresholds, body_moves, wheel_moves
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms, body_terms, places, places_near, wheel_terms
-from disco_hw.gap.settings import GapSettings
+from disco_hw.gap.settings import SelectionSettings
 
 # Fourth moment of normal noise over its variance squared.
 _GAUSSIAN_KURTOSIS = 3.0
@@ -67,7 +67,7 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
     def searched(channel: WheelChannel) -> ChannelResult:
         white = whiten_wheels(left, channel.gains)
         rolling = np.abs(drive.speed_rad_s[drive.encoder.node]).max(axis=1) > drive.settings.grid.rest_rad_s
-        limits = _thresholds(white, channel.gains.use & rolling, drive.settings)
+        limits = _thresholds(white, channel.gains.use & rolling, settings)
         selector = timed(Selector(channel, moves, limits, given=given, start=rough.fit(given).vector))
         selector.fits[frozenset(names)] = fit(channel, rough.fit(names).vector, indices(channel, names))
         richest = (white * channel.weight).ravel()
@@ -186,7 +186,7 @@ def search_body(drive: GriddedDrive, start: Array, given: Names = ()) -> Channel
     channel = learn_body_noise(channel, vector)
     perturbations = _body_perturbations(channel, rich, vector)
     channel, fullest, extra, many = learn_saturated_body(channel, rich, vector, perturbations)
-    limits = _thresholds(channel.whitened(fullest, extra), channel.use, drive.settings)
+    limits = _thresholds(channel.whitened(fullest, extra), channel.use, settings)
     selector = timed(Selector(channel, body_moves(channel), limits, given=given, start=rough.fit(given).vector))
     richest = channel.residual(fullest, extra)
     found = ChannelResult(selector, selector.select(), channel, richest=richest, richest_parameters=many)
@@ -227,18 +227,18 @@ def _body_perturbations(channel: BodyChannel, names: Names, vector: Array) -> It
     yield from (disc.perturbation for disc in discs)
 
 
-def _thresholds(white: Array, use: NDArray[np.bool_], all_settings: GapSettings) -> Thresholds:
+def _thresholds(white: Array, use: NDArray[np.bool_], settings: SelectionSettings) -> Thresholds:
     """Thresholds for a channel: the heavier the noise's tails, the more it takes.
 
     Noise that comes in bursts wanders too, more slowly than any block that could show it.
     """
-    settings, sound = all_settings.selection, white[use]
+    sound = white[use]
     sound = sound[np.abs(sound).max(axis=1) > settings.silent]
     if not sound.size:
         return Thresholds(settings.named_score, settings.least_moved_m, settings.unnamed_score)
     sound = np.clip(sound / np.sqrt((sound**2).mean()), -settings.clipped_at, settings.clipped_at)
     heavy = float((sound**4).mean()) / _GAUSSIAN_KURTOSIS
-    times = min(max(heavy, 1.0), all_settings.noise.poor_fit)
+    times = min(max(heavy, 1.0), settings.heaviest)
     return Thresholds(times * settings.named_score, settings.least_moved_m, times * settings.unnamed_score)
 
 
@@ -261,7 +261,7 @@ def with_unnamed(found: ChannelResult, options: Callable[[ChannelResult], Iterat
     be drawn.
     """
     patches = True
-    while len(found.unnamed) < found.channel.settings.report.most_listed:
+    while len(found.unnamed) < found.channel.settings.terms.most_terms:
         larger, patches = _with_one_more(found, options, patches)
         if larger is None:
             break
@@ -374,7 +374,7 @@ def best_terms(small: Fit, channel: ResidualChannel, options: Iterator[Term]) ->
         across = small.jacobian.T @ slope
         information = slope.T @ slope - across.T @ solved @ across
         pull = slope.T @ small.residual - across.T @ solved @ gradient
-        if np.trace(information) < channel.settings.report.worth_share * float((slope**2).sum()):
+        if np.trace(information) < settings.least_independent_share * float((slope**2).sum()):
             continue
         coefficients = -inverse(information) @ pull
         gain = -0.5 * float(pull @ coefficients) - 0.5 * (len(columns) - 1) * math.log(channel.count)

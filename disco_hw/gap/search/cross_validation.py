@@ -99,11 +99,11 @@ class Chain:
 def smoothed_poses(channel: BodyChannel, p: Array) -> tuple[Array, Array]:
     """Return the poses at all nodes, smoothed along the wheels' path, and those from the nearest sample alone.
 
-    Both are (M, 3) in m, m and rad, and NaN where no sample is near. Smoothing averages over `steady_s` on
+    Both are (M, 3) in m, m and rad, and NaN where no sample is near. Smoothing averages over `pose_reach_s` on
     either side.
     """
     drive, samples = channel.drive, channel.samples
-    reach_s = channel.settings.noise.steady_s
+    reach_s = channel.settings.prediction.pose_reach_s
     track = channel.track(p)
     at = np.empty((samples.t_s.size, 3))
     read_angles(track, samples.node, samples.fraction, at)
@@ -252,7 +252,7 @@ def fold_vectors(found: Fit, fold: Index, count: int, neutral: Array, settings: 
         vector, others = found.vector.copy(), np.delete(normal, place, axis=0).sum(axis=0)
         pulled = np.delete(gradient, place, axis=0).sum(axis=0) + pull
         determined = known(others, normal.sum(axis=0), settings.fit)
-        determined |= np.diag(others) * vector[active] ** 2 > settings.noise.outlier**2
+        determined |= np.diag(others) * vector[active] ** 2 > settings.prediction.fixed_sigmas**2
         here = (others + np.diag(precision))[np.ix_(determined, determined)]
         vector[active[determined]] -= inverse(here) @ pulled[determined]
         vector[active[~determined]] = neutral[active[~determined]]
@@ -321,7 +321,7 @@ def floor_errors(body: BodyChannel, noise: SensorNoise, ahead_s: float, poses: t
     settings = body.settings.prediction
     period_s = max(float(np.median(np.diff(body.samples.t_s))), 1e-3)
     # The start is a mean over all poses within reach, the end a single one.
-    averaged = max(2.0 * body.settings.noise.steady_s / period_s, 1.0)
+    averaged = max(2.0 * settings.pose_reach_s / period_s, 1.0)
     size = np.array([noise.position_m, noise.position_m, noise.yaw_rad])
     cosine, sine = np.cos(starts.pose[:, 2]), np.sin(starts.pose[:, 2])
     dx, dy = starts.end[:, 0] - starts.pose[:, 0], starts.end[:, 1] - starts.pose[:, 1]

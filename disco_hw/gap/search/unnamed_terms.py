@@ -139,10 +139,7 @@ def _waves(drive: GriddedDrive, v: Array, w: Array) -> Iterator[Term]:
     for axis, speed, name in ((0, v, "v_x += {:.2g} v"), (2, w, "omega += {:.2g} omega")):
         first, *others = (_on(axis, wave * speed) for wave in waves)
         yield Term(
-            f"{name} times what varies slowly with time",
-            first,
-            further_waves=tuple(others),
-            usual=drive.settings.fit.expected_share,
+            f"{name} times what varies slowly with time", first, further_waves=tuple(others), usual=settings.usual_wave
         )
 
 
@@ -222,7 +219,7 @@ def _where(channel: BodyChannel) -> tuple[Array, Array]:
 def _discs(channel: BodyChannel, p: Array, discs: Iterable[tuple[float, float, float]]) -> Iterator[Term]:
     """Yield terms for the discs inside and outside of which much of all turning was done."""
     x, y = _where(channel)
-    least, most = channel.settings.terms.least_inside, 1.0 - channel.settings.fit.part_known_share
+    settings = channel.settings.terms
     speed = channel.drive.speed_rad_s
     w = p[0] / p[1] * (speed[:, 1] - speed[:, 0])
     turning = np.abs(w)
@@ -232,7 +229,7 @@ def _discs(channel: BodyChannel, p: Array, discs: Iterable[tuple[float, float, f
         if centre != (centre_x, centre_y):
             centre, squares = (centre_x, centre_y), (x - centre_x) ** 2 + (y - centre_y) ** 2
         inside = squares < radius * radius
-        if least < float(turning @ inside) / turned < most:
+        if settings.least_inside < float(turning @ inside) / turned < settings.most_inside:
             where = f"within {radius:.2f} m of ({centre_x:.2f}, {centre_y:.2f}) m"
             perturbation = _on(2, np.where(inside, w, 0.0))
             disc = (float(centre_x), float(centre_y), float(radius))

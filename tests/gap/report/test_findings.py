@@ -123,8 +123,8 @@ def test_a_log_of_short_stretches_says_that_it_does_not_tell_the_gap():
 
 
 def test_the_page_names_the_score_that_a_name_takes():
-    least = DEFAULT_SETTINGS.selection.named_score
-    accepts = f"score ({least:g} accepts, up to {DEFAULT_SETTINGS.noise.poor_fit * least:g} where"
+    selection = DEFAULT_SETTINGS.selection
+    accepts = f"score ({selection.named_score:g} accepts, up to {selection.heaviest * selection.named_score:g} where"
     assert accepts in page(report(0.014))
 
 

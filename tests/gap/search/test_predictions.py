@@ -25,7 +25,7 @@ from disco_hw.gap.search.cross_validation import (
     summarise,
 )
 from disco_hw.gap.search.least_squares import Fit
-from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, NoiseSettings, PredictionSettings
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, PredictionSettings
 from tests.gap.synthetic import GEOMETRY, NOISE, line_of
 
 RADIUS_M, AXLE_M, X_ICR_M = GEOMETRY
@@ -90,7 +90,7 @@ def test_poses_at_rest_are_averaged_within_their_reach_and_their_run_and_taken_a
 
 def test_poses_at_the_end_of_their_reach_count_and_thin_ones_of_either_side():
     line = line_of(np.zeros((800, 2)))
-    line = replace(line, settings=replace(line.settings, noise=NoiseSettings(steady_s=0.25)))
+    line = replace(line, settings=replace(line.settings, prediction=PredictionSettings(pose_reach_s=0.25)))
     poses = np.array([0, 25, 50, 80, 200, 260])
     samples = GridSamples(poses, np.zeros(6), line.t_s[poses], np.zeros(6, dtype=int))
     smooth, alone = smoothed_poses(

@@ -19,7 +19,7 @@ from disco_hw.gap.search.unnamed_terms import (
     wheel_terms,
     with_known_terms,
 )
-from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, FitSettings, TermSettings
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, TermSettings
 from disco_hw.model import EffectSetting
 from tests.gap.synthetic import GEOMETRY, body_channel, line_of
 
@@ -250,9 +250,7 @@ def test_a_patch_holds_more_than_the_least_and_less_than_the_most_of_all_turning
     # Three quarters of it in one spot and the rest in another, at 1 rad/s.
     line = line_of(np.repeat([[1.0, 3.0]], 400, axis=0))
     x = np.repeat([0.0, 0.0, 0.0, 3.0], 100)
-    settings = replace(
-        DEFAULT_SETTINGS, terms=TermSettings(least_inside=least), fit=FitSettings(part_known_share=1.0 - most)
-    )
+    settings = replace(DEFAULT_SETTINGS, terms=TermSettings(least_inside=least, most_inside=most))
     measured = np.column_stack([x, 0.0 * x, 0.0 * x])
     channel = SimpleNamespace(drive=line, samples=SimpleNamespace(t_s=line.t_s), measured=measured, settings=settings)
     discs = _discs(channel, np.array([0.5, 1.0]), ((spot_m, 0.0, 1.0) for spot_m in (0.0, 3.0)))

@@ -504,8 +504,7 @@ def test_the_price_of_a_patch_is_that_of_four_numbers_and_of_a_term_one():
 
 def heavy(white, use=None):
     white = np.asarray(white, dtype=float)
-    selection = SelectionSettings(named_score=4.0, unnamed_score=20.0, least_moved_m=0.002)
-    settings = replace(DEFAULT_SETTINGS, selection=selection)
+    settings = SelectionSettings(named_score=4.0, unnamed_score=20.0, least_moved_m=0.002)
     return _thresholds(white, np.ones(white.shape[0], dtype=bool) if use is None else np.asarray(use), settings)
 
 
