@@ -208,8 +208,7 @@ def _time_or_place(found: ChannelResult) -> ChannelResult:
     if set(alike) & set(placed.names) or not any(one.term.disc for one in placed.unnamed):
         return named
     better = _priced(named) - _priced(placed)
-    # A patch has several shapes to choose from, so that twice the usual evidence tells them apart.
-    clearly = 2.0 * found.channel.settings.selection.telling_nats
+    clearly = found.channel.settings.selection.telling_nats
     return replace(placed, either=alike if better < clearly else ()) if better > -clearly else named
 
 
