@@ -219,6 +219,11 @@ def prediction_error(body: BodyChannel, starts: Starts, p: Array, track: Array, 
     moved = displacement(
         p, drive.first, track, body.carried(p), starts.node, starts.pose[:, 2], ahead_s, drive.poses_moved_s
     )
+    return displacement_error(starts, moved)
+
+
+def displacement_error(starts: Starts, moved: Array) -> Array:
+    """Measured minus predicted displacement (K, 3) of any predictor, in the frame of the start: forward, left, yaw."""
     dx, dy = starts.end[:, 0] - starts.pose[:, 0], starts.end[:, 1] - starts.pose[:, 1]
     cosine, sine = np.cos(starts.pose[:, 2]), np.sin(starts.pose[:, 2])
     yaw = starts.end[:, 2] - starts.pose[:, 2] - moved[:, 2]
