@@ -185,7 +185,7 @@ def offered_stage(gap: Mapping[str, Mapping[float, PredictionErrors]], adds: boo
     errors["amended"] = gap.get("written", gap["amended"])[horizon_s]
     floor = gap["floor"][horizon_s] if "floor" in gap else None
     order = ("timed", "refitted", "amended") if adds else ("amended", "timed", "refitted")
-    return first_as_good(order, errors.__getitem__, floor)
+    return first_as_good(order, errors.__getitem__, floor, settings.report.worth_share)
 
 
 def model_of(

@@ -34,7 +34,7 @@ class PredictionErrors:
     """Root mean square at one horizon with 95 % bootstrap intervals over blocks of time.
 
     `squares` (B, 2): sums of squares of position and of yaw by block, for a comparison block by block;
-    `folds`: in how many the drive is divided; `regime_squares`: sums of squares by what the robot was doing.
+    `regime_squares`: sums of squares by what the robot was doing.
     """
 
     position_m: float
@@ -44,7 +44,6 @@ class PredictionErrors:
     wheel_rad_s: float
     by_regime_m: dict[str, float]
     squares: Array | None = field(default=None, repr=False, compare=False)
-    folds: int = field(default=2, repr=False, compare=False)
     regime_squares: Mapping[str, tuple[float, float]] = field(default_factory=dict, repr=False, compare=False)
 
     @property
@@ -283,12 +282,10 @@ def errors_of(
         error[inside] = prediction_error(body, starts, chain.body, track, ahead_s)[inside]
         there = starts.node[inside] + ahead
         speed_error[inside] = (body.drive.speed_rad_s[there] - speed[there]).mean(axis=1)
-    return summarise(error, speed_error, starts, body.settings.prediction, len(chains))
+    return summarise(error, speed_error, starts, body.settings.prediction)
 
 
-def summarise(
-    error: Array, speed_error: Array, starts: Starts, settings: PredictionSettings, folds: int = 2
-) -> PredictionErrors:
+def summarise(error: Array, speed_error: Array, starts: Starts, settings: PredictionSettings) -> PredictionErrors:
     """Root mean squares, their bootstrap intervals over blocks, and position by regime."""
     position, yaw = error[:, 0] ** 2 + error[:, 1] ** 2, error[:, 2] ** 2
     if not position.size:
@@ -306,7 +303,6 @@ def summarise(
         float(np.sqrt((speed_error**2).mean())),
         {name: float(np.sqrt(position[of].mean())) for name, of in inside.items()},
         squares,
-        folds,
         {name: (float(position[of].sum()), float(yaw[of].sum())) for name, of in inside.items()},
     )
 
@@ -399,4 +395,4 @@ def _errors(channel: WheelChannel, of: Angles, ahead_s: float) -> PredictionErro
     way, heading = 0.5 * radius * turned.sum(axis=1), radius / axial * (turned[:, 1] - turned[:, 0])
     poses = np.zeros((node.size, 3))
     starts = Starts(node, poses, poses, block, tuple(regimes_driven(channel, node, ahead)))
-    return summarise(np.column_stack([way, np.zeros(node.size), heading]), speed, starts, settings.prediction, len(of))
+    return summarise(np.column_stack([way, np.zeros(node.size), heading]), speed, starts, settings.prediction)
