@@ -208,7 +208,8 @@ def _time_or_place(found: ChannelResult) -> ChannelResult:
     if set(alike) & set(placed.names) or not any(one.term.disc for one in placed.unnamed):
         return named
     better = _priced(named) - _priced(placed)
-    clearly = found.channel.settings.selection.telling_nats
+    # A patch has a place and a size to be fitted at: twice the usual evidence tells the two apart.
+    clearly = 2.0 * found.channel.settings.selection.telling_nats
     return replace(placed, either=alike if better < clearly else ()) if better > -clearly else named
 
 

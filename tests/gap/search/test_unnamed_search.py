@@ -464,7 +464,7 @@ def told(monkeypatch, found, placed_price=90.0, placed_terms=(PATCH,), placed_na
 
 def test_a_patch_is_told_in_place_of_a_change_that_is_not_clearly_better(monkeypatch):
     change = Searched()
-    clearly = DEFAULT_SETTINGS.selection.telling_nats
+    clearly = 2.0 * DEFAULT_SETTINGS.selection.telling_nats
     both, searches = told(monkeypatch, change, 100.0 + 0.9 * clearly)
     assert searches == [("turn_slip", "surface_change"), ("turn_slip",)]
     assert (both.names, both.unnamed, both.either) == (("turn_slip",), (PATCH,), ("surface_change",))
