@@ -69,11 +69,11 @@ def _events_of(found: ChannelResult, channels: int) -> Iterator[Event]:
         if excess[width].max(initial=0.0) <= 1.0:
             return
         place, component = divmod(int(np.argmax(excess[width])), excess[width].shape[1])
-        peak_s = float(scans[width].middle_s[place])
+        from_s, to_s = float(scans[width].begin_s[place]), float(scans[width].end_s[place])
         # Of an even mismatch in white noise the window fits best whose sum over the root of its length is largest.
         options = []
         for k, one in enumerate(scans):
-            about = (one.begin_s <= peak_s) & (one.end_s >= peak_s) & (excess[k][:, component] > 1.0)
+            about = (one.middle_s >= from_s) & (one.middle_s <= to_s)
             fits = np.where(about, np.abs(one.off[:, component]) / np.sqrt(one.end_s - one.begin_s), 0.0)
             options.append((float(fits.max(initial=0.0)), k, int(np.argmax(fits)) if fits.size else 0))
         _, k, place = max(options)
@@ -91,7 +91,7 @@ def _told(found: ChannelResult, windows: Windows, place: int, component: int) ->
     less = off * predicted < 0.0
     how = "less" if less[component] else "more"
     if found.channel.layout.of_wheels:
-        both = bool((windows.excess[place] > 1.0).all() and less[0] == less[1])
+        both = bool(np.abs(off).min() > 0.5 * np.abs(off).max() and less[0] == less[1])
         side = "both" if both else _SIDES[component]
         who = "the wheels" if both else f"the {side} wheels"
         text = f"{who} turned {abs(size):.2g} rad {how} than expected within {lasted_s:.1f} s"

@@ -141,7 +141,7 @@ def _paths(found: ChannelResult) -> list[_Path]:
     if isinstance(channel, WheelChannel):
         command = drive.command_rad_s[samples.node]
         moves |= np.abs(command).max(axis=1) > rest_rad_s
-        run = np.cumsum(channel.motion.restart)
+        run = np.cumsum(channel.motion.restart).astype(np.int64)
         since_s = samples.t_s - samples.t_s[np.searchsorted(run, run)]
         known = np.isfinite(command[:, 0]) & (since_s >= drive.settings.grid.lead_s)
         angle = drive.encoder_angle_rad
