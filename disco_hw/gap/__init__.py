@@ -29,6 +29,7 @@ from disco_hw.gap.report import (
 )
 from disco_hw.gap.report.amend import amended_model, at_joint_fit, carried_terms, channel_estimates, simple_model
 from disco_hw.gap.report.blind_spots import being_proved, boldest_claims, finder
+from disco_hw.gap.report.events import main_event, rare_events
 from disco_hw.gap.report.judge import (
     Measured,
     across_logs,
@@ -115,12 +116,14 @@ def find_gap(
     kept = written[0] if written[2] is None or written[2].kept is None else written[2].kept[0]
     offered = offered_stage(gap or _of_wheels(wheels), kept.adds_to_timed, settings)
     amended, remarks = model_of(offered, model, *written)
-    remains = None
+    remains, events = None, rare_events(analysis.channels)
     if gap and written[2] is not None:
         handed_out = "written" if offered == "amended" and "written" in gap else offered
         ahead_s = reached_horizon_s(gap, settings.prediction)
         timed, left, noise = (gap[stage][ahead_s] for stage in ("timed", handed_out, "floor"))
         remains = Remains.of(timed, left, noise, written[2].errors_of_body(offered))
+        if remains is not None:
+            remains = replace(remains, event=main_event(events, remains.channel))
     remarks = (*left_out_notes(written[0], written[1], kept), *remarks)
     return GapReport(
         sources=log.sources,
@@ -142,6 +145,7 @@ def find_gap(
         across=across_logs(analysis),
         warnings=warnings,
         remains=remains,
+        events=events,
     )
 
 

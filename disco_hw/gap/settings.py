@@ -324,6 +324,11 @@ class ReportSettings:
     lacks, where it still disagrees, is disputed. Chosen."""
     differ_share: float = 0.03
     """Logs of one robot differ in its geometry by so much of it at least. Chosen: another floor changes more."""
+    event_span_s: tuple[float, float] = (0.2, 2.0)
+    """Rare events last so long at least and at most. Chosen: twice a slow controller's period, and what a window of
+    poses can hold."""
+    event_chance: float = 0.01
+    """Share of logs without a rare event in which chance makes one. Chosen: as effects are named by chance."""
 
 
 @dataclass(frozen=True, slots=True)

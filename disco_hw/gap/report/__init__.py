@@ -13,6 +13,7 @@ from typing import Any
 
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report.blind_spots import BlindSpot
+from disco_hw.gap.report.events import Event
 from disco_hw.gap.report.remains import Remains
 from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors
@@ -142,6 +143,7 @@ class GapReport:
     provenance: Provenance | None = None
     warnings: tuple[str, ...] = ()
     remains: Remains | None = None
+    events: tuple[Event, ...] = ()
 
     @property
     def horizon_s(self) -> float:
@@ -189,6 +191,7 @@ class GapReport:
             ],
             "doubtful": [asdict(one) for one in self.doubtful],
             "residue": list(self.residue),
+            "events": [event.as_dict() for event in self.events],
             "blind_spots": [asdict(spot) for spot in self.blind_spots],
             "drive": self.drive,
             "gap": self._gap_dict(),

@@ -9,6 +9,7 @@ from html import escape
 from disco_hw import reports
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report import STAGES, EffectFinding, GapReport, UnnamedFinding
+from disco_hw.gap.report.events import Event
 from disco_hw.gap.report.judge import is_weakly_known
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.settings import DEFAULT_SETTINGS, ReportSettings
@@ -51,6 +52,11 @@ def summary_lines(report: GapReport) -> list[str]:
         lines.append("Nothing is missing that this log could show.")
     if effects:
         lines.append(f"How sure: with 95 % probability {'; '.join(_range(each) for each in effects)}.")
+    if report.events:
+        told = sorted(report.events, key=lambda event: -event.share)[:most]
+        text = "; ".join(event.describe() for event in sorted(told, key=lambda event: event.begin_s))
+        more = len(report.events) - len(told)
+        lines.append(f"Rare events: {text}.{f' And {more} more, listed below.' if more else ''}")
     if report.gap or report.wheels:
         lines.append(_gap_line(report))
     if report.remains is not None:
@@ -111,6 +117,7 @@ def as_text(report: GapReport) -> str:
         lines.append(f"{effect.channel}: {effect.name}: {values}{_confounded(effect)}")
     lines += [f"{term.channel}: unnamed: {_describe(term)}{_confounded(term)}" for term in report.unnamed]
     lines += [f"doubtful: {one.name}: {one.why}" for one in report.doubtful]
+    lines += [f"event: {_describe_event(event)}" for event in report.events]
     lines += [*report.residue, *_describe_logs(report), *report.notes]
     of = report.gap or report.wheels
     if of:
@@ -144,6 +151,11 @@ def _in_cell(errors: PredictionErrors) -> str:
 def _describe(term: UnnamedFinding) -> str:
     """Format the equation of a term, followed by its meaning where that is known."""
     return term.form if term.meaning is None else f"{term.form} ({term.meaning})"
+
+
+def _describe_event(event: Event) -> str:
+    """Describe an event, its channel, and how much of the channel's mismatch it is."""
+    return f"{event.describe()} ({event.share:.0%} of the mismatch of {event.channel})"
 
 
 def _confounded(finding: EffectFinding | UnnamedFinding) -> str:
@@ -190,6 +202,8 @@ def page(report: GapReport) -> str:
     if report.doubtful:
         doubts = (f"{one.name}: {one.why}" for one in report.doubtful)
         parts.append("<h2>What fits and is not to be believed</h2>" + _list(doubts))
+    if report.events:
+        parts.append("<h2>Rare events</h2>" + _list(_describe_event(event) for event in report.events))
     if report.residue:
         parts.append("<h2>What is still left</h2>" + _list(report.residue))
     if len(report.sources) > 1:

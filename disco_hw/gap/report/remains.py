@@ -28,6 +28,7 @@ class Remains:
 
     `regime` and `channel`: what the robot does, and which half of the way from command to pose it is, where most of the
     rest lies, in position or in heading, whichever is the larger in units of the noise. None where that is not known.
+    `event`: the rare event, in words, that makes up most of the mismatch of that half.
     """
 
     before: tuple[float, float]
@@ -35,6 +36,7 @@ class Remains:
     floor: tuple[float, float]
     regime: str | None
     channel: Channel | None
+    event: str | None = None
 
     @classmethod
     def of(
@@ -79,6 +81,8 @@ class Remains:
         closed = f"Of what is more than the sensors' noise this explains {' and '.join(shares)}." if shares else ""
         if self.is_explained:
             return closed or "What is left is the sensors' noise."
+        if self.event is not None:
+            return f"{closed} Most of the rest is one event: {self.event}.".strip()
         if self.regime is None:
             return closed
         part = {Channel.WHEEL_TO_BODY: ", between wheels and body", Channel.COMMAND_TO_WHEEL: ", from command to wheel"}
@@ -94,4 +98,5 @@ class Remains:
             "explained": self.is_explained,
             "regime": self.regime,
             "channel": None if self.channel is None else self.channel.value,
+            "event": self.event,
         }

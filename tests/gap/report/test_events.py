@@ -1,0 +1,122 @@
+"""What happens once in a log is told as an event; what holds all the time is none."""
+
+from dataclasses import replace
+from functools import cache
+
+import pytest
+
+from disco_hw.effects import Channel
+from disco_hw.gap import search_log
+from disco_hw.gap.report.events import Event, main_event, rare_events
+from disco_hw.gap.report.page import as_text, page, summary_lines
+from disco_hw.gap.report.remains import Remains
+from disco_hw.model import Model
+from tests.gap.report.eventful_robot import driven, moments
+from tests.gap.report.test_remains import FLOOR, TIMED, errors
+from tests.gap.test_write_report import report_of
+
+MODEL = Model(0.0771, 0.541, 0.05)
+LASTING = {"turn_slip_s": 0.1, "lag_s": 0.12, "delay_s": 0.06}
+
+
+def middle(seed, lasting_s):
+    """A time (s) in the middle of a log from which the robot drives on for so long."""
+    even = moments(seed, lasting_s)[1]
+    return float(even[len(even) // 2])
+
+
+@cache
+def found(seed, **happened):
+    analysis, _ = search_log(driven(seed, **happened), MODEL)
+    names = {name for channel in analysis.channels for name in channel.names}
+    return names, rare_events(analysis.channels)
+
+
+def is_told(events, begin_s, duration_s, kind, channel):
+    (event,) = events
+    assert (event.kind, event.channel) == (kind, channel)
+    assert event.begin_s == pytest.approx(begin_s, abs=0.3)
+    assert 0.5 * duration_s < event.duration_s < 2.0 * duration_s
+    return event
+
+
+THOROUGH = [pytest.param(seed, marks=pytest.mark.thorough) for seed in (3, 4, 5)]
+
+
+@pytest.mark.parametrize("seed", [1, *THOROUGH])
+def test_a_wheel_that_is_blocked_is_told(seed):
+    begin_s = middle(seed, 1.0)
+    event = is_told(found(seed, blocked=(begin_s, 0.5, (0,)))[1], begin_s, 0.5, "blocked", "command_to_wheel")
+    assert event.side == "left"
+    assert event.text.startswith("the left wheels stood for 0.5 s under a command of ")
+    assert event.share > 0.5
+
+
+@pytest.mark.parametrize("seed", [1, *THOROUGH])
+def test_a_start_that_comes_late_is_told(seed):
+    starts = moments(seed, 1.0)[0]
+    begin_s = float(starts[len(starts) // 2])
+    event = is_told(found(seed, late=(begin_s, 0.4))[1], begin_s, 0.4, "late_start", "command_to_wheel")
+    assert event.text.endswith("started 0.4 s late")
+
+
+@pytest.mark.parametrize("seed", [1, *THOROUGH])
+def test_a_slip_is_told(seed):
+    begin_s = middle(seed, 1.0)
+    event = is_told(found(seed, slipping=(begin_s, 1.0, 0.4))[1], begin_s, 1.0, "slip", "wheel_to_body")
+    assert "less than the wheels say" in event.text
+    assert event.side == "body"
+
+
+@pytest.mark.parametrize("seed", [1, 2, *(pytest.param(k, marks=pytest.mark.thorough) for k in range(3, 21))])
+def test_without_an_event_none_is_told(seed):
+    assert found(seed)[1] == ()
+
+
+@pytest.mark.parametrize("seed", [1, *THOROUGH])
+def test_what_holds_all_the_time_is_no_event(seed):
+    names, events = found(seed, **LASTING)
+    assert {"turn_slip", "motor_lag", "command_delay"} <= names
+    assert events == ()
+
+
+# With this event the search names a speed limit that is none, which makes up for it in part.
+SWALLOWED = pytest.param(4, marks=[pytest.mark.thorough, pytest.mark.xfail(strict=True, reason="named speed_limit")])
+
+
+@pytest.mark.parametrize("seed", [1, THOROUGH[0], SWALLOWED, THOROUGH[2]])
+def test_an_event_is_told_beside_what_holds_all_the_time(seed):
+    begin_s = middle(seed, 1.0)
+    names, events = found(seed, blocked=(begin_s, 0.5, (1,)), **LASTING)
+    assert {"turn_slip", "motor_lag", "command_delay"} <= names
+    is_told(events, begin_s, 0.5, "blocked", "command_to_wheel")
+
+
+def event_at(begin_s, share, channel=Channel.COMMAND_TO_WHEEL):
+    return Event(begin_s, 0.5, channel.value, "left", "blocked", -1.0, "rad", share, "the left wheels stood")
+
+
+def test_an_event_that_is_most_of_a_channel_s_mismatch_stands_in_place_of_the_regime():
+    events = (event_at(3.0, 0.3), event_at(7.0, 0.6))
+    assert main_event(events, Channel.WHEEL_TO_BODY) is None
+    assert main_event(events, None) is None
+    assert main_event(events[:1], Channel.COMMAND_TO_WHEEL) is None
+    told = main_event(events, Channel.COMMAND_TO_WHEEL)
+    assert told == "at 7.0 s the left wheels stood"
+    remains = replace(Remains.of(TIMED, errors(0.05, 0.1), FLOOR, None), event=told)
+    assert remains.describe().endswith("Most of the rest is one event: at 7.0 s the left wheels stood.")
+    assert remains.as_dict()["event"] == told
+
+
+def test_the_answer_tells_three_events_in_one_line_and_counts_the_rest():
+    plain = report_of("motor_lag", 0.05, 0.02)
+    events = tuple(event_at(float(k), share) for k, share in enumerate((0.1, 0.02, 0.3, 0.2)))
+    full = replace(plain, events=events)
+    (line,) = set(summary_lines(full)) - set(summary_lines(plain))
+    said = "; ".join(f"at {k}.0 s the left wheels stood" for k in (0, 2, 3))
+    assert line == f"Rare events: {said}. And 1 more, listed below."
+    assert len(summary_lines(full)) <= 10
+    assert [one["begin_s"] for one in full.as_dict()["events"]] == [0.0, 1.0, 2.0, 3.0]
+    assert "event: at 1.0 s the left wheels stood (2% of the mismatch of command_to_wheel)" in as_text(full)
+    assert "<h2>Rare events</h2>" in page(full)
+    assert "Rare events" not in page(plain)
