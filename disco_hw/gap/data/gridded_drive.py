@@ -108,6 +108,15 @@ class GriddedDrive:
         is_long = self.duration_s >= 3 * prediction.folds.count * prediction.folds.stretch_s
         return prediction.folds if is_long else prediction.short_folds
 
+    def stretch(self, t_s: Array) -> Index:
+        """Return the stretch, left out as a whole, in which each time lies: one log of several, or so many seconds.
+
+        What logs differ by is then part of the errors. Too few logs to judge by are divided as a single one is.
+        """
+        if len(self.log_begins_s) < self.settings.selection.fewest_blocks:
+            return np.floor(t_s / self.folds.stretch_s).astype(np.int64)
+        return np.maximum(np.searchsorted(self.log_begins_s, t_s, side="right") - 1, 0).astype(np.int64)
+
     def delayed_commands(self, delay_s: float) -> Array:
         """Commands at the nodes (M, 2) that are in force after a dead time, negative of commands that are stamped late.
 

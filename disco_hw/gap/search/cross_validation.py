@@ -148,7 +148,7 @@ def find_starts(channel: BodyChannel, poses: tuple[Array, Array], ahead_s: float
     node = starts_of(drive.first, known, ahead_s, drive.settings.grid)
     ahead = round(ahead_s / GRID_STEP_S)
     node = node[np.isfinite(smooth[node, 0]) & np.isfinite(alone[node + ahead, 0])]
-    block = np.floor(drive.t_s[node] / drive.folds.stretch_s).astype(np.int64)
+    block = drive.stretch(drive.t_s[node])
     return Starts(node, smooth[node], alone[node + ahead], block, tuple(regimes_driven(channel, node, ahead)))
 
 
@@ -232,9 +232,8 @@ def displacement_error(starts: Starts, moved: Array) -> Array:
 
 def fold_of(channel: BodyChannel | WheelChannel) -> Index:
     """Return the fold (n,) of each residual of a channel."""
-    folds = channel.drive.folds
-    fold: Index = channel.block // round(folds.stretch_s / channel.settings.grid.block_s) % folds.count
-    return fold
+    middle_s = (channel.block.astype(np.float64) + 0.5) * channel.settings.grid.block_s
+    return channel.drive.stretch(middle_s) % channel.drive.folds.count
 
 
 def fold_vectors(found: Fit, fold: Index, count: int, neutral: Array, settings: GapSettings) -> dict[int, Array]:
@@ -383,7 +382,7 @@ def _errors(channel: WheelChannel, of: Angles, ahead_s: float) -> PredictionErro
     drive, settings = channel.drive, channel.settings
     node = starts_of(drive.first, np.isfinite(drive.command_rad_s[:, 0]), ahead_s, settings.grid)
     ahead = round(ahead_s / GRID_STEP_S)
-    block = np.floor(drive.t_s[node] / drive.folds.stretch_s).astype(np.int64)
+    block = drive.stretch(drive.t_s[node])
     turned, speed = np.zeros((node.size, 2)), np.zeros(node.size)
     for fold, angle in of.items():
         inside = block % len(of) == fold

@@ -232,3 +232,19 @@ def test_wheels_that_answer_slower_than_any_lag_do_not_say_how_late_commands_are
     assert line.commands_timed == (lag_s < 1.0)
     assert len(said) == (0 if line.commands_timed else 1)
     assert abs(line.commands_moved_s) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("begins_s", "stretches"),
+    [
+        # One log of 50 s, in stretches of 9 s.
+        ((0.0,), [0, 0, 1, 4]),
+        # Four logs are too few to judge by.
+        ((0.0, 10.0, 20.0, 30.0), [0, 0, 1, 4]),
+        ((0.0, 5.0, 10.0, 20.0, 30.0), [0, 1, 2, 4]),
+    ],
+)
+def test_a_stretch_is_one_log_where_there_are_several(begins_s, stretches):
+    t_s = np.arange(0.0, 50.0, 0.02)
+    gridded = replace(grid_drive(drive(t_s, np.ones(t_s.size), t_s, np.ones(t_s.size))), log_begins_s=begins_s)
+    assert gridded.stretch(np.array([0.0, 8.9, 10.0, 44.0])).tolist() == stretches

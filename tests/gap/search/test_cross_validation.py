@@ -1,12 +1,14 @@
 """Errors on held-out stretches: the right model errs by the noise of a pose, a wrong one by what it lacks."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from disco_hw.gap.data import BODY
+from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.noise import sensor_noise
 from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.search.channel_search import indices
@@ -90,7 +92,9 @@ def test_each_fold_is_predicted_by_what_was_fitted_on_the_others():
 
 
 def test_every_third_stretch_is_of_one_fold_of_three():
-    drive = SimpleNamespace(folds=Folds(2.0 * DEFAULT_SETTINGS.grid.block_s, 3))
+    folds = Folds(2.0 * DEFAULT_SETTINGS.grid.block_s, 3)
+    drive = SimpleNamespace(folds=folds, settings=DEFAULT_SETTINGS, log_begins_s=(0.0,))
+    drive.stretch = partial(GriddedDrive.stretch, drive)
     channel = SimpleNamespace(drive=drive, settings=DEFAULT_SETTINGS, block=np.arange(14))
     assert fold_of(channel).tolist() == [0, 0, 1, 1, 2, 2] * 2 + [0, 0]
 

@@ -1,6 +1,7 @@
 """What the last fits of the stages free, how surely it was known before, and which of them is told."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.linalg import block_diag
 
 from disco_hw.gap import search as stages
 from disco_hw.gap.data import BODY, WHEEL
+from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.search import _chain, _Fitted, _information, _on_top, _roughly, _split, _timed, joint_predictions
 from disco_hw.gap.search.analysis import final_fit
 from disco_hw.gap.search.cross_validation import Chain, PredictionErrors
@@ -31,7 +33,9 @@ def test_without_a_fold_is_known_what_the_stretches_of_the_others_say_and_what_w
     rng = np.random.default_rng(0)
     slope, block = rng.standard_normal((900, 3)), np.arange(900) // 10
     # Four blocks of 3 s are a stretch of 12 s, and every third one is of one fold.
-    channel = SimpleNamespace(settings=DEFAULT_SETTINGS, block=block, drive=SimpleNamespace(folds=Folds(12.0, 3)))
+    drive = SimpleNamespace(folds=Folds(12.0, 3), settings=DEFAULT_SETTINGS, log_begins_s=(0.0,))
+    drive.stretch = partial(GriddedDrive.stretch, drive)
+    channel = SimpleNamespace(settings=DEFAULT_SETTINGS, block=block, drive=drive)
     for fold in range(3):
         others = slope[(block // 4) % 3 != fold]
         np.testing.assert_allclose(_information(fit_of(slope), channel, fold), others.T @ others)
