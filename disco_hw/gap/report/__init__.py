@@ -13,7 +13,7 @@ from typing import Any
 
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report.blind_spots import BlindSpot
-from disco_hw.gap.report.events import Event
+from disco_hw.gap.report.events import RareEvent
 from disco_hw.gap.report.remains import Remains
 from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors
@@ -143,7 +143,7 @@ class GapReport:
     provenance: Provenance | None = None
     warnings: tuple[str, ...] = ()
     remains: Remains | None = None
-    events: tuple[Event, ...] = ()
+    events: tuple[RareEvent, ...] = ()
 
     @property
     def horizon_s(self) -> float:

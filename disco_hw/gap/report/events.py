@@ -22,7 +22,7 @@ _YAW = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class RareEvent:
     """A rare event: when it began and how long it lasted (s), where, what, and how large.
 
     `kind`: late_start, blocked, slow or fast of wheels, slip or pushed of the body. `size`: measured less predicted
@@ -48,19 +48,19 @@ class Event:
         return asdict(self)
 
 
-def rare_events(channels: Sequence[ChannelResult]) -> tuple[Event, ...]:
+def rare_events(channels: Sequence[ChannelResult]) -> tuple[RareEvent, ...]:
     """Return the rare events of all channels by time; chance makes one in a share `event_chance` of logs."""
     found = [event for one in channels for event in _events_of(one, len(channels))]
     return tuple(sorted(found, key=lambda event: event.begin_s))
 
 
-def main_event(events: Sequence[Event], channel: Channel | None) -> str | None:
+def main_event(events: Sequence[RareEvent], channel: Channel | None) -> str | None:
     """Describe the event that makes up most of a channel's mismatch; None if none does."""
     there = [event for event in events if channel is not None and event.channel == channel.value and event.share > 0.5]
     return there[0].describe() if there else None
 
 
-def _events_of(found: ChannelResult, channels: int) -> Iterator[Event]:
+def _events_of(found: ChannelResult, channels: int) -> Iterator[RareEvent]:
     """Events of one channel, the clearest first; what begins within the longest window of one belongs to it."""
     long_s, scans = found.channel.settings.report.event_span_s[1], scan(found, channels)
     excess = [one.excess.copy() for one in scans]
@@ -83,7 +83,7 @@ def _events_of(found: ChannelResult, channels: int) -> Iterator[Event]:
             of[(one.end_s > event.begin_s - long_s) & (one.begin_s < event.begin_s + event.duration_s + long_s)] = 0.0
 
 
-def _told(found: ChannelResult, windows: Windows, place: int, component: int) -> Event:
+def _told(found: ChannelResult, windows: Windows, place: int, component: int) -> RareEvent:
     """Describe the event of a window in words."""
     begin_s, end_s = float(windows.begin_s[place]), float(windows.end_s[place])
     off, predicted, share = windows.off[place], windows.predicted[place], windows.share(begin_s, end_s)
@@ -102,7 +102,7 @@ def _told(found: ChannelResult, windows: Windows, place: int, component: int) ->
             text = f"{who} stood for {lasted_s:.1f} s under a command of {command:.2g} rad/s"
             if from_rest:
                 text = f"{who} started {lasted_s:.1f} s late"
-        return Event(begin_s, lasted_s, Channel.COMMAND_TO_WHEEL.value, side, kind, size, "rad", share, text)
+        return RareEvent(begin_s, lasted_s, Channel.COMMAND_TO_WHEEL.value, side, kind, size, "rad", share, text)
     unit, verb = ("rad", "turned") if component == _YAW else ("m", "moved")
     kind = "slip" if less[component] else "pushed"
     text = f"the body {verb} {abs(size):.2g} {unit} {how} than the wheels say, for {lasted_s:.1f} s"
@@ -110,7 +110,7 @@ def _told(found: ChannelResult, windows: Windows, place: int, component: int) ->
         kind, where = "pushed", "left" if size > 0.0 else "right"
         text = f"the body moved {abs(size):.2g} m to the {where}, which the wheels do not say, for {lasted_s:.1f} s"
     text = f"{text}: slip" if kind == "slip" else text
-    return Event(begin_s, lasted_s, Channel.WHEEL_TO_BODY.value, "body", kind, size, unit, share, text)
+    return RareEvent(begin_s, lasted_s, Channel.WHEEL_TO_BODY.value, "body", kind, size, unit, share, text)
 
 
 def _stood(found: ChannelResult, begin_s: float, end_s: float, side: int) -> tuple[float, float, bool, float] | None:

@@ -9,7 +9,7 @@ from html import escape
 from disco_hw import reports
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report import STAGES, EffectFinding, GapReport, UnnamedFinding
-from disco_hw.gap.report.events import Event
+from disco_hw.gap.report.events import RareEvent
 from disco_hw.gap.report.judge import is_weakly_known
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.settings import DEFAULT_SETTINGS, ReportSettings
@@ -153,7 +153,7 @@ def _describe(term: UnnamedFinding) -> str:
     return term.form if term.meaning is None else f"{term.form} ({term.meaning})"
 
 
-def _describe_event(event: Event) -> str:
+def _describe_event(event: RareEvent) -> str:
     """Describe an event, its channel, and how much of the channel's mismatch it is."""
     return f"{event.describe()} ({event.share:.0%} of the mismatch of {event.channel})"
 

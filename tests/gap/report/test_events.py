@@ -7,7 +7,7 @@ import pytest
 
 from disco_hw.effects import Channel
 from disco_hw.gap import search_log
-from disco_hw.gap.report.events import Event, main_event, rare_events
+from disco_hw.gap.report.events import RareEvent, main_event, rare_events
 from disco_hw.gap.report.page import as_text, page, summary_lines
 from disco_hw.gap.report.remains import Remains
 from disco_hw.model import Model
@@ -93,7 +93,7 @@ def test_an_event_is_told_beside_what_holds_all_the_time(seed):
 
 
 def event_at(begin_s, share, channel=Channel.COMMAND_TO_WHEEL):
-    return Event(begin_s, 0.5, channel.value, "left", "blocked", -1.0, "rad", share, "the left wheels stood")
+    return RareEvent(begin_s, 0.5, channel.value, "left", "blocked", -1.0, "rad", share, "the left wheels stood")
 
 
 def test_an_event_that_is_most_of_a_channel_s_mismatch_stands_in_place_of_the_regime():
