@@ -3,8 +3,8 @@
 Wheel radius, axle and x_icr of every robot are off by up to 15 %, and nobody is told; the motors' lag and dead band are
 known to all. From rest on the line; figures are of 5 to 30 s, at 50 plans a second. The gains of the classical ones
 were found on robots 0 to 4 (`docs/results.md`); these are robots 1000 on, or others with `--first`.
-Names that begin with `mujoco` drive the robot of `tools/mujoco_plant.py`, those with `ahead` track a point ahead of the
-centre of rotation.
+Names that begin with `mujoco_` drive the robot of `tools/mujoco_plant.py`, those with `turned_` the same robots with
+their back as their front (`tools/turned_plant.py`), as the MPC drives them.
 
 `python -m tools.bench_tracking disco_adapting circle,square 20` drives some of it; `... starts 20` begins anywhere.
 `... --first 5000 --count 20` drives robots that nothing was chosen on; `--speeds 0.1,0.2,0.3` at these speeds (m/s),
@@ -33,11 +33,12 @@ from disco_hw.tasks.circle import CircleCost
 from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots
 from tools.mujoco_plant import MujocoPlant, mujoco_robots
 from tools.nmpc import NonlinearMpc
-from tools.tracking import LIMITS, Contender, Drive, Track, classical, disco, drive, model, tracks
+from tools.tracking import LIMITS, Contender, Drive, Plant, Track, classical, disco, drive, model, tracks
+from tools.turned_plant import TurnedPlant, turned_robot
 
 FIRST = 1000
 SPEED_M_S, RATE_HZ = 0.2, 50.0
-MUJOCO, AHEAD = "mujoco_", "ahead_"
+MUJOCO, TURNED = "mujoco_", "turned_"
 
 
 def contenders(speed_m_s: float = SPEED_M_S) -> dict[str, Contender]:
@@ -47,7 +48,7 @@ def contenders(speed_m_s: float = SPEED_M_S) -> dict[str, Contender]:
     integral = classical(PurePursuit(look_ahead_m=0.081, integral=3.04, preview_s=0.142), speed_m_s)
     nmpc_forward = Contender(partial(_nmpc, speed_m_s, True), learns=True)
     adapting = disco(settings, learns=True)
-    sampled = disco(replace(settings, refine=False), learns=True)
+    sampled = disco(DiscoSettings.for_speed(speed_m_s, RATE_HZ, refine=False), learns=True)
     offset_free = disco(replace(settings, offset_free=True), learns=True)
     return {
         "pure_pursuit": classical(PurePursuit(), speed_m_s),
@@ -65,16 +66,6 @@ def contenders(speed_m_s: float = SPEED_M_S) -> dict[str, Contender]:
         "disco_offset_free": offset_free,
         "disco_truth": disco(settings, knows=True),
         "kanayama_truth": classical(Kanayama(), speed_m_s, knows=True),
-        AHEAD + "nmpc": nmpc,
-        AHEAD + "disco_sampled": sampled,
-        AHEAD + "disco_adapting": adapting,
-        MUJOCO + "pure_pursuit_integral": integral,
-        MUJOCO + "kanayama": classical(Kanayama(), speed_m_s),
-        MUJOCO + "nmpc": nmpc,
-        MUJOCO + "nmpc_forward": nmpc_forward,
-        MUJOCO + "disco_adapting": adapting,
-        MUJOCO + "disco_sampled": sampled,
-        MUJOCO + "disco_offset_free": offset_free,
     }
 
 
@@ -110,37 +101,29 @@ def rows(
     """The drives of these contenders on robots `first` to `first + count` - 1, and what they are called, by way."""
     for name in names:
         made: Callable[[int, int], list[ForeignRobot]] = robots
-        plant_of: Callable[..., ForeignPlant | MujocoPlant] = ForeignPlant
-        if name.startswith(MUJOCO):
-            made, plant_of = mujoco_robots, MujocoPlant
-        elif name.startswith(AHEAD):
-            made = point_ahead
+        plant_of: Callable[..., Plant] = ForeignPlant
+        contender = name
+        if contender.startswith(MUJOCO):
+            made, plant_of, contender = mujoco_robots, MujocoPlant, contender.removeprefix(MUJOCO)
+        driven = made(first, count)
+        if contender.startswith(TURNED):
+            driven, contender = [turned_robot(robot) for robot in driven], contender.removeprefix(TURNED)
+            plant_of = partial(TurnedPlant, plant_of)
         for way in ways:
             yield (
                 f"tracking.{name}.{way}",
                 [
                     drive(
-                        contenders(speed_m_s)[name],
+                        contenders(speed_m_s)[contender],
                         robot,
                         tracks(speed_m_s)[way],
                         rate_hz=RATE_HZ,
                         seed=seed,
                         plant_of=plant_of,
                     ).after()
-                    for seed, robot in enumerate(made(first, count))
+                    for seed, robot in enumerate(driven)
                 ],
             )
-
-
-def point_ahead(first: int, count: int) -> list[ForeignRobot]:
-    """The same robots with the tracked point as far ahead of the centre of rotation as it is behind it otherwise.
-
-    There forwards is the stable direction, and every controller drives it.
-    """
-    radius_m, axle_m, x_icr_m = NOMINAL
-    return [
-        replace(robot, x_icr_m=-robot.x_icr_m, believed=(radius_m, axle_m, -x_icr_m)) for robot in robots(first, count)
-    ]
 
 
 def figures_of(drives: list[Drive]) -> dict[str, float]:

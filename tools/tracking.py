@@ -251,6 +251,5 @@ def _learner(robot: ForeignRobot, pipeline: Pipeline, drifts: bool) -> FastAdapt
     """The filter beside this pipeline."""
     believed = model(robot)
     mean = believed_geometry(believed)
-    return FastAdaptation(
-        mean, 0.5 * mean.mean, 1.5 * mean.mean, lambda geometry: apply_geometry(pipeline, believed, geometry), drifts
-    )
+    low, high = np.sort([0.5 * mean.mean, 1.5 * mean.mean], axis=0)
+    return FastAdaptation(mean, low, high, lambda geometry: apply_geometry(pipeline, believed, geometry), drifts)

@@ -22,14 +22,16 @@ from disco_hw.model.coefficients import NO_DISTURBANCE, Disturbance
 Array = NDArray[np.float64]
 # Radians in a turn.
 ROTATION = 2.0 * math.pi
-PLANNER_VERSION = 2
+PLANNER_VERSION = 3
 """Version of the plans that the default mode makes from the same input; a log names it, and a replay follows it.
 
-1: the sampled plan, as `mode = "sampled"` has it now. 2: the plan is refined beside the line.
+1: the sampled plan, as `mode = "sampled"` has it now. 2: the plan is refined beside the line. 3: with other
+weights, and shorter steps below 0.2 m/s.
 """
 USUAL_SPEED_M_S, USUAL_STEP_S, USUAL_NOISE = 0.2, 0.1, 0.1 * ROTATION
-# Chosen: longer steps of a slow robot would answer too late to what happens on the way.
-LONGEST_STEP_S = 0.25
+# Chosen: longer steps of a slow robot would answer too late to what happens on the way. What follows a refined plan
+# follows its first steps as they are.
+LONGEST_STEP_S, LONGEST_REFINED_STEP_S = 0.25, USUAL_STEP_S
 # Noise of a fast robot grows with this power of its speed: with less it stays beside tight circles, with more it is
 # pulled off them.
 FASTER_NOISE = 0.2
@@ -187,8 +189,8 @@ class DiscoSettings:
         )
 
     @classmethod
-    def for_speed(cls, speed_m_s: float, rate_hz: float) -> DiscoSettings:
-        """Return the settings for a task of this speed (m/s) at `rate_hz` plans a second.
+    def for_speed(cls, speed_m_s: float, rate_hz: float, refine: bool = True) -> DiscoSettings:
+        """Return the settings for a task of this speed (m/s) at `rate_hz` plans a second, with refinement or without.
 
         A slow robot plans over the same way as one at 0.2 m/s, with noise in proportion to its speed; a fast one has
         shorter steps, but no more than one a plan. With these the mean distance from circles of 0.3 to 3 m stays below
@@ -199,13 +201,20 @@ class DiscoSettings:
         step_s = max(min(step_s, LONGEST_STEP_S), 1.0 / rate_hz)
         noise_std = USUAL_NOISE * (slower**-FASTER_NOISE if slower < 1.0 else 1.0 / slower)
         sampler = Sampler(noise_std=noise_std, wide=USUAL_WIDE)
-        return cls(sampler=sampler, step_s=step_s)
+        if refine and step_s > LONGEST_REFINED_STEP_S:
+            shorter_s = max(LONGEST_REFINED_STEP_S, 1.0 / rate_hz)
+            sampler = replace(sampler, horizon=round(sampler.horizon * step_s / shorter_s))
+            step_s = shorter_s
+        return cls(sampler=sampler, step_s=step_s, refine=refine)
 
     @classmethod
     def from_config(cls, control: config.Control, speed_m_s: float) -> DiscoSettings:
         """Return the settings that robot.toml asks for, for its task's speed."""
-        settings = cls.paper() if control.mode == "paper" else cls.for_speed(speed_m_s, control.rate_hz)
-        settings = replace(settings, refine=control.mode == "default")
+        settings = (
+            cls.paper()
+            if control.mode == "paper"
+            else cls.for_speed(speed_m_s, control.rate_hz, control.mode == "default")
+        )
         horizon = settings.sampler.horizon if control.horizon is None else control.horizon
         step_s = settings.step_s if control.step_s is None else control.step_s
         sampler = replace(settings.sampler, samples=control.samples, horizon=horizon)

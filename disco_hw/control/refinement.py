@@ -33,13 +33,14 @@ Array = NDArray[np.float64]
 STEPS = 20
 # Chosen: each takes its time of the tick; the next tick begins from what this one found.
 ITERATIONS = 2
-# A change of a wheel's rim speed costs as much as the distance that it covers in this time.
-CHANGE_S = 0.15
+# A wheel's acceleration of 1 rad/s^2 costs as much as this distance, whatever the wheel's radius: the noise of poses,
+# which restless commands answer, is alike for robots of all sizes.
+ACCELERATION_M = 6e-4
 # What lies beyond the horizon: who follows the line exactly with the tracked point behind the centre of rotation turns
 # away from the heading that stays on it, e-fold over each x_icr of the way. So the end, distance and x_icr times the
-# error of the heading, counts as much as over so many times x_icr more of the way.
+# error of the heading, counts as much as over so many times x_icr more of the way. With the point ahead of the centre
+# errors of the heading die away by themselves, and the end counts as every step does.
 END_X_ICR = 5.0
-LEAST_END_WEIGHT = 10.0
 # The robot is beside the line within this part of the way that the horizon covers, and facing within this cosine.
 LATERAL_PART, FACING = 0.3, 0.5
 # A robot that, in the mean over the last horizon, covers less than this part of its way is left to the sampled plan: a
@@ -131,15 +132,15 @@ class Refinement:
         # The reference is relative to the task's origin.
         self._start[:2] = start[:2]
         self._before[:] = begin.before
-        x_icr_m = abs(self._chassis.x_icr_m)
-        end_weight = max(END_X_ICR * x_icr_m * self._rows.size / max(way_m, 1e-3), LEAST_END_WEIGHT)
-        change_m = CHANGE_S * self._chassis.wheel_radius_m
+        behind_m = max(self._chassis.x_icr_m, 0.0)
+        end_weight = max(END_X_ICR * behind_m * self._rows.size / max(way_m, 1e-3), 1.0)
+        change_m = ACCELERATION_M / self._step_s
         change = min(self._limits.acceleration_rad_s2 * self._step_s, 4.0 * self._limits.speed_rad_s)
         return Problem(
             self._start, float(begin.elapsed_s), np.array(begin.slide, np.float64), begin.mean_means, self._base,
             self._effects, self._series, self._history, self._reference,
             float(self._limits.speed_rad_s), float(change), self._before, change_m,
-            self._found[3:5], end_weight, x_icr_m,
+            self._found[3:5], end_weight, behind_m,
         )  # fmt: skip
 
     def _call(self, name: str, kernel: Callable[..., object], *arguments: object) -> float:

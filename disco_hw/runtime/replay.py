@@ -125,7 +125,8 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
             raise InputError(
                 f"{path}: its commands are from {first.source!r}, not from a planner or a hand; {_REPLAYED}"
             )
-        setup = _planned_as_recorded(setup_of_log(log, _REPLAYED), path, log.metadata)
+        has_plans = next(iter(log.records(("/plan",))), None) is not None
+        setup = _planned_as_recorded(setup_of_log(log, _REPLAYED), path, log.metadata, has_plans)
         pipeline = create_pipeline(setup.config, setup.model, create_planner(setup.config, setup.model))
         area = _ReplayedArea(pipeline, setup.config)
         ticks = values = 0
@@ -150,7 +151,7 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
         return ReplayReport(ticks, values, log.summary().missing_ticks, log.metadata.version, difference, tolerance)
 
 
-def _planned_as_recorded(setup: Setup, path: Path, recorded: Metadata) -> Setup:
+def _planned_as_recorded(setup: Setup, path: Path, recorded: Metadata, has_plans: bool) -> Setup:
     """Return the setup with the mode that plans as the log's planner version did; raises InputError if none does."""
     planner = recorded.planner or 1
     if planner > PLANNER_VERSION:
@@ -159,8 +160,13 @@ def _planned_as_recorded(setup: Setup, path: Path, recorded: Metadata) -> Setup:
             f"{PLANNER_VERSION}; replay it with disco-hw {recorded.version or 'of the version that recorded it'}"
         )
     control = setup.config.control
-    if planner == PLANNER_VERSION or control.mode != "default":
+    if planner == PLANNER_VERSION or control.mode != "default" or not has_plans:
         return setup
+    if planner > 1:
+        raise InputError(
+            f"{path}: its plans are of planner version {planner}, which refined them otherwise; replay it with "
+            f"disco-hw {recorded.version or 'of the version that recorded it'}"
+        )
     sampled = msgspec.structs.replace(control, mode="sampled")
     return replace(setup, config=msgspec.structs.replace(setup.config, control=sampled))
 

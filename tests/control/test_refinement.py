@@ -11,7 +11,7 @@ from msgspec import structs
 
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState
 from disco_hw.control.parameter_points import mean_point
-from disco_hw.control.refinement import CHANGE_S, END_X_ICR, LEAST_END_WEIGHT, STEPS
+from disco_hw.control.refinement import ACCELERATION_M, END_X_ICR, STEPS
 from disco_hw.control.surroundings import Surroundings
 from disco_hw.fence import Fence, Footprint
 from disco_hw.fence.clearance import Boundaries
@@ -85,13 +85,13 @@ def _cost(commands: np.ndarray, state: PlannerState, speed_m_s: float, step_s: f
     reference = RADIUS_M * np.column_stack([np.cos(angles), np.sin(angles)])
     way_m = float(np.hypot(*np.diff(reference, axis=0).T).sum())
     weights = np.ones(STEPS)
-    weights[-1] = max(END_X_ICR * X_ICR_M * STEPS / way_m, LEAST_END_WEIGHT)
+    weights[-1] = max(END_X_ICR * X_ICR_M * STEPS / way_m, 1.0)
     turned = states[-1, 2] - (angles[-1] + 0.5 * math.pi + math.asin(X_ICR_M / RADIUS_M))
     turned_m = X_ICR_M * math.remainder(turned, 2.0 * math.pi)
     changes = np.diff(np.vstack([wheels, commands]), axis=0)
     distance = float(weights @ ((states[:, :2] - reference) ** 2).sum(axis=1))
     last = float(weights[-1]) * turned_m**2
-    return distance + last + (CHANGE_S * MODEL.wheel_radius_m) ** 2 * float((changes**2).sum())
+    return distance + last + float(((ACCELERATION_M * changes / step_s) ** 2).sum())
 
 
 @pytest.mark.thorough

@@ -15,7 +15,7 @@ from disco_hw.control.plan import PLANNER_VERSION
 from disco_hw.errors import InputError
 from disco_hw.log import MODEL_TOML, ROBOT_TOML, Attachment
 from disco_hw.log.process_recorder import ProcessRecorder, RecordingSettings
-from disco_hw.log.records import UnexplainedMotion
+from disco_hw.log.records import Plan, UnexplainedMotion
 from disco_hw.model import EffectSetting, load_model, save_model
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay
@@ -182,6 +182,13 @@ def test_plans_of_a_later_planner_are_refused_with_the_version_that_has_it(tmp_p
     text = f"{log}: its plans are of planner version {PLANNER_VERSION + 1}, .* up to {PLANNER_VERSION}; replay it with"
     with pytest.raises(InputError, match=text):
         replay(log)
+
+
+def test_plans_that_were_refined_otherwise_are_refused_and_a_log_without_plans_is_replayed(tmp_path, ticks):
+    with pytest.raises(InputError, match="planner version 2, which refined them otherwise; replay it with disco-hw"):
+        replay(write_log(tmp_path / "refined.mcap", ticks, planner=2))
+    planned = next(at for at, (_, records) in enumerate(ticks) if any(isinstance(one, Plan) for one in records))
+    assert replay(write_log(tmp_path / "standing.mcap", ticks[:planned], planner=2)).ok
 
 
 def test_a_log_without_ticks_or_robot_is_refused(tmp_path, ticks):
