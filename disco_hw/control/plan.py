@@ -215,8 +215,11 @@ class DiscoSettings:
             if control.mode == "paper"
             else cls.for_speed(speed_m_s, control.rate_hz, control.mode == "default")
         )
-        horizon = settings.sampler.horizon if control.horizon is None else control.horizon
-        step_s = settings.step_s if control.step_s is None else control.step_s
+        horizon, step_s = settings.sampler.horizon, settings.step_s
+        if control.step_s is not None:
+            # The number of steps that goes with steps of the task's speed says nothing of others.
+            step_s, horizon = control.step_s, horizon if control.mode == "paper" else Sampler().horizon
+        horizon = horizon if control.horizon is None else control.horizon
         sampler = replace(settings.sampler, samples=control.samples, horizon=horizon)
         return replace(
             settings, sampler=sampler, step_s=step_s, uncertainty=control.uncertainty, offset_free=control.disturbance

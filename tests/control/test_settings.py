@@ -28,6 +28,15 @@ def test_from_config_takes_size_mode_and_uncertainty():
     assert DiscoSettings.from_config(Control(mode="paper"), 0.2).sampler.knots is None
 
 
+def test_a_slow_robot_plans_as_far_in_shorter_steps_where_its_plans_are_refined():
+    slow, slow_sampled = (DiscoSettings.from_config(Control(mode=mode), 0.1) for mode in ("default", "sampled"))
+    assert slow_sampled.step_s == pytest.approx(0.2)
+    assert slow.step_s == pytest.approx(0.1)
+    assert slow.sampler.horizon * slow.step_s == pytest.approx(slow_sampled.sampler.horizon * slow_sampled.step_s)
+    usual = DiscoSettings.from_config(Control(), 0.2).sampler.horizon
+    assert DiscoSettings.from_config(Control(step_s=0.2), 0.1).sampler.horizon == usual
+
+
 def test_limits_of_the_robot():
     robot = Robot(name="r", wheel_radius_m=0.06, axial_distance_m=0.3, ticks_per_rev=1, max_wheel_speed_rad_s=7.0)
     assert CommandLimits.of_robot(robot) == CommandLimits(7.0, 20.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from tools import bench_tracking
 from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots
 from tools.mujoco_plant import BEHIND_M, MujocoPlant, mujoco_robots
 from tools.tracking import Drive, classical, drive, tracks
+from tools.turned_plant import TurnedPlant, turned_robot
 
 
 def test_a_robot_in_mujoco_turns_about_the_point_that_it_is_said_to():
@@ -46,6 +49,25 @@ def test_a_follower_drives_the_robot_in_mujoco_round_its_circle():
     found = drive(classical(Kanayama()), robot, tracks()["circle"], duration_s=9.0, plant_of=MujocoPlant)
     assert found.after(4.0).rms_mm < 20.0
     assert found.after(4.0).speed_m_s > 0.15
+
+
+def test_a_robot_whose_back_is_its_front_is_the_same_machine():
+    """It turns as the robot does that gets the same motion by its own front, and its sensors agree with its pose."""
+    (robot,) = robots(1000, 1, grip_std=0.0, pose_std_m=0.0, yaw_std_rad=0.0, pose_delay_s=0.0)
+    plant = ForeignPlant(robot, (1.0, 2.0, 0.5), 1)
+    turned = TurnedPlant(ForeignPlant, turned_robot(robot), (1.0, 2.0, 0.5 + math.pi), 1)
+    for _ in range(100):
+        plant.advance(-3.0, -2.0, 20)
+        turned.advance(2.0, 3.0, 20)
+        expected, found = plant.readings(), turned.readings()
+    assert turned.forward_m_s == pytest.approx(-plant.forward_m_s)
+    assert turned.forward_m_s > 0.1
+    assert turned.pose[:2] == pytest.approx(plant.pose[:2])
+    assert math.remainder(turned.pose[2] - plant.pose[2] - math.pi, math.tau) == pytest.approx(0.0, abs=1e-9)
+    assert (found.wheels[0].left_angle_rad, found.wheels[0].right_speed_rad_s) == pytest.approx(
+        (-expected.wheels[0].right_angle_rad, -expected.wheels[0].left_speed_rad_s)
+    )
+    assert math.remainder(found.poses[0].yaw_rad - turned.pose[2], math.tau) == pytest.approx(0.0, abs=1e-9)
 
 
 class Straight:
