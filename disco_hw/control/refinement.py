@@ -1,9 +1,9 @@
 """Refinement of DISCO's plan beside the task's line: a few Gauss-Newton steps from the better of two plans.
 
-Sampling is the global search and the fallback. Its plan and the last refined one are both costed against a timed
-reference (`kernel/reference.py`), in the mean of the belief; the cheaper one is improved (`kernel/refine.py`). The mean
-it is because feedback corrects what a wrong parameter does, which a plan costed under several points does not know: it
-leaves the line on the side where their spread costs least.
+Sampling is the global search and the fallback. Its plan and the last refined one are both costed against a reference
+in time (`kernel/reference.py`, or the task's own), in the mean of the belief; the cheaper one is improved
+(`kernel/refine.py`). The mean it is because feedback corrects what a wrong parameter does, which a plan costed under
+several points does not know: it leaves the line on the side where their spread costs least.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.control.kernel import Terms
+from disco_hw.control.kernel import START_COS, START_SIN, START_X, START_Y, Terms
 from disco_hw.control.kernel.guide import SteeredChassis
 from disco_hw.control.kernel.reference import timed_reference
 from disco_hw.control.kernel.refine import CHANNELS, STATE_COLUMNS, Buffers, Problem, refine
@@ -26,6 +26,7 @@ from disco_hw.model import Model
 from disco_hw.model.added_terms import new_means
 from disco_hw.model.model import coefficient_tables
 from disco_hw.model.step import integration_series
+from disco_hw.tasks.timed_path import TimedPathTerms
 
 Array = NDArray[np.float64]
 
@@ -99,12 +100,9 @@ class Refinement:
         `terms` of the task and `start` (11,) are those of `SkidSteer`.
         What is returned is kept as the start of the next refinement.
         """
-        if not hasattr(terms, "line_at"):
+        if not (hasattr(terms, "line_at") or isinstance(terms, TimedPathTerms)):
             return None
-        self._call(
-            "timed reference", timed_reference, self._reference, terms, start, self._chassis,
-            self._limits.speed_rad_s, self._step_s, self._found,
-        )  # fmt: skip
+        moves = self._set_reference(terms, start)
         distance_m, facing, _, _, _, way_m = self._found.tolist()
         problem, buffers = self._posed(begin, start, way_m), self._buffers
         assert buffers is not None
@@ -114,7 +112,11 @@ class Refinement:
         last, self._last = self._last, None
         covered_m = 0.5 * float(begin.state[3] + begin.state[4]) * self._chassis.wheel_radius_m * self._horizon_s
         progress = self._progress.after(begin.t0_ns, covered_m / max(way_m, 1e-3))
-        if progress < LEAST_PROGRESS or not (distance_m < max(LATERAL_PART * way_m, 0.02) and facing > FACING):
+        if (
+            not moves
+            or progress < LEAST_PROGRESS
+            or not (distance_m < max(LATERAL_PART * way_m, 0.02) and facing > FACING)
+        ):
             return None
         buffers.commands[: self._history] = begin.earlier
         buffers.starts[0] = nominal[: self._rows.size]
@@ -126,6 +128,25 @@ class Refinement:
             return None
         self._last, self._last_ns = buffers.commands[self._history :].copy(), begin.t0_ns
         return self._last
+
+    def _set_reference(self, terms: Terms, start: NDArray[np.float32]) -> bool:
+        """Set the reference, and what else is found on the task's line; returns whether it goes anywhere."""
+        if not isinstance(terms, TimedPathTerms):
+            self._call(
+                "timed reference", timed_reference, self._reference, terms, start, self._chassis,
+                self._limits.speed_rad_s, self._step_s, self._found,
+            )  # fmt: skip
+            return True
+        # The task is a reference in time, and its origin is where the robot should be now.
+        headings = terms.headings(self._chassis.x_icr_m)
+        self._reference[:, 0], self._reference[:, 1] = terms.x[: self._rows.size], terms.y[: self._rows.size]
+        if headings is None:
+            return False
+        first, last = headings[0], headings[self._rows.size]
+        facing = math.cos(first) * start[START_COS] + math.sin(first) * start[START_SIN]
+        way_m = np.hypot(*np.diff(self._reference, axis=0).T).sum()
+        self._found[:] = math.hypot(start[START_X], start[START_Y]), facing, 1.0, math.cos(last), math.sin(last), way_m
+        return True
 
     def _posed(self, begin: PlanStart, start: NDArray[np.float32], way_m: float) -> Problem:
         self._start[:] = begin.state

@@ -22,6 +22,7 @@ from disco_hw.tasks.line.course import (
     LineCourse,
     describe_part,
     line_course,
+    stable_yaw,
     straight_fastest_m_s,
     straight_too_fast,
 )
@@ -230,3 +231,17 @@ class TimedPathTerms(NamedTuple):
     def terminal(self, memory: float, x: float, y: float, cos_yaw: float, sin_yaw: float, found: Found) -> float:
         """Return zero, because there is no terminal cost."""
         return _ZERO
+
+    def headings(self, x_icr_m: float) -> Array | None:
+        """Headings (T + 1,), rad, in which a robot stays with the place, at each step's begin and the last one's end.
+
+        None while the place rests throughout. Python only.
+        """
+        x, y = np.diff(self.x, prepend=np.float32(0.0)), np.diff(self.y, prepend=np.float32(0.0))
+        (moves,) = np.nonzero(self.along_x**2 + self.along_y**2)
+        if not moves.size:
+            return None
+        # A place that rests has the direction in which it goes on.
+        along = np.arctan2(self.along_y, self.along_x)[moves]
+        after = np.minimum(np.searchsorted(moves, np.arange(self.x.size)), moves.size - 1)
+        return stable_yaw(np.unwrap(along.astype(np.float64))[after], np.hypot(x, y), x_icr_m, False)

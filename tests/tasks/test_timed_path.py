@@ -5,7 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from disco_hw.control import DiscoSettings
 from disco_hw.tasks.line import Waypoints
+from disco_hw.tasks.line.course import END_M
 from disco_hw.tasks.timed_path import TimedPathCost
 from tests.tasks.drives import SPIN, begin_with, drive, planner_for, plant_at
 
@@ -22,6 +24,38 @@ def test_places_are_reached_at_their_times_after_waiting_for_the_first():
     ]
     assert np.mean(off[60:]) < 0.05
     assert np.max(off[100:]) < 0.12
+
+
+def test_a_refined_plan_is_nearer_to_the_place_than_a_sampled_one_and_stops_at_the_last():
+    off = {}
+    for refine in (False, True):
+        task = TimedPathCost(Waypoints(ROUND.places_m, 4.0 * ANGLE))
+        plant = plant_at(0.0, 0.0, 0.0)
+        planner = planner_for(task, DiscoSettings.for_speed(0.25, 10.0, refine))
+        off[refine] = [
+            task.instant_cost((step + 1) * 0.1, plant.x_m, plant.y_m, plant.forward_m_s)
+            for step in drive(planner, plant, range(300))
+        ]
+    # The circle takes 25 s; the first seconds are those of a robot that comes from rest.
+    assert np.mean(off[True][60:250]) < 0.005
+    assert np.mean(off[True][60:250]) < 0.2 * np.mean(off[False][60:250])
+    assert off[True][-1] < END_M
+
+
+def test_the_heading_is_that_of_a_robot_that_stays_with_the_place():
+    """On a circle it is turned inwards by asin(x_icr / radius); before the place moves it waits for that."""
+    radius_m, x_icr_m, ahead = 1.0, 0.2, 100
+    rests, goes_on = (
+        TimedPathCost(ROUND).prepare(time_s, 0.0, 0.0, 0.0, None, 0.1, ahead).terms.headings(x_icr_m)
+        for time_s in (0.0, 5.0)
+    )
+    turned = math.asin(x_icr_m / radius_m)
+    # Of the last pieces the heading ends along the way, which is forgotten x_icr before.
+    settled = np.arange(60)
+    np.testing.assert_allclose(goes_on[:60], turned + settled * 0.1 / 4.0, atol=0.02)
+    np.testing.assert_allclose(rests[:50], goes_on[0], atol=0.02)
+    still = Waypoints(np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([50.0, 60.0]))
+    assert TimedPathCost(still).prepare(0.0, 0.0, 0.0, 0.0, None, 0.1, 40).terms.headings(x_icr_m) is None
 
 
 @pytest.mark.parametrize("trap", ["standing", "spinning"])
