@@ -4,7 +4,8 @@ Wheel radius, axle and x_icr of every robot are off by up to 15 %, and nobody is
 known to all. From rest on the line; figures are of 5 to 30 s, at 50 plans a second. The gains of the classical ones
 were found on robots 0 to 4 (`docs/results.md`); these are robots 1000 on, or others with `--first`.
 Names that begin with `mujoco_` drive the robot of `tools/mujoco_plant.py`, those with `turned_` the same robots with
-their back as their front (`tools/turned_plant.py`), as the MPC drives them.
+their back as their front (`tools/turned_plant.py`), as the MPC drives them. Ways that begin with `timed_` are
+way-points by time, of which the distance from the line is shown.
 
 `python -m tools.bench_tracking disco_adapting circle,square 20` drives some of it; `... starts 20` begins anywhere.
 `... --first 5000 --count 20` drives robots that nothing was chosen on; `--speeds 0.1,0.2,0.3` at these speeds (m/s),
@@ -33,12 +34,12 @@ from disco_hw.tasks.circle import CircleCost
 from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots
 from tools.mujoco_plant import MujocoPlant, mujoco_robots
 from tools.nmpc import NonlinearMpc
-from tools.tracking import LIMITS, Contender, Drive, Plant, Track, classical, disco, drive, model, tracks
+from tools.tracking import LIMITS, Contender, Drive, Plant, Track, classical, disco, drive, model, timed, tracks
 from tools.turned_plant import TurnedPlant, turned_robot
 
 FIRST = 1000
 SPEED_M_S, RATE_HZ = 0.2, 50.0
-MUJOCO, TURNED = "mujoco_", "turned_"
+MUJOCO, TURNED, TIMED = "mujoco_", "turned_", "timed_"
 
 
 def contenders(speed_m_s: float = SPEED_M_S) -> dict[str, Contender]:
@@ -110,13 +111,15 @@ def rows(
             driven, contender = [turned_robot(robot) for robot in driven], contender.removeprefix(TURNED)
             plant_of = partial(TurnedPlant, plant_of)
         for way in ways:
+            track = tracks(speed_m_s)[way.removeprefix(TIMED)]
+            track = timed(track, speed_m_s) if way.startswith(TIMED) else track
             yield (
                 f"tracking.{name}.{way}",
                 [
                     drive(
                         contenders(speed_m_s)[contender],
                         robot,
-                        tracks(speed_m_s)[way],
+                        track,
                         rate_hz=RATE_HZ,
                         seed=seed,
                         plant_of=plant_of,

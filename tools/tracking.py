@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -30,9 +30,10 @@ from disco_hw.runtime.pipeline import FollowTask, Governor, Pipeline, Planner, W
 from disco_hw.tasks import PlannedTask
 from disco_hw.tasks.circle import CircleCost, CircleCourse
 from disco_hw.tasks.lemniscate import LemniscateTask
-from disco_hw.tasks.line import PathTable
+from disco_hw.tasks.line import PathTable, Waypoints
 from disco_hw.tasks.line.cost import PathCost
 from disco_hw.tasks.line.course import LineCourse, line_course
+from disco_hw.tasks.timed_path import TimedPathCost
 from drivers.types import Readings
 from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot
 
@@ -84,6 +85,17 @@ def tracks(speed_m_s: float = 0.2) -> dict[str, Track]:
         "square": line_track(((0.0, 0.0), (1.5, 0.0), (1.5, 1.5), (0.0, 1.5), (0.0, 0.0)), speed_m_s),
         "slalom": line_track(slalom, speed_m_s),
     }
+
+
+def timed(track: Track, speed_m_s: float) -> Track:
+    """The same way as way-points by time; a closed one is gone round until the drive ends."""
+    ways = [track.points_m]
+    length_m = float(np.hypot(*np.diff(track.points_m, axis=0).T).sum())
+    if np.hypot(*(track.points_m[-1] - track.points_m[0])) < 1e-6:
+        ways += [track.points_m[1:]] * math.ceil(DURATION_S * speed_m_s / length_m)
+    places_m = np.concatenate(ways)
+    times_s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(places_m, axis=0).T))]) / speed_m_s
+    return replace(track, task=TimedPathCost(Waypoints(places_m, times_s)))
 
 
 def belief(mean: tuple[float, ...] = NOMINAL, spread: float = SPREAD) -> Gaussian:

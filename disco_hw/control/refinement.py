@@ -44,6 +44,8 @@ ACCELERATION_M = 6e-4
 END_X_ICR = 5.0
 # The robot is beside the line within this part of the way that the horizon covers, and facing within this cosine.
 LATERAL_PART, FACING = 0.3, 0.5
+# Behind a place that moves by itself it may be as far as that goes within the horizon: sampled plans do not catch up.
+TIMED_PART = 1.0
 # A robot that, in the mean over the last horizon, covers less than this part of its way is left to the sampled plan: a
 # reference that starts anew beside the robot lets a plan put off its way from tick to tick. And one that starts from
 # rest would be turned on the spot to where the line begins, as fast as its wheels can.
@@ -112,11 +114,9 @@ class Refinement:
         last, self._last = self._last, None
         covered_m = 0.5 * float(begin.state[3] + begin.state[4]) * self._chassis.wheel_radius_m * self._horizon_s
         progress = self._progress.after(begin.t0_ns, covered_m / max(way_m, 1e-3))
-        if (
-            not moves
-            or progress < LEAST_PROGRESS
-            or not (distance_m < max(LATERAL_PART * way_m, 0.02) and facing > FACING)
-        ):
+        part = TIMED_PART if isinstance(terms, TimedPathTerms) else LATERAL_PART
+        is_beside = distance_m < max(part * way_m, 0.02) and facing > FACING
+        if not moves or progress < LEAST_PROGRESS or not is_beside:
             return None
         buffers.commands[: self._history] = begin.earlier
         buffers.starts[0] = nominal[: self._rows.size]
