@@ -26,7 +26,6 @@ from disco_hw.model import Model
 from disco_hw.model.added_terms import new_means
 from disco_hw.model.model import coefficient_tables
 from disco_hw.model.step import integration_series
-from disco_hw.tasks.timed_path import TimedPathTerms
 
 Array = NDArray[np.float64]
 
@@ -102,7 +101,8 @@ class Refinement:
         `terms` of the task and `start` (11,) are those of `SkidSteer`.
         What is returned is kept as the start of the next refinement.
         """
-        if not (hasattr(terms, "line_at") or isinstance(terms, TimedPathTerms)):
+        is_timed = hasattr(terms, "headings")
+        if not (is_timed or hasattr(terms, "line_at")):
             return None
         moves = self._set_reference(terms, start)
         distance_m, facing, _, _, _, way_m = self._found.tolist()
@@ -114,7 +114,7 @@ class Refinement:
         last, self._last = self._last, None
         covered_m = 0.5 * float(begin.state[3] + begin.state[4]) * self._chassis.wheel_radius_m * self._horizon_s
         progress = self._progress.after(begin.t0_ns, covered_m / max(way_m, 1e-3))
-        part = TIMED_PART if isinstance(terms, TimedPathTerms) else LATERAL_PART
+        part = TIMED_PART if is_timed else LATERAL_PART
         is_beside = distance_m < max(part * way_m, 0.02) and facing > FACING
         if not moves or progress < LEAST_PROGRESS or not is_beside:
             return None
@@ -131,7 +131,7 @@ class Refinement:
 
     def _set_reference(self, terms: Terms, start: NDArray[np.float32]) -> bool:
         """Set the reference, and what else is found on the task's line; returns whether it goes anywhere."""
-        if not isinstance(terms, TimedPathTerms):
+        if hasattr(terms, "line_at"):
             self._call(
                 "timed reference", timed_reference, self._reference, terms, start, self._chassis,
                 self._limits.speed_rad_s, self._step_s, self._found,

@@ -28,6 +28,11 @@ the point so far on, the heading in which a robot stays on the line there, the c
 and the speed wanted; a place begins as a rollout's memory does. And how far a robot on the line goes in so long: the
 law has one whose plan stands.
 
+Terms of a task that says where to be at each step's end, `x` and `y` (T,), may say how a robot faces that stays there,
+for its plans to be refined (control/refinement.py):
+
+    headings(self, x_icr_m) -> rad (T + 1,), or None at rest        not compiled
+
 `found` holds what `follow` kept and the four numbers of that row; zeros without a table. Constants are made by
 `single`: any other number would pull the arithmetic up to double precision. Compiled, the functions below use estimates
 refined by a Newton step; as written here they are their oracle.
