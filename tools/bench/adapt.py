@@ -291,8 +291,8 @@ def drive_through_change(directory: Path, changes: str, *, adapt: bool) -> LiveD
     narrow.write_text(model_text(with_geometry(model, Geometry(mean, np.diag(std**2)))), encoding="utf-8")
     axle, wheels = CHANGES[changes]
     hidden = ("--hide", f"surface_change={axle * GROWTH},{LIVE_CHANGE_S},{wheels * GROWTH}")
-    arguments = ("--adapt",) if adapt else ()
-    with running_stack(directory, "can", LIVE_TASK, LIVE_START, hidden, arguments, str(narrow)) as stack:
+    control = "" if adapt else 'adaptation = "off"'
+    with running_stack(directory, "can", LIVE_TASK, LIVE_START, hidden, model=str(narrow), control=control) as stack:
         stack.operator.wait_for("READY", 60.0)
         stack.start()
         stack.operator.wait_until("driving", lambda s: s["source"] == "plan", 10.0)
