@@ -6,6 +6,7 @@ import stat
 import subprocess
 import sys
 import time
+from contextlib import closing
 
 import pytest
 
@@ -154,12 +155,13 @@ def test_a_stopped_page_holds_up_neither_the_feed_nor_another_page(feed, tmp_pat
 
 
 def test_what_cannot_be_encoded_is_counted(feed, tmp_path):
-    subscriber = FeedSubscriber(tmp_path / "control.sock.view")
-    tick = connected(feed, subscriber)
-    now_ns = tick_records(tick + 50)[0]
-    feed.put(now_ns, [records.Event(now_ns, "info", "x", object())])
-    assert feed.refused == 1
-    subscriber.close()
+    with closing(FeedSubscriber(tmp_path / "control.sock.view")) as subscriber:
+        tick = connected(feed, subscriber)
+        # What waits goes out with the next tick, so that the event is alone in its batch.
+        feed.put(*tick_records(tick + 50))
+        now_ns = tick_records(tick + 100)[0]
+        feed.put(now_ns, [records.Event(now_ns, "info", "x", object())])
+        assert feed.refused == 1
 
 
 def test_garbage_is_counted_by_the_subscriber(tmp_path):
