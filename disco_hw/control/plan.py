@@ -29,8 +29,8 @@ PLANNER_VERSION = 3
 weights, and shorter steps below 0.2 m/s.
 """
 USUAL_SPEED_M_S, USUAL_STEP_S, USUAL_NOISE = 0.2, 0.1, 0.1 * ROTATION
-# Chosen: longer steps of a slow robot would answer too late to what happens on the way. What follows a refined plan
-# follows its first steps as they are.
+# Chosen: longer steps of a slow robot would answer too late to what happens on the way. Refined plans gain by shorter
+# ones: on a circle at 0.1 m/s six robots were 1.7 mm off with steps of 0.1 s, and 5.4 mm with 0.2 s (medians).
 LONGEST_STEP_S, LONGEST_REFINED_STEP_S = 0.25, USUAL_STEP_S
 # Noise of a fast robot grows with this power of its speed: with less it stays beside tight circles, with more it is
 # pulled off them.
@@ -210,11 +210,10 @@ class DiscoSettings:
     @classmethod
     def from_config(cls, control: config.Control, speed_m_s: float) -> DiscoSettings:
         """Return the settings that robot.toml asks for, for its task's speed."""
-        settings = (
-            cls.paper()
-            if control.mode == "paper"
-            else cls.for_speed(speed_m_s, control.rate_hz, control.mode == "default")
-        )
+        if control.mode == "paper":
+            settings = cls.paper()
+        else:
+            settings = cls.for_speed(speed_m_s, control.rate_hz, control.mode == "default")
         horizon, step_s = settings.sampler.horizon, settings.step_s
         if control.step_s is not None:
             # The number of steps that goes with steps of the task's speed says nothing of others.
