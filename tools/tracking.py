@@ -30,7 +30,7 @@ from disco_hw.runtime.pipeline import FollowTask, Governor, Pipeline, Planner, W
 from disco_hw.tasks import PlannedTask
 from disco_hw.tasks.circle import CircleCost, CircleCourse
 from disco_hw.tasks.lemniscate import LemniscateTask
-from disco_hw.tasks.line import PathTable, Waypoints
+from disco_hw.tasks.line import Waypoints, planned_table
 from disco_hw.tasks.line.cost import PathCost
 from disco_hw.tasks.line.course import LineCourse, line_course
 from disco_hw.tasks.timed_path import TimedPathCost
@@ -48,11 +48,15 @@ SETTLED_S, DURATION_S = 5.0, 30.0
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A way to drive: its line, its cost, its way-points, where to start."""
+    """A way to drive: its line, its cost, its way-points, where to start.
+
+    `sampled`: the cost where plans are not refined; None where it is the same.
+    """
 
     course: LineCourse | CircleCourse
     task: PlannedTask
     points_m: Array
+    sampled: PlannedTask | None = None
 
     @property
     def start(self) -> tuple[float, float, float]:
@@ -62,8 +66,8 @@ class Track:
 
 def line_track(points: tuple[tuple[float, float], ...], speed_m_s: float) -> Track:
     """A line of way-points."""
-    places = np.array(points)
-    return Track(line_course(points, "line"), PathCost(PathTable(places), speed_m_s), places)
+    refined, sampled = (PathCost(planned_table(points, mode), speed_m_s) for mode in ("default", "sampled"))
+    return Track(line_course(points, "line"), refined, np.array(points), sampled)
 
 
 def circle_track(radius_m: float, speed_m_s: float) -> Track:
@@ -175,7 +179,8 @@ def disco(settings: DiscoSettings, knows: bool = False, learns: bool = False, se
     """DISCO with these settings."""
 
     def made(robot: ForeignRobot, track: Track) -> Planner:
-        return Disco(model(robot, knows), track.task, settings, LIMITS, seed)
+        task = track.task if settings.refine or track.sampled is None else track.sampled
+        return Disco(model(robot, knows), task, settings, LIMITS, seed)
 
     return Contender(made, knows, learns, settings.offset_free)
 

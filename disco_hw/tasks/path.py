@@ -12,7 +12,7 @@ from msgspec import Meta
 
 from disco_hw.errors import InputError
 from disco_hw.tasks import Chassis, Editable, Point, Positive, TaskFault
-from disco_hw.tasks.line import PathTable, check_size, load_waypoints, points_of
+from disco_hw.tasks.line import PathTable, check_size, load_waypoints, planned_table, points_of
 from disco_hw.tasks.line.cost import PathCost
 from disco_hw.tasks.line.course import (
     LineCourse,
@@ -100,9 +100,9 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         """Laps of a closed path, or the part of an open one that is behind."""
         return PathProgress(PathTable(np.array(self.points)))
 
-    def planned(self, _mode: str) -> PathCost:
-        """Return the cost of following the path, for the planner; the same in every mode."""
-        return PathCost(PathTable(np.array(self.points)), self.speed_m_s)
+    def planned(self, mode: str) -> PathCost:
+        """Return the cost of following the path, for the planner; its line is finer in the default mode."""
+        return PathCost(planned_table(self.points, mode), self.speed_m_s)
 
 
 TASK = PathTask

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,8 +18,9 @@ from disco_hw.files import WAY_POINTS, read_lines
 from disco_hw.tasks import Array, Point
 from drivers.samples import FARTHEST_M
 
-# Chosen: smaller follows corners more closely, and makes the table longer.
+# Chosen: smaller follows corners more closely, which refined plans are exact enough for, and makes the table longer.
 SPACING_M = 0.02
+REFINED_SPACING_M = 0.01
 # Entries closer than this part of the spacing lie on either side of a turn straight back.
 FOLDED = 0.01
 LOOK_BACK_M = 0.3
@@ -38,7 +40,7 @@ AGAINST_BRANCH_M = 0.6
 
 @dataclass(frozen=True, eq=False)
 class PathTable:
-    """Way-points (N, 2) in equal pieces of arc length.
+    """Way-points (N, 2) in equal pieces of arc length, of about `nominal_spacing_m`.
 
     Where the way turns sharply it is cut into pieces: the robot stops at a piece's end and turns to the next. The path
     is closed if its last way-point is its first. Raises ValueError for way-points closer than the table's spacing
@@ -46,6 +48,7 @@ class PathTable:
     """
 
     places_m: Array
+    nominal_spacing_m: float = SPACING_M
     _table: Array = field(init=False, repr=False)
     _closed: bool = field(init=False, repr=False)
     _spacing_m: float = field(init=False, repr=False)
@@ -54,9 +57,9 @@ class PathTable:
     def __post_init__(self) -> None:
         places = self.places_m
         distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(places, axis=0).T))])
-        count = round(distance[-1] / SPACING_M)
+        count = round(distance[-1] / self.nominal_spacing_m)
         if count < 1:
-            raise ValueError(f"the path is {distance[-1]} m long; it must be longer than {SPACING_M} m")
+            raise ValueError(f"the path is {distance[-1]} m long; it must be longer than {self.nominal_spacing_m} m")
         at = np.linspace(0.0, distance[-1], count + 1)
         x, y = np.interp(at, distance, places[:, 0]), np.interp(at, distance, places[:, 1])
         # Where the way turns straight back between two entries they may coincide, and there would be no direction: the
@@ -64,7 +67,7 @@ class PathTable:
         (folds,) = np.nonzero(np.hypot(np.diff(x), np.diff(y)) < FOLDED * distance[-1] / count)
         turns = np.searchsorted(distance, at[folds], side="right")
         x[folds], y[folds] = places[turns].T
-        closed = bool(np.hypot(*(places[0] - places[-1])) < SPACING_M)
+        closed = bool(np.hypot(*(places[0] - places[-1])) < self.nominal_spacing_m)
         spacing = float(distance[-1]) / count
         corners = sharp_turns(np.column_stack([x, y]), closed, max(1, round(TURN_M / spacing)))
         x, y = _rounded(np.column_stack([x, y]), closed).T
@@ -162,6 +165,11 @@ class PathTable:
         branches = np.append(nearest, branches[distance[branches] < distance[nearest] + BRANCHES_M])
         along = self._table[branches, 2] * math.cos(yaw_rad) + self._table[branches, 3] * math.sin(yaw_rad)
         return int(branches[np.argmin(distance[branches] + 0.5 * AGAINST_BRANCH_M * (1.0 - along))])
+
+
+def planned_table(points: Sequence[Point], mode: str) -> PathTable:
+    """Return the table that the planner of a control mode follows: a finer one where plans are refined."""
+    return PathTable(np.array(points), REFINED_SPACING_M if mode == "default" else SPACING_M)
 
 
 def _rounded(points: Array, closed: bool) -> Array:
