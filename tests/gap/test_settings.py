@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 
 from disco_hw import gap
-from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.search.selection import Selector, body_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
 from tests.gap.synthetic import LIMITS, body_channel
-from tools.gap.logs import simulated_drive
 
 GROUPS = [type(getattr(DEFAULT_SETTINGS, field.name)) for field in fields(GapSettings)]
 
@@ -37,14 +35,6 @@ def test_settings_are_frozen():
     for group in (DEFAULT_SETTINGS, *(getattr(DEFAULT_SETTINGS, field.name) for field in fields(GapSettings))):
         with pytest.raises(FrozenInstanceError):
             setattr(group, fields(group)[0].name, None)
-
-
-def test_a_setting_of_the_grid_is_felt_in_the_drive():
-    log = simulated_drive({}, 1, "circle")
-    short = replace(DEFAULT_SETTINGS, grid=replace(DEFAULT_SETTINGS.grid, longest_s=20.0, stretch_s=5.0))
-    drive = grid_drive(log, short)
-    assert drive.settings is short
-    assert drive.duration_s < 30.0 < grid_drive(log).duration_s
 
 
 def test_a_setting_of_the_selection_is_felt_by_who_selects():
