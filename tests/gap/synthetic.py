@@ -1,6 +1,7 @@
 """A short drive made with the model itself, so that what is right is known exactly: straights, spins, arcs, rests."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search.channel_result import ChannelResult
+from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.selection import Selector, Thresholds, body_moves, wheel_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 
@@ -86,6 +88,22 @@ def selector_of(channel, limits=LIMITS, **chosen):
 def searched(channel, names=(), limits=LIMITS):
     """A search of a channel that found these names."""
     return ChannelResult(selector_of(channel, limits), names, channel)
+
+
+def fit_at(cost, vector=(0.0,), active=()):
+    """A fit that ended at this cost, in nats."""
+    return Fit(np.asarray(vector, dtype=float), active, cost, np.empty(0), np.empty((0, len(active))))
+
+
+def is_accepted(smaller, larger, proof, costs=(500.0, 450.0), layout=BODY, limits=LIMITS, moved_m=1.0, count=1000):
+    """Whether what one set has more than another is accepted, as its proof, the costs and what it moves are."""
+    channel = SimpleNamespace(
+        settings=DEFAULT_SETTINGS, count=count, split=lambda vector: (vector, None), layout=layout
+    )
+    chosen = Selector(channel, lambda small, big: moved_m, limits)
+    chosen.fits = {frozenset(names): fit_at(cost) for names, cost in zip((smaller, larger), costs, strict=True)}
+    chosen.proofs[frozenset(smaller), frozenset(larger)] = proof
+    return chosen.acceptable(smaller, larger)
 
 
 def body_channel(seed=0, **effects):

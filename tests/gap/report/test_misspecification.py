@@ -8,11 +8,7 @@ import pytest
 
 from disco_hw.gap.data.free_runs import read_angles
 from disco_hw.gap.noise.channels import BodyChannel
-from disco_hw.gap.report.misspecification import (
-    _answers_otherwise,
-    _apart,
-    disputed_names,
-)
+from disco_hw.gap.report.misspecification import _answers_otherwise, _apart, disputed_names
 from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.unnamed_terms import motion

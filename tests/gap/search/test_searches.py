@@ -22,6 +22,7 @@ from tests.gap.synthetic import (
     NOISE,
     answered,
     body_channel,
+    fit_at,
     line_of,
     moved_by,
     vector_of,
@@ -301,7 +302,7 @@ def begun(names, given=(), before=None, best=0, seen_s=0.0):
     selector = Selector(channel, lambda small, big: 0.0, LIMITS, given=given)
     plain = vector_of(WHEEL, deadband=0.4)
     others = tuple(name for name in names if name in given or name not in DELAY_NAMES)
-    selector.fits[frozenset(others)] = Fit(plain, (), 50.0, np.empty(0), np.empty((0, 0)))
+    selector.fits[frozenset(others)] = fit_at(50.0, plain)
     if before is not None:
         selector.fits[frozenset(names)] = before
     starts = []
@@ -329,7 +330,7 @@ def test_lateness_is_fitted_from_quick_and_slow_responses_after_what_is_seen_at_
 def test_lateness_on_top_of_what_was_accepted_is_fitted_from_none(monkeypatch):
     names = (*DELAY_NAMES, "deadband")
     for before_cost, kept in ((5.0, True), (15.0, False)):
-        before = Fit(WHEEL.neutral, (), before_cost, np.empty(0), np.empty((0, 0)))
+        before = fit_at(before_cost, WHEEL.neutral)
         selector, starts, fitted = begun(names, before=before)
         monkeypatch.setattr(channel_search, "fit", fitted)
         responding(selector, names)

@@ -11,11 +11,22 @@ from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.search import selection
 from disco_hw.gap.search.evidence import EffectEvidence
-from disco_hw.gap.search.least_squares import Fit, fit
+from disco_hw.gap.search.least_squares import fit
 from disco_hw.gap.search.richest_model import CANDIDATES, DELAY_NAMES, candidates_of, indices
 from disco_hw.gap.search.selection import Selector, Thresholds, body_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
-from tests.gap.synthetic import GEOMETRY, LIMITS, body_channel, line_of, moved_by, selector_of, vector_of, wheels_on
+from tests.gap.synthetic import (
+    GEOMETRY,
+    LIMITS,
+    body_channel,
+    fit_at,
+    is_accepted,
+    line_of,
+    moved_by,
+    selector_of,
+    vector_of,
+    wheels_on,
+)
 
 
 def selector(given=(), start=None, moves_m=0.001, **effects):
@@ -161,14 +172,9 @@ def test_a_slow_drive_cannot_tell_lag_from_delay_and_says_so():
 
 def judged(gain=30.0, score=30.0, without_two=10.0, moved_m=0.01, misfit=0.0, count=1000):
     """Whether one effect is accepted on top of none: its gain, proof, what it moves, and what the fit without lacks."""
-    channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=count, split=lambda vector: (vector, None), layout=BODY)
     base = 0.5 * count * (1.0 + misfit)
-    limits = LIMITS
-    chosen = Selector(channel, lambda small, big: moved_m, limits)
-    for names, cost in ((frozenset(), base), (frozenset({"turn_slip"}), base - gain)):
-        chosen.fits[names] = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
-    chosen.proofs[frozenset(), frozenset({"turn_slip"})] = EffectEvidence(gain, 50.0, 50.0, without_two, 1.0, score)
-    return chosen.acceptable((), ("turn_slip",))
+    proof = EffectEvidence(gain, 50.0, 50.0, without_two, 1.0, score)
+    return is_accepted((), ("turn_slip",), proof, (base, base - gain), moved_m=moved_m, count=count)
 
 
 def test_an_effect_is_accepted_only_if_every_condition_holds():
@@ -200,15 +206,8 @@ def test_an_effect_is_accepted_only_if_every_condition_holds():
     ],
 )
 def test_a_lag_beside_a_delay_is_told_where_it_surely_is_however_little_it_moves(smaller, new, score, accepted):
-    channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=1000, split=lambda vector: (vector, None), layout=WHEEL)
-    limits = Thresholds(10.0, 0.001, 20.0)
-    chosen = Selector(channel, lambda small, big: 0.0009, limits)
-    larger = (*smaller, *new)
-    for names, cost in ((smaller, 500.0), (larger, 450.0)):
-        chosen.fits[frozenset(names)] = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
-    proof = EffectEvidence(50.0, 40.0, 30.0, 20.0, 1.0, score)
-    chosen.proofs[frozenset(smaller), frozenset(larger)] = proof
-    assert chosen.acceptable(smaller, larger) == accepted
+    proof, limits = EffectEvidence(50.0, 40.0, 30.0, 20.0, 1.0, score), Thresholds(10.0, 0.001, 20.0)
+    assert is_accepted(smaller, (*smaller, *new), proof, layout=WHEEL, limits=limits, moved_m=0.0009) == accepted
 
 
 @pytest.mark.parametrize(
@@ -225,13 +224,9 @@ def test_a_lag_beside_a_delay_is_told_where_it_surely_is_however_little_it_moves
 def test_a_delay_of_the_commands_needs_its_score_but_not_to_show_in_a_third_place(
     layout, smaller, new, accepted, score
 ):
-    channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=1000, split=lambda vector: (vector, None), layout=layout)
-    chosen = Selector(channel, lambda small, big: 0.01, Thresholds(10.0, 0.001, 20.0))
-    larger = (*smaller, *new)
-    for names, cost in ((smaller, 500.0), (larger, 480.0)):
-        chosen.fits[frozenset(names)] = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
-    chosen.proofs[frozenset(smaller), frozenset(larger)] = EffectEvidence(20.0, -1.0, -7.0, 0.0, 1.0, score)
-    assert chosen.acceptable(smaller, larger) == (accepted and score > 10.0)
+    proof, limits = EffectEvidence(20.0, -1.0, -7.0, 0.0, 1.0, score), Thresholds(10.0, 0.001, 20.0)
+    found = is_accepted(smaller, (*smaller, *new), proof, (500.0, 480.0), layout, limits, 0.01)
+    assert found == (accepted and score > 10.0)
 
 
 def test_what_fits_badly_is_helped_by_a_large_part_of_what_it_lacks_whatever_its_score():
@@ -340,8 +335,7 @@ def test_a_search_that_comes_back_to_where_it_was_ends_with_the_best_set_on_its_
 def test_the_price_of_an_effect_is_that_of_all_its_parameters():
     channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=1000)
     fitted = Selector(channel, lambda small, big: 1.0, LIMITS)
-    for names, cost in ((frozenset(), 700.0), (frozenset({"wheel_gain"}), 650.0)):
-        fitted.fits[names] = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
+    fitted.fits = {frozenset(): fit_at(700.0), frozenset({"wheel_gain"}): fit_at(650.0)}
     # Left and right: half of 2 ln(1000).
     assert fitted.promise((), "wheel_gain") == pytest.approx(50.0 - np.log(1000))
     assert fitted._worth((), ("wheel_gain",), "wheel_gain") == pytest.approx(50.0 - np.log(1000))
