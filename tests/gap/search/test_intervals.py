@@ -31,21 +31,25 @@ def estimated(channel, names=("turn_slip",)):
     return estimate_parameters(searched(channel, names))
 
 
-def test_intervals_hold_the_truth_nine_times_of_ten():
-    held = []
-    for seed in range(12):
-        found = estimated(body_channel(seed, turn_slip=0.08)[0]).by_name
-        for name, truth in (("turn_slip.k_s", 0.08), ("wheel_radius_m", 0.06), ("axial_distance_m", 0.4)):
-            held.append(found[name].low <= truth <= found[name].high)
+TRUTH = {"turn_slip.k_s": 0.08, "wheel_radius_m": 0.06, "axial_distance_m": 0.4}
+
+
+@pytest.fixture(scope="module")
+def twelve():
+    """What twelve drives of one robot say of its parameters."""
+    return [estimated(body_channel(seed, turn_slip=0.08)[0]).by_name for seed in range(12)]
+
+
+def test_intervals_hold_the_truth_nine_times_of_ten(twelve):
+    held = [found[name].low <= truth <= found[name].high for found in twelve for name, truth in TRUTH.items()]
     assert np.mean(held) >= 0.85
 
 
-def test_intervals_hold_what_another_drive_gives():
+def test_intervals_hold_what_another_drive_gives(twelve):
     """The promise of the report, which no error of the other drive is added to."""
-    held, names = [], ("turn_slip.k_s", "wheel_radius_m", "axial_distance_m")
-    found = [estimated(body_channel(seed, turn_slip=0.08)[0]).by_name for seed in range(12)]
-    for here, there in permutations(found, 2):
-        held += [here[name].low <= there[name].value <= here[name].high for name in names]
+    held = []
+    for here, there in permutations(twelve, 2):
+        held += [here[name].low <= there[name].value <= here[name].high for name in TRUTH]
     assert 0.95 <= np.mean(held) <= 0.995
 
 

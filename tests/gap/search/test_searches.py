@@ -134,13 +134,17 @@ def test_what_slips_is_named_and_the_rest_is_the_noise_of_the_poses():
     assert found.richest_parameters in (smooth + terms, smooth + terms + 1)
 
 
+def late_by(late_s):
+    """A drive of a robot as drawn, whose poses are stamped late."""
+    channel, line = body_channel()
+    track = channel.track(channel.neutral)
+    late = np.clip(line.pose.node - round(late_s / GRID_STEP_S), 0, len(track) - 1)
+    return replace(line, pose_values=track[late] + (line.pose_values - track[line.pose.node]))
+
+
 @pytest.mark.thorough
 def test_poses_that_are_late_at_first_sight_are_named_late_and_their_noise_is_not_that_of_slip():
-    channel, line = body_channel()
-    late = np.clip(line.pose.node - 30, 0, None)
-    poses = channel.track(channel.neutral)[late] + (line.pose_values - channel.track(channel.neutral)[line.pose.node])
-    line = replace(line, pose_values=poses, pose_delay_s=0.28)
-    found = search_body(line, channel.neutral)
+    found = search_body(replace(late_by(0.3), pose_delay_s=0.28), vector_of())
     assert found.names == ("pose_latency",)
     assert found.fit.vector[BODY.place["pose_latency.latency_s"]] == pytest.approx(0.3, abs=0.005)
     assert found.channel.noise.position_m == pytest.approx(NOISE.position_m, rel=0.15)
@@ -159,17 +163,12 @@ def test_poses_that_are_late_at_first_sight_are_named_late_and_their_noise_is_no
 def test_the_first_noise_is_of_poses_as_late_as_at_first_sight_unless_that_errs(
     monkeypatch, late_s, seen_s, moved_s, begun_s
 ):
-    channel, line = body_channel()
-    track = channel.track(channel.neutral)
-    late = np.clip(line.pose.node - round(late_s / GRID_STEP_S), 0, len(track) - 1)
-    poses = track[late] + (line.pose_values - track[line.pose.node])
-
     def begin(of, vector, **_):
         raise RuntimeError(vector[BODY.place["pose_latency.latency_s"]])
 
     monkeypatch.setattr(channel_search, "learn_body_noise", begin)
     with pytest.raises(RuntimeError) as begun:
-        search_body(replace(line, pose_values=poses, pose_delay_s=seen_s, poses_moved_s=moved_s), channel.neutral)
+        search_body(replace(late_by(late_s), pose_delay_s=seen_s, poses_moved_s=moved_s), vector_of())
     assert begun.value.args == (begun_s,)
 
 
