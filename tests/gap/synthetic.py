@@ -81,7 +81,7 @@ def moved_by(channel, perturbation):
 def selector_of(channel, limits=LIMITS, **chosen):
     """The selector of a channel of wheels or of a body."""
     is_body = isinstance(channel, BodyChannel)
-    moves = body_moves(channel) if is_body else wheel_moves(channel, np.array(GEOMETRY))
+    moves = body_moves(channel) if is_body else wheel_moves(channel, channel.geometry)
     return Selector(channel, moves, limits, **chosen)
 
 
