@@ -1,15 +1,19 @@
 """A short drive made with the model itself, so that what is right is known exactly: straights, spins, arcs, rests."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 
-from disco_hw.gap.data import BODY
-from disco_hw.gap.data.free_runs import read_angles
+from disco_hw.gap.data import BODY, WHEEL
+from disco_hw.gap.data.free_runs import read_angles, run_wheels
 from disco_hw.gap.data.gridded_drive import GriddedDrive, GridSamples
 from disco_hw.gap.noise.body_noise import BodyNoise
-from disco_hw.gap.noise.channels import BodyChannel
-from disco_hw.gap.search.selection import Thresholds
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
+from disco_hw.gap.noise.wheel_noise import WheelNoise
+from disco_hw.gap.search.channel_result import ChannelResult
+from disco_hw.gap.search.least_squares import Fit
+from disco_hw.gap.search.selection import Selector, Thresholds, body_moves, wheel_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 
 GEOMETRY = (0.06, 0.4, 0.1)
@@ -38,21 +42,79 @@ def line_of(speed_rad_s):
     )  # fmt: skip
 
 
+def vector_of(layout=BODY, **values):
+    """A channel's vector of a robot as drawn, with these entries: `effect__parameter`, or an effect's first."""
+    vector = layout.neutral.copy()
+    if layout is BODY:
+        vector[:3] = GEOMETRY
+    for name, value in values.items():
+        start = name.replace("__", ".")
+        vector[next(at for column, at in layout.place.items() if f"{column}.".startswith(f"{start}."))] = value
+    return vector
+
+
+def answered(command, added=None, **effects):
+    """A drive whose wheels answer commands (M, 2), with what is added to them, by these effects; read exactly."""
+    line, still = line_of(command), np.zeros_like(command)
+    truth, added = vector_of(WHEEL, **effects), still if added is None else added
+    angle = run_wheels(truth, np.array(GEOMETRY), command, added, line.first, line.t_s, still)
+    speed = np.gradient(angle, GRID_STEP_S, axis=0)
+    return replace(line, angle_rad=angle, speed_rad_s=speed, encoder_angle_rad=angle[line.encoder.node])
+
+
+def wheels_on(line, noise=WheelNoise()):  # noqa: B008  (it is frozen)
+    """The wheel channel of a drive."""
+    return WheelChannel.build(line, noise, np.array(GEOMETRY))
+
+
+def body_on(line, poses, use=None):
+    """The body channel of a drive with these poses (P, 3)."""
+    return BodyChannel.build(replace(line, pose_values=poses), NOISE, vector_of(), use)
+
+
+def moved_by(channel, perturbation):
+    """The body channel of a robot that moves by this (M, 3) too: m/s forward and left, rad/s."""
+    moved = channel.track(channel.neutral, perturbation) - channel.track(channel.neutral)
+    return body_on(channel.drive, channel.measured + moved[channel.samples.node])
+
+
+def selector_of(channel, limits=LIMITS, **chosen):
+    """The selector of a channel of wheels or of a body."""
+    is_body = isinstance(channel, BodyChannel)
+    moves = body_moves(channel) if is_body else wheel_moves(channel, channel.geometry)
+    return Selector(channel, moves, limits, **chosen)
+
+
+def searched(channel, names=(), limits=LIMITS):
+    """A search of a channel that found these names."""
+    return ChannelResult(selector_of(channel, limits), names, channel)
+
+
+def fit_at(cost, vector=(0.0,), active=()):
+    """A fit that ended at this cost, in nats."""
+    return Fit(np.asarray(vector, dtype=float), active, cost, np.empty(0), np.empty((0, len(active))))
+
+
+def is_accepted(smaller, larger, proof, costs=(500.0, 450.0), layout=BODY, limits=LIMITS, moved_m=1.0, count=1000):
+    """Whether what one set has more than another is accepted, as its proof, the costs and what it moves are."""
+    channel = SimpleNamespace(
+        settings=DEFAULT_SETTINGS, count=count, split=lambda vector: (vector, None), layout=layout
+    )
+    chosen = Selector(channel, lambda small, big: moved_m, limits)
+    chosen.fits = {frozenset(names): fit_at(cost) for names, cost in zip((smaller, larger), costs, strict=True)}
+    chosen.proofs[frozenset(smaller), frozenset(larger)] = proof
+    return chosen.acceptable(smaller, larger)
+
+
 def body_channel(seed=0, **effects):
     """A body channel and its drive; its poses are the model's with these first parameters of motion effects."""
     line = line_of(np.repeat(np.array(DRIVE * 3, dtype=float), 200, axis=0))
-    truth = BODY.neutral.copy()
-    truth[:3] = GEOMETRY
-    for name, value in effects.items():
-        truth[next(place for column, place in BODY.place.items() if column.startswith(f"{name}."))] = value
-    plain = BODY.neutral.copy()
-    plain[:3] = GEOMETRY
-    channel = BodyChannel.build(line, NOISE, plain)
-    clean = np.empty((line.pose.t_s.size, 3))
-    read_angles(channel.track(truth), line.pose.node, line.pose.fraction, clean)
+    clean = np.zeros((line.pose.t_s.size, 3))
+    channel = body_on(line, clean)
+    read_angles(channel.track(vector_of(**effects)), line.pose.node, line.pose.fraction, clean)
     noise = np.random.default_rng(seed).standard_normal(clean.shape) * (0.004, 0.004, 0.006)
-    line = replace(line, pose_values=clean + noise)
-    return BodyChannel.build(line, NOISE, plain), line
+    channel = body_on(line, clean + noise)
+    return channel, channel.drive
 
 
 def of_regression(columns, measured):

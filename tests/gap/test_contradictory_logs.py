@@ -29,7 +29,7 @@ def no_search(monkeypatch):
     monkeypatch.setattr(gap, "search_log", search)
 
 
-@thinned("fault", FAULTS, quick=2)
+@thinned("fault", sorted(FAULTS), quick=2)
 def test_what_says_nothing_is_refused_before_the_search_and_the_rest_is_searched(fault):
     change, _, hint = FAULTS[fault]
     log = change(sound())

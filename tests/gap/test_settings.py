@@ -9,11 +9,8 @@ import numpy as np
 import pytest
 
 from disco_hw import gap
-from disco_hw.gap.data.gridded_drive import grid_drive
-from disco_hw.gap.search.selection import Selector, body_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
-from tests.gap.synthetic import LIMITS, body_channel
-from tools.gap.logs import simulated_drive
+from tests.gap.synthetic import body_channel, selector_of
 
 GROUPS = [type(getattr(DEFAULT_SETTINGS, field.name)) for field in fields(GapSettings)]
 
@@ -39,20 +36,12 @@ def test_settings_are_frozen():
             setattr(group, fields(group)[0].name, None)
 
 
-def test_a_setting_of_the_grid_is_felt_in_the_drive():
-    log = simulated_drive({}, 1, "circle")
-    short = replace(DEFAULT_SETTINGS, grid=replace(DEFAULT_SETTINGS.grid, longest_s=20.0, stretch_s=5.0))
-    drive = grid_drive(log, short)
-    assert drive.settings is short
-    assert drive.duration_s < 30.0 < grid_drive(log).duration_s
-
-
 def test_a_setting_of_the_selection_is_felt_by_who_selects():
     channel, drive = body_channel(turn_slip=0.08)
     never = replace(DEFAULT_SETTINGS, selection=replace(DEFAULT_SETTINGS.selection, telling_nats=1e9))
     lenient = type(channel).build(replace(drive, settings=never), channel.noise, channel.neutral)
-    assert Selector(channel, body_moves(channel), LIMITS).rivals(("turn_slip",), "turn_slip") == ()
-    assert "side_slip" in Selector(lenient, body_moves(lenient), LIMITS).rivals(("turn_slip",), "turn_slip")
+    assert selector_of(channel).rivals(("turn_slip",), "turn_slip") == ()
+    assert "side_slip" in selector_of(lenient).rivals(("turn_slip",), "turn_slip")
 
 
 def test_a_setting_of_the_noise_is_felt_by_the_channel():

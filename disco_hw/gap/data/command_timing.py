@@ -110,31 +110,41 @@ class WheelResponse:
 
     def known(self, turned: Turned, delay_s: float) -> Mask:
         """Between which pairs (n,) commands are known at a delay."""
-        (_, unknown_s, inside), (_, more_s, also_inside) = (
-            self._at(at - delay_s, turned.segment) for at in (turned.begin_s, turned.end_s)
+        (unknown_s, inside), (more_s, also_inside) = (
+            self._unknown(at - delay_s, turned.segment) for at in (turned.begin_s, turned.end_s)
         )
         return np.asarray(inside & also_inside & (more_s - unknown_s < 1e-9))
 
     def _mismatch(self, turned: Turned, delay_s: float) -> float:
-        began, ended = (self._at(at - delay_s, turned.segment)[0] for at in (turned.begin_s, turned.end_s))
-        left, right = (ended - began).T
+        began, ended = (self._angles(at - delay_s) for at in (turned.begin_s, turned.end_s))
+        left, right = ended - began
         sides = (turned.left_rad, turned.right_rad)
         return float(sum(mismatch_of(right - left, right + left, measured) for measured in sides))
 
-    def _at(self, t_s: Array, segment: Index) -> tuple[Array, Array, Mask]:
-        """Return the ideal wheels' angles at some times, the time without a known command, and a validity mask.
-
-        Angles (n, 2) in rad; accumulated time (n,) in s; mask (n,): whether commands of the segment are in force there.
-        """
-        commands, lag_s = self.commands, self.lag_s
-        k = np.maximum(np.searchsorted(commands.t_s, t_s, side="right") - 1, 0)
+    def _in_force(self, t_s: Array) -> tuple[Index, Array]:
+        """Return the place of the command in force at some times (n,), and for how long (s) it has been in force."""
+        k = np.maximum(np.searchsorted(self.commands.t_s, t_s, side="right") - 1, 0)
         # Before the first command nothing is known, and is not counted below.
-        since = np.maximum(t_s - commands.t_s[k], 0.0)[:, None]
-        slow = lag_s * (1.0 - np.exp(-since / lag_s)) if lag_s > 0.0 else 0.0
-        now = self.commanded[k]
-        way = self.angle[k] + now * since + (self.speed[k] - now) * slow
+        return k, np.maximum(t_s - self.commands.t_s[k], 0.0)
+
+    def _unknown(self, t_s: Array, segment: Index) -> tuple[Array, Mask]:
+        """Return the time (s) without a known command until some times (n,), and a validity mask.
+
+        The mask (n,) says whether commands of the segment are in force there.
+        """
+        commands = self.commands
+        k, since_s = self._in_force(t_s)
         inside = (commands.segment[k] == segment) & (t_s >= commands.t_s[0]) & (t_s <= commands.t_s[-1])
-        return way, self.unknown_s[k] + since[:, 0] * np.isnan(commands.left_rad_s[k]), inside
+        return self.unknown_s[k] + since_s * np.isnan(commands.left_rad_s[k]), inside
+
+    def _angles(self, t_s: Array) -> Array:
+        """Return the ideal wheels' angles (2, n) in rad at some times."""
+        lag_s = self.lag_s
+        k, since_s = self._in_force(t_s)
+        slow = lag_s * (1.0 - np.exp(-since_s / lag_s)) if lag_s > 0.0 else 0.0
+        # By sides: numpy is slow along an axis of two.
+        now, speed, angle = (each.T.take(k, axis=1) for each in (self.commanded, self.speed, self.angle))
+        return np.asarray(angle + now * since_s + (speed - now) * slow)
 
 
 @kernel_function

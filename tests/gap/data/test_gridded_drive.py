@@ -212,6 +212,7 @@ def test_of_a_long_drive_the_stretches_with_commands_are_judged_first(commanded_
     command = np.where((t >= begin_s) & (t < end_s), 2.0, np.nan)
     short = replace(DEFAULT_SETTINGS, grid=replace(DEFAULT_SETTINGS.grid, longest_s=60.0, stretch_s=10.0))
     line = grid_drive(drive(t, command, t, speed), short)
+    assert line.settings is short
     known_s = GRID_STEP_S * np.isfinite(line.command_rad_s[:, 0]).sum()
     assert known_s == pytest.approx(min(end_s - begin_s, 60.0), abs=2.0)
     assert line.t_s.size * GRID_STEP_S == pytest.approx(60.0, abs=1.0)

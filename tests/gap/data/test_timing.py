@@ -12,6 +12,7 @@ from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.data.timing import pose_clock, pose_delay_s
 from disco_hw.gap.settings import GridSettings
 from disco_hw.log.drive import Commands, Poses, Wheels
+from tests.gap.synthetic import of_regression
 from tests.tables import thinned
 from tools.gap.logs import realistic, simulated_drive
 
@@ -113,17 +114,6 @@ def test_poses_are_compared_over_no_silence_and_no_segment():
     assert pairs == [[0, 1], [2, 3]]
 
 
-def by_decomposition(difference, total, measured):
-    """Minus the log likelihood of a sample, of a regression by Huber's weights whose steps are decompositions."""
-    columns, weight = np.column_stack([difference, total]), np.ones(measured.size)
-    for _ in range(4):
-        fitted = np.linalg.lstsq(columns * weight[:, None], measured * weight, rcond=None)[0]
-        left = np.abs(measured - columns @ fitted)
-        limit = 2.0 * 1.4826 * np.median(left) + 1e-9
-        weight = np.sqrt(np.minimum(1.0, limit / np.maximum(left, 1e-12)))
-    return 0.5 * np.log(np.where(left < limit, left**2, limit * (2.0 * left - limit)).mean() + 1e-10)
-
-
 @pytest.mark.parametrize("alike", [1.0, 1e-2, 1e-4, 0.0])
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 def test_a_regression_by_normal_equations_fits_as_one_by_decomposition(alike, scale):
@@ -133,19 +123,21 @@ def test_a_regression_by_normal_equations_fits_as_one_by_decomposition(alike, sc
     measured = 0.11 * total + 0.05 / scale * difference + 0.01 * rng.normal(0.0, 1.0, 300)
     measured[::17] += 0.8
     found = timing.mismatch_of(difference, total, measured)
-    assert found == pytest.approx(by_decomposition(difference, total, measured), abs=1e-8)
+    assert found == pytest.approx(of_regression(np.column_stack([difference, total]), measured), abs=1e-8)
     assert timing.mismatch_of(difference, total, measured + 0.1 * total**2) > found + 0.1
 
 
 def test_wheels_that_do_not_turn_leave_all_that_is_measured():
     nothing, measured = np.zeros(100), np.random.default_rng(6).normal(0.0, 0.1, 100)
-    assert timing.mismatch_of(nothing, nothing, measured) == pytest.approx(by_decomposition(nothing, nothing, measured))
+    assert timing.mismatch_of(nothing, nothing, measured) == pytest.approx(
+        of_regression(np.column_stack([nothing, nothing]), measured)
+    )
 
 
 def test_wheels_that_only_turn_alike_or_against_each_other_tell_all_that_they_do():
     nothing, turned, noise = np.random.default_rng(8).normal(0.0, 0.1, (3, 100)) * [[0.0], [1.0], [0.1]]
     measured = 2.0 * turned + noise
-    expected = by_decomposition(nothing, turned, measured)
+    expected = of_regression(np.column_stack([nothing, turned]), measured)
     assert timing.mismatch_of(nothing, turned, measured) == pytest.approx(expected)
     assert timing.mismatch_of(turned, nothing, measured) == pytest.approx(expected)
 

@@ -7,12 +7,11 @@ import pytest
 
 from disco_hw.gap.data import WHEEL
 from disco_hw.gap.noise.body_noise import BodyMotion, BodyNoise, body_gains, body_likelihood, whiten_body
-from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelMotion, WheelNoise, wheel_gains, wheel_likelihood, whiten_wheels
 from disco_hw.gap.search.least_squares import fit
 from disco_hw.gap.search.richest_model import indices
 from disco_hw.gap.settings import GRID_STEP_S
-from tests.gap.synthetic import GEOMETRY, line_of
+from tests.gap.synthetic import line_of, wheels_on
 
 
 def simulated(noise, speed, rng):
@@ -119,7 +118,7 @@ def test_a_slow_error_acts_on_the_speed_that_is_expected_and_tells_nothing_of_a_
     asked = np.repeat(np.where(np.arange(60) % 2 == 0, 4.0, 0.0), 100)[:, None].repeat(2, axis=1)
     line = line_of(asked)
     stamped = WheelNoise(relative=1e-4, reading_rad=1e-3, stamp_s=4e-3, command_stamp_s=1e-5, drift_std=0.01)
-    channel = WheelChannel.build(line, stamped, np.array(GEOMETRY)).expecting(WHEEL.neutral)
+    channel = wheels_on(line, stamped).expecting(WHEEL.neutral)
     gained = WHEEL.neutral.copy()
     gained[WHEEL.place["wheel_gain.left"]] = 0.01
     difference = channel.residual(gained) - channel.residual(WHEEL.neutral)
@@ -138,7 +137,7 @@ def test_readings_with_an_error_make_no_gain():
     speed = (np.roll(between, -2, axis=0) - np.roll(between, 2, axis=0)) / (4.0 * GRID_STEP_S)
     line = replace(line, encoder_angle_rad=read, speed_rad_s=np.clip(speed, -6.0, 6.0))
     noise = WheelNoise(0.015, 0.16, 0.004, 1e-5, 1e-5, 1e-5, 1e-4)
-    channel = WheelChannel.build(line, noise, np.array(GEOMETRY))
+    channel = wheels_on(line, noise)
     found = fit(channel, WHEEL.neutral, indices(channel, ("wheel_gain",)))
     gains = found.vector[list(found.active)]
     assert np.abs(gains).max() < 5e-4
@@ -147,7 +146,7 @@ def test_readings_with_an_error_make_no_gain():
 def test_after_unknown_commands_the_wheels_angle_begins_anew():
     line = line_of(np.full((2000, 2), 3.0))
     line.command_rad_s[600:900] = np.nan
-    channel = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
+    channel = wheels_on(line)
     again = np.flatnonzero(np.diff(channel.motion.use.astype(int)) == 1) + 1
     assert again.size == 1
     assert channel.motion.restart[again].all()

@@ -5,18 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data import BODY
 from disco_hw.gap.noise import sensor_noise
 from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.search.cross_validation import Chain, errors_of, floor_errors, smoothed_poses
-from tests.gap.synthetic import NOISE, body_channel
+from tests.gap.synthetic import NOISE, body_channel, vector_of
 
 
 def measured_with(position_m, yaw_rad, believed=NOISE):
     """A drive of a robot whose turning slips, which is not in the channel's geometry, and the truth."""
     channel, line = body_channel(turn_slip=0.1)
-    truth = channel.neutral.copy()
-    truth[BODY.place["turn_slip.k_s"]] = 0.1
+    truth = vector_of(turn_slip=0.1)
     draws = np.random.default_rng(5).standard_normal(line.pose_values.shape)
     track = channel.track(truth)[line.pose.node]
     return BodyChannel.build(

@@ -10,10 +10,9 @@ from tools.joystick import COMMANDS_PER_S, joystick
 RADIUS_M, AXIAL_M, AHEAD_M = 0.0771, 0.541, 0.087
 STEPS_PER_S, STEPS_A_READING, STEPS_A_POSE = 400, 8, 20
 COUNTS_PER_TURN = 3071
-DURATION_S = 90.0
 
 
-def driven(seed, blocked=(), slipping=(), late=(), turn_slip_s=0.0, lag_s=0.021, delay_s=0.0):
+def driven(seed, duration_s, blocked=(), slipping=(), late=(), turn_slip_s=0.0, lag_s=0.021, delay_s=0.0):
     """The log of a drive by joystick.
 
     `blocked`: (begin_s, duration_s, sides) in which wheels do not turn; `slipping`: (begin_s, duration_s, share) in
@@ -21,7 +20,7 @@ def driven(seed, blocked=(), slipping=(), late=(), turn_slip_s=0.0, lag_s=0.021,
     wait.
     """
     rng = np.random.default_rng([seed, 6131])
-    commands = joystick(seed, DURATION_S)
+    commands = joystick(seed, duration_s)
     dt, every = 1.0 / STEPS_PER_S, STEPS_PER_S // COMMANDS_PER_S
     requested = np.repeat(commands, every, axis=0)
     requested = requested[np.maximum(np.arange(requested.shape[0]) - round(delay_s * STEPS_PER_S), 0)]
@@ -35,25 +34,32 @@ def driven(seed, blocked=(), slipping=(), late=(), turn_slip_s=0.0, lag_s=0.021,
     grip = np.ones(t_s.size)
     if slipping:
         grip[(t_s >= slipping[0]) & (t_s < slipping[0] + slipping[1])] = slipping[2]
-    slip, keep = np.zeros(2), math.exp(-dt / 0.11)
-    ripples, shocks = rng.standard_normal((2, t_s.size, 2)) * math.sqrt(1.0 - keep**2)
-    speed, angle, rough, pose = np.zeros(2), np.zeros(2), np.zeros(2), np.zeros(3)
-    angles, path = np.empty((t_s.size, 2)), np.empty((t_s.size, 3))
-    for k in range(t_s.size):
-        rough = keep * rough + 0.009 * ripples[k]
-        slip = keep * slip + 0.008 * shocks[k]
-        speed = speed + (requested[k] - speed) * -math.expm1(-dt / lag_s)
-        speed[held[k]] = 0.0
-        turned = speed * (1.0 + rough) * dt
-        angle = angle + turned
-        left, right = RADIUS_M * turned * (1.0 + slip) * grip[k]
-        turn = (right - left) / AXIAL_M
+    keep, mixed = math.exp(-dt / 0.11), -math.expm1(-dt / lag_s)
+    ripples, shocks = (each.tolist() for each in rng.standard_normal((2, t_s.size, 2)) * math.sqrt(1.0 - keep**2))
+    # Plain floats: arrays of two numbers would take ten times as long.
+    speed, rough, slip = [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]
+    wheel_rad, rolled_m = [0.0, 0.0], [0.0, 0.0]
+    x_m = y_m = yaw_rad = 0.0
+    angles, path = [], []
+    for wanted, is_held, ripple, shock, share in zip(
+        requested.tolist(), held.tolist(), ripples, shocks, grip.tolist(), strict=True
+    ):
+        for side in (0, 1):
+            rough[side] = keep * rough[side] + 0.009 * ripple[side]
+            slip[side] = keep * slip[side] + 0.008 * shock[side]
+            speed[side] = 0.0 if is_held[side] else speed[side] + (wanted[side] - speed[side]) * mixed
+            turned = speed[side] * (1.0 + rough[side]) * dt
+            wheel_rad[side] += turned
+            rolled_m[side] = RADIUS_M * turned * (1.0 + slip[side]) * share
+        turn = (rolled_m[1] - rolled_m[0]) / AXIAL_M
         turn /= 1.0 + turn_slip_s * abs(turn) / dt
-        ahead, middle = 0.5 * (left + right), pose[2] + 0.5 * turn
+        ahead, middle = 0.5 * (rolled_m[0] + rolled_m[1]), yaw_rad + 0.5 * turn
         aside = -AHEAD_M * turn
         cosine, sine = math.cos(middle), math.sin(middle)
-        pose = pose + np.array([cosine * ahead - sine * aside, sine * ahead + cosine * aside, turn])
-        angles[k], path[k] = angle, pose
+        x_m, y_m, yaw_rad = x_m + (cosine * ahead - sine * aside), y_m + (sine * ahead + cosine * aside), yaw_rad + turn
+        angles.append(tuple(wheel_rad))
+        path.append((x_m, y_m, yaw_rad))
+    angles, path = np.array(angles), np.array(path)
     read, seen = np.arange(0, t_s.size, STEPS_A_READING), np.arange(0, t_s.size, STEPS_A_POSE)
     count = 2.0 * math.pi / COUNTS_PER_TURN
     counted = np.round(angles[read] / count) * count
@@ -69,9 +75,9 @@ def driven(seed, blocked=(), slipping=(), late=(), turn_slip_s=0.0, lag_s=0.021,
     )
 
 
-def moments(seed, lasting_s):
+def moments(seed, duration_s, lasting_s):
     """Times (s) at which a drive begins from standstill, and from which it goes on at some speed for `lasting_s`."""
-    commands = joystick(seed, DURATION_S)
+    commands = joystick(seed, duration_s)
     size, span = np.abs(commands), round(lasting_s * COMMANDS_PER_S)
     rests = size.max(axis=1) == 0.0
     begins = np.flatnonzero(rests[:-1] & ~rests[1:])

@@ -12,8 +12,7 @@ import pytest
 
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data import BODY, WHEEL
-from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
-from disco_hw.gap.noise.wheel_noise import WheelNoise
+from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.report.blind_spots import (
     BlindSpot,
     being_proved,
@@ -25,15 +24,14 @@ from disco_hw.gap.report.blind_spots import (
 )
 from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.richest_model import candidates_of
-from disco_hw.gap.search.selection import Selector, body_moves, wheel_moves
-from tests.gap.synthetic import GEOMETRY, LIMITS, body_channel, line_of
+from tests.gap.synthetic import LIMITS, body_channel, line_of, searched, selector_of, wheels_on
 from tests.tables import thinned
 
 
 @thinned("name", candidates_of(BODY), quick=4)
 def test_poses_of_a_log_into_which_an_effect_is_put_are_those_of_a_robot_that_has_it(name):
     channel, drive = body_channel()
-    found = ChannelResult(Selector(channel, body_moves(channel), LIMITS), (), channel)
+    found = searched(channel)
     size = REGISTRY[name].parameters[0].realistic or REGISTRY[name].parameters[0].start
     vector = with_size(found, name, size)
     changed = with_effect(drive, found, vector)
@@ -53,12 +51,11 @@ def test_poses_of_a_log_into_which_an_effect_is_put_are_those_of_a_robot_that_ha
 
 def test_wheels_of_a_log_into_which_an_effect_is_put_are_those_of_a_robot_that_has_it():
     _, drive = body_channel()
-    geometry = np.array(GEOMETRY)
-    channel = WheelChannel.build(drive, WheelNoise(), geometry)
-    found = ChannelResult(Selector(channel, wheel_moves(channel, geometry), LIMITS), (), channel)
+    channel = wheels_on(drive)
+    found = searched(channel)
     for name, size in {"motor_lag": 0.1, "command_delay": 0.1, "speed_limit": 4.0, "deadband": 0.5}.items():
         vector = with_size(found, name, size)
-        again = WheelChannel.build(with_effect(drive, found, vector), WheelNoise(), geometry)
+        again = wheels_on(with_effect(drive, found, vector))
         before, after = channel.raw_residual(WHEEL.neutral), again.raw_residual(vector)
         assert after == pytest.approx(before, abs=1e-9), name
         assert np.abs(again.raw_residual(WHEEL.neutral) - before).max() > 0.01, name
@@ -252,7 +249,7 @@ def test_where_nobody_says_how_many_processors_there_are_no_process_is_copied(mo
 
 
 def spots_of(channel, names=(), limits=None):
-    selector = Selector(channel, body_moves(channel), limits or LIMITS)
+    selector = selector_of(channel, limits or LIMITS)
     return {spot.name: spot for spot in blind_spots(ChannelResult(selector, names, channel))}
 
 
@@ -271,7 +268,7 @@ def test_twice_the_smallest_visible_size_is_found_and_a_third_of_it_is_not(name)
     size = spots_of(body_channel()[0])[name].smallest_visible
     for share, found in ((2.0, True), (1.0 / 3.0, False)):
         channel, _ = body_channel(1, **{name: share * size})
-        assert (name in Selector(channel, body_moves(channel), LIMITS).select()) is found, (name, share, size)
+        assert (name in selector_of(channel).select()) is found, (name, share, size)
 
 
 def test_what_moves_the_prediction_too_little_to_be_reported_is_called_too_small():
@@ -280,7 +277,7 @@ def test_what_moves_the_prediction_too_little_to_be_reported_is_called_too_small
     assert size > 1.5 * spots_of(body_channel()[0])["lateral_icr"].smallest_visible
     for share, found in ((1.2, True), (0.8, False)):
         channel, _ = body_channel(1, lateral_icr=share * size)
-        assert ("lateral_icr" in Selector(channel, body_moves(channel), limits).select()) is found, (share, size)
+        assert ("lateral_icr" in selector_of(channel, limits).select()) is found, (share, size)
 
 
 def test_a_drive_that_only_goes_straight_is_blind_to_slip_in_turns():
@@ -293,11 +290,9 @@ def test_a_drive_that_only_goes_straight_is_blind_to_slip_in_turns():
 
 
 def test_how_fast_turning_speeds_up_shows_only_where_the_robot_is_asked_to_turn():
-    geometry = np.array(GEOMETRY)
-
     def spot_at(*commands):
-        channel = WheelChannel.build(line_of(np.repeat(commands, 200, axis=0)), WheelNoise(), geometry)
-        found = ChannelResult(Selector(channel, wheel_moves(channel, geometry), LIMITS), (), channel)
+        channel = wheels_on(line_of(np.repeat(commands, 200, axis=0)))
+        found = searched(channel)
         return {spot.name: spot for spot in blind_spots(found, 8.0)}["yaw_acceleration_limit"]
 
     straight = spot_at(*[(0.0, 0.0), (5.0, 5.0), (-5.0, -5.0)] * 4)
@@ -311,11 +306,9 @@ def test_how_fast_turning_speeds_up_shows_only_where_the_robot_is_asked_to_turn(
 
 
 def test_no_limit_shows_above_what_was_asked_of_the_robot():
-    geometry = np.array(GEOMETRY)
-
     def spots_at(left, right, top_rad_s):
-        channel = WheelChannel.build(line_of(np.full((4000, 2), (left, right))), WheelNoise(), geometry)
-        found = ChannelResult(Selector(channel, wheel_moves(channel, geometry), LIMITS), (), channel)
+        channel = wheels_on(line_of(np.full((4000, 2), (left, right))))
+        found = searched(channel)
         return {spot.name: spot for spot in blind_spots(found, top_rad_s)}
 
     # A steady circle at half speed: 0.3 rad/s of turning.
@@ -334,10 +327,9 @@ def test_no_limit_shows_above_what_was_asked_of_the_robot():
 
 @thinned("top_rad_s", [0.5, 2.0, 5.0, 8.0, 50.0, None], quick=2)
 def test_whether_a_drive_is_blind_is_a_plain_truth_value_however_slowly_the_robot_turns(top_rad_s):
-    geometry = np.array(GEOMETRY)
     for speeds in ((0.0, 0.0), (4.0, 4.0), (-1.5, 1.5), (-40.0, 40.0)):
-        channel = WheelChannel.build(line_of(np.full((4000, 2), speeds)), WheelNoise(), geometry)
-        found = ChannelResult(Selector(channel, wheel_moves(channel, geometry), LIMITS), (), channel)
+        channel = wheels_on(line_of(np.full((4000, 2), speeds)))
+        found = searched(channel)
         for spot in blind_spots(found, top_rad_s):
             assert type(spot.blind) is bool, spot.name
             assert spot.smallest_visible is None or type(spot.smallest_visible) is float, spot.name

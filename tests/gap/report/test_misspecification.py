@@ -6,20 +6,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data import BODY
 from disco_hw.gap.data.free_runs import read_angles
 from disco_hw.gap.noise.channels import BodyChannel
-from disco_hw.gap.report.misspecification import (
-    _answers_otherwise,
-    _apart,
-    disputed_names,
-)
+from disco_hw.gap.report.misspecification import _answers_otherwise, _apart, disputed_names
 from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.least_squares import Fit
-from disco_hw.gap.search.selection import Selector, body_moves
 from disco_hw.gap.search.unnamed_terms import motion
 from disco_hw.gap.settings import DEFAULT_SETTINGS
-from tests.gap.synthetic import GEOMETRY, LIMITS, NOISE, body_channel, line_of
+from tests.gap.synthetic import NOISE, body_channel, line_of, searched, selector_of, vector_of
 
 # Turns at four rates: at two of them a wrong axial distance makes up for any form.
 DRIVE = ((4, 4), (0, 0), (-1, 1), (1, -1), (-2, 2), (2, -2), (-3.5, 3.5), (3.5, -3.5), (-6, 6), (6, -6), (3, 6), (6, 3))
@@ -27,9 +21,7 @@ DRIVE = ((4, 4), (0, 0), (-1, 1), (1, -1), (-2, 2), (2, -2), (-3.5, 3.5), (3.5, 
 
 def driven():
     """The drive without poses, and the vector of a robot that is as drawn."""
-    plain = BODY.neutral.copy()
-    plain[:3] = GEOMETRY
-    return line_of(np.repeat(np.array(DRIVE * 3, dtype=float), 200, axis=0)), plain
+    return line_of(np.repeat(np.array(DRIVE * 3, dtype=float), 200, axis=0)), vector_of()
 
 
 def found_of(name, truth, perturbation):
@@ -40,8 +32,7 @@ def found_of(name, truth, perturbation):
     read_angles(channel.track(truth, perturbation), line.pose.node, line.pose.fraction, clean)
     noise = np.random.default_rng(5).standard_normal(clean.shape) * (0.004, 0.004, 0.006)
     channel = BodyChannel.build(replace(line, pose_values=clean + noise), NOISE, plain)
-    selector = Selector(channel, body_moves(channel), LIMITS)
-    return ChannelResult(selector, (name,), channel)
+    return searched(channel, (name,))
 
 
 def aside(of_left_m, of_right_m):
@@ -70,7 +61,7 @@ def test_what_the_model_has_is_not_disputed():
 @pytest.mark.parametrize(("offset_m", "disputed"), [(0.0, False), (0.1, True)])
 def test_a_name_that_takes_little_of_what_its_channel_lacks_is_disputed(offset_m, disputed):
     channel, _ = body_channel(turn_slip=0.02, lateral_icr=offset_m)
-    selector = Selector(channel, body_moves(channel), LIMITS)
+    selector = selector_of(channel)
     richest = selector.fit(("turn_slip", "lateral_icr")).residual
     found = ChannelResult(selector, ("turn_slip",), channel, richest=richest, richest_parameters=6)
     why = disputed_names(found).get("turn_slip", "")

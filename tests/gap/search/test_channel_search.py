@@ -16,9 +16,8 @@ from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report.page import as_text
 from disco_hw.gap.search.channel_search import responding, search_body, search_wheels
-from disco_hw.gap.search.selection import Selector, wheel_moves
 from disco_hw.model import Model
-from tests.gap.synthetic import LIMITS
+from tests.gap.synthetic import selector_of
 from tools.gap.logs import simulated_drive
 
 pytestmark = pytest.mark.long
@@ -64,7 +63,7 @@ def test_what_holds_the_wheels_is_not_fitted_with_a_slow_response():
     geometry = np.array([0.061, 0.415, 0.238])
     line = grid_drive(simulated_drive({"stiction": 0.85}, seed=3005))
     channel = WheelChannel.build(line, WheelNoise(reading_rad=max(line.quantum_rad, 2e-4)), geometry)
-    selector = Selector(channel, wheel_moves(channel, geometry), LIMITS, start=WHEEL.neutral.copy())
+    selector = selector_of(channel, start=WHEEL.neutral.copy())
     both = ("motor_lag", "command_delay")
     responding(selector, both)
     slow = selector.fit((*both, "stiction")).cost

@@ -28,7 +28,7 @@ from disco_hw.gap.search.cross_validation import (
 from disco_hw.gap.search.end_to_end import Ahead
 from disco_hw.gap.search.least_squares import fit
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, Folds
-from tests.gap.synthetic import NOISE, body_channel
+from tests.gap.synthetic import NOISE, body_channel, body_on, vector_of
 
 AHEAD_S = 2.0
 
@@ -37,15 +37,9 @@ def both(vector):
     return {fold: Chain(vector, None) for fold in (0, 1)}
 
 
-def with_slip(channel, k_s=0.1):
-    vector = channel.neutral.copy()
-    vector[BODY.place["turn_slip.k_s"]] = k_s
-    return vector
-
-
 def test_the_right_model_errs_by_the_noise_alone_and_a_wrong_one_by_more():
     channel, _ = body_channel(turn_slip=0.1)
-    right = with_slip(channel)
+    right = vector_of(turn_slip=0.1)
     poses = smoothed_poses(channel, right)
     sound = errors_of(channel, None, both(right), AHEAD_S, poses)
     wrong = errors_of(channel, None, both(channel.neutral), AHEAD_S, poses)
@@ -81,7 +75,7 @@ def test_each_fold_is_predicted_by_what_was_fitted_on_the_others():
     # In the first stretch of time every turn is measured a tenth too large.
     first = line.pose.t_s < line.folds.stretch_s
     spoilt[first, 2] *= 1.1
-    shifted = BodyChannel.build(type(line)(**{**_fields(line), "pose_values": spoilt}), NOISE, channel.neutral)
+    shifted = body_on(line, spoilt)
     found = fit(shifted, channel.neutral, indices(shifted, ()))
     folds = line.folds.count
     vectors = fold_vectors(found, fold_of(shifted), folds, shifted.neutral, DEFAULT_SETTINGS)
@@ -102,7 +96,7 @@ def test_every_third_stretch_is_of_one_fold_of_three():
 def test_what_a_fold_knows_nothing_about_is_not_in_its_prediction():
     channel, _ = body_channel(turn_slip=0.1)
     place = BODY.place["turn_slip.k_s"]
-    found = fit(channel, with_slip(channel), indices(channel, ("turn_slip",)))
+    found = fit(channel, vector_of(turn_slip=0.1), indices(channel, ("turn_slip",)))
     # As if all turning had been done in fold 0: nothing elsewhere depends on the slip.
     column, folds = found.active.index(place), channel.drive.folds.count
     elsewhere = fold_of(channel) != 0
@@ -111,10 +105,6 @@ def test_what_a_fold_knows_nothing_about_is_not_in_its_prediction():
     vectors = fold_vectors(replace(found, slope=slope), fold_of(channel), folds, channel.neutral, DEFAULT_SETTINGS)
     assert vectors[0][place] == 0.0
     assert vectors[1][place] == pytest.approx(0.1, rel=0.2)
-
-
-def _fields(line):
-    return {name: getattr(line, name) for name in line.__slots__}
 
 
 @pytest.mark.parametrize(("window_s", "judged_s"), [(None, 2.0), (2.0, 1.0), (1.2, 0.5)])

@@ -7,15 +7,13 @@ import pytest
 
 from disco_hw.gap import offered_stage
 from disco_hw.gap.data import BODY, WHEEL
-from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
-from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report.amend import at_joint_fit
 from disco_hw.gap.search import _on_top
 from disco_hw.gap.search.channel_result import ChannelEstimates, ParameterEstimate
 from disco_hw.gap.search.cross_validation import Chain, PredictionErrors, chain_wheels, smoothed_poses
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
 from disco_hw.gap.settings import DEFAULT_SETTINGS
-from tests.gap.synthetic import GEOMETRY, NOISE, body_channel
+from tests.gap.synthetic import GEOMETRY, body_channel, body_on, wheels_on
 
 
 def geometry_of(vector, information=0.0):
@@ -54,7 +52,7 @@ def test_the_fold_that_is_left_out_is_not_looked_at():
     spoilt = line.pose_values.copy()
     # In the first stretch of time every turn is measured a tenth too large.
     spoilt[line.pose.t_s < line.folds.stretch_s, 2] *= 1.1
-    ahead = predictions(BodyChannel.build(replace(line, pose_values=spoilt), NOISE, channel.neutral))
+    ahead = predictions(body_on(line, spoilt))
     axle = {held: ahead.fit(geometry_of(channel.neutral), held).vectors[0][1] for held in (0, 1)}
     assert axle[0] == pytest.approx(0.4, rel=0.01)
     assert abs(axle[1] - 0.4) > 3.0 * abs(axle[0] - 0.4)
@@ -115,7 +113,7 @@ def test_a_term_of_the_wheels_keeps_its_number_though_the_body_has_one_of_the_sa
 
 def test_derivatives_by_what_only_the_body_has_are_those_of_the_whole_chain():
     channel, line = body_channel(turn_slip=0.08)
-    wheels = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
+    wheels = wheels_on(line)
     poses = smoothed_poses(channel, channel.neutral)
     slip = BODY.place["turn_slip.k_s"]
     parts = (

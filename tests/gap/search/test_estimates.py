@@ -8,14 +8,7 @@ import pytest
 
 from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.search import channel_result
-from disco_hw.gap.search.channel_result import (
-    InParts,
-    drifted,
-    estimate_parameters,
-    in_equal_parts,
-    in_logs,
-    in_parts,
-)
+from disco_hw.gap.search.channel_result import InParts, drifted, estimate_parameters, in_equal_parts, in_logs, in_parts
 from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.settings import DEFAULT_SETTINGS, FitSettings, GapSettings
 

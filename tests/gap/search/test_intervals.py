@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from disco_hw.gap.data import BODY, WHEEL
+from disco_hw.gap.data import WHEEL
 from disco_hw.gap.data.free_runs import read_angles
-from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report.judge import across_logs, drifting_parameters
 from disco_hw.gap.search.analysis import GapAnalysis, final_fit, in_motion
 from disco_hw.gap.search.channel_result import (
     ChannelEstimates,
-    ChannelResult,
     InParts,
     ParameterEstimate,
     deviations_of,
@@ -25,30 +23,33 @@ from disco_hw.gap.search.channel_result import (
     in_equal_parts,
     in_logs,
 )
-from disco_hw.gap.search.selection import Selector, body_moves, wheel_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
-from tests.gap.synthetic import DRIVE, GEOMETRY, LIMITS, NOISE, body_channel, line_of
+from tests.gap.synthetic import DRIVE, GEOMETRY, body_channel, body_on, line_of, searched, vector_of, wheels_on
 
 
 def estimated(channel, names=("turn_slip",)):
-    return estimate_parameters(ChannelResult(Selector(channel, body_moves(channel), LIMITS), names, channel))
+    return estimate_parameters(searched(channel, names))
 
 
-def test_intervals_hold_the_truth_nine_times_of_ten():
-    held = []
-    for seed in range(12):
-        found = estimated(body_channel(seed, turn_slip=0.08)[0]).by_name
-        for name, truth in (("turn_slip.k_s", 0.08), ("wheel_radius_m", 0.06), ("axial_distance_m", 0.4)):
-            held.append(found[name].low <= truth <= found[name].high)
+TRUTH = {"turn_slip.k_s": 0.08, "wheel_radius_m": 0.06, "axial_distance_m": 0.4}
+
+
+@pytest.fixture(scope="module")
+def twelve():
+    """What twelve drives of one robot say of its parameters."""
+    return [estimated(body_channel(seed, turn_slip=0.08)[0]).by_name for seed in range(12)]
+
+
+def test_intervals_hold_the_truth_nine_times_of_ten(twelve):
+    held = [found[name].low <= truth <= found[name].high for found in twelve for name, truth in TRUTH.items()]
     assert np.mean(held) >= 0.85
 
 
-def test_intervals_hold_what_another_drive_gives():
+def test_intervals_hold_what_another_drive_gives(twelve):
     """The promise of the report, which no error of the other drive is added to."""
-    held, names = [], ("turn_slip.k_s", "wheel_radius_m", "axial_distance_m")
-    found = [estimated(body_channel(seed, turn_slip=0.08)[0]).by_name for seed in range(12)]
-    for here, there in permutations(found, 2):
-        held += [here[name].low <= there[name].value <= here[name].high for name in names]
+    held = []
+    for here, there in permutations(twelve, 2):
+        held += [here[name].low <= there[name].value <= here[name].high for name in TRUTH]
     assert 0.95 <= np.mean(held) <= 0.995
 
 
@@ -64,18 +65,16 @@ def test_an_estimate_tells_its_standard_deviation_and_the_joint_one():
 def test_noise_larger_than_thought_widens_the_interval():
     channel, line = body_channel(turn_slip=0.08)
     wander = 0.05 * np.sin(2.0 * np.pi * channel.samples.t_s[:, None] / (7.0, 11.0, 17.0))
-    shaken = type(channel).build(replace(line, pose_values=line.pose_values + wander), channel.noise, channel.neutral)
+    shaken = body_on(line, line.pose_values + wander)
     found = [estimated(one).by_name["turn_slip.k_s"] for one in (channel, shaken)]
     assert found[1].deviation > 2.0 * found[0].deviation
 
 
 def test_the_time_of_a_change_has_an_interval_around_it():
     channel, _ = body_channel()
-    vector = channel.neutral.copy()
-    vector[[BODY.place["surface_change.track"], BODY.place["surface_change.time_s"]]] = 0.12, 35.0
+    vector = vector_of(surface_change__track=0.12, surface_change__time_s=35.0)
     moved = channel.measured + (channel.track(vector) - channel.track(channel.neutral))[channel.samples.node]
-    line = replace(channel.drive, pose_values=moved)
-    found = estimated(type(channel).build(line, channel.noise, channel.neutral), ("surface_change",))
+    found = estimated(body_on(channel.drive, moved), ("surface_change",))
     time = found.by_name["surface_change.time_s"]
     assert time.low < time.value < time.high
     assert time.value == pytest.approx(35.0, abs=1.0)
@@ -104,11 +103,10 @@ def test_a_limit_of_turning_is_no_better_known_than_the_geometry_that_it_is_told
 
 def changing(late_k_s):
     """A drive whose turn slip is 0.08 in the first half and another later."""
-    channel, line = body_channel(turn_slip=0.08)
+    _, line = body_channel(turn_slip=0.08)
     _, changed = body_channel(turn_slip=late_k_s)
     second = line.pose.t_s > line.t_s[-1] / 2.0
-    poses = np.where(second[:, None], changed.pose_values, line.pose_values)
-    return type(channel).build(replace(line, pose_values=poses), channel.noise, channel.neutral)
+    return body_on(line, np.where(second[:, None], changed.pose_values, line.pose_values))
 
 
 def of_two_logs(channel):
@@ -120,7 +118,7 @@ def test_halves_that_disagree_widen_the_interval_to_hold_both():
     names = ("turn_slip",)
     same, drifting = changing(0.08), changing(0.16)
     found = [estimated(one, names).by_name["turn_slip.k_s"] for one in (same, drifting)]
-    result = ChannelResult(Selector(drifting, body_moves(drifting), LIMITS), names, drifting)
+    result = searched(drifting, names)
     early, late = in_equal_parts(result, 2)["turn_slip.k_s"].values
     assert (early, late) == pytest.approx((0.08, 0.16), abs=0.03)
     assert found[1].low < early < late < found[1].high
@@ -151,15 +149,12 @@ def test_a_part_that_cannot_tell_two_parameters_apart_says_nothing_of_either():
     """On a circle a longer axle is as good as slip."""
     rich = 2 * DRIVE
     line = line_of(np.repeat(np.array([(3, 5)] * len(rich) + list(rich), dtype=float), 200, axis=0))
-    truth = BODY.neutral.copy()
-    truth[:3] = GEOMETRY
-    plain = BodyChannel.build(line, NOISE, truth)
-    truth[BODY.place["turn_slip.k_s"]] = 0.08
+    plain, truth = body_on(line, line.pose_values), vector_of(turn_slip=0.08)
     poses = np.empty((line.pose.t_s.size, 3))
     noise = np.random.default_rng(4).standard_normal(poses.shape) * (0.004, 0.004, 0.006)
     read_angles(plain.track(truth), line.pose.node, line.pose.fraction, poses)
-    channel = BodyChannel.build(replace(line, pose_values=poses + noise), NOISE, plain.neutral)
-    result = ChannelResult(Selector(channel, body_moves(channel), LIMITS), ("turn_slip",), channel)
+    channel = body_on(line, poses + noise)
+    result = searched(channel, ("turn_slip",))
     found = in_equal_parts(result, 2)
     assert "turn_slip.k_s" not in found
     assert "axial_distance_m" not in found
@@ -167,26 +162,26 @@ def test_a_part_that_cannot_tell_two_parameters_apart_says_nothing_of_either():
     # Of three logs, of which the first is such a circle, the two others speak.
     quarter_s = 0.25 * channel.drive.duration_s
     three = replace(channel, drive=replace(channel.drive, log_begins_s=(0.0, 2.0 * quarter_s, 3.0 * quarter_s)))
-    found = in_logs(ChannelResult(Selector(three, body_moves(three), LIMITS), ("turn_slip",), three))
+    found = in_logs(searched(three, ("turn_slip",)))
     assert found["turn_slip.k_s"].values == pytest.approx((0.08, 0.08), abs=0.03)
     assert found["x_icr_m"].values.size == 3
 
 
 def test_each_of_several_logs_speaks_for_itself():
     channel = of_two_logs(changing(0.16))
-    result = ChannelResult(Selector(channel, body_moves(channel), LIMITS), ("turn_slip",), channel)
+    result = searched(channel, ("turn_slip",))
     found = in_logs(result)
     assert found["turn_slip.k_s"].values == pytest.approx((0.08, 0.16), abs=0.03)
     assert found["turn_slip.k_s"].apart(0, 1) > 3.0
     assert abs(found["wheel_radius_m"].apart(0, 1)) < 3.0
     one = changing(0.16)
-    assert in_logs(ChannelResult(Selector(one, body_moves(one), LIMITS), ("turn_slip",), one)) == {}
+    assert in_logs(searched(one, ("turn_slip",))) == {}
     assert in_equal_parts(result, 3)["turn_slip.k_s"].values.size == 3
 
 
 def test_a_parameter_that_changes_along_a_log_is_said_to_drift_and_another_is_not():
     for channel, drifts in ((changing(0.08), False), (changing(0.16), True)):
-        result = ChannelResult(Selector(channel, body_moves(channel), LIMITS), ("turn_slip",), channel)
+        result = searched(channel, ("turn_slip",))
         analysis = GapAnalysis(channel.drive, channel.neutral, WHEEL.neutral, result, None)
         said = drifting_parameters(analysis, final_fit(analysis))
         assert bool(said) == drifts
@@ -219,7 +214,7 @@ def test_a_drift_shows_in_thirds_or_where_these_say_too_little_in_halves(monkeyp
 def test_logs_of_one_robot_differ_in_what_changed_between_them_alone():
     for late_k_s, differs in ((0.08, set()), (0.16, {"turn_slip.k_s"})):
         channel = of_two_logs(changing(late_k_s))
-        result = ChannelResult(Selector(channel, body_moves(channel), LIMITS), ("turn_slip",), channel)
+        result = searched(channel, ("turn_slip",))
         analysis = GapAnalysis(channel.drive, channel.neutral, WHEEL.neutral, result, None)
         found = across_logs(analysis)
         assert {each.name for each in found} >= {"turn_slip.k_s", "wheel_radius_m", "x_icr_m"}
@@ -263,8 +258,8 @@ def wheels_that_lose(lost_on_the_spot):
     speed = turned * (1.0 + 0.015 * error) + 0.02 * rng.standard_normal(turned.shape)
     line = replace(line_of(speed), command_rad_s=np.repeat(commands, 50, axis=0))
     noise = WheelNoise(relative=0.015, correlation_s=0.15, stamp_s=1e-6, drift_std=1e-3, drift_rad_sqrt_s=2e-3)
-    channel = WheelChannel.build(line, noise, np.array(GEOMETRY))
-    return ChannelResult(Selector(channel, wheel_moves(channel, np.array(GEOMETRY)), LIMITS), ("deadband",), channel)
+    channel = wheels_on(line, noise)
+    return searched(channel, ("deadband",))
 
 
 def wheels_that_stick(thresholds):
@@ -275,8 +270,8 @@ def wheels_that_stick(thresholds):
     turned = np.where(command > np.repeat(thresholds, ramp.size)[:, None], command, 0.0)
     line = replace(line_of(turned + 0.02 * rng.standard_normal(turned.shape)), command_rad_s=command)
     noise = WheelNoise(relative=0.015, correlation_s=0.15, stamp_s=1e-6, drift_std=1e-3, drift_rad_sqrt_s=2e-3)
-    channel = WheelChannel.build(line, noise, np.array(GEOMETRY))
-    return ChannelResult(Selector(channel, wheel_moves(channel, np.array(GEOMETRY)), LIMITS), ("stiction",), channel)
+    channel = wheels_on(line, noise)
+    return searched(channel, ("stiction",))
 
 
 @pytest.mark.parametrize("scatters", [False, True])

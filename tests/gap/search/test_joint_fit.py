@@ -12,17 +12,16 @@ from disco_hw.gap.search import end_to_end
 from disco_hw.gap.search.cross_validation import Chain
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part, _usual
 from disco_hw.gap.settings import DEFAULT_SETTINGS, Folds
-from tests.gap.synthetic import GEOMETRY
+from tests.gap.synthetic import GEOMETRY, vector_of
 
 MANY = 80
 HORIZONS_S = (1.0, 2.0)
 IN_TWO = SimpleNamespace(folds=Folds(21.0, 2))
 
 
-def start():
-    vector = BODY.neutral.copy()
-    vector[:3] = GEOMETRY
-    return vector
+def of_geometry(information):
+    """The geometry of a chain without wheels, freed, of which so much is known."""
+    return Freed((Part(BODY, vector_of(), (0, 1, 2), information),), lambda vectors: Chain(vectors[0], None))
 
 
 @pytest.fixture
@@ -73,8 +72,7 @@ def minimised(errors, chosen, information, begin, horizons_s=HORIZONS_S):
 def test_what_predicts_best_is_found_by_errors_in_their_usual_size_and_what_was_known_before(linear, left_out, known):
     ahead, errors = linear
     information = known * np.diag([1.0, 2.0, 0.5])
-    of = Freed((Part(BODY, start(), (0, 1, 2), information),), lambda vectors: Chain(vectors[0], None))
-    found = ahead.fit(of, left_out)
+    found = ahead.fit(of_geometry(information), left_out)
     chosen = (np.arange(MANY) // 10) % 2 != left_out
     values, cost = minimised(errors, chosen, information, np.array(GEOMETRY))
     assert found.vectors[0][:3] == pytest.approx(values, abs=2e-5)
@@ -87,8 +85,7 @@ def test_a_fit_begins_where_it_is_told_and_trusts_what_it_is_about(linear):
     ahead, _ = linear
     steps = replace(DEFAULT_SETTINGS, fit=replace(DEFAULT_SETTINGS.fit, rounds=0))
     still = replace(ahead, body=SimpleNamespace(settings=steps, drive=IN_TWO))
-    information, off = 3e6 * np.eye(3), start() + np.where(np.arange(start().size) < 3, 0.01, 0.0)
-    of = Freed((Part(BODY, start(), (0, 1, 2), information),), lambda vectors: Chain(vectors[0], None))
+    of, off = of_geometry(3e6 * np.eye(3)), vector_of() + np.where(np.arange(BODY.neutral.size) < 3, 0.01, 0.0)
     assert still.fit(of, begin=[off]).vectors[0][:3] == pytest.approx(off[:3], abs=1e-6)
     assert still.fit(of).vectors[0][:3] == pytest.approx(GEOMETRY, abs=1e-6)
     # From there it finds what it finds from its own start.
@@ -99,10 +96,8 @@ def test_predictions_that_do_not_overlap_count_whole(linear):
     ahead, errors = linear
     horizons_s = (0.1, 1.0)
     ahead = replace(ahead, starts=tuple(zip(horizons_s, (starts for _, starts in ahead.starts), strict=True)))
-    information = np.eye(3)
-    of = Freed((Part(BODY, start(), (0, 1, 2), information),), lambda vectors: Chain(vectors[0], None))
-    values, cost = minimised(errors, np.full(MANY, True), information, np.array(GEOMETRY), horizons_s)
-    found = ahead.fit(of)
+    values, cost = minimised(errors, np.full(MANY, True), np.eye(3), np.array(GEOMETRY), horizons_s)
+    found = ahead.fit(of_geometry(np.eye(3)))
     assert found.vectors[0][:3] == pytest.approx(values, abs=2e-5)
     assert found.cost == pytest.approx(cost, rel=1e-3)
 
@@ -119,12 +114,9 @@ def test_wheels_are_run_anew_for_what_moves_them_and_not_for_effects_of_the_body
     monkeypatch.setattr(end_to_end, "chain_wheels", lambda *_: turned_once)
     once = replace(DEFAULT_SETTINGS.fit, rounds=1, iterations=1)
     body = SimpleNamespace(settings=replace(DEFAULT_SETTINGS, fit=once), drive=IN_TWO)
-    vector = start()
+    vector = vector_of()
     vector[2] = BODY.high[2]
-    parts = (
-        Part(BODY, vector, (2, BASE_COUNT), np.eye(2)),
-        Part(WHEEL, WHEEL.neutral, (5,), np.eye(1)),
-    )
+    parts = (Part(BODY, vector, (2, BASE_COUNT), np.eye(2)), Part(WHEEL, WHEEL.neutral, (5,), np.eye(1)))
     Ahead(body, None, ((1.0, SimpleNamespace(block=np.zeros(4, dtype=int))),)).fit(
         Freed(parts, lambda vectors: Chain(*vectors))
     )
@@ -141,7 +133,7 @@ def test_wheels_are_run_anew_for_what_moves_them_and_not_for_effects_of_the_body
 
 def test_what_nothing_is_known_of_hardly_stays_and_a_fit_begins_inside_its_bounds():
     ahead = Ahead(SimpleNamespace(settings=DEFAULT_SETTINGS, drive=IN_TWO), None, ())
-    vector, active = start(), (0, 1, int(np.argmax(BODY.step)))
+    vector, active = vector_of(), (0, 1, int(np.argmax(BODY.step)))
     step = BODY.step[list(active)]
     assert step[2] > 5.0 * step[0]
     wide = replace(BODY, high=np.full(BODY.high.size, 1e6))
@@ -163,9 +155,8 @@ def test_what_nothing_is_known_of_hardly_stays_and_a_fit_begins_inside_its_bound
 def test_without_predictions_everything_stays_as_surely_as_it_was_known():
     ahead = Ahead(SimpleNamespace(settings=DEFAULT_SETTINGS, drive=IN_TWO), None, ())
     information = np.array([[4.0, 1.0, 0.0], [1.0, 3.0, 0.5], [0.0, 0.5, 2.0]]) * 1e4
-    of = Freed((Part(BODY, start(), (0, 1, 2), information),), lambda vectors: Chain(vectors[0], None))
-    found = ahead.fit(of)
-    assert found.vectors[0] == pytest.approx(start())
+    found = ahead.fit(of_geometry(information))
+    assert found.vectors[0] == pytest.approx(vector_of())
     assert found.cost == np.inf
     assert found.covariance == pytest.approx(np.linalg.inv(information), rel=1e-3)
 
@@ -181,13 +172,13 @@ def test_what_is_usual_is_the_median_of_positions_and_of_headings():
 def test_chains_are_compared_by_the_logarithms_of_both_usual_errors(linear):
     ahead, errors = linear
     expected = sum(np.log(_usual(error)[1]) + np.log(_usual(error)[2]) for error in errors(np.array(GEOMETRY)))
-    assert ahead.usual_cost(Chain(start(), None)) == pytest.approx(expected)
+    assert ahead.usual_cost(Chain(vector_of(), None)) == pytest.approx(expected)
 
 
 def test_an_entry_is_told_of_its_own_part_or_of_the_first_that_has_it():
-    parts = tuple(Part(BODY, start(), (0,), np.eye(1)) for _ in range(2))
+    parts = tuple(Part(BODY, vector_of(), (0,), np.eye(1)) for _ in range(2))
     of = Freed(parts, lambda vectors: Chain(vectors[0], None))
-    vectors = (start(), 2.0 * start())
+    vectors = (vector_of(), 2.0 * vector_of())
     joint = JointFit(vectors, 0.0, (), np.zeros((0, 0)))
     assert joint.value("axial_distance_m", of) == GEOMETRY[1]
     assert joint.value("axial_distance_m", of, parts[1]) == 2.0 * GEOMETRY[1]

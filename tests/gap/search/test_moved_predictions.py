@@ -6,13 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data import BODY
 from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.search.selection import _where_most, body_moves, wheel_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
-from tests.gap.synthetic import NOISE, line_of
+from tests.gap.synthetic import GEOMETRY, NOISE, line_of, vector_of
 
-RADIUS_M, AXLE_M, X_ICR_M = 0.06, 0.4, -0.1
+RADIUS_M, AXLE_M, X_ICR_M = *GEOMETRY[:2], -0.1
 
 
 def apart_as_wheels(apart_rad, command_rad_s=None):
@@ -62,20 +61,12 @@ def test_what_is_felt_in_few_places_is_judged_there():
     assert _where_most(squares, 0.01) == 4.0
 
 
-def body_on(speed_rad_s, yaw_rad=0.0, seconds=8.0):
+def body_at(speed_rad_s, yaw_rad=0.0, seconds=8.0):
     """The body channel of a drive at steady wheel speeds, with poses that look so all the time."""
     line = line_of(np.repeat(np.array([speed_rad_s], dtype=float), round(seconds / GRID_STEP_S), axis=0))
     poses = np.tile([1.5, 0.0, yaw_rad], (line.pose.t_s.size, 1))
-    plain = BODY.neutral.copy()
-    plain[:3] = RADIUS_M, AXLE_M, X_ICR_M
+    plain = vector_of(x_icr_m=X_ICR_M)
     return BodyChannel.build(replace(line, pose_values=poses), NOISE, plain), plain
-
-
-def changed(vector, **values):
-    out = vector.copy()
-    for name, value in values.items():
-        out[BODY.place[name.replace("__", ".")]] = value
-    return out
 
 
 def end_of_arc(vector, left_rad_s, right_rad_s, t_s):
@@ -89,8 +80,8 @@ def end_of_arc(vector, left_rad_s, right_rad_s, t_s):
 
 
 def test_bodies_on_two_arcs_lie_apart_by_their_ends_and_by_their_headings_half_the_way():
-    channel, small = body_on((2.0, 4.0))
-    big = changed(small, wheel_radius_m=0.066, axial_distance_m=0.35, x_icr_m=0.05)
+    channel, small = body_at((2.0, 4.0))
+    big = vector_of(wheel_radius_m=0.066, axial_distance_m=0.35, x_icr_m=0.05)
     ends = [end_of_arc(vector, 2.0, 4.0, 2.0) for vector in (small, big)]
     apart, lever_m = ends[1] - ends[0], 0.5 * np.hypot(*ends[1][:2])
     assert min(abs(apart)) > 0.02
@@ -99,7 +90,7 @@ def test_bodies_on_two_arcs_lie_apart_by_their_ends_and_by_their_headings_half_t
 
 
 def test_what_drives_a_body_besides_moves_it():
-    channel, plain = body_on((3.0, 3.0))
+    channel, plain = body_at((3.0, 3.0))
     extra = np.zeros((channel.drive.t_s.size, 3))
     extra[:, 1] = 0.02
     assert body_moves(channel)((plain, None), (plain, extra)) == pytest.approx(0.04, rel=1e-6)
@@ -108,11 +99,11 @@ def test_what_drives_a_body_besides_moves_it():
 
 def test_a_slope_moves_the_robot_to_where_it_looks_by_its_poses():
     # It looks along y, downhill: the drift adds to what a larger wheel moves it ahead, 0.003 m x 3 rad/s x 2 s.
-    channel, small = body_on((3.0, 3.0), yaw_rad=0.5 * np.pi)
-    big = changed(small, wheel_radius_m=0.063, slope__drift_y_m_s=0.01)
+    channel, small = body_at((3.0, 3.0), yaw_rad=0.5 * np.pi)
+    big = vector_of(x_icr_m=X_ICR_M, wheel_radius_m=0.063, slope__drift_y_m_s=0.01)
     assert body_moves(channel)((small, None), (big, None)) == pytest.approx(0.018 + 0.02, rel=1e-3)
 
 
 def test_a_body_in_a_run_that_is_too_short_is_not_moved():
-    channel, small = body_on((3.0, 3.0), seconds=0.5)
-    assert body_moves(channel)((small, None), (changed(small, wheel_radius_m=0.09), None)) == 0.0
+    channel, small = body_at((3.0, 3.0), seconds=0.5)
+    assert body_moves(channel)((small, None), (vector_of(x_icr_m=X_ICR_M, wheel_radius_m=0.09), None)) == 0.0

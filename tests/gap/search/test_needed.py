@@ -16,10 +16,9 @@ from disco_hw.gap.search import joint_predictions
 from disco_hw.gap.search.analysis import GapAnalysis, final_fit
 from disco_hw.gap.search.channel_result import ChannelResult, ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors, within_one_standard_error
-from disco_hw.gap.search.selection import Selector, body_moves
 from disco_hw.model import Model
 from tests.gap.search.test_lacking import analysis_of, found, told
-from tests.gap.synthetic import GEOMETRY, LIMITS, NOISE, body_channel
+from tests.gap.synthetic import GEOMETRY, NOISE, body_channel, selector_of
 
 
 def kept_of(names):
@@ -29,7 +28,7 @@ def kept_of(names):
     line = replace(line, command_rad_s=np.full_like(line.command_rad_s, np.nan))
     start = body_channel()[0].neutral.copy()
     channel = BodyChannel.build(line, NOISE, start)
-    selector = Selector(channel, body_moves(channel), LIMITS)
+    selector = selector_of(channel)
     analysis = GapAnalysis(line, start, WHEEL.neutral, ChannelResult(selector, names, channel), None)
     final = final_fit(analysis)
     predictions = joint_predictions(analysis, final)

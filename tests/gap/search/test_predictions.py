@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data import BODY, WHEEL
+from disco_hw.gap.data import WHEEL
 from disco_hw.gap.data.gridded_drive import GridSamples
 from disco_hw.gap.noise import SensorNoise
-from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
-from disco_hw.gap.noise.wheel_noise import WheelNoise
+from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.search.cross_validation import (
     Chain,
     Starts,
@@ -26,18 +25,9 @@ from disco_hw.gap.search.cross_validation import (
 )
 from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, PredictionSettings
-from tests.gap.synthetic import GEOMETRY, NOISE, line_of
+from tests.gap.synthetic import GEOMETRY, NOISE, line_of, vector_of, wheels_on
 
 RADIUS_M, AXLE_M, X_ICR_M = GEOMETRY
-
-
-def vector_of(layout=BODY, **values):
-    out = layout.neutral.copy()
-    if layout is BODY:
-        out[:3] = GEOMETRY
-    for name, value in values.items():
-        out[layout.place[name.replace("__", ".")]] = value
-    return out
 
 
 def steady(left_rad_s, right_rad_s, seconds=8.0, pose=(0.0, 0.0, 0.0)):
@@ -133,10 +123,6 @@ def test_ground_that_slopes_is_predicted_where_the_robot_looks():
     starts = starts_at([200], [[1.0, 2.0, 0.5 * np.pi]], [[1.0, 2.2, 0.5 * np.pi]])
     error = prediction_error(channel, starts, downhill, channel.track(downhill), 1.0)
     assert error == pytest.approx(np.array([[0.01, 0.0, 0.0]]), abs=1e-9)
-
-
-def wheels_on(line):
-    return WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
 
 
 def test_wheels_of_the_chain_are_as_they_turn_and_not_as_they_are_counted():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.data import BODY, WHEEL
-from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
+from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search import richest_model
 from disco_hw.gap.search.richest_model import (
@@ -23,7 +23,7 @@ from disco_hw.gap.search.richest_model import (
     with_delay,
 )
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, FitSettings
-from tests.gap.synthetic import GEOMETRY, NOISE, body_channel, line_of
+from tests.gap.synthetic import GEOMETRY, NOISE, body_channel, line_of, moved_by, vector_of, wheels_on
 
 
 def test_a_ridge_takes_most_away_and_holds_columns_that_look_alike_small():
@@ -60,11 +60,8 @@ def test_a_lag_takes_its_time_and_a_limit_its_steps():
 
 def shapes_of(command_rad_s, **effects):
     line = replace(line_of(np.repeat([[3.0, 5.0]], command_rad_s.shape[0], axis=0)), command_rad_s=command_rad_s)
-    channel = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
-    vector = WHEEL.neutral.copy()
-    for name, value in effects.items():
-        vector[WHEEL.place[name.replace("__", ".")]] = value
-    return line, [*richest_model._wheel_shapes(channel, vector)]
+    channel = wheels_on(line)
+    return line, [*richest_model._wheel_shapes(channel, vector_of(WHEEL, **effects))]
 
 
 def lagged(u, response_s):
@@ -109,7 +106,7 @@ def test_wheels_without_a_lag_answer_at_once_and_without_a_command_not_at_all():
     np.testing.assert_allclose(shapes_of(0.01 * commands)[1][9], 0.01 * commands, rtol=1e-3)
     line, none = shapes_of(np.zeros((400, 2)))
     assert none == []
-    channel = WheelChannel.build(line, WheelNoise(reading_rad=1e-3), np.array(GEOMETRY))
+    channel = wheels_on(line, WheelNoise(reading_rad=1e-3))
     learnt, left, many = learn_saturated_wheels(channel, WHEEL.neutral)
     np.testing.assert_array_equal(left, channel.raw_residual(WHEEL.neutral))
     assert many == WHEEL.neutral.size
@@ -185,8 +182,7 @@ def test_a_body_is_pushed_as_it_is_fitted_best_and_where_that_is_too_far_half_of
     p = channel.neutral
     push = np.zeros((line.t_s.size, 3))
     push[2000:4000, 0] = 0.5
-    moved = channel.track(p, 0.1 * push) - channel.track(p)
-    pushed = BodyChannel.build(replace(line, pose_values=channel.measured + moved[channel.samples.node]), NOISE, p)
+    pushed = moved_by(channel, 0.1 * push)
     learnt, vector, extra, many = learn_saturated_body(pushed, (), p, iter((np.zeros_like(push), push)))
     assert many == 4
     np.testing.assert_allclose(extra, 0.1 * push, atol=0.01 * 0.5)
@@ -270,7 +266,7 @@ def test_effects_see_the_commands_that_are_known_the_geometry_and_the_time_of_wh
     commands = np.tile([2.0, 3.0], (800, 1))
     commands[100:300] = np.nan
     line = replace(line_of(np.tile([2.0, 3.0], (800, 1))), command_rad_s=commands)
-    wheels = driven(WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY)))
+    wheels = driven(wheels_on(line))
     body = driven(BodyChannel.build(line, NOISE, np.array([*GEOMETRY, *BODY.neutral[3:]])))
     for seen in (wheels, body):
         assert seen.commands.shape == (600, 2)
@@ -293,7 +289,7 @@ def test_a_delay_at_first_sight_is_put_where_the_age_of_poses_is_within_its_rang
 @pytest.mark.parametrize("seen_s", [0.0, -0.25, 0.1])
 def test_a_delay_of_commands_begins_from_what_is_seen_at_first_sight(seen_s):
     line = replace(line_of(np.tile([2.0, 3.0], (800, 1))), commands_moved_s=seen_s)
-    channel = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
+    channel = wheels_on(line)
     place = WHEEL.place["command_delay.delay_s"]
     vector = with_delay(channel, WHEEL.neutral)
     assert vector[place] == seen_s

@@ -7,9 +7,6 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.data import BODY, WHEEL
-from disco_hw.gap.data.free_runs import run_wheels
-from disco_hw.gap.noise.channels import WheelChannel
-from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search import channel_search
 from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.channel_search import evaluated_channel, responding, search_body, search_wheels, stamped, timed
@@ -18,7 +15,19 @@ from disco_hw.gap.search.richest_model import DELAY_COLUMNS, DELAY_NAMES, DELAY_
 from disco_hw.gap.search.selection import Selector
 from disco_hw.gap.search.unnamed_terms import WithTerms, body_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
-from tests.gap.synthetic import DRIVE, GEOMETRY, LIMITS, NOISE, body_channel, line_of
+from tests.gap.synthetic import (
+    DRIVE,
+    GEOMETRY,
+    LIMITS,
+    NOISE,
+    answered,
+    body_channel,
+    fit_at,
+    line_of,
+    moved_by,
+    vector_of,
+    wheels_on,
+)
 from tests.tables import thinned
 
 READ_TO_RAD = 1e-3
@@ -27,22 +36,18 @@ READ_TO_RAD = 1e-3
 def wheels_of(extra=None, settings=DEFAULT_SETTINGS, drive=DRIVE * 3, **effects):
     """Wheels read with some noise that answer their commands with these first parameters of effects."""
     command = np.repeat(np.array(drive, dtype=float), 200, axis=0)
-    truth = WHEEL.neutral.copy()
-    for name, value in effects.items():
-        truth[next(place for column, place in WHEEL.place.items() if column.startswith(f"{name}."))] = value
-    line = replace(line_of(command), settings=settings)
-    still = np.zeros_like(command)
-    added = still if extra is None else extra(command)
-    angle = run_wheels(truth, np.array(GEOMETRY), command, added, line.first, line.t_s, still)
+    line = answered(command, None if extra is None else extra(command), **effects)
     noise = READ_TO_RAD * np.random.default_rng(3).standard_normal((line.encoder.node.size, 2))
-    return replace(
-        line, angle_rad=angle, speed_rad_s=np.gradient(angle, GRID_STEP_S, axis=0),
-        encoder_angle_rad=angle[line.encoder.node] + noise,
-    )  # fmt: skip
+    return replace(line, settings=settings, encoder_angle_rad=line.encoder_angle_rad + noise)
+
+
+def found_on(line, start=WHEEL.neutral, given=()):
+    """What is found of a drive's wheels."""
+    return search_wheels(line, np.array(GEOMETRY), start, given)
 
 
 def test_what_slows_the_wheels_is_named_and_the_rest_is_what_they_are_read_with():
-    found = search_wheels(wheels_of(motor_lag=0.15), np.array(GEOMETRY), WHEEL.neutral)
+    found = found_on(wheels_of(motor_lag=0.15))
     assert found.names == ("motor_lag",)
     assert not found.unnamed
     assert found.fit.vector[WHEEL.place["motor_lag.tau_s"]] == pytest.approx(0.15, abs=0.002)
@@ -57,9 +62,7 @@ def test_what_slows_the_wheels_is_named_and_the_rest_is_what_they_are_read_with(
 
 
 def test_what_a_model_knows_of_the_wheels_is_refitted_and_not_found():
-    start = WHEEL.neutral.copy()
-    start[WHEEL.place["motor_lag.tau_s"]] = 0.1
-    found = search_wheels(wheels_of(motor_lag=0.15), np.array(GEOMETRY), start, ("motor_lag",))
+    found = found_on(wheels_of(motor_lag=0.15), vector_of(WHEEL, motor_lag=0.1), ("motor_lag",))
     assert found.names == found.selector.given == ("motor_lag",)
     assert found.base.vector[WHEEL.place["motor_lag.tau_s"]] == pytest.approx(0.15, abs=0.002)
 
@@ -69,10 +72,7 @@ def test_what_a_model_knows_of_the_wheels_is_refitted_and_not_found():
 def test_commands_are_searched_alike_to_the_last_bit_wherever_they_are_stamped(curved):
     """A delay that is counted from other stamps is rounded otherwise, and what it leads to may be another set."""
     line = wheels_of(lambda u: curved * u * np.abs(u), motor_lag=0.15)
-    plain, moved = (
-        search_wheels(replace(line, commands_moved_s=seen_s), np.array(GEOMETRY), WHEEL.neutral)
-        for seen_s in (0.0, -0.3)
-    )
+    plain, moved = (found_on(replace(line, commands_moved_s=seen_s)) for seen_s in (0.0, -0.3))
     assert set(moved.names) == {*plain.names, "command_delay"}
     assert [one.term.model_name for one in moved.unnamed] == [one.term.model_name for one in plain.unnamed]
     assert len(plain.unnamed) == (curved != 0.0)
@@ -109,7 +109,7 @@ def test_poses_are_searched_alike_to_the_last_bit_wherever_they_are_stamped(late
 @pytest.mark.thorough
 def test_wheels_with_a_term_that_has_no_name_have_it_found_with_its_number():
     line = wheels_of(lambda u: -0.02 * u * np.abs(u), drive=DRIVE * 2)
-    found = search_wheels(line, np.array(GEOMETRY), WHEEL.neutral)
+    found = found_on(line)
     assert found.names == ()
     (one,) = found.unnamed
     assert one.form.endswith(" u |u|")
@@ -134,13 +134,17 @@ def test_what_slips_is_named_and_the_rest_is_the_noise_of_the_poses():
     assert found.richest_parameters in (smooth + terms, smooth + terms + 1)
 
 
+def late_by(late_s):
+    """A drive of a robot as drawn, whose poses are stamped late."""
+    channel, line = body_channel()
+    track = channel.track(channel.neutral)
+    late = np.clip(line.pose.node - round(late_s / GRID_STEP_S), 0, len(track) - 1)
+    return replace(line, pose_values=track[late] + (line.pose_values - track[line.pose.node]))
+
+
 @pytest.mark.thorough
 def test_poses_that_are_late_at_first_sight_are_named_late_and_their_noise_is_not_that_of_slip():
-    channel, line = body_channel()
-    late = np.clip(line.pose.node - 30, 0, None)
-    poses = channel.track(channel.neutral)[late] + (line.pose_values - channel.track(channel.neutral)[line.pose.node])
-    line = replace(line, pose_values=poses, pose_delay_s=0.28)
-    found = search_body(line, channel.neutral)
+    found = search_body(replace(late_by(0.3), pose_delay_s=0.28), vector_of())
     assert found.names == ("pose_latency",)
     assert found.fit.vector[BODY.place["pose_latency.latency_s"]] == pytest.approx(0.3, abs=0.005)
     assert found.channel.noise.position_m == pytest.approx(NOISE.position_m, rel=0.15)
@@ -159,26 +163,19 @@ def test_poses_that_are_late_at_first_sight_are_named_late_and_their_noise_is_no
 def test_the_first_noise_is_of_poses_as_late_as_at_first_sight_unless_that_errs(
     monkeypatch, late_s, seen_s, moved_s, begun_s
 ):
-    channel, line = body_channel()
-    track = channel.track(channel.neutral)
-    late = np.clip(line.pose.node - round(late_s / GRID_STEP_S), 0, len(track) - 1)
-    poses = track[late] + (line.pose_values - track[line.pose.node])
-
     def begin(of, vector, **_):
         raise RuntimeError(vector[BODY.place["pose_latency.latency_s"]])
 
     monkeypatch.setattr(channel_search, "learn_body_noise", begin)
     with pytest.raises(RuntimeError) as begun:
-        search_body(replace(line, pose_values=poses, pose_delay_s=seen_s, poses_moved_s=moved_s), channel.neutral)
+        search_body(replace(late_by(late_s), pose_delay_s=seen_s, poses_moved_s=moved_s), vector_of())
     assert begun.value.args == (begun_s,)
 
 
 @pytest.mark.thorough
 def test_what_a_model_knows_of_the_body_is_refitted_and_not_found():
-    channel, line = body_channel(turn_slip=0.08)
-    start = channel.neutral.copy()
-    start[BODY.place["turn_slip.k_s"]] = 0.05
-    found = search_body(line, start, ("turn_slip",))
+    _, line = body_channel(turn_slip=0.08)
+    found = search_body(line, vector_of(turn_slip=0.05), ("turn_slip",))
     assert found.names == found.selector.given == ("turn_slip",)
     assert found.base.vector[BODY.place["turn_slip.k_s"]] == pytest.approx(0.08, abs=0.004)
 
@@ -189,8 +186,7 @@ def test_a_body_with_a_term_that_has_no_name_has_it_found_with_its_number():
     v = 0.5 * p[0] * speed.sum(axis=1)
     extra = np.zeros((v.size, 3))
     extra[:, 0] = -0.8 * v**3
-    moved = channel.track(p, extra) - channel.track(p)
-    found = search_body(replace(line, pose_values=line.pose_values + moved[line.pose.node]), p)
+    found = search_body(moved_by(channel, extra).drive, p)
     (one,) = found.unnamed
     assert one.term.model_name == "v_x += k v^3"
     # Of the speed that wheels of another radius make.
@@ -241,9 +237,7 @@ def of_rough_and_smooth(found, noted, layout):
 
 
 def test_the_noise_of_wheels_is_learnt_of_a_rough_selection_and_all_that_is_smooth(noted):
-    found = search_wheels(
-        wheels_of(motor_lag=0.15, drive=((0, 4), (3, 3), (0, 0)) * 6), np.array(GEOMETRY), WHEEL.neutral
-    )
+    found = found_on(wheels_of(motor_lag=0.15, drive=((0, 4), (3, 3), (0, 0)) * 6))
     chosen = of_rough_and_smooth(found, noted, WHEEL)
     settings = DEFAULT_SETTINGS.selection
     # Heavy tails are those of wheels of which one turns at least.
@@ -268,7 +262,7 @@ def test_where_nothing_that_is_known_comes_near_the_noise_is_what_that_leaves(no
         choice = replace(DEFAULT_SETTINGS.noise, poor_fit=poor_fit)
         line = wheels_of(drive=drive, settings=replace(DEFAULT_SETTINGS, noise=choice), motor_lag=0.15)
         noted.selectors.clear()
-        return search_wheels(line, np.array(GEOMETRY), WHEEL.neutral), len(noted.selectors)
+        return found_on(line), len(noted.selectors)
 
     near, selectors = searched(1e9)
     assert selectors == 2
@@ -305,10 +299,9 @@ def begun(names, given=(), before=None, best=0, seen_s=0.0):
     drive = SimpleNamespace(commands_moved_s=seen_s)
     channel = SimpleNamespace(layout=WHEEL, free=(), inner=SimpleNamespace(drive=drive))
     selector = Selector(channel, lambda small, big: 0.0, LIMITS, given=given)
-    plain = WHEEL.neutral.copy()
-    plain[WHEEL.place["deadband.width_rad_s"]] = 0.4
+    plain = vector_of(WHEEL, deadband=0.4)
     others = tuple(name for name in names if name in given or name not in DELAY_NAMES)
-    selector.fits[frozenset(others)] = Fit(plain, (), 50.0, np.empty(0), np.empty((0, 0)))
+    selector.fits[frozenset(others)] = fit_at(50.0, plain)
     if before is not None:
         selector.fits[frozenset(names)] = before
     starts = []
@@ -336,7 +329,7 @@ def test_lateness_is_fitted_from_quick_and_slow_responses_after_what_is_seen_at_
 def test_lateness_on_top_of_what_was_accepted_is_fitted_from_none(monkeypatch):
     names = (*DELAY_NAMES, "deadband")
     for before_cost, kept in ((5.0, True), (15.0, False)):
-        before = Fit(WHEEL.neutral, (), before_cost, np.empty(0), np.empty((0, 0)))
+        before = fit_at(before_cost, WHEEL.neutral)
         selector, starts, fitted = begun(names, before=before)
         monkeypatch.setattr(channel_search, "fit", fitted)
         responding(selector, names)
@@ -366,10 +359,8 @@ def test_a_result_has_the_fits_with_and_without_what_is_missing_and_of_a_search_
 
 def test_every_set_has_the_delay_that_is_seen_at_first_sight_until_it_is_judged_itself():
     line = replace(line_of(np.tile([2.0, 3.0], (800, 1))), commands_moved_s=0.2)
-    channel = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
-    start = WHEEL.neutral.copy()
-    start[WHEEL.place["wheel_gain.left"]] = 0.1
-    moved = np.zeros(start.size)
+    channel = wheels_on(line)
+    start, moved = vector_of(WHEEL, wheel_gain__left=0.1), np.zeros(WHEEL.neutral.size)
     moved[WHEEL.place["command_delay.delay_s"]] = 0.2
     for given, begin, expected in ((("wheel_gain",), start, start + moved), ((), None, WHEEL.neutral + moved)):
         selector = Selector(channel, None, LIMITS, given=given, start=begin, fits={frozenset(): 1}, proofs={(): 2})
@@ -389,13 +380,13 @@ def test_wheels_are_searched_as_if_commands_were_stamped_where_they_lie(monkeypa
     monkeypatch.setattr(channel_search, "WheelChannel", SimpleNamespace(build=build))
     line = replace(line_of(np.tile([2.0, 3.0], (80, 1))), commands_moved_s=0.2)
     with pytest.raises(InterruptedError):
-        search_wheels(line, np.array(GEOMETRY), WHEEL.neutral)
+        found_on(line)
     assert [drive.commands_moved_s for drive in drives] == [0.0]
 
 
 def test_delays_are_told_from_the_stamps_of_commands_with_where_fits_begin():
     line = line_of(np.tile([2.0, 3.0], (80, 1)))
-    channel = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
+    channel = wheels_on(line)
     moved = np.where([column == "command_delay.delay_s" for column in WHEEL.columns], 0.2, 0.0)
     for start, expected in ((WHEEL.neutral, WHEEL.neutral + moved), (None, None)):
         found = ChannelResult(Selector(channel, None, LIMITS, start=start), (), channel)

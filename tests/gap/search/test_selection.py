@@ -9,20 +9,29 @@ from scipy.signal import lfilter
 
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data import BODY, WHEEL
-from disco_hw.gap.noise.channels import WheelChannel
-from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search import selection
 from disco_hw.gap.search.evidence import EffectEvidence
-from disco_hw.gap.search.least_squares import Fit, fit
+from disco_hw.gap.search.least_squares import fit
 from disco_hw.gap.search.richest_model import CANDIDATES, DELAY_NAMES, candidates_of, indices
-from disco_hw.gap.search.selection import Selector, Thresholds, body_moves, wheel_moves
+from disco_hw.gap.search.selection import Selector, Thresholds, body_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
-from tests.gap.synthetic import GEOMETRY, LIMITS, body_channel, line_of
+from tests.gap.synthetic import (
+    GEOMETRY,
+    LIMITS,
+    body_channel,
+    fit_at,
+    is_accepted,
+    line_of,
+    moved_by,
+    selector_of,
+    vector_of,
+    wheels_on,
+)
 
 
 def selector(given=(), start=None, moves_m=0.001, **effects):
     channel, _ = body_channel(**effects)
-    return Selector(channel, body_moves(channel), replace(LIMITS, moves_m=moves_m), given=given, start=start)
+    return selector_of(channel, replace(LIMITS, moves_m=moves_m), given=given, start=start)
 
 
 def test_nothing_is_selected_where_nothing_is_missing():
@@ -63,8 +72,8 @@ def wheels_slow(tau_s):
     followed = lfilter([1.0 - keep], [1.0, -keep], commands)
     line = line_of(np.repeat(followed[:, None], 2, axis=1))
     line = replace(line, command_rad_s=np.repeat(commands[:, None], 2, axis=1))
-    channel = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
-    return Selector(channel, wheel_moves(channel, np.array(GEOMETRY)), replace(LIMITS, moves_m=0.005))
+    channel = wheels_on(line)
+    return selector_of(channel, replace(LIMITS, moves_m=0.005))
 
 
 def test_a_short_lag_with_a_delay_beside_it_is_not_taken_for_the_delay():
@@ -88,8 +97,8 @@ def test_what_only_turning_loses_is_told_from_what_every_wheel_loses(hidden):
     turned = np.column_stack([mean - less(half), mean + less(half)])
     followed = turned if hidden == "turning_load" else less(commands)
     line = replace(line_of(followed + 0.05 * rng.standard_normal(commands.shape)), command_rad_s=commands)
-    channel = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
-    found = Selector(channel, wheel_moves(channel, np.array(GEOMETRY)), LIMITS)
+    channel = wheels_on(line)
+    found = selector_of(channel)
     # Starts and stops within a cell of the grid look like a short delay.
     assert [name for name in found.select() if name not in DELAY_NAMES] == [hidden]
     column = REGISTRY[hidden].columns[0]
@@ -97,10 +106,7 @@ def test_what_only_turning_loses_is_told_from_what_every_wheel_loses(hidden):
 
 
 def test_given_effects_stay_and_are_not_selected_again():
-    channel, _ = body_channel(turn_slip=0.08)
-    start = channel.neutral.copy()
-    start[BODY.place["turn_slip.k_s"]] = 0.08
-    assert selector(given=("turn_slip",), start=start, turn_slip=0.08).select() == ("turn_slip",)
+    assert selector(given=("turn_slip",), start=vector_of(turn_slip=0.08), turn_slip=0.08).select() == ("turn_slip",)
 
 
 def test_what_moves_no_prediction_is_not_accepted():
@@ -137,18 +143,10 @@ def test_every_effect_shows_beside_the_two_blocks_that_say_most(monkeypatch, nam
 
 def test_a_change_is_found_when_it_happens():
     channel, line = body_channel()
-    late = line.t_s > 40.0
-    truth = channel.neutral.copy()
     perturbation = np.zeros((line.t_s.size, 3))
-    omega = truth[0] / truth[1] * (line.speed_rad_s[:, 1] - line.speed_rad_s[:, 0])
-    perturbation[:, 2] = np.where(late, -omega * (1.0 - 1.0 / 1.12), 0.0)
-    moved = (
-        channel.measured
-        + channel.track(truth, perturbation)[channel.samples.node]
-        - channel.track(truth)[channel.samples.node]
-    )
-    changed = type(channel).build(replace(line, pose_values=moved), channel.noise, truth)
-    found = Selector(changed, body_moves(changed), LIMITS)
+    omega = GEOMETRY[0] / GEOMETRY[1] * (line.speed_rad_s[:, 1] - line.speed_rad_s[:, 0])
+    perturbation[:, 2] = np.where(line.t_s > 40.0, -omega * (1.0 - 1.0 / 1.12), 0.0)
+    found = selector_of(moved_by(channel, perturbation))
     names = found.select()
     assert names == ("surface_change",)
     assert found.fit(names).vector[BODY.place["surface_change.time_s"]] == pytest.approx(40.0, abs=2.0)
@@ -158,10 +156,9 @@ def wheels_late(commands_rad_s, late_cells=20):
     """A search of wheels that follow these commands (M,) 0.2 s late."""
     commands = np.repeat(commands_rad_s[:, None], 2, axis=1)
     followed = np.concatenate([np.repeat(commands[:1], late_cells, axis=0), commands[:-late_cells]])
-    geometry = np.array(GEOMETRY)
     line = replace(line_of(followed), command_rad_s=commands)
-    channel = WheelChannel.build(line, WheelNoise(), geometry)
-    return Selector(channel, wheel_moves(channel, geometry), LIMITS)
+    channel = wheels_on(line)
+    return selector_of(channel)
 
 
 def test_a_slow_drive_cannot_tell_lag_from_delay_and_says_so():
@@ -175,14 +172,9 @@ def test_a_slow_drive_cannot_tell_lag_from_delay_and_says_so():
 
 def judged(gain=30.0, score=30.0, without_two=10.0, moved_m=0.01, misfit=0.0, count=1000):
     """Whether one effect is accepted on top of none: its gain, proof, what it moves, and what the fit without lacks."""
-    channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=count, split=lambda vector: (vector, None), layout=BODY)
     base = 0.5 * count * (1.0 + misfit)
-    limits = LIMITS
-    chosen = Selector(channel, lambda small, big: moved_m, limits)
-    for names, cost in ((frozenset(), base), (frozenset({"turn_slip"}), base - gain)):
-        chosen.fits[names] = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
-    chosen.proofs[frozenset(), frozenset({"turn_slip"})] = EffectEvidence(gain, 50.0, 50.0, without_two, 1.0, score)
-    return chosen.acceptable((), ("turn_slip",))
+    proof = EffectEvidence(gain, 50.0, 50.0, without_two, 1.0, score)
+    return is_accepted((), ("turn_slip",), proof, (base, base - gain), moved_m=moved_m, count=count)
 
 
 def test_an_effect_is_accepted_only_if_every_condition_holds():
@@ -214,15 +206,8 @@ def test_an_effect_is_accepted_only_if_every_condition_holds():
     ],
 )
 def test_a_lag_beside_a_delay_is_told_where_it_surely_is_however_little_it_moves(smaller, new, score, accepted):
-    channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=1000, split=lambda vector: (vector, None), layout=WHEEL)
-    limits = Thresholds(10.0, 0.001, 20.0)
-    chosen = Selector(channel, lambda small, big: 0.0009, limits)
-    larger = (*smaller, *new)
-    for names, cost in ((smaller, 500.0), (larger, 450.0)):
-        chosen.fits[frozenset(names)] = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
-    proof = EffectEvidence(50.0, 40.0, 30.0, 20.0, 1.0, score)
-    chosen.proofs[frozenset(smaller), frozenset(larger)] = proof
-    assert chosen.acceptable(smaller, larger) == accepted
+    proof, limits = EffectEvidence(50.0, 40.0, 30.0, 20.0, 1.0, score), Thresholds(10.0, 0.001, 20.0)
+    assert is_accepted(smaller, (*smaller, *new), proof, layout=WHEEL, limits=limits, moved_m=0.0009) == accepted
 
 
 @pytest.mark.parametrize(
@@ -239,13 +224,9 @@ def test_a_lag_beside_a_delay_is_told_where_it_surely_is_however_little_it_moves
 def test_a_delay_of_the_commands_needs_its_score_but_not_to_show_in_a_third_place(
     layout, smaller, new, accepted, score
 ):
-    channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=1000, split=lambda vector: (vector, None), layout=layout)
-    chosen = Selector(channel, lambda small, big: 0.01, Thresholds(10.0, 0.001, 20.0))
-    larger = (*smaller, *new)
-    for names, cost in ((smaller, 500.0), (larger, 480.0)):
-        chosen.fits[frozenset(names)] = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
-    chosen.proofs[frozenset(smaller), frozenset(larger)] = EffectEvidence(20.0, -1.0, -7.0, 0.0, 1.0, score)
-    assert chosen.acceptable(smaller, larger) == (accepted and score > 10.0)
+    proof, limits = EffectEvidence(20.0, -1.0, -7.0, 0.0, 1.0, score), Thresholds(10.0, 0.001, 20.0)
+    found = is_accepted(smaller, (*smaller, *new), proof, (500.0, 480.0), layout, limits, 0.01)
+    assert found == (accepted and score > 10.0)
 
 
 def test_what_fits_badly_is_helped_by_a_large_part_of_what_it_lacks_whatever_its_score():
@@ -267,12 +248,7 @@ def test_noise_that_wanders_is_named_by_gain_alone_and_not_by_the_rule():
     steps = np.repeat(rng.standard_normal(line.t_s.size // 300 + 1), 300)[: line.t_s.size]
     perturbation = np.zeros((line.t_s.size, 3))
     perturbation[:, 2] = 0.03 * steps * (np.abs(line.speed_rad_s).max(axis=1) > 0.0)
-    plain = channel.neutral
-    moved = channel.track(plain, perturbation) - channel.track(plain)
-    wandering = type(channel).build(
-        replace(line, pose_values=channel.measured + moved[channel.samples.node]), channel.noise, plain
-    )
-    found = Selector(wandering, body_moves(wandering), LIMITS)
+    found = selector_of(moved_by(channel, perturbation))
     gains = {name: found.fit(()).cost - found.fit((name,)).cost for name in ("turn_slip", "surface_change")}
     assert max(gains.values()) > 20.0
     assert found.select() == ()
@@ -359,8 +335,7 @@ def test_a_search_that_comes_back_to_where_it_was_ends_with_the_best_set_on_its_
 def test_the_price_of_an_effect_is_that_of_all_its_parameters():
     channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=1000)
     fitted = Selector(channel, lambda small, big: 1.0, LIMITS)
-    for names, cost in ((frozenset(), 700.0), (frozenset({"wheel_gain"}), 650.0)):
-        fitted.fits[names] = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
+    fitted.fits = {frozenset(): fit_at(700.0), frozenset({"wheel_gain"}): fit_at(650.0)}
     # Left and right: half of 2 ln(1000).
     assert fitted.promise((), "wheel_gain") == pytest.approx(50.0 - np.log(1000))
     assert fitted._worth((), ("wheel_gain",), "wheel_gain") == pytest.approx(50.0 - np.log(1000))

@@ -9,11 +9,10 @@ import pytest
 from disco_hw.gap.data import BODY
 from disco_hw.gap.search import selection
 from disco_hw.gap.search.evidence import EffectEvidence
-from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.richest_model import candidates_of
 from disco_hw.gap.search.selection import Selector
 from disco_hw.gap.settings import DEFAULT_SETTINGS
-from tests.gap.synthetic import LIMITS
+from tests.gap.synthetic import LIMITS, fit_at, is_accepted
 
 SETTINGS = DEFAULT_SETTINGS.selection
 A, B, C, D = "turn_slip", "side_slip", "lateral_icr", "slope"
@@ -74,16 +73,6 @@ def test_rivals_are_those_that_are_worse_by_less_than_it_takes_to_tell():
     assert C in candidates_of(BODY)
 
 
-def judged(smaller, larger, proof, count=1000):
-    """Whether what one set has more than another is accepted, as its proof is, by 50 nats."""
-    channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=count, split=lambda vector: (vector, None), layout=BODY)
-    chosen = Selector(channel, lambda small, big: 1.0, LIMITS)
-    for names, cost in ((smaller, 500.0), (larger, 450.0)):
-        chosen.fits[frozenset(names)] = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
-    chosen.proofs[frozenset(smaller), frozenset(larger)] = proof
-    return chosen.acceptable(smaller, larger)
-
-
 @pytest.mark.parametrize(
     ("smaller", "larger", "parameters"),
     [((), ("surface_change",), 3.0), ((A,), (A, "surface_change"), 3.0), ((), (A, "surface_change"), 4.0)],
@@ -91,7 +80,7 @@ def judged(smaller, larger, proof, count=1000):
 def test_what_repeats_of_what_happens_once_pays_for_all_that_is_new(smaller, larger, parameters):
     price = 0.5 * (parameters * np.log(1000))
     for repeated, accepted in ((price, False), (1.001 * price, True)):
-        assert judged(smaller, larger, EffectEvidence(50.0, 40.0, repeated, repeated, 1.0, 99.0)) == accepted
+        assert is_accepted(smaller, larger, EffectEvidence(50.0, 40.0, repeated, repeated, 1.0, 99.0)) == accepted
 
 
 def test_evidence_pays_for_the_parameters_that_are_new(monkeypatch):
@@ -107,7 +96,7 @@ def test_evidence_pays_for_the_parameters_that_are_new(monkeypatch):
 def test_what_may_reach_the_score_is_fitted_before_it_is_ranked(more, is_fitted):
     gain = 0.5 * (LIMITS.score + np.log(1000)) + more
     chosen = Selector(SimpleNamespace(settings=DEFAULT_SETTINGS, count=1000), lambda small, big: 1.0, LIMITS)
-    chosen.fits[frozenset()] = Fit(np.zeros(1), (), 50.0, np.empty(0), np.empty((0, 0)))
+    chosen.fits[frozenset()] = fit_at(50.0)
     chosen._linear_gain = lambda parent, new: gain
     chosen._with = lambda parent, names, new: replace(parent, cost=20.0)
     told = chosen.promise((), A)

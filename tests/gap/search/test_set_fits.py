@@ -12,14 +12,10 @@ from disco_hw.gap.search.least_squares import Fit, fit
 from disco_hw.gap.search.richest_model import Candidate, Profile
 from disco_hw.gap.search.selection import Selector
 from disco_hw.gap.settings import DEFAULT_SETTINGS
-from tests.gap.synthetic import LIMITS
+from tests.gap.synthetic import LIMITS, fit_at
 
 # Half a score is a gain in nats.
 WORTH = 0.5 * LIMITS.score
-
-
-def fitted(cost, vector=(0.0,), active=()):
-    return Fit(np.array(vector), active, cost, np.empty(0), np.empty((0, len(active))))
 
 
 class Growing(Selector):
@@ -27,12 +23,12 @@ class Growing(Selector):
 
     def __init__(self, channel, known):
         super().__init__(channel, lambda small, big: 1.0, LIMITS)
-        self.fits = {frozenset(names): fitted(cost) for names, cost in known.items()}
+        self.fits = {frozenset(names): fit_at(cost) for names, cost in known.items()}
         self.begun = []
 
     def _with(self, parent, names, new):
         self.begun.append((parent.cost, new.name))
-        return fitted(parent.cost - 1.0)
+        return fit_at(parent.cost - 1.0)
 
 
 def test_a_set_is_fitted_from_every_smaller_one_that_is_known_and_the_best_is_kept():
@@ -57,7 +53,7 @@ def asked(monkeypatch):
 
     def keep(channel, begin, active, iterations=None, loose=False):
         calls.append((begin, iterations, loose))
-        return fitted(float(len(calls)))
+        return fit_at(float(len(calls)))
 
     monkeypatch.setattr(selection, "fit", keep)
     return calls
@@ -75,7 +71,7 @@ def searching(closely=False, free=()):
 
 @pytest.mark.parametrize("closely", [False, True])
 def test_every_start_is_tried_in_two_steps_and_the_best_fitted_to_the_end(asked, closely):
-    parent = fitted(9.0, (0.0, 7.0))
+    parent = fit_at(9.0, (0.0, 7.0))
     found = searching(closely)._with(parent, (), Candidate("own", ("own.size",), lambda channel: ((3.0,), (4.0,))))
     assert found.cost == 3.0
     (first, *how), (second, *again), (best, *last) = asked
@@ -87,7 +83,7 @@ def test_every_start_is_tried_in_two_steps_and_the_best_fitted_to_the_end(asked,
 
 @pytest.mark.parametrize("closely", [False, True])
 def test_a_scan_of_no_values_is_a_fit_from_the_smaller_set(asked, closely):
-    parent = fitted(9.0)
+    parent = fit_at(9.0)
     new = Candidate("own", ("own.size",), profile=Profile("own.at", lambda channel: (), 0.5))
     searching(closely)._with(parent, (), new)
     assert asked == [(parent, None, not closely)]
@@ -121,21 +117,21 @@ def test_a_scanned_value_is_fitted_from_what_is_known_beside_it(asked):
 def test_an_effect_does_nothing_where_all_it_has_beside_the_scanned_entry_is_neutral():
     some = searching()
     both = SimpleNamespace(columns=("own.size", "own.at"))
-    assert some._neutral(fitted(0.0, (0.0, 0.0)), both)
-    assert not some._neutral(fitted(0.0, (0.0, 1.0)), both)
-    assert not some._neutral(fitted(0.0, (1.0, 1.0)), both)
-    assert not some._neutral(fitted(0.0, (0.0, 0.0)), SimpleNamespace(columns=()))
+    assert some._neutral(fit_at(0.0, (0.0, 0.0)), both)
+    assert not some._neutral(fit_at(0.0, (0.0, 1.0)), both)
+    assert not some._neutral(fit_at(0.0, (1.0, 1.0)), both)
+    assert not some._neutral(fit_at(0.0, (0.0, 0.0)), SimpleNamespace(columns=()))
 
 
 @pytest.mark.parametrize("closely", [False, True])
 def test_a_set_is_fitted_anew_from_a_larger_one_only_where_that_is_clearly_better(monkeypatch, closely):
     some = searching(closely)
     better = DEFAULT_SETTINGS.fit.enough_nats
-    some.fits = {frozenset(names): fitted(9.0) for names in (("turn_slip", "side_slip"), ("turn_slip",))}
+    some.fits = {frozenset(names): fit_at(9.0) for names in (("turn_slip", "side_slip"), ("turn_slip",))}
     some.channel.layout = BODY
-    some.fits[frozenset({"turn_slip", "side_slip"})] = fitted(5.0, BODY.neutral)
+    some.fits[frozenset({"turn_slip", "side_slip"})] = fit_at(5.0, BODY.neutral)
     for cost, kept in ((9.0 - better, 9.0), (8.99 - better, 8.99 - better)):
-        found = replace(fitted(cost), loose=not closely)
+        found = replace(fit_at(cost), loose=not closely)
         monkeypatch.setattr(selection, "fit", lambda *_, loose, found=found: found if loose == found.loose else None)
         some._refit_without(("turn_slip", "side_slip"), "side_slip", ("turn_slip",))
         assert some.fit(("turn_slip",)).cost == kept
@@ -150,7 +146,7 @@ class Scanned(Selector):
 
     def _at(self, start, active, new, value, iterations=None):
         self.tried.append((float(start.vector[0]), value, iterations))
-        return fitted((value - 41.0) ** 2, (value,))
+        return fit_at((value - 41.0) ** 2, (value,))
 
 
 def test_a_profiled_entry_is_searched_closer_to_first_order_and_then_by_fits():
@@ -160,7 +156,7 @@ def test_a_profiled_entry_is_searched_closer_to_first_order_and_then_by_fits():
 
     def found(cost):
         scanned.looked_at, scanned.tried = [], []
-        return float(scanned._profiled(fitted(cost), (), new).vector[0])
+        return float(scanned._profiled(fit_at(cost), (), new).vector[0])
 
     assert found(first + WORTH) == 40.875
     # Half as far on either side of the best, until that is as close as it is searched.

@@ -72,10 +72,7 @@ def test_on_top_of_the_timed_stage_stands_what_else_was_found_as_surely_as_by_it
         lambda vectors: Chain(*vectors),
     )
     timed = Freed(
-        (
-            Part(BODY, body, (0, 1, 2), known(3, 2)),
-            Part(replace(WHEEL, low=raised), wheels, (LAG, DELAY), known(2, 3)),
-        ),
+        (Part(BODY, body, (0, 1, 2), known(3, 2)), Part(replace(WHEEL, low=raised), wheels, (LAG, DELAY), known(2, 3))),
         lambda vectors: Chain(*vectors),
     )
     both = _on_top(amended, timed, True)

@@ -7,15 +7,12 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.data import BODY, WHEEL
-from disco_hw.gap.data.free_runs import run_body, run_wheels
-from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
+from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search import joint_predictions, stage_predictions
 from disco_hw.gap.search.analysis import GapAnalysis, final_fit
-from disco_hw.gap.search.channel_result import ChannelResult
-from disco_hw.gap.search.selection import Selector, body_moves, wheel_moves
-from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
-from tests.gap.synthetic import DRIVE, GEOMETRY, LIMITS, NOISE, line_of
+from disco_hw.gap.settings import DEFAULT_SETTINGS
+from tests.gap.synthetic import DRIVE, GEOMETRY, NOISE, answered, body_on, searched, vector_of, wheels_on
 
 LAG_S, SLIP_S = 0.2, 0.08
 LAG, SLIP = WHEEL.place["motor_lag.tau_s"], BODY.place["turn_slip.k_s"]
@@ -24,17 +21,11 @@ LAG, SLIP = WHEEL.place["motor_lag.tau_s"], BODY.place["turn_slip.k_s"]
 @cache
 def driven(repeats=2):
     command = np.repeat(np.array(DRIVE * repeats, dtype=float), 200, axis=0)
-    plain, still = line_of(command), np.zeros_like(command)
-    wheels, body = WHEEL.neutral.copy(), BODY.neutral.copy()
-    wheels[LAG], body[SLIP] = LAG_S, SLIP_S
-    body[:3] = GEOMETRY
-    rng = np.random.default_rng(8)
-    angle = run_wheels(wheels, np.array(GEOMETRY), command, still, plain.first, plain.t_s, still)
-    speed = np.gradient(angle, GRID_STEP_S, axis=0)
-    read = angle[plain.encoder.node] + 1e-3 * rng.standard_normal((plain.encoder.node.size, 2))
-    track = run_body(body, angle, speed, np.zeros((angle.shape[0], 3)), plain.first, plain.t_s)
-    poses = track[plain.pose.node] + rng.standard_normal((plain.pose.node.size, 3)) * (0.004, 0.004, 0.006)
-    return replace(plain, angle_rad=angle, speed_rad_s=speed, encoder_angle_rad=read, pose_values=poses)
+    line, rng = answered(command, motor_lag=LAG_S), np.random.default_rng(8)
+    read = line.encoder_angle_rad + 1e-3 * rng.standard_normal((line.encoder.node.size, 2))
+    track = body_on(line, line.pose_values).track(vector_of(turn_slip=SLIP_S))
+    poses = track[line.pose.node] + rng.standard_normal((line.pose.node.size, 3)) * (0.004, 0.004, 0.006)
+    return replace(line, encoder_angle_rad=read, pose_values=poses)
 
 
 def analysed(body_names=("turn_slip",), wheel_names=("motor_lag",), commands=True):
@@ -43,13 +34,11 @@ def analysed(body_names=("turn_slip",), wheel_names=("motor_lag",), commands=Tru
     nominal = BODY.neutral.copy()
     nominal[:3] = 0.062, 0.38, 0.12
     body = BodyChannel.build(line, NOISE, nominal)
-    found = ChannelResult(Selector(body, body_moves(body), LIMITS), body_names, body)
+    found = searched(body, body_names)
     wheels = None
     if commands:
-        channel = WheelChannel.build(line, WheelNoise(reading_rad=1e-3), np.array(GEOMETRY))
-        wheels = ChannelResult(
-            Selector(channel, wheel_moves(channel, np.array(GEOMETRY)), LIMITS), wheel_names, channel
-        )
+        channel = wheels_on(line, WheelNoise(reading_rad=1e-3))
+        wheels = searched(channel, wheel_names)
     return GapAnalysis(line, nominal, WHEEL.neutral, found, wheels)
 
 

@@ -12,11 +12,11 @@ from disco_hw.gap.search.channel_result import ChannelResult, UnnamedTerm
 from disco_hw.gap.search.channel_search import best_terms, that_models_hold, with_unnamed
 from disco_hw.gap.search.evidence import EffectEvidence
 from disco_hw.gap.search.least_squares import fit
-from disco_hw.gap.search.selection import Selector, body_moves
+from disco_hw.gap.search.selection import Selector
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms, motion
 from disco_hw.model import Model, load_model, save_model
 from tests.gap.search.another_drive import another_drive, errors_ahead, without_terms
-from tests.gap.synthetic import LIMITS, body_channel
+from tests.gap.synthetic import LIMITS, body_channel, moved_by, searched, selector_of
 from tools.gap import strange_robot
 
 PROOF = EffectEvidence(100.0, 90.0, 80.0, 80.0, 1.0, 190.0)
@@ -26,7 +26,7 @@ PROOF = EffectEvidence(100.0, 90.0, 80.0, 80.0, 1.0, 190.0)
 def turning_less():
     """A channel whose robot turns less the faster it turns, its plain fit, and the yaw rate at the nodes."""
     channel, line = body_channel(turn_slip=0.1)
-    selector = Selector(channel, body_moves(channel), LIMITS)
+    selector = selector_of(channel)
     return ChannelResult(selector, (), channel), motion(line, channel.neutral)[1]
 
 
@@ -103,11 +103,7 @@ def test_tyres_that_slip_are_told_by_what_they_grip():
     for k, wheels in enumerate(rolling):
         before, speed = speed, min(max(wheels, speed - 0.02), speed + 0.02)
         lost[k, 0] = 0.5 * (before + speed) - wheels
-    moved = channel.track(channel.neutral, lost) - channel.track(channel.neutral)
-    slipping = replace(line, pose_values=channel.measured + moved[channel.samples.node])
-    channel = type(channel).build(slipping, channel.noise, channel.neutral)
-    bare = ChannelResult(Selector(channel, body_moves(channel), LIMITS), (), channel)
-    (term, *_) = with_unnamed(bare, channel_search._body_options).unnamed
+    (term, *_) = with_unnamed(searched(moved_by(channel, lost)), channel_search._body_options).unnamed
     assert term.term.model_name == "v_x += k (v - slewed_2(v))"
     assert float(term.form.split()[2]) == pytest.approx(-1.0, abs=0.1)
 

@@ -22,10 +22,10 @@ from disco_hw.gap.search.channel_search import (
 )
 from disco_hw.gap.search.evidence import EffectEvidence
 from disco_hw.gap.search.least_squares import Fit
-from disco_hw.gap.search.selection import Selector, Thresholds, body_moves
+from disco_hw.gap.search.selection import Selector, Thresholds
 from disco_hw.gap.search.unnamed_terms import Term
 from disco_hw.gap.settings import DEFAULT_SETTINGS, SelectionSettings
-from tests.gap.synthetic import LIMITS, NOISE, body_channel
+from tests.gap.synthetic import LIMITS, body_channel, moved_by, searched
 
 
 class Linear:
@@ -160,13 +160,7 @@ def turned_in(since, until, factor):
     inside = (np.arange(line.t_s.size) >= since * line.t_s.size) & (np.arange(line.t_s.size) < until * line.t_s.size)
     perturbation = np.zeros((line.t_s.size, 3))
     perturbation[:, 2] = np.where(inside, p[0] / p[1] * (line.speed_rad_s[:, 1] - line.speed_rad_s[:, 0]), 0.0)
-    moved = channel.track(p, factor * perturbation) - channel.track(p)
-    poses = channel.measured + moved[channel.samples.node]
-    return BodyChannel.build(replace(line, pose_values=poses), NOISE, p), Term("omega += {:.2f} then", perturbation)
-
-
-def searched(channel, names=(), moves=None):
-    return ChannelResult(Selector(channel, moves or body_moves(channel), LIMITS), names, channel)
+    return moved_by(channel, factor * perturbation), Term("omega += {:.2f} then", perturbation)
 
 
 def test_a_term_is_accepted_with_its_number_and_its_evidence_and_what_stood_in_for_it_goes():
@@ -207,7 +201,8 @@ def test_a_term_takes_its_score_holds_without_two_best_blocks_and_moves_predicti
     without_two = prices * 0.5 * np.log(channel.count)
     proof = EffectEvidence(30.0, 10.0, 9.0, without_two, 1.0, score)
     monkeypatch.setattr(channel_search, "compare", lambda *_: proof)
-    found = with_unnamed(searched(channel, moves=lambda small, big: moved_m), lambda found: iter((term,)))
+    plain = ChannelResult(Selector(channel, lambda small, big: moved_m, LIMITS), (), channel)
+    found = with_unnamed(plain, lambda found: iter((term,)))
     assert [one.evidence for one in found.unnamed] == ([proof] if accepted else [])
 
 

@@ -6,19 +6,15 @@ import numpy as np
 import pytest
 
 from disco_hw.gap import model_of, offered_stage
-from disco_hw.gap.data import BODY, WHEEL
-from disco_hw.gap.data.free_runs import run_wheels
-from disco_hw.gap.noise.channels import WheelChannel
+from disco_hw.gap.data import WHEEL
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report import GapReport
 from disco_hw.gap.report.page import as_text, page, summary_lines
 from disco_hw.gap.search.analysis import GapAnalysis, final_fit
-from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.cross_validation import _errors, only_timed, wheel_table
-from disco_hw.gap.search.selection import Selector, wheel_moves
-from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
+from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.model import Model
-from tests.gap.synthetic import DRIVE, GEOMETRY, LIMITS, line_of
+from tests.gap.synthetic import DRIVE, GEOMETRY, answered, line_of, searched, vector_of, wheels_on
 
 MODEL = Model(*GEOMETRY)
 
@@ -26,26 +22,9 @@ MODEL = Model(*GEOMETRY)
 def analysed(names, **effects):
     """Wheels that answer their commands with these first parameters of effects, and what was found of them."""
     command = np.repeat(np.array(DRIVE * 3, dtype=float), 200, axis=0)
-    truth = WHEEL.neutral.copy()
-    for name, value in effects.items():
-        truth[next(place for column, place in WHEEL.place.items() if column.startswith(f"{name}."))] = value
-    plain = line_of(command)
-    start = np.zeros_like(command)
-    angle = run_wheels(truth, np.array(GEOMETRY), command, start, plain.first, plain.t_s, start)
-    speed = np.gradient(angle, GRID_STEP_S, axis=0)
-    line = type(plain)(
-        **{
-            **{name: getattr(plain, name) for name in plain.__slots__},
-            "angle_rad": angle,
-            "speed_rad_s": speed,
-            "encoder_angle_rad": angle[plain.encoder.node],
-        }
-    )
-    channel = WheelChannel.build(line, WheelNoise(reading_rad=1e-3), np.array(GEOMETRY))
-    selector = Selector(channel, wheel_moves(channel, np.array(GEOMETRY)), LIMITS)
-    body = BODY.neutral.copy()
-    body[:3] = GEOMETRY
-    return GapAnalysis(line, body, WHEEL.neutral, None, ChannelResult(selector, names, channel))
+    line = answered(command, **effects)
+    found = searched(wheels_on(line, WheelNoise(reading_rad=1e-3)), names)
+    return GapAnalysis(line, vector_of(), WHEEL.neutral, None, found)
 
 
 def table_of(analysis):
