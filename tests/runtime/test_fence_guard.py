@@ -453,7 +453,7 @@ rounds = st.integers(4, 7).flatmap(
 
 
 @examples(
-    quick=25,
+    quick=12,
     every=120,
     room=rounds,
     pillar=st.tuples(unit, unit, st.floats(0.05, 0.3)),
