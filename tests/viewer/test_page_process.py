@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.viewer import page_in_background
+from disco_hw import viewer
+from disco_hw.viewer import TOKEN_VARIABLE, PageProcess, page_in_background
 from tests.drivers.waiting import free_port, wait_until
 from tools.viewer_run import ROBOT_FILE
 
@@ -41,6 +42,7 @@ def test_the_page_lives_as_long_as_the_block_and_prints_on_standard_error_alone(
         )
         wait_until(lambda: listens(port), 60.0)
         assert os.getsid(page.pid) == page.pid
+        assert f"?token={page._environment[TOKEN_VARIABLE]}\n" in "".join(it.err for it in captured)
     assert page.returncode == 0
     assert not listens(port)
     captured.append(capfd.readouterr())
@@ -79,27 +81,37 @@ def test_what_the_block_raises_is_passed_on(error):
         raise error
 
 
-def test_a_killed_page_is_started_again_under_the_same_token_and_one_that_hangs_is_ended(capfd):
-    port = free_port()
+def slim_page(program):
+    """A stand-in for the page's process that starts at once."""
+    return PageProcess([sys.executable, "-S", "-c", program])
+
+
+def test_a_killed_page_is_started_again_under_the_same_token(capfd):
     output = ["", ""]
 
-    def addresses():
+    def tokens():
         output[:] = [before + new for before, new in zip(output, capfd.readouterr(), strict=True)]
-        pattern = rf"http://127\.0\.0\.1:{port}/\?token=\S+(?=\s)"
-        return [found for text in output for found in re.findall(pattern, text)]
+        return re.findall(r"token=(\S+)\n", output[0])
 
-    with page_in_background(ROBOT_FILE, None, "127.0.0.1", port) as page:
-        wait_until(lambda: len(addresses()) == 1, 60.0)
+    page = slim_page(f"import os, time; print('token=' + os.environ['{TOKEN_VARIABLE}'], flush=True); time.sleep(60)")
+    try:
+        wait_until(lambda: len(tokens()) == 1, 60.0)
         first = page.pid
         os.kill(first, signal.SIGKILL)
-        wait_until(lambda: len(addresses()) == 2, 60.0)
-        assert len(set(addresses())) == 1
+        wait_until(lambda: len(tokens()) == 2, 60.0)
+        assert len(set(tokens())) == 1
         assert not Path(f"/proc/{first}").exists(), "a zombie is left"
         assert page.new_messages() == ("the page was ended by SIGKILL; it is started again",)
         assert page.new_messages() == ()
-        # From here on it would end in order.
-        wait_until(lambda: listens(port), 60.0)
-        os.kill(page.pid, signal.SIGSTOP)
+    finally:
+        page.close()
+    assert page.returncode == -signal.SIGTERM
+    assert "page: the page was ended by SIGKILL; it is started again" in output[1]
+
+
+def test_a_page_that_hangs_is_killed(monkeypatch):
+    monkeypatch.setattr(viewer, "_END_TIMEOUT_S", 0.2)
+    page = slim_page("import time; time.sleep(60)")
+    os.kill(page.pid, signal.SIGSTOP)
+    page.close()
     assert page.returncode == -signal.SIGKILL
-    assert "page: the page was ended by SIGKILL; it is started again" in "".join(output)
-    assert not listens(port)
