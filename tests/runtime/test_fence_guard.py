@@ -13,14 +13,7 @@ from disco_hw.estimation import PoseEstimate
 from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.fence import Circle, Fence, Footprint
 from disco_hw.fence.clearance import Boundaries, MovingCircle
-from disco_hw.runtime.fence_guard import (
-    IDLE,
-    SCALES,
-    STOPS_MOTION,
-    FenceGuard,
-    FenceVerdict,
-    StoppingSettings,
-)
+from disco_hw.runtime.fence_guard import IDLE, SCALES, STOPS_MOTION, FenceGuard, FenceVerdict, StoppingSettings
 from disco_hw.runtime.pipeline import Governor, WheelLimits
 from tests.tables import examples
 

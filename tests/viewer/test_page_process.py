@@ -28,9 +28,10 @@ def listens(port):
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
-def gone(pid):
+def state_of(pid):
+    """State of a process: Z for a zombie, T for one that is stopped; empty where there is none."""
     stat = Path(f"/proc/{pid}/stat")
-    return not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] == "Z"
+    return stat.read_text().rpartition(")")[2].split()[0] if stat.exists() else ""
 
 
 def test_the_page_lives_as_long_as_the_block_and_prints_on_standard_error_alone(capfd):
@@ -58,7 +59,7 @@ def test_the_page_ends_when_its_parent_is_killed():
     wait_until(lambda: listens(port), 60.0)
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    wait_until(lambda: gone(pid), 60.0)
+    wait_until(lambda: state_of(pid) in {"", "Z"}, 60.0)
 
 
 def test_a_page_that_cannot_start_is_reported_and_not_started_again(tmp_path, capfd):
@@ -113,5 +114,6 @@ def test_a_page_that_hangs_is_killed(monkeypatch):
     monkeypatch.setattr(viewer, "_END_TIMEOUT_S", 0.2)
     page = slim_page("import time; time.sleep(60)")
     os.kill(page.pid, signal.SIGSTOP)
+    wait_until(lambda: state_of(page.pid) == "T")
     page.close()
     assert page.returncode == -signal.SIGKILL

@@ -38,11 +38,7 @@ BASE = st.tuples(st.floats(0.02, 0.12), st.floats(0.2, 0.8), st.floats(-0.3, 0.4
 # has another arm of the integration, which the tests with all effects go through.
 SLOW_TURNING = st.tuples(st.floats(0.02, 0.08), st.floats(0.45, 0.8), st.floats(-0.3, 0.4))
 STATES = st.tuples(
-    st.floats(-2.0, 2.0),
-    st.floats(-2.0, 2.0),
-    st.floats(-math.pi, math.pi),
-    st.floats(-6.0, 6.0),
-    st.floats(-6.0, 6.0),
+    st.floats(-2.0, 2.0), st.floats(-2.0, 2.0), st.floats(-math.pi, math.pi), st.floats(-6.0, 6.0), st.floats(-6.0, 6.0)
 )
 COMMANDS = st.lists(st.tuples(st.floats(-6.0, 6.0), st.floats(-6.0, 6.0)), min_size=1, max_size=30)
 SEEDS = st.integers(0, 2**63 - 1)
