@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw import viewer
 from disco_hw.viewer import TOKEN_VARIABLE, PageProcess, page_in_background
 from tests.drivers.waiting import free_port, wait_until
 from tools.viewer_run import ROBOT_FILE
@@ -110,8 +109,7 @@ def test_a_killed_page_is_started_again_under_the_same_token(capfd):
     assert "page: the page was ended by SIGKILL; it is started again" in output[1]
 
 
-def test_a_page_that_hangs_is_killed(monkeypatch):
-    monkeypatch.setattr(viewer, "_END_TIMEOUT_S", 0.2)
+def test_a_page_that_hangs_is_killed():
     page = slim_page("import time; time.sleep(60)")
     os.kill(page.pid, signal.SIGSTOP)
     wait_until(lambda: state_of(page.pid) == "T")
