@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace
@@ -194,27 +193,30 @@ def test_a_wheel_that_turns_either_way_on_either_side_keeps_the_robot_from_being
     assert (reply.accepted, "the wheels are turning" in reply.text) == (False, True)
 
 
-class Moody:
-    """A planner that drives straight until it gives up."""
+class Altered:
+    """The shipped robot's planner, each plan of which `change(now_ns, plan)` alters or refuses."""
 
-    def __init__(self, inner, last_ns: int) -> None:
-        self.inner, self.last_ns = inner, last_ns
+    def __init__(self, change):
+        setup = load_setup(SHIPPED_ROBOT)
+        self.inner, self.change = create_planner(setup.config, setup.model), change
 
     def plan(self, now_ns, state):
-        if now_ns > self.last_ns:
-            raise NoValidControl("planted")
-        return self.inner.plan(now_ns, state)
+        return self.change(now_ns, self.inner.plan(now_ns, state))
 
-    def reset(self) -> None:
+    def reset(self):
         self.inner.reset()
 
-    def set_belief(self, belief) -> None:
+    def set_belief(self, belief):
         self.inner.set_belief(belief)
 
 
 def test_a_planner_that_gives_up_is_followed_on_its_tail_then_the_wheels_ramp_down():
-    setup = load_setup(SHIPPED_ROBOT)
-    stack = simulated_stack(Moody(create_planner(setup.config, setup.model), 1_400_000_000))
+    def give_up(now_ns, plan):
+        if now_ns > 1_400_000_000:
+            raise NoValidControl("planted")
+        return plan
+
+    stack = simulated_stack(Altered(give_up))
     ticks = start(stack, 1.6)
     sources = [tick.pipeline.source for tick in ticks]
     tail = [k for k, source in enumerate(sources) if source is Source.TAIL]
@@ -230,18 +232,11 @@ def test_a_planner_that_gives_up_is_followed_on_its_tail_then_the_wheels_ramp_do
 def test_the_wheels_of_a_tick_are_announced_before_it_is_planned_and_recorded():
     happened = []
 
-    class Planner:
-        def plan(self, now_ns, state):
-            happened.append(("plan", now_ns))
-            raise NoValidControl("planted")
+    def refuse(now_ns, _plan):
+        happened.append(("plan", now_ns))
+        raise NoValidControl("planted")
 
-        def reset(self):
-            pass
-
-        def set_belief(self, belief):
-            pass
-
-    stack = simulated_stack(Planner())
+    stack = simulated_stack(Altered(refuse))
     stack.core.announce = lambda now_ns, wheels: happened.append(("wheels", now_ns, *wheels))
     start(stack, 0.1)
     planned = [k for k, (what, *_) in enumerate(happened) if what == "plan"]
@@ -253,30 +248,13 @@ def test_the_wheels_of_a_tick_are_announced_before_it_is_planned_and_recorded():
     ]
 
 
-class Collapsing:
-    """A planner whose plans between two times hang on one sample, as they say."""
-
-    def __init__(self, inner, first_ns: int, last_ns: int) -> None:
-        self.inner, self.first_ns, self.last_ns = inner, first_ns, last_ns
-
-    def plan(self, now_ns, state):
-        plan = self.inner.plan(now_ns, state)
-        if not self.first_ns <= now_ns <= self.last_ns:
-            return plan
-        few = msgspec.structs.replace(plan.diagnostics, ess=1.2, collapsed=True)
-        return msgspec.structs.replace(plan, diagnostics=few)
-
-    def reset(self) -> None:
-        self.inner.reset()
-
-    def set_belief(self, belief) -> None:
-        self.inner.set_belief(belief)
-
-
 def test_plans_that_hang_on_too_few_samples_are_reported_once():
-    setup = load_setup(SHIPPED_ROBOT)
-    stack = simulated_stack(Collapsing(create_planner(setup.config, setup.model), 1_300_000_000, 1_600_000_000))
-    ticks = start(stack, 1.2)
+    def collapse(now_ns, plan):
+        if not 1_300_000_000 <= now_ns <= 1_600_000_000:
+            return plan
+        return replace(plan, diagnostics=replace(plan.diagnostics, ess=1.2, collapsed=True))
+
+    ticks = start(simulated_stack(Altered(collapse)), 1.2)
     reported = [text for tick in ticks for text in tick.events if text.startswith("planner")]
     assert reported == [
         "planner: plans rest on 1.2 effective samples, too few to trust the plan",
