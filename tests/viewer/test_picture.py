@@ -45,9 +45,9 @@ def test_an_instant_before_the_log_and_one_after_it_are_its_ends(recording, tmp_
 
 def test_a_clip_has_ten_pictures_a_second_and_tells_how_far_it_is(recording, tmp_path):
     parts = []
-    picture.draw_clip(recording, tmp_path / "a.gif", 40.0, parts.append)
-    assert Image.open(tmp_path / "a.gif").n_frames == 2
-    assert parts == [0.0, 1.0]
+    picture.draw_clip(recording, tmp_path / "a.gif", 20.0, parts.append)
+    assert Image.open(tmp_path / "a.gif").n_frames == 3
+    assert parts == [0.0, 0.5, 1.0]
 
 
 @pytest.mark.parametrize("name", ["a", "a.exe"])
