@@ -70,14 +70,8 @@ def test_shipped_robot_file_is_valid():
         (("ticks_per_rev = 2048", "ticks_per_rev = true"), ["robot.ticks_per_rev", "bool", "float"]),
         (("[robot]", "[robott]"), ["robott", "no such field"]),
         (("[robot]", "[robot"), ["not valid TOML", "line"]),
-        (
-            ("ticks_per_rev = 2048", "ticks_per_rev = " + "1" * 5000),
-            ["not valid TOML", "line 6", "64 characters"],
-        ),
-        (
-            ("ticks_per_rev = 2048", "ticks_per_rev = " + "[" * 3000 + "]" * 3000),
-            ["line 6", "16 deep"],
-        ),
+        (("ticks_per_rev = 2048", "ticks_per_rev = " + "1" * 5000), ["not valid TOML", "line 6", "64 characters"]),
+        (("ticks_per_rev = 2048", "ticks_per_rev = " + "[" * 3000 + "]" * 3000), ["line 6", "16 deep"]),
         (("max_wheel_speed_rad_s = 8.0", "max_wheel_speed_rad_s = 2.0"), ["task.speed_m_s", "wheels"]),
     ],
 )

@@ -132,10 +132,7 @@ NEGATIVE = np.array([-0.5, *[0.25] * 6])
     ("options", "words"),
     [
         ({"sampler": replace(SAMPLER, risk="cvar"), "weights": NEGATIVE}, "weights: -0.5 is negative, and risk 'cvar'"),
-        (
-            {"sampler": replace(SAMPLER, risk="worst"), "weights": NEGATIVE},
-            "-0.5 is negative, and risk 'worst'",
-        ),
+        ({"sampler": replace(SAMPLER, risk="worst"), "weights": NEGATIVE}, "-0.5 is negative, and risk 'worst'"),
         ({"weights": WEIGHTS[1:]}, r"weights: shape \(6,\); must be \(7,\), one for each point of theta"),
         ({"weights": np.full(7, 0.5)}, "weights: sum to 3.5; must sum to 1"),
         ({"weights": np.full(7, math.nan)}, "theta, weights: must be finite"),

@@ -21,13 +21,13 @@ from disco_hw.control.kernel.avoid import (
     MOST_SHAPES,
     TOUCH_COST,
     TOUCH_COST_PER_M,
-    touch_cost,
 )
 from disco_hw.control.surroundings import Surroundings
 from disco_hw.fence import Circle, Fence, Footprint
 from disco_hw.fence.clearance import Boundaries, MovingCircle
 from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.robot_setup import load_setup
+from tests.control.kernel.test_avoid import touched
 from tests.control.kernel.test_step import allocations
 
 FOOTPRINT = Footprint(0.5, 0.4, 0.05)
@@ -78,7 +78,7 @@ def test_a_place_costs_what_the_footprint_lacks_of_the_distance_to_keep(x_m, yaw
     bounds = bounds_of(obstacles=[MovingCircle(1.0, 0.0, 0.25)])
     area = around(Fence(), [MovingCircle(1.0, 0.0, 0.25)]).place(0.0, 0.0, (0.0, 0.0), 0.25)
     place = tuple(map(np.float32, (x_m, 0.0, 0.0)))
-    got = touch_cost(area, 0, np.float32(0.0), place, np.float32(math.cos(yaw)), np.float32(math.sin(yaw)))
+    got = touched(area, np.float32(0.0), place, np.float32(math.cos(yaw)), np.float32(math.sin(yaw)))
     lacking_m = area.body[KEEP] - bounds.clearance_m(np.array([[x_m, 0.0, yaw]]))[0]
     expected = TOUCH_COST + TOUCH_COST_PER_M * lacking_m if lacking_m > 0.0 else 0.0
     assert got == pytest.approx(expected, abs=0.05)

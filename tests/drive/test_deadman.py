@@ -161,10 +161,7 @@ def test_a_refusal_needs_a_new_press(bench):
 
 
 moments = st.tuples(
-    st.booleans(),
-    st.sampled_from([0, 20 * MS, 150 * MS, 250 * MS]),
-    st.booleans(),
-    st.sampled_from([None, *State]),
+    st.booleans(), st.sampled_from([0, 20 * MS, 150 * MS, 250 * MS]), st.booleans(), st.sampled_from([None, *State])
 )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import threading
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -71,6 +72,7 @@ def test_it_shows_the_daemon_and_ends_with_it(tmp_path, terminal):
             for message in server.poll():
                 server.reply(message, STATUS)
                 answered += 1
+            time.sleep(0.01)
         server.poll()
     finally:
         server.close()

@@ -11,8 +11,9 @@ import pytest
 
 from disco_hw.drive.drive_command import DriveOptions, DriveResult, run_drive
 from disco_hw.errors import InputError
+from tests.runtime.simulated import write_ticks
 from tools.stack import write_robot_file
-from tools.viewer_run import write_log
+from tools.viewer_run import tick_records
 
 
 @pytest.mark.parametrize(
@@ -102,7 +103,7 @@ def test_a_writer_that_was_slow_has_lost_nothing_where_the_log_proves_it(tmp_pat
     pauses = "the log writer has not answered for 0.8 s; new ticks are kept until it does"
 
     def served(_setup, path, notify, _pilot, **_options):
-        write_log(path, ticks=60)
+        write_ticks(path, map(tick_records, range(60)))
         os.truncate(path, path.stat().st_size - cut_off)
         notify("recording", pauses)
 

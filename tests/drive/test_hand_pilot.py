@@ -48,7 +48,7 @@ class Bench:
         return self.stack.run(seconds)
 
     def driving(self):
-        self.run(1.5)
+        self.run(0.5)
         assert self.stack.core.last.output.state is State.READY
         self.run(1.5, held=True)
         assert self.stack.robot.truth.right_speed_rad_s == pytest.approx(5.0, abs=0.3)
@@ -118,7 +118,7 @@ def test_the_status_says_what_is_going_on(bench):
 
 def test_a_press_while_not_ready_is_reported_and_sends_nothing():
     bench = Bench()
-    bench.run(1.5)
+    bench.run(0.5)
     bench.stack.robot.link.plug(False)
     bench.run(0.1)
     ticks = bench.run(0.5, held=True)
@@ -135,7 +135,7 @@ def test_a_refusal_is_reported_and_needs_a_new_press(bench):
 
 def test_without_a_planner_a_task_does_nothing():
     stack = simulated_stack(NoPlanner())
-    stack.run(1.5)
+    stack.run(0.5)
     stack.run(0.5, UserRequest.ARM)
     ticks = stack.run(1.0, UserRequest.START)
     assert {tick.pipeline.source for tick in ticks} == {Source.RAMP}

@@ -53,31 +53,31 @@ def replies(ticks):
 
 
 def test_by_hand_a_metre_and_then_the_task_is_armed_anew(bench):
-    last = bench.run(2.0)[-1]
+    last = bench.run(1.0)[-1]
     assert last.output.state is State.READY
     assert "heading not known" in last.output.detail
     assert "drive" in bench.pilot.status()
     # Nobody holds the pad: whoever arms finds it disarmed again, and the task is refused.
-    ticks = bench.run(2.0, ARM, START)
+    ticks = bench.run(1.5, ARM, START)
     assert bench.robot.truth.left_speed_rad_s == pytest.approx(0.0, abs=0.01)
     assert not any(
         tick.output.motion_allowed and isinstance(bench.pilot.step(0, tick).motion, FollowTask) for tick in ticks
     )
     bench.hand.held = True
-    driven = bench.run(6.0)
+    driven = bench.run(5.0)
     assert any(tick.output.motion_allowed for tick in driven)
     assert driven[-1].pipeline.estimate.heading_known
     # Still the same hand, although the heading is known by now.
     assert driven[-1].pipeline.source.value == "manual"
     bench.hand.held = False
-    stood = bench.run(2.0)
+    stood = bench.run(1.0)
     assert stood[-1].output.state is State.READY
     assert stood[-1].output.detail == "ready to be armed"
     assert not stood[-1].output.running
     assert bench.pilot.status() == {}
     truth, estimate = bench.robot.truth, stood[-1].pipeline.estimate
     assert abs(math.remainder(estimate.yaw_rad - truth.yaw_rad, math.tau)) < 0.15
-    started = bench.run(2.0, ARM, START)
+    started = bench.run(1.0, ARM, START)
     assert all(reply.accepted for reply in replies(started))
     assert started[-1].output.motion_allowed
     assert any(tick.output.running for tick in started)

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from disco_hw.fence import Circle, Fence, Footprint
 from disco_hw.fence.clearance import FREE_M, Boundaries, MovingCircle, along_line, first_breach, task_breach
+from tests.tables import examples
 
 FOOTPRINT = Footprint(0.5, 0.4, 0.05)
 ROOM = ((-2.0, -1.5), (2.0, -1.5), (2.0, 1.5), (-2.0, 1.5))
@@ -118,8 +118,7 @@ star = st.lists(st.floats(0.4, 2.5), min_size=3, max_size=9).map(
 )
 
 
-@settings(max_examples=250)
-@given(poses, star, st.booleans())
+@examples(quick=80, every=250, pose=poses, polygon=star, keep_in=st.booleans())
 def test_the_clearance_to_any_polygon_is_that_of_the_footprints_points(pose, polygon, keep_in):
     fence = Fence(keep_in=polygon) if keep_in else Fence(keep_out=(polygon,))
     signed = off_polygon(points_of(FOOTPRINT, pose), polygon) * (1.0 if keep_in else -1.0)
@@ -133,8 +132,7 @@ def test_the_clearance_to_any_polygon_is_that_of_the_footprints_points(pose, pol
         assert found <= signed[[0, 50, -51, -1]].min() + 1e-9
 
 
-@settings(max_examples=200)
-@given(poses, poses, star)
+@examples(quick=60, every=200, first=poses, second=poses, polygon=star)
 def test_the_clearance_changes_by_no_more_than_a_corner_moves(first, second, polygon):
     fence = Fence(keep_in=polygon, keep_out=(Circle((0.3, 0.2), 0.2),))
     bounds = Boundaries(FOOTPRINT, fence, [MovingCircle(-1.0, 0.5, 0.3)])

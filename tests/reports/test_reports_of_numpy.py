@@ -20,14 +20,7 @@ from disco_hw.experiments.circle_report import CircleReport
 from disco_hw.experiments.gap import RUNS, GapExperimentResult, Lap
 from disco_hw.experiments.pendulum import PendulumOptions, PendulumResult
 from disco_hw.gap import GapResult
-from disco_hw.gap.report import (
-    STAGES,
-    CandidateEvidence,
-    ChannelFinding,
-    EffectFinding,
-    GapReport,
-    UnnamedFinding,
-)
+from disco_hw.gap.report import STAGES, CandidateEvidence, ChannelFinding, EffectFinding, GapReport, UnnamedFinding
 from disco_hw.gap.report.blind_spots import BlindSpot
 from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors

@@ -46,17 +46,9 @@ class PoseKind:
 
 
 ROBOT = PoseKind({}, by_datagram=False)
-RTK = PoseKind(
-    {"pose_rate_hz": 5.0, "pose_position_std_m": 0.02, "pose_delay_s": 0.15},
-    has_heading=False,
-)
+RTK = PoseKind({"pose_rate_hz": 5.0, "pose_position_std_m": 0.02, "pose_delay_s": 0.15}, has_heading=False)
 UDP = PoseKind(
-    {
-        "pose_rate_hz": 100.0,
-        "pose_delay_s": 0.04,
-        "pose_dropout_probability": 0.05,
-        "pose_outlier_probability": 0.01,
-    },
+    {"pose_rate_hz": 100.0, "pose_delay_s": 0.04, "pose_dropout_probability": 0.05, "pose_outlier_probability": 0.01}
 )
 
 

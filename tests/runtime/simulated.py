@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from disco_hw.config import SHIPPED_ROBOT
+from disco_hw.control.plan import PLANNER_VERSION
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
+from disco_hw.log import Attachment, End, Start, batch_encoder
+from disco_hw.log.mcap_log import McapLog
+from disco_hw.log.records import Record
 from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.core import CoreTick
 from disco_hw.runtime.pipeline import Planner
 from disco_hw.runtime.replay import ReplayReport, replay
-from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.runtime.robot_setup import kept_files, load_setup
 from disco_hw.runtime.supervisor import UserRequest
 from sim.body_dynamics import BodyPose
 from sim.plant_parameters import PlantParameters
@@ -41,14 +46,37 @@ def simulated_stack(
 
 def arm(stack: SimulatedRun) -> None:
     """Wait until the robot is ready, and arm it."""
-    stack.run(1.5)
-    stack.run(0.5, UserRequest.ARM)
+    stack.run(0.5)
+    stack.run(0.3, UserRequest.ARM)
 
 
 def start(stack: SimulatedRun, seconds: float) -> list[CoreTick]:
     """Arm the robot, start the task, and return the ticks of so long a drive."""
     arm(stack)
     return stack.run(seconds, UserRequest.START)
+
+
+def write_ticks(
+    path: Path,
+    ticks: Iterable[tuple[int, Sequence[Record]]],
+    files: Iterable[Attachment] = (),
+    planner: int = PLANNER_VERSION,
+) -> Path:
+    """Write what a recorder was given as a log, in this process: starting another takes longer than a short log."""
+    encode, number, now_ns = batch_encoder(), 0, 0
+    with path.open("xb") as file:
+        log = McapLog(file, Start(str(path), "wombot", "", 0, 10**18, attachments=tuple(files), planner=planner))
+        for number, (now_ns, records) in enumerate(ticks, start=1):
+            log.write(encode(number, now_ns, records))
+        log.end(End(now_ns, number, 0))
+        log.finish()
+    assert log.refused == 0
+    return path
+
+
+def write_run(stack: SimulatedRun, path: Path) -> Path:
+    """Write the log of a run, with the files of its robot."""
+    return write_ticks(path, stack.recorder.ticks, kept_files(stack._setup))
 
 
 def replayed(log: Path, *arguments: float) -> ReplayReport:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace
@@ -30,11 +29,14 @@ from sim.virtual_robot import VirtualRobot
 from tests.runtime.simulated import START, arm, simulated_stack, start
 from tests.tables import thinned
 
+TASK = CircleTask(radius_m=0.45, speed_m_s=0.25)
+
 
 @pytest.fixture(scope="module")
 def lap():
     """One lap of the circle, and the stop after it."""
-    stack = simulated_stack()
+    stack = simulated_stack(start=replace(START, x_m=TASK.radius_m))
+    stack.core.set_task(TASK)
     arm(stack)
     rows = []
     stack.run(0.02, UserRequest.START)
@@ -48,7 +50,7 @@ def lap():
 
 def test_the_circle_is_followed_in_simulated_time(lap):
     _, path, _ = lap
-    figures = circle_figures(path, CircleTask())
+    figures = circle_figures(path, TASK)
     assert figures.laps > 0.9
     assert figures.settled_rms_distance_m < 0.05
 
@@ -76,7 +78,7 @@ def test_everything_is_recorded(lap):
 
 def test_no_command_frame_leaves_before_arming():
     stack = simulated_stack()
-    stack.run(2.0)
+    stack.run(1.0)
     assert stack.core.last.output.state is State.READY
     sent = [r for _, tick in stack.recorder.ticks for r in tick if isinstance(r, records.FrameOut)]
     assert sent
@@ -85,7 +87,7 @@ def test_no_command_frame_leaves_before_arming():
 
 def test_a_lost_link_voids_the_session_and_nothing_rearms():
     stack = simulated_stack()
-    start(stack, 2.0)
+    start(stack, 1.0)
     session = stack.robot.board.outputs.session
     assert abs(stack.robot.truth.right_speed_rad_s) > 1.0
     stack.robot.link.plug(False)
@@ -93,7 +95,7 @@ def test_a_lost_link_voids_the_session_and_nothing_rearms():
     assert ticks[-1].output.state is State.DISCONNECTED
     assert abs(stack.robot.truth.right_speed_rad_s) < 0.05
     stack.robot.link.plug(True)
-    ticks = stack.run(3.0)
+    ticks = stack.run(1.5)
     assert ticks[-1].output.state is State.READY
     assert all(tick.command is None for tick in ticks)
     assert abs(stack.robot.truth.right_speed_rad_s) < 0.05
@@ -120,22 +122,22 @@ def exchanged(stack, **firmware):
 @thinned("limits", [{"max_wheel_speed_rad_s": 4.0}, {"ticks_per_rev": 1024}], quick=1)
 def test_a_controller_exchanged_on_a_living_link_is_judged_anew(limits):
     stack = simulated_stack(NoPlanner(), needs_pose=False)
-    assert stack.run(1.5)[-1].output.state is State.READY
+    assert stack.run(0.5)[-1].output.state is State.READY
     exchanged(stack, **limits)
-    last = stack.run(3.0)[-1].output
+    last = stack.run(1.5)[-1].output
     assert last.state is State.FAULT, last.detail
     assert next(iter(limits)) in last.detail
     assert not any(reply.accepted for tick in stack.run(0.1, UserRequest.ARM) for reply in tick.replies)
     # The one that fits is taken again, once a person has reset.
     exchanged(stack)
-    stack.run(3.0)
+    stack.run(1.5)
     stack.run(0.1, UserRequest.RESET)
-    assert stack.run(3.0)[-1].output.state is State.READY
+    assert stack.run(1.5)[-1].output.state is State.READY
 
 
 def test_the_log_says_which_controller_answers_and_who_says_its_limits():
     stack = simulated_stack(NoPlanner(), needs_pose=False)
-    stack.run(3.0)
+    stack.run(1.5)
 
     def recorded():
         return [record for _, tick in stack.recorder.ticks for record in tick if isinstance(record, records.Controller)]
@@ -148,7 +150,7 @@ def test_the_log_says_which_controller_answers_and_who_says_its_limits():
     assert shown["controller"]["limits"]["max_wheel_speed_rad_s"] == {"value": 8.0, "said_by": "device"}
     assert "controller: reference controller, firmware" in describe({**shown, "do": "status"}, SHIPPED_ROBOT)
     exchanged(stack, max_wheel_speed_rad_s=4.0)
-    stack.run(3.0)
+    stack.run(1.5)
     assert recorded()[-1].told["max_wheel_speed_rad_s"] == 4.0
 
 
@@ -162,7 +164,7 @@ def test_limits_are_recorded_under_who_says_them():
 @pytest.mark.parametrize("disconnected", ["link", "robot"])
 def test_what_a_robot_said_that_is_not_heard_any_more_is_not_its_state(disconnected):
     stack = simulated_stack(NoPlanner(), needs_pose=False)
-    stack.run(1.5)
+    stack.run(0.5)
     stack.run(0.5, UserRequest.ESTOP)
     assert stack.core.robot_status.state == "ESTOP"
     if disconnected == "link":
@@ -176,7 +178,7 @@ def test_what_a_robot_said_that_is_not_heard_any_more_is_not_its_state(disconnec
 @pytest.mark.parametrize("speeds", [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
 def test_a_wheel_that_turns_either_way_on_either_side_keeps_the_robot_from_being_armed(speeds):
     stack = simulated_stack(NoPlanner(), needs_pose=False)
-    stack.run(1.5)
+    stack.run(0.5)
     receive = stack.core.driver.receive
 
     def turning(now_ns, frames):
@@ -191,28 +193,31 @@ def test_a_wheel_that_turns_either_way_on_either_side_keeps_the_robot_from_being
     assert (reply.accepted, "the wheels are turning" in reply.text) == (False, True)
 
 
-class Moody:
-    """A planner that drives straight until it gives up."""
+class Altered:
+    """The shipped robot's planner, each plan of which `change(now_ns, plan)` alters or refuses."""
 
-    def __init__(self, inner, last_ns: int) -> None:
-        self.inner, self.last_ns = inner, last_ns
+    def __init__(self, change):
+        setup = load_setup(SHIPPED_ROBOT)
+        self.inner, self.change = create_planner(setup.config, setup.model), change
 
     def plan(self, now_ns, state):
-        if now_ns > self.last_ns:
-            raise NoValidControl("planted")
-        return self.inner.plan(now_ns, state)
+        return self.change(now_ns, self.inner.plan(now_ns, state))
 
-    def reset(self) -> None:
+    def reset(self):
         self.inner.reset()
 
-    def set_belief(self, belief) -> None:
+    def set_belief(self, belief):
         self.inner.set_belief(belief)
 
 
 def test_a_planner_that_gives_up_is_followed_on_its_tail_then_the_wheels_ramp_down():
-    setup = load_setup(SHIPPED_ROBOT)
-    stack = simulated_stack(Moody(create_planner(setup.config, setup.model), 4_000_000_000))
-    ticks = start(stack, 4.0)
+    def give_up(now_ns, plan):
+        if now_ns > 1_400_000_000:
+            raise NoValidControl("planted")
+        return plan
+
+    stack = simulated_stack(Altered(give_up))
+    ticks = start(stack, 1.6)
     sources = [tick.pipeline.source for tick in ticks]
     tail = [k for k, source in enumerate(sources) if source is Source.TAIL]
     assert len(tail) == 10
@@ -227,18 +232,11 @@ def test_a_planner_that_gives_up_is_followed_on_its_tail_then_the_wheels_ramp_do
 def test_the_wheels_of_a_tick_are_announced_before_it_is_planned_and_recorded():
     happened = []
 
-    class Planner:
-        def plan(self, now_ns, state):
-            happened.append(("plan", now_ns))
-            raise NoValidControl("planted")
+    def refuse(now_ns, _plan):
+        happened.append(("plan", now_ns))
+        raise NoValidControl("planted")
 
-        def reset(self):
-            pass
-
-        def set_belief(self, belief):
-            pass
-
-    stack = simulated_stack(Planner())
+    stack = simulated_stack(Altered(refuse))
     stack.core.announce = lambda now_ns, wheels: happened.append(("wheels", now_ns, *wheels))
     start(stack, 0.1)
     planned = [k for k, (what, *_) in enumerate(happened) if what == "plan"]
@@ -250,30 +248,13 @@ def test_the_wheels_of_a_tick_are_announced_before_it_is_planned_and_recorded():
     ]
 
 
-class Collapsing:
-    """A planner whose plans between two times hang on one sample, as they say."""
-
-    def __init__(self, inner, first_ns: int, last_ns: int) -> None:
-        self.inner, self.first_ns, self.last_ns = inner, first_ns, last_ns
-
-    def plan(self, now_ns, state):
-        plan = self.inner.plan(now_ns, state)
-        if not self.first_ns <= now_ns <= self.last_ns:
-            return plan
-        few = msgspec.structs.replace(plan.diagnostics, ess=1.2, collapsed=True)
-        return msgspec.structs.replace(plan, diagnostics=few)
-
-    def reset(self) -> None:
-        self.inner.reset()
-
-    def set_belief(self, belief) -> None:
-        self.inner.set_belief(belief)
-
-
 def test_plans_that_hang_on_too_few_samples_are_reported_once():
-    setup = load_setup(SHIPPED_ROBOT)
-    stack = simulated_stack(Collapsing(create_planner(setup.config, setup.model), 2_500_000_000, 3_000_000_000))
-    ticks = start(stack, 2.0)
+    def collapse(now_ns, plan):
+        if not 1_300_000_000 <= now_ns <= 1_600_000_000:
+            return plan
+        return replace(plan, diagnostics=replace(plan.diagnostics, ess=1.2, collapsed=True))
+
+    ticks = start(simulated_stack(Altered(collapse)), 1.2)
     reported = [text for tick in ticks for text in tick.events if text.startswith("planner")]
     assert reported == [
         "planner: plans rest on 1.2 effective samples, too few to trust the plan",

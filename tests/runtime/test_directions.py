@@ -157,7 +157,7 @@ def test_the_daemons_tick_stops_the_robot_and_says_what_to_change(wiring):
 def test_a_robot_that_is_wired_as_declared_is_let_alone():
     run = simulated_stack()
     run.start()
-    assert all(tick.output.motion_allowed for tick in run.ticks(6.0))
+    assert all(tick.output.motion_allowed for tick in run.ticks(4.0))
 
 
 @pytest.mark.thorough

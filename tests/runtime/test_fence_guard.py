@@ -13,14 +13,7 @@ from disco_hw.estimation import PoseEstimate
 from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.fence import Circle, Fence, Footprint
 from disco_hw.fence.clearance import Boundaries, MovingCircle
-from disco_hw.runtime.fence_guard import (
-    IDLE,
-    SCALES,
-    STOPS_MOTION,
-    FenceGuard,
-    FenceVerdict,
-    StoppingSettings,
-)
+from disco_hw.runtime.fence_guard import IDLE, SCALES, STOPS_MOTION, FenceGuard, FenceVerdict, StoppingSettings
 from disco_hw.runtime.pipeline import Governor, WheelLimits
 from tests.tables import examples
 
@@ -453,7 +446,7 @@ rounds = st.integers(4, 7).flatmap(
 
 
 @examples(
-    quick=25,
+    quick=12,
     every=120,
     room=rounds,
     pillar=st.tuples(unit, unit, st.floats(0.05, 0.3)),

@@ -14,7 +14,7 @@ REACHABLE = st.floats(-8.0, 8.0)
 
 def governor_at(left, right):
     governor = Governor(LIMITS, PERIOD_S)
-    for _ in range(1000):
+    for _ in range(100):
         governor.step(left, right, PERIOD_S)
     return governor
 
@@ -46,7 +46,7 @@ def test_no_input_ever_gets_a_command_beyond_the_limits(inputs):
 @given(REACHABLE, REACHABLE, REACHABLE, REACHABLE)
 def test_every_reachable_target_is_reached_exactly_and_then_not_limited(left0, right0, left, right):
     governor = governor_at(left0, right0)
-    for _ in range(200):
+    for _ in range(100):
         governed = governor.step(left, right, PERIOD_S)
     assert governed == Governed(left, right, Limited.NONE)
 

@@ -2,9 +2,17 @@
 
 import math
 
+import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
 
 from disco_hw.runtime.pipeline import Governor, Limited, WheelLimits
 
@@ -108,5 +116,6 @@ class GovernorModel(RuleBasedStateMachine):
             assert self.governor.not_finite_count == self.not_finite
 
 
-TestGovernorModel = GovernorModel.TestCase
-TestGovernorModel.settings = settings(max_examples=60, stateful_step_count=25, deadline=None)
+@pytest.mark.parametrize("walks", [25, pytest.param(60, marks=pytest.mark.thorough)])
+def test_the_governor_agrees_with_its_specification(walks):
+    run_state_machine_as_test(GovernorModel, settings=settings(max_examples=walks, stateful_step_count=25))

@@ -7,8 +7,7 @@ import pytest
 
 from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.robot_setup import load_setup
-from tests.runtime.simulated import ROBOT_TEXT, replayed, simulated_stack, start
-from tests.runtime.test_path_drive import write_log
+from tests.runtime.simulated import ROBOT_TEXT, replayed, simulated_stack, start, write_run
 
 # A kernel to compile; tests/control/test_disco.py drives with joint sampling in every `make test`.
 pytestmark = pytest.mark.long
@@ -29,4 +28,4 @@ def test_robot_toml_asks_for_joint_sampling_and_it_drives_and_replays(tmp_path):
         off_m.append(np.hypot(truth.x_m, truth.y_m) - 0.75)
     assert np.abs(off_m[50:]).max() < 0.06
     assert stack.core.progress.laps > 0.4
-    replayed(write_log(tmp_path / "run.mcap", setup, stack.recorder.ticks))
+    replayed(write_run(stack, tmp_path / "run.mcap"))

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
-from disco_hw.control.plan import PLANNER_VERSION
 from disco_hw.daemon.control_socket import loop_figures, status
 from disco_hw.daemon.loop import LoopStats
-from disco_hw.log import Attachment
-from disco_hw.log.process_recorder import ProcessRecorder, RecordingSettings
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.runtime import State
 from disco_hw.runtime.pipeline import Source
@@ -21,21 +19,9 @@ from disco_hw.viewer.commands import snapshot_log
 from disco_hw.viewer.recording import Recording
 from sim.body_dynamics import BodyPose
 from tests.runtime.path_robot import path_robot
-from tests.runtime.simulated import replayed, simulated_stack, start
+from tests.runtime.simulated import replayed, simulated_stack, start, write_run, write_ticks
 
-CORNER = "x_m,y_m\n0,0\n1.2,0\n1.2,0.8\n"
-
-
-def write_log(path, setup, ticks):
-    begin = RecordingSettings(
-        path, "wombot", planner=PLANNER_VERSION, attachments=tuple(kept_files(setup)), queue_ticks=100_000
-    )
-    recorder = ProcessRecorder(begin)
-    for now_ns, got in ticks:
-        recorder.put(now_ns, got)
-    stats = recorder.close(30.0)
-    assert (stats.dropped_ticks, stats.refused) == (0, 0)
-    return path
+CORNER = "x_m,y_m\n0,0\n1,0\n1,0.5\n"
 
 
 def started(robot_file):
@@ -78,20 +64,20 @@ def test_an_open_path_ends_with_the_robot_standing_and_is_replayed_and_shown_wit
     assert stack.core.last.output.state is State.ARMED
     assert stack.core.last.pipeline.source is Source.HOLD
     assert abs(stack.robot.truth.left_speed_rad_s) < 0.05
-    assert np.hypot(*(places[-1] - (1.2, 0.8))) < 0.12
+    assert np.hypot(*(places[-1] - (1.0, 0.5))) < 0.12
     assert np.abs(setup.config.task.course().off_m(places)).max() < 0.12
     shown = status(stack.core, loop_figures(LoopStats()), RecorderStats())["task"]
     assert shown["laps"] == pytest.approx(1.0, abs=0.03)
-    assert shown["length_m"] == pytest.approx(2.0)
+    assert shown["length_m"] == pytest.approx(1.5)
     assert "points" not in shown["asked"]
-    log = write_log(tmp_path / "run.mcap", setup, stack.recorder.ticks)
+    log = write_run(stack, tmp_path / "run.mcap")
     (tmp_path / "path.csv").unlink()
     robot_file.unlink()
     replayed(log)
     with Recording(log) as recording:
         task = recording.stage.task_at(recording.at(3.0).task)
         assert isinstance(task, PathTask)
-        assert task.points == ((0.0, 0.0), (1.2, 0.0), (1.2, 0.8))
+        assert task.points == ((0.0, 0.0), (1.0, 0.0), (1.0, 0.5))
     snapshot_log(log, tmp_path / "end.png")
     assert (tmp_path / "end.png").stat().st_size > 10_000
 
@@ -106,7 +92,7 @@ def test_another_speed_is_recorded_and_replayed(tmp_path):
     stack.run(0.5, UserRequest.ARM)
     stack.run(3.0, UserRequest.START)
     assert stack.robot.truth.speed_m_s == pytest.approx(0.15, abs=0.04)
-    log = write_log(tmp_path / "run.mcap", setup, stack.recorder.ticks)
+    log = write_run(stack, tmp_path / "run.mcap")
     replayed(log)
     with Recording(log) as recording:
         assert recording.stage.task.speed_m_s == 0.3
@@ -116,18 +102,6 @@ def test_another_speed_is_recorded_and_replayed(tmp_path):
 def test_other_way_points_give_other_plans(tmp_path):
     setup, stack = started(path_robot(tmp_path, CORNER))
     stack.run(1.0)
-    files = [
-        Attachment("path.csv", "text/csv", CORNER.replace("1.2,0\n", "1.2,0.3\n").encode())
-        if a.name == "path.csv"
-        else a
-        for a in kept_files(setup)
-    ]
-    recorder = ProcessRecorder(
-        RecordingSettings(
-            tmp_path / "run.mcap", "w", planner=PLANNER_VERSION, attachments=tuple(files), queue_ticks=10_000
-        )
-    )
-    for now_ns, got in stack.recorder.ticks:
-        recorder.put(now_ns, got)
-    recorder.close(30.0)
-    assert not replay(tmp_path / "run.mcap").ok
+    other = CORNER.replace("1,0\n", "1,0.2\n").encode()
+    files = [replace(each, data=other) if each.name == "path.csv" else each for each in kept_files(setup)]
+    assert not replay(write_ticks(tmp_path / "run.mcap", stack.recorder.ticks, files)).ok

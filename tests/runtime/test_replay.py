@@ -14,13 +14,12 @@ from disco_hw.control.past_motion import DriveMeans
 from disco_hw.control.plan import PLANNER_VERSION
 from disco_hw.errors import InputError
 from disco_hw.log import MODEL_TOML, ROBOT_TOML, Attachment
-from disco_hw.log.process_recorder import ProcessRecorder, RecordingSettings
-from disco_hw.log.records import Plan, UnexplainedMotion
+from disco_hw.log.records import Command, Plan, UnexplainedMotion
 from disco_hw.model import EffectSetting, load_model, save_model
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.supervisor import UserRequest
-from tests.runtime.simulated import ROBOT_TEXT, arm, replayed, simulated_stack, start
+from tests.runtime.simulated import ROBOT_TEXT, arm, replayed, simulated_stack, start, write_ticks
 from tests.tables import thinned
 
 ROBOTS = SHIPPED_ROBOT.parent
@@ -44,15 +43,7 @@ def write_log(
         Attachment(ROBOT_TOML, "application/toml", robot.encode()),
         Attachment(MODEL_TOML, "application/toml", model.encode()),
     )
-    recorder = ProcessRecorder(
-        RecordingSettings(path, "wombot", planner=planner, attachments=attachments, queue_ticks=100_000)
-    )
-    for now_ns, records in ticks:
-        recorder.put(now_ns, records)
-    stats = recorder.close(30.0)
-    assert stats.dropped_ticks == 0
-    assert stats.refused == 0
-    return path
+    return write_ticks(path, ticks, attachments, planner)
 
 
 def test_the_same_robot_gives_the_same_bits(tmp_path, ticks):
@@ -160,14 +151,10 @@ def test_another_robot_shows_where_it_first_differs(tmp_path, ticks, file, old, 
 
 
 def test_one_changed_bit_in_the_log_is_found(tmp_path, ticks):
-    import msgspec
-
-    from disco_hw.log.records import Command
-
     def shifted(record):
         if not isinstance(record, Command):
             return record
-        return msgspec.structs.replace(record, left_rad_s=record.left_rad_s + 2.0**-40)
+        return structs.replace(record, left_rad_s=record.left_rad_s + 2.0**-40)
 
     changed = list(ticks)
     changed[150] = (ticks[150][0], tuple(map(shifted, ticks[150][1])))
@@ -194,11 +181,8 @@ def test_plans_that_were_refined_otherwise_are_refused_and_a_log_without_plans_i
 def test_a_log_without_ticks_or_robot_is_refused(tmp_path, ticks):
     with pytest.raises(InputError, match="holds no ticks"):
         replay(write_log(tmp_path / "empty.mcap", []))
-    recorder = ProcessRecorder(RecordingSettings(tmp_path / "bare.mcap", "wombot"))
-    recorder.put(*ticks[0])
-    recorder.close(30.0)
     with pytest.raises(InputError, match=r"carries no robot\.toml"):
-        replay(tmp_path / "bare.mcap")
+        replay(write_ticks(tmp_path / "bare.mcap", ticks[:1]))
     odd = write_log(tmp_path / "odd.mcap", ticks[:1], model="format = 7\n")
     with pytest.raises(InputError, match=rf"^{odd}: model\.toml: format: "):
         replay(odd)

@@ -30,13 +30,12 @@ from disco_hw.runtime.obstacles import (
     reports_in,
 )
 from disco_hw.runtime.pipeline import Limited, Manual, NoPlanner
-from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.safe_area import OVERRIDE_NS, FenceRefused, SafeArea, fence_of_record, report_of_record
 from disco_hw.runtime.supervisor import UserRequest
 from sim.body_dynamics import BodyPose
 from sim.plant_parameters import PlantParameters
-from tests.runtime.simulated import arm, replayed
+from tests.runtime.simulated import arm, replayed, write_run
 
 ROBOTS = SHIPPED_ROBOT.parent
 ROOM = ((-2.0, -1.5), (2.0, -1.5), (2.0, 1.5), (-2.0, 1.5))
@@ -90,9 +89,9 @@ def events_of(ticks) -> list[str]:
 
 
 def test_a_hand_is_stopped_before_the_wall_and_may_leave_it(robot_file, tmp_path):
-    run, hand = by_hand(robot_file, BodyPose(1.0, 0.0, 0.0))
+    run, hand = by_hand(robot_file, BodyPose(1.4, 0.0, 0.0))
     hand.wheels = (5.0, 5.0)
-    ticks = run.run(4.0)
+    ticks = run.run(2.0)
     assert any(tick.pipeline.fence.verdict is FenceVerdict.SCALED for tick in ticks)
     assert Limited.FENCE in ticks[-1].pipeline.command.limited
     assert ticks[-1].command.left_rad_s == 0.0
@@ -152,9 +151,7 @@ def test_without_a_pose_only_an_override_moves_the_robot(robot_file, tmp_path):
     run.pilot.step = lambda now_ns, last: PilotTick(motion=Manual(3.0, 3.0), by_hand=True)
     assert run.core.area.override(run.now_us * 1000, on=False) == "the fence is in force again"
     assert run.run(1.0)[-1].command.left_rad_s == 0.0
-    log = tmp_path / "run.mcap"
-    run.write_log(log)
-    assert replay(log).ok
+    replayed(write_run(run, tmp_path / "run.mcap"))
 
 
 def test_an_override_ends_by_itself():
@@ -312,7 +309,7 @@ def test_the_log_of_a_drive_round_the_edge_makes_its_fence(tmp_path):
     run = SimulatedRun(setup, virtual_robot(setup, PlantParameters(), MIDDLE), NoPlanner(), hand)
     arm(run)
     run.run(0.02, UserRequest.START)
-    hand.wheels = (4.0, 6.5)
+    hand.wheels = (1.0, 6.0)
     log = tmp_path / "edge.mcap"
     turned, before = 0.0, run.robot.truth.yaw_rad
     for _ in run.ticks(60.0):
@@ -320,11 +317,11 @@ def test_the_log_of_a_drive_round_the_edge_makes_its_fence(tmp_path):
         turned, before = turned + math.remainder(yaw - before, 2 * math.pi), yaw
         if turned > 2 * math.pi:
             break
-    run.write_log(log)
+    write_run(run, log)
     text = fence_toml(fence_of_log(log))
     assert text.startswith("[fence]\nkeep_in = [[")
     short = SimulatedRun(setup, virtual_robot(setup, PlantParameters(), MIDDLE), NoPlanner(), Hand())
     short.run(0.1)
-    short.write_log(tmp_path / "short.mcap")
+    write_run(short, tmp_path / "short.mcap")
     with pytest.raises(InputError, match=r"short\.mcap: the log holds no poses; drive once round"):
         fence_of_log(tmp_path / "short.mcap")

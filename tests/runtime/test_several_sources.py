@@ -15,7 +15,7 @@ from disco_hw.log.recorder import RecorderStats
 from disco_hw.runtime.assembly import create_planner, pose_source_of
 from disco_hw.runtime.robot_setup import load_setup
 from drivers.types import PoseSample
-from tests.runtime.simulated import ROBOT_FILE, ROBOT_TEXT, replayed, simulated_stack, start
+from tests.runtime.simulated import ROBOT_FILE, ROBOT_TEXT, replayed, simulated_stack, start, write_run
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ class Bench:
             self._sender.send(json.dumps(datagram).encode())
 
     def start(self):
-        return start(self.stack, 1.5)[-1].output.running
+        return start(self.stack, 1.0)[-1].output.running
 
     def close(self):
         self._sender.close()
@@ -94,8 +94,7 @@ def test_both_are_fused_shown_recorded_and_replayed_bit_for_bit(bench, tmp_path)
     )
     assert "poses: udp: no pose for 1 s; continuing with robot" in bench.output_lines()
     assert {pose.source for pose in bench.poses()} == {0, 1}
-    log = tmp_path / "run.mcap"
-    bench.stack.write_log(log)
+    log = write_run(bench.stack, tmp_path / "run.mcap")
     replayed(log)
     # What compares poses takes one source: from one to the other is no motion.
     assert load_drive(log).poses.x_m.size == sum(pose.source == 0 for pose in bench.poses())
@@ -106,7 +105,8 @@ def test_two_that_contradict_each_other_stop_the_task_and_say_so(bench):
     assert bench.start()
     for tenth in range(40):
         bench.off_m = 0.005 * tenth
-        bench.stack.run(0.1)
+        if not bench.stack.run(0.1)[-1].output.running:
+            break
     assert not bench.stack.core.last.output.running
     why = "udp and robot disagree by more than their stated noise"
     hint = "find the source that is wrong and remove it from [pose] in robot.toml"

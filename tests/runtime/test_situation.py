@@ -4,15 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.runtime import (
-    State,
-    advice,
-    by_command,
-    connection,
-    describe,
-    headline,
-    next_step,
-)
+from disco_hw.runtime import State, advice, by_command, connection, describe, headline, next_step
 from drivers.types import DriverState, LinkState
 from firmware_protocol.status_codes import FAULTS
 

@@ -2,7 +2,6 @@ import math
 from dataclasses import replace
 
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from disco_hw.runtime import TRANSITIONS, State
@@ -10,6 +9,7 @@ from disco_hw.runtime.supervisor import Inputs, Supervisor, UserRequest
 from drivers.types import DriverState, LinkState, Request
 from firmware_protocol import status_codes
 from tests.runtime.supervisor_bench import ARM, DISARM, ESTOP, RESET, SETTINGS, START, STOP, TICK_NS, Bench
+from tests.tables import examples
 
 
 @pytest.fixture
@@ -464,8 +464,7 @@ ANY_INPUTS = st.builds(
 )
 
 
-@settings(max_examples=300)
-@given(st.lists(ANY_INPUTS, min_size=1, max_size=80))
+@examples(quick=80, every=300, history=st.lists(ANY_INPUTS, min_size=1, max_size=80))
 def test_whatever_happens_motion_needs_everything(history):
     supervisor = Supervisor(SETTINGS)
     armed_by_user = started_by_user = False

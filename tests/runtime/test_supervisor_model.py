@@ -5,9 +5,10 @@ supervisor's variables.
 """
 
 import msgspec
+import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
+from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_state_machine_as_test
 
 from disco_hw.runtime import State
 from disco_hw.runtime.supervisor import Inputs, Supervisor, SupervisorSettings, UserRequest
@@ -237,5 +238,6 @@ class SupervisorModel(RuleBasedStateMachine):
             assert output.driver_request is None
 
 
-TestSupervisorModel = SupervisorModel.TestCase
-TestSupervisorModel.settings = settings(max_examples=80, stateful_step_count=30, deadline=None)
+@pytest.mark.parametrize("walks", [25, pytest.param(80, marks=pytest.mark.thorough)])
+def test_the_supervisor_agrees_with_its_specification(walks):
+    run_state_machine_as_test(SupervisorModel, settings=settings(max_examples=walks, stateful_step_count=30))

@@ -153,9 +153,9 @@ def test_of_way_points_by_time_nothing_can_be_changed():
 def test_another_circle_is_driven_recorded_and_replayed_bit_for_bit(tmp_path):
     stack = simulated_stack()
     stack.run(1.5)
-    stack.core.set_task(CircleTask(center_x_m=0.25, radius_m=0.5, speed_m_s=0.15))
+    stack.core.set_task(CircleTask(center_x_m=0.25, radius_m=0.5, speed_m_s=0.25))
     stack.run(0.5, UserRequest.ARM)
-    stack.run(6.0, UserRequest.START)
+    stack.run(3.6, UserRequest.START)
     stack.run(0.5, UserRequest.DISARM)
     reported = [record for _, tick in stack.recorder.ticks for record in tick if isinstance(record, records.Task)]
     assert [task_of(record, CircleTask()) for record in reported] == [stack.core.task]

@@ -14,8 +14,8 @@ from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.tasks.timed_path import TimedPathTask
 from disco_hw.viewer.recording import Recording
 from tests.runtime.path_robot import timed_path_robot
-from tests.runtime.simulated import replayed
-from tests.runtime.test_path_drive import drive, started, write_log
+from tests.runtime.simulated import replayed, write_run
+from tests.runtime.test_path_drive import drive, started
 
 # Half a minute of compiling; tests/control/tasks/test_timed_path.py drives such a path in every `make test`.
 pytestmark = pytest.mark.long
@@ -45,7 +45,7 @@ def test_way_points_are_met_at_their_times_to_the_end_and_replayed_and_shown_wit
     shown = status(stack.core, loop_figures(LoopStats()), RecorderStats())["task"]
     assert shown["laps"] == pytest.approx(1.0)
     assert (shown["asked"]["kind"], shown["limits"]) == ("timed_path", {})
-    log = write_log(tmp_path / "run.mcap", setup, stack.recorder.ticks)
+    log = write_run(stack, tmp_path / "run.mcap")
     (tmp_path / "path.csv").unlink()
     robot_file.unlink()
     replayed(log)

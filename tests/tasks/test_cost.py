@@ -4,11 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from numba import njit
 from numba.core.errors import TypingError
 
 from disco_hw import tasks as task
 from disco_hw.control.kernel import follow, looks_up, row_of, stage_cost, terminal_cost
+from disco_hw.jit import kernel_function
 from disco_hw.tasks.circle import CircleCost, CircleTask
 from disco_hw.tasks.path import PathTask
 
@@ -21,30 +21,30 @@ class Nonsense(NamedTuple):
     value: float
 
 
-@njit
+@kernel_function
 def staged(task):
     zero, one = np.float32(0.0), np.float32(1.0)
     return stage_cost(task, zero, 0, zero, zero, one, zero, one, zero, zero, (zero, zero, zero, zero, zero))
 
 
-@njit
+@kernel_function
 def ended(task):
     zero, one = np.float32(0.0), np.float32(1.0)
     return terminal_cost(task, zero, one, zero, one, zero, (zero, zero, zero, zero, zero))
 
 
-@njit
+@kernel_function
 def looks(task):
     return looks_up(task)
 
 
-@njit
+@kernel_function
 def followed(task):
     zero, one = np.float32(0.0), np.float32(1.0)
     return follow(task, zero, one, zero, zero, (zero, zero, zero, one, zero))
 
 
-@njit
+@kernel_function
 def looked_up(task):
     return row_of(task, np.float32(0.0))
 

@@ -2,6 +2,7 @@ import pytest
 
 from disco_hw.viewer.recording import Recording
 from disco_hw.viewer.timeline import Timeline
+from tools.browser import chromium
 from tools.viewer_run import tick_records, write_log
 
 
@@ -24,3 +25,9 @@ def log_file(tmp_path_factory):
 def recording(log_file):
     with Recording(log_file) as opened:
         yield opened
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as started:
+        yield started

@@ -1,6 +1,4 @@
-"""The exported file by its contents; that a browser plays it is in test_page.py."""
-
-import re
+"""The exported file; what is in it is in test_commands.py, that a browser plays it in test_page.py."""
 
 import pytest
 
@@ -8,21 +6,13 @@ from disco_hw.errors import InputError
 from disco_hw.viewer import picture
 
 
-def test_the_file_is_whole_and_asks_nothing_of_a_network(recording, tmp_path):
-    parts = []
-    picture.export_html(recording, tmp_path / "run.html", parts.append)
-    text = (tmp_path / "run.html").read_text(encoding="utf-8")
-    assert text.lstrip().lower().startswith("<!doctype html")
-    assert not re.findall(r'<(?:script|link|img)[^>]+(?:src|href)="(?:https?:)?//', text)
-    assert parts == sorted(parts)
-    assert parts[-1] == 1.0
-
-
 def test_a_longer_log_gets_pictures_further_apart(recording, tmp_path, monkeypatch):
     monkeypatch.setattr(picture, "_MOST_PICTURES", 5)
     parts = []
     picture.export_html(recording, tmp_path / "run.html", parts.append)
     assert len(parts) == 6
+    assert parts == sorted(parts)
+    assert parts[-1] == 1.0
 
 
 def test_a_place_that_cannot_be_written_is_told(recording, tmp_path):

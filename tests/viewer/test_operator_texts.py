@@ -8,7 +8,7 @@ from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.server import serving
 from tests.viewer.camera import as_golden, off_golden, screenshot
 from tests.viewer.test_operator_controls import STATUS, Daemon
-from tools.browser import chromium, keep, opened, unnamed
+from tools.browser import keep, opened, unnamed
 from tools.viewer_run import ROBOT_FILE
 
 pytestmark = [pytest.mark.long, pytest.mark.browser]
@@ -89,12 +89,6 @@ def reached(tab):
         tab.keyboard.press("Tab")
         found.append(tab.evaluate("() => document.activeElement.id || document.activeElement.textContent"))
     return found
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as started:
-        yield started
 
 
 @pytest.fixture

@@ -17,18 +17,12 @@ from disco_hw.viewer.recording import stage_of_robot
 from disco_hw.viewer.server import serving
 from tests.viewer.camera import as_golden, off_golden, project
 from tests.viewer.test_operator_controls import STATUS, Daemon
-from tools.browser import chromium, keep, opened, unnamed
+from tools.browser import keep, opened, unnamed
 from tools.viewer_run import FAULT_TICK, RADIUS_M, ROBOT_FILE, pose_at, tick_records
 
 pytestmark = [pytest.mark.long, pytest.mark.browser]
 
 HEIGHT_M, FIELD_OF_VIEW, SIZE = 2.5, math.radians(60.0), 480
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as started:
-        yield started
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.viewer import page_in_background
+from disco_hw.viewer import TOKEN_VARIABLE, PageProcess, page_in_background
 from tests.drivers.waiting import free_port, wait_until
 from tools.viewer_run import ROBOT_FILE
 
@@ -27,9 +27,10 @@ def listens(port):
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
-def gone(pid):
+def state_of(pid):
+    """State of a process: Z for a zombie, T for one that is stopped; empty where there is none."""
     stat = Path(f"/proc/{pid}/stat")
-    return not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] == "Z"
+    return stat.read_text().rpartition(")")[2].split()[0] if stat.exists() else ""
 
 
 def test_the_page_lives_as_long_as_the_block_and_prints_on_standard_error_alone(capfd):
@@ -41,6 +42,7 @@ def test_the_page_lives_as_long_as_the_block_and_prints_on_standard_error_alone(
         )
         wait_until(lambda: listens(port), 60.0)
         assert os.getsid(page.pid) == page.pid
+        assert f"?token={page._environment[TOKEN_VARIABLE]}\n" in "".join(it.err for it in captured)
     assert page.returncode == 0
     assert not listens(port)
     captured.append(capfd.readouterr())
@@ -56,7 +58,7 @@ def test_the_page_ends_when_its_parent_is_killed():
     wait_until(lambda: listens(port), 60.0)
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    wait_until(lambda: gone(pid), 60.0)
+    wait_until(lambda: state_of(pid) in {"", "Z"}, 60.0)
 
 
 def test_a_page_that_cannot_start_is_reported_and_not_started_again(tmp_path, capfd):
@@ -79,27 +81,37 @@ def test_what_the_block_raises_is_passed_on(error):
         raise error
 
 
-def test_a_killed_page_is_started_again_under_the_same_token_and_one_that_hangs_is_ended(capfd):
-    port = free_port()
+def slim_page(program):
+    """A stand-in for the page's process that starts at once."""
+    return PageProcess([sys.executable, "-S", "-c", program])
+
+
+def test_a_killed_page_is_started_again_under_the_same_token(capfd):
     output = ["", ""]
 
-    def addresses():
+    def tokens():
         output[:] = [before + new for before, new in zip(output, capfd.readouterr(), strict=True)]
-        pattern = rf"http://127\.0\.0\.1:{port}/\?token=\S+(?=\s)"
-        return [found for text in output for found in re.findall(pattern, text)]
+        return re.findall(r"token=(\S+)\n", output[0])
 
-    with page_in_background(ROBOT_FILE, None, "127.0.0.1", port) as page:
-        wait_until(lambda: len(addresses()) == 1, 60.0)
+    page = slim_page(f"import os, time; print('token=' + os.environ['{TOKEN_VARIABLE}'], flush=True); time.sleep(60)")
+    try:
+        wait_until(lambda: len(tokens()) == 1, 60.0)
         first = page.pid
         os.kill(first, signal.SIGKILL)
-        wait_until(lambda: len(addresses()) == 2, 60.0)
-        assert len(set(addresses())) == 1
+        wait_until(lambda: len(tokens()) == 2, 60.0)
+        assert len(set(tokens())) == 1
         assert not Path(f"/proc/{first}").exists(), "a zombie is left"
         assert page.new_messages() == ("the page was ended by SIGKILL; it is started again",)
         assert page.new_messages() == ()
-        # From here on it would end in order.
-        wait_until(lambda: listens(port), 60.0)
-        os.kill(page.pid, signal.SIGSTOP)
+    finally:
+        page.close()
+    assert page.returncode == -signal.SIGTERM
+    assert "page: the page was ended by SIGKILL; it is started again" in output[1]
+
+
+def test_a_page_that_hangs_is_killed():
+    page = slim_page("import time; time.sleep(60)")
+    os.kill(page.pid, signal.SIGSTOP)
+    wait_until(lambda: state_of(page.pid) == "T")
+    page.close()
     assert page.returncode == -signal.SIGKILL
-    assert "page: the page was ended by SIGKILL; it is started again" in "".join(output)
-    assert not listens(port)

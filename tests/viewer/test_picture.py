@@ -34,7 +34,8 @@ def test_every_layer_is_in_the_picture(recording, tmp_path):
     assert count(pixels, scene.ELLIPSE_COLOUR) > 10
 
 
-def test_an_instant_before_the_log_and_one_after_it_are_its_ends(recording, tmp_path):
+def test_an_instant_before_the_log_and_one_after_it_are_its_ends(recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(picture, "_PICTURE_DPI", 40)
     before, start = (pixels_of(recording, t_s, tmp_path / "a.png") for t_s in (-5.0, 0.0))
     after, end = (pixels_of(recording, t_s, tmp_path / "a.png") for t_s in (1e6, recording.duration_s))
     assert (before == start).all()

@@ -1,8 +1,8 @@
 import pytest
 
 from disco_hw.errors import InputError
-from disco_hw.log.process_recorder import ProcessRecorder, RecordingSettings
 from disco_hw.viewer.recording import Recording
+from tests.runtime.simulated import write_ticks
 from tools.viewer_run import ROBOT_FILE, plan_at, pose_at, tick_records
 
 
@@ -29,22 +29,17 @@ def test_an_instant_is_that_of_the_tick_before(recording, t_s, tick):
 
 
 def test_a_log_without_its_robot_needs_one(tmp_path):
-    recorder = ProcessRecorder(RecordingSettings(tmp_path / "bare.mcap", "x"))
-    recorder.put(*tick_records(0))
-    recorder.close()
+    bare = write_ticks(tmp_path / "bare.mcap", [tick_records(0)])
     with pytest.raises(InputError, match="--robot"):
-        Recording(tmp_path / "bare.mcap")
-    with Recording(tmp_path / "bare.mcap", ROBOT_FILE) as opened:
+        Recording(bare)
+    with Recording(bare, ROBOT_FILE) as opened:
         assert opened.stage.name == "wombot"
         assert opened.duration_s == 0.0
 
 
 def test_a_log_without_estimates_is_told(tmp_path):
-    recorder = ProcessRecorder(RecordingSettings(tmp_path / "empty.mcap", "x"))
-    recorder.put(1, tick_records(0)[1][:2])
-    recorder.close()
     with pytest.raises(InputError, match="no estimates"):
-        Recording(tmp_path / "empty.mcap", ROBOT_FILE)
+        Recording(write_ticks(tmp_path / "empty.mcap", [(1, tick_records(0)[1][:2])]), ROBOT_FILE)
 
 
 def test_what_is_no_log_is_told(tmp_path):

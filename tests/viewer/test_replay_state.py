@@ -16,7 +16,7 @@ from disco_hw.viewer.pages import ReplayPage
 from disco_hw.viewer.panel import escaped, replay_text
 from disco_hw.viewer.recording import Recording
 from disco_hw.viewer.server import serving
-from tests.runtime.simulated import simulated_stack
+from tests.runtime.simulated import simulated_stack, write_run
 
 
 def read_of_the_task():
@@ -44,9 +44,7 @@ def drive(tmp_path_factory):
     let_pass(0.5, UserRequest.STOP)
     let_pass(0.5, UserRequest.ESTOP)
     let_pass(0.5, UserRequest.RESET)
-    path = tmp_path_factory.mktemp("drive") / "run.mcap"
-    stack.write_log(path)
-    with Recording(path) as recording:
+    with Recording(write_run(stack, tmp_path_factory.mktemp("drive") / "run.mcap")) as recording:
         yield recording, live
 
 

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from disco_hw.control.kernel.avoid import (
@@ -19,6 +18,8 @@ from disco_hw.control.kernel.avoid import (
     touch_cost,
     touch_reach,
 )
+from disco_hw.jit import kernel_function
+from tests.tables import examples
 
 HALF_LENGTH_M, HALF_WIDTH_M, AHEAD_M, KEEP_M, STEP_S = 0.25, 0.2, 0.05, 0.03, 0.1
 WALL = (-5.0, 1.0, 1.0, 0.0, 10.0, 0.0, 0.0, 0.0)
@@ -31,8 +32,28 @@ def area_of(*shapes) -> Area:
     return Area(rows.ravel(), np.array([len(rows)]), body, np.zeros(14, np.float32), np.zeros(len(rows)))
 
 
+@kernel_function
+def centred(area, pose, cosine, sine):
+    return centre_of(area, pose, cosine, sine)
+
+
+@kernel_function
+def passed_over(area, time_s, middle, around_m):
+    return is_beyond(area, 0, time_s, middle, around_m)
+
+
+@kernel_function
+def reach(area, forward):
+    return touch_reach(area, forward)
+
+
+@kernel_function
+def touched(area, time_s, place, cosine, sine):
+    return touch_cost(area, 0, time_s, place, cosine, sine)
+
+
 def cost(area: Area, x: float, y: float, yaw: float, forward: float = 0.0, time_s: float = 0.0) -> float:
-    return float(touch_cost(area, 0, time_s, (x, y, forward), math.cos(yaw), math.sin(yaw)))
+    return float(touched(area, time_s, (x, y, forward), math.cos(yaw), math.sin(yaw)))
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.3, math.pi / 2, 2.0, -2.5])
@@ -63,19 +84,24 @@ speed = st.floats(-1.0, 1.0, width=32)
 shape = st.tuples(coordinate, coordinate, angle, st.floats(0.0, 3.0), st.floats(0.0, 0.5), speed, speed)
 
 
-@given(shape, st.lists(st.tuples(coordinate, coordinate, angle, speed), min_size=1, max_size=6), st.floats(0.0, 4.0))
-@settings(max_examples=400, deadline=None)
+@examples(
+    quick=100,
+    every=400,
+    shape=shape,
+    samples=st.lists(st.tuples(coordinate, coordinate, angle, speed), min_size=1, max_size=6),
+    time_s=st.floats(0.0, 4.0),
+)
 def test_a_shape_beyond_the_circle_around_all_samples_costs_none_of_them_anything(shape, samples, time_s):
     x, y, direction, length, radius, vx, vy = shape
     area = area_of((x, y, math.cos(direction), math.sin(direction), length, radius, vx, vy))
-    middle = centre_of(area, samples[0], math.cos(samples[0][2]), math.sin(samples[0][2]))
+    middle = centred(area, samples[0], math.cos(samples[0][2]), math.sin(samples[0][2]))
     around_m = 0.0
     for x, y, yaw, _ in samples:
-        center = centre_of(area, (x, y, 0.0), math.cos(yaw), math.sin(yaw))
+        center = centred(area, (x, y, 0.0), math.cos(yaw), math.sin(yaw))
         around_m = max(around_m, math.dist(center, middle))
-    around_m += touch_reach(area, max(abs(forward) for *_, forward in samples))
+    around_m += reach(area, max(abs(forward) for *_, forward in samples))
     costs = [cost(area, x, y, yaw, forward, time_s) for x, y, yaw, forward in samples]
-    assert not is_beyond(area, 0, time_s, middle, around_m) or max(costs) == 0.0
+    assert not passed_over(area, time_s, middle, around_m) or max(costs) == 0.0
 
 
 @pytest.mark.parametrize(("gap_m", "beyond"), [(-0.002, False), (0.002, True)])
@@ -83,6 +109,6 @@ def test_a_wall_is_passed_over_from_the_reach_of_the_footprint_on(gap_m, beyond)
     area = area_of(WALL)
     reach_m = math.hypot(HALF_LENGTH_M, HALF_WIDTH_M) + KEEP_M + 0.3 * STEP_S
     middle = (0.0, 1.0 - reach_m - gap_m)
-    assert touch_reach(area, -0.3) == pytest.approx(reach_m, abs=1.1e-3)
-    assert is_beyond(area, 0, 0.0, middle, touch_reach(area, -0.3)) is beyond
+    assert reach(area, -0.3) == pytest.approx(reach_m, abs=1.1e-3)
+    assert passed_over(area, 0.0, middle, reach(area, -0.3)) is beyond
     assert COLUMNS == 8

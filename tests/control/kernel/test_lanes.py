@@ -3,15 +3,15 @@
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from numba import njit
 
 from disco_hw.control.kernel import BLOCK, U
 from disco_hw.control.kernel.sequences import row_sum
+from disco_hw.jit import kernel_function
 
 B = int(BLOCK)
 
 
-@njit
+@kernel_function
 def run(rows, first):
     return row_sum(rows, U(first))
 

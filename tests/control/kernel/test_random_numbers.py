@@ -2,25 +2,25 @@
 
 import numpy as np
 import pytest
-from numba import njit
 from scipy import stats
 
 from disco_hw.control.kernel import BLOCK, aligned_zeros
 from disco_hw.control.kernel.sequences import cos_sin_half_turns, fill_normal_block, philox
+from disco_hw.jit import kernel_function
 
 
-@njit
+@kernel_function
 def raw(c0, c1, c2, c3, k0, k1):
     return philox(c0, c1, c2, c3, k0, k1)
 
 
-@njit
+@kernel_function
 def fill(noise, rows, blocks, step, seed, scale):
     for block in range(blocks):
         fill_normal_block(noise, rows, block, step, seed, scale)
 
 
-@njit
+@kernel_function
 def cos_sin(half_turns, cosine, sine):
     for i in range(half_turns.size):
         cosine[i], sine[i] = cos_sin_half_turns(half_turns[i])

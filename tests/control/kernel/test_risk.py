@@ -2,21 +2,21 @@
 
 import numpy as np
 import pytest
-from numba import njit
 
 from disco_hw.control.kernel import BLOCK, aligned_zeros
 from disco_hw.control.kernel.step import mean_over_points, worst_over_points
+from disco_hw.jit import kernel_function
 from tests.control import oracle
 
 B = int(BLOCK)
 
 
-@njit
+@kernel_function
 def run_mean(costs, point_costs, weights, blocks):
     mean_over_points(costs, point_costs, weights, blocks)
 
 
-@njit
+@kernel_function
 def run_worst(costs, point_costs, weights, blocks, part, order):
     worst_over_points(costs, point_costs, weights, blocks, part, order)
 

@@ -3,10 +3,10 @@
 from typing import Any, NamedTuple
 
 import pytest
-from numba import njit
 from numba.core.errors import TypingError
 
 from disco_hw.control.kernel import roll_block
+from disco_hw.jit import kernel_function
 
 
 class Nonsense(NamedTuple):
@@ -15,7 +15,7 @@ class Nonsense(NamedTuple):
     value: Any
 
 
-@njit
+@kernel_function
 def rolled(system):
     roll_block(system, None, 1, 80, 0, 10, None, None)
 

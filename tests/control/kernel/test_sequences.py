@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numba import njit
 
 from disco_hw.control.kernel import BLOCK, U, aligned_zeros
 from disco_hw.control.kernel.sequences import (
@@ -22,6 +21,7 @@ from disco_hw.control.kernel.sequences import (
     sum_lanes,
 )
 from disco_hw.control.optimiser import spline_basis
+from disco_hw.jit import kernel_function
 from tests.control import oracle
 from tests.tables import thinned
 
@@ -32,34 +32,34 @@ WHITE = Basis(np.arange(T), None)
 F32 = np.float32
 
 
-@njit
+@kernel_function
 def run_clip(value, low, high):
     return clip(value, low, high)
 
 
-@njit
+@kernel_function
 def run_expand(commands, state, history, nominal, noise, basis, limits):
     expand(commands, state, history, nominal, noise, U(0), basis, limits)
 
 
-@njit
+@kernel_function
 def run_control_cost(costs, commands, history, nominal, scale):
     add_control_cost(costs, U(0), commands, history, nominal, scale)
 
 
-@njit
+@kernel_function
 def run_drawn_control_cost(costs, noise, pull, nominal, basis, scale):
     pull_on_knots(pull, nominal, basis)
     add_sampled_control_cost(costs, U(0), noise, U(0), pull, scale)
 
 
-@njit
+@kernel_function
 def run_weighted(sums, weights, blocks, values, stride, skip, rows):
     add_weighted(sums, weights, U(0), blocks, values, U(stride), U(skip), rows)
     sum_lanes(sums, rows)
 
 
-@njit
+@kernel_function
 def run_mean_noise(out, sums, basis):
     for t in range(out.shape[0]):
         for c in range(out.shape[1]):

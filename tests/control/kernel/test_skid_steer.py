@@ -23,6 +23,7 @@ from disco_hw.tasks.line import PathTable, Waypoints
 from disco_hw.tasks.line.cost import FARTHEST_STEP_M, PathCost
 from disco_hw.tasks.timed_path import TimedPathCost
 from tests.control import oracle
+from tests.tables import examples
 from tests.tasks.costs import circle_cost, path_along, path_cost, timed_path_cost
 
 SAMPLES, HORIZON, STEP_S = 160, 50, 0.1
@@ -37,13 +38,10 @@ BASE = st.tuples(st.floats(0.02, 0.12), st.floats(0.2, 0.8), st.floats(-0.3, 0.4
 # has another arm of the integration, which the tests with all effects go through.
 SLOW_TURNING = st.tuples(st.floats(0.02, 0.08), st.floats(0.45, 0.8), st.floats(-0.3, 0.4))
 STATES = st.tuples(
-    st.floats(-2.0, 2.0),
-    st.floats(-2.0, 2.0),
-    st.floats(-math.pi, math.pi),
-    st.floats(-6.0, 6.0),
-    st.floats(-6.0, 6.0),
+    st.floats(-2.0, 2.0), st.floats(-2.0, 2.0), st.floats(-math.pi, math.pi), st.floats(-6.0, 6.0), st.floats(-6.0, 6.0)
 )
 COMMANDS = st.lists(st.tuples(st.floats(-6.0, 6.0), st.floats(-6.0, 6.0)), min_size=1, max_size=30)
+SEEDS = st.integers(0, 2**63 - 1)
 FULL = {
     "motor_lag": {"tau_s": st.floats(0.0, 0.5)},
     "command_delay": {"delay_s": st.floats(0.0, 0.45)},
@@ -241,8 +239,7 @@ def test_every_effect_that_moves_the_robot_is_tried():
     assert set(FULL) == set(MOTION_EFFECTS)
 
 
-@settings(max_examples=15)
-@given(SLOW_TURNING, STATES, COMMANDS, st.integers(0, 2**63 - 1))
+@examples(quick=6, every=15, base=SLOW_TURNING, values=STATES, commands=COMMANDS, seed=SEEDS)
 def test_costs_and_update_of_the_bare_model(base, values, commands, seed):
     check_against_reference(model_of(base), state_of(values, commands), CIRCLE, PLAN_SETTINGS, seed)
 
@@ -273,13 +270,14 @@ def slid(cost, point, mean, found):
     return slid_cost
 
 
-@settings(max_examples=15)
-@given(
-    SLOW_TURNING,
-    STATES,
-    COMMANDS,
-    st.tuples(st.floats(-0.3, 0.3), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1)),
-    st.integers(0, 2**63 - 1),
+@examples(
+    quick=6,
+    every=15,
+    base=SLOW_TURNING,
+    values=STATES,
+    commands=COMMANDS,
+    slides=st.tuples(st.floats(-0.3, 0.3), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1)),
+    seed=SEEDS,
 )
 def test_costs_of_a_robot_that_slides_aside_and_drifts(base, values, commands, slides, seed):
     model, state = model_of(base), state_of(values, commands)
@@ -304,7 +302,7 @@ def test_costs_of_a_robot_that_slides_aside_and_drifts(base, values, commands, s
 
 @pytest.mark.thorough
 @settings(max_examples=15)
-@given(SLOW_TURNING, STATES, COMMANDS, st.integers(0, 2**63 - 1))
+@given(SLOW_TURNING, STATES, COMMANDS, SEEDS)
 def test_costs_and_update_with_euler_steps(base, values, commands, seed):
     check_against_reference(
         model_of(base), state_of(values, commands), CIRCLE, replace(PLAN_SETTINGS, euler=True), seed
@@ -313,7 +311,7 @@ def test_costs_and_update_with_euler_steps(base, values, commands, seed):
 
 @pytest.mark.long
 @settings(max_examples=15)
-@given(BASE, EFFECTS, STATES, COMMANDS, st.integers(0, 2**63 - 1))
+@given(BASE, EFFECTS, STATES, COMMANDS, SEEDS)
 def test_costs_and_update_with_euler_steps_and_all_effects(base, effects, values, commands, seed):
     plan_settings = replace(PLAN_SETTINGS, euler=True)
     check_against_reference(model_of(base, effects), state_of(values, commands), CIRCLE, plan_settings, seed)
@@ -321,14 +319,14 @@ def test_costs_and_update_with_euler_steps_and_all_effects(base, effects, values
 
 @pytest.mark.long
 @settings(max_examples=15)
-@given(BASE, STATES, COMMANDS, st.integers(0, 2**63 - 1))
+@given(BASE, STATES, COMMANDS, SEEDS)
 def test_costs_and_update_of_a_bare_model_that_turns_fast(base, values, commands, seed):
     check_against_reference(model_of(base), state_of(values, commands), CIRCLE, PLAN_SETTINGS, seed)
 
 
 @pytest.mark.long
 @settings(max_examples=15)
-@given(BASE, STATES, COMMANDS, st.integers(0, 2**63 - 1))
+@given(BASE, STATES, COMMANDS, SEEDS)
 def test_costs_and_update_where_the_mean_has_a_weight(base, values, commands, seed):
     plan_settings = replace(PLAN_SETTINGS, ut_alpha=0.5)
     check_against_reference(model_of(base), state_of(values, commands), CIRCLE, plan_settings, seed)
@@ -336,7 +334,7 @@ def test_costs_and_update_where_the_mean_has_a_weight(base, values, commands, se
 
 @pytest.mark.long
 @settings(max_examples=15)
-@given(BASE, EFFECTS, STATES, COMMANDS, st.integers(0, 2**63 - 1))
+@given(BASE, EFFECTS, STATES, COMMANDS, SEEDS)
 def test_costs_and_update_with_all_effects(base, effects, values, commands, seed):
     check_against_reference(model_of(base, effects), state_of(values, commands), CIRCLE, PLAN_SETTINGS, seed)
 
@@ -352,7 +350,7 @@ def test_costs_and_update_on_a_way_straight_back():
 @pytest.mark.thorough
 @settings(max_examples=40)
 @example(PathCost(PathTable(STRAIGHT_BACK), 0.5), (0.078125, 0.5, 0.0), (0.0,) * 5, [(0.5, 0.0)], 0)
-@given(paths(), SLOW_TURNING, STATES, COMMANDS, st.integers(0, 2**63 - 1))
+@given(paths(), SLOW_TURNING, STATES, COMMANDS, SEEDS)
 def test_costs_and_update_along_a_path(path, base, values, commands, seed):
     check_against_reference(model_of(base), state_of(values, commands), path, PLAN_SETTINGS, seed)
 
@@ -394,20 +392,20 @@ OF_LONG_WAY = {
     [(0.0, 0.0)],
     0,
 )
-@given(paths(), BASE, EFFECTS, STATES, COMMANDS, st.integers(0, 2**63 - 1))
+@given(paths(), BASE, EFFECTS, STATES, COMMANDS, SEEDS)
 def test_costs_and_update_along_a_path_with_all_effects(path, base, effects, values, commands, seed):
     check_against_reference(model_of(base, effects), state_of(values, commands), path, PLAN_SETTINGS, seed)
 
 
 @pytest.mark.thorough
 @settings(max_examples=20)
-@given(timed_paths(), SLOW_TURNING, STATES, COMMANDS, st.integers(0, 2**63 - 1))
+@given(timed_paths(), SLOW_TURNING, STATES, COMMANDS, SEEDS)
 def test_costs_and_update_along_a_path_by_time(path, base, values, commands, seed):
     check_against_reference(model_of(base), state_of(values, commands), path, PLAN_SETTINGS, seed)
 
 
 @pytest.mark.long
 @settings(max_examples=20)
-@given(paths() | timed_paths(), BASE, STATES, COMMANDS, st.integers(0, 2**63 - 1))
+@given(paths() | timed_paths(), BASE, STATES, COMMANDS, SEEDS)
 def test_costs_and_update_along_any_path_of_a_model_that_turns_fast(path, base, values, commands, seed):
     check_against_reference(model_of(base), state_of(values, commands), path, PLAN_SETTINGS, seed)

@@ -4,22 +4,22 @@ import math
 
 import numpy as np
 import pytest
-from numba import njit
 from numba.core.runtime import _nrt_python, rtsys
 
 from disco_hw.control.kernel.step import disco_step, shift
 from disco_hw.control.pendulum import PAPER_SAMPLER, PendulumPlanner, PendulumPoints
+from disco_hw.jit import kernel_function
 
 STEPS = np.arange(10)[:, None]
 PLAN = np.sin(np.hstack([STEPS, STEPS + 1.0])).astype(np.float32)
 
 
-@njit
+@kernel_function
 def run_shift(nominal, scratch, steps, hold):
     shift(nominal, scratch, steps, hold)
 
 
-@njit
+@kernel_function
 def empty(work, samplings, step, steps, gain, basis, limits, system, weights):
     return True
 

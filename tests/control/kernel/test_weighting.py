@@ -4,32 +4,33 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numba import njit
 
 from disco_hw.control.kernel import BLOCK, aligned_zeros
 from disco_hw.control.kernel.step import INVALID, exp_nonpositive, refuse_invalid, temperature_for, weigh
+from disco_hw.jit import kernel_function
 from tests.control import oracle
+from tests.tables import examples
 
 B = int(BLOCK)
 
 
-@njit
+@kernel_function
 def run_exp(values, out):
     for i in range(values.size):
         out[i] = exp_nonpositive(values[i])
 
 
-@njit
+@kernel_function
 def run_refuse(costs, samples):
     return refuse_invalid(costs, samples)
 
 
-@njit
+@kernel_function
 def run_weigh(weights, scratch, costs, blocks, samples, least, temperature):
     return weigh(weights, scratch, costs, blocks, samples, least, temperature)
 
 
-@njit
+@kernel_function
 def run_temperature(target, weights, scratch, costs, blocks, samples, least, guess):
     return temperature_for(target, weights, scratch, costs, blocks, samples, least, guess)
 
@@ -53,8 +54,7 @@ def test_exponential_is_accurate_and_bottoms_out():
 COSTS = st.lists(st.floats(0.0, 50.0), min_size=30, max_size=300)
 
 
-@settings(max_examples=60, deadline=None)
-@given(COSTS, st.floats(0.05, 20.0))
+@examples(quick=25, every=60, costs=COSTS, temperature=st.floats(0.05, 20.0))
 def test_weights_are_the_softmax(costs, temperature):
     costs = np.array(costs, dtype=np.float32)
     padded, weights, scratch, blocks = buffers(costs)

@@ -74,10 +74,7 @@ def test_lines_are_counted_as_an_editor_does_and_a_spreadsheets_mark_is_no_name(
         ("x_m,y_m\n0,0\n1e30,0\n", "long; between 0.1 and 2000 m"),
         ("x_m,y_m\n0,0\n1,-839\n", "line 3: y_m: -839 is more than 838 m from the origin"),
         ("x_m,y_m\n500000,838\n500010,838\n", "line 2: x_m: 500000 is more than.*in the frame of the poses"),
-        (
-            "x_m,y_m\n" + "".join(f"{0.001 * k},0\n" for k in range(10_001)),
-            "over 10000 way-points; write at most",
-        ),
+        ("x_m,y_m\n" + "".join(f"{0.001 * k},0\n" for k in range(10_001)), "over 10000 way-points; write at most"),
     ],
 )
 def test_what_a_robot_cannot_follow_is_refused(tmp_path, text, fault):
