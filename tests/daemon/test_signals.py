@@ -7,6 +7,7 @@ from contextlib import contextmanager
 import pytest
 
 from disco_hw.daemon.process import StopSignals
+from tests.tables import thinned
 
 STOP_SIGNALS = [signal.SIGTERM, signal.SIGINT, signal.SIGHUP]
 DAEMON = """
@@ -15,6 +16,7 @@ import sys
 from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.loop import Loop
 from disco_hw.daemon.process import StopSignals
+from tests.tables import thinned
 from disco_hw.daemon.process import StopPath
 
 def stop_wheels():
@@ -73,7 +75,7 @@ def test_a_signal_stops_the_loop_and_the_stop_path_runs_in_order(process, number
     assert process.returncode == 0
 
 
-@pytest.mark.parametrize("second", STOP_SIGNALS)
+@thinned("second", STOP_SIGNALS, quick=1)
 def test_a_second_signal_does_not_break_the_stop_path_off(process, second):
     process.send_signal(signal.SIGTERM)
     assert process.stdout.readline() == "stopping\n"
