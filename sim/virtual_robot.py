@@ -416,13 +416,17 @@ class RobotInProcess:
 
     Time begins at 0 and moves on by `advance` alone. `board` may be exchanged for another one between two steps.
     `exchange`: how a vendor's controllers are asked on a half-duplex line; a reply is there before the next request.
+    `step_us`: period of the controller, which for the reference firmware is its configuration's.
     """
 
-    def __init__(self, board: VirtualRobot | VendorRobot, exchange: Exchange | None = None) -> None:
+    def __init__(
+        self, board: VirtualRobot | VendorRobot, exchange: Exchange | None = None, step_us: int = STEP_US
+    ) -> None:
         host, self.link = connect_pair()
         self.host: Transport = host
         self.board = board
         self._exchange = exchange
+        self._step_us = step_us
         host.open()
         self.link.open()
         self._now_us = 0
@@ -435,7 +439,7 @@ class RobotInProcess:
     def advance(self, until_us: int) -> None:
         """Let time pass until then; frames wait at both ends."""
         while self._now_us < until_us:
-            self._now_us += STEP_US
+            self._now_us += self._step_us
             for received in self.link.receive():
                 self._receive(received.frame)
             for frame in self.board.step(self._now_us):

@@ -25,7 +25,6 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
 from disco_hw.bridge import ros2_messages as msg
-from disco_hw.bridge.ros2 import LOOPBACK
 
 
 @dataclass
@@ -37,7 +36,7 @@ class Garbage(IdlStruct, typename="geometry_msgs::msg::dds_::PoseStamped_"):
 
 def main(domain: str, kind: str, east: str, north: str, heading: str) -> None:
     x, y, yaw = float(east), float(north), float(heading)
-    _domain = Domain(int(domain), LOOPBACK)
+    _domain = Domain(int(domain), msg.LOOPBACK)
     participant = DomainParticipant(int(domain))
     best_effort = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(1))
     odometry = DataReader(participant, Topic(participant, "rt/odom", msg.Odometry), best_effort)

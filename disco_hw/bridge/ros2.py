@@ -39,10 +39,6 @@ from drivers.pose.ros2 import SOURCE, bridge_address
 
 CMD_VEL, CTL, REPLY, ESTOP = "cmd_vel", "disco_hw/ctl", "disco_hw/reply", "disco_hw/estop"
 TF_STATIC = "/tf_static"
-LOOPBACK = """<CycloneDDS><Domain><General><AllowMulticast>false</AllowMulticast>
-<Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces></General>
-<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>60</MaxAutoParticipantIndex>
-<Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
 # Diagnostics come once a second; a feed that is silent for longer is no connection.
 _SECOND_NS = 1_000_000_000
 # Chosen: how late an end is noticed, and a diagnosis made.
@@ -355,7 +351,7 @@ def join_domain(config: RobotConfig) -> tuple[Domain | None, DomainParticipant]:
     """
     number = _domain(config)
     try:
-        domain = Domain(number, LOOPBACK) if config.ros2.localhost_only else None
+        domain = Domain(number, msg.LOOPBACK) if config.ros2.localhost_only else None
         return domain, DomainParticipant(number)
     except DDSException as error:
         raise WorkError(f"ROS 2 domain {number} cannot be joined ({error.msg}); see ros2.domain") from None

@@ -10,6 +10,12 @@ from dataclasses import dataclass, field
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import array, float32, float64, int32, int64, sequence, uint8, uint32
 
+LOOPBACK = """<CycloneDDS><Domain><General><AllowMulticast>false</AllowMulticast>
+<Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces></General>
+<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>60</MaxAutoParticipantIndex>
+<Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
+"""Settings of a DDS domain that stays on this computer."""
+
 
 @dataclass
 class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):

@@ -9,6 +9,7 @@ import sys
 import pytest
 
 from disco_hw.config import SHIPPED_ROBOT
+from tests.hil.stack import disco_here
 from tests.tables import thinned
 
 SHIPPED = SHIPPED_ROBOT.parent
@@ -50,7 +51,14 @@ def robot(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("verb", [["ctl", "{robot}", "status"], ["estop", "{robot}"], ["estop", "{robot}", "--json"]])
+@pytest.mark.parametrize(
+    "verb",
+    [
+        ["ctl", "{robot}", "status"],
+        ["estop", "{robot}"],
+        pytest.param(["estop", "{robot}", "--json"], marks=pytest.mark.thorough),
+    ],
+)
 def test_a_question_and_a_stop_load_no_large_library(robot, verb):
     code, loaded, output = loaded_by(*(argument.format(robot=robot) for argument in verb))
     assert code == 1, output
@@ -65,7 +73,7 @@ def test_a_daemon_is_asked_whatever_has_become_of_the_task_in_the_file_but_not_w
     code, loaded, output = loaded_by("ctl", robot, "stop")
     assert (code, "no daemon listens there" in output, "numpy" in loaded) == (1, True, False)
     robot.write_text(text + "rate_hz = 50\n")  # in [daemon]
-    code, _, output = loaded_by("ctl", robot, "stop")
+    code, output = disco_here("ctl", str(robot), "stop")
     assert (code, "rate_hz" in output) == (2, True)
 
 
@@ -79,7 +87,7 @@ def test_a_daemon_is_asked_whatever_has_become_of_the_task_in_the_file_but_not_w
         ["infer", "{none}", "--robot", "{robot}"], ["gap", "{none}", "--robot", "{robot}", "-o", "out"],
         ["log", "info", "{none}"], ["log", "recover", "{none}", "-o", "out"], ["log", "export", "{none}", "-o", "out"],
         ["import", "{none}", "--robot", "{robot}", "-o", "out"],
-    ], quick=4,
+    ], quick=3,
     ids=" ".join,
 )  # fmt: skip
 def test_a_missing_file_is_refused_before_anything_heavy_is_loaded(robot, tmp_path, verb):

@@ -1,11 +1,11 @@
 import time
 
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
 from disco_hw.daemon.loop import MonotonicClock
 from tests.daemon.simulated_clock import SimulatedClock
+from tests.tables import examples
 
 
 @pytest.mark.parametrize("spin_s", [0.0, 0.001])
@@ -36,7 +36,7 @@ def test_absurd_spin_is_refused(spin_s):
         MonotonicClock(spin_s)
 
 
-@given(st.lists(st.tuples(st.booleans(), st.integers(0, 10**12))))
+@examples(quick=20, every=100, moves=st.lists(st.tuples(st.booleans(), st.integers(0, 10**12))))
 def test_simulated_clock_moves_only_when_asked_and_never_back(moves):
     clock = SimulatedClock(7)
     expected_ns = 7

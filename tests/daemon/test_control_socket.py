@@ -3,35 +3,29 @@ import os
 import signal
 import socket
 import stat
-import subprocess
-import sys
 import tempfile
 import time
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.errors import InputError
+from tests.tables import examples
 
 ACTIONS = ("arm", "start", "stop", "disarm", "estop", "reset", "status", "set_task")
-SERVE = """
-import sys, time
-from pathlib import Path
-from disco_hw.daemon.control_socket import ControlServer
-server = ControlServer(Path(sys.argv[1]), ["status"])
-print("serving", flush=True)
-time.sleep(60)
-"""
+
+
+def served(folder):
+    return closing(ControlServer(folder / "private" / "robot.sock", ACTIONS))
 
 
 @pytest.fixture
 def server(tmp_path):
-    server = ControlServer(tmp_path / "private" / "robot.sock", ACTIONS)
-    yield server
-    server.close()
+    with served(tmp_path) as server:
+        yield server
 
 
 def connect(server):
@@ -59,10 +53,33 @@ def hung_up(connection):
     return True
 
 
-def serve_in_another_process(path):
-    process = subprocess.Popen([sys.executable, "-c", SERVE, str(path)], stdout=subprocess.PIPE, text=True)
-    assert process.stdout.readline() == "serving\n"
-    return process
+@contextmanager
+def serving_elsewhere(path, with_child=False):
+    """Serve at `path` in another process, and perhaps a child of its; yields its id, and kills both at the end."""
+    reading, writing = os.pipe()
+    process = os.fork()
+    if process == 0:
+        try:
+            os.setsid()
+            _server = ControlServer(path, ["status"])
+            if not with_child or os.fork() == 0:
+                os.write(writing, b"!")
+            time.sleep(60)
+        finally:
+            os._exit(1)
+    os.close(writing)
+    try:
+        assert os.read(reading, 1) == b"!"
+        yield process
+    finally:
+        os.close(reading)
+        with suppress(ProcessLookupError):
+            os.killpg(process, signal.SIGKILL)
+
+
+def kill(process):
+    os.kill(process, signal.SIGKILL)
+    os.waitpid(process, 0)
 
 
 # --- requests and replies ---------------------------------------------------------------------------------------------
@@ -252,30 +269,32 @@ def test_more_connections_than_places_at_once_do_no_harm(server):
     server.poll()
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    st.lists(
+@examples(
+    quick=40,
+    every=150,
+    pieces=st.lists(
         st.binary(max_size=200)
         | st.just(b"\n")
         | st.sampled_from([b'{"do": "arm"}\n', b'{"do": "estop"}\n', b'{"do":', b'"arm"}\n']),
         max_size=12,
-    )
+    ),
 )
-def test_whatever_bytes_come_nothing_raises_and_only_known_actions_pass(server, pieces):
-    with connect(server) as client:
-        for piece in pieces:
-            try:
-                client.sendall(piece)
-            except (BrokenPipeError, ConnectionResetError):
-                break
-            for message in server.poll():
-                assert message.action in ACTIONS
-                server.reply(message, {"ok": True})
-    server.poll()
-    server.poll()
-    with connect(server) as client:
-        send(client, {"do": "status"})
-        assert [message.action for message in server.poll()] == ["status"]
+def test_whatever_bytes_come_nothing_raises_and_only_known_actions_pass(pieces):
+    with tempfile.TemporaryDirectory() as folder, served(Path(folder)) as server:
+        with connect(server) as client:
+            for piece in pieces:
+                try:
+                    client.sendall(piece)
+                except (BrokenPipeError, ConnectionResetError):
+                    break
+                for message in server.poll():
+                    assert message.action in ACTIONS
+                    server.reply(message, {"ok": True})
+        server.poll()
+        server.poll()
+        with connect(server) as client:
+            send(client, {"do": "status"})
+            assert [message.action for message in server.poll()] == ["status"]
 
 
 # --- whose it is ------------------------------------------------------------------------------------------------------
@@ -334,24 +353,14 @@ def test_a_directory_that_is_a_link_or_a_file_is_refused(tmp_path):
 # --- one daemon, and what a dead one leaves ---------------------------------------------------------------------------
 
 
-def test_a_living_daemon_is_not_displaced(tmp_path):
+def test_a_living_daemon_is_not_displaced_and_what_a_killed_one_left_is_replaced(tmp_path):
     path = tmp_path / "robot.sock"
-    process = serve_in_another_process(path)
-    try:
-        with pytest.raises(InputError, match=rf"already serves this socket \(process {process.pid}\); stop it first"):
+    with serving_elsewhere(path) as process:
+        with pytest.raises(InputError, match=rf"already serves this socket \(process {process}\); stop it first"):
             ControlServer(path, ACTIONS)
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
             client.connect(str(path))
-    finally:
-        process.kill()
-        process.wait()
-
-
-def test_what_a_killed_daemon_left_is_replaced(tmp_path):
-    path = tmp_path / "robot.sock"
-    process = serve_in_another_process(path)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+        kill(process)
     assert path.is_socket()
     server = ControlServer(path, ACTIONS)
     with connect(server) as client:
@@ -362,17 +371,9 @@ def test_what_a_killed_daemon_left_is_replaced(tmp_path):
 
 def test_a_child_of_a_killed_daemon_does_not_keep_the_socket(tmp_path):
     path = tmp_path / "robot.sock"
-    script = SERVE.replace('print("serving"', 'import os; child = os.fork()\nif child: print("serving"')
-    process = subprocess.Popen(
-        [sys.executable, "-c", script, str(path)], stdout=subprocess.PIPE, start_new_session=True
-    )
-    assert process.stdout.readline() == b"serving\n"
-    process.kill()
-    process.wait()
-    try:
+    with serving_elsewhere(path, with_child=True) as process:
+        kill(process)
         ControlServer(path, ACTIONS).close()
-    finally:
-        os.killpg(process.pid, signal.SIGKILL)
 
 
 def test_a_closed_server_leaves_no_socket_and_can_be_closed_twice(tmp_path):

@@ -2,12 +2,13 @@ import math
 import sys
 
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
 from disco_hw.daemon.loop import Histogram
+from tests.tables import examples
 
 DURATIONS_NS = st.integers(0, 2**44 - 1) | st.integers(0, 300) | st.integers(0, 44).map(lambda bits: (1 << bits) - 1)
+DURATIONS = st.lists(DURATIONS_NS, min_size=1, max_size=200)
 
 
 def filled(durations_ns):
@@ -17,14 +18,14 @@ def filled(durations_ns):
     return histogram
 
 
-@given(st.lists(DURATIONS_NS, min_size=1, max_size=200), st.integers(0, 1000))
+@examples(quick=40, every=100, durations_ns=DURATIONS, per_mille=st.integers(0, 1000))
 def test_percentiles_are_those_of_the_data_and_at_most_one_64th_too_high(durations_ns, per_mille):
     rank = max(1, -(-per_mille * len(durations_ns) // 1000))
     exact_ns = sorted(durations_ns)[rank - 1]
     assert exact_ns <= filled(durations_ns).percentile_ns(per_mille / 10) <= exact_ns * (1 + 1 / 64)
 
 
-@given(st.lists(DURATIONS_NS, min_size=1, max_size=200))
+@examples(quick=40, every=100, durations_ns=DURATIONS)
 def test_count_mean_and_maximum_are_exact(durations_ns):
     histogram = filled(durations_ns)
     assert histogram.count == len(durations_ns)

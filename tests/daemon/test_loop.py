@@ -1,9 +1,9 @@
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
 from disco_hw.daemon.loop import Loop, MonotonicClock
 from tests.daemon.simulated_clock import SimulatedClock
+from tests.tables import examples
 
 PERIOD_NS = 20_000_000
 MS_NS = 1_000_000
@@ -74,9 +74,11 @@ def test_an_overrun_is_counted_and_skips_whole_periods_without_a_burst(
     assert (run.stats.overruns, run.stats.skipped_periods) == (1, skipped_periods)
 
 
-@given(
-    st.lists(st.integers(0, 5 * PERIOD_NS) | st.integers(0, PERIOD_NS // 10), min_size=1, max_size=60),
-    st.lists(st.integers(0, 3 * PERIOD_NS) | st.just(0), max_size=60),
+@examples(
+    quick=30,
+    every=100,
+    durations_ns=st.lists(st.integers(0, 5 * PERIOD_NS) | st.integers(0, PERIOD_NS // 10), min_size=1, max_size=60),
+    wake_delays_ns=st.lists(st.integers(0, 3 * PERIOD_NS) | st.just(0), max_size=60),
 )
 def test_whatever_is_late_there_is_no_burst_and_every_period_is_accounted_for(durations_ns, wake_delays_ns):
     run = Run(durations_ns, wake_delays_ns)

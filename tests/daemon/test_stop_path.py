@@ -1,10 +1,10 @@
 import sys
 
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
 from disco_hw.daemon.process import StepOutcome, StopPath
+from tests.tables import examples
 
 ERRORS = [None, RuntimeError("broken"), OSError(5, "unplugged"), SystemExit(3), KeyboardInterrupt(), RecursionError()]
 
@@ -18,7 +18,7 @@ def test_what_was_added_last_runs_first():
     assert done == ["wheels", "link", "log"]
 
 
-@given(st.lists(st.sampled_from(ERRORS), max_size=8))
+@examples(quick=30, every=100, errors=st.lists(st.sampled_from(ERRORS), max_size=8))
 def test_every_step_runs_once_whatever_the_others_raise(errors):
     done = []
     path = StopPath()

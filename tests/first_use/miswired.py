@@ -25,7 +25,7 @@ from sim.effects import hidden_effects
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
 from sim.process import PoseSender
-from sim.virtual_robot import RobotInProcess, VendorRobot, VirtualRobot
+from sim.virtual_robot import STEP_US, RobotInProcess, VendorRobot, VirtualRobot
 from tests.drivers.waiting import free_port
 from tests.runtime.simulated import ROBOT_TEXT
 
@@ -104,7 +104,7 @@ class MiswiredPlant:
 class MiswiredRobot:
     """On an in-process link; its poses come by datagrams."""
 
-    def __init__(self, setup, plant, wrong, effects=None, seed=1):
+    def __init__(self, setup, plant, wrong, effects=None, seed=1, step_us=STEP_US):
         self.sender = PoseSender((setup.config.pose.address, setup.config.pose.port))
         self.plant = MiswiredPlant(
             Plant(plant, hidden_effects(effects or {}), seed, BodyPose(0.3, -0.2, 0.5)), wrong, self.sender.send
@@ -117,13 +117,15 @@ class MiswiredRobot:
                 ticks_per_rev=plant.ticks_per_rev,
                 max_wheel_speed_rad_s=robot.max_wheel_speed_rad_s,
                 max_wheel_acceleration_rad_s2=robot.max_wheel_acceleration_rad_s2,
+                cycle_s=1e-6 * step_us,
             )
             self.board = VirtualRobot(self.plant, firmware)
         else:
             self.board = VendorRobot(self.plant, find_controller(name)(config.link.settings(), plant.ticks_per_rev))
         # VESC speaks on CAN and on a serial line, and asks for answers on the latter only.
         exchange = find_driver(name).exchange if config.link.kind == "serial" else None
-        self._process = RobotInProcess(self.board, None if exchange is None else exchange(config.link.settings()))
+        exchange = None if exchange is None else exchange(config.link.settings())
+        self._process = RobotInProcess(self.board, exchange, step_us)
         self.host = self._process.host
 
     def advance(self, until_us):
@@ -215,7 +217,7 @@ def robot_file(directory, driver=None):
     return path
 
 
-def stage(path, steps, wrong, plant=None, effects=None, seed=1, raw_poses=False, limit_s=300.0):
+def stage(path, steps, wrong, plant=None, effects=None, raw_poses=False, limit_s=300.0, **options):
     """Go through one stage of the guided drive; its result and the run."""
     setup = load_setup(path)
     # As in `commission`, nothing is learnt while wheels are off the ground.
@@ -227,7 +229,7 @@ def stage(path, steps, wrong, plant=None, effects=None, seed=1, raw_poses=False,
     )
     if raw_poses:
         setup = as_sent(setup)
-    robot = MiswiredRobot(setup, plant or PlantParameters(), wrong, effects, seed)
+    robot = MiswiredRobot(setup, plant or PlantParameters(), wrong, effects, **options)
     operator = SimulatedOperator(robot.plant)
     pilot = CommissionPilot(Procedure(steps(setup.config.robot, slowest_rad_s(setup))), operator, operator.keys)
     operator.pilot = pilot

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import os
 import select
-import subprocess
-import sys
 import threading
 import tty
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -17,7 +14,6 @@ import pytest
 from disco_hw.adaptation.guard import choose_adaptation
 from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError
-from disco_hw.experiments import disco_hw_process
 from disco_hw.first_use import InitOptions, recognised, run_init
 from disco_hw.runtime.robot_setup import load_setup
 from drivers.motor import motor_drivers
@@ -25,8 +21,8 @@ from drivers.motor.roboclaw_protocol import FIRST_ADDRESS, GETTERS, LAST_ADDRESS
 from drivers.types import Frame
 from sim.devices.roboclaw import Roboclaw
 from sim.plant_parameters import PlantParameters
-from tests.drivers.waiting import wait_until
 from tests.first_use.miswired import MiswiredRobot, Miswiring, robot_file
+from tests.hil.stack import disco_here, virtual_robot
 from tools.stack import write_robot_file
 
 SIMULATED = {"reference": {}, "odrive": {"nodes": [3, 5]}, "vesc": {"nodes": [23, 51]}, "agilex": {}}
@@ -203,17 +199,14 @@ def test_a_line_on_which_something_speaks_is_not_asked(tmp_path):
 def test_from_the_link_of_a_virtual_robot_to_a_file_that_check_accepts(tmp_path, device, link, shown, is_checked):
     robot = write_robot_file(tmp_path, device=device)
     out = tmp_path / "mine.toml"
-    run = partial(subprocess.run, capture_output=True, text=True, timeout=300, check=False)
-    with disco_hw_process("virtual robot", ["sim", str(robot)], tmp_path / "sim.txt"):
-        wait_until((tmp_path / link.partition("/")[2]).exists, 60.0)
-        command = [sys.executable, "-m", "disco_hw"]
+    with virtual_robot(robot):
         options = ["-o", str(out), "--link", link.format(tmp_path), "--yes", "--ask", "--listen-s", "1"]
-        done = run([*command, "init", *options])
-        assert done.returncode == 0, done.stderr
+        code, output = disco_here("init", *options)
+        assert code == 0, output
         config = load_robot_config(out)
         assert config.link.driver == device
         assert {name: getattr(config.link.settings(), name) for name in shown} == shown
         if is_checked:
-            checked = run([*command, "check", str(out)])
-            assert "FAIL  link" not in checked.stdout
-            assert "FAIL  firmware" not in checked.stdout, checked.stdout
+            _, checked = disco_here("check", str(out))
+            assert "FAIL  link" not in checked
+            assert "FAIL  firmware" not in checked, checked

@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from io import StringIO
+from pathlib import Path
 from typing import Any
 from unittest import mock
 
 from disco_hw.cli import main
+from disco_hw.experiments import READY_TIMEOUT_S, Child, disco_hw_process
+from tests.drivers.waiting import wait_until
 from tools.stack import TruthRow
 
 STATIONARY_RAD_S = 0.05
@@ -39,12 +43,33 @@ def disco_json(*arguments: str, timeout_s: float = 60.0) -> tuple[int, dict[str,
 def disco_here(*arguments: str) -> tuple[int, str]:
     """Run the command `disco-hw` in this process, which has imported it; returns the exit code and all it printed."""
     printed = StringIO()
-    with mock.patch.object(sys, "argv", ["disco-hw", *arguments]), redirect_stdout(printed), redirect_stderr(printed):
+    return _run_here(arguments, printed, printed), printed.getvalue()
+
+
+def disco_json_here(*arguments: str) -> tuple[int, dict[str, Any], str]:
+    """As `disco_here`, with `--json`; returns the exit code, the parsed standard output, and the standard error."""
+    output, errors = StringIO(), StringIO()
+    code = _run_here((*arguments, "--json"), output, errors)
+    assert output.getvalue(), errors.getvalue()
+    return code, json.loads(output.getvalue()), errors.getvalue()
+
+
+@contextmanager
+def virtual_robot(robot_file: Path, *arguments: str) -> Iterator[Child]:
+    """Run `disco-hw sim`, which prints to a file beside the robot's, within the block; yield once it is ready."""
+    output = robot_file.with_name("sim.txt")
+    with disco_hw_process("virtual robot", ["sim", str(robot_file), *arguments], output) as robot:
+        wait_until(lambda: "ready" in robot.output_lines(), READY_TIMEOUT_S)
+        yield robot
+
+
+def _run_here(arguments: tuple[str, ...], output: StringIO, errors: StringIO) -> int:
+    with mock.patch.object(sys, "argv", ["disco-hw", *arguments]), redirect_stdout(output), redirect_stderr(errors):
         try:
             main()
         except SystemExit as end:
-            return int(end.code or 0), printed.getvalue()
-    return 0, printed.getvalue()
+            return int(end.code or 0)
+    return 0
 
 
 def _run(arguments: tuple[str, ...], timeout_s: float) -> subprocess.CompletedProcess[str]:

@@ -6,19 +6,15 @@ import re
 
 import pytest
 
-from disco_hw.experiments import disco_hw_process
-from tests.hil.stack import disco, disco_json
+from tests.hil.stack import disco, disco_json_here, virtual_robot
 from tools.stack import write_robot_file
 
 pytestmark = pytest.mark.hil
 
 
-@pytest.mark.parametrize("link", ["can", pytest.param("serial", marks=pytest.mark.long)])
-def test_check_passes_with_a_robot_and_says_what_it_measured(tmp_path, link):
-    robot_file = write_robot_file(tmp_path, link=link)
-    with disco_hw_process("virtual robot", ["sim", str(robot_file)], tmp_path / "sim.txt"):
-        wait_for_line(tmp_path / "sim.txt", "ready")
-        code, report = disco_json("check", str(robot_file))
+def assert_check_passes(robot_file) -> None:
+    """Check the robot that runs at the file's address, and what is reported of it."""
+    code, report, _ = disco_json_here("check", str(robot_file))
     levels = {check["name"]: check["level"] for check in report["checks"]}
     failed = {name for name, level in levels.items() if level == "fail"}
     # How soon a busy machine answers is not for a test to judge.
@@ -35,20 +31,17 @@ def test_check_passes_with_a_robot_and_says_what_it_measured(tmp_path, link):
     assert 20 <= poses <= 26
 
 
+# tests/hil/test_drive.py checks a robot on CAN before it drives it.
+@pytest.mark.long
+def test_check_passes_with_a_robot_on_a_serial_line(tmp_path):
+    robot_file = write_robot_file(tmp_path, link="serial")
+    with virtual_robot(robot_file):
+        assert_check_passes(robot_file)
+
+
 @pytest.mark.thorough
 def test_check_fails_without_a_robot_and_says_what_to_do(tmp_path):
     code, output = disco("check", str(write_robot_file(tmp_path)))
     assert code == 1
     assert "fail  link" in output
     assert 'adaptation: fast, as control.adaptation = "auto"' in output
-
-
-def wait_for_line(path, text: str, timeout_s: float = 30.0) -> None:
-    import time
-
-    deadline = time.monotonic() + timeout_s
-    while time.monotonic() < deadline:
-        if text in path.read_text():
-            return
-        time.sleep(0.05)
-    raise AssertionError(f"no {text!r} in {path.read_text()!r}")

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import subprocess
-import sys
 import warnings
 from pathlib import Path
 
@@ -14,6 +12,7 @@ import pytest
 from mcap.reader import make_reader
 
 import disco_hw
+from tests.hil.stack import disco_here, disco_json_here
 
 LAYOUT = Path(disco_hw.__file__).parent / "bridge" / "foxglove_layout.json"
 pytestmark = pytest.mark.hil
@@ -28,20 +27,11 @@ pytestmark = pytest.mark.hil
     ],
 )
 def test_demo_follows_the_circle(tmp_path, link, plant_seed, laps):
-    result = subprocess.run(
-        [
-            sys.executable, "-m", "disco_hw", "demo", "--json", "--link", link, "--laps", str(laps),
-            "--plant-seed", str(plant_seed), "--out", str(tmp_path),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=160,
-        check=False,
-    )  # fmt: skip
-    assert result.returncode == 0, result.stderr
-    if "driving anew" in result.stderr:
-        warnings.warn(f"driven twice: {result.stderr}", stacklevel=1)
-    figures = json.loads(result.stdout)
+    options = ["--link", link, "--laps", str(laps), "--plant-seed", str(plant_seed), "--out", str(tmp_path)]
+    code, figures, errors = disco_json_here("demo", *options)
+    assert code == 0, errors
+    if "driving anew" in errors:
+        warnings.warn(f"driven twice: {errors}", stacklevel=1)
     assert figures["success"]
     assert figures["circle"]["laps"] >= laps - 0.02
     assert figures["circle"]["settled_rms_distance_m"] < 0.02
@@ -52,14 +42,8 @@ def test_demo_follows_the_circle(tmp_path, link, plant_seed, laps):
     assert (tmp_path / "circle.png").read_bytes().startswith(b"\x89PNG")
     # The demonstration has no fence to show.
     assert shown_but_not_logged(tmp_path / "demo.mcap") == {"/view/fence"}
-    replayed = subprocess.run(
-        [sys.executable, "-m", "disco_hw", "replay", "--json", str(tmp_path / "demo.mcap")],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert replayed.returncode == 0, replayed.stdout + replayed.stderr
+    code, output = disco_here("replay", "--json", str(tmp_path / "demo.mcap"))
+    assert code == 0, output
 
 
 def shown_but_not_logged(log):

@@ -11,7 +11,7 @@ import time
 
 import pytest
 
-from disco_hw.experiments import disco_hw_process
+from tests.hil.stack import virtual_robot
 from tools.stack import write_robot_file
 
 pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.timeout(400)]
@@ -63,7 +63,7 @@ class Terminal:
 
 def test_the_first_stage_goes_through_at_a_terminal(tmp_path):
     robot_file = write_robot_file(tmp_path)
-    with disco_hw_process("virtual robot", ["sim", str(robot_file)], tmp_path / "sim.txt"):
+    with virtual_robot(robot_file):
         command = [sys.executable, "-m", "disco_hw", "commission", str(robot_file), "--stage", "sides", "--no-write"]
         terminal = Terminal(command, tmp_path)
         try:

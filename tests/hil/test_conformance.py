@@ -7,13 +7,23 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.experiments import DEVICES, READY_TIMEOUT_S, disco_hw_process
-from tests.drivers.waiting import wait_until
+from disco_hw.experiments import DEVICES
+from tests.hil.stack import virtual_robot
 from tools.stack import write_robot_file
 
 pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.timeout(300)]
 ROOT = Path(__file__).resolve().parents[2]
 KEY = "000102030405060708090a0b0c0d0e0f\n"
+
+
+def with_key(robot_file, key):
+    """The robot file, with a key in a file beside it unless `key` is None."""
+    if key is not None:
+        path = robot_file.with_name("key")
+        path.write_text(key)
+        path.chmod(0o600)
+        robot_file.write_text(robot_file.read_text().replace("[link]\n", '[link]\nkey_file = "key"\n'))
+    return robot_file
 
 
 def conform(robot_file, *arguments, at_terminal=""):
@@ -35,13 +45,8 @@ def conform(robot_file, *arguments, at_terminal=""):
     ],
 )
 def test_the_virtual_robot_conforms(tmp_path, link, key, chosen, least):
-    robot_file = write_robot_file(tmp_path, link)
-    if key is not None:
-        (tmp_path / "key").write_text(key)
-        (tmp_path / "key").chmod(0o600)
-        robot_file.write_text(robot_file.read_text().replace("[link]\n", '[link]\nkey_file = "key"\n'))
-    with disco_hw_process("virtual robot", ["sim", str(robot_file)], tmp_path / "sim.txt"):
-        wait_until(lambda: "ready" in (tmp_path / "sim.txt").read_text(), READY_TIMEOUT_S)
+    robot_file = with_key(write_robot_file(tmp_path, link), key)
+    with virtual_robot(robot_file):
         code, found, output = conform(robot_file, "--allow-motion", "-k", chosen)
         assert code == 0, output
         assert found["passed"] >= least, output
@@ -63,8 +68,7 @@ def test_each_vendors_simulated_controller_conforms(tmp_path, device):
     if "serial" in device:
         text = robot_file.read_text().replace('kind = "can"', 'kind = "serial"').replace("921600", "115200")
         robot_file.write_text(text.replace('driver = "vesc"', 'driver = "vesc"\nuart_node = 23'))
-    with disco_hw_process("virtual robot", ["sim", str(robot_file)], tmp_path / "sim.txt"):
-        wait_until(lambda: "ready" in (tmp_path / "sim.txt").read_text(), READY_TIMEOUT_S)
+    with virtual_robot(robot_file):
         code, found, output = conform(robot_file, "--allow-motion", "-k", "vendor or introduces")
         assert (code, found) == (0, {"passed": 12, "skipped": 1}), output
         code, found, output = conform(robot_file, "-k", "before_it_is_armed or stands_and_stays or zeros")
@@ -73,15 +77,10 @@ def test_each_vendors_simulated_controller_conforms(tmp_path, device):
 
 @pytest.mark.parametrize("key", [None, KEY])
 def test_the_virtual_robot_draws_anew_at_each_restart(tmp_path, key):
-    robot_file = write_robot_file(tmp_path)
-    if key is not None:
-        (tmp_path / "key").write_text(key)
-        (tmp_path / "key").chmod(0o600)
-        robot_file.write_text(robot_file.read_text().replace("[link]\n", '[link]\nkey_file = "key"\n'))
+    robot_file = with_key(write_robot_file(tmp_path), key)
     socket = tmp_path / "inject"
     restart = f"{sys.executable} -m sim.process {socket} reboot"
-    with disco_hw_process("virtual robot", ["sim", str(robot_file), "--inject", str(socket)], tmp_path / "sim.txt"):
-        wait_until(lambda: "ready" in (tmp_path / "sim.txt").read_text(), READY_TIMEOUT_S)
+    with virtual_robot(robot_file, "--inject", str(socket)):
         code, found, output = conform(robot_file, "--allow-motion", f"--allow-restart={restart}", "-k", "restart")
         assert (code, found) == (0, {"passed": 2}), output
         code, found, output = conform(robot_file, "-k", "restart")

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import time
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -18,23 +19,33 @@ from tools.stack import running_stack
 pytestmark = pytest.mark.hil
 
 
-# That each signal ends the loop is tested without a robot (tests/daemon/test_signals.py).
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.long)])
-def test_a_signal_stops_the_wheels_before_the_process_ends(tmp_path, number):
-    with running_stack(tmp_path) as stack:
-        stack.drive()
-        os.kill(stack.daemon.process.pid, number)
-        code = stack.daemon.process.wait(60.0)
-        ended_s = time.monotonic()
-        time.sleep(0.3)
-        rows = stack.truth()
+def end_with_signal(stack, number: int) -> None:
+    """End the daemon of a driving robot with a signal: the wheels stand before the process ends, its log is whole."""
+    begun_s = time.monotonic()
+    stack.drive()
+    os.kill(stack.daemon.process.pid, number)
+    code = stack.daemon.process.wait(60.0)
+    ended_s = time.monotonic()
+    time.sleep(0.3)
+    rows = stack.truth()
     assert code == 0
-    before = [row for row in rows if row.t_s < ended_s]
+    before = [row for row in rows if begun_s < row.t_s < ended_s]
     assert max(row.fastest for row in before) > 5.0
     assert before[-1].fastest < STATIONARY_RAD_S
     assert before[-1].state in {"STANDBY", "READY"}
-    with open_log(tmp_path / "run.mcap") as log:
+    with open_log(stack.directory / "run.mcap") as log:
         assert log.summary().complete
+
+
+# That each signal ends the loop is tested without a robot (tests/daemon/test_signals.py); tests/hil/test_estop.py ends
+# a daemon with SIGTERM.
+@pytest.mark.parametrize(
+    "number",
+    [pytest.param(signal.SIGTERM, marks=pytest.mark.thorough), pytest.param(signal.SIGINT, marks=pytest.mark.long)],
+)
+def test_a_signal_stops_the_wheels_before_the_process_ends(tmp_path, number):
+    with running_stack(tmp_path) as stack:
+        end_with_signal(stack, number)
 
 
 # tests/hil/test_recording.py quits while the robot drives, too.
@@ -49,15 +60,18 @@ def test_quit_stops_the_wheels_too(tmp_path):
     assert next(row for row in reversed(rows) if row.t_s < ended_s).fastest < STATIONARY_RAD_S
 
 
+# No valid control for the 100 calls after the 60th, which are two seconds, and an exception 60 plans after that.
 FAILING = """
 import sys
-from disco_hw.control import Disco
+from disco_hw.control import Disco, NoValidControl
 plan, count = Disco.plan, 0
 def failing(self, now_ns, state):
     global count
     count += 1
-    if count > 60:
-        raise {error}("planted")
+    if 60 < count <= 160:
+        raise NoValidControl("planted")
+    if count > 220:
+        raise RuntimeError("planted")
     return plan(self, now_ns, state)
 Disco.plan = failing
 from disco_hw.cli import main
@@ -66,60 +80,41 @@ main()
 """
 
 
-@contextmanager
-def daemon_that_fails(monkeypatch, error: str):
-    """Start the daemon from a script in which planning fails after 60 plans."""
-    import subprocess
-    import sys
-
-    import disco_hw.experiments as operator_module
-
+def test_without_a_valid_control_it_follows_the_tail_then_ramps_down_and_an_exception_stops_the_wheels(
+    tmp_path, monkeypatch
+):
     popen = subprocess.Popen
 
     def start(arguments, **options):
-        if arguments[3] == "run":
-            arguments = [sys.executable, "-c", FAILING.format(error=error), *arguments[4:]]
-        return popen(arguments, **options)
+        failing = [sys.executable, "-c", FAILING, *arguments[4:]]
+        return popen(failing if arguments[3] == "run" else arguments, **options)
 
-    monkeypatch.setattr(operator_module.subprocess, "Popen", start)
-    yield
-    monkeypatch.undo()
-
-
-def test_an_exception_in_the_loop_stops_the_wheels_and_is_reported(tmp_path, monkeypatch):
-    error = "RuntimeError"
-    with daemon_that_fails(monkeypatch, error), running_stack(tmp_path) as stack:
+    monkeypatch.setattr(subprocess, "Popen", start)
+    with running_stack(tmp_path) as stack:
         stack.start()
+        stack.operator.wait_until("ramping", lambda s: s["source"] == "ramp", 5.0)
+        status = stack.operator.wait_for_standstill(3.0)
+        standing_s = time.monotonic()
+        assert status["state"] == "ARMED"
         code = stack.daemon.process.wait(60.0)
         time.sleep(1.2)
         rows = stack.truth()
         output = (tmp_path / "daemon.txt").read_text()
-    assert code == 1
-    assert f"{error}: planted" in output
-    # 60 plans are 1.2 s; how fast it has become by then is not this test's matter.
-    assert max(row.fastest for row in rows) > 2.0
-    last_command = next(row for row in rows if row.accepted == rows[-1].accepted)
-    assert all(row.fastest < STATIONARY_RAD_S for row in rows if row.t_s > last_command.t_s + 0.75)
-
-
-def test_a_planner_without_a_valid_control_follows_the_tail_then_ramps_down(tmp_path, monkeypatch):
-    no_valid_control = "__import__('disco_hw.control').control.NoValidControl"
-    with daemon_that_fails(monkeypatch, no_valid_control), running_stack(tmp_path) as stack:
-        stack.start()
-        stack.operator.wait_until("ramping", lambda s: s["source"] == "ramp", 5.0)
-        status = stack.operator.wait_for_standstill(3.0)
-        assert status["state"] == "ARMED"
-        stack.truth()
     with open_log(tmp_path / "run.mcap") as log:
         commands = log.columns("/command")
     sources = [str(source) for source in commands["source"]]
-    first, last = sources.index("tail"), len(sources) - 1 - sources[::-1].index("tail")
+    first, ramp = sources.index("tail"), sources.index("ramp")
     assert sources[first - 1] == "plan"
-    assert set(sources[first : last + 1]) == {"tail"}
-    assert sources[last + 1] == "ramp"
+    assert set(sources[first:ramp]) == {"tail"}
     # By the ticks' times: a machine that is held up leaves ticks out.
     since_ns = commands["t_ns"].astype(np.int64) - int(commands["t_ns"][first - 1])
-    assert since_ns[last] <= 200_000_000 < since_ns[last + 1]
+    assert since_ns[ramp - 1] <= 200_000_000 < since_ns[ramp]
+    assert code == 1
+    assert "RuntimeError: planted" in output
+    # How fast it has become by the exception is not this test's matter.
+    assert max(row.fastest for row in rows if row.t_s > standing_s) > 2.0
+    last_command = next(row for row in rows if row.accepted == rows[-1].accepted)
+    assert all(row.fastest < STATIONARY_RAD_S for row in rows if row.t_s > last_command.t_s + 0.75)
 
 
 def test_child_helper_reports_last_words(tmp_path):

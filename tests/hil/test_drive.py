@@ -15,12 +15,14 @@ import numpy as np
 import pytest
 
 from disco_hw.drive import INPUT_LIMIT_NS
-from disco_hw.experiments import Operator, disco_hw_process
+from disco_hw.experiments import READY_TIMEOUT_S, Operator, disco_hw_process
 from disco_hw.log.load import load_drive
 from disco_hw.log.reader import open_log
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.replay import replay
+from tests.drivers.waiting import wait_until
 from tests.hil.stack import DECELERATION_RAD_S2, MOTOR_SETTLING_S, STATIONARY_RAD_S
+from tests.hil.test_check import assert_check_passes
 from tools.stack import write_robot_file
 
 pytestmark = pytest.mark.hil
@@ -145,9 +147,11 @@ def test_a_script_is_driven_unattended_and_recorded_as_executed(tmp_path, monkey
     assert any(text.startswith("step 1") and "found: left -" in text for text in reported)
 
 
-def test_a_key_held_drives_and_a_frozen_typist_stops_the_robot(tmp_path):
+def test_check_passes_a_key_held_drives_and_a_frozen_typist_stops_the_robot(tmp_path):
     master, slave = os.openpty()
     with bench(tmp_path) as made:
+        wait_until(lambda: "ready" in made.robot.output_lines(), READY_TIMEOUT_S)
+        assert_check_passes(made.robot_file)
         process = made.drive(stdin=slave, stdout=subprocess.DEVNULL)
         os.close(slave)
         made.ready()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from disco_hw.experiments import READY_TIMEOUT_S
-from tests.hil.stack import disco, disco_json
+from tests.hil.stack import disco, disco_json_here
 from tests.runtime.path_robot import ROBOTS
 from tools.stack import running_stack, write_robot_file
 
@@ -45,7 +45,7 @@ def test_a_path_is_driven_to_its_end_and_the_log_needs_no_other_file(tmp_path):
 def test_check_judges_the_path_and_its_speed(tmp_path):
     (tmp_path / "path.csv").write_text((ROBOTS / "eight.csv").read_text())
     robot_file = write_robot_file(tmp_path, task=TASK)
-    _, report = disco_json("check", str(robot_file))
+    _, report, _ = disco_json_here("check", str(robot_file))
     found = {check["name"]: check for check in report["checks"]}["task"]
     assert found["level"] == "ok"
     assert found["text"].startswith("path path.csv of 9.")

@@ -1,4 +1,7 @@
-"""Whatever takes the commands away at full speed, the robot stops by itself, and nothing starts it again."""
+"""Whatever takes the commands away at full speed, the robot stops by itself, and nothing starts it again.
+
+So does an e-stop, after whose reset the robot can be driven again.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ import pytest
 from disco_hw.log.log_command import info
 from disco_hw.log.reader import open_log
 from tests.hil.stack import assert_stopped_in_time
+from tests.hil.test_estop import assert_latched, latch_and_reset
 from tools.stack import running_stack
 
 pytestmark = pytest.mark.hil
@@ -40,7 +44,7 @@ def mend(stack, fault: str) -> None:
 @pytest.mark.parametrize(
     ("link", "faults"),
     [
-        ("can", ["SIGSTOP", "unplug", "bus_off", "babble_flood", "SIGKILL"]),
+        ("can", ["estop", "SIGSTOP", "unplug", "bus_off", "babble_flood", "SIGKILL"]),
         pytest.param("can", ["babble_commands"], marks=pytest.mark.long),
         pytest.param("serial", ["SIGKILL"], marks=pytest.mark.long),
         pytest.param("serial", ["unplug"], marks=pytest.mark.thorough),
@@ -49,20 +53,26 @@ def mend(stack, fault: str) -> None:
 )
 def test_the_robot_stops_and_stays(tmp_path, link, faults):
     """One fault after the other, each on a drive of its own."""
-    spans_s = []
+    spans_s, replied_s = [], None
     with running_stack(tmp_path, link=link) as stack:
         for fault in faults:
             begin_s = time.monotonic()
             stack.drive()
+            if fault == "estop":
+                replied_s = latch_and_reset(stack, "healthy")
+                reset_s = time.monotonic()
+                continue
             cut_s = time.monotonic()
             strike(stack, fault)
             time.sleep(1.3)
             mend(stack, fault)
-            time.sleep(1.2)
+            time.sleep(0.8)
             if fault != "SIGKILL":
                 assert stack.operator.status()["state"] != "ARMED", fault
             spans_s.append((begin_s, cut_s, time.monotonic()))
         rows = stack.truth()
+    if replied_s is not None:
+        assert_latched([row for row in rows if row.t_s < reset_s], replied_s)
     for begin_s, cut_s, end_s in spans_s:
         assert_stopped_in_time([row for row in rows if begin_s < row.t_s < end_s], cut_s)
     if faults[-1] == "SIGKILL":

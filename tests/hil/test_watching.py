@@ -12,9 +12,8 @@ import time
 
 import pytest
 
-from disco_hw.experiments import disco_hw_process
 from tests.drivers.waiting import wait_until
-from tests.hil.test_check import wait_for_line
+from tests.hil.stack import virtual_robot
 from tools.stack import write_robot_file
 
 pytestmark = pytest.mark.hil
@@ -23,8 +22,7 @@ pytestmark = pytest.mark.hil
 @pytest.mark.thorough
 def test_python_cans_logger_writes_what_the_bus_carries(tmp_path):
     robot_file = write_robot_file(tmp_path)
-    with disco_hw_process("virtual robot", ["sim", str(robot_file)], tmp_path / "sim.txt"):
-        wait_for_line(tmp_path / "sim.txt", "ready")
+    with virtual_robot(robot_file):
         log = tmp_path / "bus.log"
         logger = [sys.executable, "-m", "can.logger", "-i", "unixcan", "-c", str(tmp_path / "bus"), "-f", str(log)]
         with subprocess.Popen(logger, stdout=subprocess.DEVNULL) as process:
@@ -37,8 +35,7 @@ def test_python_cans_logger_writes_what_the_bus_carries(tmp_path):
 @pytest.mark.thorough
 def test_python_cans_viewer_shows_the_frames_in_a_terminal(tmp_path):
     robot_file = write_robot_file(tmp_path)
-    with disco_hw_process("virtual robot", ["sim", str(robot_file)], tmp_path / "sim.txt"):
-        wait_for_line(tmp_path / "sim.txt", "ready")
+    with virtual_robot(robot_file):
         master, slave = pty.openpty()
         viewer = [sys.executable, "-m", "can.viewer", "-i", "unixcan", "-c", str(tmp_path / "bus")]
         environment = {**os.environ, "TERM": "xterm", "LINES": "40", "COLUMNS": "120"}
