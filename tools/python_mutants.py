@@ -256,7 +256,7 @@ def quiet() -> Iterator[None]:
 
 def run_tests(arguments: Sequence[str], plugins: Sequence[Any] = ()) -> int:
     """Run those of some tests that `make test` runs until one fails."""
-    options = ["-x", "-n", "0", "-m", FAST_TESTS, "-p", "no:cacheprovider", "-p", "no:timeout", "-p", "no:playwright"]
+    options = ["-x", "-n", "0", "-m", FAST_TESTS, "-p", "no:cacheprovider", "-o", "timeout=0", "-p", "no:playwright"]
     with quiet():
         return int(pytest.main([*options, *arguments], plugins=list(plugins)))
 
@@ -315,7 +315,9 @@ def imported_by(path: Path) -> set[str]:
 
 def touched_by(name: str) -> set[str]:
     """Names of the project's modules that are there and import this one, if only through others; all tests."""
-    files = {one: module.__file__ for one, module in sys.modules.items() if one.partition(".")[0] in PROJECT}
+    modules = {one: module for one, module in sys.modules.items() if one.partition(".")[0] in PROJECT}
+    # The compiled core's library has no file.
+    files = {one: getattr(module, "__file__", None) for one, module in modules.items()}
     imports = {one: imported_by(Path(file)) for one, file in files.items() if file and file.endswith(".py")}
     touched = {name}
     while True:

@@ -66,7 +66,7 @@ def test_the_robot_stops_and_stays(tmp_path, link, faults):
             strike(stack, fault)
             time.sleep(1.3)
             mend(stack, fault)
-            time.sleep(0.8)
+            time.sleep(1.2)
             if fault != "SIGKILL":
                 assert stack.operator.status()["state"] != "ARMED", fault
             spans_s.append((begin_s, cut_s, time.monotonic()))
