@@ -201,7 +201,7 @@ def test_a_frame_may_be_stamped_after_the_cycle_that_follows(bench):
 
 @pytest.mark.parametrize("skipped", [7, 15])
 def test_repeated_commands_and_leaps_of_the_counter_are_counted(skipped):
-    bench = Bench().to_driving()
+    bench = Bench.driving()
     errors = bench.core._core.sequence_errors
     for _ in range(skipped):
         bench.next_counter("WHEEL_COMMAND")
@@ -210,7 +210,7 @@ def test_repeated_commands_and_leaps_of_the_counter_are_counted(skipped):
 
 
 def test_lost_commands_are_counted():
-    bench = Bench().to_driving()
+    bench = Bench.driving()
     errors = bench.core._core.sequence_errors
     bench.next_counter("WHEEL_COMMAND")
     bench.run(100)

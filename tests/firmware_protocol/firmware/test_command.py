@@ -18,7 +18,7 @@ def rejected(bench, act):
 
 
 def driving():
-    bench = Bench().to_driving()
+    bench = Bench.driving()
     bench.command = None
     return bench
 
@@ -72,7 +72,7 @@ def test_replayed_counter_is_rejected():
 
 
 def test_a_replayed_run_of_old_frames_is_rejected_at_its_first_frame_and_by_its_session_for_ever():
-    bench = Bench().to_armed()
+    bench = Bench.armed()
     recorded = []
     for _ in range(20):
         values = {"mode": "SPEED", "left_speed": 6.0, "right_speed": 6.0, "valid_for": 0.5, "session": 7}
@@ -111,7 +111,7 @@ def test_another_majors_command_is_a_wrong_crc():
 
 
 def test_before_qualification_nothing_is_accepted():
-    bench = Bench().to_ready()
+    bench = Bench.ready()
     for expected in ({"NOT_QUALIFIED": 1},) * 3:
         assert rejected(bench, bench.wheel_command) == expected
     bench.wheel_command()
@@ -175,7 +175,7 @@ def test_arming_takes_five_zero_commands_in_a_row():
 
 @pytest.mark.parametrize("broken", ["crc", "repeated"])
 def test_an_unusable_frame_breaks_the_row_of_zeros(broken):
-    bench = Bench().to_ready()
+    bench = Bench.ready()
     for _ in range(3 + 4):
         bench.wheel_command()
         bench.step()
@@ -199,7 +199,7 @@ def five_zeros_more(bench):
 
 
 def test_zeros_of_an_arming_before_do_not_count():
-    bench = Bench().to_armed()
+    bench = Bench.armed()
     bench.command = None
     bench.set_request("STANDBY").run_until("STANDBY")
     bench.set_request("READY", session=9).run_until("READY", within_ms=60)
@@ -207,7 +207,7 @@ def test_zeros_of_an_arming_before_do_not_count():
 
 
 def test_zeros_count_until_the_command_timeout_is_over():
-    bench = Bench().to_ready()
+    bench = Bench.ready()
     for _ in range(3 + 5):
         bench.wheel_command()
         bench.step()
@@ -219,7 +219,7 @@ def test_zeros_count_until_the_command_timeout_is_over():
 
 
 def test_zero_commands_that_stopped_do_not_arm():
-    bench = Bench().to_ready()
+    bench = Bench.ready()
     bench.command = {}
     bench.run(300)
     bench.command = None
@@ -236,7 +236,7 @@ def stop_time_us(bench):
 
 
 def test_the_watchdog_runs_from_the_instant_of_arming():
-    bench = Bench().to_ready()
+    bench = Bench.ready()
     bench.command = {}
     bench.set_request("ARM")
     while bench.step().state != "ARMED":
@@ -249,7 +249,7 @@ def test_the_watchdog_runs_from_the_instant_of_arming():
 
 def test_no_command_from_before_arming_outlives_it():
     """Neither its mode, nor its time of validity, nor its age."""
-    bench = Bench().to_ready()
+    bench = Bench.ready()
     for _ in range(3 + 5):
         bench.wheel_command(mode="COAST", valid_for=0.002)
         bench.step()
@@ -331,7 +331,7 @@ def test_a_clock_that_steps_back_neither_trips_nor_extends_the_watchdog():
 
 
 def test_timeouts_are_those_of_the_configuration():
-    bench = Bench(dataclasses.replace(CONFIG, command_timeout_s=0.06)).to_driving()
+    bench = Bench.driving(config=dataclasses.replace(CONFIG, command_timeout_s=0.06))
     bench.command = None
     bench.wheel_command(4.0, 2.0)
     assert stop_time_us(bench) == 60 * MS

@@ -26,7 +26,7 @@ def test_another_dbc_is_refused_and_named_and_the_right_one_accepted_afterwards(
 
 
 def test_another_dbc_stops_motion():
-    bench = Bench().to_driving()
+    bench = Bench.driving()
     bench.hello(dbc_hash=1).run(2)
     assert (bench.out.state, bench.out.stop_cause) == ("STOPPING", "FAULT")
 
@@ -88,14 +88,14 @@ def test_host_state_counts_only_once_qualified():
 
 
 def test_unknown_request_changes_nothing():
-    bench = Bench().to_driving()
+    bench = Bench.driving()
     bench.host_state(request=4, session=7)
     assert bench.run(2).state == "ARMED"
     assert bench.core.rejections["MODE"] == 1
 
 
 def test_wrong_crc_and_repeated_host_states_are_not_used():
-    bench = Bench().to_driving()
+    bench = Bench.driving()
     body = CODEC.encode(
         "HOST_STATE", bench.counters["HOST_STATE"] + 1, request="STANDBY", session=7, challenge_answer=0, host_fault=0
     ).data
@@ -106,7 +106,7 @@ def test_wrong_crc_and_repeated_host_states_are_not_used():
 
 
 def test_a_host_that_babbles_is_disqualified_and_motion_stops():
-    bench = Bench().to_driving()
+    bench = Bench.driving()
     for _ in range(5):
         bench.core.receive(bench.now_us, 0x101, sealed(0x101, bytes(7), major=3))
     bench.run(2)
@@ -115,7 +115,7 @@ def test_a_host_that_babbles_is_disqualified_and_motion_stops():
 
 @pytest.mark.parametrize("session", [0, 7])
 def test_session_zero_and_the_last_session_are_refused(session):
-    bench = Bench().to_ready(session=7)
+    bench = Bench.ready(session=7)
     bench.set_request("STANDBY").run_until("STANDBY")
     assert bench.set_request("READY", session=session).run(300).state == "STANDBY"
     assert "SESSION" in bench.blockers()
@@ -123,14 +123,14 @@ def test_session_zero_and_the_last_session_are_refused(session):
 
 
 def test_session_dies_with_ready_and_armed():
-    bench = Bench().to_driving()
+    bench = Bench.driving()
     assert bench.out.session == 7
     bench.command = None
     assert bench.run_until("STOPPING").session == 0
 
 
 def test_it_never_arms_again_by_itself():
-    bench = Bench().to_driving()
+    bench = Bench.driving()
     command, bench.command = bench.command, None
     bench.run_until("STANDBY")
     bench.command = command
@@ -141,7 +141,7 @@ def test_it_never_arms_again_by_itself():
 
 
 def test_a_new_session_in_ready_goes_through_standby_with_a_new_challenge():
-    bench = Bench().to_ready(session=7)
+    bench = Bench.ready(session=7)
     challenge = bench.core.challenge
     bench.set_request("READY", session=8).run(60)
     assert (bench.out.state, bench.out.session) == ("READY", 8)
@@ -229,7 +229,7 @@ def test_a_hash_of_zero_is_passed_over(entry):
 
 
 def test_arming_another_session_than_the_one_that_is_ready_starts_over():
-    bench = Bench().to_ready(session=7)
+    bench = Bench.ready(session=7)
     bench.set_request("ARM", session=8)
     bench.command = {}
     bench.run(400)
@@ -238,7 +238,7 @@ def test_arming_another_session_than_the_one_that_is_ready_starts_over():
 
 
 def arm_with(respond):
-    bench = Bench().to_ready()
+    bench = Bench.ready()
     bench.command = {}
     bench.answers = False
     bench.set_request("ARM", challenge_answer=respond(bench)).run(400)
@@ -267,7 +267,7 @@ def test_wrong_answer_does_not(respond):
 
 
 def test_the_answer_to_an_old_challenge_does_not_arm():
-    bench = Bench().to_ready(session=7)
+    bench = Bench.ready(session=7)
     old = challenge_answer(bench.core.challenge, 9, CODEC.dbc_hash)
     assert bench.set_request("READY", session=9).run(60).session == 9
     bench.command, bench.answers = {}, False
@@ -284,7 +284,7 @@ def test_answer_given_in_standby_is_no_answer():
 
 
 def test_arming_waits_for_wheels_that_stand():
-    bench = Bench().to_ready()
+    bench = Bench.ready()
     bench.wheels_follow = False
     bench.speeds = [0.0, -0.06]
     bench.command = {}
@@ -307,7 +307,7 @@ def test_wheels_stand_below_the_speed_of_stillness_and_not_at_it():
 
 
 def estopped():
-    bench = Bench().to_driving()
+    bench = Bench.driving()
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.command = None
     assert bench.set_request("ARM").run(800).state == "ESTOP"
@@ -379,7 +379,7 @@ def test_a_reset_is_asked_for_until_the_host_is_silent_and_no_longer():
 
 @pytest.mark.parametrize("source", ["estop_button", "estop_line"])
 def test_a_pressed_button_cannot_be_reset_nor_does_its_release_reset(source):
-    bench = Bench().to_driving()
+    bench = Bench.driving()
     bench.inputs[source] = True
     bench.run(700)
     assert (bench.out.state, bench.out.estop_source) == ("ESTOP", source.removeprefix("estop_").upper())
@@ -420,7 +420,7 @@ def test_host_fault_blocks_ready():
 
 
 def test_silent_host_loses_ready():
-    bench = Bench().to_ready()
+    bench = Bench.ready()
     last = bench.now_us
     bench.request = None
     bench.run_until("STANDBY")

@@ -286,7 +286,7 @@ def test_fault_is_left_only_with_every_proof(missing):
 
 
 def test_the_cause_of_a_stop_is_shown_until_the_next_arming():
-    bench = Bench().to_driving()
+    bench = Bench.driving()
     bench.command = None
     bench.run_until("STANDBY")
     bench.to_ready(session=8)
