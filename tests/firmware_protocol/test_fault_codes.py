@@ -120,7 +120,7 @@ def test_the_core_ends_each_fault_as_the_table_says(fault):
     assert bench.run(5).state == ("FAULT" if fault.latches else bench.out.state)
     bench.command = None
     end(bench)
-    bench.set_request("STANDBY").run(3000)
+    bench.set_request("STANDBY").run(1000)
     assert (bench.out.fault != 0, bench.out.state) == (fault.latches, "FAULT" if fault.latches else "STANDBY")
     bench.set_request("RESET").run(500)
     assert (bench.out.fault != 0, bench.out.state) == (fault.permanent, "FAULT" if fault.permanent else "STANDBY")

@@ -3,10 +3,10 @@
 import dataclasses
 
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.firmware_protocol.bench import CONFIG, MS, Bench
+from tests.tables import examples
 
 EPS = 1e-5
 
@@ -303,7 +303,14 @@ commands = st.tuples(
 )
 
 
-@given(st.lists(commands, min_size=1, max_size=15), st.floats(0.1, 20.0), st.floats(0.5, 100.0), st.floats(1.0, 100.0))
+@examples(
+    quick=60,
+    every=100,
+    sequence=st.lists(commands, min_size=1, max_size=15),
+    speed=st.floats(0.1, 20.0),
+    acceleration=st.floats(0.5, 100.0),
+    deceleration=st.floats(1.0, 100.0),
+)
 def test_whatever_is_commanded_the_setpoint_keeps_the_limits(sequence, speed, acceleration, deceleration):
     bench = Bench(
         dataclasses.replace(

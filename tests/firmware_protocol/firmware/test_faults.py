@@ -46,7 +46,7 @@ THRESHOLDS = [
 @pytest.mark.parametrize(("field", "bad", "good", "fault", "debounce_ms"), THRESHOLDS)
 def test_threshold_and_debounce(field, bad, good, fault, debounce_ms, bench):
     bench.inputs[field] = good
-    assert bench.run(1500).fault == 0
+    assert bench.run(1100).fault == 0
     bench.inputs[field] = bad
     assert wait_for_fault(bench) == (fault, max(debounce_ms, 1))
 

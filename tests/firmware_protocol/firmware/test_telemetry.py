@@ -6,13 +6,13 @@ from fractions import Fraction
 from functools import cache
 
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_protocol import _firmware
 from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR
 from firmware_protocol.firmware_core import FirmwareInputs
 from tests.firmware_protocol.bench import CODEC, CONFIG, MS, Bench
+from tests.tables import examples
 
 lib, ffi = _firmware.lib, _firmware.ffi
 PERIODS_MS = {
@@ -349,7 +349,9 @@ def before_power():
     return bench
 
 
-@given(st.floats(width=32) | st.integers(-40_000, 40_000).map(lambda halves: halves / 1000))
+@examples(
+    quick=60, every=100, value=st.floats(width=32) | st.integers(-40_000, 40_000).map(lambda halves: halves / 1000)
+)
 def test_values_are_rounded_exactly_halves_up(value):
     """As the 64-bit formula floor(value / scale + 1/2), without its 64 bits."""
     bench = before_power().copy()
