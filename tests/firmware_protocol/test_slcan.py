@@ -108,8 +108,7 @@ def test_commands_are_answered(text, reply):
 
 
 @pytest.mark.parametrize(
-    ("opens", "receives", "speaks"),
-    [(b"C\r", False, False), (b"L\r", True, False), (b"O\r", True, True)],
+    ("opens", "receives", "speaks"), [(b"C\r", False, False), (b"L\r", True, False), (b"O\r", True, True)]
 )
 def test_a_channel_that_is_closed_passes_nothing_and_one_that_listens_does_not_speak(opens, receives, speaks):
     line = Slcan()

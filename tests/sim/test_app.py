@@ -61,10 +61,7 @@ class Robot:
         }
         given = ", ".join(f"{name}={value!r}" for name, value in options.items())
         self.process = subprocess.Popen(
-            [sys.executable, "-c", RUN.format(options=given)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
+            [sys.executable, "-c", RUN.format(options=given)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
         self.ready = self.process.stdout.readline()
 

@@ -5,12 +5,7 @@ from contextlib import contextmanager
 import pytest
 from hypothesis import strategies as st
 
-from sim.fault_schedule import (
-    KINDS,
-    FaultFileError,
-    kinds_table,
-    parse_schedule,
-)
+from sim.fault_schedule import KINDS, FaultFileError, kinds_table, parse_schedule
 from tests.tables import examples
 from tools.faults.random_faults import random_schedule
 

@@ -490,13 +490,7 @@ def test_a_pose_without_deviation_is_valid():
 
 @pytest.mark.parametrize(
     ("position_std_m", "yaw_std_rad", "valid"),
-    [
-        (0.255, 0.255, True),
-        (0.256, 0.1, False),
-        (0.1, 0.256, False),
-        (math.inf, 0.1, False),
-        (0.1, math.inf, False),
-    ],
+    [(0.255, 0.255, True), (0.256, 0.1, False), (0.1, 0.256, False), (math.inf, 0.1, False), (0.1, math.inf, False)],
 )
 def test_a_deviation_that_does_not_fit_makes_the_pose_not_valid(position_std_m, yaw_std_rad, valid):
     seen = pose(0.0, 0.0, 0.0, 0, position_std_m, yaw_std_rad)
