@@ -149,14 +149,18 @@ def test_a_new_session_in_ready_goes_through_standby_with_a_new_challenge():
     assert bench.core.challenge != challenge
 
 
+def challenges(bench, sessions):
+    """The challenges from now on, as these sessions are opened and closed."""
+    seen = [bench.core.challenge]
+    for session in sessions:
+        for request in ("READY", "STANDBY"):
+            bench.set_request(request, session).run_until(request)
+            seen.append(bench.core.challenge)
+    return seen
+
+
 def test_every_entry_of_standby_and_ready_has_a_new_challenge_never_zero(bench):
-    seen = []
-    bench.hello()
-    for session in range(1, 60):
-        bench.set_request("READY", session=session).run_until("READY")
-        seen.append(bench.core.challenge)
-        bench.set_request("STANDBY", session=session).run_until("STANDBY")
-        seen.append(bench.core.challenge)
+    seen = challenges(bench.hello(), range(1, 60))
     assert all(a != b for a, b in itertools.pairwise(seen))
     assert len(set(seen)) > 110
     assert 0 not in seen
@@ -167,12 +171,8 @@ def test_a_counted_start_gives_none_of_the_challenges_of_the_starts_before(sessi
     """Two for each session of a hundred starts: as few are alike as of numbers drawn at random from 65535."""
     seen = []
     for start in range(1, 101):
-        bench = Bench(entropy=start, last_entropy=start - 1).to_ready()
-        for session in range(8, 8 + sessions):
-            seen.append(bench.core.challenge)
-            bench.set_request("STANDBY").run_until("STANDBY")
-            seen.append(bench.core.challenge)
-            bench.set_request("READY", session).run_until("READY")
+        bench = Bench(entropy=start, last_entropy=start - 1).hello()
+        seen += challenges(bench, range(1, 1 + sessions))[1:]
     assert len(seen) - len(set(seen)) <= most_alike, "of 2000 thirty are expected, of 1000 eight"
 
 
@@ -199,14 +199,8 @@ def test_a_start_with_entropy_of_its_own_is_taken(entropy, last_entropy):
 )
 def test_challenges_are_the_upper_sixteen_bits_of_splitmix64(entropy, outputs):
     """Its published first outputs for the seed 1234567; those for 2^64 - 1 from an implementation in Python."""
-    bench = Bench(entropy=entropy)
-    seen = [bench.core.challenge]
-    for session in (7, 8):
-        bench.hello()
-        bench.set_request("READY", session).run_until("READY")
-        seen.append(bench.core.challenge)
-        bench.set_request("STANDBY").run_until("STANDBY")
-        seen.append(bench.core.challenge)
+    bench = Bench(entropy=entropy).hello()
+    seen = challenges(bench, (7, 8))
     assert seen[:4] == [output >> 48 for output in outputs]
 
 
@@ -316,6 +310,13 @@ def estopped():
     return bench
 
 
+def estopped_and_rolling():
+    bench = estopped()
+    bench.wheels_follow = False
+    bench.speeds = [1.0, 1.0]
+    return bench
+
+
 def test_reset_clears_an_estop_but_starts_nothing():
     bench = estopped()
     bench.set_request("RESET").run_until("STANDBY")
@@ -344,9 +345,7 @@ def test_a_reset_that_was_asked_for_before_a_silence_does_not_clear_what_came_in
 
 
 def test_a_reset_waits_for_stillness_and_is_void_when_the_stop_comes_again():
-    bench = estopped()
-    bench.wheels_follow = False
-    bench.speeds = [1.0, 1.0]
+    bench = estopped_and_rolling()
     assert bench.set_request("RESET").run(300).state == "ESTOP"
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.speeds = [0.0, 0.0]
@@ -355,9 +354,7 @@ def test_a_reset_waits_for_stillness_and_is_void_when_the_stop_comes_again():
 
 @pytest.mark.parametrize("end", ["another request", "silence"])
 def test_a_reset_no_longer_asked_for_is_void(end):
-    bench = estopped()
-    bench.wheels_follow = False
-    bench.speeds = [1.0, 1.0]
+    bench = estopped_and_rolling()
     bench.set_request("RESET").run(100)
     bench.request = None
     if end == "another request":
@@ -369,9 +366,7 @@ def test_a_reset_no_longer_asked_for_is_void(end):
 
 def test_a_reset_is_asked_for_until_the_host_is_silent_and_no_longer():
     for silent_ms, state in ((500, "STANDBY"), (501, "ESTOP")):
-        bench = estopped()
-        bench.wheels_follow = False
-        bench.speeds = [1.0, 1.0]
+        bench = estopped_and_rolling()
         bench.set_request("RESET").run(50 - bench.now_us // MS % 50)
         bench.request = None
         assert bench.run(silent_ms - 1).state == "ESTOP"
