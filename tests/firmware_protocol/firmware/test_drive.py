@@ -95,11 +95,16 @@ def test_brake_waits_for_wheels_that_still_roll():
     assert (bench.out.driver_enabled, bench.out.brake) == (False, True)
 
 
-def test_coast_lets_go_and_the_driver_takes_over_where_the_wheels_are():
+def coasting():
     bench = Bench.driving()
     bench.wheels_follow = False
     bench.command = {"mode": "COAST"}
     bench.run(40)
+    return bench
+
+
+def test_coast_lets_go_and_the_driver_takes_over_where_the_wheels_are():
+    bench = coasting()
     assert (setpoints(bench), bench.out.driver_enabled, bench.out.brake) == ((0.0, 0.0), False, False)
     assert not bench.out.limited
     bench.speeds = [3.0, 1.5]
@@ -110,10 +115,7 @@ def test_coast_lets_go_and_the_driver_takes_over_where_the_wheels_are():
 
 
 def test_taking_over_a_wheel_that_runs_away_starts_within_the_limit():
-    bench = Bench.driving()
-    bench.wheels_follow = False
-    bench.command = {"mode": "COAST"}
-    bench.run(40)
+    bench = coasting()
     bench.speeds = [12.0, 6.0]
     bench.command = {"mode": "HOLD_ZERO"}
     while not bench.step().driver_enabled:
@@ -135,10 +137,7 @@ def fall_silent(bench):
     ids=["estop", "disarmed", "silence"],
 )
 def test_released_wheels_are_braked_by_any_stop_without_a_ramp(act):
-    bench = Bench.driving()
-    bench.wheels_follow = False
-    bench.command = {"mode": "COAST"}
-    bench.run(40)
+    bench = coasting()
     bench.speeds = [4.0, 4.0]
     act(bench)
     while not bench.step().brake:
