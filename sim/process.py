@@ -14,10 +14,13 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from drivers.private_socket import bind_private
-from sim.sensors import PoseMeasurement
+
+if TYPE_CHECKING:
+    # Brings the compiler of the simulation's kernels, for which a command that is sent need not wait.
+    from sim.sensors import PoseMeasurement
 
 
 class StopSignal:

@@ -393,11 +393,7 @@ def refused(tmp_path, old, new, message):
         ("watchdog_s = 0.5", "watchdog_s = 0.0", r"link\.watchdog_s"),
         ("watchdog_s = 0.5", "watchdog_s = 1.5", r"link\.watchdog_s"),
         ("watchdog_s = 0.5", 'watchdog_s = 0.5\nleft_joints = ["l"]', r"link\.right_joints: empty, .*both sides"),
-        (
-            "watchdog_s = 0.5",
-            'watchdog_s = 0.5\nleft_joints = ["l"]\nright_joints = ["l"]',
-            "a joint is listed twice",
-        ),
+        ("watchdog_s = 0.5", 'watchdog_s = 0.5\nleft_joints = ["l"]\nright_joints = ["l"]', "a joint is listed twice"),
         ("watchdog_s = 0.5", "watchdog_s = 0.5\nnodes = [3, 5]", r"link\.nodes: belongs to the driver odrive"),
         ('interface = "unixcan"', 'interface = "socketcan"', r'link\.interface: .*; write "unixcan"'),
         ("ros2_base", "agilex", "watchdog_s"),

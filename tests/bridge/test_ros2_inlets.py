@@ -26,6 +26,7 @@ from disco_hw.runtime.supervisor import UserRequest
 from drivers.pose.ros2 import create_pose_source
 from drivers.pose.udp import pose_of
 from tests.first_use.miswired import robot_file
+from tests.tables import thinned
 
 MONO_NS, WALL_NS = 50_000_000_000, 1_800_000_000_000_000_000
 MS = 1_000_000
@@ -210,7 +211,7 @@ def sent_speeds(kind, draw, struck_ns):
             yield from ((sent + i * MS // 2, sent + i * MS // 2 + MS, 0.2) for i in range(60))
 
 
-@pytest.mark.parametrize("seed", range(10))
+@thinned("seed", range(10), quick=4)
 @pytest.mark.parametrize("kind", ["none", "kill", "frozen", "nan", "flood"])
 def test_at_random_times_a_fault_disarms_within_the_deadmans_time_and_nothing_else_does(kind, seed):
     draw = random.Random(f"{kind}{seed}")

@@ -1,6 +1,8 @@
 """A controller on a bench: the real C core, ideal wheels, and a host that says what it is told to, at 1 kHz."""
 
+import copy
 import math
+from functools import lru_cache
 
 from firmware_protocol import _firmware
 from firmware_protocol.codec import Codec, Decoded
@@ -20,10 +22,16 @@ def sealed(can_id: int, body: bytes, major: int = 1) -> bytes:
 
 
 class Bench:
-    def __init__(self, config: FirmwareConfig = CONFIG, entropy: int = 1, last_entropy: int = 0) -> None:
+    """`start_us`: what the clock shows before the first cycle, as after so long a run without events."""
+
+    def __init__(
+        self, config: FirmwareConfig = CONFIG, entropy: int = 1, last_entropy: int = 0, start_us: int = 0
+    ) -> None:
         self.config = config
+        self.cycle_us = round(config.cycle_s * 1e6)
+        self.ticks_per_rad = config.ticks_per_rev / (2.0 * math.pi)
         self.core = FirmwareCore(config, entropy, last_entropy)
-        self.now_us = 0
+        self.now_us = start_us
         self.counters: dict[str, int] = {}
         self.inputs: dict[str, object] = {}
         self.wheels_follow = True
@@ -34,7 +42,36 @@ class Bench:
         self.command: dict[str, object] | None = None
         self.answers = True
         self.prover = Prover(config.key, CODEC) if config.key else None
-        self.out = self.step()
+        self.out = None
+        self.step()
+
+    def copy(self) -> "Bench":
+        """Return a bench in the same state, its core included, that goes its own way from here."""
+        twin = copy.copy(self)
+        twin.core = FirmwareCore(self.config, entropy=1)
+        _firmware.ffi.memmove(twin.core._core, self.core._core, _firmware.ffi.sizeof("disco_firmware_t"))
+        for name in ("counters", "inputs", "speeds", "ticks", "sent", "request", "command", "prover"):
+            setattr(
+                twin, name, copy.deepcopy(getattr(self, name)) if name == "prover" else copy.copy(getattr(self, name))
+            )
+        return twin
+
+    @classmethod
+    def ready(cls, session: int = 7, config: FirmwareConfig = CONFIG) -> "Bench":
+        """Return a new bench that `to_ready` has brought to READY."""
+        return _brought_there("to_ready", config, session).copy()
+
+    @classmethod
+    def armed(cls, session: int = 7, config: FirmwareConfig = CONFIG) -> "Bench":
+        """Return a new bench that `to_armed` has armed."""
+        return _brought_there("to_armed", config, session).copy()
+
+    @classmethod
+    def driving(
+        cls, left: float = 4.0, right: float = 2.0, config: FirmwareConfig = CONFIG, start_us: int = 0
+    ) -> "Bench":
+        """Return a new bench that `to_driving` has brought to these wheel speeds (rad/s)."""
+        return _brought_there("to_driving", config, left, right, start_us=start_us).copy()
 
     def next_counter(self, name: str) -> int:
         self.counters[name] = (self.counters.get(name, -1) + 1) % 16
@@ -62,7 +99,7 @@ class Bench:
     def step(self, elapsed_us: int | None = None):
         """Run one cycle after sending what the host has due: its state every 50 ms, its command every 20 ms."""
         if elapsed_us is None:
-            elapsed_us = round(self.config.cycle_s * 1e6)
+            elapsed_us = self.cycle_us
         self.now_us += elapsed_us
         if self.request is not None and self.now_us % (50 * MS) == 0:
             request = dict(self.request)
@@ -71,20 +108,21 @@ class Bench:
             self.host_state(**request)
         if self.command is not None and self.now_us % (20 * MS) == 0:
             self.wheel_command(**self.command)
-        if self.wheels_follow and hasattr(self, "out"):
+        if self.wheels_follow and self.out is not None:
             self.speeds = [self.out.left_setpoint_rad_s, self.out.right_setpoint_rad_s]
-        per_us = self.config.ticks_per_rev / (2e6 * math.pi)
-        self.ticks = [
-            ticks + speed * per_us * elapsed_us if math.isfinite(speed) else ticks
-            for ticks, speed in zip(self.ticks, self.speeds, strict=True)
-        ]
+        ticks_per_speed = self.ticks_per_rad * elapsed_us * 1e-6
+        for side, speed in enumerate(self.speeds):
+            if math.isfinite(speed):
+                self.ticks[side] += speed * ticks_per_speed
         measured = {
             "left_ticks": int(self.ticks[0]),
             "right_ticks": int(self.ticks[1]),
             "left_speed_rad_s": self.speeds[0],
             "right_speed_rad_s": self.speeds[1],
         }
-        self.out = self.core.step(self.now_us, FirmwareInputs(**measured | self.inputs))
+        if self.inputs:
+            measured |= self.inputs
+        self.out = self.core.step(self.now_us, FirmwareInputs(**measured))
         for can_id, data in self.core.drain():
             decoded = CODEC.decode(can_id, data)
             assert isinstance(decoded, Decoded), decoded
@@ -133,3 +171,10 @@ class Bench:
 
     def blockers(self) -> set[str]:
         return {name for name, bit in BLOCKERS.items() if self.out.blockers & bit}
+
+
+@lru_cache(maxsize=16)
+def _brought_there(how: str, config: FirmwareConfig, *arguments: float, start_us: int = 0) -> Bench:
+    """Return the one bench of a way there, which costs hundreds of cycles; each test goes on with a copy of it."""
+    bench: Bench = getattr(Bench(config, start_us=start_us), how)(*arguments)
+    return bench

@@ -1,12 +1,12 @@
 """AES-CMAC in Python and in C against the published vectors and each other; the proof of a frame."""
 
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_protocol import _firmware
 from firmware_protocol.codec import Codec
 from firmware_protocol.protection import PROVED, EncodedFrame, Prover, aes_cmac, parse_key, truncated_mac
+from tests.tables import examples
 
 ffi, lib = _firmware.ffi, _firmware.lib
 CODEC = Codec()
@@ -62,7 +62,7 @@ def test_the_key_schedule_is_fips_197s():
     assert schedule[-4:].hex() == "b6630ca6"
 
 
-@given(st.binary(min_size=16, max_size=16), st.binary(max_size=80))
+@examples(quick=60, every=100, key=st.binary(min_size=16, max_size=16), message=st.binary(max_size=80))
 def test_c_and_python_agree_at_every_length(key, message):
     assert c_cmac(key, message) == aes_cmac(key, message)
 
@@ -114,7 +114,7 @@ def test_the_nonce_is_a_mac_of_entropy_and_count():
     assert bytes(c.nonce) == aes_cmac(RFC_KEY, message[:8] + bytes((2,)) + bytes(7))[:6]
 
 
-@given(st.lists(st.binary(min_size=8, max_size=8), min_size=1, max_size=20))
+@examples(quick=60, every=100, payloads=st.lists(st.binary(min_size=8, max_size=8), min_size=1, max_size=20))
 def test_the_robot_believes_each_proof_once_and_in_order(payloads):
     c = c_authentication()
     prover = prover_for(c)

@@ -5,7 +5,6 @@ import struct
 
 import cantools
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_protocol import _firmware
@@ -20,6 +19,7 @@ from firmware_protocol.codec import (
     packaged_dbc,
 )
 from firmware_protocol.protection import crc8
+from tests.tables import examples
 
 ffi, lib = _firmware.ffi, _firmware.lib
 CODEC = Codec()
@@ -136,13 +136,16 @@ def messages_with_values(draw):
     return message, page, values
 
 
-@given(messages_with_values())
+@examples(quick=60, every=100, case=messages_with_values())
 def test_random_values_are_bit_equal_in_python_c_and_cantools(case):
     check_everything(*case)
 
 
-@given(
-    can_id=st.one_of(st.sampled_from([m.can_id for m in MESSAGES]), st.integers(0, 0x7FF)), data=st.binary(max_size=12)
+@examples(
+    quick=60,
+    every=100,
+    can_id=st.one_of(st.sampled_from([m.can_id for m in MESSAGES]), st.integers(0, 0x7FF)),
+    data=st.binary(max_size=12),
 )
 def test_whatever_the_wire_brings_the_answer_is_a_value(can_id, data):
     assert isinstance(CODEC.decode(can_id, data), Decoded | DecodeFault)

@@ -25,7 +25,7 @@ def bad_input(field, value):
     """A cause that lies in one measurement, and its end."""
 
     def begin():
-        bench = Bench().to_driving()
+        bench = Bench.driving()
         bench.inputs[field] = value
         return bench
 
@@ -36,7 +36,7 @@ def dead_wheel(side, current_a):
     """A driven wheel without ticks."""
 
     def begin():
-        bench = Bench().to_driving(4.0, 4.0)
+        bench = Bench.driving(4.0, 4.0)
         bench.inputs.update({f"{side}_current_a": current_a, f"{side}_ticks": int(bench.ticks[side == "right"])})
         return bench
 
@@ -45,7 +45,7 @@ def dead_wheel(side, current_a):
 
 def jump(side):
     def begin():
-        bench = Bench().to_driving()
+        bench = Bench.driving()
         bench.ticks[side] += 5000
         return bench
 
@@ -54,7 +54,7 @@ def jump(side):
 
 def turned_round(side):
     def begin():
-        bench = Bench().to_driving(4.0, 4.0)
+        bench = Bench.driving(4.0, 4.0)
         bench.wheels_follow = False
         bench.speeds[side] = -3.0
         return bench
@@ -82,7 +82,7 @@ def started_by(cause):
 
 
 def leapt_clock():
-    bench = Bench().to_driving()
+    bench = Bench.driving()
     bench.step(50 * MS)
     return bench
 
@@ -120,7 +120,7 @@ def test_the_core_ends_each_fault_as_the_table_says(fault):
     assert bench.run(5).state == ("FAULT" if fault.latches else bench.out.state)
     bench.command = None
     end(bench)
-    bench.set_request("STANDBY").run(3000)
+    bench.set_request("STANDBY").run(1000)
     assert (bench.out.fault != 0, bench.out.state) == (fault.latches, "FAULT" if fault.latches else "STANDBY")
     bench.set_request("RESET").run(500)
     assert (bench.out.fault != 0, bench.out.state) == (fault.permanent, "FAULT" if fault.permanent else "STANDBY")

@@ -7,10 +7,10 @@ import tty
 import can
 import pytest
 from can.interfaces.slcan import slcanBus
-from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.firmware_protocol.c_framing import Slcan
+from tests.tables import examples
 
 FRAMES = [
     (0x100, bytes.fromhex("8D306902B4FB2C01")),
@@ -70,7 +70,7 @@ def test_frames_pass_in_both_directions(host, can_id, data):
     assert (received.arbitration_id, bytes(received.data), received.is_extended_id) == (can_id, data, False)
 
 
-@given(st.integers(0, 0x7FF), st.binary(max_size=8))
+@examples(quick=60, every=100, can_id=st.integers(0, 0x7FF), data=st.binary(max_size=8))
 def test_the_text_is_lawicels(can_id, data):
     line = Slcan()
     line.feed(b"O\r")
@@ -108,8 +108,7 @@ def test_commands_are_answered(text, reply):
 
 
 @pytest.mark.parametrize(
-    ("opens", "receives", "speaks"),
-    [(b"C\r", False, False), (b"L\r", True, False), (b"O\r", True, True)],
+    ("opens", "receives", "speaks"), [(b"C\r", False, False), (b"L\r", True, False), (b"O\r", True, True)]
 )
 def test_a_channel_that_is_closed_passes_nothing_and_one_that_listens_does_not_speak(opens, receives, speaks):
     line = Slcan()
@@ -122,7 +121,7 @@ def test_a_channel_that_is_closed_passes_nothing_and_one_that_listens_does_not_s
         assert line.feed(other) == ([], b"\r" if speaks else b"\a")
 
 
-@given(st.lists(st.binary(max_size=60)))
+@examples(quick=60, every=100, pieces=st.lists(st.binary(max_size=60)))
 def test_garbage_does_no_harm(pieces):
     line = Slcan()
     for piece in pieces:

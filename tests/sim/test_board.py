@@ -99,10 +99,7 @@ def robot_at_rest():
 
 
 def telemetry_frames(left, right, *, flags=1, state=3):
-    return [
-        Frame(SETPOINTS, struct.pack("<ff", left, right)),
-        Frame(STATE, struct.pack("<BBHI", flags, state, 0, 9)),
-    ]
+    return [Frame(SETPOINTS, struct.pack("<ff", left, right)), Frame(STATE, struct.pack("<BBHI", flags, state, 0, 9))]
 
 
 def test_the_wheels_turn_as_the_board_says_until_it_falls_silent():

@@ -16,6 +16,7 @@ from sim.can_protocol import (
     stuffed_bits,
     unpack_frame,
 )
+from tests.tables import examples
 
 
 @st.composite
@@ -27,7 +28,7 @@ def frames(draw):
     return CanFrame(can_id, draw(st.binary(max_size=8)), extended)
 
 
-@given(frames())
+@examples(quick=40, every=100, frame=frames())
 def test_bytes_are_those_of_socketcan(frame):
     message = can.Message(
         arbitration_id=frame.can_id,
@@ -61,7 +62,7 @@ def test_controller_error_frame_carries_the_counters():
     assert frame.data == bytes((0, 0x20, 0, 0, 0, 0, 255, 7))
 
 
-@given(st.binary(max_size=40))
+@examples(quick=40, every=100, packet=st.binary(max_size=40))
 def test_any_bytes_are_a_frame_or_none(packet):
     frame = unpack_frame(packet)
     assert frame is None or (len(packet) == 16 and len(frame.data) <= 8)
@@ -150,14 +151,14 @@ def stuff(bits):
     return out
 
 
-@given(frames())
+@examples(quick=40, every=100, frame=frames())
 def test_length_equals_that_of_a_bit_by_bit_frame(frame):
     wire = stuff(fields(frame))
     assert stuffed_bits(frame) == "".join(map(str, wire))
     assert frame_bits(frame) == len(wire) + 1 + 2 + 7 + 3
 
 
-@given(st.binary(min_size=8, max_size=8), st.integers(0, 0x7FF))
+@examples(quick=40, every=100, data=st.binary(min_size=8, max_size=8), can_id=st.integers(0, 0x7FF))
 def test_standard_frame_of_eight_bytes_takes_111_to_135_bits(data, can_id):
     assert 111 <= frame_bits(CanFrame(can_id, data)) <= 135
 
@@ -197,7 +198,7 @@ def test_arbitration_order(winner, loser):
     assert arbitration_key(winner) < arbitration_key(loser)
 
 
-@given(frames(), frames())
+@examples(quick=40, every=100, one=frames(), other=frames())
 def test_the_frame_with_the_first_dominant_bit_wins(one, other):
     """A node that sends recessive and reads dominant leaves: with different keys that settles it within the field."""
     if arbitration_key(one) == arbitration_key(other):

@@ -3,15 +3,10 @@
 from contextlib import contextmanager
 
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
-from sim.fault_schedule import (
-    KINDS,
-    FaultFileError,
-    kinds_table,
-    parse_schedule,
-)
+from sim.fault_schedule import KINDS, FaultFileError, kinds_table, parse_schedule
+from tests.tables import examples
 from tools.faults.random_faults import random_schedule
 
 
@@ -41,7 +36,7 @@ def test_a_schedule_is_in_order_with_defaults_and_numbers():
     assert str(schedule.faults[0]) == "drop to=host id=-1 probability=0.3"
 
 
-@given(st.integers(0, 2**40), st.floats(10, 300))
+@examples(quick=30, every=100, seed=st.integers(0, 2**40), duration_s=st.floats(10, 300))
 def test_a_seed_draws_the_same_faults_one_after_the_other(seed, duration_s):
     schedule = random_schedule(seed, duration_s)
     assert random_schedule(seed, duration_s) == schedule
@@ -89,7 +84,7 @@ def test_a_wrong_schedule_gets_one_line(text, fragments):
     assert all(fragment in message for fragment in fragments), message
 
 
-@given(st.text(max_size=200) | st.binary(max_size=200).map(lambda b: b.decode("latin-1")))
+@examples(quick=30, every=100, text=st.text(max_size=200) | st.binary(max_size=200).map(lambda b: b.decode("latin-1")))
 def test_any_text_is_a_schedule_or_refused(text):
     with one_line_at_most():
         parse_schedule(text)
@@ -102,7 +97,12 @@ values = st.recursive(
 )
 
 
-@given(st.sampled_from(sorted(KINDS)), st.dictionaries(st.sampled_from(["at_s", "for_s", "to", "id", "wheel"]), values))
+@examples(
+    quick=30,
+    every=100,
+    kind=st.sampled_from(sorted(KINDS)),
+    entry=st.dictionaries(st.sampled_from(["at_s", "for_s", "to", "id", "wheel"]), values),
+)
 def test_any_values_are_taken_or_refused(kind, entry):
     from sim.fault_schedule import _fault
 

@@ -273,7 +273,8 @@ def test_wheel_disturbance_shows_in_ticks_and_in_the_pose():
 
 def test_the_plant_knows_nothing_of_what_thinks():
     for source in Path(sim.__file__).parent.glob("*.py"):
-        for node in ast.walk(ast.parse(source.read_text())):
+        text = source.read_text("utf-8")
+        for node in ast.walk(ast.parse(text)) if "disco_hw" in text else ():
             modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             if isinstance(node, ast.ImportFrom):
                 modules = [node.module or ""]

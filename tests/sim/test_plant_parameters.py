@@ -46,7 +46,7 @@ def test_noiseless_silences_every_random_source_and_touches_no_geometry():
 
 
 def test_draws_have_the_posteriors_mean_and_covariance():
-    samples = [draw_plant_parameters(MEAN, COVARIANCE, seed) for seed in range(3000)]
+    samples = [draw_plant_parameters(MEAN, COVARIANCE, seed) for seed in range(1500)]
     values = np.array([(p.x_icr_m, p.wheel_radius_m, p.axial_distance_m) for p in samples])
     np.testing.assert_allclose(values.mean(axis=0), MEAN, atol=4 * np.sqrt(np.diag(COVARIANCE) / 3000).max())
     np.testing.assert_allclose(np.cov(values.T), COVARIANCE, atol=0.1 * COVARIANCE.max())

@@ -54,6 +54,7 @@ def run_instrumented(tree: Path, flags: str) -> bool:
         "tests/firmware_protocol",
         "tests/drivers",
         "tests/conftest.py",
+        "tests/tables.py",
         "drivers",
         "docs",
         "tools",

@@ -22,7 +22,7 @@ def refused(bench):
 
 
 def driving():
-    bench = Bench(LOCKED).to_driving()
+    bench = Bench.driving(config=LOCKED)
     assert refused(bench) == 0
     return bench
 
@@ -45,7 +45,7 @@ def test_it_says_that_it_wants_proof_and_gives_a_nonce():
 
 
 def test_without_a_key_nothing_of_it_is_seen():
-    bench = Bench().to_driving()
+    bench = Bench.driving()
     assert int(bench.messages("HELLO")[0].values["capabilities"]) == CONFIG.capabilities
     assert not bench.messages("MAC_CHALLENGE")
     for can_id in (0x0F0, 0x0F1, 0x0F2):
@@ -200,7 +200,7 @@ def test_the_nonce_is_new_in_every_session_and_for_every_host():
 
 
 def test_a_host_that_starts_anew_is_heard():
-    bench = Bench(LOCKED).to_ready()
+    bench = Bench.ready(config=LOCKED)
     bench.set_request("STANDBY").run_until("STANDBY")
     bench.run(500)
     bench.prover = Prover(KEY, CODEC)

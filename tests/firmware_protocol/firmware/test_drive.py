@@ -3,10 +3,10 @@
 import dataclasses
 
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.firmware_protocol.bench import CONFIG, MS, Bench
+from tests.tables import examples
 
 EPS = 1e-5
 
@@ -29,13 +29,13 @@ def test_driver_is_off_and_brake_on_wherever_the_robot_is_not_armed(state, bench
 
 
 def test_armed_holds_zero_with_driver_on():
-    bench = Bench().to_armed()
+    bench = Bench.armed()
     assert (bench.out.driver_enabled, bench.out.brake, bench.out.limited) == (True, False, False)
     assert setpoints(bench) == (0.0, 0.0)
 
 
 def test_acceleration_is_limited_and_both_wheels_move_by_one_factor():
-    bench = Bench().to_armed()
+    bench = Bench.armed()
     bench.command = {"left": 4.0, "right": -2.0}
     assert bench.run(25).limited
     left, right = setpoints(bench)
@@ -50,7 +50,7 @@ def test_acceleration_is_limited_and_both_wheels_move_by_one_factor():
 
 
 def test_speed_is_limited_with_curvature_kept_and_said_so():
-    bench = Bench().to_armed()
+    bench = Bench.armed()
     bench.command = {"left": 65.0, "right": -32.5}
     bench.run(600)
     assert setpoints(bench) == pytest.approx((8.0, -4.0))
@@ -58,7 +58,7 @@ def test_speed_is_limited_with_curvature_kept_and_said_so():
 
 
 def test_hold_zero_goes_back_to_zero_within_the_limit():
-    bench = Bench().to_driving()
+    bench = Bench.driving()
     bench.command = {"mode": "HOLD_ZERO"}
     before = setpoints(bench)
     while setpoints(bench) == before:
@@ -69,7 +69,7 @@ def test_hold_zero_goes_back_to_zero_within_the_limit():
 
 
 def test_brake_stops_then_brakes_and_stays_so_when_pushed():
-    bench = Bench(dataclasses.replace(CONFIG, stop_deceleration_rad_s2=40.0)).to_driving()
+    bench = Bench.driving(config=dataclasses.replace(CONFIG, stop_deceleration_rad_s2=40.0))
     bench.command = {"mode": "BRAKE"}
     before = setpoints(bench)
     while setpoints(bench) == before:
@@ -85,7 +85,7 @@ def test_brake_stops_then_brakes_and_stays_so_when_pushed():
 
 
 def test_brake_waits_for_wheels_that_still_roll():
-    bench = Bench().to_driving(0.2, 0.2)
+    bench = Bench.driving(0.2, 0.2)
     bench.wheels_follow = False
     bench.command = {"mode": "BRAKE"}
     bench.run(100)
@@ -95,11 +95,16 @@ def test_brake_waits_for_wheels_that_still_roll():
     assert (bench.out.driver_enabled, bench.out.brake) == (False, True)
 
 
-def test_coast_lets_go_and_the_driver_takes_over_where_the_wheels_are():
-    bench = Bench().to_driving()
+def coasting():
+    bench = Bench.driving()
     bench.wheels_follow = False
     bench.command = {"mode": "COAST"}
     bench.run(40)
+    return bench
+
+
+def test_coast_lets_go_and_the_driver_takes_over_where_the_wheels_are():
+    bench = coasting()
     assert (setpoints(bench), bench.out.driver_enabled, bench.out.brake) == ((0.0, 0.0), False, False)
     assert not bench.out.limited
     bench.speeds = [3.0, 1.5]
@@ -110,10 +115,7 @@ def test_coast_lets_go_and_the_driver_takes_over_where_the_wheels_are():
 
 
 def test_taking_over_a_wheel_that_runs_away_starts_within_the_limit():
-    bench = Bench().to_driving()
-    bench.wheels_follow = False
-    bench.command = {"mode": "COAST"}
-    bench.run(40)
+    bench = coasting()
     bench.speeds = [12.0, 6.0]
     bench.command = {"mode": "HOLD_ZERO"}
     while not bench.step().driver_enabled:
@@ -135,10 +137,7 @@ def fall_silent(bench):
     ids=["estop", "disarmed", "silence"],
 )
 def test_released_wheels_are_braked_by_any_stop_without_a_ramp(act):
-    bench = Bench().to_driving()
-    bench.wheels_follow = False
-    bench.command = {"mode": "COAST"}
-    bench.run(40)
+    bench = coasting()
     bench.speeds = [4.0, 4.0]
     act(bench)
     while not bench.step().brake:
@@ -168,7 +167,7 @@ STOPS = {
 
 @pytest.mark.parametrize("how", STOPS)
 def test_estop_decelerates_from_the_very_next_cycle_then_brakes(how):
-    bench = Bench().to_driving()
+    bench = Bench.driving()
     start = bench.now_us
     trace = stop(bench, STOPS[how])
     assert trace[0] == pytest.approx((3.98, 1.99))
@@ -179,7 +178,7 @@ def test_estop_decelerates_from_the_very_next_cycle_then_brakes(how):
 
 
 def test_stopping_keeps_curvature_and_ends_in_standby():
-    bench = Bench(dataclasses.replace(CONFIG, stop_deceleration_rad_s2=10.0)).to_driving(4.0, -1.0)
+    bench = Bench.driving(4.0, -1.0, config=dataclasses.replace(CONFIG, stop_deceleration_rad_s2=10.0))
     bench.set_request("STANDBY").run_until("STOPPING")
     start = bench.now_us
     assert bench.out.limited
@@ -191,7 +190,7 @@ def test_stopping_keeps_curvature_and_ends_in_standby():
 
 
 def test_silence_drives_no_longer_than_the_drive_off_timeout():
-    bench = Bench(dataclasses.replace(CONFIG, stop_deceleration_rad_s2=2.0)).to_driving()
+    bench = Bench.driving(config=dataclasses.replace(CONFIG, stop_deceleration_rad_s2=2.0))
     bench.command = None
     bench.wheel_command(4.0, 2.0)
     start = bench.now_us
@@ -202,7 +201,7 @@ def test_silence_drives_no_longer_than_the_drive_off_timeout():
 
 
 def test_after_a_stop_that_was_cut_off_the_next_motion_begins_at_zero():
-    bench = Bench(dataclasses.replace(CONFIG, stop_deceleration_rad_s2=2.0)).to_driving()
+    bench = Bench.driving(config=dataclasses.replace(CONFIG, stop_deceleration_rad_s2=2.0))
     bench.command = None
     while bench.step().driver_enabled:
         pass
@@ -213,7 +212,7 @@ def test_after_a_stop_that_was_cut_off_the_next_motion_begins_at_zero():
 
 
 def test_a_stop_that_does_not_end_is_ended():
-    bench = Bench(dataclasses.replace(CONFIG, drive_off_timeout_s=2.0, stop_timeout_s=0.3)).to_driving()
+    bench = Bench.driving(config=dataclasses.replace(CONFIG, drive_off_timeout_s=2.0, stop_timeout_s=0.3))
     bench.wheels_follow = False
     bench.set_request("STANDBY").run_until("STOPPING")
     start = bench.now_us
@@ -223,13 +222,13 @@ def test_a_stop_that_does_not_end_is_ended():
 
 
 def test_an_estop_that_does_not_end_lets_the_driver_go():
-    bench = Bench(dataclasses.replace(CONFIG, drive_off_timeout_s=2.0, stop_timeout_s=0.3)).to_driving()
+    bench = Bench.driving(config=dataclasses.replace(CONFIG, drive_off_timeout_s=2.0, stop_timeout_s=0.3))
     bench.wheels_follow = False
     assert len(stop(bench, STOPS["estop"])) == 299
 
 
 def test_latched_fault_lets_the_driver_go_at_once_even_in_a_stop():
-    bench = Bench().to_driving()
+    bench = Bench.driving()
     bench.core.receive(bench.now_us, 0x080, b"")
     assert bench.step().driver_enabled
     bench.inputs["left_ticks"] = 1 << 20
@@ -238,7 +237,7 @@ def test_latched_fault_lets_the_driver_go_at_once_even_in_a_stop():
 
 
 def test_a_braked_robot_stays_braked_when_it_is_stopped():
-    bench = Bench().to_driving()
+    bench = Bench.driving()
     bench.command = {"mode": "BRAKE"}
     bench.run(400)
     bench.wheels_follow = False
@@ -248,7 +247,7 @@ def test_a_braked_robot_stays_braked_when_it_is_stopped():
 
 
 def test_a_stop_does_not_begin_again():
-    bench = Bench().to_driving()
+    bench = Bench.driving()
     stop(bench, STOPS["estop"])
     bench.wheels_follow = False
     bench.speeds = [2.0, 2.0]
@@ -259,7 +258,7 @@ def test_a_stop_does_not_begin_again():
 @pytest.mark.parametrize("cycle_us", [1 * MS, 5 * MS])
 @pytest.mark.parametrize("leap_ms", [0, 2, 15])
 def test_a_pause_or_a_leap_of_the_clock_is_no_bigger_step_than_any_other(cycle_us, leap_ms):
-    bench = Bench(dataclasses.replace(CONFIG, cycle_s=cycle_us * 1e-6)).to_armed()
+    bench = Bench.armed(config=dataclasses.replace(CONFIG, cycle_s=cycle_us * 1e-6))
     bench.command = {"left": 8.0, "right": 8.0}
     bench.run(20)
     bench.wheel_command(8.0, 8.0)
@@ -270,7 +269,7 @@ def test_a_pause_or_a_leap_of_the_clock_is_no_bigger_step_than_any_other(cycle_u
 
 @pytest.mark.parametrize("leap_ms", [110, 256, 480])
 def test_a_stop_that_begins_with_a_leap_of_the_clock_begins_no_steeper(leap_ms):
-    bench = Bench().to_armed()
+    bench = Bench.armed()
     bench.command = {"left": 4.0, "right": 4.0}
     bench.run(300)
     before = setpoints(bench)[0]
@@ -303,7 +302,14 @@ commands = st.tuples(
 )
 
 
-@given(st.lists(commands, min_size=1, max_size=15), st.floats(0.1, 20.0), st.floats(0.5, 100.0), st.floats(1.0, 100.0))
+@examples(
+    quick=60,
+    every=100,
+    sequence=st.lists(commands, min_size=1, max_size=15),
+    speed=st.floats(0.1, 20.0),
+    acceleration=st.floats(0.5, 100.0),
+    deceleration=st.floats(1.0, 100.0),
+)
 def test_whatever_is_commanded_the_setpoint_keeps_the_limits(sequence, speed, acceleration, deceleration):
     bench = Bench(
         dataclasses.replace(

@@ -48,10 +48,7 @@ def test_every_field_is_bounded_or_free():
 
 
 # What has to be at least as large as another: without it that one's own bound would not be seen.
-ROOM = {
-    "command_timeout_s": {"drive_off_timeout_s": 2.0},
-    "host_state_timeout_s": {"host_forget_timeout_s": 60.0},
-}
+ROOM = {"command_timeout_s": {"drive_off_timeout_s": 2.0}, "host_state_timeout_s": {"host_forget_timeout_s": 60.0}}
 
 
 @pytest.mark.parametrize("name", BOUNDS)

@@ -5,21 +5,20 @@ import subprocess
 import pytest
 
 from tests.tables import thinned
-from tools.check.firmware_check import HARNESS_SANITIZERS, build_harness, run_harness
+from tools.check.firmware_check import HARNESS, HARNESS_SANITIZERS, run_harness
 
 CYCLES = 100_000
 pytestmark = pytest.mark.timeout(300)
 
 
 @pytest.fixture(scope="module")
-def harness(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("harness")
-    probe = folder / "probe.c"
-    probe.write_text("int main(void) { return 0; }\n")
-    command = ["cc", *HARNESS_SANITIZERS, str(probe), "-o", str(folder / "probe")]
-    if subprocess.run(command, capture_output=True, check=False).returncode:
+def harness(compiled_core, tmp_path_factory):
+    flags, objects = compiled_core
+    if not set(HARNESS_SANITIZERS) <= set(flags):
         pytest.skip("this compiler has no sanitizers")
-    return build_harness(folder)
+    program = tmp_path_factory.mktemp("harness") / "harness"
+    subprocess.run(["cc", *flags, str(HARNESS), *objects, "-o", str(program), "-lm"], check=True)
+    return program
 
 
 @thinned("authenticated", [True, False], quick=1)

@@ -1,10 +1,10 @@
 import math
 
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_protocol import _firmware
+from tests.tables import examples
 
 ffi, lib = _firmware.ffi, _firmware.lib
 speeds = st.floats(-1e6, 1e6, width=32)
@@ -15,7 +15,7 @@ def wheels(left, right):
     return ffi.new("disco_wheels_t *", (left, right))[0]
 
 
-@given(speeds, speeds, limits)
+@examples(quick=60, every=100, left=speeds, right=speeds, limit=limits)
 def test_clamped_speed_is_within_the_limit_and_keeps_the_ratio(left, right, limit):
     clamped = lib.disco_clamp_speed(wheels(left, right), limit)
     assert max(abs(clamped.left), abs(clamped.right)) <= limit
@@ -36,7 +36,9 @@ def test_what_is_not_a_number_is_standstill(bad):
 moderate = st.floats(-100.0, 100.0, width=32)
 
 
-@given(moderate, moderate, moderate, moderate, st.floats(0.001, 10.0))
+@examples(
+    quick=60, every=100, left=moderate, right=moderate, to_left=moderate, to_right=moderate, step=st.floats(0.001, 10.0)
+)
 def test_approach_keeps_to_the_step_and_to_the_straight_line(left, right, to_left, to_right, step):
     result = lib.disco_approach(wheels(left, right), wheels(to_left, to_right), step)
     moved = (result.left - left, result.right - right)

@@ -5,19 +5,18 @@ import random
 import re
 import struct
 import subprocess
+from functools import cache
 from pathlib import Path
 
 import pytest
 
-from firmware_protocol.build_firmware import PACKAGE, SOURCES
+from firmware_protocol.build_firmware import PACKAGE
 from firmware_protocol.codec import Codec
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 from tests.tables import thinned
 
-FIRMWARE, PORTS = PACKAGE / "firmware", PACKAGE / "ports"
+PORTS = PACKAGE / "ports"
 PORT = Path(__file__).with_name("replay_port.c")
-FLAGS = ("-std=c11", "-O1", "-Wall", "-Wextra", "-Werror", f"-I{FIRMWARE}", f"-I{PORTS}")
-SANITIZERS = ("-fsanitize=undefined,address", "-fno-sanitize-recover=all")
 CODEC = Codec()
 LINE_US, USB_US = 11, 1
 """Between bytes: of a serial line at 921600 Bd, and of USB."""
@@ -42,35 +41,32 @@ LINKS = {
 
 
 @pytest.fixture(scope="module")
-def core(tmp_path_factory):
-    """The core's objects, with the sanitizers if this compiler has them."""
-    folder = tmp_path_factory.mktemp("core")
-    probe = folder / "probe.c"
-    probe.write_text("int main(void) { return 0; }\n")
-    tried = subprocess.run(
-        ["cc", *SANITIZERS, str(probe), "-o", str(folder / "probe")], capture_output=True, check=False
-    )
-    flags = (*FLAGS, *(() if tried.returncode else SANITIZERS))
-    subprocess.run(["cc", *flags, "-c", *(str(FIRMWARE / name) for name in SOURCES)], cwd=folder, check=True)
-    return flags, sorted(map(str, folder.glob("*.o")))
+def board(compiled_core, tmp_path_factory):
+    """Compile the board for a kind of link."""
+    flags, objects = compiled_core
+
+    @cache
+    def compiled(link):
+        program = tmp_path_factory.mktemp(link) / "board"
+        sources = [PORTS / "controller.c", PORT, *([PORTS / "plant_line.c"] if link == "plant" else [])]
+        command = ["cc", *flags, "-std=c11", f"-I{PORTS}", *LINKS[link][0], *map(str, sources), *objects, "-lm"]
+        subprocess.run([*command, "-o", str(program)], check=True)
+        return program
+
+    return compiled
 
 
 @pytest.fixture
-def replay(core, tmp_path):
-    """Compile the board for a kind of link and let it hear these bytes; what it said, its cycles and its stores."""
-    flags, objects = core
+def replay(board, tmp_path):
+    """Let the board hear these bytes; what it said, its cycles and its stores."""
 
     def replayed(link, received_bytes, byte_us=LINE_US, plant=b""):
-        options, _ = LINKS[link]
-        sources = [PORTS / "controller.c", PORT, *([PORTS / "plant_line.c"] if link == "plant" else [])]
-        program, line, plant_line = tmp_path / "board", tmp_path / "line", tmp_path / "plant"
-        subprocess.run(["cc", *flags, *options, *map(str, sources), *objects, "-lm", "-o", str(program)], check=True)
+        line, plant_line = tmp_path / "line", tmp_path / "plant"
         line.write_bytes(received_bytes)
         plant_line.write_bytes(plant)
         environment = {"LINK": str(line), "PLANT": str(plant_line), "BYTE_US": str(byte_us)}
-        ran = subprocess.run(
-            [str(program)], capture_output=True, env=environment | {"ASAN_OPTIONS": "detect_leaks=0"}, check=False
-        )
+        environment["ASAN_OPTIONS"] = "detect_leaks=0"
+        ran = subprocess.run([str(board(link))], capture_output=True, env=environment, check=False)
         stderr = ran.stderr.decode()
         assert ran.returncode == 0, stderr
         cycles, stores = map(int, re.fullmatch(r"(\d+) cycles (\d+) stores\n", stderr).groups())

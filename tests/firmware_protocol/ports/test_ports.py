@@ -7,6 +7,7 @@ import subprocess
 import pytest
 
 from firmware_protocol.build_firmware import PACKAGE, SOURCES
+from tests.tables import thinned
 
 FIRMWARE, PORTS = PACKAGE / "firmware", PACKAGE / "ports"
 CONTRACT = (PORTS / "port.h").read_text("utf-8")
@@ -90,14 +91,15 @@ def test_the_main_loop_compiles_for_each_kind_of_link(link, tmp_path):
     compiled("-c", PORTS / "controller.c", "-o", tmp_path / "controller.o", options=link)
 
 
-def test_the_guides_commands_make_a_whole_firmware_of_the_template(tmp_path):
+@thinned("optimisation", ["-O0", "-Os"], quick=1)
+def test_the_guides_commands_make_a_whole_firmware_of_the_template(optimisation, tmp_path):
     """As they stand where there is a cross-compiler, else with this computer's; a warning is an error here."""
     guide = (PACKAGE.parent / "docs" / "port.md").read_text("utf-8")
     (commands,) = re.findall(r"```sh\n(LINK=.*?)```", guide, re.DOTALL)
     if shutil.which("arm-none-eabi-gcc") is None:
         commands = re.sub(r"^CC=.*", "CC=cc", commands, flags=re.MULTILINE)
     (tmp_path / "firmware_protocol").symlink_to(PACKAGE)
-    commands = commands.replace("-Wall", "-Wall -Werror")
+    commands = commands.replace("-Wall", "-Wall -Werror").replace("-Os", optimisation)
     ran = subprocess.run(["sh", "-ec", commands], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
     assert (tmp_path / "my_board.elf").exists()
