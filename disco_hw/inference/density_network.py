@@ -361,7 +361,8 @@ def truncated_draws(region: Region, mixtures: Mixtures, count: int, rng: np.rand
     outside = np.zeros(n)
     for attempt in range(_LARGEST_REJECTION):
         fresh = region.points(mixtures.draw(count, rng))
-        good = region.contains(fresh.reshape(-1, size)).reshape(n, count)
+        good = np.zeros((n, count), dtype=bool)
+        good[missing] = region.contains(fresh[missing])
         if attempt == 0:
             outside = 1.0 - good.mean(axis=1)
         accepted = missing & good
@@ -457,7 +458,9 @@ class Region:
     def contains(self, theta: Array) -> Mask:
         """Return which points (n, P) are in the region."""
         inside = ((theta >= self.low) & (theta <= self.high) & (np.abs(self.unit(theta)) <= 1.0)).all(axis=1)
-        return np.asarray(inside if self.within is None else inside & self.within.contains(theta))
+        if self.within is not None:
+            inside[inside] = self.within.contains(theta[inside])
+        return np.asarray(inside)
 
     def draw(self, count: int, rng: np.random.Generator) -> Array:
         """Uniform draws (count, P); raises EmptyRegionError if the region is all but empty."""

@@ -32,7 +32,7 @@ def test_samples_carry_the_time_of_their_measurement(jitter_ms, skew):
     bench.run(4.0)
     bench.readings.clear()
     true_angle = {}
-    for number in range(3000):
+    for number in range(2600):
         if number % 40 == 0:
             latency_ms = 150
             sample_us = robot.us(bench.now_ns - latency_ms * MS)
