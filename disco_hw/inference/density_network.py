@@ -457,10 +457,10 @@ class Region:
 
     def contains(self, theta: Array) -> Mask:
         """Return which points (n, P) are in the region."""
-        inside = ((theta >= self.low) & (theta <= self.high) & (np.abs(self.unit(theta)) <= 1.0)).all(axis=1)
+        inside: Mask = np.all((theta >= self.low) & (theta <= self.high) & (np.abs(self.unit(theta)) <= 1.0), axis=1)
         if self.within is not None:
             inside[inside] = self.within.contains(theta[inside])
-        return np.asarray(inside)
+        return inside
 
     def draw(self, count: int, rng: np.random.Generator) -> Array:
         """Uniform draws (count, P); raises EmptyRegionError if the region is all but empty."""
