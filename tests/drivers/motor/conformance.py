@@ -193,7 +193,7 @@ class DriverConformance:
         bench.drive(1.0)
         assert bench.wheels[-1].left_angle_rad > angle
 
-    @thinned("unplugged_after_ms", range(20), quick=4)
+    @thinned("unplugged_after_ms", range(20), quick=2)
     def test_unplugged_at_any_instant(self, bench, unplugged_after_ms):
         bench.drive(0.3 + unplugged_after_ms * 1e-3, FORWARD)
         bench.host_end.plug(False)
@@ -224,23 +224,18 @@ class DriverConformance:
 
     estop_id = 0x080
 
-    @pytest.mark.parametrize(
-        "command",
-        [
-            WheelCommand(math.nan, 0.0, 0.1),
-            WheelCommand(0.0, math.inf, 0.1),
-            WheelCommand(0.0, -math.inf, 0.1),
-            WheelCommand(0.0, 0.0, math.nan),
-            WheelCommand(0.0, 0.0, 0.0),
-            WheelCommand(0.0, 0.0, -1.0),
-        ],
-    )
-    def test_a_command_that_is_none_is_the_callers_error(self, bench, command):
+    def test_a_command_that_is_none_is_the_callers_error(self, bench):
         bench.arm()
         sent = bench.driver.stats.commands_sent
+        for bad in [(math.nan, 0.0), (0.0, math.inf), (0.0, -math.inf)]:
+            self.assert_refused(bench, WheelCommand(*bad, 0.1))
+        for valid_for_s in (math.nan, 0.0, -1.0):
+            self.assert_refused(bench, WheelCommand(0.0, 0.0, valid_for_s))
+        assert bench.driver.stats.commands_sent == sent
+
+    def assert_refused(self, bench, command):
         with pytest.raises(ValueError, match="not a wheel command"):
             bench.driver.transmit(bench.now_ns, command)
-        assert bench.driver.stats.commands_sent == sent
 
     def test_released_the_wheels_roll_out_without_a_ramp_and_the_reason_is_a_fault_until_a_reset(self, bench):
         bench.drive(0.6, FORWARD)
