@@ -115,7 +115,7 @@ def test_a_robot_whose_belief_is_narrow_and_wrong_is_learnt():
 
 
 def test_beginning_and_ending_turns_is_no_change():
-    found, plant = settled()
+    found, plant = settled(2)
     for _ in range(3):
         drive(found, plant, TURN[::-1], 4.0)
         drive(found, plant, TURN, 4.0)
@@ -193,7 +193,7 @@ def test_a_pose_stamped_in_the_future_does_not_hold_up_those_after_it():
 
 
 def test_a_robot_that_stands_teaches_nothing():
-    found, plant = settled()
+    found, plant = settled(1)
     drive(found, plant, STANDSTILL, 2.0)
     before, covariance = found.mean, found.covariance
     drive(found, plant, STANDSTILL, 5.0)
@@ -203,7 +203,7 @@ def test_a_robot_that_stands_teaches_nothing():
 
 @pytest.mark.parametrize("minutes", [0.5, pytest.param(10.0, marks=pytest.mark.long)])
 def test_minutes_of_straight_lines_and_standing_leave_axle_and_x_icr_alone(minutes):
-    found, plant = settled()
+    found, plant = settled(3)
     before = found.mean
     for _ in range(round(2.0 * minutes)):
         drive(found, plant, STRAIGHT, 20.0)
@@ -212,7 +212,7 @@ def test_minutes_of_straight_lines_and_standing_leave_axle_and_x_icr_alone(minut
 
 
 def test_a_robot_that_was_carried_is_found_again():
-    found, plant = settled()
+    found, plant = settled(1)
     drive(found, plant, STANDSTILL, 2.0)
     known = found.covariance
     plant.state[:3] = 2.0, -1.0, -2.0
