@@ -204,6 +204,7 @@ class RoboclawController:
 
     def __init__(self, settings: RoboclawSettings, ticks_per_rev: int) -> None:
         self._settings = settings
+        self._sides = settings.sides
         self._counts_per_tick = settings.counts_per_rev / ticks_per_rev
         self.boards = {address: Roboclaw(address) for address in settings.addresses}
         self.dead: set[int] = set()
@@ -215,7 +216,7 @@ class RoboclawController:
     def wheels_rad_s(self) -> tuple[float | None, float | None]:
         """The mean of what a side's motors hold; None where one is released."""
         known_speeds: list[float | None] = []
-        for side, direction in zip(self._settings.sides, self._settings.direction, strict=True):
+        for side, direction in zip(self._sides, self._settings.direction, strict=True):
             speeds = [self._ramped.get(place) for place in side]
             known = [speed for speed in speeds if speed is not None]
             mean = direction * sum(known) / len(side) / self._settings.counts_per_rad
@@ -260,7 +261,7 @@ class RoboclawController:
         """Go through one millisecond: the encoders count, timeouts run, speeds are ramped."""
         self._ticks = (inputs.left_ticks, inputs.right_ticks)
         self._measured = (inputs.left_speed_rad_s, inputs.right_speed_rad_s)
-        for number, (side, direction) in enumerate(zip(self._settings.sides, self._settings.direction, strict=True)):
+        for number, (side, direction) in enumerate(zip(self._sides, self._settings.direction, strict=True)):
             ticks = self._ticks[number] - self._zero_ticks[number]
             count = round(direction * ticks * self._counts_per_tick)
             speed = direction * self._measured[number] * self._settings.counts_per_rad

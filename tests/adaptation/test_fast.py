@@ -46,7 +46,7 @@ def changes(run):
 
 
 def test_the_geometry_is_learnt_logged_and_taken_back_when_asked(tmp_path):
-    run, truth = driven(tmp_path, 11.0)
+    run, truth = driven(tmp_path, 8.0)
     adaptation = run.core.adaptation
     assert adaptation.status()["belief"] == "adapted"
     assert len(changes(run)) > 3

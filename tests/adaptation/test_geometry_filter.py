@@ -2,6 +2,7 @@
 
 import pickle
 from dataclasses import replace
+from functools import cache
 
 import msgspec
 import numpy as np
@@ -44,9 +45,10 @@ def changed(plant, **fields):
     plant.robot, plant._numbers = other.robot, other._numbers
 
 
-def test_ten_seconds_of_turning_tell_the_geometry_and_how_well_it_is_known():
+@pytest.mark.parametrize("count", [3, pytest.param(6, marks=pytest.mark.thorough)])
+def test_ten_seconds_of_turning_tell_the_geometry_and_how_well_it_is_known(count):
     inside = []
-    for seed, robot in enumerate(robots(200, 6)):
+    for seed, robot in enumerate(robots(200, count)):
         found = learner()
         drive(found, ForeignPlant(robot, (0.0, 0.0, 0.3), seed), TURN, 10.0)
         error = found.mean - truth(robot)
@@ -55,23 +57,25 @@ def test_ten_seconds_of_turning_tell_the_geometry_and_how_well_it_is_known():
     assert np.mean(inside) > 0.75
 
 
-@pytest.fixture(scope="module")
-def settled():
-    """Filters and plants of seven seeds that have turned for 10 s, pickled: each test has its own."""
-    found = []
-    for seed in range(61, 68):
-        known, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL), (0.0, 0.0, 0.3), seed)
-        drive(known, plant, TURN, 10.0)
-        found.append(pickle.dumps((known, plant)))
-    return found
+@cache
+def _settled(seed):
+    found, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL), (0.0, 0.0, 0.3), seed)
+    drive(found, plant, TURN, 10.0)
+    return pickle.dumps((found, plant))
+
+
+def settled(seed=61):
+    """A filter and its plant after 10 s of turning; each call returns a copy of its own."""
+    return pickle.loads(_settled(seed))
 
 
 @thinned("factor", [0.85, 1.15], quick=1)
 @thinned(("index", "field"), [(1, "axle_m"), (0, "radius_m"), (2, "x_icr_m")], quick=1)
-def test_four_fifths_of_a_change_are_known_after_two_and_a_half_seconds(settled, index, field, factor):
+@pytest.mark.parametrize("count", [3, pytest.param(7, marks=pytest.mark.thorough)])
+def test_four_fifths_of_a_change_are_known_after_two_and_a_half_seconds(count, index, field, factor):
     known_part = []
-    for one in settled:
-        found, plant = pickle.loads(one)
+    for seed in range(61, 61 + count):
+        found, plant = settled(seed)
         changed(plant, **{field: factor * NOMINAL[index]})
         drive(found, plant, TURN, 2.5)
         known_part.append((found.mean[index] / NOMINAL[index] - 1.0) / (factor - 1.0))
@@ -96,14 +100,14 @@ def test_intervals_widen_on_ground_that_is_rougher_than_assumed():
     widths = []
     for grip_std in (0.02, 0.12):
         found, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL, grip_std=grip_std), (0.0, 0.0, 0.3), 3)
-        drive(found, plant, TURN, 20.0)
+        drive(found, plant, TURN, 12.0)
         widths.append(np.sqrt(np.diag(found.covariance)) / np.sqrt(np.diag(found._bank.covariance[0, 3:6, 3:6])))
     assert widths[0].max() < 1.3
     assert widths[1].min() > 1.3
 
 
-def test_a_robot_whose_belief_is_narrow_and_wrong_is_learnt(settled):
-    found, plant = pickle.loads(settled[0])
+def test_a_robot_whose_belief_is_narrow_and_wrong_is_learnt():
+    found, plant = settled()
     known = GeometryFilter(0.87 * MEAN, np.diag((0.005 * MEAN) ** 2), 0.5 * MEAN, 1.6 * MEAN)
     drive(known, plant, TURN, 10.0)
     assert np.abs(known.mean / MEAN - 1.0).max() < 0.03
@@ -111,8 +115,7 @@ def test_a_robot_whose_belief_is_narrow_and_wrong_is_learnt(settled):
 
 
 def test_beginning_and_ending_turns_is_no_change():
-    found, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL), (0.0, 0.0, 0.3), 2)
-    drive(found, plant, TURN, 8.0)
+    found, plant = settled(2)
     for _ in range(3):
         drive(found, plant, TURN[::-1], 4.0)
         drive(found, plant, TURN, 4.0)
@@ -172,7 +175,7 @@ def test_wheels_without_poses_are_not_kept_and_the_filter_learns_afterwards():
         found.add(plant.readings().wheels, ())
         plant.advance(*TURN, 20)
     assert len(found._wheels) < 100
-    drive(found, plant, TURN, 10.0)
+    drive(found, plant, TURN, 5.0)
     assert found.poses > 100
 
 
@@ -185,34 +188,31 @@ def test_a_pose_stamped_in_the_future_does_not_hold_up_those_after_it():
     wrong = msgspec.structs.replace(readings.poses[0], t_ns=readings.poses[0].t_ns + 3_600_000_000_000)
     found.add(readings.wheels, (wrong,))
     before = found.poses
-    drive(found, plant, TURN, 4.0)
+    drive(found, plant, TURN, 2.5)
     assert found.poses > before + 50
 
 
 def test_a_robot_that_stands_teaches_nothing():
-    found, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL), (0.0, 0.0, 0.3), 1)
-    drive(found, plant, TURN, 10.0)
+    found, plant = settled(1)
     drive(found, plant, STANDSTILL, 2.0)
     before, covariance = found.mean, found.covariance
-    drive(found, plant, STANDSTILL, 20.0)
+    drive(found, plant, STANDSTILL, 5.0)
     np.testing.assert_array_equal(found.mean, before)
     np.testing.assert_array_equal(found.covariance, covariance)
 
 
-@pytest.mark.parametrize("minutes", [1, pytest.param(10, marks=pytest.mark.long)])
+@pytest.mark.parametrize("minutes", [0.5, pytest.param(10.0, marks=pytest.mark.long)])
 def test_minutes_of_straight_lines_and_standing_leave_axle_and_x_icr_alone(minutes):
-    found, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL), (0.0, 0.0, 0.3), 3)
-    drive(found, plant, TURN, 10.0)
+    found, plant = settled(3)
     before = found.mean
-    for _ in range(minutes):
-        drive(found, plant, STRAIGHT, 40.0)
-        drive(found, plant, STANDSTILL, 20.0)
+    for _ in range(round(2.0 * minutes)):
+        drive(found, plant, STRAIGHT, 20.0)
+        drive(found, plant, STANDSTILL, 10.0)
     assert np.abs(found.mean / before - 1.0).max() < 0.015
 
 
 def test_a_robot_that_was_carried_is_found_again():
-    found, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL), (0.0, 0.0, 0.3), 1)
-    drive(found, plant, TURN, 10.0)
+    found, plant = settled(1)
     drive(found, plant, STANDSTILL, 2.0)
     known = found.covariance
     plant.state[:3] = 2.0, -1.0, -2.0
@@ -234,6 +234,6 @@ def test_the_same_samples_give_the_same_numbers():
 
 def test_what_is_learnt_stays_within_the_prior():
     narrow = GeometryFilter(MEAN, np.diag((0.1 * MEAN) ** 2), 0.97 * MEAN, 1.03 * MEAN)
-    means = drive(narrow, ForeignPlant(ForeignRobot(*(1.15 * MEAN)), (0.0, 0.0, 0.3), 1), TURN, 5.0)
+    means = drive(narrow, ForeignPlant(ForeignRobot(*(1.15 * MEAN)), (0.0, 0.0, 0.3), 1), TURN, 3.0)
     assert (means >= 0.97 * MEAN).all()
     assert (means <= 1.03 * MEAN).all()

@@ -62,7 +62,7 @@ def slipping():
     return drives(100, 8.0)
 
 
-@pytest.mark.parametrize("seeds", [25, *SEEDS])
+@pytest.mark.parametrize("seeds", [15, *SEEDS])
 def test_nees_and_nis_are_inside_their_bounds(slipping, seeds):
     nees, nis = [], []
     for seed in range(seeds):
@@ -170,7 +170,7 @@ def test_a_robot_moved_by_half_a_metre_is_found_again(slipping, delay_ns):
         return PoseSample(pose.t_ns, pose.t_ns, pose.x_m + shift[0], pose.y_m + shift[1], pose.yaw_rad, *[0.01, 0.02])
 
     arrivals = [(t + delay_ns, i) for t, i in arrivals_in_order(slipping)]
-    for seed in range(10):
+    for seed in range(4):
         estimates, updates = follow(slipping, seed, arrivals, sample=sample, looks=1)
         reasons = [update.reason for update in updates]
         assert reasons[moved_at : moved_at + 10] == [PoseReason.GATED] * 9 + [PoseReason.REINITIALISED]

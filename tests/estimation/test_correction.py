@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from disco_hw.estimation.correction import FLOOR_VARIANCE, Measurement, PoseCorrector
 from disco_hw.estimation.odometry import Pose, PoseBelief
+from tests.tables import examples
 
 
 def belief_of(mean, covariance, sensitivity=None):
@@ -97,12 +97,13 @@ def test_one_corrector_serves_many_beliefs_without_memory():
     assert [used.correct(*case) for case in cases] == [PoseCorrector().correct(*case) for case in cases]
 
 
-@settings(deadline=None)
-@given(
-    st.lists(st.floats(-8, 4), min_size=3, max_size=3),
-    st.tuples(st.floats(-1000, 1000), st.floats(-1000, 1000), st.floats(-10, 10)),
-    st.floats(-6, 4),
-    st.integers(0, 2**32 - 1),
+@examples(
+    quick=30,
+    every=100,
+    exponents=st.lists(st.floats(-8, 4), min_size=3, max_size=3),
+    z=st.tuples(st.floats(-1000, 1000), st.floats(-1000, 1000), st.floats(-10, 10)),
+    noise_exponent=st.floats(-6, 4),
+    seed=st.integers(0, 2**32 - 1),
 )
 def test_any_sizes_leave_the_covariance_symmetric_and_positive_definite(exponents, z, noise_exponent, seed):
     rng = np.random.default_rng(seed)

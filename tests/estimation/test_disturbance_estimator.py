@@ -66,14 +66,14 @@ def test_an_estimate_stays_within_its_bounds():
 
 
 def test_a_robot_that_was_carried_begins_anew():
-    estimator, _ = driven(Disturbance(left=0.1), 20.0)
+    estimator, _ = driven(Disturbance(left=0.1), 12.0)
     assert abs(estimator.value.left) > 0.04
-    carried, _ = driven(Disturbance(left=0.1), 20.0 + STEP_S, jump_m=3.0)
+    carried, _ = driven(Disturbance(left=0.1), 12.0 + STEP_S, jump_m=3.0)
     assert abs(carried.value.left) < abs(estimator.value.left)
 
 
 def test_another_geometry_takes_off_what_it_explains_and_no_more():
-    estimator, _ = driven(Disturbance(curvature_per_m=-0.15), 30.0)
+    estimator, _ = driven(Disturbance(curvature_per_m=-0.15), 15.0)
     before = estimator.value.curvature_per_m
     wider = OdometryParameters(0.06, 0.42, 0.2)
     estimator.change_geometry(PARAMETERS, wider, (LEFT_RAD_S, RIGHT_RAD_S))

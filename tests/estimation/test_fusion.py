@@ -6,7 +6,6 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from disco_hw.config import Estimation
@@ -14,6 +13,7 @@ from disco_hw.estimation import PoseFusion
 from disco_hw.estimation.correction import PoseReason
 from disco_hw.estimation.odometry import OdometryParameters, advance
 from drivers.types import PoseSample, WheelSample
+from tests.tables import examples
 
 MS = 1_000_000
 PARAMETERS = OdometryParameters(0.061, 0.415, 0.238)
@@ -230,8 +230,13 @@ pose_events = st.tuples(
 queries = st.tuples(st.just("ask"), st.integers(-500, 5000))
 
 
-@settings(max_examples=150, deadline=None)
-@given(st.lists(st.one_of(wheel_events, wheel_events, pose_events, queries), max_size=60), st.booleans(), st.booleans())
+@examples(
+    quick=40,
+    every=150,
+    events=st.lists(st.one_of(wheel_events, wheel_events, pose_events, queries), max_size=60),
+    known=st.booleans(),
+    pose_required=st.booleans(),
+)
 def test_no_stream_of_samples_harms_the_estimate(events, known, pose_required):
     fusions = [
         fusion_with(PARAMETERS if known else UNCERTAIN, pose_required=pose_required, gate_lockout_count=2)

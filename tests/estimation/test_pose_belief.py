@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from disco_hw.config import Estimation
@@ -20,6 +19,7 @@ from disco_hw.estimation.odometry import (
     moved,
     predict,
 )
+from tests.tables import examples
 
 THETA = np.array([[0.15, 0.03, -0.03], [0.03, 0.09, -0.04], [-0.03, -0.04, 0.13]]) * 1e-3
 GEOMETRY = (0.061, 0.415, 0.238)
@@ -150,8 +150,12 @@ def test_variances_have_a_ceiling_and_stay_definite():
         assert np.linalg.eigvalsh(covariance)[0] > 0.0
 
 
-@settings(deadline=None)
-@given(st.lists(st.tuples(st.floats(-100, 100), st.floats(-100, 100)), max_size=30), st.booleans())
+@examples(
+    quick=30,
+    every=100,
+    turns=st.lists(st.tuples(st.floats(-100, 100), st.floats(-100, 100)), max_size=30),
+    known=st.booleans(),
+)
 def test_any_drive_keeps_the_covariance_positive_definite(turns, known):
     parameters = KNOWN if known else UNCERTAIN
     model = motion_model(SETTINGS, parameters)

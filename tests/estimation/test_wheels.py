@@ -4,11 +4,11 @@ import itertools
 import math
 
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from disco_hw.estimation.odometry import MAX_WHEEL_SPEED_RAD_S, WheelReading, WheelReason, WheelTracker
 from drivers.types import WheelSample
+from tests.tables import examples
 
 MS = 1_000_000
 
@@ -80,8 +80,9 @@ def test_the_bound_of_a_jump_grows_with_the_time_and_allows_for_jitter():
 numbers = st.floats(allow_nan=True, allow_infinity=True)
 
 
-@settings(deadline=None)
-@given(st.lists(st.tuples(st.integers(-(2**63), 2**63), numbers, numbers, numbers, numbers)))
+@examples(
+    quick=30, every=100, values=st.lists(st.tuples(st.integers(-(2**63), 2**63), numbers, numbers, numbers, numbers))
+)
 def test_any_stream_gives_finite_readings_in_order(values):
     tracker, readings = WheelTracker(), []
     for t_ns, *rest in values:

@@ -55,35 +55,40 @@ def weaving(t):
     return 3.3 + 0.8 * np.sin(1.7 * t), 3.3 - 0.8 * np.sin(1.7 * t) + 0.4 * np.cos(0.6 * t)
 
 
+def from_start(steps, start=0.0):
+    """Sums of steps (n, ...) from the start on, (n + 1, ...)."""
+    return np.cumsum(np.concatenate([np.full((1, *steps.shape[1:]), start), steps]), axis=0)
+
+
 def drives(seeds, duration_s, geometry=None, slip=None, speeds=weaving, position_std=0.01, yaw_std=0.02, rng_seed=1):
     """Simulate; `geometry` may hold arrays with one value per seed."""
     geometry, slip = geometry or Geometry(), slip or Slip()
     rng = np.random.default_rng(rng_seed)
     count = round(duration_s * 1e9 / WHEEL_PERIOD_NS) + 1
-    h = WHEEL_PERIOD_NS * 1e-9 / SUBSTEPS
-    x, y, yaw = np.zeros(seeds), np.zeros(seeds), np.full(seeds, 0.4)
-    truth = np.empty((seeds, count, 3))
-    wheels, left_angle, right_angle = [], 0.0, 0.0
-    for k in range(count):
-        left, right = speeds(k * WHEEL_PERIOD_NS * 1e-9)
-        truth[:, k] = np.stack([x, y, yaw], axis=1)
-        t_ns = 10**12 + k * WHEEL_PERIOD_NS
-        wheels.append(WheelSample(t_ns, t_ns, left_angle, right_angle, left, right))
-        for _ in range(SUBSTEPS):
-            rolled = geometry.radius * (abs(left) + abs(right)) / 2 * h
-            v = geometry.radius * (left + right) / 2
-            turn = geometry.radius * (right - left) / geometry.axial * h
-            yaw_std_step = np.sqrt(slip.yaw_per_m**2 * rolled + slip.yaw_per_rad**2 * abs(turn))
-            turn = turn + yaw_std_step * rng.standard_normal(seeds)
-            middle = yaw + turn / 2
-            step_std = slip.position_per_m * np.sqrt(rolled)
-            x = x + v * h * np.cos(middle) + turn * geometry.x_icr * np.sin(middle)
-            y = y + v * h * np.sin(middle) - turn * geometry.x_icr * np.cos(middle)
-            x = x + step_std * rng.standard_normal(seeds)
-            y = y + step_std * rng.standard_normal(seeds)
-            yaw = yaw + turn
-        left_angle += left * WHEEL_PERIOD_NS * 1e-9
-        right_angle += right * WHEEL_PERIOD_NS * 1e-9
+    period_s = WHEEL_PERIOD_NS * 1e-9
+    h = period_s / SUBSTEPS
+    held = np.array([speeds(k * period_s) for k in range(count)])
+    left, right = np.repeat(held, SUBSTEPS, axis=0).T[:, :, None]
+    # Each step draws the noise of the yaw, of x and of y.
+    noise = rng.standard_normal((count * SUBSTEPS, 3, seeds))
+    rolled = geometry.radius * (abs(left) + abs(right)) / 2 * h
+    forward = geometry.radius * (left + right) / 2 * h
+    turn = geometry.radius * (right - left) / geometry.axial * h
+    turn = turn + np.sqrt(slip.yaw_per_m**2 * rolled + slip.yaw_per_rad**2 * abs(turn)) * noise[:, 0]
+    yaw = from_start(turn, 0.4)
+    middle = yaw[:-1] + turn / 2
+    step_std = slip.position_per_m * np.sqrt(rolled)
+    slide = turn * geometry.x_icr
+    x = from_start(forward * np.cos(middle) + slide * np.sin(middle) + step_std * noise[:, 1])
+    y = from_start(forward * np.sin(middle) - slide * np.cos(middle) + step_std * noise[:, 2])
+    truth = np.stack([x, y, yaw], axis=2)[:-1:SUBSTEPS].transpose(1, 0, 2)
+    angles = from_start(held * period_s)[:-1].tolist()
+    wheels = [
+        WheelSample(t_ns, t_ns, *angle, *speed)
+        for t_ns, angle, speed in zip(
+            range(10**12, 10**12 + count * WHEEL_PERIOD_NS, WHEEL_PERIOD_NS), angles, held.tolist(), strict=True
+        )
+    ]
     at_poses = truth[:, ::POSE_EVERY]
     noise = rng.standard_normal(at_poses.shape) * (position_std, position_std, yaw_std)
     return Drives(wheels, truth, at_poses + noise, position_std, yaw_std)

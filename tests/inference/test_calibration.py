@@ -18,7 +18,7 @@ def simulate(theta, seeds):
 @pytest.fixture(scope="module")
 def fitted():
     prior = Region.box(np.zeros(3), np.ones(3))
-    return run_rounds(simulate, np.full(3, 0.5), prior, 1500, RoundSettings((1.0,), network=SMALL), 1)
+    return run_rounds(simulate, np.full(3, 0.5), prior, 1000, RoundSettings((1.0,), network=SMALL), 1)
 
 
 class Narrower:

@@ -35,7 +35,8 @@ def run(tmp_path, monkeypatch):
     return infer
 
 
-@thinned("fault", SPOILED, quick=2)
+# The first reversed needs one drive to be simulated, not two.
+@thinned("fault", SPOILED[::-1], quick=1)
 def test_a_log_that_says_nothing_of_the_robot_is_refused_with_the_cause(run, fault, tmp_path):
     change, _, hint = FAULTS[fault]
     log = change(sound())
@@ -63,7 +64,7 @@ def test_a_region_without_parameters_is_one_line(monkeypatch, error):
 
     monkeypatch.setattr(inference, "run_rounds", fail)
     with pytest.raises(InputError, match=r"no parameters within the prior of robot\.toml explain this log") as caught:
-        inference.infer(logged(), robot_config(), InferOptions(simulations=300))
+        inference.infer(logged("poor"), robot_config(), InferOptions(simulations=300))
     assert "\n" not in str(caught.value)
 
 

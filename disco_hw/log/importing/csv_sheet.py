@@ -155,6 +155,9 @@ def _columns(
 
 def _number(text: str) -> tuple[float, bool]:
     """Return the finite number in a cell, else NaN; and whether a cell that is not empty holds none."""
+    if not text:
+        # Half the cells are empty, and an exception costs as much as ten of them.
+        return math.nan, False
     try:
         value = float(text)
     except ValueError:

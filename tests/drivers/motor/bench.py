@@ -102,7 +102,8 @@ class Bench:
     def step(self):
         """Advance everything by one millisecond."""
         self.now_ns += MS
-        self._deliver()
+        if self._under_way:
+            self._deliver()
         for received in self.robot_end.receive():
             self.robot.receive(self.now_ns, received.frame)
         self.robot.step(self.now_ns)

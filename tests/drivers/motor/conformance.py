@@ -58,7 +58,7 @@ class DriverConformance:
         bench.arm()
         assert bench.robot.armed
         assert bench.largest_speed == 0.0, "arming alone moves nothing"
-        bench.run(2.0, FORWARD)
+        bench.run(1.0, FORWARD)
         assert bench.robot.speed == pytest.approx(FORWARD, abs=0.005)
         last = bench.wheels[-1]
         assert (last.left_speed_rad_s, last.right_speed_rad_s) == pytest.approx(FORWARD, abs=0.005)
@@ -76,28 +76,28 @@ class DriverConformance:
         assert bench.largest_speed == 0.0
 
     def test_a_silent_host_stops_the_robot_and_is_not_armed_when_it_comes_back(self, bench):
-        bench.drive(1.0, FORWARD)
+        bench.drive(0.6, FORWARD)
         bench.host_runs = False
         bench.run(self.stop_time_s(max(FORWARD)))
         assert bench.robot.speed_rad_s < 0.05
         assert not bench.robot.armed
         bench.host_runs = True
-        assert bench.largest_speed_in(3.0) == 0.0
+        assert bench.largest_speed_in(1.5) == 0.0
         assert bench.driver.state in IDLE_STATES
 
     def test_a_host_without_commands_stops_the_robot_and_arm_is_consumed(self, bench):
         """Alive and talking, but no command: the house-keeping must not feed the watchdog."""
-        bench.drive(1.0, FORWARD)
+        bench.drive(0.6, FORWARD)
         bench.command = None
         bench.run(self.stop_time_s(max(FORWARD)))
         assert bench.robot.speed_rad_s < 0.05
         bench.run_until(*IDLE_STATES)
-        bench.run(3.0, FORWARD)
+        bench.run(1.5, FORWARD)
         assert not bench.robot.armed
         assert bench.driver.detail not in ("", "armed", "arming"), "it says why"
 
     def test_disarms_on_request_while_moving(self, bench):
-        bench.drive(1.0, FORWARD)
+        bench.drive(0.6, FORWARD)
         bench.driver.request(Request.STANDBY)
         assert bench.driver.state is DriverState.STOPPING
         bench.run(self.stop_time_s(max(FORWARD)))
@@ -109,7 +109,7 @@ class DriverConformance:
         bench.arm()
         sessions = bench.driver.stats.sessions
         bench.request(Request.READY).run_until(DriverState.READY)
-        bench.run(2.0, FORWARD)
+        bench.run(1.0, FORWARD)
         assert bench.largest_speed == 0.0
         bench.arm()
         assert bench.driver.stats.sessions > sessions
@@ -123,7 +123,7 @@ class DriverConformance:
         bench.run(self.stop_time_s(max(FORWARD)))
         assert bench.robot.speed_rad_s < 0.05
         assert len(bench.driver.detail) > 10
-        bench.request(Request.ARM).run(2.0)
+        bench.request(Request.ARM).run(1.0)
         assert bench.driver.state is DriverState.FAULT
         bench.request(Request.RESET).run(1.0)
         assert bench.driver.state is DriverState.FAULT, "the cause is still there"
@@ -131,7 +131,7 @@ class DriverConformance:
         bench.robot.break_down(False)
         bench.run(0.5)
         bench.request(Request.RESET).run_until(*IDLE_STATES)
-        assert bench.largest_speed_in(2.0) == 0.0
+        assert bench.largest_speed_in(1.0) == 0.0
         bench.arm()
 
     @pytest.mark.parametrize("armed", [False, True])
@@ -143,10 +143,10 @@ class DriverConformance:
         bench.run(self.stop_time_s(max(FORWARD)))
         assert bench.robot.speed_rad_s < 0.05
         assert bench.driver.state is DriverState.ESTOP
-        bench.request(Request.ARM).run(2.0, FORWARD)
+        bench.request(Request.ARM).run(1.0, FORWARD)
         assert bench.driver.state is DriverState.ESTOP
         bench.request(Request.RESET).run_until(*IDLE_STATES)
-        assert bench.largest_speed_in(2.0) == 0.0
+        assert bench.largest_speed_in(1.0) == 0.0
         bench.arm()
 
     def test_the_emergency_stop_button_holds_until_released_and_reset(self, bench):
@@ -162,13 +162,13 @@ class DriverConformance:
         bench.run(1.0)
         assert bench.driver.state is DriverState.ESTOP, "releasing the button alone is not enough"
         bench.request(Request.RESET).run_until(*IDLE_STATES)
-        assert bench.largest_speed_in(2.0) == 0.0
+        assert bench.largest_speed_in(1.0) == 0.0
 
     def test_encoders_wrap_in_both_directions(self):
         bench = Bench(self.create_driver(), self.create_robot(first_ticks=self.near_the_wrap()))
         bench.arm()
         for command in ((4.0, -4.0), (-4.0, 4.0), (4.0, -4.0)):
-            bench.run(2.0, command)
+            bench.run(1.0, command)
         samples = bench.wheels
         for before, after in itertools.pairwise(samples):
             allowed = 4.1 * (after.t_ns - before.t_ns) * 1e-9 + 0.01
@@ -178,7 +178,7 @@ class DriverConformance:
         assert bench.driver.stats.implausible_ticks == 0
 
     def test_an_unplugged_line_stops_the_robot_and_nothing_moves_when_it_is_back(self, bench):
-        bench.drive(1.0, FORWARD)
+        bench.drive(0.6, FORWARD)
         bench.step()
         bench.host_end.plug(False)
         bench.run(self.stop_time_s(max(FORWARD)))
@@ -186,14 +186,14 @@ class DriverConformance:
         assert bench.robot.speed_rad_s < 0.05
         bench.driver.request(Request.ARM)
         bench.host_end.plug(True)
-        assert bench.largest_speed_in(3.0, FORWARD) == 0.0
+        assert bench.largest_speed_in(1.5, FORWARD) == 0.0
         assert bench.driver.state in IDLE_STATES
         angle = bench.wheels[-1].left_angle_rad
         assert angle > 1.0, "the angles go on from where they were"
         bench.drive(1.0)
         assert bench.wheels[-1].left_angle_rad > angle
 
-    @thinned("unplugged_after_ms", range(20), quick=4)
+    @thinned("unplugged_after_ms", range(20), quick=2)
     def test_unplugged_at_any_instant(self, bench, unplugged_after_ms):
         bench.drive(0.3 + unplugged_after_ms * 1e-3, FORWARD)
         bench.host_end.plug(False)
@@ -208,7 +208,7 @@ class DriverConformance:
         generator = random.Random(5)
         bench.arm()
         bench.command = WheelCommand(*FORWARD, 0.1)
-        for _ in range(2000):
+        for _ in range(1000):
             for inject in (bench.inject_to_host, bench.inject_to_robot):
                 can_id = generator.choice((generator.randrange(0x800), generator.choice(self.frame_ids)))
                 if can_id != self.estop_id:
@@ -224,23 +224,18 @@ class DriverConformance:
 
     estop_id = 0x080
 
-    @pytest.mark.parametrize(
-        "command",
-        [
-            WheelCommand(math.nan, 0.0, 0.1),
-            WheelCommand(0.0, math.inf, 0.1),
-            WheelCommand(0.0, -math.inf, 0.1),
-            WheelCommand(0.0, 0.0, math.nan),
-            WheelCommand(0.0, 0.0, 0.0),
-            WheelCommand(0.0, 0.0, -1.0),
-        ],
-    )
-    def test_a_command_that_is_none_is_the_callers_error(self, bench, command):
+    def test_a_command_that_is_none_is_the_callers_error(self, bench):
         bench.arm()
         sent = bench.driver.stats.commands_sent
+        for bad in [(math.nan, 0.0), (0.0, math.inf), (0.0, -math.inf)]:
+            self.assert_refused(bench, WheelCommand(*bad, 0.1))
+        for valid_for_s in (math.nan, 0.0, -1.0):
+            self.assert_refused(bench, WheelCommand(0.0, 0.0, valid_for_s))
+        assert bench.driver.stats.commands_sent == sent
+
+    def assert_refused(self, bench, command):
         with pytest.raises(ValueError, match="not a wheel command"):
             bench.driver.transmit(bench.now_ns, command)
-        assert bench.driver.stats.commands_sent == sent
 
     def test_released_the_wheels_roll_out_without_a_ramp_and_the_reason_is_a_fault_until_a_reset(self, bench):
         bench.drive(0.6, FORWARD)
@@ -248,7 +243,7 @@ class DriverConformance:
         bench.run(0.02)
         assert bench.driver.state is DriverState.FAULT
         assert "the left wheel does not count" in bench.driver.detail
-        bench.run(2.0)
+        bench.run(1.0)
         assert bench.robot.speed_rad_s == pytest.approx(0.0, abs=0.05)
         assert not bench.robot.armed
         bench.request(Request.ARM).run(0.5)

@@ -1,11 +1,11 @@
 """AgileX's frames: those of the manual, what is refused, and that no frame breaks the decoder."""
 
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.motor import agilex_protocol as protocol
 from drivers.types import Frame
+from tests.tables import examples
 
 
 def test_a_motion_command_is_in_thousandths():
@@ -49,6 +49,6 @@ def test_a_29_bit_frame_is_none():
     assert protocol.decode(Frame(0x211, bytes(8), extended=True)) is None
 
 
-@given(st.integers(0, 0x7FF), st.binary(max_size=8), st.booleans())
+@examples(quick=40, every=100, can_id=st.integers(0, 0x7FF), data=st.binary(max_size=8), extended=st.booleans())
 def test_no_frame_breaks_the_decoder(can_id, data, extended):
     protocol.decode(Frame(can_id, data, extended))

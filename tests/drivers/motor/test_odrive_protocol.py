@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from drivers.motor import odrive_protocol as protocol
 from drivers.motor.odrive_protocol import Generation
 from drivers.types import Frame
+from tests.tables import examples
 
 V05, V06 = Generation.V05, Generation.V06
 
@@ -61,7 +62,14 @@ def test_a_parameter_is_read_only_from_the_answer_to_its_own_endpoint():
     assert protocol.parameter(response, 4, 0x102, "f32") is None
 
 
-@given(st.integers(0, 0x7FF), st.binary(max_size=8), st.sampled_from(Generation), st.booleans())
+@examples(
+    quick=40,
+    every=100,
+    can_id=st.integers(0, 0x7FF),
+    data=st.binary(max_size=8),
+    generation=st.sampled_from(Generation),
+    extended=st.booleans(),
+)
 def test_no_frame_breaks_the_decoder(can_id, data, generation, extended):
     decoded = protocol.decode(generation, Frame(can_id, data, extended))
     assert decoded is None or (decoded.node == can_id >> 5 and len(data) == 8)

@@ -2,7 +2,6 @@
 
 import itertools
 
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.motor.reference import ReferenceDriver
@@ -10,6 +9,7 @@ from drivers.types import DriverState, Frame, ReceivedFrame, Request, WheelComma
 from firmware_protocol import protection
 from firmware_protocol.codec import PROTOCOL, Codec
 from tests.drivers.motor.bench import MS, START_NS
+from tests.tables import examples
 
 CODEC = Codec()
 
@@ -35,8 +35,7 @@ ACTION = st.one_of(
 )
 
 
-@settings(max_examples=300, deadline=None)
-@given(st.lists(ACTION, max_size=60))
+@examples(quick=80, every=300, actions=st.lists(ACTION, max_size=60))
 def test_whatever_comes_nothing_is_raised_and_nothing_moves_unless_armed(actions):
     driver = ReferenceDriver(CODEC, itertools.count(3).__next__)
     now_ns = START_NS

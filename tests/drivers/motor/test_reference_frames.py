@@ -1,10 +1,10 @@
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.motor.reference_frames import SLOW_TIMEOUT_NS, TIMEOUT_NS, FrameReception, FrameTransmission
 from drivers.types import Frame, ReceivedFrame
 from firmware_protocol.codec import PROTOCOL, Codec
+from tests.tables import examples
 
 CODEC = Codec()
 MS = 1_000_000
@@ -126,14 +126,16 @@ def test_slow_messages_may_be_silent_for_longer():
     assert [reception.accept(frame) is not None for frame in frames] == [False, False, False, True]
 
 
-@given(
-    st.lists(
+@examples(
+    quick=40,
+    every=100,
+    frames=st.lists(
         st.tuples(
             st.one_of(st.integers(0, 0x7FF), st.sampled_from([layout.can_id for layout in PROTOCOL.messages])),
             st.binary(max_size=64),
         ),
         max_size=30,
-    )
+    ),
 )
 def test_nothing_that_arrives_makes_it_raise_and_everything_is_counted(frames):
     reception = FrameReception(CODEC)

@@ -1,7 +1,6 @@
 import math
 
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.device_clock import DeviceClock
@@ -19,7 +18,7 @@ from drivers.motor.reference_frames import (
     WheelTicks,
 )
 from firmware_protocol.codec import Decoded
-from tests.tables import thinned
+from tests.tables import examples, thinned
 
 MS = 1_000_000
 BOOT_NS = 777 * MS
@@ -69,7 +68,7 @@ def pose(to, t_ns, received_ns, *, valid=1, yaw=0.5):
     return to.pose(Decoded("POSE_HEADING", 0, 3, heading), received_ns)
 
 
-@given(now_ms=st.integers(10_000, 10**9), age_ms=st.integers(0, 250))
+@examples(quick=30, every=100, now_ms=st.integers(10_000, 10**9), age_ms=st.integers(0, 250))
 def test_a_sample_is_stamped_with_its_measurement_whatever_its_delay(now_ms, age_ms):
     now_ns = now_ms * MS
     sample = wheels(create_telemetry(now_ns), 0, now_ns - age_ms * MS, now_ns)
@@ -157,7 +156,9 @@ def ticks_of(speed_rad_s, elapsed_ms):
     return int(speed_rad_s * elapsed_ms * 1e-3 / (2 * math.pi) * TICKS_PER_REV)
 
 
-@given(
+@examples(
+    quick=30,
+    every=100,
     start_ms=st.integers(0, 10**7),
     steps=st.lists(st.tuples(st.integers(10, 4000), st.integers(0, 40)), min_size=1, max_size=20),
 )
@@ -264,7 +265,9 @@ def wheel_ticks():
     return WheelTicks(TICKS_PER_REV, MAX_SPEED)
 
 
-@given(
+@examples(
+    quick=30,
+    every=100,
     start=st.tuples(st.integers(0, TICKS_MODULUS - 1), st.integers(0, TICKS_MODULUS - 1)),
     steps=st.lists(st.tuples(st.integers(-LIMIT, LIMIT), st.integers(-LIMIT, LIMIT)), max_size=60),
 )
@@ -278,16 +281,18 @@ def test_plausible_steps_add_up_wherever_the_ring_is_and_whichever_way_it_turns(
         assert angles == ((left - start[0]) * PER_TICK, (right - start[1]) * PER_TICK)
 
 
-@thinned("step", [LIMIT, -LIMIT], quick=1)
-def test_once_round_the_whole_ring(step):
+@thinned(("step", "periods"), [(50 * LIMIT, 60), (LIMIT, 1), (-LIMIT, 1)], quick=1)
+def test_once_round_the_whole_ring(step, periods):
     ticks = wheel_ticks()
     count = TICKS_MODULUS // abs(step) + 10
     for number in range(count + 1):
-        angles = ticks.update(number * step % TICKS_MODULUS, 0, number * PERIOD_US)
+        angles = ticks.update(number * step % TICKS_MODULUS, 0, number * periods * PERIOD_US)
     assert angles == (count * step * PER_TICK, 0.0)
 
 
-@given(
+@examples(
+    quick=30,
+    every=100,
     jump=st.integers(LIMIT + 1, TICKS_MODULUS - LIMIT - 1),
     start=st.integers(0, TICKS_MODULUS - 1),
     wheel=st.sampled_from([0, 1]),

@@ -36,7 +36,7 @@ def test_it_objects_to_late_commands_and_to_silence_and_forgets_at_rest():
 
 
 @thinned("rate_hz", [50, 20, 100], quick=1)
-@pytest.mark.parametrize("growth", [0.05, 0.2, 1.0, 3.0])
+@thinned("growth", [0.05, 0.2, 1.0, 3.0], quick=2)
 def test_commands_that_come_later_and_later_disarm(growth, rate_hz):
     bench = create_bench(rate_hz=rate_hz).drive(1.0, (3.0, 3.0))
     begin_ns = bench.now_ns
@@ -51,7 +51,7 @@ def test_commands_that_come_later_and_later_disarm(growth, rate_hz):
     while bench.robot.armed:
         bench.step()
         assert bench.now_ns - gave_up_ns < under_way_ns + 110 * MS
-    bench.run(5.0)
+    bench.run(1.0)
     assert not bench.robot.armed
     assert bench.robot.speed_rad_s == 0.0
 
@@ -68,7 +68,7 @@ def test_it_says_so_and_counts():
 
 def test_a_link_that_is_slow_but_not_slower_and_slower_does_not_disarm():
     bench = create_bench(lag_ns=lambda now_ns: 60 * MS, delay_ns=lambda generator: generator.uniform(2, 25) * MS)
-    bench.drive(20.0, (3.0, 3.0))
+    bench.drive(8.0, (3.0, 3.0))
     assert bench.driver.state is DriverState.ARMED
     assert bench.driver.stats.late_commands == 0
 
@@ -76,7 +76,7 @@ def test_a_link_that_is_slow_but_not_slower_and_slower_does_not_disarm():
 @thinned("rate_hz", [50, 20, 100], quick=1)
 def test_lost_frames_are_no_lateness(rate_hz):
     bench = create_bench(rate_hz=rate_hz, loses=lambda generator: generator.random() < (0.02 if rate_hz == 20 else 0.2))
-    bench.drive(20.0, (3.0, 3.0))
+    bench.drive(8.0, (3.0, 3.0))
     assert bench.driver.stats.late_commands == 0
 
 

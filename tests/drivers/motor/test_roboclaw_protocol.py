@@ -1,10 +1,10 @@
 """RoboClaw's bytes: computed examples, what belongs to which question, and that no reply breaks the decoder."""
 
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.motor import roboclaw_protocol as protocol
+from tests.tables import examples
 
 
 def test_a_command_of_both_speeds():
@@ -45,7 +45,7 @@ def test_an_address_that_no_board_has_is_refused():
         protocol.query(0x7F, "status")
 
 
-@given(st.binary(max_size=60), st.sampled_from(sorted(protocol.GETTERS)))
+@examples(quick=40, every=100, received=st.binary(max_size=60), name=st.sampled_from(sorted(protocol.GETTERS)))
 def test_no_reply_breaks_the_decoder(received, name):
     read = protocol.reply(0x80, name, received)
     assert read is None or read[1] <= len(received)

@@ -14,7 +14,7 @@ from tests.drivers.motor.bench import FORWARD, IDLE_STATES, START_NS
 from tests.drivers.motor.vendors import VENDORS
 from tests.tables import thinned
 
-COASTING_S = 2.5
+COASTING_S = 1.0
 
 
 # Of several boards with one driver all are tried by `make test-all`; of the quick ones, each driver has its first.
@@ -30,7 +30,7 @@ def vendor(request):
 
 @pytest.fixture
 def bench(vendor):
-    bench = vendor.bench()
+    bench = vendor.bench(coasting_s=0.2)
     yield bench
     assert not [frame for frame in bench.robot.received if vendor.is_forbidden(frame)]
 
@@ -43,14 +43,14 @@ def no_wheel_is_driven(bench):
     return all(wheel in (None, 0.0) for wheel in bench.robot.controller.wheels_rad_s)
 
 
-def drive(bench, seconds=1.0):
+def drive(bench, seconds=0.5):
     bench.drive(seconds, FORWARD)
     assert bench.robot.speed == pytest.approx(FORWARD, abs=0.02)
 
 
 def test_nothing_that_moves_is_sent_before_arming(vendor, bench):
     bench.command = command(*FORWARD)
-    bench.run(2.0)
+    bench.run(1.0)
     assert bench.driver.state in IDLE_STATES
     assert bench.largest_speed == 0.0
     bench.request(Request.READY).run(1.0)
@@ -60,7 +60,7 @@ def test_nothing_that_moves_is_sent_before_arming(vendor, bench):
 
 def test_a_controller_that_is_not_there_is_waited_for(vendor):
     bench = vendor.bench(loses=lambda _random: True)
-    bench.run(2.0)
+    bench.run(1.0)
     assert bench.driver.state is DriverState.HANDSHAKE
     assert bench.driver.identity is bench.driver.limits is None
     assert len(bench.driver.detail) > 10
@@ -69,7 +69,7 @@ def test_a_controller_that_is_not_there_is_waited_for(vendor):
 def test_armed_the_wheels_follow_and_the_samples_say_so(bench):
     bench.arm()
     assert bench.largest_speed == 0.0, "arming alone moves nothing"
-    bench.run(2.0, FORWARD)
+    bench.run(1.0, FORWARD)
     last = bench.wheels[-1]
     assert (last.left_speed_rad_s, last.right_speed_rad_s) == pytest.approx(FORWARD, abs=0.02)
     for wheel, name in enumerate(("left_angle_rad", "right_angle_rad")):
@@ -99,17 +99,7 @@ def test_it_says_who_it_is_and_of_each_limit_whether_it_was_reported_or_declared
     assert all(limit.value > 0.0 for limit in limits.known().values())
 
 
-def test_a_silent_host_is_stopped_by_the_controller_and_nothing_moves_when_it_is_back(vendor, bench):
-    drive(bench)
-    bench.host_runs = False
-    bench.run(vendor.watchdog_s + COASTING_S)
-    assert bench.robot.speed_rad_s < 0.05
-    bench.host_runs = True
-    assert bench.largest_speed_in(3.0) < 0.05
-    assert bench.driver.state in (*IDLE_STATES, DriverState.FAULT)
-
-
-def test_the_wheels_are_driven_no_longer_than_the_safety_card_says(vendor, bench):
+def test_a_silent_host_is_stopped_as_soon_as_the_safety_card_says_and_nothing_moves_when_it_is_back(vendor, bench):
     card = find_driver(vendor.name).safety_card(vendor.settings)
     drive(bench)
     bench.host_runs, last_ns = False, bench.now_ns
@@ -122,6 +112,9 @@ def test_the_wheels_are_driven_no_longer_than_the_safety_card_says(vendor, bench
     assert card.reaction_s < driven_s + 0.03 or vendor.name == "ros2_base", "where bridge and network fail together"
     bench.run(COASTING_S)
     assert bench.robot.speed_rad_s < 0.05
+    bench.host_runs = True
+    assert bench.largest_speed_in(1.5) < 0.05
+    assert bench.driver.state in (*IDLE_STATES, DriverState.FAULT)
 
 
 def test_a_host_that_was_frozen_blames_itself_and_not_a_controller_whose_replies_it_has_not_read_yet(vendor, bench):
@@ -185,7 +178,7 @@ def test_asked_to_stand_by_after_a_pause_it_does_not_ramp_down_from_where_it_was
     bench.run(vendor.watchdog_s + COASTING_S)
     bench.driver.request(Request.STANDBY)
     bench.host_runs = True
-    assert bench.largest_speed_in(2.0) < 0.05
+    assert bench.largest_speed_in(1.0) < 0.05
 
 
 def test_without_commands_the_controllers_watchdog_is_not_fed(vendor, bench):
@@ -194,7 +187,7 @@ def test_without_commands_the_controllers_watchdog_is_not_fed(vendor, bench):
     bench.command = None
     bench.run(vendor.watchdog_s + COASTING_S)
     assert bench.robot.speed_rad_s < 0.05
-    bench.run(2.0, FORWARD)
+    bench.run(1.0, FORWARD)
     assert bench.robot.speed_rad_s < 0.05
     assert bench.driver.state is not DriverState.ARMED
 
@@ -214,7 +207,7 @@ def test_disarming_ramps_down_and_says_so_until_it_stands(bench):
 def test_an_arming_that_is_taken_back_moves_nothing(bench):
     bench.run_until(*IDLE_STATES)
     bench.request(Request.ARM).run(0.05, FORWARD)
-    bench.request(Request.STANDBY).run(2.0, FORWARD)
+    bench.request(Request.STANDBY).run(1.0, FORWARD)
     assert bench.driver.state in IDLE_STATES
     assert bench.largest_speed == 0.0
 
@@ -238,7 +231,7 @@ def test_an_error_cleared_does_not_energise_again(vendor, bench):
     bench.run(COASTING_S)
     vendor.mend(bench.robot)
     bench.request(Request.RESET).run_until(*IDLE_STATES)
-    assert bench.largest_speed_in(2.0, FORWARD) < 0.05
+    assert bench.largest_speed_in(1.0, FORWARD) < 0.05
     bench.drive(0.5, FORWARD)
     assert bench.robot.speed == pytest.approx(FORWARD, abs=0.02)
 
@@ -264,11 +257,11 @@ def test_the_emergency_stop_stops_in_every_state(vendor, bench, when):
     assert bench.robot.speed_rad_s < 0.05
     assert bench.driver.state is DriverState.ESTOP
     bench.driver.request(Request.ARM)
-    assert bench.largest_speed_in(2.0) < 0.05
+    assert bench.largest_speed_in(1.0) < 0.05
     assert bench.driver.state is DriverState.ESTOP
     vendor.mend(bench.robot)
     bench.request(Request.RESET).run_until(*IDLE_STATES)
-    bench.run(2.0)
+    bench.run(1.0)
     assert bench.largest_speed < 0.05
 
 
@@ -312,7 +305,7 @@ def test_a_line_unplugged_stops_the_robot_and_reconnection_never_arms(vendor, be
     assert bench.robot.speed_rad_s < 0.05
     bench.driver.request(Request.ARM)
     bench.host_end.plug(True)
-    assert bench.largest_speed_in(3.0, FORWARD) < 0.05
+    assert bench.largest_speed_in(1.5, FORWARD) < 0.05
     assert bench.driver.state in (*IDLE_STATES, DriverState.FAULT)
     assert bench.wheels[-1].left_angle_rad > 1.0, "the angles go on from where they were"
 
@@ -324,7 +317,7 @@ def test_an_emergency_stop_is_latched_although_the_line_was_out_when_it_was_aske
     bench.send_estop()
     bench.run(COASTING_S)
     bench.host_end.plug(True)
-    bench.run(3.0)
+    bench.run(1.5)
     assert bench.driver.state is DriverState.ESTOP
     bench.driver.request(Request.ARM)
     assert bench.largest_speed_in(1.0, FORWARD) < 0.05
@@ -342,7 +335,7 @@ def test_a_fault_is_latched_although_the_line_was_out_since(vendor, bench):
     bench.run(0.5)
     bench.robot.controller.restart()
     bench.host_end.plug(True)
-    bench.run(2.2)
+    bench.run(1.2)
     assert (bench.driver.state, bench.driver.detail) == (DriverState.FAULT, why)
     bench.driver.request(Request.ARM)
     assert bench.largest_speed_in(0.2, FORWARD) < 0.05
@@ -367,15 +360,7 @@ def test_a_brown_out_disarms_and_nothing_moves_after_it(bench):
     bench.robot.controller.restart()
     bench.run(COASTING_S)
     assert bench.driver.state is not DriverState.ARMED
-    assert bench.largest_speed_in(2.0, FORWARD) < 0.05
-
-
-def test_telemetry_that_stops_while_armed_is_a_lost_controller(vendor, bench):
-    drive(bench)
-    bench.robot.drain = list
-    bench.run(1.0, FORWARD)
-    assert bench.driver.state is not DriverState.ARMED
-    assert not [frame for frame in bench.robot.received[-4:] if vendor.is_motion(frame)]
+    assert bench.largest_speed_in(1.0, FORWARD) < 0.05
 
 
 def test_another_host_on_the_link_disarms_and_is_named(vendor, bench):
@@ -394,7 +379,7 @@ def test_garbage_is_counted_never_raises_and_never_moves_faster(bench):
     generator = random.Random(5)
     bench.arm()
     bench.command = command(*FORWARD)
-    for _ in range(2000):
+    for _ in range(1000):
         can_id = generator.randrange(0x800)
         bench.inject_to_host(can_id, generator.randbytes(generator.choice((0, 1, 7, 8, 8))))
         bench.step()
@@ -403,31 +388,32 @@ def test_garbage_is_counted_never_raises_and_never_moves_faster(bench):
     assert bench.driver.stats.unknown_id
 
 
-@pytest.mark.parametrize("bad", [(math.nan, 0.0), (0.0, math.inf), (0.0, -math.inf)])
-def test_a_command_that_is_none_is_the_callers_error(bench, bad):
+def test_a_command_that_is_none_is_the_callers_error(bench):
     bench.arm()
     sent = bench.driver.stats.commands_sent
-    with pytest.raises(ValueError, match="not a wheel command"):
-        bench.driver.transmit(bench.now_ns, command(*bad))
-    assert bench.driver.stats.commands_sent == sent
+    for bad in [(math.nan, 0.0), (0.0, math.inf), (0.0, -math.inf)]:
+        with pytest.raises(ValueError, match="not a wheel command"):
+            bench.driver.transmit(bench.now_ns, command(*bad))
+        assert bench.driver.stats.commands_sent == sent, bad
 
 
 def test_it_arms_again_only_on_request(bench):
     drive(bench)
     sessions = bench.driver.stats.sessions
-    bench.request(Request.READY).run(3.0, FORWARD)
+    bench.request(Request.READY).run(1.5, FORWARD)
     assert bench.robot.speed_rad_s < 0.05
     bench.arm()
     assert bench.driver.stats.sessions == sessions + 1
     assert bench.now_ns > START_NS
 
 
-def test_a_controller_that_fell_silent_while_it_drove_is_a_fault_until_a_reset_though_it_is_back(bench):
+def test_a_controller_that_fell_silent_while_it_drove_is_a_fault_until_a_reset_though_it_is_back(vendor, bench):
     drive(bench)
     drain = bench.robot.drain
     bench.robot.drain = lambda: drain() and []
-    bench.run(COASTING_S)
+    bench.run(COASTING_S, FORWARD)
     assert bench.driver.state is DriverState.FAULT
+    assert not [frame for frame in bench.robot.received[-4:] if vendor.is_motion(frame)]
     bench.robot.drain = drain
     bench.run(1.0)
     assert bench.driver.state is DriverState.FAULT
@@ -441,7 +427,7 @@ def test_an_emergency_stop_is_not_reset_while_nothing_is_heard_of_the_controller
     bench.run(COASTING_S)
     drain = bench.robot.drain
     bench.robot.drain = lambda: drain() and []
-    bench.run(COASTING_S)
+    bench.run(2.5)
     bench.request(Request.RESET).run(1.0)
     assert bench.driver.state is DriverState.ESTOP
     bench.robot.drain = drain

@@ -13,19 +13,19 @@ from sim.can_protocol import CanFrame
 from tests.drivers.motor.bench import FORWARD, IDLE_STATES
 from tests.drivers.motor.vendors import VENDORS
 
-COASTING_S = 2.5
+COASTING_S = 1.0
 PHASES = ("start", "arm", "run", "stop", "again", "fault", "reset", "reconnect", "estop", "after")
 SUMS = {
-    "odrive-0.6": "73f18e 13b82a e58728 0b1fbe d1d1f9 cc7cf9 c96b0a 7e7921 4981ca 530ff3",
-    "odrive-0.5": "f8fb0e 7a818c 4742e8 863b53 38186c 2ad8f0 ae4b7b 96e2a2 b94637 89b496",
-    "odrive-four-axes": "622062 8dc6fb 0b1527 49a5af 6054b9 83345d 0b6448 1bf6e1 519218 bb3ecd",
-    "vesc": "33fa55 1784b8 a84447 0c04fe b3efc0 f48e63 1edab4 c12f15 c920f5 31b8b2",
-    "vesc-four-braking": "abb1d5 22f891 0d471e 5b2f7f 9bcf26 cb5f6a 00beac 351d32 16921a 5039dc",
-    "vesc-uart": "5ccdae 20cbc8 ee78c3 45676a e55985 0207b0 4d268f 85df41 218ce9 9f845f",
-    "agilex": "e3b0c4 2d8bed 25fe17 bf6f49 ddae68 2650d2 a1a661 1df61c 52fd3f e3b0c4",
-    "roboclaw": "6e0c07 cfe96a 90c18e 36a953 49fbbb 3e1653 09f34c 18e5cc 54503c fce227",
-    "roboclaw-a-board-a-side": "a0866e 68a16a 241b5a 3728ce 0bc9c3 160366 877c7f aa6233 475c97 ba2d7a",
-    "ros2-base": "e3b0c4 1450c4 22d636 e0adb8 044fb4 a3d951 e3b0c4 c0479d 92ef1b fc4d1f",
+    "odrive-0.6": "73f18e 13b82a e58728 60e036 e0b0ee 0fbfb3 1a72f2 ed1764 9c195a 6324af",
+    "odrive-0.5": "f8fb0e 7a818c 4742e8 86d68f 14437b 808aa8 8e5c8c 8afb1f 6edc79 00101a",
+    "odrive-four-axes": "622062 8dc6fb 0b1527 02619d 87eaac 702f0f 1ca3bb 6c4842 fbd769 2888d5",
+    "vesc": "33fa55 1784b8 a84447 f6adb1 2f2111 89c776 144b0f a7c6d0 0e9a7b eec893",
+    "vesc-four-braking": "abb1d5 22f891 0d471e 557862 5c4d8f 91bd08 ca59f9 aad34b 9972fe 13e3a5",
+    "vesc-uart": "5ccdae 20cbc8 ee78c3 73172c 060d59 9abb33 628638 8b6f63 f5e4b9 07af09",
+    "agilex": "e3b0c4 2d8bed 25fe17 bf6f49 350532 9a3dd8 c7c7a0 6a8174 53ecac e3b0c4",
+    "roboclaw": "6e0c07 cfe96a 90c18e be1b94 944ebe f2ac0d 7ac8c9 94f426 c6c7d4 fb0445",
+    "roboclaw-a-board-a-side": "a0866e 68a16a 241b5a bd0254 e0ba41 d2280f f93b2b 0cbba8 be8730 92b359",
+    "ros2-base": "e3b0c4 1450c4 22d636 e0adb8 255f60 81ad5e e3b0c4 186d20 3f0143 272f2d",
 }
 """SHA-256 of each phase's frames, its first six digits."""
 
@@ -35,7 +35,7 @@ class Recorded:
 
     def __init__(self, vendor):
         self.phases = []
-        self.bench = vendor.bench()
+        self.bench = vendor.bench(coasting_s=0.2)
         driver = self.bench.driver
         transmit, estop = driver.transmit, driver.estop
         driver.transmit = lambda now_ns, command: self.keep(now_ns, transmit(now_ns, command))

@@ -1,11 +1,11 @@
 """VESC's frames and packets: the examples of its documentation, what is refused, and that no bytes break a decoder."""
 
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.motor import vesc_codec as codec
 from drivers.types import Frame
+from tests.tables import examples
 
 
 def test_the_documented_frames():
@@ -69,7 +69,7 @@ def test_a_payload_that_no_packet_holds_is_refused(length):
         codec.packet(bytes(length))
 
 
-@given(st.binary(max_size=60))
+@examples(quick=40, every=100, noise=st.binary(max_size=60))
 def test_noise_costs_no_later_packet(noise):
     decoder = codec.PacketDecoder()
     decoder.feed(noise)
@@ -78,7 +78,14 @@ def test_noise_costs_no_later_packet(noise):
     assert decoder.feed(codec.packet(b"\x1e")) == [b"\x1e"]
 
 
-@given(st.integers(0, 2**29 - 1), st.binary(max_size=8), st.booleans(), st.binary(max_size=80))
+@examples(
+    quick=40,
+    every=100,
+    can_id=st.integers(0, 2**29 - 1),
+    data=st.binary(max_size=8),
+    extended=st.booleans(),
+    payload=st.binary(max_size=80),
+)
 def test_no_bytes_break_a_decoder(can_id, data, extended, payload):
     frame = Frame(can_id, data, extended)
     codec.decode(frame)

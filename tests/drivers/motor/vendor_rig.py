@@ -6,17 +6,18 @@ from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_protocol import CanFrame
 
 TICKS_PER_REV = 4096
-COASTING_S = 0.5
+TICKS_PER_RAD = TICKS_PER_REV / (2.0 * math.pi)
 START_NS = 50_000 * 1_000_000
 
 
 class VendorRig:
     """What `bench.Bench` steps; `controller` of `sim.devices`. `stuck`: sides that roll whatever is asked.
 
-    `exchange`: of a driver on a half-duplex line, where each request gets the reply that belongs to it.
+    `exchange`: of a driver on a half-duplex line, where each request gets the reply that belongs to it. `coasting_s`:
+    in what time a released wheel loses all but 1/e of its speed.
     """
 
-    def __init__(self, controller, exchange=None):
+    def __init__(self, controller, exchange=None, coasting_s=0.5):
         self.controller = controller
         self.exchange = exchange
         self.speed = [0.0, 0.0]
@@ -24,11 +25,13 @@ class VendorRig:
         self.pressed = False
         self.received = []
         self._outgoing = []
+        self._kept = math.exp(-1e-3 / coasting_s)
         self.stuck = set()
 
     @property
     def speed_rad_s(self):
-        return max(map(abs, self.speed))
+        left, right = self.speed
+        return max(abs(left), abs(right))
 
     def receive(self, now_ns, frame):
         self.received.append(frame)
@@ -45,12 +48,11 @@ class VendorRig:
             if target_rad_s is not None and side not in self.stuck:
                 self.speed[side] = target_rad_s
             else:
-                self.speed[side] *= math.exp(-1e-3 / COASTING_S)
+                self.speed[side] *= self._kept
             self.angle[side] += 1e-3 * self.speed[side]
-        ticks = [round(angle / (2 * math.pi) * TICKS_PER_REV) for angle in self.angle]
         inputs = FirmwareInputs(
-            left_ticks=ticks[0],
-            right_ticks=ticks[1],
+            left_ticks=round(self.angle[0] * TICKS_PER_RAD),
+            right_ticks=round(self.angle[1] * TICKS_PER_RAD),
             left_speed_rad_s=self.speed[0],
             right_speed_rad_s=self.speed[1],
             estop_button=self.pressed,

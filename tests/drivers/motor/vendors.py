@@ -45,10 +45,10 @@ class Vendor:
         driver = find_driver(self.name)
         return msgspec.convert({**tomllib.loads(driver.example), **tomllib.loads(self.changes)}, driver.settings)
 
-    def bench(self, **options):
+    def bench(self, coasting_s=0.5, **options):
         controller = find_controller(self.name)(self.settings, TICKS_PER_REV)
         exchange = find_driver(self.name).exchange(self.settings) if self.is_serial else None
-        rig = VendorRig(controller, exchange)
+        rig = VendorRig(controller, exchange, coasting_s)
         return Bench(create_driver(self.name, self.settings), rig, **options)
 
     def __str__(self):

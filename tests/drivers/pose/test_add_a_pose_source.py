@@ -81,9 +81,14 @@ def test_the_default_source_is_the_motor_controller():
 
 def test_no_other_file_names_a_pose_source():
     files = [file for top in ("disco_hw", "drivers") for file in (ROOT / top).rglob("*.py")]
-    quoted = {name: re.compile(rf"""(?i)(source|SOURCE)\b.{{0,20}}["']{name}["']""") for name in pose_sources()}
+    texts = {str(file.relative_to(ROOT)): file.read_text(encoding="utf-8") for file in files}
+    quoted = {name: re.compile(rf"""["']{name}["']""") for name in pose_sources()}
     named = {
-        name: [str(file.relative_to(ROOT)) for file in files if pattern.search(file.read_text(encoding="utf-8"))]
+        name: [
+            file
+            for file, text in texts.items()
+            if any(re.search(r"(?i)source\b.{0,20}$", text[: found.start()][-40:]) for found in pattern.finditer(text))
+        ]
         for name, pattern in quoted.items()
     }
     assert named == {name: [f"drivers/pose/{name}.py"] for name in pose_sources()}

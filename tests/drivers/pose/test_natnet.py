@@ -8,13 +8,13 @@ import socket
 import struct
 
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from drivers.pose import PoseSourceError, create_pose_source
 from drivers.pose.natnet import VERSIONS, parse_frame, plane_pose
 from tests.drivers.pose.test_nmea import until
+from tests.tables import examples
 
 # Turned by 0.7 rad about Motive's upward axis y, at 1.5 m along x and 2 m towards the viewer (z).
 TURNED = (0.0, math.sin(0.35), 0.0, math.cos(0.35))
@@ -125,8 +125,14 @@ def test_axes_that_are_z_up_already_stay():
     assert plane_pose(found.bodies[0], "z") == pytest.approx((1.0, -2.0, -0.8), abs=1e-6)
 
 
-@given(st.binary(max_size=300), st.sampled_from(list(VERSIONS.values())), st.integers(0, 400), st.binary(max_size=8))
-@settings(max_examples=200)
+@examples(
+    quick=60,
+    every=200,
+    datagram=st.binary(max_size=300),
+    version=st.sampled_from(list(VERSIONS.values())),
+    at=st.integers(0, 400),
+    change=st.binary(max_size=8),
+)
 def test_no_bytes_break_it(datagram, version, at, change):
     assert parse_frame(datagram, version) is None or datagram[:2] == b"\x07\x00"
     valid_frame = frame(version, [rigid_body(version, 3, (1.5, 0.1, -2.0), TURNED)])

@@ -40,6 +40,7 @@ from drivers.types import Frame, LinkState, OutgoingFrame
 from tests.drivers.transport.pseudo_terminal import PseudoTerminal
 from tests.drivers.waiting import collect, free_port, median_send_s, outgoing, send, wait_until
 from tests.sim.hub_process import HUB_PROCESS
+from tests.tables import examples
 
 
 @pytest.mark.parametrize(
@@ -120,7 +121,7 @@ def test_a_frame_that_was_not_sent_excuses_nothing(sent_frames):
     sent_frames.not_sent(B)
 
 
-@given(st.lists(st.tuples(st.sampled_from([A, B]), st.booleans()), max_size=40))
+@examples(quick=40, every=100, events=st.lists(st.tuples(st.sampled_from([A, B]), st.booleans()), max_size=40))
 def test_whoever_else_sends_is_heard_as_often_as_he_sends(events):
     """Echoes and another host's frames of the same contents, in any order: what is not excused is as many as his."""
     sent_frames = SentFrames()
