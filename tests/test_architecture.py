@@ -24,9 +24,17 @@ LOWER = {"sim": {"drivers", "firmware_protocol"}, "drivers": {"firmware_protocol
 OURS = {"disco_hw", "sim", "drivers", "firmware_protocol", "tests", "tools"}
 
 
+def statements(block: ast.AST) -> Iterator[ast.AST]:
+    """All statements of a block, and of the blocks in it."""
+    for name in ("body", "orelse", "finalbody", "handlers", "cases"):
+        for statement in getattr(block, name, ()):
+            yield statement
+            yield from statements(statement)
+
+
 def imports(file: Path) -> Iterator[str]:
     """Dotted names of the modules that a file imports, those in functions too."""
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for node in statements(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import gc
 import os
+import re
 import socket
 import tomllib
 from pathlib import Path
@@ -227,12 +228,14 @@ READING = {
     "np.fromfile",
 }
 METHODS = {"read_text", "read_bytes"}
+# Without one of these words a module reads no file, and need not be parsed.
+SUSPECT = re.compile("|".join({name.rpartition(".")[2] for name in READING | METHODS}))
 
 
 def reads(source: str) -> set[str]:
     """What of a module's text reads files, by the name that it is called by."""
     found = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(ast.parse(source)) if SUSPECT.search(source) else ():
         if not isinstance(node, ast.Call):
             continue
         name = ast.unparse(node.func)
