@@ -1,6 +1,4 @@
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -15,14 +13,13 @@ from disco_hw.runtime.robot_setup import setup_of_log
 from disco_hw.viewer.recording import Recording
 from tests.inference.drives import TICKS_PER_REV, write_log
 from tests.inference.test_infer_command import ROBOT
+from tests.log.importing.commands import call
 from tests.log.importing.test_candump import dumped
 
 
 def test_a_csv_file_becomes_a_log_with_the_robots_file_in_it(robot, tmp_path):
     source, out = write_log(tmp_path / "log.csv", "poor"), tmp_path / "log.mcap"
-    command = [sys.executable, "-m", "disco_hw", "import", str(source), "--robot", str(robot), "-o", str(out), "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    reported = json.loads(done.stdout)
+    reported = json.loads(call("import", source, "--robot", robot, "-o", out, "--json"))
     with open_log(out) as log:
         assert log.attachment(ROBOT_TOML) == robot.read_bytes()
         assert sum(topic.count for topic in log.summary().topics.values()) >= reported["records"]
