@@ -3,6 +3,9 @@ from pathlib import Path
 
 import pytest
 
+from disco_hw.log import writer_link
+from tests.log.processes import ForkedKeeper
+
 
 @pytest.fixture(autouse=True)
 def runtime_root(monkeypatch):
@@ -10,3 +13,8 @@ def runtime_root(monkeypatch):
     with tempfile.TemporaryDirectory(prefix="dh-") as name:
         monkeypatch.setenv("XDG_RUNTIME_DIR", name)
         yield Path(name)
+
+
+@pytest.fixture
+def forked_keepers(monkeypatch):
+    monkeypatch.setattr(writer_link, "spawn_at_normal_priority", ForkedKeeper)

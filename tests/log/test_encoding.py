@@ -8,7 +8,8 @@ from jsonschema import Draft202012Validator
 
 from disco_hw.log.encoding import JsonDecoder, encode_json, json_schema
 from disco_hw.log.records import TOPICS, Estimate, Event, Task, topic_of
-from tools.log_samples import ANY_RECORD, bits
+from tests.log.any_record import ANY_RECORD
+from tools.log_samples import bits
 
 DECODER = JsonDecoder()
 VIEWER_TYPES = {"boolean", "string", "number", "integer", "object", "array"}

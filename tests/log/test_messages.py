@@ -10,7 +10,8 @@ from disco_hw.errors import InputError
 from disco_hw.files import MODEL_TOML, ROBOT_TOML
 from disco_hw.log import ENCODE_ERRORS, BatchDecoder, Frames, attachment, batch_encoder, frame, version
 from disco_hw.log.records import TOPICS, Estimate, Event, Plan
-from tools.log_samples import ANY_RECORD, bits
+from tests.log.any_record import ANY_RECORD
+from tools.log_samples import bits
 
 ENCODE = batch_encoder()
 DECODER = BatchDecoder()

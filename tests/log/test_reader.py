@@ -11,9 +11,9 @@ from disco_hw.log.reader import Gap, open_log
 from disco_hw.log.records import Counters, Estimate, Event, Innovation, Plan
 from disco_hw.runtime.replay import replay
 from disco_hw.viewer.recording import Recording
+from tests.log.any_record import ANY_RECORD
 from tests.tables import thinned
 from tools.log_samples import (
-    ANY_RECORD,
     ATTACHMENTS,
     PERIOD_NS,
     ROBOT_TOML,
