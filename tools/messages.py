@@ -56,12 +56,14 @@ def messages(root: Path = ROOT) -> list[Message]:
 _WITHOUT_TEXT = (ast.Name, ast.expr_context, ast.operator, ast.unaryop, ast.cmpop, ast.boolop)
 
 
-def in_python(source: str, name: str) -> Iterator[Message]:
+def in_python(source: str, name: str) -> list[Message]:
     """The texts of a module."""
-    yield from _texts(ast.parse(source), name, "said")
+    found: list[Message] = []
+    _add_texts(ast.parse(source), name, "said", found)
+    return found
 
 
-def _texts(node: ast.AST, name: str, kind: str) -> Iterator[Message]:
+def _add_texts(node: ast.AST, name: str, kind: str, found: list[Message]) -> None:
     if _is_bare_string(node):
         return
     if isinstance(node, ast.Raise):
@@ -73,11 +75,11 @@ def _texts(node: ast.AST, name: str, kind: str) -> Iterator[Message]:
     text = as_text(node)
     if text is not None:
         if _PROSE.search(text):
-            yield Message(_kind_in(name, kind), text, name, getattr(node, "lineno", 0))
+            found.append(Message(_kind_in(name, kind), text, name, getattr(node, "lineno", 0)))
         return
     for child in ast.iter_child_nodes(node):
         if not isinstance(child, _WITHOUT_TEXT):
-            yield from _texts(child, name, kind)
+            _add_texts(child, name, kind, found)
 
 
 def _is_bare_string(node: ast.AST) -> bool:
