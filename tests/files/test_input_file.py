@@ -239,8 +239,8 @@ READING = {
     "np.fromfile",
 }
 METHODS = {"read_text", "read_bytes"}
-# Without one of these words a module reads no file, and need not be parsed.
-SUSPECT = re.compile("|".join({name.rpartition(".")[2] for name in READING | METHODS}))
+# Without one of these calls a module reads no file, and need not be parsed.
+SUSPECT = re.compile(rf"\b(open|{'|'.join({name.rpartition('.')[2] for name in READING | METHODS})})\s*\(")
 
 
 def reads(source: str) -> set[str]:

@@ -42,13 +42,14 @@ def test_a_killed_writer_loses_no_more_than_what_came_since_the_last_flush(path)
     wait_until(lambda: recorder.poll().delivered_ticks > 100)
     written = recorder.poll().delivered_ticks * 7
     os.kill(recorder.writer_pid, signal.SIGKILL)
+    drive(recorder, 201, 10)
     wait_until(lambda: recorder.poll().writer_deaths == 1)
     recorder.close()
     with open_log(path) as log:
         assert not log.complete
         assert "the end is missing" in log.damage[-1]
         assert sum(log.counts.values()) >= written
-    assert recorded_ticks(path) + recorded_ticks(recorder.path) == list(range(1, 201))
+    assert recorded_ticks(path) + recorded_ticks(recorder.path) == list(range(1, 211))
 
 
 def test_when_the_recording_process_is_killed_the_file_is_finished_and_nothing_else_is_left(path, runtime_root):
