@@ -1,3 +1,4 @@
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 
@@ -211,17 +212,26 @@ ESTIMATE = (
 )
 
 
-def hostile(path, about=None, wheels=WHEELS % 5, log_time=10**18, estimate=ESTIMATE % 5):
-    """A log that no recorder of ours has written."""
+@contextmanager
+def written(path, about=None):
+    """A writer of a log that no recorder of ours has written."""
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
         writer.add_metadata("disco-hw", ABOUT | (about or {}))
-        channel = writer.register_channel("/wheels", "json", writer.register_schema("x", "jsonschema", b"{}"))
-        writer.add_message(channel, log_time, wheels.encode(), 0, 1)
-        channel = writer.register_channel("/estimate", "json", 0)
-        writer.add_message(channel, log_time, estimate.encode(), 0, 1)
+        yield writer
         writer.finish()
+
+
+def add(writer, topic, text, log_time=10**18):
+    channel = writer.register_channel(topic, "json", writer.register_schema("x", "jsonschema", b"{}"))
+    writer.add_message(channel, log_time, text.encode(), 0, 1)
+
+
+def hostile(path, about=None, wheels=WHEELS % 5, log_time=10**18, estimate=ESTIMATE % 5):
+    with written(path, about) as writer:
+        add(writer, "/wheels", wheels, log_time)
+        add(writer, "/estimate", estimate, log_time)
     return path
 
 
@@ -291,15 +301,10 @@ def test_a_record_nested_without_end_is_one_line(tmp_path):
 
 def test_thousands_of_channels_are_read(tmp_path):
     path = tmp_path / "run.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        writer.add_metadata("disco-hw", ABOUT)
+    with written(path) as writer:
         for k in range(5000):
-            channel = writer.register_channel(f"/other/{k}", "json", 0)
-        channel = writer.register_channel("/wheels", "json", writer.register_schema("x", "jsonschema", b"{}"))
-        writer.add_message(channel, 10**18, (WHEELS % 5).encode(), 0, 1)
-        writer.finish()
+            writer.register_channel(f"/other/{k}", "json", 0)
+        add(writer, "/wheels", WHEELS % 5)
     with open_log(path) as log:
         assert log.counts == {"/wheels": 1}
 
@@ -307,14 +312,9 @@ def test_thousands_of_channels_are_read(tmp_path):
 @pytest.mark.parametrize("end", [{"t_ns": "9" * 30}, {"sequence": "-1"}, {"sequence": "x"}, {"sequence": "9" * 30}, {}])
 def test_a_last_word_that_is_none_is_none(tmp_path, end):
     path = tmp_path / "run.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        writer.add_metadata("disco-hw", ABOUT | {"format": "2"})
+    with written(path, {"format": "2"}) as writer:
         writer.add_metadata("disco-hw-end", {"t_ns": "5", "sequence": "5", "dropped_ticks": "0"} | end if end else {})
-        channel = writer.register_channel("/wheels", "json", 0)
-        writer.add_message(channel, 10**18, (WHEELS % 5).encode(), 0, 1)
-        writer.finish()
+        add(writer, "/wheels", WHEELS % 5)
     with open_log(path) as log:
         assert (log.ending, log.summary().ended) == (None, False)
 

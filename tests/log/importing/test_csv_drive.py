@@ -198,12 +198,6 @@ def test_a_missing_file_and_one_that_is_no_text(tmp_path):
         read_csv(path)
 
 
-def test_windows_line_ends_and_a_byte_order_mark_are_read(tmp_path):
-    path = tmp_path / "w.csv"
-    path.write_bytes(b"\xef\xbb\xbf" + (HEADER + "\n" + rows(5)).replace("\n", "\r\n").encode())
-    assert read_csv(path).commands.t_s.size == 5
-
-
 CELLS = st.sampled_from(["", "0", "1.5", "-2", "nan", "1e400", "x", '"', "9" * 30, "\x00", "é"])
 
 
