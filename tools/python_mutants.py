@@ -315,7 +315,9 @@ def imported_by(path: Path) -> set[str]:
 
 def touched_by(name: str) -> set[str]:
     """Names of the project's modules that are there and import this one, if only through others; all tests."""
-    files = {one: module.__file__ for one, module in sys.modules.items() if one.partition(".")[0] in PROJECT}
+    # A library that cffi has loaded has no such name.
+    ours = {one: module for one, module in sys.modules.items() if one.partition(".")[0] in PROJECT}
+    files = {one: getattr(module, "__file__", None) for one, module in ours.items()}
     imports = {one: imported_by(Path(file)) for one, file in files.items() if file and file.endswith(".py")}
     touched = {name}
     while True:
