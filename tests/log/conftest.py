@@ -3,9 +3,6 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.log import writer_link
-from tests.log.processes import ForkedKeeper
-
 
 @pytest.fixture(autouse=True)
 def runtime_root(monkeypatch):
@@ -17,4 +14,8 @@ def runtime_root(monkeypatch):
 
 @pytest.fixture
 def forked_keepers(monkeypatch):
+    # Mutants of what these modules do when they are imported are tried where a test is the first to import them.
+    from disco_hw.log import writer_link
+    from tests.log.processes import ForkedKeeper
+
     monkeypatch.setattr(writer_link, "spawn_at_normal_priority", ForkedKeeper)
