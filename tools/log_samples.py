@@ -1,18 +1,16 @@
-"""Records to test with: plain ones, a driven tick, arbitrary ones, and logs made of them in memory."""
+"""Records to test with: plain ones, a driven tick, and logs made of them in memory."""
 
 import io
 import math
 import struct
-import typing
 from pathlib import Path
 
 import msgspec
-from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from disco_hw.log import Attachment, Start, batch_encoder
 from disco_hw.log.mcap_log import McapLog
-from disco_hw.log.records import TOPICS, Command, Counters, Estimate, Event, FrameIn, FrameOut, LoopTiming, Plan
+from disco_hw.log.records import Command, Counters, Estimate, Event, FrameIn, FrameOut, LoopTiming, Plan
 from drivers.types import PoseSample, WheelSample
 
 WALL_OFFSET_NS = 1_700_000_000_000_000_000
@@ -111,30 +109,3 @@ def bits(value):
     if hasattr(value, "t_ns"):
         return (type(value), bits(msgspec.to_builtins(value)))
     return value
-
-
-_STRATEGIES = {
-    int: st.integers(0, 2**62),
-    float: st.floats(),
-    bool: st.booleans(),
-    str: st.text(max_size=20) | st.sampled_from(["NaN", "Infinity", "-Infinity", "null", ""]),
-    bytes: st.binary(max_size=8),
-    tuple[float, ...]: st.lists(st.floats(), max_size=12).map(tuple),
-    tuple[str, ...]: st.lists(st.text(max_size=8), max_size=3).map(tuple),
-    dict[str, float]: st.dictionaries(st.text(max_size=8), st.floats(), max_size=4),
-    dict[str, int]: st.dictionaries(st.text(max_size=8), st.integers(-(2**62), 2**62), max_size=4),
-}
-
-
-def _of(annotation):
-    if typing.get_origin(annotation) is typing.Literal:
-        return st.sampled_from(typing.get_args(annotation))
-    return _STRATEGIES[annotation]
-
-
-def of_type(record_type):
-    """Any record of one type: all floats there are, NaN, infinities, -0.0 and subnormals among them."""
-    return st.builds(record_type, **{name: _of(hint) for name, hint in typing.get_type_hints(record_type).items()})
-
-
-ANY_RECORD = st.one_of([of_type(topic.record) for topic in TOPICS])

@@ -52,21 +52,19 @@ def messages(root: Path = ROOT) -> list[Message]:
     return sorted(found, key=lambda message: (order.index(message.kind), message.file, message.line))
 
 
-def in_python(source: str, name: str) -> Iterator[Message]:
+# Most nodes of a tree are one of these.
+_WITHOUT_TEXT = (ast.Name, ast.expr_context, ast.operator, ast.unaryop, ast.cmpop, ast.boolop)
+
+
+def in_python(source: str, name: str) -> list[Message]:
     """The texts of a module."""
-    tree = ast.parse(source)
-    docstrings = {
-        id(node.body[0].value)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
-        and node.body
-        and isinstance(node.body[0], ast.Expr)
-    }
-    yield from _texts(tree, name, "said", docstrings)
+    found: list[Message] = []
+    _add_texts(ast.parse(source), name, "said", found)
+    return found
 
 
-def _texts(node: ast.AST, name: str, kind: str, skipped: set[int]) -> Iterator[Message]:
-    if id(node) in skipped or _is_bare_string(node):
+def _add_texts(node: ast.AST, name: str, kind: str, found: list[Message]) -> None:
+    if _is_bare_string(node):
         return
     if isinstance(node, ast.Raise):
         kind = "refusal"
@@ -77,10 +75,11 @@ def _texts(node: ast.AST, name: str, kind: str, skipped: set[int]) -> Iterator[M
     text = as_text(node)
     if text is not None:
         if _PROSE.search(text):
-            yield Message(_kind_in(name, kind), text, name, getattr(node, "lineno", 0))
+            found.append(Message(_kind_in(name, kind), text, name, getattr(node, "lineno", 0)))
         return
     for child in ast.iter_child_nodes(node):
-        yield from _texts(child, name, kind, skipped)
+        if not isinstance(child, _WITHOUT_TEXT):
+            _add_texts(child, name, kind, found)
 
 
 def _is_bare_string(node: ast.AST) -> bool:

@@ -70,7 +70,7 @@ def without_commands(log: DriveLog) -> DriveLog:
 
 
 def of_another_drive(log: DriveLog) -> DriveLog:
-    other = sound(seed=901).poses
+    other = sound("circle", 901).poses
     columns = {name: getattr(other, name)[: log.poses.t_s.size] for name in ("x_m", "y_m", "yaw_rad")}
     times = {name: getattr(log.poses, name)[: columns["x_m"].size] for name in ("t_s", "segment")}
     return replace(log, poses=replace(log.poses, **columns, **times))

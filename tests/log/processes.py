@@ -1,15 +1,18 @@
 """Recording processes to kill: a process that records like the daemon does, and waiting for what it brings about."""
 
+import gc
 import os
 import resource
+import signal
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
 
+from disco_hw.log import writer
 from disco_hw.log.process_recorder import RecordingSettings
 from disco_hw.log.reader import open_log
 from tools.log_samples import ATTACHMENTS, tick
@@ -17,6 +20,7 @@ from tools.log_samples import ATTACHMENTS, tick
 _RECORD = """
 import sys, time
 from pathlib import Path
+from disco_hw.log import writer
 from disco_hw.log.process_recorder import ProcessRecorder
 from tests.log.processes import recording
 from tools.log_samples import tick
@@ -80,6 +84,40 @@ def drive(recorder, first, count, period_s=0.0):
         recorder.put(times[-1], tick(k, times[-1]))
         time.sleep(period_s)
     return times
+
+
+class ForkedKeeper:
+    """A keeper that is forked from this process, as to start Python and import its code costs more than most tests."""
+
+    stdout = None
+
+    def __init__(self, command, pass_fds=()):
+        self.pid = os.fork()
+        if self.pid == 0:
+            try:
+                self._keep(command, pass_fds)
+            finally:
+                os._exit(0)
+
+    @staticmethod
+    def _keep(command, pass_fds):
+        os.setsid()
+        for number in set(map(int, os.listdir("/proc/self/fd"))) - {1, 2, *pass_fds}:
+            with suppress(OSError):
+                os.close(number)
+        gc.freeze()
+        sys.argv = command[-3:]
+        writer.main()
+
+    def kill(self):
+        os.kill(self.pid, signal.SIGKILL)
+
+    def wait(self, timeout=60.0):
+        deadline_s = time.monotonic() + timeout
+        while not os.waitpid(self.pid, os.WNOHANG)[0]:
+            if time.monotonic() > deadline_s:
+                raise subprocess.TimeoutExpired("keeper", timeout)
+            time.sleep(0.001)
 
 
 class RecordingProcess:

@@ -5,7 +5,6 @@ import tracemalloc
 
 import pytest
 import zstandard
-from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
@@ -13,6 +12,7 @@ from mcap.writer import CompressionType, Writer
 from disco_hw.errors import LogError
 from disco_hw.log import Attachment, container
 from disco_hw.log.container import MAGIC, DamagedError, messages, read_attachment, read_chunk, read_contents
+from tests.tables import examples
 from tools.log_samples import ATTACHMENTS, drive_ticks, log_bytes
 
 COMPLETE_LOG = log_bytes(drive_ticks(120), flush_every=10)
@@ -77,9 +77,10 @@ def test_whatever_tenth_is_left_all_its_whole_chunks_are(tenth):
     assert not contents_of(COMPLETE_LOG[:cut]).complete
 
 
-def test_cut_anywhere_it_reads_or_is_refused():
+@pytest.mark.parametrize("step", [7, pytest.param(1, marks=pytest.mark.thorough)])
+def test_cut_anywhere_it_reads_or_is_refused(step):
     data = log_bytes(drive_ticks(3), attachments=())
-    for cut in [*range(40), *range(40, len(data) - 300, 61), *range(len(data) - 300, len(data))]:
+    for cut in [*range(40), *range(40, len(data) - 300, 61), *range(len(data) - 300, len(data), step)]:
         try:
             contents = contents_of(data[:cut])
         except LogError:
@@ -343,8 +344,10 @@ def read_all(data):
 SMALL = log_bytes(drive_ticks(20), flush_every=5)
 
 
-@settings(max_examples=300, deadline=None)
-@given(st.lists(st.tuples(st.integers(0, len(SMALL) - 1), st.binary(min_size=1, max_size=9)), min_size=1, max_size=4))
+CHANGE = st.tuples(st.integers(0, len(SMALL) - 1), st.binary(min_size=1, max_size=9))
+
+
+@examples(quick=80, every=300, changes=st.lists(CHANGE, min_size=1, max_size=4))
 def test_no_corruption_gets_more_than_one_error_out_of_it(changes):
     data = bytearray(SMALL)
     for at, new in changes:
@@ -355,8 +358,10 @@ def test_no_corruption_gets_more_than_one_error_out_of_it(changes):
         assert data[:8] != MAGIC
 
 
-@settings(max_examples=200, deadline=None)
-@given(st.lists(st.tuples(st.integers(0, 20), st.integers(0, 2**64 - 1) | st.integers(0, 80), st.binary(max_size=80))))
+RECORD = st.tuples(st.integers(0, 20), st.integers(0, 2**64 - 1) | st.integers(0, 80), st.binary(max_size=80))
+
+
+@examples(quick=60, every=200, records=st.lists(RECORD))
 def test_no_made_up_records_get_anything_out_of_it(records):
     read_all(MAGIC + b"".join(bytes([op]) + struct.pack("<Q", length) + content for op, length, content in records))
     read_all(MAGIC + b"".join(bytes([op]) + struct.pack("<Q", len(body)) + body for op, _, body in records))

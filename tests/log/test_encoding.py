@@ -3,18 +3,19 @@ import math
 
 import msgspec
 import pytest
-from hypothesis import given
 from jsonschema import Draft202012Validator
 
 from disco_hw.log.encoding import JsonDecoder, encode_json, json_schema
 from disco_hw.log.records import TOPICS, Estimate, Event, Task, topic_of
-from tools.log_samples import ANY_RECORD, bits
+from tests.log.any_record import ANY_RECORD
+from tests.tables import examples
+from tools.log_samples import bits
 
 DECODER = JsonDecoder()
 VIEWER_TYPES = {"boolean", "string", "number", "integer", "object", "array"}
 
 
-@given(ANY_RECORD)
+@examples(quick=40, every=100, record=ANY_RECORD)
 def test_every_record_comes_back_to_the_last_bit(record):
     back = DECODER.decode(topic_of(type(record)), encode_json(record))
     assert bits(back) == bits(record)
@@ -23,7 +24,7 @@ def test_every_record_comes_back_to_the_last_bit(record):
 VALIDATORS = {topic.name: Draft202012Validator(json.loads(json_schema(topic.record))) for topic in TOPICS}
 
 
-@given(ANY_RECORD)
+@examples(quick=40, every=100, record=ANY_RECORD)
 def test_every_record_is_strict_json_that_obeys_its_schema(record):
     def refuse(constant):
         raise AssertionError(f"{constant} is not JSON")

@@ -126,14 +126,23 @@ def test_what_is_no_log_is_refused(tmp_path, command):
 COMPLETE_LOG = log_bytes(drive_ticks(300), flush_every=10)
 
 
+@pytest.fixture
+def source(tmp_path):
+    return tmp_path / "cut.mcap"
+
+
+@pytest.fixture
+def target(tmp_path):
+    return tmp_path / "mended.mcap"
+
+
 def entries(path):
     with open_log(path) as log:
         return [(entry.topic, entry.now_ns, entry.tick, bits(entry.record)) for entry in log.records()]
 
 
 @thinned("tenth", range(1, 11), quick=3)
-def test_every_whole_chunk_comes_over_and_the_loss_is_named(tmp_path, tenth):
-    source, target = tmp_path / "cut.mcap", tmp_path / "mended.mcap"
+def test_every_whole_chunk_comes_over_and_the_loss_is_named(source, target, tenth):
     source.write_bytes(COMPLETE_LOG[: len(COMPLETE_LOG) * tenth // 10])
     recovered = recover_log(source, target)
     assert entries(target) == entries(source)
@@ -147,8 +156,7 @@ def test_every_whole_chunk_comes_over_and_the_loss_is_named(tmp_path, tenth):
         assert mended.attachment("robot.toml") == damaged.attachment("robot.toml")
 
 
-def test_a_recovered_log_is_whole_for_other_readers_too(tmp_path):
-    source, target = tmp_path / "cut.mcap", tmp_path / "mended.mcap"
+def test_a_recovered_log_is_whole_for_other_readers_too(source, target):
     source.write_bytes(COMPLETE_LOG[: len(COMPLETE_LOG) // 2])
     recovered = recover_log(source, target)
     reader = make_reader(io.BytesIO(target.read_bytes()), validate_crcs=True)
@@ -157,8 +165,7 @@ def test_a_recovered_log_is_whole_for_other_readers_too(tmp_path):
     assert all(schema is not None for schema, _, _ in messages)
 
 
-def test_damage_inside_a_complete_log_costs_the_chunk(tmp_path):
-    source, target = tmp_path / "bad.mcap", tmp_path / "mended.mcap"
+def test_damage_inside_a_complete_log_costs_the_chunk(source, target):
     source.write_bytes(with_damaged_chunk(COMPLETE_LOG))
     recovered = recover_log(source, target)
     assert len(recovered.lost) == 1
@@ -167,8 +174,8 @@ def test_damage_inside_a_complete_log_costs_the_chunk(tmp_path):
         assert log.summary().missing_ticks == 10
 
 
-def test_damage_between_the_chunks_costs_nothing(tmp_path):
-    source, target, sound = tmp_path / "bad.mcap", tmp_path / "mended.mcap", tmp_path / "sound.mcap"
+def test_damage_between_the_chunks_costs_nothing(source, target, tmp_path):
+    sound = tmp_path / "sound.mcap"
     sound.write_bytes(COMPLETE_LOG)
     damaged = bytearray(COMPLETE_LOG)
     index = make_reader(io.BytesIO(COMPLETE_LOG)).get_summary().chunk_indexes[9]
@@ -178,8 +185,7 @@ def test_damage_between_the_chunks_costs_nothing(tmp_path):
     assert entries(target) == entries(source) == entries(sound)
 
 
-def test_the_source_is_not_touched_and_nothing_is_overwritten(tmp_path):
-    source = tmp_path / "cut.mcap"
+def test_the_source_is_not_touched_and_nothing_is_overwritten(source):
     source.write_bytes(COMPLETE_LOG[:20_000])
     with pytest.raises(LogError, match="already exists"):
         recover_log(source, source)
@@ -197,8 +203,7 @@ def test_the_source_is_not_touched_and_nothing_is_overwritten(tmp_path):
     ],
     ids=["empty", "other", "magic alone", "no records", "cut before its first chunk"],
 )
-def test_of_nothing_nothing_is_recovered_and_no_target_left_behind(tmp_path, content, message):
-    source, target = tmp_path / "x", tmp_path / "y"
+def test_of_nothing_nothing_is_recovered_and_no_target_left_behind(source, target, content, message):
     source.write_bytes(content)
     with pytest.raises(LogError, match=message) as refused:
         recover_log(source, target)
@@ -206,18 +211,16 @@ def test_of_nothing_nothing_is_recovered_and_no_target_left_behind(tmp_path, con
     assert not target.exists()
 
 
-def test_a_disk_full_on_the_way_leaves_no_target_behind(tmp_path):
-    source, target = tmp_path / "cut.mcap", tmp_path / "mended.mcap"
+def test_a_disk_full_on_the_way_leaves_no_target_behind(source, target):
     source.write_bytes(COMPLETE_LOG[:-1000])
     with files_of_at_most(20_000), pytest.raises(LogError, match="File too large"):
         recover_log(source, target)
     assert not target.exists()
 
 
-def test_places_that_cannot_be_read_or_written_are_named(tmp_path):
+def test_places_that_cannot_be_read_or_written_are_named(source, target, tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
-        recover_log(tmp_path / "none", tmp_path / "y")
-    source = tmp_path / "cut.mcap"
+        recover_log(source, target)
     source.write_bytes(COMPLETE_LOG)
     with pytest.raises(InputError, match="No such file"):
         recover_log(source, tmp_path / "no directory" / "y")

@@ -3,14 +3,15 @@ import re
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
 from disco_hw.errors import InputError
 from disco_hw.files import MODEL_TOML, ROBOT_TOML
 from disco_hw.log import ENCODE_ERRORS, BatchDecoder, Frames, attachment, batch_encoder, frame, version
 from disco_hw.log.records import TOPICS, Estimate, Event, Plan
-from tools.log_samples import ANY_RECORD, bits
+from tests.log.any_record import ANY_RECORD
+from tests.tables import examples
+from tools.log_samples import bits
 
 ENCODE = batch_encoder()
 DECODER = BatchDecoder()
@@ -20,7 +21,13 @@ def decoded(message):
     return [DECODER.record(index, data) for index, data in DECODER.batch(message).records]
 
 
-@given(st.lists(ANY_RECORD, max_size=6), st.integers(1, 2**40), st.integers(0, 2**62))
+@examples(
+    quick=40,
+    every=100,
+    records=st.lists(ANY_RECORD, max_size=6),
+    sequence=st.integers(1, 2**40),
+    now_ns=st.integers(0, 2**62),
+)
 def test_a_batch_comes_back_to_the_last_bit(records, sequence, now_ns):
     message = ENCODE(sequence, now_ns, records)
     batch = DECODER.batch(message)
@@ -62,7 +69,10 @@ def test_a_topic_that_does_not_exist_is_refused(index):
         DECODER.record(*batch.records[0])
 
 
-@given(st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=40))), st.integers(1, 30))
+FRAMES = st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=40)))
+
+
+@examples(quick=40, every=100, frames=FRAMES, length=st.integers(1, 30))
 def test_a_stream_cut_anywhere_gives_the_same_frames(frames, length):
     stream = b"".join(frame(kind, payload) for kind, payload in frames)
     decoder, got = Frames(), []

@@ -1,6 +1,9 @@
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import NamedTemporaryFile
+
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
@@ -11,9 +14,9 @@ from disco_hw.log.reader import Gap, open_log
 from disco_hw.log.records import Counters, Estimate, Event, Innovation, Plan
 from disco_hw.runtime.replay import replay
 from disco_hw.viewer.recording import Recording
-from tests.tables import thinned
+from tests.log.any_record import ANY_RECORD
+from tests.tables import examples, thinned
 from tools.log_samples import (
-    ANY_RECORD,
     ATTACHMENTS,
     PERIOD_NS,
     ROBOT_TOML,
@@ -33,13 +36,14 @@ def log_file(tmp_path):
     return write_log(tmp_path / "run.mcap", drive_ticks(200), flush_every=20)
 
 
-@settings(max_examples=40, deadline=None)
-@given(st.lists(st.lists(ANY_RECORD, min_size=1, max_size=5), min_size=1, max_size=5))
-def test_ticks_come_back_to_the_last_bit_in_order(tmp_path_factory, ticks):
-    path = tmp_path_factory.mktemp("log") / "any.mcap"
-    write_log(path, [(10 * number, records) for number, records in enumerate(ticks, start=1)])
-    with open_log(path) as log:
-        entries = list(log.records())
+@examples(quick=15, every=40, ticks=st.lists(st.lists(ANY_RECORD, min_size=1, max_size=5), min_size=1, max_size=5))
+def test_ticks_come_back_to_the_last_bit_in_order(ticks):
+    content = log_bytes([(10 * number, records) for number, records in enumerate(ticks, start=1)])
+    with NamedTemporaryFile(suffix=".mcap") as file:
+        file.write(content)
+        file.flush()
+        with open_log(Path(file.name)) as log:
+            entries = list(log.records())
     expected = [(10 * number, number, record) for number, records in enumerate(ticks, start=1) for record in records]
     assert bits([(entry.now_ns, entry.tick, entry.record) for entry in entries]) == bits(expected)
 
@@ -208,17 +212,26 @@ ESTIMATE = (
 )
 
 
-def hostile(path, about=None, wheels=WHEELS % 5, log_time=10**18, estimate=ESTIMATE % 5):
-    """A log that no recorder of ours has written."""
+@contextmanager
+def written(path, about=None):
+    """A writer of a log that no recorder of ours has written."""
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
         writer.add_metadata("disco-hw", ABOUT | (about or {}))
-        channel = writer.register_channel("/wheels", "json", writer.register_schema("x", "jsonschema", b"{}"))
-        writer.add_message(channel, log_time, wheels.encode(), 0, 1)
-        channel = writer.register_channel("/estimate", "json", 0)
-        writer.add_message(channel, log_time, estimate.encode(), 0, 1)
+        yield writer
         writer.finish()
+
+
+def add(writer, topic, text, log_time=10**18):
+    channel = writer.register_channel(topic, "json", writer.register_schema("x", "jsonschema", b"{}"))
+    writer.add_message(channel, log_time, text.encode(), 0, 1)
+
+
+def hostile(path, about=None, wheels=WHEELS % 5, log_time=10**18, estimate=ESTIMATE % 5):
+    with written(path, about) as writer:
+        add(writer, "/wheels", wheels, log_time)
+        add(writer, "/estimate", estimate, log_time)
     return path
 
 
@@ -288,15 +301,10 @@ def test_a_record_nested_without_end_is_one_line(tmp_path):
 
 def test_thousands_of_channels_are_read(tmp_path):
     path = tmp_path / "run.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        writer.add_metadata("disco-hw", ABOUT)
-        for k in range(20_000):
-            channel = writer.register_channel(f"/other/{k}", "json", 0)
-        channel = writer.register_channel("/wheels", "json", writer.register_schema("x", "jsonschema", b"{}"))
-        writer.add_message(channel, 10**18, (WHEELS % 5).encode(), 0, 1)
-        writer.finish()
+    with written(path) as writer:
+        for k in range(5000):
+            writer.register_channel(f"/other/{k}", "json", 0)
+        add(writer, "/wheels", WHEELS % 5)
     with open_log(path) as log:
         assert log.counts == {"/wheels": 1}
 
@@ -304,14 +312,9 @@ def test_thousands_of_channels_are_read(tmp_path):
 @pytest.mark.parametrize("end", [{"t_ns": "9" * 30}, {"sequence": "-1"}, {"sequence": "x"}, {"sequence": "9" * 30}, {}])
 def test_a_last_word_that_is_none_is_none(tmp_path, end):
     path = tmp_path / "run.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        writer.add_metadata("disco-hw", ABOUT | {"format": "2"})
+    with written(path, {"format": "2"}) as writer:
         writer.add_metadata("disco-hw-end", {"t_ns": "5", "sequence": "5", "dropped_ticks": "0"} | end if end else {})
-        channel = writer.register_channel("/wheels", "json", 0)
-        writer.add_message(channel, 10**18, (WHEELS % 5).encode(), 0, 1)
-        writer.finish()
+        add(writer, "/wheels", WHEELS % 5)
     with open_log(path) as log:
         assert (log.ending, log.summary().ended) == (None, False)
 

@@ -35,28 +35,31 @@ def path(tmp_path):
     return tmp_path / "run.mcap"
 
 
+@pytest.mark.usefixtures("forked_keepers")
 def test_a_killed_writer_loses_no_more_than_what_came_since_the_last_flush(path):
     recorder = ProcessRecorder(recording(path, flush_s=0.05))
     drive(recorder, 1, 200, period_s=0.002)
     wait_until(lambda: recorder.poll().delivered_ticks > 100)
     written = recorder.poll().delivered_ticks * 7
     os.kill(recorder.writer_pid, signal.SIGKILL)
+    drive(recorder, 201, 10)
     wait_until(lambda: recorder.poll().writer_deaths == 1)
     recorder.close()
     with open_log(path) as log:
         assert not log.complete
         assert "the end is missing" in log.damage[-1]
         assert sum(log.counts.values()) >= written
-    assert recorded_ticks(path) + recorded_ticks(recorder.path) == list(range(1, 201))
+    assert recorded_ticks(path) + recorded_ticks(recorder.path) == list(range(1, 211))
 
 
-def test_when_the_recording_process_is_killed_the_file_is_finished(path):
+def test_when_the_recording_process_is_killed_the_file_is_finished_and_nothing_else_is_left(path, runtime_root):
     with RecordingProcess(path) as recording_process:
         wait_until(lambda: size(path) > 40_000)
         recording_process.process.kill()
         killed = time.monotonic()
         wait_until(lambda: not alive(recording_process.writer_pid))
         assert time.monotonic() - killed < 10.0
+    assert list(runtime_root.iterdir()) == []
     with open_log(path) as log:
         assert log.complete
         assert log.ending is None
@@ -78,14 +81,6 @@ def test_what_was_still_on_its_way_when_the_recording_process_was_killed_is_not_
     assert recorded_ticks(path)[-1] > last_recorded - 20
 
 
-def test_nothing_is_left_in_the_runtime_directory_of_a_killed_process(path, runtime_root):
-    with RecordingProcess(path) as recording_process:
-        wait_until(lambda: size(path) > 0)
-        recording_process.process.kill()
-        wait_until(lambda: not alive(recording_process.writer_pid))
-    assert list(runtime_root.iterdir()) == []
-
-
 def test_when_both_are_killed_the_file_still_reads(path):
     with RecordingProcess(path) as recording_process:
         wait_until(lambda: size(path) > 40_000)
@@ -95,6 +90,7 @@ def test_when_both_are_killed_the_file_still_reads(path):
     assert len(recorded_ticks(path)) > 20
 
 
+@pytest.mark.usefixtures("forked_keepers")
 @pytest.mark.parametrize(("sent", "ticks"), [(signal.SIGINT, 5), (signal.SIGTERM, 50)])
 def test_what_comes_after_an_interrupt_or_a_termination_is_still_recorded(path, sent, ticks):
     recorder = ProcessRecorder(recording(path))
@@ -106,11 +102,15 @@ def test_what_comes_after_an_interrupt_or_a_termination_is_still_recorded(path, 
     assert recorded_ticks(path) == list(range(1, 6 + ticks))
 
 
-def test_the_writer_has_a_session_of_its_own(path):
-    recorder = ProcessRecorder(recording(path))
+def test_the_writer_has_a_session_of_its_own_and_its_path_may_be_relative(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
+    recorder = ProcessRecorder(recording(Path("run.mcap")))
     assert os.getsid(recorder.writer_pid) != os.getsid(0)
     assert os.getpgid(recorder.writer_pid) != os.getpgid(0)
+    drive(recorder, 1, 2)
     recorder.close()
+    assert recorded_ticks(tmp_path / "run.mcap") == [1, 2]
 
 
 def fill(recorder):
@@ -138,6 +138,7 @@ def check_after_full_disk(path, stats, message):
     assert len(recorded_ticks(path)) > 20
 
 
+@pytest.mark.usefixtures("forked_keepers")
 def test_a_full_disk_ends_the_log_and_with_room_again_another_begins(tmp_path):
     with SmallDisk(tmp_path, 4160) as disk:
         filler = disk / "filler"
@@ -169,6 +170,7 @@ def full_recorder(disk):
     return recorder, filler, given
 
 
+@pytest.mark.usefixtures("forked_keepers")
 def test_the_last_words_with_a_full_disk_count_the_ticks_that_are_lost_and_name_files_that_exist(tmp_path):
     with SmallDisk(tmp_path, 4160) as disk:
         recorder, _, given = full_recorder(disk)
@@ -183,6 +185,7 @@ def test_the_last_words_with_a_full_disk_count_the_ticks_that_are_lost_and_name_
         assert Path(final.path).exists()
 
 
+@pytest.mark.usefixtures("forked_keepers")
 def test_the_last_words_during_an_attempt_name_a_file_that_stays(tmp_path):
     with SmallDisk(tmp_path, 4160) as disk:
         recorder, _, _ = full_recorder(disk)
@@ -192,6 +195,7 @@ def test_the_last_words_during_an_attempt_name_a_file_that_stays(tmp_path):
         assert Path(final.path).exists()
 
 
+@pytest.mark.usefixtures("forked_keepers")
 def test_a_disk_with_room_again_at_the_end_loses_nothing_and_the_part_begins_before_it_ends(tmp_path):
     with SmallDisk(tmp_path, 4160) as disk:
         recorder, filler, given = full_recorder(disk)
@@ -207,6 +211,7 @@ def test_a_disk_with_room_again_at_the_end_loses_nothing_and_the_part_begins_bef
             assert log.summary().start < log.summary().end
 
 
+@pytest.mark.usefixtures("forked_keepers")
 def test_a_file_that_may_not_grow_is_continued_by_another(path):
     recorder = ProcessRecorder(recording(path))
     resource.prlimit(recorder.writer_pid, resource.RLIMIT_FSIZE, (100_000, 100_000))
@@ -217,6 +222,7 @@ def test_a_file_that_may_not_grow_is_continued_by_another(path):
     assert recorded_ticks(path) + recorded_ticks(recorder.path) == list(range(1, given + 1))
 
 
+@pytest.mark.usefixtures("forked_keepers")
 def test_a_disk_full_from_the_start_is_one_line(tmp_path):
     with SmallDisk(tmp_path, 16) as disk:
         (disk / "filler").write_bytes(bytes(16 * 1024))
@@ -226,11 +232,12 @@ def test_a_disk_full_from_the_start_is_one_line(tmp_path):
 
 
 @pytest.mark.parametrize("arguments", [[], ["1"], ["a", "b"]])
-def test_wrong_usage_of_the_keeper_is_one_line(arguments):
-    command = [sys.executable, "-m", "disco_hw.log.writer", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1
+def test_wrong_usage_of_the_keeper_is_one_line(arguments, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["writer", *arguments])
+    # Else this process would ignore signals from now on.
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    assert writer.main() == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 def test_a_status_nobody_reads_costs_nothing_and_the_next_that_is_read_is_whole():
@@ -289,7 +296,7 @@ def test_a_disk_that_takes_seconds_holds_up_no_writer_and_is_reported_once(path)
     recorder = ProcessRecorder(recording(path))
     begin_s, first = time.monotonic(), 1
     while time.monotonic() - begin_s < 7.0:
-        drive(recorder, first, 1, period_s=0.01)
+        drive(recorder, first, 1, period_s=0.05)
         stats = recorder.poll()
         assert (stats.writer_deaths, stats.fault) == (0, "")
         first += 1

@@ -6,9 +6,10 @@ from tools.check import fuzz_wire
 from tools.check.fuzz_wire import TARGETS, campaign
 
 
+@pytest.mark.parametrize("frames", [500, pytest.param(1500, marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("name", TARGETS)
-def test_a_short_campaign_is_sound(name):
-    assert campaign(name, 1500, 1) == []
+def test_a_short_campaign_is_sound(name, frames):
+    assert campaign(name, frames, 1) == []
 
 
 def test_what_raises_or_keeps_what_it_is_given_is_reported(monkeypatch):

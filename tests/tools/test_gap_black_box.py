@@ -19,7 +19,7 @@ from tools.gap import halves
 from tools.gap.black_box import STEP, BlackBox, Training, recent_speeds, train
 from tools.gap.logs import simulated_drive
 
-QUICK = Training(networks=2, hidden=8, iterations=(60, 60))
+QUICK = Training(networks=2, hidden=8, iterations=(30, 30))
 NOMINAL = Model(0.0625, 0.405, 0.25)
 TURNS = ((4, 4), (-3, 3), (0, 0), (6, 2), (-4, -4), (2, 5))
 
@@ -109,11 +109,9 @@ def test_a_box_of_a_half_has_not_seen_the_other_one():
 
 def test_two_trainings_give_the_same_box_whatever_numbers_were_drawn_before():
     drive, node = simulated_halves()[0], np.array([300, 900])
-    ways = []
-    for seed in (1, 2):
-        torch.manual_seed(seed)
-        ways.append(trained(drive).displacement(drive, node, 2.0))
-    np.testing.assert_array_equal(*ways)
+    one = quick_box().displacement(drive, node, 2.0)
+    torch.manual_seed(1)
+    np.testing.assert_array_equal(trained(drive).displacement(drive, node, 2.0), one)
 
 
 def test_without_commands_measured_wheel_speeds_stand_in():

@@ -29,6 +29,12 @@ def result(hidden="pose_latency", seed=1, named=None, truth: float | None = 0.21
     return Result(hidden, seed, LATENCY if named is None else named, truth=truth, **values | other)
 
 
+def watched(t_s, truth, turned):
+    """A recording of nothing but the true poses and wheels."""
+    none, nothing = np.zeros((0, 2)), np.zeros((0, 3))
+    return Recording(t_s[:0], none, t_s[:0], none, t_s[:0], nothing, t_s, truth, turned, nothing)
+
+
 def test_a_value_is_right_within_a_tenth():
     assert result().right
     assert not result(truth=0.25).right
@@ -85,8 +91,7 @@ def test_how_late_poses_are_is_counted_from_the_true_wheels():
     yaw = np.cumsum(0.4 * 0.13 / 0.49 * (delayed[:, 1] - delayed[:, 0])) / 480.0
     forward = 0.13 / 2 * delayed.sum(axis=1)
     truth = np.column_stack([np.cumsum(forward * np.cos(yaw)) / 480.0, np.cumsum(forward * np.sin(yaw)) / 480.0, yaw])
-    nothing, none = np.zeros((0, 3)), np.zeros((0, 2))
-    recording = Recording(t_s[:0], none, t_s[:0], none, t_s[:0], nothing, t_s, truth, turned, nothing)
+    recording = watched(t_s, truth, turned)
     assert body_lag_s(recording) == pytest.approx(0.025, abs=0.001)
     recording = replace(recording, hidden={"pose_latency": 0.2})
     assert truth_of("pose_latency", recording) == pytest.approx(0.225, abs=0.001)
@@ -101,9 +106,7 @@ def test_what_tyres_slip_is_no_lateness_where_it_is_told():
         speed = min(max(wish, speed - 2.0 / 480.0), speed + 2.0 / 480.0)
         rolling[k] = speed
     x = np.concatenate([np.zeros(7), np.cumsum(rolling)[:-7]]) / 480.0
-    nothing, none = np.zeros((0, 3)), np.zeros((0, 2))
-    truth, wheels = np.column_stack([x, 0.0 * x, 0.0 * x]), np.repeat(turned[:, None], 4, axis=1)
-    recording = Recording(t_s[:0], none, t_s[:0], none, t_s[:0], nothing, t_s, truth, wheels, nothing)
+    recording = watched(t_s, np.column_stack([x, 0.0 * x, 0.0 * x]), np.repeat(turned[:, None], 4, axis=1))
     assert body_lag_s(recording) > 0.05
     assert body_lag_s(recording, ["v_x += -1 (v - slewed_2(v))", "omega += 3 v"]) == pytest.approx(0.015, abs=0.002)
 
@@ -137,9 +140,7 @@ def test_what_a_payload_does_is_told_beside_the_forms_that_have_a_share_in_it():
     way = 0.13 * wheels - 0.2 * rate + 0.4 * rate**3
     x, y = np.cumsum(way * np.cos(yaw)) / 480.0, np.cumsum(way * np.sin(yaw)) / 480.0
     turned = np.tile((np.cumsum(wheels) / 480.0)[:, None], (1, 4))
-    nothing = np.zeros((0, 3))
-    truth = np.column_stack([x, y, yaw])
-    recording = Recording(t_s[:0], nothing, t_s[:0], nothing, t_s[:0], nothing, t_s, truth, turned, nothing)
+    recording = watched(t_s, np.column_stack([x, y, yaw]), turned)
     assert truth_of("payload", recording, ["v_x += 0.3 omega^3"]) == pytest.approx(-0.2, abs=0.003)
     # Without it the share of the cube lies in the line: 0.4 times 3/4 of the square of the rate's amplitude.
     assert truth_of("payload", recording, ["omega += 0.3 abs(omega)"]) == pytest.approx(-0.125, abs=0.003)
@@ -151,8 +152,7 @@ def test_a_worn_tyre_is_told_by_how_much_further_a_turn_to_the_left_goes():
     rate = 0.2 * ((right - left) + 0.15 * np.abs(right - left)) + 0.001 * (right + left)
     truth = np.column_stack([0.0 * t_s, 0.0 * t_s, np.cumsum(rate) / 480.0])
     turned = (np.cumsum(np.column_stack([left, right]), axis=0) / 480.0)[:, [0, 1, 0, 1]]
-    nothing = np.zeros((0, 3))
-    recording = Recording(t_s[:0], nothing, t_s[:0], nothing, t_s[:0], nothing, t_s, truth, turned, nothing)
+    recording = watched(t_s, truth, turned)
     assert truth_of("worn_tyre", recording) == pytest.approx(0.15, rel=0.01)
 
 

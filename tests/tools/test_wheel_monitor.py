@@ -1,8 +1,7 @@
 """The monitor sees what it is there for: each violation that it can see, committed once."""
 
-import dataclasses
-
 import pytest
+from msgspec.structs import replace
 
 from drivers.types import Frame
 from firmware_protocol.codec import Codec
@@ -25,7 +24,7 @@ class Scene:
     def __init__(self, **start):
         self.monitor = WheelMonitor()
         self.us = 0
-        self.outputs = dataclasses_replace(BASE, **start)
+        self.outputs = replace(BASE, **start)
         self.monitor.see(0, [], self.outputs, (0.0, 0.0))
         self.accept(command(*self.setpoints))
 
@@ -35,19 +34,12 @@ class Scene:
 
     def step(self, *frames, wheels=(0.0, 0.0), **changes):
         self.us += STEP_US
-        self.outputs = dataclasses_replace(self.outputs, **changes)
+        self.outputs = replace(self.outputs, **changes)
         self.monitor.see(self.us, frames, self.outputs, wheels)
         return self.monitor.violations
 
     def accept(self, frame, **changes):
         return self.step(frame, accepted_commands=self.outputs.accepted_commands + 1, **changes)
-
-
-def dataclasses_replace(outputs, **changes):
-    import msgspec
-
-    assert not dataclasses.is_dataclass(outputs)
-    return msgspec.structs.replace(outputs, **changes)
 
 
 def test_check_value_and_layout():

@@ -19,6 +19,11 @@ LEFT = ("front_left_wheel_joint", "rear_left_wheel_joint")
 RIGHT = ("front_right_wheel_joint", "rear_right_wheel_joint")
 
 
+def time_ns(k):
+    """Time of the k-th sample of wheels."""
+    return BEGAN_NS + k * 20_000_000
+
+
 class Maker:
     """Writes messages of the usual types to a bag of ROS 2 or ROS 1."""
 
@@ -69,6 +74,12 @@ class Maker:
             np.array(speeds, dtype=np.float64),
             np.zeros(0),
         )
+
+    def wheels(self, k, angle=None, speeds=(5.0,) * 4, *, stamp_ns=None, log_ns=None):
+        """Write sample k, at 50 Hz, of four wheels that turn at 5 rad/s."""
+        angles = [0.1 * k if angle is None else angle] * 4
+        message = self.joints(time_ns(k) if stamp_ns is None else stamp_ns, LEFT + RIGHT, angles, speeds)
+        self.write("/joint_states", message, time_ns(k) if log_ns is None else log_ns)
 
     def pose_stamped(self, t_ns, frame, x, y, yaw):
         return self.create("geometry_msgs/msg/PoseStamped", self.header(t_ns, frame), self.pose(x, y, yaw))

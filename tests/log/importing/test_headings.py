@@ -12,6 +12,7 @@ from disco_hw.log.drive import DriveLog
 from disco_hw.log.importing.csv_drive import read_csv
 from disco_hw.log.importing.losses import without_standing_headings
 from disco_hw.log.load import load_drive
+from tests.log.importing.commands import call
 from tests.log.importing.test_csv_faults import as_text, table
 from tests.tables import thinned
 
@@ -74,19 +75,13 @@ def test_whoever_compares_headings_is_given_none_that_stands_still(tmp_path):
     assert any("800 of 800 positions have no heading and were left out" in note for note in drive.notes)
 
 
-def import_command(path, robot, *options):
-    command = [sys.executable, "-m", "disco_hw", "import", str(path), "--robot", str(robot), *options]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
 def test_the_warning_comes_first_in_the_text_and_has_its_list_in_json(tmp_path, robot):
     csv_drive(tmp_path, lambda *_: 0.0)
-    done = import_command(tmp_path / "log.csv", robot, "-o", str(tmp_path / "a.mcap"))
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("warning: ")
-    assert "stand still" in done.stdout.splitlines()[0]
-    done = import_command(tmp_path / "log.csv", robot, "-o", str(tmp_path / "b.mcap"), "--json")
-    (warning,) = json.loads(done.stdout)["warnings"]
+    arguments = ("import", tmp_path / "log.csv", "--robot", robot, "-o")
+    printed = call(*arguments, tmp_path / "a.mcap")
+    assert printed.startswith("warning: ")
+    assert "stand still" in printed.splitlines()[0]
+    (warning,) = json.loads(call(*arguments, tmp_path / "b.mcap", "--json"))["warnings"]
     assert "headings: 800 of 800 stand still" in warning
 
 
@@ -95,7 +90,8 @@ def test_a_loss_of_over_half_ends_with_exit_code_two_and_one_line(tmp_path, robo
     for row in rows[:60]:
         row["pose_x_m"] = "?"
     (tmp_path / "log.csv").write_text(as_text(rows))
-    done = import_command(tmp_path / "log.csv", robot, "-o", str(tmp_path / "a.mcap"))
+    command = [sys.executable, "-m", "disco_hw", "import", "log.csv", "--robot", str(robot), "-o", "a.mcap"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode == 2
     assert "positions: 60 of 100" in " ".join(done.stderr.split())
     assert "Traceback" not in done.stderr

@@ -1,6 +1,4 @@
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -15,14 +13,20 @@ from disco_hw.runtime.robot_setup import setup_of_log
 from disco_hw.viewer.recording import Recording
 from tests.inference.drives import TICKS_PER_REV, write_log
 from tests.inference.test_infer_command import ROBOT
+from tests.log.importing.commands import call
 from tests.log.importing.test_candump import dumped
+
+
+@pytest.fixture
+def imported(robot, tmp_path):
+    """The log of a drive, whose robot names a model that the log lacks."""
+    robot.write_text(ROBOT + '[model]\nfile = "model.toml"\n')
+    return import_log(write_log(tmp_path / "log.csv", "poor"), robot, tmp_path / "log.mcap").out
 
 
 def test_a_csv_file_becomes_a_log_with_the_robots_file_in_it(robot, tmp_path):
     source, out = write_log(tmp_path / "log.csv", "poor"), tmp_path / "log.mcap"
-    command = [sys.executable, "-m", "disco_hw", "import", str(source), "--robot", str(robot), "-o", str(out), "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    reported = json.loads(done.stdout)
+    reported = json.loads(call("import", source, "--robot", robot, "-o", out, "--json"))
     with open_log(out) as log:
         assert log.attachment(ROBOT_TOML) == robot.read_bytes()
         assert sum(topic.count for topic in log.summary().topics.values()) >= reported["records"]
@@ -36,10 +40,9 @@ def test_a_candump_is_distinguished_from_a_csv_file_by_its_content(robot, tmp_pa
     assert load_drive(found.out).poses.t_s.size > 190
 
 
-def test_our_own_logs_need_no_import(robot, tmp_path):
-    import_log(write_log(tmp_path / "log.csv", "poor"), robot, tmp_path / "log.mcap")
+def test_our_own_logs_need_no_import(imported, robot, tmp_path):
     with pytest.raises(LogError, match="an MCAP log; a log of disco-hw needs no import"):
-        import_log(tmp_path / "log.mcap", robot, tmp_path / "again.mcap")
+        import_log(imported, robot, tmp_path / "again.mcap")
 
 
 def test_what_cannot_be_opened_is_reported(robot, tmp_path):
@@ -47,24 +50,19 @@ def test_what_cannot_be_opened_is_reported(robot, tmp_path):
         import_log(tmp_path / "none.csv", robot, tmp_path / "log.mcap")
 
 
-def test_a_file_that_the_logs_robot_names_and_the_log_lacks_is_reported(robot, tmp_path):
-    robot.write_text(ROBOT + '[model]\nfile = "model.toml"\n')
-    import_log(write_log(tmp_path / "log.csv", "poor"), robot, tmp_path / "log.mcap")
+def test_a_file_that_the_logs_robot_names_and_the_log_lacks_is_reported(imported):
     with (
-        open_log(tmp_path / "log.mcap") as log,
+        open_log(imported) as log,
         pytest.raises(InputError, match=r"log\.mcap: carries no model\.toml, which its robot\.toml names; do this"),
     ):
         setup_of_log(log, "do this")
 
 
-def test_nothing_of_an_imported_log_can_be_shown_and_that_is_said_whatever_it_carries(robot, tmp_path):
-    robot.write_text(ROBOT + '[model]\nfile = "model.toml"\n')
-    import_log(write_log(tmp_path / "log.csv", "poor"), robot, tmp_path / "log.mcap")
+def test_nothing_of_an_imported_log_can_be_shown_and_that_is_said_whatever_it_carries(imported):
     with pytest.raises(InputError, match="holds no estimates, so there is nothing to show"):
-        Recording(tmp_path / "log.mcap")
+        Recording(imported)
 
 
-def test_an_imported_log_cannot_be_replayed_and_says_so(robot, tmp_path):
-    import_log(write_log(tmp_path / "log.csv", "poor"), robot, tmp_path / "log.mcap")
+def test_an_imported_log_cannot_be_replayed_and_says_so(imported):
     with pytest.raises(InputError, match=r"log\.mcap: its commands are from 'import', .*only logs of `disco-hw run`"):
-        replay(tmp_path / "log.mcap")
+        replay(imported)

@@ -2,8 +2,7 @@
 
 import json
 import math
-import subprocess
-import sys
+from itertools import product
 
 import msgspec
 import numpy as np
@@ -19,7 +18,8 @@ from disco_hw.log.importing import import_log
 from disco_hw.log.importing.rosbag import read_rosbag
 from disco_hw.log.load import load_drive
 from tests.inference.drives import robot_config
-from tests.log.importing.bags import BEGAN_NS, LATENCY_NS, LEFT, RIGHT, bag, recorded
+from tests.log.importing.bags import BEGAN_NS, LATENCY_NS, LEFT, RIGHT, bag, recorded, time_ns
+from tests.log.importing.commands import call
 from tests.tables import thinned
 
 
@@ -46,9 +46,20 @@ def assert_same_wheels(drive, truth):
     np.testing.assert_allclose(drive.wheels.right_speed_rad_s, truth.wheels.right_speed_rad_s, atol=1e-9)
 
 
-@thinned("storage", ["mcap", "sqlite3", "ros1"], quick=1)
-def test_four_wheels_commands_and_the_chain_of_frames_are_read(tmp_path, storage):
-    truth = recorded(place(tmp_path, storage), storage)
+RELEASES = [Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY, Stores.ROS2_KILTED]
+BAGS = [*product(["mcap", "sqlite3"], RELEASES), ("ros1", Stores.ROS1_NOETIC)]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A bag of all topics, the drive that it is of, and what is read from it."""
+    path = place(tmp_path_factory.mktemp("bag"))
+    return path, recorded(path), read_rosbag(path, robot_config())
+
+
+@thinned(("storage", "distro"), BAGS, quick=1)
+def test_four_wheels_commands_and_the_chain_of_frames_are_read(tmp_path, storage, distro):
+    truth = recorded(place(tmp_path, storage), storage, distro)
     drive = read_rosbag(place(tmp_path, storage), robot_config())
     assert chosen(drive) == [("commands", "/cmd_vel"), ("wheels", "/joint_states"), ("poses", "tf")]
     assert_same_wheels(drive, truth)
@@ -63,16 +74,8 @@ def test_four_wheels_commands_and_the_chain_of_frames_are_read(tmp_path, storage
     assert drive.segments == 1
 
 
-@thinned("distro", [Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY, Stores.ROS2_KILTED], quick=1)
-@thinned("storage", ["mcap", "sqlite3"], quick=1)
-def test_bags_of_all_releases_are_read(tmp_path, distro, storage):
-    truth = recorded(place(tmp_path), storage, distro)
-    assert_same_wheels(read_rosbag(place(tmp_path), robot_config()), truth)
-
-
-def test_every_topic_is_in_the_table_with_the_reason(tmp_path):
-    recorded(place(tmp_path))
-    table = read_rosbag(place(tmp_path), robot_config()).notes[0]
+def test_every_topic_is_in_the_table_with_the_reason(made):
+    table = made[2].notes[0]
     assert "left: front_left_wheel_joint, rear_left_wheel_joint; right: front_right_wheel_joint" in table
     assert "map - odom - base_footprint - base_link" in table
     assert "/rtabmap/odom" in table
@@ -82,9 +85,9 @@ def test_every_topic_is_in_the_table_with_the_reason(tmp_path):
     assert "camera" not in table
 
 
-def test_a_topic_that_is_asked_for_is_taken_instead(tmp_path):
-    truth = recorded(place(tmp_path))
-    drive = read_rosbag(place(tmp_path), config(pose_topic="/rtabmap/odom", wheel_topic="/odom"))
+def test_a_topic_that_is_asked_for_is_taken_instead(made):
+    path, truth, _ = made
+    drive = read_rosbag(path, config(pose_topic="/rtabmap/odom", wheel_topic="/odom"))
     assert chosen(drive)[1:] == [("wheels", "/odom"), ("poses", "/rtabmap/odom")]
     np.testing.assert_allclose(drive.poses.x_m, truth.poses.x_m, atol=1e-12)
     np.testing.assert_allclose(drive.poses.t_s - drive.wheels.t_s[0], truth.poses.t_s - truth.wheels.t_s[0], atol=1e-6)
@@ -111,7 +114,7 @@ def test_odometry_of_the_wheels_is_never_taken_for_a_measured_pose(tmp_path):
 def test_names_of_joints_and_frames_that_nobody_guesses_can_be_set(tmp_path):
     with bag(place(tmp_path)) as maker:
         for k in range(100):
-            t_ns = BEGAN_NS + k * 20_000_000
+            t_ns = time_ns(k)
             maker.write("/joints", maker.joints(t_ns, ("a", "b"), (0.1 * k, 0.2 * k), (5.0, 10.0)), t_ns)
             maker.write("/tf", maker.transforms(t_ns, ("hall", "rover", 0.006 * k, 0.0, 0.0, 0.0)), t_ns)
     with pytest.raises(LogError, match="no topic with commands, wheels or poses"):
@@ -156,9 +159,7 @@ def test_a_simulated_clock_is_said_and_unstamped_commands_are_carried_over(tmp_p
 def test_messages_without_a_stamp_have_the_time_of_recording_and_that_is_said(tmp_path):
     with bag(place(tmp_path)) as maker:
         for k in range(200):
-            t_ns = BEGAN_NS + k * 20_000_000
-            stamp = 0 if k % 10 == 0 else t_ns
-            maker.write("/joint_states", maker.joints(stamp, LEFT + RIGHT, [0.1 * k] * 4, [5.0] * 4), t_ns)
+            maker.wheels(k, stamp_ns=0 if k % 10 == 0 else None)
     drive = read_rosbag(place(tmp_path), robot_config())
     assert has_note(drive, "20 of 200 messages have no stamp")
     np.testing.assert_allclose(np.diff(drive.wheels.t_s), 0.02, atol=1e-6)
@@ -168,9 +169,7 @@ def test_the_stamp_counts_not_the_recording(tmp_path):
     """Messages that the network held up for a while and then let go at once."""
     with bag(place(tmp_path)) as maker:
         for k in range(200):
-            t_ns = BEGAN_NS + k * 20_000_000
-            received_ns = BEGAN_NS + 120 * 20_000_000 if 80 <= k < 120 else t_ns
-            maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [0.1 * k] * 4, [5.0] * 4), received_ns + k)
+            maker.wheels(k, log_ns=time_ns(120 if 80 <= k < 120 else k) + k)
     drive = read_rosbag(place(tmp_path), robot_config())
     np.testing.assert_allclose(np.diff(drive.wheels.t_s), 0.02, atol=1e-6)
     assert drive.segments == 1
@@ -179,11 +178,9 @@ def test_the_stamp_counts_not_the_recording(tmp_path):
 def test_what_is_not_finite_is_left_out_and_counted(tmp_path):
     with bag(place(tmp_path)) as maker:
         for k in range(50):
-            t_ns = BEGAN_NS + k * 20_000_000
-            angle = math.nan if k == 7 else 0.1 * k
             x = math.inf if k in {3, 4} else 0.0
-            maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [angle] * 4, [5.0] * 4), t_ns)
-            maker.write("/slam/pose", maker.pose_stamped(t_ns, "map", x, 0.0, 0.0), t_ns)
+            maker.wheels(k, math.nan if k == 7 else None)
+            maker.write("/slam/pose", maker.pose_stamped(time_ns(k), "map", x, 0.0, 0.0), time_ns(k))
     drive = read_rosbag(place(tmp_path), robot_config())
     assert (drive.wheels.t_s.size, drive.poses.t_s.size) == (49, 48)
     assert has_note(drive, "poses, /slam/pose: 2 of 50 messages hold no finite value")
@@ -196,12 +193,9 @@ def test_what_is_not_finite_is_left_out_and_counted(tmp_path):
 def test_where_a_driver_counts_anew_nothing_is_predicted_across(tmp_path, reset_rad, burst, segments):
     with bag(place(tmp_path)) as maker:
         for k in range(300):
-            t_ns = BEGAN_NS + k * 20_000_000
-            if burst and k == 200:
-                # This one comes right after the one before.
-                t_ns -= 19_900_000
-            angle = 0.4 * k - (reset_rad if k >= 200 else 0.0)
-            maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [angle] * 4, []), t_ns)
+            # In a burst one comes right after the one before.
+            t_ns = time_ns(k) - (19_900_000 if burst and k == 200 else 0)
+            maker.wheels(k, 0.4 * k - (reset_rad if k >= 200 else 0.0), [], stamp_ns=t_ns, log_ns=t_ns)
     drive = read_rosbag(place(tmp_path), robot_config())
     assert drive.segments == segments
     assert has_note(drive, "1 times the wheels paused, or a clock or encoder was set") is (segments == 2)
@@ -212,9 +206,7 @@ def test_where_a_driver_counts_anew_nothing_is_predicted_across(tmp_path, reset_
 def test_positions_within_one_turn_are_made_continuous(tmp_path):
     with bag(place(tmp_path)) as maker:
         for k in range(200):
-            t_ns = BEGAN_NS + k * 20_000_000
-            angle = (0.1 * k + math.pi) % (2 * math.pi) - math.pi
-            maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [angle] * 4, []), t_ns)
+            maker.wheels(k, (0.1 * k + math.pi) % (2 * math.pi) - math.pi, [])
     drive = read_rosbag(place(tmp_path), robot_config())
     assert drive.wheels.left_angle_rad[-1] == pytest.approx(19.9)
     np.testing.assert_allclose(drive.wheels.left_speed_rad_s[1:], 5.0, atol=1e-3)
@@ -233,8 +225,8 @@ def test_positions_within_one_turn_are_made_continuous(tmp_path):
 def test_the_controllers_own_commands_come_before_cmd_vel(tmp_path, topic, build_message):
     with bag(place(tmp_path)) as maker:
         for k in range(50):
-            t_ns = BEGAN_NS + k * 20_000_000
-            maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [0.1 * k] * 4, [5.0] * 4), t_ns)
+            t_ns = time_ns(k)
+            maker.wheels(k)
             maker.write("/cmd_vel", maker.twist(0.0, 9.0), t_ns)
             maker.write(topic, build_message(maker, t_ns), t_ns)
     drive = read_rosbag(place(tmp_path), robot_config())
@@ -248,13 +240,11 @@ def array(maker, values):
     return maker.create("std_msgs/msg/Float64MultiArray", layout, np.array(values))
 
 
-def test_the_command_imports_a_folder_that_reads_as_any_log(robot, tmp_path):
-    truth = recorded(place(tmp_path))
+def test_the_command_imports_a_folder_that_reads_as_any_log(robot, tmp_path, made):
+    path, truth, _ = made
     out = tmp_path / "log.mcap"
-    command = [sys.executable, "-m", "disco_hw", "import", str(place(tmp_path)), "--robot", str(robot)]
-    command += ["-o", str(out), "--topic", "poses=/rtabmap/odom"]
-    done = subprocess.run([*command, "--json"], capture_output=True, text=True, check=True)
-    assert "*  poses     /rtabmap/odom" in json.loads(done.stdout)["notes"][0]
+    printed = call("import", path, "--robot", robot, "-o", out, "--topic", "poses=/rtabmap/odom", "--json")
+    assert "*  poses     /rtabmap/odom" in json.loads(printed)["notes"][0]
     np.testing.assert_allclose(load_drive(out).poses.x_m, truth.poses.x_m, atol=1e-12)
 
 
@@ -264,7 +254,7 @@ def test_no_topics_are_taken_for_what_has_none(robot, tmp_path):
         import_log(tmp_path / "a.csv", robot, tmp_path / "log.mcap", ["poses=/pose"])
 
 
-@thinned("topic", ["poses", "poses=", "pose=/x"], quick=1)
-def test_a_topic_that_is_no_role_and_name_is_refused(robot, tmp_path, topic):
+@pytest.mark.parametrize("topic", ["poses", "poses=", "pose=/x"])
+def test_a_topic_that_is_no_role_and_name_is_refused(robot, tmp_path, made, topic):
     with pytest.raises(Exception, match="is not ROLE=NAME"):
-        recorded(place(tmp_path)) and import_log(place(tmp_path), robot, tmp_path / "log.mcap", [topic])
+        import_log(made[0], robot, tmp_path / "log.mcap", [topic])

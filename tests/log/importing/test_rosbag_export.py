@@ -1,8 +1,5 @@
 """A log of ours as a bag of ROS 2, read by the stock readers and imported again."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
@@ -18,6 +15,7 @@ from disco_hw.log.load import load_drive
 from disco_hw.log.log_command import export_rosbag
 from tests.inference.drives import robot_config, write_log
 from tests.inference.test_infer_command import ROBOT
+from tests.log.importing.commands import call
 
 
 @pytest.fixture
@@ -28,8 +26,7 @@ def log(tmp_path):
 
 
 def test_what_is_exported_is_imported_again(log, tmp_path):
-    command = [sys.executable, "-m", "disco_hw", "log", "export", str(log), "-o", str(tmp_path / "bag"), "--rosbag2"]
-    subprocess.run(command, capture_output=True, text=True, check=True)
+    call("log", "export", log, "-o", tmp_path / "bag", "--rosbag2")
     drive, back = load_drive(log), read_rosbag(tmp_path / "bag", robot_config())
     for part in ("wheels", "poses"):
         for name in getattr(drive, part).__slots__:

@@ -26,21 +26,16 @@ from disco_hw.log.importing.rosbag import read_rosbag
 from disco_hw.log.load import load_drive
 from tests.inference.drives import robot_config
 from tests.inference.test_infer_command import ROBOT
-from tests.log.importing.bags import BEGAN_NS, LEFT, RIGHT, Maker, bag, recorded
+from tests.log.importing.bags import BEGAN_NS, Maker, bag, recorded
 from tests.tables import thinned
 
 
-def small(path, storage="mcap", count=50):
+def small(path, storage="mcap", samples=range(50)):
+    """A bag of wheel samples."""
     with bag(path, storage) as maker:
-        fill(maker, count)
+        for k in samples:
+            maker.wheels(k)
     return path
-
-
-def fill(maker, count):
-    """Write wheel samples at 5 rad/s."""
-    for k in range(count):
-        t_ns = BEGAN_NS + k * 20_000_000
-        maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [0.1 * k] * 4, [5.0] * 4), t_ns)
 
 
 def file_of(folder):
@@ -138,7 +133,7 @@ def test_a_damaged_chunk_costs_its_messages_only(tmp_path, kind):
 def in_chunks(folder, kind):
     """A bag of 400 wheel samples in small packed chunks, and where the bytes of each chunk begin."""
     if kind == "mcap":
-        small(folder / "b", count=400)
+        small(folder / "b", samples=range(400))
         path = folder / "chunks.mcap"
         with file_of(folder / "b").open("rb") as source, path.open("wb") as sink:
             writer = McapWriter(sink, chunk_size=10_000)
@@ -158,7 +153,9 @@ def in_chunks(folder, kind):
     writer.set_compression(Writer1.CompressionFormat[kind.upper()])
     vars(writer).update(chunk_threshold=10_000)
     with writer:
-        fill(Maker(writer, get_typestore(Stores.ROS1_NOETIC), True), 400)
+        maker = Maker(writer, get_typestore(Stores.ROS1_NOETIC), True)
+        for k in range(400):
+            maker.wheels(k)
     return path, [one.end() for one in re.finditer(b"size=....(?=....(BZh|\x04\x22M))", path.read_bytes(), re.DOTALL)]
 
 
@@ -330,11 +327,8 @@ def test_the_files_of_a_bag_that_was_split_are_read_in_order_of_time(tmp_path, s
     folder = tmp_path / "log"
     folder.mkdir()
     for number in (8, 9, 10):
-        part = tmp_path / f"part{number}"
-        with bag(part, storage) as maker:
-            for k in range(50 * (number - 8), 50 * (number - 7)):
-                t_ns = BEGAN_NS + k * 20_000_000
-                maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [0.1 * k] * 4, [5.0] * 4), t_ns)
+        samples = range(50 * (number - 8), 50 * (number - 7))
+        part = small(tmp_path / f"part{number}", storage, samples)
         file_of(part).rename(folder / f"log_{number}.{ENDINGS[storage]}")
     drive = read_rosbag(folder, robot_config())
     names = ", ".join(f"log_{number}.{ENDINGS[storage]}" for number in (8, 9, 10))

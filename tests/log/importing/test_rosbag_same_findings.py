@@ -3,9 +3,7 @@
 import json
 
 import pytest
-from typer.testing import CliRunner
 
-from disco_hw.cli import app
 from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
@@ -16,6 +14,7 @@ from disco_hw.experiments.virtual import true_parameters
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.robot_setup import load_setup
 from sim.body_dynamics import BodyPose
+from tests.log.importing.commands import call
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(1500)]
 
@@ -37,12 +36,6 @@ def logs(tmp_path_factory):
     call("log", "export", folder / "own.mcap", "-o", folder / "bag", "--rosbag2")
     call("import", folder / "bag", "--robot", SHIPPED_ROBOT, "-o", folder / "imported.mcap")
     return folder / "own.mcap", folder / "imported.mcap"
-
-
-def call(*arguments):
-    done = CliRunner().invoke(app(), [*map(str, arguments)], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
-    return done.stdout
 
 
 def test_the_posteriors_lie_within_one_anothers_intervals(logs, tmp_path):
