@@ -1,5 +1,6 @@
 """Settings of the whole suite; `--robot ROBOT.toml` runs the protocol's conformance suite on a robot instead of it."""
 
+import gc
 from pathlib import Path
 
 import pytest
@@ -105,6 +106,12 @@ def pytest_ignore_collect(collection_path, config):
     if of_robot or not on_the_way:
         return of_robot != bool(config.getoption("--robot")) or None
     return None
+
+
+def pytest_collection_finish():
+    # What has been imported stays: no collection of garbage has to look through it again.
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_deselected(items):

@@ -11,9 +11,10 @@ THERE_AND_BACK = PathTask(path="back.csv", speed_m_s=0.25, points=paths()["there
 
 
 def test_figures_of_a_drive_that_is_known():
+    # Places count the entries of the table, which are 0.01 m apart.
     step = np.arange(100)
     cross_track_m = np.where(step < 20, 5.0, np.where(step < 60, 0.1, -0.2))
-    rows = np.column_stack([0.02 * step, cross_track_m, np.where(step < 80, 0.2, -0.1), 1.0 * step])
+    rows = np.column_stack([0.02 * step, cross_track_m, np.where(step < 80, 0.2, -0.1), 2.0 * step])
     figures = followed(LINE, [rows, rows], "along")
     # The first two seconds do not count.
     assert figures["rms_mm"] == pytest.approx(np.sqrt((40 * 100.0**2 + 40 * 200.0**2) / 80.0))
@@ -23,7 +24,7 @@ def test_figures_of_a_drive_that_is_known():
 
 
 def test_laps_of_a_closed_path_add_up():
-    places = np.arange(300) * 1.0 % 200.0
+    places = np.arange(300) * 2.0 % 400.0
     rows = np.column_stack([np.zeros((300, 2)), np.full(300, 0.2), places])
     backwards = np.column_stack([np.zeros((300, 2)), np.full(300, -0.2), places[::-1]])
     figures = followed(THERE_AND_BACK, [rows, backwards], "against")
