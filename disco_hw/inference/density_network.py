@@ -30,7 +30,6 @@ _BATCH = 256
 _VALIDATION_SHARE = 0.15
 _RIDGE = 1e-3
 _CLIP_NORM = 5.0
-_MEAN_DECAY, _SQUARE_DECAY, _LEAST_ROOT = 0.9, 0.999, 1e-8
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,34 +233,6 @@ def _least_squares(features: Array, targets: Array) -> tuple[Array, Array]:
     return skip, np.maximum((targets - columns @ skip).std(axis=0), 1e-3)
 
 
-@dataclass
-class AdamW:
-    """Adam with decoupled weight decay (Loshchilov and Hutter 2019), with the usual constants.
-
-    `torch.optim` has the same, but imports PyTorch's compiler with its first step, which takes a second.
-    """
-
-    parameters: list[torch.nn.Parameter]
-    decay: float
-    steps: int = 0
-
-    def __post_init__(self) -> None:
-        self._moments = [(torch.zeros_like(one), torch.zeros_like(one)) for one in self.parameters]
-
-    def step(self, rate: float) -> None:
-        """Change the parameters at a learning rate, and forget their gradients."""
-        self.steps += 1
-        size, root = rate / (1.0 - _MEAN_DECAY**self.steps), math.sqrt(1.0 - _SQUARE_DECAY**self.steps)
-        with torch.no_grad():
-            for parameter, (mean, square) in zip(self.parameters, self._moments, strict=True):
-                gradient, parameter.grad = parameter.grad, None
-                if gradient is not None:
-                    parameter.mul_(1.0 - rate * self.decay)
-                    mean.lerp_(gradient, 1.0 - _MEAN_DECAY)
-                    square.mul_(_SQUARE_DECAY).addcmul_(gradient, gradient, value=1.0 - _SQUARE_DECAY)
-                    parameter.addcdiv_(mean, (square.sqrt() / root).add_(_LEAST_ROOT), value=-size)
-
-
 def _fit(stack: _Stack, x: torch.Tensor, y: torch.Tensor, settings: NetworkSettings) -> None:
     """Train an ensemble in place, with early stopping by the log density of held-out pairs."""
     members, count = settings.members, x.shape[0]
@@ -270,19 +241,20 @@ def _fit(stack: _Stack, x: torch.Tensor, y: torch.Tensor, settings: NetworkSetti
     validation, training = order[:, :validation_count], order[:, validation_count:]
     valid_x, valid_y = x[validation], y[validation]
     batches = max(1, training.shape[1] // _BATCH)
-    optimiser = AdamW(list(stack.parameters()), settings.decay)
+    optimiser = torch.optim.AdamW(stack.parameters(), lr=settings.rate, weight_decay=settings.decay)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.epochs)
     best = torch.full((members,), -math.inf)
     since = torch.zeros(members)
     kept = [parameter.detach().clone() for parameter in stack.parameters()]
-    for epoch in range(settings.epochs):
-        # Cosine annealing to zero.
-        rate = 0.5 * settings.rate * (1.0 + math.cos(math.pi * epoch / settings.epochs))
+    for _ in range(settings.epochs):
         shuffled = torch.stack([row[torch.randperm(row.shape[0])] for row in training])
         for batch in shuffled.tensor_split(batches, dim=1):
+            optimiser.zero_grad(set_to_none=True)
             loss = -stack.log_density(x[batch], y[batch]).mean(dim=1).sum()
             loss.backward()  # type: ignore[no-untyped-call]
             torch.nn.utils.clip_grad_norm_(stack.parameters(), _CLIP_NORM * math.sqrt(members))
-            optimiser.step(rate)
+            optimiser.step()
+        schedule.step()
         with torch.no_grad():
             score = stack.log_density(valid_x, valid_y).mean(dim=1)
         better = score > best

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from disco_hw.inference.density_network import AdamW, Mixtures, NetworkSettings, train
+from disco_hw.inference.density_network import Mixtures, NetworkSettings, train
 
 SMALL = NetworkSettings(members=2, hidden=16, epochs=40)
 
@@ -42,19 +42,6 @@ def test_the_same_seed_trains_the_same_network_and_leaves_the_generator_alone():
     one, other = (train(statistics, targets, SMALL, 3).mixtures(statistics[:5]).mean for _ in range(2))
     assert np.array_equal(one, other)
     assert torch.equal(before, torch.random.get_rng_state())
-
-
-def test_the_optimiser_steps_as_pytorchs_own():
-    parameter = torch.nn.Parameter(torch.tensor([1.0, -2.0]))
-    optimiser, found = AdamW([parameter], 0.5), []
-    for gradient in ([0.5, 2.0], [-0.1, 3.0], [2.0, -8.0]):
-        parameter.grad = torch.tensor(gradient)
-        optimiser.step(0.1)
-        assert parameter.grad is None
-        found.append(parameter.tolist())
-    # Of torch.optim.AdamW with the same rate and decay.
-    expected = [[0.85, -2.0], [0.75639743, -1.99908066], [0.64692259, -1.87233341]]
-    assert found == [pytest.approx(row, rel=1e-5) for row in expected]
 
 
 def test_density_and_draws_of_a_mixture_agree():
