@@ -1,12 +1,10 @@
 """Pictures, clips and exported pages of a log, and the pages as processes."""
 
 import json
-import os
 import re
 import signal
 import subprocess
 import sys
-import threading
 import urllib.request
 
 import numpy as np
@@ -16,7 +14,7 @@ from PIL import Image
 from disco_hw.cli.logs import view
 from disco_hw.errors import InputError
 from disco_hw.viewer import picture, scene
-from disco_hw.viewer.commands import export_log, in_figures, snapshot_log, video_log, view_log
+from disco_hw.viewer.commands import export_log, in_figures, snapshot_log, video_log
 from tests.tables import thinned
 from tools.viewer_run import FAULT_TICK
 
@@ -117,25 +115,21 @@ def test_a_clip_without_end_is_refused(recording, tmp_path, monkeypatch):
         picture.draw_clip(recording, tmp_path / "a.gif", 1.0, lambda part: None)
 
 
-def test_a_page_is_served_until_it_is_told_to_end(log_file, capfd):
-    statuses = []
-
-    def visit():
-        try:
-            output = ""
-            while "\n" not in output:
-                output += capfd.readouterr().out
-            # As a browser does: the address carries the token, a cookie keeps it.
-            browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
-            report = json.loads(output)
-            with browser.open(report["page"], timeout=60) as response:
-                statuses.extend([report["ticks"], response.status])
-        finally:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    browsing = threading.Thread(target=visit)
-    browsing.start()
-    assert view_log(log_file, port=0, as_json=True) == 0
-    browsing.join()
-    assert statuses == [200, 200]
-    assert capfd.readouterr().out == ""
+def test_a_page_is_served_until_it_is_told_to_end(log_file):
+    code = "import sys; from pathlib import Path; from disco_hw.viewer.commands import view_log\n"
+    code += f"sys.exit(view_log(Path({str(log_file)!r}), port=0, as_json=True))"
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    try:
+        line = process.stdout.readline()
+        report = json.loads(line)
+        assert report["ticks"] == 200
+        # As a browser does: the address carries the token, a cookie keeps it.
+        browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+        with browser.open(report["page"], timeout=60) as response:
+            assert response.status == 200
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 0
+        assert process.stdout.read() == ""
+    finally:
+        process.kill()
+        process.wait()
