@@ -51,7 +51,7 @@ test: $(STAMP) chromium
 	$(BIN)/ruff format --check .
 	nice sh -c '$(BIN)/mypy && $(BIN)/vulture' & static=$$!; \
 		$(BIN)/python -m tools.compile_kernels && \
-		$(PYTEST) -n 4 --dist each -m "not long and not thorough$(if $(CHROMIUM), or browser)"; \
+		$(PYTEST) -n 6 --dist each -m "not long and not thorough$(if $(CHROMIUM), or browser)"; \
 		tests=$$?; wait $$static && exit $$tests
 	@$(TOOK)
 

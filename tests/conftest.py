@@ -22,9 +22,11 @@ TESTS = Path(__file__).parent
 # With `--dist each` a worker reads and runs only its own folders, as reading all tests takes as long as a tenth of them
 # does to run. The first has the stacks in real time; the others are what takes about equally long.
 PARTS = (
-    ("hil", "first_use", "firmware_protocol/emulated", "experiments", "sim", "tasks"),
-    ("adaptation", "gap", "inference", "log"),
-    ("control", "drivers", "estimation", "model", "runtime"),
+    ("hil", "firmware_protocol/emulated"),
+    ("daemon", "effects", "gap"),
+    ("adaptation", "inference", "log"),
+    ("drivers", "estimation", "experiments", "first_use", "model", "sim"),
+    ("control", "drive", "runtime", "tasks", "viewer"),
 )
 
 
