@@ -23,10 +23,10 @@ TESTS = Path(__file__).parent
 # does to run. The first has the stacks in real time; the others are what takes about equally long.
 PARTS = (
     ("hil", "firmware_protocol/emulated"),
-    ("daemon", "effects", "gap"),
+    ("effects", "gap", "viewer"),
     ("adaptation", "inference", "log"),
-    ("drivers", "estimation", "experiments", "first_use", "model", "sim"),
-    ("control", "drive", "runtime", "tasks", "viewer"),
+    ("daemon", "drivers", "estimation", "experiments", "model", "sim"),
+    ("control", "runtime", "tasks"),
 )
 
 
