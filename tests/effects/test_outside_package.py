@@ -150,7 +150,8 @@ from disco_hw.model import Model, load_model, save_model
 from disco_hw.model.step import FreeRun
 from tools.gap.logs import simulated_drive
 
-log = simulated_drive({"x_speed_squared_drag": 0.5}, seed=905)
+# Strong enough to be worth a model of its own: with 0.5 its predictions would be less than a tenth worse without it.
+log = simulated_drive({"x_speed_squared_drag": 0.8}, seed=905)
 # Without commands only the body is searched, which is enough and takes half the time.
 log = replace(log, commands=Commands())
 report = find_gap(log, Model(0.061, 0.415, 0.238))
@@ -177,7 +178,7 @@ def test_the_effect_of_the_page_is_found_named_and_driven(tmp_path):
     assert found["named"] == ["speed_drag"], found
     assert not found["unnamed"]
     value, low, high = found["k"]["k_s2_m2"]
-    assert low < 0.5 < high, found
+    assert low < 0.8 < high, found
     assert found["sentences"] == [f"drag takes {value:.2f} v^3 of the speed"]
     # The model has the value of the last joint fit, commands to poses.
     v, k = found["rolled_m"], found["driven_with"]
