@@ -37,12 +37,8 @@ def end_with_signal(stack, number: int) -> None:
         assert log.summary().complete
 
 
-# That each signal ends the loop is tested without a robot (tests/daemon/test_signals.py); tests/hil/test_estop.py ends
-# a daemon with SIGTERM.
-@pytest.mark.parametrize(
-    "number",
-    [pytest.param(signal.SIGTERM, marks=pytest.mark.thorough), pytest.param(signal.SIGINT, marks=pytest.mark.long)],
-)
+# That each signal ends the loop is tested without a robot (tests/daemon/test_signals.py).
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.long)])
 def test_a_signal_stops_the_wheels_before_the_process_ends(tmp_path, number):
     with running_stack(tmp_path) as stack:
         end_with_signal(stack, number)
