@@ -19,29 +19,23 @@ from tools.stack import running_stack
 pytestmark = pytest.mark.hil
 
 
-def end_with_signal(stack, number: int) -> None:
-    """End the daemon of a driving robot with a signal: the wheels stand before the process ends, its log is whole."""
-    begun_s = time.monotonic()
-    stack.drive()
-    os.kill(stack.daemon.process.pid, number)
-    code = stack.daemon.process.wait(60.0)
-    ended_s = time.monotonic()
-    time.sleep(0.3)
-    rows = stack.truth()
-    assert code == 0
-    before = [row for row in rows if begun_s < row.t_s < ended_s]
-    assert max(row.fastest for row in before) > 5.0
-    assert before[-1].fastest < STATIONARY_RAD_S
-    assert before[-1].state in {"STANDBY", "READY"}
-    with open_log(stack.directory / "run.mcap") as log:
-        assert log.summary().complete
-
-
 # That each signal ends the loop is tested without a robot (tests/daemon/test_signals.py).
 @pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.long)])
 def test_a_signal_stops_the_wheels_before_the_process_ends(tmp_path, number):
     with running_stack(tmp_path) as stack:
-        end_with_signal(stack, number)
+        stack.drive()
+        os.kill(stack.daemon.process.pid, number)
+        code = stack.daemon.process.wait(60.0)
+        ended_s = time.monotonic()
+        time.sleep(0.3)
+        rows = stack.truth()
+    assert code == 0
+    before = [row for row in rows if row.t_s < ended_s]
+    assert max(row.fastest for row in before) > 5.0
+    assert before[-1].fastest < STATIONARY_RAD_S
+    assert before[-1].state in {"STANDBY", "READY"}
+    with open_log(tmp_path / "run.mcap") as log:
+        assert log.summary().complete
 
 
 # tests/hil/test_recording.py quits while the robot drives, too.

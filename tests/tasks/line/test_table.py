@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from disco_hw.tasks.lemniscate import LemniscateTask
-from disco_hw.tasks.line import PathTable
+from disco_hw.tasks.line import PathTable, planned_table
 
 ANGLE = np.linspace(0.0, 2.0 * np.pi, 400)
 EIGHT = PathTable(np.column_stack([1.5 * np.sin(ANGLE), 0.75 * np.sin(2.0 * ANGLE)]))
@@ -57,3 +57,17 @@ def test_a_corner_is_drawn_in_so_that_a_place_moves_on_round_its_inside():
         at = path.table[int(place)]
         place += ((0.98 - at[0]) * at[2] + (y_m - at[1]) * at[3]) / path.spacing_m - (place - int(place))
     assert place > 60.0
+
+
+@pytest.mark.parametrize(
+    ("length_m", "mode", "spacing_m"),
+    [(20.0, "default", 0.01), (75.0, "default", 0.015), (400.0, "default", 0.02)]
+    + [(20.0, mode, 0.02) for mode in ("sampled", "paper")],
+)
+def test_refined_plans_follow_a_finer_table_unless_the_path_is_long(length_m, mode, spacing_m):
+    side_m = length_m / 4.0
+    square = ((0.0, 0.0), (side_m, 0.0), (side_m, side_m), (0.0, side_m), (0.0, 0.0))
+    table = planned_table(square, mode)
+    assert table.spacing_m == pytest.approx(spacing_m, rel=1e-3)
+    corner = np.hypot(*(table.table[:, :2] - (side_m, 0.0)).T).min()
+    assert corner <= 0.5 * spacing_m
