@@ -45,13 +45,12 @@ TOOK = echo "make $@ took $$(($$(date +%s) - $(BEGAN))) s, set-up included."
 # One thread of linear algebra a process: pools of them on two cores only wait for one another.
 PYTEST := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-# Types and unused code are looked for beside the compiler and the tests. Not with `nice`: on a busy machine they would
-# hardly be run until the end, and be waited for.
+# Types and unused code are looked for beside the tests, and kernels compiled (tests/conftest.py). Not with `nice`: on a
+# busy machine it would hardly get on until the end, and be waited for.
 test: $(STAMP) chromium
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	sh -c '$(BIN)/mypy && $(BIN)/vulture' & static=$$!; \
-		$(BIN)/python -m tools.compile_kernels && \
 		$(PYTEST) -n 6 --dist each -m "not long and not thorough$(if $(CHROMIUM), or browser)"; \
 		tests=$$?; wait $$static && exit $$tests
 	@$(TOOK)

@@ -1,6 +1,11 @@
 """Settings of the whole suite; `--robot ROBOT.toml` runs the protocol's conformance suite on a robot instead of it."""
 
+import fcntl
 import gc
+import os
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -26,7 +31,12 @@ PARTS = (
     ("effects", "gap", "viewer"),
     ("adaptation", "inference", "log"),
     ("daemon", "drivers", "estimation", "experiments", "model", "sim"),
-    ("control", "runtime", "tasks"),
+    ("control", "first_use", "runtime", "tasks"),
+)
+# These run while the kernels that the others share are being compiled.
+WITHOUT_KERNELS = (
+    *("bridge", "cli", "config", "estimation", "fence", "files", "firmware_protocol", "jit", "processes", "reports"),
+    *("test_architecture.py", "test_docs.py", "test_public.py"),
 )
 
 
@@ -36,6 +46,8 @@ def pytest_configure(config):
         if len(config.getvalue("tx")) != len(PARTS) + 1:
             raise pytest.UsageError(f"--dist each: the tests have {len(PARTS) + 1} parts; give -n {len(PARTS) + 1}")
         config.pluginmanager.register(PartsOfTests())
+    if lock := getattr(config, "workerinput", {}).get("kernels_lock"):
+        config.pluginmanager.register(KernelsFirst(lock))
     if settings().derandomize:
         # Examples take constants from what a process has imported so far, which is chance on several workers.
         assert callable(providers._get_local_constants)
@@ -43,18 +55,29 @@ def pytest_configure(config):
 
 
 class PartsOfTests:
-    """Gives each worker its part, and says at the end how many tests were left out of them all."""
+    """Gives each worker its part, has the kernels compiled, and says how many tests were left out of all parts."""
 
     def __init__(self):
         self.collected = self.left_out = 0
         self.session = None
+        # The compiler inherits the lock, and gives it back by ending.
+        lock, self.kernels_lock = tempfile.mkstemp(prefix="kernels")
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        self.compiler = subprocess.Popen([sys.executable, "-m", "tools.compile_kernels"], pass_fds=[lock])
+        os.close(lock)
 
     def pytest_sessionstart(self, session):
         self.session = session
 
+    def pytest_sessionfinish(self, session):
+        if self.compiler.wait() != 0:
+            session.exitstatus = pytest.ExitCode.INTERNAL_ERROR
+        os.unlink(self.kernels_lock)
+
     @pytest.hookimpl(optionalhook=True)
     def pytest_configure_node(self, node):
         node.workerinput["part"] = int(node.workerinput["workerid"].removeprefix("gw"))
+        node.workerinput["kernels_lock"] = self.kernels_lock
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_xdist_node_collection_finished(self, node, ids):
@@ -71,6 +94,22 @@ class PartsOfTests:
     def pytest_terminal_summary(self, terminalreporter):
         what = "more cases of the same rules, closed loops, studies, clusters and the page in a browser"
         terminalreporter.write_line(f"make test-all also runs {self.left_out} tests: {what}.")
+
+
+class KernelsFirst:
+    """Holds up the first test that may need a kernel until all are compiled, as each worker would compile its own."""
+
+    def __init__(self, lock):
+        self.lock = lock
+
+    @pytest.hookimpl(hookwrapper=True, tryfirst=True)
+    def pytest_runtest_protocol(self, item):
+        # Around the time limits of tests, in which nothing is waited for.
+        if self.lock and not is_without_kernels(item.path):
+            with open(self.lock) as lock:
+                fcntl.flock(lock, fcntl.LOCK_SH)
+            self.lock = None
+        yield
 
 
 class FilesToWorkers(LoadScopeScheduling):
@@ -98,6 +137,10 @@ def is_in_part(path, part):
     return part in within if within else part in (*has, len(PARTS))
 
 
+def is_without_kernels(path):
+    return any(path.is_relative_to(TESTS / folder) for folder in WITHOUT_KERNELS)
+
+
 def pytest_ignore_collect(collection_path, config):
     """With a robot only its tests are run, without one all others; a worker with a part has no other."""
     part = getattr(config, "workerinput", {}).get("part")
@@ -123,7 +166,7 @@ def pytest_deselected(items):
 
 def pytest_collection_modifyitems(config, items):
     # The stacks in real time take longest, so they begin first.
-    items.sort(key=lambda item: not item.nodeid.startswith(REAL_TIME))
+    items.sort(key=lambda item: (not item.nodeid.startswith(REAL_TIME), not is_without_kernels(item.path)))
     if not config.getoption("--robot"):
         return
     skip_motion = pytest.mark.skip(reason="turns the wheels; lift them off the ground and give --allow-motion")

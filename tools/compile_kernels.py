@@ -1,4 +1,4 @@
-"""`make test` begins with this: compiles on two cores what each test process would else compile for itself.
+"""Compile on two cores what each worker of `make test` would else compile for itself.
 
 What the tests of one file alone need is not here: these compile it themselves.
 """

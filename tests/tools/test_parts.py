@@ -1,8 +1,12 @@
 """How `make test` shares the tests between its workers."""
 
+import fcntl
 from pathlib import Path
+from types import SimpleNamespace
 
-from tests.conftest import PARTS, is_in_part
+import pytest
+
+from tests.conftest import PARTS, WITHOUT_KERNELS, KernelsFirst, is_in_part
 
 TESTS = Path(__file__).parents[1]
 
@@ -24,3 +28,23 @@ def test_every_file_is_read_by_one_worker():
 
 def test_every_part_names_folders_that_there_are():
     assert all((TESTS / folder).is_dir() for part in PARTS for folder in part)
+    assert all((TESTS / one).exists() for one in WITHOUT_KERNELS)
+
+
+def test_a_test_that_needs_kernels_waits_until_they_are_compiled(tmp_path, monkeypatch):
+    def waits(_lock, how):
+        raise BlockingIOError(how)
+
+    def begin(path):
+        next(kernels.pytest_runtest_protocol(SimpleNamespace(path=TESTS / path)))
+
+    (tmp_path / "lock").touch()
+    kernels = KernelsFirst(tmp_path / "lock")
+    monkeypatch.setattr(fcntl, "flock", waits)
+    begin("firmware_protocol/test_codec.py")
+    with pytest.raises(BlockingIOError, match=str(fcntl.LOCK_SH)):
+        begin("control/test_disco.py")
+    monkeypatch.undo()
+    begin("control/test_disco.py")
+    monkeypatch.setattr(fcntl, "flock", waits)
+    begin("control/test_disco.py")
