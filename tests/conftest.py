@@ -25,13 +25,14 @@ REAL_TIME = ("tests/hil/", "tests/firmware_protocol/emulated/")
 STANDING = tuple(f"tests/hil/test_{name}.py" for name in ("check", "held_up", "path", "waiting"))
 TESTS = Path(__file__).parent
 # With `--dist each` a worker reads and runs only its own folders, as reading all tests takes as long as a tenth of them
-# does to run. The first has the stacks in real time; the others are what takes about equally long.
+# does to run. The first has the stacks in real time, and what it does after them; all take about equally long.
 PARTS = (
-    ("hil", "firmware_protocol/emulated"),
-    ("effects", "gap", "viewer"),
-    ("adaptation", "inference", "log"),
-    ("daemon", "drivers", "estimation", "experiments", "model", "sim"),
-    ("control", "first_use", "runtime", "tasks"),
+    ("adaptation", "hil", "firmware_protocol/emulated", "inference"),
+    ("effects", "gap"),
+    ("daemon", "log"),
+    ("drivers", "estimation", "sim"),
+    ("control", "runtime"),
+    ("drive", "experiments", "first_use", "model", "tasks", "viewer"),
 )
 # These run while the kernels that the others share are being compiled.
 WITHOUT_KERNELS = (
@@ -63,16 +64,18 @@ class PartsOfTests:
         # The compiler inherits the lock, and gives it back by ending.
         lock, self.kernels_lock = tempfile.mkstemp(prefix="kernels")
         fcntl.flock(lock, fcntl.LOCK_EX)
-        self.compiler = subprocess.Popen([sys.executable, "-m", "tools.compile_kernels"], pass_fds=[lock])
+        command = [sys.executable, "-m", "tools.compile_kernels"]
+        self.compiler = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, pass_fds=[lock])
         os.close(lock)
 
     def pytest_sessionstart(self, session):
         self.session = session
 
-    def pytest_sessionfinish(self, session):
-        if self.compiler.wait() != 0:
-            session.exitstatus = pytest.ExitCode.INTERNAL_ERROR
+    def pytest_sessionfinish(self):
         os.unlink(self.kernels_lock)
+        _, errors = self.compiler.communicate()
+        if self.compiler.returncode != 0:
+            pytest.exit(f"tools.compile_kernels failed: {errors}", self.compiler.returncode)
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_configure_node(self, node):
