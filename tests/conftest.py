@@ -2,7 +2,6 @@
 
 import fcntl
 import gc
-import importlib
 import os
 import subprocess
 import sys
@@ -62,8 +61,6 @@ class PartsOfTests:
     def __init__(self):
         self.collected = self.left_out = 0
         self.session = None
-        # Once here, what is imported lies there as bytecode, which all processes would else make of it at once.
-        importlib.import_module("tools.compile_kernels")
         # The compiler inherits the lock, and gives it back by ending.
         lock, self.kernels_lock = tempfile.mkstemp(prefix="kernels")
         fcntl.flock(lock, fcntl.LOCK_EX)
