@@ -149,6 +149,10 @@ COMMAND_MEMORIES: Mapping[str, _Remembering] = {
         )
         for name, time_s in _SHORT_TO_LONG.items()
     },
+    **{
+        f"(u - mean_{name}s(u))": _Memory(time_s, lambda u, other: u, lambda u, other, mean: u - mean)
+        for name, time_s in (("0.3", 0.3), ("1", 1.0))
+    },
     "u mean_30s(u^2)": _Memory(30.0, lambda u, other: u**2, lambda u, other, mean: mean * u),
     **{
         f"sign(u - mean_{name}s(u))": _Memory(time_s, lambda u, other: u, lambda u, other, mean: _sign(u - mean, 0.1))

@@ -185,6 +185,10 @@ COMMAND_MEMORIES: Mapping[str, Remembered] = MappingProxyType(
         )
         for time_s in (0.3, 1.0, 3.0)
     }
+    | {
+        f"(u - mean_{time_s:g}s(u))": Remembered(lambda u, other: u, time_s, lambda u, other, mean: u - mean)
+        for time_s in (0.3, 1.0)
+    }
     | {"u mean_30s(u^2)": Remembered(lambda u, other: u * u, 30.0, lambda u, other, mean: u * mean)}
     | {
         f"sign(u - mean_{time_s:g}s(u))": Remembered(
@@ -266,7 +270,12 @@ class GenericTerm:
 
     def describe(self, k: float) -> str | None:
         """Describe a robot that shows this term with the factor `k`; None where only the equation is known."""
-        if self.memory is None or not self.memory.slews or k > -0.5:
+        if self.memory is None:
+            return None
+        if self.target == COMMAND and self.feature.startswith("(u - "):
+            what = "overshoot a change of their command" if k > 0.0 else "take a change of their command up only in part"
+            return f"the wheels {what}, at first by up to {abs(k):.0%} of it, which fades within {self.memory.time_s:g} s"
+        if not self.memory.slews or k > -0.5:
             return None
         return f"tyres slip: the robot follows its wheels by about {self.memory.most:g} m/s^2 at most"
 

@@ -46,6 +46,13 @@ def test_a_direction_is_that_of_the_last_change_and_fades():
     assert direction[-1] == pytest.approx([0.0, 0.0], abs=1e-3)
 
 
+def test_a_change_of_the_command_is_overshot_and_comes_to_rest():
+    up = np.repeat([[1.0, -2.0], [3.0, -1.0]], 1000, axis=0)
+    changed = of_command("(u - mean_1s(u))", up)
+    assert changed[999] == pytest.approx([0.0, 0.0], abs=1e-3)
+    assert changed[1099] == pytest.approx([2.0 * LEFT, 1.0 * LEFT], rel=1e-3)
+
+
 def test_the_body_is_asked_in_its_own_speeds():
     v, w = np.full(500, 0.4), np.full(500, -0.9)
     turning = BODY_MEMORIES["omega"]["(omega - mean_1s(omega))"].at_nodes(STEP_S, v, w)

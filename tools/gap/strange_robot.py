@@ -1,7 +1,7 @@
 """A robot with imperfections that neither the model's effects nor the search's unnamed terms have the form of.
 
 It shares no constant and no equation with the virtual robot or with the model (`tests/tools/test_strange_robot.py`
-holds it to that), is driven as a person does with a joystick, and hides one of ten FORMS at a time. Its motors are as
+holds it to that), is driven as a person does with a joystick, and hides one of eleven FORMS at a time. Its motors are as
 they are: a lag and a delay of their own, which a search may name. Poses carry white noise of POSITION_STD_M on each
 axis and YAW_STD_RAD, encoders count in steps of 2 pi / COUNTS_PER_TURN. Stamps are exact.
 """
@@ -45,6 +45,7 @@ FORMS: Mapping[str, Mapping[str, tuple[float, float]]] = MappingProxyType(
         "gear_eccentricity": {"error_rad": (0.029, 0.057), "ratio": (2.63, 4.37)},
         "thermal_fade": {"most_share": (0.093, 0.173), "memory_s": (33.0, 57.0)},
         "rate_dependent_latency": {"most_s": (0.131, 0.237), "half_rad_s": (0.073, 0.139)},
+        "speed_loop": {"damping": (0.37, 0.53), "frequency_rad_s": (7.3, 11.9)},
     }
 )  # fmt: skip
 """Every form's parameters with the ranges that they are drawn from."""
@@ -66,6 +67,8 @@ class _Wheel:
     """State of one side: what is requested of the motor, its speed, heat and angle, and the angle beyond the gear."""
 
     hysteresis_rad_s: float = 0.0
+    regulated_rad_s: float = 0.0
+    growth_rad_s2: float = 0.0
     speed: float = 0.0
     heat: float = 0.0
     angle: float = 0.0
@@ -156,7 +159,7 @@ def record(form: str | None, seed: int, command: Array | None = None, share: flo
             drained += (drain - drained) * dt / values["memory_s"]
         rim = np.empty(2)
         for side, wheel in enumerate(wheels):
-            target = _target_speed(form, values, wheel, in_force[side]) * (1.0 - drained)
+            target = _target_speed(form, values, wheel, in_force[side], dt) * (1.0 - drained)
             wheel.speed += (target - wheel.speed) * -math.expm1(-dt / lag_s)
             wheel.angle += wheel.speed * dt
             if form == "thermal_fade":
@@ -180,7 +183,7 @@ def _arrivals(commands: Array, delay_s: float, values: Mapping[str, float] | Non
     return np.maximum.accumulate(sent + delays_s)
 
 
-def _target_speed(form: str | None, values: Mapping[str, float], wheel: _Wheel, command: float) -> float:
+def _target_speed(form: str | None, values: Mapping[str, float], wheel: _Wheel, command: float, dt: float) -> float:
     """The speed that a motor is after under a command."""
     if form == "hysteresis":
         half = values["half_width_rad_s"]
@@ -192,6 +195,13 @@ def _target_speed(form: str | None, values: Mapping[str, float], wheel: _Wheel, 
         return math.copysign(max(abs(command) - sliding - (breakaway - sliding) * fading, 0.0), command)
     if form == "thermal_fade":
         return command * (1.0 - values["most_share"] * wheel.heat)
+    if form == "speed_loop":
+        # A controller that is tuned too sharply overshoots, and swings.
+        frequency, before = values["frequency_rad_s"], wheel.regulated_rad_s
+        pulled = frequency**2 * (command - before) - 2.0 * values["damping"] * frequency * wheel.growth_rad_s2
+        wheel.growth_rad_s2 += pulled * dt
+        wheel.regulated_rad_s += wheel.growth_rad_s2 * dt
+        return wheel.regulated_rad_s
     return command
 
 

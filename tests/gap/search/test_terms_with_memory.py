@@ -134,6 +134,7 @@ def test_a_term_whose_number_cannot_be_so_large_is_not_offered_and_not_fitted_be
         ("hysteresis", 601, "command += k sign(u - mean_1s(u))"),
         ("cross_coupled_supply", 501, "command += k u mean_1s(|u| + |u_other|)"),
         ("tyre_relaxation", 601, "omega += k (omega - mean_1s(omega))"),
+        ("speed_loop", 601, "command += k (u - mean_0.3s(u))"),
     ],
 )
 def test_what_a_robot_remembers_is_in_its_model_and_predicts_another_drive(form, seed, term, tmp_path):
