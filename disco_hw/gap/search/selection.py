@@ -308,11 +308,11 @@ class Selector:
                 settle(self, accepted)
 
     def select(self, begin: Names = ()) -> Names:
-        """Forward, swap, backward, until nothing changes; from what is needed of a set to begin with.
+        """Forward, swap, backward, until nothing changes; from what is needed of a set to begin with, swapped too.
 
         Swaps and drops may come back to a set that was there before: then it is the best of those on the way.
         """
-        accepted = self.needed(begin) if begin else self.given
+        accepted = self.needed(self.swapped(self.needed(begin))) if begin else self.given
         visited = {frozenset(accepted): accepted}
         while True:
             new = self._next(accepted)

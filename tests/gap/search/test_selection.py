@@ -323,6 +323,18 @@ class Circling(Selector):
         }.get(accepted, accepted)
 
 
+class Stuck(Selector):
+    """A search that nothing promises to go on."""
+
+    def ranked(self, accepted):
+        return []
+
+
+def test_a_search_that_begins_with_a_stand_in_swaps_it_even_where_nothing_gains_on_top_of_it():
+    channel, _ = body_channel(turn_slip=0.08)
+    assert Stuck(channel, body_moves(channel), LIMITS).select(("surface_change",)) == ("turn_slip",)
+
+
 def test_a_search_that_comes_back_to_where_it_was_ends_with_the_best_set_on_its_way():
     channel, _ = body_channel(turn_slip=0.08, side_slip=0.1)
     circling = Circling(channel, body_moves(channel), LIMITS)
