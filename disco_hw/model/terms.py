@@ -273,8 +273,9 @@ class GenericTerm:
         if self.memory is None:
             return None
         if self.target == COMMAND and self.feature.startswith("(u - "):
-            what = "overshoot a change of their command" if k > 0.0 else "take a change of their command up only in part"
-            return f"the wheels {what}, at first by up to {abs(k):.0%} of it, which fades within {self.memory.time_s:g} s"
+            what = "overshoot a change of their command" if k > 0.0 else "take up a change of their command in part"
+            fades = f"which fades within {self.memory.time_s:g} s"
+            return f"the wheels {what}, at first by up to {abs(k):.0%} of it, {fades}"
         if not self.memory.slews or k > -0.5:
             return None
         return f"tyres slip: the robot follows its wheels by about {self.memory.most:g} m/s^2 at most"

@@ -332,7 +332,7 @@ class Stuck(Selector):
 
 def test_a_search_that_begins_with_a_stand_in_swaps_it_even_where_nothing_gains_on_top_of_it():
     channel, _ = body_channel(turn_slip=0.08)
-    assert Stuck(channel, body_moves(channel), LIMITS).select(("surface_change",)) == ("turn_slip",)
+    assert Stuck(channel, body_moves(channel), LIMITS).select(("turn_asymmetry",)) == ("turn_slip",)
 
 
 def test_a_search_that_comes_back_to_where_it_was_ends_with_the_best_set_on_its_way():
