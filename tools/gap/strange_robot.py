@@ -1,8 +1,8 @@
 """A robot with imperfections that neither the model's effects nor the search's unnamed terms have the form of.
 
 It shares no constant and no equation with the virtual robot or with the model (`tests/tools/test_strange_robot.py`
-holds it to that), is driven as a person does with a joystick, and hides one of eleven FORMS at a time. Its motors are as
-they are: a lag and a delay of their own, which a search may name. Poses carry white noise of POSITION_STD_M on each
+holds it to that), is driven as a person does with a joystick, and hides one of eleven FORMS at a time. Its motors are
+as they are: a lag and a delay of their own, which a search may name. Poses carry white noise of POSITION_STD_M on each
 axis and YAW_STD_RAD, encoders count in steps of 2 pi / COUNTS_PER_TURN. Stamps are exact.
 """
 
