@@ -13,9 +13,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.effects import Stage
+from disco_hw.effects.registry import in_stages
 from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
 from disco_hw.gap.search.evidence import Z95, EffectEvidence, inflation, interval_inflation
-from disco_hw.gap.search.least_squares import Fit, by_block, fit, inverse, within
+from disco_hw.gap.search.least_squares import Fit, by_block, fit, inverse, sensitivity, within
 from disco_hw.gap.search.richest_model import CANDIDATES, delay_columns, indices
 from disco_hw.gap.search.selection import Names, Selector
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms
@@ -148,7 +150,8 @@ def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
     factors = np.array([drives * interval_inflation(best, channel, (index,)) for index in best.active])
     covariance = best.covariance() * np.sqrt(np.outer(factors, factors))
     variances = np.maximum(np.diag(covariance), 1e-300)
-    wandering, apart, stamped = drifted(found), _weightings_apart(found), _stamped(found)
+    wandering, stamped = drifted(found), _stamped(found)
+    apart = _weightings_apart(found) + _sensor_not_told(found)
     more = np.array(
         [
             (wandering.get(columns[index], 0.0) + apart[place] + stamped.get(columns[index], 0.0)) / variances[place]
@@ -190,6 +193,29 @@ def _weightings_apart(found: ChannelResult) -> Array:
     chosen = list(best.active)
     by_chance = np.abs(deviations_of(evenly, found.channel) ** 2 - deviations_of(found.fit, found.channel) ** 2)
     return np.asarray(0.5 * np.maximum((evenly.vector - found.fit.vector)[chosen] ** 2 - by_chance, 0.0))
+
+
+def _sensor_not_told(found: ChannelResult) -> Array:
+    """Variances, (A,), that errors of the pose sensor add which were not found, but which the log may hide.
+
+    On a circle a sensor that is mounted turned looks like one that sits elsewhere, and the fit takes it for where the
+    robot turns; on a circle the other way round it takes it for the opposite. Each error is a nuisance parameter with
+    a normal prior about none, of the size that real robots have, and the variances are those of the marginal.
+    """
+    best, channel = found.reported, found.selector.channel
+    layout = channel.layout
+    sizes: dict[int, float] = {
+        layout.place[column]: parameter.realistic
+        for effect in in_stages(Stage.POSE, Stage.POSE_TIME)
+        for column, parameter in zip(effect.columns, effect.parameters, strict=True)
+        if parameter.realistic is not None and layout.place.get(column) not in (None, *best.active)
+    }
+    if not sizes or not best.active:
+        return np.zeros(len(best.active))
+    slope = sensitivity(channel, best.vector, tuple(sizes), best.residual)
+    across, expected = best.jacobian.T @ slope, np.diag([size**-2.0 for size in sizes.values()])
+    left = best.information() - across @ inverse(slope.T @ slope + expected) @ across.T
+    return np.asarray(np.maximum(np.diag(inverse(left)) - np.diag(best.covariance()), 0.0))
 
 
 def _stamped(found: ChannelResult) -> dict[str, float]:

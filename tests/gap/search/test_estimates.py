@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.data import BODY, WHEEL
+from disco_hw.gap.data.free_runs import read_angles
 from disco_hw.gap.search import channel_result
 from disco_hw.gap.search.channel_result import InParts, drifted, estimate_parameters, in_equal_parts, in_logs, in_parts
-from disco_hw.gap.search.least_squares import Fit
+from disco_hw.gap.search.least_squares import Fit, fit
 from disco_hw.gap.settings import DEFAULT_SETTINGS, FitSettings, GapSettings
+from tests.gap.synthetic import GEOMETRY, body_on, line_of, vector_of, wheels_on
 
 
 @pytest.mark.parametrize(("begins_s", "drives"), [((0.0,), 2.0), ((0.0, 30.0, 60.0), 4.0)])
@@ -25,9 +27,10 @@ def test_an_interval_is_of_another_drive_and_widened_by_how_a_value_wanders(monk
     monkeypatch.setattr(channel_result, "drifted", lambda of: {"c": 6.0})
     monkeypatch.setattr(channel_result, "_weightings_apart", lambda of: np.array([3.0, 0.0]))
     monkeypatch.setattr(channel_result, "_stamped", lambda of: {"a": 2.0})
+    monkeypatch.setattr(channel_result, "_sensor_not_told", lambda of: np.array([1.0, 5.0]))
     estimates = estimate_parameters(found)
-    # Of `c` 4 x 4 for each drive and 9 beside, of `a` 9 x 1.44 and 2 beside.
-    variances = np.array([16.0 * drives + 9.0, 12.96 * drives + 2.0])
+    # Of `c` 4 x 4 for each drive and 10 beside, of `a` 9 x 1.44 and 7 beside.
+    variances = np.array([16.0 * drives + 10.0, 12.96 * drives + 7.0])
     deviations = np.sqrt(variances)
     # The correlation is that of the fit, 1 / 6.
     together = deviations.prod() / 6.0
@@ -60,6 +63,40 @@ def test_two_weightings_lie_apart_by_what_is_beyond_the_difference_of_their_vari
     # Half of 16 beyond 9 - 4, of 1 within 4 - 1, and of 4 beyond none.
     assert channel_result._weightings_apart(found).tolist() == [5.5, 0.0, 2.0]
     assert channel_result._weightings_apart(SimpleNamespace(reported=reported, evenly=None)).tolist() == [0.0] * 3
+
+
+def turned_sensor(commands):
+    """What is found of a robot whose sensor is mounted turned by 20 mrad, which is not named, on a drive of a minute.
+
+    And how far its centre of turning is found from where it is (m).
+    """
+    line = line_of(np.repeat(np.array(commands, dtype=float), 6000 // len(commands), axis=0))
+    still = np.zeros((line.pose.t_s.size, 3))
+    poses = still.copy()
+    read_angles(body_on(line, still).track(vector_of()), line.pose.node, line.pose.fraction, poses)
+    poses += np.random.default_rng(3).standard_normal(poses.shape) * (0.004, 0.004, 0.006) + (0.0, 0.0, 0.02)
+    channel = body_on(line, poses)
+    best = fit(channel, channel.neutral, channel.free)
+    found = SimpleNamespace(reported=best, selector=SimpleNamespace(channel=channel))
+    return found, best.vector[2] - GEOMETRY[2]
+
+
+def test_on_a_circle_the_centre_of_turning_is_as_uncertain_as_how_the_sensor_is_mounted():
+    ahead = BODY.columns.index("x_icr_m")
+    found, off_m = turned_sensor([(2.0, 5.0)])
+    # The circle's radius is 0.21 m/s over 0.45 rad/s, and sensors are turned by 26 mrad.
+    assert abs(off_m) == pytest.approx(0.467 * 0.02, abs=0.002)
+    added = channel_result._sensor_not_told(found)
+    assert added[found.reported.active.index(ahead)] ** 0.5 == pytest.approx(0.467 * 0.026, rel=0.1)
+    # Straight ahead only the sensor can move it aside.
+    found, off_m = turned_sensor([(4.0, 4.0), (-3.0, 3.0), (5.0, 5.0), (3.0, -3.0), (2.0, 5.0), (5.0, 2.0)])
+    assert abs(off_m) < 0.004
+    added = channel_result._sensor_not_told(found)
+    assert added[found.reported.active.index(ahead)] ** 0.5 < 0.002
+    # Of wheels no pose is asked.
+    wheels = wheels_on(line_of(np.ones((600, 2))))
+    alone = SimpleNamespace(reported=SimpleNamespace(active=(1, 2)), selector=SimpleNamespace(channel=wheels))
+    assert channel_result._sensor_not_told(alone).tolist() == [0.0, 0.0]
 
 
 def test_a_delay_is_known_as_well_as_the_stamps_are():
