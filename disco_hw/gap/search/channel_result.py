@@ -200,13 +200,15 @@ def _sensor_not_told(found: ChannelResult) -> Array:
 
     On a circle a sensor that is mounted turned looks like one that sits elsewhere, and the fit takes it for where the
     robot turns; on a circle the other way round it takes it for the opposite. Each error is a nuisance parameter with
-    a normal prior about none, of the size that real robots have, and the variances are those of the marginal.
+    a normal prior about none, of the size that real robots have, and the variances are those of the marginal. One that
+    is the same in every drive as an effect that was found is told with it.
     """
     best, channel = found.reported, found.selector.channel
     layout = channel.layout
     sizes: dict[int, float] = {
         layout.place[column]: parameter.realistic
         for effect in in_stages(Stage.POSE, Stage.POSE_TIME)
+        if effect.mimics is None or effect.mimics.effect.name not in found.names
         for column, parameter in zip(effect.columns, effect.parameters, strict=True)
         if parameter.realistic is not None and layout.place.get(column) not in (None, *best.active)
     }

@@ -77,7 +77,7 @@ def turned_sensor(commands):
     poses += np.random.default_rng(3).standard_normal(poses.shape) * (0.004, 0.004, 0.006) + (0.0, 0.0, 0.02)
     channel = body_on(line, poses)
     best = fit(channel, channel.neutral, channel.free)
-    found = SimpleNamespace(reported=best, selector=SimpleNamespace(channel=channel))
+    found = SimpleNamespace(reported=best, names=(), selector=SimpleNamespace(channel=channel))
     return found, best.vector[2] - GEOMETRY[2]
 
 
@@ -95,7 +95,7 @@ def test_on_a_circle_the_centre_of_turning_is_as_uncertain_as_how_the_sensor_is_
     assert added[found.reported.active.index(ahead)] ** 0.5 < 0.002
     # Of wheels no pose is asked.
     wheels = wheels_on(line_of(np.ones((600, 2))))
-    alone = SimpleNamespace(reported=SimpleNamespace(active=(1, 2)), selector=SimpleNamespace(channel=wheels))
+    alone = SimpleNamespace(names=(), reported=SimpleNamespace(active=(1, 2)), selector=SimpleNamespace(channel=wheels))
     assert channel_result._sensor_not_told(alone).tolist() == [0.0, 0.0]
 
 
