@@ -151,7 +151,7 @@ def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
     covariance = best.covariance() * np.sqrt(np.outer(factors, factors))
     variances = np.maximum(np.diag(covariance), 1e-300)
     wandering, stamped = drifted(found), _stamped(found)
-    apart = _weightings_apart(found) + _sensor_not_told(found)
+    apart = _weightings_apart(found) + _hidden_sensor_errors(found)
     more = np.array(
         [
             (wandering.get(columns[index], 0.0) + apart[place] + stamped.get(columns[index], 0.0)) / variances[place]
@@ -195,7 +195,7 @@ def _weightings_apart(found: ChannelResult) -> Array:
     return np.asarray(0.5 * np.maximum((evenly.vector - found.fit.vector)[chosen] ** 2 - by_chance, 0.0))
 
 
-def _sensor_not_told(found: ChannelResult) -> Array:
+def _hidden_sensor_errors(found: ChannelResult) -> Array:
     """Variances, (A,), that errors of the pose sensor add which were not found, but which the log may hide.
 
     On a circle a sensor that is mounted turned looks like one that sits elsewhere, and the fit takes it for where the

@@ -27,7 +27,7 @@ def test_an_interval_is_of_another_drive_and_widened_by_how_a_value_wanders(monk
     monkeypatch.setattr(channel_result, "drifted", lambda of: {"c": 6.0})
     monkeypatch.setattr(channel_result, "_weightings_apart", lambda of: np.array([3.0, 0.0]))
     monkeypatch.setattr(channel_result, "_stamped", lambda of: {"a": 2.0})
-    monkeypatch.setattr(channel_result, "_sensor_not_told", lambda of: np.array([1.0, 5.0]))
+    monkeypatch.setattr(channel_result, "_hidden_sensor_errors", lambda of: np.array([1.0, 5.0]))
     estimates = estimate_parameters(found)
     # Of `c` 4 x 4 for each drive and 10 beside, of `a` 9 x 1.44 and 7 beside.
     variances = np.array([16.0 * drives + 10.0, 12.96 * drives + 7.0])
@@ -86,17 +86,17 @@ def test_on_a_circle_the_centre_of_turning_is_as_uncertain_as_how_the_sensor_is_
     found, off_m = turned_sensor([(2.0, 5.0)])
     # The circle's radius is 0.21 m/s over 0.45 rad/s, and sensors are turned by 26 mrad.
     assert abs(off_m) == pytest.approx(0.467 * 0.02, abs=0.002)
-    added = channel_result._sensor_not_told(found)
+    added = channel_result._hidden_sensor_errors(found)
     assert added[found.reported.active.index(ahead)] ** 0.5 == pytest.approx(0.467 * 0.026, rel=0.1)
     # Straight ahead only the sensor can move it aside.
     found, off_m = turned_sensor([(4.0, 4.0), (-3.0, 3.0), (5.0, 5.0), (3.0, -3.0), (2.0, 5.0), (5.0, 2.0)])
     assert abs(off_m) < 0.004
-    added = channel_result._sensor_not_told(found)
+    added = channel_result._hidden_sensor_errors(found)
     assert added[found.reported.active.index(ahead)] ** 0.5 < 0.002
     # Of wheels no pose is asked.
     wheels = wheels_on(line_of(np.ones((600, 2))))
     alone = SimpleNamespace(names=(), reported=SimpleNamespace(active=(1, 2)), selector=SimpleNamespace(channel=wheels))
-    assert channel_result._sensor_not_told(alone).tolist() == [0.0, 0.0]
+    assert channel_result._hidden_sensor_errors(alone).tolist() == [0.0, 0.0]
 
 
 def test_a_delay_is_known_as_well_as_the_stamps_are():
