@@ -44,7 +44,9 @@ def mend(stack, fault: str) -> None:
 @pytest.mark.parametrize(
     ("link", "faults"),
     [
-        ("can", ["estop", "SIGSTOP", "unplug", "bus_off", "babble_flood", "SIGKILL"]),
+        ("can", ["estop", "unplug", "bus_off", "babble_flood", "SIGKILL"]),
+        # After it a pose that has jumped may rightly stop the next drive.
+        ("can", ["SIGSTOP"]),
         pytest.param("can", ["babble_commands"], marks=pytest.mark.long),
         pytest.param("serial", ["SIGKILL"], marks=pytest.mark.long),
         pytest.param("serial", ["unplug"], marks=pytest.mark.thorough),
