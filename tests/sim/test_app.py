@@ -173,8 +173,8 @@ def test_drive_it_over_can_and_let_go(start, host):
     port = CanPort(robot)
     arm(port, host)
     host.speeds = (2.0, 3.0)
-    assert drive(port, host, 30, lambda: host.latest["WHEEL_SPEED"]["right_speed"] > 2.9)
-    assert robot.wheel_speed() > 2.9
+    # What is measured scatters about what is so.
+    assert drive(port, host, 30, lambda: min(host.latest["WHEEL_SPEED"]["right_speed"], robot.wheel_speed()) > 2.9)
     # The pause is the simulator's, not the host's: what came meanwhile is let in as if it had come in time.
     robot.process.send_signal(signal.SIGSTOP)
     drive(port, host, 1.6 * COMMAND_TIMEOUT_S)
