@@ -273,9 +273,9 @@ class GenericTerm:
         if self.memory is None:
             return None
         if self.target == COMMAND and self.feature.startswith("(u - "):
-            what = "overshoot a change of their command" if k > 0.0 else "take up a change of their command in part"
-            fades = f"which fades within {self.memory.time_s:g} s"
-            return f"the wheels {what}, at first by up to {abs(k):.0%} of it, {fades}"
+            what = "overshoot" if k > 0.0 else "at first fall short of"
+            fades = f"which fades with a time constant of {self.memory.time_s:g} s"
+            return f"the wheels {what} a change of their command by up to {abs(k):.0%} of it, {fades}"
         if not self.memory.slews or k > -0.5:
             return None
         return f"tyres slip: the robot follows its wheels by about {self.memory.most:g} m/s^2 at most"

@@ -42,12 +42,12 @@ class Outcome:
     def describe(self) -> str:
         lines = self.output.splitlines()
         counts = ", ".join(COUNT.findall(" ".join(lines[-3:]))) or "no counts"
-        failures = [line for line in lines if line.startswith(("FAILED", "ERROR", "E  ", "make test took", "!!!"))]
+        notable = [line for line in lines if line.startswith(("FAILED", "ERROR", "E  ", "make test took", "!!!"))]
         first = (
             f"rc {self.code}, {self.wall_s:.0f} s wall, {self.cpu_s:.0f} s CPU, {counts}, load {self.load[0]:.1f} "
             f"before and {self.load[1]:.1f} after, the host stole {self.stolen_s:.1f} s"
         )
-        return "\n  ".join([first, *(failures or (lines[-10:] if self.code else []))])
+        return "\n  ".join([first, *(notable or (lines[-10:] if self.code else []))])
 
 
 def run(command: list[str], folder: Path) -> Outcome:

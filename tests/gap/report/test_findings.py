@@ -55,9 +55,9 @@ def test_a_term_is_told_in_words_where_it_is_known_what_it_means():
     assert replace(plain, unnamed=(slipping,)).as_dict()["unnamed"][0]["meaning"] == meaning
     overshoot = TERMS["command += k (u - mean_0.3s(u))"]
     assert overshoot.describe(0.14) == (
-        "the wheels overshoot a change of their command, at first by up to 14% of it, which fades within 0.3 s"
+        "the wheels overshoot a change of their command by up to 14% of it, which fades with a time constant of 0.3 s"
     )
-    assert "take up a change of their command in part" in str(overshoot.describe(-0.14))
+    assert "at first fall short of a change of their command by up to 14%" in str(overshoot.describe(-0.14))
     # Half of it is something else, and so is any other form.
     assert TERMS["v_x += k (v - slewed_6.3(v))"].describe(-0.4) is None
     assert TERMS["v_x += k (v - mean_1s(v))"].describe(-1.0) is None
