@@ -46,18 +46,14 @@ class Scenario:
     """A drive of a foreign robot: what it is, how it changes at `change_s`, and how good its poses are.
 
     `changed` gives the robot after `seconds` of driving. `narrow`: the belief at first is 1 % wide, else 15 %.
-    `poses`: every how many-th pose arrives, and the noise added to it (m, rad); `stated`: the part of that noise which
-    the poses state. `wrong`: one pose of so many is off by so many metres. At `carried_s` somebody carries the robot.
-    Evaluated over the last `evaluated_s`. `step` of the length number `index` by a factor: how soon 80 % is known.
+    `poses`: every how many-th pose arrives, and the noise added to it (m, rad), which the poses state. Evaluated over
+    the last `evaluated_s`. `step` of the length number `index` by a factor: how soon 80 % is known.
     """
 
     robot: Callable[[int], ForeignRobot] = lambda seed: ForeignRobot(*NOMINAL)
     changed: Callable[[ForeignRobot, float], ForeignRobot] = lambda robot, seconds: robot
     narrow: bool = False
     poses: tuple[int, float, float] = (1, 0.0, 0.0)
-    stated: float = 1.0
-    wrong: tuple[int, float] = (0, 0.0)
-    carried_s: float = math.inf
     duration_s: float = 45.0
     evaluated_s: float = 15.0
     step: tuple[int, float] | None = None
@@ -149,8 +145,6 @@ def estimate(scenario: Scenario, seed: int) -> Estimated:
         if tick % 25 == 0:
             other = ForeignPlant(scenario.changed(first, seconds), plant.pose, 1)
             plant.robot, plant._numbers = other.robot, other._numbers
-        if seconds >= scenario.carried_s > seconds - 0.02:
-            plant.state[:3] = 2.0, -1.0, -2.0
         adaptation.feed(plant.now_ns, _as_good(plant.readings(), scenario, noise))
         adaptation.step(plant.now_ns)
         plant.advance(*_commands(seconds), 20)
@@ -178,24 +172,17 @@ def _commands(seconds: float) -> tuple[float, float]:
 
 
 def _as_good(readings: Readings, scenario: Scenario, noise: np.random.Generator) -> Readings:
-    """The readings with poses made rarer, noisier and wrong."""
+    """The readings with poses made rarer and noisier."""
     every, position_m, yaw_rad = scenario.poses
-    stated, (each, wrong_m) = scenario.stated, scenario.wrong
     found = []
     for pose in readings.poses:
-        number = pose.t_ns // 40_000_000
-        if number % every == 0:
+        if pose.t_ns // 40_000_000 % every == 0:
             x, y, yaw = noise.standard_normal(3) * (position_m, position_m, yaw_rad)
-            if each and number % each == each - 1:
-                x += wrong_m
-            spread = (
-                math.hypot(pose.position_std_m, stated * position_m),
-                math.hypot(pose.yaw_std_rad, stated * yaw_rad),
-            )
             found.append(
                 msgspec.structs.replace(
                     pose, x_m=pose.x_m + x, y_m=pose.y_m + y, yaw_rad=pose.yaw_rad + yaw,
-                    position_std_m=spread[0], yaw_std_rad=spread[1],
+                    position_std_m=math.hypot(pose.position_std_m, position_m),
+                    yaw_std_rad=math.hypot(pose.yaw_std_rad, yaw_rad),
                 )
             )  # fmt: skip
     return Readings(wheels=readings.wheels, poses=tuple(found))

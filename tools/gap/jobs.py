@@ -18,7 +18,6 @@ from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap import find_gap
 from disco_hw.gap.report.blind_spots import BlindSpot
 from disco_hw.gap.search.channel_result import ParameterEstimate
-from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
 from disco_hw.log.drive import DriveLog
 from disco_hw.model import Model
 from tools.gap import strange_robot
@@ -154,11 +153,11 @@ def jobs(kind: str, seeds: Iterable[int]) -> Iterator[Job]:
                 yield Job(kind, realistic(name, seed, 0.25 if kind == "weak" else 1.0), seed)
 
 
-def work(job: Job, settings: GapSettings = DEFAULT_SETTINGS) -> Result:
+def work(job: Job) -> Result:
     """Make one log and search it."""
     log, model = _log(job), Model(*strange_robot.NOMINAL) if job.kind == "strange" else MODEL
     began = time.process_time()
-    report = find_gap(log, model, top_rad_s=LARGEST_RAD_S, settings=settings)
+    report = find_gap(log, model, top_rad_s=LARGEST_RAD_S)
     cpu_s = time.process_time() - began
     mm = {stage: 1e3 * errors[2.0].position_m for stage, errors in report.gap.items()}
     errors, covered = [], []
