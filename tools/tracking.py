@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,32 +127,6 @@ def fusion(mean: tuple[float, ...], spread: float = SPREAD) -> PoseFusion:
     return PoseFusion(Estimation(), OdometryParameters(*mean, tuple(map(tuple, rows))), 0.1)
 
 
-class Plant(Protocol):
-    """Plant to be driven: true pose and speed, the sensors' samples, and wheel speeds that are held for a while."""
-
-    @property
-    def now_ms(self) -> int:
-        """Time of the plant, ms."""
-
-    @property
-    def pose(self) -> tuple[float, float, float]:
-        """x, y (m), yaw (rad)."""
-
-    @property
-    def forward_m_s(self) -> float:
-        """Speed along the body."""
-
-    @property
-    def now_ns(self) -> int:
-        """Time of the plant, ns."""
-
-    def readings(self) -> Readings:
-        """Return the sensors' samples at this time."""
-
-    def advance(self, left_rad_s: float, right_rad_s: float, count: int, /) -> None:
-        """Hold these wheel speeds (rad/s) for `count` milliseconds."""
-
-
 @dataclass(frozen=True)
 class Contender:
     """A planner for a robot and a track; whether it knows the geometry and whether it learns it."""
@@ -230,7 +203,7 @@ def drive(
     contender: Contender, robot: ForeignRobot, track: Track, *, rate_hz: float = 50.0, duration_s: float = DURATION_S,
     seed: int = 1, start: tuple[float, float, float] | None = None,
     listen: Callable[[Readings], object] = lambda readings: None,
-    plant_of: Callable[[ForeignRobot, tuple[float, float, float], int], Plant] = ForeignPlant,
+    plant_of: Callable[[ForeignRobot, tuple[float, float, float], int], ForeignPlant] = ForeignPlant,
 ) -> Drive:  # fmt: skip
     """One drive from rest; `listen` gets what the sensors say, `plant_of` makes the robot that is driven."""
     plant = plant_of(robot, start or track.start, seed)

@@ -143,8 +143,7 @@ def estimate(scenario: Scenario, seed: int) -> Estimated:
     for tick in range(round(scenario.duration_s / 0.02)):
         seconds = 0.02 * tick
         if tick % 25 == 0:
-            other = ForeignPlant(scenario.changed(first, seconds), plant.pose, 1)
-            plant.robot, plant._numbers = other.robot, other._numbers
+            plant.become(scenario.changed(first, seconds))
         adaptation.feed(plant.now_ns, _as_good(plant.readings(), scenario, noise))
         adaptation.step(plant.now_ns)
         plant.advance(*_commands(seconds), 20)
