@@ -18,12 +18,13 @@ from disco_hw.adaptation.fast import FastAdaptation
 from disco_hw.adaptation.guard import NAMES, Geometry, believed_geometry, with_geometry
 from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.daemon.run import warm_up
-from disco_hw.experiments.adapt import BELIEVED_STD, CHANGES, AdaptOptions, run_adapt
+from disco_hw.experiments.adapt import BELIEVED_STD, CHANGES
 from disco_hw.log.reader import open_log
 from disco_hw.model import load_model, model_text
 from disco_hw.runtime.assembly import apply_geometry, create_fast_adaptation, create_pipeline, create_planner
 from disco_hw.runtime.robot_setup import Setup, load_setup
 from drivers.types import PoseSample, Readings, WheelSample
+from tools.bench.step_times import percentiles, times_ms
 from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots
 from tools.stack import FAST_START, FAST_TASK, first_truth_s, newest_truth_s, running_stack
 
@@ -36,9 +37,9 @@ _TO_ADAPTATION, _FROM_ADAPTATION = [2, 0, 1], [1, 2, 0]
 
 
 def run() -> dict[str, float]:
-    """Microseconds of the daemon's calls, figures of the loop in real time, and of the experiment."""
+    """Microseconds of the daemon's calls, and figures of the loop in real time."""
     setup = load_setup(SHIPPED_ROBOT)
-    return _calls(setup) | _live() | _changed_live() | _won_back(setup)
+    return _calls(setup) | _live() | _changed_live()
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,22 +202,17 @@ def _calls(setup: Setup) -> dict[str, float]:
             wheels=(WheelSample(t_ns, t_ns, angle_rad, angle_rad, 4.0, 4.0),), poses=(pose,) if k % 2 else ()
         )
 
-    figures = _timed("adapt.feed", 2000, lambda k: adaptation.feed(k * 20_000_000, readings(k)))
-    figures |= _timed("adapt.step", 2000, lambda k: adaptation.step(k * 20_000_000))
     believed = believed_geometry(setup.model)
-    beliefs = [Geometry(believed.mean * (1.0 + 1e-4 * k), believed.covariance) for k in range(300)]
-    figures |= _timed("adapt.apply_geometry", 300, lambda k: apply_geometry(pipeline, setup.model, beliefs[k]))
+    beliefs = [Geometry(believed.mean * (1.0 + 1e-4 * k), believed.covariance) for k in range(320)]
+    calls: dict[str, tuple[int, Callable[[int], object]]] = {
+        "feed": (2000, lambda k: adaptation.feed(k * 20_000_000, readings(k))),
+        "step": (2000, lambda k: adaptation.step(k * 20_000_000)),
+        "apply_geometry": (300, lambda k: apply_geometry(pipeline, setup.model, beliefs[k])),
+    }
+    figures: dict[str, float] = {}
+    for name, (count, call) in calls.items():
+        figures |= percentiles(f"adapt.{name}_us", 1e3 * times_ms(call, count))
     return figures
-
-
-def _timed(name: str, count: int, call: Callable[[int], object]) -> dict[str, float]:
-    durations_us = np.empty(count)
-    for k in range(count):
-        begun = time.perf_counter()
-        call(k)
-        durations_us[k] = 1e6 * (time.perf_counter() - begun)
-    p50, p99, p999 = np.percentile(durations_us, (50.0, 99.0, 99.9))
-    return {f"{name}_p50_us": float(p50), f"{name}_p99_us": float(p99), f"{name}_p999_us": float(p999)}
 
 
 def _live() -> dict[str, float]:
@@ -318,16 +314,6 @@ def _changed_live() -> dict[str, float]:
     return figures
 
 
-def _won_back(setup: Setup) -> dict[str, float]:
-    """The experiment with one seed."""
-    figures: dict[str, float] = {}
-    for row in run_adapt(setup, replace(AdaptOptions(), seeds=1)).rows():
-        name = str(row.pop("changes")).replace(" ", "_")
-        figures |= {f"adapt.{name}.{key}": float(value) for key, value in row.items()}
-    return figures
-
-
 if __name__ == "__main__":
-    argv = sys.argv[1:]
-    for key, value in (scenarios(*map(int, argv[1:])) if argv[:1] == ["scenarios"] else run()).items():
+    for key, value in scenarios(*map(int, sys.argv[2:])).items():
         print(f"{key:45} {value:12.4g}")

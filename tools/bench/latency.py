@@ -6,7 +6,6 @@ simulator keeps it. The daemon commands at 50 Hz and samples come at 100 Hz, so 
 
 from __future__ import annotations
 
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 
 from disco_hw.experiments import Operator, disco_hw_process
 from disco_hw.log.reader import open_log
+from tools.bench.step_times import summary
 from tools.stack import write_robot_file
 
 WHEEL_COMMAND, WHEEL_TICKS = 0x100, 0x111
@@ -22,16 +22,13 @@ SETTLED_S = 2.0
 
 
 def run(seconds: float = 20.0) -> dict[str, float]:
-    """Return p50, p99 and maximum in milliseconds, over CAN and over serial."""
+    """Return the latencies in milliseconds, over CAN and over serial."""
     figures: dict[str, float] = {}
     for link in ("can", "serial"):
         with tempfile.TemporaryDirectory() as name:
             _drive(Path(name), link, seconds)
             total_ms, waited_ms = _latencies_ms(Path(name))
-        for key, values in (("", total_ms), ("waiting_", waited_ms)):
-            figures[f"latency.{link}.{key}p50_ms"] = float(np.percentile(values, 50))
-            figures[f"latency.{link}.{key}p99_ms"] = float(np.percentile(values, 99))
-        figures[f"latency.{link}.max_ms"] = float(total_ms.max())
+        figures |= summary(f"latency.{link}_ms", total_ms) | summary(f"latency.{link}.waiting_ms", waited_ms)
         figures[f"latency.{link}.commands"] = float(len(total_ms))
     return figures
 
@@ -79,8 +76,3 @@ def _nearest(times_s: list[float] | None, t_s: float) -> float | None:
         return None
     best = min(times_s, key=lambda time_s: abs(time_s - t_s))
     return best if abs(best - t_s) < 0.08 else None
-
-
-if __name__ == "__main__":
-    for name, value in run(float(sys.argv[1]) if len(sys.argv) > 1 else 20.0).items():
-        print(f"{name:35} {value:10.3f}")

@@ -388,10 +388,3 @@ def _reader() -> Iterator[None]:
 def _read_all(client: ClientConnection) -> None:
     for _ in client:
         pass
-
-
-if __name__ == "__main__":
-    # `python -m tools.bench.viewer painted`: what a browser shows, alone.
-    with tempfile.TemporaryDirectory(prefix="disco-hw-bench-") as alone:
-        for key, value in (painted(Path(alone)) if sys.argv[1:] == ["painted"] else run()).items():
-            print(f"{key:<40} {value:10.3f}")
