@@ -23,9 +23,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, differentiate_angle
+from disco_hw.log.drive import DriveLog
 from disco_hw.log.importing import write_log
-from tools.joystick import STEPS_PER_COMMAND, STEPS_PER_S, TOP_RAD_S, joystick, keyboard
+from tools.joystick import STEPS_PER_COMMAND, STEPS_PER_S, TOP_RAD_S, joystick, keyboard, recorded_drive
 
 Array = NDArray[np.float64]
 
@@ -234,17 +234,7 @@ class Recording:
 
     def as_drive(self) -> DriveLog:
         """The log that a host would have: nothing of the truth."""
-        angle, segments = self.angle, np.zeros(self.wheel_s.size, dtype=np.int64)
-        speed = [differentiate_angle(self.wheel_s, angle[:, side], segments) for side in (0, 1)]
-        none = np.empty(0, dtype=np.int64)
-        zeros = [np.zeros(times.size, dtype=np.int64) for times in (self.command_s, self.pose_s)]
-        return DriveLog(
-            ("mujoco",),
-            Commands(self.command_s, self.command[:, 0], self.command[:, 1], zeros[0]),
-            Wheels(self.wheel_s, angle[:, 0], angle[:, 1], speed[0], speed[1], segments, True, False),
-            Poses(self.pose_s, self.pose[:, 0], self.pose[:, 1], self.pose[:, 2], zeros[1]),
-            Gyro(np.empty(0), np.empty(0), none),
-        )
+        return recorded_drive("mujoco", self.command_s, self.command, self.wheel_s, self.angle, self.pose_s, self.pose)
 
 
 def mjcf(hidden: Hidden, robot: Robot = ROBOTS["middle"]) -> str:
