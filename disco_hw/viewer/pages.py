@@ -233,8 +233,12 @@ class ReplayPage:
         self._marks = marks_of(recording.timeline)
         gui = server.gui
         gui.main_panel.dock_right()
+        shown = tuple(round(self._seconds(mark), 3) for mark in _spread(self._marks, _SLIDER_MARKS))
+        duration_s = max(recording.duration_s, 0.001)
+        self._slider = gui.add_slider("Time (s)", 0.0, duration_s, 0.001, round(self.t_s, 3), marks=shown)
+        self._play_button = gui.add_button("Play")
         self._add_controls(gui)
-        self._bar = self._scrub_bar(server)
+        self._bar = ScrubBar(server, duration_s, shown, self.stay_at)
         self._state = gui.add_markdown("")
         stage = recording.stage
         self._excited = Excited(recording.timeline, stage.drive_top_rad_s)
@@ -256,10 +260,14 @@ class ReplayPage:
             self.t_s = min(max(t_s, 0.0), self._recording.duration_s)
             self._changed = True
 
+    def stay_at(self, t_s: float) -> None:
+        """Go to a time, within the log, and stay there."""
+        self._play(False)
+        self.go_to(t_s)
+
     def step_ticks(self, count: int) -> None:
         """Go this many ticks forward or back, and stay there."""
-        self._play(False)
-        self.go_to(self._recording.seconds_of(self._recording.tick_at(self.t_s) + count))
+        self.stay_at(self._recording.seconds_of(self._recording.tick_at(self.t_s) + count))
 
     def step(self, passed_s: float) -> None:
         """Advance by this much real time if playing, and draw if anything has changed."""
@@ -300,10 +308,6 @@ class ReplayPage:
         self._play_button.label = "Pause" if playing else "Play"
 
     def _add_controls(self, gui: viser.GuiApi) -> None:
-        duration_s = max(self._recording.duration_s, 0.001)
-        shown = [round(self._seconds(mark), 3) for mark in _spread(self._marks, _SLIDER_MARKS)]
-        self._slider = gui.add_slider("Time (s)", 0.0, duration_s, 0.001, round(self.t_s, 3), marks=tuple(shown))
-        self._play_button = gui.add_button("Play")
         steps = gui.add_button_group("Step", ("-10", "-1", "+1", "+10"))
         speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1")
         listed = {self._line(mark): mark for mark in _spread(self._marks, _LISTED_MARKS)}
@@ -313,8 +317,7 @@ class ReplayPage:
         def _(event: Any) -> None:
             # Without a client it was moved from here.
             if event.client is not None:
-                self._play(False)
-                self.go_to(float(event.target.value))
+                self.stay_at(float(event.target.value))
 
         @self._play_button.on_click
         def _(_: Any) -> None:
@@ -335,16 +338,7 @@ class ReplayPage:
         def _(event: Any) -> None:
             mark = listed.get(event.target.value)
             if mark is not None:
-                self._play(False)
-                self.go_to(self._seconds(mark))
-
-    def _scrub_bar(self, server: viser.ViserServer) -> ScrubBar:
-        def go_to(t_s: float) -> None:
-            self._play(False)
-            self.go_to(t_s)
-
-        shown = [round(self._seconds(mark), 3) for mark in _spread(self._marks, _SLIDER_MARKS)]
-        return ScrubBar(server, max(self._recording.duration_s, 0.001), shown, go_to)
+                self.stay_at(self._seconds(mark))
 
     def _seconds(self, mark: Mark) -> float:
         return (mark.t_ns - self._recording.first_ns) * 1e-9

@@ -59,7 +59,6 @@ class Snapshot:
     covariance: Array
     speed_m_s: float
     yaw_rate_rad_s: float
-    wheels_healthy: bool
     pose_healthy: bool
     wheel_angles: tuple[float, float]
     wheel_speeds: tuple[float, float] | None
@@ -72,7 +71,6 @@ class Snapshot:
     state: records.DaemonState | None
     status: RobotStatus | None
     link: RobotLinkHealth | None
-    counters: records.Counters | None
     lateness_us: float
     overruns: int
     skipped: int
@@ -100,7 +98,6 @@ def snapshot_at(timeline: Timeline, t_ns: int, plan: records.Plan | None) -> Sna
         covariance=covariance,
         speed_m_s=np.nan if values is None else values["speed_m_s"],
         yaw_rate_rad_s=np.nan if values is None else values["yaw_rate_rad_s"],
-        wheels_healthy=values is not None and bool(values["wheels_healthy"]),
         pose_healthy=values is not None and bool(values["pose_healthy"]),
         wheel_angles=(0.0, 0.0) if wheels is None else (float(wheels[1][0]), float(wheels[1][1])),
         wheel_speeds=None if wheels is None else (float(wheels[1][2]), float(wheels[1][3])),
@@ -113,7 +110,6 @@ def snapshot_at(timeline: Timeline, t_ns: int, plan: records.Plan | None) -> Sna
         state=timeline.state.last(t_ns),
         status=timeline.status.last(t_ns),
         link=timeline.link.last(t_ns),
-        counters=timeline.counters.last(t_ns),
         lateness_us=np.nan if loop is None else float(loop[1][0]) * 1e-3,
         overruns=0 if loop is None else int(loop[1][1]),
         skipped=0 if loop is None else int(loop[1][2]),

@@ -45,8 +45,8 @@ def test_the_newest_instant_is_drawn(page):
     live.draw(everything=True)
     assert tuple(live.scene._robot.position[:2]) == pytest.approx(pose_at(50)[:2])
     assert live.scene._lines["plan"].visible
-    assert live.scene._trail.points[0, 0, :2] == pytest.approx(pose_at(0)[:2])
-    assert live.scene._trail.points[-1, 1, :2] == pytest.approx(pose_at(50)[:2])
+    assert live.scene._lines["trail"].points[0, 0, :2] == pytest.approx(pose_at(0)[:2])
+    assert live.scene._lines["trail"].points[-1, 1, :2] == pytest.approx(pose_at(50)[:2])
     assert "24.5 V" in live._summary.content
     assert "armed on request" in live._events.content
 
