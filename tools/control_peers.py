@@ -18,7 +18,6 @@ from disco_hw.control import pendulum
 from disco_hw.control.parameter_points import unscented_points
 from disco_hw.control.pendulum import PendulumPoints
 from disco_hw.control.plan import DiscoSettings, PlannerState
-from disco_hw.experiments.circle import Command
 from disco_hw.model import Model
 from disco_hw.tasks.circle import CircleCost
 
@@ -61,17 +60,6 @@ def circle_state(points: int, state: PlannerState) -> Tensor:
     """The state that `circle_mppi` starts from."""
     here = np.array([state.x_m, state.y_m, state.yaw_rad, 0.0], dtype=np.float32)
     return torch.tensor(np.repeat(here, points))
-
-
-def circle_command(mppi: Any, seed: int) -> Command:
-    """MPPI as a function from time and state to wheel speeds; it must be called once a step."""
-    torch.manual_seed(seed)
-
-    def command(_now_ns: int, state: PlannerState) -> tuple[float, float]:
-        left, right = mppi.command(circle_state(mppi.nx // 4, state)).tolist()
-        return left, right
-
-    return command
 
 
 def pendulum_mppi(points: PendulumPoints, samples: int, horizon: int) -> Any:

@@ -132,6 +132,27 @@ def unseen_errors(drive: GriddedDrive, models: dict[str, Model], ahead_s: float 
     return errors
 
 
+@dataclass(frozen=True)
+class StageModels:
+    """Last fit of a searched log, the table of its gap, the stage that is offered, and a model of each stage."""
+
+    final: FinalFit
+    table: dict[str, dict[float, PredictionErrors]]
+    offered: str
+    models: dict[str, Model]
+
+    @classmethod
+    def of(cls, analysis: GapAnalysis, nominal: Model) -> StageModels:
+        """Fit the last models of a search."""
+        final = final_fit(analysis)
+        written = written_of(analysis, final, joint_predictions(analysis, final))
+        assert written[2] is not None
+        table = written[2].table()
+        kept = written[0] if written[2].kept is None else written[2].kept[0]
+        offered = offered_stage(table, kept.adds_to_timed, DEFAULT_SETTINGS)
+        return cls(final, table, offered, {stage: model_of(stage, nominal, *written)[0] for stage in STAGES})
+
+
 def values_away(analysis: GapAnalysis, final: FinalFit, other: GapAnalysis) -> dict[str, float]:
     """How far another half's value of a parameter lies from its own, in standard deviations of the interval.
 
@@ -186,21 +207,17 @@ def read(path: Path) -> tuple[DriveLog, Model]:
 def taught(part: Part, others: Sequence[Part], nominal: Model) -> Iterator[Half]:
     """What a part taught of each of some others."""
     began = time.process_time()
-    final = final_fit(part.analysis)
-    written = written_of(part.analysis, final, joint_predictions(part.analysis, final))
-    assert written[2] is not None
-    kept = written[0] if written[2].kept is None else written[2].kept[0]
-    offered = offered_stage(written[2].table(), kept.adds_to_timed, DEFAULT_SETTINGS)
+    fitted = StageModels.of(part.analysis, nominal)
     cpu_s = part.cpu_s + time.process_time() - began
-    models = {stage: model_of(stage, nominal, *written)[0] for stage in STAGES}
     names = tuple(
         name for found in (part.analysis.wheels, part.analysis.body) if found is not None
         for name in (*found.names, *(term.form for term in found.unnamed))
     )  # fmt: skip
     for other in others:
-        away = values_away(part.analysis, final, other.analysis)
+        away = values_away(part.analysis, fitted.final, other.analysis)
         name = part.name if len(others) == 1 else f"{part.name} -> {other.name}"
-        yield Half(name, offered, names, unseen_errors(grid_drive(other.log), models), away, cpu_s)
+        unseen = unseen_errors(grid_drive(other.log), fitted.models)
+        yield Half(name, fitted.offered, names, unseen, away, cpu_s)
         cpu_s = 0.0
 
 
