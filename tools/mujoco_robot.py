@@ -1,4 +1,4 @@
-"""A skid-steer robot in MuJoCo, as a truth that is not ours: `python -m tools.mujoco_robot --hide EFFECT=SIZE -o LOG`.
+"""A skid-steer robot in MuJoCo, as a truth that is not ours.
 
 Four wheels in contact with a floor, each on a velocity servo with a lag and a limited torque, driven by a script like a
 person with a joystick. It shares no constant and no equation with the virtual robot or with the model that the search
@@ -12,19 +12,15 @@ robots of three sizes.
 
 from __future__ import annotations
 
-import argparse
 import math
-import sys
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.log.drive import DriveLog
-from disco_hw.log.importing import write_log
 from tools.joystick import STEPS_PER_COMMAND, STEPS_PER_S, TOP_RAD_S, joystick, keyboard, recorded_drive
 
 Array = NDArray[np.float64]
@@ -353,32 +349,3 @@ def record(hidden: Hidden, seed: int, command: Array | None = None, robot: Robot
         hidden=dict(hidden),
         robot=robot,
     )
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m tools.mujoco_robot", description=(__doc__ or "").split(":")[0])
-    about = "; ".join(f"{name}={usual} {description}" for name, (usual, description) in EFFECTS.items())
-    parser.add_argument("--hide", action="append", default=[], metavar="EFFECT[=SIZE]", help=about)
-    parser.add_argument("--robot", choices=tuple(ROBOTS), default="middle", help="which robot (middle)")
-    parser.add_argument("--seed", type=int, default=1, help="of drive and noise (1)")
-    parser.add_argument("--seconds", type=float, default=DURATION_S, help=f"length of the drive ({DURATION_S:g})")
-    parser.add_argument("-o", "--out", type=Path, required=True, help="log to write")
-    options = parser.parse_args(arguments)
-    hidden, robot = {}, ROBOTS[options.robot]
-    for text in options.hide:
-        name, _, size = text.partition("=")
-        if name not in EFFECTS:
-            parser.error(f"--hide {text}: no such effect; give some of {', '.join(EFFECTS)}")
-        try:
-            hidden[name] = float(size) if size else robot.size(name)
-        except ValueError:
-            parser.error(f"--hide {text}: {size} is no number")
-    command = joystick(options.seed, options.seconds, robot.top_rad_s)
-    recording = record(hidden, options.seed, command, robot)
-    records = write_log(recording.as_drive(), options.out, "mujoco")
-    print(f"{options.out}: {records} records")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
