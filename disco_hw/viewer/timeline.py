@@ -122,10 +122,10 @@ class Items(Generic[Item]):
 ESTIMATE = ("x_m", "y_m", "yaw_rad", "speed_m_s", "yaw_rate_rad_s", "pose_healthy")
 COVARIANCE = tuple(f"cov{row}{column}" for row in range(3) for column in range(3))
 WHEELS = ("left_angle_rad", "right_angle_rad", "left_speed_rad_s", "right_speed_rad_s")
-COMMAND = ("requested_left_rad_s", "requested_right_rad_s", "left_rad_s", "right_rad_s", "in_force")
+COMMAND = ("left_rad_s", "right_rad_s", "in_force")
 POSE = ("x_m", "y_m", "yaw_rad")
 INNOVATION = ("x_m", "y_m", "yaw_rad", "variance_x", "variance_y", "variance_yaw", "test_ratio", "accepted")
-PLANNER = ("effective_samples", "temperature", "min_cost", "mean_cost")
+PLANNER = ("effective_samples", "temperature")
 LOOP = ("lateness_ns", "overruns", "skipped")
 POWER = ("voltage_v", "current_a", "temperature_c")
 
