@@ -26,7 +26,7 @@ from disco_hw.runtime.robot_setup import Setup, load_setup
 from drivers.types import PoseSample, Readings, WheelSample
 from tools.bench.step_times import percentiles, times_ms
 from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots
-from tools.stack import FAST_START, FAST_TASK, first_truth_s, newest_truth_s, running_stack
+from tools.stack import CIRCLE_START, FAST_START, FAST_TASK, first_truth_s, newest_truth_s, running_stack
 
 Array = NDArray[np.float64]
 
@@ -240,8 +240,6 @@ LIVE_CHANGE_S = 75.0
 SETTLED_S = 20.0
 COMPARED_S = 20.0
 LIVE_TASK = 'kind = "circle"\nradius_m = 0.75\nspeed_m_s = 0.2\n'
-# On the circle of LIVE_TASK, facing along it: x, y (m) and a quarter turn.
-LIVE_START = (0.75, 0.0, 1.5707963)
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,7 +273,7 @@ def drive_through_change(directory: Path, changes: str, *, adapt: bool) -> LiveD
     hidden = ("--hide", f"surface_change={axle * GROWTH},{LIVE_CHANGE_S},{wheels * GROWTH}")
     # What a wrong geometry costs shows in sampled plans: refined ones make up for most of it beside the line.
     control = f'mode = "sampled"\nadaptation = "{"auto" if adapt else "off"}"'
-    with running_stack(directory, "can", LIVE_TASK, LIVE_START, hidden, model=str(narrow), control=control) as stack:
+    with running_stack(directory, "can", LIVE_TASK, CIRCLE_START, hidden, model=str(narrow), control=control) as stack:
         stack.operator.wait_for("READY", 60.0)
         stack.start()
         stack.operator.wait_until("driving", lambda s: s["source"] == "plan", 10.0)

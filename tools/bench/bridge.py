@@ -21,13 +21,12 @@ import numpy as np
 from disco_hw.daemon import send_request
 from disco_hw.experiments import READY_TIMEOUT_S, Operator, disco_hw_process
 from disco_hw.log.reader import open_log
-from tools.bench.latency import WHEEL_COMMAND
+from tools.bench.latency import WHEEL_COMMAND, frames_on_wire
 from tools.bench.step_times import process_cpu_s, summary
 from tools.stack import FAST_START, FAST_TASK, write_robot_file
 
 DOMAIN = 90
 SETTLED_S = 2.0
-_NS = 1_000_000_000
 
 
 def run(seconds: float = 30.0) -> dict[str, float]:
@@ -117,12 +116,8 @@ def _pose_to_command_ms(directory: Path, start_ns: int, end_ns: int) -> np.ndarr
     """From a node's saying a pose to the next wheel command on the wire after the tick that took it."""
     offset_ns = time.time_ns() - time.monotonic_ns()
     node_rows = _node_odometry(directory)
-    on_wire = []
-    for line in (directory / "bus.log").read_text(encoding="utf-8").splitlines():
-        stamp, _, frame = line.split()
-        if int(frame.partition("#")[0], 16) == WHEEL_COMMAND:
-            on_wire.append(round(float(stamp[1:-1]) * _NS))
-    commands = np.array(on_wire)
+    on_wire = frames_on_wire(directory)
+    commands = np.array([round(t_s * 1e9) for t_s, can_id, _ in on_wire if can_id == WHEEL_COMMAND])
     found = []
     with open_log(directory / "run.mcap") as log:
         for entry in log.records({"/pose"}):
