@@ -108,6 +108,21 @@ class Robot:
         return self.sizes.get(effect, EFFECTS[effect][0])
 
 
+_SIZES = {
+    "command_delay": (0.097, 0.205),
+    "motor_lag": (0.155, 0.31),
+    "dead_band": (0.36, 0.81),
+    "dry_friction": (0.36, 0.81),
+    "unequal_wheels": (0.021, 0.031),
+    "pose_latency": (0.125, 0.155),
+    "slope": (4.1, 7.2),
+    "payload": (18.5, 2.1),
+    "torque_limit": (14.3, 0.81),
+    "worn_tyre": (0.51, 0.41),
+    "backlash": (0.053, 0.155),
+}
+"""Usual sizes of what can be hidden in the heavy robot and in the light one."""
+
 ROBOTS = {
     "middle": Robot(),
     "heavy": Robot(
@@ -123,19 +138,7 @@ ROBOTS = {
         torque_nm=61.0,
         friction=0.79,
         base_kg=47.0,
-        sizes={
-            "command_delay": 0.097,
-            "motor_lag": 0.155,
-            "dead_band": 0.36,
-            "dry_friction": 0.36,
-            "unequal_wheels": 0.021,
-            "pose_latency": 0.125,
-            "slope": 4.1,
-            "payload": 18.5,
-            "torque_limit": 14.3,
-            "worn_tyre": 0.51,
-            "backlash": 0.053,
-        },
+        sizes={name: of[0] for name, of in _SIZES.items()},
     ),
     "light": Robot(
         wheel_radius_m=0.0615,
@@ -157,19 +160,7 @@ ROBOTS = {
         rotor_kg_m2=0.0061,
         bearing_nm_s=0.0021,
         payload_m={"half": 0.031, "aside": 0.081, "high": 0.0815},
-        sizes={
-            "command_delay": 0.205,
-            "motor_lag": 0.31,
-            "dead_band": 0.81,
-            "dry_friction": 0.81,
-            "unequal_wheels": 0.031,
-            "pose_latency": 0.155,
-            "slope": 7.2,
-            "payload": 2.1,
-            "torque_limit": 0.81,
-            "worn_tyre": 0.41,
-            "backlash": 0.155,
-        },
+        sizes={name: of[1] for name, of in _SIZES.items()},
     ),
 }
 """Robots of three sizes; where none is named, the first."""
