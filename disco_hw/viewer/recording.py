@@ -230,13 +230,6 @@ def stage_of_robot(robot_file: Path, model_file: Path | None = None) -> ShownRob
     return _stage(load_setup(robot_file, model_file))
 
 
-def stage_of_log(log: Log, robot_file: Path | None = None) -> ShownRobot:
-    """Create the stage from the files kept in the log, or from `robot_file`; raises InputError without either."""
-    if robot_file is not None:
-        return stage_of_robot(robot_file)
-    return _stage(setup_of_log(log, "name the robot with --robot"))
-
-
 def _stage(setup: Setup) -> ShownRobot:
     robot = setup.config.robot
     return ShownRobot(
@@ -265,7 +258,8 @@ class Recording:
         try:
             if "/estimate" not in self._log.counts:
                 raise InputError(f"{path}: holds no estimates, so there is nothing to show; give a log of `run`")
-            self.stage: ShownRobot = stage_of_log(self._log, robot_file)
+            setup = load_setup(robot_file) if robot_file else setup_of_log(self._log, "name the robot with --robot")
+            self.stage: ShownRobot = _stage(setup)
             self.timeline = Timeline()
             for now_ns, record in self._log.brief_records(_SHOWN):
                 self.timeline.add(now_ns, record)
