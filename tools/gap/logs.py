@@ -48,9 +48,7 @@ def simulated_drive(
     if script is not None:
         driven = then_scripted(driven, script)
     rows = simulated_log(driven, parameters, effects, seed, options)
-    times = np.array([t_s for t_s, _ in rows])
-    cells = np.array([[float(cell) if cell else math.nan for cell in row] for _, row in rows])[:, 1:]
-    return as_drive(times - times[0], cells, parameters.ticks_per_rev)
+    return as_drive(rows[:, 0] - rows[0, 0], rows[:, 1:], parameters.ticks_per_rev)
 
 
 def then_scripted(drive: ScriptedDrive, script: Script) -> ScriptedDrive:
