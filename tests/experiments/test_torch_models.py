@@ -6,7 +6,7 @@ import torch
 from disco_hw.control import pendulum
 from disco_hw.model import plain as physics
 from disco_hw.tasks.circle import CircleCost
-from tools.torch_models import circle_cost, pendulum_cost, pendulum_transition, skid_steer_transition
+from tests.control.torch_models import circle_cost, pendulum_cost, pendulum_transition, skid_steer_transition
 
 RNG = np.random.default_rng(4)
 

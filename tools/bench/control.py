@@ -15,8 +15,7 @@ import torch
 
 from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand
-from disco_hw.control.black_box import BlackBoxDisco
-from disco_hw.control.parameter_points import sigma_points, unscented_points
+from disco_hw.control.parameter_points import sigma_points
 from disco_hw.control.pendulum import PendulumPlanner, PendulumPoints
 from disco_hw.control.plan import ROTATION
 from disco_hw.experiments.pendulum import POSTERIOR
@@ -26,7 +25,6 @@ from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.tasks.circle import CircleCost
 from tools.bench.step_times import summary, times_ms, undisturbed
-from tools.torch_models import circle_cost, skid_steer_transition
 
 ROBOTS = SHIPPED_ROBOT.parent
 PERIOD_NS = 20_000_000
@@ -40,7 +38,6 @@ BURSTS = 10
 BARE_ROUNDS, BARE_SIZE = 1600, 640
 # States are made beforehand and used over and over; a step back in time leaves the plan where it is.
 CALLS = 500
-GPU_SAMPLES = 65_536
 
 
 def run(steps: int = 3000, peer_steps: int = 100) -> dict[str, float]:
@@ -54,9 +51,6 @@ def run(steps: int = 3000, peer_steps: int = 100) -> dict[str, float]:
         figures |= compare_with_peer("skid_steer", *skid_steer_pair(model), steps, peer_steps)
         figures |= compare_with_peer("pendulum", *pendulum_pair(), steps, peer_steps)
         figures |= scaling(model, max(steps // 100, 3))
-    if torch.cuda.is_available():
-        cuda_ms = torch_times_ms(model, "cuda", GPU_SAMPLES, 50)
-        figures |= summary("control.torch_cuda_k65536_ms", cuda_ms)
     return figures
 
 
@@ -173,16 +167,3 @@ def scaling(model: Model, steps: int) -> dict[str, float]:
         **{f"control.scaling.k{size}_ms": least[size] for size in SIZES},
         **{f"control.scaling.k{size}_over_linear": shares[size] / shares[SIZES[0]] for size in SIZES[1:]},
     }
-
-
-def torch_times_ms(model: Model, device: str, samples: int, steps: int) -> np.ndarray:
-    """Milliseconds of each step of the torch planner on the paper's circle, on a device."""
-    theta, weights = unscented_points(model, 1.0)
-    sampler = replace(PAPERS_SIZE, samples=samples)
-    planner = BlackBoxDisco(
-        skid_steer_transition(DiscoSettings().step_s), circle_cost(CircleCost()), theta[:, :3], weights, 2, sampler,
-        largest=LARGEST_RAD_S, device=device,
-    )  # fmt: skip
-    state = np.array([0.75, 0.0, 1.25, 0.0])
-    # The plan comes back as a numpy array, so a step has waited for the device.
-    return times_ms(lambda _: planner.plan(state), steps, left_out=3)
