@@ -24,18 +24,20 @@ from tools.gap import jobs as gap_jobs
 from tools.gap.jobs import KINDS, Job, Result, jobs
 from tools.gap.tables import summary, table, write
 
-_JUDGED = ("disco_hw/gap", "disco_hw/effects", "disco_hw/model", "disco_hw/log", "disco_hw/drive", "sim")
-_JUDGED_TOO = (
-    "tools/gap/logs.py", "tools/gap/jobs.py", "tools/gap/mujoco.py", "tools/mujoco_robot.py",
-    "tools/gap/strange_robot.py",
+ROOT = Path(__file__).resolve().parents[2]
+JUDGED = (
+    "disco_hw/gap", "disco_hw/effects", "disco_hw/model", "disco_hw/log", "disco_hw/drive", "sim",
+    "tools/gap/halves.py", "tools/gap/jobs.py", "tools/gap/logs.py", "tools/gap/mujoco.py",
+    "tools/gap/strange_robot.py", "tools/joystick.py", "tools/mujoco_robot.py",
+    "tools/simulated_drives.py", "tools/simulated_log.py",
 )  # fmt: skip
 
 
 def revision() -> str:
     """A short hash of all sources that a result depends on."""
-    root, digest = Path(__file__).parents[2], hashlib.sha256()
-    for name in (*_JUDGED, *_JUDGED_TOO):
-        path = root / name
+    digest = hashlib.sha256()
+    for name in JUDGED:
+        path = ROOT / name
         for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
             digest.update(file.read_bytes())
     return digest.hexdigest()[:12]
