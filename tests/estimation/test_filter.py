@@ -7,7 +7,7 @@ import pytest
 
 from disco_hw.config import Estimation
 from disco_hw.estimation.correction import Measurement, PoseReason, gate_limit
-from disco_hw.estimation.filter import MAX_EXTRAPOLATION_S, PoseFilter
+from disco_hw.estimation.filter import PoseFilter
 from disco_hw.estimation.odometry import OdometryParameters, Pose, WheelReading, advance
 
 PARAMETERS = OdometryParameters(0.061, 0.415, 0.238)
@@ -58,6 +58,21 @@ def test_where_no_pose_is_required_odometry_starts_at_the_origin_until_the_first
     state = pose_filter.fuse(state, measured(10**9, 5.0, 5.0, 1.0))
     assert state.evaluation.reason is PoseReason.INITIALISED
     assert state.belief.pose == Pose(5.0, 5.0, 1.0)
+    assert state.reinitialisations == 1
+
+
+def test_a_first_pose_to_which_odometry_from_the_origin_has_led_is_no_jump():
+    pose_filter, state = started(Estimation(pose_required=False))
+    state = pose_filter.fuse(state, measured(0, 0.005, 0.005, 0.01))
+    assert (state.evaluation.reason, state.reinitialisations) == (PoseReason.INITIALISED, 0)
+
+
+def test_the_first_pose_of_a_sensor_that_is_mounted_aside_sets_the_robot_beside_it():
+    pose_filter, state = started()
+    # Heading along y: what is ahead lies at larger y, what is to the left at smaller x.
+    aside = Measurement(0, Pose(1.0, 2.0, 0.5 * math.pi), 1e-4, 4e-4, False, 0.3, -0.2)
+    belief = pose_filter.fuse(state, aside).belief
+    assert (belief.x_m, belief.y_m, belief.yaw_rad) == pytest.approx((1.0 - 0.2, 2.0 - 0.3, 0.5 * math.pi))
 
 
 def test_the_gate_opens_at_its_limit():
@@ -73,6 +88,15 @@ def test_the_gate_opens_at_its_limit():
     assert outside.evaluation.distance2 == pytest.approx(1.001**2 * gate_limit(0.999), rel=1e-4)
     assert outside.belief == state.belief
     assert outside.pose_t_ns == 0
+
+
+def test_for_a_position_alone_the_gate_is_that_of_two_numbers():
+    pose_filter, state = initialised()
+    # Chi-square with two degrees of freedom exceeds -2 ln(0.001) once in a thousand times.
+    edge = math.sqrt(-2.0 * math.log(0.001) * 2e-4)
+    for part, reason in ((0.999, PoseReason.ACCEPTED), (1.001, PoseReason.GATED)):
+        place = Measurement(0, Pose(part * edge, 0.0, 0.0), 1e-4, None, False)
+        assert pose_filter.fuse(state, place).evaluation.reason is reason
 
 
 def test_outliers_that_disagree_never_move_the_belief():
@@ -148,7 +172,7 @@ def test_extrapolation_keeps_the_speed_for_a_bounded_time_and_doubts_it_for_long
     near = pose_filter.extrapolate(state, wheels, 100_000_000)
     expected = advance(PARAMETERS, Pose(0.0, 0.0, 0.0), [(5.0, 6.0, 0.1)])
     assert (near.belief.x_m, near.belief.yaw_rad) == pytest.approx((expected.x_m, expected.yaw_rad))
-    current = pose_filter.extrapolate(state, wheels, round(MAX_EXTRAPOLATION_S * 1e9))
+    current = pose_filter.extrapolate(state, wheels, 200_000_000)
     later = pose_filter.extrapolate(state, wheels, 2 * 10**9)
     assert later.belief.pose == current.belief.pose
     # Without the slip of the moved part, a quarter of all the path there may have been: 0.061 * 5.5 * 2 s.

@@ -164,6 +164,16 @@ def test_one_changed_bit_in_the_log_is_found(tmp_path, ticks):
     assert report.difference.t_ns == ticks[150][0]
 
 
+def test_a_record_that_the_log_lacks_is_a_difference(tmp_path, ticks):
+    changed = list(ticks)
+    t_ns, records = ticks[150]
+    changed[150] = t_ns, tuple(record for record in records if not isinstance(record, Command))
+    report = replay(write_log(tmp_path / "run.mcap", changed))
+    assert (report.difference.field, report.difference.t_ns) == ("records", t_ns)
+    assert "Command" not in report.difference.recorded
+    assert "Command" in report.difference.replayed
+
+
 def test_plans_of_a_later_planner_are_refused_with_the_version_that_has_it(tmp_path, ticks):
     log = write_log(tmp_path / "later.mcap", ticks[:1], planner=PLANNER_VERSION + 1)
     text = f"{log}: its plans are of planner version {PLANNER_VERSION + 1}, .* up to {PLANNER_VERSION}; replay it with"
