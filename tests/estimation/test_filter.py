@@ -7,7 +7,7 @@ import pytest
 
 from disco_hw.config import Estimation
 from disco_hw.estimation.correction import Measurement, PoseReason, gate_limit
-from disco_hw.estimation.filter import PoseFilter
+from disco_hw.estimation.filter import HeadingSearch, PoseFilter
 from disco_hw.estimation.odometry import OdometryParameters, Pose, WheelReading, advance
 
 PARAMETERS = OdometryParameters(0.061, 0.415, 0.238)
@@ -52,6 +52,7 @@ def test_the_first_pose_sets_the_belief():
 
 def test_where_no_pose_is_required_odometry_starts_at_the_origin_until_the_first_pose():
     pose_filter, state = started(Estimation(pose_required=False))
+    np.testing.assert_allclose(state.belief.covariance, 1e-6 * np.eye(3), rtol=1e-9)
     state = pose_filter.move(state, 10**9, 10.0, 10.0, False)
     assert state.belief.x_m == pytest.approx(0.61)
     assert state.pose_t_ns is None
@@ -88,6 +89,28 @@ def test_the_gate_opens_at_its_limit():
     assert outside.evaluation.distance2 == pytest.approx(1.001**2 * gate_limit(0.999), rel=1e-4)
     assert outside.belief == state.belief
     assert outside.pose_t_ns == 0
+
+
+@pytest.mark.parametrize(("std_rad", "is_known"), [(0.29, True), (0.31, False)])
+def test_a_heading_is_known_up_to_a_standard_deviation_of_0_3_rad(std_rad, is_known):
+    pose_filter, state = started()
+    found = pose_filter.fuse(state, Measurement(0, Pose(0.0, 0.0, 0.0), 1e-4, std_rad**2, False))
+    assert (found.heading_known, isinstance(found.belief, HeadingSearch)) == (is_known, not is_known)
+
+
+def test_a_heading_is_forgotten_where_the_wheels_turn_the_robot_unmeasured():
+    pose_filter, state = initialised()
+    spins = WheelReading(0, 0.0, 0.0, -5.0, 5.0)
+    assert pose_filter.extrapolate(state, spins, 200_000_000).heading_known
+    assert not pose_filter.extrapolate(state, spins, 2 * 10**9).heading_known
+
+
+def test_of_each_source_the_last_accepted_stamp_is_kept():
+    pose_filter, state = initialised()
+    for t_ns, source in ((1, 1), (2, 0), (3, 1)):
+        state = pose_filter.fuse(state, Measurement(t_ns, Pose(0.0, 0.0, 0.0), 1e-4, 4e-4, False, source=source))
+    assert dict(state.accepted) == {0: 2, 1: 3}
+    assert len(state.accepted) == 2
 
 
 def test_for_a_position_alone_the_gate_is_that_of_two_numbers():
