@@ -36,7 +36,10 @@ UNPACKED = "python3,python3-dev,gcc,libc6-dev,base-files,coreutils,dash,sed,grep
 
 # torch has no wheel for ARM without CUDA's packages, viser is the page's; these tests need neither.
 LEFT_OUT = ("torch", "viser")
-FOR_TESTS = ("pytest", "pytest-timeout", "pytest-xdist", "hypothesis", "setuptools", "crccheck", "jsonschema")
+FOR_TESTS = (
+    *("pytest", "pytest-timeout", "pytest-xdist", "hypothesis"),
+    *("setuptools", "cantools", "crccheck", "jsonschema"),
+)
 # Handed out as source alone.
 COMPILED_THERE = "cobs"
 WHEELS_FOR = [f"--platform=manylinux_2_{minor}_aarch64" for minor in (34, 31, 28, 27, 26, 24, 17)]
