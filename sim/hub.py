@@ -1,7 +1,8 @@
 """The simulated CAN bus between processes, in real time: a client of a Unix socket is a node on it.
 
 Each packet on the socket is one Linux `struct can_frame`. Without threads: the owner waits on `fileno()` and
-`next_event_ns()` and calls `pump`. `HubLink` is the virtual robot on a hub that its own process serves to others.
+`next_event_ns()` and calls `collect` and `advance`. `HubLink` is the virtual robot on a hub that its own process serves
+to others.
 """
 
 from __future__ import annotations
@@ -32,10 +33,6 @@ from sim.can_protocol import (
 CLIENT_TRANSMIT_QUEUE = 32
 READER_QUEUE = 1024
 """Frames kept for a client that does not read, beyond the kernel's 280 or so; more are dropped and counted."""
-READER_QUEUE_PAUSE = 256
-"""Unpaced only: with more than this waiting for a reader that still reads, nobody may send."""
-READER_STALL_NS = 100_000_000
-"""Unpaced only: a reader that took nothing for so long holds up nobody."""
 
 
 @dataclass(slots=True)
@@ -57,15 +54,13 @@ class _Client:
     unread: deque[bytes] = field(default_factory=deque)
     lost_unread: int = 0
     unsent: int = 0
-    last_read_ns: int = 0
 
 
 class Hub:
     """The bus, the clients' nodes on it, and the socket through which clients come and go.
 
-    `pacing` makes each frame take its time on the wire at `bitrate`; without it a frame takes none, and readers slow
-    the senders down instead of losing frames. Clients send in the order in which they wrote. A silent node acknowledges
-    all frames, so that a lone node is not without an answer. Raises SocketPathError if it cannot listen at `path`.
+    Clients send in the order in which they wrote. A silent node acknowledges all frames, so that a lone node is not
+    without an answer. Raises SocketPathError if it cannot listen at `path`.
     """
 
     def __init__(
@@ -74,15 +69,12 @@ class Hub:
         now_ns: int,
         *,
         bitrate: int = 500_000,
-        pacing: bool = True,
-        fault: BusFault | None = None,
         log: Callable[[str], object] | None = None,
     ) -> None:
         self.path = path
-        self.bus = CanBus(bitrate if pacing else None, fault=fault, log=log, start_ns=now_ns)
+        self.bus = CanBus(bitrate, log=log, start_ns=now_ns)
         self.bus.attach("monitor")
         self.stats = HubStats()
-        self._pacing = pacing
         self._now_ns = now_ns
         self._epoll = select.epoll()
         self._listener: socket.socket | None = None
@@ -98,18 +90,9 @@ class Hub:
         return self._epoll.fileno()
 
     def next_event_ns(self) -> int | None:
-        """Return when `pump` is due even if no client does anything; None if never."""
+        """Return when `collect` and `advance` are due even if no client does anything; None if never."""
         times = [t for t in (self.bus.next_event_ns(), self._plug_in_ns) if t is not None]
-        times.extend(client.last_read_ns + READER_STALL_NS for client in self._slow_readers())
         return min(times) if times else None
-
-    def pump(self, now_ns: int) -> list[DeliveredFrame]:
-        """Take in what clients wrote, let the bus run up to `now_ns`, and hand out what was received; never blocks.
-
-        Returns the deliveries, for nodes that the owner has attached to `bus` itself.
-        """
-        self.collect(now_ns)
-        return self.advance(now_ns)
 
     def collect(self, now_ns: int) -> int:
         """Read and write all sockets; return how many frames of clients now wait to be let onto the bus."""
@@ -130,7 +113,10 @@ class Hub:
         return len(self._inbox)
 
     def advance(self, now_ns: int, admit: int | None = None) -> list[DeliveredFrame]:
-        """Let the oldest `admit` waiting frames (None: all) onto the bus and run it up to `now_ns`."""
+        """Let the oldest `admit` waiting frames (None: all) onto the bus and run it up to `now_ns`.
+
+        Returns the deliveries, for nodes that the owner has attached to `bus` itself.
+        """
         deliveries = self.bus.advance(now_ns)
         for _ in range(len(self._inbox) if admit is None else admit):
             client, frame = self._inbox.popleft()
@@ -229,13 +215,12 @@ class Hub:
                 client.lost_unread += 1
                 self.stats.reader_overflow += 1
                 continue
-            was_read = not client.unread
+            was_empty = not client.unread
             if client.lost_unread:
                 client.unread.append(pack_frame(receive_overflow_frame()))
                 client.lost_unread = 0
             client.unread.append(packet)
-            if was_read:
-                client.last_read_ns = self._now_ns
+            if was_empty:
                 self._flush(client)
 
     def _flush(self, client: _Client) -> None:
@@ -249,25 +234,13 @@ class Hub:
                 client.unread.clear()
                 return
             client.unread.popleft()
-            client.last_read_ns = self._now_ns
             self.stats.frames_out += 1
-
-    def _slow_readers(self) -> list[_Client]:
-        """Return the clients whose full queues make the senders wait."""
-        if self._pacing:
-            return []
-        return [
-            client
-            for client in self._clients.values()
-            if len(client.unread) > READER_QUEUE_PAUSE and self._now_ns - client.last_read_ns < READER_STALL_NS
-        ]
 
     def _set_events(self) -> None:
         """Listen only to what can be served now, or a level-triggered poll would spin."""
-        must_wait = bool(self._slow_readers())
         for descriptor, client in self._clients.items():
             room = client.unsent + client.node.pending < CLIENT_TRANSMIT_QUEUE
-            events = select.EPOLLIN if room and not must_wait else 0
+            events = select.EPOLLIN if room else 0
             if client.unread:
                 events |= select.EPOLLOUT
             if events != client.events:
@@ -294,10 +267,9 @@ class HubLink:
         now_ns: int,
         *,
         bitrate: int = 500_000,
-        pacing: bool = True,
         log: Callable[[str], object] | None = None,
     ) -> None:
-        self.hub = Hub(path, now_ns, bitrate=bitrate, pacing=pacing, log=log)
+        self.hub = Hub(path, now_ns, bitrate=bitrate, log=log)
         self._robot = RobotNode(self.hub.bus)
         self.robot = self._robot.node
 

@@ -54,7 +54,7 @@ class SerialLine:
     """The robot's end of the line; satisfies `sim.RobotLink`.
 
     `path` becomes a symbolic link to the port that a host opens; None leaves the port under its own name (`port`).
-    `baud` is the robot's rate in bit/s (8 data bits, no parity, 1 stop bit); `pacing` off makes bytes take no time.
+    `baud` is the robot's rate in bit/s (8 data bits, no parity, 1 stop bit).
     `log` gets a line for each frame whose last bit has passed, in either direction, as candump writes it.
     `framed`: whether the line carries frames in the reference protocol's framing; otherwise what comes goes on as it
     is, each piece as the data of a frame.
@@ -67,7 +67,6 @@ class SerialLine:
         now_ns: int,
         *,
         baud: int = 921_600,
-        pacing: bool = True,
         log: Callable[[str], object] | None = None,
         framed: bool = True,
     ) -> None:
@@ -76,7 +75,7 @@ class SerialLine:
         self.stats = SerialLineStats()
         self._path = path
         self._baud = baud
-        self._byte_ns = BITS_PER_BYTE * 1_000_000_000 // baud if pacing else 0
+        self._byte_ns = BITS_PER_BYTE * 1_000_000_000 // baud
         self._now_ns = now_ns
         self._plug_in_ns: int | None = None
         self._noise = random.Random(0)

@@ -1,4 +1,4 @@
-"""A hub in a process of its own: `python hub_process.py PATH [--no-pacing | INTERFACE CHANNEL KEY=JSON ...]`.
+"""A hub in a process of its own: `python hub_process.py PATH [INTERFACE CHANNEL KEY=JSON ...]`.
 
 What is on the python-can interface, where one is given, is a node of the bus, as a board behind SLCAN.
 """
@@ -53,9 +53,8 @@ class Guest:
 def main(path: str, *guest_on: str) -> None:
     """Serve the hub; print a line when it can be opened."""
     stop, now_ns = StopSignal(), time.monotonic_ns()
-    paced = guest_on != ("--no-pacing",)
-    hub, guest = Hub(Path(path), now_ns, pacing=paced), None
-    if guest_on and paced:
+    hub, guest = Hub(Path(path), now_ns), None
+    if guest_on:
         interface, channel, *rest = guest_on
         options = {key: json.loads(value) for key, _, value in (option.partition("=") for option in rest)}
         guest = Guest(hub.bus, PythonCanLink(interface, channel, now_ns, **options))
@@ -69,7 +68,8 @@ def main(path: str, *guest_on: str) -> None:
         now_ns = time.monotonic_ns()
         if guest is not None:
             guest.take(now_ns)
-        deliveries = hub.pump(now_ns)
+        hub.collect(now_ns)
+        deliveries = hub.advance(now_ns)
         if guest is not None:
             guest.give(deliveries)
     hub.close()
