@@ -121,7 +121,7 @@ def run_virtual_robot(options: VirtualRobotOptions) -> int:
         while not stop.requested:
             select.select((*process.filenos(), stop.fileno()), (), (), process.timeout_s())
             process.work()
-        print(f"stopped after {process.robot.now_us / 1e6:.3f} s: {process.link.summary()}", file=sys.stderr)
+        print(f"stopped after {process.robot.plant.now_us / 1e6:.3f} s: {process.link.summary()}", file=sys.stderr)
     return 1 if any(record.error for record in records) else 0
 
 

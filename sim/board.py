@@ -64,14 +64,9 @@ class BoardRobot:
         self._state_names = tuple(codec.choice_name("SYSTEM_STATE", "state", value) for value in range(256))
 
     @property
-    def now_us(self) -> int:
-        """Robot time of the last step."""
-        return self.plant.now_us
-
-    @property
     def silent(self) -> bool:
         """Whether the board has not been heard for so long that its wheels are braked."""
-        return self.now_us - self._received_us >= SILENT_US
+        return self.plant.now_us - self._received_us >= SILENT_US
 
     @property
     def outputs(self) -> FirmwareOutputs:
@@ -120,10 +115,6 @@ class BoardRobot:
         for pose in poses:
             frames += _pose(pose, now_us)
         return frames
-
-    def kidnap(self, dx_m: float, dy_m: float, dyaw_rad: float) -> None:
-        """Carry the robot off: a step in the world frame and a turn about the tracked point, wheels untouched."""
-        self.plant.kidnap(dx_m, dy_m, dyaw_rad)
 
     def jump_clock(self, step_us: int) -> None:
         """Do nothing, because the clock is the board's own, and `sim.app` refuses such a fault."""

@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 
 from drivers.types import Frame
 from firmware_protocol.firmware_core import ResetCause
-from sim import LinkFaultError, RobotLink
+from sim import FaultyLink, LinkFaultError
 from sim.fault_schedule import FaultSchedule, ScheduledFault, Site
 from sim.injected_faults import FrameFaults, RobotFaults
 from sim.virtual_robot import Robot, truth_row
@@ -87,7 +87,7 @@ class FaultPlayer:
         self,
         schedule: FaultSchedule,
         robot: Robot,
-        link: RobotLink,
+        link: FaultyLink,
         start_ns: int,
         report: Callable[[str], object] = lambda _line: None,
         processes: ProcessFaults | None = None,
@@ -172,7 +172,7 @@ class FaultPlayer:
 class Injection:
     """Executes `COMMANDS` on a robot and its link, and keeps up what goes on over time."""
 
-    def __init__(self, robot: Robot, link: RobotLink) -> None:
+    def __init__(self, robot: Robot, link: FaultyLink) -> None:
         self.refused = 0
         self._robot = robot
         self._link = link
@@ -231,7 +231,7 @@ class Injection:
     def _kidnap(self, arguments: list[str], _now_ns: int) -> str:
         _expect("kidnap", arguments, 3, 3)
         dx_m, dy_m, dyaw_rad = (_number("kidnap", argument, -1000.0, 1000.0) for argument in arguments)
-        self._robot.kidnap(dx_m, dy_m, dyaw_rad)
+        self._robot.plant.kidnap(dx_m, dy_m, dyaw_rad)
         return "ok"
 
     def _start_babble(self, arguments: list[str], now_ns: int) -> str:

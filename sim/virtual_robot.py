@@ -31,15 +31,11 @@ from sim.sensors import PoseMeasurement
 
 
 class Robot(Protocol):
-    """Satisfied by `VirtualRobot` and `VendorRobot`; pure, stepped at 1 kHz."""
+    """A plant with its controller, at the plant's time; pure, stepped at 1 kHz."""
 
     plant: Plant
     estop_button: bool
     faults: RobotFaults | None
-
-    @property
-    def now_us(self) -> int:
-        """Robot time of the last step."""
 
     @property
     def outputs(self) -> FirmwareOutputs:
@@ -54,9 +50,6 @@ class Robot(Protocol):
 
     def step(self, now_us: int, error_counters: tuple[int, int] = (0, 0)) -> Sequence[Frame]:
         """Move on to robot time `now_us`; return the frames that the controller sends, in order."""
-
-    def kidnap(self, dx_m: float, dy_m: float, dyaw_rad: float) -> None:
-        """Carry the robot off."""
 
     def jump_clock(self, step_us: int) -> None:
         """Set the controller's clock."""
@@ -155,11 +148,6 @@ class VendorRobot:
         self._replies: list[CanFrame] = []
 
     @property
-    def now_us(self) -> int:
-        """Robot time of the last step."""
-        return self.plant.now_us
-
-    @property
     def truth(self) -> TrueState:
         """The plant's true state at the last step."""
         return self.plant.truth
@@ -200,10 +188,6 @@ class VendorRobot:
             self._loop.see(setpoints, true, inputs, dt_s, regulates)
         frames, self._replies = [*self._replies, *self.controller.step(now_us, inputs)], []
         return [Frame(frame.can_id, frame.data, frame.extended) for frame in frames]
-
-    def kidnap(self, dx_m: float, dy_m: float, dyaw_rad: float) -> None:
-        """Carry the robot off: a step in the world frame and a turn about the tracked point, wheels untouched."""
-        self.plant.kidnap(dx_m, dy_m, dyaw_rad)
 
     def jump_clock(self, step_us: int) -> None:
         """Do nothing, because these controllers send no time."""
@@ -297,11 +281,6 @@ class VirtualRobot:
         self._outputs = _RELEASED
 
     @property
-    def now_us(self) -> int:
-        """Robot time of the last step."""
-        return self.plant.now_us
-
-    @property
     def outputs(self) -> FirmwareOutputs:
         """Outputs of the firmware in the last cycle."""
         return self._outputs
@@ -353,13 +332,9 @@ class VirtualRobot:
         self._outputs = self._firmware.step(self.device_us(now_us), inputs)
         return [Frame(can_id, data) for can_id, data in self._firmware.drain()]
 
-    def kidnap(self, dx_m: float, dy_m: float, dyaw_rad: float) -> None:
-        """Carry the robot off: a step in the world frame and a turn about the tracked point, wheels untouched."""
-        self.plant.kidnap(dx_m, dy_m, dyaw_rad)
-
     def jump_clock(self, step_us: int) -> None:
         """Set the controller's clock forward, or back, though never to before its tenth second."""
-        largest_us = max(0, self.device_us(self.now_us) - EARLIEST_JUMP_US)
+        largest_us = max(0, self.device_us(self.plant.now_us) - EARLIEST_JUMP_US)
         self._clock = ControllerClock(self._clock.start_us + max(step_us, -largest_us), self._clock.skew_ppm)
 
     def reboot(self, cause: ResetCause = ResetCause.POWER_ON) -> None:

@@ -218,14 +218,14 @@ def test_the_device_clock_has_its_own_start_and_speed():
 
 def test_error_counters_of_the_link_reach_the_firmware(setup):
     setup.run(100)
-    setup.robot.step(setup.robot.now_us + 1000, (256, 3))
+    setup.robot.step(setup.robot.plant.now_us + 1000, (256, 3))
     assert setup.robot.outputs.fault == setup.host.codec.choice_value("SYSTEM_STATE", "fault", "BUS_OFF")
 
 
 def test_kidnapping_moves_the_pose_and_not_the_ticks(setup):
     setup.run(100)
     before = setup.robot.plant.encoder_ticks
-    setup.robot.kidnap(0.5, -0.25, 1.0)
+    setup.robot.plant.kidnap(0.5, -0.25, 1.0)
     setup.run(200)
     assert setup.robot.plant.encoder_ticks == before
     assert setup.host.latest["POSE_POSITION"] == pytest.approx({"valid": 1, "x": 0.5, "y": -0.25}, abs=1e-3)
@@ -238,7 +238,7 @@ def test_a_restart_forgets_the_session_and_stands_still(setup):
     assert setup.robot.outputs.left_setpoint_rad_s == 0.0
     setup.run(1)
     assert setup.robot.outputs.state in {"BOOT", "STANDBY"}
-    assert setup.robot.device_us(setup.robot.now_us) == 1000
+    assert setup.robot.device_us(setup.robot.plant.now_us) == 1000
     setup.run(1000)
     assert setup.wheel_speed() < 0.01
     assert setup.robot.truth.x_m >= position
