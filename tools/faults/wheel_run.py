@@ -7,6 +7,7 @@ shows from when it is there while a wheel is commanded, and the robot is stopped
 from __future__ import annotations
 
 import math
+import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -93,8 +94,7 @@ def setup_of(driver: str, speed_m_s: float) -> Setup:
     with tempfile.TemporaryDirectory() as folder:
         robot = Path(folder) / "robot.toml"
         robot.write_text(text)
-        for name in ("wombot_model.toml",):
-            (Path(folder) / name).write_bytes((ROBOTS / name).read_bytes())
+        shutil.copy(ROBOTS / "wombot_model.toml", folder)
         return load_setup(robot)
 
 
