@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -14,33 +14,6 @@ SMALLEST_SAMPLE = (-1.0, 0.01, 0.05)
 LARGEST_SAMPLE = (1.0, 1.0, 2.0)
 # Chosen: a Gaussian with less than about one draw in so many inside lies outside.
 MAX_DRAWS = 10_000
-
-_MAY_BE_NEGATIVE = frozenset({"x_icr_m", "ambient_temperature_c"})
-_MUST_BE_POSITIVE = frozenset(
-    {
-        "wheel_radius_m",
-        "axial_distance_m",
-        "ticks_per_rev",
-        "integration_step_us",
-        "max_motor_acceleration_rad_s2",
-        "wheel_inertia_kg_m2",
-        "max_motor_torque_nm",
-        "motor_torque_constant_nm_per_a",
-        "brake_time_constant_s",
-        "speed_observer_bandwidth_rad_s",
-        "wheel_disturbance_correlation_s",
-        "wheel_drift_correlation_s",
-        "slip_correlation_s",
-        "volatility_correlation_s",
-        "pose_rate_hz",
-        "battery_voltage_v",
-        "battery_capacity_ah",
-        "motor_thermal_resistance_k_per_w",
-        "motor_thermal_capacity_j_per_k",
-    }
-)
-_MAY_BE_INFINITE = frozenset({"max_motor_acceleration_rad_s2", "max_motor_torque_nm"})
-_PROBABILITIES = frozenset({"pose_dropout_probability", "pose_outlier_probability"})
 
 
 class DrawError(ValueError):
@@ -54,7 +27,6 @@ class PlantParameters:
     Geometry: the tracked point is the origin of the body frame, x forward, y left; it lies `x_icr_m` behind the line
     on which the instantaneous centre of rotation moves. Standard deviations are of stationary processes; a probability
     is per pose sample. `speed_loop_time_constant_s` = 0 means wheels that follow their command at once.
-    Raises ValueError naming the field that is out of its physical range.
     """
 
     wheel_radius_m: float = 0.061
@@ -120,10 +92,6 @@ class PlantParameters:
     motor_thermal_capacity_j_per_k: float = 60.0
     ambient_temperature_c: float = 22.0
 
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            self._check(field.name, getattr(self, field.name))
-
     def noiseless(self) -> PlantParameters:
         """Return the parameters without disturbances, sensor noise, jitter and losses (ticks stay whole)."""
         return replace(
@@ -152,14 +120,6 @@ class PlantParameters:
             turning_load_nm=0.0,
             standstill_hold_rad_s=0.0,
         )
-
-    def _check(self, name: str, value: float) -> None:
-        if math.isinf(value) and value > 0.0 and name in _MAY_BE_INFINITE:
-            return
-        low = -math.inf if name in _MAY_BE_NEGATIVE or name.startswith("encoder_start") else 0.0
-        high = 1.0 if name in _PROBABILITIES else math.inf
-        if not math.isfinite(value) or not low <= value <= high or (value == 0.0 and name in _MUST_BE_POSITIVE):
-            raise ValueError(f"PlantParameters.{name} = {value:g} is impossible")
 
 
 def draw_plant_parameters(
