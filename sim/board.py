@@ -53,7 +53,7 @@ class BoardRobot:
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
         self.estop_button = False
-        self.faults: RobotFaults | None = None
+        self.faults = RobotFaults()
         self.about: tuple[int, int] | None = None
         self._setpoints = (0.0, 0.0)
         self._state = (0, 0, 0, 0)
@@ -102,12 +102,10 @@ class BoardRobot:
         """Move on to robot time `now_us`; return what the board's sensors say then."""
         plant, faults, outputs = self.plant, self.faults, self.outputs
         setpoints = (outputs.left_setpoint_rad_s, outputs.right_setpoint_rad_s)
-        turned = setpoints if faults is None else faults.setpoints(*setpoints, is_driven=outputs.driver_enabled)
-        poses: Sequence[PoseMeasurement] = plant.step(now_us, *turned, outputs.driver_enabled, outputs.brake)
+        turned = faults.setpoints(*setpoints, is_driven=outputs.driver_enabled)
+        poses = faults.poses(now_us, plant.step(now_us, *turned, outputs.driver_enabled, outputs.brake))
         inputs = sensor_inputs(plant, self.estop_button, error_counters, ResetCause.POWER_ON)
-        if faults is not None:
-            poses = faults.poses(now_us, poses)
-            inputs = faults.inputs(inputs, setpoints, outputs.driver_enabled)
+        inputs = faults.inputs(inputs, setpoints, outputs.driver_enabled)
         frames = [_wheels(inputs)] if self._steps % WHEELS_STEPS == 0 else []
         if self._steps % POWER_STEPS == 0:
             frames.append(_power(inputs))

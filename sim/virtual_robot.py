@@ -35,7 +35,7 @@ class Robot(Protocol):
 
     plant: Plant
     estop_button: bool
-    faults: RobotFaults | None
+    faults: RobotFaults
 
     @property
     def outputs(self) -> FirmwareOutputs:
@@ -141,7 +141,7 @@ class VendorRobot:
         self.plant = plant
         self.controller = controller
         self.estop_button = False
-        self.faults: RobotFaults | None = None
+        self.faults = RobotFaults()
         self.pose_sink = pose_sink
         self._coasting = [0.0, 0.0]
         self._loop = controller.create_loop()
@@ -171,21 +171,17 @@ class VendorRobot:
         plant, faults = self.plant, self.faults
         wheels, regulates = self.controller.wheels_rad_s, self.controller.regulates
         setpoints = self._setpoints(wheels)
-        turned = self._loop.drive(setpoints) if regulates else setpoints
-        if faults is not None:
-            turned = faults.setpoints(*turned, is_driven=regulates)
+        driven = self._loop.drive(setpoints) if regulates else setpoints
+        turned = faults.setpoints(*driven, is_driven=regulates)
         enabled = wheels != (None, None)
         dt_s = 1e-6 * (now_us - plant.now_us)
-        poses: Sequence[PoseMeasurement] = plant.step(now_us, *turned, enabled, self.controller.brakes)
-        if faults is not None:
-            poses = faults.poses(now_us, poses)
+        poses = faults.poses(now_us, plant.step(now_us, *turned, enabled, self.controller.brakes))
         if self.pose_sink is not None:
             for pose in poses:
                 self.pose_sink(pose, now_us)
-        inputs = sensor_inputs(plant, self.estop_button, error_counters, ResetCause.POWER_ON)
-        if faults is not None:
-            true, inputs = inputs, faults.inputs(inputs, setpoints, enabled)
-            self._loop.see(setpoints, true, inputs, dt_s, regulates)
+        true = sensor_inputs(plant, self.estop_button, error_counters, ResetCause.POWER_ON)
+        inputs = faults.inputs(true, setpoints, enabled)
+        self._loop.see(setpoints, true, inputs, dt_s, regulates)
         frames, self._replies = [*self._replies, *self.controller.step(now_us, inputs)], []
         return [Frame(frame.can_id, frame.data, frame.extended) for frame in frames]
 
@@ -256,7 +252,7 @@ class VirtualRobot:
 
     Robot time is true microseconds since the robot was switched on, the plant's time. The motor driver takes the
     firmware's setpoints, its enable and its brake one cycle later. `estop_button` is the state of the button on the
-    robot; `faults`, if there is one, stands between plant and firmware. At each start the controller draws its
+    robot; `faults` stands between plant and firmware. At each start the controller draws its
     challenges from the system's entropy, as a real one must; with a `challenge_seed` every run has the same ones, and
     whoever has recorded one run can replay it in the next: for tests alone.
     """
@@ -270,7 +266,7 @@ class VirtualRobot:
     ) -> None:
         self.plant = plant
         self.estop_button = False
-        self.faults: RobotFaults | None = None
+        self.faults = RobotFaults()
         self._config = config
         self._clock = clock or ControllerClock()
         self._clock_start_us = 0
@@ -313,13 +309,9 @@ class VirtualRobot:
         """
         plant = self.plant
         outputs, faults = self._outputs, self.faults
-        setpoints = turned = (outputs.left_setpoint_rad_s, outputs.right_setpoint_rad_s)
-        if faults is not None:
-            turned = faults.setpoints(*setpoints, is_driven=outputs.driver_enabled)
-        poses: Sequence[PoseMeasurement] = plant.step(now_us, *turned, outputs.driver_enabled, outputs.brake)
-        if faults is not None:
-            poses = faults.poses(now_us, poses)
-        for pose in poses:
+        setpoints = (outputs.left_setpoint_rad_s, outputs.right_setpoint_rad_s)
+        turned = faults.setpoints(*setpoints, is_driven=outputs.driver_enabled)
+        for pose in faults.poses(now_us, plant.step(now_us, *turned, outputs.driver_enabled, outputs.brake)):
             if pose.sample_us < self._clock_start_us:
                 # The controller's clock has no name for a time before it started.
                 continue
@@ -327,8 +319,7 @@ class VirtualRobot:
                 pose.x_m, pose.y_m, pose.yaw_rad, self.device_us(pose.sample_us), pose.position_std_m, pose.yaw_std_rad
             )
         inputs = sensor_inputs(plant, self.estop_button, error_counters, self._reset_cause)
-        if faults is not None:
-            inputs = faults.inputs(inputs, setpoints, outputs.driver_enabled)
+        inputs = faults.inputs(inputs, setpoints, outputs.driver_enabled)
         self._outputs = self._firmware.step(self.device_us(now_us), inputs)
         return [Frame(can_id, data) for can_id, data in self._firmware.drain()]
 

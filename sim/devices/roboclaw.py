@@ -304,6 +304,4 @@ class RoboclawController:
 _MOVING = frozenset({34, 35, 36, 37, 40})
 
 
-def create_controller(settings: RoboclawSettings, ticks_per_rev: int) -> RoboclawController:
-    """Return the boards of a robot whose robot.toml has these settings."""
-    return RoboclawController(settings, ticks_per_rev)
+CONTROLLER = RoboclawController

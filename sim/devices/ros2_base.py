@@ -97,6 +97,4 @@ class Ros2BaseController:
             self._speeds, self._set_ms, self.obeyed = speeds, now_ms, self.obeyed + 1
 
 
-def create_controller(settings: wire.Ros2BaseSettings, ticks_per_rev: int) -> Ros2BaseController:
-    """Return the base of a robot whose robot.toml has these settings, with the encoder on the wheel."""
-    return Ros2BaseController(settings, ticks_per_rev)
+CONTROLLER = Ros2BaseController

@@ -25,7 +25,6 @@ from sim.body_dynamics import BodyPose
 from sim.devices import find_controller
 from sim.effects import hidden_effects
 from sim.fault_schedule import KINDS, ScheduledFault
-from sim.injected_faults import RobotFaults
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
 from sim.sensors import PoseMeasurement
@@ -187,7 +186,6 @@ class WheelFaultRun:
             self.stack.core.pose_source.close()
             self.stack.core.pose_source = poses
         self.board = robot.board
-        self.board.faults = RobotFaults()
 
     def drive(self, seconds: float) -> list[str]:
         """Arm, start and drive; returns events of a robot that stopped by itself, none where it drove all the time."""
