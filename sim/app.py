@@ -25,7 +25,7 @@ from sim.body_dynamics import BodyPose
 from sim.effects import HiddenEffectError, hidden_effects
 from sim.fault_player import BUS_ONLY, CpuHogs, FaultPlayer, Injection
 from sim.fault_schedule import FaultSchedule, Site
-from sim.hub import HubLink
+from sim.hub import Hub
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
 from sim.process import CommandSocket, PoseSender, StopSignal, TextRecord
@@ -328,7 +328,7 @@ def _open_link(options: VirtualRobotOptions, log: Callable[[str], object] | None
     if options.bitrate <= 0:
         raise OptionError(f"bitrate {options.bitrate}: not positive; give the bus's rate in bit/s")
     if options.interface == "unixcan":
-        return HubLink(Path(options.channel), now_ns, bitrate=options.bitrate, log=log)
+        return Hub(Path(options.channel), now_ns, bitrate=options.bitrate, log=log)
     try:
         return PythonCanLink(options.interface, options.channel, now_ns, bitrate=options.bitrate)
     except (can.CanError, OSError, ValueError, NotImplementedError) as error:

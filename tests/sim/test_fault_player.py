@@ -11,7 +11,7 @@ from sim.app import OptionError, _check_faults
 from sim.can_protocol import ErrorState
 from sim.fault_player import COMMANDS, CpuHogs, FaultPlayer, Injection
 from sim.fault_schedule import KINDS, parse_schedule
-from sim.hub import HubLink
+from sim.hub import Hub
 from sim.plant import Plant
 from sim.serial_line import SerialLine
 from sim.unixcan import UnixCanBus
@@ -173,7 +173,7 @@ def robot():
 
 @pytest.fixture
 def link(tmp_path):
-    link = HubLink(tmp_path / "hub", 0)
+    link = Hub(tmp_path / "hub", 0)
     yield link
     link.close()
 
@@ -208,16 +208,16 @@ def test_kidnap(robot, injection):
 
 def test_bus_off_of_the_robot(link, injection):
     assert injection.execute("bus_off robot", 0) == "ok"
-    assert link.robot.state is ErrorState.BUS_OFF
+    assert link.robot.node.state is ErrorState.BUS_OFF
 
 
 def test_bus_off_is_the_hosts_by_default(link, injection):
-    with UnixCanBus(str(link.hub.path)) as bus:
+    with UnixCanBus(str(link.path)) as bus:
         link.collect(0)
         assert injection.execute("bus_off", 0) == "ok"
         link.advance(0)
         assert bus.recv(1).arbitration_id == 0x40
-    assert link.robot.state is ErrorState.ACTIVE
+    assert link.robot.node.state is ErrorState.ACTIVE
 
 
 def test_unplug_lasts_as_long_as_asked(tmp_path, link, injection):
@@ -294,7 +294,7 @@ def test_a_bad_command_is_refused_with_one_line_and_changes_nothing(robot, link,
     assert why in response
     assert "\n" not in response
     assert robot.truth == before
-    assert link.hub.path.exists()
+    assert link.path.exists()
     assert babbled(injection, link, 5) == []
 
 
