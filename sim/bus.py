@@ -247,12 +247,8 @@ class CanBus:
         """Arbitrate among the heads of the queues and put the winner on the wire."""
         senders = [node for node in self._nodes if node.queue and node.eligible_ns <= now_ns]
         if len(senders) > 1:
-            contenders = senders
-            best = min([node.queue[0][2] for node in contenders])
-            senders = [node for node in contenders if node.queue[0][2] == best]
-            for node in contenders:
-                if node not in senders:
-                    node.arbitrations_lost += 1
+            best = min([node.queue[0][2] for node in senders])
+            senders = [node for node in senders if node.queue[0][2] == best]
         frames = [node.start() for node in senders]
         frame = frames[0]
         outcome = UNHARMED if self.fault is None else self.fault.outcome(now_ns, senders[0].name, frame)
