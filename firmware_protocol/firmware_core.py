@@ -130,15 +130,15 @@ class FirmwareOutputs(msgspec.Struct, frozen=True, gc=False):
     brake: bool
     limited: bool
     state: str
-    fault: int
-    session: int
-    estop_source: str
-    stop_cause: str
-    blockers: int
-    accepted_commands: int
-    last_command_counter: int
-    rejected_frames: int
-    watchdog_events: int
+    fault: int = 0
+    session: int = 0
+    estop_source: str = "NONE"
+    stop_cause: str = "NONE"
+    blockers: int = 0
+    accepted_commands: int = 0
+    last_command_counter: int = 0
+    rejected_frames: int = 0
+    watchdog_events: int = 0
 
 
 def random_entropy() -> int:

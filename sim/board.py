@@ -76,7 +76,7 @@ class BoardRobot:
         enabled, brake = bool(flags & 1) and not self.silent, bool(flags & 2) or self.silent
         name = self._state_names[state]
         return FirmwareOutputs(
-            left, right, enabled, brake, False, name, fault, self._session, "NONE", "NONE", 0, accepted, 0, 0, 0
+            left, right, enabled, brake, False, name, fault, self._session, accepted_commands=accepted
         )
 
     @property

@@ -64,9 +64,9 @@ def sensor_inputs(
     """Return the inputs of a controller now: its sensors, button, and link (transmit and receive errors)."""
     left_ticks, right_ticks = plant.encoder_ticks
     left_speed, right_speed = plant.measured_wheel_speeds_rad_s
-    left_current, right_current = plant.motor_currents_a
-    left_temperature, right_temperature = plant.motor_temperatures_c
-    battery = plant.battery
+    left_current, right_current = plant.electrics.motor_currents_a
+    left_temperature, right_temperature = plant.electrics.motor_temperatures_c
+    battery = plant.electrics.battery
     return FirmwareInputs(
         left_ticks=left_ticks,
         right_ticks=right_ticks,
@@ -157,10 +157,10 @@ class VendorRobot:
         """Outputs of the controller now, in the terms of the reference firmware."""
         left, right = self.controller.wheels_rad_s
         driven = left is not None or right is not None
+        state, accepted = self.controller.state, self.controller.obeyed
         return FirmwareOutputs(
-            left or 0.0, right or 0.0, driven, self.controller.brakes, False, self.controller.state, 0, 0, "NONE",
-            "NONE", self.controller.obeyed, 0, 0, 0, 0,
-        )  # fmt: skip
+            left or 0.0, right or 0.0, driven, self.controller.brakes, False, state, accepted_commands=accepted
+        )
 
     def receive(self, now_us: int, frame: Frame) -> None:
         """One frame from the link, at robot time `now_us`; the replies leave with the next step."""
@@ -212,7 +212,7 @@ class VendorRobot:
 STEP_US = 1000
 # Chosen: keeps the controller's clock away from 0, before which it has no times.
 EARLIEST_JUMP_US = 10_000_000
-_RELEASED = FirmwareOutputs(0.0, 0.0, False, True, False, "BOOT", 0, 0, "NONE", "NONE", 0, 0, 0, 0, 0)
+_RELEASED = FirmwareOutputs(0.0, 0.0, False, True, False, "BOOT")
 TRUTH_COLUMNS = (
     "t_ns",
     "x_m",

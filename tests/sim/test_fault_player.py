@@ -7,7 +7,7 @@ import pytest
 
 from drivers.types import Frame
 from firmware_protocol.firmware_core import FirmwareConfig
-from sim.app import OptionError, _check_faults
+from sim.app import OptionError, VirtualRobotOptions, _check_faults
 from sim.can_protocol import ErrorState
 from sim.fault_player import COMMANDS, CpuHogs, FaultPlayer, Injection
 from sim.fault_schedule import KINDS, parse_schedule
@@ -151,19 +151,20 @@ def test_faults_of_processes_go_to_whoever_has_them_in_hand():
 
 
 @pytest.mark.parametrize(
-    ("kind", "link", "interface", "expected_error"),
+    ("kind", "options", "expected_error"),
     [
-        ("sigkill", "can", "unixcan", "tests/hil"),
-        ("babble", "serial", "", "CAN bus"),
-        ("bus_off", "serial", "", "CAN bus"),
-        ("drop", "can", "socketcan", "unixcan"),
+        ("sigkill", {}, "tests/hil"),
+        ("babble", {"kind": "serial"}, "CAN bus"),
+        ("bus_off", {"kind": "serial"}, "CAN bus"),
+        ("drop", {"interface": "socketcan"}, "unixcan"),
+        *((kind, {"board": "/dev/tty"}, "--board") for kind in ("drop", "unplug", "sigstop", "reboot")),
     ],
 )
-def test_what_the_simulator_cannot_do_is_refused(kind, link, interface, expected_error):
+def test_what_the_simulator_cannot_do_is_refused(kind, options, expected_error):
     lasts = "for_s=1" if KINDS[kind].lasts else ""
     schedule = parse_schedule(f'[[fault]]\nkind="{kind}"\nat_s=0\n{lasts}')
     with pytest.raises(OptionError, match=expected_error):
-        _check_faults(schedule, link, interface)
+        _check_faults(schedule, VirtualRobotOptions(**options))
 
 
 @pytest.fixture
