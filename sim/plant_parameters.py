@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-SAMPLED_FIELDS = ("x_icr_m", "wheel_radius_m", "axial_distance_m")
-# Chosen: wider than any robot this project drives; beyond, the Gaussian is not of a robot.
+# Chosen, for x_icr, wheel radius and axial distance (m): wider than any robot this project drives; beyond, the Gaussian
+# is not of a robot.
 SMALLEST_SAMPLE = (-1.0, 0.01, 0.05)
 LARGEST_SAMPLE = (1.0, 1.0, 2.0)
 # Chosen: a Gaussian with less than about one draw in so many inside lies outside.
@@ -130,24 +130,15 @@ def draw_plant_parameters(
 ) -> PlantParameters:
     """Draw a robot from a Gaussian over (x_icr, wheel radius, axial distance), in metres and this order.
 
-    mean: shape (3,); covariance: shape (3, 3). Draws outside `SMALLEST_SAMPLE`..`LARGEST_SAMPLE` are drawn again, so
-    the distribution is the truncated Gaussian; everything else is taken from `base`. Raises DrawError if the covariance
-    is not symmetric positive semi-definite, or if `MAX_DRAWS` draws give nothing physical.
+    mean: shape (3,); covariance: shape (3, 3), positive semi-definite, as a model's is. Draws outside
+    `SMALLEST_SAMPLE`..`LARGEST_SAMPLE` are drawn again, so the distribution is the truncated Gaussian; everything else
+    is taken from `base`. Raises DrawError if `MAX_DRAWS` draws give nothing physical.
     """
-    centre = np.asarray(mean, dtype=np.float64)
-    spread = np.asarray(covariance, dtype=np.float64)
-    size = len(SAMPLED_FIELDS)
-    if centre.shape != (size,) or spread.shape != (size, size):
-        raise DrawError(f"{', '.join(SAMPLED_FIELDS)}: the mean needs shape ({size},), the covariance ({size}, {size})")
-    if not (np.all(np.isfinite(centre)) and np.all(np.isfinite(spread)) and np.allclose(spread, spread.T)):
-        raise DrawError("mean and covariance must be finite and the covariance symmetric")
-    variances, axes = np.linalg.eigh(spread)
-    if variances[0] < -1e-9 * max(variances[-1], 0.0):
-        raise DrawError("the covariance is not positive semi-definite")
+    variances, axes = np.linalg.eigh(np.asarray(covariance, dtype=np.float64))
     root = axes * np.sqrt(np.maximum(variances, 0.0))
     generator = np.random.default_rng(seed)
     for _ in range(MAX_DRAWS):
-        sample = centre + root @ generator.standard_normal(size)
+        sample = np.asarray(mean) + root @ generator.standard_normal(len(SMALLEST_SAMPLE))
         if np.all(sample >= SMALLEST_SAMPLE) and np.all(sample <= LARGEST_SAMPLE):
             x_icr_m, wheel_radius_m, axial_distance_m = (float(number) for number in sample)
             return replace(

@@ -1,7 +1,6 @@
 """Plants without noise, and plants drawn from a posterior."""
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -48,18 +47,3 @@ def test_draws_stay_in_the_physical_range():
 def test_a_posterior_without_physical_plants_is_an_error():
     with pytest.raises(DrawError, match="physical"):
         draw_plant_parameters((0.2, -5.0, 0.4), COVARIANCE, 1)
-
-
-@pytest.mark.parametrize(
-    ("mean", "covariance"),
-    [
-        ((0.2, 0.06), COVARIANCE),
-        (MEAN, np.eye(2)),
-        (MEAN, -np.eye(3)),
-        ((0.2, math.nan, 0.4), COVARIANCE),
-        (MEAN, COVARIANCE + np.triu(np.ones((3, 3)), 1)),
-    ],
-)
-def test_a_malformed_posterior_is_an_error(mean, covariance):
-    with pytest.raises(DrawError):
-        draw_plant_parameters(mean, covariance, 1)
