@@ -156,7 +156,8 @@ def _report(results: list[dict[str, Any]]) -> int:
     seen, accepted = (sum(result[f"commands_{name}"] for result in results) for name in ("seen", "accepted"))
     print(
         f"{len(results)} seeds, {hours:.2f} h simulated in {cpu_s / 3600.0:.2f} CPU h "
-        f"({hours * 3600.0 / cpu_s:.0f} times real time on a core); {seen} wheel commands reached the robot, {accepted} were accepted"
+        f"({hours * 3600.0 / cpu_s:.0f} times real time on a core); "
+        f"{seen} wheel commands reached the robot, {accepted} were accepted"
     )
     bad = [
         f"seed {result['seed']}: {text}"
