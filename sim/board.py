@@ -24,7 +24,7 @@ from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 from sim import LinkFaultError
 from sim.bus import BusFault
 from sim.injected_faults import RobotFaults
-from sim.plant import Plant, TrueState
+from sim.plant import Plant
 from sim.python_can_link import RETRY_NS
 from sim.sensors import PoseMeasurement
 from sim.virtual_robot import sensor_inputs
@@ -78,11 +78,6 @@ class BoardRobot:
         return FirmwareOutputs(
             left, right, enabled, brake, False, name, fault, self._session, accepted_commands=accepted
         )
-
-    @property
-    def truth(self) -> TrueState:
-        """The plant's true state at the last step."""
-        return self.plant.truth
 
     def receive(self, now_us: int, frame: Frame) -> None:
         """One frame of the line; what is not of this line is ignored."""

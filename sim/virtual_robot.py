@@ -41,10 +41,6 @@ class Robot(Protocol):
     def outputs(self) -> FirmwareOutputs:
         """Outputs of the controller in the last cycle."""
 
-    @property
-    def truth(self) -> TrueState:
-        """The plant's true state at the last step."""
-
     def receive(self, now_us: int, frame: Frame) -> None:
         """One frame from the link, at robot time `now_us`."""
 
@@ -146,11 +142,6 @@ class VendorRobot:
         self._coasting = [0.0, 0.0]
         self._loop = controller.create_loop()
         self._replies: list[CanFrame] = []
-
-    @property
-    def truth(self) -> TrueState:
-        """The plant's true state at the last step."""
-        return self.plant.truth
 
     @property
     def outputs(self) -> FirmwareOutputs:
@@ -286,11 +277,6 @@ class VirtualRobot:
         """The controller's program, for its counters."""
         return self._firmware
 
-    @property
-    def truth(self) -> TrueState:
-        """The plant's true state at the last step."""
-        return self.plant.truth
-
     def device_us(self, robot_us: int) -> int:
         """Return the time (us) of the controller's clock at robot time `robot_us`."""
         return self._clock.at(robot_us - self._clock_start_us)
@@ -346,7 +332,7 @@ class VirtualRobot:
 
 def truth_row(robot: Robot, t_ns: int) -> str:
     """Return the values of `TRUTH_COLUMNS` at the last step, at the monotonic time `t_ns`, separated by commas."""
-    truth, outputs = robot.truth, robot.outputs
+    truth, outputs = robot.plant.truth, robot.outputs
     return (
         f"{t_ns},{truth.x_m:.6f},{truth.y_m:.6f},{truth.yaw_rad:.6f},"
         f"{truth.left_speed_rad_s:.5f},{truth.right_speed_rad_s:.5f},"
@@ -400,7 +386,7 @@ class RobotInProcess:
     @property
     def truth(self) -> TrueState:
         """The true state of the plant now."""
-        return self.board.truth
+        return self.board.plant.truth
 
     def advance(self, until_us: int) -> None:
         """Let time pass until then; frames wait at both ends."""

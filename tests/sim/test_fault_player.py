@@ -203,7 +203,7 @@ def test_estop_button(robot, injection):
 
 def test_kidnap(robot, injection):
     assert injection.execute("kidnap 0.5 -1 0.25", 0) == "ok"
-    truth = robot.truth
+    truth = robot.plant.truth
     assert (truth.x_m, truth.y_m, truth.yaw_rad) == pytest.approx((0.5, -1.0, 0.25))
 
 
@@ -289,12 +289,12 @@ def test_state_answers_with_a_row_of_the_truth(injection):
     ],
 )
 def test_a_bad_command_is_refused_with_one_line_and_changes_nothing(robot, link, injection, text, why):
-    before = robot.truth
+    before = robot.plant.truth
     response = injection.execute(text, 0)
     assert response.startswith("error: ")
     assert why in response
     assert "\n" not in response
-    assert robot.truth == before
+    assert robot.plant.truth == before
     assert link.path.exists()
     assert babbled(injection, link, 5) == []
 

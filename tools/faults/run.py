@@ -257,7 +257,7 @@ class FaultRun:
             if robot.firmware is not firmware:
                 monitor.restarted()
             if now_us >= self._next_tick_us:
-                truth = robot.truth
+                truth = robot.plant.truth
                 wheels = (truth.left_speed_rad_s, truth.right_speed_rad_s)
                 self._loop.ticks += 1
                 self._tick_if_able(now_ns)

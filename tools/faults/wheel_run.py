@@ -204,7 +204,7 @@ class WheelFaultRun:
         stood_us: int | None = None
         for tick in self.stack.ticks(seconds):
             now_us = self.stack.now_us
-            truth = self.board.truth
+            truth = self.board.plant.truth
             true = (truth.left_speed_rad_s, truth.right_speed_rad_s)
             if shows_us is None:
                 commanded = (0.0, 0.0) if tick.command is None else (tick.command.left_rad_s, tick.command.right_rad_s)
