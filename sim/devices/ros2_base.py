@@ -22,7 +22,7 @@ WHEELS_MS, STATE_MS, STEP_MS = 20, 50, 20
 class Ros2BaseController:
     """Controller of a base on ROS 2 (a `sim.virtual_robot.Controller`).
 
-    `joints`: whether the base reports each wheel. `joints`: whether the base says how all of its wheels turn.
+    `joints`: whether the base says how each of its wheels turns.
     """
 
     brakes = False
