@@ -126,12 +126,10 @@ def _check_effect(found: Comparison, case: Case) -> None:
         # Values that nobody sends, so that whatever is written shows.
         for name in ("input_vel_turns_s", "input_torque_nm", "input_pos_turns", "requested_state", "control_mode"):
             setattr(axis, name, -77)
-        axis.input_mode = -77
-        for name in ("vel_limit_turns_s", "current_limit_a", "pos_gain", "vel_gain", "vel_integrator_gain"):
-            setattr(axis, name, -77.0)
+        axis.input_mode, axis.vel_limit_turns_s, axis.current_limit_a = -77, -77.0, -77.0
+        axis.pos_gain = axis.vel_gain = axis.vel_integrator_gain = -77.0
         axis.traj_vel_limit = axis.traj_accel_limit = axis.traj_decel_limit = -77.0
-        for name, value in given.get("errors_before", {}).get(str(axis.node_id), {}).items():
-            setattr(axis, name, value)
+    _set_errors(board, given.get("errors_before", {}))
     _check_frames(found, board, case["frames"], then)
 
 
@@ -142,8 +140,7 @@ def _check_frames(found: Comparison, board: OdriveBoard, frames: list[Any], then
     replies = [reply for frame in frames for reply in board.receive(on_bus(frame))]
     changed = {}
     for node, axis, old in zip(nodes, board.axes, before, strict=True):
-        now = {name: getattr(axis, name) for name in _STATE}
-        new = {n: value for n, value in now.items() if not (equal(value, old[n]) and type(value) is type(old[n]))}
+        new = {name: getattr(axis, name) for name in _STATE if not _same(getattr(axis, name), old[name])}
         # The controller's own reaction to a change of mode is not the message layer's.
         if new:
             changed[str(node)] = new
@@ -151,6 +148,16 @@ def _check_frames(found: Comparison, board: OdriveBoard, frames: list[Any], then
     found.same("changed", changed, then["changed"])
     found.same("fed", fed, then["watchdog_fed_nodes"])
     found.same("replies", as_cases(replies), then["replies"])
+
+
+def _same(ours: object, before: object) -> bool:
+    return equal(ours, before) and type(ours) is type(before)
+
+
+def _set_errors(board: OdriveBoard, errors: Mapping[str, Mapping[str, int]]) -> None:
+    for axis in board.axes:
+        for name, value in errors.get(str(axis.node_id), {}).items():
+            setattr(axis, name, value)
 
 
 def _check_telemetry(found: Comparison, case: Case, generation: Generation) -> None:
