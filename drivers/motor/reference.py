@@ -33,7 +33,7 @@ from drivers.types import (
     WheelCommand,
 )
 from firmware_protocol import status_codes
-from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded, packaged_dbc
+from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded
 
 # Five periods of SYSTEM_STATE (0.1 s): then the handshake begins anew.
 SILENCE_NS = 500_000_000
@@ -467,9 +467,7 @@ DRIVER = MotorDriver(
     _create,
     stop_frames=protocol.stop_frames,
     stop_confirmation=protocol.stop_confirmation,
-    cyclic_frames=lambda _settings, rate_hz, authenticated: protocol.cyclic_frames(
-        packaged_dbc(), rate_hz, authenticated=authenticated
-    ),
+    cyclic_frames=protocol.cyclic_frames,
     safety_card=protocol.safety_card,
     recognise=protocol.recognise,
     kinds=("can", "serial"),

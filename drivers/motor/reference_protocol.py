@@ -12,7 +12,7 @@ from typing import Any
 from drivers.motor.reference_arming import HostState
 from drivers.motor.reference_frames import FrameReception, FrameTransmission
 from drivers.types import CyclicFrame, Frame, NoSettings, OutgoingFrame, ReceivedFrame, SafetyCard
-from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded, load_protocol
+from firmware_protocol.codec import PROTOCOL, PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded
 
 # Chosen: each has an 8-bit check sum that fits a foreign frame by chance, five do not.
 _FRAMES_OF_OURS = 5
@@ -32,13 +32,13 @@ _DEADLINE_NS = 100_000_000
 _PENDING_TIMES = 8
 
 
-def cyclic_frames(dbc: str, command_rate_hz: float, *, authenticated: bool = False) -> tuple[CyclicFrame, ...]:
-    """Return all frames with a cycle time (GenMsgCycleTime, ms) in the DBC's text, each page of a multiplexed one.
+def cyclic_frames(_settings: NoSettings, command_rate_hz: float, authenticated: bool) -> tuple[CyclicFrame, ...]:
+    """Return all frames with a cycle time (GenMsgCycleTime) in the DBC, each page of a multiplexed one.
 
     The wheel command counts at the rate of the control loop; proofs and their challenge only if `authenticated`.
     """
     frames = []
-    for message in load_protocol(dbc).messages:
+    for message in PROTOCOL.messages:
         if message.period_s is not None and (authenticated or message.name not in _AUTHENTICATION_FRAMES):
             pages = {signal.page for signal in message.signals} - {None}
             rate_hz = command_rate_hz if message.name in _COMMANDS else 1.0 / message.period_s

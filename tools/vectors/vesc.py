@@ -214,41 +214,18 @@ def _check_serial_reply(found: Comparison, device: Vesc, case: Case) -> None:
                 found.same(name, (codec.values(payload) or {}).get(name), then[name])
 
 
-class _Clocked:
-    """Runs a device through the milliseconds of a case, noting what its timeout does.
+def _check_timeout(found: Comparison, device: Vesc, given: Mapping[str, Any], then: Mapping[str, Any]) -> None:
+    """What is sent, on CAN or on the serial line, is obeyed and answered in its millisecond; the timeout stops it.
 
     What arrives in a millisecond comes before that millisecond's check: the timeout thread sleeps until then.
     """
-
-    def __init__(self, device: Vesc, given: Mapping[str, Any]) -> None:
-        device.timeout_ms = given["timeout_ms"]
-        device.timeout_brake_current_a = given["timeout_brake_current_a"]
-        device.last_fed_ms = given["last_fed_at_ms"]
-        self.device = device
-        self.changes: list[list[object]] = []
-        self.brakes: list[list[float]] = []
-        self._was = False
-
-    def check(self, ms: int) -> None:
-        device = self.device
-        if ms % CHECK_MS:
-            return
-        current = device.check_timeout(ms)
-        if device.timed_out != self._was:
-            self._was = device.timed_out
-            self.changes.append([ms, self._was])
-        if current is not None:
-            if self.brakes and self.brakes[-1][1] == ms - CHECK_MS and self.brakes[-1][2] == current:
-                self.brakes[-1][1] = ms
-            else:
-                self.brakes.append([ms, ms, current])
-
-
-def _check_timeout(found: Comparison, device: Vesc, given: Mapping[str, Any], then: Mapping[str, Any]) -> None:
-    """What is sent, on CAN or on the serial line, is obeyed and answered in its millisecond; the timeout stops it."""
-    clocked = _Clocked(device, given)
-    events: list[list[object]] = []
+    device.timeout_ms = given["timeout_ms"]
+    device.timeout_brake_current_a = given["timeout_brake_current_a"]
+    device.last_fed_ms = given["last_fed_at_ms"]
     is_serial = "sent_ms_bytes" in given
+    events: list[list[object]] = []
+    changes: list[list[object]] = []
+    brakes: list[list[float]] = []
     for ms in range(given["until_ms"]):
         device.at(ms)
         for at, *sent in given["sent_ms_bytes" if is_serial else "sent_ms_id_data"]:
@@ -261,7 +238,15 @@ def _check_timeout(found: Comparison, device: Vesc, given: Mapping[str, Any], th
                 device.receive(CanFrame(sent[0], data, extended=True))
             events += [[ms, *call] for call in device.pop_calls()]
             events += [[ms, "reply", reply.hex()]] if reply else []
-        clocked.check(ms)
-    found.same("timed out", clocked.changes, then["has_timeout_changes_ms"])
-    found.same("brake", clocked.brakes, then["brake_calls_from_to_ms_value"])
+        if ms % CHECK_MS:
+            continue
+        was_timed_out, current = device.timed_out, device.check_timeout(ms)
+        if device.timed_out != was_timed_out:
+            changes.append([ms, device.timed_out])
+        if current is not None and brakes and brakes[-1][1:] == [ms - CHECK_MS, current]:
+            brakes[-1][1] = ms
+        elif current is not None:
+            brakes.append([ms, ms, current])
+    found.same("timed out", changes, then["has_timeout_changes_ms"])
+    found.same("brake", brakes, then["brake_calls_from_to_ms_value"])
     found.same("events", events, then["events_ms" if is_serial else "obeyed_ms_call_value"])

@@ -270,9 +270,9 @@ def slid(cost, point, mean, found):
     return slid_cost
 
 
-@examples(
-    quick=6,
-    every=15,
+@pytest.mark.thorough
+@settings(max_examples=15)
+@given(
     base=SLOW_TURNING,
     values=STATES,
     commands=COMMANDS,
