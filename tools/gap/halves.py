@@ -1,12 +1,13 @@
 """What models learnt from one half of a measured log predict of the other, end to end: tables of `docs/results.md`.
 
-`DISCO_HW_DATA=FOLDER python -m tools.gap.halves [--parts N | --days | --others] [NAME...]`: logs whose path holds a
-NAME, all without one. For either half: the stage that is offered, the errors 2 s ahead on the half that
+`DISCO_HW_DATA=FOLDER python -m tools.gap.halves [--parts N | --days | --others] [--black-box] [NAME...]`: logs whose
+path holds a NAME, all without one. For either half: the stage that is offered, the errors 2 s ahead on the half that
 was not seen, of every stage, and how many of its 95 % intervals hold the other half's value of the same parameters, as
 well as that is known, where it is known half as well. With `--parts` the same of N parts of each log, and of every
 other one of it; with `--days` of whole logs, each learnt from, and every other one of the same robot predicted; with
 `--others` each log predicted by all others of the robot, searched together. Where those are of windows of 2 s, 1 s
-ahead.
+ahead. With `--black-box` also the errors of a network that knows nothing of robots (`tools.gap.black_box`), trained on
+the same part.
 """
 
 from __future__ import annotations
@@ -39,9 +40,12 @@ from disco_hw.gap.search.channel_result import estimate_parameters
 from disco_hw.gap.search.cross_validation import (
     Chain,
     PredictionErrors,
+    displacement_error,
     errors_of,
+    find_starts,
     scored_horizon_s,
     smoothed_poses,
+    summarise,
 )
 from disco_hw.gap.search.evidence import Z95
 from disco_hw.gap.search.unnamed_terms import with_known_terms
@@ -49,6 +53,7 @@ from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.log.drive import DriveLog, concatenate
 from disco_hw.log.load import load_drive
 from disco_hw.model import Model
+from tools.gap.black_box import BlackBox, train
 
 # Ticks per revolution, nominal wheel radius and axial distance (m) of the robots whose logs lie in a folder.
 ROBOTS = {
@@ -57,6 +62,7 @@ ROBOTS = {
     "optiodom": (2796.8, 0.042, 0.2),
 }
 STAGES = ("refitted", "timed", "amended")
+BLACK_BOX = "black box"
 DELAYS = ("command_delay", "motor_lag", "pose_latency")
 GROUPS: dict[str, Callable[[str], bool]] = {
     "geometry": lambda name: "." not in name,
@@ -69,7 +75,8 @@ GROUPS: dict[str, Callable[[str], bool]] = {
 class Half:
     """What a half of a log, or a log, taught: the stage offered, and by stage the errors 2 s ahead on another one.
 
-    `away`: by parameter how far that one's value lies from its own, in standard deviations of its interval.
+    `unseen` has the errors of a black box too, where one was trained. `away`: by parameter how far that one's value
+    lies from its own, in standard deviations of its interval.
     """
 
     learnt_from: str
@@ -79,10 +86,10 @@ class Half:
     away: dict[str, float]
     cpu_s: float
 
-    def ratios(self, stage: str) -> tuple[float, float]:
-        """Errors of a stage over those of `timed`, of position and of heading."""
-        one, timed = self.unseen[stage], self.unseen["timed"]
-        return one.position_m / timed.position_m, one.yaw_rad / timed.yaw_rad
+    def ratios(self, stage: str, over: str = "timed") -> tuple[float, float]:
+        """Errors of a stage over those of another, of position and of heading."""
+        one, other = self.unseen[stage], self.unseen[over]
+        return one.position_m / other.position_m, one.yaw_rad / other.yaw_rad
 
     @property
     def missed(self) -> dict[str, float]:
@@ -120,8 +127,10 @@ def channels(drive: GriddedDrive, model: Model) -> tuple[BodyChannel, WheelChann
     return body, wheels, Chain(body_vector, None if wheels is None else wheel_vector)
 
 
-def unseen_errors(drive: GriddedDrive, models: dict[str, Model], ahead_s: float = 2.0) -> dict[str, PredictionErrors]:
-    """Errors of models on a drive, all from the same smoothed poses."""
+def unseen_errors(
+    drive: GriddedDrive, models: dict[str, Model], ahead_s: float = 2.0, box: BlackBox | None = None
+) -> dict[str, PredictionErrors]:
+    """Errors of models, and of a black box, on a drive, all from the same smoothed poses."""
     poses, errors = None, {}
     for stage, model in models.items():
         body, wheels, chain = channels(drive, model)
@@ -129,6 +138,12 @@ def unseen_errors(drive: GriddedDrive, models: dict[str, Model], ahead_s: float 
         # Of windows of 2 s nothing is known so far ahead.
         reached_s = min(ahead_s, scored_horizon_s(body, poses))
         errors[stage] = errors_of(body, wheels, {0: chain, 1: chain}, reached_s, poses)
+    if box is not None and poses is not None:
+        starts = find_starts(body, poses, reached_s)
+        error = displacement_error(starts, box.displacement(drive, starts.node, reached_s))
+        # It says nothing of the wheels.
+        unknown = np.full(starts.node.size, np.nan)
+        errors[BLACK_BOX] = summarise(error, unknown, starts, drive.settings.prediction)
     return errors
 
 
@@ -151,6 +166,14 @@ class StageModels:
         kept = written[0] if written[2].kept is None else written[2].kept[0]
         offered = offered_stage(table, kept.adds_to_timed, DEFAULT_SETTINGS)
         return cls(final, table, offered, {stage: model_of(stage, nominal, *written)[0] for stage in STAGES})
+
+
+def black_box(drive: GriddedDrive, model: Model, ahead_s: float = 2.0) -> BlackBox:
+    """A black box trained on a drive, whose poses at the starts are smoothed along the wheels' path of a model."""
+    body, _, chain = channels(drive, model)
+    poses = smoothed_poses(body, chain.body)
+    reached_s = min(ahead_s, scored_horizon_s(body, poses))
+    return train(drive, find_starts(body, poses, reached_s), poses[1], reached_s)
 
 
 def values_away(analysis: GapAnalysis, final: FinalFit, other: GapAnalysis) -> dict[str, float]:
@@ -204,11 +227,12 @@ def read(path: Path) -> tuple[DriveLog, Model]:
     return load_drive(path, ticks, radius_m), Model(radius_m, axial_m, 0.0)
 
 
-def taught(part: Part, others: Sequence[Part], nominal: Model) -> Iterator[Half]:
-    """What a part taught of each of some others."""
+def taught(part: Part, others: Sequence[Part], nominal: Model, boxed: bool = False) -> Iterator[Half]:
+    """What a part taught of each of some others; `boxed`: a black box too."""
     began = time.process_time()
     fitted = StageModels.of(part.analysis, nominal)
     cpu_s = part.cpu_s + time.process_time() - began
+    box = black_box(grid_drive(part.log), fitted.models["refitted"]) if boxed else None
     names = tuple(
         name for found in (part.analysis.wheels, part.analysis.body) if found is not None
         for name in (*found.names, *(term.form for term in found.unnamed))
@@ -216,12 +240,12 @@ def taught(part: Part, others: Sequence[Part], nominal: Model) -> Iterator[Half]
     for other in others:
         away = values_away(part.analysis, fitted.final, other.analysis)
         name = part.name if len(others) == 1 else f"{part.name} -> {other.name}"
-        unseen = unseen_errors(grid_drive(other.log), fitted.models)
+        unseen = unseen_errors(grid_drive(other.log), fitted.models, box=box)
         yield Half(name, fitted.offered, names, unseen, away, cpu_s)
         cpu_s = 0.0
 
 
-def halves(path: Path, count: int) -> Iterator[Half]:
+def halves(path: Path, count: int, boxed: bool = False) -> Iterator[Half]:
     """Each of some parts of a log, equally long, learnt from and the others predicted; none of a log without poses."""
     log, nominal = read(path)
     if not log.poses.t_s.size:
@@ -233,10 +257,10 @@ def halves(path: Path, count: int) -> Iterator[Half]:
     judged = [part for part in parts if part.analysis.body is not None]
     for part in judged:
         others = [other for other in judged if other is not part]
-        yield from taught(part, others, nominal)
+        yield from taught(part, others, nominal, boxed)
 
 
-def days(paths: Sequence[Path], together: bool) -> Iterator[Half]:
+def days(paths: Sequence[Path], together: bool, boxed: bool = False) -> Iterator[Half]:
     """Each log with poses learnt from and every other one of the same robot predicted, or the other way `together`."""
     for robot in ROBOTS:
         own = [(path, *read(path)) for path in paths if path.parent.name == robot]
@@ -246,17 +270,30 @@ def days(paths: Sequence[Path], together: bool) -> Iterator[Half]:
             others = [other for other in parts if other is not part]
             if together:
                 joined = concatenate([other.log for other in others])
-                yield from taught(Part.search(f"all but {part.name}", joined, own[0][2]), [part], own[0][2])
+                yield from taught(Part.search(f"all but {part.name}", joined, own[0][2]), [part], own[0][2], boxed)
             elif part.analysis.body is not None and others:
-                yield from taught(part, others, own[0][2])
+                yield from taught(part, others, own[0][2], boxed)
 
 
 def row(of: Half) -> str:
-    """One line of the table: mm and mrad by stage, and the offered one against `timed`."""
+    """One line of the table: mm and mrad by stage and of the black box, and the offered one against `timed`."""
     cells = [f"{1e3 * of.unseen[stage].position_m:.1f} / {1e3 * of.unseen[stage].yaw_rad:.0f}" for stage in of.unseen]
     position, yaw = of.ratios(of.offered)
     held = f"{len(of.away) - len(of.missed)} of {len(of.away)}"
     return f"| {of.learnt_from} | {' | '.join(cells)} | {of.offered} | {position:.2f} / {yaw:.2f} | {held} |"
+
+
+def against_black_box(found: Sequence[Half]) -> str:
+    """How often the offered model is worse and better than the black box, and where the box is better by a fifth."""
+    ratios = {half.learnt_from: half.ratios(half.offered, BLACK_BOX) for half in found}
+    worse = sum(min(each) > 1.0 for each in ratios.values())
+    better = sum(max(each) < 1.0 for each in ratios.values())
+    # Twenty percent less than the offered model's error.
+    beaten = [name for name, each in ratios.items() if max(each) > 1.0 / 0.8]
+    return (
+        f"offered worse than the black box in position and heading: {worse} of {len(found)}, better in both: {better}; "
+        f"black box better by 20 % in one of them: {len(beaten)} ({', '.join(beaten) or 'none'})"
+    )
 
 
 def measured_logs(names: Sequence[str]) -> list[Path]:
@@ -274,15 +311,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     what.add_argument("--parts", type=int, default=2, metavar="N", help="of each log (2)")
     what.add_argument("--days", action="store_true", help="whole logs of one robot predict each other")
     what.add_argument("--others", action="store_true", help="all others of one robot together predict each log")
+    parser.add_argument("--black-box", action="store_true", help="train one on each part, which takes a minute or so")
     options = parser.parse_args(arguments)
     paths = measured_logs(options.names)
-    head = ("learnt from", f"{STAGES[0]}, mm / mrad", *STAGES[1:], "offered", "offered over timed", "intervals hold")
+    boxed = options.black_box
+    stages = (*STAGES, BLACK_BOX) if boxed else STAGES
+    head = ("learnt from", f"{stages[0]}, mm / mrad", *stages[1:], "offered", "offered over timed", "intervals hold")
     print(f"| {' | '.join(head)} |")
     print(f"|{'---|' * len(head)}")
     found = []
     whole = options.days or options.others
-    every = (half for path in paths for half in halves(path, options.parts))
-    for half in days(paths, options.others) if whole else every:
+    every = (half for path in paths for half in halves(path, options.parts, boxed))
+    for half in days(paths, options.others, boxed) if whole else every:
         found.append(half)
         print(row(half), flush=True)
     worse = [half for half in found if half.offered != "timed" and max(half.ratios(half.offered)) > 1.05]
@@ -297,6 +337,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         f"{half.learnt_from} {name} ({away:+.1f} sd)" for half in found for name, away in half.missed.items()
     )
     print(f"not: {', '.join(names)}; CPU {sum(half.cpu_s for half in found):.0f} s")
+    if boxed:
+        print(against_black_box(found))
     return 0
 
 

@@ -18,6 +18,7 @@ from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap import find_gap
 from disco_hw.gap.report.blind_spots import BlindSpot
 from disco_hw.gap.search.channel_result import ParameterEstimate
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
 from disco_hw.log.drive import DriveLog
 from disco_hw.model import Model
 from tools.gap import strange_robot
@@ -153,11 +154,11 @@ def jobs(kind: str, seeds: Iterable[int]) -> Iterator[Job]:
                 yield Job(kind, realistic(name, seed, 0.25 if kind == "weak" else 1.0), seed)
 
 
-def work(job: Job) -> Result:
+def work(job: Job, settings: GapSettings = DEFAULT_SETTINGS) -> Result:
     """Make one log and search it."""
     log, model = _log(job), Model(*strange_robot.NOMINAL) if job.kind == "strange" else MODEL
     began = time.process_time()
-    report = find_gap(log, model, top_rad_s=LARGEST_RAD_S)
+    report = find_gap(log, model, top_rad_s=LARGEST_RAD_S, settings=settings)
     cpu_s = time.process_time() - began
     mm = {stage: 1e3 * errors[2.0].position_m for stage, errors in report.gap.items()}
     errors, covered = [], []
