@@ -15,7 +15,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from disco_hw.jit import cast_like, scalar_function, specialise
+from disco_hw.jit import cast_like, compiled_only, scalar_function, specialise
 from disco_hw.model.coefficients import Base, Coefficients, TermCoefficients, Terms
 from disco_hw.model.terms import BODY_FEATURES, COMMAND, COMMAND_FEATURES, TERMS, Feature, GenericTerm
 
@@ -86,25 +86,11 @@ def new_means(effects: Coefficients) -> NDArray[np.float64] | None:
 def add_to_commands(
     left: float, right: float, time_s: float, terms: Terms | None, means: Means, at: Any, apart: Any
 ) -> tuple[float, float]:
-    """Return both commands (rad/s) with the terms that act on them.
+    """Return both commands (rad/s) with the terms that act on them; compiled code only.
 
     Number n of the means that terms remember is `means[at + n * apart]`, and goes on by a step.
     """
-    if terms is None:
-        return left, right
-    new_left, new_right, place = left, right, 0
-    for entry, term in zip(terms, _terms_of(map(type, terms)), strict=True):
-        if term.memory is None:
-            feature = COMMAND_FEATURES[term.feature]
-            new_left = new_left + entry.k * _within(feature(left, right, time_s), entry.reach)
-            new_right = new_right + entry.k * _within(feature(right, left, time_s), entry.reach)
-            continue
-        mean_left = _averaged(term.memory.of(left, right), entry, means, at + place * apart)
-        mean_right = _averaged(term.memory.of(right, left), entry, means, at + (place + 1) * apart)
-        new_left = new_left + entry.k * _within(term.memory.feature(left, right, mean_left), entry.reach)
-        new_right = new_right + entry.k * _within(term.memory.feature(right, left, mean_right), entry.reach)
-        place += term.means
-    return new_left, new_right
+    raise compiled_only(terms)
 
 
 @scalar_function
@@ -174,33 +160,9 @@ def add_to_velocity(
 ) -> tuple[float, float | None, float]:  # fmt: skip
     """Return forward and lateral speed (m/s) and half the yaw rate (rad/s) with the terms that act on them.
 
-    Wheels as for `body_velocity`, means as for `add_to_commands`.
+    Wheels as for `body_velocity`, means as for `add_to_commands`. Compiled code only.
     """
-    if terms is None:
-        return forward, lateral, turn
-    ratio = 2.0 * base.half_turn_ratio
-    v, w, place = base.half_radius_m * wheel_sum, ratio * difference, 0
-    for entry, term in zip(terms, _terms_of(map(type, terms)), strict=True):
-        if term.memory is None:
-            feature = BODY_FEATURES[term.feature](v, w, base.half_radius_m * change * entry.per_s, time_s)
-        else:
-            unit = term.memory.of(base.half_radius_m, ratio)
-            signal, here = term.memory.of(wheel_sum, difference), at + place * apart
-            if term.memory.slews:
-                followed = unit * _slewed(signal, entry.most / unit, means, here)
-            else:
-                followed = unit * _averaged(signal, entry, means, here)
-            feature = term.memory.feature(v, w, followed)
-            place += term.means
-        more = entry.k * _within(feature, entry.reach)
-        match term.target:
-            case "v_x":
-                forward = forward + more
-            case "v_y":
-                lateral = more if lateral is None else lateral + more
-            case _:
-                turn = turn + 0.5 * more
-    return forward, lateral, turn
+    raise compiled_only(terms)
 
 
 @specialise(add_to_velocity)
@@ -249,8 +211,8 @@ def _add_to_velocity(
 
 
 def terms_need_change(terms: Terms | None) -> bool:
-    """Whether any of the body's terms depends on the acceleration; a constant to the compiler."""
-    return terms is not None and any(TERMS[_NAME_OF[type(term)]].needs_acceleration for term in terms)
+    """Whether any of the body's terms depends on the acceleration; a constant of compiled code."""
+    raise compiled_only(terms)
 
 
 @specialise(terms_need_change)

@@ -354,10 +354,7 @@ body_terms = _made(
     "Forward speed (m/s), lateral speed of the axle (m/s) or None, half the yaw rate (rad/s), from the wheels' means.",
 )
 world_terms = _made(
-    "world_terms",
-    "x, y, wheel_sum, difference, time_s, effects",
-    _world_lines(),
-    "Position (m) at the end of a step.",
+    "world_terms", "x, y, wheel_sum, difference, time_s, effects", _world_lines(), "Position (m) at the end of a step."
 )
 needs_change = _made(
     "needs_change",

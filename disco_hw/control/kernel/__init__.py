@@ -189,21 +189,8 @@ def _looks_up(terms: Any) -> Callable[[Any], bool | None] | None:
     return (lambda terms: True) if "table" in fields else (lambda terms: None)
 
 
-@specialise(tasks.norm)
-def _norm(x: Any, y: Any) -> Callable[..., float]:
-    return lambda x, y: fast_norm(x, y)  # noqa: PLW0108 - the compiler wants Python code
-
-
-@specialise(tasks.norm_and_inverse)
-def _norm_and_inverse(x: Any, y: Any) -> Callable[..., tuple[float, float]]:
-    return lambda x, y: fast_norm_and_inverse(x, y)  # noqa: PLW0108 - the compiler wants Python code
-
-
-@specialise(tasks.norm_of_three)
-def _norm_of_three(x: Any, y: Any, z: Any) -> Callable[..., float]:
-    return lambda x, y, z: fast_length(x, y, z)  # noqa: PLW0108 - the compiler wants Python code
-
-
-@specialise(tasks.constant)
-def _constant(value: Any, like: Any) -> Callable[..., float]:
-    return lambda value, like: cast_like(value, like)  # noqa: PLW0108 - the compiler wants Python code
+# The compiler wants Python code, which calls the compiled function.
+specialise(tasks.norm)(lambda x, y: lambda x, y: fast_norm(x, y))  # noqa: PLW0108
+specialise(tasks.norm_and_inverse)(lambda x, y: lambda x, y: fast_norm_and_inverse(x, y))  # noqa: PLW0108
+specialise(tasks.norm_of_three)(lambda x, y, z: lambda x, y, z: fast_length(x, y, z))  # noqa: PLW0108
+specialise(tasks.constant)(lambda value, like: lambda value, like: cast_like(value, like))  # noqa: PLW0108
