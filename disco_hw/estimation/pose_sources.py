@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
@@ -223,20 +223,13 @@ class PoseSources:
 
 def _difference(one: TrackedSource, other: TrackedSource) -> str:
     """Return by how much two sources differ, where that is more than their noise; else empty."""
-    (x, y, yaw), (xx, yy, tt) = _minus(one.innovation, other.innovation), _plus(one.variance, other.variance)
+    x, y, yaw = (a - b for a, b in zip(one.innovation, other.innovation, strict=True))
+    xx, yy, tt = (a + b for a, b in zip(one.variance, other.variance, strict=True))
     if x * x / xx + y * y / yy > APART_STDS**2:
         return f"{math.hypot(x, y):.2f} m apart,"
     if math.isfinite(yaw) and yaw * yaw / tt > APART_STDS**2:
         return f"{abs(yaw):.2f} rad apart,"
     return ""
-
-
-def _minus(one: Iterable[float], other: Iterable[float]) -> Iterator[float]:
-    return (a - b for a, b in zip(one, other, strict=True))
-
-
-def _plus(one: Iterable[float], other: Iterable[float]) -> Iterator[float]:
-    return (a + b for a, b in zip(one, other, strict=True))
 
 
 def _known(value: float) -> float | None:
