@@ -25,8 +25,7 @@ from disco_hw.control.kernel.avoid import (
     touches,
 )
 from disco_hw.fence import Footprint
-from disco_hw.fence.clearance import Boundaries
-from disco_hw.fence.outlines import circle_outline
+from disco_hw.fence.clearance import Boundaries, circle_outline
 from disco_hw.jit import compiled_for
 
 Array = NDArray[np.float64]
