@@ -125,7 +125,7 @@ def _add_to_commands(
 ) -> Callable[..., Any]:
     arguments = "left, right, time_s, terms, means, at, apart"
     if isinstance(terms, types.NoneType):
-        return _made("add_to_commands", arguments, ["return left, right"], {})
+        return written_out("add_to_commands", arguments, ["return left, right"], {})
     scope: dict[str, Any] = {"averaged": _averaged, "within": _within, "place": np.uintp}
     lines, place = ["new_left, new_right = left, right"], 0
     for n, term in enumerate(_compiled_terms(terms)):
@@ -144,7 +144,7 @@ def _add_to_commands(
             f"new_right = new_right + terms[{n}].k * within(feature{n}(right, left, mean_right), terms[{n}].reach)",
         ]
         place += term.means
-    return _made("add_to_commands", arguments, [*lines, "return new_left, new_right"], scope)
+    return written_out("add_to_commands", arguments, [*lines, "return new_left, new_right"], scope)
 
 
 @scalar_function
@@ -172,7 +172,7 @@ def _add_to_velocity(
 ) -> Callable[..., Any]:  # fmt: skip
     arguments = "forward, lateral, turn, wheel_sum, difference, change, time_s, base, terms, means, at, apart"
     if isinstance(terms, types.NoneType):
-        return _made("add_to_velocity", arguments, ["return forward, lateral, turn"], {})
+        return written_out("add_to_velocity", arguments, ["return forward, lateral, turn"], {})
     scope: dict[str, Any] = {
         "plus": _plus, "cast_like": cast_like, "averaged": _averaged, "slewed": _slewed, "within": _within,
         "place": np.uintp,
@@ -207,7 +207,7 @@ def _add_to_velocity(
                 across += 1
             case _:
                 lines.append(f"new_turn = new_turn + cast_like(0.5, turn) * ({more})")
-    return _made("add_to_velocity", arguments, [*lines, f"return new_forward, lateral{across}, new_turn"], scope)
+    return written_out("add_to_velocity", arguments, [*lines, f"return new_forward, lateral{across}, new_turn"], scope)
 
 
 def terms_need_change(terms: Terms | None) -> bool:
@@ -222,8 +222,8 @@ def _terms_need_change(terms: Any) -> Callable[..., Any]:
     return lambda terms: False
 
 
-def _made(name: str, arguments: str, lines: list[str], scope: dict[str, Any]) -> Callable[..., Any]:
-    """Return a function of these lines; a tuple of mixed types cannot be looped over in compiled code."""
+def written_out(name: str, arguments: str, lines: list[str], scope: dict[str, Any]) -> Callable[..., Any]:
+    """Return a function of these lines, which compiled code calls: it cannot loop over a tuple of mixed types."""
     body = "\n".join(f"    {line}" for line in lines)
     exec(f"def {name}({arguments}):\n{body}", scope)
     made: Callable[..., Any] = scope[name]
