@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from disco_hw.control.kernel import Floats
+from disco_hw.control.kernel.avoid import TOUCH_COST
 from disco_hw.control.kernel.guide import SteeredChassis, guide
 from disco_hw.control.kernel.skid_steer import SkidSteer
 from disco_hw.control.optimiser import Optimiser
@@ -68,18 +69,15 @@ class Sampling:
     @property
     def guide_touches(self) -> bool:
         """Whether the guide of the last step touches the fence or an obstacle."""
-        around = self._surroundings
-        return around is not None and self._optimiser.guide_cost >= around.touching_cost
+        return self._surroundings is not None and self._optimiser.guide_cost >= TOUCH_COST
 
     def leave_touching_plan(self) -> None:
         """Continue from the best sample where the plan touches something and that sample does not.
 
         The mean of samples that pass an obstacle on both sides leads through it.
         """
-        around, optimiser = self._surroundings, self._optimiser
-        if around is None or optimiser.least_cost >= around.touching_cost:
-            return
-        if optimiser.nominal_cost >= around.touching_cost:
+        optimiser = self._optimiser
+        if self._surroundings is not None and optimiser.least_cost < TOUCH_COST <= optimiser.nominal_cost:
             commands, _ = optimiser.sampled_commands(1)
             if len(commands):
                 optimiser.set_nominal(commands[0])

@@ -55,6 +55,8 @@ class Surroundings:
         self._margin_m = margin_m
         self._deviations = NormalDist().inv_cdf(1.0 - max_breach_probability)
         self._horizon = horizon
+        self.trapped_cost = TOUCH_COST * TRAPPED_PART * horizon / LOOK_EVERY
+        """Cost from which on a sequence touches something for most of the horizon; from TOUCH_COST on it touches."""
         self._table = np.empty((0, COLUMNS))
         self._edges = np.empty((0, COLUMNS))
         self._bounds: Boundaries | None = None
@@ -70,16 +72,6 @@ class Surroundings:
             np.zeros(DETOURS * DETOUR_COLUMNS, np.float32),
             np.zeros(MOST_SHAPES),
         )
-
-    @property
-    def trapped_cost(self) -> float:
-        """Cost from which on a sequence touches something for most of the horizon."""
-        return TOUCH_COST * TRAPPED_PART * self._horizon / LOOK_EVERY
-
-    @property
-    def touching_cost(self) -> float:
-        """Cost from which on a sequence touches something."""
-        return TOUCH_COST
 
     def look_around(self, bounds: Boundaries, deviation_m: float) -> None:
         """Keep away from these boundaries; `deviation_m`: of the corner whose place is known least."""

@@ -215,6 +215,7 @@ class WheelTracker:
 
 
 Flat9 = tuple[float, float, float, float, float, float, float, float, float]
+_INDEPENDENT: Flat9 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 # A yaw that is anywhere on the circle has this variance; a position is as good as unknown beyond 100 m.
 MAX_YAW_VARIANCE = math.pi**2 / 3.0
@@ -303,7 +304,7 @@ def motion_model(settings: Estimation, parameters: OdometryParameters) -> Motion
 
 def belief_at(pose: Pose, position_variance: float, yaw_variance: float, model: MotionModel) -> PoseBelief:
     """Return a belief with independent x, y (the same variance, m^2) and yaw (rad^2), independent of the parameters."""
-    sensitivity: Flat9 | None = None if model.parameter_root is None else (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    sensitivity = None if model.parameter_root is None else _INDEPENDENT
     x, y, yaw = pose.x_m, pose.y_m, wrap(pose.yaw_rad)
     return PoseBelief(x, y, yaw, position_variance, 0.0, 0.0, position_variance, 0.0, yaw_variance, sensitivity)
 
@@ -311,7 +312,7 @@ def belief_at(pose: Pose, position_variance: float, yaw_variance: float, model: 
 def rebased(belief: PoseBelief, model: MotionModel) -> PoseBelief:
     """Return the belief under other parameters, whose error is independent of what those before have caused."""
     (xx, xy, xt), (_, yy, yt), (_, _, tt) = belief.covariance
-    sensitivity: Flat9 | None = None if model.parameter_root is None else (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    sensitivity = None if model.parameter_root is None else _INDEPENDENT
     return PoseBelief(belief.x_m, belief.y_m, belief.yaw_rad, xx, xy, xt, yy, yt, tt, sensitivity)
 
 
