@@ -72,30 +72,27 @@ def test_every_feature_agrees_with_the_reference(target):
 
 
 def test_every_feature_is_what_its_name_says():
-    first, second, third = np.random.default_rng(3).uniform(-4.0, 4.0, (3, 50))
-    assert COMMAND_FEATURES.keys() == features.COMMAND_FEATURES.keys()
-    for name, feature in COMMAND_FEATURES.items():
-        expected = features.COMMAND_FEATURES[name](first, second, 70.0)
-        np.testing.assert_allclose(feature(first, second, 70.0), expected, rtol=1e-12, err_msg=name)
-    assert BODY_FEATURES.keys() == features.BODY_FEATURES.keys()
-    for name, feature in BODY_FEATURES.items():
-        expected = features.BODY_FEATURES[name](first, second, third, 70.0)
-        np.testing.assert_allclose(feature(first, second, third, 70.0), expected, rtol=1e-12, err_msg=name)
+    u, other, v, omega, a = np.random.default_rng(3).uniform(-4.0, 4.0, (5, 50))
+    for name, found in COMMAND_FEATURES.items():
+        expected = features.feature(name, u=u, u_other=other, t=70.0)
+        np.testing.assert_allclose(found(u, other, 70.0), expected, rtol=1e-12, err_msg=name)
+    for name, found in BODY_FEATURES.items():
+        expected = features.feature(name, v=v, omega=omega, a=a, t=70.0)
+        np.testing.assert_allclose(found(v, omega, a, 70.0), expected, rtol=1e-12, err_msg=name)
 
 
 def test_every_memory_follows_what_its_name_says():
     first, second, before = np.random.default_rng(4).uniform(-4.0, 4.0, (3, 50))
-    of_body = {name: memory for target in BODY_TARGETS for name, memory in BODY_MEMORIES[target].items()}
-    for found, expected in ((COMMAND_MEMORIES, features.COMMAND_MEMORIES), (of_body, features.BODY_MEMORIES)):
-        assert found.keys() == expected.keys()
-        for name, memory in found.items():
-            other, value = expected[name], memory.of(first, second)
-            np.testing.assert_array_equal(value, other.goes_in(first, second), err_msg=name)
-            feature, same = (one.feature(first, second, before) for one in (memory, other))
-            np.testing.assert_allclose(feature, same, rtol=1e-12, err_msg=name)
-            mean = other.over(before, value, STEP_S)
+    kinds = ((("u", "u_other"), COMMAND_MEMORIES), *((("v", "omega"), BODY_MEMORIES[each]) for each in BODY_TARGETS))
+    for names, memories in kinds:
+        motion = dict(zip(names, (first, second), strict=True))
+        for name, memory in memories.items():
+            value = memory.of(first, second)
+            np.testing.assert_array_equal(value, features.goes_in(name, **motion), err_msg=name)
+            expected = features.feature(name, mean=before, **motion)
+            np.testing.assert_allclose(memory.feature(first, second, before), expected, rtol=1e-12, err_msg=name)
+            mean, end = (follow(name, before, value, STEP_S) for follow in (features.over, features.after))
             np.testing.assert_allclose(plain._over(memory, before, value, STEP_S), mean, atol=1e-12, err_msg=name)
-            end = other.after(before, value, STEP_S)
             np.testing.assert_allclose(plain._after(memory, before, value, STEP_S), end, atol=1e-12, err_msg=name)
             one_by_one = [memory.after(b, v, STEP_S, 1.0) for b, v in zip(before, value, strict=True)]
             np.testing.assert_allclose(one_by_one, end, atol=1e-12, err_msg=name)
