@@ -157,7 +157,7 @@ class DiscoSettings:
             raise ValueError("ut_alpha: below 1 the weight of the mean is negative, so only risk 'mean' has a meaning")
 
     @classmethod
-    def paper(cls, uncertainty: Uncertainty = "ut") -> DiscoSettings:
+    def paper(cls) -> DiscoSettings:
         """Return the paper's skid-steer settings (appendix): white noise, control cost, UT with alpha = 0.5.
 
         K = 400, T = 50, temperature 0.1, control authority 0.25 (rotations per second)^2. Rollouts take Euler steps, as
@@ -177,7 +177,6 @@ class DiscoSettings:
         )
         return cls(
             sampler=sampler,
-            uncertainty=uncertainty,
             common_draws=False,
             ut_alpha=0.5,
             gain_by_time=False,

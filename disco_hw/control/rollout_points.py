@@ -109,8 +109,8 @@ class RolloutPoints:
         dead = [f"{s.name}.{s.effect.dead_by}" for s in model.effects if s.effect.dead_by is not None]
         response_s = sum(_largest(model, self.mean_theta, name) for name in delayed)
         dead_rad_s = sum(_largest(model, self.mean_theta, name) for name in dead)
-        geometry = self.mean_theta[0, : len(BASE_PARAMETERS)].tolist()
-        self.chassis = SteeredChassis(*geometry, float(response_s), float(dead_rad_s))
+        radius_m, axle_m, x_icr_m = self.mean_theta[0, : len(BASE_PARAMETERS)].tolist()
+        self.chassis = SteeredChassis(radius_m, axle_m, x_icr_m, float(response_s), float(dead_rad_s))
         self.base, self.effects = coefficient_tables(model, theta, step_s, np.float32)
         found = equivalent_points(model, theta, step_s, self._pairs)
         self.ahead, self.scaled = (_pair(found, number) if number < self._pairs else None for number in (0, 1))

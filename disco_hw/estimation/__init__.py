@@ -196,11 +196,9 @@ class PoseFusion:
         if isinstance(outcome, PoseReason):
             outcome = Evaluation(outcome)
         self._counts[f"poses_{outcome.reason.value}"] += 1
-        stds = (sample.position_std_m, sample.yaw_std_rad)
-        self.sources.add_sample(
-            sample.source, sample.t_ns, now_ns, stds, outcome.reason, outcome.innovation, outcome.innovation_variance
-        )
-        return PoseUpdate(sample.t_ns, (now_ns - sample.t_ns) / 1e9, *msgspec.structs.astuple(outcome))
+        update = PoseUpdate(sample.t_ns, (now_ns - sample.t_ns) / 1e9, *msgspec.structs.astuple(outcome))
+        self.sources.add_sample(sample, update, now_ns)
+        return update
 
     def estimate(self, now_ns: int) -> PoseEstimate:
         """Estimate the pose at `now_ns`.
