@@ -80,7 +80,7 @@ class Disco:
         self._wheels = aligned_zeros(sampler.horizon * WHEEL_ROWS * int(BLOCK))
         # Of the first plan since the last reset, and of the last one.
         self._begun_ns: int | None = None
-        self._t0_ns: int | None = None
+        self._last_ns: int | None = None
         # What the task carries along from plan to plan.
         self._memory: float | None = None
         self._begin = PlanStart.at_rest(points.history)
@@ -128,7 +128,7 @@ class Disco:
 
     def reset(self) -> None:
         """Forget the last plan, as at a new start; the random numbers go on."""
-        self._begun_ns = self._t0_ns = self._memory = None
+        self._begun_ns = self._last_ns = self._memory = None
         self.optimiser.reset()
         self._guidance.reset()
         self._stopping.end()
@@ -147,24 +147,23 @@ class Disco:
         self.reset()
 
     def plan(self, now_ns: int, state: PlannerState) -> WheelPlan:
-        """Plan from the state, predicted to when a command made from it acts.
+        """Plan from the state, predicted to `now_ns`.
 
         A step without a valid result is tried again, then planned anew from standstill, then answered with a ramp to
         zero for `decay_s`; after that NoValidControl is raised. Plans and commands are finite in any case.
         """
         settings, optimiser, sampling = self.settings, self.optimiser, self._sampling
-        # When the plan begins, and how long after the last one.
-        t0_ns, last_ns = now_ns + round(settings.latency_s * 1e9), self._t0_ns
+        # How long after the first plan and after the last one.
         begun_ns = self._begun_ns = now_ns if self._begun_ns is None else self._begun_ns
-        task_s = (t0_ns - begun_ns) * 1e-9
-        elapsed_s = task_s if state.elapsed_s is None else state.elapsed_s + settings.latency_s
-        shift_steps = 0.0 if last_ns is None else max((t0_ns - last_ns) * 1e-9 / settings.step_s, 0.0)
+        task_s, last_ns = (now_ns - begun_ns) * 1e-9, self._last_ns
+        elapsed_s = task_s if state.elapsed_s is None else state.elapsed_s
+        shift_steps = 0.0 if last_ns is None else max((now_ns - last_ns) * 1e-9 / settings.step_s, 0.0)
 
         # Where it begins, and what is rolled out from there.
         self._compensation.follow(now_ns, state)
-        begin = self._prediction.start(state, t0_ns, elapsed_s)
+        begin = self._prediction.start(state, now_ns, elapsed_s)
         system = self._system(state, begin, task_s)
-        self._t0_ns = t0_ns
+        self._last_ns = now_ns
 
         # Sample around the last plan, roll out, weigh, update; stop where nothing helps.
         guided = self._guidance.offer(system, self.chassis, begin.before)
@@ -188,8 +187,8 @@ class Disco:
             nominal = optimiser.nominal()
             trajectory = begin.mean_path(self._points.mean_run, nominal)
         elif refined is not None:
-            return WheelPlan(t0_ns, settings.step_s, *refined, diagnostics)
-        return WheelPlan(t0_ns, settings.step_s, self._compensation.commanded(nominal), trajectory, diagnostics)
+            return WheelPlan(now_ns, settings.step_s, *refined, diagnostics)
+        return WheelPlan(now_ns, settings.step_s, self._compensation.commanded(nominal), trajectory, diagnostics)
 
     def _system(self, state: PlannerState, begin: PlanStart, task_s: float) -> SkidSteer:
         """Return what the compiled step rolls out: f_theta from the plan's start, and the task's cost."""

@@ -57,7 +57,7 @@ class PlanStart(NamedTuple):
 
 
 class StatePrediction:
-    """Predicts the state over the latency, under the mean parameters and the commands already sent."""
+    """Predicts the state to a plan's start, under the mean parameters and the commands already sent."""
 
     def __init__(
         self, points: RolloutPoints, compensation: DisturbanceCompensation, settings: DiscoSettings,
