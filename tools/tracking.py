@@ -17,7 +17,8 @@ from disco_hw.adaptation.fast import FastAdaptation
 from disco_hw.adaptation.guard import believed_geometry
 from disco_hw.config import Estimation
 from disco_hw.control import CommandLimits, Disco, DiscoSettings
-from disco_hw.control.baselines import Follower, Law, NominalRobot, Reference
+from disco_hw.control.baselines import Follower, Law, Reference
+from disco_hw.control.kernel.guide import SteeredChassis
 from disco_hw.control.plan import ROTATION
 from disco_hw.estimation import PoseFusion
 from disco_hw.estimation.correction import DisturbanceEstimator
@@ -142,8 +143,8 @@ def classical(law: Law, speed_m_s: float = 0.2, knows: bool = False) -> Contende
 
     def made(robot: ForeignRobot, track: Track) -> Planner:
         geometry = _geometry(robot, knows)
-        chassis = NominalRobot(*geometry, robot.lag_s, robot.dead_rad_s, LIMITS)
-        return Follower(Reference(track.points_m, speed_m_s, geometry[2]), law, chassis)
+        chassis = SteeredChassis(*geometry, robot.lag_s, robot.dead_rad_s)
+        return Follower(Reference(track.points_m, speed_m_s, geometry[2]), law, chassis, LIMITS)
 
     return Contender(made, knows)
 

@@ -87,6 +87,11 @@ def specialise(function: Callable[..., Any]) -> Callable[..., Any]:
     return decorator
 
 
+def compiled_only(argument: object) -> TypeError:
+    """Return the error of a function that has compiled forms alone, and none for an argument of this type."""
+    return TypeError(f"{type(argument).__name__}: no compiled form takes it, and Python cannot call this function")
+
+
 @cache
 def sources_fingerprint() -> str:
     """Hash of all Python sources that compiled code can come from."""

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from disco_hw.errors import InputError
-from disco_hw.fence.outlines import fence_outlines
+from disco_hw.fence.clearance import fence_outlines
 from disco_hw.viewer import curves, scene
 from disco_hw.viewer.area import fence_in_force, obstacle_outlines, stopping_outlines
 from disco_hw.viewer.curves import WINDOW_NS, Curves

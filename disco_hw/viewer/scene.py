@@ -13,7 +13,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from disco_hw.fence.outlines import circle_outline, fence_outlines
+from disco_hw.fence.clearance import circle_outline, fence_outlines
 from disco_hw.log import records
 from disco_hw.tasks import RobotTask
 from disco_hw.viewer.area import fence_in_force, obstacle_outlines, stopping_outlines
