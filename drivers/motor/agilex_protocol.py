@@ -34,10 +34,7 @@ LAYOUTS: Mapping[int, Layout] = MappingProxyType(
     {
         row[1]: layout(">", *row)
         for row in (
-            ("motion_command", MOTION_COMMAND, "hhhh", _MOTION),
             ("light_command", LIGHT_COMMAND, "BBBBBxxx", _LIGHT),
-            ("control_mode_config", CONTROL_MODE, "B", "mode"),
-            ("state_reset", STATE_RESET, "B", "error_clear_byte"),
             ("system_state", SYSTEM_STATE, "BBhHxx", "vehicle_state control_mode battery_v:10 error_code"),
             ("motion_state", MOTION_STATE, "hhhh", _MOTION),
             ("light_state", LIGHT_STATE, "BBBBBxxx", _LIGHT),
@@ -69,20 +66,15 @@ def control_mode(mode: int) -> Frame:
     return Frame(CONTROL_MODE, bytes([mode]).ljust(8, b"\0"))
 
 
-def clear_errors(which: int = 0) -> Frame:
-    """Clear all errors (0) or those of motor 1 to 4."""
-    return Frame(STATE_RESET, bytes([which]))
+def clear_errors() -> Frame:
+    """Clear the errors of the base and of all motors."""
+    return Frame(STATE_RESET, b"\0")
 
 
 def decode(frame: Frame) -> Decoded | None:
-    """Return what a frame says; None for an unknown one, and for one not of its full length.
-
-    CONTROL_MODE and STATE_RESET may have 1 or 8 bytes: the manual and the SDK disagree.
-    """
+    """Return what a base says; None for what is no telemetry, or not of its full length."""
     found = LAYOUTS.get(frame.can_id)
-    if frame.extended or found is None:
-        return None
-    if len(frame.data) != found.length and not (found.length == 1 and len(frame.data) == 8):
+    if frame.extended or found is None or len(frame.data) != found.length:
         return None
     # The messages of a motor, counted from 0.
     motor = (frame.can_id & 0xF) - 1 if frame.can_id >> 4 in (0x25, 0x26) else -1

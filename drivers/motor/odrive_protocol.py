@@ -52,34 +52,15 @@ _COMMON_COMMANDS = (
     ("Estop", 0x02, "", ""),
     ("Set_Axis_State", 0x07, "I4x", "state"),
     ("Set_Controller_Mode", 0x0B, "II", "control_mode input_mode"),
-    ("Set_Input_Pos", 0x0C, "fhh", "pos_turns vel_ff_milliturns_s torque_ff_mnm"),
     ("Set_Input_Vel", 0x0D, "ff", "vel_turns_s torque_nm"),
-    ("Set_Input_Torque", 0x0E, "f4x", "torque_nm"),
-    ("Set_Limits", 0x0F, "ff", "vel_limit_turns_s current_limit_a"),
-    ("Set_Traj_Vel_Limit", 0x11, "f4x", "vel_limit"),
-    ("Set_Traj_Accel_Limits", 0x12, "ff", "accel decel"),
-    ("Set_Pos_Gain", 0x1A, "f4x", "pos_gain"),
-    ("Set_Vel_Gains", 0x1B, "ff", "vel_gain vel_integrator_gain"),
 )
 COMMANDS: Mapping[Generation, Mapping[str, Layout]] = MappingProxyType(
     {
-        Generation.V05: layouts(
-            "<",
-            *_COMMON_COMMANDS,
-            ("Set_Axis_Node_ID", 0x06, "I", "new_node_id"),
-            ("Clear_Errors", 0x18, "", ""),
-            ("Set_Linear_Count", 0x19, "i4x", "count"),
-        ),
-        Generation.V06: layouts(
-            "<",
-            *_COMMON_COMMANDS,
-            ("Reboot", 0x16, "B", "action"),
-            ("Clear_Errors", 0x18, "B", "identify"),
-            ("Set_Absolute_Position", 0x19, "f4x", "pos_turns"),
-        ),
+        Generation.V05: layouts("<", *_COMMON_COMMANDS, ("Clear_Errors", 0x18, "", "")),
+        Generation.V06: layouts("<", *_COMMON_COMMANDS, ("Clear_Errors", 0x18, "B", "identify")),
     }
 )
-"""What a host may send. The driver uses Estop, Set_Axis_State, Set_Controller_Mode, Set_Input_Vel and Clear_Errors."""
+"""What the driver sends; a host may send more."""
 
 _VERSION_FIELDS = "protocol hw_major hw_minor hw_variant fw_major fw_minor fw_revision fw_unreleased"
 _COMMON_TELEMETRY = (
@@ -160,12 +141,6 @@ def decode(generation: Generation, frame: Frame) -> Decoded | None:
 def read_parameter(node: int, endpoint: int) -> Frame:
     """Return the request (0.6) for a parameter; its number is of that very firmware's flat_endpoints.json."""
     return Frame(identifier(node, SDO_REQUEST), _SDO_HEAD.pack(0, endpoint, 0) + bytes(4))
-
-
-def write_parameter(node: int, endpoint: int, kind: str, value: Value) -> Frame:
-    """Return the request (0.6) to set a parameter of a `kind` of "f32", "u32", "i32", "u16", "u8" or "bool"."""
-    body = struct.pack("<" + _SDO_VALUES[kind], value).ljust(4, b"\0")
-    return Frame(identifier(node, SDO_REQUEST), _SDO_HEAD.pack(1, endpoint, 0) + body)
 
 
 def parameter(frame: Frame, node: int, endpoint: int, kind: str) -> Value | None:

@@ -50,10 +50,9 @@ _PING_PERIOD_NS = 100_000_000
 _FAULT_PERIOD_NS = 50_000_000
 # A little under the 20 ms of a tick at 50 Hz, so that a tick that comes early is not left out.
 _POLL_PERIOD_NS = 18_000_000
-_SET_COMMANDS = frozenset(number for number, _ in codec.CAN_COMMANDS.values())
 _ERPM_PER_STEP_S = 10.0
 """Electrical rpm of a motor whose tachometer counts a step a second."""
-_BRAKE = codec.CAN_COMMANDS["set_brake_current"][0]
+_BRAKE = codec.COMMANDS["set_brake_current"][0]
 
 
 @dataclass(slots=True)
@@ -264,7 +263,7 @@ class VescPort(Port):
         )
 
     def _request(self, now_ns: int, motor: _Motor, payload: bytes) -> tuple[OutgoingFrame, ...]:
-        return parts.outgoing(now_ns, *codec.fragments(motor.node, declared.HOST_ID, payload))
+        return parts.outgoing(now_ns, codec.packet_frame(motor.node, declared.HOST_ID, payload))
 
     def _handle_packet(self, received: ReceivedFrame, permit: MotionPermit) -> FrameReport:
         found = self._reassembly.feed(received.frame)
@@ -295,7 +294,7 @@ class VescPort(Port):
     def _unused(self, frame: Frame) -> FrameReport:
         number, to = frame.can_id >> 8, frame.can_id & 0xFF
         is_addressed = frame.extended and (to in self._motors or to == codec.EVERYBODY)
-        if not (is_addressed and number in _SET_COMMANDS):
+        if not (is_addressed and number in codec.SET_COMMANDS):
             return UNKNOWN
         is_stop = number == _BRAKE
         return FrameReport(counts=("unknown_id",), is_stop=is_stop, commanded=None if is_stop else f"controller {to}")

@@ -131,7 +131,7 @@ class VescExchange:
     def reply(self, frame: Frame, received: bytes) -> Frame | None:
         """Return the first packet that answers this question, of this controller."""
         to, query = frame.can_id & 0xFF, self._payload(frame)
-        for payload in codec.PacketDecoder().feed(received):
+        for payload in codec.packets(received):
             if payload[0] == query[0] == codec.GET_APPCONF and codec.timeout(payload, to) is None:
                 continue
             if payload[0] == codec.GET_VALUES_SELECTIVE:
@@ -151,9 +151,8 @@ class VescExchange:
             return frame.data[2:]
         if number == codec.PING:
             return codec.request_values(codec.ALL_OF_A_MOTOR)
-        name = next(name for name, (command, _) in codec.CAN_COMMANDS.items() if command == number)
         # Both kinds of command have the value in the same steps.
-        return bytes([codec.PACKET_COMMANDS[name][0]]) + frame.data
+        return bytes(in_packet for on_can, in_packet, _ in codec.COMMANDS.values() if on_can == number) + frame.data
 
 
 def stop_frames(settings: VescSettings) -> tuple[Frame, ...]:
@@ -168,7 +167,7 @@ def stop_frames(settings: VescSettings) -> tuple[Frame, ...]:
 def questions(settings: VescSettings) -> tuple[Frame, ...]:
     """On a serial line, for all that must be known of each motor; no status messages come there."""
     query = codec.request_values(codec.ALL_OF_A_MOTOR)
-    return tuple(frame for node in all_of(settings.nodes) for frame in codec.fragments(node, HOST_ID, query))
+    return tuple(codec.packet_frame(node, HOST_ID, query) for node in all_of(settings.nodes))
 
 
 def cyclic_frames(settings: VescSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:
