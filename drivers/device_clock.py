@@ -41,8 +41,6 @@ class DeviceClock:
     everything starts afresh. The device's clock is taken modulo 2^40 us, as it is on the wire.
     """
 
-    __slots__ = ("_base_host_ns", "_base_us", "_count", "_filter", "_last_ns", "_slew_from_ns", "_slew_ns", "_window")
-
     def __init__(self) -> None:
         self._window: deque[_Exchange] = deque(maxlen=WINDOW)
         self._base_host_ns = 0
@@ -137,8 +135,6 @@ class DeviceClock:
 
 class _OffsetFilter:
     """Kalman filter of two states: offset (ns, relative to the first exchange) and skew (ns per ns)."""
-
-    __slots__ = ("_host_ns", "_offset_ns", "_p00", "_p01", "_p11", "_used_ns", "skew")
 
     def __init__(self, host_ns: int) -> None:
         self._host_ns = host_ns

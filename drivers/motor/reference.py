@@ -13,6 +13,7 @@ from typing import Any
 from drivers.device_clock import DEVICE_CLOCK_MODULUS_US, DeviceClock
 from drivers.motor import reference_frames as telemetry
 from drivers.motor import reference_protocol as protocol
+from drivers.motor.permit import STOPPED_FROM_OUTSIDE
 from drivers.motor.reference_arming import MESSAGES as HANDSHAKE_MESSAGES
 from drivers.motor.reference_arming import ArmedWatch, Arming, Handshake
 from drivers.motor.reference_frames import FrameReception, FrameTransmission
@@ -33,7 +34,7 @@ from drivers.types import (
     WheelCommand,
 )
 from firmware_protocol import status_codes
-from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded, packaged_dbc
+from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded
 
 # Five periods of SYSTEM_STATE (0.1 s): then the handshake begins anew.
 SILENCE_NS = 500_000_000
@@ -375,7 +376,7 @@ class ReferenceDriver:
         """Say that somebody else sent an e-stop, once for frames that come within a second."""
         newest_ns = self._reception.outside_stop_ns
         if newest_ns is not None and (before_ns is None or newest_ns - before_ns > _ONE_STOP_NS):
-            self._events.append("e-stop received on the link, sent by `disco-hw estop` or another host")
+            self._events.append(STOPPED_FROM_OUTSIDE)
 
     def _count_clock_errors(self, reported: int) -> None:
         before, self._reported_clock_errors = self._reported_clock_errors, reported
@@ -467,9 +468,7 @@ DRIVER = MotorDriver(
     _create,
     stop_frames=protocol.stop_frames,
     stop_confirmation=protocol.stop_confirmation,
-    cyclic_frames=lambda _settings, rate_hz, authenticated: protocol.cyclic_frames(
-        packaged_dbc(), rate_hz, authenticated=authenticated
-    ),
+    cyclic_frames=protocol.cyclic_frames,
     safety_card=protocol.safety_card,
     recognise=protocol.recognise,
     kinds=("can", "serial"),

@@ -66,8 +66,6 @@ class TransmitQueue:
     When it is full a more urgent frame takes the place of the least urgent one, so that an emergency stop always fits.
     """
 
-    __slots__ = ("_capacity", "_front", "_heap", "_sequence")
-
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
         self._heap: list[tuple[int, int, OutgoingFrame]] = []
@@ -122,8 +120,6 @@ def _rank(outgoing: OutgoingFrame) -> int:
 
 class TransportCounters:
     """The counters of one transport, named as the fields of `TransportStats`."""
-
-    __slots__ = ("_counts", "_lock")
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
