@@ -30,35 +30,12 @@ from drivers.transport.serial import READ_TIMEOUT_S, WRITE_TIMEOUT_S, error_numb
 from drivers.types import MAX_EXTENDED_ID, Frame, ReceivedFrame
 from firmware_protocol.serial_framing import MAX_CAN_ID, MAX_DATA
 
-# Classes and controller states of an error frame: linux/can/error.h.
-_TX_TIMEOUT = 0x001
-_LOST_ARBITRATION = 0x002
-_CONTROLLER = 0x004
-_PROTOCOL = 0x008
-_TRANSCEIVER = 0x010
-_NO_ACK = 0x020
-_BUS_OFF = 0x040
-_BUS_ERROR = 0x080
-_RESTARTED = 0x100
-_COUNTERS = 0x200
-_CLASSES = (
-    (_TX_TIMEOUT, "transmit timeout"),
-    (_LOST_ARBITRATION, "arbitration lost"),
-    (_PROTOCOL, "protocol violation"),
-    (_TRANSCEIVER, "transceiver fault (wiring)"),
-    (_NO_ACK, "no acknowledgement: no other node is on the bus, or it uses another bit rate"),
-    (_BUS_ERROR, "bus error"),
-)
-_CONTROLLER_STATES = (
-    (0x01, "receive overflow in the controller"),
-    (0x02, "transmit overflow in the controller"),
-    (0x04, "receive errors at warning level"),
-    (0x08, "transmit errors at warning level"),
-    (0x10, "receive errors at passive level"),
-    (0x20, "transmit errors at passive level"),
-)
-# CAN_ERR_CRTL_RX_OVERFLOW of linux/can/error.h.
-_RECEIVE_OVERFLOW = 0x01
+# Classes of an error frame (linux/can/error.h). Of the errors among them: transmit timeout, lost arbitration, protocol
+# violation, transceiver fault, no acknowledgement, bus error.
+_ERROR_CLASSES = 0x001 | 0x002 | 0x008 | 0x010 | 0x020 | 0x080
+_CONTROLLER_CLASS, _BUS_OFF_CLASS = 0x004, 0x040
+# States of the controller in its second byte; above the errors is only that it is active again.
+_CONTROLLER_ERRORS, _RECEIVE_OVERFLOW = 0x3F, 0x01
 # Chosen: longer than a frame waits for a loaded bus; until then an equal frame of another host counts as the echo.
 ECHO_NS = 1_000_000_000
 # Of a bus whose library or system is not here; where a library was not loaded, some of python-can use it all the same.
@@ -267,14 +244,12 @@ class CanConnection:
             ) from error
 
     def _handle_error_frame(self, message: can.Message) -> None:
-        bus_error = decode_error_frame(message.arbitration_id, bytes(message.data))
-        self._counters.add(
-            bus_off=int(bus_error.bus_off),
-            bus_errors=int(bus_error.harmful and not bus_error.bus_off),
-            receive_overflow=int(bus_error.receive_overflow),
-        )
-        if bus_error.bus_off:
-            raise LinkLostError(f"{bus_error.text}; check wiring, termination and bit rate")
+        counts = error_counts(message.arbitration_id, bytes(message.data))
+        self._counters.add(**counts)
+        if counts["bus_off"]:
+            raise LinkLostError(
+                "bus-off: the controller has left the bus after too many errors; check wiring, termination and bit rate"
+            )
 
 
 def monotonic_stamp_ns(timestamp_s: float, wall_now_ns: int, now_ns: int) -> int:
@@ -403,39 +378,16 @@ class SentFrames:
             self._sent.popleft()
 
 
-@dataclass(frozen=True, slots=True)
-class CanBusError:
-    """One error frame in words; the error counters are None where the adapter does not report them."""
+def error_counts(error_class: int, data: bytes) -> dict[str, int]:
+    """Return the transport's counters of an error frame's class bits (its identifier) and data of any length.
 
-    bus_off: bool
-    harmful: bool
-    receive_overflow: bool
-    text: str
-    tx_error_count: int | None
-    rx_error_count: int | None
-
-
-def decode_error_frame(error_class: int, data: bytes) -> CanBusError:
-    """Return the meaning of an error frame from its class bits (its identifier) and data; any length is accepted.
-
-    `harmful` is False for what only reports a recovery (controller active again, restarted) or counters.
+    What only reports a recovery (controller active again, restarted) or its own counters is no bus error.
     """
-    detail = data.ljust(8, b"\0")
-    controller = detail[1] if error_class & _CONTROLLER else 0
-    texts = [text for bit, text in _CLASSES if error_class & bit]
-    texts += [text for bit, text in _CONTROLLER_STATES if controller & bit]
-    bus_off = bool(error_class & _BUS_OFF)
-    if bus_off:
-        texts.insert(0, "bus-off: the controller has left the bus after too many errors")
-    harmful = bool(texts)
-    if error_class & _RESTARTED:
-        texts.append("controller restarted")
-    counted = bool(error_class & _COUNTERS)
-    return CanBusError(
-        bus_off=bus_off,
-        harmful=harmful,
-        receive_overflow=bool(controller & _RECEIVE_OVERFLOW),
-        text=", ".join(texts) or "controller is error-active",
-        tx_error_count=detail[6] if counted else None,
-        rx_error_count=detail[7] if counted else None,
-    )
+    controller = data[1] if error_class & _CONTROLLER_CLASS and len(data) > 1 else 0
+    is_bus_off = bool(error_class & _BUS_OFF_CLASS)
+    is_error = bool(error_class & _ERROR_CLASSES or controller & _CONTROLLER_ERRORS)
+    return {
+        "bus_off": int(is_bus_off),
+        "bus_errors": int(is_error and not is_bus_off),
+        "receive_overflow": int(bool(controller & _RECEIVE_OVERFLOW)),
+    }
