@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from drivers.motor import agilex_protocol as protocol
 from drivers.motor import vendor_parts as parts
-from drivers.motor.agilex_protocol import TIMEOUT_S, AgilexSettings, is_stationary, stop_frames
+from drivers.motor.agilex_protocol import TIMEOUT_S, AgilexSettings, is_stationary
 from drivers.motor.permit import Controllers, MotionPermit, Stage
 from drivers.motor.vendor_driver import (
     IMPLAUSIBLE,
@@ -111,7 +111,7 @@ class AgilexPort(BodyPort):
         """Take in a frame of the base, or of another host."""
         frame = received.frame
         if not frame.extended and frame.can_id in _HOST_COMMANDS:
-            if frame not in stop_frames(self.settings):
+            if frame not in self.stop_frames():
                 return FrameReport(counts=("unknown_id",), commanded="the base")
             return FrameReport(counts=("unknown_id",), is_stop=frame.can_id == protocol.CONTROL_MODE)
         decoded = protocol.decode(frame)
@@ -169,8 +169,8 @@ class AgilexPort(BodyPort):
         return (protocol.clear_errors(),) if clears else self.stop_frames()
 
     def stop_frames(self) -> tuple[Frame, ...]:
-        """Return the frames that command zero and standby."""
-        return stop_frames(self.settings)
+        """Return the frames for zero and standby, because the base has no e-stop by frame."""
+        return protocol.motion(0.0, 0.0), protocol.control_mode(protocol.STANDBY)
 
     @property
     def _is_stationary(self) -> bool:
@@ -209,7 +209,7 @@ DRIVER = MotorDriver(
     example=protocol.EXAMPLE,
     recognise=protocol.recognise,
     latches_stop=False,
-    stop_frames=stop_frames,
+    stop_frames=lambda settings: AgilexPort(settings).stop_frames(),
     stop_confirmation=lambda settings: stop_confirmation(AgilexPort(settings)),
     cyclic_frames=protocol.cyclic_frames,
     safety_card=protocol.safety_card,

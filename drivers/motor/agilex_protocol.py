@@ -103,11 +103,6 @@ class AgilexSettings(BodySettings, frozen=True, forbid_unknown_fields=True, kw_o
         return None
 
 
-def stop_frames(_settings: AgilexSettings) -> tuple[Frame, ...]:
-    """Return the frames for zero and standby, because the base has no e-stop by frame."""
-    return motion(0.0, 0.0), control_mode(STANDBY)
-
-
 def is_stationary(motion: Decoded) -> bool:
     """Whether the base says that it does not move."""
     speed, turn = motion.values["linear_m_s"], motion.values["angular_rad_s"]

@@ -21,7 +21,6 @@ from drivers.motor.odrive_protocol import (
     OdriveSettings,
     Questions,
     error_text,
-    stop_frames,
 )
 from drivers.motor.permit import Controllers, MotionPermit, Stage
 from drivers.motor.vendor_driver import (
@@ -236,8 +235,8 @@ class OdrivePort(Port):
         return bool(is_cleared and self._may_be_cleared) and not any(axis.error for axis in self._all)
 
     def stop_frames(self) -> tuple[Frame, ...]:
-        """Return the e-stop frames to every axis."""
-        return stop_frames(self._settings)
+        """Return the e-stop to every axis: it idles with an error that stays until it is cleared."""
+        return tuple(self._each("Estop"))
 
     @property
     def _all(self) -> Sequence[_Axis]:
@@ -324,7 +323,7 @@ DRIVER = MotorDriver(
     settings=OdriveSettings,
     example=protocol.EXAMPLE,
     recognise=protocol.recognise,
-    stop_frames=stop_frames,
+    stop_frames=lambda settings: OdrivePort(settings).stop_frames(),
     stop_confirmation=lambda settings: stop_confirmation(OdrivePort(settings)),
     cyclic_frames=protocol.cyclic_frames,
     safety_card=protocol.safety_card,

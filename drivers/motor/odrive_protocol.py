@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from drivers.motor.vendor_parts import Decoded, Layout, Nodes, Sign, all_of, by_number, in_sides, layouts, sides_of
+from drivers.motor.vendor_parts import Decoded, Layout, Nodes, Sign, all_of, by_number, in_sides, layouts, nodes_fault
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 # CAN Simple: six bits of node, of which 0x3F is no axis, and five of command.
@@ -227,29 +227,15 @@ class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
     def fault(self) -> SettingsFault | None:
         """Return what is wrong with the fields taken together, or None."""
-        nodes = all_of(self.nodes)
-        if not all(sides_of(self.nodes)):
-            return SettingsFault("nodes", "a side has no node", "write [left, right], such as [3, 5]")
-        if any(not 0 <= node <= LARGEST_NODE for node in nodes):
-            return SettingsFault(
-                "nodes", f"a node is outside 0 to {LARGEST_NODE}", "write the ids that odrivetool shows"
-            )
         if self.watchdog_endpoints is not None and self.firmware != "0.6":
             return SettingsFault("watchdog_endpoints", "firmware 0.5 has none that CAN could read", "remove it")
-        if len(set(nodes)) != len(nodes):
-            return SettingsFault("nodes", "a node is listed twice", "write the id of each motor's own node")
-        return None
+        return nodes_fault(self.nodes, LARGEST_NODE)
 
 
 def error_text(generation: Generation, error: int) -> str:
     """Return the meaning of the bits of an axis' error as text."""
     texts = [text for bit, text in _ERRORS[generation].items() if error & bit]
     return "; ".join(texts) or f"error {error:#x}"
-
-
-def stop_frames(settings: OdriveSettings) -> tuple[Frame, ...]:
-    """Return the e-stop to every node: it idles with an error that stays until it is cleared."""
-    return tuple(encode(settings.generation, node, "Estop") for node in all_of(settings.nodes))
 
 
 def cyclic_frames(settings: OdriveSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:

@@ -163,7 +163,7 @@ class Ros2BasePort(BodyPort):
 
     def stop_frames(self) -> tuple[Frame, ...]:
         """Return the stop that the bridge latches."""
-        return wire.stop_frames(self.settings)
+        return (Frame(wire.STOP, b""),)
 
     def _motion(self, linear_m_s: float, angular_rad_s: float) -> Frame:
         return wire.speeds(linear_m_s, angular_rad_s)
@@ -229,7 +229,7 @@ DRIVER = MotorDriver(
     settings=wire.Ros2BaseSettings,
     takes_body_speeds=True,
     example=wire.EXAMPLE,
-    stop_frames=wire.stop_frames,
+    stop_frames=lambda settings: Ros2BasePort(settings).stop_frames(),
     stop_confirmation=lambda settings: stop_confirmation(Ros2BasePort(settings)),
     cyclic_frames=wire.cyclic_frames,
     safety_card=wire.safety_card,

@@ -223,11 +223,6 @@ class BaseEnd:
             self.hold_standstill(now_ns)
 
 
-def stop_frames(_settings: Ros2BaseSettings) -> tuple[Frame, ...]:
-    """Return the e-stop, which the bridge latches."""
-    return (Frame(STOP, b""),)
-
-
 def cyclic_frames(_settings: Ros2BaseSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:
     """Return the frames of each period: the command, and the bridge's reports of a base with 50 messages a second."""
     return (

@@ -7,6 +7,7 @@ permit to move and hands it to the port as a value; the port never changes it.
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 
@@ -347,7 +348,9 @@ class VendorDriver:
                     return ()
                 self._permit = self._permit.commanded(now_ns, command)
                 self._count("commands_sent")
-                return parts.commanding(now_ns, command, *self._port.speeds(now_ns, *self._permit.speeds))
+                frames = self._port.speeds(now_ns, *self._permit.speeds)
+                # Half of the command's validity may pass on the way.
+                return parts.outgoing(now_ns, *frames, life_ns=round(0.5e9 * command.valid_for_s))
             case Stage.ARMING:
                 frames = self._arm(now_ns)
             case Stage.STOPPING:
@@ -454,4 +457,4 @@ class VendorDriver:
         self._port.reset_state(now_ns)
 
     def _count(self, name: str) -> None:
-        self.stats = parts.counted(self.stats, name)
+        self.stats = dataclasses.replace(self.stats, **{name: getattr(self.stats, name) + 1})

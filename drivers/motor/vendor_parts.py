@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import struct
 from collections.abc import Mapping, Sequence
@@ -15,12 +14,12 @@ from msgspec import Meta
 
 from drivers.types import (
     DriverState,
-    DriverStats,
     Frame,
     Limit,
     Limits,
     OutgoingFrame,
     RobotStatus,
+    SettingsFault,
     WheelCommand,
     WheelSample,
 )
@@ -187,11 +186,6 @@ def outgoing(now_ns: int, *frames: Frame, life_ns: int = _FRAME_LIFE_NS) -> tupl
     return tuple(OutgoingFrame(frame, now_ns + life_ns, _RANK) for frame in frames)
 
 
-def commanding(now_ns: int, command: WheelCommand, *frames: Frame) -> tuple[OutgoingFrame, ...]:
-    """Return the frames of a command: half of its validity may pass on the way."""
-    return outgoing(now_ns, *frames, life_ns=round(0.5e9 * command.valid_for_s))
-
-
 def estop_frames(now_ns: int, frames: tuple[Frame, ...]) -> tuple[OutgoingFrame, ...]:
     """Return the frames of an e-stop, three times over, before all others."""
     return tuple(OutgoingFrame(frame, now_ns + ESTOP_LIFE_NS, _ESTOP_RANK) for frame in ESTOP_REPEATS * frames)
@@ -217,11 +211,6 @@ def status(t_ns: int, state: DriverState, stop_confirmed: bool) -> RobotStatus:
     )
 
 
-def counted(stats: DriverStats, name: str) -> DriverStats:
-    """Return the counters, with one more of `name`."""
-    return dataclasses.replace(stats, **{name: getattr(stats, name) + 1})
-
-
 def sides_of(nodes: tuple[Nodes, Nodes]) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Return the ids on the left and on the right."""
     left, right = ((side,) if isinstance(side, int) else side for side in nodes)
@@ -232,6 +221,19 @@ def all_of(nodes: tuple[Nodes, Nodes]) -> tuple[int, ...]:
     """Return every id, left before right."""
     left, right = sides_of(nodes)
     return (*left, *right)
+
+
+def nodes_fault(nodes: tuple[Nodes, Nodes], largest: int, reserved: int | None = None) -> SettingsFault | None:
+    """Return what is wrong with the ids in link.nodes, or None; `reserved` is an id that no controller may have."""
+    ids = all_of(nodes)
+    if not all(sides_of(nodes)):
+        return SettingsFault("nodes", "a side has no controller", "write [left, right], such as [3, 5]")
+    if any(not 0 <= one <= largest or one == reserved for one in ids):
+        of_host = "" if reserved is None else f", or is {reserved}, the id of this host"
+        return SettingsFault("nodes", f"an id is outside 0 to {largest}{of_host}", "write the ids of the controllers")
+    if len(set(ids)) != len(ids):
+        return SettingsFault("nodes", "an id is listed twice", "give each controller an id of its own")
+    return None
 
 
 def in_sides(nodes: Sequence[int | str]) -> list[Any]:

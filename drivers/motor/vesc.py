@@ -235,13 +235,17 @@ class VescPort(Port):
             motor.requested_timeout += 1
             return self._request(now_ns, motor, bytes([codec.GET_APPCONF]))
         if polled:
-            return parts.outgoing(now_ns, *declared.questions(self._settings))
+            return parts.outgoing(now_ns, *self._poll())
         self._next_requested = (self._next_requested + 1) % len(self._all)
         return self._request(now_ns, self._all[self._next_requested], codec.request_values(codec.FAULT_AND_STATUS))
 
     def stop_frames(self) -> tuple[Frame, ...]:
-        """Return the frames that brake every motor."""
-        return declared.stop_frames(self._settings)
+        """Return the frames that brake with the declared current, all motors at once; nothing latches it.
+
+        On a serial line they also ask whether the motors stand.
+        """
+        brake = codec.command(codec.EVERYBODY, "set_brake_current", self._settings.brake_current_a)
+        return (brake,) if self._settings.uart_node is None else (brake, *self._poll())
 
     @property
     def _all(self) -> Sequence[_Motor]:
@@ -261,6 +265,11 @@ class VescPort(Port):
         return (
             None if complete else "no status messages 1 and 5; switch them on, at 50 Hz (VESC Tool, App Settings, CAN)"
         )
+
+    def _poll(self) -> Sequence[Frame]:
+        """Return the questions for all that must be known of each motor: no status messages come on a serial line."""
+        query = codec.request_values(codec.ALL_OF_A_MOTOR)
+        return [codec.packet_frame(motor.node, declared.HOST_ID, query) for motor in self._all]
 
     def _request(self, now_ns: int, motor: _Motor, payload: bytes) -> tuple[OutgoingFrame, ...]:
         return parts.outgoing(now_ns, codec.packet_frame(motor.node, declared.HOST_ID, payload))
@@ -311,7 +320,7 @@ DRIVER = MotorDriver(
     example=declared.EXAMPLE,
     recognise=declared.recognise,
     latches_stop=False,
-    stop_frames=declared.stop_frames,
+    stop_frames=lambda settings: VescPort(settings).stop_frames(),
     stop_confirmation=lambda settings: stop_confirmation(VescPort(settings)),
     cyclic_frames=declared.cyclic_frames,
     safety_card=declared.safety_card,
