@@ -17,7 +17,6 @@ from drivers.motor.odrive_protocol import (
     ESTOP_ERROR,
     WATCHDOG_ERROR,
     AxisState,
-    Generation,
     OdriveSettings,
     Questions,
     error_text,
@@ -79,7 +78,6 @@ class OdrivePort(Port):
     def __init__(self, settings: OdriveSettings) -> None:
         self._settings = settings
         self.table = Table(stop_deceleration_rad_s2=settings.stop_deceleration_rad_s2)
-        self._generation = settings.generation
         self._sides = [[_Axis(node) for node in side] for side in parts.sides_of(settings.nodes)]
         self._axes = {axis.node: axis for side in self._sides for axis in side}
         self._questions = Questions(settings)
@@ -90,7 +88,7 @@ class OdrivePort(Port):
         """State of the axes, as received last."""
         silent = ", ".join(str(axis.node) for axis in self._all if axis.received_ns is None)
         unheard = f"no heartbeat of node {silent}; check that it is switched on and has this bit rate and this id"
-        stopped = any(axis.error & ESTOP_ERROR[self._generation] for axis in self._all)
+        stopped = any(axis.error & ESTOP_ERROR[self._settings.firmware] for axis in self._all)
         faulty = [axis for axis in self._all if axis.error and not self._is_idle_watchdog(axis)]
         return Controllers(
             missing=None if self._questions.known else unheard if silent else "requesting the version of the nodes",
@@ -123,7 +121,7 @@ class OdrivePort(Port):
     @property
     def is_stopped(self) -> bool:
         """Whether every axis has the error of an e-stop and lets its motor go, which is a control cycle later."""
-        estop = ESTOP_ERROR[self._generation]
+        estop = ESTOP_ERROR[self._settings.firmware]
         return all(axis.error & estop and axis.state != AxisState.CLOSED_LOOP for axis in self._all)
 
     def reset_state(self, now_ns: int) -> None:
@@ -139,10 +137,10 @@ class OdrivePort(Port):
         frame, t_ns = received.frame, received.t_ns
         if self._questions.handle_parameter(frame):
             return FrameReport(message=self._questions.new_messages())
-        decoded = protocol.decode(self._generation, frame)
-        if decoded is None and self._generation is Generation.V05:
+        decoded = protocol.decode(self._settings.firmware, frame)
+        if decoded is None and self._settings.firmware == "0.5":
             # What 0.5 never sends: an answer for the version.
-            decoded = protocol.decode(Generation.V06, frame)
+            decoded = protocol.decode("0.6", frame)
             decoded = decoded if decoded is not None and decoded.name == "Get_Version" else None
         if decoded is None or decoded.node not in self._axes:
             return self._unused(frame)
@@ -211,7 +209,7 @@ class OdrivePort(Port):
             # Adding zero takes the sign off a zero.
             turns = min(max(turns, -limit), limit) + 0.0
             frames += [
-                protocol.encode(self._generation, axis.node, "Set_Input_Vel", vel_turns_s=turns, torque_nm=0.0)
+                protocol.encode(self._settings.firmware, axis.node, "Set_Input_Vel", vel_turns_s=turns, torque_nm=0.0)
                 for axis in side
             ]
         return frames
@@ -252,7 +250,7 @@ class OdrivePort(Port):
 
     def _is_idle_watchdog(self, axis: _Axis) -> bool:
         """Whether its watchdog has run out while nobody drove it, which is no fault."""
-        return axis.state == AxisState.IDLE and axis.error == WATCHDOG_ERROR[self._generation]
+        return axis.state == AxisState.IDLE and axis.error == WATCHDOG_ERROR[self._settings.firmware]
 
     @property
     def _why_unfit(self) -> str | None:
@@ -264,13 +262,13 @@ class OdrivePort(Port):
         return "a motor is turning; wait until it stands still" if fastest > _STATIONARY_RAD_S else None
 
     def _each(self, name: str, **values: int) -> list[Frame]:
-        return [protocol.encode(self._generation, axis.node, name, **values) for axis in self._all]
+        return [protocol.encode(self._settings.firmware, axis.node, name, **values) for axis in self._all]
 
     def _state_frames(self, state: AxisState) -> list[Frame]:
         return self._each("Set_Axis_State", state=int(state))
 
     def _clear_frames(self) -> list[Frame]:
-        return self._each("Clear_Errors", **({"identify": 0} if self._generation is Generation.V06 else {}))
+        return self._each("Clear_Errors", **({"identify": 0} if self._settings.firmware == "0.6" else {}))
 
     def _handle_heartbeat(self, axis: _Axis, values: Mapping[str, float], t_ns: int) -> FrameReport:
         state, error = int(values["axis_state"]), int(values["axis_error"])
@@ -314,7 +312,7 @@ class OdrivePort(Port):
         return UNKNOWN if len(frame.data) == 8 else REJECTED_LENGTH
 
     def _fault_text(self, axis: _Axis) -> str:
-        return error_text(self._generation, axis.error)
+        return error_text(self._settings.firmware, axis.error)
 
 
 DRIVER = MotorDriver(

@@ -26,13 +26,8 @@ from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 LARGEST_NODE = 0x3E
 _NODE_SHIFT, _COMMAND_MASK = 5, 0x1F
 Value = float | int
-
-
-class Generation(enum.Enum):
-    """Generations of the firmware; 0.6 and later use the same protocol."""
-
-    V05 = "0.5"
-    V06 = "0.6"
+Firmware = Literal["0.5", "0.6"]
+"""Generations of the firmware; 0.6 and later use the same protocol."""
 
 
 class AxisState(enum.IntEnum):
@@ -54,10 +49,10 @@ _COMMON_COMMANDS = (
     ("Set_Controller_Mode", 0x0B, "II", "control_mode input_mode"),
     ("Set_Input_Vel", 0x0D, "ff", "vel_turns_s torque_nm"),
 )
-COMMANDS: Mapping[Generation, Mapping[str, Layout]] = MappingProxyType(
+COMMANDS: Mapping[Firmware, Mapping[str, Layout]] = MappingProxyType(
     {
-        Generation.V05: layouts("<", *_COMMON_COMMANDS, ("Clear_Errors", 0x18, "", "")),
-        Generation.V06: layouts("<", *_COMMON_COMMANDS, ("Clear_Errors", 0x18, "B", "identify")),
+        "0.5": layouts("<", *_COMMON_COMMANDS, ("Clear_Errors", 0x18, "", "")),
+        "0.6": layouts("<", *_COMMON_COMMANDS, ("Clear_Errors", 0x18, "B", "identify")),
     }
 )
 """What the driver sends; a host may send more."""
@@ -68,9 +63,9 @@ _COMMON_TELEMETRY = (
     ("Get_Iq", 0x14, "ff", "iq_setpoint_a iq_measured_a"),
     ("Get_Bus_Voltage_Current", 0x17, "ff", "bus_v bus_a"),
 )
-TELEMETRY: Mapping[Generation, Mapping[str, Layout]] = MappingProxyType(
+TELEMETRY: Mapping[Firmware, Mapping[str, Layout]] = MappingProxyType(
     {
-        Generation.V05: layouts(
+        "0.5": layouts(
             "<",
             *_COMMON_TELEMETRY,
             ("Heartbeat", 0x01, "IBBBB", "axis_error axis_state motor_flags encoder_flags controller_flags"),
@@ -81,7 +76,7 @@ TELEMETRY: Mapping[Generation, Mapping[str, Layout]] = MappingProxyType(
             ("Get_Sensorless_Estimates", 0x15, "ff", "sensorless_pos sensorless_vel"),
             ("Get_Controller_Error", 0x1D, "I4x", "controller_error"),
         ),
-        Generation.V06: layouts(
+        "0.6": layouts(
             "<",
             *_COMMON_TELEMETRY,
             ("Get_Version", 0x00, "8B", _VERSION_FIELDS),
@@ -95,7 +90,7 @@ TELEMETRY: Mapping[Generation, Mapping[str, Layout]] = MappingProxyType(
 )
 # Get_Version of CAN Simple in firmware 0.6; 0.5 has no such command.
 GET_VERSION = 0x00
-_BY_NUMBER = {generation: by_number(table) for generation, table in TELEMETRY.items()}
+_BY_NUMBER = {firmware: by_number(table) for firmware, table in TELEMETRY.items()}
 _SDO_VALUES = MappingProxyType({"f32": "f", "u32": "I", "i32": "i", "u16": "H", "u8": "B", "bool": "?"})
 _SDO_HEAD = struct.Struct("<BHB")
 # RxSdo and TxSdo of CAN Simple in firmware 0.6, as the node names them.
@@ -114,9 +109,9 @@ def split(can_id: int) -> tuple[int, int]:
     return can_id >> _NODE_SHIFT, can_id & _COMMAND_MASK
 
 
-def encode(generation: Generation, node: int, name: str, **values: Value) -> Frame:
+def encode(firmware: Firmware, node: int, name: str, **values: Value) -> Frame:
     """Return the frame of a command; `values` by the names of `COMMANDS`. Raises KeyError for one that is missing."""
-    layout = COMMANDS[generation][name]
+    layout = COMMANDS[firmware][name]
     data = layout.pack(*(values[field] for field in layout.fields))
     return Frame(identifier(node, layout.command), data)
 
@@ -126,14 +121,14 @@ def request_frame(node: int, command: int) -> Frame:
     return Frame(identifier(node, command), b"")
 
 
-def decode(generation: Generation, frame: Frame) -> Decoded | None:
+def decode(firmware: Firmware, frame: Frame) -> Decoded | None:
     """Return what a node says; None for what is no telemetry, or not of its full length."""
     node, command = split(frame.can_id)
-    known = _BY_NUMBER[generation].get(command)
+    known = _BY_NUMBER[firmware].get(command)
     if frame.extended or known is None or node > LARGEST_NODE or len(frame.data) != known.length:
         return None
     values = known.unpack(frame.data)
-    if generation is Generation.V06 and known.name == "Heartbeat":
+    if firmware == "0.6" and known.name == "Heartbeat":
         values["trajectory_done"] = int(values["trajectory_done"]) & 1
     return Decoded(known.name, values, node)
 
@@ -152,7 +147,7 @@ def parameter(frame: Frame, node: int, endpoint: int, kind: str) -> Value | None
     return value if replied == endpoint else None
 
 
-WATCHDOG_ERROR = {Generation.V05: 0x800, Generation.V06: 0x0100_0000}
+WATCHDOG_ERROR = {"0.5": 0x800, "0.6": 0x0100_0000}
 EXAMPLE = """nodes = [3, 5]
 direction = [1, -1]
 gear = 8.0
@@ -160,10 +155,10 @@ watchdog_s = 0.1
 vel_limit_turns_s = 15.0
 heartbeat_s = 0.02
 """
-ESTOP_ERROR = {Generation.V05: 0x4000, Generation.V06: 0x0200_0000}
-_ERRORS: Mapping[Generation, Mapping[int, str]] = MappingProxyType(
+ESTOP_ERROR = {"0.5": 0x4000, "0.6": 0x0200_0000}
+_ERRORS: Mapping[Firmware, Mapping[int, str]] = MappingProxyType(
     {
-        Generation.V05: {
+        "0.5": {
             0x1: "invalid state: calibrate it with odrivetool first",
             0x40: "the motor failed; read its error with odrivetool",
             0x80: "the sensorless estimator failed",
@@ -175,7 +170,7 @@ _ERRORS: Mapping[Generation, Mapping[int, str]] = MappingProxyType(
             0x4000: "emergency stop",
             0x40000: "too hot; let it cool",
         },
-        Generation.V06: {
+        "0.6": {
             0x1: "still starting",
             0x4: "it missed its own control deadlines",
             0x8: "no position or velocity estimate; check the encoder",
@@ -213,17 +208,12 @@ class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     nodes: tuple[Nodes, Nodes]
     watchdog_s: Annotated[float, Meta(gt=0.0, le=0.5)]
     vel_limit_turns_s: Annotated[float, Meta(gt=0.0, le=1000.0)]
-    firmware: Literal["0.5", "0.6"] = "0.6"
+    firmware: Firmware = "0.6"
     direction: tuple[Sign, Sign] = (1, 1)
     gear: Annotated[float, Meta(gt=0.0, le=1000.0)] = 1.0
     heartbeat_s: Annotated[float, Meta(ge=0.005, le=0.2)] = 0.1
     watchdog_endpoints: tuple[_Endpoint, _Endpoint] | None = None
     stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
-
-    @property
-    def generation(self) -> Generation:
-        """Generation of the firmware."""
-        return Generation(self.firmware)
 
     def fault(self) -> SettingsFault | None:
         """Return what is wrong with the fields taken together, or None."""
@@ -232,9 +222,9 @@ class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         return nodes_fault(self.nodes, LARGEST_NODE)
 
 
-def error_text(generation: Generation, error: int) -> str:
+def error_text(firmware: Firmware, error: int) -> str:
     """Return the meaning of the bits of an axis' error as text."""
-    texts = [text for bit, text in _ERRORS[generation].items() if error & bit]
+    texts = [text for bit, text in _ERRORS[firmware].items() if error & bit]
     return "; ".join(texts) or f"error {error:#x}"
 
 
@@ -255,7 +245,7 @@ def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
 
     None if there are none: heartbeats alone could be another vendor's frames.
     """
-    decoded = [one for frame in frames if (one := decode(Generation.V06, frame)) is not None]
+    decoded = [one for frame in frames if (one := decode("0.6", frame)) is not None]
     beats, estimates = (
         [one.node for one in decoded if one.name == name] for name in ("Heartbeat", "Get_Encoder_Estimates")
     )
@@ -345,13 +335,13 @@ class Questions:
             return []
         self._requested_ns = now_ns
         if waits:
-            number = TELEMETRY[self._settings.generation]["Get_Bus_Voltage_Current"].command
+            number = TELEMETRY[self._settings.firmware]["Get_Bus_Voltage_Current"].command
             return [request_frame(node, number) for node in self._nodes]
         return self._for_watchdogs() if self._is_met else self._for_version()
 
     def handle_version(self, values: Mapping[str, float]) -> None:
         """Handle a reply with the version."""
-        if self._settings.generation is Generation.V05:
+        if self._settings.firmware == "0.5":
             self.refusal = 'the nodes report their version, which firmware 0.5 does not; write link.firmware = "0.6"'
         elif not self._is_met:
             version = ".".join(str(values[f"fw_{part}"]) for part in ("major", "minor", "revision"))
@@ -383,7 +373,7 @@ class Questions:
         self._version_tries += 1
         if self._version_tries <= VERSION_TRIES:
             return [request_frame(node, GET_VERSION) for node in self._nodes]
-        if self._settings.generation is Generation.V05:
+        if self._settings.firmware == "0.5":
             # That generation does not know the question.
             self._complete_handshake()
         else:

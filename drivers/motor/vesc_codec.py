@@ -12,7 +12,7 @@ import struct
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from drivers.motor.vendor_parts import Decoded, by_number, layout, layouts
+from drivers.motor.vendor_parts import Decoded, by_number, layouts
 from drivers.types import Frame
 
 # comm_can of the firmware: identifier 255 is all controllers; packets have at most PACKET_MAX_PL_LEN bytes.
@@ -31,7 +31,7 @@ COMMANDS: Mapping[str, tuple[int, int, float]] = MappingProxyType(
 SET_COMMANDS = frozenset({0, 1, 2, 3, 4, 10, 11, 12, 13})
 """Numbers on CAN of all commands that move or brake a motor: duty, current, brake, speed, position, and shares."""
 # COMM_PACKET_ID of datatypes.h.
-GET_VALUES, GET_APPCONF, FORWARD_CAN, GET_VALUES_SELECTIVE = 4, 17, 34, 50
+GET_APPCONF, FORWARD_CAN, GET_VALUES_SELECTIVE = 17, 34, 50
 _TIMEOUT = struct.Struct(">BIBIf")
 # CAN_PACKET_ID of datatypes.h; FILL frames have one byte of offset, FILL_LONG frames two.
 PING, PONG = 17, 18
@@ -49,37 +49,17 @@ _STATUS = by_number(
         ("status6", 58, "hhhh", "adc1_v:1000 adc2_v:1000 adc3_v:1000 ppm:1000"),
     )
 )
-VALUES = tuple(
-    layout(">", "values", GET_VALUES, body, fields)
-    for body, fields in (
-        ("h", "t_fet_c:10"),
-        ("h", "t_motor_c:10"),
-        ("i", "current_motor_a:100"),
-        ("i", "current_in_a:100"),
-        ("i", "id_a:100"),
-        ("i", "iq_a:100"),
-        ("h", "duty:1000"),
-        ("i", "erpm"),
-        ("h", "v_in:10"),
-        ("i", "ah:1e4"),
-        ("i", "ah_charged:1e4"),
-        ("i", "wh:1e4"),
-        ("i", "wh_charged:1e4"),
-        ("i", "tachometer"),
-        ("i", "tachometer_abs"),
-        ("B", "fault"),
-        ("i", "pid_pos_deg:1e6"),
-        ("B", "controller_id"),
-        ("hhh", "t_mos1_c:10 t_mos2_c:10 t_mos3_c:10"),
-        ("i", "vd_v:1000"),
-        ("i", "vq_v:1000"),
-        ("B", "status_byte"),
-    )
-)
-"""Of COMM_GET_VALUES, in the order of the bits of the selective form's mask."""
-# Bits of the mask of COMM_GET_VALUES_SELECTIVE, and of the status byte that it returns.
+_VALUES = {
+    7: ("erpm", "i"),
+    13: ("tachometer", "i"),
+    15: ("fault", "B"),
+    17: ("controller_id", "B"),
+    21: ("status_byte", "B"),
+}
+"""Of COMM_GET_VALUES_SELECTIVE what is asked for: by the bit of its mask the name and the `struct` code."""
 FAULT_AND_STATUS = 1 << 15 | 1 << 21
-ALL_OF_A_MOTOR = 1 << 7 | 1 << 13 | 1 << 17 | FAULT_AND_STATUS
+ALL_OF_A_MOTOR = sum(1 << bit for bit in _VALUES)
+# Bits of the status byte.
 TIMED_OUT, KILL_SWITCH = 1, 2
 
 
@@ -122,22 +102,16 @@ def forward(controller: int, payload: bytes) -> bytes:
     return bytes([FORWARD_CAN, controller]) + payload
 
 
-def values(payload: bytes) -> Mapping[str, float] | None:
-    """Return the values in an answer to GET_VALUES or its selective form; None for what is no whole answer."""
-    if payload[:1] == bytes([GET_VALUES]):
-        mask, offset = (1 << len(VALUES)) - 1, 1
-    elif payload[:1] == bytes([GET_VALUES_SELECTIVE]) and len(payload) >= 5:
-        mask, offset = int.from_bytes(payload[1:5]), 5
-    else:
+def values(payload: bytes) -> Mapping[str, int] | None:
+    """Return the values in an answer to `request_values`; None for what is no whole one, or has others."""
+    if payload[:1] != bytes([GET_VALUES_SELECTIVE]) or len(payload) < 5:
         return None
-    found: dict[str, float] = {}
-    for bit, part in enumerate(VALUES):
-        if mask >> bit & 1:
-            if len(payload) < offset + part.length:
-                return None
-            found |= part.unpack(payload, offset)
-            offset += part.length
-    return MappingProxyType(found)
+    mask = int.from_bytes(payload[1:5])
+    requested = [each for bit, each in _VALUES.items() if mask >> bit & 1]
+    form = struct.Struct(">" + "".join(code for _, code in requested))
+    if mask & ~ALL_OF_A_MOTOR or len(payload) < 5 + form.size:
+        return None
+    return {name: value for (name, _), value in zip(requested, form.unpack_from(payload, 5), strict=True)}
 
 
 def timeout(payload: bytes, controller: int) -> tuple[float, float] | None:

@@ -93,5 +93,5 @@ def test_no_bytes_break_a_decoder(can_id, data, extended, payload):
     frame = Frame(can_id, data, extended)
     codec.decode(frame)
     codec.Reassembly(can_id & 0xFF).feed(frame)
-    codec.values(payload)
+    codec.values(bytes([codec.GET_VALUES_SELECTIVE]) + payload)
     codec.packets(payload)
