@@ -45,7 +45,7 @@ _MODES = {protocol.STANDBY: "standby", protocol.UART_MODE: "serial mode", protoc
 _HOST_COMMANDS = frozenset({protocol.MOTION_COMMAND, protocol.CONTROL_MODE, protocol.STATE_RESET, protocol.BRAKE})
 
 
-class AgilexPort(BodyPort):
+class _AgilexPort(BodyPort):
     """Port of `VendorDriver` for AgileX bases."""
 
     settings: AgilexSettings
@@ -60,7 +60,6 @@ class AgilexPort(BodyPort):
 
     @property
     def seen(self) -> Controllers:
-        """State of the base, as received last."""
         is_complete = None not in (self._state_ns, self._motion_ns, self._driven_mm[0].last)
         faulty = self._vehicle == protocol.EXCEPTION or bool(self._error & ~_WARNINGS)
         text = f"the base reports an error ({self._error:#06x}); its manual's table of faults names it"
@@ -98,7 +97,6 @@ class AgilexPort(BodyPort):
         return standing_by or self._vehicle == protocol.EMERGENCY_STOP
 
     def reset_state(self, now_ns: int) -> None:
-        """Forget the base's state."""
         self._state_ns: int | None = None
         self._motion_ns: int | None = None
         self._vehicle, self._mode, self._error = protocol.NORMAL, protocol.STANDBY, 0
@@ -108,7 +106,6 @@ class AgilexPort(BodyPort):
             side.reset_state()
 
     def handle(self, received: ReceivedFrame, permit: MotionPermit) -> FrameReport:
-        """Take in a frame of the base, or of another host."""
         frame = received.frame
         if not frame.extended and frame.can_id in _HOST_COMMANDS:
             if frame not in self.stop_frames():
@@ -132,7 +129,6 @@ class AgilexPort(BodyPort):
         return FrameReport()
 
     def sources(self) -> Sequence[Source]:
-        """Return the sources that must report again and again: the base's state and its motion."""
         return (
             Source("the base", self._state_ns, STATE_SILENT_NS, GONE_NS),
             Source("the base's motion", self._motion_ns, MOTION_SILENT_NS),
@@ -203,14 +199,14 @@ class AgilexPort(BodyPort):
 
 DRIVER = MotorDriver(
     "agilex",
-    lambda settings, _key: VendorDriver(AgilexPort(settings)),
+    lambda settings, _key: VendorDriver(_AgilexPort(settings)),
     settings=AgilexSettings,
     takes_body_speeds=True,
     example=protocol.EXAMPLE,
     recognise=protocol.recognise,
     latches_stop=False,
-    stop_frames=lambda settings: AgilexPort(settings).stop_frames(),
-    stop_confirmation=lambda settings: stop_confirmation(AgilexPort(settings)),
+    stop_frames=lambda settings: _AgilexPort(settings).stop_frames(),
+    stop_confirmation=lambda settings: stop_confirmation(_AgilexPort(settings)),
     cyclic_frames=protocol.cyclic_frames,
     safety_card=protocol.safety_card,
 )

@@ -72,7 +72,7 @@ class _Axis:
     turned: parts.Odometer = field(default_factory=parts.Odometer)
 
 
-class OdrivePort(Port):
+class _OdrivePort(Port):
     """Port of `VendorDriver` for ODrive boards. Asks nothing but at rest: it would feed the watchdogs."""
 
     def __init__(self, settings: OdriveSettings) -> None:
@@ -85,7 +85,6 @@ class OdrivePort(Port):
 
     @property
     def seen(self) -> Controllers:
-        """State of the axes, as received last."""
         silent = ", ".join(str(axis.node) for axis in self._all if axis.received_ns is None)
         unheard = f"no heartbeat of node {silent}; check that it is switched on and has this bit rate and this id"
         stopped = any(axis.error & ESTOP_ERROR[self._settings.firmware] for axis in self._all)
@@ -125,7 +124,6 @@ class OdrivePort(Port):
         return all(axis.error & estop and axis.state != AxisState.CLOSED_LOOP for axis in self._all)
 
     def reset_state(self, now_ns: int) -> None:
-        """Clear what the axes reported."""
         self._questions.reset_state(now_ns)
         for axis in self._all:
             axis.received_ns = None
@@ -133,7 +131,6 @@ class OdrivePort(Port):
             axis.turned.reset_state()
 
     def handle(self, received: ReceivedFrame, permit: MotionPermit) -> FrameReport:
-        """Take in a frame of an axis, or of another host."""
         frame, t_ns = received.frame, received.t_ns
         if self._questions.handle_parameter(frame):
             return FrameReport(message=self._questions.new_messages())
@@ -156,7 +153,6 @@ class OdrivePort(Port):
         return FrameReport()
 
     def sources(self) -> Sequence[Source]:
-        """Return the sources that must report again and again: the heartbeats of every axis."""
         silent_ns = max(SILENT_BEATS * self._settings.heartbeat_s * 1e9, SILENT_AT_LEAST_NS)
         gone_ns = max(2.0 * silent_ns, 5e8)
         return [Source(f"node {axis.node}", axis.received_ns, silent_ns, gone_ns) for axis in self._all]
@@ -199,7 +195,6 @@ class OdrivePort(Port):
         return Pending(why=why, frames=tuple(frames))
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """Return the frames that command the velocity of each axis."""
         limit = self._settings.vel_limit_turns_s
         frames = []
         for side, direction, speed in zip(
@@ -317,12 +312,12 @@ class OdrivePort(Port):
 
 DRIVER = MotorDriver(
     "odrive",
-    lambda settings, _key: VendorDriver(OdrivePort(settings)),
+    lambda settings, _key: VendorDriver(_OdrivePort(settings)),
     settings=OdriveSettings,
     example=protocol.EXAMPLE,
     recognise=protocol.recognise,
-    stop_frames=lambda settings: OdrivePort(settings).stop_frames(),
-    stop_confirmation=lambda settings: stop_confirmation(OdrivePort(settings)),
+    stop_frames=lambda settings: _OdrivePort(settings).stop_frames(),
+    stop_confirmation=lambda settings: stop_confirmation(_OdrivePort(settings)),
     cyclic_frames=protocol.cyclic_frames,
     safety_card=protocol.safety_card,
 )

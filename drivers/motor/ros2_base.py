@@ -39,7 +39,7 @@ from drivers.types import (
 SILENT_NS, GONE_NS = 250_000_000, 1_000_000_000
 
 
-class Ros2BasePort(BodyPort):
+class _Ros2BasePort(BodyPort):
     """Port of `VendorDriver` for bases on ROS 2."""
 
     settings: wire.Ros2BaseSettings
@@ -56,7 +56,6 @@ class Ros2BasePort(BodyPort):
 
     @property
     def seen(self) -> Controllers:
-        """State of the bridge and its base, as received last."""
         stopped = f"a button on the base is pressed{self._or_unheard}" if self._flags & wire.BUTTON else None
         latched = "emergency stop; remove its cause, then reset" if self._flags & wire.LATCHED else None
         return Controllers(
@@ -89,7 +88,6 @@ class Ros2BasePort(BodyPort):
         return bool((is_latched and self._wheels_ns is not None and self._is_stationary) or self._flags & wire.BUTTON)
 
     def reset_state(self, now_ns: int) -> None:
-        """Clear what the bridge reported."""
         self._state_ns: int | None = None
         self._wheels_ns: int | None = None
         self._newest: tuple[int, int] | None = None
@@ -98,7 +96,6 @@ class Ros2BasePort(BodyPort):
             side.reset_state()
 
     def handle(self, received: ReceivedFrame, permit: MotionPermit) -> FrameReport:
-        """Take in a frame of the bridge, or of another host."""
         frame, data = received.frame, received.frame.data
         if frame.extended or frame.can_id not in wire.LENGTHS:
             return UNKNOWN
@@ -119,7 +116,6 @@ class Ros2BasePort(BodyPort):
         return FrameReport()
 
     def sources(self) -> Sequence[Source]:
-        """Return the sources that must report again and again: the bridge, and the base behind it."""
         return (
             Source("the bridge", self._state_ns, SILENT_NS, GONE_NS),
             Source("the base's odometry", self._wheels_ns, SILENT_NS),
@@ -225,12 +221,12 @@ class Ros2BasePort(BodyPort):
 
 DRIVER = MotorDriver(
     "ros2_base",
-    lambda settings, _key: VendorDriver(Ros2BasePort(settings)),
+    lambda settings, _key: VendorDriver(_Ros2BasePort(settings)),
     settings=wire.Ros2BaseSettings,
     takes_body_speeds=True,
     example=wire.EXAMPLE,
-    stop_frames=lambda settings: Ros2BasePort(settings).stop_frames(),
-    stop_confirmation=lambda settings: stop_confirmation(Ros2BasePort(settings)),
+    stop_frames=lambda settings: _Ros2BasePort(settings).stop_frames(),
+    stop_confirmation=lambda settings: stop_confirmation(_Ros2BasePort(settings)),
     cyclic_frames=wire.cyclic_frames,
     safety_card=wire.safety_card,
 )

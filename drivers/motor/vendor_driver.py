@@ -46,8 +46,8 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
 
     `watchdog_s`: after what silence of the host they have stopped by themselves, where they keep no state that shows
     it, so that a later command would move them again; None where they do. `zeros_to_arm`: zeros commanded before the
-    first speed. `slowest_rad_s`: the slowest speed that they hold, at which the ramp of a stop ends. `idle` and
-    `after_loss`: see `MotionPermit`; `begins`: the stage in which they are met.
+    first speed. `slowest_rad_s`: the slowest speed that they hold, at which the ramp of a stop ends. `idle`, in which
+    they are met, and `after_loss`: see `MotionPermit`.
     """
 
     stop_deceleration_rad_s2: float
@@ -56,7 +56,6 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
     slowest_rad_s: float = 0.0
     idle: Idle = Stage.REST
     after_loss: Idle = Stage.REST
-    begins: Idle = Stage.REST
 
 
 class Source(msgspec.Struct, frozen=True):
@@ -256,7 +255,7 @@ class VendorDriver:
         table = port.table
         self._port = port
         self._table = table
-        self._permit = MotionPermit(idle=table.idle, after_loss=table.after_loss, stage=table.begins)
+        self._permit = MotionPermit(idle=table.idle, after_loss=table.after_loss, stage=table.idle)
         self.stats = DriverStats()
 
     @property

@@ -84,7 +84,7 @@ class _Motor:
         self.turned.speed, self.erpm_ns = erpm / _ERPM_PER_STEP_S, t_ns
 
 
-class VescPort(Port):
+class _VescPort(Port):
     """Port of `VendorDriver` for VESC controllers, which need nothing at rest: released motors roll."""
 
     def __init__(self, settings: declared.VescSettings) -> None:
@@ -104,7 +104,6 @@ class VescPort(Port):
 
     @property
     def seen(self) -> Controllers:
-        """State of the controllers, as received last."""
         timeouts = ((motor.node, motor.timeout) for motor in self._all if motor.timeout is not None)
         refusals = (declared.timeout_fault(self._settings, node, *timeout) for node, timeout in timeouts)
         return Controllers(
@@ -137,7 +136,6 @@ class VescPort(Port):
         return all(motor.erpm_ns is not None and motor.is_stationary for motor in self._all)
 
     def reset_state(self, now_ns: int) -> None:
-        """Clear what the controllers reported."""
         self._pinged_ns = now_ns - _PING_PERIOD_NS
         for motor in self._all:
             motor.answered = motor.timed_out = motor.killed = False
@@ -172,7 +170,6 @@ class VescPort(Port):
         return FrameReport()
 
     def sources(self) -> Sequence[Source]:
-        """Return the speed of every motor."""
         return [Source(f"controller {motor.node}", motor.erpm_ns, SILENT_NS, GONE_NS) for motor in self._all]
 
     def objection(self, permit: MotionPermit) -> Objection | None:
@@ -197,7 +194,6 @@ class VescPort(Port):
         return None
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """Return the electrical speed of each motor."""
         limit, commanded = self._settings.max_erpm, (left_rad_s, right_rad_s)
         frames = []
         for side, direction, speed in zip(self._sides, self._settings.direction, commanded, strict=True):
@@ -315,13 +311,13 @@ def _describe(motor: _Motor) -> str:
 
 DRIVER = MotorDriver(
     "vesc",
-    lambda settings, _key: VendorDriver(VescPort(settings)),
+    lambda settings, _key: VendorDriver(_VescPort(settings)),
     settings=declared.VescSettings,
     example=declared.EXAMPLE,
     recognise=declared.recognise,
     latches_stop=False,
-    stop_frames=lambda settings: VescPort(settings).stop_frames(),
-    stop_confirmation=lambda settings: stop_confirmation(VescPort(settings)),
+    stop_frames=lambda settings: _VescPort(settings).stop_frames(),
+    stop_confirmation=lambda settings: stop_confirmation(_VescPort(settings)),
     cyclic_frames=declared.cyclic_frames,
     safety_card=declared.safety_card,
     kinds=("can", "serial"),

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-from collections.abc import Collection, Hashable, Sequence
+from collections.abc import Collection, Hashable
 from ipaddress import AddressValueError, IPv4Address, IPv4Network, NetmaskValueError
 
 SILENCE_S = 2.0
@@ -62,13 +62,14 @@ class PoseProof:
 class SenderGate:
     """Keeps to one sender: the first whose pose is good, until it has been silent; all others are counted and named.
 
-    `allowed`: networks that may send at all; None for every one. A `sender` is whatever names one, as (address, port).
+    `allow`: addresses and networks that may send at all; None for every one. A `sender` is whatever names one, as
+    (address, port).
     """
 
-    def __init__(self, silence_s: float = SILENCE_S, allowed: Sequence[IPv4Network] | None = None) -> None:
+    def __init__(self, silence_s: float = SILENCE_S, allow: Collection[str] | None = None) -> None:
         self.refused = 0
         self._silence_ns = round(silence_s * 1e9)
-        self._allowed = allowed
+        self._allowed = None if allow is None else parse_allowed(allow)
         self._known: dict[str, bool] = {}
         self._kept: Hashable | None = None
         self._came_ns = 0
