@@ -315,15 +315,12 @@ class VendorDriver:
 
         Raises ValueError for a command that is not finite or valid for no time.
         """
-        parts.check_command(command)
+        parts.check_command(command, 0.0)
         if not self._permit.link_is_up:
             return ()
         if self._table.watchdog_s is not None and self._permit.is_late(now_ns, self._table.watchdog_s):
-            self._end(
-                self._permit.lost(
-                    "no command was sent for longer than the controllers' time-out; check the load of this computer"
-                )
-            )
+            why = "no command was sent for longer than the controllers' time-out; check the load of this computer"
+            self._end(self._permit.lost(why))
         sent = self._step(now_ns, command)
         return (*sent, *self._port.questions(now_ns, self._permit))
 
@@ -423,18 +420,16 @@ class VendorDriver:
             self._end(self._permit.given_up(objection.why).with_event(objection.why))
 
     def _check_silence(self, now_ns: int) -> None:
+        is_idle = self._permit.stage in (Stage.REST, self._table.idle)
         for source in self._port.sources():
             silent_ns = 0 if source.received_ns is None else self._permit.silent_ns(source.received_ns)
             why = f"{source.name} stopped reporting"
             if self._may_lose:
                 if silent_ns > source.silent_ns:
-                    self._end(
-                        self._permit.lost(
-                            f"{why}: no frame for {source.silent_ns * 1e-9:g} s; check its power and the cable"
-                        )
-                    )
+                    why = f"{why}: no frame for {source.silent_ns * 1e-9:g} s; check its power and the cable"
+                    self._end(self._permit.lost(why))
                     return
-            elif self._is_idle and source.gone_ns is not None and silent_ns > source.gone_ns:
+            elif is_idle and source.gone_ns is not None and silent_ns > source.gone_ns:
                 self._restart_handshake(self._permit.restarted(why, f"{why}: waiting for it"), now_ns)
                 return
 
@@ -442,10 +437,6 @@ class VendorDriver:
     def _may_lose(self) -> bool:
         """Whether something that is wrong has a drive to end, and has not ended it already."""
         return self._permit.stage not in (Stage.REST, self._table.after_loss)
-
-    @property
-    def _is_idle(self) -> bool:
-        return self._permit.stage in (Stage.REST, self._table.idle)
 
     def _end(self, permit: MotionPermit) -> None:
         self._permit = permit

@@ -173,11 +173,12 @@ def limits(fastest: Limit, timeout: Limit, stop_deceleration_rad_s2: float) -> L
     return Limits(max_wheel_speed_rad_s=fastest, command_timeout_s=timeout, stop_deceleration_rad_s2=slows)
 
 
-def check_command(command: WheelCommand | None) -> None:
-    """Raise ValueError for a command that is not finite or valid for no time."""
-    if command is not None and not (
-        math.isfinite(command.left_rad_s) and math.isfinite(command.right_rad_s) and command.valid_for_s > 0.0
-    ):
+def check_command(command: WheelCommand | None, shortest_s: float) -> None:
+    """Raise ValueError for a command that is not finite, or valid for no time or for less than `shortest_s`."""
+    if command is None:
+        return
+    is_finite = math.isfinite(command.left_rad_s) and math.isfinite(command.right_rad_s)
+    if not (is_finite and command.valid_for_s > 0.0 and command.valid_for_s >= shortest_s):
         raise ValueError(f"not a wheel command: {command}")
 
 
