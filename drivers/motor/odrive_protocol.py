@@ -12,7 +12,6 @@ from __future__ import annotations
 import enum
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
@@ -289,14 +288,6 @@ _ALIVE_PERIOD_NS = 30_000_000
 _SAME_TIMEOUT_S = 0.002
 
 
-@dataclass(slots=True)
-class _Watchdog:
-    """Watchdog of a node, as far as the node has reported it."""
-
-    is_on: bool | None = None
-    timeout_s: float | None = None
-
-
 class Questions:
     """Questions to all nodes and their replies since the last start; pure.
 
@@ -317,7 +308,9 @@ class Questions:
         self.refusal: str | None = None
         self._message: str | None = None
         self._is_met = False
-        self._watchdogs = {node: _Watchdog() for node in self._nodes}
+        # Of the nodes that have reported their watchdog: whether it is on, and its timeout (s).
+        self._is_on: dict[int, bool] = {}
+        self._timeouts_s: dict[int, float] = {}
         self._version_tries = self._watchdog_tries = 0
         self._requested_ns = now_ns - _PERIOD_NS
 
@@ -350,22 +343,24 @@ class Questions:
     def handle_parameter(self, frame: Frame) -> bool:
         """Whether the frame answers for a watchdog, which is then judged."""
         node, _ = split(frame.can_id)
-        if node not in self._watchdogs or self._settings.watchdog_endpoints is None or not self._is_met:
+        if node not in self._nodes or self._settings.watchdog_endpoints is None or not self._is_met:
             return False
         enabled, timeout = self._settings.watchdog_endpoints
         is_on = parameter(frame, node, enabled, "bool")
         timeout_s = parameter(frame, node, timeout, "f32")
         if is_on is None and timeout_s is None:
             return False
-        watchdog = self._watchdogs[node]
-        watchdog.is_on = watchdog.is_on if is_on is None else bool(is_on)
-        watchdog.timeout_s = watchdog.timeout_s if timeout_s is None else float(timeout_s)
+        if is_on is not None:
+            self._is_on[node] = bool(is_on)
+        if timeout_s is not None:
+            self._timeouts_s[node] = float(timeout_s)
         configured_s = self._settings.watchdog_s
-        if watchdog.is_on is False:
+        found_s = self._timeouts_s.get(node, configured_s)
+        if not self._is_on.get(node, True):
             self.refusal = f"node {node}: its watchdog is off; set axis0.config.enable_watchdog (odrivetool)"
-        elif watchdog.timeout_s is not None and not abs(watchdog.timeout_s - configured_s) <= _SAME_TIMEOUT_S:
-            self.refusal = f"node {node}: its watchdog is set to {watchdog.timeout_s:g} s; set it to {configured_s:g} s"
-        elif not self.known and all(one.is_on and one.timeout_s is not None for one in self._watchdogs.values()):
+        elif not abs(found_s - configured_s) <= _SAME_TIMEOUT_S:
+            self.refusal = f"node {node}: its watchdog is set to {found_s:g} s; set it to {configured_s:g} s"
+        elif not self.known and all(self._is_on.get(one) and one in self._timeouts_s for one in self._nodes):
             self._announce(f", watchdog {configured_s:g} s")
         return True
 
@@ -384,7 +379,7 @@ class Questions:
         """Return the questions until every node has reported whether its watchdog is on and how long it waits."""
         self._watchdog_tries += 1
         endpoints = self._settings.watchdog_endpoints or ()
-        waiting = [node for node, one in self._watchdogs.items() if one.is_on is None or one.timeout_s is None]
+        waiting = [node for node in self._nodes if node not in self._is_on or node not in self._timeouts_s]
         if self._watchdog_tries > WATCHDOG_TRIES:
             self.refusal = f"node {waiting[0]} does not report its watchdog; correct link.watchdog_endpoints"
             return []

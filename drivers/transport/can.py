@@ -152,12 +152,41 @@ class CanMedium:
 
     def explain(self, error: Exception) -> str:
         """Say in one line what the error means and what to do."""
+        number = error_number(error)
+        text = plain(error)
         if isinstance(error, LinkMuteError):
             where = "the adapter (its number may have changed: use its name in /dev/serial/by-id)"
-            return f"{self.name}: {error}; check the robot's power, the bit rate and {where}"
-        if isinstance(error, LinkLostError):
-            return f"{self.name}: {error}"
-        return explain_can(self.interface, self.channel, self.bitrate, error)
+            text = f"{error}; check the robot's power, the bit rate and {where}"
+        elif isinstance(error, LinkLostError):
+            text = str(error)
+        elif isinstance(error, TypeError):
+            text = f"link.options do not fit this interface ({error}); correct them"
+        elif isinstance(error, _NOT_HERE):
+            text = f"cannot be used here ({text}); install its maker's driver, or use another interface"
+        elif type(error).__name__ == "NoBackendError":
+            text = "libusb is missing; run: sudo apt-get install libusb-1.0-0"
+        elif self.interface == "socketcan" and number in (hints := self._socketcan_hints()):
+            text = hints[number]
+        elif self.interface in _OVER_A_TTY and number is not None:
+            return explain_port(self.channel, error)
+        elif number in (errno.ENOENT, errno.ECONNREFUSED):
+            text = "nothing listens there; start the other end first"
+        return f"{self.name}: {text}"
+
+    def _socketcan_hints(self) -> Mapping[int | None, str]:
+        bring_up = f"sudo ip link set {self.channel} up"
+        if self.channel.startswith("vcan"):
+            create = f"run: sudo ip link add dev {self.channel} type vcan && {bring_up}"
+        else:
+            bring_up += f" type can bitrate {self.bitrate}"
+            create = f"plug the adapter in and run: {bring_up}"
+        check = f"check that another node is on the bus (ip -details link show {self.channel})"
+        return {
+            errno.ENODEV: f"no such CAN interface; {create}",
+            errno.ENETDOWN: f"the interface is down; run: {bring_up}",
+            errno.EAFNOSUPPORT: "this kernel has no CAN; load it with: sudo modprobe can_raw, or use another interface",
+            errno.ENOBUFS: f"transmit queue full; {check}",
+        }
 
 
 class CanConnection:
@@ -304,38 +333,6 @@ def require_working_interface(channel: str, sysfs: Path = Path("/sys/class/net")
             f"the interface is in bus-off; check wiring, termination and bit rate, then run: "
             f"sudo ip link set {channel} type can restart (or set it up with restart-ms 100)"
         )
-
-
-def explain_can(interface: str, channel: str, bitrate: int, error: BaseException) -> str:
-    """Say what went wrong with a CAN bus and what to do about it."""
-    number = error_number(error)
-    where = f"{interface} {channel}"
-    if isinstance(error, TypeError):
-        return f"{where}: link.options do not fit this interface ({error}); correct them"
-    if isinstance(error, _NOT_HERE):
-        return f"{where}: cannot be used here ({plain(error)}); install its maker's driver, or use another interface"
-    if type(error).__name__ == "NoBackendError":
-        return f"{where}: libusb is missing; run: sudo apt-get install libusb-1.0-0"
-    if interface == "socketcan":
-        virtual = channel.startswith("vcan")
-        bring_up = f"sudo ip link set {channel} up" + ("" if virtual else f" type can bitrate {bitrate}")
-        if number == errno.ENODEV and virtual:
-            return f"{where}: no such CAN interface; run: sudo ip link add dev {channel} type vcan && {bring_up}"
-        if number == errno.ENODEV:
-            return f"{where}: no such CAN interface; plug the adapter in and run: {bring_up}"
-        if number == errno.ENETDOWN:
-            return f"{where}: the interface is down; run: {bring_up}"
-        if number == errno.EAFNOSUPPORT:
-            return f"{where}: this kernel has no CAN; load it with: sudo modprobe can_raw, or use another interface"
-        if number == errno.ENOBUFS:
-            return (
-                f"{where}: transmit queue full; check that another node is on the bus (ip -details link show {channel})"
-            )
-    if interface in _OVER_A_TTY and number is not None:
-        return explain_port(channel, error)
-    if number in (errno.ENOENT, errno.ECONNREFUSED):
-        return f"{where}: nothing listens there; start the other end first"
-    return f"{where}: {plain(error)}"
 
 
 class SentFrames:
