@@ -9,19 +9,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from drivers.motor import agilex_protocol as protocol
-from drivers.motor import vendor_parts as parts
 from drivers.motor.agilex_protocol import TIMEOUT_S, AgilexSettings, is_stationary
+from drivers.motor.body_port import BodyPort
 from drivers.motor.permit import Controllers, MotionPermit, Stage
 from drivers.motor.vendor_driver import (
-    IMPLAUSIBLE,
     REJECTED_LENGTH,
     UNKNOWN,
-    BodyPort,
     FrameReport,
     Objection,
     Pending,
     Source,
-    Table,
     VendorDriver,
     stop_confirmation,
 )
@@ -29,7 +26,6 @@ from drivers.types import (
     Frame,
     Identity,
     Limit,
-    Limits,
     MotorDriver,
     ReceivedFrame,
     Request,
@@ -51,16 +47,11 @@ class _AgilexPort(BodyPort):
     settings: AgilexSettings
 
     def __init__(self, settings: AgilexSettings) -> None:
-        self.settings = settings
-        self.table = Table(
-            stop_deceleration_rad_s2=settings.stop_deceleration_rad_s2, watchdog_s=TIMEOUT_S, zeros_to_arm=5
-        )
-        self._driven_mm = (parts.Odometer(), parts.Odometer())
-        self.reset_state(0)
+        super().__init__(settings, TIMEOUT_S, Limit(TIMEOUT_S, "fixed"))
 
     @property
     def seen(self) -> Controllers:
-        is_complete = None not in (self._state_ns, self._motion_ns, self._driven_mm[0].last)
+        is_complete = None not in (self._state_ns, self._motion_ns, self._turned[0].last)
         faulty = self._vehicle == protocol.EXCEPTION or bool(self._error & ~_WARNINGS)
         text = f"the base reports an error ({self._error:#06x}); its manual's table of faults names it"
         driven = "an operator drives it by remote control; switch that off to drive it from here"
@@ -80,15 +71,6 @@ class _AgilexPort(BodyPort):
         return None if self._state_ns is None else Identity("AgileX base, CAN v2", "", "robot.toml")
 
     @property
-    def limits(self) -> Limits:
-        """Limits that robot.toml declares of the base, and the time-out that all of them have."""
-        return parts.limits(
-            Limit(self.settings.fastest_rad_s, "robot.toml"),
-            Limit(TIMEOUT_S, "fixed"),
-            self.table.stop_deceleration_rad_s2,
-        )
-
-    @property
     def is_stopped(self) -> bool:
         """Whether the base stands in a mode that CAN cannot drive, or one of its buttons is pressed."""
         if self._state_ns is None or self._motion_ns is None:
@@ -97,13 +79,12 @@ class _AgilexPort(BodyPort):
         return standing_by or self._vehicle == protocol.EMERGENCY_STOP
 
     def reset_state(self, now_ns: int) -> None:
+        super().reset_state(now_ns)
         self._state_ns: int | None = None
         self._motion_ns: int | None = None
         self._vehicle, self._mode, self._error = protocol.NORMAL, protocol.STANDBY, 0
         self._is_still = True
         self._speed = (0.0, 0.0)
-        for side in self._driven_mm:
-            side.reset_state()
 
     def handle(self, received: ReceivedFrame, permit: MotionPermit) -> FrameReport:
         frame = received.frame
@@ -125,7 +106,8 @@ class _AgilexPort(BodyPort):
                 self._speed = (float(values["linear_m_s"]), float(values["angular_rad_s"]))
             case "odometry":
                 counts = (int(values["left_mm"]), int(values["right_mm"]))
-                return self._handle_odometry(counts, received.t_ns, permit.looked_ns)
+                fastest = 1.5e3 * self.settings.max_speed_m_s
+                return self._handle_counts(counts, received.t_ns, permit.looked_ns, fastest, 10.0)
         return FrameReport()
 
     def sources(self) -> Sequence[Source]:
@@ -178,21 +160,12 @@ class _AgilexPort(BodyPort):
     def _standby_frames(self) -> tuple[Frame, ...]:
         return self.stop_frames()
 
-    def _handle_odometry(self, counts_mm: tuple[int, int], t_ns: int, looked_ns: int) -> FrameReport:
-        fastest = 1.5e3 * self.settings.max_speed_m_s
-        plausible = [
-            side.add_wrapping(count, t_ns, looked_ns, fastest, 10.0)
-            for side, count in zip(self._driven_mm, counts_mm, strict=True)
-        ]
-        wheels = None if self._motion_ns is None else self._sample(t_ns)
-        if all(plausible):
-            return FrameReport(wheels=wheels)
-        return FrameReport(counts=IMPLAUSIBLE, wheels=wheels, lost="the base has restarted: its odometry jumped")
-
-    def _sample(self, t_ns: int) -> WheelSample:
+    def _sample(self, t_ns: int) -> WheelSample | None:
+        if self._motion_ns is None:
+            return None
         radius, track = self.settings.wheel_radius_m, self.settings.track_m
         linear, angular = self._speed
-        left, right = (1e-3 * side.total / radius for side in self._driven_mm)
+        left, right = (1e-3 * side.total / radius for side in self._turned)
         speeds = (linear - 0.5 * track * angular, linear + 0.5 * track * angular)
         return WheelSample(t_ns, t_ns, left, right, speeds[0] / radius, speeds[1] / radius)
 

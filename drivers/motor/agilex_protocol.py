@@ -11,11 +11,10 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Any
 
-from msgspec import Meta
-
-from drivers.motor.vendor_parts import BodySettings, Decoded, Layout, layout
+from drivers.motor.body_port import BodySettings
+from drivers.motor.vendor_parts import Decoded, Layout, layout
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 # Identifiers of protocol v2 (ugv_sdk).
@@ -95,8 +94,6 @@ max_speed_m_s = 1.5
 
 class AgilexSettings(BodySettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Settings of AgileX bases in [link], which turn wheel speeds into speeds of the body and back."""
-
-    stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
 
     def fault(self) -> SettingsFault | None:
         """Return None, because each field shows its own faults."""

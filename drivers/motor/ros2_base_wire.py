@@ -15,7 +15,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from drivers.motor.vendor_parts import BodySettings
+from drivers.motor.body_port import BodySettings
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 # Chosen for this link alone: e-stop first, as low identifiers go first on CAN.
@@ -66,7 +66,6 @@ class Ros2BaseSettings(BodySettings, frozen=True, forbid_unknown_fields=True, kw
     """
 
     watchdog_s: Annotated[float, Meta(gt=0.0, le=1.0)]
-    stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
     speed_topic: Annotated[str, Meta(min_length=1, max_length=200)] = "/cmd_vel"
     speed_stamped: bool = False
     wheels_topic: Annotated[str, Meta(max_length=200)] = ""

@@ -198,39 +198,6 @@ class Port(ABC):
         return is_due
 
 
-class BodyPort(Port):
-    """Port of a base that takes speed and turn rate of its body, and makes wheel speeds of them by its own track."""
-
-    settings: parts.BodySettings
-
-    def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """Return the frame that commands the body's motion, by the nominal geometry."""
-        it = self.settings
-        left_m_s, right_m_s = it.wheel_radius_m * left_rad_s, it.wheel_radius_m * right_rad_s
-        scale = min(1.0, it.max_speed_m_s / max(abs(left_m_s), abs(right_m_s), 1e-9))
-        return (self._motion(scale * (left_m_s + right_m_s) / 2.0, scale * (right_m_s - left_m_s) / it.track_m),)
-
-    def brake(self, now_ns: int, lasts_ns: int) -> tuple[Sequence[Frame], bool]:
-        """Zero speed until the base stands, then the frames of standby."""
-        if self._is_stationary or lasts_ns > BRAKING_NS:
-            self._repeat_ns = now_ns
-            return self._standby_frames(), True
-        return (self._motion(0.0, 0.0),), False
-
-    @property
-    @abstractmethod
-    def _is_stationary(self) -> bool:
-        """Whether the base says that it does not move."""
-
-    @abstractmethod
-    def _motion(self, linear_m_s: float, angular_rad_s: float) -> Frame:
-        """Return the command of these speeds of the body."""
-
-    @abstractmethod
-    def _standby_frames(self) -> tuple[Frame, ...]:
-        """Return the frames after which a base that stands takes no speeds."""
-
-
 def stop_confirmation(port: Port) -> Callable[[Frame], bool]:
     """Return what says, frame by frame heard, whether the controllers have confirmed an e-stop that was sent to them.
 

@@ -7,10 +7,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Annotated, Any, Literal
-
-import msgspec
-from msgspec import Meta
+from typing import Any, Literal
 
 from drivers.types import (
     DriverState,
@@ -34,22 +31,6 @@ _ESTOP_RANK, _RANK = 0, 1
 Nodes = int | tuple[int, ...]
 """Ids on CAN of one side's controllers, as robot.toml names them."""
 Sign = Literal[-1, 1]
-
-
-class BodySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Settings in [link] of a base that takes speeds of its body: the nominal geometry, and what the base can do.
-
-    Write the geometry of [robot] there, and leave it when the model learns another.
-    """
-
-    wheel_radius_m: Annotated[float, Meta(gt=0.0, le=2.0)]
-    track_m: Annotated[float, Meta(gt=0.0, le=5.0)]
-    max_speed_m_s: Annotated[float, Meta(gt=0.0, le=10.0)]
-
-    @property
-    def fastest_rad_s(self) -> float:
-        """The wheel speed of the base's largest speed."""
-        return self.max_speed_m_s / self.wheel_radius_m
 
 
 @dataclass(slots=True)
