@@ -6,9 +6,11 @@ takes it away, is noticed at the next poll.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from evdev import AbsInfo, InputDevice, InputEvent
 
 # linux/input-event-codes.h.
 _EV_SYN, _EV_KEY, _EV_ABS = 0, 1, 3
@@ -17,40 +19,6 @@ _SYN_REPORT, _SYN_DROPPED = 0, 3
 
 class GamepadError(Exception):
     """Exception for no usable gamepad; the message is one line that says what to do."""
-
-
-class InputEvent(Protocol):
-    """One input event as evdev has it."""
-
-    type: int
-    code: int
-    value: int
-
-
-class AxisInfo(Protocol):
-    """Present value and range of an axis."""
-
-    value: int
-    min: int
-    max: int
-
-
-class EventDevice(Protocol):
-    """Part of evdev.InputDevice that is used."""
-
-    name: str
-
-    def read(self) -> Iterable[InputEvent]:
-        """Events since the last call; raises BlockingIOError for none, another OSError when the device is gone."""
-
-    def absinfo(self, axis_num: int) -> AxisInfo:
-        """Return the present state of an axis."""
-
-    def active_keys(self) -> list[int]:
-        """Codes of the buttons held now."""
-
-    def close(self) -> None:
-        """Close the input device."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +50,7 @@ class Gamepad:
     Raises GamepadError for a mapping with names that the device does not have.
     """
 
-    def __init__(self, device: EventDevice, mapping: GamepadMapping, now_ns: int) -> None:
+    def __init__(self, device: InputDevice[str], mapping: GamepadMapping, now_ns: int) -> None:
         self._device = device
         self._dead_zone = mapping.dead_zone
         self._forward = (_axis(mapping.forward_axis), _sign(mapping.forward_axis))
@@ -142,7 +110,7 @@ class Gamepad:
 
     def _read_state(self) -> None:
         for code, _ in (self._forward, self._left):
-            info = self._device.absinfo(code)
+            info: AbsInfo = self._device.absinfo(code)
             self._range[code] = (info.min, info.max)
             self._raw[code] = self._share(code, info.value)
         self._deadman = self._button in self._device.active_keys()

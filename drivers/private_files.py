@@ -26,19 +26,15 @@ def key_of_file(path: Path, content: bytes, status: os.stat_result) -> bytes:
     Mode and owner are then those of the content, whatever the path names a moment later. Raises KeyFileError for a
     file of another user, one that others than its owner can read, or no key.
     """
-    _check(path, status)
-    try:
-        return parse_key(content.decode("ascii"))
-    except (ValueError, UnicodeDecodeError):
-        raise KeyFileError(f"{path}: is not a key of 32 hexadecimal digits; {_CREATE_HINT}") from None
-
-
-def _check(path: Path, status: os.stat_result) -> None:
     mode = stat.S_IMODE(status.st_mode)
     if mode & 0o077:
         raise KeyFileError(f"{path}: others may read the key (mode {mode:04o}); run: chmod 600 {path}")
     if status.st_uid not in (os.geteuid(), 0):
         raise KeyFileError(f"{path}: belongs to another user; run: chown {os.geteuid()} {path}")
+    try:
+        return parse_key(content.decode("ascii"))
+    except (ValueError, UnicodeDecodeError):
+        raise KeyFileError(f"{path}: is not a key of 32 hexadecimal digits; {_CREATE_HINT}") from None
 
 
 def user_name(uid: int) -> str:

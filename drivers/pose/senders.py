@@ -22,7 +22,6 @@ CLOCKS_APART_NS = 1_000_000_000
 """A proven datagram was sent at most so long ago, by the sender's clock, or so far ahead of this computer's."""
 # UNIX time in ns as 64-bit integer, and HMAC-SHA-256.
 TIME_BYTES, PROOF_BYTES = 8, 32
-Sender = tuple[str, int]
 
 
 def parse_allowed(addresses: Collection[str]) -> tuple[IPv4Network, ...]:
