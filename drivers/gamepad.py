@@ -53,8 +53,8 @@ class Gamepad:
     def __init__(self, device: InputDevice[str], mapping: GamepadMapping, now_ns: int) -> None:
         self._device = device
         self._dead_zone = mapping.dead_zone
-        self._forward = (_axis(mapping.forward_axis), _sign(mapping.forward_axis))
-        self._left = (_axis(mapping.left_axis), _sign(mapping.left_axis))
+        self._forward = _axis(mapping.forward_axis)
+        self._left = _axis(mapping.left_axis)
         self._button = _code(mapping.deadman_button, "BTN_")
         self._range: dict[int, tuple[int, int]] = {}
         self._raw: dict[int, float] = {}
@@ -130,7 +130,8 @@ class Gamepad:
 def open_gamepad(mapping: GamepadMapping, now_ns: int, path: str = "") -> Gamepad:
     """Open the gamepad at `path`, or the first one that has the axes and the button; raises GamepadError."""
     evdev = _evdev()
-    axes, button = {_axis(mapping.forward_axis), _axis(mapping.left_axis)}, _code(mapping.deadman_button, "BTN_")
+    axes = {code for code, _ in map(_axis, (mapping.forward_axis, mapping.left_axis))}
+    button = _code(mapping.deadman_button, "BTN_")
     for candidate in [path] if path else evdev.list_devices(writable=False):
         try:
             device = evdev.InputDevice(candidate)
@@ -162,12 +163,9 @@ def _evdev() -> Any:
     return evdev
 
 
-def _axis(name: str) -> int:
-    return _code(name.removeprefix("-"), "ABS_")
-
-
-def _sign(name: str) -> float:
-    return -1.0 if name.startswith("-") else 1.0
+def _axis(name: str) -> tuple[int, float]:
+    """Return the code of an axis and the sign of its values."""
+    return _code(name.removeprefix("-"), "ABS_"), -1.0 if name.startswith("-") else 1.0
 
 
 def _code(name: str, prefix: str) -> int:
