@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from drivers.motor import agilex_protocol as protocol
-from drivers.motor.agilex_protocol import TIMEOUT_S, AgilexSettings, is_stationary
+from drivers.motor.agilex_protocol import TIMEOUT_S, AgilexSettings
 from drivers.motor.body_port import BodyPort
 from drivers.motor.permit import Controllers, MotionPermit, Stage
 from drivers.motor.vendor_driver import (
@@ -35,6 +35,8 @@ from drivers.types import (
 # The base sends its state at 10 Hz and its motion at 50 Hz: three and five messages. Gone: longer than a disturbance of
 # the bus.
 STATE_SILENT_NS, MOTION_SILENT_NS, GONE_NS = 350_000_000, 100_000_000, 1_000_000_000
+# Chosen: some steps of 0.001 on the wire, so that noise does not keep a base that stands from standing by.
+_STATIONARY_M_S, _STATIONARY_RAD_S = 0.01, 0.02
 _WARNINGS = 0x0606
 """Bits of the error word that only warn, in the SDK's byte and in the manual's: battery low, remote control lost."""
 _MODES = {protocol.STANDBY: "standby", protocol.UART_MODE: "serial mode", protocol.RC_MODE: "remote control"}
@@ -83,7 +85,6 @@ class _AgilexPort(BodyPort):
         self._state_ns: int | None = None
         self._motion_ns: int | None = None
         self._vehicle, self._mode, self._error = protocol.NORMAL, protocol.STANDBY, 0
-        self._is_still = True
         self._speed = (0.0, 0.0)
 
     def handle(self, received: ReceivedFrame, permit: MotionPermit) -> FrameReport:
@@ -102,7 +103,7 @@ class _AgilexPort(BodyPort):
                 self._error, self._state_ns = int(values["error_code"]), received.t_ns
                 return FrameReport(is_status=True)
             case "motion_state":
-                self._motion_ns, self._is_still = received.t_ns, is_stationary(decoded)
+                self._motion_ns = received.t_ns
                 self._speed = (float(values["linear_m_s"]), float(values["angular_rad_s"]))
             case "odometry":
                 counts = (int(values["left_mm"]), int(values["right_mm"]))
@@ -152,7 +153,8 @@ class _AgilexPort(BodyPort):
 
     @property
     def _is_stationary(self) -> bool:
-        return self._is_still
+        linear, angular = self._speed
+        return abs(linear) < _STATIONARY_M_S and abs(angular) < _STATIONARY_RAD_S
 
     def _motion(self, linear_m_s: float, angular_rad_s: float) -> Frame:
         return protocol.motion(linear_m_s, angular_rad_s)

@@ -84,8 +84,6 @@ def decode(frame: Frame) -> Decoded | None:
 TIMEOUT_S = 0.5
 # Chosen: so many frames of both kinds are no chance on a bus of another vendor.
 _RECEIVED = 3
-# Chosen: some steps of 0.001 on the wire, so that noise does not keep a base that stands from standing by.
-STATIONARY_M_S, STATIONARY_RAD_S = 0.01, 0.02
 EXAMPLE = """wheel_radius_m = 0.06
 track_m = 0.31
 max_speed_m_s = 1.5
@@ -98,12 +96,6 @@ class AgilexSettings(BodySettings, frozen=True, forbid_unknown_fields=True, kw_o
     def fault(self) -> SettingsFault | None:
         """Return None, because each field shows its own faults."""
         return None
-
-
-def is_stationary(motion: Decoded) -> bool:
-    """Whether the base says that it does not move."""
-    speed, turn = motion.values["linear_m_s"], motion.values["angular_rad_s"]
-    return abs(float(speed)) < STATIONARY_M_S and abs(float(turn)) < STATIONARY_RAD_S
 
 
 def cyclic_frames(_settings: AgilexSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:

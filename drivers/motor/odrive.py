@@ -19,7 +19,6 @@ from drivers.motor.odrive_protocol import (
     AxisState,
     OdriveSettings,
     Questions,
-    error_text,
 )
 from drivers.motor.permit import Controllers, MotionPermit, Stage
 from drivers.motor.vendor_driver import (
@@ -307,7 +306,9 @@ class _OdrivePort(Port):
         return UNKNOWN if len(frame.data) == 8 else REJECTED_LENGTH
 
     def _fault_text(self, axis: _Axis) -> str:
-        return error_text(self._settings.firmware, axis.error)
+        """Return the meaning of the bits of an axis' error as text."""
+        texts = [text for bit, text in protocol.ERRORS[self._settings.firmware].items() if axis.error & bit]
+        return "; ".join(texts) or f"error {axis.error:#x}"
 
 
 DRIVER = MotorDriver(

@@ -155,7 +155,7 @@ vel_limit_turns_s = 15.0
 heartbeat_s = 0.02
 """
 ESTOP_ERROR = {"0.5": 0x4000, "0.6": 0x0200_0000}
-_ERRORS: Mapping[Firmware, Mapping[int, str]] = MappingProxyType(
+ERRORS: Mapping[Firmware, Mapping[int, str]] = MappingProxyType(
     {
         "0.5": {
             0x1: "invalid state: calibrate it with odrivetool first",
@@ -219,12 +219,6 @@ class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         if self.watchdog_endpoints is not None and self.firmware != "0.6":
             return SettingsFault("watchdog_endpoints", "firmware 0.5 has none that CAN could read", "remove it")
         return nodes_fault(self.nodes, LARGEST_NODE)
-
-
-def error_text(firmware: Firmware, error: int) -> str:
-    """Return the meaning of the bits of an axis' error as text."""
-    texts = [text for bit, text in _ERRORS[firmware].items() if error & bit]
-    return "; ".join(texts) or f"error {error:#x}"
 
 
 def cyclic_frames(settings: OdriveSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:

@@ -16,7 +16,6 @@ from drivers.motor.permit import Controllers, MotionPermit, Stage
 from drivers.motor.roboclaw_protocol import (
     RoboclawExchange,
     RoboclawSettings,
-    is_stationary,
     query,
     setting,
     stop_frames,
@@ -66,6 +65,8 @@ _ERROR_TEXTS = {
 TO_KNOW = ("version", "velocity_pid_m1", "velocity_pid_m2", "status", "serial_timeout", "speeds", "encoders")
 
 
+# Chosen: above the noise of a counted speed, and below any motion that could matter.
+_STATIONARY_RAD_S = 0.1
 # As many as the reference controller asks for (firmware/command.c).
 ZEROS_TO_ARM = 5
 # Chosen: five replies at 50 Hz; gone when a board could have been switched off and on.
@@ -352,7 +353,8 @@ class _RoboclawPort(Port):
 
     @property
     def _is_stationary(self) -> bool:
-        return all(is_stationary(self._settings, *board.speeds) for board in self._all)
+        fastest = _STATIONARY_RAD_S * self._settings.counts_per_rad
+        return all(abs(speed) < fastest for board in self._all for speed in board.speeds)
 
     @property
     def _fastest_rad_s(self) -> float:

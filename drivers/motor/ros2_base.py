@@ -33,6 +33,8 @@ from drivers.types import (
 
 # Chosen: five reports of the bridge, which come every 50 ms; gone, longer than a disturbance of the network.
 SILENT_NS, GONE_NS = 250_000_000, 1_000_000_000
+# Chosen: above the noise of odometry.
+_STATIONARY_M_S = 0.02
 
 
 class _Ros2BasePort(BodyPort):
@@ -183,7 +185,7 @@ class _Ros2BasePort(BodyPort):
 
     @property
     def _is_stationary(self) -> bool:
-        return self.settings.is_stationary(*self._wheel_speeds)
+        return self.settings.wheel_radius_m * max(map(abs, self._wheel_speeds)) < _STATIONARY_M_S
 
     def _sample(self, t_ns: int) -> WheelSample:
         left, right = (wire.ANGLE_RAD * side.total for side in self._turned)

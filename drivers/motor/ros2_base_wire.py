@@ -38,8 +38,6 @@ DEADMAN_S = 0.2
 ZEROS_S = 0.5
 # Period of those zeros: 50 Hz, as the commands.
 STEP_S = 0.02
-# Chosen: above the noise of odometry.
-STATIONARY_M_S = 0.02
 # Steps on the wire; WHEELS' speeds in 16 bits reach 65 rad/s, and the age 6.5 s.
 ANGLE_RAD = 1e-4
 _SPEED_RAD_S, _AGE_S = 2e-3, 1e-4
@@ -89,10 +87,6 @@ class Ros2BaseSettings(BodySettings, frozen=True, forbid_unknown_fields=True, kw
     def wheels_from(self) -> str:
         """The topic that says how the wheels turn."""
         return self.wheels_topic or ("/joint_states" if self.left_joints else "/odom")
-
-    def is_stationary(self, left_rad_s: float, right_rad_s: float) -> bool:
-        """Whether these are wheels of a base that does not move."""
-        return self.wheel_radius_m * max(abs(left_rad_s), abs(right_rad_s)) < STATIONARY_M_S
 
     def check_sum(self) -> int:
         """Return a CRC-32 of all fields: driver and bridge must have been started with the same."""
