@@ -130,10 +130,6 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
                 return seen.unfit or self.note
         return self.note
 
-    def may_arm(self, seen: Controllers) -> bool:
-        """Whether arming may be asked for."""
-        return self.state(seen) in (DriverState.STANDBY, DriverState.READY) and seen.unfit is None
-
     def is_late(self, now_ns: int, timeout_s: float) -> bool:
         """Whether controllers that hold a speed must have stopped by themselves, as nothing was commanded for so long.
 
@@ -172,7 +168,7 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         if request is self.target:
             return self
         if request is Request.ARM:
-            if not self.may_arm(seen):
+            if self.state(seen) not in (DriverState.STANDBY, DriverState.READY) or seen.unfit is not None:
                 return replace(self, note=f"not arming: {self.detail(seen)}")
             return replace(
                 self, target=request, stage=Stage.ARMING, since_ns=None, zeros=0, speeds=(0.0, 0.0), note="arming"

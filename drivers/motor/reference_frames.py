@@ -259,7 +259,8 @@ class Telemetry:
             received_ns=received_ns,
             x_m=position["x"],
             y_m=position["y"],
-            yaw_rad=_wrap(heading["yaw"]),
+            # Into (-pi, pi]: the wire's range is a little wider.
+            yaw_rad=math.pi - (math.pi - heading["yaw"]) % (2.0 * math.pi),
             position_std_m=heading["position_std"],
             yaw_std_rad=heading["yaw_std"],
         )
@@ -323,11 +324,6 @@ def link_health(decoded: Decoded, received_ns: int) -> RobotLinkHealth:
     """Return the sample of a LINK_HEALTH frame."""
     values = {name: int(value) for name, value in decoded.values.items()}
     return RobotLinkHealth(t_ns=received_ns, **values)
-
-
-def _wrap(angle_rad: float) -> float:
-    """Wrap into (-pi, pi]; the wire's range is a little wider."""
-    return math.pi - (math.pi - angle_rad) % (2.0 * math.pi)
 
 
 class FramePairs:

@@ -88,7 +88,7 @@ class SenderGate:
                 now_ns, f"{_name(sender)} sends poses but is not in pose.allow", "add it there, or stop that sender"
             )
             return False
-        if self._kept in (None, sender) or self._is_silent(now_ns):
+        if self._kept in (None, sender) or now_ns - self._came_ns >= self._silence_ns:
             return True
         self.refuse(
             now_ns,
@@ -120,9 +120,6 @@ class SenderGate:
         """Return what a person should know since the last call."""
         messages, self._messages = self._messages, []
         return messages
-
-    def _is_silent(self, now_ns: int) -> bool:
-        return now_ns - self._came_ns >= self._silence_ns
 
     def _is_allowed(self, sender: Hashable) -> bool:
         address = sender[0] if isinstance(sender, tuple) else str(sender)
