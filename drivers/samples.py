@@ -82,13 +82,13 @@ class RobotStatus(msgspec.Struct, frozen=True, gc=False):
 
     t_ns: int
     state: str
-    fault_code: int = 0
-    fault: str = "NONE"
-    estop_source: str = "NONE"
-    stop_cause: str = "NONE"
-    session: int = 0
-    rejected_count: int = 0
-    reject_reason: str = "NONE"
+    fault_code: int
+    fault: str
+    estop_source: str
+    stop_cause: str
+    session: int
+    rejected_count: int
+    reject_reason: str
 
 
 class RobotLinkHealth(msgspec.Struct, frozen=True, gc=False):

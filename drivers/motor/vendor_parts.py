@@ -180,7 +180,17 @@ def status(t_ns: int, state: DriverState, stop_confirmed: bool) -> RobotStatus:
     """
     names = {DriverState.ARMED: "ARMED", DriverState.FAULT: "FAULT", DriverState.STOPPING: "STOPPING"}
     names[DriverState.ESTOP] = "ESTOP" if stop_confirmed else "STOPPING"
-    return RobotStatus(t_ns, names.get(state, "STANDBY"))
+    return RobotStatus(
+        t_ns=t_ns,
+        state=names.get(state, "STANDBY"),
+        fault_code=0,
+        fault="NONE",
+        estop_source="NONE",
+        stop_cause="NONE",
+        session=0,
+        rejected_count=0,
+        reject_reason="NONE",
+    )
 
 
 def sides_of(nodes: tuple[Nodes, Nodes]) -> tuple[tuple[int, ...], tuple[int, ...]]:
