@@ -95,7 +95,10 @@ class _AgilexPort(BodyPort):
             return FrameReport(counts=("unknown_id",), is_stop=frame.can_id == protocol.CONTROL_MODE)
         decoded = protocol.decode(frame)
         if decoded is None:
-            return REJECTED_LENGTH if frame.can_id in protocol.LAYOUTS and not frame.extended else UNKNOWN
+            if frame.extended or frame.can_id not in protocol.LAYOUTS.keys() | protocol.IGNORED:
+                return UNKNOWN
+            is_ignored = frame.can_id in protocol.IGNORED and len(frame.data) == 8
+            return FrameReport() if is_ignored else REJECTED_LENGTH
         values = decoded.values
         match decoded.name:
             case "system_state":

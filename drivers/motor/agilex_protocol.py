@@ -9,48 +9,35 @@ What robot.toml says of a base follows the frames, with e-stop, bus load and saf
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Sequence
 from typing import Any
 
 from drivers.motor.body_port import BodySettings
-from drivers.motor.vendor_parts import Decoded, Layout, layout
+from drivers.motor.vendor_parts import Decoded, by_number, layouts
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 # Identifiers of protocol v2 (ugv_sdk).
 MOTION_COMMAND, LIGHT_COMMAND, BRAKE, CONTROL_MODE, STATE_RESET = 0x111, 0x121, 0x131, 0x421, 0x441
 SYSTEM_STATE, MOTION_STATE, LIGHT_STATE, RC_STATE, ODOMETRY = 0x211, 0x221, 0x231, 0x241, 0x311
-VERSION, MOTOR_SPEED = 0x4A1, 0x281
+VERSION, MOTOR_SPEED, BATTERY = 0x4A1, 0x281, (0x361, 0x362)
 STANDBY, CAN_MODE, UART_MODE, RC_MODE = range(4)
 NORMAL, EMERGENCY_STOP, EXCEPTION = range(3)
 # Speeds are 16-bit integers on the wire.
 _I16 = (-32768, 32767)
 
 
-_MOTION = "linear_m_s:1000 angular_rad_s:1000 lateral_m_s:1000 steering_rad:1000"
-_LIGHT = "enable front_mode front_value rear_mode rear_value"
-LAYOUTS: Mapping[int, Layout] = MappingProxyType(
-    {
-        row[1]: layout(">", *row)
-        for row in (
-            ("light_command", LIGHT_COMMAND, "BBBBBxxx", _LIGHT),
-            ("system_state", SYSTEM_STATE, "BBhHxx", "vehicle_state control_mode battery_v:10 error_code"),
-            ("motion_state", MOTION_STATE, "hhhh", _MOTION),
-            ("light_state", LIGHT_STATE, "BBBBBxxx", _LIGHT),
-            ("rc_state", RC_STATE, "Bbbbbbxx", "switches stick_right_h stick_right_v stick_left_v stick_left_h var_a"),
-            ("odometry", ODOMETRY, "ii", "left_mm right_mm"),
-            ("bms_basic", 0x361, "BBHhh", "soc_percent soh_percent bms_v:10 bms_a:10 bms_deg_c:10"),
-            ("bms_extended", 0x362, "BBBB4x", "alarm_1 alarm_2 warn_1 warn_2"),
-            ("motor_speed", MOTOR_SPEED, "hhhh", "m1_m_s:1000 m2_m_s:1000 m3_m_s:1000 m4_m_s:1000"),
-            ("version_response", VERSION, "8s", "bytes"),
-            *(("actuator_high_speed", 0x251 + motor, "hhi", "rpm current_a:10 pulses") for motor in range(8)),
-            *(
-                ("actuator_low_speed", 0x261 + motor, "HhbBxx", "driver_v:10 driver_deg_c motor_deg_c driver_state")
-                for motor in range(8)
-            ),
-        )
-    }
+LAYOUTS = by_number(
+    layouts(
+        ">",
+        ("system_state", SYSTEM_STATE, "BBhHxx", "vehicle_state control_mode battery_v:10 error_code"),
+        ("motion_state", MOTION_STATE, "hhhh", "linear_m_s:1000 angular_rad_s:1000 lateral_m_s:1000 steering_rad:1000"),
+        ("odometry", ODOMETRY, "ii", "left_mm right_mm"),
+    )
 )
+IGNORED = frozenset(
+    {LIGHT_COMMAND, LIGHT_STATE, RC_STATE, VERSION, MOTOR_SPEED, *BATTERY, *range(0x251, 0x259), *range(0x261, 0x269)}
+)
+"""Messages of 8 bytes that say nothing to the driver; the last two of each motor: its speed, and its temperatures."""
 
 
 def motion(linear_m_s: float, angular_rad_s: float) -> Frame:
@@ -71,13 +58,11 @@ def clear_errors() -> Frame:
 
 
 def decode(frame: Frame) -> Decoded | None:
-    """Return what a base says; None for what is no telemetry, or not of its full length."""
+    """Return what a base says; None for another message than those of `LAYOUTS`, or not of its full length."""
     found = LAYOUTS.get(frame.can_id)
     if frame.extended or found is None or len(frame.data) != found.length:
         return None
-    # The messages of a motor, counted from 0.
-    motor = (frame.can_id & 0xF) - 1 if frame.can_id >> 4 in (0x25, 0x26) else -1
-    return Decoded(found.name, found.unpack(frame.data), motor)
+    return Decoded(found.name, found.unpack(frame.data))
 
 
 # By the manual; the base offers no way to change or read it.
