@@ -35,7 +35,7 @@ _PENDING_TIMES = 8
 
 
 def cyclic_frames(_settings: NoSettings, command_rate_hz: float, authenticated: bool) -> tuple[CyclicFrame, ...]:
-    """Return all frames with a cycle time (GenMsgCycleTime, ms) in the DBC, each page of a multiplexed one.
+    """Return all frames with a cycle time (GenMsgCycleTime) in the DBC, each page of a multiplexed one.
 
     The wheel command counts at the rate of the control loop; proofs and their challenge only if `authenticated`.
     """
