@@ -320,14 +320,11 @@ class ReferenceDriver:
             "SYSTEM_STATE": ("status", self._on_status),
             "SESSION_STATE": ("", self._on_session),
             "TIME_RESPONSE": ("", self._on_time),
-            "MAC_CHALLENGE": ("", self._on_challenge),
+            "MAC_CHALLENGE": ("", lambda decoded, _: self._transmission.challenge(int(decoded.values["nonce"]))),
             "MOTOR": ("motors", telemetry.motor),
             "POWER": ("power", telemetry.power),
             "LINK_HEALTH": ("link_health", telemetry.link_health),
         }
-
-    def _on_challenge(self, decoded: Decoded, _received_ns: int) -> None:
-        self._transmission.challenge(int(decoded.values["nonce"]))
 
     def _on_handshake(self, decoded: Decoded, _received_ns: int) -> None:
         before, refusal = (self.identity, self.limits), self._handshake.refusal
@@ -394,16 +391,12 @@ class ReferenceDriver:
         before_us, self._device_us = self._device_us, device_us
         if not self._clock.add(sent_ns, received_ns, device_us):
             return
+        why, cause = "the robot has restarted", "its clock was set back"
         if before_us is not None and (device_us - before_us) % DEVICE_CLOCK_MODULUS_US < DEVICE_CLOCK_MODULUS_US // 2:
-            why = "its clock jumped"
-            event = (
-                "the robot's clock jumped: this computer was suspended, or the controller's clock is over 200 ppm off"
-            )
-        else:
-            why = "the robot has restarted"
-            event = f"{why}: its clock was set back"
+            why = "the robot's clock jumped"
+            cause = "this computer was suspended, or the controller's clock is over 200 ppm off"
         self._restart(why)
-        self._events.append(event)
+        self._events.append(f"{why}: {cause}")
 
     def _check_liveness(self, now_ns: int) -> None:
         """Start afresh with a robot that has fallen silent or has sample times that contradict its clock."""
