@@ -16,7 +16,7 @@ from typing import Literal
 import can
 import serial
 
-from drivers.private_socket import SocketPathError
+from drivers.private_files import SocketPathError
 from drivers.types import ReceivedFrame
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim import RobotLink

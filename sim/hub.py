@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from drivers.private_socket import bind_private
+from drivers.private_files import bind_private
 from drivers.types import Frame, ReceivedFrame
 from sim import LinkFaultError, RobotNode
 from sim.bus import BusFault, CanBus

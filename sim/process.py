@@ -16,7 +16,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, TextIO
 
-from drivers.private_socket import bind_private
+from drivers.private_files import bind_private
 
 if TYPE_CHECKING:
     # Brings the compiler of the simulation's kernels, for which a command that is sent need not wait.

@@ -31,8 +31,7 @@ from disco_hw.daemon import peer_uid
 from disco_hw.daemon.process import StopSignals
 from disco_hw.errors import InputError
 from drivers.motor import ros2_base_wire as wire
-from drivers.private_files import why_not_private
-from drivers.private_socket import SocketPathError, bind_private
+from drivers.private_files import SocketPathError, bind_private, why_not_private
 from drivers.types import Frame
 
 INTERFACE = "unixcan"

@@ -3,7 +3,7 @@ import threading
 
 import pytest
 
-from drivers.private_socket import SocketPathError
+from drivers.private_files import SocketPathError
 from sim.process import CommandSocket, main, send_command
 
 

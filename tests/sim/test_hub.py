@@ -6,7 +6,7 @@ import socket
 import can
 import pytest
 
-from drivers.private_socket import SocketPathError
+from drivers.private_files import SocketPathError
 from drivers.types import Frame
 from sim import RESTART_DELAY_NS, LinkFaultError
 from sim.bus import FrameOutcome
