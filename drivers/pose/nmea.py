@@ -80,7 +80,7 @@ class NmeaPoses:
                 if not message:
                     break
                 pose = pose_of(message, now_ns)
-                if pose is not None:
+                if isinstance(pose, PoseSample):
                     poses.append(pose)
                 elif (text := message_of(message)) is not None:
                     self._messages.append(text)

@@ -15,7 +15,7 @@ from typing import Any
 
 from drivers.pose import PoseSourceError
 from drivers.pose.senders import SILENCE_S, SenderGate
-from drivers.pose.udp import LONGEST_DATAGRAM, MOST_A_TICK, message_of, pose_of
+from drivers.pose.udp import LONGEST_DATAGRAM, MOST_A_TICK, POSE_HINT, message_of, pose_of
 from drivers.types import PoseSample
 
 SOURCE = "ros2"
@@ -76,6 +76,8 @@ class BridgePoses:
                 process, user = _sender(ancillary)
                 if user not in self._users:
                     self.foreign_users += 1
+                    text = f"process {process} of user {user} sends poses to the bridge's port"
+                    self._senders.refuse(now_ns, text, "only the daemon's user and root may")
                 elif (pose := self._handle(datagram, f"bridge process {process}", now_ns)) is not None:
                     poses.append(pose)
         return sorted(poses, key=lambda pose: pose.t_ns)
@@ -93,13 +95,15 @@ class BridgePoses:
         if not self._senders.may_send(sender, now_ns):
             return None
         pose = pose_of(datagram, now_ns)
-        if pose is not None:
+        if isinstance(pose, PoseSample):
             self._senders.note_pose(sender, now_ns)
-        elif (text := message_of(datagram)) is not None:
+            return pose
+        if (text := message_of(datagram)) is not None:
             self._messages.append(text)
         else:
             self.malformed += 1
-        return pose
+            self._senders.refuse(now_ns, f"the {sender} sends no pose but {pose}", POSE_HINT)
+        return None
 
 
 def _sender(ancillary: Sequence[tuple[int, int, bytes]]) -> tuple[int | None, int | None]:

@@ -28,6 +28,7 @@ MOST_A_TICK = 100
 LONGEST_DATAGRAM = 1024
 # Chosen: longer than any sensor's delay; an older pose is of a clock that is not synchronised.
 OLDEST_S = 10.0
+POSE_HINT = "docs/poses.md shows what a sender sends"
 
 
 class _Datagram(msgspec.Struct, frozen=True):
@@ -125,38 +126,38 @@ class UdpPoses:
                 return None
             datagram = opened
         pose = pose_of(datagram, now_ns)
-        if pose is None:
+        if isinstance(pose, str):
             self.malformed += 1
+            self._senders.refuse(now_ns, f"{sender[0]}:{sender[1]} sends no pose but {pose}", POSE_HINT)
             return None
         self._senders.note_pose(sender, now_ns)
         return pose
 
 
-def pose_of(datagram: bytes, now_ns: int) -> PoseSample | None:
-    """Return the pose in a datagram; None for what is none, or has no time in the last ten seconds."""
+def pose_of(datagram: bytes, now_ns: int) -> PoseSample | str:
+    """Return the pose in a datagram, or in words what is there instead."""
     is_json = datagram[:1] == b"{"
     try:
         read = _DECODERS[not is_json](datagram)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-        return None
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        return f"what cannot be read as one ({str(error)[:80]})"
+    if not all(map(math.isfinite, (read.x_m, read.y_m, read.position_std_m))) or read.position_std_m < 0.0:
+        return "a position or a standard deviation that cannot be"
     if read.age_s is not None and math.isfinite(read.age_s):
-        t_ns = now_ns - round(1e9 * read.age_s) if 0.0 <= read.age_s <= OLDEST_S else None
+        age_ns = round(1e9 * read.age_s)
+    elif read.t_ns is not None:
+        age_ns = now_ns - read.t_ns
     else:
-        t_ns = read.t_ns
-    position = (read.x_m, read.y_m, read.position_std_m)
-    if t_ns is None or not 0 <= now_ns - t_ns <= OLDEST_S * 1e9 or not all(map(math.isfinite, position)):
-        return None
-    if read.yaw_rad is None and read.yaw_std_rad is None:
+        return "a position without age_s or t_ns"
+    if not 0 <= age_ns <= OLDEST_S * 1e9:
+        return f"one that is {age_ns * 1e-9:.3g} s old by this computer's clock, not 0 to {OLDEST_S:g} s"
+    if (read.yaw_rad is None) != (read.yaw_std_rad is None):
+        return "half a heading: yaw_rad and yaw_std_rad go together"
+    yaw_rad = math.nan if read.yaw_rad is None else read.yaw_rad
+    yaw_std_rad = math.nan if read.yaw_std_rad is None else read.yaw_std_rad
+    if not is_heading_filled_in(yaw_rad, yaw_std_rad):
         yaw_rad = yaw_std_rad = math.nan
-    elif read.yaw_rad is None or read.yaw_std_rad is None:
-        return None
-    elif is_heading_filled_in(read.yaw_rad, read.yaw_std_rad):
-        yaw_rad, yaw_std_rad = read.yaw_rad, read.yaw_std_rad
-    else:
-        yaw_rad = yaw_std_rad = math.nan
-    if read.position_std_m < 0.0:
-        return None
-    return PoseSample(t_ns, now_ns, read.x_m, read.y_m, yaw_rad, read.position_std_m, yaw_std_rad)
+    return PoseSample(now_ns - age_ns, now_ns, read.x_m, read.y_m, yaw_rad, read.position_std_m, yaw_std_rad)
 
 
 def message_of(datagram: bytes) -> str | None:

@@ -30,21 +30,21 @@ def test_a_datagram_is_a_pose_at_its_own_time(encode):
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("change", "text"),
     [
-        {"age_s": -1.0},
-        {"age_s": 11.0},
-        {"t_ns": NOW_NS + 1},
-        {},
-        {"age_s": 0.0, "x_m": "1"},
-        {"age_s": 0.0, "position_std_m": -1.0},
-        {"age_s": 0.0, "x_m": None},
-        {"age_s": 0.0, "yaw_rad": None},
-        {"age_s": 0.0, "yaw_std_rad": None},
+        ({"age_s": -1.0}, "is -1 s old"),
+        ({"age_s": 11.0}, "is 11 s old by this computer's clock, not 0 to 10 s"),
+        ({"t_ns": NOW_NS + 1}, "is -1e-09 s old"),
+        ({}, "without age_s or t_ns"),
+        ({"age_s": 0.0, "x_m": "1"}, "Expected `float`, got `str`"),
+        ({"age_s": 0.0, "position_std_m": -1.0}, "a standard deviation that cannot be"),
+        ({"age_s": 0.0, "x_m": None}, "Expected `float`, got `null`"),
+        ({"age_s": 0.0, "yaw_rad": None}, "half a heading"),
+        ({"age_s": 0.0, "yaw_std_rad": None}, "half a heading"),
     ],
 )
-def test_what_is_no_pose_of_now_is_none(change):
-    assert pose_of(json.dumps({**POSE, **change}).encode(), NOW_NS) is None
+def test_of_what_is_no_pose_of_now_it_is_said_why(change, text):
+    assert text in pose_of(json.dumps({**POSE, **change}).encode(), NOW_NS)
 
 
 @pytest.mark.parametrize("encode", [msgspec.json.encode, msgspec.msgpack.encode], ids=["json", "msgpack"])
@@ -74,15 +74,15 @@ def test_a_heading_that_nobody_has_filled_in_is_left_out_and_the_position_is_kep
 @pytest.mark.parametrize("literal", [b"NaN", b"1e999", b"-Infinity"])
 def test_a_number_that_is_not_finite_is_none(literal):
     text = json.dumps({**POSE, "age_s": 0.0}).encode().replace(b"-2.0", literal)
-    assert pose_of(text, NOW_NS) is None
+    assert isinstance(pose_of(text, NOW_NS), str)
 
 
 @given(st.binary(max_size=200))
 def test_no_bytes_break_it(datagram):
-    assert pose_of(datagram, NOW_NS) is None
+    assert pose_of(datagram, NOW_NS).startswith("what cannot be read as one (")
 
 
-def test_over_a_real_socket_in_order_and_the_malformed_counted(port):
+def test_over_a_real_socket_in_order_and_the_malformed_counted_and_said(port):
     source = create_pose_source("udp", port=port)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for age_s in (0.01, 0.05):
@@ -90,6 +90,10 @@ def test_over_a_real_socket_in_order_and_the_malformed_counted(port):
         sender.sendto(b"hello", ("127.0.0.1", port))
         assert [NOW_NS - pose.t_ns for pose in source.receive(NOW_NS, ())] == [50_000_000, 10_000_000]
     assert source.malformed == 1
+    (text,) = source.new_messages()
+    assert re.fullmatch(
+        r"127\.0\.0\.1:\d+ sends no pose but what cannot be read as one \(.*\): not used \(1 datagrams\); docs/.*", text
+    )
     assert list(source.receive(NOW_NS, ())) == []
     source.close()
     source.close()
