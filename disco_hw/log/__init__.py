@@ -13,7 +13,7 @@ import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -98,11 +98,15 @@ class Ended(msgspec.Struct, frozen=True, tag=True):
     code: int
 
 
-class End(msgspec.Struct, frozen=True):
-    """The recorder's last word: the number of the last tick that it was given, and how many it had to drop."""
+Time64 = Annotated[int, msgspec.Meta(ge=-(2**63) + 1, le=2**63 - 1)]
+"""A time or an offset of times, ns, in the 64 bits that a log has for it."""
 
-    t_ns: int
-    sequence: int
+
+class End(msgspec.Struct, frozen=True):
+    """The recorder's last word: when it ended (monotonic), the last tick's number, and how many ticks it dropped."""
+
+    t_ns: Time64
+    sequence: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
     dropped_ticks: int
 
 

@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import IO, Any, Protocol, cast
+from typing import IO, Any, Protocol, TypeVar, cast
 
 import msgspec
 from foxglove_schemas_protobuf.Color_pb2 import Color
@@ -36,7 +35,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from disco_hw.log import Batch, BatchDecoder, End, Start, TaskScene
+from disco_hw.log import Batch, BatchDecoder, End, Start, TaskScene, Time64
 from disco_hw.log.encoding import encode_json, json_schema
 from disco_hw.log.records import TOPICS, Estimate, Event, Fan, GuardVerdict, Plan, Record
 from drivers.types import PoseSample
@@ -217,8 +216,7 @@ class ByteSink(Protocol):
         """Hand everything on to the operating system."""
 
 
-@dataclass(frozen=True, slots=True)
-class Metadata:
+class Metadata(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Metadata of a log: wall-clock time is monotonic time plus `wall_offset_ns`.
 
     `planner`: version of the planner (`control.plan.PLANNER_VERSION`); 0 where none is named, as in logs of version 1.
@@ -226,71 +224,28 @@ class Metadata:
     was not recorded.
     """
 
+    format: str = ""
     robot: str
     version: str
     part: int
-    start_ns: int
-    wall_offset_ns: int
-    format: str = FORMAT
+    start_ns: Time64
+    wall_offset_ns: Time64
     continues: str = ""
     continues_sequence: int | None = None
     planner: int = 0
 
-    def as_text(self) -> dict[str, str]:
-        """Return the metadata in the form kept in the file."""
-        text = {
-            "format": self.format,
-            "robot": self.robot,
-            "version": self.version,
-            "part": str(self.part),
-            "start_ns": str(self.start_ns),
-            "wall_offset_ns": str(self.wall_offset_ns),
-        }
-        if self.continues_sequence is not None:
-            text |= {"continues": self.continues, "continues_sequence": str(self.continues_sequence)}
-        if self.planner:
-            text["planner"] = str(self.planner)
-        return text
 
-    @staticmethod
-    def from_text(text: dict[str, str]) -> Metadata:
-        """Read what `as_text` wrote; raises KeyError or ValueError on anything else."""
-        start_ns, wall_offset_ns = int(text["start_ns"]), int(text["wall_offset_ns"])
-        if max(abs(start_ns), abs(wall_offset_ns)) > _MAX_TIME_NS // 2:
-            raise ValueError("times beyond what 64 bits of ns hold")
-        former = text.get("continues_sequence")
-        return Metadata(
-            text["robot"],
-            text["version"],
-            int(text["part"]),
-            start_ns,
-            wall_offset_ns,
-            text.get("format", ""),
-            text.get("continues", ""),
-            None if former is None else int(former),
-            int(text.get("planner", "0")),
-        )
+_T = TypeVar("_T")
 
 
-@dataclass(frozen=True, slots=True)
-class Ending:
-    """The recorder's last word: when it ended (monotonic), the last tick's number, and how many ticks it dropped."""
+def as_text(values: Metadata | End) -> dict[str, str]:
+    """Return metadata in the form kept in the file."""
+    return {name: str(value) for name, value in msgspec.to_builtins(values).items()}
 
-    t_ns: int
-    sequence: int
-    dropped_ticks: int
 
-    def as_text(self) -> dict[str, str]:
-        """Return the form kept in the file."""
-        return {"t_ns": str(self.t_ns), "sequence": str(self.sequence), "dropped_ticks": str(self.dropped_ticks)}
-
-    @staticmethod
-    def from_text(text: dict[str, str]) -> Ending:
-        """Read what `as_text` wrote; raises KeyError or ValueError on anything else."""
-        ending = Ending(int(text["t_ns"]), int(text["sequence"]), int(text["dropped_ticks"]))
-        if abs(ending.t_ns) > _MAX_TIME_NS // 2 or not 0 <= ending.sequence <= _MAX_TIME_NS:
-            raise ValueError("an end time or tick number beyond 64 bits")
-        return ending
+def from_text(text: dict[str, str], kind: type[_T]) -> _T:
+    """Read what `as_text` wrote; raises msgspec.ValidationError on anything else."""
+    return msgspec.convert(text, kind, strict=False)
 
 
 class McapLog:
@@ -313,16 +268,17 @@ class McapLog:
         self._writer.start(profile=PROFILE, library=LIBRARY)
         wall_ns = start.start_ns + start.wall_offset_ns
         metadata = Metadata(
-            start.robot,
-            start.version,
-            start.part,
-            start.start_ns,
-            start.wall_offset_ns,
+            format=FORMAT,
+            robot=start.robot,
+            version=start.version,
+            part=start.part,
+            start_ns=start.start_ns,
+            wall_offset_ns=start.wall_offset_ns,
             continues=start.continues,
             continues_sequence=start.continues_sequence if start.part > 1 else None,
             planner=start.planner,
         )
-        self._writer.add_metadata(METADATA, metadata.as_text())
+        self._writer.add_metadata(METADATA, as_text(metadata))
         for attachment in start.attachments:
             self._writer.add_attachment(wall_ns, wall_ns, attachment.name, attachment.media_type, attachment.data)
         self._channels = tuple(self._json_channel(topic.name, topic.record) for topic in TOPICS)
@@ -387,8 +343,7 @@ class McapLog:
     def end(self, end: End) -> None:
         """Write the recorder's last word; no tick comes after it."""
         self.flush()
-        ending = Ending(end.t_ns, end.sequence, end.dropped_ticks)
-        self._writer.add_metadata(ENDING, ending.as_text())
+        self._writer.add_metadata(ENDING, as_text(end))
 
     def finish(self) -> None:
         """Finish the file with its index; nothing can be written after it."""

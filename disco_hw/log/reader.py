@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from disco_hw.errors import LogError
 from disco_hw.files import LOG, open_file
+from disco_hw.log import End
 from disco_hw.log.container import (
     ChunkRef,
     Contents,
@@ -27,7 +28,7 @@ from disco_hw.log.container import (
     read_contents,
 )
 from disco_hw.log.encoding import JsonDecoder
-from disco_hw.log.mcap_log import ENDING, FORMAT, METADATA, RECOVERY, Ending, Metadata
+from disco_hw.log.mcap_log import ENDING, FORMAT, METADATA, RECOVERY, Metadata, from_text
 from disco_hw.log.records import TOPIC_BY_NAME, PlanFigures, Record
 
 Column = NDArray[np.generic]
@@ -80,6 +81,7 @@ def _objects(values: list[Any]) -> Column:
 
 
 _R = TypeVar("_R")
+_T = TypeVar("_T")
 # Times are int64 in our records.
 _EARLIEST_NS, _LATEST_NS = -(2**63), 2**63 - 1
 _NO_TIME = "a time or count in it is beyond 64 bits; leave this log out"
@@ -149,7 +151,7 @@ class Log:
         try:
             self._contents = _contents(self._fd, path)
             self._metadata = _metadata(self._contents, path)
-            self._ending = _ending(self._contents)
+            self._ending = _named(self._contents, ENDING, End)
         except BaseException:
             self.close()
             raise
@@ -186,7 +188,7 @@ class Log:
         return self._contents.complete
 
     @property
-    def ending(self) -> Ending | None:
+    def ending(self) -> End | None:
         """The recorder's last word; None if there is none, as the daemon or its recorder was gone before."""
         return self._ending
 
@@ -368,12 +370,9 @@ def _contents(fd: int, path: Path) -> Contents:
 
 
 def _metadata(contents: Contents, path: Path) -> Metadata:
-    for record in contents.metadata:
-        if record.name == METADATA:
-            try:
-                return Metadata.from_text(record.metadata)
-            except (KeyError, ValueError):
-                break
+    metadata = _named(contents, METADATA, Metadata)
+    if metadata is not None:
+        return metadata
     if contents.chunks:
         raise LogError(
             f"{path}: an MCAP file, but not a log of disco-hw; write it as a CSV, which `disco-hw import` takes"
@@ -381,14 +380,15 @@ def _metadata(contents: Contents, path: Path) -> Metadata:
     raise LogError(f"{path}: nothing of the log is left but its first bytes; there is nothing to read")
 
 
-def _ending(contents: Contents) -> Ending | None:
-    for record in contents.metadata:
-        if record.name == ENDING:
-            try:
-                return Ending.from_text(record.metadata)
-            except (KeyError, ValueError):
-                break
-    return None
+def _named(contents: Contents, name: str, kind: type[_T]) -> _T | None:
+    """Return the first metadata of this name; None if there is none or it is damaged."""
+    text = next((record.metadata for record in contents.metadata if record.name == name), None)
+    if text is None:
+        return None
+    try:
+        return from_text(text, kind)
+    except msgspec.ValidationError:
+        return None
 
 
 def _iso(wall_ns: int) -> str:
