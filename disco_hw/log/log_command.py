@@ -21,7 +21,7 @@ from disco_hw.files import LOG, open_file
 from disco_hw.log.container import Contents, DamagedError, messages, read_attachment, read_chunk, read_contents
 from disco_hw.log.drive import DriveLog
 from disco_hw.log.importing.csv_drive import write_csv
-from disco_hw.log.load import drive_from_log, nominal_geometry, ticks_per_rev
+from disco_hw.log.load import drive_from_log, nominal_robot
 from disco_hw.log.mcap_log import CHUNK_BYTES, LIBRARY, PROFILE, RECOVERY
 from disco_hw.log.reader import LogSummary, open_log
 from disco_hw.log.records import Controller
@@ -53,7 +53,8 @@ def export(path: Path, out: Path, as_json: bool) -> str:
     """Write commands, encoders and poses of a log as CSV; raises LogError."""
     with open_log(path) as log:
         drive = drive_from_log(log)
-        rows = write_csv(drive, out, ticks_per_rev(log))
+        ticks_per_rev = nominal_robot(log).get("ticks_per_rev")
+        rows = write_csv(drive, out, ticks_per_rev if isinstance(ticks_per_rev, int) else None)
     if as_json:
         return json.dumps({"out": str(out), "rows": rows, "segments": drive.segments, "notes": drive.notes})
     return "\n".join([f"{out}: {rows} rows, {drive.segments} segment{'s' * (drive.segments != 1)}", *drive.notes])
@@ -65,7 +66,10 @@ def export_rosbag(path: Path, out: Path, as_json: bool) -> str:
         drive = drive_from_log(log)
         times = (log.columns(topic).get("t_ns") for topic in ("/command", "/wheels", "/pose"))
         first_ns = min(int(t_ns.min()) for t_ns in times if t_ns is not None and t_ns.size)
-        messages = write_rosbag(drive, out, first_ns + log.metadata.wall_offset_ns, nominal_geometry(log))
+        robot = nominal_robot(log)
+        radius_m, axial_m = robot.get("wheel_radius_m"), robot.get("axial_distance_m")
+        geometry = None if radius_m is None or axial_m is None else (radius_m, axial_m)
+        messages = write_rosbag(drive, out, first_ns + log.metadata.wall_offset_ns, geometry)
     if as_json:
         return json.dumps({"out": str(out), "messages": messages, "segments": drive.segments, "notes": drive.notes})
     return "\n".join(

@@ -17,14 +17,12 @@ from disco_hw.errors import LogError
 from disco_hw.log.drive import (
     LONGEST_COMMAND_S,
     Array,
-    Commands,
     DriveLog,
     Edge,
     Index,
     Motion,
-    Poses,
     after_silences,
-    in_segments,
+    drive_of,
     poses,
     rotations,
 )
@@ -49,7 +47,7 @@ from disco_hw.log.importing.rosbag_topics import (
     Choice,
     choose,
 )
-from disco_hw.log.importing.rosbag_wheels import measured_columns, unwrapped, wheels_of
+from disco_hw.log.importing.rosbag_wheels import measured_columns, unwrapped
 from drivers.pose import is_heading_measured
 
 _LONGEST_COMMAND_NS = round(LONGEST_COMMAND_S * 1e9)
@@ -190,13 +188,12 @@ def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: R
     uncertain = np.zeros(wheel_ns.size, dtype=bool)
     if measured[0]:
         wheel, uncertain = unwrapped(path, wheel_ns, wheel, robot, (command_ns, command), notes)
-    began_ns = min(int(t_ns[0]) for t_ns in (command_ns, wheel_ns, pose_ns) if t_ns.size)
     breaks_ns = np.unique(
         np.concatenate(
             [
                 times.breaks_ns,
                 _pauses(wheel_ns, (command_ns, pose_ns)),
-                wheel_ns[restarts((wheel_ns - began_ns).astype(np.float64) * 1e-9, wheel[:, :2]) | uncertain],
+                wheel_ns[restarts((wheel_ns - wheel_ns[:1]) * 1e-9, wheel[:, :2]) | uncertain],
             ]
         )
     )
@@ -204,19 +201,14 @@ def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: R
         notes.append(
             f"{breaks_ns.size} times the wheels paused, or a clock or encoder was set; new segments begin there"
         )
-    when = in_segments(began_ns, breaks_ns)
-    (command_s, command_segment), (pose_s, pose_segment) = when(command_ns), when(pose_ns)
-    commands = Commands(command_s, command[:, 0], command[:, 1], command_segment)
-    wheels = wheels_of(*when(wheel_ns), wheel, measured)
-    drive_poses = Poses(pose_s, pose[:, 0], pose[:, 1], pose[:, 2], pose_segment)
-    fault = length_fault(drive_poses, wheels, commands, robot.wheel_radius_m)
+    drive = drive_of(str(path), (command_ns, command), (wheel_ns, wheel), (pose_ns, pose), breaks_ns, measured)
+    fault = length_fault(drive.poses, drive.wheels, drive.commands, robot.wheel_radius_m)
     if fault is not None:
         notes.append(f"poses and wheels do not fit together: {fault.rpartition(';')[0]}; see which topics were read")
-    notes += _of_the_choice(choice)
-    return DriveLog((str(path),), commands, wheels, drive_poses, notes=tuple(notes))
+    return replace(drive, notes=(*notes, *_notes_on_types(choice)))
 
 
-def _of_the_choice(choice: Choice) -> list[str]:
+def _notes_on_types(choice: Choice) -> list[str]:
     """Return notes on what the types of the chosen topics mean for the results."""
     notes = []
     command, wheel = choice.used(COMMANDS), choice.used(WHEELS)

@@ -9,7 +9,7 @@ import numpy as np
 
 from disco_hw.config import Robot
 from disco_hw.errors import LogError
-from disco_hw.log.drive import LONGEST_SILENCE_NS, Array, Index, Wheels, differentiate_angle, integrate_angle
+from disco_hw.log.drive import LONGEST_SILENCE_NS, Array, Index
 from disco_hw.log.importing.counter_wrap import WIDTHS_BITS, Mask, unwrap_wheels
 from disco_hw.log.importing.losses import loss_note
 from disco_hw.log.importing.rosbag_topics import WHEELS
@@ -63,14 +63,3 @@ def unwrapped(
             )
     angles = np.column_stack([one.values for one in found])
     return np.column_stack([angles, wheel[:, 2:]]), found[0].uncertain | found[1].uncertain
-
-
-def wheels_of(t_s: Array, segment: Index, wheel: Array, measured: tuple[bool, bool]) -> Wheels:
-    """Wheel samples of rows (N, 4); whichever of angles and speeds was not measured is derived from the other."""
-    has_angle, has_speed = measured
-    (left, right), (left_speed, right_speed) = wheel[:, :2].T, wheel[:, 2:].T
-    if not has_angle:
-        left, right = (integrate_angle(t_s, speed, segment) for speed in (left_speed, right_speed))
-    if not has_speed:
-        left_speed, right_speed = (differentiate_angle(t_s, angle, segment) for angle in (left, right))
-    return Wheels(t_s, left, right, left_speed, right_speed, segment, has_angle, has_speed)
