@@ -56,7 +56,8 @@ class Start(msgspec.Struct, frozen=True):
     """Start of a log, all that a writer must know; wall-clock time is monotonic time plus `wall_offset_ns`.
 
     `path` is the first part's. A later part names the file that it continues, of which it is known that ticks up to
-    `continues_sequence` are in it.
+    `continues_sequence` are in it. It is also the request to the keeper process to start a writer on the attached
+    socket, then without attachments and scene, which the keeper has.
     """
 
     path: str
@@ -73,15 +74,6 @@ class Start(msgspec.Struct, frozen=True):
     beat_s: float = 0.2
     grace_s: float = 3.0
     planner: int = 0
-
-
-class Launch(msgspec.Struct, frozen=True):
-    """Request to the keeper process to start a writer on the attached socket."""
-
-    part: int
-    start_ns: int
-    continues: str
-    continues_sequence: int
 
 
 class Started(msgspec.Struct, frozen=True, tag=True):

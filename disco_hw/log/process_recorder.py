@@ -23,7 +23,6 @@ from disco_hw.log import (
     TICK,
     Attachment,
     End,
-    Launch,
     Start,
     TaskScene,
     WriterStatus,
@@ -333,8 +332,16 @@ class ProcessRecorder:
         self._look_after(now_s)
 
     def _launch(self) -> None:
-        launch = Launch(self._next_part, time.monotonic_ns(), self._continues, self._delivery.last_delivered)
-        connection = self._keeper.launch(launch)
+        request = msgspec.structs.replace(
+            self._start,
+            attachments=(),
+            scene=None,
+            part=self._next_part,
+            start_ns=time.monotonic_ns(),
+            continues=self._continues,
+            continues_sequence=self._delivery.last_delivered,
+        )
+        connection = self._keeper.launch(request)
         if connection is not None:
             self._line = WriterLine(connection, self._start.path, self._next_part)
             self._next_part = max(2, self._next_part)

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,39 +74,28 @@ def limit_thread_pools() -> Step:
 
 
 def spawn_at_normal_priority(command: list[str], pass_fds: Sequence[int] = ()) -> subprocess.Popen[bytes]:
-    """Start a process that never runs in the real-time class, whatever the caller's is; its output can be read.
+    """Start a process that never runs in the real-time class, whatever the caller's is; it has no input and output.
 
     A child inherits the scheduling of the thread that makes it, and a child at the loop's priority would take its core
     from the loop while it starts; so a thread made for it gives the priority up first. Its own session keeps the
-    terminal's Ctrl-C from it; it keeps the descriptors `pass_fds`. Standard output is a pipe that does not block its
-    reader. Raises LogError.
+    terminal's Ctrl-C from it; it keeps the descriptors `pass_fds`. Raises LogError.
     """
-    made: list[subprocess.Popen[bytes]] = []
-    failed: list[OSError] = []
 
-    def spawn() -> None:
+    def spawn() -> subprocess.Popen[bytes]:
         with suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
             if os.getpriority(os.PRIO_PROCESS, 0) < 0:
                 os.setpriority(os.PRIO_PROCESS, 0, 0)
-        try:
-            made.append(
-                subprocess.Popen(
-                    command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, start_new_session=True, pass_fds=pass_fds
-                )
-            )
-        except OSError as error:
-            failed.append(error)
+        none = subprocess.DEVNULL
+        return subprocess.Popen(command, stdin=none, stdout=none, start_new_session=True, pass_fds=pass_fds)
 
-    thread = threading.Thread(target=spawn, name="log-writer-start")
-    thread.start()
-    thread.join()
-    if failed:
-        raise LogError(f"{command[0]}: cannot start the log writer ({failed[0].strerror}); repair the installation")
-    process = made[0]
-    assert process.stdout is not None
-    os.set_blocking(process.stdout.fileno(), False)
-    return process
+    try:
+        with ThreadPoolExecutor(1, thread_name_prefix="log-writer-start") as thread:
+            return thread.submit(spawn).result()
+    except OSError as error:
+        raise LogError(
+            f"{command[0]}: cannot start the log writer ({error.strerror}); repair the installation"
+        ) from None
 
 
 # Chosen: short beside a tick of 20 ms, in which the loop may wait for another thread.
