@@ -30,6 +30,7 @@ from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
@@ -60,44 +61,36 @@ _ROBOT = "robot"
 
 def views(record: Record, wall_ns: int) -> list[tuple[str, bytes]]:
     """Foxglove messages (topic, protobuf bytes) that show this record, true at `wall_ns`; none for most records."""
-    time = _timestamp(wall_ns)
+    return [(topic, message.SerializeToString()) for topic, message in _messages(record, _timestamp(wall_ns))]
+
+
+def _messages(record: Record, time: Timestamp) -> list[tuple[str, Message]]:
     match record:
         case Estimate():
-            pose = PoseInFrame(timestamp=time, frame_id=_WORLD, pose=_pose(record.x_m, record.y_m, record.yaw_rad))
+            pose = _pose(record.x_m, record.y_m, record.yaw_rad)
             transform = FrameTransform(
                 timestamp=time,
                 parent_frame_id=_WORLD,
                 child_frame_id=_ROBOT,
-                translation=Vector3(x=record.x_m, y=record.y_m, z=0.0),
-                rotation=_rotation(record.yaw_rad),
+                translation=pose.position,
+                rotation=pose.orientation,
             )
-            return [
-                ("/view/estimate", pose.SerializeToString()),
-                ("/view/transform", transform.SerializeToString()),
-            ]
+            placed = PoseInFrame(timestamp=time, frame_id=_WORLD, pose=pose)
+            return [("/view/estimate", placed), ("/view/transform", transform)]
         case PoseSample():
-            measured = PoseInFrame(timestamp=time, frame_id=_WORLD, pose=_pose(record.x_m, record.y_m, record.yaw_rad))
-            return [("/view/measured_pose", measured.SerializeToString())]
+            pose = _pose(record.x_m, record.y_m, record.yaw_rad)
+            return [("/view/measured_pose", PoseInFrame(timestamp=time, frame_id=_WORLD, pose=pose))]
         case Plan() if record.path_x_m:
             path = zip(record.path_x_m, record.path_y_m, record.path_yaw_rad, strict=False)
-            plan = PosesInFrame(
-                timestamp=time,
-                frame_id=_WORLD,
-                poses=[_pose(x, y, yaw) for x, y, yaw in path],
-            )
-            return [("/view/plan", plan.SerializeToString())]
+            poses = [_pose(x, y, yaw) for x, y, yaw in path]
+            return [("/view/plan", PosesInFrame(timestamp=time, frame_id=_WORLD, poses=poses))]
         case Fan() if record.weights:
-            return [("/view/rollouts", _rollouts(record, time).SerializeToString())]
+            return [("/view/rollouts", _rollouts(record, time))]
         case GuardVerdict() if record.path_x_m or record.obstacles:
-            return [("/view/fence", _stopping(record, time).SerializeToString())]
+            return [("/view/fence", _stopping(record, time))]
         case Event():
-            log = Log(
-                timestamp=time,
-                level=_LEVELS[record.level],
-                message=record.text,
-                name=record.code,
-            )
-            return [("/view/log", log.SerializeToString())]
+            level = _LEVELS[record.level]
+            return [("/view/log", Log(timestamp=time, level=level, message=record.text, name=record.code))]
     return []
 
 
@@ -138,12 +131,12 @@ def _stopping(record: GuardVerdict, time: Timestamp) -> SceneUpdate:
     return SceneUpdate(entities=[entity])
 
 
-def _line(points: Iterable[tuple[float, float]], colour: Color) -> LinePrimitive:
-    """Return a line of 2 cm through these points on the floor."""
+def _line(points: Iterable[tuple[float, float]], colour: Color, thickness_m: float = 0.02) -> LinePrimitive:
+    """Return a line through these points on the floor."""
     return LinePrimitive(
         type=LinePrimitive.LINE_STRIP,
         pose=_pose(0.0, 0.0, 0.0),
-        thickness=0.02,
+        thickness=thickness_m,
         color=colour,
         points=[Point3(x=x, y=y, z=0.0) for x, y in points],
     )
@@ -152,16 +145,10 @@ def _line(points: Iterable[tuple[float, float]], colour: Color) -> LinePrimitive
 def _rollouts(fan: Fan, time: Timestamp) -> SceneUpdate:
     """Return a line for each sequence, the fainter the less it weighs."""
     # A broken plan must still be seen in the log: neither as many points as weights promise, nor a weight, are certain.
-    points = [Point3(x=x, y=y, z=0.0) for x, y in zip(fan.x_m, fan.y_m, strict=False)]
+    points = list(zip(fan.x_m, fan.y_m, strict=False))
     count, heaviest = len(points) // len(fan.weights), fan.weights[0] or 1.0
     lines = [
-        LinePrimitive(
-            type=LinePrimitive.LINE_STRIP,
-            pose=_pose(0.0, 0.0, 0.0),
-            thickness=0.005,
-            color=Color(r=0.3, g=0.5, b=0.9, a=0.15 + 0.85 * weight / heaviest),
-            points=points[k * count : (k + 1) * count],
-        )
+        _line(points[k * count : (k + 1) * count], Color(r=0.3, g=0.5, b=0.9, a=0.15 + 0.85 * weight / heaviest), 0.005)
         for k, weight in enumerate(fan.weights)
     ]
     return SceneUpdate(entities=[SceneEntity(timestamp=time, id="rollouts", frame_id=_WORLD, lines=lines)])
@@ -173,15 +160,10 @@ def _timestamp(wall_ns: int) -> Timestamp:
 
 
 def _pose(x_m: float, y_m: float, yaw_rad: float) -> Pose:
-    return Pose(position=Vector3(x=x_m, y=y_m, z=0.0), orientation=_rotation(yaw_rad))
-
-
-def _rotation(yaw_rad: float) -> Quaternion:
     half = 0.5 * yaw_rad
     # sin and cos of an infinity raise; a broken estimate must still be seen in the log.
-    if not math.isfinite(half):
-        return Quaternion(x=0.0, y=0.0, z=math.nan, w=math.nan)
-    return Quaternion(x=0.0, y=0.0, z=math.sin(half), w=math.cos(half))
+    z, w = (math.sin(half), math.cos(half)) if math.isfinite(half) else (math.nan, math.nan)
+    return Pose(position=Vector3(x=x_m, y=y_m, z=0.0), orientation=Quaternion(x=0.0, y=0.0, z=z, w=w))
 
 
 PROFILE = ""
@@ -253,6 +235,10 @@ class McapLog:
 
     A record that cannot be decoded is refused and counted, never raised: the rest of its tick is kept. A tick is never
     split between chunks, so whatever cuts the file short, a tick is in it whole or not at all.
+
+    `records` were written. `refused` are records and whole messages that were not what they should be, `last_refusal`
+    says in words which was the newest. `flushed_sequence`: the last tick that was handed to the sink, 0 if none was;
+    `flushed_refused`: refused records up to there.
     """
 
     def __init__(self, sink: ByteSink, start: Start) -> None:
@@ -261,10 +247,10 @@ class McapLog:
         self._decoder = BatchDecoder()
         self._offset_ns = start.wall_offset_ns
         self._pending_bytes = 0
-        self._sequence = self._flushed_sequence = 0
-        self._records = 0
-        self._refused = self._flushed_refused = 0
-        self._last_refusal = ""
+        self._sequence = self.flushed_sequence = 0
+        self.records = 0
+        self.refused = self.flushed_refused = 0
+        self.last_refusal = ""
         self._writer.start(profile=PROFILE, library=LIBRARY)
         wall_ns = start.start_ns + start.wall_offset_ns
         metadata = Metadata(
@@ -285,31 +271,6 @@ class McapLog:
         self._view_channels = self._register_views(() if start.scene is None else ((SCENE, SceneUpdate),))
         self._scene = None if start.scene is None else scene_message(start.scene)
         self._writer.flush()  # type: ignore[no-untyped-call]
-
-    @property
-    def flushed_sequence(self) -> int:
-        """Number of the last tick that was handed to the sink; 0 if none was."""
-        return self._flushed_sequence
-
-    @property
-    def flushed_refused(self) -> int:
-        """Refused records of the ticks up to there."""
-        return self._flushed_refused
-
-    @property
-    def records(self) -> int:
-        """Number of records written."""
-        return self._records
-
-    @property
-    def refused(self) -> int:
-        """Records and whole messages that were not what they should be, and are not in the file."""
-        return self._refused
-
-    @property
-    def last_refusal(self) -> str:
-        """The newest refusal in words, or empty."""
-        return self._last_refusal
 
     def write(self, message: bytes) -> None:
         """Write the records of one message of the recorder."""
@@ -337,8 +298,8 @@ class McapLog:
         """End the chunk and hand it on, so that a reader can have everything written so far."""
         self._writer.flush()  # type: ignore[no-untyped-call]
         self._pending_bytes = 0
-        self._flushed_sequence = self._sequence
-        self._flushed_refused = self._refused
+        self.flushed_sequence = self._sequence
+        self.flushed_refused = self.refused
 
     def end(self, end: End) -> None:
         """Write the recorder's last word; no tick comes after it."""
@@ -362,11 +323,11 @@ class McapLog:
         for channel, payload in payloads:
             self._writer.add_message(channel, log_time, payload, publish_time, batch.sequence & 0xFFFFFFFF)
             self._pending_bytes += len(payload) + _MESSAGE_OVERHEAD
-        self._records += 1
+        self.records += 1
 
     def _refuse(self, why: str) -> None:
-        self._refused += 1
-        self._last_refusal = why
+        self.refused += 1
+        self.last_refusal = why
 
     def _json_channel(self, topic: str, record: type) -> int:
         schema = self._writer.register_schema(
