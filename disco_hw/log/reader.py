@@ -310,7 +310,7 @@ class Log:
                 topic: TopicSummary(count, count / duration_s if duration_s > 0.0 else 0.0)
                 for topic, count in self.counts.items()
             },
-            attachments={ref.name: ref.size for ref in self._contents.attachments},
+            attachments={ref.name: ref.data_size for ref in self._contents.attachments},
             damage=self.damage,
         )
 
