@@ -15,7 +15,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -55,12 +55,11 @@ class Step:
         return f"{self.name}: {self.text}"
 
 
-def limit_thread_pools() -> Step:
+def limit_thread_pools() -> None:
     """Hold the numeric libraries to one thread each; must come before they are imported to bind all of them.
 
     Torch and numba are also held if they are imported already; a BLAS that is loaded keeps the threads it has.
     """
-    numpy_is_loaded = "numpy" in sys.modules and os.environ.get("OPENBLAS_NUM_THREADS") != "1"
     for name in _COUNTED_BY:
         # Numba reads its variable again at each compilation and raises if it then differs from the threads it has.
         if not (name.startswith("NUMBA") and "numba" in sys.modules):
@@ -68,9 +67,6 @@ def limit_thread_pools() -> Step:
     for name in ("torch", "numba"):
         if (module := sys.modules.get(name)) is not None:
             module.set_num_threads(1)
-    if numpy_is_loaded:
-        return Step("threads", False, "numpy was loaded before; start with OPENBLAS_NUM_THREADS=1 in the environment")
-    return Step("threads", True, "numeric libraries use one thread")
 
 
 def spawn_at_normal_priority(command: list[str], pass_fds: Sequence[int] = ()) -> subprocess.Popen[bytes]:
@@ -141,18 +137,15 @@ def spare_memory() -> None:
     _LIBC.pthread_attr_destroy(attributes)
 
 
-def enter_real_time(priority: int, cpus: Collection[int] = ()) -> tuple[Step, ...]:
+def enter_real_time(priority: int) -> tuple[Step, ...]:
     """Take every measure, in the order that lets threads made later inherit them; never raises for a refused one.
 
     To be called when everything is imported, warmed up and allocated, before the link's threads are made, and after
     other processes were started: children inherit the scheduler too. The calling thread gets SCHED_FIFO 10 below
     `priority` (at least 1), for the threads to inherit; `raise_loop_thread` gives the loop its own. `priority` 0
-    leaves the scheduler and the memory alone. `cpus`: the only CPUs to run on, all if empty.
+    leaves the scheduler and the memory alone.
     """
     steps = [_set_switch_interval(), _freeze_garbage()]
-    if cpus:
-        done, hint = f"runs on {sorted(cpus)}", "name CPUs that this computer has"
-        steps.append(_try("cpus", lambda: os.sched_setaffinity(0, cpus), done, hint))
     if priority == 0:
         return (*steps, Step("scheduler", False, "unchanged, because daemon.realtime_priority is 0"))
     steps.append(_lock_memory())

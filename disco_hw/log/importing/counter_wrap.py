@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.errors import LogError
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -113,12 +115,21 @@ def unwrap_counter(
     return Unwrapped(values, unchanged.uncertain, fault=_too_fast(motion, speeds, reach, usual, unit))
 
 
-def unwrap_wheels(
-    t_s: Array, values: Array, spans: Sequence[float], begins: Mask, speeds: Array, unit: str = "counts"
-) -> tuple[Unwrapped, Unwrapped]:
+def continuous_wheels(
+    names: tuple[str, str],
+    t_s: Array,
+    values: Array,
+    spans: Sequence[float],
+    begins: Mask,
+    speeds: Array,
+    notes: list[str],
+    unit: str = "counts",
+) -> tuple[Array, Mask]:
     """Make the counters of both wheels continuous, `values` and `speeds` (N, 2); each wheel is judged by itself.
 
-    The counters are of one kind: a span that one wheel shows is tried on the other, which may wrap too rarely.
+    Also returns where the number of wraps is not known, (N,). The counters are of one kind: a span that one wheel shows
+    is tried on the other, which may wrap too rarely. `names` begin with the file's. Raises LogError for a counter that
+    cannot be made continuous.
     """
 
     def unwrap(side: int, spans: Sequence[float]) -> Unwrapped:
@@ -127,7 +138,12 @@ def unwrap_wheels(
     first = unwrap(0, spans), unwrap(1, spans)
     shown = [*spans, *(one.span for one in first if one.wraps)]
     left, right = (one if one.wraps or one.fault else unwrap(side, shown) for side, one in enumerate(first))
-    return left, right
+    for name, one in zip(names, (left, right), strict=True):
+        if one.fault:
+            raise LogError(f"{name}: {one.fault}")
+        if one.wraps:
+            notes.append(f"{name} wraps at {one.span:.10g} {unit}: made continuous at {one.wraps} places")
+    return np.column_stack([left.values, right.values]), left.uncertain | right.uncertain
 
 
 def _steps(t_s: Array, values: Array, begins: Mask | None, reach: float, unit: str) -> _Steps:

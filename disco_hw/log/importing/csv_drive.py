@@ -31,7 +31,7 @@ from disco_hw.log.drive import (
     integrate_angle,
 )
 from disco_hw.log.importing import LogFormat
-from disco_hw.log.importing.counter_wrap import Mask, restarts, unwrap_wheels
+from disco_hw.log.importing.counter_wrap import Mask, continuous_wheels, restarts
 from disco_hw.log.importing.csv_sheet import (
     COMMAND,
     GYRO,
@@ -200,7 +200,11 @@ def _wheels(sheet: Sheet, ticks_per_rev: float | None, notes: list[str]) -> tupl
         raise LogError(f"{sheet.name}: {TICKS[0]} needs the ticks of a revolution; give --robot ROBOT.toml")
     t_s = sheet.t_s[has_ticks]
     per_rad = ticks_per_rev / (2.0 * math.pi)
-    counts, uncertain = _continuous(sheet, ticks[has_ticks], has_ticks, per_rad, notes)
+    begins = np.concatenate([[True], np.diff(sheet.segment[has_ticks]) != 0])
+    measured, commanded = (sheet.group(names)[0][has_ticks] * per_rad for names in (SPEED, COMMAND))
+    known = np.where(np.isfinite(measured), measured, commanded)
+    names = (f"{sheet.name}: {TICKS[0]}", f"{sheet.name}: {TICKS[1]}")
+    counts, uncertain = continuous_wheels(names, t_s, ticks[has_ticks], (ticks_per_rev,), begins, known, notes)
     angles = counts * (2.0 * math.pi / ticks_per_rev)
     sheet = _with_new_segments(sheet, t_s, angles, uncertain, sheet.segment[has_ticks], notes)
     segment = sheet.segment[has_ticks]
@@ -213,25 +217,6 @@ def _wheels(sheet: Sheet, ticks_per_rev: float | None, notes: list[str]) -> tupl
         count = int(np.count_nonzero(~there) if both else there.size)
         notes.append(f"{sheet.name}: {SPEED[0]}: {count} of {there.size} speeds were taken from the ticks")
     return sheet, Wheels(t_s, angles[:, 0], angles[:, 1], left, right, segment, True, both)
-
-
-def _continuous(sheet: Sheet, ticks: Array, has_ticks: Mask, per_rad: float, notes: list[str]) -> tuple[Array, Mask]:
-    """Ticks (N, 2) of which none wraps, each wheel judged by itself; and where the number of wraps is not known, (N,).
-
-    `has_ticks` are the sheet's rows of the N ticks, `per_rad` the ticks of a radian.
-    """
-    t_s, segment = sheet.t_s[has_ticks], sheet.segment[has_ticks]
-    begins = np.concatenate([[True], np.diff(segment) != 0])
-    measured, commanded = (sheet.group(names)[0][has_ticks] * per_rad for names in (SPEED, COMMAND))
-    speeds = np.where(np.isfinite(measured), measured, commanded)
-
-    found = unwrap_wheels(t_s, ticks, (2.0 * math.pi * per_rad,), begins, speeds)
-    for name, one in zip(TICKS, found, strict=True):
-        if one.fault:
-            raise LogError(f"{sheet.name}: {name}: {one.fault}")
-        if one.wraps:
-            notes.append(f"{sheet.name}: {name} wraps at {one.span:.10g}: made continuous at {one.wraps} places")
-    return np.column_stack([one.values for one in found]), found[0].uncertain | found[1].uncertain
 
 
 def _with_new_segments(

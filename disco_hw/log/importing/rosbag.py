@@ -193,7 +193,7 @@ def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: R
             [
                 times.breaks_ns,
                 _pauses(wheel_ns, (command_ns, pose_ns)),
-                wheel_ns[restarts((wheel_ns - wheel_ns[:1]) * 1e-9, wheel[:, :2]) | uncertain],
+                wheel_ns[restarts(np.asarray((wheel_ns - wheel_ns[:1]) * 1e-9), wheel[:, :2]) | uncertain],
             ]
         )
     )

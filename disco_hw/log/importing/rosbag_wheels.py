@@ -10,7 +10,7 @@ import numpy as np
 from disco_hw.config import Robot
 from disco_hw.errors import LogError
 from disco_hw.log.drive import LONGEST_SILENCE_NS, Array, Index
-from disco_hw.log.importing.counter_wrap import WIDTHS_BITS, Mask, unwrap_wheels
+from disco_hw.log.importing.counter_wrap import WIDTHS_BITS, Mask, continuous_wheels
 from disco_hw.log.importing.losses import loss_note
 from disco_hw.log.importing.rosbag_topics import WHEELS
 
@@ -53,13 +53,8 @@ def unwrapped(
     tick_rad = 2.0 * math.pi / robot.ticks_per_rev
     spans = (2.0 * math.pi, *(2.0**bits * tick_rad for bits in WIDTHS_BITS))
     begins = np.concatenate([[True], np.diff(t_ns) > LONGEST_SILENCE_NS])
-    found = unwrap_wheels((t_ns - t_ns[0]) * 1e-9, wheel[:, :2], spans, begins, known, "rad")
-    for side, one in zip(("left", "right"), found, strict=True):
-        if one.fault:
-            raise LogError(f"{path}: {side} wheel: {one.fault}")
-        if one.wraps:
-            notes.append(
-                f"{side} wheel: the position wraps at {one.span:.10g} rad: made continuous at {one.wraps} places"
-            )
-    angles = np.column_stack([one.values for one in found])
-    return np.column_stack([angles, wheel[:, 2:]]), found[0].uncertain | found[1].uncertain
+    names = (f"{path}: left wheel", f"{path}: right wheel")
+    angles, uncertain = continuous_wheels(
+        names, (t_ns - t_ns[0]) * 1e-9, wheel[:, :2], spans, begins, known, notes, "rad"
+    )
+    return np.column_stack([angles, wheel[:, 2:]]), uncertain

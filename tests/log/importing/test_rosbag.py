@@ -211,7 +211,7 @@ def test_positions_within_one_turn_are_made_continuous(tmp_path):
     assert drive.wheels.left_angle_rad[-1] == pytest.approx(19.9)
     np.testing.assert_allclose(drive.wheels.left_speed_rad_s[1:], 5.0, atol=1e-3)
     assert not drive.wheels.speed_measured
-    assert has_note(drive, "left wheel: the position wraps at 6.283185307 rad: made continuous at 3 places")
+    assert has_note(drive, "left wheel wraps at 6.283185307 rad: made continuous at 3 places")
 
 
 @pytest.mark.parametrize(
