@@ -5,7 +5,7 @@ Poses may come as chains of transforms: what /tf and /tf_static say between fram
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -153,6 +153,11 @@ class DriveLog:
 def _columns(part: Part) -> dict[str, NDArray[Any]]:
     """Return the arrays of a part by name."""
     return {name: getattr(part, name) for name in part.__slots__ if not name.endswith("measured")}
+
+
+def rows(part: Part) -> Iterator[tuple[Any, ...]]:
+    """Yield the samples of a part as tuples of plain numbers, in the order of its fields: time first, segment last."""
+    return zip(*(column.tolist() for column in _columns(part).values()), strict=True)
 
 
 Samples = tuple[NDArray[Any], Array]

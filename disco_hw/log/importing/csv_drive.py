@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from disco_hw.errors import LogError
 from disco_hw.log.drive import (
@@ -260,9 +261,6 @@ FORMAT = LogFormat(
 )
 
 
-Cells = Callable[[float], list[str]]
-
-
 def write_csv(drive: DriveLog, path: Path, ticks_per_rev: int | None) -> int:
     """Write one row for each time at which anything was recorded; return the number of rows.
 
@@ -270,23 +268,27 @@ def write_csv(drive: DriveLog, path: Path, ticks_per_rev: int | None) -> int:
     sample at that time. With `ticks_per_rev` the wheel angles are written as ticks. Raises LogError if the file exists
     or cannot be written.
     """
-    wheels, poses = drive.wheels, drive.poses
-    groups: list[tuple[tuple[str, ...], Cells]] = [
-        (COMMAND, _in_force(drive)),
-        (SPEED, _at(wheels.t_s, (wheels.left_speed_rad_s, wheels.right_speed_rad_s), repr)),
-        ((*POSITION, YAW), _at(poses.t_s, (poses.x_m, poses.y_m, poses.yaw_rad), repr)),
-    ]
+    commands, wheels, poses = drive.commands, drive.wheels, drive.poses
+    parts = (commands, wheels, poses)
+    times, first = np.unique(np.concatenate([part.t_s for part in parts]), return_index=True)
+    segments = np.concatenate([part.segment for part in parts])[first]
+    last_command = np.searchsorted(commands.t_s, times, side="right") - 1
+    in_force = np.vstack([np.column_stack([commands.left_rad_s, commands.right_rad_s]), [np.nan, np.nan]])[last_command]
+    in_force[np.isnan(in_force).any(axis=1)] = np.nan
+    table = dict(zip(COMMAND, ([_cell(value) for value in column] for column in in_force.T.tolist()), strict=True))
     if ticks_per_rev is not None and wheels.angle_measured:
         per_rad = ticks_per_rev / (2.0 * math.pi)
-        ticks = (np.rint(wheels.left_angle_rad * per_rad), np.rint(wheels.right_angle_rad * per_rad))
-        groups.insert(1, (TICKS, _at(wheels.t_s, ticks, lambda value: str(int(value)))))
-    times, segments = _rows(drive)
+        for name, angle_rad in zip(TICKS, (wheels.left_angle_rad, wheels.right_angle_rad), strict=True):
+            table[name] = _cells(times, wheels.t_s, np.rint(angle_rad * per_rad).astype(np.int64))
+    for name, speed_rad_s in zip(SPEED, (wheels.left_speed_rad_s, wheels.right_speed_rad_s), strict=True):
+        table[name] = _cells(times, wheels.t_s, speed_rad_s)
+    for name, value in zip((*POSITION, YAW), (poses.x_m, poses.y_m, poses.yaw_rad), strict=True):
+        table[name] = _cells(times, poses.t_s, value)
     try:
         with path.open("x", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
-            writer.writerow([TIME, *(name for names, _ in groups for name in names), SEGMENT])
-            for t_s, segment in zip(times.tolist(), segments.tolist(), strict=True):
-                writer.writerow([repr(t_s), *(cell for _, cells in groups for cell in cells(t_s)), segment])
+            writer.writerow([TIME, *table, SEGMENT])
+            writer.writerows(zip(map(repr, times.tolist()), *table.values(), segments.tolist(), strict=True))
     except FileExistsError:
         raise LogError(f"{path}: already exists; give another name") from None
     except OSError as error:
@@ -296,33 +298,13 @@ def write_csv(drive: DriveLog, path: Path, ticks_per_rev: int | None) -> int:
     return times.size
 
 
-def _rows(drive: DriveLog) -> tuple[Array, Index]:
-    """Return all times in order, and their segments."""
-    parts = (drive.commands, drive.wheels, drive.poses)
-    times, first = np.unique(np.concatenate([part.t_s for part in parts]), return_index=True)
-    return times, np.concatenate([part.segment for part in parts])[first]
-
-
-def _at(t_s: Array, columns: tuple[Array, ...], text: Callable[[float], str]) -> Cells:
-    """Return a function from a time to its cells: the samples at exactly that time, empty if there is none."""
-    rows = dict(zip(t_s.tolist(), zip(*(column.tolist() for column in columns), strict=True), strict=True))
-    nothing = [""] * len(columns)
-
-    def cells(time: float) -> list[str]:
-        values = rows.get(time)
-        return nothing if values is None else [text(value) for value in values]
-
+def _cells(times: Array, t_s: Array, values: NDArray[Any]) -> list[str]:
+    """Return a column of the table: the samples at exactly these times, empty where there is none."""
+    cells = [""] * times.size
+    for place, value in zip(np.searchsorted(times, t_s).tolist(), values.tolist(), strict=True):
+        cells[place] = repr(value)
     return cells
 
 
-def _in_force(drive: DriveLog) -> Cells:
-    """Return a function from a time to its command cells: the latest command, empty if none is known."""
-    commands = drive.commands
-
-    def cells(time: float) -> list[str]:
-        at = int(np.searchsorted(commands.t_s, time, side="right")) - 1
-        if at < 0 or math.isnan(commands.left_rad_s[at]):
-            return ["", ""]
-        return [repr(float(commands.left_rad_s[at])), repr(float(commands.right_rad_s[at]))]
-
-    return cells
+def _cell(value: float) -> str:
+    return "" if math.isnan(value) else repr(value)

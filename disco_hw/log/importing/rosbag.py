@@ -6,6 +6,7 @@ import math
 from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -155,7 +156,9 @@ def _columns(bag: Bag, choice: Choice, config: RobotConfig, undecoded: dict[str,
             for one in message.value.transforms:
                 edge = (one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/"))
                 if edge in edges:
-                    edges[edge].add(message.log_ns, stamp_of(one), finite(transform_row(one.transform)))
+                    edges[edge].add(
+                        message.log_ns, stamp_of(one), finite(_place(one.transform.translation, one.transform.rotation))
+                    )
                     if message.topic.endswith("static"):
                         static.add(edge)
     return columns | {_edge_name(edge, edge in static): column for edge, column in edges.items()}
@@ -321,72 +324,50 @@ def stamp_of(message: Any) -> int:
 def row_reader(role: str, kind: str, choice: Choice, config: RobotConfig) -> tuple[int, ReadRow]:
     """Return how many numbers a message of this type gives in this role, and the function that reads them."""
     if role == POSES:
-        return 7, _odometry_pose if kind == ODOMETRY else _measured_pose
+        return 7, _pose_row
     if role == WHEELS:
-        return 4, _joint_wheels(choice) if kind == JOINTS else _odometry_wheels(config.robot)
+        return 4, partial(_joint_wheels, choice) if kind == JOINTS else partial(_odometry_wheels, config.robot)
     if kind == JOINTS:
-        return 2, _joint_command(choice)
+        return 2, partial(_joint_command, choice)
     if kind == ARRAY:
-        return 2, _array_command(choice, config.ros2.command_joints)
+        return 2, partial(_array_command, choice, config.ros2.command_joints)
     if kind in TWIST:
-        return 2, _twist_command(config.robot)
+        return 2, lambda message: _wheel_pair(config.robot, getattr(message, "twist", message))
     return 2, _drivers if DRIVERS.fullmatch(kind) else _wheel_speeds
 
 
-def _wheel_pair(robot: Robot, forward: float, turning: float) -> Row:
+def _wheel_pair(robot: Robot, twist: Any) -> Row:
     """Left and right wheel speeds of a motion, rad/s."""
-    half = 0.5 * robot.axial_distance_m * turning
+    forward, half = float(twist.linear.x), 0.5 * robot.axial_distance_m * float(twist.angular.z)
     return (forward - half) / robot.wheel_radius_m, (forward + half) / robot.wheel_radius_m
 
 
-def _twist_command(robot: Robot) -> ReadRow:
-    def read_row(message: Any) -> Row:
-        twist = getattr(message, "twist", message)
-        return _wheel_pair(robot, float(twist.linear.x), float(twist.angular.z))
-
-    return read_row
-
-
 def _mean_of(values: Any, names: Sequence[str], joints: Sequence[str]) -> float:
-    """Mean over several joints; NaN where the array does not hold one of them."""
+    """Mean over several joints; NaN where the array does not hold one of them, or nobody knows which they are."""
     found = [float(values[names.index(name)]) for name in joints if names.index(name) < len(values)]
-    return sum(found) / len(found) if len(found) == len(joints) else math.nan
+    return sum(found) / len(found) if found and len(found) == len(joints) else math.nan
 
 
-def _joint_wheels(choice: Choice) -> ReadRow:
-    joints = {*choice.left_joints, *choice.right_joints}
-
-    def read_row(message: Any) -> Row | None:
-        names = list(message.name)
-        # Other joints of the robot may come in messages of their own.
-        if not joints <= set(names):
-            return None
-        sides = (choice.left_joints, choice.right_joints)
-        return tuple(_mean_of(values, names, side) for values in (message.position, message.velocity) for side in sides)
-
-    return read_row
+def _joint_wheels(choice: Choice, message: Any) -> Row | None:
+    names, sides = list(message.name), (choice.left_joints, choice.right_joints)
+    # Other joints of the robot may come in messages of their own.
+    if not {*sides[0], *sides[1]} <= set(names):
+        return None
+    return tuple(_mean_of(values, names, side) for values in (message.position, message.velocity) for side in sides)
 
 
-def _joint_command(choice: Choice) -> ReadRow:
-    def read_row(message: Any) -> Row | None:
-        names = list(message.name)
-        if not {*choice.left_joints, *choice.right_joints} <= set(names):
-            return None
-        if not len(message.velocity):
-            # No speed: from here on nothing is commanded.
-            return math.nan, math.nan
-        return tuple(_mean_of(message.velocity, names, side) for side in (choice.left_joints, choice.right_joints))
-
-    return read_row
+def _joint_command(choice: Choice, message: Any) -> Row | None:
+    names, sides = list(message.name), (choice.left_joints, choice.right_joints)
+    if not all(sides) or not {*sides[0], *sides[1]} <= set(names):
+        return None
+    # Without a speed nothing is commanded from here on.
+    return tuple(_mean_of(message.velocity, names, side) for side in sides)
 
 
-def _array_command(choice: Choice, joints: Sequence[str]) -> ReadRow:
-    def read_row(message: Any) -> Row | None:
-        if not joints:
-            return (float(message.data[0]), float(message.data[1])) if len(message.data) == 2 else None
-        return tuple(_mean_of(message.data, list(joints), side) for side in (choice.left_joints, choice.right_joints))
-
-    return read_row
+def _array_command(choice: Choice, joints: Sequence[str], message: Any) -> Row | None:
+    if not joints:
+        return (float(message.data[0]), float(message.data[1])) if len(message.data) == 2 else None
+    return tuple(_mean_of(message.data, list(joints), side) for side in (choice.left_joints, choice.right_joints))
 
 
 def _drivers(message: Any) -> Row | None:
@@ -398,43 +379,24 @@ def _wheel_speeds(message: Any) -> Row:
     return float(message.velocity_left), float(message.velocity_right)
 
 
-def _odometry_wheels(robot: Robot) -> ReadRow:
-    def read_row(message: Any) -> Row:
-        twist = message.twist.twist
-        return (math.nan, math.nan, *_wheel_pair(robot, float(twist.linear.x), float(twist.angular.z)))
-
-    return read_row
+def _odometry_wheels(robot: Robot, message: Any) -> Row:
+    return (math.nan, math.nan, *_wheel_pair(robot, message.twist.twist))
 
 
-def _odometry_pose(message: Any) -> Row | None:
-    return _with_measured_heading(message.pose.pose, message.pose.covariance)
-
-
-def _measured_pose(message: Any) -> Row | None:
-    if hasattr(message.pose, "covariance"):
-        return _with_measured_heading(message.pose.pose, message.pose.covariance)
-    return _space(message.pose)
-
-
-def _with_measured_heading(pose: Any, covariance: Any) -> Row | None:
+def _pose_row(message: Any) -> Row | None:
     """Position and quaternion (7,); the quaternion is NaN where the message says that nobody measured the heading."""
-    row = _space(pose)
+    if not hasattr(message.pose, "covariance"):
+        return _place(message.pose.position, message.pose.orientation)
+    row = _place(message.pose.pose.position, message.pose.pose.orientation)
     if row is None:
         return None
     yaw_rad = math.atan2(2.0 * (row[6] * row[5] + row[3] * row[4]), 1.0 - 2.0 * (row[4] ** 2 + row[5] ** 2))
-    return row if is_heading_measured(yaw_rad, float(covariance[_YAW_VARIANCE])) else (*row[:3], *[math.nan] * 4)
-
-
-def _space(pose: Any) -> Row | None:
-    return _place(pose.position, pose.orientation)
-
-
-def transform_row(transform: Any) -> Row | None:
-    """Position and quaternion (7,) of a transform."""
-    return _place(transform.translation, transform.rotation)
+    measured = is_heading_measured(yaw_rad, float(message.pose.covariance[_YAW_VARIANCE]))
+    return row if measured else (*row[:3], *[math.nan] * 4)
 
 
 def _place(position: Any, rotation: Any) -> Row | None:
+    """Position and quaternion (7,)."""
     row = (position.x, position.y, position.z, rotation.x, rotation.y, rotation.z, rotation.w)
     length = math.hypot(*row[3:])
     # A quaternion of zeros is what a publisher leaves that never set it.
