@@ -32,6 +32,8 @@ from mcap.records import (
     Schema,
     Statistics,
 )
+from mcap.records import Message as McapMessage
+from mcap.writer import Writer
 
 from disco_hw.errors import LogError
 
@@ -228,6 +230,34 @@ def messages(chunk_data: bytes, channels: Collection[int] | None = None) -> Iter
     for opcode, _, _ in _inner(chunk_data, offset):
         if opcode == _MESSAGE_OPCODE:
             raise DamagedError("a message that is too short")
+
+
+class McapCopy:
+    """Copies the schemas, channels and messages of one MCAP file to a new one; a channel without schema keeps none."""
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self._schemas: dict[int, int] = {}
+        self._channels: dict[int, int] = {}
+
+    def describe(self, record: Schema | Channel) -> None:
+        """Copy a schema or channel, of several with one number the first; schemas come before their channels."""
+        if isinstance(record, Schema):
+            if record.id not in self._schemas:
+                self._schemas[record.id] = self._writer.register_schema(record.name, record.encoding, record.data)
+        elif record.id not in self._channels:
+            schema = self._schemas.get(record.schema_id, 0)
+            self._channels[record.id] = self._writer.register_channel(
+                record.topic, record.message_encoding, schema, record.metadata
+            )
+
+    def add(self, message: Message | McapMessage) -> bool:
+        """Copy a message; False for one of a channel that nothing describes."""
+        channel = self._channels.get(message.channel_id)
+        if channel is None:
+            return False
+        self._writer.add_message(channel, message.log_time, message.data, message.publish_time, message.sequence)
+        return True
 
 
 def _inner(data: bytes, offset: int = 0) -> Iterator[tuple[int, int, int]]:

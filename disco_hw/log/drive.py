@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,6 +93,7 @@ class Gyro:
 
 
 Part = Commands | Wheels | Poses | Gyro
+PartT = TypeVar("PartT", Commands, Wheels, Poses, Gyro)
 
 
 def after_silences(wheel_ns: NDArray[Any]) -> NDArray[Any]:
@@ -153,6 +154,12 @@ class DriveLog:
 def _columns(part: Part) -> dict[str, NDArray[Any]]:
     """Return the arrays of a part by name."""
     return {name: getattr(part, name) for name in part.__slots__ if not name.endswith("measured")}
+
+
+def chosen(part: PartT, which: NDArray[np.bool_]) -> PartT:
+    """Return the samples of a part that are marked (N,)."""
+    columns: dict[str, Any] = {name: column[which] for name, column in _columns(part).items()}
+    return replace(part, **columns)
 
 
 def rows(part: Part) -> Iterator[tuple[Any, ...]]:
@@ -253,9 +260,8 @@ def _between(drive: DriveLog, source: str, begin_s: float, end_s: float) -> Driv
     parts: dict[str, Any] = {}
     for name in _PARTS:
         part = getattr(drive, name)
-        inside = (part.t_s >= begin_s) & (part.t_s < end_s)
-        arrays = {field: column[inside] for field, column in _columns(part).items()}
-        parts[name] = replace(part, **(arrays | {"t_s": arrays["t_s"] - begin_s}))
+        inside = chosen(part, (part.t_s >= begin_s) & (part.t_s < end_s))
+        parts[name] = replace(inside, t_s=inside.t_s - begin_s)
     return replace(drive, sources=(source,), begins_s=(0.0,), **parts)
 
 

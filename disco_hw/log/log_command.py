@@ -18,7 +18,15 @@ from mcap.writer import CompressionType, Writer
 
 from disco_hw.errors import InputError, LogError
 from disco_hw.files import LOG, open_file
-from disco_hw.log.container import Contents, DamagedError, messages, read_attachment, read_chunk, read_contents
+from disco_hw.log.container import (
+    Contents,
+    DamagedError,
+    McapCopy,
+    messages,
+    read_attachment,
+    read_chunk,
+    read_contents,
+)
 from disco_hw.log.drive import DriveLog, rows
 from disco_hw.log.importing.csv_drive import write_csv
 from disco_hw.log.load import drive_from_log, nominal_robot
@@ -172,16 +180,11 @@ def _copy(fd: int, contents: Contents, writer: Writer, name: str) -> Recovered:
             attachments += 1
         except DamagedError as damage:
             all_damage.append(str(damage))
-    schemas = {
-        schema.id: writer.register_schema(schema.name, schema.encoding, schema.data)
-        for schema in contents.schemas.values()
-    }
-    channels = {
-        channel.id: writer.register_channel(
-            channel.topic, channel.message_encoding, schemas.get(channel.schema_id, 0), channel.metadata
-        )
-        for channel in contents.channels.values()
-    }
+    copy = McapCopy(writer)
+    for schema in contents.schemas.values():
+        copy.describe(schema)
+    for channel in contents.channels.values():
+        copy.describe(channel)
     count, chunks = 0, 0
     for chunk in contents.chunks:
         try:
@@ -190,16 +193,7 @@ def _copy(fd: int, contents: Contents, writer: Writer, name: str) -> Recovered:
             all_damage.append(f"at byte {chunk.offset}: {damage}; {chunk.length} bytes are lost")
             continue
         chunks += 1
-        for message in found:
-            if message.channel_id in channels:
-                writer.add_message(
-                    channels[message.channel_id],
-                    message.log_time,
-                    message.data,
-                    message.publish_time,
-                    message.sequence,
-                )
-                count += 1
+        count += sum(map(copy.add, found))
     writer.add_metadata(RECOVERY, {"source": name, "lost": "\n".join(all_damage)})
     writer.finish()  # type: ignore[no-untyped-call]
     return Recovered(count, chunks, attachments, tuple(all_damage))

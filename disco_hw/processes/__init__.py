@@ -145,7 +145,14 @@ def enter_real_time(priority: int) -> tuple[Step, ...]:
     `priority` (at least 1), for the threads to inherit; `raise_loop_thread` gives the loop its own. `priority` 0
     leaves the scheduler and the memory alone.
     """
-    steps = [_set_switch_interval(), _freeze_garbage()]
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    steps = [
+        Step("interpreter", True, f"a thread gives way within {SWITCH_INTERVAL_S * 1e3:g} ms"),
+        Step("garbage collector", True, f"off, {gc.get_freeze_count()} objects frozen"),
+    ]
     if priority == 0:
         return (*steps, Step("scheduler", False, "unchanged, because daemon.realtime_priority is 0"))
     steps.append(_lock_memory())
@@ -177,18 +184,6 @@ def can_lock_memory() -> bool:
     """Whether all memory, present and future, may be locked, without locking it."""
     unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
     return _has_capability(_CAP_IPC_LOCK) or unlimited
-
-
-def _set_switch_interval() -> Step:
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
-    return Step("interpreter", True, f"a thread gives way within {SWITCH_INTERVAL_S * 1e3:g} ms")
-
-
-def _freeze_garbage() -> Step:
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    return Step("garbage collector", True, f"off, {gc.get_freeze_count()} objects frozen")
 
 
 def _lock_memory() -> Step:

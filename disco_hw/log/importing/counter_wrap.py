@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,11 +108,11 @@ def unwrap_counter(
     span = _span_of(motion, [each for each in usual if reach < each <= 2.0 * reach], reach, unit)
     if span is not None:
         if _is_too_fast(motion, speeds, span):
-            return Unwrapped(values, unchanged.uncertain, fault=_faster_than_read(span, unit))
+            return replace(unchanged, fault=_faster_than_read(span, unit))
         found = _without_wraps(motion, values, span)
         if found is not None:
             return found
-    return Unwrapped(values, unchanged.uncertain, fault=_too_fast(motion, speeds, reach, usual, unit))
+    return replace(unchanged, fault=_too_fast(motion, speeds, reach, usual, unit))
 
 
 def continuous_wheels(
@@ -259,17 +259,14 @@ def _too_fast(motion: _Steps, speeds: Array | None, reach: float, spans: Sequenc
     """Describe a counter that wraps within so few samples that its direction is unknown; empty if none does."""
     if np.mean(motion.is_jump) <= _JUMPS_ALL_THE_TIME_SHARE:
         return ""
+    # How far speeds that are known carry the wheel, to and fro.
+    driven = 0.0 if speeds is None else float(np.nansum(np.abs(speeds[:-1]) * motion.dt_s))
     for span in spans:
         if _FULL_SHARE * span <= reach < span:
             shortest = np.abs(motion.steps - span * np.round(motion.steps / span))
-            if np.quantile(shortest, 0.75) > _AMBIGUOUS_SHARE * span or _is_driven_over(motion, speeds, 2.0 * span):
+            if np.quantile(shortest, 0.75) > _AMBIGUOUS_SHARE * span or driven > 2.0 * span:
                 return _faster_than_read(span, unit)
     return ""
-
-
-def _is_driven_over(motion: _Steps, speeds: Array | None, length: float) -> bool:
-    """Whether speeds (N,) that are known carry a wheel over a length, to and fro."""
-    return speeds is not None and float(np.nansum(np.abs(speeds[:-1]) * motion.dt_s)) > length
 
 
 def _faster_than_read(span: float, unit: str) -> str:

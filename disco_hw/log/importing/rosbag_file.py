@@ -163,9 +163,8 @@ def open_bag(path: Path, *, salvage: bool = False) -> Iterator[Bag]:
             topics = _topics(path, readers)
             start_ns = min(reader.start_time for reader in readers)
             end_ns = max(reader.end_time for reader in readers)
-        yield Bag(
-            path, topics, start_ns, end_ns, tuple(notes), tuple(readers), _decoder(store, is_ros1), Definitions(store)
-        )
+        read = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+        yield Bag(path, topics, start_ns, end_ns, tuple(notes), tuple(readers), read, Definitions(store))
 
 
 def _readers(path: Path, stack: ExitStack, notes: list[str], salvage: bool) -> tuple[list[Any], bool]:
@@ -220,11 +219,6 @@ def _opened(path: Path, is_ros1: bool, stack: ExitStack, notes: list[str], salva
         raise DamagedBagError(str(error)) from None
     stack.callback(reader.close)
     return reader
-
-
-def _decoder(store: Any, is_ros1: bool) -> Callable[[bytes, str], Any]:
-    read: Callable[[bytes, str], Any] = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
-    return read
 
 
 SUFFIXES = {MAGIC: ".mcap", SQLITE_MAGIC: ".db3", ROS1_MAGIC: ".bag"}
