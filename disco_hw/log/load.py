@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -151,7 +152,7 @@ def load_drive(
     if not several:
         raise LogError("no log given; give at least one")
     for place, path in enumerate(several):
-        if any(_same(path, other) for other in several[:place]):
+        if os.path.realpath(path) in map(os.path.realpath, several[:place]):
             raise LogError(f"{path}: given twice, so that its data would count twice; give each log once")
     drives = [_load(path, ticks_per_rev, wheel_radius_m) for path in several]
     if len(drives) > 1:
@@ -174,13 +175,6 @@ def _marks(drive: DriveLog) -> set[tuple[float, ...]]:
     since_us = np.rint(np.diff(poses.t_s) * 1e6)
     columns = (since_us, poses.x_m[1:], poses.y_m[1:], poses.yaw_rad[1:])
     return set(zip(*(column.tolist() for column in columns), strict=True))
-
-
-def _same(path: Path, other: Path) -> bool:
-    try:
-        return path.samefile(other)
-    except OSError:
-        return False
 
 
 def _load(path: Path, ticks_per_rev: float | None, wheel_radius_m: float | None) -> DriveLog:

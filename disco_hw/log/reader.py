@@ -236,11 +236,7 @@ class Log:
     def columns(
         self, topic: str, start_ns: int | None = None, end_ns: int | None = None
     ) -> dict[str, NDArray[np.generic]]:
-        """Return all records of a topic as one array a field, shape (N, ...), and the tick's time as `now_ns`.
-
-        Tuples of one length become (N, k) arrays, of different lengths arrays of objects; a mapping gives one array
-        `field.key` for each key.
-        """
+        """Return all records of a topic as one array a field, shape (N, ...), as `to_columns` makes them."""
         now_ns: list[int] = []
         records: list[Record] = []
         for entry in self.records((topic,), start_ns, end_ns):

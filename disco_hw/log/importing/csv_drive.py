@@ -226,22 +226,18 @@ def _with_new_segments(
     """Return the sheet with a new segment wherever an encoder restarts or may have wrapped."""
     inside = np.concatenate([[False], np.diff(segment) == 0])
     restart, uncertain = restarts(t_s, angles) & ~uncertain & inside, uncertain & inside
-    count, unknown = int(np.count_nonzero(restart)), int(np.count_nonzero(uncertain))
-    if count > _MAX_RESTART_SHARE * t_s.size:
+    if np.count_nonzero(restart) > _MAX_RESTART_SHARE * t_s.size:
         raise LogError(
-            f"{sheet.name}: an encoder jumps {count} times, first at t_s {t_s[restart][0]:.9g}, further than a "
-            f"wheel turns; {TICKS[0]} and {TICKS[1]} must be cumulative, and ticks_per_rev the true one"
+            f"{sheet.name}: an encoder jumps {np.count_nonzero(restart)} times, first at t_s {t_s[restart][0]:.9g}, "
+            f"further than a wheel turns; {TICKS[0]} and {TICKS[1]} must be cumulative, and ticks_per_rev the true one"
         )
-    if count:
-        notes.append(
-            f"{sheet.name}: an encoder was reset {count} times, first at t_s {t_s[restart][0]:.9g}; new segments "
-            "begin there"
-        )
-    if unknown:
-        notes.append(
-            f"{sheet.name}: ticks are missing for so long that they may have wrapped unseen, {unknown} times, first "
-            f"at t_s {t_s[uncertain][0]:.9g}; new segments begin there"
-        )
+    for which, what in (
+        (restart, "an encoder was reset"),
+        (uncertain, "ticks are missing for so long that they may have wrapped unseen,"),
+    ):
+        if which.any():
+            times = f"{np.count_nonzero(which)} times, first at t_s {t_s[which][0]:.9g}"
+            notes.append(f"{sheet.name}: {what} {times}; new segments begin there")
     breaks_s = t_s[restart | uncertain]
     return replace(sheet, segment=sheet.segment + np.searchsorted(breaks_s, sheet.t_s, side="right"))
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from array import array
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from disco_hw.config import Robot, RobotConfig
 from disco_hw.errors import LogError
 from disco_hw.log.drive import (
     LONGEST_COMMAND_S,
+    LONGEST_SILENCE_NS,
     Array,
     DriveLog,
     Edge,
@@ -28,11 +28,11 @@ from disco_hw.log.drive import (
     rotations,
 )
 from disco_hw.log.importing import LogFormat
-from disco_hw.log.importing.counter_wrap import restarts
+from disco_hw.log.importing.counter_wrap import WIDTHS_BITS, continuous_wheels, restarts
 from disco_hw.log.importing.csv_drive import length_fault
 from disco_hw.log.importing.losses import WARNING, loss_note
 from disco_hw.log.importing.rosbag_file import Bag, DamagedBagError, Undecoded, is_bag, message_of, open_bag
-from disco_hw.log.importing.rosbag_times import Stamps, timeline
+from disco_hw.log.importing.rosbag_times import Column, alike, timeline
 from disco_hw.log.importing.rosbag_topics import (
     ARRAY,
     COMMANDS,
@@ -48,7 +48,6 @@ from disco_hw.log.importing.rosbag_topics import (
     Choice,
     choose,
 )
-from disco_hw.log.importing.rosbag_wheels import measured_columns, unwrapped
 from drivers.pose import is_heading_measured
 
 _LONGEST_COMMAND_NS = round(LONGEST_COMMAND_S * 1e9)
@@ -58,36 +57,6 @@ _LONGEST_PAUSE_NS = 2_000_000_000
 _MOST_MESSAGES = 20_000_000
 _YAW_VARIANCE = 35
 """Place of the yaw's variance among the 36 of a pose's covariance."""
-
-
-@dataclass(slots=True)
-class _Column:
-    """Samples collected from one topic, or from one edge of the transforms."""
-
-    width: int
-    log_ns: array[int] = field(default_factory=lambda: array("q"))
-    stamp_ns: array[int] = field(default_factory=lambda: array("q"))
-    values: array[float] = field(default_factory=lambda: array("d"))
-    left_out: int = 0
-
-    def add(self, log_ns: int, stamp_ns: int, row: Row | None) -> None:
-        """Keep a row, or count that there was none."""
-        if row is None:
-            self.left_out += 1
-            return
-        self.log_ns.append(log_ns)
-        self.stamp_ns.append(stamp_ns)
-        self.values.extend(row)
-
-    def stamps(self) -> Stamps:
-        """Return the times of its rows."""
-        table = self.table()
-        is_repeat = np.concatenate([[False], _alike(table[1:], table[:-1])]) if len(table) else np.empty(0, dtype=bool)
-        return Stamps(np.array(self.log_ns, dtype=np.int64), np.array(self.stamp_ns, dtype=np.int64), is_repeat)
-
-    def table(self) -> Array:
-        """Return the column's rows, (N, width)."""
-        return np.array(self.values, dtype=np.float64).reshape(-1, self.width)
 
 
 def read_rosbag(path: Path, config: RobotConfig) -> DriveLog:
@@ -127,18 +96,18 @@ def _notes_on_undecoded(bag: Bag, undecoded: dict[str, Undecoded]) -> list[str]:
     ]  # fmt: skip
 
 
-def _columns(bag: Bag, choice: Choice, config: RobotConfig, undecoded: dict[str, Undecoded]) -> dict[str, _Column]:
+def _columns(bag: Bag, choice: Choice, config: RobotConfig, undecoded: dict[str, Undecoded]) -> dict[str, Column]:
     """One pass through the chosen topics; messages that cannot be decoded are counted."""
-    columns: dict[str, _Column] = {}
+    columns: dict[str, Column] = {}
     takes: dict[str, list[tuple[str, ReadRow]]] = {}
     for role in ROLES:
         used = choice.used(role)
         if used is not None and used.topic != TF:
             width, read_row = row_reader(role, used.type, choice, config)
-            columns[role] = _Column(width)
+            columns[role] = Column(width)
             takes.setdefault(used.topic, []).append((role, read_row))
     by_tf = choice.used(POSES) is not None and POSES not in columns
-    edges = {edge: _Column(7) for edge in choice.edges} if by_tf else {}
+    edges = {edge: Column(7) for edge in choice.edges} if by_tf else {}
     static: set[Edge] = set()
     transforms = {one.name for one in bag.topics.values() if one.type in TRANSFORMS} if by_tf else set()
     for number, message in enumerate(bag.messages({*takes, *transforms}, undecoded=undecoded)):
@@ -168,7 +137,7 @@ def _edge_name(edge: Edge, static: bool) -> str:
     return f"{'/tf_static' if static else '/tf'} {edge[0]} - {edge[1]}"
 
 
-def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: Robot) -> DriveLog:
+def _assembled(path: Path, choice: Choice, columns: dict[str, Column], robot: Robot) -> DriveLog:
     notes = [choice.as_text()]
     for name, column in columns.items():
         used = choice.used(name)
@@ -187,10 +156,10 @@ def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: R
     nothing: tuple[Index, Array] = (np.empty(0, dtype=np.int64), np.empty((0, 4)))
     command_ns, command = _expired(*arrays.get(COMMANDS, (nothing[0], np.empty((0, 2)))))
     wheel_ns, wheel = arrays.get(WHEELS, nothing)
-    wheel_ns, wheel, measured = measured_columns(path, wheel_ns, wheel, notes)
+    wheel_ns, wheel, measured = _measured_rows(path, wheel_ns, wheel, notes)
     uncertain = np.zeros(wheel_ns.size, dtype=bool)
     if measured[0]:
-        wheel, uncertain = unwrapped(path, wheel_ns, wheel, robot, (command_ns, command), notes)
+        wheel, uncertain = _unwrapped(path, wheel_ns, wheel, robot, (command_ns, command), notes)
     breaks_ns = np.unique(
         np.concatenate(
             [
@@ -239,22 +208,17 @@ def _notes_on_types(choice: Choice) -> list[str]:
 def _ordered(path: Path, name: str, t_ns: Index, table: Array, notes: list[str]) -> tuple[Index, Array]:
     """Sort messages by time, and keep the first of several with one time; one that is sent again is no loss."""
     unique, first, place = np.unique(t_ns, return_index=True, return_inverse=True)
-    conflicts = int(np.count_nonzero(~_alike(table, table[first][place])))
+    conflicts = int(np.count_nonzero(~alike(table, table[first][place])))
     if conflicts:
         what = "messages have the time of another and were left out"
         notes.append(loss_note(str(path), name, conflicts, t_ns.size, what, "record it again, or name another topic"))
     return unique, table[first]
 
 
-def _alike(one: Array, other: Array) -> NDArray[np.bool_]:
-    """Whether the rows of two tables (N, k) hold the same values."""
-    return np.asarray(((one == other) | (np.isnan(one) & np.isnan(other))).all(axis=1))
-
-
 def _pose_table(
     path: Path,
     choice: Choice,
-    columns: dict[str, _Column],
+    columns: dict[str, Column],
     arrays: dict[str, tuple[Index, Array]],
     static: set[str],
     notes: list[str],
@@ -284,6 +248,51 @@ def _pose_table(
     if not t_ns.size:
         raise LogError(f"{path}: the transforms of {used.why} never overlap in time; name another topic for poses")
     return t_ns, table
+
+
+def _measured_rows(path: Path, t_ns: Index, wheel: Array, notes: list[str]) -> tuple[Index, Array, tuple[bool, bool]]:
+    """Rows in which everything is there that the wheels measure at all, and whether that is angles, and speeds."""
+    angles, speeds = (np.isfinite(wheel[:, part]).all(axis=1) for part in (slice(0, 2), slice(2, 4)))
+    has_angle, has_speed = (
+        bool(2 * np.count_nonzero(angles) > t_ns.size),
+        bool(2 * np.count_nonzero(speeds) > t_ns.size),
+    )
+    kept = (angles | (not has_angle)) & (speeds | (not has_speed))
+    if t_ns.size and not (has_angle or has_speed):
+        raise LogError(
+            f"{path}: wheels: most messages have neither position nor velocity of all wheels; "
+            "set ros2.left_joints and ros2.right_joints"
+        )
+    if not kept.all():
+        dropped, what = int(np.count_nonzero(~kept)), "messages lack a position or velocity and were left out"
+        notes.append(
+            loss_note(str(path), WHEELS, dropped, kept.size, what, "set ros2.left_joints and ros2.right_joints")
+        )
+    wheel = wheel[kept]
+    if has_angle and has_speed and (wheel[:, 2:] == 0.0).all() and np.ptp(wheel[:, 0]) > 1.0:
+        notes.append("wheels: the velocities are all zero while the wheels turn; they were taken from the positions")
+        has_speed = False
+    return t_ns[kept], wheel, (has_angle, has_speed)
+
+
+def _unwrapped(
+    path: Path, t_ns: Index, wheel: Array, robot: Robot, commands: tuple[Index, Array], notes: list[str]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Wheels whose angles are continuous; and where the number of wraps is not known, (N,).
+
+    Angles wrap at a turn or where the counter behind them overflows; each wheel is judged by itself.
+    """
+    # Before the first command nothing is known.
+    commanded = np.vstack([[np.nan, np.nan], commands[1]])[np.searchsorted(commands[0], t_ns, side="right")]
+    known = np.where(np.isfinite(wheel[:, 2:]), wheel[:, 2:], commanded)
+    tick_rad = 2.0 * math.pi / robot.ticks_per_rev
+    spans = (2.0 * math.pi, *(2.0**bits * tick_rad for bits in WIDTHS_BITS))
+    begins = np.concatenate([[True], np.diff(t_ns) > LONGEST_SILENCE_NS])
+    names = (f"{path}: left wheel", f"{path}: right wheel")
+    angles, uncertain = continuous_wheels(
+        names, (t_ns - t_ns[0]) * 1e-9, wheel[:, :2], spans, begins, known, notes, "rad"
+    )
+    return np.column_stack([angles, wheel[:, 2:]]), uncertain
 
 
 def _expired(t_ns: Index, speeds: Array) -> tuple[Index, Array]:
