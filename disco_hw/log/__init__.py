@@ -67,7 +67,7 @@ class Start(msgspec.Struct, frozen=True):
     wall_offset_ns: int
     part: int = 1
     continues: str = ""
-    continues_sequence: int = 0
+    continues_sequence: int | None = None
     attachments: tuple[Attachment, ...] = ()
     scene: TaskScene | None = None
     flush_s: float = 0.5

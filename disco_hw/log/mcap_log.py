@@ -253,17 +253,7 @@ class McapLog:
         self.last_refusal = ""
         self._writer.start(profile=PROFILE, library=LIBRARY)
         wall_ns = start.start_ns + start.wall_offset_ns
-        metadata = Metadata(
-            format=FORMAT,
-            robot=start.robot,
-            version=start.version,
-            part=start.part,
-            start_ns=start.start_ns,
-            wall_offset_ns=start.wall_offset_ns,
-            continues=start.continues,
-            continues_sequence=start.continues_sequence if start.part > 1 else None,
-            planner=start.planner,
-        )
+        metadata = msgspec.structs.replace(msgspec.convert(start, Metadata, from_attributes=True), format=FORMAT)
         self._writer.add_metadata(METADATA, as_text(metadata))
         for attachment in start.attachments:
             self._writer.add_attachment(wall_ns, wall_ns, attachment.name, attachment.media_type, attachment.data)

@@ -335,7 +335,7 @@ class ProcessRecorder:
             part=self._next_part,
             start_ns=time.monotonic_ns(),
             continues=self._continues,
-            continues_sequence=self._delivery.last_delivered,
+            continues_sequence=None if self._next_part == 1 else self._delivery.last_delivered,
         )
         connection = self._keeper.launch(request)
         if connection is not None:
