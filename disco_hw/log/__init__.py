@@ -77,10 +77,9 @@ class Start(msgspec.Struct, frozen=True):
 
 
 class Started(msgspec.Struct, frozen=True, tag=True):
-    """Report of the keeper process: process id of the newest writer, or 0 with the reason in `error`."""
+    """Report of the keeper process: process id of the newest writer, or 0 if none could be made, as its status says."""
 
     pid: int
-    error: str = ""
 
 
 class Ended(msgspec.Struct, frozen=True, tag=True):

@@ -307,8 +307,10 @@ def keep(channel: socket.socket, start: Start) -> None:
         try:
             pid = os.fork()
         except OSError as error:
+            fault = f"{request.path}: no process can be made to write it ({_reason(error)})"
+            StatusLine(connection).send(WriterStatus("failed", request.path, request.part, error=fault))
             connection.close()
-            _send_message(channel, Started(0, f"no process can be made ({error.strerror})"))
+            _send_message(channel, Started(0))
             continue
         if pid == 0:
             # A writer that kept these would hide the end of the keeper and of other writers.
