@@ -84,10 +84,9 @@ class _Steps:
 def unwrap_counter(
     t_s: Array,
     values: Array,
-    spans: Sequence[float] = (),
-    *,
-    begins: Mask | None = None,
-    speeds: Array | None = None,
+    spans: Sequence[float],
+    begins: Mask,
+    speeds: Array,
     unit: str = "counts",
 ) -> Unwrapped:
     """Make a counter continuous that jumps by a constant span whenever it overflows.
@@ -133,7 +132,7 @@ def continuous_wheels(
     """
 
     def unwrap(side: int, spans: Sequence[float]) -> Unwrapped:
-        return unwrap_counter(t_s, values[:, side], spans, begins=begins, speeds=speeds[:, side], unit=unit)
+        return unwrap_counter(t_s, values[:, side], spans, begins, speeds[:, side], unit)
 
     first = unwrap(0, spans), unwrap(1, spans)
     shown = [*spans, *(one.span for one in first if one.wraps)]
@@ -146,9 +145,9 @@ def continuous_wheels(
     return np.column_stack([left.values, right.values]), left.uncertain | right.uncertain
 
 
-def _steps(t_s: Array, values: Array, begins: Mask | None, reach: float, unit: str) -> _Steps:
+def _steps(t_s: Array, values: Array, begins: Mask, reach: float, unit: str) -> _Steps:
     dt_s, steps = np.maximum(np.diff(t_s), 1e-9), np.diff(values)
-    inside = np.ones(steps.size, dtype=bool) if begins is None else ~begins[1:]
+    inside = ~begins[1:]
     jumps = inside & (np.abs(steps) > _JUMP_SHARE * reach) & (reach > 0.0)
     usable = inside & ~jumps
     expected = _expected(dt_s, steps, usable)
@@ -245,22 +244,20 @@ def _without_wraps(motion: _Steps, values: Array, span: float) -> Unwrapped | No
     )
 
 
-def _is_too_fast(motion: _Steps, speeds: Array | None, span: float) -> bool:
+def _is_too_fast(motion: _Steps, speeds: Array, span: float) -> bool:
     """Whether speeds (N,) carry a counter over half its span from one value to the next, more than now and then."""
-    if speeds is None:
-        return False
     lengths = np.abs(speeds[:-1]) * motion.dt_s
     known = motion.is_inside & np.isfinite(lengths)
     too_long = int(np.count_nonzero(lengths[known] > 0.5 * span))
     return too_long > _TOO_FAST_SHARE * int(np.count_nonzero(known))
 
 
-def _too_fast(motion: _Steps, speeds: Array | None, reach: float, spans: Sequence[float], unit: str) -> str:
+def _too_fast(motion: _Steps, speeds: Array, reach: float, spans: Sequence[float], unit: str) -> str:
     """Describe a counter that wraps within so few samples that its direction is unknown; empty if none does."""
     if np.mean(motion.is_jump) <= _JUMPS_ALL_THE_TIME_SHARE:
         return ""
     # How far speeds that are known carry the wheel, to and fro.
-    driven = 0.0 if speeds is None else float(np.nansum(np.abs(speeds[:-1]) * motion.dt_s))
+    driven = float(np.nansum(np.abs(speeds[:-1]) * motion.dt_s))
     for span in spans:
         if _FULL_SHARE * span <= reach < span:
             shortest = np.abs(motion.steps - span * np.round(motion.steps / span))

@@ -243,7 +243,7 @@ def _check_file(path: Path) -> bool:
 def _check_folder(path: Path) -> None:
     """Refuse what the library would wait for or fill a disk with."""
     content = read_bytes(path / METADATA, BAG_METADATA)[0] if (path / METADATA).exists() else b""
-    is_file_compressed = b"compression_mode: FILE" in content.upper().replace(b"COMPRESSION_MODE", b"compression_mode")
+    is_file_compressed = b"COMPRESSION_MODE: FILE" in content.upper()
     for one in sorted(path.iterdir()):
         if one.is_dir():
             continue

@@ -82,15 +82,13 @@ def _records(source: BinaryIO) -> Iterator[Any]:  # Any: the library's records, 
             readable = source.tell()
             if not isinstance(record, Chunk):
                 yield record
-            elif record.uncompressed_size <= _LARGEST_UNPACKED_BYTES:
-                try:
+                continue
+            inside: list[Any] = [None]
+            # Whatever the decompressors raise of damaged bytes: counted, and said.
+            with contextlib.suppress(Exception):
+                if record.uncompressed_size <= _LARGEST_UNPACKED_BYTES:
                     inside = breakup_chunk(record, validate_crc=True)
-                except Exception:  # Whatever the decompressors raise of damaged bytes: counted, and said.
-                    yield None
-                    continue
-                yield from inside
-            else:
-                yield None
+            yield from inside
     source.seek(readable)
     rest = source.read(_LARGEST_RECORD_BYTES)
     # What is whole of a last chunk that was cut: a short recording may have no other.

@@ -66,7 +66,7 @@ def test_a_step_from_one_segment_to_the_next_is_no_wrap():
     begins[300] = True
     values = counts % 4096.0
     values[300:] = counts[300:] - counts[300]
-    found = unwrap_counter(T_S, values, begins=begins)
+    found = unwrap_counter(T_S, values, (), begins, np.full(T_S.size, np.nan))
     assert (found.span, found.wraps) == (4096.0, 1)
     steps = np.delete(np.diff(found.values), 299)
     np.testing.assert_array_equal(steps, 20.0)
