@@ -68,10 +68,8 @@ class WriterLine:
         while self._rest and not self.ended:
             try:
                 sent = self._connection.send(self._rest)
-            except BlockingIOError:
-                return False
             except OSError:
-                # What it said last may still be waiting to be read; that it has gone is found there.
+                # Full, or gone: what it said last may still be waiting to be read, and that it has gone is found there.
                 return False
             self._rest = self._rest[sent:]
         return not self._rest
